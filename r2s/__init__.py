@@ -1,0 +1,1 @@
+"""r2s: real-to-sim for fabrics."""
