@@ -1,0 +1,87 @@
+"""The cloth: a sheet of triangles, implicit in time, second order, differentiable."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from r2s.fabric import Fabric
+from r2s.implicit import minimise
+from r2s.increment import Increment, curvatures, strains
+from r2s.mesh import Mesh
+from r2s.physics import contact
+from r2s.scene import Control, Scene
+
+Positions = Float[Array, "vertex 3"]
+
+
+class ClothState(eqx.Module):
+    """- `x`, `v`: positions [m] and velocities [m/s], world frame, z up.
+    - `x_before`, `v_before`: those of the step before, which the second-order formula needs.
+    """
+
+    x: Float[Array, "vertex 3"]
+    v: Float[Array, "vertex 3"]
+    x_before: Float[Array, "vertex 3"]
+    v_before: Float[Array, "vertex 3"]
+
+
+class Cloth(eqx.Module):
+    """A sheet in a scene, stepped by BDF2; every step is solved to convergence.
+
+    Differentiable, forward and reverse, in fabric, state, control and scene.
+
+    - `scene`: sheet, held vertices, table, air.
+    - `dt`: step, [s].
+    - `tolerance`: the solve ends when no coordinate changes by more, [m]. None: 1e-6 in float32,
+      1e-11 in float64.
+    - `max_iterations`: of Newton's method; a step that needs more is NaN.
+    """
+
+    scene: Scene
+    dt: float = eqx.field(static=True)
+    tolerance: float | None = eqx.field(static=True, default=None)
+    max_iterations: int = eqx.field(static=True, default=60)
+
+    def __check_init__(self):
+        if not self.dt > 0:
+            raise ValueError(f"dt must be positive, got {self.dt} s")
+
+    def init(self, x: Positions, v: Positions | None = None) -> ClothState:
+        """A state from positions [m] and velocities [m/s] (default: at rest)."""
+        v = jnp.zeros_like(x) if v is None else v
+        return ClothState(x, v, x - self.dt * v, v)
+
+    def step(self, fabric: Fabric, state: ClothState, control: Control) -> ClothState:
+        """The state `dt` later, with the held vertices at `control.handles`."""
+        increment = self.increment(fabric, state, control)
+        guess = self.scene.place(state.x + self.dt * state.v, control.handles)
+        tolerance = self.tolerance or (1e-11 if guess.dtype == jnp.float64 else 1e-6)
+        x = minimise(increment, guess, self.scene.is_free, tolerance, self.max_iterations)
+        v = increment.rate * (x - increment.x_anchor)
+        return ClothState(x, v, state.x, state.v)
+
+    def increment(self, fabric: Fabric, state: ClothState, control: Control) -> Increment:
+        """What this step's potential depends on. BDF2: 2 dt v' = 3 x' - 4 x + x_before."""
+        mesh = self.scene.mesh
+        depth = self.scene.table.depth(state.x, fabric.thickness)
+        bdf2 = lambda now, before: (4 * now - before) / 3
+        return Increment(
+            mesh=mesh,
+            fabric=fabric,
+            air=self.scene.air,
+            table=self.scene.table,
+            rate=jnp.asarray(1.5 / self.dt, float),
+            x_anchor=bdf2(state.x, state.x_before),
+            v_anchor=bdf2(state.v, state.v_before),
+            strain_anchor=bdf2(strains(mesh, state.x), strains(mesh, state.x_before)),
+            curvature_anchor=bdf2(curvatures(mesh, state.x), curvatures(mesh, state.x_before)),
+            area_normals=_area_normals(mesh, state.x),
+            friction_limit=fabric.friction * mesh.vertex_area * contact.pressure(depth),
+            wind=control.wind,
+        )
+
+
+def _area_normals(mesh: Mesh, x: Positions) -> Float[Array, "face 3"]:
+    """Normals of the faces, as long as their areas, [m^2]."""
+    corners = x[mesh.faces]
+    return jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2

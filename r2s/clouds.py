@@ -1,0 +1,177 @@
+"""Point clouds in files: one reader per format, and the numbered frames of a folder."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+
+def read_cloud(path: Path | str) -> Float[np.ndarray, "point 3"]:
+    """The points of a file, in the file's units, as float64, in the order of the file.
+
+    The suffix says the format: npy; ply (vertices; needs trimesh); obj (vertices); xyz (three
+    columns parted by blanks or commas, # starts a comment); pcd (needs pypcd4).
+
+    Raises FileNotFoundError, ImportError (names the extra to install), or a ValueError that names
+    the file: unknown suffix, unreadable content, wrong shape, no points, non-finite points.
+    """
+    path = Path(path)
+    points = read_values(path)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"{path}: expected an array (points, 3), found {points.shape}")
+    if len(points) == 0:
+        raise ValueError(f"{path}: the cloud is empty")
+    bad = ~np.isfinite(points).all(axis=1)
+    if bad.any():
+        raise ValueError(
+            f"{path}: {bad.sum()} of {len(points)} points are not finite, "
+            f"the first is point {bad.argmax()}: {points[bad.argmax()]}"
+        )
+    return points
+
+
+def read_values(path: Path | str) -> Float[np.ndarray, "..."]:
+    """The numbers of a file as float64, with neither shape nor values checked.
+
+    Raises as `read_cloud`, less what that says about shape and values.
+    """
+    path = Path(path)
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        known = ", ".join(READERS)
+        raise ValueError(f"{path}: unknown suffix {path.suffix!r}, expected one of {known}")
+    try:
+        return np.asarray(reader(path), np.float64)
+    except (FileNotFoundError, ImportError):
+        raise
+    except Exception as error:  # the libraries raise anything, from IndexError to their own types
+        kind = path.suffix.lower()[1:]
+        raise ValueError(f"{path}: cannot be read as {kind}: {error}") from error
+
+
+def find_frames(folder: Path | str, first: int | None = None) -> list[Path]:
+    """The numbered clouds of a folder (`000.npy`, `frame_12.ply`), sorted by their number.
+
+    The number is the last group of digits in the name. `first` is the number that the first frame
+    must have (None: any). Other files and hidden files are passed over.
+
+    Raises FileNotFoundError (no such folder, no frames) or ValueError (mixed formats, two files
+    of one number, a number that is missing).
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder")
+    numbered = [(n, p) for p in sorted(folder.iterdir()) if (n := _frame_number(p)) is not None]
+    if not numbered:
+        raise FileNotFoundError(
+            f"{folder}: no numbered frames such as 000.npy (formats: {', '.join(READERS)})"
+        )
+    suffixes = sorted({p.suffix.lower() for _, p in numbered})
+    if len(suffixes) > 1:
+        raise ValueError(f"{folder}: frames of mixed formats: {', '.join(suffixes)}")
+    frames: dict[int, Path] = {}
+    for number, path in numbered:
+        if number in frames:
+            names = f"{frames[number].name} and {path.name}"
+            raise ValueError(f"{folder}: frame {number} is there twice: {names}")
+        frames[number] = path
+    start = min(frames) if first is None else first
+    for number in range(start, max(frames)):
+        if number not in frames:
+            found = f"found {len(frames)} frames from {min(frames)} to {max(frames)}"
+            raise ValueError(f"{folder}: frame {number} is missing ({found})")
+    if min(frames) < start:
+        raise ValueError(f"{folder}: frame {min(frames)} comes before the first frame, {start}")
+    return [frames[number] for number in sorted(frames)]
+
+
+def _frame_number(path: Path) -> int | None:
+    if path.name.startswith(".") or path.suffix.lower() not in READERS or not path.is_file():
+        return None
+    digits = re.findall(r"[0-9]+", path.stem)
+    return int(digits[-1]) if digits else None
+
+
+def _read_npy(path: Path) -> np.ndarray:
+    values = np.load(path, allow_pickle=False)
+    if not isinstance(values, np.ndarray):
+        raise ValueError("it is an archive of several arrays")
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"expected real numbers, found dtype {values.dtype}")
+    return values
+
+
+def _read_ply(path: Path) -> np.ndarray:
+    try:
+        import trimesh
+    except ImportError as error:
+        raise ImportError(
+            f"{path}: reading ply needs trimesh: pip install 'r2s[study]'"
+        ) from error
+    count = _ply_vertices(path.read_bytes())
+    if count == 0:
+        return np.zeros((0, 3))
+    # process=False: else vertices are merged and reordered.
+    loaded = trimesh.load(path, process=False)
+    vertices = np.asarray(getattr(loaded, "vertices", ()))
+    if len(vertices) != count:
+        raise ValueError(f"the header promises {count} vertices, found {len(vertices)}")
+    return vertices
+
+
+def _ply_vertices(data: bytes) -> int:
+    """The number of vertices that the header promises; trimesh takes a cut ASCII file as it is."""
+    header, end, body = data.partition(b"end_header")
+    if not data.startswith(b"ply") or not end:
+        raise ValueError("no ply header")
+    counts = {
+        name: int(count) for name, count in re.findall(rb"^element (\S+) (\d+)", header, re.M)
+    }
+    if b"vertex" not in counts:
+        raise ValueError("the header names no vertices")
+    if b"format ascii" in header:
+        lines = sum(1 for line in body.splitlines() if line.strip())
+        if lines < sum(counts.values()):
+            raise ValueError(f"cut short: {lines} of {sum(counts.values())} lines of data")
+    return counts[b"vertex"]
+
+
+def _read_obj(path: Path) -> np.ndarray:
+    # By hand: trimesh drops the vertices that no face uses and repeats others.
+    lines = (line.split() for line in path.read_text().splitlines())
+    rows = [line[1:4] for line in lines if line[:1] == ["v"]]
+    return np.array(rows, np.float64) if rows else np.zeros((0, 3))
+
+
+def _read_xyz(path: Path) -> np.ndarray:
+    lines = [line.split("#")[0].replace(",", " ").split() for line in path.read_text().splitlines()]
+    rows = [line for line in lines if line]
+    widths = {len(row) for row in rows}
+    if len(widths) > 1:
+        raise ValueError(f"rows of {min(widths)} to {max(widths)} columns")
+    return np.array(rows, np.float64) if rows else np.zeros((0, 3))
+
+
+def _read_pcd(path: Path) -> np.ndarray:
+    if not path.is_file():  # before pypcd4, which wraps this error
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        import pypcd4
+    except ImportError as error:
+        raise ImportError(f"{path}: reading pcd needs pypcd4: pip install 'r2s[pcd]'") from error
+    cloud = pypcd4.PointCloud.from_path(path)
+    values = cloud.numpy(("x", "y", "z"))
+    if len(values) != cloud.points:
+        raise ValueError(f"the header promises {cloud.points} points, found {len(values)}")
+    return values
+
+
+READERS: dict[str, Callable[[Path], np.ndarray]] = {
+    ".npy": _read_npy,
+    ".ply": _read_ply,
+    ".obj": _read_obj,
+    ".xyz": _read_xyz,
+    ".pcd": _read_pcd,
+}

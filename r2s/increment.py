@@ -1,0 +1,223 @@
+"""The energy that one implicit step minimises.
+
+With the rate matrix of BDF2 (or backward Euler) the velocity at the end of a step is
+v = rate (x - x_anchor) and the acceleration rate (v - v_anchor), both linear in the new positions
+x. The new positions are then those that minimise the *incremental potential*
+
+    inertia  m rate^2 / 2 |x - x_anchor - v_anchor / rate|^2
+    + stored energy(x) + dissipation(v) / rate
+
+(Ortiz and Stainier 1999; Kane et al. 2000; for contact Li et al. 2020). What has no potential
+is lagged: the normals for the drag, and the normal force for the friction, are those at the start
+of the step.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from r2s.fabric import Fabric
+from r2s.mesh import Mesh
+from r2s.physics import contact
+from r2s.physics.air import Air
+from r2s.physics.bending import hinge_angle
+from r2s.physics.contact import Table
+from r2s.physics.membrane import green_strain
+from r2s.units import GRAVITY
+
+Positions = Float[Array, "vertex 3"]
+
+
+class Increment(eqx.Module):
+    """All that a step's potential depends on, beside the new positions.
+
+    - `rate`: of the time-stepping formula, [1/s].
+    - `x_anchor`, `v_anchor`: what the formula's velocity [m/s] and acceleration start from.
+    - `strain_anchor`, `curvature_anchor`: likewise for the rates of strain [-] and curvature [1/m].
+    - `area_normals`: of the faces at the start of the step, [m^2].
+    - `friction_limit`: coefficient times normal force at the start of the step, [N].
+    - `wind`: [m/s].
+    """
+
+    mesh: Mesh
+    fabric: Fabric
+    air: Air
+    table: Table
+    rate: Float[Array, ""]
+    x_anchor: Positions
+    v_anchor: Positions
+    strain_anchor: Float[Array, "face 3"]
+    curvature_anchor: Float[Array, " hinge"]
+    area_normals: Float[Array, "face 3"]
+    friction_limit: Float[Array, " vertex"]
+    wind: Float[Array, " 3"]
+
+
+def strains(mesh: Mesh, x: Positions) -> Float[Array, "face 3"]:
+    """Green strain (E11, E22, 2 E12) [-] of every face at positions [m]."""
+    return jax.vmap(green_strain)(x[mesh.faces], mesh.inverse)
+
+
+def curvatures(mesh: Mesh, x: Positions) -> Float[Array, " hinge"]:
+    """Curvature theta l / A [1/m] of every hinge at positions [m]."""
+    return jax.vmap(hinge_angle)(x[mesh.hinges]) * mesh.hinge_length / mesh.hinge_area
+
+
+def vertex_mass(mesh: Mesh, fabric: Fabric) -> Float[Array, " vertex"]:
+    """Lumped mass [kg] of every vertex."""
+    return fabric.density * mesh.vertex_area
+
+
+def _viscoelastic(
+    energy_density: Callable[[Array], Array], strain: Array, anchor: Array, viscosity: Array
+) -> Array:
+    """Stored energy and dissipation of one strain: the viscous stress is damping x tangent x rate.
+
+    `viscosity` is damping times rate [-]. The tangent is the law's at the anchor.
+    """
+    change = strain - anchor
+    gradient = jax.grad(energy_density)
+    _, tangent_change = jax.jvp(gradient, (anchor,), (change,))
+    return energy_density(strain) + viscosity / 2 * jnp.sum(change * tangent_change)
+
+
+def _strain_energy(step: Increment, strain: Float[Array, " 3"], anchor: Float[Array, " 3"]):
+    viscosity = step.fabric.damping * step.rate
+    return _viscoelastic(step.fabric.membrane.energy_density, strain, anchor, viscosity)
+
+
+def _curvature_energy(step: Increment, curvature: Float[Array, ""], anchor: Float[Array, ""]):
+    viscosity = step.fabric.damping * step.rate
+    return _viscoelastic(step.fabric.bending.energy_density, curvature, anchor, viscosity)
+
+
+def _drag_energy(step: Increment, face, normal, corners):
+    anchor = step.x_anchor[face].mean(axis=0)
+    velocity = step.rate * (corners.mean(axis=0) - anchor)
+    return step.air.dissipation(velocity - step.wind, normal) / step.rate
+
+
+def _face_energy(step, corners, face, inverse, area, anchor, normal):
+    strain = green_strain(corners, inverse)
+    drag = _drag_energy(step, face, normal, corners)
+    return area * _strain_energy(step, strain, anchor) + drag
+
+
+def _hinge_energy(step, corners, length, area, anchor):
+    curvature = hinge_angle(corners) * length / area
+    return area * _curvature_energy(step, curvature, anchor)
+
+
+def _vertex_energy(step, x, x_anchor, v_anchor, area, limit):
+    mass = step.fabric.density * area
+    offset = x - x_anchor - v_anchor / step.rate
+    depth = step.table.depth(x, step.fabric.thickness)
+    slip = step.rate * (x - x_anchor)
+    return (
+        mass * step.rate**2 / 2 * jnp.sum(offset**2)
+        + mass * GRAVITY * x[2]
+        + area * contact.normal_potential(depth)
+        + contact.friction_dissipation(limit, slip) / step.rate
+    )
+
+
+def _faces(step: Increment):
+    mesh = step.mesh
+    return mesh.faces, mesh.inverse, mesh.area, step.strain_anchor, step.area_normals
+
+
+def _hinges(step: Increment):
+    return step.mesh.hinge_length, step.mesh.hinge_area, step.curvature_anchor
+
+
+def _vertices(step: Increment):
+    return step.x_anchor, step.v_anchor, step.mesh.vertex_area, step.friction_limit
+
+
+def _over(function, step):
+    """`function(step, element...)`, for all elements."""
+    return jax.vmap(lambda *element: function(step, *element))
+
+
+def potential(step: Increment, x: Positions) -> Float[Array, ""]:
+    """The incremental potential [J] at new positions [m]."""
+    mesh = step.mesh
+    return (
+        jnp.sum(_over(_face_energy, step)(x[mesh.faces], *_faces(step)))
+        + jnp.sum(_over(_hinge_energy, step)(x[mesh.hinges], *_hinges(step)))
+        + jnp.sum(_over(_vertex_energy, step)(x, *_vertices(step)))
+    )
+
+
+imbalance = jax.grad(potential, argnums=1)  # [N]; zero where the forces balance
+
+
+def hessian(step: Increment, x: Positions) -> Float[Array, "coordinate coordinate"]:
+    """Second derivative [N/m] of the potential, exact."""
+    mesh = step.mesh
+    exact = lambda energy: _over(jax.hessian(energy, argnums=1), step)
+    return _assemble(
+        mesh,
+        exact(_face_energy)(x[mesh.faces], *_faces(step)),
+        exact(_hinge_energy)(x[mesh.hinges], *_hinges(step)),
+        exact(_vertex_energy)(x, *_vertices(step)),
+    )
+
+
+def convex_hessian(step: Increment, x: Positions) -> Float[Array, "coordinate coordinate"]:
+    """A positive definite stand-in for `hessian` [N/m], whose Newton steps always descend.
+
+    It leaves out the second derivative of the hinge angle, and the geometric stiffness of
+    compressed directions, as is usual for cloth (Choi and Ko 2002).
+    """
+    mesh = step.mesh
+    return _assemble(
+        mesh,
+        _over(_convex_face, step)(x[mesh.faces], *_faces(step)),
+        _over(_convex_hinge, step)(x[mesh.hinges], *_hinges(step)),
+        _over(jax.hessian(_vertex_energy, argnums=1), step)(x, *_vertices(step)),
+    )
+
+
+def _convex_face(step, corners, face, inverse, area, anchor, normal):
+    strain, vjp = jax.vjp(lambda corners: green_strain(corners, inverse), corners)
+    jacobian = jax.vmap(vjp)(jnp.eye(3, dtype=strain.dtype))[0]  # (strain, corner, axis)
+    energy = lambda strain: _strain_energy(step, strain, anchor)
+    stress, tangent = jax.grad(energy)(strain), jax.hessian(energy)(strain)
+    material = jnp.einsum("sai,st,tbj->aibj", jacobian, tangent, jacobian)
+    shape = jnp.concatenate([-jnp.sum(inverse, axis=0, keepdims=True), inverse])
+    geometric = jnp.einsum("as,st,bt,ij->aibj", shape, _tension(stress), shape, jnp.eye(3))
+    drag = jax.hessian(lambda corners: _drag_energy(step, face, normal, corners))(corners)
+    return area * (material + geometric) + drag
+
+
+def _tension(stress: Float[Array, " 3"]) -> Float[Array, "2 2"]:
+    """The part of a symmetric stress (S11, S22, S12) whose principal values are positive."""
+    mean, half = (stress[0] + stress[1]) / 2, (stress[0] - stress[1]) / 2
+    radius = jnp.sqrt(half**2 + stress[2] ** 2)
+    high, low = jnp.maximum(mean + radius, 0), jnp.maximum(mean - radius, 0)
+    slope = (high - low) / jnp.where(radius > 0, 2 * radius, 1)
+    centre = (high + low) / 2
+    deviator = jnp.stack([jnp.stack([half, stress[2]]), jnp.stack([stress[2], -half])])
+    return centre * jnp.eye(2) + slope * deviator
+
+
+def _convex_hinge(step, corners, length, area, anchor):
+    angle, gradient = jax.value_and_grad(hinge_angle)(corners)
+    energy = lambda angle: area * _curvature_energy(step, angle * length / area, anchor)
+    return jax.hessian(energy)(angle) * jnp.einsum("ai,bj->aibj", gradient, gradient)
+
+
+def _assemble(mesh: Mesh, faces, hinges, vertices):
+    """A dense matrix from the blocks (corner, axis, corner, axis) of the elements."""
+    count = mesh.rest.shape[0]
+    matrix = jnp.zeros((count, 3, count, 3), faces.dtype)
+    for elements, blocks in ((mesh.faces, faces), (mesh.hinges, hinges)):
+        rows, columns = elements[:, :, None], elements[:, None, :]
+        matrix = matrix.at[rows, :, columns, :].add(blocks.transpose(0, 1, 3, 2, 4))
+    every = jnp.arange(count)
+    matrix = matrix.at[every, :, every, :].add(vertices)
+    return matrix.reshape(3 * count, 3 * count)

@@ -1,0 +1,123 @@
+"""The rest shape of a sheet: a triangle mesh in material coordinates, and what follows from it."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+
+class Mesh(eqx.Module):
+    """A flat sheet of triangles at rest, with its warp along the first material axis.
+
+    - `rest`: material coordinates (warp, weft), [m].
+    - `faces`: corners, counter-clockwise in material coordinates.
+    - `hinges`: the two ends of each inner edge, then the two vertices opposite to it.
+    - `inverse`: inverse of each face's rest edges, [1/m].
+    - `area`, `vertex_area`: rest areas of the faces, and a third of them at each vertex, [m^2].
+    - `hinge_length`, `hinge_area`: of each hinge's edge [m], and its two faces together [m^2].
+    """
+
+    rest: Float[Array, "vertex 2"]
+    faces: Int[Array, "face 3"]
+    hinges: Int[Array, "hinge 4"]
+    inverse: Float[Array, "face 2 2"]
+    area: Float[Array, " face"]
+    vertex_area: Float[Array, " vertex"]
+    hinge_length: Float[Array, " hinge"]
+    hinge_area: Float[Array, " hinge"]
+
+    @classmethod
+    def make(cls, rest: Float[np.ndarray, "vertex 2"], faces: Int[np.ndarray, "face 3"]) -> "Mesh":
+        """A mesh from material coordinates [m] and triangles.
+
+        Raises `ValueError` for wrong shapes, indices out of range, vertices in no face, an edge of
+        more than two faces, and faces that are degenerate or clockwise.
+        """
+        rest, faces = np.asarray(rest, float), np.asarray(faces)
+        _check(rest, faces)
+        edges = rest[faces[:, 1:]] - rest[faces[:, :1]]  # (face, edge, material axis)
+        area = np.linalg.det(edges) / 2
+        if np.any(area <= 1e-12 * np.ptp(rest) ** 2):
+            worst = int(np.argmin(area))
+            raise ValueError(
+                f"face {worst} has the signed area {area[worst]:.3g} m^2: "
+                "faces must be counter-clockwise and not degenerate"
+            )
+        hinges, hinge_faces = _hinges(faces)
+        ends = rest[hinges[:, 0]] - rest[hinges[:, 1]]
+        vertex_area = np.zeros(len(rest))
+        np.add.at(vertex_area, faces.ravel(), np.repeat(area / 3, 3))
+        return cls(
+            rest=jnp.asarray(rest, float),
+            faces=jnp.asarray(faces, int),
+            hinges=jnp.asarray(hinges, int),
+            inverse=jnp.asarray(np.linalg.inv(edges.transpose(0, 2, 1)), float),
+            area=jnp.asarray(area, float),
+            vertex_area=jnp.asarray(vertex_area, float),
+            hinge_length=jnp.asarray(np.linalg.norm(ends, axis=-1), float),
+            hinge_area=jnp.asarray(area[hinge_faces].sum(axis=-1), float),
+        )
+
+
+def _check(rest: np.ndarray, faces: np.ndarray) -> None:
+    if rest.ndim != 2 or rest.shape[1] != 2 or not np.all(np.isfinite(rest)):
+        raise ValueError(f"rest must be finite, of shape (vertex, 2) [m], got shape {rest.shape}")
+    if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
+        raise ValueError(f"faces must be integers of shape (face, 3), got shape {faces.shape}")
+    lonely = np.setdiff1d(np.arange(len(rest)), faces)
+    if faces.min() < 0 or faces.max() >= len(rest) or len(lonely):
+        raise ValueError(
+            f"faces must use each of the vertices 0 to {len(rest) - 1} and no other; "
+            f"they go from {faces.min()} to {faces.max()} and leave out {lonely[:5].tolist()}"
+        )
+
+
+def _hinges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Inner edges with their two opposite vertices, and the two faces of each."""
+    sides: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
+    for index, face in enumerate(faces):
+        for i in range(3):
+            start, end, opposite = (int(face[(i + k) % 3]) for k in range(3))
+            key = (min(start, end), max(start, end))
+            sides.setdefault(key, []).append((start, opposite, index))
+    hinges, pairs = [], []
+    for (low, high), touching in sides.items():
+        if len(touching) > 2:
+            raise ValueError(f"edge {low}-{high} belongs to {len(touching)} faces, at most 2 may be")
+        if len(touching) == 2:
+            # the left triangle is the one that runs along the edge from its start
+            (start, left, face_left), (_, right, face_right) = touching
+            hinges.append((start, high if start == low else low, left, right))
+            pairs.append((face_left, face_right))
+    return np.reshape(hinges, (-1, 4)).astype(int), np.reshape(pairs, (-1, 2)).astype(int)
+
+
+def rectangle(size: tuple[float, float], shape: tuple[int, int] = (9, 9)) -> Mesh:
+    """A rectangle of `size` (warp, weft) [m] with `shape` vertices along warp and weft.
+
+    Vertex (i, j) has the index i * shape[1] + j. The diagonals alternate, so that the mesh favours
+    neither bias direction. Raises `ValueError` when a side is not positive or has no two vertices.
+    """
+    if min(size) <= 0 or min(shape) < 2:
+        raise ValueError(f"a rectangle needs sides > 0 m and >= 2 vertices, got {size}, {shape}")
+    rows, columns = shape
+    warp, weft = np.meshgrid(
+        np.linspace(0, size[0], rows), np.linspace(0, size[1], columns), indexing="ij"
+    )
+    index = np.arange(rows * columns).reshape(shape)
+    a, b = index[:-1, :-1].ravel(), index[1:, :-1].ravel()  # corners (0, 0) and (1, 0) of a cell
+    c, d = index[1:, 1:].ravel(), index[:-1, 1:].ravel()
+    even = (np.add.outer(np.arange(rows - 1), np.arange(columns - 1)) % 2 == 0).ravel()[:, None]
+    first = np.where(even, np.stack([a, b, c], 1), np.stack([a, b, d], 1))
+    second = np.where(even, np.stack([a, c, d], 1), np.stack([b, c, d], 1))
+    return Mesh.make(np.stack([warp.ravel(), weft.ravel()], 1), np.concatenate([first, second]))
+
+
+def corner(shape: tuple[int, int], name: str) -> int:
+    """Index of a corner of `rectangle`: "origin", "warp", "weft" or "opposite"."""
+    rows, columns = shape
+    corners = {"origin": 0, "weft": columns - 1, "warp": (rows - 1) * columns}
+    corners["opposite"] = rows * columns - 1
+    if name not in corners:
+        raise ValueError(f"a corner is one of {sorted(corners)}, got {name!r}")
+    return corners[name]

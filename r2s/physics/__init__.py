@@ -1,0 +1,7 @@
+"""The physics of a cloth: laws and forces of one element or vertex, apart from how time is stepped.
+
+- `membrane`: Green strain of a triangle, and the energy that a fabric stores in it.
+- `bending`: the angle and curvature of a hinge, and the energy that a fabric stores in it.
+- `contact`: the table: normal pressure and Coulomb friction.
+- `air`: wind and still-air drag.
+"""

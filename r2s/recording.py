@@ -1,0 +1,250 @@
+"""The canonical observation of a fabric: point clouds and the path of what holds the cloth."""
+
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from r2s.files import write_bytes
+
+FORMAT = "r2s-recording/1"
+CORNERS = {"origin": (0, 0), "warp": (1, 0), "weft": (0, 1), "opposite": (1, 1)}
+CLOCK_TOLERANCE = 1e-6  # [s], rounding when a time is a frame number over a rate
+
+
+@dataclass(frozen=True)
+class SheetPlacement:
+    """Where the rectangular sheet lies at rest, in metres, z up.
+
+    `held` names the corners grasped by the handles, one per handle: "origin", "warp" (at the end
+    of the warp side), "weft" (at the end of the weft side) or "opposite". Raises ValueError for
+    sides that are not positive, directions that are not orthonormal, and unknown corners.
+    """
+
+    size: tuple[float, float]  # [m], lengths of the warp and the weft side
+    origin: tuple[float, float, float]  # [m], world position of the rest corner (0, 0)
+    warp: tuple[float, float, float]  # unit vector, world direction of the warp side
+    weft: tuple[float, float, float]  # unit vector, world direction of the weft side
+    held: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if not all(np.isfinite(side) and side > 0 for side in self.size):
+            raise ValueError(f"sheet: sides must be positive [m], found {self.size}")
+        if not np.isfinite(self.origin).all():
+            raise ValueError(f"sheet: origin must be finite [m], found {self.origin}")
+        axes = np.array([self.warp, self.weft])
+        if not np.allclose(axes @ axes.T, np.eye(2), atol=1e-6):
+            raise ValueError(
+                "sheet: warp and weft must be unit vectors at a right angle, "
+                f"found {self.warp} and {self.weft}"
+            )
+        for name in self.held:
+            if name not in CORNERS:
+                raise ValueError(f"sheet: unknown corner {name!r}, expected one of {list(CORNERS)}")
+
+
+def corner(sheet: SheetPlacement, name: str) -> Float[np.ndarray, "3"]:
+    """The world position [m] of a corner at rest; `name` is a key of CORNERS (else KeyError)."""
+    along_warp, along_weft = CORNERS[name]
+    warp, weft = np.array(sheet.warp) * sheet.size[0], np.array(sheet.weft) * sheet.size[1]
+    return np.array(sheet.origin) + along_warp * warp + along_weft * weft
+
+
+@dataclass(frozen=True)
+class RecordingInfo:
+    """What a recording is of. `frames_used`: the first and the last frame that count."""
+
+    name: str
+    scenario: str
+    fabric: str
+    trial: str
+    source: str
+    frames_used: tuple[int, int]  # inclusive
+    sheet: SheetPlacement
+    table_height: float  # [m]
+    verified: bool | None  # do the files match published hashes (None: there are none)
+
+
+class Recording(eqx.Module):
+    """The canonical observation of a fabric, in metres and seconds, z up.
+
+    `info` is static: a jitted function that takes a whole Recording compiles once per `info`; one
+    that takes its arrays compiles once per shape (see `subsample`).
+    """
+
+    points: Float[Array, "frame point 3"]  # [m], padded with zeros; only where mask
+    mask: Bool[Array, "frame point"]
+    times: Float[Array, " frame"]  # [s], on the clock of handle_times
+    handle_path: Float[Array, "knot handle 3"]  # [m], held still before the first knot
+    handle_times: Float[Array, " knot"]  # [s]
+    info: RecordingInfo = eqx.field(static=True)
+
+
+def make_recording(
+    clouds: Sequence[Any], times: Any, handle_path: Any, handle_times: Any, info: RecordingInfo
+) -> Recording:
+    """Pad ragged clouds into a Recording.
+
+    `clouds`: one (points, 3) array [m] per frame; `times`: (frame,) [s]; `handle_path`:
+    (knot, handle, 3), or (knot, 3) for one handle [m]; `handle_times`: (knot,) [s]. Floats take
+    JAX's default precision.
+
+    Raises ValueError that names the recording, and the frame where there is one: no frames, a
+    cloud that is empty or not finite or not (points, 3), times that do not increase, a path of
+    another shape or of more handles than `info.sheet.held` names, a path that ends before the
+    last frame, `frames_used` outside of the frames.
+    """
+    try:
+        checked = [_check_cloud(cloud, frame) for frame, cloud in enumerate(clouds)]
+        first, last = info.frames_used
+        if not checked:
+            raise ValueError("no frames: a recording needs at least one cloud")
+        if not 0 <= first <= last < len(checked):
+            raise ValueError(f"frames_used is {first}..{last}, but there are {len(checked)} frames")
+        path = _check_path(handle_path, info.sheet.held)
+        clock = _check_times(times, "times", len(checked))
+        knots = _check_times(handle_times, "handle_times", len(path))
+        if knots[-1] < clock[-1] - CLOCK_TOLERANCE:
+            raise ValueError(
+                f"the handle path ends at {knots[-1]:g} s, before the last frame at {clock[-1]:g} s"
+            )
+    except ValueError as error:
+        raise ValueError(f"recording {info.name}: {error}") from error
+    points, mask = _pad(checked, max(map(len, checked)))
+    numbers = [jnp.asarray(values, float) for values in (points, clock, path, knots)]
+    return Recording(numbers[0], jnp.asarray(mask), *numbers[1:], info=info)
+
+
+def cloud(recording: Recording, frame: int) -> Float[np.ndarray, "point 3"]:
+    """The points [m] of one frame, without the padding; IndexError if there is no such frame."""
+    return np.asarray(recording.points)[frame][np.asarray(recording.mask)[frame]]
+
+
+def subsample(recording: Recording, num_points: int, voxel: float, seed: int) -> Recording:
+    """Thin every frame to at most `num_points`, padded to exactly that many.
+
+    First the points of each cube of side `voxel` [m] become their mean; of these `num_points` are
+    drawn without repetition, by a generator seeded with (`seed`, frame). Recordings of as many
+    frames and knots then have the same shapes. Raises ValueError if `num_points` < 1 or `voxel`
+    is not positive.
+    """
+    if num_points < 1:
+        raise ValueError(f"num_points must be at least 1, found {num_points}")
+    if not (np.isfinite(voxel) and voxel > 0):
+        raise ValueError(f"voxel must be positive [m], found {voxel}")
+    thinned = []
+    for frame in range(len(recording.times)):
+        means = _voxel_means(cloud(recording, frame), voxel)
+        if len(means) > num_points:
+            generator = np.random.default_rng([seed, frame])
+            means = means[np.sort(generator.choice(len(means), num_points, replace=False))]
+        thinned.append(means)
+    points, mask = _pad(thinned, num_points)
+    return replace(recording, points=jnp.asarray(points, float), mask=jnp.asarray(mask))
+
+
+def save(recording: Recording, path: Path | str) -> None:
+    """Write the recording to `path` as one NPZ, whole or not at all; OSError names `path`."""
+    clouds = [cloud(recording, frame) for frame in range(len(recording.times))]
+    buffer = io.BytesIO()
+    np.savez(
+        buffer,
+        meta=np.array(json.dumps({"format": FORMAT, "info": asdict(recording.info)})),
+        points=np.concatenate(clouds),
+        offsets=np.cumsum([0, *map(len, clouds)]),
+        times=np.asarray(recording.times),
+        handle_path=np.asarray(recording.handle_path),
+        handle_times=np.asarray(recording.handle_times),
+    )
+    write_bytes(path, buffer.getvalue())
+
+
+def load(path: Path | str) -> Recording:
+    """Read what `save` wrote.
+
+    Raises FileNotFoundError, or a ValueError that names the file if it is damaged, not a
+    recording, or of another version of the format.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            meta = json.loads(str(file["meta"]))
+            if meta["format"] != FORMAT:
+                raise ValueError(f"format {meta['format']!r}, expected {FORMAT!r}")
+            info = _info_from(meta["info"])
+            clouds = np.split(file["points"], file["offsets"][1:-1])
+            rest = [file[key] for key in ("times", "handle_path", "handle_times")]
+        return make_recording(clouds, *rest, info)
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # a damaged archive raises anything, from EOFError to zlib.error
+        raise ValueError(f"{path}: not a readable recording ({FORMAT}): {error}") from error
+
+
+def _info_from(values: dict[str, Any]) -> RecordingInfo:
+    sheet = SheetPlacement(**{key: tuple(value) for key, value in values["sheet"].items()})
+    frames_used = tuple(values["frames_used"])
+    return RecordingInfo(**{**values, "sheet": sheet, "frames_used": frames_used})
+
+
+def _check_cloud(points: Any, frame: int) -> np.ndarray:
+    points = np.asarray(points, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"frame {frame}: expected points of shape (n, 3), found {points.shape}")
+    if len(points) == 0:
+        raise ValueError(f"frame {frame}: the cloud is empty")
+    if bad := int((~np.isfinite(points).all(axis=1)).sum()):
+        raise ValueError(f"frame {frame}: {bad} of {len(points)} points are not finite")
+    return points
+
+
+def _check_times(times: Any, what: str, count: int) -> np.ndarray:
+    times = np.asarray(times, np.float64)
+    if times.shape != (count,):
+        raise ValueError(f"{what} must have the shape ({count},), found {times.shape}")
+    if not np.isfinite(times).all():
+        raise ValueError(f"{what} must be finite [s]")
+    # As they will be kept: in single precision, the frames of a clock that counts from 1970
+    # would fall together.
+    kept = np.asarray(jnp.asarray(times, float))
+    if (np.diff(kept) <= 0).any():
+        at = int((np.diff(kept) <= 0).argmax())
+        raise ValueError(
+            f"{what} must increase: {times[at]} s at {at}, then {times[at + 1]} s, "
+            f"as {kept.dtype} {kept[at]} and {kept[at + 1]}"
+        )
+    return times
+
+
+def _check_path(path: Any, held: tuple[str, ...]) -> np.ndarray:
+    path = np.asarray(path, np.float64)
+    path = path[:, None] if path.ndim == 2 else path
+    if path.ndim != 3 or path.shape[2] != 3 or len(path) == 0:
+        raise ValueError(f"the handle path must be (knot, handle, 3), found {path.shape}")
+    if path.shape[1] != len(held):
+        raise ValueError(f"the path has {path.shape[1]} handles, the sheet is held at {held}")
+    if not np.isfinite(path).all():
+        raise ValueError("the handle path must be finite [m]")
+    return path
+
+
+def _pad(clouds: Sequence[np.ndarray], width: int) -> tuple[np.ndarray, np.ndarray]:
+    points = np.zeros((len(clouds), width, 3))
+    mask = np.arange(width) < np.array([len(cloud) for cloud in clouds])[:, None]
+    points[mask] = np.concatenate(clouds)
+    return points, mask
+
+
+def _voxel_means(points: np.ndarray, voxel: float) -> np.ndarray:
+    points = points.astype(np.float64)
+    cells = np.floor(points / voxel).astype(np.int64)
+    _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    sums = np.zeros((len(counts), 3))
+    np.add.at(sums, cell.reshape(-1), points)
+    return sums / counts[:, None]

@@ -1,0 +1,57 @@
+"""A scene: what an experiment fixes. Sheet, held vertices, table, air; and what grippers do."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from r2s.mesh import Mesh
+from r2s.physics.air import Air
+from r2s.physics.contact import Table
+
+
+class Control(eqx.Module):
+    """What grippers and air do: at one step, or with a leading time axis over a motion.
+
+    - `handles`: positions of the held vertices at the end of the step, [m].
+    - `wind`: uniform wind, [m/s].
+    """
+
+    handles: Float[Array, "*time handle 3"]
+    wind: Float[Array, "*time 3"]
+
+
+class Scene(eqx.Module):
+    """What an experiment fixes; gravity is 9.81 m/s^2 along -z.
+
+    - `mesh`: the sheet.
+    - `held`: the vertices that grippers hold, one a handle.
+    - `table`, `air`: the surroundings.
+    """
+
+    mesh: Mesh
+    held: Int[Array, " handle"]
+    table: Table
+    air: Air
+
+    @property
+    def is_free(self) -> Bool[Array, " vertex"]:
+        """Which vertices no gripper holds."""
+        return jnp.ones(self.mesh.rest.shape[0], bool).at[self.held].set(False)
+
+    def place(
+        self, x: Float[Array, "vertex 3"], handles: Float[Array, "handle 3"]
+    ) -> Float[Array, "vertex 3"]:
+        """Positions with the held vertices put to `handles` [m]."""
+        return x.at[self.held].set(handles)
+
+
+def along_path(
+    times: Float[Array, " step"],
+    knot_times: Float[Array, " knot"],
+    path: Float[Array, "knot handle 3"],
+) -> Float[Array, "step handle 3"]:
+    """Handle positions [m] at times [s], linear between the knots, at rest before and after."""
+    knots = path.reshape(path.shape[0], -1)
+    at = jax.vmap(lambda column: jnp.interp(times, knot_times, column), in_axes=1, out_axes=1)
+    return at(knots).reshape(times.shape[0], *path.shape[1:])
