@@ -87,6 +87,16 @@ def find_frames(folder: Path | str, first: int | None = None) -> list[Path]:
     return [frames[number] for number in sorted(frames)]
 
 
+def voxel_means(points: Float[np.ndarray, "point 3"], voxel: float) -> Float[np.ndarray, "cell 3"]:
+    """The mean of the points in each cube of side `voxel` (units of the points), by cell."""
+    points = points.astype(np.float64)
+    cells = np.floor(points / voxel).astype(np.int64)
+    _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    sums = np.zeros((len(counts), 3))
+    np.add.at(sums, cell.reshape(-1), points)
+    return sums / counts[:, None]
+
+
 def _frame_number(path: Path) -> int | None:
     if path.name.startswith(".") or path.suffix.lower() not in READERS or not path.is_file():
         return None
@@ -107,9 +117,7 @@ def _read_ply(path: Path) -> np.ndarray:
     try:
         import trimesh
     except ImportError as error:
-        raise ImportError(
-            f"{path}: reading ply needs trimesh: pip install 'r2s[study]'"
-        ) from error
+        raise ImportError(f"{path}: reading ply needs trimesh: pip install 'r2s[study]'") from error
     count = _ply_vertices(path.read_bytes())
     if count == 0:
         return np.zeros((0, 3))
@@ -158,10 +166,10 @@ def _read_pcd(path: Path) -> np.ndarray:
     if not path.is_file():  # before pypcd4, which wraps this error
         raise FileNotFoundError(f"{path}: no such file")
     try:
-        import pypcd4
+        from pypcd4 import PointCloud  # pyright: ignore[reportPrivateImportUsage]
     except ImportError as error:
         raise ImportError(f"{path}: reading pcd needs pypcd4: pip install 'r2s[pcd]'") from error
-    cloud = pypcd4.PointCloud.from_path(path)
+    cloud = PointCloud.from_path(path)
     values = cloud.numpy(("x", "y", "z"))
     if len(values) != cloud.points:
         raise ValueError(f"the header promises {cloud.points} points, found {len(values)}")

@@ -1,11 +1,17 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and JSON that is read strictly."""
 
 import contextlib
+import dataclasses
 import json
+import math
 import os
 import shutil
+import typing
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 
 def write_bytes(path: Path | str, data: bytes) -> None:
@@ -44,8 +50,69 @@ def write_json(path: Path | str, value: Any) -> None:
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
+def read_json(path: Path | str, kind: type[T]) -> T:
+    """Read the dataclass `kind` from JSON: its fields, no more and (but for defaults) no less.
+
+    Fields are numbers (finite), strings, booleans, tuples (JSON lists), mappings and dataclasses.
+    The metadata "unknown" of a field is the hint in the error when it is missing or null. Raises
+    OSError, or a ValueError that names the file and the field: no JSON, fields missing or unknown,
+    values of another type, or what `kind` itself refuses.
+    """
+    try:
+        value = json.loads(Path(path).read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: no JSON: {error}") from error
+    return _read(kind, value, f"{path}")
+
+
 def _free(folder: Path) -> str:
     try:
         return f"{shutil.disk_usage(folder).free} bytes free in {folder}"
     except OSError:
         return f"folder {folder} is missing or cannot be read"
+
+
+def _read(kind: Any, value: Any, where: str) -> Any:
+    """`value` (from JSON) as `kind`: a dataclass, tuple, mapping or plain type."""
+    if dataclasses.is_dataclass(kind):
+        return _read_fields(kind, value, where)
+    arguments = typing.get_args(kind)
+    if typing.get_origin(kind) is tuple:
+        _expect(isinstance(value, list), "a list", value, where)
+        if arguments[1:] == (...,):
+            arguments = (arguments[0],) * len(value)
+        _expect(len(value) == len(arguments), f"{len(arguments)} entries", value, where)
+        entries = enumerate(zip(arguments, value, strict=True))
+        return tuple(_read(kind, entry, f"{where}[{i}]") for i, (kind, entry) in entries)
+    if typing.get_origin(kind) is Mapping:
+        _expect(isinstance(value, dict), "an object", value, where)
+        return {key: _read(arguments[1], v, f"{where}: {key}") for key, v in value.items()}
+    if kind is float:
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        _expect(number and math.isfinite(value), "a finite number", value, where)
+        return float(value)
+    _expect(type(value) is kind, f"{kind.__name__}", value, where)
+    return value
+
+
+def _read_fields(kind: Any, value: Any, where: str) -> Any:
+    _expect(isinstance(value, dict), "an object", value, where)
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    for name, field in fields.items():
+        if "unknown" in field.metadata and value.get(name) is None:
+            raise ValueError(f"{where}: {name} is unknown: {field.metadata['unknown']}")
+    needed = {name for name, field in fields.items() if field.default is dataclasses.MISSING}
+    if missing := sorted(needed - value.keys()):
+        raise ValueError(f"{where}: missing: {', '.join(missing)}")
+    if unknown := sorted(value.keys() - fields.keys()):
+        raise ValueError(f"{where}: unknown: {', '.join(unknown)}; known: {', '.join(fields)}")
+    read = {name: _read(fields[name].type, v, f"{where}: {name}") for name, v in value.items()}
+    try:
+        return kind(**read)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+
+
+def _expect(holds: bool, expected: str, value: Any, where: str) -> None:
+    if not holds:
+        raise ValueError(f"{where}: expected {expected}, found {value!r}")

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
-from r2s.increment import Increment, convex_hessian, hessian, imbalance
+from r2s.increment import Increment, convex_hessian, hessian, imbalance, potential
 
 Positions = Float[Array, "vertex 3"]
+CONVEX_ITERATIONS = 4  # of Newton, before it tries the exact Hessian
 SAVED = "positions"  # what a checkpointed rollout keeps of a step
 
 
@@ -40,10 +41,8 @@ def minimise(
 def _newton(tolerance, max_iterations, increment, start, free):
     def iterate(state: _Search) -> _Search:
         force = _masked(imbalance(increment, state.x), free)
-        matrix = _pinned(convex_hessian(increment, state.x), free)
-        factor = jax.scipy.linalg.cho_factor(matrix)
-        direction = -jax.scipy.linalg.cho_solve(factor, force.ravel()).reshape(start.shape)
-        length = _line_search(increment, state.x, direction, -jnp.sum(direction * force), free)
+        direction = _direction(increment, state, force, free)
+        length = _line_search(increment, state.x, direction, jnp.sum(direction * force))
         moved = length * jnp.max(jnp.abs(direction))
         return _Search(state.x + length * direction, moved, state.count + 1)
 
@@ -56,17 +55,40 @@ def _newton(tolerance, max_iterations, increment, start, free):
     return jnp.where(found.moved <= tolerance, found.x, jnp.nan)
 
 
-def _line_search(increment, x, direction, descent, free):
-    """The largest of 1, 1/2, 1/4, ... at which the slope along `direction` has not overshot.
+def _direction(increment, state, force, free):
+    """A Newton direction [m]: with the exact Hessian where it is positive definite.
 
-    On slopes, not on energies: in float32 the energy's rounding hides the last Newton steps.
+    The convex stand-in is cheaper and gets close from afar; next to a buckling shape it converges
+    slowly, and the exact one quadratically.
     """
 
-    def slope(length):
-        return jnp.sum(direction * _masked(imbalance(increment, x + length * direction), free))
+    def solve(matrix):
+        factor = jax.scipy.linalg.cho_factor(_pinned(matrix, free))
+        return -jax.scipy.linalg.cho_solve(factor, force.ravel()).reshape(force.shape)
+
+    def convex():
+        return solve(convex_hessian(increment, state.x))
+
+    def exact():
+        direction = solve(hessian(increment, state.x))
+        usable = jnp.all(jnp.isfinite(direction))  # the Cholesky factor of an indefinite one is NaN
+        return jax.lax.cond(usable, lambda: direction, convex)
+
+    return jax.lax.cond(state.count < CONVEX_ITERATIONS, convex, exact)
+
+
+def _line_search(increment, x, direction, slope):
+    """The first of 1, 1/2, 1/4, ... that lowers the potential enough (Armijo).
+
+    Changes that rounding hides pass: they are the last Newton steps.
+    """
+    before = potential(increment, x)
+    rounding = 8 * jnp.finfo(x.dtype).eps * jnp.abs(before)
 
     def too_long(length):
-        return (slope(length) > 0.9 * descent) & (length > 1e-3)
+        after = potential(increment, x + length * direction)
+        enough = after <= before + 1e-4 * length * slope + rounding
+        return ~enough & (length > 1e-6)
 
     return jax.lax.while_loop(too_long, lambda length: length / 2, jnp.ones((), x.dtype))
 

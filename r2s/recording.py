@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from r2s.clouds import voxel_means
 from r2s.files import write_bytes
 
 FORMAT = "r2s-recording/1"
@@ -41,10 +42,8 @@ class SheetPlacement:
             raise ValueError(f"sheet: origin must be finite [m], found {self.origin}")
         axes = np.array([self.warp, self.weft])
         if not np.allclose(axes @ axes.T, np.eye(2), atol=1e-6):
-            raise ValueError(
-                "sheet: warp and weft must be unit vectors at a right angle, "
-                f"found {self.warp} and {self.weft}"
-            )
+            found = f"found {self.warp} and {self.weft}"
+            raise ValueError(f"sheet: warp and weft must be orthonormal, {found}")
         for name in self.held:
             if name not in CORNERS:
                 raise ValueError(f"sheet: unknown corner {name!r}, expected one of {list(CORNERS)}")
@@ -118,8 +117,14 @@ def make_recording(
     except ValueError as error:
         raise ValueError(f"recording {info.name}: {error}") from error
     points, mask = _pad(checked, max(map(len, checked)))
-    numbers = [jnp.asarray(values, float) for values in (points, clock, path, knots)]
-    return Recording(numbers[0], jnp.asarray(mask), *numbers[1:], info=info)
+    return Recording(
+        points=jnp.asarray(points, float),
+        mask=jnp.asarray(mask),
+        times=jnp.asarray(clock, float),
+        handle_path=jnp.asarray(path, float),
+        handle_times=jnp.asarray(knots, float),
+        info=info,
+    )
 
 
 def cloud(recording: Recording, frame: int) -> Float[np.ndarray, "point 3"]:
@@ -141,7 +146,7 @@ def subsample(recording: Recording, num_points: int, voxel: float, seed: int) ->
         raise ValueError(f"voxel must be positive [m], found {voxel}")
     thinned = []
     for frame in range(len(recording.times)):
-        means = _voxel_means(cloud(recording, frame), voxel)
+        means = voxel_means(cloud(recording, frame), voxel)
         if len(means) > num_points:
             generator = np.random.default_rng([seed, frame])
             means = means[np.sort(generator.choice(len(means), num_points, replace=False))]
@@ -179,8 +184,8 @@ def load(path: Path | str) -> Recording:
                 raise ValueError(f"format {meta['format']!r}, expected {FORMAT!r}")
             info = _info_from(meta["info"])
             clouds = np.split(file["points"], file["offsets"][1:-1])
-            rest = [file[key] for key in ("times", "handle_path", "handle_times")]
-        return make_recording(clouds, *rest, info)
+            handles = file["handle_path"], file["handle_times"]
+            return make_recording(clouds, file["times"], *handles, info)
     except FileNotFoundError:
         raise
     except Exception as error:  # a damaged archive raises anything, from EOFError to zlib.error
@@ -194,7 +199,10 @@ def _info_from(values: dict[str, Any]) -> RecordingInfo:
 
 
 def _check_cloud(points: Any, frame: int) -> np.ndarray:
-    points = np.asarray(points, np.float64)
+    try:
+        points = np.asarray(points, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"frame {frame}: no array of numbers: {error}") from error
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"frame {frame}: expected points of shape (n, 3), found {points.shape}")
     if len(points) == 0:
@@ -239,12 +247,3 @@ def _pad(clouds: Sequence[np.ndarray], width: int) -> tuple[np.ndarray, np.ndarr
     mask = np.arange(width) < np.array([len(cloud) for cloud in clouds])[:, None]
     points[mask] = np.concatenate(clouds)
     return points, mask
-
-
-def _voxel_means(points: np.ndarray, voxel: float) -> np.ndarray:
-    points = points.astype(np.float64)
-    cells = np.floor(points / voxel).astype(np.int64)
-    _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    sums = np.zeros((len(counts), 3))
-    np.add.at(sums, cell.reshape(-1), points)
-    return sums / counts[:, None]

@@ -1,0 +1,249 @@
+"""Point clouds in files: round trips in every format, and errors that help."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from r2s.clouds import find_frames, read_cloud, voxel_means
+
+POINTS = arrays(
+    np.float32,
+    st.tuples(st.integers(1, 12), st.just(3)),
+    elements=st.floats(-1e3, 1e3, width=32, allow_subnormal=False),
+)
+FORMATS = [
+    "npy",
+    "ascii.ply",
+    "binary.ply",
+    "obj",
+    "blank.xyz",
+    "comma.xyz",
+    "ascii.pcd",
+    "binary.pcd",
+]
+PLY = (
+    "ply\nformat {}\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n"
+    "end_header\n"
+)
+PCD = (
+    "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\n"
+    "VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {0}\nDATA {1}\n"
+)
+some_example = settings(
+    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+def rows(points: np.ndarray, separator: str = " ", start: str = "") -> bytes:
+    lines = (start + separator.join(repr(float(value)) for value in point) for point in points)
+    return "".join(line + "\n" for line in lines).encode()
+
+
+def write_cloud(path: Path, points: np.ndarray) -> Path:
+    binary = points.astype("<f4").tobytes()
+    count = len(points)
+    match path.name:
+        case "npy":
+            np.save(path := path.with_suffix(".npy"), points)
+            return path
+        case "ascii.ply":
+            data = PLY.format("ascii 1.0", count).encode() + rows(points)
+        case "binary.ply":
+            data = PLY.format("binary_little_endian 1.0", count).encode() + binary
+        case "obj":
+            path = path.with_suffix(".obj")
+            data = b"# a comment\n" + rows(points, start="v ") + b"vn 0 0 1\nf 1 1 1\n"
+        case "blank.xyz":
+            data = b"# x y z\n" + rows(points)
+        case "comma.xyz":
+            data = rows(points, ", ")
+        case "ascii.pcd":
+            data = PCD.format(count, "ascii").encode() + rows(points)
+        case _:
+            data = PCD.format(count, "binary").encode() + binary
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+@some_example
+@given(points=POINTS)
+def test_a_cloud_is_read_as_it_was_written(tmp_path: Path, kind: str, points: np.ndarray) -> None:
+    read = read_cloud(write_cloud(tmp_path / kind, points))
+    assert read.dtype == np.float64
+    np.testing.assert_array_equal(read, points)
+
+
+def test_trimesh_and_pypcd4_write_what_we_read(tmp_path: Path) -> None:
+    import pypcd4
+    import trimesh
+
+    points = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    trimesh.PointCloud(points).export(tmp_path / "a.ply")
+    cloud = pypcd4.PointCloud.from_xyz_points(points)  # pyright: ignore[reportPrivateImportUsage]
+    cloud.save(tmp_path / "a.pcd")
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply"), points)
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd"), points)
+
+
+def test_an_upper_case_suffix_and_integers_are_fine(tmp_path: Path) -> None:
+    with open(tmp_path / "A.NPY", "wb") as file:
+        np.save(file, np.arange(6).reshape(2, 3))
+    np.testing.assert_array_equal(read_cloud(tmp_path / "A.NPY"), [[0, 1, 2], [3, 4, 5]])
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_nan_is_counted_and_located(tmp_path: Path, kind: str) -> None:
+    points = np.ones((5, 3), np.float32)
+    points[2, 1], points[4, 0] = np.nan, np.inf
+    path = write_cloud(tmp_path / kind, points)
+    with pytest.raises(ValueError, match="2 of 5 points are not finite, the first is point 2") as e:
+        read_cloud(path)
+    assert str(path) in str(e.value)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_an_empty_cloud_is_refused(tmp_path: Path, kind: str) -> None:
+    path = write_cloud(tmp_path / kind, np.zeros((0, 3), np.float32))
+    with pytest.raises(ValueError, match="empty") as error:
+        read_cloud(path)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("kind", ["npy", "ascii.ply", "binary.ply", "ascii.pcd", "binary.pcd"])
+@pytest.mark.parametrize("lost", [5, 12])  # a part of a point, and a whole one of 12 bytes
+def test_a_truncated_file_is_refused(tmp_path: Path, kind: str, lost: int) -> None:
+    path = write_cloud(tmp_path / kind, np.full((6, 3), 1.5, np.float32))  # 12 bytes as text also
+    path.write_bytes(path.read_bytes()[:-lost])
+    with pytest.raises(ValueError, match="cannot be read as") as error:
+        read_cloud(path)
+    assert str(path) in str(error.value)
+
+
+def test_a_face_is_not_taken_for_a_lost_vertex(tmp_path: Path) -> None:
+    face = "element face 1\nproperty list uchar int vertex_indices\nend_header"
+    header = PLY.format("ascii 1.0", 3).replace("end_header", face)
+    vertices = "1 2 3\n4 5 6\n7 8 9\n"
+    (tmp_path / "a.ply").write_text(header + vertices + "3 0 1 2\n")
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply"), np.arange(1.0, 10).reshape(3, 3))
+    (tmp_path / "a.ply").write_text(header + vertices[:-6] + "3 0 1 2\n")
+    with pytest.raises(ValueError, match="a.ply: .*cut short: 3 of 4 lines"):
+        read_cloud(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("suffix", ["npy", "ply", "xyz", "pcd"])
+@pytest.mark.parametrize("junk", [b"garbage\n", b"\xff\xfe\x00\x93"])
+def test_junk_is_refused(tmp_path: Path, suffix: str, junk: bytes) -> None:
+    path = tmp_path / f"cloud.{suffix}"
+    path.write_bytes(junk)
+    with pytest.raises(ValueError, match=f"cloud.{suffix}: cannot be read as {suffix}"):
+        read_cloud(path)
+
+
+def test_junk_as_obj_has_no_vertices(tmp_path: Path) -> None:
+    (tmp_path / "cloud.obj").write_text("garbage\n")
+    with pytest.raises(ValueError, match="cloud.obj: the cloud is empty"):
+        read_cloud(tmp_path / "cloud.obj")
+
+
+@pytest.mark.parametrize("shape", [(6,), (3, 2), (2, 3, 3), (3, 4)])
+def test_a_wrong_shape_is_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    np.save(tmp_path / "a.npy", np.zeros(shape))
+    with pytest.raises(ValueError, match="a.npy: expected an array") as error:
+        read_cloud(tmp_path / "a.npy")
+    assert str(shape) in str(error.value)
+
+
+def test_wrong_columns_and_kinds_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "two.xyz").write_text("1 2\n3 4\n5 6\n")
+    (tmp_path / "ragged.xyz").write_text("1 2 3\n4 5\n")
+    (tmp_path / "two.obj").write_text("v 1 2\nv 3 4\nv 5 6\n")
+    np.save(tmp_path / "text.npy", np.array([["a", "b", "c"]]))
+    np.savez(tmp_path / "many.npz", a=np.zeros((1, 3)))
+    (tmp_path / "many.npz").rename(tmp_path / "many.npy")
+    for name, words in [
+        ("two.xyz", r"\(3, 2\)"),
+        ("ragged.xyz", "rows of 2 to 3 columns"),
+        ("two.obj", r"\(3, 2\)"),
+        ("text.npy", "expected real numbers"),
+        ("many.npy", "several arrays"),
+    ]:
+        with pytest.raises(ValueError, match=f"{name}: .*{words}"):
+            read_cloud(tmp_path / name)
+
+
+def test_unknown_suffixes_and_missing_files(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"unknown suffix '.las'.*\.npy, \.ply, \.obj"):
+        read_cloud(tmp_path / "a.las")
+    for suffix in ("npy", "ply", "obj", "xyz", "pcd"):
+        with pytest.raises(FileNotFoundError, match=f"nowhere.{suffix}"):
+            read_cloud(tmp_path / f"nowhere.{suffix}")
+
+
+@pytest.mark.parametrize(
+    "library, suffix, extra", [("trimesh", "ply", "study"), ("pypcd4", "pcd", "pcd")]
+)
+def test_a_missing_library_names_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str, suffix: str, extra: str
+) -> None:
+    (tmp_path / f"a.{suffix}").write_bytes(b"ply\n")
+    monkeypatch.setitem(sys.modules, library, None)  # makes the import fail
+    with pytest.raises(ImportError, match=rf"pip install 'r2s\[{extra}\]'"):
+        read_cloud(tmp_path / f"a.{suffix}")
+
+
+def touch(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).touch()
+
+
+def test_frames_are_sorted_by_number(tmp_path: Path) -> None:
+    touch(tmp_path, "t1_frame_10.ply", "t1_frame_8.ply", "t1_frame_9.ply", "notes.txt", "mesh.obj")
+    touch(tmp_path, "._t1_frame_11.ply")
+    names = [path.name for path in find_frames(tmp_path)]
+    assert names == ["t1_frame_8.ply", "t1_frame_9.ply", "t1_frame_10.ply"]
+
+
+@given(start=st.integers(0, 5), count=st.integers(3, 30), data=st.data())
+@some_example
+def test_any_gap_is_named(
+    tmp_path_factory: pytest.TempPathFactory, start: int, count: int, data: st.DataObject
+) -> None:
+    folder = tmp_path_factory.mktemp("frames")
+    lost = data.draw(st.integers(start + 1, start + count - 2))
+    touch(folder, *(f"{i:03d}.npy" for i in range(start, start + count) if i != lost))
+    with pytest.raises(ValueError, match=f"frame {lost} is missing"):
+        find_frames(folder)
+
+
+def test_the_first_frame_may_be_required(tmp_path: Path) -> None:
+    touch(tmp_path, "001.npy", "002.npy")
+    assert len(find_frames(tmp_path)) == len(find_frames(tmp_path, first=1)) == 2
+    with pytest.raises(ValueError, match="frame 0 is missing"):
+        find_frames(tmp_path, first=0)
+    with pytest.raises(ValueError, match="frame 1 comes before the first frame, 2"):
+        find_frames(tmp_path, first=2)
+
+
+def test_bad_folders_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="nowhere: no such folder"):
+        find_frames(tmp_path / "nowhere")
+    with pytest.raises(FileNotFoundError, match="no numbered frames"):
+        find_frames(tmp_path)
+    touch(tmp_path, "000.npy", "00.npy")
+    with pytest.raises(ValueError, match="frame 0 is there twice: 00.npy and 000.npy"):
+        find_frames(tmp_path)
+    touch(tmp_path, "001.ply")
+    with pytest.raises(ValueError, match=r"mixed formats: \.npy, \.ply"):
+        find_frames(tmp_path)
+
+
+def test_voxel_means_average_per_cell() -> None:
+    points = np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [-0.1, 0.1, 0.1], [1.2, 0.0, 0.0]])
+    means = voxel_means(points, 1.0)
+    np.testing.assert_allclose(means, [[-0.1, 0.1, 0.1], [0.2, 0.1, 0.1], [1.2, 0.0, 0.0]])
