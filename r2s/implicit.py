@@ -1,5 +1,6 @@
 """A minimiser with an implicit derivative: the numerics of a step, apart from its physics."""
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -95,21 +96,46 @@ def _line_search(increment, x, direction, slope):
 
 @eqx.filter_custom_jvp
 def _minimise(tolerance, max_iterations, increment, start, free):
-    return _newton(tolerance, max_iterations, increment, start, free)
+    return _one_by_one(partial(_newton, tolerance, max_iterations))(increment, start, free)
 
 
 @_minimise.def_jvp
 def _minimise_jvp(primals, tangents):
-    tolerance, max_iterations, increment, start, free = primals
+    _, _, increment, start, free = primals
     _, _, increment_dot, start_dot, _ = tangents
-    x = checkpoint_name(_newton(tolerance, max_iterations, increment, start, free), SAVED)
+    x = checkpoint_name(_minimise(*primals), SAVED)
     held_dot = jnp.zeros_like(x) if start_dot is None else jnp.where(free[:, None], 0, start_dot)
-
     _, force_dot = eqx.filter_jvp(imbalance, (increment, x), (increment_dot, held_dot))
-    matrix = _pinned(hessian(increment, x), free)
-    factor = jax.scipy.linalg.lu_factor(matrix)
-    free_dot = -jax.scipy.linalg.lu_solve(factor, _masked(force_dot, free).ravel())
+    # an explicit inverse, since its product batches and transposes without another factorisation
+    free_dot = -_one_by_one(_inverse)(increment, x, free) @ _masked(force_dot, free).ravel()
     return x, held_dot + free_dot.reshape(x.shape)
+
+
+def _inverse(increment, x, free):
+    return jnp.linalg.inv(_pinned(hessian(increment, x), free))
+
+
+def _one_by_one(function):
+    """`function`, which under `vmap` on a CPU runs for one member of the batch after the other.
+
+    So no member waits for the slowest, and the factors fit the cache. Nor is there a gain from a
+    batch there; and jaxlib 0.10.1 for the CPU can hang in a batched factorisation inside a loop.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def call(*args):
+        return function(*args)
+
+    @call.def_vmap
+    def batched(size, is_batched, *args):
+        moving, still = eqx.partition(args, tuple(is_batched))
+        single = lambda moving: function(*eqx.combine(moving, still))
+        out = jax.lax.platform_dependent(
+            moving, cpu=lambda moving: jax.lax.map(single, moving), default=jax.vmap(single)
+        )
+        return out, True
+
+    return call
 
 
 def _masked(force: Positions, free: Bool[Array, " vertex"]) -> Positions:
