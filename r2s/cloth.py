@@ -40,7 +40,7 @@ class Cloth(eqx.Module):
     scene: Scene
     dt: float = eqx.field(static=True)
     tolerance: float | None = eqx.field(static=True, default=None)
-    max_iterations: int = eqx.field(static=True, default=60)
+    max_iterations: int = eqx.field(static=True, default=200)
 
     def __check_init__(self):
         if not self.dt > 0:

@@ -62,8 +62,9 @@ def strains(mesh: Mesh, x: Positions) -> Float[Array, "face 3"]:
 
 
 def curvatures(mesh: Mesh, x: Positions) -> Float[Array, " hinge"]:
-    """Curvature theta l / A [1/m] of every hinge at positions [m]."""
-    return jax.vmap(hinge_angle)(x[mesh.hinges]) * mesh.hinge_length / mesh.hinge_area
+    """Curvature theta l / A [1/m] of every hinge at positions [m], less that at rest."""
+    angles = jax.vmap(hinge_angle)(x[mesh.hinges])
+    return angles * mesh.hinge_length / mesh.hinge_area - mesh.rest_curvature
 
 
 def vertex_mass(mesh: Mesh, fabric: Fabric) -> Float[Array, " vertex"]:
@@ -106,8 +107,8 @@ def _face_energy(step, corners, face, inverse, area, anchor, normal):
     return area * _strain_energy(step, strain, anchor) + drag
 
 
-def _hinge_energy(step, corners, length, area, anchor):
-    curvature = hinge_angle(corners) * length / area
+def _hinge_energy(step, corners, length, area, rest, anchor):
+    curvature = hinge_angle(corners) * length / area - rest
     return area * _curvature_energy(step, curvature, anchor)
 
 
@@ -130,7 +131,8 @@ def _faces(step: Increment):
 
 
 def _hinges(step: Increment):
-    return step.mesh.hinge_length, step.mesh.hinge_area, step.curvature_anchor
+    mesh = step.mesh
+    return mesh.hinge_length, mesh.hinge_area, mesh.rest_curvature, step.curvature_anchor
 
 
 def _vertices(step: Increment):
@@ -205,9 +207,9 @@ def _tension(stress: Float[Array, " 3"]) -> Float[Array, "2 2"]:
     return centre * jnp.eye(2) + slope * deviator
 
 
-def _convex_hinge(step, corners, length, area, anchor):
+def _convex_hinge(step, corners, length, area, rest, anchor):
     angle, gradient = jax.value_and_grad(hinge_angle)(corners)
-    energy = lambda angle: area * _curvature_energy(step, angle * length / area, anchor)
+    energy = lambda angle: area * _curvature_energy(step, angle * length / area - rest, anchor)
     return jax.hessian(energy)(angle) * jnp.einsum("ai,bj->aibj", gradient, gradient)
 
 

@@ -15,6 +15,7 @@ class Mesh(eqx.Module):
     - `inverse`: inverse of each face's rest edges, [1/m].
     - `area`, `vertex_area`: rest areas of the faces, and a third of them at each vertex, [m^2].
     - `hinge_length`, `hinge_area`: of each hinge's edge [m], and its two faces together [m^2].
+    - `rest_curvature`: of each hinge where it stores no energy, [1/m]; 0 for a flat sheet.
     """
 
     rest: Float[Array, "vertex 2"]
@@ -25,6 +26,7 @@ class Mesh(eqx.Module):
     vertex_area: Float[Array, " vertex"]
     hinge_length: Float[Array, " hinge"]
     hinge_area: Float[Array, " hinge"]
+    rest_curvature: Float[Array, " hinge"]
 
     @classmethod
     def make(cls, rest: Float[np.ndarray, "vertex 2"], faces: Int[np.ndarray, "face 3"]) -> "Mesh":
@@ -56,6 +58,7 @@ class Mesh(eqx.Module):
             vertex_area=jnp.asarray(vertex_area, float),
             hinge_length=jnp.asarray(np.linalg.norm(ends, axis=-1), float),
             hinge_area=jnp.asarray(area[hinge_faces].sum(axis=-1), float),
+            rest_curvature=jnp.zeros(len(hinges), float),
         )
 
 

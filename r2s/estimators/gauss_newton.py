@@ -1,0 +1,159 @@
+"""Gauss-Newton on nearest-point distances, with forward sensitivities: r2s's default DIFFCLOUD.
+
+The loss is that of DIFFCLOUD turned round (recording to simulated surface, so that a partial view
+does not pull on what it does not see), robust against outliers. The parameters are few, so the
+derivative of the whole motion with respect to all of them costs about as much as one gradient, and
+its normal equations give the step and the covariance at once.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from r2s.estimators.base import Problem
+from r2s.losses import robust, robust_weight, surface_residuals
+from r2s.scenario import motion
+from r2s.solver import Trajectory
+
+MARGIN = 1e-3  # of the unit cube, so that a start at its edge can move
+PRIOR_DEVIATION = 0.29  # of a uniform prior over the unit cube
+SPAN = 5  # independent pieces of evidence a frame holds: neighbours in a cloud err alike
+
+
+class Normal(eqx.Module):
+    """The objective at an unknown, and its normal equations there.
+
+    - `objective`: `loss` and the prior, [m^2]; infinite when the run diverged.
+    - `loss`: robust mean of the clouds alone, [m^2].
+    - `gradient`, `matrix`: of the objective in the unknown, [m^2].
+    """
+
+    objective: Float[Array, ""]
+    loss: Float[Array, ""]
+    gradient: Float[Array, " unknown"]
+    matrix: Float[Array, "unknown unknown"]
+
+
+class Descent(eqx.Module):
+    """A Levenberg-Marquardt descent.
+
+    - `unknown`: a point of the family's unit cube, then the misalignment (x, y, z, turn) in units
+      of its standard deviations.
+    - `normal`: the normal equations there.
+    - `damping`: Levenberg's, [-].
+    - `prior`: weight of the prior, [m^2].
+    """
+
+    unknown: Float[Array, " unknown"]
+    normal: Normal
+    damping: Float[Array, ""]
+    prior: Float[Array, ""]
+
+
+def loss_at(problem: Problem, unknown: Float[Array, " unknown"]) -> Float[Array, ""]:
+    """The robust loss [m^2] at an unknown; infinite when the run diverged."""
+    place, shift = _split(problem, unknown)
+    moved = motion(problem.scenario, problem.family(place))
+    distance, *_ = _residuals(problem, _aligned(problem, moved.x, shift))
+    return _loss(problem, moved, distance)
+
+
+def normal_at(
+    problem: Problem, unknown: Float[Array, " unknown"], prior: Float[Array, ""]
+) -> Normal:
+    """Objective, gradient and Gauss-Newton matrix at an unknown."""
+    place, shift = _split(problem, unknown)
+
+    def move(place):
+        moved = motion(problem.scenario, problem.family(place))
+        return _aligned(problem, moved.x, shift), moved
+
+    slope, moved = jax.jacfwd(move, has_aux=True)(place)  # (frame, vertex, axis, place)
+    x = _aligned(problem, moved.x, shift)
+    turn = jax.jacfwd(lambda shift: _aligned(problem, moved.x, shift))(shift)
+    slope = jnp.concatenate([slope, turn], axis=-1)[jnp.array(problem.frames)]
+    distance, direction, vertices, weights = _residuals(problem, x)
+    picked = jax.vmap(lambda slope, vertices: slope[vertices])(slope, vertices)
+    jacobian = -jnp.einsum("fpi,fpk,fpkiu->fpu", direction, weights, picked)
+    weight = jnp.where(problem.mask, robust_weight(distance), 0) / jnp.sum(problem.mask)
+    loss = _loss(problem, moved, distance)
+    pull, precision = _prior(problem, unknown)
+    return Normal(
+        objective=loss + prior * jnp.sum(pull**2 * precision) / 2,
+        loss=loss,
+        gradient=jnp.einsum("fp,fp,fpu->u", weight, distance, jacobian) + prior * precision * pull,
+        matrix=jnp.einsum("fp,fpu,fpv->uv", weight, jacobian, jacobian)
+        + prior * jnp.diag(precision),
+    )
+
+
+def _prior(problem: Problem, unknown):
+    """Difference from the expected unknown, and the inverse of its variance."""
+    middle, spread = jnp.full(problem.family.dim, 0.5), jnp.full(problem.family.dim, PRIOR_DEVIATION)
+    expected = jnp.concatenate([middle, jnp.zeros(4)])
+    return unknown - expected, 1 / jnp.concatenate([spread, jnp.ones(4)]) ** 2
+
+
+def _split(problem: Problem, unknown):
+    """The point of the unit cube, and the misalignment in metres and radians."""
+    shift, turn = problem.misalignment
+    return unknown[: problem.family.dim], unknown[problem.family.dim :] * jnp.array(
+        [shift, shift, shift, turn]
+    )
+
+
+def _aligned(problem: Problem, x: Float[Array, "frame vertex 3"], shift: Float[Array, " 4"]):
+    """Positions [m] in the frame of the cameras: turned about the first handle, and shifted."""
+    pivot = x[:, problem.scenario.scene.held[:1]]
+    cosine, sine = jnp.cos(shift[3]), jnp.sin(shift[3])
+    turn = jnp.stack([jnp.stack([cosine, -sine]), jnp.stack([sine, cosine])])
+    offset = x - pivot
+    turned = jnp.concatenate([offset[..., :2] @ turn.T, offset[..., 2:]], axis=-1)
+    return pivot + turned + shift[:3]
+
+
+def _residuals(problem: Problem, x):
+    faces = problem.scenario.scene.mesh.faces
+    per_frame = jax.vmap(lambda points, mask, x: surface_residuals(points, mask, x, faces))
+    return per_frame(problem.points, problem.mask, x[jnp.array(problem.frames)])
+
+
+def _loss(problem: Problem, moved: Trajectory, distance) -> Float[Array, ""]:
+    loss = jnp.sum(robust(distance)) / jnp.sum(problem.mask)
+    return jnp.where(jnp.all(moved.ok), loss, jnp.inf)
+
+
+def start(problem: Problem, unknown: Float[Array, " unknown"], loss: Float[Array, ""]) -> Descent:
+    """A descent that begins at an unknown.
+
+    `loss` [m^2] is what the best start reached: it sets how much the prior weighs against clouds
+    that no fabric explains better.
+    """
+    prior = 2 * loss / (SPAN * len(problem.frames))
+    return Descent(unknown, normal_at(problem, unknown, prior), jnp.asarray(1e-2, float), prior)
+
+
+def step(problem: Problem, descent: Descent) -> Descent:
+    """One Levenberg-Marquardt step, kept if it lowers the objective; within the unit cube.
+
+    What runs into a bound stays there, and the other unknowns take the step alone.
+    """
+    normal, unknown = descent.normal, descent.unknown
+    size = unknown.shape[0]
+    damped = normal.matrix + descent.damping * jnp.diag(jnp.diag(normal.matrix))
+    bounded = jnp.arange(size) < problem.family.dim
+    stuck = bounded & (unknown <= MARGIN) & (normal.gradient > 0)
+    stuck |= bounded & (unknown >= 1 - MARGIN) & (normal.gradient < 0)
+    pinned = jnp.where(stuck[:, None] | stuck, jnp.diag(jnp.diag(damped)), damped)
+    change = -jnp.linalg.solve(pinned, jnp.where(stuck, 0, normal.gradient))
+    longest = jnp.max(jnp.where(bounded, jnp.abs(change), 0))
+    change = change / jnp.maximum(1, longest / 0.2)  # a fifth of a range at most
+    inside = jnp.clip(unknown + change, MARGIN, 1 - MARGIN)
+    trial = jnp.where(bounded, inside, unknown + change)
+    tried = normal_at(problem, trial, descent.prior)
+    better = tried.objective < normal.objective
+    take = lambda new, old: jnp.where(better, new, old)
+    kept = jax.tree.map(take, tried, normal)
+    damping = jnp.where(better, descent.damping / 5, descent.damping * 5)
+    return Descent(take(trial, unknown), kept, jnp.clip(damping, 1e-6, 1e6), descent.prior)

@@ -1,0 +1,56 @@
+"""Distances from clouds to a simulated sheet, differentiable."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from r2s.surface import nearest
+
+OUTLIER_SCALE = 0.015  # [m]: a point much farther away than this counts as an outlier
+
+
+def one_sided_chamfer(
+    points: Float[Array, "point 3"], mask: Bool[Array, " point"], targets: Float[Array, "target 3"]
+) -> Float[Array, ""]:
+    """Mean squared distance [m^2] from each (masked) point to the nearest target.
+
+    Chamfer distance in one direction. Differentiable in both; NaN when the mask is empty.
+    """
+    frozen_points, frozen_targets = jax.lax.stop_gradient((points, targets))
+    pairs = jnp.sum((frozen_points[:, None] - frozen_targets) ** 2, axis=-1)
+    distances = jnp.sum((points - targets[jnp.argmin(pairs, axis=1)]) ** 2, axis=-1)
+    return jnp.sum(jnp.where(mask, distances, 0)) / jnp.sum(mask)
+
+
+def surface_residuals(
+    points: Float[Array, "point 3"],
+    mask: Bool[Array, " point"],
+    x: Float[Array, "vertex 3"],
+    faces: Int[Array, "face 3"],
+) -> tuple[Float[Array, " point"], Float[Array, "point 3"], Int[Array, "point 3"], Array]:
+    """Distances [m] from points to a sheet, and what moves them.
+
+    Gives the distance of each point (0 where masked out), the unit direction from the sheet to it,
+    and the three vertices with their weights that make the nearest place: a small motion `dx` of
+    the vertices changes the distance by -direction . sum(weights dx).
+    """
+    face, weights = nearest(points, x, faces)
+    vertices = faces[face]
+    gap = points - jnp.einsum("pk,pki->pi", weights, x[vertices])
+    distance = jnp.sqrt(jnp.sum(gap**2, axis=-1))
+    edges = x[vertices[:, 1:]] - x[vertices[:, :1]]
+    normal = jnp.cross(edges[:, 0], edges[:, 1])
+    normal = normal / jnp.sqrt(jnp.sum(normal**2, axis=-1, keepdims=True))
+    apart = distance > 1e-6  # a point on the sheet has no direction but the normal
+    direction = jnp.where(apart[:, None], gap / jnp.where(apart, distance, 1)[:, None], normal)
+    return jnp.where(mask, distance, 0), direction, vertices, weights
+
+
+def robust(distance: Float[Array, "*point"]) -> Float[Array, "*point"]:
+    """Cauchy's robust loss [m^2]: d^2 / 2 for small distances [m], logarithmic for outliers."""
+    return OUTLIER_SCALE**2 / 2 * jnp.log1p((distance / OUTLIER_SCALE) ** 2)
+
+
+def robust_weight(distance: Float[Array, "*point"]) -> Float[Array, "*point"]:
+    """The derivative of `robust`, divided by the distance [-]."""
+    return 1 / (1 + (distance / OUTLIER_SCALE) ** 2)
