@@ -130,10 +130,9 @@ def _one_by_one(function):
     def batched(size, is_batched, *args):
         moving, still = eqx.partition(args, tuple(is_batched))
         single = lambda moving: function(*eqx.combine(moving, still))
-        out = jax.lax.platform_dependent(
-            moving, cpu=lambda moving: jax.lax.map(single, moving), default=jax.vmap(single)
-        )
-        return out, True
+        if jax.default_backend() == "cpu":
+            return jax.lax.map(single, moving), True
+        return jax.vmap(single)(moving), True
 
     return call
 

@@ -18,7 +18,9 @@ from r2s.solver import Trajectory
 
 MARGIN = 1e-3  # of the unit cube, so that a start at its edge can move
 PRIOR_DEVIATION = 0.29  # of a uniform prior over the unit cube
-SPAN = 5  # independent pieces of evidence a frame holds: neighbours in a cloud err alike
+LONGEST_STEP = 0.2  # of a parameter's range
+PATCHES = 3  # along a side of the sheet: points of one patch in one frame err alike
+SPAN = 5  # independent pieces of evidence in a frame, for the weight of the prior
 
 
 class Normal(eqx.Module):
@@ -27,12 +29,15 @@ class Normal(eqx.Module):
     - `objective`: `loss` and the prior, [m^2]; infinite when the run diverged.
     - `loss`: robust mean of the clouds alone, [m^2].
     - `gradient`, `matrix`: of the objective in the unknown, [m^2].
+    - `scatter`: covariance of the gradient, [m^4], from how it varies between patches of the sheet
+      and frames (a clustered sandwich): points of one patch and frame err alike.
     """
 
     objective: Float[Array, ""]
     loss: Float[Array, ""]
     gradient: Float[Array, " unknown"]
     matrix: Float[Array, "unknown unknown"]
+    scatter: Float[Array, "unknown unknown"]
 
 
 class Descent(eqx.Module):
@@ -42,13 +47,11 @@ class Descent(eqx.Module):
       of its standard deviations.
     - `normal`: the normal equations there.
     - `damping`: Levenberg's, [-].
-    - `prior`: weight of the prior, [m^2].
     """
 
     unknown: Float[Array, " unknown"]
     normal: Normal
     damping: Float[Array, ""]
-    prior: Float[Array, ""]
 
 
 def loss_at(problem: Problem, unknown: Float[Array, " unknown"]) -> Float[Array, ""]:
@@ -77,22 +80,34 @@ def normal_at(
     picked = jax.vmap(lambda slope, vertices: slope[vertices])(slope, vertices)
     jacobian = -jnp.einsum("fpi,fpk,fpkiu->fpu", direction, weights, picked)
     weight = jnp.where(problem.mask, robust_weight(distance), 0) / jnp.sum(problem.mask)
+    score = (weight * distance)[..., None] * jacobian
     loss = _loss(problem, moved, distance)
     pull, precision = _prior(problem, unknown)
     return Normal(
         objective=loss + prior * jnp.sum(pull**2 * precision) / 2,
         loss=loss,
-        gradient=jnp.einsum("fp,fp,fpu->u", weight, distance, jacobian) + prior * precision * pull,
+        gradient=jnp.sum(score, axis=(0, 1)) + prior * precision * pull,
         matrix=jnp.einsum("fp,fpu,fpv->uv", weight, jacobian, jacobian)
         + prior * jnp.diag(precision),
+        scatter=_scatter(problem, score, vertices[..., 0]) + prior**2 * jnp.diag(precision),
     )
+
+
+def _scatter(problem: Problem, score: Float[Array, "frame point unknown"], vertex):
+    """Sum over clusters of the outer product of their scores; a cluster is a patch in a frame."""
+    rest = problem.scenario.scene.mesh.rest
+    cell = jnp.floor(rest / (jnp.max(rest, axis=0) * (1 + 1e-3)) * PATCHES).astype(int)
+    patch = (cell[:, 0] * PATCHES + cell[:, 1])[vertex]
+    total = jax.vmap(lambda s, c: jax.ops.segment_sum(s, c, PATCHES**2))(score, patch)
+    return jnp.einsum("fcu,fcv->uv", total, total)
 
 
 def _prior(problem: Problem, unknown):
     """Difference from the expected unknown, and the inverse of its variance."""
-    middle, spread = jnp.full(problem.family.dim, 0.5), jnp.full(problem.family.dim, PRIOR_DEVIATION)
-    expected = jnp.concatenate([middle, jnp.zeros(4)])
-    return unknown - expected, 1 / jnp.concatenate([spread, jnp.ones(4)]) ** 2
+    dim = problem.family.dim
+    expected = jnp.concatenate([jnp.full(dim, 0.5, float), jnp.zeros(4, float)])
+    spread = jnp.concatenate([jnp.full(dim, PRIOR_DEVIATION, float), jnp.ones(4, float)])
+    return unknown - expected, 1 / spread**2
 
 
 def _split(problem: Problem, unknown):
@@ -124,36 +139,39 @@ def _loss(problem: Problem, moved: Trajectory, distance) -> Float[Array, ""]:
     return jnp.where(jnp.all(moved.ok), loss, jnp.inf)
 
 
-def start(problem: Problem, unknown: Float[Array, " unknown"], loss: Float[Array, ""]) -> Descent:
-    """A descent that begins at an unknown.
+def prior_weight(problem: Problem, loss: Float[Array, ""]) -> Float[Array, ""]:
+    """Weight [m^2] of the prior, where `loss` [m^2] is what the best start reached.
 
-    `loss` [m^2] is what the best start reached: it sets how much the prior weighs against clouds
-    that no fabric explains better.
+    What no fabric explains is an error that the clouds share, so it counts once in a while only.
     """
-    prior = 2 * loss / (SPAN * len(problem.frames))
-    return Descent(unknown, normal_at(problem, unknown, prior), jnp.asarray(1e-2, float), prior)
+    return 2 * loss / (SPAN * len(problem.frames))
 
 
-def step(problem: Problem, descent: Descent) -> Descent:
-    """One Levenberg-Marquardt step, kept if it lowers the objective; within the unit cube.
+def propose(problem: Problem, descent: Descent) -> Float[Array, " unknown"]:
+    """The next unknown to try: a damped Gauss-Newton step, within the unit cube.
 
     What runs into a bound stays there, and the other unknowns take the step alone.
     """
     normal, unknown = descent.normal, descent.unknown
-    size = unknown.shape[0]
+    bounded = jnp.arange(unknown.shape[0]) < problem.family.dim
     damped = normal.matrix + descent.damping * jnp.diag(jnp.diag(normal.matrix))
-    bounded = jnp.arange(size) < problem.family.dim
     stuck = bounded & (unknown <= MARGIN) & (normal.gradient > 0)
     stuck |= bounded & (unknown >= 1 - MARGIN) & (normal.gradient < 0)
     pinned = jnp.where(stuck[:, None] | stuck, jnp.diag(jnp.diag(damped)), damped)
     change = -jnp.linalg.solve(pinned, jnp.where(stuck, 0, normal.gradient))
     longest = jnp.max(jnp.where(bounded, jnp.abs(change), 0))
-    change = change / jnp.maximum(1, longest / 0.2)  # a fifth of a range at most
+    change = change / jnp.maximum(1, longest / LONGEST_STEP)
     inside = jnp.clip(unknown + change, MARGIN, 1 - MARGIN)
-    trial = jnp.where(bounded, inside, unknown + change)
-    tried = normal_at(problem, trial, descent.prior)
-    better = tried.objective < normal.objective
+    return jnp.where(bounded, inside, unknown + change)
+
+
+def accept(descent: Descent, trial: Float[Array, " unknown"], tried: Normal) -> Descent:
+    """The descent after a trial: moved if that lowers the objective, else damped more."""
+    better = tried.objective < descent.normal.objective
     take = lambda new, old: jnp.where(better, new, old)
-    kept = jax.tree.map(take, tried, normal)
     damping = jnp.where(better, descent.damping / 5, descent.damping * 5)
-    return Descent(take(trial, unknown), kept, jnp.clip(damping, 1e-6, 1e6), descent.prior)
+    return Descent(
+        take(trial, descent.unknown),
+        jax.tree.map(take, tried, descent.normal),
+        jnp.clip(damping, 1e-6, 1e6),
+    )

@@ -1,0 +1,36 @@
+# make study [DATA=folder] [OUT=folder] [ARGS=...], make test, make check: each sets up what it needs.
+PYTHON ?= python3
+VENV := .venv
+STAMP := $(VENV)/.installed
+RUN := $(VENV)/bin/python
+DATA ?=
+OUT ?= results
+ARGS ?=
+
+.PHONY: study test test-slow lint types check clean
+
+study: $(STAMP)
+	$(RUN) experiments/study.py --data "$(DATA)" --out "$(OUT)" $(ARGS)
+
+test: $(STAMP)
+	$(RUN) -m pytest -q -n 2 --dist loadfile
+
+test-slow: $(STAMP)
+	$(RUN) -m pytest -q -m slow
+
+lint: $(STAMP)
+	$(RUN) -m ruff check .
+	$(RUN) -m ruff format --check .
+
+types: $(STAMP)
+	$(RUN) -m pyright
+
+check: lint types
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(RUN) -m pip install -q --disable-pip-version-check -c constraints.txt -e ".[study,pcd,dev]"
+	touch $@
+
+clean:
+	rm -rf $(VENV) results

@@ -1,0 +1,102 @@
+"""What the tests of the physics share: strict float64, a small sheet, and a step compiled once.
+
+Most tests use the 5 x 5 `sheet` and the step `DT`, so that they share two compilations of `step`:
+a sheet that is free, and one held by its first row.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from r2s.cloth import Cloth, ClothState
+from r2s.fabric import Fabric
+from r2s.increment import curvatures, strains, vertex_mass
+from r2s.mesh import Mesh, rectangle
+from r2s.physics.air import Air
+from r2s.physics.contact import Table
+from r2s.scene import Control, Scene
+from r2s.units import GRAVITY
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+SIZE = 0.2  # of the sheet's sides, [m]
+SHAPE = (5, 5)
+FIRST_ROW = range(5)  # the vertices at warp = 0
+DT = 0.01  # [s]
+
+
+@pytest.fixture(scope="session")
+def sheet() -> Mesh:
+    """A square of 0.2 m with 5 x 5 vertices."""
+    return rectangle((SIZE, SIZE), SHAPE)
+
+
+@pytest.fixture(scope="session")
+def fabric() -> Fabric:
+    return Fabric.make(0.2, (300.0, 60.0, 200.0, 80.0), 2e-5)
+
+
+def cloth(mesh: Mesh, held=(), table: float = -jnp.inf, air: float = 0.0, dt: float = DT) -> Cloth:
+    """A solver for a sheet; by default free, without table, in vacuum."""
+    held = jnp.asarray(tuple(held), int)
+    return Cloth(Scene(mesh, held, Table.make(table), Air.make(density=air)), dt)
+
+
+def flat(mesh: Mesh, height: float = 0.0):
+    """Positions of a flat, horizontal sheet at a height [m]."""
+    return jnp.pad(mesh.rest, ((0, 0), (0, 1)), constant_values=height)
+
+
+def rotation(angle: float, axis: int):
+    """A rotation matrix about a world axis."""
+    i, j = [k for k in range(3) if k != axis]
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return jnp.eye(3).at[i, i].set(c).at[j, j].set(c).at[i, j].set(-s).at[j, i].set(s)
+
+
+def everywhere(vector, mesh: Mesh):
+    """The same vector at every vertex."""
+    return jnp.broadcast_to(jnp.asarray(vector, float), (mesh.rest.shape[0], 3))
+
+
+@eqx.filter_jit
+def step(solver: Cloth, fabric: Fabric, state: ClothState, control: Control) -> ClothState:
+    return solver.step(fabric, state, control)
+
+
+def roll(solver: Cloth, fabric: Fabric, state: ClothState, count: int, path=None, wind=(0, 0, 0)):
+    """The states from `state` on, after each of `count` steps, as numpy arrays (time, vertex, 3).
+
+    `path` gives the handles' positions at a time [s] from the start; by default they stay.
+    """
+    states, start = [state], state.x[solver.scene.held]
+    for i in range(1, count + 1):
+        handles = start if path is None else path(i * solver.dt)
+        states.append(step(solver, fabric, states[-1], Control(handles, jnp.asarray(wind, float))))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *states)
+
+
+@eqx.filter_jit
+def stored_energy(mesh: Mesh, fabric: Fabric, x):
+    """Energy [J] in the strains and curvatures of a sheet."""
+    membrane = jax.vmap(fabric.membrane.energy_density)(strains(mesh, x))
+    bending = jax.vmap(fabric.bending.energy_density)(curvatures(mesh, x))
+    return jnp.sum(mesh.area * membrane) + jnp.sum(mesh.hinge_area * bending)
+
+
+@eqx.filter_jit
+def energy(mesh: Mesh, fabric: Fabric, x, v):
+    """Stored, kinetic and gravitational energy [J] of a sheet."""
+    mass = vertex_mass(mesh, fabric)
+    motion = jnp.sum(mass * (jnp.sum(v**2, axis=1) / 2 + GRAVITY * x[:, 2]))
+    return stored_energy(mesh, fabric, x) + motion
+
+
+def directional_difference(function, at, direction, size: float):
+    """The central difference of `function` at a tree of arrays along another."""
+    moved = lambda sign: jax.tree.map(lambda a, d: a + sign * size * d, at, direction)
+    return (function(moved(1)) - function(moved(-1))) / (2 * size)
