@@ -1,7 +1,7 @@
 """The main job: which fabric was that, and how well does it predict a motion never seen?
 
-    python experiments/study.py                          # five known fabrics, made by the solver
-    python experiments/study.py --data FOLDER            # recordings (see README, "Your recordings")
+python experiments/study.py                          # five known fabrics, made by the solver
+python experiments/study.py --data FOLDER            # recordings (see README, "Your recordings")
 """
 
 import argparse
@@ -21,9 +21,11 @@ def main(data: str, out: Path, density: float, only: str, effort: run.Effort) ->
     out.mkdir(parents=True, exist_ok=True)
     judged, rows = run.run(found, out, effort)
     settings = {"data": kind, **{k: str(v) for k, v in vars(effort).items()}}
-    intro = f"Fabrics estimated from a lift and judged on a fold that the estimate never saw: {kind}."
+    intro = (
+        f"Fabrics estimated from a lift and judged on a fold that the estimate never saw: {kind}."
+    )
     for table in pictures.publish(out, judged, rows, settings, intro):
-        print(f"\n{table.caption}\n\n{tables.markdown(table)}")
+        print(f"\n{tables.markdown(table)}")
     print(f"\n{out / 'report.html'} has the pictures, {out / 'results.csv'} every figure.")
 
 

@@ -17,9 +17,9 @@ def one_sided_chamfer(
     Chamfer distance in one direction. Differentiable in both; NaN when the mask is empty.
     """
     frozen_points, frozen_targets = jax.lax.stop_gradient((points, targets))
-    pairs = jnp.sum((frozen_points[:, None] - frozen_targets) ** 2, axis=-1)
+    pairs = jnp.sum((frozen_points[:, None] - frozen_targets[None]) ** 2, axis=-1)
     distances = jnp.sum((points - targets[jnp.argmin(pairs, axis=1)]) ** 2, axis=-1)
-    return jnp.sum(jnp.where(mask, distances, 0)) / jnp.sum(mask)
+    return jnp.sum(jnp.where(mask, distances, 0)) / jnp.sum(mask, dtype=distances.dtype)
 
 
 def surface_residuals(

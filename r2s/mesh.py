@@ -86,7 +86,9 @@ def _hinges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     hinges, pairs = [], []
     for (low, high), touching in sides.items():
         if len(touching) > 2:
-            raise ValueError(f"edge {low}-{high} belongs to {len(touching)} faces, at most 2 may be")
+            raise ValueError(
+                f"edge {low}-{high} belongs to {len(touching)} faces, at most 2 may be"
+            )
         if len(touching) == 2:
             # the left triangle is the one that runs along the edge from its start
             (start, left, face_left), (_, right, face_right) = touching

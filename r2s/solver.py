@@ -1,6 +1,6 @@
 """From steps to motions: `simulate`, for any solver with `init` and `step`."""
 
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -14,6 +14,7 @@ from r2s.scene import Control
 State = TypeVar("State")
 
 
+@runtime_checkable
 class Solver(Protocol[State]):
     """What `simulate` and the estimators ask of a solver."""
 

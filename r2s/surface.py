@@ -21,15 +21,13 @@ def nearest(
     def of_point(point):
         weights = jax.vmap(_closest_weights, in_axes=(None, 0))(point, corners)
         places = jnp.einsum("fk,fki->fi", weights, corners)
-        best = jnp.argmin(jnp.sum((places - point) ** 2, axis=-1))
+        best = jnp.argmin(jnp.sum((places - point[None]) ** 2, axis=-1))
         return best, weights[best]
 
     return jax.vmap(of_point)(points)
 
 
-def _closest_weights(
-    point: Float[Array, " 3"], corners: Float[Array, "3 3"]
-) -> Float[Array, " 3"]:
+def _closest_weights(point: Float[Array, " 3"], corners: Float[Array, "3 3"]) -> Float[Array, " 3"]:
     """Barycentric weights of the place in a triangle that is nearest to a point."""
     a, b, c = corners
     inside = _plane_weights(point, a, b, c)
@@ -42,7 +40,7 @@ def _closest_weights(
             jnp.stack([edges[2], zero, 1 - edges[2]]),
         ]
     )
-    distances = jnp.sum((on_edges @ corners - point) ** 2, axis=-1)
+    distances = jnp.sum((on_edges @ corners - point[None]) ** 2, axis=-1)
     return jnp.where(jnp.all(inside >= 0), inside, on_edges[jnp.argmin(distances)])
 
 
@@ -63,12 +61,11 @@ def _edge_weight(point, a, b):
 
 def sample_weights(resolution: int) -> Float[Array, "sample 3"]:
     """Barycentric weights of `resolution`^2 places spread evenly over a triangle."""
-    steps = jnp.arange(resolution)
+    steps = jnp.arange(resolution, dtype=float)
     i, j = (axis.ravel() for axis in jnp.meshgrid(steps, steps, indexing="ij"))
     upright = i + j < resolution  # the small triangles come upright and, between them, inverted
-    third = jnp.asarray(1 / 3, float)
-    first = jnp.where(upright, i + third, resolution - i - third).astype(float) / resolution
-    second = jnp.where(upright, j + third, resolution - j - third).astype(float) / resolution
+    first = jnp.where(upright, i + 1 / 3, resolution - i - 1 / 3) / resolution
+    second = jnp.where(upright, j + 1 / 3, resolution - j - 1 / 3) / resolution
     return jnp.stack([1 - first - second, first, second], axis=1)
 
 

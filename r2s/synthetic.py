@@ -48,9 +48,7 @@ def fold(fabric: Fabric, name: str, trial: int, *, key: PRNGKeyArray) -> Recordi
 
 def placement(held: str) -> SheetPlacement:
     """The study's square sheet, flat on a table at z = 0, held at a named corner."""
-    return SheetPlacement(
-        (SIDE, SIDE), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (held,)
-    )
+    return SheetPlacement((SIDE, SIDE), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (held,))
 
 
 def cameras() -> tuple[Camera, Camera]:
@@ -113,9 +111,9 @@ def _observe_frame(x: Float[Array, "vertex 3"], faces, key):
     seen = jnp.any(jnp.stack([camera.sees(surface) for camera in cameras()]), axis=0)
     seen = seen & (surface[:, 2] > MARGIN)
     # a random order with what is seen in front: its first points are a random choice of the seen
-    order = jnp.argsort(jr.uniform(key_pick, seen.shape, float) + ~seen)[:POINTS]
+    order = jnp.argsort(jr.uniform(key_pick, seen.shape, float) + (~seen).astype(float))[:POINTS]
     points = surface[order] + NOISE * jr.normal(key_noise, (POINTS, 3), float)
     low, high = jnp.array([-0.1, -0.1, 0.0], float), jnp.array([0.6, 0.6, 0.5], float)
-    stray = low + (high - low) * jr.uniform(key_where, (POINTS, 3), float)
+    stray = low[None] + (high - low)[None] * jr.uniform(key_where, (POINTS, 3), float)
     is_stray = jr.uniform(key_outlier, (POINTS,), float) < OUTLIERS
     return jnp.where(is_stray[:, None], stray, points), seen[order] | is_stray

@@ -25,9 +25,7 @@ def isotropic_membrane(
     return c11, poissons_ratio * c11, c11, c33
 
 
-def isotropic_bending(
-    youngs_modulus: Scalar, poissons_ratio: Scalar, thickness: Scalar
-) -> Scalar:
+def isotropic_bending(youngs_modulus: Scalar, poissons_ratio: Scalar, thickness: Scalar) -> Scalar:
     """Bending stiffness E h^3 / (12 (1 - nu^2)) [N m] of a solid isotropic plate (Kirchhoff).
 
     From Young's modulus [Pa], Poisson's ratio [-] and thickness [m]. A woven or knitted fabric is

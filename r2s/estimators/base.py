@@ -118,7 +118,12 @@ def as_json(estimate: Estimate) -> dict[str, Any]:
         "parameters": parameters,
         "correlation": _plain(estimate.correlation),
         "fabric": _fabric_json(estimate.fabric),
-        "misalignment": {"shift": shift[:3], "shift_unit": "m", "turn": shift[3], "turn_unit": "rad"},
+        "misalignment": {
+            "shift": shift[:3],
+            "shift_unit": "m",
+            "turn": shift[3],
+            "turn_unit": "rad",
+        },
         "loss": estimate.loss,
         "loss_unit": "m^2",
         "seconds": estimate.seconds,

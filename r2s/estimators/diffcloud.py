@@ -184,5 +184,3 @@ def _original_loss(raw, problem, assumed, resolution) -> Float[Array, ""]:
     targets = jnp.where(problem.mask[-1][:, None], problem.points[-1], jnp.inf)
     # padding is infinitely far, so never the nearest
     return one_sided_chamfer(seen, jnp.ones(seen.shape[0], bool), targets)
-
-

@@ -49,9 +49,9 @@ class Descent(eqx.Module):
     - `damping`: Levenberg's, [-].
     """
 
-    unknown: Float[Array, " unknown"]
+    unknown: Float[Array, "*start unknown"]
     normal: Normal
-    damping: Float[Array, ""]
+    damping: Float[Array, "*start"]
 
 
 def loss_at(problem: Problem, unknown: Float[Array, " unknown"]) -> Float[Array, ""]:
@@ -79,7 +79,7 @@ def normal_at(
     distance, direction, vertices, weights = _residuals(problem, x)
     picked = jax.vmap(lambda slope, vertices: slope[vertices])(slope, vertices)
     jacobian = -jnp.einsum("fpi,fpk,fpkiu->fpu", direction, weights, picked)
-    weight = jnp.where(problem.mask, robust_weight(distance), 0) / jnp.sum(problem.mask)
+    weight = jnp.where(problem.mask, robust_weight(distance), 0) / jnp.sum(problem.mask, dtype=float)
     score = (weight * distance)[..., None] * jacobian
     loss = _loss(problem, moved, distance)
     pull, precision = _prior(problem, unknown)
@@ -96,7 +96,8 @@ def normal_at(
 def _scatter(problem: Problem, score: Float[Array, "frame point unknown"], vertex):
     """Sum over clusters of the outer product of their scores; a cluster is a patch in a frame."""
     rest = problem.scenario.scene.mesh.rest
-    cell = jnp.floor(rest / (jnp.max(rest, axis=0) * (1 + 1e-3)) * PATCHES).astype(int)
+    size = jnp.max(rest, axis=0, keepdims=True) * (1 + 1e-3)
+    cell = jnp.floor(rest / size * PATCHES).astype(int)
     patch = (cell[:, 0] * PATCHES + cell[:, 1])[vertex]
     total = jax.vmap(lambda s, c: jax.ops.segment_sum(s, c, PATCHES**2))(score, patch)
     return jnp.einsum("fcu,fcv->uv", total, total)
@@ -125,7 +126,7 @@ def _aligned(problem: Problem, x: Float[Array, "frame vertex 3"], shift: Float[A
     turn = jnp.stack([jnp.stack([cosine, -sine]), jnp.stack([sine, cosine])])
     offset = x - pivot
     turned = jnp.concatenate([offset[..., :2] @ turn.T, offset[..., 2:]], axis=-1)
-    return pivot + turned + shift[:3]
+    return pivot + turned + shift[None, None, :3]
 
 
 def _residuals(problem: Problem, x):
@@ -135,7 +136,7 @@ def _residuals(problem: Problem, x):
 
 
 def _loss(problem: Problem, moved: Trajectory, distance) -> Float[Array, ""]:
-    loss = jnp.sum(robust(distance)) / jnp.sum(problem.mask)
+    loss = jnp.sum(robust(distance)) / jnp.sum(problem.mask, dtype=float)
     return jnp.where(jnp.all(moved.ok), loss, jnp.inf)
 
 
@@ -157,7 +158,7 @@ def propose(problem: Problem, descent: Descent) -> Float[Array, " unknown"]:
     damped = normal.matrix + descent.damping * jnp.diag(jnp.diag(normal.matrix))
     stuck = bounded & (unknown <= MARGIN) & (normal.gradient > 0)
     stuck |= bounded & (unknown >= 1 - MARGIN) & (normal.gradient < 0)
-    pinned = jnp.where(stuck[:, None] | stuck, jnp.diag(jnp.diag(damped)), damped)
+    pinned = jnp.where(stuck[:, None] | stuck[None], jnp.diag(jnp.diag(damped)), damped)
     change = -jnp.linalg.solve(pinned, jnp.where(stuck, 0, normal.gradient))
     longest = jnp.max(jnp.where(bounded, jnp.abs(change), 0))
     change = change / jnp.maximum(1, longest / LONGEST_STEP)

@@ -30,11 +30,11 @@ class Camera(eqx.Module):
         right = jnp.cross(forward, jnp.array([0.0, 0.0, 1.0], points.dtype))
         right = right / jnp.sqrt(right @ right)
         down = jnp.cross(forward, right)
-        offset = points - self.position
+        offset = points - self.position[None]
         depth = offset @ forward
         plane = jnp.stack([offset @ right, offset @ down], axis=1)
         centre = jnp.array(self.resolution, points.dtype) / 2
-        return centre + self.focal_length * plane / depth[:, None], depth
+        return centre[None] + self.focal_length * plane / depth[:, None], depth
 
     def sees(self, points: Float[Array, "point 3"]) -> Bool[Array, " point"]:
         """Which points [m] of a densely sampled surface are in view and not behind others.

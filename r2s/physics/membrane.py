@@ -38,9 +38,7 @@ def deformation_gradient(
     return edges @ inverse
 
 
-def green_strain(
-    corners: Float[Array, "3 3"], inverse: Float[Array, "2 2"]
-) -> Float[Array, " 3"]:
+def green_strain(corners: Float[Array, "3 3"], inverse: Float[Array, "2 2"]) -> Float[Array, " 3"]:
     """Green strain (E11, E22, 2 E12) [-] of a triangle, E = (F^T F - 1) / 2."""
     deformation = deformation_gradient(corners, inverse)
     warp, weft = deformation[:, 0], deformation[:, 1]

@@ -52,10 +52,22 @@ def _mean(recording: Recording, simulated: list[np.ndarray]) -> dict[str, float]
     first, _ = recording.info.frames_used
     real = [cloud(recording, first + i) for i in range(len(simulated))]
     if not all(np.all(np.isfinite(points)) for points in simulated):
-        names = (*metrics.distances(real[0], real[0]), *UNITS)
-        return dict.fromkeys(names, float("nan"))
-    rows = [
-        metrics.distances(a, b) | metrics.paper_units(a, b, real[0], simulated[0])
-        for a, b in zip(real, simulated, strict=True)
-    ]
+        return dict.fromkeys(_frame(real[0], real[0], real[0], real[0]), float("nan"))
+    rows = [_frame(a, b, real[0], simulated[0]) for a, b in zip(real, simulated, strict=True)]
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+
+
+def _frame(real, simulated, first_real, first_simulated) -> dict[str, float]:
+    """All metrics of one frame.
+
+    Those that end in `_cropped` leave out what lies below the recording's lowest point: recordings
+    are cut off above the table, where a simulation still has a sheet.
+    """
+    visible = simulated[simulated[:, 2] >= real[:, 2].min()]
+    cropped = metrics.distances(real, visible) if len(visible) else {}
+    whole = metrics.distances(real, simulated)
+    return (
+        whole
+        | {f"{name}_cropped": cropped.get(name, float("nan")) for name in whole}
+        | metrics.paper_units(real, simulated, first_real, first_simulated)
+    )

@@ -227,7 +227,7 @@ def _parameter(
     if determined:
         text = _plus_minus(value, deviation * (abs(value) if bound.log else 1)) + unit
     else:
-        text = f"not determined ({bound.low:g} to {bound.high:g}{unit})"
+        text = f"not determined (best fit {significant(value)}{unit})"
     return text if math.isnan(truth) else f"{text}; truth {significant(truth)}{unit}"
 
 
