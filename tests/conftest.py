@@ -7,6 +7,7 @@ a sheet that is free, and one held by its first row.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -38,6 +39,14 @@ def sheet() -> Mesh:
 @pytest.fixture(scope="session")
 def fabric() -> Fabric:
     return Fabric.make(0.2, (300.0, 60.0, 200.0, 80.0), 2e-5)
+
+
+@pytest.fixture
+def unchecked():
+    """The shape checks of the tests off, so that the code's own are reached."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def cloth(mesh: Mesh, held=(), table: float = -jnp.inf, air: float = 0.0, dt: float = DT) -> Cloth:

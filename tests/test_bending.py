@@ -78,7 +78,7 @@ def test_gradient_of_the_angle_agrees_with_differences(angle):
     direction = jax.random.normal(jax.random.key(0), corners.shape)
     expected = directional_difference(angle_of, corners, direction, 1e-5)
     found = jnp.sum(gradient(corners) * direction)
-    assert found == pytest.approx(float(expected), rel=1e-7)  # differences err by 1e-10 and rounding
+    assert found == pytest.approx(float(expected), rel=1e-7)  # 1e-10 and rounding
 
 
 def test_the_angle_does_not_change_with_rigid_motion():

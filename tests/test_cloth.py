@@ -97,13 +97,19 @@ def test_damping_does_not_brake_a_rotation(sheet):
     assert spin[1] == pytest.approx(spin[0], rel=1e-7)
 
 
-def test_damping_calms_a_stretch(sheet):
-    solver, left = cloth(sheet, FIRST_ROW), []
-    for damping in (0.0, 0.05):
-        fabric = Fabric.make(0.2, LAW, 1e-3, damping=damping)
-        start = solver.init(1.02 * hanging(sheet))
-        left.append(np.ptp(roll(solver, fabric, start, 30).x[20:, :, 2], axis=0).max())
-    assert left[1] < 0.1 * left[0]
+def test_damping_is_proportional_to_stiffness(sheet):
+    # the first standing wave of a free sheet, x = s + a cos(pi s / L), on a grid of 4 cells
+    solver, along, peaks = cloth(sheet), sheet.rest[:, 0], []
+    wave = jnp.cos(jnp.pi / SIZE * along)
+    rate = 8 / SIZE * (0.3 / 0.2) ** 0.5 * np.sin(np.pi / 8)  # [rad/s]
+    for damping in (0.0, 0.005):
+        fabric = Fabric.make(0.2, (0.3, 0.0, 0.3, 0.1), 0.0, damping=damping)
+        start = solver.init(flat(sheet).at[:, 0].add(1e-3 * wave))
+        moved = roll(solver, fabric, start, 40).x[:, :, 0] - np.asarray(along)
+        peaks.append(np.max((moved * np.asarray(wave)).sum(axis=1)[25:]))
+    period = 2 * np.pi / rate
+    # 3 %: triangles and vertices share the mass unevenly
+    assert peaks[1] / peaks[0] == pytest.approx(np.exp(-(rate**2) * 0.005 / 2 * period), rel=0.03)
 
 
 @pytest.mark.parametrize("stiffness", [20.0, 1000.0])
@@ -140,9 +146,9 @@ def test_a_path_is_linear_between_knots_and_rests_beyond():
 def test_a_swinging_sheet_gains_no_energy(sheet, fabric):
     solver = cloth(sheet, FIRST_ROW)
     states = roll(solver, fabric, solver.init(hanging(sheet, np.deg2rad(20))), 100)
-    energies = [energy(sheet, fabric, x, v) for x, v in zip(states.x, states.v, strict=True)]
+    energies = jax.vmap(lambda x, v: energy(sheet, fabric, x, v))(states.x, states.v)
     scale = 0.2 * SIZE**3 * GRAVITY / 2  # weight times half the length
-    assert np.max(np.diff(energies)) < 1e-5 * scale  # what BDF2 exchanges between its two steps
+    assert jnp.max(jnp.diff(energies)) < 1e-5 * scale  # what BDF2 exchanges between its two steps
     assert energies[-1] < energies[0]
 
 
@@ -222,8 +228,7 @@ def test_the_convex_hessian_is_positive_definite(disturbed, seed):
 def test_the_convex_hessian_is_exact_on_a_flat_sheet_under_tension(sheet, disturbed):
     _, both = disturbed
     solver = cloth(sheet, FIRST_ROW, table=0.0, air=AIR_DENSITY)
-    x = flat(1.0 * sheet.rest[:, :1] * 0 + 0 if False else sheet)
-    x = 1.1 * x + jnp.array([[0.0, 0.0, 1.0]])
+    x = 1.1 * flat(sheet, 1.0)
     still = solver.init(x)
     fabric = Fabric.make(0.2, LAW, 1e-4)
     increment = solver.increment(fabric, still, Control(x[:5], jnp.zeros(3)))

@@ -3,7 +3,6 @@
 from collections import Counter
 
 import jax.numpy as jnp
-import jaxtyping
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -82,14 +81,6 @@ BAD = {
     "wrong shape of faces": (SQUARE, [[0, 1, 2, 3]], r"\(face, 3\), got shape \(1, 4\)"),
     "faces that are no integers": (SQUARE, [[0.0, 1, 2], [0, 2, 3]], "must be integers"),
 }
-
-
-@pytest.fixture
-def unchecked():
-    """The shape checks of the tests off, so that the code's own are reached."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.mark.parametrize("name", BAD)

@@ -25,8 +25,8 @@ SOLVER = "cloth"
 class Effort:
     """How much an estimate may cost. `recipe` is "default" or "original" (DIFFCLOUD's)."""
 
-    num_coarse: int = 32
-    num_starts: int = 3
+    num_coarse: int = 24
+    num_starts: int = 2
     num_iterations: int = 12
     recipe: str = "default"
     seed: int = 0
