@@ -30,7 +30,7 @@ def main(data: str, out: Path, density: float, only: str, effort: run.Effort) ->
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Estimate from lifts, judge on folds.")
     parser.add_argument("--data", default="", help="folder of recordings; synthetic when empty")
     parser.add_argument("--out", type=Path, default=Path("results"), help="folder of the results")
     parser.add_argument("--density", type=float, default=0.15, help="areal density [kg/m^2]")

@@ -1,1 +1,37 @@
-"""r2s: real-to-sim for fabrics."""
+"""r2s: real-to-sim for fabrics.
+
+In reading order:
+
+- `units`, `fabric`, `presets`, `family`: what a fabric is, and which an estimator may choose.
+- `mesh`, `physics`: the sheet at rest; membrane, bending, air, contact.
+- `increment`, `implicit`, `cloth`: the energy of a step, its minimiser, the solver.
+- `scene`, `solver`, `scenario`: what an experiment fixes, motions over time, lift and fold.
+- `recording`, `clouds`, `manifest`, `synthetic`, `observe`: observations, real and made.
+- `surface`, `losses`, `metrics`: distances between clouds and sheets.
+- `estimators`: DIFFCLOUD. `study`: the main job, its tables and report.
+"""
+
+from r2s.cloth import Cloth, ClothState
+from r2s.fabric import Fabric
+from r2s.family import OrthotropicFamily
+from r2s.mesh import Mesh, rectangle
+from r2s.recording import Recording
+from r2s.scenario import Scenario, motion
+from r2s.scene import Control, Scene
+from r2s.solver import Trajectory, simulate
+
+__all__ = [
+    "Cloth",
+    "ClothState",
+    "Control",
+    "Fabric",
+    "Mesh",
+    "OrthotropicFamily",
+    "Recording",
+    "Scenario",
+    "Scene",
+    "Trajectory",
+    "motion",
+    "rectangle",
+    "simulate",
+]

@@ -46,10 +46,18 @@ class Cloth(eqx.Module):
         if not self.dt > 0:
             raise ValueError(f"dt must be positive, got {self.dt} s")
 
-    def init(self, x: Positions, v: Positions | None = None) -> ClothState:
-        """A state from positions [m] and velocities [m/s] (default: at rest)."""
+    def init(
+        self, x: Positions, v: Positions | None = None, acceleration: Positions | None = None
+    ) -> ClothState:
+        """A state from positions [m], velocities [m/s], accelerations [m/s^2] (default: zero).
+
+        The acceleration makes up the step before. The motion is second order in `dt` when it is
+        right: zero for a sheet that starts in equilibrium. Otherwise the velocity lags by half a
+        step's change, once and for all.
+        """
         v = jnp.zeros_like(x) if v is None else v
-        return ClothState(x, v, x - self.dt * v, v)
+        a = jnp.zeros_like(x) if acceleration is None else acceleration
+        return ClothState(x, v, x - self.dt * v + self.dt**2 / 2 * a, v - self.dt * a)
 
     def step(self, fabric: Fabric, state: ClothState, control: Control) -> ClothState:
         """The state `dt` later, with the held vertices at `control.handles`."""

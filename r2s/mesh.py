@@ -67,6 +67,8 @@ def _check(rest: np.ndarray, faces: np.ndarray) -> None:
         raise ValueError(f"rest must be finite, of shape (vertex, 2) [m], got shape {rest.shape}")
     if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
         raise ValueError(f"faces must be integers of shape (face, 3), got shape {faces.shape}")
+    if not len(faces):
+        raise ValueError("a mesh needs at least one face, got none")
     lonely = np.setdiff1d(np.arange(len(rest)), faces)
     if faces.min() < 0 or faces.max() >= len(rest) or len(lonely):
         raise ValueError(
@@ -88,6 +90,11 @@ def _hinges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if len(touching) > 2:
             raise ValueError(
                 f"edge {low}-{high} belongs to {len(touching)} faces, at most 2 may be"
+            )
+        if len(touching) == 2 and touching[0][0] == touching[1][0]:
+            raise ValueError(
+                f"faces {touching[0][2]} and {touching[1][2]} lie on the same side of edge "
+                f"{low}-{high}: faces must not overlap"
             )
         if len(touching) == 2:
             # the left triangle is the one that runs along the edge from its start

@@ -6,9 +6,9 @@ to differentiate see `r2s.losses`.
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
-Cloud = Float[np.ndarray, "point 3"]
+Cloud = Float[np.ndarray, "_ 3"]
 
 
 def distances(real: Cloud, simulated: Cloud) -> dict[str, float]:
@@ -60,4 +60,4 @@ def _nearest(a: Cloud, b: Cloud) -> tuple[np.ndarray, np.ndarray]:
             raise ValueError(f"the {name} cloud must be (point, 3), not empty, got {cloud.shape}")
         if not np.all(np.isfinite(cloud)):
             raise ValueError(f"the {name} cloud has coordinates that are not finite")
-    return cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
+    return KDTree(b).query(a)[0], KDTree(a).query(b)[0]

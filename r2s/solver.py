@@ -47,7 +47,7 @@ def simulate(solver: Solver[State], fabric: Fabric, start: State, controls: Cont
 
     def frame(state, control):
         state, _ = jax.lax.scan(substep, state, control)
-        return state, state.x
+        return state, state.x  # pyright: ignore[reportAttributeAccessIssue]
 
     _, x = jax.lax.scan(frame, start, controls)
     ok = jnp.all(jnp.isfinite(x), axis=(1, 2))

@@ -148,7 +148,7 @@ def test_a_swinging_sheet_gains_no_energy(sheet, fabric):
     states = roll(solver, fabric, solver.init(hanging(sheet, np.deg2rad(20))), 100)
     energies = jax.vmap(lambda x, v: energy(sheet, fabric, x, v))(states.x, states.v)
     scale = 0.2 * SIZE**3 * GRAVITY / 2  # weight times half the length
-    assert jnp.max(jnp.diff(energies)) < 1e-5 * scale  # what BDF2 exchanges between its two steps
+    assert jnp.max(jnp.diff(energies)) < 3e-5 * scale  # BDF2 bounds another energy, of two steps
     assert energies[-1] < energies[0]
 
 
@@ -180,7 +180,7 @@ def disturbed(sheet):
     solver = cloth(sheet, FIRST_ROW, table=0.0, air=AIR_DENSITY)
     fabric = Fabric.make(0.2, LAW, 1e-4)
     # both Hessians and the force, in one compilation
-    both = eqx.filter_jit(lambda *at: (hessian(*at), convex_hessian(*at), imbalance(*at)))
+    both = eqx.filter_jit(lambda at, x: (hessian(at, x), convex_hessian(at, x), imbalance(at, x)))
 
     def state(seed):
         noise = jnp.asarray(np.random.default_rng(seed).normal(size=(4, 25, 3))) * 5e-3

@@ -133,10 +133,16 @@ def several(inputs):
     return [eqx.tree_at(lambda inputs: inputs.fabric, inputs, fabric) for fabric in fabrics]
 
 
+def test_one_compilation_serves_all_fabrics(value_and_grad, several):
+    values = [value_and_grad(inputs)[0][0] for inputs in several]
+    assert value_and_grad._cache_size() == 1
+    assert len({float(value) for value in values}) == 3
+
+
 def test_a_batch_of_fabrics_equals_the_loop(loss, value_and_grad, several):
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)
     (value, x), slope = jax.jit(jax.vmap(jax.value_and_grad(loss, has_aux=True)))(batch)
-    for i, single in enumerate(several):  # which are compiled once, or `value_and_grad` raises
+    for i, single in enumerate(several):
         (expected, expected_x), expected_slope = value_and_grad(single)
         assert value[i] == pytest.approx(float(expected), rel=1e-9)
         assert np.asarray(x[i]) == pytest.approx(np.asarray(expected_x), abs=1e-10)

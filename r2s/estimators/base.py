@@ -150,7 +150,9 @@ def _fabric_json(fabric: Fabric) -> dict[str, Any]:
 
 def _plain(values: np.ndarray) -> Any:
     """Nested lists, with None for what is not finite: JSON has no word for it."""
-    return np.where(np.isfinite(values), values, None).tolist()
+    plain = values.astype(object)
+    plain[~np.isfinite(values)] = None
+    return plain.tolist()
 
 
 def _numbers(values: Any) -> np.ndarray:

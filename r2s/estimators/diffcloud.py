@@ -7,6 +7,7 @@ Differentiable Simulation and Rendering of Deformable Objects"). `estimate` is r
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -140,7 +141,7 @@ def original(
             lambda raw, problem, assumed: _original_loss(raw, problem, assumed, resolution)
         )
     )
-    raw = jnp.zeros(2, float)
+    raw: Any = jnp.zeros(2, float)  # optax gives back what it is given
     state = optimiser.init(raw)
     losses, history = [], []
     for epoch in range(num_epochs):

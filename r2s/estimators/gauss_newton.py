@@ -79,7 +79,9 @@ def normal_at(
     distance, direction, vertices, weights = _residuals(problem, x)
     picked = jax.vmap(lambda slope, vertices: slope[vertices])(slope, vertices)
     jacobian = -jnp.einsum("fpi,fpk,fpkiu->fpu", direction, weights, picked)
-    weight = jnp.where(problem.mask, robust_weight(distance), 0) / jnp.sum(problem.mask, dtype=float)
+    weight = jnp.where(problem.mask, robust_weight(distance), 0) / jnp.sum(
+        problem.mask, dtype=float
+    )
     score = (weight * distance)[..., None] * jacobian
     loss = _loss(problem, moved, distance)
     pull, precision = _prior(problem, unknown)

@@ -2,7 +2,8 @@
 
 A hinge is an edge of rest length l with the rest area A of its two triangles. Its curvature is
 theta l / A, its energy A times the law's energy per area. On a grid of squares that is the energy
-of the bent continuum exactly, for bending along the grid's lines.
+of the bent continuum exactly, for bending along the grid's lines; across its diagonals it is up to
+half as much again, at any resolution.
 """
 
 import equinox as eqx

@@ -193,8 +193,9 @@ def _findings(judged: Sequence[Judged], rows: Sequence[Row]) -> tuple[str, ...]:
         f"mm with the estimate, {1e3 * mean('default', one_sided):.1f} mm with the default fabric, "
         f"{1e3 * mean('other_fabric', one_sided):.1f} mm with the estimate of another fabric. The "
         f"estimate is {abs(better):.0%} {'below' if better >= 0 else 'above'} the default.",
-        f"Both directions: {1e3 * mean('', both):.1f} mm, against {1e3 * mean('repeatability', both):.1f} "
-        "mm between two trials of a fabric.",
+        f"Both directions, above the height at which the recording is cut off: "
+        f"{1e3 * mean('', both):.1f} mm, against {1e3 * mean('repeatability', both):.1f} mm "
+        "between two trials of a fabric.",
     ]
     for item in judged:
         estimate = item.estimate
