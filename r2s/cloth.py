@@ -6,9 +6,10 @@ from jaxtyping import Array, Float
 
 from r2s.fabric import Fabric
 from r2s.implicit import minimise
-from r2s.increment import Increment, curvatures, strains
+from r2s.increment import Increment, curvatures, hinge_angles, strains
 from r2s.mesh import Mesh
 from r2s.physics import contact
+from r2s.physics.bending import unwrapped
 from r2s.scene import Control, Scene
 
 Positions = Float[Array, "vertex 3"]
@@ -73,6 +74,8 @@ class Cloth(eqx.Module):
         mesh = self.scene.mesh
         depth = self.scene.table.depth(state.x, fabric.thickness)
         bdf2 = lambda now, before: (4 * now - before) / 3
+        angles = hinge_angles(mesh, state.x)
+        angles_before = unwrapped(hinge_angles(mesh, state.x_before), angles)
         return Increment(
             mesh=mesh,
             fabric=fabric,
@@ -82,7 +85,8 @@ class Cloth(eqx.Module):
             x_anchor=bdf2(state.x, state.x_before),
             v_anchor=bdf2(state.v, state.v_before),
             strain_anchor=bdf2(strains(mesh, state.x), strains(mesh, state.x_before)),
-            curvature_anchor=bdf2(curvatures(mesh, state.x), curvatures(mesh, state.x_before)),
+            curvature_anchor=curvatures(mesh, bdf2(angles, angles_before)),
+            angles=angles,
             area_normals=_area_normals(mesh, state.x),
             friction_limit=fabric.friction * mesh.vertex_area * contact.pressure(depth),
             wind=control.wind,

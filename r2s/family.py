@@ -68,7 +68,7 @@ class OrthotropicFamily(eqx.Module):
             Range("coupling", "-", -0.9, 0.9, log=False),
             Range("bending", "N m", 1e-7, 1e-3),
             Range("damping", "s", 1e-3, 1e-1),
-            Range("friction", "-", 0.05, 1.5),
+            Range("friction", "-", 0.1, 1.0),
         ),
     )
 

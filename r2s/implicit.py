@@ -43,7 +43,7 @@ def _newton(tolerance, max_iterations, increment, start, free):
     def iterate(state: _Search) -> _Search:
         force = _masked(imbalance(increment, state.x), free)
         direction = _direction(increment, state, force, free)
-        length = _line_search(increment, state.x, direction, jnp.sum(direction * force))
+        length = _line_search(increment, state.x, direction, force)
         moved = length * jnp.max(jnp.abs(direction))
         return _Search(state.x + length * direction, moved, state.count + 1)
 
@@ -78,18 +78,21 @@ def _direction(increment, state, force, free):
     return jax.lax.cond(state.count < CONVEX_ITERATIONS, convex, exact)
 
 
-def _line_search(increment, x, direction, slope):
-    """The first of 1, 1/2, 1/4, ... that lowers the potential enough (Armijo).
+def _line_search(increment, x, direction, force):
+    """The first of 1, 1/2, 1/4, ... that lowers the potential enough (Armijo) and ends short of
+    where it would rise as steeply as it fell.
 
-    Changes that rounding hides pass: they are the last Newton steps.
+    The second test is for the last Newton steps, whose gain rounding hides.
     """
-    before = potential(increment, x)
+    before, slope = potential(increment, x), jnp.sum(direction * force)
     rounding = 8 * jnp.finfo(x.dtype).eps * jnp.abs(before)
 
     def too_long(length):
-        after = potential(increment, x + length * direction)
+        # held vertices have no direction, so that their force does not count
+        after, ahead = jax.value_and_grad(potential, argnums=1)(increment, x + length * direction)
         enough = after <= before + 1e-4 * length * slope + rounding
-        return ~enough & (length > 1e-6)
+        overshot = jnp.sum(direction * ahead) > -0.5 * slope
+        return (~enough | overshot) & (length > 1e-6)
 
     return jax.lax.while_loop(too_long, lambda length: length / 2, jnp.ones((), x.dtype))
 

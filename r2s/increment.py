@@ -23,7 +23,7 @@ from r2s.fabric import Fabric
 from r2s.mesh import Mesh
 from r2s.physics import contact
 from r2s.physics.air import Air
-from r2s.physics.bending import hinge_angle
+from r2s.physics.bending import hinge_angle, unwrapped
 from r2s.physics.contact import Table
 from r2s.physics.membrane import green_strain
 from r2s.units import GRAVITY
@@ -37,6 +37,7 @@ class Increment(eqx.Module):
     - `rate`: of the time-stepping formula, [1/s].
     - `x_anchor`, `v_anchor`: what the formula's velocity [m/s] and acceleration start from.
     - `strain_anchor`, `curvature_anchor`: likewise for the rates of strain [-] and curvature [1/m].
+    - `angles`: of the hinges at the start of the step, [rad].
     - `area_normals`: of the faces at the start of the step, [m^2].
     - `friction_limit`: coefficient times normal force at the start of the step, [N].
     - `wind`: [m/s].
@@ -51,6 +52,7 @@ class Increment(eqx.Module):
     v_anchor: Positions
     strain_anchor: Float[Array, "face 3"]
     curvature_anchor: Float[Array, " hinge"]
+    angles: Float[Array, " hinge"]
     area_normals: Float[Array, "face 3"]
     friction_limit: Float[Array, " vertex"]
     wind: Float[Array, " 3"]
@@ -61,9 +63,13 @@ def strains(mesh: Mesh, x: Positions) -> Float[Array, "face 3"]:
     return jax.vmap(green_strain)(x[mesh.faces], mesh.inverse)
 
 
-def curvatures(mesh: Mesh, x: Positions) -> Float[Array, " hinge"]:
-    """Curvature theta l / A [1/m] of every hinge at positions [m], less that at rest."""
-    angles = jax.vmap(hinge_angle)(x[mesh.hinges])
+def hinge_angles(mesh: Mesh, x: Positions) -> Float[Array, " hinge"]:
+    """Angle [rad] of every hinge at positions [m]."""
+    return jax.vmap(hinge_angle)(x[mesh.hinges])
+
+
+def curvatures(mesh: Mesh, angles: Float[Array, " hinge"]) -> Float[Array, " hinge"]:
+    """Curvature theta l / A [1/m] of hinges at their angles [rad], less that at rest."""
     return angles * mesh.hinge_length / mesh.hinge_area - mesh.rest_curvature
 
 
@@ -107,8 +113,8 @@ def _face_energy(step, corners, face, inverse, area, anchor, normal):
     return area * _strain_energy(step, strain, anchor) + drag
 
 
-def _hinge_energy(step, corners, length, area, rest, anchor):
-    curvature = hinge_angle(corners) * length / area - rest
+def _hinge_energy(step, corners, length, area, rest, anchor, start):
+    curvature = unwrapped(hinge_angle(corners), start) * length / area - rest
     return area * _curvature_energy(step, curvature, anchor)
 
 
@@ -132,7 +138,8 @@ def _faces(step: Increment):
 
 def _hinges(step: Increment):
     mesh = step.mesh
-    return mesh.hinge_length, mesh.hinge_area, mesh.rest_curvature, step.curvature_anchor
+    rest, anchor = mesh.rest_curvature, step.curvature_anchor
+    return mesh.hinge_length, mesh.hinge_area, rest, anchor, step.angles
 
 
 def _vertices(step: Increment):
@@ -207,10 +214,11 @@ def _tension(stress: Float[Array, " 3"]) -> Float[Array, "2 2"]:
     return centre * jnp.eye(2) + slope * deviator
 
 
-def _convex_hinge(step, corners, length, area, rest, anchor):
+def _convex_hinge(step, corners, length, area, rest, anchor, start):
     angle, gradient = jax.value_and_grad(hinge_angle)(corners)
     energy = lambda angle: area * _curvature_energy(step, angle * length / area - rest, anchor)
-    return jax.hessian(energy)(angle) * jnp.einsum("ai,bj->aibj", gradient, gradient)
+    stiffness = jax.hessian(energy)(unwrapped(angle, start))
+    return stiffness * jnp.einsum("ai,bj->aibj", gradient, gradient)
 
 
 def _assemble(mesh: Mesh, faces, hinges, vertices):

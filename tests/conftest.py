@@ -13,7 +13,7 @@ import pytest
 
 from r2s.cloth import Cloth, ClothState
 from r2s.fabric import Fabric
-from r2s.increment import curvatures, strains, vertex_mass
+from r2s.increment import curvatures, hinge_angles, strains, vertex_mass
 from r2s.mesh import Mesh, rectangle
 from r2s.physics.air import Air
 from r2s.physics.contact import Table
@@ -93,7 +93,7 @@ def roll(solver: Cloth, fabric: Fabric, state: ClothState, count: int, path=None
 def stored_energy(mesh: Mesh, fabric: Fabric, x):
     """Energy [J] in the strains and curvatures of a sheet."""
     membrane = jax.vmap(fabric.membrane.energy_density)(strains(mesh, x))
-    bending = jax.vmap(fabric.bending.energy_density)(curvatures(mesh, x))
+    bending = jax.vmap(fabric.bending.energy_density)(curvatures(mesh, hinge_angles(mesh, x)))
     return jnp.sum(mesh.area * membrane) + jnp.sum(mesh.hinge_area * bending)
 
 

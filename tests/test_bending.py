@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r2s.fabric import Fabric
-from r2s.increment import curvatures
+from r2s.increment import curvatures, hinge_angles
 from r2s.mesh import rectangle
-from r2s.physics.bending import hinge_angle
+from r2s.physics.bending import hinge_angle, unwrapped
 
 STIFFNESS = 3e-5  # [N m]
 gradient = jax.jit(jax.grad(hinge_angle))
@@ -20,7 +20,7 @@ angle_of = jax.jit(hinge_angle)
 
 def bending_energy(mesh, x):
     """Energy [J] in the curvatures alone."""
-    return STIFFNESS / 2 * jnp.sum(mesh.hinge_area * curvatures(mesh, x) ** 2)
+    return STIFFNESS / 2 * jnp.sum(mesh.hinge_area * curvatures(mesh, hinge_angles(mesh, x)) ** 2)
 
 
 def rolled(mesh, radius, axis):
@@ -32,7 +32,7 @@ def rolled(mesh, radius, axis):
 
 def test_a_flat_sheet_stores_no_energy(sheet, fabric):
     x = flat(sheet) @ rotation(0.4, 0).T @ rotation(1.1, 2).T
-    assert jnp.max(jnp.abs(curvatures(sheet, x))) < 1e-12
+    assert jnp.max(jnp.abs(curvatures(sheet, hinge_angles(sheet, x)))) < 1e-12
     assert stored_energy(sheet, fabric, x) < 1e-20
 
 
@@ -85,3 +85,11 @@ def test_the_angle_does_not_change_with_rigid_motion():
     direction = jnp.cross(hinge(0.7), jnp.broadcast_to(jnp.array([0.2, -0.5, 1.0]), (4, 3)))
     assert jnp.sum(gradient(hinge(0.7)) * direction) == pytest.approx(0, abs=1e-14)
     assert jnp.sum(gradient(hinge(0.7)), axis=0) == pytest.approx(0, abs=1e-14)
+
+
+@given(angle=st.floats(-np.pi, np.pi), near=st.floats(-10.0, 10.0))
+def test_an_unwrapped_angle_differs_by_whole_turns_and_is_nearest(angle, near):
+    found = float(unwrapped(jnp.asarray(angle), jnp.asarray(near)))
+    turns = (found - angle) / (2 * np.pi)
+    assert turns == pytest.approx(round(turns), abs=1e-9)
+    assert abs(found - near) <= np.pi * (1 + 1e-9)

@@ -329,7 +329,7 @@ def test_the_real_gripper_paths_are_the_documented_ones(real: dict[str, Recordin
         if recording.info.scenario == "lift":
             start, end, offset = (0.002, 0.304, 0.223), (0.001, -0.245, 1.107), 0.0
         else:
-            start, end, offset = (0.002, -0.818, 0.288), (0.001, -0.008, 0.403), -0.025
+            start, end, offset = (0.002, -0.818, 0.288), (0.001, -0.008, 0.403), -0.012
         np.testing.assert_allclose(path[0], np.array(start) * 0.35 + [0, 0, offset], atol=5e-4)
         np.testing.assert_allclose(path[-1], np.array(end) * 0.35 + [0, 0, offset], atol=5e-4)
         held = corner(recording.info.sheet, recording.info.sheet.held[0])

@@ -99,3 +99,16 @@ def test_a_rectangle_needs_positive_sides(size, shape):
 def test_a_rectangle_needs_two_vertices_a_side():
     with pytest.raises(ValueError, match=">= 2 vertices"):
         rectangle((1.0, 1.0), (1, 3))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_faces_that_overlap_are_refused():
+    rest = np.array([[0.0, 0.0], [1.0, 0.0], [0.3, 1.0], [0.7, 1.0]])
+    with pytest.raises(ValueError, match="must not overlap"):
+        Mesh.make(rest, np.array([[0, 1, 2], [0, 1, 3]]))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_mesh_without_faces_is_refused():
+    with pytest.raises(ValueError, match="at least one face"):
+        Mesh.make(np.zeros((3, 2)), np.zeros((0, 3), int))

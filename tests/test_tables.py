@@ -157,7 +157,7 @@ def test_parameters_with_deviations_bounds_and_truth():
         "towel_1",
         "123 ± 12 N/m; truth 100 N/m",  # relative, for the range is logarithmic
         "-0.25 ± 0.10",  # absolute
-        "not determined (1e-07 to 0.001 N m); truth 2.00e-05 N m",
+        "not determined (best fit 1.00e-05 N m); truth 2.00e-05 N m",
         "-",
     )
     assert table.rows[1] == ("rag_1", "-", "-", "-", "0.0100 ± 0.0050 s")

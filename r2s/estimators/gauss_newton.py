@@ -74,7 +74,8 @@ def normal_at(
 
     slope, moved = jax.jacfwd(move, has_aux=True)(place)  # (frame, vertex, axis, place)
     x = _aligned(problem, moved.x, shift)
-    turn = jax.jacfwd(lambda shift: _aligned(problem, moved.x, shift))(shift)
+    realign = lambda unknown: _aligned(problem, moved.x, _split(problem, unknown)[1])
+    turn = jax.jacfwd(realign)(unknown)[..., problem.family.dim :]
     slope = jnp.concatenate([slope, turn], axis=-1)[jnp.array(problem.frames)]
     distance, direction, vertices, weights = _residuals(problem, x)
     picked = jax.vmap(lambda slope, vertices: slope[vertices])(slope, vertices)

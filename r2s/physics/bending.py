@@ -37,3 +37,13 @@ def hinge_angle(corners: Float[Array, "4 3"]) -> Float[Array, ""]:
     normal_right = jnp.cross(right - start, edge)
     sine = jnp.cross(normal_left, normal_right) @ edge / jnp.sqrt(edge @ edge)
     return jnp.arctan2(sine, normal_left @ normal_right)
+
+
+def unwrapped(
+    angle: Float[Array, "*hinge"], near: Float[Array, "*hinge"]
+) -> Float[Array, "*hinge"]:
+    """The angle [rad] plus the whole turns that bring it nearest to another one.
+
+    So that a hinge that folds right over goes on from pi, and does not jump to minus pi.
+    """
+    return angle + 2 * jnp.pi * jnp.round((near - angle) / (2 * jnp.pi))

@@ -1,0 +1,120 @@
+"""Synthetic recordings: what the cameras see, and that a known fabric is found again."""
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from r2s import presets, synthetic
+from r2s.estimators import diffcloud, gauss_newton
+from r2s.estimators.base import Problem, as_json, from_json
+from r2s.family import OrthotropicFamily
+from r2s.observe.camera import Camera
+from r2s.recording import cloud
+from r2s.scenario import from_recording, motion
+from r2s.surface import sample
+
+
+def test_a_camera_sees_the_nearer_of_two_sheets():
+    plane = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 40), np.linspace(-0.1, 0.1, 40)), -1)
+    near = np.concatenate([plane.reshape(-1, 2), np.full((1600, 1), 0.5)], axis=1)
+    far = near - [0, 0, 0.2]
+    camera = Camera(jnp.array([0.0, -0.01, 1.5]), jnp.array([0.0, 0.0, 0.0]))
+    seen = np.asarray(camera.sees(jnp.asarray(np.concatenate([near, far]))))
+    assert seen[:1600].mean() > 0.99
+    assert seen[1600:].mean() < 0.1  # but for the far sheet's edge
+
+
+def test_a_point_projects_where_similar_triangles_say():
+    camera = Camera(jnp.array([0.0, -2.0, 0.0]), jnp.zeros(3))
+    pixel, depth = camera.project(jnp.array([[0.1, 0.0, 0.05]]))
+    assert depth[0] == pytest.approx(2.0)
+    # 200 pixels of focal length; right is +x, down is -z
+    np.testing.assert_allclose(pixel[0], [80 + 200 * 0.05, 60 - 200 * 0.025], atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return synthetic.lift(presets.grey_interlock(), "grey", 1, key=jr.key(0))
+
+
+def test_the_same_key_gives_the_same_recording(recording):
+    again = synthetic.lift(presets.grey_interlock(), "grey", 1, key=jr.key(0))
+    np.testing.assert_array_equal(recording.points, again.points)
+
+
+def test_the_cloud_lies_on_the_sheet_but_for_noise_and_outliers(recording):
+    moved = motion(from_recording(recording), presets.grey_interlock())
+    assert bool(jnp.all(moved.ok))
+    faces = from_recording(recording).scene.mesh.faces
+    surface = np.asarray(sample(moved.x[45], faces, 12))
+    distance = KDTree(surface).query(cloud(recording, 45))[0]
+    stray = np.mean(distance > 0.01)
+    assert 0.002 < stray < 0.02  # one point in a hundred is an outlier
+    # 3-D noise of 1 mm, of which the surface takes up what lies along it
+    assert 0.5e-3 < np.median(distance) < 2.5e-3
+
+
+def test_the_view_is_partial(recording):
+    moved = motion(from_recording(recording), presets.grey_interlock())
+    faces = from_recording(recording).scene.mesh.faces
+    surface = np.asarray(sample(moved.x[40], faces, 8))
+    hidden = KDTree(cloud(recording, 40)).query(surface)[0] > 0.02
+    assert 0.05 < hidden.mean() < 0.95
+
+
+@pytest.fixture(scope="module")
+def small():
+    """A problem of six frames on a coarse sheet, whose truth it can express."""
+    fabric = presets.grey_interlock()
+    knots = [(0.0, 0.0, 0.002), (0.1, 0.1, 0.15), (0.1, 0.1, 0.25)]
+    record = synthetic._record(fabric, "grey", "lift", 1, "origin", knots, (20, 25), jr.key(1))
+    return Problem.make(
+        record, OrthotropicFamily.make(float(fabric.density)), num_points=60, shape=(5, 5)
+    )
+
+
+def test_the_objective_has_the_gradient_that_differences_have(small):
+    """Gauss-Newton's gradient is that of the whole rollout, contact, nearest points and prior."""
+    unknown = jnp.concatenate([jnp.full(7, 0.45), jnp.array([0.1, -0.2, 0.1, 0.3])])
+    prior = jnp.asarray(1e-6)
+    normal = jax.jit(gauss_newton.normal_at)
+    found = normal(small, unknown, prior).gradient
+    for index in range(11):
+        ahead, behind = (
+            normal(small, unknown.at[index].add(sign * 1e-5), prior).objective for sign in (1, -1)
+        )
+        difference = float(ahead - behind) / 2e-5
+        assert float(found[index]) == pytest.approx(difference, rel=1e-4, abs=1e-10)
+
+
+def test_an_estimate_lowers_the_loss_and_survives_its_file(small):
+    found = diffcloud.estimate(small, num_coarse=2, num_starts=1, num_iterations=2, key=jr.key(0))
+    assert np.nanmin(found.losses[-1]) < np.nanmin(found.losses[0])
+    again = from_json(as_json(found))
+    np.testing.assert_allclose(again.values, found.values)
+    np.testing.assert_allclose(again.history, found.history)
+    assert float(again.fabric.membrane.c12) == pytest.approx(float(found.fabric.membrane.c12))
+
+
+def test_the_original_recipe_lowers_its_loss(small):
+    with jax.numpy_dtype_promotion("standard"):  # optax counts its steps in integers
+        found = diffcloud.original(small, small.family.middle(), num_epochs=6)
+    assert found.loss < found.losses[0, 0]
+    assert np.all((found.values > [0.05, 0.1]) & (found.values < [10, 10]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["camel_ponte_roma", "grey_interlock"])
+def test_a_known_fabric_is_found_again(name):
+    """What the lift determines is within 10 % of the truth; what it does not is declared so."""
+    fabric = presets.FIVE[name]()
+    record = synthetic.lift(fabric, name, 1, key=jr.key(0))
+    family = OrthotropicFamily.make(float(fabric.density))
+    found = diffcloud.estimate(Problem.make(record, family), key=jr.key(0))
+    truth = np.asarray(family.values(family.locate(fabric)))
+    assert found.determined.sum() >= 1
+    error = np.abs(found.values / truth - 1)
+    assert np.all(error[found.determined] < 0.1)
