@@ -41,7 +41,7 @@ def estimate(
     *,
     num_coarse: int = 24,
     num_starts: int = 2,
-    num_iterations: int = 12,
+    num_iterations: int = 10,
     patience: int = 3,
     progress: Progress | None = None,
     key: PRNGKeyArray,

@@ -20,7 +20,7 @@ MARGIN = 1e-3  # of the unit cube, so that a start at its edge can move
 PRIOR_DEVIATION = 0.29  # of a uniform prior over the unit cube
 LONGEST_STEP = 0.2  # of a parameter's range
 PATCHES = 3  # along a side of the sheet: points of one patch in one frame err alike
-SPAN = 5  # independent pieces of evidence in a frame, for the weight of the prior
+SPAN = 1  # independent pieces of evidence in a frame, for the weight of the prior
 
 
 class Normal(eqx.Module):

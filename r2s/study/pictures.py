@@ -29,7 +29,7 @@ METRICS = (
     "paper_chamfer",
     "paper_hausdorff",
 )
-LINE_POINTS = 9  # along each parameter
+LINE_POINTS = 7  # along each parameter
 
 
 def picture(out: Path, judged: Judged) -> tuple[tuple[Path, str], ...]:
