@@ -9,6 +9,7 @@ import jax.random as jr
 
 from r2s import manifest, presets, synthetic
 from r2s.fabric import Fabric
+from r2s.family import OrthotropicFamily
 from r2s.recording import Recording
 
 ESTIMATED_FROM, EVALUATED_ON = "lift", "fold"
@@ -55,6 +56,7 @@ def recorded_pairs(folder: Path, density: float, only: str = "") -> list[Pair]:
     `density` is the areal density to assume [kg/m^2]; `only` a regular expression for the names of
     the lifts. Raises what the readers raise, and `ValueError` when there is no pair.
     """
+    OrthotropicFamily.make(density)  # refuses a density that is none, before any reading
     rules = manifest.manifest_for(folder)
     names = manifest.read_recordings(folder, rules, (ESTIMATED_FROM, EVALUATED_ON))
     recordings = {name: manifest.read_recording(folder, rules, name) for name in names}
