@@ -77,15 +77,12 @@ def small():
 
 
 def test_the_objective_has_the_gradient_that_differences_have(small):
-    """Gauss-Newton's gradient is that of the whole rollout, contact, nearest points and prior."""
+    """Gauss-Newton's gradient is that of the whole rollout, contact, and nearest points."""
     unknown = jnp.concatenate([jnp.full(7, 0.45), jnp.array([0.1, -0.2, 0.1, 0.3])])
-    prior = jnp.asarray(1e-6)
     normal = jax.jit(gauss_newton.normal_at)
-    found = normal(small, unknown, prior).gradient
+    found = normal(small, unknown).gradient
     for index in range(11):
-        ahead, behind = (
-            normal(small, unknown.at[index].add(sign * 1e-5), prior).objective for sign in (1, -1)
-        )
+        ahead, behind = (normal(small, unknown.at[index].add(sign * 1e-5)).loss for sign in (1, -1))
         difference = float(ahead - behind) / 2e-5
         assert float(found[index]) == pytest.approx(difference, rel=1e-4, abs=1e-10)
 

@@ -31,9 +31,10 @@ Progress = Callable[[int, float], None]  # told the iteration and the best loss 
 
 # compiled once in a process for all recordings of as many frames, knots and points
 _losses = eqx.filter_jit(eqx.filter_vmap(gauss_newton.loss_at, in_axes=(None, 0)))
-_normals = eqx.filter_jit(eqx.filter_vmap(gauss_newton.normal_at, in_axes=(None, 0, None)))
-_propose = eqx.filter_jit(eqx.filter_vmap(gauss_newton.propose, in_axes=(None, 0)))
-_accept = eqx.filter_jit(eqx.filter_vmap(gauss_newton.accept))
+_normals = eqx.filter_jit(eqx.filter_vmap(gauss_newton.normal_at, in_axes=(None, 0)))
+_propose = eqx.filter_jit(eqx.filter_vmap(gauss_newton.propose, in_axes=(None, 0, None)))
+_accept = eqx.filter_jit(eqx.filter_vmap(gauss_newton.accept, in_axes=(None, 0, 0, 0, None)))
+_objectives = eqx.filter_jit(eqx.filter_vmap(gauss_newton.objective, in_axes=(None, 0, 0, None)))
 
 
 def estimate(
@@ -41,7 +42,7 @@ def estimate(
     *,
     num_coarse: int = 24,
     num_starts: int = 2,
-    num_iterations: int = 10,
+    num_iterations: int = 12,
     patience: int = 3,
     progress: Progress | None = None,
     key: PRNGKeyArray,
@@ -62,14 +63,14 @@ def estimate(
             "units and gripper path, or narrow the family's ranges"
         )
     best = jnp.asarray(np.argsort(losses)[:num_starts])
-    prior = gauss_newton.prior_weight(problem, jnp.asarray(np.nanmin(losses), float))
     descent = Descent(
-        unknowns[best], _normals(problem, unknowns[best], prior), jnp.full(num_starts, 1e-2, float)
+        unknowns[best], _normals(problem, unknowns[best]), jnp.full(num_starts, 1e-2, float)
     )
     rows = [descent]
     for iteration in range(num_iterations):
-        trial = _propose(problem, descent)
-        descent = _accept(descent, trial, _normals(problem, trial, prior))
+        prior = gauss_newton.prior_weight(problem, jnp.min(descent.normal.spread))
+        trial = _propose(problem, descent, prior)
+        descent = _accept(problem, descent, trial, _normals(problem, trial), prior)
         rows.append(descent)
         if _stalled(rows, patience):
             break
@@ -81,17 +82,18 @@ def estimate(
 def _stalled(rows: list[Descent], patience: int) -> bool:
     if len(rows) <= patience:
         return False
-    before, now = (np.asarray(row.normal.objective) for row in (rows[-1 - patience], rows[-1]))
+    before, now = (np.asarray(row.normal.loss) for row in (rows[-1 - patience], rows[-1]))
     return not np.any(now < 0.999 * before)
 
 
 def _collect(problem: Problem, rows: list[Descent], seconds: float) -> Estimate:
     family, last = problem.family, rows[-1]
-    winner = int(np.argmin(np.asarray(last.normal.objective)))
-    unknown = last.unknown[winner]
+    prior = gauss_newton.prior_weight(problem, jnp.min(last.normal.spread))
+    winner = int(np.argmin(_objectives(problem, last.unknown, last.normal.loss, prior)))
+    best = jax.tree.map(lambda leaf: leaf[winner], last)
+    unknown = best.unknown
     place = unknown[: family.dim]
-    inverse = np.linalg.inv(np.asarray(last.normal.matrix[winner], float))
-    covariance = inverse @ np.asarray(last.normal.scatter[winner], float) @ inverse
+    covariance = np.asarray(gauss_newton.covariance(problem, best, prior))
     covariance = covariance[: family.dim, : family.dim]
     deviation = np.sqrt(np.diag(covariance))
     # a place moves a parameter by its range: by that much, or by that ratio's logarithm

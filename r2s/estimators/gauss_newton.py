@@ -24,20 +24,20 @@ SPAN = 1  # independent pieces of evidence in a frame, for the weight of the pri
 
 
 class Normal(eqx.Module):
-    """The objective at an unknown, and its normal equations there.
+    """The loss at an unknown, and its normal equations there, of the clouds alone.
 
-    - `objective`: `loss` and the prior, [m^2]; infinite when the run diverged.
-    - `loss`: robust mean of the clouds alone, [m^2].
-    - `gradient`, `matrix`: of the objective in the unknown, [m^2].
+    - `loss`: robust mean, [m^2]; infinite when the run diverged.
+    - `spread`: robust standard deviation of the distances, [m].
+    - `gradient`, `matrix`: of the loss in the unknown, [m^2].
     - `scatter`: covariance of the gradient, [m^4], from how it varies between patches of the sheet
       and frames (a clustered sandwich): points of one patch and frame err alike.
     """
 
-    objective: Float[Array, ""]
-    loss: Float[Array, ""]
-    gradient: Float[Array, " unknown"]
-    matrix: Float[Array, "unknown unknown"]
-    scatter: Float[Array, "unknown unknown"]
+    loss: Float[Array, "*start"]
+    spread: Float[Array, "*start"]
+    gradient: Float[Array, "*start unknown"]
+    matrix: Float[Array, "*start unknown unknown"]
+    scatter: Float[Array, "*start unknown unknown"]
 
 
 class Descent(eqx.Module):
@@ -62,10 +62,8 @@ def loss_at(problem: Problem, unknown: Float[Array, " unknown"]) -> Float[Array,
     return _loss(problem, moved, distance)
 
 
-def normal_at(
-    problem: Problem, unknown: Float[Array, " unknown"], prior: Float[Array, ""]
-) -> Normal:
-    """Objective, gradient and Gauss-Newton matrix at an unknown."""
+def normal_at(problem: Problem, unknown: Float[Array, " unknown"]) -> Normal:
+    """Loss, gradient and Gauss-Newton matrix at an unknown."""
     place, shift = _split(problem, unknown)
 
     def move(place):
@@ -84,15 +82,13 @@ def normal_at(
         problem.mask, dtype=float
     )
     score = (weight * distance)[..., None] * jacobian
-    loss = _loss(problem, moved, distance)
-    pull, precision = _prior(problem, unknown)
+    seen = jnp.where(problem.mask, distance, jnp.nan)
     return Normal(
-        objective=loss + prior * jnp.sum(pull**2 * precision) / 2,
-        loss=loss,
-        gradient=jnp.sum(score, axis=(0, 1)) + prior * precision * pull,
-        matrix=jnp.einsum("fp,fpu,fpv->uv", weight, jacobian, jacobian)
-        + prior * jnp.diag(precision),
-        scatter=_scatter(problem, score, vertices[..., 0]) + prior**2 * jnp.diag(precision),
+        loss=_loss(problem, moved, distance),
+        spread=1.4826 * jnp.nanmedian(seen),  # the deviation of a normal one with that median
+        gradient=jnp.sum(score, axis=(0, 1)),
+        matrix=jnp.einsum("fp,fpu,fpv->uv", weight, jacobian, jacobian),
+        scatter=_scatter(problem, score, vertices[..., 0]),
     )
 
 
@@ -143,35 +139,61 @@ def _loss(problem: Problem, moved: Trajectory, distance) -> Float[Array, ""]:
     return jnp.where(jnp.all(moved.ok), loss, jnp.inf)
 
 
-def prior_weight(problem: Problem, loss: Float[Array, ""]) -> Float[Array, ""]:
-    """Weight [m^2] of the prior, where `loss` [m^2] is what the best start reached.
+def prior_weight(problem: Problem, spread: Float[Array, ""]) -> Float[Array, ""]:
+    """Weight [m^2] of the prior, where the distances have this spread [m] at the best unknown.
 
-    What no fabric explains is an error that the clouds share, so it counts once in a while only.
+    What no fabric explains is an error that the clouds of a frame share, so it counts once a frame.
     """
-    return 2 * loss / (SPAN * len(problem.frames))
+    return spread**2 / (SPAN * len(problem.frames))
 
 
-def propose(problem: Problem, descent: Descent) -> Float[Array, " unknown"]:
+def objective(problem: Problem, unknown, loss, prior) -> Float[Array, ""]:
+    """Loss and prior [m^2] at an unknown."""
+    pull, precision = _prior(problem, unknown)
+    return loss + prior * jnp.sum(pull**2 * precision) / 2
+
+
+def covariance(problem: Problem, descent: Descent, prior) -> Float[Array, "unknown unknown"]:
+    """Of the unknown, at the end of one descent: the clustered sandwich, with the prior.
+
+    To it comes the square of the Gauss-Newton step that would be next, so that a descent which has
+    not arrived does not claim to know.
+    """
+    pull, precision = _prior(problem, descent.unknown)
+    inverse = jnp.linalg.inv(descent.normal.matrix + prior * jnp.diag(precision))
+    step = inverse @ (descent.normal.gradient + prior * precision * pull)
+    spread = descent.normal.scatter + prior**2 * jnp.diag(precision)
+    return inverse @ spread @ inverse + jnp.outer(step, step)
+
+
+def propose(problem: Problem, descent: Descent, prior) -> Float[Array, " unknown"]:
     """The next unknown to try: a damped Gauss-Newton step, within the unit cube.
 
     What runs into a bound stays there, and the other unknowns take the step alone.
     """
-    normal, unknown = descent.normal, descent.unknown
+    unknown = descent.unknown
+    pull, precision = _prior(problem, unknown)
+    gradient = descent.normal.gradient + prior * precision * pull
+    matrix = descent.normal.matrix + prior * jnp.diag(precision)
     bounded = jnp.arange(unknown.shape[0]) < problem.family.dim
-    damped = normal.matrix + descent.damping * jnp.diag(jnp.diag(normal.matrix))
-    stuck = bounded & (unknown <= MARGIN) & (normal.gradient > 0)
-    stuck |= bounded & (unknown >= 1 - MARGIN) & (normal.gradient < 0)
+    damped = matrix + descent.damping * jnp.diag(jnp.diag(matrix))
+    stuck = bounded & (unknown <= MARGIN) & (gradient > 0)
+    stuck |= bounded & (unknown >= 1 - MARGIN) & (gradient < 0)
     pinned = jnp.where(stuck[:, None] | stuck[None], jnp.diag(jnp.diag(damped)), damped)
-    change = -jnp.linalg.solve(pinned, jnp.where(stuck, 0, normal.gradient))
+    change = -jnp.linalg.solve(pinned, jnp.where(stuck, 0, gradient))
     longest = jnp.max(jnp.where(bounded, jnp.abs(change), 0))
     change = change / jnp.maximum(1, longest / LONGEST_STEP)
     inside = jnp.clip(unknown + change, MARGIN, 1 - MARGIN)
     return jnp.where(bounded, inside, unknown + change)
 
 
-def accept(descent: Descent, trial: Float[Array, " unknown"], tried: Normal) -> Descent:
+def accept(
+    problem: Problem, descent: Descent, trial: Float[Array, " unknown"], tried: Normal, prior
+) -> Descent:
     """The descent after a trial: moved if that lowers the objective, else damped more."""
-    better = tried.objective < descent.normal.objective
+    new = objective(problem, trial, tried.loss, prior)
+    old = objective(problem, descent.unknown, descent.normal.loss, prior)
+    better = new < old
     take = lambda new, old: jnp.where(better, new, old)
     damping = jnp.where(better, descent.damping / 5, descent.damping * 5)
     return Descent(

@@ -27,7 +27,7 @@ class Effort:
 
     num_coarse: int = 24
     num_starts: int = 2
-    num_iterations: int = 10
+    num_iterations: int = 12
     recipe: str = "default"
     seed: int = 0
 
