@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
@@ -85,7 +86,7 @@ def _fake(pair):
     from r2s.family import OrthotropicFamily
 
     family = OrthotropicFamily.make(pair.density)
-    values = np.asarray(family.values(np.full(family.dim, 0.5)))
+    values = np.asarray(family.values(jnp.full(family.dim, 0.5)))
     size = family.dim
     return Estimate(
         "fake", family.middle(), family.ranges, values, np.full(size, np.nan), np.eye(size),

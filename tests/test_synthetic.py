@@ -96,6 +96,7 @@ def test_an_estimate_lowers_the_loss_and_survives_its_file(small):
     assert float(again.fabric.membrane.c12) == pytest.approx(float(found.fabric.membrane.c12))
 
 
+@pytest.mark.slow
 def test_the_original_recipe_lowers_its_loss(small):
     with jax.numpy_dtype_promotion("standard"):  # optax counts its steps in integers
         found = diffcloud.original(small, small.family.middle(), num_epochs=6)
