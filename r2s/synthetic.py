@@ -117,5 +117,5 @@ def _observe_frame(x: Float[Array, "vertex 3"], faces, key):
     stray = low[None] + (high - low)[None] * jr.uniform(key_where, (POINTS, 3), float)
     # one in a hundred, and three at least: a sheet flat on the table gives nothing else
     strays = jnp.maximum(3, OUTLIERS * jnp.sum(seen[order], dtype=float))
-    is_stray = jnp.arange(POINTS) >= POINTS - strays
+    is_stray = jnp.arange(POINTS, dtype=float) >= POINTS - strays
     return jnp.where(is_stray[:, None], stray, points), seen[order] | is_stray
