@@ -31,7 +31,7 @@ def minimise(
 ) -> Positions:
     """Positions [m] that minimise an increment's potential over the `free` vertices.
 
-    Newton's method on a convex stand-in for the Hessian, with a line search, until no coordinate
+    Newton's method (a convex stand-in for the Hessian, then the exact one), until no coordinate
     changes by more than `tolerance` [m]. Its derivative, forward and reverse, is that of the exact
     minimum (implicit function theorem, with the exact Hessian), so it is right as far as the
     iteration converged; NaN when `max_iterations` did not suffice.

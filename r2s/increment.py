@@ -1,6 +1,6 @@
 """The energy that one implicit step minimises.
 
-With the rate matrix of BDF2 (or backward Euler) the velocity at the end of a step is
+With the rate of BDF2 [1/s] the velocity at the end of a step is
 v = rate (x - x_anchor) and the acceleration rate (v - v_anchor), both linear in the new positions
 x. The new positions are then those that minimise the *incremental potential*
 
