@@ -1,6 +1,7 @@
 """The cloth: a sheet of triangles, implicit in time, second order, differentiable."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -76,20 +77,27 @@ class Cloth(eqx.Module):
         bdf2 = lambda now, before: (4 * now - before) / 3
         angles = hinge_angles(mesh, state.x)
         angles_before = unwrapped(hinge_angles(mesh, state.x_before), angles)
+        strain, strain_before = strains(mesh, state.x), strains(mesh, state.x_before)
+        ahead = lambda now, before: 2 * now - before  # second order, like the formula
+        bending = jax.vmap(fabric.bending.at)(
+            mesh.hinge_direction, curvatures(mesh, ahead(angles, angles_before))
+        )
         return Increment(
             mesh=mesh,
             fabric=fabric,
+            membrane=jax.vmap(fabric.membrane.at)(ahead(strain, strain_before)),
+            bending=bending,
             air=self.scene.air,
             table=self.scene.table,
             rate=jnp.asarray(1.5 / self.dt, float),
             x_anchor=bdf2(state.x, state.x_before),
             v_anchor=bdf2(state.v, state.v_before),
-            strain_anchor=bdf2(strains(mesh, state.x), strains(mesh, state.x_before)),
+            strain_anchor=bdf2(strain, strain_before),
             curvature_anchor=curvatures(mesh, bdf2(angles, angles_before)),
             angles=angles,
             area_normals=_area_normals(mesh, state.x),
             friction_limit=fabric.friction * mesh.vertex_area * contact.pressure(depth),
-            wind=control.wind,
+            wind=self.scene.wind_on_faces(ahead(state.x, state.x_before), control.wind),
         )
 
 

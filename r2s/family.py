@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from r2s.fabric import Fabric
+from r2s.fabric import Fabric, constant_laws
 from r2s.physics.bending import HingeBending
 from r2s.physics.membrane import OrthotropicMembrane
 
@@ -102,13 +102,14 @@ class OrthotropicFamily(eqx.Module):
             damping,
             friction,
             self.thickness,
+            jnp.zeros((), float),
         )
 
     def locate(self, fabric: Fabric) -> Float[Array, " dim"]:
         """The point of the unit cube where a fabric lies; outside of it, beyond the bounds."""
-        law = fabric.membrane
+        law, bending = constant_laws(fabric)
         coupling = law.c12 / jnp.sqrt(law.c11 * law.c22)
-        values = (law.c11, law.c22, law.c33, coupling, fabric.bending.stiffness)
+        values = (law.c11, law.c22, law.c33, coupling, bending.stiffness)
         values += (fabric.damping, fabric.friction)
         places = [bound.place(value) for bound, value in zip(self.ranges, values, strict=True)]
         return jnp.stack(places)

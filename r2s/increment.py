@@ -23,9 +23,9 @@ from r2s.fabric import Fabric
 from r2s.mesh import Mesh
 from r2s.physics import contact
 from r2s.physics.air import Air
-from r2s.physics.bending import hinge_angle, unwrapped
+from r2s.physics.bending import BendingLaw, hinge_angle, unwrapped
 from r2s.physics.contact import Table
-from r2s.physics.membrane import green_strain
+from r2s.physics.membrane import MembraneLaw, green_strain
 from r2s.units import GRAVITY
 
 Positions = Float[Array, "vertex 3"]
@@ -40,11 +40,15 @@ class Increment(eqx.Module):
     - `angles`: of the hinges at the start of the step, [rad].
     - `area_normals`: of the faces at the start of the step, [m^2].
     - `friction_limit`: coefficient times normal force at the start of the step, [N].
-    - `wind`: [m/s].
+    - `membrane`, `bending`: the fabric's laws as they stand in this step, one for each face and
+      hinge (`at`).
+    - `wind`: on the faces, [m/s].
     """
 
     mesh: Mesh
     fabric: Fabric
+    membrane: MembraneLaw
+    bending: BendingLaw
     air: Air
     table: Table
     rate: Float[Array, ""]
@@ -55,7 +59,7 @@ class Increment(eqx.Module):
     angles: Float[Array, " hinge"]
     area_normals: Float[Array, "face 3"]
     friction_limit: Float[Array, " vertex"]
-    wind: Float[Array, " 3"]
+    wind: Float[Array, "face 3"]
 
 
 def strains(mesh: Mesh, x: Positions) -> Float[Array, "face 3"]:
@@ -91,55 +95,51 @@ def _viscoelastic(
     return energy_density(strain) + viscosity / 2 * jnp.sum(change * tangent_change)
 
 
-def _strain_energy(step: Increment, strain: Float[Array, " 3"], anchor: Float[Array, " 3"]):
-    viscosity = step.fabric.damping * step.rate
-    return _viscoelastic(step.fabric.membrane.energy_density, strain, anchor, viscosity)
+def _element_energy(step: Increment, law: MembraneLaw | BendingLaw, strain: Array, anchor: Array):
+    return _viscoelastic(law.energy_density, strain, anchor, step.fabric.damping * step.rate)
 
 
-def _curvature_energy(step: Increment, curvature: Float[Array, ""], anchor: Float[Array, ""]):
-    viscosity = step.fabric.damping * step.rate
-    return _viscoelastic(step.fabric.bending.energy_density, curvature, anchor, viscosity)
-
-
-def _drag_energy(step: Increment, face, normal, corners):
+def _drag_energy(step: Increment, face, normal, wind, corners):
     anchor = step.x_anchor[face].mean(axis=0)
     velocity = step.rate * (corners.mean(axis=0) - anchor)
-    return step.air.dissipation(velocity - step.wind, normal) / step.rate
+    return step.air.dissipation(velocity - wind, normal) / step.rate
 
 
-def _face_energy(step, corners, face, inverse, area, anchor, normal):
+def _face_energy(step, corners, face, law, inverse, area, anchor, normal, wind):
     strain = green_strain(corners, inverse)
-    drag = _drag_energy(step, face, normal, corners)
-    return area * _strain_energy(step, strain, anchor) + drag
+    drag = _drag_energy(step, face, normal, wind, corners)
+    return area * _element_energy(step, law, strain, anchor) + drag
 
 
-def _hinge_energy(step, corners, length, area, rest, anchor, start):
+def _hinge_energy(step, corners, law, length, area, rest, anchor, start):
     curvature = unwrapped(hinge_angle(corners), start) * length / area - rest
-    return area * _curvature_energy(step, curvature, anchor)
+    return area * _element_energy(step, law, curvature, anchor)
 
 
 def _vertex_energy(step, x, x_anchor, v_anchor, area, limit):
     mass = step.fabric.density * area
     offset = x - x_anchor - v_anchor / step.rate
     depth = step.table.depth(x, step.fabric.thickness)
-    slip = step.rate * (x - x_anchor)
+    velocity = step.rate * (x - x_anchor)
+    drag = mass * step.fabric.mass_damping / 2 * jnp.sum(velocity**2)
     return (
         mass * step.rate**2 / 2 * jnp.sum(offset**2)
         + mass * GRAVITY * x[2]
         + area * contact.normal_potential(depth)
-        + contact.friction_dissipation(limit, slip) / step.rate
+        + (contact.friction_dissipation(limit, velocity) + drag) / step.rate
     )
 
 
 def _faces(step: Increment):
     mesh = step.mesh
-    return mesh.faces, mesh.inverse, mesh.area, step.strain_anchor, step.area_normals
+    shape = mesh.faces, step.membrane, mesh.inverse, mesh.area
+    return *shape, step.strain_anchor, step.area_normals, step.wind
 
 
 def _hinges(step: Increment):
     mesh = step.mesh
     rest, anchor = mesh.rest_curvature, step.curvature_anchor
-    return mesh.hinge_length, mesh.hinge_area, rest, anchor, step.angles
+    return step.bending, mesh.hinge_length, mesh.hinge_area, rest, anchor, step.angles
 
 
 def _vertices(step: Increment):
@@ -191,15 +191,15 @@ def convex_hessian(step: Increment, x: Positions) -> Float[Array, "coordinate co
     )
 
 
-def _convex_face(step, corners, face, inverse, area, anchor, normal):
+def _convex_face(step, corners, face, law, inverse, area, anchor, normal, wind):
     strain, vjp = jax.vjp(lambda corners: green_strain(corners, inverse), corners)
     jacobian = jax.vmap(vjp)(jnp.eye(3, dtype=strain.dtype))[0]  # (strain, corner, axis)
-    energy = lambda strain: _strain_energy(step, strain, anchor)
+    energy = lambda strain: _element_energy(step, law, strain, anchor)
     stress, tangent = jax.grad(energy)(strain), jax.hessian(energy)(strain)
     material = jnp.einsum("sai,st,tbj->aibj", jacobian, tangent, jacobian)
     shape = jnp.concatenate([-jnp.sum(inverse, axis=0, keepdims=True), inverse])
     geometric = jnp.einsum("as,st,bt,ij->aibj", shape, _tension(stress), shape, jnp.eye(3))
-    drag = jax.hessian(lambda corners: _drag_energy(step, face, normal, corners))(corners)
+    drag = jax.hessian(lambda corners: _drag_energy(step, face, normal, wind, corners))(corners)
     return area * (material + geometric) + drag
 
 
@@ -214,9 +214,9 @@ def _tension(stress: Float[Array, " 3"]) -> Float[Array, "2 2"]:
     return centre * jnp.eye(2) + slope * deviator
 
 
-def _convex_hinge(step, corners, length, area, rest, anchor, start):
+def _convex_hinge(step, corners, law, length, area, rest, anchor, start):
     angle, gradient = jax.value_and_grad(hinge_angle)(corners)
-    energy = lambda angle: area * _curvature_energy(step, angle * length / area - rest, anchor)
+    energy = lambda angle: area * _element_energy(step, law, angle * length / area - rest, anchor)
     stiffness = jax.hessian(energy)(unwrapped(angle, start))
     return stiffness * jnp.einsum("ai,bj->aibj", gradient, gradient)
 

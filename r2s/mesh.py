@@ -15,6 +15,8 @@ class Mesh(eqx.Module):
     - `inverse`: inverse of each face's rest edges, [1/m].
     - `area`, `vertex_area`: rest areas of the faces, and a third of them at each vertex, [m^2].
     - `hinge_length`, `hinge_area`: of each hinge's edge [m], and its two faces together [m^2].
+    - `hinge_direction`: angle between the warp and the line that the hinge bends, which is at right
+      angles to its edge, 0 to pi/2 [rad].
     - `rest_curvature`: of each hinge where it stores no energy, [1/m]; 0 for a flat sheet.
     """
 
@@ -26,6 +28,7 @@ class Mesh(eqx.Module):
     vertex_area: Float[Array, " vertex"]
     hinge_length: Float[Array, " hinge"]
     hinge_area: Float[Array, " hinge"]
+    hinge_direction: Float[Array, " hinge"]
     rest_curvature: Float[Array, " hinge"]
 
     @classmethod
@@ -58,6 +61,7 @@ class Mesh(eqx.Module):
             vertex_area=jnp.asarray(vertex_area, float),
             hinge_length=jnp.asarray(np.linalg.norm(ends, axis=-1), float),
             hinge_area=jnp.asarray(area[hinge_faces].sum(axis=-1), float),
+            hinge_direction=jnp.asarray(np.arctan2(*np.abs(ends.T)), float),
             rest_curvature=jnp.zeros(len(hinges), float),
         )
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s.mesh import Mesh
-from r2s.physics.air import Air
+from r2s.physics.air import Air, Fan
 from r2s.physics.contact import Table
 
 
@@ -14,7 +14,7 @@ class Control(eqx.Module):
     """What grippers and air do: at one step, or with a leading time axis over a motion.
 
     - `handles`: positions of the held vertices at the end of the step, [m].
-    - `wind`: uniform wind, [m/s].
+    - `wind`: [m/s], uniform (3 numbers), or one for each vertex (vertex, 3).
     """
 
     handles: Float[Array, "*time handle 3"]
@@ -27,12 +27,14 @@ class Scene(eqx.Module):
     - `mesh`: the sheet.
     - `held`: the vertices that grippers hold, one a handle.
     - `table`, `air`: the surroundings.
+    - `fan`: where the wind blows; None: everywhere.
     """
 
     mesh: Mesh
     held: Int[Array, " handle"]
     table: Table
     air: Air
+    fan: Fan | None = None
 
     @property
     def is_free(self) -> Bool[Array, " vertex"]:
@@ -44,6 +46,13 @@ class Scene(eqx.Module):
     ) -> Float[Array, "vertex 3"]:
         """Positions with the held vertices put to `handles` [m]."""
         return x.at[self.held].set(handles)
+
+    def wind_on_faces(
+        self, x: Float[Array, "vertex 3"], wind: Float[Array, "*vertex 3"]
+    ) -> Float[Array, "face 3"]:
+        """The wind [m/s] at the middle of every face, of a sheet at `x` [m]."""
+        strength = 1.0 if self.fan is None else self.fan(x)[:, None]
+        return jnp.mean((jnp.broadcast_to(wind, x.shape) * strength)[self.mesh.faces], axis=1)
 
 
 def along_path(

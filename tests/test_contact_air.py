@@ -117,7 +117,7 @@ def test_wind_as_fast_as_the_sheet_exerts_no_drag(sheet, fabric):
 @few
 def test_drag_is_the_pressure_of_the_normal_flow(velocity, normal):
     velocity, normal = jnp.array(velocity), jnp.array(normal)
-    air = Air.make(1.3, 1.7)
+    air = Air.make(1.3, 1.7, 0.0)
     area = float(jnp.linalg.norm(normal))
     flow = float(velocity @ normal) / area
     expected = -1.3 * 1.7 / 2 * abs(flow) * flow * np.asarray(normal)

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from r2s.fabric import Fabric
+from r2s.fabric import Fabric, constant_laws
 from r2s.family import OrthotropicFamily, Range
 from r2s.recording import Recording, subsample
 from r2s.scenario import Scenario, from_recording
@@ -133,17 +133,18 @@ def as_json(estimate: Estimate) -> dict[str, Any]:
 
 
 def _fabric_json(fabric: Fabric) -> dict[str, Any]:
-    law = fabric.membrane
+    law, bending = constant_laws(fabric)
     numbers = {
         "density": (fabric.density, "kg/m^2"),
         "C11": (law.c11, "N/m"),
         "C12": (law.c12, "N/m"),
         "C22": (law.c22, "N/m"),
         "C33": (law.c33, "N/m"),
-        "bending": (fabric.bending.stiffness, "N m"),
+        "bending": (bending.stiffness, "N m"),
         "damping": (fabric.damping, "s"),
         "friction": (fabric.friction, "-"),
         "thickness": (fabric.thickness, "m"),
+        "mass_damping": (fabric.mass_damping, "1/s"),
     }
     return {name: {"value": float(value), "unit": unit} for name, (value, unit) in numbers.items()}
 
@@ -181,6 +182,7 @@ def from_json(stored: dict[str, Any]) -> Estimate:
             numbers["damping"],
             numbers["friction"],
             numbers["thickness"],
+            numbers.get("mass_damping", 0.0),  # not in the files of version 0.1
         ),
         ranges=ranges,
         values=np.array([p["value"] for p in parameters.values()]),

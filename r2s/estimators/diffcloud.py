@@ -5,6 +5,7 @@ Differentiable Simulation and Rendering of Deformable Objects"). `estimate` is r
 `original` follows their recipe.
 """
 
+import dataclasses
 import time
 from collections.abc import Callable
 from typing import Any
@@ -22,8 +23,6 @@ from r2s.estimators.gauss_newton import Descent
 from r2s.fabric import Fabric
 from r2s.family import Range
 from r2s.losses import one_sided_chamfer
-from r2s.physics.bending import HingeBending
-from r2s.physics.membrane import OrthotropicMembrane
 from r2s.scenario import motion
 from r2s.surface import sample
 
@@ -181,15 +180,8 @@ def _multipliers(raw: Float[Array, " 2"]) -> Float[Array, " 2"]:
 
 def _scaled(fabric: Fabric, multipliers: Float[Array, " 2"]) -> Fabric:
     stretch, mass = multipliers
-    law = fabric.membrane
-    return Fabric(
-        fabric.density * mass,
-        OrthotropicMembrane(*(c * stretch for c in (law.c11, law.c12, law.c22, law.c33))),
-        HingeBending(fabric.bending.stiffness),
-        fabric.damping,
-        fabric.friction,
-        fabric.thickness,
-    )
+    law = jax.tree.map(lambda c: c * stretch, fabric.membrane)
+    return dataclasses.replace(fabric, density=fabric.density * mass, membrane=law)
 
 
 def _original_loss(raw, problem, assumed, resolution) -> Float[Array, ""]:
