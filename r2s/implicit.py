@@ -9,16 +9,24 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
-from r2s.increment import Increment, convex_hessian, hessian, imbalance, potential
+from r2s.increment import Increment, hessian, imbalance, potential
+from r2s.linear.cholesky import Factor, factor, solve
+from r2s.linear.pattern import pinned
 
 Positions = Float[Array, "vertex 3"]
-CONVEX_ITERATIONS = 4  # of Newton, before it tries the exact Hessian
+CONVEX_ITERATIONS = 3  # before the exact Hessian is tried
+SLOW = 0.5  # a step that is longer than this much of the one before calls for the exact Hessian,
+STALE = 0.2  # and longer than this much for new factors
+SHORTEST, LONGEST = 1e-6, 64.0  # fractions of a Newton step that are tried
 SAVED = "positions"  # what a checkpointed rollout keeps of a step
 
 
 class _Search(NamedTuple):
     x: Positions
     moved: Float[Array, ""]  # the last change, [m]
+    factors: tuple[Factor, ...]
+    is_stale: Bool[Array, ""]  # whether the next step needs new factors
+    is_exact: Bool[Array, ""]  # whether they are to be of the exact Hessian
     count: Array
 
 
@@ -31,70 +39,92 @@ def minimise(
 ) -> Positions:
     """Positions [m] that minimise an increment's potential over the `free` vertices.
 
-    Newton's method (a convex stand-in for the Hessian, then the exact one), until no coordinate
-    changes by more than `tolerance` [m]. Its derivative, forward and reverse, is that of the exact
-    minimum (implicit function theorem, with the exact Hessian), so it is right as far as the
-    iteration converged; NaN when `max_iterations` did not suffice.
+    Newton's method (a convex stand-in for the Hessian, then the exact one; a factor serves as long
+    as the steps shrink fast), until no coordinate changes by more than `tolerance` [m]. Its
+    derivative, forward and reverse, is that of the exact minimum (implicit function theorem, with
+    the exact Hessian), so it is right as far as the iteration converged; NaN when `max_iterations`
+    did not suffice.
     """
     return _minimise(tolerance, max_iterations, increment, start, free)
 
 
 def _newton(tolerance, max_iterations, increment, start, free):
+    levels = increment.mesh.levels
+
     def iterate(state: _Search) -> _Search:
         force = _masked(imbalance(increment, state.x), free)
-        direction = _direction(increment, state, force, free)
-        length = _line_search(increment, state.x, direction, force)
-        moved = length * jnp.max(jnp.abs(direction))
-        return _Search(state.x + length * direction, moved, state.count + 1)
+        renew = lambda: _search_factors(increment, state, free)
+        factors = jax.lax.cond(state.is_stale, renew, lambda: state.factors)
+        direction = -solve(levels, factors, force)
+        usable = jnp.all(jnp.isfinite(direction))  # an indefinite Hessian has NaN for factors
+        direction = jnp.where(usable, direction, 0)
+        length, found = _line_search(increment, state.x, direction, force)
+        full = jnp.max(jnp.abs(direction))
+        # a search that found nothing has not arrived, however little it moved
+        moved = jnp.where(found, length * full, full)
+        moved = jnp.where(usable | ~state.is_exact, moved, state.moved)
+        return _Search(
+            x=state.x + length * direction,
+            moved=moved,
+            factors=factors,
+            is_stale=~usable | (length != 1) | (moved > STALE * state.moved),
+            is_exact=usable & (moved > SLOW * state.moved) & (state.count >= CONVEX_ITERATIONS),
+            count=state.count + 1,
+        )
 
     def unfinished(state: _Search):
         return (state.moved > tolerance) & (state.count < max_iterations)
 
+    zero, true = jnp.zeros((), int), jnp.ones((), bool)
     infinite = jnp.full((), jnp.inf, start.dtype)
-    found = jax.lax.while_loop(unfinished, iterate, _Search(start, infinite, jnp.zeros((), int)))
+    shapes = jax.eval_shape(lambda: factor(levels, hessian(increment, start)))
+    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    begin = _Search(start, infinite, blank, true, ~true, zero)
+    found = jax.lax.while_loop(unfinished, iterate, begin)
     # a NaN compares false, so that it ends the loop and fails here
     return jnp.where(found.moved <= tolerance, found.x, jnp.nan)
 
 
-def _direction(increment, state, force, free):
-    """A Newton direction [m]: with the exact Hessian where it is positive definite.
-
-    The convex stand-in is cheaper and gets close from afar; next to a buckling shape it converges
-    slowly, and the exact one quadratically.
-    """
-
-    def solve(matrix):
-        factor = jax.scipy.linalg.cho_factor(_pinned(matrix, free))
-        return -jax.scipy.linalg.cho_solve(factor, force.ravel()).reshape(force.shape)
-
-    def convex():
-        return solve(convex_hessian(increment, state.x))
-
-    def exact():
-        direction = solve(hessian(increment, state.x))
-        usable = jnp.all(jnp.isfinite(direction))  # the Cholesky factor of an indefinite one is NaN
-        return jax.lax.cond(usable, lambda: direction, convex)
-
-    return jax.lax.cond(state.count < CONVEX_ITERATIONS, convex, exact)
+def _search_factors(increment, state, free):
+    """Factors of the exact Hessian or of the convex stand-in, at the place of a search."""
+    blocks = hessian(increment, state.x, state.is_exact)
+    return factor(increment.mesh.levels, pinned(increment.mesh.pattern, blocks, free))
 
 
 def _line_search(increment, x, direction, force):
-    """The first of 1, 1/2, 1/4, ... that lowers the potential enough (Armijo) and ends short of
-    where it would rise as steeply as it fell.
+    """How much of a direction to go [-], and whether there is a length that will do.
 
-    The second test is for the last Newton steps, whose gain rounding hides.
+    The first of 1, 1/2, 1/4, ... that lowers the potential enough (Armijo) and ends short of where
+    it would rise as steeply as it fell; the second test is for the last Newton steps, whose gain
+    rounding hides. If that is 1, the last of 1, 2, 4, ... up to which the potential falls steeply:
+    away from a shape that is about to buckle the convex stand-in is far too cautious.
     """
     before, slope = potential(increment, x), jnp.sum(direction * force)
     rounding = 8 * jnp.finfo(x.dtype).eps * jnp.abs(before)
 
-    def too_long(length):
+    def look(length):
         # held vertices have no direction, so that their force does not count
         after, ahead = jax.value_and_grad(potential, argnums=1)(increment, x + length * direction)
         enough = after <= before + 1e-4 * length * slope + rounding
-        overshot = jnp.sum(direction * ahead) > -0.5 * slope
-        return (~enough | overshot) & (length > 1e-6)
+        ahead = jnp.sum(direction * ahead)
+        return enough & (ahead <= -0.5 * slope), enough & (ahead < 0.5 * slope)
 
-    return jax.lax.while_loop(too_long, lambda length: length / 2, jnp.ones((), x.dtype))
+    def unfinished(state):
+        length, (is_fine, is_steep), grows = state
+        return jnp.where(grows, is_steep & (length < LONGEST), ~is_fine & (length > SHORTEST))
+
+    def go_on(state):
+        length, _, grows = state
+        length = jnp.where(grows, 2 * length, length / 2)
+        return length, look(length), grows
+
+    one = jnp.ones((), x.dtype)
+    first = look(one)
+    length, (is_fine, is_steep), grows = jax.lax.while_loop(
+        unfinished, go_on, (one, first, first[1])
+    )
+    length = jnp.where(grows & ~is_fine, length / 2, length)
+    return length, length > SHORTEST
 
 
 @eqx.filter_custom_jvp
@@ -109,13 +139,14 @@ def _minimise_jvp(primals, tangents):
     x = checkpoint_name(_minimise(*primals), SAVED)
     held_dot = jnp.zeros_like(x) if start_dot is None else jnp.where(free[:, None], 0, start_dot)
     _, force_dot = eqx.filter_jvp(imbalance, (increment, x), (increment_dot, held_dot))
-    # an explicit inverse, since its product batches and transposes without another factorisation
-    free_dot = -_one_by_one(_inverse)(increment, x, free) @ _masked(force_dot, free).ravel()
-    return x, held_dot + free_dot.reshape(x.shape)
+    # linear in the right-hand side, so that it batches and transposes with the same factors
+    factors = _one_by_one(_exact_factors)(increment, x, free)
+    return x, held_dot - solve(increment.mesh.levels, factors, _masked(force_dot, free))
 
 
-def _inverse(increment, x, free):
-    return jnp.linalg.inv(_pinned(hessian(increment, x), free))
+def _exact_factors(increment, x, free):
+    blocks = pinned(increment.mesh.pattern, hessian(increment, x), free)
+    return factor(increment.mesh.levels, blocks)
 
 
 def _one_by_one(function):
@@ -133,19 +164,15 @@ def _one_by_one(function):
     def batched(size, is_batched, *args):
         moving, still = eqx.partition(args, tuple(is_batched))
         single = lambda moving: function(*eqx.combine(moving, still))
-        if jax.default_backend() == "cpu":
-            return jax.lax.map(single, moving), True
-        return jax.vmap(single)(moving), True
+        outputs = jax.lax.map(single, moving) if _on_cpu() else jax.vmap(single)(moving)
+        return outputs, jax.tree.map(lambda _: True, outputs)
 
     return call
 
 
+def _on_cpu():
+    return jax.default_backend() == "cpu"
+
+
 def _masked(force: Positions, free: Bool[Array, " vertex"]) -> Positions:
     return jnp.where(free[:, None], force, 0)
-
-
-def _pinned(matrix: Array, free: Bool[Array, " vertex"]) -> Array:
-    """The matrix with rows and columns of held coordinates replaced by those of the identity."""
-    coordinate = jnp.repeat(free, 3)
-    both = coordinate[:, None] & coordinate[None, :]
-    return jnp.where(both, matrix, jnp.diag(jnp.where(coordinate, 0, 1).astype(matrix.dtype)))

@@ -17,18 +17,20 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from r2s.fabric import Fabric
+from r2s.linear.pattern import assemble
 from r2s.mesh import Mesh
 from r2s.physics import contact
 from r2s.physics.air import Air
-from r2s.physics.bending import BendingLaw, hinge_angle, unwrapped
+from r2s.physics.bending import BendingLaw, angle_gradient, hinge_angle, unwrapped
 from r2s.physics.contact import Table
 from r2s.physics.membrane import MembraneLaw, green_strain
 from r2s.units import GRAVITY
 
 Positions = Float[Array, "vertex 3"]
+Blocks = Float[Array, "block 3 3"]
 
 
 class Increment(eqx.Module):
@@ -99,15 +101,14 @@ def _element_energy(step: Increment, law: MembraneLaw | BendingLaw, strain: Arra
     return _viscoelastic(law.energy_density, strain, anchor, step.fabric.damping * step.rate)
 
 
-def _drag_energy(step: Increment, face, normal, wind, corners):
-    anchor = step.x_anchor[face].mean(axis=0)
-    velocity = step.rate * (corners.mean(axis=0) - anchor)
+def _drag_energy(step: Increment, face, normal, wind, middle):
+    velocity = step.rate * (middle - step.x_anchor[face].mean(axis=0))
     return step.air.dissipation(velocity - wind, normal) / step.rate
 
 
 def _face_energy(step, corners, face, law, inverse, area, anchor, normal, wind):
     strain = green_strain(corners, inverse)
-    drag = _drag_energy(step, face, normal, wind, corners)
+    drag = _drag_energy(step, face, normal, wind, corners.mean(axis=0))
     return area * _element_energy(step, law, strain, anchor) + drag
 
 
@@ -164,43 +165,58 @@ def potential(step: Increment, x: Positions) -> Float[Array, ""]:
 imbalance = jax.grad(potential, argnums=1)  # [N]; zero where the forces balance
 
 
-def hessian(step: Increment, x: Positions) -> Float[Array, "coordinate coordinate"]:
-    """Second derivative [N/m] of the potential, exact."""
-    mesh = step.mesh
-    exact = lambda energy: _over(jax.hessian(energy, argnums=1), step)
-    return _assemble(
-        mesh,
-        exact(_face_energy)(x[mesh.faces], *_faces(step)),
-        exact(_hinge_energy)(x[mesh.hinges], *_hinges(step)),
-        exact(_vertex_energy)(x, *_vertices(step)),
-    )
+def hessian(step: Increment, x: Positions, is_exact: Bool[Array, ""] | bool = True) -> Blocks:
+    """Second derivative [N/m] of the potential, as blocks of `mesh.pattern`.
 
-
-def convex_hessian(step: Increment, x: Positions) -> Float[Array, "coordinate coordinate"]:
-    """A positive definite stand-in for `hessian` [N/m], whose Newton steps always descend.
-
-    It leaves out the second derivative of the hinge angle, and the geometric stiffness of
-    compressed directions, as is usual for cloth (Choi and Ko 2002).
+    When not `is_exact`, a positive definite stand-in, whose Newton steps always descend: it leaves
+    out the second derivative of the hinge angle, and the geometric stiffness of compressed
+    directions, as is usual for cloth (Choi and Ko 2002).
     """
-    mesh = step.mesh
-    return _assemble(
-        mesh,
-        _over(_convex_face, step)(x[mesh.faces], *_faces(step)),
-        _over(_convex_hinge, step)(x[mesh.hinges], *_hinges(step)),
+    mesh, is_exact = step.mesh, jnp.asarray(is_exact)
+    corners = x[mesh.hinges]
+    gradients, moments, stiffnesses = _over(_hinge_terms, step)(corners, *_hinges(step))
+    turning = lambda: (
+        moments[:, None, None, None, None] * jax.vmap(jax.jacfwd(angle_gradient))(corners)
+    )
+    bending = stiffnesses[:, None, None, None, None] * jnp.einsum(
+        "hai,hbj->haibj", gradients, gradients
+    )
+    bending += jax.lax.cond(is_exact, turning, lambda: jnp.zeros_like(bending))
+    face = lambda *element: _face_hessian(step, is_exact, *element)
+    return assemble(
+        mesh.pattern,
+        jax.vmap(face)(x[mesh.faces], *_faces(step)),
+        bending,
         _over(jax.hessian(_vertex_energy, argnums=1), step)(x, *_vertices(step)),
     )
 
 
-def _convex_face(step, corners, face, law, inverse, area, anchor, normal, wind):
+def _hinge_terms(step, corners, law, length, area, rest, anchor, start):
+    """Gradient of a hinge's angle, and the derivatives of its energy in the angle."""
+    energy = lambda angle: area * _element_energy(step, law, angle * length / area - rest, anchor)
+    angle = unwrapped(hinge_angle(corners), start)
+    return angle_gradient(corners), jax.grad(energy)(angle), jax.hessian(energy)(angle)
+
+
+def _face_hessian(step, is_exact, corners, face, law, inverse, area, anchor, normal, wind):
+    # exact with all of the stress, since the Green strain is quadratic in the corners
     strain, vjp = jax.vjp(lambda corners: green_strain(corners, inverse), corners)
     jacobian = jax.vmap(vjp)(jnp.eye(3, dtype=strain.dtype))[0]  # (strain, corner, axis)
     energy = lambda strain: _element_energy(step, law, strain, anchor)
     stress, tangent = jax.grad(energy)(strain), jax.hessian(energy)(strain)
     material = jnp.einsum("sai,st,tbj->aibj", jacobian, tangent, jacobian)
     shape = jnp.concatenate([-jnp.sum(inverse, axis=0, keepdims=True), inverse])
-    geometric = jnp.einsum("as,st,bt,ij->aibj", shape, _tension(stress), shape, jnp.eye(3))
-    drag = jax.hessian(lambda corners: _drag_energy(step, face, normal, wind, corners))(corners)
-    return area * (material + geometric) + drag
+    carried = jnp.where(is_exact, _symmetric(stress), _tension(stress))
+    geometric = jnp.einsum("as,st,bt,ij->aibj", shape, carried, shape, jnp.eye(3))
+    drag = jax.hessian(lambda middle: _drag_energy(step, face, normal, wind, middle))(
+        corners.mean(axis=0)
+    )
+    return area * (material + geometric) + jnp.einsum("ab,ij->aibj", jnp.full((3, 3), 1 / 9), drag)
+
+
+def _symmetric(stress: Float[Array, " 3"]) -> Float[Array, "2 2"]:
+    """The matrix of a stress (S11, S22, S12)."""
+    return jnp.stack([jnp.stack([stress[0], stress[2]]), jnp.stack([stress[2], stress[1]])])
 
 
 def _tension(stress: Float[Array, " 3"]) -> Float[Array, "2 2"]:
@@ -209,25 +225,5 @@ def _tension(stress: Float[Array, " 3"]) -> Float[Array, "2 2"]:
     radius = jnp.sqrt(half**2 + stress[2] ** 2)
     high, low = jnp.maximum(mean + radius, 0), jnp.maximum(mean - radius, 0)
     slope = (high - low) / jnp.where(radius > 0, 2 * radius, 1)
-    centre = (high + low) / 2
-    deviator = jnp.stack([jnp.stack([half, stress[2]]), jnp.stack([stress[2], -half])])
-    return centre * jnp.eye(2) + slope * deviator
-
-
-def _convex_hinge(step, corners, law, length, area, rest, anchor, start):
-    angle, gradient = jax.value_and_grad(hinge_angle)(corners)
-    energy = lambda angle: area * _element_energy(step, law, angle * length / area - rest, anchor)
-    stiffness = jax.hessian(energy)(unwrapped(angle, start))
-    return stiffness * jnp.einsum("ai,bj->aibj", gradient, gradient)
-
-
-def _assemble(mesh: Mesh, faces, hinges, vertices):
-    """A dense matrix from the blocks (corner, axis, corner, axis) of the elements."""
-    count = mesh.rest.shape[0]
-    matrix = jnp.zeros((count, 3, count, 3), faces.dtype)
-    for elements, blocks in ((mesh.faces, faces), (mesh.hinges, hinges)):
-        rows, columns = elements[:, :, None], elements[:, None, :]
-        matrix = matrix.at[rows, :, columns, :].add(blocks.transpose(0, 1, 3, 2, 4))
-    every = jnp.arange(count)
-    matrix = matrix.at[every, :, every, :].add(vertices)
-    return matrix.reshape(3 * count, 3 * count)
+    deviator = _symmetric(jnp.stack([half, -half, stress[2]]))
+    return (high + low) / 2 * jnp.eye(2) + slope * deviator

@@ -5,6 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from r2s.linear.dissection import Level, levels
+from r2s.linear.pattern import Pattern
+
 
 class Mesh(eqx.Module):
     """A flat sheet of triangles at rest, with its warp along the first material axis.
@@ -18,6 +21,7 @@ class Mesh(eqx.Module):
     - `hinge_direction`: angle between the warp and the line that the hinge bends, which is at right
       angles to its edge, 0 to pi/2 [rad].
     - `rest_curvature`: of each hinge where it stores no energy, [1/m]; 0 for a flat sheet.
+    - `pattern`, `levels`: of the matrices over its vertices, for their solution.
     """
 
     rest: Float[Array, "vertex 2"]
@@ -30,6 +34,8 @@ class Mesh(eqx.Module):
     hinge_area: Float[Array, " hinge"]
     hinge_direction: Float[Array, " hinge"]
     rest_curvature: Float[Array, " hinge"]
+    pattern: Pattern
+    levels: tuple[Level, ...]
 
     @classmethod
     def make(cls, rest: Float[np.ndarray, "vertex 2"], faces: Int[np.ndarray, "face 3"]) -> "Mesh":
@@ -50,6 +56,7 @@ class Mesh(eqx.Module):
             )
         hinges, hinge_faces = _hinges(faces)
         ends = rest[hinges[:, 0]] - rest[hinges[:, 1]]
+        pattern = Pattern.make(len(rest), faces, hinges)
         vertex_area = np.zeros(len(rest))
         np.add.at(vertex_area, faces.ravel(), np.repeat(area / 3, 3))
         return cls(
@@ -63,6 +70,8 @@ class Mesh(eqx.Module):
             hinge_area=jnp.asarray(area[hinge_faces].sum(axis=-1), float),
             hinge_direction=jnp.asarray(np.arctan2(*np.abs(ends.T)), float),
             rest_curvature=jnp.zeros(len(hinges), float),
+            pattern=pattern,
+            levels=levels(rest, np.asarray(pattern.rows), np.asarray(pattern.columns)),
         )
 
 

@@ -12,6 +12,7 @@ direction across which it bends and its curvature, and `energy_density` of a cur
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -102,19 +103,46 @@ class SpringBending(eqx.Module):
         return self.stiffness / 2 * (1 - jnp.cos(curvature * self.spacing / 2)) ** 2
 
 
+@jax.custom_jvp
 def hinge_angle(corners: Float[Array, "4 3"]) -> Float[Array, ""]:
     """Signed angle [rad] between the normals of two triangles that share an edge.
 
     `corners` [m]: the two ends of the edge, then the two vertices opposite to it. Zero when flat.
-    The angle comes from an arctangent of two arguments, so that its gradient is finite and exact
-    everywhere but at a triangle of no area.
+    The angle comes from an arctangent of two arguments, and its derivative from `angle_gradient`,
+    so that both are finite and exact everywhere but at a triangle of no area.
     """
+    edge, left, right = _normals(corners)
+    sine = jnp.cross(left, right) @ edge / jnp.sqrt(edge @ edge)
+    return jnp.arctan2(sine, left @ right)
+
+
+def angle_gradient(corners: Float[Array, "4 3"]) -> Float[Array, "4 3"]:
+    """Derivative [rad/m] of `hinge_angle` in its corners.
+
+    An opposite vertex turns its triangle by its motion along the normal over its height; what the
+    ends of the edge do follows, since no rigid motion changes the angle.
+    """
+    start, end, to_left, to_right = corners
+    edge, left, right = _normals(corners)
+    length = jnp.sqrt(edge @ edge)
+    of_left, of_right = -length * left / (left @ left), -length * right / (right @ right)
+    share = lambda point: (point - start) @ edge / length**2  # 0 at the start, 1 at the end
+    left_share, right_share = share(to_left), share(to_right)
+    of_end = -left_share * of_left - right_share * of_right
+    of_start = -(1 - left_share) * of_left - (1 - right_share) * of_right
+    return jnp.stack([of_start, of_end, of_left, of_right])
+
+
+@hinge_angle.defjvp
+def _hinge_angle_jvp(primals, tangents):
+    return hinge_angle(*primals), jnp.sum(angle_gradient(*primals) * tangents[0])
+
+
+def _normals(corners):
+    """The edge [m], and the normals of its two triangles, twice as long as their areas [m^2]."""
     start, end, left, right = corners
     edge = end - start
-    normal_left = jnp.cross(edge, left - start)
-    normal_right = jnp.cross(right - start, edge)
-    sine = jnp.cross(normal_left, normal_right) @ edge / jnp.sqrt(edge @ edge)
-    return jnp.arctan2(sine, normal_left @ normal_right)
+    return edge, jnp.cross(edge, left - start), jnp.cross(right - start, edge)
 
 
 def unwrapped(

@@ -1,0 +1,83 @@
+"""Which pairs of vertices share an element, and the sum of element matrices into blocks."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+
+class Pattern(eqx.Module):
+    """The blocks of a sparse symmetric matrix over the vertices of a mesh.
+
+    - `rows`, `columns`: the vertices of every block, both triangles and the diagonal, sorted.
+    - `diagonal`: the block of every vertex with itself.
+    - `faces`, `hinges`: the block to which each pair of corners of an element adds.
+    """
+
+    rows: Int[Array, " block"]
+    columns: Int[Array, " block"]
+    diagonal: Int[Array, " vertex"]
+    faces: Int[Array, "face 3 3"]
+    hinges: Int[Array, "hinge 4 4"]
+
+    @classmethod
+    def make(
+        cls, count: int, faces: Int[np.ndarray, "face 3"], hinges: Int[np.ndarray, "hinge 4"]
+    ) -> "Pattern":
+        """The pattern of `count` vertices and their elements."""
+        every = np.arange(count)
+        keys = [every * count + every]
+        for elements in (faces, hinges):
+            keys.append((elements[:, :, None] * count + elements[:, None, :]).ravel())
+        unique, where = np.unique(np.concatenate(keys), return_inverse=True)
+        ends = np.cumsum([len(part) for part in keys])
+        integers = lambda array: jnp.asarray(array, int)
+        return cls(
+            rows=integers(unique // count),
+            columns=integers(unique % count),
+            diagonal=integers(where[: ends[0]]),
+            faces=integers(where[ends[0] : ends[1]].reshape(-1, 3, 3)),
+            hinges=integers(where[ends[1] :].reshape(-1, 4, 4)),
+        )
+
+
+def assemble(
+    pattern: Pattern,
+    faces: Float[Array, "face 3 3 3 3"],
+    hinges: Float[Array, "hinge 4 3 4 3"],
+    vertices: Float[Array, "vertex 3 3"],
+) -> Float[Array, "block 3 3"]:
+    """The blocks that element matrices (corner, axis, corner, axis) add up to."""
+    blocks = jnp.zeros((pattern.rows.shape[0], 3, 3), vertices.dtype)
+    blocks = blocks.at[pattern.diagonal].add(vertices, unique_indices=True)
+    for slots, matrices in ((pattern.faces, faces), (pattern.hinges, hinges)):
+        blocks = blocks.at[slots].add(matrices.transpose(0, 1, 3, 2, 4))
+    return blocks
+
+
+def pinned(
+    pattern: Pattern, blocks: Float[Array, "block 3 3"], free: Bool[Array, " vertex"]
+) -> Float[Array, "block 3 3"]:
+    """The blocks with rows and columns of vertices that are not free made those of the identity."""
+    both = free[pattern.rows] & free[pattern.columns]
+    blocks = jnp.where(both[:, None, None], blocks, 0)
+    held = jnp.where(free[:, None, None], 0, jnp.eye(3, dtype=blocks.dtype))
+    return blocks.at[pattern.diagonal].add(held, unique_indices=True)
+
+
+def product(
+    pattern: Pattern, blocks: Float[Array, "block 3 3"], x: Float[Array, "vertex 3"]
+) -> Float[Array, "vertex 3"]:
+    """The matrix times a vector."""
+    parts = jnp.einsum("bij,bj->bi", blocks, x[pattern.columns])
+    return jnp.zeros_like(x).at[pattern.rows].add(parts, indices_are_sorted=True)
+
+
+def dense(
+    pattern: Pattern, blocks: Float[Array, "block 3 3"]
+) -> Float[Array, "coordinate coordinate"]:
+    """The matrix with all its zeros, coordinates ordered (vertex, axis)."""
+    count = pattern.diagonal.shape[0]
+    matrix = jnp.zeros((count, 3, count, 3), blocks.dtype)
+    matrix = matrix.at[pattern.rows, :, pattern.columns, :].set(blocks)
+    return matrix.reshape(3 * count, 3 * count)

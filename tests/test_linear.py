@@ -1,0 +1,119 @@
+"""Sparse matrices over a mesh: elements add up, and the factor solves."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.spatial
+
+from r2s.linear.cholesky import factor, solve
+from r2s.linear.dissection import levels
+from r2s.linear.pattern import assemble, dense, pinned, product
+from r2s.mesh import Mesh, rectangle
+
+
+def scattered(count: int) -> Mesh:
+    """The Delaunay triangles of random points."""
+    points = np.random.default_rng(3).random((count, 2))
+    points = points[np.unique(scipy.spatial.Delaunay(points).simplices)]
+    return Mesh.make(points, scipy.spatial.Delaunay(points).simplices)
+
+
+def two_pieces() -> Mesh:
+    """Two sheets that do not touch."""
+    one = rectangle((1.0, 1.0), (6, 7))
+    rest, faces = np.asarray(one.rest), np.asarray(one.faces)
+    return Mesh.make(np.concatenate([rest, rest + [2.0, 0.0]]), np.concatenate([faces, faces + 42]))
+
+
+MESHES = {
+    "one face": lambda: rectangle((1.0, 1.0), (2, 2)),
+    "square": lambda: rectangle((1.0, 1.0), (13, 13)),
+    "strip": lambda: rectangle((1.0, 0.01), (90, 2)),
+    "scattered": lambda: scattered(300),
+    "two pieces": two_pieces,
+}
+
+
+@pytest.fixture(scope="module", params=MESHES)
+def problem(request):
+    """A mesh, and the blocks of a random positive definite matrix over it."""
+    mesh = MESHES[request.param]()
+    random = np.random.default_rng(0)
+
+    def elements(count, corners):
+        roots = random.normal(size=(count, 3 * corners, 3 * corners))
+        return jnp.asarray((roots @ roots.transpose(0, 2, 1)).reshape(-1, corners, 3, corners, 3))
+
+    parts = elements(len(mesh.faces), 3), elements(len(mesh.hinges), 4)
+    vertices = jnp.tile(jnp.eye(3), (len(mesh.rest), 1, 1))
+    return mesh, parts, jax.jit(assemble)(mesh.pattern, *parts, vertices)
+
+
+def test_elements_add_up(problem):
+    mesh, parts, blocks = problem
+    matrix = np.zeros((len(mesh.rest), 3, len(mesh.rest), 3))
+    for elements, matrices in zip((mesh.faces, mesh.hinges), parts, strict=True):
+        for element, part in zip(np.asarray(elements), np.asarray(matrices), strict=True):
+            for i, row in enumerate(element):
+                for j, column in enumerate(element):
+                    matrix[row, :, column] += part[i, :, j]
+    size = 3 * len(mesh.rest)
+    matrix = matrix.reshape(size, size) + np.eye(size)
+    assert np.asarray(dense(mesh.pattern, blocks)) == pytest.approx(matrix, rel=1e-12, abs=1e-9)
+
+
+def test_the_factor_solves(problem):
+    mesh, _, blocks = problem
+    right = jnp.asarray(np.random.default_rng(1).normal(size=(len(mesh.rest), 3)))
+    x = jax.jit(solve)(mesh.levels, jax.jit(factor)(mesh.levels, blocks), right)
+    expected = np.linalg.solve(np.asarray(dense(mesh.pattern, blocks)), right.ravel())
+    assert np.asarray(x).ravel() == pytest.approx(expected, rel=1e-8, abs=1e-9)
+    assert np.asarray(product(mesh.pattern, blocks, x)) == pytest.approx(
+        np.asarray(right), abs=1e-8
+    )
+
+
+def test_every_depth_of_dissection_gives_the_same(problem):
+    mesh, _, blocks = problem
+    right = jnp.ones((len(mesh.rest), 3))
+    expected = solve(mesh.levels, factor(mesh.levels, blocks), right)
+    rows, columns = np.asarray(mesh.pattern.rows), np.asarray(mesh.pattern.columns)
+    for leaf in (6, 1000):
+        others = levels(np.asarray(mesh.rest), rows, columns, leaf)
+        found = solve(others, factor(others, blocks), right)
+        assert np.asarray(found) == pytest.approx(np.asarray(expected), rel=1e-8, abs=1e-10)
+
+
+def test_every_vertex_is_eliminated_once(problem):
+    mesh = problem[0]
+    count = len(mesh.rest)
+    pivots = np.concatenate([np.asarray(level.pivots).ravel() for level in mesh.levels])
+    assert np.array_equal(np.sort(pivots[pivots < count]), np.arange(count))
+
+
+def test_an_indefinite_matrix_has_no_factor(problem):
+    mesh, _, blocks = problem
+    vertex = len(mesh.rest) // 2
+    bad = blocks.at[mesh.pattern.diagonal[vertex], 0, 0].set(-1.0)
+    x = solve(mesh.levels, factor(mesh.levels, bad), jnp.ones((len(mesh.rest), 3)))
+    assert not np.all(np.isfinite(x))
+
+
+def test_held_vertices_do_not_move(problem):
+    mesh, _, blocks = problem
+    free = jnp.ones(len(mesh.rest), bool).at[jnp.array([0, 2])].set(False)
+    right = jnp.where(free[:, None], jnp.ones((len(mesh.rest), 3)), 0.0)
+    x = solve(mesh.levels, factor(mesh.levels, pinned(mesh.pattern, blocks, free)), right)
+    assert np.all(np.asarray(x)[[0, 2]] == 0)
+    force = np.asarray(product(mesh.pattern, blocks, x))[np.asarray(free)]
+    assert force == pytest.approx(np.ones_like(force), abs=1e-8)
+
+
+def test_a_solution_is_transposed_by_itself(problem):
+    mesh, _, blocks = problem
+    factors = factor(mesh.levels, blocks)
+    right, other = jnp.asarray(np.random.default_rng(2).normal(size=(2, len(mesh.rest), 3)))
+    run = lambda b: solve(mesh.levels, factors, b)
+    (back,) = jax.linear_transpose(run, right)(other)
+    assert np.asarray(back) == pytest.approx(np.asarray(run(other)), rel=1e-8, abs=1e-10)
