@@ -1,5 +1,7 @@
 """The cloth: a sheet of triangles, implicit in time, second order, differentiable."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ from jaxtyping import Array, Float
 from r2s.fabric import Fabric
 from r2s.implicit import minimise
 from r2s.increment import Increment, curvatures, hinge_angles, strains
+from r2s.layers import Contacts, settle
 from r2s.mesh import Mesh
 from r2s.physics import contact
 from r2s.physics.bending import unwrapped
@@ -66,7 +69,17 @@ class Cloth(eqx.Module):
         increment = self.increment(fabric, state, control)
         guess = self.scene.place(state.x + self.dt * state.v, control.handles)
         tolerance = self.tolerance or (1e-11 if guess.dtype == jnp.float64 else 1e-6)
-        x = minimise(increment, guess, self.scene.is_free, tolerance, self.max_iterations)
+        free = self.scene.is_free
+
+        def solve(contacts: Contacts | None, guess: Positions) -> Positions:
+            touched = dataclasses.replace(increment, contacts=contacts)
+            return minimise(touched, guess, free, tolerance, self.max_iterations)
+
+        if self.scene.layers is None:
+            x = solve(None, guess)
+        else:
+            about = self.scene.mesh, fabric.thickness, fabric.friction
+            x = settle(self.scene.layers, *about, state.x, guess, solve)
         v = increment.rate * (x - increment.x_anchor)
         return ClothState(x, v, state.x, state.v)
 
@@ -97,6 +110,7 @@ class Cloth(eqx.Module):
             angles=angles,
             area_normals=_area_normals(mesh, state.x),
             friction_limit=fabric.friction * mesh.vertex_area * contact.pressure(depth),
+            layers=self.scene.layers,
             wind=self.scene.wind_on_faces(ahead(state.x, state.x_before), control.wind),
         )
 

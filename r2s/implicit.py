@@ -15,8 +15,8 @@ from r2s.linear.pattern import pinned
 
 Positions = Float[Array, "vertex 3"]
 CONVEX_ITERATIONS = 3  # before the exact Hessian is tried
-SLOW = 0.5  # a step that is longer than this much of the one before calls for the exact Hessian,
-STALE = 0.2  # and longer than this much for new factors
+SLOW = 0.6  # a step that is longer than this much of the one before calls for the exact Hessian,
+STALE = 0.6  # and longer than this much for new factors
 SHORTEST, LONGEST = 1e-6, 64.0  # fractions of a Newton step that are tried
 SAVED = "positions"  # what a checkpointed rollout keeps of a step
 
@@ -26,7 +26,8 @@ class _Search(NamedTuple):
     moved: Float[Array, ""]  # the last change, [m]
     factors: tuple[Factor, ...]
     is_stale: Bool[Array, ""]  # whether the next step needs new factors
-    is_exact: Bool[Array, ""]  # whether they are to be of the exact Hessian
+    exactness: Float[Array, ""]  # of the Hessian that they are to be of
+    limit: Float[Array, ""]  # exactness at which it may be indefinite
     count: Array
 
 
@@ -49,7 +50,7 @@ def minimise(
 
 
 def _newton(tolerance, max_iterations, increment, start, free):
-    levels = increment.mesh.levels
+    levels = increment.levels
 
     def iterate(state: _Search) -> _Search:
         force = _masked(imbalance(increment, state.x), free)
@@ -62,13 +63,16 @@ def _newton(tolerance, max_iterations, increment, start, free):
         full = jnp.max(jnp.abs(direction))
         # a search that found nothing has not arrived, however little it moved
         moved = jnp.where(found, length * full, full)
-        moved = jnp.where(usable | ~state.is_exact, moved, state.moved)
+        moved = jnp.where(usable | (state.exactness == 0), moved, state.moved)
+        is_slow = (moved > SLOW * state.moved) & (state.count >= CONVEX_ITERATIONS)
+        exactness = jnp.where(is_slow, (state.exactness + state.limit) / 2, state.exactness)
         return _Search(
             x=state.x + length * direction,
             moved=moved,
             factors=factors,
             is_stale=~usable | (length != 1) | (moved > STALE * state.moved),
-            is_exact=usable & (moved > SLOW * state.moved) & (state.count >= CONVEX_ITERATIONS),
+            exactness=jnp.where(usable, jnp.minimum(exactness, 1), state.exactness / 2),
+            limit=jnp.where(usable, jnp.minimum(1.2 * state.limit, 2), state.exactness),
             count=state.count + 1,
         )
 
@@ -79,7 +83,8 @@ def _newton(tolerance, max_iterations, increment, start, free):
     infinite = jnp.full((), jnp.inf, start.dtype)
     shapes = jax.eval_shape(lambda: factor(levels, hessian(increment, start)))
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    begin = _Search(start, infinite, blank, true, ~true, zero)
+    none = jnp.zeros((), start.dtype)
+    begin = _Search(start, infinite, blank, true, none, none + 2, zero)
     found = jax.lax.while_loop(unfinished, iterate, begin)
     # a NaN compares false, so that it ends the loop and fails here
     return jnp.where(found.moved <= tolerance, found.x, jnp.nan)
@@ -87,8 +92,8 @@ def _newton(tolerance, max_iterations, increment, start, free):
 
 def _search_factors(increment, state, free):
     """Factors of the exact Hessian or of the convex stand-in, at the place of a search."""
-    blocks = hessian(increment, state.x, state.is_exact)
-    return factor(increment.mesh.levels, pinned(increment.mesh.pattern, blocks, free))
+    blocks = hessian(increment, state.x, state.exactness)
+    return factor(increment.levels, pinned(increment.pattern, blocks, free))
 
 
 def _line_search(increment, x, direction, force):
@@ -141,12 +146,12 @@ def _minimise_jvp(primals, tangents):
     _, force_dot = eqx.filter_jvp(imbalance, (increment, x), (increment_dot, held_dot))
     # linear in the right-hand side, so that it batches and transposes with the same factors
     factors = _one_by_one(_exact_factors)(increment, x, free)
-    return x, held_dot - solve(increment.mesh.levels, factors, _masked(force_dot, free))
+    return x, held_dot - solve(increment.levels, factors, _masked(force_dot, free))
 
 
 def _exact_factors(increment, x, free):
-    blocks = pinned(increment.mesh.pattern, hessian(increment, x), free)
-    return factor(increment.mesh.levels, blocks)
+    blocks = pinned(increment.pattern, hessian(increment, x), free)
+    return factor(increment.levels, blocks)
 
 
 def _one_by_one(function):

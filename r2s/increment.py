@@ -17,10 +17,12 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from r2s.fabric import Fabric
-from r2s.linear.pattern import assemble
+from r2s.layers import Contacts, Layers, contact_energy, contact_hessians
+from r2s.linear.dissection import Level
+from r2s.linear.pattern import Pattern, add_between, assemble
 from r2s.mesh import Mesh
 from r2s.physics import contact
 from r2s.physics.air import Air
@@ -45,6 +47,7 @@ class Increment(eqx.Module):
     - `membrane`, `bending`: the fabric's laws as they stand in this step, one for each face and
       hinge (`at`).
     - `wind`: on the faces, [m/s].
+    - `layers`, `contacts`: of the sheet with itself; None: it passes through itself.
     """
 
     mesh: Mesh
@@ -62,6 +65,18 @@ class Increment(eqx.Module):
     area_normals: Float[Array, "face 3"]
     friction_limit: Float[Array, " vertex"]
     wind: Float[Array, "face 3"]
+    layers: Layers | None = None
+    contacts: Contacts | None = None
+
+    @property
+    def pattern(self) -> Pattern:
+        """The blocks that its Hessian may have."""
+        return self.mesh.pattern if self.layers is None else self.layers.pattern
+
+    @property
+    def levels(self) -> tuple[Level, ...]:
+        """The order in which the Hessian is eliminated."""
+        return self.mesh.levels if self.layers is None else self.layers.levels
 
 
 def strains(mesh: Mesh, x: Positions) -> Float[Array, "face 3"]:
@@ -127,7 +142,7 @@ def _vertex_energy(step, x, x_anchor, v_anchor, area, limit):
         mass * step.rate**2 / 2 * jnp.sum(offset**2)
         + mass * GRAVITY * x[2]
         + area * contact.normal_potential(depth)
-        + (contact.friction_dissipation(limit, velocity) + drag) / step.rate
+        + (contact.friction_dissipation(limit, velocity[:2]) + drag) / step.rate
     )
 
 
@@ -155,40 +170,49 @@ def _over(function, step):
 def potential(step: Increment, x: Positions) -> Float[Array, ""]:
     """The incremental potential [J] at new positions [m]."""
     mesh = step.mesh
-    return (
+    elements = (
         jnp.sum(_over(_face_energy, step)(x[mesh.faces], *_faces(step)))
         + jnp.sum(_over(_hinge_energy, step)(x[mesh.hinges], *_hinges(step)))
         + jnp.sum(_over(_vertex_energy, step)(x, *_vertices(step)))
     )
+    if step.contacts is None:
+        return elements
+    return elements + contact_energy(step.contacts, *_about_layers(step, x))
+
+
+def _about_layers(step: Increment, x: Positions):
+    return step.fabric.thickness, step.rate, x, step.x_anchor
 
 
 imbalance = jax.grad(potential, argnums=1)  # [N]; zero where the forces balance
 
 
-def hessian(step: Increment, x: Positions, is_exact: Bool[Array, ""] | bool = True) -> Blocks:
-    """Second derivative [N/m] of the potential, as blocks of `mesh.pattern`.
+def hessian(step: Increment, x: Positions, exactness: Float[Array, ""] | float = 1.0) -> Blocks:
+    """Second derivative [N/m] of the potential, as blocks of `step.pattern`.
 
-    When not `is_exact`, a positive definite stand-in, whose Newton steps always descend: it leaves
-    out the second derivative of the hinge angle, and the geometric stiffness of compressed
-    directions, as is usual for cloth (Choi and Ko 2002).
+    At an exactness of 0, a positive definite stand-in, whose Newton steps always descend: it
+    leaves out the second derivative of the hinge angle, and the geometric stiffness of compressed
+    directions, as is usual for cloth (Choi and Ko 2002). Between 0 and 1, that fraction of these.
     """
-    mesh, is_exact = step.mesh, jnp.asarray(is_exact)
+    mesh, exactness = step.mesh, jnp.asarray(exactness, x.dtype)
     corners = x[mesh.hinges]
     gradients, moments, stiffnesses = _over(_hinge_terms, step)(corners, *_hinges(step))
-    turning = lambda: (
-        moments[:, None, None, None, None] * jax.vmap(jax.jacfwd(angle_gradient))(corners)
-    )
-    bending = stiffnesses[:, None, None, None, None] * jnp.einsum(
-        "hai,hbj->haibj", gradients, gradients
-    )
-    bending += jax.lax.cond(is_exact, turning, lambda: jnp.zeros_like(bending))
-    face = lambda *element: _face_hessian(step, is_exact, *element)
-    return assemble(
-        mesh.pattern,
+    turns = jax.vmap(jax.jacfwd(angle_gradient))
+    turning = lambda: jnp.einsum("h,haibj->haibj", exactness * moments, turns(corners))
+    bending = jnp.einsum("h,hai,hbj->haibj", stiffnesses, gradients, gradients)
+    bending += jax.lax.cond(exactness > 0, turning, lambda: jnp.zeros_like(bending))
+    face = lambda *element: _face_hessian(step, exactness, *element)
+    blocks = assemble(
+        step.pattern,
         jax.vmap(face)(x[mesh.faces], *_faces(step)),
         bending,
         _over(jax.hessian(_vertex_energy, argnums=1), step)(x, *_vertices(step)),
     )
+    if step.contacts is None:
+        return blocks
+    stencils = step.contacts.stencils
+    between = contact_hessians(step.contacts, *_about_layers(step, x))
+    return add_between(step.pattern, blocks, stencils, between)
 
 
 def _hinge_terms(step, corners, law, length, area, rest, anchor, start):
@@ -198,7 +222,7 @@ def _hinge_terms(step, corners, law, length, area, rest, anchor, start):
     return angle_gradient(corners), jax.grad(energy)(angle), jax.hessian(energy)(angle)
 
 
-def _face_hessian(step, is_exact, corners, face, law, inverse, area, anchor, normal, wind):
+def _face_hessian(step, exactness, corners, face, law, inverse, area, anchor, normal, wind):
     # exact with all of the stress, since the Green strain is quadratic in the corners
     strain, vjp = jax.vjp(lambda corners: green_strain(corners, inverse), corners)
     jacobian = jax.vmap(vjp)(jnp.eye(3, dtype=strain.dtype))[0]  # (strain, corner, axis)
@@ -206,7 +230,7 @@ def _face_hessian(step, is_exact, corners, face, law, inverse, area, anchor, nor
     stress, tangent = jax.grad(energy)(strain), jax.hessian(energy)(strain)
     material = jnp.einsum("sai,st,tbj->aibj", jacobian, tangent, jacobian)
     shape = jnp.concatenate([-jnp.sum(inverse, axis=0, keepdims=True), inverse])
-    carried = jnp.where(is_exact, _symmetric(stress), _tension(stress))
+    carried = exactness * _symmetric(stress) + (1 - exactness) * _tension(stress)
     geometric = jnp.einsum("as,st,bt,ij->aibj", shape, carried, shape, jnp.eye(3))
     drag = jax.hessian(lambda middle: _drag_energy(step, face, normal, wind, middle))(
         corners.mean(axis=0)

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from r2s.layers import Layers
 from r2s.mesh import Mesh
 from r2s.physics.air import Air, Fan
 from r2s.physics.contact import Table
@@ -28,6 +29,7 @@ class Scene(eqx.Module):
     - `held`: the vertices that grippers hold, one a handle.
     - `table`, `air`: the surroundings.
     - `fan`: where the wind blows; None: everywhere.
+    - `layers`: contact of the sheet with itself; None: it passes through itself.
     """
 
     mesh: Mesh
@@ -35,6 +37,7 @@ class Scene(eqx.Module):
     table: Table
     air: Air
     fan: Fan | None = None
+    layers: Layers | None = None
 
     @property
     def is_free(self) -> Bool[Array, " vertex"]:

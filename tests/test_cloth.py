@@ -181,9 +181,9 @@ def disturbed(sheet):
     solver = cloth(sheet, FIRST_ROW, table=0.0, air=AIR_DENSITY)
     fabric = Fabric.make(0.2, LAW, 1e-4)
     # both Hessians and the force, in one compilation
-    matrix = lambda at, x, is_exact: dense(at.mesh.pattern, hessian(at, x, is_exact))
+    matrix = lambda at, x, exactness: dense(at.mesh.pattern, hessian(at, x, exactness))
     both = eqx.filter_jit(
-        lambda at, x: (matrix(at, x, True), matrix(at, x, False), imbalance(at, x))
+        lambda at, x: (matrix(at, x, 1.0), matrix(at, x, 0.0), imbalance(at, x))
     )
 
     def state(seed):

@@ -40,6 +40,16 @@ class Pattern(eqx.Module):
             hinges=integers(where[ends[1] :].reshape(-1, 4, 4)),
         )
 
+    @classmethod
+    def full(
+        cls, count: int, faces: Int[np.ndarray, "face 3"], hinges: Int[np.ndarray, "hinge 4"]
+    ) -> "Pattern":
+        """The pattern in which every pair of `count` vertices has a block."""
+        rows, columns = np.divmod(np.arange(count * count), count)
+        slots = lambda elements: elements[:, :, None] * count + elements[:, None, :]
+        parts = rows, columns, np.arange(count) * (count + 1), slots(faces), slots(hinges)
+        return cls(*(jnp.asarray(part, int) for part in parts))
+
 
 def assemble(
     pattern: Pattern,
@@ -53,6 +63,18 @@ def assemble(
     for slots, matrices in ((pattern.faces, faces), (pattern.hinges, hinges)):
         blocks = blocks.at[slots].add(matrices.transpose(0, 1, 3, 2, 4))
     return blocks
+
+
+def add_between(
+    pattern: Pattern,
+    blocks: Float[Array, "block 3 3"],
+    stencils: Int[Array, "pair 4"],
+    matrices: Float[Array, "pair 4 3 4 3"],
+) -> Float[Array, "block 3 3"]:
+    """The blocks of a full pattern with the matrices of any four vertices added."""
+    count = pattern.diagonal.shape[0]
+    slots = stencils[:, :, None] * count + stencils[:, None, :]
+    return blocks.at[slots].add(matrices.transpose(0, 1, 3, 2, 4))
 
 
 def pinned(

@@ -1,4 +1,4 @@
-"""Contact with a horizontal table: normal pressure, and Coulomb friction made smooth."""
+"""Contact: normal pressure, and Coulomb friction made smooth; a horizontal table."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -39,12 +39,13 @@ def pressure(depth: Float[Array, "*vertex"]) -> Float[Array, "*vertex"]:
 
 
 def friction_dissipation(
-    limit: Float[Array, "*vertex"], velocity: Float[Array, "*vertex 3"]
+    limit: Float[Array, "*vertex"], slip: Float[Array, "*vertex axis"]
 ) -> Float[Array, "*vertex"]:
     """The potential [W] of Coulomb friction, with `limit` [N] = coefficient x normal force.
+
+    `slip` is the velocity along the surface, [m/s].
 
     Its negative gradient in velocity is the friction [N]: `limit` against the sliding direction,
     less below `SLIP_SPEED`.
     """
-    slip = velocity[..., :2]
     return limit * (jnp.sqrt(jnp.sum(slip**2, axis=-1) + SLIP_SPEED**2) - SLIP_SPEED)
