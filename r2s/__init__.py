@@ -4,6 +4,8 @@ In reading order:
 
 - `units`, `fabric`, `presets`, `family`: what a fabric is, and which an estimator may choose.
 - `mesh`, `physics`: the sheet at rest; membrane, bending, air, contact.
+- `neighbours`, `layers`: contact of the sheet with itself.
+- `linear`: sparse matrices over a mesh, and their factor.
 - `increment`, `implicit`, `cloth`: the energy of a step, its minimiser, the solver.
 - `scene`, `solver`, `scenario`: what an experiment fixes, motions over time, lift and fold.
 - `recording`, `clouds`, `manifest`, `synthetic`, `observe`: observations, real and made.
@@ -14,17 +16,19 @@ In reading order:
 from r2s.cloth import Cloth, ClothState
 from r2s.fabric import Fabric
 from r2s.family import OrthotropicFamily
+from r2s.layers import Layers
 from r2s.mesh import Mesh, rectangle
 from r2s.recording import Recording
 from r2s.scenario import Scenario, motion
 from r2s.scene import Control, Scene
-from r2s.solver import Trajectory, simulate
+from r2s.solver import Trajectory, predicted_memory, simulate
 
 __all__ = [
     "Cloth",
     "ClothState",
     "Control",
     "Fabric",
+    "Layers",
     "Mesh",
     "OrthotropicFamily",
     "Recording",
@@ -32,6 +36,7 @@ __all__ = [
     "Scene",
     "Trajectory",
     "motion",
+    "predicted_memory",
     "rectangle",
     "simulate",
 ]

@@ -18,6 +18,8 @@ from r2s.scene import Control, Scene
 
 Positions = Float[Array, "vertex 3"]
 
+MAX_CONTACT_STEP = 1 / 30  # [s]
+
 
 class ClothState(eqx.Module):
     """- `x`, `v`: positions [m] and velocities [m/s], world frame, z up.
@@ -50,6 +52,11 @@ class Cloth(eqx.Module):
     def __check_init__(self):
         if not self.dt > 0:
             raise ValueError(f"dt must be positive, got {self.dt} s")
+        if self.scene.layers is not None and self.dt > MAX_CONTACT_STEP:
+            raise ValueError(
+                f"with contact between layers dt must be at most {MAX_CONTACT_STEP:.4f} s, since "
+                f"contacts are planes that stand still in a step; got {self.dt} s"
+            )
 
     def init(
         self, x: Positions, v: Positions | None = None, acceleration: Positions | None = None

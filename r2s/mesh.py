@@ -8,6 +8,8 @@ from jaxtyping import Array, Float, Int
 from r2s.linear.dissection import Level, levels
 from r2s.linear.pattern import Pattern
 
+SMALLEST, LARGEST = 1e-3, 50.0  # [m], of sheets
+
 
 class Mesh(eqx.Module):
     """A flat sheet of triangles at rest, with its warp along the first material axis.
@@ -42,7 +44,8 @@ class Mesh(eqx.Module):
         """A mesh from material coordinates [m] and triangles.
 
         Raises `ValueError` for wrong shapes, indices out of range, vertices in no face, an edge of
-        more than two faces, and faces that are degenerate or clockwise.
+        more than two faces, faces that are degenerate or clockwise, and a sheet so large or small
+        that its coordinates are hardly in metres.
         """
         rest, faces = np.asarray(rest, float), np.asarray(faces)
         _check(rest, faces)
@@ -87,6 +90,12 @@ def _check(rest: np.ndarray, faces: np.ndarray) -> None:
         raise ValueError(
             f"faces must use each of the vertices 0 to {len(rest) - 1} and no other; "
             f"they go from {faces.min()} to {faces.max()} and leave out {lonely[:5].tolist()}"
+        )
+    extent = float(np.max(np.ptp(rest, axis=0))) if len(rest) else 0.0
+    if not SMALLEST <= extent <= LARGEST:
+        raise ValueError(
+            f"the rest coordinates extend over {extent:g}, expected {SMALLEST} to {LARGEST} m: "
+            "are they in millimetres, or normalised?"
         )
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from r2s.cloth import Cloth
 from r2s.fabric import Fabric
-from r2s.mesh import corner, rectangle
+from r2s.mesh import Mesh, corner, rectangle
 from r2s.physics.air import Air
 from r2s.physics.contact import Table
 from r2s.recording import Recording, SheetPlacement
@@ -31,6 +31,7 @@ class Scenario(eqx.Module):
     - `first_time`: of the first frame, [s].
     - `interval`: between frames, [s].
     - `num_frames`, `lead_in`: frames that count from the first, and frames simulated before it.
+    - `substeps`: steps between frames, from `steps_between`.
     """
 
     scene: Scene
@@ -41,6 +42,7 @@ class Scenario(eqx.Module):
     interval: float = eqx.field(static=True)
     num_frames: int = eqx.field(static=True)
     lead_in: int = eqx.field(static=True)
+    substeps: int = eqx.field(static=True)
 
     def controls(self, substeps: int) -> Control:
         """What the grippers do at the end of every substep, axes (frame, substep)."""
@@ -96,7 +98,29 @@ def from_placement(
         interval=interval,
         num_frames=len(times),
         lead_in=lead_in,
+        substeps=steps_between(interval, mesh, np.asarray(path), np.asarray(path_times)),
     )
+
+
+def steps_between(
+    interval: float,
+    mesh: Mesh,
+    path: Float[np.ndarray, "knot handle 3"],
+    path_times: Float[np.ndarray, " knot"],
+) -> int:
+    """How many steps to make in an interval [s]: the least such that none is above `MAX_STEP`, and
+    that no gripper goes farther in one than the shortest edge of the mesh is long.
+
+    The fabric does not limit the step: the formula is stable for any stiffness, and what is faster
+    than the step is damped.
+    """
+    corners = np.asarray(mesh.rest)[np.asarray(mesh.faces)]
+    edge = np.min(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1))
+    moved = np.linalg.norm(np.diff(path, axis=0), axis=-1)
+    speeds = moved / np.maximum(np.diff(path_times), 1e-9)[:, None]
+    fastest = float(np.max(speeds, initial=0.0))
+    longest = min(MAX_STEP, edge / fastest) if fastest > 0 else MAX_STEP
+    return math.ceil(interval / longest - 1e-9)
 
 
 def from_recording(recording: Recording, shape: tuple[int, int] = (9, 9)) -> Scenario:
@@ -112,12 +136,15 @@ def from_recording(recording: Recording, shape: tuple[int, int] = (9, 9)) -> Sce
     )
 
 
-def motion(scenario: Scenario, fabric: Fabric, max_step: float = MAX_STEP) -> Trajectory:
+def motion(scenario: Scenario, fabric: Fabric, max_step: float | None = None) -> Trajectory:
     """How a fabric moves in a scenario: positions [m] at its frames.
 
-    Steps of equal size fill the time between frames, none above `max_step` [s].
+    Steps of equal size fill the time between frames: the scenario's, or as many as it takes that
+    none is above `max_step` [s].
     """
-    substeps = math.ceil(scenario.interval / max_step - 1e-9)
+    substeps = scenario.substeps
+    if max_step is not None:
+        substeps = math.ceil(scenario.interval / max_step - 1e-9)
     solver = Cloth(scenario.scene, scenario.interval / substeps)
     moved = simulate(solver, fabric, solver.init(scenario.start), scenario.controls(substeps))
     skipped = scenario.lead_in - 1

@@ -214,3 +214,9 @@ def test_pressure_is_that_of_the_table(pressed):
     assert force > 0
     found = np.asarray(push[contacts.stencils[deepest]])
     assert found == pytest.approx(np.asarray(expected), rel=1e-9, abs=1e-12)
+
+
+def test_a_step_too_long_for_contact_is_refused():
+    solver = with_layers(cloth(two_sheets(0.01)[0], dt=1 / 60))
+    with pytest.raises(ValueError, match="at most 0.0333 s.*got 0.05 s"):
+        dataclasses.replace(solver, dt=0.05)

@@ -112,3 +112,9 @@ def test_faces_that_overlap_are_refused():
 def test_a_mesh_without_faces_is_refused():
     with pytest.raises(ValueError, match="at least one face"):
         Mesh.make(np.zeros((3, 2)), np.zeros((0, 3), int))
+
+
+@pytest.mark.parametrize("size", [300.0, 1e-4])
+def test_coordinates_that_are_not_metres_are_refused(size):
+    with pytest.raises(ValueError, match="expected 0.001 to 50.0 m: are they in millimetres"):
+        rectangle((size, size), (3, 3))
