@@ -10,7 +10,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
 from r2s.increment import Increment, hessian, imbalance, potential
-from r2s.linear.cholesky import Factor, factor, solve
+from r2s.linear.factor import Factor, factor, solve
 from r2s.linear.pattern import pinned
 
 Positions = Float[Array, "vertex 3"]
@@ -151,7 +151,8 @@ def _minimise_jvp(primals, tangents):
 
 def _exact_factors(increment, x, free):
     blocks = pinned(increment.pattern, hessian(increment, x), free)
-    return factor(increment.levels, blocks)
+    # where a shape is about to buckle the minimum may be found as a saddle: not definite
+    return factor(increment.levels, blocks, is_definite=False)
 
 
 def _one_by_one(function):

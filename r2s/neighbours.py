@@ -233,6 +233,8 @@ def _of_bodies(extreme, corners, is_edges):
 
 def _compact(mask, capacity):
     """Where a mask is set, in order and padded; which of them are real; whether there are more."""
-    (index,) = jnp.nonzero(mask, size=capacity, fill_value=0)
-    count = jnp.sum(mask)
-    return index, jnp.arange(capacity) < count, count > capacity
+    upto = jnp.cumsum(mask)
+    place = jnp.arange(capacity)
+    is_real = place < upto[-1]
+    index = jnp.searchsorted(upto, place + 1)  # `nonzero`, but several times as fast on a CPU
+    return jnp.where(is_real, index, 0), is_real, upto[-1] > capacity

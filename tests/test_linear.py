@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import scipy.spatial
 
-from r2s.linear.cholesky import factor, solve
 from r2s.linear.dissection import levels
+from r2s.linear.factor import factor, solve
 from r2s.linear.pattern import assemble, dense, pinned, product
 from r2s.mesh import Mesh, rectangle
 
@@ -98,6 +98,18 @@ def test_an_indefinite_matrix_has_no_factor(problem):
     bad = blocks.at[mesh.pattern.diagonal[vertex], 0, 0].set(-1.0)
     x = solve(mesh.levels, factor(mesh.levels, bad), jnp.ones((len(mesh.rest), 3)))
     assert not np.all(np.isfinite(x))
+
+
+def test_an_indefinite_matrix_is_solved_when_asked(problem):
+    mesh, _, blocks = problem
+    vertex = len(mesh.rest) // 2
+    bad = blocks.at[mesh.pattern.diagonal[vertex], 0, 0].add(-500.0)
+    right = jnp.ones((len(mesh.rest), 3))
+    x = solve(mesh.levels, factor(mesh.levels, bad, is_definite=False), right)
+    matrix = np.asarray(dense(mesh.pattern, bad))
+    assert np.linalg.eigvalsh(matrix)[0] < 0
+    expected = np.linalg.solve(matrix, np.ones(len(matrix)))
+    assert np.asarray(x).ravel() == pytest.approx(expected, rel=1e-7, abs=1e-9)
 
 
 def test_held_vertices_do_not_move(problem):

@@ -2,5 +2,5 @@
 
 - `pattern`: which pairs of vertices have a block, and how elements add up to blocks.
 - `dissection`: in which order vertices are eliminated (nested dissection).
-- `cholesky`: the factor of such a matrix, front by front, and solutions with it.
+- `factor`: the factor of such a matrix, front by front, and solutions with it.
 """

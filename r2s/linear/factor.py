@@ -1,4 +1,4 @@
-"""The Cholesky factor of a sparse symmetric matrix of blocks, one batch of fronts a level.
+"""The factor of a sparse symmetric matrix of blocks, one batch of fronts a level.
 
 Levels go from the leaves to the root. A front holds the rows of its pivots, and what its children
 left over for all of its vertices; eliminating the pivots leaves a Schur complement for its parent.
@@ -17,7 +17,7 @@ from r2s.linear.dissection import Level
 class Factor(eqx.Module):
     """The factor of one level's fronts.
 
-    - `inverse`: of the lower Cholesky factor of the pivots.
+    - `inverse`: of the block of the pivots.
     - `coupling`: `inverse` times the block of pivots and boundary.
     """
 
@@ -25,8 +25,14 @@ class Factor(eqx.Module):
     coupling: Float[Array, "node pivot outer"]
 
 
-def factor(levels: Sequence[Level], blocks: Float[Array, "block 3 3"]) -> tuple[Factor, ...]:
-    """The factors of all levels, root first; NaN when the matrix is not positive definite."""
+def factor(
+    levels: Sequence[Level], blocks: Float[Array, "block 3 3"], is_definite: bool = True
+) -> tuple[Factor, ...]:
+    """The factors of all levels, root first.
+
+    With `is_definite` by Cholesky: NaN when the matrix is not positive definite. Without, by
+    elimination with pivoting inside the fronts, for any symmetric matrix but a singular one.
+    """
     blocks = jnp.concatenate([blocks, jnp.zeros((1, 3, 3), blocks.dtype)])
     factors: list[Factor] = []
     schur = None
@@ -37,9 +43,9 @@ def factor(levels: Sequence[Level], blocks: Float[Array, "block 3 3"]) -> tuple[
         if schur is not None:
             left_over = _from_children(level, schur)
             rows, rest = rows + left_over[:, :inner], left_over[:, inner:, inner:]
-        inverse = _inverse_factors(rows[:, :, :inner])
+        inverse = _inverses(rows[:, :, :inner], is_definite)
         coupling = inverse @ rows[:, :, inner:]
-        schur = rest - coupling.mT @ coupling
+        schur = rest - rows[:, :, inner:].mT @ coupling
         factors.append(Factor(inverse, coupling))
     return tuple(factors[::-1])
 
@@ -50,16 +56,14 @@ def solve(
     """The solution of the factored matrix times x = `right`."""
     # padding stays zero: it is coupled to nothing
     b = jnp.concatenate([right, jnp.zeros((1, 3), right.dtype)])
-    halves = []
     for level, part in zip(reversed(levels), reversed(factors), strict=True):
-        half = _times(part.inverse, _flat(b[level.pivots]))
-        b = b.at[level.boundary].add(-_unflat(_times(part.coupling.mT, half)))
-        halves.append(half)
+        b = b.at[level.boundary].add(-_unflat(_times(part.coupling.mT, _flat(b[level.pivots]))))
     x = jnp.zeros_like(b)
-    for level, part, half in zip(levels, factors, reversed(halves), strict=True):
-        half = half - _times(part.coupling, _flat(x[level.boundary]))
+    for level, part in zip(levels, factors, strict=True):
+        alone = _times(part.inverse, _flat(b[level.pivots]))
+        coupled = _times(part.coupling, _flat(x[level.boundary]))
         # each vertex is a pivot once; an addition, since that has a transpose
-        x = x.at[level.pivots].add(_unflat(_times(part.inverse.mT, half)))
+        x = x.at[level.pivots].add(_unflat(alone - coupled))
     return x[:-1]
 
 
@@ -83,14 +87,16 @@ def _from_children(level: Level, schur: Array) -> Array:
     return jnp.sum(pick(schur, places), axis=1)
 
 
-def _inverse_factors(pivots: Array) -> Array:
-    """The inverses of the lower Cholesky factors of a batch of matrices."""
+def _inverses(pivots: Array, is_definite: bool) -> Array:
+    """The inverses of a batch of symmetric matrices."""
 
-    def one(matrix):
+    def definite(matrix):
         lower = jnp.linalg.cholesky(matrix, symmetrize_input=False)
         unit = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
-        return jax.scipy.linalg.solve_triangular(lower, unit, lower=True)
+        inverse = jax.scipy.linalg.solve_triangular(lower, unit, lower=True)
+        return inverse.T @ inverse
 
+    one = definite if is_definite else jnp.linalg.inv
     if pivots.shape[0] == 1:
         return one(pivots[0])[None]
     if jax.default_backend() == "cpu":

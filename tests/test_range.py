@@ -1,0 +1,56 @@
+"""The whole range of fabrics: values and gradients are finite in float32, in air and on a table."""
+
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import cloth, flat
+
+from r2s.fabric import Fabric
+from r2s.mesh import rectangle
+from r2s.scene import Control
+from r2s.solver import simulate
+
+STIFFNESSES = (1.0, 1e2, 1e4)  # [N/m]
+BENDINGS = (1e-7, 1e-5, 1e-3)  # [N m]
+DENSITIES = (0.05, 0.5)  # [kg/m^2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "table",
+    [
+        pytest.param(
+            -jnp.inf, id="air", marks=pytest.mark.xfail(reason="3 of 54 gradients overflow")
+        ),
+        pytest.param(0.0, id="table"),
+    ],
+)
+def test_every_fabric_of_the_range_has_a_finite_gradient(table):
+    with jax.enable_x64(False):
+        mesh = rectangle((0.3, 0.3), (9, 9))
+        solver = cloth(mesh, held=(0,), table=table, air=1.2, dt=1 / 60)
+        along = jnp.minimum(jnp.arange(1, 61) / 60, 1.0)
+        handle = jnp.stack([0.1 * along, 0.1 * along, 1e-3 + 0.2 * along], axis=-1)
+        controls = Control(handle.reshape(20, 3, 1, 3), jnp.zeros((20, 3, 3)))
+        start = solver.init(flat(mesh, 1e-3))
+
+        @eqx.filter_jit
+        def both(fabric):
+            run = lambda fabric: jnp.mean(simulate(solver, fabric, start, controls).x[-1] ** 2)
+            return jax.value_and_grad(run)(fabric)
+
+        failed = []
+        for c11, c22, bending, density in itertools.product(
+            STIFFNESSES, STIFFNESSES, BENDINGS, DENSITIES
+        ):
+            law = (c11, 0.2 * (c11 * c22) ** 0.5, c22, 0.3 * min(c11, c22))
+            value, gradient = both(Fabric.make(density, law, bending))
+            numbers = np.array([value, *jax.tree.leaves(gradient)])
+            assert numbers.dtype == np.float32
+            if not np.all(np.isfinite(numbers)):
+                failed.append((c11, c22, bending, density))
+        assert not failed
