@@ -190,7 +190,8 @@ def colliding(
     none; whether the capacity sufficed.
     """
     gap = CLOSEST * thickness
-    found, overflow = near(layers.pairs, before, after, gap, layers.capacity)
+    drift = jnp.mean(after - before, axis=0)  # no pair comes closer by what all have in common
+    found, overflow = near(layers.pairs, before, after - drift[None], gap, layers.capacity)
     start, end = before[found.stencils], after[found.stencils]
     impact = jax.vmap(time_of_impact, in_axes=(0, 0, 0, None))
     times = jax.lax.stop_gradient(impact(start, end, found.is_edges, gap))

@@ -53,7 +53,10 @@ class Tree(eqx.Module):
 
 
 def all_pairs(faces: Int[np.ndarray, "face 3"]) -> Pairs:
-    """Every pair of a mesh, some 5.5 V^2 for V vertices: edges in ascending order of their ends."""
+    """Every pair of a mesh, some 5.5 V^2 for V vertices; the edges by their ends, lower first.
+
+    Raises `ValueError` when there is none.
+    """
     faces = np.asarray(faces)
     ends, _ = _edges(faces)
     vertex, face = (axis.ravel() for axis in np.indices((faces.max() + 1, len(faces))))
@@ -63,6 +66,8 @@ def all_pairs(faces: Int[np.ndarray, "face 3"]) -> Pairs:
     met = met[np.all(met[:, :1] != met[:, 1:], axis=1)]
     crossed = crossed[np.all(crossed[:, :2, None] != crossed[:, None, 2:], axis=(1, 2))]
     is_edges = np.arange(len(met) + len(crossed)) >= len(met)
+    if not len(is_edges):
+        raise ValueError(f"a mesh of {len(faces)} face(s) has no pairs that share no vertex")
     stencils = jnp.asarray(np.concatenate([met, crossed]), int)
     return Pairs(stencils, jnp.asarray(is_edges), jnp.ones(len(is_edges), bool))
 

@@ -19,7 +19,7 @@ class Control(eqx.Module):
     """
 
     handles: Float[Array, "*time handle 3"]
-    wind: Float[Array, "*time 3"]
+    wind: Float[Array, "*time_and_vertex 3"]
 
 
 class Scene(eqx.Module):

@@ -88,13 +88,13 @@ def test_pressure_begins_at_the_thickness(height, thickness):
     assert force[0] == force[1] == 0
 
 
-@given(st.tuples(*[st.floats(-1, 1)] * 3), st.floats(0, 1))
+@given(st.tuples(*[st.floats(-1, 1)] * 2), st.floats(0, 1))
 @few
 def test_friction_is_within_its_cone_and_against_the_slip(velocity, limit):
     velocity = jnp.array(velocity)
     force = -jax.grad(friction_dissipation, argnums=1)(jnp.array(limit), velocity)
     assert jnp.linalg.norm(force) <= limit * (1 + 1e-12)
-    assert force @ velocity <= 0 and force[2] == 0
+    assert force @ velocity <= 0
 
 
 def test_a_falling_sheet_reaches_its_terminal_velocity(sheet, fabric):

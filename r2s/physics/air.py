@@ -78,7 +78,7 @@ class Fan(eqx.Module):
 
     def __call__(self, points: Float[Array, "point 3"]) -> Float[Array, " point"]:
         """The fraction [-] of the control's wind that blows at each point [m]."""
-        offset = points - self.centre
+        offset = points - self.centre[None]
         along = self.axis / jnp.sqrt(self.axis @ self.axis)
         across = offset - jnp.outer(offset @ along, along)
         distance = jnp.sqrt(jnp.sum(across**2, axis=1) + (self.edge / 4) ** 2)  # smooth on the axis
