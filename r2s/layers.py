@@ -244,10 +244,13 @@ def _append(contacts: Contacts, chosen: Bool[Array, " pair"], *columns: Array) -
     """The contacts with the chosen rows of others after them, as far as there is room."""
     places = contacts.count + jnp.cumsum(chosen) - 1
     places = jnp.where(chosen, places, contacts.area.shape[0])  # out of bounds is dropped
-    names = ("stencils", "weights", "normals", "area", "limit")
-    old = [getattr(contacts, name) for name in names]
-    new = [
-        column.at[places].set(values, mode="drop")
-        for column, values in zip(old, columns, strict=True)
-    ]
-    return Contacts(*new, contacts.count + jnp.sum(chosen))
+    put = lambda column, values: column.at[places].set(values, mode="drop")
+    stencils, weights, normals, area, limit = columns
+    return Contacts(
+        stencils=put(contacts.stencils, stencils),
+        weights=put(contacts.weights, weights),
+        normals=put(contacts.normals, normals),
+        area=put(contacts.area, area),
+        limit=put(contacts.limit, limit),
+        count=contacts.count + jnp.sum(chosen),
+    )

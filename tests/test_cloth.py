@@ -182,9 +182,7 @@ def disturbed(sheet):
     fabric = Fabric.make(0.2, LAW, 1e-4)
     # both Hessians and the force, in one compilation
     matrix = lambda at, x, exactness: dense(at.mesh.pattern, hessian(at, x, exactness))
-    both = eqx.filter_jit(
-        lambda at, x: (matrix(at, x, 1.0), matrix(at, x, 0.0), imbalance(at, x))
-    )
+    both = eqx.filter_jit(lambda at, x: (matrix(at, x, 1.0), matrix(at, x, 0.0), imbalance(at, x)))
 
     def state(seed):
         noise = jnp.asarray(np.random.default_rng(seed).normal(size=(4, 25, 3))) * 5e-3

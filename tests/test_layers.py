@@ -103,7 +103,8 @@ def test_a_layer_rests_on_another_with_its_weight():
     )
     x, area = jnp.asarray(still.x[-1]), mesh.vertex_area
     assert np.max(np.abs(still.v[-1])) < 1e-3
-    contacts, fits = touching(solver.scene.layers, mesh, THICKNESS, jnp.asarray(0.5), x)
+    layers = Layers.make(mesh, 512)
+    contacts, fits = touching(layers, mesh, THICKNESS, jnp.asarray(0.5), x)
     energy = lambda x: contact_energy(contacts, THICKNESS, RATE, x, x)
     push = jax.grad(lambda moved: contact_energy(contacts, THICKNESS, RATE, moved, x))(x)
     weight = 0.2 * GRAVITY * float(jnp.sum(area[16:]))
