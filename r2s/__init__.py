@@ -4,6 +4,7 @@ In reading order:
 
 - `units`, `fabric`, `presets`, `family`: what a fabric is, and which an estimator may choose.
 - `mesh`, `physics`: the sheet at rest; membrane, bending, air, contact.
+- `arcsim`: fabrics from and to ARCSim's material files.
 - `neighbours`, `layers`: contact of the sheet with itself.
 - `linear`: sparse matrices over a mesh, and their factor.
 - `increment`, `implicit`, `cloth`: the energy of a step, its minimiser, the solver.
