@@ -161,7 +161,7 @@ def _step(setting, count, x, v, x_before):
     target = setting.target(dt * (count + 1).astype(float))
     pull = setting.spring[:, None] * (target - x)
     weight = jnp.outer(setting.mass, setting.gravity)
-    force = (weight + pull + _wind(setting, v, x_before)).ravel() + internal
+    force = (weight + pull + wind_force(setting, v, x_before)).ravel() + internal
     lead = dt + setting.damping
     matrix = jnp.diag(jnp.repeat(setting.mass, 3) + dt**2 * spring) + dt * lead * stiffness
     change = dt * (force - (lead * stiffness @ v.ravel() + dt * spring * v.ravel()))
@@ -208,7 +208,7 @@ def _hinge(corners, law, length, area):
     return -jax.grad(energy)(angle) * gradient, stiffness
 
 
-def _wind(setting, v, x_before):
+def wind_force(setting, v, x_before):
     """Force [N] of the air on the vertices, on the faces' rest areas."""
     mesh = setting.mesh
     corners = x_before[mesh.faces]
