@@ -9,6 +9,7 @@ C12 = C33 = shear, where `shear` is the constant of a diagonal. So they can be t
 "hang", whose Poisson's ratio is 1/3, and no other.
 """
 
+import math
 from functools import partial
 
 import jax
@@ -17,6 +18,7 @@ import numpy as np
 import scenes
 from jaxtyping import Array, Float
 
+import r2s
 from r2s.units import GRAVITY
 
 SHEAR = scenes.MEMBRANE[1]  # [N/m]
@@ -72,10 +74,9 @@ def _force(x: Grid, v: Grid, stiffness: dict, damping: float) -> Grid:
     return total
 
 
-def _simulate(parameters: dict, size: int, substeps: int, damping: float) -> scenes.Motion:
+def _simulate(parameters: dict, mesh: r2s.Mesh, substeps: int, damping: float) -> scenes.Motion:
     """The motion of "hang"; `parameters`: areal density [kg/m^2], stiffness of springs [N/m]."""
-    dt = 1 / (60 * substeps)
-    mesh = scenes.sheet(size)
+    dt, size = 1 / (60 * substeps), math.isqrt(len(mesh.rest))
     mass = parameters["density"] * mesh.vertex_area.reshape(size, size, 1)
     is_free = jnp.ones((size, size, 1)).at[0, jnp.array([0, -1])].set(0)
     weight = jnp.array([0.0, 0.0, -GRAVITY])
@@ -106,7 +107,7 @@ def _parameters(stiffness: float) -> dict:
 
 def forward(size: int, substeps: int, damping: float):
     """As `ours.forward`."""
-    simulate = partial(_simulate, size=size, substeps=substeps, damping=damping)
+    simulate = partial(_simulate, mesh=scenes.sheet(size), substeps=substeps, damping=damping)
     run = jax.jit(simulate).lower(_parameters(1.0)).compile()
     return lambda stiffness=1.0: np.asarray(run(_parameters(stiffness)))
 
@@ -114,10 +115,11 @@ def forward(size: int, substeps: int, damping: float):
 def gradient(size: int, substeps: int, damping: float):
     """As `ours.gradient`, in areal density and the stiffness of the springs."""
     arguments = _parameters(1.0)
-    start = scenes.flat(scenes.sheet(size))
+    mesh = scenes.sheet(size)
+    start = scenes.flat(mesh)
 
     def loss(parameters):
-        return scenes.loss(_simulate(parameters, size, substeps, damping), start)
+        return scenes.loss(_simulate(parameters, mesh, substeps, damping), start)
 
     run = jax.jit(jax.value_and_grad(loss)).lower(arguments).compile()
 
