@@ -104,6 +104,16 @@ def test_stiffness_and_its_derivatives_are_finite(lookup, size):
         assert jnp.all(jnp.isfinite(slope(law, strain)))
 
 
+@pytest.mark.parametrize("kind", [TableMembrane, DiffSimTableMembrane])
+def test_single_precision_stays_single_and_finite(kind):
+    with jax.enable_x64(False):
+        law = kind(jnp.asarray(np.asarray(STRETCHING), jnp.float32))
+        for size in (0.0, 1e-30, 1e-12, 1e-4, 0.1):
+            strain = size * jnp.array([1.0, 0.999, -1e-3], jnp.float32)
+            assert look(law, strain).dtype == jnp.float32
+            assert jnp.all(jnp.isfinite(slope(law, strain)))
+
+
 @pytest.mark.parametrize("biaxial", [0.0, 0.05, 0.15])
 def test_stiffness_is_smooth_where_the_principal_stretches_are_equal(biaxial):
     # a step of a thousandth of the blur across the place changes no more than the blur allows
