@@ -15,6 +15,7 @@ from r2s.fabric import Fabric
 from r2s.files import read_json, write_json
 from r2s.physics.bending import HingeBending, OrthotropicBending
 from r2s.physics.membrane import OrthotropicMembrane
+from r2s.physics.plate import OrthotropicPlate, PlateBending
 from r2s.physics.table import (
     HINGE_FACTOR,
     DiffSimTableBending,
@@ -102,7 +103,8 @@ def write_material(
 
     Tables are written as they are. A constant stiffness is written as a table of equal rows, which
     `read_material` with the same `diffsim` reads back as the same stiffness: for DiffSim, which
-    doubles it, as half of it. Damping, friction and thickness are not written.
+    doubles it, as half of it; that of a plate as that of hinges, without its Poisson's ratio.
+    Damping, friction and thickness are not written.
 
     Raises `TypeError` for a law that is neither; `ValueError` for a batch of fabrics, for what
     `read_material` would refuse, and for a constant C12 < 0 with `diffsim`, which takes it for 0.
@@ -146,12 +148,12 @@ def _stretching(law: Any, diffsim: bool) -> np.ndarray:
 def _bending(law: Any) -> np.ndarray:
     if isinstance(law, TableBending | DiffSimTableBending):
         return np.asarray(law.stiffness)
-    if isinstance(law, HingeBending):
+    if isinstance(law, HingeBending | PlateBending):
         return np.full((3, 5), HINGE_FACTOR * np.asarray(law.stiffness))
-    if not isinstance(law, OrthotropicBending):
+    if not isinstance(law, OrthotropicBending | OrthotropicPlate):
         raise TypeError(
-            "a material file holds a TableBending, a DiffSimTableBending, a HingeBending or an "
-            f"OrthotropicBending, got {type(law).__name__}"
+            "a material file holds a TableBending, a DiffSimTableBending, or the constant "
+            f"stiffness of hinges or of a plate, got {type(law).__name__}"
         )
     # an edge along the warp bends the weft
     by_edge = HINGE_FACTOR * np.array([law.weft, law.bias, law.warp])

@@ -9,11 +9,12 @@ from jaxtyping import Array, Float
 
 from r2s.fabric import Fabric
 from r2s.implicit import minimise
-from r2s.increment import Increment, curvatures, hinge_angles, strains
+from r2s.increment import Increment, bends, curvatures, hinge_angles, strains
 from r2s.layers import Contacts, settle
 from r2s.mesh import Mesh
 from r2s.physics import contact
-from r2s.physics.bending import unwrapped
+from r2s.physics.bending import BendingLaw, unwrapped
+from r2s.physics.plate import PlateLaw
 from r2s.scene import Control, Scene
 
 Positions = Float[Array, "vertex 3"]
@@ -99,9 +100,7 @@ class Cloth(eqx.Module):
         angles_before = unwrapped(hinge_angles(mesh, state.x_before), angles)
         strain, strain_before = strains(mesh, state.x), strains(mesh, state.x_before)
         ahead = lambda now, before: 2 * now - before  # second order, like the formula
-        bending = jax.vmap(fabric.bending.at)(
-            mesh.hinge_direction, curvatures(mesh, ahead(angles, angles_before))
-        )
+        bending = _laws(fabric.bending, mesh, curvatures(mesh, ahead(angles, angles_before)))
         return Increment(
             mesh=mesh,
             fabric=fabric,
@@ -120,6 +119,13 @@ class Cloth(eqx.Module):
             layers=self.scene.layers,
             wind=self.scene.wind_on_faces(ahead(state.x, state.x_before), control.wind),
         )
+
+
+def _laws(law: BendingLaw | PlateLaw, mesh: Mesh, hinges: Float[Array, " hinge"]):
+    """The bending law of every face or hinge, from the curvatures [1/m] of the hinges."""
+    if isinstance(law, PlateLaw):
+        return jax.vmap(law.at)(bends(mesh, law, hinges))
+    return jax.vmap(law.at)(mesh.hinge_direction, hinges)
 
 
 def _area_normals(mesh: Mesh, x: Positions) -> Float[Array, "face 3"]:

@@ -6,16 +6,16 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from r2s.physics.bending import HingeBending
 from r2s.physics.membrane import OrthotropicMembrane
+from r2s.physics.plate import PlateBending
 
 
 class Fabric(eqx.Module):
     """A fabric. A leading batch axis on every field makes it a sweep, for `jax.vmap`.
 
     - `density`: areal density, [kg/m^2].
-    - `membrane`, `bending`: the laws of its energies, any `MembraneLaw` [N/m] and `BendingLaw`
-      [N m] of `r2s.physics`.
+    - `membrane`, `bending`: the laws of its energies, any `MembraneLaw` [N/m], and any `PlateLaw`
+      or `BendingLaw` [N m], of `r2s.physics`.
     - `damping`: stiffness-proportional (Kelvin-Voigt) damping time, [s]: the viscous stress is
       `damping` times the stiffness times the rate of strain.
     - `friction`: Coulomb coefficient against the table, [-].
@@ -68,7 +68,7 @@ class Fabric(eqx.Module):
         return cls(
             density=array(density),
             membrane=OrthotropicMembrane(array(c11), array(c12), array(c22), array(c33)),
-            bending=HingeBending(array(bending)),
+            bending=PlateBending.make(bending),
             damping=array(damping),
             friction=array(friction),
             thickness=array(thickness),
@@ -76,12 +76,12 @@ class Fabric(eqx.Module):
         )
 
 
-def constant_laws(fabric: Fabric) -> tuple[OrthotropicMembrane, HingeBending]:
+def constant_laws(fabric: Fabric) -> tuple[OrthotropicMembrane, PlateBending]:
     """The laws of a fabric whose stiffness is constant; raises `TypeError` for another one."""
     membrane, bending = fabric.membrane, fabric.bending
-    if not isinstance(membrane, OrthotropicMembrane) or not isinstance(bending, HingeBending):
+    if not isinstance(membrane, OrthotropicMembrane) or not isinstance(bending, PlateBending):
         raise TypeError(
-            "this needs a fabric of constant stiffness (OrthotropicMembrane, HingeBending), got "
+            "this needs a fabric of constant stiffness (OrthotropicMembrane, PlateBending), got "
             f"{type(membrane).__name__} and {type(bending).__name__}"
         )
     return membrane, bending

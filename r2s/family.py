@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r2s.fabric import Fabric, constant_laws
-from r2s.physics.bending import HingeBending
 from r2s.physics.membrane import OrthotropicMembrane
+from r2s.physics.plate import PlateBending
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class OrthotropicFamily(eqx.Module):
         return Fabric(
             self.density,
             OrthotropicMembrane(c11, c12, c22, c33),
-            HingeBending(bending),
+            PlateBending.make(bending),
             damping,
             friction,
             self.thickness,

@@ -13,6 +13,7 @@ of the step.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -29,6 +30,7 @@ from r2s.physics.air import Air
 from r2s.physics.bending import BendingLaw, angle_gradient, hinge_angle, unwrapped
 from r2s.physics.contact import Table
 from r2s.physics.membrane import MembraneLaw, green_strain
+from r2s.physics.plate import PlateLaw
 from r2s.units import GRAVITY
 
 Positions = Float[Array, "vertex 3"]
@@ -44,8 +46,8 @@ class Increment(eqx.Module):
     - `angles`: of the hinges at the start of the step, [rad].
     - `area_normals`: of the faces at the start of the step, [m^2].
     - `friction_limit`: coefficient times normal force at the start of the step, [N].
-    - `membrane`, `bending`: the fabric's laws as they stand in this step, one for each face and
-      hinge (`at`).
+    - `membrane`, `bending`: the fabric's laws as they stand in this step (`at`), one for each face,
+      and for each face or hinge.
     - `wind`: on the faces, [m/s].
     - `layers`, `contacts`: of the sheet with itself; None: it passes through itself.
     """
@@ -53,7 +55,7 @@ class Increment(eqx.Module):
     mesh: Mesh
     fabric: Fabric
     membrane: MembraneLaw
-    bending: BendingLaw
+    bending: BendingLaw | PlateLaw
     air: Air
     table: Table
     rate: Float[Array, ""]
@@ -99,6 +101,18 @@ def vertex_mass(mesh: Mesh, fabric: Fabric) -> Float[Array, " vertex"]:
     return fabric.density * mesh.vertex_area
 
 
+def bends(
+    mesh: Mesh, law: BendingLaw | PlateLaw, hinges: Float[Array, " hinge"]
+) -> Float[Array, "face 3"] | Float[Array, " hinge"]:
+    """What a law sees [1/m] of hinges' curvatures: these, or those of faces (k11, k22, 2 k12)."""
+    return mesh.patches.curvatures(hinges) if isinstance(law, PlateLaw) else hinges
+
+
+def bending_areas(mesh: Mesh, law: BendingLaw | PlateLaw) -> Float[Array, " element"]:
+    """The areas [m^2] on which a law acts: of the faces, or those of the hinges."""
+    return mesh.area if isinstance(law, PlateLaw) else mesh.hinge_area
+
+
 def _viscoelastic(
     energy_density: Callable[[Array], Array], strain: Array, anchor: Array, viscosity: Array
 ) -> Array:
@@ -112,7 +126,7 @@ def _viscoelastic(
     return energy_density(strain) + viscosity / 2 * jnp.sum(change * tangent_change)
 
 
-def _element_energy(step: Increment, law: MembraneLaw | BendingLaw, strain: Array, anchor: Array):
+def _element_energy(step: Increment, law: Any, strain: Array, anchor: Array):
     return _viscoelastic(law.energy_density, strain, anchor, step.fabric.damping * step.rate)
 
 
@@ -125,11 +139,6 @@ def _face_energy(step, corners, face, law, inverse, area, anchor, normal, wind):
     strain = green_strain(corners, inverse)
     drag = _drag_energy(step, face, normal, wind, corners.mean(axis=0))
     return area * _element_energy(step, law, strain, anchor) + drag
-
-
-def _hinge_energy(step, corners, law, length, area, rest, anchor, start):
-    curvature = unwrapped(hinge_angle(corners), start) * length / area - rest
-    return area * _element_energy(step, law, curvature, anchor)
 
 
 def _vertex_energy(step, x, x_anchor, v_anchor, area, limit):
@@ -152,10 +161,18 @@ def _faces(step: Increment):
     return *shape, step.strain_anchor, step.area_normals, step.wind
 
 
-def _hinges(step: Increment):
-    mesh = step.mesh
-    rest, anchor = mesh.rest_curvature, step.curvature_anchor
-    return step.bending, mesh.hinge_length, mesh.hinge_area, rest, anchor, step.angles
+def _bends(step: Increment, hinges: Float[Array, " hinge"]):
+    see = lambda curvatures: bends(step.mesh, step.bending, curvatures)
+    areas = bending_areas(step.mesh, step.bending)
+    return areas, step.bending, see(hinges), see(step.curvature_anchor)
+
+
+def _bend_energy(step, area, law, curvature, anchor):
+    return area * _element_energy(step, law, curvature, anchor)
+
+
+def _bending_energy(step: Increment, hinges: Float[Array, " hinge"]):
+    return jnp.sum(_over(_bend_energy, step)(*_bends(step, hinges)))
 
 
 def _vertices(step: Increment):
@@ -172,7 +189,7 @@ def potential(step: Increment, x: Positions) -> Float[Array, ""]:
     mesh = step.mesh
     elements = (
         jnp.sum(_over(_face_energy, step)(x[mesh.faces], *_faces(step)))
-        + jnp.sum(_over(_hinge_energy, step)(x[mesh.hinges], *_hinges(step)))
+        + _bending_energy(step, _hinge_curvatures(step, x))
         + jnp.sum(_over(_vertex_energy, step)(x, *_vertices(step)))
     )
     if step.contacts is None:
@@ -182,6 +199,10 @@ def potential(step: Increment, x: Positions) -> Float[Array, ""]:
 
 def _about_layers(step: Increment, x: Positions):
     return step.fabric.thickness, step.rate, x, step.x_anchor
+
+
+def _hinge_curvatures(step: Increment, x: Positions) -> Float[Array, " hinge"]:
+    return curvatures(step.mesh, unwrapped(hinge_angles(step.mesh, x), step.angles))
 
 
 imbalance = jax.grad(potential, argnums=1)  # [N]; zero where the forces balance
@@ -195,18 +216,14 @@ def hessian(step: Increment, x: Positions, exactness: Float[Array, ""] | float =
     directions, as is usual for cloth (Choi and Ko 2002). Between 0 and 1, that fraction of these.
     """
     mesh, exactness = step.mesh, jnp.asarray(exactness, x.dtype)
-    corners = x[mesh.hinges]
-    gradients, moments, stiffnesses = _over(_hinge_terms, step)(corners, *_hinges(step))
-    turns = jax.vmap(jax.jacfwd(angle_gradient))
-    turning = lambda: jnp.einsum("h,haibj->haibj", exactness * moments, turns(corners))
-    bending = jnp.einsum("h,hai,hbj->haibj", stiffnesses, gradients, gradients)
-    bending += jax.lax.cond(exactness > 0, turning, lambda: jnp.zeros_like(bending))
+    hinges, patches = _bending_hessians(step, x, exactness)
     face = lambda *element: _face_hessian(step, exactness, *element)
     blocks = assemble(
         step.pattern,
         jax.vmap(face)(x[mesh.faces], *_faces(step)),
-        bending,
+        hinges,
         _over(jax.hessian(_vertex_energy, argnums=1), step)(x, *_vertices(step)),
+        patches,
     )
     if step.contacts is None:
         return blocks
@@ -215,11 +232,26 @@ def hessian(step: Increment, x: Positions, exactness: Float[Array, ""] | float =
     return add_between(step.pattern, blocks, stencils, between)
 
 
-def _hinge_terms(step, corners, law, length, area, rest, anchor, start):
-    """Gradient of a hinge's angle, and the derivatives of its energy in the angle."""
-    energy = lambda angle: area * _element_energy(step, law, angle * length / area - rest, anchor)
-    angle = unwrapped(hinge_angle(corners), start)
-    return angle_gradient(corners), jax.grad(energy)(angle), jax.hessian(energy)(angle)
+def _bending_hessians(step, x, exactness):
+    """Second derivatives [N/m] of the bending energy: in each hinge, and in each patch if any."""
+    mesh, corners = step.mesh, x[step.mesh.hinges]
+    hinges = _hinge_curvatures(step, x)
+    width = (mesh.hinge_length / mesh.hinge_area)[:, None, None]
+    gradients = width * jax.vmap(angle_gradient)(corners)
+    stiffnesses = _over(jax.hessian(_bend_energy, argnums=3), step)(*_bends(step, hinges))
+
+    def turning():
+        moments = exactness * jax.grad(_bending_energy, argnums=1)(step, hinges)
+        turns = width[..., None, None] * jax.vmap(jax.jacfwd(angle_gradient))(corners)
+        return jnp.einsum("h,haibj->haibj", moments, turns)
+
+    none = lambda: jnp.zeros((*corners.shape, *corners.shape[1:]), x.dtype)
+    of_hinges = jax.lax.cond(exactness > 0, turning, none)
+    if isinstance(step.bending, PlateLaw):
+        bent = mesh.patches.gradients(gradients)
+        return of_hinges, jnp.einsum("fiva,fij,fjwb->fvawb", bent, stiffnesses, bent)
+    along = jnp.einsum("h,hai,hbj->haibj", stiffnesses, gradients, gradients)
+    return of_hinges + along, None
 
 
 def _face_hessian(step, exactness, corners, face, law, inverse, area, anchor, normal, wind):

@@ -55,7 +55,8 @@ class Layers(eqx.Module):
             raise ValueError(
                 f"contact between layers is for meshes of at most {LARGEST} vertices, got {count}"
             )
-        pattern = Pattern.full(count, np.asarray(mesh.faces), np.asarray(mesh.hinges))
+        elements = mesh.faces, mesh.hinges, mesh.patches.vertices
+        pattern = Pattern.full(count, *map(np.asarray, elements))
         whole = levels(
             np.asarray(mesh.rest), np.asarray(pattern.rows), np.asarray(pattern.columns), count
         )

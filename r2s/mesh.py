@@ -7,6 +7,7 @@ from jaxtyping import Array, Float, Int
 
 from r2s.linear.dissection import Level, levels
 from r2s.linear.pattern import Pattern
+from r2s.patches import Patches
 
 SMALLEST, LARGEST = 1e-3, 50.0  # [m], of sheets
 
@@ -23,6 +24,7 @@ class Mesh(eqx.Module):
     - `hinge_direction`: angle between the warp and the line that the hinge bends, which is at right
       angles to its edge, 0 to pi/2 [rad].
     - `rest_curvature`: of each hinge where it stores no energy, [1/m]; 0 for a flat sheet.
+    - `patches`: the faces with the hinges around them.
     - `pattern`, `levels`: of the matrices over its vertices, for their solution.
     """
 
@@ -36,6 +38,7 @@ class Mesh(eqx.Module):
     hinge_area: Float[Array, " hinge"]
     hinge_direction: Float[Array, " hinge"]
     rest_curvature: Float[Array, " hinge"]
+    patches: Patches
     pattern: Pattern
     levels: tuple[Level, ...]
 
@@ -59,7 +62,9 @@ class Mesh(eqx.Module):
             )
         hinges, hinge_faces = _hinges(faces)
         ends = rest[hinges[:, 0]] - rest[hinges[:, 1]]
-        pattern = Pattern.make(len(rest), faces, hinges)
+        patches = Patches.make(rest, faces, hinges)
+        elements = faces, hinges, np.asarray(patches.vertices)
+        pattern = Pattern.make(len(rest), *elements)
         vertex_area = np.zeros(len(rest))
         np.add.at(vertex_area, faces.ravel(), np.repeat(area / 3, 3))
         return cls(
@@ -73,6 +78,7 @@ class Mesh(eqx.Module):
             hinge_area=jnp.asarray(area[hinge_faces].sum(axis=-1), float),
             hinge_direction=jnp.asarray(np.arctan2(*np.abs(ends.T)), float),
             rest_curvature=jnp.zeros(len(hinges), float),
+            patches=patches,
             pattern=pattern,
             levels=levels(rest, np.asarray(pattern.rows), np.asarray(pattern.columns)),
         )
@@ -126,11 +132,16 @@ def _hinges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.reshape(hinges, (-1, 4)).astype(int), np.reshape(pairs, (-1, 2)).astype(int)
 
 
-def rectangle(size: tuple[float, float], shape: tuple[int, int] = (9, 9)) -> Mesh:
+def rectangle(
+    size: tuple[float, float], shape: tuple[int, int] = (9, 9), diagonals: str = "falling"
+) -> Mesh:
     """A rectangle of `size` (warp, weft) [m] with `shape` vertices along warp and weft.
 
-    Vertex (i, j) has the index i * shape[1] + j. The diagonals alternate, so that the mesh favours
-    neither bias direction. Raises `ValueError` when a side is not positive or has no two vertices.
+    Vertex (i, j) has the index i * shape[1] + j. The `diagonals` of its cells are "falling" (from
+    the warp's corner to the weft's, where the sheet bends when its origin is lifted), "rising"
+    (from the origin to the opposite corner) or "alternating" (favours neither, bends too softly).
+
+    Raises `ValueError` when a side is not positive or has no two vertices, or for other diagonals.
     """
     if min(size) <= 0 or min(shape) < 2:
         raise ValueError(f"a rectangle needs sides > 0 m and >= 2 vertices, got {size}, {shape}")
@@ -141,10 +152,19 @@ def rectangle(size: tuple[float, float], shape: tuple[int, int] = (9, 9)) -> Mes
     index = np.arange(rows * columns).reshape(shape)
     a, b = index[:-1, :-1].ravel(), index[1:, :-1].ravel()  # corners (0, 0) and (1, 0) of a cell
     c, d = index[1:, 1:].ravel(), index[:-1, 1:].ravel()
-    even = (np.add.outer(np.arange(rows - 1), np.arange(columns - 1)) % 2 == 0).ravel()[:, None]
-    first = np.where(even, np.stack([a, b, c], 1), np.stack([a, b, d], 1))
-    second = np.where(even, np.stack([a, c, d], 1), np.stack([b, c, d], 1))
+    rises = _rises(diagonals, rows - 1, columns - 1).ravel()[:, None]
+    first = np.where(rises, np.stack([a, b, c], 1), np.stack([a, b, d], 1))
+    second = np.where(rises, np.stack([a, c, d], 1), np.stack([b, c, d], 1))
     return Mesh.make(np.stack([warp.ravel(), weft.ravel()], 1), np.concatenate([first, second]))
+
+
+def _rises(diagonals: str, rows: int, columns: int) -> np.ndarray:
+    """Whether the diagonal of a cell goes from its origin to its opposite corner."""
+    if diagonals == "alternating":
+        return np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0
+    if diagonals not in ("falling", "rising"):
+        raise ValueError(f"diagonals are falling, rising or alternating, got {diagonals!r}")
+    return np.full((rows, columns), diagonals == "rising")
 
 
 def corner(shape: tuple[int, int], name: str) -> int:

@@ -18,7 +18,7 @@ class Control(eqx.Module):
     - `wind`: [m/s], uniform (3 numbers), or one for each vertex (vertex, 3).
     """
 
-    handles: Float[Array, "*time handle 3"]
+    handles: Float[Array, "*time handle axis"]
     wind: Float[Array, "*time_and_vertex 3"]
 
 

@@ -46,7 +46,7 @@ class Trajectory(eqx.Module):
     - `ok`: whether they are finite; False from the frame on in which a run diverged.
     """
 
-    x: Float[Array, "frame vertex 3"]
+    x: Float[Array, "frame vertex axis"]
     ok: Bool[Array, " frame"]
 
 

@@ -5,6 +5,7 @@ a sheet that is free, and one held by its first row.
 """
 
 import equinox as eqx
+import hypothesis
 import jax
 import jax.numpy as jnp
 import jaxtyping
@@ -13,7 +14,7 @@ import pytest
 
 from r2s.cloth import Cloth, ClothState
 from r2s.fabric import Fabric
-from r2s.increment import curvatures, hinge_angles, strains, vertex_mass
+from r2s.increment import bending_areas, bends, curvatures, hinge_angles, strains, vertex_mass
 from r2s.mesh import Mesh, rectangle
 from r2s.physics.air import Air
 from r2s.physics.contact import Table
@@ -21,6 +22,8 @@ from r2s.scene import Control, Scene
 from r2s.units import GRAVITY
 
 jax.config.update("jax_enable_x64", True)
+hypothesis.settings.register_profile("r2s", deadline=None)  # a first example compiles
+hypothesis.settings.load_profile("r2s")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
@@ -93,8 +96,9 @@ def roll(solver: Cloth, fabric: Fabric, state: ClothState, count: int, path=None
 def stored_energy(mesh: Mesh, fabric: Fabric, x):
     """Energy [J] in the strains and curvatures of a sheet."""
     membrane = jax.vmap(fabric.membrane.energy_density)(strains(mesh, x))
-    bending = jax.vmap(fabric.bending.energy_density)(curvatures(mesh, hinge_angles(mesh, x)))
-    return jnp.sum(mesh.area * membrane) + jnp.sum(mesh.hinge_area * bending)
+    hinges = curvatures(mesh, hinge_angles(mesh, x))
+    bending = jax.vmap(fabric.bending.energy_density)(bends(mesh, fabric.bending, hinges))
+    return jnp.sum(mesh.area * membrane) + jnp.sum(bending_areas(mesh, fabric.bending) * bending)
 
 
 @eqx.filter_jit

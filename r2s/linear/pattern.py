@@ -11,7 +11,7 @@ class Pattern(eqx.Module):
 
     - `rows`, `columns`: the vertices of every block, both triangles and the diagonal, sorted.
     - `diagonal`: the block of every vertex with itself.
-    - `faces`, `hinges`: the block to which each pair of corners of an element adds.
+    - `faces`, `hinges`, `patches`: the block to which each pair of vertices of an element adds.
     """
 
     rows: Int[Array, " block"]
@@ -19,15 +19,20 @@ class Pattern(eqx.Module):
     diagonal: Int[Array, " vertex"]
     faces: Int[Array, "face 3 3"]
     hinges: Int[Array, "hinge 4 4"]
+    patches: Int[Array, "face 6 6"]
 
     @classmethod
     def make(
-        cls, count: int, faces: Int[np.ndarray, "face 3"], hinges: Int[np.ndarray, "hinge 4"]
+        cls,
+        count: int,
+        faces: Int[np.ndarray, "face 3"],
+        hinges: Int[np.ndarray, "hinge 4"],
+        patches: Int[np.ndarray, "face 6"],
     ) -> "Pattern":
         """The pattern of `count` vertices and their elements."""
         every = np.arange(count)
         keys = [every * count + every]
-        for elements in (faces, hinges):
+        for elements in (faces, hinges, patches):
             keys.append((elements[:, :, None] * count + elements[:, None, :]).ravel())
         unique, where = np.unique(np.concatenate(keys), return_inverse=True)
         ends = np.cumsum([len(part) for part in keys])
@@ -37,17 +42,23 @@ class Pattern(eqx.Module):
             columns=integers(unique % count),
             diagonal=integers(where[: ends[0]]),
             faces=integers(where[ends[0] : ends[1]].reshape(-1, 3, 3)),
-            hinges=integers(where[ends[1] :].reshape(-1, 4, 4)),
+            hinges=integers(where[ends[1] : ends[2]].reshape(-1, 4, 4)),
+            patches=integers(where[ends[2] :].reshape(-1, 6, 6)),
         )
 
     @classmethod
     def full(
-        cls, count: int, faces: Int[np.ndarray, "face 3"], hinges: Int[np.ndarray, "hinge 4"]
+        cls,
+        count: int,
+        faces: Int[np.ndarray, "face 3"],
+        hinges: Int[np.ndarray, "hinge 4"],
+        patches: Int[np.ndarray, "face 6"],
     ) -> "Pattern":
         """The pattern in which every pair of `count` vertices has a block."""
         rows, columns = np.divmod(np.arange(count * count), count)
         slots = lambda elements: elements[:, :, None] * count + elements[:, None, :]
-        parts = rows, columns, np.arange(count) * (count + 1), slots(faces), slots(hinges)
+        elements = slots(faces), slots(hinges), slots(patches)
+        parts = rows, columns, np.arange(count) * (count + 1), *elements
         return cls(*(jnp.asarray(part, int) for part in parts))
 
 
@@ -56,11 +67,15 @@ def assemble(
     faces: Float[Array, "face 3 3 3 3"],
     hinges: Float[Array, "hinge 4 3 4 3"],
     vertices: Float[Array, "vertex 3 3"],
+    patches: Float[Array, "face 6 3 6 3"] | None = None,
 ) -> Float[Array, "block 3 3"]:
     """The blocks that element matrices (corner, axis, corner, axis) add up to."""
     blocks = jnp.zeros((pattern.rows.shape[0], 3, 3), vertices.dtype)
     blocks = blocks.at[pattern.diagonal].add(vertices, unique_indices=True)
-    for slots, matrices in ((pattern.faces, faces), (pattern.hinges, hinges)):
+    elements = [(pattern.faces, faces), (pattern.hinges, hinges)]
+    if patches is not None:
+        elements.append((pattern.patches, patches))
+    for slots, matrices in elements:
         blocks = blocks.at[slots].add(matrices.transpose(0, 1, 3, 2, 4))
     return blocks
 
