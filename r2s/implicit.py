@@ -23,6 +23,8 @@ SAVED = "positions"  # what a checkpointed rollout keeps of a step
 
 class _Search(NamedTuple):
     x: Positions
+    value: Float[Array, ""]  # of the potential, [J]
+    force: Positions  # its derivative, [N]
     moved: Float[Array, ""]  # the last change, [m]
     factors: tuple[Factor, ...]
     is_stale: Bool[Array, ""]  # whether the next step needs new factors
@@ -52,22 +54,29 @@ def minimise(
 def _newton(tolerance, max_iterations, increment, start, free):
     levels = increment.levels
 
+    def evaluate(x):
+        value, force = jax.value_and_grad(potential, argnums=1)(increment, x)
+        return value, _masked(force, free)
+
     def iterate(state: _Search) -> _Search:
-        force = _masked(imbalance(increment, state.x), free)
         renew = lambda: _search_factors(increment, state, free)
         factors = jax.lax.cond(state.is_stale, renew, lambda: state.factors)
-        direction = -solve(levels, factors, force)
-        usable = jnp.all(jnp.isfinite(direction))  # an indefinite Hessian has NaN for factors
+        direction = -solve(levels, factors, state.force)
+        slope = jnp.sum(direction * state.force)
+        usable = slope < 0  # an indefinite Hessian has NaN for factors
         direction = jnp.where(usable, direction, 0)
-        length, found = _line_search(increment, state.x, direction, force)
+        length, value, force = _line_search(evaluate, state, direction, slope)
+        found = length > 0
         full = jnp.max(jnp.abs(direction))
-        # a search that found nothing has not arrived, however little it moved
+        # a search that found nothing has not arrived
         moved = jnp.where(found, length * full, full)
         moved = jnp.where(usable | (state.exactness == 0), moved, state.moved)
         is_slow = (moved > SLOW * state.moved) & (state.count >= CONVEX_ITERATIONS)
         exactness = jnp.where(is_slow, (state.exactness + state.limit) / 2, state.exactness)
         return _Search(
             x=state.x + length * direction,
+            value=value,
+            force=force,
             moved=moved,
             factors=factors,
             is_stale=~usable | (length != 1) | (moved > STALE * state.moved),
@@ -77,17 +86,29 @@ def _newton(tolerance, max_iterations, increment, start, free):
         )
 
     def unfinished(state: _Search):
-        return (state.moved > tolerance) & (state.count < max_iterations)
+        goes_on = (state.moved > tolerance) & (state.count < max_iterations)
+        return goes_on & jnp.isfinite(state.value)
 
     zero, true = jnp.zeros((), int), jnp.ones((), bool)
     infinite = jnp.full((), jnp.inf, start.dtype)
     shapes = jax.eval_shape(lambda: factor(levels, hessian(increment, start)))
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     none = jnp.zeros((), start.dtype)
-    begin = _Search(start, infinite, blank, true, none, none + 2, zero)
+    value, force = evaluate(start)
+    begin = _Search(
+        x=start,
+        value=value,
+        force=force,
+        moved=infinite,
+        factors=blank,
+        is_stale=true,
+        exactness=none,
+        limit=none + 2,
+        count=zero,
+    )
     found = jax.lax.while_loop(unfinished, iterate, begin)
     # a NaN compares false, so that it ends the loop and fails here
-    return jnp.where(found.moved <= tolerance, found.x, jnp.nan)
+    return jnp.where((found.moved <= tolerance) & jnp.isfinite(found.value), found.x, jnp.nan)
 
 
 def _search_factors(increment, state, free):
@@ -96,40 +117,45 @@ def _search_factors(increment, state, free):
     return factor(increment.levels, pinned(increment.pattern, blocks, free))
 
 
-def _line_search(increment, x, direction, force):
-    """How much of a direction to go [-], and whether there is a length that will do.
+class _Length(NamedTuple):
+    trial: Float[Array, ""]  # the next length to look at
+    length: Float[Array, ""]  # the best so far; 0: none
+    value: Float[Array, ""]  # potential [J] and force [N] there
+    force: Positions
+    goes_on: Bool[Array, ""]
+
+
+def _line_search(evaluate, state: _Search, direction, slope):
+    """How much of a direction to go [-], 0 if no length will do; potential and force there.
 
     The first of 1, 1/2, 1/4, ... that lowers the potential enough (Armijo) and ends short of where
     it would rise as steeply as it fell; the second test is for the last Newton steps, whose gain
     rounding hides. If that is 1, the last of 1, 2, 4, ... up to which the potential falls steeply:
     away from a shape that is about to buckle the convex stand-in is far too cautious.
     """
-    before, slope = potential(increment, x), jnp.sum(direction * force)
-    rounding = 8 * jnp.finfo(x.dtype).eps * jnp.abs(before)
+    rounding = 8 * jnp.finfo(direction.dtype).eps * jnp.abs(state.value)
 
-    def look(length):
-        # held vertices have no direction, so that their force does not count
-        after, ahead = jax.value_and_grad(potential, argnums=1)(increment, x + length * direction)
-        enough = after <= before + 1e-4 * length * slope + rounding
-        ahead = jnp.sum(direction * ahead)
-        return enough & (ahead <= -0.5 * slope), enough & (ahead < 0.5 * slope)
+    def look(at: _Length) -> _Length:
+        value, force = evaluate(state.x + at.trial * direction)
+        ahead = jnp.sum(direction * force)
+        enough = value <= state.value + 1e-4 * at.trial * slope + rounding
+        is_fine = enough & (ahead <= -0.5 * slope)
+        is_steep = enough & (ahead < 0.5 * slope)
+        grows = is_steep & (at.trial >= 1) & (at.trial < LONGEST)
+        shrinks = ~is_fine & (at.trial <= 1) & (at.trial > SHORTEST)
+        best = lambda new, old: jnp.where(is_fine, new, old)
+        return _Length(
+            trial=jnp.where(grows, 2 * at.trial, at.trial / 2),
+            length=best(at.trial, at.length),
+            value=best(value, at.value),
+            force=best(force, at.force),
+            goes_on=grows | shrinks,
+        )
 
-    def unfinished(state):
-        length, (is_fine, is_steep), grows = state
-        return jnp.where(grows, is_steep & (length < LONGEST), ~is_fine & (length > SHORTEST))
-
-    def go_on(state):
-        length, _, grows = state
-        length = jnp.where(grows, 2 * length, length / 2)
-        return length, look(length), grows
-
-    one = jnp.ones((), x.dtype)
-    first = look(one)
-    length, (is_fine, is_steep), grows = jax.lax.while_loop(
-        unfinished, go_on, (one, first, first[1])
-    )
-    length = jnp.where(grows & ~is_fine, length / 2, length)
-    return length, length > SHORTEST
+    one, true = jnp.ones((), direction.dtype), jnp.ones((), bool)
+    begin = _Length(one, 0 * one, state.value, state.force, true)
+    found = jax.lax.while_loop(lambda at: at.goes_on, look, begin)
+    return found.length, found.value, found.force
 
 
 @eqx.filter_custom_jvp

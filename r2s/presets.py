@@ -3,8 +3,9 @@
 The five fabrics of the study, with the areal density and the small-strain stiffness that Wang,
 O'Brien and Ramamoorthi measured ("Data-driven elastic models for cloth: modeling and measurement",
 ACM Transactions on Graphics 30(4), 2011), rounded to two digits. C33 is half of theirs, since ours
-acts on the engineering shear strain. Bending is the mean over their directions and curvatures.
-Damping and friction were not measured there: they are r2s's defaults.
+acts on the engineering shear strain. Bending is a quarter of the mean over their directions and
+curvatures, since the moment of their hinges is k l^2 / (4 A) per angle, that of a plate l^2 / A
+times its stiffness. Damping and friction were not measured there: they are r2s's defaults.
 """
 
 from r2s.fabric import Fabric
@@ -12,27 +13,27 @@ from r2s.fabric import Fabric
 
 def camel_ponte_roma() -> Fabric:
     """A double knit. Wang et al. 2011."""
-    return Fabric.make(0.28, (31.0, -13.0, 44.0, 16.0), 3.3e-5)
+    return Fabric.make(0.28, (31.0, -13.0, 44.0, 16.0), 8.3e-6)
 
 
 def black_denim() -> Fabric:
     """An 11 oz twill. Wang et al. 2011."""
-    return Fabric.make(0.32, (210.0, 10.0, 1000.0, 27.0), 7.3e-5)
+    return Fabric.make(0.32, (210.0, 10.0, 1000.0, 27.0), 1.8e-5)
 
 
 def grey_interlock() -> Fabric:
     """A T-shirt knit. Wang et al. 2011."""
-    return Fabric.make(0.19, (17.0, -15.0, 34.0, 18.0), 2.2e-5)
+    return Fabric.make(0.19, (17.0, -15.0, 34.0, 18.0), 5.5e-6)
 
 
 def pink_solid() -> Fabric:
     """The ribbon brown of Wang et al. 2011, which the study calls pink solid."""
-    return Fabric.make(0.23, (150.0, 110.0, 240.0, 15.0), 1.1e-4)
+    return Fabric.make(0.23, (150.0, 110.0, 240.0, 15.0), 2.8e-5)
 
 
 def red_jet_set() -> Fabric:
     """A light knit. Wang et al. 2011."""
-    return Fabric.make(0.11, (43.0, 54.0, 170.0, 7.2), 1.9e-5)
+    return Fabric.make(0.11, (43.0, 54.0, 170.0, 7.2), 4.8e-6)
 
 
 FIVE = {

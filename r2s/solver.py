@@ -1,14 +1,13 @@
 """From steps to motions: `simulate`, for any solver with `init` and `step`."""
 
 from collections.abc import Callable
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from r2s.fabric import Fabric
 from r2s.implicit import SAVED
 from r2s.scene import Control
 
@@ -17,11 +16,14 @@ State = TypeVar("State")
 
 @runtime_checkable
 class Solver(Protocol[State]):
-    """What `simulate` and the estimators ask of a solver."""
+    """What `simulate` and the estimators ask of a solver.
+
+    Its fabric is an `r2s.Fabric`, or what else its bodies are made of.
+    """
 
     dt: float
 
-    def step(self, fabric: Fabric, state: State, control: Control) -> State: ...
+    def step(self, fabric: Any, state: State, control: Control) -> State: ...
 
 
 def predicted_memory(function: Callable, *args) -> int:
@@ -52,7 +54,7 @@ class Trajectory(eqx.Module):
 
 def simulate(
     solver: Solver[State],
-    fabric: Fabric,
+    fabric: Any,
     start: State,
     controls: Control,
     keep_solutions: bool = True,
