@@ -9,9 +9,8 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
-from r2s.increment import Increment, hessian, imbalance, potential
-from r2s.linear.factor import Factor, factor, solve
-from r2s.linear.pattern import pinned
+from r2s.increment import Increment, far, hessian, imbalance, potential
+from r2s.linear.system import System, apply_inverse, prepare
 
 Positions = Float[Array, "vertex 3"]
 CONVEX_ITERATIONS = 3  # before the exact Hessian is tried
@@ -26,7 +25,7 @@ class _Search(NamedTuple):
     value: Float[Array, ""]  # of the potential, [J]
     force: Positions  # its derivative, [N]
     moved: Float[Array, ""]  # the last change, [m]
-    factors: tuple[Factor, ...]
+    system: System
     is_stale: Bool[Array, ""]  # whether the next step needs new factors
     exactness: Float[Array, ""]  # of the Hessian that they are to be of
     limit: Float[Array, ""]  # exactness at which it may be indefinite
@@ -52,18 +51,19 @@ def minimise(
 
 
 def _newton(tolerance, max_iterations, increment, start, free):
-    levels = increment.levels
+    levels, pattern = increment.levels, increment.pattern
 
     def evaluate(x):
         value, force = jax.value_and_grad(potential, argnums=1)(increment, x)
         return value, _masked(force, free)
 
     def iterate(state: _Search) -> _Search:
-        renew = lambda: _search_factors(increment, state, free)
-        factors = jax.lax.cond(state.is_stale, renew, lambda: state.factors)
-        direction = -solve(levels, factors, state.force)
+        second = lambda: _second(increment, state.x, state.exactness)
+        renew = lambda: prepare(levels, pattern, *second(), free)
+        system = jax.lax.cond(state.is_stale, renew, lambda: state.system)
+        direction = -apply_inverse(levels, pattern, system, state.force)
         slope = jnp.sum(direction * state.force)
-        usable = slope < 0  # an indefinite Hessian has NaN for factors
+        usable = slope <= 0  # an indefinite Hessian has NaN for factors
         direction = jnp.where(usable, direction, 0)
         length, value, force = _line_search(evaluate, state, direction, slope)
         found = length > 0
@@ -78,7 +78,7 @@ def _newton(tolerance, max_iterations, increment, start, free):
             value=value,
             force=force,
             moved=moved,
-            factors=factors,
+            system=system,
             is_stale=~usable | (length != 1) | (moved > STALE * state.moved),
             exactness=jnp.where(usable, jnp.minimum(exactness, 1), state.exactness / 2),
             limit=jnp.where(usable, jnp.minimum(1.2 * state.limit, 2), state.exactness),
@@ -91,7 +91,7 @@ def _newton(tolerance, max_iterations, increment, start, free):
 
     zero, true = jnp.zeros((), int), jnp.ones((), bool)
     infinite = jnp.full((), jnp.inf, start.dtype)
-    shapes = jax.eval_shape(lambda: factor(levels, hessian(increment, start)))
+    shapes = jax.eval_shape(lambda: prepare(levels, pattern, *_second(increment, start), free))
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     none = jnp.zeros((), start.dtype)
     value, force = evaluate(start)
@@ -100,7 +100,7 @@ def _newton(tolerance, max_iterations, increment, start, free):
         value=value,
         force=force,
         moved=infinite,
-        factors=blank,
+        system=blank,
         is_stale=true,
         exactness=none,
         limit=none + 2,
@@ -111,10 +111,9 @@ def _newton(tolerance, max_iterations, increment, start, free):
     return jnp.where((found.moved <= tolerance) & jnp.isfinite(found.value), found.x, jnp.nan)
 
 
-def _search_factors(increment, state, free):
-    """Factors of the exact Hessian or of the convex stand-in, at the place of a search."""
-    blocks = hessian(increment, state.x, state.exactness)
-    return factor(increment.levels, pinned(increment.pattern, blocks, free))
+def _second(increment, x, exactness=1.0):
+    """The second derivative [N/m] of the potential, or its convex stand-in."""
+    return hessian(increment, x, exactness), far(increment, x)
 
 
 class _Length(NamedTuple):
@@ -171,14 +170,15 @@ def _minimise_jvp(primals, tangents):
     held_dot = jnp.zeros_like(x) if start_dot is None else jnp.where(free[:, None], 0, start_dot)
     _, force_dot = eqx.filter_jvp(imbalance, (increment, x), (increment_dot, held_dot))
     # linear in the right-hand side, so that it batches and transposes with the same factors
-    factors = _one_by_one(_exact_factors)(increment, x, free)
-    return x, held_dot - solve(increment.levels, factors, _masked(force_dot, free))
+    system = _one_by_one(_exact_system)(increment, x, free)
+    about = increment.levels, increment.pattern, system
+    return x, held_dot - apply_inverse(*about, _masked(force_dot, free), is_definite=False)
 
 
-def _exact_factors(increment, x, free):
-    blocks = pinned(increment.pattern, hessian(increment, x), free)
+def _exact_system(increment, x, free):
+    about = increment.levels, increment.pattern
     # where a shape is about to buckle the minimum may be found as a saddle: not definite
-    return factor(increment.levels, blocks, is_definite=False)
+    return prepare(*about, *_second(increment, x), free, is_definite=False)
 
 
 def _one_by_one(function):

@@ -24,6 +24,7 @@ from r2s.fabric import Fabric
 from r2s.layers import Contacts, Layers, contact_energy, contact_hessians
 from r2s.linear.dissection import Level
 from r2s.linear.pattern import Pattern, add_between, assemble
+from r2s.linear.system import Far
 from r2s.mesh import Mesh
 from r2s.physics import contact
 from r2s.physics.air import Air
@@ -73,12 +74,14 @@ class Increment(eqx.Module):
     @property
     def pattern(self) -> Pattern:
         """The blocks that its Hessian may have."""
-        return self.mesh.pattern if self.layers is None else self.layers.pattern
+        layers = self.layers
+        return self.mesh.pattern if layers is None or layers.whole is None else layers.whole.pattern
 
     @property
     def levels(self) -> tuple[Level, ...]:
         """The order in which the Hessian is eliminated."""
-        return self.mesh.levels if self.layers is None else self.layers.levels
+        layers = self.layers
+        return self.mesh.levels if layers is None or layers.whole is None else layers.whole.levels
 
 
 def strains(mesh: Mesh, x: Positions) -> Float[Array, "face 3"]:
@@ -209,7 +212,7 @@ imbalance = jax.grad(potential, argnums=1)  # [N]; zero where the forces balance
 
 
 def hessian(step: Increment, x: Positions, exactness: Float[Array, ""] | float = 1.0) -> Blocks:
-    """Second derivative [N/m] of the potential, as blocks of `step.pattern`.
+    """Second derivative [N/m] of the potential, as blocks of `step.pattern`, but for `far`.
 
     At an exactness of 0, a positive definite stand-in, whose Newton steps always descend: it
     leaves out the second derivative of the hinge angle, and the geometric stiffness of compressed
@@ -225,11 +228,17 @@ def hessian(step: Increment, x: Positions, exactness: Float[Array, ""] | float =
         _over(jax.hessian(_vertex_energy, argnums=1), step)(x, *_vertices(step)),
         patches,
     )
-    if step.contacts is None:
+    if step.contacts is None or step.layers is None or step.layers.whole is None:
         return blocks
-    stencils = step.contacts.stencils
     between = contact_hessians(step.contacts, *_about_layers(step, x))
-    return add_between(step.pattern, blocks, stencils, between)
+    return add_between(step.pattern, blocks, step.contacts.stencils, between)
+
+
+def far(step: Increment, x: Positions) -> Far | None:
+    """What the second derivative [N/m] of the potential has outside of `step.pattern`."""
+    if step.contacts is None or step.layers is None or step.layers.whole is not None:
+        return None
+    return Far(step.contacts.stencils, contact_hessians(step.contacts, *_about_layers(step, x)))
 
 
 def _bending_hessians(step, x, exactness):

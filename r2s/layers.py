@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from r2s.linear.dissection import Level, levels
 from r2s.linear.pattern import Pattern
 from r2s.mesh import Mesh
-from r2s.neighbours import Pairs, all_pairs, near
+from r2s.neighbours import Pairs, Tree, all_pairs, near, near_in_tree, tree
 from r2s.physics import contact
 from r2s.physics.proximity import closest_weights, separation, time_of_impact
 
@@ -27,40 +27,62 @@ Positions = Float[Array, "vertex 3"]
 WATCHED = 1.5  # thicknesses, up to which places that are close at the start of a step touch
 CLOSEST = 0.1  # thicknesses, below which a step may not bring any two places
 MAX_ATTEMPTS = 12  # at a step, before it is NaN
-LARGEST = 400  # vertices
+SMALL = 400  # vertices, up to which a matrix couples all
+
+
+class Whole(eqx.Module):
+    """- `pattern`, `levels`: of matrices that couple all vertices of a small mesh."""
+
+    pattern: Pattern
+    levels: tuple[Level, ...]
+
+    @classmethod
+    def make(cls, mesh: Mesh) -> "Whole":
+        """Of a mesh."""
+        count = mesh.rest.shape[0]
+        elements = mesh.faces, mesh.hinges, mesh.patches.vertices
+        pattern = Pattern.full(count, *map(np.asarray, elements))
+        rows, columns = np.asarray(pattern.rows), np.asarray(pattern.columns)
+        return cls(pattern, levels(np.asarray(mesh.rest), rows, columns, count))
 
 
 class Layers(eqx.Module):
     """What a scene needs for contact of its sheet with itself.
 
-    - `pairs`: the pairs of its vertices and triangles, and of its edges, that may meet.
-    - `pattern`, `levels`: of matrices that couple all vertices.
-    - `capacity`: how many pairs may be near each other, and how many contacts a step may have. A
-      step that needs more is NaN.
+    - `search`: the pairs of its vertices and triangles, and of its edges, that may meet; of a large
+      mesh, a tree in which to find them.
+    - `whole`: for a small mesh, the matrices that couple all of it. Without, contact is coupled by
+      iteration (`r2s.linear.system`).
+    - `capacity`: how many contacts a step may have; four times as many pairs may be near each
+      other. A step that needs more is NaN.
     """
 
-    pairs: Pairs
-    pattern: Pattern
-    levels: tuple[Level, ...]
+    search: Pairs | Tree
+    whole: Whole | None
     capacity: int = eqx.field(static=True)
 
     @classmethod
-    def make(cls, mesh: Mesh, capacity: int = 1024) -> "Layers":
-        """For a mesh of at most 400 vertices; raises `ValueError` for a larger one.
+    def make(cls, mesh: Mesh, capacity: int | None = None) -> "Layers":
+        """For a mesh; the capacity is by default 512, or 6 for each vertex if that is more.
 
-        Every pair of vertices has a block, and every pair of places is looked at in each step.
+        Up to 400 vertices every pair of places is looked at in each step, and every pair of
+        vertices has a block of the matrix.
         """
-        count = mesh.rest.shape[0]
-        if count > LARGEST:
-            raise ValueError(
-                f"contact between layers is for meshes of at most {LARGEST} vertices, got {count}"
-            )
-        elements = mesh.faces, mesh.hinges, mesh.patches.vertices
-        pattern = Pattern.full(count, *map(np.asarray, elements))
-        whole = levels(
-            np.asarray(mesh.rest), np.asarray(pattern.rows), np.asarray(pattern.columns), count
-        )
-        return cls(all_pairs(np.asarray(mesh.faces)), pattern, whole, capacity)
+        count, faces = mesh.rest.shape[0], np.asarray(mesh.faces)
+        capacity = max(512, 6 * count) if capacity is None else capacity
+        if count <= SMALL:
+            return cls(all_pairs(faces), Whole.make(mesh), capacity)
+        return cls(tree(faces, np.asarray(mesh.rest)), None, capacity)
+
+    def near(
+        self, start: Positions, end: Positions, reach: Float[Array, ""]
+    ) -> tuple[Pairs, Bool[Array, ""]]:
+        """The pairs that may come within `reach` [m] in a straight motion; if there are more."""
+        # the boxes around neighbouring parts of a flat sheet overlap: 8 pairs for each vertex
+        capacity = 4 * self.capacity
+        if isinstance(self.search, Pairs):
+            return near(self.search, start, end, reach, capacity)
+        return near_in_tree(self.search, start, end, reach, capacity, 2 * capacity)
 
 
 class Contacts(eqx.Module):
@@ -168,7 +190,7 @@ def touching(
 ) -> tuple[Contacts, Bool[Array, ""]]:
     """The contacts of places that are close to each other, and whether the capacity sufficed."""
     reach = WATCHED * thickness
-    found, overflow = near(layers.pairs, x, x, reach, layers.capacity)
+    found, overflow = layers.near(x, x, reach)
     corners = x[found.stencils]
     weights, normals, distance = jax.vmap(_plane)(corners, found.is_edges)
     is_close = found.is_real & (distance < reach)
@@ -176,7 +198,8 @@ def touching(
     depth = jnp.maximum(thickness - distance, 0)
     limit = friction * area * contact.pressure(depth)
     empty = _empty(layers.capacity, x)
-    return _append(empty, is_close, found.stencils, weights, normals, area, limit), ~overflow
+    contacts = _append(empty, is_close, found.stencils, weights, normals, area, limit)
+    return contacts, ~overflow & (contacts.count <= layers.capacity)
 
 
 def colliding(
@@ -192,7 +215,7 @@ def colliding(
     """
     gap = CLOSEST * thickness
     drift = jnp.mean(after - before, axis=0)  # no pair comes closer by what all have in common
-    found, overflow = near(layers.pairs, before, after - drift[None], gap, layers.capacity)
+    found, overflow = layers.near(before, after - drift[None], gap)
     start, end = before[found.stencils], after[found.stencils]
     impact = jax.vmap(time_of_impact, in_axes=(0, 0, 0, None))
     times = jax.lax.stop_gradient(impact(start, end, found.is_edges, gap))

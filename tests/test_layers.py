@@ -12,6 +12,7 @@ from conftest import cloth, directional_difference, everywhere, flat, roll
 from r2s.fabric import Fabric
 from r2s.layers import Layers, colliding, contact_energy, contact_hessians, touching
 from r2s.mesh import Mesh, rectangle
+from r2s.neighbours import Tree, tree
 from r2s.physics.contact import pressure
 from r2s.scene import Control
 from r2s.solver import simulate
@@ -41,8 +42,13 @@ def crossings(mesh: Mesh, x) -> int:
     return int(np.sum(~shared & (at > 0) & (at < 1) & (u > 0) & (v > 0) & (u + v < 1)))
 
 
-def with_layers(solver):
-    layers = Layers.make(solver.scene.mesh, 512)
+def as_if_large(mesh: Mesh) -> Layers:
+    """As they are made for a large mesh."""
+    return Layers(tree(np.asarray(mesh.faces), np.asarray(mesh.rest)), None, 256)
+
+
+def with_layers(solver, make=lambda mesh: Layers.make(mesh, 256)):
+    layers = make(solver.scene.mesh)
     return dataclasses.replace(solver, scene=dataclasses.replace(solver.scene, layers=layers))
 
 
@@ -103,7 +109,7 @@ def test_a_layer_rests_on_another_with_its_weight():
     )
     x, area = jnp.asarray(still.x[-1]), mesh.vertex_area
     assert np.max(np.abs(still.v[-1])) < 1e-3
-    layers = Layers.make(mesh, 512)
+    layers = Layers.make(mesh, 256)
     contacts, fits = touching(layers, mesh, THICKNESS, jnp.asarray(0.5), x)
     energy = lambda x: contact_energy(contacts, THICKNESS, RATE, x, x)
     push = jax.grad(lambda moved: contact_energy(contacts, THICKNESS, RATE, moved, x))(x)
@@ -133,7 +139,7 @@ def pressed():
     mesh, x = two_sheets(0.8e-3)
     random = np.random.default_rng(0)
     x = x + jnp.asarray(random.normal(size=x.shape)) * 1e-4
-    layers = Layers.make(mesh, 512)
+    layers = Layers.make(mesh, 256)
     contacts, _ = touching(layers, mesh, THICKNESS, jnp.asarray(0.5), x)
     after = x.at[16:, 2].add(-2e-3)
     contacts, _, _ = colliding(layers, mesh, THICKNESS, x, after, contacts)
@@ -163,16 +169,18 @@ def test_too_many_contacts_are_not_forgotten():
     assert np.all(np.isnan(after.x[-1]))
 
 
-def test_large_meshes_are_refused():
-    with pytest.raises(ValueError, match="at most 400 vertices, got 441"):
-        Layers.make(rectangle((1.0, 1.0), (21, 21)))
+def test_a_large_mesh_searches_a_tree_and_iterates():
+    large = Layers.make(rectangle((1.0, 1.0), (21, 21)))
+    assert isinstance(large.search, Tree) and large.whole is None
+    assert large.capacity == 6 * 441
 
 
-def test_the_gradient_through_a_collision_agrees_with_differences():
+def landing(make):
+    """Value, motion and gradient of a sheet that lands on another, and where they are."""
     mesh, x = two_sheets(3e-3, count=3)
     # crumpled: where edges are parallel, the closest points jump
     x = x + jnp.asarray(np.random.default_rng(0).normal(size=x.shape)) * 3e-4
-    solver = with_layers(cloth(mesh, held=range(9)))
+    solver = with_layers(cloth(mesh, held=range(9)), make)
     controls = Control(jnp.broadcast_to(x[:9], (1, 8, 9, 3)), jnp.zeros((1, 8, 3)))
     weights = jax.random.normal(jax.random.key(1), x.shape)
     v = everywhere([0.1, 0.0, 0.0], mesh).at[:, 2].set(-0.4)
@@ -182,7 +190,22 @@ def test_the_gradient_through_a_collision_agrees_with_differences():
         moved = simulate(solver, fabric, solver.init(x, v), controls).x[-1]
         return jnp.sum(weights * moved), moved
 
-    both = eqx.filter_jit(jax.value_and_grad(loss, has_aux=True))
+    return eqx.filter_jit(jax.value_and_grad(loss, has_aux=True)), x, v
+
+
+@pytest.mark.slow
+def test_a_large_mesh_moves_as_a_small_one_does_and_has_its_gradient():
+    small, x, v = landing(lambda mesh: Layers.make(mesh, 256))
+    large, _, _ = landing(as_if_large)
+    (_, moved), gradient = small((FABRIC, x, v))
+    (_, found), found_gradient = large((FABRIC, x, v))
+    assert jnp.max(jnp.abs(found - moved)) < 1e-8
+    for one, other in zip(*map(jax.tree.leaves, (found_gradient, gradient)), strict=True):
+        assert jnp.linalg.norm(one - other) <= 1e-5 * jnp.linalg.norm(other)
+
+
+def test_the_gradient_through_a_collision_agrees_with_differences():
+    both, x, v = landing(lambda mesh: Layers.make(mesh, 256))
     (_, moved), gradient = both((FABRIC, x, v))
     assert jnp.max(jnp.abs(moved[9:, 2] - 1e-3)) < 2e-3  # it has landed
     inputs = (FABRIC, x, v)
@@ -207,7 +230,7 @@ def test_pressure_is_that_of_the_table(pressed):
     gaps = jnp.sum(contacts.weights[:, :, None] * corners, axis=1)
     gaps = jnp.where(contacts.area > 0, jnp.sum(gaps * contacts.normals, axis=1), jnp.inf)
     deepest = jnp.argmin(gaps)
-    keep = jnp.arange(512) == deepest
+    keep = jnp.arange(256) == deepest
     one = eqx.tree_at(lambda c: c.area, contacts, jnp.where(keep, contacts.area, 0))
     push = jax.grad(lambda moved: contact_energy(one, THICKNESS, RATE, moved, x))(x)
     force = contacts.area[deepest] * pressure(THICKNESS - gaps[deepest])
