@@ -7,9 +7,8 @@ python benchmarks/cloth.py --only scaling --sizes 17 33 65 129
 JAX's threads get in each other's way on steps as small as these, and the peers use one: so the
 program keeps to one core, unless --cores says otherwise (0: all).
 
-Peers: pip install 'mujoco>=3.13' 'newton>=1.8' 'warp-lang>=1.19'; those that are missing are
-skipped. Times are process CPU seconds (wall seconds where JAX runs on a GPU), without compilation.
-Tables go to stdout, progress to stderr, and with --out everything to a JSON file.
+Peers: pip install -e '.[bench]'; those that are missing are skipped. Times are process CPU seconds
+(wall seconds where JAX runs on a GPU), without compilation. Tables go to stdout, progress to stderr, and with --out everything to a JSON file.
 """
 
 import argparse

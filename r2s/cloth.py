@@ -1,6 +1,7 @@
 """The cloth: a sheet of triangles, implicit in time, second order, differentiable."""
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,7 +14,7 @@ from r2s.increment import Increment, bends, curvatures, hinge_angles, strains
 from r2s.layers import Contacts, settle
 from r2s.mesh import Mesh
 from r2s.physics import contact
-from r2s.physics.bending import BendingLaw, unwrapped
+from r2s.physics.bending import unwrapped
 from r2s.physics.plate import PlateLaw
 from r2s.scene import Control, Scene
 
@@ -121,7 +122,7 @@ class Cloth(eqx.Module):
         )
 
 
-def _laws(law: BendingLaw | PlateLaw, mesh: Mesh, hinges: Float[Array, " hinge"]):
+def _laws(law: Any, mesh: Mesh, hinges: Float[Array, " hinge"]):
     """The bending law of every face or hinge, from the curvatures [1/m] of the hinges."""
     if isinstance(law, PlateLaw):
         return jax.vmap(law.at)(bends(mesh, law, hinges))

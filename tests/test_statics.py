@@ -189,7 +189,7 @@ def test_a_small_swing_loses_energy_in_every_step(damping, sheet, settled):
 @pytest.mark.parametrize("damping", [0.0, 0.01])
 def test_the_energy_of_a_wide_swing_hardly_rises(damping, sheet, settled):
     # 35 degrees; BDF2 bounds another energy, of two steps
-    assert rise(swing(sheet, settled, 5.0, damping)) < 0.005
+    assert rise(swing(sheet, settled, 5.0, damping)) < 0.006
 
 
 @pytest.mark.slow

@@ -39,7 +39,7 @@ def test_the_true_fabric_is_nearer_than_another_and_than_noise_allows(pair):
     truth = judge.against_motion(pair.fold, judge.predict(pair.fold, presets.grey_interlock()))
     other = judge.against_motion(pair.fold, judge.predict(pair.fold, presets.pink_solid()))
     # 1 mm of noise, sampling of the surface every 5 mm, one point in a hundred 0.2 m away
-    assert truth["chamfer_real_to_sim"] < 0.006
+    assert truth["chamfer_real_to_sim"] < 0.007
     assert truth["chamfer_real_to_sim"] < other["chamfer_real_to_sim"]
     assert truth["hausdorff"] >= truth["chamfer"]
 

@@ -82,13 +82,13 @@ def test_the_objective_has_the_gradient_that_differences_have(small):
     normal = jax.jit(gauss_newton.normal_at)
     found = normal(small, unknown).gradient
     for index in range(11):
-        ahead, behind = (normal(small, unknown.at[index].add(sign * 1e-5)).loss for sign in (1, -1))
-        difference = float(ahead - behind) / 2e-5
+        ahead, behind = (normal(small, unknown.at[index].add(sign * 1e-4)).loss for sign in (1, -1))
+        difference = float(ahead - behind) / 2e-4
         assert float(found[index]) == pytest.approx(difference, rel=1e-4, abs=1e-10)
 
 
 def test_an_estimate_lowers_the_loss_and_survives_its_file(small):
-    found = diffcloud.estimate(small, num_coarse=2, num_starts=1, num_iterations=2, key=jr.key(0))
+    found = diffcloud.estimate(small, num_coarse=2, num_starts=1, num_iterations=5, key=jr.key(0))
     assert np.nanmin(found.losses[-1]) < np.nanmin(found.losses[0])
     again = from_json(as_json(found))
     np.testing.assert_allclose(again.values, found.values)
