@@ -7,13 +7,16 @@ DATA ?=
 OUT ?= results
 ARGS ?=
 
+# Most of the fast tests' time is compilation: they do without XLA's optimisation.
+QUICK := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0
+
 .PHONY: study test test-slow lint types check clean
 
 study: $(STAMP)
 	$(RUN) experiments/study.py --data "$(DATA)" --out "$(OUT)" $(ARGS)
 
 test: $(STAMP)
-	$(RUN) -m pytest -q -n 2 --dist loadfile
+	XLA_FLAGS="$(QUICK)" $(RUN) -m pytest -q -n 2 --dist loadfile
 
 test-slow: $(STAMP)
 	$(RUN) -m pytest -q -m slow

@@ -8,7 +8,8 @@ JAX's threads get in each other's way on steps as small as these, and the peers 
 program keeps to one core, unless --cores says otherwise (0: all).
 
 Peers: pip install -e '.[bench]'; those that are missing are skipped. Times are process CPU seconds
-(wall seconds where JAX runs on a GPU), without compilation. Tables go to stdout, progress to stderr, and with --out everything to a JSON file.
+(wall seconds where JAX runs on a GPU), without compilation. Tables go to stdout, progress to
+stderr, and with --out everything to a JSON file.
 """
 
 import argparse

@@ -1,0 +1,178 @@
+"""What particles move through: the grid, with gravity, table, walls and grippers at its nodes."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from r2s.mpm.grid import Grid
+from r2s.mpm.transfer import (
+    affine_factor,
+    collect,
+    collect_plain,
+    spread,
+    spread_few,
+    spread_plain,
+)
+from r2s.physics.contact import SLIP_SPEED, Table
+from r2s.units import GRAVITY
+
+Vectors = Float[Array, "particle axis"]
+Matrices = Float[Array, "particle axis axis"]
+Field = Float[Array, "node axis"]
+
+GRIPPED = 0.25  # of a node's mass; at the border between held and free particles it is a half
+
+
+class Held(eqx.Module):
+    """Particles that grippers carry: their positions [m], velocities [m/s] and masses [kg]."""
+
+    x: Float[Array, "held axis"]
+    v: Float[Array, "held axis"]
+    mass: Float[Array, " held"]
+
+
+class Background(eqx.Module):
+    """A grid and what acts at its nodes. Up is the last axis.
+
+    - `grid`: where particles may be.
+    - `table`: nodes at its height and below give way to nothing that comes from above; None: none.
+    - `gravity`: downwards, [m/s^2].
+    - `walls`: how many nodes at each end of an axis let nothing out, though back in; 0: no walls.
+    - `sticky`: whether what touches the table stays; otherwise friction is Coulomb's.
+    - `mass_floor`: added to the masses of nodes, over the mean mass of a particle [-].
+    - `forward_mode`: derivatives by JAX's own rules, so that `jax.jvp` works; without, the reverse
+      mode is faster.
+    """
+
+    grid: Grid
+    table: Table | None
+    gravity: Float[Array, ""]
+    walls: int = eqx.field(static=True, default=0)
+    sticky: bool = eqx.field(static=True, default=False)
+    mass_floor: float = eqx.field(static=True, default=1e-15)
+    forward_mode: bool = eqx.field(static=True, default=False)
+
+    @classmethod
+    def make(
+        cls,
+        grid: Grid,
+        table: Table | None = None,
+        gravity: float = GRAVITY,
+        walls: int = 0,
+        sticky: bool = False,
+        mass_floor: float = 1e-15,
+        forward_mode: bool = False,
+    ) -> "Background":
+        """With a table or none, and gravity [m/s^2]. Raises `ValueError` for impossible walls."""
+        if not 0 <= walls < min(grid.shape) / 2 or mass_floor < 0:
+            raise ValueError(
+                f"walls must be from 0 to less than half of {min(grid.shape)} nodes and the mass "
+                f"floor >= 0, got {walls} and {mass_floor}"
+            )
+        downwards = jnp.asarray(gravity, float)
+        return cls(grid, table, downwards, walls, sticky, mass_floor, forward_mode)
+
+    def advance(
+        self,
+        dt: float,
+        friction: Float[Array, ""],
+        x: Vectors,
+        mass: Float[Array, " particle"],
+        momentum: Vectors,
+        affine: Matrices,
+        held: Held | None = None,
+    ) -> tuple[Vectors, Matrices]:
+        """Velocities [m/s] and affine velocities [1/s] of particles after a step of `dt` [s].
+
+        From their positions [m], masses [kg], momenta [kg m/s] and affine momenta [kg/s], which
+        contain what forces and stresses have added in the step.
+        """
+        with jax.named_scope("particles_to_grid"):
+            still = jnp.zeros_like(affine[:, :1])
+            values = jnp.concatenate([momentum, mass[:, None]], axis=1)
+            slopes = jnp.concatenate([affine, still], axis=1)
+            nodes = (spread_plain if self.forward_mode else spread)(self.grid, x, values, slopes)
+        floor = self.mass_floor * jnp.mean(mass)
+        with jax.named_scope("grid"):
+            v = quotient(nodes[:, :-1], nodes[:, -1:] + floor)
+            up = jnp.eye(v.shape[1], dtype=v.dtype)[-1:]
+            v = v - dt * self.gravity * up
+            if held is not None and held.x.shape[0]:
+                v = self._gripped(v, nodes[:, -1:], floor, held)
+            v = self._walled(self._on_table(v, friction))
+        with jax.named_scope("grid_to_particles"):
+            get = collect_plain if self.forward_mode else collect
+            v, moment = get(self.grid, x, v)
+        return v, affine_factor(self.grid) * moment
+
+    def _gripped(self, v: Field, mass: Array, floor: Array, held: Held) -> Field:
+        """Velocities with those of the grippers where `GRIPPED` or more of the mass is held.
+
+        Nodes that are held only in part give way, so that the body would creep out of the grip.
+        """
+        values = jnp.concatenate([held.mass[:, None] * held.v, held.mass[:, None]], axis=1)
+        nodes = spread_few(self.grid, held.x, values)
+        share = quotient(nodes[:, -1:], mass + floor)
+        carried = quotient(nodes[:, :-1], nodes[:, -1:] + floor)
+        return v + jnp.minimum(share / GRIPPED, 1) * (carried - v)
+
+    def _on_table(self, v: Field, friction: Float[Array, ""]) -> Field:
+        """Velocities [m/s] that do not go into the table, and slide on it by Coulomb's law.
+
+        What stops the fall of a node, times the friction coefficient, is what can stop its sliding.
+        """
+        if self.table is None:
+            return v
+        up = self.grid.axes[-1]
+        below = jnp.broadcast_to(
+            up <= self.table.height + 1e-6 * self.grid.spacing, self.grid.shape
+        )
+        below = below.reshape(-1, 1)
+        if self.sticky:
+            return jnp.where(below, 0, v)
+        along, normal = v[:, :-1], v[:, -1:]
+        impulse = jnp.maximum(-normal, 0)
+        speed = jnp.sqrt(jnp.sum(along**2, axis=1, keepdims=True) + SLIP_SPEED**2)
+        kept = jnp.maximum(1 - friction * impulse / speed, 0)
+        return jnp.where(below, jnp.concatenate([kept * along, jnp.maximum(normal, 0)], axis=1), v)
+
+    def _walled(self, v: Field) -> Field:
+        """Velocities [m/s] that do not go out through the walls."""
+        if not self.walls:
+            return v
+        columns = []
+        for i, count in enumerate(self.grid.shape):
+            index = jnp.arange(count).reshape([-1 if i == k else 1 for k in range(v.shape[1])])
+            spaced = jnp.broadcast_to(index, self.grid.shape).reshape(-1)
+            low = jnp.where(spaced < self.walls, jnp.maximum(v[:, i], 0), v[:, i])
+            columns.append(jnp.where(spaced > count - self.walls, jnp.minimum(low, 0), low))
+        return jnp.stack(columns, axis=1)
+
+    def settle(self, x: Vectors) -> Vectors:
+        """New positions [m]: on the table when they are in it, NaN when they are off the grid.
+
+        So that a particle which leaves shows as a run that diverged.
+        """
+        if self.table is not None:
+            lowest = jnp.full(x.shape[1] - 1, -jnp.inf, x.dtype)
+            x = jnp.maximum(x, jnp.append(lowest, self.table.height)[None])
+        return jnp.where(self.grid.inside(x)[:, None], x, jnp.nan)
+
+
+@jax.custom_jvp
+def quotient(
+    numerator: Float[Array, "node channel"], denominator: Float[Array, "node 1"]
+) -> Float[Array, "node channel"]:
+    """The ratio, with derivatives that do not square its denominator, which may be tiny.
+
+    The cotangent of a node is as small as its mass: their ratio is harmless, in float32 too.
+    """
+    return numerator / denominator
+
+
+@quotient.defjvp
+def _quotient_jvp(primals, tangents):
+    ratio = quotient(*primals)
+    change, stretch = tangents
+    return ratio, (change - ratio * stretch) / primals[1]

@@ -1,0 +1,123 @@
+"""Membrane and bending of a sheet as forces on its vertices, and bounds on their frequencies.
+
+Strains, curvatures and laws are those of `r2s.Cloth`; here they give forces, for explicit steps.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from r2s.fabric import Fabric
+from r2s.increment import bending_areas, bends, curvatures, hinge_angles, strains
+from r2s.mesh import Mesh
+from r2s.physics.bending import angle_gradient
+from r2s.physics.membrane import green_strain
+from r2s.physics.plate import PlateLaw
+
+Vertices = Float[Array, "vertex 3"]
+
+
+def elastic_force(
+    mesh: Mesh, fabric: Fabric, membrane_damping: Float[Array, ""], x: Vertices, v: Vertices
+) -> Vertices:
+    """The force [N] of membrane and bending with their viscosity, at positions [m] and velocities
+    [m/s].
+
+    As in `r2s.Cloth`, but for `membrane_damping` [s], the damping time of the membrane.
+    """
+    bend = lambda x: bends(mesh, fabric.bending, curvatures(mesh, hinge_angles(mesh, x)))
+    stretched = jax.vmap(fabric.membrane.at)(strains(mesh, x))
+    bent = _bending_laws(fabric, mesh, x)
+    along = _resistance(stretched, lambda x: strains(mesh, x), mesh.area, membrane_damping, x, v)
+    areas = bending_areas(mesh, fabric.bending)
+    return along + _resistance(bent, bend, areas, fabric.damping, x, v)
+
+
+def _bending_laws(fabric: Fabric, mesh: Mesh, x: Vertices) -> Any:
+    """The bending law of every face or hinge, as it stands at positions [m]."""
+    law, hinges = fabric.bending, curvatures(mesh, hinge_angles(mesh, x))
+    if isinstance(law, PlateLaw):
+        return jax.vmap(law.at)(bends(mesh, law, hinges))
+    return jax.vmap(law.at)(mesh.hinge_direction, hinges)
+
+
+def _resistance(
+    laws: Any,
+    measure: Callable[[Vertices], Array],
+    areas: Array,
+    damping: Array,
+    x: Array,
+    v: Array,
+) -> Vertices:
+    """Minus the derivative in x of the energy that laws give a measure of x, with its viscosity."""
+    strain, rate = jax.jvp(measure, (x,), (v,))
+    slopes = lambda strain: jax.vmap(lambda law, s: jax.grad(law.energy_density)(s))(laws, strain)
+    stress, viscous = jax.jvp(slopes, (strain,), (rate,))
+    _, pull = jax.vjp(measure, x)
+    areas = areas if strain.ndim == 1 else areas[:, None]
+    return -pull(areas * (stress + damping * viscous))[0]
+
+
+def membrane_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
+    """A bound on the square of the membrane's highest frequency [1/s^2], flat and unstrained.
+
+    That of the worst face, with a third of its mass at each corner (Fried 1972).
+    """
+    tangent = _tangent(fabric.membrane.at, fabric.membrane)
+
+    def square(corners, inverse):
+        rates = jax.jacobian(lambda corners: green_strain(corners, inverse))(corners)
+        return 3 * _largest(tangent, rates.reshape(3, 9)) / fabric.density
+
+    return jnp.max(jax.vmap(square)(_flat(mesh)[mesh.faces], mesh.inverse))
+
+
+def bending_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
+    """A bound on the square of bending's highest frequency [1/s^2], flat and at rest.
+
+    That of the worst face or hinge, with the vertices' masses in equal parts among those that
+    share them.
+    """
+    if not mesh.hinges.shape[0]:
+        return jnp.zeros((), float)
+    mass = fabric.density * mesh.vertex_area
+    width = (mesh.hinge_length / mesh.hinge_area)[:, None, None]
+    turns = width * jax.vmap(angle_gradient)(_flat(mesh)[mesh.hinges])
+    law, areas = fabric.bending, bending_areas(mesh, fabric.bending)
+    if isinstance(law, PlateLaw):
+        vertices, rates = mesh.patches.vertices, mesh.patches.gradients(turns)
+        tangents = _tangent(law.at, law)[None]
+    else:
+        vertices, rates = mesh.hinges, turns[:, None]
+        flat = jnp.zeros(len(areas), mesh.rest.dtype)
+        laws = jax.vmap(law.at)(mesh.hinge_direction, flat)
+        tangents = jax.vmap(lambda law, k: jax.hessian(law.energy_density)(k))(laws, flat)
+        tangents = tangents[:, None, None]
+    sharing = jnp.zeros(mass.shape, float).at[vertices].add(1)
+    weight = jnp.sqrt(areas[:, None] * sharing[vertices] / mass[vertices])
+    rates = (rates * weight[:, None, :, None]).reshape(*rates.shape[:2], -1)
+    tangents = jnp.broadcast_to(tangents, (len(areas), *tangents.shape[1:]))
+    return jnp.max(jax.vmap(_largest)(tangents, rates))
+
+
+def _tangent(at: Callable[[Array], Any], law: Any) -> Float[Array, "3 3"]:
+    """The stiffness of a law at no strain or curvature."""
+    none = jnp.zeros(3, jax.tree.leaves(law)[0].dtype)
+    return jax.hessian(at(none).energy_density)(none)
+
+
+def _largest(
+    tangent: Float[Array, "strain strain"], rates: Float[Array, "strain coordinate"]
+) -> Float[Array, ""]:
+    """The largest eigenvalue of rates^T tangent rates."""
+    size = jnp.trace(tangent) + jnp.finfo(tangent.dtype).tiny
+    root = jnp.linalg.cholesky(tangent + 1e-6 * size * jnp.eye(len(tangent), dtype=tangent.dtype))
+    scaled = root.T @ rates
+    return jnp.linalg.eigvalsh(scaled @ scaled.T)[-1]
+
+
+def _flat(mesh: Mesh) -> Vertices:
+    return jnp.pad(mesh.rest, ((0, 0), (0, 1)))

@@ -1,0 +1,89 @@
+"""The grid of the material point method: where its nodes are, and whether points are inside."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float
+
+REACH = 2  # nodes that a particle needs beyond it, on each side
+MAX_NODES = 2**27  # about 2 GB in 3-D
+
+
+class Grid(eqx.Module):
+    """A grid of nodes in 2-D or 3-D; the last axis is up.
+
+    - `lower`: the first node, [m].
+    - `spacing`: between nodes, [m].
+    - `shape`: nodes along each axis.
+    """
+
+    lower: Float[Array, " axis"]
+    spacing: float = eqx.field(static=True)
+    shape: tuple[int, ...] = eqx.field(static=True)
+
+    @classmethod
+    def make(cls, lower: tuple[float, ...], spacing: float, shape: tuple[int, ...]) -> "Grid":
+        """A grid from its first node [m], spacing [m] and nodes along each axis.
+
+        Raises `ValueError` when it is not 2-D or 3-D, or has too few or too many nodes.
+        """
+        if len(shape) not in (2, 3) or len(lower) != len(shape):
+            raise ValueError(f"a grid has 2 or 3 axes, got lower {lower} and shape {shape}")
+        if not spacing > 0 or min(shape) < 2 * REACH or math.prod(shape) > MAX_NODES:
+            raise ValueError(
+                f"a grid needs a spacing > 0 m, at least {2 * REACH} nodes along each axis and at "
+                f"most {MAX_NODES} in all, got {spacing} m and {shape}"
+            )
+        return cls(jnp.asarray(lower, float), float(spacing), tuple(shape))
+
+    @classmethod
+    def covering(
+        cls, lower: tuple[float, ...], upper: tuple[float, ...], spacing: float, margin: int = 4
+    ) -> "Grid":
+        """The grid whose particles may be anywhere between two corners [m].
+
+        `margin` nodes surround them. A node lies exactly at `lower`: a table there is met by nodes.
+        """
+        if not spacing > 0 or not all(a < b for a, b in zip(lower, upper, strict=True)):
+            raise ValueError(
+                f"a grid needs a spacing > 0 m and lower < upper, got {spacing}, {lower}, {upper}"
+            )
+        first = tuple(a - margin * spacing for a in lower)
+        cells = [math.ceil((b - a) / spacing - 1e-9) for a, b in zip(lower, upper, strict=True)]
+        return cls.make(first, spacing, tuple(count + 1 + 2 * margin for count in cells))
+
+    @property
+    def axes(self) -> tuple[Float[Array, " ..."], ...]:
+        """The coordinates of the nodes [m] along each axis, ready to be broadcast to `shape`."""
+        dimension = len(self.shape)
+        return tuple(
+            (self.lower[i] + self.spacing * jnp.arange(count).astype(float)).reshape(
+                [-1 if i == k else 1 for k in range(dimension)]
+            )
+            for i, count in enumerate(self.shape)
+        )
+
+    def inside(self, x: Float[Array, "particle axis"]) -> Bool[Array, " particle"]:
+        """Whether all nodes that a particle at `x` [m] touches are on the grid."""
+        place = (x - self.lower[None]) / self.spacing
+        last = jnp.asarray(self.shape, x.dtype)[None] - 1.5
+        return jnp.all((place >= 0.5) & (place < last), axis=1)
+
+    def check(self, x: Float[Array, "particle axis"]) -> None:
+        """Raises `ValueError` when a particle at `x` [m] is not inside. Skipped when traced."""
+        if isinstance(x, Tracer) or isinstance(self.lower, Tracer):
+            return
+        with jax.ensure_compile_time_eval():
+            outside = np.flatnonzero(~np.asarray(self.inside(x)))
+        if len(outside):
+            lower, shape = np.asarray(self.lower), np.asarray(self.shape)
+            low, high = lower + 0.5 * self.spacing, lower + (shape - 1.5) * self.spacing
+            raise ValueError(
+                f"{len(outside)} particles are outside the grid, the first at "
+                f"{np.asarray(x)[outside[0]].tolist()} m; they may be from {low.tolist()} to "
+                f"{high.tolist()} m"
+            )

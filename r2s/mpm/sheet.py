@@ -1,0 +1,216 @@
+"""A sheet of fabric by the material point method: a mesh whose vertices are the particles.
+
+After Jiang, Gast and Teran 2017, whom DiffCP (Zheng et al. 2024) follows. In its plane the sheet is
+the one of `r2s.Cloth`: the same laws of membrane and bending on the same mesh, and the same
+`Fabric`. The forces on the vertices go through the grid; across the sheet the grid's velocity
+gradient drives what layers do to each other (`r2s.mpm.transverse`). So contact of the sheet with
+itself, with the table and with walls comes from the grid, and keeps layers about a spacing apart.
+Explicit in time.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from r2s.fabric import Fabric
+from r2s.mesh import Mesh
+from r2s.mpm.background import Background
+from r2s.mpm.drag import drag_on_vertices
+from r2s.mpm.elements import bending_frequency, elastic_force, membrane_frequency
+from r2s.mpm.grid import Grid
+from r2s.mpm.stability import check_step, longest_step
+from r2s.mpm.transfer import affine_factor
+from r2s.mpm.transverse import Transverse, unit_normal
+from r2s.scene import Control, Scene
+
+Vertices = Float[Array, "vertex 3"]
+
+COARSEST = 1.8  # longest edge of a mesh over the grid's spacing, so that layers cannot pass
+ONSET = 0.5  # [-]: layers press when they are about a spacing apart
+CONTACT = 20.0  # [N/m]: some cm of a fabric's weight press layers together by a tenth
+
+
+class SheetState(eqx.Module):
+    """- `x`, `v`: positions [m] and velocities [m/s] of the vertices.
+    - `C`: affine velocities, [1/s].
+    - `d`: transverse directions of the faces, [-].
+    """
+
+    x: Float[Array, "vertex 3"]
+    v: Float[Array, "vertex 3"]
+    C: Float[Array, "vertex 3 3"]
+    d: Float[Array, "face 3"]
+
+
+class Sheet(eqx.Module):
+    """A sheet in a scene, stepped explicitly on a grid.
+
+    Differentiable in fabric, state, control and scene; by forward mode when the background says so.
+
+    - `scene`: sheet, held vertices, air. Its table is the background's.
+    - `background`: grid, table, walls, gravity.
+    - `transverse`: compression and shear between layers.
+    - `membrane_damping`: damping time of the membrane [s], instead of the fabric's, which then
+      holds for bending alone; None: the fabric's. The membrane's high frequencies, which no motion
+      of a sheet shows, make long damping times cost short steps.
+    - `dt`: step, [s].
+    """
+
+    scene: Scene
+    background: Background
+    transverse: Transverse
+    membrane_damping: Float[Array, ""] | None
+    dt: float = eqx.field(static=True)
+
+    @classmethod
+    def make(
+        cls,
+        scene: Scene,
+        grid: Grid,
+        fabric: Fabric,
+        dt: float,
+        membrane_damping: float | None = None,
+        compression: float = CONTACT,
+        shear: float = CONTACT,
+        walls: int = 0,
+        sticky: bool = False,
+        forward_mode: bool = False,
+    ) -> "Sheet":
+        """A solver for a scene on a grid, with steps of `dt` [s].
+
+        `fabric` is the stiffest that it will be used for; `compression` and `shear` [N/m] are those
+        between layers; walls, sticky and forward mode as in `Background`. Raises `ValueError` when
+        the step is too long for the fabric (the text gives the limit), the mesh too coarse for the
+        grid, or the scene has layers, which belong to `r2s.Cloth`.
+        """
+        if not dt > 0 or not min(compression, shear) > 0:
+            raise ValueError(
+                f"dt [s], compression and shear [N/m] must be positive, got {dt}, {compression} "
+                f"and {shear}"
+            )
+        if scene.layers is not None:
+            raise ValueError(
+                "contact between layers comes from the grid: the scene needs no layers"
+            )
+        edge = longest_edge(scene.mesh)
+        if edge > COARSEST * grid.spacing:
+            raise ValueError(
+                f"the mesh has an edge of {edge:.4g} m, the grid a spacing of {grid.spacing:.4g} "
+                f"m: edges may be {COARSEST} spacings long, or layers slip through between vertices"
+            )
+        background = Background.make(
+            grid, scene.table, walls=walls, sticky=sticky, forward_mode=forward_mode
+        )
+        solver = cls(
+            scene,
+            background,
+            between_layers(compression, shear),
+            None if membrane_damping is None else jnp.asarray(membrane_damping, float),
+            float(dt),
+        )
+        solver.check(fabric)
+        return solver
+
+    def check(self, fabric: Fabric) -> None:
+        """Raises `ValueError`, with the limit, when the step is too long for a fabric.
+
+        A traced fabric is not checked.
+        """
+        spacing = self.background.grid.spacing
+        about = self.scene.mesh, spacing, fabric, self.membrane_damping, self.transverse
+        with jax.ensure_compile_time_eval():
+            longest = stable_step(*about)
+        check_step(self.dt, longest, "the fabric, the mesh and the grid")
+
+    def init(self, x: Vertices, v: Vertices | None = None) -> SheetState:
+        """A state from positions [m] and velocities [m/s] (default: zero), with free layers.
+
+        Raises `ValueError` when a vertex is outside the grid, unless they are traced.
+        """
+        self.background.grid.check(x)
+        v = jnp.zeros_like(x) if v is None else v
+        normals = jax.vmap(unit_normal)(x[self.scene.mesh.faces])
+        return SheetState(x, v, jnp.zeros((*x.shape, 3), x.dtype), normals)
+
+    def step(self, fabric: Fabric, state: SheetState, control: Control) -> SheetState:
+        """The state `dt` later, with the held vertices at `control.handles`."""
+        mesh, held, dt = self.scene.mesh, self.scene.held, self.dt
+        mass = fabric.density * mesh.vertex_area
+        d = self._directions(fabric, state)
+        force, stress = self._across(state.x, d)
+        force += self._along(fabric, state, control)
+        momentum = mass[:, None] * (1 - dt * fabric.mass_damping) * state.v + dt * force
+        # what pulls at a held vertex, the gripper bears
+        carried = (control.handles - state.x[held]) / dt
+        momentum = momentum.at[held].set(mass[held][:, None] * carried)
+        factor = dt * affine_factor(self.background.grid)
+        affine = mass[:, None, None] * state.C - factor * stress
+        v, C = self.background.advance(dt, fabric.friction, state.x, mass, momentum, affine)
+        v = v.at[held].set(carried)
+        x = self.background.settle(state.x + dt * v).at[held].set(control.handles)
+        return SheetState(x, v, C, d)
+
+    def _directions(self, fabric: Fabric, state: SheetState) -> Float[Array, "face 3"]:
+        """Where the grid has carried the transverse directions, after the return mapping."""
+        faces = self.scene.mesh.faces
+        rates = jnp.mean(state.C[faces], axis=1)
+        moved = state.d + self.dt * jnp.sum(rates * state.d[:, None], axis=2)
+        settle = lambda corners, d: self.transverse.settled(corners, d, fabric.friction)
+        return jax.vmap(settle)(state.x[faces], moved)
+
+    def _across(
+        self, x: Vertices, d: Float[Array, "face 3"]
+    ) -> tuple[Vertices, Float[Array, "vertex 3 3"]]:
+        """Forces [N] and stresses times volume [N m] of the vertices, from between the layers."""
+        mesh = self.scene.mesh
+        forces, stresses = jax.vmap(self.transverse.stress)(x[mesh.faces], d)
+        shares = (mesh.area / 3)[:, None, None] * stresses
+        stress = jnp.zeros((*x.shape, 3), x.dtype).at[mesh.faces].add(shares[:, None])
+        force = jnp.zeros_like(x).at[mesh.faces].add(mesh.area[:, None, None] * forces)
+        return force, stress
+
+    def _along(self, fabric: Fabric, state: SheetState, control: Control) -> Vertices:
+        """Forces [N] of membrane, bending and air on the vertices."""
+        scene = self.scene
+        damping = fabric.damping if self.membrane_damping is None else self.membrane_damping
+        elastic = elastic_force(scene.mesh, fabric, damping, state.x, state.v)
+        wind = control.wind
+        return elastic + drag_on_vertices(scene.mesh, scene.air, scene.fan, state.x, state.v, wind)
+
+
+@eqx.filter_jit
+def stable_step(
+    mesh: Mesh,
+    spacing: float,
+    fabric: Fabric,
+    membrane_damping: Float[Array, ""] | float | None = None,
+    transverse: Transverse | None = None,
+) -> Float[Array, ""]:
+    """The longest step [s] that is stable for a fabric, near its rest shape, on a mesh and a grid.
+
+    From bounds on the squares of the highest frequencies of membrane, bending and layers, which
+    add. The grid only lowers those of the mesh.
+    """
+    if transverse is None:
+        transverse = between_layers()
+    damping = fabric.damping if membrane_damping is None else jnp.asarray(membrane_damping, float)
+    return longest_step(
+        [
+            (membrane_frequency(mesh, fabric), damping),
+            (bending_frequency(mesh, fabric), fabric.damping),
+            (transverse.frequency(fabric.density, spacing), jnp.zeros((), float)),
+        ]
+    )
+
+
+def between_layers(compression: float = CONTACT, shear: float = CONTACT) -> Transverse:
+    """Compression and shear [N/m] between layers that start to press at `ONSET`."""
+    return Transverse(*(jnp.asarray(value, float) for value in (compression, shear, ONSET)))
+
+
+def longest_edge(mesh: Mesh) -> float:
+    """Of a mesh, [m]."""
+    corners = np.asarray(mesh.rest)[np.asarray(mesh.faces)]
+    return float(np.max(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)))
