@@ -86,10 +86,10 @@ def test_the_motion_touches_the_table_and_slides_on_it(value_and_grad, inputs):
 
 WHERE = {  # what to differ, and by how much [in its unit]
     "density": (lambda i: i.fabric.density, 1e-6),
-    "c11": (lambda i: i.fabric.membrane.c11, 1e-2),
-    "c12": (lambda i: i.fabric.membrane.c12, 1e-2),
-    "c22": (lambda i: i.fabric.membrane.c22, 1e-2),
-    "c33": (lambda i: i.fabric.membrane.c33, 1e-2),
+    "c11": (lambda i: i.fabric.membrane.c11, 1e-1),
+    "c12": (lambda i: i.fabric.membrane.c12, 1e-1),
+    "c22": (lambda i: i.fabric.membrane.c22, 1e-1),
+    "c33": (lambda i: i.fabric.membrane.c33, 1e-1),
     "bending": (lambda i: i.fabric.bending.stiffness, 1e-8),
     "damping": (lambda i: i.fabric.damping, 1e-6),
     "friction": (lambda i: i.fabric.friction, 1e-6),
