@@ -8,6 +8,7 @@ In reading order:
 - `neighbours`, `layers`: contact of the sheet with itself.
 - `linear`: sparse matrices over a mesh, and their factor.
 - `increment`, `implicit`, `cloth`: the energy of a step, its minimiser, the solver.
+- `mpm`: the second simulator, of material points.
 - `scene`, `solver`, `scenario`: what an experiment fixes, motions over time, lift and fold.
 - `recording`, `clouds`, `manifest`, `synthetic`, `observe`: observations, real and made.
 - `surface`, `losses`, `metrics`: distances between clouds and sheets.

@@ -4,6 +4,7 @@ A family maps a point of the unit cube to a fabric, so that one flat vector serv
 sensitivities, multi-start and sampling.
 """
 
+import dataclasses
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -45,12 +46,15 @@ class Range:
         return (scale(value) - low) / (high - low)
 
 
+MASS_DAMPING = Range("mass damping", "1/s", 1e-2, 10.0)
+
+
 class OrthotropicFamily(eqx.Module):
     """Fabrics of one areal density, in all that a motion may determine.
 
     Membrane stiffness C11, C22, C33 [N/m]; coupling C12 / sqrt(C11 C22) [-], within -1..1, so that
     C stays positive definite while C12 may be negative; bending stiffness [N m]; damping [s];
-    friction [-].
+    friction [-]; and, when it is the last of the ranges, mass damping [1/s], else none.
 
     - `density`: areal density, [kg/m^2], an input: a motion under gravity determines only the
       ratio of stiffness to density.
@@ -73,14 +77,23 @@ class OrthotropicFamily(eqx.Module):
     )
 
     @classmethod
-    def make(cls, density: float, thickness: float = 1e-3) -> "OrthotropicFamily":
-        """The family of an areal density [kg/m^2] and a thickness [m], which must be positive."""
+    def make(
+        cls, density: float, thickness: float = 1e-3, mass_damping: Range | None = None
+    ) -> "OrthotropicFamily":
+        """The family of an areal density [kg/m^2] and a thickness [m], which must be positive.
+
+        `mass_damping`, for example `MASS_DAMPING`, makes that one of its parameters. What brakes
+        rigid motion is hard to tell from the air's drag, so by default it is not.
+        """
         if not (density > 0 and thickness > 0):
             raise ValueError(
                 f"areal density and thickness must be positive, got {density} kg/m^2 and "
                 f"{thickness} m"
             )
-        return cls(jnp.asarray(density, float), jnp.asarray(thickness, float))
+        family = cls(jnp.asarray(density, float), jnp.asarray(thickness, float))
+        if mass_damping is None:
+            return family
+        return dataclasses.replace(family, ranges=(*family.ranges, mass_damping))
 
     @property
     def dim(self) -> int:
@@ -93,7 +106,7 @@ class OrthotropicFamily(eqx.Module):
 
     def __call__(self, u: Float[Array, " dim"]) -> Fabric:
         """The fabric at a point of the unit cube."""
-        c11, c22, c33, coupling, bending, damping, friction = self.values(u)
+        c11, c22, c33, coupling, bending, damping, friction, *others = self.values(u)
         c12 = coupling * jnp.sqrt(c11 * c22)
         return Fabric(
             self.density,
@@ -102,7 +115,7 @@ class OrthotropicFamily(eqx.Module):
             damping,
             friction,
             self.thickness,
-            jnp.zeros((), float),
+            others[0] if others else jnp.zeros((), float),
         )
 
     def locate(self, fabric: Fabric) -> Float[Array, " dim"]:
@@ -110,7 +123,7 @@ class OrthotropicFamily(eqx.Module):
         law, bending = constant_laws(fabric)
         coupling = law.c12 / jnp.sqrt(law.c11 * law.c22)
         values = (law.c11, law.c22, law.c33, coupling, bending.stiffness)
-        values += (fabric.damping, fabric.friction)
+        values += (fabric.damping, fabric.friction, fabric.mass_damping)[: self.dim - 5]
         places = [bound.place(value) for bound, value in zip(self.ranges, values, strict=True)]
         return jnp.stack(places)
 

@@ -193,6 +193,7 @@ def read_recording(folder: Path | str, manifest: Manifest, name: str) -> Recordi
         sheet=scenario.sheet,
         table_height=scenario.table_height,
         verified=verified,
+        time_offset=scenario.time_offset,
     )
     kept = [_distinct(points) if scenario.drop_repeats else points for points in clouds.values()]
     return make_recording(

@@ -15,8 +15,10 @@ from jaxtyping import Array, Bool, Float
 from r2s.clouds import voxel_means
 from r2s.files import write_bytes
 
-FORMAT = "r2s-recording/1"
+FORMAT = "r2s-recording/2"
+READABLE = ("r2s-recording/1", FORMAT)  # the first knew neither force nor markers nor wind
 CORNERS = {"origin": (0, 0), "warp": (1, 0), "weft": (0, 1), "opposite": (1, 1)}
+OPTIONAL = ("force", "force_times", "markers", "markers_seen")
 CLOCK_TOLERANCE = 1e-6  # [s], rounding when a time is a frame number over a rate
 
 
@@ -58,7 +60,15 @@ def corner(sheet: SheetPlacement, name: str) -> Float[np.ndarray, "3"]:
 
 @dataclass(frozen=True)
 class RecordingInfo:
-    """What a recording is of. `frames_used`: the first and the last frame that count."""
+    """What a recording is of.
+
+    - `frames_used`: the first and the last frame that count.
+    - `wind`: of the air around the sheet, None where nobody measured it.
+    - `time_offset`: what was added to the cameras' clock to give `Recording.times`; a negative one
+      says that the cameras lag behind the grippers. `set_time_offset` changes it.
+
+    Raises ValueError for a wind or an offset that is not finite.
+    """
 
     name: str
     scenario: str
@@ -69,6 +79,14 @@ class RecordingInfo:
     sheet: SheetPlacement
     table_height: float  # [m]
     verified: bool | None  # do the files match published hashes (None: there are none)
+    wind: tuple[float, float, float] | None = None  # [m/s]
+    time_offset: float = 0.0  # [s]
+
+    def __post_init__(self) -> None:
+        if self.wind is not None and (len(self.wind) != 3 or not np.isfinite(self.wind).all()):
+            raise ValueError(f"wind must be three finite numbers [m/s], found {self.wind}")
+        if not np.isfinite(self.time_offset):
+            raise ValueError(f"time_offset must be finite [s], found {self.time_offset}")
 
 
 class Recording(eqx.Module):
@@ -76,6 +94,9 @@ class Recording(eqx.Module):
 
     `info` is static: a jitted function that takes a whole Recording compiles once per `info`; one
     that takes its arrays compiles once per shape (see `subsample`).
+
+    `force` is what pulls at the sheet: for each sample of its log a number, or a vector in the
+    world. `markers` are places printed on the sheet, in each frame. None where not recorded.
     """
 
     points: Float[Array, "frame point 3"]  # [m], padded with zeros; only where mask
@@ -84,39 +105,59 @@ class Recording(eqx.Module):
     handle_path: Float[Array, "knot handle 3"]  # [m], held still before the first knot
     handle_times: Float[Array, " knot"]  # [s]
     info: RecordingInfo = eqx.field(static=True)
+    force: Float[Array, " sample"] | Float[Array, "sample 3"] | None = None  # [N]
+    force_times: Float[Array, " sample"] | None = None  # [s], on the clock of handle_times
+    markers: Float[Array, "frame marker 3"] | None = None  # [m], zero where not markers_seen
+    markers_seen: Bool[Array, "frame marker"] | None = None
 
 
 def make_recording(
-    clouds: Sequence[Any], times: Any, handle_path: Any, handle_times: Any, info: RecordingInfo
+    clouds: Sequence[Any] | None,
+    times: Any,
+    handle_path: Any,
+    handle_times: Any,
+    info: RecordingInfo,
+    *,
+    force: Any = None,
+    force_times: Any = None,
+    markers: Any = None,
+    markers_seen: Any = None,
 ) -> Recording:
     """Pad ragged clouds into a Recording.
 
-    `clouds`: one (points, 3) array [m] per frame; `times`: (frame,) [s]; `handle_path`:
-    (knot, handle, 3), or (knot, 3) for one handle [m]; `handle_times`: (knot,) [s]. Floats take
-    JAX's default precision.
+    `clouds`: one (points, 3) array [m] per frame, or None: the markers that are seen; `times`:
+    (frame,) [s], `info.time_offset` included; `handle_path`: (knot, handle, 3), or (knot, 3) for
+    one handle [m]; `handle_times`: (knot,) [s]; `force`: (sample,) or (sample, 3) [N] at
+    `force_times` [s]; `markers`: (frame, marker, 3) [m], and `markers_seen`: (frame, marker), by
+    default wherever the markers are finite. Floats take JAX's default precision.
 
     Raises ValueError that names the recording, and the frame where there is one: no frames, a
     cloud that is empty or not finite or not (points, 3), times that do not increase, a path of
     another shape or of more handles than `info.sheet.held` names, a path that ends before the
-    last frame, `frames_used` outside of the frames.
+    last frame, `frames_used` outside of the frames, a force without times or the reverse, markers
+    of other frames, or seen but not finite.
     """
     try:
+        marks = _check_markers(markers, markers_seen)
+        if clouds is None:
+            clouds = [] if marks is None else [at[seen] for at, seen in zip(*marks, strict=True)]
         checked = [_check_cloud(cloud, frame) for frame, cloud in enumerate(clouds)]
         first, last = info.frames_used
         if not checked:
             raise ValueError("no frames: a recording needs at least one cloud")
         if not 0 <= first <= last < len(checked):
             raise ValueError(f"frames_used is {first}..{last}, but there are {len(checked)} frames")
+        if marks is not None and len(marks[0]) != len(checked):
+            raise ValueError(f"markers in {len(marks[0])} frames, but clouds in {len(checked)}")
         path = _check_path(handle_path, info.sheet.held)
         clock = _check_times(times, "times", len(checked))
         knots = _check_times(handle_times, "handle_times", len(path))
-        if knots[-1] < clock[-1] - CLOCK_TOLERANCE:
-            raise ValueError(
-                f"the handle path ends at {knots[-1]:g} s, before the last frame at {clock[-1]:g} s"
-            )
+        _check_end(knots, clock)
+        log = _check_force(force, force_times)
     except ValueError as error:
         raise ValueError(f"recording {info.name}: {error}") from error
     points, mask = _pad(checked, max(map(len, checked)))
+    floats = lambda values: None if values is None else jnp.asarray(values, float)
     return Recording(
         points=jnp.asarray(points, float),
         mask=jnp.asarray(mask),
@@ -124,7 +165,27 @@ def make_recording(
         handle_path=jnp.asarray(path, float),
         handle_times=jnp.asarray(knots, float),
         info=info,
+        force=floats(log and log[0]),
+        force_times=floats(log and log[1]),
+        markers=floats(marks and marks[0]),
+        markers_seen=None if marks is None else jnp.asarray(marks[1]),
     )
+
+
+def set_time_offset(recording: Recording, offset: float) -> Recording:
+    """The recording with another offset [s] between the cameras' clock and that of the grippers.
+
+    Markers move with the frames, the force does not. Raises ValueError when the last frame comes
+    after the end of the handle path.
+    """
+    shift = offset - recording.info.time_offset
+    times = np.asarray(recording.times, np.float64) + shift
+    info = replace(recording.info, time_offset=offset)
+    try:
+        _check_end(np.asarray(recording.handle_times), times)
+    except ValueError as error:
+        raise ValueError(f"recording {info.name}: time offset {offset:g} s: {error}") from error
+    return replace(recording, times=jnp.asarray(times, float), info=info)
 
 
 def cloud(recording: Recording, frame: int) -> Float[np.ndarray, "point 3"]:
@@ -156,23 +217,30 @@ def subsample(recording: Recording, num_points: int, voxel: float, seed: int) ->
 
 
 def save(recording: Recording, path: Path | str) -> None:
-    """Write the recording to `path` as one NPZ, whole or not at all; OSError names `path`."""
-    clouds = [cloud(recording, frame) for frame in range(len(recording.times))]
+    """Write the recording to `path` as one NPZ, whole or not at all; OSError names `path`.
+
+    Arrays: `points` (all frames', 3) and `offsets` (frame + 1), where frame i is
+    `points[offsets[i]:offsets[i + 1]]`; `times`, `handle_path`, `handle_times`; where recorded
+    `force`, `force_times`, `markers`, `markers_seen`; `meta`: JSON of format and `info`.
+    """
+    mask = np.asarray(recording.mask)
     buffer = io.BytesIO()
+    optional = {name: getattr(recording, name) for name in OPTIONAL}
     np.savez(
         buffer,
         meta=np.array(json.dumps({"format": FORMAT, "info": asdict(recording.info)})),
-        points=np.concatenate(clouds),
-        offsets=np.cumsum([0, *map(len, clouds)]),
+        points=np.asarray(recording.points)[mask],
+        offsets=np.cumsum([0, *mask.sum(axis=1)]),
         times=np.asarray(recording.times),
         handle_path=np.asarray(recording.handle_path),
         handle_times=np.asarray(recording.handle_times),
+        **{name: np.asarray(values) for name, values in optional.items() if values is not None},
     )
     write_bytes(path, buffer.getvalue())
 
 
 def load(path: Path | str) -> Recording:
-    """Read what `save` wrote.
+    """Read what `save` wrote, in this version of the format or an earlier one.
 
     Raises FileNotFoundError, or a ValueError that names the file if it is damaged, not a
     recording, or of another version of the format.
@@ -180,22 +248,36 @@ def load(path: Path | str) -> Recording:
     try:
         with np.load(path, allow_pickle=False) as file:
             meta = json.loads(str(file["meta"]))
-            if meta["format"] != FORMAT:
-                raise ValueError(f"format {meta['format']!r}, expected {FORMAT!r}")
+            if meta["format"] not in READABLE:
+                raise ValueError(
+                    f"format {meta['format']!r}, expected one of {READABLE}: update r2s, or "
+                    "convert the recording again"
+                )
             info = _info_from(meta["info"])
-            clouds = np.split(file["points"], file["offsets"][1:-1])
+            clouds = _split(file["points"], file["offsets"])
             handles = file["handle_path"], file["handle_times"]
-            return make_recording(clouds, file["times"], *handles, info)
+            optional = {name: file[name] for name in OPTIONAL if name in file}
+            return make_recording(clouds, file["times"], *handles, info, **optional)
     except FileNotFoundError:
         raise
     except Exception as error:  # a damaged archive raises anything, from EOFError to zlib.error
-        raise ValueError(f"{path}: not a readable recording ({FORMAT}): {error}") from error
+        reason = f"it lacks {error}" if isinstance(error, KeyError) else error
+        raise ValueError(f"{path}: not a readable recording ({FORMAT}): {reason}") from error
 
 
 def _info_from(values: dict[str, Any]) -> RecordingInfo:
     sheet = SheetPlacement(**{key: tuple(value) for key, value in values["sheet"].items()})
-    frames_used = tuple(values["frames_used"])
-    return RecordingInfo(**{**values, "sheet": sheet, "frames_used": frames_used})
+    changed = {"sheet": sheet, "frames_used": tuple(values["frames_used"])}
+    if values.get("wind") is not None:
+        changed["wind"] = tuple(values["wind"])
+    return RecordingInfo(**{**values, **changed})
+
+
+def _split(points: np.ndarray, offsets: np.ndarray) -> list[np.ndarray]:
+    ends = [0, len(points)]
+    if offsets.ndim != 1 or list(offsets[[0, -1]]) != ends or (np.diff(offsets) < 0).any():
+        raise ValueError(f"offsets must go from {ends[0]} to {ends[1]}, found {offsets}")
+    return np.split(points, offsets[1:-1])
 
 
 def _check_cloud(points: Any, frame: int) -> np.ndarray:
@@ -225,9 +307,53 @@ def _check_times(times: Any, what: str, count: int) -> np.ndarray:
         at = int((np.diff(kept) <= 0).argmax())
         raise ValueError(
             f"{what} must increase: {times[at]} s at {at}, then {times[at + 1]} s, "
-            f"as {kept.dtype} {kept[at]} and {kept[at + 1]}"
+            f"as {kept.dtype} {kept[at]} and {kept[at + 1]}; sort them, drop repeated ones, and "
+            "count from the start of the recording"
         )
     return times
+
+
+def _check_end(knots: np.ndarray, times: np.ndarray) -> None:
+    if knots[-1] < times[-1] - CLOCK_TOLERANCE:
+        raise ValueError(
+            f"the handle path ends at {knots[-1]:g} s, before the last frame at {times[-1]:g} s"
+        )
+
+
+def _check_force(force: Any, times: Any) -> tuple[np.ndarray, np.ndarray] | None:
+    if force is None and times is None:
+        return None
+    if force is None or times is None:
+        there, lacks = ("force_times", "force") if force is None else ("force", "force_times")
+        raise ValueError(f"{there} without {lacks}: give both or neither")
+    force = np.asarray(force, np.float64)
+    if len(force.shape) not in (1, 2) or force.shape[1:] not in ((), (3,)) or len(force) == 0:
+        raise ValueError(f"force must be (sample,) or (sample, 3) [N], found {force.shape}")
+    if not np.isfinite(force).all():
+        bad = int((~np.isfinite(force.reshape(len(force), -1)).all(axis=1)).argmax())
+        raise ValueError(f"force must be finite [N], found {force[bad]} in sample {bad}")
+    return force, _check_times(times, "force_times", len(force))
+
+
+def _check_markers(markers: Any, seen: Any) -> tuple[np.ndarray, np.ndarray] | None:
+    """Markers, zero where they are not seen, and where they are."""
+    if markers is None:
+        if seen is not None:
+            raise ValueError("markers_seen without markers")
+        return None
+    markers = np.asarray(markers, np.float64)
+    if markers.ndim != 3 or markers.shape[2] != 3:
+        raise ValueError(f"markers must be (frame, marker, 3) [m], found {markers.shape}")
+    finite = np.isfinite(markers).all(axis=2)
+    seen = finite if seen is None else np.asarray(seen)
+    if seen.dtype != bool or seen.shape != finite.shape:
+        raise ValueError(
+            f"markers_seen must be {finite.shape} of bool, found {seen.shape} of {seen.dtype}"
+        )
+    if (seen & ~finite).any():
+        frame, marker = np.argwhere(seen & ~finite)[0]
+        raise ValueError(f"frame {frame}: marker {marker} is seen, but its place is not finite")
+    return np.where(seen[..., None], markers, 0), seen
 
 
 def _check_path(path: Any, held: tuple[str, ...]) -> np.ndarray:

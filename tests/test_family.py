@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r2s.fabric import Fabric
-from r2s.family import OrthotropicFamily, Range
+from r2s.family import MASS_DAMPING, OrthotropicFamily, Range
 from r2s.presets import FIVE
 
 few = settings(max_examples=25, deadline=None)
@@ -50,6 +50,15 @@ def test_every_fabric_of_the_cube_is_stable(place):
 def test_every_fabric_has_the_density_and_thickness_of_the_family():
     fabric = OrthotropicFamily.make(0.17, 2e-3)(jnp.linspace(0.0, 1.0, 7))
     assert (float(fabric.density), float(fabric.thickness)) == (0.17, 2e-3)
+
+
+def test_mass_damping_is_a_parameter_when_asked_for():
+    family = OrthotropicFamily.make(0.17, mass_damping=MASS_DAMPING)
+    place = jnp.linspace(0.1, 0.8, 8)
+    assert family.dim == FAMILY.dim + 1
+    assert family(place).mass_damping == pytest.approx(float(MASS_DAMPING.value(place[-1])))
+    assert np.asarray(family.locate(family(place))) == pytest.approx(np.asarray(place), abs=1e-9)
+    assert FAMILY(place[:-1]).mass_damping == 0
 
 
 def test_the_middle_is_the_geometric_one():

@@ -1,6 +1,7 @@
 """Recordings: what makes one, thinning, and files that are whole or not there."""
 
 import errno
+import json
 import os
 import subprocess
 import sys
@@ -26,6 +27,7 @@ from r2s.recording import (
     load,
     make_recording,
     save,
+    set_time_offset,
     subsample,
 )
 
@@ -236,6 +238,128 @@ def test_save_and_load_give_the_same_recording(
         np.testing.assert_array_equal(before, after)
 
 
+def shapes_of(recording: Recording) -> dict[str, Any]:
+    names = [name for name in vars(recording) if name != "info"]
+    return {name: None if (v := getattr(recording, name)) is None else v.shape for name in names}
+
+
+FINITE = st.floats(-1e3, 1e3, allow_subnormal=False)
+
+
+@given(
+    force=arrays(float, st.sampled_from([(4,), (4, 3), (1,)]), elements=FINITE),
+    markers=arrays(float, st.sampled_from([(2, 1, 3), (2, 6, 3)]), elements=FINITE),
+    lost=st.integers(0, 5),
+    wind=st.none() | st.tuples(FINITE, FINITE, FINITE),
+    time_offset=st.floats(-1, 1),
+)
+@settings(max_examples=30, deadline=None)
+def test_force_markers_and_wind_survive_the_file(
+    tmp_path_factory: pytest.TempPathFactory,
+    force: np.ndarray,
+    markers: np.ndarray,
+    lost: int,
+    wind: tuple[float, float, float] | None,
+    time_offset: float,
+) -> None:
+    path = tmp_path_factory.mktemp("saved") / "a.npz"
+    if lost < markers.shape[1]:
+        markers[1, lost] = np.nan
+    recording = record(
+        ones(3, 4),
+        replace(INFO, wind=wind, time_offset=time_offset),
+        force=force,
+        force_times=np.arange(len(force)) * 0.03,
+        markers=markers,
+    )
+    save(recording, path)
+    loaded = load(path)
+    assert loaded.info == recording.info
+    assert shapes_of(loaded) == shapes_of(recording)
+    for name in shapes_of(loaded):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(recording, name))
+    np.testing.assert_allclose(loaded.force, force, rtol=1e-6)
+    seen = np.asarray(loaded.markers_seen)
+    assert seen.sum() == markers.shape[0] * markers.shape[1] - (lost < markers.shape[1])
+    np.testing.assert_allclose(np.asarray(loaded.markers)[seen], markers[seen], rtol=1e-6)
+    assert not np.asarray(loaded.markers)[~seen].any()  # no NaN gets into a loss
+
+
+def test_a_file_of_the_first_version_is_read(tmp_path: Path) -> None:
+    save(record(ones(3, 4)), tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz") as file:
+        meta = json.loads(str(file["meta"]))
+    meta["format"] = "r2s-recording/1"
+    for later in ("wind", "time_offset"):
+        del meta["info"][later]
+    resave(tmp_path / "a.npz", meta=np.array(json.dumps(meta)))
+    loaded = load(tmp_path / "a.npz")
+    assert loaded.info == INFO and loaded.force is None and loaded.markers is None
+    np.testing.assert_array_equal(loaded.points, record(ones(3, 4)).points)
+
+
+def test_markers_alone_make_the_clouds() -> None:
+    markers = np.arange(18.0).reshape(2, 3, 3)
+    seen = np.array([[True, True, True], [True, False, True]])
+    recording = make_recording(
+        None, [0.0, 0.1], np.zeros((2, 3)), [0.0, 0.1], INFO, markers=markers, markers_seen=seen
+    )
+    np.testing.assert_array_equal(cloud(recording, 1), markers[1, [0, 2]])
+    blind = seen & [[True], [False]]
+    with pytest.raises(ValueError, match="frame 1: the cloud is empty"):
+        make_recording(
+            None, [0.0, 0.1], np.zeros((2, 3)), [0, 1], INFO, markers=markers, markers_seen=blind
+        )
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"force": [1.0, 2.0]}, "force without force_times"),
+        ({"force_times": [1.0, 2.0]}, "force_times without force"),
+        ({"force": [[1.0, 2.0]], "force_times": [0.0]}, r"or \(sample, 3\) .N., found \(1, 2\)"),
+        ({"force": [], "force_times": []}, r"found \(0,\)"),
+        ({"force": [1.0, np.nan], "force_times": [0.0, 1.0]}, "found nan in sample 1"),
+        ({"force": [1.0, 2.0], "force_times": [0.0]}, r"force_times must have the shape \(2,\)"),
+        (
+            {"force": [1.0, 2.0, 3.0], "force_times": [0.0, 0.2, 0.1]},
+            "force_times must increase: 0.2 s at 1, then 0.1 s.*sort them, drop repeated",
+        ),
+        ({"markers": np.zeros((3, 4, 3))}, "markers in 3 frames, but clouds in 2"),
+        ({"markers": np.zeros((2, 4, 2))}, r"markers must be \(frame, marker, 3\)"),
+        ({"markers_seen": np.ones((2, 4), bool)}, "markers_seen without markers"),
+        (
+            {"markers": np.zeros((2, 4, 3)), "markers_seen": np.ones((2, 4))},
+            r"markers_seen must be \(2, 4\) of bool, found \(2, 4\) of float64",
+        ),
+        (
+            {"markers": np.full((2, 4, 3), np.nan), "markers_seen": np.ones((2, 4), bool)},
+            "frame 0: marker 0 is seen, but its place is not finite",
+        ),
+    ],
+)
+def test_a_bad_force_or_marker_is_refused(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=f"recording lift_tan: .*{words}"):
+        record(ones(3, 4), **changes)
+
+
+def test_bad_wind_and_offset_are_refused() -> None:
+    with pytest.raises(ValueError, match="wind must be three finite numbers"):
+        replace(INFO, wind=(0.0, np.inf, 0.0))
+    with pytest.raises(ValueError, match="time_offset must be finite"):
+        replace(INFO, time_offset=np.nan)
+
+
+def test_the_offset_of_the_clocks_can_be_set_again() -> None:
+    recording = record(ones(3, 4), replace(INFO, time_offset=-0.05), times=[-0.05, 0.05])
+    moved = set_time_offset(recording, 0.1)
+    np.testing.assert_allclose(moved.times, [0.1, 0.2], rtol=1e-6)
+    assert moved.info.time_offset == 0.1
+    np.testing.assert_allclose(set_time_offset(moved, -0.05).times, recording.times, atol=1e-7)
+    with pytest.raises(ValueError, match="lift_tan: time offset 2 s: the handle path ends at 1.1"):
+        set_time_offset(recording, 2.0)
+
+
 def test_a_recording_goes_through_jit() -> None:
     total = jax.jit(lambda r: jnp.where(r.mask[..., None], r.points, 0).sum())
     assert total(record(ones(3, 4))) == pytest.approx(0.5 * 3 * 7)
@@ -265,8 +389,10 @@ def test_unreadable_files_are_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "changes, words",
     [
-        ({"meta": np.array('{"format": "r2s-recording/2"}')}, "r2s-recording/2.*expected"),
-        ({"meta": np.array('{"format": "r2s-recording/1"}')}, "info"),
+        ({"meta": np.array('{"format": "r2s-recording/3"}')}, "r2s-recording/3.*expected.*update"),
+        ({"meta": np.array('{"format": "r2s-recording/2"}')}, "it lacks 'info'"),
+        ({"offsets": np.array([0, 3, 6])}, "offsets must go from 0 to 7"),
+        ({"offsets": np.array([0, 8, 7])}, "offsets must go from 0 to 7"),
         ({"points": None}, "points"),
         ({"times": np.array([0.0])}, r"times must have the shape \(2,\)"),
         ({"offsets": np.array([0, 0, 7])}, "frame 0: the cloud is empty"),
