@@ -40,7 +40,8 @@ class Patches(eqx.Module):
         """The patches of a mesh at rest [m]."""
         of_face = _hinges_of_faces(faces, hinges)
         exists = of_face >= 0
-        four = np.where(exists[:, :, None], hinges[of_face] if len(hinges) else -1, -1)
+        listed = np.concatenate([hinges.reshape(-1, 4), np.full((1, 4), -1)])
+        four = listed[of_face]  # a row of -1 where there is no hinge, the last
         # the hinge's opposite vertices are the face's own corner and the one beyond
         beyond = np.where(four[:, :, 2] == faces, four[:, :, 3], four[:, :, 2])
         beyond = np.where(exists, beyond, faces[:, :1])

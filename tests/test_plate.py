@@ -89,6 +89,11 @@ def test_a_face_at_the_border_takes_the_least_curvature_that_its_hinges_allow():
     assert has_warp.mean() == 1 - 2 * 5 / len(mesh.faces)
 
 
+def test_a_single_triangle_has_no_curvature():
+    mesh = Mesh.make(np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]]), np.array([[0, 1, 2]]))
+    assert np.all(np.asarray(seen(mesh, bent(mesh, 1.0, 1.0, 0.0))) == 0)
+
+
 @pytest.mark.parametrize("name", ["falling", "rising", "irregular"])
 @pytest.mark.parametrize("angle", [0.0, 22.5, 45.0, 90.0, 135.0])
 def test_a_plate_bends_alike_in_all_directions(name, angle):
