@@ -1,0 +1,140 @@
+"""The command line `r2s`: data sets, and pictures of recordings. `r2s --help` begins.
+
+Exit codes: 0; 1 for an error, in one line on stderr; 2 for wrong usage. A command is a dataclass,
+whose fields are its arguments, with a method `run`; its docstring is its help. What it needs is
+imported there, so that help comes at once.
+"""
+
+import sys
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+try:
+    import tyro
+    from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
+except ImportError:
+    sys.exit("r2s: error: the command line needs tyro: pip install 'r2s[cli]'")
+
+
+@dataclass(frozen=True)
+class Fetch:
+    """Bring a public data set into a folder, and verify it.
+
+    Files that are there and are what was published are left alone; a download that broke off goes
+    on where it ended. A corrupt file is named and never replaced unasked. What cannot be downloaded
+    automatically is said, with its licence, how to get it, and where to put it. Run it again then:
+    it checks what is there.
+
+        r2s data fetch diffcloud --to recordings
+    """
+
+    name: Annotated[Positional[str], arg(metavar="NAME")]
+    """Of the data set; `r2s data list` shows them."""
+    to: Annotated[Path, arg(metavar="FOLDER")]
+    """Where it is, or shall be."""
+    manifests: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Descriptions of other data sets, one JSON each, instead of the project's."""
+
+    def run(self) -> None:
+        from r2s.data import fetch
+
+        for line in fetch(self.name, self.to, self.manifests):
+            print(line)
+
+
+@dataclass(frozen=True)
+class List:
+    """List the public data sets that r2s knows: name, title, licence, and how each is got."""
+
+    manifests: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Descriptions of other data sets, one JSON each, instead of the project's."""
+
+    def run(self) -> None:
+        from r2s.data import Dataset, known_datasets
+
+        for name, data in known_datasets(self.manifests).items():
+            automatic = isinstance(data, Dataset) and data.downloads and not data.layout
+            print(f"{name}: {data.title}")
+            print(f"    licence: {data.licence}")
+            print(f"    {'downloaded automatically' if automatic else 'fetched by hand'}")
+
+
+@dataclass(frozen=True)
+class Data:
+    """Public data sets of recordings: which there are, and how to get them."""
+
+    command: Annotated[
+        Annotated[Fetch, subcommand("fetch")] | Annotated[List, subcommand("list")], arg(name="")
+    ]
+
+    def run(self) -> None:
+        self.command.run()
+
+
+@dataclass(frozen=True)
+class Show:
+    """Draw a recording: a contact sheet (PNG) and a video of clouds, grippers and simulated cloth.
+
+    All panels have one scale, in metres. RECORDING is an NPZ of r2s, or a folder of frames with
+    its manifest.json beside it; without one, the manifest of DIFFCLOUD is taken.
+
+        r2s show recordings/lift_tan --out pictures
+        r2s show lift.npz --trajectory simulated.npz --out pictures --video gif
+    """
+
+    recording: Annotated[Positional[Path], arg(metavar="RECORDING")]
+    """NPZ, or folder of numbered clouds or of RGB-D images."""
+    out: Annotated[Path, arg(metavar="FOLDER")]
+    """Where the pictures go; it is made when it is not there."""
+    trajectory: Annotated[Path | None, arg(metavar="FILE")] = None
+    """NPZ with x (frame, vertex, 3) [m], at the recording's frames, and faces (face, 3)."""
+    video: Literal["auto", "gif", "mp4", "none"] = "auto"
+    """auto: an MP4 where OpenCV is installed, else a GIF."""
+
+    def run(self) -> None:
+        from r2s.show import load_trajectory, open_recording, show
+
+        cloth = None if self.trajectory is None else load_trajectory(self.trajectory)
+        for path in show(open_recording(self.recording), self.out, cloth, self.video):
+            print(path)
+
+
+Command = Annotated[Data, subcommand("data")] | Annotated[Show, subcommand("show")]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command line (None: that of the process); the exit code.
+
+    Raises SystemExit, with 0 after --help and 2 after a wrong usage, whose message is on stderr.
+    """
+    command = tyro.cli(
+        Command,  # pyright: ignore[reportArgumentType]
+        prog="r2s",
+        description="r2s: real-to-sim for fabrics. Each command tells more with --help.",
+        args=arguments,
+        config=(OmitArgPrefixes, OmitSubcommandPrefixes),
+    )
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            command.run()
+    except BrokenPipeError:  # whoever read the output had enough
+        sys.stdout = None
+    except (ValueError, OSError, ImportError) as error:
+        print(f"r2s: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("r2s: error: interrupted", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _warn(message, *_, **__) -> None:
+    print(f"r2s: warning: {message}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,105 @@
+"""Grey frames of a video file or of a folder of images. Needs OpenCV: pip install 'r2s[camera]'."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+
+
+def read_grey(path: Path | str) -> Iterator[UInt8[np.ndarray, "height width"]]:
+    """The frames of a video, one after the other, as grey images.
+
+    `path`: a video file, or a folder of images, which come in the order of the last number in
+    their names.
+
+    Raises FileNotFoundError, ImportError (names the extra), or a ValueError that names the file
+    and the frame: no video, no images, one that is damaged, of another size than the first, two of
+    one number, a number that is missing, a video that ends early.
+    """
+    path = Path(path)
+    frames = _images(path) if path.is_dir() else _video(path)
+    size = None
+    for number, (name, image) in enumerate(frames):
+        size = size or image.shape
+        if image.shape != size:
+            raise ValueError(
+                f"{name}: frame {number} has {image.shape[1]} x {image.shape[0]} pixels, the first "
+                f"{size[1]} x {size[0]}: one recording needs one size"
+            )
+        yield image
+
+
+def _images(folder: Path) -> Iterator[tuple[Path, np.ndarray]]:
+    cv2 = opencv()
+    for file in _numbered(folder):
+        data = file.read_bytes()
+        # libpng hands out the rows that it has: a cut file must be told by its missing end
+        cut = file.suffix.lower() == ".png" and b"IEND" not in data[-16:]
+        buffer = np.frombuffer(data, np.uint8)
+        image = cv2.imdecode(buffer, cv2.IMREAD_GRAYSCALE) if len(buffer) and not cut else None
+        if image is None:
+            raise ValueError(f"{file}: damaged or cut short: copy it again from the camera")
+        yield file, np.asarray(image, np.uint8)
+
+
+def _numbered(folder: Path) -> list[Path]:
+    found: dict[int, Path] = {}
+    for file in sorted(folder.iterdir()):
+        digits = re.findall(r"[0-9]+", file.stem)
+        if file.name.startswith(".") or file.suffix.lower() not in IMAGES or not digits:
+            continue
+        number = int(digits[-1])
+        if number in found:
+            raise ValueError(
+                f"{folder}: frame {number} is there twice: {found[number].name} and {file.name}"
+            )
+        found[number] = file
+    if not found:
+        raise FileNotFoundError(f"{folder}: no numbered images such as 000.png")
+    for number in range(min(found), max(found)):
+        if number not in found:
+            raise ValueError(
+                f"{folder}: frame {number} is missing, of {min(found)} to {max(found)}: times are "
+                "counted by frames, so restore it, or split the recording there"
+            )
+    return [found[number] for number in sorted(found)]
+
+
+def _video(path: Path) -> Iterator[tuple[Path, np.ndarray]]:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such video file or folder of images")
+    cv2 = opencv()
+    capture = cv2.VideoCapture(str(path))
+    try:
+        if not capture.isOpened():
+            raise ValueError(f"{path}: no video that OpenCV can read: convert it to MP4 (H.264)")
+        promised, number = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0
+        while True:
+            there, image = capture.read()
+            if not there:
+                break
+            number += 1
+            image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+            yield path, np.asarray(image, np.uint8)
+    finally:
+        capture.release()
+    if number < promised - 1:  # some containers count one frame too many
+        raise ValueError(
+            f"{path}: frame {number} cannot be read, of {promised} that the file promises: it is "
+            "cut short or damaged; copy it again, or cut it before that frame"
+        )
+    if number == 0:
+        raise ValueError(f"{path}: the video has no frames")
+
+
+def opencv():
+    """The module cv2; ImportError that names the extra when it is not installed."""
+    try:
+        import cv2
+    except ImportError as error:
+        raise ImportError("images need OpenCV: pip install 'r2s[camera]'") from error
+    return cv2

@@ -1,0 +1,94 @@
+"""The command line: what it does, its help, and its exit codes."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("tyro")
+
+from test_show import cloth, recorded  # noqa: E402
+
+from r2s.cli import main  # noqa: E402
+from r2s.recording import save  # noqa: E402
+from r2s.show import save_trajectory  # noqa: E402
+
+
+def stopped(*arguments: str) -> int | str | None:
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    return stop.value.code
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        ((), ["data", "show", "real-to-sim for fabrics"]),
+        (("data",), ["fetch", "list"]),
+        (("data", "fetch"), ["NAME", "--to FOLDER", "r2s data fetch diffcloud --to recordings"]),
+        (("data", "list"), ["--manifests FOLDER"]),
+        (("show",), ["RECORDING", "--trajectory FILE", "--out FOLDER", "gif", "frame, vertex, 3"]),
+    ],
+)
+def test_help_teaches(capsys: pytest.CaptureFixture, arguments: tuple, words: list[str]) -> None:
+    assert stopped(*arguments, "--help") == 0
+    text = capsys.readouterr().out
+    for word in words:
+        assert word in text
+
+
+@pytest.mark.parametrize(
+    "arguments, word",
+    [
+        ((), "command"),
+        (("shov",), "shov"),
+        (("data", "fetch", "rgbench"), "--to"),
+        (("show", "a.npz", "--out", "b", "--video", "avi"), "avi"),
+        (("show", "a.npz", "--out", "b", "--colour", "red"), "--colour"),
+    ],
+)
+def test_wrong_usage_is_2(capsys: pytest.CaptureFixture, arguments: tuple, word: str) -> None:
+    assert stopped(*arguments) == 2
+    assert word in capsys.readouterr().err.lower()
+
+
+def test_the_data_sets_are_listed(capsys: pytest.CaptureFixture) -> None:
+    assert main(["data", "list"]) == 0
+    text = capsys.readouterr().out
+    assert "rgbench: RGBench" in text and "licence: CC-BY-4.0" in text
+
+
+def test_an_error_is_one_line_and_1(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    for arguments, words in (
+        (["data", "fetch", "blanco_mulero", "--to", str(tmp_path)], "10.5281/zenodo.13823986"),
+        (["data", "fetch", "none", "--to", str(tmp_path)], "no data set 'none'; there are"),
+        (["show", str(tmp_path / "no.npz"), "--out", str(tmp_path)], "no.npz: no such recording"),
+    ):
+        assert main(arguments) == 1
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 1 and lines[0].startswith("r2s: error: ") and words in lines[0]
+
+
+def test_a_recording_is_shown_with_its_simulation(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    save(recorded(2), tmp_path / "made.npz")
+    save_trajectory(tmp_path / "t.npz", cloth(2).x, cloth(2).faces)
+    made, out = str(tmp_path / "made.npz"), str(tmp_path / "out")
+    command = ["show", made, "--trajectory", str(tmp_path / "t.npz"), "--out", out]
+    assert main([*command, "--video", "gif"]) == 0
+    printed = capsys.readouterr().out.split()
+    assert [Path(line).name for line in printed] == ["lift_made.png", "lift_made.gif"]
+    np.savez(tmp_path / "t.npz", x=cloth(3).x, faces=cloth(3).faces)
+    assert main(command) == 1
+    assert "t.npz" not in (text := capsys.readouterr().err) and "has 3 frames" in text
+
+
+def test_the_console_script_is_installed() -> None:
+    script = Path(sys.executable).with_name("r2s")
+    if not script.exists():
+        pytest.skip("the package is not installed with its scripts")
+    run = subprocess.run([script, "--help"], capture_output=True, text=True, timeout=60)
+    assert run.returncode == 0 and "usage: r2s" in run.stdout

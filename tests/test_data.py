@@ -1,0 +1,332 @@
+"""Data sets: manifests, downloads from a server on loopback, what is corrupt; RGBench captures."""
+
+import hashlib
+import json
+import shutil
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from r2s.data import Dataset, fetch, known_datasets, read_dataset
+from r2s.manifest import Manifest, default_manifest, hash_values, read_manifest
+from r2s.recording import SheetPlacement, cloud
+from r2s.rgbench import read_capture
+
+MANIFESTS = default_manifest().parent
+CONTENT = np.random.default_rng(0).bytes(300_000)
+SHA256 = hashlib.sha256(CONTENT).hexdigest()
+
+
+class Server(BaseHTTPRequestHandler):
+    """Serves CONTENT as /whole, /breaks (after 100,000 bytes), /forgets (no ranges) and /other."""
+
+    def do_GET(self) -> None:
+        kind = self.path.strip("/")
+        asked = self.headers.get("Range")
+        self.server.asked.append((kind, asked))  # type: ignore[attr-defined]
+        if kind not in ("whole", "breaks", "forgets", "other"):
+            self.send_error(404)
+            return
+        data = CONTENT if kind != "other" else CONTENT[::-1]
+        start = int(asked.split("=")[1].rstrip("-")) if asked and kind != "forgets" else 0
+        if start >= len(data):
+            self.send_response(416)
+            self.send_header("Content-Range", f"bytes */{len(data)}")
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+            return
+        self.send_response(206 if start else 200)
+        if start:
+            self.send_header("Content-Range", f"bytes {start}-{len(data) - 1}/{len(data)}")
+        self.send_header("Content-Length", str(len(data) - start))
+        self.end_headers()
+        broken = kind == "breaks" and not start
+        self.wfile.write(data[start : 100_000 if broken else None])
+
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[ThreadingHTTPServer]:
+    pytest.importorskip("pooch")
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Server)
+    server.asked = []  # type: ignore[attr-defined]
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield server
+    server.shutdown()
+    server.server_close()
+
+
+def dataset(folder: Path, server: Any, **kinds: str) -> Path:
+    """A folder with the manifest of a data set `made`, of the files kind/NAME.bin."""
+    port = server.server_address[1] if server else 1
+    downloads = {
+        f"clouds/{name}.bin": {"url": f"http://127.0.0.1:{port}/{kind}", "sha256": SHA256}
+        for name, kind in kinds.items()
+    }
+    about = {key: f"the {key}" for key in ("title", "citation", "licence", "how", "note")}
+    made = {"name": "made", **about, "layout": {}, "downloads": downloads}
+    folder.mkdir(exist_ok=True)
+    (folder / "made.json").write_text(json.dumps(made))
+    return folder
+
+
+def fetched(tmp_path: Path, server: Any, **kinds: str) -> list[str]:
+    manifests = dataset(tmp_path / "manifests", server, **kinds)
+    return list(fetch("made", tmp_path / "data", manifests))
+
+
+def test_a_download_is_verified_and_not_repeated(tmp_path: Path, server: Any) -> None:
+    lines = fetched(tmp_path, server, a="whole")
+    assert lines[1:3] == ["licence: the licence", "cite: the citation"]
+    assert lines[-1] == "clouds/a.bin: downloaded, verified"
+    assert (tmp_path / "data/clouds/a.bin").read_bytes() == CONTENT
+    assert sorted(p.name for p in (tmp_path / "data/clouds").iterdir()) == ["a.bin"]
+    server.asked.clear()
+    assert fetched(tmp_path, server, a="whole")[-1] == "clouds/a.bin: there, verified"
+    assert server.asked == []
+
+
+def test_a_broken_download_goes_on_where_it_ended(tmp_path: Path, server: Any) -> None:
+    with pytest.raises(ValueError, match="/breaks: the connection broke after 98304 bytes.*again"):
+        fetched(tmp_path, server, a="breaks")
+    assert not (tmp_path / "data/clouds/a.bin").exists()
+    server.asked.clear()
+    lines = fetched(tmp_path, server, a="breaks")
+    assert lines[-1] == "clouds/a.bin: downloaded from byte 98304 on, verified"
+    assert server.asked == [("breaks", "bytes=98304-")]
+    assert (tmp_path / "data/clouds/a.bin").read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize("kind, have", [("forgets", 1000), ("whole", len(CONTENT))])
+def test_a_server_without_ranges_and_a_download_that_was_whole(
+    tmp_path: Path, server: Any, kind: str, have: int
+) -> None:
+    (tmp_path / "data/clouds").mkdir(parents=True)
+    (tmp_path / "data/clouds/a.bin.part").write_bytes(CONTENT[:have])
+    fetched(tmp_path, server, a=kind)
+    assert (tmp_path / "data/clouds/a.bin").read_bytes() == CONTENT
+    assert not (tmp_path / "data/clouds/a.bin.part").exists()
+
+
+def test_a_part_that_is_too_long_is_dropped(tmp_path: Path, server: Any) -> None:
+    (tmp_path / "data/clouds").mkdir(parents=True)
+    part = tmp_path / "data/clouds/a.bin.part"
+    part.write_bytes(CONTENT + b"more")
+    with pytest.raises(ValueError, match="did not fit: run the command again"):
+        fetched(tmp_path, server, a="whole")
+    assert not part.exists()
+
+
+def test_what_is_corrupt_is_named_and_left_alone(tmp_path: Path, server: Any) -> None:
+    (tmp_path / "data/clouds").mkdir(parents=True)
+    mine = tmp_path / "data/clouds/a.bin"
+    mine.write_bytes(b"something of mine")
+    server.asked.clear()
+    with pytest.raises(ValueError, match="a.bin: corrupt: sha256 .* published is .* delete it"):
+        fetched(tmp_path, server, a="whole", b="whole")
+    assert mine.read_bytes() == b"something of mine"
+    assert (tmp_path / "data/clouds/b.bin").read_bytes() == CONTENT  # the others are fetched
+    assert [kind for kind, _ in server.asked] == ["whole"]
+
+
+def test_a_server_that_sends_something_else(tmp_path: Path, server: Any) -> None:
+    with pytest.raises(
+        ValueError, match="a.bin: corrupt: what http.*other sent is not the publish"
+    ):
+        fetched(tmp_path, server, a="other")
+    assert list((tmp_path / "data/clouds").iterdir()) == []
+
+
+def test_what_is_not_there(tmp_path: Path, server: Any) -> None:
+    with pytest.raises(ValueError, match="/gone: the server says 404"):
+        fetched(tmp_path, server, a="gone")
+    with pytest.raises(ValueError, match="connection broke after 0 bytes .ConnectionError"):
+        fetched(tmp_path, None, a="whole")
+    with pytest.raises(ValueError, match="no data set 'none'; there are made"):
+        list(fetch("none", tmp_path, tmp_path / "manifests"))
+    with pytest.raises(FileNotFoundError, match="no folder of manifests"):
+        known_datasets(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    "path, change, words",
+    [
+        ("clouds/a.bin", {"sha256": "abc"}, "sha256 must be 64 hexadecimal digits, found 'abc'"),
+        ("clouds/a.bin", {"url": "ftp://x"}, "url must begin with https://"),
+        ("../a.bin", {}, "paths must stay in the folder of the data, found '../a.bin'"),
+        ("/a.bin", {}, "paths must stay in the folder"),
+    ],
+)
+def test_a_manifest_that_is_wrong(tmp_path: Path, path: str, change: dict, words: str) -> None:
+    file = dataset(tmp_path, None, a="whole") / "made.json"
+    made = json.loads(file.read_text())
+    made["downloads"] = {path: made["downloads"]["clouds/a.bin"] | change}
+    file.write_text(json.dumps(made))
+    with pytest.raises(ValueError, match=f"made.json.*{words}"):
+        read_dataset(file)
+    file.write_text("{")
+    with pytest.raises(ValueError, match="made.json: no JSON"):
+        read_dataset(file)
+
+
+def test_the_manifests_of_the_project() -> None:
+    known = known_datasets()
+    assert set(known) == {"blanco_mulero", "diffcloud", "rgbench", "study"}
+    assert isinstance(known["diffcloud"], Manifest) and isinstance(known["rgbench"], Dataset)
+    assert known["rgbench"].licence == "CC-BY-4.0"
+    assert "10.5281/zenodo.13823986" in known["blanco_mulero"].citation
+    study = read_manifest(MANIFESTS / "templates" / "study.json")
+    assert set(study.scenarios) == {"lift", "wind", "fold", "fling", "shaking"}
+    with pytest.raises(ValueError, match="blanco_mulero.json.*scenarios: dynamic: .*"):
+        read_manifest(MANIFESTS / "templates" / "blanco_mulero.json")  # until it is filled in
+
+
+@pytest.mark.parametrize("name", ["rgbench", "blanco_mulero", "study"])
+def test_what_must_be_fetched_by_hand_says_how(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name}: cannot be downloaded automatically. .* Licence"):
+        list(fetch(name, tmp_path))
+
+
+def test_what_was_fetched_by_hand_is_counted(tmp_path: Path) -> None:
+    for motion in ("dynamic", "quasi_static"):
+        (tmp_path / "cotton_rag_0" / motion / "cloud").mkdir(parents=True)
+        (tmp_path / "cotton_rag_0" / motion / "cloud" / "00000.ply").touch()
+    lines = list(fetch("blanco_mulero", tmp_path))
+    assert lines[-1].endswith(
+        "1 found (clouds of the slow motion, frames 00000.ply and on), not verified"
+    )
+
+
+def test_recordings_are_compared_with_the_published_values(tmp_path: Path) -> None:
+    manifests, data = tmp_path / "manifests", tmp_path / "data"
+    (data / "lift_tan").mkdir(parents=True)
+    manifests.mkdir()
+    points = np.arange(6.0).reshape(2, 3)
+    made = json.loads(default_manifest().read_text())
+    made["files"] = {f"lift_tan/00{i}.npy": hash_values(points) for i in range(3)}
+    (manifests / "made.json").write_text(json.dumps(made))
+    with pytest.raises(
+        ValueError, match="no licence stated.*Get it from priyasundaresan.*lift_tan"
+    ):
+        list(fetch("diffcloud", data, manifests))
+    for i in range(3):
+        np.save(data / "lift_tan" / f"00{i}.npy", points)
+    lines = list(fetch("diffcloud", data, manifests))
+    assert lines[-1].endswith("3 of 3 files verified")
+    np.save(data / "lift_tan" / "001.npy", points + 1)
+    (data / "lift_tan" / "002.npy").write_bytes(b"cut")
+    with pytest.raises(ValueError, match="corrupt, not the published.*001.npy, lift_tan/002.npy$"):
+        list(fetch("diffcloud", data, manifests))
+
+
+# RGBench
+
+X, Y = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+SHEET = SheetPlacement((0.5, 0.6), (0.1, 0.0, 0.0), X, Y, ("weft", "opposite"))
+START = 1752924898.0  # [s], the arms' first sample
+TURN = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # from world to camera
+SHIFT = np.array([0.1, 0.2, 0.3])
+POINTS = np.array([[0.3, 0.1, 0.02], [0.5, -0.2, 0.1]])  # [m], in the world
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    """A capture of five clouds, 0.06 s apart, with two arms that rise by 1 m/s."""
+    from_pcd = pytest.importorskip("pypcd4").PointCloud
+    folder = tmp_path / "green_tshirt" / "green_tshirt_grasp_2025-07-19-19-14-58"
+    for name in ("segment_pcds", "calibration", "joints"):
+        (folder / name).mkdir(parents=True)
+    for i in range(5):
+        seen = (POINTS + [0, 0, 0.06 * i]) @ TURN.T + SHIFT
+        file = folder / "segment_pcds" / f"pointcloud_{START + 0.06 * i:.6f}_segmented.pcd"
+        from_pcd.from_xyz_points(seen.astype(np.float32)).save(file)
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = TURN, SHIFT
+    extrinsics = folder / "calibration" / "world_to_camera_transform.json"
+    extrinsics.write_text(json.dumps(matrix.tolist()))
+    for arm, late in (("left", 0.0), ("right", 0.003)):
+        lines = ["time,pos_1,pos_x,pos_y,pos_z,orn_w"]
+        for i in range(40):
+            lines.append(f"{START + late + 0.01 * i},0.5,0.3,0.0,{late + 0.01 * i},1")
+        file = folder / "joints" / f"{arm}_arm_joint_states_and_end_pose.csv"
+        file.write_text("\n".join(lines))
+    return folder
+
+
+def test_a_capture_is_in_the_world_and_on_the_arms_clock(capture: Path) -> None:
+    recording = read_capture(capture, SHEET, camera_delay=0.05)
+    np.testing.assert_allclose(recording.times, 0.05 + 0.06 * np.arange(5), atol=1e-6)
+    for i in range(5):
+        np.testing.assert_allclose(cloud(recording, i), POINTS + [0, 0, 0.06 * i], atol=1e-6)
+    np.testing.assert_allclose(recording.handle_path[10, :, 1], [-0.25, 0.25])
+    np.testing.assert_allclose(recording.handle_path[10, :, 2], [0.1, 0.1], atol=1e-6)
+    info = recording.info
+    assert (info.fabric, info.scenario, info.trial) == (
+        "green_tshirt",
+        "grasp",
+        "2025-07-19-19-14-58",
+    )
+    assert float(read_capture(capture, SHEET).times[0]) == pytest.approx(0.06, abs=1e-5)
+
+
+def broken(capture: Path, what: str) -> None:
+    joints, calibration = capture / "joints", capture / "calibration"
+    left = joints / "left_arm_joint_states_and_end_pose.csv"
+    extrinsics = calibration / "world_to_camera_transform.json"
+    lines = left.read_text().splitlines()
+    if what == "no clouds":
+        shutil.rmtree(capture / "segment_pcds")
+    elif what == "one cloud":
+        for file in sorted((capture / "segment_pcds").iterdir())[1:]:
+            file.unlink()
+    elif what == "no extrinsics":
+        extrinsics.unlink()
+    elif what == "short extrinsics":
+        extrinsics.write_text(json.dumps(np.eye(3).tolist()))
+    elif what == "mirrored":
+        extrinsics.write_text(json.dumps(np.diag([1.0, 1, -1, 1]).tolist()))
+    elif what == "columns":
+        left.write_text("\n".join([lines[0].replace("pos_x", "x"), *lines[1:]]))
+    elif what == "word":
+        left.write_text("\n".join([*lines[:3], lines[3].replace("0.3", "high"), *lines[4:]]))
+    elif what == "unsorted":
+        left.write_text("\n".join([*lines[:3], lines[4], lines[3], *lines[5:]]))
+    else:  # of another day
+        for file in sorted(capture.glob("segment_pcds/*")):
+            file.rename(file.with_name(file.name.replace("pointcloud_17", "pointcloud_16")))
+
+
+@pytest.mark.parametrize(
+    "what, words",
+    [
+        ("no clouds", "segment_pcds: no such folder of clouds"),
+        ("one cloud", "segment_pcds: expected clouds such as pointcloud_.*found 1"),
+        ("no extrinsics", "world_to_camera_transform.json"),
+        ("short extrinsics", "world_to_camera_transform.json: expected a 4 x 4 matrix"),
+        ("mirrored", "world_to_camera_transform.json: its rotation is none"),
+        ("columns", "left_arm.*lacks the columns pos_x"),
+        ("word", "left_arm.*csv: line 4: could not convert"),
+        ("unsorted", "left_arm.*csv: line 5: times must increase"),
+        ("another day", "no cloud is from the time of the arms' paths.*of one capture"),
+    ],
+)
+def test_a_broken_capture_names_the_file(capture: Path, what: str, words: str) -> None:
+    broken(capture, what)
+    with pytest.raises((ValueError, FileNotFoundError), match=words):
+        read_capture(capture, SHEET)
+
+
+def test_a_capture_needs_two_held_corners_and_its_name(capture: Path) -> None:
+    one = SheetPlacement((0.5, 0.6), (0.1, 0.0, 0.0), X, Y, ("weft",))
+    with pytest.raises(ValueError, match="two arms hold the sheet, found 1"):
+        read_capture(capture, one)
+    other = capture.rename(capture.with_name("capture"))
+    with pytest.raises(ValueError, match="expected a name such as (green_t|white_)shirt_grasp"):
+        read_capture(other, SHEET)

@@ -1,0 +1,163 @@
+"""Pictures of recordings: written, of the right frames, and errors that name the file."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("matplotlib")
+from PIL import Image  # noqa: E402
+
+from r2s.manifest import default_manifest  # noqa: E402
+from r2s.recording import (  # noqa: E402
+    Recording,
+    RecordingInfo,
+    SheetPlacement,
+    make_recording,
+    save,
+)
+from r2s.show import (  # noqa: E402
+    SimulatedCloth,
+    contact_sheet,
+    load_trajectory,
+    open_recording,
+    save_trajectory,
+    show,
+    write_gif,
+)
+
+FRAMES = 5
+X, Y = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+
+
+def recorded(frames: int = FRAMES, **more: Any) -> Recording:
+    """A square of 0.2 m whose corner is lifted, with a few points far off."""
+    sheet = SheetPlacement((0.2, 0.2), (0.0, 0.0, 0.0), X, Y, ("origin",))
+    info = RecordingInfo(
+        "lift_made", "lift", "made", "1", "here", (1, frames - 1), sheet, 0.0, None
+    )
+    generator = np.random.default_rng(0)
+    flat = generator.uniform(0, 0.2, (frames, 300, 2))
+    lifted = np.linspace(0, 0.15, frames)[:, None] * (1 - flat.sum(axis=-1) / 0.4)
+    clouds = np.concatenate([flat, lifted[..., None]], axis=-1)
+    clouds[:, :1] = [1.5, 1.5, 1.5]
+    path = np.linspace([0, 0, 0], [0, 0, 0.15], frames)
+    times = np.arange(frames) / 15
+    return make_recording(list(clouds), times, path, times, info, **more)
+
+
+def cloth(frames: int = FRAMES) -> SimulatedCloth:
+    corners = np.array([[0, 0, 0], [0.2, 0, 0], [0.2, 0.2, 0], [0, 0.2, 0]])
+    x = np.repeat(corners[None], frames, axis=0)
+    x[:, 0, 2] = np.linspace(0, 0.15, frames)
+    return SimulatedCloth(x, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def colours(path: Path) -> set[tuple[int, int, int]]:
+    image = Image.open(path).convert("RGB")
+    found = image.getcolors(image.width * image.height)
+    assert found is not None
+    return {colour for _, colour in found}  # type: ignore[misc]
+
+
+def test_a_sheet_and_a_gif_are_written(tmp_path: Path) -> None:
+    written = show(recorded(), tmp_path / "new" / "folder", video="gif")
+    assert [path.name for path in written] == ["lift_made.png", "lift_made.gif"]
+    assert sorted(written) == sorted((tmp_path / "new" / "folder").iterdir())
+    with Image.open(written[1]) as video:
+        lasts = []
+        for frame in range(getattr(video, "n_frames", 1)):
+            video.seek(frame)
+            lasts.append(video.info["duration"])
+    assert lasts == [70, 60, 70, 70, 60]  # [ms]: 5/15 s in all
+    assert (0xD5, 0x5E, 0x00) in colours(written[0])  # the cloud
+
+
+def test_the_cloth_is_drawn_over_it_and_markers_too(tmp_path: Path) -> None:
+    without = show(recorded(), tmp_path / "without", video="none")
+    assert len(without) == 1
+    with_cloth = contact_sheet(tmp_path / "with.png", recorded(), cloth())
+    blue = lambda path: sum(b > r + 60 for r, _, b in colours(path))
+    assert blue(with_cloth) > 5 + blue(without[0])
+    markers = np.full((FRAMES, 4, 3), 0.1)
+    seen = np.array([True, True, False, True])[None].repeat(FRAMES, axis=0)
+    marked = recorded(markers=markers, markers_seen=seen)
+    drawn = contact_sheet(tmp_path / "marked.png", marked)
+    assert drawn.read_bytes() != without[0].read_bytes()
+
+
+def test_a_video_of_opencv(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    written = show(recorded(3), tmp_path, video="mp4")
+    capture = cv2.VideoCapture(str(written[1]))
+    assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == 3
+    assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(15, abs=0.01)
+
+
+def test_a_cloth_that_flew_off_does_not_spoil_the_picture(tmp_path: Path) -> None:
+    lost = cloth()
+    lost.x[2:] = 1e6
+    lost.x[3:] = np.nan
+    contact_sheet(tmp_path / "lost.png", recorded(), lost)
+    write_gif(tmp_path / "lost.gif", recorded(3), SimulatedCloth(lost.x[:3], lost.faces))
+    with pytest.raises(ValueError, match="trajectory has 4 frames, the recording lift_made 5"):
+        show(recorded(), tmp_path, cloth(4))
+
+
+def test_a_trajectory_is_read_back(tmp_path: Path) -> None:
+    file = tmp_path / "trajectory.npz"
+    save_trajectory(file, cloth().x, cloth().faces)
+    np.testing.assert_array_equal(load_trajectory(file).x, cloth().x)
+    np.testing.assert_array_equal(load_trajectory(file).faces, cloth().faces)
+
+
+@pytest.mark.parametrize(
+    "arrays, words",
+    [
+        ({"x": cloth().x}, "no trajectory .*lacks the array 'faces', has x"),
+        ({"x": cloth().x[0], "faces": cloth().faces}, r"expected x .frame, vertex, 3.*\(4, 3\)"),
+        ({"x": cloth().x, "faces": cloth().faces + 1}, "faces must be numbers of the 4 vertices"),
+        ({"x": cloth().x, "faces": cloth().faces * 1.0}, "faces must be numbers"),
+    ],
+)
+def test_a_trajectory_that_is_none_names_the_file(tmp_path: Path, arrays, words: str) -> None:
+    np.savez(tmp_path / "t.npz", **arrays)
+    with pytest.raises(ValueError, match=f"t.npz: {words}"):
+        load_trajectory(tmp_path / "t.npz")
+
+
+def test_a_damaged_trajectory_and_none(tmp_path: Path) -> None:
+    (tmp_path / "t.npz").write_bytes(b"PK cut")
+    with pytest.raises(ValueError, match="t.npz: no trajectory"):
+        load_trajectory(tmp_path / "t.npz")
+    with pytest.raises(FileNotFoundError, match="none.npz"):
+        load_trajectory(tmp_path / "none.npz")
+
+
+def lab(tmp_path: Path, *names: str) -> Path:
+    """A folder with the template of a lab's manifest, and recordings of these names."""
+    template = default_manifest().parent / "templates" / "study.json"
+    manifest = json.loads(template.read_text())
+    manifest["scenarios"]["lift"]["frames_used"] = [0, 2]
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    np.save(tmp_path / "lift_gripper.npy", np.zeros((3, 3)))
+    for name in names:
+        (tmp_path / name).mkdir()
+        for frame in range(3):
+            np.save(tmp_path / name / f"{frame:03d}.npy", np.ones((4, 3)) * frame)
+    return tmp_path
+
+
+def test_recordings_are_opened_by_what_they_are(tmp_path: Path) -> None:
+    save(recorded(), tmp_path / "made.npz")
+    assert open_recording(tmp_path / "made.npz").info.name == "lift_made"
+    folder = lab(tmp_path, "lift_camel_1")
+    assert open_recording(folder / "lift_camel_1").info.fabric == "camel"
+    assert open_recording(folder).info.trial == "1"
+    (folder / "lift_denim_1").mkdir()
+    with pytest.raises(ValueError, match="name one of its recordings.*lift_camel_1, lift_denim_1"):
+        open_recording(folder)
+    with pytest.raises(FileNotFoundError, match="nowhere: no such recording"):
+        open_recording(tmp_path / "nowhere")
