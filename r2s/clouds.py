@@ -1,7 +1,7 @@
 """Point clouds in files: one reader per format, and the numbered frames of a folder."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,8 @@ def read_cloud(path: Path | str) -> Float[np.ndarray, "point 3"]:
     if bad.any():
         raise ValueError(
             f"{path}: {bad.sum()} of {len(points)} points are not finite, "
-            f"the first is point {bad.argmax()}: {points[bad.argmax()]}"
+            f"the first is point {bad.argmax()}: {points[bad.argmax()]}: export the cloud without "
+            "pixels that have no depth"
         )
     return points
 
@@ -60,45 +61,65 @@ def find_frames(folder: Path | str, first: int | None = None) -> list[Path]:
     Raises FileNotFoundError (no such folder, no frames) or ValueError (mixed formats, two files
     of one number, a number that is missing).
     """
+    return list(find_numbered(folder, READERS, first).values())
+
+
+def find_numbered(
+    folder: Path | str, suffixes: Collection[str], first: int | None = None
+) -> dict[int, Path]:
+    """The numbered files of a folder with one of these suffixes, by number; else `find_frames`."""
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder")
-    numbered = [(n, p) for p in sorted(folder.iterdir()) if (n := _frame_number(p)) is not None]
+    found = [(_frame_number(path, suffixes), path) for path in sorted(folder.iterdir())]
+    numbered = [(number, path) for number, path in found if number is not None]
     if not numbered:
+        formats = f"formats: {', '.join(suffixes)}"
         raise FileNotFoundError(
-            f"{folder}: no numbered frames such as 000.npy (formats: {', '.join(READERS)})"
+            f"{folder}: no numbered frames such as 000{next(iter(suffixes))} ({formats})"
         )
-    suffixes = sorted({p.suffix.lower() for _, p in numbered})
-    if len(suffixes) > 1:
-        raise ValueError(f"{folder}: frames of mixed formats: {', '.join(suffixes)}")
+    formats = sorted({path.suffix.lower() for _, path in numbered})
+    if len(formats) > 1:
+        raise ValueError(f"{folder}: frames of mixed formats: {', '.join(formats)}")
     frames: dict[int, Path] = {}
     for number, path in numbered:
         if number in frames:
             names = f"{frames[number].name} and {path.name}"
-            raise ValueError(f"{folder}: frame {number} is there twice: {names}")
+            raise ValueError(f"{folder}: frame {number} is there twice: {names}: remove one")
         frames[number] = path
     start = min(frames) if first is None else first
     for number in range(start, max(frames)):
         if number not in frames:
             found = f"found {len(frames)} frames from {min(frames)} to {max(frames)}"
-            raise ValueError(f"{folder}: frame {number} is missing ({found})")
+            raise ValueError(
+                f"{folder}: frame {number} is missing ({found}): restore it, or number the frames "
+                "without gaps"
+            )
     if min(frames) < start:
         raise ValueError(f"{folder}: frame {min(frames)} comes before the first frame, {start}")
-    return [frames[number] for number in sorted(frames)]
+    return {number: frames[number] for number in sorted(frames)}
 
 
 def voxel_means(points: Float[np.ndarray, "point 3"], voxel: float) -> Float[np.ndarray, "cell 3"]:
     """The mean of the points in each cube of side `voxel` (units of the points), by cell."""
     points = points.astype(np.float64)
     cells = np.floor(points / voxel).astype(np.int64)
-    _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    sums = np.zeros((len(counts), 3))
-    np.add.at(sums, cell.reshape(-1), points)
-    return sums / counts[:, None]
+    cells -= cells.min(axis=0, initial=0)
+    shape = cells.max(axis=0, initial=0) + 1
+    # One number a cell sorts ten times as fast as three, where 64 bits hold it.
+    keys = cells if np.prod(shape.astype(float)) > 2.0**62 else _ravel(cells, shape)
+    _, cell, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    cell = cell.reshape(-1)
+    sums = [np.bincount(cell, axis, len(counts)) for axis in points.T]
+    return np.stack(sums, axis=1) / counts[:, None]
 
 
-def _frame_number(path: Path) -> int | None:
-    if path.name.startswith(".") or path.suffix.lower() not in READERS or not path.is_file():
+def _ravel(cells: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    return (cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2]
+
+
+def _frame_number(path: Path, suffixes: Collection[str]) -> int | None:
+    if path.name.startswith(".") or path.suffix.lower() not in suffixes or not path.is_file():
         return None
     digits = re.findall(r"[0-9]+", path.stem)
     return int(digits[-1]) if digits else None

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from r2s.clouds import find_frames, read_cloud, read_values
 from r2s.files import read_json
+from r2s.observe.rgbd import find_rig, read_clouds, read_rig
 from r2s.recording import Recording, RecordingInfo, SheetPlacement, make_recording
 
 Vector = tuple[float, float, float]
@@ -58,6 +59,10 @@ class Scenario:
     `folder`: a regex for the whole folder name, with the groups `fabric` and `trial`. Frame i
     (the first is numbered `first_frame`) is taken at i / frame_rate + time_offset on the
     gripper's clock: a negative offset says that the clouds lag behind the gripper.
+
+    A folder for which there is a cameras.json holds RGB-D images (`r2s.observe.rgbd`) instead of
+    clouds: the cameras' own times or rate come before `frame_rate`, and `cloud` transforms what
+    cameras.json calls the world. No hashes are kept of images.
     """
 
     folder: str
@@ -166,7 +171,7 @@ def read_recordings(
 
 
 def read_recording(folder: Path | str, manifest: Manifest, name: str) -> Recording:
-    """The recording in `folder`/`name`, in metres and seconds.
+    """The recording in `folder`/`name`, of clouds or of RGB-D images, in metres and seconds.
 
     `info.verified`: True if all its files are listed in the manifest and have the listed values,
     None if some are not listed; False, with a warning, if a listed one differs or is missing.
@@ -178,10 +183,12 @@ def read_recording(folder: Path | str, manifest: Manifest, name: str) -> Recordi
     folder = Path(folder)
     scenario_name, fabric, trial = _scenario_of(manifest, name)
     scenario = manifest.scenarios[scenario_name]
-    frames = find_frames(folder / name, scenario.first_frame)
-    clouds = {f"{name}/{frame.name}": read_cloud(frame) for frame in frames}
     path = _read_path(folder / scenario.gripper.file)
-    verified = _verify(manifest.files, name, clouds | {scenario.gripper.file: path})
+    if find_rig(folder / name):
+        times, seen = read_clouds(folder / name, read_rig(folder / name), scenario.frame_rate)
+        clouds, verified = [to_world(scenario.cloud, points) for points in seen], None
+    else:
+        times, clouds, verified = _numbered_clouds(folder, manifest, name, scenario, path)
     source = f"{manifest.source.repository} {manifest.source.commit} {manifest.source.path}"
     info = RecordingInfo(
         name=name,
@@ -195,14 +202,25 @@ def read_recording(folder: Path | str, manifest: Manifest, name: str) -> Recordi
         verified=verified,
         time_offset=scenario.time_offset,
     )
-    kept = [_distinct(points) if scenario.drop_repeats else points for points in clouds.values()]
     return make_recording(
-        [to_world(scenario.cloud, points) for points in kept],
-        np.arange(len(frames)) / scenario.frame_rate + scenario.time_offset,
+        clouds,
+        times + scenario.time_offset,
         to_world(scenario.gripper.transform, path) + np.array(scenario.gripper.offset),
         np.arange(len(path)) / scenario.gripper.rate,
         info,
     )
+
+
+def _numbered_clouds(
+    folder: Path, manifest: Manifest, name: str, scenario: Scenario, path: np.ndarray
+) -> tuple[np.ndarray, list[np.ndarray], bool | None]:
+    """Times [s] on the cameras' clock, clouds [m] in the world, and whether they are verified."""
+    frames = find_frames(folder / name, scenario.first_frame)
+    clouds = {f"{name}/{frame.name}": read_cloud(frame) for frame in frames}
+    verified = _verify(manifest.files, name, clouds | {scenario.gripper.file: path})
+    kept = [_distinct(points) if scenario.drop_repeats else points for points in clouds.values()]
+    world = [to_world(scenario.cloud, points) for points in kept]
+    return np.arange(len(frames)) / scenario.frame_rate, world, verified
 
 
 def _scenario_of(manifest: Manifest, name: str) -> tuple[str, str, str]:
@@ -228,7 +246,7 @@ def _verify(listed: Mapping[str, str], name: str, found: Mapping[str, np.ndarray
     differ += [f for f in listed if f.startswith(f"{name}/") and f not in found]
     if differ:
         warnings.warn(
-            f"{name}: not the published values, or missing: {', '.join(differ)}", stacklevel=3
+            f"{name}: not the published values, or missing: {', '.join(differ)}", stacklevel=4
         )
         return False
     return True if all(file in listed for file in found) else None

@@ -146,7 +146,10 @@ def make_recording(
         if not checked:
             raise ValueError("no frames: a recording needs at least one cloud")
         if not 0 <= first <= last < len(checked):
-            raise ValueError(f"frames_used is {first}..{last}, but there are {len(checked)} frames")
+            raise ValueError(
+                f"frames_used is {first}..{last}, but there are {len(checked)} frames: they count "
+                "from 0, the last one included"
+            )
         if marks is not None and len(marks[0]) != len(checked):
             raise ValueError(f"markers in {len(marks[0])} frames, but clouds in {len(checked)}")
         path = _check_path(handle_path, info.sheet.held)
@@ -224,18 +227,16 @@ def save(recording: Recording, path: Path | str) -> None:
     `force`, `force_times`, `markers`, `markers_seen`; `meta`: JSON of format and `info`.
     """
     mask = np.asarray(recording.mask)
+    arrays: dict[str, Any] = {
+        "meta": np.array(json.dumps({"format": FORMAT, "info": asdict(recording.info)})),
+        "points": np.asarray(recording.points)[mask],
+        "offsets": np.cumsum([0, *mask.sum(axis=1)]),
+    }
+    for name in ("times", "handle_path", "handle_times", *OPTIONAL):
+        if (values := getattr(recording, name)) is not None:
+            arrays[name] = np.asarray(values)
     buffer = io.BytesIO()
-    optional = {name: getattr(recording, name) for name in OPTIONAL}
-    np.savez(
-        buffer,
-        meta=np.array(json.dumps({"format": FORMAT, "info": asdict(recording.info)})),
-        points=np.asarray(recording.points)[mask],
-        offsets=np.cumsum([0, *mask.sum(axis=1)]),
-        times=np.asarray(recording.times),
-        handle_path=np.asarray(recording.handle_path),
-        handle_times=np.asarray(recording.handle_times),
-        **{name: np.asarray(values) for name, values in optional.items() if values is not None},
-    )
+    np.savez(buffer, **arrays)
     write_bytes(path, buffer.getvalue())
 
 
@@ -261,7 +262,9 @@ def load(path: Path | str) -> Recording:
     except FileNotFoundError:
         raise
     except Exception as error:  # a damaged archive raises anything, from EOFError to zlib.error
-        reason = f"it lacks {error}" if isinstance(error, KeyError) else error
+        reason = f"it lacks {error}" if isinstance(error, KeyError) else f"{error}"
+        if not isinstance(error, ValueError):
+            reason += ": copy the file again, or make it anew"
         raise ValueError(f"{path}: not a readable recording ({FORMAT}): {reason}") from error
 
 
@@ -316,7 +319,8 @@ def _check_times(times: Any, what: str, count: int) -> np.ndarray:
 def _check_end(knots: np.ndarray, times: np.ndarray) -> None:
     if knots[-1] < times[-1] - CLOCK_TOLERANCE:
         raise ValueError(
-            f"the handle path ends at {knots[-1]:g} s, before the last frame at {times[-1]:g} s"
+            f"the handle path ends at {knots[-1]:g} s, before the last frame at {times[-1]:g} s: "
+            "log it longer, leave the last frames out, or correct the time offset"
         )
 
 

@@ -1,0 +1,169 @@
+"""Cameras, and depth images of meshes: exact against geometry, flawed as they are told to be."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from rgbd_scene import FACES, LENS, camera, surface
+
+from r2s.observe.calibration import calibrated, look_at, project, rays
+from r2s.observe.camera import Camera
+from r2s.observe.depth import back_project, from_world, moved, steps
+from r2s.observe.flaws import NONE, TYPICAL, Flaws, flawed_depth, flawed_mask
+from r2s.observe.images import encode_depth, read_depth, write_depth
+from r2s.observe.render import render
+
+SMALL = (32, 24)
+LENSES = [(), LENS]
+
+
+def seen(lens: tuple[float, ...] = (), **changes: Any):
+    return camera((-0.3, -0.2, 0.5), distortion=lens, **changes)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_pixel_and_its_ray_belong_together(lens) -> None:
+    view = seen(lens)
+    directions = rays(view)
+    points = np.concatenate([directions, np.ones((*directions.shape[:2], 1))], axis=2)
+    pixels = project(view, 0.7 * points.reshape(-1, 3)).reshape(120, 160, 2)
+    expected = np.stack(np.meshgrid(np.arange(160), np.arange(120)), axis=-1)
+    np.testing.assert_allclose(pixels, expected, atol=0.01)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_the_points_of_a_rendered_plane_lie_in_the_plane(lens) -> None:
+    corners = np.array([[-5.0, -5, 0.7], [5, -5, 0.7], [5, 5, -0.3], [-5, 5, -0.3]])
+    view = seen(lens)
+    depth, which = render(view, corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    assert (which >= 0).all()
+    points = moved(np.array(view.to_world), back_project(view, depth, depth > 0))
+    np.testing.assert_allclose(points[:, 2], 0.2 - 0.1 * points[:, 1], atol=1e-12)
+
+
+def test_a_calibrated_camera_agrees_with_the_simulated_one() -> None:
+    pinhole = Camera(jnp.array([-0.5, -0.1, 0.5]), jnp.array([0.25, 0.25, 0.1]))
+    points = np.random.default_rng(0).uniform(-0.2, 0.6, (20, 3))
+    pixel, depth = pinhole.project(jnp.asarray(points))
+    view = calibrated(pinhole)
+    np.testing.assert_allclose(from_world(view, points)[:, 2], depth)
+    np.testing.assert_allclose(project(view, from_world(view, points)) + 0.5, pixel, atol=1e-6)
+
+
+def test_looking_straight_down_is_refused() -> None:
+    with pytest.raises(ValueError, match="no way up"):
+        look_at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+
+
+@given(
+    x=arrays(float, (9, 3), elements=st.floats(-0.25, 0.5, width=16)),
+    lens=st.sampled_from(LENSES),
+)
+@settings(max_examples=60)
+def test_each_pixel_sees_the_nearest_face(x: np.ndarray, lens: tuple[float, ...]) -> None:
+    faces = np.arange(9).reshape(3, 3)
+    view = seen(lens, resolution=SMALL)
+    depth, which = render(view, x, faces)
+    nearest = np.full(depth.shape, np.inf)
+    directions = np.concatenate([rays(view), np.ones((*depth.shape, 1))], axis=2)
+    for a, b, c in from_world(view, x)[faces]:
+        system = np.stack([a, b, c], axis=1)
+        if abs(np.linalg.det(system)) < 1e-9:  # seen edge on
+            continue
+        weights = np.linalg.solve(system, directions.reshape(-1, 3).T).T.reshape(directions.shape)
+        inside = (weights >= 0).all(axis=2)
+        nearest[inside] = np.minimum(nearest, 1 / weights.sum(axis=2))[inside]
+    sure = np.isfinite(nearest) & (depth > 0)
+    np.testing.assert_allclose(depth[sure], nearest[sure], rtol=1e-6)
+    # rays through an edge may count as in or out, and thin faces may be seen edge on
+    assert (sure == (depth > 0)).mean() > 0.98
+    assert ((depth > 0) == (which >= 0)).all()
+
+
+def test_faces_behind_the_camera_are_not_seen() -> None:
+    view = seen()
+    behind = moved(np.array(view.to_world), np.array([[-1.0, -1, -1], [1, -1, -1], [0, 1, -1]]))
+    assert not render(view, behind, np.array([[0, 1, 2]]))[0].any()
+
+
+def test_jumps_of_depth_are_found_on_both_sides_but_not_at_holes() -> None:
+    depth = np.array([[1.0, 1.0, 1.5, 1.5], [1.0, 1.0, 0.0, 1.5]])
+    expected = [[False, True, True, False], [False, False, False, False]]
+    np.testing.assert_array_equal(steps(depth, 0.1), expected)
+    assert not steps(depth, 1.0).any()
+
+
+def test_depth_survives_its_file_but_for_rounding(tmp_path) -> None:
+    depth = np.random.default_rng(0).uniform(0.3, 3, (24, 32))
+    for name, scale, close in [("a.png", 1e-3, 5e-4), ("b.png", 1e-4, 5e-5), ("c.npy", 1.0, 1e-6)]:
+        write_depth(tmp_path / name, depth, scale)
+        read = read_depth(tmp_path / name, scale, SMALL)
+        np.testing.assert_allclose(read, depth, atol=1.01 * close)
+    with pytest.raises(ValueError, match="does not fit into 16 bits"):
+        encode_depth(100 * depth, 1e-3)
+
+
+def rendered():
+    view = camera((-0.4, -0.1, 0.45))
+    x = surface(0)
+    return view, *render(view, x, FACES), x, FACES
+
+
+def test_no_flaws_change_nothing_and_a_seed_repeats() -> None:
+    scene = rendered()
+    depth = scene[1]
+    np.testing.assert_array_equal(flawed_depth(*scene, NONE, np.random.default_rng(0)), depth)
+    first, again, other = (
+        flawed_depth(*scene, TYPICAL, np.random.default_rng(seed)) for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+
+
+def test_noise_grows_with_the_square_of_depth() -> None:
+    scene = rendered()
+    depth = scene[1]
+    noisy = flawed_depth(*scene, replace(NONE, noise=2e-3), np.random.default_rng(0))
+    error = (noisy - depth)[depth > 0] / depth[depth > 0] ** 2
+    assert error.std() == pytest.approx(2e-3, rel=0.05)
+
+
+def test_grazing_surfaces_and_chance_make_holes() -> None:
+    scene = rendered()
+    depth = scene[1]
+    grazing = flawed_depth(*scene, replace(NONE, grazing=60.0), np.random.default_rng(0))
+    lost = (grazing == 0) & (depth > 0)
+    assert 0.02 < lost.sum() / (depth > 0).sum() < 0.9
+    chance = flawed_depth(*scene, replace(NONE, holes=0.1), np.random.default_rng(0))
+    assert (chance[depth > 0] == 0).mean() == pytest.approx(0.1, abs=0.02)
+
+
+def test_depth_at_edges_lies_between_the_two_sides() -> None:
+    near = np.array([[0.0, 0, 0.3], [0.2, 0, 0.3], [0.2, 0.2, 0.3], [0, 0.2, 0.3]])
+    x = np.concatenate([near, [[-1, -1, 0], [2, -1, 0], [2, 2, 0], [-1, 2, 0]]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    view = camera((-0.4, -0.1, 0.6))
+    depth, which = render(view, x, faces)
+    mixed = flawed_depth(
+        view, depth, which, x, faces, replace(NONE, edge_mixed=1.0), np.random.default_rng(0)
+    )
+    changed = mixed != depth
+    assert changed.any() and not changed[~steps(depth, 0.02)].any()
+    assert mixed.min() >= depth.min() and mixed.max() <= depth.max()
+
+
+def test_the_border_of_a_mask_wanders_by_what_it_is_told() -> None:
+    mask = np.zeros((120, 160), bool)
+    mask[30:90, 40:120] = True
+    wrong = flawed_mask(mask, 2.0, np.random.default_rng(0)) != mask
+    assert wrong.any()
+    inner = np.zeros_like(mask)
+    inner[38:82, 48:112] = True
+    assert not wrong[inner].any()  # four deviations from the border
+    np.testing.assert_array_equal(flawed_mask(mask, 0.0, np.random.default_rng(0)), mask)
+    assert Flaws().mask_error > 0
