@@ -9,8 +9,11 @@ In reading order:
 - `linear`: sparse matrices over a mesh, and their factor.
 - `increment`, `implicit`, `cloth`: the energy of a step, its minimiser, the solver.
 - `mpm`: the second simulator, of material points.
-- `scene`, `solver`, `scenario`: what an experiment fixes, motions over time, lift and fold.
+- `scene`, `solver`, `scenario`: what an experiment fixes, motions over time.
+- `trajectories`, `scenarios`: the six experiments of the study, on either solver.
 - `recording`, `clouds`, `manifest`, `synthetic`, `observe`: observations, real and made.
+- `video`, `markers`, `plane`, `forces`: stretching, from a video and a force log.
+- `data`, `rgbench`: public data sets. `show`, `cli`: pictures, and the command line.
 - `surface`, `losses`, `metrics`: distances between clouds and sheets.
 - `estimators`: DIFFCLOUD. `study`: the main job, its tables and report.
 """

@@ -63,13 +63,14 @@ class Layers(eqx.Module):
 
     @classmethod
     def make(cls, mesh: Mesh, capacity: int | None = None) -> "Layers":
-        """For a mesh; the capacity is by default 512, or 6 for each vertex if that is more.
+        """For a mesh; the capacity is by default 512, or 24 for each vertex if that is more: what a
+        sheet that is folded flat needs.
 
         Up to 400 vertices every pair of places is looked at in each step, and every pair of
         vertices has a block of the matrix.
         """
         count, faces = mesh.rest.shape[0], np.asarray(mesh.faces)
-        capacity = max(512, 6 * count) if capacity is None else capacity
+        capacity = max(512, 24 * count) if capacity is None else capacity
         if count <= SMALL:
             return cls(all_pairs(faces), Whole.make(mesh), capacity)
         return cls(tree(faces, np.asarray(mesh.rest)), None, capacity)

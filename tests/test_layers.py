@@ -172,7 +172,7 @@ def test_too_many_contacts_are_not_forgotten():
 def test_a_large_mesh_searches_a_tree_and_iterates():
     large = Layers.make(rectangle((1.0, 1.0), (21, 21)))
     assert isinstance(large.search, Tree) and large.whole is None
-    assert large.capacity == 6 * 441
+    assert large.capacity == 24 * 441
 
 
 def landing(make):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from r2s import presets, synthetic
+from r2s import presets, scenarios, synthetic
 from r2s.estimators import diffcloud, gauss_newton
 from r2s.estimators.base import Problem, as_json, from_json
 from r2s.family import OrthotropicFamily
@@ -63,6 +63,67 @@ def test_the_view_is_partial(recording):
     surface = np.asarray(sample(moved.x[40], faces, 8))
     hidden = KDTree(cloud(recording, 40)).query(surface)[0] > 0.02
     assert 0.05 < hidden.mean() < 0.95
+
+
+SHAPE = (5, 5)
+
+
+@pytest.fixture(scope="module")
+def blown():
+    """An experiment of a few frames, and its recording with a late clock and dropped points."""
+    experiment = scenarios.wind(num_frames=6, interval=1 / 10, speed=3.0)
+    seen = synthetic.sensing(experiment)._replace(time_offset=0.07, dropped=0.6, points=20000)
+    make = lambda seen: synthetic.record(
+        experiment, presets.grey_interlock(), "grey", seen=seen, shape=SHAPE, key=jr.key(2)
+    )
+    return experiment, make(seen), make(seen._replace(dropped=0.0, time_offset=0.0))
+
+
+def test_what_is_known_of_an_experiment_is_in_its_recording(blown):
+    experiment, record, whole = blown
+    assert record.info.scenario == "wind" and record.info.wind == (0.0, 3.0, 0.0)
+    np.testing.assert_allclose(record.times, np.asarray(whole.times) + 0.07, atol=1e-9)
+    np.testing.assert_allclose(whole.times, experiment.times, atol=1e-9)
+    assert record.handle_times[-1] >= record.times[-1]
+    assert from_recording(whole, SHAPE).brake is not None
+
+
+def test_dropped_points_are_missing(blown):
+    _, record, whole = blown
+    fewer, all_of_them = (np.asarray(r.mask).sum(axis=1) for r in (record, whole))
+    assert fewer / all_of_them == pytest.approx(0.4, abs=0.05)
+
+
+def test_a_hanging_sheet_is_in_view(blown):
+    experiment, _, whole = blown
+    moved = synthetic._motion(experiment.scenario(SHAPE), presets.grey_interlock(), None, None)
+    faces = experiment.scenario(SHAPE).scene.mesh.faces
+    surface = np.asarray(sample(moved.x[-1], faces, 16))
+    assert np.mean(KDTree(cloud(whole, 5)).query(surface)[0] < 0.02) > 0.8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["cloth", "points"])
+@pytest.mark.parametrize("name", scenarios.SIX)
+def test_every_scenario_is_recorded_by_either_solver(name, kind):
+    """On another mesh and with smaller steps than the estimators' own."""
+    solver = scenarios.material_points if kind == "points" else None
+    finer = {"shape": (13, 13), "max_step": 1 / 90, "solver": solver}
+    record = synthetic.record(
+        scenarios.SIX[name](), presets.black_denim(), "denim", **finer, key=jr.key(0)
+    )
+    assert len(record.times) == 60
+    x = np.asarray(motion(from_recording(record), presets.black_denim()).x)
+    faces = from_recording(record).scene.mesh.faces
+    distance = KDTree(np.asarray(sample(jnp.asarray(x[-1]), faces, 12))).query(cloud(record, 59))[0]
+    assert np.median(distance) < 0.02  # two models of one fabric
+    if name == "stretching":
+        assert record.force is not None and record.markers is not None
+        assert record.markers.shape == (60, 81, 3)
+        strain = np.ptp(np.asarray(record.markers)[..., 0], axis=1) / (0.45 * 8 / 9) - 1
+        assert strain[-1] == pytest.approx(0.04, abs=0.003) and abs(strain[0]) < 0.003
+        # between that of a free and of a wholly prevented contraction
+        assert 0.9 * 0.04 * 210 * 0.45 < record.force[-1, 0] < 1.2 * 0.04 * 210 * 0.45
 
 
 @pytest.fixture(scope="module")

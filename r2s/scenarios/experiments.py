@@ -1,0 +1,212 @@
+"""The six scenarios of the study, each a function of the sheet's size and the grippers' path.
+
+An experiment does not know how it will be simulated: `Experiment.scenario` puts it on a mesh. The
+grippers follow a `route` that was recorded, or a smooth one made from a few numbers
+(`r2s.trajectories`).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from r2s import trajectories
+from r2s.recording import SheetPlacement
+from r2s.scenario import CLAMPS, CLEARANCE, Scenario, from_placement
+from r2s.trajectories import Route
+
+SIDE = 0.45  # [m], the study's sheets
+NUM_FRAMES = 60
+INTERVAL, STRETCHING_INTERVAL = 1 / 15, 1 / 30  # [s]
+GRIP_HEIGHT = 0.7  # [m] above the table, of a hanging sheet's grippers
+ALL_CORNERS = ("origin", "weft", "warp", "opposite")
+Size = tuple[float, float]
+
+
+class Experiment(NamedTuple):
+    """What is done to a sheet, for any fabric and any solver.
+
+    - `name`: of the scenario.
+    - `sheet`: where it is at rest, and which corners the grippers hold.
+    - `route`: the grippers' path.
+    - `times`: of the frames, [s].
+    - `frames_used`: the first and the last frame that count.
+    - `wind`: of a fan in front of the sheet's middle, from the first frame on, [m/s]; None: none.
+    - `clamps`: pairs of held corners between which the whole side is held.
+    - `table_height`: [m].
+    """
+
+    name: str
+    sheet: SheetPlacement
+    route: Route
+    times: Float[np.ndarray, " frame"]
+    frames_used: tuple[int, int]
+    wind: tuple[float, float, float] | None = None
+    clamps: tuple[tuple[str, str], ...] = ()
+    table_height: float = 0.0
+
+    def scenario(self, shape: tuple[int, int] = (9, 9), layers: bool = False) -> Scenario:
+        """On a mesh of `shape` vertices along warp and weft; with `layers` it touches itself."""
+        return from_placement(
+            self.sheet,
+            self.table_height,
+            jnp.asarray(self.route.path, float),
+            jnp.asarray(self.route.times, float),
+            self.times,
+            shape,
+            clamps=self.clamps,
+            wind=self.wind,
+            layers=layers,
+        )
+
+
+def lifting(
+    size: Size = (SIDE, SIDE),
+    held: str = "origin",
+    *,
+    route: Route | None = None,
+    num_frames: int = NUM_FRAMES,
+    interval: float = INTERVAL,
+    **path: float,
+) -> Experiment:
+    """A sheet lies flat on the table; a corner is lifted. The second half of the frames counts.
+
+    `path`: see `trajectories.lift`. The left corner is the "origin" or the "weft".
+    """
+    sheet, times = on_table(size, (held,)), _frames(num_frames, interval)
+    route = trajectories.lift(sheet, times[-1], **path) if route is None else route
+    return Experiment("lifting", sheet, route, times, (num_frames // 2, num_frames - 1))
+
+
+def folding(
+    size: Size = (SIDE, SIDE),
+    held: str = "origin",
+    *,
+    route: Route | None = None,
+    num_frames: int = NUM_FRAMES,
+    interval: float = INTERVAL,
+    **path: float,
+) -> Experiment:
+    """A sheet lies flat on the table; a corner is brought onto the opposite one.
+
+    `path`: see `trajectories.fold`.
+    """
+    sheet, times = on_table(size, (held,)), _frames(num_frames, interval)
+    route = trajectories.fold(sheet, times[-1], **path) if route is None else route
+    return Experiment("folding", sheet, route, times, (0, num_frames - 1))
+
+
+def stretching(
+    size: Size = (SIDE, SIDE),
+    *,
+    route: Route | None = None,
+    height: float = CLEARANCE,
+    num_frames: int = NUM_FRAMES,
+    interval: float = STRETCHING_INTERVAL,
+    **path: float,
+) -> Experiment:
+    """A sheet lies on the table, clamped at both ends of its warp; one is pulled, and held.
+
+    Its force is `r2s.scenarios.clamp_force`. At a `height` [m] above the table the sheet sags in
+    the air instead, until it is pulled taut. A `route` is that of the corners (origin, weft, warp,
+    opposite). `path`: see `trajectories.pull`.
+    """
+    sheet, times = on_table(size, ALL_CORNERS, height), _frames(num_frames, interval)
+    route = trajectories.pull(sheet, times[-1], **path) if route is None else route
+    return Experiment("stretching", sheet, route, times, (0, num_frames - 1), clamps=CLAMPS)
+
+
+def wind(
+    size: Size = (SIDE, SIDE),
+    speed: float = 2.5,
+    aside: float = 0.0,
+    *,
+    route: Route | None = None,
+    height: float = GRIP_HEIGHT,
+    num_frames: int = NUM_FRAMES,
+    interval: float = INTERVAL,
+    **path: float,
+) -> Experiment:
+    """A sheet hangs from its top corners; a fan blows on its middle, `speed` [m/s] on its axis.
+
+    `aside` [degrees] is how far the wind turns from straight on. `path`: see `trajectories.hold`.
+    """
+    sheet, times = hanging(size, height), _frames(num_frames, interval)
+    route = trajectories.hold(sheet, times[-1], **path) if route is None else route
+    angle = np.radians(aside)
+    blows = (float(speed * np.sin(angle)), float(speed * np.cos(angle)), 0.0)
+    return Experiment("wind", sheet, route, times, (0, num_frames - 1), wind=blows)
+
+
+def fling(
+    size: Size = (SIDE, SIDE),
+    *,
+    route: Route | None = None,
+    height: float = GRIP_HEIGHT,
+    num_frames: int = NUM_FRAMES,
+    interval: float = INTERVAL,
+    **path: float,
+) -> Experiment:
+    """A sheet hangs from its top corners, which rapidly go forward and back.
+
+    `path`: see `trajectories.fling`.
+    """
+    sheet, times = hanging(size, height), _frames(num_frames, interval)
+    route = trajectories.fling(sheet, times[-1], **path) if route is None else route
+    return Experiment("fling", sheet, route, times, (0, num_frames - 1))
+
+
+def shaking(
+    size: Size = (SIDE, SIDE),
+    *,
+    route: Route | None = None,
+    height: float = GRIP_HEIGHT,
+    num_frames: int = NUM_FRAMES,
+    interval: float = INTERVAL,
+    **path: float,
+) -> Experiment:
+    """A sheet hangs from its top corners, of which one goes up and down.
+
+    `path`: see `trajectories.shake`.
+    """
+    sheet, times = hanging(size, height), _frames(num_frames, interval)
+    route = trajectories.shake(sheet, times[-1], **path) if route is None else route
+    return Experiment("shaking", sheet, route, times, (0, num_frames - 1))
+
+
+SIX: dict[str, Callable[..., Experiment]] = {
+    "lifting": lifting,
+    "wind": wind,
+    "stretching": stretching,
+    "folding": folding,
+    "fling": fling,
+    "shaking": shaking,
+}
+
+
+def varied(
+    name: str, number: int, size: Size = (SIDE, SIDE), *, key: PRNGKeyArray
+) -> list[Experiment]:
+    """`number` experiments of a scenario, their numbers drawn within `trajectories.LIMITS`.
+
+    The study has `trajectories.ESTIMATION` of each to estimate from and `EVALUATION` to judge by:
+    split a key, so that they differ.
+    """
+    return [SIX[name](size, **numbers) for numbers in trajectories.draw(name, number, key=key)]
+
+
+def on_table(size: Size, held: tuple[str, ...], height: float = CLEARANCE) -> SheetPlacement:
+    """A sheet of `size` [m], horizontal at a `height` [m], warp along x and weft along y."""
+    return SheetPlacement(size, (0.0, 0.0, height), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), held)
+
+
+def hanging(size: Size, height: float) -> SheetPlacement:
+    """A sheet of `size` [m], vertical, held by the ends of its warp at a `height` [m], along x."""
+    held = ("origin", "warp")
+    return SheetPlacement(size, (0.0, 0.0, height), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), held)
+
+
+def _frames(num_frames: int, interval: float) -> Float[np.ndarray, " frame"]:
+    return np.arange(num_frames) * interval

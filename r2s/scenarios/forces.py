@@ -1,0 +1,63 @@
+"""What grippers feel: the forces with which they hold a sheet, of either solver."""
+
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from r2s.cloth import Cloth, ClothState
+from r2s.fabric import Fabric
+from r2s.increment import imbalance
+from r2s.mpm.sheet import Sheet, SheetState
+from r2s.mpm.transfer import affine_factor
+from r2s.scenario import Braked
+from r2s.scene import Control
+
+Forces = Float[Array, "handle 3"]
+
+
+def step_with_forces(
+    solver: Any, fabric: Fabric, state: Any, control: Control
+) -> tuple[Any, Forces]:
+    """`solver.step`, and the mean forces [N] of the grippers on the held vertices in that step.
+
+    Of the cloth: the derivative of the step's potential in the place of the held vertices, which
+    vanishes for free ones; contact of layers is left out. Of material points: the momentum that
+    the grippers give, over the step. Either has the weight and the inertia of the held vertices
+    in it. Raises `TypeError` for another solver.
+    """
+    if isinstance(solver, Braked):
+        fabric = solver.braked(fabric, state)
+        inner, forces = step_with_forces(solver.solver, fabric, state.inner, control)
+        return eqx.tree_at(lambda s: (s.inner, s.count), state, (inner, state.count + 1)), forces
+    after = solver.step(fabric, state, control)
+    if isinstance(solver, Cloth):
+        return after, _cloth_forces(solver, fabric, state, control, after)
+    if isinstance(solver, Sheet):
+        return after, _sheet_forces(solver, fabric, state, control)
+    raise TypeError(f"forces are known of Cloth and Sheet, got {type(solver).__name__}")
+
+
+def _cloth_forces(
+    solver: Cloth, fabric: Fabric, state: ClothState, control: Control, after: ClothState
+) -> Forces:
+    return imbalance(solver.increment(fabric, state, control), after.x)[solver.scene.held]
+
+
+def _sheet_forces(solver: Sheet, fabric: Fabric, state: SheetState, control: Control) -> Forces:
+    """As in `Sheet.step`, which twice gives the held vertices their grippers' velocity: before
+    their momentum goes to the grid, and after the grid has given back another.
+    """
+    held, dt = solver.scene.held, solver.dt
+    mass = fabric.density * solver.scene.mesh.vertex_area
+    d = solver._directions(fabric, state)
+    force, stress = solver._across(state.x, d)
+    force += solver._along(fabric, state, control)
+    momentum = mass[:, None] * (1 - dt * fabric.mass_damping) * state.v + dt * force
+    carried = mass[held][:, None] * (control.handles - state.x[held]) / dt
+    given = carried - momentum[held]
+    factor = dt * affine_factor(solver.background.grid)
+    affine = mass[:, None, None] * state.C - factor * stress
+    momentum = momentum.at[held].set(carried)
+    v, _ = solver.background.advance(dt, fabric.friction, state.x, mass, momentum, affine)
+    return (given + carried - mass[held][:, None] * v[held]) / dt

@@ -1,0 +1,87 @@
+"""Gripper paths: smooth, at rest at both ends, within their limits."""
+
+import jax.random as jr
+import numpy as np
+import pytest
+
+from r2s import trajectories
+from r2s.recording import corner
+from r2s.scenarios.experiments import ALL_CORNERS, SIX, hanging, on_table, varied
+
+DURATION = 59 / 15  # [s]
+SIZE = (0.3, 0.2)  # [m]
+
+
+@pytest.mark.parametrize("name", SIX)
+def test_every_path_is_smooth_and_at_rest_at_both_ends(name):
+    for experiment in (SIX[name](), *varied(name, 5, key=jr.key(0))):
+        times, path = experiment.route
+        rate = 1 / np.diff(times)[:, None, None]
+        velocity = np.diff(path, axis=0) * rate
+        assert times[0] == 0 and times[-1] == experiment.times[-1]
+        # a knot is 1 / 120 s: at rest means one acceleration times that
+        assert np.abs(velocity[[0, -1]]).max() < 20 / 120
+        assert np.abs(np.diff(velocity, axis=0)).max() < 20 / 120  # [m/s], of 20 m/s^2
+        assert np.linalg.norm(velocity, axis=-1).max() < 2.5
+
+
+@pytest.mark.parametrize("held", ["origin", "warp", "weft", "opposite"])
+def test_any_corner_can_be_folded_onto_the_opposite_one(held):
+    sheet = on_table(SIZE, (held,))
+    path = trajectories.fold(sheet, DURATION, reach=1.0).path[:, 0]
+    np.testing.assert_allclose(path[0], corner(sheet, held), atol=1e-12)
+    there = corner(sheet, trajectories.OPPOSITE[held])
+    np.testing.assert_allclose(path[-1, :2], there[:2], atol=1e-12)
+    assert path[:, 2].min() >= sheet.origin[2] - 1e-12
+    assert path[-1, 2] == pytest.approx(sheet.origin[2] + trajectories.TABLE_GAP)
+
+
+def test_a_lift_goes_up_and_inward():
+    path = trajectories.lift(on_table(SIZE, ("weft",)), DURATION, height=0.3, inward=0.1).path
+    moved = path[-1, 0] - path[0, 0]
+    assert moved[2] == pytest.approx(0.3)
+    assert np.linalg.norm(moved[:2]) == pytest.approx(0.1)
+    assert moved[0] > 0 > moved[1]  # from the end of the weft towards the end of the warp
+
+
+def test_a_pull_moves_one_clamp_by_its_strain():
+    path = trajectories.pull(on_table(SIZE, ALL_CORNERS), DURATION, strain=0.05).path
+    moved = path[-1] - path[0]
+    np.testing.assert_allclose(moved[:, 0], [0, 0, 0.05 * SIZE[0], 0.05 * SIZE[0]], atol=1e-12)
+    np.testing.assert_array_equal(moved[:, 1:], 0)
+
+
+def test_a_fling_comes_back_and_a_shake_moves_one_gripper():
+    sheet = hanging(SIZE, 0.5)
+    flung = trajectories.fling(sheet, DURATION, forward=0.3).path
+    away = flung - flung[:1]
+    assert away[..., 1].max() == pytest.approx(0.3, rel=1e-3)
+    np.testing.assert_allclose(away[-1], 0, atol=1e-12)
+    shaken = trajectories.shake(sheet, DURATION, amplitude=0.05, frequency=1.5).path
+    away = shaken - shaken[:1]
+    np.testing.assert_array_equal(away[:, 0], 0)
+    assert np.abs(away[:, 1, 2]).max() == pytest.approx(0.05, rel=0.02)
+    risen = np.diff(np.sign(away[:, 1, 2][np.abs(away[:, 1, 2]) > 1e-3]))
+    assert np.sum(risen != 0) == pytest.approx(2 * 1.5 * (DURATION - 0.5), abs=1.5)
+
+
+@pytest.mark.parametrize("name", SIX)
+def test_drawn_numbers_keep_their_limits_and_their_seed(name):
+    first, second = jr.split(jr.key(1))
+    estimation = trajectories.draw(name, trajectories.ESTIMATION, key=first)
+    evaluation = trajectories.draw(name, trajectories.EVALUATION, key=second)
+    assert (len(estimation), len(evaluation)) == (40, 120)
+    assert estimation == trajectories.draw(name, trajectories.ESTIMATION, key=first)
+    limits = trajectories.LIMITS[name]
+    for numbers in estimation + evaluation:
+        assert all(low <= numbers[number] <= high for number, (low, high) in limits.items())
+    assert len({tuple(numbers.values()) for numbers in estimation + evaluation}) == 160
+
+
+def test_what_does_not_fit_is_refused():
+    with pytest.raises(ValueError, match="a scenario is one of"):
+        trajectories.draw("dancing", 1, key=jr.key(0))
+    with pytest.raises(ValueError, match="one gripper"):
+        trajectories.lift(hanging(SIZE, 0.5), DURATION)
+    with pytest.raises(ValueError, match="two grippers"):
+        trajectories.fling(on_table(SIZE, ("origin",)), DURATION)
