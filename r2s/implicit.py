@@ -111,7 +111,7 @@ def _newton(tolerance, max_iterations, increment, start, free):
     return jnp.where((found.moved <= tolerance) & jnp.isfinite(found.value), found.x, jnp.nan)
 
 
-def _second(increment, x, exactness=1.0):
+def _second(increment, x, exactness: Array | float = 1.0):
     """The second derivative [N/m] of the potential, or its convex stand-in."""
     return hessian(increment, x, exactness), far(increment, x)
 

@@ -99,13 +99,13 @@ def _times(pattern: Pattern, system: System, x: Vector) -> Vector:
 
 
 def _conjugate_gradients(times: Callable, around: Callable, b: Vector) -> Vector:
-    tolerance = jnp.sqrt(jnp.finfo(b.dtype).eps) / 10
+    tolerance = float(jnp.finfo(b.dtype).eps) ** 0.5 / 10
     x, _ = jax.scipy.sparse.linalg.cg(times, b, tol=tolerance, maxiter=ITERATIONS, M=around)
     return _checked(times, x, b)
 
 
 def _minimal_residual(times: Callable, around: Callable, b: Vector) -> Vector:
-    tolerance = 50 * jnp.finfo(b.dtype).eps
+    tolerance = 50 * float(jnp.finfo(b.dtype).eps)
     x, _ = jax.scipy.sparse.linalg.gmres(
         times, b, tol=tolerance, restart=RESTART, maxiter=ITERATIONS // RESTART, M=around
     )
