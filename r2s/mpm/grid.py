@@ -81,9 +81,10 @@ class Grid(eqx.Module):
             outside = np.flatnonzero(~np.asarray(self.inside(x)))
         if len(outside):
             lower, shape = np.asarray(self.lower), np.asarray(self.shape)
+            written = lambda place: [round(float(number), 4) for number in place]
             low, high = lower + 0.5 * self.spacing, lower + (shape - 1.5) * self.spacing
             raise ValueError(
                 f"{len(outside)} particles are outside the grid, the first at "
-                f"{np.asarray(x)[outside[0]].tolist()} m; they may be from {low.tolist()} to "
-                f"{high.tolist()} m"
+                f"{written(np.asarray(x)[outside[0]])} m; they may be from {written(low)} to "
+                f"{written(high)} m"
             )
