@@ -14,7 +14,6 @@ stderr, and with --out everything to a JSON file.
 
 import argparse
 import json
-import os
 import sys
 from pathlib import Path
 
@@ -37,16 +36,6 @@ def main(options: argparse.Namespace) -> None:
         rows += getattr(parts, part)(options)
         if options.out:
             files.write_json(options.out, {"machine": about, "rows": rows})
-
-
-def _keep_to(cores: int) -> None:
-    """Start again on some cores only, since JAX counts them when it is imported. Linux only."""
-    if not hasattr(os, "sched_setaffinity"):
-        return
-    allowed = sorted(os.sched_getaffinity(0))
-    if 0 < cores < len(allowed):
-        os.sched_setaffinity(0, allowed[-cores:])
-        os.execv(sys.executable, [sys.executable, *sys.argv])
 
 
 def _arguments() -> argparse.Namespace:
@@ -75,7 +64,7 @@ def _arguments() -> argparse.Namespace:
 
 if __name__ == "__main__":
     arguments = _arguments()
-    _keep_to(arguments.cores)
+    measure.keep_to(arguments.cores)
     if arguments.probe:
         name, size = arguments.probe
         print(json.dumps(parts.probe(name, int(size), arguments)))

@@ -43,6 +43,16 @@ def _version(package: str) -> str:
         return "none"
 
 
+def keep_to(cores: int) -> None:
+    """Start again on some cores only, since JAX counts them when it is imported. Linux only."""
+    if not hasattr(os, "sched_setaffinity"):
+        return
+    allowed = sorted(os.sched_getaffinity(0))
+    if 0 < cores < len(allowed):
+        os.sched_setaffinity(0, allowed[-cores:])
+        os.execv(sys.executable, [sys.executable, *sys.argv])
+
+
 def clock_name() -> str:
     """Which seconds are compared: CPU seconds of all threads, or wall seconds beside a GPU."""
     return "cpu_s" if jax.default_backend() == "cpu" else "wall_s"

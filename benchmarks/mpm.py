@@ -14,8 +14,6 @@ core (wall seconds where JAX runs on a GPU), without compilation.
 
 import argparse
 import importlib.util
-import os
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -95,16 +93,6 @@ def _show(rows: list[Row]) -> None:
     measure.show(title, rows, columns)
 
 
-def _keep_to(cores: int) -> None:
-    """Start again on some cores only, since JAX counts them when it is imported. Linux only."""
-    if not hasattr(os, "sched_setaffinity"):
-        return
-    allowed = sorted(os.sched_getaffinity(0))
-    if 0 < cores < len(allowed):
-        os.sched_setaffinity(0, allowed[-cores:])
-        os.execv(sys.executable, [sys.executable, *sys.argv])
-
-
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Time the material point method of r2s.")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="parts to run")
@@ -125,6 +113,6 @@ def _arguments() -> argparse.Namespace:
 
 if __name__ == "__main__":
     arguments = _arguments()
-    _keep_to(arguments.cores)
+    measure.keep_to(arguments.cores)
     jax.config.update("jax_enable_x64", False)
     main(arguments)
