@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from r2s.fabric import Fabric
 from r2s.layers import Contacts, Layers, contact_energy, contact_hessians
 from r2s.linear.dissection import Level
-from r2s.linear.pattern import Pattern, add_between, assemble
+from r2s.linear.pattern import Pattern, add_between, add_elements, assemble
 from r2s.linear.system import Far
 from r2s.mesh import Mesh
 from r2s.physics import contact
@@ -96,7 +96,7 @@ def hinge_angles(mesh: Mesh, x: Positions) -> Float[Array, " hinge"]:
 
 def curvatures(mesh: Mesh, angles: Float[Array, " hinge"]) -> Float[Array, " hinge"]:
     """Curvature theta l / A [1/m] of hinges at their angles [rad], less that at rest."""
-    return angles * mesh.hinge_length / mesh.hinge_area - mesh.rest_curvature
+    return angles * _widths(mesh) - mesh.rest_curvature
 
 
 def vertex_mass(mesh: Mesh, fabric: Fabric) -> Float[Array, " vertex"]:
@@ -219,7 +219,7 @@ def hessian(step: Increment, x: Positions, exactness: Float[Array, ""] | float =
     directions, as is usual for cloth (Choi and Ko 2002). Between 0 and 1, that fraction of these.
     """
     mesh, exactness = step.mesh, jnp.asarray(exactness, x.dtype)
-    hinges, patches = _bending_hessians(step, x, exactness)
+    hinges, patches = _bending_hessians(step, x)
     face = lambda *element: _face_hessian(step, exactness, *element)
     blocks = assemble(
         step.pattern,
@@ -228,6 +228,8 @@ def hessian(step: Increment, x: Positions, exactness: Float[Array, ""] | float =
         _over(jax.hessian(_vertex_energy, argnums=1), step)(x, *_vertices(step)),
         patches,
     )
+    turned = lambda: add_elements(blocks, step.pattern.hinges, exactness * _turning(step, x))
+    blocks = jax.lax.cond(exactness > 0, turned, lambda: blocks)
     if step.contacts is None or step.layers is None or step.layers.whole is None:
         return blocks
     between = contact_hessians(step.contacts, *_about_layers(step, x))
@@ -241,26 +243,28 @@ def far(step: Increment, x: Positions) -> Far | None:
     return Far(step.contacts.stencils, contact_hessians(step.contacts, *_about_layers(step, x)))
 
 
-def _bending_hessians(step, x, exactness):
-    """Second derivatives [N/m] of the bending energy: in each hinge, and in each patch if any."""
-    mesh, corners = step.mesh, x[step.mesh.hinges]
-    hinges = _hinge_curvatures(step, x)
-    width = (mesh.hinge_length / mesh.hinge_area)[:, None, None]
-    gradients = width * jax.vmap(angle_gradient)(corners)
-    stiffnesses = _over(jax.hessian(_bend_energy, argnums=3), step)(*_bends(step, hinges))
-
-    def turning():
-        moments = exactness * jax.grad(_bending_energy, argnums=1)(step, hinges)
-        turns = width[..., None, None] * jax.vmap(jax.jacfwd(angle_gradient))(corners)
-        return jnp.einsum("h,haibj->haibj", moments, turns)
-
-    none = lambda: jnp.zeros((*corners.shape, *corners.shape[1:]), x.dtype)
-    of_hinges = jax.lax.cond(exactness > 0, turning, none)
+def _bending_hessians(step, x):
+    """Second derivatives [N/m] of the bending energy, but for `_turning`: in hinges, or patches."""
+    mesh = step.mesh
+    gradients = _widths(mesh)[:, None, None] * jax.vmap(angle_gradient)(x[mesh.hinges])
+    bent = _bends(step, _hinge_curvatures(step, x))
+    stiffnesses = _over(jax.hessian(_bend_energy, argnums=3), step)(*bent)
     if isinstance(step.bending, PlateLaw):
-        bent = mesh.patches.gradients(gradients)
-        return of_hinges, jnp.einsum("fiva,fij,fjwb->fvawb", bent, stiffnesses, bent)
-    along = jnp.einsum("h,hai,hbj->haibj", stiffnesses, gradients, gradients)
-    return of_hinges + along, None
+        gradients = mesh.patches.gradients(gradients)
+        return None, jnp.einsum("fiva,fij,fjwb->fvawb", gradients, stiffnesses, gradients)
+    return jnp.einsum("h,hai,hbj->haibj", stiffnesses, gradients, gradients), None
+
+
+def _turning(step, x):
+    """What the second derivative [N/m] of the bending energy owes to that of the hinges' angles."""
+    moments = jax.grad(_bending_energy, argnums=1)(step, _hinge_curvatures(step, x))
+    turns = jax.vmap(jax.jacfwd(angle_gradient))(x[step.mesh.hinges])
+    return jnp.einsum("h,haibj->haibj", _widths(step.mesh) * moments, turns)
+
+
+def _widths(mesh: Mesh) -> Float[Array, " hinge"]:
+    """What makes a curvature [1/m] of an angle [rad], [1/m]."""
+    return mesh.hinge_length / mesh.hinge_area
 
 
 def _face_hessian(step, exactness, corners, face, law, inverse, area, anchor, normal, wind):

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer
 from scipy.spatial import KDTree
 
-from r2s.video import opencv
+from r2s.extras import opencv
 
 Places = Float[np.ndarray, "dot 2"]
 

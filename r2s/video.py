@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
+from r2s.extras import opencv
+
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
@@ -94,12 +96,3 @@ def _video(path: Path) -> Iterator[tuple[Path, np.ndarray]]:
         )
     if number == 0:
         raise ValueError(f"{path}: the video has no frames")
-
-
-def opencv():
-    """The module cv2; ImportError that names the extra when it is not installed."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise ImportError("images need OpenCV: pip install 'r2s[camera]'") from error
-    return cv2

@@ -65,19 +65,27 @@ class Pattern(eqx.Module):
 def assemble(
     pattern: Pattern,
     faces: Float[Array, "face 3 3 3 3"],
-    hinges: Float[Array, "hinge 4 3 4 3"],
+    hinges: Float[Array, "hinge 4 3 4 3"] | None,
     vertices: Float[Array, "vertex 3 3"],
     patches: Float[Array, "face 6 3 6 3"] | None = None,
 ) -> Float[Array, "block 3 3"]:
     """The blocks that element matrices (corner, axis, corner, axis) add up to."""
     blocks = jnp.zeros((pattern.rows.shape[0], 3, 3), vertices.dtype)
     blocks = blocks.at[pattern.diagonal].add(vertices, unique_indices=True)
-    elements = [(pattern.faces, faces), (pattern.hinges, hinges)]
-    if patches is not None:
-        elements.append((pattern.patches, patches))
+    elements = (pattern.faces, faces), (pattern.hinges, hinges), (pattern.patches, patches)
     for slots, matrices in elements:
-        blocks = blocks.at[slots].add(matrices.transpose(0, 1, 3, 2, 4))
+        if matrices is not None:
+            blocks = add_elements(blocks, slots, matrices)
     return blocks
+
+
+def add_elements(
+    blocks: Float[Array, "block 3 3"],
+    slots: Int[Array, "element corner corner"],
+    matrices: Float[Array, "element corner 3 corner 3"],
+) -> Float[Array, "block 3 3"]:
+    """The blocks with element matrices added, each pair of corners at its slot."""
+    return blocks.at[slots].add(matrices.transpose(0, 1, 3, 2, 4))
 
 
 def add_between(
@@ -88,8 +96,7 @@ def add_between(
 ) -> Float[Array, "block 3 3"]:
     """The blocks of a full pattern with the matrices of any four vertices added."""
     count = pattern.diagonal.shape[0]
-    slots = stencils[:, :, None] * count + stencils[:, None, :]
-    return blocks.at[slots].add(matrices.transpose(0, 1, 3, 2, 4))
+    return add_elements(blocks, stencils[:, :, None] * count + stencils[:, None, :], matrices)
 
 
 def pinned(

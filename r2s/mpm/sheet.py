@@ -136,6 +136,16 @@ class Sheet(eqx.Module):
 
     def step(self, fabric: Fabric, state: SheetState, control: Control) -> SheetState:
         """The state `dt` later, with the held vertices at `control.handles`."""
+        return self.step_with_forces(fabric, state, control)[0]
+
+    def step_with_forces(
+        self, fabric: Fabric, state: SheetState, control: Control
+    ) -> tuple[SheetState, Float[Array, "handle 3"]]:
+        """The state `dt` later, and the grippers' mean forces [N] on the held vertices.
+
+        Twice these get their grippers' velocity: before their momentum goes to the grid, and after
+        the grid has given back another. The forces are the momentum that this takes, over `dt`.
+        """
         mesh, held, dt = self.scene.mesh, self.scene.held, self.dt
         mass = fabric.density * mesh.vertex_area
         d = self._directions(fabric, state)
@@ -144,13 +154,16 @@ class Sheet(eqx.Module):
         momentum = mass[:, None] * (1 - dt * fabric.mass_damping) * state.v + dt * force
         # what pulls at a held vertex, the gripper bears
         carried = (control.handles - state.x[held]) / dt
-        momentum = momentum.at[held].set(mass[held][:, None] * carried)
+        at_handles = mass[held][:, None] * carried
+        given = at_handles - momentum[held]
+        momentum = momentum.at[held].set(at_handles)
         factor = dt * affine_factor(self.background.grid)
         affine = mass[:, None, None] * state.C - factor * stress
         v, C = self.background.advance(dt, fabric.friction, state.x, mass, momentum, affine)
+        given += at_handles - mass[held][:, None] * v[held]
         v = v.at[held].set(carried)
         x = self.background.settle(state.x + dt * v).at[held].set(control.handles)
-        return SheetState(x, v, C, d)
+        return SheetState(x, v, C, d), given / dt
 
     def _directions(self, fabric: Fabric, state: SheetState) -> Float[Array, "face 3"]:
         """Where the grid has carried the transverse directions, after the return mapping."""

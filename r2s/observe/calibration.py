@@ -6,8 +6,8 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
+from r2s.extras import opencv
 from r2s.observe.camera import Camera
-from r2s.observe.images import opencv
 
 Row = tuple[float, float, float, float]
 

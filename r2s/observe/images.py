@@ -2,26 +2,17 @@
 
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
+from r2s.extras import opencv
 from r2s.files import write_bytes
 
 DEPTHS, MASKS, COLOURS = (".png", ".npy"), (".png",), (".png", ".jpg", ".jpeg")
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 FARTHEST, NEAREST = 20.0, 0.02  # [m], of median depths; no camera of a fabric measures others
 DEEPEST = 65535  # units of depth that 16 bits hold
-
-
-def opencv() -> Any:
-    """The module cv2; ImportError names the extra to install."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise ImportError("images need OpenCV: pip install 'r2s[camera]'") from error
-    return cv2
 
 
 def read_depth(

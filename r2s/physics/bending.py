@@ -2,10 +2,11 @@
 
 A hinge is an edge of rest length l with the rest area A of its two triangles. Its curvature is
 theta l / A, its energy A times the law's energy per area. On a grid of squares whose lines stay
-straight that is the energy of the bent continuum exactly, for bending along the grid's lines;
-across its diagonals it is up to half as much again, at any resolution. Where the membrane lets its
-lines zigzag, a strip along the warp is softer: 1 / (1 / warp + 1 / (4 bias)) of hinge stiffnesses,
-0.8 of a stiffness that is the same in all directions.
+straight that is the energy of the bent continuum exactly, for bending along the grid's lines.
+Across its diagonals it is up to half as much again where these alternate, and between once and
+three times as much where they are parallel, at any resolution. A strip along the warp, free to
+zigzag or twist, is softer: 1 / (1 / warp + 1 / (4 bias)) of hinge stiffnesses, 0.8 of a stiffness
+that is the same in all directions. `r2s.physics.plate` has neither flaw.
 
 A law is a pytree of parameters with two methods: `at`, which gives the law of one hinge from the
 direction across which it bends and its curvature, and `energy_density` of a curvature.

@@ -8,8 +8,7 @@ from jaxtyping import Array, Float
 from r2s.cloth import Cloth, ClothState
 from r2s.fabric import Fabric
 from r2s.increment import imbalance
-from r2s.mpm.sheet import Sheet, SheetState
-from r2s.mpm.transfer import affine_factor
+from r2s.mpm.sheet import Sheet
 from r2s.scenario import Braked
 from r2s.scene import Control
 
@@ -30,11 +29,11 @@ def step_with_forces(
         fabric = solver.braked(fabric, state)
         inner, forces = step_with_forces(solver.solver, fabric, state.inner, control)
         return eqx.tree_at(lambda s: (s.inner, s.count), state, (inner, state.count + 1)), forces
-    after = solver.step(fabric, state, control)
     if isinstance(solver, Cloth):
+        after = solver.step(fabric, state, control)
         return after, _cloth_forces(solver, fabric, state, control, after)
     if isinstance(solver, Sheet):
-        return after, _sheet_forces(solver, fabric, state, control)
+        return solver.step_with_forces(fabric, state, control)
     raise TypeError(f"forces are known of Cloth and Sheet, got {type(solver).__name__}")
 
 
@@ -42,22 +41,3 @@ def _cloth_forces(
     solver: Cloth, fabric: Fabric, state: ClothState, control: Control, after: ClothState
 ) -> Forces:
     return imbalance(solver.increment(fabric, state, control), after.x)[solver.scene.held]
-
-
-def _sheet_forces(solver: Sheet, fabric: Fabric, state: SheetState, control: Control) -> Forces:
-    """As in `Sheet.step`, which twice gives the held vertices their grippers' velocity: before
-    their momentum goes to the grid, and after the grid has given back another.
-    """
-    held, dt = solver.scene.held, solver.dt
-    mass = fabric.density * solver.scene.mesh.vertex_area
-    d = solver._directions(fabric, state)
-    force, stress = solver._across(state.x, d)
-    force += solver._along(fabric, state, control)
-    momentum = mass[:, None] * (1 - dt * fabric.mass_damping) * state.v + dt * force
-    carried = mass[held][:, None] * (control.handles - state.x[held]) / dt
-    given = carried - momentum[held]
-    factor = dt * affine_factor(solver.background.grid)
-    affine = mass[:, None, None] * state.C - factor * stress
-    momentum = momentum.at[held].set(carried)
-    v, _ = solver.background.advance(dt, fabric.friction, state.x, mass, momentum, affine)
-    return (given + carried - mass[held][:, None] * v[held]) / dt
