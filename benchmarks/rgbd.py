@@ -1,4 +1,4 @@
-"""How long RGB-D images take to become clouds, and how much memory.
+"""How long RGB-D images take to become a recording (`r2s data convert`), and how much memory.
 
     python benchmarks/rgbd.py --frames 60 --cameras 2 --across 1280 --down 720
 
@@ -7,7 +7,9 @@ converts them, so that its peak memory is that of the conversion.
 """
 
 import argparse
+import contextlib
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -19,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 RENDERED = 4
+NAME = "lift_made_1"
 POSITIONS = {"left": (-0.5, -0.1, 0.5), "right": (0.1, -0.4, 0.9)}
 
 
@@ -34,13 +37,17 @@ def main() -> None:
         convert(args.convert)
         return
     with tempfile.TemporaryDirectory() as folder:
-        size = write(Path(folder), args)
+        size = write(Path(folder) / NAME, args)
+        describe(Path(folder), args.frames)
         out = subprocess.run(
             [sys.executable, __file__, "--convert", folder], check=True, stdout=subprocess.PIPE
         )
     found = json.loads(out.stdout)
     images = args.frames * args.cameras
-    print(f"{args.frames} frames, {args.cameras} cameras, {args.across} x {args.down}")
+    cores = len(os.sched_getaffinity(0))
+    print(
+        f"{args.frames} frames, {args.cameras} cameras, {args.across} x {args.down}, {cores} cores"
+    )
     print(f"files           {images} depth images and as many masks, {size / 1e6:.0f} MB")
     print(
         f"conversion      {found['seconds']:.1f} s, {1e3 * found['seconds'] / images:.0f} ms/image"
@@ -48,6 +55,7 @@ def main() -> None:
     print(f"processor time  {found['processor']:.1f} s")
     print(f"peak memory     {found['peak']:.0f} MB, {found['before']:.0f} MB of them the libraries")
     print(f"points          {found['points']:.0f} a frame")
+    print(f"when up to date {found['again']:.1f} s")
 
 
 def write(folder: Path, args: argparse.Namespace) -> int:
@@ -80,6 +88,16 @@ def write(folder: Path, args: argparse.Namespace) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*.png"))
 
 
+def describe(folder: Path, frames: int) -> None:
+    """The manifest of the recording, and its gripper's path."""
+    from r2s.manifest import default_manifest
+
+    manifest = json.loads((default_manifest().parent / "templates" / "study.json").read_text())
+    manifest["scenarios"]["lift"]["frames_used"] = [0, frames - 1]
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    np.save(folder / "lift_gripper.npy", np.zeros((frames, 3)))
+
+
 def peak() -> float:
     """Peak memory of this process [MB]; getrusage would count that of the parent (Linux)."""
     status = Path("/proc/self/status").read_text()
@@ -89,20 +107,30 @@ def peak() -> float:
 
 
 def convert(folder: Path) -> None:
+    from r2s.cli import main as r2s
     from r2s.observe import images
-    from r2s.observe.rgbd import read_rig, stream
+    from r2s.recording import load
 
     images.opencv()
     before = peak()
+    out = folder / "out"
+    command = ["data", "convert", str(folder), "--to", str(out)]
     start, processor = time.perf_counter(), time.process_time()
-    counts = [len(points) for _, points in stream(folder, read_rig(folder))]
+    with contextlib.redirect_stdout(sys.stderr):
+        code = r2s(command)
     found = {
         "seconds": time.perf_counter() - start,
         "processor": time.process_time() - processor,
         "peak": peak(),
         "before": before,
-        "points": float(np.mean(counts)),
     }
+    if code:
+        sys.exit(code)
+    start = time.perf_counter()
+    with contextlib.redirect_stdout(sys.stderr):
+        r2s(command)
+    found["again"] = time.perf_counter() - start
+    found["points"] = float(np.mean(load(out / f"{NAME}.npz").mask.sum(axis=1)))
     print(json.dumps(found))
 
 

@@ -1,4 +1,4 @@
-"""The command line `r2s`: data sets, and pictures of recordings. `r2s --help` begins.
+"""The command line `r2s`: data sets, recordings, and their pictures. `r2s --help` begins.
 
 Exit codes: 0; 1 for an error, in one line on stderr; 2 for wrong usage. A command is a dataclass,
 whose fields are its arguments, with a method `run`; its docstring is its help. What it needs is
@@ -14,7 +14,14 @@ from typing import Annotated, Literal
 
 try:
     import tyro
-    from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
+    from tyro.conf import (
+        FlagCreatePairsOff,
+        OmitArgPrefixes,
+        OmitSubcommandPrefixes,
+        Positional,
+        arg,
+        subcommand,
+    )
 except ImportError:
     sys.exit("r2s: error: the command line needs tyro: pip install 'r2s[cli]'")
 
@@ -63,11 +70,43 @@ class List:
 
 
 @dataclass(frozen=True)
+class Convert:
+    """Read recordings, of RGB-D images or of point clouds, and write each as one NPZ of r2s.
+
+    FOLDER has a manifest.json and a folder for each recording, or is the folder of one. Where there
+    is a cameras.json, in a recording's folder or above, that holds images, else numbered clouds.
+    What was converted already is skipped, unless the files that it was made from have changed.
+    Recordings that cannot be read are named, with file and frame, after the others were converted.
+
+        r2s data convert recordings --to canonical
+        r2s data convert recordings --only '^lift_' --to canonical
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """Of recordings, or of one."""
+    to: Annotated[Path, arg(metavar="OUT")]
+    """Where NAME.npz goes, and NAME.sha256 of what it was made from; made when it is not there."""
+    only: Annotated[str, arg(metavar="REGEX")] = ""
+    """Convert those whose name matches this regular expression."""
+    force: bool = False
+    """Convert again what is up to date, as after an update of r2s."""
+
+    def run(self) -> None:
+        from r2s.convert import convert
+
+        for line in convert(self.folder, self.to, self.only, self.force):
+            print(line)
+
+
+@dataclass(frozen=True)
 class Data:
-    """Public data sets of recordings: which there are, and how to get them."""
+    """Recordings: which are public and how to get them, and how yours become those of r2s."""
 
     command: Annotated[
-        Annotated[Fetch, subcommand("fetch")] | Annotated[List, subcommand("list")], arg(name="")
+        Annotated[Fetch, subcommand("fetch")]
+        | Annotated[List, subcommand("list")]
+        | Annotated[Convert, subcommand("convert")],
+        arg(name=""),
     ]
 
     def run(self) -> None:
@@ -115,7 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="r2s",
         description="r2s: real-to-sim for fabrics. Each command tells more with --help.",
         args=arguments,
-        config=(OmitArgPrefixes, OmitSubcommandPrefixes),
+        config=(OmitArgPrefixes, OmitSubcommandPrefixes, FlagCreatePairsOff),
     )
     try:
         with warnings.catch_warnings():

@@ -6,6 +6,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from r2s.surface import nearest
 
+TOUCHING = 1e-6  # [m]: what is nearer lies on the sheet
+
 OUTLIER_SCALE = 0.015  # [m]: a point much farther away than this counts as an outlier
 
 
@@ -37,20 +39,36 @@ def surface_residuals(
     face, weights = nearest(points, x, faces)
     vertices = faces[face]
     gap = points - jnp.einsum("pk,pki->pi", weights, x[vertices])
-    distance = jnp.sqrt(jnp.sum(gap**2, axis=-1))
+    square = jnp.sum(gap**2, axis=-1)
+    apart = square > TOUCHING**2  # a point on the sheet has no direction but the normal
+    distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
     edges = x[vertices[:, 1:]] - x[vertices[:, :1]]
     normal = jnp.cross(edges[:, 0], edges[:, 1])
     normal = normal / jnp.sqrt(jnp.sum(normal**2, axis=-1, keepdims=True))
-    apart = distance > 1e-6  # a point on the sheet has no direction but the normal
     direction = jnp.where(apart[:, None], gap / jnp.where(apart, distance, 1)[:, None], normal)
     return jnp.where(mask, distance, 0), direction, vertices, weights
 
 
-def robust(distance: Float[Array, "*point"]) -> Float[Array, "*point"]:
-    """Cauchy's robust loss [m^2]: d^2 / 2 for small distances [m], logarithmic for outliers."""
-    return OUTLIER_SCALE**2 / 2 * jnp.log1p((distance / OUTLIER_SCALE) ** 2)
+def robust(
+    distance: Float[Array, "*point"], scale: Float[Array, ""] | float = 0.0
+) -> Float[Array, "*point"]:
+    """A robust loss [m^2]: d^2 / 2 for small distances d [m], less for outliers.
+
+    Cauchy's, logarithmic beyond `OUTLIER_SCALE`, which draws from afar. Or, with a `scale` [m] above
+    zero, that of Geman and McClure (1987), bounded: what is much farther off than that does not
+    count at all.
+    """
+    strict = jnp.asarray(scale, float) > 0
+    limit = jnp.where(strict, jnp.maximum(scale, TOUCHING), OUTLIER_SCALE)
+    square = (distance / limit) ** 2
+    return limit**2 / 2 * jnp.where(strict, square / (1 + square), jnp.log1p(square))
 
 
-def robust_weight(distance: Float[Array, "*point"]) -> Float[Array, "*point"]:
+def robust_weight(
+    distance: Float[Array, "*point"], scale: Float[Array, ""] | float = 0.0
+) -> Float[Array, "*point"]:
     """The derivative of `robust`, divided by the distance [-]."""
-    return 1 / (1 + (distance / OUTLIER_SCALE) ** 2)
+    strict = jnp.asarray(scale, float) > 0
+    limit = jnp.where(strict, jnp.maximum(scale, TOUCHING), OUTLIER_SCALE)
+    weight = 1 / (1 + (distance / limit) ** 2)
+    return jnp.where(strict, weight**2, weight)

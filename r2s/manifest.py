@@ -3,9 +3,10 @@
 import hashlib
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +17,7 @@ from r2s.observe.rgbd import find_rig, read_clouds, read_rig
 from r2s.recording import Recording, RecordingInfo, SheetPlacement, make_recording
 
 Vector = tuple[float, float, float]
+Watch = Callable[[Iterable[Any]], Iterable[Any]]
 
 
 @dataclass(frozen=True)
@@ -128,8 +130,13 @@ def hash_values(values: np.ndarray) -> str:
 
 
 def default_manifest() -> Path:
-    """The manifest of the public DIFFCLOUD recordings, in the repository beside the package."""
-    return Path(__file__).parents[1] / "data_manifests" / "diffcloud.json"
+    """The manifest of the public DIFFCLOUD recordings.
+
+    In the repository the manifests lie beside the package, in an installation within it.
+    """
+    package = Path(__file__).parent
+    within = package / "data_manifests"
+    return (within if within.is_dir() else package.parent / "data_manifests") / "diffcloud.json"
 
 
 def manifest_for(folder: Path | str) -> Manifest:
@@ -137,8 +144,13 @@ def manifest_for(folder: Path | str) -> Manifest:
 
     Raises as `read_manifest`.
     """
+    return read_manifest(manifest_of(folder))
+
+
+def manifest_of(folder: Path | str) -> Path:
+    """The file of `manifest_for`."""
     own = Path(folder) / "manifest.json"
-    return read_manifest(own if own.exists() else default_manifest())
+    return own if own.exists() else default_manifest()
 
 
 def read_manifest(path: Path | str) -> Manifest:
@@ -170,8 +182,24 @@ def read_recordings(
     return [n for n in names if any(re.fullmatch(manifest.scenarios[s].folder, n) for s in wanted)]
 
 
-def read_recording(folder: Path | str, manifest: Manifest, name: str) -> Recording:
+def sources(folder: Path | str, manifest: Manifest, name: str) -> list[Path]:
+    """The files that a recording is read from, as far as they are there, sorted.
+
+    Its manifest, the gripper's path, cameras.json, and all in its folder but colour images.
+    """
+    folder = Path(folder)
+    gripper = folder / manifest.scenarios[_scenario_of(manifest, name)[0]].gripper.file
+    about = (manifest_of(folder), gripper, find_rig(folder / name))
+    inside = (path for path in (folder / name).rglob("*") if path.parent.name != "colour")
+    return sorted({path for path in (*about, *inside) if path is not None and path.is_file()})
+
+
+def read_recording(
+    folder: Path | str, manifest: Manifest, name: str, watch: Watch = iter
+) -> Recording:
     """The recording in `folder`/`name`, of clouds or of RGB-D images, in metres and seconds.
+
+    Frames are read through `watch`, such as a bar that shows progress.
 
     `info.verified`: True if all its files are listed in the manifest and have the listed values,
     None if some are not listed; False, with a warning, if a listed one differs or is missing.
@@ -185,10 +213,11 @@ def read_recording(folder: Path | str, manifest: Manifest, name: str) -> Recordi
     scenario = manifest.scenarios[scenario_name]
     path = _read_path(folder / scenario.gripper.file)
     if find_rig(folder / name):
-        times, seen = read_clouds(folder / name, read_rig(folder / name), scenario.frame_rate)
+        rig = read_rig(folder / name)
+        times, seen = read_clouds(folder / name, rig, scenario.frame_rate, watch)
         clouds, verified = [to_world(scenario.cloud, points) for points in seen], None
     else:
-        times, clouds, verified = _numbered_clouds(folder, manifest, name, scenario, path)
+        times, clouds, verified = _numbered_clouds(folder, manifest, name, scenario, path, watch)
     source = f"{manifest.source.repository} {manifest.source.commit} {manifest.source.path}"
     info = RecordingInfo(
         name=name,
@@ -212,11 +241,16 @@ def read_recording(folder: Path | str, manifest: Manifest, name: str) -> Recordi
 
 
 def _numbered_clouds(
-    folder: Path, manifest: Manifest, name: str, scenario: Scenario, path: np.ndarray
+    folder: Path,
+    manifest: Manifest,
+    name: str,
+    scenario: Scenario,
+    path: np.ndarray,
+    watch: Watch,
 ) -> tuple[np.ndarray, list[np.ndarray], bool | None]:
     """Times [s] on the cameras' clock, clouds [m] in the world, and whether they are verified."""
     frames = find_frames(folder / name, scenario.first_frame)
-    clouds = {f"{name}/{frame.name}": read_cloud(frame) for frame in frames}
+    clouds = {f"{name}/{frame.name}": read_cloud(frame) for frame in watch(frames)}
     verified = _verify(manifest.files, name, clouds | {scenario.gripper.file: path})
     kept = [_distinct(points) if scenario.drop_repeats else points for points in clouds.values()]
     world = [to_world(scenario.cloud, points) for points in kept]

@@ -1,5 +1,7 @@
 """Pictures of a recording: a contact sheet and a video of clouds, grippers, and simulated cloth.
 
+Where a force was recorded, its curve runs below, with the frames that are shown.
+
     show(open_recording("recording.npz"), "out", load_trajectory("trajectory.npz"))
 
 Needs matplotlib: pip install 'r2s[study]'; the video is an MP4 where OpenCV is installed
@@ -35,7 +37,9 @@ except ImportError as error:
 CLOTH, CLOUD, GRIPPER, MARKER, GREY = "#0072B2", "#D55E00", "#000000", "#009E73", "#8c8c8c"
 MOST_DOTS = 1500  # a panel; more would hide the cloth
 PANELS = 12  # of the contact sheet, at most
-VIEW = {"elev": 18, "azim": -60}  # [degrees]
+ABOVE, FROM_ABOVE, AZIMUTH = 18, 50, -60  # [degrees], of the eye; the second for flat scenes
+FLAT = 0.3  # least height of the box over its longest side, so that a flat scene can be seen in
+STRIP = 1.7  # [inch], height of the force's curve
 Video = Literal["auto", "gif", "mp4", "none"]
 
 
@@ -111,8 +115,9 @@ def show(
 ) -> list[Path]:
     """Write `NAME.png`, a contact sheet, and `NAME.gif` or `NAME.mp4`, in real time; their paths.
 
-    Clouds, grippers with their path so far, markers where there are any, the sheet's outline at
-    rest, and the table; one scale for all axes, in metres, for all frames. Raises ValueError when
+    Clouds, grippers with their path so far, markers and the force where there are any, the sheet's
+    outline at rest, and the table; one scale for all axes, in metres, for all frames. Raises
+    ValueError when
     the cloth has another number of frames, ImportError that names the extra, OSError.
     """
     if cloth is not None and len(cloth.x) != len(recording.times):
@@ -139,14 +144,19 @@ def contact_sheet(path: Path, recording: Recording, cloth: SimulatedCloth | None
     columns = min(4, len(frames))
     rows = -(-len(frames) // columns)
     box, dots = _limits(recording, cloth), _thinned(recording)
-    figure = Figure(figsize=(3.6 * columns, 3.3 * rows + 0.9))
-    top, bottom = 1 - 0.55 / (3.3 * rows + 0.9), 0.4 / (3.3 * rows + 0.9)
+    strip = 0.0 if recording.force is None else STRIP
+    height = 3.3 * rows + 0.9 + strip  # [inch]
+    figure = Figure(figsize=(3.6 * columns, height))
+    top, bottom = 1 - 0.55 / height, (0.4 + strip) / height
     figure.subplots_adjust(0.0, bottom, 0.96, top - 0.02, wspace=0.06, hspace=0.1)
     for i, frame in enumerate(frames):
-        axes: Any = figure.add_subplot(rows, columns, i + 1, projection="3d", **VIEW)
+        axes: Any = figure.add_subplot(rows, columns, i + 1, projection="3d")
         _dress(axes, recording, box)
         _draw(axes, recording, dots, cloth, int(frame), box)
         axes.set_title(_caption(recording, int(frame)), fontsize=9, y=0.98)
+    if strip:
+        curve = _force_curve(figure, recording, 0.75 / height, (strip - 0.45) / height)
+        _mark(curve, recording, frames)
     figure.suptitle(_title(recording), fontsize=12)
     _legend(figure, recording, cloth, box)
     buffer = io.BytesIO()
@@ -200,16 +210,21 @@ def write_mp4(path: Path, recording: Recording, cloth: SimulatedCloth | None = N
 def _pictures(recording: Recording, cloth: SimulatedCloth | None) -> Iterator[np.ndarray]:
     """Each frame as a picture, (height, width, 3) in 0..255, of even sides."""
     box, dots = _limits(recording, cloth), _thinned(recording)
-    figure = Figure(figsize=(6.4, 5.6), dpi=100)
+    strip = 0.0 if recording.force is None else STRIP - 0.1  # [inch]: sides of even pixels
+    height = 5.6 + strip
+    figure = Figure(figsize=(6.4, height), dpi=100)
     canvas = FigureCanvasAgg(figure)
-    figure.subplots_adjust(0.0, 0.06, 0.96, 0.93)
-    axes: Any = figure.add_subplot(projection="3d", **VIEW)
+    figure.subplots_adjust(0.0, (0.34 + strip) / height, 0.96, 1 - 0.39 / height)
+    axes: Any = figure.add_subplot(projection="3d")
     _dress(axes, recording, box)
     figure.suptitle(_title(recording), fontsize=11)
     _legend(figure, recording, cloth, box)
-    caption = figure.text(0.02, 0.9, "", fontsize=10)
+    caption = figure.text(0.02, 1 - 0.56 / height, "", fontsize=10)
+    curve = strip and _force_curve(figure, recording, 0.7 / height, (strip - 0.45) / height)
     for frame in range(len(recording.times)):
         drawn = _draw(axes, recording, dots, cloth, frame, box)
+        if strip:
+            drawn += _mark(curve, recording, np.array([frame]))
         caption.set_text(_caption(recording, frame))
         canvas.draw()
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
@@ -224,6 +239,8 @@ def _dress(axes: Any, recording: Recording, box: tuple[np.ndarray, np.ndarray]) 
     axes.computed_zorder = False  # the dots lie over the cloth, whatever their depth
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set_box_aspect(high - low, zoom=0.98)
+    is_flat = high[2] - low[2] < 1.01 * FLAT * (high - low).max()
+    axes.view_init(elev=FROM_ABOVE if is_flat else ABOVE, azim=AZIMUTH)
     for axis, name in ((axes.xaxis, "x"), (axes.yaxis, "y"), (axes.zaxis, "z")):
         axis.set_major_locator(MaxNLocator(3))
         axis.set_label_text(f"{name} [m]", fontsize=8)
@@ -270,11 +287,41 @@ def _draw(
     drawn.append(axes.scatter(*points.T, s=2.2, color=CLOUD, zorder=5, **options))
     if recording.markers is not None and recording.markers_seen is not None:
         seen = np.asarray(recording.markers)[frame][np.asarray(recording.markers_seen)[frame]]
-        drawn.append(axes.scatter(*seen.T, s=12, color=MARKER, marker="x", zorder=6))
+        drawn.append(
+            axes.scatter(*seen.T, s=14, color=MARKER, marker="x", zorder=6, depthshade=False)
+        )
     for path in _grippers(recording, frame):
         drawn += axes.plot(*path.T, color=GRIPPER, linewidth=0.9, zorder=7)
         drawn += axes.plot(*path[-1:].T, "o", color=GRIPPER, markersize=5, zorder=8)
     return drawn
+
+
+def _force_curve(figure: Any, recording: Recording, bottom: float, height: float) -> Any:
+    """The force [N] while the frames were taken, in a strip of the figure; of a vector its size."""
+    axes = figure.add_axes((0.08, bottom, 0.86, height))
+    force = _force(recording)
+    axes.plot(np.asarray(recording.force_times), force, color=GRIPPER, linewidth=1.1)
+    times = np.asarray(recording.times)
+    margin = 0.02 * float(np.ptp(times)) or 1.0
+    axes.set_xlim(times[0] - margin, times[-1] + margin)
+    axes.set_xlabel("time [s]", fontsize=8, labelpad=1)
+    axes.set_ylabel("force [N]", fontsize=8)
+    axes.tick_params(labelsize=7)
+    axes.grid(color=GREY, alpha=0.3, linewidth=0.5)
+    return axes
+
+
+def _mark(axes: Any, recording: Recording, frames: np.ndarray) -> list[Any]:
+    """Dots on the curve of the force at frames; none where the log does not reach."""
+    times = np.asarray(recording.times)[frames]
+    options: dict[str, Any] = {"left": np.nan, "right": np.nan}
+    force = np.interp(times, np.asarray(recording.force_times), _force(recording), **options)
+    return axes.plot(times, force, "o", color=CLOUD, markersize=4, zorder=3)
+
+
+def _force(recording: Recording) -> np.ndarray:
+    force = np.asarray(recording.force)
+    return force if force.ndim == 1 else np.linalg.norm(force, axis=1)
 
 
 def _grippers(recording: Recording, frame: int) -> list[np.ndarray]:
@@ -321,7 +368,7 @@ def _limits(recording: Recording, cloth: SimulatedCloth | None) -> tuple[np.ndar
         vertices = cloth.x.reshape(-1, 3)
         met = vertices[_inside(vertices, *around)]
         low, high = np.min([low, *met], axis=0), np.max([high, *met], axis=0)
-    least = 0.3 * float((high - low).max())  # a flat scene needs some height to be seen in
+    least = FLAT * float((high - low).max())
     centre, half = (low + high) / 2, np.maximum(high - low, least) / 2
     return centre - 1.04 * half, centre + 1.04 * half
 
@@ -365,8 +412,15 @@ def _legend(
         handles.append(Line2D([], [], color=MARKER, linestyle="", marker="x", label="marker"))
     if cloth is not None:
         handles.append(Line2D([], [], color=CLOTH, linewidth=5, alpha=0.5, label="simulated cloth"))
+    narrow = figure.get_figwidth() < 8
+    spacing = {"columnspacing": 0.9, "handletextpad": 0.3} if narrow else {}
     figure.legend(
-        handles=handles, loc="lower center", ncols=len(handles), frameon=False, fontsize=9
+        handles=handles,
+        loc="lower center",
+        ncols=len(handles),
+        frameon=False,
+        fontsize=7.5 if narrow else 9,
+        **spacing,
     )
 
 

@@ -16,15 +16,37 @@ def nearest(
     the distance does not change when the weights do (envelope theorem).
     """
     points, x = jax.lax.stop_gradient((points, x))
-    corners = x[faces]
+    squared = _squared_distances(points, x[faces])
+    # a minimum and a comparison vectorise, argmin does not: five times as fast on a CPU
+    least = jnp.min(squared, axis=1, keepdims=True)
+    face = jnp.argmax(squared <= least, axis=1)
+    return face, jax.vmap(_closest_weights)(points, x[faces[face]])
 
-    def of_point(point):
-        weights = jax.vmap(_closest_weights, in_axes=(None, 0))(point, corners)
-        places = jnp.einsum("fk,fki->fi", weights, corners)
-        best = jnp.argmin(jnp.sum((places - point[None]) ** 2, axis=-1))
-        return best, weights[best]
 
-    return jax.vmap(of_point)(points)
+def _squared_distances(
+    points: Float[Array, "point 3"], corners: Float[Array, "face 3 3"]
+) -> Float[Array, "point face"]:
+    """From points to triangles, [m^2]: within the triangle its plane's, else its nearest edge's."""
+    a, u, v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    tiny = jnp.finfo(points.dtype).tiny
+    dot = lambda p, q: jnp.sum(p * q, axis=-1)[None]  # of each face
+    uu, uv, vv = dot(u, u), dot(u, v), dot(v, v)
+    normal = jnp.cross(u, v)
+    normal = normal / jnp.sqrt(jnp.maximum(dot(normal, normal)[0], tiny))[:, None]
+    offset = [points[:, k, None] - a[None, :, k] for k in range(3)]  # each (point, face)
+    along = lambda q: sum(offset[k] * q[None, :, k] for k in range(3))
+    s, t, height = along(u), along(v), along(normal)
+    square = sum(part**2 for part in offset)
+    first, second = vv * s - uv * t, uu * t - uv * s
+    inside = (first >= 0) & (second >= 0) & (first + second <= uu * vv - uv**2)
+
+    def to_edge(square, along, length):
+        place = jnp.clip(along / jnp.maximum(length, tiny), 0, 1)
+        return square - place * (2 * along - place * length)
+
+    opposite = to_edge(square - 2 * s + uu, t - s - uv + uu, vv - 2 * uv + uu)
+    edges = jnp.minimum(jnp.minimum(to_edge(square, s, uu), to_edge(square, t, vv)), opposite)
+    return jnp.where(inside, height**2, edges)
 
 
 def _closest_weights(point: Float[Array, " 3"], corners: Float[Array, "3 3"]) -> Float[Array, " 3"]:

@@ -1,9 +1,12 @@
 """Gripper paths for the six scenarios: smooth, at rest at both ends, and varied at random.
 
 Each is a function of where the sheet lies and of a few numbers, whose limits are in `LIMITS`. The
-speed is continuous everywhere, and zero at the first and the last knot.
+speed is continuous everywhere, and zero at the first and the last knot. Numbers that make no sense,
+or with which a path would not be at rest when its `duration` ends, raise a `ValueError` that names
+them.
 """
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -17,6 +20,7 @@ KNOT_RATE = 120.0  # [1/s]: in a fling of 20 m/s^2 the speed jumps by 0.17 m/s f
 UP = np.array([0.0, 0.0, 1.0])
 OPPOSITE = {"origin": "opposite", "opposite": "origin", "warp": "weft", "weft": "warp"}
 TABLE_GAP = 0.01  # [m], between the table and a corner that was folded over
+FASTEST = KNOT_RATE / 10  # [1/s], of an oscillation: ten knots a period show its shape
 
 
 class Route(NamedTuple):
@@ -69,6 +73,9 @@ def lift(
 
     Inward is towards the opposite corner.
     """
+    not_negative("m", height=height, inward=inward)
+    positive("s", moving=moving)
+    _ends(duration, "moving", moving)
     here, there = _corner(sheet), corner(sheet, OPPOSITE[sheet.held[0]])
     away = inward * _unit(there - here) + height * UP
     return _route(duration, lambda t: here + ease(t / moving)[:, None] * away)
@@ -85,6 +92,10 @@ def fold(
 
     It ends after the fraction `reach` [-] of the way; `height` [-] is the ellipse's over that way.
     """
+    _share("reach", reach)
+    not_negative("-", height=height)
+    positive("s", moving=moving)
+    _ends(duration, "moving", moving)
     here, there = _corner(sheet), corner(sheet, OPPOSITE[sheet.held[0]])
     across = reach * (there - here)
     up = height * float(np.linalg.norm(across)) * UP
@@ -106,6 +117,9 @@ def pull(
     It goes along the warp by `strain` [-] times the sheet's length, and stays. The grippers are
     the corners, in the order in which they are held.
     """
+    not_negative("-", strain=strain)
+    positive("s", moving=moving)
+    _ends(duration, "moving", moving)
     corners = np.array([corner(sheet, name) for name in sheet.held])
     pulled = np.array([name in ("warp", "opposite") for name in sheet.held], float)
     away = strain * sheet.size[0] * np.outer(pulled, sheet.warp)
@@ -133,6 +147,10 @@ def fling(
     the one from the first to the second gripper. The greatest acceleration is
     6 forward / there^2.
     """
+    not_negative("m", forward=forward)
+    positive("s", there=there, back=back)
+    not_negative("s", wait=wait)
+    _ends(duration, "wait + there + back", wait + there + back)
     corners = _drawn_together(sheet, gap)
     direction = np.cross(UP, _unit(corners[1] - corners[0]))
 
@@ -157,6 +175,13 @@ def shake(
     It takes `fade` [s] to come to that amplitude and to lose it, and is still for the last `still`
     of `duration` [s].
     """
+    not_negative("m", amplitude=amplitude)
+    positive("1/s", frequency=frequency)
+    if frequency > FASTEST:
+        raise ValueError(f"frequency must be at most {FASTEST:g} 1/s, found {frequency}")
+    positive("s", fade=fade)
+    not_negative("s", still=still)
+    _ends(duration, "2 fade + still", 2 * fade + still)
     corners = _drawn_together(sheet, gap)
     which = np.array([[0.0], [1.0]]) * UP
 
@@ -168,8 +193,37 @@ def shake(
     return _route(duration, at)
 
 
+def positive(unit: str, **numbers: float) -> None:
+    """Raise a `ValueError` that names a number and its unit unless it is positive and finite."""
+    for name, value in numbers.items():
+        if not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{name} must be positive [{unit}], found {value}")
+
+
+def not_negative(unit: str, **numbers: float) -> None:
+    """As `positive`, but zero is allowed."""
+    for name, value in numbers.items():
+        if not (math.isfinite(value) and value >= 0):
+            raise ValueError(f"{name} must not be negative [{unit}], found {value}")
+
+
+def _share(name: str, value: float) -> None:
+    if not 0 < value <= 1:
+        raise ValueError(f"{name} must be above 0 and at most 1 [-], found {value}")
+
+
+def _ends(duration: float, what: str, needed: float) -> None:
+    """The path is at rest when it ends."""
+    if needed > duration + 1e-9:
+        raise ValueError(
+            f"{what} is {needed:g} s, but the path ends after {duration:g} s: move faster, or "
+            "take more frames"
+        )
+
+
 def _route(duration: float, at: Callable[[np.ndarray], np.ndarray]) -> Route:
     """A function of time [s], at knots `1 / KNOT_RATE` apart or less that end at `duration`."""
+    positive("s", duration=duration)
     times = np.linspace(0, duration, int(np.ceil(duration * KNOT_RATE - 1e-9)) + 1)
     path = at(times)
     return Route(times, path[:, None] if path.ndim == 2 else path)
@@ -184,6 +238,7 @@ def _corner(sheet: SheetPlacement) -> Float[np.ndarray, "3"]:
 def _drawn_together(sheet: SheetPlacement, gap: float) -> Float[np.ndarray, "2 3"]:
     if len(sheet.held) != 2:
         raise ValueError(f"this path is of two grippers, the sheet is held at {sheet.held}")
+    _share("gap", gap)
     corners = np.array([corner(sheet, name) for name in sheet.held])
     middle = corners.mean(axis=0)
     return middle + gap * (corners - middle)

@@ -123,7 +123,7 @@ BROKEN: dict[str, tuple[Break, str]] = {
     "truncated mask": (cut("left/masks/002.png"), "left/masks/002.png: truncated PNG"),
     "no PNG": (
         lambda folder: (folder / "left/depth/002.png").write_bytes(b"\xff\xd8\xff\xe0 JFIF"),
-        "left/depth/002.png: no PNG: found the bytes",
+        "left/depth/002.png: no PNG: found the bytes .*: export it as PNG",
     ),
     "damaged NPY": (
         lambda folder: (depths(lambda d: d)(folder), cut("left/depth/001.npy")(folder)),
@@ -178,7 +178,10 @@ BROKEN: dict[str, tuple[Break, str]] = {
     ),
     # calibration
     "no JSON": (cut("cameras.json"), "cameras.json: no JSON: "),
-    "no cameras.json": (removed("cameras.json"), "wave: no cameras.json there or in the folder"),
+    "no cameras.json": (
+        removed("cameras.json"),
+        "wave: no cameras.json there or in the folder above: write one",
+    ),
     "unknown key": (edited(*LEFT, "fx", value=900), "cameras.json: cameras: left: unknown: fx"),
     "unknown scale": (
         lambda folder: edited(
@@ -245,7 +248,11 @@ BROKEN: dict[str, tuple[Break, str]] = {
     ),
     "times that are no numbers": (
         text("left/times.csv", "0\n0.1\n12:00:01\n0.3\n"),
-        "left/times.csv: line 3: expected a time .s. last, found '12:00:01'",
+        "left/times.csv: line 3: expected a time .s. last, found '12:00:01': write a number",
+    ),
+    "times in another encoding": (
+        lambda folder: (folder / "left/times.csv").write_bytes(b"Zeit in s, f\xfcr alle\n0\n"),
+        "left/times.csv: no text in UTF-8 .*: export it again",
     ),
     "too few times": (text("left/times.csv", "0\n0.1\n"), "left/times.csv: 2 times, but 4 frames"),
     "no times": (removed("left/times.csv"), "left/times.csv: no such file, and no frame_rate"),

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("tyro")
 
-from test_show import cloth, recorded  # noqa: E402
+from test_show import cloth, lab, recorded  # noqa: E402
 
 from r2s.cli import main  # noqa: E402
 from r2s.recording import save  # noqa: E402
@@ -26,7 +26,8 @@ def stopped(*arguments: str) -> int | str | None:
     "arguments, words",
     [
         ((), ["data", "show", "real-to-sim for fabrics"]),
-        (("data",), ["fetch", "list"]),
+        (("data",), ["fetch", "list", "convert"]),
+        (("data", "convert"), ["FOLDER", "--to OUT", "--only REGEX", "--force", "cameras.json"]),
         (("data", "fetch"), ["NAME", "--to FOLDER", "r2s data fetch diffcloud --to recordings"]),
         (("data", "list"), ["--manifests FOLDER"]),
         (("show",), ["RECORDING", "--trajectory FILE", "--out FOLDER", "gif", "frame, vertex, 3"]),
@@ -45,6 +46,7 @@ def test_help_teaches(capsys: pytest.CaptureFixture, arguments: tuple, words: li
         ((), "command"),
         (("shov",), "shov"),
         (("data", "fetch", "rgbench"), "--to"),
+        (("data", "convert", "recordings"), "--to"),
         (("show", "a.npz", "--out", "b", "--video", "avi"), "avi"),
         (("show", "a.npz", "--out", "b", "--colour", "red"), "--colour"),
     ],
@@ -64,6 +66,7 @@ def test_an_error_is_one_line_and_1(tmp_path: Path, capsys: pytest.CaptureFixtur
     for arguments, words in (
         (["data", "fetch", "blanco_mulero", "--to", str(tmp_path)], "10.5281/zenodo.13823986"),
         (["data", "fetch", "none", "--to", str(tmp_path)], "no data set 'none'; there are"),
+        (["data", "convert", str(tmp_path), "--to", str(tmp_path / "out")], "no recording whose"),
         (["show", str(tmp_path / "no.npz"), "--out", str(tmp_path)], "no.npz: no such recording"),
     ):
         assert main(arguments) == 1
@@ -84,6 +87,17 @@ def test_a_recording_is_shown_with_its_simulation(
     np.savez(tmp_path / "t.npz", x=cloth(3).x, faces=cloth(3).faces)
     assert main(command) == 1
     assert "t.npz" not in (text := capsys.readouterr().err) and "has 3 frames" in text
+
+
+def test_recordings_are_converted_once(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    (tmp_path / "in").mkdir()
+    folder = str(lab(tmp_path / "in", "lift_camel_1", "lift_denim_1"))
+    command = ["data", "convert", folder, "--only", "camel", "--to", str(tmp_path / "out")]
+    for words in ("3 frames, 12 points", "up to date"):
+        assert main(command) == 0
+        assert words in (text := capsys.readouterr().out) and "denim" not in text
+    assert main([*command, "--force"]) == 0
+    assert "3 frames" in capsys.readouterr().out
 
 
 def test_the_console_script_is_installed() -> None:

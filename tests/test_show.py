@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("matplotlib")
+from matplotlib.figure import Figure  # noqa: E402
 from PIL import Image  # noqa: E402
 
 from r2s.manifest import default_manifest  # noqa: E402
@@ -20,6 +21,8 @@ from r2s.recording import (  # noqa: E402
 )
 from r2s.show import (  # noqa: E402
     SimulatedCloth,
+    _force_curve,
+    _mark,
     contact_sheet,
     load_trajectory,
     open_recording,
@@ -86,6 +89,35 @@ def test_the_cloth_is_drawn_over_it_and_markers_too(tmp_path: Path) -> None:
     marked = recorded(markers=markers, markers_seen=seen)
     drawn = contact_sheet(tmp_path / "marked.png", marked)
     assert drawn.read_bytes() != without[0].read_bytes()
+
+
+@pytest.mark.parametrize("vector", [False, True])
+def test_the_force_is_drawn_below(tmp_path: Path, vector: bool) -> None:
+    """Its curve as the log has it; dots only at frames that the log reaches."""
+    times = np.linspace(0.1, 1.0, 50)
+    force = 3 * times
+    log = np.outer(force, [0.6, 0.0, -0.8]) if vector else force
+    pulled = recorded(force=log, force_times=times)
+    curve = _force_curve(Figure(), pulled, 0.1, 0.2)
+    np.testing.assert_allclose(curve.lines[0].get_ydata(), force, rtol=1e-12)
+    (marked,) = _mark(curve, pulled, np.arange(FRAMES))
+    expected = np.where(np.arange(FRAMES) / 15 < 0.1, np.nan, np.arange(FRAMES) / 5)
+    np.testing.assert_allclose(marked.get_ydata(), expected, rtol=1e-12)
+    assert curve.get_xlim()[1] < 0.3  # the frames end long before the log
+    size = lambda recording, name: Image.open(contact_sheet(tmp_path / name, recording)).height
+    assert size(pulled, "with.png") > size(recorded(), "without.png") + 100
+
+
+def test_a_video_with_a_force(tmp_path: Path) -> None:
+    pulled = recorded(3, force=np.arange(4.0), force_times=np.arange(4.0) / 20)
+    with Image.open(write_gif(tmp_path / "pull.gif", pulled)) as video:
+        pictures = []
+        for frame in range(getattr(video, "n_frames", 1)):
+            video.seek(frame)
+            pictures.append(np.asarray(video.convert("RGB")))
+    assert len(pictures) == 3 and all(side % 2 == 0 for side in pictures[0].shape[:2])
+    below = [picture[-160:] for picture in pictures]
+    assert (below[0] != below[1]).any() and (below[1] != below[2]).any()  # the dot moves
 
 
 def test_a_video_of_opencv(tmp_path: Path) -> None:

@@ -1,12 +1,17 @@
 """Gripper paths: smooth, at rest at both ends, within their limits."""
 
+import inspect
+import math
+
 import jax.random as jr
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from r2s import trajectories
 from r2s.recording import corner
-from r2s.scenarios.experiments import ALL_CORNERS, SIX, hanging, on_table, varied
+from r2s.scenarios.experiments import ALL_CORNERS, SIX, hanging, on_table, varied, wind
 
 DURATION = 59 / 15  # [s]
 SIZE = (0.3, 0.2)  # [m]
@@ -85,3 +90,99 @@ def test_what_does_not_fit_is_refused():
         trajectories.lift(hanging(SIZE, 0.5), DURATION)
     with pytest.raises(ValueError, match="two grippers"):
         trajectories.fling(on_table(SIZE, ("origin",)), DURATION)
+
+
+NOT_POSITIVE = st.floats(max_value=0.0)
+NEGATIVE = st.floats(max_value=0.0, exclude_max=True)
+SHARE = st.one_of(NOT_POSITIVE, st.floats(min_value=1.0, exclude_min=True))
+WRONG: dict[str, dict[str, tuple[st.SearchStrategy[float], str]]] = {
+    "lifting": {
+        "height": (NEGATIVE, "m"),
+        "inward": (NEGATIVE, "m"),
+        "moving": (NOT_POSITIVE, "s"),
+    },
+    "wind": {"gap": (SHARE, "-"), "speed": (NEGATIVE, "m/s"), "height": (NOT_POSITIVE, "m")},
+    "stretching": {
+        "strain": (NEGATIVE, "-"),
+        "moving": (NOT_POSITIVE, "s"),
+        "height": (NEGATIVE, "m"),
+    },
+    "folding": {"reach": (SHARE, "-"), "height": (NEGATIVE, "-"), "moving": (NOT_POSITIVE, "s")},
+    "fling": {
+        "gap": (SHARE, "-"),
+        "forward": (NEGATIVE, "m"),
+        "there": (NOT_POSITIVE, "s"),
+        "back": (NOT_POSITIVE, "s"),
+        "wait": (NEGATIVE, "s"),
+    },
+    "shaking": {
+        "gap": (SHARE, "-"),
+        "amplitude": (NEGATIVE, "m"),
+        "frequency": (NOT_POSITIVE, "1/s"),
+        "fade": (NOT_POSITIVE, "s"),
+        "still": (NEGATIVE, "s"),
+    },
+}
+PATHS = {
+    "lifting": trajectories.lift,
+    "wind": trajectories.hold,
+    "stretching": trajectories.pull,
+    "folding": trajectories.fold,
+    "fling": trajectories.fling,
+    "shaking": trajectories.shake,
+}
+
+
+@pytest.mark.parametrize("name", SIX)
+def test_every_number_of_a_path_is_checked(name):
+    numbers = set(list(inspect.signature(PATHS[name]).parameters)[2:])
+    assert numbers <= WRONG[name].keys()
+
+
+@pytest.mark.parametrize(
+    ("name", "number"), [(name, number) for name in SIX for number in WRONG[name]]
+)
+@given(data=st.data())
+def test_numbers_that_make_no_sense_are_refused(name, number, data):
+    """With the number, its unit, and what was found."""
+    strategy, unit = WRONG[name][number]
+    value = data.draw(st.one_of(strategy, st.sampled_from([math.nan, math.inf, -math.inf])))
+    with pytest.raises(ValueError) as error:
+        SIX[name](**{number: value})
+    text = str(error.value)
+    assert text.startswith(f"{number} must") and f"[{unit}], found {value}" in text
+
+
+@pytest.mark.parametrize("name", SIX)
+@given(data=st.data())
+def test_any_numbers_within_the_limits_give_a_path_at_rest_at_both_ends(name, data):
+    limits = trajectories.LIMITS[name]
+    numbers = {key: data.draw(st.floats(*ends)) for key, ends in limits.items()}
+    times, path = SIX[name](**numbers).route
+    assert np.isfinite(path).all() and (np.diff(times) > 0).all()
+    velocity = np.diff(path, axis=0) / np.diff(times)[:, None, None]
+    assert np.abs(velocity[[0, -1]]).max() < 20 / 120
+
+
+@pytest.mark.parametrize(
+    ("name", "numbers", "words"),
+    [
+        ("lifting", {"moving": 4.0}, "moving is 4 s, but the path ends after 3.93333 s"),
+        ("folding", {"num_frames": 20}, "moving is 2.5 s, but the path ends after 1.26667 s"),
+        ("fling", {"wait": 3.0}, r"wait \+ there \+ back is 4.1 s"),
+        ("shaking", {"fade": 2.0}, r"2 fade \+ still is 4.5 s"),
+        ("shaking", {"frequency": 13.0}, "frequency must be at most 12 1/s, found 13.0"),
+        ("wind", {"aside": 120.0}, r"aside must be from -90 to 90 \[degrees\], found 120.0"),
+        ("lifting", {"num_frames": 1}, "num_frames must be at least 2, found 1"),
+        ("lifting", {"interval": 0.0}, r"interval must be positive \[s\], found 0.0"),
+    ],
+)
+def test_a_path_that_would_not_come_to_rest_is_refused(name, numbers, words):
+    with pytest.raises(ValueError, match=words):
+        SIX[name](**numbers)
+
+
+def test_numbers_beside_a_route_are_refused():
+    route = wind().route
+    with pytest.raises(ValueError, match="wind: a route is given, which gap would not change"):
+        wind(route=route, gap=0.9)

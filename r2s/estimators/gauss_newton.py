@@ -1,30 +1,36 @@
-"""Gauss-Newton on nearest-point distances, with forward sensitivities: r2s's default DIFFCLOUD.
+"""Gauss-Newton on nearest-point distances, with forward sensitivities: the default of r2s.
 
 The loss is that of DIFFCLOUD turned round (recording to simulated surface, so that a partial view
 does not pull on what it does not see), robust against outliers. The parameters are few, so the
 derivative of the whole motion with respect to all of them costs about as much as one gradient, and
 its normal equations give the step and the covariance at once.
+
+Several recordings of one fabric count by their frames: `Joint` is a tuple of problems, its unknown
+the fabric's place, what they share (`SHARED`), and what is each one's own (`OWN`).
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from r2s.estimators.base import Problem
-from r2s.losses import robust, robust_weight, surface_residuals
-from r2s.scenario import motion
-from r2s.solver import Trajectory
+from r2s.estimators import evidence
+from r2s.estimators.prediction import Unknown, predict, sensitivities
+from r2s.estimators.problem import OWN, SHARED, Problem
+
+Joint = tuple[Problem, ...]
 
 MARGIN = 1e-3  # of the unit cube, so that a start at its edge can move
 PRIOR_DEVIATION = 0.29  # of a uniform prior over the unit cube
+DAMPINGS, GROWTH = (1e-5, 1e6), 3.0
 LONGEST_STEP = 0.2  # of a parameter's range
-PATCHES = 3  # along a side of the sheet: points of one patch in one frame err alike
-SPAN = 1  # independent pieces of evidence in a frame, for the weight of the prior
+FINEST = 1e-5  # [m]: no recording is better
+CLUSTERS = 9  # independent pieces of evidence in a frame, at most
 
 
 class Normal(eqx.Module):
-    """The loss at an unknown, and its normal equations there, of the clouds alone.
+    """The loss at an unknown, and its normal equations there, without the prior.
 
     - `loss`: robust mean, [m^2]; infinite when the run diverged.
     - `spread`: robust standard deviation of the distances, [m].
@@ -43,142 +49,152 @@ class Normal(eqx.Module):
 class Descent(eqx.Module):
     """A Levenberg-Marquardt descent.
 
-    - `unknown`: a point of the family's unit cube, then the misalignment (x, y, z, turn) in units
-      of its standard deviations.
+    - `unknown`: see `r2s.estimators.prediction`.
     - `normal`: the normal equations there.
-    - `damping`: Levenberg's, [-].
+    - `damping`: Levenberg's, [-]; `growth`: its factor should the next step fail (Nielsen 1999).
+    - `scale`: beyond which distances do not count, [m]; 0: all do, see `r2s.losses.robust`.
     """
 
     unknown: Float[Array, "*start unknown"]
     normal: Normal
     damping: Float[Array, "*start"]
+    growth: Float[Array, "*start"]
+    scale: Float[Array, "*start"]
 
 
-def loss_at(problem: Problem, unknown: Float[Array, " unknown"]) -> Float[Array, ""]:
-    """The robust loss [m^2] at an unknown; infinite when the run diverged."""
-    place, shift = _split(problem, unknown)
-    moved = motion(problem.scenario, problem.family(place))
-    distance, *_ = _residuals(problem, _aligned(problem, moved.x, shift))
-    return _loss(problem, moved, distance)
+def size(problems: Joint) -> int:
+    """Of the unknown of some recordings of one fabric."""
+    return problems[0].family.dim + len(SHARED) + len(OWN) * len(problems)
 
 
-def normal_at(problem: Problem, unknown: Float[Array, " unknown"]) -> Normal:
-    """Loss, gradient and Gauss-Newton matrix at an unknown."""
-    place, shift = _split(problem, unknown)
-
-    def move(place):
-        moved = motion(problem.scenario, problem.family(place))
-        return _aligned(problem, moved.x, shift), moved
-
-    slope, moved = jax.jacfwd(move, has_aux=True)(place)  # (frame, vertex, axis, place)
-    x = _aligned(problem, moved.x, shift)
-    realign = lambda unknown: _aligned(problem, moved.x, _split(problem, unknown)[1])
-    turn = jax.jacfwd(realign)(unknown)[..., problem.family.dim :]
-    slope = jnp.concatenate([slope, turn], axis=-1)[jnp.array(problem.frames)]
-    distance, direction, vertices, weights = _residuals(problem, x)
-    picked = jax.vmap(lambda slope, vertices: slope[vertices])(slope, vertices)
-    jacobian = -jnp.einsum("fpi,fpk,fpkiu->fpu", direction, weights, picked)
-    weight = jnp.where(problem.mask, robust_weight(distance), 0) / jnp.sum(
-        problem.mask, dtype=float
-    )
-    score = (weight * distance)[..., None] * jacobian
-    seen = jnp.where(problem.mask, distance, jnp.nan)
-    return Normal(
-        loss=_loss(problem, moved, distance),
-        spread=1.4826 * jnp.nanmedian(seen),  # the deviation of a normal one with that median
-        gradient=jnp.sum(score, axis=(0, 1)),
-        matrix=jnp.einsum("fp,fpu,fpv->uv", weight, jacobian, jacobian),
-        scatter=_scatter(problem, score, vertices[..., 0]),
-    )
+def part_of(problems: Joint, which: int) -> np.ndarray:
+    """Where in the joint unknown that of one recording is."""
+    shared = problems[0].family.dim + len(SHARED)
+    first = shared + len(OWN) * which
+    return np.concatenate([np.arange(shared), np.arange(first, first + len(OWN))])
 
 
-def _scatter(problem: Problem, score: Float[Array, "frame point unknown"], vertex):
-    """Sum over clusters of the outer product of their scores; a cluster is a patch in a frame."""
-    rest = problem.scenario.scene.mesh.rest
-    size = jnp.max(rest, axis=0, keepdims=True) * (1 + 1e-3)
-    cell = jnp.floor(rest / size * PATCHES).astype(int)
-    patch = (cell[:, 0] * PATCHES + cell[:, 1])[vertex]
-    total = jax.vmap(lambda s, c: jax.ops.segment_sum(s, c, PATCHES**2))(score, patch)
-    return jnp.einsum("fcu,fcv->uv", total, total)
+def shares(problems: Joint) -> list[float]:
+    """Weights of the recordings: their frames among all."""
+    frames = [len(problem.frames) for problem in problems]
+    return [count / sum(frames) for count in frames]
 
 
-def _prior(problem: Problem, unknown):
+def loss_at(
+    problems: Joint,
+    unknown: Unknown,
+    loss: evidence.Loss | None = None,
+    scale: evidence.Scale = 0.0,
+) -> Float[Array, ""]:
+    """The robust loss [m^2] at an unknown, with the `scale` [m] of `r2s.losses.robust`.
+
+    Or another `loss`. Infinite when a run diverged.
+    """
+    total = jnp.zeros((), unknown.dtype)
+    for which, (problem, share) in enumerate(zip(problems, shares(problems), strict=True)):
+        seen = predict(problem, unknown[part_of(problems, which)])
+        value = evidence.loss_of(problem, seen, scale) if loss is None else loss(problem, seen)
+        total += share * jnp.where(seen.ok, value, jnp.inf)
+    return total
+
+
+def normal_at(
+    problems: Joint, unknown: Unknown, scale: evidence.Scale = 0.0, width: float | None = None
+) -> Normal:
+    """Loss, gradient and Gauss-Newton matrix at an unknown.
+
+    `scale` as of `r2s.losses.robust`, `width` as of `r2s.estimators.prediction.sensitivities`.
+    """
+    count = size(problems)
+    sums = evidence.Normals.zero(count, unknown.dtype)
+    spreads = []
+    for which, (problem, share) in enumerate(zip(problems, shares(problems), strict=True)):
+        index = part_of(problems, which)
+        seen, slope = sensitivities(problem, unknown[index], width)
+        found = evidence.normals_of(problem, seen, slope, scale)
+        loss = jnp.where(seen.ok, found.loss, jnp.inf)
+        sums = evidence.Normals(
+            sums.loss + share * loss,
+            sums.gradient.at[index].add(share * found.gradient),
+            sums.matrix.at[np.ix_(index, index)].add(share * found.matrix),
+            sums.scatter.at[np.ix_(index, index)].add(share**2 * found.scatter),
+            found.spread,
+        )
+        spreads.append(share * found.spread**2)
+    spread = jnp.sqrt(sum(spreads))
+    return Normal(sums.loss, spread, sums.gradient, sums.matrix, sums.scatter)
+
+
+def _prior(problems: Joint, unknown):
     """Difference from the expected unknown, and the inverse of its variance."""
-    dim = problem.family.dim
-    expected = jnp.concatenate([jnp.full(dim, 0.5, float), jnp.zeros(4, float)])
-    spread = jnp.concatenate([jnp.full(dim, PRIOR_DEVIATION, float), jnp.ones(4, float)])
+    dim, rest = problems[0].family.dim, size(problems) - problems[0].family.dim
+    expected = jnp.concatenate([jnp.full(dim, 0.5, float), jnp.zeros(rest, float)])
+    spread = jnp.concatenate([jnp.full(dim, PRIOR_DEVIATION, float), jnp.ones(rest, float)])
     return unknown - expected, 1 / spread**2
 
 
-def _split(problem: Problem, unknown):
-    """The point of the unit cube, and the misalignment in metres and radians."""
-    shift, turn = problem.misalignment
-    return unknown[: problem.family.dim], unknown[problem.family.dim :] * jnp.array(
-        [shift, shift, shift, turn]
-    )
+def prior_weight(problems: Joint, normal: Normal) -> Float[Array, ""]:
+    """Weight [m^2] of the prior at the best unknown: how much the loss scatters by chance.
 
-
-def _aligned(problem: Problem, x: Float[Array, "frame vertex 3"], shift: Float[Array, " 4"]):
-    """Positions [m] in the frame of the cameras: turned about the first handle, and shifted."""
-    pivot = x[:, problem.scenario.scene.held[:1]]
-    cosine, sine = jnp.cos(shift[3]), jnp.sin(shift[3])
-    turn = jnp.stack([jnp.stack([cosine, -sine]), jnp.stack([sine, cosine])])
-    offset = x - pivot
-    turned = jnp.concatenate([offset[..., :2] @ turn.T, offset[..., 2:]], axis=-1)
-    return pivot + turned + shift[None, None, :3]
-
-
-def _residuals(problem: Problem, x):
-    faces = problem.scenario.scene.mesh.faces
-    per_frame = jax.vmap(lambda points, mask, x: surface_residuals(points, mask, x, faces))
-    return per_frame(problem.points, problem.mask, x[jnp.array(problem.frames)])
-
-
-def _loss(problem: Problem, moved: Trajectory, distance) -> Float[Array, ""]:
-    loss = jnp.sum(robust(distance)) / jnp.sum(problem.mask, dtype=float)
-    return jnp.where(jnp.all(moved.ok), loss, jnp.inf)
-
-
-def prior_weight(problem: Problem, spread: Float[Array, ""]) -> Float[Array, ""]:
-    """Weight [m^2] of the prior, where the distances have this spread [m] at the best unknown.
-
-    What no fabric explains is an error that the clouds of a frame share, so it counts once a frame.
+    The likelihood is exp(-loss / weight) when the gradient scatters like weight times the matrix
+    (magnitude adjustment of a composite likelihood, Pauli, Racugno and Ventura 2011).
     """
-    return spread**2 / (SPAN * len(problem.frames))
+    _, precision = _prior(problems, jnp.zeros(size(problems), float))
+    frames = sum(len(problem.frames) for problem in problems)
+    least = jnp.maximum(normal.spread, FINEST) ** 2 / (frames * CLUSTERS)
+    inverse = jnp.linalg.inv(normal.matrix + least * jnp.diag(precision))
+    ratio = jnp.trace(inverse @ normal.scatter) / jnp.trace(inverse @ normal.matrix)
+    return jnp.maximum(ratio, jnp.finfo(ratio.dtype).tiny)
 
 
-def objective(problem: Problem, unknown, loss, prior) -> Float[Array, ""]:
+def objective(problems: Joint, unknown, loss, prior) -> Float[Array, ""]:
     """Loss and prior [m^2] at an unknown."""
-    pull, precision = _prior(problem, unknown)
+    pull, precision = _prior(problems, unknown)
     return loss + prior * jnp.sum(pull**2 * precision) / 2
 
 
-def covariance(problem: Problem, descent: Descent, prior) -> Float[Array, "unknown unknown"]:
+def covariance(problems: Joint, descent: Descent, prior) -> Float[Array, "unknown unknown"]:
     """Of the unknown, at the end of one descent: the clustered sandwich, with the prior.
 
     To it comes the square of the Gauss-Newton step that would be next, so that a descent which has
     not arrived does not claim to know.
     """
-    pull, precision = _prior(problem, descent.unknown)
+    pull, precision = _prior(problems, descent.unknown)
     inverse = jnp.linalg.inv(descent.normal.matrix + prior * jnp.diag(precision))
     step = inverse @ (descent.normal.gradient + prior * precision * pull)
     spread = descent.normal.scatter + prior**2 * jnp.diag(precision)
     return inverse @ spread @ inverse + jnp.outer(step, step)
 
 
-def propose(problem: Problem, descent: Descent, prior) -> Float[Array, " unknown"]:
+def remaining(problems: Joint, descent: Descent, prior) -> Float[Array, ""]:
+    """What the next Gauss-Newton step promises to gain [m^2], of the unknowns not at a bound."""
+    gradient, matrix, stuck = _equations(problems, descent, prior)
+    pinned = jnp.where(stuck[:, None] | stuck[None], jnp.diag(jnp.diag(matrix)), matrix)
+    gradient = jnp.where(stuck, 0, gradient)
+    return gradient @ jnp.linalg.solve(pinned, gradient) / 2
+
+
+def _equations(problems: Joint, descent: Descent, prior):
+    """Gradient and matrix with the prior, and which unknowns would leave the unit cube."""
+    unknown = descent.unknown
+    pull, precision = _prior(problems, unknown)
+    gradient = descent.normal.gradient + prior * precision * pull
+    matrix = descent.normal.matrix + prior * jnp.diag(precision)
+    bounded = jnp.arange(unknown.shape[0]) < problems[0].family.dim
+    stuck = bounded & (unknown <= MARGIN) & (gradient > 0)
+    stuck |= bounded & (unknown >= 1 - MARGIN) & (gradient < 0)
+    return gradient, matrix, stuck
+
+
+def propose(problems: Joint, descent: Descent, prior) -> Unknown:
     """The next unknown to try: a damped Gauss-Newton step, within the unit cube.
 
     What runs into a bound stays there, and the other unknowns take the step alone.
     """
     unknown = descent.unknown
-    pull, precision = _prior(problem, unknown)
-    gradient = descent.normal.gradient + prior * precision * pull
-    matrix = descent.normal.matrix + prior * jnp.diag(precision)
-    bounded = jnp.arange(unknown.shape[0]) < problem.family.dim
+    bounded = jnp.arange(unknown.shape[0]) < problems[0].family.dim
+    gradient, matrix, stuck = _equations(problems, descent, prior)
     damped = matrix + descent.damping * jnp.diag(jnp.diag(matrix))
-    stuck = bounded & (unknown <= MARGIN) & (gradient > 0)
-    stuck |= bounded & (unknown >= 1 - MARGIN) & (gradient < 0)
     pinned = jnp.where(stuck[:, None] | stuck[None], jnp.diag(jnp.diag(damped)), damped)
     change = -jnp.linalg.solve(pinned, jnp.where(stuck, 0, gradient))
     longest = jnp.max(jnp.where(bounded, jnp.abs(change), 0))
@@ -187,17 +203,17 @@ def propose(problem: Problem, descent: Descent, prior) -> Float[Array, " unknown
     return jnp.where(bounded, inside, unknown + change)
 
 
-def accept(
-    problem: Problem, descent: Descent, trial: Float[Array, " unknown"], tried: Normal, prior
-) -> Descent:
+def accept(problems: Joint, descent: Descent, trial: Unknown, tried: Normal, prior) -> Descent:
     """The descent after a trial: moved if that lowers the objective, else damped more."""
-    new = objective(problem, trial, tried.loss, prior)
-    old = objective(problem, descent.unknown, descent.normal.loss, prior)
+    new = objective(problems, trial, tried.loss, prior)
+    old = objective(problems, descent.unknown, descent.normal.loss, prior)
     better = new < old
     take = lambda new, old: jnp.where(better, new, old)
-    damping = jnp.where(better, descent.damping / 5, descent.damping * 5)
+    damping = jnp.where(better, descent.damping / 4, descent.damping * descent.growth)
     return Descent(
         take(trial, descent.unknown),
         jax.tree.map(take, tried, descent.normal),
-        jnp.clip(damping, 1e-6, 1e6),
+        jnp.clip(damping, *DAMPINGS),
+        jnp.where(better, GROWTH, 2 * descent.growth),
+        descent.scale,
     )

@@ -104,7 +104,9 @@ def _read_png(path: Path) -> np.ndarray:
     cv2 = opencv()
     data = path.read_bytes()
     if not data.startswith(PNG_START):
-        raise ValueError(f"{path}: no PNG: found the bytes {data[:8]!r}")
+        raise ValueError(
+            f"{path}: no PNG: found the bytes {data[:8]!r}: export it as PNG, depth also as NPY"
+        )
     # by hand, since the decoder says nothing, or takes a part for the whole
     if PNG_END not in data[-64:]:
         raise ValueError(f"{path}: truncated PNG of {len(data)} bytes: copy or export it again")

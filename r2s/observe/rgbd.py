@@ -20,7 +20,7 @@ The fields are those of `Rig`, `Cleaning` and `DepthCamera`.
 import dataclasses
 import itertools
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -73,7 +73,10 @@ def read_rig(folder: Path | str) -> Rig:
     """
     path = find_rig(folder)
     if path is None:
-        raise FileNotFoundError(f"{folder}: no {NAME} there or in the folder above")
+        raise FileNotFoundError(
+            f"{folder}: no {NAME} there or in the folder above: write one with intrinsics, poses "
+            "and depth_scale of the cameras"
+        )
     return read_json(path, Rig)
 
 
@@ -108,10 +111,16 @@ def rgbd_recording(
 
 
 def read_clouds(
-    folder: Path | str, rig: Rig, frame_rate: float = 0.0
+    folder: Path | str,
+    rig: Rig,
+    frame_rate: float = 0.0,
+    watch: Callable[[Iterable[Any]], Iterable[Any]] = iter,
 ) -> tuple[Float[np.ndarray, " frame"], list[Float[np.ndarray, "point 3"]]]:
-    """Times [s] on the cameras' clock, and the cleaned clouds [m]; raises as `stream`."""
-    frames = list(stream(folder, rig, frame_rate))
+    """Times [s] on the cameras' clock, and the cleaned clouds [m]; raises as `stream`.
+
+    Frames come through `watch`, such as a bar that shows progress.
+    """
+    frames = list(watch(stream(folder, rig, frame_rate)))
     return np.array([time for time, _ in frames]), [cloud for _, cloud in frames]
 
 

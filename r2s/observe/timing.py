@@ -16,7 +16,11 @@ def read_times(path: Path) -> Float[np.ndarray, " frame"]:
     Raises FileNotFoundError, or ValueError that names the file and the line: no number, times that
     do not increase, or intervals that seconds cannot have.
     """
-    lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: no text in UTF-8 ({error.reason}): export it again") from error
+    lines = [line.strip() for line in text.splitlines()]
     rows = [(number, line) for number, line in enumerate(lines, 1) if line]
     if rows and re.match(r"[A-Za-z]", rows[0][1].split(",")[-1].strip()):
         rows = rows[1:]
@@ -78,5 +82,7 @@ def _number(path: Path, number: int, line: str) -> float:
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        raise ValueError(f"{path}: line {number}: expected a time [s] last, found {line!r}")
+        raise ValueError(
+            f"{path}: line {number}: expected a time [s] last, found {line!r}: write a number"
+        )
     return value

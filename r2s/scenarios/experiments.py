@@ -75,9 +75,8 @@ def lifting(
 
     `path`: see `trajectories.lift`. The left corner is the "origin" or the "weft".
     """
-    sheet, times = on_table(size, (held,)), _frames(num_frames, interval)
-    route = trajectories.lift(sheet, times[-1], **path) if route is None else route
-    return Experiment("lifting", sheet, route, times, (num_frames // 2, num_frames - 1))
+    done = _moved("lifting", on_table(size, (held,)), route, num_frames, interval, path)
+    return done._replace(frames_used=(num_frames // 2, num_frames - 1))
 
 
 def folding(
@@ -93,9 +92,7 @@ def folding(
 
     `path`: see `trajectories.fold`.
     """
-    sheet, times = on_table(size, (held,)), _frames(num_frames, interval)
-    route = trajectories.fold(sheet, times[-1], **path) if route is None else route
-    return Experiment("folding", sheet, route, times, (0, num_frames - 1))
+    return _moved("folding", on_table(size, (held,)), route, num_frames, interval, path)
 
 
 def stretching(
@@ -113,9 +110,8 @@ def stretching(
     the air instead, until it is pulled taut. A `route` is that of the corners (origin, weft, warp,
     opposite). `path`: see `trajectories.pull`.
     """
-    sheet, times = on_table(size, ALL_CORNERS, height), _frames(num_frames, interval)
-    route = trajectories.pull(sheet, times[-1], **path) if route is None else route
-    return Experiment("stretching", sheet, route, times, (0, num_frames - 1), clamps=CLAMPS)
+    sheet = on_table(size, ALL_CORNERS, height)
+    return _moved("stretching", sheet, route, num_frames, interval, path)._replace(clamps=CLAMPS)
 
 
 def wind(
@@ -133,11 +129,13 @@ def wind(
 
     `aside` [degrees] is how far the wind turns from straight on. `path`: see `trajectories.hold`.
     """
-    sheet, times = hanging(size, height), _frames(num_frames, interval)
-    route = trajectories.hold(sheet, times[-1], **path) if route is None else route
+    trajectories.not_negative("m/s", speed=speed)
+    if not abs(aside) <= 90:
+        raise ValueError(f"aside must be from -90 to 90 [degrees], found {aside}")
     angle = np.radians(aside)
     blows = (float(speed * np.sin(angle)), float(speed * np.cos(angle)), 0.0)
-    return Experiment("wind", sheet, route, times, (0, num_frames - 1), wind=blows)
+    done = _moved("wind", hanging(size, height), route, num_frames, interval, path)
+    return done._replace(wind=blows)
 
 
 def fling(
@@ -153,9 +151,7 @@ def fling(
 
     `path`: see `trajectories.fling`.
     """
-    sheet, times = hanging(size, height), _frames(num_frames, interval)
-    route = trajectories.fling(sheet, times[-1], **path) if route is None else route
-    return Experiment("fling", sheet, route, times, (0, num_frames - 1))
+    return _moved("fling", hanging(size, height), route, num_frames, interval, path)
 
 
 def shaking(
@@ -171,9 +167,7 @@ def shaking(
 
     `path`: see `trajectories.shake`.
     """
-    sheet, times = hanging(size, height), _frames(num_frames, interval)
-    route = trajectories.shake(sheet, times[-1], **path) if route is None else route
-    return Experiment("shaking", sheet, route, times, (0, num_frames - 1))
+    return _moved("shaking", hanging(size, height), route, num_frames, interval, path)
 
 
 SIX: dict[str, Callable[..., Experiment]] = {
@@ -199,14 +193,41 @@ def varied(
 
 def on_table(size: Size, held: tuple[str, ...], height: float = CLEARANCE) -> SheetPlacement:
     """A sheet of `size` [m], horizontal at a `height` [m], warp along x and weft along y."""
+    trajectories.not_negative("m", height=height)
     return SheetPlacement(size, (0.0, 0.0, height), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), held)
 
 
 def hanging(size: Size, height: float) -> SheetPlacement:
     """A sheet of `size` [m], vertical, held by the ends of its warp at a `height` [m], along x."""
+    trajectories.positive("m", height=height)
     held = ("origin", "warp")
     return SheetPlacement(size, (0.0, 0.0, height), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), held)
 
 
-def _frames(num_frames: int, interval: float) -> Float[np.ndarray, " frame"]:
-    return np.arange(num_frames) * interval
+_PATHS: dict[str, Callable[..., Route]] = {
+    "lifting": trajectories.lift,
+    "wind": trajectories.hold,
+    "stretching": trajectories.pull,
+    "folding": trajectories.fold,
+    "fling": trajectories.fling,
+    "shaking": trajectories.shake,
+}
+
+
+def _moved(
+    name: str,
+    sheet: SheetPlacement,
+    route: Route | None,
+    num_frames: int,
+    interval: float,
+    path: dict[str, float],
+) -> Experiment:
+    """An experiment all of whose frames count: on a `route`, or on the path of these numbers."""
+    if num_frames < 2:
+        raise ValueError(f"num_frames must be at least 2, found {num_frames}")
+    trajectories.positive("s", interval=interval)
+    if route is not None and path:
+        raise ValueError(f"{name}: a route is given, which {', '.join(path)} would not change")
+    times = np.arange(num_frames) * interval
+    route = _PATHS[name](sheet, times[-1], **path) if route is None else route
+    return Experiment(name, sheet, route, times, (0, num_frames - 1))

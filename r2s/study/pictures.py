@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from r2s.estimators import gauss_newton
+from r2s.estimators.problem import OWN, SHARED
 from r2s.family import OrthotropicFamily
 from r2s.files import write_text
 from r2s.recording import Recording, cloud
@@ -90,15 +91,17 @@ def line_picture(out: Path, judged: Judged) -> tuple[Path, str] | None:
         return None
     losses_of = eqx.filter_jit(
         lambda problem, unknowns: jax.lax.map(
-            lambda unknown: gauss_newton.loss_at(problem, unknown), unknowns
+            lambda unknown: gauss_newton.loss_at((problem,), unknown), unknowns
         )
     )
     centre = np.asarray(family.locate(estimate.fabric))
-    shift = estimate.misalignment / np.repeat(problem.misalignment, (3, 1))
+    found = {c.name: c.value for c in estimate.conditions}
+    names = zip((*SHARED, *OWN), problem.doubt.scales, strict=True)
+    rest = np.array([found[name] / scale if scale else 0.0 for name, scale in names])
     places = np.linspace(0.02, 0.98, LINE_POINTS)
     lines = []
     for index, bound in enumerate(family.ranges):
-        unknowns = np.tile(np.concatenate([centre, shift]), (LINE_POINTS, 1))
+        unknowns = np.tile(np.concatenate([centre, rest]), (LINE_POINTS, 1))
         unknowns[:, index] = places
         losses = np.asarray(losses_of(problem, jnp.asarray(unknowns, float)))
         lines.append((bound, np.asarray(bound.value(jnp.asarray(places, float))), losses))

@@ -11,7 +11,9 @@ import numpy as np
 from tqdm import tqdm
 
 from r2s.estimators import diffcloud
-from r2s.estimators.base import Estimate, Problem, as_json, from_json
+from r2s.estimators.descent import Effort as Cost
+from r2s.estimators.estimate import FORMAT, Estimate, as_json, from_json
+from r2s.estimators.problem import Problem
 from r2s.family import OrthotropicFamily
 from r2s.files import write_json
 from r2s.study import judge
@@ -94,16 +96,14 @@ def _approach(effort: Effort) -> Callable[[Pair], Estimate]:
         raise ValueError(f"recipe is 'default' or 'original', got {effort.recipe!r}")
     return lambda pair: diffcloud.estimate(
         problem_of(pair),
-        num_coarse=effort.num_coarse,
-        num_starts=effort.num_starts,
-        num_iterations=effort.num_iterations,
+        Cost(effort.num_coarse, effort.num_starts, effort.num_iterations),
         key=jax.random.key(effort.seed),
     )
 
 
 def _key(pair: Pair, effort: Effort) -> str:
     """A hash of what an estimate depends on: the recording's arrays and the effort."""
-    digest = sha256(repr((effort, pair.density, pair.lift.info)).encode())
+    digest = sha256(repr((FORMAT, effort, pair.density, pair.lift.info)).encode())
     for leaf in jax.tree.leaves(pair.lift):
         digest.update(np.ascontiguousarray(leaf).tobytes())
     return digest.hexdigest()

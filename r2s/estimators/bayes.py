@@ -1,0 +1,178 @@
+"""Bayesian optimisation by ask and tell, of any objective over a unit cube.
+
+Gaussian processes of scikit-optimize. It knows nothing of fabrics: the objective is any function
+that gives a loss for each of a batch of places.
+"""
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from r2s.files import write_bytes
+
+FORMAT = "r2s-search/1"
+Objective = Callable[[Float[np.ndarray, "place dim"]], Float[np.ndarray, " place"]]
+UNKNOWN_PENALTY = 1.0  # while no loss is finite
+
+
+@dataclass(frozen=True)
+class History:
+    """What was tried, in order.
+
+    - `places`: in the unit cube. - `losses`: as the objective gave them, NaN where it failed.
+    """
+
+    places: Float[np.ndarray, "call dim"]
+    losses: Float[np.ndarray, " call"]
+
+    @property
+    def failed(self) -> Bool[np.ndarray, " call"]:
+        """Which calls diverged: their loss is not finite."""
+        return ~np.isfinite(self.losses)
+
+    @property
+    def penalised(self) -> Float[np.ndarray, " call"]:
+        """The losses that the optimiser is told: the worst finite one so far where a call failed.
+
+        A fixed penalty far above the losses would be all that the Gaussian process sees.
+        """
+        finite = self.losses[~self.failed]
+        worst = finite.max() if len(finite) else UNKNOWN_PENALTY
+        return np.where(self.failed, worst, self.losses)
+
+    @property
+    def best(self) -> int:
+        """Which call had the least loss. Raises `RuntimeError` when all failed."""
+        if self.failed.all():
+            raise RuntimeError(
+                f"all {len(self.losses)} calls of the objective failed: check the units of the "
+                "recording and its gripper path, or narrow the ranges"
+            )
+        return int(np.nanargmin(np.where(self.failed, np.nan, self.losses)))
+
+
+def begin(dim: int) -> History:
+    """Nothing tried yet, in `dim` dimensions."""
+    return History(np.zeros((0, dim)), np.zeros(0))
+
+
+def ask(
+    history: History, number: int, *, num_first: int = 16, seed: int = 0
+) -> Float[np.ndarray, "place dim"]:
+    """The next `number` places to try.
+
+    The first `num_first` fill the cube evenly (Sobol's sequence); later ones have the greatest
+    expected improvement, each with those before it in the batch pretended to have given the best
+    loss so far (Ginsbourger, Le Riche and Carraro 2010: "constant liar"). They follow from history
+    and seed alone, so a search that goes on from a file asks the same as one that never stopped.
+    """
+    done, dim = history.places.shape
+    if done < num_first:
+        from scipy.stats import qmc
+
+        filled = qmc.Sobol(dim, rng=np.random.default_rng(seed)).random(_power_of_two(num_first))
+        return filled[done : min(done + number, num_first)]
+    optimiser = _optimizer()(
+        [(0.0, 1.0)] * dim,
+        base_estimator="GP",
+        n_initial_points=0,
+        acq_func="EI",
+        random_state=np.random.RandomState([seed, done]),
+    )
+    optimiser.tell(history.places.tolist(), history.penalised.tolist())
+    asked = optimiser.ask(number, strategy="cl_min") if number > 1 else [optimiser.ask()]
+    return np.array(asked, float)
+
+
+def tell(history: History, places: Any, losses: Any) -> History:
+    """The history with the losses of some places; raises `ValueError` when their numbers differ."""
+    places, losses = np.asarray(places, float), np.asarray(losses, float)
+    if losses.shape != (len(places),):
+        raise ValueError(
+            f"expected one loss for each of {len(places)} places, found the shape {losses.shape}"
+        )
+    losses = np.where(np.isfinite(losses), losses, np.nan)
+    return History(
+        np.concatenate([history.places, places]), np.concatenate([history.losses, losses])
+    )
+
+
+def minimise(
+    objective: Objective,
+    dim: int,
+    *,
+    num_calls: int = 80,
+    batch: int = 4,
+    num_first: int = 16,
+    seed: int = 0,
+    path: Path | str | None = None,
+    progress: Callable[[History], None] | None = None,
+) -> History:
+    """Ask, evaluate and tell until there were `num_calls`; saved to `path` after every batch.
+
+    Goes on from `path` when it is there. Raises `ValueError` when that is of another search.
+    """
+    about = {"dim": dim, "batch": batch, "num_first": num_first, "seed": seed}
+    history = begin(dim)
+    if path is not None and Path(path).exists():
+        history = load(path, about)
+    while len(history.losses) < num_calls:
+        number = min(batch, num_calls - len(history.losses))
+        places = ask(history, number, num_first=num_first, seed=seed)
+        history = tell(history, places, objective(places))
+        if path is not None:
+            save(history, path, about)
+        if progress is not None:
+            progress(history)
+    return history
+
+
+def random_search(objective: Objective, dim: int, *, num_calls: int, batch: int, seed: int):
+    """The same number of calls at random places: what an optimiser is to beat."""
+    generator = np.random.default_rng(seed)
+    history = begin(dim)
+    while len(history.losses) < num_calls:
+        places = generator.random((min(batch, num_calls - len(history.losses)), dim))
+        history = tell(history, places, objective(places))
+    return history
+
+
+def save(history: History, path: Path | str, about: dict[str, int]) -> None:
+    """Write a history and the settings of its search, whole or not at all."""
+    buffer = io.BytesIO()
+    arrays: dict[str, Any] = {"places": history.places, "losses": history.losses, **about}
+    np.savez(buffer, format=FORMAT, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
+def load(path: Path | str, about: dict[str, int]) -> History:
+    """Read what `save` wrote; `ValueError` that names the file when it is damaged or of others."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            stored = {name: file[name] for name in file.files}
+        found = {name: int(stored[name]) for name in about}
+        history = History(stored["places"], stored["losses"])
+    except Exception as error:  # a damaged file raises anything
+        raise ValueError(f"{path}: no history of a search: {error}") from error
+    if found != about:
+        raise ValueError(f"{path}: is of a search with {found}, asked for {about}: choose another")
+    return history
+
+
+def _power_of_two(number: int) -> int:
+    return 1 << max(number - 1, 0).bit_length()
+
+
+def _optimizer() -> Any:
+    try:
+        from skopt import Optimizer
+    except ImportError as error:
+        raise ImportError(
+            "Bayesian optimisation needs scikit-optimize: pip install 'r2s[physnet]'"
+        ) from error
+    return Optimizer

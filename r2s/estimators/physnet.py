@@ -1,0 +1,146 @@
+"""PhysNet: a fabric from depth images, by Bayesian optimisation on the physics similarity map.
+
+After Duan et al. 2022. The loss is the distance, frame by frame, between where a trained network
+puts the recorded and the simulated images. Both pass the same preprocessing, and the simulation
+follows the recorded gripper.
+"""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from r2s.estimators import bayes
+from r2s.estimators.bayes import History, Objective
+from r2s.estimators.estimate import Estimate, without_deviations
+from r2s.family import Family
+from r2s.physnet.network import PhysNet
+from r2s.physnet.preprocess import grey
+from r2s.physnet.training import Training
+from r2s.physnet.views import View, depths_of_sheet, per_face
+from r2s.scenario import Scenario, motion
+from r2s.solver import Solver
+
+Images = Float[np.ndarray, "frame down across"]
+
+
+class Sighting(eqx.Module):
+    """A recorded motion on the map, and how to simulate it.
+
+    - `scenario`, `frames`: which of its frames were seen. - `points`: where those images lie.
+    - `family`: the fabrics to choose from. - `solver`: None for the cloth.
+    """
+
+    scenario: Scenario
+    points: Float[Array, "frame dim"]
+    family: Family
+    network: PhysNet
+    solver: Solver | None
+    frames: tuple[int, ...] = eqx.field(static=True)
+    view: View = eqx.field(static=True)
+    per_face: int = eqx.field(static=True)
+
+    @classmethod
+    def make(
+        cls,
+        scenario: Scenario,
+        images: Images,
+        frames: tuple[int, ...],
+        family: Family,
+        training: Training,
+        solver: Solver | None = None,
+    ) -> "Sighting":
+        """From images of `r2s.physnet.preprocess` at some frames of a scenario.
+
+        Raises `ValueError` when images and frames differ in number, or a frame is not simulated.
+        """
+        if len(images) != len(frames) or not all(0 <= f < scenario.num_frames for f in frames):
+            raise ValueError(
+                f"{len(images)} images at frames {frames}, of {scenario.num_frames} simulated: "
+                "expected one image for each frame"
+            )
+        points = embedded(training.network, jnp.asarray(images, float))
+        rest = np.asarray(scenario.scene.mesh.rest)
+        along = tuple(len(np.unique(rest[:, axis].round(6))) for axis in (0, 1))
+        width, height = (float(side) for side in np.ptp(rest, axis=0))
+        fine = per_face(training.view, (along[0], along[1]), (width, height))
+        about = frames, training.view, fine
+        return cls(scenario, points, family, training.network, solver, *about)
+
+
+@eqx.filter_jit
+def embedded(
+    network: PhysNet, images: Float[Array, "image down across"]
+) -> Float[Array, "image dim"]:
+    """Where images lie on the map."""
+    return jax.vmap(network)(images)
+
+
+@eqx.filter_jit
+def distances(sighting: Sighting, places: Float[Array, "place dim"]) -> Float[Array, " place"]:
+    """The rms distance [-] on the map between the recorded frames and those of each fabric.
+
+    NaN where the simulation diverges.
+    """
+
+    def of_place(place):
+        fabric = sighting.family(place)
+        found = motion(sighting.scenario, fabric, solver=sighting.solver)
+        x = found.x[jnp.array(sighting.frames)]
+        faces = sighting.scenario.scene.mesh.faces
+        depth = depths_of_sheet(sighting.view, x, faces, sighting.per_face)
+        images = jax.vmap(lambda image: grey(sighting.view, image))(depth)
+        squares = jnp.sum((jax.vmap(sighting.network)(images) - sighting.points) ** 2, axis=1)
+        whole = jnp.all(found.ok) & jnp.all(jnp.isfinite(x))
+        return jnp.where(whole, jnp.sqrt(jnp.mean(squares)), jnp.nan)
+
+    return jax.vmap(of_place)(places)
+
+
+def objective(sighting: Sighting, batch: int) -> Objective:
+    """The loss of places as `r2s.estimators.bayes` asks for them, simulated `batch` together."""
+
+    def losses(places):
+        padded = np.full((batch, places.shape[1]), 0.5)  # so that it compiles once
+        padded[: len(places)] = places
+        return np.asarray(distances(sighting, jnp.asarray(padded, float)))[: len(places)]
+
+    return losses
+
+
+def estimate(
+    sighting: Sighting,
+    *,
+    num_calls: int = 80,
+    batch: int = 4,
+    seed: int = 0,
+    path: Path | str | None = None,
+    progress: Callable[[History], None] | None = None,
+) -> Estimate:
+    """The fabric of the least distance on the map among `num_calls` simulations.
+
+    Goes on from the history in `path`. The losses are distances on the map, without unit. Gives no
+    deviations: repeat with other seeds. Raises `RuntimeError` when all simulations diverge.
+    """
+    began = time.perf_counter()
+    family = sighting.family
+    about = {"num_calls": num_calls, "batch": batch, "seed": seed}
+    history = bayes.minimise(
+        objective(sighting, batch), family.dim, **about, path=path, progress=progress
+    )
+    place = jnp.asarray(history.places[history.best], float)
+    values = np.asarray(jax.vmap(family.values)(jnp.asarray(history.places, float)))
+    return without_deviations(
+        f"physnet (Bayesian optimisation, {num_calls} simulations)",
+        family,
+        place,
+        float(history.losses[history.best]),
+        history.losses[:, None],
+        values[:, None],
+        time.perf_counter() - began,
+    )

@@ -1,0 +1,158 @@
+"""From depth to the grey image that the network sees, for real and simulated depth alike."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from r2s.observe.calibration import DepthCamera
+from r2s.observe.depth import back_project, moved
+from r2s.physnet.views import LAYER, View, depth_of
+from r2s.recording import Recording
+
+ALIKE = 2  # neighbours within `views.LAYER` of a pixel, with fewer of which it is a stray
+AROUND = 5  # of 8 neighbours with depth, from which a hole is filled
+PASSES = 2  # of filling: holes of up to about 4 pixels across
+DARKEST = 0.2  # what is as far as the view goes; nothing at all is 0
+LEAST = 20  # pixels with depth, in an image of 64 x 64; else there is nothing to recognise
+
+
+class Flaws(NamedTuple):
+    """What training images suffer.
+
+    - `noise`: standard deviation of depth at 1 m, growing with its square, [m].
+    - `holes`: the greatest share of pixels without depth; in each image it is drawn from 0 on.
+    - `strays`: share of pixels with any depth.
+    """
+
+    noise: float = 1.5e-3
+    holes: float = 0.3
+    strays: float = 0.003
+
+
+def grey(view: View, depth: Float[Array, "down across"]) -> Float[Array, "down across"]:
+    """The image of a depth image [m] in a view: near white (1), far grey, none 0.
+
+    Strays are dropped, and then holes filled.
+    """
+    depth = filled(without_strays(depth))
+    shade = (view.far - depth) / (view.far - view.near)
+    return jnp.where(depth > 0, DARKEST + (1 - DARKEST) * jnp.clip(shade, 0, 1), 0)
+
+
+def without_strays(depth: Float[Array, "down across"]) -> Float[Array, "down across"]:
+    """Depth [m] without the pixels with fewer than `ALIKE` neighbours at about their depth."""
+    near = lambda other: ((other > 0) & (jnp.abs(other - depth) < LAYER)).astype(depth.dtype)
+    return jnp.where(sum(near(other) for other in _around(depth)) >= ALIKE, depth, 0)
+
+
+def filled(depth: Float[Array, "down across"]) -> Float[Array, "down across"]:
+    """Depth [m] with the mean of its neighbours in pixels that have none but are surrounded."""
+    for _ in range(PASSES):
+        there = depth > 0
+        number = sum((other > 0).astype(depth.dtype) for other in _around(depth))
+        mean = sum(_around(depth)) / jnp.maximum(number, 1)
+        depth = jnp.where(there | (number < AROUND), depth, mean)
+    return depth
+
+
+def _around(values: Float[Array, "down across"]) -> list[Float[Array, "down across"]]:
+    """The 8 neighbours of every pixel; outside of the image 0."""
+    padded, (rows, columns) = jnp.pad(values, 1), values.shape
+    shifts = [(i, j) for i in range(3) for j in range(3) if (i, j) != (1, 1)]
+    return [padded[i : i + rows, j : j + columns] for i, j in shifts]
+
+
+def flawed(
+    depth: Float[Array, "down across"], view: View, flaws: Flaws, key: Array
+) -> Float[Array, "down across"]:
+    """Depth [m] as cameras and clouds give it: with noise, holes and strays."""
+    key_noise, key_share, key_holes, key_stray, key_where = jax.random.split(key, 5)
+    noise, holes, strays = flaws
+    error = noise * depth**2 * jax.random.normal(key_noise, depth.shape, depth.dtype)
+    share = holes * jax.random.uniform(key_share, (), depth.dtype)
+    kept = jax.random.uniform(key_holes, depth.shape, depth.dtype) >= share
+    depth = jnp.where(kept & (depth > 0), depth + error, 0)
+    is_stray = jax.random.uniform(key_stray, depth.shape, depth.dtype) < strays
+    where = jax.random.uniform(key_where, depth.shape, depth.dtype, view.near, view.far)
+    return jnp.where(is_stray, where, depth)
+
+
+def of_clouds(view: View, recording: Recording, frames: tuple[int, ...]) -> np.ndarray:
+    """Images (frame, down, across) of a recording's clouds at some frames, checked."""
+    see = jax.jit(jax.vmap(lambda points, mask: depth_of(view, points, mask)))
+    chosen = np.array(frames)
+    depth = see(recording.points[chosen], recording.mask[chosen])
+    return of_depths(view, np.asarray(depth), recording.info.name, frames)
+
+
+def of_camera(
+    view: View,
+    camera: DepthCamera,
+    depths: Float[np.ndarray, "frame down across"],
+    masks: Bool[np.ndarray, "frame down across"],
+    name: str = "depth images",
+) -> np.ndarray:
+    """Images in a view of what a calibrated camera measured [m] where the masks are, checked.
+
+    The camera may have another resolution, lens and pose than the view: its pixels become points.
+    """
+    across, down = camera.resolution
+    if depths.shape[1:] != (down, across) or masks.shape != depths.shape:
+        raise ValueError(
+            f"{name}: expected depths and masks of {down} x {across} pixels (down, across), found "
+            f"{depths.shape[1:]} and {masks.shape[1:]}: use the resolution of the calibration"
+        )
+    see = jax.jit(lambda points, mask: depth_of(view, points, mask))
+    images = []
+    for depth, mask in zip(depths, masks, strict=True):
+        everywhere = np.ones(depth.shape, bool)  # all pixels, so that it compiles once
+        points = moved(np.array(camera.to_world), back_project(camera, depth, everywhere))
+        found = np.isfinite(depth) & (depth > 0) & mask
+        points = np.where(found.reshape(-1, 1), points, 0)
+        images.append(np.asarray(see(jnp.asarray(points, float), jnp.asarray(found.ravel()))))
+    _check_unit(depths, masks, name)
+    return of_depths(view, np.stack(images), name, tuple(range(len(images))))
+
+
+def of_depths(
+    view: View,
+    depths: Float[np.ndarray, "frame down across"],
+    name: str = "depth images",
+    frames: tuple[int, ...] = (),
+) -> np.ndarray:
+    """Images of depths [m] in the view's own pixels.
+
+    Raises `ValueError` that names the frame: another size, not finite, no depth, or depths that are
+    not in metres or not where the view looks.
+    """
+    if depths.ndim != 3 or depths.shape[1:] != (view.size, view.size):
+        raise ValueError(
+            f"{name}: expected images of {view.size} x {view.size} pixels, found {depths.shape}"
+        )
+    least = LEAST * view.size**2 / 64**2
+    for number, depth in enumerate(depths):
+        at = f"{name}, frame {frames[number] if frames else number}"
+        seen = depth > 0
+        if not np.isfinite(depth).all():
+            raise ValueError(f"{at}: {(~np.isfinite(depth)).sum()} depths are not finite")
+        if seen.sum() < least:
+            raise ValueError(
+                f"{at}: {seen.sum()} pixels have a depth, expected at least {least:.0f}: the frame "
+                f"is empty, the view looks elsewhere, or the units are not metres"
+            )
+        middle = float(np.median(depth[seen]))
+        if not view.near / 2 <= middle <= 2 * view.far:
+            raise ValueError(
+                f"{at}: the median depth is {middle:g} m, the view expects {view.near:g} to "
+                f"{view.far:g} m: give depths in metres, from the view's camera"
+            )
+    return np.asarray(jax.jit(jax.vmap(lambda d: grey(view, d)))(jnp.asarray(depths, float)))
+
+
+def _check_unit(depths: np.ndarray, masks: np.ndarray, name: str) -> None:
+    seen = depths[masks & (depths > 0)]
+    if len(seen) and np.median(seen) > 20:
+        raise ValueError(f"{name}: the median depth is {np.median(seen):g} m: give metres")

@@ -1,0 +1,70 @@
+"""Bayesian optimisation: better than chance, whole after failures and interruptions."""
+
+import numpy as np
+import pytest
+
+from r2s.estimators import bayes
+
+pytest.importorskip("skopt")
+CENTRE = np.array([0.3, 0.8, 0.55])
+
+
+def bowl(places):
+    return np.sqrt(((places - CENTRE) ** 2).sum(axis=1))
+
+
+def test_finds_the_bottom_of_a_bowl_closer_than_random_search():
+    found = bayes.minimise(bowl, 3, num_calls=24, batch=2, num_first=8, seed=1)
+    chance = bayes.random_search(bowl, 3, num_calls=24, batch=2, seed=1)
+    assert len(found.losses) == len(chance.losses) == 24
+    assert found.losses[found.best] < 0.5 * chance.losses[chance.best]
+
+
+def test_goes_on_from_a_file_with_the_same_places(tmp_path):
+    whole = bayes.minimise(bowl, 3, num_calls=14, batch=3, num_first=8, seed=2)
+    bayes.minimise(bowl, 3, num_calls=11, batch=3, num_first=8, seed=2, path=tmp_path / "h.npz")
+    rest = []
+
+    def rest_of(places):
+        rest.extend(places)
+        return bowl(places)
+
+    resumed = bayes.minimise(
+        rest_of, 3, num_calls=14, batch=3, num_first=8, seed=2, path=tmp_path / "h.npz"
+    )
+    assert len(rest) == 3
+    np.testing.assert_array_equal(resumed.places, whole.places)
+    np.testing.assert_array_equal(resumed.losses, whole.losses)
+
+
+def test_a_failed_call_counts_as_the_worst_so_far():
+    history = bayes.tell(bayes.begin(2), [[0.1, 0.2], [0.3, 0.4]], [np.nan, np.inf])
+    assert history.failed.all()
+    np.testing.assert_array_equal(history.penalised, bayes.UNKNOWN_PENALTY)
+    history = bayes.tell(history, [[0.5, 0.6], [0.7, 0.8]], [3.0, 2.0])
+    np.testing.assert_array_equal(history.penalised, [3, 3, 3, 2])
+    assert history.best == 3
+    with pytest.raises(RuntimeError, match="all 1 calls of the objective failed"):
+        _ = bayes.tell(bayes.begin(1), [[0.5]], [np.nan]).best
+
+
+def test_avoids_where_the_objective_fails():
+    fails = lambda places: np.where(places[:, 0] > 0.5, np.nan, bowl(places))
+    found = bayes.minimise(fails, 3, num_calls=16, batch=4, num_first=8, seed=0)
+    assert found.failed[:8].sum() >= 3
+    assert found.failed[8:].mean() < 0.4
+    assert found.losses[found.best] < 0.25
+
+
+def test_refuses_a_history_of_another_search(tmp_path):
+    bayes.minimise(bowl, 3, num_calls=4, batch=2, num_first=8, seed=0, path=tmp_path / "h.npz")
+    with pytest.raises(ValueError, match=r"h\.npz: is of a search with .*'seed': 0"):
+        bayes.minimise(bowl, 3, num_calls=4, batch=2, num_first=8, seed=1, path=tmp_path / "h.npz")
+    (tmp_path / "h.npz").write_bytes(b"no archive")
+    with pytest.raises(ValueError, match=r"h\.npz: no history of a search"):
+        bayes.minimise(bowl, 3, num_calls=4, batch=2, num_first=8, seed=0, path=tmp_path / "h.npz")
+
+
+def test_refuses_losses_of_another_number():
+    with pytest.raises(ValueError, match="one loss for each of 2 places"):
+        bayes.tell(bayes.begin(1), [[0.1], [0.2]], [1.0])

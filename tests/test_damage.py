@@ -1,0 +1,142 @@
+"""Files damaged anywhere: either they are still read, or the error names the file."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2")
+from hypothesis import HealthCheck, given, settings  # noqa: E402
+from hypothesis import strategies as st  # noqa: E402
+from rgbd_scene import INFO, PATH, TIMES, write  # noqa: E402
+
+from r2s.clouds import read_cloud  # noqa: E402
+from r2s.forces import read_force_log  # noqa: E402
+from r2s.manifest import default_manifest, read_manifest  # noqa: E402
+from r2s.observe.rgbd import read_clouds, read_rig  # noqa: E402
+from r2s.recording import load, make_recording, save  # noqa: E402
+
+IMAGES = ("cameras.json", "left/times.csv", "left/depth/001.png", "right/masks/002.png")
+Damage = Callable[[bytes], bytes]
+
+
+@st.composite
+def damages(draw: st.DrawFn) -> Damage:
+    """Cut, emptied, bytes changed, bytes put in, or doubled."""
+    at = draw(st.floats(0, 1, exclude_max=True))
+    junk = draw(st.binary(min_size=1, max_size=8))
+    where = lambda data: int(at * len(data))
+    kinds: dict[str, Damage] = {
+        "cut": lambda data: data[: where(data)],
+        "changed": lambda data: data[: where(data)] + junk + data[where(data) + len(junk) :],
+        "put in": lambda data: data[: where(data)] + junk + data[where(data) :],
+        "doubled": lambda data: data + data,
+        "no beginning": lambda data: data[where(data) :],
+    }
+    return kinds[draw(st.sampled_from(list(kinds)))]
+
+
+def read_or_named(read: Callable[[], Any], *names: Path) -> None:
+    """It is read, or the error is one of those promised and has one of the names."""
+    try:
+        read()
+    except (ValueError, FileNotFoundError) as error:
+        assert any(str(name) in str(error) for name in names), error
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("whole") / "wave"
+    write(folder, colour=False)
+    return folder
+
+
+@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@given(name=st.sampled_from(IMAGES), damage=damages())
+@pytest.mark.filterwarnings("ignore")
+def test_a_damaged_folder_of_images(whole: Path, name: str, damage: Damage) -> None:
+    file = whole / name
+    before = file.read_bytes()
+    try:
+        file.write_bytes(damage(before))
+        read_or_named(lambda: read_clouds(whole, read_rig(whole)), whole)
+    finally:
+        file.write_bytes(before)
+
+
+CLOUD = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+
+
+def ply(path: Path) -> None:
+    lines = "".join(f"{x:.4f} {y:.4f} {z:.4f}\n" for x, y, z in CLOUD)
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    path.write_text(f"ply\nformat ascii 1.0\nelement vertex 20\n{axes}end_header\n{lines}")
+
+
+def pcd(path: Path) -> None:
+    pytest.importorskip("pypcd4")
+    fields = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 20\nHEIGHT 1\n"
+    head = f"VERSION 0.7\n{fields}VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 20\nDATA binary\n"
+    path.write_bytes(head.encode() + CLOUD.astype("<f4").tobytes())
+
+
+def npy(path: Path) -> None:
+    np.save(path, CLOUD)
+
+
+def xyz(path: Path) -> None:
+    np.savetxt(path, CLOUD)
+
+
+def obj(path: Path) -> None:
+    path.write_text("".join(f"v {x:.4f} {y:.4f} {z:.4f}\n" for x, y, z in CLOUD))
+
+
+def recording(path: Path) -> None:
+    save(make_recording([CLOUD] * 4, TIMES, PATH, TIMES, INFO), path)
+
+
+def log(path: Path) -> None:
+    path.write_text("time_s,force_N\n" + "".join(f"{0.1 * i:.1f},{i}\n" for i in range(20)))
+
+
+def manifest(path: Path) -> None:
+    value = json.loads(default_manifest().read_text())
+    value["files"] = dict(list(value["files"].items())[:3])
+    path.write_text(json.dumps(value))
+
+
+FILES = {
+    "cloud.ply": (ply, read_cloud),
+    "cloud.pcd": (pcd, read_cloud),
+    "cloud.npy": (npy, read_cloud),
+    "cloud.xyz": (xyz, read_cloud),
+    "cloud.obj": (obj, read_cloud),
+    "recording.npz": (recording, load),
+    "log.csv": (log, read_force_log),
+    "manifest.json": (manifest, read_manifest),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(damage=damages())
+@pytest.mark.filterwarnings("ignore")
+def test_a_damaged_file(tmp_path: Path, name: str, damage: Damage) -> None:
+    write_it, read_it = FILES[name]
+    write_it(tmp_path / name)
+    read_it(tmp_path / name)
+    (tmp_path / name).write_bytes(damage((tmp_path / name).read_bytes()))
+    read_or_named(lambda: read_it(tmp_path / name), tmp_path / name)
+
+
+def test_a_file_that_is_a_folder(whole: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(whole, tmp_path / "wave")
+    (folder / "left" / "depth" / "001.png").unlink()
+    (folder / "left" / "depth" / "001.png").mkdir()
+    with pytest.raises((ValueError, OSError), match="left/depth"):
+        read_clouds(folder, read_rig(folder))

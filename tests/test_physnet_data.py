@@ -1,0 +1,108 @@
+"""Shards that a seed makes again, and an estimate from images of a known fabric."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from r2s.estimators import physnet
+from r2s.estimators.physnet import Sighting
+from r2s.physnet import dataset, preprocess, training
+from r2s.physnet.dataset import Settings
+from r2s.physnet.network import Architecture
+
+TINY = Settings(
+    num_fabrics=3, num_levels=2, num_frames=2, size=16, shape=(3, 3), per_shard=2, seed=5
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data")
+    dataset.make(folder, TINY, progress=False)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def sighting(folder):
+    """The first motion of the first fabric, without flaws."""
+    view, data = dataset.load_manifest(folder).view, dataset.load(folder)
+    experiment = dataset.levels(TINY)[0]
+    frames = dataset.kept_frames(experiment, TINY.num_frames)
+    images = preprocess.of_depths(view, data.depth[0] * dataset.STEP)
+    untrained = training.begin(view, Architecture(16, (4,), (8,)))
+    scenario = experiment.scenario(TINY.shape)
+    return Sighting.make(scenario, images, frames, TINY.family, untrained)
+
+
+def test_holds_what_the_settings_say(folder):
+    data, manifest = dataset.load(folder), dataset.load_manifest(folder)
+    assert data.depth.shape == (6, 2, 16, 16) and data.places.shape == (3, 7)
+    np.testing.assert_array_equal(data.fabric, [0, 0, 1, 1, 2, 2])
+    seen = data.depth[data.depth > 0] * dataset.STEP
+    assert 0.9 * manifest.view.near < seen.min() and seen.max() < 1.1 * manifest.view.far
+    assert not np.array_equal(data.depth[0], data.depth[2])  # fabrics differ
+    assert not np.array_equal(data.depth[0], data.depth[1])  # motions differ
+
+
+def test_goes_on_where_it_stopped_with_the_same_bytes(folder):
+    before = dataset.load_manifest(folder)
+    kept = (folder / "0000.npz").stat().st_mtime_ns
+    (folder / "0001.npz").write_bytes(b"torn")
+    with pytest.raises(ValueError, match=r"0001\.npz is missing or damaged"):
+        dataset.load(folder)
+    after = dataset.make(folder, TINY, progress=False)
+    assert after == before
+    assert (folder / "0000.npz").stat().st_mtime_ns == kept
+
+
+def test_other_settings_in_the_same_folder_are_refused(folder):
+    with pytest.raises(ValueError, match="other settings: seed 5 there, 6 asked"):
+        dataset.make(folder, dataclasses.replace(TINY, seed=6))
+    with pytest.raises(ValueError, match="scenario must be one of .*'lifting'.*found 'lift'"):
+        dataclasses.replace(TINY, scenario="lift")
+
+
+def test_the_distance_is_least_at_the_fabric_that_was_seen(sighting, folder):
+    truth = jnp.asarray(dataset.load(folder).places[0])
+    rough, soft = truth.at[6].set(1 - truth[6]), truth.at[2].set(1 - truth[2])
+    places = jnp.stack([truth, rough, soft, jnp.full_like(truth, jnp.nan)])
+    found = physnet.distances(sighting, places)
+    assert 10 * float(found[0]) < min(float(found[1]), float(found[2]))  # the files round depths
+    assert np.isnan(found[3])
+
+
+def test_an_estimate_goes_on_and_gives_the_best_of_what_was_tried(sighting, tmp_path):
+    pytest.importorskip("skopt")
+    path = tmp_path / "history.npz"
+    first = physnet.estimate(sighting, num_calls=6, path=path)
+    assert first.loss == first.losses.min() and first.losses.shape == (6, 1)
+    again = physnet.estimate(sighting, num_calls=6, path=path)
+    np.testing.assert_array_equal(first.history, again.history)
+    place = TINY.family.locate(first.fabric)
+    loss = physnet.distances(sighting, jnp.stack([place] * 4))[0]
+    np.testing.assert_allclose(loss, first.loss, rtol=1e-3)
+    assert not first.determined.any()
+
+
+def test_images_and_frames_must_belong_together(sighting):
+    images = np.zeros((2, 16, 16))
+    about = TINY.family, training.begin(sighting.view, Architecture(16, (4,), (8,)))
+    for frames in ((59,), (30, 60)):
+        with pytest.raises(ValueError, match="of 60 simulated: expected one image for each frame"):
+            Sighting.make(sighting.scenario, images, frames, *about)
+
+
+@pytest.mark.slow
+def test_material_points_make_data_too(tmp_path):
+    narrow = tuple(
+        dataclasses.replace(bound, high=bound.low * 3) if bound.unit == "N/m" else bound
+        for bound in TINY.ranges
+    )
+    settings = dataclasses.replace(
+        TINY, material_points=True, shape=(5, 5), ranges=narrow, num_fabrics=2
+    )
+    dataset.make(tmp_path, settings, progress=False)
+    data = dataset.load(tmp_path)
+    assert data.depth.shape == (4, 2, 16, 16) and (data.depth > 0).any(axis=(2, 3)).all()

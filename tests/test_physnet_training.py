@@ -1,0 +1,157 @@
+"""The embedding learns to tell things apart, and an interrupted training makes the same numbers."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from r2s.family import Range
+from r2s.physnet import pictures, training, triplets
+from r2s.physnet.dataset import STEP, Data
+from r2s.physnet.network import DEEPER, PAPER, Architecture, PhysNet
+from r2s.physnet.preprocess import Flaws
+from r2s.physnet.training import Schedule
+from r2s.physnet.views import View
+
+VIEW = View((0.0, -1.0, 0.0), (0.0, 0.0, 0.0), 16.0, 16, 0.5, 1.5, -1.0)
+SMALL = Architecture(size=16, channels=(4, 8), hidden=(16,))
+SHORT = Schedule(
+    epochs=4, steps=30, fabrics=6, images=3, decay_every=3, held_back=0.25, triplets=300,
+    flaws=Flaws(1e-3, 0.1, 0.002),
+)  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def promotion():
+    """optax multiplies numbers of different kinds."""
+    with jax.numpy_dtype_promotion("standard"):
+        yield
+
+
+@pytest.fixture(scope="module")
+def data() -> Data:
+    """Discs whose radius is that of the fabric, at the place that is the motion's."""
+    generator = np.random.default_rng(0)
+    radii = generator.uniform(1.5, 6, 16)
+    rows, columns = np.mgrid[:16, :16]
+    depth = np.zeros((64, 2, 16, 16), np.uint16)
+    for motion in range(64):
+        for frame in range(2):
+            i, j = generator.uniform(6, 10, 2)
+            disc = (rows - i) ** 2 + (columns - j) ** 2 < radii[motion // 4] ** 2
+            depth[motion, frame] = np.where(disc, 1.0 / STEP, 0)
+    return Data(depth, np.arange(64) // 4, (radii[:, None] - 1.5) / 4.5)
+
+
+@pytest.fixture(scope="module")
+def trained(data):
+    with jax.numpy_dtype_promotion("standard"):
+        return training.train(training.begin(VIEW, SMALL, SHORT), data)
+
+
+def test_learns_to_tell_unseen_classes_apart(data, trained):
+    _, held_back = training.divide(data, SHORT)
+    untrained = training.begin(VIEW, SMALL, SHORT).network
+    before = training.judge(untrained, VIEW, held_back, SHORT)[1]
+    assert trained.curve[-1].accuracy > 0.85 > before
+    assert trained.curve[-1].loss < 0.7 * trained.curve[0].loss
+
+
+def test_an_interrupted_training_makes_the_same_numbers(data, trained, tmp_path):
+    path = tmp_path / "training.eqx"
+    taught, held_back = training.divide(data, SHORT)
+    training.save(training.epoch(training.begin(VIEW, SMALL, SHORT), taught, held_back), path)
+    rest = []
+    resumed = training.load(path, expected=SMALL)
+    resumed = training.train(resumed, data, path, lambda number, row: rest.append(number))
+    assert rest == [2, 3, 4]
+    for one in (resumed, training.load(path)):
+        assert one.curve == trained.curve and one.schedule == SHORT and one.view == VIEW
+        same = jax.tree.map(np.array_equal, one.network, trained.network)
+        assert all(jax.tree.leaves(eqx.filter(same, lambda leaf: isinstance(leaf, bool))))
+
+
+def test_a_checkpoint_of_another_architecture_is_refused(trained, tmp_path):
+    path = tmp_path / "training.eqx"
+    training.save(trained, path)
+    with pytest.raises(ValueError, match=r"training\.eqx: expected Architecture\(size=256.*16"):
+        training.load(path, expected=PAPER)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match=r"training\.eqx: damaged"):
+        training.load(path)
+    path.write_bytes(b"{}\n")
+    with pytest.raises(ValueError, match=r"training\.eqx: no training of PhysNet"):
+        training.load(path)
+
+
+def test_images_of_another_size_are_refused(trained):
+    with pytest.raises(ValueError, match=r"16 x 16 pixels, found \(32, 32\)"):
+        trained.network(jnp.zeros((32, 32)))
+    with pytest.raises(ValueError, match="images of 64 pixels, the data have 16"):
+        training.begin(VIEW, DEEPER, SHORT)
+    with pytest.raises(ValueError, match="multiple of 16 for 4 convolutions, found 40"):
+        dataclasses.replace(DEEPER, size=40)
+
+
+def test_a_loss_that_is_not_finite_is_named(data):
+    taught, held_back = training.divide(data, SHORT)
+    wild = training.begin(VIEW, SMALL, dataclasses.replace(SHORT, rate=1e200))
+    with pytest.raises(FloatingPointError, match="loss is .* in epoch 0: lower the learning rate"):
+        training.epoch(wild, taught, held_back)
+
+
+def test_too_few_fabrics_are_refused(data):
+    with pytest.raises(ValueError, match="16 fabrics, of which 4 are held back"):
+        training.divide(data, dataclasses.replace(SHORT, fabrics=13))
+
+
+def test_a_fabric_is_either_taught_or_held_back(data):
+    taught, held_back = training.divide(data, SHORT)
+    assert not set(taught.fabric) & set(held_back.fabric)
+    assert set(taught.fabric) | set(held_back.fabric) == set(range(16))
+
+
+def test_triplets_are_of_two_motions_of_a_fabric_and_another(data):
+    _, images = training.divide(data, SHORT)
+    anchor, positive, negative = triplets.triplets(images, 200, 0).T
+    assert (images.fabric[anchor] == images.fabric[positive]).all()
+    assert (images.motion[anchor] != images.motion[positive]).all()
+    assert (images.fabric[anchor] != images.fabric[negative]).all()
+
+
+def test_losses_of_three_points_on_a_line():
+    points = jnp.array([[[0.0], [1.0]], [[3.0], [3.5]]])  # two fabrics, two images each
+    squares = {(0, 2): 9, (0, 3): 12.25, (1, 2): 4, (1, 3): 6.25}
+    near = {(0, 1): 1, (2, 3): 0.25}
+    every, hardest = [], []
+    for pair, own in near.items():
+        for anchor in pair:
+            others = [v for k, v in squares.items() if anchor in k]
+            every += [max(own - other + 5, 0) for other in others]
+            hardest.append(max(own - min(others) + 5, 0))
+    np.testing.assert_allclose(triplets.all_triplets(points, 5.0), np.mean(every))
+    np.testing.assert_allclose(triplets.hardest_triplets(points, 5.0), np.mean(hardest))
+
+
+def test_the_paper_s_network_has_its_layers():
+    network = jax.eval_shape(lambda: PhysNet.make(PAPER, key=jax.random.key(0)))
+    assert [c.weight.shape for c in network.convolutions] == [(32, 1, 5, 5), (64, 32, 5, 5)]
+    assert [layer.weight.shape for layer in network.layers] == [
+        (256, 64 * 64 * 64), (256, 256), (2, 256),
+    ]  # fmt: skip
+
+
+def test_draws_map_and_curves(data, trained, tmp_path):
+    _, images = training.divide(data, SHORT)
+    points = training.embed(trained.network, VIEW, images.depth, None)
+    places = data.places[images.fabric]
+    pictures.draw_map(tmp_path / "map.png", points, places, (Range("radius", "m", 1.5, 6.0),))
+    wide = np.c_[0.01 * points[:, :1], points]
+    pictures.draw_map(tmp_path / "plane.png", wide, places, (Range("radius", "m", 1.5, 6.0),))
+    pictures.draw_curves(tmp_path / "curves.png", trained.curve, 0.5)
+    for name in ("map", "plane", "curves"):
+        assert (tmp_path / f"{name}.png").stat().st_size > 5000

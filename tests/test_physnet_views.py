@@ -1,0 +1,151 @@
+"""Depth images of points: where a surface is, cropped and scaled alike whatever measured it."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from r2s import scenarios, synthetic
+from r2s.mesh import rectangle
+from r2s.observe.calibration import DepthCamera, calibrated, look_at
+from r2s.observe.camera import Camera
+from r2s.observe.render import render
+from r2s.physnet import preprocess, views
+from r2s.physnet.views import View
+
+VIEW = View((0.1, -0.4, 0.6), (0.1, 0.1, 0.1), 40.0, 32, 0.4, 1.0, -1.0)
+MESH = rectangle((0.3, 0.3), (4, 4))
+TILTED = np.c_[np.asarray(MESH.rest), 0.1 + 0.4 * np.asarray(MESH.rest[:, 1])]
+
+
+def camera_of(view: View) -> DepthCamera:
+    """The view as a calibrated camera."""
+    place = [jnp.asarray(p, float) for p in (view.position, view.target)]
+    return calibrated(Camera(place[0], place[1], view.focal_length, (view.size, view.size)))
+
+
+def drawn(view: View = VIEW):
+    depth = views.depths_of_sheet(view, jnp.asarray(TILTED)[None], MESH.faces, 24)
+    return np.asarray(depth[0])
+
+
+def test_agrees_with_exact_rendering():
+    exact, _ = render(camera_of(VIEW), TILTED, np.asarray(MESH.faces))
+    both = (drawn() > 0) & (exact > 0)
+    assert both.sum() > 250
+    assert np.abs(drawn() - exact)[both].mean() < 1e-3  # [m], on a surface tilted by 20 degrees
+    # a pixel has depth where any of it sees the sheet, not only its middle
+    assert ((exact > 0) & (drawn() == 0)).sum() == 0
+
+
+def test_nearer_layers_hide_others_and_the_floor_is_left_out():
+    low = jnp.array([[0.104, 0.1, 0.104]])  # in the middle of a pixel
+    towards = jnp.asarray(VIEW.position) - low[0]
+    high = low + 0.3 * towards[None]
+    both = jnp.concatenate([low, high])
+    depth = views.depth_of(VIEW, both, jnp.array([True, True]))
+    forward = jnp.asarray(VIEW.target) - jnp.asarray(VIEW.position)
+    distance = -float(towards @ forward / jnp.sqrt(forward @ forward))
+    np.testing.assert_allclose(depth.max(), 0.7 * distance, rtol=1e-6)
+    masked = views.depth_of(VIEW, both, jnp.array([True, False]))
+    np.testing.assert_allclose(masked.max(), distance, rtol=1e-6)
+    raised = dataclasses.replace(VIEW, floor=0.15)
+    assert float(views.depth_of(raised, both, jnp.array([True, False])).max()) == 0
+
+
+def test_a_view_around_points_holds_them_all():
+    points = np.random.default_rng(0).uniform([0, 0, 0], [0.4, 0.3, 0.2], (200, 3))
+    view = views.view_around((-0.5, -0.1, 0.5), points, 64, 0.01)
+    seen = points[:, 2] > 0.01
+    depth = views.depth_of(view, jnp.asarray(points), jnp.ones(200, bool))
+    found = np.asarray(depth)[np.asarray(depth) > 0]
+    assert view.near < found.min() and found.max() < view.far
+    alone = [
+        views.depth_of(view, jnp.asarray(p)[None], jnp.array([True])).max() for p in points[seen]
+    ]
+    assert min(alone) > 0
+    with pytest.raises(ValueError, match="no point is higher than 1 m"):
+        views.view_around((-0.5, -0.1, 0.5), points, 64, 1.0)
+
+
+def test_a_real_camera_of_another_resolution_gives_the_same_image():
+    pose = look_at((0.12, -0.42, 0.58), (0.1, 0.1, 0.1))
+    camera = DepthCamera((160, 120), (140.0, 140.0), (79.5, 59.5), pose, 1e-3)
+    depth, which = render(camera, TILTED, np.asarray(MESH.faces))
+    image = preprocess.of_camera(VIEW, camera, depth[None], (which >= 0)[None])[0]
+    expected = np.asarray(preprocess.grey(VIEW, jnp.asarray(drawn())))
+    both = (image > 0) & (expected > 0)
+    assert both.sum() > 0.9 * (expected > 0).sum()
+    assert np.abs(image - expected)[both].mean() < 0.01
+
+
+def test_holes_are_filled_and_strays_dropped():
+    whole = drawn()
+    image = preprocess.grey(VIEW, jnp.asarray(whole))
+    inside = np.argwhere(whole > 0)
+    inner = [(i, j) for i, j in inside if (whole[i - 2 : i + 3, j - 2 : j + 3] > 0).all()]
+    broken = whole.copy()
+    for i, j in inner[::7]:
+        broken[i, j] = 0
+    broken[1, 1] = 0.5
+    mended = preprocess.grey(VIEW, jnp.asarray(broken))
+    assert float(image[1, 1]) == float(mended[1, 1]) == 0
+    np.testing.assert_array_equal(image > 0, mended > 0)
+    assert float(jnp.max(jnp.abs(image - mended))) < 0.02
+
+
+def test_flaws_are_those_asked_for():
+    depth = jnp.full((32, 32), 0.8)
+    flaws = preprocess.Flaws(noise=1e-3, holes=0.0, strays=0.0)
+    noisy = preprocess.flawed(depth, VIEW, flaws, jax.random.key(0))
+    np.testing.assert_allclose(np.std(noisy), 0.64e-3, rtol=0.1)
+    flaws = preprocess.Flaws(noise=0.0, holes=0.4, strays=0.0)
+    shares = [
+        float((preprocess.flawed(depth, VIEW, flaws, jax.random.key(i)) == 0).mean())
+        for i in range(20)
+    ]
+    assert max(shares) < 0.5 and min(shares) < 0.1 < np.mean(shares) < 0.3
+
+
+@pytest.mark.parametrize(
+    "depths, message",
+    [
+        (np.ones((2, 24, 32)), r"cup: expected images of 32 x 32 pixels, found \(2, 24, 32\)"),
+        (np.zeros((2, 32, 32)), "cup, frame 5: 0 pixels have a depth, expected at least 5"),
+        (np.full((2, 32, 32), 700.0), "cup, frame 5: the median depth is 700 m.*in metres"),
+        (np.full((2, 32, 32), np.nan), "cup, frame 5: 1024 depths are not finite"),
+    ],
+)
+def test_broken_depth_is_refused(depths, message):
+    with pytest.raises(ValueError, match=message):
+        preprocess.of_depths(VIEW, depths, "cup", (5, 9))
+
+
+def test_a_cameras_wrong_size_and_unit_are_refused():
+    camera = camera_of(VIEW)
+    there = np.ones((1, 32, 32), bool)
+    with pytest.raises(ValueError, match="the median depth is 700 m: give metres"):
+        preprocess.of_camera(VIEW, camera, np.full((1, 32, 32), 700.0), there)
+    with pytest.raises(ValueError, match=r"of 32 x 32 pixels .*found \(30, 32\)"):
+        preprocess.of_camera(VIEW, camera, np.ones((1, 30, 32)), there[:, :30])
+
+
+def test_clouds_become_depth(fabric):
+    experiment = scenarios.lifting()
+    view = views.view_around(
+        views.eye_of(experiment), np.array([[0, 0, 0.01], [0.45, 0.45, 0.4]]), 32, 0.004
+    )
+    cloud = np.random.default_rng(0).uniform([0.1, 0.1, 0.1], [0.3, 0.3, 0.3], (2000, 3))
+    info = synthetic.RecordingInfo(
+        "r", "lifting", "f", "1", "s", (0, 1), experiment.sheet, 0.0, None
+    )
+    path = np.zeros((2, 1, 3))
+    recording = synthetic.make_recording([cloud, cloud[:1999]], [0, 1], path, [0, 1], info)
+    images = preprocess.of_clouds(view, recording, (0, 1))
+    assert images.shape == (2, 32, 32)
+    assert np.abs(images[0] - images[1]).max() < 0.3
+    far = dataclasses.replace(recording, points=recording.points * 1000)
+    with pytest.raises(ValueError, match="r, frame 0: 0 pixels have a depth.*units are not metres"):
+        preprocess.of_clouds(view, far, (0, 1))
