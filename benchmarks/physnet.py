@@ -12,6 +12,7 @@ import json
 import time
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -30,6 +31,7 @@ from r2s.physnet.network import DEEPER, PAPER
 from r2s.scenario import motion
 
 SEEDS = 20  # of random search, which is free: the motions are those of the training data
+SEEN = preprocess.Flaws(noise=1.5e-3, holes=0.05, strays=0.001)  # of the images to estimate from
 
 
 def main() -> None:
@@ -176,7 +178,7 @@ def estimates(out: Path, data, settings, trained, asked) -> dict:
         row = np.flatnonzero(data.fabric == targets[number])[0]
         depth = jnp.asarray(data.depth[row] * dataset.STEP, float)
         keys = jr.split(jr.fold_in(jr.key(1), number), len(depth))
-        flawed = lambda d, k: preprocess.flawed(d, trained.view, trained.schedule.flaws, k)
+        flawed = lambda d, k: preprocess.flawed(d, trained.view, SEEN, k)
         images = preprocess.of_depths(trained.view, np.asarray(jax.vmap(flawed)(depth, keys)))
         sighting = sighting_of(settings, trained, images)
         own = []
@@ -220,7 +222,7 @@ def end_to_end(out: Path, data, settings, trained, asked) -> dict:
     truth, fabric = truths[0], settings.family(jnp.asarray(truths[0], float))
     experiment = dataset.levels(settings)[0]
     frames = dataset.kept_frames(experiment, settings.num_frames)
-    x = np.asarray(jax.jit(lambda f: motion(experiment.scenario(settings.shape), f).x)(fabric))
+    x = np.asarray(eqx.filter_jit(motion)(experiment.scenario(settings.shape), fabric).x)
     camera = calibrated(synthetic.sensing(experiment).cameras[0])
     faces = np.asarray(experiment.scenario(settings.shape).scene.mesh.faces)
     generator, depths, masks = np.random.default_rng(0), [], []

@@ -83,8 +83,8 @@ class OrthotropicFamily(Family):
     Stiffness in a uniaxial pull along warp and weft [N/m], which is C11 and C22 less C12^2 over the
     other one: a motion determines that, where C11 alone would go up and down with C12. Shear
     stiffness C33 [N/m]. Coupling C12 / sqrt(C11 C22) [-], within -1..1, so that C stays positive
-    definite while C12 may be negative. Bending stiffness [N m]; damping [s]; friction [-]; and, when
-    it is the last of the ranges, mass damping [1/s], else none.
+    definite while C12 may be negative. Bending stiffness [N m]; damping [s]; friction [-]; and,
+    when it is the last of the ranges, mass damping [1/s], else none.
 
     - `density`: areal density, [kg/m^2], an input: a motion under gravity determines only the
       ratio of stiffness to density.

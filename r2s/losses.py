@@ -54,9 +54,8 @@ def robust(
 ) -> Float[Array, "*point"]:
     """A robust loss [m^2]: d^2 / 2 for small distances d [m], less for outliers.
 
-    Cauchy's, logarithmic beyond `OUTLIER_SCALE`, which draws from afar. Or, with a `scale` [m] above
-    zero, that of Geman and McClure (1987), bounded: what is much farther off than that does not
-    count at all.
+    Cauchy's, logarithmic beyond `OUTLIER_SCALE`, which draws from afar. Or, with a `scale` [m] > 0,
+    that of Geman and McClure (1987), bounded: what is much farther off does not count at all.
     """
     strict = jnp.asarray(scale, float) > 0
     limit = jnp.where(strict, jnp.maximum(scale, TOUCHING), OUTLIER_SCALE)

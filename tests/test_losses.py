@@ -105,12 +105,20 @@ def test_a_point_on_the_sheet_has_the_normal_as_direction(sheet):
     assert np.asarray(direction[0]) == pytest.approx(np.array([0, 0, 1]), abs=1e-12)
 
 
-@given(st.floats(0, 1))
+@given(st.floats(0, 1), st.sampled_from([0.0, 3e-3, 0.02]))
 @settings(max_examples=25, deadline=None)
-def test_the_robust_weight_is_its_slope_over_the_distance(distance):
+def test_the_robust_weight_is_its_slope_over_the_distance(distance, scale):
     distance = jnp.array(distance)
-    slope = jax.grad(robust)(distance)
-    assert slope == pytest.approx(float(robust_weight(distance) * distance), rel=1e-9)
+    slope = jax.grad(robust)(distance, scale)
+    assert slope == pytest.approx(float(robust_weight(distance, scale) * distance), rel=1e-9)
+
+
+def test_with_a_scale_what_is_far_off_does_not_pull():
+    near, far = jnp.array(1e-4), jnp.array(0.1)
+    assert robust(near, 5e-3) == pytest.approx(0.5e-8, rel=1e-3)
+    assert robust(far, 5e-3) == pytest.approx(5e-3**2 / 2, rel=1e-2)
+    pull = lambda scale: float(robust_weight(far, scale) * far)
+    assert pull(5e-3) < 1e-3 * pull(0.0)
 
 
 def test_the_robust_loss_is_quadratic_near_and_flat_far():

@@ -65,7 +65,7 @@ def test_an_estimate_is_made_once(pair, tmp_path, monkeypatch):
         patch.setattr(run, "_approach", lambda effort: _fake)
         judged, rows = run.run([pair], tmp_path, effort)
     stored = json.loads((tmp_path / "estimates" / "lift_grey.json").read_text())
-    assert stored["parameters"]["C11"]["unit"] == "N/m"
+    assert stored["parameters"]["warp"]["unit"] == "N/m"
     assert tables.read_rows(tmp_path / "results.csv") == rows
     baselines = {row.baseline for row in rows}
     assert baselines == {"", "default", "repeatability"}  # one fabric, so no other
@@ -82,16 +82,14 @@ def test_an_estimate_is_made_once(pair, tmp_path, monkeypatch):
 
 def _fake(pair):
     """An estimate without the work: the middle of the family."""
-    from r2s.estimators.base import Estimate
+    from r2s.estimators.estimate import without_deviations
     from r2s.family import OrthotropicFamily
 
     family = OrthotropicFamily.make(pair.density)
-    values = np.asarray(family.values(jnp.full(family.dim, 0.5)))
-    size = family.dim
-    return Estimate(
-        "fake", family.middle(), family.ranges, values, np.full(size, np.nan), np.eye(size),
-        np.zeros(4), 1e-4, np.full((1, 1), 1e-4), values[None, None], 0.1,
-    )  # fmt: skip
+    middle = jnp.full(family.dim, 0.5)
+    values = np.asarray(family.values(middle))
+    losses, history = np.full((1, 1), 1e-4), values[None, None]
+    return without_deviations("fake", family, middle, 1e-4, losses, history, 0.1)
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ that gives a loss for each of a batch of places.
 """
 
 import io
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -84,8 +85,10 @@ def ask(
         acq_func="EI",
         random_state=np.random.RandomState([seed, done]),
     )
-    optimiser.tell(history.places.tolist(), history.penalised.tolist())
-    asked = optimiser.ask(number, strategy="cl_min") if number > 1 else [optimiser.ask()]
+    with warnings.catch_warnings():  # that a place repeats, and that it took a random one instead
+        warnings.filterwarnings("ignore", "The objective has been evaluated", UserWarning)
+        optimiser.tell(history.places.tolist(), history.penalised.tolist())
+        asked = optimiser.ask(number, strategy="cl_min") if number > 1 else [optimiser.ask()]
     return np.array(asked, float)
 
 

@@ -15,22 +15,29 @@ from r2s.estimators import gauss_newton
 from r2s.estimators.checkpoint import fingerprint, load, save
 from r2s.estimators.estimate import Condition, Estimate
 from r2s.estimators.gauss_newton import Descent, Joint, Normal, part_of
+from r2s.estimators.prediction import fabric_at
 from r2s.estimators.problem import OWN, SHARED, UNITS, Problem
+
+Progress = Callable[[int, float], None]  # told the iteration and the best loss [m^2]
 
 FIRST_DAMPING = 1e-2
 CLOSE = 5e-3  # of the prior's weight, which is what a change by one deviation costs, about twice
 STRICT, SCALES = 3.0, (3e-3, 0.015)  # of the spread, and between [m]: what is off is an outlier
-SHORTEST, PATIENCE = 4, 8  # iterations
+PATIENCE = 6  # iterations without a gain
 
-Progress = Callable[[int, float], None]  # told the iteration and the best loss [m^2]
+Row = list[Descent]  # of every start
 
 # compiled once in a process for all recordings of as many frames, knots and points
+_loss = eqx.filter_jit(gauss_newton.loss_at)
+_normal = eqx.filter_jit(gauss_newton.normal_at)
 _losses = eqx.filter_jit(eqx.filter_vmap(gauss_newton.loss_at, in_axes=(None, 0)))
 _normals = eqx.filter_jit(eqx.filter_vmap(gauss_newton.normal_at, in_axes=(None, 0, 0, None)))
-_propose = eqx.filter_jit(eqx.filter_vmap(gauss_newton.propose, in_axes=(None, 0, None)))
-_accept = eqx.filter_jit(eqx.filter_vmap(gauss_newton.accept, in_axes=(None, 0, 0, 0, None)))
-_remaining = eqx.filter_jit(eqx.filter_vmap(gauss_newton.remaining, in_axes=(None, 0, None)))
-_objectives = eqx.filter_jit(eqx.filter_vmap(gauss_newton.objective, in_axes=(None, 0, 0, None)))
+_propose = eqx.filter_jit(gauss_newton.propose)
+_accept = eqx.filter_jit(gauss_newton.accept)
+_objective = eqx.filter_jit(gauss_newton.objective)
+_remaining = eqx.filter_jit(gauss_newton.remaining)
+_weight = eqx.filter_jit(gauss_newton.prior_weight)
+_covariance = eqx.filter_jit(gauss_newton.covariance)
 
 
 class Effort(NamedTuple):
@@ -38,14 +45,15 @@ class Effort(NamedTuple):
 
     - `coarse`: places of the range that are tried first; 0: descend from the start alone.
     - `starts`: how many of the best of them are descended from, side by side.
-    - `iterations`: at most. The descents end when the best has arrived: when its next step promises
-      to change no parameter by more than about a tenth of its deviation.
+    - `iterations`: at most, of each of two stages: of all starts, until each has arrived, when its
+      next step promises to change no parameter by more than about a tenth of its deviation; and of
+      the best one with outliers left out.
     - `width`: over which slopes are taken, as of `r2s.estimators.prediction.sensitivities`.
     """
 
     coarse: int = 24
     starts: int = 2
-    iterations: int = 40
+    iterations: int = 25
     width: float | None = None
 
 
@@ -72,114 +80,150 @@ def descend(
     began = time.perf_counter()
     problems = (problems,) if isinstance(problems, Problem) else problems
     identity = "" if checkpoint is None else fingerprint(problems, effort, start, key)
-    rows = [] if checkpoint is None else _resumed(checkpoint, identity)
+    rows = [] if checkpoint is None else _resumed(checkpoint, identity, effort)
     if not rows:
         rows = [_begin(problems, effort, start, key)]
-    strict = bool(np.any(np.asarray(rows[-1].scale) > 0))
-    last = sum(not np.any(np.asarray(row.scale) > 0) for row in rows) if strict else 0
-    for iteration in range(len(rows) - 1, effort.iterations):
-        descent = rows[-1]
-        prior = _prior(problems, descent)
-        if _arrived(problems, rows[last:], prior):
-            if strict:
-                break
-            last, strict = len(rows), True
-            rows.append(_strict(problems, effort, descent))
-            continue
-        trial = _propose(problems, descent, prior)
-        tried = _normals(problems, trial, descent.scale, effort.width)
-        rows.append(_accept(problems, descent, trial, tried, prior))
+    while (row := _next(problems, effort, rows)) is not None:
+        rows.append(row)
         if checkpoint is not None:
-            save(checkpoint, identity, rows)
+            save(checkpoint, identity, [_stacked(row) for row in rows])
         if progress is not None:
-            progress(iteration, float(jnp.min(rows[-1].normal.loss)))
+            progress(len(rows) - 2, float(_best(problems, row)[1].normal.loss))
     return _collect(problems, rows, approach, time.perf_counter() - began)
 
 
-def _resumed(checkpoint: Path, identity: str) -> list[Descent]:
-    nothing = jnp.zeros(0)
-    like = Descent(nothing, Normal(*[nothing] * 5), nothing, nothing, nothing)
-    return load(checkpoint, identity, like)
-
-
-def _begin(problems: Joint, effort: Effort, start, key) -> Descent:
+def _begin(problems: Joint, effort: Effort, start, key) -> Row:
     dim, count = problems[0].family.dim, max(effort.coarse, effort.starts)
     start = jnp.full(dim, 0.5, float) if start is None else start
     places = jax.random.uniform(key, (count, dim), float).at[0].set(start)
     nothing = jnp.zeros((count, gauss_newton.size(problems) - dim), float)
     unknowns = jnp.concatenate([places, nothing], axis=1)
     if effort.coarse:
-        losses = np.asarray(_losses(problems, unknowns))
+        losses = losses_of(problems, unknowns)
         if not np.any(np.isfinite(losses)):
             raise RuntimeError(
                 f"all {count} simulations of the coarse search diverged: check the recording's "
                 "units and gripper path, or narrow the family's ranges"
             )
-        unknowns = unknowns[jnp.asarray(np.argsort(losses))]
-    chosen = unknowns[: effort.starts]
-    return _fresh(problems, effort, chosen, 0.0)
+        unknowns = unknowns[np.argsort(losses)]
+    return _fresh(problems, effort, list(unknowns[: effort.starts]), 0.0)
 
 
-def _fresh(problems: Joint, effort: Effort, unknown, scale: float) -> Descent:
+def losses_of(problems: Joint, unknowns: Float[Array, "start unknown"]) -> np.ndarray:
+    """The losses [m^2] of many unknowns: together, or on a CPU, which gains nothing by that, one
+    by one."""
+    if jax.default_backend() != "cpu":
+        return np.asarray(_losses(problems, unknowns))
+    return np.array([float(_loss(problems, unknown)) for unknown in unknowns])
+
+
+def _normals_of(problems: Joint, unknowns: list, scales: list, width: float | None) -> list[Normal]:
+    """As `losses_of`."""
+    if jax.default_backend() == "cpu" or len(unknowns) == 1:
+        pairs = zip(unknowns, scales, strict=True)
+        return [_normal(problems, unknown, scale, width) for unknown, scale in pairs]
+    found = _normals(problems, jnp.stack(unknowns), jnp.stack(scales), width)
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(len(unknowns))]
+
+
+def _fresh(problems: Joint, effort: Effort, unknowns: list, scale: float) -> Row:
     """Descents that begin at unknowns."""
-    fill = lambda value: jnp.full(effort.starts, value, float)
-    normal = _normals(problems, unknown, fill(scale), effort.width)
-    return Descent(unknown, normal, fill(FIRST_DAMPING), fill(gauss_newton.GROWTH), fill(scale))
+    value = lambda number: jnp.asarray(number, float)
+    normals = _normals_of(problems, unknowns, [value(scale)] * len(unknowns), effort.width)
+    rest = value(FIRST_DAMPING), value(gauss_newton.GROWTH), value(scale)
+    return [Descent(u, normal, *rest) for u, normal in zip(unknowns, normals, strict=True)]
 
 
-def _strict(problems: Joint, effort: Effort, descent: Descent) -> Descent:
-    """The descents go on with outliers left out, from what the best of them leaves unexplained.
+def _next(problems: Joint, effort: Effort, rows: list[Row]) -> Row | None:
+    """The next iteration; None at the end."""
+    row = rows[-1]
+    strict = any(float(descent.scale) > 0 for descent in row)
+    stage = [r for r in rows if any(float(descent.scale) > 0 for descent in r) == strict]
+    which, best = _best(problems, row)
+    prior = _weight(problems, best.normal)
+    moving = [i for i in range(len(row)) if not _arrived(problems, stage, i, prior)]
+    moving = [i for i in moving if i == which] if strict else moving
+    if not moving or len(stage) > effort.iterations:
+        return None if strict else _strict(problems, effort, row)
+    trials = [_propose(problems, row[i], prior) for i in moving]
+    tried = _normals_of(problems, trials, [row[i].scale for i in moving], effort.width)
+    after = list(row)
+    for i, trial, normal in zip(moving, trials, tried, strict=True):
+        after[i] = _accept(problems, row[i], trial, normal, prior)
+    return after
+
+
+def _strict(problems: Joint, effort: Effort, row: Row) -> Row:
+    """The best descent goes on with outliers left out, from what it leaves unexplained.
 
     Outliers lie to one side of a sheet, so that even a small pull of theirs biases the estimate.
     """
-    best = int(np.argmin(np.asarray(descent.normal.loss)))
-    scale = float(np.clip(STRICT * float(descent.normal.spread[best]), *SCALES))
-    return _fresh(problems, effort, descent.unknown, scale)
+    which, best = _best(problems, row)
+    scale = float(np.clip(STRICT * float(best.normal.spread), *SCALES))
+    after = list(row)
+    (after[which],) = _fresh(problems, effort, [best.unknown], scale)
+    return after
 
 
-def _prior(problems: Joint, descent: Descent) -> Float[Array, ""]:
-    """The weight of the prior, at the start of the least loss."""
-    best = jnp.argmin(descent.normal.loss)
-    return gauss_newton.prior_weight(problems, jax.tree.map(lambda a: a[best], descent.normal))
+def _best(problems: Joint, row: Row) -> tuple[int, Descent]:
+    """The descent with outliers left out, or else that of the least loss."""
+    finest = [i for i, descent in enumerate(row) if float(descent.scale) > 0]
+    which = finest[0] if finest else int(np.argmin([float(d.normal.loss) for d in row]))
+    return which, row[which]
 
 
-def _arrived(problems: Joint, rows: list[Descent], prior) -> bool:
-    """Whether the best descent is at its end, or none gained in the last `PATIENCE` iterations."""
-    now = rows[-1]
-    value = np.asarray(_objectives(problems, now.unknown, now.normal.loss, prior))
-    promised = np.asarray(_remaining(problems, now, prior))
-    if len(rows) > SHORTEST and promised[np.argmin(value)] < CLOSE * float(prior):
+def _arrived(problems: Joint, stage: list[Row], start: int, prior) -> bool:
+    """Whether a start's next step promises nothing, or its last ones have brought nothing."""
+    now = stage[-1][start]
+    if not np.isfinite(float(now.normal.loss)):
         return True
-    if len(rows) <= PATIENCE:
+    least = CLOSE * float(prior)
+    if len(stage) > 1 and float(_remaining(problems, now, prior)) < least:
+        return True
+    if len(stage) <= PATIENCE:
         return False
-    before = rows[-1 - PATIENCE]
-    earlier = np.asarray(_objectives(problems, before.unknown, before.normal.loss, prior))
-    return not np.any(value < earlier - CLOSE * float(prior))
+    values = [
+        float(_objective(problems, d.unknown, d.normal.loss, prior))
+        for d in (stage[-1 - PATIENCE][start], now)
+    ]
+    return not values[1] < values[0] - least
 
 
-def _collect(problems: Joint, rows: list[Descent], approach: str, seconds: float) -> Estimate:
-    family, last = problems[0].family, rows[-1]
-    prior = _prior(problems, last)
-    winner = int(np.argmin(_objectives(problems, last.unknown, last.normal.loss, prior)))
-    best = jax.tree.map(lambda leaf: leaf[winner], last)
+def _stacked(row: Row) -> Descent:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *row)
+
+
+def _resumed(checkpoint: Path, identity: str, effort: Effort) -> list[Row]:
+    none, vector, square = (jnp.zeros((0,) * dims) for dims in (1, 2, 3))
+    normal = Normal(none, none, vector, square, square)
+    like = Descent(vector, normal, none, none, none)
+    each = lambda row: [jax.tree.map(lambda a, i=i: a[i], row) for i in range(effort.starts)]
+    return [each(row) for row in load(checkpoint, identity, like)]
+
+
+def _collect(problems: Joint, rows: list[Row], approach: str, seconds: float) -> Estimate:
+    family = problems[0].family
+    _, best = _best(problems, rows[-1])
+    prior = _weight(problems, best.normal)
     unknown = best.unknown
-    whole = np.asarray(gauss_newton.covariance(problems, best, prior))
+    whole = np.asarray(_covariance(problems, best, prior))
     covariance = whole[: family.dim, : family.dim]
     deviation = np.sqrt(np.diag(covariance))
     # a place moves a parameter by its range: by that much, or by that ratio's logarithm
     widths = [np.log(b.high / b.low) if b.log else b.high - b.low for b in family.ranges]
     values_of = jax.vmap(jax.vmap(family.values))
+    places = jnp.stack([_stacked(row).unknown[:, : family.dim] for row in rows])
     return Estimate(
         approach=approach,
-        fabric=family(unknown[: family.dim]),
+        fabric=fabric_at(problems[0], unknown[part_of(problems, 0)]),
         ranges=family.ranges,
         values=np.asarray(family.values(unknown[: family.dim])),
         deviations=deviation * np.array(widths),
         correlation=covariance / np.outer(deviation, deviation),
         conditions=conditions(problems, np.asarray(unknown), np.sqrt(np.diag(whole))),
-        loss=float(last.normal.loss[winner]),
-        losses=np.stack([np.asarray(row.normal.loss) for row in rows]),
-        history=np.asarray(values_of(jnp.stack([row.unknown for row in rows])[..., : family.dim])),
+        loss=float(_loss(problems, unknown)),
+        losses=np.stack([np.asarray(_stacked(row).normal.loss) for row in rows]),
+        history=np.asarray(values_of(places)),
         seconds=seconds,
     )
 

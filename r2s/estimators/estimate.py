@@ -10,7 +10,7 @@ from r2s.family import Family, Range
 from r2s.physics.plate import PlateBending
 
 FORMAT = "r2s-estimate/2"
-DETERMINED = 0.05  # standard deviation, relative or absolute, up to which a parameter is known
+DETERMINED = 0.025  # standard deviation, relative or absolute: then 5 % are two of them
 
 
 class Condition(NamedTuple):
@@ -68,7 +68,7 @@ class Estimate:
 
     @property
     def determined(self) -> np.ndarray:
-        """Which parameters the recording determines: those known to `DETERMINED` or better."""
+        """Which parameters the recording determines: to 5 % (or 0.05) with 95 % confidence."""
         return self.deviations < DETERMINED
 
     @property

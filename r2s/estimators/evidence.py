@@ -82,7 +82,7 @@ def _of_clouds(clouds: Clouds, mesh: Mesh, seen: Seen, slope: Slope, scale) -> N
         loss=_mean(robust(distance, scale), clouds.mask),
         gradient=jnp.sum(score, axis=(0, 1)),
         matrix=jnp.einsum("fp,fpu,fpv->uv", weight, jacobian, jacobian),
-        scatter=_scatter(mesh, score, vertices[..., 0]),
+        scatter=_scatter(mesh, score, jnp.einsum("fpk,fpki->fpi", weights, mesh.rest[vertices])),
         spread=_spread(distance, clouds.mask),
     )
 
@@ -95,12 +95,12 @@ def _of_markers(markers: Markers, mesh: Mesh, seen: Seen, slope: Slope, scale) -
     count = jnp.sum(markers.seen, dtype=float)
     weight = jnp.where(markers.seen, robust_weight(distance, scale), 0) / count
     score = jnp.einsum("fm,fmi,fmiu->fmu", weight, gap, jacobian)
-    corner = jnp.broadcast_to(markers.vertices[None, :, 0], distance.shape)
+    place = jnp.einsum("mk,mki->mi", markers.weights, mesh.rest[markers.vertices])
     return Normals(
         loss=_mean(robust(distance, scale), markers.seen),
         gradient=jnp.sum(score, axis=(0, 1)),
         matrix=jnp.einsum("fm,fmiu,fmiv->uv", weight, jacobian, jacobian),
-        scatter=_scatter(mesh, score, corner),
+        scatter=_scatter(mesh, score, jnp.broadcast_to(place[None], (*distance.shape, 2))),
         spread=_spread(distance, markers.seen),
     )
 
@@ -149,15 +149,19 @@ def _spread(distance: Float[Array, "*shape"], mask) -> Float[Array, ""]:
     return 1.4826 * jnp.nanmedian(jnp.where(mask, distance, jnp.nan))
 
 
-def _scatter(mesh: Mesh, score: Float[Array, "frame point unknown"], vertex):
+def _scatter(
+    mesh: Mesh,
+    score: Float[Array, "frame point unknown"],
+    place: Float[Array, "frame point 2"],
+) -> Float[Array, "unknown unknown"]:
     """The covariance of the gradient, from the scores of the patches of the sheet.
 
     Points of a patch err alike, in one frame and in those near to it: sums over patches, weighted
     over the frames between them (Newey and West 1987).
     """
-    extent = jnp.max(mesh.rest, axis=0, keepdims=True) * (1 + 1e-3)
-    cell = jnp.floor(mesh.rest / extent * PATCHES).astype(int)
-    patch = (cell[:, 0] * PATCHES + cell[:, 1])[vertex]
+    extent = jnp.max(mesh.rest, axis=0) * (1 + 1e-3)
+    cell = jnp.floor(place / extent[None, None] * PATCHES).astype(int)
+    patch = jnp.clip(cell[..., 0] * PATCHES + cell[..., 1], 0, PATCHES**2 - 1)
     total = jax.vmap(lambda s, c: jax.ops.segment_sum(s, c, PATCHES**2))(score, patch)
     return _over_time(total)
 

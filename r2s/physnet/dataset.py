@@ -44,7 +44,7 @@ class Settings:
     """
 
     scenario: str = "lifting"
-    num_fabrics: int = 256
+    num_fabrics: int = 512
     num_levels: int = 6
     num_frames: int = 8
     size: int = 64
@@ -186,9 +186,13 @@ def solver_of(settings: Settings, scenarios: list[Scenario]) -> Sheet | None:
     """None for the cloth; else material points whose step and grid serve all these motions."""
     if not settings.material_points:
         return None
-    paths = jnp.concatenate([scenario.path for scenario in scenarios])
+    paths, times = (
+        jnp.concatenate([getattr(scenario, name) for scenario in scenarios])
+        for name in ("path", "path_times")
+    )
     stiffest = settings.family(jnp.ones(len(settings.ranges), float))
-    return material_points(dataclasses.replace(scenarios[0], path=paths), stiffest)
+    everywhere = dataclasses.replace(scenarios[0], path=paths, path_times=times)
+    return material_points(everywhere, stiffest)
 
 
 def kept_frames(experiment: Experiment, number: int) -> tuple[int, ...]:

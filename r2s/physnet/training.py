@@ -51,8 +51,8 @@ class Schedule:
     - `flaws`: of the images, to train and to validate with.
     """
 
-    epochs: int = 14
-    steps: int = 60
+    epochs: int = 9
+    steps: int = 80
     fabrics: int = 24
     images: int = 4
     rate: float = 1e-3

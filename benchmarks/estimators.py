@@ -1,0 +1,155 @@
+"""How often an estimate arrives, from anywhere in the range: r2s beside the recipe and CMA-ES.
+
+python benchmarks/estimators.py --starts 20 --out results/estimators     # hours on one core
+python benchmarks/estimators.py --fabrics grey_interlock --starts 2 --methods ours
+
+Every start is a random place of the family; the recording of a fabric is one and the same. A method
+succeeds when every parameter that the recording determines (by the deviations of a descent from the
+true fabric) is within 5 % of the truth; it arrives when its loss is that of the descent from the
+truth. What is done is kept in `runs.csv`, and not made again.
+"""
+
+import argparse
+import csv
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import measure
+import numpy as np
+
+from r2s import presets, scenarios, synthetic
+from r2s.estimators import cma_es, diffcloud, gauss_newton
+from r2s.estimators.descent import Effort
+from r2s.estimators.estimate import Estimate
+from r2s.estimators.problem import Problem
+from r2s.family import OrthotropicFamily
+
+_loss = eqx.filter_jit(gauss_newton.loss_at)
+SAME = 1.05  # times the loss at the truth's descent: the same place
+
+
+def alone(problem: Problem, start, key) -> Estimate:
+    """Gauss-Newton from the start, and from nowhere else."""
+    return diffcloud.estimate(problem, Effort(coarse=0, starts=1), start=start, key=key)
+
+
+METHODS: dict[str, Callable] = {
+    "ours": lambda p, start, key: diffcloud.estimate(p, start=start, key=key),
+    "ours, no search": alone,
+    "recipe": lambda p, start, key: diffcloud.recipe(p, start=start),
+    "cma": lambda p, start, key: cma_es.estimate(p, start=start, key=key),
+}
+
+
+def problem_of(name: str, scenario: str) -> tuple[Problem, np.ndarray]:
+    """The problem of a preset, and its true place."""
+    fabric = presets.FIVE[name]()
+    family = OrthotropicFamily.make(float(fabric.density))
+    recording = synthetic.record(scenarios.SIX[scenario](), fabric, name, key=jax.random.key(0))
+    return Problem.make(recording, family), np.asarray(family.locate(fabric))
+
+
+def errors(problem: Problem, estimate: Estimate, place: np.ndarray) -> np.ndarray:
+    """Relative, or absolute where a range is linear."""
+    truth = np.asarray(problem.family.values(jnp.asarray(place, float)))
+    log = np.array([bound.log for bound in problem.family.ranges])
+    ratio = np.where(log, estimate.values / np.where(log, truth, 1), 1)
+    return np.where(log, ratio - 1, estimate.values - truth)
+
+
+def run(out: Path, fabrics: list[str], scenario: str, methods: list[str], starts: int) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / "runs.csv"
+    rows = list(csv.DictReader(open(path))) if path.exists() else []
+    for name in fabrics:
+        problem, place = problem_of(name, scenario)
+        truth = jnp.asarray(place, float)
+        best = alone(problem, truth, jax.random.key(0))
+        determined = best.determined
+        rest = jnp.zeros(gauss_newton.size((problem,)) - problem.family.dim, float)
+        at = lambda e: float(
+            _loss((problem,), jnp.concatenate([problem.family.locate(e.fabric), rest]))
+        )
+        floor = at(best)
+        for method in methods:
+            for number in range(starts):
+                done = {(r["scenario"], r["fabric"], r["method"], r["start"]) for r in rows}
+                if (scenario, name, method, str(number)) in done:
+                    continue
+                measure.progress(f"{scenario}, {name}, {method}, start {number}")
+                key = jax.random.key(100 + number)
+                start = jax.random.uniform(key, (problem.family.dim,), float)
+                before, clock = time.perf_counter(), time.process_time()
+                try:
+                    found = METHODS[method](problem, start, key)
+                    wrong, loss = errors(problem, found, place), at(found)
+                except RuntimeError:
+                    wrong, loss = np.full(problem.family.dim, np.nan), np.inf
+                worst = np.max(np.abs(wrong[determined]), initial=0.0)
+                rows.append(
+                    {
+                        "scenario": scenario,
+                        "fabric": name,
+                        "method": method,
+                        "start": str(number),
+                        "determined": int(determined.sum()),
+                        "worst": float(worst),
+                        "within": bool(worst <= 0.05),
+                        "arrived": bool(loss <= SAME * floor),
+                        "loss_mm2": 1e6 * loss,
+                        "seconds": time.perf_counter() - before,
+                        "cpu_seconds": time.process_time() - clock,
+                        "errors": " ".join(f"{e:.4f}" for e in wrong),
+                    }
+                )
+                with open(path, "w", newline="") as file:
+                    writer = csv.DictWriter(file, rows[0])
+                    writer.writeheader()
+                    writer.writerows(rows)
+    summary(rows)
+
+
+def summary(rows: list[dict]) -> None:
+    """One line a fabric and method."""
+    groups: dict[tuple[str, str, str], list[dict]] = {}
+    for row in rows:
+        for fabric in (row["fabric"], "all"):
+            groups.setdefault((row["scenario"], row["method"], fabric), []).append(row)
+    lines = []
+    for (scenario, method, fabric), members in groups.items():
+        seconds = np.array([float(r["cpu_seconds"]) for r in members])
+        share = lambda name: np.mean([str(r[name]) == "True" for r in members])
+        lines.append(
+            {
+                "scenario": scenario,
+                "method": method,
+                "fabric": fabric,
+                "starts": len(members),
+                "within 5 %": share("within"),
+                "arrived": share("arrived"),
+                "median s": np.median(seconds),
+                "worst s": seconds.max(),
+                "median error": np.median([float(r["worst"]) for r in members]),
+            }
+        )
+    text = {name: (lambda row, name=name: row[name]) for name in ("scenario", "method", "fabric")}
+    count = {"starts": lambda row: f"{row['starts']}"}
+    share = {n: (lambda row, n=n: f"{row[n]:.0%}") for n in ("within 5 %", "arrived")}
+    times = {n: (lambda row, n=n: f"{row[n]:.1f}") for n in ("median s", "worst s")}
+    error = {"median error": lambda row: f"{row['median error']:.1%}"}
+    measure.show("estimates from random starts", lines, text | count | share | times | error)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Estimates from random starts.")
+    parser.add_argument("--out", type=Path, default=Path("results/estimators"))
+    parser.add_argument("--fabrics", nargs="*", default=list(presets.FIVE))
+    parser.add_argument("--scenario", default="lifting", choices=("lifting", "wind", "stretching"))
+    parser.add_argument("--methods", nargs="*", default=list(METHODS), choices=METHODS)
+    parser.add_argument("--starts", type=int, default=20)
+    a = parser.parse_args()
+    run(a.out, a.fabrics, a.scenario, a.methods, a.starts)

@@ -1,0 +1,97 @@
+"""The network: a multilayer perceptron from (X, Y, t) to a displacement, with its derivatives.
+
+The derivatives are carried forward through the layers beside the value, all in one matrix product
+a layer: no backward pass is nested in another.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+from jaxtyping import Array, Float, PRNGKeyArray
+
+WIDTH, LAYERS = 50, 7  # the paper's seven layers: six hidden ones and the last
+X, Y, T = range(3)  # the inputs
+STRONG = ((X, X), (X, Y), (Y, Y), (T, T))  # second derivatives of the equation of motion
+WEAK = ((X, T), (Y, T), (T, T))  # of the virtual work: none of second order in space
+
+
+class Jet(eqx.Module):
+    """Displacements at points, with derivatives.
+
+    - `value`: [m].
+    - `first`: in X [-], Y [-] and t [m/s].
+    - `second`: of the pairs that were asked for, in their units.
+    """
+
+    value: Float[Array, "*point axis"]
+    first: Float[Array, "3 *point axis"]
+    second: Float[Array, "pair *point axis"]
+
+
+class Network(eqx.Module):
+    """Displacement [m] at material points and times, by layers of tanh.
+
+    - `weights`, `biases`: of the layers.
+    - `centre`, `radius`: of the inputs X [m], Y [m], t [s], which become -1..1.
+    - `scale`: displacement [m] that an output of 1 stands for.
+    """
+
+    weights: tuple[Float[Array, "*batch _ _"], ...]
+    biases: tuple[Float[Array, "*batch _"], ...]
+    centre: Float[Array, "*batch 3"]
+    radius: Float[Array, "*batch 3"]
+    scale: Float[Array, "*batch"]
+
+    @classmethod
+    def make(
+        cls,
+        low: Float[Array, " 3"],
+        high: Float[Array, " 3"],
+        scale: Float[Array, ""],
+        *,
+        axes: int = 2,
+        width: int = WIDTH,
+        layers: int = LAYERS,
+        key: PRNGKeyArray,
+    ) -> "Network":
+        """A network with random weights (Glorot) for inputs between `low` and `high` [m, m, s]."""
+        sizes = (3, *(layers - 1) * (width,), axes)
+        draw = jax.nn.initializers.glorot_normal()
+        keys, dtype = jr.split(key, layers), jnp.zeros((), float).dtype
+        weights = [draw(k, (sizes[i], sizes[i + 1]), dtype) for i, k in enumerate(keys)]
+        biases = [jnp.zeros(size, float) for size in sizes[1:]]
+        centre, radius = (low + high) / 2, (high - low) / 2
+        return cls(tuple(weights), tuple(biases), centre, radius, scale)
+
+    def __call__(self, points: Float[Array, "point 3"]) -> Float[Array, "point axis"]:
+        """Displacements [m] at points (X [m], Y [m], t [s])."""
+        z = (points - self.centre[None]) / self.radius[None]
+        *hidden, (weight, bias) = zip(self.weights, self.biases, strict=True)
+        for inner, offset in hidden:
+            z = jnp.tanh(z @ inner + offset[None])
+        return self.scale * (z @ weight + bias[None])
+
+    def jet(self, points: Float[Array, "point 3"], pairs: tuple[tuple[int, int], ...]) -> Jet:
+        """Displacements [m] with their first derivatives and second ones in `pairs` of inputs.
+
+        Through z = tanh(a): z_i = z' a_i, z_ij = z' a_ij + z'' a_i a_j, where z' = 1 - z^2 and
+        z'' = -2 z z'.
+        """
+        count = len(points)
+        left, right = (jnp.array([1 + pair[i] for pair in pairs], int) for i in range(2))
+        value = (points - self.centre[None]) / self.radius[None]
+        slopes = jnp.broadcast_to(jnp.diag(1 / self.radius)[:, None], (3, count, 3))
+        flat = jnp.zeros((len(pairs), count, 3), points.dtype)
+        z = jnp.concatenate([value[None], slopes, flat])  # (derivative, point, unit)
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            a = (z.reshape(-1, z.shape[2]) @ weight).reshape(*z.shape[:2], -1)
+            if i == len(self.weights) - 1:
+                a = self.scale * a.at[0].add(bias[None])
+                return Jet(a[0], a[1:4], a[4:])
+            value = jnp.tanh(a[0] + bias[None])
+            slope = 1 - value**2
+            curve = -2 * value * slope
+            second = slope[None] * a[4:] + curve[None] * a[left] * a[right]
+            z = jnp.concatenate([value[None], slope[None] * a[1:4], second])
+        raise AssertionError("a network has at least one layer")

@@ -1,0 +1,125 @@
+"""The paper's recipe, as a preset to compare with (Ru et al. 2025).
+
+Two losses in SI units: markers by Adam at 1e-4, and the equation of motion in small strain by L-BFGS
+with steps of 0.1, with the stiffness trainable and a weight of 0.1 that rises by 0.1 every 500
+epochs up to 1; 10,000 epochs. No force enters, so nothing fixes the scale of the stiffness: what
+comes out is where it started, or what the descent made of it. The paper does not say how the two
+optimisers take turns; here each makes a step in every epoch.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from r2s.family import Family
+from r2s.pinn.data import Pull
+from r2s.pinn.laws import small
+from r2s.pinn.losses import marker_residual, motion_residual
+from r2s.pinn.network import LAYERS, WIDTH
+from r2s.pinn.training import Model, Recipe, init, trainable
+
+EPOCHS = 10_000
+ADAM_RATE, LBFGS_RATE = 1e-4, 0.1
+MEMORY = 10  # pairs that L-BFGS remembers
+WEIGHT, EVERY = 0.1, 500  # of the equation of motion: at first and as a step; epochs between steps
+BEGIN = 10.0  # [N/m], all stiffnesses
+
+
+class Course(NamedTuple):
+    """A model, and after every chunk the losses of markers [m^2] and motion [(N/m^2)^2] and the
+    fabric's place in its family."""
+
+    model: Model
+    data: Float[np.ndarray, " chunk"]
+    motion: Float[np.ndarray, " chunk"]
+    places: Float[np.ndarray, "chunk dim"]
+
+
+def weight(epoch: Array) -> Array:
+    """Of the equation of motion in an epoch."""
+    return jnp.minimum(WEIGHT * (1 + (epoch // EVERY).astype(float)), 1.0)
+
+
+def plain(pull: Pull) -> Pull:
+    """A pull without what the paper does not use: clamps, force, friction."""
+    parts = lambda p: (p.near, p.far, p.normal)
+    nothing = jax.tree.map(jnp.zeros_like, parts(pull))
+    pull = eqx.tree_at(parts, pull, nothing)
+    return eqx.tree_at(lambda p: p.force, pull, None, is_leaf=lambda leaf: leaf is None)
+
+
+def begin(family: Family, pulls: Pull, place: Float[Array, " dim"], *, key: PRNGKeyArray) -> Model:
+    """An untrained model of stacked pulls, with networks of the paper's size."""
+    model = init(family, pulls, Recipe(width=WIDTH, layers=LAYERS), key=key)
+    return eqx.tree_at(lambda m: m.free, model, jnp.log(place / (1 - place)))
+
+
+def losses(model: Model, family: Family, pulls: Pull) -> tuple[Array, Array]:
+    """Mean squares of the markers' distances [m^2], and of the residual at the markers in every
+    frame [(N/m^2)^2]."""
+    fabric = family(model.place)
+
+    def of_pull(network, pull):
+        number, markers, _ = pull.displacement.shape
+        places = jnp.tile(pull.places, (number, 1))
+        frames = jnp.repeat(jnp.arange(number), markers)
+        motion = motion_residual(network, pull, fabric, places, frames, small)
+        return jnp.mean(marker_residual(network, pull) ** 2), jnp.mean(motion**2)
+
+    data, motion = jax.vmap(of_pull)(model.networks, pulls)
+    return jnp.mean(data), jnp.mean(motion)
+
+
+@eqx.filter_jit
+def run(
+    model: Model, states: Any, family: Family, pulls: Pull, first: Array, epochs: int
+) -> tuple[Model, Any, tuple[Array, Array]]:
+    """Some epochs from number `first` on; `states` of the optimisers, None at first."""
+    which = trainable(model)
+    weights, fixed = eqx.partition(model, which)
+    adam = optax.adam(ADAM_RATE)
+    lbfgs = optax.lbfgs(LBFGS_RATE, MEMORY, linesearch=None)
+    whole = lambda weights: eqx.combine(weights, fixed)
+
+    def epoch(carried, number):
+        weights, of_adam, of_lbfgs = carried
+        data, slope = jax.value_and_grad(lambda w: losses(whole(w), family, pulls)[0])(weights)
+        change, of_adam = adam.update(slope, of_adam)
+        weights = eqx.apply_updates(weights, change)
+        share = weight(number)
+        physics = lambda w: share * losses(whole(w), family, pulls)[1]
+        motion, slope = jax.value_and_grad(physics)(weights)
+        change, of_lbfgs = lbfgs.update(slope, of_lbfgs, weights)
+        return (eqx.apply_updates(weights, change), of_adam, of_lbfgs), (data, motion / share)
+
+    states = (adam.init(weights), lbfgs.init(weights)) if states is None else states
+    (weights, *states), values = jax.lax.scan(epoch, (weights, *states), first + jnp.arange(epochs))
+    return whole(weights), tuple(states), jax.tree.map(lambda v: v[-1], values)
+
+
+def train(
+    family: Family,
+    pulls: Pull,
+    place: Float[Array, " dim"],
+    epochs: int = EPOCHS,
+    chunk: int = 100,
+    *,
+    key: PRNGKeyArray,
+) -> Course:
+    """Train on stacked pulls, the fabric from a `place` in its family on.
+
+    Does not raise when it diverges: the course shows it.
+    """
+    pulls = plain(pulls)
+    model, states, course = begin(family, pulls, place, key=key), None, []
+    for first in range(0, epochs, chunk):
+        about = model, states, family, pulls, jnp.asarray(first), min(chunk, epochs - first)
+        model, states, (data, motion) = run(*about)
+        course.append((float(data), float(motion), np.asarray(model.place)))
+    data, motion, places = (np.array(part) for part in zip(*course, strict=True))
+    return Course(model, data, motion, places)

@@ -1,0 +1,236 @@
+"""Estimators: their derivatives, what they say of the recordings, files, and resumed runs."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+from r2s import presets, scenarios, synthetic
+from r2s.estimators import adam, cma_es, diffcloud, gauss_newton
+from r2s.estimators.descent import Effort, descend
+from r2s.estimators.estimate import Estimate, as_json, from_json
+from r2s.estimators.evidence import loss_of
+from r2s.estimators.prediction import _delayed, predict, sensitivities
+from r2s.estimators.problem import Doubt, Problem, window
+from r2s.family import OrthotropicFamily, Range
+from r2s.recording import set_time_offset
+
+ALL = Doubt(time=0.05, density=0.2, air=0.3)
+SMALL = Effort(coarse=2, starts=1, iterations=4)
+FABRIC = presets.grey_interlock()
+FAMILY = OrthotropicFamily.make(float(FABRIC.density))
+
+
+@pytest.fixture(scope="module")
+def recording():
+    motion = {"height": 0.2, "inward": 0.1, "moving": 0.6}
+    experiment = scenarios.lifting(num_frames=8, interval=1 / 10, **motion)
+    return synthetic.record(experiment, FABRIC, "grey", shape=(5, 5), key=jr.key(1))
+
+
+@pytest.fixture(scope="module")
+def small(recording):
+    """A problem of four frames on a coarse sheet, of which nothing is known for sure."""
+    return Problem.make(recording, FAMILY, num_points=60, shape=(5, 5), doubt=ALL)
+
+
+@pytest.fixture(scope="module")
+def pulled():
+    """A stretching of few frames, with markers and force."""
+    experiment = scenarios.stretching(num_frames=6, interval=1 / 10, strain=0.03, moving=0.4)
+    record = synthetic.record(experiment, FABRIC, "grey", shape=(5, 5), key=jr.key(3))
+    return Problem.make(record, FAMILY, shape=(5, 5))
+
+
+normal_at = jax.jit(gauss_newton.normal_at)
+AWAY = jnp.array([0.1, -0.2, 0.1, 0.3, 0.2, -0.1, 0.4])
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.01])
+@pytest.mark.parametrize("kind", ["small", "pulled"])
+def test_the_objective_has_the_gradient_that_differences_have(kind, scale, request):
+    """Gauss-Newton's gradient is that of the whole rollout: contact, nearest points, force."""
+    problems = (request.getfixturevalue(kind),)
+    unknown = jnp.concatenate([jnp.full(7, 0.45), AWAY])
+    normal = normal_at(problems, unknown, scale)
+    found = normal.gradient
+    width = 1e-4 if kind == "small" else 1e-3  # forces of a stiff sheet are rounded more
+    least = 1e-6 * float(jnp.max(jnp.abs(found)))
+    assert normal.loss == pytest.approx(float(jax.jit(_loss)(problems, unknown, scale)))
+    for index in range(14):
+        steps = [normal_at(problems, unknown.at[index].add(s * width), scale).loss for s in (1, -1)]
+        difference = float(steps[0] - steps[1]) / (2 * width)
+        assert float(found[index]) == pytest.approx(difference, rel=2e-3, abs=least)
+    moved = 14 if kind == "small" else 11  # what is not in doubt does not move it
+    assert np.count_nonzero(np.asarray(found)) == moved
+
+
+def _loss(problems, unknown, scale):
+    return gauss_newton.loss_at(problems, unknown, scale=scale)
+
+
+def test_a_narrow_secant_is_the_derivative(small):
+    unknown = jnp.concatenate([jnp.full(7, 0.45), AWAY])
+    _, exact = jax.jit(sensitivities)(small, unknown)
+    _, secant = jax.jit(lambda p, u: sensitivities(p, u, 1e-4))(small, unknown)
+    largest = float(jnp.max(jnp.abs(exact.x)))
+    assert np.asarray(secant.x) == pytest.approx(np.asarray(exact.x), abs=1e-4 * largest)
+
+
+def test_a_delay_by_frames_shifts_and_one_between_them_is_third_order():
+    times = jnp.arange(12.0)
+    x = jnp.stack([times**2, times, 3 - times], axis=1)[:, None]
+    shifted = _delayed(x, jnp.array(2.0))
+    np.testing.assert_allclose(shifted[4:], x[2:-2], atol=1e-12)
+    between = _delayed(x, jnp.array(0.3))  # exact for a quadratic, but at the ends
+    np.testing.assert_allclose(between[3:-2, 0, 0], (times[3:-2] - 0.3) ** 2, atol=1e-12)
+
+
+def test_an_early_camera_is_predicted_as_an_early_recording(recording):
+    """Clouds on a clock that is a frame early are explained, by that delay, as on the right one."""
+    late = set_time_offset(recording, -0.1)
+    doubt = Doubt(time=0.1)
+    place = FAMILY.locate(FABRIC)
+    unknown = lambda delay: jnp.concatenate([place, jnp.zeros(6), jnp.array([delay])])
+    loss = jax.jit(lambda p, u: loss_of(p, predict(p, u)))
+    whole = lambda r: Problem.make(r, FAMILY, num_points=60, shape=(5, 5), doubt=doubt)
+    make = lambda r: window(whole(r), 4, 6)  # the simulation ends where the recording does
+    same, shifted = float(loss(make(recording), unknown(0.0))), make(late)
+    assert float(loss(shifted, unknown(-1.0))) == pytest.approx(same, rel=0.02)
+    assert float(loss(shifted, unknown(0.0))) > 2 * same
+
+
+def test_recordings_of_one_fabric_add_up(small):
+    unknown = jnp.concatenate([jnp.full(7, 0.45), AWAY])
+    both = jnp.concatenate([unknown, unknown[-5:]])
+    one, two = normal_at((small,), unknown), normal_at((small, small), both)
+    assert two.loss == pytest.approx(float(one.loss), rel=1e-12)
+    same = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6 * np.max(np.abs(b)))
+    same(two.gradient[:9], one.gradient[:9])
+    same(two.matrix[:9, :9], one.matrix[:9, :9])
+    same(two.gradient[9:14], one.gradient[9:] / 2)
+    same(two.scatter[:9, :9], one.scatter[:9, :9] / 2)
+    assert np.all(np.asarray(two.matrix[9:14, 14:]) == 0)
+
+
+def test_an_estimate_lowers_the_loss_and_survives_its_file(small):
+    found = diffcloud.estimate(small, SMALL, key=jr.key(0))
+    assert np.nanmin(found.losses[-1]) < np.nanmin(found.losses[0])
+    again = from_json(as_json(found))
+    np.testing.assert_allclose(again.values, found.values)
+    np.testing.assert_allclose(again.history, found.history)
+    assert float(again.fabric.membrane.c12) == pytest.approx(float(found.fabric.membrane.c12))
+    names = ["density ratio", "air ratio", "shift x", "shift y", "shift z", "turn", "time"]
+    assert [c.name for c in again.conditions] == names
+    assert again.conditions == found.conditions and again.combinations == found.combinations
+
+
+def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(small, tmp_path):
+    path = tmp_path / "descent.npz"
+    whole = diffcloud.estimate(small, SMALL, key=jr.key(0))
+
+    class Stop(Exception):
+        pass
+
+    def stop(iteration, loss):
+        if iteration == 1:
+            raise Stop
+
+    with pytest.raises(Stop):
+        diffcloud.estimate(small, SMALL, checkpoint=path, progress=stop, key=jr.key(0))
+    seen = []
+    count = lambda iteration, loss: seen.append(iteration)
+    found = diffcloud.estimate(small, SMALL, checkpoint=path, progress=count, key=jr.key(0))
+    np.testing.assert_array_equal(found.values, whole.values)
+    np.testing.assert_array_equal(found.losses, whole.losses)
+    assert seen[0] == 2  # and did not begin again
+    with pytest.raises(ValueError, match="of another recording, family or setting"):
+        diffcloud.estimate(small, SMALL, checkpoint=path, key=jr.key(1))
+    path.write_bytes(b"nothing")
+    with pytest.raises(ValueError, match="no checkpoint"):
+        diffcloud.estimate(small, SMALL, checkpoint=path, key=jr.key(0))
+
+
+def test_what_is_known_of_a_product_is_said():
+    """Two parameters of which only the ratio is known, and a third that is."""
+    ranges = (
+        Range("a", "N/m", 1.0, 100.0),
+        Range("b", "N/m", 1.0, 100.0),
+        Range("c", "-", 0.1, 10.0),
+    )
+    spread, ratio = 0.5, 0.01
+    covariance = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 0]]) * spread**2
+    covariance += np.diag([ratio**2 / 2, ratio**2 / 2, 1e-4])
+    deviation = np.sqrt(np.diag(covariance))
+    found = Estimate(
+        "test", FABRIC, ranges, np.array([8.0, 2.0, 1.0]), deviation,
+        covariance / np.outer(deviation, deviation), (), 0.0, np.zeros((1, 1)),
+        np.zeros((1, 1, 3)), 0.0,
+    )  # fmt: skip
+    assert found.determined.tolist() == [False, False, True]
+    (known,) = found.combinations
+    assert sorted(known.exponents.values()) == [-1.0, 1.0] and set(known.exponents) == {"a", "b"}
+    assert known.value == pytest.approx(4 if known.exponents["a"] > 0 else 0.25)
+    assert known.deviation == pytest.approx(ratio, rel=1e-6)
+
+
+def test_a_window_leaves_the_other_frames_out(small, pulled):
+    part = window(small, 5, 6)
+    assert part.frames == (5, 6) and part.clouds is not None and small.clouds is not None
+    np.testing.assert_array_equal(part.clouds.points, small.clouds.points[1:3])
+    force, whole = window(pulled, 0, 1).force, pulled.force
+    assert force is not None and whole is not None and len(force.values) == 2
+    with pytest.raises(ValueError, match="no frame from 40 to 50 counts"):
+        window(small, 40, 50)
+
+
+def test_markers_must_lie_on_the_sheet():
+    experiment = scenarios.stretching(num_frames=4, interval=1 / 10, strain=0.03, moving=0.2)
+    record = synthetic.record(experiment, FABRIC, "grey", shape=(5, 5), key=jr.key(3))
+    assert record.markers is not None and record.markers_seen is not None
+    moved = dataclasses.replace(record, markers=record.markers + jnp.array([[[0.0, 0.3, 0.0]]]))
+    with pytest.raises(ValueError, match="marker .* mm off the sheet"):
+        Problem.make(moved, FAMILY, shape=(5, 5))
+    lost = dataclasses.replace(record, markers_seen=record.markers_seen.at[0, 7].set(False))
+    with pytest.raises(ValueError, match=r"markers \[7\] are not seen at rest"):
+        Problem.make(lost, FAMILY, shape=(5, 5))
+
+
+def test_the_recipe_and_cma_lower_their_losses(small):
+    with jax.numpy_dtype_promotion("standard"):  # optax counts its steps in integers
+        found = diffcloud.original(small, small.family.middle(), epochs=4)
+        recipe = diffcloud.recipe(small, start=jnp.full(7, 0.4), epochs=4)
+    assert found.loss < found.losses[0, 0] and recipe.loss < recipe.losses[0, 0]
+    assert np.all((found.values > [0.05, 0.1]) & (found.values < [10, 10]))
+    evolved = cma_es.estimate(small, evaluations=80, start=jnp.full(7, 0.9), key=jr.key(0))
+    again = cma_es.estimate(small, evaluations=80, start=jnp.full(7, 0.9), key=jr.key(0))
+    assert evolved.losses.min() < evolved.losses[0, 0]
+    np.testing.assert_array_equal(evolved.values, again.values)
+
+
+def test_a_loss_that_is_not_finite_at_the_start_is_an_error(small):
+    broken = lambda problem, seen: jnp.nan * jnp.sum(seen.x)
+    with jax.numpy_dtype_promotion("standard"), pytest.raises(RuntimeError, match="diverged"):
+        adam.descend(small, broken, approach="test", epochs=2, rate=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["camel_ponte_roma", "grey_interlock"])
+def test_a_known_fabric_and_a_late_clock_are_found(name):
+    """What the lift determines is within three deviations of the truth, and so is the delay."""
+    fabric = presets.FIVE[name]()
+    experiment = scenarios.lifting()
+    seen = synthetic.sensing(experiment)._replace(time_offset=0.08)
+    record = synthetic.record(experiment, fabric, name, seen=seen, key=jr.key(0))
+    family = OrthotropicFamily.make(float(fabric.density))
+    problem = Problem.make(record, family, doubt=Doubt(time=0.1))
+    found = descend(problem, approach="test", key=jr.key(0))
+    truth = np.asarray(family.values(family.locate(fabric)))
+    assert found.determined.sum() >= 3
+    error = np.abs(np.where(truth > 0, found.values / truth - 1, found.values - truth))
+    assert np.all(error[found.determined] < 0.1)
+    delay = found.conditions[-1]
+    assert delay.name == "time" and abs(delay.value - 0.08) < 0.01

@@ -1,0 +1,144 @@
+"""The network's derivatives, and the stress in a sheet, against others' derivations."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+from r2s.fabric import Fabric
+from r2s.family import IsotropicFamily
+from r2s.mesh import rectangle
+from r2s.physics.membrane import OrthotropicMembrane
+from r2s.physics.solid import LinearSolid
+from r2s.pinn.laws import (
+    PlaneStrainFamily,
+    TurnedMembrane,
+    divergence,
+    green,
+    nominal_stress,
+    small,
+    turned,
+)
+from r2s.pinn.network import STRONG, WEAK, Network
+
+FABRIC = Fabric.make(0.3, (200.0, 40.0, 120.0, 30.0), 1e-5, damping=0.02)
+ANGLE = jnp.asarray(0.4)
+
+
+def some_network(axes: int = 2) -> Network:
+    low, high = jnp.zeros(3), jnp.array([0.45, 0.3, 1.2])
+    about = {"axes": axes, "width": 9, "layers": 4}
+    return Network.make(low, high, jnp.asarray(0.02), **about, key=jr.key(0))
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+@pytest.mark.parametrize("pairs", [STRONG, WEAK])
+def test_jets_are_the_derivatives(pairs, axes):
+    network = some_network(axes)
+    points = jr.uniform(jr.key(1), (5, 3)) * jnp.array([[0.45, 0.3, 1.2]])
+    jet = network.jet(points, pairs)
+    one = lambda point: network(point[None])[0]
+    first = jax.vmap(jax.jacrev(one))(points)
+    second = jax.vmap(jax.hessian(one))(points)
+    np.testing.assert_allclose(jet.value, network(points), rtol=1e-12)
+    np.testing.assert_allclose(jet.first, jnp.moveaxis(first, 2, 0), rtol=1e-9, atol=1e-14)
+    for found, (i, j) in zip(jet.second, pairs, strict=True):
+        np.testing.assert_allclose(found, second[:, :, i, j], rtol=1e-9, atol=1e-13)
+
+
+def gradient(key: int, size: float):
+    return size * jr.normal(jr.key(key), (2, 2))
+
+
+def test_green_strain_does_not_see_a_rotation():
+    c, s = jnp.cos(0.7), jnp.sin(0.7)
+    rotation = jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
+    np.testing.assert_allclose(green(rotation - jnp.eye(2)), 0, atol=1e-15)
+
+
+def test_strains_agree_when_small():
+    change = gradient(2, 1e-7)
+    np.testing.assert_allclose(green(change), small(change), atol=1e-12)
+
+
+def test_stress_is_the_derivative_of_the_energy():
+    at, law = gradient(3, 0.05), TurnedMembrane(FABRIC.membrane, ANGLE)
+    expected = jax.grad(lambda g: law.energy_density(green(g)))(at)
+    np.testing.assert_allclose(nominal_stress(FABRIC, ANGLE, at), expected, rtol=1e-10)
+
+
+def test_damping_adds_the_stress_of_the_rate():
+    """Kelvin-Voigt: as if the strain were that of `damping` later, to first order."""
+    at, rate = gradient(3, 0.05), gradient(4, 1e-4)
+    found = nominal_stress(FABRIC, ANGLE, at, rate) - nominal_stress(FABRIC, ANGLE, at)
+    fast = jax.jvp(green, (at,), (rate,))[1]
+    law = TurnedMembrane(FABRIC.membrane, ANGLE)
+    viscous = 0.02 * jax.grad(law.energy_density)(fast)  # the law is linear
+    expected = jax.vjp(green, at)[1](viscous)[0]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("strain", [green, small])
+def test_divergence_against_differences(strain):
+    network = some_network()
+    fields = lambda x: jax.jacfwd(lambda p: network(p[None])[0])(jnp.append(x, 0.5))[:, :2]
+    stress = lambda x: nominal_stress(FABRIC, ANGLE, fields(x), strain=strain)
+    at, h = jnp.array([0.2, 0.1]), 1e-5
+    differences = [(stress(at + step) - stress(at - step)) / (2 * h) for step in h * jnp.eye(2)]
+    expected = differences[0][:, 0] + differences[1][:, 1]
+    changes = jnp.moveaxis(jax.jacfwd(fields)(at), 2, 0)
+    found = divergence(FABRIC, ANGLE, fields(at), changes, strain)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_turning_a_strain_turns_its_tensor():
+    strain = jnp.array([0.02, -0.01, 0.03])
+    e11, e22, shear = strain
+    tensor = jnp.array([[e11, shear / 2], [shear / 2, e22]])
+    c, s = jnp.cos(ANGLE), jnp.sin(ANGLE)
+    axes = jnp.array([[c, s], [-s, c]])  # warp and weft
+    there = axes @ tensor @ axes.T
+    found = turned(strain, ANGLE)
+    np.testing.assert_allclose(found, jnp.array([there[0, 0], there[1, 1], 2 * there[0, 1]]))
+
+
+def test_a_turned_isotropic_law_is_the_same():
+    law = OrthotropicMembrane.isotropic(1e5, 0.3, 1e-3)
+    strain = jnp.array([0.02, -0.01, 0.03])
+    found = TurnedMembrane(law, ANGLE).energy_density(strain)
+    np.testing.assert_allclose(found, law.energy_density(strain), rtol=1e-12)
+
+
+def test_plane_strain_is_that_of_the_solid():
+    """A sheet of 1 m is a block in 2-D, whose law is that of plane strain."""
+    family = PlaneStrainFamily.make(1.0)
+    place = jnp.array([0.3, 0.7])
+    modulus, ratio = family.values(place)
+    solid = LinearSolid.make(modulus, ratio)
+    change = gradient(5, 0.01)
+    expected = solid.energy_density(jnp.eye(2) + change)
+    found = family(place).membrane.energy_density(small(change))
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    np.testing.assert_allclose(family.locate(family(place)), place, rtol=1e-9)
+
+
+def test_plane_stress_is_softer_than_plane_strain():
+    place = jnp.array([0.3, 0.7])
+    stress, strain = (f.make(1.0)(place).membrane for f in (IsotropicFamily, PlaneStrainFamily))
+    assert float(stress.c11) < 0.9 * float(strain.c11)
+    np.testing.assert_allclose(stress.c33, strain.c33)
+
+
+def test_a_turned_law_stretches_a_sheet_of_the_cloth():
+    """The stored energy of a stretched mesh is that of the law at its strain."""
+    from r2s.scenarios.account import stored_energy
+
+    mesh = rectangle((0.2, 0.2), (3, 3))
+    fabric = dataclasses.replace(FABRIC, membrane=TurnedMembrane(FABRIC.membrane, ANGLE))
+    x = jnp.pad(mesh.rest * jnp.array([[1.05, 1.0]]), ((0, 0), (0, 1)))
+    strain = jnp.array([(1.05**2 - 1) / 2, 0.0, 0.0])
+    expected = 0.04 * fabric.membrane.energy_density(strain)
+    np.testing.assert_allclose(stored_energy(mesh, fabric, x), expected, rtol=1e-10)
