@@ -11,6 +11,7 @@ truth. What is done is kept in `runs.csv`, and not made again.
 
 import argparse
 import csv
+import itertools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -61,56 +62,73 @@ def errors(problem: Problem, estimate: Estimate, place: np.ndarray) -> np.ndarra
     return np.where(log, ratio - 1, estimate.values - truth)
 
 
+def loss_of(problem: Problem, estimate: Estimate) -> float:
+    """The default loss [m^2] of an estimate's fabric, cameras as written down."""
+    rest = jnp.zeros(gauss_newton.size((problem,)) - problem.family.dim, float)
+    return float(_loss((problem,), jnp.concatenate([problem.family.locate(estimate.fabric), rest])))
+
+
+def attempt(problem: Problem, place: np.ndarray, method: str, number: int) -> measure.Row:
+    """One estimate from a random start: its errors, loss [m^2] and times [s]."""
+    key = jax.random.key(100 + number)
+    start = jax.random.uniform(key, (problem.family.dim,), float)
+    before, clock = time.perf_counter(), time.process_time()
+    try:
+        found = METHODS[method](problem, start, key)
+    except RuntimeError:
+        return {
+            "errors": np.full(problem.family.dim, np.nan),
+            "loss": np.inf,
+            "seconds": np.nan,
+            "cpu_seconds": np.nan,
+        }
+    seconds, cpu = time.perf_counter() - before, time.process_time() - clock
+    wrong = errors(problem, found, place)
+    return {
+        "errors": wrong,
+        "loss": loss_of(problem, found),
+        "seconds": seconds,
+        "cpu_seconds": cpu,
+    }
+
+
 def run(out: Path, fabrics: list[str], scenario: str, methods: list[str], starts: int) -> None:
     out.mkdir(parents=True, exist_ok=True)
     path = out / "runs.csv"
-    rows = list(csv.DictReader(open(path))) if path.exists() else []
+    rows: list[dict] = list(csv.DictReader(open(path))) if path.exists() else []
     for name in fabrics:
         problem, place = problem_of(name, scenario)
-        truth = jnp.asarray(place, float)
-        best = alone(problem, truth, jax.random.key(0))
-        determined = best.determined
-        rest = jnp.zeros(gauss_newton.size((problem,)) - problem.family.dim, float)
-        at = lambda e: float(
-            _loss((problem,), jnp.concatenate([problem.family.locate(e.fabric), rest]))
-        )
-        floor = at(best)
-        for method in methods:
-            for number in range(starts):
-                done = {(r["scenario"], r["fabric"], r["method"], r["start"]) for r in rows}
-                if (scenario, name, method, str(number)) in done:
-                    continue
-                measure.progress(f"{scenario}, {name}, {method}, start {number}")
-                key = jax.random.key(100 + number)
-                start = jax.random.uniform(key, (problem.family.dim,), float)
-                before, clock = time.perf_counter(), time.process_time()
-                try:
-                    found = METHODS[method](problem, start, key)
-                    wrong, loss = errors(problem, found, place), at(found)
-                except RuntimeError:
-                    wrong, loss = np.full(problem.family.dim, np.nan), np.inf
-                worst = np.max(np.abs(wrong[determined]), initial=0.0)
-                rows.append(
-                    {
-                        "scenario": scenario,
-                        "fabric": name,
-                        "method": method,
-                        "start": str(number),
-                        "determined": int(determined.sum()),
-                        "worst": float(worst),
-                        "within": bool(worst <= 0.05),
-                        "arrived": bool(loss <= SAME * floor),
-                        "loss_mm2": 1e6 * loss,
-                        "seconds": time.perf_counter() - before,
-                        "cpu_seconds": time.process_time() - clock,
-                        "errors": " ".join(f"{e:.4f}" for e in wrong),
-                    }
-                )
-                with open(path, "w", newline="") as file:
-                    writer = csv.DictWriter(file, rows[0])
-                    writer.writeheader()
-                    writer.writerows(rows)
+        best = alone(problem, jnp.asarray(place, float), jax.random.key(0))
+        floor = loss_of(problem, best)
+        for method, number in itertools.product(methods, range(starts)):
+            label = {"scenario": scenario, "fabric": name, "method": method, "start": str(number)}
+            if any(label.items() <= row.items() for row in rows):
+                continue
+            measure.progress(", ".join(label.values()))
+            found = attempt(problem, place, method, number)
+            worst = float(np.max(np.abs(found["errors"][best.determined]), initial=0.0))
+            rows.append(
+                label
+                | {
+                    "determined": int(best.determined.sum()),
+                    "worst": worst,
+                    "within": worst <= 0.05,
+                    "arrived": found["loss"] <= SAME * floor,
+                    "loss_mm2": 1e6 * found["loss"],
+                    "seconds": found["seconds"],
+                    "cpu_seconds": found["cpu_seconds"],
+                    "errors": " ".join(f"{e:.4f}" for e in found["errors"]),
+                }
+            )
+            with open(path, "w", newline="") as file:
+                writer = csv.DictWriter(file, rows[0])
+                writer.writeheader()
+                writer.writerows(rows)
     summary(rows)
+
+
+def _share(rows: list[dict], name: str) -> float:
+    return float(np.mean([str(row[name]) == "True" for row in rows]))
 
 
 def summary(rows: list[dict]) -> None:
@@ -122,15 +140,14 @@ def summary(rows: list[dict]) -> None:
     lines = []
     for (scenario, method, fabric), members in groups.items():
         seconds = np.array([float(r["cpu_seconds"]) for r in members])
-        share = lambda name: np.mean([str(r[name]) == "True" for r in members])
         lines.append(
             {
                 "scenario": scenario,
                 "method": method,
                 "fabric": fabric,
                 "starts": len(members),
-                "within 5 %": share("within"),
-                "arrived": share("arrived"),
+                "within 5 %": _share(members, "within"),
+                "arrived": _share(members, "arrived"),
                 "median s": np.median(seconds),
                 "worst s": seconds.max(),
                 "median error": np.median([float(r["worst"]) for r in members]),

@@ -17,7 +17,7 @@ import time
 FRAMES, MARKERS, WIDTH, LAYERS = 39, 81, 50, 7
 DENSITY, SIDE, PULLED, DURATION = 0.3, 0.45, 0.018, 1.267  # [kg/m^2, m, m, s]
 STIFFNESS = 10.0  # [N/m]
-REPEATS = 15
+REPEATS = 5
 SHAPE = (33, 33)  # vertices of the sheets that are pulled
 
 

@@ -1,4 +1,4 @@
-"""The command line `r2s`: data sets, recordings, and their pictures. `r2s --help` begins.
+"""The command line `r2s`: data sets, recordings, pictures, plans. `r2s --help` begins.
 
 Exit codes: 0; 1 for an error, in one line on stderr; 2 for wrong usage. A command is a dataclass,
 whose fields are its arguments, with a method `run`; its docstring is its help. What it needs is
@@ -141,7 +141,53 @@ class Show:
             print(path)
 
 
-Command = Annotated[Data, subcommand("data")] | Annotated[Show, subcommand("show")]
+@dataclass(frozen=True)
+class Sensitivity:
+    """Say what a planned motion would reveal of a fabric, before anybody makes it.
+
+    Simulates the motion with a preset that is like the fabric, as seen by two depth cameras, and
+    prints how well each parameter would be known, and which combinations where one is not.
+    Numbers of the motion are those of `r2s.trajectories`, in SI units.
+
+        r2s sensitivity lifting --fabric black_denim --motion height=0.3 moving=2
+        r2s sensitivity wind --fabric grey_interlock --motion speed=3 --noise 0.002
+    """
+
+    scenario: Annotated[
+        Positional[Literal["lifting", "wind", "stretching", "folding", "fling", "shaking"]],
+        arg(metavar="SCENARIO"),
+    ]
+    """Of the study."""
+    fabric: str = "grey_interlock"
+    """A preset of `r2s.presets`."""
+    motion: Annotated[tuple[str, ...], arg(metavar="NAME=NUMBER")] = ()
+    """Numbers of the motion, such as height=0.3 [m]."""
+    noise: float = 1e-3
+    """Of each coordinate of a point, a standard deviation [m]."""
+    seed: int = 0
+    """Of the noise."""
+
+    def run(self) -> None:
+        from r2s.estimators.planned import describe, planned
+
+        numbers = dict(_number(text) for text in self.motion)
+        for line in describe(planned(self.scenario, self.fabric, numbers, self.noise, self.seed)):
+            print(line)
+
+
+def _number(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    try:
+        return name, float(value)
+    except ValueError:
+        raise ValueError(f"--motion expects NAME=NUMBER, such as height=0.3, got {text}") from None
+
+
+Command = (
+    Annotated[Data, subcommand("data")]
+    | Annotated[Show, subcommand("show")]
+    | Annotated[Sensitivity, subcommand("sensitivity")]
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,11 +1,10 @@
 """Bayesian optimisation by ask and tell, of any objective over a unit cube.
 
 Gaussian processes of scikit-optimize. It knows nothing of fabrics: the objective is any function
-that gives a loss for each of a batch of places.
+that gives a loss, not negative, for each of a batch of places.
 """
 
 import io
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +15,14 @@ from jaxtyping import Bool, Float
 
 from r2s.files import write_bytes
 
-FORMAT = "r2s-search/1"
+FORMAT = "r2s-search/2"
 Objective = Callable[[Float[np.ndarray, "place dim"]], Float[np.ndarray, " place"]]
 UNKNOWN_PENALTY = 1.0  # while no loss is finite
+LEAST = 1e-6  # of the greatest loss: what is less counts as this on the logarithmic scale
+
+CANDIDATES = 1000  # places anywhere, and as many around the best
+CENTRES = 5  # how many of the best
+WIDTHS = (0.01, 0.5)  # of the Gaussians around them, evenly on a logarithmic scale
 
 
 @dataclass(frozen=True)
@@ -67,10 +71,15 @@ def ask(
 ) -> Float[np.ndarray, "place dim"]:
     """The next `number` places to try.
 
-    The first `num_first` fill the cube evenly (Sobol's sequence); later ones have the greatest
-    expected improvement, each with those before it in the batch pretended to have given the best
-    loss so far (Ginsbourger, Le Riche and Carraro 2010: "constant liar"). They follow from history
-    and seed alone, so a search that goes on from a file asks the same as one that never stopped.
+    The first `num_first` fill the cube evenly (Sobol's sequence). Later ones have the greatest
+    expected improvement of a Gaussian process of the losses' logarithm, with noise, each with those
+    before it in the batch pretended to have given what the process expects (Ginsbourger, Le Riche
+    and Carraro 2010: "kriging believer").
+
+    They are sought among random places, half of them anywhere and half around the best so far:
+    where an optimiser of the expected improvement ends, in many dimensions, is on the cube's faces.
+    They follow from history and seed alone, so a search that goes on from a file asks the same as
+    one that never stopped.
     """
     done, dim = history.places.shape
     if done < num_first:
@@ -78,28 +87,36 @@ def ask(
 
         filled = qmc.Sobol(dim, rng=np.random.default_rng(seed)).random(_power_of_two(num_first))
         return filled[done : min(done + number, num_first)]
-    optimiser = _optimizer()(
-        [(0.0, 1.0)] * dim,
-        base_estimator="GP",
-        n_initial_points=0,
-        acq_func="EI",
-        random_state=np.random.RandomState([seed, done]),
-    )
-    with warnings.catch_warnings():  # that a place repeats, and that it took a random one instead
-        warnings.filterwarnings("ignore", "The objective has been evaluated", UserWarning)
-        optimiser.tell(history.places.tolist(), history.penalised.tolist())
-        asked = optimiser.ask(number, strategy="cl_min") if number > 1 else [optimiser.ask()]
-    return np.array(asked, float)
+    generator = np.random.default_rng([seed, done])
+    places, losses = history.places, history.penalised
+    least = max(LEAST * losses.max(), np.finfo(float).tiny)
+    values = np.log(np.maximum(losses, least))
+    process = _process(dim, np.random.RandomState([seed, done])).fit(places, values)
+    kernel = process.kernel_
+    for _ in range(number):
+        best = places[np.argsort(values)[:CENTRES]]
+        place = _most_promising(process, _candidates(best, generator), values.min())
+        places = np.concatenate([places, place[None]])
+        values = np.concatenate([values, process.predict(place[None])])
+        process = _process(dim, kernel=kernel).fit(places, values)
+    return places[done:]
 
 
 def tell(history: History, places: Any, losses: Any) -> History:
-    """The history with the losses of some places; raises `ValueError` when their numbers differ."""
+    """The history with the losses of some places.
+
+    Raises `ValueError` when their numbers differ, or a loss is negative.
+    """
     places, losses = np.asarray(places, float), np.asarray(losses, float)
     if losses.shape != (len(places),):
         raise ValueError(
             f"expected one loss for each of {len(places)} places, found the shape {losses.shape}"
         )
     losses = np.where(np.isfinite(losses), losses, np.nan)
+    if (losses < 0).any():
+        raise ValueError(
+            f"a loss is {np.nanmin(losses):g}: expected none below 0, as their logarithm is taken"
+        )
     return History(
         np.concatenate([history.places, places]), np.concatenate([history.losses, losses])
     )
@@ -162,6 +179,8 @@ def load(path: Path | str, about: dict[str, int]) -> History:
         history = History(stored["places"], stored["losses"])
     except Exception as error:  # a damaged file raises anything
         raise ValueError(f"{path}: no history of a search: {error}") from error
+    if stored["format"] != FORMAT:
+        raise ValueError(f"{path}: expected format {FORMAT}, found {stored['format']}")
     if found != about:
         raise ValueError(f"{path}: is of a search with {found}, asked for {about}: choose another")
     return history
@@ -171,11 +190,40 @@ def _power_of_two(number: int) -> int:
     return 1 << max(number - 1, 0).bit_length()
 
 
-def _optimizer() -> Any:
+def _candidates(
+    best: Float[np.ndarray, "centre dim"], generator: np.random.Generator
+) -> Float[np.ndarray, "place dim"]:
+    dim = best.shape[1]
+    anywhere = generator.random((CANDIDATES, dim))
+    widths = np.exp(generator.uniform(*np.log(WIDTHS), (CANDIDATES, 1)))
+    centres = best[generator.integers(len(best), size=CANDIDATES)]
+    around = centres + widths * generator.standard_normal((CANDIDATES, dim))
+    return np.concatenate([anywhere, np.clip(around, 0, 1)])
+
+
+def _most_promising(
+    process: Any, candidates: Float[np.ndarray, "place dim"], least: float
+) -> Float[np.ndarray, " dim"]:
+    from skopt.acquisition import gaussian_ei
+
+    return candidates[np.argmax(gaussian_ei(candidates, process, least, xi=0.0))]
+
+
+def _process(dim: int, random: Any = None, kernel: Any = None) -> Any:
+    """A Gaussian process whose kernel is to be fitted, or is given."""
     try:
-        from skopt import Optimizer
+        from skopt.learning import GaussianProcessRegressor
+        from skopt.learning.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
     except ImportError as error:
         raise ImportError(
             "Bayesian optimisation needs scikit-optimize: pip install 'r2s[physnet]'"
         ) from error
-    return Optimizer
+    if kernel is not None:
+        return GaussianProcessRegressor(kernel, optimizer=None, normalize_y=True)
+    smooth = ConstantKernel(1.0, (0.01, 1000.0)) * Matern([1.0] * dim, [(0.1, 20.0)] * dim, nu=2.5)
+    return GaussianProcessRegressor(
+        smooth + WhiteKernel(1e-2, (1e-6, 1.0)),
+        normalize_y=True,
+        n_restarts_optimizer=1,
+        random_state=random,
+    )

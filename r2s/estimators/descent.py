@@ -52,7 +52,7 @@ class Effort(NamedTuple):
     """
 
     coarse: int = 24
-    starts: int = 2
+    starts: int = 3
     iterations: int = 25
     width: float | None = None
 
@@ -88,8 +88,8 @@ def descend(
         if checkpoint is not None:
             save(checkpoint, identity, [_stacked(row) for row in rows])
         if progress is not None:
-            progress(len(rows) - 2, float(_best(problems, row)[1].normal.loss))
-    return _collect(problems, rows, approach, time.perf_counter() - began)
+            progress(len(rows) - 2, float(_best(row)[1].normal.loss))
+    return collect(problems, rows, approach, time.perf_counter() - began)
 
 
 def _begin(problems: Joint, effort: Effort, start, key) -> Row:
@@ -139,7 +139,7 @@ def _next(problems: Joint, effort: Effort, rows: list[Row]) -> Row | None:
     row = rows[-1]
     strict = any(float(descent.scale) > 0 for descent in row)
     stage = [r for r in rows if any(float(descent.scale) > 0 for descent in r) == strict]
-    which, best = _best(problems, row)
+    which, best = _best(row)
     prior = _weight(problems, best.normal)
     moving = [i for i in range(len(row)) if not _arrived(problems, stage, i, prior)]
     moving = [i for i in moving if i == which] if strict else moving
@@ -158,14 +158,14 @@ def _strict(problems: Joint, effort: Effort, row: Row) -> Row:
 
     Outliers lie to one side of a sheet, so that even a small pull of theirs biases the estimate.
     """
-    which, best = _best(problems, row)
+    which, best = _best(row)
     scale = float(np.clip(STRICT * float(best.normal.spread), *SCALES))
     after = list(row)
     (after[which],) = _fresh(problems, effort, [best.unknown], scale)
     return after
 
 
-def _best(problems: Joint, row: Row) -> tuple[int, Descent]:
+def _best(row: Row) -> tuple[int, Descent]:
     """The descent with outliers left out, or else that of the least loss."""
     finest = [i for i, descent in enumerate(row) if float(descent.scale) > 0]
     which = finest[0] if finest else int(np.argmin([float(d.normal.loss) for d in row]))
@@ -201,9 +201,10 @@ def _resumed(checkpoint: Path, identity: str, effort: Effort) -> list[Row]:
     return [each(row) for row in load(checkpoint, identity, like)]
 
 
-def _collect(problems: Joint, rows: list[Row], approach: str, seconds: float) -> Estimate:
+def collect(problems: Joint, rows: list[Row], approach: str, seconds: float) -> Estimate:
+    """The estimate of the best descent of the last of some iterations."""
     family = problems[0].family
-    _, best = _best(problems, rows[-1])
+    _, best = _best(rows[-1])
     prior = _weight(problems, best.normal)
     unknown = best.unknown
     whole = np.asarray(_covariance(problems, best, prior))

@@ -125,8 +125,8 @@ def normal_at(
     return Normal(sums.loss, spread, sums.gradient, sums.matrix, sums.scatter)
 
 
-def _prior(problems: Joint, unknown):
-    """Difference from the expected unknown, and the inverse of its variance."""
+def pull(problems: Joint, unknown: Unknown) -> tuple[Unknown, Unknown]:
+    """Difference from the unknown that the prior expects, and the inverse of its variance."""
     dim, rest = problems[0].family.dim, size(problems) - problems[0].family.dim
     expected = jnp.concatenate([jnp.full(dim, 0.5, float), jnp.zeros(rest, float)])
     spread = jnp.concatenate([jnp.full(dim, PRIOR_DEVIATION, float), jnp.ones(rest, float)])
@@ -139,7 +139,7 @@ def prior_weight(problems: Joint, normal: Normal) -> Float[Array, ""]:
     The likelihood is exp(-loss / weight) when the gradient scatters like weight times the matrix
     (magnitude adjustment of a composite likelihood, Pauli, Racugno and Ventura 2011).
     """
-    _, precision = _prior(problems, jnp.zeros(size(problems), float))
+    _, precision = pull(problems, jnp.zeros(size(problems), float))
     frames = sum(len(problem.frames) for problem in problems)
     least = jnp.maximum(normal.spread, FINEST) ** 2 / (frames * CLUSTERS)
     inverse = jnp.linalg.inv(normal.matrix + least * jnp.diag(precision))
@@ -149,8 +149,8 @@ def prior_weight(problems: Joint, normal: Normal) -> Float[Array, ""]:
 
 def objective(problems: Joint, unknown, loss, prior) -> Float[Array, ""]:
     """Loss and prior [m^2] at an unknown."""
-    pull, precision = _prior(problems, unknown)
-    return loss + prior * jnp.sum(pull**2 * precision) / 2
+    off, precision = pull(problems, unknown)
+    return loss + prior * jnp.sum(off**2 * precision) / 2
 
 
 def covariance(problems: Joint, descent: Descent, prior) -> Float[Array, "unknown unknown"]:
@@ -159,9 +159,9 @@ def covariance(problems: Joint, descent: Descent, prior) -> Float[Array, "unknow
     To it comes the square of the Gauss-Newton step that would be next, so that a descent which has
     not arrived does not claim to know.
     """
-    pull, precision = _prior(problems, descent.unknown)
+    off, precision = pull(problems, descent.unknown)
     inverse = jnp.linalg.inv(descent.normal.matrix + prior * jnp.diag(precision))
-    step = inverse @ (descent.normal.gradient + prior * precision * pull)
+    step = inverse @ (descent.normal.gradient + prior * precision * off)
     spread = descent.normal.scatter + prior**2 * jnp.diag(precision)
     return inverse @ spread @ inverse + jnp.outer(step, step)
 
@@ -177,8 +177,8 @@ def remaining(problems: Joint, descent: Descent, prior) -> Float[Array, ""]:
 def _equations(problems: Joint, descent: Descent, prior):
     """Gradient and matrix with the prior, and which unknowns would leave the unit cube."""
     unknown = descent.unknown
-    pull, precision = _prior(problems, unknown)
-    gradient = descent.normal.gradient + prior * precision * pull
+    off, precision = pull(problems, unknown)
+    gradient = descent.normal.gradient + prior * precision * off
     matrix = descent.normal.matrix + prior * jnp.diag(precision)
     bounded = jnp.arange(unknown.shape[0]) < problems[0].family.dim
     stuck = bounded & (unknown <= MARGIN) & (gradient > 0)

@@ -300,21 +300,20 @@ def balance(
             here.append(reduced(solved, pull, basis))
         information, right = _normal(here, pulls, marker, force)
         normal = information + FLAT_PRIOR * np.eye(len(place))
-        change = np.linalg.solve(normal, right + FLAT_PRIOR * (0.5 - place))
-        turned = change @ normal @ last < 0
-        if turned and np.abs(last).max() < LONGEST:
-            longest = max(np.abs(last).max() / 2, 1e-3)
-        factor = min(1.0, longest / max(np.abs(change).max(), 1e-12))
-        after = np.clip(place + factor * change, INSIDE, 1 - INSIDE)
+        change = _step(normal, right + FLAT_PRIOR * (0.5 - place), place)
+        whole = bool(np.all(np.abs(change) <= longest))
+        if whole and change @ normal @ last < 0:  # friction is curved: Newton may go to and fro
+            longest = max(np.abs(change).max() / 2, 1e-3)
+        after = np.clip(place + np.clip(change, -longest, longest), INSIDE, 1 - INSIDE)
         last, place = after - place, after
         marker_left = _rms([one.markers for one in here])
         force_left = _rms([one.force / _greatest(p) for one, p in zip(here, pulls, strict=True)])
         losses.append(marker_left**2)
         places.append(place)
-        if factor == 1.0:  # what is left of a longer step is not noise
+        if whole:  # what is left of a longer step is not noise
             marker, force = max(marker_left, LEAST_NOISE[0]), max(force_left, LEAST_NOISE[1])
         deviations = np.sqrt(np.diag(np.linalg.inv(normal)))
-        if factor == 1.0 and np.all(np.abs(last) < SMALL * deviations):
+        if whole and np.all(np.abs(last) < SMALL * deviations):
             converged = True
             break
     covariance, history = np.linalg.inv(normal), (np.array(places), np.array(losses))
@@ -334,6 +333,16 @@ def _normal(here: list[Reduced], pulls: list[Pull], marker: float, force: float)
             information += slope.T @ slope
             right -= slope.T @ value
     return information, right
+
+
+def _step(normal: np.ndarray, right: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """The step of Newton's, along the ends of the ranges where it would leave them."""
+    change = np.linalg.solve(normal, right)
+    out = (place <= INSIDE) & (change < 0) | (place >= 1 - INSIDE) & (change > 0)
+    free = np.flatnonzero(~out)
+    change = np.zeros_like(change)
+    change[free] = np.linalg.solve(normal[np.ix_(free, free)], right[free])
+    return change
 
 
 def _greatest(pull: Pull) -> float:

@@ -17,7 +17,8 @@ from r2s.fabric import Fabric
 from r2s.physics.contact import friction_dissipation
 from r2s.pinn.data import Pull
 from r2s.pinn.laws import Strain, divergence, green, nominal_stress
-from r2s.pinn.network import STRONG, Jet, Network, T
+from r2s.pinn.network import STRONG, DisplacementField, Jet, T
+from r2s.units import Scalar
 
 TOLERANCE = 0.01  # of the stress in the sheet, to which equations are to hold
 EDGE_NODES = 6  # of Gauss, along an edge
@@ -66,7 +67,7 @@ def plain_scales() -> Scales:
     return Scales(*(jnp.ones((), float) for _ in Scales._fields))
 
 
-def scales_of(pull: Pull, fabric: Fabric, marker: float, force: float) -> Scales:
+def scales_of(pull: Pull, fabric: Fabric, marker: Scalar, force: Scalar) -> Scales:
     """Known magnitudes: the noise of markers [m] and force [N], and the stress in the sheet.
 
     The stress is the measured force over the width; without force that of the `fabric` as it is
@@ -95,7 +96,7 @@ def draw_points(pull: Pull, count: int, *, key: PRNGKeyArray) -> Points:
 
 
 def field(
-    network: Network,
+    network: DisplacementField,
     pull: Pull,
     places: Float[Array, "point 2"],
     frames: Int[Array, " point"],
@@ -117,7 +118,7 @@ def field(
 
 
 def displacement(
-    network: Network,
+    network: DisplacementField,
     pull: Pull,
     places: Float[Array, "point 2"],
     frames: Int[Array, " point"],
@@ -151,7 +152,7 @@ def load(
 
 
 def motion_residual(
-    network: Network, pull: Pull, fabric: Fabric, places, frames, strain: Strain = green
+    network: DisplacementField, pull: Pull, fabric: Fabric, places, frames, strain: Strain = green
 ) -> Float[Array, "point axis"]:
     """Residual [N/m^2] of the equation of motion at points and frames: stress against load."""
     jet = field(network, pull, places, frames, STRONG)
@@ -166,7 +167,7 @@ def motion_residual(
 
 
 def edge_force(
-    network: Network, pull: Pull, fabric: Fabric, strain: Strain = green
+    network: DisplacementField, pull: Pull, fabric: Fabric, strain: Strain = green
 ) -> Float[Array, "frame axis"]:
     """The force [N] on the far clamp: the traction, integrated over the edge in every frame."""
     nodes, weights = _gauss(EDGE_NODES)
@@ -181,7 +182,7 @@ def edge_force(
     return pull.size[1] * jnp.einsum("q,tqi->ti", weights, traction)
 
 
-def marker_residual(network: Network, pull: Pull) -> Float[Array, "frame marker axis"]:
+def marker_residual(network: DisplacementField, pull: Pull) -> Float[Array, "frame marker axis"]:
     """How far [m] the network is from the markers; zero where they are not seen."""
     number, markers, axes = pull.displacement.shape
     places = jnp.tile(pull.places, (number, 1))
@@ -190,7 +191,7 @@ def marker_residual(network: Network, pull: Pull) -> Float[Array, "frame marker 
     return jnp.where(pull.seen[..., None], off, 0)
 
 
-def clamp_residual(network: Network, pull: Pull) -> Float[Array, "point axis"]:
+def clamp_residual(network: DisplacementField, pull: Pull) -> Float[Array, "point axis"]:
     """How far [m] the network is from the clamps, at nodes on both of them in every frame."""
     nodes, _ = _gauss(EDGE_NODES)
     number = len(pull.times)
@@ -202,7 +203,7 @@ def clamp_residual(network: Network, pull: Pull) -> Float[Array, "point axis"]:
     return displacement(network, pull, places, frames) - far
 
 
-def common_losses(network: Network, pull: Pull, scales: Scales):
+def common_losses(network: DisplacementField, pull: Pull, scales: Scales):
     """The losses of markers and clamps, which every form has."""
     off = marker_residual(network, pull)
     share = jnp.mean(pull.seen, dtype=off.dtype)
@@ -211,7 +212,7 @@ def common_losses(network: Network, pull: Pull, scales: Scales):
 
 
 def strong_losses(
-    network: Network,
+    network: DisplacementField,
     pull: Pull,
     fabric: Fabric,
     points: Points,

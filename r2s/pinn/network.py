@@ -4,6 +4,8 @@ The derivatives are carried forward through the layers beside the value, all in 
 a layer: no backward pass is nested in another.
 """
 
+from typing import Protocol, runtime_checkable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -27,6 +29,19 @@ class Jet(eqx.Module):
     value: Float[Array, "*point axis"]
     first: Float[Array, "3 *point axis"]
     second: Float[Array, "pair *point axis"]
+
+
+@runtime_checkable
+class DisplacementField(Protocol):
+    """What the losses ask of a network; an exact solution will do."""
+
+    def __call__(self, points: Float[Array, "point 3"]) -> Float[Array, "point axis"]:
+        """Displacements [m] at points (X [m], Y [m], t [s])."""
+        ...
+
+    def jet(self, points: Float[Array, "point 3"], pairs: tuple[tuple[int, int], ...]) -> Jet:
+        """Displacements with first derivatives, and second ones in pairs of inputs."""
+        ...
 
 
 class Network(eqx.Module):

@@ -1,10 +1,10 @@
 """The paper's recipe, as a preset to compare with (Ru et al. 2025).
 
-Two losses in SI units: markers by Adam at 1e-4, and the equation of motion in small strain by L-BFGS
-with steps of 0.1, with the stiffness trainable and a weight of 0.1 that rises by 0.1 every 500
-epochs up to 1; 10,000 epochs. No force enters, so nothing fixes the scale of the stiffness: what
-comes out is where it started, or what the descent made of it. The paper does not say how the two
-optimisers take turns; here each makes a step in every epoch.
+Two losses in SI units: markers by Adam at 1e-4, and the equation of motion in small strain by
+L-BFGS with steps of 0.1, with the stiffness trainable and a weight of 0.1 that rises by 0.1 every
+500 epochs up to 1; 10,000 epochs. No force enters, so nothing fixes the scale of the stiffness:
+what comes out is where it started, or what the descent made of it. The paper does not say how the
+two optimisers take turns; here each makes a step in every epoch.
 """
 
 from typing import Any, NamedTuple

@@ -17,7 +17,7 @@ from r2s.fabric import Fabric
 from r2s.pinn.data import Pull
 from r2s.pinn.laws import Strain, green, nominal_stress
 from r2s.pinn.losses import Losses, Points, Scales, common_losses, field, gradients, load
-from r2s.pinn.network import WEAK, Network, T
+from r2s.pinn.network import WEAK, DisplacementField, T
 
 NODES = 12  # of the quadrature, along each side
 FEW_NODES, FEW_DEGREES = 8, (3, 4)  # of the loss of the network
@@ -81,7 +81,7 @@ class Kinematics(NamedTuple):
 
 
 def kinematics(
-    network: Network, pull: Pull, virtual: Virtual, frames: Int[Array, " frame"]
+    network: DisplacementField, pull: Pull, virtual: Virtual, frames: Int[Array, " frame"]
 ) -> Kinematics:
     """The motion that a network gives, at the nodes in some frames."""
     number, nodes = len(frames), len(virtual.nodes)
@@ -119,7 +119,7 @@ def end_value(virtual: Virtual) -> Float[Array, ""]:
 
 
 def weak_losses(
-    network: Network,
+    network: DisplacementField,
     pull: Pull,
     fabric: Fabric,
     points: Points,

@@ -1,0 +1,54 @@
+"""A motion that is planned: what it would reveal, in words."""
+
+import inspect
+
+import jax
+
+from r2s import presets, scenarios, synthetic
+from r2s.estimators.estimate import Estimate
+from r2s.estimators.problem import Problem
+from r2s.estimators.trust import sensitivity
+from r2s.family import OrthotropicFamily
+
+
+def planned(
+    scenario: str, fabric: str, numbers: dict[str, float], noise: float = 1e-3, seed: int = 0
+) -> Estimate:
+    """What a scenario with these numbers would reveal of a preset; `noise` of the clouds [m].
+
+    Raises `ValueError` for an unknown scenario, preset or number, and for numbers out of range.
+    """
+    if scenario not in scenarios.SIX:
+        raise ValueError(f"a scenario is one of {', '.join(scenarios.SIX)}, got {scenario!r}")
+    if fabric not in presets.FIVE:
+        raise ValueError(f"a preset is one of {', '.join(presets.FIVE)}, got {fabric!r}")
+    if not noise >= 0:
+        raise ValueError(f"noise must not be negative [m], got {noise:g}")
+    try:
+        experiment = scenarios.SIX[scenario](**numbers)
+    except TypeError as error:
+        known = inspect.signature(getattr(scenarios, scenario)).parameters
+        raise ValueError(f"{scenario}: {error}; it takes {', '.join(known)}") from None
+    chosen = presets.FIVE[fabric]()
+    seen = synthetic.sensing(experiment)._replace(noise=noise)
+    key = jax.random.key(seed)
+    recording = synthetic.record(experiment, chosen, fabric, seen=seen, key=key)
+    family = OrthotropicFamily.make(float(chosen.density))
+    return sensitivity(Problem.make(recording, family), chosen)
+
+
+def describe(estimate: Estimate) -> list[str]:
+    """One line a parameter, and one a combination: how well each would be known."""
+    lines = []
+    rows = zip(
+        estimate.ranges, estimate.values, estimate.deviations, estimate.determined, strict=True
+    )
+    for bound, value, deviation, determined in rows:
+        unit = "" if bound.unit == "-" else f" {bound.unit}"
+        spread = f"{deviation:.1%}" if bound.log else f"{deviation:.3f}"
+        word = "determined" if determined else "not determined"
+        lines.append(f"{bound.name:14s}{value:10.4g}{unit:6s} +- {spread:8s}{word}")
+    for found in estimate.combinations:
+        powers = " ".join(f"{name}^{power:g}" for name, power in found.exponents.items())
+        lines.append(f"known to {found.deviation:.1%}: {powers}")
+    return lines
