@@ -17,7 +17,7 @@ import time
 FRAMES, MARKERS, WIDTH, LAYERS = 39, 81, 50, 7
 DENSITY, SIDE, PULLED, DURATION = 0.3, 0.45, 0.018, 1.267  # [kg/m^2, m, m, s]
 STIFFNESS = 10.0  # [N/m]
-REPEATS = 5
+REPEATS, TOGETHER = 5, 10  # calls, and epochs in a call
 SHAPE = (33, 33)  # vertices of the sheets that are pulled
 
 
@@ -124,32 +124,39 @@ def epochs(torch_python: str | None) -> list[dict]:
     weights, fixed = eqx.partition(model, trainable(model))
     optimiser = optax.adam(1e-4)
 
-    def epoch_of(losses_of):
+    def epochs_of(losses_of):
+        """A function that makes `TOGETHER` epochs of Adam in one call, as a training does."""
+
         @jax.jit
-        def epoch(weights, state):
+        def run(weights, state, pulls):
             def loss(weights):
-                data, motion = losses_of(eqx.combine(weights, fixed))
+                data, motion = losses_of(eqx.combine(weights, fixed), family, pulls)
                 return data + 0.1 * motion
 
-            change, state = optimiser.update(jax.grad(loss)(weights), state)
-            return eqx.apply_updates(weights, change), state
+            def epoch(carried, _):
+                weights, state = carried
+                change, state = optimiser.update(jax.grad(loss)(weights), state)
+                return (eqx.apply_updates(weights, change), state), None
+
+            return jax.lax.scan(epoch, (weights, state), None, TOGETHER)[0]
 
         state = optimiser.init(weights)
-        return lambda: jax.block_until_ready(epoch(weights, state))
+        return lambda: jax.block_until_ready(run(weights, state, pulls))
 
-    rows = [{"epoch": "forward jets", **timed(epoch_of(lambda m: paper.losses(m, family, pulls)))}]
-    nested = lambda m: _nested_losses(jax, jnp, m, family, pulls)
-    rows.append({"epoch": "nested reverse, JAX", **timed(epoch_of(nested))})
+    each = lambda call: {name: s / TOGETHER for name, s in timed(call).items()}
+    rows = [{"epoch": "forward jets", **each(epochs_of(paper.losses))}]
+    nested = lambda model, family, pulls: _nested_losses(jax, jnp, model, family, pulls)
+    rows.append({"epoch": "nested reverse, JAX", **each(epochs_of(nested))})
     states = None
 
-    def ten_of_the_paper():
+    def of_the_paper():
         nonlocal model, states
-        model, states, values = paper.run(model, states, family, pulls, jnp.asarray(0), 10)
+        about = model, states, family, pulls, jnp.asarray(0), TOGETHER
+        model, states, values = paper.run(*about)
         jax.block_until_ready(values)
 
-    ten_of_the_paper()
-    row = {name: seconds / 10 for name, seconds in timed(ten_of_the_paper).items()}
-    rows.append({"epoch": "the paper's recipe (Adam and L-BFGS)", **row})
+    of_the_paper()
+    rows.append({"epoch": "the paper's recipe (Adam and L-BFGS)", **each(of_the_paper)})
     if torch_python:
         out = subprocess.run([torch_python, __file__, "torch"], stdout=subprocess.PIPE, check=True)
         rows.append({"epoch": "nested reverse, PyTorch", **json.loads(out.stdout)})
@@ -239,7 +246,7 @@ def fabrics(seeds: int) -> list[dict]:
     return rows
 
 
-def recipes(name: str, seeds: int, number: int) -> list[dict]:
+def recipes(name: str, seeds: int, number: int, alone: bool) -> list[dict]:
     """Rows of the recipes on the same data: the paper's, our networks alone, and the estimate."""
     import equinox as eqx
     import jax.random as jr
@@ -257,7 +264,6 @@ def recipes(name: str, seeds: int, number: int) -> list[dict]:
     family = OrthotropicFamily.make(float(fabric.density))
     ten = Fabric.make(float(fabric.density), (10.0, 0.0, 10.0, 10.0), 1e-5)
     place = family.locate(ten)
-    long = {"warm_up": 500, "adam": 1500, "lbfgs": 100}
     rows = []
 
     def note(recipe, seed, began, values):
@@ -275,8 +281,8 @@ def recipes(name: str, seeds: int, number: int) -> list[dict]:
         note(f"the paper's, {number} epochs", seed, began, family.values(course.model.place))
         began = clock()
         note("ours", seed, began, estimate(some, family, key=key).estimate.values)
-        for form in (weak_losses, strong_losses) if seed == 0 else ():
-            began, recipe = clock(), Recipe(losses=form, **long)
+        for form in (weak_losses, strong_losses) if alone else ():
+            began, recipe = clock(), Recipe(losses=form, lbfgs=100)
             found = estimate(some, family, recipe, key=key)
             note(f"network alone, {form.__name__}", seed, began, found.network.values)
         eqx.clear_caches()
@@ -284,12 +290,13 @@ def recipes(name: str, seeds: int, number: int) -> list[dict]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("what", choices=("epochs", "fabrics", "recipes", "torch"))
     parser.add_argument("--torch", help="python of an environment with PyTorch")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--epochs", type=int, default=10_000, help="of the paper's recipe")
     parser.add_argument("--fabric", default="pink_solid")
+    parser.add_argument("--alone", action="store_true", help="long trainings of networks alone too")
     options = parser.parse_args()
     if options.what == "torch":
         print(json.dumps(torch_epoch()))
@@ -299,7 +306,7 @@ def main() -> None:
     elif options.what == "fabrics":
         fabrics(options.seeds)
     else:
-        recipes(options.fabric, options.seeds, options.epochs)
+        recipes(options.fabric, options.seeds, options.epochs, options.alone)
     sys.stdout.flush()
 
 

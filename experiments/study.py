@@ -37,8 +37,8 @@ if __name__ == "__main__":
     parser.add_argument("--only", default="", help="regular expression for names of lifts")
     parser.add_argument("--recipe", default="default", choices=("default", "original"))
     parser.add_argument("--coarse", type=int, default=24, help="places of the coarse search")
-    parser.add_argument("--starts", type=int, default=2, help="descents from the best of them")
-    parser.add_argument("--iterations", type=int, default=12, help="Gauss-Newton steps")
+    parser.add_argument("--starts", type=int, default=3, help="descents from the best of them")
+    parser.add_argument("--iterations", type=int, default=25, help="Gauss-Newton steps")
     parser.add_argument("--seed", type=int, default=0)
     a = parser.parse_args()
     try:

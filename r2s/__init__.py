@@ -15,7 +15,8 @@ In reading order:
 - `video`, `markers`, `plane`, `forces`: stretching, from a video and a force log.
 - `data`, `rgbench`: public data sets. `show`, `cli`: pictures, and the command line.
 - `surface`, `losses`, `metrics`: distances between clouds and sheets.
-- `estimators`: DIFFCLOUD. `study`: the main job, its tables and report.
+- `estimators`: DIFFCLOUD, DiffCP, CMA-ES, PhysNet, the physics-informed network.
+- `study`: the main job, its tables and report.
 """
 
 from r2s.cloth import Cloth, ClothState

@@ -64,7 +64,7 @@ def test_a_force_of_one_number_is_along_the_pull():
     whole = recording()
     number = np.asarray(whole.force)[:, 0]
     found = pull_from(dataclasses.replace(whole, force=jnp.asarray(number)))
-    np.testing.assert_allclose(found.force, number)
+    np.testing.assert_allclose(np.asarray(found.force), number)
 
 
 def test_a_marker_that_is_not_seen_for_a_while_is_left_out():

@@ -121,15 +121,19 @@ def _found(trained: Trained, i: int, pulls, family, recipe, noise, seconds: floa
         history[:, None],
         seconds,
     )
-    balanced = balance(family, networks, pulls, np.asarray(model.place), *noise, recipe.strain)
-    fewer = (DEGREES[0] - 1, DEGREES[1] - 1)
-    about_that = balanced.place, balanced.marker, balanced.force, recipe.strain, fewer
-    coarser = balance(family, networks, pulls, *about_that)
-    model_error = np.abs(coarser.place - balanced.place) + _unmodelled(family)
-    covariance = balanced.covariance + np.diag(model_error**2)
-    balanced = balanced._replace(covariance=covariance)
+    balanced = _balanced(family, networks, pulls, np.asarray(model.place), noise, recipe)
     seconds += time.perf_counter() - began
     return Found(_estimate(balanced, family, network, f"pinn ({about})", pulls, seconds), network)
+
+
+def _balanced(family: Family, networks, pulls, place, noise, recipe: Recipe) -> Balanced:
+    """The estimate from the weak form, with what it owes to the number of virtual displacements."""
+    found = balance(family, networks, pulls, place, noise[0], noise[1], recipe.strain, DEGREES)
+    about = found.place, found.marker, found.force, recipe.strain
+    fewer = DEGREES[0] - 1, DEGREES[1] - 1
+    difference = balance(family, networks, pulls, *about, degrees=fewer).place - found.place
+    more = np.outer(difference, difference) + np.diag(_unmodelled(family) ** 2)
+    return found._replace(covariance=found.covariance + more)
 
 
 def _unmodelled(family: Family) -> np.ndarray:

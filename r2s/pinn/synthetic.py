@@ -33,15 +33,15 @@ def pulled(
     force_noise: float = FORCE_NOISE,
     max_step: float = 1 / 30,
     key: PRNGKeyArray,
-    **path: float,
+    strain: float = 0.04,
 ) -> Recording:
     """A stretching of a fabric whose warp is turned from the pull by an `angle` [rad].
 
     81 markers with `marker_noise` [m], and a force with `force_noise` [-] of its greatest. Steps
     of at most `max_step` [s]: by default one a frame, so that a force is that at its frame's time
-    and not a mean. `path`: of `r2s.trajectories.pull`. Raises `RuntimeError` when it diverges.
+    and not a mean. The pull is by `strain` [-] of the sheet's length. Raises `RuntimeError` when it diverges.
     """
-    experiment = stretching(num_frames=frames, **path)
+    experiment = stretching(num_frames=frames, strain=strain)
     scenario = experiment.scenario(shape)
     turned = dataclasses.replace(
         fabric, membrane=TurnedMembrane(fabric.membrane, jnp.asarray(angle, float))

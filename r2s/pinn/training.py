@@ -50,8 +50,8 @@ class Model(eqx.Module):
 class Recipe:
     """How to train.
 
-    - `losses`: `strong_losses` or `r2s.pinn.weak.weak_losses`. - `weights`: of their terms; 0
-      leaves one out. - `strain`: `green` or `small`.
+    - `losses`: `strong_losses` or `r2s.pinn.weak.weak_losses`. - `weights`: of their terms, in
+      the order of `Losses`; 0 leaves one out. - `strain`: `green` or `small`.
     - `warm_up`, `adam`, `lbfgs`: epochs without and with physics by Adam, and iterations.
     - `rate`: of Adam, falling to a hundredth by a cosine. - `fabric_rate`: that of the fabric's
       parameters, as a multiple.
@@ -61,7 +61,7 @@ class Recipe:
     """
 
     losses: LossesOf = strong_losses
-    weights: Losses = Losses(1.0, 1.0, 1.0, 1.0, 1.0)
+    weights: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0, 1.0)
     strain: Strain = green
     warm_up: int = 500
     adam: int = 1500
@@ -185,6 +185,7 @@ def adam_chunk(
 ) -> tuple[Progress, Losses]:
     """Some epochs of Adam for every fabric, on points drawn anew; the losses of the last one."""
     which, optimiser = trainable(progress.model), adam(recipe)
+    faster = lambda change: recipe.fabric_rate * change
 
     def run(progress: Progress, family: Family, pulls: Pull, key: PRNGKeyArray):
         points = redrawn(progress.model, family, pulls, recipe, key)
@@ -197,7 +198,7 @@ def adam_chunk(
             )
             gradient, losses = jax.grad(loss, has_aux=True)(weights)
             change, state = optimiser.update(gradient, progress.state)
-            change = eqx.tree_at(lambda m: m.free, change, recipe.fabric_rate * change.free)
+            change = eqx.tree_at(lambda m: m.free, change, replace_fn=faster)
             model = eqx.apply_updates(progress.model, change)
             return Progress(model, state, progress.epoch + 1), losses
 

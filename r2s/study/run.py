@@ -28,8 +28,8 @@ class Effort:
     """How much an estimate may cost. `recipe` is "default" or "original" (DIFFCLOUD's)."""
 
     num_coarse: int = 24
-    num_starts: int = 2
-    num_iterations: int = 12
+    num_starts: int = 3
+    num_iterations: int = 25
     recipe: str = "default"
     seed: int = 0
 
