@@ -1,9 +1,11 @@
 """PhysNet from data to estimates: accuracy of triplets, errors beside random search, times.
 
     python benchmarks/physnet.py --out results/physnet
-    python benchmarks/physnet.py --out results/physnet --fabrics 64 --epochs 4 --estimates 2
+    python benchmarks/physnet.py --out results/physnet_small --small
 
-Goes on where it was interrupted. Writes figures.json, curves.png, map.png and images.png.
+Goes on where it was interrupted: data, network and searches that lie in the folder are read. The
+small one, of few fabrics, shows that all of it runs; its figures say nothing of the method. Writes
+figures.json, curves.png, map.png and images.png.
 """
 
 import argparse
@@ -31,6 +33,7 @@ from r2s.physnet.network import DEEPER, PAPER
 from r2s.scenario import motion
 
 SEEDS = 20  # of random search, which is free: the motions are those of the training data
+SMALL = {"fabrics": 32, "epochs": 2, "steps": 20, "estimates": 1, "repeats": 1, "calls": 20}
 SEEN = preprocess.Flaws(noise=1.5e-3, holes=0.05, strays=0.001)  # of the images to estimate from
 
 
@@ -65,11 +68,15 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--epochs", type=int, default=training.Schedule.epochs)
     parser.add_argument("--steps", type=int, default=training.Schedule.steps)
     parser.add_argument("--paper", action="store_true", help="the paper's two convolutions")
-    parser.add_argument("--estimates", type=int, default=8, help="fabrics to estimate")
+    parser.add_argument("--estimates", type=int, default=4, help="fabrics to estimate")
     parser.add_argument("--calls", type=int, default=80)
-    parser.add_argument("--repeats", type=int, default=2, help="seeds of the first estimates")
+    parser.add_argument("--repeats", type=int, default=2, help="seeds of each estimate")
     parser.add_argument("--seed", type=int, default=0)
-    return parser.parse_args()
+    parser.add_argument("--small", action="store_true", help="of all less, in a few minutes")
+    asked = parser.parse_args()
+    if asked.small:
+        vars(asked).update(SMALL)
+    return asked
 
 
 def load(path: Path) -> dict:
@@ -92,7 +99,12 @@ def teach(path: Path, data, view, architecture, schedule):
     start = training.begin(view, architecture, schedule)
     _, held_back = training.divide(data, schedule)
     untrained = training.judge(start.network, view, held_back, schedule)[1]
-    trained = training.load(path, expected=architecture) if path.exists() else start
+    trained = start
+    if path.exists():  # the epochs asked for count, not those of its own schedule
+        trained = training.load(path, expected=architecture)
+        if dataclasses.replace(trained.schedule, epochs=schedule.epochs) != schedule:
+            raise ValueError(f"{path}: was trained by {trained.schedule}, asked for {schedule}")
+        trained = trained._replace(schedule=schedule)
     began, spent, done = time.perf_counter(), time.process_time(), len(trained.curve)
     say = lambda number, row: print(number, *(f"{value:.4f}" for value in row), flush=True)
     trained = training.train(trained, data, path, say)
@@ -182,36 +194,36 @@ def estimates(out: Path, data, settings, trained, asked) -> dict:
         images = preprocess.of_depths(trained.view, np.asarray(jax.vmap(flawed)(depth, keys)))
         sighting = sighting_of(settings, trained, images)
         own = []
-        for seed in range(asked.repeats if number < 3 else 1):
+        for seed in range(asked.repeats):
             path = out / f"history_{number}_{seed}.npz"
+            fresh = not path.exists()
             done = physnet.estimate(sighting, num_calls=asked.calls, seed=seed, path=path)
             place = np.asarray(settings.family.locate(done.fabric))
             own.append(np.abs(place - truths[number]))
             losses.append(done.loss)
-            seconds.append(done.seconds)
-        errors.append(own[0])
-        if len(own) > 1:
-            spread.append(np.std([np.array(own)], axis=1)[0])
+            if fresh:
+                seconds.append(done.seconds)
+        errors.extend(own)
+        spread.append(np.std(own, axis=0))
         apart = np.sqrt(((points - np.asarray(sighting.points)) ** 2).sum(axis=2).mean(axis=1))
         for seed in range(SEEDS):
             tried = np.random.default_rng([seed, number]).permutation(len(apart))[: asked.calls]
             best = tried[np.argmin(apart[tried])]
             random.append(np.abs(places[best] - truths[number]))
             random_losses.append(apart[best])
-        print(
-            number, np.round(errors[-1], 3), np.round(np.median(random[-SEEDS:], 0), 3), flush=True
-        )
+        print(number, np.round(own, 3), np.round(np.median(random[-SEEDS:], 0), 3), flush=True)
     names = [bound.name for bound in settings.ranges]
     named = lambda values: dict(zip(names, np.round(values, 4).tolist(), strict=True))
     return {
-        "fabrics": len(errors),
+        "fabrics": len(spread),
+        "seeds": asked.repeats,
         "calls": asked.calls,
         "median error": named(np.median(errors, axis=0)),
         "of random search": named(np.median(random, axis=0)),
-        "of the middle": named(np.median(np.abs(truths[: len(errors)] - 0.5), axis=0)),
-        "deviation over seeds": named(np.mean(spread, axis=0)) if spread else {},
+        "of the middle": named(np.median(np.abs(truths[: len(spread)] - 0.5), axis=0)),
+        "deviation over seeds": named(np.mean(spread, axis=0)) if asked.repeats > 1 else {},
         "median loss": [float(np.median(losses)), float(np.median(random_losses))],
-        "seconds": [float(np.median(seconds)), float(np.max(seconds))],
+        "seconds": [float(np.median(seconds)), float(np.max(seconds))] if seconds else [],
     }
 
 

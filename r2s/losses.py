@@ -1,5 +1,7 @@
 """Distances from clouds to a simulated sheet, differentiable."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -71,3 +73,124 @@ def robust_weight(
     limit = jnp.where(strict, jnp.maximum(scale, TOUCHING), OUTLIER_SCALE)
     weight = 1 / (1 + (distance / limit) ** 2)
     return jnp.where(strict, weight**2, weight)
+
+
+Penalty = Callable[[Float[Array, " point"]], Float[Array, " point"]]  # of distances [m]
+
+
+def squared(distance: Float[Array, "*point"]) -> Float[Array, "*point"]:
+    """Half of the square, [m^2], so that it is `robust` for small distances [m]."""
+    return distance**2 / 2
+
+
+def huber(distance: Float[Array, "*point"], scale: float = 0.01) -> Float[Array, "*point"]:
+    """Huber's penalty [m^2]: d^2 / 2 up to the `scale` [m], beyond it a straight line."""
+    return jnp.where(distance < scale, distance**2 / 2, scale * (distance - scale / 2))
+
+
+def masked_mean(values: Float[Array, " point"], mask: Bool[Array, " point"]) -> Float[Array, ""]:
+    """The mean of the values in a mask; NaN when it is empty."""
+    return jnp.sum(jnp.where(mask, values, 0)) / jnp.sum(mask, dtype=values.dtype)
+
+
+def trimmed_mean(
+    values: Float[Array, " point"], mask: Bool[Array, " point"], share: float = 0.9
+) -> Float[Array, ""]:
+    """The mean of the least `share` of the values in a mask; NaN when it is empty.
+
+    Raises `ValueError` for a share that is not above 0 and at most 1.
+    """
+    if not 0 < share <= 1:
+        raise ValueError(f"a share is above 0 and at most 1, got {share}")
+    order = jnp.sort(jnp.where(mask, values, jnp.inf))
+    kept = jnp.ceil(share * jnp.sum(mask, dtype=values.dtype))
+    return masked_mean(order, jnp.arange(len(values), dtype=values.dtype) < kept)
+
+
+def to_surface(
+    points: Float[Array, "point 3"],
+    mask: Bool[Array, " point"],
+    x: Float[Array, "vertex 3"],
+    faces: Int[Array, "face 3"],
+    penalty: Penalty = robust,
+    mean: Callable[..., Float[Array, ""]] = masked_mean,
+) -> Float[Array, ""]:
+    """A mean [m^2] of the distances from a cloud to a sheet, under a penalty.
+
+    One-sided: what the cameras did not see of the sheet does not count.
+    """
+    return mean(penalty(surface_residuals(points, mask, x, faces)[0]), mask)
+
+
+def from_surface(
+    samples: Float[Array, "sample 3"],
+    visible: Bool[Array, " sample"],
+    points: Float[Array, "point 3"],
+    mask: Bool[Array, " point"],
+    penalty: Penalty = squared,
+    mean: Callable[..., Float[Array, ""]] = masked_mean,
+) -> Float[Array, ""]:
+    """A mean [m^2] of the distances from samples of a sheet to a cloud, under a penalty.
+
+    Only samples that are `visible` count, such as those that `r2s.observe.camera.Camera.sees`: of
+    what no camera sees a cloud has no points.
+    """
+    targets = jnp.where(mask[:, None], points, jnp.inf)
+    pairs = jnp.sum((jax.lax.stop_gradient(samples)[:, None] - targets[None]) ** 2, axis=-1)
+    square = jnp.sum((samples - points[jnp.argmin(pairs, axis=1)]) ** 2, axis=-1)
+    apart = square > TOUCHING**2
+    distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
+    return mean(penalty(distance), visible)
+
+
+def sinkhorn(
+    points: Float[Array, "point 3"],
+    mask: Bool[Array, " point"],
+    samples: Float[Array, "sample 3"],
+    visible: Bool[Array, " sample"],
+    blur: float = 0.02,
+    iterations: int = 50,
+) -> Float[Array, ""]:
+    """The Sinkhorn divergence [m^2] between a cloud and samples of a sheet, half squares as cost.
+
+    Each point goes to a place of its own, so that it sees global shape, which nearest points do
+    not: a folded sheet does not lie well on an open one. Entropic transport at the scale `blur`
+    [m], less that of each to itself (Feydy et al. 2019): zero when both are the same. Every point
+    that is there, and every sample that is `visible`, weighs alike.
+    """
+    a, b = _log_weights(mask, points.dtype), _log_weights(visible, samples.dtype)
+    both = _transport(points, a, samples, b, blur, iterations)
+    alone = _transport(points, a, points, a, blur, iterations)
+    return both - (alone + _transport(samples, b, samples, b, blur, iterations)) / 2
+
+
+def _log_weights(mask: Bool[Array, " point"], dtype) -> Float[Array, " point"]:
+    return jnp.where(mask, 0.0, -jnp.inf).astype(dtype) - jnp.log(jnp.sum(mask, dtype=dtype))
+
+
+def _transport(x, a, y, b, blur: float, iterations: int) -> Float[Array, ""]:
+    """The dual value [m^2] of entropic transport between weighted points, by Sinkhorn's iteration.
+
+    Its derivative is that at fixed potentials (envelope theorem), which is exact at convergence.
+    """
+    epsilon = blur**2
+    cost = lambda x, y: jnp.sum((x[:, None] - y[None]) ** 2, axis=-1) / 2
+
+    def soften(weights, costs, potential):
+        return -epsilon * jax.nn.logsumexp(weights[None] + (potential[None] - costs) / epsilon, 1)
+
+    fixed = jax.lax.stop_gradient(cost(x, y))
+
+    def step(potentials, _):
+        f, g = potentials
+        new = soften(b, fixed, g), soften(a, fixed.T, f)
+        return tuple((old + now) / 2 for old, now in zip(potentials, new, strict=True)), None
+
+    zeros = jnp.zeros(len(x), x.dtype), jnp.zeros(len(y), y.dtype)
+    (_, g), _ = jax.lax.scan(step, zeros, None, length=iterations)
+    g = jax.lax.stop_gradient(g)
+    f = soften(b, cost(x, y), g)
+    weigh = lambda weights, values: (
+        jnp.sum(jnp.where(weights > -jnp.inf, values, 0)) * jnp.exp(jnp.max(weights))
+    )
+    return weigh(a, f) + weigh(b, g)

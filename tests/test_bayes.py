@@ -56,15 +56,38 @@ def test_avoids_where_the_objective_fails():
     assert found.losses[found.best] < 0.25
 
 
+def test_settles_in_seven_dimensions():
+    centre = np.array([0.2, 0.7, 0.45, 0.6, 0.3, 0.8, 0.5])
+    weights = np.array([1.0, 1.0, 1.0, 0.1, 1.0, 0.1, 1.0])  # two hardly matter
+    wide = lambda places: np.sqrt((weights * (places - centre) ** 2).sum(axis=1) + 1e-3)
+    found = bayes.minimise(wide, 7, num_calls=48, seed=0)
+    error = np.abs(found.places[found.best] - centre)[weights == 1]
+    assert error.max() < 0.1
+    chance = bayes.random_search(wide, 7, num_calls=48, batch=4, seed=0)
+    assert found.losses[found.best] < 0.5 * chance.losses[chance.best]
+
+
 def test_refuses_a_history_of_another_search(tmp_path):
     bayes.minimise(bowl, 3, num_calls=4, batch=2, num_first=8, seed=0, path=tmp_path / "h.npz")
     with pytest.raises(ValueError, match=r"h\.npz: is of a search with .*'seed': 0"):
         bayes.minimise(bowl, 3, num_calls=4, batch=2, num_first=8, seed=1, path=tmp_path / "h.npz")
+    np.savez(tmp_path / "h.npz", places=[[0.5]], losses=[1.0], dim=3, batch=2, num_first=8, seed=0,
+             format="r2s-search/1")  # fmt: skip
+    with pytest.raises(ValueError, match=r"h\.npz: expected format r2s-search/2, found .*/1"):
+        bayes.minimise(bowl, 3, num_calls=4, batch=2, num_first=8, seed=0, path=tmp_path / "h.npz")
     (tmp_path / "h.npz").write_bytes(b"no archive")
     with pytest.raises(ValueError, match=r"h\.npz: no history of a search"):
         bayes.minimise(bowl, 3, num_calls=4, batch=2, num_first=8, seed=0, path=tmp_path / "h.npz")
 
 
-def test_refuses_losses_of_another_number():
+def test_refuses_losses_of_another_number_and_below_zero():
     with pytest.raises(ValueError, match="one loss for each of 2 places"):
         bayes.tell(bayes.begin(1), [[0.1], [0.2]], [1.0])
+    with pytest.raises(ValueError, match="a loss is -2: expected none below 0"):
+        bayes.tell(bayes.begin(1), [[0.1], [0.2]], [1.0, -2.0])
+
+
+def test_losses_of_zero_and_places_that_repeat_can_be_gone_on_from():
+    history = bayes.tell(bayes.begin(2), [[0.1, 0.2]] * 8, np.zeros(8))
+    places = bayes.ask(history, 3, num_first=8)
+    assert places.shape == (3, 2) and (places >= 0).all() and (places <= 1).all()

@@ -73,6 +73,7 @@ def _loss(problems, unknown, scale):
     return gauss_newton.loss_at(problems, unknown, scale=scale)
 
 
+@pytest.mark.slow
 def test_a_narrow_secant_is_the_derivative(small):
     unknown = jnp.concatenate([jnp.full(7, 0.45), AWAY])
     _, exact = jax.jit(sensitivities)(small, unknown)
@@ -104,6 +105,7 @@ def test_an_early_camera_is_predicted_as_an_early_recording(recording):
     assert float(loss(shifted, unknown(0.0))) > 2 * same
 
 
+@pytest.mark.slow
 def test_recordings_of_one_fabric_add_up(small):
     unknown = jnp.concatenate([jnp.full(7, 0.45), AWAY])
     both = jnp.concatenate([unknown, unknown[-5:]])

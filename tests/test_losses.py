@@ -8,7 +8,19 @@ from conftest import directional_difference, flat, rotation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.losses import OUTLIER_SCALE, one_sided_chamfer, robust, robust_weight, surface_residuals
+from r2s.losses import (
+    OUTLIER_SCALE,
+    from_surface,
+    huber,
+    one_sided_chamfer,
+    robust,
+    robust_weight,
+    sinkhorn,
+    squared,
+    surface_residuals,
+    to_surface,
+    trimmed_mean,
+)
 
 EVERY = jnp.ones(40, bool)
 chamfer = jax.jit(one_sided_chamfer)
@@ -126,3 +138,69 @@ def test_the_robust_loss_is_quadratic_near_and_flat_far():
     assert robust_weight(jnp.array(OUTLIER_SCALE)) == pytest.approx(0.5)
     far = robust(jnp.array([1.0, 2.0]))
     assert far[1] - far[0] == pytest.approx(OUTLIER_SCALE**2 * np.log(2), rel=1e-3)
+
+
+def test_huber_is_smooth_and_grows_like_a_line():
+    near, far = jnp.array(1e-3), jnp.array([1.0, 2.0])
+    assert huber(near) == squared(near)
+    assert jnp.diff(huber(far))[0] == pytest.approx(0.01)
+    slope = jax.grad(huber)
+    assert slope(jnp.array(0.01 - 1e-9)) == pytest.approx(float(slope(jnp.array(0.01 + 1e-9))))
+
+
+@given(st.integers(1, 40), st.floats(0.05, 1.0))
+@settings(max_examples=25, deadline=None)
+def test_a_trimmed_mean_is_that_of_the_least_values(count, share):
+    values = np.random.default_rng(count).uniform(size=40)
+    mask = np.arange(40) < count
+    kept = np.sort(values[mask])[: int(np.ceil(share * count))]
+    found = trimmed_mean(jnp.asarray(values), jnp.asarray(mask), share)
+    assert found == pytest.approx(kept.mean(), rel=1e-12)
+
+
+def test_a_trimmed_mean_needs_a_share():
+    with pytest.raises(ValueError, match="share"):
+        trimmed_mean(jnp.ones(3), jnp.ones(3, bool), 0.0)
+
+
+def test_one_sided_losses_see_one_side(surface, sheet):
+    points, x = surface
+    near = to_surface(points, EVERY, x, sheet.faces, squared)
+    distance, *_ = residuals(points, EVERY, x, sheet.faces)
+    assert near == pytest.approx(float(jnp.mean(distance**2)) / 2)
+    half = jnp.arange(40) < 20
+    samples = points[:30] + jnp.array([[0.0, 0.0, 0.01]])
+    visible = jnp.arange(30) < 10
+    found = from_surface(samples, visible, points, half)
+    nearest = np.linalg.norm(np.asarray(samples)[:10, None] - np.asarray(points)[None, :20], axis=2)
+    assert found == pytest.approx(np.mean(nearest.min(axis=1) ** 2) / 2)
+    assert from_surface(points[:5], jnp.ones(5, bool), points, half) == 0
+
+
+def test_sinkhorn_is_zero_for_the_same_cloud_and_half_the_square_of_a_shift(clouds):
+    points, _ = clouds
+    assert abs(float(sinkhorn(points, EVERY, points, EVERY))) < 1e-9
+    shift = jnp.array([[0.03, -0.01, 0.02]])
+    found = sinkhorn(points, EVERY, points + shift, EVERY, 0.05, 200)
+    assert found == pytest.approx(float(jnp.sum(shift**2)) / 2, rel=0.02)
+
+
+def test_the_gradient_of_sinkhorn_agrees_with_differences(clouds):
+    points, targets = clouds
+    mask = jnp.arange(40) < 35
+    visible = jnp.arange(30) < 25
+    loss = jax.jit(lambda x: sinkhorn(points, mask, x, visible, 0.2, 400))
+    direction = jax.random.normal(jax.random.key(0), targets.shape)
+    expected = directional_difference(loss, targets, direction, 1e-5)
+    gradient = jax.grad(loss)(targets)
+    assert float(jnp.sum(gradient * direction)) == pytest.approx(float(expected), rel=1e-5)
+    assert jnp.all(gradient[25:] == 0) and jnp.all(jnp.isfinite(gradient))
+
+
+def test_sinkhorn_sees_what_nearest_points_do_not():
+    """Two halves of a cloud on top of each other lie on the whole, yet are not the whole."""
+    line = jnp.linspace(0.0, 1.0, 40)
+    whole = jnp.stack([line, 0 * line, 0 * line], axis=1)
+    folded = whole.at[:, 0].set(jnp.where(line > 0.5, 1 - line, line))
+    assert one_sided_chamfer(folded, EVERY, whole) < 1e-3
+    assert sinkhorn(folded, EVERY, whole, EVERY) > 0.02

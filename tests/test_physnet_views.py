@@ -17,6 +17,8 @@ from r2s.physnet.views import View
 
 VIEW = View((0.1, -0.4, 0.6), (0.1, 0.1, 0.1), 40.0, 32, 0.4, 1.0, -1.0)
 MESH = rectangle((0.3, 0.3), (4, 4))
+seen_by = jax.jit(views.depth_of, static_argnums=0)
+shown = jax.jit(preprocess.grey, static_argnums=0)
 TILTED = np.c_[np.asarray(MESH.rest), 0.1 + 0.4 * np.asarray(MESH.rest[:, 1])]
 
 
@@ -45,27 +47,25 @@ def test_nearer_layers_hide_others_and_the_floor_is_left_out():
     towards = jnp.asarray(VIEW.position) - low[0]
     high = low + 0.3 * towards[None]
     both = jnp.concatenate([low, high])
-    depth = views.depth_of(VIEW, both, jnp.array([True, True]))
+    depth = seen_by(VIEW, both, jnp.array([True, True]))
     forward = jnp.asarray(VIEW.target) - jnp.asarray(VIEW.position)
     distance = -float(towards @ forward / jnp.sqrt(forward @ forward))
     np.testing.assert_allclose(depth.max(), 0.7 * distance, rtol=1e-6)
-    masked = views.depth_of(VIEW, both, jnp.array([True, False]))
+    masked = seen_by(VIEW, both, jnp.array([True, False]))
     np.testing.assert_allclose(masked.max(), distance, rtol=1e-6)
     raised = dataclasses.replace(VIEW, floor=0.15)
-    assert float(views.depth_of(raised, both, jnp.array([True, False])).max()) == 0
+    assert float(seen_by(raised, both, jnp.array([True, False])).max()) == 0
 
 
 def test_a_view_around_points_holds_them_all():
     points = np.random.default_rng(0).uniform([0, 0, 0], [0.4, 0.3, 0.2], (200, 3))
     view = views.view_around((-0.5, -0.1, 0.5), points, 64, 0.01)
     seen = points[:, 2] > 0.01
-    depth = views.depth_of(view, jnp.asarray(points), jnp.ones(200, bool))
+    depth = seen_by(view, jnp.asarray(points), jnp.ones(200, bool))
     found = np.asarray(depth)[np.asarray(depth) > 0]
     assert view.near < found.min() and found.max() < view.far
-    alone = [
-        views.depth_of(view, jnp.asarray(p)[None], jnp.array([True])).max() for p in points[seen]
-    ]
-    assert min(alone) > 0
+    alone = jax.jit(jax.vmap(lambda p: seen_by(view, p[None], jnp.array([True])).max()))
+    assert float(alone(jnp.asarray(points[seen])).min()) > 0
     with pytest.raises(ValueError, match="no point is higher than 1 m"):
         views.view_around((-0.5, -0.1, 0.5), points, 64, 1.0)
 
@@ -75,22 +75,35 @@ def test_a_real_camera_of_another_resolution_gives_the_same_image():
     camera = DepthCamera((160, 120), (140.0, 140.0), (79.5, 59.5), pose, 1e-3)
     depth, which = render(camera, TILTED, np.asarray(MESH.faces))
     image = preprocess.of_camera(VIEW, camera, depth[None], (which >= 0)[None])[0]
-    expected = np.asarray(preprocess.grey(VIEW, jnp.asarray(drawn())))
+    expected = np.asarray(shown(VIEW, jnp.asarray(drawn())))
     both = (image > 0) & (expected > 0)
     assert both.sum() > 0.9 * (expected > 0).sum()
     assert np.abs(image - expected)[both].mean() < 0.01
 
 
+def test_measured_points_cover_as_much_as_the_surface_does():
+    generator = np.random.default_rng(0)
+    there = jnp.ones(900, bool)
+    places = np.c_[generator.uniform(0, 0.3, (900, 2)), np.zeros(900)]
+    places[:, 2] = 0.1 + 0.4 * places[:, 1]
+    covered = lambda depth: float((shown(VIEW, depth) > 0).sum())
+    whole = covered(jnp.asarray(drawn()))
+    points = jnp.asarray(places)
+    assert covered(seen_by(VIEW, points, there)) < 0.97 * whole
+    measured = jax.jit(preprocess.of_points, static_argnums=0)(VIEW, points, there)
+    assert 0.97 < covered(measured) / whole < 1.03
+
+
 def test_holes_are_filled_and_strays_dropped():
     whole = drawn()
-    image = preprocess.grey(VIEW, jnp.asarray(whole))
+    image = shown(VIEW, jnp.asarray(whole))
     inside = np.argwhere(whole > 0)
     inner = [(i, j) for i, j in inside if (whole[i - 2 : i + 3, j - 2 : j + 3] > 0).all()]
     broken = whole.copy()
     for i, j in inner[::7]:
         broken[i, j] = 0
     broken[1, 1] = 0.5
-    mended = preprocess.grey(VIEW, jnp.asarray(broken))
+    mended = shown(VIEW, jnp.asarray(broken))
     assert float(image[1, 1]) == float(mended[1, 1]) == 0
     np.testing.assert_array_equal(image > 0, mended > 0)
     assert float(jnp.max(jnp.abs(image - mended))) < 0.02

@@ -66,7 +66,6 @@ def small_network(pull: Pull) -> Network:
 def coarse(monkeypatch):
     """Few virtual displacements, so that it compiles fast; the slow tests undo it."""
     monkeypatch.setattr("r2s.estimators.pinn.DEGREES", (3, 3))
-    monkeypatch.setattr("r2s.pinn.weak.NODES", 6)
     fewer = lambda pull, degrees=(3, 3): basis_of(pull, (3, 3))
     monkeypatch.setattr(balancing, "basis_of", fewer)
 

@@ -12,19 +12,26 @@ from jaxtyping import Array
 
 from r2s.fabric import Fabric
 from r2s.physics.membrane import OrthotropicMembrane
+from r2s.pinn import losses as strong
+from r2s.pinn import weak
 from r2s.pinn.data import Clamp, Pull
 from r2s.pinn.laws import green, small
-from r2s.pinn.losses import (
-    draw_points,
-    edge_force,
-    marker_residual,
-    motion_residual,
-    plain_scales,
-    scales_of,
-    strong_losses,
-)
+from r2s.pinn.losses import draw_points, plain_scales, scales_of
 from r2s.pinn.network import Jet, Network
-from r2s.pinn.weak import end_value, kinematics, virtual_fields, virtual_work, weak_losses
+from r2s.pinn.weak import end_value, virtual_fields, weak_losses
+
+# compiled as a whole, which is faster than one operation after the other
+edge_force, marker_residual, motion_residual, strong_losses, kinematics, virtual_work = (
+    eqx.filter_jit(function)
+    for function in (
+        strong.edge_force,
+        strong.marker_residual,
+        strong.motion_residual,
+        strong.strong_losses,
+        weak.kinematics,
+        weak.virtual_work,
+    )
+)
 
 SIZE, DENSITY, FRAMES = (0.45, 0.3), 0.3, 7  # [m, kg/m^2]
 TRUE = (90.0, 25.0, 140.0, 30.0)  # C11, C12, C22, C33 [N/m]
@@ -233,8 +240,7 @@ def test_scales_are_those_of_noise_and_force():
     np.testing.assert_allclose(scales.length, min(SIZE))
 
 
-@pytest.mark.parametrize("losses", [strong_losses, weak_losses])
-@pytest.mark.parametrize("strain", [green, small])
+@pytest.mark.parametrize(("losses", "strain"), [(strong_losses, green), (weak_losses, small)])
 def test_losses_have_finite_gradients(losses, strain):
     given = pull(stretched(2.0), force=jnp.full(FRAMES, 3.0), normal=9.81)
     low, high = jnp.zeros(3), jnp.array([*SIZE, 0.02])
@@ -246,5 +252,5 @@ def test_losses_have_finite_gradients(losses, strain):
     def loss(network):
         return sum(losses(network, given, FABRIC, points, scales, strain))
 
-    gradient = jax.grad(loss)(network)
+    gradient = jax.jit(jax.grad(loss))(network)
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(gradient))

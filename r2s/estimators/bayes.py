@@ -5,6 +5,7 @@ that gives a loss, not negative, for each of a batch of places.
 """
 
 import io
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,7 +92,10 @@ def ask(
     places, losses = history.places, history.penalised
     least = max(LEAST * losses.max(), np.finfo(float).tiny)
     values = np.log(np.maximum(losses, least))
-    process = _process(dim, np.random.RandomState([seed, done])).fit(places, values)
+    process = _process(dim, np.random.RandomState([seed, done]))
+    with warnings.catch_warnings():  # that a length or the noise is at its bound
+        warnings.simplefilter("ignore")
+        process.fit(places, values)
     kernel = process.kernel_
     for _ in range(number):
         best = places[np.argsort(values)[:CENTRES]]
@@ -195,7 +199,8 @@ def _candidates(
 ) -> Float[np.ndarray, "place dim"]:
     dim = best.shape[1]
     anywhere = generator.random((CANDIDATES, dim))
-    widths = np.exp(generator.uniform(*np.log(WIDTHS), (CANDIDATES, 1)))
+    low, high = np.log(WIDTHS)
+    widths = np.exp(generator.uniform(low, high, (CANDIDATES, 1)))
     centres = best[generator.integers(len(best), size=CANDIDATES)]
     around = centres + widths * generator.standard_normal((CANDIDATES, dim))
     return np.concatenate([anywhere, np.clip(around, 0, 1)])
@@ -218,10 +223,12 @@ def _process(dim: int, random: Any = None, kernel: Any = None) -> Any:
         raise ImportError(
             "Bayesian optimisation needs scikit-optimize: pip install 'r2s[physnet]'"
         ) from error
+    make: Any = GaussianProcessRegressor  # its annotations miss what it takes
     if kernel is not None:
-        return GaussianProcessRegressor(kernel, optimizer=None, normalize_y=True)
-    smooth = ConstantKernel(1.0, (0.01, 1000.0)) * Matern([1.0] * dim, [(0.1, 20.0)] * dim, nu=2.5)
-    return GaussianProcessRegressor(
+        return make(kernel, optimizer=None, normalize_y=True)
+    lengths: Any = [1.0] * dim
+    smooth = ConstantKernel(1.0, (0.01, 1000.0)) * Matern(lengths, [(0.1, 20.0)] * dim, nu=2.5)
+    return make(
         smooth + WhiteKernel(1e-2, (1e-6, 1.0)),
         normalize_y=True,
         n_restarts_optimizer=1,

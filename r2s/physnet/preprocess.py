@@ -16,6 +16,7 @@ ALIKE = 2  # neighbours within `views.LAYER` of a pixel, with fewer of which it 
 AROUND = 5  # of 8 neighbours with depth, from which a hole is filled
 PASSES = 2  # of filling: holes of up to about 4 pixels across
 DARKEST = 0.2  # what is as far as the view goes; nothing at all is 0
+REACH = 0.25  # of the distance between measured points: half the side of what one stands for
 LEAST = 20  # pixels with depth, in an image of 64 x 64; else there is nothing to recognise
 
 
@@ -80,9 +81,21 @@ def flawed(
     return jnp.where(is_stray, where, depth)
 
 
+def of_points(
+    view: View, points: Float[Array, "point 3"], mask: Bool[Array, " point"]
+) -> Float[Array, "down across"]:
+    """The depth image [m] of measured points [m], as large as that of the surface they lie on.
+
+    Simulated surfaces are sampled up to their borders; measured points only come near them.
+    """
+    covered = jnp.sum(depth_of(view, points, mask) > 0)
+    apart = jnp.sqrt(covered / jnp.maximum(jnp.sum(mask), 1)).astype(points.dtype)
+    return depth_of(view, points, mask, REACH * apart)
+
+
 def of_clouds(view: View, recording: Recording, frames: tuple[int, ...]) -> np.ndarray:
     """Images (frame, down, across) of a recording's clouds at some frames, checked."""
-    see = jax.jit(jax.vmap(lambda points, mask: depth_of(view, points, mask)))
+    see = jax.jit(jax.vmap(lambda points, mask: of_points(view, points, mask)))
     chosen = np.array(frames)
     depth = see(recording.points[chosen], recording.mask[chosen])
     return of_depths(view, np.asarray(depth), recording.info.name, frames)
@@ -105,7 +118,7 @@ def of_camera(
             f"{name}: expected depths and masks of {down} x {across} pixels (down, across), found "
             f"{depths.shape[1:]} and {masks.shape[1:]}: use the resolution of the calibration"
         )
-    see = jax.jit(lambda points, mask: depth_of(view, points, mask))
+    see = jax.jit(lambda points, mask: of_points(view, points, mask))
     images = []
     for depth, mask in zip(depths, masks, strict=True):
         everywhere = np.ones(depth.shape, bool)  # all pixels, so that it compiles once

@@ -87,17 +87,26 @@ def floor_of(experiment: Experiment) -> float:
 
 
 def depth_of(
-    view: View, points: Float[Array, "point 3"], mask: Bool[Array, " point"]
+    view: View,
+    points: Float[Array, "point 3"],
+    mask: Bool[Array, " point"],
+    reach: Float[Array, ""] | None = None,
 ) -> Float[Array, "down across"]:
     """The depth [m] of the nearest layer of points [m] in each pixel, 0 where there is none.
 
     The mean of the points within `LAYER` of the nearest: many points in a pixel lessen noise.
+    With `reach` [pixel], a point stands for a square of twice that side around it: few points of a
+    surface lie at its very border, so that without it the surface looks smaller than it is.
     """
     eye, target = (jnp.asarray(place, points.dtype) for place in (view.position, view.target))
     camera = Camera(eye, target, view.focal_length, (view.size, view.size))
     pixel, depth = camera.project(points)
-    column, row = jnp.floor(pixel[:, 0]).astype(int), jnp.floor(pixel[:, 1]).astype(int)
     inside = mask & (depth > 0) & (points[:, 2] > view.floor)
+    if reach is not None:
+        corners = reach * jnp.array([(-1, -1), (-1, 1), (1, -1), (1, 1)], pixel.dtype)
+        pixel = (corners[:, None] + pixel[None]).reshape(-1, 2)
+        inside, depth = jnp.tile(inside, len(corners)), jnp.tile(depth, len(corners))
+    column, row = jnp.floor(pixel[:, 0]).astype(int), jnp.floor(pixel[:, 1]).astype(int)
     inside = inside & (jnp.minimum(column, row) >= 0) & (jnp.maximum(column, row) < view.size)
     count = view.size**2
     index = jnp.where(inside, row * view.size + column, count)

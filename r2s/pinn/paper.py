@@ -94,8 +94,13 @@ def run(
         share = weight(number)
         physics = lambda w: share * losses(whole(w), family, pulls)[1]
         motion, slope = jax.value_and_grad(physics)(weights)
-        change, of_lbfgs = lbfgs.update(slope, of_lbfgs, weights)
-        return (eqx.apply_updates(weights, change), of_adam, of_lbfgs), (data, motion / share)
+        change, after = lbfgs.update(slope, of_lbfgs, weights)
+        moved = eqx.apply_updates(weights, change)
+        # no step, and no memory, from gradients that do not differ: their curvature is 0 / 0
+        good = jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(moved)]))
+        keep = lambda new, old: jax.tree.map(lambda n, o: jnp.where(good, n, o), new, old)
+        state = keep(after, lbfgs.init(weights))
+        return (keep(moved, weights), of_adam, state), (data, motion / share)
 
     states = (adam.init(weights), lbfgs.init(weights)) if states is None else states
     (weights, *states), values = jax.lax.scan(epoch, (weights, *states), first + jnp.arange(epochs))

@@ -39,7 +39,8 @@ def pulled(
 
     81 markers with `marker_noise` [m], and a force with `force_noise` [-] of its greatest. Steps
     of at most `max_step` [s]: by default one a frame, so that a force is that at its frame's time
-    and not a mean. The pull is by `strain` [-] of the sheet's length. Raises `RuntimeError` when it diverges.
+    and not a mean. The pull is by `strain` [-] of the sheet's length. Raises `RuntimeError` when
+    it diverges.
     """
     experiment = stretching(num_frames=frames, strain=strain)
     scenario = experiment.scenario(shape)
