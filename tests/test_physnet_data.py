@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax.numpy as jnp
-import jaxtyping
 import numpy as np
 import pytest
 
@@ -21,9 +20,7 @@ TINY = Settings(
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data")
-    jaxtyping.config.update("jaxtyping_disable", True)  # most of the time; `distances` is checked
     dataset.make(folder, TINY, progress=False)
-    jaxtyping.config.update("jaxtyping_disable", False)
     return folder
 
 

@@ -1,6 +1,7 @@
 """The losses on exact fields, which obey the equations of motion at the true stiffness only."""
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -21,17 +22,10 @@ from r2s.pinn.network import Jet, Network
 from r2s.pinn.weak import end_value, virtual_fields, weak_losses
 
 # compiled as a whole, which is faster than one operation after the other
-edge_force, marker_residual, motion_residual, strong_losses, kinematics, virtual_work = (
-    eqx.filter_jit(function)
-    for function in (
-        strong.edge_force,
-        strong.marker_residual,
-        strong.motion_residual,
-        strong.strong_losses,
-        weak.kinematics,
-        weak.virtual_work,
-    )
-)
+compiled: Any = eqx.filter_jit
+edge_force, marker_residual = compiled(strong.edge_force), compiled(strong.marker_residual)
+motion_residual, strong_losses = compiled(strong.motion_residual), compiled(strong.strong_losses)
+kinematics, virtual_work = compiled(weak.kinematics), compiled(weak.virtual_work)
 
 SIZE, DENSITY, FRAMES = (0.45, 0.3), 0.3, 7  # [m, kg/m^2]
 TRUE = (90.0, 25.0, 140.0, 30.0)  # C11, C12, C22, C33 [N/m]
