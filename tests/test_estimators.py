@@ -215,6 +215,7 @@ def test_the_recipe_and_cma_lower_their_losses(small):
     np.testing.assert_array_equal(evolved.values, again.values)
 
 
+@pytest.mark.slow
 def test_a_loss_that_is_not_finite_at_the_start_is_an_error(small):
     broken = lambda problem, seen: jnp.nan * jnp.sum(seen.x)
     with jax.numpy_dtype_promotion("standard"), pytest.raises(RuntimeError, match="diverged"):
@@ -240,6 +241,7 @@ def test_a_known_fabric_and_a_late_clock_are_found(name):
     assert delay.name == "time" and abs(delay.value - 0.08) < 0.01
 
 
+@pytest.mark.slow
 def test_a_planned_motion_reveals_more_with_better_cameras():
     """And one that does not move reveals less than one that does."""
     from r2s.estimators.trust import sensitivity

@@ -123,6 +123,7 @@ def test_sensitivities_of_the_motion_in_balance_against_differences():
 TINY = Recipe(losses=QUICK.losses, warm_up=20, adam=20, lbfgs=10, redraw=10, width=6, layers=3)
 
 
+@pytest.mark.slow
 def test_estimates_of_several_fabrics_at_once():
     """With a report in the words of every estimator, which survives its file."""
     with jax.numpy_dtype_promotion("standard"):
@@ -146,6 +147,7 @@ def test_without_force_the_report_says_so():
     assert not found.determined[:3].any()
 
 
+@pytest.mark.slow
 def test_the_same_key_trains_the_same_network():
     pulls = jax.tree.map(lambda leaf: leaf[None], stacked([even_pull()]))
     families = jax.tree.map(lambda leaf: leaf[None], FAMILY)
@@ -154,6 +156,7 @@ def test_the_same_key_trains_the_same_network():
     np.testing.assert_array_equal(first.model.free, second.model.free)
 
 
+@pytest.mark.slow
 def test_training_lowers_the_losses_of_the_strong_form():
     """Adam, then L-BFGS, on points where the equation of motion is least fulfilled."""
     pulls = jax.tree.map(lambda leaf: leaf[None], stacked([even_pull()]))
