@@ -26,6 +26,13 @@ def one_sided_chamfer(
     return jnp.sum(jnp.where(mask, distances, 0)) / jnp.sum(mask, dtype=distances.dtype)
 
 
+def length(gap: Float[Array, "*point 3"]) -> Float[Array, "*point"]:
+    """Lengths [m], 0 below `TOUCHING`, where the derivative of a root would not be finite."""
+    square = jnp.sum(gap**2, axis=-1)
+    apart = square > TOUCHING**2
+    return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
+
+
 def surface_residuals(
     points: Float[Array, "point 3"],
     mask: Bool[Array, " point"],
@@ -41,9 +48,8 @@ def surface_residuals(
     face, weights = nearest(points, x, faces)
     vertices = faces[face]
     gap = points - jnp.einsum("pk,pki->pi", weights, x[vertices])
-    square = jnp.sum(gap**2, axis=-1)
-    apart = square > TOUCHING**2  # a point on the sheet has no direction but the normal
-    distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
+    distance = length(gap)
+    apart = distance > 0  # a point on the sheet has no direction but the normal
     edges = x[vertices[:, 1:]] - x[vertices[:, :1]]
     normal = jnp.cross(edges[:, 0], edges[:, 1])
     normal = normal / jnp.sqrt(jnp.sum(normal**2, axis=-1, keepdims=True))
@@ -88,7 +94,7 @@ def huber(distance: Float[Array, "*point"], scale: float = 0.01) -> Float[Array,
     return jnp.where(distance < scale, distance**2 / 2, scale * (distance - scale / 2))
 
 
-def masked_mean(values: Float[Array, " point"], mask: Bool[Array, " point"]) -> Float[Array, ""]:
+def masked_mean(values: Float[Array, "*point"], mask: Bool[Array, "*point"]) -> Float[Array, ""]:
     """The mean of the values in a mask; NaN when it is empty."""
     return jnp.sum(jnp.where(mask, values, 0)) / jnp.sum(mask, dtype=values.dtype)
 
@@ -137,9 +143,7 @@ def from_surface(
     """
     targets = jnp.where(mask[:, None], points, jnp.inf)
     pairs = jnp.sum((jax.lax.stop_gradient(samples)[:, None] - targets[None]) ** 2, axis=-1)
-    square = jnp.sum((samples - points[jnp.argmin(pairs, axis=1)]) ** 2, axis=-1)
-    apart = square > TOUCHING**2
-    distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
+    distance = length(samples - points[jnp.argmin(pairs, axis=1)])
     return mean(penalty(distance), visible)
 
 

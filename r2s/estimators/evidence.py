@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from r2s.estimators.prediction import Seen, Slope
 from r2s.estimators.problem import FORCE_SCALE, Clouds, Force, Markers, Problem
-from r2s.losses import robust, robust_weight, surface_residuals
+from r2s.losses import length, masked_mean, robust, robust_weight, surface_residuals
 from r2s.mesh import Mesh
 
 Scale = Float[Array, ""] | float
@@ -40,12 +40,12 @@ def loss_of(problem: Problem, seen: Seen, scale: Scale = 0.0) -> Float[Array, ""
     """The robust mean [m^2] of all that was seen; `scale` [m] as of `r2s.losses.robust`."""
     mesh, total = problem.scenario.scene.mesh, jnp.zeros((), seen.x.dtype)
     if problem.clouds is not None:
-        total += _mean(
+        total += masked_mean(
             robust(_residuals(problem.clouds, mesh, seen)[0], scale), problem.clouds.mask
         )
     if problem.markers is not None:
         gap = _gaps(problem.markers, seen.x)
-        total += _mean(robust(_length(gap), scale), problem.markers.seen)
+        total += masked_mean(robust(length(gap), scale), problem.markers.seen)
     if problem.force is not None and seen.force is not None:
         total += jnp.mean(jnp.sum(_force_gaps(problem.force, seen.force) ** 2, axis=1)) / 2
     return total
@@ -79,7 +79,7 @@ def _of_clouds(clouds: Clouds, mesh: Mesh, seen: Seen, slope: Slope, scale) -> N
     )
     score = (weight * distance)[..., None] * jacobian
     return Normals(
-        loss=_mean(robust(distance, scale), clouds.mask),
+        loss=masked_mean(robust(distance, scale), clouds.mask),
         gradient=jnp.sum(score, axis=(0, 1)),
         matrix=jnp.einsum("fp,fpu,fpv->uv", weight, jacobian, jacobian),
         scatter=_scatter(mesh, score, jnp.einsum("fpk,fpki->fpi", weights, mesh.rest[vertices])),
@@ -89,7 +89,7 @@ def _of_clouds(clouds: Clouds, mesh: Mesh, seen: Seen, slope: Slope, scale) -> N
 
 def _of_markers(markers: Markers, mesh: Mesh, seen: Seen, slope: Slope, scale) -> Normals:
     gap = _gaps(markers, seen.x)
-    distance = _length(gap)
+    distance = length(gap)
     picked = slope.x[:, markers.vertices]  # (frame, marker, corner, axis, unknown)
     jacobian = jnp.einsum("mk,fmkiu->fmiu", markers.weights, picked)
     count = jnp.sum(markers.seen, dtype=float)
@@ -97,7 +97,7 @@ def _of_markers(markers: Markers, mesh: Mesh, seen: Seen, slope: Slope, scale) -
     score = jnp.einsum("fm,fmi,fmiu->fmu", weight, gap, jacobian)
     place = jnp.einsum("mk,mki->mi", markers.weights, mesh.rest[markers.vertices])
     return Normals(
-        loss=_mean(robust(distance, scale), markers.seen),
+        loss=masked_mean(robust(distance, scale), markers.seen),
         gradient=jnp.sum(score, axis=(0, 1)),
         matrix=jnp.einsum("fm,fmiu,fmiv->uv", weight, jacobian, jacobian),
         scatter=_scatter(mesh, score, jnp.broadcast_to(place[None], (*distance.shape, 2))),
@@ -132,16 +132,6 @@ def _gaps(markers: Markers, x: Float[Array, "frame vertex 3"]) -> Float[Array, "
 
 def _force_gaps(force: Force, pulled: Array) -> Float[Array, "frame direction"]:
     return FORCE_SCALE * (pulled - force.values)
-
-
-def _length(gap: Float[Array, "*shape 3"]) -> Float[Array, "*shape"]:
-    square = jnp.sum(gap**2, axis=-1)
-    apart = square > 0  # the derivative of a root at 0 is not finite
-    return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
-
-
-def _mean(values: Float[Array, "*shape"], mask) -> Float[Array, ""]:
-    return jnp.sum(jnp.where(mask, values, 0)) / jnp.sum(mask, dtype=float)
 
 
 def _spread(distance: Float[Array, "*shape"], mask) -> Float[Array, ""]:

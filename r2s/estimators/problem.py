@@ -108,8 +108,8 @@ class Problem(eqx.Module):
 
         `voxel` [m] is the distance below which points are merged, `shape` the vertices of the
         simulated sheet. Where markers were tracked they count instead of the clouds, and the force
-        on the pulled clamp counts where it was measured. Raises `ValueError` when the recording has
-        none of these.
+        on the pulled clamp counts where it was measured. Raises `ValueError` when a marker is not
+        seen in the first frame, or lies off the sheet there.
         """
         scenario = from_recording(recording, shape)
         first, last = recording.info.frames_used
