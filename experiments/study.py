@@ -42,7 +42,7 @@ if __name__ == "__main__":
     parser.add_argument("--seed", type=int, default=0)
     a = parser.parse_args()
     try:
-        effort = run.Effort(a.coarse, a.starts, a.iterations, a.recipe, a.seed)
+        effort = run.Effort(run.Cost(a.coarse, a.starts, a.iterations), a.recipe, a.seed)
         main(a.data, a.out, a.density, a.only, effort)
     except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")

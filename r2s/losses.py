@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from r2s.surface import nearest
+from r2s.surface import nearest, prolonged
 
 TOUCHING = 1e-6  # [m]: what is nearer lies on the sheet
 
@@ -38,14 +38,24 @@ def surface_residuals(
     mask: Bool[Array, " point"],
     x: Float[Array, "vertex 3"],
     faces: Int[Array, "face 3"],
+    borders: Bool[Array, "face 3"] | None = None,
+    slack: Float[Array, ""] | float = 0.0,
 ) -> tuple[Float[Array, " point"], Float[Array, "point 3"], Int[Array, "point 3"], Array]:
     """Distances [m] from points to a sheet, and what moves them.
 
     Gives the distance of each point (0 where masked out), the unit direction from the sheet to it,
     and the three vertices with their weights that make the nearest place: a small motion `dx` of
     the vertices changes the distance by -direction . sum(weights dx).
+
+    With its `borders` (`r2s.mesh.borders`) the sheet goes on beyond them, in the planes of its
+    faces, by `slack` [m]. Noise throws points beyond a border, where they pull at it, but what it
+    throws inward does not push back: without slack, noise makes a sheet seem larger than it is.
     """
     face, weights = nearest(points, x, faces)
+    if borders is not None:
+        beyond = jnp.any(borders[face] & (weights <= 0), axis=1)
+        longer = prolonged(points, x[faces[face]], weights, slack)
+        weights = jnp.where(beyond[:, None], longer, weights)
     vertices = faces[face]
     gap = points - jnp.einsum("pk,pki->pi", weights, x[vertices])
     distance = length(gap)
@@ -79,6 +89,16 @@ def robust_weight(
     limit = jnp.where(strict, jnp.maximum(scale, TOUCHING), OUTLIER_SCALE)
     weight = 1 / (1 + (distance / limit) ** 2)
     return jnp.where(strict, weight**2, weight)
+
+
+def robust_curvature(
+    distance: Float[Array, "*point"], scale: Float[Array, ""] | float = 0.0
+) -> Float[Array, "*point"]:
+    """The second derivative of `robust` [-]: below 0 for an outlier."""
+    strict = jnp.asarray(scale, float) > 0
+    limit = jnp.where(strict, jnp.maximum(scale, TOUCHING), OUTLIER_SCALE)
+    square = (distance / limit) ** 2
+    return jnp.where(strict, (1 - 3 * square) / (1 + square) ** 3, (1 - square) / (1 + square) ** 2)
 
 
 Penalty = Callable[[Float[Array, " point"]], Float[Array, " point"]]  # of distances [m]

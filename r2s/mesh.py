@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from r2s.linear.dissection import Level, levels
 from r2s.linear.pattern import Pattern
@@ -130,6 +130,14 @@ def _hinges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             hinges.append((start, high if start == low else low, left, right))
             pairs.append((face_left, face_right))
     return np.reshape(hinges, (-1, 4)).astype(int), np.reshape(pairs, (-1, 2)).astype(int)
+
+
+def borders(mesh: Mesh) -> Bool[Array, "face 3"]:
+    """Which edges of the faces, each opposite to a corner, are borders of the sheet."""
+    count = len(mesh.rest)
+    name = lambda a, b: jnp.minimum(a, b) * count + jnp.maximum(a, b)
+    edges = name(jnp.roll(mesh.faces, -1, axis=1), jnp.roll(mesh.faces, -2, axis=1))
+    return ~jnp.isin(edges, name(mesh.hinges[:, 0], mesh.hinges[:, 1]))
 
 
 def rectangle(

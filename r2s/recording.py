@@ -196,25 +196,27 @@ def cloud(recording: Recording, frame: int) -> Float[np.ndarray, "point 3"]:
     return np.asarray(recording.points)[frame][np.asarray(recording.mask)[frame]]
 
 
-def subsample(recording: Recording, num_points: int, voxel: float, seed: int) -> Recording:
+def subsample(recording: Recording, num_points: int, voxel: float | None, seed: int) -> Recording:
     """Thin every frame to at most `num_points`, padded to exactly that many.
 
-    First the points of each cube of side `voxel` [m] become their mean; of these `num_points` are
-    drawn without repetition, by a generator seeded with (`seed`, frame). Recordings of as many
-    frames and knots then have the same shapes. Raises ValueError if `num_points` < 1 or `voxel`
-    is not positive.
+    They are drawn without repetition, by a generator seeded with (`seed`, frame). With a `voxel`
+    the points of each cube of that side [m] become their mean first, which evens out their density,
+    but moves them: a point that noise throws into an empty cube counts as much as the many of the
+    next. Recordings of as many frames and knots then have the same shapes. Raises ValueError if
+    `num_points` < 1 or `voxel` is not positive.
     """
     if num_points < 1:
         raise ValueError(f"num_points must be at least 1, found {num_points}")
-    if not (np.isfinite(voxel) and voxel > 0):
+    if voxel is not None and not (np.isfinite(voxel) and voxel > 0):
         raise ValueError(f"voxel must be positive [m], found {voxel}")
     thinned = []
     for frame in range(len(recording.times)):
-        means = voxel_means(cloud(recording, frame), voxel)
-        if len(means) > num_points:
+        points = cloud(recording, frame)
+        points = points if voxel is None else voxel_means(points, voxel)
+        if len(points) > num_points:
             generator = np.random.default_rng([seed, frame])
-            means = means[np.sort(generator.choice(len(means), num_points, replace=False))]
-        thinned.append(means)
+            points = points[np.sort(generator.choice(len(points), num_points, replace=False))]
+        thinned.append(points)
     points, mask = _pad(thinned, num_points)
     return replace(recording, points=jnp.asarray(points, float), mask=jnp.asarray(mask))
 

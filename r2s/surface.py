@@ -66,6 +66,27 @@ def _closest_weights(point: Float[Array, " 3"], corners: Float[Array, "3 3"]) ->
     return jnp.where(jnp.all(inside >= 0), inside, on_edges[jnp.argmin(distances)])
 
 
+def prolonged(
+    points: Float[Array, "point 3"],
+    corners: Float[Array, "point 3 3"],
+    weights: Float[Array, "point 3"],
+    length: Float[Array, ""] | float,
+) -> Float[Array, "point 3"]:
+    """Barycentric weights of the place nearest to each point when its triangle, whose nearest place
+    has `weights`, goes on in its plane by a `length` [m] beyond that place. Not differentiable,
+    like `nearest`."""
+    points, corners = jax.lax.stop_gradient((points, corners))
+    edges = corners[:, 1:] - corners[:, :1]
+    normal = jnp.cross(edges[:, 0], edges[:, 1])
+    square = jnp.maximum(jnp.sum(normal**2, axis=-1), jnp.finfo(points.dtype).tiny)
+    place = jnp.einsum("pk,pki->pi", weights, corners)
+    gap = points - place
+    along = gap - (jnp.sum(gap * normal, axis=-1) / square)[:, None] * normal
+    far = jnp.sqrt(jnp.maximum(jnp.sum(along**2, axis=-1), jnp.finfo(points.dtype).tiny))
+    moved = place + jnp.minimum(1, length / far)[:, None] * along
+    return jax.vmap(_plane_weights)(moved, corners[:, 0], corners[:, 1], corners[:, 2])
+
+
 def _plane_weights(point, a, b, c):
     """Barycentric weights of the foot of the perpendicular on the triangle's plane."""
     u, v, w = b - a, c - a, point - a

@@ -14,6 +14,7 @@ from r2s.losses import (
     huber,
     one_sided_chamfer,
     robust,
+    robust_curvature,
     robust_weight,
     sinkhorn,
     squared,
@@ -21,6 +22,7 @@ from r2s.losses import (
     to_surface,
     trimmed_mean,
 )
+from r2s.mesh import borders
 
 EVERY = jnp.ones(40, bool)
 chamfer = jax.jit(one_sided_chamfer)
@@ -117,12 +119,35 @@ def test_a_point_on_the_sheet_has_the_normal_as_direction(sheet):
     assert np.asarray(direction[0]) == pytest.approx(np.array([0, 0, 1]), abs=1e-12)
 
 
+def test_with_slack_noise_does_not_pull_at_the_borders(sheet):
+    """Noise about a flat sheet makes it seem too small, unless it may go on beyond its borders."""
+    side = jnp.max(sheet.rest, axis=0)
+    key, other = jax.random.split(jax.random.key(0))
+    places = jnp.pad(jax.random.uniform(key, (4000, 2)) * side[None], ((0, 0), (0, 1)))
+    points = places + 2e-3 * jax.random.normal(other, places.shape)
+    mask = jnp.ones(len(points), bool)
+    middle = jnp.pad(side / 2, (0, 1))[None]
+
+    def loss(stretch, slack):
+        x = (flat(sheet) - middle) * (1 + stretch) + middle
+        found = surface_residuals(points, mask, x, sheet.faces, borders(sheet), slack)
+        return jnp.mean(squared(found[0]))
+
+    pull = jax.jit(jax.grad(loss))
+    assert pull(0.0, 0.0) < -1e-6  # [m^2]: larger would be better
+    assert abs(pull(0.0, 0.01)) < 1e-9
+    # what lies farther away than the slack still pulls
+    assert pull(-0.1, 0.002) < -1e-5
+
+
 @given(st.floats(0, 1), st.sampled_from([0.0, 3e-3, 0.02]))
 @settings(max_examples=25, deadline=None)
 def test_the_robust_weight_is_its_slope_over_the_distance(distance, scale):
     distance = jnp.array(distance)
     slope = jax.grad(robust)(distance, scale)
     assert slope == pytest.approx(float(robust_weight(distance, scale) * distance), rel=1e-9)
+    curvature = jax.grad(jax.grad(robust))(distance, scale)
+    assert curvature == pytest.approx(float(robust_curvature(distance, scale)), rel=1e-9, abs=1e-12)
 
 
 def test_with_a_scale_what_is_far_off_does_not_pull():

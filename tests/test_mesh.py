@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.mesh import Mesh, corner, rectangle
+from r2s.mesh import Mesh, borders, corner, rectangle
 
 sides = st.floats(0.01, 10)
 counts = st.integers(2, 6)
@@ -33,6 +33,18 @@ def test_every_inner_edge_has_one_hinge(shape):
     shared = Counter(tuple(sorted(side)) for side in sides.tolist())
     inner = sorted(edge for edge, number in shared.items() if number == 2)
     assert sorted(tuple(sorted(hinge)) for hinge in mesh.hinges[:, :2].tolist()) == inner
+
+
+@given(st.tuples(counts, counts))
+@few
+def test_the_borders_go_once_around_the_sheet(shape):
+    mesh = rectangle((1.0, 2.0), shape)
+    face, corner_of = np.nonzero(np.asarray(borders(mesh)))
+    faces = np.asarray(mesh.faces)
+    ends = np.stack([faces[face, (corner_of + i) % 3] for i in (1, 2)])
+    first, second = np.asarray(mesh.rest)[ends]
+    assert np.linalg.norm(second - first, axis=1).sum() == pytest.approx(6, rel=1e-12)
+    assert np.any(np.isin((first + second) / 2, (0, 1, 2)), axis=1).all()
 
 
 def test_a_hinge_lies_between_its_two_triangles(sheet):

@@ -212,6 +212,13 @@ def test_subsample_makes_one_mean_of_a_voxel(clouds: list[np.ndarray], voxel: fl
         np.testing.assert_allclose(cloud(thin, frame), means, atol=1e-5)
 
 
+def test_subsample_without_voxel_moves_no_point() -> None:
+    clouds = np.random.default_rng(0).uniform(size=(2, 200, 3)).astype(np.float32)
+    thin = cloud(subsample(record(list(clouds)), 50, None, seed=0), 0)
+    assert len(np.unique(thin, axis=0)) == 50
+    assert {tuple(point) for point in thin} <= {tuple(point) for point in clouds[0]}
+
+
 def test_subsample_refuses_bad_numbers() -> None:
     with pytest.raises(ValueError, match="num_points must be at least 1, found 0"):
         subsample(record(ones(3, 4)), 0, 0.01, seed=0)

@@ -60,7 +60,7 @@ def test_the_cropped_distance_leaves_out_what_the_recording_cannot_show(pair):
 
 
 def test_an_estimate_is_made_once(pair, tmp_path, monkeypatch):
-    effort = run.Effort(num_coarse=2, num_starts=1, num_iterations=1)
+    effort = run.Effort(run.Cost(coarse=2, starts=1, iterations=1))
     with monkeypatch.context() as patch:
         patch.setattr(run, "_approach", lambda effort: _fake)
         judged, rows = run.run([pair], tmp_path, effort)
@@ -77,7 +77,7 @@ def test_an_estimate_is_made_once(pair, tmp_path, monkeypatch):
     again, _ = run.run([pair], tmp_path, effort)
     np.testing.assert_array_equal(again[0].estimate.values, judged[0].estimate.values)
     with pytest.raises(AssertionError, match="made again"):
-        run.run([pair], tmp_path, run.Effort(num_coarse=3))
+        run.run([pair], tmp_path, run.Effort(run.Cost(coarse=3)))
 
 
 def _fake(pair):

@@ -1,6 +1,7 @@
 """What a prediction says against what was seen: clouds, markers and forces, each a robust mean."""
 
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -9,31 +10,39 @@ from jaxtyping import Array, Float
 
 from r2s.estimators.prediction import Seen, Slope
 from r2s.estimators.problem import FORCE_SCALE, Clouds, Force, Markers, Problem
-from r2s.losses import length, masked_mean, robust, robust_weight, surface_residuals
-from r2s.mesh import Mesh
+from r2s.losses import (
+    length,
+    masked_mean,
+    robust,
+    robust_curvature,
+    robust_weight,
+    surface_residuals,
+)
+from r2s.mesh import Mesh, borders
 
 Scale = Float[Array, ""] | float
 Loss = Callable[[Problem, Seen], Float[Array, ""]]  # [m^2]
 
 PATCHES = 3  # along a side of the sheet: what lies in one patch errs alike
-MEMORY = 8  # frames, over which it does so
+MEMORY = 8  # frames, in which it does so
+FLATTEST = 0.3  # curvature of a robust loss over the mean weight, at least
 
 
-class Normals(eqx.Module):
-    """A loss [m^2] with its gradient and Gauss-Newton matrix in the unknown [m^2], the scatter of
-    the gradient between patches and frames [m^4], and the spread of the distances [m]."""
+class Evidence(eqx.Module):
+    """A loss with its normal equations, by clusters: a patch of the sheet over some frames.
+
+    - `loss`: [m^2]. `spread`: robust standard deviation of the distances, [m].
+    - `scores`, `matrices`: each cluster's share of the loss's gradient and Gauss-Newton matrix in
+      the unknown, [m^2].
+    - `noise`: times its matrix, the covariance [m^4] of its score if all residuals err
+      independently, [m^2].
+    """
 
     loss: Float[Array, ""]
-    gradient: Float[Array, " unknown"]
-    matrix: Float[Array, "unknown unknown"]
-    scatter: Float[Array, "unknown unknown"]
     spread: Float[Array, ""]
-
-    @classmethod
-    def zero(cls, count: int, dtype) -> "Normals":
-        """Of no evidence."""
-        nothing, square = jnp.zeros((), dtype), jnp.zeros((count, count), dtype)
-        return cls(nothing, jnp.zeros(count, dtype), square, square, nothing)
+    scores: Float[Array, "cluster unknown"]
+    matrices: Float[Array, "cluster unknown unknown"]
+    noise: Float[Array, " cluster"]
 
 
 def loss_of(problem: Problem, seen: Seen, scale: Scale = 0.0) -> Float[Array, ""]:
@@ -41,7 +50,7 @@ def loss_of(problem: Problem, seen: Seen, scale: Scale = 0.0) -> Float[Array, ""
     mesh, total = problem.scenario.scene.mesh, jnp.zeros((), seen.x.dtype)
     if problem.clouds is not None:
         total += masked_mean(
-            robust(_residuals(problem.clouds, mesh, seen)[0], scale), problem.clouds.mask
+            robust(_residuals(problem.clouds, mesh, seen, scale)[0], scale), problem.clouds.mask
         )
     if problem.markers is not None:
         gap = _gaps(problem.markers, seen.x)
@@ -51,7 +60,7 @@ def loss_of(problem: Problem, seen: Seen, scale: Scale = 0.0) -> Float[Array, ""
     return total
 
 
-def normals_of(problem: Problem, seen: Seen, slope: Slope, scale: Scale = 0.0) -> Normals:
+def evidence_of(problem: Problem, seen: Seen, slope: Slope, scale: Scale = 0.0) -> Evidence:
     """Loss and normal equations of all that was seen, from a prediction and its derivative."""
     mesh = problem.scenario.scene.mesh
     parts = []
@@ -61,66 +70,113 @@ def normals_of(problem: Problem, seen: Seen, slope: Slope, scale: Scale = 0.0) -
         parts.append(_of_markers(problem.markers, mesh, seen, slope, scale))
     if problem.force is not None and seen.force is not None and slope.force is not None:
         parts.append(_of_force(problem.force, seen.force, slope.force))
-    total = jax.tree.map(lambda *leaves: sum(leaves), *parts)
-    return eqx.tree_at(lambda n: n.spread, total, parts[0].spread)
+    return Evidence(
+        loss=sum((part.loss for part in parts), jnp.zeros((), seen.x.dtype)),
+        spread=parts[0].spread,
+        scores=jnp.concatenate([part.scores for part in parts]),
+        matrices=jnp.concatenate([part.matrices for part in parts]),
+        noise=jnp.concatenate([part.noise for part in parts]),
+    )
 
 
-def _of_clouds(clouds: Clouds, mesh: Mesh, seen: Seen, slope: Slope, scale) -> Normals:
-    distance, direction, vertices, weights = _residuals(clouds, mesh, seen)
+def _of_clouds(clouds: Clouds, mesh: Mesh, seen: Seen, slope: Slope, scale) -> Evidence:
+    distance, direction, vertices, weights = _residuals(clouds, mesh, seen, scale)
+    weight = _weights(distance, clouds.mask, scale)
 
     def frame(args):  # one at a time: its derivatives fit the cache
-        slope, vertices, weights, direction = args
+        slope, vertices, weights, direction, distance, weight = args
         moved = jnp.einsum("pk,pkiu->piu", weights, slope[vertices])
-        return -jnp.einsum("pi,piu->pu", direction, moved)
+        jacobian = -jnp.einsum("pi,piu->pu", direction, moved)
+        place = jnp.einsum("pk,pki->pi", weights, mesh.rest[vertices])
+        return _by_patch(mesh, place, jacobian[:, None], distance[:, None], weight)
 
-    jacobian = jax.lax.map(frame, (slope.x, vertices, weights, direction))
-    weight = jnp.where(clouds.mask, robust_weight(distance, scale), 0) / jnp.sum(
-        clouds.mask, dtype=float
-    )
-    score = (weight * distance)[..., None] * jacobian
-    return Normals(
-        loss=masked_mean(robust(distance, scale), clouds.mask),
-        gradient=jnp.sum(score, axis=(0, 1)),
-        matrix=jnp.einsum("fp,fpu,fpv->uv", weight, jacobian, jacobian),
-        scatter=_scatter(mesh, score, jnp.einsum("fpk,fpki->fpi", weights, mesh.rest[vertices])),
-        spread=_spread(distance, clouds.mask),
-    )
+    shares = jax.lax.map(frame, (slope.x, vertices, weights, direction, distance, weight))
+    return _of_robust(distance, clouds.mask, scale, *shares)
 
 
-def _of_markers(markers: Markers, mesh: Mesh, seen: Seen, slope: Slope, scale) -> Normals:
+def _of_markers(markers: Markers, mesh: Mesh, seen: Seen, slope: Slope, scale) -> Evidence:
     gap = _gaps(markers, seen.x)
     distance = length(gap)
     picked = slope.x[:, markers.vertices]  # (frame, marker, corner, axis, unknown)
     jacobian = jnp.einsum("mk,fmkiu->fmiu", markers.weights, picked)
-    count = jnp.sum(markers.seen, dtype=float)
-    weight = jnp.where(markers.seen, robust_weight(distance, scale), 0) / count
-    score = jnp.einsum("fm,fmi,fmiu->fmu", weight, gap, jacobian)
     place = jnp.einsum("mk,mki->mi", markers.weights, mesh.rest[markers.vertices])
-    return Normals(
-        loss=masked_mean(robust(distance, scale), markers.seen),
-        gradient=jnp.sum(score, axis=(0, 1)),
-        matrix=jnp.einsum("fm,fmiu,fmiv->uv", weight, jacobian, jacobian),
-        scatter=_scatter(mesh, score, jnp.broadcast_to(place[None], (*distance.shape, 2))),
-        spread=_spread(distance, markers.seen),
+    shares = jax.vmap(partial(_by_patch, mesh, place))(
+        jacobian, gap, _weights(distance, markers.seen, scale)
     )
+    return _of_robust(distance, markers.seen, scale, *shares)
 
 
-def _of_force(force: Force, pulled: Array, slope: Array) -> Normals:
+def _of_force(force: Force, pulled: Array, slope: Array) -> Evidence:
     gap, jacobian = _force_gaps(force, pulled), FORCE_SCALE * slope
-    count = len(gap)
-    score = jnp.einsum("fd,fdu->fu", gap, jacobian) / count
-    return Normals(
+    scores = jnp.einsum("fd,fdu->fu", gap, jacobian) / len(gap)
+    matrices = jnp.einsum("fdu,fdv->fuv", jacobian, jacobian) / len(gap)
+    matrices = _by_time(matrices[:, None])
+    return Evidence(
         loss=jnp.mean(jnp.sum(gap**2, axis=1)) / 2,
-        gradient=jnp.sum(score, axis=0),
-        matrix=jnp.einsum("fdu,fdv->uv", jacobian, jacobian) / count,
-        scatter=_over_time(score[:, None]),
         spread=jnp.sqrt(jnp.mean(gap**2)),
+        scores=_by_time(scores[:, None]),
+        matrices=matrices,
+        noise=jnp.full(len(matrices), jnp.mean(gap**2) / len(gap)),
     )
 
 
-def _residuals(clouds: Clouds, mesh: Mesh, seen: Seen):
-    """Of every frame, `surface_residuals`; one frame at a time, which fits the cache."""
-    frame = lambda seen: surface_residuals(seen[0], seen[1], seen[2], mesh.faces)
+def _weights(distance: Float[Array, "frame point"], mask, scale: Scale) -> Array:
+    """What each point weighs in the normal equations of the mean."""
+    return jnp.where(mask, robust_weight(distance, scale), 0) / jnp.sum(mask, dtype=float)
+
+
+def _of_robust(distance, mask, scale: Scale, scores: Array, matrices: Array) -> Evidence:
+    """The evidence of distances, from the shares of each frame and patch in their weighted squares.
+
+    Their matrix is steeper than the robust loss is curved: by the ratio of its mean curvature to
+    the mean weight, with which the estimate has the covariance of an M-estimate (Huber 1981).
+    """
+    count = jnp.sum(mask, dtype=float)
+    weight = masked_mean(robust_weight(distance, scale), mask)
+    curvature = masked_mean(robust_curvature(distance, scale), mask)
+    curvature = jnp.clip(curvature, FLATTEST * weight, weight)
+    square = masked_mean((robust_weight(distance, scale) * distance) ** 2, mask)
+    matrices = _by_time(matrices * (curvature / weight))
+    return Evidence(
+        loss=masked_mean(robust(distance, scale), mask),
+        spread=_spread(distance, mask),
+        scores=_by_time(scores),
+        matrices=matrices,
+        noise=jnp.full(len(matrices), square / curvature / count),
+    )
+
+
+def _by_patch(
+    mesh: Mesh,
+    place: Float[Array, "point 2"],
+    jacobian: Float[Array, "point axis unknown"],
+    gap: Float[Array, "point axis"],
+    weight: Float[Array, " point"],
+) -> tuple[Float[Array, "patch unknown"], Float[Array, "patch unknown unknown"]]:
+    """Scores and matrices of a frame's patches, from residuals at places of the sheet [m]."""
+    extent = jnp.max(mesh.rest, axis=0) * (1 + 1e-3)
+    cell = jnp.clip(jnp.floor(place / extent[None] * PATCHES).astype(int), 0, PATCHES - 1)
+    patch = jax.nn.one_hot(cell[:, 0] * PATCHES + cell[:, 1], PATCHES**2, dtype=gap.dtype)
+    score = jnp.einsum("pa,pau->pu", weight[:, None] * gap, jacobian)
+    matrix = jnp.einsum("p,pau,pav->puv", weight, jacobian, jacobian)
+    return patch.T @ score, jnp.einsum("pc,puv->cuv", patch, matrix)
+
+
+def _by_time(shares: Float[Array, "frame patch *rest"]) -> Float[Array, " *cluster"]:
+    """Sums over blocks of frames, which with their patches are the clusters."""
+    missing = -len(shares) % MEMORY
+    whole = jnp.pad(shares, ((0, missing), *((0, 0),) * (shares.ndim - 1)))
+    blocks = jnp.sum(whole.reshape(-1, MEMORY, *shares.shape[1:]), axis=1)
+    return blocks.reshape(-1, *shares.shape[2:])
+
+
+def _residuals(clouds: Clouds, mesh: Mesh, seen: Seen, scale: Scale):
+    """Of every frame, `surface_residuals`; one frame at a time, which fits the cache.
+
+    With as much slack at the borders as what is not an outlier may be off.
+    """
+    edges = borders(mesh)
+    frame = lambda seen: surface_residuals(seen[0], seen[1], seen[2], mesh.faces, edges, scale)
     return jax.lax.map(frame, (clouds.points, clouds.mask, seen.x))
 
 
@@ -137,26 +193,3 @@ def _force_gaps(force: Force, pulled: Array) -> Float[Array, "frame direction"]:
 def _spread(distance: Float[Array, "*shape"], mask) -> Float[Array, ""]:
     """The deviation [m] of a normal one with the same median."""
     return 1.4826 * jnp.nanmedian(jnp.where(mask, distance, jnp.nan))
-
-
-def _scatter(
-    mesh: Mesh,
-    score: Float[Array, "frame point unknown"],
-    place: Float[Array, "frame point 2"],
-) -> Float[Array, "unknown unknown"]:
-    """The covariance of the gradient, from the scores of the patches of the sheet.
-
-    Points of a patch err alike, in one frame and in those near to it: sums over patches, weighted
-    over the frames between them (Newey and West 1987).
-    """
-    extent = jnp.max(mesh.rest, axis=0) * (1 + 1e-3)
-    cell = jnp.floor(place / extent[None, None] * PATCHES).astype(int)
-    patch = jnp.clip(cell[..., 0] * PATCHES + cell[..., 1], 0, PATCHES**2 - 1)
-    total = jax.vmap(lambda s, c: jax.ops.segment_sum(s, c, PATCHES**2))(score, patch)
-    return _over_time(total)
-
-
-def _over_time(score: Float[Array, "frame cluster unknown"]) -> Float[Array, "unknown unknown"]:
-    frames = jnp.arange(len(score), dtype=float)
-    near = jnp.maximum(0, 1 - jnp.abs(frames[:, None] - frames[None]) / MEMORY)
-    return jnp.einsum("fcu,fg,gcv->uv", score, near, score)

@@ -98,7 +98,7 @@ class Problem(eqx.Module):
         family: Family,
         *,
         num_points: int = 300,
-        voxel: float = 0.008,
+        voxel: float | None = None,
         shape: tuple[int, int] = (9, 9),
         seed: int = 0,
         doubt: Doubt = USUAL,
@@ -106,7 +106,7 @@ class Problem(eqx.Module):
     ) -> "Problem":
         """A problem from a recording, its clouds thinned to `num_points` a frame.
 
-        `voxel` [m] is the distance below which points are merged, `shape` the vertices of the
+        `voxel` [m] as of `r2s.recording.subsample`, `shape` the vertices of the
         simulated sheet. Where markers were tracked they count instead of the clouds, and the force
         on the pulled clamp counts where it was measured. Raises `ValueError` when a marker is not
         seen in the first frame, or lies off the sheet there.

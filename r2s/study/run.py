@@ -11,6 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from r2s.estimators import diffcloud
+from r2s.estimators.descent import DEFAULT
 from r2s.estimators.descent import Effort as Cost
 from r2s.estimators.estimate import FORMAT, Estimate, as_json, from_json
 from r2s.estimators.problem import Problem
@@ -25,11 +26,9 @@ SOLVER = "cloth"
 
 @dataclass(frozen=True)
 class Effort:
-    """How much an estimate may cost. `recipe` is "default" or "original" (DIFFCLOUD's)."""
+    """What an estimate may `cost`, and its `recipe`: "default" or "original" (DIFFCLOUD's)."""
 
-    num_coarse: int = 24
-    num_starts: int = 3
-    num_iterations: int = 25
+    cost: Cost = DEFAULT
     recipe: str = "default"
     seed: int = 0
 
@@ -95,9 +94,7 @@ def _approach(effort: Effort) -> Callable[[Pair], Estimate]:
     if effort.recipe != "default":
         raise ValueError(f"recipe is 'default' or 'original', got {effort.recipe!r}")
     return lambda pair: diffcloud.estimate(
-        problem_of(pair),
-        Cost(effort.num_coarse, effort.num_starts, effort.num_iterations),
-        key=jax.random.key(effort.seed),
+        problem_of(pair), effort.cost, key=jax.random.key(effort.seed)
     )
 
 
