@@ -43,6 +43,7 @@ class Scenario(eqx.Module):
     - `substeps`: steps between frames, from `steps_between`.
     - `wind`, `wind_times`: of the air, [m/s] and [s], linear between; None: still air.
     - `brake`: mass damping [1/s] before the first frame, beside the fabric's; None: none.
+    - `acceleration`: at the start, [m/s^2], of a sheet that is let go there; None: it is at rest.
     """
 
     scene: Scene
@@ -57,6 +58,7 @@ class Scenario(eqx.Module):
     wind: Float[Array, "gust 3"] | None = None
     wind_times: Float[Array, " gust"] | None = None
     brake: Float[Array, ""] | None = None
+    acceleration: Float[Array, "vertex 3"] | None = None
 
     def controls(self, substeps: int) -> Control:
         """What grippers and air do at the end of every substep, axes (frame, substep)."""
@@ -261,8 +263,11 @@ def stepped(
 
 
 def begin(solver: Any, scenario: Scenario) -> Any:
-    """The state of a solver from `stepped` at the start of a scenario, at rest."""
-    return solver.init(scenario.start)
+    """The state of a solver from `stepped` at the start of a scenario, without velocity."""
+    bare = solver.solver if isinstance(solver, Braked) else solver
+    if scenario.acceleration is None or not isinstance(bare, Cloth):  # only BDF2 looks back
+        return solver.init(scenario.start)
+    return solver.init(scenario.start, None, scenario.acceleration)
 
 
 class BrakedState(eqx.Module):
@@ -296,9 +301,9 @@ class Braked(eqx.Module):
     steps: int = eqx.field(static=True)
     dt: float = eqx.field(static=True)
 
-    def init(self, x: Float[Array, "vertex 3"]) -> BrakedState:
-        """At rest at positions [m]."""
-        return BrakedState(self.solver.init(x), jnp.zeros((), int))
+    def init(self, x: Float[Array, "vertex 3"], *rates: Array | None) -> BrakedState:
+        """At positions [m]; `rates` as of the solver, by default at rest."""
+        return BrakedState(self.solver.init(x, *rates), jnp.zeros((), int))
 
     def step(self, fabric: Fabric, state: BrakedState, control: Control) -> BrakedState:
         """The state `dt` later."""
