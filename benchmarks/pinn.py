@@ -3,16 +3,20 @@
 python benchmarks/pinn.py epochs --torch /path/to/python   # of an environment with PyTorch
 python benchmarks/pinn.py fabrics                          # ours on the five fabrics
 python benchmarks/pinn.py recipes --seeds 5 --epochs 1000  # the paper's recipe beside ours
+python benchmarks/pinn.py clouds                           # from a lift and a wind, no markers
 
-Times are CPU seconds of all threads, and wall seconds.
+Times are CPU seconds of all threads, and wall seconds. Tables and a picture go to --out; what is in
+a table there is not measured again.
 """
 
 import argparse
+import csv
+import io
 import json
 import statistics
 import subprocess
-import sys
 import time
+from pathlib import Path
 
 FRAMES, MARKERS, WIDTH, LAYERS = 39, 81, 50, 7
 DENSITY, SIDE, PULLED, DURATION = 0.3, 0.45, 0.018, 1.267  # [kg/m^2, m, m, s]
@@ -188,126 +192,229 @@ def _nested_losses(jax, jnp, model, family, pulls):
     return jnp.mean(off**2), jnp.mean(jax.vmap(residual)(points) ** 2)
 
 
-def _pulls(name: str, seed: int):
+def resumed(out: Path, name: str, jobs: list[dict], make) -> list[dict]:
+    """A row for each job, with what `make` gives of it; those that are in the file are kept."""
+    from measure import progress
+
+    from r2s.files import write_text
+
+    path = out / f"{name}.csv"
+    rows = list(csv.DictReader(io.StringIO(path.read_text()))) if path.exists() else []
+    done = [{key: row.get(key) for key in jobs[0]} for row in rows]
+    for job in jobs:
+        if {key: str(value) for key, value in job.items()} in done:
+            continue
+        cpu, wall = time.process_time(), time.perf_counter()
+        found = make(**job)
+        seconds = {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
+        rows.append({key: str(value) for key, value in (job | found | seconds).items()})
+        text = io.StringIO()
+        writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)))
+        writer.writeheader()
+        writer.writerows(rows)
+        write_text(path, text.getvalue())
+        progress(", ".join(f"{key} {value}" for key, value in rows[-1].items()))
+    return rows
+
+
+def _number(row: dict, key: str, form: str = ".4f") -> str:
+    return format(float(row[key]), form) if row.get(key) else "-"
+
+
+def _show(title: str, rows: list[dict], names: list[str], keys: list[str]) -> None:
+    from measure import show  # not at the top: PyTorch's environment has no JAX
+
+    columns: dict = {key: (lambda row, key=key: str(row[key])) for key in keys}
+    for name in names:
+        columns[name] = lambda row, name=name: (
+            f"{_number(row, 'error ' + name)} ({_number(row, 'deviation ' + name)})"
+        )
+    columns["CPU s"] = lambda row: _number(row, "cpu_s", ".0f")
+    show(title, rows, columns)
+
+
+def _fabric(name: str):
+    from r2s import presets
+    from r2s.family import OrthotropicFamily
+
+    fabric = presets.FIVE[name]()
+    return fabric, OrthotropicFamily.make(float(fabric.density))
+
+
+def _pulls(name: str, seed: int) -> list:
+    """Of a fabric along warp, weft and bias."""
     import jax.random as jr
     import numpy as np
 
-    from r2s import presets
     from r2s.pinn.data import pull_from
     from r2s.pinn.synthetic import pulled
 
-    fabric = presets.FIVE[name]()
+    fabric, _ = _fabric(name)
     some = []
     for i, angle in enumerate((0.0, np.pi / 2, np.pi / 4)):
         key = jr.fold_in(jr.key(seed), i)
         recording = pulled(fabric, name, angle, shape=SHAPE, key=key)
         some.append(pull_from(recording, angle))
-    return fabric, some
+    return some
 
 
-def _errors(family, fabric, values):
-    """Of warp, weft, shear relative, of coupling absolute."""
-    import numpy as np
+def _errors(family, truth, values, deviations=None) -> dict[str, float]:
+    """Of every parameter: relative where its range is logarithmic, else absolute."""
+    row = {}
+    for i, bound in enumerate(family.ranges):
+        ratio = float(values[i]) / float(truth[i]) - 1 if bound.log else 0.0
+        row[f"error {bound.name}"] = ratio if bound.log else float(values[i] - truth[i])
+        if deviations is not None:
+            row[f"deviation {bound.name}"] = float(deviations[i])
+    return row
 
-    truth = np.asarray(family.values(family.locate(fabric)))
-    return [float(v / t - 1) for v, t in zip(values[:3], truth[:3], strict=True)] + [
-        float(values[3] - truth[3])
-    ]
+
+STIFFNESSES = ["warp", "weft", "shear", "coupling"]
 
 
-def fabrics(seeds: int) -> list[dict]:
-    """Rows of the five fabrics, each pulled along warp, weft and bias."""
+def fabrics(out: Path, seeds: int) -> None:
+    """The five fabrics, each pulled along warp, weft and bias, with other noise."""
     import jax.random as jr
+    import numpy as np
+    from measure import show
 
     from r2s import presets
     from r2s.estimators.pinn import estimate
-    from r2s.family import OrthotropicFamily
 
-    rows = []
-    for seed in range(seeds):
-        for name in presets.FIVE:
-            fabric, some = _pulls(name, seed)
-            family = OrthotropicFamily.make(float(fabric.density))
-            cpu, wall = time.process_time(), time.perf_counter()
-            found = estimate(some, family, key=jr.key(seed)).estimate
-            seconds = time.process_time() - cpu, time.perf_counter() - wall
-            rows.append(
-                {
-                    "fabric": name,
-                    "seed": seed,
-                    "cpu_s": seconds[0],
-                    "wall_s": seconds[1],
-                    "errors": _errors(family, fabric, found.values),
-                    "deviations": found.deviations[:4].tolist(),
-                    "determined": found.determined[:4].tolist(),
-                }
-            )
-            print(json.dumps(rows[-1]), flush=True)
-    return rows
+    def make(fabric: str, seed: int) -> dict:
+        some = _pulls(fabric, seed)
+        about, family = _fabric(fabric)
+        truth = family.values(family.locate(about))
+        found = estimate(some, family, key=jr.key(seed)).estimate
+        return _errors(family, truth, found.values, found.deviations)
+
+    jobs = [{"fabric": name, "seed": seed} for seed in range(seeds) for name in presets.FIVE]
+    rows = resumed(out, "fabrics", jobs, make)
+    _show("errors (deviations)", rows, STIFFNESSES, ["fabric", "seed"])
+    known = [*STIFFNESSES, "damping", "friction"]
+    ratio = lambda row, of: float(row[f"error {of}"]) / float(row[f"deviation {of}"])
+    rms = lambda of: float(np.sqrt(np.mean([ratio(row, of) ** 2 for row in rows])))
+    spread = [{"of": of, "rms": rms(of)} for of in known]
+    columns = {"parameter": lambda row: row["of"], "rms": lambda row: f"{row['rms']:.2f}"}
+    show("errors over deviations", spread, columns)
+    _picture(out / "fabrics.png", rows)
 
 
-def recipes(name: str, seeds: int, number: int, alone: bool) -> list[dict]:
-    """Rows of the recipes on the same data: the paper's, our networks alone, and the estimate."""
+def _picture(path: Path, rows: list[dict]) -> None:
+    """Errors with two deviations, of every fabric and seed."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    names = list(dict.fromkeys(row["fabric"] for row in rows))
+    figure, axes = plt.subplots(1, 4, figsize=(13, 3.6), layout="constrained")
+    for ax, name in zip(axes, STIFFNESSES, strict=True):
+        for row in rows:
+            at = names.index(row["fabric"]) + 0.12 * (int(row["seed"]) % 5 - 2)
+            error, deviation = (float(row[f"{kind} {name}"]) for kind in ("error", "deviation"))
+            size = 1 if name == "coupling" else 100
+            ax.errorbar(at, size * error, 2 * size * deviation, fmt="o", ms=3, color="C0", lw=1)
+        ax.axhline(0, color="0.5", lw=0.8)
+        ax.set_xticks(range(len(names)), [n.replace("_", "\n") for n in names], fontsize=7)
+        ax.set_ylabel("error [-]" if name == "coupling" else "error [%]")
+        ax.set_title(name)
+    figure.suptitle("estimate from three pulls, with two standard deviations")
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def recipes(out: Path, name: str, seeds: int, number: int, alone: bool) -> None:
+    """The recipes on the same pulls: the paper's, ours, and long trainings of networks alone."""
     import equinox as eqx
     import jax.random as jr
 
     from r2s.estimators.pinn import estimate
     from r2s.fabric import Fabric
-    from r2s.family import OrthotropicFamily
     from r2s.pinn import paper
     from r2s.pinn.data import stacked
     from r2s.pinn.losses import strong_losses
     from r2s.pinn.training import Recipe
     from r2s.pinn.weak import weak_losses
 
-    fabric, some = _pulls(name, 0)
-    family = OrthotropicFamily.make(float(fabric.density))
-    ten = Fabric.make(float(fabric.density), (10.0, 0.0, 10.0, 10.0), 1e-5)
-    place = family.locate(ten)
-    rows = []
+    some, (fabric, family) = _pulls(name, 0), _fabric(name)
+    truth = family.values(family.locate(fabric))
+    place = family.locate(Fabric.make(float(fabric.density), (10.0, 0.0, 10.0, 10.0), 1e-5))
 
-    def note(recipe, seed, began, values):
-        cpu, wall = time.process_time() - began[0], time.perf_counter() - began[1]
-        errors = _errors(family, fabric, values)
-        rows.append(
-            {"recipe": recipe, "seed": seed, "cpu_s": cpu, "wall_s": wall, "errors": errors}
-        )
-        print(json.dumps(rows[-1]), flush=True)
-
-    clock = lambda: (time.process_time(), time.perf_counter())
-    for seed in range(seeds):
-        key, began = jr.key(seed), clock()
-        course = paper.train(family, stacked(some), place, number, key=key)
-        note(f"the paper's, {number} epochs", seed, began, family.values(course.model.place))
-        began = clock()
-        note("ours", seed, began, estimate(some, family, key=key).estimate.values)
-        for form in (weak_losses, strong_losses) if alone else ():
-            began, recipe = clock(), Recipe(losses=form, lbfgs=100)
-            found = estimate(some, family, recipe, key=key)
-            note(f"network alone, {form.__name__}", seed, began, found.network.values)
+    def make(fabric: str, recipe: str, seed: int) -> dict:
+        del fabric
+        key = jr.key(seed)
         eqx.clear_caches()
-    return rows
+        if recipe.startswith("the paper's"):
+            course = paper.train(family, stacked(some), place, number, key=key)
+            return _errors(family, truth, family.values(course.model.place))
+        if recipe == "ours":
+            found = estimate(some, family, key=key).estimate
+            return _errors(family, truth, found.values, found.deviations)
+        losses = weak_losses if recipe.endswith("weak") else strong_losses
+        found = estimate(some, family, Recipe(losses=losses, lbfgs=100), key=key).network
+        return _errors(family, truth, found.values)
+
+    names = [f"the paper's, {number} epochs", "ours"]
+    names += ["network alone, weak", "network alone, strong"] if alone else []
+    jobs = [{"fabric": name, "recipe": r, "seed": s} for s in range(seeds) for r in names]
+    rows = resumed(out, "recipes", jobs, make)
+    _show("errors (deviations)", rows, STIFFNESSES, ["fabric", "recipe", "seed"])
+
+
+def clouds(out: Path, seeds: int) -> None:
+    """The five fabrics, from clouds of a lift and of a wind without markers."""
+    import jax.random as jr
+
+    from r2s import presets, scenarios, synthetic
+    from r2s.estimators.pinn_clouds import estimate
+
+    def make(scenario: str, fabric: str, seed: int) -> dict:
+        about, family = _fabric(fabric)
+        key_seen, key = jr.split(jr.key(seed))
+        experiment = scenarios.SIX[scenario]()
+        recording = synthetic.record(experiment, about, fabric, shape=(17, 17), key=key_seen)
+        found = estimate(recording, family, key=key)
+        truth = family.values(family.locate(about))
+        return _errors(family, truth, found.values, found.deviations)
+
+    jobs = [
+        {"scenario": scenario, "fabric": name, "seed": seed}
+        for seed in range(seeds)
+        for scenario in ("wind", "lifting")
+        for name in presets.FIVE
+    ]
+    rows = resumed(out, "clouds", jobs, make)
+    _show("errors (deviations)", rows, [*STIFFNESSES, "bending"], ["scenario", "fabric", "seed"])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("what", choices=("epochs", "fabrics", "recipes", "torch"))
+    parser.add_argument("what", choices=("epochs", "fabrics", "recipes", "clouds", "torch"))
     parser.add_argument("--torch", help="python of an environment with PyTorch")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--epochs", type=int, default=10_000, help="of the paper's recipe")
     parser.add_argument("--fabric", default="pink_solid")
     parser.add_argument("--alone", action="store_true", help="long trainings of networks alone too")
+    parser.add_argument("--out", type=Path, default=Path("results/pinn"))
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
     if options.what == "torch":
         print(json.dumps(torch_epoch()))
     elif options.what == "epochs":
-        for row in epochs(options.torch):
-            print(json.dumps(row))
+        from measure import show
+
+        rows = epochs(options.torch)
+        columns = {"epoch": lambda row: row["epoch"]}
+        for key in ("cpu_s", "wall_s"):
+            columns[key] = lambda row, key=key: f"{row[key]:.4f}"
+        show("an epoch", rows, columns)
     elif options.what == "fabrics":
-        fabrics(options.seeds)
+        fabrics(options.out, options.seeds)
+    elif options.what == "clouds":
+        clouds(options.out, options.seeds)
     else:
-        recipes(options.fabric, options.seeds, options.epochs, options.alone)
-    sys.stdout.flush()
+        recipes(options.out, options.fabric, options.seeds, options.epochs, options.alone)
 
 
 if __name__ == "__main__":

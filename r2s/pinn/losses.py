@@ -170,7 +170,7 @@ def edge_force(
     network: DisplacementField, pull: Pull, fabric: Fabric, strain: Strain = green
 ) -> Float[Array, "frame axis"]:
     """The force [N] on the far clamp: the traction, integrated over the edge in every frame."""
-    nodes, weights = _gauss(EDGE_NODES)
+    nodes, weights = gauss(EDGE_NODES)
     number = len(pull.times)
     y = jnp.tile(nodes * pull.size[1], number)
     places = jnp.stack([jnp.broadcast_to(pull.size[0], y.shape), y], axis=1)
@@ -193,7 +193,7 @@ def marker_residual(network: DisplacementField, pull: Pull) -> Float[Array, "fra
 
 def clamp_residual(network: DisplacementField, pull: Pull) -> Float[Array, "point axis"]:
     """How far [m] the network is from the clamps, at nodes on both of them in every frame."""
-    nodes, _ = _gauss(EDGE_NODES)
+    nodes, _ = gauss(EDGE_NODES)
     number = len(pull.times)
     y = jnp.tile(nodes * pull.size[1], 2 * number)
     frames = jnp.repeat(jnp.arange(number), 2 * EDGE_NODES)
@@ -235,7 +235,7 @@ def strong_losses(
     return Losses(data, motion, traction, free, clamps)
 
 
-def _gauss(number: int) -> tuple[Float[Array, " node"], Float[Array, " node"]]:
+def gauss(number: int) -> tuple[Float[Array, " node"], Float[Array, " node"]]:
     """Nodes and weights of Gauss and Legendre on 0..1."""
     nodes, weights = np.polynomial.legendre.leggauss(number)
     return jnp.asarray((nodes + 1) / 2, float), jnp.asarray(weights / 2, float)

@@ -5,7 +5,8 @@ L-BFGS with steps of 0.1, with the stiffness trainable and a weight of 0.1 that 
 500 epochs up to 1; 10,000 epochs. No force enters, so nothing fixes the scale of the stiffness:
 what comes out is where it started, or what the descent made of it. The paper does not say how the
 two optimisers take turns; here each makes a step in every epoch, and a step of L-BFGS that raises
-its loss is not made: otherwise the network saturates within 50 epochs.
+the sum of both losses is not made: otherwise the network saturates within 50 epochs. (Its own loss
+is not enough: after a thousand epochs it once fell to zero, in a network that no longer varied.)
 """
 
 from typing import Any, NamedTuple
@@ -98,7 +99,8 @@ def run(
         change, after = lbfgs.update(slope, of_lbfgs, weights)
         moved = eqx.apply_updates(weights, change)
         # a fixed step may go astray, also where gradients hardly differ: then none, and no memory
-        good = physics(moved) <= motion
+        off, left = losses(whole(moved), family, pulls)
+        good = off + share * left <= data + motion
         keep = lambda new, old: jax.tree.map(lambda n, o: jnp.where(good, n, o), new, old)
         state = keep(after, lbfgs.init(weights))
         return (keep(moved, weights), of_adam, state), (data, motion / share)
