@@ -64,6 +64,23 @@ def test_other_settings_in_the_same_folder_are_refused(folder):
         dataclasses.replace(TINY, scenario="lift")
 
 
+def test_other_data_can_have_the_same_view(folder, tmp_path):
+    view = dataset.load_manifest(folder).view
+    settings = dataclasses.replace(TINY, num_fabrics=2, seed=6)
+    assert dataset.make(tmp_path, settings, progress=False, view=view).view == view
+    moved = dataclasses.replace(view, floor=0.1)
+    with pytest.raises(ValueError, match="has data of View.*asked for View.*floor=0.1"):
+        dataset.make(tmp_path, settings, progress=False, view=moved)
+
+
+def test_ranges_are_those_of_the_family_unless_given():
+    assert [bound.name for bound in Settings(isotropic=True).ranges] == ["E h", "nu"]
+    assert len(Settings().ranges) == 7
+    one = (dataclasses.replace(Settings(isotropic=True).ranges[0], high=20.0),)
+    narrow = Settings(isotropic=True, ranges=(*one, Settings(isotropic=True).ranges[1]))
+    assert float(narrow.family.values(jnp.ones(2))[0]) == pytest.approx(20)
+
+
 def test_the_distance_is_least_at_the_fabric_that_was_seen(sighting, folder):
     truth = jnp.asarray(dataset.load(folder).places[0])
     rough, soft = truth.at[6].set(1 - truth[6]), truth.at[2].set(1 - truth[2])
@@ -96,13 +113,9 @@ def test_images_and_frames_must_belong_together(sighting):
 
 @pytest.mark.slow
 def test_material_points_make_data_too(tmp_path):
-    narrow = tuple(
-        dataclasses.replace(bound, high=bound.low * 3) if bound.unit == "N/m" else bound
-        for bound in TINY.ranges
-    )
-    settings = dataclasses.replace(
-        TINY, material_points=True, shape=(5, 5), ranges=narrow, num_fabrics=2
-    )
+    about = {"material_points": True, "isotropic": True, "ranges": (), "shape": (5, 5)}
+    settings = dataclasses.replace(TINY, num_fabrics=2, **about)
     dataset.make(tmp_path, settings, progress=False)
     data = dataset.load(tmp_path)
     assert data.depth.shape == (4, 2, 16, 16) and (data.depth > 0).any(axis=(2, 3)).all()
+    assert data.places.shape == (2, 2)

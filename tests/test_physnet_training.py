@@ -20,7 +20,7 @@ VIEW = View((0.0, -1.0, 0.0), (0.0, 0.0, 0.0), 16.0, 16, 0.5, 1.5, -1.0)
 SMALL = Architecture(size=16, channels=(4, 4), hidden=(16,))
 SHORT = Schedule(
     epochs=3, steps=20, fabrics=6, images=3, rate=3e-3, decay_every=2, held_back=0.25, triplets=300,
-    flaws=Flaws(1e-3, 0.1, 0.002),
+    flaws=Flaws(1e-3, 0.1, 0.002, lost=0.0, gained=0.0, flying=0.0),
 )  # fmt: skip
 
 

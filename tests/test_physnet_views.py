@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from r2s import scenarios, synthetic
 from r2s.mesh import rectangle
@@ -19,6 +20,7 @@ VIEW = View((0.1, -0.4, 0.6), (0.1, 0.1, 0.1), 40.0, 32, 0.4, 1.0, -1.0)
 MESH = rectangle((0.3, 0.3), (4, 4))
 seen_by = jax.jit(views.depth_of, static_argnums=0)
 shown = jax.jit(preprocess.grey, static_argnums=0)
+CLEAN = preprocess.Flaws(noise=0.0, holes=0.0, strays=0.0, lost=0.0, gained=0.0, flying=0.0)
 TILTED = np.c_[np.asarray(MESH.rest), 0.1 + 0.4 * np.asarray(MESH.rest[:, 1])]
 
 
@@ -111,15 +113,37 @@ def test_holes_are_filled_and_strays_dropped():
 
 def test_flaws_are_those_asked_for():
     depth = jnp.full((32, 32), 0.8)
-    flaws = preprocess.Flaws(noise=1e-3, holes=0.0, strays=0.0)
+    flaws = CLEAN._replace(noise=1e-3)
     noisy = preprocess.flawed(depth, VIEW, flaws, jax.random.key(0))
     np.testing.assert_allclose(np.std(noisy), 0.64e-3, rtol=0.1)
-    flaws = preprocess.Flaws(noise=0.0, holes=0.4, strays=0.0)
+    flaws = CLEAN._replace(holes=0.4)
     shares = [
         float((preprocess.flawed(depth, VIEW, flaws, jax.random.key(i)) == 0).mean())
         for i in range(20)
     ]
     assert max(shares) < 0.5 and min(shares) < 0.1 < np.mean(shares) < 0.3
+
+
+def test_borders_lose_gain_and_err_and_nothing_else_does():
+    whole = drawn()
+    there = whole > 0
+    inner = np.asarray(ndimage.binary_erosion(there, np.ones((3, 3))), bool)
+    outer = np.asarray(ndimage.binary_dilation(there, np.ones((3, 3))), bool)
+    flaw = jax.jit(jax.vmap(preprocess.flawed, in_axes=(None, None, None, 0)), static_argnums=1)
+    keys = jax.random.split(jax.random.key(0), 50)
+    flaws = CLEAN._replace(lost=0.5, gained=0.2, flying=1e-2)
+    images = np.asarray(flaw(jnp.asarray(whole), VIEW, flaws, keys))
+    np.testing.assert_array_equal(
+        images[:, inner], np.broadcast_to(whole[inner], (50, inner.sum()))
+    )
+    assert (images[:, ~outer] == 0).all()
+    lost = (images[:, there & ~inner] == 0).mean(axis=1)  # from 0 to `lost`, by image
+    assert lost.min() < 0.1 and 0.4 < lost.max() < 0.65 and 0.2 < lost.mean() < 0.3
+    gained = (images[:, outer & ~there] > 0).mean(axis=1)
+    assert gained.max() < 0.35 and 0.06 < gained.mean() < 0.14
+    edge = images[:, there & ~inner]
+    error = np.abs(edge - whole[there & ~inner])[edge > 0]
+    assert 2e-3 < error.mean() < 8e-3  # of Laplace's, the mean is the scale: 0 to 1e-2
 
 
 @pytest.mark.parametrize(
@@ -162,3 +186,17 @@ def test_clouds_become_depth(fabric):
     far = dataclasses.replace(recording, points=recording.points * 1000)
     with pytest.raises(ValueError, match="r, frame 0: 0 pixels have a depth.*units are not metres"):
         preprocess.of_clouds(view, far, (0, 1))
+
+
+def test_a_stray_point_that_was_spread_is_dropped():
+    inside = np.asarray(MESH.rest)[:, :2].max(axis=0)
+    plane = np.random.default_rng(0).uniform([0, 0], inside, (1500, 2))
+    points = np.c_[plane, 0.1 + 0.4 * plane[:, 1]]
+    far = np.array([[-0.1, 0.1, 0.1], [-0.12, 0.2, 0.15]])  # beside the sheet
+    see = jax.jit(lambda points: preprocess.of_points(VIEW, points, jnp.ones(len(points), bool)))
+    clean, stray = (np.asarray(see(jnp.asarray(p))) for p in (points, np.r_[points, far]))
+    plain = np.asarray(views.depth_of(VIEW, jnp.asarray(far), jnp.ones(2, bool), jnp.asarray(0.5)))
+    assert (plain > 0).sum() >= 4  # more than a pixel for each
+    alone = (plain > 0) & (clean == 0)
+    assert alone.any() and (stray[alone] == 0).all()
+    assert ((clean > 0) == (stray > 0))[plain == 0].mean() > 0.99

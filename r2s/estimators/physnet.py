@@ -82,10 +82,11 @@ def embedded(
 
 
 @eqx.filter_jit
-def distances(sighting: Sighting, places: Float[Array, "place dim"]) -> Float[Array, " place"]:
-    """The rms distance [-] on the map between the recorded frames and those of each fabric.
+def answers(sighting: Sighting, places: Float[Array, "place dim"]) -> Float[Array, "place part"]:
+    """Where the simulated frames of each fabric lie on the map, one after the other.
 
-    NaN where the simulation diverges.
+    In units in which the root mean square of the parts' differences is that of the frames'
+    distances. NaN where the simulation diverges.
     """
 
     def of_place(place):
@@ -95,22 +96,43 @@ def distances(sighting: Sighting, places: Float[Array, "place dim"]) -> Float[Ar
         faces = sighting.scenario.scene.mesh.faces
         depth = depths_of_sheet(sighting.view, x, faces, sighting.per_face)
         images = jax.vmap(lambda image: grey(sighting.view, image))(depth)
-        squares = jnp.sum((jax.vmap(sighting.network)(images) - sighting.points) ** 2, axis=1)
+        points = jax.vmap(sighting.network)(images)
         whole = jnp.all(found.ok) & jnp.all(jnp.isfinite(x))
-        return jnp.where(whole, jnp.sqrt(jnp.mean(squares)), jnp.nan)
+        return jnp.where(whole, _flat(points), jnp.nan)
 
     return jax.vmap(of_place)(places)
 
 
-def objective(sighting: Sighting, batch: int) -> Objective:
-    """The loss of places as `r2s.estimators.bayes` asks for them, simulated `batch` together."""
+def _flat(points: Float[Array, "frame dim"]) -> Float[Array, " part"]:
+    return points.reshape(-1) * jnp.sqrt(jnp.asarray(points.shape[-1], points.dtype))
 
-    def losses(places):
+
+def distances(sighting: Sighting, places: Float[Array, "place dim"]) -> Float[Array, " place"]:
+    """The rms distance [-] on the map between the recorded frames and those of each fabric.
+
+    NaN where the simulation diverges.
+    """
+    squares = (answers(sighting, places) - _flat(sighting.points)[None]) ** 2
+    return jnp.sqrt(jnp.mean(squares, axis=1))
+
+
+def responses(
+    sighting: Sighting, batch: int
+) -> Callable[[Float[np.ndarray, "place dim"]], Float[np.ndarray, "place part"]]:
+    """The answers of any number of places up to `batch`, simulated together."""
+
+    def respond(places):
         padded = np.full((batch, places.shape[1]), 0.5)  # so that it compiles once
         padded[: len(places)] = places
-        return np.asarray(distances(sighting, jnp.asarray(padded, float)))[: len(places)]
+        return np.asarray(answers(sighting, jnp.asarray(padded, float)))[: len(places)]
 
-    return losses
+    return respond
+
+
+def objective(sighting: Sighting, batch: int) -> Objective:
+    """The loss of places as `r2s.estimators.bayes` asks for them, simulated `batch` together."""
+    respond, target = responses(sighting, batch), np.asarray(_flat(sighting.points))
+    return lambda places: np.sqrt(((respond(places) - target) ** 2).mean(axis=1))
 
 
 def estimate(

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt
 
 from r2s.fabric import Fabric
-from r2s.family import OrthotropicFamily, Range
+from r2s.family import Family, IsotropicFamily, OrthotropicFamily, Range
 from r2s.files import read_json, write_bytes, write_json
 from r2s.mpm.sheet import Sheet
 from r2s.physnet.views import View, depths_of_sheet, eye_of, floor_of, per_face, view_around
@@ -26,7 +26,6 @@ from r2s.scenarios.points import material_points
 
 FORMAT = "r2s-physnet-data/1"
 STEP = 1e-4  # [m], of the depths in the files
-FAMILY = OrthotropicFamily.make(0.2)
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,8 @@ class Settings:
     - `num_levels`: motions of each, the same for all; see `levels`.
     - `num_frames`: kept of each motion, evenly spread over those that count.
     - `size`: of the images, [pixel]. - `shape`: vertices along warp and weft.
-    - `density` [kg/m^2], `thickness` [m], `ranges`: of the family.
+    - `density` [kg/m^2], `thickness` [m], `ranges`: of the family; no ranges: its own.
+    - `isotropic`: fabrics of E h and Poisson's ratio, not orthotropic ones.
     - `material_points`: by these instead of the cloth.
     - `per_shard`: fabrics in a file. - `seed`.
     """
@@ -51,12 +51,15 @@ class Settings:
     shape: tuple[int, int] = (9, 9)
     density: float = 0.2
     thickness: float = 1e-3
-    ranges: tuple[Range, ...] = FAMILY.ranges
+    ranges: tuple[Range, ...] = ()
     material_points: bool = False
     per_shard: int = 16
     seed: int = 0
+    isotropic: bool = False
 
     def __post_init__(self) -> None:
+        if not self.ranges:
+            object.__setattr__(self, "ranges", self._plain().ranges)
         if self.scenario not in SIX:
             raise ValueError(f"scenario must be one of {list(SIX)}, found {self.scenario!r}")
         for name in ("num_fabrics", "num_levels", "num_frames", "per_shard"):
@@ -64,9 +67,13 @@ class Settings:
                 raise ValueError(f"{name} must be at least 1, found {getattr(self, name)}")
 
     @property
-    def family(self) -> OrthotropicFamily:
-        family = OrthotropicFamily.make(self.density, self.thickness)
-        return dataclasses.replace(family, ranges=self.ranges)
+    def family(self) -> Family:
+        return dataclasses.replace(self._plain(), ranges=self.ranges)
+
+    def _plain(self) -> OrthotropicFamily | IsotropicFamily:
+        if self.isotropic:
+            return IsotropicFamily.make(self.density, thickness=self.thickness)
+        return OrthotropicFamily.make(self.density, self.thickness)
 
 
 @dataclass(frozen=True)
@@ -105,12 +112,15 @@ def _moved(scenarios: Scenario, fabrics: Fabric, solver: Sheet | None):
 _seen = eqx.filter_jit(eqx.filter_vmap(depths_of_sheet, in_axes=(None, 0, None, None)))
 
 
-def make(folder: Path | str, settings: Settings, progress: bool = True) -> Manifest:
+def make(
+    folder: Path | str, settings: Settings, progress: bool = True, view: View | None = None
+) -> Manifest:
     """Write the shards of a data set that are not there yet, and its manifest after each.
 
     A shard depends on the seed and on its own number alone, so an interrupted call goes on with
-    the same numbers. Raises
-    `ValueError` when the folder has data of other settings.
+    the same numbers. The view is that of all motions of the first shard, or the one given: that of
+    other data, for their network. Raises `ValueError` when the folder has data of other settings or
+    of another view.
     """
     from tqdm import tqdm
 
@@ -122,8 +132,10 @@ def make(folder: Path | str, settings: Settings, progress: bool = True) -> Manif
             f"{folder} has data of other settings: {_differences(known.settings, settings)}; "
             "choose another folder"
         )
+    if known is not None and view not in (None, known.view):
+        raise ValueError(f"{folder} has data of {known.view}, asked for {view}")
     shards = dict(known.shards) if known else {}
-    view = known.view if known else None
+    view = known.view if known else view
     starts = range(0, settings.num_fabrics, settings.per_shard)
     for number, _ in enumerate(tqdm(starts, "shards", disable=None if progress else True)):
         name = f"{number:04d}.npz"

@@ -13,6 +13,8 @@ from r2s.physnet.views import LAYER, View, depth_of
 from r2s.recording import Recording
 
 ALIKE = 2  # neighbours within `views.LAYER` of a pixel, with fewer of which it is a stray
+SPECK = 5  # pixels of a measured image within 2 of one, itself included, with fewer of which it is
+# a stray that `REACH` has spread
 AROUND = 5  # of 8 neighbours with depth, from which a hole is filled
 PASSES = 2  # of filling: holes of up to about 4 pixels across
 DARKEST = 0.2  # what is as far as the view goes; nothing at all is 0
@@ -21,16 +23,26 @@ LEAST = 20  # pixels with depth, in an image of 64 x 64; else there is nothing t
 
 
 class Flaws(NamedTuple):
-    """What training images suffer.
+    """What training images suffer; each share is drawn anew for an image, from 0 to what is here.
+
+    Chosen by what `r2s.observe.flaws.TYPICAL` and clouds of two cameras do to images of 64 x 64:
+    of the pixels at a border 5 to 22 % are lost, beside it up to 10 % gained, and a tenth of the
+    depths there are more than 6 to 8 mm wrong.
 
     - `noise`: standard deviation of depth at 1 m, growing with its square, [m].
-    - `holes`: the greatest share of pixels without depth; in each image it is drawn from 0 on.
-    - `strays`: share of pixels with any depth.
+    - `holes`: share of the pixels that have no depth.
+    - `strays`: share of all pixels with any depth, the same in every image.
+    - `lost`: share of the pixels at a border, also one between layers, that have no depth.
+    - `gained`: share of the pixels just outside of a border that have the depth inside.
+    - `flying`: scale of the (Laplacian) error of depth at a border, [m].
     """
 
-    noise: float = 1.5e-3
-    holes: float = 0.3
+    noise: float = 2e-3
+    holes: float = 0.15
     strays: float = 0.003
+    lost: float = 0.25
+    gained: float = 0.1
+    flying: float = 5e-3
 
 
 def grey(view: View, depth: Float[Array, "down across"]) -> Float[Array, "down across"]:
@@ -69,16 +81,34 @@ def _around(values: Float[Array, "down across"]) -> list[Float[Array, "down acro
 def flawed(
     depth: Float[Array, "down across"], view: View, flaws: Flaws, key: Array
 ) -> Float[Array, "down across"]:
-    """Depth [m] as cameras and clouds give it: with noise, holes and strays."""
-    key_noise, key_share, key_holes, key_stray, key_where = jax.random.split(key, 5)
-    noise, holes, strays = flaws
-    error = noise * depth**2 * jax.random.normal(key_noise, depth.shape, depth.dtype)
-    share = holes * jax.random.uniform(key_share, (), depth.dtype)
-    kept = jax.random.uniform(key_holes, depth.shape, depth.dtype) >= share
+    """Depth [m] as cameras and clouds give it: with noise, holes, strays and ragged borders."""
+    key_shares, key_border, key_noise, key_holes, key_stray, key_where = jax.random.split(key, 6)
+    share = jax.random.uniform(key_shares, (4,), depth.dtype)
+    uniform = lambda key: jax.random.uniform(key, depth.shape, depth.dtype)
+    depth = _ragged(depth, flaws, share[:3], key_border)
+    error = flaws.noise * depth**2 * jax.random.normal(key_noise, depth.shape, depth.dtype)
+    kept = uniform(key_holes) >= flaws.holes * share[3]
     depth = jnp.where(kept & (depth > 0), depth + error, 0)
-    is_stray = jax.random.uniform(key_stray, depth.shape, depth.dtype) < strays
-    where = jax.random.uniform(key_where, depth.shape, depth.dtype, view.near, view.far)
-    return jnp.where(is_stray, where, depth)
+    where = view.near + (view.far - view.near) * uniform(key_where)
+    return jnp.where(uniform(key_stray) < flaws.strays, where, depth)
+
+
+def _ragged(depth: Float[Array, "down across"], flaws: Flaws, share: Float[Array, "3"], key: Array):
+    """Depth [m] whose borders have lost, gained and wrong pixels."""
+    key_lost, key_error = jax.random.split(key)
+    around = _around(depth)
+    there = depth > 0
+    number = sum((other > 0).astype(depth.dtype) for other in around)
+    steps = [(other == 0) | (jnp.abs(other - depth) > LAYER) for other in around]
+    border = there & jnp.any(jnp.stack(steps), axis=0)
+    outside = ~there & (number > 0)
+    chance = jax.random.uniform(key_lost, depth.shape, depth.dtype)
+    beside = sum(around) / jnp.maximum(number, 1)
+    gained = outside & (chance < flaws.gained * share[0])
+    lost = border & (chance < flaws.lost * share[1])
+    error = flaws.flying * share[2] * jax.random.laplace(key_error, depth.shape, depth.dtype)
+    depth = jnp.where(gained, beside, jnp.where(lost, 0, depth))
+    return jnp.where((border | outside) & (depth > 0), depth + error, depth)
 
 
 def of_points(
@@ -90,7 +120,15 @@ def of_points(
     """
     covered = jnp.sum(depth_of(view, points, mask) > 0)
     apart = jnp.sqrt(covered / jnp.maximum(jnp.sum(mask), 1)).astype(points.dtype)
-    return depth_of(view, points, mask, REACH * apart)
+    return without_specks(depth_of(view, points, mask, REACH * apart))
+
+
+def without_specks(depth: Float[Array, "down across"]) -> Float[Array, "down across"]:
+    """Depth [m] without the pixels with fewer than `SPECK` within 2 pixels at about their depth."""
+    padded, (rows, columns) = jnp.pad(depth, 2), depth.shape
+    others = [padded[i : i + rows, j : j + columns] for i in range(5) for j in range(5)]
+    near = [((depth > 0) & (jnp.abs(other - depth) < 2 * LAYER)).astype(int) for other in others]
+    return jnp.where(sum(near) >= SPECK, depth, 0)
 
 
 def of_clouds(view: View, recording: Recording, frames: tuple[int, ...]) -> np.ndarray:

@@ -34,10 +34,10 @@ def split(data: Data, held_back: float, needed: int, seed: int) -> tuple[Split, 
             f"{needed} more for a batch"
         )
     unseen = np.isin(data.fabric, order[:number])
-    return _images(data, ~unseen), _images(data, unseen)
+    return images_of(data, ~unseen), images_of(data, unseen)
 
 
-def _images(data: Data, motions: np.ndarray) -> Split:
+def images_of(data: Data, motions: np.ndarray) -> Split:
     depth = data.depth[motions]
     frames = depth.shape[1]
     fabric = np.repeat(data.fabric[motions], frames)
