@@ -35,6 +35,7 @@ from r2s.scenarios.points import material_points
 
 _loss = eqx.filter_jit(gauss_newton.loss_at)
 COARSE, FRAMES, INSIDE = (7, 7), 30, (0.1, 0.9)  # of the problems on material points
+SHORTER = {"lifting": {"moving": 1.5}, "stretching": {"moving": 0.9}, "wind": {}}  # [s]
 SAME = 1.05  # times the loss at the truth's descent: the same place
 
 
@@ -80,7 +81,7 @@ def _on_points(family: IsotropicFamily, fabric: Fabric, name: str, scenario: str
     """As `problem_of`, for the member of the family that is nearest to the fabric."""
     place = np.clip(np.asarray(family.locate(fabric)), *INSIDE)
     truth = family(jnp.asarray(place, float))
-    experiment = scenarios.SIX[scenario](num_frames=FRAMES)
+    experiment = scenarios.SIX[scenario](num_frames=FRAMES, **SHORTER[scenario])
     recording = synthetic.record(
         experiment, truth, name, shape=COARSE, solver=material_points, key=key
     )
