@@ -140,7 +140,7 @@ def test_the_errors_of_a_motion_with_itself_are_none_and_a_shift_is_found():
 def test_an_estimate_predicts_another_support_and_the_wind(name, bound):
     density = another.read(another.DATA, another.LIFT.format(name)).told["material_json"]["density"]
     middle = OrthotropicFamily.make(density).middle()
-    found = another.estimated(another.DATA, name, 1500, 0.0, Effort(8, 1, 12))
+    found = another.estimated(another.DATA, name, 2000, 0.0, Effort(24, 2, 20))
     row, _ = another.judged(another.DATA, name, "estimate", found.fabric, another.clock_of(found))
     default, _ = another.judged(another.DATA, name, "default", middle, 0.0)
     assert row["edge_rms"] < 1 and row["wind_rms"] < bound

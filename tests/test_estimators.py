@@ -115,11 +115,12 @@ def test_the_scatter_of_a_gradient_is_that_of_the_jackknife():
     scores = np.einsum("cpu,cp->cu", rows, rows @ best - values)
     left = np.stack([fit(np.arange(6) != i) - best for i in range(6)])
     matrices = np.einsum("cpu,cpv->cuv", rows, rows)
-    inverse, arrays = np.linalg.inv(whole), [jnp.asarray(part) for part in (scores, matrices)]
+    inverse = np.linalg.inv(whole)
+    clusters = jnp.asarray(scores), jnp.asarray(matrices)
 
     def covariance(noise):
-        given = jnp.full(6, noise), jnp.zeros((2, 2))
-        return inverse @ np.asarray(gauss_newton.scatter(*arrays, *given)) @ inverse
+        found = gauss_newton.scatter(*clusters, jnp.full(6, noise), jnp.zeros((2, 2)))
+        return inverse @ np.asarray(found) @ inverse
 
     np.testing.assert_allclose(covariance(0.0), left.T @ left, rtol=1e-9)
     # nor is it less than by independent errors, of a variance of 100 here

@@ -25,6 +25,7 @@ Loss = Callable[[Problem, Seen], Float[Array, ""]]  # [m^2]
 
 PATCHES = 3  # along a side of the sheet: what lies in one patch errs alike
 MEMORY = 8  # frames, in which it does so
+SLACK = 3e-3  # [m], which noise seldom throws a point of a depth camera beyond a border
 FLATTEST = 0.3  # curvature of a robust loss over the mean weight, at least
 
 
@@ -173,10 +174,10 @@ def _by_time(shares: Float[Array, "frame patch *rest"]) -> Float[Array, " *clust
 def _residuals(clouds: Clouds, mesh: Mesh, seen: Seen, scale: Scale):
     """Of every frame, `surface_residuals`; one frame at a time, which fits the cache.
 
-    With as much slack at the borders as what is not an outlier may be off.
+    With slack at the borders where outliers are left out, and a small bias would show.
     """
-    edges = borders(mesh)
-    frame = lambda seen: surface_residuals(seen[0], seen[1], seen[2], mesh.faces, edges, scale)
+    edges, slack = borders(mesh), jnp.minimum(scale, SLACK)
+    frame = lambda seen: surface_residuals(seen[0], seen[1], seen[2], mesh.faces, edges, slack)
     return jax.lax.map(frame, (clouds.points, clouds.mask, seen.x))
 
 
