@@ -76,6 +76,8 @@ def test_other_data_can_have_the_same_view(folder, tmp_path):
 def test_ranges_are_those_of_the_family_unless_given():
     assert [bound.name for bound in Settings(isotropic=True).ranges] == ["E h", "nu"]
     assert len(Settings().ranges) == 7
+    with pytest.raises(ValueError, match="the family has the ranges .'E h', 'nu'., found"):
+        dataclasses.replace(Settings(), isotropic=True)  # with those of the other family
     one = (dataclasses.replace(Settings(isotropic=True).ranges[0], high=20.0),)
     narrow = Settings(isotropic=True, ranges=(*one, Settings(isotropic=True).ranges[1]))
     assert float(narrow.family.values(jnp.ones(2))[0]) == pytest.approx(20)

@@ -141,19 +141,19 @@ def scatter(
     times its matrix: where it is, that is the chance of few clusters.
     """
     whole = jnp.sum(matrices, axis=0) + prior
-    eye = jnp.eye(len(prior), dtype=scores.dtype)
-    left = jax.vmap(lambda m: eye - jnp.linalg.solve(whole, m).T)(matrices)
+    # a cluster that alone tells something would leave nothing behind, but for rounding
+    share = 1 - 16 * jnp.finfo(scores.dtype).eps
+    left = jnp.eye(len(prior), dtype=scores.dtype)[None] - share * matrices @ jnp.linalg.inv(whole)
     alone = jax.vmap(jnp.linalg.solve)(left, scores)
     return _larger(alone.T @ alone, jnp.einsum("c,cuv->uv", noise, matrices), whole)
 
 
 def _larger(one: Array, other: Array, metric: Array) -> Float[Array, "unknown unknown"]:
     """The larger of two positive matrices in each direction in which a metric tells them apart."""
-    root = jnp.linalg.cholesky(metric)
-    inverse = jax.scipy.linalg.solve_triangular(
-        root, jnp.eye(len(root), dtype=root.dtype), lower=True
-    )
-    apart, directions = jnp.linalg.eigh(inverse @ (one - other) @ inverse.T)
+    sizes, axes = jnp.linalg.eigh(metric)
+    lengths = jnp.sqrt(jnp.maximum(sizes, jnp.finfo(sizes.dtype).eps * sizes[-1]))
+    root, inverse = axes * lengths[None], axes / lengths[None]
+    apart, directions = jnp.linalg.eigh(inverse.T @ (one - other) @ inverse)
     absolute = (directions * jnp.abs(apart)[None]) @ directions.T
     return (one + other + root @ absolute @ root.T) / 2
 

@@ -32,7 +32,7 @@ from r2s.pinn.clouds import Rows, Sight, above, axes_of, bordered, fixed, matche
 from r2s.pinn.exact import PRIOR, clipped, ranged, weights_of, with_weights
 from r2s.pinn.laws import green
 from r2s.pinn.levenberg import FIRST, Term, Unknown, least_squares, marginal
-from r2s.pinn.network import Network, X, Y
+from r2s.pinn.network import Network, X, Y, at_time
 from r2s.pinn.shell import Hanging, Splines, loose, splines, virtual_work, work_scale
 from r2s.recording import Recording
 from r2s.scenario import GUST, JET, from_recording, motion
@@ -244,8 +244,7 @@ def _of_balance(network: Network, about: About, sight: Sight, grips, every: int)
     places = about.parts.nodes * sight.size[None]
 
     def free(time):
-        points = jnp.concatenate([places, jnp.broadcast_to(time, (len(places), 1))], axis=1)
-        low = placed(network, points) @ sight.up - sight.table < LOW
+        low = placed(network, at_time(places, time)) @ sight.up - sight.table < LOW
         return loose(about.parts, held, low)
 
     times = sight.times[every // 2 :: every]

@@ -58,8 +58,12 @@ class Settings:
     isotropic: bool = False
 
     def __post_init__(self) -> None:
-        if not self.ranges:
-            object.__setattr__(self, "ranges", self._plain().ranges)
+        plain = self._plain().ranges
+        if not self.ranges:  # written down with the data, whatever they will be by default
+            object.__setattr__(self, "ranges", plain)
+        names, expected = ([bound.name for bound in ranges] for ranges in (self.ranges, plain))
+        if names[: len(expected)] != expected:
+            raise ValueError(f"the family has the ranges {expected}, found {names}")
         if self.scenario not in SIX:
             raise ValueError(f"scenario must be one of {list(SIX)}, found {self.scenario!r}")
         for name in ("num_fabrics", "num_levels", "num_frames", "per_shard"):

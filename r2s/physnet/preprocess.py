@@ -13,8 +13,9 @@ from r2s.physnet.views import LAYER, View, depth_of
 from r2s.recording import Recording
 
 ALIKE = 2  # neighbours within `views.LAYER` of a pixel, with fewer of which it is a stray
-SPECK = 5  # pixels of a measured image within 2 of one, itself included, with fewer of which it is
-# a stray that `REACH` has spread
+# pixels of a measured image within 2 of one, itself included; with fewer it is a stray that `REACH`
+# has spread
+SPECK = 5
 AROUND = 5  # of 8 neighbours with depth, from which a hole is filled
 PASSES = 2  # of filling: holes of up to about 4 pixels across
 DARKEST = 0.2  # what is as far as the view goes; nothing at all is 0

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from r2s.losses import surface_residuals
 from r2s.mesh import Mesh
-from r2s.pinn.network import Network
+from r2s.pinn.network import Network, at_time
 from r2s.recording import CORNERS, Recording, subsample
-from r2s.surface import nearest
 
 BINS = 6  # of the border, along each side
 DEPTH, OFF, BEYOND = 0.02, 0.006, 0.01  # [m]: the strip at the border, into the sheet, off it, out
@@ -109,17 +109,16 @@ def matched(network: Network, sight: Sight, mesh: Mesh) -> tuple[Rows, Float[Arr
     of their distances [m]; outliers hardly count (Geman and McClure 1987)."""
 
     def frame(given):
-        points, time = given
-        x = placed(network, _at(mesh.rest, time))
-        face, shares = nearest(points, x, mesh.faces)
-        corners = x[mesh.faces[face]]
+        points, mask, time = given
+        x = placed(network, at_time(mesh.rest, time))
+        gap, _, vertices, shares = surface_residuals(points, mask, x, mesh.faces)
+        corners = x[vertices]
         across = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normal = across / jnp.sqrt(jnp.sum(across**2, axis=1, keepdims=True))
-        place = jnp.einsum("pk,pki->pi", shares, mesh.rest[mesh.faces[face]])
-        gap = jnp.sqrt(jnp.sum((points - jnp.einsum("pk,pki->pi", shares, corners)) ** 2, axis=1))
-        return _at(place, time), normal, gap
+        place = jnp.einsum("pk,pki->pi", shares, mesh.rest[vertices])
+        return at_time(place, time), normal, gap
 
-    place, normal, gap = jax.lax.map(frame, (sight.points, sight.times))
+    place, normal, gap = jax.lax.map(frame, (sight.points, sight.mask, sight.times))
     middle = jnp.nanmedian(jnp.where(sight.mask, gap, jnp.nan))
     spread = jnp.maximum(1.4826 * middle, LEAST)
     share = 1 / (1 + (gap / (CUT * spread)) ** 2)  # the square root of that of the squares
@@ -169,7 +168,7 @@ def bordered(network: Network, sight: Sight) -> Rows:
     def frame(given):
         time, cloud, there = given
         found = jax.vmap(strip, in_axes=(0, 0, 0, None, None, None))
-        return _at(places, time), *found(places, outward, half, time, cloud, there)
+        return at_time(places, time), *found(places, outward, half, time, cloud, there)
 
     rows = jax.lax.map(frame, (sight.times, sight.cloud, sight.there))
     place, target, away, weight = (part.reshape(-1, *part.shape[2:]) for part in rows)
@@ -184,7 +183,7 @@ def fixed(
 ) -> Rows:
     """Rows that draw places of the sheet in all directions to where they are known to be [m]."""
     frames, number, _ = targets.shape
-    at = jnp.concatenate([_at(places, time) for time in times])
+    at = jnp.concatenate([at_time(places, time) for time in times])
     directions = jnp.tile(jnp.eye(3, dtype=targets.dtype), (frames * number, 1))
     weight = jnp.full(3 * frames * number, 1 / deviation, targets.dtype)
     thrice = lambda values: jnp.repeat(values.reshape(-1, 3), 3, axis=0)
@@ -194,13 +193,9 @@ def fixed(
 @eqx.filter_jit
 def above(network: Network, sight: Sight, mesh: Mesh, deviation: float = 1e-3) -> Rows:
     """Rows that lift what is below the table, at the vertices of a mesh."""
-    at = jax.vmap(lambda time: _at(mesh.rest, time))(sight.times).reshape(-1, 3)
+    at = jax.vmap(lambda time: at_time(mesh.rest, time))(sight.times).reshape(-1, 3)
     x = placed(network, at)
     short = sight.table - x @ sight.up
     direction = jnp.broadcast_to(sight.up[None], x.shape)
     weight = jnp.where(short > 0, 1 / deviation, 0.0).astype(x.dtype)
     return Rows(at, x + short[:, None] * sight.up[None], direction, weight)
-
-
-def _at(places: Float[Array, "place 2"], time: Float[Array, ""]) -> Float[Array, "place 3"]:
-    return jnp.concatenate([places, jnp.broadcast_to(time, (len(places), 1))], axis=1)

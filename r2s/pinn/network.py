@@ -110,3 +110,8 @@ class Network(eqx.Module):
             second = slope[None] * a[4:] + curve[None] * a[left] * a[right]
             z = jnp.concatenate([value[None], slope[None] * a[1:4], second])
         raise AssertionError("a network has at least one layer")
+
+
+def at_time(places: Float[Array, "place 2"], time: Float[Array, ""]) -> Float[Array, "place 3"]:
+    """Places (X, Y) [m] at one time [s]: what a network of three axes takes."""
+    return jnp.concatenate([places, jnp.broadcast_to(time, (len(places), 1))], axis=1)

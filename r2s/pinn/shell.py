@@ -19,7 +19,7 @@ from scipy.interpolate import BSpline
 from r2s.fabric import Fabric
 from r2s.physics.air import Air, Fan
 from r2s.pinn.laws import green
-from r2s.pinn.network import STRONG, DisplacementField, T
+from r2s.pinn.network import STRONG, DisplacementField, T, at_time
 from r2s.units import GRAVITY
 
 SPANS, NODES, DEGREE = 8, 2, 2  # along each side; Gauss nodes in a span; enough for curvatures
@@ -105,8 +105,7 @@ def virtual_work(
     Without damping, which in a slow motion is small.
     """
     places = parts.nodes * hanging.size[None]
-    points = jnp.concatenate([places, jnp.broadcast_to(time, (len(places), 1))], axis=1)
-    jet = network.jet(points, STRONG)
+    jet = network.jet(at_time(places, time), STRONG)
     flat = jnp.eye(3, 2, dtype=jet.value.dtype)
     gradient = jnp.moveaxis(jet.first[:2], 0, -1)
     second = jnp.moveaxis(jet.second[:3], 0, -1)
