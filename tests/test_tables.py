@@ -25,7 +25,7 @@ names = st.one_of(
 )
 any_row = st.builds(
     Row,
-    *([names] * 6),
+    *([names] * 7),
     baseline=st.sampled_from(list(BASELINES)),
     metric=names,
     unit=names,
@@ -35,7 +35,9 @@ any_row = st.builds(
 
 def row(value, recording="towel_1", baseline="", metric="chamfer", on="fold", unit="m"):
     fabric = recording.split("_")[0]
-    return Row("gauss_newton", "xpbd", "lift", fabric, recording, on, baseline, metric, unit, value)
+    return Row(
+        "gauss_newton", "xpbd", "lift", fabric, "1", recording, on, baseline, metric, unit, value
+    )
 
 
 @settings(max_examples=60, deadline=None)
@@ -51,9 +53,9 @@ def test_file_of_rows(tmp_path):
     tables.write_rows(path, [row(np.float64(0.1)), row(math.nan)])
     lines = path.read_text().splitlines()
     assert lines[0] == (
-        "approach,solver,estimated_from,fabric,recording,evaluated_on,baseline,metric,unit,value"
+        "approach,solver,estimated_from,fabric,repeat,recording,evaluated_on,baseline,metric,unit,value"
     )
-    assert lines[1] == "gauss_newton,xpbd,lift,towel,towel_1,fold,,chamfer,m,0.1"
+    assert lines[1] == "gauss_newton,xpbd,lift,towel,1,towel_1,fold,,chamfer,m,0.1"
     assert math.isnan(tables.read_rows(path)[1].value)
     assert [entry.name for entry in tmp_path.iterdir()] == ["results.csv"]
 
@@ -63,9 +65,9 @@ def test_file_of_rows(tmp_path):
     [
         ("", "expected the header"),
         ("approach,value\n", "expected the header"),
-        (",".join(COLUMNS) + "\na,b\n", "line 2: expected 10 cells, found 2"),
-        (",".join(COLUMNS) + "\na,b,c,d,e,f,,h,m,many\n", "line 2: .*many"),
-        (",".join(COLUMNS) + "\na,b,c,d,e,f,best,h,m,1.0\n", "line 2: unknown baseline 'best'"),
+        (",".join(COLUMNS) + "\na,b\n", "line 2: expected 11 cells, found 2"),
+        (",".join(COLUMNS) + "\na,b,c,d,e,f,g,,h,m,many\n", "line 2: .*many"),
+        (",".join(COLUMNS) + "\na,b,c,d,e,f,g,best,h,m,1.0\n", "line 2: unknown baseline 'best'"),
     ],
 )
 def test_damaged_rows_are_refused(tmp_path, text, message):

@@ -134,6 +134,7 @@ def _rows(pair: Pair, estimate: Estimate, scenario: str, baseline: str, measured
             SOLVER,
             info.scenario,
             info.fabric,
+            info.trial,
             evaluated,
             scenario,
             baseline,

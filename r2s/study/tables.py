@@ -22,12 +22,13 @@ MISSING = "-"
 
 @dataclass(frozen=True)
 class Row:
-    """One number of a recording. ValueError for a `baseline` that is not a key of BASELINES."""
+    """One number of an estimate on a recording. ValueError unless `baseline` is in BASELINES."""
 
     approach: str
     solver: str
     estimated_from: str
     fabric: str
+    repeat: str  # which of several estimates alike: of other recordings, or another seed
     recording: str
     evaluated_on: str
     baseline: str  # "" for the estimate itself
