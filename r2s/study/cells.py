@@ -1,0 +1,139 @@
+"""Cells of a study: pure functions of their configuration, each kept in one file.
+
+A cell is a frozen dataclass: what it is made from are fields, other cells among them. Its key is a
+hash of all of that, so a file that is there for a key is the result, and is not made again.
+"""
+
+import json
+import os
+import resource
+import tempfile
+import time
+import zipfile
+from abc import abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, ClassVar
+
+from r2s.files import write_bytes
+
+FORMAT = "r2s-cell/1"
+KEY_LENGTH = 16  # of a key in the name of a file, hexadecimal digits
+ABOUT = "about.json"
+VERSIONS = ("r2s", "jax", "jaxlib", "numpy")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A part of a study. Its fields are numbers, strings, tuples of them and frozen dataclasses.
+
+    - `kind`: a folder for cells of this class.
+    - `weight`: how long one takes, roughly, in CPU seconds: for the estimate of the time left.
+    """
+
+    kind: ClassVar[str] = ""
+    weight: ClassVar[float] = 1.0
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """What people call it; need not be unique."""
+
+    @property
+    def alike(self) -> str:
+        """Cells of the same value run faster one after the other: they compile once."""
+        return self.kind
+
+    @abstractmethod
+    def make(self, folder: Path, out: Path) -> dict[str, Any]:
+        """Write the result's files into the folder `out`; what is to be noted of it.
+
+        The results of `needs` are opened in the study's `folder`. The same cell gives the same
+        numbers.
+        """
+
+    @property
+    def key(self) -> str:
+        """A hash of the configuration and of the inputs, whose configurations are part of it."""
+        return sha256(f"{FORMAT} {version('r2s')} {self!r}".encode()).hexdigest()[:KEY_LENGTH]
+
+    def path(self, folder: Path) -> Path:
+        """Where its result is, or will be."""
+        return folder / "cells" / self.kind / f"{self.name}-{self.key}.zip"
+
+    def is_made(self, folder: Path) -> bool:
+        """Whether its result is there, whole."""
+        return zipfile.is_zipfile(self.path(folder))
+
+
+def needs(cell: Cell) -> tuple[Cell, ...]:
+    """The cells that a cell is made from: those in its fields."""
+    found: list[Cell] = []
+    for field in fields(cell):
+        value = getattr(cell, field.name)
+        for part in value if isinstance(value, tuple) else (value,):
+            if isinstance(part, Cell) and part not in found:
+                found.append(part)
+    return tuple(found)
+
+
+def execute(cell: Cell, folder: Path) -> None:
+    """Make the result of a cell, unless it is there; raises what `make` and writing raise."""
+    path = cell.path(folder)
+    if cell.is_made(folder):
+        return
+    began, spent = time.perf_counter(), time.process_time()
+    with tempfile.TemporaryDirectory(prefix="r2s-") as scratch:
+        noted = cell.make(folder, Path(scratch))
+        about = {
+            "format": FORMAT,
+            "key": cell.key,
+            "kind": cell.kind,
+            "name": cell.name,
+            "config": repr(cell),
+            "versions": {name: version(name) for name in VERSIONS},
+            "seconds": time.perf_counter() - began,
+            "cpu_seconds": time.process_time() - spent,
+            "peak_memory_MB": _peak_memory(),  # of the process so far
+            **noted,
+        }
+        packed = _pack(Path(scratch), about)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, packed)
+
+
+def about(cell: Cell, folder: Path) -> dict[str, Any]:
+    """What was noted of a cell that is made: configuration, versions, times, memory, divergence."""
+    with zipfile.ZipFile(cell.path(folder)) as packed:
+        return json.loads(packed.read(ABOUT))
+
+
+@contextmanager
+def opened(cell: Cell, folder: Path) -> Iterator[Path]:
+    """A folder with the files of a cell that is made, for as long as the context lasts.
+
+    Raises `FileNotFoundError` when it is not, and `zipfile.BadZipFile` when it is damaged.
+    """
+    with tempfile.TemporaryDirectory(prefix="r2s-") as scratch:
+        with zipfile.ZipFile(cell.path(folder)) as packed:
+            packed.extractall(scratch)
+        yield Path(scratch)
+
+
+def _pack(scratch: Path, about: dict[str, Any]) -> bytes:
+    (scratch / ABOUT).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+    whole = scratch / ".whole.zip"
+    with zipfile.ZipFile(whole, "w", zipfile.ZIP_DEFLATED) as packed:
+        for file in sorted(scratch.iterdir()):
+            if file != whole:
+                packed.write(file, file.name)
+    return whole.read_bytes()
+
+
+def _peak_memory() -> float:
+    scale = 1e6 if os.uname().sysname == "Darwin" else 1e3  # bytes there, kilobytes elsewhere
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale

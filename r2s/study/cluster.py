@@ -1,0 +1,130 @@
+"""Workers for a study: processes of this machine, of a cluster, or whatever serves Dask.
+
+Needs dask: pip install 'r2s[cluster]'.
+"""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from r2s.study.cells import Cell
+from r2s.study.engine import attempt
+
+try:
+    from dask import config
+    from distributed import Client, LocalCluster, as_completed
+except ImportError as error:
+    raise ImportError("workers need dask: pip install 'r2s[cluster]'") from error
+
+RETRIES = 5  # of a cell whose worker died
+
+
+def environment(workers: int, compilation_cache: Path | None = None) -> dict[str, str]:
+    """What a worker's environment holds before it imports JAX, for so many on a machine.
+
+    One thread each; all of them share the memory of its GPUs, if there are any; a fabric that goes
+    wrong in a batch does not stop the others. Compiled programs are kept in `compilation_cache`.
+    """
+    threads = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    found = one | {
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {threads}".strip(),
+        "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.9 / workers:.3f}",
+        "EQX_ON_ERROR": "nan",
+    }
+    if compilation_cache is not None:
+        found |= {"JAX_COMPILATION_CACHE_DIR": str(compilation_cache)}
+    return found
+
+
+def local(workers: int, compilation_cache: Path | None = None) -> "Workers":
+    """Worker processes on this machine, one thread each."""
+    if workers < 1:
+        raise ValueError(f"at least one worker is needed, got {workers}")
+    _configure(environment(workers, compilation_cache))
+    cluster = LocalCluster(
+        n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0"
+    )
+    return Workers(Client(cluster), cluster)
+
+
+def at(address: str) -> "Workers":
+    """The workers of a scheduler that runs already, such as "tcp://node:8786"."""
+    return Workers(Client(address), None)
+
+
+def slurm(
+    jobs: int, *, cores: int = 1, memory: str = "8GB", walltime: str = "04:00:00", queue: str = ""
+) -> "Workers":
+    """As many Slurm jobs, each of `cores` workers. Needs dask-jobqueue."""
+    try:
+        from dask_jobqueue.slurm import SLURMCluster
+    except ImportError as error:
+        raise ImportError("Slurm needs dask-jobqueue: pip install 'r2s[cluster]'") from error
+    exports = [f"export {name}='{value}'" for name, value in environment(cores).items()]
+    cluster = SLURMCluster(
+        cores=cores,
+        processes=cores,
+        memory=memory,
+        walltime=walltime,
+        queue=queue or None,
+        job_script_prologue=exports,
+    )
+    cluster.scale(jobs=jobs)
+    return Workers(Client(cluster), cluster)
+
+
+class Workers:
+    """A `r2s.study.engine.Runner` on the workers of a Dask client.
+
+    Cells that compile alike go to the same worker, as long as it is not busy.
+    """
+
+    def __init__(self, client: Any, cluster: Any) -> None:
+        self._client, self._cluster = client, cluster
+        self._cells: dict[str, Cell] = {}
+        self._homes: dict[str, int] = {}
+        self._done = as_completed()
+
+    def submit(self, cell: Cell, folder: Path) -> None:
+        workers = sorted(self._client.scheduler_info(n_workers=-1)["workers"])
+        home = self._homes.setdefault(cell.alike, len(self._homes))
+        future = self._client.submit(
+            attempt,
+            cell,
+            folder.absolute(),
+            key=f"{cell.kind}-{cell.key}",
+            pure=False,
+            retries=RETRIES,
+            workers=[workers[home % len(workers)]] if workers else None,
+            allow_other_workers=True,
+        )
+        self._cells[future.key] = cell
+        self._done.add(future)
+
+    def finished(self) -> Iterator[tuple[Cell, str]]:
+        for future in self._done:
+            cell = self._cells.pop(future.key)
+            reason = future.result() if future.status == "finished" else _broken(future)
+            yield cell, reason
+            if not self._cells:
+                return
+
+    def close(self) -> None:
+        self._client.close()
+        if self._cluster is not None:
+            self._cluster.close()
+
+
+def _configure(variables: dict[str, str]) -> None:
+    """Set what Dask gives to the processes that it starts, before they import anything."""
+    config.set({"distributed.nanny.pre-spawn-environ": variables})
+    config.set({"distributed.worker.multiprocessing-method": "spawn"})
+    config.set({"distributed.scheduler.allowed-failures": RETRIES})
+    config.set({"distributed.worker.memory.terminate": False})  # JAX keeps what it compiled
+
+
+def _broken(future: Any) -> str:
+    error = future.exception()
+    return f"{type(error).__name__}: {error}"

@@ -1,0 +1,118 @@
+"""Runs the cells of a study in the order of their needs, here or on workers.
+
+Nothing that is finished is lost: a result is there whole or not at all, a cell that fails does not
+stop the others, and a run that was killed goes on where it was.
+"""
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from tqdm import tqdm
+
+from r2s.study.cells import Cell, execute, needs
+
+
+@runtime_checkable
+class Runner(Protocol):
+    """What makes cells: here one after the other, or elsewhere many at once."""
+
+    def submit(self, cell: Cell, folder: Path) -> None:
+        """Take a cell whose needs are made."""
+        ...
+
+    def finished(self) -> Iterator[tuple[Cell, str]]:
+        """Each cell when it is done, with why it failed, or "". Others may be submitted meanwhile;
+        ends when none is left."""
+        ...
+
+    def close(self) -> None:
+        """Give back workers."""
+        ...
+
+
+class Serial:
+    """One cell after the other in this process, those that compile alike together."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[tuple[Cell, Path]] = deque()
+        self._last = ""
+
+    def submit(self, cell: Cell, folder: Path) -> None:
+        self._waiting.append((cell, folder))
+
+    def finished(self) -> Iterator[tuple[Cell, str]]:
+        while self._waiting:
+            alike = (i for i, (cell, _) in enumerate(self._waiting) if cell.alike == self._last)
+            index = next(alike, 0)
+            cell, folder = self._waiting[index]
+            del self._waiting[index]
+            self._last = cell.alike
+            yield cell, attempt(cell, folder)
+
+    def close(self) -> None:
+        pass
+
+
+def attempt(cell: Cell, folder: Path) -> str:
+    """Make a cell; why it failed, or ""."""
+    try:
+        execute(cell, folder)
+    except Exception as error:  # whatever it is, the other cells go on
+        return f"{type(error).__name__}: {error}"
+    return ""
+
+
+def closure(cells: Iterable[Cell]) -> list[Cell]:
+    """The cells and all that they need, what is needed first."""
+    found: dict[Cell, None] = {}
+
+    def visit(cell: Cell) -> None:
+        if cell not in found:
+            for need in needs(cell):
+                visit(need)
+            found[cell] = None
+
+    for cell in cells:
+        visit(cell)
+    return list(found)
+
+
+def run(cells: Iterable[Cell], folder: Path, runner: Runner) -> dict[Cell, str]:
+    """Make the cells and what they need; those that are missing at the end, each with its reason.
+
+    Those that are made already are left alone, those that failed before are tried again.
+    """
+    every = closure(cells)
+    waiting = {cell for cell in every if not cell.is_made(folder)}
+    failed: dict[Cell, str] = {}
+    total = sum(cell.weight for cell in waiting)
+    shape = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}, about {remaining} left{postfix}"
+    with tqdm(total=total, desc="study", bar_format=shape, disable=None, smoothing=0.1) as bar:
+        submitted = _submit(every, waiting, set(), failed, folder, runner)
+        for cell, reason in runner.finished():
+            waiting.discard(cell)
+            bar.update(cell.weight)
+            bar.set_postfix_str(f"{cell.kind} {cell.name}")
+            if reason:
+                failed[cell] = reason
+                tqdm.write(f"missing: {cell.kind} {cell.name}: {reason}")
+            submitted |= _submit(every, waiting, submitted, failed, folder, runner)
+    return failed
+
+
+def _submit(every, waiting, submitted, failed, folder: Path, runner: Runner) -> set[Cell]:
+    """Submit what is ready, and give up what needs a cell that failed."""
+    new = set()
+    for cell in every:  # in the order of needs, so that one pass gives up all that depend
+        if cell not in waiting or cell in submitted:
+            continue
+        wanting = [need for need in needs(cell) if need in failed]
+        if wanting:
+            failed[cell] = f"needs {wanting[0].kind} {wanting[0].name}, which is missing"
+            waiting.discard(cell)
+        elif not any(need in waiting for need in needs(cell)):
+            runner.submit(cell, folder)
+            new.add(cell)
+    return new

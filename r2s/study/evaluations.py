@@ -1,0 +1,142 @@
+"""Cells that judge: a fabric in motions that its estimate never saw, beside recordings of them."""
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from r2s.fabric import Fabric
+from r2s.files import write_json
+from r2s.mpm.sheet import Sheet, longest_edge, stable_step
+from r2s.recording import Recording
+from r2s.scenario import Scenario, from_recording, motion
+from r2s.scenarios.points import EDGE, MEMBRANE_DAMPING, grid_around
+from r2s.study import judge
+from r2s.study.cells import Cell, opened
+from r2s.study.estimates import Estimated, default_fabric, read_estimate
+from r2s.study.truths import Source, read
+
+MEASURED, MOTION = "measured.json", "motion.npz"
+LADDER = math.sqrt(2)  # steps between frames are powers of this: few programs to compile
+
+_motion = eqx.filter_jit(motion)
+
+
+@dataclass(frozen=True)
+class Judged(Cell):
+    """How near simulations of a fabric come to recordings of one scenario.
+
+    - `estimate`: whose fabric; None: the default one of `solver` with that areal `density`.
+    - `recordings`: judged against, together, since they compile once.
+    - `other`: `estimate` is that of another fabric, for comparison.
+    """
+
+    kind: ClassVar[str] = "evaluations"
+    weight: ClassVar[float] = 8.0
+
+    estimate: Estimated | None
+    solver: str
+    density: float
+    fabric: str
+    recordings: tuple[Source, ...]
+    other: bool = False
+
+    @property
+    def scenario(self) -> str:
+        """What is judged."""
+        return self.recordings[0].scenario
+
+    @property
+    def name(self) -> str:
+        whose = self.estimate.name if self.estimate else f"default_{self.solver}_{self.fabric}"
+        on = f"{self.fabric}_" if self.other else ""
+        return f"{whose}_on_{on}{self.scenario}_{self.recordings[0].name.split('_')[-1]}"
+
+    @property
+    def alike(self) -> str:
+        return f"evaluations {self.solver} {self.scenario}"
+
+    def make(self, folder: Path, out: Path) -> dict[str, Any]:
+        """Metrics of every recording, and the motion beside the first."""
+        recordings = [read(source, folder) for source in self.recordings]
+        fabric = self._fabric(folder)
+        if fabric is None:
+            shape = (len(recordings[0].times), 81, 3)
+            motions = [np.full(shape, np.nan)] * len(recordings)
+        else:
+            motions = predict(recordings, fabric, self.solver)
+        measured = {
+            source.name: judge.against_motion(recording, x)
+            for source, recording, x in zip(self.recordings, recordings, motions, strict=True)
+        }
+        plain = {name: {k: _plain(v) for k, v in row.items()} for name, row in measured.items()}
+        write_json(out / MEASURED, plain)
+        np.savez_compressed(out / MOTION, x=np.asarray(motions[0], np.float32))
+        diverged = [
+            source.name
+            for source, x in zip(self.recordings, motions, strict=True)
+            if not np.isfinite(x).all()
+        ]
+        return {"diverged": diverged}
+
+    def _fabric(self, folder: Path) -> Fabric | None:
+        if self.estimate is None:
+            return default_fabric(self.solver, self.density)
+        found = read_estimate(self.estimate, folder)
+        return None if found is None else found.fabric
+
+
+def read_measured(cell: Judged, folder: Path) -> dict[str, dict[str, float]]:
+    """The metrics of each recording by name; NaN where the motion diverged."""
+    with opened(cell, folder) as files:
+        stored = json.loads((files / MEASURED).read_text(encoding="utf-8"))
+    number = lambda value: math.nan if value is None else value
+    return {name: {k: number(v) for k, v in row.items()} for name, row in stored.items()}
+
+
+def read_motion(cell: Judged, folder: Path) -> Float[np.ndarray, "frame vertex 3"]:
+    """Positions [m] of the motion beside the first recording."""
+    with opened(cell, folder) as files, np.load(files / MOTION) as stored:
+        return stored["x"]
+
+
+def predict(
+    recordings: list[Recording], fabric: Fabric, solver: str
+) -> list[Float[np.ndarray, "frame vertex 3"]]:
+    """Positions [m] of a fabric in the motions of recordings of one scenario; NaN from where one
+    diverged. By the cloth, or by material points in a grid that serves them all."""
+    scenarios = [from_recording(recording) for recording in recordings]
+    most = max(scenario.substeps for scenario in scenarios)
+    alike = [dataclasses.replace(scenario, substeps=most) for scenario in scenarios]
+    sheet = _points(alike, fabric) if solver == "points" else None
+    motions = []
+    for scenario in alike:
+        own = sheet and eqx.tree_at(lambda s: s.scene, sheet, scenario.scene)
+        moved = _motion(scenario, fabric, solver=own)
+        ok = np.logical_and.accumulate(np.asarray(moved.ok))[:, None, None]
+        motions.append(np.where(ok, np.asarray(moved.x), np.nan))
+    return motions
+
+
+def _points(scenarios: list[Scenario], fabric: Fabric) -> Sheet:
+    paths = [jnp.concatenate([getattr(s, name) for s in scenarios]) for name in ("path", "start")]
+    everywhere = dataclasses.replace(scenarios[0], path=paths[0], start=paths[1])
+    first = scenarios[0]
+    mesh = first.scene.mesh
+    spacing = longest_edge(mesh) / EDGE
+    limit = float(stable_step(mesh, spacing, fabric, MEMBRANE_DAMPING))
+    needed = max(first.substeps, first.interval / limit) + 1
+    substeps = math.ceil(LADDER ** math.ceil(math.log(needed) / math.log(LADDER)))
+    grid = grid_around(everywhere, spacing)
+    return Sheet.make(first.scene, grid, fabric, first.interval / substeps, MEMBRANE_DAMPING)
+
+
+def _plain(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,175 @@
+"""The engine: nothing finished is lost, what fails stops nothing else, keys say all."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from r2s.study import cells, engine
+from r2s.study.cells import Cell
+
+
+@dataclass(frozen=True)
+class Number(Cell):
+    """Writes a number; a negative one fails."""
+
+    kind: ClassVar[str] = "numbers"
+
+    value: int
+    pause: float = 0.0
+
+    @property
+    def name(self) -> str:
+        return f"n{self.value}"
+
+    def make(self, folder: Path, out: Path) -> dict[str, Any]:
+        time.sleep(self.pause)
+        if self.value < 0:
+            raise ValueError("is below zero")
+        (out / "value.txt").write_text(str(self.value))
+        return {"seed": self.value}
+
+
+@dataclass(frozen=True)
+class Sum(Cell):
+    """The sum of others."""
+
+    kind: ClassVar[str] = "sums"
+
+    parts: tuple[Cell, ...]
+    label: str = "sum"
+
+    @property
+    def name(self) -> str:
+        return self.label
+
+    def make(self, folder: Path, out: Path) -> dict[str, Any]:
+        total = sum(value_of(part, folder) for part in self.parts)
+        (out / "value.txt").write_text(str(total))
+        return {}
+
+
+def value_of(cell: Cell, folder: Path) -> int:
+    with cells.opened(cell, folder) as files:
+        return int((files / "value.txt").read_text())
+
+
+def tree() -> Sum:
+    return Sum((Sum((Number(1), Number(2)), "a"), Sum((Number(2), Number(3)), "b")), "whole")
+
+
+def test_needs_come_first_and_once(tmp_path):
+    order = [cell.name for cell in engine.closure([tree()])]
+    assert order == ["n1", "n2", "a", "n3", "b", "whole"]
+    assert engine.run([tree()], tmp_path, engine.Serial()) == {}
+    assert value_of(tree(), tmp_path) == 8
+
+
+@settings(max_examples=25, deadline=None)
+@given(values=st.lists(st.integers(-2, 3), min_size=1, max_size=6))
+def test_what_fails_stops_only_what_needs_it(tmp_path_factory, values):
+    folder = tmp_path_factory.mktemp("study")
+    sums = [Sum((Number(value), Number(5)), f"s{i}") for i, value in enumerate(values)]
+    failed = engine.run(sums, folder, engine.Serial())
+    for cell, value in zip(sums, values, strict=True):
+        assert cell.is_made(folder) == (value >= 0)
+        assert (cell in failed) == (value < 0)
+        if value < 0:
+            assert failed[cell] == f"needs numbers n{value}, which is missing"
+            assert failed[Number(value)] == "ValueError: is below zero"
+
+
+def test_what_is_made_is_not_made_again_and_says_how_it_was_made(tmp_path):
+    engine.run([tree()], tmp_path, engine.Serial())
+    times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.zip")}
+    engine.run([tree()], tmp_path, engine.Serial())
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.zip")} == times
+    noted = cells.about(Number(3), tmp_path)
+    assert noted["config"] == "Number(value=3, pause=0.0)" and noted["seed"] == 3
+    assert {"r2s", "jax"} <= noted["versions"].keys()
+    assert noted["seconds"] >= 0 and noted["peak_memory_MB"] > 10
+
+
+def test_the_key_depends_on_the_configuration_of_what_is_needed():
+    assert Sum((Number(1),)).key == Sum((Number(1),)).key
+    assert Sum((Number(1),)).key != Sum((Number(2),)).key
+    assert Sum((Sum((Number(1),)),)).key != Sum((Sum((Number(1, 0.5),)),)).key
+    assert Number(1).key != Sum((Number(1),)).key
+
+
+def test_a_damaged_result_is_made_again(tmp_path):
+    engine.run([Number(4)], tmp_path, engine.Serial())
+    path = Number(4).path(tmp_path)
+    path.write_bytes(path.read_bytes()[:20])
+    engine.run([Number(4)], tmp_path, engine.Serial())
+    assert zipfile.is_zipfile(path) and value_of(Number(4), tmp_path) == 4
+
+
+def test_a_full_disk_is_a_reason_and_leaves_nothing_behind(tmp_path, monkeypatch):
+    def full(path, data):
+        raise OSError(28, f"cannot write {path}: no space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(cells, "write_bytes", full)
+        failed = engine.run([Number(1)], tmp_path, engine.Serial())
+    assert "no space left" in failed[Number(1)]
+    assert not list(tmp_path.rglob("*.zip"))
+    assert engine.run([Number(1)], tmp_path, engine.Serial()) == {}
+
+
+STUDY = """
+import sys
+sys.path.insert(0, {tests!r})
+from pathlib import Path
+from test_engine import Number, Sum
+from r2s.study import engine
+cells = [Sum((Number(i, 0.05), Number(i + 1, 0.05)), f"s{{i}}") for i in range(8)]
+engine.run(cells, Path({folder!r}), engine.Serial())
+"""
+
+
+@pytest.mark.parametrize("after", [0.1, 0.25])
+def test_a_run_that_was_killed_goes_on(tmp_path, after):
+    code = STUDY.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
+    killed = subprocess.Popen([sys.executable, "-c", code])
+    deadline = time.time() + 60
+    while time.time() < deadline and not list(tmp_path.rglob("*.zip")):
+        time.sleep(0.01)
+    time.sleep(after)
+    os.kill(killed.pid, signal.SIGKILL)
+    killed.wait()
+    made = set(tmp_path.rglob("*.zip"))
+    assert 0 < len(made) < 17
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert made <= set(tmp_path.rglob("*.zip"))
+    sums = [Sum((Number(i, 0.05), Number(i + 1, 0.05)), f"s{i}") for i in range(8)]
+    assert [value_of(cell, tmp_path) for cell in sums] == [2 * i + 1 for i in range(8)]
+
+
+def test_workers_of_dask_make_the_same_and_survive_a_kill(tmp_path):
+    cluster = pytest.importorskip("r2s.study.cluster", reason="needs the extra cluster")
+    sums = [Sum((Number(i, 0.2), Number(i + 1, 0.2)), f"s{i}") for i in range(6)]
+    sums.append(Sum((Number(-1), Number(0, 0.2)), "bad"))
+    runner = cluster.local(2)
+    try:
+        client = runner._client
+        # a process that dies in the middle of a cell
+        client.run_on_scheduler(lambda: None)
+        pid = next(iter(client.run(os.getpid).values()))
+        import threading
+
+        threading.Timer(0.5, os.kill, (pid, signal.SIGKILL)).start()
+        failed = engine.run(sums, tmp_path, runner)
+    finally:
+        runner.close()
+    assert {cell.name for cell in failed} == {"n-1", "bad"}
+    assert [value_of(cell, tmp_path) for cell in sums[:6]] == [2 * i + 1 for i in range(6)]
