@@ -122,11 +122,13 @@ def _is_there(out: Path) -> bool:
 def settings_of(asked: argparse.Namespace, fabrics: int, seed: int) -> Settings:
     settings = Settings(asked.scenario, fabrics, seed=seed)
     judged = seed != asked.seed
-    settings = dataclasses.replace(settings, num_levels=3) if judged else settings
+    # all that is judged is moved alike, and as nothing before
+    apart: dict[str, Any] = {"num_levels": 3, "per_shard": fabrics} if judged else {}
     if not asked.points:
-        return settings
+        return dataclasses.replace(settings, **apart)
     about: dict[str, Any] = {"material_points": True, "isotropic": True, "ranges": ()}
-    return dataclasses.replace(settings, num_levels=3, shape=(7, 7), per_shard=4, **about)
+    about |= {"num_levels": 3, "shape": (7, 7), "per_shard": 4} | apart
+    return dataclasses.replace(settings, **about)
 
 
 def make_data(folder: Path, settings: Settings) -> dict[str, float]:

@@ -1,6 +1,6 @@
-"""The main job: which fabric was that, and how well does it predict a motion never seen?
+"""Which approach, which simulator, which scenario? Every cell of the study, and its report.
 
-python experiments/study.py                          # five known fabrics, made by the solver
+python experiments/study.py --preset small           # minutes; "paper" and "full" are for a cluster
 python experiments/study.py --data FOLDER            # recordings (see README, "Your recordings")
 """
 
@@ -8,41 +8,54 @@ import argparse
 import sys
 from pathlib import Path
 
-from r2s.study import pairs, pictures, run, tables
+from r2s.study import engine, matrix, results
 
 
-def main(data: str, out: Path, density: float, only: str, effort: run.Effort) -> None:
-    if data:
-        found = pairs.recorded_pairs(Path(data), density, only)
-        kind = f"recordings in {data}, areal density assumed {density:g} kg/m^2"
+def runner(a: argparse.Namespace) -> engine.Runner:
+    if not (a.workers > 1 or a.scheduler or a.slurm):
+        return engine.Serial()
+    from r2s.study import cluster
+
+    if a.scheduler:
+        return cluster.at(a.scheduler)
+    return cluster.slurm(a.slurm) if a.slurm else cluster.local(a.workers, a.compilation_cache)
+
+
+def main(a: argparse.Namespace) -> int:
+    about = a.columns, a.fabrics, a.repeats, a.judged, a.materials, a.seed
+    plan = matrix.narrowed(matrix.PRESETS[a.preset], *about)
+    if a.data:
+        cells = matrix.recorded(a.data, a.density, plan)
     else:
-        found = pairs.synthetic_pairs(list(pairs.presets.FIVE), effort.seed)
-        kind = "synthetic recordings of five known fabrics, made by the same solver"
-    out.mkdir(parents=True, exist_ok=True)
-    judged, rows = run.run(found, out, effort)
-    settings = {"data": kind, **{k: str(v) for k, v in vars(effort).items()}}
-    intro = (
-        f"Fabrics estimated from a lift and judged on a fold that the estimate never saw: {kind}."
-    )
-    for table in pictures.publish(out, judged, rows, settings, intro):
-        print(f"\n{tables.markdown(table)}")
-    print(f"\n{out / 'report.html'} has the pictures, {out / 'results.csv'} every figure.")
+        cells = matrix.synthetic(plan)
+    workers = runner(a)
+    try:
+        failed = engine.run(cells, a.out, workers)
+    finally:
+        workers.close()
+    results.publish(cells, failed, a.out, plan, str(a.data or "synthetic recordings"), a.paper)
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Estimate from lifts, judge on folds.")
-    parser.add_argument("--data", default="", help="folder of recordings; synthetic when empty")
-    parser.add_argument("--out", type=Path, default=Path("results"), help="folder of the results")
-    parser.add_argument("--density", type=float, default=0.15, help="areal density [kg/m^2]")
-    parser.add_argument("--only", default="", help="regular expression for names of lifts")
-    parser.add_argument("--recipe", default="default", choices=("default", "original"))
-    parser.add_argument("--coarse", type=int, default=24, help="places of the coarse search")
-    parser.add_argument("--starts", type=int, default=3, help="descents from the best of them")
-    parser.add_argument("--iterations", type=int, default=25, help="Gauss-Newton steps")
-    parser.add_argument("--seed", type=int, default=0)
-    a = parser.parse_args()
+    parser = argparse.ArgumentParser(description="Estimate, and judge on motions never seen.")
+    add = parser.add_argument
+    add("--preset", default="small", choices=matrix.PRESETS)
+    add("--data", type=Path, help="folder of recordings; synthetic ones without")
+    add("--out", type=Path, default=Path("results"), help="folder of the results")
+    add("--paper", type=Path, help="folder of the tables of Ru et al. 2025, to set beside ours")
+    add("--density", type=float, default=0.15, help="areal density of recordings [kg/m^2]")
+    add("--materials", default="", help="folder of measured tables, FABRIC.json (ARCSim)")
+    add("--columns", nargs="*", help="such as diffcloud-cloth-lifting, instead of the preset's")
+    add("--fabrics", nargs="*", help="presets, instead of the preset's")
+    add("--repeats", type=int, help="estimates of each fabric")
+    add("--judged", type=int, help="motions to judge by, of each scenario")
+    add("--seed", type=int, default=0)
+    add("--workers", type=int, default=1, help="processes on this machine (extra cluster)")
+    add("--scheduler", default="", help="address of a Dask scheduler, such as tcp://node:8786")
+    add("--slurm", type=int, default=0, help="jobs of a Slurm cluster")
+    add("--compilation-cache", type=Path, help="folder where workers keep compiled programs")
     try:
-        effort = run.Effort(run.Cost(a.coarse, a.starts, a.iterations), a.recipe, a.seed)
-        main(a.data, a.out, a.density, a.only, effort)
-    except (ValueError, OSError) as error:
+        sys.exit(main(parser.parse_args()))
+    except (ValueError, OSError, ImportError) as error:
         sys.exit(f"error: {error}")

@@ -1,7 +1,6 @@
 """The cloth: a sheet of triangles, implicit in time, second order, differentiable."""
 
 import dataclasses
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,12 +9,11 @@ from jaxtyping import Array, Float
 
 from r2s.fabric import Fabric
 from r2s.implicit import minimise
-from r2s.increment import Increment, bends, curvatures, hinge_angles, strains
+from r2s.increment import Increment, bending_laws, curvatures, hinge_angles, strains
 from r2s.layers import Contacts, settle
 from r2s.mesh import Mesh
 from r2s.physics import contact
 from r2s.physics.bending import unwrapped
-from r2s.physics.plate import PlateLaw
 from r2s.scene import Control, Scene
 
 Positions = Float[Array, "vertex 3"]
@@ -101,12 +99,12 @@ class Cloth(eqx.Module):
         angles_before = unwrapped(hinge_angles(mesh, state.x_before), angles)
         strain, strain_before = strains(mesh, state.x), strains(mesh, state.x_before)
         ahead = lambda now, before: 2 * now - before  # second order, like the formula
-        bending = _laws(fabric.bending, mesh, curvatures(mesh, ahead(angles, angles_before)))
+        hinges = curvatures(mesh, ahead(angles, angles_before))
         return Increment(
             mesh=mesh,
             fabric=fabric,
             membrane=jax.vmap(fabric.membrane.at)(ahead(strain, strain_before)),
-            bending=bending,
+            bending=bending_laws(mesh, fabric.bending, hinges),
             air=self.scene.air,
             table=self.scene.table,
             rate=jnp.asarray(1.5 / self.dt, float),
@@ -120,13 +118,6 @@ class Cloth(eqx.Module):
             layers=self.scene.layers,
             wind=self.scene.wind_on_faces(ahead(state.x, state.x_before), control.wind),
         )
-
-
-def _laws(law: Any, mesh: Mesh, hinges: Float[Array, " hinge"]):
-    """The bending law of every face or hinge, from the curvatures [1/m] of the hinges."""
-    if isinstance(law, PlateLaw):
-        return jax.vmap(law.at)(bends(mesh, law, hinges))
-    return jax.vmap(law.at)(mesh.hinge_direction, hinges)
 
 
 def _area_normals(mesh: Mesh, x: Positions) -> Float[Array, "face 3"]:

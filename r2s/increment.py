@@ -111,6 +111,13 @@ def bends(
     return mesh.patches.curvatures(hinges) if isinstance(law, PlateLaw) else hinges
 
 
+def bending_laws(mesh: Mesh, law: Any, hinges: Float[Array, " hinge"]) -> Any:
+    """The bending law of every face or hinge, as it stands at the curvatures [1/m] of hinges."""
+    if isinstance(law, PlateLaw):
+        return jax.vmap(law.at)(bends(mesh, law, hinges))
+    return jax.vmap(law.at)(mesh.hinge_direction, hinges)
+
+
 def bending_areas(mesh: Mesh, law: BendingLaw | PlateLaw) -> Float[Array, " element"]:
     """The areas [m^2] on which a law acts: of the faces, or those of the hinges."""
     return mesh.area if isinstance(law, PlateLaw) else mesh.hinge_area

@@ -66,7 +66,7 @@ def stream(
     run = _sharded(function, devices)
     like = None
     for first in range(0, count, size):
-        part = jax.tree.map(lambda leaf: np.asarray(leaf[first : first + size]), members)
+        part = _part(members, slice(first, first + size))
         kept = min(size, count - first)
         path = None if folder is None else folder / f"{first:08d}-{_digest(part)}.eqx"
         if path is not None and path.exists():
@@ -100,6 +100,10 @@ def _length(members: Any) -> int:
     if len(lengths) != 1 or lengths == {()} or lengths == {(0,)}:
         raise ValueError(f"members need one leading axis on all arrays, found {sorted(lengths)}")
     return lengths.pop()[0]
+
+
+def _part(members: Any, chosen: slice) -> Any:
+    return jax.tree.map(lambda leaf: np.asarray(leaf[chosen]), members)
 
 
 def _filled(leaf: np.ndarray, size: int) -> np.ndarray:

@@ -10,9 +10,12 @@ import pytest
 
 from r2s import presets, scenarios
 from r2s.fabric import Fabric
+from r2s.mesh import rectangle
+from r2s.physics.bending import HingeBending
+from r2s.physics.table import HINGE_FACTOR, TableBending
 from r2s.recording import RecordingInfo, make_recording
 from r2s.scenario import from_recording, motion
-from r2s.scenarios.account import stretch
+from r2s.scenarios.account import stored_energy, stretch
 from r2s.scenarios.experiments import CLEARANCE, SIX
 from r2s.trajectories import Route
 from r2s.units import GRAVITY
@@ -176,3 +179,12 @@ def test_every_scenario_on_every_solver(name, kind, fabric):
     else:
         # a knit of 10 N/m (C11 - C12^2 / C22) under a weight of 0.8 N/m, shaken
         assert stretched.mean(axis=1).max() < 0.12 and stretched.max() < 0.8
+
+
+def test_the_energy_of_a_table_law_is_that_of_its_stiffness_there():
+    mesh = rectangle((0.2, 0.2), (4, 4))
+    fabric = presets.grey_interlock()
+    x = jnp.concatenate([mesh.rest, 0.02 * jnp.sin(20 * mesh.rest[:, :1])], axis=1)
+    of = lambda law: float(stored_energy(mesh, dataclasses.replace(fabric, bending=law), x))
+    table = TableBending(jnp.full((3, 5), HINGE_FACTOR * 1e-5))
+    assert of(table) == pytest.approx(of(HingeBending(jnp.asarray(1e-5))), rel=1e-12)

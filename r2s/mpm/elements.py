@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r2s.fabric import Fabric
-from r2s.increment import bending_areas, bends, curvatures, hinge_angles, strains
+from r2s.increment import bending_areas, bending_laws, bends, curvatures, hinge_angles, strains
 from r2s.mesh import Mesh
 from r2s.physics.bending import angle_gradient
 from r2s.physics.membrane import green_strain
@@ -28,20 +28,13 @@ def elastic_force(
 
     As in `r2s.Cloth`, but for `membrane_damping` [s], the damping time of the membrane.
     """
-    bend = lambda x: bends(mesh, fabric.bending, curvatures(mesh, hinge_angles(mesh, x)))
+    hinges = lambda x: curvatures(mesh, hinge_angles(mesh, x))
+    bend = lambda x: bends(mesh, fabric.bending, hinges(x))
     stretched = jax.vmap(fabric.membrane.at)(strains(mesh, x))
-    bent = _bending_laws(fabric, mesh, x)
+    bent = bending_laws(mesh, fabric.bending, hinges(x))
     along = _resistance(stretched, lambda x: strains(mesh, x), mesh.area, membrane_damping, x, v)
     areas = bending_areas(mesh, fabric.bending)
     return along + _resistance(bent, bend, areas, fabric.damping, x, v)
-
-
-def _bending_laws(fabric: Fabric, mesh: Mesh, x: Vertices) -> Any:
-    """The bending law of every face or hinge, as it stands at positions [m]."""
-    law, hinges = fabric.bending, curvatures(mesh, hinge_angles(mesh, x))
-    if isinstance(law, PlateLaw):
-        return jax.vmap(law.at)(bends(mesh, law, hinges))
-    return jax.vmap(law.at)(mesh.hinge_direction, hinges)
 
 
 def _resistance(

@@ -24,7 +24,7 @@ from r2s.scenario import Scenario, motion
 from r2s.scenarios.experiments import SIX, Experiment, varied
 from r2s.scenarios.points import material_points
 
-FORMAT = "r2s-physnet-data/1"
+FORMAT = "r2s-physnet-data/2"
 STEP = 1e-4  # [m], of the depths in the files
 
 
@@ -34,7 +34,7 @@ class Settings:
 
     - `scenario`: a name in `r2s.scenarios.SIX`.
     - `num_fabrics`: the classes, drawn evenly from the unit cube of the family.
-    - `num_levels`: motions of each, the same for all; see `levels`.
+    - `num_levels`: motions of each, the same for all of a shard; see `levels`.
     - `num_frames`: kept of each motion, evenly spread over those that count.
     - `size`: of the images, [pixel]. - `shape`: vertices along warp and weft.
     - `density` [kg/m^2], `thickness` [m], `ranges`: of the family; no ranges: its own.
@@ -141,11 +141,13 @@ def make(
     shards = dict(known.shards) if known else {}
     view = known.view if known else view
     starts = range(0, settings.num_fabrics, settings.per_shard)
+    shared = None
     for number, _ in enumerate(tqdm(starts, "shards", disable=None if progress else True)):
         name = f"{number:04d}.npz"
         if view is not None and _is_whole(folder / name, shards.get(name)):
             continue
-        experiments, places, x, ok = _simulate(settings, number)
+        shared = alike(settings) if shared is None else shared
+        experiments, places, x, ok = _simulate(settings, number, shared)
         if view is None:  # the first shard says where sheets go
             view = _fit(settings, experiments[0], x[ok])
         shards[name] = _write(folder / name, settings, view, places, x, ok)
@@ -185,15 +187,25 @@ def load(folder: Path | str) -> Data:
     return Data(depth[ok], fabric[ok], places)
 
 
-def levels(settings: Settings) -> list[Experiment]:
-    """The motions of every fabric: the scenario's own, and others within `trajectories.LIMITS`."""
-    others = varied(settings.scenario, settings.num_levels - 1, key=jr.key(settings.seed))
-    return [SIX[settings.scenario](), *others]
+def levels(settings: Settings, number: int = 0) -> list[Experiment]:
+    """The motions of every fabric of a shard: the scenario's own, and others within
+    `trajectories.LIMITS`, of which each shard has its own: so a network cannot learn them by heart.
+    """
+    key = jr.fold_in(jr.key(settings.seed), 2**20 + number)  # not that of the fabrics
+    return [SIX[settings.scenario](), *varied(settings.scenario, settings.num_levels - 1, key=key)]
 
 
-def stacked(scenarios: list[Scenario]) -> Scenario:
-    """Scenarios with a leading axis on their arrays, all with the steps of the one with most."""
-    most = max(scenario.substeps for scenario in scenarios)
+def every_level(settings: Settings) -> list[Experiment]:
+    """The motions of all shards."""
+    shards = -(-settings.num_fabrics // settings.per_shard)
+    first, *others = levels(settings)
+    return [first, *others, *(e for i in range(1, shards) for e in levels(settings, i)[1:])]
+
+
+def stacked(scenarios: list[Scenario], most: int | None = None) -> Scenario:
+    """Scenarios with a leading axis on their arrays, all with `most` steps between frames, or as
+    the one with most."""
+    most = max(scenario.substeps for scenario in scenarios) if most is None else most
     alike = [dataclasses.replace(scenario, substeps=most) for scenario in scenarios]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *alike)
 
@@ -217,18 +229,31 @@ def kept_frames(experiment: Experiment, number: int) -> tuple[int, ...]:
     return tuple(int(frame) for frame in np.linspace(first, last, number).round())
 
 
-def _simulate(settings: Settings, number: int):
+class Alike(NamedTuple):
+    """What all shards share, so that they compile once: steps between frames, and the solver."""
+
+    substeps: int
+    solver: Sheet | None
+
+
+def alike(settings: Settings) -> Alike:
+    """For the motions of all shards."""
+    scenarios = [experiment.scenario(settings.shape) for experiment in every_level(settings)]
+    return Alike(max(s.substeps for s in scenarios), solver_of(settings, scenarios))
+
+
+def _simulate(settings: Settings, number: int, alike: Alike):
     """The experiments of a shard, its fabrics' places, and their motions [m], with which are ok."""
     first = number * settings.per_shard
     count = min(settings.per_shard, settings.num_fabrics - first)
     # always a whole shard, so that it compiles once and the last fabrics do not depend on how many
     key = jr.fold_in(jr.key(settings.seed), number)
     places = jr.uniform(key, (settings.per_shard, len(settings.ranges)), float)
-    experiments = levels(settings)
+    experiments = levels(settings, number)
     scenarios = [experiment.scenario(settings.shape) for experiment in experiments]
     fabrics = jax.vmap(settings.family)(jnp.repeat(places, settings.num_levels, axis=0))
-    repeated = stacked(scenarios * settings.per_shard)
-    x, ok = _moved(repeated, fabrics, solver_of(settings, scenarios))
+    repeated = stacked(scenarios * settings.per_shard, alike.substeps)
+    x, ok = _moved(repeated, fabrics, alike.solver)
     motions = count * settings.num_levels
     frames = np.array(kept_frames(experiments[0], settings.num_frames))
     return (

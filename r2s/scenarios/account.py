@@ -8,7 +8,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r2s.fabric import Fabric
-from r2s.increment import bending_areas, bends, curvatures, hinge_angles, strains, vertex_mass
+from r2s.increment import (
+    bending_areas,
+    bending_laws,
+    bends,
+    curvatures,
+    hinge_angles,
+    strains,
+    vertex_mass,
+)
 from r2s.mesh import Mesh
 from r2s.mpm.drag import drag_on_vertices
 from r2s.scenario import Scenario, begin, stepped
@@ -104,11 +112,16 @@ def clamp_force(scenario: Scenario, found: Account) -> Float[Array, "frame 3"]:
 
 
 def stored_energy(mesh: Mesh, fabric: Fabric, x: Float[Array, "vertex 3"]) -> Float[Array, ""]:
-    """The energy [J] in the strains and curvatures of a sheet at positions [m]."""
+    """The energy [J] in the strains and curvatures of a sheet at positions [m].
+
+    Of laws by table: that of a sheet which has had the stiffness it has there all along.
+    """
     membrane = jax.vmap(fabric.membrane.energy_density)(strains(mesh, x))
     hinges = curvatures(mesh, hinge_angles(mesh, x))
-    bending = jax.vmap(fabric.bending.energy_density)(bends(mesh, fabric.bending, hinges))
-    return jnp.sum(mesh.area * membrane) + jnp.sum(bending_areas(mesh, fabric.bending) * bending)
+    laws = bending_laws(mesh, fabric.bending, hinges)
+    of_one = lambda law, curvature: law.energy_density(curvature)
+    bending = jax.vmap(of_one)(laws, bends(mesh, laws, hinges))
+    return jnp.sum(mesh.area * membrane) + jnp.sum(bending_areas(mesh, laws) * bending)
 
 
 def _drag(scenario: Scenario, state: Any, after: Any, control: Control):

@@ -4,7 +4,8 @@ Nothing that is finished is lost: a result is there whole or not at all, a cell 
 stop the others, and a run that was killed goes on where it was.
 """
 
-from collections import deque
+import sys
+from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -84,35 +85,36 @@ def run(cells: Iterable[Cell], folder: Path, runner: Runner) -> dict[Cell, str]:
 
     Those that are made already are left alone, those that failed before are tried again.
     """
-    every = closure(cells)
-    waiting = {cell for cell in every if not cell.is_made(folder)}
+    waiting = {cell: None for cell in closure(cells) if not cell.is_made(folder)}
+    wanting = {cell: {need for need in needs(cell) if need in waiting} for cell in waiting}
+    dependents = defaultdict(list)
+    for cell, missing in wanting.items():
+        for need in missing:
+            dependents[need].append(cell)
     failed: dict[Cell, str] = {}
-    total = sum(cell.weight for cell in waiting)
     shape = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}, about {remaining} left{postfix}"
+    total = sum(cell.weight for cell in waiting)
     with tqdm(total=total, desc="study", bar_format=shape, disable=None, smoothing=0.1) as bar:
-        submitted = _submit(every, waiting, set(), failed, folder, runner)
-        for cell, reason in runner.finished():
-            waiting.discard(cell)
+        for cell in waiting:
+            if not wanting[cell]:
+                runner.submit(cell, folder)
+        for cell, reason in runner.finished() if waiting else ():
             bar.update(cell.weight)
             bar.set_postfix_str(f"{cell.kind} {cell.name}")
             if reason:
-                failed[cell] = reason
-                tqdm.write(f"missing: {cell.kind} {cell.name}: {reason}")
-            submitted |= _submit(every, waiting, submitted, failed, folder, runner)
+                tqdm.write(f"missing: {cell.kind} {cell.name}: {reason}", file=sys.stderr)
+                _give_up(cell, reason, dependents, failed)
+                continue
+            for other in dependents[cell]:
+                wanting[other].discard(cell)
+                if not wanting[other] and other not in failed:
+                    runner.submit(other, folder)
     return failed
 
 
-def _submit(every, waiting, submitted, failed, folder: Path, runner: Runner) -> set[Cell]:
-    """Submit what is ready, and give up what needs a cell that failed."""
-    new = set()
-    for cell in every:  # in the order of needs, so that one pass gives up all that depend
-        if cell not in waiting or cell in submitted:
-            continue
-        wanting = [need for need in needs(cell) if need in failed]
-        if wanting:
-            failed[cell] = f"needs {wanting[0].kind} {wanting[0].name}, which is missing"
-            waiting.discard(cell)
-        elif not any(need in waiting for need in needs(cell)):
-            runner.submit(cell, folder)
-            new.add(cell)
-    return new
+def _give_up(cell: Cell, reason: str, dependents, failed: dict[Cell, str]) -> None:
+    """Note that a cell failed, and all that need it."""
+    failed[cell] = reason
+    for other in dependents[cell]:
+        if other not in failed:
+            _give_up(other, f"needs {cell.kind} {cell.name}, which is missing", dependents, failed)

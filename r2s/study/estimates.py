@@ -33,7 +33,7 @@ class Spent:
     """What estimates may cost.
 
     - `coarse`, `starts`, `iterations`: of DIFFCLOUD, as of `r2s.estimators.descent.Effort`.
-    - `points_coarse`, `points_starts`: likewise of DiffCP.
+    - `points_coarse`, `points_starts`, `points_iterations`: likewise of DiffCP.
     - `calls`: simulations of PhysNet's search. - `fabrics`, `epochs`, `steps`: of its training.
     """
 
@@ -42,6 +42,7 @@ class Spent:
     iterations: int = 25
     points_coarse: int = 12
     points_starts: int = 2
+    points_iterations: int = 25
     calls: int = 80
     fabrics: int = 512
     epochs: int = 9
@@ -181,9 +182,9 @@ def _diffcloud(cell: Estimated, family, recordings: list[Recording], folder: Pat
 
 def _diffcp(cell: Estimated, family, recordings: list[Recording], folder: Path) -> Estimate:
     del folder
-    effort = Effort(
-        cell.spent.points_coarse, cell.spent.points_starts, cell.spent.iterations, diffcp.WIDTH
-    )
+    spent = cell.spent
+    about = spent.points_coarse, spent.points_starts, spent.points_iterations
+    effort = Effort(*about, width=diffcp.WIDTH)
     problem = diffcp.on_points(Problem.make(recordings[0], family, shape=COARSE))
     return diffcp.estimate(problem, effort, key=jr.key(cell.repeat))
 

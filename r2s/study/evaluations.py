@@ -21,6 +21,7 @@ from r2s.scenarios.points import EDGE, MEMBRANE_DAMPING, grid_around
 from r2s.study import judge
 from r2s.study.cells import Cell, opened
 from r2s.study.estimates import Estimated, default_fabric, read_estimate
+from r2s.study.panel import Column
 from r2s.study.truths import Source, read
 
 MEASURED, MOTION = "measured.json", "motion.npz"
@@ -52,6 +53,18 @@ class Judged(Cell):
     def scenario(self) -> str:
         """What is judged."""
         return self.recordings[0].scenario
+
+    @property
+    def column(self) -> Column:
+        """Whose fabric it is: an approach's on a solver, or the default one."""
+        if self.estimate is None:
+            return Column("", self.solver, "")
+        return Column(self.estimate.approach, self.solver, self.estimate.scenario)
+
+    @property
+    def repeat(self) -> str:
+        """Which of several estimates alike; "" for the default fabric."""
+        return "" if self.estimate is None else str(self.estimate.repeat)
 
     @property
     def name(self) -> str:

@@ -2,51 +2,32 @@
 
 import dataclasses
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from r2s import presets
-from r2s.study.estimates import SOLVERS, Estimated, Spent, Trained
+from r2s.study.estimates import SOLVERS, Estimated, Spent, Trained, family_of
 from r2s.study.evaluations import Judged
+from r2s.study.panel import MOTIONS, PAPER_COLUMNS, Column
 from r2s.study.truths import Given, Made, Making, Source, given, strain_dependent
+from r2s.trajectories import ESTIMATION, EVALUATION
 
-UNSEEN = ("folding", "fling", "shaking")
 ESTIMATED_FROM = ("lifting", "wind", "stretching")
 TOGETHER = 10  # recordings in a cell that judges
 PULLS = (0.0, 45.0, 90.0)  # [degrees], from which PINN estimates together
 
 
-class Column(NamedTuple):
-    """An approach on a solver, and the scenario that it estimates from."""
-
-    approach: str
-    solver: str
-    scenario: str
-
-
-PAPER = (
-    Column("diffcloud", "cloth", "lifting"),
-    Column("diffcloud", "cloth", "wind"),
-    Column("diffcp", "points", "lifting"),
-    Column("physnet", "cloth", "lifting"),
-    Column("physnet", "cloth", "wind"),
-    Column("physnet", "points", "lifting"),
-    Column("pinn", "points", "stretching"),
-    Column("pinn", "cloth", "stretching"),
-)
-"""The eight of the study."""
-
-FULL = PAPER + tuple(
-    column
+FULL = PAPER_COLUMNS + tuple(
+    Column(approach, solver, scenario)
     for approach, solvers in SOLVERS.items()
     for solver in solvers
     for scenario in ESTIMATED_FROM
-    if (column := Column(approach, solver, scenario)) not in PAPER
-    # the network maps what a camera sees, or what markers do; see README for its limits on clouds
+    if (approach, solver, scenario) not in PAPER_COLUMNS
+    # the network's maps of lifts and winds are balanced as an orthotropic sheet alone
     and not (approach == "pinn" and solver == "points" and scenario != "stretching")
 )
-"""And those that it calls unsupported."""
+"""The columns of the study, and those that it calls unsupported."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +35,7 @@ class Plan:
     """A study of synthetic recordings.
 
     - `columns`, `fabrics`: which. - `repeats`: estimates of each, from other motions.
-    - `judged`: motions of each of `UNSEEN` to judge by. - `making`, `spent`, `seed`.
+    - `judged`: motions of each of `MOTIONS` to judge by. - `making`, `spent`, `seed`.
     """
 
     columns: tuple[Column, ...]
@@ -66,7 +47,16 @@ class Plan:
     seed: int = 0
 
 
-LITTLE = Spent(fabrics=32, epochs=2, steps=40, calls=40)
+ALL = Plan(FULL, tuple(presets.FIVE), ESTIMATION, EVALUATION // len(MOTIONS), Making(layers=True))
+LITTLE = Spent(
+    points_coarse=6,
+    points_starts=1,
+    points_iterations=6,
+    calls=40,
+    fabrics=32,
+    epochs=2,
+    steps=40,
+)
 SMALL = Plan(
     columns=tuple(
         Column(*names)
@@ -86,9 +76,44 @@ SMALL = Plan(
 )
 PRESETS = {
     "small": SMALL,
-    "paper": Plan(PAPER, tuple(presets.FIVE), repeats=40, judged=40, making=Making(layers=True)),
-    "full": Plan(FULL, tuple(presets.FIVE), repeats=40, judged=40, making=Making(layers=True)),
+    "paper": dataclasses.replace(ALL, columns=PAPER_COLUMNS),
+    "full": ALL,
 }
+
+
+def named(text: str) -> Column:
+    """The column written as "diffcloud-cloth-lifting"; `ValueError` says which there are."""
+    names = {"-".join(each): each for each in FULL}
+    if text not in names:
+        raise ValueError(f"no column {text!r}; there are {', '.join(names)}")
+    return names[text]
+
+
+def narrowed(
+    plan: Plan,
+    columns: Sequence[str] | None = None,
+    fabrics: Sequence[str] | None = None,
+    repeats: int | None = None,
+    judged: int | None = None,
+    materials: str = "",
+    seed: int = 0,
+) -> Plan:
+    """A plan with other columns, fabrics, numbers, measured tables or another seed; None: as it is.
+
+    Raises `ValueError` for numbers below 1.
+    """
+    for name, number in (("repeats", repeats), ("judged", judged)):
+        if number is not None and number < 1:
+            raise ValueError(f"{name} must be at least 1, got {number}")
+    return dataclasses.replace(
+        plan,
+        columns=plan.columns if not columns else tuple(map(named, columns)),
+        fabrics=plan.fabrics if not fabrics else tuple(fabrics),
+        repeats=plan.repeats if repeats is None else repeats,
+        judged=plan.judged if judged is None else judged,
+        making=dataclasses.replace(plan.making, materials=materials),
+        seed=seed,
+    )
 
 
 def synthetic(plan: Plan) -> list[Judged]:
@@ -104,7 +129,7 @@ def synthetic(plan: Plan) -> list[Judged]:
                 Made(fabric, scenario, number, True, plan.making, plan.seed)
                 for number in range(plan.judged)
             )
-            for scenario in UNSEEN
+            for scenario in MOTIONS
         }
         estimates = [
             _estimated(column, fabric, density, plan, repeat)
@@ -115,25 +140,28 @@ def synthetic(plan: Plan) -> list[Judged]:
     return found
 
 
-def recorded(folder: Path, density: float, columns: tuple[Column, ...], plan: Plan) -> list[Judged]:
-    """Likewise of the recordings in a folder, with an areal density to assume [kg/m^2].
+def recorded(folder: Path, density: float, plan: Plan) -> list[Judged]:
+    """Likewise of the recordings in a folder, with an areal density to assume [kg/m^2]: those
+    columns of the plan that have recordings to estimate from.
 
-    A repeat is a recording. Judged by scenarios of `UNSEEN` of the same fabric and trial (of all
-    trials where that trial has none), also with the estimate of another fabric. Raises what
-    `truths.given` raises, and `ValueError` when no column has a recording to estimate from, or
-    none is there to judge by.
+    A repeat is a recording. Judged by `MOTIONS` of the same fabric and trial (of all trials where
+    that trial has none), also with the estimate of another fabric. Raises what `truths.given`
+    raises, and `ValueError` for a density that is none, when no column has a recording to estimate
+    from, or none is there to judge by.
     """
+    family_of("cloth", density)
+    columns = plan.columns
     every = given(folder)
-    seen = [r for r in every if r.scenario in {column.scenario for column in columns}]
-    unseen = [r for r in every if r.scenario in UNSEEN]
+    seen = [r for r in every if r.scenario in {column.estimated_from for column in columns}]
+    unseen = [r for r in every if r.scenario in MOTIONS]
     if not seen or not unseen:
         raise ValueError(
             f"{folder}: nothing to estimate from ({', '.join(ESTIMATED_FROM)}) or to judge by "
-            f"({', '.join(UNSEEN)}); found {sorted({r.scenario for r in every})}"
+            f"({', '.join(MOTIONS)}); found {sorted({r.scenario for r in every})}"
         )
     found: list[Judged] = []
     for column in columns:
-        own = [r for r in seen if r.scenario == column.scenario]
+        own = [r for r in seen if r.scenario == column.estimated_from]
         estimates = [_from_given(column, r, density, plan, i) for i, r in enumerate(own)]
         for index, (recording, estimate) in enumerate(zip(own, estimates, strict=True)):
             by = _by_scenario(_of_trial(unseen, recording))
@@ -159,9 +187,9 @@ def _judged(estimates, fabric: str, density: float, unseen) -> list[Judged]:
 
 def _estimated(column: Column, fabric: str, density: float, plan: Plan, repeat: int) -> Estimated:
     make = lambda angle: Made(
-        fabric, column.scenario, repeat, False, plan.making, plan.seed, angle=angle
+        fabric, column.estimated_from, repeat, False, plan.making, plan.seed, angle=angle
     )
-    several = column.approach == "pinn" and column.scenario == "stretching"
+    several = column.approach == "pinn" and column.estimated_from == "stretching"
     sources = tuple(make(angle) for angle in (PULLS if several else (None,)))
     return _estimate(column, fabric, sources, density, plan, repeat)
 
@@ -177,7 +205,7 @@ def _estimate(
     if column.approach == "physnet":
         on_points = dataclasses.replace(spent, fabrics=min(spent.fabrics, 32))
         spent = on_points if column.solver == "points" else spent
-        network = Trained(column.solver, column.scenario, spent, plan.seed)
+        network = Trained(column.solver, column.estimated_from, spent, plan.seed)
     about = column.approach, column.solver, fabric, sources, density
     return Estimated(*about, spent, network, repeat)
 

@@ -2,21 +2,69 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from dataclasses import fields
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from r2s.family import Range
+from r2s.files import write_text
+from r2s.recording import cloud
+from r2s.scenario import from_recording
 from r2s.study import judge
-from r2s.study.cells import Cell, about
+from r2s.study.cells import Cell, about, opened
 from r2s.study.engine import closure
-from r2s.study.estimates import Estimated, family_of, read_estimate
-from r2s.study.evaluations import Judged, read_measured
-from r2s.study.tables import Row
-from r2s.study.truths import Made, read, small_strain
+from r2s.study.estimates import ESTIMATE, Estimated, family_of, read_estimate
+from r2s.study.evaluations import Judged, read_measured, read_motion
+from r2s.study.matrix import Plan
+from r2s.study.shown import Shown
+from r2s.study.tables import Row, write_rows
+from r2s.study.truths import Made, Source, read, small_strain
 
 Entry = tuple[str, tuple[Range, ...], Any, Any, Any, Any]
+
+
+def publish(
+    cells: Sequence[Judged],
+    failed: dict[Cell, str],
+    out: Path,
+    plan: Plan,
+    source: str,
+    paper: Path | None = None,
+) -> None:
+    """Write `results.csv`, `estimates/`, tables, pictures and `report.html` of a study, and print
+    its tables; nothing but the tables again when nothing has changed."""
+    changed = sha256(repr([[c.key for c in cells], missing(failed), str(paper)]).encode())
+    mark = out / ".published"
+    if not mark.exists() or mark.read_text(encoding="utf-8") != changed.hexdigest():
+        found = rows(cells, out)
+        write_rows(out / "results.csv", found)
+        for cell in estimated(cells, out):
+            with opened(cell, out) as files:
+                if (files / ESTIMATE).exists():
+                    (out / "estimates").mkdir(exist_ok=True)
+                    write_text(out / f"estimates/{cell.name}.json", (files / ESTIMATE).read_text())
+        settings = {"recordings": source} | {
+            field.name: str(getattr(plan, field.name)) for field in fields(plan)
+        }
+        from r2s.study import full_report
+
+        full_report.publish(
+            out,
+            found,
+            shown(cells, out),
+            parameters(cells, out),
+            missing(failed),
+            settings,
+            paper,
+            costs(cells, out),
+        )
+        write_text(mark, changed.hexdigest())
+    for table in sorted((out / "tables").glob("*.md")):
+        print(f"\n{table.read_text(encoding='utf-8')}")
+    print(f"\n{out / 'report.html'} has the pictures, {out / 'results.csv'} every figure.")
 
 
 def rows(cells: Iterable[Judged], folder: Path) -> list[Row]:
@@ -28,13 +76,12 @@ def rows(cells: Iterable[Judged], folder: Path) -> list[Row]:
 
 def _rows(cell: Judged, folder: Path) -> list[Row]:
     estimate = cell.estimate
-    column = (estimate.approach, estimate.solver, estimate.scenario) if estimate else None
     baseline = "default" if estimate is None else "other_fabric" if cell.other else ""
     return [
         Row(
-            *(column or ("", cell.solver, "")),
+            *cell.column,
             cell.fabric,
-            str(estimate.repeat) if estimate else "",
+            cell.repeat,
             name,
             cell.scenario,
             baseline,
@@ -70,15 +117,19 @@ def _repeatability(cells: Sequence[Judged], folder: Path) -> list[Row]:
 def parameters(cells: Iterable[Judged], folder: Path) -> dict[str, list[Entry]]:
     """What was estimated, by solver, as `r2s.study.tables.parameter_table` takes it."""
     found: dict[str, list[Entry]] = {}
-    for cell in closure(cells):
-        if not isinstance(cell, Estimated) or not cell.is_made(folder):
-            continue
+    for cell in estimated(cells, folder):
         estimate = read_estimate(cell, folder)
         if estimate is not None:
             numbers = estimate.values, estimate.deviations, estimate.determined
             entry = (cell.name, estimate.ranges, *numbers, _truth(cell))
             found.setdefault(cell.solver, []).append(entry)
     return found
+
+
+def estimated(cells: Iterable[Judged], folder: Path) -> list[Estimated]:
+    """The estimates that are made."""
+    every = closure(cells)
+    return [cell for cell in every if isinstance(cell, Estimated) and cell.is_made(folder)]
 
 
 def _truth(cell: Estimated) -> np.ndarray | None:
@@ -88,6 +139,34 @@ def _truth(cell: Estimated) -> np.ndarray | None:
         return None
     family = family_of("cloth", cell.density)
     return np.asarray(family.values(family.locate(small_strain(cell.fabric))))
+
+
+def shown(cells: Iterable[Judged], folder: Path) -> list[Shown]:
+    """The first recording of each fabric and scenario with its simulations by all columns that are
+    made, at the frames that count."""
+    groups: dict[Source, dict[str, np.ndarray]] = {}
+    for cell in cells:
+        if cell.is_made(folder) and not cell.other and cell.repeat in ("", "0"):
+            moved = read_motion(cell, folder)
+            groups.setdefault(cell.recordings[0], {}).setdefault(cell.column.label, moved)
+    found = []
+    for source, motions in groups.items():
+        recording = read(source, folder)
+        first, last = recording.info.frames_used
+        frames = range(first, last + 1)
+        found.append(
+            Shown(
+                source.fabric,
+                source.scenario,
+                source.name,
+                np.asarray(recording.times)[first : last + 1],
+                tuple(cloud(recording, frame) for frame in frames),
+                np.asarray(from_recording(recording).scene.mesh.faces),
+                {label: x[first : last + 1] for label, x in motions.items()},
+            )
+        )
+    firsts = {(s.fabric, s.evaluated_on): s for s in reversed(found)}
+    return [s for s in found if firsts[s.fabric, s.evaluated_on] is s]
 
 
 def costs(cells: Iterable[Judged], folder: Path) -> list[dict[str, Any]]:
