@@ -1,8 +1,8 @@
-"""The command line `r2s`: data sets, recordings, pictures, plans. `r2s --help` begins.
+"""The command line `r2s`: data, pictures, plans, simulations, estimates. `r2s --help` begins.
 
 Exit codes: 0; 1 for an error, in one line on stderr; 2 for wrong usage. A command is a dataclass,
 whose fields are its arguments, with a method `run`; its docstring is its help. What it needs is
-imported there, so that help comes at once.
+imported there, so that help comes at once. Those of simulation and estimate are in `r2s.commands`.
 """
 
 import sys
@@ -24,6 +24,14 @@ try:
     )
 except ImportError:
     sys.exit("r2s: error: the command line needs tyro: pip install 'r2s[cli]'")
+
+from r2s.commands.check_grad import CheckGrad
+from r2s.commands.common import ScenarioName, numbers_of
+from r2s.commands.doctor import Doctor
+from r2s.commands.estimate import EstimateCard
+from r2s.commands.evaluate import Evaluate
+from r2s.commands.export import Export
+from r2s.commands.simulate import Simulate
 
 
 @dataclass(frozen=True)
@@ -153,10 +161,7 @@ class Sensitivity:
         r2s sensitivity wind --fabric grey_interlock --motion speed=3 --noise 0.002
     """
 
-    scenario: Annotated[
-        Positional[Literal["lifting", "wind", "stretching", "folding", "fling", "shaking"]],
-        arg(metavar="SCENARIO"),
-    ]
+    scenario: Annotated[Positional[ScenarioName], arg(metavar="SCENARIO")]
     """Of the study."""
     fabric: str = "grey_interlock"
     """A preset of `r2s.presets`."""
@@ -170,23 +175,21 @@ class Sensitivity:
     def run(self) -> None:
         from r2s.estimators.planned import describe, planned
 
-        numbers = dict(_number(text) for text in self.motion)
+        numbers = numbers_of(self.motion)
         for line in describe(planned(self.scenario, self.fabric, numbers, self.noise, self.seed)):
             print(line)
-
-
-def _number(text: str) -> tuple[str, float]:
-    name, _, value = text.partition("=")
-    try:
-        return name, float(value)
-    except ValueError:
-        raise ValueError(f"--motion expects NAME=NUMBER, such as height=0.3, got {text}") from None
 
 
 Command = (
     Annotated[Data, subcommand("data")]
     | Annotated[Show, subcommand("show")]
     | Annotated[Sensitivity, subcommand("sensitivity")]
+    | Annotated[Simulate, subcommand("simulate")]
+    | Annotated[EstimateCard, subcommand("estimate")]
+    | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[Export, subcommand("export")]
+    | Annotated[CheckGrad, subcommand("check-grad")]
+    | Annotated[Doctor, subcommand("doctor")]
 )
 
 
@@ -205,10 +208,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
-            command.run()
+            return command.run() or 0
     except BrokenPipeError:  # whoever read the output had enough
         sys.stdout = None
-    except (ValueError, OSError, ImportError) as error:
+    except (ValueError, TypeError, OSError, ImportError, RuntimeError) as error:
         print(f"r2s: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

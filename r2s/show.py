@@ -9,7 +9,6 @@ Needs matplotlib: pip install 'r2s[study]'; the video is an MP4 where OpenCV is 
 """
 
 import io
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Integer
 
+from r2s import movies
 from r2s.files import write_bytes
 from r2s.manifest import manifest_for, read_recording, read_recordings
 from r2s.recording import Recording, SheetPlacement, cloud, corner, load
@@ -130,7 +130,7 @@ def show(
     stem = recording.info.name.replace("/", "_")
     written = [contact_sheet(folder / f"{stem}.png", recording, cloth)]
     if video == "auto":
-        video = "mp4" if _has_opencv() else "gif"
+        video = "mp4" if movies.has_opencv() else "gif"
     if video != "none":
         write = write_mp4 if video == "mp4" else write_gif
         written.append(write(folder / f"{stem}.{video}", recording, cloth))
@@ -167,44 +167,12 @@ def contact_sheet(path: Path, recording: Recording, cloth: SimulatedCloth | None
 
 def write_gif(path: Path, recording: Recording, cloth: SimulatedCloth | None = None) -> Path:
     """Write all frames as a GIF, in real time up to 50 frames a second."""
-    from PIL import Image  # comes with matplotlib
-
-    images = [Image.fromarray(pixels) for pixels in _pictures(recording, cloth)]
-    # One palette for all, from the fullest picture: else colours flicker, and files are larger.
-    palette = images[len(images) // 2].quantize(64)
-    small = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    buffer = io.BytesIO()
-    # GIFs count in hundredths of a second: round the times, not the intervals, which would add up.
-    times = np.round(100 * _interval(recording) * np.arange(len(small) + 1))
-    duration = [max(20, 10 * int(step)) for step in np.diff(times)]  # [ms]
-    options = {"save_all": True, "append_images": small[1:], "loop": 0, "optimize": False}
-    small[0].save(buffer, format="GIF", duration=duration, **options)
-    write_bytes(path, buffer.getvalue())
-    return path
+    return movies.write_gif(path, _pictures(recording, cloth), _interval(recording))
 
 
 def write_mp4(path: Path, recording: Recording, cloth: SimulatedCloth | None = None) -> Path:
     """Write all frames as an MP4, in real time. Needs OpenCV: pip install 'r2s[camera]'."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise ImportError("an MP4 needs OpenCV: pip install 'r2s[camera]'; or ask for a GIF") from (
-            error
-        )
-    with tempfile.TemporaryDirectory(dir=path.parent) as place:
-        part = Path(place) / "video.mp4"
-        writer = None
-        for pixels in _pictures(recording, cloth):
-            if writer is None:
-                code, rate = cv2.VideoWriter.fourcc(*"mp4v"), 1 / _interval(recording)
-                writer = cv2.VideoWriter(str(part), code, rate, pixels.shape[1::-1])
-                if not writer.isOpened():
-                    raise OSError(f"{path}: OpenCV cannot write MP4 here: ask for a GIF")
-            writer.write(np.ascontiguousarray(pixels[..., ::-1]))
-        if writer is not None:
-            writer.release()
-        write_bytes(path, part.read_bytes())
-    return path
+    return movies.write_mp4(path, _pictures(recording, cloth), _interval(recording))
 
 
 def _pictures(recording: Recording, cloth: SimulatedCloth | None) -> Iterator[np.ndarray]:
@@ -422,11 +390,3 @@ def _legend(
         fontsize=7.5 if narrow else 9,
         **spacing,
     )
-
-
-def _has_opencv() -> bool:
-    try:
-        import cv2  # noqa: F401
-    except ImportError:
-        return False
-    return True

@@ -89,7 +89,7 @@ def test_limits_hold_the_cloth_but_not_what_strays():
     dots = generator.uniform(0, 1, (1000, 3))
     dots[:3] = 40.0
     vertices = np.array([[1.2, 0.5, 0.5], [0.5, -0.3, 0.5], [9.0, 9.0, 9.0], [np.nan, 0, 0]])
-    low, high = figures._limits(dots, vertices)
+    low, high = figures.limits(dots, vertices)
     assert 1.2 <= high[0] < 1.3 and -0.4 < low[1] <= -0.3
     assert high[2] < 1.1 and (high < 2).all()
 

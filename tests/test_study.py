@@ -1,6 +1,5 @@
-"""The study: pairs, what a figure means, and that nothing finished is made again."""
+"""The study: what a figure means, which cells there are, and that nothing is made twice."""
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -11,93 +10,148 @@ import numpy as np
 import pytest
 
 from r2s import presets, synthetic
+from r2s.estimators.estimate import without_deviations
 from r2s.recording import cloud
-from r2s.study import judge, pairs, run, tables
+from r2s.study import engine, estimates, judge, matrix, results, tables
+from r2s.study.cells import needs
+from r2s.study.estimates import Estimated, Trained
+from r2s.study.panel import MOTIONS, PAPER_COLUMNS, Column
+from r2s.study.truths import Made, Making, strain_dependent
 
 ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
-def pair():
-    fabric = presets.grey_interlock()
-    lift, fold = synthetic.lift, synthetic.fold
-    return pairs.Pair(
-        lift(fabric, "grey", 1, key=jr.key(0)),
-        fold(fabric, "grey", 1, key=jr.key(1)),
-        float(fabric.density),
-        fold(fabric, "grey", 2, key=jr.key(2)),
-        fabric,
-    )
+def fold():
+    return synthetic.fold(presets.grey_interlock(), "grey", 1, key=jr.key(1))
 
 
-def test_a_recording_is_at_no_distance_from_itself(pair):
-    found = judge.against_recording(pair.fold, pair.fold)
+def test_a_recording_is_at_no_distance_from_itself(fold):
+    found = judge.against_recording(fold, fold)
     assert all(value == 0 for value in found.values())
 
 
-def test_the_true_fabric_is_nearer_than_another_and_than_noise_allows(pair):
-    truth = judge.against_motion(pair.fold, judge.predict(pair.fold, presets.grey_interlock()))
-    other = judge.against_motion(pair.fold, judge.predict(pair.fold, presets.pink_solid()))
+def test_the_true_fabric_is_nearer_than_another_and_than_noise_allows(fold):
+    truth = judge.against_motion(fold, judge.predict(fold, presets.grey_interlock()))
+    other = judge.against_motion(fold, judge.predict(fold, presets.pink_solid()))
     # 1 mm of noise, sampling of the surface every 5 mm, one point in a hundred 0.2 m away
     assert truth["chamfer_real_to_sim"] < 0.007
     assert truth["chamfer_real_to_sim"] < other["chamfer_real_to_sim"]
     assert truth["hausdorff"] >= truth["chamfer"]
 
 
-def test_a_diverged_motion_is_a_result(pair):
-    shape = (len(pair.fold.times), 81, 3)
-    found = judge.against_motion(pair.fold, np.full(shape, np.nan))
-    whole = judge.against_recording(pair.fold, pair.fold)
+def test_a_diverged_motion_is_a_result(fold):
+    shape = (len(fold.times), 81, 3)
+    found = judge.against_motion(fold, np.full(shape, np.nan))
+    whole = judge.against_recording(fold, fold)
     assert found.keys() == whole.keys()
     assert all(np.isnan(value) for value in found.values())
 
 
-def test_the_cropped_distance_leaves_out_what_the_recording_cannot_show(pair):
-    x = judge.predict(pair.fold, presets.grey_interlock())
-    found = judge.against_motion(pair.fold, x)
+def test_the_cropped_distance_leaves_out_what_the_recording_cannot_show(fold):
+    x = judge.predict(fold, presets.grey_interlock())
+    found = judge.against_motion(fold, x)
     assert found["chamfer_sim_to_real_cropped"] < found["chamfer_sim_to_real"]
-    assert cloud(pair.fold, 20)[:, 2].min() > 0
+    assert cloud(fold, 20)[:, 2].min() > 0
 
 
-def test_an_estimate_is_made_once(pair, tmp_path, monkeypatch):
-    effort = run.Effort(run.Cost(coarse=2, starts=1, iterations=1))
-    with monkeypatch.context() as patch:
-        patch.setattr(run, "_approach", lambda effort: _fake)
-        judged, rows = run.run([pair], tmp_path, effort)
-    stored = json.loads((tmp_path / "estimates" / "lift_grey.json").read_text())
-    assert stored["parameters"]["warp"]["unit"] == "N/m"
+def test_the_columns_of_the_paper_are_part_of_all():
+    assert set(PAPER_COLUMNS) <= set(matrix.FULL)
+    assert len(set(matrix.FULL)) == len(matrix.FULL)
+    for cell in matrix.synthetic(matrix.PRESETS["small"]):
+        assert cell.scenario in MOTIONS
+        assert all(source.unseen for source in cell.recordings)
+
+
+def test_small_has_every_approach_both_solvers_two_fabrics_and_six_scenarios():
+    every = engine.closure(matrix.synthetic(matrix.SMALL))
+    estimated = [cell for cell in every if isinstance(cell, Estimated)]
+    assert {cell.approach for cell in estimated} == set(estimates.SOLVERS)
+    assert {cell.solver for cell in estimated} == {"cloth", "points"}
+    assert len({cell.fabric for cell in estimated}) >= 2
+    assert len({cell.scenario for cell in every if isinstance(cell, Made)}) == 6
+    networks = [need for cell in estimated for need in needs(cell) if isinstance(need, Trained)]
+    assert networks and all(network.scenario == "lifting" for network in networks)
+
+
+def test_what_is_judged_was_never_estimated_from():
+    plan = matrix.narrowed(matrix.SMALL, repeats=3, judged=3)
+    every = engine.closure(matrix.synthetic(plan))
+    made = [cell for cell in every if isinstance(cell, Made)]
+    assert len({cell.path(Path()) for cell in every}) == len(every)
+    motions = [cell._experiment().route.path.tobytes() for cell in made if cell.angle is None]
+    assert len(set(motions)) == len(motions) / len(plan.fabrics)  # all fabrics are moved alike
+
+
+def test_a_truth_has_the_stiffness_of_the_preset_at_rest_and_more_when_stretched():
+    preset, truth = presets.grey_interlock(), strain_dependent("grey_interlock", Making())
+    at_rest, stretched = (truth.membrane.at(jnp.array([e, 0.0, 0.0])) for e in (0.0, 0.3))
+    for name in ("c11", "c12", "c22", "c33"):
+        assert getattr(at_rest, name) == pytest.approx(float(getattr(preset.membrane, name)))
+        assert getattr(stretched, name) == pytest.approx(2 * float(getattr(preset.membrane, name)))
+    hinge = truth.bending.at(jnp.array(0.0), jnp.array(0.0))
+    assert float(hinge.stiffness) == pytest.approx(float(preset.bending.stiffness))
+    assert isinstance(strain_dependent("grey_interlock", Making(stiffening=0)), type(preset))
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """One column and fabric, whose estimate is the middle of the family, without work."""
+    made = []
+
+    def fake(cell, family, recordings, folder):
+        made.append(cell)
+        middle = jnp.full(family.dim, 0.5)
+        values = np.asarray(family.values(middle))
+        about = 1e-4, np.full((1, 1), 1e-4), values[None, None], 0.1
+        return without_deviations("fake", family, middle, *about)
+
+    monkeypatch.setitem(estimates._ESTIMATORS, "diffcloud", fake)
+    plan = matrix.Plan(
+        (Column("diffcloud", "cloth", "lifting"),),
+        ("grey_interlock",),
+        1,
+        1,
+        Making((5, 5), 1 / 15),
+    )
+    return matrix.synthetic(plan)[-1:], made
+
+
+def test_an_estimate_is_made_once_and_judged(tiny, tmp_path):
+    cells, made = tiny
+    assert engine.run(cells, tmp_path, engine.Serial()) == {}
+    rows = results.rows(cells, tmp_path)
+    assert {row.approach for row in rows} == {"diffcloud"} and {row.repeat for row in rows} == {"0"}
+    assert all(np.isfinite(row.value) and row.value > 0 for row in rows)
+    tables.write_rows(tmp_path / "results.csv", rows)
     assert tables.read_rows(tmp_path / "results.csv") == rows
-    baselines = {row.baseline for row in rows}
-    assert baselines == {"", "default", "repeatability"}  # one fabric, so no other
-
-    def refuse(effort):
-        raise AssertionError("made again")
-
-    monkeypatch.setattr(run, "_approach", refuse)
-    again, _ = run.run([pair], tmp_path, effort)
-    np.testing.assert_array_equal(again[0].estimate.values, judged[0].estimate.values)
-    with pytest.raises(AssertionError, match="made again"):
-        run.run([pair], tmp_path, run.Effort(run.Cost(coarse=3)))
+    engine.run(cells, tmp_path, engine.Serial())
+    assert len(made) == 1
+    (entry,) = results.parameters(cells, tmp_path)["cloth"]
+    assert entry[1][0].unit == "N/m" and not np.isfinite(entry[3]).any()
 
 
-def _fake(pair):
-    """An estimate without the work: the middle of the family."""
-    from r2s.estimators.estimate import without_deviations
-    from r2s.family import OrthotropicFamily
+def test_an_estimate_that_diverges_is_a_result(tiny, tmp_path, monkeypatch):
+    cells, _ = tiny
 
-    family = OrthotropicFamily.make(pair.density)
-    middle = jnp.full(family.dim, 0.5)
-    values = np.asarray(family.values(middle))
-    losses, history = np.full((1, 1), 1e-4), values[None, None]
-    return without_deviations("fake", family, middle, 1e-4, losses, history, 0.1)
+    def explode(cell, family, recordings, folder):
+        raise RuntimeError("every simulation diverged")
+
+    monkeypatch.setitem(estimates._ESTIMATORS, "diffcloud", explode)
+    assert engine.run(cells, tmp_path, engine.Serial()) == {}
+    assert all(np.isnan(row.value) for row in results.rows(cells, tmp_path))
+    assert results.parameters(cells, tmp_path) == {}
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("--data", "no-such-folder"), "no such folder"),
-        (("--data", "r2s"), "no lift with a fold"),
+        (("--data", "r2s"), "no recording"),
         (("--data", "r2s", "--density", "-1"), "must be positive"),
+        (("--fabrics", "silk"), "no preset 'silk'"),
+        (("--columns", "diffcp-cloth-wind"), "no column 'diffcp-cloth-wind'; there are diffcloud-"),
+        (("--judged", "0"), "judged must be at least 1"),
     ],
 )
 def test_a_wrong_call_says_what_is_wrong_and_writes_nothing(arguments, message, tmp_path):

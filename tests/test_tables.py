@@ -225,3 +225,49 @@ def test_html_escapes_and_parts():
         "tfoot": ["all", "3"],
     }
     assert "<c>" not in text and "x<y" not in text
+
+
+def test_latex_escapes_and_sets_numbers_to_the_right():
+    table = Table(("name_1", "[mm]"), (("a & b", "1.5"), ("50 %\n", "-"), ("all", "x")), "C^2 ±", 1)
+    assert tables.latex(table).splitlines() == [
+        r"\begin{table}",
+        r"\centering",
+        r"\caption{C\textasciicircum{}2 $\pm$}",
+        r"\begin{tabular}{lr}",
+        r"\toprule",
+        r"name\_1 & {[}mm] \\",
+        r"\midrule",
+        r"a \& b & 1.5 \\",
+        r"50 \% & - \\",
+        r"\midrule",
+        r"all & x \\",
+        r"\bottomrule",
+        r"\end{tabular}",
+        r"\end{table}",
+    ]
+
+
+LATEX_COMMANDS = (
+    r"\textbackslash{}", r"\textasciitilde{}", r"\textasciicircum{}", r"\textless{}",
+    r"\textgreater{}", r"\textbar{}", r"$\pm$", r"$\times$", r"$^2$", "{[}",
+    *("\\" + c for c in "&%$#_{}"),
+)  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None)
+@given(text=st.text(max_size=8) | st.text('\\{}&%$#_~^<>|[]"±² \n', max_size=8))
+def test_latex_has_no_character_that_means_something(text):
+    line = tables.latex(Table((text,), (), "")).splitlines()[5]
+    assert line.endswith(r" \\") and len(line.splitlines()) == 1
+    line = line.removesuffix(r" \\")
+    for command in LATEX_COMMANDS:
+        line = line.replace(command, "")
+    assert not set(line) & set("\\{}&%$#_~^")
+
+
+def test_a_table_is_published_three_ways(tmp_path):
+    assert tables.publish(tmp_path / "new", "name", AWKWARD) is AWKWARD
+    assert sorted(p.name for p in (tmp_path / "new").iterdir()) == [
+        "name.csv", "name.md", "name.tex"
+    ]  # fmt: skip
+    assert (tmp_path / "new" / "name.md").read_text() == tables.markdown(AWKWARD)

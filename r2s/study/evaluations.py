@@ -97,7 +97,7 @@ class Judged(Cell):
             for source, x in zip(self.recordings, motions, strict=True)
             if not np.isfinite(x).all()
         ]
-        return {"diverged": diverged}
+        return {"diverged": diverged, "runs": len(recordings)}
 
     def _fabric(self, folder: Path) -> Fabric | None:
         if self.estimate is None:

@@ -26,6 +26,9 @@ except ImportError as error:
 # Okabe and Ito's colours, which the colour-blind can tell apart.
 BLUE, ORANGE, SKY, VERMILION, GREY = "#0072B2", "#E69F00", "#56B4E9", "#D55E00", "#8c8c8c"
 BAR_COLOURS = (BLUE, ORANGE, SKY, GREY, VERMILION)
+# One a column of the study, which keeps its own in every picture: Okabe and Ito's, and then darker.
+LABEL_COLOURS = (BLUE, ORANGE, "#009E73", VERMILION, SKY, "#CC79A7", "#B8A800", "#5D3A9B",
+                 "#994F00", "#006CD1", "#40B0A6", GREY)  # fmt: skip
 MOST_DOTS = 1500  # a panel; more would hide the cloth
 
 
@@ -48,8 +51,8 @@ def overlay(
     cloths, count = [np.asarray(before), np.asarray(after)], len(times)
     if len(clouds) != count:
         raise ValueError(f"expected one cloud per frame, found {len(clouds)} for {count}")
-    dots = [_thin(np.asarray(cloud)) for cloud in clouds]
-    box = _limits(np.concatenate(dots), np.concatenate(cloths).reshape(-1, 3))
+    dots = [thin(np.asarray(cloud)) for cloud in clouds]
+    box = limits(np.concatenate(dots), np.concatenate(cloths).reshape(-1, 3))
     figure = Figure(figsize=(3.1 * count, 6.2))
     figure.subplots_adjust(left=0.02, right=0.98, bottom=0.03, top=0.91, wspace=0.1, hspace=0.1)
     view = {"projection": "3d", "elev": 15, "azim": -60}
@@ -61,7 +64,7 @@ def overlay(
     for height, text in ((0.7, "before: default fabric"), (0.25, "after: estimate")):
         figure.text(0.006, height, text, rotation=90, va="center", fontsize=12)
     figure.suptitle(title, fontsize=13)
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def traces(
@@ -94,7 +97,7 @@ def traces(
         axes.set_xlabel("iteration")
         axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
     _legend(figure, panels)
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def loss_lines(
@@ -131,7 +134,7 @@ def loss_lines(
             axes.axvline(value, color=VERMILION, linestyle="--", label="truth")
     figure.supylabel("rms distance [mm]", fontsize=10)
     _legend(figure, panels)
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def bars(
@@ -162,37 +165,40 @@ def bars(
     axes.set(ylabel=ylabel, title=title, axisbelow=True)
     axes.grid(axis="y", alpha=0.3)
     _legend(figure, [axes])
-    return _save(figure, path)
+    return save(figure, path)
 
 
-def _save(figure: Figure, path: Path | str) -> Path:
+def save(figure: Figure, path: Path | str) -> Path:
+    """Write a figure as PNG, whole or not at all."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     write_bytes(path, buffer.getvalue())
     return Path(path)
 
 
-def _thin(cloud: np.ndarray) -> np.ndarray:
+def thin(cloud: np.ndarray) -> np.ndarray:
+    """At most MOST_DOTS finite points of a cloud, chosen at random, always the same."""
     return np.random.default_rng(0).permutation(cloud[np.isfinite(cloud).all(axis=1)])[:MOST_DOTS]
 
 
-def _inside(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> Any:
-    return ((points >= low) & (points <= high)).all(axis=1)  # False where a point is not finite
+def inside(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> Any:
+    """Which points lie in a box; not those that are not finite."""
+    return ((points >= low) & (points <= high)).all(axis=1)
 
 
-def _limits(dots: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def limits(dots: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The corners [m] of the box around the cloths and most of the dots."""
     low, high = np.percentile(dots, [1, 99], axis=0)
     # A cloth may be out of the cloud by half of its width; what is beyond flew off.
     reach = max(0.5 * float((high - low).max()), 0.05)
-    near = vertices[_inside(vertices, low - reach, high + reach)]
+    near = vertices[inside(vertices, low - reach, high + reach)]
     low, high = np.min([low, *near], axis=0), np.max([high, *near], axis=0)
     return low - 0.04 * reach - 1e-3, high + 0.04 * reach + 1e-3
 
 
 def _draw(axes: Any, dots: Any, cloth: Any, faces: Any, low: Any, high: Any) -> None:
     # Three-dimensional axes do not clip: what lies outside would run over the other panels.
-    dots, shown = dots[_inside(dots, low, high)], faces[_inside(cloth, low, high)[faces].all(1)]
+    dots, shown = dots[inside(dots, low, high)], faces[inside(cloth, low, high)[faces].all(1)]
     axes.computed_zorder = False  # the dots lie over the cloth, whatever their depth
     colours: dict[str, Any] = {"facecolor": to_rgba(BLUE, 0.2), "edgecolor": to_rgba(BLUE, 0.6)}
     axes.add_collection3d(Poly3DCollection(cloth[shown], linewidth=0.3, **colours))

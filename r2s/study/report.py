@@ -61,12 +61,16 @@ for (const head of document.querySelectorAll("table.sortable thead th")) {
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report: paragraphs, then tables, then pictures (a PNG file and its caption)."""
+    """A part of a report: paragraphs, then tables, then pictures (a PNG file and its caption).
+
+    `html`, last, is put in as it is: a fragment that is trusted, such as `r2s.study.viewer`'s.
+    """
 
     heading: str
     paragraphs: tuple[str, ...] = ()
     tables: tuple[Table, ...] = ()
     figures: tuple[tuple[Path, str], ...] = ()
+    html: str = ""
 
 
 def write_report(
@@ -79,7 +83,7 @@ def write_report(
     """Write a report as one HTML file, which needs no other file and no network.
 
     `intro`: paragraphs of plain text, apart by empty lines; `settings`: what the study was run
-    with, shown as a table unless empty. All text is escaped: none is read as HTML. Raises
+    with, shown as a table unless empty. All text but `Section.html` is escaped. Raises
     FileNotFoundError that names a figure that is missing, ValueError that names one that is no
     PNG, and OSError that names `path`; then nothing is written.
     """
@@ -99,7 +103,8 @@ def _section(section: Section) -> str:
     shown = "".join(f'<div class="wide">\n{tables.html(t)}</div>\n' for t in section.tables)
     pictures = "".join(_figure(Path(path), caption) for path, caption in section.figures)
     heading = f"<h2>{escape(section.heading)}</h2>\n"
-    return f"<section>\n{heading}{_paragraphs(section.paragraphs)}{shown}{pictures}</section>\n"
+    body = f"{_paragraphs(section.paragraphs)}{shown}{pictures}{section.html}"
+    return f"<section>\n{heading}{body}</section>\n"
 
 
 def _paragraphs(paragraphs: Iterable[str]) -> str:

@@ -1,5 +1,6 @@
 """What the cells of a study found, as rows, parameters and costs."""
 
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
@@ -18,9 +19,9 @@ from r2s.study.cells import Cell, about, opened
 from r2s.study.engine import closure
 from r2s.study.estimates import ESTIMATE, Estimated, family_of, read_estimate
 from r2s.study.evaluations import Judged, read_measured, read_motion
-from r2s.study.matrix import Plan
+from r2s.study.matrix import Plan, synthetic
 from r2s.study.shown import Shown
-from r2s.study.tables import Row, write_rows
+from r2s.study.tables import Row, Table, significant, write_rows
 from r2s.study.truths import Made, Source, read, small_strain
 
 Entry = tuple[str, tuple[Range, ...], Any, Any, Any, Any]
@@ -170,7 +171,8 @@ def shown(cells: Iterable[Judged], folder: Path) -> list[Shown]:
 
 
 def costs(cells: Iterable[Judged], folder: Path) -> list[dict[str, Any]]:
-    """CPU seconds (compilation included), their number and peak memory [MB] of cells alike."""
+    """Of cells alike: their number, CPU seconds (compilation included) in all and the median of
+    each (of each recording, where one judges several), and peak memory [MB]."""
     groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for cell in closure(cells):
         if cell.is_made(folder):
@@ -180,11 +182,39 @@ def costs(cells: Iterable[Judged], folder: Path) -> list[dict[str, Any]]:
             "kind": alike,
             "count": len(found),
             "seconds": float(np.sum([a["cpu_seconds"] for a in found])),
-            "each": float(np.median([a["cpu_seconds"] for a in found])),
+            "each": float(np.median([a["cpu_seconds"] / a.get("runs", 1) for a in found])),
             "peak_memory_MB": float(np.max([a["peak_memory_MB"] for a in found])),
         }
         for alike, found in groups.items()
     ]
+
+
+def forecast(costs: Sequence[dict[str, Any]], plan: Plan, cores: Sequence[int] = (2, 16)) -> Table:
+    """What another study of synthetic recordings would take, from the costs of one that was made.
+
+    CPU seconds of cells alike, the median of those made (compilation is in the first of each alone,
+    so not in the median of many); a cell that judges is counted by its recordings. Cells that none
+    made is like are said to be not measured, and left out of the sum.
+    """
+    of_kind = {cost["kind"]: cost["each"] for cost in costs}
+    groups: dict[str, float] = defaultdict(float)
+    for cell in closure(synthetic(plan)):
+        groups[cell.alike] += len(cell.recordings) if isinstance(cell, Judged) else 1
+    lines, total = [], 0.0
+    for alike, count in groups.items():
+        each = of_kind.get(alike)
+        hours = math.nan if each is None else each * count / 3600
+        total += 0.0 if each is None else hours
+        known = each is not None
+        shown = significant(each) if known else "not measured"
+        lines.append((alike, f"{count:.0f}", shown, significant(hours) if known else "-"))
+    on = ", ".join(f"{significant(total / n)} hours on {n} cores" for n in cores)
+    return Table(
+        header=("cells", "number", "CPU seconds each", "CPU hours"),
+        rows=(*lines, ("measured in all", "", "", significant(total))),
+        caption=f"What it would take: {on}, if all cores are busy",
+        foot=1,
+    )
 
 
 def missing(failed: dict[Cell, str]) -> list[tuple[str, str]]:

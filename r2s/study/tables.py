@@ -186,6 +186,36 @@ def csv_text(table: Table) -> str:
     return _csv([table.header, *table.rows])
 
 
+def latex(table: Table) -> str:
+    r"""The table as a LaTeX `table`, which needs \\usepackage{booktabs}; all text is escaped.
+
+    Columns whose cells are numbers, but for the lines at the foot, are set to the right.
+    """
+    end = len(table.rows) - table.foot
+    bodies = [row for row in table.rows[:end]] or list(table.rows)
+    sides = "".join(
+        "r" if bodies and all(_is_number(row[i]) for row in bodies) else "l"
+        for i in range(len(table.header))
+    )
+    line = lambda cells: " & ".join(map(_latex_text, cells)) + r" \\" + "\n"
+    foot = "\\midrule\n" + "".join(map(line, table.rows[end:])) if table.foot else ""
+    return (
+        "\\begin{table}\n\\centering\n"
+        f"\\caption{{{_latex_text(table.caption)}}}\n\\begin{{tabular}}{{{sides}}}\n\\toprule\n"
+        f"{line(table.header)}\\midrule\n{''.join(map(line, table.rows[:end]))}{foot}"
+        "\\bottomrule\n\\end{tabular}\n\\end{table}\n"
+    )
+
+
+def publish(folder: Path | str, name: str, table: Table) -> Table:
+    """Write a table as `name`.csv, .md and .tex into a folder, which is made; returns it."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for ending, text in (("csv", csv_text), ("md", markdown), ("tex", latex)):
+        write_text(folder / f"{name}.{ending}", text(table))
+    return table
+
+
 def html(table: Table) -> str:
     """The table as an HTML fragment of class "sortable", which the script of a report sorts."""
 
@@ -202,6 +232,19 @@ def html(table: Table) -> str:
         f"<thead><tr>{head}</tr></thead>\n<tbody>\n{lines(table.rows[:end])}</tbody>\n"
         f"<tfoot>\n{lines(table.rows[end:])}</tfoot>\n</table>\n"
     )
+
+
+LATEX = {
+    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}",
+    '"': "''", "±": r"$\pm$", "×": r"$\times$", "²": r"$^2$",
+    "[": "{[}",  # at the start of a line it would be an option of the line before
+    **{character: "\\" + character for character in "&%$#_"},
+}  # fmt: skip
+
+
+def _latex_text(text: str) -> str:
+    return "".join(LATEX.get(character, character) for character in " ".join(text.split()))
 
 
 def _csv(lines: Iterable[Iterable[str]]) -> str:

@@ -1,0 +1,55 @@
+"""Where should a gripper go, so that the free corner of a cloth ends where it is wanted?
+
+    python examples/optimise_policy.py
+
+The path is a few knots, which optax moves down the exact gradient of the motion.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+
+import r2s
+from r2s import presets
+from r2s.physics.air import Air
+from r2s.physics.contact import Table
+
+STEPS, KNOTS = 24, 4
+TARGET = jnp.array([0.10, 0.10, 0.05])  # [m]
+sheet = r2s.rectangle((0.2, 0.2), (5, 5))  # [m]
+scene = r2s.Scene(sheet, jnp.array([0]), Table.make(0.0), Air.make())  # vertex 0 is held
+solver = r2s.Cloth(scene, dt=0.025)  # [s]
+start = jnp.pad(sheet.rest, ((0, 0), (0, 1)), constant_values=0.001)
+
+
+def final(knots):
+    """Positions [m] after the held corner went along knots (knot, 3) [m], linear between them."""
+    times = jnp.arange(1, STEPS + 1) / STEPS
+    at = jnp.linspace(0, 1, KNOTS + 1)
+    way = jnp.concatenate([start[:1], start[:1] + knots])
+    handles = jax.vmap(lambda axis: jnp.interp(times, at, axis), in_axes=1, out_axes=1)(way)
+    controls = r2s.Control(handles[:, None, None], jnp.zeros((STEPS, 1, 3)))
+    return r2s.simulate(solver, presets.black_denim(), solver.init(start), controls).x[-1]
+
+
+def loss(knots):
+    """Squared distance [m^2] of the opposite corner from the target."""
+    return jnp.sum((final(knots)[-1] - TARGET) ** 2)
+
+
+@eqx.filter_jit
+def improve(knots, state):
+    value, slope = jax.value_and_grad(loss)(knots)
+    change, state = optimiser.update(slope, state)
+    return optax.apply_updates(knots, change), state, value
+
+
+optimiser = optax.adam(0.01)
+if __name__ == "__main__":
+    knots = jnp.linspace(0, 1, KNOTS + 1)[1:, None] * jnp.array([0.0, 0.0, 0.1])
+    state = optimiser.init(knots)
+    for i in range(40):
+        knots, state, value = improve(knots, state)
+        if i % 5 == 0 or i == 39:
+            print(f"{i:3d}  the corner is {1e3 * value**0.5:6.1f} mm from where it should be")

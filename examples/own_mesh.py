@@ -1,0 +1,56 @@
+"""A mesh of one's own: a disc from an OBJ file, held in the middle, as in a drape test.
+
+    python examples/own_mesh.py [sheet.obj]
+
+Any flat triangle mesh will do: no grid is needed. `r2s doctor --mesh sheet.obj` checks a file.
+Needs trimesh: pip install 'r2s[study]'
+"""
+
+import sys
+import tempfile
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+
+import r2s
+from r2s import presets
+from r2s.physics.air import Air
+from r2s.physics.contact import Table
+
+
+def write_disc(path: Path, radius: float = 0.15, rings: int = 5) -> None:
+    """A disc [m] of rings of six more triangles each, from its middle."""
+    points, faces = [np.zeros((1, 2))], []
+    for ring in range(1, rings + 1):
+        angle = np.arange(6 * ring) * np.pi / (3 * ring)
+        points.append(ring / rings * radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+        inner, outer = 1 + 3 * ring * (ring - 1) - 6 * (ring - 1), 1 + 3 * ring * (ring - 1)
+        for i in range(6 * ring):
+            side, place = divmod(i, ring)
+            near = lambda k, r=ring, a=inner: 0 if r == 1 else a + k % (6 * (r - 1))
+            here, there = outer + i, outer + (i + 1) % (6 * ring)
+            faces.append((near(side * (ring - 1) + place), here, there))
+            if place:
+                back = near(side * (ring - 1) + place - 1)
+                faces.append((back, here, near(side * (ring - 1) + place)))
+    flat = np.pad(np.concatenate(points), ((0, 0), (0, 1)))
+    trimesh.Trimesh(flat, faces, process=False).export(path)
+
+
+if __name__ == "__main__":
+    if not sys.argv[1:]:
+        write_disc(file := Path(tempfile.mkdtemp()) / "disc.obj")
+    loaded = trimesh.load(sys.argv[1] if sys.argv[1:] else file, process=False, force="mesh")
+    sheet = r2s.Mesh.make(np.asarray(loaded.vertices)[:, :2], np.asarray(loaded.faces))
+    middle = jnp.asarray(np.flatnonzero(np.linalg.norm(sheet.rest, axis=1) < 0.07))
+    solver = r2s.Cloth(r2s.Scene(sheet, middle, Table.make(-jnp.inf), Air.make()), dt=0.02)
+    start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
+    handles = jnp.broadcast_to(start[middle], (1, 75, len(middle), 3))
+    controls = r2s.Control(handles, jnp.zeros((1, 75, 3)))
+    moved = eqx.filter_jit(r2s.simulate)(
+        solver, presets.black_denim(), solver.init(start), controls
+    )
+    print(f"{len(sheet.rest)} vertices; the edge hangs {-1e3 * moved.x[-1, :, 2].min():.1f} mm low")

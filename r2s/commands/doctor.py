@@ -1,0 +1,202 @@
+"""`r2s doctor`: is what is installed, and what a card and a scenario say, sound?"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import arg
+
+from r2s.commands.common import ScenarioName
+
+if TYPE_CHECKING:
+    from r2s.fabric import Fabric
+
+EXCLUDED = {"0.10.2": "wrong numbers from a jitted vmap on the CPU", "0.11.1": "no flax"}
+EXTRAS = {
+    "study": ("matplotlib", "tqdm", "trimesh"),
+    "pcd": ("pypcd4",),
+    "camera": ("cv2",),
+    "data": ("pooch",),
+    "cli": ("tyro",),
+    "physnet": ("skopt",),
+    "cma": ("cma",),
+    "bench": ("mujoco", "newton", "warp", "taichi"),
+}
+PACKAGES = ("r2s", "jax", "jaxlib", "equinox", "optax", "optimistix", "lineax", "numpy")
+PLAUSIBLE = {  # of fabrics for clothes and the household
+    "density": (0.05, 1.0, "kg/m^2", "an areal density: a T-shirt has 0.15, denim 0.4"),
+    "damping": (0.0, 0.1, "s", "a time"),
+    "friction": (0.05, 1.5, "-", "Coulomb's coefficient"),
+    "thickness": (1e-4, 5e-3, "m", "of the sheet"),
+    "mass_damping": (0.0, 20.0, "1/s", "a rate"),
+}
+STIFF = (1.0, 1e5, "N/m", "a force per width: a modulus in Pa times the thickness in m")
+BENDS = (1e-8, 1e-2, "N m", "a moment per curvature and width: 1 mN mm is 1e-6 N m")
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Look at the installation; with a card, a mesh or a scenario, also at those.
+
+    Says versions, devices, precision and which extras there are; whether the numbers of a fabric
+    are plausible in their units; whether a mesh is sound; and which time step and how much memory a
+    scenario will take. Exit code 1 when something is wrong.
+
+        r2s doctor
+        r2s doctor --fabric mine.json --scenario folding --shape 17 17
+    """
+
+    fabric: Annotated[str, arg(metavar="PRESET|CARD")] = ""
+    """A preset of `r2s.presets`, or the file of a fabric card."""
+    mesh: Annotated[Path | None, arg(metavar="FILE")] = None
+    """A flat triangle mesh in metres, as OBJ, PLY or STL."""
+    scenario: Annotated[ScenarioName | None, arg(metavar="SCENARIO")] = None
+    """Of the study."""
+    motion: Annotated[tuple[str, ...], arg(metavar="NAME=NUMBER")] = ()
+    """Numbers of the motion, such as height=0.3 [m]."""
+    shape: tuple[int, int] = (9, 9)
+    """Vertices along warp and weft."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        from r2s.commands.common import card_of, tell
+
+        told, lines, wrong = installation()
+        if self.fabric:
+            card = card_of(self.fabric)
+            found = list(implausible(card.fabric))
+            wrong += [f"{card.name}: {text}" for text in found]
+            lines.append(f"fabric {card.name}: {'see below' if found else 'plausible'}")
+            told["fabric"] = {"name": card.name, "implausible": found}
+        if self.mesh is not None:
+            told["mesh"], text = _mesh(self.mesh)
+            lines.append(text)
+        if self.scenario is not None:
+            told["scenario"], more = self._scenario()
+            lines += more
+        told["wrong"] = wrong
+        tell(self.json, told, [*lines, *(f"WRONG: {text}" for text in wrong)])
+        return 1 if wrong else 0
+
+    def _scenario(self) -> tuple[dict[str, Any], list[str]]:
+        import jax
+        import jax.numpy as jnp
+
+        from r2s.commands.common import card_of, experiment_of
+        from r2s.scenario import motion
+        from r2s.scenarios import material_points
+        from r2s.solver import predicted_memory
+
+        fabric = card_of(self.fabric or "grey_interlock").fabric
+        scenario = experiment_of(str(self.scenario), self.motion).scenario(self.shape)
+        points = material_points(scenario, fabric)
+        loss = lambda fabric: jnp.mean(motion(scenario, fabric).x ** 2)
+        gradient = jax.value_and_grad(loss)
+        memory = [predicted_memory(each, fabric) for each in (loss, gradient)]
+        step = scenario.interval / scenario.substeps
+        told = {
+            "frames": scenario.num_frames + scenario.lead_in,
+            "step_s": step,
+            "steps": (scenario.num_frames + scenario.lead_in - 1) * scenario.substeps,
+            "points_step_s": points.dt,
+            "memory_bytes": memory[0],
+            "gradient_memory_bytes": memory[1],
+        }
+        return told, [
+            f"scenario {self.scenario}: {told['steps']} steps of {1e3 * step:.1f} ms, "
+            f"{memory[0] / 1e6:.1f} MB, with its gradient {memory[1] / 1e6:.1f} MB",
+            f"    on material points: steps of {1e3 * points.dt:.3f} ms",
+        ]
+
+
+def installation() -> tuple[dict[str, Any], list[str], list[str]]:
+    """What is installed: as data, in lines, and what is wrong with it."""
+    import importlib.util
+    import platform
+    from importlib import metadata
+
+    import jax
+
+    versions = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    missing = {
+        extra: [name for name in modules if importlib.util.find_spec(name) is None]
+        for extra, modules in EXTRAS.items()
+    }
+    devices = [f"{each.platform} {each.device_kind}" for each in jax.devices()]
+    x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
+    lines = [", ".join(f"{name} {version}" for name, version in versions.items())]
+    lines.append(f"devices: {', '.join(devices)}; {'double' if x64 else 'single'} precision")
+    for extra, lacking in missing.items():
+        state = f"lacks {', '.join(lacking)}: pip install 'r2s[{extra}]'" if lacking else "there"
+        lines.append(f"extra {extra}: {state}")
+    wrong = []
+    if jax.__version__ in EXCLUDED:
+        wrong.append(f"jax {jax.__version__} ({EXCLUDED[jax.__version__]}): install another one")
+    told = {"versions": versions, "devices": devices, "x64": x64, "missing": missing}
+    return told, lines, wrong
+
+
+def implausible(fabric: "Fabric") -> Iterator[str]:
+    """What numbers of a fabric are hardly in their units, one line each."""
+    import numpy as np
+
+    from r2s.export.stiffness import bending_stiffness, membrane_stiffness
+
+    for name, (low, high, unit, what) in PLAUSIBLE.items():
+        value = float(getattr(fabric, name))
+        if not low <= value <= high:
+            yield f"{name} is {value:g} {unit}, expected {low:g} to {high:g} ({what})"
+    matrix = membrane_stiffness(fabric)
+    low, high, unit, what = STIFF
+    for name, value in zip(("C11", "C22", "C33"), np.diag(matrix).tolist(), strict=True):
+        if not low <= value <= high:
+            yield f"{name} is {value:g} {unit}, expected {low:g} to {high:g} ({what})"
+    if not np.all(np.linalg.eigvalsh(matrix) > 0):
+        yield "the membrane has a negative stiffness: C12^2 must be less than C11 C22"
+    low, high, unit, what = BENDS
+    for name, value in bending_stiffness(fabric).items():
+        if value and not low <= value <= high:
+            yield f"bending ({name}) is {value:g} {unit}, expected {low:g} to {high:g} ({what})"
+            break
+
+
+def _mesh(path: Path) -> tuple[dict[str, Any], str]:
+    import numpy as np
+
+    from r2s.mesh import Mesh
+
+    try:
+        import trimesh
+    except ImportError as error:
+        raise ImportError("mesh files need trimesh: pip install 'r2s[study]'") from error
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such mesh")
+    loaded: Any = trimesh.load(path, process=False, force="mesh")
+    places, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
+    spread = np.ptp(places, axis=0)
+    flat = int(np.argmin(spread))
+    if spread[flat] > 1e-6 * spread.max():
+        raise ValueError(f"{path}: a rest shape must lie in a plane, it extends over {spread} m")
+    try:
+        mesh = Mesh.make(np.delete(places, flat, axis=1), faces)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    corners = np.asarray(mesh.rest)[np.asarray(mesh.faces)]
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
+    told = {
+        "vertices": len(places),
+        "faces": len(faces),
+        "area_m2": float(np.sum(np.asarray(mesh.area))),
+        "shortest_edge_m": float(edges.min()),
+        "longest_edge_m": float(edges.max()),
+    }
+    size = f"{told['vertices']} vertices, {told['faces']} faces, {told['area_m2']:.4g} m^2"
+    edge = f"edges {1e3 * edges.min():.2f} to {1e3 * edges.max():.2f} mm"
+    return told, f"mesh {path.name}: sound; {size}, {edge}"

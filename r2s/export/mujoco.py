@@ -1,0 +1,206 @@
+"""A fabric as a flex of MuJoCo (4.0), in MJCF.
+
+MuJoCo's 2-D flex is a solid plate of Young's modulus E [Pa], Poisson's ratio nu in [0, 0.5) and
+thickness h [m]: a St. Venant-Kirchhoff membrane in plane stress, of stiffness E h, on the same mesh
+that of r2s to rounding; and hinges with the bending stiffness E h^3 / (12 (1 - nu^2)), which know
+no Poisson's ratio. Both stiffnesses together fix E and h (`r2s.physics.solid.plate_solid`): h is
+not the fabric's thickness, which is the `radius` of its contacts. `damping` is a Kelvin-Voigt time
+[s], as in r2s.
+
+`flexcomp` is the short form: isotropic, all vertices of one mass. `mjcf` is a whole model with a
+body for each vertex: masses of their areas, held vertices tied to mocap bodies, and springs along
+the yarns (spatial tendons) that make it orthotropic.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from r2s.export import stiffness
+from r2s.export.stiffness import Loss, Stiffness
+from r2s.export.yarns import split, springs, together
+from r2s.fabric import Fabric
+from r2s.mesh import Mesh
+from r2s.physics.solid import plate_solid
+from r2s.units import GRAVITY
+
+POISSON = (0.0, 0.499)
+MASSES = "all vertices get the same mass"
+RIGID = "mass damping: `r2s.export.mujoco.brake` sets it in the finished model"
+AXES = ("1 0 0", "0 1 0", "0 0 1")
+LARGE = "at large strains the springs along the yarns are linear in length, not in Green strain"
+
+
+class Elasticity(NamedTuple):
+    """The attributes of `<elasticity>`: E [Pa], nu [-], h [m], time [s], which parts there are."""
+
+    young: float
+    poisson: float
+    thickness: float
+    damping: float
+    elastic2d: str
+
+
+def elasticity(fabric: Fabric, modulus: float, poisson: float) -> Elasticity:
+    """Of a sheet of E h [N/m] and Poisson's ratio [-], with a fabric's bending and damping."""
+    near, bending = stiffness.isotropic(modulus, poisson), stiffness.mean_bending(fabric)
+    damping = float(fabric.damping)
+    if not bending:
+        thickness = float(fabric.thickness)
+        return Elasticity(modulus / thickness, poisson, thickness, damping, "stretch")
+    young, _, thickness = plate_solid(near[0, 0], near[0, 1], bending)
+    return Elasticity(float(young), poisson, float(thickness), damping, "both")
+
+
+def flexcomp(
+    fabric: Fabric, mesh: Mesh, *, name: str = "cloth", held: tuple[int, ...] = ()
+) -> tuple[str, Loss]:
+    """The `<flexcomp>` of a sheet, flat at z = 0 in its parent body, and what is lost.
+
+    Of the nearest isotropic sheet, on r2s's mesh; `held` vertices belong to the parent. Raises
+    `ValueError` for a batch, and for a membrane without positive stiffness.
+    """
+    stiffness.one(fabric)
+    own = stiffness.membrane_stiffness(fabric)
+    sheet = stiffness.nearest_isotropic(own, POISSON)
+    mass = float(fabric.density) * float(np.sum(np.asarray(mesh.area, np.float64)))
+    pin = f'\n  <pin id="{_numbers(np.array(held))}"/>' if held else ""
+    text = f"""<flexcomp name="{name}" type="direct" dim="2" dof="full" mass="{mass!r}"
+    radius="{float(fabric.thickness)!r}"
+    point="{_numbers(_flat(mesh))}"
+    element="{_numbers(np.asarray(mesh.faces))}">
+  {_contact(fabric)}
+  {_elasticity(elasticity(fabric, *sheet))}{pin}
+</flexcomp>"""
+    lost = (MASSES, RIGID) if float(fabric.mass_damping) else (MASSES,)
+    return text, _loss(fabric, mesh, own, stiffness.isotropic(*sheet), lost)
+
+
+def mjcf(
+    fabric: Fabric,
+    mesh: Mesh,
+    *,
+    held: tuple[int, ...] = (),
+    height: float = 0.0,
+    table: float | None = 0.0,
+    yarns: bool = True,
+    timestep: float = 5e-4,
+    integrator: str = "discrete",
+) -> tuple[str, Loss]:
+    """A whole model, and what is lost: a sheet, horizontal at a `height` [m], over a table.
+
+    - `held`: vertices that are tied to mocap bodies, in this order: move `mjData.mocap_pos`.
+    - `table`: z of its surface [m]; None: there is none.
+    - `yarns`: springs along warp and weft, for a mesh such as `r2s.rectangle`; without, the nearest
+      isotropic sheet.
+    - `timestep` [s]; `integrator`: of MuJoCo.
+
+    Vertex i is the body "v<i>" and number i of the flex "cloth". Raises as `flexcomp`, and
+    `ValueError` for a mesh that has no yarns.
+    """
+    stiffness.one(fabric)
+    own = stiffness.membrane_stiffness(fabric)
+    tendons, lost = "", ()
+    if yarns:
+        parts = split(own, POISSON, negative=False)
+        near, sheet, lost = together(parts), parts[:2], (LARGE,)
+        tendons = _tendons(mesh, parts.warp, parts.weft, float(fabric.damping))
+    else:
+        sheet = stiffness.nearest_isotropic(own, POISSON)
+        near = stiffness.isotropic(*sheet)
+    lost += (RIGID,) if float(fabric.mass_damping) else ()
+    friction = f"{float(fabric.friction)!r} 0.005 0.0001"
+    plane = (
+        f'<geom type="plane" size="0 0 1" pos="0 0 {table!r}" friction="{friction}"/>'
+        if table is not None
+        else ""
+    )
+    names = " ".join(f"v{i}" for i in range(len(mesh.rest)))
+    text = f"""<mujoco>
+  <option timestep="{timestep!r}" gravity="0 0 {-GRAVITY}" integrator="{integrator}"/>
+  <size memory="1G"/>
+  <worldbody>
+    {plane}
+{_bodies(fabric, mesh, held, height)}
+  </worldbody>
+  <deformable>
+    <flex name="cloth" dim="2" radius="{float(fabric.thickness)!r}" body="{names}"
+        element="{_numbers(np.asarray(mesh.faces))}">
+      {_contact(fabric)}
+      {_elasticity(elasticity(fabric, *sheet))}
+    </flex>
+  </deformable>
+{tendons}{_grips(held, timestep)}</mujoco>
+"""
+    return text, _loss(fabric, mesh, own, near, lost)
+
+
+def brake(model: Any, fabric: Fabric) -> None:
+    """Set the mass damping [1/s] of a model of MuJoCo in which all that moves is this fabric.
+
+    MJCF knows no damping of a flex's joints; the engine does.
+    """
+    mass = np.asarray(model.body_mass)[np.asarray(model.dof_bodyid)]
+    model.dof_damping[:] = float(fabric.mass_damping) * mass
+
+
+def _bodies(fabric: Fabric, mesh: Mesh, held: tuple[int, ...], height: float) -> str:
+    """A mocap body for each held vertex, in their order, and a body for each vertex."""
+    mass = float(fabric.density) * np.asarray(mesh.vertex_area, np.float64)
+    places = _flat(mesh) + [0.0, 0.0, height]
+    lines = [f'    <body name="h{i}" pos="{_numbers(places[i])}" mocap="true"/>' for i in held]
+    for i in range(len(places)):
+        joints = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in AXES)
+        tiny = _numbers(np.full(3, 1e-6 * mass[i]))
+        inertial = f'<inertial pos="0 0 0" mass="{float(mass[i])!r}" diaginertia="{tiny}"/>'
+        opening = f'    <body name="v{i}" pos="{_numbers(places[i])}">'
+        lines.append(f'{opening}{inertial}{joints}<site name="v{i}"/></body>')
+    return "\n".join(lines)
+
+
+def _grips(held: tuple[int, ...], timestep: float) -> str:
+    """What ties held vertices to their mocap bodies, as stiff as the time step allows."""
+    lines = [
+        f'    <connect body1="v{i}" body2="h{i}" anchor="0 0 0" solref="{2 * timestep!r} 1"/>'
+        for i in held
+    ]
+    return "  <equality>\n" + "\n".join(lines) + "\n  </equality>\n" if held else ""
+
+
+def _tendons(mesh: Mesh, warp: float, weft: float, damping: float) -> str:
+    found = springs(mesh, warp, weft)
+    lines = [
+        f'    <spatial stiffness="{k!r}" damping="{damping * k!r}" springlength="{length!r}">'
+        f'<site site="v{a}"/><site site="v{b}"/></spatial>'
+        for (a, b), k, length in zip(*(part.tolist() for part in found), strict=True)
+        if k > 0
+    ]
+    return "  <tendon>\n" + "\n".join(lines) + "\n  </tendon>\n" if lines else ""
+
+
+def _loss(fabric: Fabric, mesh: Mesh, own: Stiffness, near: Stiffness, lost) -> Loss:
+    bending = stiffness.mean_bending(fabric)
+    shown = stiffness.hinged(mesh, bending) if bending else {}
+    return Loss(
+        stiffness.errors(stiffness.probes(near), stiffness.probes(own)),
+        stiffness.errors(shown, stiffness.bending_stiffness(fabric)) if bending else {},
+        (*stiffness.softening(fabric), *lost),
+    )
+
+
+def _contact(fabric: Fabric) -> str:
+    friction = f"{float(fabric.friction)!r} 0.005 0.0001"
+    return f'<contact selfcollide="none" friction="{friction}"/>'
+
+
+def _elasticity(values: Elasticity) -> str:
+    fields = " ".join(f'{name}="{value}"' for name, value in values._asdict().items())
+    return f"<elasticity {fields}/>"
+
+
+def _flat(mesh: Mesh) -> np.ndarray:
+    return np.pad(np.asarray(mesh.rest, np.float64), ((0, 0), (0, 1)))
+
+
+def _numbers(values: np.ndarray) -> str:
+    return " ".join(repr(value) for value in values.ravel().tolist())

@@ -1,0 +1,89 @@
+"""Made-up rows and motions of a study, whose effects are known."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from r2s.mesh import rectangle
+from r2s.study import panel
+from r2s.study.panel import MOTIONS, PAPER_COLUMNS, Column
+from r2s.study.shown import Shown
+from r2s.study.tables import Row
+
+FABRICS = ("black_denim", "grey_interlock", "pink_solid")
+METRICS = {"chamfer": ("m", 1.0), "paper_chamfer": ("-", 20.0), "hausdorff": ("m", 3.0)}
+
+
+@contextmanager
+def few_draws(count: int = 60) -> Iterator[None]:
+    """Bootstraps of so many draws, for the sake of time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(panel, "DRAWS", count)
+        yield
+
+
+def flat_distance(column: Column, fabric: str, motion: str, trial: int, repeat: int) -> float:
+    """The same everywhere, [m]."""
+    return 0.02
+
+
+def made_up_rows(
+    distance: Callable[[Column, str, str, int, int], float] = flat_distance,
+    columns: Sequence[Column] = PAPER_COLUMNS,
+    fabrics: Sequence[str] = FABRICS,
+    motions: Sequence[str] = MOTIONS,
+    trials: int = 4,
+    repeats: int = 2,
+    noise: float = 0.1,
+    seed: int = 0,
+    metrics: Sequence[str] = tuple(METRICS),
+) -> list[Row]:
+    """Rows of `distance` [m], times log-normal noise; that of the default fabric is 40 mm."""
+    generator = np.random.default_rng(seed)
+    rows = []
+    for column in (*columns, Column("", "cloth", "")):
+        for fabric in fabrics:
+            for motion in motions:
+                for trial in range(1, trials + 1):
+                    for repeat in range(1, repeats + 1 if column.approach else 2):
+                        is_default = not column.approach
+                        value = (
+                            0.04 if is_default else distance(column, fabric, motion, trial, repeat)
+                        )
+                        value *= math.exp(noise * generator.normal())
+                        rows += [
+                            Row(
+                                *column,
+                                fabric,
+                                str(repeat),
+                                f"{motion}_{fabric}{trial}",
+                                motion,
+                                "default" if is_default else "",
+                                metric,
+                                METRICS[metric][0],
+                                METRICS[metric][1] * value,
+                            )
+                            for metric in metrics
+                        ]
+    return rows
+
+
+def made_up_shown(
+    motion: str = "fling", fabric: str = "black_denim", labels: Sequence[str] = ("a", "b")
+) -> Shown:
+    """A sheet that swings, seen as its own vertices; the columns lag behind it."""
+    mesh = rectangle((0.4, 0.4), (4, 4))
+    rest, times = np.asarray(mesh.rest, float), np.linspace(0.0, 1.0, 6)
+
+    def swung(lag: float) -> np.ndarray:
+        angle = 1.5 * np.sin(np.pi * (times - lag))[:, None]
+        across = rest[:, 0] * np.cos(angle), rest[:, 0] * np.sin(angle)
+        return np.stack([across[0], np.broadcast_to(rest[:, 1], across[0].shape), across[1]], -1)
+
+    motions = {label: swung(0.1 * i) for i, label in enumerate(labels)}
+    clouds = tuple(swung(0.0)[i, : len(rest) - i] for i in range(len(times)))
+    faces = np.asarray(mesh.faces)
+    return Shown(fabric, motion, f"{motion}_{fabric}1", times, clouds, faces, motions)

@@ -1,0 +1,208 @@
+"""Commands that simulate, estimate, evaluate, export and check: what they write and print."""
+
+import dataclasses
+import json
+import xml.etree.ElementTree as xml
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+pytest.importorskip("tyro")
+
+from test_cli import stopped  # noqa: E402
+
+from r2s import cards, presets  # noqa: E402
+from r2s.arcsim import read_material  # noqa: E402
+from r2s.cards import Card, Provenance  # noqa: E402
+from r2s.cli import main  # noqa: E402
+from r2s.commands.check_grad import _row  # noqa: E402
+from r2s.commands.common import experiment_of, tell  # noqa: E402
+from r2s.commands.doctor import EXCLUDED, EXTRAS, implausible  # noqa: E402
+from r2s.recording import load  # noqa: E402
+from r2s.show import load_trajectory  # noqa: E402
+
+COMMANDS = ["simulate", "estimate", "evaluate", "export", "check-grad", "doctor"]
+SHORT = ["--motion", "num_frames=4", "moving=0.15", "--shape", "3", "3"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_has_two_examples(capsys: pytest.CaptureFixture, command: str) -> None:
+    assert stopped(command, "--help") == 0
+    text = capsys.readouterr().out
+    assert text.count(f"    r2s {command}") == 2 and "--json" in text
+
+
+@pytest.mark.parametrize(
+    "arguments, word",
+    [
+        (("simulate", "lifting"), "--out"),
+        (("simulate", "hovering", "--out", "x.npz"), "hovering"),
+        (("estimate", "a.npz", "--out", "x.json"), "--density"),
+        (("export", "black_denim", "--to", "felt", "--out", "x"), "felt"),
+    ],
+)
+def test_wrong_usage_is_2(capsys: pytest.CaptureFixture, arguments: tuple, word: str) -> None:
+    assert stopped(*arguments) == 2
+    assert word in capsys.readouterr().err.lower()
+
+
+def test_an_error_is_one_line_and_1(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    out = ["--out", str(tmp_path / "out")]
+    broken = tmp_path / "broken.json"
+    broken.write_text('{"format": "r2s-card/9"}')
+    for arguments, words in (
+        (["simulate", "lifting", "--fabric", "felt", *out], "felt: no such card, and no preset"),
+        (["simulate", "lifting", "--fabric", str(broken), *out], "broken.json: no fabric card"),
+        (["simulate", "lifting", "--motion", "heigt=1", *out], "lifting has no heigt; it takes he"),
+        (["simulate", "lifting", "--motion", "height", *out], "expects NAME=NUMBER"),
+        (["simulate", "wind", "--layers", "--solver", "points", *out], "--layers is of the cloth"),
+        (["estimate", str(tmp_path / "no.npz"), "--density", "0.2", *out], "no.npz: no such"),
+        (["evaluate", "black_denim", str(tmp_path / "no.npz")], "no.npz: no such recording"),
+        (["check-grad", "wind", "--solver", "points", "--forward"], "are of the cloth"),
+        (["doctor", "--mesh", str(tmp_path / "no.obj")], "no.obj: no such mesh"),
+    ):
+        assert main(arguments) == 1, arguments
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 1 and lines[0].startswith("r2s: error: ") and words in lines[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_motion_is_simulated(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    out = tmp_path / "x.npz"
+    command = ["simulate", "lifting", "--fabric", "black_denim", "--out", str(out), *SHORT]
+    assert main([*command, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["frames"] == 4 and told["diverged_in_frame"] is None
+    moved = load_trajectory(out)
+    assert moved.x.shape == (4, 9, 3) and np.isfinite(moved.x).all()
+
+
+@pytest.mark.slow
+def test_a_recording_is_simulated_and_judged(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    out, recording = str(tmp_path / "x.npz"), tmp_path / "lift.npz"
+    command = ["simulate", "lifting", "--fabric", "black_denim", "--out", out, *SHORT]
+    assert main([*command, "--recording", str(recording)]) == 0
+    assert load(recording).info.fabric == "black_denim"
+    capsys.readouterr()
+    assert main(["evaluate", "black_denim", str(recording), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    (metrics,) = told["recordings"].values()
+    assert 0 < metrics["chamfer_real_to_sim"] < 0.02 and told["units"]["hausdorff"] == "m"
+
+
+def test_exports_are_files_and_say_what_is_lost(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    def export(to: str, *more: str) -> tuple[Path, dict]:
+        out = tmp_path / f"{to}.out"
+        assert main(["export", "black_denim", "--to", to, "--out", str(out), "--json", *more]) == 0
+        return out, json.loads(capsys.readouterr().out)
+
+    path, told = export("mujoco", "--size", "0.2", "0.2", "--shape", "3", "3")
+    tree = xml.fromstring(path.read_text())
+    assert len(list(tree.iter("inertial"))) == 9 and len(list(tree.iter("spatial"))) == 12
+    assert abs(told["relative_energy_error"]["membrane"]["weft"]) < 1e-6
+    path, told = export("mujoco", "--isotropic")
+    assert told["relative_energy_error"]["membrane"]["weft"] < -0.5
+    path, told = export("newton")
+    model = json.loads(path.read_text())
+    assert model["add_cloth_mesh"]["density"] == pytest.approx(0.32) and model["add_spring"]
+    path, _ = export("newton-vbd", "--isotropic")
+    assert json.loads(path.read_text())["add_spring"] == []
+    path, told = export("pybullet")
+    assert json.loads(path.read_text())["loadSoftBody"]["useMassSpring"] == 1
+    assert any("bending" in text for text in told["lost"])
+    path, _ = export("arcsim")
+    assert float(read_material(path).density) == pytest.approx(0.32)
+
+
+def test_the_doctor_knows_the_installation(capsys: pytest.CaptureFixture) -> None:
+    assert main(["doctor", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["x64"] and told["versions"]["jax"] not in EXCLUDED and told["wrong"] == []
+    assert told["missing"].keys() == EXTRAS.keys() and not told["missing"]["cli"]
+    project = (Path(__file__).parents[1] / "pyproject.toml").read_text()
+    assert all(f"!={version}" in project for version in EXCLUDED)
+
+
+def test_the_doctor_finds_wrong_units(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    for make in presets.FIVE.values():
+        assert not list(implausible(make()))
+    wrong = dataclasses.replace(presets.black_denim(), density=jnp.asarray(320.0))
+    cards.write(tmp_path / "grams.json", Card.make("grams", wrong, Provenance("weighed in g")))
+    assert main(["doctor", "--fabric", str(tmp_path / "grams.json")]) == 1
+    text = capsys.readouterr().out
+    assert "WRONG: grams: density is 320 kg/m^2, expected 0.05 to 1 (an areal density" in text
+
+
+def test_the_doctor_looks_at_a_mesh(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    pytest.importorskip("trimesh")
+    path = tmp_path / "sheet.obj"
+    corners = "v 0 0 0\nv 0.2 0 0\nv 0 0.2 0\nv 0.2 0.2 0\n"
+    path.write_text(corners + "f 1 2 3\nf 2 4 3\n")
+    assert main(["doctor", "--mesh", str(path), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["mesh"]
+    assert told["faces"] == 2 and told["area_m2"] == pytest.approx(0.04)
+    path.write_text(corners + "f 1 2 3\nf 2 3 4\n")  # one is clockwise
+    assert main(["doctor", "--mesh", str(path)]) == 1
+    assert "sheet.obj: face 1 has the signed area" in capsys.readouterr().err
+
+
+def test_derivatives_are_told_from_wrong_and_from_rough_ones() -> None:
+    start = jnp.array([2.0, 0.0])
+    smooth = lambda v: v[0] ** 3 + jnp.sin(v[1])
+    row = lambda loss, i, slope: _row("it", loss, start, i, slope, 1e-3)["verdict"]
+    assert row(smooth, 0, 12.0) == "agrees" and row(smooth, 1, 1.0) == "agrees"
+    assert row(smooth, 0, 12.1) == "differs" and row(smooth, 1, 0.0) == "differs"
+    assert row(smooth, 0, float("nan")) == "not finite"
+    jump = lambda v: smooth(v) + jnp.where(v[0] > 2.0001, 1e-2, 0.0)
+    assert row(jump, 0, 12.0) == "rough"
+    assert row(lambda v: jnp.asarray(7.0) + 0 * v[0], 0, 0.0) == "agrees"  # no influence
+
+
+def test_numbers_of_a_motion_and_what_is_printed(capsys: pytest.CaptureFixture) -> None:
+    made = experiment_of("folding", ["reach=0.8", "num_frames=50"])
+    assert len(made.times) == 50 and made.name == "folding"
+    with pytest.raises(ValueError, match="reach must be above 0 and at most 1"):
+        experiment_of("folding", ["reach=2"])
+    tell(True, {"a": float("nan"), "b": [np.inf, 1.0], "c": Path("x")}, [])
+    assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, 1.0], "c": "x"}
+
+
+@pytest.mark.slow
+def test_a_card_comes_from_a_recording_and_goes_on_where_it_was(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    recording, card = tmp_path / "lift.npz", tmp_path / "card.json"
+    command = ["simulate", "lifting", "--out", str(tmp_path / "x.npz"), "--shape", "5", "5"]
+    assert main([*command, "--recording", str(recording)]) == 0
+    command = ["estimate", str(recording), "--density", "0.19", "--out", str(card), "--json"]
+    command += ["--shape", "5", "5", "--coarse", "4", "--starts", "1", "--iterations", "6"]
+    capsys.readouterr()
+    assert main([*command, "--date", "2026-01-31"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    found = cards.read(card)
+    assert told["provenance"]["date"] == "2026-01-31" and told["estimate"]["parameters"]
+    assert found.provenance.recordings == (
+        ("lifting_grey_interlock", cards.fingerprint(load(recording))),
+    )
+    assert found.estimate is not None and found.estimate.approach.startswith("diffcloud")
+    assert not list(tmp_path.glob("*.progress.npz"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("more", [[], ["--forward"]])
+def test_derivatives_of_a_scene_agree(capsys: pytest.CaptureFixture, more: list[str]) -> None:
+    assert main(["check-grad", "lifting", *SHORT, "--json", *more]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["agree"] and len(told["rows"]) == 11
+
+
+@pytest.mark.slow
+def test_the_doctor_predicts_step_and_memory(capsys: pytest.CaptureFixture) -> None:
+    assert main(["doctor", "--scenario", "lifting", *SHORT, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["scenario"]
+    assert told["points_step_s"] < told["step_s"] <= 0.025
+    assert 0 < told["memory_bytes"] < told["gradient_memory_bytes"]

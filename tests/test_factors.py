@@ -1,0 +1,110 @@
+"""Shares of the variance: right on made-up data whose shares are known."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from made_up_study import made_up_rows
+
+from r2s.study.factors import share_table, variance_shares
+from r2s.study.panel import PAPER_COLUMNS, Column, make_panel
+
+CROSSED = tuple(
+    Column(*names)
+    for names in itertools.product(("a", "b", "c"), ("cloth", "points"), ("lifting", "wind"))
+)
+FABRICS = tuple(f"fabric_{i}" for i in range(6))
+
+
+def shares(rows, motions=("fling",), draws=100):
+    found = variance_shares(make_panel(rows, "chamfer", motions), draws)
+    assert found is not None
+    return found, dict(zip(found.factors, found.share, strict=True))
+
+
+def effects(generator, levels, variance):
+    """One number a level, whose variance over the levels is as given."""
+    drawn = generator.normal(size=len(levels))
+    drawn = (drawn - drawn.mean()) / drawn.std()
+    return dict(zip(levels, math.sqrt(variance) * drawn, strict=True))
+
+
+def test_known_shares_are_found():
+    generator = np.random.default_rng(0)
+    wanted = {
+        "approach": 0.03,
+        "solver": 0.02,
+        "scenario": 0.01,
+        "fabric": 0.04,
+        "trajectory": 0.06,
+    }
+    by = {
+        "approach": effects(generator, "abc", wanted["approach"]),
+        "solver": effects(generator, ("cloth", "points"), wanted["solver"]),
+        "scenario": effects(generator, ("lifting", "wind"), wanted["scenario"]),
+        "fabric": effects(generator, FABRICS, wanted["fabric"]),
+    }
+    trajectory = {f: effects(generator, range(1, 13), wanted["trajectory"]) for f in FABRICS}
+
+    def distance(column, fabric, motion, trial, repeat):
+        parts = zip(("approach", "solver", "scenario"), column, strict=True)
+        total = sum(by[name][level] for name, level in parts)
+        return 0.02 * math.exp(total + by["fabric"][fabric] + trajectory[fabric][trial])
+
+    rows = made_up_rows(distance, CROSSED, FABRICS, ["fling"], trials=12, noise=0.2)
+    found, share = shares(rows)
+    total = sum(wanted.values()) + 0.2**2
+    for name, variance in wanted.items():
+        assert share[name] == pytest.approx(variance / total, abs=0.02)
+    assert share["rest"] == pytest.approx(0.2**2 / total, abs=0.02)
+    assert found.share.sum() == pytest.approx(1)
+    assert np.all(found.low <= found.share + 0.03) and np.all(found.high >= found.share - 0.03)
+    assert found.confounded == () and found.diverged == 0
+    assert "share of the variance [%]" in share_table(found, "").header
+
+
+def test_factors_without_effect_have_no_share():
+    found, share = shares(made_up_rows(columns=CROSSED, fabrics=FABRICS, trials=10, repeats=3))
+    assert all(abs(value) < 0.02 for name, value in share.items() if name != "rest")
+    assert share["rest"] == pytest.approx(1, abs=0.02)
+    assert found.deviation == pytest.approx(0.1, rel=0.1)
+
+
+def test_confounded_factors_share_what_cannot_be_told_apart():
+    # The fourth approach comes from stretching, and nothing else does.
+    columns = [Column(a, "cloth", s) for a in "abc" for s in ("lifting", "wind")]
+    columns += [Column("pinn", "cloth", "stretching")]
+    distance = lambda column, *_: 0.02 * (2 if column.approach == "pinn" else 1)
+    rows = made_up_rows(distance, columns, trials=6, noise=0.05)
+    found, share = shares(rows)
+    assert share["approach"] == pytest.approx(share["scenario"], abs=0.02)
+    assert share["approach"] + share["scenario"] > 0.9
+    assert ("approach", "scenario") in found.confounded
+    assert "approach and scenario" in share_table(found, "").caption
+
+
+def test_what_depends_on_one_alone_is_its_own_even_when_the_design_is_not_balanced():
+    distance = lambda column, *_: 0.02 * (2 if column.solver == "points" else 1)
+    found, share = shares(made_up_rows(distance, trials=6, noise=0.02))
+    assert share["solver"] == max(share.values()) and share["solver"] > 0.6
+    assert found.share.sum() == pytest.approx(1)
+
+
+def test_motions_count_together_with_the_others():
+    distance = lambda column, fabric, motion, *_: 0.02 * (3 if motion == "fling" else 1)
+    _, share = shares(made_up_rows(distance, trials=4), ("folding", "fling"))
+    assert share["motion"] > 0.9
+
+
+def test_what_diverged_is_counted():
+    distance = lambda column, f, m, trial, r: math.nan if trial == 2 else 0.02
+    found, _ = shares(made_up_rows(distance, PAPER_COLUMNS[:2], noise=0.1, trials=5))
+    assert (found.count, found.diverged) == (48, 12)
+    assert "12 runs that diverged" in share_table(found, "").caption
+
+
+def test_too_little_to_tell():
+    assert variance_shares(make_panel([], "chamfer")) is None
+    constant = made_up_rows(noise=0.0)
+    assert variance_shares(make_panel(constant, "chamfer")) is None

@@ -1,0 +1,145 @@
+"""Conclusions are told right where made-up rows make them true, false or unclear."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from made_up_study import FABRICS, few_draws, made_up_rows
+
+from r2s.study.conclusions import CONCLUSIONS
+from r2s.study.findings import find, finding_table, in_words
+from r2s.study.hypotheses import Claim, compare, holm, judge, signed_rank
+from r2s.study.panel import PAPER_COLUMNS, make_panel, select
+
+DIFFCLOUD_L, DIFFCLOUD_W, DIFFCP = PAPER_COLUMNS[:3]
+PINN_POINTS, PINN_CLOTH = PAPER_COLUMNS[6:]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick():
+    with few_draws():
+        yield
+
+
+def as_concluded(column, fabric, motion, trial, repeat):
+    """Distances that make all conclusions right."""
+    value = {"folding": 0.01, "fling": 0.03, "shaking": 0.025}[motion]
+    if motion == "shaking" and column.solver == "points":
+        value *= 1.5
+    if motion == "fling" and column.solver == "cloth":
+        value *= 1.5
+    if column.estimated_from == "wind":
+        value *= 0.8 if motion == "folding" else 1.3
+    if (column, motion) in ((PINN_CLOTH, "folding"), (PINN_POINTS, "fling")):
+        value *= 0.6
+    if column.approach == "physnet":
+        value *= math.exp(0.4 * (-1) ** repeat)
+    return math.nan if column == DIFFCP and motion == "shaking" and repeat < 3 else value
+
+
+def reversed_of(column, fabric, motion, trial, repeat):
+    """Distances that make them wrong."""
+    value = {"folding": 0.03, "fling": 0.02, "shaking": 0.02}[motion]
+    if motion == "shaking" and column.solver == "cloth":
+        value *= 1.5
+    if motion == "fling" and column.solver == "points":
+        value *= 1.5
+    if column.estimated_from == "wind":
+        value *= 1.3 if motion == "folding" else 0.8
+    if (column, motion) in ((PINN_CLOTH, "folding"), (PINN_POINTS, "fling")):
+        value *= 2
+    return value * math.exp(0.4 * (-1) ** repeat) if column.approach != "physnet" else value
+
+
+@pytest.fixture(scope="module")
+def right():
+    return find(made_up_rows(as_concluded, trials=6, repeats=3), {})
+
+
+def answers(verdicts):
+    return dict(zip((f.__name__ for f in CONCLUSIONS), (v.answer for v in verdicts), strict=True))
+
+
+def test_conclusions_that_are_right_hold(right):
+    found = answers(right)
+    # DiffCP diverges: that is further from its own repeats than PhysNet is.
+    assert found.pop("physnet_varies_most") != "holds"
+    assert set(found.values()) == {"holds"}
+    without = [r for r in made_up_rows(as_concluded, trials=6, repeats=3) if r.approach != "diffcp"]
+    assert answers(find(without, {}))["physnet_varies_most"] == "holds"
+
+
+def test_conclusions_that_are_wrong_do_not():
+    found = answers(find(made_up_rows(reversed_of, trials=6, repeats=2), {}))
+    assert found.pop("diffcp_explodes") == "cannot be told"  # none diverged
+    assert set(found.values()) == {"does not hold"}
+
+
+def test_what_is_alike_does_not_hold_and_what_is_unclear_is_not_told():
+    panel = make_panel(made_up_rows(noise=0.02, trials=20), "chamfer", ("fling",))
+    alike = compare("", panel, [DIFFCLOUD_L], [DIFFCLOUD_W])
+    few = select(make_panel(made_up_rows(noise=0.4), "chamfer"), None, lambda t: t[0] == FABRICS[0])
+    unclear = compare("", few, [DIFFCLOUD_L], [DIFFCLOUD_W])
+    found = [verdict.answer for verdict in judge([Claim("", (alike,)), Claim("", (unclear,))])]
+    assert found == ["does not hold", "cannot be told"]
+
+
+def test_missing_columns_are_said():
+    rows = [row for row in made_up_rows(trials=2) if row.approach != "pinn"]
+    for metric_rows in (rows, [], made_up_rows(columns=[], trials=2)):
+        for verdict in find(metric_rows, {}):
+            assert verdict.answer in ("cannot be told", "does not hold")
+            assert in_words(verdict)
+    words = "\n".join(in_words(verdict) for verdict in find(rows, {}))
+    assert "no rows of PINN cloth stretching" in words
+    assert finding_table(find([], {}), "chamfer").rows[0][1] == "cannot be told"
+
+
+def test_the_paper_is_quoted_when_it_is_there(right):
+    values = {column: {"black_denim": 0.1 * (i + 1)} for i, column in enumerate(PAPER_COLUMNS)}
+    paper = {(m, "paper_chamfer"): values for m in ("folding", "fling", "shaking")}
+    found = find(made_up_rows(as_concluded, trials=2), paper)
+    table = finding_table(found, "chamfer")
+    lifting = [line for line in table.rows if line[2].startswith("lifting better than wind")]
+    assert lifting[0][-1] == "0.100 against 0.200"
+    assert "the paper has 2 times in squared units" in in_words(found[3])
+    assert "paper has" not in in_words(right[3])
+    assert finding_table(right, "chamfer").rows[0][-1] == "-"
+
+
+def test_a_diverged_side_counts_against_it():
+    some = lambda column, *_: math.nan if column == DIFFCLOUD_W else 0.02
+    panel = make_panel(made_up_rows(some), "chamfer", ("fling",))
+    found = compare("", panel, [DIFFCLOUD_L], [DIFFCLOUD_W])
+    assert found.favoured and found.p < 1e-3 and math.isnan(found.ratio) and found.diverged == 12
+    both = compare("", panel, [DIFFCLOUD_W], [DIFFCLOUD_W])
+    assert both.p == 1
+
+
+def test_wilcoxon_of_pairs():
+    p, favoured = signed_rank(np.array([1.0, 2.0, 3.0, 4.0, np.inf]))
+    assert (p, favoured) == (2 / 2**5, True)  # all of the signs alike: two of 32 orders
+    assert signed_rank(np.zeros(5)) == (1.0, False)
+
+
+def test_trajectories_of_alike_columns_give_uniform_p():
+    p = []
+    for seed in range(60):
+        rows = made_up_rows(columns=[DIFFCLOUD_L, DIFFCLOUD_W], repeats=1, seed=seed)
+        p.append(compare("", make_panel(rows, "chamfer"), [DIFFCLOUD_L], [DIFFCLOUD_W]).p)
+    assert 0 <= sum(value < 0.1 for value in p) <= 14  # 6 expected
+
+
+@given(st.lists(st.floats(0, 1) | st.just(math.nan), max_size=8))
+def test_holm(values):
+    found = holm(values)
+    known = [(v, f) for v, f in zip(values, found, strict=True) if not math.isnan(v)]
+    assert all(f >= v and f <= 1 for v, f in known)
+    assert all(math.isnan(f) == math.isnan(v) for v, f in zip(values, found, strict=True))
+    ordered = sorted(known)
+    assert all(a[1] <= b[1] for a, b in zip(ordered, ordered[1:], strict=False))
+    if known:
+        assert ordered[0][1] == pytest.approx(min(1, ordered[0][0] * len(known)))
+    np.testing.assert_allclose(holm([0.01, 0.04, 0.03]), [0.03, 0.06, 0.06])

@@ -1,0 +1,118 @@
+"""The report of a whole study, also where most of it is missing."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_up_study import few_draws, made_up_rows, made_up_shown
+from test_report import Page
+
+from r2s.family import Range
+from r2s.study import full_report, overlays
+from r2s.study.panel import MOTIONS, PAPER_COLUMNS
+from r2s.study.report import PNG
+
+ENTRY = (
+    "diffcloud_denim",
+    (Range("C11", "N/m", 3.0, 3000.0),),
+    np.array([123.0]),
+    np.array([0.1]),
+    np.array([True]),
+    None,
+)
+COST = {"kind": "estimates", "count": 3, "seconds": 12.345, "peak_memory_MB": 512.0}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick():
+    with few_draws():
+        yield
+
+
+def some_diverged(column, fabric, motion, trial, repeat):
+    return math.nan if column.approach == "diffcp" and trial == 1 else 0.02 * trial
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory):
+    out = tmp_path_factory.mktemp("study")
+    shown = [made_up_shown(motion, labels=("DIFFCLOUD cloth lifting", "b")) for motion in MOTIONS]
+    shown[1].motions["b"][2:] = np.nan
+    tables = full_report.publish(
+        out,
+        made_up_rows(some_diverged, trials=3),
+        [*shown, made_up_shown("folding")],
+        {"cloth": [ENTRY], "points": []},
+        [("estimates pinn_denim", "RuntimeError: <diverged>")],
+        {"recordings": "made up"},
+        None,
+        [COST],
+    )
+    return out, tables, Page((out / "report.html").read_text())
+
+
+def test_all_parts_are_there(published):
+    out, tables, page = published
+    for text in (
+        "Findings", "Holds", "Distances in millimetres", "In the units of the paper", "Ranks",
+        "What matters", "Motions", "Viewer", "123 ± 12 N/m", "RuntimeError: <diverged>", "12.3",
+        "peak memory [MB]", "recordings", "made up", "version of jax", "diverged)",
+        "1 more recordings are not in it", "videos/fling_black_denim1.mp4",
+    ):  # fmt: skip
+        assert text in page.text, text
+    written = {path.stem for path in (out / "tables").iterdir()}
+    assert len(written) == len(tables) == len(page.all("table"))
+    assert {"findings", "chamfer", "ranks_all", "factors_fling", "costs", "missing"} <= written
+    assert all((out / "tables" / f"{n}.{end}").exists() for n in written for end in ("md", "tex"))
+    assert len(page.all("canvas")) == 1
+
+
+def test_pictures_and_videos_are_written(published):
+    out, _, page = published
+    names = {path.name for path in (out / "figures").iterdir()}
+    assert names == {"distances.png", "ranks.png", "factors.png", "motions_black_denim.png"}
+    assert all((out / "figures" / name).read_bytes().startswith(PNG) for name in names)
+    assert len(page.all("img")) == len(names)
+    assert len(list((out / "videos").iterdir())) == len(MOTIONS)
+
+
+def test_findings_come_first(published):
+    page = published[2]
+    text = page.text
+    assert text.index("Findings") < text.index("Distances in millimetres") < text.index("Settings")
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [],
+        made_up_rows(lambda *_: math.nan, PAPER_COLUMNS[:1], ["denim"], ["fling"], trials=1),
+        made_up_rows(columns=PAPER_COLUMNS[2:3], fabrics=["denim"], trials=1, repeats=1),
+        made_up_rows(columns=[], metrics=["hausdorff"]),
+    ],
+    ids=["nothing", "all diverged", "one column", "default fabric alone"],
+)
+def test_parts_of_a_study_are_reported(tmp_path, rows):
+    full_report.publish(tmp_path, rows)
+    page = Page((tmp_path / "report.html").read_text())
+    assert "Findings" in page.text and "Settings" in page.text
+    assert "Columns of the paper that have no result here" in page.text
+
+
+def test_a_late_frame_is_one_where_much_is_seen_and_has_moved():
+    shown = made_up_shown()
+    assert overlays.late_frame(shown) == 3  # back at the start in the last
+    clouds = tuple(cloud if i < 3 else cloud[:2] for i, cloud in enumerate(shown.clouds))
+    assert overlays.late_frame(replace(shown, clouds=clouds)) < 3
+
+
+def test_pictures_of_a_video_move():
+    first, *_, last = list(overlays.pictures(made_up_shown()))
+    assert first.shape == last.shape and first.shape[0] % 2 == first.shape[1] % 2 == 0
+    assert np.mean(np.any(first != last, axis=-1)) > 0.005
+
+
+def test_nothing_to_draw_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="no recording"):
+        overlays.overview(tmp_path / "none.png", [])

@@ -1,0 +1,177 @@
+"""A report with a viewer: what a browser decodes and draws is what was stored."""
+
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from made_up_study import made_up_shown
+from test_report import Page
+
+from r2s.study import viewer
+from r2s.study.report import Section, write_report
+from r2s.study.shown import Shown, load_shown, save_shown
+from r2s.study.tables import Table
+
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+needs_browser = pytest.mark.skipif(
+    BROWSER is None, reason="neither chromium nor google-chrome is on the path"
+)
+FLAGS = (
+    "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+    "--window-size=900,900", "--virtual-time-budget=3000", "--dump-dom",
+)  # fmt: skip
+TABLE = Table(("n", "v"), (("b", "10 [9, 11]"), ("a", "9.5"), ("c", "diverged"), ("d", "-")), "")
+
+# What a reader does, after which the page holds what came of it.
+DEEDS = """
+<script>
+addEventListener("load", () => {
+  const root = document.querySelector(".viewer"), canvas = root.querySelector("canvas");
+  const slider = root.querySelector("input[type=range]");
+  const picture = () => {
+    const pixels = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+    let sum = 0;
+    for (let i = 0; i < pixels.length; i++) sum = (31 * sum + pixels[i]) % 4294967291;
+    return sum;
+  };
+  const found = { pictures: [picture()] };
+  const change = (element, kind) => {
+    element.dispatchEvent(new Event(kind));
+    found.pictures.push(picture());
+  };
+  slider.value = 1;
+  change(slider, "input");
+  found.clock = root.querySelector("output").textContent;
+  const boxes = [...root.querySelectorAll("input[type=checkbox]")];
+  boxes[1].checked = false;
+  change(boxes[1], "change");
+  canvas.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowLeft" }));
+  found.pictures.push(picture());
+  canvas.dispatchEvent(new KeyboardEvent("keydown", { key: "+" }));
+  found.pictures.push(picture());
+  found.sheet = [...root.viewer.positions("b")];
+  found.points = [...root.viewer.positions("")];
+  const choice = root.querySelector("select");
+  choice.value = 1;
+  change(choice, "change");
+  found.legend = root.querySelector(".legend").textContent;
+  const heads = document.querySelectorAll("table.sortable th");
+  const column = i => [...document.querySelectorAll("tbody tr")].map(r => r.cells[i].textContent);
+  heads[1].click();
+  found.up = column(0);
+  heads[1].click();
+  found.down = column(0);
+  const out = document.createElement("pre");
+  out.id = "found";
+  out.textContent = JSON.stringify(found);
+  document.body.append(out);
+});
+</script>
+"""
+
+
+def diverged() -> Shown:
+    shown = made_up_shown("shaking", "pink_solid")
+    shown.motions["b"][2:] = np.nan
+    return shown
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    return [made_up_shown(), diverged()]
+
+
+def page(path, recordings, extra=""):
+    section = Section("Motions", ("Words.",), (TABLE,), html=viewer.viewer(recordings) + extra)
+    write_report(path, "A study", "", {}, [section])
+    return path.read_text()
+
+
+def test_nothing_is_fetched_and_tags_are_closed(tmp_path, recordings):
+    text = page(tmp_path / "report.html", recordings)
+    found = Page(text)
+    assert not re.search("https?:|//|@import|url\\(", re.sub('base64,[^"]*', "", text).lower())
+    assert all("src" not in script for script in found.all("script"))
+    assert len(found.all("canvas")) == 1 and len(found.all("option")) == 2
+    assert viewer.viewer([]) == ""
+
+
+def test_labels_are_escaped(tmp_path):
+    shown = made_up_shown(labels=("</script><b>",), fabric="<i>")
+    found = Page(page(tmp_path / "report.html", [shown]))
+    assert not {"i", "b"} & {tag for tag, _ in found.tags}
+
+
+def test_size_of_a_long_recording():
+    generator = np.random.default_rng(0)
+    clouds = tuple(generator.normal(size=(3000, 3)) for _ in range(120))
+    motions = {f"column {i}": generator.normal(size=(120, 81, 3)) for i in range(12)}
+    faces = np.array([[0, 1, 2]])
+    shown = Shown("f", "fling", "fling_f1", np.arange(120.0), clouds, faces, motions)
+    text = viewer.viewer([shown])
+    assert 0.5 * viewer.BUDGET < len(text) < viewer.BUDGET + 30_000
+
+
+def test_shown_is_read_back(tmp_path):
+    shown = diverged()
+    save_shown(tmp_path / "shown.npz", shown)
+    read = load_shown(tmp_path / "shown.npz")
+    assert (read.fabric, read.evaluated_on, read.recording) == (
+        "pink_solid", "shaking", "shaking_pink_solid1"
+    )  # fmt: skip
+    assert list(read.motions) == ["a", "b"] and len(read.clouds) == 6
+    for mine, other in zip(
+        [*shown.clouds, *shown.motions.values(), shown.times, shown.faces],
+        [*read.clouds, *read.motions.values(), read.times, read.faces],
+        strict=True,
+    ):
+        np.testing.assert_array_equal(mine, other)
+
+
+def test_what_cannot_be_shown_is_refused(tmp_path, unchecked):
+    shown = made_up_shown()
+    with pytest.raises(ValueError, match="fling_black_denim1: expected a cloud for each of 6"):
+        replace(shown, clouds=shown.clouds[:2])
+    with pytest.raises(ValueError, match=r"fling_black_denim1, a: expected \(6, vertex, 3\)"):
+        replace(shown, motions={"a": shown.motions["a"][:3]})
+    with pytest.raises(ValueError, match="the faces name vertex 15"):
+        replace(shown, motions={"a": shown.motions["a"][:, :9]})
+    (tmp_path / "damaged.npz").write_bytes(b"PK")
+    with pytest.raises(ValueError, match=r"damaged.npz"):
+        load_shown(tmp_path / "damaged.npz")
+    with pytest.raises(FileNotFoundError, match=r"nowhere.npz"):
+        load_shown(tmp_path / "nowhere.npz")
+
+
+@needs_browser
+def test_in_a_browser(tmp_path, recordings):
+    page(tmp_path / "report.html", recordings, DEEDS)
+    command = (str(BROWSER), *FLAGS, f"--user-data-dir={tmp_path / 'profile'}")
+    done = subprocess.run(
+        [*command, (tmp_path / "report.html").as_uri()],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    match = re.search('<pre id="found">(.*?)</pre>', done.stdout, re.DOTALL)
+    assert match, done.stdout[-2000:]
+    found = json.loads(match[1])
+    assert len(set(found["pictures"])) == len(found["pictures"]) == 6
+    assert found["clock"] == "frame 1, 0.20 s"
+    shown = recordings[0]
+    rounded: dict[str, Any] = {"atol": 0.51 * viewer.STEP, "rtol": 1e-6}
+    np.testing.assert_allclose(
+        np.reshape(found["sheet"], shown.motions["b"].shape), shown.motions["b"], **rounded
+    )
+    points = np.reshape(found["points"], (-1, 3))
+    every = np.concatenate(shown.clouds)
+    assert len(points) == len(every)
+    order = lambda x: x[np.lexsort(np.round(x, 3).T)]
+    np.testing.assert_allclose(order(points), order(every), **rounded)
+    assert "b (diverged)" in found["legend"]
+    assert found["up"] == ["a", "b", "d", "c"]
+    assert found["down"][:2] == ["b", "a"] and set(found["down"][2:]) == {"c", "d"}
