@@ -100,9 +100,9 @@ def _intro(panel: Panel, missing: Sequence[tuple[str, str]]) -> str:
         f"{lost} diverged; {len(missing)} cells are missing."
     )
     how = (
-        f"Columns are compared by {panel.metric}. A simulation that diverged is a result: it is counted, "
-        f"ranks last, and is in no mean. Intervals are of {LEVEL:.0%}, a bootstrap over recordings "
-        "and over repeats of an estimate; the fabrics are given, so that they say nothing about "
+        f"Columns are compared by {panel.metric}. A simulation that diverged is a result: it is "
+        f"counted, ranks last, and is in no mean. Intervals are of {LEVEL:.0%}, a bootstrap over "
+        "recordings and over repeats of an estimate; the fabrics are given, so that they say nothing about "
         "other fabrics. An estimate that was made once has no repeats: then its interval does not "
         "have its spread."
     )
