@@ -52,7 +52,7 @@ def _model(fabric, mesh, held, start: np.ndarray, yarns: bool):
         builder.particle_flags[vertex] &= ~newton.ParticleFlags.ACTIVE
     model = builder.finalize()
     model.particle_grid = None  # no contact between particles
-    export.set_edges(model, fabric, "semi_implicit")
+    export.set_edges(model, fabric, mesh, "semi_implicit")
     return model, loss
 
 

@@ -61,7 +61,9 @@ def test_known_shares_are_found():
     assert found.share.sum() == pytest.approx(1)
     assert np.all(found.low <= found.share + 0.03) and np.all(found.high >= found.share - 0.03)
     assert found.confounded == () and found.diverged == 0
-    assert "share of the variance [%]" in share_table(found, "").header
+    table = share_table({"fling": found, "again": found}, "")
+    assert table.header == ("factor", "fling [%]", "again [%]") and table.rows[-1][0] == "rest"
+    assert table.rows[0][1].startswith(f"{100 * share['approach']:.1f} [")
 
 
 def test_factors_without_effect_have_no_share():
@@ -81,7 +83,7 @@ def test_confounded_factors_share_what_cannot_be_told_apart():
     assert share["approach"] == pytest.approx(share["scenario"], abs=0.02)
     assert share["approach"] + share["scenario"] > 0.9
     assert ("approach", "scenario") in found.confounded
-    assert "approach and scenario" in share_table(found, "").caption
+    assert "approach and scenario" in share_table({"fling": found}, "").caption
 
 
 def test_what_depends_on_one_alone_is_its_own_even_when_the_design_is_not_balanced():
@@ -101,7 +103,7 @@ def test_what_diverged_is_counted():
     distance = lambda column, f, m, trial, r: math.nan if trial == 2 else 0.02
     found, _ = shares(made_up_rows(distance, PAPER_COLUMNS[:2], noise=0.1, trials=5))
     assert (found.count, found.diverged) == (48, 12)
-    assert "12 runs that diverged" in share_table(found, "").caption
+    assert "12 runs that diverged" in share_table({"fling": found}, "").caption
 
 
 def test_too_little_to_tell():

@@ -30,8 +30,10 @@ def test_ranks_do_not_see_how_hard_a_trajectory_is():
     assert np.all(np.diff(estimates) > 0) and np.all(found.low <= found.high)
     assert found.by_trajectory.p < 1e-9 and found.by_fabric.blocks == 3
     assert found.first.sum() == pytest.approx(1)
-    shown = rank_table(found, "Ranks")
+    shown = rank_table({"fling": found}, "Ranks")
+    assert shown.header == ("column", "fling") and "Fling: 9 columns, 12 tra" in shown.caption
     assert shown.rows[0][0] == "DIFFCLOUD cloth lifting" and "Friedman" in shown.caption
+    assert shown.rows[0][1].startswith(f"{found.mean[0]:.2f} [")
 
 
 def test_what_diverged_is_last():
@@ -49,7 +51,7 @@ def test_what_is_judged_on_less_than_half_is_left_out():
     found = rank(make_panel(rows, "chamfer", ("fling",)))
     assert found is not None
     assert [column.approach for column in found.left_out] == ["diffcp"]
-    assert found.trajectories == 11 and "left out" in rank_table(found, "").caption
+    assert found.trajectories == 11 and "left out" in rank_table({"fling": found}, "").caption
 
 
 def test_alike_columns_are_not_told_apart():
@@ -67,7 +69,7 @@ def test_too_little_to_rank():
     assert rank(make_panel(one, "chamfer")) is None
     two = rank(make_panel(made_up_rows(columns=PAPER_COLUMNS[:2]), "chamfer"))
     assert two is not None and math.isnan(two.by_trajectory.p)
-    assert "cannot be made" in rank_table(two, "").caption
+    assert "cannot be made" in rank_table({"fling": two}, "").caption
 
 
 def test_critical_difference_is_that_of_the_tables():

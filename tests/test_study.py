@@ -91,7 +91,7 @@ def test_a_truth_has_the_stiffness_of_the_preset_at_rest_and_more_when_stretched
         assert getattr(stretched, name) == pytest.approx(2 * float(getattr(preset.membrane, name)))
     hinge = truth.bending.at(jnp.array(0.0), jnp.array(0.0))
     assert float(hinge.stiffness) == pytest.approx(float(preset.bending.stiffness))
-    assert isinstance(strain_dependent("grey_interlock", Making(stiffening=0)), type(preset))
+    assert isinstance(strain_dependent("grey_interlock", Making(stiffening=0.0)), type(preset))
 
 
 @pytest.fixture
@@ -129,6 +129,14 @@ def test_an_estimate_is_made_once_and_judged(tiny, tmp_path):
     assert len(made) == 1
     (entry,) = results.parameters(cells, tmp_path)["cloth"]
     assert entry[1][0].unit == "N/m" and not np.isfinite(entry[3]).any()
+    # what more of the same would cost
+    plan = matrix.Plan((Column("diffcloud", "cloth", "lifting"),), ("grey_interlock",), 3, 4)
+    table = results.forecast(results.costs(cells, tmp_path), plan)
+    lines = {line[0]: line[1:] for line in table.rows}
+    assert lines["estimates diffcloud cloth lifting"][0] == "3"
+    assert lines["evaluations cloth shaking"][0] == "16"  # 3 estimates and the default, 4 motions
+    assert float(lines["evaluations cloth shaking"][2]) > 0
+    assert lines["evaluations cloth fling"][1:] == ("not measured", "-")
 
 
 def test_an_estimate_that_diverges_is_a_result(tiny, tmp_path, monkeypatch):

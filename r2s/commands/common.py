@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from r2s.recording import Recording
     from r2s.scenarios import Experiment
 
+NO_NUMBERS = {"path", "route", "size", "held"}
 ScenarioName = Literal["lifting", "wind", "stretching", "folding", "fling", "shaking"]
 
 
@@ -47,7 +48,12 @@ def experiment_of(scenario: str, motion: Iterable[str], **others: Any) -> "Exper
     from r2s import scenarios, trajectories
 
     make = scenarios.SIX[scenario]
-    known = {*trajectories.LIMITS[scenario], *inspect.signature(make).parameters} - {"path", "route", "size", "held"}
+    known = {*trajectories.LIMITS[scenario], *inspect.signature(make).parameters} - {
+        "path",
+        "route",
+        "size",
+        "held",
+    }
     numbers: dict[str, Any] = {**numbers_of(motion), **others}
     if unknown := sorted(set(numbers) - known):
         raise ValueError(

@@ -65,7 +65,7 @@ class Export:
 
         if self.to == "arcsim":
             return arcsim.write(self.out, fabric, name)
-        mesh, yarns = rectangle(self.size, self.shape), not self.isotropic
+        mesh, yarns = rectangle(self.size, self.shape, "alternating"), not self.isotropic
         if self.to == "mujoco":
             text, loss = mujoco.mjcf(fabric, mesh, yarns=yarns)
             write_text(self.out, text)

@@ -3,9 +3,9 @@
 MuJoCo's 2-D flex is a solid plate of Young's modulus E [Pa], Poisson's ratio nu in [0, 0.5) and
 thickness h [m]: a St. Venant-Kirchhoff membrane in plane stress, of stiffness E h, on the same mesh
 that of r2s to rounding; and hinges with the bending stiffness E h^3 / (12 (1 - nu^2)), which know
-no Poisson's ratio. Both stiffnesses together fix E and h (`r2s.physics.solid.plate_solid`): h is
-not the fabric's thickness, which is the `radius` of its contacts. `damping` is a Kelvin-Voigt time
-[s], as in r2s.
+no Poisson's ratio, and are too stiff across diagonals: take a mesh whose diagonals alternate. Both
+stiffnesses together fix E and h (`r2s.physics.solid.plate_solid`): h is not the fabric's thickness,
+which is the `radius` of its contacts. `damping` is a Kelvin-Voigt time [s], as in r2s.
 
 `flexcomp` is the short form: isotropic, all vertices of one mass. `mjcf` is a whole model with a
 body for each vertex: masses of their areas, held vertices tied to mocap bodies, and springs along
@@ -41,9 +41,9 @@ class Elasticity(NamedTuple):
     elastic2d: str
 
 
-def elasticity(fabric: Fabric, modulus: float, poisson: float) -> Elasticity:
+def elasticity(fabric: Fabric, mesh: Mesh, modulus: float, poisson: float) -> Elasticity:
     """Of a sheet of E h [N/m] and Poisson's ratio [-], with a fabric's bending and damping."""
-    near, bending = stiffness.isotropic(modulus, poisson), stiffness.mean_bending(fabric)
+    near, bending = stiffness.isotropic(modulus, poisson), stiffness.hinge_stiffness(fabric, mesh)
     damping = float(fabric.damping)
     if not bending:
         thickness = float(fabric.thickness)
@@ -70,7 +70,7 @@ def flexcomp(
     point="{_numbers(_flat(mesh))}"
     element="{_numbers(np.asarray(mesh.faces))}">
   {_contact(fabric)}
-  {_elasticity(elasticity(fabric, *sheet))}{pin}
+  {_elasticity(elasticity(fabric, mesh, *sheet))}{pin}
 </flexcomp>"""
     lost = (MASSES, RIGID) if float(fabric.mass_damping) else (MASSES,)
     return text, _loss(fabric, mesh, own, stiffness.isotropic(*sheet), lost)
@@ -127,7 +127,7 @@ def mjcf(
     <flex name="cloth" dim="2" radius="{float(fabric.thickness)!r}" body="{names}"
         element="{_numbers(np.asarray(mesh.faces))}">
       {_contact(fabric)}
-      {_elasticity(elasticity(fabric, *sheet))}
+      {_elasticity(elasticity(fabric, mesh, *sheet))}
     </flex>
   </deformable>
 {tendons}{_grips(held, timestep)}</mujoco>
@@ -179,7 +179,7 @@ def _tendons(mesh: Mesh, warp: float, weft: float, damping: float) -> str:
 
 
 def _loss(fabric: Fabric, mesh: Mesh, own: Stiffness, near: Stiffness, lost) -> Loss:
-    bending = stiffness.mean_bending(fabric)
+    bending = stiffness.hinge_stiffness(fabric, mesh)
     shown = stiffness.hinged(mesh, bending) if bending else {}
     return Loss(
         stiffness.errors(stiffness.probes(near), stiffness.probes(own)),

@@ -9,7 +9,8 @@ A hinge of r2s has the moment B l / A per angle and length l of its edge, A the 
 triangles. VBD multiplies `edge_ke` by l: it is B l / A [N] there, another number for every edge.
 `SolverSemiImplicit` multiplies by twice a triangle's area, too, which is A where both are alike:
 B l / A^2 [N/m^2]. So the argument, which is one for all edges, is the mean; `set_edges` puts the
-right ones into the finished model.
+right ones into the finished model. Hinges are too stiff across diagonals: take a mesh whose
+diagonals alternate.
 
 Damping is Kelvin-Voigt. In VBD, of shear alone: `tri_kd`, on the rate of F^T F, is half of mu times
 the damping time. In `SolverSemiImplicit` it acts on the rate of F, also in a rigid rotation, as a
@@ -70,7 +71,7 @@ def cloth(
         along = None
         sheet = near = stiffness.isotropic(*stiffness.nearest_isotropic(own))
     lost += (RIGID,) if float(fabric.mass_damping) else ()
-    shown = stiffness.hinged(mesh, stiffness.mean_bending(fabric))
+    shown = stiffness.hinged(mesh, stiffness.hinge_stiffness(fabric, mesh))
     loss = Loss(
         stiffness.errors(stiffness.probes(near), stiffness.probes(own)),
         stiffness.errors(shown, stiffness.bending_stiffness(fabric)),
@@ -83,7 +84,7 @@ def cloth(
 def _arguments(fabric: Fabric, mesh: Mesh, kind: Kind, sheet: np.ndarray) -> dict[str, float]:
     shear, coupling, damping = float(sheet[2, 2]), float(sheet[0, 1]), float(fabric.damping)
     edges = np.asarray(mesh.hinge_length), np.asarray(mesh.hinge_area)
-    ke, kd = edge_factors(*edges, kind, stiffness.mean_bending(fabric), damping)
+    ke, kd = edge_factors(*edges, kind, stiffness.hinge_stiffness(fabric, mesh), damping)
     return {
         "density": float(fabric.density),
         "tri_ke": shear,
@@ -118,15 +119,18 @@ def edge_factors(
     return moment / area, damping * moment / area**2
 
 
-def set_edges(model: Any, fabric: Fabric, kind: Kind) -> None:
-    """Give every edge of a finished model, of this cloth alone, its own bending stiffness."""
+def set_edges(model: Any, fabric: Fabric, mesh: Mesh, kind: Kind) -> None:
+    """Give every edge of a finished model, of this cloth alone, its own bending stiffness.
+
+    `fabric`, `mesh`, `kind` as of `cloth`.
+    """
     indices = model.edge_indices.numpy()  # opposite, opposite, start, end
     places = model.particle_q.numpy().astype(np.float64)
     inner = (indices[:, :2] >= 0).all(axis=1)
     first, second, start, end = (places[indices[:, i]] for i in range(4))
     area = _area(first, start, end) + _area(second, start, end)
     length = model.edge_rest_length.numpy().astype(np.float64)
-    bending, damping = stiffness.mean_bending(fabric), float(fabric.damping)
+    bending, damping = stiffness.hinge_stiffness(fabric, mesh), float(fabric.damping)
     properties = model.edge_bending_properties.numpy().copy()
     factors = edge_factors(length[inner], area[inner], kind, bending, damping)
     properties[inner] = np.stack(factors, axis=1)

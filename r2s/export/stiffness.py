@@ -121,10 +121,17 @@ def nearest_isotropic(
     return float(np.exp(ratios(poisson).mean())), poisson
 
 
-def mean_bending(fabric: Fabric) -> float:
-    """The bending stiffness [N m] nearest to those of all directions; 0 when one is."""
-    values = np.array(list(bending_stiffness(fabric).values()))
-    return float(np.exp(np.mean(np.log(values)))) if values.min() > 0 else 0.0
+def hinge_stiffness(fabric: Fabric, mesh: Mesh) -> float:
+    """The stiffness of hinges [N m] on a mesh that bend most as a fabric does in all directions.
+
+    Less than the fabric's, since hinges are too stiff across the diagonals (`hinged`); 0 for a
+    fabric without bending stiffness.
+    """
+    own = bending_stiffness(fabric)
+    if min(own.values()) <= 0:
+        return 0.0
+    shown = hinged(mesh, 1.0)
+    return float(np.exp(np.mean([np.log(own[name] / shown[name]) for name in own])))
 
 
 def errors(exported: dict[str, float], own: dict[str, float]) -> dict[str, float]:

@@ -24,7 +24,7 @@ from r2s.files import write_bytes
 FORMAT = "r2s-cell/1"
 KEY_LENGTH = 16  # of a key in the name of a file, hexadecimal digits
 ABOUT = "about.json"
-VERSIONS = ("r2s", "jax", "jaxlib", "numpy")
+VERSIONS = {name: version(name) for name in ("r2s", "jax", "jaxlib", "numpy")}
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Cell:
     @property
     def key(self) -> str:
         """A hash of the configuration and of the inputs, whose configurations are part of it."""
-        return sha256(f"{FORMAT} {version('r2s')} {self!r}".encode()).hexdigest()[:KEY_LENGTH]
+        return sha256(f"{FORMAT} {VERSIONS['r2s']} {self!r}".encode()).hexdigest()[:KEY_LENGTH]
 
     def path(self, folder: Path) -> Path:
         """Where its result is, or will be."""
@@ -95,7 +95,7 @@ def execute(cell: Cell, folder: Path) -> None:
             "kind": cell.kind,
             "name": cell.name,
             "config": repr(cell),
-            "versions": {name: version(name) for name in VERSIONS},
+            "versions": VERSIONS,
             "seconds": time.perf_counter() - began,
             "cpu_seconds": time.process_time() - spent,
             "peak_memory_MB": _peak_memory(),  # of the process so far

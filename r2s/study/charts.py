@@ -25,10 +25,14 @@ def rank_chart(path: Path | str, ranks: Mapping[str, Ranks]) -> Path:
     The bar below is as long as two mean ranks must be apart to be told from each other.
     """
     count = max(len(each.columns) for each in ranks.values())
-    size = (max(5.5, 4.6 * len(ranks)), 1.9 + 0.34 * count)
+    across = min(2, len(ranks))
+    down = -(-len(ranks) // across)
+    size = (5.6 * across, 0.4 + (1.5 + 0.3 * count) * down)
     figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(1, len(ranks), squeeze=False)[0]
-    for axes, (title, each) in zip(panels, ranks.items(), strict=True):
+    panels = figure.subplots(down, across, squeeze=False).ravel()
+    for axes in panels[len(ranks) :]:
+        axes.remove()
+    for axes, (title, each) in zip(panels, ranks.items(), strict=False):
         order = np.argsort(each.mean, kind="stable")
         places = np.arange(len(order))
         axes.hlines(places, each.low[order], each.high[order], color=BLUE, linewidth=5, alpha=0.35)

@@ -13,7 +13,7 @@ one. The explained variance is adjusted for degrees of freedom, so that a factor
 a share of zero on average, which may come out slightly below.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import permutations
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer
 
 from r2s.study.panel import LEVEL, Panel, Weights, interval, resamples
-from r2s.study.tables import Table
+from r2s.study.tables import MISSING, Table
 
 NESTED = {"trajectory": ("fabric", "motion")}  # what must enter before it
 REST = "rest"
@@ -201,19 +201,25 @@ def _confounded(data: _Data, names: Sequence[str]) -> tuple[tuple[str, str], ...
     return tuple(found)
 
 
-def share_table(shares: Shares, caption: str) -> Table:
-    """A line a factor, [%]."""
-    numbers = zip(shares.factors, shares.share, shares.low, shares.high, strict=True)
-    lines = tuple(
-        (name, _percent(share), f"{_percent(low)} to {_percent(high)}")
-        for name, share, low, high in numbers
-    )
+def share_table(found: Mapping[str, Shares], caption: str) -> Table:
+    """Shares by motion, [%]: a line a factor."""
+    shown = {motion: _cells_of(each) for motion, each in found.items()}
+    factors = dict.fromkeys(name for cells in shown.values() for name in cells if name != REST)
+    words = " ".join(f"{motion.capitalize()}: {explained(each)}" for motion, each in found.items())
     return Table(
-        ("factor", "share of the variance [%]", f"{LEVEL:.0%} interval"),
-        lines,
-        f"{caption}. {explained(shares)}",
+        ("factor", *(f"{motion} [%]" for motion in found)),
+        tuple((name, *(c.get(name, MISSING) for c in shown.values())) for name in (*factors, REST)),
+        f"{caption}: shares of the variance of the log distance, and {LEVEL:.0%} interval. {words}",
         foot=1,
     )
+
+
+def _cells_of(shares: Shares) -> dict[str, str]:
+    numbers = zip(shares.factors, shares.share, shares.low, shares.high, strict=True)
+    return {
+        name: f"{_percent(share)} [{_percent(low)}, {_percent(high)}]"
+        for name, share, low, high in numbers
+    }
 
 
 def _percent(share: float) -> str:
@@ -222,10 +228,8 @@ def _percent(share: float) -> str:
 
 def explained(shares: Shares) -> str:
     """What the shares are of, in words."""
-    words = [
-        f"Variance of the logarithm of {shares.count} distances, whose deviation is "
-        f"{100 * shares.deviation:.0f} %, by factors (means over the orders of entry)"
-    ]
+    spread = 100 * shares.deviation
+    words = [f"{shares.count} distances, whose logarithm has a deviation of {spread:.0f} %"]
     if shares.confounded:
         pairs = ", ".join(" and ".join(pair) for pair in shares.confounded)
         words.append(f"not crossed in full, so that they share what cannot be told apart: {pairs}")

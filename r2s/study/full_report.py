@@ -102,9 +102,9 @@ def _intro(panel: Panel, missing: Sequence[tuple[str, str]]) -> str:
     how = (
         f"Columns are compared by {panel.metric}. A simulation that diverged is a result: it is "
         f"counted, ranks last, and is in no mean. Intervals are of {LEVEL:.0%}, a bootstrap over "
-        "recordings and over repeats of an estimate; the fabrics are given, so that they say nothing about "
-        "other fabrics. An estimate that was made once has no repeats: then its interval does not "
-        "have its spread."
+        "recordings and over repeats of an estimate; the fabrics are given, so that they say "
+        "nothing about other fabrics. An estimate that was made once has no repeats: then its "
+        "interval does not have its spread."
     )
     return f"{text}\n\n{how}"
 
@@ -159,7 +159,8 @@ def _headlines(every: Panel) -> list[str]:
         shown = {
             column: f"{column.label} {tables.significant(scale * each.mean[i])}{unit} "
             f"({tables.significant(scale * each.low[i])} to "
-            f"{tables.significant(scale * each.high[i])})"
+            f"{tables.significant(scale * each.high[i])}"
+            + (f"; {each.diverged[i]} of {each.runs[i]} diverged)" if each.diverged[i] else ")")
             for i, column in enumerate(panel.columns)
             if np.isfinite(each.mean[i])
         }
@@ -203,7 +204,7 @@ def _distance_chart(out: Path, panel: Panel) -> tuple[tuple[Path, str], ...]:
 def _parts(panel: Panel) -> dict[str, Panel]:
     """Each motion, and all of them together where there are several."""
     parts = by_motion(panel)
-    return parts | ({"all": panel} if len(parts) > 1 else {})
+    return parts | ({"all motions": panel} if len(parts) > 1 else {})
 
 
 def _ranks(out: Path, panel: Panel, keep: Publish) -> list[Section]:
@@ -214,10 +215,7 @@ def _ranks(out: Path, panel: Panel, keep: Publish) -> list[Section]:
     }
     if not found:
         return []
-    shown = tuple(
-        keep(f"ranks_{motion}", ranks.rank_table(each, f"Ranks on {motion}, by {panel.metric}"))
-        for motion, each in found.items()
-    )
+    shown = (keep("ranks", ranks.rank_table(found, f"Ranks by {panel.metric}")),)
     path = charts.rank_chart(out / "figures" / "ranks.png", found)
     words = "Columns are ranked within each recording, so that hard recordings count no more."
     return [Section("Ranks", (words,), shown, ((path, "Mean ranks with their intervals."),))]
@@ -231,10 +229,7 @@ def _factors(out: Path, panel: Panel, keep: Publish) -> list[Section]:
     }
     if not found:
         return []
-    shown = tuple(
-        keep(f"factors_{motion}", factors.share_table(each, f"On {motion}, by {panel.metric}"))
-        for motion, each in found.items()
-    )
+    shown = (keep("factors", factors.share_table(found, f"By {panel.metric}")),)
     path = charts.share_chart(out / "figures" / "factors.png", found)
     words = (
         "How much of the variance of the logarithm of the distance each factor explains, whatever "

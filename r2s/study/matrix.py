@@ -51,7 +51,7 @@ ALL = Plan(FULL, tuple(presets.FIVE), ESTIMATION, EVALUATION // len(MOTIONS), Ma
 LITTLE = Spent(
     points_coarse=6,
     points_starts=1,
-    points_iterations=6,
+    points_iterations=4,
     calls=40,
     fabrics=32,
     epochs=2,
@@ -170,7 +170,7 @@ def recorded(folder: Path, density: float, plan: Plan) -> list[Judged]:
             if other is not None:
                 about = column.solver, density, recording.fabric
                 found += [Judged(estimates[other], *about, r, True) for r in by.values()]
-    return found
+    return list(dict.fromkeys(found))  # columns share the default fabric
 
 
 def _judged(estimates, fabric: str, density: float, unseen) -> list[Judged]:

@@ -17,7 +17,8 @@ from r2s.study.tables import Row
 APPROACHES = {"diffcloud": "DIFFCLOUD", "diffcp": "DiffCP", "physnet": "PhysNet", "pinn": "PINN"}
 MOTIONS = ("folding", "fling", "shaking")  # that no estimate has seen
 LEVEL = 0.9  # of every interval
-DRAWS = 1000
+DRAWS, FEWEST_DRAWS = 1000, 200  # of a bootstrap
+LARGE = 100_000  # values, beyond which fewer draws are made: they take as long together
 
 
 class Column(NamedTuple):
@@ -204,7 +205,7 @@ def over_repeats(
 def resamples(panel: Panel, count: int | None = None, seed: int = 0) -> Iterator[Weights]:
     """Bootstrap draws of trajectories within fabric and motion, of repeats within column, fabric.
 
-    `count`: DRAWS where not given.
+    `count`: where not given DRAWS, of a LARGE panel fewer, at least FEWEST_DRAWS.
 
     A group of one is always itself: with one repeat there is no telling how repeats vary.
     """
@@ -217,7 +218,8 @@ def resamples(panel: Panel, count: int | None = None, seed: int = 0) -> Iterator
          for f in range(fabrics.max(initial=-1) + 1)], axis=1,
     ) if len(fabrics) else np.zeros((len(panel.columns), 0), int)  # fmt: skip
     slots = np.arange(panel.values.shape[2])
-    for _ in range(DRAWS if count is None else count):
+    fewer = min(DRAWS, max(FEWEST_DRAWS, DRAWS * LARGE // max(1, panel.values.size)))
+    for _ in range(fewer if count is None else count):
         trajectory = np.zeros(len(panel.trajectories))
         for group in members:
             np.add.at(trajectory, generator.choice(group, len(group)), 1.0)

@@ -4,6 +4,7 @@ Distances of trajectories differ by more than those of columns; ranks within a t
 comparable. Demsar 2006, Statistical comparisons of classifiers over multiple data sets.
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from jaxtyping import Float
 from scipy import stats
 
 from r2s.study.panel import LEVEL, Column, Panel, interval, over_repeats, resamples, select
-from r2s.study.tables import Table, significant
+from r2s.study.tables import MISSING, Table, significant
 
 SIGNIFICANCE = 0.05
 
@@ -111,25 +112,39 @@ def _friedman(values: Float[np.ndarray, "column block"]) -> Friedman:
     return Friedman(float(found.statistic), float(found.pvalue), blocks)
 
 
-def rank_table(ranks: Ranks, caption: str) -> Table:
-    """The best column first."""
-    order = np.argsort(ranks.mean, kind="stable")
+def rank_table(found: Mapping[str, Ranks], caption: str) -> Table:
+    """Mean ranks by motion: a line a column, the best of the last motion first."""
+    last = list(found.values())[-1]
+    order = [last.columns[i] for i in np.argsort(last.mean, kind="stable")]
+    order += [c for each in found.values() for c in each.columns if c not in last.columns]
+    shown = {motion: _cells(each) for motion, each in found.items()}
     lines = tuple(
-        (
-            ranks.columns[i].label,
-            f"{ranks.mean[i]:.2f}",
-            f"{ranks.low[i]:.2f} to {ranks.high[i]:.2f}",
-            f"{100 * ranks.first[i]:.0f}",
-        )
-        for i in order
+        (column.label, *(cells.get(column, MISSING) for cells in shown.values()))
+        for column in dict.fromkeys(order)
     )
-    header = ("column", "mean rank", f"{LEVEL:.0%} interval", "best of all [%]")
-    return Table(header, lines, f"{caption}. {explained(ranks)}")
+    words = " ".join(f"{motion.capitalize()}: {explained(each)}" for motion, each in found.items())
+    return Table(
+        ("column", *found),
+        lines,
+        f"{caption}: mean rank (1 is best), {LEVEL:.0%} interval, and how often the best of all. "
+        f"{words}",
+    )
+
+
+def _cells(ranks: Ranks) -> dict[Column, str]:
+    numbers = zip(
+        ranks.columns, *(x.tolist() for x in (ranks.mean, ranks.low, ranks.high, ranks.first)),
+        strict=True,
+    )  # fmt: skip
+    return {
+        column: f"{mean:.2f} [{low:.2f}, {high:.2f}], {100 * first:.0f} %"
+        for column, mean, low, high, first in numbers
+    }
 
 
 def explained(ranks: Ranks) -> str:
     """The tests in words."""
-    words = [f"Ranks of {len(ranks.columns)} columns within {ranks.trajectories} trajectories"]
+    words = [f"{len(ranks.columns)} columns, {ranks.trajectories} trajectories"]
     for what, test in (("trajectories", ranks.by_trajectory), ("fabrics", ranks.by_fabric)):
         if np.isfinite(test.p):
             words.append(

@@ -147,11 +147,13 @@ def shown(cells: Iterable[Judged], folder: Path) -> list[Shown]:
     made, at the frames that count."""
     groups: dict[Source, dict[str, np.ndarray]] = {}
     for cell in cells:
-        if cell.is_made(folder) and not cell.other and cell.repeat in ("", "0"):
-            moved = read_motion(cell, folder)
-            groups.setdefault(cell.recordings[0], {}).setdefault(cell.column.label, moved)
+        label, motions = cell.column.label, groups.setdefault(cell.recordings[0], {})
+        if label not in motions and not cell.other and cell.is_made(folder):
+            motions[label] = read_motion(cell, folder)
     found = []
     for source, motions in groups.items():
+        if not motions:
+            continue
         recording = read(source, folder)
         first, last = recording.info.frames_used
         frames = range(first, last + 1)

@@ -20,7 +20,7 @@ BASELINES = {"": "estimate"} | {
 MISSING = "-"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Row:
     """One number of an estimate on a recording. ValueError unless `baseline` is in BASELINES."""
 
