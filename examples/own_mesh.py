@@ -9,6 +9,7 @@ Needs trimesh: pip install 'r2s[study]'
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -43,7 +44,8 @@ def write_disc(path: Path, radius: float = 0.15, rings: int = 5) -> None:
 if __name__ == "__main__":
     if not sys.argv[1:]:
         write_disc(file := Path(tempfile.mkdtemp()) / "disc.obj")
-    loaded = trimesh.load(sys.argv[1] if sys.argv[1:] else file, process=False, force="mesh")
+    path = sys.argv[1] if sys.argv[1:] else file
+    loaded: Any = trimesh.load(path, process=False, force="mesh")
     sheet = r2s.Mesh.make(np.asarray(loaded.vertices)[:, :2], np.asarray(loaded.faces))
     middle = jnp.asarray(np.flatnonzero(np.linalg.norm(sheet.rest, axis=1) < 0.07))
     solver = r2s.Cloth(r2s.Scene(sheet, middle, Table.make(-jnp.inf), Air.make()), dt=0.02)

@@ -255,6 +255,7 @@ def test_arcsim_keeps_the_directions(tmp_path):
 @pytest.mark.parametrize("elastic", ["membrane", "both"])
 def test_mujocos_forces_are_ours(elastic):
     engine = pytest.importorskip("mujoco", reason="MuJoCo is not installed: r2s[bench]")
+    engine.set_mju_user_warning(lambda message: None)  # or it writes a log file where it is run
     fabric = dataclasses.replace(DENIM, damping=jnp.asarray(0.0))
     if elastic == "membrane":
         fabric = dataclasses.replace(fabric, bending=PlateBending.make(0.0))

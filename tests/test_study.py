@@ -169,3 +169,18 @@ def test_a_wrong_call_says_what_is_wrong_and_writes_nothing(arguments, message, 
     assert done.returncode == 1
     assert message in done.stderr
     assert not out.exists()
+
+
+def test_given_recordings_are_shown_one_by_one():
+    def row(approach, baseline, recording, value):
+        scenario = "lifting" if approach else ""
+        about = approach, "cloth" if baseline != "repeatability" else "", scenario, "silk", "0"
+        metric = "chamfer_real_to_sim", "m", value
+        return tables.Row(*about, recording, "folding", baseline, *metric)
+
+    rows = [row("diffcloud", "", "fold_silk", 0.02), row("", "default", "fold_silk", 0.03)]
+    rows += [row("diffcloud", "other_fabric", "fold_silk", 0.025)]
+    rows += [row("", "repeatability", "fold_silk", 0.01)]
+    (found,) = results.by_recording(rows).values()
+    assert found.rows[0] == ("silk", "fold_silk", "20.0", "30.0", "25.0", "10.0")
+    assert results.by_recording(rows[:2]) == {}  # as of made recordings

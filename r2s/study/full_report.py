@@ -1,6 +1,6 @@
 """Everything that a study has found, as tables, pictures, videos and one report."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -9,26 +9,24 @@ import numpy as np
 from tqdm import tqdm
 
 from r2s.family import Range
-from r2s.study import charts, factors, findings, overlays, ranks, tables
-from r2s.study.distances import METRICS, distance_tables, means
+from r2s.study import comparisons, overlays, tables
+from r2s.study.comparisons import Publish
 from r2s.study.panel import (
     LEVEL,
     MOTIONS,
     PAPER_COLUMNS,
     Panel,
     by_metric,
-    by_motion,
     columns_of,
     make_panel,
 )
-from r2s.study.paper import CITED, Paper, paper_tables, read_paper
+from r2s.study.paper import read_paper
 from r2s.study.report import Section, write_report
 from r2s.study.shown import Shown
 from r2s.study.tables import Row, Table, parameter_table
 from r2s.study.viewer import viewer
 
 Entry = tuple[str, tuple[Range, ...], Any, Any, Any, Any]  # of tables.parameter_table
-Publish = Callable[[str, Table], Table]
 
 TITLE = "A study of fabrics: from recordings to simulations"
 JUDGED_BY = ("chamfer", "chamfer_cropped", "chamfer_real_to_sim", "paper_chamfer", "hausdorff")
@@ -75,10 +73,10 @@ def publish(
     metrics = [metric for metric in JUDGED_BY if metric in rows_of]
     panel = make_panel(rows_of[metrics[0]], metrics[0]) if metrics else make_panel([], JUDGED_BY[0])
     sections = [
-        *_findings(rows_of, metrics, panel, paper, keep),
-        *_distances(out, rows, panel, paper, keep),
-        *_ranks(out, panel, keep),
-        *_factors(out, panel, keep),
+        *comparisons.findings_section(rows_of, metrics, panel, paper, keep),
+        *comparisons.distance_sections(out, rows, panel, paper, keep),
+        *comparisons.rank_section(out, panel, keep),
+        *comparisons.factor_section(out, panel, keep),
         *_motions(out, shown),
         *_parameters(parameters, keep),
         *_missing(rows, missing, keep),
@@ -109,137 +107,6 @@ def _intro(panel: Panel, missing: Sequence[tuple[str, str]]) -> str:
     return f"{text}\n\n{how}"
 
 
-def _findings(
-    rows_of: Mapping[str, Sequence[Row]],
-    metrics: Sequence[str],
-    panel: Panel,
-    paper: Paper,
-    keep: Publish,
-) -> list[Section]:
-    """The conclusions of the paper, by each of `metrics`; in words by the first."""
-    if not metrics:
-        return [Section("Findings", ("There are no results yet.",))]
-    found = {metric: findings.find(rows_of[metric], paper, metric) for metric in metrics}
-    first = found[metrics[0]]
-    words = [
-        *_headlines(panel),
-        "Each conclusion of the paper is a test on these numbers. Ratios are of distances, or of "
-        "what is named, with their interval; they are above 1 where the conclusion is right. All "
-        "p are Wilcoxon's signed-rank test with Holm's correction.",
-        *(findings.in_words(verdict) for verdict in first),
-    ]
-    if not paper:
-        words.append("The tables of the paper were not given: its own numbers are not shown.")
-    lines = tuple(
-        (first[i].claim.words, *(found[metric][i].answer for metric in metrics))
-        for i in range(len(first))
-    )
-    caption = f"Which conclusions of the paper ({CITED}) hold here, by metric"
-    return [
-        Section(
-            "Findings",
-            tuple(words),
-            (
-                keep("findings", Table(("conclusion", *metrics), lines, caption)),
-                *(
-                    keep(f"findings_{metric}", findings.finding_table(found[metric], metric))
-                    for metric in metrics[:1]
-                ),
-            ),
-        )
-    ]
-
-
-def _headlines(every: Panel) -> list[str]:
-    """The best columns of each motion, beside the default fabric."""
-    found = []
-    for motion, panel in by_motion(every).items():
-        each = means(panel)
-        scale, unit = (1e3, " mm") if panel.unit == "m" else (1.0, "")
-        shown = {
-            column: f"{column.label} {tables.significant(scale * each.mean[i])}{unit} "
-            f"({tables.significant(scale * each.low[i])} to "
-            f"{tables.significant(scale * each.high[i])}"
-            + (f"; {each.diverged[i]} of {each.runs[i]} diverged)" if each.diverged[i] else ")")
-            for i, column in enumerate(panel.columns)
-            if np.isfinite(each.mean[i])
-        }
-        order = [panel.columns[i] for i in np.argsort(each.mean) if panel.columns[i] in shown]
-        best = [shown[column] for column in order if column.approach][:3]
-        defaults = [shown[column] for column in order if not column.approach]
-        if best:
-            compared = f"; {', '.join(defaults)}" if defaults else ""
-            found.append(f"Least {every.metric} in {motion}: {', '.join(best)}{compared}.")
-    return found
-
-
-def _distances(
-    out: Path, rows: Sequence[Row], panel: Panel, paper: Paper, keep: Publish
-) -> list[Section]:
-    sections = []
-    ours = [keep(name, table) for name, table in distance_tables(rows).items()]
-    if ours:
-        figures = _distance_chart(out, panel) if panel.metric in METRICS else ()
-        sections.append(Section("Distances in millimetres", (), tuple(ours), figures))
-    beside = [keep(name, table) for name, table in paper_tables(rows, paper).items()]
-    if beside:
-        words = (
-            "Every cloud is centred on its first frame's centroid and divided by half of its first "
-            "frame's largest radius; Chamfer distances are means of squares, both directions "
-            "summed. That hides errors of size, and clouds that were seen in part are compared "
-            "with whole sheets."
-        )
-        sections.append(Section("In the units of the paper", (words,), tuple(beside)))
-    return sections
-
-
-def _distance_chart(out: Path, panel: Panel) -> tuple[tuple[Path, str], ...]:
-    found = {motion: (each.columns, means(each)) for motion, each in by_motion(panel).items()}
-    if not found:
-        return ()
-    path = charts.distance_chart(out / "figures" / "distances.png", found, panel.metric)
-    return ((path, f"Mean {panel.metric} of every column, with {LEVEL:.0%} intervals."),)
-
-
-def _parts(panel: Panel) -> dict[str, Panel]:
-    """Each motion, and all of them together where there are several."""
-    parts = by_motion(panel)
-    return parts | ({"all motions": panel} if len(parts) > 1 else {})
-
-
-def _ranks(out: Path, panel: Panel, keep: Publish) -> list[Section]:
-    found = {
-        motion: ranked
-        for motion, part in _parts(panel).items()
-        if (ranked := ranks.rank(part)) is not None
-    }
-    if not found:
-        return []
-    shown = (keep("ranks", ranks.rank_table(found, f"Ranks by {panel.metric}")),)
-    path = charts.rank_chart(out / "figures" / "ranks.png", found)
-    words = "Columns are ranked within each recording, so that hard recordings count no more."
-    return [Section("Ranks", (words,), shown, ((path, "Mean ranks with their intervals."),))]
-
-
-def _factors(out: Path, panel: Panel, keep: Publish) -> list[Section]:
-    found = {
-        motion: shares
-        for motion, part in _parts(panel).items()
-        if (shares := factors.variance_shares(part)) is not None
-    }
-    if not found:
-        return []
-    shown = (keep("factors", factors.share_table(found, f"By {panel.metric}")),)
-    path = charts.share_chart(out / "figures" / "factors.png", found)
-    words = (
-        "How much of the variance of the logarithm of the distance each factor explains, whatever "
-        "the order in which factors are looked at. The rest is interactions, such as a solver that "
-        "is good for one fabric, and the spread of repeats."
-    )
-    caption = "Shares of the variance, by what was judged."
-    return [Section("What matters", (words,), shown, ((path, caption),))]
-
-
 def _motions(out: Path, shown: Sequence[Shown]) -> list[Section]:
     """Overlays of each fabric, a video of each motion, and the viewer."""
     if not shown:
@@ -256,8 +123,8 @@ def _motions(out: Path, shown: Sequence[Shown]) -> list[Section]:
         )
         pictures.append((path, caption))
     order = {motion: i for i, motion in enumerate(MOTIONS)}
-    by_motion = {each.evaluated_on: each for each in reversed(chosen)}
-    filmed = sorted(by_motion.values(), key=lambda each: order.get(each.evaluated_on, len(order)))
+    filmed_of = {each.evaluated_on: each for each in reversed(chosen)}
+    filmed = sorted(filmed_of.values(), key=lambda each: order.get(each.evaluated_on, len(order)))
     names = [
         overlays.video(out / "videos", each).name for each in tqdm(filmed, "videos", disable=None)
     ]

@@ -28,7 +28,8 @@ class Friedman(NamedTuple):
 class Ranks(NamedTuple):
     """Mean ranks, 1 the best, of the columns that were all judged on the same trajectories.
 
-    - `low`, `high`: interval by a bootstrap over trajectories and repeats.
+    - `low`, `high`: interval by a bootstrap over trajectories and repeats. Means of resampled
+      repeats scatter more than those of all, so that intervals reach to the middle rather too far.
     - `first`: the share of trajectories in which a column is the best.
     - `trajectories`: how many count; `left_out`: columns that lack most of them.
     - `by_trajectory`: the test of all but default fabrics with trajectories as blocks, which takes

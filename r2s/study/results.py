@@ -3,7 +3,7 @@
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,9 @@ from r2s.study.engine import closure
 from r2s.study.estimates import ESTIMATE, Estimated, family_of, read_estimate
 from r2s.study.evaluations import Judged, read_measured, read_motion
 from r2s.study.matrix import Plan, synthetic
+from r2s.study.panel import Column
 from r2s.study.shown import Shown
-from r2s.study.tables import Row, Table, significant, write_rows
+from r2s.study.tables import Row, Table, pivot, significant, write_rows
 from r2s.study.truths import Made, Source, read, small_strain
 
 Entry = tuple[str, tuple[Range, ...], Any, Any, Any, Any]
@@ -112,6 +113,34 @@ def _repeatability(cells: Sequence[Judged], folder: Path) -> list[Row]:
                 Row(*about_it, metric, judge.UNITS.get(metric, "m"), value)
                 for metric, value in measured.items()
             ]
+    return found
+
+
+def by_recording(rows: Sequence[Row], metric: str = "chamfer_real_to_sim") -> dict[str, Table]:
+    """One table a column and scenario: each recording's error beside that of the default fabric, of
+    another fabric's estimate and of another trial. Of given recordings alone, where an estimate is
+    judged by what belongs to it."""
+    columns = dict.fromkeys(
+        Column(row.approach, row.solver, row.estimated_from)
+        for row in rows
+        if row.approach and row.baseline == "other_fabric"
+    )
+    found = {}
+    for column in columns:
+        theirs = [
+            row
+            for row in rows
+            if (row.approach, row.estimated_from)
+            in ((column.approach, column.estimated_from), ("", ""))
+            and row.solver in (column.solver, "")
+        ]
+        # where several estimates are judged by one recording, the first
+        first = {(r.recording, r.evaluated_on, r.baseline, r.metric): r for r in reversed(theirs)}
+        theirs = list(reversed(first.values()))
+        for scenario in dict.fromkeys(row.evaluated_on for row in theirs):
+            table = pivot(theirs, metric, scenario)
+            name = f"{'_'.join(column)}_on_{scenario}"
+            found[name] = replace(table, caption=f"{column.label}: {table.caption}")
     return found
 
 
