@@ -125,9 +125,9 @@ class Card:
 
 def preset(name: str) -> Card:
     """The card of a preset of `r2s.presets`; `ValueError` names the presets there are."""
-    if name not in presets.FIVE:
-        raise ValueError(f"no preset {name!r}; there are {', '.join(presets.FIVE)}")
-    make = presets.FIVE[name]
+    if name not in presets.MEASURED:
+        raise ValueError(f"no preset {name!r}; there are {', '.join(presets.MEASURED)}")
+    make = presets.MEASURED[name]
     described = " ".join((make.__doc__ or "").split())
     about = Provenance(
         method=f"{described} Areal density and stiffness at small strains, rounded to two digits; "

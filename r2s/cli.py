@@ -32,6 +32,7 @@ from r2s.commands.estimate import EstimateCard
 from r2s.commands.evaluate import Evaluate
 from r2s.commands.export import Export
 from r2s.commands.simulate import Simulate
+from r2s.commands.study import Study
 
 
 @dataclass(frozen=True)
@@ -190,6 +191,7 @@ Command = (
     | Annotated[Export, subcommand("export")]
     | Annotated[CheckGrad, subcommand("check-grad")]
     | Annotated[Doctor, subcommand("doctor")]
+    | Annotated[Study, subcommand("study")]
 )
 
 
@@ -198,20 +200,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Raises SystemExit, with 0 after --help and 2 after a wrong usage, whose message is on stderr.
     """
-    command = tyro.cli(
-        Command,  # pyright: ignore[reportArgumentType]
-        prog="r2s",
-        description="r2s: real-to-sim for fabrics. Each command tells more with --help.",
-        args=arguments,
-        config=(OmitArgPrefixes, OmitSubcommandPrefixes, FlagCreatePairsOff),
-    )
     try:
+        command = tyro.cli(
+            Command,  # pyright: ignore[reportArgumentType]
+            prog="r2s",
+            description="r2s: real-to-sim for fabrics. Each command tells more with --help.",
+            args=arguments,
+            config=(OmitArgPrefixes, OmitSubcommandPrefixes, FlagCreatePairsOff),
+        )
         with warnings.catch_warnings():
             warnings.showwarning = _warn
             return command.run() or 0
     except BrokenPipeError:  # whoever read the output had enough
         sys.stdout = None
-    except (ValueError, TypeError, OSError, ImportError, RuntimeError) as error:
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
         print(f"r2s: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

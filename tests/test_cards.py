@@ -147,7 +147,7 @@ def test_what_is_not_determined_is_on_the_card_with_units():
 
 
 def test_the_presets_have_cards_with_their_source():
-    for name, make in presets.FIVE.items():
+    for name, make in presets.MEASURED.items():
         card = cards.preset(name)
         assert same(card.fabric, make()) and card.estimate is None
         assert "2011" in card.provenance.source and "friction" in card.provenance.assumed

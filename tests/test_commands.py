@@ -69,6 +69,7 @@ def test_an_error_is_one_line_and_1(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_motion_is_simulated(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out = tmp_path / "x.npz"
     command = ["simulate", "lifting", "--fabric", "black_denim", "--out", str(out), *SHORT]
@@ -128,7 +129,7 @@ def test_the_doctor_knows_the_installation(capsys: pytest.CaptureFixture) -> Non
 
 
 def test_the_doctor_finds_wrong_units(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    for make in presets.FIVE.values():
+    for make in presets.MEASURED.values():
         assert not list(implausible(make()))
     wrong = dataclasses.replace(presets.black_denim(), density=jnp.asarray(320.0))
     cards.write(tmp_path / "grams.json", Card.make("grams", wrong, Provenance("weighed in g")))

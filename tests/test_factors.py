@@ -103,7 +103,8 @@ def test_what_diverged_is_counted():
     distance = lambda column, f, m, trial, r: math.nan if trial == 2 else 0.02
     found, _ = shares(made_up_rows(distance, PAPER_COLUMNS[:2], noise=0.1, trials=5))
     assert (found.count, found.diverged) == (48, 12)
-    assert "12 runs that diverged" in share_table({"fling": found}, "").caption
+    assert "48 on fling" in share_table({"fling": found}, "").caption
+    assert "12 more diverged" in share_table({"fling": found}, "").caption
 
 
 def test_too_little_to_tell():

@@ -1,6 +1,7 @@
 """What is installed finds the descriptions of the data sets, which lie beside the package."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -28,27 +29,57 @@ def test_every_manifest_is_package_data() -> None:
     assert listed == set(MANIFESTS.rglob("*.json")) != set()
 
 
+def build_wheel(folder: Path) -> Path:
+    """From a copy, since building leaves files behind."""
+    source = folder / "source"
+    for name in ("r2s", "data_manifests"):
+        shutil.copytree(ROOT / name, source / name, symlinks=True)
+    for name in ("pyproject.toml", "README.md"):
+        shutil.copy(ROOT / name, source)
+    pip = [sys.executable, "-m", "pip", "wheel", str(source), "--no-deps", "-q", "-w", str(folder)]
+    subprocess.run([*pip, "-c", str(ROOT / "constraints.txt")], check=True, cwd=folder)
+    (wheel,) = folder.glob("r2s-*.whl")
+    return wheel
+
+
+@pytest.mark.slow
+def test_what_the_readme_says_runs_where_only_a_wheel_is_installed(tmp_path: Path) -> None:
+    """In an environment of its own, away from the checkout: commands that need no data of others,
+    and all Python."""
+    wheel = build_wheel(tmp_path)
+    environment = tmp_path / "environment"
+    subprocess.run([sys.executable, "-m", "venv", environment], check=True)
+    binaries = environment / "bin"
+    install = [
+        binaries / "python",
+        "-m",
+        "pip",
+        "install",
+        "-q",
+        f"{wheel}[study,camera,pcd,data,cli]",
+    ]
+    subprocess.run([*install, "-c", ROOT / "constraints.txt"], check=True, cwd=tmp_path)
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    commands = [line.strip() for line in re.findall(r"^ {4}(r2s .*?)(?:  +#.*)?$", readme, re.M)]
+    unaided = [c for c in commands if not re.search(r"recordings|diffcloud|\.\.\.", c)]
+    assert len(unaided) >= 3, commands
+    ours = os.environ | {"PATH": f"{binaries}:{os.environ['PATH']}", "JAX_PLATFORMS": "cpu"}
+    for command in unaided:
+        run = subprocess.run(command, shell=True, cwd=tmp_path, env=ours, capture_output=True)
+        assert run.returncode == 0, (command, run.stderr[-2000:])
+    (tmp_path / "blocks.py").write_text(
+        "\n".join(re.findall(r"^```python\n(.*?)^```", readme, re.M | re.S))
+    )
+    run = subprocess.run(
+        [binaries / "python", "blocks.py"], cwd=tmp_path, env=ours, capture_output=True
+    )
+    assert run.returncode == 0, run.stderr[-2000:]
+
+
 @pytest.mark.slow
 def test_a_wheel_knows_the_data_sets(tmp_path: Path) -> None:
     """Built and unpacked elsewhere; that folder comes before the one that the tests import."""
-    source = tmp_path / "source"  # a copy: building leaves files behind
-    for folder in ("r2s", "data_manifests"):
-        shutil.copytree(ROOT / folder, source / folder, symlinks=True)
-    for file in ("pyproject.toml", "README.md"):
-        shutil.copy(ROOT / file, source)
-    pip = [
-        sys.executable,
-        "-m",
-        "pip",
-        "wheel",
-        str(source),
-        "--no-deps",
-        "-q",
-        "-w",
-        str(tmp_path),
-    ]
-    subprocess.run([*pip, "-c", str(ROOT / "constraints.txt")], check=True, cwd=tmp_path)
-    (wheel,) = tmp_path.glob("r2s-*.whl")
+    wheel = build_wheel(tmp_path)
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path / "site")
     code = "import r2s, r2s.cli; print(r2s.__file__); r2s.cli.main(['data', 'list'])"

@@ -1,6 +1,7 @@
 """The panel of a study: what is compared, and how it is resampled."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from r2s.study.panel import (
     PAPER_COLUMNS,
     Column,
     columns_of,
+    defined,
     interval,
     make_panel,
     over_repeats,
@@ -56,6 +58,19 @@ def test_other_baselines_and_motions_are_left_out():
     assert make_panel(rows, "hausdorff").values.shape == (0, 0, 0)
     part = select(make_panel(rows, "chamfer"), lambda c: c.solver == "points")
     assert part.values.shape == (0, 1, 1)
+
+
+def test_a_metric_without_a_value_is_not_a_run_that_diverged():
+    rows = [
+        replace(row(value, recording=name), metric=metric)
+        for name, values in {"well": (0.1, math.nan), "lost": (math.nan, math.nan)}.items()
+        for metric, value in zip(("chamfer", "chamfer_cropped"), values, strict=True)
+    ]
+    kept, left_out = defined(rows)
+    assert [(r.recording, r.metric) for r in kept] == [
+        ("well", "chamfer"), ("lost", "chamfer"), ("lost", "chamfer_cropped")
+    ]  # fmt: skip
+    assert left_out == {"chamfer_cropped": 1}
 
 
 def test_two_values_of_one_place_and_two_units_are_refused():

@@ -23,10 +23,12 @@ def card_of(text: str) -> "Card":
     """
     from r2s import cards, presets
 
-    if text in presets.FIVE:
+    if text in presets.MEASURED:
         return cards.preset(text)
     if not Path(text).exists():
-        raise ValueError(f"{text}: no such card, and no preset; they are {', '.join(presets.FIVE)}")
+        raise ValueError(
+            f"{text}: no such card, and no preset; they are {', '.join(presets.MEASURED)}"
+        )
     return cards.read(text)
 
 

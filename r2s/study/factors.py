@@ -205,11 +205,11 @@ def share_table(found: Mapping[str, Shares], caption: str) -> Table:
     """Shares by motion, [%]: a line a factor."""
     shown = {motion: _cells_of(each) for motion, each in found.items()}
     factors = dict.fromkeys(name for cells in shown.values() for name in cells if name != REST)
-    words = " ".join(f"{motion.capitalize()}: {explained(each)}" for motion, each in found.items())
     return Table(
         ("factor", *(f"{motion} [%]" for motion in found)),
         tuple((name, *(c.get(name, MISSING) for c in shown.values())) for name in (*factors, REST)),
-        f"{caption}: shares of the variance of the log distance, and {LEVEL:.0%} interval. {words}",
+        f"{caption}: shares of the variance of the log distance, and {LEVEL:.0%} interval. "
+        f"{explained(found)}",
         foot=1,
     )
 
@@ -226,13 +226,17 @@ def _percent(share: float) -> str:
     return f"{100 * share:.1f}".replace("-0.0", "0.0")
 
 
-def explained(shares: Shares) -> str:
+def explained(found: Mapping[str, Shares]) -> str:
     """What the shares are of, in words."""
-    spread = 100 * shares.deviation
-    words = [f"{shares.count} distances, whose logarithm has a deviation of {spread:.0f} %"]
-    if shares.confounded:
-        pairs = ", ".join(" and ".join(pair) for pair in shares.confounded)
-        words.append(f"not crossed in full, so that they share what cannot be told apart: {pairs}")
-    if shares.diverged:
-        words.append(f"{shares.diverged} runs that diverged have no distance and do not count")
-    return "; ".join(words) + "."
+    counts = ", ".join(
+        f"{each.count} on {motion} (deviation of the logarithm {100 * each.deviation:.0f} %"
+        + (f"; {each.diverged} more diverged, and have none)" if each.diverged else ")")
+        for motion, each in found.items()
+    )
+    pairs = dict.fromkeys(" and ".join(pair) for each in found.values() for pair in each.confounded)
+    if not pairs:
+        return f"Distances: {counts}."
+    return (
+        f"Distances: {counts}. Not crossed in full, so that they share what cannot be told apart: "
+        f"{', '.join(pairs)}."
+    )

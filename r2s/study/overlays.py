@@ -28,6 +28,7 @@ from r2s.study.shown import Shown
 
 DOTS = "#404040"
 VIEW = {"projection": "3d", "elev": 15, "azim": -60}
+RECORDING = "recording [m]"
 ACROSS = 5  # panels in a row of a video, at most
 
 
@@ -43,16 +44,16 @@ def overview(path: Path | str, shown: Sequence[Shown]) -> Path:
     order = {motion: i for i, motion in enumerate(MOTIONS)}
     rows = sorted(shown, key=lambda each: order.get(each.evaluated_on, len(order)))
     labels = list(dict.fromkeys(label for each in rows for label in each.motions))
-    size = (0.75 + 1.9 * (len(labels) + 1), 0.5 + 2.0 * len(rows))  # [inch]
+    size = (0.9 + 1.7 * (len(labels) + 1), 0.5 + 1.8 * len(rows))  # [inch]
     figure = Figure(figsize=size)
     figure.subplots_adjust(
-        left=0.45 / size[0], right=1 - 0.3 / size[0], bottom=0.02, top=1 - 0.5 / size[1],
+        left=0.45 / size[0], right=1 - 0.45 / size[0], bottom=0.02, top=1 - 0.5 / size[1],
         wspace=0.02, hspace=0.06,
     )  # fmt: skip
     panels = figure.subplots(len(rows), len(labels) + 1, subplot_kw=VIEW, squeeze=False)
     for each, row in zip(rows, panels, strict=True):
         frame = late_frame(each)
-        box = _box(each, [frame])
+        box = _box(each, frame)
         dots = thin(each.clouds[frame])
         for label, axes in zip(labels, row, strict=False):
             sheet = each.motions.get(label)
@@ -68,7 +69,7 @@ def overview(path: Path | str, shown: Sequence[Shown]) -> Path:
         text = f"{each.evaluated_on}, {each.times[frame]:.2f} s\n{each.fabric.replace('_', ' ')}"
         figure.text(0.12 / size[0], (middle.y0 + middle.y1) / 2, text, rotation=90, va="center",
                     ha="left", fontsize=9)  # fmt: skip
-    for label, axes in zip([*labels, "recording"], panels[0], strict=True):
+    for label, axes in zip([*labels, RECORDING], panels[0], strict=True):
         middle = axes.get_position()
         words = label.rsplit(" ", 2) if label.count(" ") > 1 else [label]
         heading = words[0] + ("\n" + " ".join(words[1:]) if len(words) > 1 else "")
@@ -101,7 +102,7 @@ def pictures(shown: Shown) -> Iterator[np.ndarray]:
     """Each frame as a picture, (height, width, 3) in 0..255, of even sides."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    labels, box = [*shown.motions, ""], _box(shown, range(len(shown.times)))
+    labels, box = [*shown.motions, ""], _box(shown)
     across = min(ACROSS, len(labels))
     down = -(-len(labels) // across)
     figure = Figure(figsize=(2.4 * across, 2.5 * down + 0.3), dpi=100)
@@ -112,7 +113,7 @@ def pictures(shown: Shown) -> Iterator[np.ndarray]:
         axes.remove()
     for label, axes in zip(labels, panels, strict=False):
         _dress(axes, box, is_labelled=not label)
-        axes.set_title(label or "recording", fontsize=9, y=0.97)
+        axes.set_title(label or RECORDING, fontsize=9, y=0.97)
     caption = figure.text(0.01, 0.995, "", va="top", fontsize=10)
     for frame in range(len(shown.times)):
         drawn = []
@@ -127,11 +128,22 @@ def pictures(shown: Shown) -> Iterator[np.ndarray]:
             artist.remove()
 
 
-def _box(shown: Shown, frames: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    sheets = [x[list(frames)].reshape(-1, 3) for x in shown.motions.values()]
-    dots = np.concatenate([thin(shown.clouds[i]) for i in frames])
-    vertices = np.concatenate([np.zeros((0, 3)), *sheets])
-    return limits(dots if len(dots) else np.zeros((1, 3)), vertices)
+def _box(shown: Shown, frame: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Limits [m] that hold the recording and sheets that did not fly off; or those of a frame."""
+    dots = [thin(cloud) for cloud in shown.clouds]
+    sheets = [x.reshape(-1, 3) for x in shown.motions.values()]
+    every = np.concatenate(dots) if any(map(len, dots)) else np.zeros((1, 3))
+    low, high = limits(every, np.concatenate([np.zeros((0, 3)), *sheets]))
+    if frame is None:
+        return low, high
+    here = np.concatenate([dots[frame], *(x[frame] for x in shown.motions.values())])
+    here = here[inside(here, low, high)]
+    if not len(here):
+        return low, high
+    # Strays of the cloud do not widen the picture.
+    ends = np.percentile(here, [0.2, 99.8], axis=0)
+    margin = 0.03 * float((ends[1] - ends[0]).max()) + 1e-3
+    return ends[0] - margin, ends[1] + margin
 
 
 def _dress(axes: Any, box: tuple[np.ndarray, np.ndarray], is_labelled: bool) -> None:
@@ -139,15 +151,13 @@ def _dress(axes: Any, box: tuple[np.ndarray, np.ndarray], is_labelled: bool) -> 
     axes.computed_zorder = False  # the dots lie over the cloth, whatever their depth
     axes.patch.set_alpha(0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(high - low, zoom=1.0)
+    axes.set_box_aspect(high - low, zoom=1.2)
     if not is_labelled:
         axes.set_axis_off()
         return
-    for axis, name in ((axes.xaxis, "x"), (axes.yaxis, "y"), (axes.zaxis, "z")):
-        size = (high - low)["xyz".index(name)]
-        axis.set_major_locator(MaxNLocator(2 if 3 * size > (high - low).max() else 1))
-        axis.set_label_text(f"{name} [m]", fontsize=7)
-        axis.labelpad = -9
+    for i, axis in enumerate((axes.xaxis, axes.yaxis, axes.zaxis)):
+        is_short = 3 * (high - low)[i] < (high - low).max()
+        axis.set_major_locator(MaxNLocator(1 if is_short else 2))
     axes.tick_params(labelsize=6, pad=-5)
     axes.tick_params("z", pad=-3)
 

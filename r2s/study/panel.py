@@ -7,12 +7,13 @@ these fabrics, not about others.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from r2s.study.tables import Row
+from r2s.study.tables import COLUMNS, Row
 
 APPROACHES = {"diffcloud": "DIFFCLOUD", "diffcp": "DiffCP", "physnet": "PhysNet", "pinn": "PINN"}
 MOTIONS = ("folding", "fling", "shaking")  # that no estimate has seen
@@ -102,6 +103,23 @@ def by_metric(rows: Iterable[Row]) -> dict[str, list[Row]]:
     for row in rows:
         found.setdefault(row.metric, []).append(row)
     return found
+
+
+def defined(rows: Iterable[Row]) -> tuple[list[Row], dict[str, int]]:
+    """Rows without those whose metric has no value for a run that did not diverge.
+
+    That is a run of which another metric is finite. Second, how many of each metric are left out.
+    """
+    rows = list(rows)
+    run = attrgetter(*COLUMNS[: COLUMNS.index("metric")])
+    finite = {run(row) for row in rows if np.isfinite(row.value)}
+    kept, left_out = [], dict[str, int]()
+    for row in rows:
+        if np.isfinite(row.value) or run(row) not in finite:
+            kept.append(row)
+        else:
+            left_out[row.metric] = left_out.get(row.metric, 0) + 1
+    return kept, left_out
 
 
 def by_motion(panel: Panel) -> dict[str, Panel]:
