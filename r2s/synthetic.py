@@ -41,11 +41,11 @@ FORCE_NOISE = 0.01  # [N]
 class Sensing(NamedTuple):
     """How cameras see a motion.
 
-    - `cameras`: one or more; a point is recorded that one of them sees.
+    - `cameras`: a point is recorded that one of them sees; none: all of the surface is.
     - `region`: two corners of the box in which outliers lie, [m].
     - `points`: at most, in a frame.
     - `noise`: standard deviation of each coordinate, [m].
-    - `outliers`, `dropped`: fractions of the points, [-].
+    - `outliers`, `dropped`: fractions of the points, [-]; three outliers at least, unless 0.
     - `time_offset`: how much later than the grippers' clock the cameras' is, [s].
     - `margin`: above the table, below which no point is recorded, [m].
     """
@@ -78,6 +78,10 @@ def sensing(experiment: Experiment) -> Sensing:
     low, high = corners.min(axis=0) - [0.1, 0.3, 0.1], corners.max(axis=0) + [0.1, 0.5, 0.1]
     region = (tuple(low.tolist()), tuple(high.tolist()))
     return Sensing(tuple(Camera(array(eye), array(target)) for eye in eyes), region)
+
+
+WHOLE = Sensing((), ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), 10_000, 0.0, 0.0, margin=-math.inf)
+"""All of the surface, as it is: to judge by, as the study does with 10,000 points a frame."""
 
 
 def record(
@@ -238,8 +242,10 @@ def _observe_frame(x: Float[Array, "vertex 3"], faces, resolution: int, lowest, 
     """Noisy points of the surface, and which of them the cameras record."""
     key_pick, key_noise, key_where = jr.split(key, 3)
     surface = sample(x, faces, resolution)
-    visible = jnp.any(jnp.stack([camera.sees(surface) for camera in seen.cameras]), axis=0)
-    visible = visible & (surface[:, 2] > lowest)
+    visible = surface[:, 2] > lowest
+    if seen.cameras:
+        by_camera = [camera.sees(surface) for camera in seen.cameras]
+        visible = visible & jnp.any(jnp.stack(by_camera), axis=0)
     if seen.dropped:
         kept = jr.uniform(jr.fold_in(key, 1), visible.shape, float) >= seen.dropped
         visible = visible & kept
@@ -248,6 +254,8 @@ def _observe_frame(x: Float[Array, "vertex 3"], faces, resolution: int, lowest, 
     count = min(seen.points, len(surface))
     order = order[:count]
     points = surface[order] + seen.noise * jr.normal(key_noise, (count, 3), float)
+    if not seen.outliers:
+        return points, visible[order]
     low, high = (jnp.asarray(end, float) for end in seen.region)
     where = jr.uniform(key_where, (count, 3), float)
     stray = low[None] + (high - low)[None] * where

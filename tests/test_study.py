@@ -12,6 +12,7 @@ import pytest
 from r2s import presets, synthetic
 from r2s.estimators.estimate import without_deviations
 from r2s.recording import cloud
+from r2s.scenarios.experiments import SIX
 from r2s.study import engine, estimates, judge, matrix, results, tables
 from r2s.study.cells import needs
 from r2s.study.estimates import Estimated, Trained
@@ -38,6 +39,18 @@ def test_the_true_fabric_is_nearer_than_another_and_than_noise_allows(fold):
     assert truth["chamfer_real_to_sim"] < 0.007
     assert truth["chamfer_real_to_sim"] < other["chamfer_real_to_sim"]
     assert truth["hausdorff"] >= truth["chamfer"]
+
+
+def test_a_whole_surface_tells_the_true_fabric_by_every_metric():
+    experiment, fabric = SIX["fling"](), presets.grey_interlock()
+    seen = synthetic.record(experiment, fabric, "grey", seen=synthetic.WHOLE, key=jr.key(0))
+    clouds = [cloud(seen, frame) for frame in (0, 30)]
+    assert all(len(points) == len(clouds[0]) > 5000 for points in clouds)
+    of = lambda fabric: judge.against_motion(seen, judge.predict(seen, fabric))
+    truth, other = of(fabric), of(presets.pink_solid())
+    for name, value in truth.items():
+        assert value < other[name] / 1.5, name
+    assert truth["hausdorff"] < 0.01  # samples of the surface, 8 mm apart
 
 
 def test_a_diverged_motion_is_a_result(fold):

@@ -21,6 +21,7 @@ EXTRAS = {
     "cli": ("tyro",),
     "physnet": ("skopt",),
     "cma": ("cma",),
+    "cluster": ("dask", "distributed", "dask_jobqueue"),
     "bench": ("mujoco", "newton", "warp", "taichi"),
 }
 PACKAGES = ("r2s", "jax", "jaxlib", "equinox", "optax", "optimistix", "lineax", "numpy")

@@ -17,7 +17,7 @@ class Export:
 
     mujoco: a model (MJCF) of a sheet; newton: arguments of add_cloth_mesh and add_spring (JSON);
     arcsim: a material file (JSON); pybullet: arguments of loadSoftBody (JSON). MuJoCo and Newton
-    get springs along the yarns, unless --isotropic. The sheet is a grid whose diagonals alternate.
+    get springs along the yarns, unless --isotropic. The sheet is a grid as of `r2s simulate`.
 
         r2s export denim.json --to mujoco --size 0.3 0.3 --shape 17 17 --out sheet.xml
         r2s export black_denim --to arcsim --out material.json
@@ -68,7 +68,7 @@ class Export:
                 return arcsim.write(self.out, fabric, name)
             except TypeError as error:  # a law that such a file cannot hold
                 raise ValueError(str(error)) from error
-        mesh, yarns = rectangle(self.size, self.shape, "alternating"), not self.isotropic
+        mesh, yarns = rectangle(self.size, self.shape), not self.isotropic
         if self.to == "mujoco":
             text, loss = mujoco.mjcf(fabric, mesh, yarns=yarns)
             write_text(self.out, text)

@@ -3,9 +3,9 @@
 MuJoCo's 2-D flex is a solid plate of Young's modulus E [Pa], Poisson's ratio nu in [0, 0.5) and
 thickness h [m]: a St. Venant-Kirchhoff membrane in plane stress, of stiffness E h, on the same mesh
 that of r2s to rounding; and hinges with the bending stiffness E h^3 / (12 (1 - nu^2)), which know
-no Poisson's ratio, and are too stiff across diagonals: take a mesh whose diagonals alternate. Both
-stiffnesses together fix E and h (`r2s.physics.solid.plate_solid`): h is not the fabric's thickness,
-which is the `radius` of its contacts. `damping` is a Kelvin-Voigt time [s], as in r2s.
+no Poisson's ratio, and are too stiff across diagonals. Both stiffnesses together fix E and h
+(`r2s.physics.solid.plate_solid`): h is not the fabric's thickness, which is the `radius` of its
+contacts. `damping` is a Kelvin-Voigt time [s], as in r2s.
 
 `flexcomp` is the short form: isotropic, all vertices of one mass. `mjcf` is a whole model with a
 body for each vertex: masses of their areas, held vertices tied to mocap bodies, and springs along

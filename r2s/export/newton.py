@@ -9,8 +9,7 @@ A hinge of r2s has the moment B l / A per angle and length l of its edge, A the 
 triangles. VBD multiplies `edge_ke` by l: it is B l / A [N] there, another number for every edge.
 `SolverSemiImplicit` multiplies by twice a triangle's area, too, which is A where both are alike:
 B l / A^2 [N/m^2]. So the argument, which is one for all edges, is the mean; `set_edges` puts the
-right ones into the finished model. Hinges are too stiff across diagonals: take a mesh whose
-diagonals alternate.
+right ones into the finished model. Hinges are too stiff across diagonals.
 
 Damping is Kelvin-Voigt. In VBD, of shear alone: `tri_kd`, on the rate of F^T F, is half of mu times
 the damping time. In `SolverSemiImplicit` it acts on the rate of F, also in a rigid rotation, as a

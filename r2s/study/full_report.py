@@ -51,6 +51,7 @@ def publish(
     settings: Mapping[str, str] | None = None,
     paper_folder: Path | str | None = None,
     costs: Sequence[Mapping[str, Any]] = (),
+    more: Sequence[tuple[str, str, Sequence[tuple[str, Table]]]] = (),
 ) -> list[Table]:
     """Write `report.html`, `tables/`, `figures/` and `videos/` into `out`; returns the tables.
 
@@ -59,6 +60,7 @@ def publish(
     - `missing`: cells that have no result, and why. - `settings`: what the study was run with.
     - `paper_folder`: of the tables to set beside ours (`paper.read_paper`).
     - `costs`: what cells of a kind took, any keys.
+    - `more`: sections of one's own: heading, words, and tables by name.
 
     Whatever is not there is left out, or said to be missing. Raises what `read_paper` raises, and
     OSError that names what cannot be written.
@@ -85,6 +87,11 @@ def publish(
         *_parameters(parameters, keep),
         *_missing(rows, missing, keep),
         *_costs(costs, keep),
+        *(
+            Section(heading, (words,), tuple(keep(name, table) for name, table in theirs))
+            for heading, words, theirs in more
+            if theirs
+        ),
         _settings(settings or {}, keep),
     ]
     write_report(out / "report.html", TITLE, _intro(panel, missing, undefined), {}, sections)

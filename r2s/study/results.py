@@ -19,11 +19,13 @@ from r2s.study.cells import Cell, about, opened
 from r2s.study.engine import closure
 from r2s.study.estimates import ESTIMATE, Estimated, family_of, read_estimate
 from r2s.study.evaluations import Judged, read_measured, read_motion
-from r2s.study.matrix import Plan, synthetic
+from r2s.study.matrix import PRESETS, Plan, synthetic
 from r2s.study.panel import Column
 from r2s.study.shown import Shown
 from r2s.study.tables import Row, Table, pivot, significant, write_rows
 from r2s.study.truths import Made, Source, read, small_strain
+
+PRINTED = ("findings.md", "chamfer_real_to_sim*.md", "diff*_on_*.md")  # the others are in files
 
 Entry = tuple[str, tuple[Range, ...], Any, Any, Any, Any]
 
@@ -53,6 +55,11 @@ def publish(
         }
         from r2s.study import full_report
 
+        for old in (out / "tables").glob("*.*"):
+            old.unlink()
+        took = costs(cells, out)
+        by = list(by_recording(found).items())
+        larger = [(f"forecast_{name}", forecast(took, larger)) for name, larger in PRESETS.items()]
         full_report.publish(
             out,
             found,
@@ -61,11 +68,16 @@ def publish(
             missing(failed),
             settings,
             paper,
-            costs(cells, out),
+            took,
+            [
+                ("Every recording", "Mean over the frames that count.", by),
+                ("What larger studies would take", "From the costs of this one.", larger),
+            ],
         )
         write_text(mark, changed.hexdigest())
-    for table in sorted((out / "tables").glob("*.md")):
-        print(f"\n{table.read_text(encoding='utf-8')}")
+    for name in PRINTED:
+        for table in sorted((out / "tables").glob(name)):
+            print(f"\n{table.read_text(encoding='utf-8')}")
     print(f"\n{out / 'report.html'} has the pictures, {out / 'results.csv'} every figure.")
 
 

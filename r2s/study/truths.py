@@ -53,9 +53,11 @@ class Made(Cell):
     """A synthetic recording of a preset's fabric.
 
     - `number`: 0 is the motion of the scenario without any numbers; others are drawn within
-      `r2s.trajectories.LIMITS`, the same for all fabrics. - `unseen`: drawn to be judged by, none
-      of which is one to estimate from. - `angle`: from the pull of a stretching to the warp
-      [degrees], for `r2s.pinn`; None: a motion of `r2s.scenarios`.
+      `r2s.trajectories.LIMITS`, the same for all fabrics.
+    - `unseen`: drawn to be judged by, none of which is one to estimate from; its clouds are all of
+      the surface, without any error.
+    - `angle`: from the pull of a stretching to the warp [degrees], for `r2s.pinn`; None: a motion
+      of `r2s.scenarios`.
     """
 
     kind: ClassVar[str] = "recordings"
@@ -90,6 +92,7 @@ class Made(Cell):
                 self._experiment(),
                 fabric,
                 self.fabric,
+                seen=synthetic.WHOLE if self.unseen else None,
                 shape=making.shape,
                 max_step=making.max_step,
                 layers=making.layers and self.scenario == "folding",
