@@ -18,7 +18,6 @@ from r2s import cards, presets  # noqa: E402
 from r2s.arcsim import read_material  # noqa: E402
 from r2s.cards import Card, Provenance  # noqa: E402
 from r2s.cli import main  # noqa: E402
-from r2s.commands.check_grad import _row  # noqa: E402
 from r2s.commands.common import experiment_of, tell  # noqa: E402
 from r2s.commands.doctor import EXCLUDED, EXTRAS, implausible  # noqa: E402
 from r2s.recording import load  # noqa: E402
@@ -152,18 +151,6 @@ def test_the_doctor_looks_at_a_mesh(tmp_path: Path, capsys: pytest.CaptureFixtur
     path.write_text(corners + "f 1 2 3\nf 2 3 4\n")  # one is clockwise
     assert main(["doctor", "--mesh", str(path)]) == 1
     assert "sheet.obj: face 1 has the signed area" in capsys.readouterr().err
-
-
-def test_derivatives_are_told_from_wrong_and_from_rough_ones() -> None:
-    start = jnp.array([2.0, 0.0])
-    smooth = lambda v: v[0] ** 3 + jnp.sin(v[1])
-    row = lambda loss, i, slope: _row("it", loss, start, i, slope, 1e-3)["verdict"]
-    assert row(smooth, 0, 12.0) == "agrees" and row(smooth, 1, 1.0) == "agrees"
-    assert row(smooth, 0, 12.1) == "differs" and row(smooth, 1, 0.0) == "differs"
-    assert row(smooth, 0, float("nan")) == "not finite"
-    jump = lambda v: smooth(v) + jnp.where(v[0] > 2.0001, 1e-2, 0.0)
-    assert row(jump, 0, 12.0) == "rough"
-    assert row(lambda v: jnp.asarray(7.0) + 0 * v[0], 0, 0.0) == "agrees"  # no influence
 
 
 def test_numbers_of_a_motion_and_what_is_printed(capsys: pytest.CaptureFixture) -> None:

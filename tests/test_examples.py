@@ -60,7 +60,7 @@ def test_network_in_the_loop() -> None:
 @pytest.mark.slow
 def test_sweep_fabrics() -> None:
     text = run("sweep_fabrics")
-    assert float(re.findall(r"1000 fabrics in ([\d.]+) s", text)[0]) < 60
+    assert float(re.findall(r"1000 fabrics in ([\d.]+) CPU s", text)[0]) < 60
     assert float(re.findall(r"bending +([+-][\d.]+)", text)[0]) > 0.3
 
 

@@ -16,6 +16,7 @@ from r2s.export.stiffness import BOUNDS, Stiffness, isotropic, nearest_isotropic
 from r2s.mesh import Mesh
 
 PARALLEL = 1e-6  # [rad]
+NEGLIGIBLE = 1e-6  # of the sheet's stiffness: springs that are at their bound, and cost much
 
 
 class Split(NamedTuple):
@@ -64,8 +65,9 @@ def _nearest(
     own, scale = probes(stiffness), start[0]
 
     def made(parameters: np.ndarray) -> Split:
-        modulus, ratio, warp, weft = parameters.tolist()
-        return Split(float(scale * np.exp(modulus)), ratio, scale * warp, scale * weft)
+        modulus, ratio, *along = parameters.tolist()
+        kept = [k if k > NEGLIGIBLE else 0.0 for k in along]
+        return Split(float(scale * np.exp(modulus)), ratio, scale * kept[0], scale * kept[1])
 
     def residuals(parameters: np.ndarray) -> np.ndarray:
         found = probes(together(made(parameters)))

@@ -94,6 +94,7 @@ class Workers:
             attempt,
             cell,
             folder.absolute(),
+            cell.key,
             key=f"{cell.kind}-{cell.key}",
             pure=False,
             retries=RETRIES,

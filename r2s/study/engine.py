@@ -56,8 +56,10 @@ class Serial:
         pass
 
 
-def attempt(cell: Cell, folder: Path) -> str:
-    """Make a cell; why it failed, or ""."""
+def attempt(cell: Cell, folder: Path, key: str | None = None) -> str:
+    """Make a cell; why it failed, or "". `key`: what it is to the caller, who may be elsewhere."""
+    if key not in (None, cell.key):
+        return "a worker has another version of r2s: install the same everywhere"
     try:
         execute(cell, folder)
     except Exception as error:  # whatever it is, the other cells go on

@@ -22,7 +22,7 @@ from r2s.study import judge
 from r2s.study.cells import Cell, opened
 from r2s.study.estimates import Estimated, default_fabric, read_estimate
 from r2s.study.panel import Column
-from r2s.study.truths import Source, read
+from r2s.study.truths import Given, Source, read
 
 MEASURED, MOTION = "measured.json", "motion.npz"
 LADDER = math.sqrt(2)  # steps between frames are powers of this: few programs to compile
@@ -37,6 +37,7 @@ class Judged(Cell):
     - `estimate`: whose fabric; None: the default one of `solver` with that areal `density`.
     - `recordings`: judged against, together, since they compile once.
     - `other`: `estimate` is that of another fabric, for comparison.
+    - `every`: 1 compares all frames that count, 3 every third.
     """
 
     kind: ClassVar[str] = "evaluations"
@@ -48,6 +49,7 @@ class Judged(Cell):
     fabric: str
     recordings: tuple[Source, ...]
     other: bool = False
+    every: int = 1
 
     @property
     def scenario(self) -> str:
@@ -86,7 +88,7 @@ class Judged(Cell):
         else:
             motions = predict(recordings, fabric, self.solver)
         measured = {
-            source.name: judge.against_motion(recording, x)
+            source.name: judge.against_motion(recording, x, self.every, isinstance(source, Given))
             for source, recording, x in zip(self.recordings, recordings, motions, strict=True)
         }
         plain = {name: {k: _plain(v) for k, v in row.items()} for name, row in measured.items()}

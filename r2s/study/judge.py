@@ -25,16 +25,21 @@ def predict(recording: Recording, fabric: Fabric) -> Float[np.ndarray, "frame ve
 
 
 def against_motion(
-    recording: Recording, x: Float[np.ndarray, "frame vertex 3"]
+    recording: Recording,
+    x: Float[np.ndarray, "frame vertex 3"],
+    every: int = 1,
+    crop: bool = True,
 ) -> dict[str, float]:
-    """Metrics of a motion against a recording, mean over the frames that count.
+    """Metrics of a motion against a recording, mean over those frames that count (3: every third).
 
-    All NaN when the motion diverged in them: that is a result, too.
+    All NaN when the motion diverged in them: that is a result, too. Without `crop` those metrics
+    are left out that leave out what lies below the recording, see `_frame`.
     """
     first, last = recording.info.frames_used
     faces = from_recording(recording).scene.mesh.faces
-    simulated = np.asarray(_sample(jnp.asarray(x[first : last + 1]), faces, SAMPLES))
-    return _mean(recording, [frame for frame in simulated])
+    used = range(first, last + 1, every)
+    simulated = np.asarray(_sample(jnp.asarray(x[np.array(used)]), faces, SAMPLES))
+    return _mean([cloud(recording, frame) for frame in used], list(simulated), crop)
 
 
 def against_recording(recording: Recording, other: Recording) -> dict[str, float]:
@@ -45,29 +50,30 @@ def against_recording(recording: Recording, other: Recording) -> dict[str, float
             f"{other.info.name} has {len(other.times)} frames, {recording.info.name} is judged "
             f"on frames {first} to {last}"
         )
-    return _mean(recording, [cloud(other, frame) for frame in range(first, last + 1)])
+    used = range(first, last + 1)
+    return _mean([cloud(recording, f) for f in used], [cloud(other, f) for f in used])
 
 
-def _mean(recording: Recording, simulated: list[np.ndarray]) -> dict[str, float]:
-    first, _ = recording.info.frames_used
-    real = [cloud(recording, first + i) for i in range(len(simulated))]
+def _mean(
+    real: list[np.ndarray], simulated: list[np.ndarray], crop: bool = True
+) -> dict[str, float]:
     if not all(np.all(np.isfinite(points)) for points in simulated):
-        return dict.fromkeys(_frame(real[0], real[0], real[0], real[0]), float("nan"))
-    rows = [_frame(a, b, real[0], simulated[0]) for a, b in zip(real, simulated, strict=True)]
+        return dict.fromkeys(_frame(real[0], real[0], real[0], real[0], crop), float("nan"))
+    firsts = real[0], simulated[0]
+    rows = [_frame(a, b, *firsts, crop) for a, b in zip(real, simulated, strict=True)]
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
 
-def _frame(real, simulated, first_real, first_simulated) -> dict[str, float]:
+def _frame(real, simulated, first_real, first_simulated, crop: bool) -> dict[str, float]:
     """All metrics of one frame.
 
     Those that end in `_cropped` leave out what lies below the recording's lowest point: recordings
     are cut off above the table, where a simulation still has a sheet.
     """
+    whole = metrics.distances(real, simulated)
+    found = whole | metrics.paper_units(real, simulated, first_real, first_simulated)
+    if not crop:
+        return found
     visible = simulated[simulated[:, 2] >= real[:, 2].min()]
     cropped = metrics.distances(real, visible) if len(visible) else {}
-    whole = metrics.distances(real, simulated)
-    return (
-        whole
-        | {f"{name}_cropped": cropped.get(name, float("nan")) for name in whole}
-        | metrics.paper_units(real, simulated, first_real, first_simulated)
-    )
+    return found | {f"{name}_cropped": cropped.get(name, float("nan")) for name in whole}

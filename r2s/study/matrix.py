@@ -36,6 +36,7 @@ class Plan:
 
     - `columns`, `fabrics`: which. - `repeats`: estimates of each, from other motions.
     - `judged`: motions of each of `MOTIONS` to judge by. - `making`, `spent`, `seed`.
+    - `every`: 1 compares all frames that count, 3 every third.
     """
 
     columns: tuple[Column, ...]
@@ -45,13 +46,17 @@ class Plan:
     making: Making = Making()
     spent: Spent = Spent()
     seed: int = 0
+    every: int = 1
 
 
 ALL = Plan(FULL, tuple(presets.FIVE), ESTIMATION, EVALUATION // len(MOTIONS), Making(layers=True))
 LITTLE = Spent(
-    points_coarse=6,
+    coarse=16,
+    starts=2,
+    iterations=15,
+    points_coarse=4,
     points_starts=1,
-    points_iterations=4,
+    points_iterations=3,
     calls=40,
     fabrics=32,
     epochs=2,
@@ -73,6 +78,7 @@ SMALL = Plan(
     repeats=1,
     judged=2,
     spent=LITTLE,
+    every=3,
 )
 PRESETS = {
     "small": SMALL,
@@ -136,7 +142,7 @@ def synthetic(plan: Plan) -> list[Judged]:
             for column in plan.columns
             for repeat in range(plan.repeats)
         ]
-        found += _judged(estimates, fabric, density, unseen)
+        found += _judged(estimates, fabric, density, unseen, plan.every)
     return found
 
 
@@ -165,21 +171,24 @@ def recorded(folder: Path, density: float, plan: Plan) -> list[Judged]:
         estimates = [_from_given(column, r, density, plan, i) for i, r in enumerate(own)]
         for index, (recording, estimate) in enumerate(zip(own, estimates, strict=True)):
             by = _by_scenario(_of_trial(unseen, recording))
-            found += _judged([estimate], recording.fabric, density, by)
+            found += _judged([estimate], recording.fabric, density, by, plan.every)
             other = _other_fabric(own, index)
             if other is not None:
                 about = column.solver, density, recording.fabric
-                found += [Judged(estimates[other], *about, r, True) for r in by.values()]
+                found += [
+                    Judged(estimates[other], *about, r, True, plan.every) for r in by.values()
+                ]
     return list(dict.fromkeys(found))  # columns share the default fabric
 
 
-def _judged(estimates, fabric: str, density: float, unseen) -> list[Judged]:
+def _judged(estimates, fabric: str, density: float, unseen, every: int) -> list[Judged]:
     """Cells for estimates of a fabric, and for the default fabric on each solver."""
     solvers = dict.fromkeys(estimate.solver for estimate in estimates)
-    whose = [(None, solver) for solver in solvers] + [(e, e.solver) for e in estimates]
+    of = lambda solver: (solver, density, fabric)
+    whose = [(None, of(solver)) for solver in solvers] + [(e, of(e.solver)) for e in estimates]
     return [
-        Judged(estimate, solver, density, fabric, recordings[first : first + TOGETHER])
-        for estimate, solver in whose
+        Judged(estimate, *about, recordings[first : first + TOGETHER], every=every)
+        for estimate, about in whose
         for recordings in unseen.values()
         for first in range(0, len(recordings), TOGETHER)
     ]
