@@ -4,7 +4,7 @@ In reading order:
 
 - `units`, `fabric`, `presets`, `family`: what a fabric is, and which an estimator may choose.
 - `mesh`, `physics`: the sheet at rest; membrane, bending, air, contact.
-- `arcsim`: fabrics from and to ARCSim's material files.
+- `arcsim`, `cards`, `export`: fabrics from and to files, and to other simulators.
 - `neighbours`, `layers`: contact of the sheet with itself.
 - `linear`: sparse matrices over a mesh, and their factor.
 - `increment`, `implicit`, `cloth`: the energy of a step, its minimiser, the solver.
@@ -16,6 +16,7 @@ In reading order:
 - `data`, `rgbench`: public data sets. `show`, `cli`: pictures, and the command line.
 - `surface`, `losses`, `metrics`: distances between clouds and sheets.
 - `estimators`: DIFFCLOUD, DiffCP, CMA-ES, PhysNet, the physics-informed network.
+- `gradcheck`: derivatives against differences. `sweep`: thousands of fabrics at once.
 - `study`: the main job, its tables and report.
 """
 

@@ -9,8 +9,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import maximum_bipartite_matching
 
 Boxes = tuple[Array, Array]  # their lowest and highest corners
 
@@ -152,6 +150,9 @@ def _leaves(centres: np.ndarray, faces: np.ndarray, depth: int) -> list[int]:
 
 def _owned(parts: Int[np.ndarray, "face 3"]) -> Int[np.ndarray, "face owned"]:
     """Parts (of which every face has three) shared out to their faces, as evenly as can be."""
+    from scipy.sparse import csr_array  # here, since it takes long to import
+    from scipy.sparse.csgraph import maximum_bipartite_matching
+
     count = parts.max() + 1
     for width in (1, 2, 3):  # a matching of the parts with places in the faces
         place = np.arange(len(parts) * width).reshape(-1, 1, width)

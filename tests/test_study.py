@@ -46,7 +46,7 @@ def test_a_whole_surface_tells_the_true_fabric_by_every_metric():
     seen = synthetic.record(experiment, fabric, "grey", seen=synthetic.WHOLE, key=jr.key(0))
     clouds = [cloud(seen, frame) for frame in (0, 30)]
     assert all(len(points) == len(clouds[0]) > 5000 for points in clouds)
-    of = lambda fabric: judge.against_motion(seen, judge.predict(seen, fabric))
+    of = lambda fabric: judge.against_motion(seen, judge.predict(seen, fabric), 6, False)
     truth, other = of(fabric), of(presets.pink_solid())
     for name, value in truth.items():
         assert value < other[name] / 1.5, name

@@ -9,7 +9,6 @@ one depth are eliminated together, as one batch of small dense matrices (fronts;
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
 from jaxtyping import Array, Int
 
 LEAF = 20  # vertices, about, that are not cut any further
@@ -40,6 +39,8 @@ def levels(
     `places` decide where sets are cut, at medians; `rows` and `columns` are those of all its
     blocks, sorted. Scaling an axis changes nothing.
     """
+    import scipy.sparse  # here, since it would take a third of the time that r2s takes to import
+
     count = len(places)
     numbers = np.arange(1, len(rows) + 1)  # not zero, which a sparse matrix would drop
     graph = scipy.sparse.csr_matrix((numbers, (rows, columns)), shape=(count, count))
