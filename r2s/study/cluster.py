@@ -3,13 +3,13 @@
 Needs dask: pip install 'r2s[cluster]'.
 """
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from r2s.study.cells import Cell
 from r2s.study.engine import attempt
+from r2s.study.environment import environment
 
 try:
     from dask import config
@@ -18,24 +18,6 @@ except ImportError as error:
     raise ImportError("workers need dask: pip install 'r2s[cluster]'") from error
 
 RETRIES = 5  # of a cell whose worker died
-
-
-def environment(workers: int, compilation_cache: Path | None = None) -> dict[str, str]:
-    """What a worker's environment holds before it imports JAX, for so many on a machine.
-
-    One thread each; all of them share the memory of its GPUs, if there are any; a fabric that goes
-    wrong in a batch does not stop the others. Compiled programs are kept in `compilation_cache`.
-    """
-    threads = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    found = one | {
-        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {threads}".strip(),
-        "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.9 / workers:.3f}",
-        "EQX_ON_ERROR": "nan",
-    }
-    if compilation_cache is not None:
-        found |= {"JAX_COMPILATION_CACHE_DIR": str(compilation_cache)}
-    return found
 
 
 def local(workers: int, compilation_cache: Path | None = None) -> "Workers":

@@ -1,9 +1,11 @@
 """A study from its settings to its report: what `experiments/study.py` and `r2s study` call."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
 from r2s.study import engine, matrix, results
+from r2s.study.environment import environment
 
 
 def study(
@@ -37,6 +39,7 @@ def study(
     """
     if preset not in matrix.PRESETS:
         raise ValueError(f"no preset {preset!r}; there are {', '.join(matrix.PRESETS)}")
+    os.environ.update(environment(1))  # as of workers: JAX reads it at its first computation
     changes = columns, fabrics, repeats, judged, materials, seed
     plan = matrix.narrowed(matrix.PRESETS[preset], *changes)
     cells = matrix.synthetic(plan) if data is None else matrix.recorded(data, density, plan)
