@@ -15,7 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r2s.study import cells, engine
+from r2s.study.apart import Apart
 from r2s.study.cells import Cell
+from r2s.study.environment import environment
 
 
 @dataclass(frozen=True)
@@ -153,6 +155,34 @@ def test_a_run_that_was_killed_goes_on(tmp_path, after):
     assert made <= set(tmp_path.rglob("*.zip"))
     sums = [Sum((Number(i, 0.05), Number(i + 1, 0.05)), f"s{i}") for i in range(8)]
     assert [value_of(cell, tmp_path) for cell in sums] == [2 * i + 1 for i in range(8)]
+
+
+@dataclass(frozen=True)
+class Dying(Cell):
+    """Ends its process."""
+
+    kind: ClassVar[str] = "deaths"
+
+    @property
+    def name(self) -> str:
+        return "dying"
+
+    def make(self, folder: Path, out: Path) -> dict[str, Any]:
+        os.kill(os.getpid(), signal.SIGKILL)
+        return {}
+
+
+def test_a_process_apart_has_a_workers_environment_and_may_die(tmp_path, monkeypatch):
+    for name in environment(1):
+        monkeypatch.setenv(name, os.environ.get(name, ""))  # put back at the end
+    runner = Apart()
+    try:
+        failed = engine.run([Dying(), tree()], tmp_path, runner)
+    finally:
+        runner.close()
+    assert list(failed) == [Dying()] and "Broken" in failed[Dying()]
+    assert value_of(tree(), tmp_path) == 8
+    assert os.environ["OPENBLAS_NUM_THREADS"] == "1"
 
 
 def test_workers_of_dask_make_the_same_and_survive_a_kill(tmp_path):

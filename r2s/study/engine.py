@@ -50,7 +50,11 @@ class Serial:
             cell, folder = self._waiting[index]
             del self._waiting[index]
             self._last = cell.alike
-            yield cell, attempt(cell, folder)
+            yield cell, self.make(cell, folder)
+
+    def make(self, cell: Cell, folder: Path) -> str:
+        """Why it failed, or ""."""
+        return attempt(cell, folder)
 
     def close(self) -> None:
         pass

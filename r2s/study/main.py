@@ -1,11 +1,10 @@
 """A study from its settings to its report: what `experiments/study.py` and `r2s study` call."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 from r2s.study import engine, matrix, results
-from r2s.study.environment import environment
+from r2s.study.apart import Apart
 
 
 def study(
@@ -32,14 +31,14 @@ def study(
       `repeats`, `judged` and `seed` change it, see `matrix.Plan`.
     - `data`: a folder of recordings, of an areal `density` [kg/m^2]; None: synthetic ones.
     - `paper`: a folder with the tables of Ru et al. 2025. - `materials`: see `truths.Making`.
-    - `workers`: processes of this machine; or `slurm` jobs; or those of a Dask `scheduler`.
+    - `workers`: processes of this machine (one: cell after cell); or `slurm` jobs; or those of a
+      Dask `scheduler`.
 
     Raises `ValueError` for settings that make no sense, `OSError`, and `ImportError` that names the
     extra for workers.
     """
     if preset not in matrix.PRESETS:
         raise ValueError(f"no preset {preset!r}; there are {', '.join(matrix.PRESETS)}")
-    os.environ.update(environment(1))  # as of workers: JAX reads it at its first computation
     changes = columns, fabrics, repeats, judged, materials, seed
     plan = matrix.narrowed(matrix.PRESETS[preset], *changes)
     cells = matrix.synthetic(plan) if data is None else matrix.recorded(data, density, plan)
@@ -54,7 +53,7 @@ def study(
 
 def _runner(workers: int, scheduler: str, slurm: int, cache: Path | None) -> engine.Runner:
     if not (workers > 1 or scheduler or slurm):
-        return engine.Serial()
+        return Apart()
     from r2s.study import cluster
 
     if scheduler:
