@@ -45,7 +45,8 @@ def test_an_interrupted_sweep_goes_on_where_it_was(tmp_path):
 
     members = members_of(6)
     running = stream(counted, members, 2, folder=tmp_path)
-    next(running), next(running)
+    for _ in range(2):
+        next(running)
     jax.effects_barrier()
     assert len(calls) == 4
     found = sweep(counted, members, 2, folder=tmp_path)
