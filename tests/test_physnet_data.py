@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s.estimators import physnet
+from r2s.estimators import bayes, physnet
 from r2s.estimators.physnet import Sighting
 from r2s.physnet import dataset, preprocess, training
 from r2s.physnet.dataset import Settings
@@ -103,6 +103,17 @@ def test_an_estimate_goes_on_and_gives_the_best_of_what_was_tried(sighting, tmp_
     loss = physnet.distances(sighting, jnp.stack([place] * 4))[0]
     np.testing.assert_allclose(loss, first.loss, rtol=1e-3)
     assert not first.determined.any()
+
+
+def test_gauss_newton_steps_come_nearer_within_their_number(sighting):
+    dim = TINY.family.dim
+    middle = np.full((4, dim), 0.5)
+    loss = np.asarray(physnet.distances(sighting, jnp.asarray(middle, float)))
+    begun = bayes.tell(bayes.begin(dim), middle[:1], loss[:1])
+    found = physnet.refined(sighting, begun, 3 * (dim + 5) - 1)
+    assert 1 + dim + 5 <= len(found.losses) <= 1 + 2 * (dim + 5)
+    assert found.losses.min() < 0.95 * loss[0]  # four numbers of an untrained network are seen
+    assert ((found.places >= 0) & (found.places <= 1)).all()
 
 
 def test_images_and_frames_must_belong_together(sighting):

@@ -196,14 +196,15 @@ def estimate(
 ) -> Estimate:
     """The fabric of the least distance on the map among `num_calls` simulations.
 
-    A share `refine` of them goes into Gauss-Newton steps from where Bayesian optimisation ended,
-    as of `refined`; none, as in the study, for 0. Goes on from the history of the optimisation in
-    `path`. The losses are distances on the map, without unit. Gives no deviations: repeat with
-    other seeds. Raises `RuntimeError` when all simulations diverge.
+    As many Gauss-Newton steps as fit a share `refine` of them are made from where Bayesian
+    optimisation ended, as of `refined`; none, as in the study, for 0. Goes on from the history of
+    the optimisation in `path`. The losses are distances on the map, without unit. Gives no
+    deviations: repeat with other seeds. Raises `RuntimeError` when all simulations diverge.
     """
     began = time.perf_counter()
     family = sighting.family
-    searched = num_calls - round(refine * num_calls)
+    each = family.dim + 1 + len(LENGTHS)  # simulations of a Gauss-Newton step
+    searched = num_calls - each * int(refine * num_calls / each)
     about = {"num_calls": searched, "batch": batch, "seed": seed}
     history = bayes.minimise(
         objective(sighting, batch), family.dim, **about, path=path, progress=progress
