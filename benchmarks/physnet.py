@@ -215,7 +215,7 @@ def distance(one: np.ndarray, two: np.ndarray) -> np.ndarray:
 def targets(others: Data, settings: Settings, view, count: int) -> list[Target]:
     """Fabrics to estimate: as simulated, as a depth camera saw them, as clouds of two cameras."""
     experiment = dataset.levels(settings)[LEVEL]
-    frames = dataset.kept_frames(experiment, settings.num_frames)
+    frames = dataset.kept_frames(experiment.frames_used, settings.num_frames)
     scenario = experiment.scenario(settings.shape)
     solver = solver_of(settings, scenario)
     camera = calibrated(synthetic.sensing(experiment).cameras[0])
@@ -271,7 +271,7 @@ def compared(chosen: list[Target], networks: list[Training]) -> dict[str, list[f
 def estimates(out, others, settings, networks, chosen, asked) -> list[dict[str, Any]]:
     """A row for every network, fabric, kind of images and search; and errors.csv."""
     experiment = dataset.levels(settings)[LEVEL]
-    frames = dataset.kept_frames(experiment, settings.num_frames)
+    frames = dataset.kept_frames(experiment.frames_used, settings.num_frames)
     scenario = experiment.scenario(settings.shape)
     solver = solver_of(settings, scenario)
     bank, depth = of_level(others, settings)

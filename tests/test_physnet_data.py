@@ -29,7 +29,7 @@ def sighting(folder):
     """The first motion of the first fabric, without flaws."""
     view, data = dataset.load_manifest(folder).view, dataset.load(folder)
     experiment = dataset.levels(TINY)[0]
-    frames = dataset.kept_frames(experiment, TINY.num_frames)
+    frames = dataset.kept_frames(experiment.frames_used, TINY.num_frames)
     images = preprocess.of_depths(view, data.depth[0] * dataset.STEP)
     untrained = training.begin(view, Architecture(16, (4,), (8,)))
     scenario = experiment.scenario(TINY.shape)

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -182,6 +183,17 @@ def test_a_wrong_call_says_what_is_wrong_and_writes_nothing(arguments, message, 
     assert done.returncode == 1
     assert message in done.stderr
     assert not out.exists()
+
+
+def test_an_estimate_without_memory_is_missing_and_no_divergence(tiny, tmp_path, monkeypatch):
+    estimated = tiny[0][0].estimate
+
+    def exhaust(cell, family, recordings, folder):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory")
+
+    monkeypatch.setitem(estimates._ESTIMATORS, "diffcloud", exhaust)
+    failed = engine.run([estimated], tmp_path, engine.Serial())
+    assert "out of memory" in failed[estimated] and not estimated.is_made(tmp_path)
 
 
 def test_given_recordings_are_shown_one_by_one():

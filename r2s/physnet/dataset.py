@@ -223,9 +223,9 @@ def solver_of(settings: Settings, scenarios: list[Scenario]) -> Sheet | None:
     return material_points(everywhere, stiffest)
 
 
-def kept_frames(experiment: Experiment, number: int) -> tuple[int, ...]:
-    """`number` frames evenly spread over those of an experiment that count."""
-    first, last = experiment.frames_used
+def kept_frames(used: tuple[int, int], number: int) -> tuple[int, ...]:
+    """`number` frames evenly spread from the first to the last that counts."""
+    first, last = used
     return tuple(int(frame) for frame in np.linspace(first, last, number).round())
 
 
@@ -255,7 +255,7 @@ def _simulate(settings: Settings, number: int, alike: Alike):
     repeated = stacked(scenarios * settings.per_shard, alike.substeps)
     x, ok = _moved(repeated, fabrics, alike.solver)
     motions = count * settings.num_levels
-    frames = np.array(kept_frames(experiments[0], settings.num_frames))
+    frames = np.array(kept_frames(experiments[0].frames_used, settings.num_frames))
     return (
         experiments,
         np.asarray(places)[:count],
