@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from r2s import presets, synthetic
+from r2s.arcsim import write_material
 from r2s.estimators.estimate import without_deviations
 from r2s.recording import cloud
 from r2s.scenarios.experiments import SIX
@@ -106,6 +107,24 @@ def test_a_truth_has_the_stiffness_of_the_preset_at_rest_and_more_when_stretched
     hinge = truth.bending.at(jnp.array(0.0), jnp.array(0.0))
     assert float(hinge.stiffness) == pytest.approx(float(preset.bending.stiffness))
     assert isinstance(strain_dependent("grey_interlock", Making(stiffening=0.0)), type(preset))
+
+
+def test_a_changed_file_of_measured_tables_is_another_recording(tmp_path):
+    def recordings():
+        plan = matrix.narrowed(matrix.SMALL, fabrics=["grey_interlock"], materials=str(tmp_path))
+        return [cell.recordings[0] for cell in matrix.synthetic(plan)]
+
+    truth = strain_dependent("grey_interlock", Making())
+    write_material(tmp_path / "grey_interlock.json", truth)
+    first, again = recordings(), recordings()
+    write_material(tmp_path / "grey_interlock.json", strain_dependent("pink_solid", Making()))
+    changed = recordings()
+    assert [cell.key for cell in first] == [cell.key for cell in again]
+    assert not {cell.key for cell in first} & {cell.key for cell in changed}
+    softer = strain_dependent("grey_interlock", changed[0].making).membrane.stiffness
+    assert not np.array_equal(softer, truth.membrane.stiffness)
+    with pytest.raises(FileNotFoundError, match="camel_ponte_roma.json"):
+        matrix.narrowed(matrix.SMALL, fabrics=["camel_ponte_roma"], materials=str(tmp_path))
 
 
 @pytest.fixture

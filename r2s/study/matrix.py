@@ -10,7 +10,7 @@ from r2s import presets
 from r2s.study.estimates import SOLVERS, Estimated, Spent, Trained, family_of
 from r2s.study.evaluations import Judged
 from r2s.study.panel import MOTIONS, PAPER_COLUMNS, Column
-from r2s.study.truths import Given, Made, Making, Source, given, strain_dependent
+from r2s.study.truths import Given, Made, Making, Source, given, measured, strain_dependent
 from r2s.trajectories import ESTIMATION, EVALUATION
 
 ESTIMATED_FROM = ("lifting", "wind", "stretching")
@@ -56,7 +56,7 @@ LITTLE = Spent(
     iterations=15,
     points_coarse=4,
     points_starts=1,
-    points_iterations=3,
+    points_iterations=2,
     calls=40,
     fabrics=32,
     epochs=2,
@@ -106,18 +106,19 @@ def narrowed(
 ) -> Plan:
     """A plan with other columns, fabrics, numbers, measured tables or another seed; None: as it is.
 
-    Raises `ValueError` for numbers below 1.
+    Raises `ValueError` for numbers below 1, and what `truths.measured` raises.
     """
     for name, number in (("repeats", repeats), ("judged", judged)):
         if number is not None and number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
+    chosen, making = tuple(fabrics or plan.fabrics), plan.making
     return dataclasses.replace(
         plan,
         columns=plan.columns if not columns else tuple(map(named, columns)),
-        fabrics=plan.fabrics if not fabrics else tuple(fabrics),
+        fabrics=chosen,
         repeats=plan.repeats if repeats is None else repeats,
         judged=plan.judged if judged is None else judged,
-        making=dataclasses.replace(plan.making, materials=materials),
+        making=making if not materials else measured(making, Path(materials), chosen),
         seed=seed,
     )
 

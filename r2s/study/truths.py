@@ -6,6 +6,7 @@ and their fabrics stiffen with the strain and soften with the curvature, as meas
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -38,13 +39,15 @@ class Making:
       at zero strain; 0: constant stiffness, bending too, as the estimators assume. Assumed, not
       measured.
     - `materials`: a folder of ARCSim material files, FABRIC.json, with measured tables to take
-      instead; "": none. - `layers`: the sheet touches itself.
+      instead; "": none. - `materials_digest`: of those files, from `measured`. - `layers`: the
+      sheet touches itself.
     """
 
     shape: tuple[int, int] = (17, 17)
     max_step: float = 1 / 90
     stiffening: float = 2.0
     materials: str = ""
+    materials_digest: str = ""
     layers: bool = False
 
 
@@ -155,6 +158,21 @@ def given(folder: Path) -> list[Given]:
     if not found:
         raise ValueError(f"{folder}: no recording that a manifest describes")
     return found
+
+
+def measured(making: Making, folder: Path, fabrics: Sequence[str]) -> Making:
+    """Recordings made with the measured tables in a folder, one file FABRIC.json for each fabric.
+
+    Raises `FileNotFoundError` for one that is missing, and what `r2s.arcsim.read_material` raises.
+    """
+    digest = sha256()
+    for fabric in fabrics:
+        file = folder / f"{fabric}.json"
+        read_material(file)
+        digest.update(file.read_bytes())
+    return dataclasses.replace(
+        making, materials=str(folder), materials_digest=digest.hexdigest()[:16]
+    )
 
 
 def read(source: Source, folder: Path) -> Recording:
