@@ -121,6 +121,7 @@ def test_a_changed_file_of_measured_tables_is_another_recording(tmp_path):
     changed = recordings()
     assert [cell.key for cell in first] == [cell.key for cell in again]
     assert not {cell.key for cell in first} & {cell.key for cell in changed}
+    assert isinstance(changed[0], Made)
     softer = strain_dependent("grey_interlock", changed[0].making).membrane.stiffness
     assert not np.array_equal(softer, truth.membrane.stiffness)
     with pytest.raises(FileNotFoundError, match="camel_ponte_roma.json"):
