@@ -17,7 +17,7 @@ In reading order:
 - `surface`, `losses`, `metrics`: distances between clouds and sheets.
 - `estimators`: DIFFCLOUD, DiffCP, CMA-ES, PhysNet, the physics-informed network.
 - `gradcheck`: derivatives against differences. `sweep`: thousands of fabrics at once.
-- `study`: the main job, its tables and report.
+- `interactive`: sliders for a fabric. `study`: the main job, its tables and report.
 """
 
 from r2s.cloth import Cloth, ClothState

@@ -124,7 +124,11 @@ class Card:
 
 
 def preset(name: str) -> Card:
-    """The card of a preset of `r2s.presets`; `ValueError` names the presets there are."""
+    """The card of a preset of `r2s.presets`; `ValueError` names the presets there are.
+
+    >>> preset("black_denim").numbers["density"]
+    {'value': 0.32, 'unit': 'kg/m^2'}
+    """
     if name not in presets.MEASURED:
         raise ValueError(f"no preset {name!r}; there are {', '.join(presets.MEASURED)}")
     make = presets.MEASURED[name]

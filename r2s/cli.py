@@ -33,6 +33,7 @@ from r2s.commands.evaluate import Evaluate
 from r2s.commands.export import Export
 from r2s.commands.simulate import Simulate
 from r2s.commands.study import Study
+from r2s.commands.view import View
 
 
 @dataclass(frozen=True)
@@ -192,6 +193,7 @@ Command = (
     | Annotated[CheckGrad, subcommand("check-grad")]
     | Annotated[Doctor, subcommand("doctor")]
     | Annotated[Study, subcommand("study")]
+    | Annotated[View, subcommand("view")]
 )
 
 

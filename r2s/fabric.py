@@ -47,6 +47,10 @@ class Fabric(eqx.Module):
         stiffness [N m], damping time [s], friction [-], thickness [m], mass damping [1/s].
 
         Raises `ValueError` when one is out of its physical range.
+
+        >>> fabric = Fabric.make(0.2, (300.0, 60.0, 200.0, 80.0), 2e-5)
+        >>> float(fabric.membrane.c12)
+        60.0
         """
         c11, c12, c22, c33 = membrane
         if not min(density, c11, c22, c33, thickness) > 0:

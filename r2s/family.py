@@ -35,7 +35,11 @@ class Range:
             )
 
     def value(self, u: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        """The parameter at a place `u` in 0..1 between its bounds."""
+        """The parameter at a place `u` in 0..1 between its bounds.
+
+        >>> round(float(Range("warp", "N/m", 3.0, 3000.0).value(jnp.asarray(0.5))), 1)
+        94.9
+        """
         if self.log:
             return jnp.exp(jnp.log(self.low) * (1 - u) + jnp.log(self.high) * u)
         return self.low * (1 - u) + self.high * u

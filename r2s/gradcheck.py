@@ -45,6 +45,12 @@ def compare(
 
     By reverse mode, or by `forward` mode. Call it in double precision (`jax.enable_x64`): single
     precision says "rough" of most. It runs the function four times a number.
+
+    >>> from r2s.presets import black_denim
+    >>> with jax.enable_x64(True):
+    ...     rows = compare(lambda fabric: fabric.friction**2, black_denim())
+    >>> {row.verdict for row in rows}
+    {'agrees'}
     """
     leaves, tree = jax.tree.flatten(fabric)
     start = jnp.concatenate([jnp.ravel(leaf) for leaf in leaves])

@@ -144,6 +144,11 @@ def to_surface(
     """A mean [m^2] of the distances from a cloud to a sheet, under a penalty.
 
     One-sided: what the cameras did not see of the sheet does not count.
+
+    >>> corners = jnp.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    >>> points, mask = jnp.array([[0.2, 0.2, 0.1], [9, 9, 9]]), jnp.array([True, False])
+    >>> round(float(to_surface(points, mask, corners, jnp.array([[0, 1, 2]]), squared)), 4)
+    0.005
     """
     return mean(penalty(surface_residuals(points, mask, x, faces)[0]), mask)
 

@@ -150,6 +150,10 @@ def rectangle(
     (from the origin to the opposite corner) or "alternating" (favours neither, bends too softly).
 
     Raises `ValueError` when a side is not positive or has no two vertices, or for other diagonals.
+
+    >>> sheet = rectangle((0.3, 0.2), (4, 3))
+    >>> sheet.rest.shape, sheet.faces.shape
+    ((12, 2), (12, 3))
     """
     if min(size) <= 0 or min(shape) < 2:
         raise ValueError(f"a rectangle needs sides > 0 m and >= 2 vertices, got {size}, {shape}")

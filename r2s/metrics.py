@@ -17,6 +17,10 @@ def distances(real: Cloud, simulated: Cloud) -> dict[str, float]:
     `chamfer_real_to_sim` and `chamfer_sim_to_real` are mean (not squared) distances to the nearest
     point, `chamfer` is the mean of the two, and `hausdorff` the largest nearest distance of both.
     Raises `ValueError` when a cloud is empty or not finite.
+
+    >>> real, simulated = np.zeros((1, 3)), np.array([[0, 0, 0.01], [0, 0, 0.03]])
+    >>> distances(real, simulated)["chamfer_real_to_sim"], distances(real, simulated)["hausdorff"]
+    (0.01, 0.03)
     """
     to_simulated, to_real = _nearest(real, simulated)
     one, other = float(np.mean(to_simulated)), float(np.mean(to_real))

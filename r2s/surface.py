@@ -14,6 +14,11 @@ def nearest(
 
     Every pair of point and face is tried. Not differentiable, nor need it be: at the nearest place
     the distance does not change when the weights do (envelope theorem).
+
+    >>> corners = jnp.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    >>> face, weights = nearest(jnp.array([[0.25, 0.25, 0.1]]), corners, jnp.array([[0, 1, 2]]))
+    >>> weights.tolist()
+    [[0.5, 0.25, 0.25]]
     """
     points, x = jax.lax.stop_gradient((points, x))
     squared = _squared_distances(points, x[faces])

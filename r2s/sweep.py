@@ -33,7 +33,12 @@ def sweep(
     folder: Path | None = None,
     devices: Mesh | None = None,
 ) -> Any:
-    """The results of all members, in NumPy arrays with a leading axis; arguments as of `stream`."""
+    """The results of all members, in NumPy arrays with a leading axis; arguments as of `stream`.
+
+    >>> members = {"a": np.ones(3), "b": np.arange(3.0)}
+    >>> sweep(lambda member: member["a"] + member["b"], members, chunk=2).tolist()
+    [1.0, 2.0, 3.0]
+    """
     parts = [found for _, found in stream(function, members, chunk, folder=folder, devices=devices)]
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 

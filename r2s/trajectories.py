@@ -72,6 +72,11 @@ def lift(
     """The held corner goes up by `height` and inward by `inward` [m] in `moving` of `duration` [s].
 
     Inward is towards the opposite corner.
+
+    >>> from r2s.scenarios.experiments import on_table
+    >>> path = lift(on_table((0.3, 0.3), ("origin",)), 4.0, height=0.2, inward=0.0).path
+    >>> np.asarray(path[-1, 0]).round(3).tolist()
+    [0.0, 0.0, 0.201]
     """
     not_negative("m", height=height, inward=inward)
     positive("s", moving=moving)

@@ -19,6 +19,9 @@ def isotropic_membrane(
     """C11, C12, C22, C33 [N/m] of an isotropic sheet in plane stress.
 
     From Young's modulus [Pa], Poisson's ratio [-] and thickness [m].
+
+    >>> [round(c, 2) for c in isotropic_membrane(1e5, 0.3, 1e-3)]
+    [109.89, 32.97, 109.89, 38.46]
     """
     c11 = youngs_modulus * thickness / (1 - poissons_ratio**2)
     c33 = youngs_modulus * thickness / (2 * (1 + poissons_ratio))
@@ -30,5 +33,8 @@ def isotropic_bending(youngs_modulus: Scalar, poissons_ratio: Scalar, thickness:
 
     From Young's modulus [Pa], Poisson's ratio [-] and thickness [m]. A woven or knitted fabric is
     far softer in bending than a plate of its membrane stiffness: measure both.
+
+    >>> round(isotropic_bending(1e5, 0.3, 1e-3) * 1e6, 3)  # [1e-6 N m]
+    9.158
     """
     return youngs_modulus * thickness**3 / (12 * (1 - poissons_ratio**2))

@@ -1,5 +1,7 @@
-"""What the documents say runs, and what they name is there."""
+"""What the documents and docstrings say runs, and what they name is there."""
 
+import doctest
+import importlib
 import pydoc
 import re
 import subprocess
@@ -43,3 +45,16 @@ def test_the_makefile_lists_public_modules_that_are_there():
     for name in listed[1].replace("\\", " ").split():
         path = ROOT.joinpath(*name.split("."))
         assert path.is_dir() or path.with_suffix(".py").exists(), name
+
+
+def with_examples():
+    modules = sorted((ROOT / "r2s").rglob("*.py"))
+    return [path for path in modules if ">>> " in path.read_text(encoding="utf-8")]
+
+
+@pytest.mark.parametrize("path", with_examples(), ids=lambda path: path.stem)
+def test_the_examples_of_docstrings_are_right(path):
+    module = importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
+    found = doctest.testmod(module)
+    assert found.attempted > 0
+    assert found.failed == 0

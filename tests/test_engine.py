@@ -203,3 +203,35 @@ def test_workers_of_dask_make_the_same_and_survive_a_kill(tmp_path):
         runner.close()
     assert {cell.name for cell in failed} == {"n-1", "bad"}
     assert [value_of(cell, tmp_path) for cell in sums[:6]] == [2 * i + 1 for i in range(6)]
+
+
+SBATCH = """#!/bin/sh
+for script; do :; done
+cp "$script" "$0.$$"
+setsid sh "$0.$$" > "$0.$$.log" 2>&1 &
+echo "Submitted batch job $!"
+"""
+
+
+@pytest.mark.slow
+def test_jobs_of_slurm_make_the_same_with_a_stand_in_for_sbatch(tmp_path, monkeypatch):
+    """The stand-in runs a job's script at once, as Slurm would on a node that is free."""
+    cluster = pytest.importorskip("r2s.study.cluster", reason="needs the extra cluster")
+    monkeypatch.setenv("PATH", "/usr/bin:/bin")
+    with pytest.raises(OSError, match="sbatch"):
+        cluster.slurm(1)
+    for name, script in (("sbatch", SBATCH), ("scancel", '#!/bin/sh\nkill -- "-$1"\n')):
+        (tmp_path / name).write_text(script)
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    sums = [Sum((Number(i, 0.1), Number(i + 1, 0.1)), f"s{i}") for i in range(4)]
+    runner = cluster.slurm(2)
+    try:
+        assert not engine.run(sums, tmp_path / "out", runner)
+        settings = runner._client.run(os.getenv, "OPENBLAS_NUM_THREADS")
+    finally:
+        runner.close()
+    assert [value_of(cell, tmp_path / "out") for cell in sums] == [1, 3, 5, 7]
+    assert settings and set(settings.values()) == {"1"}
+    assert len(list(tmp_path.glob("sbatch.*.log"))) >= 1

@@ -2,10 +2,13 @@
 
 import os
 import re
+import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import tomllib
+import urllib.request
 import zipfile
 from pathlib import Path
 
@@ -42,37 +45,55 @@ def build_wheel(folder: Path) -> Path:
     return wheel
 
 
+def commands_of(document: Path) -> list[str]:
+    """The `r2s` commands that a document tells to type, but those that need data of others."""
+    text = document.read_text(encoding="utf-8")
+    found = re.findall(r"^ {4}(r2s .*?)(?:  +#.*)?$", text, re.M)
+    return [command for command in found if not re.search(r"recordings|diffcloud", command)]
+
+
+def run_until_shown(command: str, **about) -> None:
+    """A command that shows a page until it is interrupted."""
+    process = subprocess.Popen(shlex.split(command), stdout=subprocess.PIPE, text=True, **about)
+    assert process.stdout is not None
+    try:
+        for line in process.stdout:
+            if line.startswith("http://"):
+                urllib.request.urlopen(line.split()[0]).close()
+                process.send_signal(signal.SIGINT)
+    finally:
+        process.stdout.close()
+        assert process.wait(60) == 0
+
+
 @pytest.mark.slow
 def test_what_the_readme_says_runs_where_only_a_wheel_is_installed(tmp_path: Path) -> None:
-    """In an environment of its own, away from the checkout: commands that need no data of others,
-    and all Python."""
+    """In an environment of its own, away from the checkout: its commands and those of the guide to
+    them, one after the other, and all Python."""
     wheel = build_wheel(tmp_path)
     environment = tmp_path / "environment"
     subprocess.run([sys.executable, "-m", "venv", environment], check=True)
     binaries = environment / "bin"
-    install = [
-        binaries / "python",
-        "-m",
-        "pip",
-        "install",
-        "-q",
-        f"{wheel}[study,camera,pcd,data,cli]",
-    ]
-    subprocess.run([*install, "-c", ROOT / "constraints.txt"], check=True, cwd=tmp_path)
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    commands = [line.strip() for line in re.findall(r"^ {4}(r2s .*?)(?:  +#.*)?$", readme, re.M)]
-    unaided = [c for c in commands if not re.search(r"recordings|diffcloud|\.\.\.", c)]
-    assert len(unaided) >= 3, commands
+    python = binaries / "python"
+    extras = f"{wheel}[study,camera,pcd,data,cli,viz]"
+    install = [python, "-m", "pip", "install", "-q", extras, "-c", ROOT / "constraints.txt"]
+    subprocess.run(install, check=True, cwd=tmp_path)
     ours = os.environ | {"PATH": f"{binaries}:{os.environ['PATH']}", "JAX_PLATFORMS": "cpu"}
-    for command in unaided:
-        run = subprocess.run(command, shell=True, cwd=tmp_path, env=ours, capture_output=True)
+    about = {"cwd": tmp_path, "env": ours}
+    commands = [*commands_of(ROOT / "README.md"), *commands_of(ROOT / "docs" / "fabrics.md")]
+    named = {command.split()[1] for command in commands}
+    assert {"simulate", "estimate", "evaluate", "export", "doctor", "view", "show"} <= named
+    for command in dict.fromkeys(commands):
+        if command.startswith("r2s view"):
+            run_until_shown(command, **about)
+            continue
+        run = subprocess.run(command, shell=True, capture_output=True, **about)
         assert run.returncode == 0, (command, run.stderr[-2000:])
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
     (tmp_path / "blocks.py").write_text(
         "\n".join(re.findall(r"^```python\n(.*?)^```", readme, re.M | re.S))
     )
-    run = subprocess.run(
-        [binaries / "python", "blocks.py"], cwd=tmp_path, env=ours, capture_output=True
-    )
+    run = subprocess.run([python, "blocks.py"], capture_output=True, **about)
     assert run.returncode == 0, run.stderr[-2000:]
 
 

@@ -175,6 +175,10 @@ def plate_solid(c11: Scalar, c12: Scalar, bending: Scalar) -> tuple[Scalar, Scal
     The inverse of `plate_stiffness`, from C11 and C12 [N/m] and the bending stiffness [N m] of an
     isotropic sheet: nu = C12 / C11, h^2 = 12 B / C11. That is the thickness of the solid that bends
     so, as a rule less than the fabric's own.
+
+    >>> membrane, bending = plate_stiffness(1e5, 0.3, 1e-3)
+    >>> [round(x, 6) for x in plate_solid(membrane[0], membrane[1], bending)]
+    [100000.0, 0.3, 0.001]
     """
     poisson = c12 / c11
     thickness = (12 * bending / c11) ** 0.5

@@ -74,6 +74,10 @@ def lifting(
     """A sheet lies flat on the table; a corner is lifted. The second half of the frames counts.
 
     `path`: see `trajectories.lift`. The left corner is the "origin" or the "weft".
+
+    >>> scenario = lifting((0.3, 0.3), height=0.2).scenario((5, 5))
+    >>> scenario.start.shape, scenario.num_frames
+    ((25, 3), 60)
     """
     done = _moved("lifting", on_table(size, (held,)), route, num_frames, interval, path)
     return done._replace(frames_used=(num_frames // 2, num_frames - 1))

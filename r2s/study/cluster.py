@@ -3,6 +3,7 @@
 Needs dask: pip install 'r2s[cluster]'.
 """
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -39,12 +40,22 @@ def at(address: str) -> "Workers":
 def slurm(
     jobs: int, *, cores: int = 1, memory: str = "8GB", walltime: str = "04:00:00", queue: str = ""
 ) -> "Workers":
-    """As many Slurm jobs, each of `cores` workers. Needs dask-jobqueue."""
+    """As many Slurm jobs, each of `cores` workers, which see the study's folder too.
+
+    Needs dask-jobqueue. Partition, account and the like come from its configuration file. Raises
+    `OSError` where there is no Slurm.
+    """
     try:
         from dask_jobqueue.slurm import SLURMCluster
     except ImportError as error:
         raise ImportError("Slurm needs dask-jobqueue: pip install 'r2s[cluster]'") from error
-    exports = [f"export {name}='{value}'" for name, value in environment(cores).items()]
+    if shutil.which("sbatch") is None:
+        raise OSError("no command sbatch: submit from a node of the Slurm cluster")
+    variables = environment(cores)
+    _configure(variables)  # the scheduler runs here
+    # the workers read their part of Dask's settings from their own environment
+    variables |= {"DASK_DISTRIBUTED__WORKER__MEMORY__TERMINATE": "False"}
+    exports = [f"export {name}='{value}'" for name, value in variables.items()]
     cluster = SLURMCluster(
         cores=cores,
         processes=cores,
@@ -70,6 +81,7 @@ class Workers:
         self._done = as_completed()
 
     def submit(self, cell: Cell, folder: Path) -> None:
+        # none yet where jobs wait in a queue: then any worker will do
         workers = sorted(self._client.scheduler_info(n_workers=-1)["workers"])
         home = self._homes.setdefault(cell.alike, len(self._homes))
         future = self._client.submit(
@@ -81,7 +93,7 @@ class Workers:
             pure=False,
             retries=RETRIES,
             workers=[workers[home % len(workers)]] if workers else None,
-            allow_other_workers=True,
+            allow_other_workers=bool(workers),
         )
         self._cells[future.key] = cell
         self._done.add(future)

@@ -1,0 +1,84 @@
+"""`r2s view`: a fabric with sliders, in a browser."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from r2s.commands.common import ScenarioName
+
+if TYPE_CHECKING:
+    from r2s.cards import Card
+    from r2s.fabric import Fabric
+    from r2s.family import Family
+    from r2s.interactive.subject import Subject
+
+
+@dataclass(frozen=True)
+class View:
+    """Show a fabric in motion in a browser, with a slider for each of its parameters.
+
+    With --recording the motion is the recording's, its points lie over the cloth, and their mean
+    distance follows the sliders. Sliders run over the range of estimates; values are below them.
+    Ends with Ctrl-C. Needs the extra viz.
+
+        r2s view grey_interlock --scenario fling
+        r2s view denim.json --recording lift.npz --save mine.json
+    """
+
+    fabric: Annotated[Positional[str], arg(metavar="PRESET|CARD")] = "grey_interlock"
+    """Where the sliders begin; its areal density is kept."""
+    recording: Annotated[Path | None, arg(metavar="RECORDING")] = None
+    """NPZ, or folder of frames."""
+    scenario: Annotated[ScenarioName, arg(metavar="SCENARIO")] = "lifting"
+    """Without a recording: of the study."""
+    motion: Annotated[tuple[str, ...], arg(metavar="NAME=NUMBER")] = ()
+    """Numbers of that motion, such as height=0.3 [m]."""
+    shape: tuple[int, int] = (9, 9)
+    """Vertices along warp and weft."""
+    save: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Card that a button writes, with the fabric as shown."""
+    host: str = "127.0.0.1"
+    """0.0.0.0 lets other machines in."""
+    port: int = 8080
+
+    def run(self) -> None:
+        import time
+
+        from r2s.commands.common import card_of
+        from r2s.family import OrthotropicFamily
+        from r2s.interactive.page import Page
+        from r2s.interactive.subject import place
+
+        card = card_of(self.fabric)
+        subject = self._subject(OrthotropicFamily.make(float(card.fabric.density)))
+        save = None if self.save is None else lambda fabric: self._saved(card, fabric)
+        start = place(subject, card.fabric)
+        page = Page(subject, start, save=save, host=self.host, port=self.port)
+        print(f"{page.url} (Ctrl-C ends)", flush=True)
+        try:
+            while True:
+                time.sleep(1)
+        except KeyboardInterrupt:
+            page.close()
+
+    def _subject(self, family: "Family") -> "Subject":
+        from r2s.commands.common import experiment_of
+        from r2s.interactive.subject import of_experiment, of_recording
+        from r2s.show import open_recording
+
+        if self.recording is None:
+            return of_experiment(experiment_of(self.scenario, self.motion), family, self.shape)
+        if self.motion:
+            raise ValueError("--motion is of a scenario: a recording has its own motion")
+        return of_recording(open_recording(self.recording), family, self.shape)
+
+    def _saved(self, card: "Card", fabric: "Fabric") -> str:
+        from r2s import cards
+
+        assert self.save is not None
+        method = f"set by hand with sliders, from {card.name}"
+        about = cards.Provenance(method, assumed=("density", "thickness", "mass_damping"))
+        cards.write(self.save, cards.Card.make(self.save.stem, fabric, about))
+        return f"{self.save}"

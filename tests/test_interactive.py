@@ -1,0 +1,189 @@
+"""Sliders for a fabric: what is simulated, and what a browser shows when one is moved."""
+
+import base64
+import contextlib
+import io
+import json
+import shutil
+import socket
+import subprocess
+import time
+import urllib.request
+
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from r2s import presets, synthetic
+from r2s.family import OrthotropicFamily
+from r2s.interactive import subject as subjects
+from r2s.scenarios import fling, lifting
+from r2s.study import judge
+
+page = pytest.importorskip("r2s.interactive.page", reason="viser is not installed")
+
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+needs_browser = pytest.mark.skipif(
+    BROWSER is None, reason="neither chromium nor google-chrome is on the path"
+)
+FLAGS = (
+    "--headless=new", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-sync",
+    "--disable-background-networking", "--disable-component-update", "--use-gl=angle",
+    "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--window-size=1100,800",
+    "--remote-debugging-port=0",
+)  # fmt: skip
+SLIDER = "document.querySelectorAll('[role=slider]')[1]"  # the frame's is before the parameters'
+SHAPE = (9, 9)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    experiment = lifting(num_frames=12, interval=0.1, moving=0.8)
+    fabric = presets.grey_interlock()
+    return synthetic.record(experiment, fabric, "grey", shape=SHAPE, key=jr.key(0))
+
+
+@pytest.fixture(scope="module")
+def subject(recording):
+    family = OrthotropicFamily.make(float(presets.grey_interlock().density))
+    return subjects.of_recording(recording, family, SHAPE)
+
+
+@pytest.fixture
+def shown(subject):
+    start = subjects.place(subject, presets.grey_interlock())
+    made = page.Page(subject, start, port=free_port())
+    yield made
+    made.close()
+
+
+def free_port():
+    with socket.socket() as tried:
+        tried.bind(("127.0.0.1", 0))
+        return tried.getsockname()[1]
+
+
+def test_the_error_is_the_distance_that_the_study_reports(recording, subject):
+    moved = subjects.move(subject, subjects.place(subject, presets.black_denim()))
+    found = judge.against_motion(recording, np.asarray(moved.x))["chamfer_real_to_sim"]
+    # theirs is to samples of the surface 6 mm apart, and of all points
+    assert float(subjects.error_used(subject, moved)) == pytest.approx(found, rel=0.05, abs=5e-4)
+
+
+def test_the_true_fabric_is_nearest_and_a_softer_one_hangs_lower(subject):
+    truth = subjects.place(subject, presets.grey_interlock())
+    at = lambda u: subjects.move(subject, u)
+    softer = at(truth.at[0].set(0.0))
+    assert subjects.error_used(subject, at(truth)) < subjects.error_used(subject, softer)
+    assert softer.x[-1, :, 2].min() <= at(truth).x[-1, :, 2].min() + 1e-4
+
+
+def test_without_a_recording_there_is_no_error():
+    subject = subjects.of_experiment(fling(num_frames=24), OrthotropicFamily.make(0.2), SHAPE)
+    moved = subjects.move(subject, jnp.full(subject.family.dim, 0.5))
+    assert bool(moved.ok.all()) and np.isnan(np.asarray(moved.error)).all()
+
+
+def test_a_taken_port_is_said(subject, shown):
+    with pytest.raises(OSError, match=f"port {shown.server.get_port()}"):
+        page.Page(subject, jnp.asarray(shown.u), port=shown.server.get_port())
+
+
+def test_only_the_last_place_of_a_slider_is_shown(subject, shown):
+    before = shown.moved
+    for value in np.linspace(0.1, 0.9, 9):
+        shown._sliders[2].value = float(value)
+    after = shown.latest()
+    assert shown.u[2] == pytest.approx(0.9)
+    assert np.allclose(after.x, subjects.move(subject, jnp.asarray(shown.u)).x)
+    assert not np.allclose(after.x, before.x, atol=1e-3)
+
+
+class Browser:
+    """A page in headless Chromium, by its debugging protocol."""
+
+    def __init__(self, folder):
+        from websockets.sync.client import connect
+
+        flags = [*FLAGS, f"--user-data-dir={folder}", "about:blank"]
+        self.process = subprocess.Popen(
+            [str(BROWSER), *flags], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+        )
+        port = wait_for(lambda: (folder / "DevToolsActivePort").read_text().split()[0])
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
+            target = next(each for each in json.load(answer) if each["type"] == "page")
+        self.socket = connect(target["webSocketDebuggerUrl"], max_size=None)
+        self.count = 0
+
+    def call(self, method, **arguments):
+        self.count += 1
+        self.socket.send(json.dumps({"id": self.count, "method": method, "params": arguments}))
+        while True:
+            answer = json.loads(self.socket.recv(timeout=60))
+            if answer.get("id") == self.count:
+                assert "error" not in answer, answer
+                return answer["result"]
+
+    def evaluate(self, script):
+        found = self.call("Runtime.evaluate", expression=script, returnByValue=True)
+        assert "exceptionDetails" not in found, found
+        return found["result"].get("value")
+
+    def press(self, key):
+        for kind in ("rawKeyDown", "keyUp"):
+            about = {"key": key, "code": key, "windowsVirtualKeyCode": KEYS[key]}
+            self.call("Input.dispatchKeyEvent", type=kind, **about)
+
+    def picture(self):
+        return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
+
+    def close(self):
+        self.socket.close()
+        self.process.terminate()
+        self.process.wait()
+
+
+KEYS = {"ArrowRight": 39, "Home": 36}
+
+
+def wait_for(found, timeout=60.0):
+    """What a function gives once it gives something and does not raise."""
+    end = time.monotonic() + timeout
+    while True:
+        with contextlib.suppress(OSError, IndexError):
+            if value := found():
+                return value
+        assert time.monotonic() < end, "nothing came in time"
+        time.sleep(0.1)
+
+
+def is_blue(png):
+    """Which pixels of a picture have the colour of the cloth."""
+    red, green, blue = imread(io.BytesIO(png))[..., :3].transpose(2, 0, 1)
+    return (blue > 0.35) & (blue > 1.2 * green) & (blue > 2 * red)
+
+
+@needs_browser
+def test_a_slider_moved_in_a_browser_moves_the_cloth(shown, tmp_path):
+    browser = Browser(tmp_path)
+    try:
+        browser.call("Page.navigate", url=shown.url)
+        wait_for(lambda: browser.evaluate(f"!!{SLIDER}"))
+        time.sleep(3)
+        before, picture = shown.moved, browser.picture()
+        browser.evaluate(f"{SLIDER}.focus()")
+        browser.press("Home")
+        wait_for(lambda: shown.u[0] == 0)
+        after = shown.latest()
+        time.sleep(2)
+        changed = browser.picture()
+        (tmp_path / "before.png").write_bytes(picture)
+        (tmp_path / "after.png").write_bytes(changed)
+        assert not np.allclose(after.x, before.x, atol=1e-3)
+        sheets = is_blue(picture), is_blue(changed)
+        assert min(sheet.sum() for sheet in sheets) > 1000
+        assert (sheets[0] ^ sheets[1]).sum() > 0.05 * sheets[0].sum()
+    finally:
+        browser.close()
