@@ -62,6 +62,9 @@ def test_an_error_is_one_line_and_1(tmp_path: Path, capsys: pytest.CaptureFixtur
         (["evaluate", "black_denim", str(tmp_path / "no.npz")], "no.npz: no such recording"),
         (["check-grad", "wind", "--solver", "points", "--forward"], "are of the cloth"),
         (["doctor", "--mesh", str(tmp_path / "no.obj")], "no.obj: no such mesh"),
+        (["view", "felt"], "felt: no such card, and no preset"),
+        (["view", "--recording", str(tmp_path / "no.npz")], "no.npz: no such recording"),
+        (["view", "--recording", "x.npz", "--motion", "height=1"], "--motion is of a scenario"),
     ):
         assert main(arguments) == 1, arguments
         lines = capsys.readouterr().err.splitlines()

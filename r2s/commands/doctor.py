@@ -22,6 +22,7 @@ EXTRAS = {
     "physnet": ("skopt",),
     "cma": ("cma",),
     "cluster": ("dask", "distributed", "dask_jobqueue"),
+    "viz": ("viser",),
     "bench": ("mujoco", "newton", "warp", "taichi"),
 }
 PACKAGES = ("r2s", "jax", "jaxlib", "equinox", "optax", "optimistix", "lineax", "numpy")

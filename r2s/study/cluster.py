@@ -81,8 +81,9 @@ class Workers:
         self._done = as_completed()
 
     def submit(self, cell: Cell, folder: Path) -> None:
-        # none yet where jobs wait in a queue: then any worker will do
-        workers = sorted(self._client.scheduler_info(n_workers=-1)["workers"])
+        # asked of the scheduler: the client's own list is emptied by its refresh now and then.
+        # None yet where jobs wait in a queue: then any worker will do.
+        workers = sorted(self._client.nthreads())
         home = self._homes.setdefault(cell.alike, len(self._homes))
         future = self._client.submit(
             attempt,
