@@ -10,8 +10,10 @@ ARGS ?=
 PRESET ?= small
 WORKERS ?= 2
 
-# Most of the fast tests' time is compilation: they do without XLA's optimisation.
-QUICK := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0
+# Most of the fast tests' time is compilation: they do without XLA's optimisation. Two processes of
+# one thread each: threads that wait for each other cost more than they compute.
+QUICK := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 \
+	--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1
 
 # The public surface: what changes here is in the changelog.
 PUBLIC := r2s r2s.fabric r2s.family r2s.presets r2s.units r2s.mesh r2s.scene r2s.solver r2s.cloth \

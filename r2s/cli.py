@@ -5,6 +5,7 @@ whose fields are its arguments, with a method `run`; its docstring is its help. 
 imported there, so that help comes at once. Those of simulation and estimate are in `r2s.commands`.
 """
 
+import os
 import sys
 import warnings
 from collections.abc import Sequence
@@ -34,6 +35,7 @@ from r2s.commands.export import Export
 from r2s.commands.simulate import Simulate
 from r2s.commands.study import Study
 from r2s.commands.view import View
+from r2s.study.environment import one_thread
 
 
 @dataclass(frozen=True)
@@ -224,9 +226,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+def command() -> int:
+    """`main` in a process of its own."""
+    os.environ["XLA_FLAGS"] = one_thread(os.environ.get("XLA_FLAGS", ""))  # JAX has not begun yet
+    return main()
+
+
 def _warn(message, *_, **__) -> None:
     print(f"r2s: warning: {message}", file=sys.stderr)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(command())
