@@ -31,13 +31,14 @@ from r2s import synthetic
 from r2s.estimators import physnet
 from r2s.estimators.physnet import Sighting
 from r2s.files import write_json, write_text
-from r2s.observe.calibration import calibrated
+from r2s.observe.calibration import DepthCamera, calibrated, frustum, look_at
 from r2s.observe.flaws import TYPICAL, flawed_depth, flawed_mask
 from r2s.observe.render import render
 from r2s.physnet import dataset, pictures, preprocess, training, triplets
 from r2s.physnet.dataset import Data, Settings
 from r2s.physnet.network import DEEPER, PAPER
 from r2s.physnet.training import Training
+from r2s.physnet.views import View, in_frame
 from r2s.scenario import Scenario, motion
 
 DRAWS = 200  # of random search, which is free: its motions are simulated once
@@ -253,7 +254,8 @@ def solver_of(settings: Settings, scenario: Scenario):
 
 
 def compared(chosen: list[Target], networks: list[Training]) -> dict[str, list[float]]:
-    """Median distances of images with flaws from those without, by each network."""
+    """Median distances of images with flaws from those without, by each network; where the sheet is
+    out of the camera's frame, that counts, too."""
     found: dict[str, list[float]] = {"depth camera": [], "clouds": []}
     for trained in networks:
         for name, distances in found.items():
@@ -275,16 +277,23 @@ def estimates(out, others, settings, networks, chosen, asked) -> list[dict[str, 
     scenario = experiment.scenario(settings.shape)
     solver = solver_of(settings, scenario)
     bank, depth = of_level(others, settings)
+    cameras = [calibrated(camera) for camera in synthetic.sensing(experiment).cameras]
     rows = []
     for index, trained in enumerate(networks):
-        points = embedded(trained, depth)
+        by_kind = {"depth camera": cameras[:1], "clouds": cameras}
+        banks = {
+            kind: embedded(trained, in_view(trained.view, depth, some))
+            for kind, some in by_kind.items()
+        }
         for order, target in enumerate(chosen):
             # clouds of the first fabrics only: each takes another search
             kinds = ("depth camera", "clouds") if order < 3 and index == 0 else ("depth camera",)
             for kind in kinds:
                 images = target.images[kind]
-                sighting = Sighting.make(scenario, images, frames, settings.family, trained, solver)
-                guessed = random_search(sighting, points, bank, others.places, target, asked.calls)
+                about = scenario, images, frames, settings.family, trained, solver
+                sighting = Sighting.make(*about, cameras=by_kind[kind])
+                about = banks[kind], bank, others.places, target, asked.calls
+                guessed = random_search(sighting, *about)
                 if index == 0 and kind == "depth camera":
                     guessed["deviation"] = deviations(sighting, target)
                 for seed in range(asked.repeats):
@@ -295,6 +304,17 @@ def estimates(out, others, settings, networks, chosen, asked) -> list[dict[str, 
                     progress(f"{kind}, fabric {order}: errors {np.round(row['error'], 3)}")
     write_rows(out / "errors.csv", rows, settings)
     return rows
+
+
+def in_view(view: View, depth: np.ndarray, cameras: list[DepthCamera]) -> np.ndarray:
+    """Depth images of a view without what is out of the cameras' frames."""
+    pose = np.array(look_at(view.position, view.target))
+    middles = (np.arange(view.size) + 0.5 - view.size / 2) / view.focal_length
+    rays = np.stack([*np.meshgrid(middles, middles), np.ones((view.size,) * 2)], axis=-1)
+    points = (depth * dataset.STEP)[..., None] * (rays @ pose[:3, :3].T) + pose[:3, 3]
+    planes = jnp.asarray(np.stack([frustum(camera) for camera in cameras]), float)
+    inside = in_frame(jnp.asarray(points.reshape(-1, 3), float), planes)
+    return np.where(np.asarray(inside).reshape(depth.shape), depth, 0)
 
 
 def searched(path: Path, sighting: Sighting, target: Target, calls: int, seed: int):

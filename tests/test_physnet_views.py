@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from r2s import scenarios, synthetic
 from r2s.mesh import rectangle
-from r2s.observe.calibration import DepthCamera, calibrated, look_at
+from r2s.observe.calibration import DepthCamera, calibrated, frustum, look_at
 from r2s.observe.camera import Camera
 from r2s.observe.render import render
 from r2s.physnet import preprocess, views
@@ -200,3 +200,34 @@ def test_a_stray_point_that_was_spread_is_dropped():
     alone = (plain > 0) & (clean == 0)
     assert alone.any() and (stray[alone] == 0).all()
     assert ((clean > 0) == (stray > 0))[plain == 0].mean() > 0.99
+
+
+def test_in_the_frame_is_what_falls_onto_a_pixel():
+    camera = Camera(jnp.array([-0.5, -0.1, 0.5]), jnp.array([0.25, 0.25, 0.1]), 200.0, (160, 120))
+    points = jnp.asarray(np.random.default_rng(0).uniform(-0.3, 0.8, (2000, 3)), float)
+    pixel, depth = (np.asarray(part) for part in camera.project(points))
+    found = np.asarray(views.in_frame(points, frames_of(camera)))
+    spare = np.minimum(pixel, np.array(camera.resolution) - pixel).min(axis=1)
+    assert found[(depth > 0) & (spare > 1)].all()
+    assert not found[(depth <= 0) | (spare < 0)].any()
+    assert 100 < found.sum() < 1900
+
+
+def test_what_no_camera_has_in_its_frame_is_left_out_of_an_image():
+    aside = jnp.array([0.3, 0.1, 0.1])
+    narrow = Camera(jnp.array(VIEW.position), aside, 40.0, (12, 32))
+    wide = Camera(jnp.array(VIEW.position), aside, 40.0, (200, 200))
+    x = jnp.asarray(TILTED, float)[None]
+    images = [
+        np.asarray(views.depths_of_sheet(VIEW, x, MESH.faces, 40, frames)[0])
+        for frames in (None, frames_of(narrow), frames_of(narrow, wide))
+    ]
+    whole, cut, again = images
+    kept = cut > 0
+    assert 0.2 < kept.sum() / (whole > 0).sum() < 0.8
+    np.testing.assert_allclose(cut[kept], whole[kept], atol=0.02)
+    np.testing.assert_array_equal(again, whole)
+
+
+def frames_of(*cameras):
+    return jnp.asarray(np.stack([frustum(calibrated(camera)) for camera in cameras]), float)

@@ -6,7 +6,7 @@ follows the recorded gripper.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import equinox as eqx
@@ -19,6 +19,7 @@ from r2s.estimators import bayes
 from r2s.estimators.bayes import History, Objective
 from r2s.estimators.estimate import Estimate, without_deviations
 from r2s.family import Family
+from r2s.observe.calibration import DepthCamera, frustum
 from r2s.physnet.network import PhysNet
 from r2s.physnet.preprocess import grey
 from r2s.physnet.training import Training
@@ -40,6 +41,7 @@ class Sighting(eqx.Module):
 
     - `scenario`, `frames`: which of its frames were seen. - `points`: where those images lie.
     - `family`: the fabrics to choose from. - `solver`: None for the cloth.
+    - `cameras`: what is in the frame of each, of `frustum`; None: all of the sheet is.
     """
 
     scenario: Scenario
@@ -50,6 +52,7 @@ class Sighting(eqx.Module):
     frames: tuple[int, ...] = eqx.field(static=True)
     view: View = eqx.field(static=True)
     per_face: int = eqx.field(static=True)
+    cameras: Float[Array, "camera 4 4"] | None = None
 
     @classmethod
     def make(
@@ -60,9 +63,11 @@ class Sighting(eqx.Module):
         family: Family,
         training: Training,
         solver: Solver | None = None,
+        cameras: Sequence[DepthCamera] = (),
     ) -> "Sighting":
         """From images of `r2s.physnet.preprocess` at some frames of a scenario.
 
+        Where `cameras` are given, simulated images too lack what all of them have out of frame.
         Raises `ValueError` when images and frames differ in number, or a frame is not simulated.
         """
         if len(images) != len(frames) or not all(0 <= f < scenario.num_frames for f in frames):
@@ -76,7 +81,9 @@ class Sighting(eqx.Module):
         width, height = (float(side) for side in np.ptp(rest, axis=0))
         fine = per_face(training.view, (along[0], along[1]), (width, height))
         about = frames, training.view, fine
-        return cls(scenario, points, family, training.network, solver, *about)
+        planes = [frustum(camera) for camera in cameras]
+        planes = jnp.asarray(np.stack(planes), float) if planes else None
+        return cls(scenario, points, family, training.network, solver, *about, planes)
 
 
 @eqx.filter_jit
@@ -100,7 +107,8 @@ def answers(sighting: Sighting, places: Float[Array, "place dim"]) -> Float[Arra
         found = motion(sighting.scenario, fabric, solver=sighting.solver)
         x = found.x[jnp.array(sighting.frames)]
         faces = sighting.scenario.scene.mesh.faces
-        depth = depths_of_sheet(sighting.view, x, faces, sighting.per_face)
+        about = sighting.per_face, sighting.cameras
+        depth = depths_of_sheet(sighting.view, x, faces, *about)
         images = jax.vmap(lambda image: grey(sighting.view, image))(depth)
         points = jax.vmap(sighting.network)(images)
         whole = jnp.all(found.ok) & jnp.all(jnp.isfinite(x))
