@@ -84,10 +84,7 @@ def ask(
     """
     done, dim = history.places.shape
     if done < num_first:
-        from scipy.stats import qmc
-
-        filled = qmc.Sobol(dim, rng=np.random.default_rng(seed)).random(_power_of_two(num_first))
-        return filled[done : min(done + number, num_first)]
+        return even(dim, num_first, seed)[done : done + number]
     generator = np.random.default_rng([seed, done])
     places, losses = history.places, history.penalised
     least = max(LEAST * losses.max(), np.finfo(float).tiny)
@@ -99,7 +96,7 @@ def ask(
     kernel = process.kernel_
     for _ in range(number):
         best = places[np.argsort(values)[:CENTRES]]
-        place = _most_promising(process, _candidates(best, generator), values.min())
+        place = _most_promising(process, candidates(best, generator), values.min())
         places = np.concatenate([places, place[None]])
         values = np.concatenate([values, process.predict(place[None])])
         process = _process(dim, kernel=kernel).fit(places, values)
@@ -190,13 +187,18 @@ def load(path: Path | str, about: dict[str, int]) -> History:
     return history
 
 
-def _power_of_two(number: int) -> int:
-    return 1 << max(number - 1, 0).bit_length()
+def even(dim: int, number: int, seed: int) -> Float[np.ndarray, "place dim"]:
+    """Places that fill the unit cube evenly, by Sobol's sequence."""
+    from scipy.stats import qmc
+
+    power_of_two = 1 << max(number - 1, 0).bit_length()
+    return qmc.Sobol(dim, rng=np.random.default_rng(seed)).random(power_of_two)[:number]
 
 
-def _candidates(
+def candidates(
     best: Float[np.ndarray, "centre dim"], generator: np.random.Generator
 ) -> Float[np.ndarray, "place dim"]:
+    """Random places of the unit cube, half of them anywhere and half around the best so far."""
     dim = best.shape[1]
     anywhere = generator.random((CANDIDATES, dim))
     low, high = np.log(WIDTHS)

@@ -1,4 +1,4 @@
-"""PhysNet: a fabric from depth images, by Bayesian optimisation on the physics similarity map.
+"""PhysNet: a fabric from depth images, by a search on the physics similarity map.
 
 After Duan et al. 2022. The loss is the distance, frame by frame, between where a trained network
 puts the recorded and the simulated images. Both pass the same preprocessing, and the simulation
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r2s.estimators import bayes
+from r2s.estimators import bayes, emulator
 from r2s.estimators.bayes import History, Objective
 from r2s.estimators.estimate import Estimate, without_deviations
 from r2s.family import Family
@@ -26,12 +26,6 @@ from r2s.physnet.training import Training
 from r2s.physnet.views import View, depths_of_sheet, per_face
 from r2s.scenario import Scenario, motion
 from r2s.solver import Solver
-
-REFINE = 0.45  # of the simulations
-STEP = 0.04  # of a range, of differences
-LENGTHS = (1.0, 0.5, 0.25, 0.1)  # of a Gauss-Newton step
-LEAST_GAIN = 1e-3  # of the loss, or no further step is made
-RANGE_VARIANCE = 1 / 12  # of a place drawn evenly from a range
 
 Images = Float[np.ndarray, "frame down across"]
 
@@ -149,84 +143,65 @@ def objective(sighting: Sighting, batch: int) -> Objective:
     return lambda places: np.sqrt(((respond(places) - target) ** 2).mean(axis=1))
 
 
-def refined(
-    sighting: Sighting, history: History, num_calls: int, batch: int = 4, dim_step: float = STEP
-) -> History:
-    """The history with Gauss-Newton steps from its best place, of at most `num_calls` simulations.
-
-    The residuals are how far each frame's image lies on the map from the recorded one, along its
-    axes; their slopes are differences over `dim_step` of a range; the ranges count as a prior, by
-    what is left of the residuals. Each step tries shorter ones, too, and takes the best.
-    """
-    respond, target = responses(sighting, batch), np.asarray(_flat(sighting.points))
-    dim = history.places.shape[1]
-
-    def tried(places: np.ndarray) -> np.ndarray:
-        nonlocal history
-        starts = range(0, len(places), batch)
-        residuals = np.concatenate([respond(places[i : i + batch]) for i in starts]) - target
-        history = bayes.tell(history, places, np.sqrt((residuals**2).mean(axis=1)))
-        return residuals
-
-    while num_calls >= dim + 1 + len(LENGTHS):
-        place, least = history.places[history.best], np.nanmin(history.losses)
-        sides = np.where(place > 0.5, -dim_step, dim_step)
-        residuals = tried(np.concatenate([place[None], place + np.diag(sides)]))
-        slopes = np.nan_to_num((residuals[1:] - residuals[0]).T / sides)
-        # the error of the images counts as the same in all frames
-        noise = len(sighting.frames) * (residuals[0] ** 2).mean()
-        step = _gauss_newton(slopes, residuals[0], place, noise)
-        tried(np.clip(place + np.array(LENGTHS)[:, None] * step, 0, 1))
-        num_calls -= dim + 1 + len(LENGTHS)
-        if np.nanmin(history.losses) > (1 - LEAST_GAIN) * least:
-            break
-    return history
-
-
-def _gauss_newton(
-    slopes: np.ndarray, residuals: np.ndarray, place: np.ndarray, noise: float
-) -> np.ndarray:
-    """The step to the least sum of squares, with the range as prior, by the variance `noise`."""
-    weight = noise / RANGE_VARIANCE
-    matrix = slopes.T @ slopes + weight * np.eye(len(place))
-    return np.linalg.solve(matrix, -slopes.T @ residuals - weight * (place - 0.5))
-
-
 def estimate(
     sighting: Sighting,
     *,
     num_calls: int = 80,
-    refine: float = REFINE,
+    batch: int = 4,
+    seed: int = 0,
+    path: Path | str | None = None,
+    progress: Callable[[emulator.Trials], None] | None = None,
+) -> Estimate:
+    """The fabric most likely to look as recorded, by `num_calls` simulations.
+
+    Where its images lie on the map is emulated, as of `r2s.estimators.emulator`; the last
+    simulation is of the estimate. Goes on from `path`. The losses are distances on the map, without
+    unit. Gives no deviations: repeat with other seeds. Raises `RuntimeError` when all simulations
+    diverge, or the last one.
+    """
+    began = time.perf_counter()
+    target = np.asarray(_flat(sighting.points))
+    about = {"num_calls": num_calls, "batch": batch, "seed": seed, "path": path}
+    frames = len(sighting.frames)  # the error of the images counts as the same in all of them
+    dim = sighting.family.dim
+    trials = emulator.minimise(
+        responses(sighting, batch), target, dim, shared=frames, progress=progress, **about
+    )
+    losses = trials.losses(target)
+    if not np.isfinite(losses[-1]):
+        raise RuntimeError("the simulation of the estimate diverged: narrow the ranges")
+    name = f"physnet (emulated answers, {num_calls} simulations)"
+    return _told(sighting, name, trials.places, losses, -1, began)
+
+
+def original(
+    sighting: Sighting,
+    *,
+    num_calls: int = 80,
     batch: int = 4,
     seed: int = 0,
     path: Path | str | None = None,
     progress: Callable[[History], None] | None = None,
 ) -> Estimate:
-    """The fabric of the least distance on the map among `num_calls` simulations.
-
-    As many Gauss-Newton steps as fit a share `refine` of them are made from where Bayesian
-    optimisation ended, as of `refined`; none, as in the study, for 0. Goes on from the history of
-    the optimisation in `path`. The losses are distances on the map, without unit. Gives no
-    deviations: repeat with other seeds. Raises `RuntimeError` when all simulations diverge.
-    """
+    """The fabric of the least distance on the map among `num_calls` simulations, by Bayesian
+    optimisation of that distance, as in the study; otherwise as `estimate`."""
     began = time.perf_counter()
+    about = {"num_calls": num_calls, "batch": batch, "seed": seed, "path": path}
+    lossy, dim = objective(sighting, batch), sighting.family.dim
+    history = bayes.minimise(lossy, dim, progress=progress, **about)
+    name = f"physnet (Bayesian optimisation, {num_calls} simulations)"
+    return _told(sighting, name, history.places, history.losses, history.best, began)
+
+
+def _told(sighting: Sighting, name: str, places, losses, best: int, began: float) -> Estimate:
     family = sighting.family
-    each = family.dim + 1 + len(LENGTHS)  # simulations of a Gauss-Newton step
-    searched = num_calls - each * int(refine * num_calls / each)
-    about = {"num_calls": searched, "batch": batch, "seed": seed}
-    history = bayes.minimise(
-        objective(sighting, batch), family.dim, **about, path=path, progress=progress
-    )
-    history = refined(sighting, history, num_calls - searched, batch)
-    place = jnp.asarray(history.places[history.best], float)
-    values = np.asarray(jax.vmap(family.values)(jnp.asarray(history.places, float)))
+    values = np.asarray(jax.vmap(family.values)(jnp.asarray(places, float)))
     return without_deviations(
-        f"physnet (Bayesian optimisation, {searched} simulations; {len(history.losses) - searched} "
-        "of Gauss-Newton)",
+        name,
         family,
-        place,
-        float(history.losses[history.best]),
-        history.losses[:, None],
+        jnp.asarray(places[best], float),
+        float(losses[best]),
+        losses[:, None],
         values[:, None],
         time.perf_counter() - began,
     )
