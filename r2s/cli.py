@@ -27,7 +27,7 @@ except ImportError:
     sys.exit("r2s: error: the command line needs tyro: pip install 'r2s[cli]'")
 
 from r2s.commands.check_grad import CheckGrad
-from r2s.commands.common import ScenarioName, numbers_of
+from r2s.commands.common import ScenarioName, numbers_of, tell
 from r2s.commands.doctor import Doctor
 from r2s.commands.estimate import EstimateCard
 from r2s.commands.evaluate import Evaluate
@@ -70,15 +70,20 @@ class List:
 
     manifests: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Descriptions of other data sets, one JSON each, instead of the project's."""
+    json: bool = False
+    """Print one JSON object."""
 
     def run(self) -> None:
         from r2s.data import Dataset, known_datasets
 
+        told, lines = {}, []
         for name, data in known_datasets(self.manifests).items():
-            automatic = isinstance(data, Dataset) and data.downloads and not data.layout
-            print(f"{name}: {data.title}")
-            print(f"    licence: {data.licence}")
-            print(f"    {'downloaded automatically' if automatic else 'fetched by hand'}")
+            automatic = isinstance(data, Dataset) and bool(data.downloads) and not data.layout
+            about = {"title": data.title, "licence": data.licence, "automatic": automatic}
+            told[name] = about
+            lines += [f"{name}: {data.title}", f"    licence: {data.licence}"]
+            lines.append(f"    {'downloaded automatically' if automatic else 'fetched by hand'}")
+        tell(self.json, told, lines)
 
 
 @dataclass(frozen=True)
@@ -175,13 +180,16 @@ class Sensitivity:
     """Of each coordinate of a point, a standard deviation [m]."""
     seed: int = 0
     """Of the noise."""
+    json: bool = False
+    """Print one JSON object: that of an estimate."""
 
     def run(self) -> None:
+        from r2s.estimators.estimate import as_json
         from r2s.estimators.planned import describe, planned
 
-        numbers = numbers_of(self.motion)
-        for line in describe(planned(self.scenario, self.fabric, numbers, self.noise, self.seed)):
-            print(line)
+        about = self.fabric, numbers_of(self.motion), self.noise, self.seed
+        found = planned(self.scenario, *about)
+        tell(self.json, as_json(found), describe(found))
 
 
 Command = (

@@ -1,5 +1,6 @@
 """The command line: what it does, its help, and its exit codes."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -60,6 +61,8 @@ def test_the_data_sets_are_listed(capsys: pytest.CaptureFixture) -> None:
     assert main(["data", "list"]) == 0
     text = capsys.readouterr().out
     assert "rgbench: RGBench" in text and "licence: CC-BY-4.0" in text
+    assert main(["data", "list", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rgbench"]["licence"] == "CC-BY-4.0"
 
 
 def test_an_error_is_one_line_and_1(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
