@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import jax.random as jr
@@ -116,6 +117,31 @@ def test_only_the_last_place_of_a_slider_is_shown(subject, shown):
     assert shown.u[2] == pytest.approx(0.9)
     assert np.allclose(after.x, subjects.move(subject, jnp.asarray(shown.u)).x)
     assert not np.allclose(after.x, before.x, atol=1e-3)
+
+
+def test_a_motion_that_fails_is_said_and_the_page_goes_on(shown, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("out of memory")
+
+    before, whole = shown.moved, page.move
+    monkeypatch.setattr(page, "move", fail)
+    shown._sliders[2].value = 0.2
+    assert shown.latest() is before and "out of memory" in shown._told(0)
+    monkeypatch.setattr(page, "move", whole)
+    shown._sliders[2].value = 0.3
+    assert shown.latest() is not before and not shown.failure
+
+
+def test_what_cannot_be_saved_is_said(shown):
+    told = []
+
+    def save(fabric):
+        raise OSError("disk is full")
+
+    client = SimpleNamespace(add_notification=lambda *words: told.append(words))
+    shown._save(save, SimpleNamespace(client=client))
+    shown._save(lambda fabric: f"{float(fabric.density):.2f}", SimpleNamespace(client=client))
+    assert told == [("not saved", "disk is full"), ("saved", "0.19")]
 
 
 class Browser:

@@ -26,7 +26,8 @@ class Page:
     """A server on a thread of its own, until `close`.
 
     Only the last of the places that a slider was dragged through is simulated. `moved` is what the
-    page shows, `u` where in the family it lies; `latest` waits for what the sliders ask for.
+    page shows, `u` where in the family it lies, `failure` why there is no motion of it; `latest`
+    waits for what the sliders ask for.
 
     - `u`: where the sliders begin, in the unit cube of the subject's family.
     - `save`: called with the fabric that is shown when the button for that is pressed, gives what
@@ -47,6 +48,7 @@ class Page:
     ):
         self.subject, self.u = subject, np.asarray(u)
         self.moved: Moved = move(subject, jnp.asarray(u))
+        self.failure = ""
         self._asked, self._stop = threading.Event(), threading.Event()
         self._shown = threading.Lock()
         self.server = viser.ViserServer(host=host, port=port, label="r2s", verbose=False)
@@ -111,9 +113,12 @@ class Page:
             client.camera.position, client.camera.look_at = eye, middle
 
     def _save(self, save: Callable[[Fabric], str], event: Any) -> None:
-        told = save(self.subject.family(jnp.asarray(self.u)))
+        try:
+            title, told = "saved", save(self.subject.family(jnp.asarray(self.u)))
+        except (OSError, ValueError) as error:
+            title, told = "not saved", f"{error}"
         if event.client is not None:
-            event.client.add_notification("saved", told)
+            event.client.add_notification(title, told)
 
     def _wanted(self) -> np.ndarray:
         return np.array([slider.value for slider in self._sliders], self.u.dtype)
@@ -125,8 +130,11 @@ class Page:
             if self._asked.is_set():
                 self._asked.clear()
                 wanted = self._wanted()
-                moved = move(self.subject, jnp.asarray(wanted))
-                self.u, self.moved = wanted, moved
+                try:
+                    self.moved, self.failure = move(self.subject, jnp.asarray(wanted)), ""
+                except RuntimeError as error:  # such as of memory: the page goes on
+                    self.failure = f"No motion of this fabric: {error}. Shown is the last one."
+                self.u = wanted
                 self._draw()
             if self._play.value and time.monotonic() >= due:
                 due = time.monotonic() + interval
@@ -166,7 +174,9 @@ class Page:
             for bound, value in zip(family.ranges, values, strict=True)
         ]
         lines = ["| | | |", "|---|---|---|", *rows, ""]
-        if not moved.ok.all():
+        if self.failure:
+            lines.append(self.failure)
+        elif not moved.ok.all():
             lines.append(f"The simulation diverged in frame {int(np.argmin(moved.ok))}.")
         elif self.subject.clouds is not None:
             error = 1e3 * float(moved.error[frame]), 1e3 * float(error_used(self.subject, moved))
