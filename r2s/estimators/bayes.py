@@ -4,7 +4,6 @@ Gaussian processes of scikit-optimize. It knows nothing of fabrics: the objectiv
 that gives a loss, not negative, for each of a batch of places.
 """
 
-import io
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from r2s.files import write_bytes
+from r2s.estimators import search_file
 
 FORMAT = "r2s-search/2"
 Objective = Callable[[Float[np.ndarray, "place dim"]], Float[np.ndarray, " place"]]
@@ -141,13 +140,14 @@ def minimise(
     about = {"dim": dim, "batch": batch, "num_first": num_first, "seed": seed}
     history = begin(dim)
     if path is not None and Path(path).exists():
-        history = load(path, about)
+        history = History(*search_file.read(path, FORMAT, ("places", "losses"), about))
     while len(history.losses) < num_calls:
         number = min(batch, num_calls - len(history.losses))
         places = ask(history, number, num_first=num_first, seed=seed)
         history = tell(history, places, objective(places))
         if path is not None:
-            save(history, path, about)
+            tried = {"places": history.places, "losses": history.losses}
+            search_file.write(path, FORMAT, tried, about)
         if progress is not None:
             progress(history)
     return history
@@ -160,30 +160,6 @@ def random_search(objective: Objective, dim: int, *, num_calls: int, batch: int,
     while len(history.losses) < num_calls:
         places = generator.random((min(batch, num_calls - len(history.losses)), dim))
         history = tell(history, places, objective(places))
-    return history
-
-
-def save(history: History, path: Path | str, about: dict[str, int]) -> None:
-    """Write a history and the settings of its search, whole or not at all."""
-    buffer = io.BytesIO()
-    arrays: dict[str, Any] = {"places": history.places, "losses": history.losses, **about}
-    np.savez(buffer, format=FORMAT, **arrays)
-    write_bytes(path, buffer.getvalue())
-
-
-def load(path: Path | str, about: dict[str, int]) -> History:
-    """Read what `save` wrote; `ValueError` that names the file when it is damaged or of others."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            stored = {name: file[name] for name in file.files}
-        found = {name: int(stored[name]) for name in about}
-        history = History(stored["places"], stored["losses"])
-    except Exception as error:  # a damaged file raises anything
-        raise ValueError(f"{path}: no history of a search: {error}") from error
-    if stored["format"] != FORMAT:
-        raise ValueError(f"{path}: expected format {FORMAT}, found {stored['format']}")
-    if found != about:
-        raise ValueError(f"{path}: is of a search with {found}, asked for {about}: choose another")
     return history
 
 

@@ -5,7 +5,6 @@ numbers each say more of where the target lies than 80 losses (composite Bayesia
 Astudillo and Frazier 2019). It knows nothing of fabrics.
 """
 
-import io
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -14,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from r2s.estimators import search_file
 from r2s.estimators.bayes import CENTRES, candidates, even
-from r2s.files import write_bytes
 
 FORMAT = "r2s-trials/1"
 PARTS = 10  # of the answers, of the greatest variance, at most
@@ -60,7 +59,7 @@ def minimise(
     about = {"dim": dim, "calls": num_calls, "batch": batch, "seed": seed}
     trials = Trials(np.zeros((0, dim)), np.zeros((0, len(target))))
     if path is not None and Path(path).exists():
-        trials = load(path, about)
+        trials = Trials(*search_file.read(path, FORMAT, Trials._fields, about))
     first = even(dim, max(int(FIRST * num_calls), dim + 1), seed)
     while (done := len(trials.places)) < num_calls:
         if done < len(first):
@@ -72,7 +71,7 @@ def minimise(
         told = np.concatenate([trials.answers, answers])
         trials = Trials(np.concatenate([trials.places, places]), told)
         if path is not None:
-            save(trials, path, about)
+            search_file.write(path, FORMAT, trials._asdict(), about)
         if progress is not None:
             progress(trials)
     return trials
@@ -131,27 +130,3 @@ def _process(places: np.ndarray, values: np.ndarray) -> Any:
     with warnings.catch_warnings():  # that a length or the noise is at its bound
         warnings.simplefilter("ignore")
         return process.fit(places, values)
-
-
-def save(trials: Trials, path: Path | str, about: dict[str, int]) -> None:
-    """Write trials and the settings of their search, whole or not at all."""
-    buffer = io.BytesIO()
-    arrays: dict[str, Any] = {**trials._asdict(), **about}
-    np.savez(buffer, format=FORMAT, **arrays)
-    write_bytes(path, buffer.getvalue())
-
-
-def load(path: Path | str, about: dict[str, int]) -> Trials:
-    """Read what `save` wrote; `ValueError` that names the file when it is damaged or of others."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            stored = {name: file[name] for name in file.files}
-        found = {name: int(stored[name]) for name in about}
-        trials = Trials(stored["places"], stored["answers"])
-    except Exception as error:  # a damaged file raises anything
-        raise ValueError(f"{path}: no trials of a search: {error}") from error
-    if stored["format"] != FORMAT:
-        raise ValueError(f"{path}: expected format {FORMAT}, found {stored['format']}")
-    if found != about:
-        raise ValueError(f"{path}: is of a search with {found}, asked for {about}: choose another")
-    return trials
