@@ -5,7 +5,6 @@ import contextlib
 import importlib
 import io
 import json
-import shutil
 import socket
 import subprocess
 import sys
@@ -17,6 +16,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+from browser import BROWSER, needs_browser
 from matplotlib.image import imread
 
 from r2s import metrics, presets, synthetic
@@ -28,10 +28,6 @@ from r2s.surface import sample
 
 page = pytest.importorskip("r2s.interactive.page", reason="viser is not installed")
 
-BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
-needs_browser = pytest.mark.skipif(
-    BROWSER is None, reason="neither chromium nor google-chrome is on the path"
-)
 FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-sync",
     "--disable-background-networking", "--disable-component-update", "--use-gl=angle",

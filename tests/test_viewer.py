@@ -2,13 +2,13 @@
 
 import json
 import re
-import shutil
 import subprocess
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from browser import BROWSER, needs_browser
 from made_up_study import made_up_shown
 from test_report import Page
 
@@ -17,10 +17,6 @@ from r2s.study.report import Section, write_report
 from r2s.study.shown import Shown, load_shown, save_shown
 from r2s.study.tables import Table
 
-BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
-needs_browser = pytest.mark.skipif(
-    BROWSER is None, reason="neither chromium nor google-chrome is on the path"
-)
 FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",

@@ -19,7 +19,7 @@ EXTRAS = {
     "camera": ("cv2",),
     "data": ("pooch",),
     "cli": ("tyro",),
-    "physnet": ("skopt",),
+    "physnet": ("skopt", "sklearn"),
     "cma": ("cma",),
     "cluster": ("dask", "distributed", "dask_jobqueue"),
     "viz": ("viser",),

@@ -122,9 +122,7 @@ def _process(places: np.ndarray, values: np.ndarray) -> Any:
         from sklearn.gaussian_process import GaussianProcessRegressor
         from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
     except ImportError as error:
-        raise ImportError(
-            "the search needs scikit-learn, of scikit-optimize: pip install 'r2s[physnet]'"
-        ) from error
+        raise ImportError("the search needs scikit-learn: pip install 'r2s[physnet]'") from error
     smooth = ConstantKernel(1.0, (0.1, 100.0)) * RBF([1.0] * places.shape[1], (0.2, 20.0))
     process = GaussianProcessRegressor(smooth + WhiteKernel(1e-2, (1e-4, 1.0)), normalize_y=True)
     with warnings.catch_warnings():  # that a length or the noise is at its bound
