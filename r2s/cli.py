@@ -35,7 +35,7 @@ from r2s.commands.export import Export
 from r2s.commands.simulate import Simulate
 from r2s.commands.study import Study
 from r2s.commands.view import View
-from r2s.study.environment import one_thread
+from r2s.study.environment import one_core, one_thread
 
 
 @dataclass(frozen=True)
@@ -237,6 +237,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def command() -> int:
     """`main` in a process of its own."""
     os.environ["XLA_FLAGS"] = one_thread(os.environ.get("XLA_FLAGS", ""))  # JAX has not begun yet
+    if sys.argv[1:2] != ["study"]:  # whose workers have a core each
+        one_core()
     return main()
 
 

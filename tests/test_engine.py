@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from r2s.study import cells, engine
 from r2s.study.apart import Apart
 from r2s.study.cells import Cell
-from r2s.study.environment import environment
+from r2s.study.environment import environment, one_core
 
 
 @dataclass(frozen=True)
@@ -194,6 +194,7 @@ def test_workers_of_dask_make_the_same_and_survive_a_kill(tmp_path):
         client = runner._client
         # a process that dies in the middle of a cell
         client.run_on_scheduler(lambda: None)
+        cores = list(client.run(_cores).values())
         pid = next(iter(client.run(os.getpid).values()))
         import threading
 
@@ -203,6 +204,23 @@ def test_workers_of_dask_make_the_same_and_survive_a_kill(tmp_path):
         runner.close()
     assert {cell.name for cell in failed} == {"n-1", "bad"}
     assert [value_of(cell, tmp_path) for cell in sums[:6]] == [2 * i + 1 for i in range(6)]
+    if _cores():  # else not Linux
+        assert sorted(map(len, cores)) == [1, 1]
+        assert len(set.union(*cores)) == min(2, len(_cores()))
+
+
+def _cores() -> set[int]:
+    return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
+
+
+def test_a_process_takes_the_core_that_has_least_to_do(monkeypatch):
+    psutil, taken = pytest.importorskip("psutil"), []
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {1, 3, 4}, raising=False)
+    monkeypatch.setattr(os, "sched_setaffinity", lambda *about: taken.append(about), raising=False)
+    monkeypatch.setattr(psutil, "cpu_percent", lambda **about: [0.0, 90.0, 0.0, 20.0, 40.0])
+    one_core()
+    one_core(5)
+    assert taken == [(0, {3}), (0, {4})]
 
 
 SBATCH = """#!/bin/sh

@@ -3,7 +3,9 @@
 import dataclasses
 import math
 
+import equinox as eqx
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -18,10 +20,11 @@ from r2s.pinn import balance as balancing
 from r2s.pinn import paper
 from r2s.pinn.balance import balance, basis_of, prepared, reduced, solve
 from r2s.pinn.data import Clamp, Pull, pull_from, stacked
-from r2s.pinn.losses import Losses
+from r2s.pinn.laws import small
+from r2s.pinn.losses import Losses, motion_residual
 from r2s.pinn.network import Network
 from r2s.pinn.synthetic import pulled
-from r2s.pinn.training import Recipe, train
+from r2s.pinn.training import Recipe, train, trainable
 from r2s.scenario import motion
 from r2s.scenarios import fling, folding, shaking
 
@@ -183,6 +186,29 @@ def test_the_papers_recipe_runs_and_sees_no_force(monkeypatch):
     with jax.numpy_dtype_promotion("standard"):
         course = paper.train(FAMILY, pulls, jnp.full(7, 0.4), 4, 2, key=jr.key(0))
     assert course.data.shape == (2,) and np.isfinite(course.motion).all()
+
+
+def test_the_gradient_made_along_with_the_sum_is_that_of_the_sum():
+    """Of the recipe's loss of the motion, in the networks and the fabric of two pulls."""
+    pulls = paper.plain(stacked([even_pull(frames=4), even_pull(frames=4)]))
+    with jax.numpy_dtype_promotion("standard"):
+        model = paper.begin(FAMILY, pulls, jnp.full(7, 0.4), key=jr.key(0))
+    weights, fixed = eqx.partition(model, trainable(model))
+
+    def at_once(weights):
+        model = eqx.combine(weights, fixed)
+        places = jnp.tile(pulls.places[0], (4, 1))
+        frames = jnp.repeat(jnp.arange(4), len(pulls.places[0]))
+        about = FAMILY(model.place), places, frames, small
+        residual = lambda network, pull: motion_residual(network, pull, *about)
+        return jnp.mean(jax.vmap(residual)(model.networks, pulls) ** 2)
+
+    found = jax.value_and_grad(lambda w: paper.losses(eqx.combine(w, fixed), FAMILY, pulls)[1])
+    (one, slope), (other, wanted) = found(weights), jax.value_and_grad(at_once)(weights)
+    slope, wanted = (np.asarray(jax.flatten_util.ravel_pytree(g)[0]) for g in (slope, wanted))
+    assert np.abs(wanted).max() > 0
+    np.testing.assert_allclose(one, other, rtol=1e-12)
+    np.testing.assert_allclose(slope, wanted, rtol=1e-9, atol=1e-12 * np.abs(wanted).max())
 
 
 def test_pulls_and_families_that_do_not_go_together():

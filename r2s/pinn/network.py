@@ -93,23 +93,26 @@ class Network(eqx.Module):
         Through z = tanh(a): z_i = z' a_i, z_ij = z' a_ij + z'' a_i a_j, where z' = 1 - z^2 and
         z'' = -2 z z'.
         """
-        count = len(points)
-        left, right = (jnp.array([1 + pair[i] for pair in pairs], int) for i in range(2))
-        value = (points - self.centre[None]) / self.radius[None]
-        slopes = jnp.broadcast_to(jnp.diag(1 / self.radius)[:, None], (3, count, 3))
-        flat = jnp.zeros((len(pairs), count, 3), points.dtype)
-        z = jnp.concatenate([value[None], slopes, flat])  # (derivative, point, unit)
-        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            a = (z.reshape(-1, z.shape[2]) @ weight).reshape(*z.shape[:2], -1)
-            if i == len(self.weights) - 1:
-                a = self.scale * a.at[0].add(bias[None])
-                return Jet(a[0], a[1:4], a[4:])
-            value = jnp.tanh(a[0] + bias[None])
-            slope = 1 - value**2
-            curve = -2 * value * slope
-            second = slope[None] * a[4:] + curve[None] * a[left] * a[right]
-            z = jnp.concatenate([value[None], slope[None] * a[1:4], second])
-        raise AssertionError("a network has at least one layer")
+        (weight, bias), *layers = zip(self.weights, self.biases, strict=True)
+        value = (points - self.centre[None]) / self.radius[None] @ weight + bias[None]
+        slopes = [jnp.broadcast_to(row, value.shape) for row in weight / self.radius[:, None]]
+        curves = [jnp.zeros_like(value) for _ in pairs]
+        for weight, bias in layers:
+            z = jnp.tanh(value)
+            slope = 1 - z**2
+            curve = -2 * z * slope
+            # lists, because gradients of indexed arrays are slow scatters
+            curves = [
+                slope * own + curve * slopes[i] * slopes[j]
+                for own, (i, j) in zip(curves, pairs, strict=True)
+            ]
+            slopes = [slope * own for own in slopes]
+            product = jnp.concatenate([z, *slopes, *curves]) @ weight
+            value, *parts = jnp.split(product, 4 + len(pairs))
+            value, slopes, curves = value + bias[None], parts[:3], parts[3:]
+        none = jnp.zeros((0, *value.shape), value.dtype)
+        second = jnp.stack(curves) if pairs else none
+        return Jet(self.scale * value, self.scale * jnp.stack(slopes), self.scale * second)
 
 
 def at_time(places: Float[Array, "place 2"], time: Float[Array, ""]) -> Float[Array, "place 3"]:

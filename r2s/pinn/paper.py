@@ -18,11 +18,13 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from r2s.fabric import Fabric
 from r2s.family import Family
+from r2s.pinn.batches import summed
 from r2s.pinn.data import Pull
 from r2s.pinn.laws import small
 from r2s.pinn.losses import marker_residual, motion_residual
-from r2s.pinn.network import LAYERS, WIDTH
+from r2s.pinn.network import LAYERS, WIDTH, Network
 from r2s.pinn.training import Model, Recipe, init, trainable
 
 EPOCHS = 10_000
@@ -68,13 +70,17 @@ def losses(model: Model, family: Family, pulls: Pull) -> tuple[Array, Array]:
 
     def of_pull(network, pull):
         number, markers, _ = pull.displacement.shape
-        places = jnp.tile(pull.places, (number, 1))
-        frames = jnp.repeat(jnp.arange(number), markers)
-        motion = motion_residual(network, pull, fabric, places, frames, small)
-        return jnp.mean(marker_residual(network, pull) ** 2), jnp.mean(motion**2)
+        motion = summed((network, fabric), _motion_of_frame, jnp.arange(number), pull)
+        return jnp.mean(marker_residual(network, pull) ** 2), motion / (2 * number * markers)
 
     data, motion = jax.vmap(of_pull)(model.networks, pulls)
     return jnp.mean(data), jnp.mean(motion)
+
+
+def _motion_of_frame(weights: tuple[Network, Fabric], frame: Array, pull: Pull) -> Array:
+    """Sum of squares of the residual [(N/m^2)^2] at the markers in a frame."""
+    frames = jnp.full(len(pull.places), frame)
+    return jnp.sum(motion_residual(weights[0], pull, weights[1], pull.places, frames, small) ** 2)
 
 
 @eqx.filter_jit

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from r2s.study.cells import Cell
 from r2s.study.engine import Serial, attempt
-from r2s.study.environment import environment
+from r2s.study.environment import environment, one_core
 
 TRIES = 2  # of a cell whose process died
 
@@ -37,4 +37,4 @@ class Apart(Serial):
 
     @staticmethod
     def _started() -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+        return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=one_core)

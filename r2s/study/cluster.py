@@ -3,6 +3,7 @@
 Needs dask: pip install 'r2s[cluster]'.
 """
 
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,11 +11,11 @@ from typing import Any
 
 from r2s.study.cells import Cell
 from r2s.study.engine import attempt
-from r2s.study.environment import environment
+from r2s.study.environment import environment, one_core
 
 try:
     from dask import config
-    from distributed import Client, LocalCluster, as_completed
+    from distributed import Client, LocalCluster, WorkerPlugin, as_completed
 except ImportError as error:
     raise ImportError("workers need dask: pip install 'r2s[cluster]'") from error
 
@@ -29,7 +30,7 @@ def local(workers: int, compilation_cache: Path | None = None) -> "Workers":
     cluster = LocalCluster(
         n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0"
     )
-    return Workers(Client(cluster), cluster)
+    return Workers(_bound(cluster), cluster)
 
 
 def at(address: str) -> "Workers":
@@ -65,7 +66,20 @@ def slurm(
         job_script_prologue=exports,
     )
     cluster.scale(jobs=jobs)
-    return Workers(Client(cluster), cluster)
+    return Workers(_bound(cluster), cluster)
+
+
+class OneCore(WorkerPlugin):
+    """A core for each worker of a machine, by the number at the end of its name."""
+
+    def setup(self, worker: Any) -> None:
+        one_core(int(re.findall(r"\d+", str(worker.name))[-1]))
+
+
+def _bound(cluster: Any) -> Client:
+    client = Client(cluster)
+    client.register_plugin(OneCore())
+    return client
 
 
 class Workers:
