@@ -2,7 +2,7 @@
 
 python benchmarks/pinn.py epochs --torch /path/to/python   # of an environment with PyTorch
 python benchmarks/pinn.py fabrics                          # ours on the five fabrics
-python benchmarks/pinn.py recipes --seeds 5 --epochs 1000  # the paper's recipe beside ours
+python benchmarks/pinn.py recipes --pulls 1 --seeds 5      # the paper's recipe beside ours
 python benchmarks/pinn.py clouds                           # from a lift and a wind, no markers
 
 Times are CPU seconds of all threads, and wall seconds. Tables and a picture go to --out; what is in
@@ -151,7 +151,7 @@ def epochs(torch_python: str | None) -> list[dict]:
     rows = [{"epoch": "forward jets", **each(epochs_of(paper.losses))}]
     nested = lambda model, family, pulls: _nested_losses(jax, jnp, model, family, pulls)
     rows.append({"epoch": "nested reverse, JAX", **each(epochs_of(nested))})
-    states = None
+    states = paper.untouched(model)
 
     def of_the_paper():
         nonlocal model, states
@@ -241,8 +241,8 @@ def _fabric(name: str):
     return fabric, OrthotropicFamily.make(float(fabric.density))
 
 
-def _pulls(name: str, seed: int) -> list:
-    """Of a fabric along warp, weft and bias."""
+def _pulls(name: str, seed: int, count: int = 3) -> list:
+    """Of a fabric along warp, weft and bias, or the first ones of these."""
     import jax.random as jr
     import numpy as np
 
@@ -251,7 +251,7 @@ def _pulls(name: str, seed: int) -> list:
 
     fabric, _ = _fabric(name)
     some = []
-    for i, angle in enumerate((0.0, np.pi / 2, np.pi / 4)):
+    for i, angle in enumerate((0.0, np.pi / 2, np.pi / 4)[:count]):
         key = jr.fold_in(jr.key(seed), i)
         recording = pulled(fabric, name, angle, shape=SHAPE, key=key)
         some.append(pull_from(recording, angle))
@@ -324,7 +324,7 @@ def _picture(path: Path, rows: list[dict]) -> None:
     plt.close(figure)
 
 
-def recipes(out: Path, name: str, seeds: int, number: int, alone: bool) -> None:
+def recipes(out: Path, name: str, count: int, seeds: int, number: int, alone: bool) -> None:
     """The recipes on the same pulls: the paper's, ours, and long trainings of networks alone."""
     import equinox as eqx
     import jax.random as jr
@@ -337,12 +337,12 @@ def recipes(out: Path, name: str, seeds: int, number: int, alone: bool) -> None:
     from r2s.pinn.training import Recipe
     from r2s.pinn.weak import weak_losses
 
-    some, (fabric, family) = _pulls(name, 0), _fabric(name)
+    some, (fabric, family) = _pulls(name, 0, count), _fabric(name)
     truth = family.values(family.locate(fabric))
     place = family.locate(Fabric.make(float(fabric.density), (10.0, 0.0, 10.0, 10.0), 1e-5))
 
-    def make(fabric: str, recipe: str, seed: int) -> dict:
-        del fabric
+    def make(fabric: str, pulls: int, recipe: str, seed: int) -> dict:
+        del fabric, pulls
         key = jr.key(seed)
         eqx.clear_caches()
         if recipe.startswith("the paper's"):
@@ -357,9 +357,10 @@ def recipes(out: Path, name: str, seeds: int, number: int, alone: bool) -> None:
 
     names = [f"the paper's, {number} epochs", "ours"]
     names += ["network alone, weak", "network alone, strong"] if alone else []
-    jobs = [{"fabric": name, "recipe": r, "seed": s} for s in range(seeds) for r in names]
+    about = {"fabric": name, "pulls": count}
+    jobs = [about | {"recipe": r, "seed": s} for s in range(seeds) for r in names]
     rows = resumed(out, "recipes", jobs, make)
-    _show("errors (deviations)", rows, STIFFNESSES, ["fabric", "recipe", "seed"])
+    _show("errors (deviations)", rows, STIFFNESSES, ["fabric", "pulls", "recipe", "seed"])
 
 
 def clouds(out: Path, seeds: int) -> None:
@@ -395,6 +396,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--epochs", type=int, default=10_000, help="of the paper's recipe")
     parser.add_argument("--fabric", default="pink_solid")
+    parser.add_argument("--pulls", type=int, default=3, help="along warp, weft, bias: so many")
     parser.add_argument("--alone", action="store_true", help="long trainings of networks alone too")
     parser.add_argument("--out", type=Path, default=Path("results/pinn"))
     options = parser.parse_args()
@@ -414,7 +416,8 @@ def main() -> None:
     elif options.what == "clouds":
         clouds(options.out, options.seeds)
     else:
-        recipes(options.out, options.fabric, options.seeds, options.epochs, options.alone)
+        about = options.fabric, options.pulls, options.seeds, options.epochs, options.alone
+        recipes(options.out, *about)
 
 
 if __name__ == "__main__":

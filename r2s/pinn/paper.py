@@ -60,7 +60,18 @@ def plain(pull: Pull) -> Pull:
 def begin(family: Family, pulls: Pull, place: Float[Array, " dim"], *, key: PRNGKeyArray) -> Model:
     """An untrained model of stacked pulls, with networks of the paper's size."""
     model = init(family, pulls, Recipe(width=WIDTH, layers=LAYERS), key=key)
-    return eqx.tree_at(lambda m: m.free, model, jnp.log(place / (1 - place)))
+    free = jnp.log(place / (1 - place)).astype(model.free.dtype)  # no weak type: compiles once
+    return eqx.tree_at(lambda m: m.free, model, free)
+
+
+def optimisers() -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
+    """Adam, and L-BFGS with fixed steps."""
+    return optax.adam(ADAM_RATE), optax.lbfgs(LBFGS_RATE, MEMORY, linesearch=None)
+
+
+def untouched(model: Model) -> tuple[Any, ...]:
+    """States of both optimisers before the first epoch."""
+    return tuple(each.init(eqx.filter(model, trainable(model))) for each in optimisers())
 
 
 def losses(model: Model, family: Family, pulls: Pull) -> tuple[Array, Array]:
@@ -87,11 +98,10 @@ def _motion_of_frame(weights: tuple[Network, Fabric], frame: Array, pull: Pull) 
 def run(
     model: Model, states: Any, family: Family, pulls: Pull, first: Array, epochs: int
 ) -> tuple[Model, Any, tuple[Array, Array]]:
-    """Some epochs from number `first` on; `states` of the optimisers, None at first."""
+    """Some epochs from number `first` on, with the optimisers' `states`: at first `untouched`."""
     which = trainable(model)
     weights, fixed = eqx.partition(model, which)
-    adam = optax.adam(ADAM_RATE)
-    lbfgs = optax.lbfgs(LBFGS_RATE, MEMORY, linesearch=None)
+    adam, lbfgs = optimisers()
     whole = lambda weights: eqx.combine(weights, fixed)
 
     def epoch(carried, number):
@@ -111,7 +121,6 @@ def run(
         state = keep(after, lbfgs.init(weights))
         return (keep(moved, weights), of_adam, state), (data, motion / share)
 
-    states = (adam.init(weights), lbfgs.init(weights)) if states is None else states
     (weights, *states), values = jax.lax.scan(epoch, (weights, *states), first + jnp.arange(epochs))
     return whole(weights), tuple(states), jax.tree.map(lambda v: v[-1], values)
 
@@ -130,7 +139,8 @@ def train(
     Does not raise when it diverges: the course shows it.
     """
     pulls = plain(pulls)
-    model, states, course = begin(family, pulls, place, key=key), None, []
+    model, course = begin(family, pulls, place, key=key), []
+    states = untouched(model)
     for first in range(0, epochs, chunk):
         about = model, states, family, pulls, jnp.asarray(first), min(chunk, epochs - first)
         model, states, (data, motion) = run(*about)
