@@ -151,12 +151,12 @@ def epochs(torch_python: str | None) -> list[dict]:
     rows = [{"epoch": "forward jets", **each(epochs_of(paper.losses))}]
     nested = lambda model, family, pulls: _nested_losses(jax, jnp, model, family, pulls)
     rows.append({"epoch": "nested reverse, JAX", **each(epochs_of(nested))})
-    states = paper.untouched(model)
+    state = paper.untouched(model)
 
     def of_the_paper():
-        nonlocal model, states
-        about = model, states, family, pulls, jnp.asarray(0), TOGETHER
-        model, states, values = paper.run(*about)
+        nonlocal model, state
+        about = model, state, family, pulls, jnp.asarray(0), TOGETHER
+        model, state, values = paper.run(*about)
         jax.block_until_ready(values)
 
     of_the_paper()

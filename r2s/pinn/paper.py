@@ -4,9 +4,10 @@ Two losses in SI units: markers by Adam at 1e-4, and the equation of motion in s
 L-BFGS with steps of 0.1, with the stiffness trainable and a weight of 0.1 that rises by 0.1 every
 500 epochs up to 1; 10,000 epochs. No force enters, so nothing fixes the scale of the stiffness:
 what comes out is where it started, or what the descent made of it. The paper does not say how the
-two optimisers take turns; here each makes a step in every epoch, and a step of L-BFGS that raises
-the sum of both losses is not made: otherwise the network saturates within 50 epochs. (Its own loss
-is not enough: after a thousand epochs it once fell to zero, in a network that no longer varied.)
+two optimisers take turns; here each makes a step in every epoch, and a step of L-BFGS after which
+the sum of both losses is greater is taken back in the next epoch, with L-BFGS's memory: otherwise
+the network saturates within 50 epochs. (Its own loss is not enough: after a thousand epochs it once
+fell to zero, in a network that no longer varied.)
 """
 
 from typing import Any, NamedTuple
@@ -69,9 +70,22 @@ def optimisers() -> tuple[optax.GradientTransformation, optax.GradientTransforma
     return optax.adam(ADAM_RATE), optax.lbfgs(LBFGS_RATE, MEMORY, linesearch=None)
 
 
-def untouched(model: Model) -> tuple[Any, ...]:
-    """States of both optimisers before the first epoch."""
-    return tuple(each.init(eqx.filter(model, trainable(model))) for each in optimisers())
+class State(NamedTuple):
+    """Between epochs: the weights after a step of L-BFGS that is not judged yet, the states of both
+    optimisers, and what the sum of the losses was before that step."""
+
+    ahead: Any
+    adam: Any
+    lbfgs: Any
+    before: Array
+
+
+def untouched(model: Model) -> State:
+    """Before the first epoch."""
+    weights = eqx.filter(model, trainable(model))
+    adam, lbfgs = optimisers()
+    none = jnp.asarray(jnp.inf, model.free.dtype)
+    return State(weights, adam.init(weights), lbfgs.init(weights), none)
 
 
 def losses(model: Model, family: Family, pulls: Pull) -> tuple[Array, Array]:
@@ -96,33 +110,36 @@ def _motion_of_frame(weights: tuple[Network, Fabric], frame: Array, pull: Pull) 
 
 @eqx.filter_jit
 def run(
-    model: Model, states: Any, family: Family, pulls: Pull, first: Array, epochs: int
-) -> tuple[Model, Any, tuple[Array, Array]]:
-    """Some epochs from number `first` on, with the optimisers' `states`: at first `untouched`."""
-    which = trainable(model)
-    weights, fixed = eqx.partition(model, which)
+    model: Model, state: State, family: Family, pulls: Pull, first: Array, epochs: int
+) -> tuple[Model, State, tuple[Array, Array]]:
+    """Some epochs from number `first` on; the model is without the step that is not judged yet.
+
+    The losses of markers and motion are those of the last epoch that was good.
+    """
+    weights, fixed = eqx.partition(model, trainable(model))
     adam, lbfgs = optimisers()
     whole = lambda weights: eqx.combine(weights, fixed)
 
     def epoch(carried, number):
-        weights, of_adam, of_lbfgs = carried
-        data, slope = jax.value_and_grad(lambda w: losses(whole(w), family, pulls)[0])(weights)
-        change, of_adam = adam.update(slope, of_adam)
-        weights = eqx.apply_updates(weights, change)
+        weights, (ahead, of_adam, of_lbfgs, before) = carried
+        data, slope = jax.value_and_grad(lambda w: losses(whole(w), family, pulls)[0])(ahead)
+        change, adam_after = adam.update(slope, of_adam)
+        stepped = eqx.apply_updates(ahead, change)
         share = weight(number)
         physics = lambda w: share * losses(whole(w), family, pulls)[1]
-        motion, slope = jax.value_and_grad(physics)(weights)
-        change, after = lbfgs.update(slope, of_lbfgs, weights)
-        moved = eqx.apply_updates(weights, change)
-        # a fixed step may go astray, also where gradients hardly differ: then none, and no memory
-        off, left = losses(whole(moved), family, pulls)
-        good = off + share * left <= data + motion
-        keep = lambda new, old: jax.tree.map(lambda n, o: jnp.where(good, n, o), new, old)
-        state = keep(after, lbfgs.init(weights))
-        return (keep(moved, weights), of_adam, state), (data, motion / share)
+        motion, slope = jax.value_and_grad(physics)(stepped)
+        change, lbfgs_after = lbfgs.update(slope, of_lbfgs, stepped)
+        moved = eqx.apply_updates(stepped, change)
+        good = data + motion <= before
+        on = stepped, State(moved, adam_after, lbfgs_after, data + motion)
+        back = weights, State(weights, of_adam, lbfgs.init(weights), jnp.full_like(before, jnp.inf))
+        carried = jax.tree.map(lambda new, old: jnp.where(good, new, old), on, back)
+        return carried, (good, data, motion / share)
 
-    (weights, *states), values = jax.lax.scan(epoch, (weights, *states), first + jnp.arange(epochs))
-    return whole(weights), tuple(states), jax.tree.map(lambda v: v[-1], values)
+    numbers = first + jnp.arange(epochs)
+    (weights, state), (good, *values) = jax.lax.scan(epoch, (weights, state), numbers)
+    last = jnp.max(jnp.where(good, jnp.arange(epochs), 0))
+    return whole(weights), state, (values[0][last], values[1][last])
 
 
 def train(
@@ -140,10 +157,10 @@ def train(
     """
     pulls = plain(pulls)
     model, course = begin(family, pulls, place, key=key), []
-    states = untouched(model)
+    state = untouched(model)
     for first in range(0, epochs, chunk):
-        about = model, states, family, pulls, jnp.asarray(first), min(chunk, epochs - first)
-        model, states, (data, motion) = run(*about)
+        about = model, state, family, pulls, jnp.asarray(first), min(chunk, epochs - first)
+        model, state, (data, motion) = run(*about)
         course.append((float(data), float(motion), np.asarray(model.place)))
     data, motion, places = (np.array(part) for part in zip(*course, strict=True))
     return Course(model, data, motion, places)
