@@ -21,7 +21,7 @@ from pathlib import Path
 FRAMES, MARKERS, WIDTH, LAYERS = 39, 81, 50, 7
 DENSITY, SIDE, PULLED, DURATION = 0.3, 0.45, 0.018, 1.267  # [kg/m^2, m, m, s]
 STIFFNESS = 10.0  # [N/m]
-REPEATS, TOGETHER = 5, 10  # calls, and epochs in a call
+REPEATS, TOGETHER = 5, 50  # calls, and epochs in a call
 SHAPE = (33, 33)  # vertices of the sheets that are pulled
 
 
