@@ -188,6 +188,25 @@ def test_the_papers_recipe_runs_and_sees_no_force(monkeypatch):
     assert course.data.shape == (2,) and np.isfinite(course.motion).all()
 
 
+def test_a_step_that_went_astray_is_taken_back(monkeypatch):
+    """To the model before it and without memory, when the losses are greater than they were."""
+    monkeypatch.setattr(paper, "LAYERS", 3)
+    monkeypatch.setattr(paper, "WIDTH", 5)
+    pulls = paper.plain(stacked([even_pull(frames=4)]))
+    with jax.numpy_dtype_promotion("standard"):
+        model = paper.begin(FAMILY, pulls, jnp.full(7, 0.4), key=jr.key(0))
+        fresh = paper.untouched(model)
+        about = FAMILY, pulls, jnp.asarray(0), 1
+        after, state, _ = paper.run(model, fresh, *about)
+        assert not eqx.tree_equal(after, model) and np.isfinite(state.before)
+        worse = state._replace(before=jnp.zeros(()))
+        same, state, _ = paper.run(after, worse, *about)
+    assert eqx.tree_equal(same, after)
+    assert eqx.tree_equal(state.ahead, eqx.filter(after, trainable(after)))
+    assert all(not np.any(leaf) for leaf in jax.tree.leaves(state.lbfgs[0].diff_params_memory))
+    assert np.isinf(state.before)
+
+
 def test_the_gradient_made_along_with_the_sum_is_that_of_the_sum():
     """Of the recipe's loss of the motion, in the networks and the fabric of two pulls."""
     pulls = paper.plain(stacked([even_pull(frames=4), even_pull(frames=4)]))
