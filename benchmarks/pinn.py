@@ -396,7 +396,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--epochs", type=int, default=10_000, help="of the paper's recipe")
     parser.add_argument("--fabric", default="pink_solid")
-    parser.add_argument("--pulls", type=int, default=3, help="along warp, weft, bias: so many")
+    parser.add_argument(
+        "--pulls", type=int, default=3, choices=(1, 2, 3), help="along warp, weft, bias"
+    )
     parser.add_argument("--alone", action="store_true", help="long trainings of networks alone too")
     parser.add_argument("--out", type=Path, default=Path("results/pinn"))
     options = parser.parse_args()

@@ -52,7 +52,7 @@ def test_goes_on_as_if_it_had_never_stopped(tmp_path):
     with pytest.raises(ValueError, match="'seed': 2.*asked for"):
         emulator.minimise(respond, TARGET, 3, num_calls=15, seed=3, path=path)
     path.write_bytes(b"torn")
-    with pytest.raises(ValueError, match="no history of a search"):
+    with pytest.raises(ValueError, match="trials.npz: no history of a search"):
         emulator.minimise(respond, TARGET, 3, num_calls=15, seed=2, path=path)
 
 

@@ -192,9 +192,9 @@ def test_workers_of_dask_make_the_same_and_survive_a_kill(tmp_path):
     runner = cluster.local(2)
     try:
         client = runner._client
+        cores = list(client.run(_cores).values())
         # a process that dies in the middle of a cell
         client.run_on_scheduler(lambda: None)
-        cores = list(client.run(_cores).values())
         pid = next(iter(client.run(os.getpid).values()))
         import threading
 

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
 EXCLUDED = {"0.10.2": "wrong numbers from a jitted vmap on the CPU", "0.11.1": "no flax"}
 EXTRAS = {
-    "study": ("matplotlib", "tqdm", "trimesh"),
+    "study": ("matplotlib", "psutil", "tqdm", "trimesh"),
     "pcd": ("pypcd4",),
     "camera": ("cv2",),
     "data": ("pooch",),
-    "cli": ("tyro",),
+    "cli": ("tyro", "psutil"),
     "physnet": ("skopt", "sklearn"),
     "cma": ("cma",),
     "cluster": ("dask", "distributed", "dask_jobqueue"),

@@ -114,7 +114,7 @@ def run(
 ) -> tuple[Model, State, tuple[Array, Array]]:
     """Some epochs from number `first` on; the model is without the step that is not judged yet.
 
-    The losses of markers and motion are those of the last epoch that was good.
+    The losses of markers and motion are those of the last epoch that was good, or of the first.
     """
     weights, fixed = eqx.partition(model, trainable(model))
     adam, lbfgs = optimisers()

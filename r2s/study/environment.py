@@ -8,8 +8,8 @@ LOOK = 0.1  # [s], to see which core is idle
 
 
 def one_thread(flags: str) -> str:
-    """XLA's flags, with one thread: sheets are too small for more, and on a busy machine the
-    threads of a step wait for each other many times longer than they compute."""
+    """XLA's flags, with linear algebra in one thread: sheets are too small for more. It is not
+    enough on a busy machine: see `one_core`."""
     return flags if ONE_THREAD in flags else f"{flags} {ONE_THREAD}".strip()
 
 
@@ -24,10 +24,13 @@ def one_core(number: int | None = None) -> None:
         return
     cores = sorted(os.sched_getaffinity(0))
     if number is None:
-        import psutil  # comes with every extra that makes processes
-
-        busy = psutil.cpu_percent(interval=LOOK, percpu=True)
-        number = min(range(len(cores)), key=lambda i: busy[cores[i]])
+        try:
+            import psutil
+        except ImportError as error:
+            raise ImportError("to see idle cores needs psutil: pip install 'r2s[cli]'") from error
+        busy = dict(enumerate(psutil.cpu_percent(interval=LOOK, percpu=True)))
+        # some containers show their cores' times under other numbers
+        number = min(range(len(cores)), key=lambda i: busy.get(cores[i], 0.0))
     os.sched_setaffinity(0, {cores[number % len(cores)]})
 
 
