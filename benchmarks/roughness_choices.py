@@ -165,7 +165,7 @@ def descended(problem: Problem, gradient: Gradient, start: Array) -> np.ndarray:
     """Where Levenberg and Marquardt's descent ends with some gradient, all points counting."""
     problems, value = (problem,), lambda number: jnp.asarray(number, float)
     unknown = unknown_of(problem, jnp.clip(start, MARGIN, 1 - MARGIN))
-    rest = value(FIRST_DAMPING), value(GROWTH), value(0.0)
+    rest = value(FIRST_DAMPING), value(GROWTH), value(0.0), jnp.asarray(0)
     now = Descent(unknown, gradient(problem, unknown), *rest)
     for _ in range(ITERATIONS):
         prior = _weight(problems, now.normal)

@@ -15,12 +15,12 @@ from r2s.estimators.descent import Effort, descend
 from r2s.estimators.estimate import Estimate, as_json, from_json
 from r2s.estimators.evidence import loss_of
 from r2s.estimators.prediction import _delayed, predict, sensitivities
-from r2s.estimators.problem import Doubt, Problem, window
+from r2s.estimators.problem import Doubt, Problem, beginning, window
 from r2s.family import OrthotropicFamily, Range
 from r2s.recording import set_time_offset
 
 ALL = Doubt(time=0.05, density=0.2, air=0.3)
-SMALL = Effort(coarse=2, starts=1, iterations=4)
+SMALL = Effort(coarse=2, starts=1, iterations=4, shares=(0.5,))
 FABRIC = presets.grey_interlock()
 FAMILY = OrthotropicFamily.make(float(FABRIC.density))
 
@@ -216,6 +216,23 @@ def test_a_window_leaves_the_other_frames_out(small, pulled):
         window(small, 40, 50)
 
 
+@pytest.mark.parametrize("kind", ["small", "pulled"])
+def test_a_beginning_counts_as_a_window_of_the_first_frames_does(kind, request):
+    """In the loss and in the normal equations; later frames have no say."""
+    problem = request.getfixturevalue(kind)
+    unknown = jnp.concatenate([jnp.full(7, 0.45), AWAY])
+    frames = problem.frames
+    assert len(frames) >= 4
+    half = round(len(frames) / 2)
+    early = normal_at((beginning(problem, half / len(frames)),), unknown)
+    part = normal_at((window(problem, frames[0], frames[half - 1]),), unknown)
+    assert float(early.loss) == pytest.approx(float(part.loss), rel=1e-9)
+    for name in ("gradient", "matrix", "scatter"):
+        one, other = np.asarray(getattr(early, name)), np.asarray(getattr(part, name))
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9 * np.abs(other).max())
+    assert float(early.spread) == pytest.approx(float(part.spread))
+
+
 def test_markers_must_lie_on_the_sheet():
     experiment = scenarios.stretching(num_frames=4, interval=1 / 10, strain=0.03, moving=0.2)
     record = synthetic.record(experiment, FABRIC, "grey", shape=(5, 5), key=jr.key(3))
@@ -265,6 +282,23 @@ def test_a_known_fabric_and_a_late_clock_are_found(name):
     assert np.all(error[found.determined] < 0.1)
     delay = found.conditions[-1]
     assert delay.name == "time" and abs(delay.value - 0.08) < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "number"), [("red_jet_set", 1), ("black_denim", 1)])
+def test_wind_finds_a_fabric_from_where_a_descent_on_all_frames_does_not(name, number):
+    """A light sheet, whose motion is rough, and a stiff one, which hangs in more than one way."""
+    fabric = presets.FIVE[name]()
+    record = synthetic.record(scenarios.wind(), fabric, name, key=jr.key(0))
+    family = OrthotropicFamily.make(float(fabric.density))
+    problem = Problem.make(record, family)
+    key = jr.key(100 + number)
+    start = jr.uniform(key, (family.dim,), float)
+    found = diffcloud.estimate(problem, start=start, key=key)
+    truth = np.asarray(family.values(family.locate(fabric)))
+    error = np.abs(np.where(truth > 0, found.values / truth - 1, found.values - truth))
+    assert found.determined.sum() >= 4
+    assert np.all(error[found.determined] < 0.05)
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from r2s.estimators.checkpoint import fingerprint, load, save
 from r2s.estimators.estimate import Condition, Estimate
 from r2s.estimators.gauss_newton import Descent, Joint, Normal, part_of
 from r2s.estimators.prediction import fabric_at
-from r2s.estimators.problem import OWN, SHARED, UNITS, Problem
+from r2s.estimators.problem import OWN, SHARED, UNITS, Problem, beginning
 
 Progress = Callable[[int, float], None]  # told the iteration and the best loss [m^2]
 
@@ -45,16 +45,21 @@ class Effort(NamedTuple):
 
     - `coarse`: places of the range that are tried first; 0: descend from the start alone.
     - `starts`: how many of the best of them are descended from, side by side.
-    - `iterations`: at most, of each of two stages: of all starts, until each has arrived, when its
-      next step promises to change no parameter by more than about a tenth of its deviation; and of
+    - `iterations`: at most, of each stage: of all starts, until each has arrived, when its next
+      step promises to change no parameter by more than about a tenth of its deviation; and then of
       the best one with outliers left out.
     - `width`: over which slopes are taken, as of `r2s.estimators.prediction.sensitivities`.
+    - `shares`: of the frames, from the first, that count before all of them do: all starts descend
+      on the first share, and then the best one, outliers left out, on each and on all frames. The
+      end of a long motion can depend on the fabric so steeply that a loss over all of it is low
+      nowhere but near the truth; that of its beginning leads there.
     """
 
     coarse: int = 24
     starts: int = 3
     iterations: int = 25
     width: float | None = None
+    shares: tuple[float, ...] = ()
 
 
 DEFAULT = Effort()
@@ -99,14 +104,14 @@ def _begin(problems: Joint, effort: Effort, start, key) -> Row:
     nothing = jnp.zeros((count, gauss_newton.size(problems) - dim), float)
     unknowns = jnp.concatenate([places, nothing], axis=1)
     if effort.coarse:
-        losses = losses_of(problems, unknowns)
+        losses = losses_of(_seen(problems, effort, 0), unknowns)
         if not np.any(np.isfinite(losses)):
             raise RuntimeError(
                 f"all {count} simulations of the coarse search diverged: check the recording's "
                 "units and gripper path, or narrow the family's ranges"
             )
         unknowns = unknowns[np.argsort(losses)]
-    return _fresh(problems, effort, list(unknowns[: effort.starts]), 0.0)
+    return _fresh(problems, effort, list(unknowns[: effort.starts]), 0.0, 0)
 
 
 def losses_of(problems: Joint, unknowns: Float[Array, "start unknown"]) -> np.ndarray:
@@ -126,49 +131,69 @@ def _normals_of(problems: Joint, unknowns: list, scales: list, width: float | No
     return [jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(len(unknowns))]
 
 
-def _fresh(problems: Joint, effort: Effort, unknowns: list, scale: float) -> Row:
+def _share(effort: Effort, stage: int) -> float:
+    """Of the frames that count in a stage."""
+    shares = (*effort.shares, 1.0)
+    return (shares[0], *shares)[stage]
+
+
+def _seen(problems: Joint, effort: Effort, stage: int) -> Joint:
+    """The problems with those frames seen that count in a stage."""
+    share = _share(effort, stage)
+    return problems if share == 1 else tuple(beginning(p, share) for p in problems)
+
+
+def _fresh(problems: Joint, effort: Effort, unknowns: list, scale: float, stage: int) -> Row:
     """Descents that begin at unknowns."""
     value = lambda number: jnp.asarray(number, float)
-    normals = _normals_of(problems, unknowns, [value(scale)] * len(unknowns), effort.width)
-    rest = value(FIRST_DAMPING), value(gauss_newton.GROWTH), value(scale)
+    seen, scales = _seen(problems, effort, stage), [value(scale)] * len(unknowns)
+    normals = _normals_of(seen, unknowns, scales, effort.width)
+    rest = value(FIRST_DAMPING), value(gauss_newton.GROWTH), value(scale), jnp.asarray(stage)
     return [Descent(u, normal, *rest) for u, normal in zip(unknowns, normals, strict=True)]
 
 
 def _next(problems: Joint, effort: Effort, rows: list[Row]) -> Row | None:
     """The next iteration; None at the end."""
     row = rows[-1]
-    strict = any(float(descent.scale) > 0 for descent in row)
-    stage = [r for r in rows if any(float(descent.scale) > 0 for descent in r) == strict]
-    which, best = _best(row)
+    _, best = _best(row)
+    now = int(best.stage)
+    stage = [r for r in rows if int(_best(r)[1].stage) == now]
     prior = _weight(problems, best.normal)
-    moving = [i for i in range(len(row)) if not _arrived(problems, stage, i, prior)]
-    moving = [i for i in moving if i == which] if strict else moving
+    there = [i for i, descent in enumerate(row) if int(descent.stage) == now]
+    moving = [i for i in there if not _arrived(problems, stage, i, prior)]
     if not moving or len(stage) > effort.iterations:
-        return None if strict else _strict(problems, effort, row)
+        return _later(problems, effort, row)
+    seen = _seen(problems, effort, now)
     trials = [_propose(problems, row[i], prior) for i in moving]
-    tried = _normals_of(problems, trials, [row[i].scale for i in moving], effort.width)
+    tried = _normals_of(seen, trials, [row[i].scale for i in moving], effort.width)
     after = list(row)
     for i, trial, normal in zip(moving, trials, tried, strict=True):
         after[i] = _accept(problems, row[i], trial, normal, prior)
     return after
 
 
-def _strict(problems: Joint, effort: Effort, row: Row) -> Row:
-    """The best descent goes on with outliers left out, from what it leaves unexplained.
+def _later(problems: Joint, effort: Effort, row: Row) -> Row | None:
+    """The next stage, to which only the best descent goes on; None after the last.
 
-    Outliers lie to one side of a sheet, so that even a small pull of theirs biases the estimate.
+    From the second on outliers are left out, by what is unexplained: they lie to one side of a
+    sheet, so that even a small pull of theirs biases the estimate.
     """
     which, best = _best(row)
-    scale = float(np.clip(STRICT * float(best.normal.spread), *SCALES))
+    stage = int(best.stage) + 1
+    if stage > len(effort.shares) + 1:
+        return None
+    (loose,) = _fresh(problems, effort, [best.unknown], 0.0, stage)
+    scale = float(np.clip(STRICT * float(loose.normal.spread), *SCALES))
     after = list(row)
-    (after[which],) = _fresh(problems, effort, [best.unknown], scale)
+    (after[which],) = _fresh(problems, effort, [best.unknown], scale, stage)
     return after
 
 
 def _best(row: Row) -> tuple[int, Descent]:
-    """The descent with outliers left out, or else that of the least loss."""
-    finest = [i for i, descent in enumerate(row) if float(descent.scale) > 0]
-    which = finest[0] if finest else int(np.argmin([float(d.normal.loss) for d in row]))
+    """Of the descents in the latest stage, that of the least loss."""
+    last = max(int(descent.stage) for descent in row)
+    losses = [float(d.normal.loss) if int(d.stage) == last else np.inf for d in row]
+    which = int(np.argmin(losses))
     return which, row[which]
 
 
@@ -196,7 +221,7 @@ def _stacked(row: Row) -> Descent:
 def _resumed(checkpoint: Path, identity: str, effort: Effort) -> list[Row]:
     none, vector, square = (jnp.zeros((0,) * dims) for dims in (1, 2, 3))
     normal = Normal(none, none, vector, square, square)
-    like = Descent(vector, normal, none, none, none)
+    like = Descent(vector, normal, none, none, none, none)
     each = lambda row: [jax.tree.map(lambda a, i=i: a[i], row) for i in range(effort.starts)]
     return [each(row) for row in load(checkpoint, identity, like)]
 

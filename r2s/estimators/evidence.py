@@ -57,7 +57,7 @@ def loss_of(problem: Problem, seen: Seen, scale: Scale = 0.0) -> Float[Array, ""
         gap = _gaps(problem.markers, seen.x)
         total += masked_mean(robust(length(gap), scale), problem.markers.seen)
     if problem.force is not None and seen.force is not None:
-        total += jnp.mean(jnp.sum(_force_gaps(problem.force, seen.force) ** 2, axis=1)) / 2
+        total += _force_loss(problem.force, _force_gaps(problem.force, seen.force))
     return total
 
 
@@ -108,17 +108,23 @@ def _of_markers(markers: Markers, mesh: Mesh, seen: Seen, slope: Slope, scale) -
 
 
 def _of_force(force: Force, pulled: Array, slope: Array) -> Evidence:
-    gap, jacobian = _force_gaps(force, pulled), FORCE_SCALE * slope
-    scores = jnp.einsum("fd,fdu->fu", gap, jacobian) / len(gap)
-    matrices = jnp.einsum("fdu,fdv->fuv", jacobian, jacobian) / len(gap)
+    gap, count = _force_gaps(force, pulled), jnp.sum(force.seen, dtype=float)
+    jacobian = jnp.where(force.seen[:, None, None], FORCE_SCALE * slope, 0)
+    scores = jnp.einsum("fd,fdu->fu", gap, jacobian) / count
+    matrices = jnp.einsum("fdu,fdv->fuv", jacobian, jacobian) / count
     matrices = _by_time(matrices[:, None])
+    square = jnp.sum(gap**2) / (count * gap.shape[1])
     return Evidence(
-        loss=jnp.mean(jnp.sum(gap**2, axis=1)) / 2,
-        spread=jnp.sqrt(jnp.mean(gap**2)),
+        loss=_force_loss(force, gap),
+        spread=jnp.sqrt(square),
         scores=_by_time(scores[:, None]),
         matrices=matrices,
-        noise=jnp.full(len(matrices), jnp.mean(gap**2) / len(gap)),
+        noise=jnp.full(len(matrices), square / count),
     )
+
+
+def _force_loss(force: Force, gap: Float[Array, "frame direction"]) -> Float[Array, ""]:
+    return masked_mean(jnp.sum(gap**2, axis=1), force.seen) / 2
 
 
 def _weights(distance: Float[Array, "frame point"], mask, scale: Scale) -> Array:
@@ -188,7 +194,8 @@ def _gaps(markers: Markers, x: Float[Array, "frame vertex 3"]) -> Float[Array, "
 
 
 def _force_gaps(force: Force, pulled: Array) -> Float[Array, "frame direction"]:
-    return FORCE_SCALE * (pulled - force.values)
+    """Too much of it, as a distance [m]; zero where it was not measured."""
+    return jnp.where(force.seen[:, None], FORCE_SCALE * (pulled - force.values), 0)
 
 
 def _spread(distance: Float[Array, "*shape"], mask) -> Float[Array, ""]:

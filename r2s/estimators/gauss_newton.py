@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from r2s.estimators import evidence
 from r2s.estimators.prediction import Unknown, predict, sensitivities
@@ -52,6 +52,7 @@ class Descent(eqx.Module):
     - `normal`: the normal equations there.
     - `damping`: Levenberg's, [-]; `growth`: its factor should the next step fail (Nielsen 1999).
     - `scale`: beyond which distances do not count, [m]; 0: all do, see `r2s.losses.robust`.
+    - `stage`: which of an estimate's, see `r2s.estimators.descent.Effort`.
     """
 
     unknown: Float[Array, "*start unknown"]
@@ -59,6 +60,7 @@ class Descent(eqx.Module):
     damping: Float[Array, "*start"]
     growth: Float[Array, "*start"]
     scale: Float[Array, "*start"]
+    stage: Int[Array, "*start"]
 
 
 def size(problems: Joint) -> int:
@@ -254,4 +256,5 @@ def accept(problems: Joint, descent: Descent, trial: Unknown, tried: Normal, pri
         jnp.clip(damping, *DAMPINGS),
         jnp.where(better, GROWTH, 2 * descent.growth),
         descent.scale,
+        descent.stage,
     )

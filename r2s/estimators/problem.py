@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from r2s.estimators.hanging import as_seen
 from r2s.family import Family
 from r2s.mesh import Mesh
 from r2s.recording import Recording, subsample
@@ -65,9 +66,10 @@ class Markers(eqx.Module):
 
 
 class Force(eqx.Module):
-    """What pulled at the clamp at the frames that count [N], along `directions`."""
+    """What pulled at the clamp at the frames that count [N], along `directions`; where measured."""
 
     values: Float[Array, "frame direction"]
+    seen: Bool[Array, " frame"]
     directions: Float[Array, "direction 3"]
 
 
@@ -108,8 +110,9 @@ class Problem(eqx.Module):
 
         `voxel` [m] as of `r2s.recording.subsample`, `shape` the vertices of the
         simulated sheet. Where markers were tracked they count instead of the clouds, and the force
-        on the pulled clamp counts where it was measured. Raises `ValueError` when a marker is not
-        seen in the first frame, or lies off the sheet there.
+        on the pulled clamp counts where it was measured. A sheet that hangs starts in the shape
+        that the first cloud shows, see `r2s.estimators.hanging`. Raises `ValueError` when a marker
+        is not seen in the first frame, or lies off the sheet there.
         """
         scenario = from_recording(recording, shape)
         first, last = recording.info.frames_used
@@ -119,6 +122,9 @@ class Problem(eqx.Module):
         if markers is None:
             thinned = subsample(recording, num_points, voxel, seed)
             clouds = Clouds(thinned.points[frames], thinned.mask[frames])
+            if scenario.brake is not None and first == 0:
+                middle = family(jnp.full(family.dim, 0.5, float))
+                scenario = as_seen(scenario, middle, clouds.points[0], clouds.mask[0])
         return cls(
             scenario,
             family,
@@ -153,7 +159,30 @@ def window(problem: Problem, first: int, last: int) -> Problem:
         frames=tuple(problem.frames[i] for i in kept),
         clouds=pick(problem.clouds, ("points", "mask")),
         markers=pick(problem.markers, ("positions", "seen")),
-        force=pick(problem.force, ("values",)),
+        force=pick(problem.force, ("values", "seen")),
+    )
+
+
+def beginning(problem: Problem, share: float) -> Problem:
+    """The problem with nothing seen after a share of its frames, at least one, that count.
+
+    Of the same shapes, so that what is compiled for the problem serves this one.
+    """
+    last = max(1, round(share * len(problem.frames)))
+    early = jnp.arange(len(problem.frames)) < last
+
+    def hide(part: Any, name: str) -> Any:
+        if part is None:
+            return None
+        seen = getattr(part, name)
+        when = early.reshape(-1, *(1,) * (seen.ndim - 1))
+        return dataclasses.replace(part, **{name: seen & when})
+
+    return dataclasses.replace(
+        problem,
+        clouds=hide(problem.clouds, "mask"),
+        markers=hide(problem.markers, "seen"),
+        force=hide(problem.force, "seen"),
     )
 
 
@@ -194,4 +223,5 @@ def _force(recording: Recording, frames: slice) -> Force | None:
     at = lambda column: np.interp(times, np.asarray(recording.force_times), column)
     values = np.stack([at(column) for column in columns.T], axis=1)
     directions = np.array([recording.info.sheet.warp]) if scalar else np.eye(3)
-    return Force(jnp.asarray(values, float), jnp.asarray(directions, float))
+    seen = jnp.ones(len(values), bool)
+    return Force(jnp.asarray(values, float), seen, jnp.asarray(directions, float))

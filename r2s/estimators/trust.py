@@ -39,7 +39,7 @@ def sensitivity(problems: Problem | Joint, fabric: Fabric) -> Estimate:
     # the fabric is the true one, so what is left of the gradient is noise, and no step to take
     normal = eqx.tree_at(lambda n: n.gradient, normal, _balanced(problems, unknown, normal))
     zero = jnp.zeros((), float)
-    row = [Descent(unknown, normal, zero, zero, scale)]
+    row = [Descent(unknown, normal, zero, zero, scale, jnp.zeros((), int))]
     return descent.collect(problems, [row], "sensitivity", 0.0)
 
 

@@ -1,0 +1,61 @@
+"""How a sheet hangs before it moves: laid onto points, and in the way that was seen."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from r2s import presets, scenarios
+from r2s.estimators.hanging import as_seen, registered
+from r2s.family import OrthotropicFamily
+from r2s.mesh import borders, rectangle
+from r2s.scenario import motion
+from r2s.surface import sample
+
+SIDE, RADIUS = 0.4, 0.15  # [m]
+
+
+def bent(rest, radius):
+    """A flat sheet rolled about the weft, without stretch [m]."""
+    angle = rest[:, 0] / radius
+    return jnp.stack([radius * jnp.sin(angle), rest[:, 1], radius * (1 - jnp.cos(angle))], axis=1)
+
+
+def test_a_flat_sheet_is_laid_onto_a_cylinder_without_stretch():
+    """An isometry: points of the bent sheet, and the length of every edge, say where it is."""
+    mesh = rectangle((SIDE, SIDE), (9, 9))
+    held = np.flatnonzero(np.asarray(mesh.rest)[:, 0] == 0)
+    free = jnp.ones(81, bool).at[held].set(False)
+    exact, start = bent(mesh.rest, RADIUS), bent(mesh.rest, 1.2 * RADIUS)
+    points = sample(exact, mesh.faces, 3)
+    stray = points.at[:5].add(jnp.array([0.0, 0.0, 0.3]))  # outliers
+    hidden = jnp.arange(len(points)) % 7 != 0
+    found = registered(stray, hidden, start, mesh, free)
+    off = lambda x: float(jnp.mean(jnp.linalg.norm(x - exact, axis=1)))
+    assert off(start) > 0.02 and off(found) < 2e-3
+    np.testing.assert_array_equal(found[held], start[held])
+    edges = lambda x: jnp.linalg.norm(x[mesh.faces] - x[jnp.roll(mesh.faces, 1, axis=1)], axis=-1)
+    assert float(jnp.max(jnp.abs(edges(found) / edges(exact) - 1))) < 0.05
+    nothing = registered(points, jnp.zeros(len(points), bool), start, mesh, free)
+    np.testing.assert_allclose(nothing, start, atol=1e-6)
+    assert int(jnp.sum(borders(mesh))) == 32
+
+
+@pytest.mark.slow
+def test_fabrics_come_to_rest_in_the_buckled_shape_that_was_seen():
+    """Two denims of slightly other stiffness fall into two shapes, 5 mm apart, and into one when
+    they start near it."""
+    denim = presets.black_denim()
+    family = OrthotropicFamily.make(float(denim.density))
+    scenario = scenarios.wind(num_frames=2).scenario((9, 9), False)
+    place = family.locate(denim)
+    changed = place + jnp.array([-0.015, -0.06, 0.0, -0.02, 0.01, 0.09, -0.06])
+    rest = jax.jit(lambda scenario, u: motion(scenario, family(u)).x[0])
+    apart = lambda one, other: float(jnp.mean(jnp.linalg.norm(one - other, axis=1)))
+    true = rest(scenario, place)
+    assert apart(rest(scenario, changed), true) > 4e-3
+    points = sample(true, scenario.scene.mesh.faces, 3)
+    middle = family(jnp.full(family.dim, 0.5))
+    seen = as_seen(scenario, middle, points, jnp.ones(len(points), bool))
+    assert apart(rest(seen, changed), true) < 2e-3
+    assert apart(rest(seen, place), true) < 1e-3
