@@ -16,7 +16,7 @@ import measure
 
 from r2s import presets, scenarios, synthetic
 from r2s.estimators import diffcloud, gauss_newton
-from r2s.estimators.descent import Effort
+from r2s.estimators.descent import DEFAULT, Effort
 from r2s.estimators.prediction import predict
 from r2s.estimators.problem import Problem
 from r2s.family import OrthotropicFamily
@@ -32,10 +32,10 @@ PARTS = {
     "loss, gradient and Gauss-Newton matrix, forward": _normal,
 }
 EFFORTS = {
-    "estimate, 24 places, 3 descents": Effort(),
-    "estimate, 64 places, 3 descents": Effort(coarse=64),
+    "estimate, 24 places, 3 descents": DEFAULT,
+    "estimate, 64 places, 3 descents": DEFAULT._replace(coarse=64),
     "estimate, 1 descent": Effort(coarse=0, starts=1),
-    "estimate, 64 descents": Effort(coarse=64, starts=64),
+    "estimate, 64 descents": DEFAULT._replace(coarse=64, starts=64),
 }
 
 

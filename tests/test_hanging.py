@@ -8,6 +8,7 @@ import pytest
 from r2s import presets, scenarios
 from r2s.estimators.hanging import as_seen, registered
 from r2s.family import OrthotropicFamily
+from r2s.losses import surface_residuals
 from r2s.mesh import borders, rectangle
 from r2s.scenario import motion
 from r2s.surface import sample
@@ -28,11 +29,13 @@ def test_a_flat_sheet_is_laid_onto_a_cylinder_without_stretch():
     free = jnp.ones(81, bool).at[held].set(False)
     exact, start = bent(mesh.rest, RADIUS), bent(mesh.rest, 1.2 * RADIUS)
     points = sample(exact, mesh.faces, 3)
-    stray = points.at[:5].add(jnp.array([0.0, 0.0, 0.3]))  # outliers
+    stray = points.at[::200].add(jnp.array([0.0, 0.0, 0.3]))  # outliers
     hidden = jnp.arange(len(points)) % 7 != 0
     found = registered(stray, hidden, start, mesh, free)
     off = lambda x: float(jnp.mean(jnp.linalg.norm(x - exact, axis=1)))
-    assert off(start) > 0.02 and off(found) < 2e-3
+    assert off(start) > 0.02 and off(found) < 5e-3
+    distance, *_ = surface_residuals(points, hidden, found, mesh.faces)
+    assert float(jnp.median(distance)) < 5e-4
     np.testing.assert_array_equal(found[held], start[held])
     edges = lambda x: jnp.linalg.norm(x[mesh.faces] - x[jnp.roll(mesh.faces, 1, axis=1)], axis=-1)
     assert float(jnp.max(jnp.abs(edges(found) / edges(exact) - 1))) < 0.05

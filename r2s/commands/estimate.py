@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 if TYPE_CHECKING:
+    from r2s.estimators.descent import Effort
     from r2s.estimators.estimate import Estimate
     from r2s.recording import Recording
 
@@ -80,12 +81,13 @@ class EstimateCard:
 
     def _cloud(self, seen: "Sequence[Recording]") -> "Estimate":
         from r2s.estimators import diffcloud
+        from r2s.estimators.descent import DEFAULT
         from r2s.estimators.problem import Problem
         from r2s.family import OrthotropicFamily
 
         family = OrthotropicFamily.make(self.density)
         problems = tuple(Problem.make(each, family, shape=self.shape) for each in seen)
-        return self._descend(diffcloud.estimate, problems, 24, 3, None)
+        return self._descend(diffcloud.estimate, problems, DEFAULT)
 
     def _points(self, seen: "Sequence[Recording]") -> "Estimate":
         from r2s.estimators import diffcp
@@ -95,20 +97,16 @@ class EstimateCard:
         family = IsotropicFamily.make(self.density)
         made = (Problem.make(each, family, shape=self.shape) for each in seen)
         problems = tuple(diffcp.on_points(each) for each in made)
-        return self._descend(diffcp.estimate, problems, 12, 2, diffcp.WIDTH)
+        return self._descend(diffcp.estimate, problems, diffcp.DEFAULT)
 
-    def _descend(self, estimate: Callable, problems, coarse, starts, width) -> "Estimate":
+    def _descend(self, estimate: Callable, problems, usual: "Effort") -> "Estimate":
         import jax
 
-        from r2s.estimators.descent import DEFAULT, Effort
-
-        given = lambda value, usual: usual if value is None else value
-        iterations = given(self.iterations, DEFAULT.iterations)
-        numbers = given(self.coarse, coarse), given(self.starts, starts), iterations
+        asked = {name: getattr(self, name) for name in ("coarse", "starts", "iterations")}
         with _bar() as progress:
             return estimate(
                 problems,
-                Effort(*numbers, width),
+                usual._replace(**{name: n for name, n in asked.items() if n is not None}),
                 checkpoint=self._progress_file,
                 progress=progress,
                 key=jax.random.key(self.seed),

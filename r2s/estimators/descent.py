@@ -62,7 +62,7 @@ class Effort(NamedTuple):
     shares: tuple[float, ...] = ()
 
 
-DEFAULT = Effort()
+DEFAULT = Effort(shares=(0.25, 0.5))
 
 
 def descend(

@@ -26,6 +26,7 @@ from r2s.scenarios.points import MEMBRANE_DAMPING, material_points
 WIDTH = 0.02  # of the range: the slope of the exact motion is rough below that
 FIRST = {"E h": 100.0, "nu": 0.1}  # where the public code starts
 EPOCHS, RATE = 51, 0.05
+DEFAULT = Effort(coarse=12, starts=2, width=WIDTH)
 
 
 def on_points(
@@ -51,7 +52,7 @@ def stiffest(problem: Problem) -> Fabric:
 
 def estimate(
     problems: Problem | Joint,
-    effort: Effort = Effort(coarse=12, starts=2, width=WIDTH),  # noqa: B008  (immutable)
+    effort: Effort = DEFAULT,
     *,
     start: Float[Array, " dim"] | None = None,
     checkpoint: Path | None = None,

@@ -12,7 +12,7 @@ import jax.random as jr
 import numpy as np
 
 from r2s.estimators import diffcloud, diffcp, physnet, pinn, pinn_clouds
-from r2s.estimators.descent import Effort
+from r2s.estimators.descent import DEFAULT
 from r2s.estimators.estimate import Estimate, as_json, from_json
 from r2s.estimators.problem import Problem
 from r2s.fabric import Fabric
@@ -177,7 +177,8 @@ def default_fabric(solver: str, density: float) -> Fabric:
 
 def _diffcloud(cell: Estimated, family, recordings: list[Recording], folder: Path) -> Estimate:
     del folder
-    effort = Effort(cell.spent.coarse, cell.spent.starts, cell.spent.iterations)
+    spent = cell.spent
+    effort = DEFAULT._replace(coarse=spent.coarse, starts=spent.starts, iterations=spent.iterations)
     problem = Problem.make(recordings[0], family)
     return diffcloud.estimate(problem, effort, key=jr.key(cell.repeat))
 
@@ -185,8 +186,12 @@ def _diffcloud(cell: Estimated, family, recordings: list[Recording], folder: Pat
 def _diffcp(cell: Estimated, family, recordings: list[Recording], folder: Path) -> Estimate:
     del folder
     spent = cell.spent
-    about = spent.points_coarse, spent.points_starts, spent.points_iterations
-    effort = Effort(*about, width=diffcp.WIDTH)
+    about = {
+        "coarse": spent.points_coarse,
+        "starts": spent.points_starts,
+        "iterations": spent.points_iterations,
+    }
+    effort = diffcp.DEFAULT._replace(**about)
     problem = diffcp.on_points(Problem.make(recordings[0], family, shape=COARSE))
     return diffcp.estimate(problem, effort, key=jr.key(cell.repeat))
 
