@@ -25,7 +25,7 @@ from r2s import presets, scenarios, synthetic
 from r2s.estimators import diffcloud, gauss_newton
 from r2s.estimators.descent import CLOSE, FIRST_DAMPING, Effort
 from r2s.estimators.gauss_newton import GROWTH, MARGIN, Descent, Normal
-from r2s.estimators.problem import Problem, window
+from r2s.estimators.problem import Problem, beginning, window
 from r2s.family import OrthotropicFamily
 
 STARTS, ITERATIONS = 6, 12
@@ -34,6 +34,7 @@ NUM_FRAMES, MOVING = 30, 1.2  # of a lift, and for how long the gripper moves [s
 SETTLED = 22  # the frame from which the sheet hangs still
 WIDTHS = (0.02, 0.1)  # of secants, of the range
 MORE = 5.0  # times the damping
+FIRST = 0.25  # share of the frames
 SEEN = 1e-3  # [m]: error of an observed vertex
 BATCH, SPREAD = 8, 0.03  # places over which a gradient is averaged, and their deviation [range]
 
@@ -64,6 +65,7 @@ def choices(fabric: str) -> dict[str, Choice]:
     return {
         "exact slopes": Choice(same, exact),
         f"secants, {WIDTHS[0]:g} of the range": Choice(same, secants(WIDTHS[0])),
+        f"first {FIRST:.0%} of the frames": Choice(lambda p: beginning(p, FIRST), exact),
         "settled frames only": Choice(lambda p: window(p, SETTLED, 99), exact),
         f"{MORE:g} times the damping": Choice(more_damped, exact),
         f"mean of {BATCH} places": Choice(same, mean),

@@ -221,7 +221,7 @@ def _stacked(row: Row) -> Descent:
 def _resumed(checkpoint: Path, identity: str, effort: Effort) -> list[Row]:
     none, vector, square = (jnp.zeros((0,) * dims) for dims in (1, 2, 3))
     normal = Normal(none, none, vector, square, square)
-    like = Descent(vector, normal, none, none, none, none)
+    like = Descent(vector, normal, none, none, none, jnp.zeros(0, int))
     each = lambda row: [jax.tree.map(lambda a, i=i: a[i], row) for i in range(effort.starts)]
     return [each(row) for row in load(checkpoint, identity, like)]
 

@@ -50,7 +50,8 @@ class Estimate:
     - `correlation`: of the parameters, [-].
     - `conditions`: what was not known for sure of the recordings.
     - `loss`: at the estimate, [m^2].
-    - `losses`, `history`: of every iteration and start, [m^2], and the parameters there.
+    - `losses`, `history`: of every iteration and start, [m^2], and the parameters there. A stage
+      counts other frames than the one before, or leaves outliers out: its losses are others.
     - `seconds`: how long it took, compilation included.
     """
 
