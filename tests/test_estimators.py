@@ -13,8 +13,8 @@ from r2s import presets, scenarios, synthetic
 from r2s.estimators import adam, cma_es, diffcloud, gauss_newton
 from r2s.estimators.descent import Effort, descend
 from r2s.estimators.estimate import Estimate, as_json, from_json
-from r2s.estimators.evidence import loss_of
-from r2s.estimators.prediction import _delayed, predict, sensitivities
+from r2s.estimators.evidence import evidence_of, loss_of
+from r2s.estimators.prediction import Seen, Slope, _delayed, predict, sensitivities
 from r2s.estimators.problem import Doubt, Problem, beginning, window
 from r2s.family import OrthotropicFamily, Range
 from r2s.recording import set_time_offset
@@ -218,19 +218,30 @@ def test_a_window_leaves_the_other_frames_out(small, pulled):
 
 @pytest.mark.parametrize("kind", ["small", "pulled"])
 def test_a_beginning_counts_as_a_window_of_the_first_frames_does(kind, request):
-    """In the loss and in the normal equations; later frames have no say."""
+    """In the loss and in the normal equations of any motion; later frames have no say."""
     problem = request.getfixturevalue(kind)
-    unknown = jnp.concatenate([jnp.full(7, 0.45), AWAY])
-    frames = problem.frames
-    assert len(frames) >= 4
-    half = round(len(frames) / 2)
-    early = normal_at((beginning(problem, half / len(frames)),), unknown)
-    part = normal_at((window(problem, frames[0], frames[half - 1]),), unknown)
-    assert float(early.loss) == pytest.approx(float(part.loss), rel=1e-9)
-    for name in ("gradient", "matrix", "scatter"):
-        one, other = np.asarray(getattr(early, name)), np.asarray(getattr(part, name))
-        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9 * np.abs(other).max())
-    assert float(early.spread) == pytest.approx(float(part.spread))
+    rest, count, size = problem.scenario.scene.mesh.rest, len(problem.frames), 3
+    half = count // 2
+    draw = lambda number, *shape: jr.normal(jr.key(number), (count, *shape), float)
+    x = jnp.pad(rest, ((0, 0), (0, 1)))[None] + 0.02 * draw(1, len(rest), 3)
+    forces = None if problem.force is None else (draw(2, 3), draw(3, 3, size))
+    slope = draw(4, len(rest), 3, size)
+
+    def evidence(problem, frames):
+        pick = lambda which: None if forces is None else forces[which][:frames]
+        seen = Seen(x[:frames], pick(0), jnp.array(True))
+        both = lambda p, *about: (loss_of(p, about[0]), evidence_of(p, *about))
+        return jax.jit(both)(problem, seen, Slope(slope[:frames], pick(1)))
+
+    loss, early = evidence(beginning(problem, half / count), count)
+    same, part = evidence(window(problem, problem.frames[0], problem.frames[half - 1]), half)
+    assert half >= 2 and float(loss) == pytest.approx(float(same), rel=1e-12)
+    assert float(early.loss) == pytest.approx(float(loss), rel=1e-12)
+    assert float(early.spread) == pytest.approx(float(part.spread), rel=1e-12)
+    for name in ("scores", "matrices"):
+        one, other = (jnp.sum(getattr(each, name), axis=0) for each in (early, part))
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(early.noise[0], part.noise[0], rtol=1e-12)
 
 
 def test_markers_must_lie_on_the_sheet():
