@@ -216,6 +216,25 @@ def test_a_window_leaves_the_other_frames_out(small, pulled):
         window(small, 40, 50)
 
 
+def test_what_a_beginning_is(small):
+    """A share of the frames that show something, and one at least; shares must rise."""
+    assert small.clouds is not None
+    mask = small.clouds.mask.at[0].set(False)
+    late = dataclasses.replace(small, clouds=dataclasses.replace(small.clouds, mask=mask))
+
+    def frames(problem: Problem, share: float) -> list[bool]:
+        clouds = beginning(problem, share).clouds
+        assert clouds is not None
+        return np.any(clouds.mask, axis=1).tolist()
+
+    assert frames(small, 0.5) == [True, True, False, False]
+    assert frames(late, 0.67) == [False, True, True, False]
+    assert frames(late, 0.01) == [False, True, False, False]
+    for shares in ((0.5, 0.25), (0.5, 1.0), (0.0,), (0.5, 0.5)):
+        with pytest.raises(ValueError, match="shares of the frames must rise between 0 and 1"):
+            diffcloud.estimate(small, SMALL._replace(shares=shares), key=jr.key(0))
+
+
 @pytest.mark.parametrize("kind", ["small", "pulled"])
 def test_a_beginning_counts_as_a_window_of_the_first_frames_does(kind, request):
     """In the loss and in the normal equations of any motion; later frames have no say."""

@@ -1,5 +1,6 @@
 """From anywhere in the range to the best fabric: a coarse search, then Gauss-Newton descents."""
 
+import itertools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -80,8 +81,11 @@ def descend(
     `start`, by default the middle of the range, is among the coarse places; the others are drawn
     with `key`. What is there after every iteration is written to `checkpoint`, and a run with the
     same problem that finds it goes on from there. A simulation that diverges counts as infinitely
-    bad; when all do, raises `RuntimeError`.
+    bad; when all do, raises `RuntimeError`. Raises `ValueError` for shares that are not below 1
+    and rising.
     """
+    if any(not low < high for low, high in itertools.pairwise((0.0, *effort.shares, 1.0))):
+        raise ValueError(f"shares of the frames must rise between 0 and 1, got {effort.shares}")
     began = time.perf_counter()
     problems = (problems,) if isinstance(problems, Problem) else problems
     identity = "" if checkpoint is None else fingerprint(problems, effort, start, key)
@@ -182,7 +186,9 @@ def _later(problems: Joint, effort: Effort, row: Row) -> Row | None:
     stage = int(best.stage) + 1
     if stage > len(effort.shares) + 1:
         return None
-    (loose,) = _fresh(problems, effort, [best.unknown], 0.0, stage)
+    loose = best
+    if _share(effort, stage) != _share(effort, stage - 1):
+        (loose,) = _fresh(problems, effort, [best.unknown], 0.0, stage)
     scale = float(np.clip(STRICT * float(loose.normal.spread), *SCALES))
     after = list(row)
     (after[which],) = _fresh(problems, effort, [best.unknown], scale, stage)

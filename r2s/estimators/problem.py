@@ -164,19 +164,21 @@ def window(problem: Problem, first: int, last: int) -> Problem:
 
 
 def beginning(problem: Problem, share: float) -> Problem:
-    """The problem with nothing seen after a share of its frames, at least one, that count.
+    """The problem with nothing seen after a share of the frames in which something was.
 
-    Of the same shapes, so that what is compiled for the problem serves this one.
+    One frame at least is kept. Of the same shapes, so that what is compiled for the problem serves
+    this one.
     """
-    last = max(1, round(share * len(problem.frames)))
-    early = jnp.arange(len(problem.frames)) < last
 
     def hide(part: Any, name: str) -> Any:
         if part is None:
             return None
         seen = getattr(part, name)
-        when = early.reshape(-1, *(1,) * (seen.ndim - 1))
-        return dataclasses.replace(part, **{name: seen & when})
+        number = jnp.cumsum(jnp.any(seen.reshape(len(seen), -1), axis=1)).astype(float)
+        early = number <= jnp.maximum(jnp.round(share * number[-1]), 1)
+        return dataclasses.replace(
+            part, **{name: seen & early.reshape(-1, *(1,) * (seen.ndim - 1))}
+        )
 
     return dataclasses.replace(
         problem,
