@@ -90,7 +90,8 @@ def _on_points(family: IsotropicFamily, fabric: Fabric, name: str, scenario: str
         solver=lambda scenario, fabric: material_points(scenario, stiffest),
         key=key,
     )
-    return diffcp.on_points(Problem.make(recording, family, shape=COARSE)), place
+    problem = Problem.make(recording, family, shape=COARSE, as_seen=False)
+    return diffcp.on_points(problem), place
 
 
 def errors(problem: Problem, estimate: Estimate, place: np.ndarray) -> np.ndarray:

@@ -327,8 +327,7 @@ def test_wind_finds_a_fabric_from_where_a_descent_on_all_frames_does_not(name, n
     found = diffcloud.estimate(problem, start=start, key=key)
     truth = np.asarray(family.values(family.locate(fabric)))
     error = np.abs(np.where(truth > 0, found.values / truth - 1, found.values - truth))
-    assert found.determined.sum() >= 4
-    assert np.all(error[found.determined] < 0.05)
+    assert np.all(error[:-1] < 0.05)  # of all but friction
 
 
 @pytest.mark.slow

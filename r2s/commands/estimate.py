@@ -95,7 +95,7 @@ class EstimateCard:
         from r2s.family import IsotropicFamily
 
         family = IsotropicFamily.make(self.density)
-        made = (Problem.make(each, family, shape=self.shape) for each in seen)
+        made = (Problem.make(each, family, shape=self.shape, as_seen=False) for each in seen)
         problems = tuple(diffcp.on_points(each) for each in made)
         return self._descend(diffcp.estimate, problems, diffcp.DEFAULT)
 

@@ -38,7 +38,8 @@ def on_points(
     """A problem whose motion is simulated by material points, stable for all of its family.
 
     Arguments as of `r2s.scenarios.material_points`; `forward_mode` for exact sensitivities, which
-    the default estimator does not need.
+    the default estimator does not need. A sheet that hangs is to be made with `as_seen=False`: the
+    points do not settle into the shape that their own recording shows from the one laid onto it.
     """
     sheet = material_points(problem.scenario, stiffest(problem), spacing, membrane_damping)
     background = dataclasses.replace(sheet.background, forward_mode=forward_mode)

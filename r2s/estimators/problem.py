@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from r2s.estimators.hanging import as_seen
+from r2s.estimators import hanging
 from r2s.family import Family
 from r2s.mesh import Mesh
 from r2s.recording import Recording, subsample
@@ -105,14 +105,16 @@ class Problem(eqx.Module):
         seed: int = 0,
         doubt: Doubt = USUAL,
         solver: Any = None,
+        as_seen: bool = True,
     ) -> "Problem":
         """A problem from a recording, its clouds thinned to `num_points` a frame.
 
         `voxel` [m] as of `r2s.recording.subsample`, `shape` the vertices of the
         simulated sheet. Where markers were tracked they count instead of the clouds, and the force
         on the pulled clamp counts where it was measured. A sheet that hangs starts in the shape
-        that the first cloud shows, see `r2s.estimators.hanging`. Raises `ValueError` when a marker
-        is not seen in the first frame, or lies off the sheet there.
+        that the first cloud shows, see `r2s.estimators.hanging`, unless not `as_seen`: then flat.
+        Raises `ValueError` when a marker is not seen in the first frame, or lies off the sheet
+        there.
         """
         scenario = from_recording(recording, shape)
         first, last = recording.info.frames_used
@@ -122,9 +124,9 @@ class Problem(eqx.Module):
         if markers is None:
             thinned = subsample(recording, num_points, voxel, seed)
             clouds = Clouds(thinned.points[frames], thinned.mask[frames])
-            if scenario.brake is not None and first == 0:
+            if as_seen and scenario.brake is not None and first == 0:
                 middle = family(jnp.full(family.dim, 0.5, float))
-                scenario = as_seen(scenario, middle, clouds.points[0], clouds.mask[0])
+                scenario = hanging.as_seen(scenario, middle, clouds.points[0], clouds.mask[0])
         return cls(
             scenario,
             family,

@@ -192,8 +192,8 @@ def _diffcp(cell: Estimated, family, recordings: list[Recording], folder: Path) 
         "iterations": spent.points_iterations,
     }
     effort = diffcp.DEFAULT._replace(**about)
-    problem = diffcp.on_points(Problem.make(recordings[0], family, shape=COARSE))
-    return diffcp.estimate(problem, effort, key=jr.key(cell.repeat))
+    problem = Problem.make(recordings[0], family, shape=COARSE, as_seen=False)
+    return diffcp.estimate(diffcp.on_points(problem), effort, key=jr.key(cell.repeat))
 
 
 def _physnet(cell: Estimated, family: Family, recordings: list[Recording], folder: Path):
