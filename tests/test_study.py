@@ -1,5 +1,6 @@
 """The study: what a figure means, which cells there are, and that nothing is made twice."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -214,6 +215,22 @@ def test_an_estimate_without_memory_is_missing_and_no_divergence(tiny, tmp_path,
     monkeypatch.setitem(estimates._ESTIMATORS, "diffcloud", exhaust)
     failed = engine.run([estimated], tmp_path, engine.Serial())
     assert "out of memory" in failed[estimated] and not estimated.is_made(tmp_path)
+
+
+def test_results_are_written_again_when_one_is_gone_or_a_cell_is_newer(tmp_path):
+    mark, cell = tmp_path / ".published", tmp_path / "cells/estimates/one.zip"
+    cell.parent.mkdir(parents=True)
+    for path in (cell, tmp_path / "results.csv", tmp_path / "report.html"):
+        path.write_text("made")
+    mark.write_text("these cells")
+    os.utime(cell, ns=(0, 0))
+    assert results._is_published(tmp_path, mark, "these cells")
+    assert not results._is_published(tmp_path, mark, "others")
+    os.utime(cell, (mark.stat().st_mtime + 10,) * 2)
+    assert not results._is_published(tmp_path, mark, "these cells")
+    os.utime(cell, ns=(0, 0))
+    (tmp_path / "results.csv").unlink()
+    assert not results._is_published(tmp_path, mark, "these cells")
 
 
 def test_given_recordings_are_shown_one_by_one():

@@ -39,10 +39,10 @@ def publish(
     paper: Path | None = None,
 ) -> None:
     """Write `results.csv`, `estimates/`, tables, pictures and `report.html` of a study, and print
-    its tables; nothing but the tables again when nothing has changed."""
+    its tables; nothing but the tables again when nothing has changed, nor is gone."""
     changed = sha256(repr([[c.key for c in cells], missing(failed), str(paper)]).encode())
     mark = out / ".published"
-    if not mark.exists() or mark.read_text(encoding="utf-8") != changed.hexdigest():
+    if not _is_published(out, mark, changed.hexdigest()):
         found = rows(cells, out)
         write_rows(out / "results.csv", found)
         for cell in estimated(cells, out):
@@ -79,6 +79,15 @@ def publish(
         for table in sorted((out / "tables").glob(name)):
             print(f"\n{table.read_text(encoding='utf-8')}")
     print(f"\n{out / 'report.html'} has the pictures, {out / 'results.csv'} every figure.")
+
+
+def _is_published(out: Path, mark: Path, changed: str) -> bool:
+    """Whether what was published last is there, and of these cells as they are now."""
+    if not all(path.exists() for path in (mark, out / "results.csv", out / "report.html")):
+        return False
+    made = mark.stat().st_mtime
+    newer = any(path.stat().st_mtime > made for path in (out / "cells").rglob("*.zip"))
+    return not newer and mark.read_text(encoding="utf-8") == changed
 
 
 def rows(cells: Iterable[Judged], folder: Path) -> list[Row]:
