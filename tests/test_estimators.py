@@ -230,6 +230,8 @@ def test_what_a_beginning_is(small):
     assert frames(small, 0.5) == [True, True, False, False]
     assert frames(late, 0.67) == [False, True, True, False]
     assert frames(late, 0.01) == [False, True, False, False]
+    with pytest.raises(ValueError, match="needs a start or more, got 0"):
+        diffcloud.estimate(small, SMALL._replace(starts=0), key=jr.key(0))
     for shares in ((0.5, 0.25), (0.5, 1.0), (0.0,), (0.5, 0.5)):
         with pytest.raises(ValueError, match="shares of the frames must rise between 0 and 1"):
             diffcloud.estimate(small, SMALL._replace(shares=shares), key=jr.key(0))
@@ -315,14 +317,12 @@ def test_a_known_fabric_and_a_late_clock_are_found(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "number"), [("red_jet_set", 1), ("black_denim", 1)])
-def test_wind_finds_a_fabric_from_where_a_descent_on_all_frames_does_not(name, number):
-    """A light sheet, whose motion is rough, and a stiff one, which hangs in more than one way."""
-    fabric = presets.FIVE[name]()
-    record = synthetic.record(scenarios.wind(), fabric, name, key=jr.key(0))
+def test_wind_finds_a_light_fabric_from_where_a_descent_on_all_frames_does_not():
+    fabric = presets.red_jet_set()
+    record = synthetic.record(scenarios.wind(), fabric, "red", key=jr.key(0))
     family = OrthotropicFamily.make(float(fabric.density))
     problem = Problem.make(record, family)
-    key = jr.key(100 + number)
+    key = jr.key(101)
     start = jr.uniform(key, (family.dim,), float)
     found = diffcloud.estimate(problem, start=start, key=key)
     truth = np.asarray(family.values(family.locate(fabric)))

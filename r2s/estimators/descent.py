@@ -81,9 +81,11 @@ def descend(
     `start`, by default the middle of the range, is among the coarse places; the others are drawn
     with `key`. What is there after every iteration is written to `checkpoint`, and a run with the
     same problem that finds it goes on from there. A simulation that diverges counts as infinitely
-    bad; when all do, raises `RuntimeError`. Raises `ValueError` for shares that are not below 1
-    and rising.
+    bad; when all do, raises `RuntimeError`. Raises `ValueError` for no starts, and for shares that
+    do not rise between 0 and 1.
     """
+    if effort.starts < 1:
+        raise ValueError(f"an estimate needs a start or more, got {effort.starts}")
     if any(not low < high for low, high in itertools.pairwise((0.0, *effort.shares, 1.0))):
         raise ValueError(f"shares of the frames must rise between 0 and 1, got {effort.shares}")
     began = time.perf_counter()
