@@ -317,7 +317,7 @@ def test_a_known_fabric_and_a_late_clock_are_found(name):
 
 
 @pytest.mark.slow
-def test_wind_finds_a_light_fabric_from_where_a_descent_on_all_frames_does_not():
+def test_wind_finds_a_light_fabric_from_a_random_start():
     fabric = presets.red_jet_set()
     record = synthetic.record(scenarios.wind(), fabric, "red", key=jr.key(0))
     family = OrthotropicFamily.make(float(fabric.density))

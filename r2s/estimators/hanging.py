@@ -3,7 +3,8 @@
 A sheet whose corners are nearer to each other than they were cut buckles, and can do so in several
 ways, each at rest. Which one a simulation falls into depends on the fabric, so that a small change
 of its stiffness may change the shape by millimetres, and no descent comes across such a jump. From
-a start near the shape that was seen, all fabrics come to rest in that one.
+a start near the shape that was seen, more fabrics come to rest in that one (not all: of a stiff
+denim it fails for some recordings).
 """
 
 import dataclasses
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from r2s.fabric import Fabric
-from r2s.losses import length, robust_weight, surface_residuals
+from r2s.losses import TOUCHING, length, robust_weight, surface_residuals
 from r2s.mesh import Mesh
 from r2s.scenario import Scenario, motion
 
@@ -30,7 +31,7 @@ def as_seen(
     points: Float[Array, "point 3"],
     mask: Bool[Array, " point"],
 ) -> Scenario:
-    """A scenario of a hanging sheet that starts in the shape of its first cloud [m].
+    """A scenario of a hanging sheet that starts in the shape of its first cloud, `points` [m].
 
     `fabric`, any of those that are to be estimated, says how the sheet hangs as far as the cloud
     does not show it. The grippers, which a sheet at rest has at its corners, are where the path
@@ -51,7 +52,7 @@ def registered(
     mesh: Mesh,
     free: Bool[Array, " vertex"],
 ) -> Float[Array, "vertex 3"]:
-    """A sheet that was at `x` [m], laid onto points: smoothly, and with edges as long as they were.
+    """A sheet at `x` [m] laid onto points [m]: smoothly, with edges as long as they were.
 
     Nonrigid iterative closest points (Amberg, Romdhani and Vetter 2007), with distances to the
     surface and outliers down-weighted. Vertices that are not free stay.
@@ -68,7 +69,7 @@ def registered(
         weight = share * jnp.where(mask, robust_weight(distance), 0)
         seen = _along(shares, direction)
         now = length(edges @ x)
-        stretch = _along(edges, edges @ x / now[:, None])
+        stretch = _along(edges, edges @ x / jnp.maximum(now, TOUCHING)[:, None])
         matrix = seen.T @ (weight[:, None] * seen) + smooth + STRETCHED * stretch.T @ stretch
         force = seen.T @ (weight * distance) - STRETCHED * stretch.T @ (now - lengths)
         matrix = jnp.where(moving[:, None] & moving[None], matrix, jnp.eye(len(matrix)))
