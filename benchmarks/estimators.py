@@ -118,6 +118,7 @@ def attempt(problem: Problem, place: np.ndarray, method: str, number: int) -> me
     except RuntimeError:
         return {
             "errors": np.full(problem.family.dim, np.nan),
+            "deviations": np.full(problem.family.dim, np.nan),
             "loss": np.inf,
             "seconds": np.nan,
             "cpu_seconds": np.nan,
@@ -126,6 +127,7 @@ def attempt(problem: Problem, place: np.ndarray, method: str, number: int) -> me
     wrong = errors(problem, found, place)
     return {
         "errors": wrong,
+        "deviations": found.deviations,
         "loss": loss_of(problem, found),
         "seconds": seconds,
         "cpu_seconds": cpu,
@@ -162,6 +164,7 @@ def run(
                     "seconds": found["seconds"],
                     "cpu_seconds": found["cpu_seconds"],
                     "errors": " ".join(f"{e:.4f}" for e in found["errors"]),
+                    "deviations": " ".join(f"{d:.4f}" for d in found["deviations"]),
                 }
             )
             with open(path, "w", newline="") as file:

@@ -158,7 +158,7 @@ def attempts(problem: Problem, choice: Choice, starts: int) -> dict:
 
 def usual(problem: Problem, place: np.ndarray) -> np.ndarray:
     """Where the default descent ends that begins at a place, and nowhere else."""
-    start, effort = jnp.asarray(place, float), Effort(0, 1, ITERATIONS)
+    start, effort = jnp.asarray(place, float), Effort(0, 1, ITERATIONS, around=0)
     found = diffcloud.estimate(problem, effort, start=start, key=jax.random.key(0))
     return np.clip(np.asarray(problem.family.locate(found.fabric)), MARGIN, 1 - MARGIN)
 

@@ -20,7 +20,7 @@ from r2s.family import OrthotropicFamily, Range
 from r2s.recording import set_time_offset
 
 ALL = Doubt(time=0.05, density=0.2, air=0.3)
-SMALL = Effort(coarse=2, starts=1, iterations=4, shares=(0.5,))
+SMALL = Effort(coarse=2, starts=1, iterations=4, shares=(0.5,), around=2)
 FABRIC = presets.grey_interlock()
 FAMILY = OrthotropicFamily.make(float(FABRIC.density))
 
@@ -232,6 +232,9 @@ def test_what_a_beginning_is(small):
     assert frames(late, 0.01) == [False, True, False, False]
     with pytest.raises(ValueError, match="needs a start or more, got 0"):
         diffcloud.estimate(small, SMALL._replace(starts=0), key=jr.key(0))
+    for count in (3, -2):
+        with pytest.raises(ValueError, match=f"an even number, got {count}"):
+            diffcloud.estimate(small, SMALL._replace(around=count), key=jr.key(0))
     for shares in ((0.5, 0.25), (0.5, 1.0), (0.0,), (0.5, 0.5)):
         with pytest.raises(ValueError, match="shares of the frames must rise between 0 and 1"):
             diffcloud.estimate(small, SMALL._replace(shares=shares), key=jr.key(0))
@@ -370,7 +373,8 @@ def test_material_points_find_a_known_modulus():
     problem = Problem.make(record, family, num_points=100, shape=(4, 4))
     with pytest.raises(ValueError, match="material points"):
         diffcp.estimate(problem, key=jr.key(0))
-    effort, start = Effort(coarse=0, starts=1, iterations=6, width=0.02), jnp.array([0.25, 0.5])
+    effort = Effort(coarse=0, starts=1, iterations=6, width=0.02, around=2)
+    start = jnp.array([0.25, 0.5])
     found = diffcp.estimate(diffcp.on_points(problem), effort, start=start, key=jr.key(0))
     truth = np.asarray(family.values(place))
     spread = found.deviations * np.where([b.log for b in family.ranges], truth, 1)

@@ -27,6 +27,7 @@ STRICT, SCALES = 3.0, (3e-3, 0.015)  # of the spread, and between [m]: what is o
 PATIENCE = 6  # iterations without a gain
 
 Row = list[Descent]  # of every start
+Near = list[tuple[Array, Normal]]  # unknowns around the end, and what is there
 
 # compiled once in a process for all recordings of as many frames, knots and points
 _loss = eqx.filter_jit(gauss_newton.loss_at)
@@ -39,6 +40,7 @@ _objective = eqx.filter_jit(gauss_newton.objective)
 _remaining = eqx.filter_jit(gauss_newton.remaining)
 _weight = eqx.filter_jit(gauss_newton.prior_weight)
 _covariance = eqx.filter_jit(gauss_newton.covariance)
+_around = eqx.filter_jit(gauss_newton.around)
 
 
 class Effort(NamedTuple):
@@ -50,6 +52,8 @@ class Effort(NamedTuple):
       step promises to change no parameter by more than about a tenth of its deviation; and then of
       the best one with outliers left out.
     - `width`: over which slopes are taken, as of `r2s.estimators.prediction.sensitivities`.
+    - `around`: places, an even number, that are looked at around the end: by how far they would
+      lead away from it the deviations are larger, see `r2s.estimators.gauss_newton.covariance`.
     - `shares`: of the frames, from the first, that count before all of them do: all starts descend
       on the first share, and then the best one, outliers left out, on each and on all frames. The
       end of a long motion can depend on the fabric so steeply that a loss over all of it is low
@@ -61,6 +65,7 @@ class Effort(NamedTuple):
     iterations: int = 25
     width: float | None = None
     shares: tuple[float, ...] = ()
+    around: int = 8
 
 
 DEFAULT = Effort(shares=(0.25, 0.5))
@@ -88,6 +93,8 @@ def descend(
         raise ValueError(f"an estimate needs a start or more, got {effort.starts}")
     if any(not low < high for low, high in itertools.pairwise((0.0, *effort.shares, 1.0))):
         raise ValueError(f"shares of the frames must rise between 0 and 1, got {effort.shares}")
+    if effort.around < 0 or effort.around % 2:
+        raise ValueError(f"places around the end are in pairs: an even number, got {effort.around}")
     began = time.perf_counter()
     problems = (problems,) if isinstance(problems, Problem) else problems
     identity = "" if checkpoint is None else fingerprint(problems, effort, start, key)
@@ -100,7 +107,8 @@ def descend(
             save(checkpoint, identity, [_stacked(row) for row in rows])
         if progress is not None:
             progress(len(rows) - 2, float(_best(row)[1].normal.loss))
-    return collect(problems, rows, approach, time.perf_counter() - began)
+    near = look_around(problems, effort, rows[-1], jax.random.fold_in(key, 1))
+    return collect(problems, rows, approach, time.perf_counter() - began, near)
 
 
 def _begin(problems: Joint, effort: Effort, start, key) -> Row:
@@ -197,6 +205,17 @@ def _later(problems: Joint, effort: Effort, row: Row) -> Row | None:
     return after
 
 
+def look_around(problems: Joint, effort: Effort, row: Row, key: PRNGKeyArray) -> Near:
+    """The normal equations at places around the end of the best descent."""
+    if not effort.around:
+        return []
+    _, best = _best(row)
+    prior = _weight(problems, best.normal)
+    places = list(_around(problems, best, prior, effort.around, key))
+    normals = _normals_of(problems, places, [best.scale] * len(places), effort.width)
+    return list(zip(places, normals, strict=True))
+
+
 def _best(row: Row) -> tuple[int, Descent]:
     """Of the descents in the latest stage, that of the least loss."""
     last = max(int(descent.stage) for descent in row)
@@ -234,13 +253,15 @@ def _resumed(checkpoint: Path, identity: str, effort: Effort) -> list[Row]:
     return [each(row) for row in load(checkpoint, identity, like)]
 
 
-def collect(problems: Joint, rows: list[Row], approach: str, seconds: float) -> Estimate:
-    """The estimate of the best descent of the last of some iterations."""
+def collect(
+    problems: Joint, rows: list[Row], approach: str, seconds: float, near: Near | None = None
+) -> Estimate:
+    """The estimate of the best descent of the last of some iterations; `near`: around its end."""
     family = problems[0].family
     _, best = _best(rows[-1])
     prior = _weight(problems, best.normal)
     unknown = best.unknown
-    whole = np.asarray(_covariance(problems, best, prior))
+    whole = np.asarray(_covariance(problems, best, prior, near))
     covariance = whole[: family.dim, : family.dim]
     deviation = np.sqrt(np.diag(covariance))
     # a place moves a parameter by its range: by that much, or by that ratio's logarithm
@@ -266,14 +287,15 @@ def conditions(
     problems: Joint, unknown: np.ndarray, deviation: np.ndarray
 ) -> tuple[Condition, ...]:
     """What an unknown says of the recordings, where they were in doubt."""
-    found = []
+    found, told = [], set()
     for which, problem in enumerate(problems):
         number = f" {which + 1}" if len(problems) > 1 else ""
         places = part_of(problems, which)[problem.family.dim :]
         rows = zip((*SHARED, *OWN), problem.doubt.scales, places, strict=True)
         for name, scale, place in rows:
-            if not scale or (name in SHARED and which):
+            if not scale or place in told:
                 continue
+            told.add(place)
             value, spread = scale * float(unknown[place]), scale * float(deviation[place])
             if name in SHARED:  # the logarithm of a ratio
                 value, spread = float(np.exp(value)), float(np.exp(value)) * spread

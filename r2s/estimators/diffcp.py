@@ -26,7 +26,7 @@ from r2s.scenarios.points import MEMBRANE_DAMPING, material_points
 WIDTH = 0.02  # of the range: the slope of the exact motion is rough below that
 FIRST = {"E h": 100.0, "nu": 0.1}  # where the public code starts
 EPOCHS, RATE = 51, 0.05
-DEFAULT = Effort(coarse=12, starts=2, width=WIDTH)
+DEFAULT = Effort(coarse=12, starts=2, width=WIDTH, around=4)
 
 
 def on_points(

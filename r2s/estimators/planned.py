@@ -38,7 +38,7 @@ def planned(
 
 
 def describe(estimate: Estimate) -> list[str]:
-    """One line a parameter, and one a combination: how well each would be known."""
+    """One line a parameter, a combination, and what was in doubt: how well each is known."""
     lines = []
     rows = zip(
         estimate.ranges, estimate.values, estimate.deviations, estimate.determined, strict=True
@@ -51,4 +51,7 @@ def describe(estimate: Estimate) -> list[str]:
     for found in estimate.combinations:
         powers = " ".join(f"{name}^{power:g}" for name, power in found.exponents.items())
         lines.append(f"known to {found.deviation:.1%}: {powers}")
+    for name, unit, value, deviation in estimate.conditions:
+        unit = "" if unit == "-" else f" {unit}"
+        lines.append(f"{name:14s}{value:10.4g}{unit:6s} +- {deviation:.2g}")
     return lines

@@ -23,7 +23,7 @@ NOISE = 3e-3  # [m]: beyond which a distance counts as an outlier's
 def sensitivity(problems: Problem | Joint, fabric: Fabric) -> Estimate:
     """What recordings would reveal of a fabric, were it the true one: deviations, combinations.
 
-    Nothing is fitted: it takes one simulation with its derivatives. Make the recordings with
+    Nothing is fitted: it takes nine simulations with their derivatives. Make the recordings with
     `r2s.synthetic.record` from the motion that is planned and the cameras that there are. Raises
     `RuntimeError` when the simulation diverges.
     """
@@ -37,10 +37,13 @@ def sensitivity(problems: Problem | Joint, fabric: Fabric) -> Estimate:
     if not np.isfinite(float(normal.loss)):
         raise RuntimeError("the simulation of the planned motion diverged")
     # the fabric is the true one, so what is left of the gradient is noise, and no step to take
-    normal = eqx.tree_at(lambda n: n.gradient, normal, _balanced(problems, unknown, normal))
+    noise = normal.gradient - _balanced(problems, unknown, normal)
+    quiet = lambda normal: eqx.tree_at(lambda n: n.gradient, normal, normal.gradient - noise)
     zero = jnp.zeros((), float)
-    row = [Descent(unknown, normal, zero, zero, scale, jnp.zeros((), int))]
-    return descent.collect(problems, [row], "sensitivity", 0.0)
+    row = [Descent(unknown, quiet(normal), zero, zero, scale, jnp.zeros((), int))]
+    around = descent.look_around(problems, Effort(), row, jax.random.key(0))
+    near = [(place, quiet(found)) for place, found in around]
+    return descent.collect(problems, [row], "sensitivity", 0.0, near)
 
 
 _normal = eqx.filter_jit(gauss_newton.normal_at)
@@ -102,7 +105,7 @@ def profile(
     order = sorted(range(len(values)), key=lambda i: abs(places[i] - centre))
     losses = np.full(len(values), np.nan)
     starts = {-1: estimate.fabric, 1: estimate.fabric}
-    effort = Effort(coarse=0, starts=1, iterations=iterations)
+    effort = Effort(coarse=0, starts=1, iterations=iterations, around=0)
     for i in order:
         side = 1 if places[i] >= centre else -1
         held = Fixed.make(family, which, places[i])

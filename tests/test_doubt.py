@@ -1,0 +1,142 @@
+"""What an estimate does not know for sure: the air, and what a rough loss leaves open."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+from r2s import presets, scenarios, synthetic
+from r2s.estimators import diffcloud, gauss_newton
+from r2s.estimators.descent import Effort, conditions
+from r2s.estimators.gauss_newton import Descent, Normal, around, covariance
+from r2s.estimators.planned import describe
+from r2s.estimators.prediction import predict
+from r2s.estimators.problem import Doubt, Problem
+from r2s.family import OrthotropicFamily
+
+FABRIC = presets.grey_interlock()
+FAMILY = OrthotropicFamily.make(float(FABRIC.density))
+RATIO = 1.2
+
+
+@pytest.fixture(scope="module")
+def blown():
+    """A sheet in wind, of few frames and vertices."""
+    experiment = scenarios.wind(num_frames=6, interval=1 / 10)
+    record = synthetic.record(experiment, FABRIC, "grey", shape=(4, 4), key=jr.key(1))
+    return Problem.make(record, FAMILY, num_points=60, shape=(4, 4))
+
+
+@pytest.fixture(scope="module")
+def lifted():
+    experiment = scenarios.lifting(num_frames=4, interval=1 / 10, height=0.2, moving=0.3)
+    record = synthetic.record(experiment, FABRIC, "grey", shape=(4, 4), key=jr.key(1))
+    return Problem.make(record, FAMILY, num_points=60, shape=(4, 4))
+
+
+def test_heavier_stiffer_and_in_denser_air_a_sheet_moves_alike(blown):
+    """All forces and the mass by one factor: without it known, wind cannot tell the three apart."""
+    problem = dataclasses.replace(blown, doubt=Doubt(density=0.5, air=0.5))
+    place, change = FAMILY.locate(FABRIC), np.log(RATIO)
+    wider = [
+        change / np.log(b.high / b.low) if b.name in ("warp", "weft", "shear", "bending") else 0.0
+        for b in FAMILY.ranges
+    ]
+    seen = jax.jit(lambda u: predict(problem, u).x)
+    at = lambda place, *ratios: seen(jnp.concatenate([place, jnp.array(ratios), jnp.zeros(5)]))
+    plain, scaled = at(place, 0.0, 0.0), at(place + jnp.array(wider), *(change / 0.5,) * 2)
+    heavier = at(place + jnp.array(wider), change / 0.5, 0.0)
+    np.testing.assert_allclose(scaled, plain, atol=1e-6)
+    assert float(jnp.max(jnp.abs(heavier - plain))) > 5e-3
+
+
+def test_the_air_is_in_doubt_where_a_wind_blows(blown, lifted):
+    assert blown.doubt == Doubt(air=0.1) and lifted.doubt == Doubt()
+    unknown = np.arange(19.0)
+    names = lambda *problems: [c.name for c in conditions(problems, unknown, unknown)]
+    shifts = ["shift x", "shift y", "shift z", "turn"]
+    numbered = lambda number: [f"{name} {number}" for name in shifts]
+    assert names(blown) == ["air ratio", *shifts]
+    assert names(lifted, blown) == [*numbered(1), "air ratio", *numbered(2)]
+    assert names(blown, blown) == ["air ratio", *numbered(1), *numbered(2)]
+    (air, *_) = conditions((blown,), unknown, unknown)
+    assert air.value == pytest.approx(np.exp(0.1 * 8)) and air.unit == "-"
+
+
+def valley(lifted, size):
+    """The end of a descent in a quadratic loss, and what the loss is at any place."""
+    random = np.random.default_rng(0)
+    root = random.normal(size=(size, 2 * size))
+    matrix = jnp.asarray(root @ root.T)
+    end = jnp.full(size, 0.5).at[lifted.family.dim :].set(0.0)
+
+    def at(place, gradient=0.0, loss=0.0):
+        found = matrix @ (place - end) + gradient
+        one = jnp.ones(())
+        return Normal(loss * one, one, found, matrix, 1e-4 * matrix)
+
+    one = jnp.ones(())
+    return Descent(end, at(end), one, one, one, jnp.zeros((), int)), at
+
+
+def test_deviations_are_those_of_a_smooth_loss_or_of_how_far_descents_lie_apart(lifted):
+    problems, prior = (lifted,), 1e-9
+    size = gauss_newton.size(problems)
+    end, at = valley(lifted, size)
+    alone = covariance(problems, end, prior)
+    np.testing.assert_allclose(alone, 1e-4 * jnp.linalg.inv(end.normal.matrix), rtol=1e-5)
+    places = around(problems, end, prior, 64, jr.key(0))
+    off = places - end.unknown[None]
+    np.testing.assert_allclose(jnp.mean(off, axis=0), 0, atol=1e-12)  # in opposite pairs
+    far = jnp.einsum("pu,uv,pv->p", off, jnp.linalg.inv(alone), off)
+    np.testing.assert_allclose(far, size, rtol=1e-4)  # a deviation along each axis
+    smooth = covariance(problems, end, prior, [(place, at(place)) for place in places])
+    np.testing.assert_allclose(smooth, alone, rtol=1e-6)
+    # descents that would all end one way, but for one that would end anywhere
+    away = jnp.linalg.cholesky(alone)[:, 0] * 5
+    push = lambda times: -end.normal.matrix @ away * times
+    pushes = [1e6, *(1.0 if i % 2 else -1.0 for i in range(63))]
+    led = [(place, at(place, push(t))) for place, t in zip(places, pushes, strict=True)]
+    rough = covariance(problems, end, prior, led)
+    expected = alone + jnp.outer(away, away) * (63 + gauss_newton.FARTHEST**2) / 65
+    np.testing.assert_allclose(rough, expected, rtol=1e-3, atol=1e-12)
+    # a run that diverged, or whose derivatives did, says that its place is no better known
+    for loss, gradient in ((jnp.inf, away * jnp.nan), (1.0, away * jnp.nan), (1.0, away / 0)):
+        pair = jnp.asarray(loss), gradient
+        broken = eqx.tree_at(lambda n: (n.loss, n.gradient), at(end.unknown), pair)
+        lost = covariance(problems, end, prior, [(place, broken) for place in places[:2]])
+        assert np.all(np.isfinite(lost)) and np.all(np.diag(lost) > np.diag(alone))
+
+
+def test_an_estimate_says_what_was_in_doubt(lifted):
+    """And places around its end have a say in its deviations alone."""
+    effort = Effort(coarse=0, starts=1, iterations=1, around=0)
+    descend = lambda effort: diffcloud.estimate(lifted, effort, key=jr.key(0))
+    alone, found = descend(effort), descend(effort._replace(around=4))
+    np.testing.assert_array_equal(found.values, alone.values)
+    np.testing.assert_array_equal(found.losses, alone.losses)
+    assert np.all(found.deviations > 0) and np.all(np.isfinite(found.deviations))
+    assert np.max(np.abs(found.deviations / alone.deviations - 1)) > 1e-3
+    lines = describe(found)
+    assert any(line.startswith("shift x") and " m " in line for line in lines)
+
+
+@pytest.mark.slow
+def test_wind_gives_the_stiffness_of_a_sheet_that_was_weighed_wrongly():
+    """By 4 %: all is found as if it were so much stiffer, and the air so much stronger."""
+    denim = presets.black_denim()
+    record = synthetic.record(scenarios.wind(), denim, "denim", key=jr.key(0))
+    wrong = 1.04
+    family = OrthotropicFamily.make(wrong * float(denim.density))
+    found = diffcloud.estimate(Problem.make(record, family), key=jr.key(0))
+    truth = np.asarray(family.values(family.locate(denim)))
+    stiff = [i for i, b in enumerate(family.ranges) if b.name in ("warp", "weft", "shear")]
+    ratio = found.values[stiff] / truth[stiff]
+    np.testing.assert_allclose(ratio, wrong, atol=0.05)
+    assert np.all(np.abs(np.log(ratio / wrong)) < 3 * found.deviations[stiff])
+    air = found.conditions[0]
+    assert air.name == "air ratio" and air.value == pytest.approx(wrong, rel=5e-3)
