@@ -52,12 +52,12 @@ class Effort(NamedTuple):
       step promises to change no parameter by more than about a tenth of its deviation; and then of
       the best one with outliers left out.
     - `width`: over which slopes are taken, as of `r2s.estimators.prediction.sensitivities`.
-    - `around`: places, an even number, that are looked at around the end: by how far they would
-      lead away from it the deviations are larger, see `r2s.estimators.gauss_newton.covariance`.
     - `shares`: of the frames, from the first, that count before all of them do: all starts descend
       on the first share, and then the best one, outliers left out, on each and on all frames. The
       end of a long motion can depend on the fabric so steeply that a loss over all of it is low
       nowhere but near the truth; that of its beginning leads there.
+    - `around`: places, an even number, that are looked at around the end: by how far they would
+      lead away from it the deviations are larger, see `r2s.estimators.gauss_newton.covariance`.
     """
 
     coarse: int = 24
@@ -86,8 +86,8 @@ def descend(
     `start`, by default the middle of the range, is among the coarse places; the others are drawn
     with `key`. What is there after every iteration is written to `checkpoint`, and a run with the
     same problem that finds it goes on from there. A simulation that diverges counts as infinitely
-    bad; when all do, raises `RuntimeError`. Raises `ValueError` for no starts, and for shares that
-    do not rise between 0 and 1.
+    bad; when all do, raises `RuntimeError`. Raises `ValueError` for no starts, for
+    places around the end that are no pairs, and for shares that do not rise between 0 and 1.
     """
     if effort.starts < 1:
         raise ValueError(f"an estimate needs a start or more, got {effort.starts}")
