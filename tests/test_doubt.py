@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from r2s import presets, scenarios, synthetic
-from r2s.estimators import diffcloud, gauss_newton
-from r2s.estimators.descent import Effort, conditions
-from r2s.estimators.gauss_newton import Descent, Normal, around, covariance
+from r2s.estimators import descent, diffcloud, gauss_newton
+from r2s.estimators.descent import Effort, conditions, spread_of
+from r2s.estimators.deviations import FARTHEST, apart, around, covariance
+from r2s.estimators.gauss_newton import Descent, Normal
 from r2s.estimators.planned import describe
 from r2s.estimators.prediction import predict
-from r2s.estimators.problem import Doubt, Problem
+from r2s.estimators.problem import Doubt, Problem, beginning
 from r2s.family import OrthotropicFamily
 
 FABRIC = presets.grey_interlock()
@@ -87,29 +88,79 @@ def test_deviations_are_those_of_a_smooth_loss_or_of_how_far_descents_lie_apart(
     problems, prior = (lifted,), 1e-9
     size = gauss_newton.size(problems)
     end, at = valley(lifted, size)
-    alone = covariance(problems, end, prior)
+    alone = covariance(problems, end, prior, [])
     np.testing.assert_allclose(alone, 1e-4 * jnp.linalg.inv(end.normal.matrix), rtol=1e-5)
     places = around(problems, end, prior, 64, jr.key(0))
     off = places - end.unknown[None]
     np.testing.assert_allclose(jnp.mean(off, axis=0), 0, atol=1e-12)  # in opposite pairs
     far = jnp.einsum("pu,uv,pv->p", off, jnp.linalg.inv(alone), off)
     np.testing.assert_allclose(far, size, rtol=1e-4)  # a deviation along each axis
-    smooth = covariance(problems, end, prior, [(place, at(place)) for place in places])
-    np.testing.assert_allclose(smooth, alone, rtol=1e-6)
+    back = [(place, at(place)) for place in places]
+    np.testing.assert_allclose(covariance(problems, end, prior, back), alone, rtol=1e-6)
+    assert float(apart(problems, end, prior, back)) < 1e-6
     # descents that would all end one way, but for one that would end anywhere
     away = jnp.linalg.cholesky(alone)[:, 0] * 5
     push = lambda times: -end.normal.matrix @ away * times
     pushes = [1e6, *(1.0 if i % 2 else -1.0 for i in range(63))]
     led = [(place, at(place, push(t))) for place, t in zip(places, pushes, strict=True)]
     rough = covariance(problems, end, prior, led)
-    expected = alone + jnp.outer(away, away) * (63 + gauss_newton.FARTHEST**2) / 65
+    expected = alone + jnp.outer(away, away) * (63 + FARTHEST**2) / 65
     np.testing.assert_allclose(rough, expected, rtol=1e-3, atol=1e-12)
+    assert float(apart(problems, end, prior, led)) == pytest.approx(5, rel=1e-4)
     # a run that diverged, or whose derivatives did, says that its place is no better known
     for loss, gradient in ((jnp.inf, away * jnp.nan), (1.0, away * jnp.nan), (1.0, away / 0)):
         pair = jnp.asarray(loss), gradient
         broken = eqx.tree_at(lambda n: (n.loss, n.gradient), at(end.unknown), pair)
         lost = covariance(problems, end, prior, [(place, broken) for place in places[:2]])
         assert np.all(np.isfinite(lost)) and np.all(np.diag(lost) > np.diag(alone))
+
+
+def test_of_the_true_fabric_where_its_end_leads_is_noise(lifted):
+    problems, prior = (lifted,), 1e-9
+    end, at = valley(lifted, gauss_newton.size(problems))
+    noise = jnp.arange(1.0, len(end.unknown) + 1)
+    noisy = dataclasses.replace(end, normal=at(end.unknown, noise))
+    found = lambda end, noise, true: covariance(
+        problems, end, prior, [(p, at(p, noise)) for p in (end.unknown + 0.01, end.unknown)], true
+    )
+    np.testing.assert_allclose(found(noisy, noise, True), found(end, 0.0, False), rtol=1e-6)
+    assert np.all(np.diag(found(noisy, noise, False)) > np.diag(found(noisy, noise, True)))
+
+
+def test_where_derivatives_overflow_nothing_is_known(lifted):
+    problems, prior = (lifted,), 1e-9
+    size = gauss_newton.size(problems)
+    end, at = valley(lifted, size)
+    broken = eqx.tree_at(lambda e: e.normal.scatter, end, jnp.full((size, size), jnp.inf))
+    near = [(end.unknown, at(end.unknown))] * 2
+    known = np.diag(covariance(problems, broken, prior, near))
+    dim = lifted.family.dim
+    np.testing.assert_allclose(known[:dim], gauss_newton.PRIOR_DEVIATION**2)
+    np.testing.assert_allclose(known[dim:], 1)
+    assert apart(problems, broken, prior, near) == np.inf
+
+
+def test_deviations_are_from_the_frames_on_which_places_agree(lifted, monkeypatch):
+    """Of all frames if they do on all, or on none; else of the largest share."""
+    problems, effort = (lifted,), Effort(shares=(0.25, 0.5), around=2)
+    unknown = jnp.concatenate([FAMILY.locate(FABRIC), jnp.zeros(7)])
+    zero = jnp.zeros(())
+
+    def found(agree, share=1.0, effort=effort):
+        agree = iter(agree)
+        monkeypatch.setattr(descent, "_apart", lambda *_: 0.0 if next(agree) else np.inf)
+        seen = problems if share == 1 else (beginning(lifted, share),)
+        normal = gauss_newton.normal_at(seen, unknown)
+        end = Descent(unknown, normal, zero, zero, zero, jnp.zeros((), int))
+        return spread_of(seen, effort, end, jr.key(0))
+
+    alone = effort._replace(shares=())
+    whole, half, quarter = (found([True], share, alone) for share in (1.0, 0.5, 0.25))
+    np.testing.assert_allclose(found([True]), whole)
+    np.testing.assert_allclose(found([False, True]), half)
+    np.testing.assert_allclose(found([False, False, True]), quarter)
+    np.testing.assert_allclose(found([False] * 3), whole)
+    assert np.max(np.abs(half / whole - 1)) > 0.1 and np.max(np.abs(quarter / half - 1)) > 0.1
 
 
 def test_an_estimate_says_what_was_in_doubt(lifted):

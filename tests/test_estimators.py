@@ -105,6 +105,33 @@ def test_an_early_camera_is_predicted_as_an_early_recording(recording):
     assert float(loss(shifted, unknown(0.0))) > 2 * same
 
 
+def test_a_marker_that_is_off_in_every_frame_is_one_error(pulled):
+    """As the first frame's noise makes it: to see it twice as often tells no more."""
+    pulled = dataclasses.replace(pulled, force=None)
+    unknown = jnp.concatenate([FAMILY.locate(FABRIC), jnp.zeros(7)])
+    seen, slope = jax.jit(sensitivities)(pulled, unknown)
+    off = 1e-3 * jr.normal(jr.key(0), pulled.markers.positions.shape[1:])
+    twice = lambda part: jnp.concatenate([part, part])
+
+    def covariance(number, repeat):
+        about = Seen(repeat(seen.x), None, seen.ok), Slope(repeat(slope.x), None)
+        expected = jnp.einsum("mk,fmki->fmi", pulled.markers.weights, seen.x[:, corners])
+        markers = dataclasses.replace(
+            pulled.markers,
+            positions=repeat(expected + off[None]),
+            seen=repeat(pulled.markers.seen),
+        )
+        frames = pulled.frames * number
+        found = evidence_of(dataclasses.replace(pulled, markers=markers, frames=frames), *about)
+        prior = 1e-6 * jnp.diag(jnp.diag(jnp.sum(found.matrices, axis=0)) + 1e-9)
+        inverse = jnp.linalg.inv(jnp.sum(found.matrices, axis=0) + prior)
+        noise = jnp.zeros_like(found.noise)
+        return inverse @ gauss_newton.scatter(found.scores, found.matrices, noise, prior) @ inverse
+
+    corners = pulled.markers.vertices
+    np.testing.assert_allclose(covariance(2, twice), covariance(1, lambda x: x), rtol=1e-6)
+
+
 def test_the_scatter_of_a_gradient_is_that_of_the_jackknife():
     """Of a straight line through points: as if each cluster in turn had been left out."""
     random = np.random.default_rng(0)

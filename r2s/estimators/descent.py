@@ -1,5 +1,6 @@
 """From anywhere in the range to the best fabric: a coarse search, then Gauss-Newton descents."""
 
+import dataclasses
 import itertools
 import time
 from collections.abc import Callable
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimators import gauss_newton
+from r2s.estimators import deviations, gauss_newton
 from r2s.estimators.checkpoint import fingerprint, load, save
 from r2s.estimators.estimate import Condition, Estimate
 from r2s.estimators.gauss_newton import Descent, Joint, Normal, part_of
@@ -25,9 +26,9 @@ FIRST_DAMPING = 1e-2
 CLOSE = 5e-3  # of the prior's weight, which is what a change by one deviation costs, about twice
 STRICT, SCALES = 3.0, (3e-3, 0.015)  # of the spread, and between [m]: what is off is an outlier
 PATIENCE = 6  # iterations without a gain
+ROUGH = 3.0  # deviations, by which places around an end lead apart
 
 Row = list[Descent]  # of every start
-Near = list[tuple[Array, Normal]]  # unknowns around the end, and what is there
 
 # compiled once in a process for all recordings of as many frames, knots and points
 _loss = eqx.filter_jit(gauss_newton.loss_at)
@@ -39,8 +40,9 @@ _accept = eqx.filter_jit(gauss_newton.accept)
 _objective = eqx.filter_jit(gauss_newton.objective)
 _remaining = eqx.filter_jit(gauss_newton.remaining)
 _weight = eqx.filter_jit(gauss_newton.prior_weight)
-_covariance = eqx.filter_jit(gauss_newton.covariance)
-_around = eqx.filter_jit(gauss_newton.around)
+_covariance = eqx.filter_jit(deviations.covariance)
+_apart = eqx.filter_jit(deviations.apart)
+_around = eqx.filter_jit(deviations.around)
 
 
 class Effort(NamedTuple):
@@ -57,7 +59,7 @@ class Effort(NamedTuple):
       end of a long motion can depend on the fabric so steeply that a loss over all of it is low
       nowhere but near the truth; that of its beginning leads there.
     - `around`: places, an even number, that are looked at around the end: by how far they would
-      lead away from it the deviations are larger, see `r2s.estimators.gauss_newton.covariance`.
+      lead away from it the deviations are larger, see `spread_of`.
     """
 
     coarse: int = 24
@@ -107,8 +109,9 @@ def descend(
             save(checkpoint, identity, [_stacked(row) for row in rows])
         if progress is not None:
             progress(len(rows) - 2, float(_best(row)[1].normal.loss))
-    near = look_around(problems, effort, rows[-1], jax.random.fold_in(key, 1))
-    return collect(problems, rows, approach, time.perf_counter() - began, near)
+    _, best = _best(rows[-1])
+    spread = spread_of(problems, effort, best, jax.random.fold_in(key, 1))
+    return collect(problems, rows, spread, approach, time.perf_counter() - began)
 
 
 def _begin(problems: Joint, effort: Effort, start, key) -> Row:
@@ -205,14 +208,36 @@ def _later(problems: Joint, effort: Effort, row: Row) -> Row | None:
     return after
 
 
-def look_around(problems: Joint, effort: Effort, row: Row, key: PRNGKeyArray) -> Near:
-    """The normal equations at places around the end of the best descent."""
+def spread_of(
+    problems: Joint, effort: Effort, end: Descent, key: PRNGKeyArray, true: bool = False
+) -> Float[np.ndarray, "unknown unknown"]:
+    """The covariance of the unknown at the end of a descent, see `r2s.estimators.deviations`.
+
+    From as many of the frames as agree. If the places around it lead apart, the end of the motion
+    depends on the fabric so steeply that its derivatives say nothing, and the effort's shares of
+    the frames are asked, the largest first. If these do not agree either, it is that of all frames.
+    """
+    found = []
+    for share in (1.0, *reversed(effort.shares)):
+        seen, here = problems, end
+        if share < 1:
+            seen = tuple(beginning(problem, share) for problem in problems)
+            normal = _normal(seen, end.unknown, end.scale, effort.width)
+            here = dataclasses.replace(end, normal=normal)
+        prior = _weight(problems, here.normal)
+        near = _look_around(seen, effort, here, prior, key)
+        found.append(np.asarray(_covariance(problems, here, prior, near, true)))
+        if not near or float(_apart(problems, here, prior, near)) < ROUGH:
+            return found[-1]
+    return found[0]
+
+
+def _look_around(problems: Joint, effort: Effort, end: Descent, prior, key) -> deviations.Near:
+    """The normal equations at places around the end of a descent."""
     if not effort.around:
         return []
-    _, best = _best(row)
-    prior = _weight(problems, best.normal)
-    places = list(_around(problems, best, prior, effort.around, key))
-    normals = _normals_of(problems, places, [best.scale] * len(places), effort.width)
+    places = list(_around(problems, end, prior, effort.around, key))
+    normals = _normals_of(problems, places, [end.scale] * len(places), effort.width)
     return list(zip(places, normals, strict=True))
 
 
@@ -254,15 +279,17 @@ def _resumed(checkpoint: Path, identity: str, effort: Effort) -> list[Row]:
 
 
 def collect(
-    problems: Joint, rows: list[Row], approach: str, seconds: float, near: Near | None = None
+    problems: Joint,
+    rows: list[Row],
+    spread: Float[np.ndarray, "unknown unknown"],
+    approach: str,
+    seconds: float,
 ) -> Estimate:
-    """The estimate of the best descent of the last of some iterations; `near`: around its end."""
+    """The estimate of the best descent of the last of some iterations, of a covariance."""
     family = problems[0].family
     _, best = _best(rows[-1])
-    prior = _weight(problems, best.normal)
     unknown = best.unknown
-    whole = np.asarray(_covariance(problems, best, prior, near))
-    covariance = whole[: family.dim, : family.dim]
+    covariance = spread[: family.dim, : family.dim]
     deviation = np.sqrt(np.diag(covariance))
     # a place moves a parameter by its range: by that much, or by that ratio's logarithm
     widths = [np.log(b.high / b.low) if b.log else b.high - b.low for b in family.ranges]
@@ -275,7 +302,7 @@ def collect(
         values=np.asarray(family.values(unknown[: family.dim])),
         deviations=deviation * np.array(widths),
         correlation=covariance / np.outer(deviation, deviation),
-        conditions=conditions(problems, np.asarray(unknown), np.sqrt(np.diag(whole))),
+        conditions=conditions(problems, np.asarray(unknown), np.sqrt(np.diag(spread))),
         loss=float(_loss(problems, unknown)),
         losses=np.stack([np.asarray(_stacked(row).normal.loss) for row in rows]),
         history=np.asarray(values_of(places)),

@@ -1,7 +1,6 @@
 """What a prediction says against what was seen: clouds, markers and forces, each a robust mean."""
 
 from collections.abc import Callable
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -30,7 +29,9 @@ FLATTEST = 0.3  # curvature of a robust loss over the mean weight, at least
 
 
 class Evidence(eqx.Module):
-    """A loss with its normal equations, by clusters: a patch of the sheet over some frames.
+    """A loss with its normal equations, by clusters: what errs alike.
+
+    A patch of the sheet over some frames, a marker, or a force over some frames.
 
     - `loss`: [m^2]. `spread`: robust standard deviation of the distances, [m].
     - `scores`, `matrices`: each cluster's share of the loss's gradient and Gauss-Newton matrix in
@@ -68,7 +69,7 @@ def evidence_of(problem: Problem, seen: Seen, slope: Slope, scale: Scale = 0.0) 
     if problem.clouds is not None:
         parts.append(_of_clouds(problem.clouds, mesh, seen, slope, scale))
     if problem.markers is not None:
-        parts.append(_of_markers(problem.markers, mesh, seen, slope, scale))
+        parts.append(_of_markers(problem.markers, seen, slope, scale))
     if problem.force is not None and seen.force is not None and slope.force is not None:
         parts.append(_of_force(problem.force, seen.force, slope.force))
     return Evidence(
@@ -89,22 +90,22 @@ def _of_clouds(clouds: Clouds, mesh: Mesh, seen: Seen, slope: Slope, scale) -> E
         moved = jnp.einsum("pk,pkiu->piu", weights, slope[vertices])
         jacobian = -jnp.einsum("pi,piu->pu", direction, moved)
         place = jnp.einsum("pk,pki->pi", weights, mesh.rest[vertices])
-        return _by_patch(mesh, place, jacobian[:, None], distance[:, None], weight)
+        return _by_patch(mesh, place, jacobian, distance, weight)
 
     shares = jax.lax.map(frame, (slope.x, vertices, weights, direction, distance, weight))
-    return _of_robust(distance, clouds.mask, scale, *shares)
+    return _of_robust(distance, clouds.mask, scale, *(_by_time(share) for share in shares))
 
 
-def _of_markers(markers: Markers, mesh: Mesh, seen: Seen, slope: Slope, scale) -> Evidence:
+def _of_markers(markers: Markers, seen: Seen, slope: Slope, scale) -> Evidence:
+    """Each marker is a cluster: where the first frame shows it wrongly, it is wrong in them all."""
     gap = _gaps(markers, seen.x)
     distance = length(gap)
     picked = slope.x[:, markers.vertices]  # (frame, marker, corner, axis, unknown)
     jacobian = jnp.einsum("mk,fmkiu->fmiu", markers.weights, picked)
-    place = jnp.einsum("mk,mki->mi", markers.weights, mesh.rest[markers.vertices])
-    shares = jax.vmap(partial(_by_patch, mesh, place))(
-        jacobian, gap, _weights(distance, markers.seen, scale)
-    )
-    return _of_robust(distance, markers.seen, scale, *shares)
+    weight = _weights(distance, markers.seen, scale)
+    scores = jnp.einsum("fm,fmi,fmiu->mu", weight, gap, jacobian)
+    matrices = jnp.einsum("fm,fmiu,fmiv->muv", weight, jacobian, jacobian)
+    return _of_robust(distance, markers.seen, scale, scores, matrices)
 
 
 def _of_force(force: Force, pulled: Array, slope: Array) -> Evidence:
@@ -133,7 +134,7 @@ def _weights(distance: Float[Array, "frame point"], mask, scale: Scale) -> Array
 
 
 def _of_robust(distance, mask, scale: Scale, scores: Array, matrices: Array) -> Evidence:
-    """The evidence of distances, from the shares of each frame and patch in their weighted squares.
+    """The evidence of distances, from the shares of the clusters in their weighted squares.
 
     Their matrix is steeper than the robust loss is curved: by the ratio of its mean curvature to
     the mean weight, with which the estimate has the covariance of an M-estimate (Huber 1981).
@@ -143,11 +144,11 @@ def _of_robust(distance, mask, scale: Scale, scores: Array, matrices: Array) -> 
     curvature = masked_mean(robust_curvature(distance, scale), mask)
     curvature = jnp.clip(curvature, FLATTEST * weight, weight)
     square = masked_mean((robust_weight(distance, scale) * distance) ** 2, mask)
-    matrices = _by_time(matrices * (curvature / weight))
+    matrices = matrices * (curvature / weight)
     return Evidence(
         loss=masked_mean(robust(distance, scale), mask),
         spread=_spread(distance, mask),
-        scores=_by_time(scores),
+        scores=scores,
         matrices=matrices,
         noise=jnp.full(len(matrices), square / curvature / count),
     )
@@ -156,16 +157,16 @@ def _of_robust(distance, mask, scale: Scale, scores: Array, matrices: Array) -> 
 def _by_patch(
     mesh: Mesh,
     place: Float[Array, "point 2"],
-    jacobian: Float[Array, "point axis unknown"],
-    gap: Float[Array, "point axis"],
+    jacobian: Float[Array, "point unknown"],
+    distance: Float[Array, " point"],
     weight: Float[Array, " point"],
 ) -> tuple[Float[Array, "patch unknown"], Float[Array, "patch unknown unknown"]]:
-    """Scores and matrices of a frame's patches, from residuals at places of the sheet [m]."""
+    """Scores and matrices of a frame's patches, from distances at places of the sheet [m]."""
     extent = jnp.max(mesh.rest, axis=0) * (1 + 1e-3)
     cell = jnp.clip(jnp.floor(place / extent[None] * PATCHES).astype(int), 0, PATCHES - 1)
-    patch = jax.nn.one_hot(cell[:, 0] * PATCHES + cell[:, 1], PATCHES**2, dtype=gap.dtype)
-    score = jnp.einsum("pa,pau->pu", weight[:, None] * gap, jacobian)
-    matrix = jnp.einsum("p,pau,pav->puv", weight, jacobian, jacobian)
+    patch = jax.nn.one_hot(cell[:, 0] * PATCHES + cell[:, 1], PATCHES**2, dtype=distance.dtype)
+    score = (weight * distance)[:, None] * jacobian
+    matrix = jnp.einsum("p,pu,pv->puv", weight, jacobian, jacobian)
     return patch.T @ score, jnp.einsum("pc,puv->cuv", patch, matrix)
 
 

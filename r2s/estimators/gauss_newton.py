@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int
 
 from r2s.estimators import evidence
 from r2s.estimators.prediction import Unknown, predict, sensitivities
@@ -25,7 +25,6 @@ MARGIN = 1e-3  # of the unit cube, so that a start at its edge can move
 PRIOR_DEVIATION = 0.29  # of a uniform prior over the unit cube
 DAMPINGS, GROWTH = (1e-5, 1e6), 3.0
 LONGEST_STEP = 0.2  # of a parameter's range
-FARTHEST = 2.0  # times the median
 FINEST = 1e-5  # [m]: no recording is better
 
 
@@ -192,59 +191,6 @@ def objective(problems: Joint, unknown, loss, prior) -> Float[Array, ""]:
     """Loss and prior [m^2] at an unknown."""
     off, precision = pull(problems, unknown)
     return loss + prior * jnp.sum(off**2 * precision) / 2
-
-
-def covariance(
-    problems: Joint, descent: Descent, prior, around: list[tuple[Unknown, Normal]] | None = None
-) -> Float[Array, "unknown unknown"]:
-    """Of the unknown, at the end of one descent: the sandwich, with the prior.
-
-    To it comes how far from there the next Gauss-Newton step would lead, so that a descent which
-    has not arrived does not claim to know: the mean square of that of the descent, and of those
-    from places `around` it. Where the loss is smooth these lead back to it; where it is rough they
-    lead each elsewhere, as descents do. What leads farther than `FARTHEST` times the median, in
-    deviations, is taken for as far.
-    """
-    places = [(descent.unknown, descent.normal), *(around or [])]
-    off = jnp.stack([_led(problems, *place, prior) - descent.unknown for place in places])
-    spread, root = _sandwich(problems, descent, prior)
-    far = jnp.linalg.norm(jnp.linalg.solve(root, off.T), axis=0)
-    limit = FARTHEST * jnp.median(far)
-    off = off * jnp.where(far > limit, limit / far, 1)[:, None]
-    return spread + off.T @ off / len(places)
-
-
-def around(
-    problems: Joint, descent: Descent, prior, count: int, key: PRNGKeyArray
-) -> Float[Array, "place unknown"]:
-    """Places one deviation away from the end of a descent, an even `count`, in opposite pairs."""
-    spread, root = _sandwich(problems, descent, prior)
-    signs = jax.random.rademacher(key, (count // 2, len(spread)), spread.dtype)
-    places = descent.unknown[None] + jnp.concatenate([signs, -signs]) @ root.T
-    bounded = jnp.arange(len(spread)) < problems[0].family.dim
-    return jnp.where(bounded[None], jnp.clip(places, MARGIN, 1 - MARGIN), places)
-
-
-def _sandwich(problems: Joint, descent: Descent, prior):
-    """The covariance of an estimate, had it arrived and were the loss smooth, and its root."""
-    _, precision = pull(problems, descent.unknown)
-    inverse = jnp.linalg.inv(descent.normal.matrix + prior * jnp.diag(precision))
-    spread = inverse @ (descent.normal.scatter + prior**2 * jnp.diag(precision)) @ inverse
-    deviation = jnp.sqrt(jnp.diag(spread))
-    squares, axes = jnp.linalg.eigh(spread / jnp.outer(deviation, deviation))
-    least = len(squares) * jnp.finfo(squares.dtype).eps
-    return spread, deviation[:, None] * axes * jnp.sqrt(jnp.maximum(squares, least))[None]
-
-
-def _led(problems: Joint, unknown: Unknown, normal: Normal, prior) -> Unknown:
-    """Where the Gauss-Newton step leads, without regard to bounds.
-
-    Nowhere from a run that diverged, or whose derivatives did.
-    """
-    off, precision = pull(problems, unknown)
-    matrix = normal.matrix + prior * jnp.diag(precision)
-    step = jnp.linalg.solve(matrix, normal.gradient + prior * precision * off)
-    return unknown - jnp.where(jnp.isfinite(normal.loss) & jnp.all(jnp.isfinite(step)), step, 0)
 
 
 def remaining(problems: Joint, descent: Descent, prior) -> Float[Array, ""]:

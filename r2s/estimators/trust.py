@@ -36,24 +36,13 @@ def sensitivity(problems: Problem | Joint, fabric: Fabric) -> Estimate:
     normal = _normal(problems, unknown, scale)
     if not np.isfinite(float(normal.loss)):
         raise RuntimeError("the simulation of the planned motion diverged")
-    # the fabric is the true one, so what is left of the gradient is noise, and no step to take
-    noise = normal.gradient - _balanced(problems, unknown, normal)
-    quiet = lambda normal: eqx.tree_at(lambda n: n.gradient, normal, normal.gradient - noise)
     zero = jnp.zeros((), float)
-    row = [Descent(unknown, quiet(normal), zero, zero, scale, jnp.zeros((), int))]
-    around = descent.look_around(problems, Effort(), row, jax.random.key(0))
-    near = [(place, quiet(found)) for place, found in around]
-    return descent.collect(problems, [row], "sensitivity", 0.0, near)
+    end = Descent(unknown, normal, zero, zero, scale, jnp.zeros((), int))
+    spread = descent.spread_of(problems, descent.DEFAULT, end, jax.random.key(0), true=True)
+    return descent.collect(problems, [[end]], spread, "sensitivity", 0.0)
 
 
 _normal = eqx.filter_jit(gauss_newton.normal_at)
-
-
-def _balanced(problems: Joint, unknown, normal) -> Array:
-    """The gradient that the prior's pull cancels."""
-    prior = gauss_newton.prior_weight(problems, normal)
-    pull, precision = gauss_newton.pull(problems, unknown)
-    return -prior * precision * pull
 
 
 class Fixed(Family):
