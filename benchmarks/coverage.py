@@ -16,7 +16,7 @@ import numpy as np
 
 from r2s import presets, scenarios, synthetic
 from r2s.estimators import diffcloud
-from r2s.estimators.descent import Effort
+from r2s.estimators.descent import DEFAULT
 from r2s.estimators.problem import Problem
 from r2s.family import OrthotropicFamily
 
@@ -31,7 +31,7 @@ def scores(name: str, scenario: str, number: int) -> np.ndarray:
     recording = synthetic.record(experiment, fabric, name, key=jax.random.key(1000 + number))
     problem = Problem.make(recording, family, seed=number)
     start = family.locate(fabric)
-    effort = Effort(coarse=0, starts=1)
+    effort = DEFAULT._replace(coarse=0, starts=1)
     found = diffcloud.estimate(problem, effort, start=start, key=jax.random.key(0))
     truth = np.asarray(family.values(start))
     log = np.array([bound.log for bound in family.ranges])

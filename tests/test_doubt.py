@@ -141,8 +141,8 @@ def test_where_derivatives_overflow_nothing_is_known(lifted):
 
 
 def test_deviations_are_from_the_frames_on_which_places_agree(lifted, monkeypatch):
-    """Of all frames if they do on all, or on none; else of the largest share."""
-    problems, effort = (lifted,), Effort(shares=(0.25, 0.5), around=2)
+    """Of all frames if they do on them, or nowhere; else of the largest share."""
+    problems, effort = (lifted,), Effort(shares=(0.5,), around=2)
     unknown = jnp.concatenate([FAMILY.locate(FABRIC), jnp.zeros(7)])
     zero = jnp.zeros(())
 
@@ -150,17 +150,16 @@ def test_deviations_are_from_the_frames_on_which_places_agree(lifted, monkeypatc
         agree = iter(agree)
         monkeypatch.setattr(descent, "_apart", lambda *_: 0.0 if next(agree) else np.inf)
         seen = problems if share == 1 else (beginning(lifted, share),)
-        normal = gauss_newton.normal_at(seen, unknown)
+        normal = descent._normal(seen, unknown, zero, None)
         end = Descent(unknown, normal, zero, zero, zero, jnp.zeros((), int))
         return spread_of(seen, effort, end, jr.key(0))
 
     alone = effort._replace(shares=())
-    whole, half, quarter = (found([True], share, alone) for share in (1.0, 0.5, 0.25))
+    whole, half = (found([True], share, alone) for share in (1.0, 0.5))
     np.testing.assert_allclose(found([True]), whole)
     np.testing.assert_allclose(found([False, True]), half)
-    np.testing.assert_allclose(found([False, False, True]), quarter)
-    np.testing.assert_allclose(found([False] * 3), whole)
-    assert np.max(np.abs(half / whole - 1)) > 0.1 and np.max(np.abs(quarter / half - 1)) > 0.1
+    np.testing.assert_allclose(found([False, False]), whole)
+    assert np.max(np.abs(np.diag(half) / np.diag(whole) - 1)) > 0.1
 
 
 def test_an_estimate_says_what_was_in_doubt(lifted):
