@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from r2s import presets, scenarios, synthetic
-from r2s.estimators import adam, cma_es, diffcloud, gauss_newton
+from r2s.estimators import adam, cma_es, descent, diffcloud, gauss_newton
 from r2s.estimators.descent import Effort, descend
 from r2s.estimators.estimate import Estimate, as_json, from_json
 from r2s.estimators.evidence import evidence_of, loss_of
+from r2s.estimators.gauss_newton import Descent
 from r2s.estimators.prediction import Seen, Slope, _delayed, predict, sensitivities
 from r2s.estimators.problem import Doubt, Problem, beginning, window
 from r2s.family import OrthotropicFamily, Range
@@ -103,6 +104,24 @@ def test_an_early_camera_is_predicted_as_an_early_recording(recording):
     same, shifted = float(loss(make(recording), unknown(0.0))), make(late)
     assert float(loss(shifted, unknown(-1.0))) == pytest.approx(same, rel=0.02)
     assert float(loss(shifted, unknown(0.0))) > 2 * same
+
+
+def test_of_many_descents_the_better_half_go_on():
+    """After every third iteration, until three are left; a diverged one goes first."""
+    zero, vector, matrix = (jnp.zeros((2,) * dims) for dims in range(3))
+    stage = jnp.zeros((), int)
+    losses = [float("nan"), *np.random.default_rng(0).permutation(63).astype(float)]
+    normals = [gauss_newton.Normal(jnp.array(x), zero, vector, matrix, matrix) for x in losses]
+    row = [Descent(vector, normal, zero, zero, zero, stage) for normal in normals]
+    order = [int(i) for i in np.argsort(losses)]  # NaN is last
+    counts = []
+    for iteration in range(1, 25):
+        kept = descent._kept(row, iteration)
+        counts.append(len(kept))
+        assert kept == sorted(order[: len(kept)])
+    assert counts == [64] * 3 + [32] * 3 + [16] * 3 + [8] * 3 + [4] * 3 + [3] * 9
+    later = dataclasses.replace(row[5], stage=stage + 1)
+    assert descent._kept([*row[:5], later, *row[6:]], 1) == [5]
 
 
 def test_a_marker_that_is_off_in_every_frame_is_one_error(pulled):

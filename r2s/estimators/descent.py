@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +27,7 @@ FIRST_DAMPING = 1e-2
 CLOSE = 5e-3  # of the prior's weight, which is what a change by one deviation costs, about twice
 STRICT, SCALES = 3.0, (3e-3, 0.015)  # of the spread, and between [m]: what is off is an outlier
 PATIENCE = 6  # iterations without a gain
+HALVING, FEWEST = 3, 3  # iterations, after each of which half go on, but no fewer than this
 ROUGH = 3.0  # deviations, by which places around an end lead apart
 
 Row = list[Descent]  # of every start
@@ -49,7 +51,8 @@ class Effort(NamedTuple):
     """How much a descent may cost.
 
     - `coarse`: places of the range that are tried first; 0: descend from the start alone.
-    - `starts`: how many of the best of them are descended from, side by side.
+    - `starts`: how many of the best of them are descended from, side by side; of more than three
+      the better half go on every three iterations, until three are left.
     - `iterations`: at most, of each stage: of all starts, until each has arrived, when its next
       step promises to change no parameter by more than about a tenth of its deviation; and then of
       the best one with outliers left out.
@@ -140,11 +143,13 @@ def losses_of(problems: Joint, unknowns: Float[Array, "start unknown"]) -> np.nd
 
 
 def _normals_of(problems: Joint, unknowns: list, scales: list, width: float | None) -> list[Normal]:
-    """As `losses_of`."""
+    """As `losses_of`; together in numbers that are powers of two, so that few are compiled."""
     if jax.default_backend() == "cpu" or len(unknowns) == 1:
         pairs = zip(unknowns, scales, strict=True)
         return [_normal(problems, unknown, scale, width) for unknown, scale in pairs]
-    found = _normals(problems, jnp.stack(unknowns), jnp.stack(scales), width)
+    more = 2 ** math.ceil(math.log2(len(unknowns))) - len(unknowns)
+    fill = lambda parts: jnp.stack([*parts, *[parts[-1]] * more])
+    found = _normals(problems, fill(unknowns), fill(scales), width)
     return [jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(len(unknowns))]
 
 
@@ -176,8 +181,7 @@ def _next(problems: Joint, effort: Effort, rows: list[Row]) -> Row | None:
     now = int(best.stage)
     stage = [r for r in rows if int(_best(r)[1].stage) == now]
     prior = _weight(problems, best.normal)
-    there = [i for i, descent in enumerate(row) if int(descent.stage) == now]
-    moving = [i for i in there if not _arrived(problems, stage, i, prior)]
+    moving = [i for i in _kept(row, len(stage)) if not _arrived(problems, stage, i, prior)]
     if not moving or len(stage) > effort.iterations:
         return _later(problems, effort, row)
     seen = _seen(problems, effort, now)
@@ -187,6 +191,18 @@ def _next(problems: Joint, effort: Effort, rows: list[Row]) -> Row | None:
     for i, trial, normal in zip(moving, trials, tried, strict=True):
         after[i] = _accept(problems, row[i], trial, normal, prior)
     return after
+
+
+def _kept(row: Row, iteration: int) -> list[int]:
+    """Which of the descents in the latest stage go on: of many, the best half every few iterations.
+
+    (Successive halving, Jamieson and Talwalkar 2016.)
+    """
+    now = max(int(descent.stage) for descent in row)
+    there = [i for i, descent in enumerate(row) if int(descent.stage) == now]
+    count = max(FEWEST, len(there) >> (iteration - 1) // HALVING)
+    loss = lambda i: np.nan_to_num(float(row[i].normal.loss), nan=np.inf)
+    return sorted(sorted(there, key=loss)[:count])
 
 
 def _later(problems: Joint, effort: Effort, row: Row) -> Row | None:
