@@ -1,6 +1,6 @@
 """Where the cloth is held against the commanded path, in real folds: which offset and lag fit best.
 
-python benchmarks/calibration.py --data FOLDER --out results/calibration   # minutes on one core
+python benchmarks/calibration.py --data FOLDER --out results/calibration   # 10 minutes on one core
 
 The recordings state neither the camera's pose nor how the fingers hold the sheet. Six assumed
 fabrics (the default and the presets; none is estimated) move along the commanded path with every
