@@ -27,7 +27,7 @@ import numpy as np
 
 from r2s import presets, scenarios, synthetic
 from r2s.estimators import cma_es, diffcloud, diffcp, gauss_newton
-from r2s.estimators.descent import Effort
+from r2s.estimators.descent import DEFAULT
 from r2s.estimators.estimate import Estimate
 from r2s.estimators.problem import Problem
 from r2s.fabric import Fabric
@@ -41,9 +41,9 @@ SAME = 1.05  # times the loss at the truth's descent: the same place
 
 def alone(problem: Problem, start, key) -> Estimate:
     """Gauss-Newton from the start, and from nowhere else."""
-    effort = Effort(coarse=0, starts=1, width=None if problem.solver is None else diffcp.WIDTH)
-    estimate = diffcloud.estimate if problem.solver is None else diffcp.estimate
-    return estimate(problem, effort, start=start, key=key)
+    cloth = problem.solver is None
+    estimate, effort = (diffcloud.estimate, DEFAULT) if cloth else (diffcp.estimate, diffcp.DEFAULT)
+    return estimate(problem, effort._replace(coarse=0, starts=1), start=start, key=key)
 
 
 def ours(problem: Problem, start, key) -> Estimate:
