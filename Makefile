@@ -22,7 +22,7 @@ PUBLIC := r2s r2s.fabric r2s.family r2s.presets r2s.units r2s.mesh r2s.scene r2s
 	r2s.physics.air r2s.physics.contact r2s.recording r2s.manifest r2s.synthetic r2s.metrics r2s.losses \
 	r2s.estimators.problem r2s.estimators.hanging r2s.estimators.estimate r2s.estimators.descent r2s.estimators.diffcloud \
 	r2s.estimators.diffcp r2s.estimators.physnet r2s.estimators.pinn r2s.estimators.pinn_clouds \
-	r2s.estimators.cma_es r2s.estimators.trust r2s.estimators.planned r2s.cards r2s.export r2s.gradcheck r2s.arcsim \
+	r2s.estimators.cma_es r2s.estimators.trust r2s.estimators.planned r2s.cards r2s.export r2s.gradcheck r2s.arcsim r2s.study.placement \
 	r2s.interactive.subject r2s.interactive.page
 
 .PHONY: study test test-slow lint types check docs clean
