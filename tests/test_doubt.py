@@ -1,6 +1,7 @@
 """What an estimate does not know for sure: the air, and what a rough loss leaves open."""
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -75,7 +76,7 @@ def valley(lifted, size):
     matrix = jnp.asarray(root @ root.T)
     end = jnp.full(size, 0.5).at[lifted.family.dim :].set(0.0)
 
-    def at(place, gradient=0.0, loss=0.0):
+    def at(place, gradient: Any = 0.0, loss: Any = 0.0):
         found = matrix @ (place - end) + gradient
         one = jnp.ones(())
         return Normal(loss * one, one, found, matrix, 1e-4 * matrix)

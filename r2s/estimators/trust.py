@@ -23,9 +23,9 @@ NOISE = 3e-3  # [m]: beyond which a distance counts as an outlier's
 def sensitivity(problems: Problem | Joint, fabric: Fabric) -> Estimate:
     """What recordings would reveal of a fabric, were it the true one: deviations, combinations.
 
-    Nothing is fitted: it takes nine simulations with their derivatives, up to 27 where the motion is
-    rough. Make the recordings with `r2s.synthetic.record` from the motion that is planned and the
-    cameras that there are. Raises `RuntimeError` when the simulation diverges.
+    Nothing is fitted: it takes nine simulations with their derivatives, up to 27 where the motion
+    is rough. Make the recordings with `r2s.synthetic.record` from the motion that is planned and
+    the cameras that there are. Raises `RuntimeError` when the simulation diverges.
     """
     problems = (problems,) if isinstance(problems, Problem) else problems
     family = problems[0].family
