@@ -39,7 +39,14 @@ def nearest(real: Sequence[Cloud], simulated: Sequence[Cloud], seed: int = 0) ->
 
     From the recording to the motion, at most `FARTHEST` [m] along each axis and `TURN` [rad]; with
     distances squared, but beyond `OUTLIER` [m] (soft L1). `seed`: of the points that are drawn.
+    Raises `ValueError` for another number of frames, and for one that is empty or not finite.
     """
+    if len(real) != len(simulated):
+        raise ValueError(f"{len(real)} recorded frames, {len(simulated)} simulated ones")
+    for name, clouds in (("recorded", real), ("simulated", simulated)):
+        for frame, cloud in enumerate(clouds):
+            if not len(cloud) or not np.all(np.isfinite(cloud)):
+                raise ValueError(f"{name} frame {frame} is empty, or not finite")
     random = np.random.default_rng(seed)
     thin = lambda cloud: cloud[random.permutation(len(cloud))[:POINTS]]
     frames = [thin(np.asarray(cloud, float)) for cloud in real]
