@@ -23,7 +23,7 @@ from r2s.files import write_json
 from r2s.recording import Recording, subsample
 from r2s.study import judge
 
-METRIC = "chamfer_real_to_sim"
+METRIC, FOLD = "chamfer_real_to_sim", "fold"
 BACK = (0.01, 0.0, -0.01, -0.02, -0.03)  # [m], along y
 BELOW = (0.0, -0.012, -0.025)  # [m], along z
 LAGS = (0.0, 0.06, 0.12, 0.18)  # [s]
@@ -47,20 +47,20 @@ def errors(recordings: list[Recording], fabrics: list, change: np.ndarray, lag: 
     return [float(score(recording)) for recording in at]
 
 
-def main(folder: Path, out: Path, kind: str) -> None:
+def main(folder: Path, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     rules = manifest.manifest_for(folder)
-    names = manifest.read_recordings(folder, rules, (kind,))
+    names = manifest.read_recordings(folder, rules, (FOLD,))
     read = lambda name: subsample(manifest.read_recording(folder, rules, name), POINTS, None, 0)
     recordings = [read(name) for name in names]
-    written = np.array(rules.scenarios[kind].gripper.offset)
+    written = np.array(rules.scenarios[FOLD].gripper.offset)
     fabrics = [OrthotropicFamily.make(0.15).middle(), *(make() for make in presets.FIVE.values())]
     rows = []
     for y, z, lag in itertools.product(BACK, BELOW, LAGS):
         measure.progress(f"y {1e3 * y:.0f} mm, z {1e3 * z:.0f} mm, lag {1e3 * lag:.0f} ms")
         found = errors(recordings, fabrics, np.array([0, y, z]) - written, lag)
         rows.append({"y": y, "z": z, "lag": lag, "errors": found})
-        write_json(out / f"{kind}.json", rows)
+        write_json(out / f"{FOLD}.json", rows)
     summary(rows, recordings)
 
 
@@ -90,9 +90,8 @@ def summary(rows: list[measure.Row], recordings: list[Recording]) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Offset and lag of the cloth in real recordings.")
+    parser = argparse.ArgumentParser(description="Offset and lag of the cloth in real folds.")
     parser.add_argument("--data", type=Path, required=True, help="folder of recordings")
     parser.add_argument("--out", type=Path, default=Path("results/calibration"))
-    parser.add_argument("--kind", default="fold", choices=("fold", "lift"))
     a = parser.parse_args()
-    main(a.data, a.out, a.kind)
+    main(a.data, a.out)

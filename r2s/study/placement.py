@@ -52,20 +52,16 @@ def nearest(real: Sequence[Cloud], simulated: Sequence[Cloud], seed: int = 0) ->
     frames = [thin(np.asarray(cloud, float)) for cloud in real]
     trees = [KDTree(cloud) for cloud in simulated]
     pivot = np.mean(np.concatenate(frames), axis=0)
-    size = np.array([FARTHEST, FARTHEST, FARTHEST, TURN])
-    at = lambda place: Placement(place[:3] * FARTHEST, float(place[3] * TURN), pivot)
+    bounds = np.array([FARTHEST, FARTHEST, FARTHEST, TURN])
 
-    def distances(place: np.ndarray) -> np.ndarray:
+    def at(share: np.ndarray) -> Placement:
+        *shift, turn = share * bounds
+        return Placement(np.array(shift), float(turn), pivot)
+
+    def distances(share: np.ndarray) -> np.ndarray:
         pairs = zip(trees, frames, strict=True)
-        return np.concatenate([tree.query(moved(at(place), frame))[0] for tree, frame in pairs])
+        return np.concatenate([tree.query(moved(at(share), frame))[0] for tree, frame in pairs])
 
-    # all in units of its bound; a millimetre is finer than the points lie
-    found = least_squares(
-        distances,
-        np.zeros(len(size)),
-        bounds=(-1, 1),
-        loss="soft_l1",
-        f_scale=OUTLIER,
-        diff_step=1e-3 / FARTHEST,
-    )
+    start = np.zeros(len(bounds))
+    found = least_squares(distances, start, bounds=(-1, 1), loss="soft_l1", f_scale=OUTLIER)
     return at(found.x)
