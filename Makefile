@@ -16,14 +16,14 @@ QUICK := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 
 	--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1
 
 # The public surface: what changes here is in the changelog.
-PUBLIC := r2s r2s.fabric r2s.family r2s.presets r2s.units r2s.mesh r2s.scene r2s.solver r2s.cloth \
-	r2s.layers r2s.mpm r2s.scenario r2s.scenarios r2s.trajectories r2s.sweep \
-	r2s.physics.membrane r2s.physics.plate r2s.physics.bending r2s.physics.table r2s.physics.solid \
-	r2s.physics.air r2s.physics.contact r2s.recording r2s.manifest r2s.synthetic r2s.metrics r2s.losses \
-	r2s.estimators.problem r2s.estimators.hanging r2s.estimators.estimate r2s.estimators.descent r2s.estimators.diffcloud \
-	r2s.estimators.diffcp r2s.estimators.physnet r2s.estimators.pinn r2s.estimators.pinn_clouds \
-	r2s.estimators.cma_es r2s.estimators.trust r2s.estimators.planned r2s.cards r2s.export r2s.gradcheck r2s.arcsim r2s.study.placement \
-	r2s.interactive.subject r2s.interactive.page
+PUBLIC := r2s r2s.fabrics.fabric r2s.fabrics.parameters r2s.fabrics.presets r2s.units r2s.geometry.mesh r2s.world.scene r2s.rollout r2s.cloth.cloth \
+	r2s.cloth.self_contact.contacts r2s.mpm r2s.scenarios.scenario r2s.scenarios r2s.scenarios.paths r2s.sweep \
+	r2s.laws.membrane r2s.laws.plate r2s.laws.bending r2s.laws.tables r2s.laws.solid \
+	r2s.world.air r2s.world.contact r2s.recordings.recording r2s.recordings.manifest r2s.scenarios.synthetic r2s.evaluation.metrics r2s.evaluation.losses \
+	r2s.estimation.problem r2s.estimation.initial_shape r2s.estimation.estimate r2s.estimation.descent r2s.estimation.diffcloud \
+	r2s.estimation.diffcp r2s.estimation.physnet.estimator r2s.estimation.pinn.from_pulls r2s.estimation.pinn.from_clouds \
+	r2s.estimation.cma_es r2s.estimation.identifiability r2s.estimation.experiment_design r2s.estimation.cards r2s.export r2s.gradient_check r2s.fabrics.arcsim r2s.evaluation.placement \
+	r2s.viewer.subject r2s.viewer.page
 
 .PHONY: study test test-slow lint types check docs clean
 

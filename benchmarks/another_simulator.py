@@ -31,19 +31,19 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.interpolate import CubicSpline
 
-from r2s.estimators import diffcloud
-from r2s.estimators.descent import Effort
-from r2s.estimators.estimate import Estimate
-from r2s.estimators.problem import Clouds, Doubt, Problem
-from r2s.fabric import Fabric
-from r2s.family import OrthotropicFamily
-from r2s.mesh import Mesh
-from r2s.physics.air import Air
-from r2s.physics.contact import Table
-from r2s.physics.table import DiffSimTableBending, DiffSimTableMembrane
-from r2s.scenario import BRAKE, Scenario, motion
-from r2s.scene import Scene
+from r2s.estimation import diffcloud
+from r2s.estimation.descent import Effort
+from r2s.estimation.estimate import Estimate
+from r2s.estimation.problem import Clouds, Doubt, Problem
+from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.geometry.mesh import Mesh
+from r2s.laws.tables import DiffSimTableBending, DiffSimTableMembrane
+from r2s.scenarios.scenario import BRAKE, Scenario, motion
 from r2s.units import GRAVITY
+from r2s.world.air import Air
+from r2s.world.contact import Table
+from r2s.world.scene import Scene
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "diffsim_reference"
 FABRICS = ("camel", "denim")

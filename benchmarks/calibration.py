@@ -17,11 +17,12 @@ import equinox as eqx
 import measure
 import numpy as np
 
-from r2s import manifest, presets
-from r2s.family import OrthotropicFamily
+from r2s.evaluation import prediction_error
+from r2s.fabrics import presets
+from r2s.fabrics.parameters import OrthotropicFamily
 from r2s.files import write_json
-from r2s.recording import Recording, subsample
-from r2s.study import judge
+from r2s.recordings import manifest
+from r2s.recordings.recording import Recording, subsample
 
 METRIC, FOLD = "chamfer_real_to_sim", "fold"
 BACK = (0.01, 0.0, -0.01, -0.02, -0.03)  # [m], along y
@@ -40,9 +41,11 @@ def moved(recording: Recording, change: np.ndarray, lag: float) -> Recording:
 def errors(recordings: list[Recording], fabrics: list, change: np.ndarray, lag: float) -> list:
     """Mean error [m] of the fabrics on every recording."""
     at = [moved(recording, change, lag) for recording in recordings]
-    motions = [judge.predict(at[0], fabric) for fabric in fabrics]  # one path for all of them
+    motions = [
+        prediction_error.predict(at[0], fabric) for fabric in fabrics
+    ]  # one path for all of them
     score = lambda r: np.mean(
-        [judge.against_motion(r, x, EVERY, crop=False)[METRIC] for x in motions]
+        [prediction_error.against_motion(r, x, EVERY, crop=False)[METRIC] for x in motions]
     )
     return [float(score(recording)) for recording in at]
 

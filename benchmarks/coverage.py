@@ -14,11 +14,13 @@ import jax
 import measure
 import numpy as np
 
-from r2s import presets, scenarios, synthetic
-from r2s.estimators import diffcloud
-from r2s.estimators.descent import DEFAULT
-from r2s.estimators.problem import Problem
-from r2s.family import OrthotropicFamily
+from r2s import scenarios
+from r2s.estimation import diffcloud
+from r2s.estimation.descent import DEFAULT
+from r2s.estimation.problem import Problem
+from r2s.fabrics import presets
+from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.scenarios import synthetic
 
 NINETY = 1.645  # deviations to either side
 

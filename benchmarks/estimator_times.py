@@ -14,12 +14,14 @@ import jax
 import jax.numpy as jnp
 import measure
 
-from r2s import presets, scenarios, synthetic
-from r2s.estimators import diffcloud, gauss_newton
-from r2s.estimators.descent import DEFAULT, Effort
-from r2s.estimators.prediction import predict
-from r2s.estimators.problem import Problem
-from r2s.family import OrthotropicFamily
+from r2s import scenarios
+from r2s.estimation import diffcloud, gauss_newton
+from r2s.estimation.descent import DEFAULT, Effort
+from r2s.estimation.prediction import predict
+from r2s.estimation.problem import Problem
+from r2s.fabrics import presets
+from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.scenarios import synthetic
 
 _motion = eqx.filter_jit(predict)
 _loss = eqx.filter_jit(lambda problem, unknown: gauss_newton.loss_at((problem,), unknown))

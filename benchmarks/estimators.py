@@ -25,14 +25,16 @@ import jax.numpy as jnp
 import measure
 import numpy as np
 
-from r2s import presets, scenarios, synthetic
-from r2s.estimators import cma_es, diffcloud, diffcp, gauss_newton
-from r2s.estimators.descent import DEFAULT
-from r2s.estimators.estimate import Estimate
-from r2s.estimators.problem import Problem
-from r2s.fabric import Fabric
-from r2s.family import IsotropicFamily, OrthotropicFamily
-from r2s.scenarios.points import material_points
+from r2s import scenarios
+from r2s.estimation import cma_es, diffcloud, diffcp, gauss_newton
+from r2s.estimation.descent import DEFAULT
+from r2s.estimation.estimate import Estimate
+from r2s.estimation.problem import Problem
+from r2s.fabrics import presets
+from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.parameters import IsotropicFamily, OrthotropicFamily
+from r2s.scenarios import synthetic
+from r2s.scenarios.on_points import material_points
 
 _loss = eqx.filter_jit(gauss_newton.loss_at)
 COARSE, INSIDE = (7, 7), (0.1, 0.9)  # of the problems on material points

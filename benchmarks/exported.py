@@ -29,12 +29,12 @@ import measure
 import numpy as np
 
 import r2s
-from r2s import presets
 from r2s.export import stiffness
-from r2s.physics.air import Air
-from r2s.physics.bending import HingeBending
-from r2s.physics.contact import Table
+from r2s.fabrics import presets
+from r2s.laws.bending import HingeBending
 from r2s.units import GRAVITY
+from r2s.world.air import Air
+from r2s.world.contact import Table
 
 SIDE, SIZE, HEIGHT = 0.3, 13, 0.5  # [m], vertices a side, [m]
 RATE = 60.0  # frames a second

@@ -11,11 +11,11 @@ import mpm_scenes
 import numpy as np
 
 import r2s
-from r2s import presets
+from r2s.fabrics import presets
+from r2s.laws.solid import FixedCorotated, NeoHookean, Solid
 from r2s.mpm import Background, Block, Grid, Sheet
-from r2s.physics.air import Air
-from r2s.physics.contact import Table
-from r2s.physics.solid import FixedCorotated, NeoHookean, Solid
+from r2s.world.air import Air
+from r2s.world.contact import Table
 
 LAWS = {"corotated": FixedCorotated, "neo-hookean": NeoHookean}
 FRAMES = 32  # the states that reverse mode keeps

@@ -27,19 +27,23 @@ import numpy as np
 from measure import progress, show
 from scipy.stats import spearmanr
 
-from r2s import synthetic
-from r2s.estimators import physnet
-from r2s.estimators.physnet import Sighting
+from r2s.estimation.physnet import dataset, estimator, pictures, preprocess, training, triplets
+from r2s.estimation.physnet.dataset import Data, Settings
+from r2s.estimation.physnet.estimator import Sighting
+from r2s.estimation.physnet.network import DEEPER, PAPER
+from r2s.estimation.physnet.training import Training
+from r2s.estimation.physnet.views import View, in_frame
 from r2s.files import write_json, write_text
-from r2s.observe.calibration import DepthCamera, calibrated, frustum, look_at
-from r2s.observe.flaws import TYPICAL, flawed_depth, flawed_mask
-from r2s.observe.render import render
-from r2s.physnet import dataset, pictures, preprocess, training, triplets
-from r2s.physnet.dataset import Data, Settings
-from r2s.physnet.network import DEEPER, PAPER
-from r2s.physnet.training import Training
-from r2s.physnet.views import View, in_frame
-from r2s.scenario import Scenario, motion
+from r2s.recordings.cameras.calibration import (
+    DepthCamera,
+    calibrated,
+    frustum,
+    look_at,
+)
+from r2s.recordings.cameras.flaws import TYPICAL, flawed_depth, flawed_mask
+from r2s.recordings.cameras.render import render
+from r2s.scenarios import synthetic
+from r2s.scenarios.scenario import Scenario, motion
 
 DRAWS = 200  # of random search, which is free: its motions are simulated once
 STEP = 0.03  # of the range, of differences
@@ -262,7 +266,7 @@ def compared(chosen: list[Target], networks: list[Training]) -> dict[str, list[f
             apart = []
             for target in chosen:
                 points = [
-                    np.asarray(physnet.embedded(trained.network, jnp.asarray(images, float)))
+                    np.asarray(estimator.embedded(trained.network, jnp.asarray(images, float)))
                     for images in (target.images["simulated"], target.images[name])
                 ]
                 apart.append(distance(*points))
@@ -319,9 +323,9 @@ def in_view(view: View, depth: np.ndarray, cameras: list[DepthCamera]) -> np.nda
 
 def searched(path: Path, sighting: Sighting, target: Target, calls: int, seed: int):
     fresh, spent = not path.exists(), time.process_time()
-    done = physnet.estimate(sighting, num_calls=calls, seed=seed, path=path)
+    done = estimator.estimate(sighting, num_calls=calls, seed=seed, path=path)
     place = np.asarray(sighting.family.locate(done.fabric))
-    at_truth = physnet.distances(sighting, jnp.asarray(np.stack([target.place] * 4), float))[0]
+    at_truth = estimator.distances(sighting, jnp.asarray(np.stack([target.place] * 4), float))[0]
     return {
         "search": seed,
         "error": np.abs(place - target.place),
@@ -336,7 +340,7 @@ def deviations(sighting: Sighting, target: Target) -> np.ndarray:
 
     The error of the images counts as the same in all frames, and the ranges as a flat prior.
     """
-    respond, place = physnet.responses(sighting, 4), target.place
+    respond, place = estimator.responses(sighting, 4), target.place
     ends = [np.clip(place + sign * STEP * np.eye(len(place)), 0, 1) for sign in (-1, 1)]
     places = np.concatenate([*ends, place[None]])
     found = np.concatenate([respond(places[i : i + 4]) for i in range(0, len(places), 4)])

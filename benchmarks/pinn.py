@@ -89,9 +89,9 @@ def _problem():
     import jax.numpy as jnp
     import jax.random as jr
 
-    from r2s.family import OrthotropicFamily
-    from r2s.pinn.data import Clamp, Pull, stacked
-    from r2s.pinn.paper import begin
+    from r2s.estimation.pinn.data import Clamp, Pull, stacked
+    from r2s.estimation.pinn.published_recipe import begin
+    from r2s.fabrics.parameters import OrthotropicFamily
 
     array = lambda value: jnp.asarray(value, float)
     keys = jr.split(jr.key(0), 3)
@@ -122,8 +122,8 @@ def epochs(torch_python: str | None) -> list[dict]:
     import equinox as eqx
     import optax
 
-    from r2s.pinn import paper
-    from r2s.pinn.training import trainable
+    from r2s.estimation.pinn import published_recipe
+    from r2s.estimation.pinn.training import trainable
 
     weights, fixed = eqx.partition(model, trainable(model))
     optimiser = optax.adam(1e-4)
@@ -148,15 +148,15 @@ def epochs(torch_python: str | None) -> list[dict]:
         return lambda: jax.block_until_ready(run(weights, state, pulls))
 
     each = lambda call: {name: s / TOGETHER for name, s in timed(call).items()}
-    rows = [{"epoch": "forward jets", **each(epochs_of(paper.losses))}]
+    rows = [{"epoch": "forward jets", **each(epochs_of(published_recipe.losses))}]
     nested = lambda model, family, pulls: _nested_losses(jax, jnp, model, family, pulls)
     rows.append({"epoch": "nested reverse, JAX", **each(epochs_of(nested))})
-    state = paper.untouched(model)
+    state = published_recipe.untouched(model)
 
     def of_the_paper():
         nonlocal model, state
         about = model, state, family, pulls, jnp.asarray(0), TOGETHER
-        model, state, values = paper.run(*about)
+        model, state, values = published_recipe.run(*about)
         jax.block_until_ready(values)
 
     of_the_paper()
@@ -168,7 +168,7 @@ def epochs(torch_python: str | None) -> list[dict]:
 
 
 def _nested_losses(jax, jnp, model, family, pulls):
-    """The losses of `r2s.pinn.paper`, with every derivative by a reverse pass."""
+    """The losses of the published recipe, with every derivative by a reverse pass."""
     fabric, pull = family(model.place), jax.tree.map(lambda leaf: leaf[0], pulls)
     network = jax.tree.map(lambda leaf: leaf[0], model.networks)
     law = fabric.membrane
@@ -234,8 +234,8 @@ def _show(title: str, rows: list[dict], names: list[str], keys: list[str]) -> No
 
 
 def _fabric(name: str):
-    from r2s import presets
-    from r2s.family import OrthotropicFamily
+    from r2s.fabrics import presets
+    from r2s.fabrics.parameters import OrthotropicFamily
 
     fabric = presets.FIVE[name]()
     return fabric, OrthotropicFamily.make(float(fabric.density))
@@ -246,8 +246,8 @@ def _pulls(name: str, seed: int, count: int = 3) -> list:
     import jax.random as jr
     import numpy as np
 
-    from r2s.pinn.data import pull_from
-    from r2s.pinn.synthetic import pulled
+    from r2s.estimation.pinn.data import pull_from
+    from r2s.estimation.pinn.synthetic_pulls import pulled
 
     fabric, _ = _fabric(name)
     some = []
@@ -278,8 +278,8 @@ def fabrics(out: Path, seeds: int) -> None:
     import numpy as np
     from measure import show
 
-    from r2s import presets
-    from r2s.estimators.pinn import estimate
+    from r2s.estimation.pinn.from_pulls import estimate
+    from r2s.fabrics import presets
 
     def make(fabric: str, seed: int) -> dict:
         some = _pulls(fabric, seed)
@@ -329,13 +329,13 @@ def recipes(out: Path, name: str, count: int, seeds: int, number: int, alone: bo
     import equinox as eqx
     import jax.random as jr
 
-    from r2s.estimators.pinn import estimate
-    from r2s.fabric import Fabric
-    from r2s.pinn import paper
-    from r2s.pinn.data import stacked
-    from r2s.pinn.losses import strong_losses
-    from r2s.pinn.training import Recipe
-    from r2s.pinn.weak import weak_losses
+    from r2s.estimation.pinn import published_recipe
+    from r2s.estimation.pinn.data import stacked
+    from r2s.estimation.pinn.from_pulls import estimate
+    from r2s.estimation.pinn.losses import strong_losses
+    from r2s.estimation.pinn.training import Recipe
+    from r2s.estimation.pinn.weak import weak_losses
+    from r2s.fabrics.fabric import Fabric
 
     some, (fabric, family) = _pulls(name, 0, count), _fabric(name)
     truth = family.values(family.locate(fabric))
@@ -346,7 +346,7 @@ def recipes(out: Path, name: str, count: int, seeds: int, number: int, alone: bo
         key = jr.key(seed)
         eqx.clear_caches()
         if recipe.startswith("the paper's"):
-            course = paper.train(family, stacked(some), place, number, key=key)
+            course = published_recipe.train(family, stacked(some), place, number, key=key)
             return _errors(family, truth, family.values(course.model.place))
         if recipe == "ours":
             found = estimate(some, family, key=key).estimate
@@ -367,8 +367,10 @@ def clouds(out: Path, seeds: int) -> None:
     """The five fabrics, from clouds of a lift and of a wind without markers."""
     import jax.random as jr
 
-    from r2s import presets, scenarios, synthetic
-    from r2s.estimators.pinn_clouds import estimate
+    from r2s import scenarios
+    from r2s.estimation.pinn.from_clouds import estimate
+    from r2s.fabrics import presets
+    from r2s.scenarios import synthetic
 
     def make(scenario: str, fabric: str, seed: int) -> dict:
         about, family = _fabric(fabric)

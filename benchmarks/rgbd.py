@@ -60,11 +60,11 @@ def main() -> None:
 
 def write(folder: Path, args: argparse.Namespace) -> int:
     """Write the images; returns their size in bytes."""
-    from r2s.mesh import rectangle
-    from r2s.observe.calibration import DepthCamera, look_at
-    from r2s.observe.cleaning import Cleaning
-    from r2s.observe.rgbd import Rig
-    from r2s.observe.synthetic_rgbd import write_rgbd
+    from r2s.geometry.mesh import rectangle
+    from r2s.recordings.cameras.calibration import DepthCamera, look_at
+    from r2s.recordings.cameras.cleaning import Cleaning
+    from r2s.recordings.cameras.rgbd import Rig
+    from r2s.recordings.cameras.synthetic_rgbd import write_rgbd
 
     size = args.across, args.down
     lens = ((0.7 * size[0],) * 2, ((size[0] - 1) / 2, (size[1] - 1) / 2))
@@ -90,7 +90,7 @@ def write(folder: Path, args: argparse.Namespace) -> int:
 
 def describe(folder: Path, frames: int) -> None:
     """The manifest of the recording, and its gripper's path."""
-    from r2s.manifest import default_manifest
+    from r2s.recordings.manifest import default_manifest
 
     manifest = json.loads((default_manifest().parent / "templates" / "study.json").read_text())
     manifest["scenarios"]["lift"]["frames_used"] = [0, frames - 1]
@@ -108,8 +108,8 @@ def peak() -> float:
 
 def convert(folder: Path) -> None:
     from r2s.cli import main as r2s
-    from r2s.observe import images
-    from r2s.recording import load
+    from r2s.recordings.cameras import images
+    from r2s.recordings.recording import load
 
     images.opencv()
     before = peak()

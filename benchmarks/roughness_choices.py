@@ -21,12 +21,14 @@ from matplotlib.figure import Figure
 from roughness_tools import POINTS, Damped, kept, losses_at, normal_at, picture, table, unknown_of
 from roughness_windows import restarted
 
-from r2s import presets, scenarios, synthetic
-from r2s.estimators import diffcloud, gauss_newton
-from r2s.estimators.descent import CLOSE, FIRST_DAMPING, Effort
-from r2s.estimators.gauss_newton import GROWTH, MARGIN, Descent, Normal
-from r2s.estimators.problem import Problem, beginning, window
-from r2s.family import OrthotropicFamily
+from r2s import scenarios
+from r2s.estimation import diffcloud, gauss_newton
+from r2s.estimation.descent import CLOSE, FIRST_DAMPING, Effort
+from r2s.estimation.gauss_newton import GROWTH, MARGIN, Descent, Normal
+from r2s.estimation.problem import Problem, beginning, window
+from r2s.fabrics import presets
+from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.scenarios import synthetic
 
 STARTS, ITERATIONS = 6, 12
 FABRICS = ("grey_interlock",)

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from roughness_tools import kept, losses_at, normal_at, picture, table, truth, unknown_of
 
-from r2s.estimators.problem import Problem
+from r2s.estimation.problem import Problem
 
 WIDTHS = (0.5, 0.05, 0.005, 0.0005)  # of the range
 COUNT = 41

@@ -22,12 +22,21 @@ from matplotlib.figure import Figure
 from roughness_tools import kept, picture, recorded, table, truth, unknown_of
 from scipy.stats import rankdata
 
-from r2s import losses, scenarios
-from r2s.estimators.prediction import predict
-from r2s.estimators.problem import Clouds, Problem, window
-from r2s.losses import from_surface, huber, robust, sinkhorn, squared, to_surface, trimmed_mean
-from r2s.surface import sample_weights
-from r2s.synthetic import Sensing, sensing
+from r2s import scenarios
+from r2s.estimation.prediction import predict
+from r2s.estimation.problem import Clouds, Problem, window
+from r2s.evaluation import losses
+from r2s.evaluation.losses import (
+    from_surface,
+    huber,
+    robust,
+    sinkhorn,
+    squared,
+    to_surface,
+    trimmed_mean,
+)
+from r2s.geometry.surface import sample_weights
+from r2s.scenarios.synthetic import Sensing, sensing
 
 FABRIC, FRAMES, POINTS = "grey_interlock", (34, 39, 44, 49, 54, 59), 300
 KNOWN = {"warp": 0, "weft": 1, "shear": 2, "coupling": 3, "friction": 6}

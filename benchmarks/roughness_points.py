@@ -26,9 +26,9 @@ from roughness_sheets import (
 from roughness_tools import kept, picture, table
 
 from r2s import scenarios
-from r2s.family import IsotropicFamily
+from r2s.fabrics.parameters import IsotropicFamily
 from r2s.mpm.sheet import Sheet, stable_step
-from r2s.scenarios.points import MEMBRANE_DAMPING
+from r2s.scenarios.on_points import MEMBRANE_DAMPING
 
 STEEPEST = 1.25  # times the modulus, up to where lines and secants go
 SECANT = 0.02  # of the range

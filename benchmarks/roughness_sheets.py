@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r2s.fabric import Fabric
-from r2s.family import IsotropicFamily
+from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.parameters import IsotropicFamily
 from r2s.mpm.sheet import Sheet
-from r2s.scenario import Scenario, motion
-from r2s.scenarios.points import MEMBRANE_DAMPING, material_points
+from r2s.scenarios.on_points import MEMBRANE_DAMPING, material_points
+from r2s.scenarios.scenario import Scenario, motion
 
 DENSITY, MODULUS, RATIO = 0.19, 100.0, 0.3  # [kg/m^2], [N/m], [-]
 SOFT = 1e-6  # times the stiffness between layers: they pass through each other

@@ -16,15 +16,17 @@ import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 
-from r2s import presets, scenarios, synthetic
-from r2s.cloth import Cloth
-from r2s.estimators import gauss_newton
-from r2s.estimators.problem import Problem
-from r2s.fabric import Fabric
-from r2s.family import Family, OrthotropicFamily, Range
+from r2s import scenarios
+from r2s.cloth.cloth import Cloth
+from r2s.estimation import gauss_newton
+from r2s.estimation.problem import Problem
+from r2s.fabrics import presets
+from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.parameters import Family, OrthotropicFamily, Range
 from r2s.files import write_bytes, write_text
-from r2s.recording import Recording
-from r2s.scenario import Scenario
+from r2s.recordings.recording import Recording
+from r2s.scenarios import synthetic
+from r2s.scenarios.scenario import Scenario
 
 POINTS = 100  # of a cloud, a frame: the roughness is that of the motion, not of the cloud
 FINE = 4  # times as many steps: 5.6 ms, which hardly damp

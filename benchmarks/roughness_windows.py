@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from r2s.estimators.problem import Problem
-from r2s.fabric import Fabric
-from r2s.scenario import Scenario, begin, stepped
-from r2s.scene import Control, Scene
+from r2s.estimation.problem import Problem
+from r2s.fabrics.fabric import Fabric
+from r2s.scenarios.scenario import Scenario, begin, stepped
+from r2s.world.scene import Control, Scene
 
 FRAMES = 5  # of a window
 

@@ -12,10 +12,10 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from r2s.files import write_bytes
-from r2s.observe.calibration import DepthCamera, look_at, project
-from r2s.observe.depth import back_project, from_world
-from r2s.observe.render import render
-from r2s.scenario import Scenario
+from r2s.recordings.cameras.calibration import DepthCamera, look_at, project
+from r2s.recordings.cameras.depth import back_project, from_world
+from r2s.recordings.cameras.render import render
+from r2s.scenarios.scenario import Scenario
 
 VIEWS = {"lifting": (25, -50), "folding": (35, -40), "stretching": (50, -60)}  # degrees
 SIDEWAYS = (12, -50)  # of hanging sheets

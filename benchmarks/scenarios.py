@@ -17,12 +17,13 @@ import measure
 import numpy as np
 from scenario_pictures import picture
 
-from r2s import presets, scenarios
+from r2s import scenarios
+from r2s.fabrics import presets
 from r2s.files import write_text
-from r2s.scenario import Scenario
-from r2s.scenarios.account import Account, stretch
-from r2s.study.report import Section, write_report
-from r2s.study.tables import Table, csv_text
+from r2s.scenarios.energy_balance import Account, stretch
+from r2s.scenarios.scenario import Scenario
+from r2s.study.report.page import Section, write_report
+from r2s.study.statistics.tables import Table, csv_text
 
 FABRICS = ("grey_interlock", "black_denim")  # softest and stiffest membrane of the five
 SOLVERS = {"cloth": (13, 13), "layers": (9, 9), "points": (13, 13)}  # vertices of their meshes

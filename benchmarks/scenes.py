@@ -13,10 +13,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 import r2s
-from r2s import presets
-from r2s.physics.air import Air
-from r2s.physics.contact import Table
+from r2s.fabrics import presets
 from r2s.units import GRAVITY, isotropic_bending, isotropic_membrane
+from r2s.world.air import Air
+from r2s.world.contact import Table
 
 SIDE = 1.0  # of the sheet, [m]
 DENSITY = 0.2  # [kg/m^2]

@@ -24,17 +24,17 @@ import measure
 import numpy as np
 from scipy.spatial import KDTree
 
-from r2s import manifest
-from r2s.estimators import diffcloud
-from r2s.estimators.estimate import Estimate, as_json, from_json
-from r2s.estimators.problem import Problem
-from r2s.fabric import Fabric
-from r2s.family import OrthotropicFamily
+from r2s.estimation import diffcloud
+from r2s.estimation.estimate import Estimate, as_json, from_json
+from r2s.estimation.problem import Problem
+from r2s.evaluation import placement, prediction_error
+from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.parameters import OrthotropicFamily
 from r2s.files import write_json
-from r2s.recording import Recording, cloud
-from r2s.scenario import from_recording
-from r2s.study import judge, placement
-from r2s.surface import sample
+from r2s.geometry.surface import sample
+from r2s.recordings import manifest
+from r2s.recordings.recording import Recording, cloud
+from r2s.scenarios.scenario import from_recording
 
 LIFT, FOLD = "lift", "fold"
 
@@ -61,8 +61,14 @@ def errors(real: list[np.ndarray], other: list[np.ndarray]) -> tuple[float, floa
 
 def points_of(recording: Recording, fabric: Fabric) -> list[np.ndarray]:
     """Points on a fabric's motion in the frames that count."""
-    x, faces = judge.predict(recording, fabric), from_recording(recording).scene.mesh.faces
-    return [np.asarray(sample(jnp.asarray(x[f]), faces, judge.SAMPLES)) for f in used(recording)]
+    x, faces = (
+        prediction_error.predict(recording, fabric),
+        from_recording(recording).scene.mesh.faces,
+    )
+    return [
+        np.asarray(sample(jnp.asarray(x[f]), faces, prediction_error.SAMPLES))
+        for f in used(recording)
+    ]
 
 
 def used(recording: Recording) -> range:

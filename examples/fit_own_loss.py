@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import optax
 
 import r2s
-from r2s.family import OrthotropicFamily
-from r2s.physics.air import Air
-from r2s.physics.contact import Table
+from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.world.air import Air
+from r2s.world.contact import Table
 
 STEPS = 40
 sheet = r2s.rectangle((0.15, 0.05), (7, 3))  # [m]

@@ -13,9 +13,9 @@ import jax.random as jr
 import optax
 
 import r2s
-from r2s import presets
-from r2s.physics.air import Air
-from r2s.physics.contact import Table
+from r2s.fabrics import presets
+from r2s.world.air import Air
+from r2s.world.contact import Table
 
 STEPS, FASTEST = 20, 0.5  # [m/s]
 sheet = r2s.rectangle((0.2, 0.2), (4, 4))  # [m]

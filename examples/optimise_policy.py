@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import optax
 
 import r2s
-from r2s import presets
-from r2s.physics.air import Air
-from r2s.physics.contact import Table
+from r2s.fabrics import presets
+from r2s.world.air import Air
+from r2s.world.contact import Table
 
 STEPS, KNOTS, ITERATIONS = 24, 4, 40
 TARGET = jnp.array([0.12, 0.15, 0.001])  # [m]

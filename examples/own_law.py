@@ -13,10 +13,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 import r2s
-from r2s import presets
-from r2s.physics.air import Air
-from r2s.physics.contact import Table
-from r2s.physics.membrane import OrthotropicMembrane
+from r2s.fabrics import presets
+from r2s.laws.membrane import OrthotropicMembrane
+from r2s.world.air import Air
+from r2s.world.contact import Table
 
 
 class Stiffening(eqx.Module):

@@ -17,9 +17,9 @@ import numpy as np
 import trimesh
 
 import r2s
-from r2s import presets
-from r2s.physics.air import Air
-from r2s.physics.contact import Table
+from r2s.fabrics import presets
+from r2s.world.air import Air
+from r2s.world.contact import Table
 
 
 def write_disc(path: Path, radius: float = 0.15, rings: int = 5) -> None:

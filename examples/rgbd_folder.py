@@ -12,12 +12,13 @@ import equinox as eqx
 import numpy as np
 
 import r2s
-from r2s import presets, scenarios
-from r2s.observe.calibration import DepthCamera, look_at
-from r2s.observe.cleaning import Cleaning
-from r2s.observe.rgbd import Rig, read_rig, rgbd_recording
-from r2s.observe.synthetic_rgbd import write_rgbd
-from r2s.recording import RecordingInfo, cloud, save
+from r2s import scenarios
+from r2s.fabrics import presets
+from r2s.recordings.cameras.calibration import DepthCamera, look_at
+from r2s.recordings.cameras.cleaning import Cleaning
+from r2s.recordings.cameras.rgbd import Rig, read_rig, rgbd_recording
+from r2s.recordings.cameras.synthetic_rgbd import write_rgbd
+from r2s.recordings.recording import RecordingInfo, cloud, save
 
 
 def camera(place: tuple[float, float, float]) -> DepthCamera:

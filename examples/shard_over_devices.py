@@ -16,9 +16,9 @@ import numpy as np  # noqa: E402
 from jax.sharding import Mesh, PartitionSpec  # noqa: E402
 
 import r2s  # noqa: E402
-from r2s.family import OrthotropicFamily  # noqa: E402
-from r2s.physics.air import Air  # noqa: E402
-from r2s.physics.contact import Table  # noqa: E402
+from r2s.fabrics.parameters import OrthotropicFamily  # noqa: E402
+from r2s.world.air import Air  # noqa: E402
+from r2s.world.contact import Table  # noqa: E402
 
 FABRICS, STEPS = 16, 10
 sheet = r2s.rectangle((0.2, 0.2), (4, 4))  # [m]

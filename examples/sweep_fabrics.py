@@ -14,9 +14,9 @@ import jax.random as jr
 import numpy as np
 
 import r2s
-from r2s.family import OrthotropicFamily
-from r2s.physics.air import Air
-from r2s.physics.contact import Table
+from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.world.air import Air
+from r2s.world.contact import Table
 
 FABRICS, STEPS = 1000, 10
 sheet = r2s.rectangle((0.2, 0.2), (4, 4))  # [m]

@@ -20,15 +20,15 @@ In reading order:
 - `interactive`: sliders for a fabric. `study`: the main job, its tables and report.
 """
 
-from r2s.cloth import Cloth, ClothState
-from r2s.fabric import Fabric
-from r2s.family import OrthotropicFamily
-from r2s.layers import Layers
-from r2s.mesh import Mesh, rectangle
-from r2s.recording import Recording
-from r2s.scenario import Scenario, motion
-from r2s.scene import Control, Scene
-from r2s.solver import Trajectory, predicted_memory, simulate
+from r2s.cloth.cloth import Cloth, ClothState
+from r2s.cloth.self_contact.contacts import Layers
+from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.geometry.mesh import Mesh, rectangle
+from r2s.recordings.recording import Recording
+from r2s.rollout import Trajectory, predicted_memory, simulate
+from r2s.scenarios.scenario import Scenario, motion
+from r2s.world.scene import Control, Scene
 
 __all__ = [
     "Cloth",

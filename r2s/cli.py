@@ -58,7 +58,7 @@ class Fetch:
     """Descriptions of other data sets, one JSON each, instead of the project's."""
 
     def run(self) -> None:
-        from r2s.data import fetch
+        from r2s.recordings.datasets import fetch
 
         for line in fetch(self.name, self.to, self.manifests):
             print(line)
@@ -74,7 +74,7 @@ class List:
     """Print one JSON object."""
 
     def run(self) -> None:
-        from r2s.data import Dataset, known_datasets
+        from r2s.recordings.datasets import Dataset, known_datasets
 
         told, lines = {}, []
         for name, data in known_datasets(self.manifests).items():
@@ -109,7 +109,7 @@ class Convert:
     """Convert again what is up to date, as after an update of r2s."""
 
     def run(self) -> None:
-        from r2s.convert import convert
+        from r2s.recordings.convert import convert
 
         for line in convert(self.folder, self.to, self.only, self.force):
             print(line)
@@ -151,7 +151,7 @@ class Show:
     """auto: an MP4 where OpenCV is installed, else a GIF."""
 
     def run(self) -> None:
-        from r2s.show import load_trajectory, open_recording, show
+        from r2s.viewer.pictures import load_trajectory, open_recording, show
 
         cloth = None if self.trajectory is None else load_trajectory(self.trajectory)
         for path in show(open_recording(self.recording), self.out, cloth, self.video):
@@ -164,7 +164,7 @@ class Sensitivity:
 
     Simulates the motion with a preset that is like the fabric, as seen by two depth cameras, and
     prints how well each parameter would be known, and which combinations where one is not.
-    Numbers of the motion are those of `r2s.trajectories`, in SI units.
+    Numbers of the motion are those of `r2s.scenarios.paths`, in SI units.
 
         r2s sensitivity lifting --fabric black_denim --motion height=0.3 moving=2
         r2s sensitivity wind --fabric grey_interlock --motion speed=3 --noise 0.002
@@ -173,7 +173,7 @@ class Sensitivity:
     scenario: Annotated[Positional[ScenarioName], arg(metavar="SCENARIO")]
     """Of the study."""
     fabric: str = "grey_interlock"
-    """A preset of `r2s.presets`."""
+    """A preset of `r2s.fabrics.presets`."""
     motion: Annotated[tuple[str, ...], arg(metavar="NAME=NUMBER")] = ()
     """Numbers of the motion, such as height=0.3 [m]."""
     noise: float = 1e-3
@@ -184,8 +184,8 @@ class Sensitivity:
     """Print one JSON object: that of an estimate."""
 
     def run(self) -> None:
-        from r2s.estimators.estimate import as_json
-        from r2s.estimators.planned import describe, planned
+        from r2s.estimation.estimate import as_json
+        from r2s.estimation.experiment_design import describe, planned
 
         about = self.fabric, numbers_of(self.motion), self.noise, self.seed
         found = planned(self.scenario, *about)

@@ -12,14 +12,21 @@ import jaxtyping
 import numpy as np
 import pytest
 
-from r2s.cloth import Cloth, ClothState
-from r2s.fabric import Fabric
-from r2s.increment import bending_areas, bends, curvatures, hinge_angles, strains, vertex_mass
-from r2s.mesh import Mesh, rectangle
-from r2s.physics.air import Air
-from r2s.physics.contact import Table
-from r2s.scene import Control, Scene
+from r2s.cloth.cloth import Cloth, ClothState
+from r2s.cloth.potential import (
+    bending_areas,
+    bends,
+    curvatures,
+    hinge_angles,
+    strains,
+    vertex_mass,
+)
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import Mesh, rectangle
 from r2s.units import GRAVITY
+from r2s.world.air import Air
+from r2s.world.contact import Table
+from r2s.world.scene import Control, Scene
 
 jax.config.update("jax_enable_x64", True)
 hypothesis.settings.register_profile("r2s", deadline=None)  # a first example compiles

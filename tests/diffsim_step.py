@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from r2s.increment import curvatures, hinge_angles
-from r2s.mesh import Mesh
-from r2s.physics.bending import hinge_angle
-from r2s.physics.membrane import green_strain
-from r2s.physics.table import DiffSimTableBending, DiffSimTableMembrane
+from r2s.cloth.potential import curvatures, hinge_angles
+from r2s.geometry.mesh import Mesh
+from r2s.laws.bending import hinge_angle
+from r2s.laws.membrane import green_strain
+from r2s.laws.tables import DiffSimTableBending, DiffSimTableMembrane
 
 FOLDER = Path(__file__).parents[2] / "shared" / "data" / "diffsim_reference"
 FRAMES = 61  # as many as the longest of the recordings, so that all share one compilation

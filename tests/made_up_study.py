@@ -7,11 +7,11 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from r2s.mesh import rectangle
-from r2s.study import panel
-from r2s.study.panel import MOTIONS, PAPER_COLUMNS, Column
-from r2s.study.shown import Shown
-from r2s.study.tables import Row
+from r2s.geometry.mesh import rectangle
+from r2s.study.report.scenes import Shown
+from r2s.study.statistics import panel
+from r2s.study.statistics.panel import MOTIONS, PAPER_COLUMNS, Column
+from r2s.study.statistics.tables import Row
 
 FABRICS = ("black_denim", "grey_interlock", "pink_solid")
 METRICS = {"chamfer": ("m", 1.0), "paper_chamfer": ("-", 20.0), "hausdorff": ("m", 3.0)}

@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from r2s import surface as surfaces
-from r2s.mesh import rectangle
-from r2s.observe.calibration import DepthCamera, look_at
-from r2s.observe.cleaning import Cleaning
-from r2s.observe.rgbd import Rig
-from r2s.observe.synthetic_rgbd import write_rgbd
-from r2s.recording import RecordingInfo, SheetPlacement
+from r2s.geometry import surface as surfaces
+from r2s.geometry.mesh import rectangle
+from r2s.recordings.cameras.calibration import DepthCamera, look_at
+from r2s.recordings.cameras.cleaning import Cleaning
+from r2s.recordings.cameras.rgbd import Rig
+from r2s.recordings.cameras.synthetic_rgbd import write_rgbd
+from r2s.recordings.recording import RecordingInfo, SheetPlacement
 
 nearest = jax.jit(surfaces.nearest)
 SAMPLE = 1000

@@ -11,17 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s.cloth import Cloth
-from r2s.estimators.descent import Effort
-from r2s.fabric import Fabric
-from r2s.family import OrthotropicFamily
-from r2s.mesh import rectangle
-from r2s.physics.air import Air
-from r2s.physics.contact import Table
-from r2s.scenario import Scenario, begin, motion, stepped
-from r2s.scene import Scene
-from r2s.surface import nearest
+from r2s.cloth.cloth import Cloth
+from r2s.estimation.descent import Effort
+from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.geometry.mesh import rectangle
+from r2s.geometry.surface import nearest
+from r2s.scenarios.scenario import Scenario, begin, motion, stepped
 from r2s.units import GRAVITY
+from r2s.world.air import Air
+from r2s.world.contact import Table
+from r2s.world.scene import Scene
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 another = importlib.import_module("another_simulator")

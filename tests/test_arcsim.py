@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s.arcsim import read_material, write_material
-from r2s.fabric import Fabric
-from r2s.physics.bending import HingeBending, OrthotropicBending, SpringBending
-from r2s.physics.membrane import SpringMembrane
-from r2s.physics.table import (
+from r2s.fabrics.arcsim import read_material, write_material
+from r2s.fabrics.fabric import Fabric
+from r2s.laws.bending import HingeBending, OrthotropicBending, SpringBending
+from r2s.laws.membrane import SpringMembrane
+from r2s.laws.tables import (
     DiffSimTableBending,
     DiffSimTableMembrane,
     TableBending,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from r2s.estimators import bayes
+from r2s.estimation.physnet import bayes
 
 pytest.importorskip("skopt")
 CENTRE = np.array([0.3, 0.8, 0.55])

@@ -8,10 +8,10 @@ from conftest import directional_difference, flat, rotation, stored_energy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.fabric import Fabric
-from r2s.increment import curvatures, hinge_angles
-from r2s.mesh import rectangle
-from r2s.physics.bending import hinge_angle, unwrapped
+from r2s.cloth.potential import curvatures, hinge_angles
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import rectangle
+from r2s.laws.bending import hinge_angle, unwrapped
 
 STIFFNESS = 3e-5  # [N m]
 gradient = jax.jit(jax.grad(hinge_angle))

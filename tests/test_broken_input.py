@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from rgbd_scene import INFO, PATH, TIMES, write
 
-from r2s.clouds import read_cloud
-from r2s.forces import read_force_log
-from r2s.observe.images import encode_png
-from r2s.observe.rgbd import read_clouds, read_rig, rgbd_recording
-from r2s.recording import load, make_recording, save
+from r2s.recordings.cameras.images import encode_png
+from r2s.recordings.cameras.rgbd import read_clouds, read_rig, rgbd_recording
+from r2s.recordings.readers.clouds import read_cloud
+from r2s.recordings.readers.force_log import read_force_log
+from r2s.recordings.recording import load, make_recording, save
 
 Break = Callable[[Path], Any]
 LEFT = ("cameras", "left")
@@ -69,7 +69,7 @@ def depths(change: Callable[[np.ndarray], np.ndarray]) -> Break:
     """The depth of the left camera as NPY of metres, changed."""
 
     def rewrite(folder: Path) -> None:
-        from r2s.observe.images import read_depth
+        from r2s.recordings.cameras.images import read_depth
 
         edited(*LEFT, "depth_scale", value=1.0)(folder)
         for path in sorted((folder / "left" / "depth").iterdir()):

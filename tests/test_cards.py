@@ -13,15 +13,22 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from r2s import cards, presets
-from r2s.cards import Card, Provenance
-from r2s.estimators.estimate import Condition, Estimate
-from r2s.fabric import Fabric
-from r2s.family import OrthotropicFamily
-from r2s.physics.bending import HingeBending, OrthotropicBending
-from r2s.physics.plate import OrthotropicPlate
-from r2s.physics.table import TableBending, TableMembrane
-from r2s.recording import RecordingInfo, SheetPlacement, load, make_recording, save
+from r2s.estimation import cards
+from r2s.estimation.cards import Card, Provenance
+from r2s.estimation.estimate import Condition, Estimate
+from r2s.fabrics import presets
+from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.laws.bending import HingeBending, OrthotropicBending
+from r2s.laws.plate import OrthotropicPlate
+from r2s.laws.tables import TableBending, TableMembrane
+from r2s.recordings.recording import (
+    RecordingInfo,
+    SheetPlacement,
+    load,
+    make_recording,
+    save,
+)
 
 MEASURED = Provenance(method="measured", version="1.0", date="2026-01-31", assumed=("damping",))
 FAMILY = OrthotropicFamily.make(0.2)

@@ -22,13 +22,13 @@ from conftest import (
     step,
 )
 
-from r2s.cloth import ClothState
-from r2s.fabric import Fabric
-from r2s.increment import hessian, imbalance, potential, vertex_mass
-from r2s.linear.pattern import dense
-from r2s.mesh import rectangle
-from r2s.scene import Control, along_path
+from r2s.cloth.cloth import ClothState
+from r2s.cloth.linear.pattern import dense
+from r2s.cloth.potential import hessian, imbalance, potential, vertex_mass
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import rectangle
 from r2s.units import AIR_DENSITY, GRAVITY
+from r2s.world.scene import Control, along_path
 
 LAW = (300.0, 60.0, 200.0, 80.0)  # [N/m]
 STEPS = np.arange(21)

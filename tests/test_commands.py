@@ -14,14 +14,15 @@ pytest.importorskip("tyro")
 
 from test_cli import stopped  # noqa: E402
 
-from r2s import cards, presets  # noqa: E402
-from r2s.arcsim import read_material  # noqa: E402
-from r2s.cards import Card, Provenance  # noqa: E402
 from r2s.cli import main  # noqa: E402
 from r2s.commands.common import experiment_of, tell  # noqa: E402
 from r2s.commands.doctor import EXCLUDED, EXTRAS, implausible  # noqa: E402
-from r2s.recording import load  # noqa: E402
-from r2s.show import load_trajectory  # noqa: E402
+from r2s.estimation import cards
+from r2s.estimation.cards import Card, Provenance  # noqa: E402
+from r2s.fabrics import presets  # noqa: E402
+from r2s.fabrics.arcsim import read_material  # noqa: E402
+from r2s.recordings.recording import load  # noqa: E402
+from r2s.viewer.pictures import load_trajectory  # noqa: E402
 
 COMMANDS = ["simulate", "estimate", "evaluate", "export", "check-grad", "doctor"]
 SHORT = ["--motion", "num_frames=4", "moving=0.15", "--shape", "3", "3"]

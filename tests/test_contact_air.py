@@ -9,8 +9,9 @@ from conftest import DT, cloth, directional_difference, everywhere, flat, roll, 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.physics.air import Air
-from r2s.physics.contact import (
+from r2s.units import AIR_DENSITY, GRAVITY
+from r2s.world.air import Air
+from r2s.world.contact import (
     PRESSURE_STIFFNESS,
     SLIP_SPEED,
     Table,
@@ -18,7 +19,6 @@ from r2s.physics.contact import (
     normal_potential,
     pressure,
 )
-from r2s.units import AIR_DENSITY, GRAVITY
 
 few = settings(max_examples=25, deadline=None)
 REST_DEPTH = (0.2 * GRAVITY / PRESSURE_STIFFNESS) ** 0.5  # [m], where pressure carries 0.2 kg/m^2

@@ -12,10 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from r2s.data import Dataset, fetch, known_datasets, read_dataset
-from r2s.manifest import Manifest, default_manifest, hash_values, read_manifest
-from r2s.recording import SheetPlacement, cloud
-from r2s.rgbench import read_capture
+from r2s.recordings.datasets import Dataset, fetch, known_datasets, read_dataset
+from r2s.recordings.manifest import (
+    Manifest,
+    default_manifest,
+    hash_values,
+    read_manifest,
+)
+from r2s.recordings.readers.rgbench import read_capture
+from r2s.recordings.recording import SheetPlacement, cloud
 
 MANIFESTS = default_manifest().parent
 CONTENT = np.random.default_rng(0).bytes(300_000)

@@ -11,12 +11,18 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from rgbd_scene import FACES, LENS, camera, surface
 
-from r2s.observe.calibration import calibrated, look_at, project, rays
-from r2s.observe.camera import Camera
-from r2s.observe.depth import back_project, from_world, moved, steps
-from r2s.observe.flaws import NONE, TYPICAL, Flaws, flawed_depth, flawed_mask
-from r2s.observe.images import encode_depth, read_depth, write_depth
-from r2s.observe.render import render
+from r2s.recordings.cameras.calibration import calibrated, look_at, project, rays
+from r2s.recordings.cameras.camera import Camera
+from r2s.recordings.cameras.depth import back_project, from_world, moved, steps
+from r2s.recordings.cameras.flaws import (
+    NONE,
+    TYPICAL,
+    Flaws,
+    flawed_depth,
+    flawed_mask,
+)
+from r2s.recordings.cameras.images import encode_depth, read_depth, write_depth
+from r2s.recordings.cameras.render import render
 
 SMALL = (32, 24)
 LENSES = [(), LENS]

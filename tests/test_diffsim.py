@@ -9,12 +9,12 @@ import pytest
 from conftest import step
 from diffsim_step import FOLDER, load, repeat, wind_force
 
-from r2s.cloth import Cloth
-from r2s.fabric import Fabric
-from r2s.physics.air import Air
-from r2s.physics.contact import Table
-from r2s.scene import Control, Scene
+from r2s.cloth.cloth import Cloth
+from r2s.fabrics.fabric import Fabric
 from r2s.units import GRAVITY
+from r2s.world.air import Air
+from r2s.world.contact import Table
+from r2s.world.scene import Control, Scene
 
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason=f"no trajectories in {FOLDER}")
 

@@ -10,15 +10,17 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from r2s import presets, scenarios, synthetic
-from r2s.estimators import descent, diffcloud, gauss_newton
-from r2s.estimators.descent import Effort, conditions, spread_of
-from r2s.estimators.deviations import FARTHEST, apart, around, covariance
-from r2s.estimators.gauss_newton import Descent, Normal
-from r2s.estimators.planned import describe
-from r2s.estimators.prediction import predict
-from r2s.estimators.problem import Doubt, Problem, beginning
-from r2s.family import OrthotropicFamily
+from r2s import scenarios
+from r2s.estimation import descent, diffcloud, gauss_newton
+from r2s.estimation.descent import Effort, conditions, spread_of
+from r2s.estimation.experiment_design import describe
+from r2s.estimation.gauss_newton import Descent, Normal
+from r2s.estimation.prediction import predict
+from r2s.estimation.problem import Doubt, Problem, beginning
+from r2s.estimation.standard_errors import FARTHEST, apart, around, covariance
+from r2s.fabrics import presets
+from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.scenarios import synthetic
 
 FABRIC = presets.grey_interlock()
 FAMILY = OrthotropicFamily.make(float(FABRIC.density))

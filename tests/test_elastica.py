@@ -15,12 +15,12 @@ from conftest import cloth, flat, roll
 from scipy.integrate import solve_bvp
 from scipy.linalg import eigh
 
-from r2s.fabric import Fabric
-from r2s.increment import bending_areas, bends, curvatures, hinge_angles, strains
-from r2s.mesh import rectangle
-from r2s.physics.bending import OrthotropicBending
-from r2s.physics.membrane import OrthotropicMembrane
-from r2s.physics.plate import OrthotropicPlate, PlateBending, PlateLaw
+from r2s.cloth.potential import bending_areas, bends, curvatures, hinge_angles, strains
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import rectangle
+from r2s.laws.bending import OrthotropicBending
+from r2s.laws.membrane import OrthotropicMembrane
+from r2s.laws.plate import OrthotropicPlate, PlateBending, PlateLaw
 from r2s.units import GRAVITY
 
 LENGTH = 0.2  # [m], with the held cell

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("sklearn")
 
-from r2s.estimators import bayes, emulator  # noqa: E402
+from r2s.estimation.physnet import bayes, emulator  # noqa: E402
 
 TRUTH = np.array([0.3, 0.7, 0.55])
 

@@ -15,9 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r2s.study import cells, engine
-from r2s.study.apart import Apart
 from r2s.study.cells import Cell
 from r2s.study.environment import environment, one_core
+from r2s.study.subprocesses import Apart
 
 
 @dataclass(frozen=True)

@@ -9,16 +9,18 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from r2s import presets, scenarios, synthetic
-from r2s.estimators import adam, cma_es, descent, diffcloud, gauss_newton
-from r2s.estimators.descent import Effort, descend
-from r2s.estimators.estimate import Estimate, as_json, from_json
-from r2s.estimators.evidence import evidence_of, loss_of
-from r2s.estimators.gauss_newton import Descent
-from r2s.estimators.prediction import Seen, Slope, _delayed, predict, sensitivities
-from r2s.estimators.problem import Doubt, Problem, beginning, window
-from r2s.family import OrthotropicFamily, Range
-from r2s.recording import set_time_offset
+from r2s import scenarios
+from r2s.estimation import adam, cma_es, descent, diffcloud, gauss_newton
+from r2s.estimation.descent import Effort, descend
+from r2s.estimation.estimate import Estimate, as_json, from_json
+from r2s.estimation.gauss_newton import Descent
+from r2s.estimation.normal_equations import evidence_of, loss_of
+from r2s.estimation.prediction import Seen, Slope, _delayed, predict, sensitivities
+from r2s.estimation.problem import Doubt, Problem, beginning, window
+from r2s.fabrics import presets
+from r2s.fabrics.parameters import OrthotropicFamily, Range
+from r2s.recordings.recording import set_time_offset
+from r2s.scenarios import synthetic
 
 ALL = Doubt(time=0.05, density=0.2, air=0.3)
 SMALL = Effort(coarse=2, starts=1, iterations=4, shares=(0.5,), around=2)
@@ -390,7 +392,7 @@ def test_wind_finds_a_light_fabric_from_a_random_start():
 @pytest.mark.slow
 def test_a_planned_motion_reveals_more_with_better_cameras():
     """And one that does not move reveals less than one that does."""
-    from r2s.estimators.trust import sensitivity
+    from r2s.estimation.identifiability import sensitivity
 
     def deviations(height, noise):
         experiment = scenarios.lifting(num_frames=8, interval=1 / 10, height=height, moving=0.6)
@@ -409,8 +411,8 @@ def test_a_planned_motion_reveals_more_with_better_cameras():
 
 def test_material_points_find_a_known_modulus():
     """Of an isotropic sheet, by DiffCP; the same sheet of cloth is refused."""
-    from r2s.estimators import diffcp
-    from r2s.family import IsotropicFamily
+    from r2s.estimation import diffcp
+    from r2s.fabrics.parameters import IsotropicFamily
     from r2s.scenarios import material_points
 
     family = IsotropicFamily.make(0.2, plate=5e-4)

@@ -11,14 +11,14 @@ from conftest import stored_energy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s import presets
-from r2s.arcsim import read_material
 from r2s.export import Loss, arcsim, mujoco, newton, pybullet, stiffness, yarns
-from r2s.fabric import Fabric
-from r2s.mesh import Mesh, rectangle
-from r2s.physics.bending import HingeBending, OrthotropicBending
-from r2s.physics.plate import OrthotropicPlate, PlateBending
-from r2s.physics.table import TableMembrane
+from r2s.fabrics import presets
+from r2s.fabrics.arcsim import read_material
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import Mesh, rectangle
+from r2s.laws.bending import HingeBending, OrthotropicBending
+from r2s.laws.plate import OrthotropicPlate, PlateBending
+from r2s.laws.tables import TableMembrane
 from r2s.units import isotropic_membrane
 
 MODULUS, POISSON = 60.0, 0.3  # [N/m], [-]

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from made_up_study import made_up_rows
 
-from r2s.study.factors import share_table, variance_shares
-from r2s.study.panel import PAPER_COLUMNS, Column, make_panel
+from r2s.study.statistics.factors import share_table, variance_shares
+from r2s.study.statistics.panel import PAPER_COLUMNS, Column, make_panel
 
 CROSSED = tuple(
     Column(*names)

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.fabric import Fabric
-from r2s.family import MASS_DAMPING, OrthotropicFamily, Range
-from r2s.presets import FIVE
+from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.parameters import MASS_DAMPING, OrthotropicFamily, Range
+from r2s.fabrics.presets import FIVE
 
 few = settings(max_examples=25, deadline=None)
 FAMILY = OrthotropicFamily.make(0.2)

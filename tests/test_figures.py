@@ -10,8 +10,8 @@ pytest.importorskip("matplotlib")
 
 from PIL import Image  # noqa: E402
 
-from r2s.family import Range  # noqa: E402
-from r2s.study import figures  # noqa: E402
+from r2s.fabrics.parameters import Range  # noqa: E402
+from r2s.study.report import figures  # noqa: E402
 
 RANGES = (
     Range("C11", "N/m", 3.0, 3000.0),
@@ -143,7 +143,7 @@ def test_bars(tmp_path):
 
 
 def test_without_matplotlib_the_extra_is_named(monkeypatch):
-    monkeypatch.delitem(sys.modules, "r2s.study.figures")
+    monkeypatch.delitem(sys.modules, "r2s.study.report.figures")
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"pip install 'r2s\[study\]'"):
-        import r2s.study.figures  # noqa: F401
+        import r2s.study.report.figures  # noqa: F401

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_up_study import FABRICS, few_draws, made_up_rows
 
-from r2s.study.conclusions import CONCLUSIONS
-from r2s.study.findings import find, finding_table, in_words
-from r2s.study.hypotheses import Claim, compare, holm, judge, signed_rank
-from r2s.study.panel import PAPER_COLUMNS, make_panel, select
+from r2s.study.statistics.conclusions import CONCLUSIONS
+from r2s.study.statistics.findings import find, finding_table, in_words
+from r2s.study.statistics.hypotheses import Claim, compare, holm, judge, signed_rank
+from r2s.study.statistics.panel import PAPER_COLUMNS, make_panel, select
 
 DIFFCLOUD_L, DIFFCLOUD_W, DIFFCP = PAPER_COLUMNS[:3]
 PINN_POINTS, PINN_CLOTH = PAPER_COLUMNS[6:]

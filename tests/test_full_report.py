@@ -8,10 +8,10 @@ import pytest
 from made_up_study import few_draws, made_up_rows, made_up_shown
 from test_report import Page
 
-from r2s.family import Range
-from r2s.study import full_report, overlays
-from r2s.study.panel import MOTIONS, PAPER_COLUMNS
-from r2s.study.report import PNG
+from r2s.fabrics.parameters import Range
+from r2s.study.report import full, overlays
+from r2s.study.report.page import PNG
+from r2s.study.statistics.panel import MOTIONS, PAPER_COLUMNS
 
 ENTRY = (
     "diffcloud_denim",
@@ -39,7 +39,7 @@ def published(tmp_path_factory):
     out = tmp_path_factory.mktemp("study")
     shown = [made_up_shown(motion, labels=("DIFFCLOUD cloth lifting", "b")) for motion in MOTIONS]
     shown[1].motions["b"][2:] = np.nan
-    tables = full_report.publish(
+    tables = full.publish(
         out,
         made_up_rows(some_diverged, trials=3),
         [*shown, made_up_shown("folding")],
@@ -94,7 +94,7 @@ def test_findings_come_first(published):
     ids=["nothing", "all diverged", "one column", "default fabric alone"],
 )
 def test_parts_of_a_study_are_reported(tmp_path, rows):
-    full_report.publish(tmp_path, rows)
+    full.publish(tmp_path, rows)
     page = Page((tmp_path / "report.html").read_text())
     assert "Findings" in page.text and "Settings" in page.text
     assert "Columns of the paper that have no result here" in page.text

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from r2s import presets
-from r2s.gradcheck import compare, judge
+from r2s.fabrics import presets
+from r2s.gradient_check import compare, judge
 
 
 def verdict(function, i: int, slope: float) -> str:
@@ -47,7 +47,7 @@ def test_every_number_of_a_fabric_is_checked(forward: bool) -> None:
 
 
 def test_numbers_of_arrays_have_indices() -> None:
-    from r2s.physics.table import TableMembrane
+    from r2s.laws.tables import TableMembrane
 
     table = TableMembrane(jnp.ones((6, 4)))
     fabric = dataclasses.replace(presets.black_denim(), membrane=table)

@@ -8,12 +8,12 @@ import pytest
 from conftest import DT, cloth, directional_difference, everywhere, flat
 from jaxtyping import Array, Float
 
-from r2s.cloth import Cloth
-from r2s.fabric import Fabric
-from r2s.physics.contact import Table
-from r2s.scene import Control, along_path
-from r2s.solver import simulate
+from r2s.cloth.cloth import Cloth
+from r2s.fabrics.fabric import Fabric
+from r2s.rollout import simulate
 from r2s.units import AIR_DENSITY
+from r2s.world.contact import Table
+from r2s.world.scene import Control, along_path
 
 FRAMES, SUBSTEPS = 6, 5
 KNOTS = jnp.linspace(0, FRAMES * SUBSTEPS * DT, 4)

@@ -5,13 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s import presets, scenarios
-from r2s.estimators.hanging import as_seen, registered
-from r2s.family import OrthotropicFamily
-from r2s.losses import surface_residuals
-from r2s.mesh import borders, rectangle
-from r2s.scenario import motion
-from r2s.surface import sample
+from r2s import scenarios
+from r2s.estimation.initial_shape import as_seen, registered
+from r2s.evaluation.losses import surface_residuals
+from r2s.fabrics import presets
+from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.geometry.mesh import borders, rectangle
+from r2s.geometry.surface import sample
+from r2s.scenarios.scenario import motion
 
 SIDE, RADIUS = 0.4, 0.15  # [m]
 

@@ -19,14 +19,15 @@ import pytest
 from browser import BROWSER, needs_browser
 from matplotlib.image import imread
 
-from r2s import metrics, presets, synthetic
-from r2s.family import OrthotropicFamily
-from r2s.interactive import subject as subjects
-from r2s.recording import cloud
-from r2s.scenarios import lifting
-from r2s.surface import sample
+from r2s.evaluation import metrics
+from r2s.fabrics import presets
+from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.geometry.surface import sample
+from r2s.recordings.recording import cloud
+from r2s.scenarios import lifting, synthetic
+from r2s.viewer import subject as subjects
 
-page = pytest.importorskip("r2s.interactive.page", reason="viser is not installed")
+page = pytest.importorskip("r2s.viewer.page", reason="viser is not installed")
 
 FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-sync",
@@ -95,9 +96,9 @@ def test_without_a_recording_there_is_no_error():
 
 def test_without_viser_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    monkeypatch.delitem(sys.modules, "r2s.interactive.page")
+    monkeypatch.delitem(sys.modules, "r2s.viewer.page")
     with pytest.raises(ImportError, match=r"r2s\[viz\]"):
-        importlib.import_module("r2s.interactive.page")
+        importlib.import_module("r2s.viewer.page")
 
 
 def test_a_taken_port_is_said(subject, shown):

@@ -9,14 +9,14 @@ from conftest import DT, SHAPE, SIZE, cloth, everywhere, flat, roll, rotation, s
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.fabric import Fabric
-from r2s.increment import curvatures, hinge_angles, strains
-from r2s.mesh import Mesh
-from r2s.physics.air import STILL, Air, Fan
-from r2s.physics.bending import HingeBending, OrthotropicBending, SpringBending
-from r2s.physics.membrane import OrthotropicMembrane, SpringMembrane
-from r2s.scene import Control
+from r2s.cloth.potential import curvatures, hinge_angles, strains
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import Mesh
+from r2s.laws.bending import HingeBending, OrthotropicBending, SpringBending
+from r2s.laws.membrane import OrthotropicMembrane, SpringMembrane
 from r2s.units import AIR_DENSITY, GRAVITY
+from r2s.world.air import STILL, Air, Fan
+from r2s.world.scene import Control
 
 CELL = SIZE / (SHAPE[0] - 1)  # side of the sheet's squares, [m]
 few = settings(max_examples=25, deadline=None)

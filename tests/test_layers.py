@@ -9,14 +9,20 @@ import numpy as np
 import pytest
 from conftest import cloth, directional_difference, everywhere, flat, roll
 
-from r2s.fabric import Fabric
-from r2s.layers import Layers, colliding, contact_energy, contact_hessians, touching
-from r2s.mesh import Mesh, rectangle
-from r2s.neighbours import Tree, tree
-from r2s.physics.contact import pressure
-from r2s.scene import Control
-from r2s.solver import simulate
+from r2s.cloth.self_contact.broad_phase import Tree, tree
+from r2s.cloth.self_contact.contacts import (
+    Layers,
+    colliding,
+    contact_energy,
+    contact_hessians,
+    touching,
+)
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import Mesh, rectangle
+from r2s.rollout import simulate
 from r2s.units import GRAVITY
+from r2s.world.contact import pressure
+from r2s.world.scene import Control
 
 FABRIC = Fabric.make(0.2, (60.0, 10.0, 60.0, 20.0), 1e-5)
 THICKNESS, RATE = jnp.asarray(1e-3), jnp.asarray(100.0)

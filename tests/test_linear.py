@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import scipy.spatial
 
-from r2s.linear.dissection import levels
-from r2s.linear.factor import factor, solve
-from r2s.linear.pattern import assemble, dense, pinned, product
-from r2s.mesh import Mesh, rectangle
+from r2s.cloth.linear.dissection import levels
+from r2s.cloth.linear.factor import factor, solve
+from r2s.cloth.linear.pattern import assemble, dense, pinned, product
+from r2s.geometry.mesh import Mesh, rectangle
 
 
 def scattered(count: int) -> Mesh:

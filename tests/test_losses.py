@@ -8,7 +8,7 @@ from conftest import directional_difference, flat, rotation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.losses import (
+from r2s.evaluation.losses import (
     OUTLIER_SCALE,
     from_surface,
     huber,
@@ -22,7 +22,7 @@ from r2s.losses import (
     to_surface,
     trimmed_mean,
 )
-from r2s.mesh import borders
+from r2s.geometry.mesh import borders
 
 EVERY = jnp.ones(40, bool)
 chamfer = jax.jit(one_sided_chamfer)

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from r2s.manifest import (
+from r2s.recordings.manifest import (
     Manifest,
     Transform,
     default_manifest,
@@ -25,7 +25,7 @@ from r2s.manifest import (
     read_recordings,
     to_world,
 )
-from r2s.recording import Recording, cloud, corner
+from r2s.recordings.recording import Recording, cloud, corner
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("R2S_DATA") or ROOT.parent / "shared" / "data" / "diffcloud_real")
@@ -37,7 +37,7 @@ MANIFEST: dict[str, Any] = {
     "citation": "nobody",
     "source": {"repository": "nobody/nothing", "commit": "0", "path": "."},
     "licence": "none",
-    "hash": "see r2s.manifest.hash_values",
+    "hash": "see r2s.recordings.manifest.hash_values",
     "note": "",
     "files": {},
     "scenarios": {

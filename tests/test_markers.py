@@ -10,15 +10,15 @@ import pytest
 
 cv2 = pytest.importorskip("cv2")
 
-from r2s.markers import Tracks, detect, find_grid, track  # noqa: E402
-from r2s.plane import (  # noqa: E402
+from r2s.recordings.readers.markers import Tracks, detect, find_grid, track  # noqa: E402
+from r2s.recordings.readers.plane import (  # noqa: E402
     checkerboard,
     on_table,
     plane_homography,
     to_metres,
     undistort,
 )
-from r2s.video import read_grey  # noqa: E402
+from r2s.recordings.readers.video import read_grey  # noqa: E402
 
 SIZE = (1280, 720)  # [px]
 PITCH, RADIUS = 0.045, 0.006  # [m], of a sheet of 0.45 m

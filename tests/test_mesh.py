@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.mesh import Mesh, borders, corner, rectangle
+from r2s.geometry.mesh import Mesh, borders, corner, rectangle
 
 sides = st.floats(0.01, 10)
 counts = st.integers(2, 6)

@@ -11,13 +11,13 @@ import pytest
 from mpm_bodies import box, lattice, momenta, small_block, solid, states, still
 
 import r2s
+from r2s.laws.solid import FixedCorotated, LinearSolid, NeoHookean
 from r2s.mpm import Background, Block, Grid, Surface, diagnose, layered
 from r2s.mpm.block import stable_step
-from r2s.physics.air import Air
-from r2s.physics.contact import Table
-from r2s.physics.solid import FixedCorotated, LinearSolid, NeoHookean
-from r2s.scene import Control
 from r2s.units import GRAVITY
+from r2s.world.air import Air
+from r2s.world.contact import Table
+from r2s.world.scene import Control
 
 STEPS = still(1, 60, 2)
 

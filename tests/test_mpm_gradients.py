@@ -12,13 +12,13 @@ from jaxtyping import Array, Float
 from mpm_bodies import lattice
 
 import r2s
-from r2s.fabric import Fabric
+from r2s.fabrics.fabric import Fabric
+from r2s.laws.solid import FixedCorotated, NeoHookean, Solid
 from r2s.mpm import Background, Block, Grid, Sheet
-from r2s.physics.air import Air
-from r2s.physics.contact import Table
-from r2s.physics.solid import FixedCorotated, NeoHookean, Solid
-from r2s.scene import Control, Scene
-from r2s.solver import simulate
+from r2s.rollout import simulate
+from r2s.world.air import Air
+from r2s.world.contact import Table
+from r2s.world.scene import Control, Scene
 
 REFERENCE = Path(__file__).resolve().parents[2] / "shared" / "data" / "difftaichi_reference"
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import r2s
-from r2s import presets
+from r2s.fabrics import presets
+from r2s.laws.solid import FixedCorotated, Solid
 from r2s.mpm import Background, Block, Grid, Sheet, block, diagnose, layered, sheet
-from r2s.physics.air import Air
-from r2s.physics.contact import Table
-from r2s.physics.solid import FixedCorotated, Solid
+from r2s.world.air import Air
+from r2s.world.contact import Table
 
 SIDE, SHAPE = 0.45, (17, 17)
 FRAMES, INTERVAL = 60, 1 / 15  # [s]

@@ -11,17 +11,17 @@ from conftest import SIZE, everywhere, flat, rotation, stored_energy
 from mpm_bodies import momenta, states, still
 
 import r2s
-from r2s.fabric import Fabric
-from r2s.increment import vertex_mass
+from r2s.cloth.potential import vertex_mass
+from r2s.fabrics.fabric import Fabric
+from r2s.laws.bending import HingeBending
 from r2s.mpm import Grid, Sheet
 from r2s.mpm.elements import bending_frequency, elastic_force, membrane_frequency
 from r2s.mpm.sheet import stable_step
 from r2s.mpm.transverse import Transverse, unit_normal
-from r2s.physics.air import Air
-from r2s.physics.bending import HingeBending
-from r2s.physics.contact import Table
-from r2s.scene import Control, Scene
 from r2s.units import GRAVITY
+from r2s.world.air import Air
+from r2s.world.contact import Table
+from r2s.world.scene import Control, Scene
 
 SPACING = 0.05
 

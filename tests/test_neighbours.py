@@ -8,9 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s.mesh import rectangle
-from r2s.neighbours import Pairs, all_pairs, near, near_in_tree, tree
-from r2s.physics.proximity import closest_weights, separation
+from r2s.cloth.self_contact.broad_phase import (
+    Pairs,
+    all_pairs,
+    near,
+    near_in_tree,
+    tree,
+)
+from r2s.cloth.self_contact.proximity import closest_weights, separation
+from r2s.geometry.mesh import rectangle
 
 SIZE = 0.2  # of the sheets' sides, [m]
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 import r2s
-from r2s.manifest import default_manifest
+from r2s.recordings.manifest import default_manifest
 
 ROOT = Path(__file__).parents[1]
 MANIFESTS = ROOT / "data_manifests"

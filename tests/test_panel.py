@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from made_up_study import made_up_rows
 
-from r2s.study.distances import distance_table, means
-from r2s.study.panel import (
+from r2s.study.statistics.distances import distance_table, means
+from r2s.study.statistics.panel import (
     PAPER_COLUMNS,
     Column,
     columns_of,
@@ -19,7 +19,7 @@ from r2s.study.panel import (
     resamples,
     select,
 )
-from r2s.study.tables import Row
+from r2s.study.statistics.tables import Row
 
 LIFTING = PAPER_COLUMNS[0]
 

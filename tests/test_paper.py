@@ -5,8 +5,8 @@ import math
 import pytest
 from made_up_study import made_up_rows
 
-from r2s.study.panel import MOTIONS, Column
-from r2s.study.paper import average, beside_paper, paper_tables, read_paper
+from r2s.study.statistics.panel import MOTIONS, Column
+from r2s.study.statistics.paper import average, beside_paper, paper_tables, read_paper
 
 HEADER = "metric,fabric,diffcloud-diffsim-lifting,pinn-difftaichi-stretching\n"
 LINES = "CD,Black Denim,0.25,0.5\nCD,Red Jet Set,0.75,1.5\nCD,Average,9,9\nHD,Black Denim,1.25,2\n"

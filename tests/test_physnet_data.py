@@ -6,11 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s.estimators import physnet
-from r2s.estimators.physnet import Sighting
-from r2s.physnet import dataset, preprocess, training
-from r2s.physnet.dataset import Settings
-from r2s.physnet.network import Architecture
+from r2s.estimation.physnet import dataset, estimator, preprocess, training
+from r2s.estimation.physnet.dataset import Settings
+from r2s.estimation.physnet.estimator import Sighting
+from r2s.estimation.physnet.network import Architecture
 
 TINY = Settings(
     num_fabrics=3, num_levels=2, num_frames=2, size=16, shape=(3, 3), per_shard=2, seed=5
@@ -87,7 +86,7 @@ def test_the_distance_is_least_at_the_fabric_that_was_seen(sighting, folder):
     truth = jnp.asarray(dataset.load(folder).places[0])
     rough, soft = truth.at[6].set(1 - truth[6]), truth.at[2].set(1 - truth[2])
     places = jnp.stack([truth, rough, soft, jnp.full_like(truth, jnp.nan)])
-    found = physnet.distances(sighting, places)
+    found = estimator.distances(sighting, places)
     assert 10 * float(found[0]) < min(float(found[1]), float(found[2]))  # the files round depths
     assert np.isnan(found[3])
 
@@ -95,21 +94,21 @@ def test_the_distance_is_least_at_the_fabric_that_was_seen(sighting, folder):
 def test_an_estimate_goes_on_and_is_the_last_of_what_was_tried(sighting, tmp_path):
     pytest.importorskip("sklearn")
     path = tmp_path / "trials.npz"
-    first = physnet.estimate(sighting, num_calls=12, path=path)
+    first = estimator.estimate(sighting, num_calls=12, path=path)
     assert first.loss == first.losses[-1] and first.losses.shape == (12, 1)
-    again = physnet.estimate(sighting, num_calls=12, path=path)
+    again = estimator.estimate(sighting, num_calls=12, path=path)
     np.testing.assert_array_equal(first.history, again.history)
     place = TINY.family.locate(first.fabric)
-    loss = physnet.distances(sighting, jnp.stack([place] * 4))[0]
+    loss = estimator.distances(sighting, jnp.stack([place] * 4))[0]
     np.testing.assert_allclose(loss, first.loss, rtol=1e-3)
     assert not first.determined.any()
 
 
 def test_the_studys_search_gives_the_best_of_what_was_tried(sighting, tmp_path):
     pytest.importorskip("skopt")
-    first = physnet.original(sighting, num_calls=6, path=tmp_path / "history.npz")
+    first = estimator.original(sighting, num_calls=6, path=tmp_path / "history.npz")
     assert first.loss == first.losses.min() and first.losses.shape == (6, 1)
-    again = physnet.original(sighting, num_calls=6, path=tmp_path / "history.npz")
+    again = estimator.original(sighting, num_calls=6, path=tmp_path / "history.npz")
     np.testing.assert_array_equal(first.history, again.history)
 
 

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s.family import Range
-from r2s.physnet import pictures, training, triplets
-from r2s.physnet.dataset import STEP, Data
-from r2s.physnet.network import DEEPER, PAPER, Architecture, PhysNet
-from r2s.physnet.preprocess import Flaws
-from r2s.physnet.training import Schedule
-from r2s.physnet.views import View
+from r2s.estimation.physnet import pictures, training, triplets
+from r2s.estimation.physnet.dataset import STEP, Data
+from r2s.estimation.physnet.network import DEEPER, PAPER, Architecture, PhysNet
+from r2s.estimation.physnet.preprocess import Flaws
+from r2s.estimation.physnet.training import Schedule
+from r2s.estimation.physnet.views import View
+from r2s.fabrics.parameters import Range
 
 VIEW = View((0.0, -1.0, 0.0), (0.0, 0.0, 0.0), 16.0, 16, 0.5, 1.5, -1.0)
 SMALL = Architecture(size=16, channels=(4, 4), hidden=(16,))

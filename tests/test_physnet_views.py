@@ -8,13 +8,19 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from r2s import scenarios, synthetic
-from r2s.mesh import rectangle
-from r2s.observe.calibration import DepthCamera, calibrated, frustum, look_at
-from r2s.observe.camera import Camera
-from r2s.observe.render import render
-from r2s.physnet import preprocess, views
-from r2s.physnet.views import View
+from r2s import scenarios
+from r2s.estimation.physnet import preprocess, views
+from r2s.estimation.physnet.views import View
+from r2s.geometry.mesh import rectangle
+from r2s.recordings.cameras.calibration import (
+    DepthCamera,
+    calibrated,
+    frustum,
+    look_at,
+)
+from r2s.recordings.cameras.camera import Camera
+from r2s.recordings.cameras.render import render
+from r2s.scenarios import synthetic
 
 VIEW = View((0.1, -0.4, 0.6), (0.1, 0.1, 0.1), 40.0, 32, 0.4, 1.0, -1.0)
 MESH = rectangle((0.3, 0.3), (4, 4))

@@ -10,17 +10,16 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from r2s import presets, synthetic
-from r2s.estimators import pinn_clouds
-from r2s.fabric import Fabric
-from r2s.family import OrthotropicFamily
-from r2s.mesh import rectangle
-from r2s.physics.air import Air
-from r2s.pinn import clouds, shell
-from r2s.pinn.clouds import Sight, above, fixed, sight_of
-from r2s.pinn.network import Jet, Network
-from r2s.pinn.shell import Hanging, curvature, loose, splines, work_scale
-from r2s.scenarios import lifting, wind
+from r2s.estimation.pinn import clouds, from_clouds, shell
+from r2s.estimation.pinn.clouds import Sight, above, fixed, sight_of
+from r2s.estimation.pinn.network import Jet, Network
+from r2s.estimation.pinn.shell import Hanging, curvature, loose, splines, work_scale
+from r2s.fabrics import presets
+from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.geometry.mesh import rectangle
+from r2s.scenarios import lifting, synthetic, wind
+from r2s.world.air import Air
 
 SIZE, TIMES = (0.3, 0.2), (0.0, 0.5, 1.0)  # [m], [s]
 DENSITY = 0.2  # [kg/m^2]
@@ -281,8 +280,8 @@ def test_the_map_comes_to_lie_where_the_points_are():
     family = OrthotropicFamily.make(float(fabric.density))
     with jax.numpy_dtype_promotion("standard"):
         seen = synthetic.record(wind(), fabric, "grey_interlock", shape=(17, 17), key=jr.key(11))
-        few = pinn_clouds.Settings(rounds=10)
-        found = pinn_clouds.estimate(seen, family, few, key=jr.key(0))
+        few = from_clouds.Settings(rounds=10)
+        found = from_clouds.estimate(seen, family, few, key=jr.key(0))
     spreads = np.sqrt(found.losses[:, 0])  # [m]
     assert spreads[-1] < 0.5 * spreads[0]
     assert found.values[0] < 0.5 * family.values(jnp.full(family.dim, 0.5))[0]  # softer
@@ -293,4 +292,4 @@ def test_a_wind_that_is_still_rising_does_not_count():
     seen = recorded(wind())
     windy = dataclasses.replace(seen.info, wind=(0.0, 2.0, 0.0))
     with pytest.raises(ValueError, match="after the wind rises"):
-        pinn_clouds.estimate(dataclasses.replace(seen, info=windy), FAMILY, key=jr.key(0))
+        from_clouds.estimate(dataclasses.replace(seen, info=windy), FAMILY, key=jr.key(0))

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s.pinn.data import pull_from, stacked
-from r2s.recording import RecordingInfo, make_recording
+from r2s.estimation.pinn.data import pull_from, stacked
+from r2s.recordings.recording import RecordingInfo, make_recording
 from r2s.scenarios import stretching
 
 FRAMES, SIDE, PULLED, FORCE = 9, 0.45, 0.018, 4.0  # [m], [m], [N]

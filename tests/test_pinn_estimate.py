@@ -12,21 +12,21 @@ import numpy as np
 import pytest
 
 import r2s
-from r2s import presets
-from r2s.estimators.estimate import as_json, from_json
-from r2s.estimators.pinn import QUICK, estimate, estimate_all
-from r2s.family import OrthotropicFamily
-from r2s.pinn import balance as balancing
-from r2s.pinn import paper
-from r2s.pinn.balance import balance, basis_of, prepared, reduced, solve
-from r2s.pinn.data import Clamp, Pull, pull_from, stacked
-from r2s.pinn.laws import small
-from r2s.pinn.losses import Losses, motion_residual
-from r2s.pinn.network import Network
-from r2s.pinn.synthetic import pulled
-from r2s.pinn.training import Recipe, train, trainable
-from r2s.scenario import motion
+from r2s.estimation.estimate import as_json, from_json
+from r2s.estimation.pinn import balance as balancing
+from r2s.estimation.pinn import published_recipe
+from r2s.estimation.pinn.balance import balance, basis_of, prepared, reduced, solve
+from r2s.estimation.pinn.data import Clamp, Pull, pull_from, stacked
+from r2s.estimation.pinn.from_pulls import QUICK, estimate, estimate_all
+from r2s.estimation.pinn.laws import small
+from r2s.estimation.pinn.losses import Losses, motion_residual
+from r2s.estimation.pinn.network import Network
+from r2s.estimation.pinn.synthetic_pulls import pulled
+from r2s.estimation.pinn.training import Recipe, train, trainable
+from r2s.fabrics import presets
+from r2s.fabrics.parameters import OrthotropicFamily
 from r2s.scenarios import fling, folding, shaking
+from r2s.scenarios.scenario import motion
 
 SIZE, DENSITY, FRAMES = (0.45, 0.45), 0.2, 6
 WARP, PULLED = 80.0, 0.02  # [N/m], [m]
@@ -68,7 +68,7 @@ def small_network(pull: Pull) -> Network:
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
     """Few virtual displacements, so that it compiles fast; the slow tests undo it."""
-    monkeypatch.setattr("r2s.estimators.pinn.DEGREES", (3, 3))
+    monkeypatch.setattr("r2s.estimation.pinn.from_pulls.DEGREES", (3, 3))
     fewer = lambda pull, degrees=(3, 3): basis_of(pull, (3, 3))
     monkeypatch.setattr(balancing, "basis_of", fewer)
 
@@ -175,32 +175,32 @@ def test_training_lowers_the_losses_of_the_strong_form():
 
 def test_the_papers_weight_anneals():
     epochs = jnp.array([0, 499, 500, 4499, 4500, 9999])
-    np.testing.assert_allclose(paper.weight(epochs), [0.1, 0.1, 0.2, 0.9, 1.0, 1.0])
+    np.testing.assert_allclose(published_recipe.weight(epochs), [0.1, 0.1, 0.2, 0.9, 1.0, 1.0])
 
 
 def test_the_papers_recipe_runs_and_sees_no_force(monkeypatch):
-    monkeypatch.setattr(paper, "LAYERS", 3)
-    monkeypatch.setattr(paper, "WIDTH", 5)
+    monkeypatch.setattr(published_recipe, "LAYERS", 3)
+    monkeypatch.setattr(published_recipe, "WIDTH", 5)
     pulls = stacked([even_pull(frames=4)])
-    assert paper.plain(pulls).force is None
+    assert published_recipe.plain(pulls).force is None
     with jax.numpy_dtype_promotion("standard"):
-        course = paper.train(FAMILY, pulls, jnp.full(7, 0.4), 4, 2, key=jr.key(0))
+        course = published_recipe.train(FAMILY, pulls, jnp.full(7, 0.4), 4, 2, key=jr.key(0))
     assert course.data.shape == (2,) and np.isfinite(course.motion).all()
 
 
 def test_a_step_that_went_astray_is_taken_back(monkeypatch):
     """To the model before it and without memory, when the losses are greater than they were."""
-    monkeypatch.setattr(paper, "LAYERS", 3)
-    monkeypatch.setattr(paper, "WIDTH", 5)
-    pulls = paper.plain(stacked([even_pull(frames=4)]))
+    monkeypatch.setattr(published_recipe, "LAYERS", 3)
+    monkeypatch.setattr(published_recipe, "WIDTH", 5)
+    pulls = published_recipe.plain(stacked([even_pull(frames=4)]))
     with jax.numpy_dtype_promotion("standard"):
-        model = paper.begin(FAMILY, pulls, jnp.full(7, 0.4), key=jr.key(0))
-        fresh = paper.untouched(model)
+        model = published_recipe.begin(FAMILY, pulls, jnp.full(7, 0.4), key=jr.key(0))
+        fresh = published_recipe.untouched(model)
         about = FAMILY, pulls, jnp.asarray(0), 1
-        after, state, _ = paper.run(model, fresh, *about)
+        after, state, _ = published_recipe.run(model, fresh, *about)
         assert not eqx.tree_equal(after, model) and np.isfinite(state.before)
         worse = state._replace(before=jnp.zeros(()))
-        same, state, _ = paper.run(after, worse, *about)
+        same, state, _ = published_recipe.run(after, worse, *about)
     assert eqx.tree_equal(same, after)
     assert eqx.tree_equal(state.ahead, eqx.filter(after, trainable(after)))
     assert all(not np.any(leaf) for leaf in jax.tree.leaves(state.lbfgs[0].diff_params_memory))
@@ -209,9 +209,9 @@ def test_a_step_that_went_astray_is_taken_back(monkeypatch):
 
 def test_the_gradient_made_along_with_the_sum_is_that_of_the_sum():
     """Of the recipe's loss of the motion, in the networks and the fabric of two pulls."""
-    pulls = paper.plain(stacked([even_pull(frames=4), even_pull(frames=4)]))
+    pulls = published_recipe.plain(stacked([even_pull(frames=4), even_pull(frames=4)]))
     with jax.numpy_dtype_promotion("standard"):
-        model = paper.begin(FAMILY, pulls, jnp.full(7, 0.4), key=jr.key(0))
+        model = published_recipe.begin(FAMILY, pulls, jnp.full(7, 0.4), key=jr.key(0))
     weights, fixed = eqx.partition(model, trainable(model))
 
     def at_once(weights):
@@ -222,7 +222,9 @@ def test_the_gradient_made_along_with_the_sum_is_that_of_the_sum():
         residual = lambda network, pull: motion_residual(network, pull, *about)
         return jnp.mean(jax.vmap(residual)(model.networks, pulls) ** 2)
 
-    found = jax.value_and_grad(lambda w: paper.losses(eqx.combine(w, fixed), FAMILY, pulls)[1])
+    found = jax.value_and_grad(
+        lambda w: published_recipe.losses(eqx.combine(w, fixed), FAMILY, pulls)[1]
+    )
     (one, slope), (other, wanted) = found(weights), jax.value_and_grad(at_once)(weights)
     slope, wanted = (np.asarray(jax.flatten_util.ravel_pytree(g)[0]) for g in (slope, wanted))
     assert np.abs(wanted).max() > 0

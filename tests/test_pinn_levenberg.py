@@ -10,13 +10,18 @@ import pytest
 from test_pinn_losses import DENSITY, FABRIC, SIZE, waves
 from test_pinn_losses import exact as in_closed_form
 
-from r2s.family import IsotropicFamily, OrthotropicFamily
-from r2s.pinn import exact
-from r2s.pinn.data import Clamp, Pull
-from r2s.pinn.laws import PlaneStrainFamily, small
-from r2s.pinn.levenberg import Term, least_squares, marginal, normal_equations
-from r2s.pinn.losses import edge_force, marker_residual
-from r2s.pinn.network import Network
+from r2s.estimation.pinn import exact
+from r2s.estimation.pinn.data import Clamp, Pull
+from r2s.estimation.pinn.laws import PlaneStrainFamily, small
+from r2s.estimation.pinn.levenberg import (
+    Term,
+    least_squares,
+    marginal,
+    normal_equations,
+)
+from r2s.estimation.pinn.losses import edge_force, marker_residual
+from r2s.estimation.pinn.network import Network
+from r2s.fabrics.parameters import IsotropicFamily, OrthotropicFamily
 
 
 def of_line(unknown, about, row):

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from jaxtyping import Array
 
-from r2s.fabric import Fabric
-from r2s.physics.membrane import OrthotropicMembrane
-from r2s.pinn import losses as strong
-from r2s.pinn import weak
-from r2s.pinn.data import Clamp, Pull
-from r2s.pinn.laws import green, small
-from r2s.pinn.losses import draw_points, plain_scales, scales_of
-from r2s.pinn.network import Jet, Network
-from r2s.pinn.weak import end_value, virtual_fields, weak_losses
+from r2s.estimation.pinn import losses as strong
+from r2s.estimation.pinn import weak
+from r2s.estimation.pinn.data import Clamp, Pull
+from r2s.estimation.pinn.laws import green, small
+from r2s.estimation.pinn.losses import draw_points, plain_scales, scales_of
+from r2s.estimation.pinn.network import Jet, Network
+from r2s.estimation.pinn.weak import end_value, virtual_fields, weak_losses
+from r2s.fabrics.fabric import Fabric
+from r2s.laws.membrane import OrthotropicMembrane
 
 # compiled as a whole, which is faster than one operation after the other
 compiled: Any = eqx.filter_jit

@@ -8,12 +8,7 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from r2s.fabric import Fabric
-from r2s.family import IsotropicFamily
-from r2s.mesh import rectangle
-from r2s.physics.membrane import OrthotropicMembrane
-from r2s.physics.solid import LinearSolid
-from r2s.pinn.laws import (
+from r2s.estimation.pinn.laws import (
     PlaneStrainFamily,
     TurnedMembrane,
     divergence,
@@ -22,7 +17,12 @@ from r2s.pinn.laws import (
     small,
     turned,
 )
-from r2s.pinn.network import STRONG, WEAK, Network
+from r2s.estimation.pinn.network import STRONG, WEAK, Network
+from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.parameters import IsotropicFamily
+from r2s.geometry.mesh import rectangle
+from r2s.laws.membrane import OrthotropicMembrane
+from r2s.laws.solid import LinearSolid
 
 FABRIC = Fabric.make(0.3, (200.0, 40.0, 120.0, 30.0), 1e-5, damping=0.02)
 ANGLE = jnp.asarray(0.4)
@@ -134,7 +134,7 @@ def test_plane_stress_is_softer_than_plane_strain():
 
 def test_a_turned_law_stretches_a_sheet_of_the_cloth():
     """The stored energy of a stretched mesh is that of the law at its strain."""
-    from r2s.scenarios.account import stored_energy
+    from r2s.scenarios.energy_balance import stored_energy
 
     mesh = rectangle((0.2, 0.2), (3, 3))
     fabric = dataclasses.replace(FABRIC, membrane=TurnedMembrane(FABRIC.membrane, ANGLE))

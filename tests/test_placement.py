@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from r2s.study.placement import FARTHEST, TURN, Placement, moved, nearest
+from r2s.evaluation.placement import FARTHEST, TURN, Placement, moved, nearest
 
 
 def surface(count: int, seed: int) -> list[np.ndarray]:

@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 
-from r2s.fabric import Fabric
-from r2s.increment import curvatures, hessian, hinge_angles, imbalance
-from r2s.mesh import Mesh, rectangle
-from r2s.physics.plate import OrthotropicPlate, PlateBending
-from r2s.scene import Control
+from r2s.cloth.potential import curvatures, hessian, hinge_angles, imbalance
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import Mesh, rectangle
+from r2s.laws.plate import OrthotropicPlate, PlateBending
+from r2s.world.scene import Control
 
 SLIGHT = 1e-4  # so that angles are slopes
 numbers = st.floats(-1.0, 1.0)

@@ -8,8 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from r2s.physics import proximity
-from r2s.physics.proximity import closest_weights, separation, time_of_impact
+from r2s.cloth.self_contact import proximity
+from r2s.cloth.self_contact.proximity import (
+    closest_weights,
+    separation,
+    time_of_impact,
+)
 from tests.conftest import rotation
 
 COUNT = 600  # pairs in a batch, all of the same shape to share compilations

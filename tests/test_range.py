@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from conftest import cloth, flat
 
-from r2s.fabric import Fabric
-from r2s.mesh import rectangle
-from r2s.scene import Control
-from r2s.solver import simulate
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import rectangle
+from r2s.rollout import simulate
+from r2s.world.scene import Control
 
 STIFFNESSES = (1.0, 1e2, 1e4)  # [N/m]
 BENDINGS = (1e-7, 1e-5, 1e-3)  # [N m]

@@ -7,8 +7,8 @@ import pytest
 from made_up_study import few_draws, made_up_rows
 from scipy import stats
 
-from r2s.study.panel import PAPER_COLUMNS, make_panel
-from r2s.study.ranks import critical_difference, rank, rank_table
+from r2s.study.statistics.panel import PAPER_COLUMNS, make_panel
+from r2s.study.statistics.ranks import critical_difference, rank, rank_table
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from r2s.files import write_bytes, write_json
-from r2s.recording import (
+from r2s.recordings.recording import (
     Recording,
     RecordingInfo,
     SheetPlacement,
@@ -77,7 +77,7 @@ def test_the_import_needs_no_extras() -> None:
     code = (
         "import sys; extras = 'trimesh', 'pypcd4', 'cv2', 'matplotlib', 'tqdm';"
         "sys.modules.update(dict.fromkeys(extras));"
-        "import r2s.recording, r2s.clouds, r2s.manifest"
+        "import r2s.recordings.recording, r2s.recordings.readers.clouds, r2s.recordings.manifest"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 

@@ -12,12 +12,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from rgbd_scene import INFO, PATH, TIMES, camera, distances, rig, surface, write
 
-from r2s.manifest import manifest_for, read_recording
-from r2s.observe.calibration import DepthCamera, look_at
-from r2s.observe.cleaning import Cleaning, clean, inside, outliers
-from r2s.observe.flaws import NONE
-from r2s.observe.images import encode_png, read_depth, read_mask
-from r2s.observe.rgbd import (
+from r2s.recordings.cameras.calibration import DepthCamera, look_at
+from r2s.recordings.cameras.cleaning import Cleaning, clean, inside, outliers
+from r2s.recordings.cameras.flaws import NONE
+from r2s.recordings.cameras.images import encode_png, read_depth, read_mask
+from r2s.recordings.cameras.rgbd import (
     Rig,
     find_rig,
     read_clouds,
@@ -26,9 +25,10 @@ from r2s.observe.rgbd import (
     stream,
     write_rig,
 )
-from r2s.observe.summary import summarise, table
-from r2s.observe.timing import pair, read_times
-from r2s.recording import cloud, load, make_recording, save
+from r2s.recordings.cameras.timing import pair, read_times
+from r2s.recordings.manifest import manifest_for, read_recording
+from r2s.recordings.recording import cloud, load, make_recording, save
+from r2s.recordings.summary import summarise, table
 
 
 @pytest.fixture(scope="module")
@@ -285,9 +285,10 @@ def test_a_simulated_fabric_comes_back_within_2_mm(motion_of: str, tmp_path: Pat
     """Two 720p cameras with the flaws of real ones, a soft sheet that is lifted or folded."""
     import jax.random as jr
 
-    from r2s import presets, synthetic
-    from r2s.observe.synthetic_rgbd import write_rgbd
-    from r2s.scenario import from_recording, motion
+    from r2s.fabrics import presets
+    from r2s.recordings.cameras.synthetic_rgbd import write_rgbd
+    from r2s.scenarios import synthetic
+    from r2s.scenarios.scenario import from_recording, motion
 
     fabric = presets.grey_interlock()
     recorded = getattr(synthetic, motion_of)(fabric, "grey", 1, key=jr.key(0))

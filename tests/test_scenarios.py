@@ -8,16 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s import presets, scenarios
-from r2s.fabric import Fabric
-from r2s.mesh import rectangle
-from r2s.physics.bending import HingeBending
-from r2s.physics.table import HINGE_FACTOR, TableBending
-from r2s.recording import RecordingInfo, make_recording
-from r2s.scenario import from_recording, motion
-from r2s.scenarios.account import stored_energy, stretch
-from r2s.scenarios.experiments import CLEARANCE, SIX
-from r2s.trajectories import Route
+from r2s import scenarios
+from r2s.fabrics import presets
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import rectangle
+from r2s.laws.bending import HingeBending
+from r2s.laws.tables import HINGE_FACTOR, TableBending
+from r2s.recordings.recording import RecordingInfo, make_recording
+from r2s.scenarios.energy_balance import stored_energy, stretch
+from r2s.scenarios.paths import Route
+from r2s.scenarios.scenario import from_recording, motion
+from r2s.scenarios.six import CLEARANCE, SIX
 from r2s.units import GRAVITY
 
 SHAPE = (5, 5)

@@ -11,15 +11,15 @@ pytest.importorskip("matplotlib")
 from matplotlib.figure import Figure  # noqa: E402
 from PIL import Image  # noqa: E402
 
-from r2s.manifest import default_manifest  # noqa: E402
-from r2s.recording import (  # noqa: E402
+from r2s.recordings.manifest import default_manifest  # noqa: E402
+from r2s.recordings.recording import (
     Recording,
     RecordingInfo,
     SheetPlacement,
     make_recording,
     save,
 )
-from r2s.show import (  # noqa: E402
+from r2s.viewer.pictures import (
     SimulatedCloth,
     _force_curve,
     _mark,

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s.physics.solid import (
+from r2s.laws.solid import (
     FixedCorotated,
     LinearSolid,
     NeoHookean,

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from conftest import DT, FIRST_ROW, SIZE, cloth, energy, flat, roll, rotation
 
-from r2s.fabric import Fabric
-from r2s.increment import imbalance
-from r2s.mesh import Mesh, rectangle
-from r2s.physics.contact import PRESSURE_STIFFNESS, pressure
-from r2s.scene import Control
+from r2s.cloth.potential import imbalance
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import Mesh, rectangle
 from r2s.units import GRAVITY
+from r2s.world.contact import PRESSURE_STIFFNESS, pressure
+from r2s.world.scene import Control
 
 LONG = 5.0  # [s]: in a step as long as this, inertia and damping hardly count
 DENSITY = 0.2  # [kg/m^2]

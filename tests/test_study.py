@@ -11,16 +11,19 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from r2s import presets, synthetic
-from r2s.arcsim import write_material
-from r2s.estimators.estimate import without_deviations
-from r2s.recording import cloud
-from r2s.scenarios.experiments import SIX
-from r2s.study import engine, estimates, judge, matrix, results, tables
+from r2s.estimation.estimate import without_deviations
+from r2s.evaluation import prediction_error
+from r2s.fabrics import presets
+from r2s.fabrics.arcsim import write_material
+from r2s.recordings.recording import cloud
+from r2s.scenarios import synthetic
+from r2s.scenarios.six import SIX
+from r2s.study import engine, estimates, matrix, results
 from r2s.study.cells import needs
 from r2s.study.estimates import Estimated, Trained
-from r2s.study.panel import MOTIONS, PAPER_COLUMNS, Column
-from r2s.study.truths import Made, Making, strain_dependent
+from r2s.study.sources import Made, Making, strain_dependent
+from r2s.study.statistics import tables
+from r2s.study.statistics.panel import MOTIONS, PAPER_COLUMNS, Column
 
 ROOT = Path(__file__).parents[1]
 
@@ -31,13 +34,17 @@ def fold():
 
 
 def test_a_recording_is_at_no_distance_from_itself(fold):
-    found = judge.against_recording(fold, fold)
+    found = prediction_error.against_recording(fold, fold)
     assert all(value == 0 for value in found.values())
 
 
 def test_the_true_fabric_is_nearer_than_another_and_than_noise_allows(fold):
-    truth = judge.against_motion(fold, judge.predict(fold, presets.grey_interlock()))
-    other = judge.against_motion(fold, judge.predict(fold, presets.pink_solid()))
+    truth = prediction_error.against_motion(
+        fold, prediction_error.predict(fold, presets.grey_interlock())
+    )
+    other = prediction_error.against_motion(
+        fold, prediction_error.predict(fold, presets.pink_solid())
+    )
     # 1 mm of noise, sampling of the surface every 5 mm, one point in a hundred 0.2 m away
     assert truth["chamfer_real_to_sim"] < 0.007
     assert truth["chamfer_real_to_sim"] < other["chamfer_real_to_sim"]
@@ -49,7 +56,9 @@ def test_a_whole_surface_tells_the_true_fabric_by_every_metric():
     seen = synthetic.record(experiment, fabric, "grey", seen=synthetic.WHOLE, key=jr.key(0))
     clouds = [cloud(seen, frame) for frame in (0, 30)]
     assert all(len(points) == len(clouds[0]) > 5000 for points in clouds)
-    of = lambda fabric: judge.against_motion(seen, judge.predict(seen, fabric), 6, False)
+    of = lambda fabric: prediction_error.against_motion(
+        seen, prediction_error.predict(seen, fabric), 6, False
+    )
     truth, other = of(fabric), of(presets.pink_solid())
     for name, value in truth.items():
         assert value < other[name] / 1.5, name
@@ -58,15 +67,15 @@ def test_a_whole_surface_tells_the_true_fabric_by_every_metric():
 
 def test_a_diverged_motion_is_a_result(fold):
     shape = (len(fold.times), 81, 3)
-    found = judge.against_motion(fold, np.full(shape, np.nan))
-    whole = judge.against_recording(fold, fold)
+    found = prediction_error.against_motion(fold, np.full(shape, np.nan))
+    whole = prediction_error.against_recording(fold, fold)
     assert found.keys() == whole.keys()
     assert all(np.isnan(value) for value in found.values())
 
 
 def test_the_cropped_distance_leaves_out_what_the_recording_cannot_show(fold):
-    x = judge.predict(fold, presets.grey_interlock())
-    found = judge.against_motion(fold, x)
+    x = prediction_error.predict(fold, presets.grey_interlock())
+    found = prediction_error.against_motion(fold, x)
     assert found["chamfer_sim_to_real_cropped"] < found["chamfer_sim_to_real"]
     assert cloud(fold, 20)[:, 2].min() > 0
 

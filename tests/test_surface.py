@@ -8,7 +8,7 @@ from conftest import flat
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.surface import nearest, sample, sample_weights
+from r2s.geometry.surface import nearest, sample, sample_weights
 
 few = settings(max_examples=25, deadline=None)
 TRIANGLE = jnp.array([[0, 1, 2]])

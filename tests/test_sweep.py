@@ -80,8 +80,8 @@ import numpy as np
 import dataclasses
 import r2s
 from r2s import presets
-from r2s.physics.air import Air
-from r2s.physics.contact import Table
+from r2s.world.air import Air
+from r2s.world.contact import Table
 from r2s.sweep import sweep
 
 sheet = r2s.rectangle((0.2, 0.2), (3, 3))

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from r2s import presets, scenarios, synthetic
-from r2s.observe.camera import Camera
-from r2s.recording import cloud
-from r2s.scenario import from_recording, motion
-from r2s.surface import sample
+from r2s import scenarios
+from r2s.fabrics import presets
+from r2s.geometry.surface import sample
+from r2s.recordings.cameras.camera import Camera
+from r2s.recordings.recording import cloud
+from r2s.scenarios import synthetic
+from r2s.scenarios.scenario import from_recording, motion
 
 
 def test_a_camera_sees_the_nearer_of_two_sheets():

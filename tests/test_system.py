@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s.linear.pattern import dense
-from r2s.linear.system import Far, apply_inverse, prepare
-from r2s.mesh import rectangle
+from r2s.cloth.linear.pattern import dense
+from r2s.cloth.linear.system import Far, apply_inverse, prepare
+from r2s.geometry.mesh import rectangle
 
 MESH = rectangle((1.0, 1.0), (6, 6))
 COUNT = 36

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from r2s.fabric import Fabric
-from r2s.physics.bending import BendingLaw, HingeBending, OrthotropicBending
-from r2s.physics.membrane import MembraneLaw, OrthotropicMembrane
-from r2s.physics.table import (
+from r2s.fabrics.fabric import Fabric
+from r2s.laws.bending import BendingLaw, HingeBending, OrthotropicBending
+from r2s.laws.membrane import MembraneLaw, OrthotropicMembrane
+from r2s.laws.tables import (
     BLUR,
     HINGE_FACTOR,
     DiffSimTableBending,
@@ -22,8 +22,8 @@ from r2s.physics.table import (
     TableBending,
     TableMembrane,
 )
-from r2s.scene import Control
 from r2s.units import GRAVITY
+from r2s.world.scene import Control
 
 few = settings(max_examples=25, deadline=None)
 STRETCHING = jnp.array(  # [N/m]; numbers of no fabric, which tell the rows apart

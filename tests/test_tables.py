@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.family import Range
-from r2s.study import tables
-from r2s.study.tables import BASELINES, COLUMNS, Row, Table
+from r2s.fabrics.parameters import Range
+from r2s.study.statistics import tables
+from r2s.study.statistics.tables import BASELINES, COLUMNS, Row, Table
 
 RANGES = (
     Range("C11", "N/m", 3.0, 3000.0),

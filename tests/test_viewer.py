@@ -12,10 +12,10 @@ from browser import BROWSER, needs_browser
 from made_up_study import made_up_shown
 from test_report import Page
 
-from r2s.study import viewer
-from r2s.study.report import Section, write_report
-from r2s.study.shown import Shown, load_shown, save_shown
-from r2s.study.tables import Table
+from r2s.study.report import player
+from r2s.study.report.page import Section, write_report
+from r2s.study.report.scenes import Shown, load_shown, save_shown
+from r2s.study.statistics.tables import Table
 
 FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
@@ -84,7 +84,7 @@ def recordings():
 
 
 def page(path, recordings, extra=""):
-    section = Section("Motions", ("Words.",), (TABLE,), html=viewer.viewer(recordings) + extra)
+    section = Section("Motions", ("Words.",), (TABLE,), html=player.viewer(recordings) + extra)
     write_report(path, "A study", "", {}, [section])
     return path.read_text()
 
@@ -95,7 +95,7 @@ def test_nothing_is_fetched_and_tags_are_closed(tmp_path, recordings):
     assert not re.search("https?:|//|@import|url\\(", re.sub('base64,[^"]*', "", text).lower())
     assert all("src" not in script for script in found.all("script"))
     assert len(found.all("canvas")) == 1 and len(found.all("option")) == 2
-    assert viewer.viewer([]) == ""
+    assert player.viewer([]) == ""
 
 
 def test_labels_are_escaped(tmp_path):
@@ -110,8 +110,8 @@ def test_size_of_a_long_recording():
     motions = {f"column {i}": generator.normal(size=(120, 81, 3)) for i in range(12)}
     faces = np.array([[0, 1, 2]])
     shown = Shown("f", "fling", "fling_f1", np.arange(120.0), clouds, faces, motions)
-    text = viewer.viewer([shown])
-    assert 0.5 * viewer.BUDGET < len(text) < viewer.BUDGET + 30_000
+    text = player.viewer([shown])
+    assert 0.5 * player.BUDGET < len(text) < player.BUDGET + 30_000
 
 
 def test_shown_is_read_back(tmp_path):
@@ -159,7 +159,7 @@ def test_in_a_browser(tmp_path, recordings):
     assert len(set(found["pictures"])) == len(found["pictures"]) == 6
     assert found["clock"] == "frame 1, 0.20 s"
     shown = recordings[0]
-    rounded: dict[str, Any] = {"atol": 0.51 * viewer.STEP, "rtol": 1e-6}
+    rounded: dict[str, Any] = {"atol": 0.51 * player.STEP, "rtol": 1e-6}
     np.testing.assert_allclose(
         np.reshape(found["sheet"], shown.motions["b"].shape), shown.motions["b"], **rounded
     )

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from conftest import cloth, flat, roll
 
-from r2s.fabric import Fabric
-from r2s.mesh import rectangle
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import rectangle
 from r2s.units import GRAVITY
 
 LENGTH, WIDTH = 0.2, 0.025  # [m]

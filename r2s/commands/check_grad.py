@@ -9,7 +9,7 @@ from tyro.conf import Positional, arg
 from r2s.commands.common import ScenarioName
 
 if TYPE_CHECKING:
-    from r2s.fabric import Fabric
+    from r2s.fabrics.fabric import Fabric
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class CheckGrad:
     In double precision, of the mean squared distance [m^2] from where the sheet began, over frames
     and vertices. Differences are taken over two widths: where these disagree, the motion is rough
     there, and says nothing ("rough"). Exit code 0 when all agree, else 1. Takes a minute or two.
-    For a scene, mesh or loss of your own: `r2s.gradcheck.compare`.
+    For a scene, mesh or loss of your own: `r2s.gradient_check.compare`.
 
         r2s check-grad lifting --fabric black_denim --motion height=0.3 --shape 5 5
         r2s check-grad folding --fabric mine.json --layers --forward
@@ -28,7 +28,7 @@ class CheckGrad:
     scenario: Annotated[Positional[ScenarioName], arg(metavar="SCENARIO")]
     """Of the study."""
     fabric: Annotated[str, arg(metavar="PRESET|CARD")] = "grey_interlock"
-    """A preset of `r2s.presets`, or the file of a fabric card."""
+    """A preset of `r2s.fabrics.presets`, or the file of a fabric card."""
     motion: Annotated[tuple[str, ...], arg(metavar="NAME=NUMBER")] = ()
     """Numbers of the motion, such as height=0.3 [m]; num_frames=20 and interval=0.05 [s], too."""
     solver: Literal["cloth", "points"] = "cloth"
@@ -48,7 +48,7 @@ class CheckGrad:
         import jax
 
         from r2s.commands.common import card_of, tell
-        from r2s.gradcheck import compare
+        from r2s.gradient_check import compare
 
         if self.solver == "points" and (self.layers or self.forward):
             raise ValueError("--layers and --forward are of the cloth")
@@ -74,8 +74,8 @@ class CheckGrad:
         import jax.numpy as jnp
 
         from r2s.commands.common import experiment_of
-        from r2s.scenario import motion
         from r2s.scenarios import material_points
+        from r2s.scenarios.scenario import motion
 
         scenario = experiment_of(self.scenario, self.motion).scenario(self.shape, self.layers)
         solver = material_points(scenario, fabric) if self.solver == "points" else None

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
-    from r2s.cards import Card
-    from r2s.recording import Recording
+    from r2s.estimation.cards import Card
+    from r2s.recordings.recording import Recording
     from r2s.scenarios import Experiment
 
 NO_NUMBERS = {"path", "route", "size", "held"}
@@ -19,9 +19,10 @@ ScenarioName = Literal["lifting", "wind", "stretching", "folding", "fling", "sha
 def card_of(text: str) -> "Card":
     """The card of a preset, or that in a file.
 
-    Raises `ValueError` that names the presets for what is neither; as `r2s.cards.read`.
+    Raises `ValueError` that names the presets for what is neither; as `r2s.estimation.cards.read`.
     """
-    from r2s import cards, presets
+    from r2s.estimation import cards
+    from r2s.fabrics import presets
 
     if text in presets.MEASURED:
         return cards.preset(text)
@@ -47,7 +48,8 @@ def numbers_of(motion: Iterable[str]) -> dict[str, float]:
 
 def experiment_of(scenario: str, motion: Iterable[str], **others: Any) -> "Experiment":
     """An experiment of `r2s.scenarios` with these numbers; `ValueError` names those it takes."""
-    from r2s import scenarios, trajectories
+    from r2s import scenarios
+    from r2s.scenarios import paths as trajectories
 
     make = scenarios.SIX[scenario]
     known = {*trajectories.LIMITS[scenario], *inspect.signature(make).parameters} - {
@@ -71,8 +73,8 @@ def experiment_of(scenario: str, motion: Iterable[str], **others: Any) -> "Exper
 
 def recordings_of(paths: Sequence[Path]) -> Iterator["Recording"]:
     """The recordings of NPZ files, of folders of them, or of folders of clouds or images."""
-    from r2s.recording import load
-    from r2s.show import open_recording
+    from r2s.recordings.recording import load
+    from r2s.viewer.pictures import open_recording
 
     for path in paths:
         inside = sorted(path.glob("*.npz")) if path.is_dir() else []

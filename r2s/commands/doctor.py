@@ -10,7 +10,7 @@ from tyro.conf import arg
 from r2s.commands.common import ScenarioName
 
 if TYPE_CHECKING:
-    from r2s.fabric import Fabric
+    from r2s.fabrics.fabric import Fabric
 
 EXCLUDED = {"0.10.2": "wrong numbers from a jitted vmap on the CPU", "0.11.1": "no flax"}
 EXTRAS = {
@@ -50,7 +50,7 @@ class Doctor:
     """
 
     fabric: Annotated[str, arg(metavar="PRESET|CARD")] = ""
-    """A preset of `r2s.presets`, or the file of a fabric card."""
+    """A preset of `r2s.fabrics.presets`, or the file of a fabric card."""
     mesh: Annotated[Path | None, arg(metavar="FILE")] = None
     """A flat triangle mesh in metres, as OBJ, PLY or STL."""
     scenario: Annotated[ScenarioName | None, arg(metavar="SCENARIO")] = None
@@ -87,9 +87,9 @@ class Doctor:
         import jax.numpy as jnp
 
         from r2s.commands.common import card_of, experiment_of
-        from r2s.scenario import motion
+        from r2s.rollout import predicted_memory
         from r2s.scenarios import material_points
-        from r2s.solver import predicted_memory
+        from r2s.scenarios.scenario import motion
 
         fabric = card_of(self.fabric or "grey_interlock").fabric
         scenario = experiment_of(str(self.scenario), self.motion).scenario(self.shape)
@@ -172,7 +172,7 @@ def implausible(fabric: "Fabric") -> Iterator[str]:
 def _mesh(path: Path) -> tuple[dict[str, Any], str]:
     import numpy as np
 
-    from r2s.mesh import Mesh
+    from r2s.geometry.mesh import Mesh
 
     try:
         import trimesh

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 if TYPE_CHECKING:
-    from r2s.estimators.descent import Effort
-    from r2s.estimators.estimate import Estimate
-    from r2s.recording import Recording
+    from r2s.estimation.descent import Effort
+    from r2s.estimation.estimate import Estimate
+    from r2s.recordings.recording import Recording
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,9 @@ class EstimateCard:
     """Print the card as one JSON object."""
 
     def run(self) -> int:
-        from r2s import cards
         from r2s.commands.common import recordings_of, tell
-        from r2s.estimators.planned import describe
+        from r2s.estimation import cards
+        from r2s.estimation.experiment_design import describe
 
         seen = list(recordings_of(self.recordings))
         if not seen:
@@ -80,19 +80,19 @@ class EstimateCard:
         return self.out.with_name(f"{self.out.name}.progress.npz")
 
     def _cloud(self, seen: "Sequence[Recording]") -> "Estimate":
-        from r2s.estimators import diffcloud
-        from r2s.estimators.descent import DEFAULT
-        from r2s.estimators.problem import Problem
-        from r2s.family import OrthotropicFamily
+        from r2s.estimation import diffcloud
+        from r2s.estimation.descent import DEFAULT
+        from r2s.estimation.problem import Problem
+        from r2s.fabrics.parameters import OrthotropicFamily
 
         family = OrthotropicFamily.make(self.density)
         problems = tuple(Problem.make(each, family, shape=self.shape) for each in seen)
         return self._descend(diffcloud.estimate, problems, DEFAULT)
 
     def _points(self, seen: "Sequence[Recording]") -> "Estimate":
-        from r2s.estimators import diffcp
-        from r2s.estimators.problem import Problem
-        from r2s.family import IsotropicFamily
+        from r2s.estimation import diffcp
+        from r2s.estimation.problem import Problem
+        from r2s.fabrics.parameters import IsotropicFamily
 
         family = IsotropicFamily.make(self.density)
         made = (Problem.make(each, family, shape=self.shape, as_seen=False) for each in seen)
@@ -117,9 +117,9 @@ class EstimateCard:
 
         import jax
 
-        from r2s.estimators import pinn
-        from r2s.family import OrthotropicFamily
-        from r2s.pinn.data import pull_from
+        from r2s.estimation.pinn import from_pulls
+        from r2s.estimation.pinn.data import pull_from
+        from r2s.fabrics.parameters import OrthotropicFamily
 
         angles = self.angles or (0.0,) * len(seen)
         if len(angles) != len(seen):
@@ -127,7 +127,7 @@ class EstimateCard:
         pairs = zip(seen, angles, strict=True)
         pulls = [pull_from(each, math.radians(angle)) for each, angle in pairs]
         family = OrthotropicFamily.make(self.density)
-        return pinn.estimate(pulls, family, key=jax.random.key(self.seed)).estimate
+        return from_pulls.estimate(pulls, family, key=jax.random.key(self.seed)).estimate
 
 
 class _bar:

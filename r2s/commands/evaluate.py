@@ -19,7 +19,7 @@ class Evaluate:
     """
 
     fabric: Annotated[Positional[str], arg(metavar="PRESET|CARD")]
-    """A preset of `r2s.presets`, or the file of a fabric card."""
+    """A preset of `r2s.fabrics.presets`, or the file of a fabric card."""
     recordings: Annotated[Positional[tuple[Path, ...]], arg(metavar="RECORDING")]
     """NPZ, or folders."""
     json: bool = False
@@ -29,24 +29,24 @@ class Evaluate:
         import math
 
         from r2s.commands.common import card_of, recordings_of, tell
-        from r2s.study import judge
+        from r2s.evaluation import prediction_error
 
         card, found = card_of(self.fabric), {}
         for recording in recordings_of(self.recordings):
-            x = judge.predict(recording, card.fabric)
-            found[recording.info.name] = judge.against_motion(recording, x)
+            x = prediction_error.predict(recording, card.fabric)
+            found[recording.info.name] = prediction_error.against_motion(recording, x)
         if not found:
             raise ValueError("no recording: name an NPZ, or a folder that holds some")
         lines, diverged = [], []
         for name, metrics in found.items():
             lines.append(f"{name}:")
             for metric, value in metrics.items():
-                unit = judge.UNITS.get(metric, "m")
+                unit = prediction_error.UNITS.get(metric, "m")
                 text = f"{value:.4f}" if unit == "-" else f"{1e3 * value:.2f} mm"
                 lines.append(f"    {metric:32s}{text:>12s}")
             if math.isnan(metrics["chamfer_real_to_sim"]):
                 diverged.append(name)
                 lines.append("    the simulation diverged")
-        units = {name: judge.UNITS.get(name, "m") for name in next(iter(found.values()))}
+        units = {name: prediction_error.UNITS.get(name, "m") for name in next(iter(found.values()))}
         tell(self.json, {"fabric": card.name, "units": units, "recordings": found}, lines)
         return 1 if diverged else 0

@@ -8,7 +8,7 @@ from tyro.conf import Positional, arg
 
 if TYPE_CHECKING:
     from r2s.export import Loss
-    from r2s.fabric import Fabric
+    from r2s.fabrics.fabric import Fabric
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Export:
     """
 
     fabric: Annotated[Positional[str], arg(metavar="PRESET|CARD")]
-    """A preset of `r2s.presets`, or the file of a fabric card."""
+    """A preset of `r2s.fabrics.presets`, or the file of a fabric card."""
     to: Literal["mujoco", "newton", "newton-vbd", "arcsim", "pybullet"]
     """The simulator."""
     out: Annotated[Path, arg(metavar="FILE")]
@@ -61,7 +61,7 @@ class Export:
     def _write(self, fabric: "Fabric", name: str) -> "Loss":
         from r2s.export import arcsim, mujoco, newton, pybullet
         from r2s.files import write_json, write_text
-        from r2s.mesh import rectangle
+        from r2s.geometry.mesh import rectangle
 
         if self.to == "arcsim":
             try:

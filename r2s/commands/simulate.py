@@ -15,7 +15,8 @@ class Simulate:
 
     The NPZ has x (frame, vertex, 3) [m] and faces (face, 3), as `r2s show --trajectory` reads it.
     With --recording it is also seen by two depth cameras, with noise and outliers: a synthetic
-    recording to estimate from. Numbers of the motion are those of `r2s.trajectories`, in SI units.
+    recording to estimate from. Numbers of the motion are those of `r2s.scenarios.paths`, in SI
+    units.
 
         r2s simulate lifting --fabric black_denim --motion height=0.3 --out lift.npz
         r2s simulate fling --fabric mine.json --shape 17 17 --out x.npz --recording fling.npz
@@ -26,7 +27,7 @@ class Simulate:
     out: Annotated[Path, arg(metavar="FILE")]
     """NPZ of the motion."""
     fabric: Annotated[str, arg(metavar="PRESET|CARD")] = "grey_interlock"
-    """A preset of `r2s.presets`, or the file of a fabric card."""
+    """A preset of `r2s.fabrics.presets`, or the file of a fabric card."""
     motion: Annotated[tuple[str, ...], arg(metavar="NAME=NUMBER")] = ()
     """Numbers of the motion, such as height=0.3 [m]."""
     solver: Literal["cloth", "points"] = "cloth"
@@ -47,11 +48,12 @@ class Simulate:
         import jax
         import numpy as np
 
-        from r2s import scenarios, synthetic
+        from r2s import scenarios
         from r2s.commands.common import card_of, experiment_of, tell
-        from r2s.recording import save
-        from r2s.scenario import motion
-        from r2s.show import save_trajectory
+        from r2s.recordings.recording import save
+        from r2s.scenarios import synthetic
+        from r2s.scenarios.scenario import motion
+        from r2s.viewer.pictures import save_trajectory
 
         if self.layers and self.solver == "points":
             raise ValueError("--layers is of the cloth: material points touch through their grid")

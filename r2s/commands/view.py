@@ -9,10 +9,10 @@ from tyro.conf import Positional, arg
 from r2s.commands.common import ScenarioName
 
 if TYPE_CHECKING:
-    from r2s.cards import Card
-    from r2s.fabric import Fabric
-    from r2s.family import Family
-    from r2s.interactive.subject import Subject
+    from r2s.estimation.cards import Card
+    from r2s.fabrics.fabric import Fabric
+    from r2s.fabrics.parameters import Family
+    from r2s.viewer.subject import Subject
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class View:
         import time
 
         from r2s.commands.common import card_of
-        from r2s.family import OrthotropicFamily
-        from r2s.interactive.page import Page
-        from r2s.interactive.subject import place
+        from r2s.fabrics.parameters import OrthotropicFamily
+        from r2s.viewer.page import Page
+        from r2s.viewer.subject import place
 
         card = card_of(self.fabric)
         subject = self._subject(OrthotropicFamily.make(float(card.fabric.density)))
@@ -65,8 +65,8 @@ class View:
 
     def _subject(self, family: "Family") -> "Subject":
         from r2s.commands.common import experiment_of
-        from r2s.interactive.subject import of_experiment, of_recording
-        from r2s.show import open_recording
+        from r2s.viewer.pictures import open_recording
+        from r2s.viewer.subject import of_experiment, of_recording
 
         if self.recording is None:
             return of_experiment(experiment_of(self.scenario, self.motion), family, self.shape)
@@ -75,7 +75,7 @@ class View:
         return of_recording(open_recording(self.recording), family, self.shape)
 
     def _saved(self, card: "Card", fabric: "Fabric") -> str:
-        from r2s import cards
+        from r2s.estimation import cards
 
         assert self.save is not None
         method = f"set by hand with sliders, from {card.name}"

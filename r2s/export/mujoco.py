@@ -4,7 +4,7 @@ MuJoCo's 2-D flex is a solid plate of Young's modulus E [Pa], Poisson's ratio nu
 thickness h [m]: a St. Venant-Kirchhoff membrane in plane stress, of stiffness E h, on the same mesh
 that of r2s to rounding; and hinges with the bending stiffness E h^3 / (12 (1 - nu^2)), which know
 no Poisson's ratio, and are too stiff across diagonals. Both stiffnesses together fix E and h
-(`r2s.physics.solid.plate_solid`): h is not the fabric's thickness, which is the `radius` of its
+(`r2s.laws.solid.plate_solid`): h is not the fabric's thickness, which is the `radius` of its
 contacts. `damping` is a Kelvin-Voigt time [s], as in r2s.
 
 `flexcomp` is the short form: isotropic, all vertices of one mass. `mjcf` is a whole model with a
@@ -19,9 +19,9 @@ import numpy as np
 from r2s.export import stiffness
 from r2s.export.stiffness import Loss, Stiffness
 from r2s.export.yarns import split, springs, together
-from r2s.fabric import Fabric
-from r2s.mesh import Mesh
-from r2s.physics.solid import plate_solid
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import Mesh
+from r2s.laws.solid import plate_solid
 from r2s.units import GRAVITY
 
 POISSON = (0.0, 0.499)

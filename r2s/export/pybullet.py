@@ -12,8 +12,8 @@ import numpy as np
 
 from r2s.export import stiffness
 from r2s.export.stiffness import Loss, Stiffness
-from r2s.fabric import Fabric
-from r2s.mesh import Mesh
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import Mesh
 
 NO_BENDING = "bending: a flat sheet of springs has none"
 CAUCHY = "shear and coupling are what the mesh's diagonals make them"

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
-from r2s.fabric import Fabric
-from r2s.increment import bending_areas, bends, curvatures, hinge_angles
-from r2s.mesh import Mesh
-from r2s.physics.bending import HingeBending
-from r2s.physics.plate import PlateBending, PlateLaw
+from r2s.cloth.potential import bending_areas, bends, curvatures, hinge_angles
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import Mesh
+from r2s.laws.bending import HingeBending
+from r2s.laws.plate import PlateBending, PlateLaw
 
 Stiffness = Float[np.ndarray, "3 3"]
 DIRECTIONS = {"warp": 0.0, "bias": np.pi / 4, "weft": np.pi / 2, "other bias": 3 * np.pi / 4}
@@ -143,7 +143,7 @@ def hinged(mesh: Mesh, stiffness: float) -> dict[str, float]:
     """What a mesh of hinges of a stiffness [N m] shows in a cylinder along each direction, [N m].
 
     Along the lines of a grid that is `stiffness`; across its diagonals it is more (see
-    `r2s.physics.bending`), and in part three times as much where all diagonals are parallel.
+    `r2s.laws.bending`), and in part three times as much where all diagonals are parallel.
     """
     hinges, plate = HingeBending(jnp.ones((), float)), PlateBending.make(1.0)
     middle = np.asarray(mesh.rest) - np.asarray(mesh.rest).mean(axis=0)

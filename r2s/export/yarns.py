@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from scipy.optimize import least_squares
 
 from r2s.export.stiffness import BOUNDS, Stiffness, isotropic, nearest_isotropic, probes
-from r2s.mesh import Mesh
+from r2s.geometry.mesh import Mesh
 
 PARALLEL = 1e-6  # [rad]
 NEGLIGIBLE = 1e-6  # of the sheet's stiffness: springs that are at their bound, and cost much

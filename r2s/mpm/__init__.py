@@ -2,7 +2,7 @@
 
 - `grid`, `transfer`: the nodes, and what goes between them and particles.
 - `background`: gravity, table, walls and grippers at the nodes.
-- `block`: a solid body of particles (`r2s.physics.solid`).
+- `block`: a solid body of particles (`r2s.laws.solid`).
 - `transverse`, `elements`, `drag`, `sheet`: a sheet of fabric, the same as of `r2s.Cloth`.
 - `stability`: how long a step may be, and where a run went wrong.
 """

@@ -14,8 +14,8 @@ from r2s.mpm.transfer import (
     spread_few,
     spread_plain,
 )
-from r2s.physics.contact import SLIP_SPEED, Table
 from r2s.units import GRAVITY
+from r2s.world.contact import SLIP_SPEED, Table
 
 Vectors = Float[Array, "particle axis"]
 Matrices = Float[Array, "particle axis axis"]

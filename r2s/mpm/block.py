@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from r2s.mesh import Mesh
+from r2s.geometry.mesh import Mesh
+from r2s.laws.solid import Solid, product
 from r2s.mpm.background import Background, Held
-from r2s.mpm.drag import drag_on_vertices
 from r2s.mpm.stability import check_step, longest_step
 from r2s.mpm.transfer import affine_factor
-from r2s.physics.air import Air, Fan
-from r2s.physics.solid import Solid, product
-from r2s.scene import Control
+from r2s.world.air import Air, Fan
+from r2s.world.drag import drag_on_vertices
+from r2s.world.scene import Control
 
 Points = Float[Array, "particle axis"]
 

@@ -10,12 +10,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from r2s.fabric import Fabric
-from r2s.increment import bending_areas, bending_laws, bends, curvatures, hinge_angles, strains
-from r2s.mesh import Mesh
-from r2s.physics.bending import angle_gradient
-from r2s.physics.membrane import green_strain
-from r2s.physics.plate import PlateLaw
+from r2s.cloth.potential import (
+    bending_areas,
+    bending_laws,
+    bends,
+    curvatures,
+    hinge_angles,
+    strains,
+)
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import Mesh
+from r2s.laws.bending import angle_gradient
+from r2s.laws.membrane import green_strain
+from r2s.laws.plate import PlateLaw
 
 Vertices = Float[Array, "vertex 3"]
 

@@ -14,16 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r2s.fabric import Fabric
-from r2s.mesh import Mesh
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import Mesh
 from r2s.mpm.background import Background
-from r2s.mpm.drag import drag_on_vertices
 from r2s.mpm.elements import bending_frequency, elastic_force, membrane_frequency
 from r2s.mpm.grid import Grid
 from r2s.mpm.stability import check_step, longest_step
 from r2s.mpm.transfer import affine_factor
 from r2s.mpm.transverse import Transverse, unit_normal
-from r2s.scene import Control, Scene
+from r2s.world.drag import drag_on_vertices
+from r2s.world.scene import Control, Scene
 
 Vertices = Float[Array, "vertex 3"]
 

@@ -9,8 +9,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from r2s.scene import Control
 from r2s.units import Scalar
+from r2s.world.scene import Control
 
 SAFETY = 0.7  # of the limit at rest: what is stretched or compressed is stiffer
 

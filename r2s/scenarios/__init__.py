@@ -6,8 +6,9 @@
 - `account`: a motion with its forces, also on a clamp, and where the energy goes.
 """
 
-from r2s.scenarios.account import Account, account, clamp_force
-from r2s.scenarios.experiments import (
+from r2s.scenarios.energy_balance import Account, account, clamp_force
+from r2s.scenarios.on_points import material_points, motion_of_points
+from r2s.scenarios.six import (
     SIX,
     Experiment,
     fling,
@@ -18,7 +19,6 @@ from r2s.scenarios.experiments import (
     varied,
     wind,
 )
-from r2s.scenarios.points import material_points, motion_of_points
 
 __all__ = [
     "SIX",

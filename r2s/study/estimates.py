@@ -11,20 +11,21 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
-from r2s.estimators import diffcloud, diffcp, physnet, pinn, pinn_clouds
-from r2s.estimators.descent import DEFAULT
-from r2s.estimators.estimate import Estimate, as_json, from_json
-from r2s.estimators.problem import Problem
-from r2s.fabric import Fabric
-from r2s.family import Family, IsotropicFamily, OrthotropicFamily
+from r2s.estimation import diffcloud, diffcp
+from r2s.estimation.descent import DEFAULT
+from r2s.estimation.estimate import Estimate, as_json, from_json
+from r2s.estimation.physnet import dataset, estimator, preprocess, training
+from r2s.estimation.pinn import from_clouds, from_pulls
+from r2s.estimation.pinn.data import pull_from
+from r2s.estimation.problem import Problem
+from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.parameters import Family, IsotropicFamily, OrthotropicFamily
 from r2s.files import write_json
-from r2s.physnet import dataset, preprocess, training
-from r2s.pinn.data import pull_from
-from r2s.recording import Recording
-from r2s.scenario import from_recording
-from r2s.scenarios.points import material_points
+from r2s.recordings.recording import Recording
+from r2s.scenarios.on_points import material_points
+from r2s.scenarios.scenario import from_recording
 from r2s.study.cells import Cell, opened
-from r2s.study.truths import Source, read
+from r2s.study.sources import Source, read
 
 ESTIMATE, NETWORK = "estimate.json", "network.eqx"
 COARSE = (7, 7)  # vertices of a sheet of material points in an estimate
@@ -34,7 +35,7 @@ COARSE = (7, 7)  # vertices of a sheet of material points in an estimate
 class Spent:
     """What estimates may cost.
 
-    - `coarse`, `starts`, `iterations`: of DIFFCLOUD, as of `r2s.estimators.descent.Effort`.
+    - `coarse`, `starts`, `iterations`: of DIFFCLOUD, as of `r2s.estimation.descent.Effort`.
     - `points_coarse`, `points_starts`, `points_iterations`: likewise of DiffCP.
     - `calls`: simulations of PhysNet's search. - `fabrics`, `epochs`, `steps`: of its training.
     """
@@ -207,20 +208,20 @@ def _physnet(cell: Estimated, family: Family, recordings: list[Recording], folde
     images = preprocess.of_clouds(trained.view, recording, frames)
     stiffest = family(jnp.ones(family.dim, float))
     solver = None if on_cloth else material_points(scenario, stiffest)
-    seen = physnet.Sighting.make(scenario, images, frames, family, trained, solver)
-    return physnet.estimate(seen, num_calls=cell.spent.calls, seed=cell.repeat)
+    seen = estimator.Sighting.make(scenario, images, frames, family, trained, solver)
+    return estimator.estimate(seen, num_calls=cell.spent.calls, seed=cell.repeat)
 
 
 def _pinn(cell: Estimated, family: Family, recordings: list[Recording], folder: Path) -> Estimate:
     del folder
     if cell.scenario != "stretching":
-        return pinn_clouds.estimate(recordings[0], family, key=jr.key(cell.repeat))
+        return from_clouds.estimate(recordings[0], family, key=jr.key(cell.repeat))
     angles = [getattr(source, "angle", None) or 0.0 for source in cell.sources]
     pulls = [
         pull_from(recording, float(np.radians(angle)))
         for recording, angle in zip(recordings, angles, strict=True)
     ]
-    return pinn.estimate(pulls, family, key=jr.key(cell.repeat)).estimate
+    return from_pulls.estimate(pulls, family, key=jr.key(cell.repeat)).estimate
 
 
 _ESTIMATORS = {"diffcloud": _diffcloud, "diffcp": _diffcp, "physnet": _physnet, "pinn": _pinn}

@@ -12,17 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from r2s.fabric import Fabric
+from r2s.evaluation import prediction_error
+from r2s.fabrics.fabric import Fabric
 from r2s.files import write_json
 from r2s.mpm.sheet import Sheet, longest_edge, stable_step
-from r2s.recording import Recording
-from r2s.scenario import Scenario, from_recording, motion
-from r2s.scenarios.points import EDGE, MEMBRANE_DAMPING, grid_around
-from r2s.study import judge
+from r2s.recordings.recording import Recording
+from r2s.scenarios.on_points import EDGE, MEMBRANE_DAMPING, grid_around
+from r2s.scenarios.scenario import Scenario, from_recording, motion
 from r2s.study.cells import Cell, opened
 from r2s.study.estimates import Estimated, default_fabric, read_estimate
-from r2s.study.panel import Column
-from r2s.study.truths import Given, Source, read
+from r2s.study.sources import Given, Source, read
+from r2s.study.statistics.panel import Column
 
 MEASURED, MOTION = "measured.json", "motion.npz"
 LADDER = math.sqrt(2)  # steps between frames are powers of this: few programs to compile
@@ -88,7 +88,9 @@ class Judged(Cell):
         else:
             motions = predict(recordings, fabric, self.solver)
         measured = {
-            source.name: judge.against_motion(recording, x, self.every, isinstance(source, Given))
+            source.name: prediction_error.against_motion(
+                recording, x, self.every, isinstance(source, Given)
+            )
             for source, recording, x in zip(self.recordings, recordings, motions, strict=True)
         }
         plain = {name: {k: _plain(v) for k, v in row.items()} for name, row in measured.items()}

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from r2s.study import engine, matrix, results
-from r2s.study.apart import Apart
+from r2s.study.subprocesses import Apart
 
 
 def study(

@@ -6,12 +6,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from r2s import presets
+from r2s.fabrics import presets
+from r2s.scenarios.paths import ESTIMATION, EVALUATION
 from r2s.study.estimates import SOLVERS, Estimated, Spent, Trained, family_of
 from r2s.study.evaluations import Judged
-from r2s.study.panel import MOTIONS, PAPER_COLUMNS, Column
-from r2s.study.truths import Given, Made, Making, Source, given, measured, strain_dependent
-from r2s.trajectories import ESTIMATION, EVALUATION
+from r2s.study.sources import (
+    Given,
+    Made,
+    Making,
+    Source,
+    given,
+    measured,
+    strain_dependent,
+)
+from r2s.study.statistics.panel import MOTIONS, PAPER_COLUMNS, Column
 
 ESTIMATED_FROM = ("lifting", "wind", "stretching")
 TOGETHER = 10  # recordings in a cell that judges

@@ -10,20 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from r2s.family import Range
+from r2s.evaluation import prediction_error
+from r2s.fabrics.parameters import Range
 from r2s.files import write_text
-from r2s.recording import cloud
-from r2s.scenario import from_recording
-from r2s.study import judge
+from r2s.recordings.recording import cloud
+from r2s.scenarios.scenario import from_recording
 from r2s.study.cells import Cell, about, opened
 from r2s.study.engine import closure
 from r2s.study.estimates import ESTIMATE, Estimated, family_of, read_estimate
 from r2s.study.evaluations import Judged, read_measured, read_motion
 from r2s.study.matrix import PRESETS, Plan, synthetic
-from r2s.study.panel import Column
-from r2s.study.shown import Shown
-from r2s.study.tables import Row, Table, pivot, significant, write_rows
-from r2s.study.truths import Made, Source, read, small_strain
+from r2s.study.report.scenes import Shown
+from r2s.study.sources import Made, Source, read, small_strain
+from r2s.study.statistics.panel import Column
+from r2s.study.statistics.tables import Row, Table, pivot, significant, write_rows
 
 PRINTED = ("findings.md", "chamfer_real_to_sim*.md", "diff*_on_*.md")  # the others are in files
 
@@ -53,14 +53,14 @@ def publish(
         settings = {"recordings": source} | {
             field.name: str(getattr(plan, field.name)) for field in fields(plan)
         }
-        from r2s.study import full_report
+        from r2s.study.report import full
 
         for old in (out / "tables").glob("*.*"):
             old.unlink()
         took = costs(cells, out)
         by = list(by_recording(found).items())
         larger = [(f"forecast_{name}", forecast(took, larger)) for name, larger in PRESETS.items()]
-        full_report.publish(
+        full.publish(
             out,
             found,
             shown(cells, out),
@@ -109,7 +109,7 @@ def _rows(cell: Judged, folder: Path) -> list[Row]:
             cell.scenario,
             baseline,
             metric,
-            judge.UNITS.get(metric, "m"),
+            prediction_error.UNITS.get(metric, "m"),
             value,
         )
         for name, measured in read_measured(cell, folder).items()
@@ -128,10 +128,10 @@ def _repeatability(cells: Sequence[Judged], folder: Path) -> list[Row]:
         for first, second in zip(sources, sources[1:] + sources[:1], strict=True):
             if first is second:
                 continue
-            measured = judge.against_recording(read(first, folder), read(second, folder))
+            measured = prediction_error.against_recording(read(first, folder), read(second, folder))
             about_it = "", "", "", fabric, "", first.name, scenario, "repeatability"
             found += [
-                Row(*about_it, metric, judge.UNITS.get(metric, "m"), value)
+                Row(*about_it, metric, prediction_error.UNITS.get(metric, "m"), value)
                 for metric, value in measured.items()
             ]
     return found
@@ -166,7 +166,7 @@ def by_recording(rows: Sequence[Row], metric: str = "chamfer_real_to_sim") -> di
 
 
 def parameters(cells: Iterable[Judged], folder: Path) -> dict[str, list[Entry]]:
-    """What was estimated, by solver, as `r2s.study.tables.parameter_table` takes it."""
+    """What was estimated, by solver, as `r2s.study.statistics.tables.parameter_table` takes it."""
     found: dict[str, list[Entry]] = {}
     for cell in estimated(cells, folder):
         estimate = read_estimate(cell, folder)

@@ -1,0 +1,92 @@
+"""How a sheet hangs before it moves: as the first cloud shows it, where there is more than one way.
+
+A sheet whose corners are nearer to each other than they were cut buckles, and can do so in several
+ways, each at rest. Which one a simulation falls into depends on the fabric, so that a small change
+of its stiffness may change the shape by millimetres, and no descent comes across such a jump. From
+a start near the shape that was seen, more fabrics come to rest in that one (not all: of a stiff
+denim it fails for some recordings).
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from r2s.evaluation.losses import TOUCHING, length, robust_weight, surface_residuals
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import Mesh
+from r2s.scenarios.scenario import Scenario, motion
+
+_motion = eqx.filter_jit(motion)
+
+ROUNDS = 60  # in which the nearest places settle
+SMOOTH, STRETCHED = 0.02, 0.1  # weights of neighbours moving apart, and of edges growing longer
+
+
+def as_seen(
+    scenario: Scenario,
+    fabric: Fabric,
+    points: Float[Array, "point 3"],
+    mask: Bool[Array, " point"],
+) -> Scenario:
+    """A scenario of a hanging sheet that starts in the shape of its first cloud, `points` [m].
+
+    `fabric`, any of those that are to be estimated, says how the sheet hangs as far as the cloud
+    does not show it. The grippers, which a sheet at rest has at its corners, are where the path
+    begins.
+    """
+    scene = scenario.scene
+    first = _motion(dataclasses.replace(scenario, num_frames=1), fabric).x[0]
+    start = registered(points, mask, first, scene.mesh, scene.is_free)
+    path = scenario.path.at[0].set(scenario.path[1])
+    return dataclasses.replace(scenario, start=start, path=path)
+
+
+@eqx.filter_jit
+def registered(
+    points: Float[Array, "point 3"],
+    mask: Bool[Array, " point"],
+    x: Float[Array, "vertex 3"],
+    mesh: Mesh,
+    free: Bool[Array, " vertex"],
+) -> Float[Array, "vertex 3"]:
+    """A sheet at `x` [m] laid onto points [m]: smoothly, with edges as long as they were.
+
+    Nonrigid iterative closest points (Amberg, Romdhani and Vetter 2007), with distances to the
+    surface and outliers down-weighted. Vertices that are not free stay.
+    """
+    edges = _edges(mesh, len(x))
+    lengths = length(edges @ x)
+    smooth = jnp.kron(SMOOTH * edges.T @ edges, jnp.eye(3, dtype=x.dtype))
+    moving = jnp.repeat(free, 3)
+    share = len(x) / jnp.maximum(jnp.sum(mask, dtype=x.dtype), 1)
+
+    def closer(x: Array, _: None) -> tuple[Array, None]:
+        distance, direction, vertices, weights = surface_residuals(points, mask, x, mesh.faces)
+        shares = jnp.einsum("pk,pkv->pv", weights, jax.nn.one_hot(vertices, len(x), dtype=x.dtype))
+        weight = share * jnp.where(mask, robust_weight(distance), 0)
+        seen = _along(shares, direction)
+        now = length(edges @ x)
+        stretch = _along(edges, edges @ x / jnp.maximum(now, TOUCHING)[:, None])
+        matrix = seen.T @ (weight[:, None] * seen) + smooth + STRETCHED * stretch.T @ stretch
+        force = seen.T @ (weight * distance) - STRETCHED * stretch.T @ (now - lengths)
+        matrix = jnp.where(moving[:, None] & moving[None], matrix, jnp.eye(len(matrix)))
+        change = jnp.linalg.solve(matrix, jnp.where(moving, force, 0))
+        return x + change.reshape(x.shape), None
+
+    return jax.lax.scan(closer, x, length=ROUNDS)[0]
+
+
+def _edges(mesh: Mesh, count: int) -> Float[Array, "edge vertex"]:
+    """What takes vertices to the edges of the faces; inner ones are there twice."""
+    corner = jax.nn.one_hot(mesh.faces, count, dtype=float)
+    return (corner - jnp.roll(corner, 1, axis=1)).reshape(-1, count)
+
+
+def _along(
+    shares: Float[Array, "row vertex"], direction: Float[Array, "row 3"]
+) -> Float[Array, "row coordinate"]:
+    """The derivative of shares of vertices along directions."""
+    return jnp.einsum("rv,ri->rvi", shares, direction).reshape(len(shares), -1)

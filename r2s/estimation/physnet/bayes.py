@@ -1,0 +1,214 @@
+"""Bayesian optimisation by ask and tell, of any objective over a unit cube.
+
+Gaussian processes of scikit-optimize. It knows nothing of fabrics: the objective is any function
+that gives a loss, not negative, for each of a batch of places.
+"""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from r2s.estimation.physnet import search_file
+
+FORMAT = "r2s-search/2"
+Objective = Callable[[Float[np.ndarray, "place dim"]], Float[np.ndarray, " place"]]
+UNKNOWN_PENALTY = 1.0  # while no loss is finite
+LEAST = 1e-6  # of the greatest loss: what is less counts as this on the logarithmic scale
+
+CANDIDATES = 1000  # places anywhere, and as many around the best
+CENTRES = 5  # how many of the best
+WIDTHS = (0.01, 0.5)  # of the Gaussians around them, evenly on a logarithmic scale
+
+
+@dataclass(frozen=True)
+class History:
+    """What was tried, in order.
+
+    - `places`: in the unit cube. - `losses`: as the objective gave them, NaN where it failed.
+    """
+
+    places: Float[np.ndarray, "call dim"]
+    losses: Float[np.ndarray, " call"]
+
+    @property
+    def failed(self) -> Bool[np.ndarray, " call"]:
+        """Which calls diverged: their loss is not finite."""
+        return ~np.isfinite(self.losses)
+
+    @property
+    def penalised(self) -> Float[np.ndarray, " call"]:
+        """The losses that the optimiser is told: the worst finite one so far where a call failed.
+
+        A fixed penalty far above the losses would be all that the Gaussian process sees.
+        """
+        finite = self.losses[~self.failed]
+        worst = finite.max() if len(finite) else UNKNOWN_PENALTY
+        return np.where(self.failed, worst, self.losses)
+
+    @property
+    def best(self) -> int:
+        """Which call had the least loss. Raises `RuntimeError` when all failed."""
+        if self.failed.all():
+            raise RuntimeError(
+                f"all {len(self.losses)} calls of the objective failed: check the units of the "
+                "recording and its gripper path, or narrow the ranges"
+            )
+        return int(np.nanargmin(np.where(self.failed, np.nan, self.losses)))
+
+
+def begin(dim: int) -> History:
+    """Nothing tried yet, in `dim` dimensions."""
+    return History(np.zeros((0, dim)), np.zeros(0))
+
+
+def ask(
+    history: History, number: int, *, num_first: int = 16, seed: int = 0
+) -> Float[np.ndarray, "place dim"]:
+    """The next `number` places to try.
+
+    The first `num_first` fill the cube evenly (Sobol's sequence). Later ones have the greatest
+    expected improvement of a Gaussian process of the losses' logarithm, with noise, each with those
+    before it in the batch pretended to have given what the process expects (Ginsbourger, Le Riche
+    and Carraro 2010: "kriging believer").
+
+    They are sought among random places, half of them anywhere and half around the best so far:
+    where an optimiser of the expected improvement ends, in many dimensions, is on the cube's faces.
+    They follow from history and seed alone, so a search that goes on from a file asks the same as
+    one that never stopped.
+    """
+    done, dim = history.places.shape
+    if done < num_first:
+        return even(dim, num_first, seed)[done : done + number]
+    generator = np.random.default_rng([seed, done])
+    places, losses = history.places, history.penalised
+    least = max(LEAST * losses.max(), np.finfo(float).tiny)
+    values = np.log(np.maximum(losses, least))
+    process = _process(dim, np.random.RandomState([seed, done]))
+    with warnings.catch_warnings():  # that a length or the noise is at its bound
+        warnings.simplefilter("ignore")
+        process.fit(places, values)
+    kernel = process.kernel_
+    for _ in range(number):
+        best = places[np.argsort(values)[:CENTRES]]
+        place = _most_promising(process, candidates(best, generator), values.min())
+        places = np.concatenate([places, place[None]])
+        values = np.concatenate([values, process.predict(place[None])])
+        process = _process(dim, kernel=kernel).fit(places, values)
+    return places[done:]
+
+
+def tell(history: History, places: Any, losses: Any) -> History:
+    """The history with the losses of some places.
+
+    Raises `ValueError` when their numbers differ, or a loss is negative.
+    """
+    places, losses = np.asarray(places, float), np.asarray(losses, float)
+    if losses.shape != (len(places),):
+        raise ValueError(
+            f"expected one loss for each of {len(places)} places, found the shape {losses.shape}"
+        )
+    losses = np.where(np.isfinite(losses), losses, np.nan)
+    if (losses < 0).any():
+        raise ValueError(
+            f"a loss is {np.nanmin(losses):g}: expected none below 0, as their logarithm is taken"
+        )
+    return History(
+        np.concatenate([history.places, places]), np.concatenate([history.losses, losses])
+    )
+
+
+def minimise(
+    objective: Objective,
+    dim: int,
+    *,
+    num_calls: int = 80,
+    batch: int = 4,
+    num_first: int = 16,
+    seed: int = 0,
+    path: Path | str | None = None,
+    progress: Callable[[History], None] | None = None,
+) -> History:
+    """Ask, evaluate and tell until there were `num_calls`; saved to `path` after every batch.
+
+    Goes on from `path` when it is there. Raises `ValueError` when that is of another search.
+    """
+    about = {"dim": dim, "batch": batch, "num_first": num_first, "seed": seed}
+    history = begin(dim)
+    if path is not None and Path(path).exists():
+        history = History(*search_file.read(path, FORMAT, ("places", "losses"), about))
+    while len(history.losses) < num_calls:
+        number = min(batch, num_calls - len(history.losses))
+        places = ask(history, number, num_first=num_first, seed=seed)
+        history = tell(history, places, objective(places))
+        if path is not None:
+            tried = {"places": history.places, "losses": history.losses}
+            search_file.write(path, FORMAT, tried, about)
+        if progress is not None:
+            progress(history)
+    return history
+
+
+def random_search(objective: Objective, dim: int, *, num_calls: int, batch: int, seed: int):
+    """The same number of calls at random places: what an optimiser is to beat."""
+    generator = np.random.default_rng(seed)
+    history = begin(dim)
+    while len(history.losses) < num_calls:
+        places = generator.random((min(batch, num_calls - len(history.losses)), dim))
+        history = tell(history, places, objective(places))
+    return history
+
+
+def even(dim: int, number: int, seed: int) -> Float[np.ndarray, "place dim"]:
+    """Places that fill the unit cube evenly, by Sobol's sequence."""
+    from scipy.stats import qmc
+
+    power_of_two = 1 << max(number - 1, 0).bit_length()
+    return qmc.Sobol(dim, rng=np.random.default_rng(seed)).random(power_of_two)[:number]
+
+
+def candidates(
+    best: Float[np.ndarray, "centre dim"], generator: np.random.Generator
+) -> Float[np.ndarray, "place dim"]:
+    """Random places of the unit cube, half of them anywhere and half around the best so far."""
+    dim = best.shape[1]
+    anywhere = generator.random((CANDIDATES, dim))
+    low, high = np.log(WIDTHS)
+    widths = np.exp(generator.uniform(low, high, (CANDIDATES, 1)))
+    centres = best[generator.integers(len(best), size=CANDIDATES)]
+    around = centres + widths * generator.standard_normal((CANDIDATES, dim))
+    return np.concatenate([anywhere, np.clip(around, 0, 1)])
+
+
+def _most_promising(
+    process: Any, candidates: Float[np.ndarray, "place dim"], least: float
+) -> Float[np.ndarray, " dim"]:
+    from skopt.acquisition import gaussian_ei
+
+    return candidates[np.argmax(gaussian_ei(candidates, process, least, xi=0.0))]
+
+
+def _process(dim: int, random: Any = None, kernel: Any = None) -> Any:
+    """A Gaussian process whose kernel is to be fitted, or is given."""
+    try:
+        from skopt.learning import GaussianProcessRegressor
+        from skopt.learning.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
+    except ImportError as error:
+        raise ImportError(
+            "Bayesian optimisation needs scikit-optimize: pip install 'r2s[physnet]'"
+        ) from error
+    make: Any = GaussianProcessRegressor  # its annotations miss what it takes
+    if kernel is not None:
+        return make(kernel, optimizer=None, normalize_y=True)
+    lengths: Any = [1.0] * dim
+    smooth = ConstantKernel(1.0, (0.01, 1000.0)) * Matern(lengths, [(0.1, 20.0)] * dim, nu=2.5)
+    return make(
+        smooth + WhiteKernel(1e-2, (1e-6, 1.0)),
+        normalize_y=True,
+        n_restarts_optimizer=1,
+        random_state=random,
+    )

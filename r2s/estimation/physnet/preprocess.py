@@ -1,0 +1,210 @@
+"""From depth to the grey image that the network sees, for real and simulated depth alike."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from r2s.estimation.physnet.views import LAYER, View, depth_of
+from r2s.recordings.cameras.calibration import DepthCamera
+from r2s.recordings.cameras.depth import back_project, moved
+from r2s.recordings.recording import Recording
+
+ALIKE = 2  # neighbours within `views.LAYER` of a pixel, with fewer of which it is a stray
+# pixels of a measured image within 2 of one, itself included; with fewer it is a stray that `REACH`
+# has spread
+SPECK = 5
+AROUND = 5  # of 8 neighbours with depth, from which a hole is filled
+PASSES = 2  # of filling: holes of up to about 4 pixels across
+DARKEST = 0.2  # what is as far as the view goes; nothing at all is 0
+REACH = 0.25  # of the distance between measured points: half the side of what one stands for
+LEAST = 20  # pixels with depth, in an image of 64 x 64; else there is nothing to recognise
+
+
+class Flaws(NamedTuple):
+    """What training images suffer; each share is drawn anew for an image, from 0 to what is here.
+
+    Chosen by what `r2s.recordings.cameras.flaws.TYPICAL` and clouds of two cameras do to images of
+    64 x 64: of the pixels at a border 5 to 22 % are lost, beside it up to 10 % gained, and a tenth
+    of the depths there are more than 6 to 8 mm wrong.
+
+    - `noise`: standard deviation of depth at 1 m, growing with its square, [m].
+    - `holes`: share of the pixels that have no depth.
+    - `strays`: share of all pixels with any depth, the same in every image.
+    - `lost`: share of the pixels at a border, also one between layers, that have no depth.
+    - `gained`: share of the pixels just outside of a border that have the depth inside.
+    - `flying`: scale of the (Laplacian) error of depth at a border, [m].
+    """
+
+    noise: float = 2e-3
+    holes: float = 0.15
+    strays: float = 0.003
+    lost: float = 0.25
+    gained: float = 0.1
+    flying: float = 5e-3
+
+
+def grey(view: View, depth: Float[Array, "down across"]) -> Float[Array, "down across"]:
+    """The image of a depth image [m] in a view: near white (1), far grey, none 0.
+
+    Strays are dropped, and then holes filled.
+    """
+    depth = filled(without_strays(depth))
+    shade = (view.far - depth) / (view.far - view.near)
+    return jnp.where(depth > 0, DARKEST + (1 - DARKEST) * jnp.clip(shade, 0, 1), 0)
+
+
+def without_strays(depth: Float[Array, "down across"]) -> Float[Array, "down across"]:
+    """Depth [m] without the pixels with fewer than `ALIKE` neighbours at about their depth."""
+    near = lambda other: ((other > 0) & (jnp.abs(other - depth) < LAYER)).astype(depth.dtype)
+    return jnp.where(sum(near(other) for other in _around(depth)) >= ALIKE, depth, 0)
+
+
+def filled(depth: Float[Array, "down across"]) -> Float[Array, "down across"]:
+    """Depth [m] with the mean of its neighbours in pixels that have none but are surrounded."""
+    for _ in range(PASSES):
+        there = depth > 0
+        number = sum((other > 0).astype(depth.dtype) for other in _around(depth))
+        mean = sum(_around(depth)) / jnp.maximum(number, 1)
+        depth = jnp.where(there | (number < AROUND), depth, mean)
+    return depth
+
+
+def _around(values: Float[Array, "down across"]) -> list[Float[Array, "down across"]]:
+    """The 8 neighbours of every pixel; outside of the image 0."""
+    padded, (rows, columns) = jnp.pad(values, 1), values.shape
+    shifts = [(i, j) for i in range(3) for j in range(3) if (i, j) != (1, 1)]
+    return [padded[i : i + rows, j : j + columns] for i, j in shifts]
+
+
+def flawed(
+    depth: Float[Array, "down across"], view: View, flaws: Flaws, key: Array
+) -> Float[Array, "down across"]:
+    """Depth [m] as cameras and clouds give it: with noise, holes, strays and ragged borders."""
+    key_shares, key_border, key_noise, key_holes, key_stray, key_where = jax.random.split(key, 6)
+    share = jax.random.uniform(key_shares, (4,), depth.dtype)
+    uniform = lambda key: jax.random.uniform(key, depth.shape, depth.dtype)
+    depth = _ragged(depth, flaws, share[:3], key_border)
+    error = flaws.noise * depth**2 * jax.random.normal(key_noise, depth.shape, depth.dtype)
+    kept = uniform(key_holes) >= flaws.holes * share[3]
+    depth = jnp.where(kept & (depth > 0), depth + error, 0)
+    where = view.near + (view.far - view.near) * uniform(key_where)
+    return jnp.where(uniform(key_stray) < flaws.strays, where, depth)
+
+
+def _ragged(depth: Float[Array, "down across"], flaws: Flaws, share: Float[Array, "3"], key: Array):
+    """Depth [m] whose borders have lost, gained and wrong pixels."""
+    key_lost, key_error = jax.random.split(key)
+    around = _around(depth)
+    there = depth > 0
+    number = sum((other > 0).astype(depth.dtype) for other in around)
+    steps = [(other == 0) | (jnp.abs(other - depth) > LAYER) for other in around]
+    border = there & jnp.any(jnp.stack(steps), axis=0)
+    outside = ~there & (number > 0)
+    chance = jax.random.uniform(key_lost, depth.shape, depth.dtype)
+    beside = sum(around) / jnp.maximum(number, 1)
+    gained = outside & (chance < flaws.gained * share[0])
+    lost = border & (chance < flaws.lost * share[1])
+    error = flaws.flying * share[2] * jax.random.laplace(key_error, depth.shape, depth.dtype)
+    depth = jnp.where(gained, beside, jnp.where(lost, 0, depth))
+    return jnp.where((border | outside) & (depth > 0), depth + error, depth)
+
+
+def of_points(
+    view: View, points: Float[Array, "point 3"], mask: Bool[Array, " point"]
+) -> Float[Array, "down across"]:
+    """The depth image [m] of measured points [m], as large as that of the surface they lie on.
+
+    Simulated surfaces are sampled up to their borders; measured points only come near them.
+    """
+    covered = jnp.sum(depth_of(view, points, mask) > 0)
+    apart = jnp.sqrt(covered / jnp.maximum(jnp.sum(mask), 1)).astype(points.dtype)
+    return without_specks(depth_of(view, points, mask, REACH * apart))
+
+
+def without_specks(depth: Float[Array, "down across"]) -> Float[Array, "down across"]:
+    """Depth [m] without the pixels with fewer than `SPECK` within 2 pixels at about their depth."""
+    padded, (rows, columns) = jnp.pad(depth, 2), depth.shape
+    others = [padded[i : i + rows, j : j + columns] for i in range(5) for j in range(5)]
+    near = [((depth > 0) & (jnp.abs(other - depth) < 2 * LAYER)).astype(int) for other in others]
+    return jnp.where(sum(near) >= SPECK, depth, 0)
+
+
+def of_clouds(view: View, recording: Recording, frames: tuple[int, ...]) -> np.ndarray:
+    """Images (frame, down, across) of a recording's clouds at some frames, checked."""
+    see = jax.jit(jax.vmap(lambda points, mask: of_points(view, points, mask)))
+    chosen = np.array(frames)
+    depth = see(recording.points[chosen], recording.mask[chosen])
+    return of_depths(view, np.asarray(depth), recording.info.name, frames)
+
+
+def of_camera(
+    view: View,
+    camera: DepthCamera,
+    depths: Float[np.ndarray, "frame down across"],
+    masks: Bool[np.ndarray, "frame down across"],
+    name: str = "depth images",
+) -> np.ndarray:
+    """Images in a view of what a calibrated camera measured [m] where the masks are, checked.
+
+    The camera may have another resolution, lens and pose than the view: its pixels become points.
+    """
+    across, down = camera.resolution
+    if depths.shape[1:] != (down, across) or masks.shape != depths.shape:
+        raise ValueError(
+            f"{name}: expected depths and masks of {down} x {across} pixels (down, across), found "
+            f"{depths.shape[1:]} and {masks.shape[1:]}: use the resolution of the calibration"
+        )
+    see = jax.jit(lambda points, mask: of_points(view, points, mask))
+    images = []
+    for depth, mask in zip(depths, masks, strict=True):
+        everywhere = np.ones(depth.shape, bool)  # all pixels, so that it compiles once
+        points = moved(np.array(camera.to_world), back_project(camera, depth, everywhere))
+        found = np.isfinite(depth) & (depth > 0) & mask
+        points = np.where(found.reshape(-1, 1), points, 0)
+        images.append(np.asarray(see(jnp.asarray(points, float), jnp.asarray(found.ravel()))))
+    _check_unit(depths, masks, name)
+    return of_depths(view, np.stack(images), name, tuple(range(len(images))))
+
+
+def of_depths(
+    view: View,
+    depths: Float[np.ndarray, "frame down across"],
+    name: str = "depth images",
+    frames: tuple[int, ...] = (),
+) -> np.ndarray:
+    """Images of depths [m] in the view's own pixels.
+
+    Raises `ValueError` that names the frame: another size, not finite, no depth, or depths that are
+    not in metres or not where the view looks.
+    """
+    if depths.ndim != 3 or depths.shape[1:] != (view.size, view.size):
+        raise ValueError(
+            f"{name}: expected images of {view.size} x {view.size} pixels, found {depths.shape}"
+        )
+    least = LEAST * view.size**2 / 64**2
+    for number, depth in enumerate(depths):
+        at = f"{name}, frame {frames[number] if frames else number}"
+        seen = depth > 0
+        if not np.isfinite(depth).all():
+            raise ValueError(f"{at}: {(~np.isfinite(depth)).sum()} depths are not finite")
+        if seen.sum() < least:
+            raise ValueError(
+                f"{at}: {seen.sum()} pixels have a depth, expected at least {least:.0f}: the frame "
+                f"is empty, the view looks elsewhere, or the units are not metres"
+            )
+        middle = float(np.median(depth[seen]))
+        if not view.near / 2 <= middle <= 2 * view.far:
+            raise ValueError(
+                f"{at}: the median depth is {middle:g} m, the view expects {view.near:g} to "
+                f"{view.far:g} m: give depths in metres, from the view's camera"
+            )
+    return np.asarray(jax.jit(jax.vmap(lambda d: grey(view, d)))(jnp.asarray(depths, float)))
+
+
+def _check_unit(depths: np.ndarray, masks: np.ndarray, name: str) -> None:
+    seen = depths[masks & (depths > 0)]
+    if len(seen) and np.median(seen) > 20:
+        raise ValueError(f"{name}: the median depth is {np.median(seen):g} m: give metres")

@@ -1,0 +1,253 @@
+"""Training the embedding with triplets: two images of one fabric, moved differently, and another.
+
+The triplet loss of squared distances, margin 1 (Schroff, Kalenichenko and Philbin 2015). Fabrics,
+not images, are held back for validation.
+"""
+
+import io
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+
+from r2s.estimation.physnet.dataset import STEP, Data
+from r2s.estimation.physnet.network import DEEPER, Architecture, PhysNet
+from r2s.estimation.physnet.preprocess import Flaws, flawed, grey
+from r2s.estimation.physnet.triplets import (
+    Images,
+    Split,
+    all_triplets,
+    draw,
+    hardest_triplets,
+    split,
+    triplets,
+)
+from r2s.estimation.physnet.views import View
+from r2s.files import write_bytes
+
+FORMAT = "r2s-physnet/1"
+EMBEDDED = 256  # images at once
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How to train.
+
+    - `epochs`, `steps`: steps in each epoch.
+    - `fabrics`, `images`: in a batch, and of each of them, from different motions.
+    - `rate`, `decay`, `decay_every`: Adam's learning rate, times `decay` every so many epochs.
+    - `margin`: by which squared distance another fabric is to be farther away.
+    - `hard`: of each image's triplets only the hardest; else all of the batch.
+    - `held_back`: share of the fabrics for validation. - `triplets`: to validate with.
+    - `flaws`: of the images, to train and to validate with.
+    """
+
+    epochs: int = 9
+    steps: int = 80
+    fabrics: int = 24
+    images: int = 4
+    rate: float = 1e-3
+    decay: float = 0.1
+    decay_every: int = 5
+    margin: float = 1.0
+    hard: bool = False
+    held_back: float = 0.15
+    triplets: int = 4000
+    flaws: Flaws = Flaws()
+    seed: int = 0
+
+
+class Row(NamedTuple):
+    """One epoch: the mean loss of training; loss and triplet accuracy of validation."""
+
+    loss: float
+    held_back_loss: float
+    accuracy: float
+
+
+class Training(NamedTuple):
+    """A training so far. The next epoch depends on nothing else but the data."""
+
+    network: PhysNet
+    optimiser: Any
+    schedule: Schedule
+    view: View
+    curve: tuple[Row, ...]
+
+
+def begin(view: View, architecture: Architecture = DEEPER, schedule: Schedule | None = None):
+    """An untrained network for a view."""
+    schedule = Schedule() if schedule is None else schedule
+    if architecture.size != view.size:
+        raise ValueError(
+            f"the network takes images of {architecture.size} pixels, the data have {view.size}"
+        )
+    network = PhysNet.make(architecture, key=jr.key(schedule.seed))
+    optimiser = _adam(schedule).init(eqx.filter(network, eqx.is_inexact_array))
+    return Training(network, optimiser, schedule, view, ())
+
+
+def train(
+    training: Training,
+    data: Data,
+    path: Path | str | None = None,
+    progress: Callable[[int, Row], None] | None = None,
+) -> Training:
+    """The training after the rest of its epochs; saved to `path` after each.
+
+    Raises `FloatingPointError` when the loss is not finite.
+    """
+    taught, held_back = divide(data, training.schedule)
+    while len(training.curve) < training.schedule.epochs:
+        training = epoch(training, taught, held_back)
+        if path is not None:
+            save(training, path)
+        if progress is not None:
+            progress(len(training.curve), training.curve[-1])
+    return training
+
+
+def epoch(training: Training, taught: Split, held_back: Split) -> Training:
+    """One epoch more."""
+    schedule, number = training.schedule, len(training.curve)
+    generator = np.random.default_rng([schedule.seed, number])
+    network, optimiser = training.network, training.optimiser
+    losses = []
+    for step in range(schedule.steps):
+        chosen = draw(taught, schedule.fabrics, schedule.images, generator)
+        key = jr.fold_in(jr.key(schedule.seed), number * schedule.steps + step)
+        depth = jnp.asarray(taught.depth[chosen])
+        about = depth, schedule, training.view, key
+        network, optimiser, loss = _step(network, optimiser, *about)
+        losses.append(loss)
+    loss = float(np.mean([float(value) for value in losses]))
+    if not np.isfinite(loss):
+        raise FloatingPointError(
+            f"the loss is {loss} in epoch {number}: lower the learning rate {schedule.rate:g}"
+        )
+    row = Row(loss, *judge(network, training.view, held_back, schedule))
+    return training._replace(network=network, optimiser=optimiser, curve=(*training.curve, row))
+
+
+def divide(data: Data, schedule: Schedule) -> tuple[Split, Split]:
+    """Images of the fabrics to train with, and of those held back; see `triplets.split`."""
+    return split(data, schedule.held_back, schedule.fabrics, schedule.seed)
+
+
+def embed(network: PhysNet, view: View, depth: Images, flaws: Flaws | None, seed: int = 0):
+    """Where images (in units of `dataset.STEP`) lie on the map; with flaws where given."""
+    parts = []
+    for start in range(0, len(depth), EMBEDDED):
+        some = depth[start : start + EMBEDDED]
+        padded = np.zeros((EMBEDDED, *depth.shape[1:]), depth.dtype)
+        padded[: len(some)] = some
+        key = jr.fold_in(jr.key(seed), start)
+        parts.append(
+            np.asarray(_embedded(network, view, jnp.asarray(padded), flaws, key))[: len(some)]
+        )
+    return np.concatenate(parts)
+
+
+def judge(network: PhysNet, view: View, images: Split, schedule: Schedule) -> tuple[float, float]:
+    """Mean loss and accuracy of triplets: the share in which the positive is the nearer one."""
+    points = embed(network, view, images.depth, schedule.flaws, schedule.seed)
+    anchor, positive, negative = points[triplets(images, schedule.triplets, schedule.seed).T]
+    near, far = (((anchor - other) ** 2).sum(axis=1) for other in (positive, negative))
+    loss = np.maximum(near - far + schedule.margin, 0).mean()
+    return float(loss), float((near < far).mean())
+
+
+def _adam(schedule: Schedule) -> optax.GradientTransformation:
+    every = schedule.decay_every * schedule.steps
+    rate = optax.exponential_decay(schedule.rate, every, schedule.decay, staircase=True)
+    return optax.adam(rate)
+
+
+def _shown(depth, view: View, flaws: Flaws | None, key) -> Float[Array, "image down across"]:
+    depth = depth.astype(float) * STEP
+
+    def one(depth, key):
+        if flaws is not None:
+            depth = flawed(depth, view, flaws, key)
+        return grey(view, depth)
+
+    return jax.vmap(one)(depth, jr.split(key, len(depth)))
+
+
+@eqx.filter_jit
+def _embedded(network: PhysNet, view: View, depth, flaws: Flaws | None, key):
+    return jax.vmap(network)(_shown(depth, view, flaws, key))
+
+
+@eqx.filter_jit
+def _step(network: PhysNet, optimiser, depth, schedule: Schedule, view: View, key):
+    fabrics, count = depth.shape[:2]
+    images = _shown(depth.reshape(-1, *depth.shape[2:]), view, schedule.flaws, key)
+
+    def loss_of(network):
+        points = jax.vmap(network)(images).reshape(fabrics, count, -1)
+        loss = hardest_triplets if schedule.hard else all_triplets
+        return loss(points, schedule.margin)
+
+    loss, slope = eqx.filter_value_and_grad(loss_of)(network)
+    update, optimiser = _adam(schedule).update(slope, optimiser)
+    return eqx.apply_updates(network, update), optimiser, loss
+
+
+def save(training: Training, path: Path | str) -> None:
+    """Write a training: one line of JSON with what it is, then the numbers."""
+    header = {
+        "format": FORMAT,
+        "architecture": asdict(training.network.architecture),
+        "schedule": asdict(training.schedule),
+        "view": asdict(training.view),
+        "curve": training.curve,
+    }
+    buffer = io.BytesIO()
+    buffer.write(json.dumps(header).encode() + b"\n")
+    eqx.tree_serialise_leaves(buffer, (training.network, training.optimiser))
+    write_bytes(path, buffer.getvalue())
+
+
+def load(path: Path | str, expected: Architecture | None = None) -> Training:
+    """Read what `save` wrote.
+
+    Raises `FileNotFoundError`, or `ValueError` that names the file when it is damaged, of another
+    format, or not of the `expected` architecture.
+    """
+    with open(path, "rb") as file:
+        try:
+            header = json.loads(file.readline())
+            found = header["format"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path}: no training of PhysNet: {error}") from error
+        if found != FORMAT:
+            raise ValueError(f"{path}: expected format {FORMAT}, found {found}")
+        architecture = Architecture(**_tuples(header["architecture"]))
+        if expected is not None and architecture != expected:
+            raise ValueError(f"{path}: expected {expected}, found {architecture}")
+        view = View(**_tuples(header["view"]))
+        schedule = {**header["schedule"], "flaws": Flaws(*header["schedule"]["flaws"])}
+        empty = begin(view, architecture, Schedule(**schedule))
+        try:
+            network, optimiser = eqx.tree_deserialise_leaves(file, (empty.network, empty.optimiser))
+        except Exception as error:  # a damaged file raises anything
+            raise ValueError(f"{path}: damaged: {error}") from error
+    curve = tuple(Row(*row) for row in header["curve"])
+    return empty._replace(network=network, optimiser=optimiser, curve=curve)
+
+
+def _tuples(values: dict[str, Any]) -> dict[str, Any]:
+    """Lists, as JSON has them, as the tuples that they were."""
+    return {
+        key: tuple(value) if isinstance(value, list) else value for key, value in values.items()
+    }

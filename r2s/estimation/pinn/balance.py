@@ -1,0 +1,353 @@
+"""The estimate from the weak form: motions in balance, and the stiffness that fits them best.
+
+The network gives a motion close to the markers, but one that need not be in balance with any
+stiffness. Here it is written in the virtual displacements, and corrected frame by frame until it
+is (Galerkin's method; rates by BDF2 from rest, the inertia that of the network). How the motion in
+balance changes with the stiffness gives the steps of Gauss-Newton to the stiffness that fits
+markers and force best, and its covariance: noise in the markers is not taken for stress.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from r2s.estimation.pinn.data import Pull
+from r2s.estimation.pinn.laws import Strain, green, nominal_stress
+from r2s.estimation.pinn.losses import load, marker_residual
+from r2s.estimation.pinn.network import Network
+from r2s.estimation.pinn.weak import (
+    DEGREES,
+    Kinematics,
+    Virtual,
+    end_value,
+    kinematics,
+    virtual_at,
+    virtual_fields,
+    virtual_work,
+)
+from r2s.fabrics.parameters import Family
+
+# rates from this frame and the two before, over the time between frames: at rest in the first
+FORMULAS = ((0.0, 0.0, 0.0), (1.0, -1.0, 0.0), (1.5, -2.0, 0.5))
+NEWTON = 25  # steps in a frame, at most
+CUTS = 6  # of a step of Newton's, each to a half
+BALANCED = 1e-5  # of the work of the stress: what is left of it
+LONGEST = 0.1  # of a range, a step of Gauss and Newton
+INSIDE = 1e-3  # from the ends of the ranges
+FLAT_PRIOR = 12.0  # one over the variance of what is even in 0..1
+STEPS = 60
+SMALL = 0.05  # of the deviations: a step after which there is no other
+LEAST_NOISE = (1e-7, 1e-5)  # of markers [m], and of the force over its greatest [-]
+
+Coefficients = Float[Array, "function axis"]  # of virtual displacements, [m]
+
+
+class Basis(NamedTuple):
+    """Functions in which a motion is written, beside what goes evenly from clamp to clamp.
+
+    - `virtual`: in space. - `at_markers`: those but the last, at the markers, [-].
+    """
+
+    virtual: Virtual
+    at_markers: Float[Array, "marker function"]
+
+
+class Solved(NamedTuple):
+    """The motion of one pull in balance, and derivatives of the imbalance in every frame.
+
+    - `coefficients`, `balanced`: and whether each frame is in balance.
+    - `by_now`, `by_rate`: derivatives in the coefficients and in their rates.
+    - `by_place`: in the family's place. The last of these two-axis blocks is of the force.
+    - `markers`: from the measured ones [m]. - `force`: on the clamp [N].
+    """
+
+    coefficients: Float[Array, "frame function axis"]
+    balanced: Bool[Array, " frame"]
+    by_now: Float[Array, "frame work unknown"]
+    by_rate: Float[Array, "frame work unknown"]
+    by_place: Float[Array, "frame work dim"]
+    markers: Float[Array, "frame marker axis"]
+    force: Float[Array, " frame"]
+
+
+class Reduced(NamedTuple):
+    """Markers from the measured ones [m] and force [N] of a pull, with derivatives in the place."""
+
+    markers: np.ndarray
+    markers_by_place: np.ndarray
+    force: np.ndarray
+    force_by_place: np.ndarray
+
+
+class Balanced(NamedTuple):
+    """What the weak form found.
+
+    - `place`: in the family's unit cube. - `covariance`: of that place.
+    - `information`: its inverse, without the prior of the ranges.
+    - `marker`, `force`: rms of what is left of markers [m] and force [-].
+    - `places`, `losses`: of every step; the losses are mean squares of the markers' rest [m^2].
+    - `converged`: whether the last step was small.
+    """
+
+    place: Float[np.ndarray, " dim"]
+    covariance: Float[np.ndarray, "dim dim"]
+    information: Float[np.ndarray, "dim dim"]
+    marker: float
+    force: float
+    places: Float[np.ndarray, "step dim"]
+    losses: Float[np.ndarray, " step"]
+    converged: bool
+
+
+def basis_of(pull: Pull, degrees: tuple[int, int] = DEGREES) -> Basis:
+    """The functions for one pull."""
+    virtual = virtual_fields(degrees)
+    nodes, weights = (np.asarray(part, np.float64) for part in virtual[:2])
+    _, slope = virtual_at(nodes, degrees)
+    scale = np.sqrt(np.einsum("fqi,q->f", slope**2, weights))
+    places = np.asarray(pull.places, np.float64) / np.asarray(pull.size, np.float64)
+    at, _ = virtual_at(places, degrees)
+    return Basis(virtual, jnp.asarray((at / scale[:, None])[:-1].T, float))
+
+
+@eqx.filter_jit
+def prepared(network: Network, pull: Pull, basis: Basis):
+    """The even motion with the network's accelerations, its distance from the markers [m], and the
+    coefficients of the network's motion in every frame [m]."""
+    even = eqx.tree_at(lambda n: n.scale, network, jnp.zeros_like(network.scale))
+    frames = jnp.arange(len(pull.times))
+    motion = kinematics(even, pull, basis.virtual, frames)
+    moving = kinematics(network, pull, basis.virtual, frames)
+    nodes = jnp.tile(basis.virtual.nodes * pull.size[None], (len(frames), 1))
+    times = jnp.repeat(pull.times, len(basis.virtual.nodes))
+    moved = network(jnp.concatenate([nodes, times[:, None]], axis=1))
+    moved = moved.reshape(motion.velocity.shape)
+    inverse = jnp.linalg.pinv(basis.virtual.value[:-1].T)
+    start = jnp.einsum("fq,tqi->tfi", inverse, moved)
+    return motion._replace(acceleration=moving.acceleration), marker_residual(even, pull), start
+
+
+def _moved(even: Kinematics, pull: Pull, basis: Basis, now: Array, rate: Array) -> Kinematics:
+    """The motion in one frame, with coefficients [m] and their rates [m/s]; all with one frame."""
+    slope = basis.virtual.slope[:-1] / pull.size[None, None]
+    gradient = lambda c: jnp.einsum("fi,fqj->qij", c, slope)[None]
+    velocity = jnp.einsum("fi,fq->qi", rate, basis.virtual.value[:-1])[None]
+    return Kinematics(
+        even.gradient + gradient(now),
+        even.rate + gradient(rate),
+        even.velocity + velocity,
+        even.acceleration,
+    )
+
+
+def _tangents(fabric, pull: Pull, basis: Basis, motion: Kinematics, strain: Strain):
+    """Derivatives of the work in one frame in coefficients and their rates."""
+
+    stress = lambda gradient, rate: nominal_stress(fabric, pull.angle, gradient, rate, strain)
+    loads = lambda velocity, acceleration: load(fabric, pull, velocity, acceleration)
+    both = jax.vmap(jax.jacfwd(stress, (0, 1)))
+    by_gradient, by_rate = both(motion.gradient[0], motion.rate[0])
+    by_velocity = jax.vmap(jax.jacfwd(loads))(motion.velocity[0], motion.acceleration[0])
+    weights = basis.virtual.weights * pull.size[0] * pull.size[1]
+    slope, value = basis.virtual.slope / pull.size[None, None], basis.virtual.value
+
+    def strains(tangent):  # in two steps, or it would be many times the work
+        inner = jnp.einsum("q,qikjl,gql->qikgj", weights, tangent, slope[:-1])
+        return jnp.einsum("fqk,qikgj->figj", slope, inner)
+
+    moves = jnp.einsum("q,fq,qij,gq->figj", weights, value, by_velocity, value[:-1])
+    size = slope.shape[0] * motion.velocity.shape[2]
+    shaped = lambda tangent: tangent.reshape(size, -1)
+    return shaped(strains(by_gradient)), shaped(strains(by_rate) + moves)
+
+
+@eqx.filter_jit
+def solve(
+    family: Family,
+    place: Float[Array, " dim"],
+    pull: Pull,
+    basis: Basis,
+    even: Kinematics,
+    off: Float[Array, "frame marker axis"],
+    start: Float[Array, "frame function axis"],
+    strain: Strain = green,
+) -> Solved:
+    """The motion in balance at a place of the family, from `start` [m], with derivatives."""
+    fabric, interval = family(place), (pull.times[-1] - pull.times[0]) / (len(pull.times) - 1)
+    shape, axes = start.shape[1:], start.shape[2]
+
+    def works(fabric, frame, formula, now, before, earlier):
+        rate = formula[0] * now + formula[1] * before + formula[2] * earlier
+        moved = _moved(frame, pull, basis, now, rate)
+        return virtual_work(fabric, pull, basis.virtual, moved, strain)[0], moved
+
+    def frame_in_balance(carried, given):
+        before, earlier = carried
+        frame, guess, formula = given
+        frame = jax.tree.map(lambda values: values[None], frame)
+        imbalance = lambda now: works(fabric, frame, formula, now, before, earlier)[0][:-1]
+        size = lambda now: jnp.linalg.norm(imbalance(now))
+        # the stress of the even motion, for want of another measure
+        enough = BALANCED * (
+            jnp.linalg.norm(works(fabric, frame, formula, guess, before, earlier)[0][-1])
+        )
+        floor = BALANCED * jnp.max(pull.size) * 0.1
+
+        def goes_on(state):
+            _, left, count = state
+            return (left > enough + floor) & (count < NEWTON)
+
+        def improve(state):
+            now, left, count = state
+            work, moved = works(fabric, frame, formula, now, before, earlier)
+            by_now, by_rate = _tangents(fabric, pull, basis, moved, strain)
+            matrix = (by_now + formula[0] * by_rate)[:-axes]
+            step = -jnp.linalg.solve(matrix, work[:-1].ravel()).reshape(shape)
+            shares = 0.5 ** jnp.arange(CUTS, dtype=now.dtype)
+            sizes = jax.vmap(lambda share: size(now + share * step))(shares)
+            best = jnp.argmin(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))
+            better = sizes[best] < left
+            now = jnp.where(better, now + shares[best] * step, now)
+            return now, jnp.minimum(sizes[best], left), jnp.where(better, count + 1, NEWTON)
+
+        # the nearer one: what the network says, or the frame before
+        guess = jnp.where(size(guess) < size(before), guess, before)
+        now, left, _ = jax.lax.while_loop(goes_on, improve, (guess, size(guess), 0))
+        work, moved = works(fabric, frame, formula, now, before, earlier)
+        of_place = lambda place: works(family(place), frame, formula, now, before, earlier)[
+            0
+        ].ravel()
+        tangents = _tangents(fabric, pull, basis, moved, strain)
+        good = left < 100 * (enough + floor)
+        return (now, before), (now, good, *tangents, jax.jacfwd(of_place)(place), work[-1, 0])
+
+    given = even, start, jnp.asarray(_formulas(len(start)), float) / interval
+    _, found = jax.lax.scan(frame_in_balance, (start[0], start[0]), given)
+    now, good, by_now, by_rate, by_place, force = found
+    markers = off + jnp.einsum("mf,tfi->tmi", basis.at_markers, now)
+    markers = jnp.where(pull.seen[..., None], markers, 0)
+    force = force / end_value(basis.virtual)
+    return Solved(now, good, by_now, by_rate, by_place, markers, force)
+
+
+def reduced(solved: Solved, pull: Pull, basis: Basis) -> Reduced:
+    """Markers and force in balance, with their derivatives through all frames."""
+    parts = (np.asarray(part, np.float64) for part in solved[2:5])
+    number, axes = len(pull.times), solved.markers.shape[2]
+    interval = float(pull.times[-1] - pull.times[0]) / (number - 1)
+    dim = solved.by_place.shape[2]
+    slopes = [np.zeros((solved.by_now.shape[2], dim))] * 2  # of the two frames before
+    force_by_place = np.zeros((number, dim))
+    formulas = _formulas(number) / interval
+    for frame, (by_now, by_rate, by_place) in enumerate(zip(*parts, strict=True)):
+        past = formulas[frame, 1] * slopes[-1] + formulas[frame, 2] * slopes[-2]
+        matrix = by_now + formulas[frame, 0] * by_rate
+        right = by_place + by_rate @ past
+        slope = -np.linalg.solve(matrix[:-axes], right[:-axes])
+        force_by_place[frame] = matrix[-axes] @ slope + right[-axes]
+        slopes.append(slope)
+    by = np.stack(slopes[2:]).reshape(number, -1, axes, dim)
+    markers = np.einsum("mf,tfid->tmid", np.asarray(basis.at_markers, np.float64), by)
+    markers = np.where(np.asarray(pull.seen)[..., None, None], markers, 0)
+    measured = 0.0 if pull.force is None else np.asarray(pull.force, np.float64)
+    return Reduced(
+        np.asarray(solved.markers, np.float64).ravel(),
+        markers.reshape(-1, dim),
+        np.asarray(solved.force, np.float64) - measured,
+        force_by_place / float(end_value(basis.virtual)),
+    )
+
+
+def _formulas(frames: int) -> Float[np.ndarray, "frame 3"]:
+    return np.array([FORMULAS[min(frame, 2)] for frame in range(frames)])
+
+
+def balance(
+    family: Family,
+    networks: list[Network],
+    pulls: list[Pull],
+    place: Float[np.ndarray, " dim"],
+    marker: float,
+    force: float,
+    strain: Strain = green,
+    degrees: tuple[int, int] = DEGREES,
+    steps: int = STEPS,
+) -> Balanced:
+    """The place in the family whose motions in balance fit markers and force best.
+
+    `marker` [m] and `force` [-], over the greatest of its pull, are the noise to begin with; what
+    is left replaces them. `degrees` are those of the virtual displacements, along and across.
+    The ranges count as a flat prior. A force that is unknown does not count.
+    Raises `RuntimeError` when no motion is in balance.
+    """
+    bases = [basis_of(pull, degrees) for pull in pulls]
+    about = [prepared(*each) for each in zip(networks, pulls, bases, strict=True)]
+    starts = [start for *_, start in about]
+    place = np.clip(np.asarray(place, np.float64), INSIDE, 1 - INSIDE)
+    places, losses, last, longest, converged = [], [], np.zeros_like(place), LONGEST, False
+    information, normal = np.zeros((2, len(place), len(place)))
+    for _ in range(steps):
+        at, here = jnp.asarray(place, float), []
+        for i, (pull, basis, (even, off, _)) in enumerate(zip(pulls, bases, about, strict=True)):
+            solved = solve(family, at, pull, basis, even, off, starts[i], strain)
+            if not np.isfinite(np.asarray(solved.coefficients)).all():
+                raise RuntimeError(f"pull {i} has no motion in balance: it is not finite")
+            starts[i] = solved.coefficients
+            here.append(reduced(solved, pull, basis))
+        information, right = _normal(here, pulls, marker, force)
+        normal = information + FLAT_PRIOR * np.eye(len(place))
+        change = _step(normal, right + FLAT_PRIOR * (0.5 - place), place)
+        whole = bool(np.all(np.abs(change) <= longest))
+        if whole and change @ normal @ last < 0:  # friction is curved: Newton may go to and fro
+            longest = max(np.abs(change).max() / 2, 1e-3)
+        after = np.clip(place + np.clip(change, -longest, longest), INSIDE, 1 - INSIDE)
+        last, place = after - place, after
+        marker_left = _rms([one.markers for one in here])
+        force_left = _rms([one.force / _greatest(p) for one, p in zip(here, pulls, strict=True)])
+        losses.append(marker_left**2)
+        places.append(place)
+        if whole:  # what is left of a longer step is not noise
+            marker, force = max(marker_left, LEAST_NOISE[0]), max(force_left, LEAST_NOISE[1])
+        deviations = np.sqrt(np.diag(np.linalg.inv(normal)))
+        if whole and np.all(np.abs(last) < SMALL * deviations):
+            converged = True
+            break
+    covariance, history = np.linalg.inv(normal), (np.array(places), np.array(losses))
+    return Balanced(place, covariance, information, marker, force, *history, converged)
+
+
+def _normal(here: list[Reduced], pulls: list[Pull], marker: float, force: float):
+    """Information of all pulls on the place, and minus the gradient of half the squares."""
+    dim = here[0].markers_by_place.shape[1]
+    information, right = np.zeros((dim, dim)), np.zeros(dim)
+    for one, pull in zip(here, pulls, strict=True):
+        rows = [(one.markers / marker, one.markers_by_place / marker)]
+        if pull.force is not None:
+            noise = force * _greatest(pull)
+            rows.append((one.force / noise, one.force_by_place / noise))
+        for value, slope in rows:
+            information += slope.T @ slope
+            right -= slope.T @ value
+    return information, right
+
+
+def _step(normal: np.ndarray, right: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """The step of Newton's, along the ends of the ranges where it would leave them."""
+    change = np.linalg.solve(normal, right)
+    out = (place <= INSIDE) & (change < 0) | (place >= 1 - INSIDE) & (change > 0)
+    free = np.flatnonzero(~out)
+    change = np.zeros_like(change)
+    change[free] = np.linalg.solve(normal[np.ix_(free, free)], right[free])
+    return change
+
+
+def _greatest(pull: Pull) -> float:
+    return 1.0 if pull.force is None else float(np.abs(np.asarray(pull.force)).max())
+
+
+def _rms(values: list[np.ndarray]) -> float:
+    return float(np.sqrt(np.mean(np.concatenate([value.ravel() for value in values]) ** 2)))

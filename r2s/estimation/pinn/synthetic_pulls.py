@@ -1,0 +1,87 @@
+"""Recordings of a known fabric that is pulled along any direction, by the cloth solver."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from r2s.estimation.pinn.laws import TurnedMembrane
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import Mesh
+from r2s.geometry.surface import nearest
+from r2s.recordings.recording import Recording, RecordingInfo, make_recording
+from r2s.scenarios import account, clamp_force, stretching
+from r2s.scenarios.synthetic import MARKER_NOISE, MARKERS
+
+FRAMES = 39  # of 1/30 s
+FORCE_NOISE = 0.01  # of the largest force
+
+_account = eqx.filter_jit(account)
+
+
+def pulled(
+    fabric: Fabric,
+    name: str,
+    angle: float = 0.0,
+    *,
+    shape: tuple[int, int] = (17, 17),
+    frames: int = FRAMES,
+    marker_noise: float = MARKER_NOISE,
+    force_noise: float = FORCE_NOISE,
+    max_step: float = 1 / 30,
+    key: PRNGKeyArray,
+    strain: float = 0.04,
+) -> Recording:
+    """A stretching of a fabric whose warp is turned from the pull by an `angle` [rad].
+
+    81 markers with `marker_noise` [m], and a force with `force_noise` [-] of its greatest. Steps
+    of at most `max_step` [s]: by default one a frame, so that a force is that at its frame's time
+    and not a mean. The pull is by `strain` [-] of the sheet's length. Raises `RuntimeError` when
+    it diverges.
+    """
+    experiment = stretching(num_frames=frames, strain=strain)
+    scenario = experiment.scenario(shape)
+    turned = dataclasses.replace(
+        fabric, membrane=TurnedMembrane(fabric.membrane, jnp.asarray(angle, float))
+    )
+    found = _account(scenario, turned, max_step)
+    if not np.isfinite(np.asarray(found.x)).all():
+        raise RuntimeError(f"the simulation of {name} diverged")
+    key_markers, key_force = jr.split(key)
+    markers = _markers(scenario.scene.mesh, found.x)
+    force = np.asarray(clamp_force(scenario, found))
+    spread = force_noise * np.abs(force).max()
+    info = RecordingInfo(
+        name=f"stretching_{name}_{np.degrees(angle):.0f}",
+        scenario="stretching",
+        fabric=name,
+        trial="1",
+        source=f"synthetic: {name}, pulled at {np.degrees(angle):.0f} degrees from its warp",
+        frames_used=experiment.frames_used,
+        sheet=experiment.sheet,
+        table_height=experiment.table_height,
+        verified=None,
+    )
+    return make_recording(
+        None,
+        experiment.times,
+        experiment.route.path,
+        experiment.route.times,
+        info,
+        markers=markers + marker_noise * np.asarray(jr.normal(key_markers, markers.shape, float)),
+        force=force + spread * np.asarray(jr.normal(key_force, force.shape, float)),
+        force_times=experiment.times,
+    )
+
+
+def _markers(mesh: Mesh, x: Float[Array, "frame vertex 3"]) -> np.ndarray:
+    """Places [m] of 9 x 9 markers in each frame, each in the middle of its cell of the sheet."""
+    along = (np.arange(MARKERS) + 0.5) / MARKERS
+    places = np.stack(np.meshgrid(along, along, indexing="ij"), -1).reshape(-1, 2)
+    places = jnp.asarray(places * np.asarray(mesh.rest).max(axis=0), float)
+    flat = lambda points: jnp.pad(points, ((0, 0), (0, 1)))
+    faces, weights = nearest(flat(places), flat(mesh.rest), mesh.faces)
+    return np.asarray(jnp.einsum("mk,tmki->tmi", weights, x[:, mesh.faces[faces]]))

@@ -1,0 +1,150 @@
+"""The weak form: the work of the stress in a few smooth virtual displacements.
+
+The virtual displacements vanish at the clamps, and are free at the free edges, where the traction
+is then zero of itself. One more, even from clamp to clamp, gives the balance with the measured
+force. First derivatives in space suffice. For a given motion the work is linear in the stiffness
+(the virtual fields method: Pierron and Grediac 2012).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from r2s.estimation.pinn.data import Pull
+from r2s.estimation.pinn.laws import Strain, green, nominal_stress
+from r2s.estimation.pinn.losses import (
+    Losses,
+    Points,
+    Scales,
+    common_losses,
+    field,
+    gradients,
+    load,
+)
+from r2s.estimation.pinn.network import WEAK, DisplacementField, T
+from r2s.fabrics.fabric import Fabric
+
+NODES = 12  # of the quadrature, along each side
+FEW_NODES, FEW_DEGREES = 8, (3, 4)  # of the loss of the network
+DEGREES = (7, 8)  # of the polynomials, along and across the pull
+
+
+class Virtual(NamedTuple):
+    """Virtual displacements on the unit square, at the nodes of a quadrature.
+
+    - `nodes`, `weights`: of the quadrature. - `value`: [-]. - `slope`: in both sides, [-].
+
+    The last one is even from clamp to clamp; the others vanish there.
+    """
+
+    nodes: Float[Array, "node 2"]
+    weights: Float[Array, " node"]
+    value: Float[Array, "function node"]
+    slope: Float[Array, "function node 2"]
+
+
+def virtual_fields(degrees: tuple[int, int] = DEGREES, nodes: int = NODES) -> Virtual:
+    """Products x (1 - x) P_i(x) P_j(y) of Legendre's polynomials, of unit slope on average."""
+    at, weight = np.polynomial.legendre.leggauss(nodes)
+    x, y = (grid.ravel() for grid in np.meshgrid((at + 1) / 2, (at + 1) / 2, indexing="ij"))
+    weights = np.outer(weight, weight).ravel() / 4
+    value, slope = virtual_at(np.stack([x, y], 1), degrees)
+    size = np.sqrt(np.einsum("fqi,q->f", slope**2, weights))
+    value, slope = value / size[:, None], slope / size[:, None, None]
+    array = lambda values: jnp.asarray(values, float)
+    return Virtual(array(np.stack([x, y], 1)), array(weights), array(value), array(slope))
+
+
+def virtual_at(
+    places: np.ndarray, degrees: tuple[int, int]
+) -> tuple[Float[np.ndarray, "function point"], Float[np.ndarray, "function point 2"]]:
+    """The functions of `virtual_fields`, not scaled, at places on the unit square, with slopes."""
+    x, y = places.T
+    along = [_legendre(i) * np.polynomial.Polynomial([0, 1, -1]) for i in range(degrees[0])]
+    across = [_legendre(j) for j in range(degrees[1])]
+    pairs = [(f, g) for f in along for g in across]
+    pairs.append((np.polynomial.Polynomial([0, 1]), np.polynomial.Polynomial([1])))
+    value = np.array([f(x) * g(y) for f, g in pairs])
+    slope = np.array([[f.deriv()(x) * g(y), f(x) * g.deriv()(y)] for f, g in pairs])
+    return value, np.moveaxis(slope, 1, 2)
+
+
+def _legendre(degree: int) -> np.polynomial.Polynomial:
+    """Legendre's polynomial on 0..1."""
+    basis = np.polynomial.legendre.Legendre.basis(degree, [0, 1])
+    return basis.convert(kind=np.polynomial.Polynomial)
+
+
+class Kinematics(NamedTuple):
+    """A motion at the nodes of a quadrature: gradients [-], their rates [1/s], velocities [m/s],
+    accelerations [m/s^2]."""
+
+    gradient: Float[Array, "frame node axis 2"]
+    rate: Float[Array, "frame node axis 2"]
+    velocity: Float[Array, "frame node axis"]
+    acceleration: Float[Array, "frame node axis"]
+
+
+def kinematics(
+    network: DisplacementField, pull: Pull, virtual: Virtual, frames: Int[Array, " frame"]
+) -> Kinematics:
+    """The motion that a network gives, at the nodes in some frames."""
+    number, nodes = len(frames), len(virtual.nodes)
+    places = jnp.tile(virtual.nodes * pull.size[None], (number, 1))
+    jet = field(network, pull, places, jnp.repeat(frames, nodes), WEAK)
+    shaped = lambda values: values.reshape(number, nodes, *values.shape[1:])
+    rate = jnp.moveaxis(jet.second[:2], 0, -1)
+    parts = gradients(jet), rate, jet.first[T], jet.second[2]
+    return Kinematics(*map(shaped, parts))
+
+
+def virtual_work(
+    fabric: Fabric, pull: Pull, virtual: Virtual, motion: Kinematics, strain: Strain = green
+) -> Float[Array, "frame function axis"]:
+    """The work [N m / m] of stress and load in every virtual displacement, in every frame.
+
+    Zero for all but the last, where it is the force on the far clamp [N], times the scale of that
+    displacement at the clamp: its largest value.
+    """
+
+    def stresses(gradient, rate, velocity, acceleration):
+        stress = nominal_stress(fabric, pull.angle, gradient, rate, strain)
+        return stress, load(fabric, pull, velocity, acceleration)
+
+    stress, loads = jax.vmap(jax.vmap(stresses))(*motion)
+    weights = virtual.weights * pull.size[0] * pull.size[1]
+    slope = virtual.slope / pull.size[None, None]
+    inner = jnp.einsum("q,tqij,fqj->tfi", weights, stress, slope)
+    return inner + jnp.einsum("q,tqi,fq->tfi", weights, loads, virtual.value)
+
+
+def end_value(virtual: Virtual) -> Float[Array, ""]:
+    """The last virtual displacement at the far clamp, [-]."""
+    return virtual.slope[-1, 0, 0]
+
+
+def weak_losses(
+    network: DisplacementField,
+    pull: Pull,
+    fabric: Fabric,
+    points: Points,
+    scales: Scales,
+    strain: Strain = green,
+) -> Losses:
+    """The losses with the virtual work in place of the equation of motion and of free edges.
+
+    Of `points` only the frames of the free edges count.
+    """
+    data, clamps = common_losses(network, pull, scales)
+    virtual = virtual_fields(FEW_DEGREES, FEW_NODES)
+    motion = kinematics(network, pull, virtual, points.edge_frame)
+    work = virtual_work(fabric, pull, virtual, motion, strain)
+    off = work[:, :-1] / (scales.stress * jnp.max(pull.size))
+    traction = jnp.zeros((), data.dtype)
+    if pull.force is not None:
+        force = work[:, -1, 0] / end_value(virtual)
+        traction = jnp.mean(((force - pull.force[points.edge_frame]) / scales.force) ** 2)
+    return Losses(data, jnp.mean(off**2), traction, jnp.zeros((), data.dtype), clamps)

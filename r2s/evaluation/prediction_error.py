@@ -1,0 +1,79 @@
+"""How well a fabric predicts a recorded motion: the figures of the results table."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from r2s.evaluation import metrics
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.surface import sample
+from r2s.recordings.recording import Recording, cloud
+from r2s.scenarios.scenario import from_recording, motion
+
+SAMPLES = 9  # squared, on each face: 10,368 points on 128 faces, the study's 10,000
+UNITS = {"paper_chamfer": "-", "paper_hausdorff": "-"}  # all others are in metres
+
+_motion = eqx.filter_jit(motion)  # compiled once for all recordings of as many frames and knots
+_sample = eqx.filter_jit(eqx.filter_vmap(sample, in_axes=(0, None, None)))
+
+
+def predict(recording: Recording, fabric: Fabric) -> Float[np.ndarray, "frame vertex 3"]:
+    """Positions [m] of a fabric in the motion of a recording; NaN from where it diverged."""
+    moved = _motion(from_recording(recording), fabric)
+    return np.where(np.asarray(moved.ok)[:, None, None], np.asarray(moved.x), np.nan)
+
+
+def against_motion(
+    recording: Recording,
+    x: Float[np.ndarray, "frame vertex 3"],
+    every: int = 1,
+    crop: bool = True,
+) -> dict[str, float]:
+    """Metrics of a motion against a recording, mean over those frames that count (3: every third).
+
+    All NaN when the motion diverged in them: that is a result, too. Without `crop` those metrics
+    are left out that leave out what lies below the recording, see `_frame`.
+    """
+    first, last = recording.info.frames_used
+    faces = from_recording(recording).scene.mesh.faces
+    used = range(first, last + 1, every)
+    simulated = np.asarray(_sample(jnp.asarray(x[np.array(used)]), faces, SAMPLES))
+    return _mean([cloud(recording, frame) for frame in used], list(simulated), crop)
+
+
+def against_recording(recording: Recording, other: Recording) -> dict[str, float]:
+    """Metrics of another recording against this one, frame by frame."""
+    first, last = recording.info.frames_used
+    if len(other.times) <= last:
+        raise ValueError(
+            f"{other.info.name} has {len(other.times)} frames, {recording.info.name} is judged "
+            f"on frames {first} to {last}"
+        )
+    used = range(first, last + 1)
+    return _mean([cloud(recording, f) for f in used], [cloud(other, f) for f in used])
+
+
+def _mean(
+    real: list[np.ndarray], simulated: list[np.ndarray], crop: bool = True
+) -> dict[str, float]:
+    if not all(np.all(np.isfinite(points)) for points in simulated):
+        return dict.fromkeys(_frame(real[0], real[0], real[0], real[0], crop), float("nan"))
+    firsts = real[0], simulated[0]
+    rows = [_frame(a, b, *firsts, crop) for a, b in zip(real, simulated, strict=True)]
+    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+
+
+def _frame(real, simulated, first_real, first_simulated, crop: bool) -> dict[str, float]:
+    """All metrics of one frame.
+
+    Those that end in `_cropped` leave out what lies below the recording's lowest point: recordings
+    are cut off above the table, where a simulation still has a sheet.
+    """
+    whole = metrics.distances(real, simulated)
+    found = whole | metrics.paper_units(real, simulated, first_real, first_simulated)
+    if not crop:
+        return found
+    visible = simulated[simulated[:, 2] >= real[:, 2].min()]
+    cropped = metrics.distances(real, visible) if len(visible) else {}
+    return found | {f"{name}_cropped": cropped.get(name, float("nan")) for name in whole}

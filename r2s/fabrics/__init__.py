@@ -1,0 +1,6 @@
+"""What is estimated: a fabric, fabrics with provenance, and which numbers may vary.
+
+- `fabric`: areal density, a membrane law, a bending law, damping, friction, thickness.
+- `presets`: measured fabrics. `arcsim`: material files of ARCSim and DiffSim.
+- `parameters`: which numbers an estimator may move, and within which bounds.
+"""

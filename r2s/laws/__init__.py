@@ -1,0 +1,7 @@
+"""Laws of one element: the energy that a fabric stores in a strain or a curvature.
+
+- `membrane`: Green strain of a triangle, and the energy in it.
+- `bending`: laws of the angle between two triangles (hinges). `plate`: of a face's curvature.
+- `tables`: laws from tables of measured stiffness.
+- `solid`: the stress of a piece of material, for bodies of particles.
+"""

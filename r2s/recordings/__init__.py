@@ -1,0 +1,7 @@
+"""Observations of a fabric, from files to one canonical form.
+
+- `recording`: the canonical form: clouds, markers, force, the path of the grippers.
+- `manifest`: what a folder of recordings is. `convert`: folders to NPZ files.
+- `datasets`: public data. `summary`: what is in a recording.
+- `readers`: one file format each. `cameras`: depth cameras, real and rendered.
+"""

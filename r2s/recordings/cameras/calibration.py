@@ -1,0 +1,156 @@
+"""Calibrated depth cameras: lenses, poses, and the rays of their pixels."""
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Float
+
+from r2s.extras import opencv
+from r2s.recordings.cameras.camera import Camera
+
+Row = tuple[float, float, float, float]
+
+DISTORTIONS = (0, 4, 5, 8, 12, 14)  # OpenCV's models: how many numbers each has
+OFF_CENTRE = 0.2  # of the image's size: a lens's axis is closer to the middle than this
+FARTHEST = 50.0  # [m]: no camera of a fabric stands farther from the origin
+IN_MILLIMETRES = "give metres per unit of the depth files: 0.001 for millimetres, 1 for metres"
+
+
+@dataclass(frozen=True)
+class DepthCamera:
+    """A depth camera as OpenCV calibrates it: its x axis points right, y down, z forward.
+
+    - `resolution`: pixels (across, down).
+    - `focal_length`, `centre`: (across, down), in pixels; (0, 0) is the middle of the first pixel.
+    - `to_world`: rows of the 4 x 4 matrix from the camera's axes to the world's, [m].
+    - `depth_scale`: metres per unit of the depth files.
+    - `distortion`: OpenCV's k1, k2, p1, p2, k3, ...; empty for none.
+    - `masks`: is there a folder of masks (else every pixel may be the fabric)?
+    - `may_miss`: may the fabric be out of this camera's view in some frames?
+
+    Depth is the distance along z, not along the ray. Raises ValueError for lengths that are not
+    positive, a centre far from the image's (the mark of another resolution), a pose that is no
+    rotation and shift, and a distortion of another length.
+    """
+
+    resolution: tuple[int, int]
+    focal_length: tuple[float, float]
+    centre: tuple[float, float]
+    to_world: tuple[Row, Row, Row, Row]
+    depth_scale: float = field(metadata={"unknown": IN_MILLIMETRES})
+    distortion: tuple[float, ...] = ()
+    masks: bool = True
+    may_miss: bool = False
+
+    def __post_init__(self) -> None:
+        if min(self.resolution) < 1:
+            raise ValueError(f"resolution must be at least one pixel, found {self.resolution}")
+        if not min(self.focal_length) > 0:
+            raise ValueError(f"focal_length must be positive [pixel], found {self.focal_length}")
+        if not self.depth_scale > 0:
+            found = f"found {self.depth_scale}: {IN_MILLIMETRES}"
+            raise ValueError(f"depth_scale must be positive, {found}")
+        if len(self.distortion) not in DISTORTIONS:
+            raise ValueError(
+                f"distortion has one of {DISTORTIONS} numbers, found {self.distortion}"
+            )
+        size = np.array(self.resolution)
+        if (np.abs(np.array(self.centre) / size - 0.5) > OFF_CENTRE).any():
+            raise ValueError(
+                f"centre {self.centre} is far from the middle of {size[0]} x {size[1]} pixels: are "
+                "these the intrinsics of another resolution? Scale focal_length and centre alike"
+            )
+        _check_pose(np.array(self.to_world))
+
+
+def _check_pose(pose: np.ndarray) -> None:
+    if not np.array_equal(pose[3], [0, 0, 0, 1]):
+        hint = "transpose it" if np.array_equal(pose[:, 3], [0, 0, 0, 1]) else "give rows"
+        raise ValueError(f"to_world must end with the row 0 0 0 1, found {pose[3]}: {hint}")
+    rotation = pose[:3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
+        raise ValueError(
+            f"to_world is no rotation and shift, its first rows and columns are {rotation.tolist()}"
+            ": give the camera's x, y and z axes in the world as columns"
+        )
+    if np.abs(pose[:3, 3]).max() > FARTHEST:
+        raise ValueError(
+            f"to_world puts the camera at {pose[:3, 3]} m, more than {FARTHEST:g} m away: "
+            "give its position in metres"
+        )
+
+
+def look_at(position: tuple[float, ...], target: tuple[float, ...]) -> tuple[Row, Row, Row, Row]:
+    """`to_world` of a camera at a position that looks at a target [m]; up in its image is up.
+
+    Raises ValueError when it looks straight up or down.
+    """
+    forward = np.subtract(target, position)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    if np.linalg.norm(right) < 1e-9:
+        raise ValueError(f"a camera at {position} looking at {target} has no way up in its image")
+    down = np.cross(forward, right)
+    axes = [axis / np.linalg.norm(axis) for axis in (right, down, forward)]
+    pose = np.eye(4)
+    pose[:3] = np.stack([*axes, np.array(position)], axis=1)
+    rows = [tuple(float(value) for value in row) for row in pose]
+    return rows[0], rows[1], rows[2], rows[3]  # pyright: ignore[reportReturnType]
+
+
+def calibrated(camera: Camera, depth_scale: float = 1e-3) -> DepthCamera:
+    """A pinhole camera of the simulation as a calibrated one."""
+    across, down = camera.resolution
+    focal = float(camera.focal_length)
+    position, target = (tuple(map(float, p)) for p in (camera.position, camera.target))
+    # its pixels begin, ours have their middle, at whole numbers
+    centre = (across / 2 - 0.5, down / 2 - 0.5)
+    pose = look_at(position, target)
+    return DepthCamera((across, down), (focal, focal), centre, pose, depth_scale)
+
+
+def matrix(camera: DepthCamera) -> Float[np.ndarray, "3 3"]:
+    """The 3 x 3 matrix of the intrinsics [pixel]."""
+    (fx, fy), (cx, cy) = camera.focal_length, camera.centre
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+
+def project(
+    camera: DepthCamera, points: Float[np.ndarray, "point 3"]
+) -> Float[np.ndarray, "point 2"]:
+    """Pixels (across, down), lens included, of points in the camera's axes [m] in front of it."""
+    if not any(camera.distortion):
+        return points[:, :2] / points[:, 2:] * camera.focal_length + camera.centre
+    still, lens = np.zeros(3), np.array(camera.distortion)
+    return opencv().projectPoints(points, still, still, matrix(camera), lens)[0].reshape(-1, 2)
+
+
+@lru_cache(maxsize=8)  # the same for every frame; 15 MB at 720p
+def rays(camera: DepthCamera) -> Float[np.ndarray, "down across 2"]:
+    """x / z and y / z of what each pixel sees, in the camera's axes: undistorted.
+
+    The image itself is left alone: interpolation would make depths between fabric and table.
+    """
+    columns, rows = (np.arange(size, dtype=float) for size in camera.resolution)
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
+    if any(camera.distortion):
+        lens = np.array(camera.distortion)
+        flat = opencv().undistortPoints(pixels.reshape(-1, 1, 2), matrix(camera), lens)
+        directions = flat.reshape(pixels.shape)
+    else:
+        directions = (pixels - camera.centre) / camera.focal_length
+    directions.setflags(write=False)
+    return directions
+
+
+def frustum(camera: DepthCamera) -> Float[np.ndarray, "4 4"]:
+    """The planes around what a camera has in its frame: points (x, y, z, 1) [m] of the world with
+    no product below zero. They go through the corners of its image; between those a lens may bend
+    the border by some pixels."""
+    around = rays(camera)[[0, 0, -1, -1], [0, -1, -1, 0]]
+    corners = np.concatenate([around, np.ones((4, 1))], axis=1)
+    inward = np.cross(corners, np.roll(corners, -1, axis=0))
+    inward /= np.linalg.norm(inward, axis=1, keepdims=True)
+    pose = np.array(camera.to_world)
+    normal = inward @ pose[:3, :3].T
+    return np.concatenate([normal, -normal @ pose[:3, 3:]], axis=1)

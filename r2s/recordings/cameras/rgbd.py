@@ -1,0 +1,303 @@
+"""RGB-D recordings: folders of depth images and masks, one a camera, to clouds of the fabric.
+
+The folder of a recording holds, for each camera that `cameras.json` names,
+
+    NAME/depth/000.png ...   16-bit PNG, or NPY; `depth_scale` metres per unit, 0 for no depth
+    NAME/masks/000.png ...   not zero where the fabric is; same numbers ("masks": false for none)
+    NAME/colour/000.png ...  PNG or JPG, same numbers; may be missing, is not read
+    NAME/times.csv           seconds, in the last column; may be missing if `frame_rate` is given
+
+and `cameras.json` lies there, or in the folder above for all recordings of one set:
+
+    {"frame_rate": 15, "clean": {"workspace": [[-0.1, -0.1, 0], [0.6, 0.6, 0.5]]}, "cameras":
+      {"left": {"resolution": [1280, 720], "focal_length": [920, 920], "centre": [640, 360],
+                "distortion": [], "to_world": [[...4 numbers...], ..., [0, 0, 0, 1]],
+                "depth_scale": 0.001}}}
+
+The fields are those of `Rig`, `Cleaning` and `DepthCamera`.
+"""
+
+import dataclasses
+import itertools
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from r2s.files import read_json, write_json
+from r2s.recordings.cameras import images
+from r2s.recordings.cameras.calibration import DepthCamera
+from r2s.recordings.cameras.cleaning import Cleaning, clean, inside
+from r2s.recordings.cameras.depth import back_project, from_world, moved, steps
+from r2s.recordings.cameras.timing import pair, read_times
+from r2s.recordings.readers.clouds import find_numbered
+from r2s.recordings.recording import Recording, RecordingInfo, make_recording
+
+NAME = "cameras.json"
+MOST = 0.5  # of the points behind a mask: at least so many are in the workspace
+DISAGREE = 0.005  # [m]: cameras whose clouds are closer than this are not swapped
+COMPARED = 2000  # points of each cloud
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The cameras of a set of recordings; the first is the clock of the others.
+
+    - `frame_rate`: for cameras without times.csv, [Hz]; 0: all have one.
+    - `pair_tolerance`: what the times of frames that belong together may differ by, [s]; 0: half
+      the interval between the first camera's frames.
+    """
+
+    cameras: Mapping[str, DepthCamera]
+    clean: Cleaning
+    frame_rate: float = 0.0
+    pair_tolerance: float = 0.0
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.cameras:
+            raise ValueError("cameras: none is given")
+        if self.frame_rate < 0 or self.pair_tolerance < 0:
+            raise ValueError("frame_rate [Hz] and pair_tolerance [s] must not be negative")
+
+
+def read_rig(folder: Path | str) -> Rig:
+    """The cameras of the recording in `folder`: its own cameras.json, or that of the folder above.
+
+    Raises FileNotFoundError, or ValueError that names the file and the field.
+    """
+    path = find_rig(folder)
+    if path is None:
+        raise FileNotFoundError(
+            f"{folder}: no {NAME} there or in the folder above: write one with intrinsics, poses "
+            "and depth_scale of the cameras"
+        )
+    return read_json(path, Rig)
+
+
+def find_rig(folder: Path | str) -> Path | None:
+    """Where the cameras of a recording are described, None if nowhere."""
+    places = (Path(folder) / NAME, Path(folder).parent / NAME)
+    return next((path for path in places if path.is_file()), None)
+
+
+def write_rig(folder: Path | str, rig: Rig) -> None:
+    """Write the cameras to `folder`, for `read_rig`."""
+    write_json(Path(folder) / NAME, dataclasses.asdict(rig))
+
+
+def rgbd_recording(
+    folder: Path | str,
+    info: RecordingInfo,
+    handle_path: Any,
+    handle_times: Any,
+    *,
+    rig: Rig | None = None,
+    **measured: Any,
+) -> Recording:
+    """The recording in a folder of RGB-D images.
+
+    `info.time_offset` is added to the cameras' times. `handle_path`, `handle_times` and `measured`
+    (force, markers) are as in `make_recording`. Raises as `stream` and `make_recording` do.
+    """
+    times, clouds = read_clouds(folder, rig or read_rig(folder))
+    times = times + info.time_offset
+    return make_recording(clouds, times, handle_path, handle_times, info, **measured)
+
+
+def read_clouds(
+    folder: Path | str,
+    rig: Rig,
+    frame_rate: float = 0.0,
+    watch: Callable[[Iterable[Any]], Iterable[Any]] = iter,
+) -> tuple[Float[np.ndarray, " frame"], list[Float[np.ndarray, "point 3"]]]:
+    """Times [s] on the cameras' clock, and the cleaned clouds [m]; raises as `stream`.
+
+    Frames come through `watch`, such as a bar that shows progress.
+    """
+    frames = list(watch(stream(folder, rig, frame_rate)))
+    return np.array([time for time, _ in frames]), [cloud for _, cloud in frames]
+
+
+def stream(
+    folder: Path | str, rig: Rig, frame_rate: float = 0.0
+) -> Iterator[tuple[float, Float[np.ndarray, "point 3"]]]:
+    """Time [s] and cleaned cloud [m] of one frame after the other: the images of one are in memory.
+
+    `frame_rate` [Hz] is used where the rig has none. Raises FileNotFoundError, ImportError (names
+    the extra), or ValueError that names the file or camera and frame, what was expected, and what
+    to do: files that are missing, damaged, of another size or unit; frames without partner; a
+    mask without pixels; points outside of the workspace.
+    """
+    folder = Path(folder)
+    rate = rig.frame_rate or frame_rate
+    files = {name: _files(folder / name, camera) for name, camera in rig.cameras.items()}
+    times = {name: _times(folder / name, len(files[name]), rate) for name in rig.cameras}
+    try:
+        pairs = pair(times, rig.pair_tolerance)
+    except ValueError as error:
+        raise ValueError(f"{folder}: {error}") from error
+    clock = next(iter(times.values()))
+    last: dict[str, bytes] = {}
+    for frame, index in enumerate(next(iter(pairs.values()))):
+        parts = {}
+        for name, chosen in pairs.items():
+            depth_file, mask_file = files[name][chosen[frame]]
+            parts[name] = _camera_cloud(rig, name, depth_file, mask_file, last)
+        if frame == 0:
+            _check_swapped(folder, rig, parts)
+        cloud = clean(np.concatenate(list(parts.values())), rig.clean, frame)
+        if len(cloud) == 0:
+            raise ValueError(
+                f"{folder}: frame {index} at {clock[index]:g} s: no point is left in the workspace "
+                f"{rig.clean.workspace} [m]: check workspace, table and masks, or drop the frame"
+            )
+        yield float(clock[index]), cloud
+
+
+def _files(folder: Path, camera: DepthCamera) -> list[tuple[Path, Path | None]]:
+    """The depth image and the mask of each frame of a camera."""
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f"{folder}: no folder of the camera {folder.name!r}, which {NAME} names: "
+            "restore it, or take the camera out"
+        )
+    depths = find_numbered(folder / "depth", images.DEPTHS)
+    masks: Mapping[int, Path | None] = dict.fromkeys(depths)
+    if camera.masks:
+        if not (folder / "masks").is_dir():
+            raise FileNotFoundError(
+                f"{folder / 'masks'}: no such folder: segment the fabric (SAM 2 writes such "
+                f'masks), or set "masks": false in {NAME}'
+            )
+        masks = find_numbered(folder / "masks", images.MASKS)
+        _same_frames(folder, "masks", depths, masks)
+    if (folder / "colour").is_dir():
+        _same_frames(folder, "colour", depths, find_numbered(folder / "colour", images.COLOURS))
+    return [(depths[number], masks[number]) for number in depths]
+
+
+def _same_frames(folder: Path, kind: str, depths: Mapping[int, Any], others: Mapping) -> None:
+    for lacking, numbers, there in ((kind, others, depths), ("depth", depths, others)):
+        for number in there:
+            if number not in numbers:
+                raise ValueError(
+                    f"{folder / lacking}: frame {number} is missing, {there[number]} is there: "
+                    f"export it again, or drop the frame; depth and {kind} have the same numbers"
+                )
+
+
+def _times(folder: Path, count: int, frame_rate: float) -> Float[np.ndarray, " frame"]:
+    path = folder / "times.csv"
+    if path.is_file():
+        times = read_times(path)
+        if len(times) != count:
+            raise ValueError(
+                f"{path}: {len(times)} times, but {count} frames in {folder / 'depth'}: "
+                "one line a frame"
+            )
+        return times
+    if frame_rate > 0:
+        return np.arange(count) / frame_rate
+    raise FileNotFoundError(f"{path}: no such file, and no frame_rate in {NAME}: give either")
+
+
+def _camera_cloud(
+    rig: Rig, name: str, depth_file: Path, mask_file: Path | None, last: dict[str, bytes]
+) -> Float[np.ndarray, "point 3"]:
+    """World points [m] of the fabric that one camera sees in one frame."""
+    camera = rig.cameras[name]
+    depth = images.read_depth(depth_file, camera.depth_scale, camera.resolution)
+    _warn_of_repeats(name, depth_file, depth, last)
+    where = depth > 0
+    if mask_file is not None:
+        mask = images.read_mask(mask_file, camera.resolution)
+        if not mask.any() and not camera.may_miss:
+            raise ValueError(
+                f"{mask_file}: the mask is empty: segment the frame again, or set "
+                f'"may_miss": true for {name!r} in {NAME} if the fabric was out of its view'
+            )
+        if mask.all():
+            raise ValueError(
+                f"{mask_file}: the mask marks every pixel: write 0 where the fabric is not, or set "
+                f'"masks": false for {name!r} in {NAME}'
+            )
+        if mask.any() and not (where & mask).any():
+            raise ValueError(
+                f"{depth_file}: no depth behind the mask {mask_file}: check that masks and depth "
+                "are of one frame and in the same pixels"
+            )
+        where &= mask
+    if rig.clean.edge > 0:
+        where &= ~steps(depth, rig.clean.edge)
+    seen = back_project(camera, depth, where)
+    points = moved(np.array(camera.to_world), seen)
+    kept = inside(points, rig.clean)
+    enough = MOST if mask_file is not None else 0
+    if len(points) and (not kept.any() or kept.mean() < enough):
+        raise ValueError(
+            f"{depth_file}: {kept.mean():.0%} of {len(points)} points of {name!r} are in the "
+            f"workspace {rig.clean.workspace} [m], they lie around "
+            f"{np.median(points, axis=0).round(3).tolist()} m: {_remedy(rig, name, seen)}"
+        )
+    return points[kept]
+
+
+def _remedy(rig: Rig, name: str, seen: Float[np.ndarray, "point 3"]) -> str:
+    """Which of the usual mistakes with poses would explain points outside of the workspace."""
+    pose = np.array(rig.cameras[name].to_world)
+    tries = {
+        "its inverse (is it world to camera?)": np.linalg.inv(pose),
+        "axes that point right, up and backward (is it OpenGL's?)": pose @ OPENGL,
+    }
+    for other, camera in rig.cameras.items():
+        if other != name:
+            tries[f"that of {other!r} (are the two swapped?)"] = np.array(camera.to_world)
+    shares = {what: inside(moved(p, seen), rig.clean).mean() for what, p in tries.items()}
+    best = max(shares, key=lambda what: shares[what])
+    if shares[best] >= MOST:
+        return f"with {best} instead of to_world, {shares[best]:.0%} would be: correct {NAME}"
+    return f"check to_world, depth_scale and workspace in {NAME}"
+
+
+def _check_swapped(folder: Path, rig: Rig, parts: Mapping[str, np.ndarray]) -> None:
+    """Refuse poses with which two cameras disagree, though exchanged they would agree."""
+    for one, other in itertools.combinations([name for name in parts if len(parts[name])], 2):
+        left, right = rig.cameras[one], rig.cameras[other]
+        apart = _apart(parts[one], parts[other])
+        if apart < DISAGREE:
+            continue
+        exchanged = _apart(
+            moved(np.array(right.to_world), from_world(left, parts[one])),
+            moved(np.array(left.to_world), from_world(right, parts[other])),
+        )
+        if exchanged < apart / 2:
+            raise ValueError(
+                f"{folder}: the first frames of {one!r} and {other!r} are {1e3 * apart:.0f} mm "
+                f"apart, with their to_world exchanged {1e3 * exchanged:.0f} mm: are the two "
+                f"swapped in {NAME}?"
+            )
+
+
+def _apart(one: np.ndarray, other: np.ndarray) -> float:
+    """Median distance [m] from the points of a cloud to the nearest of the other, both ways."""
+    from scipy.spatial import KDTree
+
+    one, other = (points[:: len(points) // COMPARED + 1] for points in (one, other))
+    both = KDTree(one).query(other)[0], KDTree(other).query(one)[0]
+    return float(np.median(np.concatenate(both)))
+
+
+def _warn_of_repeats(name: str, path: Path, depth: np.ndarray, last: dict[str, bytes]) -> None:
+    """Warn when a camera gives the same image twice: it hung, noise alone would change it."""
+    import hashlib
+
+    digest = hashlib.blake2b(depth.data, digest_size=16).digest()
+    if last.get(name) == digest:
+        warnings.warn(f"{path}: the same image as in the frame before: did it hang?", stacklevel=3)
+    last[name] = digest

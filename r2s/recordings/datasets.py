@@ -1,0 +1,265 @@
+"""Public data sets: what there is, where to get it, and whether it came as it was published.
+
+A data set is a JSON file in `data_manifests/`: a `Dataset`, or the
+`r2s.recordings.manifest.Manifest` of recordings that r2s reads as they are. Downloading needs
+pooch: pip install 'r2s[data]'.
+"""
+
+import json
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from r2s.files import read_json
+from r2s.recordings.manifest import (
+    Manifest,
+    default_manifest,
+    hash_values,
+    read_manifest,
+    read_recordings,
+)
+from r2s.recordings.readers.clouds import read_values
+
+TIMEOUT = 30  # [s], without a byte from the server
+CHUNK = 1 << 14  # [byte], of which a broken download loses at most one
+
+
+@dataclass(frozen=True)
+class Download:
+    """A file that anybody may download: where it is, and the sha256 of the whole of it."""
+
+    url: str
+    sha256: str
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch("[0-9a-f]{64}", self.sha256):
+            raise ValueError(f"sha256 must be 64 hexadecimal digits, found {self.sha256!r}")
+        if not re.match("https?://", self.url):
+            raise ValueError(f"url must begin with https:// or http://, found {self.url!r}")
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A data set that somebody published.
+
+    - `how`: how to get what `downloads` lacks, and how it comes into the form of `layout`.
+    - `layout`: pattern of paths in the folder -> what is there, of what is fetched by hand.
+    - `downloads`: path in the folder -> the file.
+    - `note`: what was checked about it, and what was not.
+    """
+
+    name: str
+    title: str
+    citation: str
+    licence: str
+    how: str
+    layout: Mapping[str, str]
+    downloads: Mapping[str, Download]
+    note: str
+
+    def __post_init__(self) -> None:
+        for path in (*self.layout, *self.downloads):
+            if PurePosixPath(path).is_absolute() or ".." in PurePosixPath(path).parts:
+                raise ValueError(f"paths must stay in the folder of the data, found {path!r}")
+
+
+def known_datasets(folder: Path | str | None = None) -> dict[str, Dataset | Manifest]:
+    """The data sets whose manifests lie in `folder` (None: that of the project), by name.
+
+    Raises FileNotFoundError when there is no such folder, ValueError as `read_dataset`, or when
+    two manifests have one name.
+    """
+    folder = default_manifest().parent if folder is None else Path(folder)
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f"{folder}: no folder of manifests: take data_manifests from the project's repository"
+        )
+    found: dict[str, Dataset | Manifest] = {}
+    for path in sorted(folder.glob("*.json")):
+        data = read_dataset(path)
+        if data.name in found:
+            raise ValueError(f"{path}: a data set of the name {data.name!r} is there already")
+        found[data.name] = data
+    return found
+
+
+def read_dataset(path: Path | str) -> Dataset | Manifest:
+    """A `Dataset`, or the `Manifest` of recordings (it has "scenarios").
+
+    Raises FileNotFoundError, or a ValueError that names the file and the field.
+    """
+    try:
+        value = json.loads(Path(path).read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: no JSON: {error}") from error
+    is_manifest = isinstance(value, dict) and "scenarios" in value
+    return read_manifest(path) if is_manifest else read_json(path, Dataset)
+
+
+def fetch(name: str, folder: Path | str, manifests: Path | str | None = None) -> Iterator[str]:
+    """Bring a data set into a folder, as far as that can be done; says what it does, line by line.
+
+    Files that are there and are what was published are left alone. A download that broke off is
+    taken up where it ended. What is corrupt is never replaced unasked: the error says which file to
+    delete. Raises ValueError or OSError, after all that could be done was done: an unknown name,
+    files that are corrupt, that the server does not have, or that must be fetched by hand; the
+    error then says how, and where to put them.
+    """
+    known = known_datasets(manifests)
+    if name not in known:
+        raise ValueError(f"no data set {name!r}; there are {', '.join(known)}")
+    data, folder = known[name], Path(folder)
+    yield f"{name}: {data.title}"
+    yield f"licence: {data.licence}"
+    yield f"cite: {data.citation}"
+    if isinstance(data, Manifest):
+        yield from _check_recordings(data, folder)
+    else:
+        yield from _download_all(data, folder)
+        yield from _check_layout(data, folder)
+
+
+def _download_all(data: Dataset, folder: Path) -> Iterator[str]:
+    problems = []
+    for path, download in data.downloads.items():
+        try:
+            yield _fetch_file(folder, path, download)
+        except (ValueError, OSError) as error:
+            problems.append(str(error))
+    _raise(problems)
+
+
+def _fetch_file(folder: Path, path: str, download: Download) -> str:
+    """Have a file, complete and verified; what was done."""
+    pooch = _pooch()
+    file = folder / path
+    if file.exists():
+        found = pooch.file_hash(str(file), alg="sha256")
+        if found != download.sha256:
+            # pooch would replace it: it may be the only copy of something else
+            raise ValueError(
+                f"{file}: corrupt: sha256 {found[:12]}..., published is {download.sha256[:12]}...: "
+                "delete it and run the command again"
+            )
+        return f"{path}: there, verified"
+    part = file.with_name(file.name + ".part")
+    resumed = part.stat().st_size if part.exists() else 0
+    source = pooch.create(folder, "", registry={path: f"sha256:{download.sha256}"})
+    source.urls = {path: download.url}
+    try:
+        source.fetch(path, downloader=lambda url, output, _: _resume(url, part, output))
+    except ValueError as error:
+        raise ValueError(
+            f"{file}: corrupt: what {download.url} sent is not the published file (sha256 "
+            f"{download.sha256[:12]}...): it was discarded; run the command again, or tell whoever "
+            "keeps the data"
+        ) from error
+    return f"{path}: downloaded{f' from byte {resumed} on' if resumed else ''}, verified"
+
+
+def _resume(url: str, part: Path, output: Any) -> None:
+    """Download `url` into `part`, from where that ends, and move it to `output` when it is whole.
+
+    Raises OSError that names the URL: it is not there, or the connection broke; then `part` stays.
+    """
+    import requests  # comes with pooch
+
+    start = part.stat().st_size if part.exists() else 0
+    part.parent.mkdir(parents=True, exist_ok=True)
+    headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={start}-"} if start else {})
+    try:
+        with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT) as answer:
+            if answer.status_code == 416 and _whole(answer) == start:
+                os.replace(part, output)  # it broke off between the last byte and the move
+                return
+            if answer.status_code == 416:
+                part.unlink()  # longer than the file: of something else
+                raise OSError(f"{url}: {part} did not fit: run the command again")
+            if answer.status_code >= 400:
+                raise OSError(f"{url}: the server says {answer.status_code} {answer.reason}")
+            # A server that knows no ranges sends it all, with 200 for 206.
+            resumes = answer.status_code == 206
+            with open(part, "ab" if resumes else "wb") as file:
+                for chunk in answer.iter_content(CHUNK):
+                    file.write(chunk)
+    except requests.RequestException as error:
+        have = part.stat().st_size if part.exists() else 0
+        raise OSError(
+            f"{url}: the connection broke after {have} bytes ({type(error).__name__}): run the "
+            "command again, it goes on from there"
+        ) from error
+    os.replace(part, output)
+
+
+def _whole(answer: Any) -> int | None:
+    """The size of a file [byte] that a server names when it has no such range."""
+    match = re.fullmatch(r"bytes \*/(\d+)", answer.headers.get("Content-Range", ""))
+    return int(match[1]) if match else None
+
+
+def _check_layout(data: Dataset, folder: Path) -> Iterator[str]:
+    """Count what must be fetched by hand: nobody published its hashes."""
+    lacking = []
+    for pattern, what in data.layout.items():
+        count = sum(1 for _ in folder.glob(pattern)) if folder.is_dir() else 0
+        yield f"{pattern}: {count} found ({what}), not verified"
+        if not count:
+            lacking.append(pattern)
+    if lacking:
+        raise ValueError(
+            f"{data.name}: cannot be downloaded automatically. {data.how} Put it into {folder} so "
+            f"that there is {' and '.join(lacking)}. Licence: {data.licence}."
+        )
+
+
+def _check_recordings(data: Manifest, folder: Path) -> Iterator[str]:
+    """Compare the recordings in a folder with the values that were published."""
+    names = read_recordings(folder, data) if folder.is_dir() else []
+    missing, corrupt, good = [], [], 0
+    for path, expected in data.files.items():
+        file = folder / path
+        if not file.is_file():
+            missing.append(path)
+            continue
+        try:
+            same = hash_values(read_values(file)) == expected
+        except ValueError:
+            same = False
+        good += same
+        if not same:
+            corrupt.append(path)
+    yield f"{len(names)} recordings in {folder}; {good} of {len(data.files)} files verified"
+    problems = []
+    if corrupt:
+        problems = [f"{folder}: corrupt, not the published values: {', '.join(corrupt)}"]
+    if missing or not names:
+        source = f"{data.source.repository}, commit {data.source.commit}, {data.source.path}"
+        folders = sorted({path.partition("/")[0] for path in missing})
+        problems.append(
+            f"{data.name}: cannot be downloaded automatically ({data.licence}). Get it from "
+            f"{source} and put into {folder}: {_some(folders) or 'the folders of the recordings'}"
+        )
+    _raise(problems)
+
+
+def _some(names: Iterable[str], most: int = 6) -> str:
+    names = list(names)
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
+def _raise(problems: list[str]) -> None:
+    if problems:
+        raise ValueError("; ".join(problems))
+
+
+def _pooch() -> Any:
+    try:
+        import pooch
+    except ImportError as error:
+        raise ImportError("downloads need pooch: pip install 'r2s[data]'") from error
+    pooch.get_logger().setLevel("ERROR")  # what is done is said here
+    return pooch

@@ -1,0 +1,301 @@
+"""Manifests: what a data set of recordings is, and how its numbers become metres and seconds."""
+
+import hashlib
+import re
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from r2s.files import read_json
+from r2s.recordings.cameras.rgbd import find_rig, read_clouds, read_rig
+from r2s.recordings.readers.clouds import find_frames, read_cloud, read_values
+from r2s.recordings.recording import (
+    Recording,
+    RecordingInfo,
+    SheetPlacement,
+    make_recording,
+)
+
+Vector = tuple[float, float, float]
+Watch = Callable[[Iterable[Any]], Iterable[Any]]
+
+
+@dataclass(frozen=True)
+class Transform:
+    """From a file's frame to the world: world = scale * rotation @ p + translation."""
+
+    scale: float = field(metadata={"unknown": "give metres per unit"})
+    rotation: tuple[Vector, Vector, Vector]  # rows
+    translation: Vector  # [m]
+
+    def __post_init__(self) -> None:
+        _positive("scale", self.scale, "m per unit")
+        rotation = np.array(self.rotation)
+        square = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-6)
+        if not square or np.linalg.det(rotation) < 0:
+            raise ValueError(f"rotation must be orthonormal with determinant 1, found {rotation}")
+
+
+@dataclass(frozen=True)
+class Gripper:
+    """The commanded path: `file` (knot, 3) or (knot, handle, 3), `rate` knots per second [Hz].
+
+    `offset` [m] leads, in the world, from the commanded tool point to the cloth that is held;
+    `note` says how it was measured.
+    """
+
+    file: str
+    rate: float
+    transform: Transform
+    offset: Vector
+    note: str
+
+    def __post_init__(self) -> None:
+        _positive("rate", self.rate, "Hz")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """How the recordings of one experiment lie on the disk and in the world.
+
+    `folder`: a regex for the whole folder name, with the groups `fabric` and `trial`. Frame i
+    (the first is numbered `first_frame`) is taken at i / frame_rate + time_offset on the
+    gripper's clock: a negative offset says that the clouds lag behind the gripper.
+
+    A folder for which there is a cameras.json holds RGB-D images (`r2s.recordings.cameras.rgbd`)
+    instead of clouds: the cameras' own times or rate come before `frame_rate`, and `cloud`
+    transforms what cameras.json calls the world. No hashes are kept of images.
+    """
+
+    folder: str
+    frame_rate: float  # [Hz]
+    time_offset: float  # [s]
+    cloud: Transform
+    gripper: Gripper
+    sheet: SheetPlacement
+    table_height: float  # [m]
+    frames_used: tuple[int, int]  # first and last, inclusive
+    drop_repeats: bool  # keep one of points that are equal
+    first_frame: int = 0
+
+    def __post_init__(self) -> None:
+        _positive("frame_rate", self.frame_rate, "Hz")
+        if not 0 <= self.frames_used[0] <= self.frames_used[1]:
+            raise ValueError(f"frames_used must be [first, last], found {self.frames_used}")
+        try:
+            groups = re.compile(self.folder).groupindex
+        except re.error as error:
+            raise ValueError(f"folder {self.folder!r} is no regex: {error}") from error
+        if not {"fabric", "trial"} <= groups.keys():
+            raise ValueError(f"folder {self.folder!r} lacks the group (?P<fabric>) or (?P<trial>)")
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the data set was published."""
+
+    repository: str
+    commit: str
+    path: str
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """A data set. `files`: path in the folder -> sha256 by `hash_values`; `hash` explains it."""
+
+    name: str
+    title: str
+    citation: str
+    source: Source
+    licence: str
+    scenarios: Mapping[str, Scenario]
+    hash: str
+    files: Mapping[str, str]
+    note: str
+
+
+def to_world(transform: Transform, points: Float[np.ndarray, "*_ 3"]) -> np.ndarray:
+    """scale * rotation @ p + translation for each point: metres in the world, of the same shape."""
+    rotated = points @ np.array(transform.rotation).T
+    return transform.scale * rotated + np.array(transform.translation)
+
+
+def hash_values(values: np.ndarray) -> str:
+    """The sha256 of the values as little-endian float32 in C order.
+
+    Of the values, not of the file: copies in double and in single precision, or in another file
+    format, have one hash.
+    """
+    return hashlib.sha256(np.asarray(values, "<f4").tobytes()).hexdigest()
+
+
+def default_manifest() -> Path:
+    """The manifest of the public DIFFCLOUD recordings.
+
+    In the repository the manifests lie beside the package, in an installation within it.
+    """
+    package = Path(__file__).parent
+    within = package / "data_manifests"
+    return (within if within.is_dir() else package.parent / "data_manifests") / "diffcloud.json"
+
+
+def manifest_for(folder: Path | str) -> Manifest:
+    """The manifest of a folder of recordings: its own `manifest.json`, else the default one.
+
+    Raises as `read_manifest`.
+    """
+    return read_manifest(manifest_of(folder))
+
+
+def manifest_of(folder: Path | str) -> Path:
+    """The file of `manifest_for`."""
+    own = Path(folder) / "manifest.json"
+    return own if own.exists() else default_manifest()
+
+
+def read_manifest(path: Path | str) -> Manifest:
+    """Read a manifest from JSON: the fields of `Manifest`, no more and (but for defaults) no less.
+
+    Raises FileNotFoundError, or a ValueError that names the file and the field: no JSON, unknown
+    or missing fields, wrong types, numbers that are not finite, an unknown scale, a rotation that
+    is none, rates or sides that are not positive.
+    """
+    return read_json(path, Manifest)
+
+
+def read_recordings(
+    folder: Path | str, manifest: Manifest, scenarios: Sequence[str] | None = None
+) -> list[str]:
+    """The names of the recordings in `folder`, sorted; `scenarios` (None: all) selects.
+
+    Any folder whose name fits a scenario counts, also fabrics and trials that the manifest does
+    not list. Raises FileNotFoundError (no such folder), ValueError (no such scenario).
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder of recordings")
+    wanted = list(manifest.scenarios) if scenarios is None else scenarios
+    for name in wanted:
+        if name not in manifest.scenarios:
+            raise ValueError(f"unknown scenario {name!r}, known: {list(manifest.scenarios)}")
+    names = sorted(path.name for path in folder.iterdir() if path.is_dir())
+    return [n for n in names if any(re.fullmatch(manifest.scenarios[s].folder, n) for s in wanted)]
+
+
+def sources(folder: Path | str, manifest: Manifest, name: str) -> list[Path]:
+    """The files that a recording is read from, as far as they are there, sorted.
+
+    Its manifest, the gripper's path, cameras.json, and all in its folder but colour images.
+    """
+    folder = Path(folder)
+    gripper = folder / manifest.scenarios[_scenario_of(manifest, name)[0]].gripper.file
+    about = (manifest_of(folder), gripper, find_rig(folder / name))
+    inside = (path for path in (folder / name).rglob("*") if path.parent.name != "colour")
+    return sorted({path for path in (*about, *inside) if path is not None and path.is_file()})
+
+
+def read_recording(
+    folder: Path | str, manifest: Manifest, name: str, watch: Watch = iter
+) -> Recording:
+    """The recording in `folder`/`name`, of clouds or of RGB-D images, in metres and seconds.
+
+    Frames are read through `watch`, such as a bar that shows progress.
+
+    `info.verified`: True if all its files are listed in the manifest and have the listed values,
+    None if some are not listed; False, with a warning, if a listed one differs or is missing.
+
+    Raises FileNotFoundError or a ValueError that names the file or folder: a name that fits no
+    scenario or several, a frame that is missing, a cloud or path that is damaged, empty or not
+    finite, a path that ends before the last frame.
+    """
+    folder = Path(folder)
+    scenario_name, fabric, trial = _scenario_of(manifest, name)
+    scenario = manifest.scenarios[scenario_name]
+    path = _read_path(folder / scenario.gripper.file)
+    if find_rig(folder / name):
+        rig = read_rig(folder / name)
+        times, seen = read_clouds(folder / name, rig, scenario.frame_rate, watch)
+        clouds, verified = [to_world(scenario.cloud, points) for points in seen], None
+    else:
+        times, clouds, verified = _numbered_clouds(folder, manifest, name, scenario, path, watch)
+    source = f"{manifest.source.repository} {manifest.source.commit} {manifest.source.path}"
+    info = RecordingInfo(
+        name=name,
+        scenario=scenario_name,
+        fabric=fabric,
+        trial=trial,
+        source=source if verified else str(folder / name),
+        frames_used=scenario.frames_used,
+        sheet=scenario.sheet,
+        table_height=scenario.table_height,
+        verified=verified,
+        time_offset=scenario.time_offset,
+    )
+    return make_recording(
+        clouds,
+        times + scenario.time_offset,
+        to_world(scenario.gripper.transform, path) + np.array(scenario.gripper.offset),
+        np.arange(len(path)) / scenario.gripper.rate,
+        info,
+    )
+
+
+def _numbered_clouds(
+    folder: Path,
+    manifest: Manifest,
+    name: str,
+    scenario: Scenario,
+    path: np.ndarray,
+    watch: Watch,
+) -> tuple[np.ndarray, list[np.ndarray], bool | None]:
+    """Times [s] on the cameras' clock, clouds [m] in the world, and whether they are verified."""
+    frames = find_frames(folder / name, scenario.first_frame)
+    clouds = {f"{name}/{frame.name}": read_cloud(frame) for frame in watch(frames)}
+    verified = _verify(manifest.files, name, clouds | {scenario.gripper.file: path})
+    kept = [_distinct(points) if scenario.drop_repeats else points for points in clouds.values()]
+    world = [to_world(scenario.cloud, points) for points in kept]
+    return np.arange(len(frames)) / scenario.frame_rate, world, verified
+
+
+def _scenario_of(manifest: Manifest, name: str) -> tuple[str, str, str]:
+    fits = [(s, m) for s, v in manifest.scenarios.items() if (m := re.fullmatch(v.folder, name))]
+    if len(fits) != 1:
+        patterns = {s: v.folder for s, v in manifest.scenarios.items()}
+        raise ValueError(f"{name!r} fits {len(fits)} scenarios, expected one of: {patterns}")
+    scenario, match = fits[0]
+    return scenario, match["fabric"], match["trial"] or "1"
+
+
+def _read_path(file: Path) -> np.ndarray:
+    path = read_values(file)
+    if path.ndim not in (2, 3) or path.shape[-1] != 3 or len(path) == 0:
+        raise ValueError(f"{file}: expected (knot, 3) or (knot, handle, 3), found {path.shape}")
+    if not np.isfinite(path).all():
+        raise ValueError(f"{file}: the gripper path is not finite")
+    return path
+
+
+def _verify(listed: Mapping[str, str], name: str, found: Mapping[str, np.ndarray]) -> bool | None:
+    differ = [f for f, values in found.items() if f in listed and hash_values(values) != listed[f]]
+    differ += [f for f in listed if f.startswith(f"{name}/") and f not in found]
+    if differ:
+        warnings.warn(
+            f"{name}: not the published values, or missing: {', '.join(differ)}", stacklevel=4
+        )
+        return False
+    return True if all(file in listed for file in found) else None
+
+
+def _distinct(points: np.ndarray) -> np.ndarray:
+    _, first = np.unique(points, axis=0, return_index=True)
+    return points[np.sort(first)]
+
+
+def _positive(what: str, value: float, unit: str) -> None:
+    if not value > 0:
+        raise ValueError(f"{what} must be positive [{unit}], found {value}")

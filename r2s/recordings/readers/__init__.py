@@ -1,0 +1,6 @@
+"""Readers, one file format each.
+
+- `clouds`: point clouds. `force_log`: a load cell's log.
+- `video`, `markers`, `plane`: printed dots in a video, in metres on the table.
+- `rgbench`: captures of RGBench.
+"""

@@ -1,0 +1,381 @@
+"""The canonical observation of a fabric: point clouds and the path of what holds the cloth."""
+
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from r2s.files import write_bytes
+from r2s.recordings.readers.clouds import voxel_means
+
+FORMAT = "r2s-recording/2"
+READABLE = ("r2s-recording/1", FORMAT)  # the first knew neither force nor markers nor wind
+CORNERS = {"origin": (0, 0), "warp": (1, 0), "weft": (0, 1), "opposite": (1, 1)}
+OPTIONAL = ("force", "force_times", "markers", "markers_seen")
+CLOCK_TOLERANCE = 1e-6  # [s], rounding when a time is a frame number over a rate
+
+
+@dataclass(frozen=True)
+class SheetPlacement:
+    """Where the rectangular sheet lies at rest, in metres, z up.
+
+    `held` names the corners grasped by the handles, one per handle: "origin", "warp" (at the end
+    of the warp side), "weft" (at the end of the weft side) or "opposite". Raises ValueError for
+    sides that are not positive, directions that are not orthonormal, and unknown corners.
+    """
+
+    size: tuple[float, float]  # [m], lengths of the warp and the weft side
+    origin: tuple[float, float, float]  # [m], world position of the rest corner (0, 0)
+    warp: tuple[float, float, float]  # unit vector, world direction of the warp side
+    weft: tuple[float, float, float]  # unit vector, world direction of the weft side
+    held: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if not all(np.isfinite(side) and side > 0 for side in self.size):
+            raise ValueError(f"sheet: sides must be positive [m], found {self.size}")
+        if not np.isfinite(self.origin).all():
+            raise ValueError(f"sheet: origin must be finite [m], found {self.origin}")
+        axes = np.array([self.warp, self.weft])
+        if not np.allclose(axes @ axes.T, np.eye(2), atol=1e-6):
+            found = f"found {self.warp} and {self.weft}"
+            raise ValueError(f"sheet: warp and weft must be orthonormal, {found}")
+        for name in self.held:
+            if name not in CORNERS:
+                raise ValueError(f"sheet: unknown corner {name!r}, expected one of {list(CORNERS)}")
+
+
+def corner(sheet: SheetPlacement, name: str) -> Float[np.ndarray, "3"]:
+    """The world position [m] of a corner at rest; `name` is a key of CORNERS (else KeyError)."""
+    along_warp, along_weft = CORNERS[name]
+    warp, weft = np.array(sheet.warp) * sheet.size[0], np.array(sheet.weft) * sheet.size[1]
+    return np.array(sheet.origin) + along_warp * warp + along_weft * weft
+
+
+@dataclass(frozen=True)
+class RecordingInfo:
+    """What a recording is of.
+
+    - `frames_used`: the first and the last frame that count.
+    - `wind`: of the air around the sheet, None where nobody measured it.
+    - `time_offset`: what was added to the cameras' clock to give `Recording.times`; a negative one
+      says that the cameras lag behind the grippers. `set_time_offset` changes it.
+
+    Raises ValueError for a wind or an offset that is not finite.
+    """
+
+    name: str
+    scenario: str
+    fabric: str
+    trial: str
+    source: str
+    frames_used: tuple[int, int]  # inclusive
+    sheet: SheetPlacement
+    table_height: float  # [m]
+    verified: bool | None  # do the files match published hashes (None: there are none)
+    wind: tuple[float, float, float] | None = None  # [m/s]
+    time_offset: float = 0.0  # [s]
+
+    def __post_init__(self) -> None:
+        if self.wind is not None and (len(self.wind) != 3 or not np.isfinite(self.wind).all()):
+            raise ValueError(f"wind must be three finite numbers [m/s], found {self.wind}")
+        if not np.isfinite(self.time_offset):
+            raise ValueError(f"time_offset must be finite [s], found {self.time_offset}")
+
+
+class Recording(eqx.Module):
+    """The canonical observation of a fabric, in metres and seconds, z up.
+
+    `info` is static: a jitted function that takes a whole Recording compiles once per `info`; one
+    that takes its arrays compiles once per shape (see `subsample`).
+
+    `force` is what pulls at the sheet: for each sample of its log a number, or a vector in the
+    world. `markers` are places printed on the sheet, in each frame. None where not recorded.
+    """
+
+    points: Float[Array, "frame point 3"]  # [m], padded with zeros; only where mask
+    mask: Bool[Array, "frame point"]
+    times: Float[Array, " frame"]  # [s], on the clock of handle_times
+    handle_path: Float[Array, "knot handle 3"]  # [m], held still before the first knot
+    handle_times: Float[Array, " knot"]  # [s]
+    info: RecordingInfo = eqx.field(static=True)
+    force: Float[Array, " sample"] | Float[Array, "sample 3"] | None = None  # [N]
+    force_times: Float[Array, " sample"] | None = None  # [s], on the clock of handle_times
+    markers: Float[Array, "frame marker 3"] | None = None  # [m], zero where not markers_seen
+    markers_seen: Bool[Array, "frame marker"] | None = None
+
+
+def make_recording(
+    clouds: Sequence[Any] | None,
+    times: Any,
+    handle_path: Any,
+    handle_times: Any,
+    info: RecordingInfo,
+    *,
+    force: Any = None,
+    force_times: Any = None,
+    markers: Any = None,
+    markers_seen: Any = None,
+) -> Recording:
+    """Pad ragged clouds into a Recording.
+
+    `clouds`: one (points, 3) array [m] per frame, or None: the markers that are seen; `times`:
+    (frame,) [s], `info.time_offset` included; `handle_path`: (knot, handle, 3), or (knot, 3) for
+    one handle [m]; `handle_times`: (knot,) [s]; `force`: (sample,) or (sample, 3) [N] at
+    `force_times` [s]; `markers`: (frame, marker, 3) [m], and `markers_seen`: (frame, marker), by
+    default wherever the markers are finite. Floats take JAX's default precision.
+
+    Raises ValueError that names the recording, and the frame where there is one: no frames, a
+    cloud that is empty or not finite or not (points, 3), times that do not increase, a path of
+    another shape or of more handles than `info.sheet.held` names, a path that ends before the
+    last frame, `frames_used` outside of the frames, a force without times or the reverse, markers
+    of other frames, or seen but not finite.
+    """
+    try:
+        marks = _check_markers(markers, markers_seen)
+        if clouds is None:
+            clouds = [] if marks is None else [at[seen] for at, seen in zip(*marks, strict=True)]
+        checked = [_check_cloud(cloud, frame) for frame, cloud in enumerate(clouds)]
+        first, last = info.frames_used
+        if not checked:
+            raise ValueError("no frames: a recording needs at least one cloud")
+        if not 0 <= first <= last < len(checked):
+            raise ValueError(
+                f"frames_used is {first}..{last}, but there are {len(checked)} frames: they count "
+                "from 0, the last one included"
+            )
+        if marks is not None and len(marks[0]) != len(checked):
+            raise ValueError(f"markers in {len(marks[0])} frames, but clouds in {len(checked)}")
+        path = _check_path(handle_path, info.sheet.held)
+        clock = _check_times(times, "times", len(checked))
+        knots = _check_times(handle_times, "handle_times", len(path))
+        _check_end(knots, clock)
+        log = _check_force(force, force_times)
+    except ValueError as error:
+        raise ValueError(f"recording {info.name}: {error}") from error
+    points, mask = _pad(checked, max(map(len, checked)))
+    floats = lambda values: None if values is None else jnp.asarray(values, float)
+    return Recording(
+        points=jnp.asarray(points, float),
+        mask=jnp.asarray(mask),
+        times=jnp.asarray(clock, float),
+        handle_path=jnp.asarray(path, float),
+        handle_times=jnp.asarray(knots, float),
+        info=info,
+        force=floats(log and log[0]),
+        force_times=floats(log and log[1]),
+        markers=floats(marks and marks[0]),
+        markers_seen=None if marks is None else jnp.asarray(marks[1]),
+    )
+
+
+def set_time_offset(recording: Recording, offset: float) -> Recording:
+    """The recording with another offset [s] between the cameras' clock and that of the grippers.
+
+    Markers move with the frames, the force does not. Raises ValueError when the last frame comes
+    after the end of the handle path.
+    """
+    shift = offset - recording.info.time_offset
+    times = np.asarray(recording.times, np.float64) + shift
+    info = replace(recording.info, time_offset=offset)
+    try:
+        _check_end(np.asarray(recording.handle_times), times)
+    except ValueError as error:
+        raise ValueError(f"recording {info.name}: time offset {offset:g} s: {error}") from error
+    return replace(recording, times=jnp.asarray(times, float), info=info)
+
+
+def cloud(recording: Recording, frame: int) -> Float[np.ndarray, "point 3"]:
+    """The points [m] of one frame, without the padding; IndexError if there is no such frame."""
+    return np.asarray(recording.points)[frame][np.asarray(recording.mask)[frame]]
+
+
+def subsample(recording: Recording, num_points: int, voxel: float | None, seed: int) -> Recording:
+    """Thin every frame to at most `num_points`, padded to exactly that many.
+
+    They are drawn without repetition, by a generator seeded with (`seed`, frame). With a `voxel`
+    the points of each cube of that side [m] become their mean first, which evens out their density,
+    but moves them: a point that noise throws into an empty cube counts as much as the many of the
+    next. Recordings of as many frames and knots then have the same shapes. Raises ValueError if
+    `num_points` < 1 or `voxel` is not positive.
+    """
+    if num_points < 1:
+        raise ValueError(f"num_points must be at least 1, found {num_points}")
+    if voxel is not None and not (np.isfinite(voxel) and voxel > 0):
+        raise ValueError(f"voxel must be positive [m], found {voxel}")
+    thinned = []
+    for frame in range(len(recording.times)):
+        points = cloud(recording, frame)
+        points = points if voxel is None else voxel_means(points, voxel)
+        if len(points) > num_points:
+            generator = np.random.default_rng([seed, frame])
+            points = points[np.sort(generator.choice(len(points), num_points, replace=False))]
+        thinned.append(points)
+    points, mask = _pad(thinned, num_points)
+    return replace(recording, points=jnp.asarray(points, float), mask=jnp.asarray(mask))
+
+
+def save(recording: Recording, path: Path | str) -> None:
+    """Write the recording to `path` as one NPZ, whole or not at all; OSError names `path`.
+
+    Arrays: `points` (all frames', 3) and `offsets` (frame + 1), where frame i is
+    `points[offsets[i]:offsets[i + 1]]`; `times`, `handle_path`, `handle_times`; where recorded
+    `force`, `force_times`, `markers`, `markers_seen`; `meta`: JSON of format and `info`.
+    """
+    mask = np.asarray(recording.mask)
+    arrays: dict[str, Any] = {
+        "meta": np.array(json.dumps({"format": FORMAT, "info": asdict(recording.info)})),
+        "points": np.asarray(recording.points)[mask],
+        "offsets": np.cumsum([0, *mask.sum(axis=1)]),
+    }
+    for name in ("times", "handle_path", "handle_times", *OPTIONAL):
+        if (values := getattr(recording, name)) is not None:
+            arrays[name] = np.asarray(values)
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
+def load(path: Path | str) -> Recording:
+    """Read what `save` wrote, in this version of the format or an earlier one.
+
+    Raises FileNotFoundError, or a ValueError that names the file if it is damaged, not a
+    recording, or of another version of the format.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            meta = json.loads(str(file["meta"]))
+            if meta["format"] not in READABLE:
+                raise ValueError(
+                    f"format {meta['format']!r}, expected one of {READABLE}: update r2s, or "
+                    "convert the recording again"
+                )
+            info = _info_from(meta["info"])
+            clouds = _split(file["points"], file["offsets"])
+            handles = file["handle_path"], file["handle_times"]
+            optional = {name: file[name] for name in OPTIONAL if name in file}
+            return make_recording(clouds, file["times"], *handles, info, **optional)
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # a damaged archive raises anything, from EOFError to zlib.error
+        reason = f"it lacks {error}" if isinstance(error, KeyError) else f"{error}"
+        if not isinstance(error, ValueError):
+            reason += ": copy the file again, or make it anew"
+        raise ValueError(f"{path}: not a readable recording ({FORMAT}): {reason}") from error
+
+
+def _info_from(values: dict[str, Any]) -> RecordingInfo:
+    sheet = SheetPlacement(**{key: tuple(value) for key, value in values["sheet"].items()})
+    changed = {"sheet": sheet, "frames_used": tuple(values["frames_used"])}
+    if values.get("wind") is not None:
+        changed["wind"] = tuple(values["wind"])
+    return RecordingInfo(**{**values, **changed})
+
+
+def _split(points: np.ndarray, offsets: np.ndarray) -> list[np.ndarray]:
+    ends = [0, len(points)]
+    if offsets.ndim != 1 or list(offsets[[0, -1]]) != ends or (np.diff(offsets) < 0).any():
+        raise ValueError(f"offsets must go from {ends[0]} to {ends[1]}, found {offsets}")
+    return np.split(points, offsets[1:-1])
+
+
+def _check_cloud(points: Any, frame: int) -> np.ndarray:
+    try:
+        points = np.asarray(points, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"frame {frame}: no array of numbers: {error}") from error
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"frame {frame}: expected points of shape (n, 3), found {points.shape}")
+    if len(points) == 0:
+        raise ValueError(f"frame {frame}: the cloud is empty")
+    if bad := int((~np.isfinite(points).all(axis=1)).sum()):
+        raise ValueError(f"frame {frame}: {bad} of {len(points)} points are not finite")
+    return points
+
+
+def _check_times(times: Any, what: str, count: int) -> np.ndarray:
+    times = np.asarray(times, np.float64)
+    if times.shape != (count,):
+        raise ValueError(f"{what} must have the shape ({count},), found {times.shape}")
+    if not np.isfinite(times).all():
+        raise ValueError(f"{what} must be finite [s]")
+    # As they will be kept: in single precision, the frames of a clock that counts from 1970
+    # would fall together.
+    kept = np.asarray(jnp.asarray(times, float))
+    if (np.diff(kept) <= 0).any():
+        at = int((np.diff(kept) <= 0).argmax())
+        raise ValueError(
+            f"{what} must increase: {times[at]} s at {at}, then {times[at + 1]} s, "
+            f"as {kept.dtype} {kept[at]} and {kept[at + 1]}; sort them, drop repeated ones, and "
+            "count from the start of the recording"
+        )
+    return times
+
+
+def _check_end(knots: np.ndarray, times: np.ndarray) -> None:
+    if knots[-1] < times[-1] - CLOCK_TOLERANCE:
+        raise ValueError(
+            f"the handle path ends at {knots[-1]:g} s, before the last frame at {times[-1]:g} s: "
+            "log it longer, leave the last frames out, or correct the time offset"
+        )
+
+
+def _check_force(force: Any, times: Any) -> tuple[np.ndarray, np.ndarray] | None:
+    if force is None and times is None:
+        return None
+    if force is None or times is None:
+        there, lacks = ("force_times", "force") if force is None else ("force", "force_times")
+        raise ValueError(f"{there} without {lacks}: give both or neither")
+    force = np.asarray(force, np.float64)
+    if len(force.shape) not in (1, 2) or force.shape[1:] not in ((), (3,)) or len(force) == 0:
+        raise ValueError(f"force must be (sample,) or (sample, 3) [N], found {force.shape}")
+    if not np.isfinite(force).all():
+        bad = int((~np.isfinite(force.reshape(len(force), -1)).all(axis=1)).argmax())
+        raise ValueError(f"force must be finite [N], found {force[bad]} in sample {bad}")
+    return force, _check_times(times, "force_times", len(force))
+
+
+def _check_markers(markers: Any, seen: Any) -> tuple[np.ndarray, np.ndarray] | None:
+    """Markers, zero where they are not seen, and where they are."""
+    if markers is None:
+        if seen is not None:
+            raise ValueError("markers_seen without markers")
+        return None
+    markers = np.asarray(markers, np.float64)
+    if markers.ndim != 3 or markers.shape[2] != 3:
+        raise ValueError(f"markers must be (frame, marker, 3) [m], found {markers.shape}")
+    finite = np.isfinite(markers).all(axis=2)
+    seen = finite if seen is None else np.asarray(seen)
+    if seen.dtype != bool or seen.shape != finite.shape:
+        raise ValueError(
+            f"markers_seen must be {finite.shape} of bool, found {seen.shape} of {seen.dtype}"
+        )
+    if (seen & ~finite).any():
+        frame, marker = np.argwhere(seen & ~finite)[0]
+        raise ValueError(f"frame {frame}: marker {marker} is seen, but its place is not finite")
+    return np.where(seen[..., None], markers, 0), seen
+
+
+def _check_path(path: Any, held: tuple[str, ...]) -> np.ndarray:
+    path = np.asarray(path, np.float64)
+    path = path[:, None] if path.ndim == 2 else path
+    if path.ndim != 3 or path.shape[2] != 3 or len(path) == 0:
+        raise ValueError(f"the handle path must be (knot, handle, 3), found {path.shape}")
+    if path.shape[1] != len(held):
+        raise ValueError(f"the path has {path.shape[1]} handles, the sheet is held at {held}")
+    if not np.isfinite(path).all():
+        raise ValueError("the handle path must be finite [m]")
+    return path
+
+
+def _pad(clouds: Sequence[np.ndarray], width: int) -> tuple[np.ndarray, np.ndarray]:
+    points = np.zeros((len(clouds), width, 3))
+    mask = np.arange(width) < np.array([len(cloud) for cloud in clouds])[:, None]
+    points[mask] = np.concatenate(clouds)
+    return points, mask

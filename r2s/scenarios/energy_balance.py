@@ -1,0 +1,142 @@
+"""A motion with its forces, and the account of its energy: given, held and lost."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from r2s.cloth.potential import (
+    bending_areas,
+    bending_laws,
+    bends,
+    curvatures,
+    hinge_angles,
+    strains,
+    vertex_mass,
+)
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import Mesh
+from r2s.rollout import Solver
+from r2s.scenarios.gripper_forces import step_with_forces
+from r2s.scenarios.scenario import Scenario, begin, stepped
+from r2s.units import GRAVITY
+from r2s.world.drag import drag_on_vertices
+from r2s.world.scene import Control
+
+Energies = Float[Array, " frame"]
+
+
+class Account(eqx.Module):
+    """A motion with its forces [N], and its energies at every frame, [J].
+
+    - `x`: positions, [m].
+    - `forces`: with which the grippers hold each vertex, the mean since the frame before.
+    - `stored`: in membrane and bending; `kinetic`; `potential`: of gravity, above z = 0.
+    - `grippers`, `air`: the work that they have done on the sheet since the first frame. That of
+      still air is negative.
+    - `dissipated`: what has gone since then, by internal and mass damping, friction, and the
+      formula of the time steps: the work less what the sheet holds more. Energy between layers
+      and in the table's contact counts as gone until it comes back.
+    """
+
+    x: Float[Array, "frame vertex 3"]
+    forces: Float[Array, "frame handle 3"]
+    stored: Energies
+    kinetic: Energies
+    potential: Energies
+    grippers: Energies
+    air: Energies
+
+    @property
+    def dissipated(self) -> Energies:
+        held = self.stored + self.kinetic + self.potential
+        return self.grippers + self.air - (held - held[0])
+
+
+def account(
+    scenario: Scenario,
+    fabric: Fabric,
+    max_step: float | None = None,
+    solver: Solver | None = None,
+) -> Account:
+    """The motion of a fabric with forces and energies, from the first frame on.
+
+    Arguments as of `motion`.
+
+    The grippers' work is the mean of their forces in two steps, times the displacement (the cloth
+    has forces at the ends of its steps); the air's is that in the middle of the step.
+    """
+    solver, substeps = stepped(scenario, max_step, solver)
+    mesh, held = scenario.scene.mesh, scenario.scene.held
+
+    def step(carried: Any, control: Control):
+        state, before = carried
+        after, forces = step_with_forces(solver, fabric, state, control)
+        moved = after.x - state.x
+        drag = _drag(scenario, state, after, control)
+        work = jnp.sum((before + forces) / 2 * moved[held]), jnp.sum(drag * moved)
+        return (after, forces), (forces, *work)
+
+    def frame(carried: Any, control: Control):
+        (state, last), (forces, *work) = jax.lax.scan(step, carried, control)
+        mean = jnp.mean(forces, axis=0)
+        return (state, last), (state.x, state.v, mean, *(jnp.sum(part) for part in work))
+
+    start = begin(solver, scenario), jnp.zeros((len(held), 3), float)
+    _, (x, v, forces, grippers, air) = jax.lax.scan(frame, start, scenario.controls(substeps))
+    first = scenario.lead_in - 1
+    since = lambda work: jnp.cumsum(work[first:]) - work[first]
+    x, v = x[first:], v[first:]
+    mass = vertex_mass(mesh, fabric)
+    return Account(
+        x=x,
+        forces=forces[first:],
+        stored=jax.vmap(lambda x: stored_energy(mesh, fabric, x))(x),
+        kinetic=jnp.sum(mass[None] * jnp.sum(v**2, axis=2), axis=1) / 2,
+        potential=GRAVITY * jnp.sum(mass[None] * x[..., 2], axis=1),
+        grippers=since(grippers),
+        air=since(air),
+    )
+
+
+def clamp_force(scenario: Scenario, found: Account) -> Float[Array, "frame 3"]:
+    """The force [N] on the pulled clamp of a stretching at its frames: what a load cell measures.
+
+    The clamp is the held vertices at the end of the warp.
+    """
+    mesh, held = scenario.scene.mesh, scenario.scene.held
+    pulled = mesh.rest[held, 0] > jnp.max(mesh.rest[:, 0]) / 2
+    return jnp.sum(jnp.where(pulled[None, :, None], found.forces, 0), axis=1)
+
+
+def stored_energy(mesh: Mesh, fabric: Fabric, x: Float[Array, "vertex 3"]) -> Float[Array, ""]:
+    """The energy [J] in the strains and curvatures of a sheet at positions [m].
+
+    Of laws by table: that of a sheet which has had the stiffness it has there all along.
+    """
+    membrane = jax.vmap(fabric.membrane.energy_density)(strains(mesh, x))
+    hinges = curvatures(mesh, hinge_angles(mesh, x))
+    laws = bending_laws(mesh, fabric.bending, hinges)
+    of_one = lambda law, curvature: law.energy_density(curvature)
+    bending = jax.vmap(of_one)(laws, bends(mesh, laws, hinges))
+    return jnp.sum(mesh.area * membrane) + jnp.sum(bending_areas(mesh, laws) * bending)
+
+
+def _drag(scenario: Scenario, state: Any, after: Any, control: Control):
+    """The force of the air [N] on the vertices, in the middle of a step."""
+    scene = scenario.scene
+    x, v = (state.x + after.x) / 2, (state.v + after.v) / 2
+    return drag_on_vertices(scene.mesh, scene.air, scene.fan, x, v, control.wind)
+
+
+def stretch(mesh: Mesh, x: Float[Array, "frame vertex 3"]) -> Float[Array, "frame face"]:
+    """The greatest principal stretch less one [-] of every face at positions [m]."""
+
+    def of_frame(x):
+        e11, e22, shear = jnp.moveaxis(strains(mesh, x), -1, 0)
+        mean, half = (e11 + e22) / 2, (e11 - e22) / 2
+        return jnp.sqrt(1 + 2 * (mean + jnp.sqrt(half**2 + shear**2 / 4))) - 1
+
+    return jax.vmap(of_frame)(x)

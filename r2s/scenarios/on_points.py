@@ -1,0 +1,59 @@
+"""Scenarios on material points: a grid that covers the motion, and steps that are stable."""
+
+import math
+
+import numpy as np
+
+from r2s.fabrics.fabric import Fabric
+from r2s.mpm.grid import Grid
+from r2s.mpm.sheet import Sheet, longest_edge, stable_step
+from r2s.rollout import Trajectory
+from r2s.scenarios.scenario import Scenario, motion
+
+MEMBRANE_DAMPING = 1e-4  # [s]: what is longer costs ten times as many steps, and shows in no motion
+EDGE = 1.5  # longest edge of the mesh over the grid's spacing
+STRETCHED = 1.3  # how much longer the way from a gripper to a vertex may be than at rest
+
+
+def material_points(
+    scenario: Scenario,
+    fabric: Fabric,
+    spacing: float | None = None,
+    membrane_damping: float | None = MEMBRANE_DAMPING,
+) -> Sheet:
+    """A solver of material points for a scenario: `motion(scenario, fabric, solver=...)`.
+
+    `fabric` is the stiffest that it will be used for. The grid's `spacing` [m] is by default the
+    mesh's longest edge over `EDGE`; layers that lie on each other are about a spacing apart. The
+    membrane's damping time [s] is as in `r2s.mpm.Sheet`. The steps fill the time between frames.
+    Raises `ValueError` when the mesh is too coarse for the grid, or the scenario has layers.
+    """
+    mesh = scenario.scene.mesh
+    spacing = longest_edge(mesh) / EDGE if spacing is None else spacing
+    limit = float(stable_step(mesh, spacing, fabric, membrane_damping))
+    substeps = max(scenario.substeps, math.ceil(scenario.interval / limit))
+    # the limit is in float32, and a step must not be above it by a rounding
+    dt = scenario.interval / (substeps + 1)
+    return Sheet.make(scenario.scene, grid_around(scenario, spacing), fabric, dt, membrane_damping)
+
+
+def motion_of_points(scenario: Scenario, fabric: Fabric) -> Trajectory:
+    """A motion by material points, with their defaults; the fabric not traced."""
+    return motion(scenario, fabric, solver=material_points(scenario, fabric))
+
+
+def grid_around(scenario: Scenario, spacing: float) -> Grid:
+    """The grid of where a sheet can be, held as it is; a node lies on the table where it reaches.
+
+    No vertex is farther from the nearest gripper than `STRETCHED` times the way in the sheet.
+    """
+    path, start = np.asarray(scenario.path), np.asarray(scenario.start)
+    rest, held = np.asarray(scenario.scene.mesh.rest), np.asarray(scenario.scene.held)
+    away = np.linalg.norm(rest[:, None] - rest[held][None], axis=2)
+    reach = STRETCHED * away.min(axis=1, initial=np.inf).max()
+    if not len(held):
+        raise ValueError("a grid can't be chosen for a sheet that nothing holds: make the Sheet")
+    lower = np.minimum(path.min(axis=(0, 1)) - reach, start.min(axis=0))
+    upper = np.maximum(path.max(axis=(0, 1)) + reach, start.max(axis=0))
+    lower[2] = max(lower[2], float(scenario.scene.table.height))
+    return Grid.covering(tuple(lower.tolist()), tuple(upper.tolist()), spacing)

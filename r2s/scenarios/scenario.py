@@ -1,0 +1,316 @@
+"""Scenarios: a sheet at rest, what holds it, how that moves, and which frames count."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from r2s.cloth.cloth import Cloth
+from r2s.cloth.self_contact.contacts import Layers
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import Mesh, corner, rectangle
+from r2s.recordings.recording import Recording, SheetPlacement
+from r2s.rollout import Solver, Trajectory, simulate
+from r2s.world.air import Air, Fan
+from r2s.world.contact import Table
+from r2s.world.scene import Control, Scene, along_path
+
+CLEARANCE = 1e-3  # [m], between the table and a sheet that lies on it
+LEAD_IN = 0.5  # [s], in which the grippers go from the sheet at rest to where their path begins
+MAX_STEP = 0.025  # [s]: 1 mm from the limit of small steps in a lift of 2.5 s, by measurement
+SETTLING = 3.0  # [s], in which a sheet that hangs comes to rest before the first frame
+BRAKE = 8.0  # [1/s], mass damping meanwhile: a sheet of 0.45 m swings at 5.6/s, and has lost its
+# energy by 4e-11
+BOW = 0.01  # [m], by which a hanging sheet starts out of its plane, so that it buckles to one side
+GUST = 0.5  # [s], in which a wind rises from nothing
+JET = (1 / 3, 1 / 4)  # radius and edge of a fan's jet, of the sheet's shorter side
+CLAMPS = (("origin", "weft"), ("warp", "opposite"))  # sides that a stretching holds
+
+
+class Scenario(eqx.Module):
+    """An experiment, for any fabric. Its arrays are traced: one compilation serves all recordings
+    of as many frames and knots.
+
+    - `scene`: sheet, table, air, fan, held vertices, whether layers touch.
+    - `start`: positions at rest, [m].
+    - `path`, `path_times`: of the held vertices, [m] and [s].
+    - `first_time`: of the first frame, [s].
+    - `interval`: between frames, [s].
+    - `num_frames`, `lead_in`: frames that count from the first, and frames simulated before it.
+    - `substeps`: steps between frames, from `steps_between`.
+    - `wind`, `wind_times`: of the air, [m/s] and [s], linear between; None: still air.
+    - `brake`: mass damping [1/s] before the first frame, beside the fabric's; None: none.
+    - `acceleration`: at the start, [m/s^2], of a sheet that is let go there; None: it is at rest.
+    """
+
+    scene: Scene
+    start: Float[Array, "vertex 3"]
+    path: Float[Array, "knot handle 3"]
+    path_times: Float[Array, " knot"]
+    first_time: Float[Array, ""]
+    interval: float = eqx.field(static=True)
+    num_frames: int = eqx.field(static=True)
+    lead_in: int = eqx.field(static=True)
+    substeps: int = eqx.field(static=True)
+    wind: Float[Array, "gust 3"] | None = None
+    wind_times: Float[Array, " gust"] | None = None
+    brake: Float[Array, ""] | None = None
+    acceleration: Float[Array, "vertex 3"] | None = None
+
+    def controls(self, substeps: int) -> Control:
+        """What grippers and air do at the end of every substep, axes (frame, substep)."""
+        frames = self.num_frames + self.lead_in - 1  # the first state needs no step
+        steps = jnp.arange(1, frames * substeps + 1) / substeps - self.lead_in
+        times = self.first_time + self.interval * steps.astype(float)
+        handles = along_path(times, self.path_times, self.path)
+        wind = jnp.zeros((frames * substeps, 3), float)
+        if self.wind is not None and self.wind_times is not None:
+            wind = along_path(times, self.wind_times, self.wind[:, None])[:, 0]
+        return Control(
+            handles.reshape(frames, substeps, *self.path.shape[1:]),
+            wind.reshape(frames, substeps, 3),
+        )
+
+
+def from_placement(
+    sheet: SheetPlacement,
+    table_height: float,
+    path: Float[Array, "knot handle 3"],
+    path_times: Float[Array, " knot"],
+    times: Float[np.ndarray, " frame"],
+    shape: tuple[int, int] = (9, 9),
+    *,
+    clamps: tuple[tuple[str, str], ...] = (),
+    wind: tuple[float, float, float] | None = None,
+    layers: bool = False,
+) -> Scenario:
+    """A scenario for a rectangular sheet, held at named corners, over a table.
+
+    `path` [m] and `path_times` [s] are the grippers', `times` [s] the frames', `shape` the
+    vertices along warp and weft. `clamps` are pairs of held corners: all of the side between them
+    is held, straight and evenly spread. `wind` [m/s] is that of a fan in front of the sheet's
+    middle, which starts with the first frame. With `layers` the sheet touches itself.
+
+    Before the first frame the grippers go from the sheet's corners to where the path begins; a
+    sheet that hangs, its plane not horizontal, also comes to rest, braked by `BRAKE` for
+    `SETTLING`. Raises `ValueError` when the frames are not evenly spaced.
+    """
+    times = np.asarray(times)
+    interval = _interval(times)
+    mesh = rectangle(sheet.size, shape)
+    axes = np.array([sheet.warp, sheet.weft])
+    normal = np.cross(*axes)
+    hangs = abs(normal[2]) < 0.9
+    start = np.asarray(sheet.origin) + np.asarray(mesh.rest) @ axes
+    if hangs:
+        bowed = np.sin(np.pi * np.asarray(mesh.rest) / np.asarray(sheet.size)).prod(axis=1)
+        start = start + BOW * bowed[:, None] * normal
+    start[:, 2] = np.maximum(start[:, 2], table_height + CLEARANCE)
+    held, shares = _grip(sheet, shape, clamps)
+    path = path if not clamps else jnp.einsum("vh,khi->kvi", jnp.asarray(shares, float), path)
+    lead_in = math.ceil((SETTLING if hangs else LEAD_IN) / interval)
+    begin = min(times[0], float(path_times[0]))
+    knots = jnp.asarray([begin - lead_in * interval, begin - lead_in * interval / 2], float)
+    at_rest = jnp.asarray(start[held], float)
+    rising, rising_times = (None, None) if wind is None else _gust(wind, float(times[0]))
+    return Scenario(
+        scene=Scene(
+            mesh,
+            jnp.asarray(held),
+            Table.make(table_height),
+            Air.make(),
+            None if wind is None else _fan(sheet, wind),
+            Layers.make(mesh) if layers else None,
+        ),
+        start=jnp.asarray(start, float),
+        path=jnp.concatenate([at_rest[None], path[:1], path]),
+        path_times=jnp.concatenate([knots, path_times]),
+        first_time=jnp.asarray(times[0], float),
+        interval=interval,
+        num_frames=len(times),
+        lead_in=lead_in,
+        substeps=steps_between(interval, mesh, np.asarray(path), np.asarray(path_times)),
+        wind=rising,
+        wind_times=rising_times,
+        brake=jnp.asarray(BRAKE, float) if hangs else None,
+    )
+
+
+def _interval(times: Float[np.ndarray, " frame"]) -> float:
+    """Between frames [s]; rounded, so that float32 times of one rate compile once."""
+    intervals = np.diff(times)
+    interval = float(np.mean(intervals)) if len(times) > 1 else 1.0
+    if np.any(np.abs(intervals - interval) > 1e-3 * interval):
+        raise ValueError(
+            f"frames must be evenly spaced in time, got {intervals.min():g} to "
+            f"{intervals.max():g} s between them: resample the recording"
+        )
+    return round(interval, 9)
+
+
+def _grip(
+    sheet: SheetPlacement, shape: tuple[int, int], clamps: tuple[tuple[str, str], ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The held vertices, and the share of each handle in the place of each (vertex, handle)."""
+    each = np.eye(len(sheet.held))
+    corners = [corner(shape, name) for name in sheet.held]
+    shares = dict(zip(corners, each, strict=True))
+    for pair in clamps:
+        first, last = (corner(shape, name) for name in pair)
+        side = np.arange(first, last + 1, 1 if last - first < shape[1] else shape[1])
+        for vertex, along in zip(side, np.linspace(0, 1, len(side)), strict=True):
+            shares[int(vertex)] = (1 - along) * shares[first] + along * shares[last]
+    return np.array(list(shares)), np.array(list(shares.values()))
+
+
+def _fan(sheet: SheetPlacement, wind: tuple[float, float, float]) -> Fan:
+    """A jet through the middle of the sheet."""
+    axes = np.array([sheet.warp, sheet.weft])
+    middle = np.asarray(sheet.origin) + np.asarray(sheet.size) @ axes / 2
+    radius, edge = (share * min(sheet.size) for share in JET)
+    array = lambda value: jnp.asarray(value, float)
+    return Fan(array(middle), array(wind), array(radius), array(edge))
+
+
+def _gust(wind: tuple[float, float, float], begin: float):
+    """A wind [m/s] that rises smoothly from `begin` [s] on, and its times [s]."""
+    progress = np.linspace(0, 1, 13)
+    risen = (progress**2 * (3 - 2 * progress))[:, None] * np.asarray(wind)
+    return jnp.asarray(risen, float), jnp.asarray(begin + GUST * progress, float)
+
+
+def steps_between(
+    interval: float,
+    mesh: Mesh,
+    path: Float[np.ndarray, "knot handle 3"],
+    path_times: Float[np.ndarray, " knot"],
+) -> int:
+    """How many steps to make in an interval [s]: the least such that none is above `MAX_STEP`, and
+    that no gripper goes farther in one than the shortest edge of the mesh is long.
+
+    The fabric does not limit the step: the formula is stable for any stiffness, and what is faster
+    than the step is damped.
+    """
+    corners = np.asarray(mesh.rest)[np.asarray(mesh.faces)]
+    edge = np.min(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1))
+    moved = np.linalg.norm(np.diff(path, axis=0), axis=-1)
+    speeds = moved / np.maximum(np.diff(path_times), 1e-9)[:, None]
+    fastest = float(np.max(speeds, initial=0.0))
+    longest = min(MAX_STEP, edge / fastest) if fastest > 0 else MAX_STEP
+    return math.ceil(interval / longest - 1e-9)
+
+
+def from_recording(recording: Recording, shape: tuple[int, int] = (9, 9)) -> Scenario:
+    """The scenario of a recording: its sheet, table, gripper path, wind and frame times.
+
+    In a recording of "stretching" the sides between the held corners are clamped.
+    """
+    info = recording.info
+    return from_placement(
+        info.sheet,
+        info.table_height,
+        recording.handle_path,
+        recording.handle_times,
+        np.asarray(recording.times),
+        shape,
+        clamps=CLAMPS if info.scenario == "stretching" else (),
+        wind=info.wind if info.wind is not None and any(info.wind) else None,
+    )
+
+
+def motion(
+    scenario: Scenario,
+    fabric: Fabric,
+    max_step: float | None = None,
+    solver: Solver | None = None,
+) -> Trajectory:
+    """How a fabric moves in a scenario: positions [m] at its frames.
+
+    By the cloth, in steps of equal size that fill the time between frames: the scenario's, or as
+    many as it takes that none is above `max_step` [s]. Or by another `solver` of the same scene,
+    whose own step divides that time, such as of `r2s.scenarios.material_points`.
+    """
+    solver, substeps = stepped(scenario, max_step, solver)
+    moved = simulate(solver, fabric, begin(solver, scenario), scenario.controls(substeps))
+    skipped = scenario.lead_in - 1
+    return Trajectory(moved.x[skipped:], moved.ok[skipped:])
+
+
+def stepped(
+    scenario: Scenario, max_step: float | None = None, solver: Solver | None = None
+) -> tuple[Solver, int]:
+    """The solver of a motion, which brakes the sheet before its first frame, and its steps a frame.
+
+    Arguments as of `motion`. Raises `ValueError` when a solver's step does not fit.
+    """
+    if solver is None:
+        substeps = scenario.substeps
+        if max_step is not None:
+            substeps = math.ceil(scenario.interval / max_step - 1e-9)
+        solver = Cloth(scenario.scene, scenario.interval / substeps)
+    else:
+        substeps = round(scenario.interval / solver.dt)
+        if abs(substeps * solver.dt - scenario.interval) > 1e-6 * scenario.interval:
+            raise ValueError(
+                f"steps must fill the {scenario.interval:g} s between frames, got {solver.dt:g} s"
+            )
+    if scenario.brake is None:
+        return solver, substeps
+    return Braked(solver, scenario.brake, scenario.lead_in * substeps, solver.dt), substeps
+
+
+def begin(solver: Any, scenario: Scenario) -> Any:
+    """The state of a solver from `stepped` at the start of a scenario, without velocity."""
+    bare = solver.solver if isinstance(solver, Braked) else solver
+    if scenario.acceleration is None or not isinstance(bare, Cloth):  # only BDF2 looks back
+        return solver.init(scenario.start)
+    return solver.init(scenario.start, None, scenario.acceleration)
+
+
+class BrakedState(eqx.Module):
+    """- `inner`: of the solver. - `count`: of the steps made."""
+
+    inner: Any
+    count: Array
+
+    @property
+    def x(self) -> Float[Array, "vertex 3"]:
+        """Positions [m]."""
+        return self.inner.x
+
+    @property
+    def v(self) -> Float[Array, "vertex 3"]:
+        """Velocities [m/s]."""
+        return self.inner.v
+
+
+class Braked(eqx.Module):
+    """A solver whose first steps have more mass damping, so that a sheet comes to rest.
+
+    - `solver`: any, of a `Fabric`.
+    - `brake`: that damping, beside the fabric's, [1/s].
+    - `steps`: how many are braked.
+    - `dt`: step of the solver, [s].
+    """
+
+    solver: Any
+    brake: Float[Array, ""]
+    steps: int = eqx.field(static=True)
+    dt: float = eqx.field(static=True)
+
+    def init(self, x: Float[Array, "vertex 3"], *rates: Array | None) -> BrakedState:
+        """At positions [m]; `rates` as of the solver, by default at rest."""
+        return BrakedState(self.solver.init(x, *rates), jnp.zeros((), int))
+
+    def step(self, fabric: Fabric, state: BrakedState, control: Control) -> BrakedState:
+        """The state `dt` later."""
+        inner = self.solver.step(self.braked(fabric, state), state.inner, control)
+        return BrakedState(inner, state.count + 1)
+
+    def braked(self, fabric: Fabric, state: BrakedState) -> Fabric:
+        """The fabric with the mass damping [1/s] of this step."""
+        brake = jnp.where(state.count < self.steps, self.brake, 0)
+        return eqx.tree_at(lambda f: f.mass_damping, fabric, fabric.mass_damping + brake)

@@ -1,0 +1,237 @@
+"""The six scenarios of the study, each a function of the sheet's size and the grippers' path.
+
+An experiment does not know how it will be simulated: `Experiment.scenario` puts it on a mesh. The
+grippers follow a `route` that was recorded, or a smooth one made from a few numbers
+(`r2s.scenarios.paths`).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from r2s.recordings.recording import SheetPlacement
+from r2s.scenarios import paths
+from r2s.scenarios.paths import Route
+from r2s.scenarios.scenario import CLAMPS, CLEARANCE, Scenario, from_placement
+
+SIDE = 0.45  # [m], the study's sheets
+NUM_FRAMES = 60
+INTERVAL, STRETCHING_INTERVAL = 1 / 15, 1 / 30  # [s]
+GRIP_HEIGHT = 0.7  # [m] above the table, of a hanging sheet's grippers
+ALL_CORNERS = ("origin", "weft", "warp", "opposite")
+Size = tuple[float, float]
+
+
+class Experiment(NamedTuple):
+    """What is done to a sheet, for any fabric and any solver.
+
+    - `name`: of the scenario.
+    - `sheet`: where it is at rest, and which corners the grippers hold.
+    - `route`: the grippers' path.
+    - `times`: of the frames, [s].
+    - `frames_used`: the first and the last frame that count.
+    - `wind`: of a fan in front of the sheet's middle, from the first frame on, [m/s]; None: none.
+    - `clamps`: pairs of held corners between which the whole side is held.
+    - `table_height`: [m].
+    """
+
+    name: str
+    sheet: SheetPlacement
+    route: Route
+    times: Float[np.ndarray, " frame"]
+    frames_used: tuple[int, int]
+    wind: tuple[float, float, float] | None = None
+    clamps: tuple[tuple[str, str], ...] = ()
+    table_height: float = 0.0
+
+    def scenario(self, shape: tuple[int, int] = (9, 9), layers: bool = False) -> Scenario:
+        """On a mesh of `shape` vertices along warp and weft; with `layers` it touches itself."""
+        return from_placement(
+            self.sheet,
+            self.table_height,
+            jnp.asarray(self.route.path, float),
+            jnp.asarray(self.route.times, float),
+            self.times,
+            shape,
+            clamps=self.clamps,
+            wind=self.wind,
+            layers=layers,
+        )
+
+
+def lifting(
+    size: Size = (SIDE, SIDE),
+    held: str = "origin",
+    *,
+    route: Route | None = None,
+    num_frames: int = NUM_FRAMES,
+    interval: float = INTERVAL,
+    **path: float,
+) -> Experiment:
+    """A sheet lies flat on the table; a corner is lifted. The second half of the frames counts.
+
+    `path`: see `trajectories.lift`. The left corner is the "origin" or the "weft".
+
+    >>> scenario = lifting((0.3, 0.3), height=0.2).scenario((5, 5))
+    >>> scenario.start.shape, scenario.num_frames
+    ((25, 3), 60)
+    """
+    done = _moved("lifting", on_table(size, (held,)), route, num_frames, interval, path)
+    return done._replace(frames_used=(num_frames // 2, num_frames - 1))
+
+
+def folding(
+    size: Size = (SIDE, SIDE),
+    held: str = "origin",
+    *,
+    route: Route | None = None,
+    num_frames: int = NUM_FRAMES,
+    interval: float = INTERVAL,
+    **path: float,
+) -> Experiment:
+    """A sheet lies flat on the table; a corner is brought onto the opposite one.
+
+    `path`: see `trajectories.fold`.
+    """
+    return _moved("folding", on_table(size, (held,)), route, num_frames, interval, path)
+
+
+def stretching(
+    size: Size = (SIDE, SIDE),
+    *,
+    route: Route | None = None,
+    height: float = CLEARANCE,
+    num_frames: int = NUM_FRAMES,
+    interval: float = STRETCHING_INTERVAL,
+    **path: float,
+) -> Experiment:
+    """A sheet lies on the table, clamped at both ends of its warp; one is pulled, and held.
+
+    Its force is `r2s.scenarios.clamp_force`. At a `height` [m] above the table the sheet sags in
+    the air instead, until it is pulled taut. A `route` is that of the corners (origin, weft, warp,
+    opposite). `path`: see `trajectories.pull`.
+    """
+    sheet = on_table(size, ALL_CORNERS, height)
+    return _moved("stretching", sheet, route, num_frames, interval, path)._replace(clamps=CLAMPS)
+
+
+def wind(
+    size: Size = (SIDE, SIDE),
+    speed: float = 2.5,
+    aside: float = 0.0,
+    *,
+    route: Route | None = None,
+    height: float = GRIP_HEIGHT,
+    num_frames: int = NUM_FRAMES,
+    interval: float = INTERVAL,
+    **path: float,
+) -> Experiment:
+    """A sheet hangs from its top corners; a fan blows on its middle, `speed` [m/s] on its axis.
+
+    `aside` [degrees] is how far the wind turns from straight on. `path`: see `trajectories.hold`.
+    """
+    paths.not_negative("m/s", speed=speed)
+    if not abs(aside) <= 90:
+        raise ValueError(f"aside must be from -90 to 90 [degrees], found {aside}")
+    angle = np.radians(aside)
+    blows = (float(speed * np.sin(angle)), float(speed * np.cos(angle)), 0.0)
+    done = _moved("wind", hanging(size, height), route, num_frames, interval, path)
+    return done._replace(wind=blows)
+
+
+def fling(
+    size: Size = (SIDE, SIDE),
+    *,
+    route: Route | None = None,
+    height: float = GRIP_HEIGHT,
+    num_frames: int = NUM_FRAMES,
+    interval: float = INTERVAL,
+    **path: float,
+) -> Experiment:
+    """A sheet hangs from its top corners, which rapidly go forward and back.
+
+    `path`: see `trajectories.fling`.
+    """
+    return _moved("fling", hanging(size, height), route, num_frames, interval, path)
+
+
+def shaking(
+    size: Size = (SIDE, SIDE),
+    *,
+    route: Route | None = None,
+    height: float = GRIP_HEIGHT,
+    num_frames: int = NUM_FRAMES,
+    interval: float = INTERVAL,
+    **path: float,
+) -> Experiment:
+    """A sheet hangs from its top corners, of which one goes up and down.
+
+    `path`: see `trajectories.shake`.
+    """
+    return _moved("shaking", hanging(size, height), route, num_frames, interval, path)
+
+
+SIX: dict[str, Callable[..., Experiment]] = {
+    "lifting": lifting,
+    "wind": wind,
+    "stretching": stretching,
+    "folding": folding,
+    "fling": fling,
+    "shaking": shaking,
+}
+
+
+def varied(
+    name: str, number: int, size: Size = (SIDE, SIDE), *, key: PRNGKeyArray
+) -> list[Experiment]:
+    """`number` experiments of a scenario, their numbers drawn within `trajectories.LIMITS`.
+
+    The study has `trajectories.ESTIMATION` of each to estimate from and `EVALUATION` to judge by:
+    split a key, so that they differ.
+    """
+    return [SIX[name](size, **numbers) for numbers in paths.draw(name, number, key=key)]
+
+
+def on_table(size: Size, held: tuple[str, ...], height: float = CLEARANCE) -> SheetPlacement:
+    """A sheet of `size` [m], horizontal at a `height` [m], warp along x and weft along y."""
+    paths.not_negative("m", height=height)
+    return SheetPlacement(size, (0.0, 0.0, height), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), held)
+
+
+def hanging(size: Size, height: float) -> SheetPlacement:
+    """A sheet of `size` [m], vertical, held by the ends of its warp at a `height` [m], along x."""
+    paths.positive("m", height=height)
+    held = ("origin", "warp")
+    return SheetPlacement(size, (0.0, 0.0, height), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), held)
+
+
+_PATHS: dict[str, Callable[..., Route]] = {
+    "lifting": paths.lift,
+    "wind": paths.hold,
+    "stretching": paths.pull,
+    "folding": paths.fold,
+    "fling": paths.fling,
+    "shaking": paths.shake,
+}
+
+
+def _moved(
+    name: str,
+    sheet: SheetPlacement,
+    route: Route | None,
+    num_frames: int,
+    interval: float,
+    path: dict[str, float],
+) -> Experiment:
+    """An experiment all of whose frames count: on a `route`, or on the path of these numbers."""
+    if num_frames < 2:
+        raise ValueError(f"num_frames must be at least 2, found {num_frames}")
+    paths.positive("s", interval=interval)
+    if route is not None and path:
+        raise ValueError(f"{name}: a route is given, which {', '.join(path)} would not change")
+    times = np.arange(num_frames) * interval
+    route = _PATHS[name](sheet, times[-1], **path) if route is None else route
+    return Experiment(name, sheet, route, times, (0, num_frames - 1))

@@ -1,0 +1,271 @@
+"""Synthetic recordings: a known fabric, moved by a solver and seen by cameras.
+
+`lift` and `fold` come from the same solver, mesh and step as the estimates made from them. So they
+test the estimators, not the solver: the error on a real fabric is larger. `record` makes those of
+any scenario, by either solver, on any mesh and with any step.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.surface import nearest, sample
+from r2s.mpm.sheet import longest_edge
+from r2s.recordings.cameras.camera import Camera
+from r2s.recordings.recording import (
+    Recording,
+    RecordingInfo,
+    SheetPlacement,
+    corner,
+    make_recording,
+)
+from r2s.rollout import Solver
+from r2s.scenarios.energy_balance import account, clamp_force
+from r2s.scenarios.paths import Route
+from r2s.scenarios.scenario import Scenario, motion
+from r2s.scenarios.six import SIDE, Experiment
+
+NUM_FRAMES, FRAME_RATE = 60, 15.0  # the study's
+SPACING = SIDE * math.sqrt(2) / 80  # [m], between samples of the surface
+POINTS = 2000  # a frame
+NOISE = 1e-3  # [m], standard deviation
+OUTLIERS = 0.01  # of the points
+MARGIN = 0.004  # [m] above the table, below which a camera cannot tell sheet from table
+MARKERS = 9  # squared, printed on a sheet that is stretched
+MARKER_NOISE = 2e-4  # [m]
+FORCE_NOISE = 0.01  # [N]
+
+
+class Sensing(NamedTuple):
+    """How cameras see a motion.
+
+    - `cameras`: a point is recorded that one of them sees; none: all of the surface is.
+    - `region`: two corners of the box in which outliers lie, [m].
+    - `points`: at most, in a frame.
+    - `noise`: standard deviation of each coordinate, [m].
+    - `outliers`, `dropped`: fractions of the points, [-]; three outliers at least, unless 0.
+    - `time_offset`: how much later than the grippers' clock the cameras' is, [s].
+    - `margin`: above the table, below which no point is recorded, [m].
+    """
+
+    cameras: tuple[Camera, ...]
+    region: tuple[tuple[float, float, float], tuple[float, float, float]]
+    points: int = POINTS
+    noise: float = NOISE
+    outliers: float = OUTLIERS
+    dropped: float = 0.0
+    time_offset: float = 0.0
+    margin: float = MARGIN
+
+
+def sensing(experiment: Experiment) -> Sensing:
+    """Two depth cameras where they see most of an experiment's sheet, and the usual errors.
+
+    For a sheet on the table, from the left and from above. For one that hangs, both from the side
+    from which the wind blows. In a stretching the sheet is told from the table by its colour.
+    """
+    if experiment.sheet.weft[2] > -0.5:
+        margin = -math.inf if experiment.name == "stretching" else MARGIN
+        return Sensing(cameras(), ((-0.1, -0.1, 0.0), (0.6, 0.6, 0.5)), margin=margin)
+    sheet = experiment.sheet
+    corners = np.array([corner(sheet, name) for name in ("origin", "warp", "weft", "opposite")])
+    middle = corners.mean(axis=0)
+    eyes = middle + np.array([(-0.35, -1.1, 0.15), (0.55, -1.0, 0.4)])
+    target = middle + np.array([0.0, 0.1, 0.0])
+    array = lambda values: jnp.asarray(values, float)
+    low, high = corners.min(axis=0) - [0.1, 0.3, 0.1], corners.max(axis=0) + [0.1, 0.5, 0.1]
+    region = (tuple(low.tolist()), tuple(high.tolist()))
+    return Sensing(tuple(Camera(array(eye), array(target)) for eye in eyes), region)
+
+
+WHOLE = Sensing((), ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), 10_000, 0.0, 0.0, margin=-math.inf)
+"""All of the surface, as it is: to judge by, as the study does with 10,000 points a frame."""
+
+
+def record(
+    experiment: Experiment,
+    fabric: Fabric,
+    name: str,
+    trial: int = 1,
+    *,
+    seen: Sensing | None = None,
+    shape: tuple[int, int] = (9, 9),
+    max_step: float | None = None,
+    layers: bool = False,
+    solver: Callable[[Scenario, Fabric], Solver] | None = None,
+    key: PRNGKeyArray,
+) -> Recording:
+    """A recording of an experiment with a fabric; `name` and `trial` say which.
+
+    Seen by default as `sensing` says. Made by the cloth with `shape` vertices and steps of at most
+    `max_step` [s], with `layers` so that it touches itself; or by another solver, such as
+    `r2s.scenarios.material_points`. A finer mesh and shorter steps than the estimators' make a
+    recording that is not their own model's. That of a stretching has markers and the force on the
+    pulled clamp. The same key gives the same recording. Raises `RuntimeError` when the simulation
+    diverges.
+    """
+    seen = sensing(experiment) if seen is None else seen
+    scenario = experiment.scenario(shape, layers)
+    about = scenario, fabric, max_step, None if solver is None else solver(scenario, fabric)
+    found = _account(*about) if experiment.name == "stretching" else None
+    moved = (_motion(*about) if found is None else found).x
+    _check(moved, name)
+    errors = f"camera noise {1e3 * seen.noise:g} mm, {seen.outliers:.0%} outliers"
+    errors += f", {seen.dropped:.0%} dropped" if seen.dropped else ""
+    info = RecordingInfo(
+        name=f"{experiment.name}_{name}{trial if trial > 1 else ''}",
+        scenario=experiment.name,
+        fabric=name,
+        trial=str(trial),
+        source=f"synthetic: {name}, {errors}",
+        frames_used=experiment.frames_used,
+        sheet=experiment.sheet,
+        table_height=experiment.table_height,
+        verified=None,
+        wind=experiment.wind,
+    )
+    clouds = _clouds(moved, scenario, seen, key)
+    times = np.asarray(experiment.times) + seen.time_offset
+    route = _lasting(experiment.route, times[-1])
+    if found is None:
+        return make_recording(clouds, times, route.path, route.times, info)
+    key_markers, key_force = jr.split(jr.fold_in(key, 1))
+    force = np.asarray(clamp_force(scenario, found))
+    force = force + FORCE_NOISE * np.asarray(jr.normal(key_force, force.shape, float))
+    return make_recording(
+        clouds,
+        times,
+        route.path,
+        route.times,
+        info,
+        force=force,
+        force_times=experiment.times,
+        markers=_markers(moved, scenario, key_markers),
+    )
+
+
+def lift(fabric: Fabric, name: str, trial: int, *, key: PRNGKeyArray) -> Recording:
+    """A recording of one corner lifted from the table by 0.35 m and drawn inward.
+
+    `trial` names the repetition, `key` its noise and the 2 mm by which its path differs. Raises
+    `RuntimeError` when the simulation diverges.
+    """
+    inward = 0.15 / np.sqrt(2)
+    knots = [(0.0, 0.0, 0.002), (0.5 * inward, 0.5 * inward, 0.2), (inward, inward, 0.35)]
+    return _record(fabric, name, "lift", trial, "origin", knots, (30, 59), key)
+
+
+def fold(fabric: Fabric, name: str, trial: int, *, key: PRNGKeyArray) -> Recording:
+    """A recording of one corner brought over to the opposite one; otherwise as `lift`."""
+    angles = np.linspace(0, np.pi, 9)
+    reach, height = 0.46 * SIDE, 0.5 * SIDE
+    knots = [(reach * (1 - np.cos(a)), reach * (1 - np.cos(a)), height * np.sin(a)) for a in angles]
+    knots = [(x, y, max(z, 0.01)) for x, y, z in knots]
+    return _record(fabric, name, "fold", trial, "origin", knots, (15, 59), key)
+
+
+def placement(held: str) -> SheetPlacement:
+    """The study's square sheet, flat on a table at z = 0, held at a named corner."""
+    return SheetPlacement((SIDE, SIDE), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (held,))
+
+
+def cameras() -> tuple[Camera, Camera]:
+    """Two depth cameras in front of the sheet, one from the left and one from above."""
+    target = jnp.array([0.25, 0.25, 0.1], float)
+    positions = [(-0.5, -0.1, 0.5), (0.1, -0.4, 0.9)]
+    return tuple(Camera(jnp.array(p, float), target) for p in positions)  # pyright: ignore
+
+
+def _record(fabric, name, scenario, trial, held, knots, frames_used, key) -> Recording:
+    key_path, key_view = jr.split(key)
+    sheet = placement(held)
+    # a smooth start and stop, at rest for the last second
+    times = np.arange(NUM_FRAMES) / FRAME_RATE
+    progress = np.clip(times / (times[-1] - 1), 0, 1)
+    progress = progress**2 * (3 - 2 * progress)
+    along = np.linspace(0, 1, len(knots))
+    path = np.stack([np.interp(progress, along, axis) for axis in np.array(knots).T], axis=1)
+    path = path + corner(sheet, held) + 2e-3 * np.asarray(jr.normal(key_path, (3,))) * [1, 1, 0]
+    experiment = Experiment(scenario, sheet, Route(times, path[:, None]), times, frames_used)
+    return record(experiment, fabric, name, trial, key=key_view)
+
+
+def _check(x: Float[Array, "frame vertex 3"], name: str) -> None:
+    finite = np.isfinite(np.asarray(x)).all(axis=(1, 2))
+    if not finite.all():
+        first = int(np.argmin(finite))
+        raise RuntimeError(f"the simulation of {name} diverged in frame {first}: positions")
+
+
+def _lasting(route: Route, end: float) -> Route:
+    """The route, at rest after its end until `end` [s]."""
+    if route.times[-1] >= end:
+        return route
+    times = np.append(route.times, end)
+    return Route(times, np.concatenate([route.path, route.path[-1:]]))
+
+
+_motion = eqx.filter_jit(motion)
+_account = eqx.filter_jit(account)
+
+
+def _markers(x, scenario: Scenario, key) -> np.ndarray:
+    """Places [m] of a printed grid of markers in each frame, each in the middle of its cell."""
+    mesh = scenario.scene.mesh
+    along = (np.arange(MARKERS) + 0.5) / MARKERS
+    places = np.stack(np.meshgrid(along, along, indexing="ij"), -1).reshape(-1, 2)
+    places = jnp.asarray(places * np.asarray(mesh.rest).max(axis=0), float)
+    flat = lambda points: jnp.pad(points, ((0, 0), (0, 1)))
+    faces, weights = nearest(flat(places), flat(mesh.rest), mesh.faces)
+    markers = jnp.einsum("mk,tmki->tmi", weights, x[:, mesh.faces[faces]])
+    return np.asarray(markers + MARKER_NOISE * jr.normal(key, markers.shape, float))
+
+
+def _clouds(x, scenario: Scenario, seen: Sensing, key) -> list[np.ndarray]:
+    mesh = scenario.scene.mesh
+    resolution = math.ceil(longest_edge(mesh) / SPACING - 1e-3)
+    lowest = scenario.scene.table.height + seen.margin
+    points, kept = _observe(x, mesh.faces, resolution, lowest, seen, jr.split(key, len(x)))
+    points, kept = np.asarray(points), np.asarray(kept)
+    return [cloud[visible] for cloud, visible in zip(points, kept, strict=True)]
+
+
+@eqx.filter_jit
+def _observe(x, faces, resolution: int, lowest, seen: Sensing, keys):
+    frame = lambda x, key: _observe_frame(x, faces, resolution, lowest, seen, key)
+    return jax.vmap(frame)(x, keys)
+
+
+def _observe_frame(x: Float[Array, "vertex 3"], faces, resolution: int, lowest, seen: Sensing, key):
+    """Noisy points of the surface, and which of them the cameras record."""
+    key_pick, key_noise, key_where = jr.split(key, 3)
+    surface = sample(x, faces, resolution)
+    visible = surface[:, 2] > lowest
+    if seen.cameras:
+        by_camera = [camera.sees(surface) for camera in seen.cameras]
+        visible = visible & jnp.any(jnp.stack(by_camera), axis=0)
+    if seen.dropped:
+        kept = jr.uniform(jr.fold_in(key, 1), visible.shape, float) >= seen.dropped
+        visible = visible & kept
+    # a random order with what is seen in front: its first points are a random choice of the seen
+    order = jnp.argsort(jr.uniform(key_pick, visible.shape, float) + (~visible).astype(float))
+    count = min(seen.points, len(surface))
+    order = order[:count]
+    points = surface[order] + seen.noise * jr.normal(key_noise, (count, 3), float)
+    if not seen.outliers:
+        return points, visible[order]
+    low, high = (jnp.asarray(end, float) for end in seen.region)
+    where = jr.uniform(key_where, (count, 3), float)
+    stray = low[None] + (high - low)[None] * where
+    # one in a hundred, and three at least: a sheet flat on the table gives nothing else
+    strays = jnp.maximum(3, seen.outliers * jnp.sum(visible[order], dtype=float))
+    is_stray = jnp.arange(count, dtype=float) >= count - strays
+    return jnp.where(is_stray[:, None], stray, points), visible[order] | is_stray

@@ -1,0 +1,1 @@
+"""The report of a study: tables, pictures, videos and one HTML page."""

@@ -1,0 +1,220 @@
+"""What a study estimates from and judges against: recordings, made or given.
+
+Those that are made are not the estimators' own model: their mesh is finer, their steps are shorter,
+and their fabrics stiffen with the strain and soften with the curvature, as measured ones do.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+
+from r2s.estimation.pinn.synthetic_pulls import pulled
+from r2s.fabrics import presets
+from r2s.fabrics.arcsim import read_material
+from r2s.fabrics.fabric import Fabric, constant_laws
+from r2s.laws.tables import HINGE_FACTOR, TableBending, TableMembrane
+from r2s.recordings import manifest
+from r2s.recordings.recording import Recording, load, save
+from r2s.scenarios import synthetic
+from r2s.scenarios.six import SIX, Experiment, varied
+from r2s.study.cells import Cell, opened
+
+RECORDING = "recording.npz"
+SOFTENED = (1.0, 0.9, 0.8, 0.75, 0.7)  # bending at curvatures of 0, 10, ... 40 1/m over that at 0
+SAME_SCENARIO = {"lift": "lifting", "fold": "folding"}  # how recordings of others call them
+
+
+@dataclass(frozen=True)
+class Making:
+    """How recordings are made.
+
+    - `shape`: vertices along warp and weft. - `max_step`: of the time, [s].
+    - `stiffening`: membrane stiffness at an extension of 16.7 % over that of the preset, which is
+      at zero strain; 0: constant stiffness, bending too, as the estimators assume. Assumed, not
+      measured.
+    - `materials`: a folder of ARCSim material files, FABRIC.json, with measured tables to take
+      instead; "": none. - `materials_digest`: of those files, from `measured`. - `layers`: the
+      sheet touches itself.
+    """
+
+    shape: tuple[int, int] = (17, 17)
+    max_step: float = 1 / 90
+    stiffening: float = 2.0
+    materials: str = ""
+    materials_digest: str = ""
+    layers: bool = False
+
+
+@dataclass(frozen=True)
+class Made(Cell):
+    """A synthetic recording of a preset's fabric.
+
+    - `number`: 0 is the motion of the scenario without any numbers; others are drawn within
+      `r2s.scenarios.paths.LIMITS`, the same for all fabrics.
+    - `unseen`: drawn to be judged by, none of which is one to estimate from; its clouds are all of
+      the surface, without any error.
+    - `angle`: from the pull of a stretching to the warp [degrees], for `r2s.estimation.pinn`; None:
+      a motion of `r2s.scenarios`.
+    """
+
+    kind: ClassVar[str] = "recordings"
+    weight: ClassVar[float] = 15.0
+
+    fabric: str
+    scenario: str
+    number: int = 0
+    unseen: bool = False
+    making: Making = Making()
+    seed: int = 0
+    angle: float | None = None
+
+    @property
+    def name(self) -> str:
+        turned = "" if self.angle is None else f"_{self.angle:g}"
+        return f"{self.scenario}_{self.fabric}{turned}_{'u' * self.unseen}{self.number}"
+
+    @property
+    def alike(self) -> str:
+        return f"recordings {self.scenario}"
+
+    def make(self, folder: Path, out: Path) -> dict[str, Any]:
+        """A recording."""
+        fabric, making = strain_dependent(self.fabric, self.making), self.making
+        key = jr.fold_in(jr.key(self.seed), _number(self.fabric, self.scenario, self.number))
+        if self.angle is not None:
+            about = {"shape": making.shape, "key": jr.fold_in(key, round(self.angle))}
+            made = pulled(fabric, self.fabric, math.radians(self.angle), **about)
+        else:
+            made = synthetic.record(
+                self._experiment(),
+                fabric,
+                self.fabric,
+                seen=synthetic.WHOLE if self.unseen else None,
+                shape=making.shape,
+                max_step=making.max_step,
+                layers=making.layers and self.scenario == "folding",
+                key=key,
+            )
+        info = dataclasses.replace(made.info, name=self.name, trial=str(self.number))
+        save(dataclasses.replace(made, info=info), out / RECORDING)
+        return {"seed": self.seed, "frames": len(made.times)}
+
+    def _experiment(self) -> Experiment:
+        if self.number == 0 and not self.unseen:
+            return SIX[self.scenario]()
+        key = jr.fold_in(jr.key(self.seed), 2 * self.number + self.unseen)
+        return varied(self.scenario, 1, key=key)[0]
+
+
+@dataclass(frozen=True)
+class Given(Cell):
+    """A recording in a folder with its manifest; `digest` is of its files, from `given`."""
+
+    kind: ClassVar[str] = "recordings"
+
+    folder: str
+    recording: str
+    fabric: str
+    scenario: str
+    trial: str
+    digest: str
+
+    @property
+    def name(self) -> str:
+        return self.recording
+
+    def make(self, folder: Path, out: Path) -> dict[str, Any]:
+        """The recording, as it was read."""
+        rules = manifest.manifest_for(self.folder)
+        read = manifest.read_recording(self.folder, rules, self.recording)
+        save(read, out / RECORDING)
+        return {"frames": len(read.times), "verified": read.info.verified}
+
+
+Source = Made | Given
+
+
+def given(folder: Path) -> list[Given]:
+    """The recordings in a folder, by its own manifest or that of DIFFCLOUD.
+
+    Raises what `r2s.recordings.manifest` raises, and `ValueError` when there is none.
+    """
+    rules = manifest.manifest_for(folder)
+    found = []
+    for name in manifest.read_recordings(folder, rules):
+        digest = sha256()
+        for file in manifest.sources(folder, rules, name):
+            digest.update(file.read_bytes())
+        info = manifest.read_recording(folder, rules, name).info
+        scenario = SAME_SCENARIO.get(info.scenario, info.scenario)
+        about = str(folder), name, info.fabric, scenario, info.trial
+        found.append(Given(*about, digest.hexdigest()))
+    if not found:
+        raise ValueError(f"{folder}: no recording that a manifest describes")
+    return found
+
+
+def measured(making: Making, folder: Path, fabrics: Sequence[str]) -> Making:
+    """Recordings made with the measured tables in a folder, one file FABRIC.json for each fabric.
+
+    Raises `FileNotFoundError` for one that is missing, and what `r2s.fabrics.arcsim.read_material`
+    raises.
+    """
+    digest = sha256()
+    for fabric in fabrics:
+        file = folder / f"{fabric}.json"
+        read_material(file)
+        digest.update(file.read_bytes())
+    return dataclasses.replace(
+        making, materials=str(folder), materials_digest=digest.hexdigest()[:16]
+    )
+
+
+def read(source: Source, folder: Path) -> Recording:
+    """The recording of a cell that is made."""
+    with opened(source, folder) as files:
+        return load(files / RECORDING)
+
+
+def strain_dependent(name: str, making: Making = Making()) -> Fabric:
+    """The fabric that a recording is made with; see `Making`.
+
+    The stiffening table is `TableMembrane`'s: linear in the principal stretch, up to `stiffening`
+    times the preset's numbers at 16.7 %, alike in all directions. Bending softens with curvature
+    down to `SOFTENED`. Raises `ValueError` for an unknown preset.
+    """
+    if name not in presets.FIVE:
+        raise ValueError(f"no preset {name!r}; there are {', '.join(presets.FIVE)}")
+    if making.materials:
+        return read_material(Path(making.materials) / f"{name}.json")
+    fabric = presets.FIVE[name]()
+    if not making.stiffening:
+        return fabric
+    law, bending = constant_laws(fabric)
+    published = np.array([law.c11, law.c12, law.c22, 2 * law.c33])  # theirs acts on E12
+    rows = np.stack([published, *[making.stiffening * published] * 5])
+    columns = HINGE_FACTOR * float(bending.stiffness) * np.tile(SOFTENED, (3, 1))
+    return dataclasses.replace(
+        fabric,
+        membrane=TableMembrane(jnp.asarray(rows, float)),
+        bending=TableBending(jnp.asarray(columns, float)),
+    )
+
+
+def small_strain(name: str) -> Fabric:
+    """What an estimate of a made recording is compared with: the preset, whose constant stiffness
+    is that of `strain_dependent` at zero strain and curvature."""
+    return presets.FIVE[name]()
+
+
+def _number(*parts: Any) -> int:
+    """A number below 2^31 that goes with the parts."""
+    return int.from_bytes(sha256(repr(parts).encode()).digest()[:4], "big") >> 1

@@ -1,0 +1,242 @@
+"""How much of the variance of the logarithm of a distance each factor of the study explains.
+
+Factors: the approach, the solver and the scenario that a column is made of; the fabric; the motion
+that is judged, and in it the trajectory; the rest is interactions and the spread of repeats.
+
+The design is not balanced, and partly confounded: an approach that works from one scenario only
+cannot be told from that scenario. So there is no one share of a factor: what it adds to the
+explained variance depends on which factors are there before it. Shares here are means over all
+orders in which the factors may enter (Lindeman, Merenda and Gold 1980; Shapley's value of the
+explained variance), a trajectory always after the fabric and the motion that it lies in.
+Confounded factors share evenly what no data could tell apart, and the shares and the rest sum to
+one. The explained variance is adjusted for degrees of freedom, so that a factor without effect has
+a share of zero on average, which may come out slightly below.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import permutations
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Integer
+
+from r2s.study.statistics.panel import LEVEL, Panel, Weights, interval, resamples
+from r2s.study.statistics.tables import MISSING, Table
+
+NESTED = {"trajectory": ("fabric", "motion")}  # what must enter before it
+REST = "rest"
+ROUNDING = 1e-9  # of singular values: what is dependent on the other columns
+
+
+class Shares(NamedTuple):
+    """Shares of the variance, their interval by a bootstrap over trajectories and repeats.
+
+    - `factors`: their names, those with one level only left out; the last is the rest.
+    - `deviation`: of the logarithm of the distance, [-].
+    - `confounded`: pairs of factors, one of which tells the other.
+    - `count`, `diverged`: values that count, and those that do not, for they diverged.
+    """
+
+    factors: tuple[str, ...]
+    share: Float[np.ndarray, " factor"]
+    low: Float[np.ndarray, " factor"]
+    high: Float[np.ndarray, " factor"]
+    deviation: float
+    confounded: tuple[tuple[str, str], ...]
+    count: int
+    diverged: int
+
+
+class _Data(NamedTuple):
+    y: Float[np.ndarray, " value"]
+    levels: dict[str, Integer[np.ndarray, " value"]]  # but for trajectories
+    trajectory: Integer[np.ndarray, " value"]  # ascending
+    where: tuple[np.ndarray, ...]  # of the values in the panel
+
+
+def variance_shares(panel: Panel, draws: int | None = None, seed: int = 0) -> Shares | None:
+    """The shares for a panel without default fabrics; None where nothing varies."""
+    data = _data(panel)
+    if len(data.y) < 3 or np.ptp(data.y) == 0:
+        return None
+    names = tuple(name for name, level in data.levels.items() if level.max() > 0)
+    nested = len(np.unique(data.trajectory)) > len(_cells(data, ("fabric", "motion")))
+    factors = (*names, *(("trajectory",) if nested else ()))
+    if not factors:
+        return None
+    found = _shares(data, factors, np.ones(len(data.y)))
+    drawn = [_shares(data, factors, w) for w in _weights(data, resamples(panel, draws, seed))]
+    ends = np.array([interval(samples) for samples in np.array(drawn).T])
+    lost = int((panel.present & ~np.isfinite(panel.values)).sum())
+    return Shares(
+        (*factors, REST),
+        found,
+        ends[:, 0],
+        ends[:, 1],
+        float(data.y.std()),
+        _confounded(data, names),
+        len(data.y),
+        lost,
+    )
+
+
+def _data(panel: Panel) -> _Data:
+    """One entry a finite distance, those of a trajectory side by side."""
+    estimates = np.array([bool(column.approach) for column in panel.columns], bool)
+    known = np.isfinite(panel.values) & (np.nan_to_num(panel.values) > 0)
+    trajectory, column, repeat = np.nonzero((known & estimates[:, None, None]).transpose(1, 0, 2))
+    columns = [panel.columns[i] for i in column]
+    places = [panel.trajectories[i] for i in trajectory]
+    named = {
+        "approach": [c.approach for c in columns],
+        "solver": [c.solver for c in columns],
+        "scenario": [c.estimated_from for c in columns],
+        "fabric": [t.fabric for t in places],
+        "motion": [t.evaluated_on for t in places],
+    }
+    levels = {name: np.unique(texts, return_inverse=True)[1] for name, texts in named.items()}
+    where = column, trajectory, repeat
+    return _Data(np.log(panel.values[where]), levels, trajectory, where)
+
+
+def _weights(data: _Data, drawn: Iterator[Weights]) -> Iterator[np.ndarray]:
+    for weights in drawn:
+        weight = weights.trajectory[data.where[1]] * weights.repeat[data.where]
+        if np.count_nonzero(weight) > 2:
+            yield weight
+
+
+def _shares(data: _Data, factors: tuple[str, ...], weights: np.ndarray) -> np.ndarray:
+    """The mean of what each factor adds, over the orders that nesting allows; then the rest."""
+    explained = {frozenset(): 0.0}
+    design = _Design(data, weights)
+    added = dict.fromkeys(factors, 0.0)
+    orders = _orders(factors)
+    for order in orders:
+        for i, name in enumerate(order):
+            before, after = frozenset(order[:i]), frozenset(order[: i + 1])
+            if after not in explained:
+                explained[after] = design.explained(after)
+            added[name] += (explained[after] - explained[before]) / len(orders)
+    return np.array([*added.values(), 1 - explained[frozenset(factors)]])
+
+
+def _orders(factors: tuple[str, ...]) -> list[tuple[str, ...]]:
+    allowed = lambda order: all(
+        order.index(outer) < order.index(inner)
+        for inner, outers in NESTED.items()
+        for outer in outers
+        if inner in order and outer in order
+    )
+    return [order for order in permutations(factors) if allowed(order)]
+
+
+class _Design:
+    """The weighted sums from which the fit of any set of factors follows.
+
+    Trajectories are many: instead of a column for each, their means are taken out of the others.
+    """
+
+    def __init__(self, data: _Data, weights: np.ndarray):
+        blocks = {
+            name: level[:, None] == np.arange(1, level.max() + 1)
+            for name, level in data.levels.items()
+        }
+        ends = np.cumsum([block.shape[1] for block in blocks.values()])
+        starts = (end - block.shape[1] for end, block in zip(ends, blocks.values(), strict=True))
+        self.columns = {
+            name: list(range(start, end))
+            for name, start, end in zip(blocks, starts, ends, strict=True)
+        }
+        table = np.concatenate([*blocks.values(), data.y[:, None]], axis=1).astype(float)
+        used = weights > 0
+        table, weights, trajectory = table[used], weights[used], data.trajectory[used]
+        self.count = len(table)
+        first = np.flatnonzero(np.diff(trajectory, prepend=-1))
+        heavy = table * weights[:, None]
+        sums, totals = np.add.reduceat(heavy, first), np.add.reduceat(weights, first)
+        square, total = heavy.T @ table, weights.sum()
+        mean = heavy.sum(axis=0)
+        self.trajectories = len(first)
+        self.around_mean = (square - np.outer(mean, mean) / total) / total
+        self.within = (square - (sums / totals[:, None]).T @ sums) / total
+
+    def explained(self, factors: frozenset[str]) -> float:
+        """The share of the variance that factors explain, adjusted for degrees of freedom."""
+        is_nested = "trajectory" in factors
+        products = self.within if is_nested else self.around_mean
+        inside = NESTED["trajectory"] if is_nested else ()
+        index = [
+            i for name in sorted(factors - {"trajectory", *inside}) for i in self.columns[name]
+        ]
+        left, parameters = products[-1, -1], self.trajectories if is_nested else 1
+        if index:
+            values, vectors = np.linalg.eigh(products[np.ix_(index, index)])
+            kept = values > ROUNDING * max(1.0, values[-1])
+            along = vectors[:, kept].T @ products[index, -1]
+            left -= float(np.sum(along**2 / values[kept]))
+            parameters += int(kept.sum())
+        free = self.count - parameters
+        if free <= 0:
+            return 1.0
+        total = self.around_mean[-1, -1] * self.count / (self.count - 1)
+        return 1 - left * self.count / free / total if total > 0 else 0.0
+
+
+def _cells(data: _Data, names: Sequence[str]) -> set[tuple[int, ...]]:
+    return set(zip(*(data.levels[name].tolist() for name in names), strict=True))
+
+
+def _confounded(data: _Data, names: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """Pairs of factors of which a level of one comes with just one level of the other."""
+    found = []
+    for i, one in enumerate(names):
+        for other in names[i + 1 :]:
+            pairs: Bool[np.ndarray, "a b"] = np.zeros(
+                (data.levels[one].max() + 1, data.levels[other].max() + 1), bool
+            )
+            pairs[data.levels[one], data.levels[other]] = True
+            if (pairs.sum(axis=0) == 1).any() or (pairs.sum(axis=1) == 1).any():
+                found.append((one, other))
+    return tuple(found)
+
+
+def share_table(found: Mapping[str, Shares], caption: str) -> Table:
+    """Shares by motion, [%]: a line a factor."""
+    shown = {motion: _cells_of(each) for motion, each in found.items()}
+    factors = dict.fromkeys(name for cells in shown.values() for name in cells if name != REST)
+    return Table(
+        ("factor", *(f"{motion} [%]" for motion in found)),
+        tuple((name, *(c.get(name, MISSING) for c in shown.values())) for name in (*factors, REST)),
+        f"{caption}: shares of the variance of the log distance, and {LEVEL:.0%} interval. "
+        f"{explained(found)}",
+        foot=1,
+    )
+
+
+def _cells_of(shares: Shares) -> dict[str, str]:
+    numbers = zip(shares.factors, shares.share, shares.low, shares.high, strict=True)
+    return {
+        name: f"{_percent(share)} [{_percent(low)}, {_percent(high)}]"
+        for name, share, low, high in numbers
+    }
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f}".replace("-0.0", "0.0")
+
+
+def explained(found: Mapping[str, Shares]) -> str:
+    """What the shares are of, in words."""
+    counts = ", ".join(
+        f"{each.count} on {motion} (deviation of the logarithm {100 * each.deviation:.0f} %"
+        + (f"; {each.diverged} more diverged, and have none)" if each.diverged else ")")
+        for motion, each in found.items()
+    )
+    pairs = dict.fromkeys(" and ".join(pair) for each in found.values() for pair in each.confounded)
+    if not pairs:
+        return f"Distances: {counts}."
+    return (
+        f"Distances: {counts}. Not crossed in full, so that they share what cannot be told apart: "
+        f"{', '.join(pairs)}."
+    )

@@ -1,0 +1,88 @@
+"""What a page with sliders shows: a motion, the family of fabrics, and what a recording saw."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from r2s.estimation.problem import Clouds
+from r2s.evaluation.losses import masked_mean, surface_residuals
+from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.parameters import Family
+from r2s.recordings.recording import Recording, subsample
+from r2s.scenarios import Experiment
+from r2s.scenarios.scenario import Scenario, from_recording, motion
+
+MOST_POINTS = 1500  # of a cloud: more change neither the picture nor the distance
+
+
+class Subject(eqx.Module):
+    """A motion that any member of a family can make.
+
+    - `scenario`, `family`. - `clouds`: of a recording, all its frames; None: there is none.
+    - `frames_used`: the first and the last frame that count.
+    """
+
+    scenario: Scenario
+    family: Family
+    clouds: Clouds | None = None
+    frames_used: tuple[int, int] = eqx.field(static=True, default=(0, 0))
+
+
+class Moved(NamedTuple):
+    """A motion of a subject.
+
+    - `x`: positions [m]. - `ok`: whether they are to be trusted, frame by frame.
+    - `error`: mean distance [m] from the recorded points to the sheet in each frame; NaN where
+      there are none, or the simulation diverged.
+    """
+
+    x: Float[Array, "frame vertex 3"]
+    ok: Bool[Array, " frame"]
+    error: Float[Array, " frame"]
+
+
+def of_recording(recording: Recording, family: Family, shape: tuple[int, int] = (9, 9)) -> Subject:
+    """The motion of a recording, on a mesh of `shape` vertices; raises as `from_recording`."""
+    seen = subsample(recording, MOST_POINTS, None, 0)
+    clouds = Clouds(seen.points, seen.mask)
+    return Subject(from_recording(recording, shape), family, clouds, recording.info.frames_used)
+
+
+def of_experiment(
+    experiment: Experiment, family: Family, shape: tuple[int, int] = (9, 9)
+) -> Subject:
+    """A motion that nobody recorded."""
+    return Subject(experiment.scenario(shape), family, None, experiment.frames_used)
+
+
+def place(subject: Subject, fabric: Fabric) -> Float[Array, " dim"]:
+    """Where a fabric lies in the subject's family, at its bounds when beyond them."""
+    return jnp.clip(subject.family.locate(fabric), 0, 1)
+
+
+@eqx.filter_jit
+def move(subject: Subject, u: Float[Array, " dim"]) -> Moved:
+    """The motion of the member at `u`, and how far the recording is from it.
+
+    A cloud's distance is that of `chamfer_real_to_sim`, but to the surface itself.
+    """
+    moved = motion(subject.scenario, subject.family(u))
+    if subject.clouds is None:
+        return Moved(moved.x, moved.ok, jnp.full(moved.ok.shape, jnp.nan))
+    faces = subject.scenario.scene.mesh.faces
+
+    def distance(frame):
+        points, mask, x = frame
+        return masked_mean(surface_residuals(points, mask, x, faces)[0], mask)
+
+    error = jax.lax.map(distance, (subject.clouds.points, subject.clouds.mask, moved.x))
+    return Moved(moved.x, moved.ok, jnp.where(moved.ok, error, jnp.nan))
+
+
+def error_used(subject: Subject, moved: Moved) -> Float[Array, ""]:
+    """The mean error [m] over the frames that count; NaN when one of them has none."""
+    first, last = subject.frames_used
+    return jnp.mean(moved.error[first : last + 1])
