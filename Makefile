@@ -16,7 +16,7 @@ QUICK := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 
 	--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1
 
 # The public surface: what changes here is in the changelog.
-PUBLIC := r2s r2s.fabrics.fabric r2s.fabrics.parameters r2s.fabrics.presets r2s.units r2s.geometry.mesh r2s.world.scene r2s.rollout r2s.cloth.cloth \
+PUBLIC := r2s r2s.fabrics.fabric r2s.fabrics.parameters r2s.fabrics.presets r2s.units r2s.geometry.mesh r2s.world.scene r2s.solver r2s.cloth.cloth \
 	r2s.cloth.self_contact.contacts r2s.mpm r2s.scenarios.scenario r2s.scenarios r2s.scenarios.paths r2s.sweep \
 	r2s.laws.membrane r2s.laws.plate r2s.laws.bending r2s.laws.tables r2s.laws.solid \
 	r2s.world.air r2s.world.contact r2s.recordings.recording r2s.recordings.manifest r2s.scenarios.synthetic r2s.evaluation.metrics r2s.evaluation.losses \

@@ -12,8 +12,8 @@ the default fabric, and DiffSim in steps of 40 ms.
 
 A run there is a linearised backward-Euler step of 10 ms after the other: it damps like a damping
 time of 10 ms, and a falling sheet is where it should be 5 ms later. So damping is estimated along,
-and in one of two ways the clock of the lift (`Doubt`), at which the wind is then predicted too.
-Estimates are kept in `--out`, and go on from there.
+and in one of two ways the clock of the lift (`NuisancePrior`), at which the wind is then predicted
+too. Estimates are kept in `--out`, and go on from there.
 """
 
 import argparse
@@ -32,14 +32,14 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.interpolate import CubicSpline
 
 from r2s.estimation import diffcloud
-from r2s.estimation.descent import Effort
+from r2s.estimation.descent import Budget
 from r2s.estimation.estimate import Estimate
-from r2s.estimation.problem import Clouds, Doubt, Problem
+from r2s.estimation.problem import Clouds, NuisancePrior, Problem
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.geometry.mesh import Mesh
 from r2s.laws.tables import DiffSimTableBending, DiffSimTableMembrane
-from r2s.scenarios.scenario import BRAKE, Scenario, motion
+from r2s.scenarios.scenario import BRAKE, Scenario, rollout
 from r2s.units import GRAVITY
 from r2s.world.air import Air
 from r2s.world.contact import Table
@@ -52,11 +52,11 @@ WIND, COARSE_WIND = "hang2wind_{}_9_dt10", "hang2wind_{}_9_dt40"
 FRAME, COUNT = 0.04, 10  # [s] between frames; how many of a motion count, the first at 0.04 s
 STEPS, REST_STEPS = 4, 2  # of r2s in a frame
 SETTLING = 90  # frames in which a braked sheet comes to rest
-NO_DOUBT = Doubt(0.0, 0.0)
+NO_DOUBT = NuisancePrior(0.0, 0.0)
 NOISE = 1e-3  # [m], of the clouds
 BAR = 0.02  # of the side
 
-_motion = eqx.filter_jit(motion)
+_motion = eqx.filter_jit(rollout)
 
 
 class Made(NamedTuple):
@@ -181,11 +181,13 @@ def problems_of(
     found = []
     for i, (name, at_rest) in enumerate(((LIFT, False), (REST, True))):
         made = read(folder, name.format(fabric))
-        family = OrthotropicFamily.make(made.told["material_json"]["density"])
+        space = OrthotropicSpace.make(made.told["material_json"]["density"])
         clouds = sampled(truth(made, at_rest), made.mesh, number, jax.random.fold_in(key, i))
-        doubt = NO_DOUBT if at_rest else NO_DOUBT._replace(time=clock)
+        nuisance_prior = NO_DOUBT if at_rest else NO_DOUBT._replace(time=clock)
         scenario = scenario_of(made, at_rest)
-        found.append(Problem(scenario, family, tuple(range(COUNT)), clouds, doubt=doubt))
+        found.append(
+            Problem(scenario, space, tuple(range(COUNT)), clouds, nuisance_prior=nuisance_prior)
+        )
     return found[0], found[1]
 
 
@@ -255,18 +257,18 @@ def estimated(
     fabric: str,
     number: int,
     clock: float,
-    effort: Effort,
+    budget: Budget,
     path: Path | None = None,
 ) -> Estimate:
     """The fabric of known density from clouds of its lift and its rest shape (`problems_of`)."""
     problems = problems_of(folder, fabric, number, clock, jax.random.key(0))
-    return diffcloud.estimate(problems, effort, checkpoint=path, key=jax.random.key(1))
+    return diffcloud.estimate(problems, budget, checkpoint=path, key=jax.random.key(1))
 
 
 WAYS = {"plain": 0.0, "clock": 0.01}  # [s], the doubt of the lift's clock
 
 
-def compare(folder: Path, fabric: str, ways: list[str], number: int, effort: Effort, out: Path):
+def compare(folder: Path, fabric: str, ways: list[str], number: int, budget: Budget, out: Path):
     """Rows of all fabrics that stand beside each other, and their vertices in the wind [m]."""
     wind = read(folder, WIND.format(fabric))
     density, dt = wind.told["material_json"]["density"], wind.told["dt"]
@@ -274,14 +276,14 @@ def compare(folder: Path, fabric: str, ways: list[str], number: int, effort: Eff
     for way in ways:
         began = time.process_time()
         path = out / f"{fabric}_{way}.npz"
-        found = estimated(folder, fabric, number, WAYS[way], effort, path)
+        found = estimated(folder, fabric, number, WAYS[way], budget, path)
         measure.progress(f"{fabric}, {way}: {time.process_time() - began:.0f} CPU s")
         candidates.append((f"estimate, {way}", found.fabric, clock_of(found)))
         told += parameters(fabric, way, found)
     candidates += [
         ("its laws", own_fabric(wind, 0.0), 0.0),
         ("its laws, damped and early as its steps", own_fabric(wind, dt), -dt / 2),
-        ("default", OrthotropicFamily.make(density).middle(), 0.0),
+        ("default", OrthotropicSpace.make(density).middle(), 0.0),
     ]
     rows, seen = [], {}
     for candidate in candidates:
@@ -336,11 +338,11 @@ def picture(path: Path, seen: dict[str, dict[str, np.ndarray]]) -> None:
     figure.savefig(path, dpi=110)
 
 
-def main(folder: Path, out: Path, fabrics: list[str], ways: list[str], number: int, effort: Effort):
+def main(folder: Path, out: Path, fabrics: list[str], ways: list[str], number: int, budget: Budget):
     out.mkdir(parents=True, exist_ok=True)
     rows, told, seen = [], [], {}
     for fabric in fabrics:
-        more, estimates, seen[fabric] = compare(folder, fabric, ways, number, effort, out)
+        more, estimates, seen[fabric] = compare(folder, fabric, ways, number, budget, out)
         rows, told = rows + more, told + estimates
         write(out / "errors.csv", rows)
         write(out / "estimates.csv", told)
@@ -377,5 +379,5 @@ if __name__ == "__main__":
     parser.add_argument("--starts", type=int, default=2)
     parser.add_argument("--iterations", type=int, default=20)
     a = parser.parse_args()
-    effort = Effort(a.coarse, a.starts, a.iterations)
-    main(a.data, a.out, a.fabrics, a.ways, a.points, effort)
+    budget = Budget(a.coarse, a.starts, a.iterations)
+    main(a.data, a.out, a.fabrics, a.ways, a.points, budget)

@@ -19,7 +19,7 @@ import numpy as np
 
 from r2s.evaluation import prediction_error
 from r2s.fabrics import presets
-from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.files import write_json
 from r2s.recordings import manifest
 from r2s.recordings.recording import Recording, subsample
@@ -57,7 +57,7 @@ def main(folder: Path, out: Path) -> None:
     read = lambda name: subsample(manifest.read_recording(folder, rules, name), POINTS, None, 0)
     recordings = [read(name) for name in names]
     written = np.array(rules.scenarios[FOLD].gripper.offset)
-    fabrics = [OrthotropicFamily.make(0.15).middle(), *(make() for make in presets.FIVE.values())]
+    fabrics = [OrthotropicSpace.make(0.15).middle(), *(make() for make in presets.FIVE.values())]
     rows = []
     for y, z, lag in itertools.product(BACK, BELOW, LAGS):
         measure.progress(f"y {1e3 * y:.0f} mm, z {1e3 * z:.0f} mm, lag {1e3 * lag:.0f} ms")

@@ -19,7 +19,7 @@ from r2s.estimation import diffcloud
 from r2s.estimation.descent import DEFAULT
 from r2s.estimation.problem import Problem
 from r2s.fabrics import presets
-from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.scenarios import synthetic
 
 NINETY = 1.645  # deviations to either side
@@ -28,15 +28,15 @@ NINETY = 1.645  # deviations to either side
 def scores(name: str, scenario: str, number: int) -> np.ndarray:
     """The errors of an estimate, in its own deviations."""
     fabric = presets.FIVE[name]()
-    family = OrthotropicFamily.make(float(fabric.density))
+    space = OrthotropicSpace.make(float(fabric.density))
     experiment = scenarios.SIX[scenario]()
     recording = synthetic.record(experiment, fabric, name, key=jax.random.key(1000 + number))
-    problem = Problem.make(recording, family, seed=number)
-    start = family.locate(fabric)
-    effort = DEFAULT._replace(coarse=0, starts=1)
-    found = diffcloud.estimate(problem, effort, start=start, key=jax.random.key(0))
-    truth = np.asarray(family.values(start))
-    log = np.array([bound.log for bound in family.ranges])
+    problem = Problem.make(recording, space, seed=number)
+    start = space.locate(fabric)
+    budget = DEFAULT._replace(coarse=0, starts=1)
+    found = diffcloud.estimate(problem, budget, start=start, key=jax.random.key(0))
+    truth = np.asarray(space.values(start))
+    log = np.array([bound.log for bound in space.ranges])
     ratio = np.where(log, found.values / np.where(log, truth, 1), 1)
     return np.where(log, np.log(ratio), found.values - truth) / found.deviations
 
@@ -44,7 +44,7 @@ def scores(name: str, scenario: str, number: int) -> np.ndarray:
 def main(out: Path, scenario: str, each: int) -> None:
     out.mkdir(parents=True, exist_ok=True)
     path = out / f"coverage_{scenario}.csv"
-    names = [bound.name for bound in OrthotropicFamily.make(0.2).ranges]
+    names = [bound.name for bound in OrthotropicSpace.make(0.2).ranges]
     rows = list(csv.reader(open(path)))[1:] if path.exists() else []
     for fabric in presets.FIVE:
         for number in range(each):

@@ -16,11 +16,11 @@ import measure
 
 from r2s import scenarios
 from r2s.estimation import diffcloud, gauss_newton
-from r2s.estimation.descent import DEFAULT, Effort
+from r2s.estimation.descent import DEFAULT, Budget
 from r2s.estimation.prediction import predict
 from r2s.estimation.problem import Problem
 from r2s.fabrics import presets
-from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.scenarios import synthetic
 
 _motion = eqx.filter_jit(predict)
@@ -36,14 +36,14 @@ PARTS = {
 EFFORTS = {
     "estimate, 24 places, 3 descents": DEFAULT,
     "estimate, 64 places, 3 descents": DEFAULT._replace(coarse=64),
-    "estimate, 1 descent": Effort(coarse=0, starts=1),
+    "estimate, 1 descent": Budget(coarse=0, starts=1),
     "estimate, 64 descents": DEFAULT._replace(coarse=64, starts=64),
 }
 
 
 def parts(problem: Problem, points: int, repeats: int) -> list[measure.Row]:
     """Times of one evaluation of each part."""
-    unknown = jnp.full(gauss_newton.size((problem,)), 0.45).at[problem.family.dim :].set(0)
+    unknown = jnp.full(gauss_newton.size((problem,)), 0.45).at[problem.space.dim :].set(0)
     rows = []
     for name, part in PARTS.items():
         call = partial(lambda part: jax.block_until_ready(part(problem, unknown)), part)
@@ -56,10 +56,10 @@ def parts(problem: Problem, points: int, repeats: int) -> list[measure.Row]:
 def estimates(problem: Problem, points: int, all_starts: bool) -> list[measure.Row]:
     """Times of whole estimates."""
     rows = []
-    for name, effort in EFFORTS.items():
-        if effort.starts > 3 and not all_starts:
+    for name, budget in EFFORTS.items():
+        if budget.starts > 3 and not all_starts:
             continue
-        call = partial(diffcloud.estimate, problem, effort, key=jax.random.key(0))
+        call = partial(diffcloud.estimate, problem, budget, key=jax.random.key(0))
         first = (
             float("nan") if rows else measure.built(call)[1]
         )  # the others share what it compiled
@@ -70,13 +70,13 @@ def estimates(problem: Problem, points: int, all_starts: bool) -> list[measure.R
 
 def main(repeats: int, all_starts: bool) -> None:
     fabric = presets.camel_ponte_roma()
-    family = OrthotropicFamily.make(float(fabric.density))
+    space = OrthotropicSpace.make(float(fabric.density))
     sensing = synthetic.sensing(scenarios.lifting())._replace(points=3500)
     recording = synthetic.record(
         scenarios.lifting(), fabric, "camel", seen=sensing, key=jax.random.key(0)
     )
-    problem = Problem.make(recording, family)
-    dense = Problem.make(recording, family, num_points=3500)
+    problem = Problem.make(recording, space)
+    dense = Problem.make(recording, space, num_points=3500)
     rows = parts(dense, 3500, repeats) + parts(problem, 300, repeats)
     rows += estimates(problem, 300, all_starts)
     columns = {

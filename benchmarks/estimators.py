@@ -6,7 +6,7 @@ python benchmarks/estimators.py --points --methods ours recipe --starts 3 --out 
 
 On the cloth, or with `--points` on material points: isotropic sheets with the presets' mean
 stiffness, 7 x 7 vertices, seen in the steps of the estimate. Every start is a random place of the
-family; the recording of a fabric is one and the same. A method succeeds when every parameter that
+space; the recording of a fabric is one and the same. A method succeeds when every parameter that
 the recording determines (by the deviations of a descent from the true fabric) is within 5 % of the
 truth; it arrives when its loss is that of the descent from the truth. What is done is kept in
 `runs.csv`, not made again.
@@ -32,7 +32,7 @@ from r2s.estimation.estimate import Estimate
 from r2s.estimation.problem import Problem
 from r2s.fabrics import presets
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import IsotropicFamily, OrthotropicFamily
+from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace
 from r2s.scenarios import synthetic
 from r2s.scenarios.on_points import material_points
 
@@ -44,8 +44,8 @@ SAME = 1.05  # times the loss at the truth's descent: the same place
 def alone(problem: Problem, start, key) -> Estimate:
     """Gauss-Newton from the start, and from nowhere else."""
     cloth = problem.solver is None
-    estimate, effort = (diffcloud.estimate, DEFAULT) if cloth else (diffcp.estimate, diffcp.DEFAULT)
-    return estimate(problem, effort._replace(coarse=0, starts=1), start=start, key=key)
+    estimate, budget = (diffcloud.estimate, DEFAULT) if cloth else (diffcp.estimate, diffcp.DEFAULT)
+    return estimate(problem, budget._replace(coarse=0, starts=1), start=start, key=key)
 
 
 def ours(problem: Problem, start, key) -> Estimate:
@@ -73,17 +73,17 @@ def problem_of(name: str, scenario: str, points: bool) -> tuple[Problem, np.ndar
     fabric = presets.FIVE[name]()
     key = jax.random.key(0)
     if points:
-        return _on_points(IsotropicFamily.make(float(fabric.density)), fabric, name, scenario, key)
-    family = OrthotropicFamily.make(float(fabric.density))
+        return _on_points(IsotropicSpace.make(float(fabric.density)), fabric, name, scenario, key)
+    space = OrthotropicSpace.make(float(fabric.density))
     recording = synthetic.record(scenarios.SIX[scenario](), fabric, name, key=key)
-    return Problem.make(recording, family), np.asarray(family.locate(fabric))
+    return Problem.make(recording, space), np.asarray(space.locate(fabric))
 
 
-def _on_points(family: IsotropicFamily, fabric: Fabric, name: str, scenario: str, key):
-    """As `problem_of`, for the member of the family that is nearest to the fabric."""
-    place = np.clip(np.asarray(family.locate(fabric)), *INSIDE)
-    truth = family(jnp.asarray(place, float))
-    stiffest = family(jnp.ones(family.dim, float))  # whose steps the estimate has, too
+def _on_points(space: IsotropicSpace, fabric: Fabric, name: str, scenario: str, key):
+    """As `problem_of`, for the member of the space that is nearest to the fabric."""
+    place = np.clip(np.asarray(space.locate(fabric)), *INSIDE)
+    truth = space(jnp.asarray(place, float))
+    stiffest = space(jnp.ones(space.dim, float))  # whose steps the estimate has, too
     recording = synthetic.record(
         scenarios.SIX[scenario](),
         truth,
@@ -92,35 +92,35 @@ def _on_points(family: IsotropicFamily, fabric: Fabric, name: str, scenario: str
         solver=lambda scenario, fabric: material_points(scenario, stiffest),
         key=key,
     )
-    problem = Problem.make(recording, family, shape=COARSE, as_seen=False)
+    problem = Problem.make(recording, space, shape=COARSE, as_seen=False)
     return diffcp.on_points(problem), place
 
 
 def errors(problem: Problem, estimate: Estimate, place: np.ndarray) -> np.ndarray:
     """Relative, or absolute where a range is linear."""
-    truth = np.asarray(problem.family.values(jnp.asarray(place, float)))
-    log = np.array([bound.log for bound in problem.family.ranges])
+    truth = np.asarray(problem.space.values(jnp.asarray(place, float)))
+    log = np.array([bound.log for bound in problem.space.ranges])
     ratio = np.where(log, estimate.values / np.where(log, truth, 1), 1)
     return np.where(log, ratio - 1, estimate.values - truth)
 
 
 def loss_of(problem: Problem, estimate: Estimate) -> float:
     """The default loss [m^2] of an estimate's fabric, cameras as written down."""
-    rest = jnp.zeros(gauss_newton.size((problem,)) - problem.family.dim, float)
-    return float(_loss((problem,), jnp.concatenate([problem.family.locate(estimate.fabric), rest])))
+    rest = jnp.zeros(gauss_newton.size((problem,)) - problem.space.dim, float)
+    return float(_loss((problem,), jnp.concatenate([problem.space.locate(estimate.fabric), rest])))
 
 
 def attempt(problem: Problem, place: np.ndarray, method: str, number: int) -> measure.Row:
     """One estimate from a random start: its errors, loss [m^2] and times [s]."""
     key = jax.random.key(100 + number)
-    start = jax.random.uniform(key, (problem.family.dim,), float)
+    start = jax.random.uniform(key, (problem.space.dim,), float)
     before, clock = time.perf_counter(), time.process_time()
     try:
         found = METHODS[method](problem, start, key)
     except RuntimeError:
         return {
-            "errors": np.full(problem.family.dim, np.nan),
-            "deviations": np.full(problem.family.dim, np.nan),
+            "errors": np.full(problem.space.dim, np.nan),
+            "deviations": np.full(problem.space.dim, np.nan),
             "loss": np.inf,
             "seconds": np.nan,
             "cpu_seconds": np.nan,

@@ -43,7 +43,7 @@ from r2s.recordings.cameras.calibration import (
 from r2s.recordings.cameras.flaws import TYPICAL, flawed_depth, flawed_mask
 from r2s.recordings.cameras.render import render
 from r2s.scenarios import synthetic
-from r2s.scenarios.scenario import Scenario, motion
+from r2s.scenarios.scenario import Scenario, rollout
 
 DRAWS = 200  # of random search, which is free: its motions are simulated once
 STEP = 0.03  # of the range, of differences
@@ -53,7 +53,7 @@ SMALL = {
     "calls": 20, "networks": 1,
 }  # fmt: skip
 POINTS = {"fabrics": 32, "unseen": 16, "steps": 30}  # unless asked for: a motion takes a second
-moved = eqx.filter_jit(motion)
+moved = eqx.filter_jit(rollout)
 
 
 class Target(NamedTuple):
@@ -229,7 +229,7 @@ def targets(others: Data, settings: Settings, view, count: int) -> list[Target]:
     found = []
     for number, simulated in zip(numbers[:count], depth[:count], strict=True):
         progress(f"images of fabric {number}")
-        fabric = settings.family(jnp.asarray(others.places[number], float))
+        fabric = settings.space(jnp.asarray(others.places[number], float))
         x = np.asarray(moved(scenario, fabric, solver=solver).x)
         generator = np.random.default_rng(int(number))
         depths, masks = [], []
@@ -294,7 +294,7 @@ def estimates(out, others, settings, networks, chosen, asked) -> list[dict[str, 
             kinds = ("depth camera", "clouds") if order < 3 and index == 0 else ("depth camera",)
             for kind in kinds:
                 images = target.images[kind]
-                about = scenario, images, frames, settings.family, trained, solver
+                about = scenario, images, frames, settings.space, trained, solver
                 sighting = Sighting.make(*about, cameras=by_kind[kind])
                 about = banks[kind], bank, others.places, target, asked.calls
                 guessed = random_search(sighting, *about)
@@ -324,7 +324,7 @@ def in_view(view: View, depth: np.ndarray, cameras: list[DepthCamera]) -> np.nda
 def searched(path: Path, sighting: Sighting, target: Target, calls: int, seed: int):
     fresh, spent = not path.exists(), time.process_time()
     done = estimator.estimate(sighting, num_calls=calls, seed=seed, path=path)
-    place = np.asarray(sighting.family.locate(done.fabric))
+    place = np.asarray(sighting.space.locate(done.fabric))
     at_truth = estimator.distances(sighting, jnp.asarray(np.stack([target.place] * 4), float))[0]
     return {
         "search": seed,

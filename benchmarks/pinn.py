@@ -84,14 +84,14 @@ def torch_epoch() -> dict[str, float]:
 
 
 def _problem():
-    """A pull of the same size as PyTorch's, a family and the paper's model."""
+    """A pull of the same size as PyTorch's, a space and the paper's model."""
     import jax
     import jax.numpy as jnp
     import jax.random as jr
 
     from r2s.estimation.pinn.data import Clamp, Pull, stacked
     from r2s.estimation.pinn.published_recipe import begin
-    from r2s.fabrics.parameters import OrthotropicFamily
+    from r2s.fabrics.parameters import OrthotropicSpace
 
     array = lambda value: jnp.asarray(value, float)
     keys = jr.split(jr.key(0), 3)
@@ -110,15 +110,15 @@ def _problem():
         gravity=jnp.zeros(2),
         normal=array(0.0),
     )
-    family = OrthotropicFamily.make(DENSITY)
+    space = OrthotropicSpace.make(DENSITY)
     pulls = stacked([pull])
-    model = begin(family, pulls, jnp.full(family.dim, 0.4), key=keys[2])
-    return jax, jnp, family, pulls, model
+    model = begin(space, pulls, jnp.full(space.dim, 0.4), key=keys[2])
+    return jax, jnp, space, pulls, model
 
 
 def epochs(torch_python: str | None) -> list[dict]:
     """Rows of an epoch: forward jets, nested reverse passes in JAX, and in PyTorch."""
-    jax, jnp, family, pulls, model = _problem()
+    jax, jnp, space, pulls, model = _problem()
     import equinox as eqx
     import optax
 
@@ -134,7 +134,7 @@ def epochs(torch_python: str | None) -> list[dict]:
         @jax.jit
         def run(weights, state, pulls):
             def loss(weights):
-                data, motion = losses_of(eqx.combine(weights, fixed), family, pulls)
+                data, motion = losses_of(eqx.combine(weights, fixed), space, pulls)
                 return data + 0.1 * motion
 
             def epoch(carried, _):
@@ -149,13 +149,13 @@ def epochs(torch_python: str | None) -> list[dict]:
 
     each = lambda call: {name: s / TOGETHER for name, s in timed(call).items()}
     rows = [{"epoch": "forward jets", **each(epochs_of(published_recipe.losses))}]
-    nested = lambda model, family, pulls: _nested_losses(jax, jnp, model, family, pulls)
+    nested = lambda model, space, pulls: _nested_losses(jax, jnp, model, space, pulls)
     rows.append({"epoch": "nested reverse, JAX", **each(epochs_of(nested))})
     state = published_recipe.untouched(model)
 
     def of_the_paper():
         nonlocal model, state
-        about = model, state, family, pulls, jnp.asarray(0), TOGETHER
+        about = model, state, space, pulls, jnp.asarray(0), TOGETHER
         model, state, values = published_recipe.run(*about)
         jax.block_until_ready(values)
 
@@ -167,9 +167,9 @@ def epochs(torch_python: str | None) -> list[dict]:
     return rows
 
 
-def _nested_losses(jax, jnp, model, family, pulls):
+def _nested_losses(jax, jnp, model, space, pulls):
     """The losses of the published recipe, with every derivative by a reverse pass."""
-    fabric, pull = family(model.place), jax.tree.map(lambda leaf: leaf[0], pulls)
+    fabric, pull = space(model.place), jax.tree.map(lambda leaf: leaf[0], pulls)
     network = jax.tree.map(lambda leaf: leaf[0], model.networks)
     law = fabric.membrane
     number, markers, _ = pull.displacement.shape
@@ -235,10 +235,10 @@ def _show(title: str, rows: list[dict], names: list[str], keys: list[str]) -> No
 
 def _fabric(name: str):
     from r2s.fabrics import presets
-    from r2s.fabrics.parameters import OrthotropicFamily
+    from r2s.fabrics.parameters import OrthotropicSpace
 
     fabric = presets.FIVE[name]()
-    return fabric, OrthotropicFamily.make(float(fabric.density))
+    return fabric, OrthotropicSpace.make(float(fabric.density))
 
 
 def _pulls(name: str, seed: int, count: int = 3) -> list:
@@ -258,10 +258,10 @@ def _pulls(name: str, seed: int, count: int = 3) -> list:
     return some
 
 
-def _errors(family, truth, values, deviations=None) -> dict[str, float]:
+def _errors(space, truth, values, deviations=None) -> dict[str, float]:
     """Of every parameter: relative where its range is logarithmic, else absolute."""
     row = {}
-    for i, bound in enumerate(family.ranges):
+    for i, bound in enumerate(space.ranges):
         ratio = float(values[i]) / float(truth[i]) - 1 if bound.log else 0.0
         row[f"error {bound.name}"] = ratio if bound.log else float(values[i] - truth[i])
         if deviations is not None:
@@ -283,10 +283,10 @@ def fabrics(out: Path, seeds: int) -> None:
 
     def make(fabric: str, seed: int) -> dict:
         some = _pulls(fabric, seed)
-        about, family = _fabric(fabric)
-        truth = family.values(family.locate(about))
-        found = estimate(some, family, key=jr.key(seed)).estimate
-        return _errors(family, truth, found.values, found.deviations)
+        about, space = _fabric(fabric)
+        truth = space.values(space.locate(about))
+        found = estimate(some, space, key=jr.key(seed)).estimate
+        return _errors(space, truth, found.values, found.deviations)
 
     jobs = [{"fabric": name, "seed": seed} for seed in range(seeds) for name in presets.FIVE]
     rows = resumed(out, "fabrics", jobs, make)
@@ -337,23 +337,23 @@ def recipes(out: Path, name: str, count: int, seeds: int, number: int, alone: bo
     from r2s.estimation.pinn.weak import weak_losses
     from r2s.fabrics.fabric import Fabric
 
-    some, (fabric, family) = _pulls(name, 0, count), _fabric(name)
-    truth = family.values(family.locate(fabric))
-    place = family.locate(Fabric.make(float(fabric.density), (10.0, 0.0, 10.0, 10.0), 1e-5))
+    some, (fabric, space) = _pulls(name, 0, count), _fabric(name)
+    truth = space.values(space.locate(fabric))
+    place = space.locate(Fabric.make(float(fabric.density), (10.0, 0.0, 10.0, 10.0), 1e-5))
 
     def make(fabric: str, pulls: int, recipe: str, seed: int) -> dict:
         del fabric, pulls
         key = jr.key(seed)
         eqx.clear_caches()
         if recipe.startswith("the paper's"):
-            course = published_recipe.train(family, stacked(some), place, number, key=key)
-            return _errors(family, truth, family.values(course.model.place))
+            course = published_recipe.train(space, stacked(some), place, number, key=key)
+            return _errors(space, truth, space.values(course.model.place))
         if recipe == "ours":
-            found = estimate(some, family, key=key).estimate
-            return _errors(family, truth, found.values, found.deviations)
+            found = estimate(some, space, key=key).estimate
+            return _errors(space, truth, found.values, found.deviations)
         losses = weak_losses if recipe.endswith("weak") else strong_losses
-        found = estimate(some, family, Recipe(losses=losses, lbfgs=100), key=key).network
-        return _errors(family, truth, found.values)
+        found = estimate(some, space, Recipe(losses=losses, lbfgs=100), key=key).network
+        return _errors(space, truth, found.values)
 
     names = [f"the paper's, {number} epochs", "ours"]
     names += ["network alone, weak", "network alone, strong"] if alone else []
@@ -373,13 +373,13 @@ def clouds(out: Path, seeds: int) -> None:
     from r2s.scenarios import synthetic
 
     def make(scenario: str, fabric: str, seed: int) -> dict:
-        about, family = _fabric(fabric)
+        about, space = _fabric(fabric)
         key_seen, key = jr.split(jr.key(seed))
         experiment = scenarios.SIX[scenario]()
         recording = synthetic.record(experiment, about, fabric, shape=(17, 17), key=key_seen)
-        found = estimate(recording, family, key=key)
-        truth = family.values(family.locate(about))
-        return _errors(family, truth, found.values, found.deviations)
+        found = estimate(recording, space, key=key)
+        truth = space.values(space.locate(about))
+        return _errors(space, truth, found.values, found.deviations)
 
     jobs = [
         {"scenario": scenario, "fabric": name, "seed": seed}

@@ -23,11 +23,11 @@ from roughness_windows import restarted
 
 from r2s import scenarios
 from r2s.estimation import diffcloud, gauss_newton
-from r2s.estimation.descent import CLOSE, FIRST_DAMPING, Effort
+from r2s.estimation.descent import CLOSE, FIRST_DAMPING, Budget
 from r2s.estimation.gauss_newton import GROWTH, MARGIN, Descent, Normal
 from r2s.estimation.problem import Problem, beginning, window
 from r2s.fabrics import presets
-from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.scenarios import synthetic
 
 STARTS, ITERATIONS = 6, 12
@@ -85,8 +85,8 @@ def problem_of(fabric: str, shape: tuple[int, int] = (9, 9)) -> Problem:
     experiment = scenarios.lifting(num_frames=NUM_FRAMES, moving=MOVING)
     truth = presets.FIVE[fabric]()
     recording = synthetic.record(experiment, truth, fabric, key=jax.random.key(0))
-    family = Damped.make(OrthotropicFamily.make(float(truth.density)), 1.0)
-    return Problem.make(recording, family, num_points=POINTS, shape=shape)
+    space = Damped.make(OrthotropicSpace.make(float(truth.density)), 1.0)
+    return Problem.make(recording, space, num_points=POINTS, shape=shape)
 
 
 def compared(out: Path, fabric: str, starts: int, first: int | None) -> list[measure.Row]:
@@ -108,10 +108,10 @@ def compared(out: Path, fabric: str, starts: int, first: int | None) -> list[mea
 
 def reference(problem: Problem, fabric: str) -> dict:
     """What the usual descent from the truth determines, and its loss [m^2]."""
-    start = problem.family.locate(presets.FIVE[fabric]())
-    found = diffcloud.estimate(problem, Effort(0, 1), start=start, key=jax.random.key(0))
-    end = np.asarray(problem.family.locate(found.fabric))
-    values = np.asarray(problem.family.values(start))
+    start = problem.space.locate(presets.FIVE[fabric]())
+    found = diffcloud.estimate(problem, Budget(0, 1), start=start, key=jax.random.key(0))
+    end = np.asarray(problem.space.locate(found.fabric))
+    values = np.asarray(problem.space.values(start))
     return {
         "determined": found.determined,
         "truth": values,
@@ -123,8 +123,8 @@ def judged(
     problem: Problem, best, places: np.ndarray, losses: np.ndarray, when: str
 ) -> measure.Row:
     """Shares of the starts that end well, and the median of their worst error."""
-    log = np.array([bound.log for bound in problem.family.ranges])
-    values = np.array([problem.family.values(jnp.asarray(p, float)) for p in places])
+    log = np.array([bound.log for bound in problem.space.ranges])
+    values = np.array([problem.space.values(jnp.asarray(p, float)) for p in places])
     wrong = np.where(log, values / np.where(log, best["truth"], 1) - 1, values - best["truth"])
     worst = np.abs(wrong[:, best["determined"]]).max(axis=1)
     return {
@@ -140,7 +140,7 @@ def attempts(problem: Problem, choice: Choice, starts: int) -> dict:
     assumed = choice.problem(problem)
     for number in range(starts):
         key = jax.random.key(100 + number)
-        start = jax.random.uniform(key, (problem.family.dim,), float)
+        start = jax.random.uniform(key, (problem.space.dim,), float)
         measure.progress(f"start {number}")
         clock = time.process_time()
         place = descended(assumed, choice.gradient, start)
@@ -160,9 +160,9 @@ def attempts(problem: Problem, choice: Choice, starts: int) -> dict:
 
 def usual(problem: Problem, place: np.ndarray) -> np.ndarray:
     """Where the default descent ends that begins at a place, and nowhere else."""
-    start, effort = jnp.asarray(place, float), Effort(0, 1, ITERATIONS, around=0)
-    found = diffcloud.estimate(problem, effort, start=start, key=jax.random.key(0))
-    return np.clip(np.asarray(problem.family.locate(found.fabric)), MARGIN, 1 - MARGIN)
+    start, budget = jnp.asarray(place, float), Budget(0, 1, ITERATIONS, around=0)
+    found = diffcloud.estimate(problem, budget, start=start, key=jax.random.key(0))
+    return np.clip(np.asarray(problem.space.locate(found.fabric)), MARGIN, 1 - MARGIN)
 
 
 def descended(problem: Problem, gradient: Gradient, start: Array) -> np.ndarray:
@@ -177,7 +177,7 @@ def descended(problem: Problem, gradient: Gradient, start: Array) -> np.ndarray:
             break
         trial = _propose(problems, now, prior)
         now = _accept(problems, now, trial, gradient(problem, trial), prior)
-    return np.asarray(now.unknown[: problem.family.dim])
+    return np.asarray(now.unknown[: problem.space.dim])
 
 
 def exact(problem: Problem, unknown: Array) -> Normal:
@@ -196,7 +196,7 @@ def mean(problem: Problem, unknown: Array) -> Normal:
 
     They lie always alike around, so that the mean is a function that one can descend.
     """
-    dim = problem.family.dim
+    dim = problem.space.dim
     around = SPREAD * jax.random.normal(jax.random.key(5), (BATCH, dim), float)
     places = jnp.clip(unknown[None, :dim] + around, MARGIN, 1 - MARGIN)
     normals = [exact(problem, unknown.at[:dim].set(place)) for place in places]
@@ -211,8 +211,8 @@ _weight = eqx.filter_jit(gauss_newton.prior_weight)
 
 def more_damped(problem: Problem) -> Problem:
     """The problem of one who takes all fabrics to be damped `MORE` times as much."""
-    assert isinstance(problem.family, Damped)
-    return dataclasses.replace(problem, family=Damped.make(problem.family.family, MORE))
+    assert isinstance(problem.space, Damped)
+    return dataclasses.replace(problem, space=Damped.make(problem.space.space, MORE))
 
 
 def drawn(rows: list[measure.Row]) -> Figure:

@@ -75,7 +75,7 @@ def main(out: Path, small: bool) -> None:
 
 
 def direction(name: str, dim: int) -> np.ndarray:
-    """A unit vector of the family's cube: along an axis, or a random one, always the same."""
+    """A unit vector of the space's cube: along an axis, or a random one, always the same."""
     if name in AXES:
         return np.eye(dim)[AXES[name]]
     drawn = np.array(jax.random.normal(jax.random.key(3), (dim,), float))
@@ -104,7 +104,7 @@ def lines(case: Case, small: bool) -> dict:
 
 
 def exact(problem: Problem, place: np.ndarray) -> np.ndarray:
-    """The exact gradient [m^2] of the loss in the family's place."""
+    """The exact gradient [m^2] of the loss in the space's place."""
     normal = normal_at((problem,), unknown_of(problem, place))
     return np.asarray(normal.gradient)[: len(place)]
 

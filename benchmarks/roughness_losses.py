@@ -126,7 +126,7 @@ class Shown(eqx.Module):
         drawn = np.asarray(jax.random.uniform(jax.random.key(11), (places, len(place)), float))
         x = move(place)
         made = lambda key: Problem.make(
-            recorded(FABRIC, "lifting", 1.0, key), problem.family, num_points=POINTS, seed=key
+            recorded(FABRIC, "lifting", 1.0, key), problem.space, num_points=POINTS, seed=key
         )
         clouds = [chosen(made(key)).clouds for key in range(keys)]
         away = np.linalg.norm((drawn - place)[:, index], axis=1)
@@ -217,7 +217,7 @@ def measured(shown: Shown, name: str) -> dict:
 
 def _widths(problem: Problem) -> np.ndarray:
     """How much the known parameters change over their range: relative where that is logarithmic."""
-    ranges = [problem.family.ranges[i] for i in KNOWN.values()]
+    ranges = [problem.space.ranges[i] for i in KNOWN.values()]
     return np.array([np.log(b.high / b.low) if b.log else b.high - b.low for b in ranges])
 
 

@@ -26,7 +26,7 @@ from roughness_sheets import (
 from roughness_tools import kept, picture, table
 
 from r2s import scenarios
-from r2s.fabrics.parameters import IsotropicFamily
+from r2s.fabrics.parameters import IsotropicSpace
 from r2s.mpm.sheet import Sheet, stable_step
 from r2s.scenarios.on_points import MEMBRANE_DAMPING
 
@@ -76,18 +76,18 @@ def main(out: Path, small: bool) -> None:
 
 def growth(name: str, physics: Physics, small: bool) -> dict:
     """Sizes of the `exact` derivative and of the `secant` one, over the frames."""
-    family, experiment = family_of(physics), scenarios.SIX[name]()
+    space, experiment = family_of(physics), scenarios.SIX[name]()
     scenario, solver = made(
         experiment.scenario((5, 5) if small else (9, 9)),
         physics,
-        family(place_of(family, STEEPEST * MODULUS)),
+        space(place_of(space, STEEPEST * MODULUS)),
     )
-    place = place_of(family)
-    x, slope = derivative(scenario, solver, family, place)
+    place = place_of(space)
+    x, slope = derivative(scenario, solver, space, place)
     secants = []
     for axis in np.eye(len(place)):
         ends = [place + end * jnp.asarray(axis, float) for end in offsets(SECANT, 2)]
-        before, after = (np.asarray(positions(scenario, solver, family, end)) for end in ends)
+        before, after = (np.asarray(positions(scenario, solver, space, end)) for end in ends)
         secants.append((after - before) / SECANT)
     return {
         "x": np.asarray(x),
@@ -122,12 +122,12 @@ def over_steps(modulus: float) -> dict:
     rows = []
     scenario = scenarios.lifting(num_frames=16, moving=0.8, height=0.2).scenario((9, 9))
     for physics in (PUBLISHED, OURS):
-        family = family_of(physics)
-        about, solver = made(scenario, physics, family(place_of(family, modulus)))
+        space = family_of(physics)
+        about, solver = made(scenario, physics, space(place_of(space, modulus)))
         for ratio in RATIOS:
-            stiffness = stiffness_of(solver, family, physics, ratio, modulus)
-            place = place_of(family, stiffness)
-            x, slope = map(np.asarray, derivative(about, solver, family, place))
+            stiffness = stiffness_of(solver, space, physics, ratio, modulus)
+            place = place_of(space, stiffness)
+            x, slope = map(np.asarray, derivative(about, solver, space, place))
             furthest = np.abs(x).max() if np.isfinite(x).all() else np.inf
             rows.append((stiffness, furthest, size(slope)[-1]))
     shape = 2, len(RATIOS), 3
@@ -135,14 +135,14 @@ def over_steps(modulus: float) -> dict:
 
 
 def stiffness_of(
-    solver: Sheet, family: IsotropicFamily, physics: Physics, ratio: float, modulus: float
+    solver: Sheet, space: IsotropicSpace, physics: Physics, ratio: float, modulus: float
 ) -> float:
     """E h [N/m] whose longest step is the solver's over the ratio, by bisection."""
     mesh, spacing = solver.scene.mesh, solver.background.grid.spacing
     low, high = np.log(modulus / 100), np.log(modulus * 100)
     for _ in range(20):
         middle = (low + high) / 2
-        fabric = family(place_of(family, float(np.exp(middle))))
+        fabric = space(place_of(space, float(np.exp(middle))))
         limit = float(stable_step(mesh, spacing, fabric, jnp.asarray(physics.membrane, float)))
         low, high = (middle, high) if limit > solver.dt / ratio else (low, middle)
     return float(np.exp(low))
@@ -172,20 +172,20 @@ def line(name: str, physics: Physics, small: bool) -> dict:
 
     At the truth the slope of this loss is zero, so both are `SECANT` away from it.
     """
-    family = family_of(physics)
+    space = family_of(physics)
     shape, count = ((5, 5), 5) if small else ((9, 9), COUNT)
     scenario = scenarios.SIX[name]().scenario(shape)
-    stiffest = family(place_of(family, STEEPEST * MODULUS))
+    stiffest = space(place_of(space, STEEPEST * MODULUS))
     scenario, solver = made(scenario, physics, stiffest)
-    truth = np.asarray(place_of(family))
+    truth = np.asarray(place_of(space))
     at = lambda place: np.asarray(
-        positions(scenario, solver, family, jnp.asarray(place, float)), float
+        positions(scenario, solver, space, jnp.asarray(place, float)), float
     )[30:]
     target, axis = at(truth), np.eye(len(truth))[0]
     centre = truth + SECANT * axis
     loss = lambda x: np.mean(np.sum((x - target) ** 2, axis=-1))
     losses = [[loss(at(centre + o * axis)) for o in offsets(w, count)] for w in WIDTHS]
-    x, slope = derivative(scenario, solver, family, jnp.asarray(centre, float))
+    x, slope = derivative(scenario, solver, space, jnp.asarray(centre, float))
     x, slope = np.asarray(x, float)[30:], np.asarray(slope, float)[30:, :, :, 0]
     return {"losses": np.array(losses), "slope": 2 * np.mean(np.sum((x - target) * slope, axis=-1))}
 

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import IsotropicFamily
+from r2s.fabrics.parameters import IsotropicSpace
 from r2s.mpm.sheet import Sheet
 from r2s.scenarios.on_points import MEMBRANE_DAMPING, material_points
-from r2s.scenarios.scenario import Scenario, motion
+from r2s.scenarios.scenario import Scenario, rollout
 
 DENSITY, MODULUS, RATIO = 0.19, 100.0, 0.3  # [kg/m^2], [N/m], [-]
 SOFT = 1e-6  # times the stiffness between layers: they pass through each other
@@ -32,14 +32,14 @@ PUBLISHED = Physics(0.0, 0.0, False)
 OURS = Physics(MEMBRANE_DAMPING, 0.01, True)
 
 
-def family_of(physics: Physics) -> IsotropicFamily:
+def family_of(physics: Physics) -> IsotropicSpace:
     """Isotropic sheets with the damping."""
-    return IsotropicFamily.make(DENSITY, damping=physics.bending)
+    return IsotropicSpace.make(DENSITY, damping=physics.bending)
 
 
-def place_of(family: IsotropicFamily, modulus: float = MODULUS) -> Float[Array, " dim"]:
+def place_of(space: IsotropicSpace, modulus: float = MODULUS) -> Float[Array, " dim"]:
     """The sheet's, with a modulus times thickness [N/m]."""
-    values = zip(family.ranges, (modulus, RATIO), strict=True)
+    values = zip(space.ranges, (modulus, RATIO), strict=True)
     return jnp.stack([bound.place(jnp.asarray(value, float)) for bound, value in values])
 
 
@@ -65,15 +65,15 @@ def made(scenario: Scenario, physics: Physics, stiffest: Fabric) -> tuple[Scenar
 
 
 @eqx.filter_jit
-def positions(scenario: Scenario, solver: Sheet, family: IsotropicFamily, place: Array) -> Array:
+def positions(scenario: Scenario, solver: Sheet, space: IsotropicSpace, place: Array) -> Array:
     """Of the vertices at all frames [m]."""
-    return motion(scenario, family(place), solver=solver).x
+    return rollout(scenario, space(place), solver=solver).x
 
 
 @eqx.filter_jit
-def derivative(scenario: Scenario, solver: Sheet, family: IsotropicFamily, place: Array):
+def derivative(scenario: Scenario, solver: Sheet, space: IsotropicSpace, place: Array):
     """Positions [m], and their derivatives [m/range]."""
-    moved = lambda place: (motion(scenario, family(place), solver=solver).x,) * 2
+    moved = lambda place: (rollout(scenario, space(place), solver=solver).x,) * 2
     slope, x = jax.jacfwd(moved, has_aux=True)(place)
     return x, slope
 

@@ -22,7 +22,7 @@ from r2s.estimation import gauss_newton
 from r2s.estimation.problem import Problem
 from r2s.fabrics import presets
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import Family, OrthotropicFamily, Range
+from r2s.fabrics.parameters import OrthotropicSpace, ParameterSpace, Range
 from r2s.files import write_bytes, write_text
 from r2s.recordings.recording import Recording
 from r2s.scenarios import synthetic
@@ -35,27 +35,27 @@ loss_at = eqx.filter_jit(gauss_newton.loss_at)
 normal_at = eqx.filter_jit(gauss_newton.normal_at)
 
 
-class Damped(Family):
-    """A family whose fabrics have `factor` times their damping; 0: none."""
+class Damped(ParameterSpace):
+    """A space whose fabrics have `factor` times their damping; 0: none."""
 
-    family: Family
+    space: ParameterSpace
     factor: Float[Array, ""]
     ranges: tuple[Range, ...] = eqx.field(static=True)
 
     @classmethod
-    def make(cls, family: Family, factor: float) -> "Damped":
-        """Of a family and a factor."""
-        return cls(family=family, factor=jnp.asarray(factor, float), ranges=family.ranges)
+    def make(cls, space: ParameterSpace, factor: float) -> "Damped":
+        """Of a space and a factor."""
+        return cls(space=space, factor=jnp.asarray(factor, float), ranges=space.ranges)
 
     def __call__(self, u: Float[Array, " dim"]) -> Fabric:
         """The fabric at a point of the unit cube."""
-        fabric = self.family(u)
+        fabric = self.space(u)
         return eqx.tree_at(lambda f: f.damping, fabric, fabric.damping * self.factor)
 
     def locate(self, fabric: Fabric) -> Float[Array, " dim"]:
         """Where a fabric lies; nowhere finite when all have no damping."""
         before = lambda damping: damping / self.factor
-        return self.family.locate(eqx.tree_at(lambda f: f.damping, fabric, replace_fn=before))
+        return self.space.locate(eqx.tree_at(lambda f: f.damping, fabric, replace_fn=before))
 
 
 def true_fabric(name: str, factor: float = 1.0) -> Fabric:
@@ -89,17 +89,17 @@ def truth(
     `bare`: simulated, and recorded, in a vacuum and in short steps.
     """
     fabric = presets.FIVE[name]()
-    family = OrthotropicFamily.make(float(fabric.density))
+    space = OrthotropicSpace.make(float(fabric.density))
     recording = recorded(name, scenario, factor, bare=bare)
-    problem = Problem.make(recording, Damped.make(family, factor), num_points=num_points)
+    problem = Problem.make(recording, Damped.make(space, factor), num_points=num_points)
     if bare:
         problem = dataclasses.replace(problem, solver=in_vacuum(problem.scenario))
-    return problem, np.asarray(family.locate(fabric))
+    return problem, np.asarray(space.locate(fabric))
 
 
 def unknown_of(problem: Problem, place: Any) -> Float[Array, " unknown"]:
-    """A place of the family, with everything else as it was written down."""
-    rest = jnp.zeros(gauss_newton.size((problem,)) - problem.family.dim, float)
+    """A place of the space, with everything else as it was written down."""
+    rest = jnp.zeros(gauss_newton.size((problem,)) - problem.space.dim, float)
     return jnp.concatenate([jnp.asarray(place, float), rest])
 
 

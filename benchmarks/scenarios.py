@@ -20,7 +20,7 @@ from scenario_pictures import picture
 from r2s import scenarios
 from r2s.fabrics import presets
 from r2s.files import write_text
-from r2s.scenarios.energy_balance import Account, stretch
+from r2s.scenarios.energy import EnergyBalance, stretch
 from r2s.scenarios.scenario import Scenario
 from r2s.study.report.page import Section, write_report
 from r2s.study.statistics.tables import Table, csv_text
@@ -49,27 +49,27 @@ spacing of the grid (35 mm) above each other, as their potential energy shows.
 Energies [mJ] are from the first to the last frame. Least dissipated in a frame: negative where
 energy came from nowhere; beside it the same for the cloth with a quarter of the step."""
 
-_account = eqx.filter_jit(scenarios.account)
+_account = eqx.filter_jit(scenarios.energy_balance)
 
 
-def run(name: str, kind: str, fabric_name: str) -> tuple[Scenario, Account, measure.Row]:
+def run(name: str, kind: str, fabric_name: str) -> tuple[Scenario, EnergyBalance, measure.Row]:
     """A scenario by a solver with a preset, and the row of its figures."""
     fabric = presets.FIVE[fabric_name]()
     scenario = scenarios.SIX[name]().scenario(SOLVERS[kind], layers=kind == "layers")
     solver = scenarios.material_points(scenario, fabric) if kind == "points" else None
     before = time.perf_counter()
-    found: Account = jax.block_until_ready(_account(scenario, fabric, None, solver))
+    found: EnergyBalance = jax.block_until_ready(_account(scenario, fabric, None, solver))
     seconds = time.perf_counter() - before
     row = {"scenario": name, "solver": kind, "fabric": fabric_name, "seconds": seconds}
     row |= figures_of(scenario, found, float(fabric.thickness))
     if kind == "cloth":
         step = scenario.interval / (FINE * scenario.substeps)
-        finer: Account = _account(scenario, fabric, step)
+        finer: EnergyBalance = _account(scenario, fabric, step)
         row["least_fine_mj"] = 1e3 * float(np.diff(np.asarray(finer.dissipated)).min())
     return scenario, found, row
 
 
-def figures_of(scenario: Scenario, found: Account, thickness: float) -> measure.Row:
+def figures_of(scenario: Scenario, found: EnergyBalance, thickness: float) -> measure.Row:
     """What has to hold of a motion, and its energy account from the first to the last frame."""
     x, mesh = np.asarray(found.x), scenario.scene.mesh
     stretched = np.asarray(stretch(mesh, found.x))

@@ -29,7 +29,7 @@ from r2s.estimation.estimate import Estimate, as_json, from_json
 from r2s.estimation.problem import Problem
 from r2s.evaluation import placement, prediction_error
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.files import write_json
 from r2s.geometry.surface import sample
 from r2s.recordings import manifest
@@ -45,7 +45,7 @@ def estimate_of(recording: Recording, density: float, out: Path) -> Estimate:
     if path.exists():
         return from_json(json.loads(path.read_text()))
     measure.progress(f"estimate from {recording.info.name}")
-    problem = Problem.make(recording, OrthotropicFamily.make(density))
+    problem = Problem.make(recording, OrthotropicSpace.make(density))
     found = diffcloud.estimate(problem, key=jax.random.key(0))
     write_json(path, as_json(found))
     return found
@@ -117,7 +117,7 @@ def main(folder: Path, out: Path, density: float) -> None:
     recordings = manifest.read_recordings(folder, rules, (LIFT, FOLD))
     loaded = [manifest.read_recording(folder, rules, name) for name in recordings]
     estimates = {r.info.name: estimate_of(r, density, out) for r in loaded}
-    default = OrthotropicFamily.make(density).middle()
+    default = OrthotropicSpace.make(density).middle()
     rows = []
     for judged in loaded:
         measure.progress(f"errors on {judged.info.name}")

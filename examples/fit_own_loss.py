@@ -2,7 +2,7 @@
 
     python examples/fit_own_loss.py
 
-A family maps the unit cube to fabrics; any differentiable function of a motion is a loss.
+A space maps the unit cube to fabrics; any differentiable function of a motion is a loss.
 """
 
 import equinox as eqx
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 
 import r2s
-from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.world.air import Air
 from r2s.world.contact import Table
 
@@ -21,20 +21,20 @@ held = jnp.arange(6)  # the first two rows: a strip that is clamped, and droops
 scene = r2s.Scene(sheet, held, Table.make(-jnp.inf), Air.make())
 solver = r2s.Cloth(scene, dt=0.02)  # [s]
 start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
-family = OrthotropicFamily.make(density=0.2)  # [kg/m^2]
-BENDING = [bound.name for bound in family.ranges].index("bending")
+space = OrthotropicSpace.make(density=0.2)  # [kg/m^2]
+BENDING = [bound.name for bound in space.ranges].index("bending")
 handles = jnp.broadcast_to(start[held], (1, STEPS, 6, 3))
 controls = r2s.Control(handles, jnp.zeros((1, STEPS, 3)))
 
 
 def droop(place):
-    """How far below the clamp the free end is [m], of the fabric at a place of the family."""
-    fabric = eqx.tree_at(lambda f: f.mass_damping, family(place), jnp.asarray(8.0))  # [1/s]
+    """How far below the clamp the free end is [m], of the fabric at a place of the space."""
+    fabric = eqx.tree_at(lambda f: f.mass_damping, space(place), jnp.asarray(8.0))  # [1/s]
     return -r2s.simulate(solver, fabric, solver.init(start), controls).x[-1, -3:, 2].mean()
 
 
 def fabric_place(bending):
-    return jnp.full(family.dim, 0.5).at[BENDING].set(bending)
+    return jnp.full(space.dim, 0.5).at[BENDING].set(bending)
 
 
 @eqx.filter_jit
@@ -53,6 +53,6 @@ if __name__ == "__main__":
     state = optimiser.init(bending)
     for _ in range(40):
         bending, state, value = improve(bending, state, seen)
-    stiffness = lambda place: float(family(fabric_place(place)).bending.stiffness)
+    stiffness = lambda place: float(space(fabric_place(place)).bending.stiffness)
     print(f"droop {1e3 * seen:.2f} mm, off by {value**0.5:.3f} mm")
     print(f"bending stiffness {stiffness(bending):.3g} N m, truth {stiffness(truth):.3g} N m")

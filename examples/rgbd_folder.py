@@ -32,7 +32,7 @@ if __name__ == "__main__":
     folder = Path(tempfile.mkdtemp()) / "lift_denim"
     experiment = scenarios.lifting(num_frames=16, interval=1 / 10, moving=1.5)
     scenario = experiment.scenario((7, 7))
-    moved = eqx.filter_jit(r2s.motion)(scenario, presets.black_denim())
+    moved = eqx.filter_jit(r2s.rollout)(scenario, presets.black_denim())
     box = ((-0.1, -0.1, 0.0), (0.6, 0.6, 0.6))  # [m]
     rig = Rig(
         {"left": camera((-0.5, -0.2, 0.7)), "right": camera((0.5, -0.4, 0.8))},

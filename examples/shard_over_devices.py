@@ -16,7 +16,7 @@ import numpy as np  # noqa: E402
 from jax.sharding import Mesh, PartitionSpec  # noqa: E402
 
 import r2s  # noqa: E402
-from r2s.fabrics.parameters import OrthotropicFamily  # noqa: E402
+from r2s.fabrics.parameters import OrthotropicSpace  # noqa: E402
 from r2s.world.air import Air  # noqa: E402
 from r2s.world.contact import Table  # noqa: E402
 
@@ -28,17 +28,17 @@ solver = r2s.Cloth(scene, dt=0.025)  # [s]
 start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
 handles = jnp.broadcast_to(start[held], (1, STEPS, 2, 3))
 controls = r2s.Control(handles, jnp.zeros((1, STEPS, 3)))
-family = OrthotropicFamily.make(density=0.2)  # [kg/m^2]
+space = OrthotropicSpace.make(density=0.2)  # [kg/m^2]
 
 
 def sag(place):
     """How far the free corners have fallen [m]."""
-    moved = r2s.simulate(solver, family(place), solver.init(start), controls)
+    moved = r2s.simulate(solver, space(place), solver.init(start), controls)
     return -moved.x[-1, jnp.array([12, 15]), 2].mean()
 
 
 if __name__ == "__main__":
-    places = jr.uniform(jr.key(0), (FABRICS, family.dim))
+    places = jr.uniform(jr.key(0), (FABRICS, space.dim))
     along = PartitionSpec("fabric")
     devices = Mesh(np.array(jax.devices()), ("fabric",))
     each = jax.vmap(sag)  # of the fabrics on one device

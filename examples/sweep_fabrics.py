@@ -14,7 +14,7 @@ import jax.random as jr
 import numpy as np
 
 import r2s
-from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.world.air import Air
 from r2s.world.contact import Table
 
@@ -26,23 +26,23 @@ solver = r2s.Cloth(scene, dt=0.025)  # [s]
 start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
 handles = jnp.broadcast_to(start[held], (1, STEPS, 2, 3))
 controls = r2s.Control(handles, jnp.zeros((1, STEPS, 3)))
-family = OrthotropicFamily.make(density=0.2)  # [kg/m^2]
+space = OrthotropicSpace.make(density=0.2)  # [kg/m^2]
 
 
 @eqx.filter_jit
 @eqx.filter_vmap
 def sag(place):
-    """How far the free corners have fallen [m], for places (fabric, parameter) of the family."""
-    moved = r2s.simulate(solver, family(place), solver.init(start), controls)
+    """How far the free corners have fallen [m], for places (fabric, parameter) of the space."""
+    moved = r2s.simulate(solver, space(place), solver.init(start), controls)
     return -moved.x[-1, jnp.array([12, 15]), 2].mean()
 
 
 if __name__ == "__main__":
-    places = jr.uniform(jr.key(0), (FABRICS, family.dim))
+    places = jr.uniform(jr.key(0), (FABRICS, space.dim))
     began = time.process_time()
     found = np.asarray(jax.block_until_ready(sag(places)))
     seconds = time.process_time() - began
     print(f"{FABRICS} fabrics in {seconds:.1f} CPU seconds, compilation included")
     print(f"sag {1e3 * found.min():.1f} to {1e3 * found.max():.1f} mm; correlation with")
-    for bound, column in zip(family.ranges, np.asarray(places).T, strict=True):
+    for bound, column in zip(space.ranges, np.asarray(places).T, strict=True):
         print(f"    {bound.name:10s}{np.corrcoef(column, found)[0, 1]:+.2f}")

@@ -21,13 +21,13 @@ In reading order:
 """
 
 from r2s.cloth.cloth import Cloth, ClothState
-from r2s.cloth.self_contact.contacts import Layers
+from r2s.cloth.self_contact.contacts import SelfContact
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.geometry.mesh import Mesh, rectangle
 from r2s.recordings.recording import Recording
-from r2s.rollout import Trajectory, predicted_memory, simulate
-from r2s.scenarios.scenario import Scenario, motion
+from r2s.scenarios.scenario import Scenario, rollout
+from r2s.solver import Trajectory, predicted_memory, simulate
 from r2s.world.scene import Control, Scene
 
 __all__ = [
@@ -35,14 +35,14 @@ __all__ = [
     "ClothState",
     "Control",
     "Fabric",
-    "Layers",
+    "SelfContact",
     "Mesh",
-    "OrthotropicFamily",
+    "OrthotropicSpace",
     "Recording",
     "Scenario",
     "Scene",
     "Trajectory",
-    "motion",
+    "rollout",
     "predicted_memory",
     "rectangle",
     "simulate",

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from r2s.cloth.cloth import Cloth
-from r2s.estimation.descent import Effort
+from r2s.estimation.descent import Budget
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.geometry.mesh import rectangle
 from r2s.geometry.surface import nearest
-from r2s.scenarios.scenario import Scenario, begin, motion, stepped
+from r2s.scenarios.scenario import Scenario, begin, rollout, stepped
 from r2s.units import GRAVITY
 from r2s.world.air import Air
 from r2s.world.contact import Table
@@ -29,7 +29,7 @@ another = importlib.import_module("another_simulator")
 needs_data = pytest.mark.skipif(not another.DATA.is_dir(), reason=f"no data in {another.DATA}")
 INTERVAL = 0.02  # [s]
 
-_motion = eqx.filter_jit(motion)
+_motion = eqx.filter_jit(rollout)
 
 
 @pytest.fixture
@@ -139,8 +139,8 @@ def test_the_errors_of_a_motion_with_itself_are_none_and_a_shift_is_found():
 @pytest.mark.parametrize(("name", "bound"), [("denim", 2.0), ("camel", 2.5)])  # [% of the side]
 def test_an_estimate_predicts_another_support_and_the_wind(name, bound):
     density = another.read(another.DATA, another.LIFT.format(name)).told["material_json"]["density"]
-    middle = OrthotropicFamily.make(density).middle()
-    found = another.estimated(another.DATA, name, 2000, 0.0, Effort(24, 2, 20))
+    middle = OrthotropicSpace.make(density).middle()
+    found = another.estimated(another.DATA, name, 2000, 0.0, Budget(24, 2, 20))
     row, _ = another.judged(another.DATA, name, "estimate", found.fabric, another.clock_of(found))
     default, _ = another.judged(another.DATA, name, "default", middle, 0.0)
     assert row["edge_rms"] < 1 and row["wind_rms"] < bound

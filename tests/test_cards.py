@@ -15,10 +15,10 @@ from hypothesis import given
 
 from r2s.estimation import cards
 from r2s.estimation.cards import Card, Provenance
-from r2s.estimation.estimate import Condition, Estimate
+from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.fabrics import presets
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.laws.bending import HingeBending, OrthotropicBending
 from r2s.laws.plate import OrthotropicPlate
 from r2s.laws.tables import TableBending, TableMembrane
@@ -31,7 +31,7 @@ from r2s.recordings.recording import (
 )
 
 MEASURED = Provenance(method="measured", version="1.0", date="2026-01-31", assumed=("damping",))
-FAMILY = OrthotropicFamily.make(0.2)
+FAMILY = OrthotropicSpace.make(0.2)
 
 
 def estimate_at(place, deviations, loss=1e-6) -> Estimate:
@@ -46,7 +46,7 @@ def estimate_at(place, deviations, loss=1e-6) -> Estimate:
         values=np.asarray(FAMILY.values(place)),
         deviations=np.asarray(deviations, float),
         correlation=correlation,
-        conditions=(Condition("shift x", "m", 0.001, np.nan),),
+        conditions=(Nuisance("shift x", "m", 0.001, np.nan),),
         loss=loss,
         losses=np.ones((3, 2)),
         history=np.ones((3, 2, dim)),

@@ -24,7 +24,7 @@ from conftest import (
 
 from r2s.cloth.cloth import ClothState
 from r2s.cloth.linear.pattern import dense
-from r2s.cloth.potential import hessian, imbalance, potential, vertex_mass
+from r2s.cloth.potential import hessian, potential, residual, vertex_mass
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import rectangle
 from r2s.units import AIR_DENSITY, GRAVITY
@@ -182,7 +182,7 @@ def disturbed(sheet):
     fabric = Fabric.make(0.2, LAW, 1e-4)
     # both Hessians and the force, in one compilation
     matrix = lambda at, x, exactness: dense(at.mesh.pattern, hessian(at, x, exactness))
-    both = eqx.filter_jit(lambda at, x: (matrix(at, x, 1.0), matrix(at, x, 0.0), imbalance(at, x)))
+    both = eqx.filter_jit(lambda at, x: (matrix(at, x, 1.0), matrix(at, x, 0.0), residual(at, x)))
 
     def state(seed):
         noise = jnp.asarray(np.random.default_rng(seed).normal(size=(4, 25, 3))) * 5e-3
@@ -243,7 +243,7 @@ def test_the_step_ends_in_balance(sheet, fabric):
     state = solver.init(hanging(sheet, 0.5))
     control = Control(state.x[:5], jnp.zeros(3))
     after = step(solver, fabric, state, control)
-    force = eqx.filter_jit(imbalance)(solver.increment(fabric, state, control), after.x)
+    force = eqx.filter_jit(residual)(solver.increment(fabric, state, control), after.x)
     assert jnp.max(jnp.abs(force[5:])) < 1e-9 * 0.2 * SIZE**2 * GRAVITY
 
 

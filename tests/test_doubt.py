@@ -12,18 +12,18 @@ import pytest
 
 from r2s import scenarios
 from r2s.estimation import descent, diffcloud, gauss_newton
-from r2s.estimation.descent import Effort, conditions, spread_of
+from r2s.estimation.descent import Budget, conditions, spread_of
 from r2s.estimation.experiment_design import describe
 from r2s.estimation.gauss_newton import Descent, Normal
 from r2s.estimation.prediction import predict
-from r2s.estimation.problem import Doubt, Problem, beginning
+from r2s.estimation.problem import NuisancePrior, Problem, beginning
 from r2s.estimation.standard_errors import FARTHEST, apart, around, covariance
 from r2s.fabrics import presets
-from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.scenarios import synthetic
 
 FABRIC = presets.grey_interlock()
-FAMILY = OrthotropicFamily.make(float(FABRIC.density))
+FAMILY = OrthotropicSpace.make(float(FABRIC.density))
 RATIO = 1.2
 
 
@@ -44,7 +44,7 @@ def lifted():
 
 def test_heavier_stiffer_and_in_denser_air_a_sheet_moves_alike(blown):
     """All forces and the mass by one factor: without it known, wind cannot tell the three apart."""
-    problem = dataclasses.replace(blown, doubt=Doubt(density=0.5, air=0.5))
+    problem = dataclasses.replace(blown, nuisance_prior=NuisancePrior(density=0.5, air=0.5))
     place, change = FAMILY.locate(FABRIC), np.log(RATIO)
     wider = [
         change / np.log(b.high / b.low) if b.name in ("warp", "weft", "shear", "bending") else 0.0
@@ -59,7 +59,9 @@ def test_heavier_stiffer_and_in_denser_air_a_sheet_moves_alike(blown):
 
 
 def test_the_air_is_in_doubt_where_a_wind_blows(blown, lifted):
-    assert blown.doubt == Doubt(air=0.1) and lifted.doubt == Doubt()
+    assert (
+        blown.nuisance_prior == NuisancePrior(air=0.1) and lifted.nuisance_prior == NuisancePrior()
+    )
     unknown = np.arange(19.0)
     names = lambda *problems: [c.name for c in conditions(problems, unknown, unknown)]
     shifts = ["shift x", "shift y", "shift z", "turn"]
@@ -76,7 +78,7 @@ def valley(lifted, size):
     random = np.random.default_rng(0)
     root = random.normal(size=(size, 2 * size))
     matrix = jnp.asarray(root @ root.T)
-    end = jnp.full(size, 0.5).at[lifted.family.dim :].set(0.0)
+    end = jnp.full(size, 0.5).at[lifted.space.dim :].set(0.0)
 
     def at(place, gradient: Any = 0.0, loss: Any = 0.0):
         found = matrix @ (place - end) + gradient
@@ -137,7 +139,7 @@ def test_where_derivatives_overflow_nothing_is_known(lifted):
     broken = eqx.tree_at(lambda e: e.normal.scatter, end, jnp.full((size, size), jnp.inf))
     near = [(end.unknown, at(end.unknown))] * 2
     known = np.diag(covariance(problems, broken, prior, near))
-    dim = lifted.family.dim
+    dim = lifted.space.dim
     np.testing.assert_allclose(known[:dim], gauss_newton.PRIOR_DEVIATION**2)
     np.testing.assert_allclose(known[dim:], 1)
     assert apart(problems, broken, prior, near) == np.inf
@@ -145,19 +147,19 @@ def test_where_derivatives_overflow_nothing_is_known(lifted):
 
 def test_deviations_are_from_the_frames_on_which_places_agree(lifted, monkeypatch):
     """Of all frames if they do on them, or nowhere; else of the largest share."""
-    problems, effort = (lifted,), Effort(shares=(0.5,), around=2)
+    problems, budget = (lifted,), Budget(shares=(0.5,), around=2)
     unknown = jnp.concatenate([FAMILY.locate(FABRIC), jnp.zeros(7)])
     zero = jnp.zeros(())
 
-    def found(agree, share=1.0, effort=effort):
+    def found(agree, share=1.0, budget=budget):
         agree = iter(agree)
         monkeypatch.setattr(descent, "_apart", lambda *_: 0.0 if next(agree) else np.inf)
         seen = problems if share == 1 else (beginning(lifted, share),)
         normal = descent._normal(seen, unknown, zero, None)
         end = Descent(unknown, normal, zero, zero, zero, jnp.zeros((), int))
-        return spread_of(seen, effort, end, jr.key(0))
+        return spread_of(seen, budget, end, jr.key(0))
 
-    alone = effort._replace(shares=())
+    alone = budget._replace(shares=())
     whole, half = (found([True], share, alone) for share in (1.0, 0.5))
     np.testing.assert_allclose(found([True]), whole)
     np.testing.assert_allclose(found([False, True]), half)
@@ -167,9 +169,9 @@ def test_deviations_are_from_the_frames_on_which_places_agree(lifted, monkeypatc
 
 def test_an_estimate_says_what_was_in_doubt(lifted):
     """And places around its end have a say in its deviations alone."""
-    effort = Effort(coarse=0, starts=1, iterations=1, around=0)
-    descend = lambda effort: diffcloud.estimate(lifted, effort, key=jr.key(0))
-    alone, found = descend(effort), descend(effort._replace(around=4))
+    budget = Budget(coarse=0, starts=1, iterations=1, around=0)
+    descend = lambda budget: diffcloud.estimate(lifted, budget, key=jr.key(0))
+    alone, found = descend(budget), descend(budget._replace(around=4))
     np.testing.assert_array_equal(found.values, alone.values)
     np.testing.assert_array_equal(found.losses, alone.losses)
     assert np.all(found.deviations > 0) and np.all(np.isfinite(found.deviations))
@@ -184,10 +186,10 @@ def test_wind_gives_the_stiffness_of_a_sheet_that_was_weighed_wrongly():
     denim = presets.black_denim()
     record = synthetic.record(scenarios.wind(), denim, "denim", key=jr.key(0))
     wrong = 1.04
-    family = OrthotropicFamily.make(wrong * float(denim.density))
-    found = diffcloud.estimate(Problem.make(record, family), key=jr.key(0))
-    truth = np.asarray(family.values(family.locate(denim)))
-    stiff = [i for i, b in enumerate(family.ranges) if b.name in ("warp", "weft", "shear")]
+    space = OrthotropicSpace.make(wrong * float(denim.density))
+    found = diffcloud.estimate(Problem.make(record, space), key=jr.key(0))
+    truth = np.asarray(space.values(space.locate(denim)))
+    stiff = [i for i, b in enumerate(space.ranges) if b.name in ("warp", "weft", "shear")]
     ratio = found.values[stiff] / truth[stiff]
     np.testing.assert_allclose(ratio, wrong, atol=0.05)
     assert np.all(np.abs(np.log(ratio / wrong)) < 3 * found.deviations[stiff])

@@ -11,21 +11,21 @@ import pytest
 
 from r2s import scenarios
 from r2s.estimation import adam, cma_es, descent, diffcloud, gauss_newton
-from r2s.estimation.descent import Effort, descend
+from r2s.estimation.descent import Budget, descend
 from r2s.estimation.estimate import Estimate, as_json, from_json
 from r2s.estimation.gauss_newton import Descent
-from r2s.estimation.normal_equations import evidence_of, loss_of
-from r2s.estimation.prediction import Seen, Slope, _delayed, predict, sensitivities
-from r2s.estimation.problem import Doubt, Problem, beginning, window
+from r2s.estimation.normal_equations import loss_of, normal_equations_of
+from r2s.estimation.prediction import Prediction, Sensitivity, _delayed, predict, sensitivities
+from r2s.estimation.problem import NuisancePrior, Problem, beginning, window
 from r2s.fabrics import presets
-from r2s.fabrics.parameters import OrthotropicFamily, Range
+from r2s.fabrics.parameters import OrthotropicSpace, Range
 from r2s.recordings.recording import set_time_offset
 from r2s.scenarios import synthetic
 
-ALL = Doubt(time=0.05, density=0.2, air=0.3)
-SMALL = Effort(coarse=2, starts=1, iterations=4, shares=(0.5,), around=2)
+ALL = NuisancePrior(time=0.05, density=0.2, air=0.3)
+SMALL = Budget(coarse=2, starts=1, iterations=4, shares=(0.5,), around=2)
 FABRIC = presets.grey_interlock()
-FAMILY = OrthotropicFamily.make(float(FABRIC.density))
+FAMILY = OrthotropicSpace.make(float(FABRIC.density))
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def recording():
 @pytest.fixture(scope="module")
 def small(recording):
     """A problem of four frames on a coarse sheet, of which nothing is known for sure."""
-    return Problem.make(recording, FAMILY, num_points=60, shape=(5, 5), doubt=ALL)
+    return Problem.make(recording, FAMILY, num_points=60, shape=(5, 5), nuisance_prior=ALL)
 
 
 @pytest.fixture(scope="module")
@@ -97,11 +97,13 @@ def test_a_delay_by_frames_shifts_and_one_between_them_is_third_order():
 def test_an_early_camera_is_predicted_as_an_early_recording(recording):
     """Clouds on a clock that is a frame early are explained, by that delay, as on the right one."""
     late = set_time_offset(recording, -0.1)
-    doubt = Doubt(time=0.1)
+    nuisance_prior = NuisancePrior(time=0.1)
     place = FAMILY.locate(FABRIC)
     unknown = lambda delay: jnp.concatenate([place, jnp.zeros(6), jnp.array([delay])])
     loss = jax.jit(lambda p, u: loss_of(p, predict(p, u)))
-    whole = lambda r: Problem.make(r, FAMILY, num_points=60, shape=(5, 5), doubt=doubt)
+    whole = lambda r: Problem.make(
+        r, FAMILY, num_points=60, shape=(5, 5), nuisance_prior=nuisance_prior
+    )
     make = lambda r: window(whole(r), 4, 6)  # the simulation ends where the recording does
     same, shifted = float(loss(make(recording), unknown(0.0))), make(late)
     assert float(loss(shifted, unknown(-1.0))) == pytest.approx(same, rel=0.02)
@@ -135,7 +137,7 @@ def test_a_marker_that_is_off_in_every_frame_is_one_error(pulled):
     twice = lambda part: jnp.concatenate([part, part])
 
     def covariance(number, repeat):
-        about = Seen(repeat(seen.x), None, seen.ok), Slope(repeat(slope.x), None)
+        about = Prediction(repeat(seen.x), None, seen.ok), Sensitivity(repeat(slope.x), None)
         expected = jnp.einsum("mk,fmki->fmi", pulled.markers.weights, seen.x[:, corners])
         markers = dataclasses.replace(
             pulled.markers,
@@ -143,7 +145,9 @@ def test_a_marker_that_is_off_in_every_frame_is_one_error(pulled):
             seen=repeat(pulled.markers.seen),
         )
         frames = pulled.frames * number
-        found = evidence_of(dataclasses.replace(pulled, markers=markers, frames=frames), *about)
+        found = normal_equations_of(
+            dataclasses.replace(pulled, markers=markers, frames=frames), *about
+        )
         prior = 1e-6 * jnp.diag(jnp.diag(jnp.sum(found.matrices, axis=0)) + 1e-9)
         inverse = jnp.linalg.inv(jnp.sum(found.matrices, axis=0) + prior)
         noise = jnp.zeros_like(found.noise)
@@ -232,7 +236,7 @@ def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(small, tmp_path):
     np.testing.assert_array_equal(found.values, whole.values)
     np.testing.assert_array_equal(found.losses, whole.losses)
     assert seen[0] == 2  # and did not begin again
-    with pytest.raises(ValueError, match="of another recording, family or setting"):
+    with pytest.raises(ValueError, match="of another recording, space or setting"):
         diffcloud.estimate(small, SMALL, checkpoint=path, key=jr.key(1))
     path.write_bytes(b"nothing")
     with pytest.raises(ValueError, match="no checkpoint"):
@@ -309,9 +313,9 @@ def test_a_beginning_counts_as_a_window_of_the_first_frames_does(kind, request):
 
     def evidence(problem, frames):
         pick = lambda which: None if forces is None else forces[which][:frames]
-        seen = Seen(x[:frames], pick(0), jnp.array(True))
-        both = lambda p, *about: (loss_of(p, about[0]), evidence_of(p, *about))
-        return jax.jit(both)(problem, seen, Slope(slope[:frames], pick(1)))
+        seen = Prediction(x[:frames], pick(0), jnp.array(True))
+        both = lambda p, *about: (loss_of(p, about[0]), normal_equations_of(p, *about))
+        return jax.jit(both)(problem, seen, Sensitivity(slope[:frames], pick(1)))
 
     loss, early = evidence(beginning(problem, half / count), count)
     same, part = evidence(window(problem, problem.frames[0], problem.frames[half - 1]), half)
@@ -339,7 +343,7 @@ def test_markers_must_lie_on_the_sheet():
 @pytest.mark.slow
 def test_the_recipe_and_cma_lower_their_losses(small):
     with jax.numpy_dtype_promotion("standard"):  # optax counts its steps in integers
-        found = diffcloud.original(small, small.family.middle(), epochs=4)
+        found = diffcloud.original(small, small.space.middle(), epochs=4)
         recipe = diffcloud.recipe(small, start=jnp.full(7, 0.4), epochs=4)
     assert found.loss < found.losses[0, 0] and recipe.loss < recipe.losses[0, 0]
     assert np.all((found.values > [0.05, 0.1]) & (found.values < [10, 10]))
@@ -364,10 +368,10 @@ def test_a_known_fabric_and_a_late_clock_are_found(name):
     experiment = scenarios.lifting()
     seen = synthetic.sensing(experiment)._replace(time_offset=0.08)
     record = synthetic.record(experiment, fabric, name, seen=seen, key=jr.key(0))
-    family = OrthotropicFamily.make(float(fabric.density))
-    problem = Problem.make(record, family, doubt=Doubt(time=0.1))
+    space = OrthotropicSpace.make(float(fabric.density))
+    problem = Problem.make(record, space, nuisance_prior=NuisancePrior(time=0.1))
     found = descend(problem, approach="test", key=jr.key(0))
-    truth = np.asarray(family.values(family.locate(fabric)))
+    truth = np.asarray(space.values(space.locate(fabric)))
     assert found.determined.sum() >= 3
     error = np.abs(np.where(truth > 0, found.values / truth - 1, found.values - truth))
     assert np.all(error[found.determined] < 0.1)
@@ -379,12 +383,12 @@ def test_a_known_fabric_and_a_late_clock_are_found(name):
 def test_wind_finds_a_light_fabric_from_a_random_start():
     fabric = presets.red_jet_set()
     record = synthetic.record(scenarios.wind(), fabric, "red", key=jr.key(0))
-    family = OrthotropicFamily.make(float(fabric.density))
-    problem = Problem.make(record, family)
+    space = OrthotropicSpace.make(float(fabric.density))
+    problem = Problem.make(record, space)
     key = jr.key(101)
-    start = jr.uniform(key, (family.dim,), float)
+    start = jr.uniform(key, (space.dim,), float)
     found = diffcloud.estimate(problem, start=start, key=key)
-    truth = np.asarray(family.values(family.locate(fabric)))
+    truth = np.asarray(space.values(space.locate(fabric)))
     error = np.abs(np.where(truth > 0, found.values / truth - 1, found.values - truth))
     assert np.all(error[:-1] < 0.05)  # of all but friction
 
@@ -412,27 +416,27 @@ def test_a_planned_motion_reveals_more_with_better_cameras():
 def test_material_points_find_a_known_modulus():
     """Of an isotropic sheet, by DiffCP; the same sheet of cloth is refused."""
     from r2s.estimation import diffcp
-    from r2s.fabrics.parameters import IsotropicFamily
+    from r2s.fabrics.parameters import IsotropicSpace
     from r2s.scenarios import material_points
 
-    family = IsotropicFamily.make(0.2, plate=5e-4)
+    space = IsotropicSpace.make(0.2, plate=5e-4)
     place = jnp.array([0.3, 0.6])
     experiment = scenarios.lifting(num_frames=6, interval=1 / 10, height=0.15, moving=0.4)
     record = synthetic.record(
         experiment,
-        family(place),
+        space(place),
         "sheet",
         shape=(4, 4),
-        solver=lambda scenario, fabric: material_points(scenario, family(jnp.ones(2))),
+        solver=lambda scenario, fabric: material_points(scenario, space(jnp.ones(2))),
         key=jr.key(0),
     )
-    problem = Problem.make(record, family, num_points=100, shape=(4, 4))
+    problem = Problem.make(record, space, num_points=100, shape=(4, 4))
     with pytest.raises(ValueError, match="material points"):
         diffcp.estimate(problem, key=jr.key(0))
-    effort = Effort(coarse=0, starts=1, iterations=6, width=0.02, around=2)
+    budget = Budget(coarse=0, starts=1, iterations=6, width=0.02, around=2)
     start = jnp.array([0.25, 0.5])
-    found = diffcp.estimate(diffcp.on_points(problem), effort, start=start, key=jr.key(0))
-    truth = np.asarray(family.values(place))
-    spread = found.deviations * np.where([b.log for b in family.ranges], truth, 1)
+    found = diffcp.estimate(diffcp.on_points(problem), budget, start=start, key=jr.key(0))
+    truth = np.asarray(space.values(place))
+    spread = found.deviations * np.where([b.log for b in space.ranges], truth, 1)
     assert np.all(np.abs(found.values - truth) < 4 * spread)
     assert found.deviations[0] < 0.3  # of the modulus

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import MASS_DAMPING, OrthotropicFamily, Range
+from r2s.fabrics.parameters import MASS_DAMPING, OrthotropicSpace, Range
 from r2s.fabrics.presets import FIVE
 
 few = settings(max_examples=25, deadline=None)
-FAMILY = OrthotropicFamily.make(0.2)
+FAMILY = OrthotropicSpace.make(0.2)
 places = st.tuples(*[st.floats(0, 1)] * FAMILY.dim).map(np.array)
 there_and_back = jax.jit(lambda u: FAMILY.locate(FAMILY(u)))
 
@@ -26,8 +26,8 @@ def test_a_fabric_is_located_where_it_came_from(place):
 @pytest.mark.parametrize("name", FIVE)
 def test_locating_a_fabric_and_going_there_gives_it_back(name):
     fabric = FIVE[name]()
-    family = OrthotropicFamily.make(float(fabric.density), float(fabric.thickness))
-    again = family(family.locate(fabric))
+    space = OrthotropicSpace.make(float(fabric.density), float(fabric.thickness))
+    again = space(space.locate(fabric))
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(fabric), strict=True):
         assert a == pytest.approx(float(b), rel=1e-9)
 
@@ -48,16 +48,16 @@ def test_every_fabric_of_the_cube_is_stable(place):
 
 
 def test_every_fabric_has_the_density_and_thickness_of_the_family():
-    fabric = OrthotropicFamily.make(0.17, 2e-3)(jnp.linspace(0.0, 1.0, 7))
+    fabric = OrthotropicSpace.make(0.17, 2e-3)(jnp.linspace(0.0, 1.0, 7))
     assert (float(fabric.density), float(fabric.thickness)) == (0.17, 2e-3)
 
 
 def test_mass_damping_is_a_parameter_when_asked_for():
-    family = OrthotropicFamily.make(0.17, mass_damping=MASS_DAMPING)
+    space = OrthotropicSpace.make(0.17, mass_damping=MASS_DAMPING)
     place = jnp.linspace(0.1, 0.8, 8)
-    assert family.dim == FAMILY.dim + 1
-    assert family(place).mass_damping == pytest.approx(float(MASS_DAMPING.value(place[-1])))
-    assert np.asarray(family.locate(family(place))) == pytest.approx(np.asarray(place), abs=1e-9)
+    assert space.dim == FAMILY.dim + 1
+    assert space(place).mass_damping == pytest.approx(float(MASS_DAMPING.value(place[-1])))
+    assert np.asarray(space.locate(space(place))) == pytest.approx(np.asarray(place), abs=1e-9)
     assert FAMILY(place[:-1]).mass_damping == 0
 
 
@@ -87,7 +87,7 @@ def test_bounds_that_do_not_increase_are_refused(low, high, is_log):
 @pytest.mark.parametrize("density, thickness", [(0.0, 1e-3), (-0.1, 1e-3), (0.1, 0.0)])
 def test_density_and_thickness_must_be_positive(density, thickness):
     with pytest.raises(ValueError, match="must be positive"):
-        OrthotropicFamily.make(density, thickness)
+        OrthotropicSpace.make(density, thickness)
 
 
 BAD = {

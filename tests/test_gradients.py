@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from r2s.cloth.cloth import Cloth
 from r2s.fabrics.fabric import Fabric
-from r2s.rollout import simulate
+from r2s.solver import simulate
 from r2s.units import AIR_DENSITY
 from r2s.world.contact import Table
 from r2s.world.scene import Control, along_path

@@ -9,10 +9,10 @@ from r2s import scenarios
 from r2s.estimation.initial_shape import as_seen, registered
 from r2s.evaluation.losses import surface_residuals
 from r2s.fabrics import presets
-from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.geometry.mesh import borders, rectangle
 from r2s.geometry.surface import sample
-from r2s.scenarios.scenario import motion
+from r2s.scenarios.scenario import rollout
 
 SIDE, RADIUS = 0.4, 0.15  # [m]
 
@@ -50,16 +50,16 @@ def test_fabrics_come_to_rest_in_the_buckled_shape_that_was_seen():
     """Two denims of slightly other stiffness fall into two shapes, 5 mm apart, and into one when
     they start near it."""
     denim = presets.black_denim()
-    family = OrthotropicFamily.make(float(denim.density))
+    space = OrthotropicSpace.make(float(denim.density))
     scenario = scenarios.wind(num_frames=2).scenario((9, 9), False)
-    place = family.locate(denim)
+    place = space.locate(denim)
     changed = place + jnp.array([-0.015, -0.06, 0.0, -0.02, 0.01, 0.09, -0.06])
-    rest = jax.jit(lambda scenario, u: motion(scenario, family(u)).x[0])
+    rest = jax.jit(lambda scenario, u: rollout(scenario, space(u)).x[0])
     apart = lambda one, other: float(jnp.mean(jnp.linalg.norm(one - other, axis=1)))
     true = rest(scenario, place)
     assert apart(rest(scenario, changed), true) > 4e-3
     points = sample(true, scenario.scene.mesh.faces, 3)
-    middle = family(jnp.full(family.dim, 0.5))
+    middle = space(jnp.full(space.dim, 0.5))
     seen = as_seen(scenario, middle, points, jnp.ones(len(points), bool))
     assert apart(rest(seen, changed), true) < 2e-3
     assert apart(rest(seen, place), true) < 1e-3

@@ -21,7 +21,7 @@ from matplotlib.image import imread
 
 from r2s.evaluation import metrics
 from r2s.fabrics import presets
-from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.geometry.surface import sample
 from r2s.recordings.recording import cloud
 from r2s.scenarios import lifting, synthetic
@@ -48,8 +48,8 @@ def recording():
 
 @pytest.fixture(scope="module")
 def subject(recording):
-    family = OrthotropicFamily.make(float(presets.grey_interlock().density))
-    return subjects.of_recording(recording, family, SHAPE)
+    space = OrthotropicSpace.make(float(presets.grey_interlock().density))
+    return subjects.of_recording(recording, space, SHAPE)
 
 
 @pytest.fixture
@@ -89,8 +89,8 @@ def test_the_true_fabric_is_nearest_and_a_softer_one_hangs_lower(subject):
 
 def test_without_a_recording_there_is_no_error():
     experiment = lifting(num_frames=3, moving=0.1)
-    subject = subjects.of_experiment(experiment, OrthotropicFamily.make(0.2), (3, 3))
-    moved = subjects.move(subject, jnp.full(subject.family.dim, 0.5))
+    subject = subjects.of_experiment(experiment, OrthotropicSpace.make(0.2), (3, 3))
+    moved = subjects.move(subject, jnp.full(subject.space.dim, 0.5))
     assert bool(moved.ok.all()) and np.isnan(np.asarray(moved.error)).all()
 
 

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from conftest import cloth, directional_difference, everywhere, flat, roll
 
-from r2s.cloth.self_contact.broad_phase import Tree, tree
+from r2s.cloth.self_contact.broad_phase import BVH, build_bvh
 from r2s.cloth.self_contact.contacts import (
-    Layers,
-    colliding,
+    SelfContact,
+    collision_contacts,
     contact_energy,
     contact_hessians,
-    touching,
+    proximity_contacts,
 )
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh, rectangle
-from r2s.rollout import simulate
+from r2s.solver import simulate
 from r2s.units import GRAVITY
 from r2s.world.contact import pressure
 from r2s.world.scene import Control
@@ -48,12 +48,12 @@ def crossings(mesh: Mesh, x) -> int:
     return int(np.sum(~shared & (at > 0) & (at < 1) & (u > 0) & (v > 0) & (u + v < 1)))
 
 
-def as_if_large(mesh: Mesh) -> Layers:
+def as_if_large(mesh: Mesh) -> SelfContact:
     """As they are made for a large mesh."""
-    return Layers(tree(np.asarray(mesh.faces), np.asarray(mesh.rest)), None, 256)
+    return SelfContact(build_bvh(np.asarray(mesh.faces), np.asarray(mesh.rest)), None, 256)
 
 
-def with_layers(solver, make=lambda mesh: Layers.make(mesh, 256)):
+def with_layers(solver, make=lambda mesh: SelfContact.make(mesh, 256)):
     layers = make(solver.scene.mesh)
     return dataclasses.replace(solver, scene=dataclasses.replace(solver.scene, layers=layers))
 
@@ -115,8 +115,8 @@ def test_a_layer_rests_on_another_with_its_weight():
     )
     x, area = jnp.asarray(still.x[-1]), mesh.vertex_area
     assert np.max(np.abs(still.v[-1])) < 1e-3
-    layers = Layers.make(mesh, 256)
-    contacts, fits = touching(layers, mesh, THICKNESS, jnp.asarray(0.5), x)
+    layers = SelfContact.make(mesh, 256)
+    contacts, fits = proximity_contacts(layers, mesh, THICKNESS, jnp.asarray(0.5), x)
     energy = lambda x: contact_energy(contacts, THICKNESS, RATE, x, x)
     push = jax.grad(lambda moved: contact_energy(contacts, THICKNESS, RATE, moved, x))(x)
     weight = 0.2 * GRAVITY * float(jnp.sum(area[16:]))
@@ -145,10 +145,10 @@ def pressed():
     mesh, x = two_sheets(0.8e-3)
     random = np.random.default_rng(0)
     x = x + jnp.asarray(random.normal(size=x.shape)) * 1e-4
-    layers = Layers.make(mesh, 256)
-    contacts, _ = touching(layers, mesh, THICKNESS, jnp.asarray(0.5), x)
+    layers = SelfContact.make(mesh, 256)
+    contacts, _ = proximity_contacts(layers, mesh, THICKNESS, jnp.asarray(0.5), x)
     after = x.at[16:, 2].add(-2e-3)
-    contacts, _, _ = colliding(layers, mesh, THICKNESS, x, after, contacts)
+    contacts, _, _ = collision_contacts(layers, mesh, THICKNESS, x, after, contacts)
     return contacts, x, x + jnp.asarray(random.normal(size=x.shape)) * 1e-4
 
 
@@ -167,8 +167,8 @@ def test_the_hessian_of_a_contact_is_that_of_its_energy(pressed):
 
 def test_too_many_contacts_are_not_forgotten():
     mesh, x = two_sheets(0.5e-3)
-    layers = Layers.make(mesh, 8)
-    assert not touching(layers, mesh, THICKNESS, jnp.asarray(0.5), x)[1]
+    layers = SelfContact.make(mesh, 8)
+    assert not proximity_contacts(layers, mesh, THICKNESS, jnp.asarray(0.5), x)[1]
     solver = cloth(mesh, held=range(16))
     solver = dataclasses.replace(solver, scene=dataclasses.replace(solver.scene, layers=layers))
     after = roll(solver, FABRIC, solver.init(x), 1)
@@ -176,8 +176,8 @@ def test_too_many_contacts_are_not_forgotten():
 
 
 def test_a_large_mesh_searches_a_tree_and_iterates():
-    large = Layers.make(rectangle((1.0, 1.0), (21, 21)))
-    assert isinstance(large.search, Tree) and large.whole is None
+    large = SelfContact.make(rectangle((1.0, 1.0), (21, 21)))
+    assert isinstance(large.search, BVH) and large.whole is None
     assert large.capacity == 24 * 441
 
 
@@ -201,7 +201,7 @@ def landing(make):
 
 @pytest.mark.slow
 def test_a_large_mesh_moves_as_a_small_one_does_and_has_its_gradient():
-    small, x, v = landing(lambda mesh: Layers.make(mesh, 256))
+    small, x, v = landing(lambda mesh: SelfContact.make(mesh, 256))
     large, _, _ = landing(as_if_large)
     (_, moved), gradient = small((FABRIC, x, v))
     (_, found), found_gradient = large((FABRIC, x, v))
@@ -211,7 +211,7 @@ def test_a_large_mesh_moves_as_a_small_one_does_and_has_its_gradient():
 
 
 def test_the_gradient_through_a_collision_agrees_with_differences():
-    both, x, v = landing(lambda mesh: Layers.make(mesh, 256))
+    both, x, v = landing(lambda mesh: SelfContact.make(mesh, 256))
     (_, moved), gradient = both((FABRIC, x, v))
     assert jnp.max(jnp.abs(moved[9:, 2] - 1e-3)) < 2e-3  # it has landed
     inputs = (FABRIC, x, v)

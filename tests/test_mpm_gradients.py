@@ -15,7 +15,7 @@ import r2s
 from r2s.fabrics.fabric import Fabric
 from r2s.laws.solid import FixedCorotated, NeoHookean, Solid
 from r2s.mpm import Background, Block, Grid, Sheet
-from r2s.rollout import simulate
+from r2s.solver import simulate
 from r2s.world.air import Air
 from r2s.world.contact import Table
 from r2s.world.scene import Control, Scene

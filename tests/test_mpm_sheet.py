@@ -240,6 +240,8 @@ def test_what_cannot_work_is_refused(sheet, elastic):
         solver_of(r2s.rectangle((0.4, 0.4), (3, 3)), elastic)
     with pytest.raises(ValueError, match="outside the grid"):
         solver_of(sheet, elastic).init(flat(sheet, 1.0))
-    scene = Scene(sheet, jnp.zeros(0, int), Table.make(), Air.make(), None, r2s.Layers.make(sheet))
+    scene = Scene(
+        sheet, jnp.zeros(0, int), Table.make(), Air.make(), None, r2s.SelfContact.make(sheet)
+    )
     with pytest.raises(ValueError, match="needs no layers"):
         Sheet.make(scene, Grid.covering((0.0,) * 3, (1.0,) * 3, SPACING), elastic, 1e-4)

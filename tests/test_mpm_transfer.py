@@ -7,7 +7,7 @@ import pytest
 from conftest import directional_difference
 
 from r2s.mpm.grid import Grid
-from r2s.mpm.transfer import affine_factor, collect, collect_plain, spread, spread_plain
+from r2s.mpm.transfer import affine_factor, g2p, g2p_plain, p2g, p2g_plain
 
 COUNT, CHANNELS = 7, 2
 
@@ -26,7 +26,7 @@ def case(request):
 
 def test_what_is_spread_sums_to_what_there_was(case):
     grid, x, values, slopes, _ = case
-    nodes = spread(grid, x, values, slopes)
+    nodes = p2g(grid, x, values, slopes)
     assert jnp.sum(nodes, axis=0) == pytest.approx(np.asarray(jnp.sum(values, axis=0)), abs=1e-13)
 
 
@@ -34,7 +34,7 @@ def test_an_affine_field_is_collected_exactly(case):
     grid, x, values, slopes, _ = case
     where = jnp.stack([jnp.broadcast_to(a, grid.shape).reshape(-1) for a in grid.axes], axis=1)
     nodes = values[0][None] + where @ slopes[0].T
-    value, moment = collect(grid, x, nodes)
+    value, moment = g2p(grid, x, nodes)
     assert value == pytest.approx(np.asarray(values[0][None] + x @ slopes[0].T), abs=1e-12)
     expected = np.broadcast_to(slopes[0], moment.shape)
     assert affine_factor(grid) * moment == pytest.approx(expected, abs=1e-11)
@@ -42,16 +42,16 @@ def test_an_affine_field_is_collected_exactly(case):
 
 def test_each_is_the_transpose_of_the_other(case):
     grid, x, values, slopes, nodes = case
-    value, moment = collect(grid, x, nodes)
-    there = jnp.sum(spread(grid, x, values, slopes) * nodes)
+    value, moment = g2p(grid, x, nodes)
+    there = jnp.sum(p2g(grid, x, values, slopes) * nodes)
     assert there == pytest.approx(float(jnp.sum(value * values) + jnp.sum(moment * slopes)))
 
 
 def test_the_reverse_rules_equal_those_of_jax(case):
     grid, x, values, slopes, nodes = case
     for fast, plain, inputs in (
-        (spread, spread_plain, (x, values, slopes)),
-        (collect, collect_plain, (x, nodes)),
+        (p2g, p2g_plain, (x, values, slopes)),
+        (g2p, g2p_plain, (x, nodes)),
     ):
         found, expected = _slopes(fast, grid, inputs), _slopes(plain, grid, inputs)
         for a, b in zip(found, expected, strict=True):
@@ -67,7 +67,7 @@ def _slopes(transfer, grid, inputs):
 
 def test_the_derivative_in_positions_agrees_with_differences(case):
     grid, x, values, slopes, _ = case
-    loss = lambda x: jnp.sum(jnp.sin(spread(grid, x, values, slopes)))
+    loss = lambda x: jnp.sum(jnp.sin(p2g(grid, x, values, slopes)))
     direction = jnp.sin(jnp.arange(x.size, dtype=float)).reshape(x.shape)
     expected = directional_difference(loss, x, direction, 1e-6)
     assert jnp.sum(jax.grad(loss)(x) * direction) == pytest.approx(float(expected), rel=1e-7)
@@ -75,7 +75,7 @@ def test_the_derivative_in_positions_agrees_with_differences(case):
 
 def test_forward_mode_equals_differences(case):
     grid, x, _, _, nodes = case
-    get = lambda x: collect_plain(grid, x, nodes)[0]
+    get = lambda x: g2p_plain(grid, x, nodes)[0]
     direction = jnp.ones_like(x)
     _, found = jax.jvp(get, (x,), (direction,))
     expected = directional_difference(get, x, direction, 1e-6)

@@ -11,17 +11,17 @@ import pytest
 from r2s.cloth.self_contact.broad_phase import (
     Pairs,
     all_pairs,
-    near,
-    near_in_tree,
-    tree,
+    build_bvh,
+    candidate_pairs,
+    candidate_pairs_in_tree,
 )
 from r2s.cloth.self_contact.proximity import closest_weights, separation
 from r2s.geometry.mesh import rectangle
 
 SIZE = 0.2  # of the sheets' sides, [m]
 
-found_near = eqx.filter_jit(near)
-found_in_tree = eqx.filter_jit(near_in_tree)
+found_near = eqx.filter_jit(candidate_pairs)
+found_in_tree = eqx.filter_jit(candidate_pairs_in_tree)
 
 
 def sheet(shape):
@@ -149,7 +149,7 @@ def test_sheets_can_be_searched_at_once():
     faces, rest = sheet((5, 5))
     pairs = all_pairs(faces)
     starts, ends = (jnp.stack(x) for x in zip(*(crumpled(rest, i) for i in range(3)), strict=True))
-    search = lambda start, end: near(pairs, start, end, jnp.asarray(5e-3), 2000)
+    search = lambda start, end: candidate_pairs(pairs, start, end, jnp.asarray(5e-3), 2000)
     found, _ = jax.jit(jax.vmap(search))(starts, ends)
     for i in range(3):
         alone, _ = search(starts[i], ends[i])
@@ -159,7 +159,7 @@ def test_sheets_can_be_searched_at_once():
 @pytest.mark.parametrize("shape", [(9, 9), (17, 17), (2, 2), (4, 7)])
 def test_a_tree_has_each_face_and_each_part_once(shape):
     faces, rest = sheet(shape)
-    found = tree(faces, rest)
+    found = build_bvh(faces, rest)
     once = lambda indices: np.sort(indices[indices >= 0])
     assert np.array_equal(once(np.asarray(found.leaves)), np.arange(len(faces)))
     assert np.array_equal(once(np.asarray(found.vertices)), np.arange(len(rest)))
@@ -188,7 +188,7 @@ CAPACITY = {(2, 2): 10, (4, 7): 3000, (9, 9): 12_000, (17, 17): 50_000}
 )
 def test_a_tree_finds_the_same(shape, dtype):
     faces, rest = sheet(shape)
-    pairs, boxes, size = all_pairs(faces), tree(faces, rest), CAPACITY[shape]
+    pairs, boxes, size = all_pairs(faces), build_bvh(faces, rest), CAPACITY[shape]
     for seed, travel, reach in ((0, 1e-3, 0.0), (1, 2e-3, 1e-3), (2, 4e-3, 3e-3)):
         start, end = map(jnp.asarray, crumpled(rest, seed, travel, dtype))
         expected, is_over = found_near(pairs, start, end, jnp.asarray(reach, dtype), size)
@@ -200,7 +200,7 @@ def test_a_tree_finds_the_same(shape, dtype):
 
 def test_a_tree_reports_too_many():
     faces, rest = sheet((9, 9))
-    boxes, (start, end) = tree(faces, rest), crumpled(rest, 1)
+    boxes, (start, end) = build_bvh(faces, rest), crumpled(rest, 1)
     search = lambda size, nodes: found_in_tree(boxes, start, end, jnp.asarray(1e-3), size, nodes)
     whole, is_over = search(12_000, 12_000)
     count = int(jnp.sum(whole.is_real))

@@ -32,7 +32,7 @@ def sighting(folder):
     images = preprocess.of_depths(view, data.depth[0] * dataset.STEP)
     untrained = training.begin(view, Architecture(16, (4,), (8,)))
     scenario = experiment.scenario(TINY.shape)
-    return Sighting.make(scenario, images, frames, TINY.family, untrained)
+    return Sighting.make(scenario, images, frames, TINY.space, untrained)
 
 
 def test_holds_what_the_settings_say(folder):
@@ -75,11 +75,11 @@ def test_other_data_can_have_the_same_view(folder, tmp_path):
 def test_ranges_are_those_of_the_family_unless_given():
     assert [bound.name for bound in Settings(isotropic=True).ranges] == ["E h", "nu"]
     assert len(Settings().ranges) == 7
-    with pytest.raises(ValueError, match="the family has the ranges .'E h', 'nu'., found"):
-        dataclasses.replace(Settings(), isotropic=True)  # with those of the other family
+    with pytest.raises(ValueError, match="the space has the ranges .'E h', 'nu'., found"):
+        dataclasses.replace(Settings(), isotropic=True)  # with those of the other space
     one = (dataclasses.replace(Settings(isotropic=True).ranges[0], high=20.0),)
     narrow = Settings(isotropic=True, ranges=(*one, Settings(isotropic=True).ranges[1]))
-    assert float(narrow.family.values(jnp.ones(2))[0]) == pytest.approx(20)
+    assert float(narrow.space.values(jnp.ones(2))[0]) == pytest.approx(20)
 
 
 def test_the_distance_is_least_at_the_fabric_that_was_seen(sighting, folder):
@@ -98,7 +98,7 @@ def test_an_estimate_goes_on_and_is_the_last_of_what_was_tried(sighting, tmp_pat
     assert first.loss == first.losses[-1] and first.losses.shape == (12, 1)
     again = estimator.estimate(sighting, num_calls=12, path=path)
     np.testing.assert_array_equal(first.history, again.history)
-    place = TINY.family.locate(first.fabric)
+    place = TINY.space.locate(first.fabric)
     loss = estimator.distances(sighting, jnp.stack([place] * 4))[0]
     np.testing.assert_allclose(loss, first.loss, rtol=1e-3)
     assert not first.determined.any()
@@ -114,7 +114,7 @@ def test_the_studys_search_gives_the_best_of_what_was_tried(sighting, tmp_path):
 
 def test_images_and_frames_must_belong_together(sighting):
     images = np.zeros((2, 16, 16))
-    about = TINY.family, training.begin(sighting.view, Architecture(16, (4,), (8,)))
+    about = TINY.space, training.begin(sighting.view, Architecture(16, (4,), (8,)))
     for frames in ((59,), (30, 60)):
         with pytest.raises(ValueError, match="of 60 simulated: expected one image for each frame"):
             Sighting.make(sighting.scenario, images, frames, *about)

@@ -16,14 +16,14 @@ from r2s.estimation.pinn.network import Jet, Network
 from r2s.estimation.pinn.shell import Hanging, curvature, loose, splines, work_scale
 from r2s.fabrics import presets
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.geometry.mesh import rectangle
 from r2s.scenarios import lifting, synthetic, wind
 from r2s.world.air import Air
 
 SIZE, TIMES = (0.3, 0.2), (0.0, 0.5, 1.0)  # [m], [s]
 DENSITY = 0.2  # [kg/m^2]
-FAMILY = OrthotropicFamily.make(DENSITY)
+FAMILY = OrthotropicSpace.make(DENSITY)
 
 
 def network(scale: float = 0.0) -> Network:
@@ -277,14 +277,14 @@ def test_frames_that_are_not_there_are_refused():
 def test_the_map_comes_to_lie_where_the_points_are():
     """In a steady wind, from the motion of a far stiffer fabric; what is not known is said."""
     fabric = presets.grey_interlock()
-    family = OrthotropicFamily.make(float(fabric.density))
+    space = OrthotropicSpace.make(float(fabric.density))
     with jax.numpy_dtype_promotion("standard"):
         seen = synthetic.record(wind(), fabric, "grey_interlock", shape=(17, 17), key=jr.key(11))
         few = from_clouds.Settings(rounds=10)
-        found = from_clouds.estimate(seen, family, few, key=jr.key(0))
+        found = from_clouds.estimate(seen, space, few, key=jr.key(0))
     spreads = np.sqrt(found.losses[:, 0])  # [m]
     assert spreads[-1] < 0.5 * spreads[0]
-    assert found.values[0] < 0.5 * family.values(jnp.full(family.dim, 0.5))[0]  # softer
+    assert found.values[0] < 0.5 * space.values(jnp.full(space.dim, 0.5))[0]  # softer
     assert "not converged" in found.approach and np.isnan(found.deviations).all()
 
 

@@ -24,9 +24,9 @@ from r2s.estimation.pinn.network import Network
 from r2s.estimation.pinn.synthetic_pulls import pulled
 from r2s.estimation.pinn.training import Recipe, train, trainable
 from r2s.fabrics import presets
-from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.scenarios import fling, folding, shaking
-from r2s.scenarios.scenario import motion
+from r2s.scenarios.scenario import rollout
 
 SIZE, DENSITY, FRAMES = (0.45, 0.45), 0.2, 6
 WARP, PULLED = 80.0, 0.02  # [N/m], [m]
@@ -73,7 +73,7 @@ def coarse(monkeypatch):
     monkeypatch.setattr(balancing, "basis_of", fewer)
 
 
-FAMILY = OrthotropicFamily.make(DENSITY)
+FAMILY = OrthotropicSpace.make(DENSITY)
 
 
 def test_an_even_stretch_gives_the_warp_of_the_closed_form():
@@ -153,9 +153,9 @@ def test_without_force_the_report_says_so():
 @pytest.mark.slow
 def test_the_same_key_trains_the_same_network():
     pulls = jax.tree.map(lambda leaf: leaf[None], stacked([even_pull()]))
-    families = jax.tree.map(lambda leaf: leaf[None], FAMILY)
+    spaces = jax.tree.map(lambda leaf: leaf[None], FAMILY)
     with jax.numpy_dtype_promotion("standard"):
-        first, second = (train(families, pulls, TINY, key=jr.key(5)) for _ in range(2))
+        first, second = (train(spaces, pulls, TINY, key=jr.key(5)) for _ in range(2))
     np.testing.assert_array_equal(first.model.free, second.model.free)
 
 
@@ -163,10 +163,10 @@ def test_the_same_key_trains_the_same_network():
 def test_training_lowers_the_losses_of_the_strong_form():
     """Adam, then L-BFGS, on points where the equation of motion is least fulfilled."""
     pulls = jax.tree.map(lambda leaf: leaf[None], stacked([even_pull()]))
-    families = jax.tree.map(lambda leaf: leaf[None], FAMILY)
+    spaces = jax.tree.map(lambda leaf: leaf[None], FAMILY)
     recipe = Recipe(warm_up=10, adam=60, lbfgs=10, redraw=10, points=32, width=6, layers=3)
     with jax.numpy_dtype_promotion("standard"):
-        found = train(families, pulls, recipe, key=jr.key(5))
+        found = train(spaces, pulls, recipe, key=jr.key(5))
     terms = np.sum(found.losses, axis=0)
     assert isinstance(found.losses, Losses) and terms.shape == (1, 8)
     assert terms[0, -1] < 0.2 * terms[0, 0]
@@ -233,7 +233,7 @@ def test_the_gradient_made_along_with_the_sum_is_that_of_the_sum():
 
 
 def test_pulls_and_families_that_do_not_go_together():
-    with pytest.raises(ValueError, match="2 families"):
+    with pytest.raises(ValueError, match="2 spaces"):
         estimate_all([[even_pull()]], [FAMILY, FAMILY], TINY, key=jr.key(0))
     with pytest.raises(ValueError, match="as many pulls"):
         estimate_all([[even_pull()], [even_pull()] * 2], [FAMILY] * 2, TINY, key=jr.key(0))
@@ -248,18 +248,18 @@ def test_the_cloths_fabric_is_found(name, monkeypatch):
     """Within 5 %, from 81 markers and a force with noise; and it simulates what was unseen."""
     monkeypatch.undo()
     fabric = presets.FIVE[name]()
-    family = OrthotropicFamily.make(float(fabric.density))
+    space = OrthotropicSpace.make(float(fabric.density))
     keys = jr.split(jr.key(0), 3)
     with jax.numpy_dtype_promotion("standard"):
         some = [
             pull_from(pulled(fabric, name, angle, shape=(33, 33), key=key), angle)
             for angle, key in zip(ANGLES, keys, strict=True)
         ]
-        found = estimate(some, family, key=jr.key(1)).estimate
-    truth = np.asarray(family.values(family.locate(fabric)))
+        found = estimate(some, space, key=jr.key(1)).estimate
+    truth = np.asarray(space.values(space.locate(fabric)))
     assert found.determined[:4].all()
     np.testing.assert_allclose(found.values[:3], truth[:3], rtol=0.05)
     np.testing.assert_allclose(found.values[3], truth[3], atol=0.05)
     for experiment in (folding(num_frames=40), fling(num_frames=25), shaking(num_frames=25)):
-        moved = motion(experiment.scenario((5, 5)), found.fabric)
+        moved = rollout(experiment.scenario((5, 5)), found.fabric)
         assert isinstance(found.fabric, r2s.Fabric) and bool(moved.ok.all())

@@ -21,7 +21,7 @@ from r2s.estimation.pinn.levenberg import (
 )
 from r2s.estimation.pinn.losses import edge_force, marker_residual
 from r2s.estimation.pinn.network import Network
-from r2s.fabrics.parameters import IsotropicFamily, OrthotropicFamily
+from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace
 
 
 def of_line(unknown, about, row):
@@ -112,8 +112,8 @@ def wave_pull(fabric) -> Pull:
 
 
 FAMILIES = {
-    "orthotropic": OrthotropicFamily.make(DENSITY),
-    "plane stress": IsotropicFamily.make(DENSITY),
+    "orthotropic": OrthotropicSpace.make(DENSITY),
+    "plane stress": IsotropicSpace.make(DENSITY),
     "plane strain": PlaneStrainFamily.make(DENSITY),
 }
 
@@ -122,12 +122,12 @@ FAMILIES = {
 @pytest.mark.parametrize("name", FAMILIES)
 def test_the_network_alone_finds_the_fabric_of_an_exact_field(name):
     """All stiffnesses to 1 %, from the middle of their ranges; where descents are 10 % off."""
-    family = FAMILIES[name]
-    dim = min(family.dim, 4)
+    space = FAMILIES[name]
+    dim = min(space.dim, 4)
     place = jnp.array([0.45, 0.6])
-    fabric = FABRIC if name == "orthotropic" else family(place)
-    truth = family.values(family.locate(fabric) if name == "orthotropic" else place)
+    fabric = FABRIC if name == "orthotropic" else space(place)
+    truth = space.values(space.locate(fabric) if name == "orthotropic" else place)
     with jax.numpy_dtype_promotion("standard"):
-        found, _ = exact.fit(family, wave_pull(fabric), strain=small, key=jr.key(0))
-    values = family.values(jnp.asarray(found))
+        found, _ = exact.fit(space, wave_pull(fabric), strain=small, key=jr.key(0))
+    values = space.values(jnp.asarray(found))
     np.testing.assert_allclose(values[:dim], truth[:dim], rtol=0.01)

@@ -19,7 +19,7 @@ from r2s.estimation.pinn.laws import (
 )
 from r2s.estimation.pinn.network import STRONG, WEAK, Network
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import IsotropicFamily
+from r2s.fabrics.parameters import IsotropicSpace
 from r2s.geometry.mesh import rectangle
 from r2s.laws.membrane import OrthotropicMembrane
 from r2s.laws.solid import LinearSolid
@@ -114,27 +114,27 @@ def test_a_turned_isotropic_law_is_the_same():
 
 def test_plane_strain_is_that_of_the_solid():
     """A sheet of 1 m is a block in 2-D, whose law is that of plane strain."""
-    family = PlaneStrainFamily.make(1.0)
+    space = PlaneStrainFamily.make(1.0)
     place = jnp.array([0.3, 0.7])
-    modulus, ratio = family.values(place)
+    modulus, ratio = space.values(place)
     solid = LinearSolid.make(modulus, ratio)
     change = gradient(5, 0.01)
     expected = solid.energy_density(jnp.eye(2) + change)
-    found = family(place).membrane.energy_density(small(change))
+    found = space(place).membrane.energy_density(small(change))
     np.testing.assert_allclose(found, expected, rtol=1e-12)
-    np.testing.assert_allclose(family.locate(family(place)), place, rtol=1e-9)
+    np.testing.assert_allclose(space.locate(space(place)), place, rtol=1e-9)
 
 
 def test_plane_stress_is_softer_than_plane_strain():
     place = jnp.array([0.3, 0.7])
-    stress, strain = (f.make(1.0)(place).membrane for f in (IsotropicFamily, PlaneStrainFamily))
+    stress, strain = (f.make(1.0)(place).membrane for f in (IsotropicSpace, PlaneStrainFamily))
     assert float(stress.c11) < 0.9 * float(strain.c11)
     np.testing.assert_allclose(stress.c33, strain.c33)
 
 
 def test_a_turned_law_stretches_a_sheet_of_the_cloth():
     """The stored energy of a stretched mesh is that of the law at its strain."""
-    from r2s.scenarios.energy_balance import stored_energy
+    from r2s.scenarios.energy import stored_energy
 
     mesh = rectangle((0.2, 0.2), (3, 3))
     fabric = dataclasses.replace(FABRIC, membrane=TurnedMembrane(FABRIC.membrane, ANGLE))

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 
-from r2s.cloth.potential import curvatures, hessian, hinge_angles, imbalance
+from r2s.cloth.potential import curvatures, hessian, hinge_angles, residual
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh, rectangle
 from r2s.laws.plate import OrthotropicPlate, PlateBending
@@ -141,7 +141,7 @@ def test_the_hessian_is_the_derivative_of_the_force(law, sheet, fabric):
     state, control = solver.init(flat(sheet)), Control(jnp.zeros((0, 3)), jnp.zeros(3))
     increment = solver.increment(fabric, state, control)
     direction = jax.random.normal(jax.random.key(2), x.shape)
-    expected = directional_difference(jax.jit(partial(imbalance, increment)), x, direction, 1e-7)
+    expected = directional_difference(jax.jit(partial(residual, increment)), x, direction, 1e-7)
     pattern, blocks = increment.pattern, jax.jit(hessian)(increment, x)
     product = np.zeros((25, 3))
     np.add.at(

@@ -11,7 +11,7 @@ from conftest import cloth, flat
 
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import rectangle
-from r2s.rollout import simulate
+from r2s.solver import simulate
 from r2s.world.scene import Control
 
 STIFFNESSES = (1.0, 1e2, 1e4)  # [N/m]

@@ -288,12 +288,12 @@ def test_a_simulated_fabric_comes_back_within_2_mm(motion_of: str, tmp_path: Pat
     from r2s.fabrics import presets
     from r2s.recordings.cameras.synthetic_rgbd import write_rgbd
     from r2s.scenarios import synthetic
-    from r2s.scenarios.scenario import from_recording, motion
+    from r2s.scenarios.scenario import from_recording, rollout
 
     fabric = presets.grey_interlock()
     recorded = getattr(synthetic, motion_of)(fabric, "grey", 1, key=jr.key(0))
     scenario = from_recording(recorded, (17, 17))
-    moved = np.asarray(motion(scenario, fabric).x)[::10]
+    moved = np.asarray(rollout(scenario, fabric).x)[::10]
     faces, times = np.asarray(scenario.scene.mesh.faces), np.asarray(recorded.times)[::10]
     positions = {"left": (-0.5, -0.1, 0.5), "right": (0.1, -0.4, 0.9)}
     views = {n: camera(p, resolution=(1280, 720)) for n, p in positions.items()}

@@ -15,9 +15,9 @@ from r2s.geometry.mesh import rectangle
 from r2s.laws.bending import HingeBending
 from r2s.laws.tables import HINGE_FACTOR, TableBending
 from r2s.recordings.recording import RecordingInfo, make_recording
-from r2s.scenarios.energy_balance import stored_energy, stretch
+from r2s.scenarios.energy import stored_energy, stretch
 from r2s.scenarios.paths import Route
-from r2s.scenarios.scenario import from_recording, motion
+from r2s.scenarios.scenario import from_recording, rollout
 from r2s.scenarios.six import CLEARANCE, SIX
 from r2s.units import GRAVITY
 
@@ -25,7 +25,7 @@ SHAPE = (5, 5)
 SOFTEST, STIFFEST = "grey_interlock", "black_denim"
 FRAMES = {"num_frames": 15}
 
-account = eqx.filter_jit(scenarios.account)
+account = eqx.filter_jit(scenarios.energy_balance)
 
 
 def solver_of(kind, scenario, fabric):
@@ -159,7 +159,7 @@ def test_material_points_fit_the_scenario():
     assert np.all(np.asarray(grid.inside(jnp.asarray(far))))
     wrong = dataclasses.replace(solver, dt=solver.dt * 1.37)
     with pytest.raises(ValueError, match="fill the 0.0666667 s between frames"):
-        motion(scenario, fabric, solver=wrong)
+        rollout(scenario, fabric, solver=wrong)
 
 
 @pytest.mark.slow

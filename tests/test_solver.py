@@ -8,8 +8,8 @@ import pytest
 from conftest import cloth, flat
 
 from r2s.geometry.mesh import rectangle
-from r2s.rollout import predicted_memory, simulate
 from r2s.scenarios.scenario import MAX_STEP, steps_between
+from r2s.solver import predicted_memory, simulate
 from r2s.world.scene import Control
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from conftest import DT, FIRST_ROW, SIZE, cloth, energy, flat, roll, rotation
 
-from r2s.cloth.potential import imbalance
+from r2s.cloth.potential import residual
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh, rectangle
 from r2s.units import GRAVITY
@@ -17,7 +17,7 @@ from r2s.world.scene import Control
 LONG = 5.0  # [s]: in a step as long as this, inertia and damping hardly count
 DENSITY = 0.2  # [kg/m^2]
 LENGTH, WIDTH, CELLS = 0.2, 0.025, 16  # of a strip, [m]
-force = eqx.filter_jit(imbalance)
+force = eqx.filter_jit(residual)
 
 
 def pull(solver, fabric, states):

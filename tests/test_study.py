@@ -11,7 +11,7 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from r2s.estimation.estimate import without_deviations
+from r2s.estimation.estimate import without_standard_errors
 from r2s.evaluation import prediction_error
 from r2s.fabrics import presets
 from r2s.fabrics.arcsim import write_material
@@ -20,8 +20,8 @@ from r2s.scenarios import synthetic
 from r2s.scenarios.six import SIX
 from r2s.study import engine, estimates, matrix, results
 from r2s.study.cells import needs
-from r2s.study.estimates import Estimated, Trained
-from r2s.study.sources import Made, Making, strain_dependent
+from r2s.study.estimates import EstimateCell, TrainedNetwork
+from r2s.study.sources import Making, SyntheticRecording, strain_dependent
 from r2s.study.statistics import tables
 from r2s.study.statistics.panel import MOTIONS, PAPER_COLUMNS, Column
 
@@ -85,24 +85,28 @@ def test_the_columns_of_the_paper_are_part_of_all():
     assert len(set(matrix.FULL)) == len(matrix.FULL)
     for cell in matrix.synthetic(matrix.PRESETS["small"]):
         assert cell.scenario in MOTIONS
-        assert all(isinstance(source, Made) and source.unseen for source in cell.recordings)
+        assert all(
+            isinstance(source, SyntheticRecording) and source.unseen for source in cell.recordings
+        )
 
 
 def test_small_has_every_approach_both_solvers_two_fabrics_and_six_scenarios():
     every = engine.closure(matrix.synthetic(matrix.SMALL))
-    estimated = [cell for cell in every if isinstance(cell, Estimated)]
+    estimated = [cell for cell in every if isinstance(cell, EstimateCell)]
     assert {cell.approach for cell in estimated} == set(estimates.SOLVERS)
     assert {cell.solver for cell in estimated} == {"cloth", "points"}
     assert len({cell.fabric for cell in estimated}) >= 2
-    assert len({cell.scenario for cell in every if isinstance(cell, Made)}) == 6
-    networks = [need for cell in estimated for need in needs(cell) if isinstance(need, Trained)]
+    assert len({cell.scenario for cell in every if isinstance(cell, SyntheticRecording)}) == 6
+    networks = [
+        need for cell in estimated for need in needs(cell) if isinstance(need, TrainedNetwork)
+    ]
     assert networks and all(network.scenario == "lifting" for network in networks)
 
 
 def test_what_is_judged_was_never_estimated_from():
     plan = matrix.narrowed(matrix.SMALL, repeats=3, judged=3)
     every = engine.closure(matrix.synthetic(plan))
-    made = [cell for cell in every if isinstance(cell, Made)]
+    made = [cell for cell in every if isinstance(cell, SyntheticRecording)]
     assert len({cell.path(Path()) for cell in every}) == len(every)
     motions = [cell._experiment().route.path.tobytes() for cell in made if cell.angle is None]
     assert len(set(motions)) == len(motions) / len(plan.fabrics)  # all fabrics are moved alike
@@ -131,7 +135,7 @@ def test_a_changed_file_of_measured_tables_is_another_recording(tmp_path):
     changed = recordings()
     assert [cell.key for cell in first] == [cell.key for cell in again]
     assert not {cell.key for cell in first} & {cell.key for cell in changed}
-    assert isinstance(changed[0], Made)
+    assert isinstance(changed[0], SyntheticRecording)
     softer = strain_dependent("grey_interlock", changed[0].making).membrane.stiffness
     assert not np.array_equal(softer, truth.membrane.stiffness)
     with pytest.raises(FileNotFoundError, match="camel_ponte_roma.json"):
@@ -140,15 +144,15 @@ def test_a_changed_file_of_measured_tables_is_another_recording(tmp_path):
 
 @pytest.fixture
 def tiny(monkeypatch):
-    """One column and fabric, whose estimate is the middle of the family, without work."""
+    """One column and fabric, whose estimate is the middle of the space, without work."""
     made = []
 
-    def fake(cell, family, recordings, folder):
+    def fake(cell, space, recordings, folder):
         made.append(cell)
-        middle = jnp.full(family.dim, 0.5)
-        values = np.asarray(family.values(middle))
+        middle = jnp.full(space.dim, 0.5)
+        values = np.asarray(space.values(middle))
         about = 1e-4, np.full((1, 1), 1e-4), values[None, None], 0.1
-        return without_deviations("fake", family, middle, *about)
+        return without_standard_errors("fake", space, middle, *about)
 
     monkeypatch.setitem(estimates._ESTIMATORS, "diffcloud", fake)
     plan = matrix.Plan(
@@ -186,7 +190,7 @@ def test_an_estimate_is_made_once_and_judged(tiny, tmp_path):
 def test_an_estimate_that_diverges_is_a_result(tiny, tmp_path, monkeypatch):
     cells, _ = tiny
 
-    def explode(cell, family, recordings, folder):
+    def explode(cell, space, recordings, folder):
         raise RuntimeError("every simulation diverged")
 
     monkeypatch.setitem(estimates._ESTIMATORS, "diffcloud", explode)
@@ -218,7 +222,7 @@ def test_a_wrong_call_says_what_is_wrong_and_writes_nothing(arguments, message, 
 def test_an_estimate_without_memory_is_missing_and_no_divergence(tiny, tmp_path, monkeypatch):
     estimated = tiny[0][0].estimate
 
-    def exhaust(cell, family, recordings, folder):
+    def exhaust(cell, space, recordings, folder):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory")
 
     monkeypatch.setitem(estimates._ESTIMATORS, "diffcloud", exhaust)

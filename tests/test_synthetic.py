@@ -12,7 +12,7 @@ from r2s.geometry.surface import sample
 from r2s.recordings.cameras.camera import Camera
 from r2s.recordings.recording import cloud
 from r2s.scenarios import synthetic
-from r2s.scenarios.scenario import from_recording, motion
+from r2s.scenarios.scenario import from_recording, rollout
 
 
 def test_a_camera_sees_the_nearer_of_two_sheets():
@@ -44,7 +44,7 @@ def test_the_same_key_gives_the_same_recording(recording):
 
 
 def test_the_cloud_lies_on_the_sheet_but_for_noise_and_outliers(recording):
-    moved = motion(from_recording(recording), presets.grey_interlock())
+    moved = rollout(from_recording(recording), presets.grey_interlock())
     assert bool(jnp.all(moved.ok))
     faces = from_recording(recording).scene.mesh.faces
     surface = np.asarray(sample(moved.x[45], faces, 12))
@@ -56,7 +56,7 @@ def test_the_cloud_lies_on_the_sheet_but_for_noise_and_outliers(recording):
 
 
 def test_the_view_is_partial(recording):
-    moved = motion(from_recording(recording), presets.grey_interlock())
+    moved = rollout(from_recording(recording), presets.grey_interlock())
     faces = from_recording(recording).scene.mesh.faces
     surface = np.asarray(sample(moved.x[40], faces, 8))
     hidden = KDTree(cloud(recording, 40)).query(surface)[0] > 0.02
@@ -111,7 +111,7 @@ def test_every_scenario_is_recorded_by_either_solver(name, kind):
         scenarios.SIX[name](), presets.black_denim(), "denim", **finer, key=jr.key(0)
     )
     assert len(record.times) == 60
-    x = np.asarray(motion(from_recording(record), presets.black_denim()).x)
+    x = np.asarray(rollout(from_recording(record), presets.black_denim()).x)
     faces = from_recording(record).scene.mesh.faces
     distance = KDTree(np.asarray(sample(jnp.asarray(x[-1]), faces, 12))).query(cloud(record, 59))[0]
     assert np.median(distance) < 0.02  # two models of one fabric

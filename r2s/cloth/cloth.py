@@ -9,13 +9,13 @@ from jaxtyping import Array, Float
 
 from r2s.cloth.newton import minimise
 from r2s.cloth.potential import (
-    Increment,
+    IncrementalPotential,
     bending_laws,
     curvatures,
     hinge_angles,
     strains,
 )
-from r2s.cloth.self_contact.contacts import Contacts, settle
+from r2s.cloth.self_contact.contacts import Contacts, resolve_contacts
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh
 from r2s.laws.bending import unwrapped
@@ -92,11 +92,13 @@ class Cloth(eqx.Module):
             x = solve(None, guess)
         else:
             about = self.scene.mesh, fabric.thickness, fabric.friction
-            x = settle(self.scene.layers, *about, state.x, guess, solve)
+            x = resolve_contacts(self.scene.layers, *about, state.x, guess, solve)
         v = increment.rate * (x - increment.x_anchor)
         return ClothState(x, v, state.x, state.v)
 
-    def increment(self, fabric: Fabric, state: ClothState, control: Control) -> Increment:
+    def increment(
+        self, fabric: Fabric, state: ClothState, control: Control
+    ) -> IncrementalPotential:
         """What this step's potential depends on. BDF2: 2 dt v' = 3 x' - 4 x + x_before."""
         mesh = self.scene.mesh
         depth = self.scene.table.depth(state.x, fabric.thickness)
@@ -106,7 +108,7 @@ class Cloth(eqx.Module):
         strain, strain_before = strains(mesh, state.x), strains(mesh, state.x_before)
         ahead = lambda now, before: 2 * now - before  # second order, like the formula
         hinges = curvatures(mesh, ahead(angles, angles_before))
-        return Increment(
+        return IncrementalPotential(
             mesh=mesh,
             fabric=fabric,
             membrane=jax.vmap(fabric.membrane.at)(ahead(strain, strain_before)),

@@ -10,7 +10,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
 from r2s.cloth.linear.system import System, apply_inverse, prepare
-from r2s.cloth.potential import Increment, far, hessian, imbalance, potential
+from r2s.cloth.potential import IncrementalPotential, far, hessian, potential, residual
 
 Positions = Float[Array, "vertex 3"]
 CONVEX_ITERATIONS = 3  # before the exact Hessian is tried
@@ -33,7 +33,7 @@ class _Search(NamedTuple):
 
 
 def minimise(
-    increment: Increment,
+    increment: IncrementalPotential,
     start: Positions,
     free: Bool[Array, " vertex"],
     tolerance: float,
@@ -168,7 +168,7 @@ def _minimise_jvp(primals, tangents):
     _, _, increment_dot, start_dot, _ = tangents
     x = checkpoint_name(_minimise(*primals), SAVED)
     held_dot = jnp.zeros_like(x) if start_dot is None else jnp.where(free[:, None], 0, start_dot)
-    _, force_dot = eqx.filter_jvp(imbalance, (increment, x), (increment_dot, held_dot))
+    _, force_dot = eqx.filter_jvp(residual, (increment, x), (increment_dot, held_dot))
     # linear in the right-hand side, so that it batches and transposes with the same factors
     system = _one_by_one(_exact_system)(increment, x, free)
     about = increment.levels, increment.pattern, system

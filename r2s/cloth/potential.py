@@ -25,7 +25,7 @@ from r2s.cloth.linear.pattern import Pattern, add_between, add_elements, assembl
 from r2s.cloth.linear.system import Far
 from r2s.cloth.self_contact.contacts import (
     Contacts,
-    Layers,
+    SelfContact,
     contact_energy,
     contact_hessians,
 )
@@ -43,7 +43,7 @@ Positions = Float[Array, "vertex 3"]
 Blocks = Float[Array, "block 3 3"]
 
 
-class Increment(eqx.Module):
+class IncrementalPotential(eqx.Module):
     """All that a step's potential depends on, beside the new positions.
 
     - `rate`: of the time-stepping formula, [1/s].
@@ -73,7 +73,7 @@ class Increment(eqx.Module):
     area_normals: Float[Array, "face 3"]
     friction_limit: Float[Array, " vertex"]
     wind: Float[Array, "face 3"]
-    layers: Layers | None = None
+    layers: SelfContact | None = None
     contacts: Contacts | None = None
 
     @property
@@ -141,11 +141,11 @@ def _viscoelastic(
     return energy_density(strain) + viscosity / 2 * jnp.sum(change * tangent_change)
 
 
-def _element_energy(step: Increment, law: Any, strain: Array, anchor: Array):
+def _element_energy(step: IncrementalPotential, law: Any, strain: Array, anchor: Array):
     return _viscoelastic(law.energy_density, strain, anchor, step.fabric.damping * step.rate)
 
 
-def _drag_energy(step: Increment, face, normal, wind, middle):
+def _drag_energy(step: IncrementalPotential, face, normal, wind, middle):
     velocity = step.rate * (middle - step.x_anchor[face].mean(axis=0))
     return step.air.dissipation(velocity - wind, normal) / step.rate
 
@@ -170,13 +170,13 @@ def _vertex_energy(step, x, x_anchor, v_anchor, area, limit):
     )
 
 
-def _faces(step: Increment):
+def _faces(step: IncrementalPotential):
     mesh = step.mesh
     shape = mesh.faces, step.membrane, mesh.inverse, mesh.area
     return *shape, step.strain_anchor, step.area_normals, step.wind
 
 
-def _bends(step: Increment, hinges: Float[Array, " hinge"]):
+def _bends(step: IncrementalPotential, hinges: Float[Array, " hinge"]):
     see = lambda curvatures: bends(step.mesh, step.bending, curvatures)
     areas = bending_areas(step.mesh, step.bending)
     return areas, step.bending, see(hinges), see(step.curvature_anchor)
@@ -186,11 +186,11 @@ def _bend_energy(step, area, law, curvature, anchor):
     return area * _element_energy(step, law, curvature, anchor)
 
 
-def _bending_energy(step: Increment, hinges: Float[Array, " hinge"]):
+def _bending_energy(step: IncrementalPotential, hinges: Float[Array, " hinge"]):
     return jnp.sum(_over(_bend_energy, step)(*_bends(step, hinges)))
 
 
-def _vertices(step: Increment):
+def _vertices(step: IncrementalPotential):
     return step.x_anchor, step.v_anchor, step.mesh.vertex_area, step.friction_limit
 
 
@@ -199,7 +199,7 @@ def _over(function, step):
     return jax.vmap(lambda *element: function(step, *element))
 
 
-def potential(step: Increment, x: Positions) -> Float[Array, ""]:
+def potential(step: IncrementalPotential, x: Positions) -> Float[Array, ""]:
     """The incremental potential [J] at new positions [m]."""
     mesh = step.mesh
     elements = (
@@ -212,18 +212,20 @@ def potential(step: Increment, x: Positions) -> Float[Array, ""]:
     return elements + contact_energy(step.contacts, *_about_layers(step, x))
 
 
-def _about_layers(step: Increment, x: Positions):
+def _about_layers(step: IncrementalPotential, x: Positions):
     return step.fabric.thickness, step.rate, x, step.x_anchor
 
 
-def _hinge_curvatures(step: Increment, x: Positions) -> Float[Array, " hinge"]:
+def _hinge_curvatures(step: IncrementalPotential, x: Positions) -> Float[Array, " hinge"]:
     return curvatures(step.mesh, unwrapped(hinge_angles(step.mesh, x), step.angles))
 
 
-imbalance = jax.grad(potential, argnums=1)  # [N]; zero where the forces balance
+residual = jax.grad(potential, argnums=1)  # [N]; zero where the forces balance
 
 
-def hessian(step: Increment, x: Positions, exactness: Float[Array, ""] | float = 1.0) -> Blocks:
+def hessian(
+    step: IncrementalPotential, x: Positions, exactness: Float[Array, ""] | float = 1.0
+) -> Blocks:
     """Second derivative [N/m] of the potential, as blocks of `step.pattern`, but for `far`.
 
     At an exactness of 0, a positive definite stand-in, whose Newton steps always descend: it
@@ -248,7 +250,7 @@ def hessian(step: Increment, x: Positions, exactness: Float[Array, ""] | float =
     return add_between(step.pattern, blocks, step.contacts.stencils, between)
 
 
-def far(step: Increment, x: Positions) -> Far | None:
+def far(step: IncrementalPotential, x: Positions) -> Far | None:
     """What the second derivative [N/m] of the potential has outside of `step.pattern`."""
     if step.contacts is None or step.layers is None or step.layers.whole is not None:
         return None

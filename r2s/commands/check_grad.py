@@ -75,13 +75,13 @@ class CheckGrad:
 
         from r2s.commands.common import experiment_of
         from r2s.scenarios import material_points
-        from r2s.scenarios.scenario import motion
+        from r2s.scenarios.scenario import rollout
 
         scenario = experiment_of(self.scenario, self.motion).scenario(self.shape, self.layers)
         solver = material_points(scenario, fabric) if self.solver == "points" else None
 
         def loss(fabric):
-            x = motion(scenario, fabric, solver=solver).x
+            x = rollout(scenario, fabric, solver=solver).x
             return jnp.mean(jnp.sum((x - scenario.start[None]) ** 2, axis=-1))
 
         return loss

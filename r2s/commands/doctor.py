@@ -87,14 +87,14 @@ class Doctor:
         import jax.numpy as jnp
 
         from r2s.commands.common import card_of, experiment_of
-        from r2s.rollout import predicted_memory
         from r2s.scenarios import material_points
-        from r2s.scenarios.scenario import motion
+        from r2s.scenarios.scenario import rollout
+        from r2s.solver import predicted_memory
 
         fabric = card_of(self.fabric or "grey_interlock").fabric
         scenario = experiment_of(str(self.scenario), self.motion).scenario(self.shape)
         points = material_points(scenario, fabric)
-        loss = lambda fabric: jnp.mean(motion(scenario, fabric).x ** 2)
+        loss = lambda fabric: jnp.mean(rollout(scenario, fabric).x ** 2)
         gradient = jax.value_and_grad(loss)
         memory = [predicted_memory(each, fabric) for each in (loss, gradient)]
         step = scenario.interval / scenario.substeps

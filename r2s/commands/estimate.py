@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 if TYPE_CHECKING:
-    from r2s.estimation.descent import Effort
+    from r2s.estimation.descent import Budget
     from r2s.estimation.estimate import Estimate
     from r2s.recordings.recording import Recording
 
@@ -83,23 +83,23 @@ class EstimateCard:
         from r2s.estimation import diffcloud
         from r2s.estimation.descent import DEFAULT
         from r2s.estimation.problem import Problem
-        from r2s.fabrics.parameters import OrthotropicFamily
+        from r2s.fabrics.parameters import OrthotropicSpace
 
-        family = OrthotropicFamily.make(self.density)
-        problems = tuple(Problem.make(each, family, shape=self.shape) for each in seen)
+        space = OrthotropicSpace.make(self.density)
+        problems = tuple(Problem.make(each, space, shape=self.shape) for each in seen)
         return self._descend(diffcloud.estimate, problems, DEFAULT)
 
     def _points(self, seen: "Sequence[Recording]") -> "Estimate":
         from r2s.estimation import diffcp
         from r2s.estimation.problem import Problem
-        from r2s.fabrics.parameters import IsotropicFamily
+        from r2s.fabrics.parameters import IsotropicSpace
 
-        family = IsotropicFamily.make(self.density)
-        made = (Problem.make(each, family, shape=self.shape, as_seen=False) for each in seen)
+        space = IsotropicSpace.make(self.density)
+        made = (Problem.make(each, space, shape=self.shape, as_seen=False) for each in seen)
         problems = tuple(diffcp.on_points(each) for each in made)
         return self._descend(diffcp.estimate, problems, diffcp.DEFAULT)
 
-    def _descend(self, estimate: Callable, problems, usual: "Effort") -> "Estimate":
+    def _descend(self, estimate: Callable, problems, usual: "Budget") -> "Estimate":
         import jax
 
         asked = {name: getattr(self, name) for name in ("coarse", "starts", "iterations")}
@@ -119,15 +119,15 @@ class EstimateCard:
 
         from r2s.estimation.pinn import from_pulls
         from r2s.estimation.pinn.data import pull_from
-        from r2s.fabrics.parameters import OrthotropicFamily
+        from r2s.fabrics.parameters import OrthotropicSpace
 
         angles = self.angles or (0.0,) * len(seen)
         if len(angles) != len(seen):
             raise ValueError(f"--angles has {len(angles)} numbers, for {len(seen)} pulls")
         pairs = zip(seen, angles, strict=True)
         pulls = [pull_from(each, math.radians(angle)) for each, angle in pairs]
-        family = OrthotropicFamily.make(self.density)
-        return from_pulls.estimate(pulls, family, key=jax.random.key(self.seed)).estimate
+        space = OrthotropicSpace.make(self.density)
+        return from_pulls.estimate(pulls, space, key=jax.random.key(self.seed)).estimate
 
 
 class _bar:

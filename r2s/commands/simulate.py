@@ -52,7 +52,7 @@ class Simulate:
         from r2s.commands.common import card_of, experiment_of, tell
         from r2s.recordings.recording import save
         from r2s.scenarios import synthetic
-        from r2s.scenarios.scenario import motion
+        from r2s.scenarios.scenario import rollout
         from r2s.viewer.pictures import save_trajectory
 
         if self.layers and self.solver == "points":
@@ -61,7 +61,7 @@ class Simulate:
         scenario, fabric = experiment.scenario(self.shape, self.layers), card.fabric
         points = scenarios.material_points if self.solver == "points" else None
         solver = None if points is None else points(scenario, fabric)
-        moved = eqx.filter_jit(motion)(scenario, fabric, solver=solver)
+        moved = eqx.filter_jit(rollout)(scenario, fabric, solver=solver)
         ok = np.asarray(moved.ok)
         save_trajectory(self.out, moved.x, scenario.scene.mesh.faces)
         told = {

@@ -11,7 +11,7 @@ from r2s.commands.common import ScenarioName
 if TYPE_CHECKING:
     from r2s.estimation.cards import Card
     from r2s.fabrics.fabric import Fabric
-    from r2s.fabrics.parameters import Family
+    from r2s.fabrics.parameters import ParameterSpace
     from r2s.viewer.subject import Subject
 
 
@@ -47,12 +47,12 @@ class View:
         import time
 
         from r2s.commands.common import card_of
-        from r2s.fabrics.parameters import OrthotropicFamily
+        from r2s.fabrics.parameters import OrthotropicSpace
         from r2s.viewer.page import Page
         from r2s.viewer.subject import place
 
         card = card_of(self.fabric)
-        subject = self._subject(OrthotropicFamily.make(float(card.fabric.density)))
+        subject = self._subject(OrthotropicSpace.make(float(card.fabric.density)))
         save = None if self.save is None else lambda fabric: self._saved(card, fabric)
         start = place(subject, card.fabric)
         page = Page(subject, start, save=save, host=self.host, port=self.port)
@@ -63,16 +63,16 @@ class View:
         except KeyboardInterrupt:
             page.close()
 
-    def _subject(self, family: "Family") -> "Subject":
+    def _subject(self, space: "ParameterSpace") -> "Subject":
         from r2s.commands.common import experiment_of
         from r2s.viewer.pictures import open_recording
         from r2s.viewer.subject import of_experiment, of_recording
 
         if self.recording is None:
-            return of_experiment(experiment_of(self.scenario, self.motion), family, self.shape)
+            return of_experiment(experiment_of(self.scenario, self.motion), space, self.shape)
         if self.motion:
             raise ValueError("--motion is of a scenario: a recording has its own motion")
-        return of_recording(open_recording(self.recording), family, self.shape)
+        return of_recording(open_recording(self.recording), space, self.shape)
 
     def _saved(self, card: "Card", fabric: "Fabric") -> str:
         from r2s.estimation import cards

@@ -11,7 +11,7 @@ import optax
 from jaxtyping import Array, Float
 
 from r2s.estimation.descent import Progress
-from r2s.estimation.estimate import Estimate, without_deviations
+from r2s.estimation.estimate import Estimate, without_standard_errors
 from r2s.estimation.gauss_newton import Joint, loss_at, size
 from r2s.estimation.normal_equations import Loss
 from r2s.estimation.problem import Problem
@@ -30,7 +30,7 @@ def descend(
     reverse: bool = True,
     progress: Progress | None = None,
 ) -> Estimate:
-    """Adam on a `loss` [m^2] (None: the default one) in the family's place, through a sigmoid.
+    """Adam on a `loss` [m^2] (None: the default one) in the space's place, through a sigmoid.
 
     From `start`, or the middle of the range. The gradient is by reverse mode, or by forward mode
     for a solver that has no other. Returns the best epoch; one whose loss or gradient is not finite
@@ -38,8 +38,8 @@ def descend(
     """
     began = time.perf_counter()
     problems = (problems,) if isinstance(problems, Problem) else problems
-    family = problems[0].family
-    place = jnp.full(family.dim, 0.5, float) if start is None else jnp.clip(start, EDGE, 1 - EDGE)
+    space = problems[0].space
+    place = jnp.full(space.dim, 0.5, float) if start is None else jnp.clip(start, EDGE, 1 - EDGE)
     raw: Any = jnp.log(place) - jnp.log1p(-place)  # optax gives back what it is given
     optimiser = optax.adam(rate)
     state = optimiser.init(raw)
@@ -47,7 +47,7 @@ def descend(
     for epoch in range(epochs):
         value, slope = _evaluate(problems, raw, loss, reverse)
         losses.append(float(value))
-        history.append(np.asarray(family.values(jax.nn.sigmoid(raw))))
+        history.append(np.asarray(space.values(jax.nn.sigmoid(raw))))
         if not (np.isfinite(losses[-1]) and np.all(np.isfinite(np.asarray(slope)))):
             break
         update, state = optimiser.update(slope, state)
@@ -58,14 +58,14 @@ def descend(
         raise RuntimeError(f"{approach}: the simulation diverged at the start, {history[0]}")
     finite = np.where(np.isfinite(losses), losses, np.inf)
     best = int(np.argmin(finite))
-    where = jnp.asarray(_places(family, history[best]), float)
+    where = jnp.asarray(_places(space, history[best]), float)
     seconds = time.perf_counter() - began
     columns = np.array(losses)[:, None], np.stack(history)[:, None]
-    return without_deviations(approach, family, where, losses[best], *columns, seconds)
+    return without_standard_errors(approach, space, where, losses[best], *columns, seconds)
 
 
-def _places(family, values: np.ndarray) -> np.ndarray:
-    pairs = zip(family.ranges, values, strict=True)
+def _places(space, values: np.ndarray) -> np.ndarray:
+    pairs = zip(space.ranges, values, strict=True)
     return np.array([float(bound.place(jnp.asarray(v, float))) for bound, v in pairs])
 
 

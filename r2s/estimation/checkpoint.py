@@ -55,7 +55,7 @@ def load(path: Path, problem: str, like: T) -> list[T]:
         raise ValueError(f"{path} is no checkpoint of an estimate: {error}; remove it") from error
     if found != problem:
         raise ValueError(
-            f"{path} is of another recording, family or setting: remove it, or choose another file"
+            f"{path} is of another recording, space or setting: remove it, or choose another file"
         )
     tree = jax.tree.structure(like)
     return [jax.tree.unflatten(tree, [leaf[i] for leaf in leaves]) for i in range(len(leaves[0]))]

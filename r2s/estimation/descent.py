@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation import gauss_newton, standard_errors
 from r2s.estimation.checkpoint import fingerprint, load, save
-from r2s.estimation.estimate import Condition, Estimate
+from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.estimation.gauss_newton import Descent, Joint, Normal, part_of
 from r2s.estimation.prediction import fabric_at
 from r2s.estimation.problem import OWN, SHARED, UNITS, Problem, beginning
@@ -47,7 +47,7 @@ _apart = eqx.filter_jit(standard_errors.apart)
 _around = eqx.filter_jit(standard_errors.around)
 
 
-class Effort(NamedTuple):
+class Budget(NamedTuple):
     """How much a descent may cost.
 
     - `coarse`: places of the range that are tried first; 0: descend from the start alone.
@@ -73,12 +73,12 @@ class Effort(NamedTuple):
     around: int = 8
 
 
-DEFAULT = Effort(shares=(0.25, 0.5))
+DEFAULT = Budget(shares=(0.25, 0.5))
 
 
 def descend(
     problems: Problem | Joint,
-    effort: Effort = DEFAULT,
+    budget: Budget = DEFAULT,
     *,
     approach: str,
     start: Float[Array, " dim"] | None = None,
@@ -94,44 +94,44 @@ def descend(
     bad; when all do, raises `RuntimeError`. Raises `ValueError` for no starts, for
     places around the end that are no pairs, and for shares that do not rise between 0 and 1.
     """
-    if effort.starts < 1:
-        raise ValueError(f"an estimate needs a start or more, got {effort.starts}")
-    if any(not low < high for low, high in itertools.pairwise((0.0, *effort.shares, 1.0))):
-        raise ValueError(f"shares of the frames must rise between 0 and 1, got {effort.shares}")
-    if effort.around < 0 or effort.around % 2:
-        raise ValueError(f"places around the end are in pairs: an even number, got {effort.around}")
+    if budget.starts < 1:
+        raise ValueError(f"an estimate needs a start or more, got {budget.starts}")
+    if any(not low < high for low, high in itertools.pairwise((0.0, *budget.shares, 1.0))):
+        raise ValueError(f"shares of the frames must rise between 0 and 1, got {budget.shares}")
+    if budget.around < 0 or budget.around % 2:
+        raise ValueError(f"places around the end are in pairs: an even number, got {budget.around}")
     began = time.perf_counter()
     problems = (problems,) if isinstance(problems, Problem) else problems
-    identity = "" if checkpoint is None else fingerprint(problems, effort, start, key)
-    rows = [] if checkpoint is None else _resumed(checkpoint, identity, effort)
+    identity = "" if checkpoint is None else fingerprint(problems, budget, start, key)
+    rows = [] if checkpoint is None else _resumed(checkpoint, identity, budget)
     if not rows:
-        rows = [_begin(problems, effort, start, key)]
-    while (row := _next(problems, effort, rows)) is not None:
+        rows = [_begin(problems, budget, start, key)]
+    while (row := _next(problems, budget, rows)) is not None:
         rows.append(row)
         if checkpoint is not None:
             save(checkpoint, identity, [_stacked(row) for row in rows])
         if progress is not None:
             progress(len(rows) - 2, float(_best(row)[1].normal.loss))
     _, best = _best(rows[-1])
-    spread = spread_of(problems, effort, best, jax.random.fold_in(key, 1))
+    spread = spread_of(problems, budget, best, jax.random.fold_in(key, 1))
     return collect(problems, rows, spread, approach, time.perf_counter() - began)
 
 
-def _begin(problems: Joint, effort: Effort, start, key) -> Row:
-    dim, count = problems[0].family.dim, max(effort.coarse, effort.starts)
+def _begin(problems: Joint, budget: Budget, start, key) -> Row:
+    dim, count = problems[0].space.dim, max(budget.coarse, budget.starts)
     start = jnp.full(dim, 0.5, float) if start is None else start
     places = jax.random.uniform(key, (count, dim), float).at[0].set(start)
     nothing = jnp.zeros((count, gauss_newton.size(problems) - dim), float)
     unknowns = jnp.concatenate([places, nothing], axis=1)
-    if effort.coarse:
-        losses = losses_of(_seen(problems, effort, 0), unknowns)
+    if budget.coarse:
+        losses = losses_of(_seen(problems, budget, 0), unknowns)
         if not np.any(np.isfinite(losses)):
             raise RuntimeError(
                 f"all {count} simulations of the coarse search diverged: check the recording's "
-                "units and gripper path, or narrow the family's ranges"
+                "units and gripper path, or narrow the space's ranges"
             )
         unknowns = unknowns[np.argsort(losses)]
-    return _fresh(problems, effort, list(unknowns[: effort.starts]), 0.0, 0)
+    return _fresh(problems, budget, list(unknowns[: budget.starts]), 0.0, 0)
 
 
 def losses_of(problems: Joint, unknowns: Float[Array, "start unknown"]) -> np.ndarray:
@@ -153,28 +153,28 @@ def _normals_of(problems: Joint, unknowns: list, scales: list, width: float | No
     return [jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(len(unknowns))]
 
 
-def _share(effort: Effort, stage: int) -> float:
+def _share(budget: Budget, stage: int) -> float:
     """Of the frames that count in a stage."""
-    shares = (*effort.shares, 1.0)
+    shares = (*budget.shares, 1.0)
     return (shares[0], *shares)[stage]
 
 
-def _seen(problems: Joint, effort: Effort, stage: int) -> Joint:
+def _seen(problems: Joint, budget: Budget, stage: int) -> Joint:
     """The problems with those frames seen that count in a stage."""
-    share = _share(effort, stage)
+    share = _share(budget, stage)
     return problems if share == 1 else tuple(beginning(p, share) for p in problems)
 
 
-def _fresh(problems: Joint, effort: Effort, unknowns: list, scale: float, stage: int) -> Row:
+def _fresh(problems: Joint, budget: Budget, unknowns: list, scale: float, stage: int) -> Row:
     """Descents that begin at unknowns."""
     value = lambda number: jnp.asarray(number, float)
-    seen, scales = _seen(problems, effort, stage), [value(scale)] * len(unknowns)
-    normals = _normals_of(seen, unknowns, scales, effort.width)
+    seen, scales = _seen(problems, budget, stage), [value(scale)] * len(unknowns)
+    normals = _normals_of(seen, unknowns, scales, budget.width)
     rest = value(FIRST_DAMPING), value(gauss_newton.GROWTH), value(scale), jnp.asarray(stage)
     return [Descent(u, normal, *rest) for u, normal in zip(unknowns, normals, strict=True)]
 
 
-def _next(problems: Joint, effort: Effort, rows: list[Row]) -> Row | None:
+def _next(problems: Joint, budget: Budget, rows: list[Row]) -> Row | None:
     """The next iteration; None at the end."""
     row = rows[-1]
     _, best = _best(row)
@@ -182,11 +182,11 @@ def _next(problems: Joint, effort: Effort, rows: list[Row]) -> Row | None:
     stage = [r for r in rows if int(_best(r)[1].stage) == now]
     prior = _weight(problems, best.normal)
     moving = [i for i in _kept(row, len(stage)) if not _arrived(problems, stage, i, prior)]
-    if not moving or len(stage) > effort.iterations:
-        return _later(problems, effort, row)
-    seen = _seen(problems, effort, now)
+    if not moving or len(stage) > budget.iterations:
+        return _later(problems, budget, row)
+    seen = _seen(problems, budget, now)
     trials = [_propose(problems, row[i], prior) for i in moving]
-    tried = _normals_of(seen, trials, [row[i].scale for i in moving], effort.width)
+    tried = _normals_of(seen, trials, [row[i].scale for i in moving], budget.width)
     after = list(row)
     for i, trial, normal in zip(moving, trials, tried, strict=True):
         after[i] = _accept(problems, row[i], trial, normal, prior)
@@ -205,7 +205,7 @@ def _kept(row: Row, iteration: int) -> list[int]:
     return sorted(sorted(there, key=loss)[:count])
 
 
-def _later(problems: Joint, effort: Effort, row: Row) -> Row | None:
+def _later(problems: Joint, budget: Budget, row: Row) -> Row | None:
     """The next stage, to which only the best descent goes on; None after the last.
 
     From the second on outliers are left out, by what is unexplained: they lie to one side of a
@@ -213,19 +213,19 @@ def _later(problems: Joint, effort: Effort, row: Row) -> Row | None:
     """
     which, best = _best(row)
     stage = int(best.stage) + 1
-    if stage > len(effort.shares) + 1:
+    if stage > len(budget.shares) + 1:
         return None
     loose = best
-    if _share(effort, stage) != _share(effort, stage - 1):
-        (loose,) = _fresh(problems, effort, [best.unknown], 0.0, stage)
+    if _share(budget, stage) != _share(budget, stage - 1):
+        (loose,) = _fresh(problems, budget, [best.unknown], 0.0, stage)
     scale = float(np.clip(STRICT * float(loose.normal.spread), *SCALES))
     after = list(row)
-    (after[which],) = _fresh(problems, effort, [best.unknown], scale, stage)
+    (after[which],) = _fresh(problems, budget, [best.unknown], scale, stage)
     return after
 
 
 def spread_of(
-    problems: Joint, effort: Effort, end: Descent, key: PRNGKeyArray, true: bool = False
+    problems: Joint, budget: Budget, end: Descent, key: PRNGKeyArray, true: bool = False
 ) -> Float[np.ndarray, "unknown unknown"]:
     """The covariance of the unknown at the end of a descent, see `r2s.estimation.standard_errors`.
 
@@ -234,26 +234,26 @@ def spread_of(
     the frames are asked, the largest first. If these do not agree either, it is that of all frames.
     """
     found = []
-    for share in (1.0, *reversed(effort.shares)):
+    for share in (1.0, *reversed(budget.shares)):
         seen, here = problems, end
         if share < 1:
             seen = tuple(beginning(problem, share) for problem in problems)
-            normal = _normal(seen, end.unknown, end.scale, effort.width)
+            normal = _normal(seen, end.unknown, end.scale, budget.width)
             here = dataclasses.replace(end, normal=normal)
         prior = _weight(problems, here.normal)
-        near = _look_around(seen, effort, here, prior, key)
+        near = _look_around(seen, budget, here, prior, key)
         found.append(np.asarray(_covariance(problems, here, prior, near, true)))
         if not near or float(_apart(problems, here, prior, near)) < ROUGH:
             return found[-1]
     return found[0]
 
 
-def _look_around(problems: Joint, effort: Effort, end: Descent, prior, key) -> standard_errors.Near:
+def _look_around(problems: Joint, budget: Budget, end: Descent, prior, key) -> standard_errors.Near:
     """The normal equations at places around the end of a descent."""
-    if not effort.around:
+    if not budget.around:
         return []
-    places = list(_around(problems, end, prior, effort.around, key))
-    normals = _normals_of(problems, places, [end.scale] * len(places), effort.width)
+    places = list(_around(problems, end, prior, budget.around, key))
+    normals = _normals_of(problems, places, [end.scale] * len(places), budget.width)
     return list(zip(places, normals, strict=True))
 
 
@@ -286,11 +286,11 @@ def _stacked(row: Row) -> Descent:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *row)
 
 
-def _resumed(checkpoint: Path, identity: str, effort: Effort) -> list[Row]:
+def _resumed(checkpoint: Path, identity: str, budget: Budget) -> list[Row]:
     none, vector, square = (jnp.zeros((0,) * dims) for dims in (1, 2, 3))
     normal = Normal(none, none, vector, square, square)
     like = Descent(vector, normal, none, none, none, jnp.zeros(0, int))
-    each = lambda row: [jax.tree.map(lambda a, i=i: a[i], row) for i in range(effort.starts)]
+    each = lambda row: [jax.tree.map(lambda a, i=i: a[i], row) for i in range(budget.starts)]
     return [each(row) for row in load(checkpoint, identity, like)]
 
 
@@ -302,20 +302,20 @@ def collect(
     seconds: float,
 ) -> Estimate:
     """The estimate of the best descent of the last of some iterations, of a covariance."""
-    family = problems[0].family
+    space = problems[0].space
     _, best = _best(rows[-1])
     unknown = best.unknown
-    covariance = spread[: family.dim, : family.dim]
+    covariance = spread[: space.dim, : space.dim]
     deviation = np.sqrt(np.diag(covariance))
     # a place moves a parameter by its range: by that much, or by that ratio's logarithm
-    widths = [np.log(b.high / b.low) if b.log else b.high - b.low for b in family.ranges]
-    values_of = jax.vmap(jax.vmap(family.values))
-    places = jnp.stack([_stacked(row).unknown[:, : family.dim] for row in rows])
+    widths = [np.log(b.high / b.low) if b.log else b.high - b.low for b in space.ranges]
+    values_of = jax.vmap(jax.vmap(space.values))
+    places = jnp.stack([_stacked(row).unknown[:, : space.dim] for row in rows])
     return Estimate(
         approach=approach,
         fabric=fabric_at(problems[0], unknown[part_of(problems, 0)]),
-        ranges=family.ranges,
-        values=np.asarray(family.values(unknown[: family.dim])),
+        ranges=space.ranges,
+        values=np.asarray(space.values(unknown[: space.dim])),
         deviations=deviation * np.array(widths),
         correlation=covariance / np.outer(deviation, deviation),
         conditions=conditions(problems, np.asarray(unknown), np.sqrt(np.diag(spread))),
@@ -326,15 +326,13 @@ def collect(
     )
 
 
-def conditions(
-    problems: Joint, unknown: np.ndarray, deviation: np.ndarray
-) -> tuple[Condition, ...]:
+def conditions(problems: Joint, unknown: np.ndarray, deviation: np.ndarray) -> tuple[Nuisance, ...]:
     """What an unknown says of the recordings, where they were in doubt."""
     found, told = [], set()
     for which, problem in enumerate(problems):
         number = f" {which + 1}" if len(problems) > 1 else ""
-        places = part_of(problems, which)[problem.family.dim :]
-        rows = zip((*SHARED, *OWN), problem.doubt.scales, places, strict=True)
+        places = part_of(problems, which)[problem.space.dim :]
+        rows = zip((*SHARED, *OWN), problem.nuisance_prior.scales, places, strict=True)
         for name, scale, place in rows:
             if not scale or place in told:
                 continue
@@ -343,5 +341,5 @@ def conditions(
             if name in SHARED:  # the logarithm of a ratio
                 value, spread = float(np.exp(value)), float(np.exp(value)) * spread
             label = f"{name} ratio" if name in SHARED else name + number
-            found.append(Condition(label, UNITS.get(name, "-"), value, spread))
+            found.append(Nuisance(label, UNITS.get(name, "-"), value, spread))
     return tuple(found)

@@ -2,7 +2,7 @@
 
 After Sundaresan, Antonova and Bohg 2022 ("DiffCloud: Real-to-Sim from Point Clouds with
 Differentiable Simulation and Rendering of Deformable Objects"). `estimate` is r2s's default;
-`original` follows their recipe, `recipe` its optimiser and loss for all parameters of a family.
+`original` follows their recipe, `recipe` its optimiser and loss for all parameters of a space.
 """
 
 import dataclasses
@@ -12,14 +12,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation import adam
-from r2s.estimation.descent import DEFAULT, Effort, Progress, descend
+from r2s.estimation.descent import DEFAULT, Budget, Progress, descend
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import Joint
-from r2s.estimation.prediction import Seen
+from r2s.estimation.prediction import Prediction
 from r2s.estimation.problem import Problem
 from r2s.evaluation.losses import one_sided_chamfer
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import Family, Range
+from r2s.fabrics.parameters import ParameterSpace, Range
 from r2s.geometry.surface import sample
 
 STRETCH = Range("stretch multiplier", "-", 0.05, 10.0, log=False)
@@ -31,7 +31,7 @@ RECIPE = "Adam 0.2, 51 epochs, 3,200 samples, last frame"
 
 def estimate(
     problems: Problem | Joint,
-    effort: Effort = DEFAULT,
+    budget: Budget = DEFAULT,
     *,
     start: Float[Array, " dim"] | None = None,
     checkpoint: Path | None = None,
@@ -41,7 +41,7 @@ def estimate(
     """The fabric of a recording, or of several, by `r2s.estimation.descent.descend`."""
     return descend(
         problems,
-        effort,
+        budget,
         approach="diffcloud",
         start=start,
         checkpoint=checkpoint,
@@ -50,7 +50,7 @@ def estimate(
     )
 
 
-class Multiplied(Family):
+class Multiplied(ParameterSpace):
     """Fabrics that are an assumed one but for two multipliers, as in the DIFFCLOUD paper.
 
     One of all membrane stiffness, one of the mass (theirs of 20 listed vertices, ours of all).
@@ -74,7 +74,7 @@ class Multiplied(Family):
         return jnp.stack([stretch, MASS.place(fabric.density / self.assumed.density)])
 
 
-def last_frame(problem: Problem, seen: Seen) -> Float[Array, ""]:
+def last_frame(problem: Problem, seen: Prediction) -> Float[Array, ""]:
     """Mean squared distance [m^2] from samples of the simulated surface to the last cloud."""
     if problem.clouds is None:
         raise ValueError("the recipe of DIFFCLOUD compares clouds: the recording has none")
@@ -98,7 +98,7 @@ def original(
     One multiplies all membrane stiffness (0.05 to 10), one the mass (0.1 to 10), through a sigmoid
     from the middle of the range. The loss is `last_frame`. Gives no deviations.
     """
-    two = dataclasses.replace(problem, family=Multiplied(assumed=assumed))
+    two = dataclasses.replace(problem, space=Multiplied(assumed=assumed))
     name = f"diffcloud_original ({RECIPE})"
     return adam.descend(two, last_frame, approach=name, epochs=epochs, rate=rate, progress=progress)
 
@@ -111,7 +111,7 @@ def recipe(
     rate: float = RATE,
     progress: Progress | None = None,
 ) -> Estimate:
-    """The same optimiser and loss, for all parameters of the problem's family, from any start."""
+    """The same optimiser and loss, for all parameters of the problem's space, from any start."""
     return adam.descend(
         problem,
         last_frame,

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation import adam
-from r2s.estimation.descent import Effort, Progress, descend
+from r2s.estimation.descent import Budget, Progress, descend
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import Joint
-from r2s.estimation.prediction import Seen
+from r2s.estimation.prediction import Prediction
 from r2s.estimation.problem import Problem
 from r2s.evaluation.losses import surface_residuals
 from r2s.fabrics.fabric import Fabric
@@ -26,7 +26,7 @@ from r2s.scenarios.on_points import MEMBRANE_DAMPING, material_points
 WIDTH = 0.02  # of the range: the slope of the exact motion is rough below that
 FIRST = {"E h": 100.0, "nu": 0.1}  # where the public code starts
 EPOCHS, RATE = 51, 0.05
-DEFAULT = Effort(coarse=12, starts=2, width=WIDTH, around=4)
+DEFAULT = Budget(coarse=12, starts=2, width=WIDTH, around=4)
 
 
 def on_points(
@@ -35,7 +35,7 @@ def on_points(
     membrane_damping: float | None = MEMBRANE_DAMPING,
     forward_mode: bool = False,
 ) -> Problem:
-    """A problem whose motion is simulated by material points, stable for all of its family.
+    """A problem whose motion is simulated by material points, stable for all of its space.
 
     Arguments as of `r2s.scenarios.material_points`; `forward_mode` for exact sensitivities, which
     the default estimator does not need. A sheet that hangs is to be made with `as_seen=False`: the
@@ -48,12 +48,12 @@ def on_points(
 
 def stiffest(problem: Problem) -> Fabric:
     """The fabric at the upper ends of the ranges, which limits the time step."""
-    return problem.family(jnp.ones(problem.family.dim, float))
+    return problem.space(jnp.ones(problem.space.dim, float))
 
 
 def estimate(
     problems: Problem | Joint,
-    effort: Effort = DEFAULT,
+    budget: Budget = DEFAULT,
     *,
     start: Float[Array, " dim"] | None = None,
     checkpoint: Path | None = None,
@@ -69,7 +69,7 @@ def estimate(
             raise ValueError("DiffCP simulates material points: pass `diffcp.on_points(problem)`")
     return descend(
         problems,
-        effort,
+        budget,
         approach="diffcp",
         start=start,
         checkpoint=checkpoint,
@@ -78,7 +78,7 @@ def estimate(
     )
 
 
-def squared_third(problem: Problem, seen: Seen) -> Float[Array, ""]:
+def squared_third(problem: Problem, seen: Prediction) -> Float[Array, ""]:
     """A third of the mean squared distance [m^2] from the clouds to the surface: theirs."""
     if problem.clouds is None:
         raise ValueError("the recipe of DiffCP compares clouds: the recording has none")
@@ -109,7 +109,7 @@ def original(
     if not isinstance(problem.solver, Sheet):
         raise ValueError("DiffCP simulates material points: pass `diffcp.on_points(problem)`")
     if start is None:
-        pairs = [(bound, FIRST.get(bound.name)) for bound in problem.family.ranges]
+        pairs = [(bound, FIRST.get(bound.name)) for bound in problem.space.ranges]
         place = [0.5 if v is None else float(b.place(jnp.asarray(v, float))) for b, v in pairs]
         start = jnp.asarray(place, float)
     return adam.descend(

@@ -6,14 +6,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from r2s.fabrics.fabric import Fabric, constant_laws
-from r2s.fabrics.parameters import Family, Range
+from r2s.fabrics.parameters import ParameterSpace, Range
 from r2s.laws.plate import PlateBending
 
 FORMAT = "r2s-estimate/2"
 DETERMINED = 0.025  # standard deviation, relative or absolute: then 5 % are two of them
 
 
-class Condition(NamedTuple):
+class Nuisance(NamedTuple):
     """Something about a recording that was estimated along with the fabric.
 
     `deviation` is the standard deviation, in the unit of the value; NaN when there is none.
@@ -61,7 +61,7 @@ class Estimate:
     values: np.ndarray
     deviations: np.ndarray
     correlation: np.ndarray
-    conditions: tuple[Condition, ...]
+    conditions: tuple[Nuisance, ...]
     loss: float
     losses: np.ndarray
     history: np.ndarray
@@ -95,24 +95,24 @@ class Estimate:
         return found
 
 
-def without_deviations(
+def without_standard_errors(
     approach: str,
-    family: Family,
+    space: ParameterSpace,
     place: Any,
     loss: float,
     losses: np.ndarray,
     history: np.ndarray,
     seconds: float,
 ) -> Estimate:
-    """An estimate at a point of the family's unit cube, by a method that gives no deviations."""
-    unknown = np.full(family.dim, np.nan)
+    """An estimate at a point of the space's unit cube, by a method that gives no deviations."""
+    unknown = np.full(space.dim, np.nan)
     return Estimate(
         approach=approach,
-        fabric=family(place),
-        ranges=family.ranges,
-        values=np.asarray(family.values(place)),
+        fabric=space(place),
+        ranges=space.ranges,
+        values=np.asarray(space.values(place)),
         deviations=unknown,
-        correlation=np.full((family.dim, family.dim), np.nan),
+        correlation=np.full((space.dim, space.dim), np.nan),
         conditions=(),
         loss=loss,
         losses=losses,
@@ -232,7 +232,7 @@ def from_json(stored: dict[str, Any]) -> Estimate:
         deviations=_numbers([p["deviation"] for p in parameters.values()]),
         correlation=_numbers(stored["correlation"]),
         conditions=tuple(
-            Condition(**c | {"deviation": np.nan if c["deviation"] is None else c["deviation"]})
+            Nuisance(**c | {"deviation": np.nan if c["deviation"] is None else c["deviation"]})
             for c in stored["conditions"]
         ),
         loss=stored["loss"],

@@ -9,7 +9,7 @@ from r2s.estimation.estimate import Estimate
 from r2s.estimation.identifiability import sensitivity
 from r2s.estimation.problem import Problem
 from r2s.fabrics import presets
-from r2s.fabrics.parameters import OrthotropicFamily
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.scenarios import synthetic
 
 
@@ -35,8 +35,8 @@ def planned(
     seen = synthetic.sensing(experiment)._replace(noise=noise)
     key = jax.random.key(seed)
     recording = synthetic.record(experiment, chosen, fabric, seen=seen, key=key)
-    family = OrthotropicFamily.make(float(chosen.density))
-    return sensitivity(Problem.make(recording, family), chosen)
+    space = OrthotropicSpace.make(float(chosen.density))
+    return sensitivity(Problem.make(recording, space), chosen)
 
 
 def describe(estimate: Estimate) -> list[str]:

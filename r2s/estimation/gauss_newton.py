@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from r2s.estimation import normal_equations
-from r2s.estimation.prediction import Unknown, predict, sensitivities
+from r2s.estimation.prediction import Theta, predict, sensitivities
 from r2s.estimation.problem import OWN, SHARED, Problem
 
 Joint = tuple[Problem, ...]
@@ -66,12 +66,12 @@ class Descent(eqx.Module):
 
 def size(problems: Joint) -> int:
     """Of the unknown of some recordings of one fabric."""
-    return problems[0].family.dim + len(SHARED) + len(OWN) * len(problems)
+    return problems[0].space.dim + len(SHARED) + len(OWN) * len(problems)
 
 
 def part_of(problems: Joint, which: int) -> np.ndarray:
     """Where in the joint unknown that of one recording is."""
-    shared = problems[0].family.dim + len(SHARED)
+    shared = problems[0].space.dim + len(SHARED)
     first = shared + len(OWN) * which
     return np.concatenate([np.arange(shared), np.arange(first, first + len(OWN))])
 
@@ -84,7 +84,7 @@ def shares(problems: Joint) -> list[float]:
 
 def loss_at(
     problems: Joint,
-    unknown: Unknown,
+    unknown: Theta,
     loss: normal_equations.Loss | None = None,
     scale: normal_equations.Scale = 0.0,
 ) -> Float[Array, ""]:
@@ -104,7 +104,7 @@ def loss_at(
 
 def normal_at(
     problems: Joint,
-    unknown: Unknown,
+    unknown: Theta,
     scale: normal_equations.Scale = 0.0,
     width: float | None = None,
 ) -> Normal:
@@ -117,7 +117,7 @@ def normal_at(
     for which, (problem, share) in enumerate(zip(problems, shares(problems), strict=True)):
         index = part_of(problems, which)
         seen, slope = sensitivities(problem, unknown[index], width)
-        found = normal_equations.evidence_of(problem, seen, slope, scale)
+        found = normal_equations.normal_equations_of(problem, seen, slope, scale)
         losses.append(share * jnp.where(seen.ok, found.loss, jnp.inf))
         spreads.append(share * found.spread**2)
         zeros = jnp.zeros((len(found.scores), size(problems), size(problems)), unknown.dtype)
@@ -167,9 +167,9 @@ def _larger(one: Array, other: Array, metric: Array) -> Float[Array, "unknown un
     return (one + other + root @ absolute @ root.T) / 2
 
 
-def pull(problems: Joint, unknown: Unknown) -> tuple[Unknown, Unknown]:
+def pull(problems: Joint, unknown: Theta) -> tuple[Theta, Theta]:
     """Difference from the unknown that the prior expects, and the inverse of its variance."""
-    dim, rest = problems[0].family.dim, size(problems) - problems[0].family.dim
+    dim, rest = problems[0].space.dim, size(problems) - problems[0].space.dim
     expected = jnp.concatenate([jnp.full(dim, 0.5, float), jnp.zeros(rest, float)])
     spread = jnp.concatenate([jnp.full(dim, PRIOR_DEVIATION, float), jnp.ones(rest, float)])
     return unknown - expected, 1 / spread**2
@@ -214,19 +214,19 @@ def _equations(problems: Joint, descent: Descent, prior):
     off, precision = pull(problems, unknown)
     gradient = descent.normal.gradient + prior * precision * off
     matrix = descent.normal.matrix + prior * jnp.diag(precision)
-    bounded = jnp.arange(unknown.shape[0]) < problems[0].family.dim
+    bounded = jnp.arange(unknown.shape[0]) < problems[0].space.dim
     stuck = bounded & (unknown <= MARGIN) & (gradient > 0)
     stuck |= bounded & (unknown >= 1 - MARGIN) & (gradient < 0)
     return gradient, matrix, stuck
 
 
-def propose(problems: Joint, descent: Descent, prior) -> Unknown:
+def propose(problems: Joint, descent: Descent, prior) -> Theta:
     """The next unknown to try: a damped Gauss-Newton step, within the unit cube.
 
     What runs into a bound stays there, and the other unknowns take the step alone.
     """
     unknown = descent.unknown
-    bounded = jnp.arange(unknown.shape[0]) < problems[0].family.dim
+    bounded = jnp.arange(unknown.shape[0]) < problems[0].space.dim
     gradient, matrix, stuck = _equations(problems, descent, prior)
     damped = matrix + descent.damping * jnp.diag(jnp.diag(matrix))
     pinned = jnp.where(stuck[:, None] | stuck[None], jnp.diag(jnp.diag(damped)), damped)
@@ -237,7 +237,7 @@ def propose(problems: Joint, descent: Descent, prior) -> Unknown:
     return jnp.where(bounded, inside, unknown + change)
 
 
-def accept(problems: Joint, descent: Descent, trial: Unknown, tried: Normal, prior) -> Descent:
+def accept(problems: Joint, descent: Descent, trial: Theta, tried: Normal, prior) -> Descent:
     """The descent after a trial: moved if that lowers the objective, else damped more."""
     new = objective(problems, trial, tried.loss, prior)
     old = objective(problems, descent.unknown, descent.normal.loss, prior)

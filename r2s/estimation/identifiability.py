@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from r2s.estimation import descent, gauss_newton
-from r2s.estimation.descent import Effort
+from r2s.estimation.descent import Budget
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import Descent, Joint
 from r2s.estimation.problem import Problem
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import Family, Range
+from r2s.fabrics.parameters import ParameterSpace, Range
 
 NOISE = 3e-3  # [m]: beyond which a distance counts as an outlier's
 
@@ -28,9 +28,9 @@ def sensitivity(problems: Problem | Joint, fabric: Fabric) -> Estimate:
     planned and the cameras that there are. Raises `RuntimeError` when the simulation diverges.
     """
     problems = (problems,) if isinstance(problems, Problem) else problems
-    family = problems[0].family
-    place = jnp.clip(family.locate(fabric), gauss_newton.MARGIN, 1 - gauss_newton.MARGIN)
-    rest = jnp.zeros(gauss_newton.size(problems) - family.dim, float)
+    space = problems[0].space
+    place = jnp.clip(space.locate(fabric), gauss_newton.MARGIN, 1 - gauss_newton.MARGIN)
+    rest = jnp.zeros(gauss_newton.size(problems) - space.dim, float)
     unknown = jnp.concatenate([place, rest])
     scale = jnp.asarray(NOISE, float)
     normal = _normal(problems, unknown, scale)
@@ -45,30 +45,30 @@ def sensitivity(problems: Problem | Joint, fabric: Fabric) -> Estimate:
 _normal = eqx.filter_jit(gauss_newton.normal_at)
 
 
-class Fixed(Family):
-    """A family with one parameter fixed at a place.
+class Fixed(ParameterSpace):
+    """A space with one parameter fixed at a place.
 
     - `family`: the whole one; `which`: the parameter; `place`: where, in 0..1.
     """
 
-    family: Family
+    space: ParameterSpace
     place: Float[Array, ""]
     which: int = eqx.field(static=True)
     ranges: tuple[Range, ...] = eqx.field(static=True)
 
     @classmethod
-    def make(cls, family: Family, which: int, place: Any) -> "Fixed":
-        """The family with its parameter number `which` at a `place` in 0..1."""
-        ranges = tuple(r for i, r in enumerate(family.ranges) if i != which)
-        return cls(family=family, place=jnp.asarray(place, float), which=which, ranges=ranges)
+    def make(cls, space: ParameterSpace, which: int, place: Any) -> "Fixed":
+        """The space with its parameter number `which` at a `place` in 0..1."""
+        ranges = tuple(r for i, r in enumerate(space.ranges) if i != which)
+        return cls(space=space, place=jnp.asarray(place, float), which=which, ranges=ranges)
 
     def __call__(self, u: Float[Array, " dim"]) -> Fabric:
         """The fabric at a point of the smaller unit cube."""
-        return self.family(jnp.insert(u, self.which, self.place))
+        return self.space(jnp.insert(u, self.which, self.place))
 
     def locate(self, fabric: Fabric) -> Float[Array, " dim"]:
         """The point where a fabric lies, but for what is fixed."""
-        return jnp.delete(self.family.locate(fabric), self.which, assume_unique_indices=True)
+        return jnp.delete(self.space.locate(fabric), self.which, assume_unique_indices=True)
 
 
 def profile(
@@ -84,24 +84,24 @@ def profile(
     does not determine the parameter. Raises `ValueError` for an unknown name.
     """
     problems = (problems,) if isinstance(problems, Problem) else problems
-    family = problems[0].family
-    names = [bound.name for bound in family.ranges]
+    space = problems[0].space
+    names = [bound.name for bound in space.ranges]
     if name not in names:
         raise ValueError(f"no parameter {name!r}: the estimate has {', '.join(names)}")
     which = names.index(name)
-    places = [float(family.ranges[which].place(jnp.asarray(v, float))) for v in values]
-    centre = float(family.locate(estimate.fabric)[which])
+    places = [float(space.ranges[which].place(jnp.asarray(v, float))) for v in values]
+    centre = float(space.locate(estimate.fabric)[which])
     order = sorted(range(len(values)), key=lambda i: abs(places[i] - centre))
     losses = np.full(len(values), np.nan)
     starts = {-1: estimate.fabric, 1: estimate.fabric}
-    effort = Effort(coarse=0, starts=1, iterations=iterations, around=0)
+    budget = Budget(coarse=0, starts=1, iterations=iterations, around=0)
     for i in order:
         side = 1 if places[i] >= centre else -1
-        held = Fixed.make(family, which, places[i])
-        fixed = tuple(dataclasses.replace(problem, family=held) for problem in problems)
+        held = Fixed.make(space, which, places[i])
+        fixed = tuple(dataclasses.replace(problem, space=held) for problem in problems)
         found = descent.descend(
             fixed,
-            effort,
+            budget,
             approach="profile",
             start=jnp.clip(held.locate(starts[side]), 0.001, 0.999),
             key=jax.random.key(0),

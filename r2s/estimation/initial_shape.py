@@ -17,9 +17,9 @@ from jaxtyping import Array, Bool, Float
 from r2s.evaluation.losses import TOUCHING, length, robust_weight, surface_residuals
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh
-from r2s.scenarios.scenario import Scenario, motion
+from r2s.scenarios.scenario import Scenario, rollout
 
-_motion = eqx.filter_jit(motion)
+_motion = eqx.filter_jit(rollout)
 
 ROUNDS = 60  # in which the nearest places settle
 SMOOTH, STRETCHED = 0.02, 0.1  # weights of neighbours moving apart, and of edges growing longer

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from r2s.estimation.prediction import Seen, Slope
+from r2s.estimation.prediction import Prediction, Sensitivity
 from r2s.estimation.problem import FORCE_SCALE, Clouds, Force, Markers, Problem
 from r2s.evaluation.losses import (
     length,
@@ -20,7 +20,7 @@ from r2s.evaluation.losses import (
 from r2s.geometry.mesh import Mesh, borders
 
 Scale = Float[Array, ""] | float
-Loss = Callable[[Problem, Seen], Float[Array, ""]]  # [m^2]
+Loss = Callable[[Problem, Prediction], Float[Array, ""]]  # [m^2]
 
 PATCHES = 3  # along a side of the sheet: what lies in one patch errs alike
 MEMORY = 8  # frames, in which it does so
@@ -28,7 +28,7 @@ SLACK = 3e-3  # [m], which noise seldom throws a point of a depth camera beyond 
 FLATTEST = 0.3  # curvature of a robust loss over the mean weight, at least
 
 
-class Evidence(eqx.Module):
+class NormalEquations(eqx.Module):
     """A loss with its normal equations, by clusters: what errs alike.
 
     A patch of the sheet over some frames, a marker, or a force over some frames.
@@ -47,7 +47,7 @@ class Evidence(eqx.Module):
     noise: Float[Array, " cluster"]
 
 
-def loss_of(problem: Problem, seen: Seen, scale: Scale = 0.0) -> Float[Array, ""]:
+def loss_of(problem: Problem, seen: Prediction, scale: Scale = 0.0) -> Float[Array, ""]:
     """The robust mean [m^2] of all that was seen.
 
     For `scale` [m] see `r2s.evaluation.losses.robust`.
@@ -65,7 +65,9 @@ def loss_of(problem: Problem, seen: Seen, scale: Scale = 0.0) -> Float[Array, ""
     return total
 
 
-def evidence_of(problem: Problem, seen: Seen, slope: Slope, scale: Scale = 0.0) -> Evidence:
+def normal_equations_of(
+    problem: Problem, seen: Prediction, slope: Sensitivity, scale: Scale = 0.0
+) -> NormalEquations:
     """Loss and normal equations of all that was seen, from a prediction and its derivative."""
     mesh = problem.scenario.scene.mesh
     parts = []
@@ -75,7 +77,7 @@ def evidence_of(problem: Problem, seen: Seen, slope: Slope, scale: Scale = 0.0) 
         parts.append(_of_markers(problem.markers, seen, slope, scale))
     if problem.force is not None and seen.force is not None and slope.force is not None:
         parts.append(_of_force(problem.force, seen.force, slope.force))
-    return Evidence(
+    return NormalEquations(
         loss=sum((part.loss for part in parts), jnp.zeros((), seen.x.dtype)),
         spread=parts[0].spread,
         scores=jnp.concatenate([part.scores for part in parts]),
@@ -84,7 +86,9 @@ def evidence_of(problem: Problem, seen: Seen, slope: Slope, scale: Scale = 0.0) 
     )
 
 
-def _of_clouds(clouds: Clouds, mesh: Mesh, seen: Seen, slope: Slope, scale) -> Evidence:
+def _of_clouds(
+    clouds: Clouds, mesh: Mesh, seen: Prediction, slope: Sensitivity, scale
+) -> NormalEquations:
     distance, direction, vertices, weights = _residuals(clouds, mesh, seen, scale)
     weight = _weights(distance, clouds.mask, scale)
 
@@ -99,7 +103,7 @@ def _of_clouds(clouds: Clouds, mesh: Mesh, seen: Seen, slope: Slope, scale) -> E
     return _of_robust(distance, clouds.mask, scale, *(_by_time(share) for share in shares))
 
 
-def _of_markers(markers: Markers, seen: Seen, slope: Slope, scale) -> Evidence:
+def _of_markers(markers: Markers, seen: Prediction, slope: Sensitivity, scale) -> NormalEquations:
     """Each marker is a cluster: where the first frame shows it wrongly, it is wrong in them all."""
     gap = _gaps(markers, seen.x)
     distance = length(gap)
@@ -111,14 +115,14 @@ def _of_markers(markers: Markers, seen: Seen, slope: Slope, scale) -> Evidence:
     return _of_robust(distance, markers.seen, scale, scores, matrices)
 
 
-def _of_force(force: Force, pulled: Array, slope: Array) -> Evidence:
+def _of_force(force: Force, pulled: Array, slope: Array) -> NormalEquations:
     gap, count = _force_gaps(force, pulled), jnp.sum(force.seen, dtype=float)
     jacobian = jnp.where(force.seen[:, None, None], FORCE_SCALE * slope, 0)
     scores = jnp.einsum("fd,fdu->fu", gap, jacobian) / count
     matrices = jnp.einsum("fdu,fdv->fuv", jacobian, jacobian) / count
     matrices = _by_time(matrices[:, None])
     square = jnp.sum(gap**2) / (count * gap.shape[1])
-    return Evidence(
+    return NormalEquations(
         loss=_force_loss(force, gap),
         spread=jnp.sqrt(square),
         scores=_by_time(scores[:, None]),
@@ -136,7 +140,7 @@ def _weights(distance: Float[Array, "frame point"], mask, scale: Scale) -> Array
     return jnp.where(mask, robust_weight(distance, scale), 0) / jnp.sum(mask, dtype=float)
 
 
-def _of_robust(distance, mask, scale: Scale, scores: Array, matrices: Array) -> Evidence:
+def _of_robust(distance, mask, scale: Scale, scores: Array, matrices: Array) -> NormalEquations:
     """The evidence of distances, from the shares of the clusters in their weighted squares.
 
     Their matrix is steeper than the robust loss is curved: by the ratio of its mean curvature to
@@ -148,7 +152,7 @@ def _of_robust(distance, mask, scale: Scale, scores: Array, matrices: Array) -> 
     curvature = jnp.clip(curvature, FLATTEST * weight, weight)
     square = masked_mean((robust_weight(distance, scale) * distance) ** 2, mask)
     matrices = matrices * (curvature / weight)
-    return Evidence(
+    return NormalEquations(
         loss=masked_mean(robust(distance, scale), mask),
         spread=_spread(distance, mask),
         scores=scores,
@@ -181,7 +185,7 @@ def _by_time(shares: Float[Array, "frame patch *rest"]) -> Float[Array, " *clust
     return blocks.reshape(-1, *shares.shape[2:])
 
 
-def _residuals(clouds: Clouds, mesh: Mesh, seen: Seen, scale: Scale):
+def _residuals(clouds: Clouds, mesh: Mesh, seen: Prediction, scale: Scale):
     """Of every frame, `surface_residuals`; one frame at a time, which fits the cache.
 
     With slack at the borders where outliers are left out, and a small bias would show.

@@ -1,6 +1,6 @@
 """What a recording would show if the sheet were of a given fabric, and how that changes with it.
 
-An unknown is a flat vector: the fabric's place in its family; then the density of the sheet and of
+An unknown is a flat vector: the fabric's place in its space; then the density of the sheet and of
 the air, which all recordings of a fabric share; then of every recording the cameras' shift, turn
 and clock. All but the place are in units of their standard deviation, as `Doubt` has them.
 """
@@ -14,13 +14,13 @@ from jaxtyping import Array, Bool, Float
 
 from r2s.estimation.problem import OWN, SHARED, Problem
 from r2s.fabrics.fabric import Fabric
-from r2s.scenarios.energy_balance import account, clamp_force
-from r2s.scenarios.scenario import motion
+from r2s.scenarios.energy import clamp_force, energy_balance
+from r2s.scenarios.scenario import rollout
 
-Unknown = Float[Array, " unknown"]
+Theta = Float[Array, " unknown"]
 
 
-class Seen(eqx.Module):
+class Prediction(eqx.Module):
     """- `x`: vertices in the frame and on the clock of the cameras, at the frames that count, [m].
     - `force`: on the pulled clamp then, [N]; None: it was not measured.
     - `ok`: whether the whole run is finite.
@@ -31,7 +31,7 @@ class Seen(eqx.Module):
     ok: Bool[Array, ""]
 
 
-class Slope(eqx.Module):
+class Sensitivity(eqx.Module):
     """The derivative of what is seen in the unknown."""
 
     x: Float[Array, "frame vertex 3 unknown"]
@@ -40,33 +40,33 @@ class Slope(eqx.Module):
 
 def size(problem: Problem) -> int:
     """Of the unknown of one recording."""
-    return problem.family.dim + len(SHARED) + len(OWN)
+    return problem.space.dim + len(SHARED) + len(OWN)
 
 
-def fabric_at(problem: Problem, unknown: Unknown) -> Fabric:
+def fabric_at(problem: Problem, unknown: Theta) -> Fabric:
     """The fabric that an unknown says, with its density."""
-    fabric = problem.family(unknown[: problem.family.dim])
-    ratio = jnp.exp(problem.doubt.density * unknown[problem.family.dim])
+    fabric = problem.space(unknown[: problem.space.dim])
+    ratio = jnp.exp(problem.nuisance_prior.density * unknown[problem.space.dim])
     return dataclasses.replace(fabric, density=fabric.density * ratio)
 
 
-def predict(problem: Problem, unknown: Unknown) -> Seen:
+def predict(problem: Problem, unknown: Theta) -> Prediction:
     """What the recording would show."""
     (x, force), ok = _move(problem, unknown)
-    return Seen(_seen_from(problem, x, unknown), force, ok)
+    return Prediction(_seen_from(problem, x, unknown), force, ok)
 
 
 def sensitivities(
-    problem: Problem, unknown: Unknown, width: float | None = None
-) -> tuple[Seen, Slope]:
+    problem: Problem, unknown: Theta, width: float | None = None
+) -> tuple[Prediction, Sensitivity]:
     """What the recording would show, and its derivative in the unknown.
 
     Exact, by forward mode; or, with a `width`, the slope of the secant over that much of every
     parameter's range, which does not see what is rougher.
     """
-    physical = problem.family.dim + len(SHARED)
-    doubts = problem.doubt.density, problem.doubt.air
-    moved = [*range(problem.family.dim), *(problem.family.dim + i for i in (0, 1) if doubts[i])]
+    physical = problem.space.dim + len(SHARED)
+    doubts = problem.nuisance_prior.density, problem.nuisance_prior.air
+    moved = [*range(problem.space.dim), *(problem.space.dim + i for i in (0, 1) if doubts[i])]
     index = jnp.array(moved)
     shift = lambda change: _move(problem, unknown.at[index].add(change))
     if width is None:
@@ -74,7 +74,7 @@ def sensitivities(
             lambda change: (lambda out: (out[0], out))(shift(change)), has_aux=True
         )(jnp.zeros(len(moved), unknown.dtype))
     else:
-        slope, ((x, force), ok) = _secants(shift, unknown[index], width, problem.family.dim)
+        slope, ((x, force), ok) = _secants(shift, unknown[index], width, problem.space.dim)
     spread = lambda part: (
         jnp.zeros((*part.shape[:-1], size(problem)), part.dtype).at[..., index].set(part)
     )
@@ -85,8 +85,8 @@ def sensitivities(
     )(slope_x[..., :physical])
     own = jax.jacfwd(lambda unknown: _seen_from(problem, x, unknown))(unknown)[..., physical:]
     return (
-        Seen(seen_from(x), force, ok),
-        Slope(jnp.concatenate([turned, own], axis=-1), slope_force),
+        Prediction(seen_from(x), force, ok),
+        Sensitivity(jnp.concatenate([turned, own], axis=-1), slope_force),
     )
 
 
@@ -111,33 +111,35 @@ def _secants(shift, place, width: float, dim: int):
     return jax.tree.map(along, moved), (first, jnp.all(ok))
 
 
-def _move(problem: Problem, unknown: Unknown):
+def _move(problem: Problem, unknown: Theta):
     """Vertices at all frames [m] and the clamp's force at those that count [N]; whether finite."""
     fabric = fabric_at(problem, unknown)
-    ratio = jnp.exp(problem.doubt.air * unknown[problem.family.dim + 1])
+    ratio = jnp.exp(problem.nuisance_prior.air * unknown[problem.space.dim + 1])
     thicken = lambda part: eqx.tree_at(
         lambda part: part.scene.air.density, part, replace_fn=lambda density: density * ratio
     )
     scenario = thicken(problem.scenario)
     solver = None if problem.solver is None else thicken(problem.solver)
     if problem.force is None:
-        moved = motion(scenario, fabric, solver=solver)
+        moved = rollout(scenario, fabric, solver=solver)
         return (moved.x, None), jnp.all(moved.ok)
-    found = account(scenario, fabric, solver=solver)
+    found = energy_balance(scenario, fabric, solver=solver)
     force = clamp_force(scenario, found)[jnp.array(problem.frames)]
     return (found.x, force @ problem.force.directions.T), jnp.all(jnp.isfinite(found.x))
 
 
-def _seen_from(problem: Problem, x: Float[Array, "all 3"] | Array, unknown: Unknown):
+def _seen_from(problem: Problem, x: Float[Array, "all 3"] | Array, unknown: Theta):
     """Vertices of all frames in the cameras' frame, at the frames that count of their clock."""
-    doubt, own = problem.doubt, unknown[problem.family.dim + len(SHARED) :]
-    x = _delayed(x, doubt.time * own[4] / problem.scenario.interval)[jnp.array(problem.frames)]
+    nuisance_prior, own = problem.nuisance_prior, unknown[problem.space.dim + len(SHARED) :]
+    x = _delayed(x, nuisance_prior.time * own[4] / problem.scenario.interval)[
+        jnp.array(problem.frames)
+    ]
     pivot = x[:, problem.scenario.scene.held[:1]]
-    cosine, sine = jnp.cos(doubt.turn * own[3]), jnp.sin(doubt.turn * own[3])
+    cosine, sine = jnp.cos(nuisance_prior.turn * own[3]), jnp.sin(nuisance_prior.turn * own[3])
     turn = jnp.stack([jnp.stack([cosine, -sine]), jnp.stack([sine, cosine])])
     offset = x - pivot
     turned = jnp.concatenate([offset[..., :2] @ turn.T, offset[..., 2:]], axis=-1)
-    return pivot + turned + doubt.shift * own[None, None, :3]
+    return pivot + turned + nuisance_prior.shift * own[None, None, :3]
 
 
 def _delayed(x: Float[Array, "all vertex 3"], delay: Float[Array, ""]) -> Array:

@@ -1,4 +1,4 @@
-"""What an estimator is given: a recording to be explained by a member of a family."""
+"""What an estimator is given: a recording to be explained by a member of a space."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s.estimation import initial_shape
-from r2s.fabrics.parameters import Family
+from r2s.fabrics.parameters import ParameterSpace
 from r2s.geometry.mesh import Mesh
 from r2s.geometry.surface import nearest
 from r2s.recordings.recording import Recording, subsample
@@ -18,7 +18,7 @@ from r2s.scenarios.scenario import Scenario, from_recording
 FORCE_SCALE = 0.02  # [m/N]: a load cell is good to 10 mN where a marker is to 0.2 mm
 
 
-class Doubt(NamedTuple):
+class NuisancePrior(NamedTuple):
     """How far what was written down of an experiment may be off: standard deviations; 0: exact.
 
     It is estimated along with the fabric, so that an error of calibration is not taken for a
@@ -43,14 +43,14 @@ class Doubt(NamedTuple):
         return (self.density, self.air, *(self.shift,) * 3, self.turn, self.time)
 
 
-USUAL = Doubt()
+USUAL = NuisancePrior()
 WIND = 0.1  # of its force: 5 % of its speed, or as much as is known of a fabric's drag
 SHARED: tuple[str, ...] = ("density", "air")  # by all recordings of a fabric
 OWN: tuple[str, ...] = ("shift x", "shift y", "shift z", "turn", "time")  # of one recording
 UNITS = {"shift x": "m", "shift y": "m", "shift z": "m", "turn": "rad", "time": "s"}
 
 
-def usual(scenario: Scenario) -> Doubt:
+def default_nuisance_prior(scenario: Scenario) -> NuisancePrior:
     """What is in doubt if nothing is said: the cameras' place, and the force of a wind that blows.
 
     A sheet in wind weighs the air against its density to a part in five thousand. Were both taken
@@ -84,7 +84,7 @@ class Force(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """A recording to be explained by a member of a family.
+    """A recording to be explained by a member of a space.
 
     - `scenario`: how the sheet is held and moved.
     - `family`: the fabrics to choose from.
@@ -95,25 +95,25 @@ class Problem(eqx.Module):
     """
 
     scenario: Scenario
-    family: Family
+    space: ParameterSpace
     frames: tuple[int, ...] = eqx.field(static=True)
     clouds: Clouds | None = None
     markers: Markers | None = None
     force: Force | None = None
     solver: Any = None
-    doubt: Doubt = eqx.field(static=True, default=USUAL)
+    nuisance_prior: NuisancePrior = eqx.field(static=True, default=USUAL)
 
     @classmethod
     def make(
         cls,
         recording: Recording,
-        family: Family,
+        space: ParameterSpace,
         *,
         num_points: int = 300,
         voxel: float | None = None,
         shape: tuple[int, int] = (9, 9),
         seed: int = 0,
-        doubt: Doubt | None = None,
+        nuisance_prior: NuisancePrior | None = None,
         solver: Any = None,
         as_seen: bool = True,
     ) -> "Problem":
@@ -121,10 +121,10 @@ class Problem(eqx.Module):
 
         `voxel` [m] as of `r2s.recordings.recording.subsample`, `shape` the vertices of the
         simulated sheet. Where markers were tracked they count instead of the clouds, and the force
-        on the pulled clamp counts where it was measured. `doubt` is by default `usual`. A sheet
-        that hangs starts in the shape that the first cloud shows, see
-        `r2s.estimation.initial_shape`, unless not `as_seen`: then flat. Raises `ValueError` when a
-        marker is not seen in the first frame, or lies off the sheet there.
+        on the pulled clamp counts where it was measured. `nuisance_prior` is by default
+        `default_nuisance_prior`. A sheet that hangs starts in the shape that the first cloud shows,
+        see `r2s.estimation.initial_shape`, unless not `as_seen`: then flat. Raises `ValueError`
+        when a marker is not seen in the first frame, or lies off the sheet there.
         """
         scenario = from_recording(recording, shape)
         first, last = recording.info.frames_used
@@ -135,17 +135,17 @@ class Problem(eqx.Module):
             thinned = subsample(recording, num_points, voxel, seed)
             clouds = Clouds(thinned.points[frames], thinned.mask[frames])
             if as_seen and scenario.brake is not None and first == 0:
-                middle = family(jnp.full(family.dim, 0.5, float))
+                middle = space(jnp.full(space.dim, 0.5, float))
                 scenario = initial_shape.as_seen(scenario, middle, clouds.points[0], clouds.mask[0])
         return cls(
             scenario,
-            family,
+            space,
             tuple(range(first, last + 1)),
             clouds,
             markers,
             _force(recording, frames) if recording.info.scenario == "stretching" else None,
             solver,
-            usual(scenario) if doubt is None else doubt,
+            default_nuisance_prior(scenario) if nuisance_prior is None else nuisance_prior,
         )
 
 

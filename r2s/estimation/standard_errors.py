@@ -5,11 +5,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation.gauss_newton import MARGIN, Descent, Joint, Normal, pull
-from r2s.estimation.prediction import Unknown
+from r2s.estimation.prediction import Theta
 
 FARTHEST = 2.0  # times the median
 
-Near = list[tuple[Unknown, Normal]]  # unknowns around the end, and what is there
+Near = list[tuple[Theta, Normal]]  # unknowns around the end, and what is there
 
 
 def covariance(
@@ -53,7 +53,7 @@ def around(
     spread, root = _sandwich(problems, end, prior)
     signs = jax.random.rademacher(key, (count // 2, len(spread)), spread.dtype)
     places = end.unknown[None] + jnp.concatenate([signs, -signs]) @ root.T
-    bounded = jnp.arange(len(spread)) < problems[0].family.dim
+    bounded = jnp.arange(len(spread)) < problems[0].space.dim
     return jnp.where(bounded[None], jnp.clip(places, MARGIN, 1 - MARGIN), places)
 
 
@@ -74,7 +74,7 @@ def _led(problems: Joint, end: Descent, prior, near: Near) -> Float[Array, "plac
     Nowhere from a run that diverged, or whose derivatives did.
     """
 
-    def led(unknown: Unknown, normal: Normal) -> Unknown:
+    def led(unknown: Theta, normal: Normal) -> Theta:
         off, precision = pull(problems, unknown)
         matrix = normal.matrix + prior * jnp.diag(precision)
         step = jnp.linalg.solve(matrix, normal.gradient + prior * precision * off)

@@ -9,12 +9,12 @@ from r2s.evaluation import metrics
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.surface import sample
 from r2s.recordings.recording import Recording, cloud
-from r2s.scenarios.scenario import from_recording, motion
+from r2s.scenarios.scenario import from_recording, rollout
 
 SAMPLES = 9  # squared, on each face: 10,368 points on 128 faces, the study's 10,000
 UNITS = {"paper_chamfer": "-", "paper_hausdorff": "-"}  # all others are in metres
 
-_motion = eqx.filter_jit(motion)  # compiled once for all recordings of as many frames and knots
+_motion = eqx.filter_jit(rollout)  # compiled once for all recordings of as many frames and knots
 _sample = eqx.filter_jit(eqx.filter_vmap(sample, in_axes=(0, None, None)))
 
 

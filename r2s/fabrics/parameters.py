@@ -1,6 +1,6 @@
 """Families: which numbers of a fabric an estimator may move, and within which bounds.
 
-A family maps a point of the unit cube to a fabric, so that one flat vector serves gradients,
+A space maps a point of the unit cube to a fabric, so that one flat vector serves gradients,
 sensitivities, multi-start and sampling.
 """
 
@@ -54,7 +54,7 @@ class Range:
 MASS_DAMPING = Range("mass damping", "1/s", 1e-2, 10.0)
 
 
-class Family(eqx.Module):
+class ParameterSpace(eqx.Module):
     """Which fabrics an estimator may choose from: a map from the unit cube to them."""
 
     ranges: eqx.AbstractVar[tuple[Range, ...]]
@@ -81,7 +81,7 @@ class Family(eqx.Module):
         return self(jnp.full(self.dim, 0.5, float))
 
 
-class OrthotropicFamily(Family):
+class OrthotropicSpace(ParameterSpace):
     """Fabrics of one areal density, in all that a motion may determine.
 
     Stiffness in a uniaxial pull along warp and weft [N/m], which is C11 and C22 less C12^2 over the
@@ -113,8 +113,8 @@ class OrthotropicFamily(Family):
     @classmethod
     def make(
         cls, density: float, thickness: float = 1e-3, mass_damping: Range | None = None
-    ) -> "OrthotropicFamily":
-        """The family of an areal density [kg/m^2] and a thickness [m], which must be positive.
+    ) -> "OrthotropicSpace":
+        """The space of an areal density [kg/m^2] and a thickness [m], which must be positive.
 
         `mass_damping`, for example `MASS_DAMPING`, makes that one of its parameters. What brakes
         rigid motion is hard to tell from the air's drag, so by default it is not.
@@ -124,10 +124,10 @@ class OrthotropicFamily(Family):
                 f"areal density and thickness must be positive, got {density} kg/m^2 and "
                 f"{thickness} m"
             )
-        family = cls(density=jnp.asarray(density, float), thickness=jnp.asarray(thickness, float))
+        space = cls(density=jnp.asarray(density, float), thickness=jnp.asarray(thickness, float))
         if mass_damping is None:
-            return family
-        return dataclasses.replace(family, ranges=(*family.ranges, mass_damping))
+            return space
+        return dataclasses.replace(space, ranges=(*space.ranges, mass_damping))
 
     def __call__(self, u: Float[Array, " dim"]) -> Fabric:
         """The fabric at a point of the unit cube."""
@@ -155,7 +155,7 @@ class OrthotropicFamily(Family):
         return jnp.stack(places)
 
 
-class IsotropicFamily(Family):
+class IsotropicSpace(ParameterSpace):
     """Isotropic sheets, as DiffCP has them: Young's modulus times thickness [N/m], Poisson's ratio.
 
     The bending stiffness is that of a solid plate of the same modulus and some `plate` thickness
@@ -180,8 +180,8 @@ class IsotropicFamily(Family):
         damping: float = 0.01,
         friction: float = 0.5,
         thickness: float = 1e-3,
-    ) -> "IsotropicFamily":
-        """The family of these numbers, of which all but damping and friction must be positive."""
+    ) -> "IsotropicSpace":
+        """The space of these numbers, of which all but damping and friction must be positive."""
         if not min(density, plate, thickness) > 0 or min(damping, friction) < 0:
             raise ValueError(
                 "areal density [kg/m^2], plate and contact thickness [m] must be positive, damping "

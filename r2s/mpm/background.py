@@ -8,11 +8,11 @@ from jaxtyping import Array, Float
 from r2s.mpm.grid import Grid
 from r2s.mpm.transfer import (
     affine_factor,
-    collect,
-    collect_plain,
-    spread,
-    spread_few,
-    spread_plain,
+    g2p,
+    g2p_plain,
+    p2g,
+    p2g_few,
+    p2g_plain,
 )
 from r2s.units import GRAVITY
 from r2s.world.contact import SLIP_SPEED, Table
@@ -92,7 +92,7 @@ class Background(eqx.Module):
             still = jnp.zeros_like(affine[:, :1])
             values = jnp.concatenate([momentum, mass[:, None]], axis=1)
             slopes = jnp.concatenate([affine, still], axis=1)
-            nodes = (spread_plain if self.forward_mode else spread)(self.grid, x, values, slopes)
+            nodes = (p2g_plain if self.forward_mode else p2g)(self.grid, x, values, slopes)
         floor = self.mass_floor * jnp.mean(mass)
         with jax.named_scope("grid"):
             v = quotient(nodes[:, :-1], nodes[:, -1:] + floor)
@@ -102,7 +102,7 @@ class Background(eqx.Module):
                 v = self._gripped(v, nodes[:, -1:], floor, held)
             v = self._walled(self._on_table(v, friction))
         with jax.named_scope("grid_to_particles"):
-            get = collect_plain if self.forward_mode else collect
+            get = g2p_plain if self.forward_mode else g2p
             v, moment = get(self.grid, x, v)
         return v, affine_factor(self.grid) * moment
 
@@ -112,7 +112,7 @@ class Background(eqx.Module):
         Nodes that are held only in part give way, so that the body would creep out of the grip.
         """
         values = jnp.concatenate([held.mass[:, None] * held.v, held.mass[:, None]], axis=1)
-        nodes = spread_few(self.grid, held.x, values)
+        nodes = p2g_few(self.grid, held.x, values)
         share = quotient(nodes[:, -1:], mass + floor)
         carried = quotient(nodes[:, :-1], nodes[:, -1:] + floor)
         return v + jnp.minimum(share / GRIPPED, 1) * (carried - v)

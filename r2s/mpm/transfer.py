@@ -13,7 +13,7 @@ Both are written axis by axis (the weights are products over the axes), and one 
 27 additions of (particle, channel) into the grid, which XLA makes in place, are faster on the CPU
 than one addition of all windows, sorted particles, or sums over cells. For the reverse mode both
 have a rule of their own, which gathers once for all that it needs: half the time of JAX's in 3-D.
-`collect_plain` and `spread_plain` have none, and so can be differentiated forward.
+`g2p_plain` and `p2g_plain` have none, and so can be differentiated forward.
 """
 
 import itertools
@@ -36,7 +36,7 @@ def affine_factor(grid: Grid) -> float:
     return 4 / grid.spacing**2
 
 
-def spread_plain(grid: Grid, x: Points, values: Values, slopes: Slopes) -> Nodes:
+def p2g_plain(grid: Grid, x: Points, values: Values, slopes: Slopes) -> Nodes:
     """Sums at the nodes of values [unit] and slopes [unit/m] of particles at x [m].
 
     Particles outside the grid are put on its border: see `Grid.inside`.
@@ -49,7 +49,7 @@ def spread_plain(grid: Grid, x: Points, values: Values, slopes: Slopes) -> Nodes
     return nodes
 
 
-def collect_plain(grid: Grid, x: Points, nodes: Nodes) -> tuple[Values, Slopes]:
+def g2p_plain(grid: Grid, x: Points, nodes: Nodes) -> tuple[Values, Slopes]:
     """Weighted means [unit] and first moments [unit m] of a field, about particles at x [m]."""
     stencil = _Stencil(grid, x)
     value, *moments = _collect_axis(stencil.weights, stencil.rows(nodes))
@@ -57,8 +57,8 @@ def collect_plain(grid: Grid, x: Points, nodes: Nodes) -> tuple[Values, Slopes]:
     return value, moment - value[:, :, None] * stencil.away[:, None]
 
 
-def spread_few(grid: Grid, x: Points, values: Values) -> Nodes:
-    """`spread` without slopes in one addition: short to compile, for a few particles."""
+def p2g_few(grid: Grid, x: Points, values: Values) -> Nodes:
+    """`p2g` without slopes in one addition: short to compile, for a few particles."""
     stencil = _Stencil(grid, x)
     weights = jnp.ones((x.shape[0], 1), x.dtype)
     for axis in stencil.weights:
@@ -72,7 +72,7 @@ def spread_few(grid: Grid, x: Points, values: Values) -> Nodes:
 def _pairing_slope(grid: Grid, x: Points, values: Values, slopes: Slopes, nodes: Nodes) -> Points:
     """The derivative in x of sum_ip w_ip (value_p + slope_p d_ip) . node_i.
 
-    The derivative of that sum in the nodes is `spread`, in values and slopes `collect`; so this is
+    The derivative of that sum in the nodes is `p2g`, in values and slopes `g2p`; so this is
     all that their reverse rules need beside each other.
     """
     stencil = _Stencil(grid, x)
@@ -87,39 +87,39 @@ def _pairing_slope(grid: Grid, x: Points, values: Values, slopes: Slopes, nodes:
 
 
 @jax.custom_vjp
-def spread(grid: Grid, x: Points, values: Values, slopes: Slopes) -> Nodes:
-    """`spread_plain`, for reverse mode only, and faster there. Constant in the grid."""
+def p2g(grid: Grid, x: Points, values: Values, slopes: Slopes) -> Nodes:
+    """`p2g_plain`, for reverse mode only, and faster there. Constant in the grid."""
     return _spread_forward(grid, x, values, slopes)[0]
 
 
 @jax.custom_vjp
-def collect(grid: Grid, x: Points, nodes: Nodes) -> tuple[Values, Slopes]:
-    """`collect_plain`, for reverse mode only, and faster there. Constant in the grid."""
+def g2p(grid: Grid, x: Points, nodes: Nodes) -> tuple[Values, Slopes]:
+    """`g2p_plain`, for reverse mode only, and faster there. Constant in the grid."""
     return _collect_forward(grid, x, nodes)[0]
 
 
 def _spread_forward(grid, x, values, slopes):
     inputs = _kept((x, values, slopes))
-    return _kept(spread_plain(grid, *inputs)), (grid, *inputs)
+    return _kept(p2g_plain(grid, *inputs)), (grid, *inputs)
 
 
 def _spread_reverse(saved, nodes):
     grid, x, values, slopes = saved
     nodes = _kept(nodes)
     slope = _pairing_slope(grid, x, values, slopes, nodes)
-    return _no_slope(grid), *_kept((slope, *collect_plain(grid, x, nodes)))
+    return _no_slope(grid), *_kept((slope, *g2p_plain(grid, x, nodes)))
 
 
 def _collect_forward(grid, x, nodes):
     inputs = _kept((x, nodes))
-    return _kept(collect_plain(grid, *inputs)), (grid, *inputs)
+    return _kept(g2p_plain(grid, *inputs)), (grid, *inputs)
 
 
 def _collect_reverse(saved, parts):
     grid, x, nodes = saved
     values, slopes = _kept(parts)
     slope = _pairing_slope(grid, x, values, slopes, nodes)
-    return _no_slope(grid), *_kept((slope, spread_plain(grid, x, values, slopes)))
+    return _no_slope(grid), *_kept((slope, p2g_plain(grid, x, values, slopes)))
 
 
 def _kept(values):
@@ -132,8 +132,8 @@ def _no_slope(grid: Grid) -> Grid:
     return jax.tree.map(jnp.zeros_like, grid)
 
 
-spread.defvjp(_spread_forward, _spread_reverse)
-collect.defvjp(_collect_forward, _collect_reverse)
+p2g.defvjp(_spread_forward, _spread_reverse)
+g2p.defvjp(_collect_forward, _collect_reverse)
 
 
 class _Stencil:

@@ -3,10 +3,10 @@
 - `experiments`: lifting, wind, stretching, folding, fling, shaking; and varied at random.
 - `points`: the same on material points.
 - `forces`: those of the grippers.
-- `account`: a motion with its forces, also on a clamp, and where the energy goes.
+- `energy_balance`: a motion with its forces, also on a clamp, and where the energy goes.
 """
 
-from r2s.scenarios.energy_balance import Account, account, clamp_force
+from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
 from r2s.scenarios.on_points import material_points, motion_of_points
 from r2s.scenarios.six import (
     SIX,
@@ -22,9 +22,9 @@ from r2s.scenarios.six import (
 
 __all__ = [
     "SIX",
-    "Account",
+    "EnergyBalance",
     "Experiment",
-    "account",
+    "energy_balance",
     "clamp_force",
     "fling",
     "folding",

@@ -6,7 +6,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from r2s.cloth.cloth import Cloth, ClothState
-from r2s.cloth.potential import imbalance
+from r2s.cloth.potential import residual
 from r2s.fabrics.fabric import Fabric
 from r2s.mpm.sheet import Sheet
 from r2s.scenarios.scenario import Braked
@@ -40,4 +40,4 @@ def step_with_forces(
 def _cloth_forces(
     solver: Cloth, fabric: Fabric, state: ClothState, control: Control, after: ClothState
 ) -> Forces:
-    return imbalance(solver.increment(fabric, state, control), after.x)[solver.scene.held]
+    return residual(solver.increment(fabric, state, control), after.x)[solver.scene.held]

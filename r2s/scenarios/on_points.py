@@ -7,8 +7,8 @@ import numpy as np
 from r2s.fabrics.fabric import Fabric
 from r2s.mpm.grid import Grid
 from r2s.mpm.sheet import Sheet, longest_edge, stable_step
-from r2s.rollout import Trajectory
-from r2s.scenarios.scenario import Scenario, motion
+from r2s.scenarios.scenario import Scenario, rollout
+from r2s.solver import Trajectory
 
 MEMBRANE_DAMPING = 1e-4  # [s]: what is longer costs ten times as many steps, and shows in no motion
 EDGE = 1.5  # longest edge of the mesh over the grid's spacing
@@ -39,7 +39,7 @@ def material_points(
 
 def motion_of_points(scenario: Scenario, fabric: Fabric) -> Trajectory:
     """A motion by material points, with their defaults; the fabric not traced."""
-    return motion(scenario, fabric, solver=material_points(scenario, fabric))
+    return rollout(scenario, fabric, solver=material_points(scenario, fabric))
 
 
 def grid_around(scenario: Scenario, spacing: float) -> Grid:

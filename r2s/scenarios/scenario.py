@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from r2s.cloth.cloth import Cloth
-from r2s.cloth.self_contact.contacts import Layers
+from r2s.cloth.self_contact.contacts import SelfContact
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh, corner, rectangle
 from r2s.recordings.recording import Recording, SheetPlacement
-from r2s.rollout import Solver, Trajectory, simulate
+from r2s.solver import Solver, Trajectory, simulate
 from r2s.world.air import Air, Fan
 from r2s.world.contact import Table
 from r2s.world.scene import Control, Scene, along_path
@@ -123,7 +123,7 @@ def from_placement(
             Table.make(table_height),
             Air.make(),
             None if wind is None else _fan(sheet, wind),
-            Layers.make(mesh) if layers else None,
+            SelfContact.make(mesh) if layers else None,
         ),
         start=jnp.asarray(start, float),
         path=jnp.concatenate([at_rest[None], path[:1], path]),
@@ -221,7 +221,7 @@ def from_recording(recording: Recording, shape: tuple[int, int] = (9, 9)) -> Sce
     )
 
 
-def motion(
+def rollout(
     scenario: Scenario,
     fabric: Fabric,
     max_step: float | None = None,
@@ -244,7 +244,7 @@ def stepped(
 ) -> tuple[Solver, int]:
     """The solver of a motion, which brakes the sheet before its first frame, and its steps a frame.
 
-    Arguments as of `motion`. Raises `ValueError` when a solver's step does not fit.
+    Arguments as of `rollout`. Raises `ValueError` when a solver's step does not fit.
     """
     if solver is None:
         substeps = scenario.substeps

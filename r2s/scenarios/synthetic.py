@@ -27,11 +27,11 @@ from r2s.recordings.recording import (
     corner,
     make_recording,
 )
-from r2s.rollout import Solver
-from r2s.scenarios.energy_balance import account, clamp_force
+from r2s.scenarios.energy import clamp_force, energy_balance
 from r2s.scenarios.paths import Route
-from r2s.scenarios.scenario import Scenario, motion
+from r2s.scenarios.scenario import Scenario, rollout
 from r2s.scenarios.six import SIDE, Experiment
+from r2s.solver import Solver
 
 NUM_FRAMES, FRAME_RATE = 60, 15.0  # the study's
 SPACING = SIDE * math.sqrt(2) / 80  # [m], between samples of the surface
@@ -213,8 +213,8 @@ def _lasting(route: Route, end: float) -> Route:
     return Route(times, np.concatenate([route.path, route.path[-1:]]))
 
 
-_motion = eqx.filter_jit(motion)
-_account = eqx.filter_jit(account)
+_motion = eqx.filter_jit(rollout)
+_account = eqx.filter_jit(energy_balance)
 
 
 def _markers(x, scenario: Scenario, key) -> np.ndarray:

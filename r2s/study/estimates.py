@@ -19,7 +19,7 @@ from r2s.estimation.pinn import from_clouds, from_pulls
 from r2s.estimation.pinn.data import pull_from
 from r2s.estimation.problem import Problem
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import Family, IsotropicFamily, OrthotropicFamily
+from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace
 from r2s.files import write_json
 from r2s.recordings.recording import Recording
 from r2s.scenarios.on_points import material_points
@@ -32,7 +32,7 @@ COARSE = (7, 7)  # vertices of a sheet of material points in an estimate
 
 
 @dataclass(frozen=True)
-class Spent:
+class Budgets:
     """What estimates may cost.
 
     - `coarse`, `starts`, `iterations`: of DIFFCLOUD, as of `r2s.estimation.descent.Effort`.
@@ -53,7 +53,7 @@ class Spent:
 
 
 @dataclass(frozen=True)
-class Trained(Cell):
+class TrainedNetwork(Cell):
     """PhysNet's network for a scenario on a solver."""
 
     kind: ClassVar[str] = "networks"
@@ -61,7 +61,7 @@ class Trained(Cell):
 
     solver: str
     scenario: str
-    spent: Spent = Spent()
+    spent: Budgets = Budgets()
     seed: int = 0
 
     @property
@@ -94,7 +94,7 @@ class Trained(Cell):
 
 
 @dataclass(frozen=True)
-class Estimated(Cell):
+class EstimateCell(Cell):
     """An estimate of a fabric.
 
     - `approach`: "diffcloud", "diffcp", "physnet" or "pinn". - `solver`: "cloth" or "points".
@@ -110,8 +110,8 @@ class Estimated(Cell):
     fabric: str
     sources: tuple[Source, ...]
     density: float
-    spent: Spent = Spent()
-    network: Trained | None = None
+    spent: Budgets = Budgets()
+    network: TrainedNetwork | None = None
     repeat: int = 0
 
     def __post_init__(self) -> None:
@@ -137,9 +137,9 @@ class Estimated(Cell):
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
         """An estimate; one whose every simulation diverged is a result too, and says so."""
         recordings = [read(source, folder) for source in self.sources]
-        family = family_of(self.solver, self.density)
+        space = family_of(self.solver, self.density)
         try:
-            found = _ESTIMATORS[self.approach](self, family, recordings, folder)
+            found = _ESTIMATORS[self.approach](self, space, recordings, folder)
         except jax.errors.JaxRuntimeError:  # out of memory, say: no result, to be tried again
             raise
         except (RuntimeError, FloatingPointError) as error:
@@ -156,13 +156,13 @@ SOLVERS = {
 }
 
 
-def family_of(solver: str, density: float) -> Family:
+def family_of(solver: str, density: float) -> ParameterSpace:
     """Among which fabrics is estimated: orthotropic on the cloth, isotropic on material points."""
-    make = OrthotropicFamily.make if solver == "cloth" else IsotropicFamily.make
+    make = OrthotropicSpace.make if solver == "cloth" else IsotropicSpace.make
     return make(density)
 
 
-def read_estimate(cell: Estimated, folder: Path) -> Estimate | None:
+def read_estimate(cell: EstimateCell, folder: Path) -> Estimate | None:
     """The estimate of a cell that is made; None where it diverged."""
     with opened(cell, folder) as files:
         if not (files / ESTIMATE).exists():
@@ -171,20 +171,20 @@ def read_estimate(cell: Estimated, folder: Path) -> Estimate | None:
 
 
 def default_fabric(solver: str, density: float) -> Fabric:
-    """What a study compares with: the middle of the family."""
-    family = family_of(solver, density)
-    return family(jnp.full(family.dim, 0.5, float))
+    """What a study compares with: the middle of the space."""
+    space = family_of(solver, density)
+    return space(jnp.full(space.dim, 0.5, float))
 
 
-def _diffcloud(cell: Estimated, family, recordings: list[Recording], folder: Path) -> Estimate:
+def _diffcloud(cell: EstimateCell, space, recordings: list[Recording], folder: Path) -> Estimate:
     del folder
     spent = cell.spent
-    effort = DEFAULT._replace(coarse=spent.coarse, starts=spent.starts, iterations=spent.iterations)
-    problem = Problem.make(recordings[0], family)
-    return diffcloud.estimate(problem, effort, key=jr.key(cell.repeat))
+    budget = DEFAULT._replace(coarse=spent.coarse, starts=spent.starts, iterations=spent.iterations)
+    problem = Problem.make(recordings[0], space)
+    return diffcloud.estimate(problem, budget, key=jr.key(cell.repeat))
 
 
-def _diffcp(cell: Estimated, family, recordings: list[Recording], folder: Path) -> Estimate:
+def _diffcp(cell: EstimateCell, space, recordings: list[Recording], folder: Path) -> Estimate:
     del folder
     spent = cell.spent
     about = {
@@ -192,12 +192,12 @@ def _diffcp(cell: Estimated, family, recordings: list[Recording], folder: Path) 
         "starts": spent.points_starts,
         "iterations": spent.points_iterations,
     }
-    effort = diffcp.DEFAULT._replace(**about)
-    problem = Problem.make(recordings[0], family, shape=COARSE, as_seen=False)
-    return diffcp.estimate(diffcp.on_points(problem), effort, key=jr.key(cell.repeat))
+    budget = diffcp.DEFAULT._replace(**about)
+    problem = Problem.make(recordings[0], space, shape=COARSE, as_seen=False)
+    return diffcp.estimate(diffcp.on_points(problem), budget, key=jr.key(cell.repeat))
 
 
-def _physnet(cell: Estimated, family: Family, recordings: list[Recording], folder: Path):
+def _physnet(cell: EstimateCell, space: ParameterSpace, recordings: list[Recording], folder: Path):
     if cell.network is None:
         raise ValueError("PhysNet needs a trained network")
     with opened(cell.network, folder) as files:
@@ -206,22 +206,24 @@ def _physnet(cell: Estimated, family: Family, recordings: list[Recording], folde
     scenario = from_recording(recording, (9, 9) if on_cloth else COARSE)
     frames = dataset.kept_frames(recording.info.frames_used, dataset.Settings.num_frames)
     images = preprocess.of_clouds(trained.view, recording, frames)
-    stiffest = family(jnp.ones(family.dim, float))
+    stiffest = space(jnp.ones(space.dim, float))
     solver = None if on_cloth else material_points(scenario, stiffest)
-    seen = estimator.Sighting.make(scenario, images, frames, family, trained, solver)
+    seen = estimator.Sighting.make(scenario, images, frames, space, trained, solver)
     return estimator.estimate(seen, num_calls=cell.spent.calls, seed=cell.repeat)
 
 
-def _pinn(cell: Estimated, family: Family, recordings: list[Recording], folder: Path) -> Estimate:
+def _pinn(
+    cell: EstimateCell, space: ParameterSpace, recordings: list[Recording], folder: Path
+) -> Estimate:
     del folder
     if cell.scenario != "stretching":
-        return from_clouds.estimate(recordings[0], family, key=jr.key(cell.repeat))
+        return from_clouds.estimate(recordings[0], space, key=jr.key(cell.repeat))
     angles = [getattr(source, "angle", None) or 0.0 for source in cell.sources]
     pulls = [
         pull_from(recording, float(np.radians(angle)))
         for recording, angle in zip(recordings, angles, strict=True)
     ]
-    return from_pulls.estimate(pulls, family, key=jr.key(cell.repeat)).estimate
+    return from_pulls.estimate(pulls, space, key=jr.key(cell.repeat)).estimate
 
 
 _ESTIMATORS = {"diffcloud": _diffcloud, "diffcp": _diffcp, "physnet": _physnet, "pinn": _pinn}

@@ -18,20 +18,20 @@ from r2s.files import write_json
 from r2s.mpm.sheet import Sheet, longest_edge, stable_step
 from r2s.recordings.recording import Recording
 from r2s.scenarios.on_points import EDGE, MEMBRANE_DAMPING, grid_around
-from r2s.scenarios.scenario import Scenario, from_recording, motion
+from r2s.scenarios.scenario import Scenario, from_recording, rollout
 from r2s.study.cells import Cell, opened
-from r2s.study.estimates import Estimated, default_fabric, read_estimate
-from r2s.study.sources import Given, Source, read
+from r2s.study.estimates import EstimateCell, default_fabric, read_estimate
+from r2s.study.sources import GivenRecording, Source, read
 from r2s.study.statistics.panel import Column
 
 MEASURED, MOTION = "measured.json", "motion.npz"
 LADDER = math.sqrt(2)  # steps between frames are powers of this: few programs to compile
 
-_motion = eqx.filter_jit(motion)
+_motion = eqx.filter_jit(rollout)
 
 
 @dataclass(frozen=True)
-class Judged(Cell):
+class EvaluationCell(Cell):
     """How near simulations of a fabric come to recordings of one scenario.
 
     - `estimate`: whose fabric; None: the default one of `solver` with that areal `density`.
@@ -43,7 +43,7 @@ class Judged(Cell):
     kind: ClassVar[str] = "evaluations"
     weight: ClassVar[float] = 8.0
 
-    estimate: Estimated | None
+    estimate: EstimateCell | None
     solver: str
     density: float
     fabric: str
@@ -89,7 +89,7 @@ class Judged(Cell):
             motions = predict(recordings, fabric, self.solver)
         measured = {
             source.name: prediction_error.against_motion(
-                recording, x, self.every, isinstance(source, Given)
+                recording, x, self.every, isinstance(source, GivenRecording)
             )
             for source, recording, x in zip(self.recordings, recordings, motions, strict=True)
         }
@@ -110,7 +110,7 @@ class Judged(Cell):
         return None if found is None else found.fabric
 
 
-def read_measured(cell: Judged, folder: Path) -> dict[str, dict[str, float]]:
+def read_measured(cell: EvaluationCell, folder: Path) -> dict[str, dict[str, float]]:
     """The metrics of each recording by name; NaN where the motion diverged."""
     with opened(cell, folder) as files:
         stored = json.loads((files / MEASURED).read_text(encoding="utf-8"))
@@ -118,7 +118,7 @@ def read_measured(cell: Judged, folder: Path) -> dict[str, dict[str, float]]:
     return {name: {k: number(v) for k, v in row.items()} for name, row in stored.items()}
 
 
-def read_motion(cell: Judged, folder: Path) -> Float[np.ndarray, "frame vertex 3"]:
+def read_motion(cell: EvaluationCell, folder: Path) -> Float[np.ndarray, "frame vertex 3"]:
     """Positions [m] of the motion beside the first recording."""
     with opened(cell, folder) as files, np.load(files / MOTION) as stored:
         return stored["x"]

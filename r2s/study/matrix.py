@@ -8,13 +8,13 @@ from pathlib import Path
 
 from r2s.fabrics import presets
 from r2s.scenarios.paths import ESTIMATION, EVALUATION
-from r2s.study.estimates import SOLVERS, Estimated, Spent, Trained, family_of
-from r2s.study.evaluations import Judged
+from r2s.study.estimates import SOLVERS, Budgets, EstimateCell, TrainedNetwork, family_of
+from r2s.study.evaluations import EvaluationCell
 from r2s.study.sources import (
-    Given,
-    Made,
+    GivenRecording,
     Making,
     Source,
+    SyntheticRecording,
     given,
     measured,
     strain_dependent,
@@ -52,13 +52,13 @@ class Plan:
     repeats: int
     judged: int
     making: Making = Making()
-    spent: Spent = Spent()
+    spent: Budgets = Budgets()
     seed: int = 0
     every: int = 1
 
 
 ALL = Plan(FULL, tuple(presets.FIVE), ESTIMATION, EVALUATION // len(MOTIONS), Making(layers=True))
-LITTLE = Spent(
+LITTLE = Budgets(
     coarse=16,
     starts=2,
     iterations=15,
@@ -131,7 +131,7 @@ def narrowed(
     )
 
 
-def synthetic(plan: Plan) -> list[Judged]:
+def synthetic(plan: Plan) -> list[EvaluationCell]:
     """The cells that judge of a study of synthetic recordings; they need all others.
 
     Raises `ValueError` for an unknown fabric.
@@ -141,7 +141,7 @@ def synthetic(plan: Plan) -> list[Judged]:
         density = float(strain_dependent(fabric, plan.making).density)
         unseen = {
             scenario: tuple(
-                Made(fabric, scenario, number, True, plan.making, plan.seed)
+                SyntheticRecording(fabric, scenario, number, True, plan.making, plan.seed)
                 for number in range(plan.judged)
             )
             for scenario in MOTIONS
@@ -155,7 +155,7 @@ def synthetic(plan: Plan) -> list[Judged]:
     return found
 
 
-def recorded(folder: Path, density: float, plan: Plan) -> list[Judged]:
+def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationCell]:
     """Likewise of the recordings in a folder, with an areal density to assume [kg/m^2]: those
     columns of the plan that have recordings to estimate from.
 
@@ -167,7 +167,7 @@ def recorded(folder: Path, density: float, plan: Plan) -> list[Judged]:
     family_of("cloth", density)
     columns = plan.columns
     # clouds of real cameras need all of the search, and there are few frames to judge by
-    search = {name: getattr(Spent, name) for name in ("coarse", "starts", "iterations")}
+    search = {name: getattr(Budgets, name) for name in ("coarse", "starts", "iterations")}
     plan = dataclasses.replace(plan, spent=dataclasses.replace(plan.spent, **search), every=1)
     every = given(folder)
     seen = [r for r in every if r.scenario in {column.estimated_from for column in columns}]
@@ -177,7 +177,7 @@ def recorded(folder: Path, density: float, plan: Plan) -> list[Judged]:
             f"{folder}: nothing to estimate from ({', '.join(ESTIMATED_FROM)}) or to judge by "
             f"({', '.join(MOTIONS)}); found {sorted({r.scenario for r in every})}"
         )
-    found: list[Judged] = []
+    found: list[EvaluationCell] = []
     for column in columns:
         own = [r for r in seen if r.scenario == column.estimated_from]
         estimates = [_from_given(column, r, density, plan, i) for i, r in enumerate(own)]
@@ -188,26 +188,29 @@ def recorded(folder: Path, density: float, plan: Plan) -> list[Judged]:
             if other is not None:
                 about = column.solver, density, recording.fabric
                 found += [
-                    Judged(estimates[other], *about, r, True, plan.every) for r in by.values()
+                    EvaluationCell(estimates[other], *about, r, True, plan.every)
+                    for r in by.values()
                 ]
     return list(dict.fromkeys(found))  # columns share the default fabric
 
 
-def _judged(estimates, fabric: str, density: float, unseen, every: int) -> list[Judged]:
+def _judged(estimates, fabric: str, density: float, unseen, every: int) -> list[EvaluationCell]:
     """Cells for estimates of a fabric, and for the default fabric on each solver."""
     solvers = dict.fromkeys(estimate.solver for estimate in estimates)
     of = lambda solver: (solver, density, fabric)
     whose = [(None, of(solver)) for solver in solvers] + [(e, of(e.solver)) for e in estimates]
     return [
-        Judged(estimate, *about, recordings[first : first + TOGETHER], every=every)
+        EvaluationCell(estimate, *about, recordings[first : first + TOGETHER], every=every)
         for estimate, about in whose
         for recordings in unseen.values()
         for first in range(0, len(recordings), TOGETHER)
     ]
 
 
-def _estimated(column: Column, fabric: str, density: float, plan: Plan, repeat: int) -> Estimated:
-    make = lambda angle: Made(
+def _estimated(
+    column: Column, fabric: str, density: float, plan: Plan, repeat: int
+) -> EstimateCell:
+    make = lambda angle: SyntheticRecording(
         fabric, column.estimated_from, repeat, False, plan.making, plan.seed, angle=angle
     )
     several = column.approach == "pinn" and column.estimated_from == "stretching"
@@ -215,36 +218,36 @@ def _estimated(column: Column, fabric: str, density: float, plan: Plan, repeat: 
     return _estimate(column, fabric, sources, density, plan, repeat)
 
 
-def _from_given(column: Column, recording: Given, density: float, plan: Plan, repeat: int):
+def _from_given(column: Column, recording: GivenRecording, density: float, plan: Plan, repeat: int):
     return _estimate(column, recording.fabric, (recording,), density, plan, repeat)
 
 
 def _estimate(
     column: Column, fabric: str, sources: tuple[Source, ...], density: float, plan: Plan, repeat
-) -> Estimated:
+) -> EstimateCell:
     spent, network = plan.spent, None
     if column.approach == "physnet":
         on_points = dataclasses.replace(spent, fabrics=min(spent.fabrics, 32))
         spent = on_points if column.solver == "points" else spent
-        network = Trained(column.solver, column.estimated_from, spent, plan.seed)
+        network = TrainedNetwork(column.solver, column.estimated_from, spent, plan.seed)
     about = column.approach, column.solver, fabric, sources, density
-    return Estimated(*about, spent, network, repeat)
+    return EstimateCell(*about, spent, network, repeat)
 
 
-def _by_scenario(recordings: list[Given]) -> dict[str, tuple[Given, ...]]:
-    found: dict[str, tuple[Given, ...]] = defaultdict(tuple)
+def _by_scenario(recordings: list[GivenRecording]) -> dict[str, tuple[GivenRecording, ...]]:
+    found: dict[str, tuple[GivenRecording, ...]] = defaultdict(tuple)
     for recording in recordings:
         found[recording.scenario] += (recording,)
     return dict(found)
 
 
-def _of_trial(unseen: list[Given], recording: Given) -> list[Given]:
+def _of_trial(unseen: list[GivenRecording], recording: GivenRecording) -> list[GivenRecording]:
     same = [r for r in unseen if r.fabric == recording.fabric]
     trial = [r for r in same if r.trial == recording.trial]
     return trial or same
 
 
-def _other_fabric(recordings: list[Given], index: int) -> int | None:
+def _other_fabric(recordings: list[GivenRecording], index: int) -> int | None:
     """The next recording of another fabric, going round."""
     order = [(index + step) % len(recordings) for step in range(1, len(recordings))]
     mine = recordings[index].fabric

@@ -17,11 +17,11 @@ from r2s.recordings.recording import cloud
 from r2s.scenarios.scenario import from_recording
 from r2s.study.cells import Cell, about, opened
 from r2s.study.engine import closure
-from r2s.study.estimates import ESTIMATE, Estimated, family_of, read_estimate
-from r2s.study.evaluations import Judged, read_measured, read_motion
+from r2s.study.estimates import ESTIMATE, EstimateCell, family_of, read_estimate
+from r2s.study.evaluations import EvaluationCell, read_measured, read_motion
 from r2s.study.matrix import PRESETS, Plan, synthetic
 from r2s.study.report.scenes import Shown
-from r2s.study.sources import Made, Source, read, small_strain
+from r2s.study.sources import Source, SyntheticRecording, read, small_strain
 from r2s.study.statistics.panel import Column
 from r2s.study.statistics.tables import Row, Table, pivot, significant, write_rows
 
@@ -31,7 +31,7 @@ Entry = tuple[str, tuple[Range, ...], Any, Any, Any, Any]
 
 
 def publish(
-    cells: Sequence[Judged],
+    cells: Sequence[EvaluationCell],
     failed: dict[Cell, str],
     out: Path,
     plan: Plan,
@@ -90,14 +90,14 @@ def _is_published(out: Path, mark: Path, changed: str) -> bool:
     return not newer and mark.read_text(encoding="utf-8") == changed
 
 
-def rows(cells: Iterable[Judged], folder: Path) -> list[Row]:
+def rows(cells: Iterable[EvaluationCell], folder: Path) -> list[Row]:
     """The rows of all cells that are made, in their order, then what two trials differ by."""
     cells = list(cells)
     found = [row for cell in cells if cell.is_made(folder) for row in _rows(cell, folder)]
     return found + _repeatability(cells, folder)
 
 
-def _rows(cell: Judged, folder: Path) -> list[Row]:
+def _rows(cell: EvaluationCell, folder: Path) -> list[Row]:
     estimate = cell.estimate
     baseline = "default" if estimate is None else "other_fabric" if cell.other else ""
     return [
@@ -117,11 +117,11 @@ def _rows(cell: Judged, folder: Path) -> list[Row]:
     ]
 
 
-def _repeatability(cells: Sequence[Judged], folder: Path) -> list[Row]:
+def _repeatability(cells: Sequence[EvaluationCell], folder: Path) -> list[Row]:
     """How far two trials of a fabric in a motion are from each other; of given recordings alone."""
     trials = defaultdict(list)
     for source in dict.fromkeys(source for cell in cells for source in cell.recordings):
-        if not isinstance(source, Made) and source.is_made(folder):
+        if not isinstance(source, SyntheticRecording) and source.is_made(folder):
             trials[source.fabric, source.scenario].append(source)
     found = []
     for (fabric, scenario), sources in trials.items():
@@ -165,7 +165,7 @@ def by_recording(rows: Sequence[Row], metric: str = "chamfer_real_to_sim") -> di
     return found
 
 
-def parameters(cells: Iterable[Judged], folder: Path) -> dict[str, list[Entry]]:
+def parameters(cells: Iterable[EvaluationCell], folder: Path) -> dict[str, list[Entry]]:
     """What was estimated, by solver, as `r2s.study.statistics.tables.parameter_table` takes it."""
     found: dict[str, list[Entry]] = {}
     for cell in estimated(cells, folder):
@@ -177,22 +177,26 @@ def parameters(cells: Iterable[Judged], folder: Path) -> dict[str, list[Entry]]:
     return found
 
 
-def estimated(cells: Iterable[Judged], folder: Path) -> list[Estimated]:
+def estimated(cells: Iterable[EvaluationCell], folder: Path) -> list[EstimateCell]:
     """The estimates that are made."""
     every = closure(cells)
-    return [cell for cell in every if isinstance(cell, Estimated) and cell.is_made(folder)]
+    return [cell for cell in every if isinstance(cell, EstimateCell) and cell.is_made(folder)]
 
 
-def _truth(cell: Estimated) -> np.ndarray | None:
+def _truth(cell: EstimateCell) -> np.ndarray | None:
     """The parameters at small strain of a made recording's fabric, on the cloth."""
     source = cell.sources[0]
-    if cell.solver != "cloth" or not isinstance(source, Made) or source.making.materials:
+    if (
+        cell.solver != "cloth"
+        or not isinstance(source, SyntheticRecording)
+        or source.making.materials
+    ):
         return None
-    family = family_of("cloth", cell.density)
-    return np.asarray(family.values(family.locate(small_strain(cell.fabric))))
+    space = family_of("cloth", cell.density)
+    return np.asarray(space.values(space.locate(small_strain(cell.fabric))))
 
 
-def shown(cells: Iterable[Judged], folder: Path) -> list[Shown]:
+def shown(cells: Iterable[EvaluationCell], folder: Path) -> list[Shown]:
     """The first recording of each fabric and scenario with its simulations by all columns that are
     made, at the frames that count."""
     groups: dict[Source, dict[str, np.ndarray]] = {}
@@ -222,7 +226,7 @@ def shown(cells: Iterable[Judged], folder: Path) -> list[Shown]:
     return [s for s in found if firsts[s.fabric, s.evaluated_on] is s]
 
 
-def costs(cells: Iterable[Judged], folder: Path) -> list[dict[str, Any]]:
+def costs(cells: Iterable[EvaluationCell], folder: Path) -> list[dict[str, Any]]:
     """Of cells alike: their number, CPU seconds (compilation included) in all and the median of
     each (of each recording, where one judges several), and peak memory [MB]."""
     groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
@@ -251,7 +255,7 @@ def forecast(costs: Sequence[dict[str, Any]], plan: Plan, cores: Sequence[int] =
     of_kind = {cost["kind"]: cost["each"] for cost in costs}
     groups: dict[str, float] = defaultdict(float)
     for cell in closure(synthetic(plan)):
-        groups[cell.alike] += len(cell.recordings) if isinstance(cell, Judged) else 1
+        groups[cell.alike] += len(cell.recordings) if isinstance(cell, EvaluationCell) else 1
     lines, total = [], 0.0
     for alike, count in groups.items():
         each = of_kind.get(alike)

@@ -54,7 +54,7 @@ class Making:
 
 
 @dataclass(frozen=True)
-class Made(Cell):
+class SyntheticRecording(Cell):
     """A synthetic recording of a preset's fabric.
 
     - `number`: 0 is the motion of the scenario without any numbers; others are drawn within
@@ -115,7 +115,7 @@ class Made(Cell):
 
 
 @dataclass(frozen=True)
-class Given(Cell):
+class GivenRecording(Cell):
     """A recording in a folder with its manifest; `digest` is of its files, from `given`."""
 
     kind: ClassVar[str] = "recordings"
@@ -139,10 +139,10 @@ class Given(Cell):
         return {"frames": len(read.times), "verified": read.info.verified}
 
 
-Source = Made | Given
+Source = SyntheticRecording | GivenRecording
 
 
-def given(folder: Path) -> list[Given]:
+def given(folder: Path) -> list[GivenRecording]:
     """The recordings in a folder, by its own manifest or that of DIFFCLOUD.
 
     Raises what `r2s.recordings.manifest` raises, and `ValueError` when there is none.
@@ -156,7 +156,7 @@ def given(folder: Path) -> list[Given]:
         info = manifest.read_recording(folder, rules, name).info
         scenario = SAME_SCENARIO.get(info.scenario, info.scenario)
         about = str(folder), name, info.fabric, scenario, info.trial
-        found.append(Given(*about, digest.hexdigest()))
+        found.append(GivenRecording(*about, digest.hexdigest()))
     if not found:
         raise ValueError(f"{folder}: no recording that a manifest describes")
     return found

@@ -26,10 +26,10 @@ class Page:
     """A server on a thread of its own, until `close`.
 
     Only the last of the places that a slider was dragged through is simulated. `moved` is what the
-    page shows, `u` where in the family it lies, `failure` why there is no motion of it; `latest`
+    page shows, `u` where in the space it lies, `failure` why there is no motion of it; `latest`
     waits for what the sliders ask for.
 
-    - `u`: where the sliders begin, in the unit cube of the subject's family.
+    - `u`: where the sliders begin, in the unit cube of the subject's space.
     - `save`: called with the fabric that is shown when the button for that is pressed, gives what
       to say; None: no button.
     - `host`, `port`: 127.0.0.1 lets nobody in from other machines.
@@ -95,7 +95,7 @@ class Page:
         self._frame = gui.add_slider("frame", 0, last, 1, subject.frames_used[1] or last)
         self._play = gui.add_checkbox("play", False)
         self._frame.on_update(lambda _: self._draw())
-        for bound, place in zip(subject.family.ranges, self.u, strict=True):
+        for bound, place in zip(subject.space.ranges, self.u, strict=True):
             hint = f"{bound.low:g} to {bound.high:g} {bound.unit}"
             hint += ", on a logarithmic scale" if bound.log else ""
             slider = gui.add_slider(bound.name, 0.0, 1.0, 0.01, float(place), hint=hint)
@@ -114,7 +114,7 @@ class Page:
 
     def _save(self, save: Callable[[Fabric], str], event: Any) -> None:
         try:
-            title, told = "saved", save(self.subject.family(jnp.asarray(self.u)))
+            title, told = "saved", save(self.subject.space(jnp.asarray(self.u)))
         except (OSError, ValueError) as error:
             title, told = "not saved", f"{error}"
         if event.client is not None:
@@ -167,11 +167,11 @@ class Page:
 
     def _told(self, frame: int) -> str:
         """The numbers of the fabric, and the distance of the recording."""
-        family, moved = self.subject.family, self.moved
-        values = np.asarray(family.values(jnp.asarray(self.u)))
+        space, moved = self.subject.space, self.moved
+        values = np.asarray(space.values(jnp.asarray(self.u)))
         rows = [
             f"| {bound.name} | {value:.3g} | {bound.unit} |"
-            for bound, value in zip(family.ranges, values, strict=True)
+            for bound, value in zip(space.ranges, values, strict=True)
         ]
         lines = ["| | | |", "|---|---|---|", *rows, ""]
         if self.failure:

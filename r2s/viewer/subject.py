@@ -1,4 +1,4 @@
-"""What a page with sliders shows: a motion, the family of fabrics, and what a recording saw."""
+"""What a page with sliders shows: a motion, the space of fabrics, and what a recording saw."""
 
 from typing import NamedTuple
 
@@ -10,23 +10,23 @@ from jaxtyping import Array, Bool, Float
 from r2s.estimation.problem import Clouds
 from r2s.evaluation.losses import masked_mean, surface_residuals
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import Family
+from r2s.fabrics.parameters import ParameterSpace
 from r2s.recordings.recording import Recording, subsample
 from r2s.scenarios import Experiment
-from r2s.scenarios.scenario import Scenario, from_recording, motion
+from r2s.scenarios.scenario import Scenario, from_recording, rollout
 
 MOST_POINTS = 1500  # of a cloud: more change neither the picture nor the distance
 
 
 class Subject(eqx.Module):
-    """A motion that any member of a family can make.
+    """A motion that any member of a space can make.
 
     - `scenario`, `family`. - `clouds`: of a recording, all its frames; None: there is none.
     - `frames_used`: the first and the last frame that count.
     """
 
     scenario: Scenario
-    family: Family
+    space: ParameterSpace
     clouds: Clouds | None = None
     frames_used: tuple[int, int] = eqx.field(static=True, default=(0, 0))
 
@@ -44,23 +44,25 @@ class Moved(NamedTuple):
     error: Float[Array, " frame"]
 
 
-def of_recording(recording: Recording, family: Family, shape: tuple[int, int] = (9, 9)) -> Subject:
+def of_recording(
+    recording: Recording, space: ParameterSpace, shape: tuple[int, int] = (9, 9)
+) -> Subject:
     """The motion of a recording, on a mesh of `shape` vertices; raises as `from_recording`."""
     seen = subsample(recording, MOST_POINTS, None, 0)
     clouds = Clouds(seen.points, seen.mask)
-    return Subject(from_recording(recording, shape), family, clouds, recording.info.frames_used)
+    return Subject(from_recording(recording, shape), space, clouds, recording.info.frames_used)
 
 
 def of_experiment(
-    experiment: Experiment, family: Family, shape: tuple[int, int] = (9, 9)
+    experiment: Experiment, space: ParameterSpace, shape: tuple[int, int] = (9, 9)
 ) -> Subject:
     """A motion that nobody recorded."""
-    return Subject(experiment.scenario(shape), family, None, experiment.frames_used)
+    return Subject(experiment.scenario(shape), space, None, experiment.frames_used)
 
 
 def place(subject: Subject, fabric: Fabric) -> Float[Array, " dim"]:
-    """Where a fabric lies in the subject's family, at its bounds when beyond them."""
-    return jnp.clip(subject.family.locate(fabric), 0, 1)
+    """Where a fabric lies in the subject's space, at its bounds when beyond them."""
+    return jnp.clip(subject.space.locate(fabric), 0, 1)
 
 
 @eqx.filter_jit
@@ -69,7 +71,7 @@ def move(subject: Subject, u: Float[Array, " dim"]) -> Moved:
 
     A cloud's distance is that of `chamfer_real_to_sim`, but to the surface itself.
     """
-    moved = motion(subject.scenario, subject.family(u))
+    moved = rollout(subject.scenario, subject.space(u))
     if subject.clouds is None:
         return Moved(moved.x, moved.ok, jnp.full(moved.ok.shape, jnp.nan))
     faces = subject.scenario.scene.mesh.faces

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from r2s.cloth.self_contact.contacts import Layers
+from r2s.cloth.self_contact.contacts import SelfContact
 from r2s.geometry.mesh import Mesh
 from r2s.world.air import Air, Fan
 from r2s.world.contact import Table
@@ -37,7 +37,7 @@ class Scene(eqx.Module):
     table: Table
     air: Air
     fan: Fan | None = None
-    layers: Layers | None = None
+    layers: SelfContact | None = None
 
     @property
     def is_free(self) -> Bool[Array, " vertex"]:

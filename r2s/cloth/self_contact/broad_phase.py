@@ -1,8 +1,9 @@
 """Neighbours: which parts of a sheet may meet in a motion, by boxes around what they sweep.
 
 A pair is a vertex and a triangle, or two edges, that share no vertex
-(`r2s.cloth.self_contact.proximity`). Small meshes search among `all_pairs` with `near`; large ones
-with `near_in_tree`, by a tree of boxes around their faces, which finds the same.
+(`r2s.cloth.self_contact.proximity`). Small meshes search among `all_pairs` with `candidate_pairs`;
+large ones with `candidate_pairs_in_tree`, by a tree of boxes around their faces, which finds the
+same.
 """
 
 import equinox as eqx
@@ -27,7 +28,7 @@ class Pairs(eqx.Module):
     is_real: Bool[Array, " pair"]
 
 
-class Tree(eqx.Module):
+class BVH(eqx.Module):
     """A complete binary tree over the faces of a sheet, nearby ones on nearby leaves.
 
     Every vertex and every edge is owned by one face that has it, so that the pairs of owned parts
@@ -70,7 +71,7 @@ def all_pairs(faces: Int[np.ndarray, "face 3"]) -> Pairs:
     return Pairs(stencils, jnp.asarray(is_edges), jnp.ones(len(is_edges), bool))
 
 
-def near(
+def candidate_pairs(
     pairs: Pairs,
     start: Float[Array, "vertex 3"],
     end: Float[Array, "vertex 3"],
@@ -95,7 +96,7 @@ def near(
     return Pairs(stencils, pairs.is_edges[index] & is_real, is_real), is_over
 
 
-def tree(faces: Int[np.ndarray, "face 3"], rest: Float[np.ndarray, "vertex axis"]) -> Tree:
+def build_bvh(faces: Int[np.ndarray, "face 3"], rest: Float[np.ndarray, "vertex axis"]) -> BVH:
     """A tree for a mesh with its vertices at `rest` [m], split at medians of the longer sides."""
     faces = np.asarray(faces)
     depth = (len(faces) - 1).bit_length()
@@ -103,7 +104,7 @@ def tree(faces: Int[np.ndarray, "face 3"], rest: Float[np.ndarray, "vertex axis"
     ends, of_faces = _edges(faces)
     array = lambda values: jnp.asarray(values, int)
     owned = _owned(of_faces)
-    return Tree(
+    return BVH(
         faces=array(faces),
         leaves=array(leaves),
         vertices=array(_owned(faces)),
@@ -111,22 +112,24 @@ def tree(faces: Int[np.ndarray, "face 3"], rest: Float[np.ndarray, "vertex axis"
     )
 
 
-def near_in_tree(
-    tree: Tree,
+def candidate_pairs_in_tree(
+    tree: BVH,
     start: Float[Array, "vertex 3"],
     end: Float[Array, "vertex 3"],
     reach: Float[Array, ""],
     capacity: int,
     node_capacity: int | None = None,
 ) -> tuple[Pairs, Bool[Array, ""]]:
-    """What `near` finds among all pairs, in another order, without looking at them all.
+    """What `candidate_pairs` finds among all pairs, in another order, without looking at them all.
 
     From level to level down the tree it keeps those pairs of nodes whose boxes come within reach,
     at most `node_capacity` (default: `capacity`); that there were more counts as overflow too.
     """
     node_capacity = capacity if node_capacity is None else node_capacity
     first, second, is_real, is_over = _near_faces(tree, start, end, reach, node_capacity)
-    found, is_over_too = near(_of_faces(tree, first, second, is_real), start, end, reach, capacity)
+    found, is_over_too = candidate_pairs(
+        _of_faces(tree, first, second, is_real), start, end, reach, capacity
+    )
     return found, is_over | is_over_too
 
 
@@ -196,7 +199,7 @@ def _children(first, second, is_real):
     return firsts.ravel(), seconds.ravel(), are_real.ravel()
 
 
-def _of_faces(tree: Tree, first, second, is_real) -> Pairs:
+def _of_faces(tree: BVH, first, second, is_real) -> Pairs:
     """The pairs of what two faces own, for pairs of faces."""
     stencils, is_edges = [], []
     for own, other in ((first, second), (second, first)):
@@ -217,7 +220,7 @@ def _of_faces(tree: Tree, first, second, is_real) -> Pairs:
     return Pairs(corners, of_edges, jnp.tile(is_real, len(stencils)) & is_apart & is_owned)
 
 
-def _face_boxes(tree: Tree, start, end) -> Boxes:
+def _face_boxes(tree: BVH, start, end) -> Boxes:
     """The boxes around what the faces of the leaves sweep; inside out where there is no face."""
     low, high = _swept(start, end)
     corners = tree.faces[tree.leaves]

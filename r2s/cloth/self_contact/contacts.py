@@ -18,12 +18,12 @@ from jaxtyping import Array, Bool, Float, Int
 from r2s.cloth.linear.dissection import Level, levels
 from r2s.cloth.linear.pattern import Pattern
 from r2s.cloth.self_contact.broad_phase import (
+    BVH,
     Pairs,
-    Tree,
     all_pairs,
-    near,
-    near_in_tree,
-    tree,
+    build_bvh,
+    candidate_pairs,
+    candidate_pairs_in_tree,
 )
 from r2s.cloth.self_contact.proximity import (
     closest_weights,
@@ -57,7 +57,7 @@ class Whole(eqx.Module):
         return cls(pattern, levels(np.asarray(mesh.rest), rows, columns, count))
 
 
-class Layers(eqx.Module):
+class SelfContact(eqx.Module):
     """What a scene needs for contact of its sheet with itself.
 
     - `search`: the pairs of its vertices and triangles, and of its edges, that may meet; of a large
@@ -68,12 +68,12 @@ class Layers(eqx.Module):
       other. A step that needs more is NaN.
     """
 
-    search: Pairs | Tree
+    search: Pairs | BVH
     whole: Whole | None
     capacity: int = eqx.field(static=True)
 
     @classmethod
-    def make(cls, mesh: Mesh, capacity: int | None = None) -> "Layers":
+    def make(cls, mesh: Mesh, capacity: int | None = None) -> "SelfContact":
         """For a mesh; the capacity is by default 512, or 24 for each vertex if that is more: what a
         sheet that is folded flat needs.
 
@@ -84,7 +84,7 @@ class Layers(eqx.Module):
         capacity = max(512, 24 * count) if capacity is None else capacity
         if count <= SMALL:
             return cls(all_pairs(faces), Whole.make(mesh), capacity)
-        return cls(tree(faces, np.asarray(mesh.rest)), None, capacity)
+        return cls(build_bvh(faces, np.asarray(mesh.rest)), None, capacity)
 
     def near(
         self, start: Positions, end: Positions, reach: Float[Array, ""]
@@ -93,8 +93,8 @@ class Layers(eqx.Module):
         # the boxes around neighbouring parts of a flat sheet overlap: 8 pairs for each vertex
         capacity = 4 * self.capacity
         if isinstance(self.search, Pairs):
-            return near(self.search, start, end, reach, capacity)
-        return near_in_tree(self.search, start, end, reach, capacity, 2 * capacity)
+            return candidate_pairs(self.search, start, end, reach, capacity)
+        return candidate_pairs_in_tree(self.search, start, end, reach, capacity, 2 * capacity)
 
 
 class Contacts(eqx.Module):
@@ -163,8 +163,8 @@ def _energy_apart(thickness, rate, apart, anchor, normal, area, limit):
     return pressed + contact.friction_dissipation(limit, slip) / rate
 
 
-def settle(
-    layers: Layers,
+def resolve_contacts(
+    layers: SelfContact,
     mesh: Mesh,
     thickness: Float[Array, ""],
     friction: Float[Array, ""],
@@ -177,12 +177,12 @@ def settle(
     `solve` gives the positions under contacts, from a guess. NaN when `MAX_ATTEMPTS` do not
     suffice, or the capacity.
     """
-    contacts, fits = touching(layers, mesh, thickness, friction, before)
+    contacts, fits = proximity_contacts(layers, mesh, thickness, friction, before)
 
     def attempt(state):
         x, contacts, _, fits = state
         x = solve(contacts, x)
-        contacts, is_free, enough = colliding(layers, mesh, thickness, before, x, contacts)
+        contacts, is_free, enough = collision_contacts(layers, mesh, thickness, before, x, contacts)
         return x, contacts, is_free, fits & enough
 
     def body(state, _):
@@ -193,8 +193,8 @@ def settle(
     return jnp.where(is_free & fits, x, jnp.nan)
 
 
-def touching(
-    layers: Layers,
+def proximity_contacts(
+    layers: SelfContact,
     mesh: Mesh,
     thickness: Float[Array, ""],
     friction: Float[Array, ""],
@@ -214,8 +214,8 @@ def touching(
     return contacts, ~overflow & (contacts.count <= layers.capacity)
 
 
-def colliding(
-    layers: Layers,
+def collision_contacts(
+    layers: SelfContact,
     mesh: Mesh,
     thickness: Float[Array, ""],
     before: Positions,

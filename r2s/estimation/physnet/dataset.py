@@ -24,11 +24,11 @@ from r2s.estimation.physnet.views import (
     view_around,
 )
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import Family, IsotropicFamily, OrthotropicFamily, Range
+from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
 from r2s.files import read_json, write_bytes, write_json
 from r2s.mpm.sheet import Sheet
 from r2s.scenarios.on_points import material_points
-from r2s.scenarios.scenario import Scenario, motion
+from r2s.scenarios.scenario import Scenario, rollout
 from r2s.scenarios.six import SIX, Experiment, varied
 
 FORMAT = "r2s-physnet-data/2"
@@ -40,11 +40,11 @@ class Settings:
     """What a data set holds; all of it follows from these.
 
     - `scenario`: a name in `r2s.scenarios.SIX`.
-    - `num_fabrics`: the classes, drawn evenly from the unit cube of the family.
+    - `num_fabrics`: the classes, drawn evenly from the unit cube of the space.
     - `num_levels`: motions of each, the same for all of a shard; see `levels`.
     - `num_frames`: kept of each motion, evenly spread over those that count.
     - `size`: of the images, [pixel]. - `shape`: vertices along warp and weft.
-    - `density` [kg/m^2], `thickness` [m], `ranges`: of the family; no ranges: its own.
+    - `density` [kg/m^2], `thickness` [m], `ranges`: of the space; no ranges: its own.
     - `isotropic`: fabrics of E h and Poisson's ratio, not orthotropic ones.
     - `material_points`: by these instead of the cloth.
     - `per_shard`: fabrics in a file. - `seed`.
@@ -70,7 +70,7 @@ class Settings:
             object.__setattr__(self, "ranges", plain)
         names, expected = ([bound.name for bound in ranges] for ranges in (self.ranges, plain))
         if names[: len(expected)] != expected:
-            raise ValueError(f"the family has the ranges {expected}, found {names}")
+            raise ValueError(f"the space has the ranges {expected}, found {names}")
         if self.scenario not in SIX:
             raise ValueError(f"scenario must be one of {list(SIX)}, found {self.scenario!r}")
         for name in ("num_fabrics", "num_levels", "num_frames", "per_shard"):
@@ -78,13 +78,13 @@ class Settings:
                 raise ValueError(f"{name} must be at least 1, found {getattr(self, name)}")
 
     @property
-    def family(self) -> Family:
+    def space(self) -> ParameterSpace:
         return dataclasses.replace(self._plain(), ranges=self.ranges)
 
-    def _plain(self) -> OrthotropicFamily | IsotropicFamily:
+    def _plain(self) -> OrthotropicSpace | IsotropicSpace:
         if self.isotropic:
-            return IsotropicFamily.make(self.density, thickness=self.thickness)
-        return OrthotropicFamily.make(self.density, self.thickness)
+            return IsotropicSpace.make(self.density, thickness=self.thickness)
+        return OrthotropicSpace.make(self.density, self.thickness)
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def _moved(scenarios: Scenario, fabrics: Fabric, solver: Sheet | None):
     def one(scenario: Scenario, fabric: Fabric):
         # the grid serves all scenarios, the fan is each one's own
         own = solver and eqx.tree_at(lambda s: s.scene, solver, scenario.scene)
-        found = motion(scenario, fabric, solver=own)
+        found = rollout(scenario, fabric, solver=own)
         return found.x, jnp.all(found.ok) & jnp.all(jnp.isfinite(found.x))
 
     return eqx.filter_vmap(one)(scenarios, fabrics)
@@ -225,7 +225,7 @@ def solver_of(settings: Settings, scenarios: list[Scenario]) -> Sheet | None:
         jnp.concatenate([getattr(scenario, name) for scenario in scenarios])
         for name in ("path", "path_times")
     )
-    stiffest = settings.family(jnp.ones(len(settings.ranges), float))
+    stiffest = settings.space(jnp.ones(len(settings.ranges), float))
     everywhere = dataclasses.replace(scenarios[0], path=paths, path_times=times)
     return material_points(everywhere, stiffest)
 
@@ -258,7 +258,7 @@ def _simulate(settings: Settings, number: int, alike: Alike):
     places = jr.uniform(key, (settings.per_shard, len(settings.ranges)), float)
     experiments = levels(settings, number)
     scenarios = [experiment.scenario(settings.shape) for experiment in experiments]
-    fabrics = jax.vmap(settings.family)(jnp.repeat(places, settings.num_levels, axis=0))
+    fabrics = jax.vmap(settings.space)(jnp.repeat(places, settings.num_levels, axis=0))
     repeated = stacked(scenarios * settings.per_shard, alike.substeps)
     x, ok = _moved(repeated, fabrics, alike.solver)
     motions = count * settings.num_levels

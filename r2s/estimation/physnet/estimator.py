@@ -15,17 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r2s.estimation.estimate import Estimate, without_deviations
+from r2s.estimation.estimate import Estimate, without_standard_errors
 from r2s.estimation.physnet import bayes, emulator
 from r2s.estimation.physnet.bayes import History, Objective
 from r2s.estimation.physnet.network import PhysNet
 from r2s.estimation.physnet.preprocess import grey
 from r2s.estimation.physnet.training import Training
 from r2s.estimation.physnet.views import View, depths_of_sheet, per_face
-from r2s.fabrics.parameters import Family
+from r2s.fabrics.parameters import ParameterSpace
 from r2s.recordings.cameras.calibration import DepthCamera, frustum
-from r2s.rollout import Solver
-from r2s.scenarios.scenario import Scenario, motion
+from r2s.scenarios.scenario import Scenario, rollout
+from r2s.solver import Solver
 
 Images = Float[np.ndarray, "frame down across"]
 
@@ -40,7 +40,7 @@ class Sighting(eqx.Module):
 
     scenario: Scenario
     points: Float[Array, "frame dim"]
-    family: Family
+    space: ParameterSpace
     network: PhysNet
     solver: Solver | None
     frames: tuple[int, ...] = eqx.field(static=True)
@@ -54,7 +54,7 @@ class Sighting(eqx.Module):
         scenario: Scenario,
         images: Images,
         frames: tuple[int, ...],
-        family: Family,
+        space: ParameterSpace,
         training: Training,
         solver: Solver | None = None,
         cameras: Sequence[DepthCamera] = (),
@@ -77,7 +77,7 @@ class Sighting(eqx.Module):
         about = frames, training.view, fine
         planes = [frustum(camera) for camera in cameras]
         planes = jnp.asarray(np.stack(planes), float) if planes else None
-        return cls(scenario, points, family, training.network, solver, *about, planes)
+        return cls(scenario, points, space, training.network, solver, *about, planes)
 
 
 @eqx.filter_jit
@@ -97,8 +97,8 @@ def answers(sighting: Sighting, places: Float[Array, "place dim"]) -> Float[Arra
     """
 
     def of_place(place):
-        fabric = sighting.family(place)
-        found = motion(sighting.scenario, fabric, solver=sighting.solver)
+        fabric = sighting.space(place)
+        found = rollout(sighting.scenario, fabric, solver=sighting.solver)
         x = found.x[jnp.array(sighting.frames)]
         faces = sighting.scenario.scene.mesh.faces
         about = sighting.per_face, sighting.cameras
@@ -163,7 +163,7 @@ def estimate(
     target = np.asarray(_flat(sighting.points))
     about = {"num_calls": num_calls, "batch": batch, "seed": seed, "path": path}
     frames = len(sighting.frames)  # the error of the images counts as the same in all of them
-    dim = sighting.family.dim
+    dim = sighting.space.dim
     trials = emulator.minimise(
         responses(sighting, batch), target, dim, shared=frames, progress=progress, **about
     )
@@ -187,18 +187,18 @@ def original(
     optimisation of that distance, as in the study; otherwise as `estimate`."""
     began = time.perf_counter()
     about = {"num_calls": num_calls, "batch": batch, "seed": seed, "path": path}
-    lossy, dim = objective(sighting, batch), sighting.family.dim
+    lossy, dim = objective(sighting, batch), sighting.space.dim
     history = bayes.minimise(lossy, dim, progress=progress, **about)
     name = f"physnet (Bayesian optimisation, {num_calls} simulations)"
     return _told(sighting, name, history.places, history.losses, history.best, began)
 
 
 def _told(sighting: Sighting, name: str, places, losses, best: int, began: float) -> Estimate:
-    family = sighting.family
-    values = np.asarray(jax.vmap(family.values)(jnp.asarray(places, float)))
-    return without_deviations(
+    space = sighting.space
+    values = np.asarray(jax.vmap(space.values)(jnp.asarray(places, float)))
+    return without_standard_errors(
         name,
-        family,
+        space,
         jnp.asarray(places[best], float),
         float(losses[best]),
         losses[:, None],

@@ -29,7 +29,7 @@ from r2s.estimation.pinn.weak import (
     virtual_fields,
     virtual_work,
 )
-from r2s.fabrics.parameters import Family
+from r2s.fabrics.parameters import ParameterSpace
 
 # rates from this frame and the two before, over the time between frames: at rest in the first
 FORMULAS = ((0.0, 0.0, 0.0), (1.0, -1.0, 0.0), (1.5, -2.0, 0.5))
@@ -61,7 +61,7 @@ class Solved(NamedTuple):
 
     - `coefficients`, `balanced`: and whether each frame is in balance.
     - `by_now`, `by_rate`: derivatives in the coefficients and in their rates.
-    - `by_place`: in the family's place. The last of these two-axis blocks is of the force.
+    - `by_place`: in the space's place. The last of these two-axis blocks is of the force.
     - `markers`: from the measured ones [m]. - `force`: on the clamp [N].
     """
 
@@ -86,7 +86,7 @@ class Reduced(NamedTuple):
 class Balanced(NamedTuple):
     """What the weak form found.
 
-    - `place`: in the family's unit cube. - `covariance`: of that place.
+    - `place`: in the space's unit cube. - `covariance`: of that place.
     - `information`: its inverse, without the prior of the ranges.
     - `marker`, `force`: rms of what is left of markers [m] and force [-].
     - `places`, `losses`: of every step; the losses are mean squares of the markers' rest [m^2].
@@ -167,7 +167,7 @@ def _tangents(fabric, pull: Pull, basis: Basis, motion: Kinematics, strain: Stra
 
 @eqx.filter_jit
 def solve(
-    family: Family,
+    space: ParameterSpace,
     place: Float[Array, " dim"],
     pull: Pull,
     basis: Basis,
@@ -176,8 +176,8 @@ def solve(
     start: Float[Array, "frame function axis"],
     strain: Strain = green,
 ) -> Solved:
-    """The motion in balance at a place of the family, from `start` [m], with derivatives."""
-    fabric, interval = family(place), (pull.times[-1] - pull.times[0]) / (len(pull.times) - 1)
+    """The motion in balance at a place of the space, from `start` [m], with derivatives."""
+    fabric, interval = space(place), (pull.times[-1] - pull.times[0]) / (len(pull.times) - 1)
     shape, axes = start.shape[1:], start.shape[2]
 
     def works(fabric, frame, formula, now, before, earlier):
@@ -218,7 +218,7 @@ def solve(
         guess = jnp.where(size(guess) < size(before), guess, before)
         now, left, _ = jax.lax.while_loop(goes_on, improve, (guess, size(guess), 0))
         work, moved = works(fabric, frame, formula, now, before, earlier)
-        of_place = lambda place: works(family(place), frame, formula, now, before, earlier)[
+        of_place = lambda place: works(space(place), frame, formula, now, before, earlier)[
             0
         ].ravel()
         tangents = _tangents(fabric, pull, basis, moved, strain)
@@ -267,7 +267,7 @@ def _formulas(frames: int) -> Float[np.ndarray, "frame 3"]:
 
 
 def balance(
-    family: Family,
+    space: ParameterSpace,
     networks: list[Network],
     pulls: list[Pull],
     place: Float[np.ndarray, " dim"],
@@ -277,7 +277,7 @@ def balance(
     degrees: tuple[int, int] = DEGREES,
     steps: int = STEPS,
 ) -> Balanced:
-    """The place in the family whose motions in balance fit markers and force best.
+    """The place in the space whose motions in balance fit markers and force best.
 
     `marker` [m] and `force` [-], over the greatest of its pull, are the noise to begin with; what
     is left replaces them. `degrees` are those of the virtual displacements, along and across.
@@ -293,7 +293,7 @@ def balance(
     for _ in range(steps):
         at, here = jnp.asarray(place, float), []
         for i, (pull, basis, (even, off, _)) in enumerate(zip(pulls, bases, about, strict=True)):
-            solved = solve(family, at, pull, basis, even, off, starts[i], strain)
+            solved = solve(space, at, pull, basis, even, off, starts[i], strain)
             if not np.isfinite(np.asarray(solved.coefficients)).all():
                 raise RuntimeError(f"pull {i} has no motion in balance: it is not finite")
             starts[i] = solved.coefficients

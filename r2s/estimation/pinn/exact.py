@@ -1,7 +1,7 @@
 """The network alone, to many digits: on fields without noise, by Levenberg and Marquardt's steps.
 
 The strong form: markers, equation of motion and the measured force at once, with the fabric's place
-in its family among the unknowns. On exact fields a descent along gradients leaves the stiffness 10
+in its space among the unknowns. On exact fields a descent along gradients leaves the stiffness 10
 to 30 % off; these steps find it with the same equations.
 """
 
@@ -29,7 +29,7 @@ from r2s.estimation.pinn.losses import (
 )
 from r2s.estimation.pinn.network import Network
 from r2s.estimation.pinn.training import Recipe, init
-from r2s.fabrics.parameters import Family
+from r2s.fabrics.parameters import ParameterSpace
 
 INSIDE = 1e-3  # from the ends of the ranges
 WIDTH, LAYERS, STEPS, POINTS = 20, 4, 60, 600
@@ -45,7 +45,7 @@ class About(eqx.Module):
     """
 
     likeness: Network
-    family: Family
+    space: ParameterSpace
     pull: Pull
     marker: Float[Array, ""]
     motion: Float[Array, ""]
@@ -66,7 +66,7 @@ def with_weights(likeness: Network, unknown: Unknown) -> Network:
 
 
 def ranged(place: Float[np.ndarray, " dim"], weight: float = PRIOR) -> Term:
-    """What draws the last unknowns, a place in a family, to another one.
+    """What draws the last unknowns, a place in a space, to another one.
 
     To the middle, with the `weight` [-] that it has, it is the ranges as a flat prior.
     """
@@ -80,12 +80,12 @@ def _of_range(unknown: Unknown, weight: Array, row) -> Array:
 
 
 def clipped(dim: int):
-    """Keeps the last `dim` unknowns, a place in a family, within their ranges."""
+    """Keeps the last `dim` unknowns, a place in a space, within their ranges."""
     return lambda u: np.append(u[:-dim], np.clip(u[-dim:], INSIDE, 1 - INSIDE))
 
 
 def fit(
-    family: Family,
+    space: ParameterSpace,
     pull: Pull,
     *,
     marker: float = 1e-6,
@@ -97,7 +97,7 @@ def fit(
     layers: int = LAYERS,
     key: PRNGKeyArray,
 ) -> tuple[Float[np.ndarray, " dim"], Fit]:
-    """The place in a family of the fabric of one pull by the network alone, and the last descent.
+    """The place in a space of the fabric of one pull by the network alone, and the last descent.
 
     `marker` is the noise of the markers [m]. Equation of motion and force hold to a `tolerance` [-]
     of the stress, at `points` drawn over sheet and frames. Neither clamps nor free edges count.
@@ -105,33 +105,33 @@ def fit(
     """
     key_network, key_points = jr.split(key)
     recipe = Recipe(width=width, layers=layers)
-    begin = init(family, jax.tree.map(lambda leaf: leaf[None], pull), recipe, key=key_network)
+    begin = init(space, jax.tree.map(lambda leaf: leaf[None], pull), recipe, key=key_network)
     likeness = jax.tree.map(lambda leaf: leaf[0], begin.networks)
-    unknown = np.concatenate([weights_of(likeness), np.full(family.dim, 0.5)])
-    about = _about(family, pull, likeness, marker, tolerance, strain)
+    unknown = np.concatenate([weights_of(likeness), np.full(space.dim, 0.5)])
+    about = _about(space, pull, likeness, marker, tolerance, strain)
     frames, markers = (grid.ravel() for grid in np.indices(pull.seen.shape))
     seen = (pull.places[markers], jnp.asarray(frames), pull.displacement.reshape(len(frames), -1))
     drawn = draw_points(pull, points, key=key_points)
     data = Term(_of_marker, about, (*seen, pull.seen.ravel()))
     terms = [data, Term(_of_motion, about, (drawn.inner, drawn.inner_frame))]
-    terms.append(ranged(np.full(family.dim, 0.5)))
+    terms.append(ranged(np.full(space.dim, 0.5)))
     if pull.force is not None:
         terms.append(Term(_of_force, about, (jnp.arange(len(pull.times)), pull.force)))
-    inside = clipped(family.dim)
+    inside = clipped(space.dim)
     # the motion first, or the fabric runs to an end of its ranges meanwhile
     known = least_squares([data, terms[2]], unknown, steps // 3, inside=inside)
     found = least_squares(terms, known.unknown, steps, inside=inside)
-    return found.unknown[-family.dim :], found
+    return found.unknown[-space.dim :], found
 
 
-def _about(family, pull, likeness, marker: float, tolerance: float, strain: Strain) -> About:
+def _about(space, pull, likeness, marker: float, tolerance: float, strain: Strain) -> About:
     array = lambda value: jnp.asarray(value, float)
     moved, shorter = jnp.max(jnp.abs(pull.displacement)), jnp.min(pull.size)
-    stress = family.middle().membrane.c11 * moved / shorter
+    stress = space.middle().membrane.c11 * moved / shorter
     force = stress * pull.size[1] if pull.force is None else jnp.max(jnp.abs(pull.force))
     small = array(tolerance)
     scales = array(marker), small * stress / shorter, small * force
-    return About(likeness, family, pull, *scales, strain)
+    return About(likeness, space, pull, *scales, strain)
 
 
 def _of_marker(unknown: Unknown, about: About, row) -> Array:
@@ -144,7 +144,7 @@ def _of_marker(unknown: Unknown, about: About, row) -> Array:
 def _of_motion(unknown: Unknown, about: About, row) -> Array:
     place, frame = row
     network = with_weights(about.likeness, unknown)
-    fabric = about.family(unknown[-about.family.dim :])
+    fabric = about.space(unknown[-about.space.dim :])
     off = motion_residual(network, about.pull, fabric, place[None], frame[None], about.strain)
     return off[0] / about.motion
 
@@ -152,7 +152,7 @@ def _of_motion(unknown: Unknown, about: About, row) -> Array:
 def _of_force(unknown: Unknown, about: About, row) -> Array:
     """The traction on the far edge, integrated, against the measured force."""
     frame, measured = row
-    pull, fabric = about.pull, about.family(unknown[-about.family.dim :])
+    pull, fabric = about.pull, about.space(unknown[-about.space.dim :])
     nodes, weights = gauss(EDGE_NODES)
     places = jnp.stack([jnp.broadcast_to(pull.size[0], nodes.shape), nodes * pull.size[1]], axis=1)
     network = with_weights(about.likeness, unknown)

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimation.estimate import Condition, Estimate
+from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.estimation.pinn.clouds import (
     Rows,
     Sight,
@@ -48,10 +48,10 @@ from r2s.estimation.pinn.shell import (
     work_scale,
 )
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import Family
+from r2s.fabrics.parameters import ParameterSpace
 from r2s.geometry.mesh import Mesh, rectangle
 from r2s.recordings.recording import Recording
-from r2s.scenarios.scenario import GUST, JET, from_recording, motion
+from r2s.scenarios.scenario import GUST, JET, from_recording, rollout
 from r2s.world.air import Air, Fan
 
 GRIP = 3e-4  # [m], to which the gripper's path is known
@@ -97,7 +97,7 @@ class About(eqx.Module):
     """What rows of residuals share; see `r2s.estimation.pinn.exact.About`."""
 
     likeness: Network
-    family: Family
+    space: ParameterSpace
     hanging: Hanging
     parts: Splines
     tolerance: Float[Array, ""]
@@ -105,7 +105,7 @@ class About(eqx.Module):
 
 def estimate(
     recording: Recording,
-    family: Family,
+    space: ParameterSpace,
     settings: Settings = Settings(),
     *,
     begin: Float[np.ndarray, " dim"] | None = None,
@@ -114,7 +114,7 @@ def estimate(
 ) -> Estimate:
     """The fabric of a recording of a sheet that is lifted or hangs, from its clouds.
 
-    `begin` is the place in the family of the fabric to begin with, by default the middle. `report`
+    `begin` is the place in the space of the fabric to begin with, by default the middle. `report`
     is called after each round with its number, the spread of the distances [m] and the
     parameters. An estimate that still moved in its last round says "not converged", and has no
     deviations. Raises `ValueError` for too few frames, `RuntimeError` when the solver or the
@@ -125,18 +125,18 @@ def estimate(
     began = time.perf_counter()
     frames = _frames(recording, settings.frames)
     sight = sight_of(recording, frames, settings.points)
-    about = _about(recording, family, sight, settings, key)
+    about = _about(recording, space, sight, settings, key)
     held = fixed(sight.corners, sight.times, sight.grips, GRIP)
-    place = np.full(family.dim, 0.5) if begin is None else np.asarray(begin, np.float64)
-    solver = _of_solver(recording, family(jnp.asarray(place, float)), sight, frames)
+    place = np.full(space.dim, 0.5) if begin is None else np.asarray(begin, np.float64)
+    solver = _of_solver(recording, space(jnp.asarray(place, float)), sight, frames)
     unknown = np.concatenate([weights_of(about.likeness), place])
     terms = [_rows(about, held), _rows(about, solver), ranged(place)]
-    unknown = least_squares(terms, unknown, settings.begin, inside=clipped(family.dim)).unknown
+    unknown = least_squares(terms, unknown, settings.begin, inside=clipped(space.dim)).unknown
     found = _rounds(about, sight, held, unknown, recording.info.sheet.held, settings, report)
     still = recording.info.wind is not None
     few = len(frames) if still else max(1.0, ALIKE * len(frames) / _counted(recording))
     words = f"clouds of {recording.info.scenario}" + ("" if found.settled else ", not converged")
-    return _estimate(words, family, found, few, time.perf_counter() - began)
+    return _estimate(words, space, found, few, time.perf_counter() - began)
 
 
 class Found(NamedTuple):
@@ -154,7 +154,7 @@ class Found(NamedTuple):
 
 def _rounds(about: About, sight: Sight, held: Rows, unknown, names, settings, report) -> Found:
     """Match, and make a few steps; the fabric follows when the map is in balance."""
-    size, dim = (float(sight.size[0]), float(sight.size[1])), about.family.dim
+    size, dim = (float(sight.size[0]), float(sight.size[1])), about.space.dim
     fine, coarse = rectangle(size, FINE), rectangle(size, COARSE)
     damping, history, settled, information = FIRST, [], False, np.zeros((dim, dim))
     deviation = np.inf
@@ -173,7 +173,7 @@ def _rounds(about: About, sight: Sight, held: Rows, unknown, names, settings, re
         moved = np.abs(found.unknown - unknown)[-dim:].max()
         unknown, damping = found.unknown, min(found.damping, FIRST)
         information = found.information
-        values = np.asarray(about.family.values(jnp.asarray(unknown[-dim:], float)))
+        values = np.asarray(about.space.values(jnp.asarray(unknown[-dim:], float)))
         history.append((float(spread) ** 2, values))
         if report is not None:
             report(number, float(spread), values)
@@ -203,7 +203,7 @@ def _frames(recording: Recording, number: int) -> np.ndarray:
     return np.unique(np.linspace(first, last, number).round().astype(int))
 
 
-def _about(recording, family, sight: Sight, settings: Settings, key) -> About:
+def _about(recording, space, sight: Sight, settings: Settings, key) -> About:
     array = lambda value: jnp.asarray(value, float)
     axes, wind = axes_of(recording), np.zeros(3)
     fan = None
@@ -217,13 +217,13 @@ def _about(recording, family, sight: Sight, settings: Settings, key) -> About:
     make = {"axes": 3, "width": settings.width, "layers": settings.layers}
     likeness = Network.make(low, high, scale, **make, key=key)
     hanging = Hanging(sight.size, -sight.up, Air.make(), fan, array(wind))
-    return About(likeness, family, hanging, splines(), array(settings.tolerance))
+    return About(likeness, space, hanging, splines(), array(settings.tolerance))
 
 
 def _of_solver(recording: Recording, fabric: Fabric, sight: Sight, frames: np.ndarray) -> Rows:
     """Rows that draw the map to how a fabric moves in the cloth solver."""
     scenario = from_recording(recording)
-    moved = eqx.filter_jit(motion)(scenario, fabric)
+    moved = eqx.filter_jit(rollout)(scenario, fabric)
     x = np.asarray(moved.x, np.float64)[frames]
     if not np.isfinite(x).all():
         raise RuntimeError(f"recording {recording.info.name}: the cloth solver diverged")
@@ -270,30 +270,32 @@ def _of_balance(network: Network, about: About, sight: Sight, grips, every: int)
 
 def _of_work(unknown: Unknown, about: About, row) -> Array:
     time, free = row
-    fabric = about.family(unknown[-about.family.dim :])
+    fabric = about.space(unknown[-about.space.dim :])
     network = with_weights(about.likeness, unknown)
     work = virtual_work(network, about.hanging, fabric, about.parts, time)
     scale = about.tolerance * work_scale(about.hanging, fabric.density, about.parts)
     return jnp.where(free[:, None], work / scale[:, None], 0).ravel()
 
 
-def _estimate(words: str, family: Family, found: Found, few: float, seconds: float) -> Estimate:
+def _estimate(
+    words: str, space: ParameterSpace, found: Found, few: float, seconds: float
+) -> Estimate:
     """What errs alike in `few` frames counts once. Without deviations while the fabric moves: what
     a linear model says of a place far from the best one is wrong."""
-    own = found.information - PRIOR**2 * np.eye(family.dim)
-    covariance = np.linalg.inv(own / few + PRIOR**2 * np.eye(family.dim))
-    lengths = np.array([np.log(r.high / r.low) if r.log else r.high - r.low for r in family.ranges])
+    own = found.information - PRIOR**2 * np.eye(space.dim)
+    covariance = np.linalg.inv(own / few + PRIOR**2 * np.eye(space.dim))
+    lengths = np.array([np.log(r.high / r.low) if r.log else r.high - r.low for r in space.ranges])
     deviations = np.sqrt(np.diag(covariance)) * (1.0 if found.settled else np.nan)
-    place = jnp.asarray(found.unknown[-family.dim :], float)
+    place = jnp.asarray(found.unknown[-space.dim :], float)
     squares = np.array([square for square, _ in found.history])[:, None]
     return Estimate(
         approach=f"pinn (weak form, {words})",
-        fabric=family(place),
-        ranges=family.ranges,
-        values=np.asarray(family.values(place)),
+        fabric=space(place),
+        ranges=space.ranges,
+        values=np.asarray(space.values(place)),
         deviations=lengths * deviations,
         correlation=covariance / np.outer(deviations, deviations),
-        conditions=(Condition("spread of distances", "m", float(squares[-1, 0] ** 0.5), np.nan),),
+        conditions=(Nuisance("spread of distances", "m", float(squares[-1, 0] ** 0.5), np.nan),),
         loss=float(squares[-1, 0]),
         losses=squares,
         history=np.stack([values for _, values in found.history])[:, None],

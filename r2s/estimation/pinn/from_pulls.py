@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from r2s.estimation.estimate import Condition, Estimate, without_deviations
+from r2s.estimation.estimate import Estimate, Nuisance, without_standard_errors
 from r2s.estimation.pinn.balance import Balanced, balance
 from r2s.estimation.pinn.data import Pull, stacked
 from r2s.estimation.pinn.training import NOISE, Recipe, Trained, chunks, train
 from r2s.estimation.pinn.weak import DEGREES, weak_losses
-from r2s.fabrics.parameters import Family
+from r2s.fabrics.parameters import ParameterSpace
 
 QUICK = Recipe(losses=weak_losses, warm_up=200, adam=200, lbfgs=0)
 # what the network is for here: a motion to begin with, and its accelerations
@@ -37,7 +37,7 @@ class Found(NamedTuple):
 
 def estimate(
     pulls: Sequence[Pull],
-    family: Family,
+    space: ParameterSpace,
     recipe: Recipe = QUICK,
     *,
     noise: tuple[float, float] = NOISE,
@@ -45,12 +45,12 @@ def estimate(
     key: PRNGKeyArray,
 ) -> Found:
     """The fabric of one or several pulls of one fabric. Arguments as of `estimate_all`."""
-    return estimate_all([pulls], [family], recipe, noise=noise, progress=progress, key=key)[0]
+    return estimate_all([pulls], [space], recipe, noise=noise, progress=progress, key=key)[0]
 
 
 def estimate_all(
     pulls: Sequence[Sequence[Pull]],
-    families: Sequence[Family],
+    spaces: Sequence[ParameterSpace],
     recipe: Recipe = QUICK,
     *,
     noise: tuple[float, float] = NOISE,
@@ -67,26 +67,26 @@ def estimate_all(
     Raises `ValueError` for pulls that do not go together, `RuntimeError` when the training or the
     balance diverges.
     """
-    if not pulls or len(pulls) != len(families):
-        raise ValueError(f"{len(pulls)} fabrics were pulled, but {len(families)} families given")
+    if not pulls or len(pulls) != len(spaces):
+        raise ValueError(f"{len(pulls)} fabrics were pulled, but {len(spaces)} spaces given")
     if len({len(some) for some in pulls}) > 1:
         raise ValueError(f"as many pulls of each fabric are needed, got {[len(p) for p in pulls]}")
-    if len({family.ranges for family in families}) > 1:
-        raise ValueError("the families must have the same ranges")
+    if len({space.ranges for space in spaces}) > 1:
+        raise ValueError("the spaces must have the same ranges")
     began = time.perf_counter()
     stack = lambda *leaves: jnp.stack(leaves)
     together = jax.tree.map(stack, *(stacked(list(some)) for some in pulls))
-    trained = _trained(jax.tree.map(stack, *families), together, recipe, noise, progress, key)
+    trained = _trained(jax.tree.map(stack, *spaces), together, recipe, noise, progress, key)
     shared = (time.perf_counter() - began) / len(pulls)
     return [
-        _found(trained, i, list(some), family, recipe, noise, shared)
-        for i, (some, family) in enumerate(zip(pulls, families, strict=True))
+        _found(trained, i, list(some), space, recipe, noise, shared)
+        for i, (some, space) in enumerate(zip(pulls, spaces, strict=True))
     ]
 
 
-def _trained(families, pulls, recipe, noise, progress, key) -> Trained:
+def _trained(spaces, pulls, recipe, noise, progress, key) -> Trained:
     if not progress:
-        return train(families, pulls, recipe, noise=noise, key=key)
+        return train(spaces, pulls, recipe, noise=noise, key=key)
     try:
         from tqdm import tqdm
     except ImportError as error:
@@ -100,78 +100,76 @@ def _trained(families, pulls, recipe, noise, progress, key) -> Trained:
             )
             bar.update()
 
-        return train(families, pulls, recipe, noise=noise, report=report, key=key)
+        return train(spaces, pulls, recipe, noise=noise, report=report, key=key)
 
 
-def _found(trained: Trained, i: int, pulls, family, recipe, noise, seconds: float) -> Found:
+def _found(trained: Trained, i: int, pulls, space, recipe, noise, seconds: float) -> Found:
     began = time.perf_counter()
     model = jax.tree.map(lambda leaf: leaf[i], trained.model)
     part = lambda j: jax.tree.map(lambda leaf: leaf[j], model.networks)
     networks = [part(j) for j in range(len(pulls))]
     squares = np.asarray(trained.losses.data)[i] * noise[0] ** 2
-    history = np.stack(
-        [np.asarray(family.values(jnp.asarray(p, float))) for p in trained.places[i]]
-    )
+    history = np.stack([np.asarray(space.values(jnp.asarray(p, float))) for p in trained.places[i]])
     about = f"{len(pulls)} pull{'s' if len(pulls) > 1 else ''}"
     if pulls[0].force is None:
         about += ", no force: the scale of stiffness is not identifiable"
     form = "weak form" if recipe.losses is weak_losses else "strong form"
-    network = without_deviations(
+    network = without_standard_errors(
         f"pinn ({form}, {about})",
-        family,
+        space,
         model.place,
         float(squares[-1]),
         squares[:, None],
         history[:, None],
         seconds,
     )
-    balanced = _balanced(family, networks, pulls, np.asarray(model.place), noise, recipe)
+    balanced = _balanced(space, networks, pulls, np.asarray(model.place), noise, recipe)
     seconds += time.perf_counter() - began
-    return Found(_estimate(balanced, family, network, f"pinn ({about})", pulls, seconds), network)
+    return Found(_estimate(balanced, space, network, f"pinn ({about})", pulls, seconds), network)
 
 
-def _balanced(family: Family, networks, pulls, place, noise, recipe: Recipe) -> Balanced:
+def _balanced(space: ParameterSpace, networks, pulls, place, noise, recipe: Recipe) -> Balanced:
     """The estimate from the weak form, with what it owes to the number of virtual displacements."""
-    found = balance(family, networks, pulls, place, noise[0], noise[1], recipe.strain, DEGREES)
+    found = balance(space, networks, pulls, place, noise[0], noise[1], recipe.strain, DEGREES)
     about = found.place, found.marker, found.force, recipe.strain
     fewer = DEGREES[0] - 1, DEGREES[1] - 1
-    difference = balance(family, networks, pulls, *about, degrees=fewer).place - found.place
-    more = np.outer(difference, difference) + np.diag(_unmodelled(family) ** 2)
+    difference = balance(space, networks, pulls, *about, degrees=fewer).place - found.place
+    more = np.outer(difference, difference) + np.diag(_unmodelled(space) ** 2)
     return found._replace(covariance=found.covariance + more)
 
 
-def _unmodelled(family: Family) -> np.ndarray:
-    """Deviations of places in the family for what the model leaves out."""
+def _unmodelled(space: ParameterSpace) -> np.ndarray:
+    """Deviations of places in the space for what the model leaves out."""
     errors = {"friction": FRICTION_ERROR, "coupling": COUPLING_ERROR, "nu": COUPLING_ERROR}
     error = lambda r: STIFFNESS_ERROR if r.unit == "N/m" else errors.get(r.name, 0.0)
     length = lambda r: np.log(r.high / r.low) if r.log else r.high - r.low
-    return np.array([error(r) / length(r) for r in family.ranges])
+    return np.array([error(r) / length(r) for r in space.ranges])
 
 
 def _estimate(
-    found: Balanced, family: Family, network: Estimate, approach: str, pulls, seconds: float
+    found: Balanced, space: ParameterSpace, network: Estimate, approach: str, pulls, seconds: float
 ) -> Estimate:
-    lengths = np.array([np.log(r.high / r.low) if r.log else r.high - r.low for r in family.ranges])
+    lengths = np.array([np.log(r.high / r.low) if r.log else r.high - r.low for r in space.ranges])
     deviations = np.sqrt(np.diag(found.covariance))
     correlation = found.covariance / np.outer(deviations, deviations)
-    values = lambda place: np.asarray(family.values(jnp.asarray(place, float)))
+    values = lambda place: np.asarray(space.values(jnp.asarray(place, float)))
     history = np.concatenate(
         [network.history, np.stack([values(p) for p in found.places])[:, None]]
     )
-    scale = np.array([r.unit == "N/m" for r in family.ranges]) * lengths
-    conditions = [Condition("marker noise", "m", found.marker, np.nan)]
+    scale = np.array([r.unit == "N/m" for r in space.ranges]) * lengths
+    conditions = [Nuisance("marker noise", "m", found.marker, np.nan)]
     if pulls[0].force is not None:
-        conditions.append(Condition("force noise", "-", found.force, np.nan))
+        conditions.append(Nuisance("force noise", "-", found.force, np.nan))
     if scale.any():
         weights = scale / np.count_nonzero(scale)
         stiff = values(found.place)[scale > 0]
         mean = float(np.exp(np.log(stiff).mean()))
         spread = float(np.sqrt(weights @ found.covariance @ weights))  # relative, since log
-        conditions.append(Condition("stiffness scale", "N/m", mean, spread * mean))
+        conditions.append(Nuisance("stiffness scale", "N/m", mean, spread * mean))
     return Estimate(
         approach=approach if found.converged else approach[:-1] + ", not converged)",
-        fabric=family(jnp.asarray(found.place, float)),
-        ranges=family.ranges,
+        fabric=space(jnp.asarray(found.place, float)),
+        ranges=space.ranges,
         values=values(found.place),
         deviations=lengths * deviations,
         correlation=correlation,

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import IsotropicFamily
+from r2s.fabrics.parameters import IsotropicSpace
 from r2s.laws.membrane import OrthotropicMembrane
 from r2s.laws.solid import lame
 
@@ -96,10 +96,10 @@ def divergence(
     return along(changes[0])[:, 0] + along(changes[1])[:, 1]
 
 
-class PlaneStrainFamily(IsotropicFamily):
+class PlaneStrainFamily(IsotropicSpace):
     """Isotropic solids in plane strain, as the paper prints them: E times thickness, and nu.
 
-    As `IsotropicFamily`, which is plane stress and right for a sheet.
+    As `IsotropicSpace`, which is plane stress and right for a sheet.
     """
 
     def __call__(self, u: Float[Array, " dim"]) -> Fabric:

@@ -26,7 +26,7 @@ from r2s.estimation.pinn.losses import marker_residual, motion_residual
 from r2s.estimation.pinn.network import LAYERS, WIDTH, Network
 from r2s.estimation.pinn.training import Model, Recipe, init, trainable
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import Family
+from r2s.fabrics.parameters import ParameterSpace
 
 EPOCHS = 10_000
 ADAM_RATE, LBFGS_RATE = 1e-4, 0.1
@@ -37,7 +37,7 @@ BEGIN = 10.0  # [N/m], all stiffnesses
 
 class Course(NamedTuple):
     """A model, and after every chunk the losses of markers [m^2] and motion [(N/m^2)^2] and the
-    fabric's place in its family."""
+    fabric's place in its space."""
 
     model: Model
     data: Float[np.ndarray, " chunk"]
@@ -58,9 +58,11 @@ def plain(pull: Pull) -> Pull:
     return eqx.tree_at(lambda p: p.force, pull, None, is_leaf=lambda leaf: leaf is None)
 
 
-def begin(family: Family, pulls: Pull, place: Float[Array, " dim"], *, key: PRNGKeyArray) -> Model:
+def begin(
+    space: ParameterSpace, pulls: Pull, place: Float[Array, " dim"], *, key: PRNGKeyArray
+) -> Model:
     """An untrained model of stacked pulls, with networks of the paper's size."""
-    model = init(family, pulls, Recipe(width=WIDTH, layers=LAYERS), key=key)
+    model = init(space, pulls, Recipe(width=WIDTH, layers=LAYERS), key=key)
     free = jnp.log(place / (1 - place)).astype(model.free.dtype)  # no weak type: compiles once
     return eqx.tree_at(lambda m: m.free, model, free)
 
@@ -88,10 +90,10 @@ def untouched(model: Model) -> State:
     return State(weights, adam.init(weights), lbfgs.init(weights), none)
 
 
-def losses(model: Model, family: Family, pulls: Pull) -> tuple[Array, Array]:
+def losses(model: Model, space: ParameterSpace, pulls: Pull) -> tuple[Array, Array]:
     """Mean squares of the markers' distances [m^2], and of the residual at the markers in every
     frame [(N/m^2)^2]."""
-    fabric = family(model.place)
+    fabric = space(model.place)
 
     def of_pull(network, pull):
         number, markers, _ = pull.displacement.shape
@@ -110,7 +112,7 @@ def _motion_of_frame(weights: tuple[Network, Fabric], frame: Array, pull: Pull) 
 
 @eqx.filter_jit
 def run(
-    model: Model, state: State, family: Family, pulls: Pull, first: Array, epochs: int
+    model: Model, state: State, space: ParameterSpace, pulls: Pull, first: Array, epochs: int
 ) -> tuple[Model, State, tuple[Array, Array]]:
     """Some epochs from number `first` on; the model is without the step that is not judged yet.
 
@@ -122,11 +124,11 @@ def run(
 
     def epoch(carried, number):
         weights, (ahead, of_adam, of_lbfgs, before) = carried
-        data, slope = jax.value_and_grad(lambda w: losses(whole(w), family, pulls)[0])(ahead)
+        data, slope = jax.value_and_grad(lambda w: losses(whole(w), space, pulls)[0])(ahead)
         change, adam_after = adam.update(slope, of_adam)
         stepped = eqx.apply_updates(ahead, change)
         share = weight(number)
-        physics = lambda w: share * losses(whole(w), family, pulls)[1]
+        physics = lambda w: share * losses(whole(w), space, pulls)[1]
         motion, slope = jax.value_and_grad(physics)(stepped)
         change, lbfgs_after = lbfgs.update(slope, of_lbfgs, stepped)
         moved = eqx.apply_updates(stepped, change)
@@ -143,7 +145,7 @@ def run(
 
 
 def train(
-    family: Family,
+    space: ParameterSpace,
     pulls: Pull,
     place: Float[Array, " dim"],
     epochs: int = EPOCHS,
@@ -151,15 +153,15 @@ def train(
     *,
     key: PRNGKeyArray,
 ) -> Course:
-    """Train on stacked pulls, the fabric from a `place` in its family on.
+    """Train on stacked pulls, the fabric from a `place` in its space on.
 
     Does not raise when it diverges: the course shows it.
     """
     pulls = plain(pulls)
-    model, course = begin(family, pulls, place, key=key), []
+    model, course = begin(space, pulls, place, key=key), []
     state = untouched(model)
     for first in range(0, epochs, chunk):
-        about = model, state, family, pulls, jnp.asarray(first), min(chunk, epochs - first)
+        about = model, state, space, pulls, jnp.asarray(first), min(chunk, epochs - first)
         model, state, (data, motion) = run(*about)
         course.append((float(data), float(motion), np.asarray(model.place)))
     data, motion, places = (np.array(part) for part in zip(*course, strict=True))

@@ -13,13 +13,13 @@ from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh
 from r2s.geometry.surface import nearest
 from r2s.recordings.recording import Recording, RecordingInfo, make_recording
-from r2s.scenarios import account, clamp_force, stretching
+from r2s.scenarios import clamp_force, energy_balance, stretching
 from r2s.scenarios.synthetic import MARKER_NOISE, MARKERS
 
 FRAMES = 39  # of 1/30 s
 FORCE_NOISE = 0.01  # of the largest force
 
-_account = eqx.filter_jit(account)
+_account = eqx.filter_jit(energy_balance)
 
 
 def pulled(

@@ -23,7 +23,7 @@ from r2s.estimation.pinn.losses import (
     strong_losses,
 )
 from r2s.estimation.pinn.network import LAYERS, Network
-from r2s.fabrics.parameters import Family
+from r2s.fabrics.parameters import ParameterSpace
 
 LossesOf = Callable[..., Losses]
 NOISE = (2e-4, 0.01)  # of markers [m], and of the force over its greatest [-]
@@ -33,7 +33,7 @@ class Model(eqx.Module):
     """What is trained: a network for each pull, and the fabric that they share.
 
     - `networks`: with a leading axis, one a pull.
-    - `free`: unbounded; its sigmoid is a place in the family's unit cube, so that no bound is left:
+    - `free`: unbounded; its sigmoid is a place in the space's unit cube, so that no bound is left:
       C stays positive definite, and Poisson's ratio within its range.
     """
 
@@ -42,7 +42,7 @@ class Model(eqx.Module):
 
     @property
     def place(self) -> Float[Array, "*batch dim"]:
-        """Where the fabric lies in its family."""
+        """Where the fabric lies in its space."""
         return jax.nn.sigmoid(self.free)
 
 
@@ -75,7 +75,7 @@ class Recipe:
 
 
 class Trained(NamedTuple):
-    """Models, and their losses [-] and places in the family's cube after each chunk of training.
+    """Models, and their losses [-] and places in the space's cube after each chunk of training.
 
     All with a leading axis, one a fabric.
     """
@@ -85,8 +85,8 @@ class Trained(NamedTuple):
     places: Float[np.ndarray, "fabric chunk dim"]
 
 
-def init(family: Family, pulls: Pull, recipe: Recipe, *, key: PRNGKeyArray) -> Model:
-    """An untrained model of stacked pulls, its fabric in the middle of the family."""
+def init(space: ParameterSpace, pulls: Pull, recipe: Recipe, *, key: PRNGKeyArray) -> Model:
+    """An untrained model of stacked pulls, its fabric in the middle of the space."""
     number = pulls.angle.shape[0]
 
     def network(pull: Pull, key: PRNGKeyArray) -> Network:
@@ -100,7 +100,7 @@ def init(family: Family, pulls: Pull, recipe: Recipe, *, key: PRNGKeyArray) -> M
         *hidden, last = made.weights  # small, since what goes from clamp to clamp is given
         return eqx.tree_at(lambda n: n.weights, made, (*hidden, last / 10))
 
-    return Model(jax.vmap(network)(pulls, jr.split(key, number)), jnp.zeros(family.dim, float))
+    return Model(jax.vmap(network)(pulls, jr.split(key, number)), jnp.zeros(space.dim, float))
 
 
 def trainable(model: Model) -> Any:
@@ -111,10 +111,16 @@ def trainable(model: Model) -> Any:
 
 
 def total(
-    model: Model, family: Family, pulls: Pull, points: Points, noise: Array, weight, recipe: Recipe
+    model: Model,
+    space: ParameterSpace,
+    pulls: Pull,
+    points: Points,
+    noise: Array,
+    weight,
+    recipe: Recipe,
 ) -> tuple[Array, Losses]:
     """The sum of all losses with those of physics times `weight` [-], and the losses themselves."""
-    fabric = family(model.place)
+    fabric = space(model.place)
 
     def of_pull(network: Network, pull: Pull, points: Points) -> Losses:
         scales = scales_of(pull, fabric, noise[0], noise[1] * _greatest(pull))
@@ -131,12 +137,14 @@ def _greatest(pull: Pull) -> Array:
     return jnp.ones((), float) if pull.force is None else jnp.max(jnp.abs(pull.force))
 
 
-def redrawn(model: Model, family: Family, pulls: Pull, recipe: Recipe, key: PRNGKeyArray) -> Points:
+def redrawn(
+    model: Model, space: ParameterSpace, pulls: Pull, recipe: Recipe, key: PRNGKeyArray
+) -> Points:
     """New points: half of them even, half where the equation of motion is least fulfilled.
 
     The latter are drawn from four times as many, with chances that rise with the residual.
     """
-    fabric = family(model.place)
+    fabric = space(model.place)
 
     def of_pull(network: Network, pull: Pull, key: PRNGKeyArray) -> Points:
         key_pool, key_even, key_pick = jr.split(key, 3)
@@ -176,7 +184,7 @@ def adam(recipe: Recipe) -> optax.GradientTransformation:
 @eqx.filter_jit
 def adam_chunk(
     progress: Progress,
-    families: Family,
+    spaces: ParameterSpace,
     pulls: Pull,
     noise: Array,
     recipe: Recipe,
@@ -187,14 +195,14 @@ def adam_chunk(
     which, optimiser = trainable(progress.model), adam(recipe)
     faster = lambda change: recipe.fabric_rate * change
 
-    def run(progress: Progress, family: Family, pulls: Pull, key: PRNGKeyArray):
-        points = redrawn(progress.model, family, pulls, recipe, key)
+    def run(progress: Progress, space: ParameterSpace, pulls: Pull, key: PRNGKeyArray):
+        points = redrawn(progress.model, space, pulls, recipe, key)
 
         def epoch(progress: Progress, _):
             weight = (progress.epoch >= recipe.warm_up).astype(float)
             weights, fixed = eqx.partition(progress.model, which)
             loss = lambda weights: total(
-                eqx.combine(weights, fixed), family, pulls, points, noise, weight, recipe
+                eqx.combine(weights, fixed), space, pulls, points, noise, weight, recipe
             )
             gradient, losses = jax.grad(loss, has_aux=True)(weights)
             change, state = optimiser.update(gradient, progress.state)
@@ -205,13 +213,19 @@ def adam_chunk(
         return jax.lax.scan(epoch, progress, None, epochs)
 
     keys = jr.split(key, progress.epoch.shape[0])
-    progress, losses = jax.vmap(run)(progress, families, pulls, keys)
+    progress, losses = jax.vmap(run)(progress, spaces, pulls, keys)
     return progress, jax.tree.map(lambda values: values[:, -1], losses)
 
 
 @eqx.filter_jit
 def lbfgs_chunk(
-    model: Model, families: Family, pulls: Pull, noise: Array, recipe: Recipe, iterations: int, key
+    model: Model,
+    spaces: ParameterSpace,
+    pulls: Pull,
+    noise: Array,
+    recipe: Recipe,
+    iterations: int,
+    key,
 ) -> tuple[Model, Losses]:
     """Some iterations of L-BFGS for every fabric, with a line search, on points drawn anew.
 
@@ -219,11 +233,11 @@ def lbfgs_chunk(
     """
     which, optimiser = trainable(model), optax.lbfgs()
 
-    def run(model: Model, family: Family, pulls: Pull, key: PRNGKeyArray):
-        points = redrawn(model, family, pulls, recipe, key)
+    def run(model: Model, space: ParameterSpace, pulls: Pull, key: PRNGKeyArray):
+        points = redrawn(model, space, pulls, recipe, key)
         weights, fixed = eqx.partition(model, which)
         loss = lambda weights: total(
-            eqx.combine(weights, fixed), family, pulls, points, noise, 1.0, recipe
+            eqx.combine(weights, fixed), space, pulls, points, noise, 1.0, recipe
         )
         value_of = lambda weights: loss(weights)[0]
         again = optax.value_and_grad_from_state(value_of)
@@ -240,11 +254,11 @@ def lbfgs_chunk(
         (weights, _), _ = jax.lax.scan(iterate, begin, None, iterations)
         return eqx.combine(weights, fixed), loss(weights)[1]
 
-    return jax.vmap(run)(model, families, pulls, jr.split(key, model.free.shape[0]))
+    return jax.vmap(run)(model, spaces, pulls, jr.split(key, model.free.shape[0]))
 
 
 def train(
-    families: Family,
+    spaces: ParameterSpace,
     pulls: Pull,
     recipe: Recipe = Recipe(),
     *,
@@ -254,18 +268,18 @@ def train(
 ) -> Trained:
     """Train a network for each pull of each fabric, and the fabrics, all together.
 
-    `families` and `pulls` have a leading axis of fabrics, `pulls` then one of pulls. `noise`: of
+    `spaces` and `pulls` have a leading axis of fabrics, `pulls` then one of pulls. `noise`: of
     the markers [m], and of the force over its greatest [-]. `report` is called after every chunk
-    with the losses and the places in the families. Raises `RuntimeError` when a loss is not finite.
+    with the losses and the places in the spaces. Raises `RuntimeError` when a loss is not finite.
     """
     key_init, key = jr.split(key)
     number = pulls.angle.shape[0]
-    begin = lambda family, pulls, key: init(family, pulls, recipe, key=key)
-    model = jax.vmap(begin)(families, pulls, jr.split(key_init, number))
+    begin = lambda space, pulls, key: init(space, pulls, recipe, key=key)
+    model = jax.vmap(begin)(spaces, pulls, jr.split(key_init, number))
     weights, _ = eqx.partition(model, trainable(model))
     state = jax.vmap(adam(recipe).init)(weights)
     progress = Progress(model, state, jnp.zeros(number, int))
-    about = families, pulls, jnp.asarray(noise, float), recipe
+    about = spaces, pulls, jnp.asarray(noise, float), recipe
     history: list[tuple[Losses, np.ndarray]] = []
 
     def note(losses: Losses, model: Model) -> None:

@@ -18,9 +18,9 @@ from r2s.cloth.potential import (
 )
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh
-from r2s.rollout import Solver
 from r2s.scenarios.gripper_forces import step_with_forces
 from r2s.scenarios.scenario import Scenario, begin, stepped
+from r2s.solver import Solver
 from r2s.units import GRAVITY
 from r2s.world.drag import drag_on_vertices
 from r2s.world.scene import Control
@@ -28,7 +28,7 @@ from r2s.world.scene import Control
 Energies = Float[Array, " frame"]
 
 
-class Account(eqx.Module):
+class EnergyBalance(eqx.Module):
     """A motion with its forces [N], and its energies at every frame, [J].
 
     - `x`: positions, [m].
@@ -55,12 +55,12 @@ class Account(eqx.Module):
         return self.grippers + self.air - (held - held[0])
 
 
-def account(
+def energy_balance(
     scenario: Scenario,
     fabric: Fabric,
     max_step: float | None = None,
     solver: Solver | None = None,
-) -> Account:
+) -> EnergyBalance:
     """The motion of a fabric with forces and energies, from the first frame on.
 
     Arguments as of `motion`.
@@ -90,7 +90,7 @@ def account(
     since = lambda work: jnp.cumsum(work[first:]) - work[first]
     x, v = x[first:], v[first:]
     mass = vertex_mass(mesh, fabric)
-    return Account(
+    return EnergyBalance(
         x=x,
         forces=forces[first:],
         stored=jax.vmap(lambda x: stored_energy(mesh, fabric, x))(x),
@@ -101,7 +101,7 @@ def account(
     )
 
 
-def clamp_force(scenario: Scenario, found: Account) -> Float[Array, "frame 3"]:
+def clamp_force(scenario: Scenario, found: EnergyBalance) -> Float[Array, "frame 3"]:
     """The force [N] on the pulled clamp of a stretching at its frames: what a load cell measures.
 
     The clamp is the held vertices at the end of the warp.
