@@ -193,7 +193,7 @@ def problems_of(
 
 def clock_of(estimate: Estimate) -> float:
     """By how much the lift's clock is late [s]; negative: early; 0 when it was not in doubt."""
-    return next((c.value for c in estimate.conditions if c.name == "time 1"), 0.0)
+    return next((c.value for c in estimate.nuisances if c.name == "time 1"), 0.0)
 
 
 def own_fabric(made: Made, damping: float) -> Fabric:
@@ -297,9 +297,9 @@ def compare(folder: Path, fabric: str, ways: list[str], number: int, budget: Bud
 
 def parameters(fabric: str, way: str, found: Estimate) -> list[measure.Row]:
     """What was estimated, one row a number."""
-    rows = zip(found.ranges, found.values, found.deviations, found.determined, strict=True)
+    rows = zip(found.ranges, found.values, found.standard_errors, found.identifiable, strict=True)
     listed = [(b.name, b.unit, float(v), float(d), bool(sure)) for b, v, d, sure in rows]
-    listed += [(c.name, c.unit, c.value, c.deviation, True) for c in found.conditions]
+    listed += [(c.name, c.unit, c.value, c.deviation, True) for c in found.nuisances]
     names = ("parameter", "unit", "value", "deviation", "determined")
     return [{"fabric": fabric, "way": way} | dict(zip(names, each, strict=True)) for each in listed]
 

@@ -38,7 +38,7 @@ def scores(name: str, scenario: str, number: int) -> np.ndarray:
     truth = np.asarray(space.values(start))
     log = np.array([bound.log for bound in space.ranges])
     ratio = np.where(log, found.values / np.where(log, truth, 1), 1)
-    return np.where(log, np.log(ratio), found.values - truth) / found.deviations
+    return np.where(log, np.log(ratio), found.values - truth) / found.standard_errors
 
 
 def main(out: Path, scenario: str, each: int) -> None:

@@ -129,7 +129,7 @@ def attempt(problem: Problem, place: np.ndarray, method: str, number: int) -> me
     wrong = errors(problem, found, place)
     return {
         "errors": wrong,
-        "deviations": found.deviations,
+        "deviations": found.standard_errors,
         "loss": loss_of(problem, found),
         "seconds": seconds,
         "cpu_seconds": cpu,
@@ -145,7 +145,7 @@ def run(
     for name in fabrics:
         problem, place = problem_of(name, scenario, points)
         best = alone(problem, jnp.asarray(place, float), jax.random.key(0))
-        known = ", ".join(f"{d:.3f}" for d in best.deviations)
+        known = ", ".join(f"{d:.3f}" for d in best.standard_errors)
         measure.progress(f"{name}: deviations {known} from the truth")
         floor = loss_of(problem, best)
         for method, number in itertools.product(methods, range(starts)):
@@ -154,11 +154,11 @@ def run(
                 continue
             measure.progress(", ".join(label.values()))
             found = attempt(problem, place, method, number)
-            worst = float(np.max(np.abs(found["errors"][best.determined]), initial=0.0))
+            worst = float(np.max(np.abs(found["errors"][best.identifiable]), initial=0.0))
             rows.append(
                 label
                 | {
-                    "determined": int(best.determined.sum()),
+                    "determined": int(best.identifiable.sum()),
                     "worst": worst,
                     "within": worst <= 0.05,
                     "arrived": found["loss"] <= SAME * floor,

@@ -258,14 +258,14 @@ def _pulls(name: str, seed: int, count: int = 3) -> list:
     return some
 
 
-def _errors(space, truth, values, deviations=None) -> dict[str, float]:
+def _errors(space, truth, values, standard_errors=None) -> dict[str, float]:
     """Of every parameter: relative where its range is logarithmic, else absolute."""
     row = {}
     for i, bound in enumerate(space.ranges):
         ratio = float(values[i]) / float(truth[i]) - 1 if bound.log else 0.0
         row[f"error {bound.name}"] = ratio if bound.log else float(values[i] - truth[i])
-        if deviations is not None:
-            row[f"deviation {bound.name}"] = float(deviations[i])
+        if standard_errors is not None:
+            row[f"deviation {bound.name}"] = float(standard_errors[i])
     return row
 
 
@@ -286,7 +286,7 @@ def fabrics(out: Path, seeds: int) -> None:
         about, space = _fabric(fabric)
         truth = space.values(space.locate(about))
         found = estimate(some, space, key=jr.key(seed)).estimate
-        return _errors(space, truth, found.values, found.deviations)
+        return _errors(space, truth, found.values, found.standard_errors)
 
     jobs = [{"fabric": name, "seed": seed} for seed in range(seeds) for name in presets.FIVE]
     rows = resumed(out, "fabrics", jobs, make)
@@ -350,7 +350,7 @@ def recipes(out: Path, name: str, count: int, seeds: int, number: int, alone: bo
             return _errors(space, truth, space.values(course.model.place))
         if recipe == "ours":
             found = estimate(some, space, key=key).estimate
-            return _errors(space, truth, found.values, found.deviations)
+            return _errors(space, truth, found.values, found.standard_errors)
         losses = weak_losses if recipe.endswith("weak") else strong_losses
         found = estimate(some, space, Recipe(losses=losses, lbfgs=100), key=key).network
         return _errors(space, truth, found.values)
@@ -379,7 +379,7 @@ def clouds(out: Path, seeds: int) -> None:
         recording = synthetic.record(experiment, about, fabric, shape=(17, 17), key=key_seen)
         found = estimate(recording, space, key=key)
         truth = space.values(space.locate(about))
-        return _errors(space, truth, found.values, found.deviations)
+        return _errors(space, truth, found.values, found.standard_errors)
 
     jobs = [
         {"scenario": scenario, "fabric": name, "seed": seed}

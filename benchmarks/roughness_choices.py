@@ -113,7 +113,7 @@ def reference(problem: Problem, fabric: str) -> dict:
     end = np.asarray(problem.space.locate(found.fabric))
     values = np.asarray(problem.space.values(start))
     return {
-        "determined": found.determined,
+        "determined": found.identifiable,
         "truth": values,
         "loss": losses_at(problem, end[None])[0],
     }

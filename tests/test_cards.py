@@ -44,9 +44,9 @@ def estimate_at(place, deviations, loss=1e-6) -> Estimate:
         fabric=FAMILY(place),
         ranges=FAMILY.ranges,
         values=np.asarray(FAMILY.values(place)),
-        deviations=np.asarray(deviations, float),
+        standard_errors=np.asarray(deviations, float),
         correlation=correlation,
-        conditions=(Nuisance("shift x", "m", 0.001, np.nan),),
+        nuisances=(Nuisance("shift x", "m", 0.001, np.nan),),
         loss=loss,
         losses=np.ones((3, 2)),
         history=np.ones((3, 2, dim)),
@@ -138,7 +138,7 @@ def test_an_estimate_comes_back_without_its_history(place, deviations):
     assert again == card
     back = again.estimate
     assert back is not None and same(back.fabric, found.fabric) and not back.history.size
-    np.testing.assert_array_equal(back.deviations, found.deviations)
+    np.testing.assert_array_equal(back.standard_errors, found.standard_errors)
     np.testing.assert_array_equal(back.correlation, found.correlation)
     np.testing.assert_array_equal(back.values, found.values)
     assert back.combinations == found.combinations and back.ranges == found.ranges

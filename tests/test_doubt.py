@@ -12,7 +12,7 @@ import pytest
 
 from r2s import scenarios
 from r2s.estimation import descent, diffcloud, gauss_newton
-from r2s.estimation.descent import Budget, conditions, spread_of
+from r2s.estimation.descent import Budget, nuisances, spread_of
 from r2s.estimation.experiment_design import describe
 from r2s.estimation.gauss_newton import Descent, Normal
 from r2s.estimation.prediction import predict
@@ -63,13 +63,13 @@ def test_the_air_is_in_doubt_where_a_wind_blows(blown, lifted):
         blown.nuisance_prior == NuisancePrior(air=0.1) and lifted.nuisance_prior == NuisancePrior()
     )
     unknown = np.arange(19.0)
-    names = lambda *problems: [c.name for c in conditions(problems, unknown, unknown)]
+    names = lambda *problems: [c.name for c in nuisances(problems, unknown, unknown)]
     shifts = ["shift x", "shift y", "shift z", "turn"]
     numbered = lambda number: [f"{name} {number}" for name in shifts]
     assert names(blown) == ["air ratio", *shifts]
     assert names(lifted, blown) == [*numbered(1), "air ratio", *numbered(2)]
     assert names(blown, blown) == ["air ratio", *numbered(1), *numbered(2)]
-    (air, *_) = conditions((blown,), unknown, unknown)
+    (air, *_) = nuisances((blown,), unknown, unknown)
     assert air.value == pytest.approx(np.exp(0.1 * 8)) and air.unit == "-"
 
 
@@ -174,8 +174,8 @@ def test_an_estimate_says_what_was_in_doubt(lifted):
     alone, found = descend(budget), descend(budget._replace(around=4))
     np.testing.assert_array_equal(found.values, alone.values)
     np.testing.assert_array_equal(found.losses, alone.losses)
-    assert np.all(found.deviations > 0) and np.all(np.isfinite(found.deviations))
-    assert np.max(np.abs(found.deviations / alone.deviations - 1)) > 1e-3
+    assert np.all(found.standard_errors > 0) and np.all(np.isfinite(found.standard_errors))
+    assert np.max(np.abs(found.standard_errors / alone.standard_errors - 1)) > 1e-3
     lines = describe(found)
     assert any(line.startswith("shift x") and " m " in line for line in lines)
 
@@ -192,6 +192,6 @@ def test_wind_gives_the_stiffness_of_a_sheet_that_was_weighed_wrongly():
     stiff = [i for i, b in enumerate(space.ranges) if b.name in ("warp", "weft", "shear")]
     ratio = found.values[stiff] / truth[stiff]
     np.testing.assert_allclose(ratio, wrong, atol=0.05)
-    assert np.all(np.abs(np.log(ratio / wrong)) < 3 * found.deviations[stiff])
-    air = found.conditions[0]
+    assert np.all(np.abs(np.log(ratio / wrong)) < 3 * found.standard_errors[stiff])
+    air = found.nuisances[0]
     assert air.name == "air ratio" and air.value == pytest.approx(wrong, rel=5e-3)

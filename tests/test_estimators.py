@@ -213,8 +213,8 @@ def test_an_estimate_lowers_the_loss_and_survives_its_file(small):
     np.testing.assert_allclose(again.history, found.history)
     assert float(again.fabric.membrane.c12) == pytest.approx(float(found.fabric.membrane.c12))
     names = ["density ratio", "air ratio", "shift x", "shift y", "shift z", "turn", "time"]
-    assert [c.name for c in again.conditions] == names
-    assert again.conditions == found.conditions and again.combinations == found.combinations
+    assert [c.name for c in again.nuisances] == names
+    assert again.nuisances == found.nuisances and again.combinations == found.combinations
 
 
 def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(small, tmp_path):
@@ -259,7 +259,7 @@ def test_what_is_known_of_a_product_is_said():
         covariance / np.outer(deviation, deviation), (), 0.0, np.zeros((1, 1)),
         np.zeros((1, 1, 3)), 0.0,
     )  # fmt: skip
-    assert found.determined.tolist() == [False, False, True]
+    assert found.identifiable.tolist() == [False, False, True]
     (known,) = found.combinations
     assert sorted(known.exponents.values()) == [-1.0, 1.0] and set(known.exponents) == {"a", "b"}
     assert known.value == pytest.approx(4 if known.exponents["a"] > 0 else 0.25)
@@ -372,10 +372,10 @@ def test_a_known_fabric_and_a_late_clock_are_found(name):
     problem = Problem.make(record, space, nuisance_prior=NuisancePrior(time=0.1))
     found = descend(problem, approach="test", key=jr.key(0))
     truth = np.asarray(space.values(space.locate(fabric)))
-    assert found.determined.sum() >= 3
+    assert found.identifiable.sum() >= 3
     error = np.abs(np.where(truth > 0, found.values / truth - 1, found.values - truth))
-    assert np.all(error[found.determined] < 0.1)
-    delay = found.conditions[-1]
+    assert np.all(error[found.identifiable] < 0.1)
+    delay = found.nuisances[-1]
     assert delay.name == "time" and abs(delay.value - 0.08) < 0.01
 
 
@@ -405,7 +405,7 @@ def test_a_planned_motion_reveals_more_with_better_cameras():
             experiment, FABRIC, "grey", seen=seen, shape=(5, 5), key=jr.key(1)
         )
         problem = Problem.make(record, FAMILY, num_points=60, shape=(5, 5), voxel=1e-3)
-        return sensitivity(problem, FABRIC).deviations
+        return sensitivity(problem, FABRIC).standard_errors
 
     good, bad, low = deviations(0.2, 3e-4), deviations(0.2, 3e-3), deviations(0.05, 3e-4)
     assert np.all(np.isfinite(good)) and np.all(good > 0)
@@ -437,6 +437,6 @@ def test_material_points_find_a_known_modulus():
     start = jnp.array([0.25, 0.5])
     found = diffcp.estimate(diffcp.on_points(problem), budget, start=start, key=jr.key(0))
     truth = np.asarray(space.values(place))
-    spread = found.deviations * np.where([b.log for b in space.ranges], truth, 1)
+    spread = found.standard_errors * np.where([b.log for b in space.ranges], truth, 1)
     assert np.all(np.abs(found.values - truth) < 4 * spread)
-    assert found.deviations[0] < 0.3  # of the modulus
+    assert found.standard_errors[0] < 0.3  # of the modulus

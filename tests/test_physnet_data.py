@@ -101,7 +101,7 @@ def test_an_estimate_goes_on_and_is_the_last_of_what_was_tried(sighting, tmp_pat
     place = TINY.space.locate(first.fabric)
     loss = estimator.distances(sighting, jnp.stack([place] * 4))[0]
     np.testing.assert_allclose(loss, first.loss, rtol=1e-3)
-    assert not first.determined.any()
+    assert not first.identifiable.any()
 
 
 def test_the_studys_search_gives_the_best_of_what_was_tried(sighting, tmp_path):

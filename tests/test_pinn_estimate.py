@@ -134,7 +134,7 @@ def test_estimates_of_several_fabrics_at_once():
         found = estimate_all(pulls, [FAMILY, FAMILY], TINY, key=jr.key(0))
     for each in found:
         np.testing.assert_allclose(each.estimate.values[0], WARP, rtol=5e-3)
-        assert each.estimate.determined[0] and not each.estimate.determined[4]
+        assert each.estimate.identifiable[0] and not each.estimate.identifiable[4]
         assert each.network.history.shape == (5, 1, 7)
         again = from_json(as_json(each.estimate))
         np.testing.assert_allclose(again.values, each.estimate.values)
@@ -145,9 +145,9 @@ def test_without_force_the_report_says_so():
     with jax.numpy_dtype_promotion("standard"):
         found = estimate([even_pull(force=False)], FAMILY, TINY, key=jr.key(0)).estimate
     assert "the scale of stiffness is not identifiable" in found.approach
-    scale = {condition.name: condition for condition in found.conditions}["stiffness scale"]
+    scale = {condition.name: condition for condition in found.nuisances}["stiffness scale"]
     assert scale.deviation > 0.3 * scale.value
-    assert not found.determined[:3].any()
+    assert not found.identifiable[:3].any()
 
 
 @pytest.mark.slow
@@ -257,7 +257,7 @@ def test_the_cloths_fabric_is_found(name, monkeypatch):
         ]
         found = estimate(some, space, key=jr.key(1)).estimate
     truth = np.asarray(space.values(space.locate(fabric)))
-    assert found.determined[:4].all()
+    assert found.identifiable[:4].all()
     np.testing.assert_allclose(found.values[:3], truth[:3], rtol=0.05)
     np.testing.assert_allclose(found.values[3], truth[3], atol=0.05)
     for experiment in (folding(num_frames=40), fling(num_frames=25), shaking(num_frames=25)):

@@ -316,9 +316,9 @@ def collect(
         fabric=fabric_at(problems[0], unknown[part_of(problems, 0)]),
         ranges=space.ranges,
         values=np.asarray(space.values(unknown[: space.dim])),
-        deviations=deviation * np.array(widths),
+        standard_errors=deviation * np.array(widths),
         correlation=covariance / np.outer(deviation, deviation),
-        conditions=conditions(problems, np.asarray(unknown), np.sqrt(np.diag(spread))),
+        nuisances=nuisances(problems, np.asarray(unknown), np.sqrt(np.diag(spread))),
         loss=float(_loss(problems, unknown)),
         losses=np.stack([np.asarray(_stacked(row).normal.loss) for row in rows]),
         history=np.asarray(values_of(places)),
@@ -326,7 +326,7 @@ def collect(
     )
 
 
-def conditions(problems: Joint, unknown: np.ndarray, deviation: np.ndarray) -> tuple[Nuisance, ...]:
+def nuisances(problems: Joint, unknown: np.ndarray, deviation: np.ndarray) -> tuple[Nuisance, ...]:
     """What an unknown says of the recordings, where they were in doubt."""
     found, told = [], set()
     for which, problem in enumerate(problems):

@@ -45,10 +45,10 @@ class Estimate:
     - `approach`: which estimator, with its settings in words.
     - `fabric`: the estimate.
     - `ranges`, `values`: its parameters, in the units of the ranges.
-    - `deviations`: their standard deviations: relative where the range is logarithmic, else
+    - `standard_errors`: their standard deviations: relative where the range is logarithmic, else
       absolute; NaN from an estimator that gives none. The ranges count as a flat prior.
     - `correlation`: of the parameters, [-].
-    - `conditions`: what was not known for sure of the recordings.
+    - `nuisances`: what was not known for sure of the recordings.
     - `loss`: at the estimate, [m^2].
     - `losses`, `history`: of every iteration and start, [m^2], and the parameters there. A stage
       counts other frames than the one before, or leaves outliers out: its losses are others.
@@ -59,18 +59,18 @@ class Estimate:
     fabric: Fabric
     ranges: tuple[Range, ...]
     values: np.ndarray
-    deviations: np.ndarray
+    standard_errors: np.ndarray
     correlation: np.ndarray
-    conditions: tuple[Nuisance, ...]
+    nuisances: tuple[Nuisance, ...]
     loss: float
     losses: np.ndarray
     history: np.ndarray
     seconds: float
 
     @property
-    def determined(self) -> np.ndarray:
+    def identifiable(self) -> np.ndarray:
         """Which parameters the recording determines: to 5 % (or 0.05) with 95 % confidence."""
-        return self.deviations < DETERMINED
+        return self.standard_errors < DETERMINED
 
     @property
     def combinations(self) -> list[Combination]:
@@ -79,10 +79,10 @@ class Estimate:
         Eigenvectors of their covariance, on the scales of their ranges, whose deviation is at most
         `DETERMINED`; the best known first.
         """
-        index = np.flatnonzero(~self.determined & np.isfinite(self.deviations))
+        index = np.flatnonzero(~self.identifiable & np.isfinite(self.standard_errors))
         if len(index) < 2:
             return []
-        scale = self.deviations[index]
+        scale = self.standard_errors[index]
         covariance = self.correlation[np.ix_(index, index)] * np.outer(scale, scale)
         squares, vectors = np.linalg.eigh(covariance)
         found = []
@@ -111,9 +111,9 @@ def without_standard_errors(
         fabric=space(place),
         ranges=space.ranges,
         values=np.asarray(space.values(place)),
-        deviations=unknown,
+        standard_errors=unknown,
         correlation=np.full((space.dim, space.dim), np.nan),
-        conditions=(),
+        nuisances=(),
         loss=loss,
         losses=losses,
         history=history,
@@ -138,7 +138,11 @@ def as_json(estimate: Estimate) -> dict[str, Any]:
     """An estimate with units, for a file. What is not determined has its bounds, and says so."""
     parameters = {}
     rows = zip(
-        estimate.ranges, estimate.values, estimate.deviations, estimate.determined, strict=True
+        estimate.ranges,
+        estimate.values,
+        estimate.standard_errors,
+        estimate.identifiable,
+        strict=True,
     )
     for bound, value, deviation, determined in rows:
         parameters[bound.name] = {
@@ -158,7 +162,7 @@ def as_json(estimate: Estimate) -> dict[str, Any]:
         "combinations": [each._asdict() for each in estimate.combinations],
         "conditions": [
             c._asdict() | {"deviation": c.deviation if np.isfinite(c.deviation) else None}
-            for c in estimate.conditions
+            for c in estimate.nuisances
         ],
         "loss": estimate.loss,
         "loss_unit": "m^2",
@@ -229,9 +233,9 @@ def from_json(stored: dict[str, Any]) -> Estimate:
         fabric=_fabric_from(stored["fabric"]),
         ranges=ranges,
         values=np.array([p["value"] for p in parameters.values()]),
-        deviations=_numbers([p["deviation"] for p in parameters.values()]),
+        standard_errors=_numbers([p["deviation"] for p in parameters.values()]),
         correlation=_numbers(stored["correlation"]),
-        conditions=tuple(
+        nuisances=tuple(
             Nuisance(**c | {"deviation": np.nan if c["deviation"] is None else c["deviation"]})
             for c in stored["conditions"]
         ),

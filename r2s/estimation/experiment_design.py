@@ -43,7 +43,11 @@ def describe(estimate: Estimate) -> list[str]:
     """One line a parameter, a combination, and what was in doubt: how well each is known."""
     lines = []
     rows = zip(
-        estimate.ranges, estimate.values, estimate.deviations, estimate.determined, strict=True
+        estimate.ranges,
+        estimate.values,
+        estimate.standard_errors,
+        estimate.identifiable,
+        strict=True,
     )
     for bound, value, deviation, determined in rows:
         unit = "" if bound.unit == "-" else f" {bound.unit}"
@@ -53,7 +57,7 @@ def describe(estimate: Estimate) -> list[str]:
     for found in estimate.combinations:
         powers = " ".join(f"{name}^{power:g}" for name, power in found.exponents.items())
         lines.append(f"known to {found.deviation:.1%}: {powers}")
-    for name, unit, value, deviation in estimate.conditions:
+    for name, unit, value, deviation in estimate.nuisances:
         unit = "" if unit == "-" else f" {unit}"
         lines.append(f"{name:14s}{value:10.4g}{unit:6s} +- {deviation:.2g}")
     return lines

@@ -171,7 +171,7 @@ def parameters(cells: Iterable[EvaluationCell], folder: Path) -> dict[str, list[
     for cell in estimated(cells, folder):
         estimate = read_estimate(cell, folder)
         if estimate is not None:
-            numbers = estimate.values, estimate.deviations, estimate.determined
+            numbers = estimate.values, estimate.standard_errors, estimate.identifiable
             entry = (cell.name, estimate.ranges, *numbers, _truth(cell))
             found.setdefault(cell.solver, []).append(entry)
     return found
