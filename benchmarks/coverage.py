@@ -32,7 +32,7 @@ def scores(name: str, scenario: str, number: int) -> np.ndarray:
     experiment = scenarios.SIX[scenario]()
     recording = synthetic.record(experiment, fabric, name, key=jax.random.key(1000 + number))
     problem = Problem.make(recording, space, seed=number)
-    start = space.locate(fabric)
+    start = space.to_unit(fabric)
     budget = DEFAULT._replace(coarse=0, starts=1)
     found = diffcloud.estimate(problem, budget, start=start, key=jax.random.key(0))
     truth = np.asarray(space.values(start))

@@ -76,12 +76,12 @@ def problem_of(name: str, scenario: str, points: bool) -> tuple[Problem, np.ndar
         return _on_points(IsotropicSpace.make(float(fabric.density)), fabric, name, scenario, key)
     space = OrthotropicSpace.make(float(fabric.density))
     recording = synthetic.record(scenarios.SIX[scenario](), fabric, name, key=key)
-    return Problem.make(recording, space), np.asarray(space.locate(fabric))
+    return Problem.make(recording, space), np.asarray(space.to_unit(fabric))
 
 
 def _on_points(space: IsotropicSpace, fabric: Fabric, name: str, scenario: str, key):
     """As `problem_of`, for the member of the space that is nearest to the fabric."""
-    place = np.clip(np.asarray(space.locate(fabric)), *INSIDE)
+    place = np.clip(np.asarray(space.to_unit(fabric)), *INSIDE)
     truth = space(jnp.asarray(place, float))
     stiffest = space(jnp.ones(space.dim, float))  # whose steps the estimate has, too
     recording = synthetic.record(
@@ -107,7 +107,7 @@ def errors(problem: Problem, estimate: Estimate, place: np.ndarray) -> np.ndarra
 def loss_of(problem: Problem, estimate: Estimate) -> float:
     """The default loss [m^2] of an estimate's fabric, cameras as written down."""
     rest = jnp.zeros(gauss_newton.size((problem,)) - problem.space.dim, float)
-    return float(_loss((problem,), jnp.concatenate([problem.space.locate(estimate.fabric), rest])))
+    return float(_loss((problem,), jnp.concatenate([problem.space.to_unit(estimate.fabric), rest])))
 
 
 def attempt(problem: Problem, place: np.ndarray, method: str, number: int) -> measure.Row:

@@ -324,7 +324,7 @@ def in_view(view: View, depth: np.ndarray, cameras: list[DepthCamera]) -> np.nda
 def searched(path: Path, sighting: Sighting, target: Target, calls: int, seed: int):
     fresh, spent = not path.exists(), time.process_time()
     done = estimator.estimate(sighting, num_calls=calls, seed=seed, path=path)
-    place = np.asarray(sighting.space.locate(done.fabric))
+    place = np.asarray(sighting.space.to_unit(done.fabric))
     at_truth = estimator.distances(sighting, jnp.asarray(np.stack([target.place] * 4), float))[0]
     return {
         "search": seed,

@@ -284,7 +284,7 @@ def fabrics(out: Path, seeds: int) -> None:
     def make(fabric: str, seed: int) -> dict:
         some = _pulls(fabric, seed)
         about, space = _fabric(fabric)
-        truth = space.values(space.locate(about))
+        truth = space.values(space.to_unit(about))
         found = estimate(some, space, key=jr.key(seed)).estimate
         return _errors(space, truth, found.values, found.standard_errors)
 
@@ -338,8 +338,8 @@ def recipes(out: Path, name: str, count: int, seeds: int, number: int, alone: bo
     from r2s.fabrics.fabric import Fabric
 
     some, (fabric, space) = _pulls(name, 0, count), _fabric(name)
-    truth = space.values(space.locate(fabric))
-    place = space.locate(Fabric.make(float(fabric.density), (10.0, 0.0, 10.0, 10.0), 1e-5))
+    truth = space.values(space.to_unit(fabric))
+    place = space.to_unit(Fabric.make(float(fabric.density), (10.0, 0.0, 10.0, 10.0), 1e-5))
 
     def make(fabric: str, pulls: int, recipe: str, seed: int) -> dict:
         del fabric, pulls
@@ -378,7 +378,7 @@ def clouds(out: Path, seeds: int) -> None:
         experiment = scenarios.SIX[scenario]()
         recording = synthetic.record(experiment, about, fabric, shape=(17, 17), key=key_seen)
         found = estimate(recording, space, key=key)
-        truth = space.values(space.locate(about))
+        truth = space.values(space.to_unit(about))
         return _errors(space, truth, found.values, found.standard_errors)
 
     jobs = [

@@ -108,9 +108,9 @@ def compared(out: Path, fabric: str, starts: int, first: int | None) -> list[mea
 
 def reference(problem: Problem, fabric: str) -> dict:
     """What the usual descent from the truth determines, and its loss [m^2]."""
-    start = problem.space.locate(presets.FIVE[fabric]())
+    start = problem.space.to_unit(presets.FIVE[fabric]())
     found = diffcloud.estimate(problem, Budget(0, 1), start=start, key=jax.random.key(0))
-    end = np.asarray(problem.space.locate(found.fabric))
+    end = np.asarray(problem.space.to_unit(found.fabric))
     values = np.asarray(problem.space.values(start))
     return {
         "determined": found.identifiable,
@@ -162,7 +162,7 @@ def usual(problem: Problem, place: np.ndarray) -> np.ndarray:
     """Where the default descent ends that begins at a place, and nowhere else."""
     start, budget = jnp.asarray(place, float), Budget(0, 1, ITERATIONS, around=0)
     found = diffcloud.estimate(problem, budget, start=start, key=jax.random.key(0))
-    return np.clip(np.asarray(problem.space.locate(found.fabric)), MARGIN, 1 - MARGIN)
+    return np.clip(np.asarray(problem.space.to_unit(found.fabric)), MARGIN, 1 - MARGIN)
 
 
 def descended(problem: Problem, gradient: Gradient, start: Array) -> np.ndarray:

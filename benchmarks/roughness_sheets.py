@@ -40,7 +40,7 @@ def family_of(physics: Physics) -> IsotropicSpace:
 def place_of(space: IsotropicSpace, modulus: float = MODULUS) -> Float[Array, " dim"]:
     """The sheet's, with a modulus times thickness [N/m]."""
     values = zip(space.ranges, (modulus, RATIO), strict=True)
-    return jnp.stack([bound.place(jnp.asarray(value, float)) for bound, value in values])
+    return jnp.stack([bound.to_unit(jnp.asarray(value, float)) for bound, value in values])
 
 
 def made(scenario: Scenario, physics: Physics, stiffest: Fabric) -> tuple[Scenario, Sheet]:

@@ -52,10 +52,10 @@ class Damped(ParameterSpace):
         fabric = self.space(u)
         return eqx.tree_at(lambda f: f.damping, fabric, fabric.damping * self.factor)
 
-    def locate(self, fabric: Fabric) -> Float[Array, " dim"]:
+    def to_unit(self, fabric: Fabric) -> Float[Array, " dim"]:
         """Where a fabric lies; nowhere finite when all have no damping."""
         before = lambda damping: damping / self.factor
-        return self.space.locate(eqx.tree_at(lambda f: f.damping, fabric, replace_fn=before))
+        return self.space.to_unit(eqx.tree_at(lambda f: f.damping, fabric, replace_fn=before))
 
 
 def true_fabric(name: str, factor: float = 1.0) -> Fabric:
@@ -94,7 +94,7 @@ def truth(
     problem = Problem.make(recording, Damped.make(space, factor), num_points=num_points)
     if bare:
         problem = dataclasses.replace(problem, solver=in_vacuum(problem.scenario))
-    return problem, np.asarray(space.locate(fabric))
+    return problem, np.asarray(space.to_unit(fabric))
 
 
 def unknown_of(problem: Problem, place: Any) -> Float[Array, " unknown"]:

@@ -184,11 +184,12 @@ class Sensitivity:
     """Print one JSON object: that of an estimate."""
 
     def run(self) -> None:
-        from r2s.estimation.estimate import as_json
-        from r2s.estimation.experiment_design import describe, planned
+        from r2s.estimation.estimate import describe
+        from r2s.estimation.estimate_json import as_json
+        from r2s.estimation.experiment_design import evaluate_design
 
-        about = self.fabric, numbers_of(self.motion), self.noise, self.seed
-        found = planned(self.scenario, *about)
+        numbers = numbers_of(self.motion)
+        found = evaluate_design(self.scenario, self.fabric, numbers, self.noise, self.seed)
         tell(self.json, as_json(found), describe(found))
 
 

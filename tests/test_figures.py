@@ -118,7 +118,7 @@ def test_loss_lines_mark_what_diverged(tmp_path):
     at = TRUTH * 1.1
     places = jnp.linspace(0.0, 1.0, 9)
     losses = 1e-5 + np.linspace(0.0, 1.0, 9) ** 2
-    lines = [(bound, bound.value(places), losses.copy()) for bound in RANGES]
+    lines = [(bound, bound.from_unit(places), losses.copy()) for bound in RANGES]
     path = figures.loss_lines(tmp_path / "a.png", lines, at, TRUTH, "towel")
     check(path)
     crosses = pixels(path, figures.GREY)

@@ -11,7 +11,7 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from r2s.estimation.estimate import without_standard_errors
+from r2s.estimation.estimate import point_estimate
 from r2s.evaluation import prediction_error
 from r2s.fabrics import presets
 from r2s.fabrics.arcsim import write_material
@@ -152,9 +152,9 @@ def tiny(monkeypatch):
         middle = jnp.full(space.dim, 0.5)
         values = np.asarray(space.values(middle))
         about = 1e-4, np.full((1, 1), 1e-4), values[None, None], 0.1
-        return without_standard_errors("fake", space, middle, *about)
+        return point_estimate("fake", space, middle, *about)
 
-    monkeypatch.setitem(estimates._ESTIMATORS, "diffcloud", fake)
+    monkeypatch.setitem(estimates.METHODS, "diffcloud", Fake)
     plan = matrix.Plan(
         (Column("diffcloud", "cloth", "lifting"),),
         ("grey_interlock",),

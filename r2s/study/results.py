@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from r2s.estimation.method import default_space
 from r2s.evaluation import prediction_error
 from r2s.fabrics.parameters import Range
 from r2s.files import write_text
@@ -17,7 +18,7 @@ from r2s.recordings.recording import cloud
 from r2s.scenarios.scenario import from_recording
 from r2s.study.cells import Cell, about, opened
 from r2s.study.engine import closure
-from r2s.study.estimates import ESTIMATE, EstimateCell, family_of, read_estimate
+from r2s.study.estimates import ESTIMATE, EstimateCell, read_estimate
 from r2s.study.evaluations import EvaluationCell, read_measured, read_motion
 from r2s.study.matrix import PRESETS, Plan, synthetic
 from r2s.study.report.scenes import Shown
@@ -192,8 +193,8 @@ def _truth(cell: EstimateCell) -> np.ndarray | None:
         or source.making.materials
     ):
         return None
-    space = family_of("cloth", cell.density)
-    return np.asarray(space.values(space.locate(small_strain(cell.fabric))))
+    space = default_space("cloth", cell.density)
+    return np.asarray(space.values(space.to_unit(small_strain(cell.fabric))))
 
 
 def shown(cells: Iterable[EvaluationCell], folder: Path) -> list[Shown]:

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from r2s.estimation.physnet import search_file
+from r2s.estimation import checkpoint
 
-FORMAT = "r2s-search/2"
 Objective = Callable[[Float[np.ndarray, "place dim"]], Float[np.ndarray, " place"]]
 UNKNOWN_PENALTY = 1.0  # while no loss is finite
 LEAST = 1e-6  # of the greatest loss: what is less counts as this on the logarithmic scale
@@ -137,17 +136,17 @@ def minimise(
 
     Goes on from `path` when it is there. Raises `ValueError` when that is of another search.
     """
-    about = {"dim": dim, "batch": batch, "num_first": num_first, "seed": seed}
+    run = {"kind": "Bayesian optimisation", "dim": dim, "batch": batch}
+    run |= {"num_first": num_first, "seed": seed}
     history = begin(dim)
-    if path is not None and Path(path).exists():
-        history = History(*search_file.read(path, FORMAT, ("places", "losses"), about))
+    if path is not None and (stored := checkpoint.load(path, run)) is not None:
+        history = History(**stored)
     while len(history.losses) < num_calls:
         number = min(batch, num_calls - len(history.losses))
         places = ask(history, number, num_first=num_first, seed=seed)
         history = tell(history, places, objective(places))
         if path is not None:
-            tried = {"places": history.places, "losses": history.losses}
-            search_file.write(path, FORMAT, tried, about)
+            checkpoint.save(path, vars(history), run)
         if progress is not None:
             progress(history)
     return history

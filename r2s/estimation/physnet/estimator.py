@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r2s.estimation.estimate import Estimate, without_standard_errors
+from r2s.estimation.estimate import Estimate, point_estimate
 from r2s.estimation.physnet import bayes, emulator
 from r2s.estimation.physnet.bayes import History, Objective
 from r2s.estimation.physnet.network import PhysNet
@@ -115,6 +115,11 @@ def _flat(points: Float[Array, "frame dim"]) -> Float[Array, " part"]:
     return points.reshape(-1) * jnp.sqrt(jnp.asarray(points.shape[-1], points.dtype))
 
 
+def target_of(sighting: Sighting) -> Float[np.ndarray, " part"]:
+    """Where the recorded frames lie on the map, in the units of `answers`."""
+    return np.asarray(_flat(sighting.points))
+
+
 def distances(sighting: Sighting, places: Float[Array, "place dim"]) -> Float[Array, " place"]:
     """The rms distance [-] on the map between the recorded frames and those of each fabric.
 
@@ -139,7 +144,7 @@ def responses(
 
 def objective(sighting: Sighting, batch: int) -> Objective:
     """The loss of places, simulated `batch` together, for `r2s.estimation.physnet.bayes`."""
-    respond, target = responses(sighting, batch), np.asarray(_flat(sighting.points))
+    respond, target = responses(sighting, batch), target_of(sighting)
     return lambda places: np.sqrt(((respond(places) - target) ** 2).mean(axis=1))
 
 
@@ -160,7 +165,7 @@ def estimate(
     diverge, or the last one.
     """
     began = time.perf_counter()
-    target = np.asarray(_flat(sighting.points))
+    target = target_of(sighting)
     about = {"num_calls": num_calls, "batch": batch, "seed": seed, "path": path}
     frames = len(sighting.frames)  # the error of the images counts as the same in all of them
     dim = sighting.space.dim
@@ -196,7 +201,7 @@ def original(
 def _told(sighting: Sighting, name: str, places, losses, best: int, began: float) -> Estimate:
     space = sighting.space
     values = np.asarray(jax.vmap(space.values)(jnp.asarray(places, float)))
-    return without_standard_errors(
+    return point_estimate(
         name,
         space,
         jnp.asarray(places[best], float),

@@ -116,8 +116,8 @@ def estimate(
 
     `begin` is the place in the space of the fabric to begin with, by default the middle. `report`
     is called after each round with its number, the spread of the distances [m] and the
-    parameters. An estimate that still moved in its last round says "not converged", and has no
-    deviations. Raises `ValueError` for too few frames, `RuntimeError` when the solver or the
+    parameters. An estimate that still moved in its last round has not converged, and has no
+    standard errors. Raises `ValueError` for too few frames, `RuntimeError` when the solver or the
     network diverges.
     """
     if settings.rounds < 1:
@@ -135,7 +135,7 @@ def estimate(
     found = _rounds(about, sight, held, unknown, recording.info.sheet.held, settings, report)
     still = recording.info.wind is not None
     few = len(frames) if still else max(1.0, ALIKE * len(frames) / _counted(recording))
-    words = f"clouds of {recording.info.scenario}" + ("" if found.settled else ", not converged")
+    words = f"clouds of {recording.info.scenario}"
     return _estimate(words, space, found, few, time.perf_counter() - began)
 
 
@@ -300,4 +300,5 @@ def _estimate(
         losses=squares,
         history=np.stack([values for _, values in found.history])[:, None],
         seconds=seconds,
+        converged=found.settled,
     )

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from r2s.estimation.estimate import Estimate, Nuisance, without_standard_errors
+from r2s.estimation.estimate import Estimate, Nuisance, point_estimate
 from r2s.estimation.pinn.balance import Balanced, balance
 from r2s.estimation.pinn.data import Pull, stacked
 from r2s.estimation.pinn.training import NOISE, Recipe, Trained, chunks, train
@@ -114,7 +114,7 @@ def _found(trained: Trained, i: int, pulls, space, recipe, noise, seconds: float
     if pulls[0].force is None:
         about += ", no force: the scale of stiffness is not identifiable"
     form = "weak form" if recipe.losses is weak_losses else "strong form"
-    network = without_standard_errors(
+    network = point_estimate(
         f"pinn ({form}, {about})",
         space,
         model.place,
@@ -167,7 +167,7 @@ def _estimate(
         spread = float(np.sqrt(weights @ found.covariance @ weights))  # relative, since log
         conditions.append(Nuisance("stiffness scale", "N/m", mean, spread * mean))
     return Estimate(
-        approach=approach if found.converged else approach[:-1] + ", not converged)",
+        approach=approach,
         fabric=space(jnp.asarray(found.place, float)),
         ranges=space.ranges,
         values=values(found.place),
@@ -178,4 +178,5 @@ def _estimate(
         losses=np.concatenate([network.losses, found.losses[:, None]]),
         history=history,
         seconds=seconds,
+        converged=found.converged,
     )

@@ -110,13 +110,13 @@ class PlaneStrainFamily(IsotropicSpace):
         law = OrthotropicMembrane(lam + 2 * mu, lam, lam + 2 * mu, mu)
         return eqx.tree_at(lambda f: f.membrane, fabric, law)
 
-    def locate(self, fabric: Fabric) -> Float[Array, " dim"]:
+    def to_unit(self, fabric: Fabric) -> Float[Array, " dim"]:
         """The point where a fabric's membrane lies, C11 and C22 averaged."""
         law = fabric.membrane
         ratio = law.c12 / ((law.c11 + law.c22) / 2)
         nu = ratio / (1 + ratio)
         modulus = (law.c11 + law.c22) / 2 * (1 + nu) * (1 - 2 * nu) / (1 - nu)
-        places = [r.place(v) for r, v in zip(self.ranges, (modulus, nu), strict=True)]
+        places = [r.to_unit(v) for r, v in zip(self.ranges, (modulus, nu), strict=True)]
         return jnp.stack(places)
 
 
