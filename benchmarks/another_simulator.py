@@ -31,8 +31,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.interpolate import CubicSpline
 
-from r2s.estimation import diffcloud
-from r2s.estimation.descent import Budget
+from r2s.estimation.descent import Budget, descend
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.problem import Clouds, NuisancePrior, Problem
 from r2s.fabrics.fabric import Fabric
@@ -262,7 +261,7 @@ def estimated(
 ) -> Estimate:
     """The fabric of known density from clouds of its lift and its rest shape (`problems_of`)."""
     problems = problems_of(folder, fabric, number, clock, jax.random.key(0))
-    return diffcloud.estimate(problems, budget, checkpoint=path, key=jax.random.key(1))
+    return descend(problems, budget, checkpoint=path, key=jax.random.key(1))
 
 
 WAYS = {"plain": 0.0, "clock": 0.01}  # [s], the doubt of the lift's clock
@@ -299,7 +298,7 @@ def parameters(fabric: str, way: str, found: Estimate) -> list[measure.Row]:
     """What was estimated, one row a number."""
     rows = zip(found.ranges, found.values, found.standard_errors, found.identifiable, strict=True)
     listed = [(b.name, b.unit, float(v), float(d), bool(sure)) for b, v, d, sure in rows]
-    listed += [(c.name, c.unit, c.value, c.deviation, True) for c in found.nuisances]
+    listed += [(c.name, c.unit, c.value, c.standard_error, True) for c in found.nuisances]
     names = ("parameter", "unit", "value", "deviation", "determined")
     return [{"fabric": fabric, "way": way} | dict(zip(names, each, strict=True)) for each in listed]
 

@@ -15,8 +15,7 @@ import measure
 import numpy as np
 
 from r2s import scenarios
-from r2s.estimation import diffcloud
-from r2s.estimation.descent import DEFAULT
+from r2s.estimation.descent import DEFAULT, descend
 from r2s.estimation.problem import Problem
 from r2s.fabrics import presets
 from r2s.fabrics.parameters import OrthotropicSpace
@@ -34,7 +33,7 @@ def scores(name: str, scenario: str, number: int) -> np.ndarray:
     problem = Problem.make(recording, space, seed=number)
     start = space.to_unit(fabric)
     budget = DEFAULT._replace(coarse=0, starts=1)
-    found = diffcloud.estimate(problem, budget, start=start, key=jax.random.key(0))
+    found = descend(problem, budget, start=start, key=jax.random.key(0))
     truth = np.asarray(space.values(start))
     log = np.array([bound.log for bound in space.ranges])
     ratio = np.where(log, found.values / np.where(log, truth, 1), 1)

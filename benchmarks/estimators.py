@@ -27,7 +27,7 @@ import numpy as np
 
 from r2s import scenarios
 from r2s.estimation import cma_es, diffcloud, diffcp, gauss_newton
-from r2s.estimation.descent import DEFAULT
+from r2s.estimation.descent import DEFAULT, descend
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.problem import Problem
 from r2s.fabrics import presets
@@ -43,28 +43,28 @@ SAME = 1.05  # times the loss at the truth's descent: the same place
 
 def alone(problem: Problem, start, key) -> Estimate:
     """Gauss-Newton from the start, and from nowhere else."""
-    cloth = problem.solver is None
-    estimate, budget = (diffcloud.estimate, DEFAULT) if cloth else (diffcp.estimate, diffcp.DEFAULT)
-    return estimate(problem, budget._replace(coarse=0, starts=1), start=start, key=key)
+    budget = DEFAULT if problem.solver is None else diffcp.DEFAULT
+    return descend(problem, budget._replace(coarse=0, starts=1), start=start, key=key)
 
 
 def ours(problem: Problem, start, key) -> Estimate:
     """The default estimator of the problem's solver."""
-    estimate = diffcloud.estimate if problem.solver is None else diffcp.estimate
-    return estimate(problem, start=start, key=key)
+    budget = DEFAULT if problem.solver is None else diffcp.DEFAULT
+    return descend(problem, budget, start=start, key=key)
 
 
 def recipe(problem: Problem, start, key) -> Estimate:
     """The published one, from the start."""
-    published = diffcloud.recipe if problem.solver is None else diffcp.original
-    return published(problem, start=start)
+    if problem.solver is None:
+        return diffcloud.published_recipe(problem, None, start=start)
+    return diffcp.published_recipe(problem, start=start)
 
 
 METHODS: dict[str, Callable] = {
     "ours": ours,
     "ours, no search": alone,
     "recipe": recipe,
-    "cma": lambda p, start, key: cma_es.estimate(p, start=start, key=key),
+    "cma": lambda p, start, key: cma_es.search(p, start=start, key=key),
 }
 
 
@@ -106,7 +106,7 @@ def errors(problem: Problem, estimate: Estimate, place: np.ndarray) -> np.ndarra
 
 def loss_of(problem: Problem, estimate: Estimate) -> float:
     """The default loss [m^2] of an estimate's fabric, cameras as written down."""
-    rest = jnp.zeros(gauss_newton.size((problem,)) - problem.space.dim, float)
+    rest = jnp.zeros(gauss_newton.theta_length((problem,)) - problem.space.dim, float)
     return float(_loss((problem,), jnp.concatenate([problem.space.to_unit(estimate.fabric), rest])))
 
 

@@ -22,8 +22,8 @@ from roughness_tools import POINTS, Damped, kept, losses_at, normal_at, picture,
 from roughness_windows import restarted
 
 from r2s import scenarios
-from r2s.estimation import diffcloud, gauss_newton
-from r2s.estimation.descent import CLOSE, FIRST_DAMPING, Budget
+from r2s.estimation import gauss_newton
+from r2s.estimation.descent import CLOSE, INITIAL_DAMPING, Budget, descend
 from r2s.estimation.gauss_newton import GROWTH, MARGIN, Descent, Normal
 from r2s.estimation.problem import Problem, beginning, window
 from r2s.fabrics import presets
@@ -109,7 +109,7 @@ def compared(out: Path, fabric: str, starts: int, first: int | None) -> list[mea
 def reference(problem: Problem, fabric: str) -> dict:
     """What the usual descent from the truth determines, and its loss [m^2]."""
     start = problem.space.to_unit(presets.FIVE[fabric]())
-    found = diffcloud.estimate(problem, Budget(0, 1), start=start, key=jax.random.key(0))
+    found = descend(problem, Budget(0, 1), start=start, key=jax.random.key(0))
     end = np.asarray(problem.space.to_unit(found.fabric))
     values = np.asarray(problem.space.values(start))
     return {
@@ -161,7 +161,7 @@ def attempts(problem: Problem, choice: Choice, starts: int) -> dict:
 def usual(problem: Problem, place: np.ndarray) -> np.ndarray:
     """Where the default descent ends that begins at a place, and nowhere else."""
     start, budget = jnp.asarray(place, float), Budget(0, 1, ITERATIONS, around=0)
-    found = diffcloud.estimate(problem, budget, start=start, key=jax.random.key(0))
+    found = descend(problem, budget, start=start, key=jax.random.key(0))
     return np.clip(np.asarray(problem.space.to_unit(found.fabric)), MARGIN, 1 - MARGIN)
 
 
@@ -169,7 +169,7 @@ def descended(problem: Problem, gradient: Gradient, start: Array) -> np.ndarray:
     """Where Levenberg and Marquardt's descent ends with some gradient, all points counting."""
     problems, value = (problem,), lambda number: jnp.asarray(number, float)
     unknown = unknown_of(problem, jnp.clip(start, MARGIN, 1 - MARGIN))
-    rest = value(FIRST_DAMPING), value(GROWTH), value(0.0), jnp.asarray(0)
+    rest = value(INITIAL_DAMPING), value(GROWTH), value(0.0), jnp.asarray(0)
     now = Descent(unknown, gradient(problem, unknown), *rest)
     for _ in range(ITERATIONS):
         prior = _weight(problems, now.normal)
@@ -177,7 +177,7 @@ def descended(problem: Problem, gradient: Gradient, start: Array) -> np.ndarray:
             break
         trial = _propose(problems, now, prior)
         now = _accept(problems, now, trial, gradient(problem, trial), prior)
-    return np.asarray(now.unknown[: problem.space.dim])
+    return np.asarray(now.theta[: problem.space.dim])
 
 
 def exact(problem: Problem, unknown: Array) -> Normal:

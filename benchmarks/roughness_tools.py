@@ -99,7 +99,7 @@ def truth(
 
 def unknown_of(problem: Problem, place: Any) -> Float[Array, " unknown"]:
     """A place of the space, with everything else as it was written down."""
-    rest = jnp.zeros(gauss_newton.size((problem,)) - problem.space.dim, float)
+    rest = jnp.zeros(gauss_newton.theta_length((problem,)) - problem.space.dim, float)
     return jnp.concatenate([jnp.asarray(place, float), rest])
 
 

@@ -24,8 +24,9 @@ import measure
 import numpy as np
 from scipy.spatial import KDTree
 
-from r2s.estimation import diffcloud
-from r2s.estimation.estimate import Estimate, as_json, from_json
+from r2s.estimation.descent import descend
+from r2s.estimation.estimate import Estimate
+from r2s.estimation.estimate_json import as_json, from_json
 from r2s.estimation.problem import Problem
 from r2s.evaluation import placement, prediction_error
 from r2s.fabrics.fabric import Fabric
@@ -46,7 +47,7 @@ def estimate_of(recording: Recording, density: float, out: Path) -> Estimate:
         return from_json(json.loads(path.read_text()))
     measure.progress(f"estimate from {recording.info.name}")
     problem = Problem.make(recording, OrthotropicSpace.make(density))
-    found = diffcloud.estimate(problem, key=jax.random.key(0))
+    found = descend(problem, key=jax.random.key(0))
     write_json(path, as_json(found))
     return found
 
