@@ -97,7 +97,10 @@ class SpringMembrane(eqx.Module):
         """Energy per rest area [J/m^2] at a Green strain (E11, E22, 2 E12) [-]."""
         e11, e22, shear = strain
         mean, half = (e11 + e22) / 2, shear / 2
-        extension = lambda along: jnp.sqrt(jnp.maximum(1 + 2 * along, COLLAPSED)) - 1
+
+        def extension(along):
+            return jnp.sqrt(jnp.maximum(1 + 2 * along, COLLAPSED)) - 1
+
         structural = self.warp * extension(e11) ** 2 + self.weft * extension(e22) ** 2
         biases = extension(mean + half) ** 2 + extension(mean - half) ** 2
         return (structural + self.shear * biases) / 2
