@@ -8,6 +8,11 @@ its normal equations give the step and the covariance at once.
 Several recordings of one fabric are weighed by their frames. Their joint parameter vector `theta`
 is the fabric's place in its space, the nuisances that all recordings share (`SHARED`), and those of
 each recording (`OWN`).
+
+This stays our own beside `optimistix.LevenbergMarquardt`, which on a lift (20 frames, 5 x 5
+vertices) came from three starts to the same loss, 6.789e-6 m^2, with 26 sensitivities each, its
+limit, where ours arrived after 21, 22 and 16, and which gives no normal equations by clusters for
+the standard errors.
 """
 
 from functools import partial
