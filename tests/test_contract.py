@@ -150,7 +150,7 @@ def test_physnet_trains_its_network_once(recording, tmp_path, monkeypatch):
         for name in ("physnet", "physnet-published"):
             method = METHODS[name](**others)
             found[name] = method.estimate([recording], SPACE, Budget(evaluations=9), key=jr.key(0))
-            others["training_budget"] = None  # what is there is not trained again
+            others["training_budget"] = TrainingBudget(0)  # what is there is not trained again
     assert not list(tmp_path.glob("*.images"))
     for name, each in found.items():
         assert each.approach.startswith("physnet") and each.losses.shape == (9, 1), name
