@@ -46,13 +46,12 @@ if __name__ == "__main__":
         for name in ("settings", "costs", *COPIED)
     }
     facts = {"command": f"make study; python experiments/summarise_study.py {a.results}"}
-    facts["version"] = f"r2s {dict(map(dict.values, table['settings']))['version of r2s']}"
+    version = {line["setting"]: line["value"] for line in table["settings"]}["version of r2s"]
+    facts["version"] = f"r2s {version}"
     made = time.gmtime((a.results / "results.csv").stat().st_mtime)
     facts["date"] = time.strftime("%Y-%m-%d", made)
     seconds = sum(float(line["CPU seconds in all"]) for line in table["costs"])
     facts["cost"] = f"{seconds / 60:.0f} CPU minutes"
-        f"{sum(float(x['CPU seconds in all']) for x in table['costs']) / 60:.0f} CPU min"
-    )
     keep(a.out, summary(a.results / "results.csv"), CAPTION, facts)
     insert(Path("README.md"), a.out.stem, shown(a.out))
     for name, (caption, *columns) in COPIED.items():
