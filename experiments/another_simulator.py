@@ -15,6 +15,7 @@ from _mujoco import HEIGHT, in_mujoco
 from _tables import command_line, keep
 
 import r2s
+from r2s.cloth.linear.elimination import Elimination
 from r2s.estimation import diffcloud
 from r2s.estimation.problem import Clouds, NuisancePrior, Problem
 from r2s.fabrics.parameters import MASS_DAMPING, OrthotropicSpace
@@ -37,7 +38,9 @@ def scenario_of(motion: str) -> r2s.Scenario:
     path = start[held] + eased[:, None, None] * np.asarray(way)
     scene = r2s.Scene(mesh, jnp.array(held), Table.make(-jnp.inf), Air.make(density=0.0))
     start, path, times, first = (jnp.asarray(a, float) for a in (start, path, times, INTERVAL))
-    return r2s.Scenario(scene, start, path, times, first, INTERVAL, FRAMES, 1, 4)
+    return r2s.Scenario(
+        scene, Elimination.make(mesh), start, path, times, first, INTERVAL, FRAMES, 1, 4
+    )
 
 
 if __name__ == "__main__":

@@ -51,7 +51,9 @@ if __name__ == "__main__":
         if kind == "self-contact" and name != "folding":
             continue  # in the others the sheet does not touch itself
         fabric = presets.FIVE[preset]()
-        scenario = scenarios.SIX[name]().scenario(SOLVERS[kind], layers=kind == "self-contact")
+        scenario = scenarios.SIX[name]().scenario(
+            SOLVERS[kind], self_contact=kind == "self-contact"
+        )
         solver = scenarios.material_points(scenario, fabric) if kind == "points" else None
         found = balance_of(scenario, fabric, None, solver)
         lines.append({"scenario": name, "solver": kind, "fabric": preset})

@@ -31,7 +31,7 @@ loss_at, normal_at = map(eqx.filter_jit, (gauss_newton.loss_at, gauss_newton.nor
 def in_vacuum(scenario: r2s.Scenario, fabric: object = None) -> r2s.Cloth:
     """The cloth without air, in steps a quarter as long as the scenario's."""
     vacuum = dataclasses.replace(scenario.scene, air=Air.make(density=0.0))
-    return r2s.Cloth(vacuum, scenario.interval / (4 * scenario.substeps))
+    return r2s.Cloth.make(vacuum, scenario.interval / (4 * scenario.substeps))
 
 
 def line(problem: Problem, truth: np.ndarray, width: float, damped: str) -> Line:

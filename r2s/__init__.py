@@ -21,7 +21,6 @@ In reading order:
 """
 
 from r2s.cloth.cloth import Cloth, ClothState
-from r2s.cloth.self_contact.contacts import SelfContact
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.geometry.mesh import Mesh, rectangle
@@ -35,7 +34,6 @@ __all__ = [
     "ClothState",
     "Control",
     "Fabric",
-    "SelfContact",
     "Mesh",
     "OrthotropicSpace",
     "Recording",
