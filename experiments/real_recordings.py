@@ -18,16 +18,14 @@ from scipy.spatial import KDTree
 import r2s
 from r2s.evaluation import placement
 
-Frames = list[np.ndarray]  # of points [m]
 
-
-def distance(real: Frames, other: Frames) -> float:
+def distance(real: list[np.ndarray], other: list[np.ndarray]) -> float:
     """Mean distance [mm] from recorded points to others."""
     pairs = zip(map(KDTree, other), real, strict=True)
     return 1e3 * float(np.mean([tree.query(points)[0].mean() for tree, points in pairs]))
 
 
-def errors(name: str, real: Frames, others: list[Frames]) -> Line:
+def errors(name: str, real: list[np.ndarray], others: list[list[np.ndarray]]) -> Line:
     """Mean errors [mm] of several simulations: as written down, and placed."""
     found = []
     for other in others:
@@ -57,7 +55,6 @@ if __name__ == "__main__":
         compared["default fabric"] = [simulated_points(fold, space.middle())]
         compared["other trial"] = [recorded_points(other, frames) for other in again]
         lines.append({"recording": fold.info.name})
-        for what, others in compared.items():
-            if others:
-                lines[-1] |= errors(what, recorded_points(fold, frames), others)
+        for what in filter(compared.get, compared):
+            lines[-1] |= errors(what, recorded_points(fold, frames), compared[what])
         keep(a.out, lines, "real folds, predicted from lifts: mean distance [mm]")

@@ -19,7 +19,7 @@ from r2s.scenarios.energy import EnergyBalance, stretch
 from r2s.scenarios.scenario import Scenario
 
 FABRICS = ("grey_interlock", "black_denim")  # softest and stiffest membrane of the five
-SOLVERS = {"cloth": (13, 13), "self-contact": (9, 9), "points": (13, 13)}  # and vertices
+SOLVERS = {"cloth": (13, 13), "touching": (9, 9), "points": (13, 13)}  # and vertices
 GRIP = 0.1  # [m] around held vertices, where a sheet that hangs by a point has no bound
 balance_of = eqx.filter_jit(scenarios.energy_balance)
 
@@ -48,12 +48,10 @@ if __name__ == "__main__":
     a = parser.parse_args()
     lines: list[Line] = []
     for name, kind, preset in itertools.product(a.only, SOLVERS, FABRICS):
-        if kind == "self-contact" and name != "folding":
-            continue  # in the others the sheet does not touch itself
+        if kind == "touching" and name != "folding":
+            continue  # in the others no self-contact is needed
         fabric = presets.FIVE[preset]()
-        scenario = scenarios.SIX[name]().scenario(
-            SOLVERS[kind], self_contact=kind == "self-contact"
-        )
+        scenario = scenarios.SIX[name]().scenario(SOLVERS[kind], self_contact=kind == "touching")
         solver = scenarios.material_points(scenario, fabric) if kind == "points" else None
         found = balance_of(scenario, fabric, None, solver)
         lines.append({"scenario": name, "solver": kind, "fabric": preset})

@@ -21,28 +21,27 @@ from r2s.estimation import gauss_newton
 from r2s.estimation.problem import Problem
 from r2s.fabrics import presets
 from r2s.scenarios import synthetic
-from r2s.world.air import Air
 
 COLUMNS = "damped by", "width", "rise [mm^2]", "rough / rise", "(exact - fit) / mean slope"
-WIDTHS, PLACES, DEGREE = (0.5, 0.05, 0.005, 0.0005), 41, 4
+WIDTHS = (0.5, 0.05, 0.005, 0.0005)
 loss_at, normal_at = map(eqx.filter_jit, (gauss_newton.loss_at, gauss_newton.normal_at))
 
 
 def in_vacuum(scenario: r2s.Scenario, fabric: object = None) -> r2s.Cloth:
     """The cloth without air, in steps a quarter as long as the scenario's."""
-    vacuum = dataclasses.replace(scenario.scene, air=Air.make(density=0.0))
+    vacuum = eqx.tree_at(lambda s: s.air.density, scenario.scene, jnp.zeros((), float))
     return r2s.Cloth.make(vacuum, scenario.interval / (4 * scenario.substeps))
 
 
 def line(problem: Problem, truth: np.ndarray, width: float, damped: str) -> Line:
     """Sample the loss [m^2] along the first parameter, and compare its slopes at the truth."""
-    offsets, axis = width * np.linspace(-0.5, 0.5, PLACES), np.eye(len(truth))[0]
+    offsets, axis = width * np.linspace(-0.5, 0.5, 41), np.eye(len(truth))[0]
     losses = [float(loss_at((problem,), jnp.asarray(truth + o * axis, float))) for o in offsets]
     rise, rough = np.ptp(losses), np.sqrt(np.mean(np.diff(losses, 3) ** 2) / 20)
-    fit = np.polynomial.Polynomial.fit(offsets, losses, DEGREE).deriv()(0.0)
+    fit = np.polynomial.Polynomial.fit(offsets, losses, 4).deriv()(0.0)
     exact = float(normal_at((problem,), jnp.asarray(truth, float)).gradient[0])
-    numbers = f"{1e6 * rise:.2g}", f"{rough / rise:.2g}", f"{(exact - fit) * width / rise:.2g}"
-    return dict(zip(COLUMNS, (damped, f"{width:g}", *numbers), strict=True))
+    numbers = width, 1e6 * rise, rough / rise, (exact - fit) * width / rise
+    return dict(zip(COLUMNS, (damped, *map("{:.2g}".format, numbers)), strict=True))
 
 
 if __name__ == "__main__":
@@ -57,7 +56,6 @@ if __name__ == "__main__":
         seen = synthetic.record(lift, fabric, a.fabric, solver=factory, key=jax.random.key(0))
         problem = Problem.make(seen, space, num_points=100)
         problem = dataclasses.replace(problem, solver=factory and factory(problem.scenario))
-        truth = np.zeros(gauss_newton.size((problem,)))
-        truth[: space.dim] = space.locate(fabric)
+        truth = np.pad(space.locate(fabric), (0, gauss_newton.size((problem,)) - space.dim))
         lines += [line(problem, truth, width, damped) for width in WIDTHS]
         keep(a.out, lines, f"the loss of a lift of {a.fabric} along the warp stiffness")

@@ -1,4 +1,4 @@
-"""What the documents and docstrings say runs, what they name is there, and figures are from files."""
+"""What documents say runs, what they name is there, and their figures are those of files."""
 
 import doctest
 import importlib
@@ -101,9 +101,7 @@ def test_the_readme_has_no_measured_figure_but_those_of_its_tables():
 def test_a_guide_that_states_times_says_which_version_was_measured(document):
     text = TABLE.sub("", BLOCK.sub("", document.read_text(encoding="utf-8")))
     if re.search(r"\d CPU seconds|\d s on one core|\d s\b.*\d s\b", text):
-        assert re.search(r"version 0\.\d+\.0", text), (
-            f"{document.name}: measured with which version?"
-        )
+        assert re.search(r"version 0\.\d+\.0", text), f"{document.name} names no version"
 
 
 def with_examples():

@@ -103,9 +103,9 @@ def test_an_exported_fabric_hangs_in_mujoco_as_ours_does(module) -> None:
         jax.numpy_rank_promotion("allow"),
     ):
         driver, peer = module("another_simulator"), module("_mujoco")
-        scenario = driver.scenario_of("drape")
+        scenario = peer.scenario_of("drape")
         ours = np.asarray(driver.r2s.rollout(scenario, driver.FABRIC).x)
         theirs = peer.in_mujoco(scenario, driver.FABRIC)
-    distance = np.sqrt(np.mean(np.sum((ours[-1] - theirs[-1]) ** 2, axis=-1))) / driver.SIDE
-    moved = np.sqrt(np.mean(np.sum((ours[-1] - ours[0]) ** 2, axis=-1))) / driver.SIDE
+    distance = np.sqrt(np.mean(np.sum((ours[-1] - theirs[-1]) ** 2, axis=-1))) / peer.SIDE
+    moved = np.sqrt(np.mean(np.sum((ours[-1] - ours[0]) ** 2, axis=-1))) / peer.SIDE
     assert distance < 0.05 < moved
