@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from r2s import scenarios
+from r2s.estimation.estimate import Estimate
 from r2s.estimation.problem import Problem
 from r2s.evaluation import prediction_error
 from r2s.fabrics import presets
@@ -50,9 +51,35 @@ def synthetic_problem(
 
 def relative_errors(space: ParameterSpace, truth: Fabric, values: Sequence[float]) -> np.ndarray:
     """Errors of parameters: relative where the range is logarithmic, else absolute."""
-    true = np.asarray(space.values(space.locate(truth)))
+    true = np.asarray(space.values(space.to_unit(truth)))
     logarithmic = np.array([bound.log for bound in space.ranges])
     return (np.asarray(values) - true) / np.where(logarithmic, true, 1.0)
+
+
+def by_fabric(recordings: Sequence[Recording]) -> dict[str, list[Recording]]:
+    """The recordings of each fabric."""
+    found: dict[str, list[Recording]] = {}
+    for recording in recordings:
+        found.setdefault(recording.info.fabric, []).append(recording)
+    return found
+
+
+def values_of(found: Estimate) -> dict[str, str]:
+    """An estimate as a line of a table: values with standard errors, and whether it converged.
+
+    Values that are not identifiable are in brackets. Standard errors are relative where the range
+    of the parameter is logarithmic.
+    """
+    line = {}
+    numbers = zip(
+        found.ranges, found.values, found.standard_errors, found.identifiable, strict=True
+    )
+    for bound, value, error, known in numbers:
+        text = f"{value:.4g}" + (
+            "" if np.isnan(error) else f" ± {error:.1%}" if bound.log else f" ± {error:.2g}"
+        )
+        line[f"{bound.name} [{bound.unit}]"] = text if known else f"({text})"
+    return line | {"converged": "yes" if found.converged else "no"}
 
 
 def frames_of(recording: Recording) -> range:

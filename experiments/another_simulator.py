@@ -16,7 +16,7 @@ from _mujoco import FRAMES, MOTIONS, SIDE, in_mujoco, scenario_of
 from _tables import Line, command_line, keep
 
 import r2s
-from r2s.estimation import diffcloud
+from r2s.estimation.descent import descend
 from r2s.estimation.problem import Clouds, NuisancePrior, Problem
 from r2s.fabrics.parameters import MASS_DAMPING, OrthotropicSpace
 from r2s.geometry.surface import sample
@@ -42,7 +42,7 @@ if __name__ == "__main__":
     space = OrthotropicSpace.make(0.2, mass_damping=MASS_DAMPING)
     seen, exact = clouds_of(shown["lift"], lift), NuisancePrior(0.0, 0.0)
     problem = Problem(lift, space, tuple(range(FRAMES)), seen, nuisance_prior=exact)
-    found = diffcloud.estimate(problem, key=jax.random.key(1))
+    found = descend(problem, key=jax.random.key(1))
     fabrics = {"exported": FABRIC, "estimate": found.fabric, "default": space.middle()}
     lines: list[Line] = []
     for name, fabric in fabrics.items():

@@ -12,8 +12,7 @@ import numpy as np
 from _common import relative_errors, synthetic_problem
 from _tables import Line, command_line, keep, resumed
 
-from r2s.estimation import diffcloud
-from r2s.estimation.descent import DEFAULT
+from r2s.estimation.descent import DEFAULT, descend
 from r2s.fabrics import presets
 
 NINETY = 1.645  # standard errors to either side
@@ -23,8 +22,8 @@ def scores(scenario: str, fabric: str, seed: str) -> Line:
     """Estimate one recording: its errors, in its own standard errors."""
     truth, space, problem = synthetic_problem(fabric, scenario, 1000 + int(seed))
     budget = DEFAULT._replace(coarse=0, starts=1)
-    start, key = space.locate(truth), jax.random.key(0)
-    found = diffcloud.estimate(problem, budget, start=start, key=key)
+    start, key = space.to_unit(truth), jax.random.key(0)
+    found = descend(problem, budget, start=start, key=key)
     score = relative_errors(space, truth, found.values) / found.standard_errors
     return {bound.name: f"{z:.3f}" for bound, z in zip(space.ranges, score, strict=True)}
 
@@ -45,5 +44,9 @@ if __name__ == "__main__":
     a = parser.parse_args()
     named = [(name, str(i)) for name in presets.FIVE for i in range(a.each)]
     jobs = [{"scenario": a.scenario, "fabric": name, "seed": i} for name, i in named]
-    lines = resumed(a.out / f"{a.scenario}.csv", "errors over standard errors", jobs, scores)
-    keep(a.out / f"{a.scenario}_summary.csv", summary(lines), "how often 90 % hold the truth")
+    lines = resumed(a.out / f"{a.scenario}.csv", "Errors over standard errors.", jobs, scores)
+    keep(
+        a.out / f"{a.scenario}_summary.csv",
+        summary(lines),
+        "How often the interval of 90 % holds the truth.",
+    )

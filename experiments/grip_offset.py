@@ -56,4 +56,4 @@ if __name__ == "__main__":
         names = {"y [mm]": f"{y}", "z [mm]": f"{z}", "lag [ms]": f"{lag}"}
         lines.append(names | {"error [mm]": f"{error(moved, fabrics):.2f}"})
     lines.sort(key=lambda line: float(line["error [mm]"]))
-    keep(a.out, lines, "assumed fabrics on all real folds, by where the cloth is held")
+    keep(a.out, lines, "Assumed fabrics on all real folds, by where the cloth is held.")

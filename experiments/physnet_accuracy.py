@@ -48,7 +48,7 @@ if __name__ == "__main__":
         scenario = experiment.scenario(judged.shape)
         sighting = estimator.Sighting.make(scenario, images, frames, space, trained)
         found = estimator.estimate(sighting, num_calls=a.calls, path=a.out / f"search_{number}.npz")
-        errors.append(np.abs(np.asarray(space.locate(found.fabric)) - place))
+        errors.append(np.abs(np.asarray(space.to_unit(found.fabric)) - place))
         drawn = jax.random.uniform(key, (a.calls, space.dim), float)
         away = estimator.objective(sighting, a.calls)(np.asarray(drawn))
         by_chance.append(np.abs(np.asarray(drawn)[np.nanargmin(away)] - place))
@@ -57,4 +57,4 @@ if __name__ == "__main__":
     columns = [[f"{number:.2f}" for number in each] for each in medians]
     header = "parameter", "median error", "of random search"
     lines = [dict(zip(header, each, strict=True)) for each in zip(names, *columns, strict=True)]
-    keep(a.out / "errors.csv", lines, f"{right:.1%} of triplets are ordered rightly")
+    keep(a.out / "errors.csv", lines, f"{right:.1%} of triplets are ordered rightly.")

@@ -16,14 +16,15 @@ import numpy as np
 from _common import relative_errors, synthetic_problem
 from _tables import Line, command_line, resumed
 
-from r2s.estimation import cma_es, diffcloud
-from r2s.estimation.descent import DEFAULT
+from r2s.estimation import cma_es
+from r2s.estimation.descent import DEFAULT, descend
+from r2s.estimation.diffcloud import published_recipe
 from r2s.fabrics import presets
 
 METHODS = {
-    "diffcloud": diffcloud.estimate,
-    "published recipe": lambda problem, start, key: diffcloud.recipe(problem, start=start),
-    "cma-es": cma_es.estimate,
+    "diffcloud": descend,
+    "diffcloud-published": lambda problem, start, key: published_recipe(problem, None, start=start),
+    "cma-es": cma_es.search,
 }
 
 
@@ -31,7 +32,7 @@ def attempt(scenario: str, fabric: str, method: str, seed: str) -> Line:
     """Estimate once from a random start: worst error, and CPU seconds with compilation."""
     truth, space, problem = synthetic_problem(fabric, scenario)
     only = DEFAULT._replace(coarse=0, starts=1)
-    known = diffcloud.estimate(problem, only, start=space.locate(truth), key=jax.random.key(0))
+    known = descend(problem, only, start=space.to_unit(truth), key=jax.random.key(0))
     key = jax.random.key(100 + int(seed))
     began, start = time.process_time(), jax.random.uniform(key, (space.dim,), float)
     found = METHODS[method](problem, start=start, key=key)
@@ -52,4 +53,4 @@ if __name__ == "__main__":
     every = itertools.product([a.scenario], a.fabrics, a.methods, map(str, range(a.starts)))
     names = "scenario", "fabric", "method", "seed"
     jobs = [dict(zip(names, each, strict=True)) for each in every]
-    resumed(a.out, "estimates from random starts", jobs, attempt)
+    resumed(a.out, "Estimates from random starts.", jobs, attempt)

@@ -56,4 +56,4 @@ if __name__ == "__main__":
         found = balance_of(scenario, fabric, None, solver)
         lines.append({"scenario": name, "solver": kind, "fabric": preset})
         lines[-1] |= figures(scenario, found)
-        keep(a.out, lines, "the six scenarios, by solver and fabric")
+        keep(a.out, lines, "The six scenarios, by solver and fabric.")

@@ -39,4 +39,4 @@ if __name__ == "__main__":
     for bound, column in zip(SPACE.ranges, thetas.T, strict=True):
         ranks = {name: f"{spearmanr(column, values)[0]:+.2f}" for name, values in found.items()}
         lines.append({"parameter": bound.name} | ranks)
-    keep(a.out / "sweep.csv", lines, f"rank correlation over {a.fabrics} fabrics, after a lift")
+    keep(a.out / "sweep.csv", lines, f"Rank correlation over {a.fabrics} fabrics, after a lift.")

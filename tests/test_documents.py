@@ -21,7 +21,7 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 NAME = re.compile(r"`(r2s(?:\.[A-Za-z_]\w*)+)")
 IMPORT = re.compile(r"^ *from (r2s[\w.]*) import ([\w, ]+)$", re.MULTILINE)
 TABLE = re.compile(r"<!-- (\w+) -->\n(.*?)<!-- end of \1 -->\n", re.DOTALL)
-FIGURE = re.compile(r"\d[\d.,]* ?(?:%|mm\b|ms\b|s\b|min\b|hours?\b|CPU\b|GB\b|MB\b|times\b)")
+FIGURE = re.compile(r"(?<!\w)\d[\d.,]* ?(?:%|mm\b|ms\b|s\b|min\b|hours?\b|CPU\b|GB\b|MB\b|times\b)")
 
 
 @pytest.fixture
