@@ -108,8 +108,9 @@ def record(
     Seen by default as `sensing` says. Made by the cloth with `shape` vertices and steps of at most
     `max_step` [s], with `self_contact` so that it does not pass through itself; or by another
     solver, such as `r2s.scenarios.material_points`. A finer mesh and shorter steps than the
-    estimators' make a recording that is not their own model's. That of a stretching has markers and the force on the
-    pulled clamp. The same key gives the same recording. Raises `RuntimeError` when the simulation
+    estimators' make a recording that is not their own model's. That of a stretching has markers and
+    the force on the pulled clamp. The same key gives the same recording. Raises `RuntimeError` when
+    the simulation
     diverges.
     """
     seen = sensing(experiment) if seen is None else seen
