@@ -8,8 +8,6 @@ import r2s
 from r2s.cloth.linear.elimination import Elimination
 from r2s.export.mujoco import brake, mjcf
 from r2s.units import GRAVITY
-from r2s.world.air import Air
-from r2s.world.contact import Table
 
 SIDE, SIZE, HEIGHT = 0.3, 9, 0.5  # [m], vertices a side, of the sheet that starts flat [m]
 FRAMES, INTERVAL, SUBSTEPS, STEPS = 45, 1 / 30, 4, 68  # -, [s], steps of r2s and MuJoCo in a frame
@@ -26,7 +24,7 @@ def scenario_of(motion: str) -> r2s.Scenario:
     way = (start[held].mean(axis=0) - start[held]) / 20 if motion == "drape" else (0.07, 0.07, 0.2)
     times = INTERVAL * np.arange(FRAMES + 1)
     eased = np.clip(times, 0, 1) ** 2 * (3 - 2 * np.clip(times, 0, 1))
-    scene = r2s.Scene(mesh, jnp.array(held), Table.make(-jnp.inf), Air.make(density=0.0))
+    scene = r2s.Scene(mesh, jnp.array(held), r2s.Table.make(-jnp.inf), r2s.Air.make(density=0.0))
     falling = jnp.array([0.0, 0.0, -GRAVITY])
     return r2s.Scenario(
         scene=scene,

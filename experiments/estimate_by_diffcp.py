@@ -12,9 +12,9 @@ from pathlib import Path
 import jax
 from _common import by_fabric, recordings_in, values_of
 from _tables import Line, command_line, keep
-
 from r2s.estimation.registry import METHODS
-from r2s.fabrics.parameters import IsotropicSpace
+
+import r2s
 
 SHAPE = (7, 7)  # vertices of the sheet
 
@@ -24,7 +24,7 @@ if __name__ == "__main__":
     parser.add_argument("--scenario", default="lift")
     parser.add_argument("--density", type=float, default=0.15, help="areal density [kg/m^2]")
     a = parser.parse_args()
-    space, key = IsotropicSpace.make(a.density), jax.random.key(0)
+    space, key = r2s.IsotropicSpace.make(a.density), jax.random.key(0)
     lines: list[Line] = []
     for fabric, recordings in by_fabric(recordings_in(a.recordings, a.scenario)).items():
         checkpoint = a.out.with_name(f"{fabric}.diffcp.npz")

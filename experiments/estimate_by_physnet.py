@@ -13,9 +13,9 @@ from pathlib import Path
 import jax
 from _common import recordings_in, values_of
 from _tables import Line, command_line, keep
-
 from r2s.estimation.registry import METHODS
-from r2s.fabrics.parameters import OrthotropicSpace
+
+import r2s
 
 if __name__ == "__main__":
     parser = command_line(__doc__, "results/physnet.csv")
@@ -24,7 +24,7 @@ if __name__ == "__main__":
     parser.add_argument("--density", type=float, default=0.15, help="areal density [kg/m^2]")
     parser.add_argument("--seed", type=int, default=0)
     a = parser.parse_args()
-    space, key = OrthotropicSpace.make(a.density), jax.random.key(a.seed)
+    space, key = r2s.OrthotropicSpace.make(a.density), jax.random.key(a.seed)
     method = METHODS["physnet"](network=a.out.with_name(f"{a.scenario}.network"))
     lines: list[Line] = []
     for recording in recordings_in(a.recordings, a.scenario):

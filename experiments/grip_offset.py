@@ -16,10 +16,10 @@ import numpy as np
 from _common import recordings_in
 from _tables import Line, command_line, keep
 
+import r2s
 from r2s.evaluation import prediction_error
 from r2s.fabrics import presets
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.recordings import manifest
 from r2s.recordings.recording import Recording, subsample
 
@@ -49,7 +49,8 @@ if __name__ == "__main__":
     a = parser.parse_args()
     folds = [subsample(r, POINTS, None, 0) for r in recordings_in(a.recordings, "fold")]
     written = np.array(manifest.manifest_for(a.recordings).scenarios["fold"].gripper.offset)
-    fabrics = [OrthotropicSpace.make(0.15).middle(), *(make() for make in presets.FIVE.values())]
+    default = r2s.OrthotropicSpace.make(0.15).middle()
+    fabrics = [default, *(make() for make in presets.FIVE.values())]
     lines: list[Line] = []
     for y, z, lag in itertools.product(BACK, BELOW, LAGS):
         moved = [held(r, np.array([0, y, z]) / 1e3 - written, lag / 1e3) for r in folds]

@@ -16,11 +16,11 @@ import time
 import jax
 from _common import relative_errors
 from _tables import Line, command_line, resumed
-
-from r2s.estimation.pinn.synthetic_pulls import pulled
 from r2s.estimation.registry import METHODS
+
+import r2s
+from r2s.estimation.pinn.synthetic_pulls import pulled
 from r2s.fabrics import presets
-from r2s.fabrics.parameters import OrthotropicSpace
 
 ANGLES = (0.0, 90.0, 45.0)  # [degrees], from the pull to the warp
 SHAPE = (33, 33)  # vertices of the sheet that is pulled
@@ -29,7 +29,7 @@ SHAPE = (33, 33)  # vertices of the sheet that is pulled
 def estimated(fabric: str, pulls: str, method: str, seed: str) -> Line:
     """Estimate one fabric from noisy pulls of it."""
     truth, angles, key = presets.FIVE[fabric](), ANGLES[: int(pulls)], jax.random.key(int(seed))
-    space = OrthotropicSpace.make(float(truth.density))
+    space = r2s.OrthotropicSpace.make(float(truth.density))
     recordings = [
         pulled(truth, fabric, math.radians(angle), shape=SHAPE, key=jax.random.fold_in(key, i))
         for i, angle in enumerate(angles)

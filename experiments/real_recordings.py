@@ -12,10 +12,10 @@ import jax
 import numpy as np
 from _common import frames_of, recorded_points, recordings_in, simulated_points
 from _tables import Line, command_line, keep
+from r2s.estimation.registry import METHODS
 from scipy.spatial import KDTree
 
 import r2s
-from r2s.estimation.registry import METHODS
 from r2s.evaluation import placement
 
 

@@ -15,7 +15,6 @@ from scipy.stats import spearmanr
 
 import r2s
 from r2s import scenarios
-from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.sweep import sweep
 
 
@@ -25,7 +24,7 @@ def heights(theta):
     return {"mean height": jnp.mean(x), "far corner": x[-1]}
 
 
-SPACE = OrthotropicSpace.make(density=0.2)  # [kg/m^2]
+SPACE = r2s.OrthotropicSpace.make(density=0.2)  # [kg/m^2]
 SCENARIO = scenarios.lifting((0.3, 0.3), num_frames=20, moving=1.0).scenario((5, 5))
 
 if __name__ == "__main__":
