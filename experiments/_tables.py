@@ -3,6 +3,7 @@
 import argparse
 import csv
 import importlib.metadata
+import io
 import os
 import platform
 import sys
@@ -11,7 +12,6 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from r2s.files import write_text
-from r2s.study.statistics.tables import Table, csv_text, markdown
 
 Line = dict[str, str]  # of a table, by column
 
@@ -47,13 +47,17 @@ def write(path: Path, lines: Sequence[Line], caption: str, facts: Line | None = 
     } | (facts or {})
     path.parent.mkdir(parents=True, exist_ok=True)
     comments = "".join(f"# {name}: {text}\n" for name, text in told.items())
-    write_text(path, comments + csv_text(_table(lines, caption)))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, _header(lines), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
+    write_text(path, comments + text.getvalue())
 
 
 def keep(path: Path, lines: Sequence[Line], caption: str, facts: Line | None = None) -> None:
     """Write a table as CSV, as `write` does, and print it as Markdown."""
     write(path, lines, caption, facts)
-    print(markdown(_table(lines, caption)))
+    print(markdown(lines, caption))
 
 
 def read(path: Path) -> tuple[list[Line], Line]:
@@ -68,7 +72,7 @@ def shown(path: Path) -> str:
     """A table that `write` wrote in Markdown, and below it what made it."""
     lines, facts = read(path)
     made = [facts[name] for name in ("version", "machine", "date", "cost") if name in facts]
-    return f"{markdown(_table(lines, facts['table']))}\n`{facts['command']}`: {', '.join(made)}.\n"
+    return f"{markdown(lines, facts['table'])}\n`{facts['command']}`: {', '.join(made)}.\n"
 
 
 def insert(document: Path, name: str, table: str) -> None:
@@ -91,11 +95,16 @@ def resumed(
         print(", ".join(job.values()), file=sys.stderr, flush=True)
         lines.append(job | make(**job))
         write(path, lines, caption)
-    print(markdown(_table(lines, caption)))
+    print(markdown(lines, caption))
     return lines
 
 
-def _table(lines: Sequence[Line], caption: str) -> Table:
-    header = tuple(dict.fromkeys(name for line in lines for name in line))
-    rows = tuple(tuple(line.get(name, "") for name in header) for line in lines)
-    return Table(header, rows, caption)
+def markdown(lines: Sequence[Line], caption: str) -> str:
+    """A caption and a table in Markdown; what a line lacks stays empty."""
+    header = _header(lines)
+    rows = [header, ["---"] * len(header), *([x.get(name, "") for name in header] for x in lines)]
+    return f"{caption}\n\n" + "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def _header(lines: Sequence[Line]) -> list[str]:
+    return list(dict.fromkeys(name for line in lines for name in line))

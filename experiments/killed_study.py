@@ -19,7 +19,7 @@ import psutil
 from _tables import command_line
 
 ROOT = Path(__file__).parents[1]
-STUDY = "--columns diffcloud-cloth-lifting --fabrics grey_interlock --judged 1".split()
+STUDY = "--configurations diffcloud-cloth-lifting --fabrics grey_interlock --judged 1".split()
 
 
 def start(out: Path, workers: int) -> subprocess.Popen:

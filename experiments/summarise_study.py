@@ -1,10 +1,9 @@
-"""Reduce a study to what the documents show of it.
+"""Copy the tables of a study that the documents show, and put them into the documents.
 
 python experiments/summarise_study.py results     # the folder that `make study` left
 
-Writes docs/results/study_small.csv and puts the same table between two marks of the README: mean
-distance [mm] from the true surface to the simulation, and the 90 % interval of a bootstrap over
-recordings. Two of the study's own tables go to docs/results.md in the same way.
+Each table becomes a file of OUT, which says what made it, and replaces what stands between the two
+marks of its name in a document.
 """
 
 import csv
@@ -13,48 +12,42 @@ from pathlib import Path
 
 from _tables import Line, command_line, insert, keep, shown
 
-from r2s.study.statistics.distances import means
-from r2s.study.statistics.panel import by_motion, make_panel
-from r2s.study.statistics.tables import read_rows
-
-METRIC = "chamfer_real_to_sim"
-CAPTION = "Distance from the true surface to the simulation [mm]: mean (90 % interval)."
-COPIED = {  # tables of the study by name, and their columns that are shown
-    "findings": ("Conclusions of the paper, tested here.", "conclusion", METRIC),
-    "parameters_cloth": ("Stiffness along warp and weft.", "recording", "warp", "weft"),
+# by the study's name: the document, the name there, a caption, and columns (none named: all)
+TABLES = {
+    "chamfer_real_to_sim": (
+        *("README.md", "study_small"),
+        "Distance from the true surface to the simulation: mean [90 % interval].",
+    ),
+    "findings": (
+        *("docs/results.md", "study_small_findings"),
+        *("Conclusions of the paper, tested here.", "conclusion", "chamfer_real_to_sim"),
+    ),
+    "parameters_cloth": (
+        *("docs/results.md", "study_small_parameters"),
+        *("Stiffness along warp and weft.", "recording", "warp", "weft"),
+    ),
 }
 
 
-def summary(results: Path) -> list[Line]:
-    """One line for each configuration: its mean error [mm] on each motion, and the interval."""
-    lines: dict[str, Line] = {}
-    for motion, panel in by_motion(make_panel(read_rows(results), METRIC)).items():
-        found = means(panel)
-        for column, *numbers in zip(panel.columns, found.mean, found.low, found.high, strict=True):
-            mean, low, high = (f"{1e3 * number:.1f}" for number in numbers)
-            line = lines.setdefault(column.label, {"configuration": column.label})
-            line[motion] = f"{mean} ({low} to {high})"
-    return list(lines.values())
+def table(results: Path, name: str) -> list[Line]:
+    """Read a table of a study."""
+    return list(csv.DictReader(open(results / "tables" / f"{name}.csv", encoding="utf-8")))
 
 
 if __name__ == "__main__":
-    parser = command_line(__doc__, "docs/results/study_small.csv")
+    parser = command_line(__doc__, "docs/results")
     parser.add_argument("results", type=Path)
     a = parser.parse_args()
-    table = {
-        name: list(csv.DictReader(open(a.results / "tables" / f"{name}.csv", encoding="utf-8")))
-        for name in ("settings", "costs", *COPIED)
-    }
-    facts = {"command": f"make study; python experiments/summarise_study.py {a.results}"}
-    version = {line["setting"]: line["value"] for line in table["settings"]}["version of r2s"]
-    facts["version"] = f"r2s {version}"
+    version = {x["setting"]: x["value"] for x in table(a.results, "settings")}["version of r2s"]
+    seconds = sum(float(x["CPU seconds in all"]) for x in table(a.results, "costs"))
     made = time.gmtime((a.results / "results.csv").stat().st_mtime)
-    facts["date"] = time.strftime("%Y-%m-%d", made)
-    seconds = sum(float(line["CPU seconds in all"]) for line in table["costs"])
-    facts["cost"] = f"{seconds / 60:.0f} CPU minutes"
-    keep(a.out, summary(a.results / "results.csv"), CAPTION, facts)
-    insert(Path("README.md"), a.out.stem, shown(a.out))
-    for name, (caption, *columns) in COPIED.items():
-        path = a.out.with_name(f"{a.out.stem}_{name}.csv")
-        keep(path, [{column: x[column] for column in columns} for x in table[name]], caption, facts)
-        insert(Path("docs/results.md"), path.stem, shown(path))
+    facts = {
+        "command": "make study; python experiments/summarise_study.py results",
+        "version": f"r2s {version}",
+        "date": time.strftime("%Y-%m-%d", made),
+        "cost": f"{seconds / 60:.0f} CPU minutes",
+    }
+    for source, (document, name, caption, *columns) in TABLES.items():
+        whole, path = table(a.results, source), a.out / f"{name}.csv"
+        keep(path, [{column: x[column] for column in columns or x} for x in whole], caption, facts)
+        insert(Path(document), name, shown(path))

@@ -31,7 +31,7 @@ def tables(monkeypatch: pytest.MonkeyPatch):
     return importlib.import_module("_tables")
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_the_code_of_a_document_runs(document, tmp_path):
     """All of its blocks, one after the other as a reader would type them."""

@@ -93,7 +93,7 @@ def test_a_folder_without_the_scenario_is_named(module, tmp_path: Path) -> None:
         module("_common").recordings_in(tmp_path, "lift")
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="motions")
 def test_an_exported_fabric_hangs_in_mujoco_as_ours_does(module) -> None:
     """As users run it: in single precision, promotion as usual."""
     pytest.importorskip("mujoco", reason="needs r2s[bench]")
