@@ -51,5 +51,7 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", type=int, default=1)
     a = parser.parse_args()
     every = itertools.product(a.fabrics, [a.pulls], a.methods, map(str, range(a.seeds)))
-    jobs = [dict(zip(("fabric", "pulls", "method", "seed"), each, strict=True)) for each in every]
+    jobs: list[Line] = [
+        dict(zip(("fabric", "pulls", "method", "seed"), each, strict=True)) for each in every
+    ]
     resumed(a.out, "Errors of estimates from stretchings (standard errors).", jobs, estimated)

@@ -23,7 +23,8 @@ from r2s.fabrics import presets
 from r2s.scenarios import synthetic
 
 COLUMNS = "damped by", "width", "rise [mm^2]", "rough / rise", "(exact - fit) / mean slope"
-loss_at, normal_at = map(eqx.filter_jit, (gauss_newton.loss_at, gauss_newton.normal_at))
+loss_at = eqx.filter_jit(gauss_newton.loss_at)
+normal_at = eqx.filter_jit(gauss_newton.normal_at)
 
 
 def in_vacuum(scenario: r2s.Scenario, fabric: object = None) -> r2s.Cloth:
