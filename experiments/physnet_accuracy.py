@@ -12,7 +12,7 @@ of the nearest of as many simulations at random. What lies in OUT is not made ag
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _tables import command_line, keep
+from _tables import Line, command_line, keep
 
 from r2s.estimation.physnet import dataset, estimator, preprocess, training, triplets
 from r2s.estimation.physnet.dataset import Settings
@@ -56,5 +56,7 @@ if __name__ == "__main__":
     medians = np.median(errors, axis=0), np.median(by_chance, axis=0)
     columns = [[f"{number:.2f}" for number in each] for each in medians]
     header = "parameter", "median error", "of random search"
-    lines = [dict(zip(header, each, strict=True)) for each in zip(names, *columns, strict=True)]
+    lines: list[Line] = [
+        dict(zip(header, each, strict=True)) for each in zip(names, *columns, strict=True)
+    ]
     keep(a.out / "errors.csv", lines, f"{right:.1%} of triplets are ordered rightly.")
