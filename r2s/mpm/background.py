@@ -149,11 +149,8 @@ class Background(eqx.Module):
             columns.append(jnp.where(spaced > count - self.walls, jnp.minimum(low, 0), low))
         return jnp.stack(columns, axis=1)
 
-    def settle(self, x: Vectors) -> Vectors:
-        """New positions [m]: on the table when they are in it, NaN when they are off the grid.
-
-        So that a particle which leaves shows as a run that diverged.
-        """
+    def project(self, x: Vectors) -> Vectors:
+        """Positions [m] lifted onto the table, and NaN where they are off the grid."""
         if self.table is not None:
             lowest = jnp.full(x.shape[1] - 1, -jnp.inf, x.dtype)
             x = jnp.maximum(x, jnp.append(lowest, self.table.height)[None])

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from r2s.geometry.mesh import Mesh
 from r2s.laws.solid import Solid, product
 from r2s.mpm.background import Background, Held
-from r2s.mpm.stability import check_step, longest_step
+from r2s.mpm.stability import check_step, first_failure, longest_step, no_failure
 from r2s.mpm.transfer import affine_factor
 from r2s.world.air import Air, Fan
 from r2s.world.drag import drag_on_vertices
@@ -23,15 +23,19 @@ Points = Float[Array, "particle axis"]
 
 
 class BlockState(eqx.Module):
-    """- `x`, `v`: positions [m] and velocities [m/s].
-    - `C`: affine velocities, [1/s].
+    """The particles of a block at one time.
+
+    - `x`, `v`: positions [m] and velocities [m/s].
+    - `C`: affine velocity matrices, [1/s].
     - `F`: deformation gradients, [-].
+    - `failure`: code of what failed first (`r2s.failures.Failure`).
     """
 
     x: Float[Array, "particle axis"]
     v: Float[Array, "particle axis"]
     C: Float[Array, "particle axis axis"]
     F: Float[Array, "particle axis axis"]
+    failure: Int[Array, ""]
 
 
 class Surface(eqx.Module):
@@ -130,7 +134,7 @@ class Block(eqx.Module):
         self.background.grid.check(x)
         v = jnp.zeros_like(x) if v is None else v
         identity = jnp.broadcast_to(jnp.eye(x.shape[1], dtype=x.dtype), (*x.shape, x.shape[1]))
-        return BlockState(x, v, jnp.zeros_like(identity), identity)
+        return BlockState(x, v, jnp.zeros_like(identity), identity, no_failure())
 
     def step(self, fabric: Solid, state: BlockState, control: Control) -> BlockState:
         """The state `dt` later, with the held particles at `control.handles` plus their offsets."""
@@ -153,14 +157,15 @@ class Block(eqx.Module):
         )
         v, C = _put(v, held, carried.v), _put(C, held, jnp.zeros_like(C[held]))
         x = _put(state.x + dt * v, held, goal)
-        return BlockState(self.background.settle(x), v, C, deformation)
+        failure = first_failure(state.failure, self.background.grid, state.x, x, (fabric, control))
+        return BlockState(self.background.project(x), v, C, deformation, failure)
 
     def _drag(self, state: BlockState, wind: Array) -> Array:
         surface = self.surface
         assert surface is not None
         count = surface.mesh.rest.shape[0]
-        about = surface.mesh, surface.air, surface.fan
-        return drag_on_vertices(*about, state.x[:count], state.v[:count], wind)
+        x, v = state.x[:count], state.v[:count]
+        return drag_on_vertices(surface.mesh, surface.air, surface.fan, x, v, wind)
 
 
 def _put(values: Array, where: Array, held: Array) -> Array:

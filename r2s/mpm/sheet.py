@@ -12,14 +12,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh
 from r2s.mpm.background import Background
 from r2s.mpm.elements import bending_frequency, elastic_force, membrane_frequency
 from r2s.mpm.grid import Grid
-from r2s.mpm.stability import check_step, longest_step
+from r2s.mpm.stability import check_step, first_failure, longest_step, no_failure
 from r2s.mpm.transfer import affine_factor
 from r2s.mpm.transverse import Transverse, unit_normal
 from r2s.world.drag import drag_on_vertices
@@ -33,15 +33,19 @@ CONTACT = 20.0  # [N/m]: some cm of a fabric's weight press layers together by a
 
 
 class SheetState(eqx.Module):
-    """- `x`, `v`: positions [m] and velocities [m/s] of the vertices.
-    - `C`: affine velocities, [1/s].
+    """A sheet at one time.
+
+    - `x`, `v`: positions [m] and velocities [m/s] of the vertices.
+    - `C`: affine velocity matrices of the vertices, [1/s].
     - `d`: transverse directions of the faces, [-].
+    - `failure`: code of what failed first (`r2s.failures.Failure`).
     """
 
     x: Float[Array, "vertex 3"]
     v: Float[Array, "vertex 3"]
     C: Float[Array, "vertex 3 3"]
     d: Float[Array, "face 3"]
+    failure: Int[Array, ""]
 
 
 class Sheet(eqx.Module):
@@ -132,7 +136,7 @@ class Sheet(eqx.Module):
         self.background.grid.check(x)
         v = jnp.zeros_like(x) if v is None else v
         normals = jax.vmap(unit_normal)(x[self.scene.mesh.faces])
-        return SheetState(x, v, jnp.zeros((*x.shape, 3), x.dtype), normals)
+        return SheetState(x, v, jnp.zeros((*x.shape, 3), x.dtype), normals, no_failure())
 
     def step(self, fabric: Fabric, state: SheetState, control: Control) -> SheetState:
         """The state `dt` later, with the held vertices at `control.handles`."""
@@ -162,8 +166,11 @@ class Sheet(eqx.Module):
         v, C = self.background.advance(dt, fabric.friction, state.x, mass, momentum, affine)
         given += at_handles - mass[held][:, None] * v[held]
         v = v.at[held].set(carried)
-        x = self.background.settle(state.x + dt * v).at[held].set(control.handles)
-        return SheetState(x, v, C, d), given / dt
+        moved = state.x + dt * v
+        grid = self.background.grid
+        failure = first_failure(state.failure, grid, state.x, moved, (fabric, control))
+        x = self.background.project(moved).at[held].set(control.handles)
+        return SheetState(x, v, C, d, failure), given / dt
 
     def _directions(self, fabric: Fabric, state: SheetState) -> Float[Array, "face 3"]:
         """Where the grid has carried the transverse directions, after the return mapping."""
