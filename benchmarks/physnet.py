@@ -24,10 +24,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+import physnet_pictures as pictures
 from measure import progress, show
 from scipy.stats import spearmanr
 
-from r2s.estimation.physnet import dataset, estimator, pictures, preprocess, training, triplets
+from r2s.estimation.physnet import dataset, estimator, preprocess, training, triplets
 from r2s.estimation.physnet.dataset import Data, Settings
 from r2s.estimation.physnet.estimator import Sighting
 from r2s.estimation.physnet.network import DEEPER, PAPER
@@ -154,8 +155,8 @@ def teach(out: Path, data: Data, others: Data, view, asked, seed: int):
     paper = dataclasses.replace(PAPER, size=view.size)
     schedule = training.Schedule(epochs=asked.epochs, steps=asked.steps, seed=seed)
     start = training.begin(view, paper if asked.paper else DEEPER, schedule)
-    _, held_back = training.divide(data, schedule)
-    untrained = training.judge(start.network, view, held_back, schedule)[1]
+    _, validation = training.divide(data, schedule)
+    untrained = training.judge(start.network, view, validation, schedule)[1]
     trained = start
     if path.exists():  # the epochs asked for count, not those of its own schedule
         trained = training.load(path, expected=start.network.architecture)
@@ -242,7 +243,7 @@ def targets(others: Data, settings: Settings, view, count: int) -> list[Target]:
             experiment, fabric, "unseen", shape=settings.shape, solver=by, key=jr.key(int(number))
         )
         images = {
-            "simulated": preprocess.of_depths(view, simulated * dataset.STEP),
+            "simulated": preprocess.of_depths(view, simulated * dataset.DEPTH_UNIT),
             "depth camera": preprocess.of_camera(view, camera, np.stack(depths), np.stack(masks)),
             "clouds": preprocess.of_clouds(view, recording, frames),
         }
@@ -294,10 +295,12 @@ def estimates(out, others, settings, networks, chosen, asked) -> list[dict[str, 
             kinds = ("depth camera", "clouds") if order < 3 and index == 0 else ("depth camera",)
             for kind in kinds:
                 images = target.images[kind]
-                about = scenario, images, frames, settings.space, trained, solver
-                sighting = Sighting.make(*about, cameras=by_kind[kind])
-                about = banks[kind], bank, others.places, target, asked.calls
-                guessed = random_search(sighting, *about)
+                sighting = Sighting.make(
+                    scenario, images, frames, settings.space, trained, solver, by_kind[kind]
+                )
+                guessed = random_search(
+                    sighting, banks[kind], bank, others.places, target, asked.calls
+                )
                 if index == 0 and kind == "depth camera":
                     guessed["deviation"] = deviations(sighting, target)
                 for seed in range(asked.repeats):
@@ -315,7 +318,7 @@ def in_view(view: View, depth: np.ndarray, cameras: list[DepthCamera]) -> np.nda
     pose = np.array(look_at(view.position, view.target))
     middles = (np.arange(view.size) + 0.5 - view.size / 2) / view.focal_length
     rays = np.stack([*np.meshgrid(middles, middles), np.ones((view.size,) * 2)], axis=-1)
-    points = (depth * dataset.STEP)[..., None] * (rays @ pose[:3, :3].T) + pose[:3, 3]
+    points = (depth * dataset.DEPTH_UNIT)[..., None] * (rays @ pose[:3, :3].T) + pose[:3, 3]
     planes = jnp.asarray(np.stack([frustum(camera) for camera in cameras]), float)
     inside = in_frame(jnp.asarray(points.reshape(-1, 3), float), planes)
     return np.where(np.asarray(inside).reshape(depth.shape), depth, 0)
@@ -325,12 +328,12 @@ def searched(path: Path, sighting: Sighting, target: Target, calls: int, seed: i
     fresh, spent = not path.exists(), time.process_time()
     done = estimator.estimate(sighting, num_calls=calls, seed=seed, path=path)
     place = np.asarray(sighting.space.locate(done.fabric))
-    at_truth = estimator.distances(sighting, jnp.asarray(np.stack([target.place] * 4), float))[0]
+    at_truth = estimator.responses(sighting, 4)(target.place[None])[0] - estimator.target(sighting)
     return {
         "search": seed,
         "error": np.abs(place - target.place),
         "loss": done.loss,
-        "loss at the truth": float(at_truth),
+        "loss at the truth": float(np.sqrt((at_truth**2).mean())),
         "cpu seconds": time.process_time() - spent if fresh else float("nan"),
     }
 
@@ -346,8 +349,7 @@ def deviations(sighting: Sighting, target: Target) -> np.ndarray:
     found = np.concatenate([respond(places[i : i + 4]) for i in range(0, len(places), 4)])
     low, high, here = np.split(found, [len(place), 2 * len(place)])
     slope = (high - low) / (ends[1] - ends[0]).sum(axis=1, keepdims=True)
-    seen = np.asarray(sighting.points).reshape(-1) * np.sqrt(sighting.points.shape[1])
-    variance = ((here[0] - seen) ** 2).mean() * len(sighting.frames)
+    variance = ((here[0] - estimator.target(sighting)) ** 2).mean() * len(sighting.frames)
     return np.sqrt(np.diag(np.linalg.inv(slope @ slope.T / variance + 12 * np.eye(len(place)))))
 
 
