@@ -3,6 +3,9 @@
 import enum
 from typing import SupportsInt
 
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
 
 class Failure(enum.IntEnum):
     """What failed first. A state carries it as an integer, so that it passes through `jax.jit`."""
@@ -46,3 +49,13 @@ def describe(code: SupportsInt) -> str:
     number that is no code.
     """
     return _SENTENCES[Failure(int(code))]
+
+
+def no_failure() -> Int[Array, ""]:
+    """The code of a run in which nothing has failed."""
+    return jnp.zeros((), int)
+
+
+def first_failure(before: Int[Array, ""], now: Int[Array, ""]) -> Int[Array, ""]:
+    """The code of a run so far and of what comes after it: the first failure stays."""
+    return jnp.where(before == Failure.NONE.value, now, before).astype(int)

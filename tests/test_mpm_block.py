@@ -237,11 +237,12 @@ def test_a_particle_outside_is_refused_and_one_that_leaves_is_recorded():
         solver.init(x + 2)
     start = solver.init(x, jnp.full(x.shape, 5.0))
     controls = still(4, 60, 2)
-    run = eqx.filter_jit(r2s.simulate)
-    assert run(solver, material, start, controls).ok.tolist() == [True, True, False, False]
+    run = eqx.filter_jit(r2s.simulate)(solver, material, start, controls)
+    assert run.ok.tolist() == [True, True, False, False]
     moved = states(solver, material, start, controls)
     code, step = failed(moved)
-    assert code == Failure.GRID and step // 60 == 2
+    assert code == run.failure == Failure.GRID
+    assert divmod(step, 60) == (run.failed_frame, run.failed_step) == (2, step - 120)
     assert np.isfinite(moved.x[step - 1]).all() and not np.isfinite(moved.x[step]).all()
     assert np.isfinite(moved.F[step]).all()
 

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from r2s.failures import first_failure, no_failure
 from r2s.geometry.mesh import Mesh
 from r2s.laws.solid import Solid, product
 from r2s.mpm.background import Background, Held
-from r2s.mpm.stability import check_step, first_failure, longest_step, no_failure
+from r2s.mpm.stability import check_step, failure_of_step, longest_step
 from r2s.mpm.transfer import affine_factor
 from r2s.world.air import Air, Fan
 from r2s.world.drag import drag_on_vertices
@@ -29,7 +30,7 @@ class BlockState(eqx.Module):
     - `x`, `v`: positions [m] and velocities [m/s].
     - `C`: affine velocity matrices, [1/s].
     - `F`: deformation gradients, [-].
-    - `failure`: code of what failed first (`r2s.failures.Failure`).
+    - `failure`: the first `r2s.failures.Failure` of the run so far.
     """
 
     x: Float[Array, "particle axis"]
@@ -159,7 +160,8 @@ class Block(eqx.Module):
         )
         v, C = _put(v, held, carried.v), _put(C, held, jnp.zeros_like(C[held]))
         x = _put(state.x + dt * v, held, goal)
-        failure = first_failure(state.failure, self.background.grid, state.x, x, (fabric, control))
+        failure = failure_of_step(self.background.grid, state.x, x, (fabric, control))
+        failure = first_failure(state.failure, failure)
         return BlockState(self.background.project(x), v, C, deformation, failure)
 
     def _drag(self, state: BlockState, wind: Array) -> Array:

@@ -10,19 +10,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from r2s.cloth.potential import (
-    bending_areas,
-    bending_laws,
-    bends,
-    curvatures,
-    hinge_angles,
-    strains,
-)
 from r2s.fabrics.fabric import Fabric
+from r2s.geometry.elements import (
+    green_strain,
+    hinge_angles,
+    hinge_curvature_gradients,
+    hinge_curvatures,
+    strains,
+    vertex_masses,
+)
 from r2s.geometry.mesh import Mesh
-from r2s.laws.bending import angle_gradient
-from r2s.laws.membrane import green_strain
-from r2s.laws.plate import PlateLaw
 
 Vertices = Float[Array, "vertex 3"]
 
@@ -39,13 +36,16 @@ def elastic_force(
     def stretch(x: Vertices) -> Array:
         return strains(mesh, x)
 
+    def hinges(x: Vertices) -> Array:
+        return hinge_curvatures(mesh, hinge_angles(mesh, x))
+
     def bend(x: Vertices) -> Array:
-        return bends(mesh, fabric.bending, curvatures(mesh, hinge_angles(mesh, x)))
+        return fabric.bending.curvatures(mesh, hinges(x))
 
     stretched = jax.vmap(fabric.membrane.at)(stretch(x))
     membrane = _resistance(stretched, stretch, mesh.area, membrane_damping, x, v)
-    bent = bending_laws(mesh, fabric.bending, curvatures(mesh, hinge_angles(mesh, x)))
-    areas = bending_areas(mesh, fabric.bending)
+    bent = fabric.bending.on_elements(mesh, hinges(x))
+    areas = fabric.bending.areas(mesh)
     return membrane + _resistance(bent, bend, areas, fabric.damping, x, v)
 
 
@@ -91,23 +91,18 @@ def bending_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
     """
     if not mesh.hinges.shape[0]:
         return jnp.zeros((), float)
-    mass = fabric.density * mesh.vertex_area
-    width = (mesh.hinge_length / mesh.hinge_area)[:, None, None]
-    turns = width * jax.vmap(angle_gradient)(_flat(mesh)[mesh.hinges])
-    law, areas = fabric.bending, bending_areas(mesh, fabric.bending)
-    if isinstance(law, PlateLaw):
-        vertices, rates = mesh.patches.vertices, mesh.patches.gradients(turns)
-        tangents = _tangent(law.at, law)[None]
-    else:
-        vertices, rates = mesh.hinges, turns[:, None]
-        flat = jnp.zeros(len(areas), mesh.rest.dtype)
-        laws = jax.vmap(law.at)(mesh.hinge_direction, flat)
-        tangents = jax.vmap(lambda law, k: jax.hessian(law.energy_density)(k))(laws, flat)
-        tangents = tangents[:, None, None]
+    mass = vertex_masses(mesh, fabric.density)
+    law = fabric.bending
+    vertices, areas = law.vertices(mesh), law.areas(mesh)
+    rates = law.gradients(mesh, hinge_curvature_gradients(mesh, _flat(mesh)))
+    count, size = rates.shape[:2]
+    hinges = jnp.zeros(mesh.hinges.shape[0], mesh.rest.dtype)
+    laws, flat = law.on_elements(mesh, hinges), law.curvatures(mesh, hinges)
+    tangents = jax.vmap(lambda law, k: jax.hessian(law.energy_density)(k))(laws, flat)
+    tangents = tangents.reshape(count, size, size)  # of a hinge it is a number
     sharing = jnp.zeros(mass.shape, float).at[vertices].add(1)
     weight = jnp.sqrt(areas[:, None] * sharing[vertices] / mass[vertices])
     rates = (rates * weight[:, None, :, None]).reshape(*rates.shape[:2], -1)
-    tangents = jnp.broadcast_to(tangents, (len(areas), *tangents.shape[1:]))
     return jnp.max(jax.vmap(_largest)(tangents, rates))
 
 

@@ -14,11 +14,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from r2s.fabrics.fabric import Fabric
+from r2s.failures import first_failure, no_failure
 from r2s.geometry.mesh import Mesh
 from r2s.mpm.background import Background
 from r2s.mpm.elements import bending_frequency, elastic_force, membrane_frequency
 from r2s.mpm.grid import Grid
-from r2s.mpm.stability import check_step, first_failure, longest_step, no_failure
+from r2s.mpm.stability import check_step, failure_of_step, longest_step
 from r2s.mpm.transfer import affine_factor
 from r2s.mpm.transverse import Transverse, unit_normal
 from r2s.world.drag import drag_on_vertices
@@ -37,7 +38,7 @@ class SheetState(eqx.Module):
     - `x`, `v`: positions [m] and velocities [m/s] of the vertices.
     - `C`: affine velocity matrices of the vertices, [1/s].
     - `d`: transverse directions of the faces, [-].
-    - `failure`: code of what failed first (`r2s.failures.Failure`).
+    - `failure`: the first `r2s.failures.Failure` of the run so far.
     """
 
     x: Float[Array, "vertex 3"]
@@ -90,17 +91,13 @@ class Sheet(eqx.Module):
         - `compression`, `shear`: stiffnesses between layers, [N/m].
         - `walls`, `sticky`, `forward_mode`: as in `Background`.
 
-        Raises `ValueError` when the step is too long for the fabric (the text gives the limit),
-        the mesh is too coarse for the grid, or the scene has layers, which belong to `r2s.Cloth`.
+        Raises `ValueError` when the step is too long for the fabric (the text gives the limit) or
+        the mesh is too coarse for the grid.
         """
         if not dt > 0 or not min(compression, shear) > 0:
             raise ValueError(
                 f"dt [s], compression and shear [N/m] must be positive, got {dt}, {compression} "
                 f"and {shear}"
-            )
-        if scene.layers is not None:
-            raise ValueError(
-                "contact between layers comes from the grid: the scene needs no layers"
             )
         edge = longest_edge(scene.mesh)
         if edge > COARSEST * grid.spacing:
@@ -166,9 +163,9 @@ class Sheet(eqx.Module):
         impulse += momentum_held - mass[held][:, None] * v[held]
         v = v.at[held].set(carried)
         moved = state.x + dt * v
-        grid = self.background.grid
-        failure = first_failure(state.failure, grid, state.x, moved, (fabric, control))
+        failure = failure_of_step(self.background.grid, state.x, moved, (fabric, control))
         x = self.background.project(moved).at[held].set(control.handles)
+        failure = first_failure(state.failure, failure)
         return SheetState(x, v, C, d, failure), impulse / dt
 
     def _transverse_directions(self, fabric: Fabric, state: SheetState) -> Float[Array, "face 3"]:

@@ -41,38 +41,24 @@ def check_step(dt: float, longest: Float[Array, ""], material: str) -> None:
         )
 
 
-def no_failure() -> Int[Array, ""]:
-    """The code of a state that no step has made."""
-    return _code(Failure.NONE)
+def failure_of_step(grid: Grid, before: Points, after: Points, inputs: Any) -> Int[Array, ""]:
+    """The `r2s.failures.Failure` of one step.
 
-
-def first_failure(
-    earlier: Int[Array, ""], grid: Grid, before: Points, after: Points, inputs: Any
-) -> Int[Array, ""]:
-    """The code of the first failure (`r2s.failures.Failure`) of a motion, at the end of a step.
-
-    - `earlier`: the code at the start of the step; it stays when it is one of a failure.
     - `before`: positions at the start of the step, [m].
     - `after`: positions at its end, also of particles that have left the grid, [m].
     - `inputs`: what else the step depends on, such as fabric and control.
 
     Inputs that are not finite give `NON_FINITE`. A result that is not finite gives `TIME_STEP`, and
-    so does a particle that leaves the grid by more than a spacing in one step, as only an unstable
-    step throws it. Any other particle outside the grid gives `GRID`.
+    so does a particle that leaves the grid while one moves by more than a spacing in the step, as
+    only an unstable step throws it. Any other particle outside the grid gives `GRID`.
     """
-    inputs_finite = _all_finite((before, inputs))
-    thrown = jnp.any(jnp.abs(after - before) > grid.spacing)
     outside = ~jnp.all(grid.inside(after))
+    thrown = jnp.any(jnp.abs(after - before) > grid.spacing)
     unstable = ~_all_finite(after) | (outside & thrown)
-    code = jnp.where(outside, _code(Failure.GRID), _code(Failure.NONE))
-    code = jnp.where(unstable, _code(Failure.TIME_STEP), code)
-    code = jnp.where(inputs_finite, code, _code(Failure.NON_FINITE))
-    return jnp.where(earlier == int(Failure.NONE), code, earlier)
+    code = jnp.where(outside, Failure.GRID.value, Failure.NONE.value)
+    code = jnp.where(unstable, Failure.TIME_STEP.value, code)
+    return jnp.where(_all_finite((before, inputs)), code, Failure.NON_FINITE.value)
 
 
 def _all_finite(tree: Any) -> Array:
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
-
-
-def _code(failure: Failure) -> Int[Array, ""]:
-    return jnp.asarray(int(failure), jnp.int32)
