@@ -172,12 +172,10 @@ def implausible(fabric: "Fabric") -> Iterator[str]:
 def _mesh(path: Path) -> tuple[dict[str, Any], str]:
     import numpy as np
 
+    from r2s.extras import require
     from r2s.geometry.mesh import Mesh
 
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ImportError("mesh files need trimesh: pip install 'r2s[study]'") from error
+    trimesh = require("trimesh", "study", "mesh files")
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such mesh")
     loaded: Any = trimesh.load(path, process=False, force="mesh")

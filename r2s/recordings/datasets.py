@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from r2s.extras import require
 from r2s.files import read_json
 from r2s.recordings.manifest import (
     Manifest,
@@ -257,9 +258,6 @@ def _raise(problems: list[str]) -> None:
 
 
 def _pooch() -> Any:
-    try:
-        import pooch
-    except ImportError as error:
-        raise ImportError("downloads need pooch: pip install 'r2s[data]'") from error
+    pooch = require("pooch", "data", "downloads")
     pooch.get_logger().setLevel("ERROR")  # what is done is said here
     return pooch

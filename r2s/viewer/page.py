@@ -9,13 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from r2s.extras import require
 from r2s.fabrics.fabric import Fabric
 from r2s.viewer.subject import Moved, Subject, error_used, move
-
-try:
-    import viser
-except ImportError as error:
-    raise ImportError("a page with sliders needs viser: pip install 'r2s[viz]'") from error
 
 CLOTH, CLOUD, GRIPPER = (0, 114, 178), (213, 94, 0), (30, 30, 30)  # Okabe and Ito's
 POINT = 0.003  # [m], of a cloud
@@ -51,6 +47,7 @@ class Page:
         self.failure = ""
         self._asked, self._stop = threading.Event(), threading.Event()
         self._shown = threading.Lock()
+        viser = require("viser", "viz", "a page with sliders")
         self.server = viser.ViserServer(host=host, port=port, label="r2s", verbose=False)
         if self.server.get_port() != port:
             taken = self.server.get_port()

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from r2s.extras import require
+
 
 def read_cloud(path: Path | str) -> Float[np.ndarray, "point 3"]:
     """The points of a file, in the file's units, as float64, in the order of the file.
@@ -135,10 +137,7 @@ def _read_npy(path: Path) -> np.ndarray:
 
 
 def _read_ply(path: Path) -> np.ndarray:
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ImportError(f"{path}: reading ply needs trimesh: pip install 'r2s[study]'") from error
+    trimesh = require("trimesh", "study", f"{path}: clouds in ply files")
     count = _ply_vertices(path.read_bytes())
     if count == 0:
         return np.zeros((0, 3))
@@ -186,11 +185,7 @@ def _read_xyz(path: Path) -> np.ndarray:
 def _read_pcd(path: Path) -> np.ndarray:
     if not path.is_file():  # before pypcd4, which wraps this error
         raise FileNotFoundError(f"{path}: no such file")
-    try:
-        from pypcd4 import PointCloud  # pyright: ignore[reportPrivateImportUsage]
-    except ImportError as error:
-        raise ImportError(f"{path}: reading pcd needs pypcd4: pip install 'r2s[pcd]'") from error
-    cloud = PointCloud.from_path(path)
+    cloud = require("pypcd4", "pcd", f"{path}: clouds in pcd files").PointCloud.from_path(path)
     values = cloud.numpy(("x", "y", "z"))
     if len(values) != cloud.points:
         raise ValueError(f"the header promises {cloud.points} points, found {len(values)}")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from r2s.extras import opencv
+from r2s.extras import require
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
@@ -36,7 +36,7 @@ def read_grey(path: Path | str) -> Iterator[UInt8[np.ndarray, "height width"]]:
 
 
 def _images(folder: Path) -> Iterator[tuple[Path, np.ndarray]]:
-    cv2 = opencv()
+    cv2 = require("cv2", "camera", "videos and images")
     for file in _numbered(folder):
         data = file.read_bytes()
         # libpng hands out the rows that it has: a cut file must be told by its missing end
@@ -74,7 +74,7 @@ def _numbered(folder: Path) -> list[Path]:
 def _video(path: Path) -> Iterator[tuple[Path, np.ndarray]]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such video file or folder of images")
-    cv2 = opencv()
+    cv2 = require("cv2", "camera", "videos and images")
     capture = cv2.VideoCapture(str(path))
     try:
         if not capture.isOpened():
