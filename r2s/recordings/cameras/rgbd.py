@@ -34,7 +34,7 @@ from r2s.recordings.cameras.calibration import DepthCamera
 from r2s.recordings.cameras.cleaning import Cleaning, clean, inside
 from r2s.recordings.cameras.depth import back_project, from_world, moved, steps
 from r2s.recordings.cameras.timing import pair, read_times
-from r2s.recordings.readers.clouds import find_numbered
+from r2s.recordings.readers.numbered import find_numbered
 from r2s.recordings.recording import Recording, RecordingInfo, make_recording
 
 NAME = "cameras.json"

@@ -28,8 +28,8 @@ def plane_homography(
     for name, points in (("image", pixels), ("table", metres)):
         if not np.isfinite(points).all():
             raise ValueError(f"the points in the {name} must be finite")
-        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-        if spread[1] < 1e-3 * spread[0]:
+        extent = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        if extent[1] < 1e-3 * extent[0]:
             raise ValueError(f"the points in the {name} lie on a line: spread them over the table")
     found, _ = cv2.findHomography(np.asarray(pixels, float), np.asarray(metres, float), 0)
     if found is None or not np.isfinite(found).all():
