@@ -27,25 +27,20 @@ class Evaluate:
     json: Json = False
 
     def run(self) -> int:
-        import equinox as eqx
-        import numpy as np
-
         from r2s.commands.common import load_card, print_result
         from r2s.evaluation import prediction_error
         from r2s.recordings.open import open_recordings
         from r2s.scenarios.scenario import from_recording, rollout
 
-        card, simulate = load_card(self.fabric), eqx.filter_jit(rollout)
-        found, failures, lines = {}, {}, []
+        card, found, failures, lines = load_card(self.fabric), {}, {}, []
         for recording in open_recordings(self.recordings):
-            motion = simulate(from_recording(recording), card.fabric)
-            x = np.where(np.asarray(motion.ok)[:, None, None], np.asarray(motion.x), np.nan)
+            x = prediction_error.predict(recording, card.fabric)
             metrics = prediction_error.against_motion(recording, x)
             name = recording.info.name
             found[name] = metrics
             lines += [f"{name}:", *(_line(metric, value) for metric, value in metrics.items())]
             if math.isnan(metrics["chamfer_real_to_sim"]):
-                failures[name] = motion.explain()
+                failures[name] = rollout(from_recording(recording), card.fabric).explain()
                 lines.append(f"    the simulation {failures[name]}")
         if not found:
             raise ValueError("no recording: name an NPZ, or a folder that holds some")

@@ -170,7 +170,7 @@ def _circles_grid(places: Places, shape: tuple[int, int]) -> Integer[np.ndarray,
     dots = np.asarray(places, np.float32)[:, None]
     if min(shape) < 2:
         raise ValueError(f"a grid has two rows and columns or more, found the shape {shape}")
-    is_there, found = False, None
+    is_there, found = False, np.zeros(0)
     if len(places) >= shape[0] * shape[1]:
         flags = cv2.CALIB_CB_SYMMETRIC_GRID
         finder = cv2.CirclesGridFinderParameters()
