@@ -18,7 +18,7 @@ class CheckGrad:
     For a scene, mesh or loss of your own: `r2s.gradient_check.compare`.
 
         r2s check-grad lifting --fabric black_denim --motion height=0.3 --shape 5 5
-        r2s check-grad folding --fabric mine.json --layers --forward
+        r2s check-grad folding --fabric mine.json --self-contact --forward
     """
 
     scenario: Annotated[Positional[ScenarioName], arg(metavar="SCENARIO")]
@@ -27,7 +27,7 @@ class CheckGrad:
     motion: Motion = ()
     solver: SolverName = "cloth"
     shape: Shape = (5, 5)
-    layers: bool = False
+    self_contact: bool = False
     """The sheet touches itself (cloth only)."""
     forward: bool = False
     """Check forward mode instead of reverse mode (cloth only)."""
@@ -44,14 +44,16 @@ class CheckGrad:
         from r2s.scenarios import material_points
         from r2s.scenarios.scenario import rollout
 
-        if self.solver == "points" and (self.layers or self.forward):
-            raise ValueError("--layers and --forward are of the cloth")
+        if self.solver == "points" and (self.self_contact or self.forward):
+            raise ValueError("--self-contact and --forward are of the cloth")
         if not self.tolerance > 0:
             raise ValueError(f"--tolerance must be positive, got {self.tolerance}")
         card = load_card(self.fabric)
         with jax.enable_x64(True):
             fabric = card.fabric
-            scenario = make_experiment(self.scenario, self.motion).scenario(self.shape, self.layers)
+            scenario = make_experiment(self.scenario, self.motion).scenario(
+                self.shape, self.self_contact
+            )
             solver = material_points(scenario, fabric) if self.solver == "points" else None
 
             def loss(fabric):

@@ -30,7 +30,7 @@ class Simulate:
     motion: Motion = ()
     solver: SolverName = "cloth"
     shape: Shape = (9, 9)
-    layers: bool = False
+    self_contact: bool = False
     """The sheet touches itself (cloth only; slower)."""
     recording: Annotated[Path | None, arg(metavar="FILE")] = None
     """Also write a synthetic recording, as NPZ."""
@@ -50,10 +50,12 @@ class Simulate:
         from r2s.scenarios import synthetic
         from r2s.scenarios.scenario import rollout
 
-        if self.layers and self.solver == "points":
-            raise ValueError("--layers is of the cloth: material points touch through their grid")
+        if self.self_contact and self.solver == "points":
+            raise ValueError(
+                "--self-contact is of the cloth: material points touch through their grid"
+            )
         card, experiment = load_card(self.fabric), make_experiment(self.scenario, self.motion)
-        scenario, fabric = experiment.scenario(self.shape, self.layers), card.fabric
+        scenario, fabric = experiment.scenario(self.shape, self.self_contact), card.fabric
         make_solver = scenarios.material_points if self.solver == "points" else None
         solver = None if make_solver is None else make_solver(scenario, fabric)
         motion = eqx.filter_jit(rollout)(scenario, fabric, solver=solver)
@@ -68,7 +70,7 @@ class Simulate:
                 fabric,
                 card.name,
                 shape=self.shape,
-                layers=self.layers,
+                self_contact=self.self_contact,
                 solver=make_solver,
                 key=jax.random.key(self.seed),
             )

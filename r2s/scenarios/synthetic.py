@@ -99,7 +99,7 @@ def record(
     seen: Sensing | None = None,
     shape: tuple[int, int] = (9, 9),
     max_step: float | None = None,
-    layers: bool = False,
+    self_contact: bool = False,
     solver: Callable[[Scenario, Fabric], Solver] | None = None,
     key: PRNGKeyArray,
 ) -> Recording:
@@ -109,7 +109,7 @@ def record(
     - `seen`: cameras and their errors; None: those of `sensing`.
     - `shape`: vertices along warp and weft. `max_step`: longest time step, [s]. A finer mesh and
       shorter steps than the estimators' make a recording that is not their own model's.
-    - `layers`: whether the sheet touches itself.
+    - `self_contact`: whether the sheet touches itself.
     - `solver`: makes another solver than the cloth, such as `r2s.scenarios.material_points`.
     - `key`: the same one gives the same recording.
 
@@ -117,7 +117,7 @@ def record(
     `RuntimeError` that says why when the simulation diverges.
     """
     seen = sensing(experiment) if seen is None else seen
-    scenario = experiment.scenario(shape, layers)
+    scenario = experiment.scenario(shape, self_contact)
     made = None if solver is None else solver(scenario, fabric)
     balance = None
     if experiment.name == "stretching":

@@ -175,7 +175,7 @@ class Page:
         if self.failure:
             lines.append(self.failure)
         elif failure := moved.motion.explain():
-            lines.append(f"The simulation {failure}.")
+            lines.append(f"The simulation {failure}")
         elif self.subject.clouds is not None:
             error = 1e3 * float(moved.error[frame]), 1e3 * float(error_used(self.subject, moved))
             first, last = self.subject.frames_used

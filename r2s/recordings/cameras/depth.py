@@ -6,7 +6,9 @@ from jaxtyping import Bool, Float
 from r2s.recordings.cameras.calibration import DepthCamera, rays
 
 
-def depth_jumps(depth: Float[np.ndarray, "down across"], limit: float) -> Bool[np.ndarray, "down across"]:
+def depth_jumps(
+    depth: Float[np.ndarray, "down across"], limit: float
+) -> Bool[np.ndarray, "down across"]:
     """Pixels at which the depth [m] jumps by more than `limit` [m] to a neighbour that has one.
 
     There a pixel sees two surfaces at once, and cameras report a depth in between.

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from r2s.recordings.cameras.calibration import DepthCamera, rays
-from r2s.recordings.cameras.depth import from_world, depth_jumps
+from r2s.recordings.cameras.depth import depth_jumps, from_world
 
 STEP = 0.02  # [m]: a jump in depth that counts as an edge
 
