@@ -27,6 +27,8 @@ class Evaluate:
     json: Json = False
 
     def run(self) -> int:
+        import equinox as eqx
+
         from r2s.commands.common import load_card, print_result
         from r2s.evaluation import prediction_error
         from r2s.recordings.open import open_recordings
@@ -40,7 +42,8 @@ class Evaluate:
             found[name] = metrics
             lines += [f"{name}:", *(_line(metric, value) for metric, value in metrics.items())]
             if math.isnan(metrics["chamfer_real_to_sim"]):
-                failures[name] = rollout(from_recording(recording), card.fabric).explain()
+                motion = eqx.filter_jit(rollout)(from_recording(recording), card.fabric)
+                failures[name] = motion.explain()
                 lines.append(f"    the simulation {failures[name]}")
         if not found:
             raise ValueError("no recording: name an NPZ, or a folder that holds some")

@@ -241,7 +241,8 @@ def _check_recordings(data: Manifest, folder: Path) -> Iterator[str]:
         folders = sorted({path.partition("/")[0] for path in missing})
         problems.append(
             f"{data.name}: cannot be downloaded automatically ({data.licence}). Get it from "
-            f"{source} and put into {folder}: {_shortened(folders) or 'the folders of the recordings'}"
+            f"{source} and put into {folder}: "
+            f"{_shortened(folders) or 'the folders of the recordings'}"
         )
     _raise_all(problems)
 

@@ -122,13 +122,10 @@ def record(
     balance = None
     if experiment.name == "stretching":
         balance = _energy_balance(scenario, fabric, max_step, made)
-        x = balance.x
-        _check_finite(x, name)
-    else:
-        motion = _rollout(scenario, fabric, max_step, made)
-        x = motion.x
-        if failure := motion.explain():
-            raise RuntimeError(f"the simulation of {name} {failure}")
+    x = balance.x if balance else _rollout(scenario, fabric, max_step, made).x
+    if not jnp.all(jnp.isfinite(x)):
+        failure = _rollout(scenario, fabric, max_step, made).explain()
+        raise RuntimeError(f"the simulation of {name} {failure}")
     errors = f"camera noise {1e3 * seen.noise:g} mm, {seen.outliers:.0%} outliers"
     errors += f", {seen.dropped:.0%} dropped" if seen.dropped else ""
     info = RecordingInfo(
@@ -207,13 +204,6 @@ def _record(fabric, name, scenario, trial, held, knots, frames_used, key) -> Rec
     path = path + corner(sheet, held) + 2e-3 * np.asarray(jr.normal(key_path, (3,))) * [1, 1, 0]
     experiment = Experiment(scenario, sheet, Route(times, path[:, None]), times, frames_used)
     return record(experiment, fabric, name, trial, key=key_view)
-
-
-def _check_finite(x: Float[Array, "frame vertex 3"], name: str) -> None:
-    finite = np.isfinite(np.asarray(x)).all(axis=(1, 2))
-    if not finite.all():
-        first = int(np.argmin(finite))
-        raise RuntimeError(f"the simulation of {name} diverged in frame {first}: positions")
 
 
 def _extended(route: Route, end: float) -> Route:
