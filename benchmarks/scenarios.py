@@ -23,7 +23,7 @@ from r2s.files import write_text
 from r2s.scenarios.energy import EnergyBalance, stretch
 from r2s.scenarios.scenario import Scenario
 from r2s.study.report.page import Section, write_report
-from r2s.study.statistics.tables import Table, csv_text
+from r2s.study.tables import Table, csv_text
 
 FABRICS = ("grey_interlock", "black_denim")  # softest and stiffest membrane of the five
 SOLVERS = {"cloth": (13, 13), "layers": (9, 9), "points": (13, 13)}  # vertices of their meshes

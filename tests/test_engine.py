@@ -61,7 +61,7 @@ class Sum(Cell):
 
 
 def value_of(cell: Cell, folder: Path) -> int:
-    with cells.opened(cell, folder) as files:
+    with cells.result_files(cell, folder) as files:
         return int((files / "value.txt").read_text())
 
 
@@ -70,7 +70,7 @@ def tree() -> Sum:
 
 
 def test_needs_come_first_and_once(tmp_path):
-    order = [cell.name for cell in engine.closure([tree()])]
+    order = [cell.name for cell in engine.with_dependencies([tree()])]
     assert order == ["n1", "n2", "a", "n3", "b", "whole"]
     assert engine.run([tree()], tmp_path, engine.Serial()) == {}
     assert value_of(tree(), tmp_path) == 8

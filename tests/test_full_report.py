@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_up_study import few_draws, made_up_rows, made_up_shown
+from made_up_study import few_draws, made_up_comparison, made_up_rows
 from test_report import Page
 
 from r2s.fabrics.parameters import Range
 from r2s.study.report import full, overlays
 from r2s.study.report.page import PNG
-from r2s.study.statistics.panel import MOTIONS, PAPER_COLUMNS
+from r2s.study.statistics.result_array import MOTIONS, PAPER_CONFIGURATIONS
 
 ENTRY = (
     "diffcloud_denim",
@@ -30,19 +30,21 @@ def quick():
         yield
 
 
-def some_diverged(column, fabric, motion, trial, repeat):
-    return math.nan if column.approach == "diffcp" and trial == 1 else 0.02 * trial
+def some_diverged(configuration, fabric, motion, trial, repeat):
+    return math.nan if configuration.approach == "diffcp" and trial == 1 else 0.02 * trial
 
 
 @pytest.fixture(scope="module")
 def published(tmp_path_factory):
     out = tmp_path_factory.mktemp("study")
-    shown = [made_up_shown(motion, labels=("DIFFCLOUD cloth lifting", "b")) for motion in MOTIONS]
+    shown = [
+        made_up_comparison(motion, labels=("DIFFCLOUD cloth lifting", "b")) for motion in MOTIONS
+    ]
     shown[1].motions["b"][2:] = np.nan
     tables = full.publish(
         out,
         made_up_rows(some_diverged, trials=3),
-        [*shown, made_up_shown("folding")],
+        [*shown, made_up_comparison("folding")],
         {"cloth": [ENTRY], "points": []},
         [("estimates pinn_denim", "RuntimeError: <diverged>")],
         {"recordings": "made up"},
@@ -87,28 +89,30 @@ def test_findings_come_first(published):
     "rows",
     [
         [],
-        made_up_rows(lambda *_: math.nan, PAPER_COLUMNS[:1], ["denim"], ["fling"], trials=1),
-        made_up_rows(columns=PAPER_COLUMNS[2:3], fabrics=["denim"], trials=1, repeats=1),
-        made_up_rows(columns=[], metrics=["hausdorff"]),
+        made_up_rows(lambda *_: math.nan, PAPER_CONFIGURATIONS[:1], ["denim"], ["fling"], trials=1),
+        made_up_rows(
+            configurations=PAPER_CONFIGURATIONS[2:3], fabrics=["denim"], trials=1, repeats=1
+        ),
+        made_up_rows(configurations=[], metrics=["hausdorff"]),
     ],
-    ids=["nothing", "all diverged", "one column", "default fabric alone"],
+    ids=["nothing", "all diverged", "one configuration", "default fabric alone"],
 )
 def test_parts_of_a_study_are_reported(tmp_path, rows):
     full.publish(tmp_path, rows)
     page = Page((tmp_path / "report.html").read_text())
     assert "Findings" in page.text and "Settings" in page.text
-    assert "Columns of the paper that have no result here" in page.text
+    assert "Configurations of the paper that have no result here" in page.text
 
 
 def test_a_late_frame_is_one_where_much_is_seen_and_has_moved():
-    shown = made_up_shown()
+    shown = made_up_comparison()
     assert overlays.late_frame(shown) == 3  # back at the start in the last
     clouds = tuple(cloud if i < 3 else cloud[:2] for i, cloud in enumerate(shown.clouds))
     assert overlays.late_frame(replace(shown, clouds=clouds)) < 3
 
 
 def test_pictures_of_a_video_move():
-    first, *_, last = list(overlays.pictures(made_up_shown()))
+    first, *_, last = list(overlays.pictures(made_up_comparison()))
     assert first.shape == last.shape and first.shape[0] % 2 == first.shape[1] % 2 == 0
     assert np.mean(np.any(first != last, axis=-1)) > 0.005
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from r2s.study.report.page import PNG, Section, write_report
-from r2s.study.statistics.tables import Table
+from r2s.study.tables import Table
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}
 TABLE = Table(("fabric", "estimate [mm]"), (("a<b", "1.0"), ("mean", "1.0")), "on the fold", foot=1)

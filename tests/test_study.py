@@ -18,12 +18,11 @@ from r2s.fabrics.arcsim import write_material
 from r2s.recordings.recording import cloud
 from r2s.scenarios import synthetic
 from r2s.scenarios.six import SIX
-from r2s.study import engine, estimates, matrix, results
-from r2s.study.cells import needs
+from r2s.study import engine, estimates, matrix, results, tables
+from r2s.study.cells import dependencies
 from r2s.study.estimates import EstimateCell, TrainedNetwork
-from r2s.study.sources import Making, SyntheticRecording, strain_dependent
-from r2s.study.statistics import tables
-from r2s.study.statistics.panel import MOTIONS, PAPER_COLUMNS, Column
+from r2s.study.sources import SyntheticRecording, TruthSettings, strain_dependent
+from r2s.study.statistics.result_array import MOTIONS, PAPER_CONFIGURATIONS, Configuration
 
 ROOT = Path(__file__).parents[1]
 
@@ -81,7 +80,7 @@ def test_the_cropped_distance_leaves_out_what_the_recording_cannot_show(fold):
 
 
 def test_the_columns_of_the_paper_are_part_of_all():
-    assert set(PAPER_COLUMNS) <= set(matrix.FULL)
+    assert set(PAPER_CONFIGURATIONS) <= set(matrix.FULL)
     assert len(set(matrix.FULL)) == len(matrix.FULL)
     for cell in matrix.synthetic(matrix.PRESETS["small"]):
         assert cell.scenario in MOTIONS
@@ -91,21 +90,24 @@ def test_the_columns_of_the_paper_are_part_of_all():
 
 
 def test_small_has_every_approach_both_solvers_two_fabrics_and_six_scenarios():
-    every = engine.closure(matrix.synthetic(matrix.SMALL))
+    every = engine.with_dependencies(matrix.synthetic(matrix.SMALL))
     estimated = [cell for cell in every if isinstance(cell, EstimateCell)]
     assert {cell.approach for cell in estimated} == set(estimates.SOLVERS)
     assert {cell.solver for cell in estimated} == {"cloth", "points"}
     assert len({cell.fabric for cell in estimated}) >= 2
     assert len({cell.scenario for cell in every if isinstance(cell, SyntheticRecording)}) == 6
     networks = [
-        need for cell in estimated for need in needs(cell) if isinstance(need, TrainedNetwork)
+        need
+        for cell in estimated
+        for need in dependencies(cell)
+        if isinstance(need, TrainedNetwork)
     ]
     assert networks and all(network.scenario == "lifting" for network in networks)
 
 
 def test_what_is_judged_was_never_estimated_from():
-    plan = matrix.narrowed(matrix.SMALL, repeats=3, judged=3)
-    every = engine.closure(matrix.synthetic(plan))
+    plan = matrix.with_changes(matrix.SMALL, repeats=3, judged=3)
+    every = engine.with_dependencies(matrix.synthetic(plan))
     made = [cell for cell in every if isinstance(cell, SyntheticRecording)]
     assert len({cell.path(Path()) for cell in every}) == len(every)
     motions = [cell._experiment().route.path.tobytes() for cell in made if cell.angle is None]
@@ -113,38 +115,44 @@ def test_what_is_judged_was_never_estimated_from():
 
 
 def test_a_truth_has_the_stiffness_of_the_preset_at_rest_and_more_when_stretched():
-    preset, truth = presets.grey_interlock(), strain_dependent("grey_interlock", Making())
+    preset, truth = presets.grey_interlock(), strain_dependent("grey_interlock", TruthSettings())
     at_rest, stretched = (truth.membrane.at(jnp.array([e, 0.0, 0.0])) for e in (0.0, 0.3))
     for name in ("c11", "c12", "c22", "c33"):
         assert getattr(at_rest, name) == pytest.approx(float(getattr(preset.membrane, name)))
         assert getattr(stretched, name) == pytest.approx(2 * float(getattr(preset.membrane, name)))
     hinge = truth.bending.at(jnp.array(0.0), jnp.array(0.0))
     assert float(hinge.stiffness) == pytest.approx(float(preset.bending.stiffness))
-    assert isinstance(strain_dependent("grey_interlock", Making(stiffening=0.0)), type(preset))
+    assert isinstance(
+        strain_dependent("grey_interlock", TruthSettings(stiffening=0.0)), type(preset)
+    )
 
 
 def test_a_changed_file_of_measured_tables_is_another_recording(tmp_path):
     def recordings():
-        plan = matrix.narrowed(matrix.SMALL, fabrics=["grey_interlock"], materials=str(tmp_path))
+        plan = matrix.with_changes(
+            matrix.SMALL, fabrics=["grey_interlock"], materials=str(tmp_path)
+        )
         return [cell.recordings[0] for cell in matrix.synthetic(plan)]
 
-    truth = strain_dependent("grey_interlock", Making())
+    truth = strain_dependent("grey_interlock", TruthSettings())
     write_material(tmp_path / "grey_interlock.json", truth)
     first, again = recordings(), recordings()
-    write_material(tmp_path / "grey_interlock.json", strain_dependent("pink_solid", Making()))
+    write_material(
+        tmp_path / "grey_interlock.json", strain_dependent("pink_solid", TruthSettings())
+    )
     changed = recordings()
     assert [cell.key for cell in first] == [cell.key for cell in again]
     assert not {cell.key for cell in first} & {cell.key for cell in changed}
     assert isinstance(changed[0], SyntheticRecording)
-    softer = strain_dependent("grey_interlock", changed[0].making).membrane.stiffness
+    softer = strain_dependent("grey_interlock", changed[0].truth_settings).membrane.stiffness
     assert not np.array_equal(softer, truth.membrane.stiffness)
     with pytest.raises(FileNotFoundError, match="camel_ponte_roma.json"):
-        matrix.narrowed(matrix.SMALL, fabrics=["camel_ponte_roma"], materials=str(tmp_path))
+        matrix.with_changes(matrix.SMALL, fabrics=["camel_ponte_roma"], materials=str(tmp_path))
 
 
 @pytest.fixture
 def tiny(monkeypatch):
-    """One column and fabric, whose estimate is the middle of the space, without work."""
+    """One configuration and fabric, whose estimate is the middle of the space, without work."""
     made = []
 
     def fake(cell, space, recordings, folder):
@@ -156,11 +164,11 @@ def tiny(monkeypatch):
 
     monkeypatch.setitem(estimates._ESTIMATORS, "diffcloud", fake)
     plan = matrix.Plan(
-        (Column("diffcloud", "cloth", "lifting"),),
+        (Configuration("diffcloud", "cloth", "lifting"),),
         ("grey_interlock",),
         1,
         1,
-        Making((5, 5), 1 / 15),
+        TruthSettings((5, 5), 1 / 15),
     )
     return matrix.synthetic(plan)[-1:], made
 
@@ -178,7 +186,7 @@ def test_an_estimate_is_made_once_and_judged(tiny, tmp_path):
     (entry,) = results.parameters(cells, tmp_path)["cloth"]
     assert entry[1][0].unit == "N/m" and not np.isfinite(entry[3]).any()
     # what more of the same would cost
-    plan = matrix.Plan((Column("diffcloud", "cloth", "lifting"),), ("grey_interlock",), 3, 4)
+    plan = matrix.Plan((Configuration("diffcloud", "cloth", "lifting"),), ("grey_interlock",), 3, 4)
     table = results.forecast(results.costs(cells, tmp_path), plan)
     lines = {line[0]: line[1:] for line in table.rows}
     assert lines["estimates diffcloud cloth lifting"][0] == "3"
@@ -206,7 +214,10 @@ def test_an_estimate_that_diverges_is_a_result(tiny, tmp_path, monkeypatch):
         (("--data", "r2s"), "no recording"),
         (("--data", "r2s", "--density", "-1"), "must be positive"),
         (("--fabrics", "silk"), "no preset 'silk'"),
-        (("--columns", "diffcp-cloth-wind"), "no column 'diffcp-cloth-wind'; there are diffcloud-"),
+        (
+            ("--configurations", "diffcp-cloth-wind"),
+            "no configuration 'diffcp-cloth-wind'; there are diffcloud-",
+        ),
         (("--judged", "0"), "judged must be at least 1"),
     ],
 )

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r2s.fabrics.parameters import Range
-from r2s.study.statistics import tables
-from r2s.study.statistics.tables import BASELINES, COLUMNS, Row, Table
+from r2s.study import tables
+from r2s.study.tables import BASELINES, HEADER, Row, Table
 
 RANGES = (
     Range("C11", "N/m", 3.0, 3000.0),
@@ -65,9 +65,9 @@ def test_file_of_rows(tmp_path):
     [
         ("", "expected the header"),
         ("approach,value\n", "expected the header"),
-        (",".join(COLUMNS) + "\na,b\n", "line 2: expected 11 cells, found 2"),
-        (",".join(COLUMNS) + "\na,b,c,d,e,f,g,,h,m,many\n", "line 2: .*many"),
-        (",".join(COLUMNS) + "\na,b,c,d,e,f,g,best,h,m,1.0\n", "line 2: unknown baseline 'best'"),
+        (",".join(HEADER) + "\na,b\n", "line 2: expected 11 cells, found 2"),
+        (",".join(HEADER) + "\na,b,c,d,e,f,g,,h,m,many\n", "line 2: .*many"),
+        (",".join(HEADER) + "\na,b,c,d,e,f,g,best,h,m,1.0\n", "line 2: unknown baseline 'best'"),
     ],
 )
 def test_damaged_rows_are_refused(tmp_path, text, message):

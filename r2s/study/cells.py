@@ -52,7 +52,7 @@ class Cell:
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
         """Write the result's files into the folder `out`; what is to be noted of it.
 
-        The results of `needs` are opened in the study's `folder`. The same cell gives the same
+        The results of `needs` are result_files in the study's `folder`. The same cell gives the same
         numbers.
         """
 
@@ -70,7 +70,7 @@ class Cell:
         return zipfile.is_zipfile(self.path(folder))
 
 
-def needs(cell: Cell) -> tuple[Cell, ...]:
+def dependencies(cell: Cell) -> tuple[Cell, ...]:
     """The cells that a cell is made from: those in its fields."""
     found: list[Cell] = []
     for field in fields(cell):
@@ -113,7 +113,7 @@ def about(cell: Cell, folder: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def opened(cell: Cell, folder: Path) -> Iterator[Path]:
+def result_files(cell: Cell, folder: Path) -> Iterator[Path]:
     """A folder with the files of a cell that is made, for as long as the context lasts.
 
     Raises `FileNotFoundError` when it is not, and `zipfile.BadZipFile` when it is damaged.

@@ -12,7 +12,7 @@ from typing import Protocol, runtime_checkable
 
 from tqdm import tqdm
 
-from r2s.study.cells import Cell, execute, needs
+from r2s.study.cells import Cell, execute
 
 
 @runtime_checkable
@@ -71,13 +71,13 @@ def attempt(cell: Cell, folder: Path, key: str | None = None) -> str:
     return ""
 
 
-def closure(cells: Iterable[Cell]) -> list[Cell]:
+def with_dependencies(cells: Iterable[Cell]) -> list[Cell]:
     """The cells and all that they need, what is needed first."""
     found: dict[Cell, None] = {}
 
     def visit(cell: Cell) -> None:
         if cell not in found:
-            for need in needs(cell):
+            for need in dependencies(cell):
                 visit(need)
             found[cell] = None
 
@@ -91,8 +91,8 @@ def run(cells: Iterable[Cell], folder: Path, runner: Runner) -> dict[Cell, str]:
 
     Those that are made already are left alone, those that failed before are tried again.
     """
-    waiting = {cell: None for cell in closure(cells) if not cell.is_made(folder)}
-    wanting = {cell: {need for need in needs(cell) if need in waiting} for cell in waiting}
+    waiting = {cell: None for cell in with_dependencies(cells) if not cell.is_made(folder)}
+    wanting = {cell: {need for need in dependencies(cell) if need in waiting} for cell in waiting}
     dependents = defaultdict(list)
     for cell, missing in wanting.items():
         for need in missing:

@@ -19,10 +19,10 @@ from r2s.mpm.sheet import Sheet, longest_edge, stable_step
 from r2s.recordings.recording import Recording
 from r2s.scenarios.on_points import EDGE, MEMBRANE_DAMPING, grid_around
 from r2s.scenarios.scenario import Scenario, from_recording, rollout
-from r2s.study.cells import Cell, opened
+from r2s.study.cells import Cell, result_files
 from r2s.study.estimates import EstimateCell, default_fabric, read_estimate
 from r2s.study.sources import GivenRecording, Source, read
-from r2s.study.statistics.panel import Column
+from r2s.study.statistics.result_array import Configuration
 
 MEASURED, MOTION = "measured.json", "motion.npz"
 LADDER = math.sqrt(2)  # steps between frames are powers of this: few programs to compile
@@ -57,11 +57,11 @@ class EvaluationCell(Cell):
         return self.recordings[0].scenario
 
     @property
-    def column(self) -> Column:
+    def configuration(self) -> Configuration:
         """Whose fabric it is: an approach's on a solver, or the default one."""
         if self.estimate is None:
-            return Column("", self.solver, "")
-        return Column(self.estimate.approach, self.solver, self.estimate.scenario)
+            return Configuration("", self.solver, "")
+        return Configuration(self.estimate.approach, self.solver, self.estimate.scenario)
 
     @property
     def repeat(self) -> str:
@@ -112,7 +112,7 @@ class EvaluationCell(Cell):
 
 def read_measured(cell: EvaluationCell, folder: Path) -> dict[str, dict[str, float]]:
     """The metrics of each recording by name; NaN where the motion diverged."""
-    with opened(cell, folder) as files:
+    with result_files(cell, folder) as files:
         stored = json.loads((files / MEASURED).read_text(encoding="utf-8"))
     number = lambda value: math.nan if value is None else value
     return {name: {k: number(v) for k, v in row.items()} for name, row in stored.items()}
@@ -120,7 +120,7 @@ def read_measured(cell: EvaluationCell, folder: Path) -> dict[str, dict[str, flo
 
 def read_motion(cell: EvaluationCell, folder: Path) -> Float[np.ndarray, "frame vertex 3"]:
     """Positions [m] of the motion beside the first recording."""
-    with opened(cell, folder) as files, np.load(files / MOTION) as stored:
+    with result_files(cell, folder) as files, np.load(files / MOTION) as stored:
         return stored["x"]
 
 

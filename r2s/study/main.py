@@ -15,7 +15,7 @@ def study(
     paper: Path | None = None,
     density: float = 0.15,
     materials: str = "",
-    columns: Sequence[str] | None = None,
+    configurations: Sequence[str] | None = None,
     fabrics: Sequence[str] | None = None,
     repeats: int | None = None,
     judged: int | None = None,
@@ -27,10 +27,10 @@ def study(
 ) -> int:
     """Make all cells that are not there, and write results and report; how many are missing.
 
-    - `preset`: in `matrix.PRESETS`; `columns` (such as "diffcloud-cloth-lifting"), `fabrics`,
+    - `preset`: in `matrix.PRESETS`; `configurations` (such as "diffcloud-cloth-lifting"), `fabrics`,
       `repeats`, `judged` and `seed` change it, see `matrix.Plan`.
     - `data`: a folder of recordings, of an areal `density` [kg/m^2]; None: synthetic ones.
-    - `paper`: a folder with the tables of Ru et al. 2025. - `materials`: see `truths.Making`.
+    - `paper`: a folder with the tables of Ru et al. 2025. - `materials`: see `truths.TruthSettings`.
     - `workers`: processes of this machine (one: cell after cell); or `slurm` jobs; or those of a
       Dask `scheduler`.
 
@@ -39,8 +39,8 @@ def study(
     """
     if preset not in matrix.PRESETS:
         raise ValueError(f"no preset {preset!r}; there are {', '.join(matrix.PRESETS)}")
-    changes = columns, fabrics, repeats, judged, materials, seed
-    plan = matrix.narrowed(matrix.PRESETS[preset], *changes)
+    changes = configurations, fabrics, repeats, judged, materials, seed
+    plan = matrix.with_changes(matrix.PRESETS[preset], *changes)
     cells = matrix.synthetic(plan) if data is None else matrix.recorded(data, density, plan)
     runner = _runner(workers, scheduler, slurm, compilation_cache)
     try:

@@ -1,4 +1,4 @@
-"""Which cells a study has: columns (approach, solver, scenario) by fabrics by motions."""
+"""Which cells a study has: configurations (approach, solver, scenario) by fabrics by motions."""
 
 import dataclasses
 from collections import defaultdict
@@ -12,52 +12,54 @@ from r2s.study.estimates import SOLVERS, Budgets, EstimateCell, TrainedNetwork, 
 from r2s.study.evaluations import EvaluationCell
 from r2s.study.sources import (
     GivenRecording,
-    Making,
     Source,
     SyntheticRecording,
+    TruthSettings,
     given,
     measured,
     strain_dependent,
 )
-from r2s.study.statistics.panel import MOTIONS, PAPER_COLUMNS, Column
+from r2s.study.statistics.result_array import MOTIONS, PAPER_CONFIGURATIONS, Configuration
 
 ESTIMATED_FROM = ("lifting", "wind", "stretching")
 TOGETHER = 10  # recordings in a cell that judges
 PULLS = (0.0, 45.0, 90.0)  # [degrees], from which PINN estimates together
 
 
-FULL = PAPER_COLUMNS + tuple(
-    Column(approach, solver, scenario)
+FULL = PAPER_CONFIGURATIONS + tuple(
+    Configuration(approach, solver, scenario)
     for approach, solvers in SOLVERS.items()
     for solver in solvers
     for scenario in ESTIMATED_FROM
-    if (approach, solver, scenario) not in PAPER_COLUMNS
+    if (approach, solver, scenario) not in PAPER_CONFIGURATIONS
     # the network's maps of lifts and winds are balanced as an orthotropic sheet alone
     and not (approach == "pinn" and solver == "points" and scenario != "stretching")
 )
-"""The columns of the study, and those that it calls unsupported."""
+"""The configurations of the study, and those that it calls unsupported."""
 
 
 @dataclass(frozen=True)
 class Plan:
     """A study of synthetic recordings.
 
-    - `columns`, `fabrics`: which. - `repeats`: estimates of each, from other motions.
-    - `judged`: motions of each of `MOTIONS` to judge by. - `making`, `spent`, `seed`.
+    - `configurations`, `fabrics`: which. - `repeats`: estimates of each, from other motions.
+    - `judged`: motions of each of `MOTIONS` to judge by. - `truth_settings`, `spent`, `seed`.
     - `every`: 1 compares all frames that count, 3 every third.
     """
 
-    columns: tuple[Column, ...]
+    configurations: tuple[Configuration, ...]
     fabrics: tuple[str, ...]
     repeats: int
     judged: int
-    making: Making = Making()
+    truth_settings: TruthSettings = TruthSettings()
     spent: Budgets = Budgets()
     seed: int = 0
     every: int = 1
 
 
-ALL = Plan(FULL, tuple(presets.FIVE), ESTIMATION, EVALUATION // len(MOTIONS), Making(layers=True))
+ALL = Plan(
+    FULL, tuple(presets.FIVE), ESTIMATION, EVALUATION // len(MOTIONS), TruthSettings(layers=True)
+)
 LITTLE = Budgets(
     coarse=16,
     starts=2,
@@ -71,8 +73,8 @@ LITTLE = Budgets(
     steps=40,
 )
 SMALL = Plan(
-    columns=tuple(
-        Column(*names)
+    configurations=tuple(
+        Configuration(*names)
         for names in (
             ("diffcloud", "cloth", "lifting"),
             ("diffcloud", "cloth", "wind"),
@@ -90,43 +92,47 @@ SMALL = Plan(
 )
 PRESETS = {
     "small": SMALL,
-    "paper": dataclasses.replace(ALL, columns=PAPER_COLUMNS),
+    "paper": dataclasses.replace(ALL, configurations=PAPER_CONFIGURATIONS),
     "full": ALL,
 }
 
 
-def named(text: str) -> Column:
-    """The column written as "diffcloud-cloth-lifting"; `ValueError` says which there are."""
+def named(text: str) -> Configuration:
+    """The configuration written as "diffcloud-cloth-lifting"; `ValueError` says which there are."""
     names = {"-".join(each): each for each in FULL}
     if text not in names:
-        raise ValueError(f"no column {text!r}; there are {', '.join(names)}")
+        raise ValueError(f"no configuration {text!r}; there are {', '.join(names)}")
     return names[text]
 
 
-def narrowed(
+def with_changes(
     plan: Plan,
-    columns: Sequence[str] | None = None,
+    configurations: Sequence[str] | None = None,
     fabrics: Sequence[str] | None = None,
     repeats: int | None = None,
     judged: int | None = None,
     materials: str = "",
     seed: int = 0,
 ) -> Plan:
-    """A plan with other columns, fabrics, numbers, measured tables or another seed; None: as it is.
+    """A plan with other configurations, fabrics, numbers, measured tables or another seed; None: as it is.
 
     Raises `ValueError` for numbers below 1, and what `truths.measured` raises.
     """
     for name, number in (("repeats", repeats), ("judged", judged)):
         if number is not None and number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
-    chosen, making = tuple(fabrics or plan.fabrics), plan.making
+    chosen, truth_settings = tuple(fabrics or plan.fabrics), plan.truth_settings
     return dataclasses.replace(
         plan,
-        columns=plan.columns if not columns else tuple(map(named, columns)),
+        configurations=plan.configurations
+        if not configurations
+        else tuple(map(named, configurations)),
         fabrics=chosen,
         repeats=plan.repeats if repeats is None else repeats,
         judged=plan.judged if judged is None else judged,
-        making=making if not materials else measured(making, Path(materials), chosen),
+        truth_settings=truth_settings
+        if not materials
+        else measured(truth_settings, Path(materials), chosen),
         seed=seed,
     )
 
@@ -138,17 +144,17 @@ def synthetic(plan: Plan) -> list[EvaluationCell]:
     """
     found = []
     for fabric in plan.fabrics:
-        density = float(strain_dependent(fabric, plan.making).density)
+        density = float(strain_dependent(fabric, plan.truth_settings).density)
         unseen = {
             scenario: tuple(
-                SyntheticRecording(fabric, scenario, number, True, plan.making, plan.seed)
+                SyntheticRecording(fabric, scenario, number, True, plan.truth_settings, plan.seed)
                 for number in range(plan.judged)
             )
             for scenario in MOTIONS
         }
         estimates = [
-            _estimated(column, fabric, density, plan, repeat)
-            for column in plan.columns
+            _estimated(configuration, fabric, density, plan, repeat)
+            for configuration in plan.configurations
             for repeat in range(plan.repeats)
         ]
         found += _judged(estimates, fabric, density, unseen, plan.every)
@@ -157,20 +163,24 @@ def synthetic(plan: Plan) -> list[EvaluationCell]:
 
 def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationCell]:
     """Likewise of the recordings in a folder, with an areal density to assume [kg/m^2]: those
-    columns of the plan that have recordings to estimate from.
+    configurations of the plan that have recordings to estimate from.
 
     A repeat is a recording. Judged by `MOTIONS` of the same fabric and trial (of all trials where
     that trial has none), also with the estimate of another fabric. Raises what `truths.given`
-    raises, and `ValueError` for a density that is none, when no column has a recording to estimate
+    raises, and `ValueError` for a density that is none, when no configuration has a recording to estimate
     from, or none is there to judge by.
     """
     family_of("cloth", density)
-    columns = plan.columns
+    configurations = plan.configurations
     # clouds of real cameras need all of the search, and there are few frames to judge by
     search = {name: getattr(Budgets, name) for name in ("coarse", "starts", "iterations")}
     plan = dataclasses.replace(plan, spent=dataclasses.replace(plan.spent, **search), every=1)
     every = given(folder)
-    seen = [r for r in every if r.scenario in {column.estimated_from for column in columns}]
+    seen = [
+        r
+        for r in every
+        if r.scenario in {configuration.estimated_from for configuration in configurations}
+    ]
     unseen = [r for r in every if r.scenario in MOTIONS]
     if not seen or not unseen:
         raise ValueError(
@@ -178,20 +188,20 @@ def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationCell]:
             f"({', '.join(MOTIONS)}); found {sorted({r.scenario for r in every})}"
         )
     found: list[EvaluationCell] = []
-    for column in columns:
-        own = [r for r in seen if r.scenario == column.estimated_from]
-        estimates = [_from_given(column, r, density, plan, i) for i, r in enumerate(own)]
+    for configuration in configurations:
+        own = [r for r in seen if r.scenario == configuration.estimated_from]
+        estimates = [_from_given(configuration, r, density, plan, i) for i, r in enumerate(own)]
         for index, (recording, estimate) in enumerate(zip(own, estimates, strict=True)):
             by = _by_scenario(_of_trial(unseen, recording))
             found += _judged([estimate], recording.fabric, density, by, plan.every)
             other = _other_fabric(own, index)
             if other is not None:
-                about = column.solver, density, recording.fabric
+                about = configuration.solver, density, recording.fabric
                 found += [
                     EvaluationCell(estimates[other], *about, r, True, plan.every)
                     for r in by.values()
                 ]
-    return list(dict.fromkeys(found))  # columns share the default fabric
+    return list(dict.fromkeys(found))  # configurations share the default fabric
 
 
 def _judged(estimates, fabric: str, density: float, unseen, every: int) -> list[EvaluationCell]:
@@ -208,29 +218,44 @@ def _judged(estimates, fabric: str, density: float, unseen, every: int) -> list[
 
 
 def _estimated(
-    column: Column, fabric: str, density: float, plan: Plan, repeat: int
+    configuration: Configuration, fabric: str, density: float, plan: Plan, repeat: int
 ) -> EstimateCell:
     make = lambda angle: SyntheticRecording(
-        fabric, column.estimated_from, repeat, False, plan.making, plan.seed, angle=angle
+        fabric,
+        configuration.estimated_from,
+        repeat,
+        False,
+        plan.truth_settings,
+        plan.seed,
+        angle=angle,
     )
-    several = column.approach == "pinn" and column.estimated_from == "stretching"
+    several = configuration.approach == "pinn" and configuration.estimated_from == "stretching"
     sources = tuple(make(angle) for angle in (PULLS if several else (None,)))
-    return _estimate(column, fabric, sources, density, plan, repeat)
+    return _estimate(configuration, fabric, sources, density, plan, repeat)
 
 
-def _from_given(column: Column, recording: GivenRecording, density: float, plan: Plan, repeat: int):
-    return _estimate(column, recording.fabric, (recording,), density, plan, repeat)
+def _from_given(
+    configuration: Configuration, recording: GivenRecording, density: float, plan: Plan, repeat: int
+):
+    return _estimate(configuration, recording.fabric, (recording,), density, plan, repeat)
 
 
 def _estimate(
-    column: Column, fabric: str, sources: tuple[Source, ...], density: float, plan: Plan, repeat
+    configuration: Configuration,
+    fabric: str,
+    sources: tuple[Source, ...],
+    density: float,
+    plan: Plan,
+    repeat,
 ) -> EstimateCell:
     spent, network = plan.spent, None
-    if column.approach == "physnet":
+    if configuration.approach == "physnet":
         on_points = dataclasses.replace(spent, fabrics=min(spent.fabrics, 32))
-        spent = on_points if column.solver == "points" else spent
-        network = TrainedNetwork(column.solver, column.estimated_from, spent, plan.seed)
-    about = column.approach, column.solver, fabric, sources, density
+        spent = on_points if configuration.solver == "points" else spent
+        network = TrainedNetwork(
+            configuration.solver, configuration.estimated_from, spent, plan.seed
+        )
+    about = configuration.approach, configuration.solver, fabric, sources, density
     return EstimateCell(*about, spent, network, repeat)
 
 

@@ -15,15 +15,15 @@ from r2s.fabrics.parameters import Range
 from r2s.files import write_text
 from r2s.recordings.recording import cloud
 from r2s.scenarios.scenario import from_recording
-from r2s.study.cells import Cell, about, opened
-from r2s.study.engine import closure
+from r2s.study.cells import Cell, about, result_files
+from r2s.study.engine import with_dependencies
 from r2s.study.estimates import ESTIMATE, EstimateCell, family_of, read_estimate
 from r2s.study.evaluations import EvaluationCell, read_measured, read_motion
 from r2s.study.matrix import PRESETS, Plan, synthetic
-from r2s.study.report.scenes import Shown
+from r2s.study.report.motions import MotionComparison
 from r2s.study.sources import Source, SyntheticRecording, read, small_strain
-from r2s.study.statistics.panel import Column
-from r2s.study.statistics.tables import Row, Table, pivot, significant, write_rows
+from r2s.study.statistics.result_array import Configuration
+from r2s.study.tables import Row, Table, pivot, significant, write_rows
 
 PRINTED = ("findings.md", "chamfer_real_to_sim*.md", "diff*_on_*.md")  # the others are in files
 
@@ -46,7 +46,7 @@ def publish(
         found = rows(cells, out)
         write_rows(out / "results.csv", found)
         for cell in estimated(cells, out):
-            with opened(cell, out) as files:
+            with result_files(cell, out) as files:
                 if (files / ESTIMATE).exists():
                     (out / "estimates").mkdir(exist_ok=True)
                     write_text(out / f"estimates/{cell.name}.json", (files / ESTIMATE).read_text())
@@ -102,7 +102,7 @@ def _rows(cell: EvaluationCell, folder: Path) -> list[Row]:
     baseline = "default" if estimate is None else "other_fabric" if cell.other else ""
     return [
         Row(
-            *cell.column,
+            *cell.configuration,
             cell.fabric,
             cell.repeat,
             name,
@@ -138,35 +138,35 @@ def _repeatability(cells: Sequence[EvaluationCell], folder: Path) -> list[Row]:
 
 
 def by_recording(rows: Sequence[Row], metric: str = "chamfer_real_to_sim") -> dict[str, Table]:
-    """One table a column and scenario: each recording's error beside that of the default fabric, of
+    """One table a configuration and scenario: each recording's error beside that of the default fabric, of
     another fabric's estimate and of another trial. Of given recordings alone, where an estimate is
     judged by what belongs to it."""
-    columns = dict.fromkeys(
-        Column(row.approach, row.solver, row.estimated_from)
+    configurations = dict.fromkeys(
+        Configuration(row.approach, row.solver, row.estimated_from)
         for row in rows
         if row.approach and row.baseline == "other_fabric"
     )
     found = {}
-    for column in columns:
+    for configuration in configurations:
         theirs = [
             row
             for row in rows
             if (row.approach, row.estimated_from)
-            in ((column.approach, column.estimated_from), ("", ""))
-            and row.solver in (column.solver, "")
+            in ((configuration.approach, configuration.estimated_from), ("", ""))
+            and row.solver in (configuration.solver, "")
         ]
         # where several estimates are judged by one recording, the first
         first = {(r.recording, r.evaluated_on, r.baseline, r.metric): r for r in reversed(theirs)}
         theirs = list(reversed(first.values()))
         for scenario in dict.fromkeys(row.evaluated_on for row in theirs):
             table = pivot(theirs, metric, scenario)
-            name = f"{'_'.join(column)}_on_{scenario}"
-            found[name] = replace(table, caption=f"{column.label}: {table.caption}")
+            name = f"{'_'.join(configuration)}_on_{scenario}"
+            found[name] = replace(table, caption=f"{configuration.label}: {table.caption}")
     return found
 
 
 def parameters(cells: Iterable[EvaluationCell], folder: Path) -> dict[str, list[Entry]]:
-    """What was estimated, by solver, as `r2s.study.statistics.tables.parameter_table` takes it."""
+    """What was estimated, by solver, as `r2s.study.tables.parameter_table` takes it."""
     found: dict[str, list[Entry]] = {}
     for cell in estimated(cells, folder):
         estimate = read_estimate(cell, folder)
@@ -179,7 +179,7 @@ def parameters(cells: Iterable[EvaluationCell], folder: Path) -> dict[str, list[
 
 def estimated(cells: Iterable[EvaluationCell], folder: Path) -> list[EstimateCell]:
     """The estimates that are made."""
-    every = closure(cells)
+    every = with_dependencies(cells)
     return [cell for cell in every if isinstance(cell, EstimateCell) and cell.is_made(folder)]
 
 
@@ -189,19 +189,19 @@ def _truth(cell: EstimateCell) -> np.ndarray | None:
     if (
         cell.solver != "cloth"
         or not isinstance(source, SyntheticRecording)
-        or source.making.materials
+        or source.truth_settings.materials
     ):
         return None
     space = family_of("cloth", cell.density)
     return np.asarray(space.values(space.locate(small_strain(cell.fabric))))
 
 
-def shown(cells: Iterable[EvaluationCell], folder: Path) -> list[Shown]:
-    """The first recording of each fabric and scenario with its simulations by all columns that are
+def shown(cells: Iterable[EvaluationCell], folder: Path) -> list[MotionComparison]:
+    """The first recording of each fabric and scenario with its simulations by all configurations that are
     made, at the frames that count."""
     groups: dict[Source, dict[str, np.ndarray]] = {}
     for cell in cells:
-        label, motions = cell.column.label, groups.setdefault(cell.recordings[0], {})
+        label, motions = cell.configuration.label, groups.setdefault(cell.recordings[0], {})
         if label not in motions and not cell.other and cell.is_made(folder):
             motions[label] = read_motion(cell, folder)
     found = []
@@ -212,7 +212,7 @@ def shown(cells: Iterable[EvaluationCell], folder: Path) -> list[Shown]:
         first, last = recording.info.frames_used
         frames = range(first, last + 1)
         found.append(
-            Shown(
+            MotionComparison(
                 source.fabric,
                 source.scenario,
                 source.name,
@@ -230,7 +230,7 @@ def costs(cells: Iterable[EvaluationCell], folder: Path) -> list[dict[str, Any]]
     """Of cells alike: their number, CPU seconds (compilation included) in all and the median of
     each (of each recording, where one judges several), and peak memory [MB]."""
     groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
-    for cell in closure(cells):
+    for cell in with_dependencies(cells):
         if cell.is_made(folder):
             groups[cell.alike].append(about(cell, folder))
     return [
@@ -254,7 +254,7 @@ def forecast(costs: Sequence[dict[str, Any]], plan: Plan, cores: Sequence[int] =
     """
     of_kind = {cost["kind"]: cost["each"] for cost in costs}
     groups: dict[str, float] = defaultdict(float)
-    for cell in closure(synthetic(plan)):
+    for cell in with_dependencies(synthetic(plan)):
         groups[cell.alike] += len(cell.recordings) if isinstance(cell, EvaluationCell) else 1
     lines, total = [], 0.0
     for alike, count in groups.items():

@@ -25,7 +25,7 @@ from r2s.recordings import manifest
 from r2s.recordings.recording import Recording, load, save
 from r2s.scenarios import synthetic
 from r2s.scenarios.six import SIX, Experiment, varied
-from r2s.study.cells import Cell, opened
+from r2s.study.cells import Cell, result_files
 
 RECORDING = "recording.npz"
 SOFTENED = (1.0, 0.9, 0.8, 0.75, 0.7)  # bending at curvatures of 0, 10, ... 40 1/m over that at 0
@@ -33,7 +33,7 @@ SAME_SCENARIO = {"lift": "lifting", "fold": "folding"}  # how recordings of othe
 
 
 @dataclass(frozen=True)
-class Making:
+class TruthSettings:
     """How recordings are made.
 
     - `shape`: vertices along warp and weft. - `max_step`: of the time, [s].
@@ -72,7 +72,7 @@ class SyntheticRecording(Cell):
     scenario: str
     number: int = 0
     unseen: bool = False
-    making: Making = Making()
+    truth_settings: TruthSettings = TruthSettings()
     seed: int = 0
     angle: float | None = None
 
@@ -87,10 +87,13 @@ class SyntheticRecording(Cell):
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
         """A recording."""
-        fabric, making = strain_dependent(self.fabric, self.making), self.making
+        fabric, truth_settings = (
+            strain_dependent(self.fabric, self.truth_settings),
+            self.truth_settings,
+        )
         key = jr.fold_in(jr.key(self.seed), _number(self.fabric, self.scenario, self.number))
         if self.angle is not None:
-            about = {"shape": making.shape, "key": jr.fold_in(key, round(self.angle))}
+            about = {"shape": truth_settings.shape, "key": jr.fold_in(key, round(self.angle))}
             made = pulled(fabric, self.fabric, math.radians(self.angle), **about)
         else:
             made = synthetic.record(
@@ -98,9 +101,9 @@ class SyntheticRecording(Cell):
                 fabric,
                 self.fabric,
                 seen=synthetic.WHOLE if self.unseen else None,
-                shape=making.shape,
-                max_step=making.max_step,
-                layers=making.layers and self.scenario == "folding",
+                shape=truth_settings.shape,
+                max_step=truth_settings.max_step,
+                layers=truth_settings.layers and self.scenario == "folding",
                 key=key,
             )
         info = dataclasses.replace(made.info, name=self.name, trial=str(self.number))
@@ -162,7 +165,7 @@ def given(folder: Path) -> list[GivenRecording]:
     return found
 
 
-def measured(making: Making, folder: Path, fabrics: Sequence[str]) -> Making:
+def measured(truth_settings: TruthSettings, folder: Path, fabrics: Sequence[str]) -> TruthSettings:
     """Recordings made with the measured tables in a folder, one file FABRIC.json for each fabric.
 
     Raises `FileNotFoundError` for one that is missing, and what `r2s.fabrics.arcsim.read_material`
@@ -174,18 +177,18 @@ def measured(making: Making, folder: Path, fabrics: Sequence[str]) -> Making:
         read_material(file)
         digest.update(file.read_bytes())
     return dataclasses.replace(
-        making, materials=str(folder), materials_digest=digest.hexdigest()[:16]
+        truth_settings, materials=str(folder), materials_digest=digest.hexdigest()[:16]
     )
 
 
 def read(source: Source, folder: Path) -> Recording:
     """The recording of a cell that is made."""
-    with opened(source, folder) as files:
+    with result_files(source, folder) as files:
         return load(files / RECORDING)
 
 
-def strain_dependent(name: str, making: Making = Making()) -> Fabric:
-    """The fabric that a recording is made with; see `Making`.
+def strain_dependent(name: str, truth_settings: TruthSettings = TruthSettings()) -> Fabric:
+    """The fabric that a recording is made with; see `TruthSettings`.
 
     The stiffening table is `TableMembrane`'s: linear in the principal stretch, up to `stiffening`
     times the preset's numbers at 16.7 %, alike in all directions. Bending softens with curvature
@@ -193,14 +196,14 @@ def strain_dependent(name: str, making: Making = Making()) -> Fabric:
     """
     if name not in presets.FIVE:
         raise ValueError(f"no preset {name!r}; there are {', '.join(presets.FIVE)}")
-    if making.materials:
-        return read_material(Path(making.materials) / f"{name}.json")
+    if truth_settings.materials:
+        return read_material(Path(truth_settings.materials) / f"{name}.json")
     fabric = presets.FIVE[name]()
-    if not making.stiffening:
+    if not truth_settings.stiffening:
         return fabric
     law, bending = constant_laws(fabric)
     published = np.array([law.c11, law.c12, law.c22, 2 * law.c33])  # theirs acts on E12
-    rows = np.stack([published, *[making.stiffening * published] * 5])
+    rows = np.stack([published, *[truth_settings.stiffening * published] * 5])
     columns = HINGE_FACTOR * float(bending.stiffness) * np.tile(SOFTENED, (3, 1))
     return dataclasses.replace(
         fabric,

@@ -1,4 +1,4 @@
-"""Charts of a study: mean ranks, shares of the variance, distances of every column. Each one PNG.
+"""Charts of a study: mean ranks, shares of the variance, distances of every configuration. Each one PNG.
 
 Needs matplotlib: pip install 'r2s[study]'. Each function returns `path`, and raises OSError that
 names it when it cannot be written.
@@ -22,18 +22,18 @@ from r2s.study.report.figures import (
 )
 from r2s.study.statistics.distances import Means
 from r2s.study.statistics.factors import REST, Shares
-from r2s.study.statistics.panel import LEVEL, Column
 from r2s.study.statistics.ranks import SIGNIFICANCE, Ranks
+from r2s.study.statistics.result_array import LEVEL, Configuration
 
 MOTION_COLOURS = (BLUE, ORANGE, "#009E73")
 
 
 def rank_chart(path: Path | str, ranks: Mapping[str, Ranks]) -> Path:
-    """Mean ranks with intervals, a panel each, the best at the top.
+    """Mean ranks with intervals, a results each, the best at the top.
 
     The bar below is as long as two mean ranks must be apart to be told from each other.
     """
-    count = max(len(each.columns) for each in ranks.values())
+    count = max(len(each.configurations) for each in ranks.values())
     across = min(2, len(ranks))
     down = -(-len(ranks) // across)
     size = (5.6 * across, 0.4 + (1.5 + 0.3 * count) * down)
@@ -46,7 +46,7 @@ def rank_chart(path: Path | str, ranks: Mapping[str, Ranks]) -> Path:
         places = np.arange(len(order))
         axes.hlines(places, each.low[order], each.high[order], color=BLUE, linewidth=5, alpha=0.35)
         axes.plot(each.mean[order], places, "o", color=BLUE, markersize=6)
-        axes.set_yticks(places, [each.columns[i].label for i in order], fontsize=8.5)
+        axes.set_yticks(places, [each.configurations[i].label for i in order], fontsize=8.5)
         axes.set(xlabel="mean rank (1 is best)", xlim=(0.7, len(order) + 0.3))
         axes.set_title(f"{title}: {each.trajectories} trajectories", fontsize=11)
         start, below = 1.0, len(order) - 0.1
@@ -55,7 +55,7 @@ def rank_chart(path: Path | str, ranks: Mapping[str, Ranks]) -> Path:
         axes.text(start, below + 0.2, text, fontsize=7.5, color=VERMILION, va="top")
         axes.set_ylim(len(order) + 0.6, -0.6)
         axes.grid(axis="x", alpha=0.3)
-    figure.suptitle(f"Ranks of the columns, with {LEVEL:.0%} intervals", fontsize=12)
+    figure.suptitle(f"Ranks of the configurations, with {LEVEL:.0%} intervals", fontsize=12)
     return save(figure, path)
 
 
@@ -85,18 +85,23 @@ def share_chart(path: Path | str, shares: Mapping[str, Shares]) -> Path:
 
 
 def distance_chart(
-    path: Path | str, found: Mapping[str, tuple[Sequence[Column], Means]], title: str
+    path: Path | str, found: Mapping[str, tuple[Sequence[Configuration], Means]], title: str
 ) -> Path:
-    """Mean distances [m], shown in mm, of all columns: a panel a motion, on one scale."""
-    columns = list(dict.fromkeys(c for columns, _ in found.values() for c in columns))
-    size = (2.6 + 2.9 * len(found), 1.6 + 0.34 * len(columns))
+    """Mean distances [m], shown in mm, of all configurations: a results a motion, on one scale."""
+    configurations = list(
+        dict.fromkeys(c for configurations, _ in found.values() for c in configurations)
+    )
+    size = (2.6 + 2.9 * len(found), 1.6 + 0.34 * len(configurations))
     figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
     finite = [1e3 * each.high[np.isfinite(each.high)] for _, each in found.values()]
     right = 1.12 * max((float(values.max()) for values in finite if len(values)), default=1.0)
     for axes, (motion, (there, each)) in zip(panels, found.items(), strict=True):
-        for i, column in enumerate(there):
-            place, colour = columns.index(column), LABEL_COLOURS[columns.index(column) % 12]
+        for i, configuration in enumerate(there):
+            place, colour = (
+                configurations.index(configuration),
+                LABEL_COLOURS[configurations.index(configuration) % 12],
+            )
             if not np.isfinite(each.mean[i]):
                 axes.text(0.02 * right, place, "diverged", fontsize=8, va="center", color=VERMILION)
                 continue
@@ -109,9 +114,11 @@ def distance_chart(
                 if high > 0.65 * right:
                     side = {"ha": "right", "x": low - 0.015 * right}
                 axes.text(y=place, s=text, fontsize=7, va="center", color=VERMILION, **side)
-        axes.set(xlabel="distance [mm]", xlim=(0, right), ylim=(len(columns) - 0.4, -0.6))
+        axes.set(xlabel="distance [mm]", xlim=(0, right), ylim=(len(configurations) - 0.4, -0.6))
         axes.set_title(motion, fontsize=11)
         axes.grid(axis="x", alpha=0.3)
-    panels[0].set_yticks(range(len(columns)), [c.label for c in columns], fontsize=8.5)
+    panels[0].set_yticks(
+        range(len(configurations)), [c.label for c in configurations], fontsize=8.5
+    )
     figure.suptitle(title, fontsize=12)
     return save(figure, path)

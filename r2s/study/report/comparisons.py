@@ -1,4 +1,4 @@
-"""The parts of a report that compare columns: findings, distances, ranks, and what matters."""
+"""The parts of a report that compare configurations: findings, distances, ranks, and what matters."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -9,9 +9,9 @@ from r2s.study.report import charts
 from r2s.study.report.page import Section
 from r2s.study.statistics import factors, findings, ranks, tables
 from r2s.study.statistics.distances import METRICS, distance_tables, means
-from r2s.study.statistics.panel import LEVEL, Panel, by_motion
 from r2s.study.statistics.paper import CITED, Paper, paper_tables
-from r2s.study.statistics.tables import Row, Table
+from r2s.study.statistics.result_array import LEVEL, ResultArray, by_motion
+from r2s.study.tables import Row, Table
 
 Publish = Callable[[str, Table], Table]  # keeps a table under a name, and returns it
 
@@ -19,7 +19,7 @@ Publish = Callable[[str, Table], Table]  # keeps a table under a name, and retur
 def findings_section(
     rows_of: Mapping[str, Sequence[Row]],
     metrics: Sequence[str],
-    panel: Panel,
+    results: ResultArray,
     paper: Paper,
     keep: Publish,
 ) -> list[Section]:
@@ -29,7 +29,7 @@ def findings_section(
     found = {metric: findings.find(rows_of[metric], paper, metric) for metric in metrics}
     first = found[metrics[0]]
     words = [
-        *_headlines(panel),
+        *_headlines(results),
         "Each conclusion of the paper is a test on these numbers. Ratios are of distances, or of "
         "what is named, with their interval; they are above 1 where the conclusion is right. All "
         "p are Wilcoxon's signed-rank test with Holm's correction.",
@@ -57,23 +57,27 @@ def findings_section(
     ]
 
 
-def _headlines(every: Panel) -> list[str]:
-    """The best columns of each motion, beside the default fabric."""
+def _headlines(every: ResultArray) -> list[str]:
+    """The best configurations of each motion, beside the default fabric."""
     found = []
-    for motion, panel in by_motion(every).items():
-        each = means(panel)
-        scale, unit = (1e3, " mm") if panel.unit == "m" else (1.0, "")
+    for motion, results in by_motion(every).items():
+        each = means(results)
+        scale, unit = (1e3, " mm") if results.unit == "m" else (1.0, "")
         shown = {
-            column: f"{column.label} {tables.significant(scale * each.mean[i])}{unit} "
+            configuration: f"{configuration.label} {tables.significant(scale * each.mean[i])}{unit} "
             f"({tables.significant(scale * each.low[i])} to "
             f"{tables.significant(scale * each.high[i])}"
             + (f"; {each.diverged[i]} of {each.runs[i]} diverged)" if each.diverged[i] else ")")
-            for i, column in enumerate(panel.columns)
+            for i, configuration in enumerate(results.configurations)
             if np.isfinite(each.mean[i])
         }
-        order = [panel.columns[i] for i in np.argsort(each.mean) if panel.columns[i] in shown]
-        best = [shown[column] for column in order if column.approach][:3]
-        defaults = [shown[column] for column in order if not column.approach]
+        order = [
+            results.configurations[i]
+            for i in np.argsort(each.mean)
+            if results.configurations[i] in shown
+        ]
+        best = [shown[configuration] for configuration in order if configuration.approach][:3]
+        defaults = [shown[configuration] for configuration in order if not configuration.approach]
         if best:
             compared = f"; {', '.join(defaults)}" if defaults else ""
             found.append(f"Least {every.metric} in {motion}: {', '.join(best)}{compared}.")
@@ -81,12 +85,12 @@ def _headlines(every: Panel) -> list[str]:
 
 
 def distance_sections(
-    out: Path, rows: Sequence[Row], panel: Panel, paper: Paper, keep: Publish
+    out: Path, rows: Sequence[Row], results: ResultArray, paper: Paper, keep: Publish
 ) -> list[Section]:
     sections = []
     ours = [keep(name, table) for name, table in distance_tables(rows).items()]
     if ours:
-        figures = _distance_chart(out, panel) if panel.metric in METRICS else ()
+        figures = _distance_chart(out, results) if results.metric in METRICS else ()
         sections.append(Section("Distances in millimetres", (), tuple(ours), figures))
     beside = [keep(name, table) for name, table in paper_tables(rows, paper).items()]
     if beside:
@@ -100,47 +104,49 @@ def distance_sections(
     return sections
 
 
-def _distance_chart(out: Path, panel: Panel) -> tuple[tuple[Path, str], ...]:
-    found = {motion: (each.columns, means(each)) for motion, each in by_motion(panel).items()}
+def _distance_chart(out: Path, results: ResultArray) -> tuple[tuple[Path, str], ...]:
+    found = {
+        motion: (each.configurations, means(each)) for motion, each in by_motion(results).items()
+    }
     if not found:
         return ()
-    path = charts.distance_chart(out / "figures" / "distances.png", found, panel.metric)
-    return ((path, f"Mean {panel.metric} of every column, with {LEVEL:.0%} intervals."),)
+    path = charts.distance_chart(out / "figures" / "distances.png", found, results.metric)
+    return ((path, f"Mean {results.metric} of every configuration, with {LEVEL:.0%} intervals."),)
 
 
-def _parts(panel: Panel) -> dict[str, Panel]:
+def _parts(results: ResultArray) -> dict[str, ResultArray]:
     """Each motion, and all of them together where there are several."""
-    parts = by_motion(panel)
-    return parts | ({"all motions": panel} if len(parts) > 1 else {})
+    parts = by_motion(results)
+    return parts | ({"all motions": results} if len(parts) > 1 else {})
 
 
-def rank_section(out: Path, panel: Panel, keep: Publish) -> list[Section]:
+def rank_section(out: Path, results: ResultArray, keep: Publish) -> list[Section]:
     found = {
         motion: ranked
-        for motion, part in _parts(panel).items()
+        for motion, part in _parts(results).items()
         if (ranked := ranks.rank(part)) is not None
     }
     if not found:
         return []
-    shown = (keep("ranks", ranks.rank_table(found, f"Ranks by {panel.metric}")),)
+    shown = (keep("ranks", ranks.rank_table(found, f"Ranks by {results.metric}")),)
     path = charts.rank_chart(out / "figures" / "ranks.png", found)
     words = (
-        "Columns are ranked within each recording, so that hard recordings count no more. "
+        "Configurations are ranked within each recording, so that hard recordings count no more. "
         "Intervals reach rather too far to the middle, where estimates were repeated: resampled, "
         "their means scatter more."
     )
     return [Section("Ranks", (words,), shown, ((path, "Mean ranks with their intervals."),))]
 
 
-def factor_section(out: Path, panel: Panel, keep: Publish) -> list[Section]:
+def factor_section(out: Path, results: ResultArray, keep: Publish) -> list[Section]:
     found = {
         motion: shares
-        for motion, part in _parts(panel).items()
+        for motion, part in _parts(results).items()
         if (shares := factors.variance_shares(part)) is not None
     }
     if not found:
         return []
-    shown = (keep("factors", factors.share_table(found, f"By {panel.metric}")),)
+    shown = (keep("factors", factors.share_table(found, f"By {results.metric}")),)
     path = charts.share_chart(out / "figures" / "factors.png", found)
     words = (
         "How much of the variance of the logarithm of the distance each factor explains, whatever "

@@ -9,29 +9,29 @@ import numpy as np
 from tqdm import tqdm
 
 from r2s.fabrics.parameters import Range
+from r2s.study import tables
 from r2s.study.report import comparisons, overlays
 from r2s.study.report.comparisons import Publish
+from r2s.study.report.motions import MotionComparison
 from r2s.study.report.page import Section, write_report
 from r2s.study.report.player import viewer
-from r2s.study.report.scenes import Shown
-from r2s.study.statistics import tables
-from r2s.study.statistics.panel import (
+from r2s.study.statistics.paper import read_paper
+from r2s.study.statistics.result_array import (
     LEVEL,
     MOTIONS,
-    PAPER_COLUMNS,
-    Panel,
+    PAPER_CONFIGURATIONS,
+    ResultArray,
     by_metric,
-    columns_of,
+    configurations_of,
     defined,
-    make_panel,
+    result_array,
 )
-from r2s.study.statistics.paper import read_paper
-from r2s.study.statistics.tables import Row, Table, parameter_table
+from r2s.study.tables import Row, Table, parameter_table
 
 Entry = tuple[str, tuple[Range, ...], Any, Any, Any, Any]  # of tables.parameter_table
 
 TITLE = "A study of fabrics: from recordings to simulations"
-# The first compares columns: what cameras did not see of a sheet counts for none of them. Hausdorff
+# The first compares configurations: what cameras did not see of a sheet counts for none of them. Hausdorff
 # distances are those of outliers, where there are any.
 JUDGED_BY = ("chamfer_real_to_sim", "chamfer", "chamfer_cropped", "paper_chamfer")
 MOST_IN_VIEWER = 15
@@ -46,7 +46,7 @@ HEADINGS = {
 def publish(
     out: Path,
     rows: Sequence[Row],
-    shown: Sequence[Shown] = (),
+    shown: Sequence[MotionComparison] = (),
     parameters: Mapping[str, Sequence[Entry]] | Sequence[Entry] = (),
     missing: Sequence[tuple[str, str]] = (),
     settings: Mapping[str, str] | None = None,
@@ -56,7 +56,7 @@ def publish(
 ) -> list[Table]:
     """Write `report.html`, `tables/`, `figures/` and `videos/` into `out`; returns the tables.
 
-    - `shown`: recordings to draw, with the motions of the columns.
+    - `shown`: recordings to draw, with the motions of the configurations.
     - `parameters`: entries of `tables.parameter_table`, or several lists of them by name.
     - `missing`: cells that have no result, and why. - `settings`: what the study was run with.
     - `paper_folder`: of the tables to set beside ours (`paper.read_paper`).
@@ -78,12 +78,14 @@ def publish(
     rows, undefined = defined(rows)
     rows_of = by_metric(rows)
     metrics = [metric for metric in JUDGED_BY if metric in rows_of]
-    panel = make_panel(rows_of[metrics[0]], metrics[0]) if metrics else make_panel([], JUDGED_BY[0])
+    results = (
+        result_array(rows_of[metrics[0]], metrics[0]) if metrics else result_array([], JUDGED_BY[0])
+    )
     sections = [
-        *comparisons.findings_section(rows_of, metrics, panel, paper, keep),
-        *comparisons.distance_sections(out, rows, panel, paper, keep),
-        *comparisons.rank_section(out, panel, keep),
-        *comparisons.factor_section(out, panel, keep),
+        *comparisons.findings_section(rows_of, metrics, results, paper, keep),
+        *comparisons.distance_sections(out, rows, results, paper, keep),
+        *comparisons.rank_section(out, results, keep),
+        *comparisons.factor_section(out, results, keep),
         *_motions(out, shown),
         *_parameters(parameters, keep),
         *_missing(rows, missing, keep),
@@ -95,22 +97,29 @@ def publish(
         ),
         _settings(settings or {}, keep),
     ]
-    write_report(out / "report.html", TITLE, _intro(panel, missing, undefined), {}, sections)
+    write_report(out / "report.html", TITLE, _intro(results, missing, undefined), {}, sections)
     return list(written.values())
 
 
-def _intro(panel: Panel, missing: Sequence[tuple[str, str]], undefined: Mapping[str, int]) -> str:
-    fabrics = len({t.fabric for t in panel.trajectories})
-    lost, runs = int((panel.present & ~np.isfinite(panel.values)).sum()), int(panel.present.sum())
-    estimates = [column for column in panel.columns if column.approach]
+def _intro(
+    results: ResultArray, missing: Sequence[tuple[str, str]], undefined: Mapping[str, int]
+) -> str:
+    fabrics = len({t.fabric for t in results.trajectories})
+    lost, runs = (
+        int((results.present & ~np.isfinite(results.values)).sum()),
+        int(results.present.sum()),
+    )
+    estimates = [
+        configuration for configuration in results.configurations if configuration.approach
+    ]
     text = (
         f"Fabrics are estimated from one motion and judged on others that the estimate never saw: "
-        f"{len(estimates)} columns (approach, solver, and what it was estimated from), {fabrics} "
-        f"fabrics, {len(panel.trajectories)} judged recordings, {runs} simulations, of which "
+        f"{len(estimates)} configurations (approach, solver, and what it was estimated from), {fabrics} "
+        f"fabrics, {len(results.trajectories)} judged recordings, {runs} simulations, of which "
         f"{lost} diverged; {len(missing)} cells are missing."
     )
     how = (
-        f"Columns are compared by {panel.metric}. A simulation that diverged is a result: it is "
+        f"Configurations are compared by {results.metric}. A simulation that diverged is a result: it is "
         f"counted, ranks last, and is in no mean. Intervals are of {LEVEL:.0%}, a bootstrap over "
         "recordings and over repeats of an estimate; the fabrics are given, so that they say "
         "nothing about other fabrics. An estimate that was made once has no repeats: then its "
@@ -124,7 +133,7 @@ def _intro(panel: Panel, missing: Sequence[tuple[str, str]], undefined: Mapping[
     return f"{text}\n\n{how}"
 
 
-def _motions(out: Path, shown: Sequence[Shown]) -> list[Section]:
+def _motions(out: Path, shown: Sequence[MotionComparison]) -> list[Section]:
     """Overlays of each fabric, a video of each motion, and the viewer."""
     if not shown:
         return []
@@ -135,7 +144,7 @@ def _motions(out: Path, shown: Sequence[Shown]) -> list[Section]:
         path = out / "figures" / f"motions_{fabric}.png"
         overlays.overview(path, [each for each in chosen if each.fabric == fabric])
         caption = (
-            f"{fabric.replace('_', ' ')}: a late frame of each motion, every column's sheet over "
+            f"{fabric.replace('_', ' ')}: a late frame of each motion, every configuration's sheet over "
             "the recorded points, which are alone at the right."
         )
         pictures.append((path, caption))
@@ -145,7 +154,7 @@ def _motions(out: Path, shown: Sequence[Shown]) -> list[Section]:
     names = [
         overlays.video(out / "videos", each).name for each in tqdm(filmed, "videos", disable=None)
     ]
-    words = f"Videos of all columns side by side: {', '.join(f'videos/{name}' for name in names)}."
+    words = f"Videos of all configurations side by side: {', '.join(f'videos/{name}' for name in names)}."
     turned = chosen[:MOST_IN_VIEWER]
     left_out = len(shown) - len(turned)
     note = (f"{left_out} more recordings are not in it.",) if left_out else ()
@@ -172,10 +181,10 @@ def _parameters(
 def _missing(
     rows: Sequence[Row], missing: Sequence[tuple[str, str]], keep: Publish
 ) -> list[Section]:
-    absent = [c.label for c in PAPER_COLUMNS if c not in columns_of(rows)]
+    absent = [c.label for c in PAPER_CONFIGURATIONS if c not in configurations_of(rows)]
     if not (absent or missing):
         return []
-    words = f"Columns of the paper that have no result here: {', '.join(absent)}."
+    words = f"Configurations of the paper that have no result here: {', '.join(absent)}."
     table = Table(("cell", "reason"), tuple(missing), "Cells without a result, and why")
     shown = (keep("missing", table),) if missing else ()
     return [Section("What is missing", (words,) if absent else (), shown)]

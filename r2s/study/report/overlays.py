@@ -1,4 +1,4 @@
-"""Simulated sheets beside the recording: a picture of all columns, and a video of a recording.
+"""Simulated sheets beside the recording: a picture of all configurations, and a video of a recording.
 
 Needs matplotlib: pip install 'r2s[study]'. Videos are MP4 where OpenCV is installed (extra
 camera), else GIF.
@@ -22,8 +22,8 @@ from r2s.study.report.figures import (
     thin,
     to_rgba,
 )
-from r2s.study.report.scenes import Shown
-from r2s.study.statistics.panel import MOTIONS
+from r2s.study.report.motions import MotionComparison
+from r2s.study.statistics.result_array import MOTIONS
 from r2s.viewer import video_writer
 
 DOTS = "#404040"
@@ -32,8 +32,8 @@ RECORDING = "recording [m]"
 ACROSS = 5  # panels in a row of a video, at most
 
 
-def overview(path: Path | str, shown: Sequence[Shown]) -> Path:
-    """A row a recording, a column of the study each, and the recording at the right.
+def overview(path: Path | str, shown: Sequence[MotionComparison]) -> Path:
+    """A row a recording, a configuration of the study each, and the recording at the right.
 
     Recordings come in the order folding, fling, shaking. Of each the frame is shown, in its later
     half, whose cloud is farthest from the first frame's. Panels of a row share their limits. What
@@ -78,7 +78,7 @@ def overview(path: Path | str, shown: Sequence[Shown]) -> Path:
     return save(figure, path)
 
 
-def late_frame(shown: Shown) -> int:
+def late_frame(shown: MotionComparison) -> int:
     """The frame of the later half whose points are, on average, farthest from the first cloud.
 
     Clouds with less than half of the points of the largest do not count: cameras saw little then.
@@ -91,14 +91,14 @@ def late_frame(shown: Shown) -> int:
     return later[int(np.argmax(away))]
 
 
-def video(folder: Path, shown: Shown) -> Path:
-    """All columns of a recording side by side, over its points, in real time; the path."""
+def video(folder: Path, shown: MotionComparison) -> Path:
+    """All configurations of a recording side by side, over its points, in real time; the path."""
     interval = float(np.median(np.diff(shown.times))) if len(shown.times) > 1 else 1.0
     stem = shown.recording.replace("/", "_")
     return video_writer.write_video(folder, stem, pictures(shown), interval)
 
 
-def pictures(shown: Shown) -> Iterator[np.ndarray]:
+def pictures(shown: MotionComparison) -> Iterator[np.ndarray]:
     """Each frame as a picture, (height, width, 3) in 0..255, of even sides."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -128,7 +128,7 @@ def pictures(shown: Shown) -> Iterator[np.ndarray]:
             artist.remove()
 
 
-def _box(shown: Shown, frame: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+def _box(shown: MotionComparison, frame: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Limits [m] that hold the recording and sheets that did not fly off; or those of a frame."""
     dots = [thin(cloud) for cloud in shown.clouds]
     sheets = [x.reshape(-1, 3) for x in shown.motions.values()]

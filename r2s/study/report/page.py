@@ -7,8 +7,8 @@ from html import escape
 from pathlib import Path
 
 from r2s.files import write_text
-from r2s.study.statistics import tables
-from r2s.study.statistics.tables import Table
+from r2s.study import tables
+from r2s.study.tables import Table
 
 PNG = b"\x89PNG\r\n\x1a\n"
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from r2s.study.report.figures import LABEL_COLOURS
+from r2s.study.report.motions import MotionComparison
 from r2s.study.report.player_script import SCRIPT, STYLE
-from r2s.study.report.scenes import Shown
 
 STEP = 1e-4  # [m], to which positions are rounded
 LARGEST = 32767  # steps from the middle
@@ -23,7 +23,7 @@ BUDGET = 950_000  # characters of positions for each recording
 FEWEST_POINTS, MOST_POINTS = 150, 800  # of a cloud, in a frame
 
 
-def viewer(shown: Sequence[Shown], name: str = "viewer") -> str:
+def viewer(shown: Sequence[MotionComparison], name: str = "viewer") -> str:
     """The fragment, for `Section.html`; `name` is its id, another one for each in a page.
 
     Of long or fine recordings every second frame is kept, or fewer, and of clouds as many points as
@@ -59,11 +59,11 @@ def viewer(shown: Sequence[Shown], name: str = "viewer") -> str:
     )
 
 
-def _title(shown: Shown) -> str:
+def _title(shown: MotionComparison) -> str:
     return f"{shown.evaluated_on}, {shown.fabric.replace('_', ' ')} ({shown.recording})"
 
 
-def _packed(shown: Shown) -> dict[str, Any]:
+def _packed(shown: MotionComparison) -> dict[str, Any]:
     frames, points = _kept(shown)
     generator = np.random.default_rng(0)
     clouds = [generator.permutation(_finite(shown.clouds[i]))[:points] for i in frames]
@@ -80,7 +80,7 @@ def _packed(shown: Shown) -> dict[str, Any]:
     }
 
 
-def _kept(shown: Shown) -> tuple[np.ndarray, int]:
+def _kept(shown: MotionComparison) -> tuple[np.ndarray, int]:
     """Which frames, and how many points of each, fit into the budget."""
     vertices = sum(x.shape[1] for x in shown.motions.values())
     for stride in range(1, len(shown.times) + 1):

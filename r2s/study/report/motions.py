@@ -1,4 +1,4 @@
-"""What of a judged recording is drawn: its clouds, and the sheet of every column."""
+"""What of a judged recording is drawn: its clouds, and the sheet of every configuration."""
 
 import io
 from collections.abc import Mapping
@@ -13,13 +13,13 @@ from r2s.files import write_bytes
 
 
 @dataclass(frozen=True)
-class Shown:
+class MotionComparison:
     """A recording with the motions that were simulated for it, at the frames that are shown.
 
     - `times`: of the frames, [s].
     - `clouds`: the points of each frame, [m].
     - `faces`: the triangles of every motion.
-    - `motions`: the vertices of each column, by its label, [m]; not finite where it diverged.
+    - `motions`: the vertices of each configuration, by its label, [m]; not finite where it diverged.
 
     ValueError, which names the recording, unless there are a cloud and vertices for each frame.
     """
@@ -51,7 +51,7 @@ class Shown:
                 )
 
 
-def save_shown(path: Path | str, shown: Shown) -> None:
+def save_shown(path: Path | str, shown: MotionComparison) -> None:
     """Write it as one NPZ, whole or not at all; OSError names the path."""
     labels = list(shown.motions)
     motions: dict[str, Any] = {
@@ -71,13 +71,13 @@ def save_shown(path: Path | str, shown: Shown) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def load_shown(path: Path | str) -> Shown:
+def load_shown(path: Path | str) -> MotionComparison:
     """Read what `save_shown` wrote. FileNotFoundError, or a ValueError that names the file."""
     try:
         with np.load(path, allow_pickle=False) as file:
             fabric, evaluated_on, recording = (str(name) for name in file["names"])
             ends = np.cumsum(file["counts"])[:-1]
-            return Shown(
+            return MotionComparison(
                 fabric,
                 evaluated_on,
                 recording,
