@@ -143,7 +143,9 @@ def report(rows: list[measure.Row], out: Path) -> None:
         )
     settings = {name: str(value) for name, value in measure.machine().items()}
     settings |= {f"mesh of {kind}": f"{a} x {b} vertices" for kind, (a, b) in SOLVERS.items()}
-    write_report(out / "report.html", "Six scenarios on both solvers", INTRO, settings, sections)
+    table = Table(("setting", "value"), tuple(settings.items()), "")
+    sections.append(Section("Settings", (), (table,)))
+    write_report(out / "report.html", "Six scenarios on both solvers", INTRO, sections)
 
 
 def main(out: Path, names: list[str], kinds: list[str]) -> None:

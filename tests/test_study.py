@@ -144,7 +144,7 @@ def test_a_changed_file_of_measured_tables_is_another_recording(tmp_path):
     assert [cell.key for cell in first] == [cell.key for cell in again]
     assert not {cell.key for cell in first} & {cell.key for cell in changed}
     assert isinstance(changed[0], SyntheticRecording)
-    softer = strain_dependent("grey_interlock", changed[0].truth_settings).membrane.stiffness
+    softer = strain_dependent("grey_interlock", changed[0].truth).membrane.stiffness
     assert not np.array_equal(softer, truth.membrane.stiffness)
     with pytest.raises(FileNotFoundError, match="camel_ponte_roma.json"):
         matrix.with_changes(matrix.SMALL, fabrics=["camel_ponte_roma"], materials=str(tmp_path))

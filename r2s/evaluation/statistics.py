@@ -1,4 +1,4 @@
-"""Statistics of repeated comparisons: intervals of a bootstrap, rank tests and their corrections."""
+"""Statistics of repeated comparisons: bootstrap intervals, rank tests and their corrections."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple

@@ -1,7 +1,8 @@
-"""What a study estimates from and judges against: recordings, made or given.
+"""What a study estimates from and judges by: recordings, synthetic or given.
 
-Those that are made are not the estimators' own model: their mesh is finer, their steps are shorter,
-and their fabrics stiffen with the strain and soften with the curvature, as measured ones do.
+Synthetic recordings are not the estimators' own model: their mesh is finer, their steps are
+shorter, and their fabrics stiffen with the strain and soften with the curvature, as measured ones
+do.
 """
 
 import dataclasses
@@ -34,15 +35,17 @@ SAME_SCENARIO = {"lift": "lifting", "fold": "folding"}  # how recordings of othe
 
 @dataclass(frozen=True)
 class TruthSettings:
-    """How recordings are made.
+    """How synthetic recordings are made.
 
-    - `shape`: vertices along warp and weft. - `max_step`: of the time, [s].
+    - `shape`: vertices along warp and weft.
+    - `max_step`: longest time step, [s].
     - `stiffening`: membrane stiffness at an extension of 16.7 % over that of the preset, which is
-      at zero strain; 0: constant stiffness, bending too, as the estimators assume. Assumed, not
-      measured.
+      at zero strain. Assumed, not measured. 0: constant stiffness, of the membrane and in bending,
+      as the estimators assume.
     - `materials`: a folder of ARCSim material files, FABRIC.json, with measured tables to take
-      instead; "": none. - `materials_digest`: of those files, from `measured`. - `layers`: the
-      sheet touches itself.
+      instead; "": none.
+    - `materials_digest`: a hash of those files, from `with_measured_tables`.
+    - `layers`: whether the sheet touches itself.
     """
 
     shape: tuple[int, int] = (17, 17)
@@ -59,8 +62,8 @@ class SyntheticRecording(Cell):
 
     - `number`: 0 is the motion of the scenario without any numbers; others are drawn within
       `r2s.scenarios.paths.LIMITS`, the same for all fabrics.
-    - `unseen`: drawn to be judged by, none of which is one to estimate from; its clouds are all of
-      the surface, without any error.
+    - `unseen`: whether its motion is drawn to be judged by; none of these is one to estimate from.
+      Its clouds are all of the surface, without any error.
     - `angle`: from the pull of a stretching to the warp [degrees], for `r2s.estimation.pinn`; None:
       a motion of `r2s.scenarios`.
     """
@@ -72,7 +75,7 @@ class SyntheticRecording(Cell):
     scenario: str
     number: int = 0
     unseen: bool = False
-    truth_settings: TruthSettings = TruthSettings()
+    truth: TruthSettings = TruthSettings()
     seed: int = 0
     angle: float | None = None
 
@@ -86,24 +89,21 @@ class SyntheticRecording(Cell):
         return f"recordings {self.scenario}"
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
-        """A recording."""
-        fabric, truth_settings = (
-            strain_dependent(self.fabric, self.truth_settings),
-            self.truth_settings,
-        )
+        """Simulate the recording."""
+        fabric, truth = strain_dependent(self.fabric, self.truth), self.truth
         key = jr.fold_in(jr.key(self.seed), _number(self.fabric, self.scenario, self.number))
         if self.angle is not None:
-            about = {"shape": truth_settings.shape, "key": jr.fold_in(key, round(self.angle))}
-            made = pulled(fabric, self.fabric, math.radians(self.angle), **about)
+            angle, key = math.radians(self.angle), jr.fold_in(key, round(self.angle))
+            made = pulled(fabric, self.fabric, angle, shape=truth.shape, key=key)
         else:
             made = synthetic.record(
                 self._experiment(),
                 fabric,
                 self.fabric,
                 seen=synthetic.WHOLE if self.unseen else None,
-                shape=truth_settings.shape,
-                max_step=truth_settings.max_step,
-                layers=truth_settings.layers and self.scenario == "folding",
+                shape=truth.shape,
+                max_step=truth.max_step,
+                layers=truth.layers and self.scenario == "folding",
                 key=key,
             )
         info = dataclasses.replace(made.info, name=self.name, trial=str(self.number))
@@ -119,7 +119,7 @@ class SyntheticRecording(Cell):
 
 @dataclass(frozen=True)
 class GivenRecording(Cell):
-    """A recording in a folder with its manifest; `digest` is of its files, from `given`."""
+    """A recording in a folder with its manifest; `digest`: a hash of its files."""
 
     kind: ClassVar[str] = "recordings"
 
@@ -135,7 +135,7 @@ class GivenRecording(Cell):
         return self.recording
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
-        """The recording, as it was read."""
+        """Read the recording, and keep it as it was read."""
         rules = manifest.manifest_for(self.folder)
         read = manifest.read_recording(self.folder, rules, self.recording)
         save(read, out / RECORDING)
@@ -145,7 +145,7 @@ class GivenRecording(Cell):
 Source = SyntheticRecording | GivenRecording
 
 
-def given(folder: Path) -> list[GivenRecording]:
+def find_recordings(folder: Path) -> list[GivenRecording]:
     """The recordings in a folder, by its own manifest or that of DIFFCLOUD.
 
     Raises what `r2s.recordings.manifest` raises, and `ValueError` when there is none.
@@ -157,16 +157,25 @@ def given(folder: Path) -> list[GivenRecording]:
         for file in manifest.sources(folder, rules, name):
             digest.update(file.read_bytes())
         info = manifest.read_recording(folder, rules, name).info
-        scenario = SAME_SCENARIO.get(info.scenario, info.scenario)
-        about = str(folder), name, info.fabric, scenario, info.trial
-        found.append(GivenRecording(*about, digest.hexdigest()))
+        found.append(
+            GivenRecording(
+                folder=str(folder),
+                recording=name,
+                fabric=info.fabric,
+                scenario=SAME_SCENARIO.get(info.scenario, info.scenario),
+                trial=info.trial,
+                digest=digest.hexdigest(),
+            )
+        )
     if not found:
         raise ValueError(f"{folder}: no recording that a manifest describes")
     return found
 
 
-def measured(truth_settings: TruthSettings, folder: Path, fabrics: Sequence[str]) -> TruthSettings:
-    """Recordings made with the measured tables in a folder, one file FABRIC.json for each fabric.
+def with_measured_tables(
+    truth: TruthSettings, folder: Path, fabrics: Sequence[str]
+) -> TruthSettings:
+    """Settings with the measured tables in a folder, one file FABRIC.json for each fabric.
 
     Raises `FileNotFoundError` for one that is missing, and what `r2s.fabrics.arcsim.read_material`
     raises.
@@ -177,7 +186,7 @@ def measured(truth_settings: TruthSettings, folder: Path, fabrics: Sequence[str]
         read_material(file)
         digest.update(file.read_bytes())
     return dataclasses.replace(
-        truth_settings, materials=str(folder), materials_digest=digest.hexdigest()[:16]
+        truth, materials=str(folder), materials_digest=digest.hexdigest()[:16]
     )
 
 
@@ -187,7 +196,7 @@ def read(source: Source, folder: Path) -> Recording:
         return load(files / RECORDING)
 
 
-def strain_dependent(name: str, truth_settings: TruthSettings = TruthSettings()) -> Fabric:
+def strain_dependent(name: str, truth: TruthSettings = TruthSettings()) -> Fabric:
     """The fabric that a recording is made with; see `TruthSettings`.
 
     The stiffening table is `TableMembrane`'s: linear in the principal stretch, up to `stiffening`
@@ -196,14 +205,14 @@ def strain_dependent(name: str, truth_settings: TruthSettings = TruthSettings())
     """
     if name not in presets.FIVE:
         raise ValueError(f"no preset {name!r}; there are {', '.join(presets.FIVE)}")
-    if truth_settings.materials:
-        return read_material(Path(truth_settings.materials) / f"{name}.json")
+    if truth.materials:
+        return read_material(Path(truth.materials) / f"{name}.json")
     fabric = presets.FIVE[name]()
-    if not truth_settings.stiffening:
+    if not truth.stiffening:
         return fabric
     law, bending = constant_laws(fabric)
     published = np.array([law.c11, law.c12, law.c22, 2 * law.c33])  # theirs acts on E12
-    rows = np.stack([published, *[truth_settings.stiffening * published] * 5])
+    rows = np.stack([published, *[truth.stiffening * published] * 5])
     columns = HINGE_FACTOR * float(bending.stiffness) * np.tile(SOFTENED, (3, 1))
     return dataclasses.replace(
         fabric,
@@ -213,11 +222,11 @@ def strain_dependent(name: str, truth_settings: TruthSettings = TruthSettings())
 
 
 def small_strain(name: str) -> Fabric:
-    """What an estimate of a made recording is compared with: the preset, whose constant stiffness
-    is that of `strain_dependent` at zero strain and curvature."""
+    """The preset, whose constant stiffness is that of `strain_dependent` at zero strain and
+    curvature: what an estimate from a synthetic recording is compared with."""
     return presets.FIVE[name]()
 
 
 def _number(*parts: Any) -> int:
-    """A number below 2^31 that goes with the parts."""
+    """A number below 2^31 that depends on the parts alone."""
     return int.from_bytes(sha256(repr(parts).encode()).digest()[:4], "big") >> 1

@@ -1,31 +1,33 @@
-"""Charts of a study: mean ranks, shares of the variance, distances of every configuration. Each one PNG.
+"""Charts of a study, each one PNG: mean ranks, shares of the variance, distances.
 
 Needs matplotlib: pip install 'r2s[study]'. Each function returns `path`, and raises OSError that
 names it when it cannot be written.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from r2s.evaluation.statistics import LEVEL, SIGNIFICANCE
 from r2s.study.report.figures import (
     BLUE,
+    GREEN,
     GREY,
-    LABEL_COLOURS,
     ORANGE,
     SKY,
     VERMILION,
     Figure,
+    colour_of,
     save,
 )
-from r2s.study.statistics.distances import Means
+from r2s.study.statistics.distances import means
 from r2s.study.statistics.factors import REST, Shares
-from r2s.study.statistics.ranks import SIGNIFICANCE, Ranks
-from r2s.study.statistics.result_array import LEVEL, Configuration
+from r2s.study.statistics.ranks import Ranks
+from r2s.study.statistics.result_array import ResultArray
 
-MOTION_COLOURS = (BLUE, ORANGE, "#009E73")
+SHARE_COLOURS = (BLUE, ORANGE, GREEN, GREY, SKY, VERMILION)
 
 
 def rank_chart(path: Path | str, ranks: Mapping[str, Ranks]) -> Path:
@@ -60,17 +62,16 @@ def rank_chart(path: Path | str, ranks: Mapping[str, Ranks]) -> Path:
 
 
 def share_chart(path: Path | str, shares: Mapping[str, Shares]) -> Path:
-    """Shares of the variance of the log distance, grouped by factor, with intervals."""
+    """Draw shares of the variance of the log distance, grouped by factor, with intervals."""
     factors = list(dict.fromkeys(name for each in shares.values() for name in each.factors))
     factors.sort(key=lambda name: name == REST)  # last
     figure = Figure(figsize=(max(6.5, 1.3 * len(factors) + 1.5), 4.2), layout="constrained")
     axes = figure.add_subplot()
     width = 0.84 / max(1, len(shares))
-    colours = (*MOTION_COLOURS, GREY, SKY, VERMILION)
     for i, (title, each) in enumerate(shares.items()):
         where = np.array([factors.index(name) for name in each.factors], float)
         where += (i - (len(shares) - 1) / 2) * width
-        axes.bar(where, 100 * each.share, 0.92 * width, label=title, color=colours[i % 6])
+        axes.bar(where, 100 * each.share, 0.92 * width, label=title, color=SHARE_COLOURS[i % 6])
         ends: dict[str, Any] = {"color": "black", "linewidth": 1.0}
         axes.vlines(where, 100 * each.low, 100 * each.high, **ends)
     axes.set_xticks(range(len(factors)), factors)
@@ -84,41 +85,33 @@ def share_chart(path: Path | str, shares: Mapping[str, Shares]) -> Path:
     return save(figure, path)
 
 
-def distance_chart(
-    path: Path | str, found: Mapping[str, tuple[Sequence[Configuration], Means]], title: str
-) -> Path:
-    """Mean distances [m], shown in mm, of all configurations: a results a motion, on one scale."""
-    configurations = list(
-        dict.fromkeys(c for configurations, _ in found.values() for c in configurations)
-    )
-    size = (2.6 + 2.9 * len(found), 1.6 + 0.34 * len(configurations))
+def distance_chart(path: Path | str, parts: Mapping[str, ResultArray], title: str) -> Path:
+    """Draw the mean distances of all configurations, a panel for each motion, on one scale."""
+    found = {motion: means(part) for motion, part in parts.items()}
+    order = list(dict.fromkeys(c for part in parts.values() for c in part.configurations))
+    size = (2.6 + 2.9 * len(found), 1.6 + 0.34 * len(order))
     figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
-    finite = [1e3 * each.high[np.isfinite(each.high)] for _, each in found.values()]
+    finite = [1e3 * each.high[np.isfinite(each.high)] for each in found.values()]
     right = 1.12 * max((float(values.max()) for values in finite if len(values)), default=1.0)
-    for axes, (motion, (there, each)) in zip(panels, found.items(), strict=True):
-        for i, configuration in enumerate(there):
-            place, colour = (
-                configurations.index(configuration),
-                LABEL_COLOURS[configurations.index(configuration) % 12],
-            )
+    for axes, (motion, each) in zip(panels, found.items(), strict=True):
+        for i, configuration in enumerate(parts[motion].configurations):
+            place = order.index(configuration)
             if not np.isfinite(each.mean[i]):
                 axes.text(0.02 * right, place, "diverged", fontsize=8, va="center", color=VERMILION)
                 continue
             low, mean, high = 1e3 * each.low[i], 1e3 * each.mean[i], 1e3 * each.high[i]
-            axes.hlines(place, low, high, color=colour, linewidth=5, alpha=0.4)
-            axes.plot(mean, place, "o", color=colour, markersize=6)
+            axes.hlines(place, low, high, color=colour_of(place), linewidth=5, alpha=0.4)
+            axes.plot(mean, place, "o", color=colour_of(place), markersize=6)
             if each.diverged[i]:
                 text = f"{each.diverged[i]}/{each.runs[i]} diverged"
                 side: dict[str, Any] = {"ha": "left", "x": high + 0.015 * right}
                 if high > 0.65 * right:
                     side = {"ha": "right", "x": low - 0.015 * right}
                 axes.text(y=place, s=text, fontsize=7, va="center", color=VERMILION, **side)
-        axes.set(xlabel="distance [mm]", xlim=(0, right), ylim=(len(configurations) - 0.4, -0.6))
+        axes.set(xlabel="distance [mm]", xlim=(0, right), ylim=(len(order) - 0.4, -0.6))
         axes.set_title(motion, fontsize=11)
         axes.grid(axis="x", alpha=0.3)
-    panels[0].set_yticks(
-        range(len(configurations)), [c.label for c in configurations], fontsize=8.5
-    )
+    panels[0].set_yticks(range(len(order)), [c.label for c in order], fontsize=8.5)
     figure.suptitle(title, fontsize=12)
     return save(figure, path)

@@ -115,7 +115,9 @@ def beside_paper(rows: Sequence[Row], paper: Paper, motion: str, metric: str) ->
     ours = results.configurations
     shown = [c for c in PAPER_CONFIGURATIONS if c in ours or c in theirs]
     shown += [c for c in ours if c not in PAPER_CONFIGURATIONS]
-    fabrics = list(dict.fromkeys((*results.fabrics, *(f for each in theirs.values() for f in each))))
+    fabrics = list(
+        dict.fromkeys((*results.fabrics, *(f for each in theirs.values() for f in each)))
+    )
     columns = {"fabric": [*(name.replace("_", " ") for name in fabrics), "mean"]}
     for configuration in shown:
         if ours:

@@ -1,19 +1,21 @@
-"""The parts of a report that compare configurations: findings, distances, ranks, and what matters."""
+"""The sections of a report that compare configurations, whose tables are kept."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from r2s.evaluation.statistics import LEVEL
 from r2s.study.report import charts
 from r2s.study.report.page import Section
-from r2s.study.statistics import factors, findings, ranks, tables
+from r2s.study.rows import Row
+from r2s.study.statistics import factors, findings, ranks
 from r2s.study.statistics.distances import METRICS, distance_tables, means
 from r2s.study.statistics.paper import CITED, Paper, paper_tables
-from r2s.study.statistics.result_array import LEVEL, ResultArray, by_motion
-from r2s.study.tables import Row, Table
+from r2s.study.statistics.result_array import ResultArray, by_motion
+from r2s.study.tables import Table, significant
 
-Publish = Callable[[str, Table], Table]  # keeps a table under a name, and returns it
+Keep = Callable[[str, Table], Table]  # writes a table under a name, and returns it
 
 
 def findings_section(
@@ -21,9 +23,9 @@ def findings_section(
     metrics: Sequence[str],
     results: ResultArray,
     paper: Paper,
-    keep: Publish,
+    keep: Keep,
 ) -> list[Section]:
-    """The conclusions of the paper, by each of `metrics`; in words by the first."""
+    """The conclusions of the paper, by each of `metrics`; in words by the first of them."""
     if not metrics:
         return [Section("Findings", ("There are no results yet.",))]
     found = {metric: findings.find(rows_of[metric], paper, metric) for metric in metrics}
@@ -42,57 +44,47 @@ def findings_section(
         for i in range(len(first))
     )
     caption = f"Which conclusions of the paper ({CITED}) hold here, by metric"
-    return [
-        Section(
-            "Findings",
-            tuple(words),
-            (
-                keep("findings", Table(("conclusion", *metrics), lines, caption)),
-                *(
-                    keep(f"findings_{metric}", findings.finding_table(found[metric], metric))
-                    for metric in metrics[:1]
-                ),
-            ),
-        )
-    ]
+    shown = (
+        keep("findings", Table(("conclusion", *metrics), lines, caption)),
+        keep(f"findings_{metrics[0]}", findings.finding_table(first, metrics[0])),
+    )
+    return [Section("Findings", tuple(words), shown)]
 
 
-def _headlines(every: ResultArray) -> list[str]:
+def _headlines(results: ResultArray) -> list[str]:
     """The best configurations of each motion, beside the default fabric."""
+    scale, unit = (1e3, " mm") if results.unit == "m" else (1.0, "")
     found = []
-    for motion, results in by_motion(every).items():
-        each = means(results)
-        scale, unit = (1e3, " mm") if results.unit == "m" else (1.0, "")
-        shown = {
-            configuration: f"{configuration.label} {tables.significant(scale * each.mean[i])}{unit} "
-            f"({tables.significant(scale * each.low[i])} to "
-            f"{tables.significant(scale * each.high[i])}"
-            + (f"; {each.diverged[i]} of {each.runs[i]} diverged)" if each.diverged[i] else ")")
-            for i, configuration in enumerate(results.configurations)
-            if np.isfinite(each.mean[i])
-        }
-        order = [
-            results.configurations[i]
-            for i in np.argsort(each.mean)
-            if results.configurations[i] in shown
-        ]
-        best = [shown[configuration] for configuration in order if configuration.approach][:3]
-        defaults = [shown[configuration] for configuration in order if not configuration.approach]
+    for motion, part in by_motion(results).items():
+        numbers = zip(part.configurations, *means(part), strict=True)
+        finite = [each for each in numbers if np.isfinite(each[1])]
+        best, defaults = [], []
+        for configuration, *ends, diverged, runs in sorted(finite, key=lambda each: each[1]):
+            mean, low, high = (significant(scale * end) for end in ends)
+            lost = f"; {diverged} of {runs} diverged" if diverged else ""
+            words = f"{configuration.label} {mean}{unit} ({low} to {high}{lost})"
+            (best if configuration.approach else defaults).append(words)
         if best:
             compared = f"; {', '.join(defaults)}" if defaults else ""
-            found.append(f"Least {every.metric} in {motion}: {', '.join(best)}{compared}.")
+            found.append(f"Least {results.metric} in {motion}: {', '.join(best[:3])}{compared}.")
     return found
 
 
 def distance_sections(
-    out: Path, rows: Sequence[Row], results: ResultArray, paper: Paper, keep: Publish
+    out: Path, rows: Sequence[Row], results: ResultArray, paper: Paper, keep: Keep
 ) -> list[Section]:
+    """Distances in millimetres, and in the units of the paper beside its own."""
     sections = []
-    ours = [keep(name, table) for name, table in distance_tables(rows).items()]
+    ours = tuple(keep(name, table) for name, table in distance_tables(rows).items())
     if ours:
-        figures = _distance_chart(out, results) if results.metric in METRICS else ()
-        sections.append(Section("Distances in millimetres", (), tuple(ours), figures))
-    beside = [keep(name, table) for name, table in paper_tables(rows, paper).items()]
+        figures: tuple[tuple[Path, str], ...] = ()
+        if results.metric in METRICS and results.trajectories:
+            path, parts = out / "figures" / "distances.png", by_motion(results)
+            charts.distance_chart(path, parts, results.metric)
+            caption = f"Mean {results.metric} of every configuration, with {LEVEL:.0%} intervals."
+            figures = ((path, caption),)
+        sections.append(Section("Distances in millimetres", (), ours, figures))
+    beside = tuple(keep(name, table) for name, table in paper_tables(rows, paper).items())
     if beside:
         words = (
             "Every cloud is centred on its first frame's centroid and divided by half of its first "
@@ -100,18 +92,8 @@ def distance_sections(
             "summed. That hides errors of size, and clouds that were seen in part are compared "
             "with whole sheets."
         )
-        sections.append(Section("In the units of the paper", (words,), tuple(beside)))
+        sections.append(Section("In the units of the paper", (words,), beside))
     return sections
-
-
-def _distance_chart(out: Path, results: ResultArray) -> tuple[tuple[Path, str], ...]:
-    found = {
-        motion: (each.configurations, means(each)) for motion, each in by_motion(results).items()
-    }
-    if not found:
-        return ()
-    path = charts.distance_chart(out / "figures" / "distances.png", found, results.metric)
-    return ((path, f"Mean {results.metric} of every configuration, with {LEVEL:.0%} intervals."),)
 
 
 def _parts(results: ResultArray) -> dict[str, ResultArray]:
@@ -120,7 +102,8 @@ def _parts(results: ResultArray) -> dict[str, ResultArray]:
     return parts | ({"all motions": results} if len(parts) > 1 else {})
 
 
-def rank_section(out: Path, results: ResultArray, keep: Publish) -> list[Section]:
+def rank_section(out: Path, results: ResultArray, keep: Keep) -> list[Section]:
+    """Mean ranks of the configurations."""
     found = {
         motion: ranked
         for motion, part in _parts(results).items()
@@ -138,7 +121,8 @@ def rank_section(out: Path, results: ResultArray, keep: Publish) -> list[Section
     return [Section("Ranks", (words,), shown, ((path, "Mean ranks with their intervals."),))]
 
 
-def factor_section(out: Path, results: ResultArray, keep: Publish) -> list[Section]:
+def factor_section(out: Path, results: ResultArray, keep: Keep) -> list[Section]:
+    """Shares of the variance that each factor of the study explains."""
     found = {
         motion: shares
         for motion, part in _parts(results).items()
