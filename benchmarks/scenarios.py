@@ -23,7 +23,7 @@ from r2s.files import write_text
 from r2s.scenarios.energy import EnergyBalance, stretch
 from r2s.scenarios.scenario import Scenario
 from r2s.study.report.page import Section, write_report
-from r2s.study.tables import Table, csv_text
+from r2s.study.statistics.tables import Table, csv_text
 
 FABRICS = ("grey_interlock", "black_denim")  # softest and stiffest membrane of the five
 SOLVERS = {"cloth": (13, 13), "layers": (9, 9), "points": (13, 13)}  # vertices of their meshes
@@ -143,9 +143,7 @@ def report(rows: list[measure.Row], out: Path) -> None:
         )
     settings = {name: str(value) for name, value in measure.machine().items()}
     settings |= {f"mesh of {kind}": f"{a} x {b} vertices" for kind, (a, b) in SOLVERS.items()}
-    table = Table(("setting", "value"), tuple(settings.items()), "")
-    sections.append(Section("Settings", (), (table,)))
-    write_report(out / "report.html", "Six scenarios on both solvers", INTRO, sections)
+    write_report(out / "report.html", "Six scenarios on both solvers", INTRO, settings, sections)
 
 
 def main(out: Path, names: list[str], kinds: list[str]) -> None:

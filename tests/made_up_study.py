@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from r2s.geometry.mesh import rectangle
+from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
 from r2s.study.report.motions import MotionComparison
-from r2s.study.statistics import results
-from r2s.study.statistics.result_array import MOTIONS, PAPER_CONFIGURATIONS, Configuration
-from r2s.study.tables import Row
+from r2s.study.rows import Row
+from r2s.study.statistics import result_array
 
 FABRICS = ("black_denim", "grey_interlock", "pink_solid")
 METRICS = {"chamfer": ("m", 1.0), "paper_chamfer": ("-", 20.0), "hausdorff": ("m", 3.0)}
@@ -21,7 +21,7 @@ METRICS = {"chamfer": ("m", 1.0), "paper_chamfer": ("-", 20.0), "hausdorff": ("m
 def few_draws(count: int = 60) -> Iterator[None]:
     """Bootstraps of so many draws, for the sake of time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(results, "DRAWS", count)
+        patch.setattr(result_array, "DRAWS", count)
         yield
 
 
@@ -52,11 +52,9 @@ def made_up_rows(
                 for trial in range(1, trials + 1):
                     for repeat in range(1, repeats + 1 if configuration.approach else 2):
                         is_default = not configuration.approach
-                        value = (
-                            0.04
-                            if is_default
-                            else distance(configuration, fabric, motion, trial, repeat)
-                        )
+                        value = 0.04
+                        if not is_default:
+                            value = distance(configuration, fabric, motion, trial, repeat)
                         value *= math.exp(noise * generator.normal())
                         rows += [
                             Row(

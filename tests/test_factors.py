@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from made_up_study import made_up_rows
 
+from r2s.study.configuration import PAPER_CONFIGURATIONS, Configuration
 from r2s.study.statistics.factors import share_table, variance_shares
-from r2s.study.statistics.result_array import PAPER_CONFIGURATIONS, Configuration, result_array
+from r2s.study.statistics.result_array import result_array
 
 CROSSED = tuple(
     Configuration(*names)
@@ -79,7 +80,10 @@ def test_confounded_factors_share_what_cannot_be_told_apart():
     # The fourth approach comes from stretching, and nothing else does.
     configurations = [Configuration(a, "cloth", s) for a in "abc" for s in ("lifting", "wind")]
     configurations += [Configuration("pinn", "cloth", "stretching")]
-    distance = lambda configuration, *_: 0.02 * (2 if configuration.approach == "pinn" else 1)
+
+    def distance(configuration, *_):
+        return 0.02 * (2 if configuration.approach == "pinn" else 1)
+
     rows = made_up_rows(distance, configurations, trials=6, noise=0.05)
     found, share = shares(rows)
     assert share["approach"] == pytest.approx(share["scenario"], abs=0.02)
@@ -89,20 +93,26 @@ def test_confounded_factors_share_what_cannot_be_told_apart():
 
 
 def test_what_depends_on_one_alone_is_its_own_even_when_the_design_is_not_balanced():
-    distance = lambda configuration, *_: 0.02 * (2 if configuration.solver == "points" else 1)
+    def distance(configuration, *_):
+        return 0.02 * (2 if configuration.solver == "points" else 1)
+
     found, share = shares(made_up_rows(distance, trials=6, noise=0.02))
     assert share["solver"] == max(share.values()) and share["solver"] > 0.6
     assert found.share.sum() == pytest.approx(1)
 
 
 def test_motions_count_together_with_the_others():
-    distance = lambda configuration, fabric, motion, *_: 0.02 * (3 if motion == "fling" else 1)
+    def distance(configuration, fabric, motion, *_):
+        return 0.02 * (3 if motion == "fling" else 1)
+
     _, share = shares(made_up_rows(distance, trials=4), ("folding", "fling"))
     assert share["motion"] > 0.9
 
 
 def test_what_diverged_is_counted():
-    distance = lambda configuration, f, m, trial, r: math.nan if trial == 2 else 0.02
+    def distance(configuration, f, m, trial, r):
+        return math.nan if trial == 2 else 0.02
+
     found, _ = shares(made_up_rows(distance, PAPER_CONFIGURATIONS[:2], noise=0.1, trials=5))
     assert (found.count, found.diverged) == (48, 12)
     assert "48 on fling" in share_table({"fling": found}, "").caption

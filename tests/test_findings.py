@@ -8,10 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_up_study import FABRICS, few_draws, made_up_rows
 
+from r2s.evaluation.statistics import holm, signed_rank
+from r2s.study.configuration import PAPER_CONFIGURATIONS
 from r2s.study.statistics.conclusions import CONCLUSIONS
 from r2s.study.statistics.findings import find, finding_table, in_words
-from r2s.study.statistics.hypotheses import Claim, compare, holm, judge, signed_rank
-from r2s.study.statistics.result_array import PAPER_CONFIGURATIONS, result_array, select
+from r2s.study.statistics.hypotheses import Claim, compare, judge
+from r2s.study.statistics.result_array import result_array, select
 
 DIFFCLOUD_L, DIFFCLOUD_W, DIFFCP = PAPER_CONFIGURATIONS[:3]
 PINN_POINTS, PINN_CLOTH = PAPER_CONFIGURATIONS[6:]
@@ -115,7 +117,9 @@ def test_the_paper_is_quoted_when_it_is_there(right):
 
 
 def test_a_diverged_side_counts_against_it():
-    some = lambda configuration, *_: math.nan if configuration == DIFFCLOUD_W else 0.02
+    def some(configuration, *_):
+        return math.nan if configuration == DIFFCLOUD_W else 0.02
+
     results = result_array(made_up_rows(some), "chamfer", ("fling",))
     found = compare("", results, [DIFFCLOUD_L], [DIFFCLOUD_W])
     assert found.favoured and found.p < 1e-3 and math.isnan(found.ratio) and found.diverged == 12

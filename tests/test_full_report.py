@@ -9,19 +9,21 @@ from made_up_study import few_draws, made_up_comparison, made_up_rows
 from test_report import Page
 
 from r2s.fabrics.parameters import Range
+from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS
+from r2s.study.costs import Cost, cost_table
 from r2s.study.report import full, overlays
 from r2s.study.report.page import PNG
-from r2s.study.statistics.result_array import MOTIONS, PAPER_CONFIGURATIONS
+from r2s.study.statistics.parameters import Estimated
 
-ENTRY = (
+ESTIMATED = Estimated(
     "diffcloud_denim",
     (Range("C11", "N/m", 3.0, 3000.0),),
     np.array([123.0]),
     np.array([0.1]),
     np.array([True]),
-    None,
+    np.array([np.nan]),
 )
-COST = {"kind": "estimates", "count": 3, "seconds": 12.345, "peak_memory_MB": 512.0}
+COSTS = cost_table([Cost("estimates", count=3, seconds=12.345, each=4.1, peak_memory=512.0)])
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -37,20 +39,20 @@ def some_diverged(configuration, fabric, motion, trial, repeat):
 @pytest.fixture(scope="module")
 def published(tmp_path_factory):
     out = tmp_path_factory.mktemp("study")
-    shown = [
-        made_up_comparison(motion, labels=("DIFFCLOUD cloth lifting", "b")) for motion in MOTIONS
-    ]
-    shown[1].motions["b"][2:] = np.nan
-    tables = full.publish(
-        out,
-        made_up_rows(some_diverged, trials=3),
-        [*shown, made_up_comparison("folding")],
-        {"cloth": [ENTRY], "points": []},
-        [("estimates pinn_denim", "RuntimeError: <diverged>")],
-        {"recordings": "made up"},
-        None,
-        [COST],
-    )
+    labels = "DIFFCLOUD cloth lifting", "b"
+    motions = [made_up_comparison(motion, labels=labels) for motion in MOTIONS]
+    motions[1].motions["b"][2:] = np.nan
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(full, "MOST_IN_VIEWER", 2)
+        tables = full.publish(
+            out,
+            made_up_rows(some_diverged, trials=3),
+            motions,
+            {"cloth": [ESTIMATED], "points": []},
+            [("estimates pinn_denim", "RuntimeError: <diverged>")],
+            {"recordings": "made up"},
+            more=[("Costs", "", {"costs": COSTS}), ("Nothing", "is said of it", {})],
+        )
     return out, tables, Page((out / "report.html").read_text())
 
 
@@ -67,7 +69,8 @@ def test_all_parts_are_there(published):
     assert len(written) == len(tables) == len(page.all("table"))
     assert {"findings", "chamfer", "ranks", "factors", "costs", "missing"} <= written
     assert all((out / "tables" / f"{n}.{end}").exists() for n in written for end in ("md", "tex"))
-    assert len(page.all("canvas")) == 1
+    assert len(page.all("canvas")) == 1 and len(page.all("option")) == 2
+    assert "is said of it" not in page.text
 
 
 def test_pictures_and_videos_are_written(published):

@@ -5,8 +5,8 @@ import math
 import pytest
 from made_up_study import made_up_rows
 
+from r2s.study.configuration import MOTIONS, Configuration
 from r2s.study.statistics.paper import average, beside_paper, paper_tables, read_paper
-from r2s.study.statistics.result_array import MOTIONS, Configuration
 
 HEADER = "metric,fabric,diffcloud-diffsim-lifting,pinn-difftaichi-stretching\n"
 LINES = "CD,Black Denim,0.25,0.5\nCD,Red Jet Set,0.75,1.5\nCD,Average,9,9\nHD,Black Denim,1.25,2\n"
@@ -58,7 +58,9 @@ def test_damaged_tables_are_refused(folder, text, message):
 
 
 def test_ours_stand_beside_theirs(folder):
-    nan = lambda configuration, fabric, *_: math.nan if fabric == "pink_solid" else 0.02
+    def nan(configuration, fabric, *_):
+        return math.nan if fabric == "pink_solid" else 0.02
+
     rows = made_up_rows(nan, configurations=[DIFFCLOUD], noise=0.0, trials=2)
     table = beside_paper(rows, read_paper(folder), "fling", "paper_chamfer")
     assert table.header == (

@@ -7,8 +7,10 @@ import pytest
 from made_up_study import few_draws, made_up_rows
 from scipy import stats
 
-from r2s.study.statistics.ranks import critical_difference, rank, rank_table
-from r2s.study.statistics.result_array import PAPER_CONFIGURATIONS, result_array
+from r2s.evaluation.statistics import critical_difference
+from r2s.study.configuration import PAPER_CONFIGURATIONS
+from r2s.study.statistics.ranks import rank, rank_table
+from r2s.study.statistics.result_array import result_array
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -40,9 +42,9 @@ def test_ranks_do_not_see_how_hard_a_trajectory_is():
 
 
 def test_what_diverged_is_last():
-    some = lambda configuration, f, m, trial, repeat: (
-        math.nan if configuration.approach == "diffcp" and repeat == 2 else 0.02
-    )
+    def some(configuration, f, m, trial, repeat):
+        return math.nan if configuration.approach == "diffcp" and repeat == 2 else 0.02
+
     found = rank(result_array(made_up_rows(some), "chamfer", ("fling",)))
     assert found is not None
     assert found.mean[PAPER_CONFIGURATIONS.index(("diffcp", "points", "lifting"))] == len(

@@ -1,25 +1,22 @@
 """The results of a study: what is compared, and how it is resampled."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from made_up_study import made_up_rows
 
+from r2s.evaluation.statistics import interval
+from r2s.study.configuration import PAPER_CONFIGURATIONS, Configuration
+from r2s.study.rows import Row
 from r2s.study.statistics.distances import distance_table, means
 from r2s.study.statistics.result_array import (
-    PAPER_CONFIGURATIONS,
-    Configuration,
     configurations_of,
-    defined,
-    interval,
     mean_over_repeats,
     resamples,
     result_array,
     select,
 )
-from r2s.study.tables import Row
 
 LIFTING = PAPER_CONFIGURATIONS[0]
 
@@ -30,7 +27,7 @@ def row(
     return Row(*configuration, "denim", repeat, recording, on, baseline, "chamfer", "m", value)
 
 
-def test_columns_are_named_and_in_the_order_of_the_paper():
+def test_configurations_are_named_and_in_the_order_of_the_paper():
     rows = made_up_rows(
         configurations=[Configuration("new", "cloth", "wind"), *reversed(PAPER_CONFIGURATIONS)]
     )
@@ -66,19 +63,6 @@ def test_other_baselines_and_motions_are_left_out():
     assert result_array(rows, "hausdorff").values.shape == (0, 0, 0)
     part = select(result_array(rows, "chamfer"), lambda c: c.solver == "points")
     assert part.values.shape == (0, 1, 1)
-
-
-def test_a_metric_without_a_value_is_not_a_run_that_diverged():
-    rows = [
-        replace(row(value, recording=name), metric=metric)
-        for name, values in {"well": (0.1, math.nan), "lost": (math.nan, math.nan)}.items()
-        for metric, value in zip(("chamfer", "chamfer_cropped"), values, strict=True)
-    ]
-    kept, left_out = defined(rows)
-    assert [(r.recording, r.metric) for r in kept] == [
-        ("well", "chamfer"), ("lost", "chamfer"), ("lost", "chamfer_cropped")
-    ]  # fmt: skip
-    assert left_out == {"chamfer_cropped": 1}
 
 
 def test_two_values_of_one_place_and_two_units_are_refused():

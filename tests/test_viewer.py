@@ -13,7 +13,7 @@ from made_up_study import made_up_comparison
 from test_report import Page
 
 from r2s.study.report import player
-from r2s.study.report.motions import MotionComparison, load_shown, save_shown
+from r2s.study.report.motions import MotionComparison
 from r2s.study.report.page import Section, write_report
 from r2s.study.tables import Table
 
@@ -85,7 +85,7 @@ def recordings():
 
 def page(path, recordings, extra=""):
     section = Section("Motions", ("Words.",), (TABLE,), html=player.viewer(recordings) + extra)
-    write_report(path, "A study", "", {}, [section])
+    write_report(path, "A study", "", [section])
     return path.read_text()
 
 
@@ -114,23 +114,7 @@ def test_size_of_a_long_recording():
     assert 0.5 * player.BUDGET < len(text) < player.BUDGET + 30_000
 
 
-def test_shown_is_read_back(tmp_path):
-    shown = diverged()
-    save_shown(tmp_path / "shown.npz", shown)
-    read = load_shown(tmp_path / "shown.npz")
-    assert (read.fabric, read.evaluated_on, read.recording) == (
-        "pink_solid", "shaking", "shaking_pink_solid1"
-    )  # fmt: skip
-    assert list(read.motions) == ["a", "b"] and len(read.clouds) == 6
-    for mine, other in zip(
-        [*shown.clouds, *shown.motions.values(), shown.times, shown.faces],
-        [*read.clouds, *read.motions.values(), read.times, read.faces],
-        strict=True,
-    ):
-        np.testing.assert_array_equal(mine, other)
-
-
-def test_what_cannot_be_shown_is_refused(tmp_path, unchecked):
+def test_what_cannot_be_shown_is_refused(unchecked):
     shown = made_up_comparison()
     with pytest.raises(ValueError, match="fling_black_denim1: expected a cloud for each of 6"):
         replace(shown, clouds=shown.clouds[:2])
@@ -138,11 +122,6 @@ def test_what_cannot_be_shown_is_refused(tmp_path, unchecked):
         replace(shown, motions={"a": shown.motions["a"][:3]})
     with pytest.raises(ValueError, match="the faces name vertex 15"):
         replace(shown, motions={"a": shown.motions["a"][:, :9]})
-    (tmp_path / "damaged.npz").write_bytes(b"PK")
-    with pytest.raises(ValueError, match=r"damaged.npz"):
-        load_shown(tmp_path / "damaged.npz")
-    with pytest.raises(FileNotFoundError, match=r"nowhere.npz"):
-        load_shown(tmp_path / "nowhere.npz")
 
 
 @needs_browser
@@ -166,8 +145,8 @@ def test_in_a_browser(tmp_path, recordings):
     points = np.reshape(found["points"], (-1, 3))
     every = np.concatenate(shown.clouds)
     assert len(points) == len(every)
-    order = lambda x: x[np.lexsort(np.round(x, 3).T)]
-    np.testing.assert_allclose(order(points), order(every), **rounded)
+    points, every = (x[np.lexsort(np.round(x, 3).T)] for x in (points, every))
+    np.testing.assert_allclose(points, every, **rounded)
     assert "b (diverged)" in found["legend"]
     assert found["up"] == ["a", "b", "d", "c"]
     assert found["down"][:2] == ["b", "a"] and set(found["down"][2:]) == {"c", "d"}
