@@ -83,7 +83,7 @@ def test_what_is_alike_does_not_hold_and_what_is_unclear_is_not_told():
     results = result_array(made_up_rows(noise=0.02, trials=20), "chamfer", ("fling",))
     alike = compare("", results, [DIFFCLOUD_L], [DIFFCLOUD_W])
     few = select(
-        result_array(made_up_rows(noise=0.4), "chamfer"), None, lambda t: t[0] == FABRICS[0]
+        result_array(made_up_rows(noise=0.4), "chamfer"), trajectories=lambda t: t[0] == FABRICS[0]
     )
     unclear = compare("", few, [DIFFCLOUD_L], [DIFFCLOUD_W])
     found = [verdict.answer for verdict in judge([Claim("", (alike,)), Claim("", (unclear,))])]

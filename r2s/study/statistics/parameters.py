@@ -32,8 +32,9 @@ def parameter_table(estimates: Sequence[Estimated], caption: str) -> Table:
     """The table of estimates, whose ranges may differ: a parameter that one lacks is "-"."""
     names = list(dict.fromkeys(bound.name for each in estimates for bound in each.ranges))
     lines = []
-    for name, *parts in estimates:
-        shown = {bound.name: _cell(bound, *rest) for bound, *rest in zip(*parts, strict=True)}
+    for name, ranges, *arrays in estimates:
+        numbers = zip(ranges, *(np.asarray(array).tolist() for array in arrays), strict=True)
+        shown = {bound.name: _cell(bound, *rest) for bound, *rest in numbers}
         lines.append((name, *(shown.get(parameter, MISSING) for parameter in names)))
     return Table(("recording", *names), tuple(lines), caption)
 
