@@ -145,9 +145,7 @@ def predict(recordings: list[Recording], fabric: Fabric, solver: str) -> list[Mo
         moved = _motion(scenario, fabric, solver=own)
         ok = np.logical_and.accumulate(np.asarray(moved.ok))
         x = np.where(ok[:, None, None], np.asarray(moved.x), np.nan)
-        is_finite = np.isfinite(x).all(axis=(1, 2))
-        lost = f"not finite from frame {int(np.argmin(is_finite))} on"
-        motions.append(Motion(x, "" if is_finite.all() else lost))
+        motions.append(Motion(x, moved.explain()))
     return motions
 
 

@@ -64,7 +64,7 @@ ALL = Plan(
     fabrics=tuple(presets.FIVE),
     repeats=ESTIMATION,
     judged=EVALUATION // len(MOTIONS),
-    truth=TruthSettings(layers=True),
+    truth=TruthSettings(self_contact=True),
 )
 SMALL = Plan(
     configurations=(

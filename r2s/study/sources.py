@@ -45,7 +45,7 @@ class TruthSettings:
     - `materials`: a folder of ARCSim material files, FABRIC.json, with measured tables to take
       instead; "": none.
     - `materials_digest`: a hash of those files, from `with_measured_tables`.
-    - `layers`: whether the sheet touches itself.
+    - `self_contact`: whether the sheet touches itself.
     """
 
     shape: tuple[int, int] = (17, 17)
@@ -53,7 +53,7 @@ class TruthSettings:
     stiffening: float = 2.0
     materials: str = ""
     materials_digest: str = ""
-    layers: bool = False
+    self_contact: bool = False
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class SyntheticRecording(Cell):
                 seen=synthetic.WHOLE if self.unseen else None,
                 shape=truth.shape,
                 max_step=truth.max_step,
-                layers=truth.layers and self.scenario == "folding",
+                self_contact=truth.self_contact and self.scenario == "folding",
                 key=key,
             )
         info = dataclasses.replace(made.info, name=self.name, trial=str(self.number))
