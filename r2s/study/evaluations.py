@@ -5,7 +5,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,12 +13,13 @@ import numpy as np
 from jaxtyping import Float
 
 from r2s.evaluation import prediction_error
+from r2s.evaluation.prediction_error import Motion
 from r2s.fabrics.fabric import Fabric
 from r2s.files import write_json
 from r2s.mpm.sheet import Sheet, longest_edge, stable_step
 from r2s.recordings.recording import Recording
 from r2s.scenarios.on_points import EDGE, MEMBRANE_DAMPING, grid_around
-from r2s.scenarios.scenario import Scenario, from_recording, rollout
+from r2s.scenarios.scenario import Scenario, from_recording
 from r2s.study.cells import Cell, result_files
 from r2s.study.configuration import Configuration
 from r2s.study.estimates import EstimateCell, default_fabric, read_estimate
@@ -26,8 +27,6 @@ from r2s.study.sources import GivenRecording, Source, read
 
 MEASURED, MOTION = "measured.json", "motion.npz"
 LADDER = math.sqrt(2)  # steps between frames are powers of this: few programs to compile
-
-_motion = eqx.filter_jit(rollout)
 
 
 @dataclass(frozen=True)
@@ -123,13 +122,6 @@ def read_motion(cell: EvaluationCell, folder: Path) -> Float[np.ndarray, "frame 
         return stored["x"]
 
 
-class Motion(NamedTuple):
-    """Positions [m], NaN from where the run diverged, and why it did; "" where it did not."""
-
-    x: Float[np.ndarray, "frame vertex 3"]
-    failure: str
-
-
 def predict(recordings: list[Recording], fabric: Fabric, solver: str) -> list[Motion]:
     """The motions of a fabric in recordings of one scenario.
 
@@ -142,10 +134,7 @@ def predict(recordings: list[Recording], fabric: Fabric, solver: str) -> list[Mo
     motions = []
     for scenario in alike:
         own = sheet and eqx.tree_at(lambda s: s.scene, sheet, scenario.scene)
-        moved = _motion(scenario, fabric, solver=own)
-        ok = np.logical_and.accumulate(np.asarray(moved.ok))
-        x = np.where(ok[:, None, None], np.asarray(moved.x), np.nan)
-        motions.append(Motion(x, moved.explain()))
+        motions.append(prediction_error.predict_motion(scenario, fabric, own))
     return motions
 
 
