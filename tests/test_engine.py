@@ -216,8 +216,8 @@ def _cores() -> set[int]:
 def test_a_process_takes_the_core_that_has_least_to_do(monkeypatch):
     psutil, taken = pytest.importorskip("psutil"), []
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {1, 3, 4}, raising=False)
-    monkeypatch.setattr(os, "sched_setaffinity", lambda *about: taken.append(about), raising=False)
-    monkeypatch.setattr(psutil, "cpu_percent", lambda **about: [0.0, 90.0, 0.0, 20.0, 40.0])
+    monkeypatch.setattr(os, "sched_setaffinity", lambda *given: taken.append(given), raising=False)
+    monkeypatch.setattr(psutil, "cpu_percent", lambda **_: [0.0, 90.0, 0.0, 20.0, 40.0])
     one_core()
     one_core(5)
     assert taken == [(0, {3}), (0, {4})]

@@ -167,5 +167,5 @@ def _missing(rows: Sequence[Row], missing: Sequence[tuple[str, str]], keep: Keep
 
 def _settings(settings: Mapping[str, str], keep: Keep) -> Section:
     versions = {f"version of {name}": version(name) for name in VERSIONS}
-    lines = tuple((settings | versions).items())
+    lines = tuple({**settings, **versions}.items())
     return Section("Settings", (), (keep("settings", Table(("setting", "value"), lines, "")),))

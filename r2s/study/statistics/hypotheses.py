@@ -157,8 +157,8 @@ def judge(claims: Sequence[Claim]) -> list[Verdict]:
     verdicts = []
     for claim in claims:
         p = tuple(next(corrected) for _ in claim.comparisons)
-        answers = tuple(_answer(c, q) for c, q in zip(claim.comparisons, p, strict=True))
-        verdicts.append(Verdict(claim, _together(answers), answers, p))
+        answers: list[Answer] = [_answer(c, q) for c, q in zip(claim.comparisons, p, strict=True)]
+        verdicts.append(Verdict(claim, _together(answers), tuple(answers), p))
     return verdicts
 
 
