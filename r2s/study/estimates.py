@@ -24,7 +24,7 @@ from r2s.files import write_json
 from r2s.recordings.recording import Recording
 from r2s.scenarios.on_points import material_points
 from r2s.scenarios.scenario import from_recording
-from r2s.study.cells import Cell, opened
+from r2s.study.cells import Cell, result_files
 from r2s.study.sources import Source, read
 
 ESTIMATE, NETWORK = "estimate.json", "network.eqx"
@@ -164,7 +164,7 @@ def family_of(solver: str, density: float) -> ParameterSpace:
 
 def read_estimate(cell: EstimateCell, folder: Path) -> Estimate | None:
     """The estimate of a cell that is made; None where it diverged."""
-    with opened(cell, folder) as files:
+    with result_files(cell, folder) as files:
         if not (files / ESTIMATE).exists():
             return None
         return from_json(json.loads((files / ESTIMATE).read_text(encoding="utf-8")))
@@ -200,7 +200,7 @@ def _diffcp(cell: EstimateCell, space, recordings: list[Recording], folder: Path
 def _physnet(cell: EstimateCell, space: ParameterSpace, recordings: list[Recording], folder: Path):
     if cell.network is None:
         raise ValueError("PhysNet needs a trained network")
-    with opened(cell.network, folder) as files:
+    with result_files(cell.network, folder) as files:
         trained = training.load(files / NETWORK)
     recording, on_cloth = recordings[0], cell.solver == "cloth"
     scenario = from_recording(recording, (9, 9) if on_cloth else COARSE)
