@@ -16,11 +16,11 @@ from r2s.estimation.estimate import as_json, from_json
 from r2s.estimation.pinn import balance as balancing
 from r2s.estimation.pinn import published_recipe
 from r2s.estimation.pinn.balance import balance, basis_of, prepared, reduced, solve
-from r2s.estimation.pinn.data import Clamp, Pull, pull_from, stacked
 from r2s.estimation.pinn.from_pulls import QUICK, estimate, estimate_all
-from r2s.estimation.pinn.laws import small
 from r2s.estimation.pinn.losses import Losses, motion_residual
 from r2s.estimation.pinn.network import Network
+from r2s.estimation.pinn.pulls import Clamp, Pull, pull_from, stacked
+from r2s.estimation.pinn.stress import small
 from r2s.estimation.pinn.synthetic_pulls import pulled
 from r2s.estimation.pinn.training import Recipe, train, trainable
 from r2s.fabrics import presets

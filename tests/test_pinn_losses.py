@@ -12,12 +12,12 @@ import pytest
 from jaxtyping import Array
 
 from r2s.estimation.pinn import losses as strong
-from r2s.estimation.pinn import weak
-from r2s.estimation.pinn.data import Clamp, Pull
-from r2s.estimation.pinn.laws import green, small
+from r2s.estimation.pinn import weak_form
 from r2s.estimation.pinn.losses import draw_points, plain_scales, scales_of
 from r2s.estimation.pinn.network import Jet, Network
-from r2s.estimation.pinn.weak import end_value, virtual_fields, weak_losses
+from r2s.estimation.pinn.pulls import Clamp, Pull
+from r2s.estimation.pinn.stress import green, small
+from r2s.estimation.pinn.weak_form import end_value, virtual_fields, weak_losses
 from r2s.fabrics.fabric import Fabric
 from r2s.laws.membrane import OrthotropicMembrane
 
@@ -25,7 +25,7 @@ from r2s.laws.membrane import OrthotropicMembrane
 compiled: Any = eqx.filter_jit
 edge_force, marker_residual = compiled(strong.edge_force), compiled(strong.marker_residual)
 motion_residual, strong_losses = compiled(strong.motion_residual), compiled(strong.strong_losses)
-kinematics, virtual_work = compiled(weak.kinematics), compiled(weak.virtual_work)
+kinematics, virtual_work = compiled(weak_form.kinematics), compiled(weak_form.virtual_work)
 
 SIZE, DENSITY, FRAMES = (0.45, 0.3), 0.3, 7  # [m, kg/m^2]
 TRUE = (90.0, 25.0, 140.0, 30.0)  # C11, C12, C22, C33 [N/m]

@@ -8,7 +8,8 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from r2s.estimation.pinn.laws import (
+from r2s.estimation.pinn.network import STRONG, WEAK, Network
+from r2s.estimation.pinn.stress import (
     PlaneStrainFamily,
     TurnedMembrane,
     divergence,
@@ -17,7 +18,6 @@ from r2s.estimation.pinn.laws import (
     small,
     turned,
 )
-from r2s.estimation.pinn.network import STRONG, WEAK, Network
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import IsotropicSpace
 from r2s.geometry.mesh import rectangle

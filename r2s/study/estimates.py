@@ -16,7 +16,7 @@ from r2s.estimation.descent import DEFAULT
 from r2s.estimation.estimate import Estimate, as_json, from_json
 from r2s.estimation.physnet import dataset, estimator, preprocess, training
 from r2s.estimation.pinn import from_clouds, from_pulls
-from r2s.estimation.pinn.data import pull_from
+from r2s.estimation.pinn.pulls import pull_from
 from r2s.estimation.problem import Problem
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace

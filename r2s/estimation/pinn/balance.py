@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from r2s.estimation.pinn.data import Pull
-from r2s.estimation.pinn.laws import Strain, green, nominal_stress
 from r2s.estimation.pinn.losses import load, marker_residual
 from r2s.estimation.pinn.network import Network
-from r2s.estimation.pinn.weak import (
+from r2s.estimation.pinn.pulls import Pull
+from r2s.estimation.pinn.stress import Strain, green, nominal_stress
+from r2s.estimation.pinn.weak_form import (
     DEGREES,
     Kinematics,
     Virtual,

@@ -15,9 +15,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimation.pinn.data import Pull
-from r2s.estimation.pinn.laws import Strain, green, nominal_stress
-from r2s.estimation.pinn.levenberg import Fit, Term, Unknown, least_squares
+from r2s.estimation.pinn.levenberg_marquardt import Fit, Term, Unknown, least_squares
 from r2s.estimation.pinn.losses import (
     EDGE_NODES,
     displacement,
@@ -28,6 +26,8 @@ from r2s.estimation.pinn.losses import (
     motion_residual,
 )
 from r2s.estimation.pinn.network import Network
+from r2s.estimation.pinn.pulls import Pull
+from r2s.estimation.pinn.stress import Strain, green, nominal_stress
 from r2s.estimation.pinn.training import Recipe, init
 from r2s.fabrics.parameters import ParameterSpace
 
@@ -41,7 +41,7 @@ class About(eqx.Module):
 
     - `likeness`: a network whose weights are the unknowns. - `marker`: [m]. - `motion`: [N/m^2].
     - `force`: [N]. The latter three are what residuals are divided by. - `strain`: see
-      `r2s.estimation.pinn.laws`.
+      `r2s.estimation.pinn.stress`.
     """
 
     likeness: Network

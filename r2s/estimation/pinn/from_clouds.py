@@ -24,7 +24,17 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation.estimate import Estimate, Nuisance
-from r2s.estimation.pinn.clouds import (
+from r2s.estimation.pinn.exact import PRIOR, clipped, ranged, weights_of, with_weights
+from r2s.estimation.pinn.hanging_sheet import (
+    Hanging,
+    Splines,
+    loose,
+    splines,
+    virtual_work,
+    work_scale,
+)
+from r2s.estimation.pinn.levenberg_marquardt import FIRST, Term, Unknown, least_squares, marginal
+from r2s.estimation.pinn.matching import (
     Rows,
     Sight,
     above,
@@ -35,18 +45,8 @@ from r2s.estimation.pinn.clouds import (
     placed,
     sight_of,
 )
-from r2s.estimation.pinn.exact import PRIOR, clipped, ranged, weights_of, with_weights
-from r2s.estimation.pinn.laws import green
-from r2s.estimation.pinn.levenberg import FIRST, Term, Unknown, least_squares, marginal
 from r2s.estimation.pinn.network import Network, X, Y, at_time
-from r2s.estimation.pinn.shell import (
-    Hanging,
-    Splines,
-    loose,
-    splines,
-    virtual_work,
-    work_scale,
-)
+from r2s.estimation.pinn.stress import green
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace
 from r2s.geometry.mesh import Mesh, rectangle

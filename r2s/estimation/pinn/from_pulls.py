@@ -15,9 +15,9 @@ from jaxtyping import PRNGKeyArray
 
 from r2s.estimation.estimate import Estimate, Nuisance, without_standard_errors
 from r2s.estimation.pinn.balance import Balanced, balance
-from r2s.estimation.pinn.data import Pull, stacked
+from r2s.estimation.pinn.pulls import Pull, stacked
 from r2s.estimation.pinn.training import NOISE, Recipe, Trained, chunks, train
-from r2s.estimation.pinn.weak import DEGREES, weak_losses
+from r2s.estimation.pinn.weak_form import DEGREES, weak_losses
 from r2s.fabrics.parameters import ParameterSpace
 
 QUICK = Recipe(losses=weak_losses, warm_up=200, adam=200, lbfgs=0)

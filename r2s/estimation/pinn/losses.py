@@ -13,9 +13,9 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from r2s.estimation.pinn.data import Pull
-from r2s.estimation.pinn.laws import Strain, divergence, green, nominal_stress
 from r2s.estimation.pinn.network import STRONG, DisplacementField, Jet, T
+from r2s.estimation.pinn.pulls import Pull
+from r2s.estimation.pinn.stress import Strain, divergence, green, nominal_stress
 from r2s.fabrics.fabric import Fabric
 from r2s.units import Scalar
 from r2s.world.contact import friction_dissipation

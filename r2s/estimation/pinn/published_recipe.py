@@ -20,10 +20,10 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation.pinn.batches import summed
-from r2s.estimation.pinn.data import Pull
-from r2s.estimation.pinn.laws import small
 from r2s.estimation.pinn.losses import marker_residual, motion_residual
 from r2s.estimation.pinn.network import LAYERS, WIDTH, Network
+from r2s.estimation.pinn.pulls import Pull
+from r2s.estimation.pinn.stress import small
 from r2s.estimation.pinn.training import Model, Recipe, init, trainable
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace

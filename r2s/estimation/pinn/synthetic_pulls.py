@@ -8,7 +8,7 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimation.pinn.laws import TurnedMembrane
+from r2s.estimation.pinn.stress import TurnedMembrane
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh
 from r2s.geometry.surface import nearest

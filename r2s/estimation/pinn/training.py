@@ -12,8 +12,6 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimation.pinn.data import Pull
-from r2s.estimation.pinn.laws import Strain, green
 from r2s.estimation.pinn.losses import (
     Losses,
     Points,
@@ -23,6 +21,8 @@ from r2s.estimation.pinn.losses import (
     strong_losses,
 )
 from r2s.estimation.pinn.network import LAYERS, Network
+from r2s.estimation.pinn.pulls import Pull
+from r2s.estimation.pinn.stress import Strain, green
 from r2s.fabrics.parameters import ParameterSpace
 
 LossesOf = Callable[..., Losses]
@@ -50,8 +50,9 @@ class Model(eqx.Module):
 class Recipe:
     """How to train.
 
-    - `losses`: `strong_losses` or `r2s.estimation.pinn.weak.weak_losses`. - `weights`: of their
-      terms, in the order of `Losses`; 0 leaves one out. - `strain`: `green` or `small`.
+    - `losses`: `strong_losses` or `r2s.estimation.pinn.weak_form.weak_losses`.
+    - `weights`: of their terms, in the order of `Losses`; 0 leaves one out.
+    - `strain`: `green` or `small`.
     - `warm_up`, `adam`, `lbfgs`: epochs without and with physics by Adam, and iterations.
     - `rate`: of Adam, falling to a hundredth by a cosine. - `fabric_rate`: that of the fabric's
       parameters, as a multiple.

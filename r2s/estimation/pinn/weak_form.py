@@ -13,8 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from r2s.estimation.pinn.data import Pull
-from r2s.estimation.pinn.laws import Strain, green, nominal_stress
 from r2s.estimation.pinn.losses import (
     Losses,
     Points,
@@ -25,6 +23,8 @@ from r2s.estimation.pinn.losses import (
     load,
 )
 from r2s.estimation.pinn.network import WEAK, DisplacementField, T
+from r2s.estimation.pinn.pulls import Pull
+from r2s.estimation.pinn.stress import Strain, green, nominal_stress
 from r2s.fabrics.fabric import Fabric
 
 NODES = 12  # of the quadrature, along each side

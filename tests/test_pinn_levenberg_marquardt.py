@@ -11,9 +11,7 @@ from test_pinn_losses import DENSITY, FABRIC, SIZE, waves
 from test_pinn_losses import exact as in_closed_form
 
 from r2s.estimation.pinn import exact
-from r2s.estimation.pinn.data import Clamp, Pull
-from r2s.estimation.pinn.laws import PlaneStrainFamily, small
-from r2s.estimation.pinn.levenberg import (
+from r2s.estimation.pinn.levenberg_marquardt import (
     Term,
     least_squares,
     marginal,
@@ -21,6 +19,8 @@ from r2s.estimation.pinn.levenberg import (
 )
 from r2s.estimation.pinn.losses import edge_force, marker_residual
 from r2s.estimation.pinn.network import Network
+from r2s.estimation.pinn.pulls import Clamp, Pull
+from r2s.estimation.pinn.stress import PlaneStrainFamily, small
 from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace
 
 

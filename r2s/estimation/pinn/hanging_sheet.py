@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.interpolate import BSpline
 
-from r2s.estimation.pinn.laws import green
 from r2s.estimation.pinn.network import STRONG, DisplacementField, T, at_time
+from r2s.estimation.pinn.stress import green
 from r2s.fabrics.fabric import Fabric
 from r2s.units import GRAVITY
 from r2s.world.air import Air, Fan

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s.estimation.pinn.data import pull_from, stacked
+from r2s.estimation.pinn.pulls import pull_from, stacked
 from r2s.recordings.recording import RecordingInfo, make_recording
 from r2s.scenarios import stretching
 
