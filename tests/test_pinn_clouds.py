@@ -29,14 +29,14 @@ FAMILY = OrthotropicSpace.make(DENSITY)
 def network(scale: float = 0.0) -> Network:
     """A map that leaves the sheet flat, or one with gentle waves of some scale [m]."""
     low, high = jnp.zeros(3), jnp.array([*SIZE, 1.0])
-    make = {"axes": 3, "width": 6, "layers": 3}
-    return Network.make(low, high, jnp.asarray(scale, float), **make, key=jr.key(0))
+    scale_array = jnp.asarray(scale, float)
+    return Network.make(low, high, scale_array, axes=3, width=6, layers=3, key=jr.key(0))
 
 
 def sight(points, cloud=None) -> Sight:
     """The same points in every frame; a table far below."""
-    every = lambda values: jnp.tile(jnp.asarray(values, float)[None], (len(TIMES), 1, 1))
-    points, cloud = every(points), every(points if cloud is None else cloud)
+    cloud = points if cloud is None else cloud
+    points, cloud = (jnp.tile(jnp.asarray(p, float), (len(TIMES), 1, 1)) for p in (points, cloud))
     return Sight(
         size=jnp.array(SIZE),
         times=jnp.array(TIMES),
@@ -159,8 +159,8 @@ def hanging(down=(0.0, 1.0, 0.0), air: float = 0.0) -> Hanging:
 
 
 @eqx.filter_jit
-def work(field: Any, about: Hanging, fabric: Fabric, time=0.3):
-    return hanging_sheet.virtual_work(field, about, fabric, PARTS, jnp.asarray(time))
+def work(field: Any, acting: Hanging, fabric: Fabric, time=0.3):
+    return hanging_sheet.virtual_work(field, acting, fabric, PARTS, jnp.asarray(time))
 
 
 def jet_of(values, slopes, curves) -> Jet:
@@ -205,7 +205,7 @@ def test_a_sheet_that_hangs_by_an_edge_is_in_balance():
 def test_work_is_the_derivative_of_the_energy():
     """Of membrane and bending, on a wavy sheet, along a virtual displacement."""
     fabric = Fabric.make(DENSITY, (90.0, 20.0, 60.0, 25.0), 1e-3)
-    wavy, about = network(0.05), hanging((0.0, 0.0, 0.0))
+    wavy, acting = network(0.05), hanging((0.0, 0.0, 0.0))
     which, direction = 27, jnp.array([0.3, -0.5, 0.8])
     slope = PARTS.slope[which] / jnp.array(SIZE)[None]
     x, y = SIZE
@@ -231,7 +231,7 @@ def test_work_is_the_derivative_of_the_energy():
         return PARTS.weights @ jax.vmap(node)(moved, second) * x * y
 
     still = dataclasses.replace(fabric, density=jnp.zeros(()))
-    found = work(wavy, about, still)[which] @ direction
+    found = work(wavy, acting, still)[which] @ direction
     np.testing.assert_allclose(found, jax.grad(energy)(0.0), rtol=1e-8)
 
 
