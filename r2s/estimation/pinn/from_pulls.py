@@ -17,6 +17,7 @@ from jaxtyping import PRNGKeyArray
 from r2s.estimation.estimate import Estimate, Nuisance, without_standard_errors
 from r2s.estimation.pinn.balance import Balanced, balance
 from r2s.estimation.pinn.losses import Losses
+from r2s.estimation.pinn.network import Network
 from r2s.estimation.pinn.pulls import Pull, stacked
 from r2s.estimation.pinn.training import NOISE, Recipe, Trained, train
 from r2s.estimation.pinn.weak_form import DEGREES, weak_losses
@@ -141,7 +142,14 @@ def _found(
     return Found(_estimate(balanced, space, network, f"pinn ({words})", pulls, seconds), network)
 
 
-def _balanced(space: ParameterSpace, networks, pulls, place, noise, recipe: Recipe) -> Balanced:
+def _balanced(
+    space: ParameterSpace,
+    networks: list[Network],
+    pulls: list[Pull],
+    place: np.ndarray,
+    noise: tuple[float, float],
+    recipe: Recipe,
+) -> Balanced:
     """The estimate from the weak form. Its covariance counts the number of virtual displacements,
     by the change with one degree less each way, and what the model leaves out."""
     found = balance(space, networks, pulls, place, *noise, recipe.strain, DEGREES)

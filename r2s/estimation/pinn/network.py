@@ -4,7 +4,7 @@ The network is a module of flax. Its derivatives are carried forward through the
 value, all in one matrix product for each layer: no backward pass is nested in another.
 """
 
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -161,7 +161,7 @@ class Network(eqx.Module):
         found = self._apply(points, self.radius, pairs, method=Perceptron.jet)
         return jax.tree.map(lambda part: self.scale * part, found)
 
-    def _apply(self, points: Float[Array, "point 3"], *rest, method=None):
+    def _apply(self, points: Float[Array, "point 3"], *rest, method=None) -> Any:
         inputs = (points - self.centre[None]) / self.radius[None]
         return self.module.apply({"params": self.params}, inputs, *rest, method=method)
 

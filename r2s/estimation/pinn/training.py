@@ -225,7 +225,9 @@ def adam_chunk(
 
             gradient, losses = jax.grad(loss, has_aux=True)(params)
             change, state = optimiser.update(gradient, progress.state)
-            change = eqx.tree_at(lambda m: m.free, change, recipe.fabric_rate * change.free)
+            change = eqx.tree_at(
+                lambda m: m.free, change, replace_fn=lambda free: recipe.fabric_rate * free
+            )
             model = eqx.apply_updates(progress.model, change)
             return Progress(model, state, progress.epoch + 1), losses
 
@@ -338,7 +340,8 @@ def _stacked(history: list[tuple[Losses, Array]]) -> tuple[Losses, Array]:
 
 def _resumed(path: Path, problem: str, progress: Progress):
     """The state of a training and its history, from a checkpoint if there is one."""
-    likeness = progress, (Losses(*Losses._fields), progress.model.place)
+    place = progress.model.place
+    likeness = progress, (Losses(place, place, place, place, place), place)
     stored = checkpoints.load(path, problem, likeness)
     if not stored:
         return progress, []
