@@ -10,7 +10,9 @@ for stress.
 The Gauss-Newton loop is our own beside optimistix, which has no bounds, begins each motion anew and
 cannot estimate the noise along: from three pulls `optimistix.LevenbergMarquardt` arrives at the
 same place, to 0.05 standard errors, in 34 steps and 71 CPU seconds, and `Dogleg`, to 0.16, in 23
-steps and 49 CPU seconds, where this takes 7 steps and 12 CPU seconds.
+steps and 49 CPU seconds, where this takes 7 steps and 12 CPU seconds. Newton's method in a frame is
+our own too, with its tangent by hand and shares of a step: `optimistix.Newton` takes 2.7 times the
+CPU seconds (1.59 against 0.59 for 39 frames, in 144 steps against 124), `Dogleg` 4.2 times.
 """
 
 from typing import NamedTuple
