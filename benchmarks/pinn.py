@@ -89,8 +89,8 @@ def _problem():
     import jax.numpy as jnp
     import jax.random as jr
 
-    from r2s.estimation.pinn.data import Clamp, Pull, stacked
     from r2s.estimation.pinn.published_recipe import begin
+    from r2s.estimation.pinn.pulls import Clamp, Pull, stacked
     from r2s.fabrics.parameters import OrthotropicSpace
 
     array = lambda value: jnp.asarray(value, float)
@@ -246,7 +246,7 @@ def _pulls(name: str, seed: int, count: int = 3) -> list:
     import jax.random as jr
     import numpy as np
 
-    from r2s.estimation.pinn.data import pull_from
+    from r2s.estimation.pinn.pulls import pull_from
     from r2s.estimation.pinn.synthetic_pulls import pulled
 
     fabric, _ = _fabric(name)
@@ -330,11 +330,11 @@ def recipes(out: Path, name: str, count: int, seeds: int, number: int, alone: bo
     import jax.random as jr
 
     from r2s.estimation.pinn import published_recipe
-    from r2s.estimation.pinn.data import stacked
     from r2s.estimation.pinn.from_pulls import estimate
     from r2s.estimation.pinn.losses import strong_losses
+    from r2s.estimation.pinn.pulls import stacked
     from r2s.estimation.pinn.training import Recipe
-    from r2s.estimation.pinn.weak import weak_losses
+    from r2s.estimation.pinn.weak_form import weak_losses
     from r2s.fabrics.fabric import Fabric
 
     some, (fabric, space) = _pulls(name, 0, count), _fabric(name)
