@@ -16,7 +16,7 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 NAME = re.compile(r"`(r2s(?:\.[A-Za-z_]+)+)`")
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_the_code_of_a_document_runs(document, tmp_path):
     """All of its blocks, one after the other as a reader would type them."""

@@ -23,7 +23,7 @@ def exported(monkeypatch: pytest.MonkeyPatch):
     exported._solver.cache_clear()
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="motions")
 @pytest.mark.parametrize("peer", ["mujoco", "newton"])
 def test_an_exported_fabric_hangs_as_ours_does(exported, peer: str) -> None:
     if not exported.installed(peer):

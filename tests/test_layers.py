@@ -199,7 +199,7 @@ def landing(make):
     return eqx.filter_jit(jax.value_and_grad(loss, has_aux=True)), x, v
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="cloth")
 def test_a_large_mesh_moves_as_a_small_one_does_and_has_its_gradient():
     small, x, v = landing(lambda mesh: SelfContact.make(mesh, 256))
     large, _, _ = landing(as_if_large)

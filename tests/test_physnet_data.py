@@ -120,7 +120,7 @@ def test_images_and_frames_must_belong_together(sighting):
             Sighting.make(sighting.scenario, images, frames, *about)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="physnet")
 def test_material_points_make_data_too(tmp_path):
     about = {"material_points": True, "isotropic": True, "ranges": (), "shape": (5, 5)}
     settings = dataclasses.replace(TINY, num_fabrics=2, **about)

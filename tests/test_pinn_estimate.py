@@ -126,7 +126,7 @@ def test_sensitivities_of_the_motion_in_balance_against_differences():
 TINY = Recipe(losses=QUICK.losses, warm_up=20, adam=20, lbfgs=10, redraw=10, width=6, layers=3)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="pinn")
 def test_estimates_of_several_fabrics_at_once():
     """With a report in the words of every estimator, which survives its file."""
     with jax.numpy_dtype_promotion("standard"):
@@ -150,7 +150,7 @@ def test_without_force_the_report_says_so():
     assert not found.identifiable[:3].any()
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="pinn")
 def test_the_same_key_trains_the_same_network():
     pulls = jax.tree.map(lambda leaf: leaf[None], stacked([even_pull()]))
     spaces = jax.tree.map(lambda leaf: leaf[None], FAMILY)
@@ -159,7 +159,7 @@ def test_the_same_key_trains_the_same_network():
     np.testing.assert_array_equal(first.model.free, second.model.free)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="pinn")
 def test_training_lowers_the_losses_of_the_strong_form():
     """Adam, then L-BFGS, on points where the equation of motion is least fulfilled."""
     pulls = jax.tree.map(lambda leaf: leaf[None], stacked([even_pull()]))
@@ -242,7 +242,7 @@ def test_pulls_and_families_that_do_not_go_together():
 ANGLES = (0.0, math.pi / 2, math.pi / 4)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="pinn")
 @pytest.mark.parametrize("name", ["pink_solid", "grey_interlock"])
 def test_the_cloths_fabric_is_found(name, monkeypatch):
     """Within 5 %, from 81 markers and a force with noise; and it simulates what was unseen."""
