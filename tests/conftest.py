@@ -9,9 +9,9 @@ process holds too much.
 import ctypes
 import gc
 import os
+import resource
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import equinox as eqx
 import hypothesis
@@ -41,7 +41,9 @@ from r2s.world.scene import Control, Scene
 # Of the tests that take minutes: each group takes less than twenty on two cores.
 SLOW_GROUPS = ("cloth", "points", "motions", "estimates", "pinn", "physnet", "study", "documents")
 MOST_MEMORY = 1000  # [MB]: a process that holds more lets its compiled programs go
-gc.set_threshold(100_000, 50, 100)  # tracing makes many objects that live: a quarter was their count
+gc.set_threshold(
+    100_000, 50, 100
+)  # tracing makes many objects that live: a quarter was their count
 
 jax.config.update("jax_enable_x64", True)
 hypothesis.settings.register_profile("r2s", deadline=None)  # a first example compiles
@@ -61,7 +63,7 @@ def keep_programs(folder: str) -> None:
     """Compiled programs are written to a folder and read from it; a damaged file is compiled."""
     jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -87,6 +89,31 @@ def little_memory() -> Iterator[None]:
 def memory() -> float:
     """Resident memory of this process [MB]."""
     return psutil.Process().memory_info().rss / 1e6
+
+
+def most_memory() -> float:
+    """The most resident memory that this process had [MB]."""
+    unit = 1 if sys.platform == "darwin" else 1024  # [byte]
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+
+
+MOST_OF_EACH: list[float] = []  # processes that ran tests [MB]
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Tell the process that collects the results how much memory this one took."""
+    getattr(session.config, "workeroutput", {})["most_memory"] = most_memory()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node) -> None:
+    MOST_OF_EACH.append(getattr(node, "workeroutput", {}).get("most_memory", float("nan")))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    most = ", ".join(f"{each:.0f}" for each in MOST_OF_EACH or [most_memory()])
+    terminalreporter.write_line(f"Most memory of each process: {most} MB")
+
 
 SIZE = 0.2  # of the sheet's sides, [m]
 SHAPE = (5, 5)

@@ -53,8 +53,11 @@ normal_at = jax.jit(gauss_newton.normal_at)
 AWAY = jnp.array([0.1, -0.2, 0.1, 0.3, 0.2, -0.1, 0.4])
 
 
+PULLED = pytest.param("pulled", marks=pytest.mark.slow(group="estimates"))
+
+
 @pytest.mark.parametrize("scale", [0.0, 0.01])
-@pytest.mark.parametrize("kind", ["small", "pulled"])
+@pytest.mark.parametrize("kind", ["small", PULLED])
 def test_the_objective_has_the_gradient_that_differences_have(kind, scale, request):
     """Gauss-Newton's gradient is that of the whole rollout: contact, nearest points, force."""
     problems = (request.getfixturevalue(kind),)
@@ -346,7 +349,6 @@ def test_the_recipe_and_cma_lower_their_losses(small):
         found = diffcloud.original(small, small.space.middle(), epochs=4)
         recipe = diffcloud.recipe(small, start=jnp.full(7, 0.4), epochs=4)
     assert found.loss < found.losses[0, 0] and recipe.loss < recipe.losses[0, 0]
-    assert np.all((found.values > [0.05, 0.1]) & (found.values < [10, 10]))
     evolved = cma_es.estimate(small, evaluations=80, start=jnp.full(7, 0.9), key=jr.key(0))
     again = cma_es.estimate(small, evaluations=80, start=jnp.full(7, 0.9), key=jr.key(0))
     assert evolved.losses.min() < evolved.losses[0, 0]
@@ -413,6 +415,7 @@ def test_a_planned_motion_reveals_more_with_better_cameras():
     assert np.median(good / low) < 0.8
 
 
+@pytest.mark.slow(group="estimates")
 def test_material_points_find_a_known_modulus():
     """Of an isotropic sheet, by DiffCP; the same sheet of cloth is refused."""
     from r2s.estimation import diffcp

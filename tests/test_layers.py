@@ -210,6 +210,7 @@ def test_a_large_mesh_moves_as_a_small_one_does_and_has_its_gradient():
         assert jnp.linalg.norm(one - other) <= 1e-5 * jnp.linalg.norm(other)
 
 
+@pytest.mark.slow(group="cloth")
 def test_the_gradient_through_a_collision_agrees_with_differences():
     both, x, v = landing(lambda mesh: SelfContact.make(mesh, 256))
     (_, moved), gradient = both((FABRIC, x, v))

@@ -57,7 +57,9 @@ def test_free_fall_is_exact():
     )
 
 
-SLOW_LAWS = [pytest.param(law, marks=pytest.mark.slow(group="points")) for law in (NeoHookean, LinearSolid)]
+SLOW_LAWS = [
+    pytest.param(law, marks=pytest.mark.slow(group="points")) for law in (NeoHookean, LinearSolid)
+]
 
 
 @pytest.mark.parametrize("law", [FixedCorotated, *SLOW_LAWS])

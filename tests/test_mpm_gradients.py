@@ -208,7 +208,10 @@ def test_a_gradient_needs_a_tenth_of_the_memory_of_all_states():
 
 @pytest.mark.parametrize(
     "name, law",
-    [("fcr", FixedCorotated), pytest.param("nh", NeoHookean, marks=pytest.mark.slow(group="points"))],
+    [
+        ("fcr", FixedCorotated),
+        pytest.param("nh", NeoHookean, marks=pytest.mark.slow(group="points")),
+    ],
 )
 def test_difftaichi_is_repeated_with_its_gradients(name, law):
     """Hu et al. 2020: a block thrown into a box, 1,024 steps, in the units of that code."""
