@@ -28,6 +28,18 @@ FABRIC = Fabric.make(0.2, (60.0, 10.0, 60.0, 20.0), 1e-5)
 THICKNESS, RATE = jnp.asarray(1e-3), jnp.asarray(100.0)
 SIZE = 0.2  # [m]
 
+# compiled as a whole, which is quicker than operation by operation
+near = eqx.filter_jit(proximity_contacts)
+touching = eqx.filter_jit(collision_contacts)
+energy_of = eqx.filter_jit(contact_energy)
+hessians_of = eqx.filter_jit(contact_hessians)
+
+
+@eqx.filter_jit
+def push_of(contacts, x, before):
+    """The derivative [N] of the energy in contacts by positions."""
+    return jax.grad(lambda x: contact_energy(contacts, THICKNESS, RATE, x, before))(x)
+
 
 def crossings(mesh: Mesh, x) -> int:
     """How many edges pass through a triangle that they share no vertex with."""
@@ -75,6 +87,7 @@ def test_crossings_are_counted():
     assert crossings(mesh, x.at[16, 2].set(-0.01)) > 0
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_corner_folded_over_passes_through_nothing():
     mesh = rectangle((SIZE, SIZE), (7, 7))
     free = cloth(mesh, held=(0,), table=0.0, air=1.2, dt=1 / 60)
@@ -116,11 +129,10 @@ def test_a_layer_rests_on_another_with_its_weight():
     x, area = jnp.asarray(still.x[-1]), mesh.vertex_area
     assert np.max(np.abs(still.v[-1])) < 1e-3
     layers = SelfContact.make(mesh, 256)
-    contacts, fits = proximity_contacts(layers, mesh, THICKNESS, jnp.asarray(0.5), x)
-    energy = lambda x: contact_energy(contacts, THICKNESS, RATE, x, x)
-    push = jax.grad(lambda moved: contact_energy(contacts, THICKNESS, RATE, moved, x))(x)
+    contacts, fits = near(layers, mesh, THICKNESS, jnp.asarray(0.5), x)
+    push = push_of(contacts, x, x)
     weight = 0.2 * GRAVITY * float(jnp.sum(area[16:]))
-    assert bool(fits) and energy(x) > 0
+    assert bool(fits) and energy_of(contacts, THICKNESS, RATE, x, x) > 0
     assert -jnp.sum(push[16:, 2]) == pytest.approx(weight, rel=0.02)
     assert jnp.sum(push, axis=0) == pytest.approx(0, abs=1e-9 * weight)  # action is reaction
 
@@ -146,18 +158,20 @@ def pressed():
     random = np.random.default_rng(0)
     x = x + jnp.asarray(random.normal(size=x.shape)) * 1e-4
     layers = SelfContact.make(mesh, 256)
-    contacts, _ = proximity_contacts(layers, mesh, THICKNESS, jnp.asarray(0.5), x)
+    contacts, _ = near(layers, mesh, THICKNESS, jnp.asarray(0.5), x)
     after = x.at[16:, 2].add(-2e-3)
-    contacts, _, _ = collision_contacts(layers, mesh, THICKNESS, x, after, contacts)
+    contacts, _, _ = touching(layers, mesh, THICKNESS, x, after, contacts)
     return contacts, x, x + jnp.asarray(random.normal(size=x.shape)) * 1e-4
 
 
 def test_the_hessian_of_a_contact_is_that_of_its_energy(pressed):
     contacts, before, x = pressed
-    force = jax.grad(lambda x: contact_energy(contacts, THICKNESS, RATE, x, before))
+    def force(x):
+        return push_of(contacts, x, before)
+
     direction = jax.random.normal(jax.random.key(0), x.shape)
     expected = directional_difference(force, x, direction, 1e-8)
-    blocks = contact_hessians(contacts, THICKNESS, RATE, x, before)
+    blocks = hessians_of(contacts, THICKNESS, RATE, x, before)
     parts = jnp.einsum("paibj,pbj->pai", blocks, direction[contacts.stencils])
     found = jnp.zeros_like(x).at[contacts.stencils].add(parts)
     assert jnp.linalg.norm(expected) > 0
@@ -168,7 +182,7 @@ def test_the_hessian_of_a_contact_is_that_of_its_energy(pressed):
 def test_too_many_contacts_are_not_forgotten():
     mesh, x = two_sheets(0.5e-3)
     layers = SelfContact.make(mesh, 8)
-    assert not proximity_contacts(layers, mesh, THICKNESS, jnp.asarray(0.5), x)[1]
+    assert not near(layers, mesh, THICKNESS, jnp.asarray(0.5), x)[1]
     solver = cloth(mesh, held=range(16))
     solver = dataclasses.replace(solver, scene=dataclasses.replace(solver.scene, layers=layers))
     after = roll(solver, FABRIC, solver.init(x), 1)
@@ -239,7 +253,7 @@ def test_pressure_is_that_of_the_table(pressed):
     deepest = jnp.argmin(gaps)
     keep = jnp.arange(256) == deepest
     one = eqx.tree_at(lambda c: c.area, contacts, jnp.where(keep, contacts.area, 0))
-    push = jax.grad(lambda moved: contact_energy(one, THICKNESS, RATE, moved, x))(x)
+    push = push_of(one, x, x)
     force = contacts.area[deepest] * pressure(THICKNESS - gaps[deepest])
     expected = -force * jnp.outer(contacts.weights[deepest], contacts.normals[deepest])
     assert force > 0
