@@ -31,6 +31,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.interpolate import CubicSpline
 
+from r2s.cloth.linear.elimination import Elimination
 from r2s.estimation import diffcloud
 from r2s.estimation.descent import Budget
 from r2s.estimation.estimate import Estimate
@@ -127,6 +128,7 @@ def scenario_of(made: Made, at_rest: bool = False) -> Scenario:
     air = Air.make(made.told["wind"]["density"], drag_coefficient=2.0, friction_coefficient=0.0)
     return Scenario(
         scene=Scene(made.mesh, jnp.asarray(made.held), Table.make(-jnp.inf), air),
+        elimination=Elimination.make(made.mesh),
         start=array(made.start),
         path=array(handles),
         path_times=array(times),

@@ -79,7 +79,7 @@ def _solver(scene: str, substeps: int):
     start[:, 2] = HEIGHT
     held, path = path_of(scene, start)
     setting = r2s.Scene(mesh, jnp.array(held), Table.make(-jnp.inf), Air.make(density=0.0))
-    solver = r2s.Cloth(setting, 1 / (RATE * substeps))
+    solver = r2s.Cloth.make(setting, 1 / (RATE * substeps))
     frames = FRAMES[scene]
     times = np.arange(1, frames * substeps + 1) / (RATE * substeps)
     handles = np.stack([path(t) for t in times]).reshape(frames, substeps, len(held), 3)

@@ -78,7 +78,7 @@ def in_vacuum(scenario: Scenario) -> Cloth:
     """The cloth without air, in steps so short that they hardly damp."""
     nothing = jnp.zeros((), float)
     scene = eqx.tree_at(lambda scene: scene.air.density, scenario.scene, nothing)
-    return Cloth(scene, scenario.interval / (FINE * scenario.substeps))
+    return Cloth.make(scene, scenario.interval / (FINE * scenario.substeps))
 
 
 def truth(

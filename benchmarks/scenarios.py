@@ -55,7 +55,7 @@ _account = eqx.filter_jit(scenarios.energy_balance)
 def run(name: str, kind: str, fabric_name: str) -> tuple[Scenario, EnergyBalance, measure.Row]:
     """A scenario by a solver with a preset, and the row of its figures."""
     fabric = presets.FIVE[fabric_name]()
-    scenario = scenarios.SIX[name]().scenario(SOLVERS[kind], layers=kind == "layers")
+    scenario = scenarios.SIX[name]().scenario(SOLVERS[kind], self_contact=kind == "layers")
     solver = scenarios.material_points(scenario, fabric) if kind == "points" else None
     before = time.perf_counter()
     found: EnergyBalance = jax.block_until_ready(_account(scenario, fabric, None, solver))

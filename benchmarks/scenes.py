@@ -55,7 +55,7 @@ def hang(size: int, substeps: int, frames: int = FRAMES):
     mesh = sheet(size)
     held = jnp.array([0, size - 1])
     scene = r2s.Scene(mesh, held, Table.make(-jnp.inf), Air.make(density=0.0))
-    solver = r2s.Cloth(scene, 1 / (60 * substeps))
+    solver = r2s.Cloth.make(scene, 1 / (60 * substeps))
     x = flat(mesh)
     falling = jnp.where(scene.is_free[:, None], jnp.array([[0.0, 0.0, -GRAVITY]]), 0)
     handles = jnp.broadcast_to(x[held], (frames, substeps, 2, 3))
@@ -67,7 +67,7 @@ def lift(size: int):
     """Fabric, solver, start and controls of "lift"."""
     mesh = sheet(size)
     scene = r2s.Scene(mesh, jnp.array([0]), Table.make(-jnp.inf), Air.make(1.0, 2.0, 0.0))
-    solver = r2s.Cloth(scene, LIFT_STEP)
+    solver = r2s.Cloth.make(scene, LIFT_STEP)
     x = flat(mesh)
     time = jnp.arange(1, LIFT_FRAMES + 1)[:, None, None, None] / LIFT_FRAMES
     handles = x[:1] + time**2 * (3 - 2 * time) * jnp.array(LIFT_SHIFT)  # a smoothstep

@@ -19,7 +19,7 @@ STEPS = 40
 sheet = r2s.rectangle((0.15, 0.05), (7, 3))  # [m]
 held = jnp.arange(6)  # the first two rows: a strip that is clamped, and droops
 scene = r2s.Scene(sheet, held, Table.make(-jnp.inf), Air.make())
-solver = r2s.Cloth(scene, dt=0.02)  # [s]
+solver = r2s.Cloth.make(scene, dt=0.02)  # [s]
 start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
 space = OrthotropicSpace.make(density=0.2)  # [kg/m^2]
 BENDING = [bound.name for bound in space.ranges].index("bending")

@@ -20,7 +20,7 @@ from r2s.world.contact import Table
 STEPS, FASTEST = 20, 0.5  # [m/s]
 sheet = r2s.rectangle((0.2, 0.2), (4, 4))  # [m]
 scene = r2s.Scene(sheet, jnp.array([0]), Table.make(-jnp.inf), Air.make())
-solver = r2s.Cloth(scene, dt=0.02)  # [s]
+solver = r2s.Cloth.make(scene, dt=0.02)  # [s]
 start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
 GOAL = start[-1]
 

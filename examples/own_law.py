@@ -36,7 +36,7 @@ class Stiffening(eqx.Module):
 sheet = r2s.rectangle((0.2, 0.2), (5, 5))  # [m]
 held = jnp.array([0, 4])
 scene = r2s.Scene(sheet, held, Table.make(-jnp.inf), Air.make())
-solver = r2s.Cloth(scene, dt=0.02)  # [s]
+solver = r2s.Cloth.make(scene, dt=0.02)  # [s]
 start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
 handles = jnp.broadcast_to(start[held], (1, 20, 2, 3))
 controls = r2s.Control(handles, jnp.zeros((1, 20, 3)))

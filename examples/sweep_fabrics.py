@@ -22,7 +22,7 @@ FABRICS, STEPS = 1000, 10
 sheet = r2s.rectangle((0.2, 0.2), (4, 4))  # [m]
 held = jnp.array([0, 3])
 scene = r2s.Scene(sheet, held, Table.make(-jnp.inf), Air.make())
-solver = r2s.Cloth(scene, dt=0.025)  # [s]
+solver = r2s.Cloth.make(scene, dt=0.025)  # [s]
 start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
 handles = jnp.broadcast_to(start[held], (1, STEPS, 2, 3))
 controls = r2s.Control(handles, jnp.zeros((1, STEPS, 3)))

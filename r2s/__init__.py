@@ -1,49 +1,120 @@
 """r2s: real-to-sim for fabrics.
 
-In reading order:
+Rooms, in the order in which they build on each other:
 
-- `units`, `fabric`, `presets`, `family`: what a fabric is, and which an estimator may choose.
-- `mesh`, `physics`: the sheet at rest; membrane, bending, air, contact.
-- `arcsim`, `cards`, `export`: fabrics from and to files, and to other simulators.
-- `neighbours`, `layers`: contact of the sheet with itself.
-- `linear`: sparse matrices over a mesh, and their factor.
-- `increment`, `implicit`, `cloth`: the energy of a step, its minimiser, the solver.
-- `mpm`: the second simulator, of material points.
-- `scene`, `solver`, `scenario`: what an experiment fixes, motions over time.
-- `trajectories`, `scenarios`: the six experiments of the study, on either solver.
-- `recording`, `clouds`, `manifest`, `synthetic`, `observe`: observations, real and made.
-- `video`, `markers`, `plane`, `forces`: stretching, from a video and a force log.
-- `data`, `rgbench`: public data sets. `show`, `cli`: pictures, and the command line.
-- `surface`, `losses`, `metrics`: distances between clouds and sheets.
-- `estimators`: DIFFCLOUD, DiffCP, CMA-ES, PhysNet, the physics-informed network.
-- `gradcheck`: derivatives against differences. `sweep`: thousands of fabrics at once.
-- `interactive`: sliders for a fabric. `study`: the main job, its tables and report.
+- `units`, `failures`: constants and conversions; why a run failed.
+- `geometry`: the sheet at rest, and what a moved one shows. `laws`: energies of one element.
+- `fabrics`: what is estimated. `world`: what a fabric meets: air, table, grippers.
+- `cloth`, `mpm`: the two solvers. `solver`: from steps to motions.
+- `recordings`: observations, from files to one form. `scenarios`: the six experiments.
+- `evaluation`: how near a simulation comes. `estimation`: fabrics from recordings.
+- `sweep`, `gradient_check`: thousands of fabrics at once; derivatives against differences.
+- `export`, `viewer`, `study`, `commands`: other simulators, pictures, the study, the command line.
+
+The names below are the public surface; what changes here is in the changelog.
 """
 
 from r2s.cloth.cloth import Cloth, ClothState
-from r2s.cloth.self_contact.contacts import SelfContact
+from r2s.estimation.cards import Card, Provenance
+from r2s.estimation.cards import read as read_card
+from r2s.estimation.cards import write as write_card
+from r2s.estimation.descent import Budget
+from r2s.estimation.estimate import Estimate, Nuisance
+from r2s.estimation.identifiability import sensitivity
+from r2s.estimation.problem import NuisancePrior, Problem
+from r2s.evaluation.metrics import distances
+from r2s.fabrics import presets
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import OrthotropicSpace
+from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
+from r2s.failures import Failure
 from r2s.geometry.mesh import Mesh, rectangle
-from r2s.recordings.recording import Recording
-from r2s.scenarios.scenario import Scenario, rollout
-from r2s.solver import Trajectory, predicted_memory, simulate
+from r2s.laws.bending import BendingLaw, HingeBending, HingeLaw
+from r2s.laws.membrane import MembraneLaw, OrthotropicMembrane, SpringMembrane
+from r2s.laws.plate import OrthotropicPlate, PlateBending, PlateLaw
+from r2s.laws.tables import TableBending, TableMembrane
+from r2s.recordings.manifest import read_recordings
+from r2s.recordings.recording import Recording, RecordingInfo, SheetPlacement, make_recording
+from r2s.recordings.recording import load as load_recording
+from r2s.recordings.recording import save as save_recording
+from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
+from r2s.scenarios.on_points import material_points
+from r2s.scenarios.scenario import Scenario, from_recording, rollout
+from r2s.scenarios.six import Experiment, fling, folding, lifting, shaking, stretching, wind
+from r2s.scenarios.synthetic import record
+from r2s.solver import Solver, Trajectory, predicted_memory, simulate
+from r2s.world.air import Air, Fan
+from r2s.world.contact import Table
 from r2s.world.scene import Control, Scene
 
 __all__ = [
+    # what a fabric is
+    "Fabric",
+    "presets",
+    "MembraneLaw",
+    "OrthotropicMembrane",
+    "SpringMembrane",
+    "TableMembrane",
+    "BendingLaw",
+    "HingeLaw",
+    "HingeBending",
+    "TableBending",
+    "PlateLaw",
+    "PlateBending",
+    "OrthotropicPlate",
+    # the sheet, and what it meets
+    "Mesh",
+    "rectangle",
+    "Scene",
+    "Control",
+    "Air",
+    "Fan",
+    "Table",
+    # solvers and motions
+    "Solver",
     "Cloth",
     "ClothState",
-    "Control",
-    "Fabric",
-    "SelfContact",
-    "Mesh",
-    "OrthotropicSpace",
-    "Recording",
-    "Scenario",
-    "Scene",
-    "Trajectory",
-    "rollout",
-    "predicted_memory",
-    "rectangle",
     "simulate",
+    "Trajectory",
+    "Failure",
+    "predicted_memory",
+    # experiments
+    "Scenario",
+    "Experiment",
+    "lifting",
+    "wind",
+    "stretching",
+    "folding",
+    "fling",
+    "shaking",
+    "rollout",
+    "material_points",
+    "energy_balance",
+    "EnergyBalance",
+    "clamp_force",
+    # recordings
+    "Recording",
+    "RecordingInfo",
+    "SheetPlacement",
+    "make_recording",
+    "load_recording",
+    "save_recording",
+    "read_recordings",
+    "from_recording",
+    "record",
+    "distances",
+    # estimates
+    "ParameterSpace",
+    "OrthotropicSpace",
+    "IsotropicSpace",
+    "Range",
+    "Problem",
+    "NuisancePrior",
+    "Budget",
+    "Estimate",
+    "Nuisance",
+    "sensitivity",
+    "Card",
+    "Provenance",
+    "read_card",
+    "write_card",
 ]

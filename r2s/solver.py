@@ -6,9 +6,10 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from r2s.cloth.newton import SAVED
+from r2s.failures import Failure, describe, first_failure, no_failure
 from r2s.world.scene import Control
 
 State = TypeVar("State")
@@ -44,12 +45,39 @@ def predicted_memory(function: Callable, *args) -> int:
 
 
 class Trajectory(eqx.Module):
-    """- `x`: positions at the end of every frame, [m].
-    - `ok`: whether they are finite; False from the frame on in which a run diverged.
+    """A motion, and whether and where it failed. Under `jax.vmap` every field has a batch axis.
+
+    - `x`: positions at the end of every frame, [m].
+    - `ok`: whether they are finite; False from the frame on in which a run failed.
+    - `failure`: why, an `r2s.failures.Failure`; 0: it did not fail.
+    - `failed_frame`, `failed_step`: the frame, and the step in it, of the first failure; -1: none.
     """
 
     x: Float[Array, "frame vertex axis"]
     ok: Bool[Array, " frame"]
+    failure: Int[Array, ""]
+    failed_frame: Int[Array, ""]
+    failed_step: Int[Array, ""]
+
+    def from_frame(self, first: int) -> "Trajectory":
+        """The motion from a frame on, which becomes frame 0. A failure before it has a negative
+        frame.
+        """
+        frame = jnp.where(self.failure == 0, -1, self.failed_frame - first)
+        return Trajectory(self.x[first:], self.ok[first:], self.failure, frame, self.failed_step)
+
+    def explain(self) -> str:
+        """One sentence: what failed, in which frame and step; empty when nothing did.
+
+        It is that of one run; of a batch, pick a member first. Raises `ValueError` for a batch.
+        """
+        if self.failure.ndim:
+            raise ValueError(f"expected one run, got a batch of shape {self.failure.shape}")
+        if not int(self.failure):
+            return ""
+        frame, step = int(self.failed_frame), int(self.failed_step)
+        where = f"frame {frame}" if frame >= 0 else f"{-frame} frames before the first one"
+        return f"failed in {where}, step {step}: {describe(int(self.failure))}"
 
 
 def simulate(
@@ -70,16 +98,35 @@ def simulate(
     policy = jax.checkpoint_policies.save_only_these_names(*names)
 
     def substep(state, control):
-        return solver.step(fabric, state, control), None
+        state = solver.step(fabric, state, control)
+        return state, _failure(state)
 
     substep = jax.checkpoint(substep, policy=policy)
 
     def frame(state, control):
-        state, _ = jax.lax.scan(substep, state, control)
-        return state, state.x  # pyright: ignore[reportAttributeAccessIssue]
+        state, failures = jax.lax.scan(substep, state, control)
+        return state, (state.x, failures)  # pyright: ignore[reportAttributeAccessIssue]
 
     frame = jax.checkpoint(frame, policy=policy)
 
-    _, x = jax.lax.scan(frame, start, controls)
+    _, (x, failures) = jax.lax.scan(frame, start, controls)
     ok = jnp.all(jnp.isfinite(x), axis=(1, 2))
-    return Trajectory(x, ok)
+    return Trajectory(x, ok, *_first_failure(failures))
+
+
+def _failure(state: Any) -> Int[Array, ""]:
+    """The failure that a state carries, or that its positions are not finite."""
+    finite = jnp.all(jnp.isfinite(jax.lax.stop_gradient(state.x)))
+    seen = jnp.where(finite, Failure.NONE.value, Failure.NON_FINITE.value)
+    return first_failure(getattr(state, "failure", no_failure()), seen)
+
+
+def _first_failure(failures: Int[Array, "frame step"]) -> tuple[Array, Array, Array]:
+    """Code, frame and step of the first failure."""
+    if not failures.size:
+        return no_failure(), no_failure() - 1, no_failure() - 1
+    failures, steps = failures.ravel(), failures.shape[1]
+    first = jnp.argmax(failures != Failure.NONE.value)
+    code = failures[first]
+    failed = code != Failure.NONE.value
+    return code, jnp.where(failed, first // steps, -1), jnp.where(failed, first % steps, -1)

@@ -23,15 +23,8 @@ import psutil
 import pytest
 
 from r2s.cloth.cloth import Cloth, ClothState
-from r2s.cloth.potential import (
-    bending_areas,
-    bends,
-    curvatures,
-    hinge_angles,
-    strains,
-    vertex_mass,
-)
 from r2s.fabrics.fabric import Fabric
+from r2s.geometry.elements import hinge_angles, hinge_curvatures, strains, vertex_masses
 from r2s.geometry.mesh import Mesh, rectangle
 from r2s.units import GRAVITY
 from r2s.world.air import Air
@@ -143,7 +136,7 @@ def unchecked():
 def cloth(mesh: Mesh, held=(), table: float = -jnp.inf, air: float = 0.0, dt: float = DT) -> Cloth:
     """A solver for a sheet; by default free, without table, in vacuum."""
     held = jnp.asarray(tuple(held), int)
-    return Cloth(Scene(mesh, held, Table.make(table), Air.make(density=air)), dt)
+    return Cloth.make(Scene(mesh, held, Table.make(table), Air.make(density=air)), dt)
 
 
 def flat(mesh: Mesh, height: float = 0.0):
@@ -184,15 +177,15 @@ def roll(solver: Cloth, fabric: Fabric, state: ClothState, count: int, path=None
 def stored_energy(mesh: Mesh, fabric: Fabric, x):
     """Energy [J] in the strains and curvatures of a sheet."""
     membrane = jax.vmap(fabric.membrane.energy_density)(strains(mesh, x))
-    hinges = curvatures(mesh, hinge_angles(mesh, x))
-    bending = jax.vmap(fabric.bending.energy_density)(bends(mesh, fabric.bending, hinges))
-    return jnp.sum(mesh.area * membrane) + jnp.sum(bending_areas(mesh, fabric.bending) * bending)
+    hinges = hinge_curvatures(mesh, hinge_angles(mesh, x))
+    bending = jax.vmap(fabric.bending.energy_density)(fabric.bending.curvatures(mesh, hinges))
+    return jnp.sum(mesh.area * membrane) + jnp.sum(fabric.bending.areas(mesh) * bending)
 
 
 @eqx.filter_jit
 def energy(mesh: Mesh, fabric: Fabric, x, v):
     """Stored, kinetic and gravitational energy [J] of a sheet."""
-    mass = vertex_mass(mesh, fabric)
+    mass = vertex_masses(mesh, fabric.density)
     motion = jnp.sum(mass * (jnp.sum(v**2, axis=1) / 2 + GRAVITY * x[:, 2]))
     return stored_energy(mesh, fabric, x) + motion
 

@@ -14,10 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from r2s.cloth.potential import curvatures, hinge_angles
+from r2s.geometry.elements import green_strain, hinge_angle, hinge_angles, hinge_curvatures
 from r2s.geometry.mesh import Mesh
-from r2s.laws.bending import hinge_angle
-from r2s.laws.membrane import green_strain
 from r2s.laws.tables import DiffSimTableBending, DiffSimTableMembrane
 
 FOLDER = Path(__file__).parents[2] / "shared" / "data" / "diffsim_reference"
@@ -173,7 +171,7 @@ def _internal(setting, x, x_before):
     """Forces [N] of membrane and bending, and minus their approximate derivative [N/m]."""
     mesh = setting.mesh
     laws = jax.vmap(setting.bending.at)(
-        mesh.hinge_direction, curvatures(mesh, hinge_angles(mesh, x_before))
+        mesh.hinge_direction, hinge_curvatures(mesh, hinge_angles(mesh, x_before))
     )
     of_face = lambda *element: _face(setting.membrane, *element)
     force = jnp.zeros(x.size)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from r2s.cloth.cloth import Cloth
+from r2s.cloth.linear.elimination import Elimination
 from r2s.estimation.descent import Budget
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import OrthotropicSpace
@@ -44,6 +45,7 @@ def dropped(air: float = 0.0, brake: float | None = None) -> Scenario:
     falling = jnp.zeros_like(start).at[1:, 2].set(-GRAVITY)
     return Scenario(
         scene=Scene(mesh, jnp.array([0]), Table.make(-jnp.inf), Air.make(air)),
+        elimination=Elimination.make(mesh),
         start=start,
         path=jnp.zeros((2, 1, 3)),
         path_times=jnp.array([0.0, 1.0]),
@@ -86,7 +88,7 @@ def test_the_first_acceleration_reaches_a_braked_solver_and_no_other_than_the_cl
             return x
 
     assert begin(Explicit(), dataclasses.replace(scenario, brake=None)) is scenario.start
-    free = Cloth(scenario.scene, 0.01)
+    free = Cloth.make(scenario.scene, 0.01)
     assert jnp.all(begin(free, dataclasses.replace(scenario, acceleration=None)).v_before == 0)
 
 

@@ -8,10 +8,9 @@ from conftest import directional_difference, flat, rotation, stored_energy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.cloth.potential import curvatures, hinge_angles
 from r2s.fabrics.fabric import Fabric
+from r2s.geometry.elements import hinge_angle, hinge_angles, hinge_curvatures, unwrapped
 from r2s.geometry.mesh import rectangle
-from r2s.laws.bending import hinge_angle, unwrapped
 
 STIFFNESS = 3e-5  # [N m]
 gradient = jax.jit(jax.grad(hinge_angle))
@@ -20,7 +19,11 @@ angle_of = jax.jit(hinge_angle)
 
 def bending_energy(mesh, x):
     """Energy [J] in the curvatures alone."""
-    return STIFFNESS / 2 * jnp.sum(mesh.hinge_area * curvatures(mesh, hinge_angles(mesh, x)) ** 2)
+    return (
+        STIFFNESS
+        / 2
+        * jnp.sum(mesh.hinge_area * hinge_curvatures(mesh, hinge_angles(mesh, x)) ** 2)
+    )
 
 
 def rolled(mesh, radius, axis):
@@ -32,7 +35,7 @@ def rolled(mesh, radius, axis):
 
 def test_a_flat_sheet_stores_no_energy(sheet, fabric):
     x = flat(sheet) @ rotation(0.4, 0).T @ rotation(1.1, 2).T
-    assert jnp.max(jnp.abs(curvatures(sheet, hinge_angles(sheet, x)))) < 1e-12
+    assert jnp.max(jnp.abs(hinge_curvatures(sheet, hinge_angles(sheet, x)))) < 1e-12
     assert stored_energy(sheet, fabric, x) < 1e-20
 
 

@@ -24,8 +24,9 @@ from conftest import (
 
 from r2s.cloth.cloth import ClothState
 from r2s.cloth.linear.pattern import dense
-from r2s.cloth.potential import hessian, potential, residual, vertex_mass
+from r2s.cloth.potential import hessian, potential, residual
 from r2s.fabrics.fabric import Fabric
+from r2s.geometry.elements import vertex_masses
 from r2s.geometry.mesh import rectangle
 from r2s.units import AIR_DENSITY, GRAVITY
 from r2s.world.scene import Control, along_path
@@ -74,7 +75,7 @@ def test_momentum_changes_by_gravity_alone(sheet, fabric):
     v = jnp.asarray(random.normal(size=(25, 3)) * 0.3)
     solver = cloth(sheet)
     states = roll(solver, fabric, solver.init(x, v), 20)
-    mass = np.asarray(vertex_mass(sheet, fabric))
+    mass = np.asarray(vertex_masses(sheet, fabric.density))
     momentum = np.einsum("v,tvi->ti", mass, states.v)
     assert momentum[:, :2] == pytest.approx(np.tile(momentum[0, :2], (21, 1)), abs=1e-12)
     weight = 0.2 * SIZE**2 * GRAVITY
@@ -91,7 +92,7 @@ def test_damping_does_not_brake_a_rotation(sheet):
         fabric = Fabric.make(0.2, (3e3, 6e2, 2e3, 8e2), 2e-5, damping=damping)
         states = roll(solver, fabric, ClothState(x, v, x @ back, v @ back), 50)
         place = states.x - states.x.mean(axis=1, keepdims=True)
-        mass = np.asarray(vertex_mass(sheet, fabric))[:, None]
+        mass = np.asarray(vertex_masses(sheet, fabric.density))[:, None]
         moment = np.sum(mass * np.cross(place, states.v), axis=1)[:, 2]
         assert moment[-1] == pytest.approx(moment[0], rel=1e-4)  # BDF2's own damping is 2e-5
         spin.append(moment[-1])
@@ -181,7 +182,7 @@ def disturbed(sheet):
     solver = cloth(sheet, FIRST_ROW, table=0.0, air=AIR_DENSITY)
     fabric = Fabric.make(0.2, LAW, 1e-4)
     # both Hessians and the force, in one compilation
-    matrix = lambda at, x, exactness: dense(at.mesh.pattern, hessian(at, x, exactness))
+    matrix = lambda at, x, exactness: dense(at.elimination.pattern, hessian(at, x, exactness))
     both = eqx.filter_jit(lambda at, x: (matrix(at, x, 1.0), matrix(at, x, 0.0), residual(at, x)))
 
     def state(seed):
@@ -189,7 +190,7 @@ def disturbed(sheet):
         x = flat(sheet, 2e-3) + noise[0]
         start = ClothState(x, 20 * noise[1], x + noise[2], 20 * noise[1])
         control = Control(x[:5], jnp.array([2.0, 1.0, -1.0]))
-        return solver.increment(fabric, start, control), x + noise[3]
+        return solver.potential(fabric, start, control), x + noise[3]
 
     return state, both
 
@@ -221,7 +222,7 @@ def test_the_convex_hessian_is_positive_definite(disturbed, seed):
     state, both = disturbed
     increment, x = state(seed)
     exact, convex, _ = both(increment, x)
-    mass = vertex_mass(increment.mesh, increment.fabric)
+    mass = vertex_masses(increment.mesh, increment.fabric.density)
     inertia = float(jnp.min(mass)) * float(increment.rate) ** 2
     assert jnp.linalg.eigvalsh(convex)[0] >= inertia * (1 - 1e-6)
     assert jnp.linalg.eigvalsh(exact)[0] < 0  # so these states are a test
@@ -233,7 +234,7 @@ def test_the_convex_hessian_is_exact_on_a_flat_sheet_under_tension(sheet, distur
     x = 1.1 * flat(sheet, 1.0)
     still = solver.init(x)
     fabric = Fabric.make(0.2, LAW, 1e-4)
-    increment = solver.increment(fabric, still, Control(x[:5], jnp.zeros(3)))
+    increment = solver.potential(fabric, still, Control(x[:5], jnp.zeros(3)))
     exact, convex, _ = both(increment, x)
     assert np.asarray(convex) == pytest.approx(np.asarray(exact), rel=1e-9, abs=1e-9)
 
@@ -243,7 +244,7 @@ def test_the_step_ends_in_balance(sheet, fabric):
     state = solver.init(hanging(sheet, 0.5))
     control = Control(state.x[:5], jnp.zeros(3))
     after = step(solver, fabric, state, control)
-    force = eqx.filter_jit(residual)(solver.increment(fabric, state, control), after.x)
+    force = eqx.filter_jit(residual)(solver.potential(fabric, state, control), after.x)
     assert jnp.max(jnp.abs(force[5:])) < 1e-9 * 0.2 * SIZE**2 * GRAVITY
 
 

@@ -59,7 +59,7 @@ def cloth_of(setting, dt):
         pytest.skip("DiffSim's drag along the faces is linear in the flow, ours is quadratic")
     air = Air.make(float(setting.air_density), drag_coefficient=2.0, friction_coefficient=0.0)
     held = jnp.flatnonzero(setting.spring > 0)
-    return Cloth(Scene(setting.mesh, held, Table.make(-jnp.inf), air), dt)
+    return Cloth.make(Scene(setting.mesh, held, Table.make(-jnp.inf), air), dt)
 
 
 def fabric_of(setting, damping):

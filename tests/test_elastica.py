@@ -15,12 +15,12 @@ from conftest import cloth, flat, roll
 from scipy.integrate import solve_bvp
 from scipy.linalg import eigh
 
-from r2s.cloth.potential import bending_areas, bends, curvatures, hinge_angles, strains
 from r2s.fabrics.fabric import Fabric
+from r2s.geometry.elements import hinge_angles, hinge_curvatures, strains
 from r2s.geometry.mesh import rectangle
 from r2s.laws.bending import OrthotropicBending
 from r2s.laws.membrane import OrthotropicMembrane
-from r2s.laws.plate import OrthotropicPlate, PlateBending, PlateLaw
+from r2s.laws.plate import OrthotropicPlate, PlateBending
 from r2s.units import GRAVITY
 
 LENGTH = 0.2  # [m], with the held cell
@@ -132,17 +132,17 @@ def heights_matrix(cells: int, law, across: int = 2, diagonals: str = "falling")
     """A strip, and the second derivative [N/m] of its bending energy in the heights, when flat."""
     mesh = strip(cells, 0, across, diagonals)
     raised = lambda height: jnp.concatenate([mesh.rest, height[:, None]], axis=1)
-    curvature = lambda height: curvatures(mesh, hinge_angles(mesh, raised(height)))
+    curvature = lambda height: hinge_curvatures(mesh, hinge_angles(mesh, raised(height)))
     at_rest = jnp.zeros(mesh.rest.shape[0])
-    if isinstance(law, PlateLaw):
-        laws = jax.vmap(law.at)(bends(mesh, law, curvature(at_rest)))
+    if law.element == "patches":
+        laws = jax.vmap(law.at)(law.curvatures(mesh, curvature(at_rest)))
     else:
         laws = jax.vmap(law.at)(mesh.hinge_direction, curvature(at_rest))
 
     def energy(height):
-        bent = bends(mesh, laws, curvature(height))
+        bent = laws.curvatures(mesh, curvature(height))
         densities = jax.vmap(lambda law, bent: law.energy_density(bent))(laws, bent)
-        return jnp.sum(bending_areas(mesh, laws) * densities)
+        return jnp.sum(laws.areas(mesh) * densities)
 
     return mesh, np.asarray(jax.jit(jax.hessian(energy))(at_rest))
 

@@ -48,7 +48,7 @@ def run(sheet):
 
     def run(inputs):
         scene = eqx.tree_at(lambda scene: scene.table, fixed.scene, Table(inputs.height))
-        solver = Cloth(scene, DT, tolerance=1e-13)  # so that differences have little noise
+        solver = Cloth.make(scene, DT, tolerance=1e-13)  # so that differences have little noise
         times = jnp.arange(1, FRAMES * SUBSTEPS + 1).astype(float) * DT
         handles = along_path(times, KNOTS, inputs.path).reshape(FRAMES, SUBSTEPS, 1, 3)
         controls = Control(handles, jnp.broadcast_to(inputs.wind, (FRAMES, SUBSTEPS, 3)))
@@ -118,7 +118,7 @@ def test_the_gradient_agrees_with_differences(name, value_and_grad, gradient, in
 def hung(sheet, fabric):
     """A sheet that hangs from its first row, taut, in wind: value and gradient, and its inputs."""
     fixed = cloth(sheet, held=range(5), air=AIR_DENSITY)
-    solver = Cloth(fixed.scene, DT, tolerance=1e-13)
+    solver = Cloth.make(fixed.scene, DT, tolerance=1e-13)
     x = jnp.stack([0 * sheet.rest[:, 0], sheet.rest[:, 1], -1.01 * sheet.rest[:, 0]], axis=1)
     path = x[:5][None] + jnp.array([0.0, 0.3, 1.0])[:, None, None] * jnp.array(
         [[[0.02, 0.01, 0.0]]]

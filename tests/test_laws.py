@@ -9,8 +9,8 @@ from conftest import DT, SHAPE, SIZE, cloth, everywhere, flat, roll, rotation, s
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.cloth.potential import curvatures, hinge_angles, strains
 from r2s.fabrics.fabric import Fabric
+from r2s.geometry.elements import hinge_angles, hinge_curvatures, strains
 from r2s.geometry.mesh import Mesh
 from r2s.laws.bending import HingeBending, OrthotropicBending, SpringBending
 from r2s.laws.membrane import OrthotropicMembrane, SpringMembrane
@@ -35,7 +35,7 @@ def membrane_energy(mesh, membrane, x):
 @eqx.filter_jit
 def bending_energy(mesh, bending, x):
     """Energy [J] in the curvatures alone."""
-    curvature = curvatures(mesh, hinge_angles(mesh, x))
+    curvature = hinge_curvatures(mesh, hinge_angles(mesh, x))
     laws = jax.vmap(bending.at)(mesh.hinge_direction, curvature)
     density = jax.vmap(lambda law, curvature: law.energy_density(curvature))(laws, curvature)
     return jnp.sum(mesh.hinge_area * density)
@@ -298,7 +298,7 @@ def test_the_same_wind_at_every_vertex_is_a_uniform_one(sheet, fabric):
     wind, none = jnp.array([1.0, -2.0, 3.0]), start.x[:0]
     uniform, each = (
         # what a step is made of; for each kind of wind it would compile anew
-        solver.increment(fabric, start, Control(none, wind))
+        solver.potential(fabric, start, Control(none, wind))
         for wind in (wind, everywhere(wind, sheet))
     )
     assert np.asarray(uniform.wind) == pytest.approx(np.tile(wind, (32, 1)), abs=1e-12)

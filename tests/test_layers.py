@@ -9,36 +9,35 @@ import numpy as np
 import pytest
 from conftest import cloth, directional_difference, everywhere, flat, roll
 
-from r2s.cloth.self_contact.broad_phase import BVH, build_bvh
-from r2s.cloth.self_contact.contacts import (
-    SelfContact,
-    collision_contacts,
-    contact_energy,
-    contact_hessians,
-    proximity_contacts,
-)
+from r2s.cloth.cloth import Cloth
+from r2s.cloth.linear.elimination import Elimination
+from r2s.cloth.self_contact import contacts as contact
+from r2s.cloth.self_contact import detection
+from r2s.cloth.self_contact.broad_phase import BVH, Pairs, build_bvh
+from r2s.cloth.self_contact.detection import SelfContact
 from r2s.fabrics.fabric import Fabric
+from r2s.failures import Failure
 from r2s.geometry.mesh import Mesh, rectangle
 from r2s.solver import simulate
 from r2s.units import GRAVITY
-from r2s.world.contact import pressure
-from r2s.world.scene import Control
+from r2s.world.air import Air
+from r2s.world.contact import Table, pressure
+from r2s.world.scene import Control, Scene
 
 FABRIC = Fabric.make(0.2, (60.0, 10.0, 60.0, 20.0), 1e-5)
 THICKNESS, RATE = jnp.asarray(1e-3), jnp.asarray(100.0)
 SIZE = 0.2  # [m]
 
 # compiled as a whole, which is quicker than operation by operation
-near = eqx.filter_jit(proximity_contacts)
-touching = eqx.filter_jit(collision_contacts)
-energy_of = eqx.filter_jit(contact_energy)
-hessians_of = eqx.filter_jit(contact_hessians)
+touching, colliding = eqx.filter_jit(detection.touching), eqx.filter_jit(detection.colliding)
+contact_energy = eqx.filter_jit(contact.contact_energy)
+contact_hessians = eqx.filter_jit(contact.contact_hessians)
 
 
 @eqx.filter_jit
 def push_of(contacts, x, before):
     """The derivative [N] of the energy in contacts by positions."""
-    return jax.grad(lambda x: contact_energy(contacts, THICKNESS, RATE, x, before))(x)
+    return jax.grad(lambda x: contact.contact_energy(contacts, THICKNESS, RATE, x, before))(x)
 
 
 def crossings(mesh: Mesh, x) -> int:
@@ -62,12 +61,15 @@ def crossings(mesh: Mesh, x) -> int:
 
 def as_if_large(mesh: Mesh) -> SelfContact:
     """As they are made for a large mesh."""
-    return SelfContact(build_bvh(np.asarray(mesh.faces), np.asarray(mesh.rest)), None, 256)
+    return SelfContact(build_bvh(np.asarray(mesh.faces), np.asarray(mesh.rest)), 256)
 
 
-def with_layers(solver, make=lambda mesh: SelfContact.make(mesh, 256)):
-    layers = make(solver.scene.mesh)
-    return dataclasses.replace(solver, scene=dataclasses.replace(solver.scene, layers=layers))
+def with_self_contact(solver, make=lambda mesh: SelfContact.make(mesh, 256)):
+    mesh = solver.scene.mesh
+    search = make(mesh)
+    couples_all = isinstance(search.search, Pairs)
+    elimination = Elimination.make(mesh, couples_all)
+    return dataclasses.replace(solver, elimination=elimination, self_contact=search)
 
 
 def two_sheets(gap: float, size: float = 0.1, count: int = 4):
@@ -97,7 +99,7 @@ def test_a_corner_folded_over_passes_through_nothing():
     handle = jnp.stack([along * (SIZE - 0.01), along * (SIZE - 0.01), height], axis=-1)
     controls = Control(handle.reshape(20, 3, 1, 3), jnp.zeros((20, 3, 3)))
     through = []
-    for solver in (free, with_layers(free)):
+    for solver in (free, with_self_contact(free)):
         start = solver.init(flat(mesh, 1e-3))
         motion = eqx.filter_jit(simulate)(solver, FABRIC, start, controls)
         assert bool(jnp.all(motion.ok))
@@ -109,7 +111,7 @@ def test_a_corner_folded_over_passes_through_nothing():
 @pytest.mark.parametrize("speed", [1.0, 5.0])
 def test_a_sheet_thrown_at_another_does_not_tunnel(speed):
     mesh, x = two_sheets(0.02)
-    solver = with_layers(cloth(mesh, held=range(16), dt=1 / 60))
+    solver = with_self_contact(cloth(mesh, held=range(16), dt=1 / 60))
     v = everywhere([0.0, 0.0, 0.0], mesh).at[16:, 2].set(-speed)
     states = roll(solver, FABRIC, solver.init(x, v), 12)
     assert np.all(np.isfinite(states.x))
@@ -119,7 +121,7 @@ def test_a_sheet_thrown_at_another_does_not_tunnel(speed):
 
 def test_a_layer_rests_on_another_with_its_weight():
     mesh, x = two_sheets(0.9e-3)
-    solver = with_layers(cloth(mesh, held=range(16)))
+    solver = with_self_contact(cloth(mesh, held=range(16)))
     still = roll(
         solver,
         Fabric.make(0.2, (60.0, 10.0, 60.0, 20.0), 1e-5, mass_damping=20.0),
@@ -128,11 +130,11 @@ def test_a_layer_rests_on_another_with_its_weight():
     )
     x, area = jnp.asarray(still.x[-1]), mesh.vertex_area
     assert np.max(np.abs(still.v[-1])) < 1e-3
-    layers = SelfContact.make(mesh, 256)
-    contacts, fits = near(layers, mesh, THICKNESS, jnp.asarray(0.5), x)
+    search = SelfContact.make(mesh, 256)
+    contacts, fits = touching(search, mesh, THICKNESS, jnp.asarray(0.5), x)
     push = push_of(contacts, x, x)
     weight = 0.2 * GRAVITY * float(jnp.sum(area[16:]))
-    assert bool(fits) and energy_of(contacts, THICKNESS, RATE, x, x) > 0
+    assert bool(fits) and contact_energy(contacts, THICKNESS, RATE, x, x) > 0
     assert -jnp.sum(push[16:, 2]) == pytest.approx(weight, rel=0.02)
     assert jnp.sum(push, axis=0) == pytest.approx(0, abs=1e-9 * weight)  # action is reaction
 
@@ -141,7 +143,7 @@ def test_a_layer_rests_on_another_with_its_weight():
 def test_friction_between_layers_is_that_of_coulomb(friction):
     mesh, x = two_sheets(0.96647e-3)  # where it carries the weight
     fabric = Fabric.make(0.2, (600.0, 10.0, 600.0, 200.0), 1e-4, friction=friction)
-    solver = with_layers(cloth(mesh, held=range(16)))
+    solver = with_self_contact(cloth(mesh, held=range(16)))
     v = everywhere([0.0, 0.0, 0.0], mesh).at[16:, 0].set(0.2)
     states = roll(solver, fabric, solver.init(x, v), 12)
     speed = states.v[:, 16:, 0].mean(axis=1)
@@ -157,21 +159,22 @@ def pressed():
     mesh, x = two_sheets(0.8e-3)
     random = np.random.default_rng(0)
     x = x + jnp.asarray(random.normal(size=x.shape)) * 1e-4
-    layers = SelfContact.make(mesh, 256)
-    contacts, _ = near(layers, mesh, THICKNESS, jnp.asarray(0.5), x)
+    search = SelfContact.make(mesh, 256)
+    contacts, _ = touching(search, mesh, THICKNESS, jnp.asarray(0.5), x)
     after = x.at[16:, 2].add(-2e-3)
-    contacts, _, _ = touching(layers, mesh, THICKNESS, x, after, contacts)
+    contacts, _, _ = colliding(search, mesh, THICKNESS, x, after, contacts)
     return contacts, x, x + jnp.asarray(random.normal(size=x.shape)) * 1e-4
 
 
 def test_the_hessian_of_a_contact_is_that_of_its_energy(pressed):
     contacts, before, x = pressed
+
     def force(x):
         return push_of(contacts, x, before)
 
     direction = jax.random.normal(jax.random.key(0), x.shape)
     expected = directional_difference(force, x, direction, 1e-8)
-    blocks = hessians_of(contacts, THICKNESS, RATE, x, before)
+    blocks = contact_hessians(contacts, THICKNESS, RATE, x, before)
     parts = jnp.einsum("paibj,pbj->pai", blocks, direction[contacts.stencils])
     found = jnp.zeros_like(x).at[contacts.stencils].add(parts)
     assert jnp.linalg.norm(expected) > 0
@@ -181,18 +184,19 @@ def test_the_hessian_of_a_contact_is_that_of_its_energy(pressed):
 
 def test_too_many_contacts_are_not_forgotten():
     mesh, x = two_sheets(0.5e-3)
-    layers = SelfContact.make(mesh, 8)
-    assert not near(layers, mesh, THICKNESS, jnp.asarray(0.5), x)[1]
-    solver = cloth(mesh, held=range(16))
-    solver = dataclasses.replace(solver, scene=dataclasses.replace(solver.scene, layers=layers))
+    search = SelfContact.make(mesh, 8)
+    assert not touching(search, mesh, THICKNESS, jnp.asarray(0.5), x)[1]
+    solver = with_self_contact(cloth(mesh, held=range(16)), lambda mesh: search)
     after = roll(solver, FABRIC, solver.init(x), 1)
-    assert np.all(np.isnan(after.x[-1]))
+    assert np.all(np.isnan(after.x[-1])) and after.failure[-1] == Failure.SELF_CONTACT
 
 
 def test_a_large_mesh_searches_a_tree_and_iterates():
-    large = SelfContact.make(rectangle((1.0, 1.0), (21, 21)))
-    assert isinstance(large.search, BVH) and large.whole is None
-    assert large.capacity == 24 * 441
+    scene = Scene(rectangle((1.0, 1.0), (21, 21)), jnp.array([0]), Table.make(), Air.make())
+    large = Cloth.make(scene, 0.02, self_contact=True)
+    assert large.self_contact is not None and not large.elimination.couples_all
+    assert isinstance(large.self_contact.search, BVH)
+    assert large.self_contact.capacity == 24 * 441
 
 
 def landing(make):
@@ -200,7 +204,7 @@ def landing(make):
     mesh, x = two_sheets(3e-3, count=3)
     # crumpled: where edges are parallel, the closest points jump
     x = x + jnp.asarray(np.random.default_rng(0).normal(size=x.shape)) * 3e-4
-    solver = with_layers(cloth(mesh, held=range(9)), make)
+    solver = with_self_contact(cloth(mesh, held=range(9)), make)
     controls = Control(jnp.broadcast_to(x[:9], (1, 8, 9, 3)), jnp.zeros((1, 8, 3)))
     weights = jax.random.normal(jax.random.key(1), x.shape)
     v = everywhere([0.1, 0.0, 0.0], mesh).at[:, 2].set(-0.4)
@@ -262,6 +266,6 @@ def test_pressure_is_that_of_the_table(pressed):
 
 
 def test_a_step_too_long_for_contact_is_refused():
-    solver = with_layers(cloth(two_sheets(0.01)[0], dt=1 / 60))
+    solver = with_self_contact(cloth(two_sheets(0.01)[0], dt=1 / 60))
     with pytest.raises(ValueError, match="at most 0.0333 s.*got 0.05 s"):
         dataclasses.replace(solver, dt=0.05)

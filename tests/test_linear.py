@@ -7,6 +7,7 @@ import pytest
 import scipy.spatial
 
 from r2s.cloth.linear.dissection import levels
+from r2s.cloth.linear.elimination import Elimination
 from r2s.cloth.linear.factor import factor, solve
 from r2s.cloth.linear.pattern import assemble, dense, pinned, product
 from r2s.geometry.mesh import Mesh, rectangle
@@ -47,11 +48,13 @@ def problem(request):
 
     parts = elements(len(mesh.faces), 3), elements(len(mesh.hinges), 4)
     vertices = jnp.tile(jnp.eye(3), (len(mesh.rest), 1, 1))
-    return mesh, parts, jax.jit(assemble)(mesh.pattern, *parts, vertices)
+    equations = Elimination.make(mesh)
+    blocks = jax.jit(assemble)(equations.pattern, vertices, faces=parts[0], hinges=parts[1])
+    return mesh, equations, parts, blocks
 
 
 def test_elements_add_up(problem):
-    mesh, parts, blocks = problem
+    mesh, equations, parts, blocks = problem
     matrix = np.zeros((len(mesh.rest), 3, len(mesh.rest), 3))
     for elements, matrices in zip((mesh.faces, mesh.hinges), parts, strict=True):
         for element, part in zip(np.asarray(elements), np.asarray(matrices), strict=True):
@@ -60,26 +63,28 @@ def test_elements_add_up(problem):
                     matrix[row, :, column] += part[i, :, j]
     size = 3 * len(mesh.rest)
     matrix = matrix.reshape(size, size) + np.eye(size)
-    assert np.asarray(dense(mesh.pattern, blocks)) == pytest.approx(matrix, rel=1e-12, abs=1e-9)
+    assert np.asarray(dense(equations.pattern, blocks)) == pytest.approx(
+        matrix, rel=1e-12, abs=1e-9
+    )
 
 
 def test_the_factor_solves(problem):
-    mesh, _, blocks = problem
+    mesh, equations, _, blocks = problem
     right = jnp.asarray(np.random.default_rng(1).normal(size=(len(mesh.rest), 3)))
-    x = jax.jit(solve)(mesh.levels, jax.jit(factor)(mesh.levels, blocks), right)
-    expected = np.linalg.solve(np.asarray(dense(mesh.pattern, blocks)), right.ravel())
+    x = jax.jit(solve)(equations.levels, jax.jit(factor)(equations.levels, blocks), right)
+    expected = np.linalg.solve(np.asarray(dense(equations.pattern, blocks)), right.ravel())
     assert np.asarray(x).ravel() == pytest.approx(expected, rel=1e-8, abs=1e-9)
-    assert np.asarray(product(mesh.pattern, blocks, x)) == pytest.approx(
+    assert np.asarray(product(equations.pattern, blocks, x)) == pytest.approx(
         np.asarray(right), abs=1e-8
     )
 
 
 @pytest.mark.slow(group="cloth")
 def test_every_depth_of_dissection_gives_the_same(problem):
-    mesh, _, blocks = problem
+    mesh, equations, _, blocks = problem
     right = jnp.ones((len(mesh.rest), 3))
-    expected = solve(mesh.levels, factor(mesh.levels, blocks), right)
-    rows, columns = np.asarray(mesh.pattern.rows), np.asarray(mesh.pattern.columns)
+    expected = solve(equations.levels, factor(equations.levels, blocks), right)
+    rows, columns = np.asarray(equations.pattern.rows), np.asarray(equations.pattern.columns)
     for leaf in (6, 1000):
         others = levels(np.asarray(mesh.rest), rows, columns, leaf)
         found = solve(others, factor(others, blocks), right)
@@ -87,46 +92,48 @@ def test_every_depth_of_dissection_gives_the_same(problem):
 
 
 def test_every_vertex_is_eliminated_once(problem):
-    mesh = problem[0]
+    mesh, equations = problem[:2]
     count = len(mesh.rest)
-    pivots = np.concatenate([np.asarray(level.pivots).ravel() for level in mesh.levels])
+    pivots = np.concatenate([np.asarray(level.pivots).ravel() for level in equations.levels])
     assert np.array_equal(np.sort(pivots[pivots < count]), np.arange(count))
 
 
 def test_an_indefinite_matrix_has_no_factor(problem):
-    mesh, _, blocks = problem
+    mesh, equations, _, blocks = problem
     vertex = len(mesh.rest) // 2
-    bad = blocks.at[mesh.pattern.diagonal[vertex], 0, 0].set(-1.0)
-    x = solve(mesh.levels, factor(mesh.levels, bad), jnp.ones((len(mesh.rest), 3)))
+    bad = blocks.at[equations.pattern.diagonal[vertex], 0, 0].set(-1.0)
+    x = solve(equations.levels, factor(equations.levels, bad), jnp.ones((len(mesh.rest), 3)))
     assert not np.all(np.isfinite(x))
 
 
 def test_an_indefinite_matrix_is_solved_when_asked(problem):
-    mesh, _, blocks = problem
+    mesh, equations, _, blocks = problem
     vertex = len(mesh.rest) // 2
-    bad = blocks.at[mesh.pattern.diagonal[vertex], 0, 0].add(-500.0)
+    bad = blocks.at[equations.pattern.diagonal[vertex], 0, 0].add(-500.0)
     right = jnp.ones((len(mesh.rest), 3))
-    x = solve(mesh.levels, factor(mesh.levels, bad, is_definite=False), right)
-    matrix = np.asarray(dense(mesh.pattern, bad))
+    x = solve(equations.levels, factor(equations.levels, bad, is_definite=False), right)
+    matrix = np.asarray(dense(equations.pattern, bad))
     assert np.linalg.eigvalsh(matrix)[0] < 0
     expected = np.linalg.solve(matrix, np.ones(len(matrix)))
     assert np.asarray(x).ravel() == pytest.approx(expected, rel=1e-7, abs=1e-9)
 
 
 def test_held_vertices_do_not_move(problem):
-    mesh, _, blocks = problem
+    mesh, equations, _, blocks = problem
     free = jnp.ones(len(mesh.rest), bool).at[jnp.array([0, 2])].set(False)
     right = jnp.where(free[:, None], jnp.ones((len(mesh.rest), 3)), 0.0)
-    x = solve(mesh.levels, factor(mesh.levels, pinned(mesh.pattern, blocks, free)), right)
+    x = solve(
+        equations.levels, factor(equations.levels, pinned(equations.pattern, blocks, free)), right
+    )
     assert np.all(np.asarray(x)[[0, 2]] == 0)
-    force = np.asarray(product(mesh.pattern, blocks, x))[np.asarray(free)]
+    force = np.asarray(product(equations.pattern, blocks, x))[np.asarray(free)]
     assert force == pytest.approx(np.ones_like(force), abs=1e-8)
 
 
 def test_a_solution_is_transposed_by_itself(problem):
-    mesh, _, blocks = problem
-    factors = factor(mesh.levels, blocks)
+    mesh, equations, _, blocks = problem
+    factors = factor(equations.levels, blocks)
     right, other = jnp.asarray(np.random.default_rng(2).normal(size=(2, len(mesh.rest), 3)))
-    run = lambda b: solve(mesh.levels, factors, b)
+    run = lambda b: solve(equations.levels, factors, b)
     (back,) = jax.linear_transpose(run, right)(other)
     assert np.asarray(back) == pytest.approx(np.asarray(run(other)), rel=1e-8, abs=1e-10)

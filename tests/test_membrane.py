@@ -8,8 +8,8 @@ from conftest import SIZE, flat, rotation, stored_energy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.cloth.potential import strains
-from r2s.laws.membrane import OrthotropicMembrane, deformation_gradient
+from r2s.geometry.elements import deformation_gradient, strains
+from r2s.laws.membrane import OrthotropicMembrane
 from r2s.units import isotropic_bending, isotropic_membrane
 
 few = settings(max_examples=25, deadline=None)

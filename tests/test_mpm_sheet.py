@@ -11,8 +11,8 @@ from conftest import SIZE, everywhere, flat, rotation, stored_energy
 from mpm_bodies import momenta, states, still
 
 import r2s
-from r2s.cloth.potential import vertex_mass
 from r2s.fabrics.fabric import Fabric
+from r2s.geometry.elements import vertex_masses
 from r2s.laws.bending import HingeBending
 from r2s.mpm import Grid, Sheet
 from r2s.mpm.elements import bending_frequency, elastic_force, membrane_frequency
@@ -52,7 +52,7 @@ def test_momenta_are_kept_to_rounding(sheet, elastic):
     pressed = start.d * 0.8 + 0.1 * jax.random.normal(jax.random.key(1), start.d.shape)
     start = dataclasses.replace(start, d=pressed)
     moved = states(solver, elastic, start, still(1, 60))
-    linear, angular = momenta(moved, vertex_mass(sheet, elastic), SPACING)
+    linear, angular = momenta(moved, vertex_masses(sheet, elastic.density), SPACING)
     assert linear == pytest.approx(np.broadcast_to(linear[0], linear.shape), abs=1e-14)
     assert angular == pytest.approx(np.broadcast_to(angular[0], angular.shape), abs=1e-14)
     assert np.max(np.abs(angular[0])) > 1e-5
@@ -84,7 +84,7 @@ def test_the_forces_are_those_of_the_energy(sheet, fabric):
 
 @pytest.mark.slow(group="points")
 def test_the_frequencies_are_bounds_of_those_of_the_matrices(sheet, fabric):
-    mass = jnp.repeat(vertex_mass(sheet, fabric), 3)
+    mass = jnp.repeat(vertex_masses(sheet, fabric.density), 3)
     none = eqx.tree_at(lambda f: f.bending, fabric, HingeBending(jnp.zeros((), float)))
     soft = jax.tree.map(lambda c: 1e-9 * c, fabric.membrane)
     bent = eqx.tree_at(lambda f: f.membrane, fabric, soft)
@@ -213,7 +213,7 @@ def test_wind_gives_the_momentum_of_its_drag(sheet, elastic):
     wind = jnp.broadcast_to(jnp.array([0.0, 0.0, 3.0]), (1, 60, 3))
     controls = dataclasses.replace(still(1, 60), wind=wind)
     moved = states(solver, elastic, solver.init(flat(sheet)), controls)
-    gained = np.sum(np.asarray(vertex_mass(sheet, elastic))[:, None] * moved.v[0], axis=0)
+    gained = np.sum(np.asarray(vertex_masses(sheet, elastic.density))[:, None] * moved.v[0], axis=0)
     expected = solver.dt * 1.2 * 2 / 2 * SIZE**2 * 3.0**2
     assert gained == pytest.approx([0, 0, expected], abs=1e-14)
 
@@ -240,8 +240,3 @@ def test_what_cannot_work_is_refused(sheet, elastic):
         solver_of(r2s.rectangle((0.4, 0.4), (3, 3)), elastic)
     with pytest.raises(ValueError, match="outside the grid"):
         solver_of(sheet, elastic).init(flat(sheet, 1.0))
-    scene = Scene(
-        sheet, jnp.zeros(0, int), Table.make(), Air.make(), None, r2s.SelfContact.make(sheet)
-    )
-    with pytest.raises(ValueError, match="needs no layers"):
-        Sheet.make(scene, Grid.covering((0.0,) * 3, (1.0,) * 3, SPACING), elastic, 1e-4)

@@ -170,7 +170,7 @@ def test_material_points_fit_the_scenario():
 )
 def test_every_scenario_on_every_solver(name, kind, fabric):
     made, shape = presets.FIVE[fabric](), (13, 13) if kind == "points" else (9, 9)
-    scenario = SIX[name]().scenario(shape, layers=kind == "layers")
+    scenario = SIX[name]().scenario(shape, self_contact=kind == "layers")
     found = account(scenario, made, None, solver_of(kind, scenario, made))
     check(scenario, made, found)
     stretched = np.asarray(stretch(scenario.scene.mesh, found.x))

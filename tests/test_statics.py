@@ -24,7 +24,7 @@ def pull(solver, fabric, states):
     """Forces [N] with which the grippers hold a sheet that is at rest in the last of its states."""
     state = jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), states)
     control = Control(state.x[solver.scene.held], jnp.zeros(3))
-    return np.asarray(force(solver.increment(fabric, state, control), state.x))[solver.scene.held]
+    return np.asarray(force(solver.potential(fabric, state, control), state.x))[solver.scene.held]
 
 
 # A strip that hangs, and gets narrower
@@ -114,7 +114,7 @@ def test_a_strip_with_free_sides_balances_its_tension_at_any_angle(degrees, shee
     solver, x, tension = strip_cut_at(degrees, sheet, smooth)
     state = solver.init(jnp.asarray(x))
     control = Control(state.x[ENDS], jnp.zeros(3))
-    found = np.asarray(force(solver.increment(smooth, state, control), state.x))
+    found = np.asarray(force(solver.potential(smooth, state, control), state.x))
     assert np.delete(found, ENDS, axis=0) == pytest.approx(0, abs=1e-12 * tension)
     ends = found[ENDS].reshape(2, 5, 3).sum(axis=1)
     expected = np.array([[-tension, 0, 0], [tension, 0, 0]])

@@ -85,7 +85,7 @@ from r2s.world.contact import Table
 from r2s.sweep import sweep
 
 sheet = r2s.rectangle((0.2, 0.2), (3, 3))
-solver = r2s.Cloth(r2s.Scene(sheet, jnp.array([0]), Table.make(-1.0), Air.make()), dt=0.02)
+solver = r2s.Cloth.make(r2s.Scene(sheet, jnp.array([0]), Table.make(-1.0), Air.make()), dt=0.02)
 start = jnp.concatenate([sheet.rest, jnp.zeros((9, 1))], axis=1)
 still = r2s.Control(jnp.broadcast_to(start[0], (2, 3, 1, 3)), jnp.zeros((2, 3, 3)))
 

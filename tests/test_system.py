@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from r2s.cloth.linear.elimination import Elimination
 from r2s.cloth.linear.pattern import dense
 from r2s.cloth.linear.system import Far, apply_inverse, prepare
 from r2s.geometry.mesh import rectangle
@@ -12,14 +13,14 @@ from r2s.geometry.mesh import rectangle
 MESH = rectangle((1.0, 1.0), (6, 6))
 COUNT = 36
 FREE = jnp.ones(COUNT, bool).at[jnp.array([0, 5])].set(False)
-ABOUT = MESH.levels, MESH.pattern
+EQUATIONS = Elimination.make(MESH)
 
 
 def blocks(least: float):
     """A symmetric matrix over the mesh with eigenvalues from `least` [-] on."""
     random = np.random.default_rng(0)
     matrix = np.zeros((COUNT, 3, COUNT, 3))
-    rows, columns = np.asarray(MESH.pattern.rows), np.asarray(MESH.pattern.columns)
+    rows, columns = np.asarray(EQUATIONS.pattern.rows), np.asarray(EQUATIONS.pattern.columns)
     matrix[rows, :, columns] = random.normal(size=(len(rows), 3, 3))
     matrix = matrix.reshape(3 * COUNT, -1)
     matrix = matrix + matrix.T
@@ -40,7 +41,7 @@ def far(stiffness: float) -> Far:
 
 def whole(blocks, far: Far):
     """The whole matrix, that of the identity where vertices are held."""
-    matrix = np.array(dense(MESH.pattern, blocks)).reshape(COUNT, 3, COUNT, 3)
+    matrix = np.array(dense(EQUATIONS.pattern, blocks)).reshape(COUNT, 3, COUNT, 3)
     for stencil, part in zip(np.asarray(far.stencils), np.asarray(far.matrices), strict=True):
         for i, row in enumerate(stencil):
             for j, column in enumerate(stencil):
@@ -53,8 +54,8 @@ def whole(blocks, far: Far):
 
 def inverse(blocks, far: Far, is_definite: bool):
     """`apply_inverse` of the matrix, as a function of the right-hand side."""
-    system = prepare(*ABOUT, blocks, far, FREE, is_definite)
-    return jax.jit(lambda b: apply_inverse(*ABOUT, system, b, is_definite))
+    system = prepare(EQUATIONS, blocks, far, FREE, is_definite)
+    return jax.jit(lambda b: apply_inverse(EQUATIONS, system, b, is_definite))
 
 
 @pytest.mark.parametrize(("least", "is_definite"), [(1.0, True), (1.0, False), (-3.0, False)])

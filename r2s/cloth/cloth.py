@@ -1,67 +1,97 @@
-"""The cloth: a sheet of triangles, implicit in time, second order, differentiable."""
+"""The cloth: a sheet of triangles, implicit in time, second order, differentiable.
+
+A step goes one way: `Cloth.step` sets up the potential of the step (`potential`), Newton's method
+minimises it (`newton`) with a sparse factor (`linear`), and where the sheet touches itself that is
+repeated with the contacts that it was found to need (`self_contact`).
+"""
 
 import dataclasses
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from r2s.cloth.linear.elimination import Elimination
 from r2s.cloth.newton import minimise
-from r2s.cloth.potential import (
-    IncrementalPotential,
-    bending_laws,
-    curvatures,
-    hinge_angles,
-    strains,
-)
-from r2s.cloth.self_contact.contacts import Contacts, resolve_contacts
+from r2s.cloth.potential import IncrementalPotential
+from r2s.cloth.self_contact.detection import SMALL, SelfContact, colliding, touching
 from r2s.fabrics.fabric import Fabric
-from r2s.geometry.mesh import Mesh
-from r2s.laws.bending import unwrapped
+from r2s.failures import Failure, first_failure, no_failure
+from r2s.geometry.elements import (
+    area_normals,
+    hinge_angles,
+    hinge_curvatures,
+    strains,
+    unwrapped,
+)
 from r2s.world import contact
 from r2s.world.scene import Control, Scene
 
 Positions = Float[Array, "vertex 3"]
 
 MAX_CONTACT_STEP = 1 / 30  # [s]
+MAX_ATTEMPTS = 12  # at a step with self-contact, before it fails
 
 
 class ClothState(eqx.Module):
     """- `x`, `v`: positions [m] and velocities [m/s], world frame, z up.
     - `x_before`, `v_before`: those of the step before, which the second-order formula needs.
+    - `failure`: the first `r2s.failures.Failure` of the run so far.
     """
 
     x: Float[Array, "vertex 3"]
     v: Float[Array, "vertex 3"]
     x_before: Float[Array, "vertex 3"]
     v_before: Float[Array, "vertex 3"]
+    failure: Int[Array, ""] = eqx.field(default_factory=no_failure)
 
 
 class Cloth(eqx.Module):
     """A sheet in a scene, stepped by BDF2; every step is solved to convergence.
 
-    Differentiable, forward and reverse, in fabric, state, control and scene.
+    Differentiable, forward and reverse, in fabric, state, control and scene. `make` makes one.
 
     - `scene`: sheet, held vertices, table, air.
+    - `elimination`: how the linear systems of its mesh are solved.
     - `dt`: step, [s].
+    - `self_contact`: how the sheet finds contacts with itself; None: it passes through itself.
     - `tolerance`: the solve ends when no coordinate changes by more, [m]. None: 1e-6 in float32,
       1e-11 in float64.
-    - `max_iterations`: of Newton's method; a step that needs more is NaN.
+    - `max_iterations`: of Newton's method; a step that needs more fails.
     """
 
     scene: Scene
+    elimination: Elimination
     dt: float = eqx.field(static=True)
+    self_contact: SelfContact | None = None
     tolerance: float | None = eqx.field(static=True, default=None)
     max_iterations: int = eqx.field(static=True, default=200)
+
+    @classmethod
+    def make(
+        cls,
+        scene: Scene,
+        dt: float,
+        *,
+        self_contact: bool = False,
+        tolerance: float | None = None,
+        max_iterations: int = 200,
+    ) -> "Cloth":
+        """A cloth solver for a scene; not under `jax.jit`, since its sizes follow from the mesh.
+
+        Raises `ValueError` for a step that is not positive, or too long for self-contact.
+        """
+        elimination, search = prepare_mesh(scene, self_contact)
+        return cls(scene, elimination, dt, search, tolerance, max_iterations)
 
     def __check_init__(self):
         if not self.dt > 0:
             raise ValueError(f"dt must be positive, got {self.dt} s")
-        if self.scene.layers is not None and self.dt > MAX_CONTACT_STEP:
+        if self.self_contact is not None and self.dt > MAX_CONTACT_STEP:
             raise ValueError(
-                f"with contact between layers dt must be at most {MAX_CONTACT_STEP:.4f} s, since "
-                f"contacts are planes that stand still in a step; got {self.dt} s"
+                f"with self-contact dt must be at most {MAX_CONTACT_STEP:.4f} s, since contacts "
+                f"are planes that stand still in a step; got {self.dt} s"
             )
 
     def init(
@@ -79,56 +109,89 @@ class Cloth(eqx.Module):
 
     def step(self, fabric: Fabric, state: ClothState, control: Control) -> ClothState:
         """The state `dt` later, with the held vertices at `control.handles`."""
-        increment = self.increment(fabric, state, control)
+        step = self.potential(fabric, state, control)
         guess = self.scene.place(state.x + self.dt * state.v, control.handles)
-        tolerance = self.tolerance or (1e-11 if guess.dtype == jnp.float64 else 1e-6)
-        free = self.scene.is_free
+        solve = self._minimise if self.self_contact is None else self._minimise_with_contacts
+        x, failure = solve(step, state.x, guess)
+        v = step.rate * (x - step.x_anchor)
+        return ClothState(x, v, state.x, state.v, first_failure(state.failure, failure))
 
-        def solve(contacts: Contacts | None, guess: Positions) -> Positions:
-            touched = dataclasses.replace(increment, contacts=contacts)
-            return minimise(touched, guess, free, tolerance, self.max_iterations)
-
-        if self.scene.layers is None:
-            x = solve(None, guess)
-        else:
-            about = self.scene.mesh, fabric.thickness, fabric.friction
-            x = resolve_contacts(self.scene.layers, *about, state.x, guess, solve)
-        v = increment.rate * (x - increment.x_anchor)
-        return ClothState(x, v, state.x, state.v)
-
-    def increment(
+    def potential(
         self, fabric: Fabric, state: ClothState, control: Control
     ) -> IncrementalPotential:
-        """What this step's potential depends on. BDF2: 2 dt v' = 3 x' - 4 x + x_before."""
+        """What this step minimises, without self-contact. BDF2: 2 dt v' = 3 x' - 4 x + x_before."""
         mesh = self.scene.mesh
         depth = self.scene.table.depth(state.x, fabric.thickness)
-        bdf2 = lambda now, before: (4 * now - before) / 3
         angles = hinge_angles(mesh, state.x)
         angles_before = unwrapped(hinge_angles(mesh, state.x_before), angles)
         strain, strain_before = strains(mesh, state.x), strains(mesh, state.x_before)
-        ahead = lambda now, before: 2 * now - before  # second order, like the formula
-        hinges = curvatures(mesh, ahead(angles, angles_before))
+        bent = hinge_curvatures(mesh, _extrapolated(angles, angles_before))
         return IncrementalPotential(
             mesh=mesh,
             fabric=fabric,
-            membrane=jax.vmap(fabric.membrane.at)(ahead(strain, strain_before)),
-            bending=bending_laws(mesh, fabric.bending, hinges),
+            membrane=jax.vmap(fabric.membrane.at)(_extrapolated(strain, strain_before)),
+            bending=fabric.bending.on_elements(mesh, bent),
             air=self.scene.air,
             table=self.scene.table,
             rate=jnp.asarray(1.5 / self.dt, float),
-            x_anchor=bdf2(state.x, state.x_before),
-            v_anchor=bdf2(state.v, state.v_before),
-            strain_anchor=bdf2(strain, strain_before),
-            curvature_anchor=curvatures(mesh, bdf2(angles, angles_before)),
+            x_anchor=_anchor(state.x, state.x_before),
+            v_anchor=_anchor(state.v, state.v_before),
+            strain_anchor=_anchor(strain, strain_before),
+            curvature_anchor=hinge_curvatures(mesh, _anchor(angles, angles_before)),
             angles=angles,
-            area_normals=_area_normals(mesh, state.x),
+            area_normals=area_normals(mesh, state.x),
             friction_limit=fabric.friction * mesh.vertex_area * contact.pressure(depth),
-            layers=self.scene.layers,
-            wind=self.scene.wind_on_faces(ahead(state.x, state.x_before), control.wind),
+            wind=self.scene.wind_on_faces(_extrapolated(state.x, state.x_before), control.wind),
+            elimination=self.elimination,
         )
 
+    def _minimise(self, step: IncrementalPotential, before: Positions, guess: Positions):
+        del before
+        tolerance = self.tolerance or (1e-11 if guess.dtype == jnp.float64 else 1e-6)
+        return minimise(step, guess, self.scene.is_free, tolerance, self.max_iterations)
 
-def _area_normals(mesh: Mesh, x: Positions) -> Float[Array, "face 3"]:
-    """Normals of the faces, as long as their areas, [m^2]."""
-    corners = x[mesh.faces]
-    return jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    def _minimise_with_contacts(
+        self, step: IncrementalPotential, before: Positions, guess: Positions
+    ):
+        """The end of a step from `before` in which the sheet does not pass through itself.
+
+        The step is solved, with the contacts known so far, until its motion lacks none.
+        """
+        search, mesh, fabric = self.self_contact, self.scene.mesh, step.fabric
+        assert search is not None
+
+        def attempt(state):
+            x, contacts, _, failure = state
+            x, newton = self._minimise(dataclasses.replace(step, contacts=contacts), before, x)
+            contacts, is_free, fits = colliding(search, mesh, fabric.thickness, before, x, contacts)
+            full = jnp.where(fits, Failure.NONE.value, Failure.SELF_CONTACT.value)
+            return x, contacts, is_free, first_failure(first_failure(failure, newton), full)
+
+        def body(state, _):
+            is_done = state[2] | (state[3] != Failure.NONE.value)
+            return jax.lax.cond(is_done, lambda: state, lambda: attempt(state)), None
+
+        contacts, fits = touching(search, mesh, fabric.thickness, fabric.friction, before)
+        failure = jnp.where(fits, Failure.NONE.value, Failure.SELF_CONTACT.value).astype(int)
+        begin = guess, contacts, jnp.zeros((), bool), failure
+        (x, _, is_free, failure), _ = jax.lax.scan(body, begin, length=MAX_ATTEMPTS)
+        unresolved = jnp.where(is_free, Failure.NONE.value, Failure.SELF_CONTACT.value)
+        failure = first_failure(failure, unresolved)
+        return jnp.where(failure == Failure.NONE.value, x, jnp.nan), failure
+
+
+def prepare_mesh(scene: Scene, self_contact: bool) -> tuple[Elimination, SelfContact | None]:
+    """What a cloth solver makes of the mesh of its scene, once."""
+    couples_all = self_contact and scene.mesh.rest.shape[0] <= SMALL
+    search = SelfContact.make(scene.mesh) if self_contact else None
+    return Elimination.make(scene.mesh, couples_all), search
+
+
+def _anchor(now: Array, before: Array) -> Array:
+    """What the rate of BDF2 is taken from."""
+    return (4 * now - before) / 3
+
+
+def _extrapolated(now: Array, before: Array) -> Array:
+    """A step ahead, second order like the formula."""
+    return 2 * now - before

@@ -1,4 +1,4 @@
-"""A minimiser with an implicit derivative: the numerics of a step, apart from its physics."""
+"""Newton's method with an implicit derivative: the numerics of a step, apart from its physics."""
 
 from functools import partial
 from typing import NamedTuple
@@ -7,10 +7,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from r2s.cloth.linear.system import System, apply_inverse, prepare
-from r2s.cloth.potential import IncrementalPotential, far, hessian, potential, residual
+from r2s.cloth.potential import IncrementalPotential, far_couplings, hessian, potential, residual
+from r2s.failures import Failure
 
 Positions = Float[Array, "vertex 3"]
 CONVEX_ITERATIONS = 3  # before the exact Hessian is tried
@@ -27,52 +28,58 @@ class _Search(NamedTuple):
     moved: Float[Array, ""]  # the last change, [m]
     system: System
     is_stale: Bool[Array, ""]  # whether the next step needs new factors
-    exactness: Float[Array, ""]  # of the Hessian that they are to be of
-    limit: Float[Array, ""]  # exactness at which it may be indefinite
+    blend: Float[Array, ""]  # share of the exact Hessian in them
+    limit: Float[Array, ""]  # blend at which it may be indefinite
     count: Array
 
 
 def minimise(
-    increment: IncrementalPotential,
+    step: IncrementalPotential,
     start: Positions,
     free: Bool[Array, " vertex"],
     tolerance: float,
     max_iterations: int,
-) -> Positions:
-    """Positions [m] that minimise an increment's potential over the `free` vertices.
+) -> tuple[Positions, Int[Array, ""]]:
+    """Positions [m] that minimise an incremental potential, and an `r2s.failures.Failure` code.
 
-    Newton's method (a convex stand-in for the Hessian, then the exact one; a factor serves as long
-    as the steps shrink fast), until no coordinate changes by more than `tolerance` [m]. Its
-    derivative, forward and reverse, is that of the exact minimum (implicit function theorem, with
-    the exact Hessian), so it is right as far as the iteration converged; NaN when `max_iterations`
-    did not suffice.
+    Newton's method, with a convex stand-in for the Hessian at first, then with more and more of the
+    exact one. A factor serves as long as the steps shrink fast. The derivative, forward and
+    reverse, is that of the exact minimum (implicit function theorem, with the exact Hessian), so it
+    is right as far as the iteration converged. Positions are NaN where it failed.
+
+    - `start`: where to begin, [m]; vertices that are not `free` stay there.
+    - `tolerance`: it has converged when no coordinate changes by more, [m].
+    - `max_iterations`: after which it has failed.
     """
-    return _minimise(tolerance, max_iterations, increment, start, free)
+    x, code = _minimise(tolerance, max_iterations, step, start, free)
+    return x, jax.lax.stop_gradient(code).astype(int)
 
 
-def _newton(tolerance, max_iterations, increment, start, free):
-    levels, pattern = increment.levels, increment.pattern
+def _newton(tolerance, max_iterations, step, start, free):
+    elimination = step.elimination
 
     def evaluate(x):
-        value, force = jax.value_and_grad(potential, argnums=1)(increment, x)
+        value, force = jax.value_and_grad(potential, argnums=1)(step, x)
         return value, _masked(force, free)
 
     def iterate(state: _Search) -> _Search:
-        second = lambda: _second(increment, state.x, state.exactness)
-        renew = lambda: prepare(levels, pattern, *second(), free)
-        system = jax.lax.cond(state.is_stale, renew, lambda: state.system)
-        direction = -apply_inverse(levels, pattern, system, state.force)
+        system = jax.lax.cond(
+            state.is_stale,
+            lambda: prepare(elimination, *_second(step, state.x, state.blend), free),
+            lambda: state.system,
+        )
+        direction = -apply_inverse(elimination, system, state.force)
         slope = jnp.sum(direction * state.force)
         usable = slope <= 0  # an indefinite Hessian has NaN for factors
+        full = jnp.max(jnp.abs(direction))
         direction = jnp.where(usable, direction, 0)
         length, value, force = _line_search(evaluate, state, direction, slope)
-        found = length > 0
-        full = jnp.max(jnp.abs(direction))
         # a search that found nothing has not arrived
-        moved = jnp.where(found, length * full, full)
-        moved = jnp.where(usable | (state.exactness == 0), moved, state.moved)
+        moved = jnp.where(length > 0, length * full, full)
+        # where even the convex stand-in gives no direction it is NaN, and the loop ends
+        moved = jnp.where(usable, moved, jnp.where(state.blend == 0, full, state.moved))
         is_slow = (moved > SLOW * state.moved) & (state.count >= CONVEX_ITERATIONS)
-        exactness = jnp.where(is_slow, (state.exactness + state.limit) / 2, state.exactness)
+        blend = jnp.where(is_slow, (state.blend + state.limit) / 2, state.blend)
         return _Search(
             x=state.x + length * direction,
             value=value,
@@ -80,8 +87,8 @@ def _newton(tolerance, max_iterations, increment, start, free):
             moved=moved,
             system=system,
             is_stale=~usable | (length != 1) | (moved > STALE * state.moved),
-            exactness=jnp.where(usable, jnp.minimum(exactness, 1), state.exactness / 2),
-            limit=jnp.where(usable, jnp.minimum(1.2 * state.limit, 2), state.exactness),
+            blend=jnp.where(usable, jnp.minimum(blend, 1), state.blend / 2),
+            limit=jnp.where(usable, jnp.minimum(1.2 * state.limit, 2), state.blend),
             count=state.count + 1,
         )
 
@@ -89,31 +96,39 @@ def _newton(tolerance, max_iterations, increment, start, free):
         goes_on = (state.moved > tolerance) & (state.count < max_iterations)
         return goes_on & jnp.isfinite(state.value)
 
-    zero, true = jnp.zeros((), int), jnp.ones((), bool)
-    infinite = jnp.full((), jnp.inf, start.dtype)
-    shapes = jax.eval_shape(lambda: prepare(levels, pattern, *_second(increment, start), free))
-    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    none = jnp.zeros((), start.dtype)
+    found = jax.lax.while_loop(unfinished, iterate, _begin(step, start, free, evaluate))
+    code = _failure(found, tolerance)
+    return jnp.where(code == Failure.NONE.value, found.x, jnp.nan), code.astype(start.dtype)
+
+
+def _begin(step, start, free, evaluate) -> _Search:
+    shapes = jax.eval_shape(lambda: prepare(step.elimination, *_second(step, start), free))
     value, force = evaluate(start)
-    begin = _Search(
+    zero = jnp.zeros((), start.dtype)
+    return _Search(
         x=start,
         value=value,
         force=force,
-        moved=infinite,
-        system=blank,
-        is_stale=true,
-        exactness=none,
-        limit=none + 2,
-        count=zero,
+        moved=zero + jnp.inf,
+        system=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes),
+        is_stale=jnp.ones((), bool),
+        blend=zero,
+        limit=zero + 2,
+        count=jnp.zeros((), int),
     )
-    found = jax.lax.while_loop(unfinished, iterate, begin)
-    # a NaN compares false, so that it ends the loop and fails here
-    return jnp.where((found.moved <= tolerance) & jnp.isfinite(found.value), found.x, jnp.nan)
 
 
-def _second(increment, x, exactness: Array | float = 1.0):
+def _failure(found: _Search, tolerance: float) -> Int[Array, ""]:
+    """Why a search failed; a NaN compares false, so that it never counts as convergence."""
+    reason = jnp.where(jnp.isnan(found.moved), Failure.LINEAR_SOLVE.value, Failure.NEWTON.value)
+    reason = jnp.where(jnp.isfinite(found.value), reason, Failure.NON_FINITE.value)
+    converged = (found.moved <= tolerance) & jnp.isfinite(found.value)
+    return jnp.where(converged, Failure.NONE.value, reason)
+
+
+def _second(step, x, blend: Array | float = 1.0):
     """The second derivative [N/m] of the potential, or its convex stand-in."""
-    return hessian(increment, x, exactness), far(increment, x)
+    return hessian(step, x, blend), far_couplings(step, x)
 
 
 class _Length(NamedTuple):
@@ -142,12 +157,11 @@ def _line_search(evaluate, state: _Search, direction, slope):
         is_steep = enough & (ahead < 0.5 * slope)
         grows = is_steep & (at.trial >= 1) & (at.trial < LONGEST)
         shrinks = ~is_fine & (at.trial <= 1) & (at.trial > SHORTEST)
-        best = lambda new, old: jnp.where(is_fine, new, old)
         return _Length(
             trial=jnp.where(grows, 2 * at.trial, at.trial / 2),
-            length=best(at.trial, at.length),
-            value=best(value, at.value),
-            force=best(force, at.force),
+            length=jnp.where(is_fine, at.trial, at.length),
+            value=jnp.where(is_fine, value, at.value),
+            force=jnp.where(is_fine, force, at.force),
             goes_on=grows | shrinks,
         )
 
@@ -158,27 +172,27 @@ def _line_search(evaluate, state: _Search, direction, slope):
 
 
 @eqx.filter_custom_jvp
-def _minimise(tolerance, max_iterations, increment, start, free):
-    return _one_by_one(partial(_newton, tolerance, max_iterations))(increment, start, free)
+def _minimise(tolerance, max_iterations, step, start, free):
+    return _one_by_one(partial(_newton, tolerance, max_iterations))(step, start, free)
 
 
 @_minimise.def_jvp
 def _minimise_jvp(primals, tangents):
-    _, _, increment, start, free = primals
-    _, _, increment_dot, start_dot, _ = tangents
-    x = checkpoint_name(_minimise(*primals), SAVED)
+    _, _, step, start, free = primals
+    _, _, step_dot, start_dot, _ = tangents
+    x, code = checkpoint_name(_minimise(*primals), SAVED)
     held_dot = jnp.zeros_like(x) if start_dot is None else jnp.where(free[:, None], 0, start_dot)
-    _, force_dot = eqx.filter_jvp(residual, (increment, x), (increment_dot, held_dot))
+    _, force_dot = eqx.filter_jvp(residual, (step, x), (step_dot, held_dot))
     # linear in the right-hand side, so that it batches and transposes with the same factors
-    system = _one_by_one(_exact_system)(increment, x, free)
-    about = increment.levels, increment.pattern, system
-    return x, held_dot - apply_inverse(*about, _masked(force_dot, free), is_definite=False)
+    system = _one_by_one(_exact_system)(step, x, free)
+    right = _masked(force_dot, free)
+    x_dot = held_dot - apply_inverse(step.elimination, system, right, is_definite=False)
+    return (x, code), (x_dot, jnp.zeros_like(code))
 
 
-def _exact_system(increment, x, free):
-    about = increment.levels, increment.pattern
+def _exact_system(step, x, free):
     # where a shape is about to buckle the minimum may be found as a saddle: not definite
-    return prepare(*about, *_second(increment, x), free, is_definite=False)
+    return prepare(step.elimination, *_second(step, x), free, is_definite=False)
 
 
 def _one_by_one(function):
@@ -195,7 +209,10 @@ def _one_by_one(function):
     @call.def_vmap
     def batched(size, is_batched, *args):
         moving, still = eqx.partition(args, tuple(is_batched))
-        single = lambda moving: function(*eqx.combine(moving, still))
+
+        def single(moving):
+            return function(*eqx.combine(moving, still))
+
         outputs = jax.lax.map(single, moving) if _on_cpu() else jax.vmap(single)(moving)
         return outputs, jax.tree.map(lambda _: True, outputs)
 

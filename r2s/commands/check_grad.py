@@ -22,7 +22,7 @@ class CheckGrad:
     For a scene, mesh or loss of your own: `r2s.gradient_check.compare`.
 
         r2s check-grad lifting --fabric black_denim --motion height=0.3 --shape 5 5
-        r2s check-grad folding --fabric mine.json --layers --forward
+        r2s check-grad folding --fabric mine.json --self-contact --forward
     """
 
     scenario: Annotated[Positional[ScenarioName], arg(metavar="SCENARIO")]
@@ -35,7 +35,7 @@ class CheckGrad:
     """The cloth, or material points."""
     shape: tuple[int, int] = (5, 5)
     """Vertices along warp and weft."""
-    layers: bool = False
+    self_contact: bool = False
     """The sheet touches itself (cloth only)."""
     forward: bool = False
     """Check forward mode instead of reverse mode (cloth only)."""
@@ -50,8 +50,8 @@ class CheckGrad:
         from r2s.commands.common import card_of, tell
         from r2s.gradient_check import compare
 
-        if self.solver == "points" and (self.layers or self.forward):
-            raise ValueError("--layers and --forward are of the cloth")
+        if self.solver == "points" and (self.self_contact or self.forward):
+            raise ValueError("--self-contact and --forward are of the cloth")
         if not self.tolerance > 0:
             raise ValueError(f"--tolerance must be positive, got {self.tolerance}")
         card = card_of(self.fabric)
@@ -77,7 +77,7 @@ class CheckGrad:
         from r2s.scenarios import material_points
         from r2s.scenarios.scenario import rollout
 
-        scenario = experiment_of(self.scenario, self.motion).scenario(self.shape, self.layers)
+        scenario = experiment_of(self.scenario, self.motion).scenario(self.shape, self.self_contact)
         solver = material_points(scenario, fabric) if self.solver == "points" else None
 
         def loss(fabric):

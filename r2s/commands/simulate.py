@@ -34,7 +34,7 @@ class Simulate:
     """The cloth, or material points."""
     shape: tuple[int, int] = (9, 9)
     """Vertices along warp and weft."""
-    layers: bool = False
+    self_contact: bool = False
     """The sheet touches itself (cloth only; slower)."""
     recording: Annotated[Path | None, arg(metavar="FILE")] = None
     """Also write a synthetic recording, as NPZ."""
@@ -55,10 +55,12 @@ class Simulate:
         from r2s.scenarios.scenario import rollout
         from r2s.viewer.pictures import save_trajectory
 
-        if self.layers and self.solver == "points":
-            raise ValueError("--layers is of the cloth: material points touch through their grid")
+        if self.self_contact and self.solver == "points":
+            raise ValueError(
+                "--self-contact is of the cloth: material points touch through their grid"
+            )
         card, experiment = card_of(self.fabric), experiment_of(self.scenario, self.motion)
-        scenario, fabric = experiment.scenario(self.shape, self.layers), card.fabric
+        scenario, fabric = experiment.scenario(self.shape, self.self_contact), card.fabric
         points = scenarios.material_points if self.solver == "points" else None
         solver = None if points is None else points(scenario, fabric)
         moved = eqx.filter_jit(rollout)(scenario, fabric, solver=solver)
@@ -78,7 +80,7 @@ class Simulate:
         lines = [f"{self.out}: {len(ok)} frames of {told['vertices']} vertices"]
         if ok.all() and self.recording is not None:
             about = experiment, fabric, card.name
-            size = {"shape": self.shape, "layers": self.layers, "solver": points}
+            size = {"shape": self.shape, "self_contact": self.self_contact, "solver": points}
             made = synthetic.record(*about, **size, key=jax.random.key(self.seed))
             save(made, self.recording)
             lines.append(f"{self.recording}: {made.points.shape[1]} points a frame at most")

@@ -6,7 +6,6 @@ from r2s.export import stiffness
 from r2s.export.stiffness import Loss
 from r2s.fabrics.arcsim import write_material
 from r2s.fabrics.fabric import Fabric
-from r2s.laws.plate import PlateLaw
 
 ELSEWHERE = "damping, friction and thickness: ARCSim and DiffSim keep them in their scene files"
 TWICE = "DiffSim uses the numbers twice as stiff: the file has half of them"
@@ -21,7 +20,7 @@ def write(path: Path | str, fabric: Fabric, name: str = "", *, diffsim: bool = F
     """
     write_material(path, fabric, name, diffsim=diffsim)
     lost = (ELSEWHERE,)
-    lost += (HINGES,) if isinstance(fabric.bending, PlateLaw) else ()
+    lost += (HINGES,) if fabric.bending.element != "hinges" else ()
     lost += (TWICE,) if diffsim else ()
     own = stiffness.probes(stiffness.membrane_stiffness(fabric))
     bending = stiffness.bending_stiffness(fabric)

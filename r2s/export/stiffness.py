@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
-from r2s.cloth.potential import bending_areas, bends, curvatures, hinge_angles
 from r2s.fabrics.fabric import Fabric
+from r2s.geometry.elements import hinge_angles, hinge_curvatures
 from r2s.geometry.mesh import Mesh
 from r2s.laws.bending import HingeBending
-from r2s.laws.plate import PlateBending, PlateLaw
+from r2s.laws.plate import PlateBending
 
 Stiffness = Float[np.ndarray, "3 3"]
 DIRECTIONS = {"warp": 0.0, "bias": np.pi / 4, "weft": np.pi / 2, "other bias": 3 * np.pi / 4}
@@ -55,17 +55,8 @@ def membrane_stiffness(fabric: Fabric) -> Stiffness:
 
 def bending_stiffness(fabric: Fabric) -> dict[str, float]:
     """Moment per curvature and width [N m] of a flat sheet, by direction, of any bending law."""
-    law, zero = fabric.bending, jnp.zeros((), float)
-    if isinstance(law, PlateLaw):
-        flat = jnp.zeros(3, float)
-        matrix = np.asarray(jax.hessian(law.at(flat).energy_density)(flat), np.float64)
-        cylinder = lambda a: np.array([np.cos(a) ** 2, np.sin(a) ** 2, np.sin(2 * a)])
-        return {name: float(cylinder(a) @ matrix @ cylinder(a)) for name, a in DIRECTIONS.items()}
-    found = {}
-    for name, angle in DIRECTIONS.items():
-        hinge = law.at(jnp.asarray(min(angle, np.pi - angle), float), zero)
-        found[name] = float(jax.hessian(hinge.energy_density)(zero))
-    return found
+    along = fabric.bending.stiffness_along
+    return {name: float(along(angle)) for name, angle in DIRECTIONS.items()}
 
 
 def probes(stiffness: Stiffness) -> dict[str, float]:
@@ -158,8 +149,8 @@ def hinged(mesh: Mesh, stiffness: float) -> dict[str, float]:
 
 
 def _energy(mesh: Mesh, law: Any, angles) -> float:
-    density = jax.vmap(law.energy_density)(bends(mesh, law, curvatures(mesh, angles)))
-    return float(jnp.sum(bending_areas(mesh, law) * density))
+    density = jax.vmap(law.energy_density)(law.curvatures(mesh, hinge_curvatures(mesh, angles)))
+    return float(jnp.sum(law.areas(mesh) * density))
 
 
 def one(fabric: Fabric) -> None:

@@ -5,8 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from r2s.cloth.linear.dissection import Level, levels
-from r2s.cloth.linear.pattern import Pattern
 from r2s.geometry.patches import Patches
 
 SMALLEST, LARGEST = 1e-3, 50.0  # [m], of sheets
@@ -25,7 +23,6 @@ class Mesh(eqx.Module):
       angles to its edge, 0 to pi/2 [rad].
     - `rest_curvature`: of each hinge where it stores no energy, [1/m]; 0 for a flat sheet.
     - `patches`: the faces with the hinges around them.
-    - `pattern`, `levels`: of the matrices over its vertices, for their solution.
     """
 
     rest: Float[Array, "vertex 2"]
@@ -39,8 +36,6 @@ class Mesh(eqx.Module):
     hinge_direction: Float[Array, " hinge"]
     rest_curvature: Float[Array, " hinge"]
     patches: Patches
-    pattern: Pattern
-    levels: tuple[Level, ...]
 
     @classmethod
     def make(cls, rest: Float[np.ndarray, "vertex 2"], faces: Int[np.ndarray, "face 3"]) -> "Mesh":
@@ -62,9 +57,6 @@ class Mesh(eqx.Module):
             )
         hinges, hinge_faces = _hinges(faces)
         ends = rest[hinges[:, 0]] - rest[hinges[:, 1]]
-        patches = Patches.make(rest, faces, hinges)
-        elements = faces, hinges, np.asarray(patches.vertices)
-        pattern = Pattern.make(len(rest), *elements)
         vertex_area = np.zeros(len(rest))
         np.add.at(vertex_area, faces.ravel(), np.repeat(area / 3, 3))
         return cls(
@@ -78,9 +70,7 @@ class Mesh(eqx.Module):
             hinge_area=jnp.asarray(area[hinge_faces].sum(axis=-1), float),
             hinge_direction=jnp.asarray(np.arctan2(*np.abs(ends.T)), float),
             rest_curvature=jnp.zeros(len(hinges), float),
-            patches=patches,
-            pattern=pattern,
-            levels=levels(rest, np.asarray(pattern.rows), np.asarray(pattern.columns)),
+            patches=Patches.make(rest, faces, hinges),
         )
 
 
@@ -135,7 +125,10 @@ def _hinges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def borders(mesh: Mesh) -> Bool[Array, "face 3"]:
     """Which edges of the faces, each opposite to a corner, are borders of the sheet."""
     count = len(mesh.rest)
-    name = lambda a, b: jnp.minimum(a, b) * count + jnp.maximum(a, b)
+
+    def name(a: Array, b: Array) -> Array:
+        return jnp.minimum(a, b) * count + jnp.maximum(a, b)
+
     edges = name(jnp.roll(mesh.faces, -1, axis=1), jnp.roll(mesh.faces, -2, axis=1))
     return ~jnp.isin(edges, name(mesh.hinges[:, 0], mesh.hinges[:, 1]))
 

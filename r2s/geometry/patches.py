@@ -49,11 +49,10 @@ class Patches(eqx.Module):
         same = vertices[:, None, :, None] == four[:, :, None, :]  # (face, hinge, patch, of hinge)
         same[:, :, 3:] &= np.eye(3, dtype=bool)[None, :, :, None]  # each only beyond its own edge
         corners = np.where(same.any(axis=-1), same.argmax(axis=-1), 4)
-        array = lambda values: jnp.asarray(values, int)
         return cls(
-            vertices=array(vertices),
-            hinges=array(np.maximum(of_face, 0)),
-            corners=array(corners),
+            vertices=jnp.asarray(vertices, int),
+            hinges=jnp.asarray(np.maximum(of_face, 0), int),
+            corners=jnp.asarray(corners, int),
             to_curvature=jnp.asarray(_to_curvature(rest, hinges, of_face), float),
         )
 

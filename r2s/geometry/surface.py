@@ -34,12 +34,18 @@ def _squared_distances(
     """From points to triangles, [m^2]: within the triangle its plane's, else its nearest edge's."""
     a, u, v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     tiny = jnp.finfo(points.dtype).tiny
-    dot = lambda p, q: jnp.sum(p * q, axis=-1)[None]  # of each face
+
+    def dot(p, q):
+        return jnp.sum(p * q, axis=-1)[None]  # of each face
+
     uu, uv, vv = dot(u, u), dot(u, v), dot(v, v)
     normal = jnp.cross(u, v)
     normal = normal / jnp.sqrt(jnp.maximum(dot(normal, normal)[0], tiny))[:, None]
     offset = [points[:, k, None] - a[None, :, k] for k in range(3)]  # each (point, face)
-    along = lambda q: sum(offset[k] * q[None, :, k] for k in range(3))
+
+    def along(q):
+        return sum(offset[k] * q[None, :, k] for k in range(3))
+
     s, t, height = along(u), along(v), along(normal)
     square = sum(part**2 for part in offset)
     first, second = vv * s - uv * t, uu * t - uv * s

@@ -1,4 +1,4 @@
-"""Bending: the angle of a hinge between two triangles, and the energy that a fabric stores in it.
+"""Bending laws of hinges: the energy that a fabric stores in the angle between two triangles.
 
 A hinge is an edge of rest length l with the rest area A of its two triangles. Its curvature is
 theta l / A, its energy A times the law's energy per area. On a grid of squares whose lines stay
@@ -8,38 +8,108 @@ three times as much where they are parallel, at any resolution. A strip along th
 zigzag or twist, is softer: 1 / (1 / warp + 1 / (4 bias)) of hinge stiffnesses, 0.8 of a stiffness
 that is the same in all directions. `r2s.laws.plate` has neither flaw.
 
-A law is a pytree of parameters with two methods: `at`, which gives the law of one hinge from the
-direction across which it bends and its curvature, and `energy_density` of a curvature.
+A law is a pytree of parameters. A `BendingLaw` owns the element that it acts on, so that solvers
+need not know which kind it is; a law of hinges derives from `HingeLaw`.
 """
 
-from typing import Protocol, runtime_checkable
+import math
+from abc import abstractmethod
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from r2s.geometry.mesh import Mesh
 from r2s.units import Scalar, isotropic_bending
 
 
-@runtime_checkable
-class BendingLaw(Protocol):
-    """What the cloth asks of a bending law."""
+class BendingLaw(eqx.Module):
+    """What the solvers ask of a bending law, which owns the element that it acts on.
 
-    def at(self, direction: Float[Array, ""], curvature: Float[Array, ""]) -> "BendingLaw":
+    A law of one's own derives from `HingeLaw` (the angle between two triangles) or from
+    `r2s.laws.plate.PlateLaw` (the curvature tensor of a face). Curvatures of all hinges of a sheet
+    go in (`r2s.geometry.elements.hinge_curvatures`).
+
+    - `element`: "hinges" or "patches", the vertices of its elements in a sparse matrix.
+    """
+
+    element: eqx.AbstractClassVar[str]
+
+    @abstractmethod
+    def vertices(self, mesh: Mesh) -> Int[Array, "element corner"]:
+        """The vertices that each element's curvature depends on."""
+
+    @abstractmethod
+    def areas(self, mesh: Mesh) -> Float[Array, " element"]:
+        """The rest areas [m^2] of the elements."""
+
+    @abstractmethod
+    def curvatures(self, mesh: Mesh, hinges: Float[Array, " hinge"]) -> Float[Array, "element ..."]:
+        """The curvatures [1/m] of the elements, from those of all hinges."""
+
+    @abstractmethod
+    def gradients(
+        self, mesh: Mesh, hinges: Float[Array, "hinge 4 3"]
+    ) -> Float[Array, "element strain corner 3"]:
+        """Derivatives [1/m^2] of the elements' curvatures in their vertices, from the hinges'."""
+
+    @abstractmethod
+    def on_elements(self, mesh: Mesh, hinges: Float[Array, " hinge"]) -> Any:
+        """The law of every element in a time step that starts near these hinge curvatures [1/m]."""
+
+    @abstractmethod
+    def stiffness_along(self, angle: float) -> Float[Array, ""]:
+        """Stiffness [N m] of the flat sheet against bending at an angle [rad] to the warp."""
+
+
+class HingeLaw(BendingLaw):
+    """A bending law of hinges: of the angle between two triangles."""
+
+    element: ClassVar[str] = "hinges"
+
+    @abstractmethod
+    def at(self, direction: Float[Array, ""], curvature: Float[Array, ""]) -> Any:
         """The law that a time step uses for a hinge which starts near this curvature [1/m].
 
-        `direction` is the angle [rad], 0 to pi/2, between the warp and the line that the hinge
-        bends, which is at right angles to its edge: 0 when warp yarns bend, pi/2 for weft yarns.
+        It has a method `energy_density(curvature)`: energy per rest area [J/m^2]. `direction` is
+        the angle [rad], 0 to pi/2, between the warp and the line that the hinge bends, which is at
+        right angles to its edge: 0 when warp yarns bend, pi/2 for weft yarns.
         """
-        ...
 
-    def energy_density(self, curvature: Float[Array, ""]) -> Float[Array, ""]:
-        """Energy per rest area [J/m^2] at a curvature [1/m]."""
-        ...
+    def vertices(self, mesh: Mesh) -> Int[Array, "hinge 4"]:
+        """The ends of each hinge's edge, then the vertices opposite to it."""
+        return mesh.hinges
+
+    def areas(self, mesh: Mesh) -> Float[Array, " hinge"]:
+        """The rest areas [m^2] of the hinges' two faces together."""
+        return mesh.hinge_area
+
+    def curvatures(self, mesh: Mesh, hinges: Float[Array, " hinge"]) -> Float[Array, " hinge"]:
+        """The curvatures of the hinges themselves, [1/m]."""
+        del mesh
+        return hinges
+
+    def gradients(
+        self, mesh: Mesh, hinges: Float[Array, "hinge 4 3"]
+    ) -> Float[Array, "hinge 1 4 3"]:
+        """The gradients of the hinges themselves, [1/m^2]."""
+        del mesh
+        return hinges[:, None]
+
+    def on_elements(self, mesh: Mesh, hinges: Float[Array, " hinge"]) -> Any:
+        """The law of every hinge, by its direction and curvature [1/m]."""
+        return jax.vmap(self.at)(mesh.hinge_direction, hinges)
+
+    def stiffness_along(self, angle: float) -> Float[Array, ""]:
+        """Stiffness [N m] of a hinge that bends at an angle [rad], 0 to pi, to the warp."""
+        zero = jnp.zeros((), float)
+        law = self.at(jnp.asarray(min(angle, math.pi - angle), float), zero)
+        return jax.hessian(law.energy_density)(zero)
 
 
-class HingeBending(eqx.Module):
+class HingeBending(HingeLaw):
     """Bending with constant stiffness.
 
     - `stiffness`: moment per curvature and width, [N m].
@@ -64,7 +134,7 @@ class HingeBending(eqx.Module):
         return self.stiffness * curvature**2 / 2
 
 
-class OrthotropicBending(eqx.Module):
+class OrthotropicBending(HingeLaw):
     """Bending whose constant stiffness depends on the direction, as warp and weft yarns do.
 
     - `warp`, `bias`, `weft`: moment per curvature and width [N m] for bending along 0, 45 and 90
@@ -83,7 +153,7 @@ class OrthotropicBending(eqx.Module):
         return HingeBending(across + to_weft * (self.weft - self.bias))
 
 
-class SpringBending(eqx.Module):
+class SpringBending(HingeLaw):
     """The bending springs of a mass-spring cloth, between vertices two apart.
 
     A spring over two cells of length h shortens to cos(theta / 2) of its length when the cells
@@ -104,55 +174,3 @@ class SpringBending(eqx.Module):
     def energy_density(self, curvature: Float[Array, ""]) -> Float[Array, ""]:
         """Energy per rest area [J/m^2] at a curvature [1/m]."""
         return self.stiffness / 2 * (1 - jnp.cos(curvature * self.spacing / 2)) ** 2
-
-
-@jax.custom_jvp
-def hinge_angle(corners: Float[Array, "4 3"]) -> Float[Array, ""]:
-    """Signed angle [rad] between the normals of two triangles that share an edge.
-
-    `corners` [m]: the two ends of the edge, then the two vertices opposite to it. Zero when flat.
-    The angle comes from an arctangent of two arguments, and its derivative from `angle_gradient`,
-    so that both are finite and exact everywhere but at a triangle of no area.
-    """
-    edge, left, right = _normals(corners)
-    sine = jnp.cross(left, right) @ edge / jnp.sqrt(edge @ edge)
-    return jnp.arctan2(sine, left @ right)
-
-
-def angle_gradient(corners: Float[Array, "4 3"]) -> Float[Array, "4 3"]:
-    """Derivative [rad/m] of `hinge_angle` in its corners.
-
-    An opposite vertex turns its triangle by its motion along the normal over its height; what the
-    ends of the edge do follows, since no rigid motion changes the angle.
-    """
-    start, end, to_left, to_right = corners
-    edge, left, right = _normals(corners)
-    length = jnp.sqrt(edge @ edge)
-    of_left, of_right = -length * left / (left @ left), -length * right / (right @ right)
-    share = lambda point: (point - start) @ edge / length**2  # 0 at the start, 1 at the end
-    left_share, right_share = share(to_left), share(to_right)
-    of_end = -left_share * of_left - right_share * of_right
-    of_start = -(1 - left_share) * of_left - (1 - right_share) * of_right
-    return jnp.stack([of_start, of_end, of_left, of_right])
-
-
-@hinge_angle.defjvp
-def _hinge_angle_jvp(primals, tangents):
-    return hinge_angle(*primals), jnp.sum(angle_gradient(*primals) * tangents[0])
-
-
-def _normals(corners):
-    """The edge [m], and the normals of its two triangles, twice as long as their areas [m^2]."""
-    start, end, left, right = corners
-    edge = end - start
-    return edge, jnp.cross(edge, left - start), jnp.cross(right - start, edge)
-
-
-def unwrapped(
-    angle: Float[Array, "*hinge"], near: Float[Array, "*hinge"]
-) -> Float[Array, "*hinge"]:
-    """The angle [rad] plus the whole turns that bring it nearest to another one.
-
-    So that a hinge that folds right over goes on from pi, and does not jump to minus pi.
-    """
-    return angle + 2 * jnp.pi * jnp.round((near - angle) / (2 * jnp.pi))

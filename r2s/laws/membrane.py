@@ -1,4 +1,4 @@
-"""Membrane: Green strain of a triangle, and the energy that a fabric stores in it.
+"""Membrane laws: the energy that a fabric stores in the Green strain of a triangle.
 
 A law is a pytree of parameters with two methods: `energy_density` of a strain, and `at`, which
 gives the law that a time step uses. A law whose energy says it all returns itself; one whose
@@ -97,25 +97,10 @@ class SpringMembrane(eqx.Module):
         """Energy per rest area [J/m^2] at a Green strain (E11, E22, 2 E12) [-]."""
         e11, e22, shear = strain
         mean, half = (e11 + e22) / 2, shear / 2
-        extension = lambda along: jnp.sqrt(jnp.maximum(1 + 2 * along, COLLAPSED)) - 1
+
+        def extension(along):
+            return jnp.sqrt(jnp.maximum(1 + 2 * along, COLLAPSED)) - 1
+
         structural = self.warp * extension(e11) ** 2 + self.weft * extension(e22) ** 2
         biases = extension(mean + half) ** 2 + extension(mean - half) ** 2
         return (structural + self.shear * biases) / 2
-
-
-def deformation_gradient(
-    corners: Float[Array, "3 3"], inverse: Float[Array, "2 2"]
-) -> Float[Array, "3 2"]:
-    """F = [x1 - x0, x2 - x0] Dm^-1 [-]: the world images of the unit warp and weft vectors.
-
-    `corners` are the triangle's positions [m], `inverse` the inverse of its rest edges [1/m].
-    """
-    edges = jnp.stack([corners[1] - corners[0], corners[2] - corners[0]], axis=1)
-    return edges @ inverse
-
-
-def green_strain(corners: Float[Array, "3 3"], inverse: Float[Array, "2 2"]) -> Float[Array, " 3"]:
-    """Green strain (E11, E22, 2 E12) [-] of a triangle, E = (F^T F - 1) / 2."""
-    deformation = deformation_gradient(corners, inverse)
-    warp, weft = deformation[:, 0], deformation[:, 1]
-    return jnp.stack([(warp @ warp - 1) / 2, (weft @ weft - 1) / 2, warp @ weft])

@@ -6,20 +6,23 @@ regular mesh whose diagonals are parallel (`r2s.geometry.mesh.rectangle`), and t
 does, which hinges (`r2s.laws.bending`) do not.
 """
 
+import math
 from abc import abstractmethod
+from typing import Any, ClassVar
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from r2s.geometry.mesh import Mesh
+from r2s.laws.bending import BendingLaw
 from r2s.units import Scalar, isotropic_bending
 
 
-class PlateLaw(eqx.Module):
-    """What the cloth asks of a bending law that acts on faces; a law of one's own derives from it.
+class PlateLaw(BendingLaw):
+    """A bending law of faces: of their curvature tensor."""
 
-    (A class and not a protocol, since laws of hinges have the same two methods.)
-    """
+    element: ClassVar[str] = "patches"
 
     @abstractmethod
     def at(self, curvature: Float[Array, " 3"]) -> "PlateLaw":
@@ -28,6 +31,37 @@ class PlateLaw(eqx.Module):
     @abstractmethod
     def energy_density(self, curvature: Float[Array, " 3"]) -> Float[Array, ""]:
         """Energy per rest area [J/m^2] at a curvature (k11, k22, 2 k12) [1/m]."""
+
+    def vertices(self, mesh: Mesh) -> Int[Array, "face 6"]:
+        """The corners of each face, then the vertices beyond its edges."""
+        return mesh.patches.vertices
+
+    def areas(self, mesh: Mesh) -> Float[Array, " face"]:
+        """The rest areas [m^2] of the faces."""
+        return mesh.area
+
+    def curvatures(self, mesh: Mesh, hinges: Float[Array, " hinge"]) -> Float[Array, "face 3"]:
+        """The curvatures (k11, k22, 2 k12) [1/m] of the faces, from those of the hinges."""
+        return mesh.patches.curvatures(hinges)
+
+    def gradients(
+        self, mesh: Mesh, hinges: Float[Array, "hinge 4 3"]
+    ) -> Float[Array, "face 3 6 3"]:
+        """Derivatives [1/m^2] of the faces' curvatures in their vertices, from the hinges'."""
+        return mesh.patches.gradients(hinges)
+
+    def on_elements(self, mesh: Mesh, hinges: Float[Array, " hinge"]) -> Any:
+        """The law of every face, by its curvature."""
+        return jax.vmap(self.at)(self.curvatures(mesh, hinges))
+
+    def stiffness_along(self, angle: float) -> Float[Array, ""]:
+        """Stiffness [N m] of the flat plate against a cylinder at an angle [rad] to the warp."""
+        flat = jnp.zeros(3, float)
+        matrix = jax.hessian(self.at(flat).energy_density)(flat)
+        cylinder = jnp.asarray(
+            [math.cos(angle) ** 2, math.sin(angle) ** 2, math.sin(2 * angle)], float
+        )
+        return cylinder @ matrix @ cylinder
 
 
 class PlateBending(PlateLaw):

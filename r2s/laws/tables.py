@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from r2s.laws.bending import HingeBending
+from r2s.laws.bending import HingeBending, HingeLaw
 from r2s.laws.membrane import OrthotropicMembrane
 
 LARGE_STRETCH = 1 / 6  # [-]: the extension at which the large-strain rows were measured
@@ -98,7 +98,7 @@ class DiffSimTableMembrane(eqx.Module):
         return self.at(strain).energy_density(strain)
 
 
-class TableBending(eqx.Module):
+class TableBending(HingeLaw):
     """Bending whose stiffness depends on the direction and the curvature.
 
     - `stiffness`: as published [N m]. Rows are the directions 0, 45 and 90 degrees of an edge from
@@ -120,7 +120,7 @@ class TableBending(eqx.Module):
         return HingeBending(_between(_between(self.stiffness, row), column) / HINGE_FACTOR)
 
 
-class DiffSimTableBending(eqx.Module):
+class DiffSimTableBending(HingeLaw):
     """A `TableBending` looked up as DiffSim does.
 
     It shifts the table by half an entry in both directions, and takes the curvature with its sign:

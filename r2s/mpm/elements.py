@@ -10,19 +10,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from r2s.cloth.potential import (
-    bending_areas,
-    bending_laws,
-    bends,
-    curvatures,
-    hinge_angles,
-    strains,
-)
 from r2s.fabrics.fabric import Fabric
+from r2s.geometry.elements import (
+    green_strain,
+    hinge_angles,
+    hinge_curvature_gradients,
+    hinge_curvatures,
+    strains,
+    vertex_masses,
+)
 from r2s.geometry.mesh import Mesh
-from r2s.laws.bending import angle_gradient
-from r2s.laws.membrane import green_strain
-from r2s.laws.plate import PlateLaw
 
 Vertices = Float[Array, "vertex 3"]
 
@@ -35,12 +32,17 @@ def elastic_force(
 
     As in `r2s.Cloth`, but for `membrane_damping` [s], the damping time of the membrane.
     """
-    hinges = lambda x: curvatures(mesh, hinge_angles(mesh, x))
-    bend = lambda x: bends(mesh, fabric.bending, hinges(x))
+
+    def hinges(x):
+        return hinge_curvatures(mesh, hinge_angles(mesh, x))
+
+    def bend(x):
+        return fabric.bending.curvatures(mesh, hinges(x))
+
     stretched = jax.vmap(fabric.membrane.at)(strains(mesh, x))
-    bent = bending_laws(mesh, fabric.bending, hinges(x))
+    bent = fabric.bending.on_elements(mesh, hinges(x))
     along = _resistance(stretched, lambda x: strains(mesh, x), mesh.area, membrane_damping, x, v)
-    areas = bending_areas(mesh, fabric.bending)
+    areas = fabric.bending.areas(mesh)
     return along + _resistance(bent, bend, areas, fabric.damping, x, v)
 
 
@@ -54,7 +56,10 @@ def _resistance(
 ) -> Vertices:
     """Minus the derivative in x of the energy that laws give a measure of x, with its viscosity."""
     strain, rate = jax.jvp(measure, (x,), (v,))
-    slopes = lambda strain: jax.vmap(lambda law, s: jax.grad(law.energy_density)(s))(laws, strain)
+
+    def slopes(strain):
+        return jax.vmap(lambda law, s: jax.grad(law.energy_density)(s))(laws, strain)
+
     stress, viscous = jax.jvp(slopes, (strain,), (rate,))
     _, pull = jax.vjp(measure, x)
     areas = areas if strain.ndim == 1 else areas[:, None]
@@ -83,23 +88,18 @@ def bending_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
     """
     if not mesh.hinges.shape[0]:
         return jnp.zeros((), float)
-    mass = fabric.density * mesh.vertex_area
-    width = (mesh.hinge_length / mesh.hinge_area)[:, None, None]
-    turns = width * jax.vmap(angle_gradient)(_flat(mesh)[mesh.hinges])
-    law, areas = fabric.bending, bending_areas(mesh, fabric.bending)
-    if isinstance(law, PlateLaw):
-        vertices, rates = mesh.patches.vertices, mesh.patches.gradients(turns)
-        tangents = _tangent(law.at, law)[None]
-    else:
-        vertices, rates = mesh.hinges, turns[:, None]
-        flat = jnp.zeros(len(areas), mesh.rest.dtype)
-        laws = jax.vmap(law.at)(mesh.hinge_direction, flat)
-        tangents = jax.vmap(lambda law, k: jax.hessian(law.energy_density)(k))(laws, flat)
-        tangents = tangents[:, None, None]
+    mass = vertex_masses(mesh, fabric.density)
+    law = fabric.bending
+    vertices, areas = law.vertices(mesh), law.areas(mesh)
+    rates = law.gradients(mesh, hinge_curvature_gradients(mesh, _flat(mesh)))
+    count, size = rates.shape[:2]
+    hinges = jnp.zeros(mesh.hinges.shape[0], mesh.rest.dtype)
+    laws, flat = law.on_elements(mesh, hinges), law.curvatures(mesh, hinges)
+    tangents = jax.vmap(lambda law, k: jax.hessian(law.energy_density)(k))(laws, flat)
+    tangents = tangents.reshape(count, size, size)  # of a hinge it is a number
     sharing = jnp.zeros(mass.shape, float).at[vertices].add(1)
     weight = jnp.sqrt(areas[:, None] * sharing[vertices] / mass[vertices])
     rates = (rates * weight[:, None, :, None]).reshape(*rates.shape[:2], -1)
-    tangents = jnp.broadcast_to(tangents, (len(areas), *tangents.shape[1:]))
     return jnp.max(jax.vmap(_largest)(tangents, rates))
 
 

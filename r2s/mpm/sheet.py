@@ -82,17 +82,13 @@ class Sheet(eqx.Module):
 
         `fabric` is the stiffest that it will be used for; `compression` and `shear` [N/m] are those
         between layers; walls, sticky and forward mode as in `Background`. Raises `ValueError` when
-        the step is too long for the fabric (the text gives the limit), the mesh too coarse for the
-        grid, or the scene has layers, which belong to `r2s.Cloth`.
+        the step is too long for the fabric (the text gives the limit), or the mesh too coarse for
+        the grid.
         """
         if not dt > 0 or not min(compression, shear) > 0:
             raise ValueError(
                 f"dt [s], compression and shear [N/m] must be positive, got {dt}, {compression} "
                 f"and {shear}"
-            )
-        if scene.layers is not None:
-            raise ValueError(
-                "contact between layers comes from the grid: the scene needs no layers"
             )
         edge = longest_edge(scene.mesh)
         if edge > COARSEST * grid.spacing:

@@ -7,16 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from r2s.cloth.potential import (
-    bending_areas,
-    bending_laws,
-    bends,
-    curvatures,
-    hinge_angles,
-    strains,
-    vertex_mass,
-)
 from r2s.fabrics.fabric import Fabric
+from r2s.geometry.elements import hinge_angles, hinge_curvatures, strains, vertex_masses
 from r2s.geometry.mesh import Mesh
 from r2s.scenarios.gripper_forces import step_with_forces
 from r2s.scenarios.scenario import Scenario, begin, stepped
@@ -63,7 +55,7 @@ def energy_balance(
 ) -> EnergyBalance:
     """The motion of a fabric with forces and energies, from the first frame on.
 
-    Arguments as of `motion`.
+    The arguments are those of `rollout`.
 
     The grippers' work is the mean of their forces in two steps, times the displacement (the cloth
     has forces at the ends of its steps); the air's is that in the middle of the step.
@@ -87,9 +79,12 @@ def energy_balance(
     start = begin(solver, scenario), jnp.zeros((len(held), 3), float)
     _, (x, v, forces, grippers, air) = jax.lax.scan(frame, start, scenario.controls(substeps))
     first = scenario.lead_in - 1
-    since = lambda work: jnp.cumsum(work[first:]) - work[first]
+
+    def since(work):
+        return jnp.cumsum(work[first:]) - work[first]
+
     x, v = x[first:], v[first:]
-    mass = vertex_mass(mesh, fabric)
+    mass = vertex_masses(mesh, fabric.density)
     return EnergyBalance(
         x=x,
         forces=forces[first:],
@@ -117,11 +112,11 @@ def stored_energy(mesh: Mesh, fabric: Fabric, x: Float[Array, "vertex 3"]) -> Fl
     Of laws by table: that of a sheet which has had the stiffness it has there all along.
     """
     membrane = jax.vmap(fabric.membrane.energy_density)(strains(mesh, x))
-    hinges = curvatures(mesh, hinge_angles(mesh, x))
-    laws = bending_laws(mesh, fabric.bending, hinges)
-    of_one = lambda law, curvature: law.energy_density(curvature)
-    bending = jax.vmap(of_one)(laws, bends(mesh, laws, hinges))
-    return jnp.sum(mesh.area * membrane) + jnp.sum(bending_areas(mesh, laws) * bending)
+    hinges = hinge_curvatures(mesh, hinge_angles(mesh, x))
+    laws = fabric.bending.on_elements(mesh, hinges)
+    curvatures = fabric.bending.curvatures(mesh, hinges)
+    bending = jax.vmap(lambda law, curvature: law.energy_density(curvature))(laws, curvatures)
+    return jnp.sum(mesh.area * membrane) + jnp.sum(fabric.bending.areas(mesh) * bending)
 
 
 def _drag(scenario: Scenario, state: Any, after: Any, control: Control):

@@ -40,4 +40,4 @@ def step_with_forces(
 def _cloth_forces(
     solver: Cloth, fabric: Fabric, state: ClothState, control: Control, after: ClothState
 ) -> Forces:
-    return residual(solver.increment(fabric, state, control), after.x)[solver.scene.held]
+    return residual(solver.potential(fabric, state, control), after.x)[solver.scene.held]

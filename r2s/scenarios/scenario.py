@@ -6,10 +6,11 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from r2s.cloth.cloth import Cloth
-from r2s.cloth.self_contact.contacts import SelfContact
+from r2s.cloth.cloth import Cloth, prepare_mesh
+from r2s.cloth.linear.elimination import Elimination
+from r2s.cloth.self_contact.detection import SelfContact
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh, corner, rectangle
 from r2s.recordings.recording import Recording, SheetPlacement
@@ -34,7 +35,8 @@ class Scenario(eqx.Module):
     """An experiment, for any fabric. Its arrays are traced: one compilation serves all recordings
     of as many frames and knots.
 
-    - `scene`: sheet, table, air, fan, held vertices, whether layers touch.
+    - `scene`: sheet, table, air, fan, held vertices.
+    - `elimination`, `self_contact`: of the cloth solver, see `r2s.cloth.cloth.Cloth`.
     - `start`: positions at rest, [m].
     - `path`, `path_times`: of the held vertices, [m] and [s].
     - `first_time`: of the first frame, [s].
@@ -47,6 +49,7 @@ class Scenario(eqx.Module):
     """
 
     scene: Scene
+    elimination: Elimination
     start: Float[Array, "vertex 3"]
     path: Float[Array, "knot handle 3"]
     path_times: Float[Array, " knot"]
@@ -59,6 +62,7 @@ class Scenario(eqx.Module):
     wind_times: Float[Array, " gust"] | None = None
     brake: Float[Array, ""] | None = None
     acceleration: Float[Array, "vertex 3"] | None = None
+    self_contact: SelfContact | None = None
 
     def controls(self, substeps: int) -> Control:
         """What grippers and air do at the end of every substep, axes (frame, substep)."""
@@ -85,14 +89,15 @@ def from_placement(
     *,
     clamps: tuple[tuple[str, str], ...] = (),
     wind: tuple[float, float, float] | None = None,
-    layers: bool = False,
+    self_contact: bool = False,
 ) -> Scenario:
     """A scenario for a rectangular sheet, held at named corners, over a table.
 
     `path` [m] and `path_times` [s] are the grippers', `times` [s] the frames', `shape` the
     vertices along warp and weft. `clamps` are pairs of held corners: all of the side between them
     is held, straight and evenly spread. `wind` [m/s] is that of a fan in front of the sheet's
-    middle, which starts with the first frame. With `layers` the sheet touches itself.
+    middle, which starts with the first frame. With `self_contact` it does not pass
+    through itself.
 
     Before the first frame the grippers go from the sheet's corners to where the path begins; a
     sheet that hangs, its plane not horizontal, also comes to rest, braked by `BRAKE` for
@@ -116,15 +121,12 @@ def from_placement(
     knots = jnp.asarray([begin - lead_in * interval, begin - lead_in * interval / 2], float)
     at_rest = jnp.asarray(start[held], float)
     rising, rising_times = (None, None) if wind is None else _gust(wind, float(times[0]))
+    fan = None if wind is None else _fan(sheet, wind)
+    scene = Scene(mesh, jnp.asarray(held), Table.make(table_height), Air.make(), fan)
+    elimination, search = prepare_mesh(scene, self_contact)
     return Scenario(
-        scene=Scene(
-            mesh,
-            jnp.asarray(held),
-            Table.make(table_height),
-            Air.make(),
-            None if wind is None else _fan(sheet, wind),
-            SelfContact.make(mesh) if layers else None,
-        ),
+        scene=scene,
+        elimination=elimination,
         start=jnp.asarray(start, float),
         path=jnp.concatenate([at_rest[None], path[:1], path]),
         path_times=jnp.concatenate([knots, path_times]),
@@ -136,6 +138,7 @@ def from_placement(
         wind=rising,
         wind_times=rising_times,
         brake=jnp.asarray(BRAKE, float) if hangs else None,
+        self_contact=search,
     )
 
 
@@ -171,8 +174,7 @@ def _fan(sheet: SheetPlacement, wind: tuple[float, float, float]) -> Fan:
     axes = np.array([sheet.warp, sheet.weft])
     middle = np.asarray(sheet.origin) + np.asarray(sheet.size) @ axes / 2
     radius, edge = (share * min(sheet.size) for share in JET)
-    array = lambda value: jnp.asarray(value, float)
-    return Fan(array(middle), array(wind), array(radius), array(edge))
+    return Fan(*(jnp.asarray(part, float) for part in (middle, wind, radius, edge)))
 
 
 def _gust(wind: tuple[float, float, float], begin: float):
@@ -231,12 +233,12 @@ def rollout(
 
     By the cloth, in steps of equal size that fill the time between frames: the scenario's, or as
     many as it takes that none is above `max_step` [s]. Or by another `solver` of the same scene,
-    whose own step divides that time, such as of `r2s.scenarios.material_points`.
+    whose own step divides that time, such as of `r2s.scenarios.on_points.material_points`.
     """
     solver, substeps = stepped(scenario, max_step, solver)
     moved = simulate(solver, fabric, begin(solver, scenario), scenario.controls(substeps))
     skipped = scenario.lead_in - 1
-    return Trajectory(moved.x[skipped:], moved.ok[skipped:])
+    return moved.from_frame(skipped)
 
 
 def stepped(
@@ -250,7 +252,8 @@ def stepped(
         substeps = scenario.substeps
         if max_step is not None:
             substeps = math.ceil(scenario.interval / max_step - 1e-9)
-        solver = Cloth(scenario.scene, scenario.interval / substeps)
+        dt = scenario.interval / substeps
+        solver = Cloth(scenario.scene, scenario.elimination, dt, scenario.self_contact)
     else:
         substeps = round(scenario.interval / solver.dt)
         if abs(substeps * solver.dt - scenario.interval) > 1e-6 * scenario.interval:
@@ -285,6 +288,11 @@ class BrakedState(eqx.Module):
     def v(self) -> Float[Array, "vertex 3"]:
         """Velocities [m/s]."""
         return self.inner.v
+
+    @property
+    def failure(self) -> Int[Array, ""]:
+        """The first `r2s.failures.Failure` so far."""
+        return self.inner.failure
 
 
 class Braked(eqx.Module):

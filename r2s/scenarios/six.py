@@ -47,8 +47,9 @@ class Experiment(NamedTuple):
     clamps: tuple[tuple[str, str], ...] = ()
     table_height: float = 0.0
 
-    def scenario(self, shape: tuple[int, int] = (9, 9), layers: bool = False) -> Scenario:
-        """On a mesh of `shape` vertices along warp and weft; with `layers` it touches itself."""
+    def scenario(self, shape: tuple[int, int] = (9, 9), self_contact: bool = False) -> Scenario:
+        """On a mesh of `shape` vertices along warp and weft; with `self_contact` it
+        does not pass through itself."""
         return from_placement(
             self.sheet,
             self.table_height,
@@ -58,7 +59,7 @@ class Experiment(NamedTuple):
             shape,
             clamps=self.clamps,
             wind=self.wind,
-            layers=layers,
+            self_contact=self_contact,
         )
 
 

@@ -99,21 +99,22 @@ def record(
     seen: Sensing | None = None,
     shape: tuple[int, int] = (9, 9),
     max_step: float | None = None,
-    layers: bool = False,
+    self_contact: bool = False,
     solver: Callable[[Scenario, Fabric], Solver] | None = None,
     key: PRNGKeyArray,
 ) -> Recording:
     """A recording of an experiment with a fabric; `name` and `trial` say which.
 
     Seen by default as `sensing` says. Made by the cloth with `shape` vertices and steps of at most
-    `max_step` [s], with `layers` so that it touches itself; or by another solver, such as
-    `r2s.scenarios.material_points`. A finer mesh and shorter steps than the estimators' make a
-    recording that is not their own model's. That of a stretching has markers and the force on the
-    pulled clamp. The same key gives the same recording. Raises `RuntimeError` when the simulation
+    `max_step` [s], with `self_contact` so that it does not pass through itself; or by another
+    solver, such as `r2s.scenarios.material_points`. A finer mesh and shorter steps than the
+    estimators' make a recording that is not their own model's. That of a stretching has markers and
+    the force on the pulled clamp. The same key gives the same recording. Raises `RuntimeError` when
+    the simulation
     diverges.
     """
     seen = sensing(experiment) if seen is None else seen
-    scenario = experiment.scenario(shape, layers)
+    scenario = experiment.scenario(shape, self_contact)
     about = scenario, fabric, max_step, None if solver is None else solver(scenario, fabric)
     found = _account(*about) if experiment.name == "stretching" else None
     moved = (_motion(*about) if found is None else found).x

@@ -100,7 +100,7 @@ class SyntheticRecording(Cell):
                 seen=synthetic.WHOLE if self.unseen else None,
                 shape=making.shape,
                 max_step=making.max_step,
-                layers=making.layers and self.scenario == "folding",
+                self_contact=making.layers and self.scenario == "folding",
                 key=key,
             )
         info = dataclasses.replace(made.info, name=self.name, trial=str(self.number))

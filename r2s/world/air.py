@@ -41,7 +41,10 @@ class Air(eqx.Module):
                 "air needs a density >= 0 kg/m^3 and coefficients of drag and friction >= 0, "
                 f"got {density}, {drag_coefficient} and {friction_coefficient}"
             )
-        array = lambda value: jnp.asarray(value, float)
+
+        def array(value):
+            return jnp.asarray(value, float)
+
         return cls(array(density), array(drag_coefficient), array(friction_coefficient))
 
     def dissipation(

@@ -5,7 +5,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from r2s.cloth.self_contact.contacts import SelfContact
 from r2s.geometry.mesh import Mesh
 from r2s.world.air import Air, Fan
 from r2s.world.contact import Table
@@ -29,7 +28,6 @@ class Scene(eqx.Module):
     - `held`: the vertices that grippers hold, one a handle.
     - `table`, `air`: the surroundings.
     - `fan`: where the wind blows; None: everywhere.
-    - `layers`: contact of the sheet with itself; None: it passes through itself.
     """
 
     mesh: Mesh
@@ -37,7 +35,6 @@ class Scene(eqx.Module):
     table: Table
     air: Air
     fan: Fan | None = None
-    layers: SelfContact | None = None
 
     @property
     def is_free(self) -> Bool[Array, " vertex"]:

@@ -36,15 +36,15 @@ class Pattern(eqx.Module):
             keys.append((elements[:, :, None] * count + elements[:, None, :]).ravel())
         unique, where = np.unique(np.concatenate(keys), return_inverse=True)
         ends = np.cumsum([len(part) for part in keys])
-        integers = lambda array: jnp.asarray(array, int)
-        return cls(
-            rows=integers(unique // count),
-            columns=integers(unique % count),
-            diagonal=integers(where[: ends[0]]),
-            faces=integers(where[ends[0] : ends[1]].reshape(-1, 3, 3)),
-            hinges=integers(where[ends[1] : ends[2]].reshape(-1, 4, 4)),
-            patches=integers(where[ends[2] :].reshape(-1, 6, 6)),
+        parts = (
+            unique // count,
+            unique % count,
+            where[: ends[0]],
+            where[ends[0] : ends[1]].reshape(-1, 3, 3),
+            where[ends[1] : ends[2]].reshape(-1, 4, 4),
+            where[ends[2] :].reshape(-1, 6, 6),
         )
+        return cls(*(jnp.asarray(part, int) for part in parts))
 
     @classmethod
     def full(
@@ -56,26 +56,24 @@ class Pattern(eqx.Module):
     ) -> "Pattern":
         """The pattern in which every pair of `count` vertices has a block."""
         rows, columns = np.divmod(np.arange(count * count), count)
-        slots = lambda elements: elements[:, :, None] * count + elements[:, None, :]
-        elements = slots(faces), slots(hinges), slots(patches)
+        elements = (e[:, :, None] * count + e[:, None, :] for e in (faces, hinges, patches))
         parts = rows, columns, np.arange(count) * (count + 1), *elements
         return cls(*(jnp.asarray(part, int) for part in parts))
 
 
 def assemble(
     pattern: Pattern,
-    faces: Float[Array, "face 3 3 3 3"],
-    hinges: Float[Array, "hinge 4 3 4 3"] | None,
     vertices: Float[Array, "vertex 3 3"],
-    patches: Float[Array, "face 6 3 6 3"] | None = None,
+    **elements: Float[Array, "_ _ 3 _ 3"],
 ) -> Float[Array, "block 3 3"]:
-    """The blocks that element matrices (corner, axis, corner, axis) add up to."""
+    """The blocks that the matrices of vertices and of elements add up to.
+
+    `elements` are matrices (corner, axis, corner, axis) by kind: `faces`, `hinges`, `patches`.
+    """
     blocks = jnp.zeros((pattern.rows.shape[0], 3, 3), vertices.dtype)
     blocks = blocks.at[pattern.diagonal].add(vertices, unique_indices=True)
-    elements = (pattern.faces, faces), (pattern.hinges, hinges), (pattern.patches, patches)
-    for slots, matrices in elements:
-        if matrices is not None:
-            blocks = add_elements(blocks, slots, matrices)
+    for kind, matrices in elements.items():
+        blocks = add_elements(blocks, getattr(pattern, kind), matrices)
     return blocks
 
 

@@ -5,14 +5,15 @@ mesh the pattern holds all pairs, on a large one what is outside is left to an i
 factors precondition.
 """
 
-from collections.abc import Callable, Sequence
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 from jaxtyping import Array, Bool, Float, Int
 
-from r2s.cloth.linear.dissection import Level
+from r2s.cloth.linear.elimination import Elimination
 from r2s.cloth.linear.factor import Factor, factor, solve
 from r2s.cloth.linear.pattern import Pattern, pinned, product
 
@@ -54,8 +55,7 @@ class System(eqx.Module):
 
 
 def prepare(
-    levels: Sequence[Level],
-    pattern: Pattern,
+    elimination: Elimination,
     blocks: Float[Array, "block 3 3"],
     far: Far | None,
     free: Bool[Array, " vertex"],
@@ -65,30 +65,48 @@ def prepare(
 
     With `is_definite` it holds NaN where the blocks are not positive definite.
     """
-    blocks = pinned(pattern, blocks, free)
-    factors = factor(levels, blocks, is_definite)
+    blocks = pinned(elimination.pattern, blocks, free)
+    factors = factor(elimination.levels, blocks, is_definite)
     return System(factors) if far is None else System(factors, far, blocks, free)
 
 
 def apply_inverse(
-    levels: Sequence[Level],
-    pattern: Pattern,
-    system: System,
-    right: Vector,
-    is_definite: bool = True,
+    elimination: Elimination, system: System, right: Vector, is_definite: bool = True
 ) -> Vector:
     """The solution [unknowns] of the system for a right-hand side.
 
-    Linear in it, so that it batches and transposes. Where there are couplings outside the pattern:
-    conjugate gradients, or GMRES if it need not be definite; NaN where they did not converge.
+    It is linear in the right-hand side, so that it batches and transposes. Couplings outside the
+    pattern are solved by conjugate gradients, or by GMRES if the matrix need not be definite, both
+    preconditioned by the factors; NaN where they did not converge.
     """
     if system.far is None:
-        return solve(levels, system.factors, right)
-    times = lambda x: _times(pattern, system, x)
-    around = lambda b: solve(levels, system.factors, b)
-    iterate = _conjugate_gradients if is_definite else _minimal_residual
-    find = lambda times, b: iterate(times, around, b)
-    return jax.lax.custom_linear_solve(times, right, find, symmetric=True)
+        return solve(elimination.levels, system.factors, right)
+    shape = jax.ShapeDtypeStruct(right.shape, right.dtype)
+    epsilon = float(jnp.finfo(right.dtype).eps)
+    tags: list[object] = [lx.symmetric_tag]
+    if is_definite:
+        tags.append(lx.positive_semidefinite_tag)
+        tolerance = epsilon**0.5 / 10
+        solver = lx.CG(rtol=tolerance, atol=0.0, norm=jnp.linalg.norm, max_steps=ITERATIONS)
+    else:
+        solver = lx.GMRES(
+            rtol=50 * epsilon,
+            atol=0.0,
+            norm=jnp.linalg.norm,
+            max_steps=ITERATIONS,
+            restart=RESTART,
+            stagnation_iters=RESTART,
+        )
+    matrix = lx.FunctionLinearOperator(
+        partial(_times, elimination.pattern, system), shape, frozenset(tags)
+    )
+    factors = lx.FunctionLinearOperator(
+        partial(solve, elimination.levels, system.factors), shape, frozenset(tags)
+    )
+    options = {"preconditioner": factors}
+    x = lx.linear_solve(matrix, right, solver, options=options, throw=False).value
+    left = jnp.linalg.norm(right - matrix.mv(x))
+    return jnp.where(left <= TOLERATED * jnp.linalg.norm(right), x, jnp.nan)
 
 
 def _times(pattern: Pattern, system: System, x: Vector) -> Vector:
@@ -96,22 +114,3 @@ def _times(pattern: Pattern, system: System, x: Vector) -> Vector:
     is_free = system.free[:, None]
     far = system.far.times(jnp.where(is_free, x, 0))
     return product(pattern, system.blocks, x) + jnp.where(is_free, far, 0)
-
-
-def _conjugate_gradients(times: Callable, around: Callable, b: Vector) -> Vector:
-    tolerance = float(jnp.finfo(b.dtype).eps) ** 0.5 / 10
-    x, _ = jax.scipy.sparse.linalg.cg(times, b, tol=tolerance, maxiter=ITERATIONS, M=around)
-    return _checked(times, x, b)
-
-
-def _minimal_residual(times: Callable, around: Callable, b: Vector) -> Vector:
-    tolerance = 50 * float(jnp.finfo(b.dtype).eps)
-    x, _ = jax.scipy.sparse.linalg.gmres(
-        times, b, tol=tolerance, restart=RESTART, maxiter=ITERATIONS // RESTART, M=around
-    )
-    return _checked(times, x, b)
-
-
-def _checked(times: Callable, x: Vector, b: Vector) -> Vector:
-    left = jnp.linalg.norm(b - times(x))
-    return jnp.where(left <= TOLERATED * jnp.linalg.norm(b), x, jnp.nan)

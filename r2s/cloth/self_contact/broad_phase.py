@@ -102,7 +102,10 @@ def build_bvh(faces: Int[np.ndarray, "face 3"], rest: Float[np.ndarray, "vertex 
     depth = (len(faces) - 1).bit_length()
     leaves = _leaves(np.asarray(rest)[faces].mean(axis=1), np.arange(len(faces)), depth)
     ends, of_faces = _edges(faces)
-    array = lambda values: jnp.asarray(values, int)
+
+    def array(values):
+        return jnp.asarray(values, int)
+
     owned = _owned(of_faces)
     return BVH(
         faces=array(faces),
@@ -175,7 +178,10 @@ def _near_faces(tree, start, end, reach, capacity):
     for _ in range(tree.depth):
         low, high = levels[0]
         levels.insert(0, (low.reshape(-1, 2, 3).min(axis=1), high.reshape(-1, 2, 3).max(axis=1)))
-    is_small = lambda level: 2**level * (2**level + 1) // 2 <= capacity
+
+    def is_small(level):
+        return 2**level * (2**level + 1) // 2 <= capacity
+
     top = max(level for level in range(tree.depth + 1) if level == 0 or is_small(level))
     first, second = (jnp.asarray(index) for index in np.triu_indices(2**top))
     is_real, is_over = jnp.ones(len(first), bool), jnp.zeros((), bool)

@@ -1,100 +1,22 @@
-"""Contact between the layers of one sheet: which places touch, or would pass through each other.
+"""Contacts of a sheet with itself, and the energy of their pressure and friction.
 
 A contact is a plane that two places of the sheet may not cross: its normal, and the weights of
 their vertices, are those of the closest points when the two touched at the start of the step, or
 at the time of their impact in the step. So a contact is lagged, like friction and drag, and its
-energy is convex. A step is solved again, with the contacts that it was found to need, until
-nothing has passed through anything (as in Harmon et al. 2008).
+energy is convex.
 """
 
-from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from r2s.cloth.linear.dissection import Level, levels
-from r2s.cloth.linear.pattern import Pattern
-from r2s.cloth.self_contact.broad_phase import (
-    BVH,
-    Pairs,
-    all_pairs,
-    build_bvh,
-    candidate_pairs,
-    candidate_pairs_in_tree,
-)
-from r2s.cloth.self_contact.proximity import (
-    closest_weights,
-    separation,
-    time_of_impact,
-)
-from r2s.geometry.mesh import Mesh
+from r2s.cloth.self_contact.proximity import separation
 from r2s.world import contact
 
 Positions = Float[Array, "vertex 3"]
-
-WATCHED = 1.5  # thicknesses, up to which places that are close at the start of a step touch
-CLOSEST = 0.1  # thicknesses, below which a step may not bring any two places
-MAX_ATTEMPTS = 12  # at a step, before it is NaN
-SMALL = 400  # vertices, up to which a matrix couples all
-
-
-class Whole(eqx.Module):
-    """- `pattern`, `levels`: of matrices that couple all vertices of a small mesh."""
-
-    pattern: Pattern
-    levels: tuple[Level, ...]
-
-    @classmethod
-    def make(cls, mesh: Mesh) -> "Whole":
-        """Of a mesh."""
-        count = mesh.rest.shape[0]
-        elements = mesh.faces, mesh.hinges, mesh.patches.vertices
-        pattern = Pattern.full(count, *map(np.asarray, elements))
-        rows, columns = np.asarray(pattern.rows), np.asarray(pattern.columns)
-        return cls(pattern, levels(np.asarray(mesh.rest), rows, columns, count))
-
-
-class SelfContact(eqx.Module):
-    """What a scene needs for contact of its sheet with itself.
-
-    - `search`: the pairs of its vertices and triangles, and of its edges, that may meet; of a large
-      mesh, a tree in which to find them.
-    - `whole`: for a small mesh, the matrices that couple all of it. Without, contact is coupled by
-      iteration (`r2s.cloth.linear.system`).
-    - `capacity`: how many contacts a step may have; four times as many pairs may be near each
-      other. A step that needs more is NaN.
-    """
-
-    search: Pairs | BVH
-    whole: Whole | None
-    capacity: int = eqx.field(static=True)
-
-    @classmethod
-    def make(cls, mesh: Mesh, capacity: int | None = None) -> "SelfContact":
-        """For a mesh; the capacity is by default 512, or 24 for each vertex if that is more: what a
-        sheet that is folded flat needs.
-
-        Up to 400 vertices every pair of places is looked at in each step, and every pair of
-        vertices has a block of the matrix.
-        """
-        count, faces = mesh.rest.shape[0], np.asarray(mesh.faces)
-        capacity = max(512, 24 * count) if capacity is None else capacity
-        if count <= SMALL:
-            return cls(all_pairs(faces), Whole.make(mesh), capacity)
-        return cls(build_bvh(faces, np.asarray(mesh.rest)), None, capacity)
-
-    def near(
-        self, start: Positions, end: Positions, reach: Float[Array, ""]
-    ) -> tuple[Pairs, Bool[Array, ""]]:
-        """The pairs that may come within `reach` [m] in a straight motion; if there are more."""
-        # the boxes around neighbouring parts of a flat sheet overlap: 8 pairs for each vertex
-        capacity = 4 * self.capacity
-        if isinstance(self.search, Pairs):
-            return candidate_pairs(self.search, start, end, reach, capacity)
-        return candidate_pairs_in_tree(self.search, start, end, reach, capacity, 2 * capacity)
 
 
 class Contacts(eqx.Module):
@@ -123,8 +45,8 @@ def contact_energy(
     x_anchor: Positions,
 ) -> Float[Array, ""]:
     """Energy [J] of pressure, and dissipation of friction over the rate [1/s], of a step."""
-    energy = lambda *one: _pair_energy(thickness, rate, *one)
-    return jnp.sum(jax.vmap(energy)(*_elements(contacts, x, x_anchor)))
+    energy = jax.vmap(partial(_pair_energy, thickness, rate))
+    return jnp.sum(energy(*_elements(contacts, x, x_anchor)))
 
 
 def contact_hessians(
@@ -138,7 +60,9 @@ def contact_hessians(
 
     def one(corners, anchor, weights, *rest):
         # the energy depends on the corners through one vector only
-        energy = lambda apart, anchor: _energy_apart(thickness, rate, apart, anchor, *rest)
+        def energy(apart, anchor):
+            return _energy_apart(thickness, rate, apart, anchor, *rest)
+
         second = jax.hessian(energy)(separation(corners, weights), separation(anchor, weights))
         return jnp.einsum("a,ij,b->aibj", weights, second, weights)
 
@@ -161,132 +85,3 @@ def _energy_apart(thickness, rate, apart, anchor, normal, area, limit):
     slip = velocity - (velocity @ normal) * normal
     pressed = area * contact.normal_potential(depth)
     return pressed + contact.friction_dissipation(limit, slip) / rate
-
-
-def resolve_contacts(
-    layers: SelfContact,
-    mesh: Mesh,
-    thickness: Float[Array, ""],
-    friction: Float[Array, ""],
-    before: Positions,
-    guess: Positions,
-    solve: Callable[[Contacts, Positions], Positions],
-) -> Positions:
-    """The end of a step [m] that starts at `before`, in which no layers pass through each other.
-
-    `solve` gives the positions under contacts, from a guess. NaN when `MAX_ATTEMPTS` do not
-    suffice, or the capacity.
-    """
-    contacts, fits = proximity_contacts(layers, mesh, thickness, friction, before)
-
-    def attempt(state):
-        x, contacts, _, fits = state
-        x = solve(contacts, x)
-        contacts, is_free, enough = collision_contacts(layers, mesh, thickness, before, x, contacts)
-        return x, contacts, is_free, fits & enough
-
-    def body(state, _):
-        return jax.lax.cond(state[2] | ~state[3], lambda: state, lambda: attempt(state)), None
-
-    begin = guess, contacts, jnp.zeros((), bool), fits
-    (x, _, is_free, fits), _ = jax.lax.scan(body, begin, length=MAX_ATTEMPTS)
-    return jnp.where(is_free & fits, x, jnp.nan)
-
-
-def proximity_contacts(
-    layers: SelfContact,
-    mesh: Mesh,
-    thickness: Float[Array, ""],
-    friction: Float[Array, ""],
-    x: Positions,
-) -> tuple[Contacts, Bool[Array, ""]]:
-    """The contacts of places that are close to each other, and whether the capacity sufficed."""
-    reach = WATCHED * thickness
-    found, overflow = layers.near(x, x, reach)
-    corners = x[found.stencils]
-    weights, normals, distance = jax.vmap(_plane)(corners, found.is_edges)
-    is_close = found.is_real & (distance < reach)
-    area = _area(mesh, found.stencils)
-    depth = jnp.maximum(thickness - distance, 0)
-    limit = friction * area * contact.pressure(depth)
-    empty = _empty(layers.capacity, x)
-    contacts = _append(empty, is_close, found.stencils, weights, normals, area, limit)
-    return contacts, ~overflow & (contacts.count <= layers.capacity)
-
-
-def collision_contacts(
-    layers: SelfContact,
-    mesh: Mesh,
-    thickness: Float[Array, ""],
-    before: Positions,
-    after: Positions,
-    contacts: Contacts,
-) -> tuple[Contacts, Bool[Array, ""], Bool[Array, ""]]:
-    """The contacts and those that the motion from `before` to `after` lacks; whether it lacks
-    none; whether the capacity sufficed.
-    """
-    gap = CLOSEST * thickness
-    drift = jnp.mean(after - before, axis=0)  # no pair comes closer by what all have in common
-    found, overflow = layers.near(before, after - drift[None], gap)
-    start, end = before[found.stencils], after[found.stencils]
-    impact = jax.vmap(time_of_impact, in_axes=(0, 0, 0, None))
-    times = jax.lax.stop_gradient(impact(start, end, found.is_edges, gap))
-    is_hit = found.is_real & jnp.isfinite(times)
-    times = jnp.where(is_hit, times, 0)
-    refine = jax.vmap(_refined, in_axes=(0, 0, 0, 0, None))
-    at = refine(times, start, end, found.is_edges, gap)[:, None, None]
-    weights, normals, _ = jax.vmap(_plane)(start + at * (end - start), found.is_edges)
-    area = _area(mesh, found.stencils)
-    more = _append(contacts, is_hit, found.stencils, weights, normals, area, jnp.zeros_like(area))
-    return more, ~jnp.any(is_hit), ~overflow & (more.count <= layers.capacity)
-
-
-def _refined(time, start, end, is_edges, gap):
-    """A time of impact, which is known to 1 % of the gap, made exact by Newton's method.
-
-    Two steps, so that it also has the derivative of the exact time. Not for a pair that was too
-    close from the start, nor for one that only grazes.
-    """
-    distance = lambda t: _plane(start + t * (end - start), is_edges)[2]
-    exact = time
-    for _ in range(2):
-        error, rate = jax.jvp(distance, (exact,), (jnp.ones_like(exact),))
-        approaches = (time > 0) & (rate < -gap)  # else it would take longer than the step
-        step = (error - gap) / jnp.where(approaches, rate, 1)
-        exact = jnp.where(approaches, jnp.clip(exact - step, 0, 1), exact)
-    return exact
-
-
-def _plane(corners, is_edges):
-    """Weights, normal and distance [m] of the closest points of a pair."""
-    weights = closest_weights(corners, is_edges)
-    between = separation(corners, weights)
-    squared = jnp.sum(between**2)
-    distance = jnp.sqrt(jnp.where(squared > 0, squared, 1))  # safe where two places coincide
-    return weights, between / distance, jnp.where(squared > 0, distance, 0)
-
-
-def _area(mesh: Mesh, stencils: Int[Array, "pair 4"]) -> Float[Array, " pair"]:
-    return jnp.mean(mesh.vertex_area[stencils], axis=1)
-
-
-def _empty(capacity: int, x: Positions) -> Contacts:
-    zeros = lambda *shape: jnp.zeros((capacity, *shape), x.dtype)
-    stencils, count = jnp.zeros((capacity, 4), int), jnp.zeros((), int)
-    return Contacts(stencils, zeros(4), zeros(3), zeros(), zeros(), count)
-
-
-def _append(contacts: Contacts, chosen: Bool[Array, " pair"], *columns: Array) -> Contacts:
-    """The contacts with the chosen rows of others after them, as far as there is room."""
-    places = contacts.count + jnp.cumsum(chosen) - 1
-    places = jnp.where(chosen, places, contacts.area.shape[0])  # out of bounds is dropped
-    put = lambda column, values: column.at[places].set(values, mode="drop")
-    stencils, weights, normals, area, limit = columns
-    return Contacts(
-        stencils=put(contacts.stencils, stencils),
-        weights=put(contacts.weights, weights),
-        normals=put(contacts.normals, normals),
-        area=put(contacts.area, area),
-        limit=put(contacts.limit, limit),
-        count=contacts.count + jnp.sum(chosen),
-    )

@@ -92,7 +92,10 @@ def time_of_impact(
     rounding = 32 * jnp.finfo(start.dtype).eps * size
     distances = jax.vmap(lambda corners: _distance(corners, is_edges))
     at_start, at_end = distances(jnp.stack([start, end]))
-    is_near = lambda distance: distance <= gap * (1 + TOLERANCE) + rounding
+
+    def is_near(distance):
+        return distance <= gap * (1 + TOLERANCE) + rounding
+
     floor = jnp.where(is_near(at_start), DIP * at_start, gap)
     met = _advance(start, motion, is_edges, floor, TOLERANCE * floor + rounding)
     of_near = jnp.where(jnp.isfinite(met) | is_near(at_end), 0.0, jnp.inf)
@@ -123,7 +126,10 @@ def _advance(start, motion, is_edges, floor, tolerance):
         return jnp.where(is_met, time, later), is_met, count + 1
 
     one = jnp.ones((), start.dtype)
-    is_open = lambda state: ~state[1] & (state[0] <= 1) & (state[2] < MAX_ADVANCES)
+
+    def is_open(state):
+        return ~state[1] & (state[0] <= 1) & (state[2] < MAX_ADVANCES)
+
     initial = jnp.zeros((), start.dtype), jnp.zeros((), bool), jnp.zeros((), int)
     time, _, _ = jax.lax.while_loop(is_open, advance, initial)
     return jnp.where(time <= 1, time, jnp.inf)

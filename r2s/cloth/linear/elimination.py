@@ -1,0 +1,35 @@
+"""How the equations of a mesh are solved: blocks of their matrix, and order of elimination."""
+
+import equinox as eqx
+import numpy as np
+
+from r2s.cloth.linear.dissection import Level, levels
+from r2s.cloth.linear.pattern import Pattern
+from r2s.geometry.mesh import Mesh
+
+
+class Elimination(eqx.Module):
+    """What depends on a mesh alone in the solution of its linear systems.
+
+    - `pattern`: the blocks of the matrix.
+    - `levels`: the order in which vertices are eliminated, root first.
+    - `couples_all`: whether every pair of vertices has a block.
+    """
+
+    pattern: Pattern
+    levels: tuple[Level, ...]
+    couples_all: bool = eqx.field(static=True, default=False)
+
+    @classmethod
+    def make(cls, mesh: Mesh, couples_all: bool = False) -> "Elimination":
+        """The elimination of a mesh; not under `jax.jit`, since its sizes follow from the mesh.
+
+        With `couples_all` any two vertices may be coupled, as self-contact does in small meshes.
+        """
+        rest = np.asarray(mesh.rest)
+        elements = (np.asarray(e) for e in (mesh.faces, mesh.hinges, mesh.patches.vertices))
+        make = Pattern.full if couples_all else Pattern.make
+        pattern = make(len(rest), *elements)
+        rows, columns = np.asarray(pattern.rows), np.asarray(pattern.columns)
+        leaf = {"leaf": len(rest)} if couples_all else {}
+        return cls(pattern, levels(rest, rows, columns, **leaf), couples_all)

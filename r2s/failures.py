@@ -1,0 +1,60 @@
+"""Why a run of a solver failed: one code for cloth and material points alike."""
+
+import enum
+
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+
+class Failure(enum.IntEnum):
+    """What failed first. A state carries it as an integer, so that it passes through `jax.jit`."""
+
+    NONE = 0
+    NEWTON = 1
+    SELF_CONTACT = 2
+    LINEAR_SOLVE = 3
+    GRID = 4
+    TIME_STEP = 5
+    NON_FINITE = 6
+
+
+_SENTENCES = {
+    Failure.NONE: "Nothing failed.",
+    Failure.NEWTON: "Newton's method did not converge: shorten the step, or allow more iterations.",
+    Failure.SELF_CONTACT: (
+        "The contacts of the fabric with itself were not resolved: shorten the step, or allow more "
+        "rounds of contact."
+    ),
+    Failure.LINEAR_SOLVE: (
+        "The linear solve of a Newton step failed: check that stiffnesses and masses are positive "
+        "and finite, or shorten the step."
+    ),
+    Failure.GRID: "A particle left the grid: enlarge the grid, or shorten the step.",
+    Failure.TIME_STEP: (
+        "The explicit time step was unstable: shorten the step, soften the material, or coarsen "
+        "the grid."
+    ),
+    Failure.NON_FINITE: (
+        "A position became infinite or not a number: check the fabric, the control and the initial "
+        "state, or shorten the step."
+    ),
+}
+
+
+def describe(code: int) -> str:
+    """One sentence that says what a failure code means and what to do.
+
+    Accepts a `Failure`, an integer or an integer array without axes. Raises `ValueError` for a
+    number that is no code.
+    """
+    return _SENTENCES[Failure(int(code))]
+
+
+def no_failure() -> Int[Array, ""]:
+    """The code of a run in which nothing has failed."""
+    return jnp.zeros((), int)
+
+
+def first_failure(before: Int[Array, ""], now: Int[Array, ""]) -> Int[Array, ""]:
+    """The code of a run so far and of what comes after it: the first failure stays."""
+    return jnp.where(before == Failure.NONE.value, now, before).astype(int)
