@@ -125,7 +125,7 @@ def test_images_and_frames_must_belong_together(sighting):
             Sighting.make(sighting.scenario, images, frames, TINY.space, untrained)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="physnet")
 def test_material_points_make_data_too(tmp_path):
     settings = dataclasses.replace(
         TINY, num_fabrics=2, material_points=True, isotropic=True, ranges=(), shape=(5, 5)

@@ -275,7 +275,7 @@ def test_frames_that_are_not_there_are_refused():
         sight_of(recorded(lifting()), np.array([0, 3, 8]), 50)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="pinn")
 def test_the_map_comes_to_lie_where_the_points_are():
     """In a steady wind, from the motion of a far stiffer fabric; what is not known is said."""
     fabric = presets.grey_interlock()
