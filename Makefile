@@ -1,5 +1,5 @@
 # make study [PRESET=name] [DATA=folder] [OUT=folder] [WORKERS=number] [ARGS=...], make test, make
-# check, make docs: each sets up what it needs.
+# test-slow [GROUP=name], make check, make docs: each sets up what it needs.
 PYTHON ?= python3
 VENV := .venv
 STAMP := $(VENV)/.installed
@@ -9,6 +9,9 @@ OUT ?= results
 ARGS ?=
 PRESET ?= small
 WORKERS ?= 2
+# What takes minutes: `make test-slow GROUP=cloth` runs one group, `make test-slow` all of them.
+GROUPS := cloth points motions estimates pinn physnet study documents
+GROUP :=
 
 # Most of the fast tests' time is compilation: they do without XLA's optimisation. Two processes of
 # one thread each: threads that wait for each other cost more than they compute.
@@ -19,7 +22,7 @@ QUICK := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 
 MODULES := r2s $(filter-out r2s.__init__,$(subst /,.,$(basename \
 	$(wildcard r2s/*.py) $(patsubst %/__init__.py,%.py,$(wildcard r2s/*/__init__.py)))))
 
-.PHONY: study test test-slow lint types check docs clean
+.PHONY: study test test-slow $(addprefix test-slow-,$(GROUPS)) lint types check docs clean
 
 study: $(STAMP)
 	$(RUN) experiments/study.py --preset $(PRESET) $(if $(DATA),--data "$(DATA)") --out "$(OUT)" \
@@ -28,8 +31,10 @@ study: $(STAMP)
 test: $(STAMP)
 	XLA_FLAGS="$(QUICK)" $(RUN) -m pytest -q -n 2 --dist loadfile
 
-test-slow: $(STAMP)
-	$(RUN) -m pytest -q -m slow
+test-slow: $(if $(GROUP),test-slow-$(GROUP),$(addprefix test-slow-,$(GROUPS)))
+
+$(addprefix test-slow-,$(GROUPS)): test-slow-%: $(STAMP)
+	$(RUN) -m pytest -q -n 2 --dist worksteal --durations=5 -m "slow(group='$*')"
 
 lint: $(STAMP)
 	$(RUN) -m ruff check .
@@ -45,8 +50,8 @@ docs: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(RUN) -m pip install -q --disable-pip-version-check -c constraints.txt -e ".[study,pcd,camera,data,cli,physnet,cma,cluster,viz,dev]"
+	$(RUN) -m pip install -q --disable-pip-version-check -c constraints.txt -e ".[study,pcd,camera,data,cli,physnet,pinn,cma,cluster,viz,dev]"
 	touch $@
 
 clean:
-	rm -rf $(VENV) results
+	rm -rf $(VENV) .pytest_cache results

@@ -1,4 +1,7 @@
-"""What the network is given of a stretching: markers, how the clamps went, and the force."""
+"""What the network is given of a stretching: markers, the motion of the clamps, and the force.
+
+`pull_from` takes it from a recording and checks it.
+"""
 
 from typing import NamedTuple
 
@@ -13,14 +16,14 @@ from r2s.recordings.recording import Recording
 from r2s.units import GRAVITY
 
 FEWEST_FRAMES = 3
-FEWEST_SEEN = 0.5  # of the markers, in every frame
-OFF_PLACE = 0.1  # of the sheet's shorter side, from a marker's place to where it first is
-OFF_PLANE = 0.02  # of the same, by which markers may leave the plane
-STIFFNESSES = (0.3, 3e4)  # [N/m]: fabrics, with room on both sides
+FEWEST_SEEN = 0.5  # share of the markers that must be seen in every frame
+OFF_PLACE = 0.1  # most a marker may begin away from its place, over the sheet's shorter side
+OFF_PLANE = 0.02  # most a marker may leave the plane, over the same
+STIFFNESSES = (0.3, 3e4)  # [N/m], those of fabrics, with room on both sides
 
 
 class Clamp(NamedTuple):
-    """How a clamp goes, at every frame: displacement [m], velocity [m/s], acceleration [m/s^2]."""
+    """Motion of a clamp in every frame: displacement [m], velocity [m/s], acceleration [m/s^2]."""
 
     value: Float[Array, "*pull frame axis"]
     rate: Float[Array, "*pull frame axis"]
@@ -31,14 +34,15 @@ class Pull(eqx.Module):
     """A sheet pulled in its plane between clamps at X = 0 and X = size[0], in the axes X and Y.
 
     - `size`: of the sheet between the clamps and across, [m].
-    - `angle`: from X, the pull, to the warp, [rad].
+    - `angle`: from X, the direction of the pull, to the warp, [rad].
     - `places`: of the markers on the sheet at rest, [m].
-    - `displacement`: of the markers [m]; only where `seen`.
-    - `times`: of the frames, [s], evenly spaced.
+    - `displacement`: of the markers [m], where they are `seen`.
+    - `seen`: which markers are seen in which frame.
+    - `times`: of the frames, evenly spaced, [s].
     - `near`, `far`: the clamps at X = 0 and at the other end.
-    - `force`: along X on the far clamp [N]; None: not measured.
-    - `gravity`: in the plane [m/s^2]; zero on a horizontal table, which carries the weight.
-    - `normal`: gravity's part that presses on a table [m/s^2]; zero without a table.
+    - `force`: along X on the far clamp [N]; None: it was not measured.
+    - `gravity`: its part in the plane [m/s^2]; zero on a horizontal table.
+    - `normal`: its part that presses on the table [m/s^2]; zero without a table.
     """
 
     size: Float[Array, "*pull 2"]
@@ -61,18 +65,20 @@ def pull_from(
     places: Float[np.ndarray, "marker 2"] | None = None,
     without_force: bool = False,
 ) -> Pull:
-    """What a recording of a stretching says, in the plane of the sheet.
+    """A stretching, in the plane of the sheet, from its recording.
 
-    `angle` [rad] is from the pull, which is along the first side of the recording's sheet, to the
-    warp of the fabric: pi / 2 in a pull along the weft, pi / 4 on the bias. `places` [m] are those
-    of the markers on the sheet at rest; by default a grid with as many rows as columns, each
-    marker in the middle of its cell. The force is that on the clamp at the end of that side; a
-    number counts along the pull. `without_force` leaves it out.
+    The pull is along the first side of the recording's sheet. The force is that on the clamp at the
+    end of that side; a force of one number is taken along the pull. The model is that of a sheet in
+    its plane: inertia, and on the table friction, while the table carries the weight.
 
-    In the plane the sheet feels its inertia and, on the table, friction: the table carries its
-    weight. Raises `ValueError` for fewer than 3 frames, times that do not increase evenly, markers
-    that are missing, lost, off the sheet or out of its plane, another way of holding, and a force
-    that is missing, does not cover the frames, points the other way or is not in newtons.
+    - `angle`: from the pull to the warp [rad]: pi / 2 in a pull along the weft, pi / 4 on the bias.
+    - `places`: of the markers on the sheet at rest [m]; by default a grid with as many rows as
+      columns, each marker in the middle of its cell.
+    - `without_force`: leave the force out.
+
+    Raises `ValueError` for fewer than 3 frames, times that do not increase evenly, markers that are
+    missing, lost, off the sheet or out of its plane, another way of holding, and a force that is
+    missing, does not cover the frames, points the other way or is not in newtons.
     """
     try:
         return _pull(recording, angle, places, without_force)
@@ -81,7 +87,7 @@ def pull_from(
 
 
 def stacked(pulls: list[Pull]) -> Pull:
-    """Several pulls as one with a leading axis, for `jax.vmap`.
+    """Several pulls as one, with a leading axis for `jax.vmap`.
 
     Raises `ValueError` when their shapes differ or only some have a force.
     """
@@ -123,21 +129,24 @@ def _pull(recording, angle, places, without_force) -> Pull:
     if not without_force:
         force = _force(recording, times, axes[0])
         _check_unit(force, far[0][:, 0] - near[0][:, 0], size)
-    array = lambda value: jnp.asarray(value, float)
     down = axes @ np.array([0.0, 0.0, -GRAVITY])
     return Pull(
-        size=array(size),
-        angle=array(angle),
-        places=array(places),
-        displacement=array(np.where(seen[..., None], displacement, 0)),
+        size=_array(size),
+        angle=_array(angle),
+        places=_array(places),
+        displacement=_array(np.where(seen[..., None], displacement, 0)),
         seen=jnp.asarray(seen),
-        times=array(times - times[0]),
-        near=Clamp(*map(array, near)),
-        far=Clamp(*map(array, far)),
-        force=None if force is None else array(force),
-        gravity=array(down[:2]),
-        normal=array(abs(down[2])),
+        times=_array(times - times[0]),
+        near=Clamp(*map(_array, near)),
+        far=Clamp(*map(_array, far)),
+        force=None if force is None else _array(force),
+        gravity=_array(down[:2]),
+        normal=_array(abs(down[2])),
     )
+
+
+def _array(value) -> Array:
+    return jnp.asarray(value, float)
 
 
 def _check_times(times: np.ndarray) -> None:
@@ -172,6 +181,7 @@ def _check_seen(seen: np.ndarray, first: int) -> None:
 
 
 def _grid(size: np.ndarray, count: int) -> np.ndarray:
+    """Places [m] of markers in a square grid, each in the middle of its cell."""
     side = round(count**0.5)
     if side * side != count:
         raise ValueError(
@@ -212,6 +222,7 @@ def _check_on_sheet(displacement, height, seen, places, side: float) -> None:
 
 
 def _clamps(recording: Recording, times: np.ndarray, axes: np.ndarray, size: np.ndarray):
+    """Displacement, velocity and acceleration of both clamps, by cubic splines of their path."""
     held = recording.info.sheet.held
     if set(held) != {"origin", "weft", "warp", "opposite"}:
         raise ValueError(f"a stretching is clamped at four corners, this sheet is held at {held}")
@@ -234,6 +245,7 @@ def _clamps(recording: Recording, times: np.ndarray, axes: np.ndarray, size: np.
 
 
 def _force(recording: Recording, times: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """The force [N] along the pull at the times of the frames."""
     if recording.force is None or recording.force_times is None:
         raise ValueError(
             "no force: without it only ratios of stiffness are identifiable, not their scale; add "
@@ -253,6 +265,7 @@ def _force(recording: Recording, times: np.ndarray, along: np.ndarray) -> np.nda
 
 
 def _check_unit(force: np.ndarray, pulled: np.ndarray, size: np.ndarray) -> None:
+    """Raise `ValueError` when force over stretch is not the stiffness of any fabric."""
     stretch = pulled / size[0]
     if np.ptp(stretch) < 1e-3:
         raise ValueError(

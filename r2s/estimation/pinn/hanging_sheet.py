@@ -1,9 +1,8 @@
-"""A sheet that hangs: the work of its membrane, bending, weight and air in local displacements.
+"""The weak form of a sheet that hangs: work of its membrane, bending, weight and air.
 
-The weak form in space, for a map (X, Y, t) to places that the network gives. The virtual
-displacements are quadratic B-splines, each zero but in a patch of the sheet, so that patches which
-are held or on the table can be left out: there forces act that nobody knows. Free edges need
-nothing: their traction is zero of itself.
+The motion is a map (X, Y, t) to places, which the network gives. The virtual displacements are
+quadratic B-splines, each zero but in a patch of the sheet. So patches which are held or on the
+table can be left out, where unknown forces act. At free edges the traction is zero of itself.
 
 All is in the axes of the sheet at rest: warp, weft and normal.
 """
@@ -16,20 +15,21 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.interpolate import BSpline
 
-from r2s.estimation.pinn.laws import green
 from r2s.estimation.pinn.network import STRONG, DisplacementField, T, at_time
+from r2s.estimation.pinn.stress import green
 from r2s.fabrics.fabric import Fabric
 from r2s.units import GRAVITY
 from r2s.world.air import Air, Fan
 
-SPANS, NODES, DEGREE = 8, 2, 2  # along each side; Gauss nodes in a span; enough for curvatures
+SPANS, NODES = 8, 2  # along each side; Gauss nodes in a span
+DEGREE = 2  # enough for curvatures
 
 
 class Splines(NamedTuple):
     """Virtual displacements on the unit square, at the nodes of a quadrature.
 
-    - `nodes`, `weights`: of the quadrature. - `value` [-], `slope`, `curve` (XX, XY, YY): with
-      derivatives. - `corners`: value at the corners (0, 0), (1, 0), (0, 1), (1, 1).
+    - `nodes`, `weights`: of the quadrature.
+    - `value`, `slope`, `curve`: of the functions [-], first and second derivatives (XX, XY, YY).
     """
 
     nodes: Float[Array, "node 2"]
@@ -37,13 +37,16 @@ class Splines(NamedTuple):
     value: Float[Array, "function node"]
     slope: Float[Array, "function node 2"]
     curve: Float[Array, "function node 3"]
-    corners: Float[Array, "function 4"]
 
 
 class Hanging(NamedTuple):
     """What acts on a sheet, in its axes at rest.
 
-    - `size`: [m]. - `down`: of gravity, [-]. - `air`. - `fan`, `wind`: [m/s]; None: still air.
+    - `size`: of the sheet, [m].
+    - `down`: direction of gravity, [-].
+    - `air`: its drag.
+    - `fan`: where the wind blows; None: everywhere.
+    - `wind`: its velocity, [m/s].
     """
 
     size: Float[Array, " 2"]
@@ -54,29 +57,32 @@ class Hanging(NamedTuple):
 
 
 def splines(spans: int = SPANS, nodes: int = NODES) -> Splines:
-    """Products of quadratic B-splines of even knots, repeated at the ends."""
+    """Products of quadratic B-splines with evenly spaced knots, repeated at the ends."""
     at, weight = np.polynomial.legendre.leggauss(nodes)
     places = ((np.arange(spans)[:, None] + (at + 1) / 2) / spans).ravel()
     weights = np.tile(weight / (2 * spans), spans)
     knots = np.concatenate([np.zeros(DEGREE), np.linspace(0, 1, spans + 1), np.ones(DEGREE)])
     spline = BSpline(knots, np.eye(spans + DEGREE), DEGREE)
     one = [spline(places) if d == 0 else spline.derivative(d)(places) for d in range(3)]
-    grid = lambda a, b: np.einsum("qi,rj->ijqr", a, b).reshape((spans + DEGREE) ** 2, -1)
+
+    def grid(along: int, across: int) -> np.ndarray:
+        """Products of derivatives of some orders, at all nodes."""
+        product = np.einsum("qi,rj->ijqr", one[along], one[across])
+        return product.reshape((spans + DEGREE) ** 2, -1)
+
     x, y = np.meshgrid(places, places, indexing="ij")
-    ends = spline(np.array([0.0, 1.0]))
-    array = lambda values: jnp.asarray(values, float)
-    return Splines(
-        array(np.stack([x.ravel(), y.ravel()], 1)),
-        array(np.outer(weights, weights).ravel()),
-        array(grid(one[0], one[0])),
-        array(np.stack([grid(one[1], one[0]), grid(one[0], one[1])], -1)),
-        array(np.stack([grid(one[2], one[0]), grid(one[1], one[1]), grid(one[0], one[2])], -1)),
-        array(np.einsum("ei,fj->ijfe", ends, ends).reshape(-1, 4)),
+    parts = (
+        np.stack([x.ravel(), y.ravel()], 1),
+        np.outer(weights, weights).ravel(),
+        grid(0, 0),
+        np.stack([grid(1, 0), grid(0, 1)], -1),
+        np.stack([grid(2, 0), grid(1, 1), grid(0, 2)], -1),
     )
+    return Splines(*(jnp.asarray(part, float) for part in parts))
 
 
 def curvature(gradient: Float[Array, "3 2"], second: Float[Array, "3 3"]) -> Float[Array, " 3"]:
-    """(k11, k22, 2 k12) [1/m] of a map, from its slopes [-] and second derivatives XX, XY, YY."""
+    """Curvatures (k11, k22, 2 k12) [1/m] of a map, from slopes [-] and derivatives XX, XY, YY."""
     across = jnp.cross(gradient[:, 0], gradient[:, 1])
     normal = across / jnp.sqrt(across @ across)
     along, twist, side = normal @ second
@@ -86,11 +92,10 @@ def curvature(gradient: Float[Array, "3 2"], second: Float[Array, "3 3"]) -> Flo
 def drag(
     hanging: Hanging, place: Float[Array, " 3"], slope: Float[Array, "3 2"], velocity
 ) -> Float[Array, " 3"]:
-    """Of the air, on an area at rest [N/m^2]."""
+    """Drag of the air per area at rest [N/m^2]."""
     share = jnp.ones(1, place.dtype) if hanging.fan is None else hanging.fan(place[None])
     area = jnp.cross(slope[:, 0], slope[:, 1])
-    flow = lambda velocity: hanging.air.dissipation(velocity - share * hanging.wind, area)
-    return -jax.grad(flow)(velocity)
+    return -jax.grad(hanging.air.dissipation)(velocity - share * hanging.wind, area)
 
 
 def virtual_work(
@@ -100,9 +105,9 @@ def virtual_work(
     parts: Splines,
     time: Float[Array, ""],
 ) -> Float[Array, "function 3"]:
-    """The work [N] per virtual displacement of all forces at a time [s]; zero in balance.
+    """Work [N] of all forces in every virtual displacement at a time [s]; zero in balance.
 
-    Without damping, which in a slow motion is small.
+    Damping is left out, which is small in a slow motion.
     """
     places = parts.nodes * hanging.size[None]
     jet = network.jet(at_time(places, time), STRONG)
@@ -133,7 +138,7 @@ def virtual_work(
 def work_scale(
     hanging: Hanging, density: Float[Array, ""], parts: Splines
 ) -> Float[Array, " function"]:
-    """The work [N] of the stress that the weight of the sheet makes, in virtual displacements."""
+    """Work [N] in virtual displacements of a stress as large as the sheet's weight makes it."""
     weights = parts.weights * hanging.size[0] * hanging.size[1]
     slope = jnp.sqrt(jnp.sum((parts.slope / hanging.size[None, None]) ** 2, axis=-1))
     longest = jnp.max(hanging.size)
@@ -143,10 +148,10 @@ def work_scale(
 def loose(
     parts: Splines, held: Bool[Array, " 4"], low: Bool[Array, " node"]
 ) -> Bool[Array, " function"]:
-    """Virtual displacements that are zero where the sheet is held or `low`, near the table.
+    """Which virtual displacements are zero wherever unknown forces act.
 
-    `held`: which corners (0, 0), (1, 0), (0, 1), (1, 1). In the span around one forces are
-    unknown: it counts as held too.
+    - `held`: which of the corners (0, 0), (1, 0), (0, 1), (1, 1) are held, with the span around.
+    - `low`: nodes near the table.
     """
     corner = jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], parts.nodes.dtype)
     away = jnp.abs(parts.nodes[:, None] - corner[None])

@@ -1,4 +1,4 @@
-"""The physics similarity map, and the curves of a training, as pictures."""
+"""Pictures of the physics similarity map and of the curves of a training."""
 
 import io
 from pathlib import Path
@@ -50,7 +50,7 @@ def draw_curves(path: Path | str, curve: tuple[Row, ...], untrained: float | Non
     figure, (left, right) = _axes(2, 3.2)
     epochs = np.arange(1, len(curve) + 1)
     left.plot(epochs, [row.loss for row in curve], label="training")
-    left.plot(epochs, [row.held_back_loss for row in curve], label="fabrics held back")
+    left.plot(epochs, [row.validation_loss for row in curve], label="fabrics held back")
     left.set(xlabel="epoch", ylabel="triplet loss", yscale="log")
     right.plot(epochs, [row.accuracy for row in curve], "C1", label="fabrics held back")
     right.axhline(0.5, color="0.6", linestyle=":", label="chance")

@@ -1,9 +1,9 @@
-"""The weak form: the work of the stress in a few smooth virtual displacements.
+"""The weak form: the work of stress and load in a few smooth virtual displacements.
 
-The virtual displacements vanish at the clamps, and are free at the free edges, where the traction
-is then zero of itself. One more, even from clamp to clamp, gives the balance with the measured
-force. First derivatives in space suffice. For a given motion the work is linear in the stiffness
-(the virtual fields method: Pierron and Grediac 2012).
+The virtual displacements vanish at the clamps. They do not at the free edges, so that their balance
+makes the traction there zero. One more virtual displacement grows evenly from clamp to clamp and
+gives the balance with the measured force. First derivatives in space suffice. For a given motion
+the work is linear in the stiffness (virtual fields method: Pierron and Grediac 2012).
 """
 
 from typing import NamedTuple
@@ -13,8 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from r2s.estimation.pinn.data import Pull
-from r2s.estimation.pinn.laws import Strain, green, nominal_stress
 from r2s.estimation.pinn.losses import (
     Losses,
     Points,
@@ -25,19 +23,22 @@ from r2s.estimation.pinn.losses import (
     load,
 )
 from r2s.estimation.pinn.network import WEAK, DisplacementField, T
+from r2s.estimation.pinn.pulls import Pull
+from r2s.estimation.pinn.stress import Strain, green, nominal_stress
 from r2s.fabrics.fabric import Fabric
 
-NODES = 12  # of the quadrature, along each side
-FEW_NODES, FEW_DEGREES = 8, (3, 4)  # of the loss of the network
-DEGREES = (7, 8)  # of the polynomials, along and across the pull
+NODES = 12  # of the quadrature along each side
+DEGREES = (7, 8)  # number of polynomials along and across the pull
+FEW_NODES, FEW_DEGREES = 8, (3, 4)  # the same in the loss of the network
 
 
 class Virtual(NamedTuple):
     """Virtual displacements on the unit square, at the nodes of a quadrature.
 
-    - `nodes`, `weights`: of the quadrature. - `value`: [-]. - `slope`: in both sides, [-].
+    The last one grows evenly from clamp to clamp; the others vanish at both.
 
-    The last one is even from clamp to clamp; the others vanish there.
+    - `nodes`, `weights`: of the quadrature.
+    - `value`, `slope`: of the functions, and in both sides, [-].
     """
 
     nodes: Float[Array, "node 2"]
@@ -47,21 +48,21 @@ class Virtual(NamedTuple):
 
 
 def virtual_fields(degrees: tuple[int, int] = DEGREES, nodes: int = NODES) -> Virtual:
-    """Products x (1 - x) P_i(x) P_j(y) of Legendre's polynomials, of unit slope on average."""
+    """Products x (1 - x) P_i(x) P_j(y) of Legendre polynomials, scaled to a mean slope of 1."""
     at, weight = np.polynomial.legendre.leggauss(nodes)
     x, y = (grid.ravel() for grid in np.meshgrid((at + 1) / 2, (at + 1) / 2, indexing="ij"))
     weights = np.outer(weight, weight).ravel() / 4
     value, slope = virtual_at(np.stack([x, y], 1), degrees)
     size = np.sqrt(np.einsum("fqi,q->f", slope**2, weights))
     value, slope = value / size[:, None], slope / size[:, None, None]
-    array = lambda values: jnp.asarray(values, float)
-    return Virtual(array(np.stack([x, y], 1)), array(weights), array(value), array(slope))
+    parts = np.stack([x, y], 1), weights, value, slope
+    return Virtual(*(jnp.asarray(part, float) for part in parts))
 
 
 def virtual_at(
     places: np.ndarray, degrees: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "function point"], Float[np.ndarray, "function point 2"]]:
-    """The functions of `virtual_fields`, not scaled, at places on the unit square, with slopes."""
+    """Values and slopes of the functions of `virtual_fields`, not scaled, at any places."""
     x, y = places.T
     along = [_legendre(i) * np.polynomial.Polynomial([0, 1, -1]) for i in range(degrees[0])]
     across = [_legendre(j) for j in range(degrees[1])]
@@ -73,14 +74,17 @@ def virtual_at(
 
 
 def _legendre(degree: int) -> np.polynomial.Polynomial:
-    """Legendre's polynomial on 0..1."""
+    """Legendre polynomial on 0..1."""
     basis = np.polynomial.legendre.Legendre.basis(degree, [0, 1])
     return basis.convert(kind=np.polynomial.Polynomial)
 
 
 class Kinematics(NamedTuple):
-    """A motion at the nodes of a quadrature: gradients [-], their rates [1/s], velocities [m/s],
-    accelerations [m/s^2]."""
+    """A motion at the nodes of a quadrature.
+
+    - `gradient`, `rate`: of the displacement [-] and its rate [1/s].
+    - `velocity`, `acceleration`: [m/s], [m/s^2].
+    """
 
     gradient: Float[Array, "frame node axis 2"]
     rate: Float[Array, "frame node axis 2"]
@@ -91,23 +95,22 @@ class Kinematics(NamedTuple):
 def kinematics(
     network: DisplacementField, pull: Pull, virtual: Virtual, frames: Int[Array, " frame"]
 ) -> Kinematics:
-    """The motion that a network gives, at the nodes in some frames."""
+    """The motion of a network at the nodes in some frames."""
     number, nodes = len(frames), len(virtual.nodes)
     places = jnp.tile(virtual.nodes * pull.size[None], (number, 1))
     jet = field(network, pull, places, jnp.repeat(frames, nodes), WEAK)
-    shaped = lambda values: values.reshape(number, nodes, *values.shape[1:])
     rate = jnp.moveaxis(jet.second[:2], 0, -1)
     parts = gradients(jet), rate, jet.first[T], jet.second[2]
-    return Kinematics(*map(shaped, parts))
+    return Kinematics(*(part.reshape(number, nodes, *part.shape[1:]) for part in parts))
 
 
 def virtual_work(
     fabric: Fabric, pull: Pull, virtual: Virtual, motion: Kinematics, strain: Strain = green
 ) -> Float[Array, "frame function axis"]:
-    """The work [N m / m] of stress and load in every virtual displacement, in every frame.
+    """Work [N m / m] of stress and load in every virtual displacement and frame.
 
-    Zero for all but the last, where it is the force on the far clamp [N], times the scale of that
-    displacement at the clamp: its largest value.
+    In balance it is zero for all but the last one. There it is the force on the far clamp [N] times
+    the value of that displacement at the clamp, see `end_value`.
     """
 
     def stresses(gradient, rate, velocity, acceleration):
@@ -122,7 +125,7 @@ def virtual_work(
 
 
 def end_value(virtual: Virtual) -> Float[Array, ""]:
-    """The last virtual displacement at the far clamp, [-]."""
+    """Value [-] of the last virtual displacement at the far clamp."""
     return virtual.slope[-1, 0, 0]
 
 
@@ -136,7 +139,7 @@ def weak_losses(
 ) -> Losses:
     """The losses with the virtual work in place of the equation of motion and of free edges.
 
-    Of `points` only the frames of the free edges count.
+    It is tested in the frames `points.edge_frame`; the other points are not used.
     """
     data, clamps = common_losses(network, pull, scales)
     virtual = virtual_fields(FEW_DEGREES, FEW_NODES)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s.estimation.pinn.data import pull_from, stacked
+from r2s.estimation.pinn.pulls import pull_from, stacked
 from r2s.recordings.recording import RecordingInfo, make_recording
 from r2s.scenarios import stretching
 
@@ -27,13 +27,13 @@ def recording(**changes):
     places = np.stack(np.meshgrid(along, along, indexing="ij"), -1).reshape(-1, 2)
     moved = places[None, :, 0] / SIDE * far[:, None]
     markers = np.stack([places[:, 0] + moved, 0 * moved + places[:, 1], 0 * moved + 1e-3], -1)
-    about = {
+    parts = {
         "markers": markers,
         "force": np.stack([FORCE * far / PULLED, 0 * far, 0 * far], 1),
         "force_times": times,
     } | {name: value for name, value in changes.items() if name != "info"}
     info = dataclasses.replace(info, **changes.get("info", {}))
-    return make_recording(None, times, path, knots, info, **about)
+    return make_recording(None, times, path, knots, info, **parts)
 
 
 def test_displacements_clamps_and_force_are_those_of_the_recording():

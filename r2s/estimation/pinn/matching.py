@@ -1,8 +1,8 @@
-"""Clouds without correspondences: which place of the network's own map each point is of.
+"""Clouds without correspondences: which place of the network's map each of their points is of.
 
-As in the iterated closest point method, places are found on the map as it stands, and a residual is
-how far the map is from a point in one direction: along the normal for points within the sheet,
-outward for the border of the cloud. What lies across is free to slide until the next matching.
+As in iterative closest point, places are found on the map as it stands. A residual is the distance
+of the map from a point in one direction: along the normal for points within the sheet, outward for
+the border of the cloud. Across it the map is free to slide until the next matching.
 """
 
 from typing import NamedTuple
@@ -18,20 +18,24 @@ from r2s.evaluation.losses import surface_residuals
 from r2s.geometry.mesh import Mesh
 from r2s.recordings.recording import CORNERS, Recording, subsample
 
-BINS = 6  # of the border, along each side
-DEPTH, OFF, BEYOND = 0.02, 0.006, 0.01  # [m]: the strip at the border, into the sheet, off it, out
-OUTERMOST, FEWEST = 3, 6  # which point of a strip tells where it ends, and of how many at least
-LEAST = 3e-4  # [m]: no camera is better
-CUT = 3.0  # of the spread of the distances: what is much farther off is an outlier
+BINS = 6  # strips along each side of the border
+DEPTH, OFF, BEYOND = 0.02, 0.006, 0.01  # of a strip into the sheet, off it and outward, [m]
+OUTERMOST, FEWEST = 3, 6  # which point of a strip tells where it ends, and least number of points
+LEAST = 3e-4  # spread of the distances, which no camera undercuts, [m]
+CUT = 3.0  # of the spread: a point that is much farther off is an outlier
 
 
 class Sight(eqx.Module):
     """What was seen of a sheet, in its axes at rest (warp, weft, normal).
 
-    - `size`: [m]. - `times`: of the frames, from the first, [s].
-    - `points`, `mask`: few in each frame, to be matched, [m]. - `cloud`, `there`: all of them.
-    - `corners`: which the grippers hold, on the sheet, [m]. - `grips`: where they are, [m].
-    - `up`: [-]. - `table`: its height above the sheet's corner at rest, along `up`, [m].
+    - `size`: of the sheet, [m].
+    - `times`: of the frames, from the first one, [s].
+    - `points`, `mask`: some of the points in each frame, which are matched, [m].
+    - `cloud`, `there`: all of them.
+    - `corners`: places on the sheet that the grippers hold, [m].
+    - `grips`: where the grippers are, [m].
+    - `up`: direction against gravity, [-].
+    - `table`: its height above the sheet's corner at rest, along `up`, [m].
     """
 
     size: Float[Array, " 2"]
@@ -47,9 +51,11 @@ class Sight(eqx.Module):
 
 
 class Rows(NamedTuple):
-    """Residuals: how far the map at a place (X, Y) and time is from a target along a direction.
+    """Residuals: distances of the map from targets, along directions.
 
-    - `weight`: one over a deviation, [1/m]; 0: it does not count.
+    - `place`: on the map (X [m], Y [m], t [s]).
+    - `target`: [m]. `direction`: [-].
+    - `weight`: one over the standard deviation, [1/m]; 0: the row does not count.
     """
 
     place: Float[Array, "row 3"]
@@ -59,13 +65,13 @@ class Rows(NamedTuple):
 
 
 def axes_of(recording: Recording) -> Float[np.ndarray, "3 3"]:
-    """Warp, weft and normal of the sheet at rest, in the world."""
+    """Directions of warp, weft and normal of the sheet at rest, in the world."""
     sheet = recording.info.sheet
     return np.array([sheet.warp, sheet.weft, np.cross(sheet.warp, sheet.weft)])
 
 
 def sight_of(recording: Recording, frames: np.ndarray, num_points: int, seed: int = 0) -> Sight:
-    """What was seen in some frames, with at most `num_points` of each to be matched.
+    """What was seen in some `frames`, with at most `num_points` of each to be matched.
 
     Raises `ValueError` when a frame that is asked for does not exist.
     """
@@ -76,37 +82,41 @@ def sight_of(recording: Recording, frames: np.ndarray, num_points: int, seed: in
             f"recording {recording.info.name}: three frames or more of 0..{len(times) - 1} are "
             f"needed, got {frames.tolist()}"
         )
-    local = lambda world: (np.asarray(world, np.float64) - np.asarray(sheet.origin)) @ axes.T
+
+    def local(world) -> np.ndarray:
+        return (np.asarray(world, np.float64) - np.asarray(sheet.origin)) @ axes.T
+
     few = subsample(recording, num_points, 0.005, seed)
     path, knots = local(recording.handle_path), np.asarray(recording.handle_times, np.float64)
-    at = lambda values: np.interp(times[frames], knots, values)
-    grips = np.stack([[at(axis) for axis in path[:, g].T] for g in range(path.shape[1])])
+    by_grip = np.moveaxis(path, 0, -1)  # (grip, axis, knot)
+    grips = np.stack([[np.interp(times[frames], knots, axis) for axis in grip] for grip in by_grip])
     corners = np.array([CORNERS[name] for name in sheet.held]) * np.asarray(sheet.size)
-    up = axes @ np.array([0.0, 0.0, 1.0])
-    array = lambda value: jnp.asarray(value, float)
     return Sight(
-        size=array(sheet.size),
-        times=array(times[frames] - times[frames[0]]),
-        points=array(local(few.points)[frames]),
+        size=jnp.asarray(sheet.size, float),
+        times=jnp.asarray(times[frames] - times[frames[0]], float),
+        points=jnp.asarray(local(few.points)[frames], float),
         mask=few.mask[frames],
-        cloud=array(local(recording.points)[frames]),
+        cloud=jnp.asarray(local(recording.points)[frames], float),
         there=recording.mask[frames],
-        corners=array(corners),
-        grips=array(grips.transpose(2, 0, 1)),
-        up=array(up),
-        table=array(recording.info.table_height - sheet.origin[2]),
+        corners=jnp.asarray(corners, float),
+        grips=jnp.asarray(grips.transpose(2, 0, 1), float),
+        up=jnp.asarray(axes @ np.array([0.0, 0.0, 1.0]), float),
+        table=jnp.asarray(recording.info.table_height - sheet.origin[2], float),
     )
 
 
 def placed(network: Network, points: Float[Array, "point 3"]) -> Float[Array, "point 3"]:
-    """Where the map takes places and times (X, Y, t), [m]."""
+    """Positions [m] to which the map takes places and times (X, Y, t)."""
     return jnp.pad(points[:, :2], ((0, 0), (0, 1))) + network(points)
 
 
 @eqx.filter_jit
 def matched(network: Network, sight: Sight, mesh: Mesh) -> tuple[Rows, Float[Array, ""]]:
-    """Rows that draw the map along its normal to the points that are nearest to it, and the spread
-    of their distances [m]; outliers hardly count (Geman and McClure 1987)."""
+    """Rows that draw the map along its normal to the points, and the spread of the distances [m].
+
+    Each point is matched to the nearest place of the map. Outliers hardly count (Geman and McClure
+    1987).
+    """
 
     def frame(given):
         points, mask, time = given
@@ -123,17 +133,17 @@ def matched(network: Network, sight: Sight, mesh: Mesh) -> tuple[Rows, Float[Arr
     spread = jnp.maximum(1.4826 * middle, LEAST)
     share = 1 / (1 + (gap / (CUT * spread)) ** 2)  # the square root of that of the squares
     weight = jnp.where(sight.mask, share, 0) / spread
-    flat = lambda values: values.reshape(-1, 3)
-    return Rows(flat(place), flat(sight.points), flat(normal), weight.ravel()), spread
+    place, target, normal = (part.reshape(-1, 3) for part in (place, sight.points, normal))
+    return Rows(place, target, normal, weight.ravel()), spread
 
 
 @eqx.filter_jit
 def bordered(network: Network, sight: Sight) -> Rows:
     """Rows that draw the map's border to that of the cloud, in the plane of the sheet.
 
-    Of the points in a strip at the border one of the outermost says where the cloud ends: with n
-    points in a depth D, the k-th lies k D / n within it. A border that is hidden, or far off, does
-    not count: its strip has too few points.
+    In a strip at the border with n points in a depth D, the k-th outermost point lies k D / n
+    within the border. A border that is hidden or far off does not count: its strip has too few
+    points.
     """
     along = (jnp.arange(BINS, dtype=sight.size.dtype) + 0.5) / BINS
     zero, one = jnp.zeros(BINS, along.dtype), jnp.ones(BINS, along.dtype)
@@ -144,11 +154,12 @@ def bordered(network: Network, sight: Sight) -> Rows:
     half = jnp.where(jnp.abs(outward[:, 0]) > 0, sight.size[1], sight.size[0]) / (2 * BINS)
 
     def strip(place, out, half, time, cloud, there):
-        one = lambda p: placed(network, jnp.append(p, time)[None])[0]
-        at, slope = one(place), jax.jacfwd(one)(place)
-        unit = lambda v: v / jnp.sqrt(v @ v)
-        side = unit(slope @ jnp.stack([-out[1], out[0]]))
-        off = unit(jnp.cross(slope[:, 0], slope[:, 1]))
+        def position(place):
+            return placed(network, jnp.append(place, time)[None])[0]
+
+        at, slope = position(place), jax.jacfwd(position)(place)
+        side = _unit(slope @ jnp.stack([-out[1], out[0]]))
+        off = _unit(jnp.cross(slope[:, 0], slope[:, 1]))
         away = jnp.cross(side, off)
         away = away * jnp.sign(away @ (slope @ out))
         offset = cloud - at[None]
@@ -175,24 +186,28 @@ def bordered(network: Network, sight: Sight) -> Rows:
     return Rows(place, target, away, weight)
 
 
+def _unit(vector: Float[Array, " 3"]) -> Float[Array, " 3"]:
+    return vector / jnp.sqrt(vector @ vector)
+
+
 def fixed(
     places: Float[Array, "place 2"],
     times: Float[Array, " frame"],
     targets: Float[Array, "frame place 3"],
     deviation: float,
 ) -> Rows:
-    """Rows that draw places of the sheet in all directions to where they are known to be [m]."""
+    """Rows that draw places of the sheet to known positions `targets` [m], in all directions."""
     frames, number, _ = targets.shape
     at = jnp.concatenate([at_time(places, time) for time in times])
     directions = jnp.tile(jnp.eye(3, dtype=targets.dtype), (frames * number, 1))
     weight = jnp.full(3 * frames * number, 1 / deviation, targets.dtype)
-    thrice = lambda values: jnp.repeat(values.reshape(-1, 3), 3, axis=0)
-    return Rows(thrice(at), thrice(targets), directions, weight)
+    at, targets = (jnp.repeat(part.reshape(-1, 3), 3, axis=0) for part in (at, targets))
+    return Rows(at, targets, directions, weight)
 
 
 @eqx.filter_jit
 def above(network: Network, sight: Sight, mesh: Mesh, deviation: float = 1e-3) -> Rows:
-    """Rows that lift what is below the table, at the vertices of a mesh."""
+    """Rows that lift the map onto the table where it is below, at the vertices of a mesh."""
     at = jax.vmap(lambda time: at_time(mesh.rest, time))(sight.times).reshape(-1, 3)
     x = placed(network, at)
     short = sight.table - x @ sight.up
