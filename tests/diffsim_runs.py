@@ -187,4 +187,4 @@ def estimated(fabric: str, number: int, budget: Budget) -> Estimate:
         clouds = sampled(truth(made, at_rest), made.mesh, number, key)
         scenario, frames = scenario_of(made, at_rest), tuple(range(COUNT))
         problems.append(Problem(scenario, space, frames, clouds, nuisance_prior=EXACT))
-    return diffcloud.estimate(tuple(problems), budget, key=jax.random.key(1))
+    return descend(tuple(problems), budget, key=jax.random.key(1))

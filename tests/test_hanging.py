@@ -52,7 +52,7 @@ def test_fabrics_come_to_rest_in_the_buckled_shape_that_was_seen():
     denim = presets.black_denim()
     space = OrthotropicSpace.make(float(denim.density))
     scenario = scenarios.wind(num_frames=2).scenario((9, 9), False)
-    place = space.locate(denim)
+    place = space.to_unit(denim)
     changed = place + jnp.array([-0.015, -0.06, 0.0, -0.02, 0.01, 0.09, -0.06])
     rest = jax.jit(lambda scenario, u: rollout(scenario, space(u)).x[0])
     apart = lambda one, other: float(jnp.mean(jnp.linalg.norm(one - other, axis=1)))

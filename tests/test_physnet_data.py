@@ -104,7 +104,7 @@ def test_an_estimate_goes_on_and_is_the_last_of_what_was_tried(sighting, tmp_pat
     assert first.loss == first.losses[-1] and first.losses.shape == (12, 1)
     again = estimator.estimate(sighting, num_calls=12, path=path)
     np.testing.assert_array_equal(first.history, again.history)
-    place = TINY.space.locate(first.fabric)
+    place = TINY.space.to_unit(first.fabric)
     np.testing.assert_allclose(distances(sighting, place[None])[0], first.loss, rtol=1e-3)
     assert not first.identifiable.any()
 

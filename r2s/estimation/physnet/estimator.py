@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r2s.estimation.estimate import Estimate, without_standard_errors
+from r2s.estimation.estimate import Estimate, point_estimate
 from r2s.estimation.physnet import bayes, emulator
 from r2s.estimation.physnet.network import PhysNet
 from r2s.estimation.physnet.preprocess import grey
@@ -224,7 +224,7 @@ def published_recipe(
 def _estimate(sighting: Sighting, name: str, places, losses, best: int, began: float) -> Estimate:
     space = sighting.space
     values = np.asarray(jax.vmap(space.values)(jnp.asarray(places, float)))
-    return without_standard_errors(
+    return point_estimate(
         name,
         space,
         jnp.asarray(places[best], float),
