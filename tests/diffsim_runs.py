@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from r2s.cloth.linear.elimination import Elimination
-from r2s.estimation import diffcloud
-from r2s.estimation.descent import Budget
+from r2s.estimation.descent import Budget, descend
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.problem import Clouds, NuisancePrior, Problem
 from r2s.fabrics.fabric import Fabric
