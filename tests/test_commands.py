@@ -78,7 +78,7 @@ def test_an_error_is_one_line_and_1(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_a_motion_is_simulated(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out = tmp_path / "x.npz"
     command = ["simulate", "lifting", "--fabric", "black_denim", "--out", str(out), *SHORT]
@@ -89,7 +89,7 @@ def test_a_motion_is_simulated(tmp_path: Path, capsys: pytest.CaptureFixture) ->
     assert moved.x.shape == (4, 9, 3) and np.isfinite(moved.x).all()
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_a_recording_is_simulated_and_judged(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out, recording = str(tmp_path / "x.npz"), tmp_path / "lift.npz"
     command = ["simulate", "lifting", "--fabric", "black_denim", "--out", out, *SHORT]
@@ -171,7 +171,7 @@ def test_numbers_of_a_motion_and_what_is_printed(capsys: pytest.CaptureFixture) 
     assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, 1.0], "c": "x"}
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_a_card_comes_from_a_recording_and_goes_on_where_it_was(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
@@ -192,7 +192,7 @@ def test_a_card_comes_from_a_recording_and_goes_on_where_it_was(
     assert not list(tmp_path.glob("*.progress.npz"))
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 @pytest.mark.parametrize("more", [[], ["--forward"]])
 def test_derivatives_of_a_scene_agree(capsys: pytest.CaptureFixture, more: list[str]) -> None:
     assert main(["check-grad", "lifting", *SHORT, "--json", *more]) == 0
@@ -200,7 +200,7 @@ def test_derivatives_of_a_scene_agree(capsys: pytest.CaptureFixture, more: list[
     assert told["agree"] and len(told["rows"]) == 11
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_the_doctor_predicts_step_and_memory(capsys: pytest.CaptureFixture) -> None:
     assert main(["doctor", "--scenario", "lifting", *SHORT, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)["scenario"]

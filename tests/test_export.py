@@ -251,7 +251,7 @@ def test_arcsim_keeps_the_directions(tmp_path):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="motions")
 @pytest.mark.parametrize("elastic", ["membrane", "both"])
 def test_mujocos_forces_are_ours(elastic):
     engine = pytest.importorskip("mujoco", reason="MuJoCo is not installed: r2s[bench]")

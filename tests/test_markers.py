@@ -182,7 +182,7 @@ def test_off_the_grid_is_no_marker(pull: list[np.ndarray]) -> None:
     assert np.linalg.norm(dots.centres[grid] - TRUTH[0], axis=1).max() < 0.6
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="motions")
 @pytest.mark.parametrize(
     "noise, blur, limit", [(10.0, 1.2, 0.15), (10.0, 2.5, 0.2), (20.0, 2.0, 0.3), (4.0, 4.0, 0.2)]
 )

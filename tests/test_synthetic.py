@@ -100,7 +100,7 @@ def test_a_hanging_sheet_is_in_view(blown):
     assert np.mean(KDTree(cloud(whole, 5)).query(surface)[0] < 0.02) > 0.8
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="motions")
 @pytest.mark.parametrize("kind", ["cloth", "points"])
 @pytest.mark.parametrize("name", scenarios.SIX)
 def test_every_scenario_is_recorded_by_either_solver(name, kind):

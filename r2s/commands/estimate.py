@@ -121,7 +121,7 @@ class EstimateCard:
         import jax
 
         from r2s.estimation.pinn import from_pulls
-        from r2s.estimation.pinn.data import pull_from
+        from r2s.estimation.pinn.pulls import pull_from
         from r2s.fabrics.parameters import OrthotropicSpace
 
         angles = self.angles or (0.0,) * len(seen)
