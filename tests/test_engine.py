@@ -231,7 +231,7 @@ echo "Submitted batch job $!"
 """
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="study")
 def test_jobs_of_slurm_make_the_same_with_a_stand_in_for_sbatch(tmp_path, monkeypatch):
     """The stand-in runs a job's script at once, as Slurm would on a node that is free."""
     cluster = pytest.importorskip("r2s.study.cluster", reason="needs the extra cluster")

@@ -15,8 +15,6 @@ from r2s.estimation import diffcloud, diffcp
 from r2s.estimation.descent import DEFAULT
 from r2s.estimation.estimate import Estimate, as_json, from_json
 from r2s.estimation.physnet import dataset, estimator, preprocess, training
-from r2s.estimation.pinn import from_clouds, from_pulls
-from r2s.estimation.pinn.data import pull_from
 from r2s.estimation.problem import Problem
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace
@@ -215,6 +213,9 @@ def _physnet(cell: EstimateCell, space: ParameterSpace, recordings: list[Recordi
 def _pinn(
     cell: EstimateCell, space: ParameterSpace, recordings: list[Recording], folder: Path
 ) -> Estimate:
+    from r2s.estimation.pinn import from_clouds, from_pulls  # need flax
+    from r2s.estimation.pinn.pulls import pull_from
+
     del folder
     if cell.scenario != "stretching":
         return from_clouds.estimate(recordings[0], space, key=jr.key(cell.repeat))
