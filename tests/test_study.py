@@ -16,9 +16,11 @@ from r2s.estimation.estimate import point_estimate
 from r2s.evaluation import prediction_error
 from r2s.fabrics import presets
 from r2s.fabrics.arcsim import write_material
+from r2s.failures import Failure
 from r2s.recordings.recording import cloud
 from r2s.scenarios import synthetic
 from r2s.scenarios.six import SIX
+from r2s.solver import Trajectory
 from r2s.study import engine, estimates, matrix, results
 from r2s.study.cells import dependencies, read_metadata, with_dependencies
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
@@ -74,6 +76,21 @@ def test_a_diverged_motion_is_a_result(fold):
     whole = prediction_error.against_recording(fold, fold)
     assert found.keys() == whole.keys()
     assert all(np.isnan(value) for value in found.values())
+
+
+def test_a_run_that_fails_is_lost_from_there_on_and_says_why(monkeypatch):
+    failed = Trajectory(
+        x=jnp.zeros((3, 9, 3)),
+        ok=jnp.array([True, False, True]),
+        failure=jnp.array(Failure.NON_FINITE.value),
+        failed_frame=jnp.array(1),
+        failed_step=jnp.array(2),
+    )
+    monkeypatch.setattr(prediction_error, "_rollout", lambda *_, **__: failed)
+    scenario = SIX["fling"]().scenario((3, 3))
+    moved = prediction_error.predict_motion(scenario, presets.grey_interlock())
+    assert np.isfinite(moved.x).all(axis=(1, 2)).tolist() == [True, False, False]
+    assert "frame 1, step 2" in moved.failure
 
 
 def test_the_cropped_distance_leaves_out_what_the_recording_cannot_show(fold):
