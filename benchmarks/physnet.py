@@ -164,7 +164,10 @@ def teach(out: Path, data: Data, others: Data, view, asked, seed: int):
             raise ValueError(f"{path}: was trained by {trained.schedule}, asked for {schedule}")
         trained = trained._replace(schedule=schedule)
     began, spent, done = time.perf_counter(), time.process_time(), len(trained.curve)
-    say = lambda number, row: print(number, *(f"{value:.4f}" for value in row), flush=True)
+
+    def say(number, row):
+        return print(number, *(f"{value:.4f}" for value in row), flush=True)
+
     trained = training.train(trained, data, path, say)
     found = {"chance": 0.5, "untrained": untrained, "accuracy": trained.curve[-1].accuracy}
     images = triplets.images_of(others, np.ones(len(others.fabric), bool))
@@ -190,7 +193,10 @@ def draw(out: Path, others: Data, settings: Settings, trained: Training) -> dict
     sequences = embedded(trained, depth)
     apart = distance(sequences[one], sequences[two])
     difference = np.abs(others.places[numbers[one]] - others.places[numbers[two]])
-    correlation = lambda values: float(np.asarray(spearmanr(apart, values))[0])
+
+    def correlation(values):
+        return float(np.asarray(spearmanr(apart, values))[0])
+
     names = [bound.name for bound in settings.ranges]
     found = {name: correlation(column) for name, column in zip(names, difference.T, strict=True)}
     found["all parameters"] = correlation(np.sqrt((difference**2).sum(axis=1)))
@@ -371,7 +377,10 @@ def summary(rows: list[dict[str, Any]], settings: Settings, asked) -> dict[str, 
     """Median errors as shares of the ranges, of each network too; printed as a table."""
     names = [bound.name for bound in settings.ranges]
     camera = [row for row in rows if row["images"] == "depth camera"]
-    pick = lambda chosen: np.median([row["error"] for row in chosen], axis=0)
+
+    def pick(chosen):
+        return np.median([row["error"] for row in chosen], axis=0)
+
     networks = sorted({row["network"] for row in camera})
     each = np.array([pick([r for r in camera if r["network"] == n]) for n in networks])
     by_chance = np.median(np.concatenate([row["random error"] for row in camera]), axis=0)
@@ -388,10 +397,16 @@ def summary(rows: list[dict[str, Any]], settings: Settings, asked) -> dict[str, 
         }
         for i, name in enumerate(names)
     ]
-    text = lambda value: f"{value:.3f}" if isinstance(value, float) else f"{value}"
+
+    def text(value):
+        return f"{value:.3f}" if isinstance(value, float) else f"{value}"
+
     columns = {key: (lambda row, key=key: text(row[key])) for key in table[0]}
     show("median error, share of the range", table, columns)
-    median = lambda key: float(np.nanmedian([row[key] for row in camera]))
+
+    def median(key):
+        return float(np.nanmedian([row[key] for row in camera]))
+
     seconds = [row["cpu seconds"] for row in camera if np.isfinite(row["cpu seconds"])]
     return {
         "fabrics": len({row["fabric"] for row in camera}),
