@@ -180,7 +180,7 @@ def test_an_estimate_says_what_was_in_doubt(lifted):
     assert any(line.startswith("shift x") and " m " in line for line in lines)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="estimates")
 def test_wind_gives_the_stiffness_of_a_sheet_that_was_weighed_wrongly():
     """By 4 %: all is found as if it were so much stiffer, and the air so much stronger."""
     denim = presets.black_denim()

@@ -121,7 +121,7 @@ def test_the_tip_of_a_strip_hangs_where_the_elastica_does(number, axis):
     assert miss(16, axis, number) < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("number", [1.0, 10.0])
 def test_the_tip_converges_to_the_elastica_to_second_order(number):
     coarse, medium, fine = (miss(cells, 0, number) for cells in (8, 16, 32))
@@ -234,7 +234,7 @@ def buckling(bends: float, twists: float) -> float:
     return 12.85 * (bends * twists) ** 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("ratio", [0.0, 0.3])
 def test_a_strip_on_its_edge_buckles_at_prandtls_weight(ratio):
     law = PlateBending.make(1.0, ratio)
@@ -244,7 +244,7 @@ def test_a_strip_on_its_edge_buckles_at_prandtls_weight(ratio):
     assert 2 * fine - coarse == pytest.approx(expected, rel=0.04)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("bias", [0.5, 1.0, 10.0])
 def test_hinges_twist_too_stiffly(bias):
     # Twist bends the diagonals alone: 4 bias width, where a plate has 2 stiffness width, so that

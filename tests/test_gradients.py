@@ -139,6 +139,7 @@ def hung(sheet, fabric):
     return jax.jit(jax.value_and_grad(loss)), inputs
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("name", sorted(WHERE.keys() - {"friction", "thickness", "table height"}))
 def test_without_contact_the_gradient_agrees_more_closely(name, hung):
     value_and_grad, inputs = hung
@@ -151,6 +152,7 @@ def test_without_contact_the_gradient_agrees_more_closely(name, hung):
     assert abs(found) > 1e-12
 
 
+@pytest.mark.slow(group="cloth")
 def test_forward_mode_equals_reverse_mode(loss, gradient, inputs):
     keys = iter(jax.random.split(jax.random.key(3), 20))
     # relative, so that all parameters count
@@ -177,6 +179,7 @@ def test_one_compilation_serves_all_fabrics(value_and_grad, several):
     assert len({float(value) for value in values}) == 3
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_batch_of_fabrics_equals_the_loop(loss, value_and_grad, several):
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)
     (value, x), slope = jax.jit(jax.vmap(jax.value_and_grad(loss, has_aux=True)))(batch)

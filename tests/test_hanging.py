@@ -45,7 +45,7 @@ def test_a_flat_sheet_is_laid_onto_a_cylinder_without_stretch():
     assert int(jnp.sum(borders(mesh))) == 32
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="cloth")
 def test_fabrics_come_to_rest_in_the_buckled_shape_that_was_seen():
     """Two denims of slightly other stiffness fall into two shapes, 5 mm apart, and into one when
     they start near it."""

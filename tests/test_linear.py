@@ -79,7 +79,7 @@ def test_the_factor_solves(problem):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="cloth")
 def test_every_depth_of_dissection_gives_the_same(problem):
     mesh, equations, _, blocks = problem
     right = jnp.ones((len(mesh.rest), 3))

@@ -30,7 +30,7 @@ def spinning(x, rate=3.0):
     return (x - jnp.mean(x, axis=0, keepdims=True)) @ matrix.T + 0.1
 
 
-@pytest.mark.parametrize("axes", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("axes", [2, pytest.param(3, marks=pytest.mark.slow(group="points"))])
 def test_momenta_are_kept_to_rounding(axes):
     solver, material, x = small_block(axes, gravity=0.0)
     # stretched, so that it pulsates
@@ -58,7 +58,9 @@ def test_free_fall_is_exact():
     )
 
 
-SLOW_LAWS = [pytest.param(law, marks=pytest.mark.slow) for law in (NeoHookean, LinearSolid)]
+SLOW_LAWS = [
+    pytest.param(law, marks=pytest.mark.slow(group="points")) for law in (NeoHookean, LinearSolid)
+]
 
 
 @pytest.mark.parametrize("law", [FixedCorotated, *SLOW_LAWS])
@@ -82,7 +84,7 @@ def test_a_bar_rings_at_the_speed_of_its_waves(law):
     assert 2 * (times[1] - times[0]) == pytest.approx(1, rel=0.03)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_three_dimensions_repeat_two():
     """A body without Poisson effect that is the same all along y moves as in the plane."""
     spacing = 1 / 8
@@ -109,7 +111,7 @@ def test_three_dimensions_repeat_two():
 
 @pytest.mark.parametrize(
     "sticky, friction",
-    [(False, 0.0), (False, 0.3), pytest.param(True, 0.3, marks=pytest.mark.slow)],
+    [(False, 0.0), (False, 0.3), pytest.param(True, 0.3, marks=pytest.mark.slow(group="points"))],
 )
 def test_a_block_on_the_table_sticks_slides_or_slows(sticky, friction):
     background = box(2, 8, table=Table.make(0.25), sticky=sticky)
@@ -128,7 +130,7 @@ def test_a_block_on_the_table_sticks_slides_or_slows(sticky, friction):
         assert gone == pytest.approx(expected, abs=2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_a_cantilever_bends_as_a_beam_does():
     """Tip deflection of Timoshenko's beam under its weight, no Poisson effect."""
     errors = [_tip_error(cells) for cells in (4, 8, 16)]  # across its height
@@ -159,7 +161,7 @@ def _tip_error(cells, young=1e6, density=1e3, length=1.0, height=0.2, gravity=0.
     return abs(found / (load * (bent + sheared)) - 1)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_walls_hold_a_block_in():
     background = box(2, 8, gravity=0.0, walls=5)
     solver, material, x = small_block(2)
@@ -190,7 +192,7 @@ def test_a_gripper_that_finds_nothing_is_refused():
         solver.gripped(x, jnp.array([[0.5, 0.6], [0.9, 0.9]]), 0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_wind_pushes_a_sheet_of_a_solid():
     mesh = r2s.rectangle((0.25, 0.25), (4, 4))
     sheet = jnp.pad(mesh.rest + 0.3, ((0, 0), (0, 1)), constant_values=0.5)
@@ -219,7 +221,7 @@ def test_a_step_above_the_limit_is_refused_with_the_limit():
         Block.make(solver.background, solver.volume, solid(damping=1.0), solver.dt)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 @pytest.mark.parametrize("factor, stays", [(1.0, True), (2.5, False)])
 def test_the_limit_is_where_a_block_starts_to_explode(factor, stays):
     solver, material, x = small_block(2, gravity=0.0)

@@ -49,7 +49,7 @@ BLOCK_WHERE = {  # what to differ, and by how much
 }
 
 
-@pytest.fixture(scope="module", params=[2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=[2, pytest.param(3, marks=pytest.mark.slow(group="points"))])
 def block(request):
     """Value and gradient of a block that is dragged over a table, and its inputs."""
     spacing, axes = 0.1, slice(-request.param, None)  # the last ones
@@ -115,7 +115,7 @@ def _agrees(value_and_grad, inputs, where, size):
     assert abs(found) > 1e-12
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_forward_mode_equals_reverse_mode(block):
     _, inputs, _, solver = block
     solver = eqx.tree_at(lambda s: s.background, solver, _forward(solver.background))
@@ -187,14 +187,14 @@ def sheet_motion(sheet, fabric):
     return jax.jit(jax.value_and_grad(loss)), inputs
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 @pytest.mark.parametrize("name", SHEET_WHERE)
 def test_the_gradient_of_a_sheet_agrees_with_differences(name, sheet_motion):
     value_and_grad, inputs = sheet_motion
     _agrees(value_and_grad, inputs, *SHEET_WHERE[name])
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_a_gradient_needs_a_tenth_of_the_memory_of_all_states():
     """Of 2,000 steps; the states of the frames, and of the steps in one, are kept."""
     frames, substeps = 50, 40
@@ -216,7 +216,10 @@ def test_a_gradient_needs_a_tenth_of_the_memory_of_all_states():
 
 @pytest.mark.parametrize(
     "name, law",
-    [("fcr", FixedCorotated), pytest.param("nh", NeoHookean, marks=pytest.mark.slow)],
+    [
+        ("fcr", FixedCorotated),
+        pytest.param("nh", NeoHookean, marks=pytest.mark.slow(group="points")),
+    ],
 )
 def test_difftaichi_is_repeated_with_its_gradients(name, law):
     """Hu et al. 2020: a block thrown into a box, 1,024 steps, in the units of that code."""

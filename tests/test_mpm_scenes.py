@@ -89,7 +89,7 @@ def setting(name, fabric):
     return solver, x, controls_of(x, held, path, wind, substeps)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 @pytest.mark.parametrize("fabric", ["camel_ponte_roma", "black_denim"])
 @pytest.mark.parametrize("name", MOTIONS)
 def test_a_sheet_neither_tears_nor_enters_the_table(name, fabric):
@@ -108,7 +108,7 @@ def test_a_sheet_neither_tears_nor_enters_the_table(name, fabric):
     assert np.array_equal(np.asarray(moved.x)[:, held], np.asarray(controls.handles)[:, -1])
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 @pytest.mark.parametrize("young", [1e2, 1e4, 1e6])
 @pytest.mark.parametrize("poisson", [0.05, 0.45])
 def test_gradients_of_a_lifted_block_are_finite_in_single_precision(young, poisson):

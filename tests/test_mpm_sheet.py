@@ -82,7 +82,7 @@ def test_the_forces_are_those_of_the_energy(sheet, fabric):
         assert rigid == pytest.approx(np.asarray(found), rel=1e-9, abs=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_the_frequencies_are_bounds_of_those_of_the_matrices(sheet, fabric):
     mass = jnp.repeat(vertex_masses(sheet, fabric.density), 3)
     none = eqx.tree_at(lambda f: f.bending, fabric, HingeBending(jnp.zeros((), float)))
@@ -95,7 +95,7 @@ def test_the_frequencies_are_bounds_of_those_of_the_matrices(sheet, fabric):
         assert largest < float(eqx.filter_jit(bound)(sheet, of)) < 6 * largest
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_a_hanging_sheet_stretches_as_it_should():
     """Force per width P = C11 (s^2 - 1) s / 2 at a stretch s carries what hangs below."""
     shape, length = (9, 5), 0.4
@@ -182,7 +182,7 @@ def pair(sheet, fabric):
     return Sheet.make(scene, grid, fabric, 5e-4), fabric
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_a_sheet_that_falls_on_another_stays_on_it(pair, sheet):
     solver, fabric = pair
     x = jnp.concatenate([flat(sheet, 2e-3), flat(sheet, 0.12)])
@@ -194,7 +194,7 @@ def test_a_sheet_that_falls_on_another_stays_on_it(pair, sheet):
     assert 0.7 * SPACING < np.mean(high[-1] - low[-1]) < 1.3 * SPACING
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_sheets_that_part_do_not_hold_each_other(pair, sheet):
     solver, fabric = pair
     solver = eqx.tree_at(lambda s: s.background.gravity, solver, jnp.zeros((), float))
@@ -218,7 +218,7 @@ def test_wind_gives_the_momentum_of_its_drag(sheet, elastic):
     assert gained == pytest.approx([0, 0, expected], abs=1e-14)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_held_vertices_follow_their_path_exactly(sheet, elastic):
     solver = solver_of(sheet, elastic, held=(0, 4))
     x = flat(sheet)

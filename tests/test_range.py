@@ -19,7 +19,7 @@ BENDINGS = (1e-7, 1e-5, 1e-3)  # [N m]
 DENSITIES = (0.05, 0.5)  # [kg/m^2]
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize(
     "table",
     [

@@ -162,7 +162,7 @@ def test_material_points_fit_the_scenario():
         rollout(scenario, fabric, solver=wrong)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="motions")
 @pytest.mark.parametrize("fabric", [SOFTEST, STIFFEST])
 @pytest.mark.parametrize(
     ("name", "kind"),
