@@ -76,9 +76,9 @@ def ask(
     2010). Candidates are random places, half of them anywhere and half around the best. History and
     seed alone determine the result, so that a search continues from a file as if uninterrupted.
 
-    It is our own, since scikit-optimize's `Optimizer` (expected improvement, refined by L-BFGS)
-    found median losses 50, 11 and 15 % higher in 60 calls on three losses in seven dimensions, at
-    13 times the CPU time (`benchmarks/bayes.py`): 21 to 27 % of its places lay on the cube's faces.
+    The search is our own: scikit-optimize's `Optimizer` (expected improvement) had median losses
+    50, 11 and 15 % higher after 60 calls on three losses in seven dimensions, at 13 times the CPU
+    time, with 21 to 27 % of its places on faces of the cube (`benchmarks/bayes.py`).
     """
     done, dim = history.places.shape
     if done < num_first:

@@ -149,6 +149,19 @@ def responses(
     return respond
 
 
+def objective(sighting: Sighting, batch: int) -> bayes.Objective:
+    """The function from up to `batch` places to the rms distances of their frames on the map.
+
+    A distance is NaN where the simulation diverges.
+    """
+    respond, recorded = responses(sighting, batch), target(sighting)
+
+    def distances(places: Float[np.ndarray, "place dim"]) -> Float[np.ndarray, " place"]:
+        return np.sqrt(((respond(places) - recorded) ** 2).mean(axis=1))
+
+    return distances
+
+
 def estimate(
     sighting: Sighting,
     *,
@@ -203,13 +216,8 @@ def published_recipe(
     study of Duan et al. The arguments are those of `estimate`.
     """
     began = time.perf_counter()
-    respond, recorded = responses(sighting, batch), target(sighting)
-
-    def distances(places):
-        return np.sqrt(((respond(places) - recorded) ** 2).mean(axis=1))
-
     history = bayes.minimise(
-        distances,
+        objective(sighting, batch),
         sighting.space.dim,
         num_calls=num_calls,
         batch=batch,
