@@ -2,7 +2,6 @@
 
 import base64
 import contextlib
-import importlib
 import io
 import json
 import socket
@@ -25,9 +24,10 @@ from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.geometry.surface import sample
 from r2s.recordings.recording import cloud
 from r2s.scenarios import lifting, synthetic
+from r2s.viewer import page
 from r2s.viewer import subject as subjects
 
-page = pytest.importorskip("r2s.viewer.page", reason="viser is not installed")
+pytest.importorskip("viser")
 
 FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-sync",
@@ -94,11 +94,10 @@ def test_without_a_recording_there_is_no_error():
     assert bool(moved.ok.all()) and np.isnan(np.asarray(moved.error)).all()
 
 
-def test_without_viser_the_extra_is_named(monkeypatch):
+def test_without_viser_the_extra_is_named(monkeypatch, subject):
     monkeypatch.setitem(sys.modules, "viser", None)
-    monkeypatch.delitem(sys.modules, "r2s.viewer.page")
-    with pytest.raises(ImportError, match=r"r2s\[viz\]"):
-        importlib.import_module("r2s.viewer.page")
+    with pytest.raises(ImportError, match=r"sliders: viser is missing: pip install 'r2s\[viz\]'"):
+        page.Page(subject, jnp.full(subject.space.dim, 0.5))
 
 
 def test_a_taken_port_is_said(subject, shown):
@@ -123,7 +122,7 @@ def test_a_motion_that_fails_is_said_and_the_page_goes_on(shown, monkeypatch):
     before, whole = shown.moved, page.move
     monkeypatch.setattr(page, "move", fail)
     shown._sliders[2].value = 0.2
-    assert shown.latest() is before and "out of memory" in shown._told(0)
+    assert shown.latest() is before and "out of memory" in shown._describe(0)
     monkeypatch.setattr(page, "move", whole)
     shown._sliders[2].value = 0.3
     assert shown.latest() is not before and not shown.failure

@@ -11,8 +11,9 @@ import pytest
 from mpm_bodies import box, lattice, momenta, small_block, solid, states, still
 
 import r2s
+from r2s.failures import Failure, describe
 from r2s.laws.solid import FixedCorotated, LinearSolid, NeoHookean
-from r2s.mpm import Background, Block, Grid, Surface, diagnose, layered
+from r2s.mpm import Background, Block, Grid, Surface, layered
 from r2s.mpm.block import stable_step
 from r2s.units import GRAVITY
 from r2s.world.air import Air
@@ -238,12 +239,65 @@ def test_a_particle_outside_is_refused_and_one_that_leaves_is_recorded():
         solver.init(x + 2)
     start = solver.init(x, jnp.full(x.shape, 5.0))
     controls = still(4, 60, 2)
-    run = eqx.filter_jit(r2s.simulate)
-    assert run(solver, material, start, controls).ok.tolist() == [True, True, False, False]
-    failure = diagnose(solver, material, start, controls)
-    assert failure is not None
-    assert failure.frame == 2 and failure.quantities == ("x",)
-    assert diagnose(solver, material, start, still(2, 60, 2)) is None
+    run = eqx.filter_jit(r2s.simulate)(solver, material, start, controls)
+    assert run.ok.tolist() == [True, True, False, False]
+    moved = states(solver, material, start, controls)
+    code, step = failed(moved)
+    assert code == run.failure == Failure.GRID
+    assert divmod(step, 60) == (run.failed_frame, run.failed_step) == (2, step - 120)
+    assert np.isfinite(moved.x[step - 1]).all() and not np.isfinite(moved.x[step]).all()
+    assert np.isfinite(moved.F[step]).all()
+
+
+def failed(moved):
+    """The code of the failure at the end of a motion, and the first step that has it."""
+    codes = np.asarray(moved.failure)
+    assert codes.tolist() == sorted(codes, key=bool)  # the first failure stays
+    return Failure(codes[-1]), int(np.argmax(codes != Failure.NONE))
+
+
+def test_a_step_that_is_too_long_and_inputs_that_are_not_finite_are_named():
+    solver, material, x = small_block(2, gravity=0.0)
+    noise = 1e-3 * jax.random.normal(jax.random.key(0), x.shape)
+    controls = still(4, 60, 2)
+    assert failed(states(solver, material, solver.init(x, noise), controls)) == (Failure.NONE, 0)
+    windy = dataclasses.replace(controls, wind=controls.wind.at[1, 5].set(jnp.nan))
+    moved = states(solver, material, solver.init(x, noise), windy)
+    assert failed(moved) == (Failure.NON_FINITE, 65)
+    # what fails afterwards does not hide it
+    moved = states(solver, material, solver.init(x, jnp.full(x.shape, 5.0)), windy)
+    assert not np.isfinite(moved.x[-1]).all()
+    assert failed(moved) == (Failure.NON_FINITE, 65)
+    broken = eqx.tree_at(lambda m: m.law.mu, material, jnp.asarray(jnp.nan))
+    assert failed(states(solver, broken, solver.init(x), controls)) == (Failure.NON_FINITE, 0)
+    limit = float(stable_step(solver.background, material))
+    long = dataclasses.replace(solver, dt=4 * limit)
+    with pytest.raises(ValueError, match="limited"):
+        long.check(material)
+    code, step = failed(states(long, material, long.init(x, noise), controls))
+    assert code == Failure.TIME_STEP and step > 2
+
+
+def test_failures_pass_through_vmap_and_gradients():
+    solver, material, x = small_block(2, gravity=0.0)
+    controls = still(4, 60, 2)
+
+    def loss(speed):
+        moved = r2s.simulate(solver, material, solver.init(x, speed * jnp.ones_like(x)), controls)
+        return jnp.sum(moved.x[-1])
+
+    def code(speed):
+        start = solver.init(x, speed * jnp.ones_like(x))
+        return states(solver, material, start, controls).failure[-1]
+
+    speeds = jnp.array([0.5, 5.0])
+    codes = jax.jit(jax.vmap(code))(speeds)
+    assert codes.tolist() == [Failure.NONE, Failure.GRID]
+    slopes = jax.jit(jax.vmap(jax.grad(loss)))(speeds)
+    assert float(slopes[0]) == pytest.approx(x.size * 240 * solver.dt)  # free flight
+    assert [describe(c).split(":")[0] for c in codes] == [
+        "Nothing failed.", "A particle left the grid",
+    ]  # fmt: skip
 
 
 def test_layers_of_a_sheet_are_odd():

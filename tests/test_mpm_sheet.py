@@ -129,11 +129,11 @@ def test_layers_press_and_do_not_pull():
     corners = jnp.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.2], [0.0, 1.0, 0.1]])
     normal = unit_normal(corners)
     law, friction = _layers(), jnp.asarray(0.5)
-    apart = law.settled(corners, 1.3 * normal + jnp.array([0.1, 0.0, 0.0]), friction)
+    apart = law.return_mapping(corners, 1.3 * normal + jnp.array([0.1, 0.0, 0.0]), friction)
     assert apart == pytest.approx(np.asarray(normal), abs=1e-6)  # it forgets
     force, stress = law.stress(corners, apart)
     assert force == pytest.approx(0, abs=1e-4) and stress == pytest.approx(0, abs=1e-4)
-    pressed = law.settled(corners, 0.8 * normal, friction)
+    pressed = law.return_mapping(corners, 0.8 * normal, friction)
     assert pressed == pytest.approx(np.asarray(0.8 * normal), abs=1e-12)
     pressure = normal @ law.stress(corners, pressed)[1] @ normal
     assert pressure == pytest.approx(-20.0 * 0.1**2 * 0.8)
@@ -144,7 +144,7 @@ def test_pressed_layers_slide_when_coulomb_lets_them():
     law, friction = _layers(), jnp.asarray(0.5)
     limit = 0.5 * 20.0 * 0.1**2 / 10.0  # friction x pressure / shear stiffness
     for tilt in (0.5 * limit, 3 * limit):
-        found = law.settled(corners, jnp.array([tilt, 0.0, 0.8]), friction)
+        found = law.return_mapping(corners, jnp.array([tilt, 0.0, 0.8]), friction)
         assert found == pytest.approx([min(tilt, limit), 0, 0.8], abs=1e-9)
 
 

@@ -16,11 +16,11 @@ from r2s.estimation.estimate import as_json, from_json
 from r2s.estimation.pinn import balance as balancing
 from r2s.estimation.pinn import published_recipe
 from r2s.estimation.pinn.balance import balance, basis_of, prepared, reduced, solve
-from r2s.estimation.pinn.data import Clamp, Pull, pull_from, stacked
 from r2s.estimation.pinn.from_pulls import QUICK, estimate, estimate_all
-from r2s.estimation.pinn.laws import small
 from r2s.estimation.pinn.losses import Losses, motion_residual
 from r2s.estimation.pinn.network import Network
+from r2s.estimation.pinn.pulls import Clamp, Pull, pull_from, stacked
+from r2s.estimation.pinn.stress import small
 from r2s.estimation.pinn.synthetic_pulls import pulled
 from r2s.estimation.pinn.training import Recipe, train, trainable
 from r2s.fabrics import presets
@@ -61,16 +61,15 @@ def even_pull(force: bool = True, seed: int = 0, frames: int = FRAMES) -> Pull:
 
 def small_network(pull: Pull) -> Network:
     low, high = jnp.zeros(3), jnp.concatenate([pull.size, pull.times[-1:]])
-    about = {"width": 5, "layers": 3}
-    return Network.make(low, high, jnp.asarray(1e-3, float), **about, key=jr.key(1))
+    scale = jnp.asarray(1e-3, float)
+    return Network.make(low, high, scale, width=5, layers=3, key=jr.key(1))
 
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
     """Few virtual displacements, so that it compiles fast; the slow tests undo it."""
     monkeypatch.setattr("r2s.estimation.pinn.from_pulls.DEGREES", (3, 3))
-    fewer = lambda pull, degrees=(3, 3): basis_of(pull, (3, 3))
-    monkeypatch.setattr(balancing, "basis_of", fewer)
+    monkeypatch.setattr(balancing, "basis_of", lambda pull, degrees=(3, 3): basis_of(pull, (3, 3)))
 
 
 FAMILY = OrthotropicSpace.make(DENSITY)
@@ -172,6 +171,45 @@ def test_training_lowers_the_losses_of_the_strong_form():
     assert terms[0, -1] < 0.2 * terms[0, 0]
 
 
+def test_a_killed_training_goes_on_from_its_checkpoint(tmp_path):
+    """To the same network, after a chunk of Adam and after one of L-BFGS."""
+    pulls = jax.tree.map(lambda leaf: leaf[None], stacked([even_pull()]))
+    spaces = jax.tree.map(lambda leaf: leaf[None], FAMILY)
+    few = dataclasses.replace(TINY, warm_up=2, adam=2, lbfgs=4, redraw=2)
+    file = tmp_path / "training.npz"
+
+    class Killed(Exception):
+        pass
+
+    def killed_after(last):
+        def report(chunk, losses):
+            del losses
+            if chunk == last:
+                raise Killed
+
+        return report
+
+    made = []
+    with jax.numpy_dtype_promotion("standard"):
+        whole = train(spaces, pulls, few, key=jr.key(5))
+        for last in (0, 2):
+            with pytest.raises(Killed):
+                train(spaces, pulls, few, report=killed_after(last), checkpoint=file, key=jr.key(5))
+        resumed = train(
+            spaces,
+            pulls,
+            few,
+            report=lambda chunk, losses: made.append(chunk),
+            checkpoint=file,
+            key=jr.key(5),
+        )
+        with pytest.raises(ValueError, match="another recording, space or setting"):
+            train(spaces, pulls, few, checkpoint=file, key=jr.key(6))
+    assert made == [3]
+    np.testing.assert_array_equal(resumed.places, whole.places)
+    assert eqx.tree_equal(resumed.model, whole.model)
+
+
 def test_the_papers_weight_anneals():
     epochs = jnp.array([0, 499, 500, 4499, 4500, 9999])
     np.testing.assert_allclose(published_recipe.weight(epochs), [0.1, 0.1, 0.2, 0.9, 1.0, 1.0])
@@ -195,11 +233,11 @@ def test_a_step_that_went_astray_is_taken_back(monkeypatch):
     with jax.numpy_dtype_promotion("standard"):
         model = published_recipe.begin(FAMILY, pulls, jnp.full(7, 0.4), key=jr.key(0))
         fresh = published_recipe.untouched(model)
-        about = FAMILY, pulls, jnp.asarray(0), 1
-        after, state, _ = published_recipe.run(model, fresh, *about)
+        first = jnp.asarray(0)
+        after, state, _ = published_recipe.run(model, fresh, FAMILY, pulls, first, 1)
         assert not eqx.tree_equal(after, model) and np.isfinite(state.before)
         worse = state._replace(before=jnp.zeros(()))
-        same, state, _ = published_recipe.run(after, worse, *about)
+        same, state, _ = published_recipe.run(after, worse, FAMILY, pulls, first, 1)
     assert eqx.tree_equal(same, after)
     assert eqx.tree_equal(state.ahead, eqx.filter(after, trainable(after)))
     assert all(not np.any(leaf) for leaf in jax.tree.leaves(state.lbfgs[0].diff_params_memory))
@@ -217,14 +255,18 @@ def test_the_gradient_made_along_with_the_sum_is_that_of_the_sum():
         model = eqx.combine(weights, fixed)
         places = jnp.tile(pulls.places[0], (4, 1))
         frames = jnp.repeat(jnp.arange(4), len(pulls.places[0]))
-        about = FAMILY(model.place), places, frames, small
-        residual = lambda network, pull: motion_residual(network, pull, *about)
+        fabric = FAMILY(model.place)
+
+        def residual(network, pull):
+            return motion_residual(network, pull, fabric, places, frames, small)
+
         return jnp.mean(jax.vmap(residual)(model.networks, pulls) ** 2)
 
-    found = jax.value_and_grad(
-        lambda w: published_recipe.losses(eqx.combine(w, fixed), FAMILY, pulls)[1]
-    )
-    (one, slope), (other, wanted) = (jax.jit(f)(weights) for f in (found, jax.value_and_grad(at_once)))
+    def found(weights):
+        return published_recipe.losses(eqx.combine(weights, fixed), FAMILY, pulls)[1]
+
+    one, slope = jax.jit(jax.value_and_grad(found))(weights)
+    other, wanted = jax.jit(jax.value_and_grad(at_once))(weights)
     slope, wanted = (np.asarray(jax.flatten_util.ravel_pytree(g)[0]) for g in (slope, wanted))
     assert np.abs(wanted).max() > 0
     np.testing.assert_allclose(one, other, rtol=1e-12)

@@ -12,6 +12,12 @@ from matplotlib.figure import Figure  # noqa: E402
 from PIL import Image  # noqa: E402
 
 from r2s.recordings.manifest import default_manifest  # noqa: E402
+from r2s.recordings.open import (
+    SimulatedCloth,
+    load_trajectory,
+    open_recording,
+    save_trajectory,
+)
 from r2s.recordings.recording import (
     Recording,
     RecordingInfo,
@@ -20,13 +26,9 @@ from r2s.recordings.recording import (
     save,
 )
 from r2s.viewer.pictures import (
-    SimulatedCloth,
     _force_curve,
-    _mark,
+    _mark_frames,
     contact_sheet,
-    load_trajectory,
-    open_recording,
-    save_trajectory,
     show,
     write_gif,
 )
@@ -100,7 +102,7 @@ def test_the_force_is_drawn_below(tmp_path: Path, vector: bool) -> None:
     pulled = recorded(force=log, force_times=times)
     curve = _force_curve(Figure(), pulled, 0.1, 0.2)
     np.testing.assert_allclose(curve.lines[0].get_ydata(), force, rtol=1e-12)
-    (marked,) = _mark(curve, pulled, np.arange(FRAMES))
+    (marked,) = _mark_frames(curve, pulled, np.arange(FRAMES))
     expected = np.where(np.arange(FRAMES) / 15 < 0.1, np.nan, np.arange(FRAMES) / 5)
     np.testing.assert_allclose(marked.get_ydata(), expected, rtol=1e-12)
     assert curve.get_xlim()[1] < 0.3  # the frames end long before the log

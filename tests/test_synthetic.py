@@ -94,7 +94,7 @@ def test_dropped_points_are_missing(blown):
 
 def test_a_hanging_sheet_is_in_view(blown):
     experiment, _, whole = blown
-    moved = synthetic._motion(experiment.scenario(SHAPE), presets.grey_interlock(), None, None)
+    moved = synthetic._rollout(experiment.scenario(SHAPE), presets.grey_interlock(), None, None)
     faces = experiment.scenario(SHAPE).scene.mesh.faces
     surface = np.asarray(sample(moved.x[-1], faces, 16))
     assert np.mean(KDTree(cloud(whole, 5)).query(surface)[0] < 0.02) > 0.8

@@ -53,11 +53,12 @@ class EstimateCard:
     """Print the card as one JSON object."""
 
     def run(self) -> int:
-        from r2s.commands.common import recordings_of, tell
+        from r2s.commands.common import print_result
         from r2s.estimation import cards
         from r2s.estimation.experiment_design import describe
+        from r2s.recordings.open import open_recordings
 
-        seen = list(recordings_of(self.recordings))
+        seen = list(open_recordings(self.recordings))
         if not seen:
             raise ValueError("no recording: name an NPZ, or a folder that holds some")
         found = {"diffcloud": self._cloud, "diffcp": self._points, "pinn": self._network}
@@ -72,7 +73,9 @@ class EstimateCard:
         card = cards.Card.make(self.name or seen[0].info.fabric, estimate, about)
         cards.write(self.out, card)
         self._progress_file.unlink(missing_ok=True)
-        tell(self.json, cards.as_json(card), [*describe(estimate), f"{self.out}: {card.name}"])
+        print_result(
+            self.json, cards.as_json(card), [*describe(estimate), f"{self.out}: {card.name}"]
+        )
         return 0
 
     @property
@@ -118,7 +121,7 @@ class EstimateCard:
         import jax
 
         from r2s.estimation.pinn import from_pulls
-        from r2s.estimation.pinn.data import pull_from
+        from r2s.estimation.pinn.pulls import pull_from
         from r2s.fabrics.parameters import OrthotropicSpace
 
         angles = self.angles or (0.0,) * len(seen)

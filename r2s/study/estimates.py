@@ -15,8 +15,6 @@ from r2s.estimation import diffcloud, diffcp
 from r2s.estimation.descent import DEFAULT
 from r2s.estimation.estimate import Estimate, as_json, from_json
 from r2s.estimation.physnet import dataset, estimator, preprocess, training
-from r2s.estimation.pinn import from_clouds, from_pulls
-from r2s.estimation.pinn.data import pull_from
 from r2s.estimation.problem import Problem
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace
@@ -24,7 +22,7 @@ from r2s.files import write_json
 from r2s.recordings.recording import Recording
 from r2s.scenarios.on_points import material_points
 from r2s.scenarios.scenario import from_recording
-from r2s.study.cells import Cell, opened
+from r2s.study.cells import Cell, result_files
 from r2s.study.sources import Source, read
 
 ESTIMATE, NETWORK = "estimate.json", "network.eqx"
@@ -164,7 +162,7 @@ def family_of(solver: str, density: float) -> ParameterSpace:
 
 def read_estimate(cell: EstimateCell, folder: Path) -> Estimate | None:
     """The estimate of a cell that is made; None where it diverged."""
-    with opened(cell, folder) as files:
+    with result_files(cell, folder) as files:
         if not (files / ESTIMATE).exists():
             return None
         return from_json(json.loads((files / ESTIMATE).read_text(encoding="utf-8")))
@@ -200,7 +198,7 @@ def _diffcp(cell: EstimateCell, space, recordings: list[Recording], folder: Path
 def _physnet(cell: EstimateCell, space: ParameterSpace, recordings: list[Recording], folder: Path):
     if cell.network is None:
         raise ValueError("PhysNet needs a trained network")
-    with opened(cell.network, folder) as files:
+    with result_files(cell.network, folder) as files:
         trained = training.load(files / NETWORK)
     recording, on_cloth = recordings[0], cell.solver == "cloth"
     scenario = from_recording(recording, (9, 9) if on_cloth else COARSE)
@@ -215,6 +213,9 @@ def _physnet(cell: EstimateCell, space: ParameterSpace, recordings: list[Recordi
 def _pinn(
     cell: EstimateCell, space: ParameterSpace, recordings: list[Recording], folder: Path
 ) -> Estimate:
+    from r2s.estimation.pinn import from_clouds, from_pulls  # need flax
+    from r2s.estimation.pinn.pulls import pull_from
+
     del folder
     if cell.scenario != "stretching":
         return from_clouds.estimate(recordings[0], space, key=jr.key(cell.repeat))
