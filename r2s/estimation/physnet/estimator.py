@@ -131,7 +131,7 @@ def _flat(points: Float[Array, "frame dim"]) -> Float[Array, " part"]:
     return points.reshape(-1) * jnp.sqrt(jnp.asarray(points.shape[-1], points.dtype))
 
 
-def target(sighting: Sighting) -> Float[np.ndarray, " part"]:
+def target_of(sighting: Sighting) -> Float[np.ndarray, " part"]:
     """The answer that a search is to reach: that of the recorded images."""
     return np.asarray(_flat(sighting.points))
 
@@ -154,7 +154,7 @@ def objective(sighting: Sighting, batch: int) -> bayes.Objective:
 
     A distance is NaN where the simulation diverges.
     """
-    respond, recorded = responses(sighting, batch), target(sighting)
+    respond, recorded = responses(sighting, batch), target_of(sighting)
 
     def distances(places: Float[np.ndarray, "place dim"]) -> Float[np.ndarray, " place"]:
         return np.sqrt(((respond(places) - recorded) ** 2).mean(axis=1))
@@ -185,7 +185,7 @@ def estimate(
     began = time.perf_counter()
     trials = emulator.minimise(
         responses(sighting, batch),
-        target(sighting),
+        target_of(sighting),
         sighting.space.dim,
         num_calls=num_calls,
         batch=batch,
@@ -194,7 +194,7 @@ def estimate(
         path=path,
         progress=progress,
     )
-    losses = trials.losses(target(sighting))
+    losses = trials.losses(target_of(sighting))
     if not np.isfinite(losses[-1]):
         raise RuntimeError("the simulation of the estimate diverged: narrow the ranges")
     name = f"physnet (emulated answers, {num_calls} simulations)"
