@@ -191,5 +191,8 @@ def energy(mesh: Mesh, fabric: Fabric, x, v):
 
 def directional_difference(function, at, direction, size: float):
     """The central difference of `function` at a tree of arrays along another."""
-    moved = lambda sign: jax.tree.map(lambda a, d: a + sign * size * d, at, direction)
+
+    def moved(sign):
+        return jax.tree.map(lambda a, d: a + sign * size * d, at, direction)
+
     return (function(moved(1)) - function(moved(-1))) / (2 * size)

@@ -115,7 +115,7 @@ def test_a_method_keeps_the_contract_on_the_cloth(recording, name):
     assert "converged: no, the budget ended the search" in describe(found)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="estimates")
 @pytest.mark.parametrize(
     "name, solver",
     [
@@ -131,7 +131,7 @@ def test_other_methods_keep_the_contract(recording, name, solver):
     assert found.approach.startswith(name) and np.isfinite(found.loss) and not found.converged
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="estimates")
 @pytest.mark.parametrize("name", ["physnet", "physnet-published"])
 def test_physnet_trains_its_network_once(recording, name, tmp_path):
     pytest.importorskip("skopt")
@@ -150,7 +150,7 @@ def test_physnet_trains_its_network_once(recording, name, tmp_path):
     assert found.converged is False
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="estimates")
 @pytest.mark.parametrize("name", ["pinn", "pinn-published"])
 def test_the_network_takes_a_stretching(name):
     from r2s.estimation.pinn.synthetic_pulls import pulled

@@ -103,12 +103,18 @@ def test_an_early_camera_is_predicted_as_an_early_recording(recording):
     late = set_time_offset(recording, -0.1)
     nuisance_prior = NuisancePrior(time=0.1)
     place = FAMILY.to_unit(FABRIC)
-    theta = lambda delay: jnp.concatenate([place, jnp.zeros(6), jnp.array([delay])])
+
+    def theta(delay):
+        return jnp.concatenate([place, jnp.zeros(6), jnp.array([delay])])
+
     loss = jax.jit(lambda p, u: loss_of(p, predict(p, u)))
-    whole = lambda r: Problem.make(
-        r, FAMILY, num_points=60, shape=(5, 5), nuisance_prior=nuisance_prior
-    )
-    make = lambda r: window(whole(r), 4, 6)  # the simulation ends where the recording does
+
+    def whole(r):
+        return Problem.make(r, FAMILY, num_points=60, shape=(5, 5), nuisance_prior=nuisance_prior)
+
+    def make(r):
+        return window(whole(r), 4, 6)  # the simulation ends where the recording does
+
     same, shifted = float(loss(make(recording), theta(0.0))), make(late)
     assert float(loss(shifted, theta(-1.0))) == pytest.approx(same, rel=0.02)
     assert float(loss(shifted, theta(0.0))) > 2 * same
@@ -138,7 +144,9 @@ def test_a_marker_that_is_off_in_every_frame_is_one_error(pulled):
     theta = jnp.concatenate([FAMILY.to_unit(FABRIC), jnp.zeros(7)])
     seen, slope = jax.jit(sensitivities)(pulled, theta)
     off = 1e-3 * jr.normal(jr.key(0), pulled.markers.positions.shape[1:])
-    twice = lambda part: jnp.concatenate([part, part])
+
+    def twice(part):
+        return jnp.concatenate([part, part])
 
     def covariance(number, repeat):
         about = Prediction(repeat(seen.x), None, seen.ok), Sensitivity(repeat(slope.x), None)
@@ -174,7 +182,10 @@ def test_the_scatter_of_a_gradient_is_that_of_the_jackknife():
     random = np.random.default_rng(0)
     rows, values = random.normal(size=(6, 4, 2)), random.normal(size=(6, 4))
     whole = np.einsum("cpu,cpv->uv", rows, rows)
-    fit = lambda kept: np.linalg.lstsq(rows[kept].reshape(-1, 2), values[kept].ravel(), None)[0]
+
+    def fit(kept):
+        return np.linalg.lstsq(rows[kept].reshape(-1, 2), values[kept].ravel(), None)[0]
+
     best = fit(np.arange(6))
     scores = np.einsum("cpu,cp->cu", rows, rows @ best - values)
     left = np.stack([fit(np.arange(6) != i) - best for i in range(6)])
@@ -199,7 +210,10 @@ def test_recordings_of_one_fabric_add_up(small):
     both = jnp.concatenate([theta, theta[-5:]])
     one, two = normal_at((small,), theta), normal_at((small, small), both)
     assert two.loss == pytest.approx(float(one.loss), rel=1e-12)
-    same = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6 * np.max(np.abs(b)))
+
+    def same(a, b):
+        return np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6 * np.max(np.abs(b)))
+
     same(two.gradient[:9], one.gradient[:9])
     same(two.matrix[:9, :9], one.matrix[:9, :9])
     same(two.gradient[9:14], one.gradient[9:] / 2)
@@ -235,7 +249,10 @@ def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(small, tmp_path):
     with pytest.raises(Stop):
         descend(small, SMALL, checkpoint=path, progress=stop, key=jr.key(0))
     seen = []
-    count = lambda iteration, loss: seen.append(iteration)
+
+    def count(iteration, loss):
+        return seen.append(iteration)
+
     found = descend(small, SMALL, checkpoint=path, progress=count, key=jr.key(0))
     np.testing.assert_array_equal(found.values, whole.values)
     np.testing.assert_array_equal(found.losses, whole.losses)
@@ -310,15 +327,23 @@ def test_a_beginning_counts_as_a_window_of_the_first_frames_does(kind, request):
     problem = request.getfixturevalue(kind)
     rest, count, size = problem.scenario.scene.mesh.rest, len(problem.frames), 3
     half = count // 2
-    draw = lambda number, *shape: jr.normal(jr.key(number), (count, *shape), float)
+
+    def draw(number, *shape):
+        return jr.normal(jr.key(number), (count, *shape), float)
+
     x = jnp.pad(rest, ((0, 0), (0, 1)))[None] + 0.02 * draw(1, len(rest), 3)
     forces = None if problem.force is None else (draw(2, 3), draw(3, 3, size))
     slope = draw(4, len(rest), 3, size)
 
     def evidence(problem, frames):
-        pick = lambda which: None if forces is None else forces[which][:frames]
+        def pick(which):
+            return None if forces is None else forces[which][:frames]
+
         seen = Prediction(x[:frames], pick(0), jnp.array(True))
-        both = lambda p, *about: (loss_of(p, about[0]), normal_equations_of(p, *about))
+
+        def both(p, *about):
+            return (loss_of(p, about[0]), normal_equations_of(p, *about))
+
         return jax.jit(both)(problem, seen, Sensitivity(slope[:frames], pick(1)))
 
     loss, early = evidence(beginning(problem, half / count), count)
@@ -358,7 +383,9 @@ def test_the_recipe_and_cma_lower_their_losses(small):
 
 @pytest.mark.slow(group="estimates")
 def test_a_loss_that_is_not_finite_at_the_start_is_an_error(small):
-    broken = lambda problem, seen: jnp.nan * jnp.sum(seen.x)
+    def broken(problem, seen):
+        return jnp.nan * jnp.sum(seen.x)
+
     with jax.numpy_dtype_promotion("standard"), pytest.raises(RuntimeError, match="diverged"):
         adam.descend(small, broken, approach="test", epochs=2, rate=0.1)
 
