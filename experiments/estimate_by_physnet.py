@@ -13,9 +13,9 @@ from pathlib import Path
 import jax
 from _common import recordings_in, values_of
 from _tables import Line, command_line, keep
-from r2s.estimation.physnet.method import PhysNetMethod
 
 import r2s
+from r2s.estimation.physnet.method import PhysNetMethod
 
 if __name__ == "__main__":
     parser = command_line(__doc__, "results/physnet.csv")

@@ -12,9 +12,9 @@ from pathlib import Path
 import jax
 from _common import by_fabric, recordings_in, values_of
 from _tables import Line, command_line, keep
-from r2s.estimation.pinn.method import PINN
 
 import r2s
+from r2s.estimation.pinn.method import PINN
 
 if __name__ == "__main__":
     parser = command_line(__doc__, "results/pinn.csv")

@@ -16,9 +16,9 @@ import time
 import jax
 from _common import relative_errors
 from _tables import Line, command_line, resumed
-from r2s.estimation.pinn.method import PINN, PublishedPINN
 
 import r2s
+from r2s.estimation.pinn.method import PINN, PublishedPINN
 from r2s.estimation.pinn.synthetic_pulls import pulled
 from r2s.fabrics import presets
 

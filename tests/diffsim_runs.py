@@ -98,7 +98,10 @@ def scenario_of(made: Made, at_rest: bool = False) -> Scenario:
     With `at_rest` they come after the sheet, which falls from where it starts, was braked for
     `SETTLING` frames.
     """
-    array = lambda value: jnp.asarray(value, float)
+
+    def array(value):
+        return jnp.asarray(value, float)
+
     wind = np.asarray(made.told["wind"]["velocity"], float)
     handles, times = np.array(made.handles), made.times
     handles[0] = made.start[made.held]
