@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import measure
 
 from r2s import scenarios
-from r2s.estimation import diffcloud, gauss_newton
-from r2s.estimation.descent import DEFAULT, Budget
+from r2s.estimation import gauss_newton
+from r2s.estimation.descent import DEFAULT, Budget, descend
 from r2s.estimation.prediction import predict
 from r2s.estimation.problem import Problem
 from r2s.fabrics import presets
@@ -43,7 +43,7 @@ EFFORTS = {
 
 def parts(problem: Problem, points: int, repeats: int) -> list[measure.Row]:
     """Times of one evaluation of each part."""
-    unknown = jnp.full(gauss_newton.size((problem,)), 0.45).at[problem.space.dim :].set(0)
+    unknown = jnp.full(gauss_newton.theta_length((problem,)), 0.45).at[problem.space.dim :].set(0)
     rows = []
     for name, part in PARTS.items():
         call = partial(lambda part: jax.block_until_ready(part(problem, unknown)), part)
@@ -59,7 +59,7 @@ def estimates(problem: Problem, points: int, all_starts: bool) -> list[measure.R
     for name, budget in EFFORTS.items():
         if budget.starts > 3 and not all_starts:
             continue
-        call = partial(diffcloud.estimate, problem, budget, key=jax.random.key(0))
+        call = partial(descend, problem, budget, key=jax.random.key(0))
         first = (
             float("nan") if rows else measure.built(call)[1]
         )  # the others share what it compiled

@@ -86,7 +86,9 @@ def _problem():
     from r2s.estimation.pinn.pulls import Clamp, Pull, stacked
     from r2s.fabrics.parameters import OrthotropicSpace
 
-    array = lambda value: jnp.asarray(value, float)
+    def array(value):
+        return jnp.asarray(value, float)
+
     keys = jr.split(jr.key(0), 3)
     zero = jnp.zeros((FRAMES, 2), float)
     clamp = Clamp(zero, zero, zero)
@@ -140,16 +142,22 @@ def epochs(torch_python: str | None) -> list[dict]:
         state = optimiser.init(weights)
         return lambda: jax.block_until_ready(run(weights, state, pulls))
 
-    each = lambda call: {name: s / TOGETHER for name, s in timed(call).items()}
+    def each(call):
+        return {name: s / TOGETHER for name, s in timed(call).items()}
+
     rows = [{"epoch": "forward jets", **each(epochs_of(published_recipe.losses))}]
-    nested = lambda model, space, pulls: _nested_losses(jax, jnp, model, space, pulls)
+
+    def nested(model, space, pulls):
+        return _nested_losses(jax, jnp, model, space, pulls)
+
     rows.append({"epoch": "nested reverse, JAX", **each(epochs_of(nested))})
     state = published_recipe.untouched(model)
 
     def of_the_paper():
         nonlocal model, state
-        about = model, state, space, pulls, jnp.asarray(0), TOGETHER
-        model, state, values = published_recipe.run(*about)
+        model, state, values = published_recipe.run(
+            model, state, space, pulls, jnp.asarray(0), TOGETHER
+        )
         jax.block_until_ready(values)
 
     of_the_paper()
@@ -168,7 +176,9 @@ def _nested_losses(jax, jnp, model, space, pulls):
     number, markers, _ = pull.displacement.shape
     times = jnp.repeat(pull.times, markers)[:, None]
     points = jnp.concatenate([jnp.tile(pull.places, (number, 1)), times], axis=1)
-    displacement = lambda point: network(point[None])[0]
+
+    def displacement(point):
+        return network(point[None])[0]
 
     def stresses(point):
         (xx, xy, _), (yx, yy, _) = jax.jacrev(displacement)(point)
@@ -177,7 +187,10 @@ def _nested_losses(jax, jnp, model, space, pulls):
 
     def residual(point):
         by = jax.jacrev(stresses)(point)
-        speed = lambda point: jax.jacrev(displacement)(point)[:, 2]
+
+        def speed(point):
+            return jax.jacrev(displacement)(point)[:, 2]
+
         force = jnp.stack([by[0, 0] + by[2, 1], by[2, 0] + by[1, 1]])
         return force - fabric.density * jax.jacrev(speed)(point)[:, 2]
 

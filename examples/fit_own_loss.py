@@ -36,7 +36,9 @@ def fabric_place(bending):
 
 @eqx.filter_jit
 def improve(bending, state, seen):
-    loss = lambda bending: ((droop(fabric_place(bending)) - seen) * 1e3) ** 2  # [mm^2]
+    def loss(bending):
+        return ((droop(fabric_place(bending)) - seen) * 1e3) ** 2  # [mm^2]
+
     value, slope = jax.value_and_grad(loss)(bending)
     change, state = optimiser.update(slope, state)
     return optax.apply_updates(bending, change), state, value
@@ -50,6 +52,9 @@ if __name__ == "__main__":
     state = optimiser.init(bending)
     for _ in range(40):
         bending, state, value = improve(bending, state, seen)
-    stiffness = lambda place: float(space(fabric_place(place)).bending.stiffness)
+
+    def stiffness(place):
+        return float(space(fabric_place(place)).bending.stiffness)
+
     print(f"droop {1e3 * seen:.2f} mm, off by {value**0.5:.3f} mm")
     print(f"bending stiffness {stiffness(bending):.3g} N m, truth {stiffness(truth):.3g} N m")

@@ -29,7 +29,10 @@ def write_disc(path: Path, radius: float = 0.15, rings: int = 5) -> None:
         inner, outer = 1 + 3 * ring * (ring - 1) - 6 * (ring - 1), 1 + 3 * ring * (ring - 1)
         for i in range(6 * ring):
             side, place = divmod(i, ring)
-            near = lambda k, r=ring, a=inner: 0 if r == 1 else a + k % (6 * (r - 1))
+
+            def near(k, r=ring, a=inner):
+                return 0 if r == 1 else a + k % (6 * (r - 1))
+
             here, there = outer + i, outer + (i + 1) % (6 * ring)
             faces.append((near(side * (ring - 1) + place), here, there))
             if place:

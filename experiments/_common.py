@@ -49,7 +49,7 @@ def synthetic_problem(
     return truth, space, Problem.make(recording, space, seed=seed)
 
 
-def relative_errors(space: ParameterSpace, truth: Fabric, values: Sequence[float]) -> np.ndarray:
+def relative_errors(space: ParameterSpace, truth: Fabric, values: np.ndarray) -> np.ndarray:
     """Errors of parameters: relative where the range is logarithmic, else absolute."""
     true = np.asarray(space.values(space.to_unit(truth)))
     logarithmic = np.array([bound.log for bound in space.ranges])

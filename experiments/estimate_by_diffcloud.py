@@ -12,9 +12,9 @@ from pathlib import Path
 import jax
 from _common import by_fabric, recordings_in, values_of
 from _tables import Line, command_line, keep
-from r2s.estimation.registry import METHODS
 
 import r2s
+from r2s.estimation.diffcloud import DiffCloud
 
 if __name__ == "__main__":
     parser = command_line(__doc__, "results/diffcloud.csv")
@@ -25,7 +25,7 @@ if __name__ == "__main__":
     space, key = r2s.OrthotropicSpace.make(a.density), jax.random.key(0)
     lines: list[Line] = []
     for fabric, recordings in by_fabric(recordings_in(a.recordings, a.scenario)).items():
-        method = METHODS["diffcloud"](checkpoint=a.out.with_name(f"{fabric}.diffcloud.npz"))
+        method = DiffCloud(checkpoint=a.out.with_name(f"{fabric}.diffcloud.npz"))
         found = method.estimate(recordings, space, key=key)
         lines.append({"fabric": fabric} | values_of(found))
         keep(a.out, lines, f"Estimates by DIFFCLOUD from {a.scenario}, with standard errors.")

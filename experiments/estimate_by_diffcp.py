@@ -12,9 +12,9 @@ from pathlib import Path
 import jax
 from _common import by_fabric, recordings_in, values_of
 from _tables import Line, command_line, keep
-from r2s.estimation.registry import METHODS
 
 import r2s
+from r2s.estimation.diffcp import DiffCP
 
 SHAPE = (7, 7)  # vertices of the sheet
 
@@ -28,7 +28,7 @@ if __name__ == "__main__":
     lines: list[Line] = []
     for fabric, recordings in by_fabric(recordings_in(a.recordings, a.scenario)).items():
         checkpoint = a.out.with_name(f"{fabric}.diffcp.npz")
-        method = METHODS["diffcp"](shape=SHAPE, checkpoint=checkpoint)
+        method = DiffCP(shape=SHAPE, checkpoint=checkpoint)
         found = method.estimate(recordings, space, key=key)
         lines.append({"fabric": fabric} | values_of(found))
         keep(a.out, lines, f"Estimates by DiffCP from {a.scenario}, with standard errors.")

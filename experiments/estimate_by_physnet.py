@@ -13,9 +13,9 @@ from pathlib import Path
 import jax
 from _common import recordings_in, values_of
 from _tables import Line, command_line, keep
-from r2s.estimation.registry import METHODS
 
 import r2s
+from r2s.estimation.physnet.method import PhysNetMethod
 
 if __name__ == "__main__":
     parser = command_line(__doc__, "results/physnet.csv")
@@ -25,7 +25,7 @@ if __name__ == "__main__":
     parser.add_argument("--seed", type=int, default=0)
     a = parser.parse_args()
     space, key = r2s.OrthotropicSpace.make(a.density), jax.random.key(a.seed)
-    method = METHODS["physnet"](network=a.out.with_name(f"{a.scenario}.network"))
+    method = PhysNetMethod(network=a.out.with_name(f"{a.scenario}.network"))
     lines: list[Line] = []
     for recording in recordings_in(a.recordings, a.scenario):
         found = method.estimate([recording], space, key=key)

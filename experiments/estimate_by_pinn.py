@@ -12,9 +12,9 @@ from pathlib import Path
 import jax
 from _common import by_fabric, recordings_in, values_of
 from _tables import Line, command_line, keep
-from r2s.estimation.registry import METHODS
 
 import r2s
+from r2s.estimation.pinn.method import PINN
 
 if __name__ == "__main__":
     parser = command_line(__doc__, "results/pinn.csv")
@@ -23,7 +23,7 @@ if __name__ == "__main__":
     parser.add_argument("--angles", type=float, nargs="*", default=[0.0])
     a = parser.parse_args()
     space, key = r2s.OrthotropicSpace.make(a.density), jax.random.key(0)
-    method = METHODS["pinn"](angles=tuple(a.angles))
+    method = PINN(angles=tuple(a.angles))
     lines: list[Line] = []
     for fabric, recordings in by_fabric(recordings_in(a.recordings, "stretching")).items():
         found = method.estimate(recordings, space, key=key)

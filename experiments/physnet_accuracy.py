@@ -12,7 +12,7 @@ of the nearest of as many simulations at random. What lies in OUT is not made ag
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _tables import command_line, keep
+from _tables import Line, command_line, keep
 
 from r2s.estimation.physnet import dataset, estimator, preprocess, training, triplets
 from r2s.estimation.physnet.dataset import Settings
@@ -52,9 +52,8 @@ if __name__ == "__main__":
         drawn = jax.random.uniform(key, (a.calls, space.dim), float)
         away = estimator.objective(sighting, a.calls)(np.asarray(drawn))
         by_chance.append(np.abs(np.asarray(drawn)[np.nanargmin(away)] - place))
-    names = [bound.name for bound in space.ranges]
-    medians = np.median(errors, axis=0), np.median(by_chance, axis=0)
-    columns = [[f"{number:.2f}" for number in each] for each in medians]
-    header = "parameter", "median error", "of random search"
-    lines = [dict(zip(header, each, strict=True)) for each in zip(names, *columns, strict=True)]
+    lines: list[Line] = [{"parameter": bound.name} for bound in space.ranges]
+    for header, found in (("median error", errors), ("of random search", by_chance)):
+        for line, value in zip(lines, np.median(found, axis=0), strict=True):
+            line[header] = f"{value:.2f}"
     keep(a.out / "errors.csv", lines, f"{right:.1%} of triplets are ordered rightly.")

@@ -16,12 +16,13 @@ import time
 import jax
 from _common import relative_errors
 from _tables import Line, command_line, resumed
-from r2s.estimation.registry import METHODS
 
 import r2s
+from r2s.estimation.pinn.method import PINN, PublishedPINN
 from r2s.estimation.pinn.synthetic_pulls import pulled
 from r2s.fabrics import presets
 
+METHODS = {"pinn": PINN, "pinn-published": PublishedPINN}
 ANGLES = (0.0, 90.0, 45.0)  # [degrees], from the pull to the warp
 SHAPE = (33, 33)  # vertices of the sheet that is pulled
 
@@ -47,9 +48,11 @@ if __name__ == "__main__":
     parser = command_line(__doc__, "results/pinn_recipes.csv")
     parser.add_argument("--fabrics", nargs="*", default=list(presets.FIVE), choices=presets.FIVE)
     parser.add_argument("--pulls", default="3", choices=("1", "2", "3"))
-    parser.add_argument("--methods", nargs="*", default=["pinn"])
+    parser.add_argument("--methods", nargs="*", default=["pinn"], choices=METHODS)
     parser.add_argument("--seeds", type=int, default=1)
     a = parser.parse_args()
     every = itertools.product(a.fabrics, [a.pulls], a.methods, map(str, range(a.seeds)))
-    jobs = [dict(zip(("fabric", "pulls", "method", "seed"), each, strict=True)) for each in every]
+    jobs: list[Line] = [
+        dict(zip(("fabric", "pulls", "method", "seed"), each, strict=True)) for each in every
+    ]
     resumed(a.out, "Errors of estimates from stretchings (standard errors).", jobs, estimated)

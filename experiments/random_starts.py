@@ -52,5 +52,5 @@ if __name__ == "__main__":
     a = parser.parse_args()
     every = itertools.product([a.scenario], a.fabrics, a.methods, map(str, range(a.starts)))
     names = "scenario", "fabric", "method", "seed"
-    jobs = [dict(zip(names, each, strict=True)) for each in every]
+    jobs: list[Line] = [dict(zip(names, each, strict=True)) for each in every]
     resumed(a.out, "Estimates from random starts.", jobs, attempt)

@@ -12,10 +12,10 @@ import jax
 import numpy as np
 from _common import frames_of, recorded_points, recordings_in, simulated_points
 from _tables import Line, command_line, keep
-from r2s.estimation.registry import METHODS
 from scipy.spatial import KDTree
 
 import r2s
+from r2s.estimation.diffcloud import DiffCloud
 from r2s.evaluation import placement
 
 
@@ -43,7 +43,7 @@ if __name__ == "__main__":
     a = parser.parse_args()
     space, key = r2s.OrthotropicSpace.make(a.density), jax.random.key(0)
     lifts, folds = (recordings_in(a.recordings, name) for name in ("lift", "fold"))
-    estimates = [METHODS["diffcloud"]().estimate([lift], space, key=key) for lift in lifts]
+    estimates = [DiffCloud().estimate([lift], space, key=key) for lift in lifts]
     lines: list[Line] = []
     for fold in folds:
         name, trial, frames = fold.info.fabric, fold.info.trial, frames_of(fold)

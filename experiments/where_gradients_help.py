@@ -16,14 +16,11 @@ import numpy as np
 from _tables import Line, command_line, keep
 
 import r2s
-from r2s import scenarios
 from r2s.estimation import gauss_newton
-from r2s.estimation.problem import Problem
-from r2s.fabrics import presets
-from r2s.scenarios import synthetic
 
 COLUMNS = "damped by", "width", "rise [mm^2]", "rough / rise", "(exact - fit) / mean slope"
-loss_at, normal_at = map(eqx.filter_jit, (gauss_newton.loss_at, gauss_newton.normal_at))
+loss_at = eqx.filter_jit(gauss_newton.loss_at)
+normal_at = eqx.filter_jit(gauss_newton.normal_at)
 
 
 def in_vacuum(scenario: r2s.Scenario, fabric: object = None) -> r2s.Cloth:
@@ -32,7 +29,7 @@ def in_vacuum(scenario: r2s.Scenario, fabric: object = None) -> r2s.Cloth:
     return r2s.Cloth.make(vacuum, scenario.interval / (4 * scenario.substeps))
 
 
-def line(problem: Problem, truth: np.ndarray, width: float, damped: str) -> Line:
+def line(problem: r2s.Problem, truth: np.ndarray, width: float, damped: str) -> Line:
     """Sample the loss [m^2] along the first parameter, and compare its slopes at the truth."""
     offsets, axis = width * np.linspace(-0.5, 0.5, 41), np.eye(len(truth))[0]
     losses = [float(loss_at((problem,), jnp.asarray(truth + o * axis, float))) for o in offsets]
@@ -45,15 +42,15 @@ def line(problem: Problem, truth: np.ndarray, width: float, damped: str) -> Line
 
 if __name__ == "__main__":
     parser = command_line(__doc__, "results/where_gradients_help.csv")
-    parser.add_argument("--fabric", default="grey_interlock", choices=presets.FIVE)
+    parser.add_argument("--fabric", default="grey_interlock", choices=r2s.presets.FIVE)
     a = parser.parse_args()
-    lines, fabric = [], presets.FIVE[a.fabric]()
-    lift, space = scenarios.lifting(), r2s.OrthotropicSpace.make(float(fabric.density))
+    lines, fabric = [], r2s.presets.FIVE[a.fabric]()
+    lift, space = r2s.lifting(), r2s.OrthotropicSpace.make(float(fabric.density))
     for damped, factory in (("fabric and air", None), ("nothing", in_vacuum)):
         if factory is not None:
             fabric = dataclasses.replace(fabric, damping=jnp.asarray(1e-9, float))
-        seen = synthetic.record(lift, fabric, a.fabric, solver=factory, key=jax.random.key(0))
-        problem = Problem.make(seen, space, num_points=100)
+        seen = r2s.record(lift, fabric, a.fabric, solver=factory, key=jax.random.key(0))
+        problem = r2s.Problem.make(seen, space, num_points=100)
         problem = dataclasses.replace(problem, solver=factory and factory(problem.scenario))
         truth = np.pad(space.to_unit(fabric), (0, len(problem.nuisance_prior.scales)))
         lines += [line(problem, truth, width, damped) for width in (0.5, 0.05, 0.005, 5e-4)]

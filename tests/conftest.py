@@ -34,9 +34,8 @@ from r2s.world.scene import Control, Scene
 # Of the tests that take minutes: each group takes less than twenty on two cores.
 SLOW_GROUPS = ("cloth", "points", "motions", "estimates", "pinn", "physnet", "study", "documents")
 MOST_MEMORY = 1000  # [MB]: a process that holds more lets its compiled programs go
-gc.set_threshold(
-    100_000, 50, 100
-)  # tracing makes many objects that live: a quarter was their count
+# Tracing makes many objects that stay: to count them again and again took a quarter of its time.
+gc.set_threshold(100_000, 50, 100)
 
 jax.config.update("jax_enable_x64", True)
 hypothesis.settings.register_profile("r2s", deadline=None)  # a first example compiles
@@ -192,5 +191,8 @@ def energy(mesh: Mesh, fabric: Fabric, x, v):
 
 def directional_difference(function, at, direction, size: float):
     """The central difference of `function` at a tree of arrays along another."""
-    moved = lambda sign: jax.tree.map(lambda a, d: a + sign * size * d, at, direction)
+
+    def moved(sign):
+        return jax.tree.map(lambda a, d: a + sign * size * d, at, direction)
+
     return (function(moved(1)) - function(moved(-1))) / (2 * size)

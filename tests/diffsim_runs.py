@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from r2s.cloth.linear.elimination import Elimination
-from r2s.estimation import diffcloud
-from r2s.estimation.descent import Budget
+from r2s.estimation.descent import Budget, descend
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.problem import Clouds, NuisancePrior, Problem
 from r2s.fabrics.fabric import Fabric
@@ -99,7 +98,10 @@ def scenario_of(made: Made, at_rest: bool = False) -> Scenario:
     With `at_rest` they come after the sheet, which falls from where it starts, was braked for
     `SETTLING` frames.
     """
-    array = lambda value: jnp.asarray(value, float)
+
+    def array(value):
+        return jnp.asarray(value, float)
+
     wind = np.asarray(made.told["wind"]["velocity"], float)
     handles, times = np.array(made.handles), made.times
     handles[0] = made.start[made.held]
@@ -187,4 +189,4 @@ def estimated(fabric: str, number: int, budget: Budget) -> Estimate:
         clouds = sampled(truth(made, at_rest), made.mesh, number, key)
         scenario, frames = scenario_of(made, at_rest), tuple(range(COUNT))
         problems.append(Problem(scenario, space, frames, clouds, nuisance_prior=EXACT))
-    return diffcloud.estimate(tuple(problems), budget, key=jax.random.key(1))
+    return descend(tuple(problems), budget, key=jax.random.key(1))

@@ -77,14 +77,10 @@ def test_settles_in_seven_dimensions():
 
 def test_refuses_a_history_of_another_search(tmp_path):
     bayes.minimise(bowl, 3, num_calls=4, batch=2, num_first=8, seed=0, path=tmp_path / "h.npz")
-    with pytest.raises(ValueError, match=r"h\.npz: is of a search with .*'seed': 0"):
+    with pytest.raises(ValueError, match=r"h\.npz is of another run .seed 0 there, 1 asked"):
         bayes.minimise(bowl, 3, num_calls=4, batch=2, num_first=8, seed=1, path=tmp_path / "h.npz")
-    np.savez(tmp_path / "h.npz", places=[[0.5]], losses=[1.0], dim=3, batch=2, num_first=8, seed=0,
-             format="r2s-search/1")  # fmt: skip
-    with pytest.raises(ValueError, match=r"h\.npz: expected format r2s-search/2, found .*/1"):
-        bayes.minimise(bowl, 3, num_calls=4, batch=2, num_first=8, seed=0, path=tmp_path / "h.npz")
     (tmp_path / "h.npz").write_bytes(b"no archive")
-    with pytest.raises(ValueError, match=r"h\.npz: no history of a search"):
+    with pytest.raises(ValueError, match=r"h\.npz is no checkpoint"):
         bayes.minimise(bowl, 3, num_calls=4, batch=2, num_first=8, seed=0, path=tmp_path / "h.npz")
 
 

@@ -51,6 +51,7 @@ def estimate_at(place, deviations, loss=1e-6) -> Estimate:
         losses=np.ones((3, 2)),
         history=np.ones((3, 2, dim)),
         seconds=1.5,
+        converged=True,
     )
 
 
@@ -148,7 +149,7 @@ def test_what_is_not_determined_is_on_the_card_with_units():
     found = estimate_at([0.5] * 7, [0.2, 0.2, 0.01, 0.01, np.nan, 1.0, 0.01], loss=float("nan"))
     stored = cards.as_json(Card.make("denim", found, MEASURED))["estimate"]
     warp, bending = stored["parameters"]["warp"], stored["parameters"]["bending"]
-    assert warp["unit"] == "N/m" and not warp["determined"] and bending["deviation"] is None
+    assert warp["unit"] == "N/m" and not warp["identifiable"] and bending["standard_error"] is None
     assert stored["combinations"][0]["exponents"].keys() == {"warp", "weft"}
     assert stored["loss"] is None and "history" not in stored
 
@@ -179,7 +180,7 @@ WRONG = {
     "another format": (
         ("format",),
         "r2s-card/9",
-        r"format must be 'r2s-card/1', found 'r2s-card/9'",
+        r"format must be 'r2s-card/2', found 'r2s-card/9'",
     ),
     "no fabric": (("fabric",), ..., r"missing: fabric"),
     "no density": (("fabric", "density"), ..., r"fabric: missing: density"),
@@ -192,7 +193,7 @@ WRONG = {
     "other key": (("fabric", "colour"), "grey", r"fabric: unknown: colour; known: density"),
     "no method": (("provenance", "method"), ..., r"provenance: missing: method"),
     "assumed": (("provenance", "assumed"), ["hue"], r"assumed: expected some of bending"),
-    "half an estimate": (("estimate",), {"format": "r2s-estimate/2"}, r"estimate: missing: param"),
+    "half an estimate": (("estimate",), {"format": "r2s-estimate/3"}, r"estimate: missing: param"),
 }
 
 

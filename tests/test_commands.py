@@ -216,8 +216,8 @@ STORM = ["--motion", "speed=1e200", "num_frames=2", "--shape", "3", "3"]  # its 
     "command",
     [
         ["simulate", "--out"],
-        pytest.param(["doctor"], marks=pytest.mark.slow),
-        pytest.param(["check-grad"], marks=pytest.mark.slow),
+        pytest.param(["doctor"], marks=pytest.mark.slow(group="documents")),
+        pytest.param(["check-grad"], marks=pytest.mark.slow(group="documents")),
     ],
     ids=["simulate", "doctor", "check-grad"],
 )

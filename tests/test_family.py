@@ -14,7 +14,7 @@ from r2s.fabrics.presets import FIVE
 few = settings(max_examples=25, deadline=None)
 FAMILY = OrthotropicSpace.make(0.2)
 places = st.tuples(*[st.floats(0, 1)] * FAMILY.dim).map(np.array)
-there_and_back = jax.jit(lambda u: FAMILY.locate(FAMILY(u)))
+there_and_back = jax.jit(lambda u: FAMILY.to_unit(FAMILY(u)))
 
 
 @given(places)
@@ -27,7 +27,7 @@ def test_a_fabric_is_located_where_it_came_from(place):
 def test_locating_a_fabric_and_going_there_gives_it_back(name):
     fabric = FIVE[name]()
     space = OrthotropicSpace.make(float(fabric.density), float(fabric.thickness))
-    again = space(space.locate(fabric))
+    again = space(space.to_unit(fabric))
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(fabric), strict=True):
         assert a == pytest.approx(float(b), rel=1e-9)
 
@@ -56,8 +56,8 @@ def test_mass_damping_is_a_parameter_when_asked_for():
     space = OrthotropicSpace.make(0.17, mass_damping=MASS_DAMPING)
     place = jnp.linspace(0.1, 0.8, 8)
     assert space.dim == FAMILY.dim + 1
-    assert space(place).mass_damping == pytest.approx(float(MASS_DAMPING.value(place[-1])))
-    assert np.asarray(space.locate(space(place))) == pytest.approx(np.asarray(place), abs=1e-9)
+    assert space(place).mass_damping == pytest.approx(float(MASS_DAMPING.from_unit(place[-1])))
+    assert np.asarray(space.to_unit(space(place))) == pytest.approx(np.asarray(place), abs=1e-9)
     assert FAMILY(place[:-1]).mass_damping == 0
 
 
@@ -72,8 +72,8 @@ def test_the_middle_is_the_geometric_one():
 @few
 def test_value_and_place_of_a_range_are_inverse(low, ratio, place, is_log):
     bound = Range("any", "-", low, low * ratio, is_log)
-    value = bound.value(jnp.array(place))
-    assert bound.place(value) == pytest.approx(place, abs=1e-9)
+    value = bound.from_unit(jnp.array(place))
+    assert bound.to_unit(value) == pytest.approx(place, abs=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -106,7 +106,10 @@ WHERE = {  # what to differ, and by how much [in its unit]
 @pytest.mark.parametrize("name", WHERE)
 def test_the_gradient_agrees_with_differences(name, value_and_grad, gradient, inputs):
     where, size = WHERE[name]
-    value = lambda part: value_and_grad(eqx.tree_at(where, inputs, part))[0][0]
+
+    def value(part):
+        return value_and_grad(eqx.tree_at(where, inputs, part))[0][0]
+
     direction = jax.random.normal(jax.random.key(2), where(inputs).shape)
     expected = directional_difference(value, where(inputs), direction, size)
     found = jnp.sum(where(gradient) * direction)
@@ -144,7 +147,10 @@ def hung(sheet, fabric):
 def test_without_contact_the_gradient_agrees_more_closely(name, hung):
     value_and_grad, inputs = hung
     where, size = WHERE[name]
-    value = lambda part: value_and_grad(eqx.tree_at(where, inputs, part))[0]
+
+    def value(part):
+        return value_and_grad(eqx.tree_at(where, inputs, part))[0]
+
     direction = jax.random.normal(jax.random.key(2), where(inputs).shape)
     expected = directional_difference(value, where(inputs), direction, size)
     found = jnp.sum(where(value_and_grad(inputs)[1]) * direction)

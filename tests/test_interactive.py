@@ -81,7 +81,10 @@ def test_the_error_is_the_distance_to_dense_samples_of_the_sheet(recording, subj
 
 def test_the_true_fabric_is_nearest_and_a_softer_one_hangs_lower(subject):
     truth = subjects.place(subject, presets.grey_interlock())
-    at = lambda u: subjects.move(subject, u)
+
+    def at(u):
+        return subjects.move(subject, u)
+
     softer = at(truth.at[0].set(0.0))
     assert subjects.error_used(subject, at(truth)) < subjects.error_used(subject, softer)
     assert softer.x[-1, :, 2].min() <= at(truth).x[-1, :, 2].min() + 1e-4

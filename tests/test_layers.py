@@ -242,7 +242,10 @@ def test_the_gradient_through_a_collision_agrees_with_differences():
         ("thickness", lambda i: i[0].thickness, 1e-8),
         ("c11", lambda i: i[0].membrane.c11, 1e-2),
     ):
-        value = lambda part, where=where: both(eqx.tree_at(where, inputs, part))[0][0]
+
+        def value(part, where=where):
+            return both(eqx.tree_at(where, inputs, part))[0][0]
+
         direction = jax.random.normal(jax.random.key(2), where(inputs).shape)
         expected = directional_difference(value, where(inputs), direction, size)
         found = jnp.sum(where(gradient) * direction)

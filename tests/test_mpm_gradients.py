@@ -64,7 +64,10 @@ def block(request):
         jnp.linspace(0, 1, BLOCK_STEPS)[:, None, None]
         * jnp.array([[[0.03, 0.01, 0.02]]])[..., axes]
     )
-    number = lambda value: jnp.asarray(value, float)
+
+    def number(value):
+        return jnp.asarray(value, float)
+
     inputs = BlockInputs(
         young=number(2e4),
         poisson=number(0.3),
@@ -83,7 +86,9 @@ def block(request):
         start = fixed.init(inputs.x, inputs.v)
         return simulate(fixed, _solid(inputs), start, controls).x
 
-    loss = lambda inputs: jnp.sum(weights * run(inputs)[-1])
+    def loss(inputs):
+        return jnp.sum(weights * run(inputs)[-1])
+
     return jax.jit(jax.value_and_grad(loss)), inputs, loss, fixed
 
 
@@ -100,7 +105,10 @@ def test_the_gradient_of_a_block_agrees_with_differences(name, block):
 
 def _agrees(value_and_grad, inputs, where, size):
     direction = jax.random.normal(jax.random.key(2), where(inputs).shape)
-    value = lambda part: value_and_grad(eqx.tree_at(where, inputs, part))[0]
+
+    def value(part):
+        return value_and_grad(eqx.tree_at(where, inputs, part))[0]
+
     expected = directional_difference(value, where(inputs), direction, size)
     found = jnp.sum(where(value_and_grad(inputs)[1]) * direction)
     assert found == pytest.approx(float(expected), rel=1e-5)
@@ -226,7 +234,10 @@ def test_difftaichi_is_repeated_with_its_gradients(name, law):
         walls=int(data["bound"]),
         mass_floor=1e-10,
     )
-    number = lambda value: jnp.asarray(value, float)
+
+    def number(value):
+        return jnp.asarray(value, float)
+
     volume, target = jnp.full(count, float(data["p_vol"])), number(data["target"])
     material = Solid.make(law(mu=number(data["mu"]), lam=number(data["la"])), float(data["p_mass"]))
     solver = Block.make(background, volume, material, float(data["dt"]))

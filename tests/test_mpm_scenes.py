@@ -69,7 +69,10 @@ MOTIONS = {  # held vertices, their displacement [m] and the wind [m/s] at a tim
 def controls_of(x, held, path, wind, substeps):
     times = jnp.arange(1, FRAMES * substeps + 1).astype(float).reshape(FRAMES, substeps)
     times = times * INTERVAL / substeps
-    each = lambda of: jax.vmap(jax.vmap(of))(times)
+
+    def each(of):
+        return jax.vmap(jax.vmap(of))(times)
+
     return r2s.Control(x[held][None, None] + each(path), each(wind))
 
 
@@ -116,12 +119,20 @@ def test_gradients_of_a_lifted_block_are_finite_in_single_precision(young, poiss
         x, volume = layered(mesh, flat, spacing, layers=3)
         grid = Grid.covering((-0.3, -0.3, 0.0), (0.8, 0.8, 0.7), spacing)
         background = Background.make(grid, Table.make(0.0))
-        solid = lambda young, poisson: Solid.make(FixedCorotated.make(young, poisson), 200.0)
+
+        def solid(young, poisson):
+            return Solid.make(FixedCorotated.make(young, poisson), 200.0)
+
         substeps = math.ceil(INTERVAL / float(block.stable_step(background, solid(young, poisson))))
         solver = Block.make(background, volume, solid(young, poisson), INTERVAL / substeps)
         solver = solver.gripped(x, flat[:1], 1.2 * spacing)
-        path = lambda t: along(0.1, 0.1, 0.3) * ease(t / 3)
-        still = lambda t: jnp.zeros(3)
+
+        def path(t):
+            return along(0.1, 0.1, 0.3) * ease(t / 3)
+
+        def still(t):
+            return jnp.zeros(3)
+
         controls = controls_of(flat, jnp.array([0]), path, still, substeps)
 
         def loss(young, poisson):

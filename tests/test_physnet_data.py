@@ -82,17 +82,11 @@ def test_ranges_are_those_of_the_family_unless_given():
     assert float(narrow.space.values(jnp.ones(2))[0]) == pytest.approx(20)
 
 
-def distances(sighting, places):
-    """The rms distance on the map between the recorded frames and those of each fabric."""
-    away = estimator.responses(sighting, 4)(np.asarray(places)) - estimator.target(sighting)
-    return np.sqrt((away**2).mean(axis=1))
-
-
 def test_the_distance_is_least_at_the_fabric_that_was_seen(sighting, folder):
     truth = jnp.asarray(dataset.load(folder).places[0])
     rough, soft = truth.at[6].set(1 - truth[6]), truth.at[2].set(1 - truth[2])
     places = jnp.stack([truth, rough, soft, jnp.full_like(truth, jnp.nan)])
-    found = distances(sighting, places)
+    found = estimator.objective(sighting, 4)(np.asarray(places))
     assert 10 * float(found[0]) < min(float(found[1]), float(found[2]))  # the files round depths
     assert np.isnan(found[3])
 
@@ -104,8 +98,9 @@ def test_an_estimate_goes_on_and_is_the_last_of_what_was_tried(sighting, tmp_pat
     assert first.loss == first.losses[-1] and first.losses.shape == (12, 1)
     again = estimator.estimate(sighting, num_calls=12, path=path)
     np.testing.assert_array_equal(first.history, again.history)
-    place = TINY.space.locate(first.fabric)
-    np.testing.assert_allclose(distances(sighting, place[None])[0], first.loss, rtol=1e-3)
+    place = TINY.space.to_unit(first.fabric)
+    loss = estimator.objective(sighting, 4)(np.asarray(place)[None])[0]
+    np.testing.assert_allclose(loss, first.loss, rtol=1e-3)
     assert not first.identifiable.any()
 
 

@@ -202,7 +202,7 @@ def fabric_of(space, pull, tolerance=1e-3, steps=60):
     return found.parameters[-space.dim :]
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="pinn")
 @pytest.mark.parametrize("name", FAMILIES)
 def test_the_network_alone_finds_the_fabric_of_an_exact_field(name):
     """All stiffnesses to 1 %, from the middle of their ranges; where descents are 10 % off."""

@@ -11,13 +11,16 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from r2s.estimation.estimate import without_standard_errors
+from r2s.estimation.diffcloud import DiffCloud
+from r2s.estimation.estimate import point_estimate
 from r2s.evaluation import prediction_error
 from r2s.fabrics import presets
 from r2s.fabrics.arcsim import write_material
+from r2s.failures import Failure
 from r2s.recordings.recording import cloud
 from r2s.scenarios import synthetic
 from r2s.scenarios.six import SIX
+from r2s.solver import Trajectory
 from r2s.study import engine, estimates, matrix, results
 from r2s.study.cells import dependencies, read_metadata, with_dependencies
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
@@ -73,6 +76,21 @@ def test_a_diverged_motion_is_a_result(fold):
     whole = prediction_error.against_recording(fold, fold)
     assert found.keys() == whole.keys()
     assert all(np.isnan(value) for value in found.values())
+
+
+def test_a_run_that_fails_is_lost_from_there_on_and_says_why(monkeypatch):
+    failed = Trajectory(
+        x=jnp.zeros((3, 9, 3)),
+        ok=jnp.array([True, False, True]),
+        failure=jnp.array(Failure.NON_FINITE.value),
+        failed_frame=jnp.array(1),
+        failed_step=jnp.array(2),
+    )
+    monkeypatch.setattr(prediction_error, "_rollout", lambda *_, **__: failed)
+    scenario = SIX["fling"]().scenario((3, 3))
+    moved = prediction_error.predict_motion(scenario, presets.grey_interlock())
+    assert np.isfinite(moved.x).all(axis=(1, 2)).tolist() == [True, False, False]
+    assert "frame 1, step 2" in moved.failure
 
 
 def test_the_cropped_distance_leaves_out_what_the_recording_cannot_show(fold):
@@ -158,14 +176,14 @@ def tiny(monkeypatch):
     """One configuration and fabric, whose estimate is the middle of the space, without work."""
     made = []
 
-    def fake(cell, space, recordings, folder):
-        made.append(cell)
+    def fake(method, recordings, space, budget, key):
+        made.append(method)
         middle = jnp.full(space.dim, 0.5)
         values = np.asarray(space.values(middle))
-        about = 1e-4, np.full((1, 1), 1e-4), values[None, None], 0.1
-        return without_standard_errors("fake", space, middle, *about)
+        losses = np.full((1, 1), 1e-4)
+        return point_estimate("fake", space, middle, 1e-4, losses, values[None, None], 0.1)
 
-    monkeypatch.setitem(estimates._ESTIMATORS, "diffcloud", fake)
+    monkeypatch.setattr(DiffCloud, "_estimate", fake)
     plan = matrix.Plan(
         (Configuration("diffcloud", "cloth", "lifting"),),
         ("grey_interlock",),
@@ -202,10 +220,10 @@ def test_an_estimate_is_made_once_and_judged(tiny, tmp_path):
 def test_an_estimate_that_diverges_is_a_result(tiny, tmp_path, monkeypatch):
     cells, _ = tiny
 
-    def explode(cell, space, recordings, folder):
+    def explode(method, recordings, space, budget, key):
         raise RuntimeError("every simulation diverged")
 
-    monkeypatch.setitem(estimates._ESTIMATORS, "diffcloud", explode)
+    monkeypatch.setattr(DiffCloud, "_estimate", explode)
     assert engine.run(cells, tmp_path, engine.Serial()) == {}
     assert all(np.isnan(row.value) for row in results.rows(cells, tmp_path))
     reasons = read_metadata(cells[0], tmp_path)["diverged"]
@@ -237,10 +255,10 @@ def test_a_wrong_call_says_what_is_wrong_and_writes_nothing(arguments, message, 
 def test_an_estimate_without_memory_is_missing_and_no_divergence(tiny, tmp_path, monkeypatch):
     estimated = tiny[0][0].estimate
 
-    def exhaust(cell, space, recordings, folder):
+    def exhaust(method, recordings, space, budget, key):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory")
 
-    monkeypatch.setitem(estimates._ESTIMATORS, "diffcloud", exhaust)
+    monkeypatch.setattr(DiffCloud, "_estimate", exhaust)
     failed = engine.run([estimated], tmp_path, engine.Serial())
     assert "out of memory" in failed[estimated] and not estimated.is_made(tmp_path)
 

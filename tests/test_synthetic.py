@@ -71,9 +71,12 @@ def blown():
     """An experiment of a few frames, and its recording with a late clock and dropped points."""
     experiment = scenarios.wind(num_frames=6, interval=1 / 10, speed=3.0)
     seen = synthetic.sensing(experiment)._replace(time_offset=0.07, dropped=0.6, points=20000)
-    make = lambda seen: synthetic.record(
-        experiment, presets.grey_interlock(), "grey", seen=seen, shape=SHAPE, key=jr.key(2)
-    )
+
+    def make(seen):
+        return synthetic.record(
+            experiment, presets.grey_interlock(), "grey", seen=seen, shape=SHAPE, key=jr.key(2)
+        )
+
     return experiment, make(seen), make(seen._replace(dropped=0.0, time_offset=0.0))
 
 

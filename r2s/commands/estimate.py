@@ -1,16 +1,26 @@
 """`r2s estimate`: recordings to a fabric card."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 if TYPE_CHECKING:
-    from r2s.estimation.descent import Budget
-    from r2s.estimation.estimate import Estimate
-    from r2s.recordings.recording import Recording
+    from r2s.estimation.method import Budget, Method, Progress
+
+MethodName = Literal[
+    "diffcloud",
+    "diffcp",
+    "physnet",
+    "pinn",
+    "cma-es",
+    "diffcloud-published",
+    "diffcp-published",
+    "physnet-published",
+    "pinn-published",
+]
 
 
 @dataclass(frozen=True)
@@ -18,8 +28,14 @@ class EstimateCard:
     """Estimate a fabric from recordings of it, and write its card.
 
     RECORDING is an NPZ of r2s, a folder of them, or a folder of frames with its manifest; several
-    are taken for the same fabric. diffcloud and diffcp take any motion; pinn takes stretchings with
-    markers and force. A killed run goes on where it was, from FILE.progress.npz.
+    are taken for the same fabric. Says whether the method converged, and which numbers ended at a
+    bound of their range. A killed run goes on where it was, from FILE.progress.npz.
+
+    diffcloud differentiates through the cloth, diffcp through material points, cma-es tries fabrics
+    on either. pinn fits a network to the markers and force of stretchings, or to the clouds of
+    another motion. physnet compares depth images on the map of a network that was trained for the
+    motion: that in the file --network, or one that is trained now (an hour) and written there.
+    Names with -published follow the recipes of the papers.
 
         r2s estimate lift.npz --density 0.32 --out denim.json
         r2s estimate warp.npz weft.npz --method pinn --angles 0 90 --density 0.2 --out mine.json
@@ -31,8 +47,11 @@ class EstimateCard:
     """Areal density of the sheet: weigh it."""
     out: Annotated[Path, arg(metavar="FILE")]
     """The card, JSON."""
-    method: Literal["diffcloud", "diffcp", "pinn"] = "diffcloud"
-    """Through the cloth, through material points (E h and Poisson's ratio), or the network."""
+    method: MethodName = "diffcloud"
+    """How to estimate."""
+    solver: Literal["cloth", "points"] | None = None
+    """What simulates: the cloth (orthotropic fabrics) or material points (isotropic ones); by
+    default what the method supports."""
     name: str = ""
     """Of the fabric; by default that of the recording."""
     coarse: int | None = None
@@ -40,9 +59,13 @@ class EstimateCard:
     starts: int | None = None
     """Descents from the best of them (diffcloud 3, diffcp 2)."""
     iterations: int | None = None
-    """Gauss-Newton steps of each stage (25)."""
+    """Gauss-Newton steps of each stage (25); of pinn and the recipes the epochs."""
+    evaluations: int | None = None
+    """Simulations of a search (cma-es 600, physnet 80)."""
     angles: Annotated[tuple[float, ...], arg(metavar="DEGREES")] = ()
     """pinn: from each pull to the warp; by default 0."""
+    network: Annotated[Path | None, arg(metavar="FILE")] = None
+    """physnet: its trained network; by default that of --out with .network."""
     shape: tuple[int, int] = (9, 9)
     """Vertices of the simulated sheet."""
     seed: int = 0
@@ -53,24 +76,31 @@ class EstimateCard:
     """Print the card as one JSON object."""
 
     def run(self) -> int:
+        import jax
+
         from r2s.commands.common import print_result
         from r2s.estimation import cards
-        from r2s.estimation.experiment_design import describe
+        from r2s.estimation.estimate import describe
+        from r2s.estimation.method import default_space
         from r2s.recordings.open import open_recordings
 
         seen = list(open_recordings(self.recordings))
         if not seen:
             raise ValueError("no recording: name an NPZ, or a folder that holds some")
-        found = {"diffcloud": self._cloud, "diffcp": self._points, "pinn": self._network}
-        estimate = found[self.method](seen)
-        about = cards.Provenance(
+        with _bar() as progress:
+            method = self._method(progress)
+            method.check(seen)
+            space = default_space(method.chosen_solver, self.density)
+            key = jax.random.key(self.seed)
+            estimate = method.estimate(seen, space, self._budget(method), key=key)
+        provenance = cards.Provenance(
             method=f"estimated by r2s: {estimate.approach}",
             source="; ".join(dict.fromkeys(each.info.source for each in seen)),
             recordings=tuple((each.info.name, cards.fingerprint(each)) for each in seen),
             date=self.date,
             assumed=("density", "thickness", "mass_damping"),
         )
-        card = cards.Card.make(self.name or seen[0].info.fabric, estimate, about)
+        card = cards.Card.make(self.name or seen[0].info.fabric, estimate, provenance)
         cards.write(self.out, card)
         self._progress_file.unlink(missing_ok=True)
         print_result(
@@ -82,55 +112,38 @@ class EstimateCard:
     def _progress_file(self) -> Path:
         return self.out.with_name(f"{self.out.name}.progress.npz")
 
-    def _cloud(self, seen: "Sequence[Recording]") -> "Estimate":
-        from r2s.estimation import diffcloud
-        from r2s.estimation.descent import DEFAULT
-        from r2s.estimation.problem import Problem
-        from r2s.fabrics.parameters import OrthotropicSpace
+    def _method(self, progress: "Progress | None") -> "Method":
+        """The method with the fields that were asked for; `ValueError` for one that it lacks."""
+        from dataclasses import fields
 
-        space = OrthotropicSpace.make(self.density)
-        problems = tuple(Problem.make(each, space, shape=self.shape) for each in seen)
-        return self._descend(diffcloud.estimate, problems, DEFAULT)
+        from r2s.estimation.registry import METHODS
 
-    def _points(self, seen: "Sequence[Recording]") -> "Estimate":
-        from r2s.estimation import diffcp
-        from r2s.estimation.problem import Problem
-        from r2s.fabrics.parameters import IsotropicSpace
+        kind = METHODS[self.method]
+        known = {field.name for field in fields(kind)}
+        own: dict[str, Any] = {"angles": self.angles, "network": self.network}
+        for name, value in own.items():
+            if value and name not in known:
+                raise ValueError(f"--{name} is not of {self.method}")
+        if self.network is None:
+            own["network"] = self.out.with_name(f"{self.out.name}.network")
+        return kind(
+            solver=self.solver,
+            shape=self.shape,
+            checkpoint=self._progress_file,
+            progress=progress,
+            **{name: value for name, value in own.items() if name in known},
+        )
 
-        space = IsotropicSpace.make(self.density)
-        made = (Problem.make(each, space, shape=self.shape, as_seen=False) for each in seen)
-        problems = tuple(diffcp.on_points(each) for each in made)
-        return self._descend(diffcp.estimate, problems, diffcp.DEFAULT)
-
-    def _descend(self, estimate: Callable, problems, usual: "Budget") -> "Estimate":
-        import jax
-
-        asked = {name: getattr(self, name) for name in ("coarse", "starts", "iterations")}
-        with _bar() as progress:
-            return estimate(
-                problems,
-                usual._replace(**{name: n for name, n in asked.items() if n is not None}),
-                checkpoint=self._progress_file,
-                progress=progress,
-                key=jax.random.key(self.seed),
-            )
-
-    def _network(self, seen: "Sequence[Recording]") -> "Estimate":
-        import math
-
-        import jax
-
-        from r2s.estimation.pinn import from_pulls
-        from r2s.estimation.pinn.pulls import pull_from
-        from r2s.fabrics.parameters import OrthotropicSpace
-
-        angles = self.angles or (0.0,) * len(seen)
-        if len(angles) != len(seen):
-            raise ValueError(f"--angles has {len(angles)} numbers, for {len(seen)} pulls")
-        pairs = zip(seen, angles, strict=True)
-        pulls = [pull_from(each, math.radians(angle)) for each, angle in pairs]
-        space = OrthotropicSpace.make(self.density)
-        return from_pulls.estimate(pulls, space, key=jax.random.key(self.seed)).estimate
+    def _budget(self, method: "Method") -> "Budget":
+        """The usual budget with the numbers that were asked for."""
+        names = ("coarse", "starts", "iterations", "evaluations")
+        asked = {name: getattr(self, name) for name in names}
+        asked = {name: value for name, value in asked.items() if value is not None}
+        for name in asked:
+            if name not in method.heeds:
+                takes = ", ".join(f"--{each}" for each in method.heeds)
+                raise ValueError(f"--{name} is not of {method.name}: it takes {takes}")
+        return method.budget._replace(**asked)
 
 
 class _bar:
@@ -146,7 +159,7 @@ class _bar:
 
         def report(iteration: int, loss: float) -> None:
             del iteration
-            bar.set_postfix_str(f"{1e3 * loss**0.5:.2f} mm")
+            bar.set_postfix_str(f"root of loss {loss**0.5:.3g}")
             bar.update()
 
         return report

@@ -33,9 +33,10 @@ class Sensitivity:
 
     def run(self) -> None:
         from r2s.commands.common import parse_numbers, print_result
-        from r2s.estimation.estimate import as_json
-        from r2s.estimation.experiment_design import describe, planned
+        from r2s.estimation.estimate import describe
+        from r2s.estimation.estimate_json import as_json
+        from r2s.estimation.experiment_design import evaluate_design
 
         numbers = parse_numbers(self.motion)
-        found = planned(self.scenario, self.fabric, numbers, self.noise, self.seed)
+        found = evaluate_design(self.scenario, self.fabric, numbers, self.noise, self.seed)
         print_result(self.json, as_json(found), describe(found))

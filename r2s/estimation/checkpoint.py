@@ -1,6 +1,13 @@
-"""What an estimator has so far, in a file from which a killed run goes on."""
+"""Checkpoints: arrays and a description of their run in one NPZ, from which a killed run goes on.
+
+run = {"kind": "descent", "run": fingerprint(problem, key)}
+save(path, {"theta": theta}, run)
+arrays = load(path, run)  # None: there is no such file
+"""
 
 import io
+import json
+from collections.abc import Mapping
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,7 +18,62 @@ import numpy as np
 
 from r2s.files import write_bytes
 
+FORMAT = "r2s-checkpoint/1"
+HEADER = "checkpoint"  # the array that holds the JSON text
 T = TypeVar("T")
+
+
+def save(path: Path | str, arrays: Mapping[str, Any], run: Mapping[str, Any]) -> None:
+    """Write arrays and the JSON description of their run, whole or not at all.
+
+    - `arrays`: by name; anything that numpy makes an array of.
+    - `run`: whatever JSON holds: settings to read back, a `fingerprint` of the rest.
+
+    Makes the folder when it is not there. Raises `ValueError` for an array named `HEADER`.
+    """
+    if HEADER in arrays:
+        raise ValueError(f"no array of a checkpoint can be named {HEADER!r}")
+    header = json.dumps({"format": FORMAT, "run": dict(run)})
+    stored: dict[str, Any] = {name: np.asarray(array) for name, array in arrays.items()}
+    buffer = io.BytesIO()
+    np.savez(buffer, **stored, **{HEADER: np.array(header)})  # pyright: ignore[reportArgumentType]
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, buffer.getvalue())
+
+
+def read(path: Path | str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays that `save` wrote, and the description of their run.
+
+    Raises `FileNotFoundError`, or `ValueError` that names the file when it is no checkpoint.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        header = json.loads(str(arrays.pop(HEADER)))
+        form, run = header["format"], header["run"]
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # a damaged file raises anything
+        raise ValueError(f"{path} is no checkpoint: {error}; remove it") from error
+    if form != FORMAT:
+        raise ValueError(f"{path}: expected format {FORMAT}, found {form}")
+    return arrays, run
+
+
+def load(path: Path | str, run: Mapping[str, Any]) -> dict[str, np.ndarray] | None:
+    """The arrays that `save` wrote for the same `run`; None when there is no file.
+
+    Raises `ValueError` that names the file when it is no checkpoint, or of another run.
+    """
+    if not Path(path).exists():
+        return None
+    arrays, found = read(path)
+    asked = json.loads(json.dumps(dict(run)))  # tuples become lists
+    if found != asked:
+        names = [key for key in {**found, **asked} if found.get(key) != asked.get(key)]
+        told = ", ".join(f"{key} {found.get(key)} there, {asked.get(key)} asked" for key in names)
+        raise ValueError(f"{path} is of another run ({told}): remove it, or choose another file")
+    return arrays
 
 
 def fingerprint(*parts: Any) -> str:
@@ -27,35 +89,23 @@ def fingerprint(*parts: Any) -> str:
     return digest.hexdigest()
 
 
+def arrays_of(tree: Any) -> dict[str, np.ndarray]:
+    """The leaves of a pytree by their path, for `save`."""
+    leaves, _ = jax.tree.flatten_with_path(tree)
+    return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
+
+
+def tree_from(arrays: Mapping[str, np.ndarray], like: T) -> T:
+    """The pytree whose `arrays_of` were saved, of the structure of `like`.
+
+    Raises `ValueError` when an array is missing.
+    """
+    paths, tree = jax.tree.flatten_with_path(like)
+    names = [jax.tree_util.keystr(path) for path, _ in paths]
+    if missing := [name for name in names if name not in arrays]:
+        raise ValueError(f"the checkpoint lacks {', '.join(missing)}")
+    return jax.tree.unflatten(tree, [jnp.asarray(arrays[name]) for name in names])
+
+
 def _is_key(leaf: Any) -> bool:
     return hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def save(path: Path, problem: str, rows: list[Any]) -> None:
-    """Writes pytrees of one structure, with the fingerprint of what they are of."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    stacked = jax.tree.leaves(jax.tree.map(lambda *leaves: np.stack(leaves), *rows))
-    buffer = io.BytesIO()
-    np.savez(buffer, problem=np.array(problem), **{f"{i}": a for i, a in enumerate(stacked)})
-    write_bytes(path, buffer.getvalue())
-
-
-def load(path: Path, problem: str, like: T) -> list[T]:
-    """The pytrees that `save` wrote, of the structure of `like`; none when there is no file.
-
-    Raises `ValueError` when the file is of another problem, or no checkpoint.
-    """
-    if not path.exists():
-        return []
-    try:
-        with np.load(path) as stored:
-            found = str(stored["problem"])
-            leaves = [jnp.asarray(stored[f"{i}"]) for i in range(len(stored.files) - 1)]
-    except (OSError, ValueError, KeyError) as error:
-        raise ValueError(f"{path} is no checkpoint of an estimate: {error}; remove it") from error
-    if found != problem:
-        raise ValueError(
-            f"{path} is of another recording, space or setting: remove it, or choose another file"
-        )
-    tree = jax.tree.structure(like)
-    return [jax.tree.unflatten(tree, [leaf[i] for leaf in leaves]) for i in range(len(leaves[0]))]

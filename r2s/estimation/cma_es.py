@@ -4,29 +4,54 @@ Needs cma: pip install 'r2s[cma]'.
 """
 
 import time
+from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import random
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimation.descent import Progress
-from r2s.estimation.estimate import Estimate, without_standard_errors
-from r2s.estimation.gauss_newton import Joint, loss_at, part_of, size
+from r2s.estimation.diffcp import problems_on_points
+from r2s.estimation.estimate import Estimate, point_estimate
+from r2s.estimation.gauss_newton import Problems, loss_at, theta_indices, theta_length
+from r2s.estimation.method import ANY, Budget, Method, Progress
 from r2s.estimation.normal_equations import Loss
 from r2s.estimation.problem import Problem
 
 DIVERGED = 1.0  # [m^2]: the loss of a run that diverged, above that of any that did not
-WIDTH = 0.25  # of the unit cube, the first deviation
+WIDTH = 0.25  # of the unit cube: the first standard deviation
+FARTHEST = 4.0  # prior standard deviations, by which a nuisance may be off
+EVALUATIONS = 600
+ARRIVED = ("tolx", "tolfun", "tolfunhist", "tolfunrel")  # its criteria that mean convergence
 
 _losses = eqx.filter_jit(eqx.filter_vmap(loss_at, in_axes=(None, 0, None)))
 
 
-def estimate(
-    problems: Problem | Joint,
+@dataclass(frozen=True, kw_only=True)
+class CMAES(Method):
+    """CMA-ES on the loss of the default methods."""
+
+    name = "cma-es"
+    budget = Budget(evaluations=EVALUATIONS)
+    heeds = ("evaluations",)
+    supports = {"cloth": ANY, "points": ANY}
+    several = True
+
+    def _estimate(self, recordings, space, budget, key):
+        _cma()
+        if self.chosen_solver == "points":
+            problems = problems_on_points(recordings, space, self.shape)
+        else:
+            problems = tuple(Problem.make(each, space, shape=self.shape) for each in recordings)
+        return search(problems, evaluations=budget.evaluations, progress=self.progress, key=key)
+
+
+def search(
+    problems: Problem | Problems,
     *,
-    evaluations: int = 600,
+    evaluations: int = EVALUATIONS,
     start: Float[Array, " dim"] | None = None,
     loss: Loss | None = None,
     progress: Progress | None = None,
@@ -34,66 +59,80 @@ def estimate(
 ) -> Estimate:
     """The best of some `evaluations` of the loss that CMA-ES (Hansen 2016) proposes from `start`.
 
-    It moves the cameras along with the fabric where they are in nuisance_prior, as the default
-    estimator does. Ends earlier when its own criteria say so. Gives no deviations.
+    It moves the nuisances of the prior along with the fabric, as the default methods do. It ends
+    earlier, and has converged, when its tolerances in place or loss say so. Gives no standard
+    errors.
     """
-    try:
-        import cma
-    except ImportError as error:
-        raise ImportError("CMA-ES needs cma: pip install 'r2s[cma]'") from error
     began = time.perf_counter()
     problems = (problems,) if isinstance(problems, Problem) else problems
-    space, count = problems[0].space, size(problems)
+    space, moved = problems[0].space, _nuisance_indices(problems)
     place = np.full(space.dim, 0.5) if start is None else np.asarray(start, float)
-    moved = _moved(problems)
-    bounds = [[0.0] * space.dim + [-4.0] * len(moved), [1.0] * space.dim + [4.0] * len(moved)]
+    first = np.concatenate([np.clip(place, 0, 1), np.zeros(len(moved))])
     options = {
-        "bounds": bounds,
-        "seed": int(jax.random.randint(key, (), 1, 2**31 - 1)),
+        "bounds": [
+            [0.0] * space.dim + [-FARTHEST] * len(moved),
+            [1.0] * space.dim + [FARTHEST] * len(moved),
+        ],
+        "seed": int(random.randint(key, (), 1, 2**31 - 1)),
         "maxfevals": evaluations,
         "verbose": -9,
         "CMA_stds": [1.0] * space.dim + [2.0] * len(moved),
     }
-    first = np.concatenate([np.clip(place, 0, 1), np.zeros(len(moved))])
-    search = cma.CMAEvolutionStrategy(first, WIDTH, options)
+    strategy = _cma().CMAEvolutionStrategy(first, WIDTH, options)
     losses, history, best = [], [], (np.inf, first)
-    while not search.stop():
-        asked = np.array(search.ask())
-        unknowns = np.zeros((len(asked), count))
-        unknowns[:, : space.dim] = asked[:, : space.dim]
-        unknowns[:, moved] = asked[:, space.dim :]
-        found = np.asarray(_losses(problems, jnp.asarray(unknowns, float), loss), float)
-        # the prior of what is in nuisance_prior, so that it does not run away
-        pull = np.sum(asked[:, space.dim :] ** 2, axis=1) / 2
-        spread = np.nanmin(np.where(np.isfinite(found), found, np.nan))
-        frames = sum(len(problem.frames) for problem in problems)
-        told = np.where(np.isfinite(found), found + 2 * spread / frames * pull, DIVERGED)
-        search.tell(list(asked), told.tolist())
+    while not strategy.stop():
+        asked = np.array(strategy.ask())
+        thetas = np.zeros((len(asked), theta_length(problems)))
+        thetas[:, : space.dim] = asked[:, : space.dim]
+        thetas[:, moved] = asked[:, space.dim :]
+        found = np.asarray(_losses(problems, jnp.asarray(thetas, float), loss), float)
+        told = _with_prior(problems, found, asked[:, space.dim :])
+        strategy.tell(list(asked), told.tolist())
         lead = int(np.argmin(told))
         if told[lead] < best[0]:
             best = float(told[lead]), asked[lead]
         losses.append(float(found[lead]))
-        history.append(_values(space, best[1]))
+        history.append(np.asarray(space.values(_unit(space.dim, best[1]))))
         if progress is not None:
             progress(len(losses), best[0])
-    where = jnp.asarray(np.clip(best[1][: space.dim], 0, 1), float)
-    seconds = time.perf_counter() - began
-    columns = np.array(losses)[:, None], np.stack(history)[:, None]
-    return without_standard_errors("cma_es", space, where, min(losses), *columns, seconds)
+    return point_estimate(
+        "cma-es",
+        space,
+        _unit(space.dim, best[1]),
+        min(losses),
+        np.array(losses)[:, None],
+        np.stack(history)[:, None],
+        time.perf_counter() - began,
+        converged=any(name in strategy.stop() for name in ARRIVED),
+    )
 
 
-def _values(space, place: np.ndarray) -> np.ndarray:
-    return np.asarray(space.values(jnp.asarray(np.clip(place[: space.dim], 0, 1), float)))
+def _cma() -> Any:
+    try:
+        import cma
+    except ImportError as error:
+        raise ImportError("CMA-ES needs cma: pip install 'r2s[cma]'") from error
+    return cma
 
 
-def _moved(problems: Joint) -> np.ndarray:
-    """Which entries of the unknown beyond the fabric's place are in doubt."""
+def _unit(dim: int, proposal: np.ndarray) -> Array:
+    """The place of a proposal in the space's unit cube."""
+    return jnp.asarray(np.clip(proposal[:dim], 0, 1), float)
+
+
+def _with_prior(problems: Problems, losses: np.ndarray, nuisances: np.ndarray) -> np.ndarray:
+    """Losses [m^2] with the prior of the nuisances, so that these do not run away."""
+    least = np.nanmin(np.where(np.isfinite(losses), losses, np.nan))
+    frames = sum(len(problem.frames) for problem in problems)
+    penalty = 2 * least / frames * np.sum(nuisances**2, axis=1) / 2
+    return np.where(np.isfinite(losses), losses + penalty, DIVERGED)
+
+
+def _nuisance_indices(problems: Problems) -> np.ndarray:
+    """Indices in theta of the nuisances that the prior lets vary."""
     dim, found = problems[0].space.dim, []
     for which, problem in enumerate(problems):
-        places = part_of(problems, which)[dim:]
-        found += [
-            place
-            for place, scale in zip(places, problem.nuisance_prior.scales, strict=True)
-            if scale
-        ]
+        places = theta_indices(problems, which)[dim:]
+        scales = problem.nuisance_prior.scales
+        found += [place for place, scale in zip(places, scales, strict=True) if scale]
     return np.unique(np.array(found, int))

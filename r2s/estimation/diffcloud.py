@@ -1,20 +1,20 @@
 """DIFFCLOUD: a fabric from point clouds, by differentiating through the cloth and its surface.
 
 After Sundaresan, Antonova and Bohg 2022 ("DiffCloud: Real-to-Sim from Point Clouds with
-Differentiable Simulation and Rendering of Deformable Objects"). `estimate` is r2s's default;
-`original` follows their recipe, `recipe` its optimiser and loss for all parameters of a space.
+Differentiable Simulation and Rendering of Deformable Objects"). `DiffCloud` is r2s's default
+method, by Gauss-Newton descents; `PublishedDiffCloud` follows their recipe.
 """
 
 import dataclasses
-from pathlib import Path
+from dataclasses import dataclass
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from r2s.estimation import adam
-from r2s.estimation.descent import DEFAULT, Budget, Progress, descend
+from r2s.estimation.descent import DEFAULT, descend
 from r2s.estimation.estimate import Estimate
-from r2s.estimation.gauss_newton import Joint
+from r2s.estimation.method import ANY, Budget, Method, Progress
 from r2s.estimation.prediction import Prediction
 from r2s.estimation.problem import Problem
 from r2s.evaluation.losses import one_sided_chamfer
@@ -27,33 +27,54 @@ MASS = Range("mass multiplier", "-", 0.1, 10.0, log=False)
 EPOCHS, RATE = 51, 0.2
 RESOLUTION = 5  # squared, samples on a face: 3,200 of theirs 3,500 on 128 faces
 RECIPE = "Adam 0.2, 51 epochs, 3,200 samples, last frame"
+REFUSALS = {"points": "it differentiates through the cloth; on material points take diffcp"}
 
 
-def estimate(
-    problems: Problem | Joint,
-    budget: Budget = DEFAULT,
-    *,
-    start: Float[Array, " dim"] | None = None,
-    checkpoint: Path | None = None,
-    progress: Progress | None = None,
-    key: PRNGKeyArray,
-) -> Estimate:
-    """The fabric of a recording, or of several, by `r2s.estimation.descent.descend`."""
-    return descend(
-        problems,
-        budget,
-        approach="diffcloud",
-        start=start,
-        checkpoint=checkpoint,
-        progress=progress,
-        key=key,
-    )
+@dataclass(frozen=True, kw_only=True)
+class DiffCloud(Method):
+    """The method of DIFFCLOUD: Gauss-Newton descents through the cloth."""
+
+    name = "diffcloud"
+    budget = DEFAULT
+    heeds = ("coarse", "starts", "iterations")
+    supports = {"cloth": ANY}
+    refusals = REFUSALS
+    several = True
+
+    def _estimate(self, recordings, space, budget, key):
+        problems = tuple(Problem.make(each, space, shape=self.shape) for each in recordings)
+        return descend(
+            problems, budget, checkpoint=self.checkpoint, progress=self.progress, key=key
+        )
 
 
-class Multiplied(ParameterSpace):
+@dataclass(frozen=True, kw_only=True)
+class PublishedDiffCloud(Method):
+    """The recipe of the DIFFCLOUD paper, see `published_recipe`.
+
+    - `assumed`: the fabric whose stiffness and mass are multiplied; None: the middle of the space.
+    """
+
+    name = "diffcloud-published"
+    budget = Budget(iterations=EPOCHS)
+    heeds = ("iterations",)
+    supports = {"cloth": ANY}
+    refusals = REFUSALS
+
+    assumed: Fabric | None = None
+
+    def _estimate(self, recordings, space, budget, key):
+        del key  # it starts in the middle
+        problem = Problem.make(recordings[0], space, shape=self.shape)
+        assumed = space.middle() if self.assumed is None else self.assumed
+        return published_recipe(problem, assumed, epochs=budget.iterations, progress=self.progress)
+
+
+class MultiplierSpace(ParameterSpace):
     """Fabrics that are an assumed one but for two multipliers, as in the DIFFCLOUD paper.
 
-    One of all membrane stiffness, one of the mass (theirs of 20 listed vertices, ours of all).
+    One multiplies all membrane stiffness, one the mass (theirs the mass of 20 listed vertices, ours
+    of all).
     """
 
     assumed: Fabric
@@ -68,10 +89,10 @@ class Multiplied(ParameterSpace):
         )
         return dataclasses.replace(self.assumed, density=self.assumed.density * mass, membrane=law)
 
-    def locate(self, fabric: Fabric) -> Float[Array, " dim"]:
+    def to_unit(self, fabric: Fabric) -> Float[Array, " dim"]:
         """The point where a fabric with multiples of the assumed one's C11 and density lies."""
-        stretch = STRETCH.place(fabric.membrane.c11 / self.assumed.membrane.c11)
-        return jnp.stack([stretch, MASS.place(fabric.density / self.assumed.density)])
+        stretch = STRETCH.to_unit(fabric.membrane.c11 / self.assumed.membrane.c11)
+        return jnp.stack([stretch, MASS.to_unit(fabric.density / self.assumed.density)])
 
 
 def last_frame(problem: Problem, seen: Prediction) -> Float[Array, ""]:
@@ -85,10 +106,11 @@ def last_frame(problem: Problem, seen: Prediction) -> Float[Array, ""]:
     return one_sided_chamfer(surface, jnp.ones(surface.shape[0], bool), targets)
 
 
-def original(
+def published_recipe(
     problem: Problem,
-    assumed: Fabric,
+    assumed: Fabric | None,
     *,
+    start: Float[Array, " dim"] | None = None,
     epochs: int = EPOCHS,
     rate: float = RATE,
     progress: Progress | None = None,
@@ -96,26 +118,17 @@ def original(
     """The recipe of the DIFFCLOUD paper: two multipliers of an assumed fabric, by Adam.
 
     One multiplies all membrane stiffness (0.05 to 10), one the mass (0.1 to 10), through a sigmoid
-    from the middle of the range. The loss is `last_frame`. Gives no deviations.
+    from the middle of the range or from `start`. The loss is `last_frame`. With no `assumed` fabric
+    the same optimiser and loss find all parameters of the problem's space. Gives no standard
+    errors.
     """
-    two = dataclasses.replace(problem, space=Multiplied(assumed=assumed))
-    name = f"diffcloud_original ({RECIPE})"
-    return adam.descend(two, last_frame, approach=name, epochs=epochs, rate=rate, progress=progress)
-
-
-def recipe(
-    problem: Problem,
-    *,
-    start: Float[Array, " dim"] | None = None,
-    epochs: int = EPOCHS,
-    rate: float = RATE,
-    progress: Progress | None = None,
-) -> Estimate:
-    """The same optimiser and loss, for all parameters of the problem's space, from any start."""
+    if assumed is not None:
+        problem = dataclasses.replace(problem, space=MultiplierSpace(assumed=assumed))
+    words = RECIPE if assumed is not None else f"{RECIPE}, all parameters"
     return adam.descend(
         problem,
         last_frame,
-        approach=f"diffcloud_recipe ({RECIPE})",
+        approach=f"diffcloud-published ({words})",
         start=start,
         epochs=epochs,
         rate=rate,

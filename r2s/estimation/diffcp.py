@@ -1,32 +1,81 @@
 """DiffCP: a fabric from point clouds, by differentiating through material points.
 
 After Zheng et al. 2024 ("Differentiable cloth parameter identification and state estimation in
-manipulation"), whom the study follows. `estimate` is r2s's default, by Gauss-Newton with slopes
-over a width of the range; `original` has the public settings.
+manipulation"), whom the study follows. `DiffCP` is r2s's method, by Gauss-Newton with slopes over a
+width of the range; `PublishedDiffCP` has the public settings.
 """
 
 import dataclasses
-from pathlib import Path
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from r2s.estimation import adam
-from r2s.estimation.descent import Budget, Progress, descend
+from r2s.estimation.descent import descend
 from r2s.estimation.estimate import Estimate
-from r2s.estimation.gauss_newton import Joint
+from r2s.estimation.method import ANY, Budget, Method, Progress
 from r2s.estimation.prediction import Prediction
 from r2s.estimation.problem import Problem
 from r2s.evaluation.losses import surface_residuals
-from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.parameters import ParameterSpace
 from r2s.mpm.sheet import Sheet
+from r2s.recordings.recording import Recording
 from r2s.scenarios.on_points import MEMBRANE_DAMPING, material_points
 
 WIDTH = 0.02  # of the range: the slope of the exact motion is rough below that
-FIRST = {"E h": 100.0, "nu": 0.1}  # where the public code starts
+PUBLISHED_START = {"E h": 100.0, "nu": 0.1}  # where the public code starts
 EPOCHS, RATE = 51, 0.05
 DEFAULT = Budget(coarse=12, starts=2, width=WIDTH, around=4)
+REFUSALS = {"cloth": "it differentiates through material points; on the cloth take diffcloud"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiffCP(Method):
+    """The method of DiffCP: Gauss-Newton descents through material points."""
+
+    name = "diffcp"
+    budget = DEFAULT
+    heeds = ("coarse", "starts", "iterations")
+    supports = {"points": ANY}
+    refusals = REFUSALS
+    several = True
+
+    def _estimate(self, recordings, space, budget, key):
+        problems = problems_on_points(recordings, space, self.shape)
+        return descend(
+            problems,
+            budget,
+            approach=self.name,
+            checkpoint=self.checkpoint,
+            progress=self.progress,
+            key=key,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublishedDiffCP(Method):
+    """The public settings of DiffCP, see `published_recipe`."""
+
+    name = "diffcp-published"
+    budget = Budget(iterations=EPOCHS)
+    heeds = ("iterations",)
+    supports = {"points": ANY}
+    refusals = REFUSALS
+
+    def _estimate(self, recordings, space, budget, key):
+        del key  # it starts where the public code does
+        (problem,) = problems_on_points(recordings, space, self.shape)
+        return published_recipe(problem, epochs=budget.iterations, progress=self.progress)
+
+
+def problems_on_points(
+    recordings: list[Recording], space: ParameterSpace, shape: tuple[int, int]
+) -> tuple[Problem, ...]:
+    """The problems of recordings, simulated by material points of a mesh of `shape` vertices."""
+    made = (Problem.make(each, space, shape=shape, as_seen=False) for each in recordings)
+    return tuple(on_points(each) for each in made)
 
 
 def on_points(
@@ -37,45 +86,16 @@ def on_points(
 ) -> Problem:
     """A problem whose motion is simulated by material points, stable for all of its space.
 
-    Arguments as of `r2s.scenarios.material_points`; `forward_mode` for exact sensitivities, which
-    the default estimator does not need. A sheet that hangs is to be made with `as_seen=False`: the
-    points do not settle into the shape that their own recording shows from the one laid onto it.
+    - `spacing`, `membrane_damping`: see `r2s.scenarios.material_points`.
+    - `forward_mode`: allow exact sensitivities, which the default method does not need.
+
+    Make the problem of a sheet that hangs with `as_seen=False`: the points do not settle into the
+    shape of their own recording from the shape that the first cloud shows.
     """
-    sheet = material_points(problem.scenario, stiffest(problem), spacing, membrane_damping)
+    stiffest = problem.space(jnp.ones(problem.space.dim, float))  # limits the time step
+    sheet = material_points(problem.scenario, stiffest, spacing, membrane_damping)
     background = dataclasses.replace(sheet.background, forward_mode=forward_mode)
     return dataclasses.replace(problem, solver=dataclasses.replace(sheet, background=background))
-
-
-def stiffest(problem: Problem) -> Fabric:
-    """The fabric at the upper ends of the ranges, which limits the time step."""
-    return problem.space(jnp.ones(problem.space.dim, float))
-
-
-def estimate(
-    problems: Problem | Joint,
-    budget: Budget = DEFAULT,
-    *,
-    start: Float[Array, " dim"] | None = None,
-    checkpoint: Path | None = None,
-    progress: Progress | None = None,
-    key: PRNGKeyArray,
-) -> Estimate:
-    """The fabric of recordings whose problems are `on_points`, by `descent.descend`.
-
-    Raises `ValueError` for a problem on another solver.
-    """
-    for problem in (problems,) if isinstance(problems, Problem) else problems:
-        if not isinstance(problem.solver, Sheet):
-            raise ValueError("DiffCP simulates material points: pass `diffcp.on_points(problem)`")
-    return descend(
-        problems,
-        budget,
-        approach="diffcp",
-        start=start,
-        checkpoint=checkpoint,
-        progress=progress,
-        key=key,
-    )
 
 
 def squared_third(problem: Problem, seen: Prediction) -> Float[Array, ""]:
@@ -93,7 +113,7 @@ def squared_third(problem: Problem, seen: Prediction) -> Float[Array, ""]:
     return jnp.sum(total) / jnp.sum(count) / 3
 
 
-def original(
+def published_recipe(
     problem: Problem,
     *,
     start: Float[Array, " dim"] | None = None,
@@ -101,21 +121,28 @@ def original(
     rate: float = RATE,
     progress: Progress | None = None,
 ) -> Estimate:
-    """The recipe: Adam on the exact gradient of `squared_third`, from E h = 100 N/m, nu = 0.1.
+    """The public settings: Adam on the exact gradient of `squared_third`.
 
-    Theirs takes single steps on short windows, whose length and rate are not published; this
-    descends on all frames that count. Start and loss are theirs. Needs a problem `on_points`.
+    It starts from E h = 100 N/m and nu = 0.1, or from `start`. Theirs takes single steps on short
+    windows, whose length and rate are not published; this descends on all frames that count. Raises
+    `ValueError` for a problem that is not `on_points`.
     """
     if not isinstance(problem.solver, Sheet):
         raise ValueError("DiffCP simulates material points: pass `diffcp.on_points(problem)`")
     if start is None:
-        pairs = [(bound, FIRST.get(bound.name)) for bound in problem.space.ranges]
-        place = [0.5 if v is None else float(b.place(jnp.asarray(v, float))) for b, v in pairs]
-        start = jnp.asarray(place, float)
+        values = ((bound, PUBLISHED_START.get(bound.name)) for bound in problem.space.ranges)
+        start = jnp.stack(
+            [
+                jnp.asarray(0.5, float)
+                if value is None
+                else bound.to_unit(jnp.asarray(value, float))
+                for bound, value in values
+            ]
+        )
     return adam.descend(
         problem,
         squared_third,
-        approach=f"diffcp_original (Adam {rate:g}, {epochs} epochs)",
+        approach=f"diffcp-published (Adam {rate:g}, {epochs} epochs)",
         start=start,
         epochs=epochs,
         rate=rate,

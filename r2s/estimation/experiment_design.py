@@ -1,4 +1,4 @@
-"""A motion that is planned: what it would reveal, in words."""
+"""Experiment design: what a motion would reveal of a fabric, before anybody makes it."""
 
 import inspect
 
@@ -13,12 +13,18 @@ from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.scenarios import synthetic
 
 
-def planned(
+def evaluate_design(
     scenario: str, fabric: str, numbers: dict[str, float], noise: float = 1e-3, seed: int = 0
 ) -> Estimate:
-    """What a scenario with these numbers would reveal of a preset; `noise` of the clouds [m].
+    """What a motion would reveal of a fabric: standard errors and combinations.
 
-    Raises `ValueError` for an unknown scenario, preset or number, and for numbers out of range.
+    - `scenario`, `numbers`: the motion, one of `r2s.scenarios.SIX` and its arguments.
+    - `fabric`: a preset, which counts as the true fabric.
+    - `noise`: of the clouds, [m].
+    - `seed`: of the noise.
+
+    Raises `ValueError` for a scenario, preset or number that does not exist, and for numbers out of
+    range.
     """
     if scenario not in scenarios.SIX:
         raise ValueError(f"a scenario is one of {', '.join(scenarios.SIX)}, got {scenario!r}")
@@ -37,27 +43,3 @@ def planned(
     recording = synthetic.record(experiment, chosen, fabric, seen=seen, key=key)
     space = OrthotropicSpace.make(float(chosen.density))
     return sensitivity(Problem.make(recording, space), chosen)
-
-
-def describe(estimate: Estimate) -> list[str]:
-    """One line a parameter, a combination, and what was in doubt: how well each is known."""
-    lines = []
-    rows = zip(
-        estimate.ranges,
-        estimate.values,
-        estimate.standard_errors,
-        estimate.identifiable,
-        strict=True,
-    )
-    for bound, value, deviation, determined in rows:
-        unit = "" if bound.unit == "-" else f" {bound.unit}"
-        spread = f"{deviation:.1%}" if bound.log else f"{deviation:.3f}"
-        word = "determined" if determined else "not determined"
-        lines.append(f"{bound.name:14s}{value:10.4g}{unit:6s} +- {spread:8s}{word}")
-    for found in estimate.combinations:
-        powers = " ".join(f"{name}^{power:g}" for name, power in found.exponents.items())
-        lines.append(f"known to {found.deviation:.1%}: {powers}")
-    for name, unit, value, deviation in estimate.nuisances:
-        unit = "" if unit == "-" else f" {unit}"
-        lines.append(f"{name:14s}{value:10.4g}{unit:6s} +- {deviation:.2g}")
-    return lines

@@ -5,9 +5,12 @@ does not pull on what it does not see), robust against outliers. The parameters 
 derivative of the whole motion with respect to all of them costs about as much as one gradient, and
 its normal equations give the step and the covariance at once.
 
-Several recordings of one fabric count by their frames: `Joint` is a tuple of problems, its unknown
-the fabric's place, what they share (`SHARED`), and what is each one's own (`OWN`).
+Several recordings of one fabric are weighed by their frames. Their joint parameter vector `theta`
+is the fabric's place in its space, the nuisances that all recordings share (`SHARED`), and those of
+each recording (`OWN`).
 """
+
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -19,7 +22,7 @@ from r2s.estimation import normal_equations
 from r2s.estimation.prediction import Theta, predict, sensitivities
 from r2s.estimation.problem import OWN, SHARED, Problem
 
-Joint = tuple[Problem, ...]
+Problems = tuple[Problem, ...]
 
 MARGIN = 1e-3  # of the unit cube, so that a start at its edge can move
 PRIOR_DEVIATION = 0.29  # of a uniform prior over the unit cube
@@ -29,34 +32,34 @@ FINEST = 1e-5  # [m]: no recording is better
 
 
 class Normal(eqx.Module):
-    """The loss at an unknown, and its normal equations there, without the prior.
+    """The loss at a theta, and its normal equations there, without the prior.
 
     - `loss`: robust mean, [m^2]; infinite when the run diverged.
     - `spread`: robust standard deviation of the distances, [m].
-    - `gradient`, `matrix`: of the loss in the unknown, [m^2].
-    - `scatter`: covariance of the gradient, [m^4], from how it varies between clusters, see
-      `scatter`.
+    - `gradient`, `matrix`: derivative of the loss in theta, and its Gauss-Newton matrix, [m^2].
+    - `scatter`: covariance of the gradient, [m^4], see the function `scatter`.
     """
 
     loss: Float[Array, "*start"]
     spread: Float[Array, "*start"]
-    gradient: Float[Array, "*start unknown"]
-    matrix: Float[Array, "*start unknown unknown"]
-    scatter: Float[Array, "*start unknown unknown"]
+    gradient: Float[Array, "*start theta"]
+    matrix: Float[Array, "*start theta theta"]
+    scatter: Float[Array, "*start theta theta"]
 
 
 class Descent(eqx.Module):
     """A Levenberg-Marquardt descent.
 
-    - `unknown`: see `r2s.estimation.prediction`.
+    - `theta`: where it is, see `r2s.estimation.prediction`.
     - `normal`: the normal equations there.
-    - `damping`: Levenberg's, [-]; `growth`: its factor should the next step fail (Nielsen 1999).
+    - `damping`: Levenberg's, [-].
+    - `growth`: factor of the damping should the next step fail (Nielsen 1999).
     - `scale`: beyond which distances do not count, [m]; 0: all do, see
       `r2s.evaluation.losses.robust`.
-    - `stage`: which of an estimate's, see `r2s.estimation.descent.Effort`.
+    - `stage`: its stage in an estimate, see `iterations` of `r2s.estimation.method.Budget`.
     """
 
-    unknown: Float[Array, "*start unknown"]
+    theta: Float[Array, "*start theta"]
     normal: Normal
     damping: Float[Array, "*start"]
     growth: Float[Array, "*start"]
@@ -64,37 +67,40 @@ class Descent(eqx.Module):
     stage: Int[Array, "*start"]
 
 
-def size(problems: Joint) -> int:
-    """Of the unknown of some recordings of one fabric."""
+def theta_length(problems: Problems) -> int:
+    """Length of theta: fabric, nuisances shared by all recordings, nuisances of each."""
     return problems[0].space.dim + len(SHARED) + len(OWN) * len(problems)
 
 
-def part_of(problems: Joint, which: int) -> np.ndarray:
-    """Where in the joint unknown that of one recording is."""
+def theta_indices(problems: Problems, which: int) -> np.ndarray:
+    """Indices in theta of the parameters of one recording."""
     shared = problems[0].space.dim + len(SHARED)
     first = shared + len(OWN) * which
     return np.concatenate([np.arange(shared), np.arange(first, first + len(OWN))])
 
 
-def shares(problems: Joint) -> list[float]:
-    """Weights of the recordings: their frames among all."""
+def recording_weights(problems: Problems) -> list[float]:
+    """Weight of each recording: its share of all frames."""
     frames = [len(problem.frames) for problem in problems]
     return [count / sum(frames) for count in frames]
 
 
 def loss_at(
-    problems: Joint,
-    unknown: Theta,
+    problems: Problems,
+    theta: Theta,
     loss: normal_equations.Loss | None = None,
     scale: normal_equations.Scale = 0.0,
 ) -> Float[Array, ""]:
-    """The robust loss [m^2] at an unknown, with the `scale` [m] of `r2s.evaluation.losses.robust`.
+    """The loss [m^2] at a theta; infinite when a run diverged.
 
-    Or another `loss`. Infinite when a run diverged.
+    - `loss`: of one recording; None: the robust one.
+    - `scale`: of the robust loss [m], see `r2s.evaluation.losses.robust`.
     """
-    total = jnp.zeros((), unknown.dtype)
-    for which, (problem, share) in enumerate(zip(problems, shares(problems), strict=True)):
-        seen = predict(problem, unknown[part_of(problems, which)])
+    total = jnp.zeros((), theta.dtype)
+    for which, (problem, share) in enumerate(
+        zip(problems, recording_weights(problems), strict=True)
+    ):
+        seen = predict(problem, theta[theta_indices(problems, which)])
         value = (
             normal_equations.loss_of(problem, seen, scale) if loss is None else loss(problem, seen)
         )
@@ -103,30 +109,34 @@ def loss_at(
 
 
 def normal_at(
-    problems: Joint,
-    unknown: Theta,
+    problems: Problems,
+    theta: Theta,
     scale: normal_equations.Scale = 0.0,
     width: float | None = None,
 ) -> Normal:
-    """Loss, gradient and Gauss-Newton matrix at an unknown.
+    """Loss, gradient and Gauss-Newton matrix at a theta.
 
-    `scale` as of `r2s.evaluation.losses.robust`, `width` as of
-    `r2s.estimation.prediction.sensitivities`.
+    - `scale`: of the robust loss [m], see `r2s.evaluation.losses.robust`.
+    - `width`: over which slopes are taken, see `r2s.estimation.prediction.sensitivities`.
     """
     losses, spreads, scores, matrices, noise = [], [], [], [], []
-    for which, (problem, share) in enumerate(zip(problems, shares(problems), strict=True)):
-        index = part_of(problems, which)
-        seen, slope = sensitivities(problem, unknown[index], width)
+    for which, (problem, share) in enumerate(
+        zip(problems, recording_weights(problems), strict=True)
+    ):
+        index = theta_indices(problems, which)
+        seen, slope = sensitivities(problem, theta[index], width)
         found = normal_equations.normal_equations_of(problem, seen, slope, scale)
         losses.append(share * jnp.where(seen.ok, found.loss, jnp.inf))
         spreads.append(share * found.spread**2)
-        zeros = jnp.zeros((len(found.scores), size(problems), size(problems)), unknown.dtype)
+        zeros = jnp.zeros(
+            (len(found.scores), theta_length(problems), theta_length(problems)), theta.dtype
+        )
         scores.append(zeros[:, 0].at[:, index].set(share * found.scores))
         matrices.append(zeros.at[:, index[:, None], index].set(share * found.matrices))
         noise.append(share * found.noise)
     spread = jnp.sqrt(jnp.sum(jnp.stack(spreads)))
     score, matrix = jnp.concatenate(scores), jnp.concatenate(matrices)
-    least = jnp.diag(pull(problems, unknown)[1]) * least_weight(problems, spread)
+    least = jnp.diag(prior_terms(problems, theta)[1]) * least_weight(problems, spread)
     return Normal(
         jnp.sum(jnp.stack(losses)),
         spread,
@@ -137,17 +147,18 @@ def normal_at(
 
 
 def scatter(
-    scores: Float[Array, "cluster unknown"],
-    matrices: Float[Array, "cluster unknown unknown"],
+    scores: Float[Array, "cluster theta"],
+    matrices: Float[Array, "cluster theta theta"],
     noise: Float[Array, " cluster"],
-    prior: Float[Array, "unknown unknown"],
-) -> Float[Array, "unknown unknown"]:
+    prior: Float[Array, "theta theta"],
+) -> Float[Array, "theta theta"]:
     """Covariance of a gradient that is a sum over clusters which err independently.
 
-    Each score is what it would be had its cluster not been fitted: with that the sandwich is the
-    jackknife, which does not take few clusters for much evidence (CR3 of Bell and McCaffrey 2002).
-    In no direction is it less than if all residuals erred independently, with a variance of `noise`
-    times its matrix: where it is, that is the chance of few clusters.
+    Each score is corrected to what it would be had its cluster not been fitted. With that the
+    sandwich estimator is the jackknife, which does not take few clusters for much evidence (CR3 of
+    Bell and McCaffrey 2002). In no direction is the covariance less than if all residuals erred
+    independently, with a variance of `noise` times the cluster's matrix: less would be the chance
+    of few clusters.
     """
     whole = jnp.sum(matrices, axis=0) + prior
     # a cluster that alone tells something would leave nothing behind, but for rounding
@@ -157,7 +168,7 @@ def scatter(
     return _larger(alone.T @ alone, jnp.einsum("c,cuv->uv", noise, matrices), whole)
 
 
-def _larger(one: Array, other: Array, metric: Array) -> Float[Array, "unknown unknown"]:
+def _larger(one: Array, other: Array, metric: Array) -> Float[Array, "theta theta"]:
     """The larger of two positive matrices in each direction in which a metric tells them apart."""
     sizes, axes = jnp.linalg.eigh(metric)
     lengths = jnp.sqrt(jnp.maximum(sizes, jnp.finfo(sizes.dtype).eps * sizes[-1]))
@@ -167,86 +178,85 @@ def _larger(one: Array, other: Array, metric: Array) -> Float[Array, "unknown un
     return (one + other + root @ absolute @ root.T) / 2
 
 
-def pull(problems: Joint, unknown: Theta) -> tuple[Theta, Theta]:
-    """Difference from the unknown that the prior expects, and the inverse of its variance."""
-    dim, rest = problems[0].space.dim, size(problems) - problems[0].space.dim
+def prior_terms(problems: Problems, theta: Theta) -> tuple[Theta, Theta]:
+    """Difference of theta from the mean of its prior, and the precision of the prior."""
+    dim, rest = problems[0].space.dim, theta_length(problems) - problems[0].space.dim
     expected = jnp.concatenate([jnp.full(dim, 0.5, float), jnp.zeros(rest, float)])
     spread = jnp.concatenate([jnp.full(dim, PRIOR_DEVIATION, float), jnp.ones(rest, float)])
-    return unknown - expected, 1 / spread**2
+    return theta - expected, 1 / spread**2
 
 
-def prior_weight(problems: Joint, normal: Normal) -> Float[Array, ""]:
-    """Weight [m^2] of the prior at the best unknown: how much the loss scatters by chance.
+def prior_weight(problems: Problems, normal: Normal) -> Float[Array, ""]:
+    """Weight [m^2] of the prior beside the loss: how much the loss scatters by chance.
 
     The likelihood is exp(-loss / weight) when the gradient scatters like weight times the matrix
     (magnitude adjustment of a composite likelihood, Pauli, Racugno and Ventura 2011).
     """
-    _, precision = pull(problems, jnp.zeros(size(problems), float))
+    _, precision = prior_terms(problems, jnp.zeros(theta_length(problems), float))
     least = least_weight(problems, normal.spread)
     inverse = jnp.linalg.inv(normal.matrix + least * jnp.diag(precision))
     ratio = jnp.trace(inverse @ normal.scatter) / jnp.trace(inverse @ normal.matrix)
     return jnp.maximum(ratio, jnp.finfo(ratio.dtype).tiny)
 
 
-def least_weight(problems: Joint, spread: Float[Array, ""]) -> Float[Array, ""]:
-    """What the prior weighs at least [m^2]: as if all points of a patch and frame were one."""
+def least_weight(problems: Problems, spread: Float[Array, ""]) -> Float[Array, ""]:
+    """Least weight [m^2] of the prior: as if all points of a patch and frame were one."""
     frames = sum(len(problem.frames) for problem in problems)
     return jnp.maximum(spread, FINEST) ** 2 / (frames * normal_equations.PATCHES**2)
 
 
-def objective(problems: Joint, unknown, loss, prior) -> Float[Array, ""]:
-    """Loss and prior [m^2] at an unknown."""
-    off, precision = pull(problems, unknown)
+def objective(problems: Problems, theta, loss, prior) -> Float[Array, ""]:
+    """Loss and prior [m^2] at a theta."""
+    off, precision = prior_terms(problems, theta)
     return loss + prior * jnp.sum(off**2 * precision) / 2
 
 
-def remaining(problems: Joint, descent: Descent, prior) -> Float[Array, ""]:
-    """What the next Gauss-Newton step promises to gain [m^2], of the unknowns not at a bound."""
+def remaining(problems: Problems, descent: Descent, prior) -> Float[Array, ""]:
+    """Gain [m^2] that the next Gauss-Newton step promises, by the parameters not at a bound."""
     gradient, matrix, stuck = _equations(problems, descent, prior)
     pinned = jnp.where(stuck[:, None] | stuck[None], jnp.diag(jnp.diag(matrix)), matrix)
     gradient = jnp.where(stuck, 0, gradient)
     return gradient @ jnp.linalg.solve(pinned, gradient) / 2
 
 
-def _equations(problems: Joint, descent: Descent, prior):
-    """Gradient and matrix with the prior, and which unknowns would leave the unit cube."""
-    unknown = descent.unknown
-    off, precision = pull(problems, unknown)
+def _equations(problems: Problems, descent: Descent, prior):
+    """Gradient and matrix with the prior, and which parameters would leave the unit cube."""
+    theta = descent.theta
+    off, precision = prior_terms(problems, theta)
     gradient = descent.normal.gradient + prior * precision * off
     matrix = descent.normal.matrix + prior * jnp.diag(precision)
-    bounded = jnp.arange(unknown.shape[0]) < problems[0].space.dim
-    stuck = bounded & (unknown <= MARGIN) & (gradient > 0)
-    stuck |= bounded & (unknown >= 1 - MARGIN) & (gradient < 0)
+    bounded = jnp.arange(theta.shape[0]) < problems[0].space.dim
+    stuck = bounded & (theta <= MARGIN) & (gradient > 0)
+    stuck |= bounded & (theta >= 1 - MARGIN) & (gradient < 0)
     return gradient, matrix, stuck
 
 
-def propose(problems: Joint, descent: Descent, prior) -> Theta:
-    """The next unknown to try: a damped Gauss-Newton step, within the unit cube.
+def propose(problems: Problems, descent: Descent, prior) -> Theta:
+    """The next theta to try: a damped Gauss-Newton step, within the unit cube.
 
-    What runs into a bound stays there, and the other unknowns take the step alone.
+    A parameter that would leave the cube stays at its bound, and the others take the step alone.
     """
-    unknown = descent.unknown
-    bounded = jnp.arange(unknown.shape[0]) < problems[0].space.dim
+    theta = descent.theta
+    bounded = jnp.arange(theta.shape[0]) < problems[0].space.dim
     gradient, matrix, stuck = _equations(problems, descent, prior)
     damped = matrix + descent.damping * jnp.diag(jnp.diag(matrix))
     pinned = jnp.where(stuck[:, None] | stuck[None], jnp.diag(jnp.diag(damped)), damped)
     change = -jnp.linalg.solve(pinned, jnp.where(stuck, 0, gradient))
     longest = jnp.max(jnp.where(bounded, jnp.abs(change), 0))
     change = change / jnp.maximum(1, longest / LONGEST_STEP)
-    inside = jnp.clip(unknown + change, MARGIN, 1 - MARGIN)
-    return jnp.where(bounded, inside, unknown + change)
+    inside = jnp.clip(theta + change, MARGIN, 1 - MARGIN)
+    return jnp.where(bounded, inside, theta + change)
 
 
-def accept(problems: Joint, descent: Descent, trial: Theta, tried: Normal, prior) -> Descent:
+def accept(problems: Problems, descent: Descent, trial: Theta, tried: Normal, prior) -> Descent:
     """The descent after a trial: moved if that lowers the objective, else damped more."""
     new = objective(problems, trial, tried.loss, prior)
-    old = objective(problems, descent.unknown, descent.normal.loss, prior)
+    old = objective(problems, descent.theta, descent.normal.loss, prior)
     better = new < old
-    take = lambda new, old: jnp.where(better, new, old)
     damping = jnp.where(better, descent.damping / 4, descent.damping * descent.growth)
     return Descent(
-        take(trial, descent.unknown),
-        jax.tree.map(take, tried, descent.normal),
+        jnp.where(better, trial, descent.theta),
+        jax.tree.map(partial(jnp.where, better), tried, descent.normal),
         jnp.clip(damping, *DAMPINGS),
         jnp.where(better, GROWTH, 2 * descent.growth),
         descent.scale,

@@ -1,10 +1,10 @@
-"""How a sheet hangs before it moves: as the first cloud shows it, where there is more than one way.
+"""The initial shape of a hanging sheet, from its first cloud.
 
 A sheet whose corners are nearer to each other than they were cut buckles, and can do so in several
 ways, each at rest. Which one a simulation falls into depends on the fabric, so that a small change
-of its stiffness may change the shape by millimetres, and no descent comes across such a jump. From
-a start near the shape that was seen, more fabrics come to rest in that one (not all: of a stiff
-denim it fails for some recordings).
+of its stiffness may change the shape by millimetres, and no descent crosses such a jump. From a
+start near the shape that was seen, more fabrics come to rest in that shape (not all: for a stiff
+denim it fails on some recordings).
 """
 
 import dataclasses
@@ -31,11 +31,13 @@ def as_seen(
     points: Float[Array, "point 3"],
     mask: Bool[Array, " point"],
 ) -> Scenario:
-    """A scenario of a hanging sheet that starts in the shape of its first cloud, `points` [m].
+    """A scenario of a hanging sheet that starts in the shape of its first cloud.
 
-    `fabric`, any of those that are to be estimated, says how the sheet hangs as far as the cloud
-    does not show it. The grippers, which a sheet at rest has at its corners, are where the path
-    begins.
+    - `fabric`: any of those to be estimated; it says how the sheet hangs where the cloud does not
+      show it.
+    - `points`, `mask`: the first cloud, [m].
+
+    The grippers, which a sheet at rest has at its corners, start where the path begins.
     """
     scene = scenario.scene
     first = _motion(dataclasses.replace(scenario, num_frames=1), fabric).x[0]
@@ -52,10 +54,14 @@ def registered(
     mesh: Mesh,
     free: Bool[Array, " vertex"],
 ) -> Float[Array, "vertex 3"]:
-    """A sheet at `x` [m] laid onto points [m]: smoothly, with edges as long as they were.
+    """The vertices of a sheet laid smoothly onto points, with edges as long as they were.
+
+    - `points`, `mask`: where to, [m].
+    - `x`: vertices at first, [m].
+    - `free`: which vertices move.
 
     Nonrigid iterative closest points (Amberg, Romdhani and Vetter 2007), with distances to the
-    surface and outliers down-weighted. Vertices that are not free stay.
+    surface, and outliers down-weighted.
     """
     edges = _edges(mesh, len(x))
     lengths = length(edges @ x)
@@ -80,7 +86,7 @@ def registered(
 
 
 def _edges(mesh: Mesh, count: int) -> Float[Array, "edge vertex"]:
-    """What takes vertices to the edges of the faces; inner ones are there twice."""
+    """The matrix from vertices to the edges of the faces; inner edges are there twice."""
     corner = jax.nn.one_hot(mesh.faces, count, dtype=float)
     return (corner - jnp.roll(corner, 1, axis=1)).reshape(-1, count)
 

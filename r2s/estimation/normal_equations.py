@@ -29,21 +29,22 @@ FLATTEST = 0.3  # curvature of a robust loss over the mean weight, at least
 
 
 class NormalEquations(eqx.Module):
-    """A loss with its normal equations, by clusters: what errs alike.
+    """A loss with its normal equations in theta, by clusters of residuals that err alike.
 
-    A patch of the sheet over some frames, a marker, or a force over some frames.
+    A cluster is a patch of the sheet over some frames, a marker, or a force over some frames.
 
-    - `loss`: [m^2]. `spread`: robust standard deviation of the distances, [m].
-    - `scores`, `matrices`: each cluster's share of the loss's gradient and Gauss-Newton matrix in
-      the unknown, [m^2].
-    - `noise`: times its matrix, the covariance [m^4] of its score if all residuals err
-      independently, [m^2].
+    - `loss`: [m^2].
+    - `spread`: robust standard deviation of the distances, [m].
+    - `scores`, `matrices`: share of each cluster in the loss's gradient and Gauss-Newton matrix,
+      [m^2].
+    - `noise`: variance [m^2] of each cluster's residuals; times its matrix it is the covariance
+      [m^4] of its score if all residuals err independently.
     """
 
     loss: Float[Array, ""]
     spread: Float[Array, ""]
-    scores: Float[Array, "cluster unknown"]
-    matrices: Float[Array, "cluster unknown unknown"]
+    scores: Float[Array, "cluster theta"]
+    matrices: Float[Array, "cluster theta theta"]
     noise: Float[Array, " cluster"]
 
 
@@ -104,10 +105,10 @@ def _of_clouds(
 
 
 def _of_markers(markers: Markers, seen: Prediction, slope: Sensitivity, scale) -> NormalEquations:
-    """Each marker is a cluster: where the first frame shows it wrongly, it is wrong in them all."""
+    """Each marker is a cluster: an error of its place in the first frame is in all frames."""
     gap = _gaps(markers, seen.x)
     distance = length(gap)
-    picked = slope.x[:, markers.vertices]  # (frame, marker, corner, axis, unknown)
+    picked = slope.x[:, markers.vertices]  # (frame, marker, corner, axis, theta)
     jacobian = jnp.einsum("mk,fmkiu->fmiu", markers.weights, picked)
     weight = _weights(distance, markers.seen, scale)
     scores = jnp.einsum("fm,fmi,fmiu->mu", weight, gap, jacobian)
@@ -136,12 +137,12 @@ def _force_loss(force: Force, gap: Float[Array, "frame direction"]) -> Float[Arr
 
 
 def _weights(distance: Float[Array, "frame point"], mask, scale: Scale) -> Array:
-    """What each point weighs in the normal equations of the mean."""
+    """Weight of each point in the normal equations of the mean."""
     return jnp.where(mask, robust_weight(distance, scale), 0) / jnp.sum(mask, dtype=float)
 
 
 def _of_robust(distance, mask, scale: Scale, scores: Array, matrices: Array) -> NormalEquations:
-    """The evidence of distances, from the shares of the clusters in their weighted squares.
+    """Normal equations of distances, from the shares of the clusters in their weighted squares.
 
     Their matrix is steeper than the robust loss is curved: by the ratio of its mean curvature to
     the mean weight, with which the estimate has the covariance of an M-estimate (Huber 1981).
@@ -164,10 +165,10 @@ def _of_robust(distance, mask, scale: Scale, scores: Array, matrices: Array) -> 
 def _by_patch(
     mesh: Mesh,
     place: Float[Array, "point 2"],
-    jacobian: Float[Array, "point unknown"],
+    jacobian: Float[Array, "point theta"],
     distance: Float[Array, " point"],
     weight: Float[Array, " point"],
-) -> tuple[Float[Array, "patch unknown"], Float[Array, "patch unknown unknown"]]:
+) -> tuple[Float[Array, "patch theta"], Float[Array, "patch theta theta"]]:
     """Scores and matrices of a frame's patches, from distances at places of the sheet [m]."""
     extent = jnp.max(mesh.rest, axis=0) * (1 + 1e-3)
     cell = jnp.clip(jnp.floor(place / extent[None] * PATCHES).astype(int), 0, PATCHES - 1)
@@ -186,12 +187,16 @@ def _by_time(shares: Float[Array, "frame patch *rest"]) -> Float[Array, " *clust
 
 
 def _residuals(clouds: Clouds, mesh: Mesh, seen: Prediction, scale: Scale):
-    """Of every frame, `surface_residuals`; one frame at a time, which fits the cache.
+    """`surface_residuals` of every frame; one frame at a time, which fits the cache.
 
-    With slack at the borders where outliers are left out, and a small bias would show.
+    There is slack at the borders where outliers are left out, since a small bias would show there.
     """
     edges, slack = borders(mesh), jnp.minimum(scale, SLACK)
-    frame = lambda seen: surface_residuals(seen[0], seen[1], seen[2], mesh.faces, edges, slack)
+
+    def frame(args):
+        points, mask, x = args
+        return surface_residuals(points, mask, x, mesh.faces, edges, slack)
+
     return jax.lax.map(frame, (clouds.points, clouds.mask, seen.x))
 
 
@@ -202,10 +207,10 @@ def _gaps(markers: Markers, x: Float[Array, "frame vertex 3"]) -> Float[Array, "
 
 
 def _force_gaps(force: Force, pulled: Array) -> Float[Array, "frame direction"]:
-    """Too much of it, as a distance [m]; zero where it was not measured."""
+    """Excess of the simulated force, as a distance [m]; zero where none was measured."""
     return jnp.where(force.seen[:, None], FORCE_SCALE * (pulled - force.values), 0)
 
 
 def _spread(distance: Float[Array, "*shape"], mask) -> Float[Array, ""]:
-    """The deviation [m] of a normal one with the same median."""
+    """Standard deviation [m] of the normal distribution with the same median."""
     return 1.4826 * jnp.nanmedian(jnp.where(mask, distance, jnp.nan))

@@ -1,4 +1,4 @@
-"""What an estimator is given: a recording to be explained by a member of a space."""
+"""What an estimator is given: a recording to be explained by a fabric of a parameter space."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -19,16 +19,16 @@ FORCE_SCALE = 0.02  # [m/N]: a load cell is good to 10 mN where a marker is to 0
 
 
 class NuisancePrior(NamedTuple):
-    """How far what was written down of an experiment may be off: standard deviations; 0: exact.
+    """Standard deviations of what was written down of an experiment; 0: it is exact.
 
-    It is estimated along with the fabric, so that an error of calibration is not taken for a
-    property of the fabric.
+    These nuisances are estimated along with the fabric, so that an error of calibration is not
+    taken for a property of the fabric.
 
-    - `shift`, `turn`: of the cameras' frame against the grippers', [m], and about the vertical
-      through the first gripper, [rad].
-    - `time`: how much later than theirs the cameras' clock is, [s].
-    - `density`: of the sheet, relative, where it was not weighed.
-    - `air`: the force of the air at its speed (its density, its drag), relative.
+    - `shift`: of the cameras' frame against the grippers', [m].
+    - `turn`: of the same, about the vertical through the first gripper, [rad].
+    - `time`: delay of the cameras' clock behind the grippers', [s].
+    - `density`: of the sheet, where it was not weighed, relative.
+    - `air`: of the force of the air at its speed (its density, its drag), relative.
     """
 
     shift: float = 0.015
@@ -39,19 +39,19 @@ class NuisancePrior(NamedTuple):
 
     @property
     def scales(self) -> tuple[float, ...]:
-        """The deviations in the order of `SHARED` and `OWN`."""
+        """The standard deviations in the order of `SHARED` and `OWN`."""
         return (self.density, self.air, *(self.shift,) * 3, self.turn, self.time)
 
 
 USUAL = NuisancePrior()
-WIND = 0.1  # of its force: 5 % of its speed, or as much as is known of a fabric's drag
-SHARED: tuple[str, ...] = ("density", "air")  # by all recordings of a fabric
-OWN: tuple[str, ...] = ("shift x", "shift y", "shift z", "turn", "time")  # of one recording
+WIND = 0.1  # of the wind's force: 5 % of its speed, or as much as is known of a fabric's drag
+SHARED: tuple[str, ...] = ("density", "air")  # nuisances that all recordings of a fabric share
+OWN: tuple[str, ...] = ("shift x", "shift y", "shift z", "turn", "time")  # nuisances of each
 UNITS = {"shift x": "m", "shift y": "m", "shift z": "m", "turn": "rad", "time": "s"}
 
 
 def default_nuisance_prior(scenario: Scenario) -> NuisancePrior:
-    """What is in doubt if nothing is said: the cameras' place, and the force of a wind that blows.
+    """The usual prior: the cameras' place may be off, and the force of a wind that blows.
 
     A sheet in wind weighs the air against its density to a part in five thousand. Were both taken
     as exact, an error of 1 % in either could be explained by half the stiffness.
@@ -60,14 +60,14 @@ def default_nuisance_prior(scenario: Scenario) -> NuisancePrior:
 
 
 class Clouds(eqx.Module):
-    """Points [m] of the frames that count, and which of them are there."""
+    """Points [m] of the frames that count; the mask tells points from padding."""
 
     points: Float[Array, "frame point 3"]
     mask: Bool[Array, "frame point"]
 
 
 class Markers(eqx.Module):
-    """Places printed on the sheet: where they were seen [m], and which vertices are around them."""
+    """Markers on the sheet: positions [m], in which frames seen, and the vertices around them."""
 
     positions: Float[Array, "frame marker 3"]
     seen: Bool[Array, "frame marker"]
@@ -76,7 +76,7 @@ class Markers(eqx.Module):
 
 
 class Force(eqx.Module):
-    """What pulled at the clamp at the frames that count [N], along `directions`; where measured."""
+    """Force on the clamp [N] at the frames that count, along `directions`, where measured."""
 
     values: Float[Array, "frame direction"]
     seen: Bool[Array, " frame"]
@@ -84,14 +84,14 @@ class Force(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """A recording to be explained by a member of a space.
+    """A recording to be explained by a fabric of a parameter space.
 
     - `scenario`: how the sheet is held and moved.
-    - `family`: the fabrics to choose from.
+    - `space`: the fabrics to choose from.
     - `frames`: which frames of the scenario count.
     - `clouds`, `markers`, `force`: what was seen in them; None: it was not.
     - `solver`: what simulates; None: the cloth, in the scenario's steps.
-    - `doubt`: how far the experiment may be off what was written down.
+    - `nuisance_prior`: how far the experiment may be off what was written down.
     """
 
     scenario: Scenario
@@ -117,14 +117,21 @@ class Problem(eqx.Module):
         solver: Any = None,
         as_seen: bool = True,
     ) -> "Problem":
-        """A problem from a recording, its clouds thinned to `num_points` a frame.
+        """The problem of a recording.
 
-        `voxel` [m] as of `r2s.recordings.recording.subsample`, `shape` the vertices of the
-        simulated sheet. Where markers were tracked they count instead of the clouds, and the force
-        on the pulled clamp counts where it was measured. `nuisance_prior` is by default
-        `default_nuisance_prior`. A sheet that hangs starts in the shape that the first cloud shows,
-        see `r2s.estimation.initial_shape`, unless not `as_seen`: then flat. Raises `ValueError`
-        when a marker is not seen in the first frame, or lies off the sheet there.
+        Where markers were tracked they count instead of the clouds, and the force on the pulled
+        clamp counts where it was measured.
+
+        - `num_points`, `voxel` [m], `seed`: how the clouds are thinned, see
+          `r2s.recordings.recording.subsample`.
+        - `shape`: vertices of the simulated sheet along warp and weft.
+        - `nuisance_prior`: by default `default_nuisance_prior`.
+        - `solver`: what simulates; None: the cloth.
+        - `as_seen`: a sheet that hangs starts in the shape that the first cloud shows, see
+          `r2s.estimation.initial_shape`; else flat.
+
+        Raises `ValueError` when a marker is not seen in the first frame, or lies off the sheet
+        there.
         """
         scenario = from_recording(recording, shape)
         first, last = recording.info.frames_used
@@ -150,7 +157,7 @@ class Problem(eqx.Module):
 
 
 def window(problem: Problem, first: int, last: int) -> Problem:
-    """The problem with only those of its frames count that lie within `first` to `last`.
+    """The problem in which only the frames from `first` to `last` count.
 
     Raises `ValueError` when none does.
     """
@@ -161,11 +168,12 @@ def window(problem: Problem, first: int, last: int) -> Problem:
             f"{problem.frames[-1]}"
         )
     index = jnp.array(kept)
-    pick = lambda part, names: (
-        None
-        if part is None
-        else dataclasses.replace(part, **{name: getattr(part, name)[index] for name in names})
-    )
+
+    def pick(part: Any, names: tuple[str, str]) -> Any:
+        if part is None:
+            return None
+        return dataclasses.replace(part, **{name: getattr(part, name)[index] for name in names})
+
     return dataclasses.replace(
         problem,
         frames=tuple(problem.frames[i] for i in kept),
@@ -176,10 +184,10 @@ def window(problem: Problem, first: int, last: int) -> Problem:
 
 
 def beginning(problem: Problem, share: float) -> Problem:
-    """The problem with nothing seen after a share of the frames in which something was.
+    """The problem with nothing seen after a share of the frames in which something was seen.
 
-    One frame at least is kept. Of the same shapes, so that what is compiled for the problem serves
-    this one.
+    At least one frame is kept. Its arrays have the same shapes, so that what is compiled for the
+    problem serves this one.
     """
 
     def hide(part: Any, name: str) -> Any:
@@ -201,7 +209,7 @@ def beginning(problem: Problem, share: float) -> Problem:
 
 
 def _markers(recording: Recording, mesh: Mesh, frames: slice) -> Markers | None:
-    """The markers, which are taken to lie on the sheet at rest where the first frame shows them."""
+    """The markers, assumed to lie on the sheet at rest where the first frame shows them."""
     if recording.markers is None or recording.markers_seen is None:
         return None
     sheet, seen = recording.info.sheet, np.asarray(recording.markers_seen)
@@ -210,8 +218,10 @@ def _markers(recording: Recording, mesh: Mesh, frames: slice) -> Markers | None:
         raise ValueError(f"{recording.info.name}, frame 0: markers {lost} are not seen at rest")
     offset = np.asarray(recording.markers[0]) - np.asarray(sheet.origin)
     material = offset @ np.array([sheet.warp, sheet.weft]).T
-    flat = lambda places: jnp.pad(jnp.asarray(places, float), ((0, 0), (0, 1)))
-    face, weights = nearest(flat(material), flat(mesh.rest), mesh.faces)
+    flat, rest = (
+        jnp.pad(jnp.asarray(places, float), ((0, 0), (0, 1))) for places in (material, mesh.rest)
+    )
+    face, weights = nearest(flat, rest, mesh.faces)
     away = np.linalg.norm(
         np.einsum("mk,mki->mi", weights, np.asarray(mesh.rest)[np.asarray(mesh.faces)[face]])
         - material,
@@ -234,8 +244,8 @@ def _force(recording: Recording, frames: slice) -> Force | None:
     scalar = log.ndim == 1
     times = np.asarray(recording.times)[frames]
     columns = log[:, None] if scalar else log
-    at = lambda column: np.interp(times, np.asarray(recording.force_times), column)
-    values = np.stack([at(column) for column in columns.T], axis=1)
+    clock = np.asarray(recording.force_times)
+    values = np.stack([np.interp(times, clock, column) for column in columns.T], axis=1)
     directions = np.array([recording.info.sheet.warp]) if scalar else np.eye(3)
     seen = jnp.ones(len(values), bool)
     return Force(jnp.asarray(values, float), seen, jnp.asarray(directions, float))

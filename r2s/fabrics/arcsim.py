@@ -82,17 +82,14 @@ def read_material(
             f"[m] positive, got {damping}, {friction}, {mass_damping} and {thickness}"
         )
     material = read_json(path, Material)
-    array = lambda value: jnp.asarray(value, float)
     membrane = DiffSimTableMembrane if diffsim else TableMembrane
     bending = DiffSimTableBending if diffsim else TableBending
+    others = (damping, friction, thickness, mass_damping)
     return Fabric(
-        density=array(material.density),
-        membrane=membrane(array(material.stretching)),
-        bending=bending(array(material.bending)),
-        damping=array(damping),
-        friction=array(friction),
-        thickness=array(thickness),
-        mass_damping=array(mass_damping),
+        jnp.asarray(material.density, float),
+        membrane(jnp.asarray(material.stretching, float)),
+        bending(jnp.asarray(material.bending, float)),
+        *(jnp.asarray(number, float) for number in others),
     )
 
 

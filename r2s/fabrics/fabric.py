@@ -14,8 +14,8 @@ class Fabric(eqx.Module):
     """A fabric. A leading batch axis on every field makes it a sweep, for `jax.vmap`.
 
     - `density`: areal density, [kg/m^2].
-    - `membrane`, `bending`: the laws of its energies, any `MembraneLaw` [N/m], and any `PlateLaw`
-      or `BendingLaw` [N m], of `r2s.laws`.
+    - `membrane`, `bending`: the laws of its energies, of `r2s.laws`: any `MembraneLaw` [N/m], and
+      any `PlateLaw` or `BendingLaw` [N m].
     - `damping`: stiffness-proportional (Kelvin-Voigt) damping time, [s]: the viscous stress is
       `damping` times the stiffness times the rate of strain.
     - `friction`: Coulomb coefficient against the table, [-].
@@ -68,15 +68,13 @@ class Fabric(eqx.Module):
                 "bending stiffness [N m], damping [s], friction [-] and mass damping [1/s] must "
                 f"not be negative, got {bending}, {damping}, {friction} and {mass_damping}"
             )
-        array = lambda value: jnp.asarray(value, float)
+        stiffnesses = (jnp.asarray(number, float) for number in membrane)
+        others = (damping, friction, thickness, mass_damping)
         return cls(
-            density=array(density),
-            membrane=OrthotropicMembrane(array(c11), array(c12), array(c22), array(c33)),
-            bending=PlateBending.make(bending),
-            damping=array(damping),
-            friction=array(friction),
-            thickness=array(thickness),
-            mass_damping=array(mass_damping),
+            jnp.asarray(density, float),
+            OrthotropicMembrane(*stiffnesses),
+            PlateBending.make(bending),
+            *(jnp.asarray(number, float) for number in others),
         )
 
 

@@ -1,4 +1,4 @@
-"""Families: which numbers of a fabric an estimator may move, and within which bounds.
+"""Parameter spaces: which numbers of a fabric an estimator may move, and within which bounds.
 
 A space maps a point of the unit cube to a fabric, so that one flat vector serves gradients,
 sensitivities, multi-start and sampling.
@@ -6,6 +6,7 @@ sensitivities, multi-start and sampling.
 
 import abc
 import dataclasses
+import math
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -34,18 +35,23 @@ class Range:
                 f"got {self.low} to {self.high} {self.unit}"
             )
 
-    def value(self, u: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    @property
+    def width(self) -> float:
+        """High less low; on a logarithmic scale the logarithm of their ratio, [-]."""
+        return math.log(self.high / self.low) if self.log else self.high - self.low
+
+    def from_unit(self, u: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """The parameter at a place `u` in 0..1 between its bounds.
 
-        >>> round(float(Range("warp", "N/m", 3.0, 3000.0).value(jnp.asarray(0.5))), 1)
+        >>> round(float(Range("warp", "N/m", 3.0, 3000.0).from_unit(jnp.asarray(0.5))), 1)
         94.9
         """
         if self.log:
             return jnp.exp(jnp.log(self.low) * (1 - u) + jnp.log(self.high) * u)
         return self.low * (1 - u) + self.high * u
 
-    def place(self, value: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        """The inverse of `value`."""
+    def to_unit(self, value: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """The inverse of `from_unit`."""
         scale = jnp.log if self.log else jnp.asarray
         low, high = scale(jnp.asarray(self.low, float)), scale(jnp.asarray(self.high, float))
         return (scale(value) - low) / (high - low)
@@ -64,7 +70,7 @@ class ParameterSpace(eqx.Module):
         """The fabric at a point of the unit cube."""
 
     @abc.abstractmethod
-    def locate(self, fabric: Fabric) -> Float[Array, " dim"]:
+    def to_unit(self, fabric: Fabric) -> Float[Array, " dim"]:
         """The point of the unit cube where a fabric lies; outside of it, beyond the bounds."""
 
     @property
@@ -74,7 +80,7 @@ class ParameterSpace(eqx.Module):
 
     def values(self, u: Float[Array, " dim"]) -> Float[Array, " dim"]:
         """The parameters, in the order and the units of `ranges`, at a point of the unit cube."""
-        return jnp.stack([bound.value(u[i]) for i, bound in enumerate(self.ranges)])
+        return jnp.stack([bound.from_unit(u[i]) for i, bound in enumerate(self.ranges)])
 
     def middle(self) -> Fabric:
         """The fabric in the middle of all ranges: what one assumes knowing nothing."""
@@ -82,17 +88,23 @@ class ParameterSpace(eqx.Module):
 
 
 class OrthotropicSpace(ParameterSpace):
-    """Fabrics of one areal density, in all that a motion may determine.
+    """Orthotropic fabrics of a given areal density.
 
-    Stiffness in a uniaxial pull along warp and weft [N/m], which is C11 and C22 less C12^2 over the
-    other one: a motion determines that, where C11 alone would go up and down with C12. Shear
-    stiffness C33 [N/m]. Coupling C12 / sqrt(C11 C22) [-], within -1..1, so that C stays positive
-    definite while C12 may be negative. Bending stiffness [N m]; damping [s]; friction [-]; and,
-    when it is the last of the ranges, mass damping [1/s], else none.
+    Parameters:
 
-    - `density`: areal density, [kg/m^2], an input: a motion under gravity determines only the
-      ratio of stiffness to density.
-    - `thickness`: [m].
+    - warp, weft: stiffness in a uniaxial pull [N/m], which is C11 and C22 less C12^2 over the other
+      one. A motion determines these, where C11 alone would go up and down with C12.
+    - shear: C33 [N/m].
+    - coupling: C12 / sqrt(C11 C22) [-], within -1..1, so that C stays positive definite while C12
+      may be negative.
+    - bending [N m], damping [s], friction [-].
+    - mass damping [1/s], when it is the last of the ranges; else there is none.
+
+    Fields:
+
+    - `density`: areal density, [kg/m^2]. It is given, since a motion under gravity determines only
+      the ratio of stiffness to density.
+    - `thickness`: contact thickness, [m].
     """
 
     density: Float[Array, ""]
@@ -144,14 +156,14 @@ class OrthotropicSpace(ParameterSpace):
             others[0] if others else jnp.zeros((), float),
         )
 
-    def locate(self, fabric: Fabric) -> Float[Array, " dim"]:
+    def to_unit(self, fabric: Fabric) -> Float[Array, " dim"]:
         """The point of the unit cube where a fabric lies; outside of it, beyond the bounds."""
         law, bending = constant_laws(fabric)
         coupling = law.c12 / jnp.sqrt(law.c11 * law.c22)
         held = 1 - coupling**2
         values = (held * law.c11, held * law.c22, law.c33, coupling, bending.stiffness)
         values += (fabric.damping, fabric.friction, fabric.mass_damping)[: self.dim - 5]
-        places = [bound.place(value) for bound, value in zip(self.ranges, values, strict=True)]
+        places = [bound.to_unit(value) for bound, value in zip(self.ranges, values, strict=True)]
         return jnp.stack(places)
 
 
@@ -188,13 +200,12 @@ class IsotropicSpace(ParameterSpace):
                 f"[s] and friction not negative, got {density}, {plate}, {thickness}, {damping} "
                 f"and {friction}"
             )
-        array = lambda value: jnp.asarray(value, float)
         return cls(
-            density=array(density),
-            plate=array(plate),
-            damping=array(damping),
-            friction=array(friction),
-            thickness=array(thickness),
+            density=jnp.asarray(density, float),
+            plate=jnp.asarray(plate, float),
+            damping=jnp.asarray(damping, float),
+            friction=jnp.asarray(friction, float),
+            thickness=jnp.asarray(thickness, float),
         )
 
     def __call__(self, u: Float[Array, " dim"]) -> Fabric:
@@ -213,11 +224,11 @@ class IsotropicSpace(ParameterSpace):
             jnp.zeros((), float),
         )
 
-    def locate(self, fabric: Fabric) -> Float[Array, " dim"]:
+    def to_unit(self, fabric: Fabric) -> Float[Array, " dim"]:
         """The point where the isotropic part of a fabric's membrane lies: C11 and C22 averaged."""
         law, _ = constant_laws(fabric)
         stiffness = (law.c11 + law.c22) / 2
         ratio = law.c12 / stiffness
         values = ((1 - ratio**2) * stiffness, ratio)
-        places = [bound.place(value) for bound, value in zip(self.ranges, values, strict=True)]
+        places = [bound.to_unit(value) for bound, value in zip(self.ranges, values, strict=True)]
         return jnp.stack(places)

@@ -122,7 +122,7 @@ def record(
     balance = None
     if experiment.name == "stretching":
         balance = _energy_balance(scenario, fabric, max_step, made)
-    x = balance.x if balance else _rollout(scenario, fabric, max_step, made).x
+    x = balance.x if balance is not None else _rollout(scenario, fabric, max_step, made).x
     if not jnp.all(jnp.isfinite(x)):
         failure = _rollout(scenario, fabric, max_step, made).explain()
         raise RuntimeError(f"the simulation of {name} {failure}")

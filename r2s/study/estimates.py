@@ -1,41 +1,37 @@
 """Cells that estimate: each approach from each scenario, on either solver."""
 
 import json
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import jax
-import jax.numpy as jnp
 import jax.random as jr
-import numpy as np
 
-from r2s.estimation import diffcloud, diffcp
-from r2s.estimation.descent import DEFAULT
-from r2s.estimation.estimate import Estimate, as_json, from_json
-from r2s.estimation.physnet import dataset, estimator, preprocess, training
-from r2s.estimation.problem import Problem
+from r2s.estimation.estimate import Estimate
+from r2s.estimation.estimate_json import as_json, from_json
+from r2s.estimation.method import Budget, Method, default_space
+from r2s.estimation.physnet.method import TrainingBudget, train_network
+from r2s.estimation.registry import METHODS
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace
 from r2s.files import write_json
-from r2s.recordings.recording import Recording
-from r2s.scenarios.on_points import material_points
-from r2s.scenarios.scenario import from_recording
 from r2s.study.cells import Cell, result_files
 from r2s.study.sources import Source, read
 
 ESTIMATE, NETWORK = "estimate.json", "network.eqx"
-COARSE = (7, 7)  # vertices of a sheet of material points in an estimate
+SHAPES = {"cloth": (9, 9), "points": (7, 7)}  # vertices of the simulated sheet
+APPROACHES = ("diffcloud", "diffcp", "physnet", "pinn")
+SOLVERS = {name: tuple(METHODS[name].supports) for name in APPROACHES}
 
 
 @dataclass(frozen=True)
 class Budgets:
     """What estimates may cost.
 
-    - `coarse`, `starts`, `iterations`: of DIFFCLOUD, as of `r2s.estimation.descent.Effort`.
+    - `coarse`, `starts`, `iterations`: of DIFFCLOUD, see `r2s.estimation.method.Budget`.
     - `points_coarse`, `points_starts`, `points_iterations`: likewise of DiffCP.
-    - `calls`: simulations of PhysNet's search. - `fabrics`, `epochs`, `steps`: of its training.
+    - `calls`: simulations of PhysNet's search.
+    - `fabrics`, `epochs`, `steps`: of the training of its network.
     """
 
     coarse: int = 24
@@ -68,26 +64,8 @@ class TrainedNetwork(Cell):
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
         """A trained network; the simulated images are not kept."""
-        settings = dataset.Settings(self.scenario, self.spent.fabrics, seed=self.seed)
-        if self.solver == "points":
-            settings = dataset.Settings(
-                self.scenario,
-                self.spent.fabrics,
-                num_levels=3,
-                shape=COARSE,
-                per_shard=4,
-                material_points=True,
-                isotropic=True,
-                seed=self.seed,
-            )
-        view = dataset.make(out / "data", settings, progress=False).view
-        schedule = training.Schedule(
-            epochs=self.spent.epochs, steps=self.spent.steps, seed=self.seed
-        )
-        trained = training.train(
-            training.begin(view, schedule=schedule), dataset.load(out / "data"), out / NETWORK
-        )
-        shutil.rmtree(out / "data")
+        spent = TrainingBudget(self.spent.fabrics, self.spent.epochs, self.spent.steps)
+        trained = train_network(out / NETWORK, self.scenario, self.solver, spent, self.seed)
         return {"seed": self.seed, "triplet_accuracy": trained.curve[-1].accuracy}
 
 
@@ -95,9 +73,11 @@ class TrainedNetwork(Cell):
 class EstimateCell(Cell):
     """An estimate of a fabric.
 
-    - `approach`: "diffcloud", "diffcp", "physnet" or "pinn". - `solver`: "cloth" or "points".
+    - `approach`: "diffcloud", "diffcp", "physnet" or "pinn".
+    - `solver`: "cloth" or "points".
     - `sources`: the recordings, of one scenario; several for the pulls of "pinn" alone.
-    - `density`: areal, as weighed [kg/m^2]. - `network`: of "physnet".
+    - `density`: areal density as weighed, [kg/m^2].
+    - `network`: of "physnet".
     """
 
     kind: ClassVar[str] = "estimates"
@@ -135,9 +115,9 @@ class EstimateCell(Cell):
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
         """An estimate; one whose every simulation diverged is a result too, and says so."""
         recordings = [read(source, folder) for source in self.sources]
-        space = family_of(self.solver, self.density)
+        space = default_space(self.solver, self.density)
         try:
-            found = _ESTIMATORS[self.approach](self, space, recordings, folder)
+            found = self._estimated(recordings, space, folder)
         except jax.errors.JaxRuntimeError:  # out of memory, say: no result, to be tried again
             raise
         except (RuntimeError, FloatingPointError) as error:
@@ -145,19 +125,38 @@ class EstimateCell(Cell):
         write_json(out / ESTIMATE, as_json(found))
         return {"seed": self.repeat, "diverged": ""}
 
+    def _estimated(self, recordings, space, folder: Path) -> Estimate:
+        key, budget = jr.key(self.repeat), self._budget()
+        if self.approach != "physnet":
+            return self._method().estimate(recordings, space, budget, key=key)
+        if self.network is None:
+            raise ValueError("PhysNet needs a trained network")
+        with result_files(self.network, folder) as files:
+            method = self._method(network=files / NETWORK)
+            return method.estimate(recordings, space, budget, key=key)
 
-SOLVERS = {
-    "diffcloud": ("cloth",),
-    "diffcp": ("points",),
-    "physnet": ("cloth", "points"),
-    "pinn": ("cloth", "points"),
-}
+    def _method(self, **others: Any) -> Method:
+        if self.approach == "pinn":
+            others["angles"] = tuple(getattr(each, "angle", None) or 0.0 for each in self.sources)
+        return METHODS[self.approach](solver=self.solver, shape=SHAPES[self.solver], **others)
 
-
-def family_of(solver: str, density: float) -> ParameterSpace:
-    """Among which fabrics is estimated: orthotropic on the cloth, isotropic on material points."""
-    make = OrthotropicSpace.make if solver == "cloth" else IsotropicSpace.make
-    return make(density)
+    def _budget(self) -> Budget:
+        spent, usual = self.spent, METHODS[self.approach].budget
+        numbers = {
+            "diffcloud": {
+                "coarse": spent.coarse,
+                "starts": spent.starts,
+                "iterations": spent.iterations,
+            },
+            "diffcp": {
+                "coarse": spent.points_coarse,
+                "starts": spent.points_starts,
+                "iterations": spent.points_iterations,
+            },
+            "physnet": {"evaluations": spent.calls},
+            "pinn": {},
+        }
+        return usual._replace(**numbers[self.approach])
 
 
 def read_estimate(cell: EstimateCell, folder: Path) -> Estimate | None:
@@ -170,61 +169,4 @@ def read_estimate(cell: EstimateCell, folder: Path) -> Estimate | None:
 
 def default_fabric(solver: str, density: float) -> Fabric:
     """What a study compares with: the middle of the space."""
-    space = family_of(solver, density)
-    return space(jnp.full(space.dim, 0.5, float))
-
-
-def _diffcloud(cell: EstimateCell, space, recordings: list[Recording], folder: Path) -> Estimate:
-    del folder
-    spent = cell.spent
-    budget = DEFAULT._replace(coarse=spent.coarse, starts=spent.starts, iterations=spent.iterations)
-    problem = Problem.make(recordings[0], space)
-    return diffcloud.estimate(problem, budget, key=jr.key(cell.repeat))
-
-
-def _diffcp(cell: EstimateCell, space, recordings: list[Recording], folder: Path) -> Estimate:
-    del folder
-    spent = cell.spent
-    about = {
-        "coarse": spent.points_coarse,
-        "starts": spent.points_starts,
-        "iterations": spent.points_iterations,
-    }
-    budget = diffcp.DEFAULT._replace(**about)
-    problem = Problem.make(recordings[0], space, shape=COARSE, as_seen=False)
-    return diffcp.estimate(diffcp.on_points(problem), budget, key=jr.key(cell.repeat))
-
-
-def _physnet(cell: EstimateCell, space: ParameterSpace, recordings: list[Recording], folder: Path):
-    if cell.network is None:
-        raise ValueError("PhysNet needs a trained network")
-    with result_files(cell.network, folder) as files:
-        trained = training.load(files / NETWORK)
-    recording, on_cloth = recordings[0], cell.solver == "cloth"
-    scenario = from_recording(recording, (9, 9) if on_cloth else COARSE)
-    frames = dataset.kept_frames(recording.info.frames_used, dataset.Settings.num_frames)
-    images = preprocess.of_clouds(trained.view, recording, frames)
-    stiffest = space(jnp.ones(space.dim, float))
-    solver = None if on_cloth else material_points(scenario, stiffest)
-    seen = estimator.Sighting.make(scenario, images, frames, space, trained, solver)
-    return estimator.estimate(seen, num_calls=cell.spent.calls, seed=cell.repeat)
-
-
-def _pinn(
-    cell: EstimateCell, space: ParameterSpace, recordings: list[Recording], folder: Path
-) -> Estimate:
-    from r2s.estimation.pinn import from_clouds, from_pulls  # need flax
-    from r2s.estimation.pinn.pulls import pull_from
-
-    del folder
-    if cell.scenario != "stretching":
-        return from_clouds.estimate(recordings[0], space, key=jr.key(cell.repeat))
-    angles = [getattr(source, "angle", None) or 0.0 for source in cell.sources]
-    pulls = [
-        pull_from(recording, float(np.radians(angle)))
-        for recording, angle in zip(recordings, angles, strict=True)
-    ]
-    return from_pulls.estimate(pulls, space, key=jr.key(cell.repeat)).estimate
-
-
-_ESTIMATORS = {"diffcloud": _diffcloud, "diffcp": _diffcp, "physnet": _physnet, "pinn": _pinn}
+    return default_space(solver, density).middle()

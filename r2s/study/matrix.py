@@ -6,10 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from r2s.estimation.method import default_space
 from r2s.fabrics import presets
 from r2s.scenarios.paths import ESTIMATION, EVALUATION
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
-from r2s.study.estimates import SOLVERS, Budgets, EstimateCell, TrainedNetwork, family_of
+from r2s.study.estimates import SOLVERS, Budgets, EstimateCell, TrainedNetwork
 from r2s.study.evaluations import EvaluationCell
 from r2s.study.sources import (
     GivenRecording,
@@ -183,7 +184,7 @@ def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationCell]:
     `find_recordings` raises, and `ValueError` for a density that is none, when no configuration
     has a recording to estimate from, or none is there to judge by.
     """
-    family_of("cloth", density)  # refuses a density that is none
+    default_space("cloth", density)  # refuses a density that is none
     # clouds of real cameras need all of the search, and there are few frames to judge by
     search = {name: getattr(Budgets, name) for name in ("coarse", "starts", "iterations")}
     plan = dataclasses.replace(plan, budgets=dataclasses.replace(plan.budgets, **search), every=1)

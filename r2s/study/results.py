@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from r2s.estimation.method import default_space
 from r2s.evaluation import prediction_error
 from r2s.files import write_text
 from r2s.recordings.recording import Recording, cloud
 from r2s.scenarios.scenario import from_recording
 from r2s.study.cells import Cell, result_files, with_dependencies
 from r2s.study.costs import cost_table, costs, forecast
-from r2s.study.estimates import ESTIMATE, EstimateCell, family_of, read_estimate
+from r2s.study.estimates import ESTIMATE, EstimateCell, read_estimate
 from r2s.study.evaluations import EvaluationCell, read_measured, read_motion
 from r2s.study.matrix import PRESETS, Plan
 from r2s.study.report.motions import MotionComparison
@@ -188,8 +189,8 @@ def _true_values(cell: EstimateCell, count: int) -> np.ndarray:
     is_known = isinstance(source, SyntheticRecording) and not source.truth.materials
     if cell.solver != "cloth" or not is_known:
         return np.full(count, np.nan)
-    space = family_of("cloth", cell.density)
-    return np.asarray(space.values(space.locate(small_strain(cell.fabric))))
+    space = default_space("cloth", cell.density)
+    return np.asarray(space.values(space.to_unit(small_strain(cell.fabric))))
 
 
 def motion_comparisons(cells: Iterable[EvaluationCell], folder: Path) -> list[MotionComparison]:

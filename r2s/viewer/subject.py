@@ -74,7 +74,7 @@ def of_experiment(
 
 def place(subject: Subject, fabric: Fabric) -> Float[Array, " dim"]:
     """Where a fabric lies in the subject's space, at its bounds when beyond them."""
-    return jnp.clip(subject.space.locate(fabric), 0, 1)
+    return jnp.clip(subject.space.to_unit(fabric), 0, 1)
 
 
 @eqx.filter_jit

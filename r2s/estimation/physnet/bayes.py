@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from r2s.estimation.physnet import search_file
+from r2s.estimation import checkpoint
 
-FORMAT = "r2s-search/2"
 Objective = Callable[[Float[np.ndarray, "place dim"]], Float[np.ndarray, " place"]]
 UNKNOWN_PENALTY = 1.0  # of a failed call while no loss is finite
 LEAST = 1e-6  # of the greatest loss: lower losses count as this on the logarithmic scale
@@ -77,9 +76,9 @@ def ask(
     2010). Candidates are random places, half of them anywhere and half around the best. History and
     seed alone determine the result, so that a search continues from a file as if uninterrupted.
 
-    It is our own, since scikit-optimize's `Optimizer` (expected improvement, refined by L-BFGS) found
-    median losses 50, 11 and 15 % higher in 60 calls on three losses in seven dimensions, at 13
-    times the CPU time (`benchmarks/bayes.py`): 21 to 27 % of its places lay on the cube's faces.
+    The search is our own: scikit-optimize's `Optimizer` (expected improvement) had median losses
+    50, 11 and 15 % higher after 60 calls on three losses in seven dimensions, at 13 times the CPU
+    time, with 21 to 27 % of its places on faces of the cube (`benchmarks/bayes.py`).
     """
     done, dim = history.places.shape
     if done < num_first:
@@ -142,17 +141,17 @@ def minimise(
 
     Raises `ValueError` when the file is of another search.
     """
-    settings = {"dim": dim, "batch": batch, "num_first": num_first, "seed": seed}
+    run = {"kind": "Bayesian optimisation", "dim": dim, "batch": batch}
+    run |= {"num_first": num_first, "seed": seed}
     history = begin(dim)
-    if path is not None and Path(path).exists():
-        history = History(*search_file.read(path, FORMAT, ("places", "losses"), settings))
+    if path is not None and (stored := checkpoint.load(path, run)) is not None:
+        history = History(**stored)
     while len(history.losses) < num_calls:
         number = min(batch, num_calls - len(history.losses))
         places = ask(history, number, num_first=num_first, seed=seed)
         history = tell(history, places, objective(places))
         if path is not None:
-            arrays = {"places": history.places, "losses": history.losses}
-            search_file.write(path, FORMAT, arrays, settings)
+            checkpoint.save(path, vars(history), run)
         if progress is not None:
             progress(history)
     return history

@@ -13,10 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from r2s.estimation.physnet import search_file
+from r2s.estimation import checkpoint
 from r2s.estimation.physnet.bayes import CENTRES, candidates, even
 
-FORMAT = "r2s-trials/1"
 COMPONENTS = 10  # principal components of the answers, at most
 FIRST = 0.4  # share of the calls that fill the cube evenly
 Respond = Callable[[Float[np.ndarray, "place dim"]], Float[np.ndarray, "place part"]]
@@ -59,10 +58,10 @@ def minimise(
     """
     if num_calls < dim + 2:
         raise ValueError(f"expected at least {dim + 2} calls in {dim} dimensions, got {num_calls}")
-    settings = {"dim": dim, "calls": num_calls, "batch": batch, "seed": seed}
+    run = {"kind": "emulated search", "dim": dim, "calls": num_calls, "batch": batch, "seed": seed}
     trials = Trials(np.zeros((0, dim)), np.zeros((0, len(target))))
-    if path is not None and Path(path).exists():
-        trials = Trials(*search_file.read(path, FORMAT, Trials._fields, settings))
+    if path is not None and (stored := checkpoint.load(path, run)) is not None:
+        trials = Trials(**stored)
     first = even(dim, max(int(FIRST * num_calls), dim + 1), seed)
     while (done := len(trials.places)) < num_calls:
         if done < len(first):
@@ -75,7 +74,7 @@ def minimise(
         told = np.concatenate([trials.answers, answers])
         trials = Trials(np.concatenate([trials.places, places]), told)
         if path is not None:
-            search_file.write(path, FORMAT, trials._asdict(), settings)
+            checkpoint.save(path, trials._asdict(), run)
         if progress is not None:
             progress(trials)
     return trials

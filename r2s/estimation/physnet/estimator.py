@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r2s.estimation.estimate import Estimate, without_standard_errors
+from r2s.estimation.estimate import Estimate, point_estimate
 from r2s.estimation.physnet import bayes, emulator
 from r2s.estimation.physnet.network import PhysNet
 from r2s.estimation.physnet.preprocess import grey
@@ -131,7 +131,7 @@ def _flat(points: Float[Array, "frame dim"]) -> Float[Array, " part"]:
     return points.reshape(-1) * jnp.sqrt(jnp.asarray(points.shape[-1], points.dtype))
 
 
-def target(sighting: Sighting) -> Float[np.ndarray, " part"]:
+def target_of(sighting: Sighting) -> Float[np.ndarray, " part"]:
     """The answer that a search is to reach: that of the recorded images."""
     return np.asarray(_flat(sighting.points))
 
@@ -147,6 +147,19 @@ def responses(
         return np.asarray(answers(sighting, jnp.asarray(padded, float)))[: len(places)]
 
     return respond
+
+
+def objective(sighting: Sighting, batch: int) -> bayes.Objective:
+    """The function from up to `batch` places to the rms distances of their frames on the map.
+
+    A distance is NaN where the simulation diverges.
+    """
+    respond, recorded = responses(sighting, batch), target_of(sighting)
+
+    def distances(places: Float[np.ndarray, "place dim"]) -> Float[np.ndarray, " place"]:
+        return np.sqrt(((respond(places) - recorded) ** 2).mean(axis=1))
+
+    return distances
 
 
 def estimate(
@@ -172,7 +185,7 @@ def estimate(
     began = time.perf_counter()
     trials = emulator.minimise(
         responses(sighting, batch),
-        target(sighting),
+        target_of(sighting),
         sighting.space.dim,
         num_calls=num_calls,
         batch=batch,
@@ -181,7 +194,7 @@ def estimate(
         path=path,
         progress=progress,
     )
-    losses = trials.losses(target(sighting))
+    losses = trials.losses(target_of(sighting))
     if not np.isfinite(losses[-1]):
         raise RuntimeError("the simulation of the estimate diverged: narrow the ranges")
     name = f"physnet (emulated answers, {num_calls} simulations)"
@@ -203,13 +216,8 @@ def published_recipe(
     study of Duan et al. The arguments are those of `estimate`.
     """
     began = time.perf_counter()
-    respond, recorded = responses(sighting, batch), target(sighting)
-
-    def distances(places):
-        return np.sqrt(((respond(places) - recorded) ** 2).mean(axis=1))
-
     history = bayes.minimise(
-        distances,
+        objective(sighting, batch),
         sighting.space.dim,
         num_calls=num_calls,
         batch=batch,
@@ -224,7 +232,7 @@ def published_recipe(
 def _estimate(sighting: Sighting, name: str, places, losses, best: int, began: float) -> Estimate:
     space = sighting.space
     values = np.asarray(jax.vmap(space.values)(jnp.asarray(places, float)))
-    return without_standard_errors(
+    return point_estimate(
         name,
         space,
         jnp.asarray(places[best], float),

@@ -168,7 +168,7 @@ def estimate(
 ) -> Estimate:
     """The fabric of a recording of a sheet that is lifted or hangs, from its clouds.
 
-    An estimate that still moved in its last round says "not converged", and has no standard errors.
+    An estimate that still moved in its last round has not converged, and has no standard errors.
 
     - `begin`: place in the space of the fabric to begin with, by default the middle.
     - `report`: called after each round with its number, the spread of the distances [m] and the
@@ -191,7 +191,7 @@ def estimate(
     found = _rounds(shared, sight, held, theta, recording.info.sheet.held, settings, report)
     in_wind = recording.info.wind is not None
     alike = len(frames) if in_wind else max(1.0, ALIKE * len(frames) / _counted(recording))
-    words = f"clouds of {recording.info.scenario}" + ("" if found.settled else ", not converged")
+    words = f"clouds of {recording.info.scenario}"
     return _estimate(words, space, found, alike, time.perf_counter() - began)
 
 
@@ -387,4 +387,5 @@ def _estimate(
         losses=squares,
         history=np.stack([values for _, values in found.history])[:, None],
         seconds=seconds,
+        converged=found.settled,
     )

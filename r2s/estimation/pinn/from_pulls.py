@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from r2s.estimation.estimate import Estimate, Nuisance, without_standard_errors
+from r2s.estimation.estimate import Estimate, Nuisance, point_estimate
 from r2s.estimation.pinn.balance import Balanced, balance
 from r2s.estimation.pinn.losses import Losses
 from r2s.estimation.pinn.network import Network
@@ -126,7 +126,7 @@ def _found(
         words += ", no force: the scale of stiffness is not identifiable"
     form = "weak form" if recipe.losses is weak_losses else "strong form"
     squares = np.asarray(trained.losses.data)[which] * noise[0] ** 2
-    network = without_standard_errors(
+    network = point_estimate(
         f"pinn ({form}, {words})",
         space,
         model.place,
@@ -205,4 +205,5 @@ def _estimate(
         losses=np.concatenate([network.losses, found.losses[:, None]]),
         history=np.concatenate([network.history, steps]),
         seconds=seconds,
+        converged=found.converged,
     )

@@ -314,10 +314,10 @@ def train(
 
     progress = jax.vmap(begin)(spaces, pulls, jr.split(key_init, number))
     history: list[tuple[Losses, Array]] = []
-    problem = ""
+    run = {"kind": "training of networks"}
     if checkpoint is not None:
-        problem = checkpoints.fingerprint(spaces, pulls, weights, _settings(recipe), key)
-        progress, history = _resumed(checkpoint, problem, progress)
+        run["run"] = checkpoints.fingerprint(spaces, pulls, weights, _settings(recipe), key)
+        progress, history = _resumed(checkpoint, run, progress)
     for chunk in range(len(history), recipe.chunks):
         make = adam_chunk if chunk < recipe.adam_chunks else lbfgs_chunk
         key_chunk = jr.fold_in(key_chunks, chunk)
@@ -326,7 +326,8 @@ def train(
             raise RuntimeError(f"training diverged in chunk {chunk + 1}: {losses}")
         history.append((losses, progress.model.place))
         if checkpoint is not None:
-            checkpoints.save(checkpoint, problem, [(progress, _stacked(history))])
+            arrays = checkpoints.arrays_of((progress, _stacked(history)))
+            checkpoints.save(checkpoint, arrays, run)
         if report is not None:
             report(chunk, losses)
     losses, places = jax.tree.map(np.asarray, _stacked(history))
@@ -338,14 +339,14 @@ def _stacked(history: list[tuple[Losses, Array]]) -> tuple[Losses, Array]:
     return jax.tree.map(lambda *values: jnp.stack(values, 1), *history)
 
 
-def _resumed(path: Path, problem: str, progress: Progress):
+def _resumed(path: Path, run: dict[str, str], progress: Progress):
     """The state of a training and its history, from a checkpoint if there is one."""
     place = progress.model.place
     likeness = progress, (Losses(place, place, place, place, place), place)
-    stored = checkpoints.load(path, problem, likeness)
-    if not stored:
+    stored = checkpoints.load(path, run)
+    if stored is None:
         return progress, []
-    progress, course = stored[0]
+    progress, course = checkpoints.tree_from(stored, likeness)
     chunks = range(course[1].shape[1])
     return progress, [jax.tree.map(lambda values, at=at: values[:, at], course) for at in chunks]
 

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.estimation import descent, diffcloud, gauss_newton
-from r2s.estimation.descent import Budget, nuisances, spread_of
-from r2s.estimation.experiment_design import describe
+from r2s.estimation import descent, gauss_newton
+from r2s.estimation.descent import Budget, covariance_at, descend, nuisances
+from r2s.estimation.estimate import describe
 from r2s.estimation.gauss_newton import Descent, Normal
 from r2s.estimation.prediction import predict
 from r2s.estimation.problem import NuisancePrior, Problem, beginning
-from r2s.estimation.standard_errors import FARTHEST, apart, around, covariance
+from r2s.estimation.standard_errors import FARTHEST, covariance, disagreement, sample_around
 from r2s.fabrics import presets
 from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.scenarios import synthetic
@@ -45,13 +45,16 @@ def lifted():
 def test_heavier_stiffer_and_in_denser_air_a_sheet_moves_alike(blown):
     """All forces and the mass by one factor: without it known, wind cannot tell the three apart."""
     problem = dataclasses.replace(blown, nuisance_prior=NuisancePrior(density=0.5, air=0.5))
-    place, change = FAMILY.locate(FABRIC), np.log(RATIO)
+    place, change = FAMILY.to_unit(FABRIC), np.log(RATIO)
     wider = [
         change / np.log(b.high / b.low) if b.name in ("warp", "weft", "shear", "bending") else 0.0
         for b in FAMILY.ranges
     ]
     seen = jax.jit(lambda u: predict(problem, u).x)
-    at = lambda place, *ratios: seen(jnp.concatenate([place, jnp.array(ratios), jnp.zeros(5)]))
+
+    def at(place, *ratios):
+        return seen(jnp.concatenate([place, jnp.array(ratios), jnp.zeros(5)]))
+
     plain, scaled = at(place, 0.0, 0.0), at(place + jnp.array(wider), *(change / 0.5,) * 2)
     heavier = at(place + jnp.array(wider), change / 0.5, 0.0)
     np.testing.assert_allclose(scaled, plain, atol=1e-6)
@@ -62,14 +65,20 @@ def test_the_air_is_in_doubt_where_a_wind_blows(blown, lifted):
     assert (
         blown.nuisance_prior == NuisancePrior(air=0.1) and lifted.nuisance_prior == NuisancePrior()
     )
-    unknown = np.arange(19.0)
-    names = lambda *problems: [c.name for c in nuisances(problems, unknown, unknown)]
+    theta = np.arange(19.0)
+
+    def names(*problems):
+        return [c.name for c in nuisances(problems, theta, theta)]
+
     shifts = ["shift x", "shift y", "shift z", "turn"]
-    numbered = lambda number: [f"{name} {number}" for name in shifts]
+
+    def numbered(number):
+        return [f"{name} {number}" for name in shifts]
+
     assert names(blown) == ["air ratio", *shifts]
     assert names(lifted, blown) == [*numbered(1), "air ratio", *numbered(2)]
     assert names(blown, blown) == ["air ratio", *numbered(1), *numbered(2)]
-    (air, *_) = nuisances((blown,), unknown, unknown)
+    (air, *_) = nuisances((blown,), theta, theta)
     assert air.value == pytest.approx(np.exp(0.1 * 8)) and air.unit == "-"
 
 
@@ -91,73 +100,79 @@ def valley(lifted, size):
 
 def test_deviations_are_those_of_a_smooth_loss_or_of_how_far_descents_lie_apart(lifted):
     problems, prior = (lifted,), 1e-9
-    size = gauss_newton.size(problems)
+    size = gauss_newton.theta_length(problems)
     end, at = valley(lifted, size)
     alone = covariance(problems, end, prior, [])
     np.testing.assert_allclose(alone, 1e-4 * jnp.linalg.inv(end.normal.matrix), rtol=1e-5)
-    places = around(problems, end, prior, 64, jr.key(0))
-    off = places - end.unknown[None]
+    places = sample_around(problems, end, prior, 64, jr.key(0))
+    off = places - end.theta[None]
     np.testing.assert_allclose(jnp.mean(off, axis=0), 0, atol=1e-12)  # in opposite pairs
     far = jnp.einsum("pu,uv,pv->p", off, jnp.linalg.inv(alone), off)
     np.testing.assert_allclose(far, size, rtol=1e-4)  # a deviation along each axis
     back = [(place, at(place)) for place in places]
     np.testing.assert_allclose(covariance(problems, end, prior, back), alone, rtol=1e-6)
-    assert float(apart(problems, end, prior, back)) < 1e-6
+    assert float(disagreement(problems, end, prior, back)) < 1e-6
     # descents that would all end one way, but for one that would end anywhere
     away = jnp.linalg.cholesky(alone)[:, 0] * 5
-    push = lambda times: -end.normal.matrix @ away * times
+
+    def push(times):
+        return -end.normal.matrix @ away * times
+
     pushes = [1e6, *(1.0 if i % 2 else -1.0 for i in range(63))]
     led = [(place, at(place, push(t))) for place, t in zip(places, pushes, strict=True)]
     rough = covariance(problems, end, prior, led)
     expected = alone + jnp.outer(away, away) * (63 + FARTHEST**2) / 65
     np.testing.assert_allclose(rough, expected, rtol=1e-3, atol=1e-12)
-    assert float(apart(problems, end, prior, led)) == pytest.approx(5, rel=1e-4)
+    assert float(disagreement(problems, end, prior, led)) == pytest.approx(5, rel=1e-4)
     # a run that diverged, or whose derivatives did, says that its place is no better known
     for loss, gradient in ((jnp.inf, away * jnp.nan), (1.0, away * jnp.nan), (1.0, away / 0)):
         pair = jnp.asarray(loss), gradient
-        broken = eqx.tree_at(lambda n: (n.loss, n.gradient), at(end.unknown), pair)
+        broken = eqx.tree_at(lambda n: (n.loss, n.gradient), at(end.theta), pair)
         lost = covariance(problems, end, prior, [(place, broken) for place in places[:2]])
         assert np.all(np.isfinite(lost)) and np.all(np.diag(lost) > np.diag(alone))
 
 
 def test_of_the_true_fabric_where_its_end_leads_is_noise(lifted):
     problems, prior = (lifted,), 1e-9
-    end, at = valley(lifted, gauss_newton.size(problems))
-    noise = jnp.arange(1.0, len(end.unknown) + 1)
-    noisy = dataclasses.replace(end, normal=at(end.unknown, noise))
-    found = lambda end, noise, true: covariance(
-        problems, end, prior, [(p, at(p, noise)) for p in (end.unknown + 0.01, end.unknown)], true
-    )
+    end, at = valley(lifted, gauss_newton.theta_length(problems))
+    noise = jnp.arange(1.0, len(end.theta) + 1)
+    noisy = dataclasses.replace(end, normal=at(end.theta, noise))
+
+    def found(end, noise, true):
+        return covariance(
+            problems, end, prior, [(p, at(p, noise)) for p in (end.theta + 0.01, end.theta)], true
+        )
+
     np.testing.assert_allclose(found(noisy, noise, True), found(end, 0.0, False), rtol=1e-6)
     assert np.all(np.diag(found(noisy, noise, False)) > np.diag(found(noisy, noise, True)))
 
 
 def test_where_derivatives_overflow_nothing_is_known(lifted):
     problems, prior = (lifted,), 1e-9
-    size = gauss_newton.size(problems)
+    size = gauss_newton.theta_length(problems)
     end, at = valley(lifted, size)
     broken = eqx.tree_at(lambda e: e.normal.scatter, end, jnp.full((size, size), jnp.inf))
-    near = [(end.unknown, at(end.unknown))] * 2
+    near = [(end.theta, at(end.theta))] * 2
     known = np.diag(covariance(problems, broken, prior, near))
     dim = lifted.space.dim
     np.testing.assert_allclose(known[:dim], gauss_newton.PRIOR_DEVIATION**2)
     np.testing.assert_allclose(known[dim:], 1)
-    assert apart(problems, broken, prior, near) == np.inf
+    assert disagreement(problems, broken, prior, near) == np.inf
 
 
 def test_deviations_are_from_the_frames_on_which_places_agree(lifted, monkeypatch):
     """Of all frames if they do on them, or nowhere; else of the largest share."""
     problems, budget = (lifted,), Budget(shares=(0.5,), around=2)
-    unknown = jnp.concatenate([FAMILY.locate(FABRIC), jnp.zeros(7)])
+    theta = jnp.concatenate([FAMILY.to_unit(FABRIC), jnp.zeros(7)])
     zero = jnp.zeros(())
 
     def found(agree, share=1.0, budget=budget):
         agree = iter(agree)
-        monkeypatch.setattr(descent, "_apart", lambda *_: 0.0 if next(agree) else np.inf)
+        monkeypatch.setattr(descent, "_disagreement", lambda *_: 0.0 if next(agree) else np.inf)
         seen = problems if share == 1 else (beginning(lifted, share),)
-        normal = descent._normal(seen, unknown, zero, None)
-        end = Descent(unknown, normal, zero, zero, zero, jnp.zeros((), int))
-        return spread_of(seen, budget, end, jr.key(0))
+        normal = descent._normal(seen, theta, zero, None)
+        end = Descent(theta, normal, zero, zero, zero, jnp.zeros((), int))
+        return covariance_at(seen, budget, end, jr.key(0))
 
     alone = budget._replace(shares=())
     whole, half = (found([True], share, alone) for share in (1.0, 0.5))
@@ -170,8 +185,11 @@ def test_deviations_are_from_the_frames_on_which_places_agree(lifted, monkeypatc
 def test_an_estimate_says_what_was_in_doubt(lifted):
     """And places around its end have a say in its deviations alone."""
     budget = Budget(coarse=0, starts=1, iterations=1, around=0)
-    descend = lambda budget: diffcloud.estimate(lifted, budget, key=jr.key(0))
-    alone, found = descend(budget), descend(budget._replace(around=4))
+
+    def run(budget):
+        return descend(lifted, budget, key=jr.key(0))
+
+    alone, found = run(budget), run(budget._replace(around=4))
     np.testing.assert_array_equal(found.values, alone.values)
     np.testing.assert_array_equal(found.losses, alone.losses)
     assert np.all(found.standard_errors > 0) and np.all(np.isfinite(found.standard_errors))
@@ -187,8 +205,8 @@ def test_wind_gives_the_stiffness_of_a_sheet_that_was_weighed_wrongly():
     record = synthetic.record(scenarios.wind(), denim, "denim", key=jr.key(0))
     wrong = 1.04
     space = OrthotropicSpace.make(wrong * float(denim.density))
-    found = diffcloud.estimate(Problem.make(record, space), key=jr.key(0))
-    truth = np.asarray(space.values(space.locate(denim)))
+    found = descend(Problem.make(record, space), key=jr.key(0))
+    truth = np.asarray(space.values(space.to_unit(denim)))
     stiff = [i for i, b in enumerate(space.ranges) if b.name in ("warp", "weft", "shear")]
     ratio = found.values[stiff] / truth[stiff]
     np.testing.assert_allclose(ratio, wrong, atol=0.05)

@@ -1,0 +1,155 @@
+"""One contract for all estimators: recordings of a fabric in, an `Estimate` out.
+
+    found = METHODS["diffcloud"]().estimate(recordings, space, key=jax.random.key(0))
+
+A method is a frozen dataclass. What it needs beyond recordings, space, budget and key (a mesh, a
+checkpoint, a trained network) are its fields. `r2s.estimation.registry.METHODS` has all methods.
+"""
+
+import abc
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from r2s.estimation.estimate import Estimate
+from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace
+from r2s.recordings.recording import Recording
+
+SOLVERS = ("cloth", "points")
+Progress = Callable[[int, float], None]  # told the iteration and the best loss
+ANY = None  # every scenario
+
+
+class Budget(NamedTuple):
+    """How much an estimate may cost. A method heeds some of the numbers, see `Method.heeds`.
+
+    - `coarse`: places of the range that are tried first; 0: descend from the start alone.
+    - `starts`: how many of the best places are descended from, side by side. Of more than three
+      descents the better half go on every three iterations, until three are left.
+    - `iterations`: at most, of each stage of a descent. First all starts descend until each has
+      arrived, which is when its next step promises to change no parameter by more than about a
+      tenth of its standard error; then the best one descends with outliers left out. Of a method
+      that trains: its epochs.
+    - `width`: over which slopes are taken, see `r2s.estimation.prediction.sensitivities`.
+    - `shares`: of the frames, from the first, that count before all of them do. All starts descend
+      on the first share; then the best one, outliers left out, descends on each share and on all
+      frames. The end of a long motion can depend on the fabric so steeply that a loss over all of
+      it is low nowhere but near the truth; the loss of its beginning leads there.
+    - `around`: an even number of places around the end, from which Gauss-Newton steps are taken;
+      the standard errors grow by how far these steps end from it, see `descent.covariance_at`.
+    - `evaluations`: simulations of a search without derivatives.
+    """
+
+    coarse: int = 24
+    starts: int = 3
+    iterations: int = 25
+    width: float | None = None
+    shares: tuple[float, ...] = ()
+    around: int = 8
+    evaluations: int = 80
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method(abc.ABC):
+    """A way to estimate a fabric.
+
+    Of every method:
+
+    - `name`: in the registry. `budget`: its usual one.
+    - `heeds`: the numbers of a `Budget` that it goes by.
+    - `supports`: solver by solver the scenarios that it estimates from; None: all of them.
+    - `refusals`: solver by solver why it does not support it.
+    - `several`: whether it takes more than one recording of a fabric.
+
+    Of one instance:
+
+    - `solver`: "cloth", or "points" (material points); None: the first that the method supports.
+    - `shape`: vertices of the simulated sheet along warp and weft.
+    - `checkpoint`: a file that a killed run goes on from; None: it begins again.
+    - `progress`: called with the iteration and the best loss so far.
+    """
+
+    name: ClassVar[str]
+    budget: ClassVar[Budget]
+    heeds: ClassVar[tuple[str, ...]]
+    supports: ClassVar[Mapping[str, tuple[str, ...] | None]]
+    refusals: ClassVar[Mapping[str, str]] = {}
+    several: ClassVar[bool] = False
+
+    solver: str | None = None
+    shape: tuple[int, int] = (9, 9)
+    checkpoint: Path | None = None
+    progress: Progress | None = None
+
+    def estimate(
+        self,
+        recordings: Sequence[Recording],
+        space: ParameterSpace,
+        budget: Budget | None = None,
+        *,
+        key: PRNGKeyArray,
+    ) -> Estimate:
+        """The fabric of `space` that explains the recordings, all of one fabric.
+
+        `budget` is by default the method's usual one. Raises `ValueError` that says why for what
+        the method does not support (`check` says so beforehand) or a recording that it cannot use,
+        `RuntimeError` when every simulation diverges, and `ImportError` that names the extra to
+        install.
+        """
+        self.check(recordings)
+        return self._estimate(list(recordings), space, budget or self.budget, key)
+
+    def check(self, recordings: Sequence[Recording]) -> None:
+        """Raise `ValueError` that says why if the method does not support these recordings."""
+        if not recordings:
+            raise ValueError(f"{self.name} needs a recording")
+        if len(recordings) > 1 and not self.several:
+            raise ValueError(f"{self.name} takes one recording, got {len(recordings)}")
+        for each in recordings:
+            if reason := self.refusal(self.chosen_solver, each.info.scenario):
+                raise ValueError(f"{self.name}: {reason}")
+
+    @property
+    def chosen_solver(self) -> str:
+        """The solver of this instance, or the first that the method supports."""
+        return self.solver or next(iter(self.supports))
+
+    @classmethod
+    def refusal(cls, solver: str, scenario: str) -> str:
+        """Why the method does not estimate from a scenario on a solver; empty: it does."""
+        if solver not in SOLVERS:
+            return f"a solver is one of {', '.join(SOLVERS)}, got {solver!r}"
+        if solver not in cls.supports:
+            return cls.refusals[solver]
+        scenarios = cls.supports[solver]
+        if scenarios is None or scenario in scenarios:
+            return ""
+        why = cls.refusals.get(solver)
+        told = f"on {solver} it estimates from {', '.join(scenarios)}, not from {scenario}"
+        return f"{told}: {why}" if why else told
+
+    @abc.abstractmethod
+    def _estimate(
+        self,
+        recordings: list[Recording],
+        space: ParameterSpace,
+        budget: Budget,
+        key: PRNGKeyArray,
+    ) -> Estimate:
+        """`estimate` of recordings that were checked."""
+
+
+def default_space(solver: str, density: float) -> ParameterSpace:
+    """The fabrics to choose from: orthotropic on the cloth, isotropic on material points."""
+    make = OrthotropicSpace.make if solver == "cloth" else IsotropicSpace.make
+    return make(density)
+
+
+def seed_of(key: PRNGKeyArray) -> int:
+    """A seed for generators of other libraries; that of `jax.random.key(seed)` is `seed`."""
+    return int(np.asarray(jax.random.key_data(key)).ravel()[-1])

@@ -1,0 +1,147 @@
+"""PhysNet by the contract of `r2s.estimation.method`: with a trained network, or one trained now.
+
+Needs scikit-optimize and scikit-learn: pip install 'r2s[physnet]'.
+"""
+
+import importlib.util
+import shutil
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from r2s.estimation.estimate import Estimate
+from r2s.estimation.method import ANY, Budget, Method, seed_of
+from r2s.estimation.physnet import bayes, dataset, emulator, estimator, preprocess, training
+from r2s.recordings.recording import Recording
+from r2s.scenarios.on_points import material_points
+from r2s.scenarios.scenario import from_recording
+
+NETWORK_SHAPE = {"cloth": (9, 9), "points": (7, 7)}
+
+
+@dataclass(frozen=True)
+class TrainingBudget:
+    """What the training of a network may cost: simulated fabrics, epochs, steps of each."""
+
+    fabrics: int = 512
+    epochs: int = 9
+    steps: int = 80
+
+
+def train_network(
+    path: Path,
+    scenario: str,
+    solver: str,
+    budget: TrainingBudget = TrainingBudget(),
+    seed: int = 0,
+    progress: bool = False,
+) -> training.Training:
+    """Train the network for a scenario on a solver, and write it to `path`.
+
+    The simulated images lie in a folder beside `path` until it is trained, so that a killed run
+    goes on. `progress` shows a bar of the simulations, and prints a line an epoch, on stderr.
+    """
+    settings = dataset.Settings(scenario, budget.fabrics, seed=seed)
+    if solver == "points":
+        settings = dataset.Settings(
+            scenario,
+            budget.fabrics,
+            num_levels=3,
+            shape=NETWORK_SHAPE["points"],
+            per_shard=4,
+            material_points=True,
+            isotropic=True,
+            seed=seed,
+        )
+    images = path.with_name(f"{path.name}.images")
+    view = dataset.make(images, settings, progress=progress).view
+    schedule = training.Schedule(epochs=budget.epochs, steps=budget.steps, seed=seed)
+    begun = training.load(path) if path.exists() else training.begin(view, schedule=schedule)
+    trained = training.train(
+        begun, dataset.load(images), path, progress=_print_epoch if progress else None
+    )
+    shutil.rmtree(images)
+    return trained
+
+
+def _print_epoch(epoch: int, row: training.Row) -> None:
+    print(f"network, epoch {epoch}: triplet accuracy {row.accuracy:.1%}", file=sys.stderr)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhysNetMethod(Method):
+    """PhysNet: by `Budget.evaluations` simulations, whose places on the map are emulated.
+
+    - `network`: the file of a network that was trained for the recording's scenario on the same
+      solver. Where there is no such file one is trained, and written there.
+    - `training_budget`: what that training may cost.
+    """
+
+    name = "physnet"
+    budget = Budget(evaluations=80)
+    heeds = ("evaluations",)
+    supports = {"cloth": ANY, "points": ANY}
+    library: ClassVar[str] = "sklearn"
+
+    network: Path | None = None
+    training_budget: TrainingBudget = TrainingBudget()
+
+    def _estimate(self, recordings, space, budget, key):
+        if importlib.util.find_spec(self.library) is None:
+            raise ImportError(f"{self.name} needs {self.library}: pip install 'r2s[physnet]'")
+        recording, solver = recordings[0], self.chosen_solver
+        trained = self._trained(recording)
+        scenario = from_recording(recording, NETWORK_SHAPE[solver])
+        frames = dataset.kept_frames(recording.info.frames_used, dataset.Settings.num_frames)
+        images = preprocess.of_clouds(trained.view, recording, frames)
+        stiffest = space(jnp.ones(space.dim, float))
+        simulator = None if solver == "cloth" else material_points(scenario, stiffest)
+        seen = estimator.Sighting.make(scenario, images, frames, space, trained, simulator)
+        return self._search(seen, budget.evaluations, seed_of(key))
+
+    def _trained(self, recording: Recording) -> training.Training:
+        if self.network is None:
+            raise ValueError("PhysNet needs a file for its trained network")
+        if self.network.exists():
+            trained = training.load(self.network)
+            if len(trained.curve) >= trained.schedule.epochs:
+                return trained
+        return train_network(
+            self.network,
+            recording.info.scenario,
+            self.chosen_solver,
+            self.training_budget,
+            progress=self.progress is not None,
+        )
+
+    def _search(self, seen: estimator.Sighting, evaluations: int, seed: int) -> Estimate:
+        target = estimator.target_of(seen)
+
+        def report(trials: emulator.Trials) -> None:
+            if self.progress is not None:
+                self.progress(len(trials.places), float(np.nanmin(trials.losses(target))))
+
+        return estimator.estimate(
+            seen, num_calls=evaluations, seed=seed, path=self.checkpoint, progress=report
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublishedPhysNet(PhysNetMethod):
+    """PhysNet as published: Bayesian optimisation of the distance on the map."""
+
+    name = "physnet-published"
+    library: ClassVar[str] = "skopt"
+
+    def _search(self, seen: estimator.Sighting, evaluations: int, seed: int) -> Estimate:
+        def report(history: bayes.History) -> None:
+            if self.progress is not None:
+                self.progress(len(history.losses), float(np.nanmin(history.losses)))
+
+        return estimator.published_recipe(
+            seen, num_calls=evaluations, seed=seed, path=self.checkpoint, progress=report
+        )

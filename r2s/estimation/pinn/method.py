@@ -1,0 +1,118 @@
+"""The physics-informed network by the contract of `r2s.estimation.method`."""
+
+import dataclasses
+import math
+import time
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+
+from r2s.estimation.estimate import point_estimate
+from r2s.estimation.method import ANY, Budget, Method
+from r2s.estimation.pinn.pulls import Pull, pull_from, stacked
+from r2s.recordings.recording import Recording
+
+REFUSALS = {
+    "points": "without markers and force it balances the map of an orthotropic sheet, and the "
+    "space of material points is isotropic"
+}
+CHUNK = 100  # epochs of the published recipe between two losses
+
+
+@dataclass(frozen=True, kw_only=True)
+class PINN(Method):
+    """The physics-informed network: from the markers and force of stretchings, or from clouds.
+
+    No solver simulates: "cloth" and "points" tell which space is estimated. `Budget.iterations`
+    are the epochs with physics of the networks' training; of clouds the rounds, at most 30.
+
+    - `angles`: from each pull to the warp, [degrees]; none: all pulls are along the warp.
+    """
+
+    name = "pinn"
+    budget = Budget(iterations=200)
+    heeds = ("iterations",)
+    supports = {"cloth": ANY, "points": ("stretching",)}
+    refusals = REFUSALS
+    several = True
+
+    angles: tuple[float, ...] = ()
+
+    def _estimate(self, recordings, space, budget, key):
+        from r2s.estimation.pinn import from_clouds, from_pulls  # need flax
+
+        if all(each.info.scenario == "stretching" for each in recordings):
+            recipe = dataclasses.replace(from_pulls.QUICK, adam=budget.iterations)
+            return from_pulls.estimate(
+                pulls_of(recordings, self.angles),
+                space,
+                recipe,
+                progress=self.progress,
+                checkpoint=self.checkpoint,
+                key=key,
+            ).estimate
+        if len(recordings) > 1:
+            raise ValueError("pinn takes several stretchings, or one recording of another motion")
+        settings = from_clouds.Settings()
+        rounds = min(settings.rounds, budget.iterations)
+        settings = dataclasses.replace(settings, rounds=rounds)
+        return from_clouds.estimate(recordings[0], space, settings, report=self._report, key=key)
+
+    def _report(self, number: int, spread: float, values: np.ndarray) -> None:
+        del values
+        if self.progress is not None:
+            self.progress(number, spread**2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublishedPINN(Method):
+    """The recipe of the paper, `r2s.estimation.pinn.published_recipe`, from stretchings.
+
+    It starts in the middle of the space. Without force nothing fixes the scale of the stiffness.
+
+    - `angles`: from each pull to the warp, [degrees]; none: all pulls are along the warp.
+    """
+
+    name = "pinn-published"
+    budget = Budget(iterations=10_000)
+    heeds = ("iterations",)
+    supports = {"cloth": ("stretching",), "points": ("stretching",)}
+    several = True
+
+    angles: tuple[float, ...] = ()
+
+    def _estimate(self, recordings, space, budget, key):
+        from r2s.estimation.pinn import published_recipe  # needs flax
+
+        began = time.perf_counter()
+        pulls = pulls_of(recordings, self.angles, without_force=True)
+        middle, epochs = jnp.full(space.dim, 0.5, float), budget.iterations
+        course = published_recipe.train(
+            space, stacked(pulls), middle, epochs, min(CHUNK, epochs), key=key
+        )
+        if not np.isfinite(course.data[-1]):
+            raise RuntimeError("the training of the published recipe diverged")
+        history = np.stack([np.asarray(space.values(jnp.asarray(p))) for p in course.places])
+        return point_estimate(
+            f"pinn-published ({epochs} epochs, no force)",
+            space,
+            course.model.place,
+            float(course.data[-1]),
+            course.data[:, None],
+            history[:, None],
+            time.perf_counter() - began,
+        )
+
+
+def pulls_of(
+    recordings: list[Recording], angles: tuple[float, ...], without_force: bool = False
+) -> list[Pull]:
+    """The pulls of stretchings, at `angles` [degrees] to the warp."""
+    angles = angles or (0.0,) * len(recordings)
+    if len(angles) != len(recordings):
+        raise ValueError(f"got {len(angles)} angles for {len(recordings)} pulls")
+    return [
+        pull_from(recording, math.radians(angle), without_force=without_force)
+        for recording, angle in zip(recordings, angles, strict=True)
+    ]

@@ -1,0 +1,275 @@
+"""The contract of all methods: refusals with reasons, convergence, bounds; files of 0.2.0."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any, get_args
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+from r2s import scenarios
+from r2s.estimation import cards
+from r2s.estimation.checkpoint import arrays_of, load, read, save, tree_from
+from r2s.estimation.estimate import describe, point_estimate
+from r2s.estimation.estimate_json import as_json, from_json
+from r2s.estimation.method import Budget, default_space, seed_of
+from r2s.estimation.pinn import from_pulls, published_recipe
+from r2s.estimation.registry import METHODS
+from r2s.fabrics import presets
+from r2s.fabrics.fabric_json import fabric_as_json, fabric_from_json
+from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace
+from r2s.scenarios import synthetic
+
+FABRIC = presets.grey_interlock()
+SPACE = OrthotropicSpace.make(float(FABRIC.density))
+DATA = Path(__file__).parent / "data"
+TINY = {
+    "diffcloud": Budget(coarse=0, starts=1, iterations=2, around=0),
+    "diffcp": Budget(coarse=0, starts=1, iterations=1, width=0.02, around=0),
+    "cma-es": Budget(evaluations=14),
+    "diffcloud-published": Budget(iterations=2),
+    "diffcp-published": Budget(iterations=2),
+}
+
+
+@pytest.fixture(scope="module")
+def recording():
+    motion: dict[str, Any] = {"height": 0.2, "inward": 0.1, "moving": 0.3}
+    experiment = scenarios.lifting(num_frames=4, interval=1 / 10, **motion)
+    return synthetic.record(experiment, FABRIC, "grey", shape=(4, 4), key=jr.key(1))
+
+
+def narrowed(name: str, low: float, high: float) -> OrthotropicSpace:
+    """The space with another range of one parameter."""
+    ranges = [
+        dataclasses.replace(bound, low=low, high=high) if bound.name == name else bound
+        for bound in SPACE.ranges
+    ]
+    return dataclasses.replace(SPACE, ranges=tuple(ranges))
+
+
+def test_the_command_line_offers_every_method_and_no_other():
+    commands = pytest.importorskip("r2s.commands.estimate")
+    assert set(get_args(commands.MethodName)) == set(METHODS)
+    assert all(method.name == name for name, method in METHODS.items())
+    assert all(set(method.heeds) <= set(Budget._fields) for method in METHODS.values())
+
+
+@pytest.mark.parametrize(
+    "name, solver, number, words",
+    [
+        ("diffcp", "cloth", 1, "differentiates through material points; on the cloth take diffcl"),
+        ("diffcloud", "points", 1, "on material points take diffcp"),
+        ("pinn", "points", 1, "estimates from stretching, not from lifting: without markers"),
+        ("pinn-published", "cloth", 1, "estimates from stretching, not from lifting"),
+        ("pinn", "cloth", 2, "several stretchings, or one recording of another motion"),
+        ("physnet", "cloth", 2, "takes one recording, got 2"),
+        ("diffcloud", "cloth", 0, "needs a recording"),
+        ("cma-es", "felt", 1, "a solver is one of cloth, points, got 'felt'"),
+    ],
+)
+def test_what_is_not_supported_is_refused_with_a_reason(recording, name, solver, number, words):
+    method = METHODS[name](solver=solver)
+    with pytest.raises(ValueError, match=words):
+        method.estimate([recording] * number, SPACE, key=jr.key(0))
+
+
+def test_every_method_supports_a_solver_and_says_why_not_the_other():
+    for method in METHODS.values():
+        assert method.supports
+        for solver in ("cloth", "points"):
+            assert method.refusal(solver, "stretching") == "" or method.refusals[solver]
+
+
+def test_the_space_is_that_of_the_solver_and_a_key_has_a_seed():
+    assert isinstance(default_space("cloth", 0.2), OrthotropicSpace)
+    assert isinstance(default_space("points", 0.2), IsotropicSpace)
+    assert seed_of(jax.random.key(7)) == 7
+
+
+def test_physnet_needs_a_file_for_its_network(recording):
+    pytest.importorskip("sklearn")
+    with pytest.raises(ValueError, match="needs a file for its trained network"):
+        METHODS["physnet"]().estimate([recording], SPACE, key=jr.key(0))
+
+
+def ran(name: str, recording, space, solver=None, **others):
+    """An estimate of a tiny budget."""
+    method = METHODS[name](solver=solver, shape=(4, 4), **others)
+    with jax.numpy_dtype_promotion("standard"):  # optax counts its steps in integers
+        return method.estimate([recording], space, TINY[name], key=jr.key(0))
+
+
+@pytest.mark.parametrize("name", ["diffcloud", "cma-es"])
+def test_a_method_keeps_the_contract_on_the_cloth(recording, name):
+    if name == "cma-es":
+        pytest.importorskip("cma")
+    seen = []
+    found = ran(name, recording, SPACE, progress=lambda step, loss: seen.append(loss))
+    assert found.approach.startswith(name) and np.isfinite(found.loss) and seen
+    assert found.converged is False  # the budget is much too small
+    assert from_json(as_json(found)).converged is False
+    assert "converged: no, the budget ended the search" in describe(found)
+
+
+@pytest.mark.slow(group="estimates")
+@pytest.mark.parametrize(
+    "name, solver",
+    [
+        ("diffcloud-published", "cloth"),
+        ("diffcp", "points"),
+        ("diffcp-published", "points"),
+        ("cma-es", "points"),
+    ],
+)
+def test_other_methods_keep_the_contract(recording, name, solver):
+    space = default_space(solver, float(FABRIC.density))
+    found = ran(name, recording, space, solver)
+    assert found.approach.startswith(name) and np.isfinite(found.loss) and not found.converged
+
+
+@pytest.mark.slow(group="estimates")
+@pytest.mark.parametrize("name", ["physnet", "physnet-published"])
+def test_physnet_trains_its_network_once(recording, name, tmp_path):
+    pytest.importorskip("skopt")
+    from r2s.estimation.physnet.method import TrainingBudget
+
+    network = tmp_path / "lifting.network"
+    spent = TrainingBudget(fabrics=32, epochs=1, steps=2)
+    method = METHODS[name](network=network, training_budget=spent)  # pyright: ignore
+    longer = synthetic.record(scenarios.lifting(), FABRIC, "grey", key=jr.key(1))
+    with jax.numpy_dtype_promotion("standard"):
+        found = method.estimate([longer], SPACE, Budget(evaluations=9), key=jr.key(0))
+        trained = network.read_bytes()
+        again = method.estimate([longer], SPACE, Budget(evaluations=9), key=jr.key(0))
+    assert network.read_bytes() == trained and not list(tmp_path.glob("*.images"))
+    np.testing.assert_array_equal(found.values, again.values)
+    assert found.converged is False
+
+
+@pytest.mark.slow(group="estimates")
+@pytest.mark.parametrize("name", ["pinn", "pinn-published"])
+def test_the_network_takes_a_stretching(name):
+    from r2s.estimation.pinn.synthetic_pulls import pulled
+
+    pull = pulled(FABRIC, "grey", 0.0, key=jr.key(0))
+    method = METHODS[name](angles=(0.0,))  # pyright: ignore
+    with jax.numpy_dtype_promotion("standard"):
+        found = method.estimate([pull], SPACE, Budget(iterations=10), key=jr.key(0))
+    assert found.approach.startswith(name) and np.isfinite(found.values).all()
+    assert isinstance(found.converged, bool)
+    if name == "pinn-published":
+        assert not found.converged and found.approach == "pinn-published (10 epochs, no force)"
+
+
+def test_a_descent_that_arrives_has_converged_and_a_truth_beyond_a_bound_is_named(recording):
+    """Its shear stiffness lies above the range, whose upper bound the estimate reaches."""
+    truth = float(SPACE.values(SPACE.to_unit(FABRIC))[2])
+    beyond = narrowed("shear", truth / 30, truth / 10)
+    method = METHODS["diffcloud"](shape=(4, 4))
+    budget = Budget(coarse=0, starts=1, iterations=40, around=0)
+    found = method.estimate([recording], beyond, budget, key=jr.key(0))
+    assert found.converged and found.at_bounds.get("shear") == "upper"
+    assert any(
+        line.startswith("shear") and "at its upper bound" in line for line in describe(found)
+    )
+    inside = method.estimate([recording], SPACE, budget, key=jr.key(0))
+    assert inside.converged and "shear" not in inside.at_bounds
+
+
+def test_bounds_are_named_at_both_ends_and_nowhere_else():
+    place = jnp.array([0.0, 1.0, 0.5, 0.001, 0.994, 0.006, 0.999])
+    nothing = np.zeros((1, 1))
+    found = point_estimate("test", SPACE, place, 0.0, nothing, nothing, 0.0)
+    expected = {"warp": "lower", "weft": "upper", "coupling": "lower", "friction": "upper"}
+    assert found.at_bounds == expected
+    stored = json.loads(json.dumps(as_json(found), allow_nan=False))
+    assert stored["at_bounds"] == expected and stored["converged"] is False
+    assert from_json(stored).at_bounds == expected
+    (last,) = [line for line in describe(found) if line.startswith("at a bound")]
+    assert last == "at a bound: warp (lower), weft (upper), coupling (lower), friction (upper)"
+
+
+def test_an_estimate_of_version_0_2_0_is_read():
+    stored = json.loads((DATA / "estimate_0.2.0.json").read_text())
+    found = from_json(stored)
+    assert stored["format"] == "r2s-estimate/2" and found.converged is None
+    assert found.at_bounds == {"damping": "upper"}
+    np.testing.assert_array_equal(found.standard_errors[[0, 3, 5]], [0.2, 0.012, 1.0])
+    assert np.isnan(found.standard_errors[4]) and found.ranges == SPACE.ranges
+    assert [each.name for each in found.nuisances] == ["shift x", "marker noise"]
+    assert found.nuisances[0].standard_error == 0.0005 and found.history.shape == (2, 2, 7)
+    assert found.values[0] == stored["parameters"]["warp"]["value"]
+    assert float(found.fabric.membrane.c33) == stored["fabric"]["C33"]["value"]
+    (known,) = found.combinations
+    assert known._asdict() == {
+        **{key: stored["combinations"][0][key] for key in ("exponents", "value")},
+        "standard_error": stored["combinations"][0]["deviation"],
+    }
+    again = from_json(as_json(found))
+    np.testing.assert_array_equal(again.values, found.values)
+    assert as_json(again)["format"] == "r2s-estimate/3"
+
+
+@pytest.mark.parametrize(
+    "approach, converged",
+    [("pinn (1 pull, not converged)", False), ("pinn (1 pull)", True), ("diffcp", None)],
+)
+def test_version_0_2_0_said_in_words_whether_it_had_converged(approach, converged):
+    stored = json.loads((DATA / "estimate_0.2.0.json").read_text())
+    assert from_json({**stored, "approach": approach}).converged is converged
+
+
+def test_a_card_of_version_0_2_0_is_read(tmp_path):
+    stored = json.loads((DATA / "card_0.2.0.json").read_text())
+    card = cards.read(DATA / "card_0.2.0.json")
+    assert stored["format"] == "r2s-card/1" and card.provenance.recordings[0][0] == "lift"
+    assert float(card.fabric.density) == stored["fabric"]["density"]["value"]
+    assert card.estimate is not None and card.estimate.at_bounds == {"damping": "upper"}
+    cards.write(tmp_path / "new.json", card)
+    assert cards.read(tmp_path / "new.json") == card
+    assert json.loads((tmp_path / "new.json").read_text())["format"] == "r2s-card/2"
+    del stored["estimate"]["conditions"]
+    with pytest.raises(ValueError, match="estimate: missing: conditions"):
+        cards.from_json(stored)
+
+
+def test_an_estimate_and_a_card_have_one_form_of_a_fabric():
+    found = point_estimate("test", SPACE, jnp.full(7, 0.4), 0.0, np.zeros(1), np.zeros(1), 0.0)
+    form = fabric_as_json(found.fabric)
+    assert as_json(found)["fabric"] == form
+    card = cards.as_json(cards.Card.make("any", found, cards.Provenance("made up")))
+    assert card["fabric"] == form == card["estimate"]["fabric"]
+    assert form["membrane"]["c12"].keys() == {"value", "unit"}
+    assert float(fabric_from_json(form).membrane.c12) == float(found.fabric.membrane.c12)
+
+
+def test_a_checkpoint_is_of_one_run(tmp_path):
+    path, tree = tmp_path / "deep" / "run.npz", {"a": jnp.arange(3.0), "b": (jnp.ones(2, int),)}
+    run = {"kind": "test", "seed": 3, "shape": (2, 2)}
+    assert load(path, run) is None
+    save(path, arrays_of(tree), run)
+    stored = load(path, run)
+    assert stored is not None
+    back = tree_from(stored, tree)
+    assert jax.tree.all(jax.tree.map(lambda x, y: bool(jnp.all(x == y)), tree, back))
+    assert read(path)[1] == {"kind": "test", "seed": 3, "shape": [2, 2]}
+    with pytest.raises(ValueError, match=r"run\.npz is of another run \(seed 3 there, 4 asked\)"):
+        load(path, {**run, "seed": 4})
+    with pytest.raises(ValueError, match=r"lacks \['c'\]"):
+        tree_from(stored, {**tree, "c": jnp.zeros(1)})
+    path.write_bytes(b"torn")
+    with pytest.raises(ValueError, match=r"run\.npz is no checkpoint"):
+        load(path, run)
+    np.savez(path, places=np.zeros(2))
+    with pytest.raises(ValueError, match=r"run\.npz is no checkpoint"):
+        read(path)
+
+
+def test_the_usual_budgets_of_the_network_are_those_of_its_recipes():
+    assert METHODS["pinn"].budget.iterations == from_pulls.QUICK.adam
+    assert METHODS["pinn-published"].budget.iterations == published_recipe.EPOCHS
