@@ -62,7 +62,10 @@ def _run(system: System, size: int, factor: int, options, finest: np.ndarray | N
 def _slope(call: Callable[[float], np.ndarray], size: int) -> float | None:
     """The loss's derivative [m^2] in a factor on the stiffness, by central differences."""
     start = np.asarray(scenes.flat(scenes.sheet(size)), float)
-    loss = lambda stiffness: np.mean(np.sum((call(stiffness) - start) ** 2, axis=-1))
+
+    def loss(stiffness):
+        return np.mean(np.sum((call(stiffness) - start) ** 2, axis=-1))
+
     slope = (loss(1 + DIFFERENCE) - loss(1 - DIFFERENCE)) / (2 * DIFFERENCE)
     return float(slope) if np.isfinite(slope) else None
 
@@ -88,7 +91,10 @@ def _number(name: str, scale: float = 1.0) -> Callable[[Row], str]:
 
 def _show(rows: list[Row]) -> None:
     unit = measure.clock_name()
-    ratio = lambda row: f"{row[f'gradient_{unit}'] / row[f'forward_{unit}']:.1f}"
+
+    def ratio(row):
+        return f"{row[f'gradient_{unit}'] / row[f'forward_{unit}']:.1f}"
+
     columns = {
         "system": lambda row: row["system"],
         "side": _number("size"),

@@ -74,7 +74,9 @@ def _rows(system: str, part: str, law: str, options: argparse.Namespace) -> list
 
 
 def _show(rows: list[Row]) -> None:
-    number = lambda name: lambda row: f"{row[name]:.3g}"
+    def number(name):
+        return lambda row: f"{row[name]:.3g}"
+
     columns = {
         "system": lambda row: row["system"],
         "scene": lambda row: row["part"],

@@ -36,7 +36,10 @@ def _compiled(function, stiffness):
     run = jax.jit(function).lower(stiffness).compile()
     plan = run.memory_analysis()
     size = plan.temp_size_in_bytes + plan.argument_size_in_bytes + plan.output_size_in_bytes
-    convert = lambda out: float(out) if isinstance(out, jax.Array) else out
+
+    def convert(out):
+        return float(out) if isinstance(out, jax.Array) else out
+
     return lambda: convert(jax.block_until_ready(run(stiffness))), size / 1e6
 
 
@@ -49,14 +52,22 @@ def _block_loss(scene):
     grid = Grid.make((0.0,) * axes, 1 / scene.nodes, (scene.nodes,) * axes)
     background = Background.make(grid, gravity=mpm_scenes.GRAVITY, walls=mpm_scenes.WALLS)
     volume = jnp.full(scene.count, mpm_scenes.VOLUME)
-    number = lambda value: jnp.asarray(value, float)
-    material = lambda mu: Solid.make(law(mu, number(mpm_scenes.LAM)), mpm_scenes.MASS)
+
+    def number(value):
+        return jnp.asarray(value, float)
+
+    def material(mu):
+        return Solid.make(law(mu, number(mpm_scenes.LAM)), mpm_scenes.MASS)
+
     solver = Block.make(background, volume, material(number(mpm_scenes.MU)), scene.dt)
     x = jnp.asarray(scene.x)
     start = solver.init(x, jnp.asarray(scene.v))
     shape = FRAMES, scene.steps // FRAMES
     controls = r2s.Control(jnp.zeros((*shape, 0, axes)), jnp.zeros((*shape, 3)))
-    loss = lambda mu: jnp.mean(r2s.simulate(solver, material(mu), start, controls).x[-1] ** 2)
+
+    def loss(mu):
+        return jnp.mean(r2s.simulate(solver, material(mu), start, controls).x[-1] ** 2)
+
     return loss, number(mpm_scenes.MU)
 
 

@@ -94,7 +94,10 @@ def batch(options) -> list[Row]:
     size = (options.sizes or [9])[0]
     setting = scenes.hang(size, 1)
     random = np.random.default_rng(0)
-    factor = lambda: jnp.asarray(SPREAD ** random.uniform(-1, 1, options.members), float)
+
+    def factor():
+        return jnp.asarray(SPREAD ** random.uniform(-1, 1, options.members), float)
+
     members = jax.tree.map(lambda leaf: leaf * factor(), scenes.fabric(options.damping))
     singles = [jax.tree.map(itemgetter(i), members) for i in range(options.members)]
     functions = {
@@ -120,7 +123,10 @@ def _batched(name: str, function, members, singles, setting, options) -> Row:
     together = eqx.filter_jit(eqx.filter_vmap(function, in_axes=(eqx.if_array(0), *[None] * 3)))
     together = together.lower(members, *setting).compile()
     alone = eqx.filter_jit(function).lower(singles[0], *setting).compile()
-    clock = lambda call: measure.timed(call, options.repeats, options.budget)
+
+    def clock(call):
+        return measure.timed(call, options.repeats, options.budget)
+
     row, result = clock(lambda: jax.block_until_ready(together(members, *setting)))
     apart, _ = clock(lambda: [jax.block_until_ready(alone(one, *setting)) for one in singles])
     leaves = [np.asarray(leaf).reshape(options.members, -1) for leaf in jax.tree.leaves(result)]

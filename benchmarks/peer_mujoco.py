@@ -34,7 +34,10 @@ MODEL = """
 
 def _model(integrator: str, size: int, substeps: int, damping: float):
     mesh = scenes.sheet(size)
-    numbers = lambda array: " ".join(f"{number:.9g}" for number in np.asarray(array).ravel())
+
+    def numbers(array):
+        return " ".join(f"{number:.9g}" for number in np.asarray(array).ravel())
+
     model = mujoco.MjModel.from_xml_string(
         MODEL.format(
             step=1 / (60 * substeps),

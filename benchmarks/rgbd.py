@@ -111,7 +111,7 @@ def convert(folder: Path) -> None:
     from r2s.recordings.cameras import images
     from r2s.recordings.recording import load
 
-    images.opencv()
+    images.require("cv2", "camera", "depth images")
     before = peak()
     out = folder / "out"
     command = ["data", "convert", str(folder), "--to", str(out)]

@@ -11,17 +11,14 @@ import jax.numpy as jnp
 import optax
 
 import r2s
-from r2s.fabrics.parameters import OrthotropicSpace
-from r2s.world.air import Air
-from r2s.world.contact import Table
 
 STEPS = 40
 sheet = r2s.rectangle((0.15, 0.05), (7, 3))  # [m]
 held = jnp.arange(6)  # the first two rows: a strip that is clamped, and droops
-scene = r2s.Scene(sheet, held, Table.make(-jnp.inf), Air.make())
+scene = r2s.Scene(sheet, held, r2s.Table.make(-jnp.inf), r2s.Air.make())
 solver = r2s.Cloth.make(scene, dt=0.02)  # [s]
 start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
-space = OrthotropicSpace.make(density=0.2)  # [kg/m^2]
+space = r2s.OrthotropicSpace.make(density=0.2)  # [kg/m^2]
 BENDING = [bound.name for bound in space.ranges].index("bending")
 handles = jnp.broadcast_to(start[held], (1, STEPS, 6, 3))
 controls = r2s.Control(handles, jnp.zeros((1, STEPS, 3)))
@@ -39,7 +36,9 @@ def fabric_place(bending):
 
 @eqx.filter_jit
 def improve(bending, state, seen):
-    loss = lambda bending: ((droop(fabric_place(bending)) - seen) * 1e3) ** 2  # [mm^2]
+    def loss(bending):
+        return ((droop(fabric_place(bending)) - seen) * 1e3) ** 2  # [mm^2]
+
     value, slope = jax.value_and_grad(loss)(bending)
     change, state = optimiser.update(slope, state)
     return optax.apply_updates(bending, change), state, value
@@ -53,6 +52,9 @@ if __name__ == "__main__":
     state = optimiser.init(bending)
     for _ in range(40):
         bending, state, value = improve(bending, state, seen)
-    stiffness = lambda place: float(space(fabric_place(place)).bending.stiffness)
+
+    def stiffness(place):
+        return float(space(fabric_place(place)).bending.stiffness)
+
     print(f"droop {1e3 * seen:.2f} mm, off by {value**0.5:.3f} mm")
     print(f"bending stiffness {stiffness(bending):.3g} N m, truth {stiffness(truth):.3g} N m")

@@ -14,12 +14,10 @@ import optax
 
 import r2s
 from r2s.fabrics import presets
-from r2s.world.air import Air
-from r2s.world.contact import Table
 
 STEPS, FASTEST = 20, 0.5  # [m/s]
 sheet = r2s.rectangle((0.2, 0.2), (4, 4))  # [m]
-scene = r2s.Scene(sheet, jnp.array([0]), Table.make(-jnp.inf), Air.make())
+scene = r2s.Scene(sheet, jnp.array([0]), r2s.Table.make(-jnp.inf), r2s.Air.make())
 solver = r2s.Cloth.make(scene, dt=0.02)  # [s]
 start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
 GOAL = start[-1]

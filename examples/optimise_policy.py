@@ -12,13 +12,11 @@ import optax
 
 import r2s
 from r2s.fabrics import presets
-from r2s.world.air import Air
-from r2s.world.contact import Table
 
 STEPS, KNOTS, ITERATIONS = 24, 4, 40
 TARGET = jnp.array([0.12, 0.15, 0.001])  # [m]
 sheet = r2s.rectangle((0.2, 0.2), (5, 5))  # [m]
-scene = r2s.Scene(sheet, jnp.array([0]), Table.make(0.0), Air.make())  # vertex 0 is held
+scene = r2s.Scene(sheet, jnp.array([0]), r2s.Table.make(0.0), r2s.Air.make())  # vertex 0 is held
 solver = r2s.Cloth.make(scene, dt=0.025)  # [s]
 start = jnp.pad(sheet.rest, ((0, 0), (0, 1)), constant_values=0.001)
 

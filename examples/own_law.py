@@ -15,8 +15,6 @@ from jaxtyping import Array, Float
 import r2s
 from r2s.fabrics import presets
 from r2s.laws.membrane import OrthotropicMembrane
-from r2s.world.air import Air
-from r2s.world.contact import Table
 
 
 class Stiffening(eqx.Module):
@@ -35,7 +33,7 @@ class Stiffening(eqx.Module):
 
 sheet = r2s.rectangle((0.2, 0.2), (5, 5))  # [m]
 held = jnp.array([0, 4])
-scene = r2s.Scene(sheet, held, Table.make(-jnp.inf), Air.make())
+scene = r2s.Scene(sheet, held, r2s.Table.make(-jnp.inf), r2s.Air.make())
 solver = r2s.Cloth.make(scene, dt=0.02)  # [s]
 start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
 handles = jnp.broadcast_to(start[held], (1, 20, 2, 3))

@@ -18,8 +18,6 @@ import trimesh
 
 import r2s
 from r2s.fabrics import presets
-from r2s.world.air import Air
-from r2s.world.contact import Table
 
 
 def write_disc(path: Path, radius: float = 0.15, rings: int = 5) -> None:
@@ -31,7 +29,10 @@ def write_disc(path: Path, radius: float = 0.15, rings: int = 5) -> None:
         inner, outer = 1 + 3 * ring * (ring - 1) - 6 * (ring - 1), 1 + 3 * ring * (ring - 1)
         for i in range(6 * ring):
             side, place = divmod(i, ring)
-            near = lambda k, r=ring, a=inner: 0 if r == 1 else a + k % (6 * (r - 1))
+
+            def near(k, r=ring, a=inner):
+                return 0 if r == 1 else a + k % (6 * (r - 1))
+
             here, there = outer + i, outer + (i + 1) % (6 * ring)
             faces.append((near(side * (ring - 1) + place), here, there))
             if place:
@@ -48,7 +49,9 @@ if __name__ == "__main__":
     loaded: Any = trimesh.load(path, process=False, force="mesh")
     sheet = r2s.Mesh.make(np.asarray(loaded.vertices)[:, :2], np.asarray(loaded.faces))
     middle = jnp.asarray(np.flatnonzero(np.linalg.norm(sheet.rest, axis=1) < 0.07))
-    solver = r2s.Cloth.make(r2s.Scene(sheet, middle, Table.make(-jnp.inf), Air.make()), dt=0.02)
+    solver = r2s.Cloth.make(
+        r2s.Scene(sheet, middle, r2s.Table.make(-jnp.inf), r2s.Air.make()), dt=0.02
+    )
     start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
     handles = jnp.broadcast_to(start[middle], (1, 75, len(middle), 3))
     controls = r2s.Control(handles, jnp.zeros((1, 75, 3)))

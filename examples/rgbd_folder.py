@@ -42,12 +42,12 @@ if __name__ == "__main__":
     write_rgbd(folder, rig, np.asarray(moved.x), faces, experiment.times)
     print(f"images in {folder}: {len(list(folder.rglob('*.png')))} files")
 
-    about = RecordingInfo(
+    info = RecordingInfo(
         *("lift_denim", "lifting", "denim", "1", "simulated", experiment.frames_used),
         *(experiment.sheet, experiment.table_height, None),
     )
     grippers = experiment.route.path, experiment.route.times
-    recording = rgbd_recording(folder, about, *grippers, rig=read_rig(folder))
+    recording = rgbd_recording(folder, info, *grippers, rig=read_rig(folder))
     save(recording, folder / "lift_denim.npz")
     last = cloud(recording, 15)
     print(f"{len(recording.times)} frames, {len(last)} points in the last")

@@ -16,19 +16,16 @@ import numpy as np  # noqa: E402
 from jax.sharding import Mesh, PartitionSpec  # noqa: E402
 
 import r2s  # noqa: E402
-from r2s.fabrics.parameters import OrthotropicSpace  # noqa: E402
-from r2s.world.air import Air  # noqa: E402
-from r2s.world.contact import Table  # noqa: E402
 
 FABRICS, STEPS = 16, 10
 sheet = r2s.rectangle((0.2, 0.2), (4, 4))  # [m]
 held = jnp.array([0, 3])
-scene = r2s.Scene(sheet, held, Table.make(-jnp.inf), Air.make())
+scene = r2s.Scene(sheet, held, r2s.Table.make(-jnp.inf), r2s.Air.make())
 solver = r2s.Cloth.make(scene, dt=0.025)  # [s]
 start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
 handles = jnp.broadcast_to(start[held], (1, STEPS, 2, 3))
 controls = r2s.Control(handles, jnp.zeros((1, STEPS, 3)))
-space = OrthotropicSpace.make(density=0.2)  # [kg/m^2]
+space = r2s.OrthotropicSpace.make(density=0.2)  # [kg/m^2]
 
 
 def sag(place):

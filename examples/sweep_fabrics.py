@@ -14,19 +14,16 @@ import jax.random as jr
 import numpy as np
 
 import r2s
-from r2s.fabrics.parameters import OrthotropicSpace
-from r2s.world.air import Air
-from r2s.world.contact import Table
 
 FABRICS, STEPS = 1000, 10
 sheet = r2s.rectangle((0.2, 0.2), (4, 4))  # [m]
 held = jnp.array([0, 3])
-scene = r2s.Scene(sheet, held, Table.make(-jnp.inf), Air.make())
+scene = r2s.Scene(sheet, held, r2s.Table.make(-jnp.inf), r2s.Air.make())
 solver = r2s.Cloth.make(scene, dt=0.025)  # [s]
 start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
 handles = jnp.broadcast_to(start[held], (1, STEPS, 2, 3))
 controls = r2s.Control(handles, jnp.zeros((1, STEPS, 3)))
-space = OrthotropicSpace.make(density=0.2)  # [kg/m^2]
+space = r2s.OrthotropicSpace.make(density=0.2)  # [kg/m^2]
 
 
 @eqx.filter_jit

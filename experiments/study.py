@@ -19,7 +19,8 @@ if __name__ == "__main__":
     add("--paper", type=Path, help="folder of the tables of Ru et al. 2025, to set beside ours")
     add("--density", type=float, default=0.15, help="areal density of recordings [kg/m^2]")
     add("--materials", default="", help="folder of measured tables, FABRIC.json (ARCSim)")
-    add("--columns", nargs="*", help="such as diffcloud-cloth-lifting, instead of the preset's")
+    name = "such as diffcloud-cloth-lifting, instead of the preset's; was --columns"
+    add("--configurations", "--columns", nargs="*", help=name)
     add("--fabrics", nargs="*", help="presets, instead of the preset's")
     add("--repeats", type=int, help="estimates of each fabric")
     add("--judged", type=int, help="motions to judge by, of each scenario")

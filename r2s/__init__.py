@@ -18,10 +18,11 @@ from r2s.cloth.cloth import Cloth, ClothState
 from r2s.estimation.cards import Card, Provenance
 from r2s.estimation.cards import read as read_card
 from r2s.estimation.cards import write as write_card
-from r2s.estimation.descent import Budget
 from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.estimation.identifiability import sensitivity
+from r2s.estimation.method import Budget, Method
 from r2s.estimation.problem import NuisancePrior, Problem
+from r2s.estimation.registry import METHODS
 from r2s.evaluation.metrics import distances
 from r2s.fabrics import presets
 from r2s.fabrics.fabric import Fabric
@@ -107,6 +108,8 @@ __all__ = [
     "OrthotropicSpace",
     "IsotropicSpace",
     "Range",
+    "METHODS",
+    "Method",
     "Problem",
     "NuisancePrior",
     "Budget",

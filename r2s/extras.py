@@ -1,12 +1,20 @@
-"""What comes with the extras of the installation, imported where it is used."""
+"""Libraries that come with the extras of the installation, imported where they are used."""
 
-from typing import Any
+from importlib import import_module
+from types import ModuleType
 
 
-def opencv() -> Any:
-    """The module cv2; `ImportError` that names the extra when it is not installed."""
+def require(module: str, extra: str, what: str) -> ModuleType:
+    """Import an optional library.
+
+    - `module`: its name, such as "cv2".
+    - `extra`: the extra of r2s that installs it, such as "camera".
+    - `what`: what needs it, as the subject of a sentence, such as "RGB-D images".
+
+    Raises ImportError that names all three when it is not installed.
+    """
     try:
-        import cv2
+        return import_module(module)
     except ImportError as error:
-        raise ImportError("images need OpenCV: pip install 'r2s[camera]'") from error
-    return cv2
+        package = module.partition(".")[0]
+        raise ImportError(f"{what}: {package} is missing: pip install 'r2s[{extra}]'") from error

@@ -1,6 +1,7 @@
 """Why a run of a solver failed: one code for cloth and material points alike."""
 
 import enum
+from typing import SupportsInt
 
 import jax.numpy as jnp
 from jaxtyping import Array, Int
@@ -41,7 +42,7 @@ _SENTENCES = {
 }
 
 
-def describe(code: int) -> str:
+def describe(code: SupportsInt) -> str:
     """One sentence that says what a failure code means and what to do.
 
     Accepts a `Failure`, an integer or an integer array without axes. Raises `ValueError` for a

@@ -33,7 +33,7 @@ def sweep(
     folder: Path | None = None,
     devices: Mesh | None = None,
 ) -> Any:
-    """The results of all members, in NumPy arrays with a leading axis; arguments as of `stream`.
+    """The results of all members, in NumPy arrays with a leading axis; for arguments see `stream`.
 
     >>> members = {"a": np.ones(3), "b": np.arange(3.0)}
     >>> sweep(lambda member: member["a"] + member["b"], members, chunk=2).tolist()
@@ -75,11 +75,11 @@ def stream(
         kept = min(size, count - first)
         path = None if folder is None else folder / f"{first:08d}-{_digest(part)}.eqx"
         if path is not None and path.exists():
-            like = _like(function, part) if like is None else like
+            like = _structure(function, part) if like is None else like
             yield first, _read(path, like, kept)
             continue
-        whole = jax.tree.map(lambda leaf: _filled(leaf, size), part)
-        found = _on_host(run(_spread(whole, devices)), kept)
+        whole = jax.tree.map(lambda leaf: _padded(leaf, size), part)
+        found = _on_host(run(_shard(whole, devices)), kept)
         if path is not None and jax.process_index() == 0:
             _write(path, found)
         yield first, found
@@ -111,11 +111,11 @@ def _part(members: Any, chosen: slice) -> Any:
     return jax.tree.map(lambda leaf: np.asarray(leaf[chosen]), members)
 
 
-def _filled(leaf: np.ndarray, size: int) -> np.ndarray:
+def _padded(leaf: np.ndarray, size: int) -> np.ndarray:
     return np.concatenate([leaf, np.repeat(leaf[-1:], size - len(leaf), axis=0)])
 
 
-def _spread(part: Any, devices: Mesh) -> Any:
+def _shard(part: Any, devices: Mesh) -> Any:
     """On the devices, of which a process sees its own alone."""
     sharding = NamedSharding(devices, PartitionSpec(AXIS))
     return jax.tree.map(
@@ -136,7 +136,7 @@ def _digest(part: Any) -> str:
     return digest.hexdigest()[:16]
 
 
-def _like(function: Callable[[Any], Any], part: Any) -> Any:
+def _structure(function: Callable[[Any], Any], part: Any) -> Any:
     one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), part)
     return jax.eval_shape(function, one)
 

@@ -1,8 +1,17 @@
-"""What the tests of the physics share: strict float64, a small sheet, and a step compiled once.
+"""What the tests share: strict float64, compiled programs, a small sheet, and a step compiled once.
 
 Most tests use the 5 x 5 `sheet` and the step `DT`, so that they share two compilations of `step`:
-a sheet that is free, and one held by its first row.
+a sheet that is free, and one held by its first row. Compiled programs are also kept in files, for
+the other process, for processes that tests start, and for the next run; and they are let go when a
+process holds too much.
 """
+
+import ctypes
+import gc
+import os
+import resource
+import sys
+from collections.abc import Iterator
 
 import equinox as eqx
 import hypothesis
@@ -10,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import jaxtyping
 import numpy as np
+import psutil
 import pytest
 
 from r2s.cloth.cloth import Cloth, ClothState
@@ -21,11 +31,81 @@ from r2s.world.air import Air
 from r2s.world.contact import Table
 from r2s.world.scene import Control, Scene
 
+# Of the tests that take minutes: each group takes less than twenty on two cores.
+SLOW_GROUPS = ("cloth", "points", "motions", "estimates", "pinn", "physnet", "study", "documents")
+MOST_MEMORY = 1000  # [MB]: a process that holds more lets its compiled programs go
+# Tracing makes many objects that stay: to count them again and again took a quarter of its time.
+gc.set_threshold(100_000, 50, 100)
+
 jax.config.update("jax_enable_x64", True)
 hypothesis.settings.register_profile("r2s", deadline=None)  # a first example compiles
 hypothesis.settings.load_profile("r2s")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep compiled programs in `.pytest_cache`, unless the environment names another folder."""
+    if hasattr(config, "cache"):
+        folder = str(config.cache.mkdir("jax"))
+        keep_programs(os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder))
+
+
+def keep_programs(folder: str) -> None:
+    """Compiled programs are written to a folder and read from it; a damaged file is compiled."""
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Refuse a slow test of no group, which `make test-slow` would never run."""
+    for item in items:
+        slow = item.get_closest_marker("slow")
+        if slow is not None and slow.kwargs.get("group") not in SLOW_GROUPS:
+            raise pytest.UsageError(f"{item.nodeid}: slow needs a group of {SLOW_GROUPS}")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def little_memory() -> Iterator[None]:
+    """After a module, compiled programs are let go if the process holds much memory."""
+    yield
+    if memory() > MOST_MEMORY:
+        eqx.clear_caches()
+        jax.clear_caches()
+        gc.collect()
+        if sys.platform == "linux":  # what was freed goes back to the system
+            ctypes.CDLL(None).malloc_trim(0)
+
+
+def memory() -> float:
+    """Resident memory of this process [MB]."""
+    return psutil.Process().memory_info().rss / 1e6
+
+
+def most_memory() -> float:
+    """The most resident memory that this process had [MB]."""
+    unit = 1 if sys.platform == "darwin" else 1024  # [byte]
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+
+
+MOST_OF_EACH: list[float] = []  # processes that ran tests [MB]
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Tell the process that collects the results how much memory this one took."""
+    getattr(session.config, "workeroutput", {})["most_memory"] = most_memory()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node) -> None:
+    MOST_OF_EACH.append(getattr(node, "workeroutput", {}).get("most_memory", float("nan")))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    most = ", ".join(f"{each:.0f}" for each in MOST_OF_EACH or [most_memory()])
+    terminalreporter.write_line(f"Most memory of each process: {most} MB")
+
 
 SIZE = 0.2  # of the sheet's sides, [m]
 SHAPE = (5, 5)
@@ -111,5 +191,8 @@ def energy(mesh: Mesh, fabric: Fabric, x, v):
 
 def directional_difference(function, at, direction, size: float):
     """The central difference of `function` at a tree of arrays along another."""
-    moved = lambda sign: jax.tree.map(lambda a, d: a + sign * size * d, at, direction)
+
+    def moved(sign):
+        return jax.tree.map(lambda a, d: a + sign * size * d, at, direction)
+
     return (function(moved(1)) - function(moved(-1))) / (2 * size)

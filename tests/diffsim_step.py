@@ -137,7 +137,9 @@ def run(setting: Setting, counts: Int[Array, " frame"]) -> tuple[Array, Array]:
     """Positions [m] and velocities [m/s] after numbers of steps."""
 
     def to_frame(carry, until):
-        before = lambda carry: carry[0] < until
+        def before(carry):
+            return carry[0] < until
+
         carry = jax.lax.while_loop(before, lambda carry: _step(setting, *carry), carry)
         return carry, (carry[1], carry[2])
 
@@ -173,7 +175,10 @@ def _internal(setting, x, x_before):
     laws = jax.vmap(setting.bending.at)(
         mesh.hinge_direction, hinge_curvatures(mesh, hinge_angles(mesh, x_before))
     )
-    of_face = lambda *element: _face(setting.membrane, *element)
+
+    def of_face(*element):
+        return _face(setting.membrane, *element)
+
     force = jnp.zeros(x.size)
     matrix = jnp.zeros((x.size, x.size))
     for elements, (forces, stiffness) in (
@@ -200,7 +205,10 @@ def _face(table, corners, inverse, area):
 
 def _hinge(corners, law, length, area):
     angle, gradient = jax.value_and_grad(hinge_angle)(corners)
-    energy = lambda angle: area * law.energy_density(angle * length / area)
+
+    def energy(angle):
+        return area * law.energy_density(angle * length / area)
+
     gradient = gradient.ravel()
     stiffness = jax.hessian(energy)(angle) * jnp.outer(gradient, gradient)
     return -jax.grad(energy)(angle) * gradient, stiffness

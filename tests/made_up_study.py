@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from r2s.geometry.mesh import rectangle
-from r2s.study.report.scenes import Shown
-from r2s.study.statistics import panel
-from r2s.study.statistics.panel import MOTIONS, PAPER_COLUMNS, Column
-from r2s.study.statistics.tables import Row
+from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
+from r2s.study.report.motions import MotionComparison
+from r2s.study.rows import Row
+from r2s.study.statistics import result_array
 
 FABRICS = ("black_denim", "grey_interlock", "pink_solid")
 METRICS = {"chamfer": ("m", 1.0), "paper_chamfer": ("-", 20.0), "hausdorff": ("m", 3.0)}
@@ -21,18 +21,20 @@ METRICS = {"chamfer": ("m", 1.0), "paper_chamfer": ("-", 20.0), "hausdorff": ("m
 def few_draws(count: int = 60) -> Iterator[None]:
     """Bootstraps of so many draws, for the sake of time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(panel, "DRAWS", count)
+        patch.setattr(result_array, "DRAWS", count)
         yield
 
 
-def flat_distance(column: Column, fabric: str, motion: str, trial: int, repeat: int) -> float:
+def flat_distance(
+    configuration: Configuration, fabric: str, motion: str, trial: int, repeat: int
+) -> float:
     """The same everywhere, [m]."""
     return 0.02
 
 
 def made_up_rows(
-    distance: Callable[[Column, str, str, int, int], float] = flat_distance,
-    columns: Sequence[Column] = PAPER_COLUMNS,
+    distance: Callable[[Configuration, str, str, int, int], float] = flat_distance,
+    configurations: Sequence[Configuration] = PAPER_CONFIGURATIONS,
     fabrics: Sequence[str] = FABRICS,
     motions: Sequence[str] = MOTIONS,
     trials: int = 4,
@@ -44,19 +46,19 @@ def made_up_rows(
     """Rows of `distance` [m], times log-normal noise; that of the default fabric is 40 mm."""
     generator = np.random.default_rng(seed)
     rows = []
-    for column in (*columns, Column("", "cloth", "")):
+    for configuration in (*configurations, Configuration("", "cloth", "")):
         for fabric in fabrics:
             for motion in motions:
                 for trial in range(1, trials + 1):
-                    for repeat in range(1, repeats + 1 if column.approach else 2):
-                        is_default = not column.approach
-                        value = (
-                            0.04 if is_default else distance(column, fabric, motion, trial, repeat)
-                        )
+                    for repeat in range(1, repeats + 1 if configuration.approach else 2):
+                        is_default = not configuration.approach
+                        value = 0.04
+                        if not is_default:
+                            value = distance(configuration, fabric, motion, trial, repeat)
                         value *= math.exp(noise * generator.normal())
                         rows += [
                             Row(
-                                *column,
+                                *configuration,
                                 fabric,
                                 str(repeat),
                                 f"{motion}_{fabric}{trial}",
@@ -71,10 +73,10 @@ def made_up_rows(
     return rows
 
 
-def made_up_shown(
+def made_up_comparison(
     motion: str = "fling", fabric: str = "black_denim", labels: Sequence[str] = ("a", "b")
-) -> Shown:
-    """A sheet that swings, seen as its own vertices; the columns lag behind it."""
+) -> MotionComparison:
+    """A sheet that swings, seen as its own vertices; the configurations lag behind it."""
     mesh = rectangle((0.4, 0.4), (4, 4))
     rest, times = np.asarray(mesh.rest, float), np.linspace(0.0, 1.0, 6)
 
@@ -86,4 +88,4 @@ def made_up_shown(
     motions = {label: swung(0.1 * i) for i, label in enumerate(labels)}
     clouds = tuple(swung(0.0)[i, : len(rest) - i] for i in range(len(times)))
     faces = np.asarray(mesh.faces)
-    return Shown(fabric, motion, f"{motion}_{fabric}1", times, clouds, faces, motions)
+    return MotionComparison(fabric, motion, f"{motion}_{fabric}1", times, clouds, faces, motions)

@@ -13,8 +13,8 @@ pytest.importorskip("tyro")
 from test_show import cloth, lab, recorded  # noqa: E402
 
 from r2s.cli import main  # noqa: E402
+from r2s.recordings.open import save_trajectory  # noqa: E402
 from r2s.recordings.recording import save  # noqa: E402
-from r2s.viewer.pictures import save_trajectory  # noqa: E402
 
 
 def stopped(*arguments: str) -> int | str | None:

@@ -131,7 +131,10 @@ def test_a_hanging_sheet_stretches_under_its_weight(sheet, stiffness):
 def test_handles_are_where_they_are_put(sheet, fabric):
     solver = cloth(sheet, FIRST_ROW)
     start = flat(sheet)
-    path = lambda t: start[:5] + jnp.array([[0.3 * t, -0.2 * t, t**2]])
+
+    def path(t):
+        return start[:5] + jnp.array([[0.3 * t, -0.2 * t, t**2]])
+
     states = roll(solver, fabric, solver.init(start), 20, path)
     expected = np.stack([np.asarray(path(t)) for t in STEPS * DT])
     assert states.x[:, :5] == pytest.approx(expected, abs=1e-12)
@@ -170,7 +173,10 @@ def test_a_smooth_swing_converges_to_second_order(sheet):
     ends = []
     for refinement in (1, 2, 4):
         solver = cloth(sheet, FIRST_ROW, dt=DT / refinement)
-        path = lambda t: start[:5] + jnp.array([[0.03 * np.sin(np.pi * t / 0.4) ** 4, 0.0, 0.0]])
+
+        def path(t):
+            return start[:5] + jnp.array([[0.03 * np.sin(np.pi * t / 0.4) ** 4, 0.0, 0.0]])
+
         ends.append(roll(solver, fabric, solver.init(start), 30 * refinement, path).x[-1])
     ratio = np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(ends[1] - ends[2])
     assert 2**1.7 < ratio < 2**2.3
@@ -181,8 +187,11 @@ def disturbed(sheet):
     """Increments and positions with strain, contact, slip and wind at random, and functions."""
     solver = cloth(sheet, FIRST_ROW, table=0.0, air=AIR_DENSITY)
     fabric = Fabric.make(0.2, LAW, 1e-4)
+
     # both Hessians and the force, in one compilation
-    matrix = lambda at, x, exactness: dense(at.elimination.pattern, hessian(at, x, exactness))
+    def matrix(at, x, exactness):
+        return dense(at.elimination.pattern, hessian(at, x, exactness))
+
     both = eqx.filter_jit(lambda at, x: (matrix(at, x, 1.0), matrix(at, x, 0.0), residual(at, x)))
 
     def state(seed):
@@ -264,7 +273,10 @@ def test_extreme_fabrics_stay_finite(is_double):
         mesh = rectangle((SIZE, SIZE), SHAPE)
         solver = cloth(mesh, FIRST_ROW, table=0.0, air=AIR_DENSITY)
         start = flat(mesh, 1e-3)
-        path = lambda t: start[:5] + jnp.array([[0.0, 0.0, 0.5 * t]])
+
+        def path(t):
+            return start[:5] + jnp.array([[0.0, 0.0, 0.5 * t]])
+
         for density, c11, c22, c33, bending in EXTREME:
             fabric = Fabric.make(density, (c11, 0.0, c22, c33), bending)
             states = roll(solver, fabric, solver.init(start), 10, path)

@@ -168,7 +168,7 @@ def test_wrong_columns_and_kinds_are_refused(tmp_path: Path) -> None:
     (tmp_path / "many.npz").rename(tmp_path / "many.npy")
     for name, words in [
         ("two.xyz", r"\(3, 2\)"),
-        ("ragged.xyz", "rows of 2 to 3 columns"),
+        ("ragged.xyz", "columns changed from 3 to 2 at row 2"),
         ("two.obj", r"\(3, 2\)"),
         ("text.npy", "expected real numbers"),
         ("many.npy", "several arrays"),

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import tomllib
 import xml.etree.ElementTree as xml
 from pathlib import Path
@@ -13,16 +14,17 @@ import pytest
 pytest.importorskip("tyro")
 
 from test_cli import stopped  # noqa: E402
+from test_show import recorded  # noqa: E402
 
 from r2s.cli import main  # noqa: E402
-from r2s.commands.common import experiment_of, tell  # noqa: E402
+from r2s.commands.common import make_experiment, print_result  # noqa: E402
 from r2s.commands.doctor import EXCLUDED, EXTRAS, implausible  # noqa: E402
 from r2s.estimation import cards
 from r2s.estimation.cards import Card, Provenance  # noqa: E402
 from r2s.fabrics import presets  # noqa: E402
 from r2s.fabrics.arcsim import read_material  # noqa: E402
-from r2s.recordings.recording import load  # noqa: E402
-from r2s.viewer.pictures import load_trajectory  # noqa: E402
+from r2s.recordings.open import load_trajectory  # noqa: E402
+from r2s.recordings.recording import load, save  # noqa: E402
 
 COMMANDS = ["simulate", "estimate", "evaluate", "export", "check-grad", "doctor"]
 SHORT = ["--motion", "num_frames=4", "moving=0.15", "--shape", "3", "3"]
@@ -58,7 +60,10 @@ def test_an_error_is_one_line_and_1(tmp_path: Path, capsys: pytest.CaptureFixtur
         (["simulate", "lifting", "--fabric", str(broken), *out], "broken.json: no fabric card"),
         (["simulate", "lifting", "--motion", "heigt=1", *out], "lifting has no heigt; it takes he"),
         (["simulate", "lifting", "--motion", "height", *out], "expects NAME=NUMBER"),
-        (["simulate", "wind", "--layers", "--solver", "points", *out], "--layers is of the cloth"),
+        (
+            ["simulate", "wind", "--self-contact", "--solver", "points", *out],
+            "--self-contact is of the cloth",
+        ),
         (["estimate", str(tmp_path / "no.npz"), "--density", "0.2", *out], "no.npz: no such"),
         (["evaluate", "black_denim", str(tmp_path / "no.npz")], "no.npz: no such recording"),
         (["check-grad", "wind", "--solver", "points", "--forward"], "are of the cloth"),
@@ -73,7 +78,7 @@ def test_an_error_is_one_line_and_1(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_a_motion_is_simulated(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out = tmp_path / "x.npz"
     command = ["simulate", "lifting", "--fabric", "black_denim", "--out", str(out), *SHORT]
@@ -84,7 +89,7 @@ def test_a_motion_is_simulated(tmp_path: Path, capsys: pytest.CaptureFixture) ->
     assert moved.x.shape == (4, 9, 3) and np.isfinite(moved.x).all()
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_a_recording_is_simulated_and_judged(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out, recording = str(tmp_path / "x.npz"), tmp_path / "lift.npz"
     command = ["simulate", "lifting", "--fabric", "black_denim", "--out", out, *SHORT]
@@ -158,15 +163,15 @@ def test_the_doctor_looks_at_a_mesh(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_numbers_of_a_motion_and_what_is_printed(capsys: pytest.CaptureFixture) -> None:
-    made = experiment_of("folding", ["reach=0.8", "num_frames=50"])
+    made = make_experiment("folding", ["reach=0.8", "num_frames=50"])
     assert len(made.times) == 50 and made.name == "folding"
     with pytest.raises(ValueError, match="reach must be above 0 and at most 1"):
-        experiment_of("folding", ["reach=2"])
-    tell(True, {"a": float("nan"), "b": [np.inf, 1.0], "c": Path("x")}, [])
+        make_experiment("folding", ["reach=2"])
+    print_result(True, {"a": float("nan"), "b": [np.inf, 1.0], "c": Path("x")}, [])
     assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, 1.0], "c": "x"}
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_a_card_comes_from_a_recording_and_goes_on_where_it_was(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
@@ -187,7 +192,7 @@ def test_a_card_comes_from_a_recording_and_goes_on_where_it_was(
     assert not list(tmp_path.glob("*.progress.npz"))
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 @pytest.mark.parametrize("more", [[], ["--forward"]])
 def test_derivatives_of_a_scene_agree(capsys: pytest.CaptureFixture, more: list[str]) -> None:
     assert main(["check-grad", "lifting", *SHORT, "--json", *more]) == 0
@@ -195,9 +200,44 @@ def test_derivatives_of_a_scene_agree(capsys: pytest.CaptureFixture, more: list[
     assert told["agree"] and len(told["rows"]) == 11
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_the_doctor_predicts_step_and_memory(capsys: pytest.CaptureFixture) -> None:
     assert main(["doctor", "--scenario", "lifting", *SHORT, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)["scenario"]
     assert told["points_step_s"] < told["step_s"] <= 0.025
     assert 0 < told["memory_bytes"] < told["gradient_memory_bytes"]
+
+
+FAILED = r"failed in (frame \d+|\d+ frames before the first one), step \d+: [A-Z]"
+STORM = ["--motion", "speed=1e200", "num_frames=2", "--shape", "3", "3"]  # its drag overflows
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["simulate", "--out"],
+        pytest.param(["doctor"], marks=pytest.mark.slow(group="documents")),
+        pytest.param(["check-grad"], marks=pytest.mark.slow(group="documents")),
+    ],
+    ids=["simulate", "doctor", "check-grad"],
+)
+def test_a_run_that_diverges_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture, command: list[str]
+) -> None:
+    name, *options = command
+    scenario = ["--scenario", "wind"] if name == "doctor" else ["wind"]
+    options += [str(tmp_path / "x.npz")] if options else []
+    assert main([name, *scenario, *options, *STORM]) == 1
+    assert re.search(f"the simulation {FAILED}", capsys.readouterr().out)
+
+
+def test_a_recording_that_cannot_be_simulated_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    calm = recorded(2)
+    storm = dataclasses.replace(calm.info, name="storm", wind=(0.0, 1e200, 0.0))
+    save(dataclasses.replace(calm, info=storm), tmp_path / "storm.npz")
+    assert main(["evaluate", "black_denim", str(tmp_path / "storm.npz"), "--json"]) == 1
+    result = json.loads(capsys.readouterr().out)
+    assert re.match(FAILED, result["failures"]["storm"])
+    assert result["recordings"]["storm"]["chamfer_real_to_sim"] is None

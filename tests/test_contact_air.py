@@ -123,7 +123,10 @@ def test_drag_is_the_pressure_of_the_normal_flow(velocity, normal):
     expected = -1.3 * 1.7 / 2 * abs(flow) * flow * np.asarray(normal)
     found = -jax.grad(air.dissipation)(velocity, normal)
     assert found == pytest.approx(expected, rel=1e-9, abs=1e-12)
-    potential = lambda velocity: air.dissipation(velocity, normal)
+
+    def potential(velocity):
+        return air.dissipation(velocity, normal)
+
     change = directional_difference(potential, velocity, jnp.ones(3), 1e-5)
     assert -change == pytest.approx(float(np.sum(expected)), rel=1e-6, abs=1e-8)
 

@@ -17,6 +17,7 @@ from r2s.estimation.checkpoint import arrays_of, load, read, save, tree_from
 from r2s.estimation.estimate import describe, point_estimate
 from r2s.estimation.estimate_json import as_json, from_json
 from r2s.estimation.method import Budget, default_space, seed_of
+from r2s.estimation.pinn import from_pulls, published_recipe
 from r2s.estimation.registry import METHODS
 from r2s.fabrics import presets
 from r2s.fabrics.fabric_json import fabric_as_json, fabric_from_json
@@ -115,7 +116,7 @@ def test_a_method_keeps_the_contract_on_the_cloth(recording, name):
     assert "converged: no, the budget ended the search" in describe(found)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="estimates")
 @pytest.mark.parametrize(
     "name, solver",
     [
@@ -131,7 +132,7 @@ def test_other_methods_keep_the_contract(recording, name, solver):
     assert found.approach.startswith(name) and np.isfinite(found.loss) and not found.converged
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="estimates")
 def test_physnet_trains_its_network_once(recording, tmp_path, monkeypatch):
     pytest.importorskip("skopt")
     from r2s.estimation.physnet import dataset
@@ -157,7 +158,7 @@ def test_physnet_trains_its_network_once(recording, tmp_path, monkeypatch):
         assert np.isfinite(each.loss) and each.converged is False
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="estimates")
 @pytest.mark.parametrize("name", ["pinn", "pinn-published"])
 def test_the_network_takes_a_stretching(name):
     from r2s.estimation.pinn.synthetic_pulls import pulled
@@ -274,3 +275,8 @@ def test_a_checkpoint_is_of_one_run(tmp_path):
     np.savez(path, places=np.zeros(2))
     with pytest.raises(ValueError, match=r"run\.npz is no checkpoint"):
         read(path)
+
+
+def test_the_usual_budgets_of_the_network_are_those_of_its_recipes():
+    assert METHODS["pinn"].budget.iterations == from_pulls.QUICK.adam
+    assert METHODS["pinn-published"].budget.iterations == published_recipe.EPOCHS

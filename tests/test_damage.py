@@ -29,7 +29,10 @@ def damages(draw: st.DrawFn) -> Damage:
     """Cut, emptied, bytes changed, bytes put in, or doubled."""
     at = draw(st.floats(0, 1, exclude_max=True))
     junk = draw(st.binary(min_size=1, max_size=8))
-    where = lambda data: int(at * len(data))
+
+    def where(data):
+        return int(at * len(data))
+
     kinds: dict[str, Damage] = {
         "cut": lambda data: data[: where(data)],
         "changed": lambda data: data[: where(data)] + junk + data[where(data) + len(junk) :],

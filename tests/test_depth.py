@@ -13,7 +13,7 @@ from rgbd_scene import FACES, LENS, camera, surface
 
 from r2s.recordings.cameras.calibration import calibrated, look_at, project, rays
 from r2s.recordings.cameras.camera import Camera
-from r2s.recordings.cameras.depth import back_project, from_world, moved, steps
+from r2s.recordings.cameras.depth import back_project, depth_jumps, from_world, moved
 from r2s.recordings.cameras.flaws import (
     NONE,
     TYPICAL,
@@ -100,8 +100,8 @@ def test_faces_behind_the_camera_are_not_seen() -> None:
 def test_jumps_of_depth_are_found_on_both_sides_but_not_at_holes() -> None:
     depth = np.array([[1.0, 1.0, 1.5, 1.5], [1.0, 1.0, 0.0, 1.5]])
     expected = [[False, True, True, False], [False, False, False, False]]
-    np.testing.assert_array_equal(steps(depth, 0.1), expected)
-    assert not steps(depth, 1.0).any()
+    np.testing.assert_array_equal(depth_jumps(depth, 0.1), expected)
+    assert not depth_jumps(depth, 1.0).any()
 
 
 def test_depth_survives_its_file_but_for_rounding(tmp_path) -> None:
@@ -159,7 +159,7 @@ def test_depth_at_edges_lies_between_the_two_sides() -> None:
         view, depth, which, x, faces, replace(NONE, edge_mixed=1.0), np.random.default_rng(0)
     )
     changed = mixed != depth
-    assert changed.any() and not changed[~steps(depth, 0.02)].any()
+    assert changed.any() and not changed[~depth_jumps(depth, 0.02)].any()
     assert mixed.min() >= depth.min() and mixed.max() <= depth.max()
 
 

@@ -28,7 +28,7 @@ def recordings(pattern: str, is_slow=lambda told: False):
     """The recordings of a kind, of which some are slow to compute."""
     found = sorted(path for path in FOLDER.glob(f"{pattern}.npz"))
     told = [json.loads(path.with_suffix(".json").read_text()) for path in found]
-    marks = [[pytest.mark.slow] if is_slow(settings) else [] for settings in told]
+    marks = [[pytest.mark.slow(group="cloth")] if is_slow(settings) else [] for settings in told]
     return [
         pytest.param(path, id=path.stem, marks=mark)
         for path, mark in zip(found, marks, strict=True)
@@ -110,7 +110,7 @@ def roll(setting, dt):
     return np.stack(frames)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("path", recordings("lift*_dt10") + recordings("hang2wind*_dt10"))
 def test_the_motion_is_its_motion_in_the_limit_of_small_steps(path):
     setting, _ = load(path)

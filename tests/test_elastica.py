@@ -36,8 +36,13 @@ def elastica(number: float) -> tuple[float, float]:
     `number` is weight per area times length^3 over bending stiffness. The moment at s carries the
     weight beyond, so that the angle below the horizontal obeys theta'' = -number (1 - s) cos theta.
     """
-    slope = lambda s, y: np.stack([y[1], -number * (1 - s) * np.cos(y[0])])
-    ends = lambda clamped, free: np.array([clamped[0], free[1]])
+
+    def slope(s, y):
+        return np.stack([y[1], -number * (1 - s) * np.cos(y[0])])
+
+    def ends(clamped, free):
+        return np.array([clamped[0], free[1]])
+
     s = np.linspace(0, 1, 201)
     guess = np.stack([np.pi / 2 * (1 - np.exp(-number * s / 3)), 0 * s])
     solution = solve_bvp(slope, ends, s, guess, tol=1e-8, max_nodes=20000)
@@ -78,7 +83,10 @@ def hinges(stiffness: float, bias: float) -> OrthotropicBending:
 
 def rest(mesh, along, law, start):
     """Where a strip comes to rest [m] whose first two rows are held; `along` it [m] from there."""
-    array = lambda value: jnp.asarray(value, float)
+
+    def array(value):
+        return jnp.asarray(value, float)
+
     membrane = OrthotropicMembrane(*map(array, MEMBRANE))
     numbers = map(array, (0.05, 0.0, 1e-3, 0.0))  # damping, friction, thickness, mass damping
     fabric = Fabric(array(DENSITY), membrane, law, *numbers)
@@ -121,7 +129,7 @@ def test_the_tip_of_a_strip_hangs_where_the_elastica_does(number, axis):
     assert miss(16, axis, number) < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("number", [1.0, 10.0])
 def test_the_tip_converges_to_the_elastica_to_second_order(number):
     coarse, medium, fine = (miss(cells, 0, number) for cells in (8, 16, 32))
@@ -131,8 +139,13 @@ def test_the_tip_converges_to_the_elastica_to_second_order(number):
 def heights_matrix(cells: int, law, across: int = 2, diagonals: str = "falling"):
     """A strip, and the second derivative [N/m] of its bending energy in the heights, when flat."""
     mesh = strip(cells, 0, across, diagonals)
-    raised = lambda height: jnp.concatenate([mesh.rest, height[:, None]], axis=1)
-    curvature = lambda height: hinge_curvatures(mesh, hinge_angles(mesh, raised(height)))
+
+    def raised(height):
+        return jnp.concatenate([mesh.rest, height[:, None]], axis=1)
+
+    def curvature(height):
+        return hinge_curvatures(mesh, hinge_angles(mesh, raised(height)))
+
     at_rest = jnp.zeros(mesh.rest.shape[0])
     if law.element == "patches":
         laws = jax.vmap(law.at)(law.curvatures(mesh, curvature(at_rest)))
@@ -199,7 +212,10 @@ def prestress(mesh, free):
     That is what the stress of its weight, which is in its plane, adds to the stiffness across it.
     """
     count = mesh.rest.shape[0]
-    grown = lambda moved: strains(mesh, jnp.pad(mesh.rest + moved, ((0, 0), (0, 1))))
+
+    def grown(moved):
+        return strains(mesh, jnp.pad(mesh.rest + moved, ((0, 0), (0, 1))))
+
     strain = np.asarray(jax.jit(jax.jacfwd(grown))(jnp.zeros((count, 2)))).reshape(-1, 3, 2 * count)
     c11, c12, c22, c33 = MEMBRANE
     law, area = np.array([[c11, c12, 0], [c12, c22, 0], [0, 0, c33]]), np.asarray(mesh.area)
@@ -234,7 +250,7 @@ def buckling(bends: float, twists: float) -> float:
     return 12.85 * (bends * twists) ** 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("ratio", [0.0, 0.3])
 def test_a_strip_on_its_edge_buckles_at_prandtls_weight(ratio):
     law = PlateBending.make(1.0, ratio)
@@ -244,7 +260,7 @@ def test_a_strip_on_its_edge_buckles_at_prandtls_weight(ratio):
     assert 2 * fine - coarse == pytest.approx(expected, rel=0.04)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("bias", [0.5, 1.0, 10.0])
 def test_hinges_twist_too_stiffly(bias):
     # Twist bends the diagonals alone: 4 bias width, where a plate has 2 stiffness width, so that

@@ -22,7 +22,10 @@ TARGET = respond(TRUTH[None])[0]
 
 def test_the_target_is_found_where_losses_alone_do_not_find_it():
     found = emulator.minimise(respond, TARGET, 3, num_calls=24, seed=1)
-    by_losses = lambda places: np.sqrt(((respond(places) - TARGET) ** 2).mean(axis=1))
+
+    def by_losses(places):
+        return np.sqrt(((respond(places) - TARGET) ** 2).mean(axis=1))
+
     alone = bayes.minimise(by_losses, 3, num_calls=24, seed=1)
     assert np.abs(found.places[-1] - TRUTH).max() < 0.02
     assert found.losses(TARGET)[-1] < alone.losses.min() / 2

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from r2s.study import cells, engine
 from r2s.study.cells import Cell
 from r2s.study.environment import environment, one_core
-from r2s.study.subprocesses import Apart
+from r2s.study.subprocesses import OneProcess
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Sum(Cell):
 
 
 def value_of(cell: Cell, folder: Path) -> int:
-    with cells.opened(cell, folder) as files:
+    with cells.result_files(cell, folder) as files:
         return int((files / "value.txt").read_text())
 
 
@@ -70,7 +70,7 @@ def tree() -> Sum:
 
 
 def test_needs_come_first_and_once(tmp_path):
-    order = [cell.name for cell in engine.closure([tree()])]
+    order = [cell.name for cell in cells.with_dependencies([tree()])]
     assert order == ["n1", "n2", "a", "n3", "b", "whole"]
     assert engine.run([tree()], tmp_path, engine.Serial()) == {}
     assert value_of(tree(), tmp_path) == 8
@@ -95,7 +95,7 @@ def test_what_is_made_is_not_made_again_and_says_how_it_was_made(tmp_path):
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.zip")}
     engine.run([tree()], tmp_path, engine.Serial())
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.zip")} == times
-    noted = cells.about(Number(3), tmp_path)
+    noted = cells.read_metadata(Number(3), tmp_path)
     assert noted["config"] == "Number(value=3, pause=0.0)" and noted["seed"] == 3
     assert {"r2s", "jax"} <= noted["versions"].keys()
     assert noted["seconds"] >= 0 and noted["peak_memory_MB"] > 10
@@ -175,7 +175,7 @@ class Dying(Cell):
 def test_a_process_apart_has_a_workers_environment_and_may_die(tmp_path, monkeypatch):
     for name in environment(1):
         monkeypatch.setenv(name, os.environ.get(name, ""))  # put back at the end
-    runner = Apart()
+    runner = OneProcess()
     try:
         failed = engine.run([Dying(), tree()], tmp_path, runner)
     finally:
@@ -216,8 +216,8 @@ def _cores() -> set[int]:
 def test_a_process_takes_the_core_that_has_least_to_do(monkeypatch):
     psutil, taken = pytest.importorskip("psutil"), []
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {1, 3, 4}, raising=False)
-    monkeypatch.setattr(os, "sched_setaffinity", lambda *about: taken.append(about), raising=False)
-    monkeypatch.setattr(psutil, "cpu_percent", lambda **about: [0.0, 90.0, 0.0, 20.0, 40.0])
+    monkeypatch.setattr(os, "sched_setaffinity", lambda *given: taken.append(given), raising=False)
+    monkeypatch.setattr(psutil, "cpu_percent", lambda **_: [0.0, 90.0, 0.0, 20.0, 40.0])
     one_core()
     one_core(5)
     assert taken == [(0, {3}), (0, {4})]
@@ -231,7 +231,7 @@ echo "Submitted batch job $!"
 """
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="study")
 def test_jobs_of_slurm_make_the_same_with_a_stand_in_for_sbatch(tmp_path, monkeypatch):
     """The stand-in runs a job's script at once, as Slurm would on a node that is free."""
     cluster = pytest.importorskip("r2s.study.cluster", reason="needs the extra cluster")

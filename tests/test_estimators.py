@@ -43,19 +43,35 @@ def small(recording):
 
 
 @pytest.fixture(scope="module")
-def pulled():
-    """A stretching of few frames, with markers and force."""
+def pull():
+    """A recorded stretching of few frames, with markers and force."""
     experiment = scenarios.stretching(num_frames=6, interval=1 / 10, strain=0.03, moving=0.4)
-    record = synthetic.record(experiment, FABRIC, "grey", shape=(5, 5), key=jr.key(3))
-    return Problem.make(record, FAMILY, shape=(5, 5))
+    return synthetic.record(experiment, FABRIC, "grey", shape=(5, 5), key=jr.key(3))
 
 
-normal_at = jax.jit(gauss_newton.normal_at)
+@pytest.fixture(scope="module")
+def pulled(pull):
+    return Problem.make(pull, FAMILY, shape=(5, 5))
+
+
+@pytest.fixture(scope="module")
+def estimated(small):
+    return descend(small, SMALL, key=jr.key(0))
+
+
+def normal_at(problems, theta, scale=0.0):
+    """By the program that a descent runs, which is compiled once for both."""
+    return descent._normal(problems, theta, jnp.asarray(scale, float), None)
+
+
 AWAY = jnp.array([0.1, -0.2, 0.1, 0.3, 0.2, -0.1, 0.4])
 
 
+PULLED = pytest.param("pulled", marks=pytest.mark.slow(group="estimates"))
+
+
 @pytest.mark.parametrize("scale", [0.0, 0.01])
-@pytest.mark.parametrize("kind", ["small", "pulled"])
+@pytest.mark.parametrize("kind", ["small", PULLED])
 def test_the_objective_has_the_gradient_that_differences_have(kind, scale, request):
     """Gauss-Newton's gradient is that of the whole rollout: contact, nearest points, force."""
     problems = (request.getfixturevalue(kind),)
@@ -77,7 +93,7 @@ def _loss(problems, theta, scale):
     return gauss_newton.loss_at(problems, theta, scale=scale)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="estimates")
 def test_a_narrow_secant_is_the_derivative(small):
     theta = jnp.concatenate([jnp.full(7, 0.45), AWAY])
     _, exact = jax.jit(sensitivities)(small, theta)
@@ -100,12 +116,18 @@ def test_an_early_camera_is_predicted_as_an_early_recording(recording):
     late = set_time_offset(recording, -0.1)
     nuisance_prior = NuisancePrior(time=0.1)
     place = FAMILY.to_unit(FABRIC)
-    theta = lambda delay: jnp.concatenate([place, jnp.zeros(6), jnp.array([delay])])
+
+    def theta(delay):
+        return jnp.concatenate([place, jnp.zeros(6), jnp.array([delay])])
+
     loss = jax.jit(lambda p, u: loss_of(p, predict(p, u)))
-    whole = lambda r: Problem.make(
-        r, FAMILY, num_points=60, shape=(5, 5), nuisance_prior=nuisance_prior
-    )
-    make = lambda r: window(whole(r), 4, 6)  # the simulation ends where the recording does
+
+    def whole(r):
+        return Problem.make(r, FAMILY, num_points=60, shape=(5, 5), nuisance_prior=nuisance_prior)
+
+    def make(r):
+        return window(whole(r), 4, 6)  # the simulation ends where the recording does
+
     same, shifted = float(loss(make(recording), theta(0.0))), make(late)
     assert float(loss(shifted, theta(-1.0))) == pytest.approx(same, rel=0.02)
     assert float(loss(shifted, theta(0.0))) > 2 * same
@@ -132,13 +154,16 @@ def test_of_many_descents_the_better_half_go_on():
 def test_a_marker_that_is_off_in_every_frame_is_one_error(pulled):
     """As the first frame's noise makes it: to see it twice as often tells no more."""
     pulled = dataclasses.replace(pulled, force=None)
-    theta = jnp.concatenate([FAMILY.to_unit(FABRIC), jnp.zeros(7)])
-    seen, slope = jax.jit(sensitivities)(pulled, theta)
+    rest = jnp.pad(pulled.scenario.scene.mesh.rest, ((0, 0), (0, 1)))
+    x = jnp.broadcast_to(rest, (len(pulled.frames), *rest.shape))
+    seen = Prediction(x, None, jnp.array(True))
+    slope = Sensitivity(0.1 * jr.normal(jr.key(1), (*x.shape, 3)), None)  # of a made-up motion
     off = 1e-3 * jr.normal(jr.key(0), pulled.markers.positions.shape[1:])
-    twice = lambda part: jnp.concatenate([part, part])
+
+    def twice(part):
+        return jnp.concatenate([part, part])
 
     def covariance(number, repeat):
-        about = Prediction(repeat(seen.x), None, seen.ok), Sensitivity(repeat(slope.x), None)
         expected = jnp.einsum("mk,fmki->fmi", pulled.markers.weights, seen.x[:, corners])
         markers = dataclasses.replace(
             pulled.markers,
@@ -146,8 +171,10 @@ def test_a_marker_that_is_off_in_every_frame_is_one_error(pulled):
             seen=repeat(pulled.markers.seen),
         )
         frames = pulled.frames * number
-        found = normal_equations_of(
-            dataclasses.replace(pulled, markers=markers, frames=frames), *about
+        found = jax.jit(normal_equations_of)(
+            dataclasses.replace(pulled, markers=markers, frames=frames),
+            Prediction(repeat(seen.x), None, seen.ok),
+            Sensitivity(repeat(slope.x), None),
         )
         prior = 1e-6 * jnp.diag(jnp.diag(jnp.sum(found.matrices, axis=0)) + 1e-9)
         inverse = jnp.linalg.inv(jnp.sum(found.matrices, axis=0) + prior)
@@ -155,11 +182,7 @@ def test_a_marker_that_is_off_in_every_frame_is_one_error(pulled):
         return inverse @ gauss_newton.scatter(found.scores, found.matrices, noise, prior) @ inverse
 
     corners = pulled.markers.vertices
-    doubted = np.array([*range(7), *range(9, 13)])  # the fabric, shift and turn
-    once, again = (
-        np.asarray(covariance(*about))[np.ix_(doubted, doubted)]
-        for about in ((1, lambda x: x), (2, twice))
-    )
+    once, again = (np.asarray(covariance(*each)) for each in ((1, lambda x: x), (2, twice)))
     sizes = np.sqrt(np.diag(once))
     np.testing.assert_allclose(
         again / np.outer(sizes, sizes), once / np.outer(sizes, sizes), atol=1e-4
@@ -171,7 +194,10 @@ def test_the_scatter_of_a_gradient_is_that_of_the_jackknife():
     random = np.random.default_rng(0)
     rows, values = random.normal(size=(6, 4, 2)), random.normal(size=(6, 4))
     whole = np.einsum("cpu,cpv->uv", rows, rows)
-    fit = lambda kept: np.linalg.lstsq(rows[kept].reshape(-1, 2), values[kept].ravel(), None)[0]
+
+    def fit(kept):
+        return np.linalg.lstsq(rows[kept].reshape(-1, 2), values[kept].ravel(), None)[0]
+
     best = fit(np.arange(6))
     scores = np.einsum("cpu,cp->cu", rows, rows @ best - values)
     left = np.stack([fit(np.arange(6) != i) - best for i in range(6)])
@@ -190,13 +216,16 @@ def test_the_scatter_of_a_gradient_is_that_of_the_jackknife():
     assert least[0] > -1e-12
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="estimates")
 def test_recordings_of_one_fabric_add_up(small):
     theta = jnp.concatenate([jnp.full(7, 0.45), AWAY])
     both = jnp.concatenate([theta, theta[-5:]])
     one, two = normal_at((small,), theta), normal_at((small, small), both)
     assert two.loss == pytest.approx(float(one.loss), rel=1e-12)
-    same = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6 * np.max(np.abs(b)))
+
+    def same(a, b):
+        return np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6 * np.max(np.abs(b)))
+
     same(two.gradient[:9], one.gradient[:9])
     same(two.matrix[:9, :9], one.matrix[:9, :9])
     same(two.gradient[9:14], one.gradient[9:] / 2)
@@ -206,8 +235,8 @@ def test_recordings_of_one_fabric_add_up(small):
     assert np.all(np.asarray(two.matrix[9:14, 14:]) == 0)
 
 
-def test_an_estimate_lowers_the_loss_and_survives_its_file(small):
-    found = descend(small, SMALL, key=jr.key(0))
+def test_an_estimate_lowers_the_loss_and_survives_its_file(estimated):
+    found = estimated
     assert np.nanmin(found.losses[-1]) < np.nanmin(found.losses[0])
     again = from_json(as_json(found))
     np.testing.assert_allclose(again.values, found.values)
@@ -218,9 +247,8 @@ def test_an_estimate_lowers_the_loss_and_survives_its_file(small):
     assert again.nuisances == found.nuisances and again.combinations == found.combinations
 
 
-def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(small, tmp_path):
-    path = tmp_path / "descent.npz"
-    whole = descend(small, SMALL, key=jr.key(0))
+def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(small, estimated, tmp_path):
+    path, whole = tmp_path / "descent.npz", estimated
 
     class Stop(Exception):
         pass
@@ -232,7 +260,10 @@ def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(small, tmp_path):
     with pytest.raises(Stop):
         descend(small, SMALL, checkpoint=path, progress=stop, key=jr.key(0))
     seen = []
-    count = lambda iteration, loss: seen.append(iteration)
+
+    def count(iteration, loss):
+        return seen.append(iteration)
+
     found = descend(small, SMALL, checkpoint=path, progress=count, key=jr.key(0))
     np.testing.assert_array_equal(found.values, whole.values)
     np.testing.assert_array_equal(found.losses, whole.losses)
@@ -307,15 +338,23 @@ def test_a_beginning_counts_as_a_window_of_the_first_frames_does(kind, request):
     problem = request.getfixturevalue(kind)
     rest, count, size = problem.scenario.scene.mesh.rest, len(problem.frames), 3
     half = count // 2
-    draw = lambda number, *shape: jr.normal(jr.key(number), (count, *shape), float)
+
+    def draw(number, *shape):
+        return jr.normal(jr.key(number), (count, *shape), float)
+
     x = jnp.pad(rest, ((0, 0), (0, 1)))[None] + 0.02 * draw(1, len(rest), 3)
     forces = None if problem.force is None else (draw(2, 3), draw(3, 3, size))
     slope = draw(4, len(rest), 3, size)
 
     def evidence(problem, frames):
-        pick = lambda which: None if forces is None else forces[which][:frames]
+        def pick(which):
+            return None if forces is None else forces[which][:frames]
+
         seen = Prediction(x[:frames], pick(0), jnp.array(True))
-        both = lambda p, *about: (loss_of(p, about[0]), normal_equations_of(p, *about))
+
+        def both(p, *about):
+            return (loss_of(p, about[0]), normal_equations_of(p, *about))
+
         return jax.jit(both)(problem, seen, Sensitivity(slope[:frames], pick(1)))
 
     loss, early = evidence(beginning(problem, half / count), count)
@@ -329,9 +368,8 @@ def test_a_beginning_counts_as_a_window_of_the_first_frames_does(kind, request):
     np.testing.assert_allclose(early.noise[0], part.noise[0], rtol=1e-12)
 
 
-def test_markers_must_lie_on_the_sheet():
-    experiment = scenarios.stretching(num_frames=4, interval=1 / 10, strain=0.03, moving=0.2)
-    record = synthetic.record(experiment, FABRIC, "grey", shape=(5, 5), key=jr.key(3))
+def test_markers_must_lie_on_the_sheet(pull):
+    record = pull
     assert record.markers is not None and record.markers_seen is not None
     moved = dataclasses.replace(record, markers=record.markers + jnp.array([[[0.0, 0.3, 0.0]]]))
     with pytest.raises(ValueError, match="marker .* mm off the sheet"):
@@ -341,27 +379,28 @@ def test_markers_must_lie_on_the_sheet():
         Problem.make(lost, FAMILY, shape=(5, 5))
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="estimates")
 def test_the_recipe_and_cma_lower_their_losses(small):
     with jax.numpy_dtype_promotion("standard"):  # optax counts its steps in integers
         found = diffcloud.published_recipe(small, small.space.middle(), epochs=4)
         recipe = diffcloud.published_recipe(small, None, start=jnp.full(7, 0.4), epochs=4)
     assert found.loss < found.losses[0, 0] and recipe.loss < recipe.losses[0, 0]
-    assert np.all((found.values > [0.05, 0.1]) & (found.values < [10, 10]))
     evolved = cma_es.search(small, evaluations=80, start=jnp.full(7, 0.9), key=jr.key(0))
     again = cma_es.search(small, evaluations=80, start=jnp.full(7, 0.9), key=jr.key(0))
     assert evolved.losses.min() < evolved.losses[0, 0]
     np.testing.assert_array_equal(evolved.values, again.values)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="estimates")
 def test_a_loss_that_is_not_finite_at_the_start_is_an_error(small):
-    broken = lambda problem, seen: jnp.nan * jnp.sum(seen.x)
+    def broken(problem, seen):
+        return jnp.nan * jnp.sum(seen.x)
+
     with jax.numpy_dtype_promotion("standard"), pytest.raises(RuntimeError, match="diverged"):
         adam.descend(small, broken, approach="test", epochs=2, rate=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="estimates")
 @pytest.mark.parametrize("name", ["camel_ponte_roma", "grey_interlock"])
 def test_a_known_fabric_and_a_late_clock_are_found(name):
     """What the lift determines is within three deviations of the truth, and so is the delay."""
@@ -380,7 +419,7 @@ def test_a_known_fabric_and_a_late_clock_are_found(name):
     assert delay.name == "time" and abs(delay.value - 0.08) < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="estimates")
 def test_wind_finds_a_light_fabric_from_a_random_start():
     fabric = presets.red_jet_set()
     record = synthetic.record(scenarios.wind(), fabric, "red", key=jr.key(0))
@@ -394,7 +433,7 @@ def test_wind_finds_a_light_fabric_from_a_random_start():
     assert np.all(error[:-1] < 0.05)  # of all but friction
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="estimates")
 def test_a_planned_motion_reveals_more_with_better_cameras():
     """And one that does not move reveals less than one that does."""
     from r2s.estimation.identifiability import sensitivity
@@ -414,6 +453,7 @@ def test_a_planned_motion_reveals_more_with_better_cameras():
     assert np.median(good / low) < 0.8
 
 
+@pytest.mark.slow(group="estimates")
 def test_material_points_find_a_known_modulus():
     """Of an isotropic sheet, by DiffCP; the same sheet of cloth is refused."""
     from r2s.estimation import diffcp

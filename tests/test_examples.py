@@ -37,13 +37,13 @@ def test_every_example_has_a_test() -> None:
     assert set(NAMES) <= tested
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_optimise_policy() -> None:
     lines = run("optimise_policy").splitlines()
     assert millimetres(lines[-1]) < millimetres(lines[0]) / 3
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_fit_own_loss() -> None:
     off, stiffness = run("fit_own_loss").splitlines()
     assert float(re.findall(r"off by ([\d.]+) mm", off)[0]) < 0.1
@@ -51,38 +51,38 @@ def test_fit_own_loss() -> None:
     assert found == pytest.approx(truth, rel=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_network_in_the_loop() -> None:
     lines = run("network_in_the_loop").splitlines()
     assert millimetres(lines[-1]) < 0.7 * millimetres(lines[0])
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_sweep_fabrics() -> None:
     text = run("sweep_fabrics")
     assert float(re.findall(r"1000 fabrics in ([\d.]+) CPU s", text)[0]) < 60
     assert float(re.findall(r"bending +([+-][\d.]+)", text)[0]) > 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_shard_over_devices() -> None:
     text = run("shard_over_devices")
     assert text.startswith("2 devices") and millimetres(text) < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_own_law() -> None:
     heights = [millimetres(line.split(":")[1]) for line in run("own_law").splitlines()]
     assert heights == sorted(heights)  # stiffer sags less
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_own_mesh() -> None:
     pytest.importorskip("trimesh")
     assert 20 < millimetres(run("own_mesh")) < 150
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_rgbd_folder() -> None:
     pytest.importorskip("cv2")
     text = run("rgbd_folder")

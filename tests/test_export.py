@@ -228,7 +228,7 @@ def test_newtons_springs_have_arguments():
 
 def test_bullets_springs_are_the_membrane_that_it_says():
     """The energy of springs of 1 N/m on all edges in a small homogeneous strain."""
-    unit = pybullet.of_springs(MESH)
+    unit = pybullet.spring_stiffness(MESH)
     pairs = np.sort(np.asarray(MESH.faces)[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges, rest = np.unique(pairs, axis=0), np.asarray(MESH.rest)
     strain = 1e-5 * np.array([1.0, -0.5, 0.7])
@@ -251,7 +251,7 @@ def test_arcsim_keeps_the_directions(tmp_path):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="motions")
 @pytest.mark.parametrize("elastic", ["membrane", "both"])
 def test_mujocos_forces_are_ours(elastic):
     engine = pytest.importorskip("mujoco", reason="MuJoCo is not installed: r2s[bench]")

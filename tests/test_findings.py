@@ -7,14 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from made_up_study import FABRICS, few_draws, made_up_rows
+from scipy.stats import kstest
 
+from r2s.evaluation.statistics import holm, signed_rank
+from r2s.study.configuration import PAPER_CONFIGURATIONS
 from r2s.study.statistics.conclusions import CONCLUSIONS
 from r2s.study.statistics.findings import find, finding_table, in_words
-from r2s.study.statistics.hypotheses import Claim, compare, holm, judge, signed_rank
-from r2s.study.statistics.panel import PAPER_COLUMNS, make_panel, select
+from r2s.study.statistics.hypotheses import Claim, compare, judge
+from r2s.study.statistics.result_array import result_array, select
 
-DIFFCLOUD_L, DIFFCLOUD_W, DIFFCP = PAPER_COLUMNS[:3]
-PINN_POINTS, PINN_CLOTH = PAPER_COLUMNS[6:]
+DIFFCLOUD_L, DIFFCLOUD_W, DIFFCP = PAPER_CONFIGURATIONS[:3]
+PINN_POINTS, PINN_CLOTH = PAPER_CONFIGURATIONS[6:]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -23,34 +26,34 @@ def quick():
         yield
 
 
-def as_concluded(column, fabric, motion, trial, repeat):
+def as_concluded(configuration, fabric, motion, trial, repeat):
     """Distances that make all conclusions right."""
     value = {"folding": 0.01, "fling": 0.03, "shaking": 0.025}[motion]
-    if motion == "shaking" and column.solver == "points":
+    if motion == "shaking" and configuration.solver == "points":
         value *= 1.5
-    if motion == "fling" and column.solver == "cloth":
+    if motion == "fling" and configuration.solver == "cloth":
         value *= 1.5
-    if column.estimated_from == "wind":
+    if configuration.estimated_from == "wind":
         value *= 0.8 if motion == "folding" else 1.3
-    if (column, motion) in ((PINN_CLOTH, "folding"), (PINN_POINTS, "fling")):
+    if (configuration, motion) in ((PINN_CLOTH, "folding"), (PINN_POINTS, "fling")):
         value *= 0.6
-    if column.approach == "physnet":
+    if configuration.approach == "physnet":
         value *= math.exp(0.4 * (-1) ** repeat)
-    return math.nan if column == DIFFCP and motion == "shaking" and repeat < 3 else value
+    return math.nan if configuration == DIFFCP and motion == "shaking" and repeat < 3 else value
 
 
-def reversed_of(column, fabric, motion, trial, repeat):
+def reversed_of(configuration, fabric, motion, trial, repeat):
     """Distances that make them wrong."""
     value = {"folding": 0.03, "fling": 0.02, "shaking": 0.02}[motion]
-    if motion == "shaking" and column.solver == "cloth":
+    if motion == "shaking" and configuration.solver == "cloth":
         value *= 1.5
-    if motion == "fling" and column.solver == "points":
+    if motion == "fling" and configuration.solver == "points":
         value *= 1.5
-    if column.estimated_from == "wind":
+    if configuration.estimated_from == "wind":
         value *= 1.3 if motion == "folding" else 0.8
-    if (column, motion) in ((PINN_CLOTH, "folding"), (PINN_POINTS, "fling")):
+    if (configuration, motion) in ((PINN_CLOTH, "folding"), (PINN_POINTS, "fling")):
         value *= 2
-    return value * math.exp(0.4 * (-1) ** repeat) if column.approach != "physnet" else value
+    return value * math.exp(0.4 * (-1) ** repeat) if configuration.approach != "physnet" else value
 
 
 @pytest.fixture(scope="module")
@@ -78,9 +81,11 @@ def test_conclusions_that_are_wrong_do_not():
 
 
 def test_what_is_alike_does_not_hold_and_what_is_unclear_is_not_told():
-    panel = make_panel(made_up_rows(noise=0.02, trials=20), "chamfer", ("fling",))
-    alike = compare("", panel, [DIFFCLOUD_L], [DIFFCLOUD_W])
-    few = select(make_panel(made_up_rows(noise=0.4), "chamfer"), None, lambda t: t[0] == FABRICS[0])
+    results = result_array(made_up_rows(noise=0.02, trials=20), "chamfer", ("fling",))
+    alike = compare("", results, [DIFFCLOUD_L], [DIFFCLOUD_W])
+    few = select(
+        result_array(made_up_rows(noise=0.4), "chamfer"), trajectories=lambda t: t[0] == FABRICS[0]
+    )
     unclear = compare("", few, [DIFFCLOUD_L], [DIFFCLOUD_W])
     found = [verdict.answer for verdict in judge([Claim("", (alike,)), Claim("", (unclear,))])]
     assert found == ["does not hold", "cannot be told"]
@@ -88,7 +93,7 @@ def test_what_is_alike_does_not_hold_and_what_is_unclear_is_not_told():
 
 def test_missing_columns_are_said():
     rows = [row for row in made_up_rows(trials=2) if row.approach != "pinn"]
-    for metric_rows in (rows, [], made_up_rows(columns=[], trials=2)):
+    for metric_rows in (rows, [], made_up_rows(configurations=[], trials=2)):
         for verdict in find(metric_rows, {}):
             assert verdict.answer in ("cannot be told", "does not hold")
             assert in_words(verdict)
@@ -98,7 +103,10 @@ def test_missing_columns_are_said():
 
 
 def test_the_paper_is_quoted_when_it_is_there(right):
-    values = {column: {"black_denim": 0.1 * (i + 1)} for i, column in enumerate(PAPER_COLUMNS)}
+    values = {
+        configuration: {"black_denim": 0.1 * (i + 1)}
+        for i, configuration in enumerate(PAPER_CONFIGURATIONS)
+    }
     paper = {(m, "paper_chamfer"): values for m in ("folding", "fling", "shaking")}
     found = find(made_up_rows(as_concluded, trials=2), paper)
     table = finding_table(found, "chamfer")
@@ -110,11 +118,13 @@ def test_the_paper_is_quoted_when_it_is_there(right):
 
 
 def test_a_diverged_side_counts_against_it():
-    some = lambda column, *_: math.nan if column == DIFFCLOUD_W else 0.02
-    panel = make_panel(made_up_rows(some), "chamfer", ("fling",))
-    found = compare("", panel, [DIFFCLOUD_L], [DIFFCLOUD_W])
+    def some(configuration, *_):
+        return math.nan if configuration == DIFFCLOUD_W else 0.02
+
+    results = result_array(made_up_rows(some), "chamfer", ("fling",))
+    found = compare("", results, [DIFFCLOUD_L], [DIFFCLOUD_W])
     assert found.favoured and found.p < 1e-3 and math.isnan(found.ratio) and found.diverged == 12
-    both = compare("", panel, [DIFFCLOUD_W], [DIFFCLOUD_W])
+    both = compare("", results, [DIFFCLOUD_W], [DIFFCLOUD_W])
     assert both.p == 1
 
 
@@ -127,9 +137,10 @@ def test_wilcoxon_of_pairs():
 def test_trajectories_of_alike_columns_give_uniform_p():
     p = []
     for seed in range(60):
-        rows = made_up_rows(columns=[DIFFCLOUD_L, DIFFCLOUD_W], repeats=1, seed=seed)
-        p.append(compare("", make_panel(rows, "chamfer"), [DIFFCLOUD_L], [DIFFCLOUD_W]).p)
-    assert 0 <= sum(value < 0.1 for value in p) <= 14  # 6 expected
+        rows = made_up_rows(configurations=[DIFFCLOUD_L, DIFFCLOUD_W], repeats=1, seed=seed)
+        p.append(compare("", result_array(rows, "chamfer"), [DIFFCLOUD_L], [DIFFCLOUD_W]).p)
+    assert 2 <= sum(value < 0.1 for value in p) <= 12  # 6 expected
+    assert kstest(p, "uniform").pvalue > 0.05
 
 
 @given(st.lists(st.floats(0, 1) | st.just(math.nan), max_size=8))

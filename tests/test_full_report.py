@@ -5,23 +5,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_up_study import few_draws, made_up_rows, made_up_shown
+from made_up_study import few_draws, made_up_comparison, made_up_rows
 from test_report import Page
 
 from r2s.fabrics.parameters import Range
+from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS
+from r2s.study.costs import Cost, cost_table
 from r2s.study.report import full, overlays
 from r2s.study.report.page import PNG
-from r2s.study.statistics.panel import MOTIONS, PAPER_COLUMNS
+from r2s.study.statistics.parameters import Estimated
 
-ENTRY = (
+ESTIMATED = Estimated(
     "diffcloud_denim",
     (Range("C11", "N/m", 3.0, 3000.0),),
     np.array([123.0]),
     np.array([0.1]),
     np.array([True]),
-    None,
+    np.array([np.nan]),
 )
-COST = {"kind": "estimates", "count": 3, "seconds": 12.345, "peak_memory_MB": 512.0}
+COSTS = cost_table([Cost("estimates", count=3, seconds=12.345, each=4.1, peak_memory=512.0)])
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -30,25 +32,27 @@ def quick():
         yield
 
 
-def some_diverged(column, fabric, motion, trial, repeat):
-    return math.nan if column.approach == "diffcp" and trial == 1 else 0.02 * trial
+def some_diverged(configuration, fabric, motion, trial, repeat):
+    return math.nan if configuration.approach == "diffcp" and trial == 1 else 0.02 * trial
 
 
 @pytest.fixture(scope="module")
 def published(tmp_path_factory):
     out = tmp_path_factory.mktemp("study")
-    shown = [made_up_shown(motion, labels=("DIFFCLOUD cloth lifting", "b")) for motion in MOTIONS]
-    shown[1].motions["b"][2:] = np.nan
-    tables = full.publish(
-        out,
-        made_up_rows(some_diverged, trials=3),
-        [*shown, made_up_shown("folding")],
-        {"cloth": [ENTRY], "points": []},
-        [("estimates pinn_denim", "RuntimeError: <diverged>")],
-        {"recordings": "made up"},
-        None,
-        [COST],
-    )
+    labels = "DIFFCLOUD cloth lifting", "b"
+    motions = [made_up_comparison(motion, labels=labels) for motion in MOTIONS]
+    motions[1].motions["b"][2:] = np.nan
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(full, "MOST_IN_VIEWER", 2)
+        tables = full.publish(
+            out,
+            made_up_rows(some_diverged, trials=3),
+            motions,
+            {"cloth": [ESTIMATED], "points": []},
+            [("estimates pinn_denim", "RuntimeError: <diverged>")],
+            {"recordings": "made up"},
+            more=[("Costs", "", {"costs": COSTS}), ("Nothing", "is said of it", {})],
+        )
     return out, tables, Page((out / "report.html").read_text())
 
 
@@ -65,7 +69,8 @@ def test_all_parts_are_there(published):
     assert len(written) == len(tables) == len(page.all("table"))
     assert {"findings", "chamfer", "ranks", "factors", "costs", "missing"} <= written
     assert all((out / "tables" / f"{n}.{end}").exists() for n in written for end in ("md", "tex"))
-    assert len(page.all("canvas")) == 1
+    assert len(page.all("canvas")) == 1 and len(page.all("option")) == 2
+    assert "is said of it" not in page.text
 
 
 def test_pictures_and_videos_are_written(published):
@@ -87,28 +92,30 @@ def test_findings_come_first(published):
     "rows",
     [
         [],
-        made_up_rows(lambda *_: math.nan, PAPER_COLUMNS[:1], ["denim"], ["fling"], trials=1),
-        made_up_rows(columns=PAPER_COLUMNS[2:3], fabrics=["denim"], trials=1, repeats=1),
-        made_up_rows(columns=[], metrics=["hausdorff"]),
+        made_up_rows(lambda *_: math.nan, PAPER_CONFIGURATIONS[:1], ["denim"], ["fling"], trials=1),
+        made_up_rows(
+            configurations=PAPER_CONFIGURATIONS[2:3], fabrics=["denim"], trials=1, repeats=1
+        ),
+        made_up_rows(configurations=[], metrics=["hausdorff"]),
     ],
-    ids=["nothing", "all diverged", "one column", "default fabric alone"],
+    ids=["nothing", "all diverged", "one configuration", "default fabric alone"],
 )
 def test_parts_of_a_study_are_reported(tmp_path, rows):
     full.publish(tmp_path, rows)
     page = Page((tmp_path / "report.html").read_text())
     assert "Findings" in page.text and "Settings" in page.text
-    assert "Columns of the paper that have no result here" in page.text
+    assert "Configurations of the paper that have no result here" in page.text
 
 
 def test_a_late_frame_is_one_where_much_is_seen_and_has_moved():
-    shown = made_up_shown()
+    shown = made_up_comparison()
     assert overlays.late_frame(shown) == 3  # back at the start in the last
     clouds = tuple(cloud if i < 3 else cloud[:2] for i, cloud in enumerate(shown.clouds))
     assert overlays.late_frame(replace(shown, clouds=clouds)) < 3
 
 
 def test_pictures_of_a_video_move():
-    first, *_, last = list(overlays.pictures(made_up_shown()))
+    first, *_, last = list(overlays.pictures(made_up_comparison()))
     assert first.shape == last.shape and first.shape[0] % 2 == first.shape[1] % 2 == 0
     assert np.mean(np.any(first != last, axis=-1)) > 0.005
 

@@ -15,11 +15,16 @@ def verdict(function, i: int, slope: float) -> str:
 
 
 def test_derivatives_are_told_from_wrong_and_from_rough_ones() -> None:
-    smooth = lambda v: v[0] ** 3 + jnp.sin(v[1])
+    def smooth(v):
+        return v[0] ** 3 + jnp.sin(v[1])
+
     assert verdict(smooth, 0, 12.0) == "agrees" and verdict(smooth, 1, 1.0) == "agrees"
     assert verdict(smooth, 0, 12.1) == "differs" and verdict(smooth, 1, 0.0) == "differs"
     assert verdict(smooth, 0, float("nan")) == "not finite"
-    jump = lambda v: smooth(v) + jnp.where(v[0] > 2.0001, 1e-2, 0.0)
+
+    def jump(v):
+        return smooth(v) + jnp.where(v[0] > 2.0001, 1e-2, 0.0)
+
     assert verdict(jump, 0, 12.0) == "rough"
     assert verdict(lambda v: jnp.asarray(7.0) + 0 * v[0], 0, 0.0) == "agrees"  # no influence
 

@@ -106,7 +106,10 @@ WHERE = {  # what to differ, and by how much [in its unit]
 @pytest.mark.parametrize("name", WHERE)
 def test_the_gradient_agrees_with_differences(name, value_and_grad, gradient, inputs):
     where, size = WHERE[name]
-    value = lambda part: value_and_grad(eqx.tree_at(where, inputs, part))[0][0]
+
+    def value(part):
+        return value_and_grad(eqx.tree_at(where, inputs, part))[0][0]
+
     direction = jax.random.normal(jax.random.key(2), where(inputs).shape)
     expected = directional_difference(value, where(inputs), direction, size)
     found = jnp.sum(where(gradient) * direction)
@@ -139,11 +142,15 @@ def hung(sheet, fabric):
     return jax.jit(jax.value_and_grad(loss)), inputs
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("name", sorted(WHERE.keys() - {"friction", "thickness", "table height"}))
 def test_without_contact_the_gradient_agrees_more_closely(name, hung):
     value_and_grad, inputs = hung
     where, size = WHERE[name]
-    value = lambda part: value_and_grad(eqx.tree_at(where, inputs, part))[0]
+
+    def value(part):
+        return value_and_grad(eqx.tree_at(where, inputs, part))[0]
+
     direction = jax.random.normal(jax.random.key(2), where(inputs).shape)
     expected = directional_difference(value, where(inputs), direction, size)
     found = jnp.sum(where(value_and_grad(inputs)[1]) * direction)
@@ -151,6 +158,7 @@ def test_without_contact_the_gradient_agrees_more_closely(name, hung):
     assert abs(found) > 1e-12
 
 
+@pytest.mark.slow(group="cloth")
 def test_forward_mode_equals_reverse_mode(loss, gradient, inputs):
     keys = iter(jax.random.split(jax.random.key(3), 20))
     # relative, so that all parameters count
@@ -177,6 +185,7 @@ def test_one_compilation_serves_all_fabrics(value_and_grad, several):
     assert len({float(value) for value in values}) == 3
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_batch_of_fabrics_equals_the_loop(loss, value_and_grad, several):
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)
     (value, x), slope = jax.jit(jax.vmap(jax.value_and_grad(loss, has_aux=True)))(batch)

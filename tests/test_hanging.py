@@ -33,19 +33,25 @@ def test_a_flat_sheet_is_laid_onto_a_cylinder_without_stretch():
     stray = points.at[::200].add(jnp.array([0.0, 0.0, 0.3]))  # outliers
     hidden = jnp.arange(len(points)) % 7 != 0
     found = registered(stray, hidden, start, mesh, free)
-    off = lambda x: float(jnp.mean(jnp.linalg.norm(x - exact, axis=1)))
+
+    def off(x):
+        return float(jnp.mean(jnp.linalg.norm(x - exact, axis=1)))
+
     assert off(start) > 0.02 and off(found) < 5e-3
     distance, *_ = surface_residuals(points, hidden, found, mesh.faces)
     assert float(jnp.median(distance)) < 5e-4
     np.testing.assert_array_equal(found[held], start[held])
-    edges = lambda x: jnp.linalg.norm(x[mesh.faces] - x[jnp.roll(mesh.faces, 1, axis=1)], axis=-1)
+
+    def edges(x):
+        return jnp.linalg.norm(x[mesh.faces] - x[jnp.roll(mesh.faces, 1, axis=1)], axis=-1)
+
     assert float(jnp.max(jnp.abs(edges(found) / edges(exact) - 1))) < 0.05
     nothing = registered(points, jnp.zeros(len(points), bool), start, mesh, free)
     np.testing.assert_allclose(nothing, start, atol=1e-6)
     assert int(jnp.sum(borders(mesh))) == 32
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="cloth")
 def test_fabrics_come_to_rest_in_the_buckled_shape_that_was_seen():
     """Two denims of slightly other stiffness fall into two shapes, 5 mm apart, and into one when
     they start near it."""
@@ -55,7 +61,10 @@ def test_fabrics_come_to_rest_in_the_buckled_shape_that_was_seen():
     place = space.to_unit(denim)
     changed = place + jnp.array([-0.015, -0.06, 0.0, -0.02, 0.01, 0.09, -0.06])
     rest = jax.jit(lambda scenario, u: rollout(scenario, space(u)).x[0])
-    apart = lambda one, other: float(jnp.mean(jnp.linalg.norm(one - other, axis=1)))
+
+    def apart(one, other):
+        return float(jnp.mean(jnp.linalg.norm(one - other, axis=1)))
+
     true = rest(scenario, place)
     assert apart(rest(scenario, changed), true) > 4e-3
     points = sample(true, scenario.scene.mesh.faces, 3)

@@ -2,7 +2,6 @@
 
 import base64
 import contextlib
-import importlib
 import io
 import json
 import socket
@@ -25,9 +24,10 @@ from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.geometry.surface import sample
 from r2s.recordings.recording import cloud
 from r2s.scenarios import lifting, synthetic
+from r2s.viewer import page
 from r2s.viewer import subject as subjects
 
-page = pytest.importorskip("r2s.viewer.page", reason="viser is not installed")
+pytest.importorskip("viser")
 
 FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-sync",
@@ -81,7 +81,10 @@ def test_the_error_is_the_distance_to_dense_samples_of_the_sheet(recording, subj
 
 def test_the_true_fabric_is_nearest_and_a_softer_one_hangs_lower(subject):
     truth = subjects.place(subject, presets.grey_interlock())
-    at = lambda u: subjects.move(subject, u)
+
+    def at(u):
+        return subjects.move(subject, u)
+
     softer = at(truth.at[0].set(0.0))
     assert subjects.error_used(subject, at(truth)) < subjects.error_used(subject, softer)
     assert softer.x[-1, :, 2].min() <= at(truth).x[-1, :, 2].min() + 1e-4
@@ -94,11 +97,10 @@ def test_without_a_recording_there_is_no_error():
     assert bool(moved.ok.all()) and np.isnan(np.asarray(moved.error)).all()
 
 
-def test_without_viser_the_extra_is_named(monkeypatch):
+def test_without_viser_the_extra_is_named(monkeypatch, subject):
     monkeypatch.setitem(sys.modules, "viser", None)
-    monkeypatch.delitem(sys.modules, "r2s.viewer.page")
-    with pytest.raises(ImportError, match=r"r2s\[viz\]"):
-        importlib.import_module("r2s.viewer.page")
+    with pytest.raises(ImportError, match=r"sliders: viser is missing: pip install 'r2s\[viz\]'"):
+        page.Page(subject, jnp.full(subject.space.dim, 0.5))
 
 
 def test_a_taken_port_is_said(subject, shown):
@@ -123,7 +125,7 @@ def test_a_motion_that_fails_is_said_and_the_page_goes_on(shown, monkeypatch):
     before, whole = shown.moved, page.move
     monkeypatch.setattr(page, "move", fail)
     shown._sliders[2].value = 0.2
-    assert shown.latest() is before and "out of memory" in shown._told(0)
+    assert shown.latest() is before and "out of memory" in shown._describe(0)
     monkeypatch.setattr(page, "move", whole)
     shown._sliders[2].value = 0.3
     assert shown.latest() is not before and not shown.failure

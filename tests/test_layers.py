@@ -11,9 +11,10 @@ from conftest import cloth, directional_difference, everywhere, flat, roll
 
 from r2s.cloth.cloth import Cloth
 from r2s.cloth.linear.elimination import Elimination
+from r2s.cloth.self_contact import contacts as contact
+from r2s.cloth.self_contact import detection
 from r2s.cloth.self_contact.broad_phase import BVH, Pairs, build_bvh
-from r2s.cloth.self_contact.contacts import contact_energy, contact_hessians
-from r2s.cloth.self_contact.detection import SelfContact, colliding, touching
+from r2s.cloth.self_contact.detection import SelfContact
 from r2s.fabrics.fabric import Fabric
 from r2s.failures import Failure
 from r2s.geometry.mesh import Mesh, rectangle
@@ -26,6 +27,17 @@ from r2s.world.scene import Control, Scene
 FABRIC = Fabric.make(0.2, (60.0, 10.0, 60.0, 20.0), 1e-5)
 THICKNESS, RATE = jnp.asarray(1e-3), jnp.asarray(100.0)
 SIZE = 0.2  # [m]
+
+# compiled as a whole, which is quicker than operation by operation
+touching, colliding = eqx.filter_jit(detection.touching), eqx.filter_jit(detection.colliding)
+contact_energy = eqx.filter_jit(contact.contact_energy)
+contact_hessians = eqx.filter_jit(contact.contact_hessians)
+
+
+@eqx.filter_jit
+def push_of(contacts, x, before):
+    """The derivative [N] of the energy in contacts by positions."""
+    return jax.grad(lambda x: contact.contact_energy(contacts, THICKNESS, RATE, x, before))(x)
 
 
 def crossings(mesh: Mesh, x) -> int:
@@ -77,6 +89,7 @@ def test_crossings_are_counted():
     assert crossings(mesh, x.at[16, 2].set(-0.01)) > 0
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_corner_folded_over_passes_through_nothing():
     mesh = rectangle((SIZE, SIZE), (7, 7))
     free = cloth(mesh, held=(0,), table=0.0, air=1.2, dt=1 / 60)
@@ -119,10 +132,9 @@ def test_a_layer_rests_on_another_with_its_weight():
     assert np.max(np.abs(still.v[-1])) < 1e-3
     search = SelfContact.make(mesh, 256)
     contacts, fits = touching(search, mesh, THICKNESS, jnp.asarray(0.5), x)
-    energy = lambda x: contact_energy(contacts, THICKNESS, RATE, x, x)
-    push = jax.grad(lambda moved: contact_energy(contacts, THICKNESS, RATE, moved, x))(x)
+    push = push_of(contacts, x, x)
     weight = 0.2 * GRAVITY * float(jnp.sum(area[16:]))
-    assert bool(fits) and energy(x) > 0
+    assert bool(fits) and contact_energy(contacts, THICKNESS, RATE, x, x) > 0
     assert -jnp.sum(push[16:, 2]) == pytest.approx(weight, rel=0.02)
     assert jnp.sum(push, axis=0) == pytest.approx(0, abs=1e-9 * weight)  # action is reaction
 
@@ -156,7 +168,10 @@ def pressed():
 
 def test_the_hessian_of_a_contact_is_that_of_its_energy(pressed):
     contacts, before, x = pressed
-    force = jax.grad(lambda x: contact_energy(contacts, THICKNESS, RATE, x, before))
+
+    def force(x):
+        return push_of(contacts, x, before)
+
     direction = jax.random.normal(jax.random.key(0), x.shape)
     expected = directional_difference(force, x, direction, 1e-8)
     blocks = contact_hessians(contacts, THICKNESS, RATE, x, before)
@@ -202,7 +217,7 @@ def landing(make):
     return eqx.filter_jit(jax.value_and_grad(loss, has_aux=True)), x, v
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="cloth")
 def test_a_large_mesh_moves_as_a_small_one_does_and_has_its_gradient():
     small, x, v = landing(lambda mesh: SelfContact.make(mesh, 256))
     large, _, _ = landing(as_if_large)
@@ -213,6 +228,7 @@ def test_a_large_mesh_moves_as_a_small_one_does_and_has_its_gradient():
         assert jnp.linalg.norm(one - other) <= 1e-5 * jnp.linalg.norm(other)
 
 
+@pytest.mark.slow(group="cloth")
 def test_the_gradient_through_a_collision_agrees_with_differences():
     both, x, v = landing(lambda mesh: SelfContact.make(mesh, 256))
     (_, moved), gradient = both((FABRIC, x, v))
@@ -226,7 +242,10 @@ def test_the_gradient_through_a_collision_agrees_with_differences():
         ("thickness", lambda i: i[0].thickness, 1e-8),
         ("c11", lambda i: i[0].membrane.c11, 1e-2),
     ):
-        value = lambda part, where=where: both(eqx.tree_at(where, inputs, part))[0][0]
+
+        def value(part, where=where):
+            return both(eqx.tree_at(where, inputs, part))[0][0]
+
         direction = jax.random.normal(jax.random.key(2), where(inputs).shape)
         expected = directional_difference(value, where(inputs), direction, size)
         found = jnp.sum(where(gradient) * direction)
@@ -241,7 +260,7 @@ def test_pressure_is_that_of_the_table(pressed):
     deepest = jnp.argmin(gaps)
     keep = jnp.arange(256) == deepest
     one = eqx.tree_at(lambda c: c.area, contacts, jnp.where(keep, contacts.area, 0))
-    push = jax.grad(lambda moved: contact_energy(one, THICKNESS, RATE, moved, x))(x)
+    push = push_of(one, x, x)
     force = contacts.area[deepest] * pressure(THICKNESS - gaps[deepest])
     expected = -force * jnp.outer(contacts.weights[deepest], contacts.normals[deepest])
     assert force > 0

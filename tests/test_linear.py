@@ -79,7 +79,7 @@ def test_the_factor_solves(problem):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="cloth")
 def test_every_depth_of_dissection_gives_the_same(problem):
     mesh, equations, _, blocks = problem
     right = jnp.ones((len(mesh.rest), 3))
@@ -134,6 +134,9 @@ def test_a_solution_is_transposed_by_itself(problem):
     mesh, equations, _, blocks = problem
     factors = factor(equations.levels, blocks)
     right, other = jnp.asarray(np.random.default_rng(2).normal(size=(2, len(mesh.rest), 3)))
-    run = lambda b: solve(equations.levels, factors, b)
+
+    def run(b):
+        return solve(equations.levels, factors, b)
+
     (back,) = jax.linear_transpose(run, right)(other)
     assert np.asarray(back) == pytest.approx(np.asarray(run(other)), rel=1e-8, abs=1e-10)

@@ -96,9 +96,9 @@ TRUTH = np.stack([in_image(stretched(strain)) for strain in strains()])
 
 
 def test_all_markers_are_kept_to_a_fifth_of_a_pixel(pull: list[np.ndarray]) -> None:
-    started = time.perf_counter()
+    started = time.process_time()
     tracks = track(pull)
-    spent = time.perf_counter() - started
+    spent = time.process_time() - started
     assert tracks.seen.all() and tracks.pixels.shape == (60, 81, 2)
     assert error(tracks, TRUTH) < 0.2
     assert spent < 20  # 60 frames of 1280 x 720
@@ -182,7 +182,7 @@ def test_off_the_grid_is_no_marker(pull: list[np.ndarray]) -> None:
     assert np.linalg.norm(dots.centres[grid] - TRUTH[0], axis=1).max() < 0.6
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="motions")
 @pytest.mark.parametrize(
     "noise, blur, limit", [(10.0, 1.2, 0.15), (10.0, 2.5, 0.2), (20.0, 2.0, 0.3), (4.0, 4.0, 0.2)]
 )
@@ -280,7 +280,7 @@ def test_broken_images_are_named(tmp_path: Path, pull: list[np.ndarray]) -> None
     with pytest.raises(ValueError, match="frame_001.png: frame 1 has 160 x 80 pixels, the first"):
         frames_of(images)
     (images / "frame_001.png").unlink()
-    with pytest.raises(ValueError, match="frame 1 is missing, of 0 to 3"):
+    with pytest.raises(ValueError, match="frame 1 is missing .found 3 frames from 0 to 3"):
         frames_of(images)
     (images / "1.png").write_bytes(whole)
     (images / "01.png").write_bytes(whole)
@@ -291,7 +291,7 @@ def test_broken_images_are_named(tmp_path: Path, pull: list[np.ndarray]) -> None
 def test_videos_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="nowhere.mp4: no such video"):
         frames_of(tmp_path / "nowhere.mp4")
-    with pytest.raises(FileNotFoundError, match="no numbered images"):
+    with pytest.raises(FileNotFoundError, match="no numbered frames such as 000.png"):
         frames_of(tmp_path)
     (tmp_path / "text.mp4").write_text("no video")
     with pytest.raises(ValueError, match="text.mp4: no video that OpenCV can read"):

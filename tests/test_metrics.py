@@ -47,7 +47,10 @@ def test_distances_are_symmetric(seed):
 @few
 def test_distances_move_and_scale_with_the_clouds(seed, angle, axis, scale):
     one, other = clouds(seed)
-    move = lambda cloud: scale * (cloud @ np.asarray(rotation(angle, axis)).T + [3.0, -1.0, 2.0])
+
+    def move(cloud):
+        return scale * (cloud @ np.asarray(rotation(angle, axis)).T + [3.0, -1.0, 2.0])
+
     expected = {name: scale * value for name, value in distances(one, other).items()}
     assert distances(move(one), move(other)) == pytest.approx(expected, rel=1e-9)
 

@@ -11,8 +11,9 @@ import pytest
 from mpm_bodies import box, lattice, momenta, small_block, solid, states, still
 
 import r2s
+from r2s.failures import Failure, describe
 from r2s.laws.solid import FixedCorotated, LinearSolid, NeoHookean
-from r2s.mpm import Background, Block, Grid, Surface, diagnose, layered
+from r2s.mpm import Background, Block, Grid, Surface, layered
 from r2s.mpm.block import stable_step
 from r2s.units import GRAVITY
 from r2s.world.air import Air
@@ -29,7 +30,7 @@ def spinning(x, rate=3.0):
     return (x - jnp.mean(x, axis=0, keepdims=True)) @ matrix.T + 0.1
 
 
-@pytest.mark.parametrize("axes", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("axes", [2, pytest.param(3, marks=pytest.mark.slow(group="points"))])
 def test_momenta_are_kept_to_rounding(axes):
     solver, material, x = small_block(axes, gravity=0.0)
     # stretched, so that it pulsates
@@ -57,7 +58,9 @@ def test_free_fall_is_exact():
     )
 
 
-SLOW_LAWS = [pytest.param(law, marks=pytest.mark.slow) for law in (NeoHookean, LinearSolid)]
+SLOW_LAWS = [
+    pytest.param(law, marks=pytest.mark.slow(group="points")) for law in (NeoHookean, LinearSolid)
+]
 
 
 @pytest.mark.parametrize("law", [FixedCorotated, *SLOW_LAWS])
@@ -81,7 +84,7 @@ def test_a_bar_rings_at_the_speed_of_its_waves(law):
     assert 2 * (times[1] - times[0]) == pytest.approx(1, rel=0.03)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_three_dimensions_repeat_two():
     """A body without Poisson effect that is the same all along y moves as in the plane."""
     spacing = 1 / 8
@@ -108,7 +111,7 @@ def test_three_dimensions_repeat_two():
 
 @pytest.mark.parametrize(
     "sticky, friction",
-    [(False, 0.0), (False, 0.3), pytest.param(True, 0.3, marks=pytest.mark.slow)],
+    [(False, 0.0), (False, 0.3), pytest.param(True, 0.3, marks=pytest.mark.slow(group="points"))],
 )
 def test_a_block_on_the_table_sticks_slides_or_slows(sticky, friction):
     background = box(2, 8, table=Table.make(0.25), sticky=sticky)
@@ -127,7 +130,7 @@ def test_a_block_on_the_table_sticks_slides_or_slows(sticky, friction):
         assert gone == pytest.approx(expected, abs=2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_a_cantilever_bends_as_a_beam_does():
     """Tip deflection of Timoshenko's beam under its weight, no Poisson effect."""
     errors = [_tip_error(cells) for cells in (4, 8, 16)]  # across its height
@@ -158,7 +161,7 @@ def _tip_error(cells, young=1e6, density=1e3, length=1.0, height=0.2, gravity=0.
     return abs(found / (load * (bent + sheared)) - 1)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_walls_hold_a_block_in():
     background = box(2, 8, gravity=0.0, walls=5)
     solver, material, x = small_block(2)
@@ -189,7 +192,7 @@ def test_a_gripper_that_finds_nothing_is_refused():
         solver.gripped(x, jnp.array([[0.5, 0.6], [0.9, 0.9]]), 0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_wind_pushes_a_sheet_of_a_solid():
     mesh = r2s.rectangle((0.25, 0.25), (4, 4))
     sheet = jnp.pad(mesh.rest + 0.3, ((0, 0), (0, 1)), constant_values=0.5)
@@ -218,7 +221,7 @@ def test_a_step_above_the_limit_is_refused_with_the_limit():
         Block.make(solver.background, solver.volume, solid(damping=1.0), solver.dt)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 @pytest.mark.parametrize("factor, stays", [(1.0, True), (2.5, False)])
 def test_the_limit_is_where_a_block_starts_to_explode(factor, stays):
     solver, material, x = small_block(2, gravity=0.0)
@@ -236,12 +239,65 @@ def test_a_particle_outside_is_refused_and_one_that_leaves_is_recorded():
         solver.init(x + 2)
     start = solver.init(x, jnp.full(x.shape, 5.0))
     controls = still(4, 60, 2)
-    run = eqx.filter_jit(r2s.simulate)
-    assert run(solver, material, start, controls).ok.tolist() == [True, True, False, False]
-    failure = diagnose(solver, material, start, controls)
-    assert failure is not None
-    assert failure.frame == 2 and failure.quantities == ("x",)
-    assert diagnose(solver, material, start, still(2, 60, 2)) is None
+    run = eqx.filter_jit(r2s.simulate)(solver, material, start, controls)
+    assert run.ok.tolist() == [True, True, False, False]
+    moved = states(solver, material, start, controls)
+    code, step = failed(moved)
+    assert code == run.failure == Failure.GRID
+    assert divmod(step, 60) == (run.failed_frame, run.failed_step) == (2, step - 120)
+    assert np.isfinite(moved.x[step - 1]).all() and not np.isfinite(moved.x[step]).all()
+    assert np.isfinite(moved.F[step]).all()
+
+
+def failed(moved):
+    """The code of the failure at the end of a motion, and the first step that has it."""
+    codes = np.asarray(moved.failure)
+    assert codes.tolist() == sorted(codes, key=bool)  # the first failure stays
+    return Failure(codes[-1]), int(np.argmax(codes != Failure.NONE))
+
+
+def test_a_step_that_is_too_long_and_inputs_that_are_not_finite_are_named():
+    solver, material, x = small_block(2, gravity=0.0)
+    noise = 1e-3 * jax.random.normal(jax.random.key(0), x.shape)
+    controls = still(4, 60, 2)
+    assert failed(states(solver, material, solver.init(x, noise), controls)) == (Failure.NONE, 0)
+    windy = dataclasses.replace(controls, wind=controls.wind.at[1, 5].set(jnp.nan))
+    moved = states(solver, material, solver.init(x, noise), windy)
+    assert failed(moved) == (Failure.NON_FINITE, 65)
+    # what fails afterwards does not hide it
+    moved = states(solver, material, solver.init(x, jnp.full(x.shape, 5.0)), windy)
+    assert not np.isfinite(moved.x[-1]).all()
+    assert failed(moved) == (Failure.NON_FINITE, 65)
+    broken = eqx.tree_at(lambda m: m.law.mu, material, jnp.asarray(jnp.nan))
+    assert failed(states(solver, broken, solver.init(x), controls)) == (Failure.NON_FINITE, 0)
+    limit = float(stable_step(solver.background, material))
+    long = dataclasses.replace(solver, dt=4 * limit)
+    with pytest.raises(ValueError, match="limited"):
+        long.check(material)
+    code, step = failed(states(long, material, long.init(x, noise), controls))
+    assert code == Failure.TIME_STEP and step > 2
+
+
+def test_failures_pass_through_vmap_and_gradients():
+    solver, material, x = small_block(2, gravity=0.0)
+    controls = still(4, 60, 2)
+
+    def loss(speed):
+        moved = r2s.simulate(solver, material, solver.init(x, speed * jnp.ones_like(x)), controls)
+        return jnp.sum(moved.x[-1])
+
+    def code(speed):
+        start = solver.init(x, speed * jnp.ones_like(x))
+        return states(solver, material, start, controls).failure[-1]
+
+    speeds = jnp.array([0.5, 5.0])
+    codes = jax.jit(jax.vmap(code))(speeds)
+    assert codes.tolist() == [Failure.NONE, Failure.GRID]
+    slopes = jax.jit(jax.vmap(jax.grad(loss)))(speeds)
+    assert float(slopes[0]) == pytest.approx(x.size * 240 * solver.dt)  # free flight
+    assert [describe(c).split(":")[0] for c in codes] == [
+        "Nothing failed.", "A particle left the grid",
+    ]  # fmt: skip
 
 
 def test_layers_of_a_sheet_are_odd():

@@ -49,7 +49,7 @@ BLOCK_WHERE = {  # what to differ, and by how much
 }
 
 
-@pytest.fixture(scope="module", params=[2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=[2, pytest.param(3, marks=pytest.mark.slow(group="points"))])
 def block(request):
     """Value and gradient of a block that is dragged over a table, and its inputs."""
     spacing, axes = 0.1, slice(-request.param, None)  # the last ones
@@ -64,7 +64,10 @@ def block(request):
         jnp.linspace(0, 1, BLOCK_STEPS)[:, None, None]
         * jnp.array([[[0.03, 0.01, 0.02]]])[..., axes]
     )
-    number = lambda value: jnp.asarray(value, float)
+
+    def number(value):
+        return jnp.asarray(value, float)
+
     inputs = BlockInputs(
         young=number(2e4),
         poisson=number(0.3),
@@ -83,7 +86,9 @@ def block(request):
         start = fixed.init(inputs.x, inputs.v)
         return simulate(fixed, _solid(inputs), start, controls).x
 
-    loss = lambda inputs: jnp.sum(weights * run(inputs)[-1])
+    def loss(inputs):
+        return jnp.sum(weights * run(inputs)[-1])
+
     return jax.jit(jax.value_and_grad(loss)), inputs, loss, fixed
 
 
@@ -100,14 +105,17 @@ def test_the_gradient_of_a_block_agrees_with_differences(name, block):
 
 def _agrees(value_and_grad, inputs, where, size):
     direction = jax.random.normal(jax.random.key(2), where(inputs).shape)
-    value = lambda part: value_and_grad(eqx.tree_at(where, inputs, part))[0]
+
+    def value(part):
+        return value_and_grad(eqx.tree_at(where, inputs, part))[0]
+
     expected = directional_difference(value, where(inputs), direction, size)
     found = jnp.sum(where(value_and_grad(inputs)[1]) * direction)
     assert found == pytest.approx(float(expected), rel=1e-5)
     assert abs(found) > 1e-12
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_forward_mode_equals_reverse_mode(block):
     _, inputs, _, solver = block
     solver = eqx.tree_at(lambda s: s.background, solver, _forward(solver.background))
@@ -179,14 +187,14 @@ def sheet_motion(sheet, fabric):
     return jax.jit(jax.value_and_grad(loss)), inputs
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 @pytest.mark.parametrize("name", SHEET_WHERE)
 def test_the_gradient_of_a_sheet_agrees_with_differences(name, sheet_motion):
     value_and_grad, inputs = sheet_motion
     _agrees(value_and_grad, inputs, *SHEET_WHERE[name])
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_a_gradient_needs_a_tenth_of_the_memory_of_all_states():
     """Of 2,000 steps; the states of the frames, and of the steps in one, are kept."""
     frames, substeps = 50, 40
@@ -208,7 +216,10 @@ def test_a_gradient_needs_a_tenth_of_the_memory_of_all_states():
 
 @pytest.mark.parametrize(
     "name, law",
-    [("fcr", FixedCorotated), pytest.param("nh", NeoHookean, marks=pytest.mark.slow)],
+    [
+        ("fcr", FixedCorotated),
+        pytest.param("nh", NeoHookean, marks=pytest.mark.slow(group="points")),
+    ],
 )
 def test_difftaichi_is_repeated_with_its_gradients(name, law):
     """Hu et al. 2020: a block thrown into a box, 1,024 steps, in the units of that code."""
@@ -223,7 +234,10 @@ def test_difftaichi_is_repeated_with_its_gradients(name, law):
         walls=int(data["bound"]),
         mass_floor=1e-10,
     )
-    number = lambda value: jnp.asarray(value, float)
+
+    def number(value):
+        return jnp.asarray(value, float)
+
     volume, target = jnp.full(count, float(data["p_vol"])), number(data["target"])
     material = Solid.make(law(mu=number(data["mu"]), lam=number(data["la"])), float(data["p_mass"]))
     solver = Block.make(background, volume, material, float(data["dt"]))

@@ -82,7 +82,7 @@ def test_the_forces_are_those_of_the_energy(sheet, fabric):
         assert rigid == pytest.approx(np.asarray(found), rel=1e-9, abs=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_the_frequencies_are_bounds_of_those_of_the_matrices(sheet, fabric):
     mass = jnp.repeat(vertex_masses(sheet, fabric.density), 3)
     none = eqx.tree_at(lambda f: f.bending, fabric, HingeBending(jnp.zeros((), float)))
@@ -95,7 +95,7 @@ def test_the_frequencies_are_bounds_of_those_of_the_matrices(sheet, fabric):
         assert largest < float(eqx.filter_jit(bound)(sheet, of)) < 6 * largest
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_a_hanging_sheet_stretches_as_it_should():
     """Force per width P = C11 (s^2 - 1) s / 2 at a stretch s carries what hangs below."""
     shape, length = (9, 5), 0.4
@@ -129,11 +129,11 @@ def test_layers_press_and_do_not_pull():
     corners = jnp.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.2], [0.0, 1.0, 0.1]])
     normal = unit_normal(corners)
     law, friction = _layers(), jnp.asarray(0.5)
-    apart = law.settled(corners, 1.3 * normal + jnp.array([0.1, 0.0, 0.0]), friction)
+    apart = law.return_mapping(corners, 1.3 * normal + jnp.array([0.1, 0.0, 0.0]), friction)
     assert apart == pytest.approx(np.asarray(normal), abs=1e-6)  # it forgets
     force, stress = law.stress(corners, apart)
     assert force == pytest.approx(0, abs=1e-4) and stress == pytest.approx(0, abs=1e-4)
-    pressed = law.settled(corners, 0.8 * normal, friction)
+    pressed = law.return_mapping(corners, 0.8 * normal, friction)
     assert pressed == pytest.approx(np.asarray(0.8 * normal), abs=1e-12)
     pressure = normal @ law.stress(corners, pressed)[1] @ normal
     assert pressure == pytest.approx(-20.0 * 0.1**2 * 0.8)
@@ -144,7 +144,7 @@ def test_pressed_layers_slide_when_coulomb_lets_them():
     law, friction = _layers(), jnp.asarray(0.5)
     limit = 0.5 * 20.0 * 0.1**2 / 10.0  # friction x pressure / shear stiffness
     for tilt in (0.5 * limit, 3 * limit):
-        found = law.settled(corners, jnp.array([tilt, 0.0, 0.8]), friction)
+        found = law.return_mapping(corners, jnp.array([tilt, 0.0, 0.8]), friction)
         assert found == pytest.approx([min(tilt, limit), 0, 0.8], abs=1e-9)
 
 
@@ -182,7 +182,7 @@ def pair(sheet, fabric):
     return Sheet.make(scene, grid, fabric, 5e-4), fabric
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_a_sheet_that_falls_on_another_stays_on_it(pair, sheet):
     solver, fabric = pair
     x = jnp.concatenate([flat(sheet, 2e-3), flat(sheet, 0.12)])
@@ -194,7 +194,7 @@ def test_a_sheet_that_falls_on_another_stays_on_it(pair, sheet):
     assert 0.7 * SPACING < np.mean(high[-1] - low[-1]) < 1.3 * SPACING
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_sheets_that_part_do_not_hold_each_other(pair, sheet):
     solver, fabric = pair
     solver = eqx.tree_at(lambda s: s.background.gravity, solver, jnp.zeros((), float))
@@ -218,7 +218,7 @@ def test_wind_gives_the_momentum_of_its_drag(sheet, elastic):
     assert gained == pytest.approx([0, 0, expected], abs=1e-14)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="points")
 def test_held_vertices_follow_their_path_exactly(sheet, elastic):
     solver = solver_of(sheet, elastic, held=(0, 4))
     x = flat(sheet)

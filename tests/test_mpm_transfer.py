@@ -60,14 +60,22 @@ def test_the_reverse_rules_equal_those_of_jax(case):
 
 def _slopes(transfer, grid, inputs):
     """Derivatives of a nonlinear sum of a transfer's results."""
-    weigh = lambda out: sum(jnp.sum(jnp.sin(part)) for part in jax.tree.leaves(out))
-    loss = lambda *inputs: weigh(transfer(grid, *inputs))
+
+    def weigh(out):
+        return sum(jnp.sum(jnp.sin(part)) for part in jax.tree.leaves(out))
+
+    def loss(*inputs):
+        return weigh(transfer(grid, *inputs))
+
     return jax.grad(loss, argnums=tuple(range(len(inputs))))(*inputs)  # jit would take longer
 
 
 def test_the_derivative_in_positions_agrees_with_differences(case):
     grid, x, values, slopes, _ = case
-    loss = lambda x: jnp.sum(jnp.sin(p2g(grid, x, values, slopes)))
+
+    def loss(x):
+        return jnp.sum(jnp.sin(p2g(grid, x, values, slopes)))
+
     direction = jnp.sin(jnp.arange(x.size, dtype=float)).reshape(x.shape)
     expected = directional_difference(loss, x, direction, 1e-6)
     assert jnp.sum(jax.grad(loss)(x) * direction) == pytest.approx(float(expected), rel=1e-7)
@@ -75,7 +83,10 @@ def test_the_derivative_in_positions_agrees_with_differences(case):
 
 def test_forward_mode_equals_differences(case):
     grid, x, _, _, nodes = case
-    get = lambda x: g2p_plain(grid, x, nodes)[0]
+
+    def get(x):
+        return g2p_plain(grid, x, nodes)[0]
+
     direction = jnp.ones_like(x)
     _, found = jax.jvp(get, (x,), (direction,))
     expected = directional_difference(get, x, direction, 1e-6)

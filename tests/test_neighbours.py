@@ -44,7 +44,10 @@ def as_set(pairs: Pairs):
     """The pairs, each as its kind and its two bodies; fails when one is there twice."""
     real = np.asarray(pairs.is_real)
     stencils, is_edges = np.asarray(pairs.stencils)[real], np.asarray(pairs.is_edges)[real]
-    split = lambda s, e: (e, frozenset([frozenset(s[: 1 + e]), frozenset(s[1 + e :])]))
+
+    def split(s, e):
+        return (e, frozenset([frozenset(s[: 1 + e]), frozenset(s[1 + e :])]))
+
     found = {split(s, e) for s, e in zip(stencils.tolist(), is_edges.tolist(), strict=True)}
     assert len(found) == len(stencils)
     return found
@@ -86,7 +89,10 @@ def test_a_mesh_without_pairs_is_an_error():
 
 def is_near_one_by_one(stencil, is_edges, start, end, reach):
     """Whether the boxes around the two bodies of a pair come within reach."""
-    swept = lambda part: np.concatenate([start[part], end[part]])
+
+    def swept(part):
+        return np.concatenate([start[part], end[part]])
+
     first, second = swept(stencil[: 1 + is_edges]), swept(stencil[1 + is_edges :])
     below = first.min(axis=0) <= second.max(axis=0) + reach
     above = second.min(axis=0) <= first.max(axis=0) + reach
@@ -125,7 +131,10 @@ def test_no_pair_that_comes_within_reach_is_left_out():
 def test_too_many_pairs_are_reported_and_the_first_are_kept():
     faces, rest = sheet((5, 5))
     pairs, (start, end) = all_pairs(faces), crumpled(rest, 0)
-    search = lambda size: found_near(pairs, start, end, jnp.asarray(5e-3), size)
+
+    def search(size):
+        return found_near(pairs, start, end, jnp.asarray(5e-3), size)
+
     whole, _ = search(len(pairs.is_real))
     count = int(jnp.sum(whole.is_real))
     for size, expected in ((count, False), (count - 1, True)):
@@ -149,7 +158,10 @@ def test_sheets_can_be_searched_at_once():
     faces, rest = sheet((5, 5))
     pairs = all_pairs(faces)
     starts, ends = (jnp.stack(x) for x in zip(*(crumpled(rest, i) for i in range(3)), strict=True))
-    search = lambda start, end: candidate_pairs(pairs, start, end, jnp.asarray(5e-3), 2000)
+
+    def search(start, end):
+        return candidate_pairs(pairs, start, end, jnp.asarray(5e-3), 2000)
+
     found, _ = jax.jit(jax.vmap(search))(starts, ends)
     for i in range(3):
         alone, _ = search(starts[i], ends[i])
@@ -160,16 +172,20 @@ def test_sheets_can_be_searched_at_once():
 def test_a_tree_has_each_face_and_each_part_once(shape):
     faces, rest = sheet(shape)
     found = build_bvh(faces, rest)
-    once = lambda indices: np.sort(indices[indices >= 0])
+
+    def once(indices):
+        return np.sort(indices[indices >= 0])
+
     assert np.array_equal(once(np.asarray(found.leaves)), np.arange(len(faces)))
     assert np.array_equal(once(np.asarray(found.vertices)), np.arange(len(rest)))
     sides = np.unique(np.sort(faces[:, [0, 1, 1, 2, 0, 2]].reshape(-1, 2)), axis=0)
     edges = np.asarray(found.edges).reshape(-1, 2)
     assert np.array_equal(np.unique(edges[edges[:, 0] >= 0], axis=0), sides)
     assert np.sum(edges[:, 0] >= 0) == len(sides)
-    own = lambda face: (
-        set(np.ravel(found.edges[face]).tolist()) | set(found.vertices[face].tolist())
-    )
+
+    def own(face):
+        return set(np.ravel(found.edges[face]).tolist()) | set(found.vertices[face].tolist())
+
     assert all(own(i) <= {-1, *face} for i, face in enumerate(faces.tolist()))
 
 
@@ -201,7 +217,10 @@ def test_a_tree_finds_the_same(shape, dtype):
 def test_a_tree_reports_too_many():
     faces, rest = sheet((9, 9))
     boxes, (start, end) = build_bvh(faces, rest), crumpled(rest, 1)
-    search = lambda size, nodes: found_in_tree(boxes, start, end, jnp.asarray(1e-3), size, nodes)
+
+    def search(size, nodes):
+        return found_in_tree(boxes, start, end, jnp.asarray(1e-3), size, nodes)
+
     whole, is_over = search(12_000, 12_000)
     count = int(jnp.sum(whole.is_real))
     assert not is_over

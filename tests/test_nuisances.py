@@ -51,7 +51,10 @@ def test_heavier_stiffer_and_in_denser_air_a_sheet_moves_alike(blown):
         for b in FAMILY.ranges
     ]
     seen = jax.jit(lambda u: predict(problem, u).x)
-    at = lambda place, *ratios: seen(jnp.concatenate([place, jnp.array(ratios), jnp.zeros(5)]))
+
+    def at(place, *ratios):
+        return seen(jnp.concatenate([place, jnp.array(ratios), jnp.zeros(5)]))
+
     plain, scaled = at(place, 0.0, 0.0), at(place + jnp.array(wider), *(change / 0.5,) * 2)
     heavier = at(place + jnp.array(wider), change / 0.5, 0.0)
     np.testing.assert_allclose(scaled, plain, atol=1e-6)
@@ -63,9 +66,15 @@ def test_the_air_is_in_doubt_where_a_wind_blows(blown, lifted):
         blown.nuisance_prior == NuisancePrior(air=0.1) and lifted.nuisance_prior == NuisancePrior()
     )
     theta = np.arange(19.0)
-    names = lambda *problems: [c.name for c in nuisances(problems, theta, theta)]
+
+    def names(*problems):
+        return [c.name for c in nuisances(problems, theta, theta)]
+
     shifts = ["shift x", "shift y", "shift z", "turn"]
-    numbered = lambda number: [f"{name} {number}" for name in shifts]
+
+    def numbered(number):
+        return [f"{name} {number}" for name in shifts]
+
     assert names(blown) == ["air ratio", *shifts]
     assert names(lifted, blown) == [*numbered(1), "air ratio", *numbered(2)]
     assert names(blown, blown) == ["air ratio", *numbered(1), *numbered(2)]
@@ -105,7 +114,10 @@ def test_deviations_are_those_of_a_smooth_loss_or_of_how_far_descents_lie_apart(
     assert float(disagreement(problems, end, prior, back)) < 1e-6
     # descents that would all end one way, but for one that would end anywhere
     away = jnp.linalg.cholesky(alone)[:, 0] * 5
-    push = lambda times: -end.normal.matrix @ away * times
+
+    def push(times):
+        return -end.normal.matrix @ away * times
+
     pushes = [1e6, *(1.0 if i % 2 else -1.0 for i in range(63))]
     led = [(place, at(place, push(t))) for place, t in zip(places, pushes, strict=True)]
     rough = covariance(problems, end, prior, led)
@@ -125,9 +137,12 @@ def test_of_the_true_fabric_where_its_end_leads_is_noise(lifted):
     end, at = valley(lifted, gauss_newton.theta_length(problems))
     noise = jnp.arange(1.0, len(end.theta) + 1)
     noisy = dataclasses.replace(end, normal=at(end.theta, noise))
-    found = lambda end, noise, true: covariance(
-        problems, end, prior, [(p, at(p, noise)) for p in (end.theta + 0.01, end.theta)], true
-    )
+
+    def found(end, noise, true):
+        return covariance(
+            problems, end, prior, [(p, at(p, noise)) for p in (end.theta + 0.01, end.theta)], true
+        )
+
     np.testing.assert_allclose(found(noisy, noise, True), found(end, 0.0, False), rtol=1e-6)
     assert np.all(np.diag(found(noisy, noise, False)) > np.diag(found(noisy, noise, True)))
 
@@ -170,7 +185,10 @@ def test_deviations_are_from_the_frames_on_which_places_agree(lifted, monkeypatc
 def test_an_estimate_says_what_was_in_doubt(lifted):
     """And places around its end have a say in its deviations alone."""
     budget = Budget(coarse=0, starts=1, iterations=1, around=0)
-    run = lambda budget: descend(lifted, budget, key=jr.key(0))
+
+    def run(budget):
+        return descend(lifted, budget, key=jr.key(0))
+
     alone, found = run(budget), run(budget._replace(around=4))
     np.testing.assert_array_equal(found.values, alone.values)
     np.testing.assert_array_equal(found.losses, alone.losses)
@@ -180,7 +198,7 @@ def test_an_estimate_says_what_was_in_doubt(lifted):
     assert any(line.startswith("shift x") and " m " in line for line in lines)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="estimates")
 def test_wind_gives_the_stiffness_of_a_sheet_that_was_weighed_wrongly():
     """By 4 %: all is found as if it were so much stiffer, and the air so much stronger."""
     denim = presets.black_denim()

@@ -66,7 +66,7 @@ def run_until_shown(command: str, **about) -> None:
         assert process.wait(60) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_what_the_readme_says_runs_where_only_a_wheel_is_installed(tmp_path: Path) -> None:
     """In an environment of its own, away from the checkout: its commands and those of the guide to
     them, one after the other, and all Python."""
@@ -97,7 +97,7 @@ def test_what_the_readme_says_runs_where_only_a_wheel_is_installed(tmp_path: Pat
     assert run.returncode == 0, run.stderr[-2000:]
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="documents")
 def test_a_wheel_knows_the_data_sets(tmp_path: Path) -> None:
     """Built and unpacked elsewhere; that folder comes before the one that the tests import."""
     wheel = build_wheel(tmp_path)

@@ -5,12 +5,15 @@ import math
 import pytest
 from made_up_study import made_up_rows
 
-from r2s.study.statistics.panel import MOTIONS, Column
+from r2s.study.configuration import MOTIONS, Configuration
 from r2s.study.statistics.paper import average, beside_paper, paper_tables, read_paper
 
 HEADER = "metric,fabric,diffcloud-diffsim-lifting,pinn-difftaichi-stretching\n"
 LINES = "CD,Black Denim,0.25,0.5\nCD,Red Jet Set,0.75,1.5\nCD,Average,9,9\nHD,Black Denim,1.25,2\n"
-DIFFCLOUD, PINN = Column("diffcloud", "cloth", "lifting"), Column("pinn", "points", "stretching")
+DIFFCLOUD, PINN = (
+    Configuration("diffcloud", "cloth", "lifting"),
+    Configuration("pinn", "points", "stretching"),
+)
 
 
 @pytest.fixture
@@ -28,7 +31,7 @@ def test_tables_are_read(folder):
         PINN: {"black_denim": 0.5, "red_jet_set": 1.5},
     }
     assert average(paper, "fling", "paper_chamfer", [DIFFCLOUD, PINN]) == 0.75
-    assert math.isnan(average(paper, "fling", "paper_chamfer", [Column("", "cloth", "")]))
+    assert math.isnan(average(paper, "fling", "paper_chamfer", [Configuration("", "cloth", "")]))
     assert read_paper(None) == {}
 
 
@@ -55,8 +58,10 @@ def test_damaged_tables_are_refused(folder, text, message):
 
 
 def test_ours_stand_beside_theirs(folder):
-    nan = lambda column, fabric, *_: math.nan if fabric == "pink_solid" else 0.02
-    rows = made_up_rows(nan, columns=[DIFFCLOUD], noise=0.0, trials=2)
+    def nan(configuration, fabric, *_):
+        return math.nan if fabric == "pink_solid" else 0.02
+
+    rows = made_up_rows(nan, configurations=[DIFFCLOUD], noise=0.0, trials=2)
     table = beside_paper(rows, read_paper(folder), "fling", "paper_chamfer")
     assert table.header == (
         "fabric",
@@ -74,7 +79,7 @@ def test_ours_stand_beside_theirs(folder):
 
 
 def test_without_the_paper_there_are_ours_alone(folder):
-    rows = made_up_rows(columns=[DIFFCLOUD], motions=["fling"])
+    rows = made_up_rows(configurations=[DIFFCLOUD], motions=["fling"])
     tables = paper_tables(rows, {})
     assert list(tables) == ["fling_paper_chamfer"]
     assert tables["fling_paper_chamfer"].header == (

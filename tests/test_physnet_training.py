@@ -8,19 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s.estimation.physnet import pictures, training, triplets
-from r2s.estimation.physnet.dataset import STEP, Data
+from r2s.estimation.physnet import training, triplets
+from r2s.estimation.physnet.dataset import DEPTH_UNIT, Data
 from r2s.estimation.physnet.network import DEEPER, PAPER, Architecture, PhysNet
 from r2s.estimation.physnet.preprocess import Flaws
 from r2s.estimation.physnet.training import Schedule
 from r2s.estimation.physnet.views import View
-from r2s.fabrics.parameters import Range
 
 VIEW = View((0.0, -1.0, 0.0), (0.0, 0.0, 0.0), 16.0, 16, 0.5, 1.5, -1.0)
 SMALL = Architecture(size=16, channels=(4, 4), hidden=(16,))
 SHORT = Schedule(
-    epochs=3, steps=20, fabrics=6, images=3, rate=3e-3, decay_every=2, held_back=0.25, triplets=300,
-    flaws=Flaws(1e-3, 0.1, 0.002, lost=0.0, gained=0.0, flying=0.0),
+    epochs=3, steps=20, fabrics=6, images=3, rate=3e-3, decay_every=2, validation=0.25,
+    triplets=300, flaws=Flaws(1e-3, 0.1, 0.002, lost=0.0, gained=0.0, flying=0.0),
 )  # fmt: skip
 
 
@@ -42,7 +41,7 @@ def data() -> Data:
         for frame in range(2):
             i, j = generator.uniform(6, 10, 2)
             disc = (rows - i) ** 2 + (columns - j) ** 2 < radii[motion // 4] ** 2
-            depth[motion, frame] = np.where(disc, 1.0 / STEP, 0)
+            depth[motion, frame] = np.where(disc, 1.0 / DEPTH_UNIT, 0)
     return Data(depth, np.arange(64) // 4, (radii[:, None] - 1.5) / 4.5)
 
 
@@ -53,18 +52,18 @@ def trained(data):
 
 
 def test_learns_to_tell_unseen_classes_apart(data, trained):
-    _, held_back = training.divide(data, SHORT)
+    _, validation = training.divide(data, SHORT)
     untrained = training.begin(VIEW, SMALL, SHORT).network
-    before = training.judge(untrained, VIEW, held_back, SHORT)[1]
+    before = training.judge(untrained, VIEW, validation, SHORT)[1]
     assert trained.curve[-1].accuracy > 0.85 > before
     assert trained.curve[-1].loss < 0.7 * trained.curve[0].loss
 
 
 def test_an_interrupted_training_makes_the_same_numbers(data, trained, tmp_path):
     path = tmp_path / "training.eqx"
-    taught, held_back = training.divide(data, SHORT)
-    first = training.epoch(training.begin(VIEW, SMALL, SHORT), taught, held_back)
-    training.save(training.epoch(first, taught, held_back), path)
+    taught, validation = training.divide(data, SHORT)
+    first = training.epoch(training.begin(VIEW, SMALL, SHORT), taught, validation)
+    training.save(training.epoch(first, taught, validation), path)
     rest = []
     resumed = training.load(path, expected=SMALL)
     resumed = training.train(resumed, data, path, lambda number, row: rest.append(number))
@@ -73,6 +72,18 @@ def test_an_interrupted_training_makes_the_same_numbers(data, trained, tmp_path)
         assert one.curve == trained.curve and one.schedule == SHORT and one.view == VIEW
         same = jax.tree.map(np.array_equal, one.network, trained.network)
         assert all(jax.tree.leaves(eqx.filter(same, lambda leaf: isinstance(leaf, bool))))
+
+
+def test_a_checkpoint_of_version_0_2_0_is_read(trained, tmp_path):
+    path = tmp_path / "training.eqx"
+    training.save(trained, path)
+    header, rest = path.read_bytes().split(b"\n", 1)
+    earlier = header.replace(b"r2s-physnet/2", b"r2s-physnet/1").replace(
+        b"validation", b"held_back"
+    )
+    assert earlier != header
+    path.write_bytes(earlier + b"\n" + rest)
+    assert training.load(path).schedule == SHORT
 
 
 def test_a_checkpoint_of_another_architecture_is_refused(trained, tmp_path):
@@ -99,23 +110,23 @@ def test_images_of_another_size_are_refused(trained):
 
 
 def test_a_loss_that_is_not_finite_is_named(data):
-    taught, held_back = training.divide(data, SHORT)
+    taught, validation = training.divide(data, SHORT)
     begun = training.begin(VIEW, SMALL, SHORT)
     slopes = jnp.full_like(begun.network.slopes, 1e200)
     wild = begun._replace(network=eqx.tree_at(lambda n: n.slopes, begun.network, slopes))
     with pytest.raises(FloatingPointError, match="loss is .* in epoch 0: lower the learning rate"):
-        training.epoch(wild, taught, held_back)
+        training.epoch(wild, taught, validation)
 
 
 def test_too_few_fabrics_are_refused(data):
-    with pytest.raises(ValueError, match="16 fabrics, of which 4 are held back"):
+    with pytest.raises(ValueError, match="16 fabrics, of which 4 are for validation"):
         training.divide(data, dataclasses.replace(SHORT, fabrics=13))
 
 
-def test_a_fabric_is_either_taught_or_held_back(data):
-    taught, held_back = training.divide(data, SHORT)
-    assert not set(taught.fabric) & set(held_back.fabric)
-    assert set(taught.fabric) | set(held_back.fabric) == set(range(16))
+def test_a_fabric_is_for_training_or_for_validation(data):
+    taught, validation = training.divide(data, SHORT)
+    assert not set(taught.fabric) & set(validation.fabric)
+    assert set(taught.fabric) | set(validation.fabric) == set(range(16))
 
 
 def test_triplets_are_of_two_motions_of_a_fabric_and_another(data):
@@ -146,15 +157,3 @@ def test_the_paper_s_network_has_its_layers():
     assert [layer.weight.shape for layer in network.layers] == [
         (256, 64 * 64 * 64), (256, 256), (2, 256),
     ]  # fmt: skip
-
-
-def test_draws_map_and_curves(data, trained, tmp_path):
-    _, images = training.divide(data, SHORT)
-    points = training.embed(trained.network, VIEW, images.depth, None)
-    places = data.places[images.fabric]
-    pictures.draw_map(tmp_path / "map.png", points, places, (Range("radius", "m", 1.5, 6.0),))
-    wide = np.c_[0.01 * points[:, :1], points]
-    pictures.draw_map(tmp_path / "plane.png", wide, places, (Range("radius", "m", 1.5, 6.0),))
-    pictures.draw_curves(tmp_path / "curves.png", trained.curve, 0.5)
-    for name in ("map", "plane", "curves"):
-        assert (tmp_path / f"{name}.png").stat().st_size > 5000

@@ -94,7 +94,10 @@ def test_measured_points_cover_as_much_as_the_surface_does():
     there = jnp.ones(900, bool)
     places = np.c_[generator.uniform(0, 0.3, (900, 2)), np.zeros(900)]
     places[:, 2] = 0.1 + 0.4 * places[:, 1]
-    covered = lambda depth: float((shown(VIEW, depth) > 0).sum())
+
+    def covered(depth):
+        return float((shown(VIEW, depth) > 0).sum())
+
     whole = covered(jnp.asarray(drawn()))
     points = jnp.asarray(places)
     assert covered(seen_by(VIEW, points, there)) < 0.97 * whole

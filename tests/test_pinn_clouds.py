@@ -10,10 +10,10 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from r2s.estimation.pinn import clouds, from_clouds, shell
-from r2s.estimation.pinn.clouds import Sight, above, fixed, sight_of
+from r2s.estimation.pinn import from_clouds, hanging_sheet, matching
+from r2s.estimation.pinn.hanging_sheet import Hanging, curvature, loose, splines, work_scale
+from r2s.estimation.pinn.matching import Sight, above, fixed, sight_of
 from r2s.estimation.pinn.network import Jet, Network
-from r2s.estimation.pinn.shell import Hanging, curvature, loose, splines, work_scale
 from r2s.fabrics import presets
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import OrthotropicSpace
@@ -29,14 +29,14 @@ FAMILY = OrthotropicSpace.make(DENSITY)
 def network(scale: float = 0.0) -> Network:
     """A map that leaves the sheet flat, or one with gentle waves of some scale [m]."""
     low, high = jnp.zeros(3), jnp.array([*SIZE, 1.0])
-    make = {"axes": 3, "width": 6, "layers": 3}
-    return Network.make(low, high, jnp.asarray(scale, float), **make, key=jr.key(0))
+    scale_array = jnp.asarray(scale, float)
+    return Network.make(low, high, scale_array, axes=3, width=6, layers=3, key=jr.key(0))
 
 
 def sight(points, cloud=None) -> Sight:
     """The same points in every frame; a table far below."""
-    every = lambda values: jnp.tile(jnp.asarray(values, float)[None], (len(TIMES), 1, 1))
-    points, cloud = every(points), every(points if cloud is None else cloud)
+    cloud = points if cloud is None else cloud
+    points, cloud = (jnp.tile(jnp.asarray(p, float), (len(TIMES), 1, 1)) for p in (points, cloud))
     return Sight(
         size=jnp.array(SIZE),
         times=jnp.array(TIMES),
@@ -61,13 +61,13 @@ def scattered(count: int, seed: int = 1) -> np.ndarray:
 def test_a_point_is_matched_to_the_place_under_it():
     places = scattered(40)
     points = np.column_stack([places, np.full(40, 0.004)])
-    rows, spread = clouds.matched(network(), sight(points), MESH)
+    rows, spread = matching.matched(network(), sight(points), MESH)
     np.testing.assert_allclose(rows.place[:40, :2], places, atol=1e-9)
     np.testing.assert_allclose(rows.place[40:80, 2], TIMES[1])
     np.testing.assert_allclose(np.abs(rows.direction[:, 2]), 1, rtol=1e-9)
     np.testing.assert_allclose(spread, 1.4826 * 0.004, rtol=1e-6)
     # all residuals are the height, over the spread
-    at = np.asarray(clouds.placed(network(), rows.place))
+    at = np.asarray(matching.placed(network(), rows.place))
     off = np.einsum("ri,ri->r", at - rows.target, rows.direction)
     np.testing.assert_allclose(np.abs(off), 0.004, rtol=1e-6)
 
@@ -77,7 +77,7 @@ def test_an_outlier_hardly_counts_and_padding_not_at_all():
     points[7, 2] = 0.05
     given = sight(points)
     given = eqx.tree_at(lambda s: s.mask, given, given.mask.at[:, 9].set(False))
-    rows, _ = clouds.matched(network(), given, MESH)
+    rows, _ = matching.matched(network(), given, MESH)
     weight = np.asarray(rows.weight).reshape(3, 40)
     assert (weight[:, 7] < 0.02 * weight[:, 8]).all()
     assert (weight[:, 9] == 0).all()
@@ -90,8 +90,8 @@ def test_the_border_of_the_cloud_says_how_long_the_sheet_is(stretch):
     places[:, 0] *= 1 + stretch
     noise = 1e-4 * np.random.default_rng(2).normal(size=(4000, 3))
     cloud = np.column_stack([places, np.zeros(4000)]) + noise
-    rows = clouds.bordered(network(), sight(cloud[:5], cloud))
-    at = np.asarray(clouds.placed(network(), rows.place))
+    rows = matching.bordered(network(), sight(cloud[:5], cloud))
+    at = np.asarray(matching.placed(network(), rows.place))
     ends = np.asarray(rows.place)[:, 0] > 0.99 * SIZE[0]
     moved = np.einsum("ri,ri->r", rows.target - at, rows.direction)
     assert (np.asarray(rows.weight) > 0).all()
@@ -105,7 +105,7 @@ def test_a_hidden_border_does_not_count():
     places = scattered(2000)
     kept = places[places[:, 0] < 0.5 * SIZE[0]]
     cloud = np.column_stack([kept, np.zeros(len(kept))])
-    rows = clouds.bordered(network(), sight(cloud[:5], cloud))
+    rows = matching.bordered(network(), sight(cloud[:5], cloud))
     ends = np.asarray(rows.place)[:, 0] > 0.99 * SIZE[0]
     assert (np.asarray(rows.weight)[ends] == 0).all()
 
@@ -159,8 +159,8 @@ def hanging(down=(0.0, 1.0, 0.0), air: float = 0.0) -> Hanging:
 
 
 @eqx.filter_jit
-def work(field: Any, about: Hanging, fabric: Fabric, time=0.3):
-    return shell.virtual_work(field, about, fabric, PARTS, jnp.asarray(time))
+def work(field: Any, acting: Hanging, fabric: Fabric, time=0.3):
+    return hanging_sheet.virtual_work(field, acting, fabric, PARTS, jnp.asarray(time))
 
 
 def jet_of(values, slopes, curves) -> Jet:
@@ -205,7 +205,7 @@ def test_a_sheet_that_hangs_by_an_edge_is_in_balance():
 def test_work_is_the_derivative_of_the_energy():
     """Of membrane and bending, on a wavy sheet, along a virtual displacement."""
     fabric = Fabric.make(DENSITY, (90.0, 20.0, 60.0, 25.0), 1e-3)
-    wavy, about = network(0.05), hanging((0.0, 0.0, 0.0))
+    wavy, acting = network(0.05), hanging((0.0, 0.0, 0.0))
     which, direction = 27, jnp.array([0.3, -0.5, 0.8])
     slope = PARTS.slope[which] / jnp.array(SIZE)[None]
     x, y = SIZE
@@ -218,18 +218,20 @@ def test_work_is_the_derivative_of_the_energy():
     points = jnp.pad(PARTS.nodes * jnp.array(SIZE)[None], ((0, 0), (0, 1)), constant_values=0.3)
 
     def energy(share):
-        jet = jax.tree.map(lambda a, b: a + share * b, wavy.jet(points, shell.STRONG), along)
+        jet = jax.tree.map(
+            lambda a, b: a + share * b, wavy.jet(points, hanging_sheet.STRONG), along
+        )
         flat, moved = jnp.eye(3, 2), jnp.moveaxis(jet.first[:2], 0, -1)
         second = jnp.moveaxis(jet.second[:3], 0, -1)
 
         def node(gradient, second):
             bent = fabric.bending.energy_density(curvature(gradient + flat, second))
-            return fabric.membrane.energy_density(shell.green(gradient)) + bent
+            return fabric.membrane.energy_density(hanging_sheet.green(gradient)) + bent
 
         return PARTS.weights @ jax.vmap(node)(moved, second) * x * y
 
     still = dataclasses.replace(fabric, density=jnp.zeros(()))
-    found = work(wavy, about, still)[which] @ direction
+    found = work(wavy, acting, still)[which] @ direction
     np.testing.assert_allclose(found, jax.grad(energy)(0.0), rtol=1e-8)
 
 
@@ -273,7 +275,7 @@ def test_frames_that_are_not_there_are_refused():
         sight_of(recorded(lifting()), np.array([0, 3, 8]), 50)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="pinn")
 def test_the_map_comes_to_lie_where_the_points_are():
     """In a steady wind, from the motion of a far stiffer fabric; what is not known is said."""
     fabric = presets.grey_interlock()

@@ -16,11 +16,11 @@ from r2s.estimation.estimate_json import as_json, from_json
 from r2s.estimation.pinn import balance as balancing
 from r2s.estimation.pinn import published_recipe
 from r2s.estimation.pinn.balance import balance, basis_of, prepared, reduced, solve
-from r2s.estimation.pinn.data import Clamp, Pull, pull_from, stacked
 from r2s.estimation.pinn.from_pulls import QUICK, estimate, estimate_all
-from r2s.estimation.pinn.laws import small
 from r2s.estimation.pinn.losses import Losses, motion_residual
 from r2s.estimation.pinn.network import Network
+from r2s.estimation.pinn.pulls import Clamp, Pull, pull_from, stacked
+from r2s.estimation.pinn.stress import small
 from r2s.estimation.pinn.synthetic_pulls import pulled
 from r2s.estimation.pinn.training import Recipe, train, trainable
 from r2s.fabrics import presets
@@ -61,16 +61,15 @@ def even_pull(force: bool = True, seed: int = 0, frames: int = FRAMES) -> Pull:
 
 def small_network(pull: Pull) -> Network:
     low, high = jnp.zeros(3), jnp.concatenate([pull.size, pull.times[-1:]])
-    about = {"width": 5, "layers": 3}
-    return Network.make(low, high, jnp.asarray(1e-3, float), **about, key=jr.key(1))
+    scale = jnp.asarray(1e-3, float)
+    return Network.make(low, high, scale, width=5, layers=3, key=jr.key(1))
 
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
     """Few virtual displacements, so that it compiles fast; the slow tests undo it."""
     monkeypatch.setattr("r2s.estimation.pinn.from_pulls.DEGREES", (3, 3))
-    fewer = lambda pull, degrees=(3, 3): basis_of(pull, (3, 3))
-    monkeypatch.setattr(balancing, "basis_of", fewer)
+    monkeypatch.setattr(balancing, "basis_of", lambda pull, degrees=(3, 3): basis_of(pull, (3, 3)))
 
 
 FAMILY = OrthotropicSpace.make(DENSITY)
@@ -126,7 +125,7 @@ def test_sensitivities_of_the_motion_in_balance_against_differences():
 TINY = Recipe(losses=QUICK.losses, warm_up=20, adam=20, lbfgs=10, redraw=10, width=6, layers=3)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="pinn")
 def test_estimates_of_several_fabrics_at_once():
     """With a report in the words of every estimator, which survives its file."""
     with jax.numpy_dtype_promotion("standard"):
@@ -150,7 +149,7 @@ def test_without_force_the_report_says_so():
     assert not found.identifiable[:3].any()
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="pinn")
 def test_the_same_key_trains_the_same_network():
     pulls = jax.tree.map(lambda leaf: leaf[None], stacked([even_pull()]))
     spaces = jax.tree.map(lambda leaf: leaf[None], FAMILY)
@@ -159,7 +158,7 @@ def test_the_same_key_trains_the_same_network():
     np.testing.assert_array_equal(first.model.free, second.model.free)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="pinn")
 def test_training_lowers_the_losses_of_the_strong_form():
     """Adam, then L-BFGS, on points where the equation of motion is least fulfilled."""
     pulls = jax.tree.map(lambda leaf: leaf[None], stacked([even_pull()]))
@@ -170,7 +169,45 @@ def test_training_lowers_the_losses_of_the_strong_form():
     terms = np.sum(found.losses, axis=0)
     assert isinstance(found.losses, Losses) and terms.shape == (1, 8)
     assert terms[0, -1] < 0.2 * terms[0, 0]
-    assert (0 < found.places).all() and (found.places < 1).all()
+
+
+def test_a_killed_training_goes_on_from_its_checkpoint(tmp_path):
+    """To the same network, after a chunk of Adam and after one of L-BFGS."""
+    pulls = jax.tree.map(lambda leaf: leaf[None], stacked([even_pull()]))
+    spaces = jax.tree.map(lambda leaf: leaf[None], FAMILY)
+    few = dataclasses.replace(TINY, warm_up=2, adam=2, lbfgs=4, redraw=2)
+    file = tmp_path / "training.npz"
+
+    class Killed(Exception):
+        pass
+
+    def killed_after(last):
+        def report(chunk, losses):
+            del losses
+            if chunk == last:
+                raise Killed
+
+        return report
+
+    made = []
+    with jax.numpy_dtype_promotion("standard"):
+        whole = train(spaces, pulls, few, key=jr.key(5))
+        for last in (0, 2):
+            with pytest.raises(Killed):
+                train(spaces, pulls, few, report=killed_after(last), checkpoint=file, key=jr.key(5))
+        resumed = train(
+            spaces,
+            pulls,
+            few,
+            report=lambda chunk, losses: made.append(chunk),
+            checkpoint=file,
+            key=jr.key(5),
+        )
+        with pytest.raises(ValueError, match="another recording, space or setting"):
+            train(spaces, pulls, few, checkpoint=file, key=jr.key(6))
+    assert made == [3]
+    np.testing.assert_array_equal(resumed.places, whole.places)
+    assert eqx.tree_equal(resumed.model, whole.model)
 
 
 def test_the_papers_weight_anneals():
@@ -196,11 +233,11 @@ def test_a_step_that_went_astray_is_taken_back(monkeypatch):
     with jax.numpy_dtype_promotion("standard"):
         model = published_recipe.begin(FAMILY, pulls, jnp.full(7, 0.4), key=jr.key(0))
         fresh = published_recipe.untouched(model)
-        about = FAMILY, pulls, jnp.asarray(0), 1
-        after, state, _ = published_recipe.run(model, fresh, *about)
+        first = jnp.asarray(0)
+        after, state, _ = published_recipe.run(model, fresh, FAMILY, pulls, first, 1)
         assert not eqx.tree_equal(after, model) and np.isfinite(state.before)
         worse = state._replace(before=jnp.zeros(()))
-        same, state, _ = published_recipe.run(after, worse, *about)
+        same, state, _ = published_recipe.run(after, worse, FAMILY, pulls, first, 1)
     assert eqx.tree_equal(same, after)
     assert eqx.tree_equal(state.ahead, eqx.filter(after, trainable(after)))
     assert all(not np.any(leaf) for leaf in jax.tree.leaves(state.lbfgs[0].diff_params_memory))
@@ -218,14 +255,18 @@ def test_the_gradient_made_along_with_the_sum_is_that_of_the_sum():
         model = eqx.combine(weights, fixed)
         places = jnp.tile(pulls.places[0], (4, 1))
         frames = jnp.repeat(jnp.arange(4), len(pulls.places[0]))
-        about = FAMILY(model.place), places, frames, small
-        residual = lambda network, pull: motion_residual(network, pull, *about)
+        fabric = FAMILY(model.place)
+
+        def residual(network, pull):
+            return motion_residual(network, pull, fabric, places, frames, small)
+
         return jnp.mean(jax.vmap(residual)(model.networks, pulls) ** 2)
 
-    found = jax.value_and_grad(
-        lambda w: published_recipe.losses(eqx.combine(w, fixed), FAMILY, pulls)[1]
-    )
-    (one, slope), (other, wanted) = found(weights), jax.value_and_grad(at_once)(weights)
+    def found(weights):
+        return published_recipe.losses(eqx.combine(weights, fixed), FAMILY, pulls)[1]
+
+    one, slope = jax.jit(jax.value_and_grad(found))(weights)
+    other, wanted = jax.jit(jax.value_and_grad(at_once))(weights)
     slope, wanted = (np.asarray(jax.flatten_util.ravel_pytree(g)[0]) for g in (slope, wanted))
     assert np.abs(wanted).max() > 0
     np.testing.assert_allclose(one, other, rtol=1e-12)
@@ -242,7 +283,7 @@ def test_pulls_and_families_that_do_not_go_together():
 ANGLES = (0.0, math.pi / 2, math.pi / 4)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="pinn")
 @pytest.mark.parametrize("name", ["pink_solid", "grey_interlock"])
 def test_the_cloths_fabric_is_found(name, monkeypatch):
     """Within 5 %, from 81 markers and a force with noise; and it simulates what was unseen."""

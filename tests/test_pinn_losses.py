@@ -12,12 +12,12 @@ import pytest
 from jaxtyping import Array
 
 from r2s.estimation.pinn import losses as strong
-from r2s.estimation.pinn import weak
-from r2s.estimation.pinn.data import Clamp, Pull
-from r2s.estimation.pinn.laws import green, small
-from r2s.estimation.pinn.losses import draw_points, plain_scales, scales_of
+from r2s.estimation.pinn import weak_form
+from r2s.estimation.pinn.losses import Scales, draw_points, scales_of
 from r2s.estimation.pinn.network import Jet, Network
-from r2s.estimation.pinn.weak import end_value, virtual_fields, weak_losses
+from r2s.estimation.pinn.pulls import Clamp, Pull
+from r2s.estimation.pinn.stress import green, small
+from r2s.estimation.pinn.weak_form import end_value, virtual_fields, weak_losses
 from r2s.fabrics.fabric import Fabric
 from r2s.laws.membrane import OrthotropicMembrane
 
@@ -25,7 +25,7 @@ from r2s.laws.membrane import OrthotropicMembrane
 compiled: Any = eqx.filter_jit
 edge_force, marker_residual = compiled(strong.edge_force), compiled(strong.marker_residual)
 motion_residual, strong_losses = compiled(strong.motion_residual), compiled(strong.strong_losses)
-kinematics, virtual_work = compiled(weak.kinematics), compiled(weak.virtual_work)
+kinematics, virtual_work = compiled(weak_form.kinematics), compiled(weak_form.virtual_work)
 
 SIZE, DENSITY, FRAMES = (0.45, 0.3), 0.3, 7  # [m, kg/m^2]
 TRUE = (90.0, 25.0, 140.0, 30.0)  # C11, C12, C22, C33 [N/m]
@@ -111,9 +111,10 @@ ISOTROPIC = OrthotropicMembrane.isotropic(8e4, 0.3, 1e-3)
 def test_waves_obey_the_equation_of_motion(law):
     function = waves(law)
     given, fabric = pull(function), dataclasses.replace(FABRIC, membrane=law)
-    residual = lambda fabric: motion_residual(
-        exact(function), given, fabric, *inner_points(given), small
-    )
+
+    def residual(fabric):
+        return motion_residual(exact(function), given, fabric, *inner_points(given), small)
+
     twice = dataclasses.replace(fabric, density=2 * fabric.density)
     assert float(jnp.abs(residual(fabric)).max()) < 1e-9 * float(jnp.abs(residual(twice)).max())
 
@@ -121,14 +122,16 @@ def test_waves_obey_the_equation_of_motion(law):
 def test_exact_waves_give_all_four_stiffnesses():
     """The residual is linear in them: least squares, without force, since the inertia is known."""
     first, second = (waves(FABRIC.membrane, wave) for wave in ((7.0, 10.0), (9.0, -4.0)))
-    function = lambda point: first(point) + second(point)
+
+    def function(point):
+        return first(point) + second(point)
+
     given = pull(function)
 
     def residual(stiffness):
-        membrane = OrthotropicMembrane(*stiffness)
-        fabric = dataclasses.replace(FABRIC, membrane=membrane)
-        about = exact(function), given, fabric
-        return motion_residual(*about, *inner_points(given), small).ravel()
+        fabric = dataclasses.replace(FABRIC, membrane=OrthotropicMembrane(*stiffness))
+        field = exact(function)
+        return motion_residual(field, given, fabric, *inner_points(given), small).ravel()
 
     start = jnp.full(4, 10.0)
     found = start - jnp.linalg.lstsq(jax.jacfwd(residual)(start), residual(start))[0]
@@ -164,7 +167,7 @@ def test_an_even_stretch_has_the_force_of_the_closed_form_and_free_edges():
     np.testing.assert_allclose(found[:, 0], expected, rtol=1e-9, atol=1e-12)
     still = eqx.tree_at(lambda f: f.density, FABRIC, jnp.zeros(()))  # no inertia
     points = draw_points(given, 64, key=jr.key(2))
-    scales = plain_scales()
+    scales = Scales(*(jnp.ones(()) for _ in Scales._fields))  # SI units
     losses = strong_losses(exact(function), given, still, points, scales)
     for term in (losses.data, losses.motion, losses.traction, losses.free):
         assert float(term) < 1e-16
@@ -238,8 +241,7 @@ def test_scales_are_those_of_noise_and_force():
 def test_losses_have_finite_gradients(losses, strain):
     given = pull(stretched(2.0), force=jnp.full(FRAMES, 3.0), normal=9.81)
     low, high = jnp.zeros(3), jnp.array([*SIZE, 0.02])
-    about = {"width": 5, "layers": 3}
-    network = Network.make(low, high, jnp.asarray(0.01), **about, key=jr.key(3))
+    network = Network.make(low, high, jnp.asarray(0.01), width=5, layers=3, key=jr.key(3))
     points = draw_points(given, 16, key=jr.key(4))
     scales = scales_of(given, FABRIC, 2e-4, 0.03)
 

@@ -32,7 +32,10 @@ def test_a_turn_keeps_heights_and_distances() -> None:
     cloud = np.random.default_rng(0).normal(size=(20, 3))
     there = moved(place, cloud)
     np.testing.assert_allclose(there[:, 2], cloud[:, 2] + 0.3)
-    lengths = lambda points: np.linalg.norm(points[:, None] - points[None], axis=2)
+
+    def lengths(points):
+        return np.linalg.norm(points[:, None] - points[None], axis=2)
+
     np.testing.assert_allclose(lengths(there), lengths(cloud), atol=1e-12)
     np.testing.assert_allclose(moved(place, place.pivot[None])[0], place.pivot + place.shift)
 

@@ -316,7 +316,10 @@ def motions(kind: str, dtype, seed: int):
 @jax.jit
 def histories(start, end, is_edges):
     """Distances (time, pair) of moving pairs, by dense sampling."""
-    at = lambda time: jax.vmap(distance)(start + time * (end - start), is_edges)
+
+    def at(time):
+        return jax.vmap(distance)(start + time * (end - start), is_edges)
+
     return jax.lax.map(at, jnp.asarray(TIMES))
 
 

@@ -19,7 +19,7 @@ BENDINGS = (1e-7, 1e-5, 1e-3)  # [N m]
 DENSITIES = (0.05, 0.5)  # [kg/m^2]
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize(
     "table",
     [
@@ -38,7 +38,9 @@ def test_every_fabric_of_the_range_has_a_finite_gradient(table):
 
         @eqx.filter_jit
         def both(fabric):
-            run = lambda fabric: jnp.mean(simulate(solver, fabric, start, controls).x[-1] ** 2)
+            def run(fabric):
+                return jnp.mean(simulate(solver, fabric, start, controls).x[-1] ** 2)
+
             return jax.value_and_grad(run)(fabric)
 
         failed = []

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from r2s.study.report.page import PNG, Section, write_report
-from r2s.study.statistics.tables import Table
+from r2s.study.tables import Table
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}
 TABLE = Table(("fabric", "estimate [mm]"), (("a<b", "1.0"), ("mean", "1.0")), "on the fold", foot=1)
@@ -55,7 +55,7 @@ def report(tmp_path, images):
         Section("Lift", figures=((images[1], "<b>bold</b>"),)),
     ]
     path = tmp_path / "report.html"
-    write_report(path, "A <study>", "One.\n\nTwo <i>.\n", {"solver": "<xpbd>"}, sections)
+    write_report(path, "A <study>", "One.\n\nTwo <i>.\n", sections)
     return path
 
 
@@ -79,13 +79,13 @@ def test_nothing_is_fetched(report):
 
 def test_text_is_escaped_and_shown(report):
     page = Page(report.read_text())
-    expected = ["A <study>", "The <fold>", "5 < 6 & so on.", "Two <i>.", "<xpbd>", "a<b"]
+    expected = ["A <study>", "The <fold>", "5 < 6 & so on.", "Two <i>.", "a<b"]
     for text in [*expected, "<b>bold</b>", "on the fold"]:
         assert text in page.text
     tags = {tag for tag, _ in page.tags}
-    assert not tags & {"study", "fold", "i", "b", "xpbd"}
+    assert not tags & {"study", "fold", "i", "b"}
     assert len(page.all("p")) == 3
-    assert [found.get("class") for found in page.all("table")] == [None, "sortable", "sortable"]
+    assert [found.get("class") for found in page.all("table")] == ["sortable", "sortable"]
 
 
 def test_phones_and_the_dark(report):
@@ -99,14 +99,14 @@ def test_phones_and_the_dark(report):
 def test_a_missing_figure_is_named_and_nothing_is_written(tmp_path):
     section = Section("Fold", figures=((tmp_path / "lost.png", ""),))
     with pytest.raises(FileNotFoundError, match="lost.png"):
-        write_report(tmp_path / "report.html", "A study", "", {}, [section])
+        write_report(tmp_path / "report.html", "A study", "", [section])
     (tmp_path / "lost.png").write_text("no picture")
     with pytest.raises(ValueError, match="lost.png.*PNG"):
-        write_report(tmp_path / "report.html", "A study", "", {}, [section])
+        write_report(tmp_path / "report.html", "A study", "", [section])
     assert [path.name for path in tmp_path.iterdir()] == ["lost.png"]
 
 
 def test_the_smallest_report(tmp_path):
-    write_report(tmp_path / "report.html", "A study", "", {}, [])
+    write_report(tmp_path / "report.html", "A study", "", [])
     page = Page((tmp_path / "report.html").read_text())
     assert page.all("table") == [] and page.all("p") == [] and len(page.all("h1")) == 1

@@ -279,7 +279,7 @@ def test_lone_points_are_outliers() -> None:
     assert not outliers(sheet[:5], 8, 3.0).any()
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="motions")
 @pytest.mark.parametrize("motion_of", ["lift", "fold"])
 def test_a_simulated_fabric_comes_back_within_2_mm(motion_of: str, tmp_path: Path) -> None:
     """Two 720p cameras with the flaws of real ones, a soft sheet that is lifted or folded."""

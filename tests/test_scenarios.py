@@ -162,7 +162,7 @@ def test_material_points_fit_the_scenario():
         rollout(scenario, fabric, solver=wrong)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="motions")
 @pytest.mark.parametrize("fabric", [SOFTEST, STIFFEST])
 @pytest.mark.parametrize(
     ("name", "kind"),
@@ -186,6 +186,9 @@ def test_the_energy_of_a_table_law_is_that_of_its_stiffness_there():
     mesh = rectangle((0.2, 0.2), (4, 4))
     fabric = presets.grey_interlock()
     x = jnp.concatenate([mesh.rest, 0.02 * jnp.sin(20 * mesh.rest[:, :1])], axis=1)
-    of = lambda law: float(stored_energy(mesh, dataclasses.replace(fabric, bending=law), x))
+
+    def of(law):
+        return float(stored_energy(mesh, dataclasses.replace(fabric, bending=law), x))
+
     table = TableBending(jnp.full((3, 5), HINGE_FACTOR * 1e-5))
     assert of(table) == pytest.approx(of(HingeBending(jnp.asarray(1e-5))), rel=1e-12)

@@ -12,6 +12,12 @@ from matplotlib.figure import Figure  # noqa: E402
 from PIL import Image  # noqa: E402
 
 from r2s.recordings.manifest import default_manifest  # noqa: E402
+from r2s.recordings.open import (
+    SimulatedCloth,
+    load_trajectory,
+    open_recording,
+    save_trajectory,
+)
 from r2s.recordings.recording import (
     Recording,
     RecordingInfo,
@@ -20,13 +26,9 @@ from r2s.recordings.recording import (
     save,
 )
 from r2s.viewer.pictures import (
-    SimulatedCloth,
     _force_curve,
-    _mark,
+    _mark_frames,
     contact_sheet,
-    load_trajectory,
-    open_recording,
-    save_trajectory,
     show,
     write_gif,
 )
@@ -82,7 +84,10 @@ def test_the_cloth_is_drawn_over_it_and_markers_too(tmp_path: Path) -> None:
     without = show(recorded(), tmp_path / "without", video="none")
     assert len(without) == 1
     with_cloth = contact_sheet(tmp_path / "with.png", recorded(), cloth())
-    blue = lambda path: sum(b > r + 60 for r, _, b in colours(path))
+
+    def blue(path):
+        return sum(b > r + 60 for r, _, b in colours(path))
+
     assert blue(with_cloth) > 5 + blue(without[0])
     markers = np.full((FRAMES, 4, 3), 0.1)
     seen = np.array([True, True, False, True])[None].repeat(FRAMES, axis=0)
@@ -100,11 +105,14 @@ def test_the_force_is_drawn_below(tmp_path: Path, vector: bool) -> None:
     pulled = recorded(force=log, force_times=times)
     curve = _force_curve(Figure(), pulled, 0.1, 0.2)
     np.testing.assert_allclose(curve.lines[0].get_ydata(), force, rtol=1e-12)
-    (marked,) = _mark(curve, pulled, np.arange(FRAMES))
+    (marked,) = _mark_frames(curve, pulled, np.arange(FRAMES))
     expected = np.where(np.arange(FRAMES) / 15 < 0.1, np.nan, np.arange(FRAMES) / 5)
     np.testing.assert_allclose(marked.get_ydata(), expected, rtol=1e-12)
     assert curve.get_xlim()[1] < 0.3  # the frames end long before the log
-    size = lambda recording, name: Image.open(contact_sheet(tmp_path / name, recording)).height
+
+    def size(recording, name):
+        return Image.open(contact_sheet(tmp_path / name, recording)).height
+
     assert size(pulled, "with.png") > size(recorded(), "without.png") + 100
 
 

@@ -129,7 +129,9 @@ def test_an_impossible_density_or_damping_is_refused(values):
 
 
 def test_young_and_poisson_can_be_traced():
-    energy = lambda young, poisson: NeoHookean.make(young, poisson).energy_density(random(3))
+    def energy(young, poisson):
+        return NeoHookean.make(young, poisson).energy_density(random(3))
+
     slope = eqx.filter_jit(jax.grad(energy, argnums=(0, 1)))(YOUNG, POISSON)
     assert slope[0] == pytest.approx(float(energy(YOUNG, POISSON)) / YOUNG)  # linear in E
     assert np.isfinite(slope[1])

@@ -121,7 +121,7 @@ def test_a_strip_with_free_sides_balances_its_tension_at_any_angle(degrees, shee
     assert ends == pytest.approx(expected, abs=1e-12 * tension)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("degrees", [0, 30, 90, -60])
 def test_a_strip_pulled_by_its_ends_comes_to_strain_uniformly(degrees, sheet, smooth):
     solver, expected, _ = strip_cut_at(degrees, sheet, smooth)
@@ -192,7 +192,7 @@ def test_the_energy_of_a_wide_swing_hardly_rises(damping, sheet, settled):
     assert rise(swing(sheet, settled, 5.0, damping)) < 0.006
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="cloth")
 def test_the_rise_of_energy_is_of_second_order(sheet, settled):
     coarse, medium, fine = (rise(swing(sheet, settled, 5.0, 0.01, DT / n)) for n in (1, 2, 4))
     assert coarse > 4 * medium > 16 * fine

@@ -16,15 +16,19 @@ from r2s.estimation.estimate import point_estimate
 from r2s.evaluation import prediction_error
 from r2s.fabrics import presets
 from r2s.fabrics.arcsim import write_material
+from r2s.failures import Failure
 from r2s.recordings.recording import cloud
 from r2s.scenarios import synthetic
 from r2s.scenarios.six import SIX
+from r2s.solver import Trajectory
 from r2s.study import engine, estimates, matrix, results
-from r2s.study.cells import needs
+from r2s.study.cells import dependencies, read_metadata, with_dependencies
+from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
+from r2s.study.costs import costs, forecast
 from r2s.study.estimates import EstimateCell, TrainedNetwork
-from r2s.study.sources import Making, SyntheticRecording, strain_dependent
-from r2s.study.statistics import tables
-from r2s.study.statistics.panel import MOTIONS, PAPER_COLUMNS, Column
+from r2s.study.rows import Row, read_rows, write_rows
+from r2s.study.sources import SyntheticRecording, TruthSettings, strain_dependent
+from r2s.study.statistics.recordings import recording_tables
 
 ROOT = Path(__file__).parents[1]
 
@@ -57,10 +61,10 @@ def test_a_whole_surface_tells_the_true_fabric_by_every_metric():
     seen = synthetic.record(experiment, fabric, "grey", seen=synthetic.WHOLE, key=jr.key(0))
     clouds = [cloud(seen, frame) for frame in (0, 30)]
     assert all(len(points) == len(clouds[0]) > 5000 for points in clouds)
-    of = lambda fabric: prediction_error.against_motion(
-        seen, prediction_error.predict(seen, fabric), 6, False
+    truth, other = (
+        prediction_error.against_motion(seen, prediction_error.predict(seen, each), 6, False)
+        for each in (fabric, presets.pink_solid())
     )
-    truth, other = of(fabric), of(presets.pink_solid())
     for name, value in truth.items():
         assert value < other[name] / 1.5, name
     assert truth["hausdorff"] < 0.01  # samples of the surface, 8 mm apart
@@ -74,6 +78,21 @@ def test_a_diverged_motion_is_a_result(fold):
     assert all(np.isnan(value) for value in found.values())
 
 
+def test_a_run_that_fails_is_lost_from_there_on_and_says_why(monkeypatch):
+    failed = Trajectory(
+        x=jnp.zeros((3, 9, 3)),
+        ok=jnp.array([True, False, True]),
+        failure=jnp.array(Failure.NON_FINITE.value),
+        failed_frame=jnp.array(1),
+        failed_step=jnp.array(2),
+    )
+    monkeypatch.setattr(prediction_error, "_rollout", lambda *_, **__: failed)
+    scenario = SIX["fling"]().scenario((3, 3))
+    moved = prediction_error.predict_motion(scenario, presets.grey_interlock())
+    assert np.isfinite(moved.x).all(axis=(1, 2)).tolist() == [True, False, False]
+    assert "frame 1, step 2" in moved.failure
+
+
 def test_the_cropped_distance_leaves_out_what_the_recording_cannot_show(fold):
     x = prediction_error.predict(fold, presets.grey_interlock())
     found = prediction_error.against_motion(fold, x)
@@ -81,8 +100,8 @@ def test_the_cropped_distance_leaves_out_what_the_recording_cannot_show(fold):
     assert cloud(fold, 20)[:, 2].min() > 0
 
 
-def test_the_columns_of_the_paper_are_part_of_all():
-    assert set(PAPER_COLUMNS) <= set(matrix.FULL)
+def test_the_configurations_of_the_paper_are_part_of_all():
+    assert set(PAPER_CONFIGURATIONS) <= set(matrix.FULL)
     assert len(set(matrix.FULL)) == len(matrix.FULL)
     for cell in matrix.synthetic(matrix.PRESETS["small"]):
         assert cell.scenario in MOTIONS
@@ -92,21 +111,24 @@ def test_the_columns_of_the_paper_are_part_of_all():
 
 
 def test_small_has_every_approach_both_solvers_two_fabrics_and_six_scenarios():
-    every = engine.closure(matrix.synthetic(matrix.SMALL))
+    every = with_dependencies(matrix.synthetic(matrix.SMALL))
     estimated = [cell for cell in every if isinstance(cell, EstimateCell)]
     assert {cell.approach for cell in estimated} == set(estimates.SOLVERS)
     assert {cell.solver for cell in estimated} == {"cloth", "points"}
     assert len({cell.fabric for cell in estimated}) >= 2
     assert len({cell.scenario for cell in every if isinstance(cell, SyntheticRecording)}) == 6
     networks = [
-        need for cell in estimated for need in needs(cell) if isinstance(need, TrainedNetwork)
+        need
+        for cell in estimated
+        for need in dependencies(cell)
+        if isinstance(need, TrainedNetwork)
     ]
     assert networks and all(network.scenario == "lifting" for network in networks)
 
 
 def test_what_is_judged_was_never_estimated_from():
-    plan = matrix.narrowed(matrix.SMALL, repeats=3, judged=3)
-    every = engine.closure(matrix.synthetic(plan))
+    plan = matrix.with_changes(matrix.SMALL, repeats=3, judged=3)
+    every = with_dependencies(matrix.synthetic(plan))
     made = [cell for cell in every if isinstance(cell, SyntheticRecording)]
     assert len({cell.path(Path()) for cell in every}) == len(every)
     motions = [cell._experiment().route.path.tobytes() for cell in made if cell.angle is None]
@@ -114,38 +136,44 @@ def test_what_is_judged_was_never_estimated_from():
 
 
 def test_a_truth_has_the_stiffness_of_the_preset_at_rest_and_more_when_stretched():
-    preset, truth = presets.grey_interlock(), strain_dependent("grey_interlock", Making())
+    preset, truth = presets.grey_interlock(), strain_dependent("grey_interlock", TruthSettings())
     at_rest, stretched = (truth.membrane.at(jnp.array([e, 0.0, 0.0])) for e in (0.0, 0.3))
     for name in ("c11", "c12", "c22", "c33"):
         assert getattr(at_rest, name) == pytest.approx(float(getattr(preset.membrane, name)))
         assert getattr(stretched, name) == pytest.approx(2 * float(getattr(preset.membrane, name)))
     hinge = truth.bending.at(jnp.array(0.0), jnp.array(0.0))
     assert float(hinge.stiffness) == pytest.approx(float(preset.bending.stiffness))
-    assert isinstance(strain_dependent("grey_interlock", Making(stiffening=0.0)), type(preset))
+    assert isinstance(
+        strain_dependent("grey_interlock", TruthSettings(stiffening=0.0)), type(preset)
+    )
 
 
 def test_a_changed_file_of_measured_tables_is_another_recording(tmp_path):
     def recordings():
-        plan = matrix.narrowed(matrix.SMALL, fabrics=["grey_interlock"], materials=str(tmp_path))
+        plan = matrix.with_changes(
+            matrix.SMALL, fabrics=["grey_interlock"], materials=str(tmp_path)
+        )
         return [cell.recordings[0] for cell in matrix.synthetic(plan)]
 
-    truth = strain_dependent("grey_interlock", Making())
+    truth = strain_dependent("grey_interlock", TruthSettings())
     write_material(tmp_path / "grey_interlock.json", truth)
     first, again = recordings(), recordings()
-    write_material(tmp_path / "grey_interlock.json", strain_dependent("pink_solid", Making()))
+    write_material(
+        tmp_path / "grey_interlock.json", strain_dependent("pink_solid", TruthSettings())
+    )
     changed = recordings()
     assert [cell.key for cell in first] == [cell.key for cell in again]
     assert not {cell.key for cell in first} & {cell.key for cell in changed}
     assert isinstance(changed[0], SyntheticRecording)
-    softer = strain_dependent("grey_interlock", changed[0].making).membrane.stiffness
+    softer = strain_dependent("grey_interlock", changed[0].truth).membrane.stiffness
     assert not np.array_equal(softer, truth.membrane.stiffness)
     with pytest.raises(FileNotFoundError, match="camel_ponte_roma.json"):
-        matrix.narrowed(matrix.SMALL, fabrics=["camel_ponte_roma"], materials=str(tmp_path))
+        matrix.with_changes(matrix.SMALL, fabrics=["camel_ponte_roma"], materials=str(tmp_path))
 
 
 @pytest.fixture
 def tiny(monkeypatch):
-    """One column and fabric, whose estimate is the middle of the space, without work."""
+    """One configuration and fabric, whose estimate is the middle of the space, without work."""
     made = []
 
     def fake(method, recordings, space, budget, key):
@@ -157,11 +185,11 @@ def tiny(monkeypatch):
 
     monkeypatch.setattr(DiffCloud, "_estimate", fake)
     plan = matrix.Plan(
-        (Column("diffcloud", "cloth", "lifting"),),
+        (Configuration("diffcloud", "cloth", "lifting"),),
         ("grey_interlock",),
         1,
         1,
-        Making((5, 5), 1 / 15),
+        TruthSettings((5, 5), 1 / 15),
     )
     return matrix.synthetic(plan)[-1:], made
 
@@ -172,15 +200,16 @@ def test_an_estimate_is_made_once_and_judged(tiny, tmp_path):
     rows = results.rows(cells, tmp_path)
     assert {row.approach for row in rows} == {"diffcloud"} and {row.repeat for row in rows} == {"0"}
     assert all(np.isfinite(row.value) and row.value > 0 for row in rows)
-    tables.write_rows(tmp_path / "results.csv", rows)
-    assert tables.read_rows(tmp_path / "results.csv") == rows
+    write_rows(tmp_path / "results.csv", rows)
+    assert read_rows(tmp_path / "results.csv") == rows
     engine.run(cells, tmp_path, engine.Serial())
     assert len(made) == 1
     (entry,) = results.parameters(cells, tmp_path)["cloth"]
-    assert entry[1][0].unit == "N/m" and not np.isfinite(entry[3]).any()
+    assert entry.ranges[0].unit == "N/m" and not np.isfinite(entry.standard_errors).any()
+    assert np.isfinite(entry.truth).all()  # those of the preset
     # what more of the same would cost
-    plan = matrix.Plan((Column("diffcloud", "cloth", "lifting"),), ("grey_interlock",), 3, 4)
-    table = results.forecast(results.costs(cells, tmp_path), plan)
+    plan = matrix.Plan((Configuration("diffcloud", "cloth", "lifting"),), ("grey_interlock",), 3, 4)
+    table = forecast(costs(cells, tmp_path), plan)
     lines = {line[0]: line[1:] for line in table.rows}
     assert lines["estimates diffcloud cloth lifting"][0] == "3"
     assert lines["evaluations cloth shaking"][0] == "16"  # 3 estimates and the default, 4 motions
@@ -197,6 +226,8 @@ def test_an_estimate_that_diverges_is_a_result(tiny, tmp_path, monkeypatch):
     monkeypatch.setattr(DiffCloud, "_estimate", explode)
     assert engine.run(cells, tmp_path, engine.Serial()) == {}
     assert all(np.isnan(row.value) for row in results.rows(cells, tmp_path))
+    reasons = read_metadata(cells[0], tmp_path)["diverged"]
+    assert reasons == {source.name: "the estimate diverged" for source in cells[0].recordings}
     assert results.parameters(cells, tmp_path) == {}
 
 
@@ -207,7 +238,8 @@ def test_an_estimate_that_diverges_is_a_result(tiny, tmp_path, monkeypatch):
         (("--data", "r2s"), "no recording"),
         (("--data", "r2s", "--density", "-1"), "must be positive"),
         (("--fabrics", "silk"), "no preset 'silk'"),
-        (("--columns", "diffcp-cloth-wind"), "no column 'diffcp-cloth-wind'; there are diffcloud-"),
+        (("--configurations", "diffcp-cloth-wind"), "no configuration 'diffcp-cloth-wind'; there"),
+        (("--columns", "diffcp-cloth-wind"), "no configuration 'diffcp-cloth-wind'; there"),
         (("--judged", "0"), "judged must be at least 1"),
     ],
 )
@@ -248,15 +280,29 @@ def test_results_are_written_again_when_one_is_gone_or_a_cell_is_newer(tmp_path)
 
 
 def test_given_recordings_are_shown_one_by_one():
-    def row(approach, baseline, recording, value):
-        scenario = "lifting" if approach else ""
-        about = approach, "cloth" if baseline != "repeatability" else "", scenario, "silk", "0"
-        metric = "chamfer_real_to_sim", "m", value
-        return tables.Row(*about, recording, "folding", baseline, *metric)
+    def row(baseline, value, recording="fold_silk", repeat="0"):
+        is_estimate = baseline in ("", "other_fabric")
+        return Row(
+            approach="diffcloud" if is_estimate else "",
+            solver="" if baseline == "repeatability" else "cloth",
+            estimated_from="lifting" if is_estimate else "",
+            fabric="silk",
+            repeat=repeat,
+            recording=recording,
+            evaluated_on="folding",
+            baseline=baseline,
+            metric="chamfer_real_to_sim",
+            unit="m",
+            value=value,
+        )
 
-    rows = [row("diffcloud", "", "fold_silk", 0.02), row("", "default", "fold_silk", 0.03)]
-    rows += [row("diffcloud", "other_fabric", "fold_silk", 0.025)]
-    rows += [row("", "repeatability", "fold_silk", 0.01)]
-    (found,) = results.by_recording(rows).values()
-    assert found.rows[0] == ("silk", "fold_silk", "20.0", "30.0", "25.0", "10.0")
-    assert results.by_recording(rows[:2]) == {}  # as of made recordings
+    rows = [row("", 0.02), row("default", 0.03), row("other_fabric", 0.025)]
+    rows += [row("repeatability", 0.01), row("", 0.09, repeat="1")]
+    (found,) = recording_tables([*rows, row("default", 0.04, "fold_silk2")]).values()
+    assert found.rows == (
+        ("silk", "fold_silk", "20.0", "30.0", "25.0", "10.0"),
+        ("silk", "fold_silk2", "-", "40.0", "-", "-"),
+        ("mean", "", "20.0", "35.0", "25.0", "10.0"),
+    )
+    assert found.caption == "DIFFCLOUD cloth lifting: chamfer_real_to_sim [mm] on folding"
+    assert recording_tables(rows[:2]) == {}  # as those of synthetic recordings

@@ -102,7 +102,7 @@ if index == 0:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="study")
 def test_two_processes_sweep_as_one_does(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -71,9 +71,12 @@ def blown():
     """An experiment of a few frames, and its recording with a late clock and dropped points."""
     experiment = scenarios.wind(num_frames=6, interval=1 / 10, speed=3.0)
     seen = synthetic.sensing(experiment)._replace(time_offset=0.07, dropped=0.6, points=20000)
-    make = lambda seen: synthetic.record(
-        experiment, presets.grey_interlock(), "grey", seen=seen, shape=SHAPE, key=jr.key(2)
-    )
+
+    def make(seen):
+        return synthetic.record(
+            experiment, presets.grey_interlock(), "grey", seen=seen, shape=SHAPE, key=jr.key(2)
+        )
+
     return experiment, make(seen), make(seen._replace(dropped=0.0, time_offset=0.0))
 
 
@@ -94,13 +97,13 @@ def test_dropped_points_are_missing(blown):
 
 def test_a_hanging_sheet_is_in_view(blown):
     experiment, _, whole = blown
-    moved = synthetic._motion(experiment.scenario(SHAPE), presets.grey_interlock(), None, None)
+    moved = synthetic._rollout(experiment.scenario(SHAPE), presets.grey_interlock(), None, None)
     faces = experiment.scenario(SHAPE).scene.mesh.faces
     surface = np.asarray(sample(moved.x[-1], faces, 16))
     assert np.mean(KDTree(cloud(whole, 5)).query(surface)[0] < 0.02) > 0.8
 
 
-@pytest.mark.slow
+@pytest.mark.slow(group="motions")
 @pytest.mark.parametrize("kind", ["cloth", "points"])
 @pytest.mark.parametrize("name", scenarios.SIX)
 def test_every_scenario_is_recorded_by_either_solver(name, kind):

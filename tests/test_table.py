@@ -117,7 +117,9 @@ def test_single_precision_stays_single_and_finite(kind):
 @pytest.mark.parametrize("biaxial", [0.0, 0.05, 0.15])
 def test_stiffness_is_smooth_where_the_principal_stretches_are_equal(biaxial):
     # a step of a thousandth of the blur across the place changes no more than the blur allows
-    at = lambda offset: look(MEMBRANES["plain"], strain_of(1 + biaxial, 0.0, 1 + biaxial) + offset)
+    def at(offset):
+        return look(MEMBRANES["plain"], strain_of(1 + biaxial, 0.0, 1 + biaxial) + offset)
+
     span = float(jnp.max(jnp.ptp(STRETCHING, axis=0)))
     for direction in ([1.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 1.0, 1.0]):
         offset = 1e-3 * BLUR * jnp.array(direction)
@@ -239,7 +241,10 @@ def test_the_hinge_has_the_force_of_the_published_stiffness():
     # k l^2 / (4 A) theta, of the energy A B (theta l / A)^2 / 2
     stiffness, length, area, angle = 3e-5, 0.12, 0.015, 0.4
     law = TableBending(jnp.full((3, 5), stiffness)).at(jnp.array(0.3), jnp.array(0.0))
-    energy = lambda angle: area * law.energy_density(angle * length / area)
+
+    def energy(angle):
+        return area * law.energy_density(angle * length / area)
+
     force = jax.grad(energy)(jnp.array(angle))
     assert force == pytest.approx(stiffness * length**2 / (4 * area) * angle, rel=1e-12)
 

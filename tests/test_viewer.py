@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import BROWSER, needs_browser
-from made_up_study import made_up_shown
+from made_up_study import made_up_comparison
 from test_report import Page
 
 from r2s.study.report import player
+from r2s.study.report.motions import MotionComparison
 from r2s.study.report.page import Section, write_report
-from r2s.study.report.scenes import Shown, load_shown, save_shown
-from r2s.study.statistics.tables import Table
+from r2s.study.tables import Table
 
 FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
@@ -72,20 +72,20 @@ addEventListener("load", () => {
 """
 
 
-def diverged() -> Shown:
-    shown = made_up_shown("shaking", "pink_solid")
+def diverged() -> MotionComparison:
+    shown = made_up_comparison("shaking", "pink_solid")
     shown.motions["b"][2:] = np.nan
     return shown
 
 
 @pytest.fixture(scope="module")
 def recordings():
-    return [made_up_shown(), diverged()]
+    return [made_up_comparison(), diverged()]
 
 
 def page(path, recordings, extra=""):
     section = Section("Motions", ("Words.",), (TABLE,), html=player.viewer(recordings) + extra)
-    write_report(path, "A study", "", {}, [section])
+    write_report(path, "A study", "", [section])
     return path.read_text()
 
 
@@ -99,7 +99,7 @@ def test_nothing_is_fetched_and_tags_are_closed(tmp_path, recordings):
 
 
 def test_labels_are_escaped(tmp_path):
-    shown = made_up_shown(labels=("</script><b>",), fabric="<i>")
+    shown = made_up_comparison(labels=("</script><b>",), fabric="<i>")
     found = Page(page(tmp_path / "report.html", [shown]))
     assert not {"i", "b"} & {tag for tag, _ in found.tags}
 
@@ -109,40 +109,19 @@ def test_size_of_a_long_recording():
     clouds = tuple(generator.normal(size=(3000, 3)) for _ in range(120))
     motions = {f"column {i}": generator.normal(size=(120, 81, 3)) for i in range(12)}
     faces = np.array([[0, 1, 2]])
-    shown = Shown("f", "fling", "fling_f1", np.arange(120.0), clouds, faces, motions)
+    shown = MotionComparison("f", "fling", "fling_f1", np.arange(120.0), clouds, faces, motions)
     text = player.viewer([shown])
     assert 0.5 * player.BUDGET < len(text) < player.BUDGET + 30_000
 
 
-def test_shown_is_read_back(tmp_path):
-    shown = diverged()
-    save_shown(tmp_path / "shown.npz", shown)
-    read = load_shown(tmp_path / "shown.npz")
-    assert (read.fabric, read.evaluated_on, read.recording) == (
-        "pink_solid", "shaking", "shaking_pink_solid1"
-    )  # fmt: skip
-    assert list(read.motions) == ["a", "b"] and len(read.clouds) == 6
-    for mine, other in zip(
-        [*shown.clouds, *shown.motions.values(), shown.times, shown.faces],
-        [*read.clouds, *read.motions.values(), read.times, read.faces],
-        strict=True,
-    ):
-        np.testing.assert_array_equal(mine, other)
-
-
-def test_what_cannot_be_shown_is_refused(tmp_path, unchecked):
-    shown = made_up_shown()
+def test_what_cannot_be_shown_is_refused(unchecked):
+    shown = made_up_comparison()
     with pytest.raises(ValueError, match="fling_black_denim1: expected a cloud for each of 6"):
         replace(shown, clouds=shown.clouds[:2])
     with pytest.raises(ValueError, match=r"fling_black_denim1, a: expected \(6, vertex, 3\)"):
         replace(shown, motions={"a": shown.motions["a"][:3]})
     with pytest.raises(ValueError, match="the faces name vertex 15"):
         replace(shown, motions={"a": shown.motions["a"][:, :9]})
-    (tmp_path / "damaged.npz").write_bytes(b"PK")
-    with pytest.raises(ValueError, match=r"damaged.npz"):
-        load_shown(tmp_path / "damaged.npz")
-    with pytest.raises(FileNotFoundError, match=r"nowhere.npz"):
-        load_shown(tmp_path / "nowhere.npz")
 
 
 @needs_browser
@@ -166,8 +145,8 @@ def test_in_a_browser(tmp_path, recordings):
     points = np.reshape(found["points"], (-1, 3))
     every = np.concatenate(shown.clouds)
     assert len(points) == len(every)
-    order = lambda x: x[np.lexsort(np.round(x, 3).T)]
-    np.testing.assert_allclose(order(points), order(every), **rounded)
+    points, every = (x[np.lexsort(np.round(x, 3).T)] for x in (points, every))
+    np.testing.assert_allclose(points, every, **rounded)
     assert "b (diverged)" in found["legend"]
     assert found["up"] == ["a", "b", "d", "c"]
     assert found["down"][:2] == ["b", "a"] and set(found["down"][2:]) == {"c", "d"}

@@ -73,7 +73,10 @@ def hung(along, stiffness: float, tension: float):
 
     Its nominal tension is C s (s^2 - 1) / 2 at a stretch s, and grows upwards by the weight below.
     """
-    stretch = lambda t: np.roots([stiffness / 2, 0, -stiffness / 2, -t]).real.max()
+
+    def stretch(t):
+        return np.roots([stiffness / 2, 0, -stiffness / 2, -t]).real.max()
+
     cell = LENGTH / CELLS
     middles = cell * (np.arange(CELLS) + 0.5)
     stretches = [stretch(tension + DENSITY * GRAVITY * (s - LENGTH / 2)) for s in middles]

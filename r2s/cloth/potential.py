@@ -90,11 +90,13 @@ def potential(step: IncrementalPotential, x: Positions) -> Float[Array, ""]:
     return total + contact_energy(step.contacts, step.fabric.thickness, step.rate, x, step.x_anchor)
 
 
+@jax.jit  # so that it is traced once for all uses in a motion and its derivatives
 def residual(step: IncrementalPotential, x: Positions) -> Positions:
     """The derivative [N] of the potential; zero where the forces on every vertex balance."""
     return jax.grad(potential, argnums=1)(step, x)
 
 
+@jax.jit
 def hessian(
     step: IncrementalPotential, x: Positions, hessian_blend: Float[Array, ""] | float = 1.0
 ) -> Blocks:

@@ -1,25 +1,46 @@
-"""What commands share: fabrics by name or card, experiments by name, what is printed."""
+"""What commands share: arguments, fabrics by name or card, experiments by name, printed results."""
 
 import inspect
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import arg
 
 if TYPE_CHECKING:
     from r2s.estimation.cards import Card
-    from r2s.recordings.recording import Recording
     from r2s.scenarios import Experiment
 
-NO_NUMBERS = {"path", "route", "size", "held"}
+NOT_NUMBERS = {"path", "route", "size", "held"}  # parameters of an experiment that are no numbers
 ScenarioName = Literal["lifting", "wind", "stretching", "folding", "fling", "shaking"]
+FabricName = Annotated[
+    str,
+    arg(
+        metavar="PRESET|CARD",
+        help="A preset of `r2s.fabrics.presets`, or the file of a fabric card.",
+    ),
+]
+Motion = Annotated[
+    tuple[str, ...],
+    arg(
+        metavar="NAME=NUMBER",
+        help="Numbers of the motion, such as height=0.3 [m]; num_frames and interval [s], too.",
+    ),
+]
+Shape = Annotated[tuple[int, int], arg(help="Vertices along warp and weft.")]
+SolverName = Annotated[
+    Literal["cloth", "points"], arg(help="The implicit cloth, or material points.")
+]
+Json = Annotated[bool, arg(help="Print one JSON object.")]
 
 
-def card_of(text: str) -> "Card":
-    """The card of a preset, or that in a file.
+def load_card(text: str) -> "Card":
+    """Read the card of a preset, or the card in a file.
 
-    Raises `ValueError` that names the presets for what is neither; as `r2s.estimation.cards.read`.
+    Raises `ValueError` that names the presets when `text` is neither, or that of
+    `r2s.estimation.cards.read`.
     """
     from r2s.estimation import cards
     from r2s.fabrics import presets
@@ -33,8 +54,8 @@ def card_of(text: str) -> "Card":
     return cards.read(text)
 
 
-def numbers_of(motion: Iterable[str]) -> dict[str, float]:
-    """From NAME=NUMBER each; `ValueError` says what was expected."""
+def parse_numbers(motion: Iterable[str]) -> dict[str, float]:
+    """Read texts NAME=NUMBER; raises `ValueError` that says what was expected."""
     found = {}
     for text in motion:
         name, _, value = text.partition("=")
@@ -46,46 +67,28 @@ def numbers_of(motion: Iterable[str]) -> dict[str, float]:
     return found
 
 
-def experiment_of(scenario: str, motion: Iterable[str], **others: Any) -> "Experiment":
-    """An experiment of `r2s.scenarios` with these numbers; `ValueError` names those it takes."""
+def make_experiment(scenario: str, motion: Iterable[str]) -> "Experiment":
+    """Make an experiment of `r2s.scenarios`; `ValueError` names the numbers that it takes."""
     from r2s import scenarios
-    from r2s.scenarios import paths as trajectories
+    from r2s.scenarios import paths
 
     make = scenarios.SIX[scenario]
-    known = {*trajectories.LIMITS[scenario], *inspect.signature(make).parameters} - {
-        "path",
-        "route",
-        "size",
-        "held",
-    }
-    numbers: dict[str, Any] = {**numbers_of(motion), **others}
+    known = {*paths.LIMITS[scenario], *inspect.signature(make).parameters} - NOT_NUMBERS
+    numbers: dict[str, Any] = {**parse_numbers(motion)}
     if unknown := sorted(set(numbers) - known):
         raise ValueError(
             f"{scenario} has no {', '.join(unknown)}; it takes {', '.join(sorted(known))}"
         )
-    for name in {"num_frames"} & set(numbers):
-        numbers[name] = int(numbers[name])
+    if "num_frames" in numbers:
+        numbers["num_frames"] = int(numbers["num_frames"])
     try:
         return make(**numbers)
     except TypeError as error:
         raise ValueError(f"{scenario}: {error}") from None
 
 
-def recordings_of(paths: Sequence[Path]) -> Iterator["Recording"]:
-    """The recordings of NPZ files, of folders of them, or of folders of clouds or images."""
-    from r2s.recordings.recording import load
-    from r2s.viewer.pictures import open_recording
-
-    for path in paths:
-        inside = sorted(path.glob("*.npz")) if path.is_dir() else []
-        if inside and not (path / "manifest.json").exists():
-            yield from map(load, inside)
-        else:
-            yield open_recording(path)
-
-
-def tell(as_json: bool, content: Mapping[str, Any], lines: Iterable[str]) -> None:
-    """Print one JSON object with what is not finite as null, or lines for people."""
+def print_result(as_json: bool, content: Mapping[str, Any], lines: Iterable[str]) -> None:
+    """Print one JSON object, with null for numbers that are not finite, or lines for people."""
     if as_json:
         print(json.dumps(_finite(content), allow_nan=False))
         return

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import arg
 
-from r2s.commands.common import ScenarioName
+from r2s.commands.common import FabricName, Json, Motion, ScenarioName, Shape
 
 if TYPE_CHECKING:
     from r2s.fabrics.fabric import Fabric
@@ -20,6 +20,7 @@ EXTRAS = {
     "data": ("pooch",),
     "cli": ("tyro", "psutil"),
     "physnet": ("skopt", "sklearn"),
+    "pinn": ("flax",),
     "cma": ("cma",),
     "cluster": ("dask", "distributed", "dask_jobqueue"),
     "viz": ("viser",),
@@ -42,73 +43,78 @@ class Doctor:
     """Look at the installation; with a card, a mesh or a scenario, also at those.
 
     Says versions, devices, precision and which extras there are; whether the numbers of a fabric
-    are plausible in their units; whether a mesh is sound; and which time step and how much memory a
-    scenario will take. Exit code 1 when something is wrong.
+    are plausible in their units; whether a mesh is sound; whether the fabric can be simulated in a
+    scenario, and which time step and how much memory that takes. Exit code 1 when something is
+    wrong.
 
         r2s doctor
         r2s doctor --fabric mine.json --scenario folding --shape 17 17
     """
 
-    fabric: Annotated[str, arg(metavar="PRESET|CARD")] = ""
-    """A preset of `r2s.fabrics.presets`, or the file of a fabric card."""
+    fabric: FabricName = ""
     mesh: Annotated[Path | None, arg(metavar="FILE")] = None
     """A flat triangle mesh in metres, as OBJ, PLY or STL."""
     scenario: Annotated[ScenarioName | None, arg(metavar="SCENARIO")] = None
     """Of the study."""
-    motion: Annotated[tuple[str, ...], arg(metavar="NAME=NUMBER")] = ()
-    """Numbers of the motion, such as height=0.3 [m]."""
-    shape: tuple[int, int] = (9, 9)
-    """Vertices along warp and weft."""
-    json: bool = False
-    """Print one JSON object."""
+    motion: Motion = ()
+    shape: Shape = (9, 9)
+    json: Json = False
 
     def run(self) -> int:
-        from r2s.commands.common import card_of, tell
+        from r2s.commands.common import load_card, print_result
 
-        told, lines, wrong = installation()
+        result, lines, wrong = installation()
         if self.fabric:
-            card = card_of(self.fabric)
+            card = load_card(self.fabric)
             found = list(implausible(card.fabric))
             wrong += [f"{card.name}: {text}" for text in found]
             lines.append(f"fabric {card.name}: {'see below' if found else 'plausible'}")
-            told["fabric"] = {"name": card.name, "implausible": found}
+            result["fabric"] = {"name": card.name, "implausible": found}
         if self.mesh is not None:
-            told["mesh"], text = _mesh(self.mesh)
+            result["mesh"], text = _mesh(self.mesh)
             lines.append(text)
         if self.scenario is not None:
-            told["scenario"], more = self._scenario()
+            result["scenario"], more = self._scenario(self.scenario)
             lines += more
-        told["wrong"] = wrong
-        tell(self.json, told, [*lines, *(f"WRONG: {text}" for text in wrong)])
+            if failure := result["scenario"]["failure"]:
+                wrong.append(f"scenario {self.scenario}: the simulation {failure}")
+        result["wrong"] = wrong
+        print_result(self.json, result, [*lines, *(f"WRONG: {text}" for text in wrong)])
         return 1 if wrong else 0
 
-    def _scenario(self) -> tuple[dict[str, Any], list[str]]:
+    def _scenario(self, name: str) -> tuple[dict[str, Any], list[str]]:
+        import equinox as eqx
         import jax
         import jax.numpy as jnp
 
-        from r2s.commands.common import card_of, experiment_of
+        from r2s.commands.common import load_card, make_experiment
         from r2s.scenarios import material_points
         from r2s.scenarios.scenario import rollout
         from r2s.solver import predicted_memory
 
-        fabric = card_of(self.fabric or "grey_interlock").fabric
-        scenario = experiment_of(str(self.scenario), self.motion).scenario(self.shape)
+        fabric = load_card(self.fabric or "grey_interlock").fabric
+        scenario = make_experiment(name, self.motion).scenario(self.shape)
         points = material_points(scenario, fabric)
-        loss = lambda fabric: jnp.mean(rollout(scenario, fabric).x ** 2)
-        gradient = jax.value_and_grad(loss)
-        memory = [predicted_memory(each, fabric) for each in (loss, gradient)]
+
+        def loss(fabric):
+            return jnp.mean(rollout(scenario, fabric).x ** 2)
+
+        memory = predicted_memory(loss, fabric)
+        gradient_memory = predicted_memory(jax.value_and_grad(loss), fabric)
         step = scenario.interval / scenario.substeps
-        told = {
-            "frames": scenario.num_frames + scenario.lead_in,
+        frames = scenario.num_frames + scenario.lead_in
+        result = {
+            "frames": frames,
             "step_s": step,
-            "steps": (scenario.num_frames + scenario.lead_in - 1) * scenario.substeps,
+            "steps": (frames - 1) * scenario.substeps,
             "points_step_s": points.dt,
-            "memory_bytes": memory[0],
-            "gradient_memory_bytes": memory[1],
+            "memory_bytes": memory,
+            "gradient_memory_bytes": gradient_memory,
+            "failure": eqx.filter_jit(rollout)(scenario, fabric).explain() or None,
         }
-        return told, [
-            f"scenario {self.scenario}: {told['steps']} steps of {1e3 * step:.1f} ms, "
-            f"{memory[0] / 1e6:.1f} MB, with its gradient {memory[1] / 1e6:.1f} MB",
+        return result, [
+            f"scenario {name}: {result['steps']} steps of {1e3 * step:.1f} ms, "
+            f"{memory / 1e6:.1f} MB, with its gradient {gradient_memory / 1e6:.1f} MB",
             f"    on material points: steps of {1e3 * points.dt:.3f} ms",
         ]
 
@@ -141,64 +147,57 @@ def installation() -> tuple[dict[str, Any], list[str], list[str]]:
     wrong = []
     if jax.__version__ in EXCLUDED:
         wrong.append(f"jax {jax.__version__} ({EXCLUDED[jax.__version__]}): install another one")
-    told = {"versions": versions, "devices": devices, "x64": x64, "missing": missing}
-    return told, lines, wrong
+    result = {"versions": versions, "devices": devices, "x64": x64, "missing": missing}
+    return result, lines, wrong
 
 
 def implausible(fabric: "Fabric") -> Iterator[str]:
-    """What numbers of a fabric are hardly in their units, one line each."""
+    """Say which numbers of a fabric are hardly in their units, one line each."""
     import numpy as np
 
     from r2s.export.stiffness import bending_stiffness, membrane_stiffness
 
-    for name, (low, high, unit, what) in PLAUSIBLE.items():
-        value = float(getattr(fabric, name))
-        if not low <= value <= high:
-            yield f"{name} is {value:g} {unit}, expected {low:g} to {high:g} ({what})"
     matrix = membrane_stiffness(fabric)
-    low, high, unit, what = STIFF
+    numbers = [(name, float(getattr(fabric, name)), limits) for name, limits in PLAUSIBLE.items()]
     for name, value in zip(("C11", "C22", "C33"), np.diag(matrix).tolist(), strict=True):
+        numbers.append((name, value, STIFF))
+    bending = bending_stiffness(fabric).items()
+    numbers += [(f"bending ({name})", value, BENDS) for name, value in bending if value]
+    for name, value, (low, high, unit, what) in numbers:
         if not low <= value <= high:
             yield f"{name} is {value:g} {unit}, expected {low:g} to {high:g} ({what})"
     if not np.all(np.linalg.eigvalsh(matrix) > 0):
         yield "the membrane has a negative stiffness: C12^2 must be less than C11 C22"
-    low, high, unit, what = BENDS
-    for name, value in bending_stiffness(fabric).items():
-        if value and not low <= value <= high:
-            yield f"bending ({name}) is {value:g} {unit}, expected {low:g} to {high:g} ({what})"
-            break
 
 
 def _mesh(path: Path) -> tuple[dict[str, Any], str]:
     import numpy as np
 
+    from r2s.extras import require
     from r2s.geometry.mesh import Mesh
 
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ImportError("mesh files need trimesh: pip install 'r2s[study]'") from error
+    trimesh = require("trimesh", "study", "mesh files")
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such mesh")
     loaded: Any = trimesh.load(path, process=False, force="mesh")
     places, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
-    spread = np.ptp(places, axis=0)
-    flat = int(np.argmin(spread))
-    if spread[flat] > 1e-6 * spread.max():
-        raise ValueError(f"{path}: a rest shape must lie in a plane, it extends over {spread} m")
+    extent = np.ptp(places, axis=0)
+    flat = int(np.argmin(extent))
+    if extent[flat] > 1e-6 * extent.max():
+        raise ValueError(f"{path}: a rest shape must lie in a plane, it extends over {extent} m")
     try:
         mesh = Mesh.make(np.delete(places, flat, axis=1), faces)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     corners = np.asarray(mesh.rest)[np.asarray(mesh.faces)]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
-    told = {
+    result = {
         "vertices": len(places),
         "faces": len(faces),
         "area_m2": float(np.sum(np.asarray(mesh.area))),
         "shortest_edge_m": float(edges.min()),
         "longest_edge_m": float(edges.max()),
     }
-    size = f"{told['vertices']} vertices, {told['faces']} faces, {told['area_m2']:.4g} m^2"
+    size = f"{result['vertices']} vertices, {result['faces']} faces, {result['area_m2']:.4g} m^2"
     edge = f"edges {1e3 * edges.min():.2f} to {1e3 * edges.max():.2f} mm"
-    return told, f"mesh {path.name}: sound; {size}, {edge}"
+    return result, f"mesh {path.name}: sound; {size}, {edge}"

@@ -78,12 +78,13 @@ class EstimateCard:
     def run(self) -> int:
         import jax
 
-        from r2s.commands.common import recordings_of, tell
+        from r2s.commands.common import print_result
         from r2s.estimation import cards
         from r2s.estimation.estimate import describe
         from r2s.estimation.method import default_space
+        from r2s.recordings.open import open_recordings
 
-        seen = list(recordings_of(self.recordings))
+        seen = list(open_recordings(self.recordings))
         if not seen:
             raise ValueError("no recording: name an NPZ, or a folder that holds some")
         with _bar() as progress:
@@ -102,7 +103,9 @@ class EstimateCard:
         card = cards.Card.make(self.name or seen[0].info.fabric, estimate, provenance)
         cards.write(self.out, card)
         self._progress_file.unlink(missing_ok=True)
-        tell(self.json, cards.as_json(card), [*describe(estimate), f"{self.out}: {card.name}"])
+        print_result(
+            self.json, cards.as_json(card), [*describe(estimate), f"{self.out}: {card.name}"]
+        )
         return 0
 
     @property

@@ -1,10 +1,13 @@
 """`r2s evaluate`: how well a card predicts recordings."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
+
+from r2s.commands.common import FabricName, Json
 
 
 @dataclass(frozen=True)
@@ -18,35 +21,40 @@ class Evaluate:
         r2s evaluate grey_interlock recordings/fold_tan --json
     """
 
-    fabric: Annotated[Positional[str], arg(metavar="PRESET|CARD")]
-    """A preset of `r2s.fabrics.presets`, or the file of a fabric card."""
+    fabric: Positional[FabricName]
     recordings: Annotated[Positional[tuple[Path, ...]], arg(metavar="RECORDING")]
     """NPZ, or folders."""
-    json: bool = False
-    """Print one JSON object."""
+    json: Json = False
 
     def run(self) -> int:
-        import math
+        import equinox as eqx
 
-        from r2s.commands.common import card_of, recordings_of, tell
+        from r2s.commands.common import load_card, print_result
         from r2s.evaluation import prediction_error
+        from r2s.recordings.open import open_recordings
+        from r2s.scenarios.scenario import from_recording, rollout
 
-        card, found = card_of(self.fabric), {}
-        for recording in recordings_of(self.recordings):
+        card, found, failures, lines = load_card(self.fabric), {}, {}, []
+        for recording in open_recordings(self.recordings):
             x = prediction_error.predict(recording, card.fabric)
-            found[recording.info.name] = prediction_error.against_motion(recording, x)
+            metrics = prediction_error.against_motion(recording, x)
+            name = recording.info.name
+            found[name] = metrics
+            lines += [f"{name}:", *(_line(metric, value) for metric, value in metrics.items())]
+            if math.isnan(metrics["chamfer_real_to_sim"]):
+                motion = eqx.filter_jit(rollout)(from_recording(recording), card.fabric)
+                failures[name] = motion.explain()
+                lines.append(f"    the simulation {failures[name]}")
         if not found:
             raise ValueError("no recording: name an NPZ, or a folder that holds some")
-        lines, diverged = [], []
-        for name, metrics in found.items():
-            lines.append(f"{name}:")
-            for metric, value in metrics.items():
-                unit = prediction_error.UNITS.get(metric, "m")
-                text = f"{value:.4f}" if unit == "-" else f"{1e3 * value:.2f} mm"
-                lines.append(f"    {metric:32s}{text:>12s}")
-            if math.isnan(metrics["chamfer_real_to_sim"]):
-                diverged.append(name)
-                lines.append("    the simulation diverged")
         units = {name: prediction_error.UNITS.get(name, "m") for name in next(iter(found.values()))}
-        tell(self.json, {"fabric": card.name, "units": units, "recordings": found}, lines)
-        return 1 if diverged else 0
+        result = {"fabric": card.name, "units": units, "recordings": found, "failures": failures}
+        print_result(self.json, result, lines)
+        return 1 if failures else 0
+
+
+def _line(metric: str, value: float) -> str:
+    from r2s.evaluation.prediction_error import UNITS
+
+    text = f"{value:.4f}" if UNITS.get(metric) == "-" else f"{1e3 * value:.2f} mm"
+    return f"    {metric:32s}{text:>12s}"

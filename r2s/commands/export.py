@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from r2s.commands.common import FabricName, Json, Shape
+
 if TYPE_CHECKING:
     from r2s.export import Loss
     from r2s.fabrics.fabric import Fabric
@@ -17,33 +19,30 @@ class Export:
 
     mujoco: a model (MJCF) of a sheet; newton: arguments of add_cloth_mesh and add_spring (JSON);
     arcsim: a material file (JSON); pybullet: arguments of loadSoftBody (JSON). MuJoCo and Newton
-    get springs along the yarns, unless --isotropic. The sheet is a grid as of `r2s simulate`.
+    get springs along the yarns, unless --isotropic. The sheet is a grid as in `r2s simulate`.
 
         r2s export denim.json --to mujoco --size 0.3 0.3 --shape 17 17 --out sheet.xml
         r2s export black_denim --to arcsim --out material.json
     """
 
-    fabric: Annotated[Positional[str], arg(metavar="PRESET|CARD")]
-    """A preset of `r2s.fabrics.presets`, or the file of a fabric card."""
+    fabric: Positional[FabricName]
     to: Literal["mujoco", "newton", "newton-vbd", "arcsim", "pybullet"]
     """The simulator."""
     out: Annotated[Path, arg(metavar="FILE")]
     """What is written."""
     size: tuple[float, float] = (0.3, 0.3)
     """Of the sheet, warp and weft [m]; stiffness of edges depends on the mesh."""
-    shape: tuple[int, int] = (9, 9)
-    """Its vertices along warp and weft."""
+    shape: Shape = (9, 9)
     isotropic: bool = False
     """The nearest isotropic sheet alone."""
-    json: bool = False
-    """Print what is lost as one JSON object."""
+    json: Json = False
 
     def run(self) -> int:
-        from r2s.commands.common import card_of, tell
+        from r2s.commands.common import load_card, print_result
 
-        card = card_of(self.fabric)
+        card = load_card(self.fabric)
         loss = self._write(card.fabric, card.name)
-        told = {
+        result = {
             "fabric": card.name,
             "to": self.to,
             "out": str(self.out),
@@ -55,7 +54,7 @@ class Export:
             errors = getattr(loss, part).items()
             if errors:
                 lines.append(f"{part}: " + ", ".join(f"{name} {e:+.1%}" for name, e in errors))
-        tell(self.json, told, [*lines, *(f"lost: {text}" for text in loss.lost)])
+        print_result(self.json, result, [*lines, *(f"lost: {text}" for text in loss.lost)])
         return 0
 
     def _write(self, fabric: "Fabric", name: str) -> "Loss":

@@ -16,13 +16,13 @@ class Study:
 
         r2s study --out results --workers 2
         r2s study --data recordings --density 0.2 --out results
-        r2s study --preset paper --column diffcloud-cloth-lifting --repeats 4 --slurm 16 --out paper
+        r2s study --preset paper --configuration diffcloud-cloth-lifting --slurm 16 --out paper
     """
 
     out: Annotated[Path, arg(metavar="FOLDER")]
     """Where report, tables, pictures and cells go."""
     preset: Literal["small", "paper", "full"] = "small"
-    """Which columns and fabrics, and how many motions."""
+    """Which configurations and fabrics, and how many motions."""
     data: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Recordings with their manifest; synthetic ones without."""
     density: float = 0.15
@@ -31,7 +31,11 @@ class Study:
     """The tables of Ru et al. 2025, to set beside ours."""
     materials: Annotated[str, arg(metavar="FOLDER")] = ""
     """Measured tables to make recordings with, FABRIC.json (ARCSim)."""
-    columns: Annotated[tuple[str, ...], arg(name="column", metavar="COLUMN"), UseAppendAction] = ()
+    configurations: Annotated[
+        tuple[str, ...],
+        arg(name="configuration", aliases=("--column",), metavar="CONFIGURATION"),
+        UseAppendAction,
+    ] = ()
     """Such as diffcloud-cloth-lifting, instead of the preset's; may be given several times."""
     fabrics: Annotated[tuple[str, ...], arg(name="fabric", metavar="PRESET"), UseAppendAction] = ()
     """Instead of the preset's; may be given several times."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from r2s.commands.common import ScenarioName
+from r2s.commands.common import Motion, ScenarioName, Shape
 
 if TYPE_CHECKING:
     from r2s.estimation.cards import Card
@@ -33,10 +33,8 @@ class View:
     """NPZ, or folder of frames."""
     scenario: Annotated[ScenarioName, arg(metavar="SCENARIO")] = "lifting"
     """Without a recording: of the study."""
-    motion: Annotated[tuple[str, ...], arg(metavar="NAME=NUMBER")] = ()
-    """Numbers of that motion, such as height=0.3 [m]."""
-    shape: tuple[int, int] = (9, 9)
-    """Vertices along warp and weft."""
+    motion: Motion = ()
+    shape: Shape = (9, 9)
     save: Annotated[Path | None, arg(metavar="FILE")] = None
     """Card that a button writes, with the fabric as shown."""
     host: str = "127.0.0.1"
@@ -46,14 +44,14 @@ class View:
     def run(self) -> None:
         import time
 
-        from r2s.commands.common import card_of
+        from r2s.commands.common import load_card
         from r2s.fabrics.parameters import OrthotropicSpace
         from r2s.viewer.page import Page
         from r2s.viewer.subject import place
 
-        card = card_of(self.fabric)
+        card = load_card(self.fabric)
         subject = self._subject(OrthotropicSpace.make(float(card.fabric.density)))
-        save = None if self.save is None else lambda fabric: self._saved(card, fabric)
+        save = None if self.save is None else lambda fabric: self._save_card(card, fabric)
         start = place(subject, card.fabric)
         page = Page(subject, start, save=save, host=self.host, port=self.port)
         print(f"{page.url} (Ctrl-C ends)", flush=True)
@@ -64,21 +62,21 @@ class View:
             page.close()
 
     def _subject(self, space: "ParameterSpace") -> "Subject":
-        from r2s.commands.common import experiment_of
-        from r2s.viewer.pictures import open_recording
+        from r2s.commands.common import make_experiment
+        from r2s.recordings.open import open_recording
         from r2s.viewer.subject import of_experiment, of_recording
 
         if self.recording is None:
-            return of_experiment(experiment_of(self.scenario, self.motion), space, self.shape)
+            return of_experiment(make_experiment(self.scenario, self.motion), space, self.shape)
         if self.motion:
             raise ValueError("--motion is of a scenario: a recording has its own motion")
         return of_recording(open_recording(self.recording), space, self.shape)
 
-    def _saved(self, card: "Card", fabric: "Fabric") -> str:
+    def _save_card(self, card: "Card", fabric: "Fabric") -> str:
         from r2s.estimation import cards
 
         assert self.save is not None
         method = f"set by hand with sliders, from {card.name}"
-        about = cards.Provenance(method, assumed=("density", "thickness", "mass_damping"))
-        cards.write(self.save, cards.Card.make(self.save.stem, fabric, about))
+        origin = cards.Provenance(method, assumed=("density", "thickness", "mass_damping"))
+        cards.write(self.save, cards.Card.make(self.save.stem, fabric, origin))
         return f"{self.save}"

@@ -3,4 +3,5 @@
 - `metrics`: Chamfer and Hausdorff distance. `losses`: differentiable distances.
 - `prediction_error`: the figures of a predicted motion. `placement`: where a recording lies
   nearest.
+- `statistics`: intervals and tests for such figures.
 """

@@ -35,11 +35,15 @@ def moved(place: Placement, cloud: Cloud) -> Cloud:
 
 
 def nearest(real: Sequence[Cloud], simulated: Sequence[Cloud], seed: int = 0) -> Placement:
-    """The placement of a recording's frames, one for all, that brings them nearest to a motion's.
+    """The one placement of all frames of a recording that brings them nearest to a motion's.
 
-    From the recording to the motion, at most `FARTHEST` [m] along each axis and `TURN` [rad]; with
-    distances squared, but beyond `OUTLIER` [m] (soft L1). `seed`: of the points that are drawn.
-    Raises `ValueError` for another number of frames, and for one that is empty or not finite.
+    - `real`, `simulated`: the clouds of their frames, [m].
+    - `seed`: of the `POINTS` that are drawn.
+
+    The placement moves at most `FARTHEST` [m] along each axis, and turns at most `TURN` [rad].
+    Distances go from the recording to the motion; they count squared, but less beyond `OUTLIER`
+    (soft L1). Raises `ValueError` for another number of frames, and for one that is empty or not
+    finite.
     """
     if len(real) != len(simulated):
         raise ValueError(f"{len(real)} recorded frames, {len(simulated)} simulated ones")
@@ -48,8 +52,8 @@ def nearest(real: Sequence[Cloud], simulated: Sequence[Cloud], seed: int = 0) ->
             if not len(cloud) or not np.all(np.isfinite(cloud)):
                 raise ValueError(f"{name} frame {frame} is empty, or not finite")
     random = np.random.default_rng(seed)
-    thin = lambda cloud: cloud[random.permutation(len(cloud))[:POINTS]]
-    frames = [thin(np.asarray(cloud, float)) for cloud in real]
+    clouds = [np.asarray(cloud, float) for cloud in real]
+    frames = [cloud[random.permutation(len(cloud))[:POINTS]] for cloud in clouds]
     trees = [KDTree(cloud) for cloud in simulated]
     pivot = np.mean(np.concatenate(frames), axis=0)
     bounds = np.array([FARTHEST, FARTHEST, FARTHEST, TURN])

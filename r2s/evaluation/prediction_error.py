@@ -1,5 +1,7 @@
 """How well a fabric predicts a recorded motion: the figures of the results table."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -9,19 +11,33 @@ from r2s.evaluation import metrics
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.surface import sample
 from r2s.recordings.recording import Recording, cloud
-from r2s.scenarios.scenario import from_recording, rollout
+from r2s.scenarios.scenario import Scenario, from_recording, rollout
+from r2s.solver import Solver
 
 SAMPLES = 9  # squared, on each face: 10,368 points on 128 faces, the study's 10,000
 UNITS = {"paper_chamfer": "-", "paper_hausdorff": "-"}  # all others are in metres
 
-_motion = eqx.filter_jit(rollout)  # compiled once for all recordings of as many frames and knots
+_rollout = eqx.filter_jit(rollout)  # compiled once for all recordings of as many frames and knots
 _sample = eqx.filter_jit(eqx.filter_vmap(sample, in_axes=(0, None, None)))
+
+
+class Motion(NamedTuple):
+    """Positions [m], NaN from where the run diverged, and why it did; "" where it did not."""
+
+    x: Float[np.ndarray, "frame vertex 3"]
+    failure: str
 
 
 def predict(recording: Recording, fabric: Fabric) -> Float[np.ndarray, "frame vertex 3"]:
     """Positions [m] of a fabric in the motion of a recording; NaN from where it diverged."""
-    moved = _motion(from_recording(recording), fabric)
-    return np.where(np.asarray(moved.ok)[:, None, None], np.asarray(moved.x), np.nan)
+    return predict_motion(from_recording(recording), fabric).x
+
+
+def predict_motion(scenario: Scenario, fabric: Fabric, solver: Solver | None = None) -> Motion:
+    """The motion of a fabric in a scenario; by the cloth unless another solver is given."""
+    moved = _rollout(scenario, fabric, solver=solver)
+    ok = np.logical_and.accumulate(np.asarray(moved.ok))[:, None, None]
+    return Motion(np.where(ok, np.asarray(moved.x), np.nan), moved.explain())
 
 
 def against_motion(
@@ -30,10 +46,13 @@ def against_motion(
     every: int = 1,
     crop: bool = True,
 ) -> dict[str, float]:
-    """Metrics of a motion against a recording, mean over those frames that count (3: every third).
+    """Metrics of a motion against a recording, means over the frames that count.
 
-    All NaN when the motion diverged in them: that is a result, too. Without `crop` those metrics
-    are left out that leave out what lies below the recording, see `_frame`.
+    - `x`: the positions of the motion, [m].
+    - `every`: 1 compares all frames that count, 3 every third.
+    - `crop`: whether to add the metrics that leave out what lies below the recording, see `_frame`.
+
+    All metrics are NaN when the motion diverged in these frames.
     """
     first, last = recording.info.frames_used
     faces = from_recording(recording).scene.mesh.faces

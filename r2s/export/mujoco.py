@@ -42,7 +42,8 @@ class Elasticity(NamedTuple):
 
 
 def elasticity(fabric: Fabric, mesh: Mesh, modulus: float, poisson: float) -> Elasticity:
-    """Of a sheet of E h [N/m] and Poisson's ratio [-], with a fabric's bending and damping."""
+    """Elasticity of a sheet with E h `modulus` [N/m], Poisson's ratio, and a fabric's bending and
+    damping."""
     near, bending = stiffness.isotropic(modulus, poisson), stiffness.hinge_stiffness(fabric, mesh)
     damping = float(fabric.damping)
     if not bending:
@@ -57,7 +58,7 @@ def flexcomp(
 ) -> tuple[str, Loss]:
     """The `<flexcomp>` of a sheet, flat at z = 0 in its parent body, and what is lost.
 
-    Of the nearest isotropic sheet, on r2s's mesh; `held` vertices belong to the parent. Raises
+    It is the nearest isotropic sheet, on r2s's mesh; `held` vertices belong to the parent. Raises
     `ValueError` for a batch, and for a membrane without positive stiffness.
     """
     stiffness.one(fabric)
@@ -180,10 +181,10 @@ def _tendons(mesh: Mesh, warp: float, weft: float, damping: float) -> str:
 
 def _loss(fabric: Fabric, mesh: Mesh, own: Stiffness, near: Stiffness, lost) -> Loss:
     bending = stiffness.hinge_stiffness(fabric, mesh)
-    shown = stiffness.hinged(mesh, bending) if bending else {}
+    hinges = stiffness.hinged(mesh, bending) if bending else {}
     return Loss(
         stiffness.errors(stiffness.probes(near), stiffness.probes(own)),
-        stiffness.errors(shown, stiffness.bending_stiffness(fabric)) if bending else {},
+        stiffness.errors(hinges, stiffness.bending_stiffness(fabric)) if bending else {},
         (*stiffness.softening(fabric), *lost),
     )
 

@@ -53,10 +53,13 @@ class Cloth(NamedTuple):
 def cloth(
     fabric: Fabric, mesh: Mesh, kind: Kind = "semi_implicit", *, yarns: bool = True
 ) -> tuple[Cloth, Loss]:
-    """What makes a fabric in Newton, and what is lost.
+    """Arguments that make a fabric in Newton, and what is lost.
 
-    `kind`: the solver. `yarns`: springs along warp and weft, for a mesh such as `r2s.rectangle`;
-    without, the nearest isotropic sheet. Raises `ValueError` for a batch, for a membrane without
+    - `kind`: the solver.
+    - `yarns`: springs along warp and weft, for a mesh such as `r2s.rectangle`; without, the nearest
+      isotropic sheet.
+
+    Raises `ValueError` for a batch, for a membrane without
     positive stiffness, and for a mesh that has no yarns.
     """
     stiffness.one(fabric)
@@ -70,10 +73,10 @@ def cloth(
         along = None
         sheet = near = stiffness.isotropic(*stiffness.nearest_isotropic(own))
     lost += (RIGID,) if float(fabric.mass_damping) else ()
-    shown = stiffness.hinged(mesh, stiffness.hinge_stiffness(fabric, mesh))
+    hinges = stiffness.hinged(mesh, stiffness.hinge_stiffness(fabric, mesh))
     loss = Loss(
         stiffness.errors(stiffness.probes(near), stiffness.probes(own)),
-        stiffness.errors(shown, stiffness.bending_stiffness(fabric)),
+        stiffness.errors(hinges, stiffness.bending_stiffness(fabric)),
         lost,
     )
     contact = {"soft_contact_mu": float(fabric.friction)}
@@ -108,9 +111,13 @@ def spring_arguments(found: Springs, damping: float) -> list[dict[str, Any]]:
 def edge_factors(
     length: np.ndarray, area: np.ndarray, kind: Kind, bending: float, damping: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`edge_ke` and `edge_kd` of edges, from their length [m] and their two triangles' area [m^2].
+    """`edge_ke` and `edge_kd` of hinges.
 
-    Of hinges with a bending stiffness [N m] and a damping time [s].
+    - `length`: of their edges, [m].
+    - `area`: of the two triangles of each, [m^2].
+    - `kind`: the solver.
+    - `bending`: stiffness, [N m].
+    - `damping`: time, [s].
     """
     moment = bending * length / area
     if kind == "vbd":
@@ -121,7 +128,7 @@ def edge_factors(
 def set_edges(model: Any, fabric: Fabric, mesh: Mesh, kind: Kind) -> None:
     """Give every edge of a finished model, of this cloth alone, its own bending stiffness.
 
-    `fabric`, `mesh`, `kind` as of `cloth`.
+    For `fabric`, `mesh` and `kind` see `cloth`.
     """
     indices = model.edge_indices.numpy()  # opposite, opposite, start, end
     places = model.particle_q.numpy().astype(np.float64)

@@ -30,7 +30,7 @@ def soft_body(fabric: Fabric, mesh: Mesh) -> tuple[dict[str, float | int], Loss]
     own = stiffness.probes(stiffness.membrane_stiffness(fabric))
     if not min(own.values()) > 0:
         raise ValueError(f"the membrane has no positive stiffness in every probe: {own}")
-    unit = stiffness.probes(of_springs(mesh))
+    unit = stiffness.probes(spring_stiffness(mesh))
     spring = float(np.exp(np.mean([np.log(own[name] / unit[name]) for name in own])))
     lost = (*stiffness.softening(fabric), CAUCHY, NO_BENDING, MASSES)
     lost += (RIGID,) if float(fabric.mass_damping) else ()
@@ -49,7 +49,7 @@ def soft_body(fabric: Fabric, mesh: Mesh) -> tuple[dict[str, float | int], Loss]
     return arguments, Loss(stiffness.errors(exported, own), {}, lost)
 
 
-def of_springs(mesh: Mesh) -> Stiffness:
+def spring_stiffness(mesh: Mesh) -> Stiffness:
     """The membrane stiffness [-] of a mesh whose edges are springs of 1 N/m."""
     rest, faces = np.asarray(mesh.rest, np.float64), np.asarray(mesh.faces)
     pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)

@@ -121,17 +121,19 @@ def hinge_stiffness(fabric: Fabric, mesh: Mesh) -> float:
     own = bending_stiffness(fabric)
     if min(own.values()) <= 0:
         return 0.0
-    shown = hinged(mesh, 1.0)
-    return float(np.exp(np.mean([np.log(own[name] / shown[name]) for name in own])))
+    unit = hinged(mesh, 1.0)
+    return float(np.exp(np.mean([np.log(own[name] / unit[name]) for name in own])))
 
 
 def errors(exported: dict[str, float], own: dict[str, float]) -> dict[str, float]:
-    """Of each probe, relative; those are left out in which the fabric has no stiffness."""
+    """Relative error of each probe in which the fabric has a stiffness."""
     return {name: exported[name] / own[name] - 1 for name in own if own[name] > 0}
 
 
 def hinged(mesh: Mesh, stiffness: float) -> dict[str, float]:
-    """What a mesh of hinges of a stiffness [N m] shows in a cylinder along each direction, [N m].
+    """Bending stiffness [N m] of a mesh of hinges, bent to a cylinder along each direction.
+
+    `stiffness`: of the hinges, [N m].
 
     Along the lines of a grid that is `stiffness`; across its diagonals it is more (see
     `r2s.laws.bending`), and in part three times as much where all diagonals are parallel.

@@ -64,19 +64,19 @@ def _nearest(
 ) -> Split:
     own, scale = probes(stiffness), start[0]
 
-    def made(parameters: np.ndarray) -> Split:
+    def split_of(parameters: np.ndarray) -> Split:
         modulus, ratio, *along = parameters.tolist()
         kept = [k if k > NEGLIGIBLE else 0.0 for k in along]
         return Split(float(scale * np.exp(modulus)), ratio, scale * kept[0], scale * kept[1])
 
     def residuals(parameters: np.ndarray) -> np.ndarray:
-        found = probes(together(made(parameters)))
+        found = probes(together(split_of(parameters)))
         return np.log([found[name] / own[name] for name in own])
 
     bounds = [-5.0, poisson[0], 0.0, 0.0], [5.0, poisson[1], 100.0, 100.0]
     middle = [0.0, np.clip(start[1], poisson[0] + 1e-3, poisson[1] - 1e-3), 0.1, 0.1]
     found = least_squares(residuals, middle, bounds=bounds)
-    return made(found.x)
+    return split_of(found.x)
 
 
 def together(parts: Split) -> Stiffness:
@@ -85,7 +85,7 @@ def together(parts: Split) -> Stiffness:
 
 
 def springs(mesh: Mesh, warp: float, weft: float) -> Springs:
-    """The springs of a mesh; `warp`, `weft` [N/m] as of `Split`.
+    """The springs of a mesh; for `warp` and `weft` [N/m] see `Split`.
 
     Each of its triangles must have an edge along the warp and one along the weft. An edge stands
     for a strip as wide as its triangles, so that those of the border are half as stiff. Raises

@@ -1,9 +1,6 @@
-"""Solids: the stress of a piece of material from its deformation gradient, in 2-D and 3-D.
+"""Laws of solids: the stress from the deformation gradient F, in 3-D and in 2-D (plane strain).
 
-A law is a pytree of parameters with three methods, of one deformation gradient F (axis, axis):
-`energy_density` [J/m^3], its Kirchhoff stress `kirchhoff` = dE/dF F^T [Pa], both per volume at
-rest, and `modulus` [Pa], the largest eigenvalue of its elasticity at rest, which limits the step.
-In 2-D a law is that of plane strain.
+A law (`SolidLaw`) is a pytree of parameters with methods of one particle.
 """
 
 from collections.abc import Callable
@@ -24,36 +21,40 @@ POLAR_ITERATIONS = 6  # of Newton in 3-D: to rounding for principal stretches up
 
 @runtime_checkable
 class SolidLaw(Protocol):
-    """What the material point method asks of a law."""
+    """The methods that the material point method calls."""
 
     def energy_density(self, deformation: Matrix) -> Float[Array, ""]:
         """Energy per rest volume [J/m^3] at a deformation gradient [-]."""
         ...
 
     def kirchhoff(self, deformation: Matrix) -> Matrix:
-        """Kirchhoff stress [Pa], the derivative of the energy times F^T."""
+        """Kirchhoff stress dE/dF F^T [Pa]."""
+        ...
+
+    def viscous(self, rate: Matrix) -> Matrix:
+        """Viscous stress over the damping time [Pa/s] at a velocity gradient [1/s]."""
         ...
 
     def modulus(self, dimension: int) -> Float[Array, ""]:
-        """The largest eigenvalue of the elasticity tensor at rest [Pa]."""
+        """The largest eigenvalue of the elasticity tensor at rest [Pa], which limits the step."""
         ...
 
 
 def lame(young: Scalar, poisson: Scalar) -> tuple[Scalar, Scalar]:
-    """Lame's mu and lambda [Pa], from Young's modulus [Pa] and Poisson's ratio [-]."""
+    """Lame's constants mu and lambda [Pa] from Young's modulus [Pa] and Poisson's ratio [-]."""
     mu = young / (2 * (1 + poisson))
     return mu, young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
 
 class _Isotropic(eqx.Module):
-    """- `mu`, `lam`: Lame's constants, [Pa]."""
+    """An isotropic law with Lame's constants `mu` and `lam` [Pa]."""
 
     mu: Float[Array, "*batch"]
     lam: Float[Array, "*batch"]
 
     @classmethod
     def make(cls, young: Scalar, poisson: Scalar):
-        """From Young's modulus [Pa] and Poisson's ratio [-], numbers or traced.
+        """A law from Young's modulus [Pa] and Poisson's ratio [-].
 
         Raises `ValueError` when one is out of its physical range, unless it is traced.
         """
@@ -66,11 +67,11 @@ class _Isotropic(eqx.Module):
         return cls(jnp.asarray(mu, float), jnp.asarray(lam, float))
 
     def modulus(self, dimension: int) -> Float[Array, ""]:
-        """The largest eigenvalue of the elasticity tensor at rest [Pa]: of a change of volume."""
+        """The largest eigenvalue of the elasticity tensor at rest [Pa], that of dilation."""
         return jnp.maximum(dimension * self.lam, 0) + 2 * self.mu
 
     def viscous(self, rate: Matrix) -> Matrix:
-        """The stress [Pa/s] of a rate of strain, from the velocity gradient [1/s]."""
+        """Viscous stress over the damping time [Pa/s] at a velocity gradient [1/s]."""
         symmetric = (rate + rate.T) / 2
         return 2 * self.mu * symmetric + self.lam * jnp.trace(rate) * _identity(rate)
 
@@ -121,10 +122,10 @@ class LinearSolid(_Isotropic):
 
 
 class Solid(eqx.Module):
-    """What a solid body is made of: what an estimator estimates, as `r2s.Fabric` is for a sheet.
+    """The material of a solid body, as `r2s.Fabric` is that of a sheet.
 
-    - `law`: any `SolidLaw` [Pa].
-    - `density`: [kg/m^3]; in 2-D of a body of 1 m depth.
+    - `law`: any `SolidLaw`.
+    - `density`: mass per volume at rest, [kg/m^3]; in 2-D of a body of 1 m depth.
     - `damping`: stiffness-proportional (Kelvin-Voigt) damping time, [s].
     - `friction`: Coulomb coefficient against the table, [-].
     - `mass_damping`: mass-proportional damping rate, [1/s].
@@ -145,7 +146,7 @@ class Solid(eqx.Module):
         friction: Scalar = 0.5,
         mass_damping: Scalar = 0.0,
     ) -> "Solid":
-        """A solid of a law, density [kg/m^3], damping time [s], friction [-], mass damping [1/s].
+        """A solid from its fields, as numbers or arrays.
 
         Raises `ValueError` when one is out of its physical range, unless it is traced.
         """
@@ -161,20 +162,20 @@ class Solid(eqx.Module):
 def plate_stiffness(
     young: Scalar, poisson: Scalar, thickness: Scalar
 ) -> tuple[tuple[Scalar, Scalar, Scalar, Scalar], Scalar]:
-    """(C11, C12, C22, C33) [N/m] and bending stiffness [N m] of a plate of a solid.
+    """Membrane stiffnesses (C11, C12, C22, C33) [N/m] and bending stiffness [N m] of a plate.
 
-    From Young's modulus [Pa], Poisson's ratio [-] and thickness [m].
+    The plate is of a solid of Young's modulus [Pa], Poisson's ratio [-] and a thickness [m].
     """
-    values = young, poisson, thickness
-    return isotropic_membrane(*values), isotropic_bending(*values)
+    membrane = isotropic_membrane(young, poisson, thickness)
+    return membrane, isotropic_bending(young, poisson, thickness)
 
 
 def plate_solid(c11: Scalar, c12: Scalar, bending: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """Young's modulus [Pa], Poisson's ratio [-] and thickness [m] of the plate that has them.
+    """Young's modulus [Pa], Poisson's ratio [-] and thickness [m] of a plate of given stiffness.
 
     The inverse of `plate_stiffness`, from C11 and C12 [N/m] and the bending stiffness [N m] of an
-    isotropic sheet: nu = C12 / C11, h^2 = 12 B / C11. That is the thickness of the solid that bends
-    so, as a rule less than the fabric's own.
+    isotropic sheet: nu = C12 / C11, h^2 = 12 B / C11. A fabric is as a rule thicker than the solid
+    plate that bends like it.
 
     >>> membrane, bending = plate_stiffness(1e5, 0.3, 1e-3)
     >>> [round(x, 6) for x in plate_solid(membrane[0], membrane[1], bending)]
@@ -186,22 +187,22 @@ def plate_solid(c11: Scalar, c12: Scalar, bending: Scalar) -> tuple[Scalar, Scal
 
 
 def determinant(matrix: Matrix) -> Float[Array, ""]:
-    """Of a 2 x 2 or 3 x 3 matrix."""
+    """The determinant of a 2 x 2 or 3 x 3 matrix."""
     if matrix.shape[0] == 2:
         return matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
     return jnp.sum(matrix[0] * jnp.cross(matrix[1], matrix[2]))
 
 
 def product(left: Matrix, right: Matrix) -> Matrix:
-    """The matrix product; not `@`, which on a GPU may round to fewer digits."""
+    """The matrix product in full precision, to which `@` may not keep on a GPU."""
     return jnp.sum(left[:, :, None] * right[None], axis=1)
 
 
 @jax.custom_jvp
 def rotation_of(matrix: Matrix) -> Matrix:
-    """The rotation R of the polar decomposition F = R S. With det F < 0 in 3-D, a reflection.
+    """The rotation R of the polar decomposition F = R S; in 3-D a reflection when det F < 0.
 
-    2-D: in closed form. 3-D: Newton's method with scaling (Higham 1986).
+    It has a closed form in 2-D; in 3-D it comes from Newton's method with scaling (Higham 1986).
     """
     if matrix.shape[0] == 2:
         cosine, sine = matrix[0, 0] + matrix[1, 1], matrix[1, 0] - matrix[0, 1]
@@ -227,9 +228,9 @@ def _newton_polar(matrix: Matrix) -> Matrix:
 
 @rotation_of.defjvp
 def _rotation_of_jvp(primals, tangents):
-    """R' = R W, with W skew and W S + S W = R^T F' - F'^T R: right where principal stretches meet.
+    """R' = R W, with W skew and W S + S W = R^T F' - F'^T R, also where principal stretches meet.
 
-    In 3-D that is (tr S - S) w = the axial vector of the right-hand side; in 2-D tr S w.
+    For the axial vector w of W the left side is (tr S - S) w in 3-D and tr S w in 2-D.
     """
     (matrix,), (change,) = primals, tangents
     rotation = rotation_of(matrix)
@@ -253,7 +254,7 @@ def _solve(matrix: Matrix, right: Float[Array, " axis"]) -> Float[Array, " axis"
 
 
 def _refuted(condition: Callable[[], Any], *values: Scalar) -> bool:
-    """Whether a condition on numbers is false; False when that is unknown, since one is traced."""
+    """Whether a condition on values is false; False when one of them is traced."""
     if any(isinstance(value, Tracer) for value in values):
         return False
     with jax.ensure_compile_time_eval():

@@ -1,27 +1,25 @@
 """The material point method: the second simulator, in 2-D and 3-D from one code.
 
-- `grid`, `transfer`: the nodes, and what goes between them and particles.
+- `grid`: the nodes.
+- `transfer`: from particles to the grid (`p2g`) and back (`g2p`).
 - `background`: gravity, table, walls and grippers at the nodes.
 - `block`: a solid body of particles (`r2s.laws.solid`).
-- `transverse`, `elements`, `drag`, `sheet`: a sheet of fabric, the same as of `r2s.Cloth`.
-- `stability`: how long a step may be, and where a run went wrong.
+- `transverse`, `elements`, `sheet`: a sheet of the same fabrics as `r2s.Cloth`.
+- `stability`: how long a step may be, and why a motion failed.
 """
 
 from r2s.mpm.background import Background
 from r2s.mpm.block import Block, BlockState, Surface, layered
 from r2s.mpm.grid import Grid
 from r2s.mpm.sheet import Sheet, SheetState
-from r2s.mpm.stability import Failure, diagnose
 
 __all__ = [
     "Background",
     "Block",
     "BlockState",
-    "Failure",
     "Grid",
     "Sheet",
     "SheetState",
     "Surface",
-    "diagnose",
     "layered",
 ]

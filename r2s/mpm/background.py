@@ -1,4 +1,4 @@
-"""What particles move through: the grid, with gravity, table, walls and grippers at its nodes."""
+"""The grid that particles move through, with gravity, table, walls and grippers at its nodes."""
 
 import equinox as eqx
 import jax
@@ -6,14 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r2s.mpm.grid import Grid
-from r2s.mpm.transfer import (
-    affine_factor,
-    g2p,
-    g2p_plain,
-    p2g,
-    p2g_few,
-    p2g_plain,
-)
+from r2s.mpm.transfer import affine_factor, g2p, g2p_plain, p2g, p2g_few, p2g_plain
 from r2s.units import GRAVITY
 from r2s.world.contact import SLIP_SPEED, Table
 
@@ -21,11 +14,11 @@ Vectors = Float[Array, "particle axis"]
 Matrices = Float[Array, "particle axis axis"]
 Field = Float[Array, "node axis"]
 
-GRIPPED = 0.25  # of a node's mass; at the border between held and free particles it is a half
+GRIPPED = 0.25  # share of a node's mass; at the border of held and free particles it is a half
 
 
 class Held(eqx.Module):
-    """Particles that grippers carry: their positions [m], velocities [m/s] and masses [kg]."""
+    """Positions [m], velocities [m/s] and masses [kg] of the particles that grippers carry."""
 
     x: Float[Array, "held axis"]
     v: Float[Array, "held axis"]
@@ -33,16 +26,16 @@ class Held(eqx.Module):
 
 
 class Background(eqx.Module):
-    """A grid and what acts at its nodes. Up is the last axis.
+    """A grid and what acts at its nodes. The last axis points up.
 
-    - `grid`: where particles may be.
-    - `table`: nodes at its height and below give way to nothing that comes from above; None: none.
-    - `gravity`: downwards, [m/s^2].
-    - `walls`: how many nodes at each end of an axis let nothing out, though back in; 0: no walls.
-    - `sticky`: whether what touches the table stays; otherwise friction is Coulomb's.
-    - `mass_floor`: added to the masses of nodes, over the mean mass of a particle [-].
-    - `forward_mode`: derivatives by JAX's own rules, so that `jax.jvp` works; without, the reverse
-      mode is faster.
+    - `grid`: the nodes, which limit where particles may be.
+    - `table`: nodes at or below its height lose downward velocity; None: no table.
+    - `gravity`: downward acceleration, [m/s^2].
+    - `walls`: number of nodes at each end of an axis that lose outward velocity; 0: no walls.
+    - `sticky`: whether nodes of the table lose all velocity; otherwise Coulomb friction acts.
+    - `mass_floor`: mass added to every node, over the mean mass of a particle [-].
+    - `forward_mode`: whether JAX derives the transfers itself, so that `jax.jvp` works; the own
+      rules, which are the default, have a faster reverse mode.
     """
 
     grid: Grid
@@ -64,7 +57,7 @@ class Background(eqx.Module):
         mass_floor: float = 1e-15,
         forward_mode: bool = False,
     ) -> "Background":
-        """With a table or none, and gravity [m/s^2]. Raises `ValueError` for impossible walls."""
+        """A background from numbers. Raises `ValueError` for impossible walls or mass floor."""
         if not 0 <= walls < min(grid.shape) / 2 or mass_floor < 0:
             raise ValueError(
                 f"walls must be from 0 to less than half of {min(grid.shape)} nodes and the mass "
@@ -83,10 +76,14 @@ class Background(eqx.Module):
         affine: Matrices,
         held: Held | None = None,
     ) -> tuple[Vectors, Matrices]:
-        """Velocities [m/s] and affine velocities [1/s] of particles after a step of `dt` [s].
+        """Velocities [m/s] and affine velocity matrices [1/s] of particles after a step.
 
-        From their positions [m], masses [kg], momenta [kg m/s] and affine momenta [kg/s], which
-        contain what forces and stresses have added in the step.
+        - `dt`: step, [s].
+        - `friction`: Coulomb coefficient against the table, [-].
+        - `x`, `mass`: positions [m] and masses [kg] at the start of the step.
+        - `momentum`, `affine`: momenta [kg m/s] and affine momenta [kg/s], with what forces and
+          stresses have added in the step.
+        - `held`: particles that impose their velocity on the nodes around them.
         """
         with jax.named_scope("particles_to_grid"):
             still = jnp.zeros_like(affine[:, :1])
@@ -107,9 +104,10 @@ class Background(eqx.Module):
         return v, affine_factor(self.grid) * moment
 
     def _gripped(self, v: Field, mass: Array, floor: Array, held: Held) -> Field:
-        """Velocities with those of the grippers where `GRIPPED` or more of the mass is held.
+        """Velocities that blend into the grippers' where up to `GRIPPED` of the mass is held.
 
-        Nodes that are held only in part give way, so that the body would creep out of the grip.
+        Beyond that share a node has the grippers' velocity: nodes that are held only in part would
+        let the body creep out of the grip.
         """
         values = jnp.concatenate([held.mass[:, None] * held.v, held.mass[:, None]], axis=1)
         nodes = p2g_few(self.grid, held.x, values)
@@ -118,9 +116,9 @@ class Background(eqx.Module):
         return v + jnp.minimum(share / GRIPPED, 1) * (carried - v)
 
     def _on_table(self, v: Field, friction: Float[Array, ""]) -> Field:
-        """Velocities [m/s] that do not go into the table, and slide on it by Coulomb's law.
+        """Velocities [m/s] that do not point into the table and slide on it by Coulomb's law.
 
-        What stops the fall of a node, times the friction coefficient, is what can stop its sliding.
+        The lost normal velocity times the friction coefficient bounds the lost sliding velocity.
         """
         if self.table is None:
             return v
@@ -138,7 +136,7 @@ class Background(eqx.Module):
         return jnp.where(below, jnp.concatenate([kept * along, jnp.maximum(normal, 0)], axis=1), v)
 
     def _walled(self, v: Field) -> Field:
-        """Velocities [m/s] that do not go out through the walls."""
+        """Velocities [m/s] that do not point out through the walls."""
         if not self.walls:
             return v
         columns = []
@@ -149,11 +147,8 @@ class Background(eqx.Module):
             columns.append(jnp.where(spaced > count - self.walls, jnp.minimum(low, 0), low))
         return jnp.stack(columns, axis=1)
 
-    def settle(self, x: Vectors) -> Vectors:
-        """New positions [m]: on the table when they are in it, NaN when they are off the grid.
-
-        So that a particle which leaves shows as a run that diverged.
-        """
+    def project(self, x: Vectors) -> Vectors:
+        """Positions [m] lifted onto the table, and NaN where they are off the grid."""
         if self.table is not None:
             lowest = jnp.full(x.shape[1] - 1, -jnp.inf, x.dtype)
             x = jnp.maximum(x, jnp.append(lowest, self.table.height)[None])
@@ -166,7 +161,7 @@ def quotient(
 ) -> Float[Array, "node channel"]:
     """The ratio, with derivatives that do not square its denominator, which may be tiny.
 
-    The cotangent of a node is as small as its mass: their ratio is harmless, in float32 too.
+    The cotangent of a node is as small as its mass, so that their ratio is safe in float32 too.
     """
     return numerator / denominator
 

@@ -1,7 +1,8 @@
 """A solid body of particles, in 2-D or 3-D, by the material point method.
 
 MLS-MPM (Hu et al. 2018) with APIC, explicit in time (symplectic Euler), as in DiffTaichi and
-DiffCP. A thin sheet of it is stretched, sheared and bent as an isotropic solid of its thickness.
+DiffCP. A thin sheet of particles stretches, shears and bends as an isotropic solid of its
+thickness does.
 """
 
 import equinox as eqx
@@ -10,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from r2s.failures import first_failure, no_failure
 from r2s.geometry.mesh import Mesh
 from r2s.laws.solid import Solid, product
 from r2s.mpm.background import Background, Held
-from r2s.mpm.stability import check_step, longest_step
+from r2s.mpm.stability import check_step, failure_of_step, longest_step
 from r2s.mpm.transfer import affine_factor
 from r2s.world.air import Air, Fan
 from r2s.world.drag import drag_on_vertices
@@ -23,21 +25,25 @@ Points = Float[Array, "particle axis"]
 
 
 class BlockState(eqx.Module):
-    """- `x`, `v`: positions [m] and velocities [m/s].
-    - `C`: affine velocities, [1/s].
+    """The particles of a block at one time.
+
+    - `x`, `v`: positions [m] and velocities [m/s].
+    - `C`: affine velocity matrices, [1/s].
     - `F`: deformation gradients, [-].
+    - `failure`: the first `r2s.failures.Failure` of the run so far.
     """
 
     x: Float[Array, "particle axis"]
     v: Float[Array, "particle axis"]
     C: Float[Array, "particle axis axis"]
     F: Float[Array, "particle axis axis"]
+    failure: Int[Array, ""]
 
 
 class Surface(eqx.Module):
-    """The triangles on which air acts. The first particles of a body are its vertices.
+    """The triangles on which air acts. Their vertices are the first particles of the body.
 
-    - `mesh`: of the triangles.
+    - `mesh`: the triangles.
     - `air`, `fan`: as in a `Scene`.
     """
 
@@ -49,14 +55,14 @@ class Surface(eqx.Module):
 class Block(eqx.Module):
     """A body in its surroundings, stepped explicitly.
 
-    Differentiable in solid, state, control and background; by forward mode when the background
-    says so.
+    It is differentiable in solid, state, control and background; in forward mode when the
+    background allows it.
 
     - `background`: grid, table, walls, gravity.
-    - `volume`: of each particle at rest, [m^3]; in 2-D of a body of 1 m depth.
+    - `volume`: volumes of the particles at rest, [m^3]; in 2-D of a body of 1 m depth.
     - `held`, `handle_of`: the particles that grippers carry, and the handle that carries each.
-    - `offset`: of each held particle from its handle, [m].
-    - `surface`: what wind acts on; None: nothing.
+    - `offset`: positions of the held particles relative to their handles, [m].
+    - `surface`: the triangles on which wind acts; None: no wind.
     - `dt`: step, [s].
     """
 
@@ -77,10 +83,14 @@ class Block(eqx.Module):
         dt: float,
         surface: Surface | None = None,
     ) -> "Block":
-        """A solver for particles of volumes [m^3], which no gripper holds.
+        """A solver for particles that no gripper holds.
 
-        `solid` is the stiffest material that it will be used for. Raises `ValueError`, which gives
-        the limit, when `dt` [s] is too long for it.
+        - `volume`: volumes of the particles at rest, [m^3].
+        - `solid`: the stiffest material that the solver will be used for.
+        - `dt`: step, [s].
+        - `surface`: the triangles on which wind acts; None: no wind.
+
+        Raises `ValueError` when the step is too long for the solid; the text gives the limit.
         """
         if not dt > 0:
             raise ValueError(f"dt must be positive, got {dt} s")
@@ -96,17 +106,17 @@ class Block(eqx.Module):
     def gripped(self, x: Points, handles: Float[Array, "handle axis"], radius: float) -> "Block":
         """The solver with grippers that carry the particles within `radius` [m] of the handles.
 
-        `x` are the particles' positions, `handles` the grippers', when they grip [m]. Raises
-        `ValueError` when a gripper finds no particle.
+        `x` and `handles` are the positions [m] of particles and grippers when the grippers close.
+        Raises `ValueError` when a gripper finds no particle.
         """
-        away = np.linalg.norm(np.asarray(x)[:, None] - np.asarray(handles)[None], axis=2)
-        nearest = np.argmin(away, axis=1)
-        held = np.flatnonzero(np.min(away, axis=1) <= radius)
+        distance = np.linalg.norm(np.asarray(x)[:, None] - np.asarray(handles)[None], axis=2)
+        nearest = np.argmin(distance, axis=1)
+        held = np.flatnonzero(np.min(distance, axis=1) <= radius)
         empty = np.setdiff1d(np.arange(len(handles)), nearest[held])
         if len(empty):
             raise ValueError(
                 f"gripper {empty[0]} finds no particle within {radius} m: the nearest is "
-                f"{away[:, empty[0]].min():.4g} m away"
+                f"{distance[:, empty[0]].min():.4g} m away"
             )
         handle_of = nearest[held]
         offset = jnp.asarray(x)[held] - jnp.asarray(handles)[handle_of]
@@ -114,23 +124,20 @@ class Block(eqx.Module):
         return eqx.tree_at(lambda s: (s.held, s.handle_of, s.offset), self, parts)
 
     def check(self, solid: Solid) -> None:
-        """Raises `ValueError`, with the limit, when the step is too long for a solid.
-
-        A traced solid is not checked.
-        """
+        """Raises `ValueError` when the step is too long for a solid, unless that is traced."""
         with jax.ensure_compile_time_eval():
             longest = stable_step(self.background, solid)
         check_step(self.dt, longest, "the solid and the grid")
 
     def init(self, x: Points, v: Points | None = None) -> BlockState:
-        """A state at rest shape from positions [m] and velocities [m/s] (default: zero).
+        """A state of no strain from positions [m] and velocities [m/s] (default: zero).
 
-        Raises `ValueError` when a particle is outside the grid, unless they are traced.
+        Raises `ValueError` when a particle is outside the grid, unless positions are traced.
         """
         self.background.grid.check(x)
         v = jnp.zeros_like(x) if v is None else v
         identity = jnp.broadcast_to(jnp.eye(x.shape[1], dtype=x.dtype), (*x.shape, x.shape[1]))
-        return BlockState(x, v, jnp.zeros_like(identity), identity)
+        return BlockState(x, v, jnp.zeros_like(identity), identity, no_failure())
 
     def step(self, fabric: Solid, state: BlockState, control: Control) -> BlockState:
         """The state `dt` later, with the held particles at `control.handles` plus their offsets."""
@@ -153,18 +160,20 @@ class Block(eqx.Module):
         )
         v, C = _put(v, held, carried.v), _put(C, held, jnp.zeros_like(C[held]))
         x = _put(state.x + dt * v, held, goal)
-        return BlockState(self.background.settle(x), v, C, deformation)
+        failure = failure_of_step(self.background.grid, state.x, x, (fabric, control))
+        failure = first_failure(state.failure, failure)
+        return BlockState(self.background.project(x), v, C, deformation, failure)
 
     def _drag(self, state: BlockState, wind: Array) -> Array:
         surface = self.surface
         assert surface is not None
         count = surface.mesh.rest.shape[0]
-        about = surface.mesh, surface.air, surface.fan
-        return drag_on_vertices(*about, state.x[:count], state.v[:count], wind)
+        x, v = state.x[:count], state.v[:count]
+        return drag_on_vertices(surface.mesh, surface.air, surface.fan, x, v, wind)
 
 
 def _put(values: Array, where: Array, held: Array) -> Array:
-    """Values with those of held particles replaced; as they are when there are none."""
+    """Values with those of the held particles replaced."""
     return values.at[where].set(held) if where.shape[0] else values
 
 
@@ -173,7 +182,7 @@ def stable_step(background: Background, solid: Solid) -> Float[Array, ""]:
 
     On quadratic B-splines sum w d^2 = spacing^2 / 4, so that the stiffness of a particle over its
     share of the nodes' masses is at most 4 modulus / (density spacing^2). That bounds the square of
-    every frequency of the grid (as of finite elements, Fried 1972).
+    every frequency of the grid, as for finite elements (Fried 1972).
     """
     grid = background.grid
     square = 4 * solid.law.modulus(len(grid.shape)) / (solid.density * grid.spacing**2)
@@ -183,10 +192,13 @@ def stable_step(background: Background, solid: Solid) -> Float[Array, ""]:
 def layered(
     mesh: Mesh, x: Float[Array, "vertex 3"], thickness: float, layers: int = 3
 ) -> tuple[Points, Float[Array, " particle"]]:
-    """Positions [m] and volumes [m^3] of particles that fill a sheet, in layers across it.
+    """Positions [m] and volumes [m^3] of particles that fill a sheet in layers.
 
-    `x` are the vertices' positions, `thickness` that of the solid [m]. The middle layer, which are
-    the vertices, comes first. Raises `ValueError` when the number of layers is not odd.
+    - `x`: positions of the mesh's vertices, [m]; they are the middle layer, which comes first.
+    - `thickness`: thickness of the solid, [m].
+    - `layers`: number of layers across the thickness.
+
+    Raises `ValueError` when the thickness is not positive or the number of layers is not odd.
     """
     if not thickness > 0 or layers < 1 or layers % 2 == 0:
         raise ValueError(

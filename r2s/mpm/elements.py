@@ -27,23 +27,26 @@ Vertices = Float[Array, "vertex 3"]
 def elastic_force(
     mesh: Mesh, fabric: Fabric, membrane_damping: Float[Array, ""], x: Vertices, v: Vertices
 ) -> Vertices:
-    """The force [N] of membrane and bending with their viscosity, at positions [m] and velocities
-    [m/s].
+    """Forces [N] of membrane and bending with their viscosity on the vertices.
 
-    As in `r2s.Cloth`, but for `membrane_damping` [s], the damping time of the membrane.
+    - `membrane_damping`: damping time of the membrane, [s]; the fabric's holds for bending alone.
+    - `x`, `v`: positions [m] and velocities [m/s].
     """
 
-    def hinges(x):
+    def stretch(x: Vertices) -> Array:
+        return strains(mesh, x)
+
+    def hinges(x: Vertices) -> Array:
         return hinge_curvatures(mesh, hinge_angles(mesh, x))
 
-    def bend(x):
+    def bend(x: Vertices) -> Array:
         return fabric.bending.curvatures(mesh, hinges(x))
 
-    stretched = jax.vmap(fabric.membrane.at)(strains(mesh, x))
+    stretched = jax.vmap(fabric.membrane.at)(stretch(x))
+    membrane = _resistance(stretched, stretch, mesh.area, membrane_damping, x, v)
     bent = fabric.bending.on_elements(mesh, hinges(x))
-    along = _resistance(stretched, lambda x: strains(mesh, x), mesh.area, membrane_damping, x, v)
     areas = fabric.bending.areas(mesh)
-    return along + _resistance(bent, bend, areas, fabric.damping, x, v)
+    return membrane + _resistance(bent, bend, areas, fabric.damping, x, v)
 
 
 def _resistance(
@@ -54,22 +57,22 @@ def _resistance(
     x: Array,
     v: Array,
 ) -> Vertices:
-    """Minus the derivative in x of the energy that laws give a measure of x, with its viscosity."""
-    strain, rate = jax.jvp(measure, (x,), (v,))
+    """Minus the derivative in x of the energy of a strain measure, with its viscosity [N]."""
 
-    def slopes(strain):
+    def stresses(strain: Array) -> Array:
         return jax.vmap(lambda law, s: jax.grad(law.energy_density)(s))(laws, strain)
 
-    stress, viscous = jax.jvp(slopes, (strain,), (rate,))
-    _, pull = jax.vjp(measure, x)
+    strain, rate = jax.jvp(measure, (x,), (v,))
+    stress, viscous = jax.jvp(stresses, (strain,), (rate,))
+    _, to_forces = jax.vjp(measure, x)
     areas = areas if strain.ndim == 1 else areas[:, None]
-    return -pull(areas * (stress + damping * viscous))[0]
+    return -to_forces(areas * (stress + damping * viscous))[0]
 
 
 def membrane_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
     """A bound on the square of the membrane's highest frequency [1/s^2], flat and unstrained.
 
-    That of the worst face, with a third of its mass at each corner (Fried 1972).
+    The bound is that of the worst face, with a third of its mass at each corner (Fried 1972).
     """
     tangent = _tangent(fabric.membrane.at, fabric.membrane)
 
@@ -81,10 +84,10 @@ def membrane_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
 
 
 def bending_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
-    """A bound on the square of bending's highest frequency [1/s^2], flat and at rest.
+    """A bound on the square of the highest frequency of bending [1/s^2], flat and at rest.
 
-    That of the worst face or hinge, with the vertices' masses in equal parts among those that
-    share them.
+    The bound is that of the worst face or hinge, with the vertices' masses in equal parts among
+    the elements that share them.
     """
     if not mesh.hinges.shape[0]:
         return jnp.zeros((), float)
@@ -104,9 +107,9 @@ def bending_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
 
 
 def _tangent(at: Callable[[Array], Any], law: Any) -> Float[Array, "3 3"]:
-    """The stiffness of a law at no strain or curvature."""
-    none = jnp.zeros(3, jax.tree.leaves(law)[0].dtype)
-    return jax.hessian(at(none).energy_density)(none)
+    """The stiffness of a law at zero strain or curvature."""
+    zero = jnp.zeros(3, jax.tree.leaves(law)[0].dtype)
+    return jax.hessian(at(zero).energy_density)(zero)
 
 
 def _largest(

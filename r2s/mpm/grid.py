@@ -1,4 +1,4 @@
-"""The grid of the material point method: where its nodes are, and whether points are inside."""
+"""The grid of the material point method: its nodes, and which particles are inside."""
 
 import math
 
@@ -14,11 +14,11 @@ MAX_NODES = 2**27  # about 2 GB in 3-D
 
 
 class Grid(eqx.Module):
-    """A grid of nodes in 2-D or 3-D; the last axis is up.
+    """A grid of nodes in 2-D or 3-D. The last axis points up.
 
-    - `lower`: the first node, [m].
-    - `spacing`: between nodes, [m].
-    - `shape`: nodes along each axis.
+    - `lower`: position of the first node, [m].
+    - `spacing`: distance between nodes, [m].
+    - `shape`: number of nodes along each axis.
     """
 
     lower: Float[Array, " axis"]
@@ -27,7 +27,7 @@ class Grid(eqx.Module):
 
     @classmethod
     def make(cls, lower: tuple[float, ...], spacing: float, shape: tuple[int, ...]) -> "Grid":
-        """A grid from its first node [m], spacing [m] and nodes along each axis.
+        """A grid from its fields, as numbers.
 
         Raises `ValueError` when it is not 2-D or 3-D, or has too few or too many nodes.
         """
@@ -68,23 +68,23 @@ class Grid(eqx.Module):
         )
 
     def inside(self, x: Float[Array, "particle axis"]) -> Bool[Array, " particle"]:
-        """Whether all nodes that a particle at `x` [m] touches are on the grid."""
+        """Whether the grid has all nodes that a particle at `x` [m] touches."""
         place = (x - self.lower[None]) / self.spacing
         last = jnp.asarray(self.shape, x.dtype)[None] - 1.5
         return jnp.all((place >= 0.5) & (place < last), axis=1)
 
     def check(self, x: Float[Array, "particle axis"]) -> None:
-        """Raises `ValueError` when a particle at `x` [m] is not inside. Skipped when traced."""
+        """Raises `ValueError` when a particle at `x` [m] is not inside, unless `x` is traced."""
         if isinstance(x, Tracer) or isinstance(self.lower, Tracer):
             return
         with jax.ensure_compile_time_eval():
             outside = np.flatnonzero(~np.asarray(self.inside(x)))
         if len(outside):
             lower, shape = np.asarray(self.lower), np.asarray(self.shape)
-            written = lambda place: [round(float(number), 4) for number in place]
+            first = np.asarray(x)[outside[0]]
             low, high = lower + 0.5 * self.spacing, lower + (shape - 1.5) * self.spacing
+            first, low, high = (np.round(place, 4).tolist() for place in (first, low, high))
             raise ValueError(
-                f"{len(outside)} particles are outside the grid, the first at "
-                f"{written(np.asarray(x)[outside[0]])} m; they may be from {written(low)} to "
-                f"{written(high)} m"
+                f"{len(outside)} particles are outside the grid, the first at {first} m; they may "
+                f"be from {low} to {high} m"
             )

@@ -1,25 +1,25 @@
 """A sheet of fabric by the material point method: a mesh whose vertices are the particles.
 
-After Jiang, Gast and Teran 2017, whom DiffCP (Zheng et al. 2024) follows. In its plane the sheet is
-the one of `r2s.Cloth`: the same laws of membrane and bending on the same mesh, and the same
-`Fabric`. The forces on the vertices go through the grid; across the sheet the grid's velocity
-gradient drives what layers do to each other (`r2s.mpm.transverse`). So contact of the sheet with
-itself, with the table and with walls comes from the grid, and keeps layers about a spacing apart.
-Explicit in time.
+After Jiang, Gast and Teran 2017, whom DiffCP (Zheng et al. 2024) follows. The laws of membrane and
+bending, the mesh and the `Fabric` are those of `r2s.Cloth`. The forces on the vertices go through
+the grid; across the sheet the grid's velocity gradient drives compression and shear between layers
+(`r2s.mpm.transverse`). So contact of the sheet with itself, with the table and with walls comes
+from the grid, and keeps layers about a spacing apart. The steps are explicit in time.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from r2s.fabrics.fabric import Fabric
+from r2s.failures import first_failure, no_failure
 from r2s.geometry.mesh import Mesh
 from r2s.mpm.background import Background
 from r2s.mpm.elements import bending_frequency, elastic_force, membrane_frequency
 from r2s.mpm.grid import Grid
-from r2s.mpm.stability import check_step, longest_step
+from r2s.mpm.stability import check_step, failure_of_step, longest_step
 from r2s.mpm.transfer import affine_factor
 from r2s.mpm.transverse import Transverse, unit_normal
 from r2s.world.drag import drag_on_vertices
@@ -33,28 +33,33 @@ CONTACT = 20.0  # [N/m]: some cm of a fabric's weight press layers together by a
 
 
 class SheetState(eqx.Module):
-    """- `x`, `v`: positions [m] and velocities [m/s] of the vertices.
-    - `C`: affine velocities, [1/s].
+    """A sheet at one time.
+
+    - `x`, `v`: positions [m] and velocities [m/s] of the vertices.
+    - `C`: affine velocity matrices of the vertices, [1/s].
     - `d`: transverse directions of the faces, [-].
+    - `failure`: the first `r2s.failures.Failure` of the run so far.
     """
 
     x: Float[Array, "vertex 3"]
     v: Float[Array, "vertex 3"]
     C: Float[Array, "vertex 3 3"]
     d: Float[Array, "face 3"]
+    failure: Int[Array, ""]
 
 
 class Sheet(eqx.Module):
     """A sheet in a scene, stepped explicitly on a grid.
 
-    Differentiable in fabric, state, control and scene; by forward mode when the background says so.
+    It is differentiable in fabric, state, control and scene; in forward mode when the background
+    allows it.
 
-    - `scene`: sheet, held vertices, air. Its table is the background's.
+    - `scene`: sheet, held vertices, air; its table is the background's.
     - `background`: grid, table, walls, gravity.
     - `transverse`: compression and shear between layers.
-    - `membrane_damping`: damping time of the membrane [s], instead of the fabric's, which then
-      holds for bending alone; None: the fabric's. The membrane's high frequencies, which no motion
-      of a sheet shows, make long damping times cost short steps.
+    - `membrane_damping`: damping time of the membrane, [s]; the fabric's then holds for bending
+      alone; None: the fabric's. A long damping time of the membrane's high frequencies, which no
+      motion of a sheet shows, would need short steps.
     - `dt`: step, [s].
     """
 
@@ -78,12 +83,16 @@ class Sheet(eqx.Module):
         sticky: bool = False,
         forward_mode: bool = False,
     ) -> "Sheet":
-        """A solver for a scene on a grid, with steps of `dt` [s].
+        """A solver for a scene on a grid.
 
-        `fabric` is the stiffest that it will be used for; `compression` and `shear` [N/m] are those
-        between layers; walls, sticky and forward mode as in `Background`. Raises `ValueError` when
-        the step is too long for the fabric (the text gives the limit), or the mesh too coarse for
-        the grid.
+        - `fabric`: the stiffest fabric that the solver will be used for.
+        - `dt`: step, [s].
+        - `membrane_damping`: as in `Sheet`, [s].
+        - `compression`, `shear`: stiffnesses between layers, [N/m].
+        - `walls`, `sticky`, `forward_mode`: as in `Background`.
+
+        Raises `ValueError` when the step is too long for the fabric (the text gives the limit) or
+        the mesh is too coarse for the grid.
         """
         if not dt > 0 or not min(compression, shear) > 0:
             raise ValueError(
@@ -110,25 +119,21 @@ class Sheet(eqx.Module):
         return solver
 
     def check(self, fabric: Fabric) -> None:
-        """Raises `ValueError`, with the limit, when the step is too long for a fabric.
-
-        A traced fabric is not checked.
-        """
-        spacing = self.background.grid.spacing
-        about = self.scene.mesh, spacing, fabric, self.membrane_damping, self.transverse
+        """Raises `ValueError` when the step is too long for a fabric, unless that is traced."""
+        mesh, spacing = self.scene.mesh, self.background.grid.spacing
         with jax.ensure_compile_time_eval():
-            longest = stable_step(*about)
+            longest = stable_step(mesh, spacing, fabric, self.membrane_damping, self.transverse)
         check_step(self.dt, longest, "the fabric, the mesh and the grid")
 
     def init(self, x: Vertices, v: Vertices | None = None) -> SheetState:
         """A state from positions [m] and velocities [m/s] (default: zero), with free layers.
 
-        Raises `ValueError` when a vertex is outside the grid, unless they are traced.
+        Raises `ValueError` when a vertex is outside the grid, unless positions are traced.
         """
         self.background.grid.check(x)
         v = jnp.zeros_like(x) if v is None else v
         normals = jax.vmap(unit_normal)(x[self.scene.mesh.faces])
-        return SheetState(x, v, jnp.zeros((*x.shape, 3), x.dtype), normals)
+        return SheetState(x, v, jnp.zeros((*x.shape, 3), x.dtype), normals, no_failure())
 
     def step(self, fabric: Fabric, state: SheetState, control: Control) -> SheetState:
         """The state `dt` later, with the held vertices at `control.handles`."""
@@ -139,40 +144,42 @@ class Sheet(eqx.Module):
     ) -> tuple[SheetState, Float[Array, "handle 3"]]:
         """The state `dt` later, and the grippers' mean forces [N] on the held vertices.
 
-        Twice these get their grippers' velocity: before their momentum goes to the grid, and after
-        the grid has given back another. The forces are the momentum that this takes, over `dt`.
+        The held vertices get their grippers' velocity twice: before the transfer to the grid and
+        after the transfer back. The forces are the momentum that this takes, over `dt`.
         """
         mesh, held, dt = self.scene.mesh, self.scene.held, self.dt
         mass = fabric.density * mesh.vertex_area
-        d = self._directions(fabric, state)
-        force, stress = self._across(state.x, d)
-        force += self._along(fabric, state, control)
+        d = self._transverse_directions(fabric, state)
+        force, stress = self._transverse_forces(state.x, d)
+        force += self._sheet_forces(fabric, state, control)
         momentum = mass[:, None] * (1 - dt * fabric.mass_damping) * state.v + dt * force
-        # what pulls at a held vertex, the gripper bears
         carried = (control.handles - state.x[held]) / dt
-        at_handles = mass[held][:, None] * carried
-        given = at_handles - momentum[held]
-        momentum = momentum.at[held].set(at_handles)
+        momentum_held = mass[held][:, None] * carried
+        impulse = momentum_held - momentum[held]
+        momentum = momentum.at[held].set(momentum_held)
         factor = dt * affine_factor(self.background.grid)
         affine = mass[:, None, None] * state.C - factor * stress
         v, C = self.background.advance(dt, fabric.friction, state.x, mass, momentum, affine)
-        given += at_handles - mass[held][:, None] * v[held]
+        impulse += momentum_held - mass[held][:, None] * v[held]
         v = v.at[held].set(carried)
-        x = self.background.settle(state.x + dt * v).at[held].set(control.handles)
-        return SheetState(x, v, C, d), given / dt
+        moved = state.x + dt * v
+        failure = failure_of_step(self.background.grid, state.x, moved, (fabric, control))
+        x = self.background.project(moved).at[held].set(control.handles)
+        failure = first_failure(state.failure, failure)
+        return SheetState(x, v, C, d, failure), impulse / dt
 
-    def _directions(self, fabric: Fabric, state: SheetState) -> Float[Array, "face 3"]:
-        """Where the grid has carried the transverse directions, after the return mapping."""
+    def _transverse_directions(self, fabric: Fabric, state: SheetState) -> Float[Array, "face 3"]:
+        """The directions that the grid's velocity gradient carries, after the return mapping."""
         faces = self.scene.mesh.faces
         rates = jnp.mean(state.C[faces], axis=1)
         moved = state.d + self.dt * jnp.sum(rates * state.d[:, None], axis=2)
-        settle = lambda corners, d: self.transverse.settled(corners, d, fabric.friction)
-        return jax.vmap(settle)(state.x[faces], moved)
+        mapped = jax.vmap(self.transverse.return_mapping, in_axes=(0, 0, None))
+        return mapped(state.x[faces], moved, fabric.friction)
 
-    def _across(
+    def _transverse_forces(
         self, x: Vertices, d: Float[Array, "face 3"]
     ) -> tuple[Vertices, Float[Array, "vertex 3 3"]]:
-        """Forces [N] and stresses times volume [N m] of the vertices, from between the layers."""
+        """Forces [N] and stresses times volume [N m] of the vertices from layers in contact."""
         mesh = self.scene.mesh
         forces, stresses = jax.vmap(self.transverse.stress)(x[mesh.faces], d)
         shares = (mesh.area / 3)[:, None, None] * stresses
@@ -180,13 +187,12 @@ class Sheet(eqx.Module):
         force = jnp.zeros_like(x).at[mesh.faces].add(mesh.area[:, None, None] * forces)
         return force, stress
 
-    def _along(self, fabric: Fabric, state: SheetState, control: Control) -> Vertices:
+    def _sheet_forces(self, fabric: Fabric, state: SheetState, control: Control) -> Vertices:
         """Forces [N] of membrane, bending and air on the vertices."""
-        scene = self.scene
+        scene, x, v = self.scene, state.x, state.v
         damping = fabric.damping if self.membrane_damping is None else self.membrane_damping
-        elastic = elastic_force(scene.mesh, fabric, damping, state.x, state.v)
-        wind = control.wind
-        return elastic + drag_on_vertices(scene.mesh, scene.air, scene.fan, state.x, state.v, wind)
+        drag = drag_on_vertices(scene.mesh, scene.air, scene.fan, x, v, control.wind)
+        return elastic_force(scene.mesh, fabric, damping, x, v) + drag
 
 
 @eqx.filter_jit
@@ -197,10 +203,14 @@ def stable_step(
     membrane_damping: Float[Array, ""] | float | None = None,
     transverse: Transverse | None = None,
 ) -> Float[Array, ""]:
-    """The longest step [s] that is stable for a fabric, near its rest shape, on a mesh and a grid.
+    """The longest step [s] that is stable for a fabric near its rest shape.
 
-    From bounds on the squares of the highest frequencies of membrane, bending and layers, which
-    add. The grid only lowers those of the mesh.
+    - `spacing`: spacing of the grid, [m].
+    - `membrane_damping`: as in `Sheet`, [s].
+    - `transverse`: compression and shear between layers; None: the default stiffnesses.
+
+    The squares of the highest frequencies of membrane, bending and layers have bounds that add.
+    The grid only lowers the frequencies of the mesh.
     """
     if transverse is None:
         transverse = between_layers()
@@ -220,6 +230,6 @@ def between_layers(compression: float = CONTACT, shear: float = CONTACT) -> Tran
 
 
 def longest_edge(mesh: Mesh) -> float:
-    """Of a mesh, [m]."""
+    """The length of the longest edge of a mesh at rest, [m]."""
     corners = np.asarray(mesh.rest)[np.asarray(mesh.faces)]
     return float(np.max(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)))

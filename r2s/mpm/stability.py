@@ -1,18 +1,20 @@
-"""How long a step may be, and where a run that diverged went wrong."""
+"""How long a step may be, and why a motion failed."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from r2s.failures import Failure
+from r2s.mpm.grid import Grid
 from r2s.units import Scalar
-from r2s.world.scene import Control
 
 SAFETY = 0.7  # of the limit at rest: what is stretched or compressed is stiffer
+
+Points = Float[Array, "particle axis"]
 
 
 def longest_step(squares: list[tuple[Scalar, Scalar]]) -> Float[Array, ""]:
@@ -20,7 +22,7 @@ def longest_step(squares: list[tuple[Scalar, Scalar]]) -> Float[Array, ""]:
 
     `squares` are pairs of frequency squared [1/s^2] and stiffness-proportional damping time [s].
     Symplectic Euler with the damping of the step's start needs, for every frequency w,
-    dt^2 w^2 + 2 dt damping w^2 <= 4. What is returned is `SAFETY` times that.
+    dt^2 w^2 + 2 dt damping w^2 <= 4. The result is `SAFETY` times that limit.
     """
     stiff = sum(square for square, _ in squares)
     damped = sum(square * time for square, time in squares)
@@ -39,41 +41,24 @@ def check_step(dt: float, longest: Float[Array, ""], material: str) -> None:
         )
 
 
-class Failure(NamedTuple):
-    """The first step of a motion whose end is not finite, and what is not.
+def failure_of_step(grid: Grid, before: Points, after: Points, inputs: Any) -> Int[Array, ""]:
+    """The `r2s.failures.Failure` of one step.
 
-    - `frame`, `substep`: counted from 0.
-    - `quantities`: the fields of the state, by name.
+    - `before`: positions at the start of the step, [m].
+    - `after`: positions at its end, also of particles that have left the grid, [m].
+    - `inputs`: what else the step depends on, such as fabric and control.
+
+    Inputs that are not finite give `NON_FINITE`. A result that is not finite gives `TIME_STEP`, and
+    so does a particle that leaves the grid while one moves by more than a spacing in the step, as
+    only an unstable step throws it. Any other particle outside the grid gives `GRID`.
     """
-
-    frame: int
-    substep: int
-    quantities: tuple[str, ...]
-
-
-def diagnose(solver: Any, fabric: Any, start: Any, controls: Control) -> Failure | None:
-    """Where a motion, simulated once more, is first not finite; None when it is finite.
-
-    `controls` have the leading axes (frame, substep), as in `r2s.simulate`.
-    """
-    frames, substeps = controls.wind.shape[:2]
-    steps = jax.tree.map(lambda leaf: leaf.reshape(frames * substeps, *leaf.shape[2:]), controls)
-    finite = np.asarray(_finite(solver, fabric, start, steps))
-    failed = np.flatnonzero(~finite.all(axis=1))
-    if not len(failed):
-        return None
-    paths = jax.tree_util.tree_leaves_with_path(start)
-    names = [jax.tree_util.keystr(path).lstrip(".") for path, _ in paths]
-    wrong = tuple(name for name, fine in zip(names, finite[failed[0]], strict=True) if not fine)
-    return Failure(int(failed[0]) // substeps, int(failed[0]) % substeps, wrong)
+    outside = ~jnp.all(grid.inside(after))
+    thrown = jnp.any(jnp.abs(after - before) > grid.spacing)
+    unstable = ~_all_finite(after) | (outside & thrown)
+    code = jnp.where(outside, Failure.GRID.value, Failure.NONE.value)
+    code = jnp.where(unstable, Failure.TIME_STEP.value, code)
+    return jnp.where(_all_finite((before, inputs)), code, Failure.NON_FINITE.value)
 
 
-@eqx.filter_jit
-def _finite(solver, fabric, start, steps):
-    """Which fields of the state are finite at the end of every step: (step, field)."""
-
-    def step(state, control):
-        state = solver.step(fabric, state, control)
-        return state, jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state)])
-
-    return jax.lax.scan(step, start, steps)[1]
+def _all_finite(tree: Any) -> Array:
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))

@@ -1,19 +1,19 @@
-"""Between particles and grid: quadratic B-splines in 2-D and 3-D (MLS-MPM with APIC).
+"""Transfers between particles and grid: quadratic B-splines in 2-D and 3-D (MLS-MPM with APIC).
 
 With w_ip the weight of node i for particle p, and d_ip = x_i - x_p,
 
-    spread:   node_i = sum_p w_ip (value_p + slope_p d_ip)
-    collect:  value_p = sum_i w_ip node_i,   moment_p = sum_i w_ip node_i d_ip
+    p2g:  node_i = sum_p w_ip (value_p + slope_p d_ip)
+    g2p:  value_p = sum_i w_ip node_i,   moment_p = sum_i w_ip node_i d_ip
 
-each the transpose of the other. Since sum_i w d d^T is spacing^2 / 4 times the identity, the affine
-velocity of APIC is 4 / spacing^2 times the moment (Jiang, Schroeder, Selle, Teran and Stomakhin
-2015; Hu et al., "A moving least squares material point method", 2018).
+Each is the transpose of the other. Since sum_i w d d^T is spacing^2 / 4 times the identity, the
+affine velocity matrix C of APIC is 4 / spacing^2 times the moment (Jiang, Schroeder, Selle, Teran
+and Stomakhin 2015; Hu et al., "A moving least squares material point method", 2018).
 
-Both are written axis by axis (the weights are products over the axes), and one row of nodes a time:
-27 additions of (particle, channel) into the grid, which XLA makes in place, are faster on the CPU
-than one addition of all windows, sorted particles, or sums over cells. For the reverse mode both
-have a rule of their own, which gathers once for all that it needs: half the time of JAX's in 3-D.
-`g2p_plain` and `p2g_plain` have none, and so can be differentiated forward.
+Both work axis by axis (the weights are products over the axes), and with one row of nodes at a
+time: 27 additions of (particle, channel) into the grid, which XLA makes in place, are faster on the
+CPU than one addition of all windows, sorted particles, or sums over cells. Both have a rule of
+their own for the reverse mode, which gathers once for all that it needs: half the time of JAX's in
+3-D. `g2p_plain` and `p2g_plain` have none, so that they can be differentiated forward.
 """
 
 import itertools
@@ -32,33 +32,33 @@ Nodes = Float[Array, "node channel"]
 
 
 def affine_factor(grid: Grid) -> float:
-    """What turns a moment of velocities [m^2/s] into the affine velocity [1/s], [1/m^2]."""
+    """The factor [1/m^2] from a moment of velocities [m^2/s] to the affine velocity [1/s]."""
     return 4 / grid.spacing**2
 
 
 def p2g_plain(grid: Grid, x: Points, values: Values, slopes: Slopes) -> Nodes:
     """Sums at the nodes of values [unit] and slopes [unit/m] of particles at x [m].
 
-    Particles outside the grid are put on its border: see `Grid.inside`.
+    The stencil of a particle outside the grid is clipped to its border: see `Grid.inside`.
     """
     stencil = _Stencil(grid, x)
     nodes = jnp.zeros((math.prod(grid.shape), values.shape[1]), values.dtype)
-    weighted = _spread_axis(stencil.weights, *stencil.affine(values, slopes))
+    weighted = _p2g_axis(stencil.weights, *stencil.affine(values, slopes))
     for offset, part in zip(_offsets(grid), weighted, strict=True):
         nodes = nodes.at[stencil.first + offset].add(part, mode="promise_in_bounds")
     return nodes
 
 
 def g2p_plain(grid: Grid, x: Points, nodes: Nodes) -> tuple[Values, Slopes]:
-    """Weighted means [unit] and first moments [unit m] of a field, about particles at x [m]."""
+    """Weighted means [unit] and first moments [unit m] of a field around particles at x [m]."""
     stencil = _Stencil(grid, x)
-    value, *moments = _collect_axis(stencil.weights, stencil.rows(nodes))
+    value, *moments = _g2p_axis(stencil.weights, stencil.rows(nodes))
     moment = jnp.stack(moments, axis=2) * grid.spacing
     return value, moment - value[:, :, None] * stencil.away[:, None]
 
 
 def p2g_few(grid: Grid, x: Points, values: Values) -> Nodes:
-    """`p2g` without slopes in one addition: short to compile, for a few particles."""
+    """`p2g` without slopes in one addition, which compiles fast, for a few particles."""
     stencil = _Stencil(grid, x)
     weights = jnp.ones((x.shape[0], 1), x.dtype)
     for axis in stencil.weights:
@@ -72,8 +72,8 @@ def p2g_few(grid: Grid, x: Points, values: Values) -> Nodes:
 def _pairing_slope(grid: Grid, x: Points, values: Values, slopes: Slopes, nodes: Nodes) -> Points:
     """The derivative in x of sum_ip w_ip (value_p + slope_p d_ip) . node_i.
 
-    The derivative of that sum in the nodes is `p2g`, in values and slopes `g2p`; so this is
-    all that their reverse rules need beside each other.
+    The derivative of that sum in the nodes is `p2g`, in values and slopes `g2p`; this is the third
+    that their reverse rules need.
     """
     stencil = _Stencil(grid, x)
     rows = stencil.rows(nodes)
@@ -82,40 +82,40 @@ def _pairing_slope(grid: Grid, x: Points, values: Values, slopes: Slopes, nodes:
         jnp.sum(a * row, axis=1, keepdims=True) for a, row in zip(affine, rows, strict=True)
     ]
     _, *gradients = _slope_axis(stencil.weights, stencil.rates, products)
-    value, *_ = _collect_axis(stencil.weights, rows)
+    value, *_ = _g2p_axis(stencil.weights, rows)
     return jnp.concatenate(gradients, axis=1) - jnp.sum(value[:, :, None] * slopes, axis=1)
 
 
 @jax.custom_vjp
 def p2g(grid: Grid, x: Points, values: Values, slopes: Slopes) -> Nodes:
-    """`p2g_plain`, for reverse mode only, and faster there. Constant in the grid."""
-    return _spread_forward(grid, x, values, slopes)[0]
+    """`p2g_plain` with a faster reverse mode and no forward mode; constant in the grid."""
+    return _p2g_forward(grid, x, values, slopes)[0]
 
 
 @jax.custom_vjp
 def g2p(grid: Grid, x: Points, nodes: Nodes) -> tuple[Values, Slopes]:
-    """`g2p_plain`, for reverse mode only, and faster there. Constant in the grid."""
-    return _collect_forward(grid, x, nodes)[0]
+    """`g2p_plain` with a faster reverse mode and no forward mode; constant in the grid."""
+    return _g2p_forward(grid, x, nodes)[0]
 
 
-def _spread_forward(grid, x, values, slopes):
+def _p2g_forward(grid, x, values, slopes):
     inputs = _kept((x, values, slopes))
     return _kept(p2g_plain(grid, *inputs)), (grid, *inputs)
 
 
-def _spread_reverse(saved, nodes):
+def _p2g_reverse(saved, nodes):
     grid, x, values, slopes = saved
     nodes = _kept(nodes)
     slope = _pairing_slope(grid, x, values, slopes, nodes)
     return _no_slope(grid), *_kept((slope, *g2p_plain(grid, x, nodes)))
 
 
-def _collect_forward(grid, x, nodes):
+def _g2p_forward(grid, x, nodes):
     inputs = _kept((x, nodes))
     return _kept(g2p_plain(grid, *inputs)), (grid, *inputs)
 
 
-def _collect_reverse(saved, parts):
+def _g2p_reverse(saved, parts):
     grid, x, nodes = saved
     values, slopes = _kept(parts)
     slope = _pairing_slope(grid, x, values, slopes, nodes)
@@ -123,8 +123,8 @@ def _collect_reverse(saved, parts):
 
 
 def _kept(values):
-    """Values that are computed once and stored: XLA would compute them anew for each of their uses,
-    of which the transfers have many."""
+    """Values that XLA computes once and stores; it would compute them anew for each of the
+    transfers' many uses."""
     return jax.lax.optimization_barrier(values)
 
 
@@ -132,22 +132,22 @@ def _no_slope(grid: Grid) -> Grid:
     return jax.tree.map(jnp.zeros_like, grid)
 
 
-p2g.defvjp(_spread_forward, _spread_reverse)
-g2p.defvjp(_collect_forward, _collect_reverse)
+p2g.defvjp(_p2g_forward, _p2g_reverse)
+g2p.defvjp(_g2p_forward, _g2p_reverse)
 
 
 class _Stencil:
     """The nodes that each particle touches: three along each axis.
 
     - `first`: index of the first of them.
-    - `away`: from that to the particle, [m].
-    - `weights`, `rates`: of the three nodes along each axis, [-], and their derivatives, [1/m].
+    - `away`: vector from that node to the particle, [m].
+    - `weights`, `rates`: weights of the three nodes along each axis, [-], and derivatives, [1/m].
     """
 
     def __init__(self, grid: Grid, x: Points):
         place = (x - grid.lower[None]) / grid.spacing
         last = jnp.asarray(grid.shape, int)[None] - 3
-        # so that a particle that left, or is NaN, reaches no memory that is not the grid's
+        # clipped, so that a particle that left or is NaN reaches no memory beyond the grid
         first = jnp.clip(jnp.floor(place - 0.5).astype(int), 0, last)
         place = place - first.astype(place.dtype)
         strides = jnp.asarray(_strides(grid), int)[None]
@@ -163,11 +163,11 @@ class _Stencil:
 
     def rows(self, nodes: Nodes) -> list[Values]:
         """The field at each of the nodes."""
-        get = lambda offset: nodes.at[self.first + offset].get(mode="promise_in_bounds")
-        return [get(offset) for offset in self._offsets]
+        wheres = [self.first + offset for offset in self._offsets]
+        return [nodes.at[where].get(mode="promise_in_bounds") for where in wheres]
 
     def affine(self, values: Values, slopes: Slopes) -> tuple[Values, list[Values]]:
-        """The affine field of a particle at its first node, and what a node further adds."""
+        """The particles' affine fields at their first nodes, and the steps between nodes."""
         start = values - jnp.sum(slopes * self.away[:, None], axis=2)
         return start, [slopes[:, :, i] * self.spacing for i in range(slopes.shape[2])]
 
@@ -177,14 +177,14 @@ def _strides(grid: Grid) -> list[int]:
 
 
 def _offsets(grid: Grid) -> list[int]:
-    """From the index of a particle's first node to those of all, the last axis fastest."""
+    """Index differences from a particle's first node to all of its nodes, the last axis fastest."""
     strides = _strides(grid)
     steps = itertools.product(range(3), repeat=len(strides))
     return [sum(i * stride for i, stride in zip(step, strides, strict=True)) for step in steps]
 
 
 def _affine_axis(value, steps):
-    """An affine field at all nodes, from that at the first and its steps along the axes."""
+    """An affine field at all nodes, from its value at the first and its steps along the axes."""
     if not steps:
         return [value]
     return [
@@ -194,29 +194,29 @@ def _affine_axis(value, steps):
     ]
 
 
-def _spread_axis(weights, value, steps):
-    """The same, times the weights of the nodes."""
+def _p2g_axis(weights, value, steps):
+    """An affine field at all nodes, as `_affine_axis` gives it, times the nodes' weights."""
     if not weights:
         return [value]
     parts = []
     for i, weight in enumerate(weights[0]):
         here = value + i * steps[0] if i else value
-        parts += _spread_axis(weights[1:], weight * here, [weight * step for step in steps[1:]])
+        parts += _p2g_axis(weights[1:], weight * here, [weight * step for step in steps[1:]])
     return parts
 
 
-def _collect_axis(weights, rows):
-    """Weighted sum of rows, then those of rows times the number of the node along each axis."""
+def _g2p_axis(weights, rows):
+    """The weighted sum of rows, then those of rows times the node's number along each axis."""
     if not weights:
         return rows
-    parts = [_collect_axis(weights[1:], third) for third in _thirds(rows)]
+    parts = [_g2p_axis(weights[1:], third) for third in _thirds(rows)]
     moment = weights[0][1] * parts[1][0] + 2 * (weights[0][2] * parts[2][0])
     value, *others = (_dot(weights[0], part) for part in zip(*parts, strict=True))
     return [value, moment, *others]
 
 
 def _slope_axis(weights, rates, rows):
-    """Weighted sum of rows, then its derivatives along each axis."""
+    """The weighted sum of rows, then its derivatives along each axis."""
     if not weights:
         return rows
     parts = [_slope_axis(weights[1:], rates[1:], third) for third in _thirds(rows)]

@@ -1,15 +1,15 @@
-"""What a sheet does across its layers: compression and shear between them, and no tension.
+"""Compression and shear between the layers of a sheet in contact, without tension.
 
 Each triangle has a transverse direction d, at rest its unit normal n, which the grid's velocity
-gradient carries along. Where layers press on each other, it shortens and tilts. After Jiang, Gast
+gradient carries along. Where layers press on each other, d shortens and tilts. After Jiang, Gast
 and Teran, "Anisotropic elastoplasticity for cloth, knit and hair frictional contact" (ACM
 Transactions on Graphics 36(4), 2017), with
 
     energy per area = K / 3 max(c - r, 0)^3 + G / 2 |s|^2,   r = d . n,   s = d - r n
 
-and their return mapping: a separated layer forgets (r = 1, s = 0), a pressed one slides when the
-shear stress exceeds friction times the pressure. The grid makes layers feel each other when they
-are three spacings apart; so that they come closer, they press only from a shortening to c < 1 on.
+and their return mapping: a separated layer returns to r = 1 and s = 0, a pressed one slides when
+the shear stress exceeds friction times the pressure. Through the grid, layers interact from a
+distance of three spacings; they press only from a shortening to c < 1 on, so that they come closer.
 """
 
 import equinox as eqx
@@ -19,11 +19,13 @@ from jaxtyping import Array, Float
 
 Vector = Float[Array, " 3"]
 
-SHEARED = 1e-6  # [-]: a tilt below which its direction is blurred
+SMOOTHING = 1e-6  # [-]: added to the tilt's norm, which is then differentiable at no tilt
 
 
 class Transverse(eqx.Module):
-    """- `compression`, `shear`: K and G, force per width, [N/m].
+    """The stiffnesses of contact between layers.
+
+    - `compression`, `shear`: K and G, force per width, [N/m].
     - `onset`: c, [-].
     """
 
@@ -39,38 +41,38 @@ class Transverse(eqx.Module):
             self.compression / 3 * jnp.maximum(self.onset - along, 0) ** 3 + self.shear / 2 * tilt
         )
 
-    def settled(
+    def return_mapping(
         self, corners: Float[Array, "3 3"], direction: Vector, friction: Float[Array, ""]
     ) -> Vector:
-        """The direction [-] after the return mapping."""
+        """The transverse direction [-] that friction and separation leave."""
         normal = unit_normal(corners)
         along = direction @ normal
         tilt = direction - along * normal
         along = jnp.minimum(along, 1)
         limit = friction * self.compression * jnp.maximum(self.onset - along, 0) ** 2 / self.shear
-        size = jnp.sqrt(tilt @ tilt + SHEARED**2)
+        size = jnp.sqrt(tilt @ tilt + SMOOTHING**2)
         return along * normal + jnp.minimum(limit / size, 1) * tilt
 
     def stress(
         self, corners: Float[Array, "3 3"], direction: Vector
     ) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
         """Forces on the corners per rest area [Pa], and the Kirchhoff stress times the thickness
-        [N/m], to which the grid answers.
+        [N/m], which goes to the grid.
 
-        Together they exert no torque, since rotations leave the energy as it is.
+        Together they exert no torque, since rotations do not change the energy.
         """
-        slope, pull = jax.grad(self.energy, argnums=(0, 1))(corners, direction)
-        return -slope, pull[:, None] * direction[None]
+        in_corners, in_direction = jax.grad(self.energy, argnums=(0, 1))(corners, direction)
+        return -in_corners, in_direction[:, None] * direction[None]
 
     def frequency(self, density: Float[Array, ""], spacing: float) -> Float[Array, ""]:
-        """A bound on the square of its highest frequency [1/s^2] on a grid, half crushed at most.
+        """A bound on the square of the highest frequency [1/s^2] on a grid, for d >= 1/2.
 
-        From the areal density [kg/m^2] and the grid's spacing [m]; as of a solid block.
+        `density` is areal [kg/m^2], `spacing` that of the grid [m]; see `block.stable_step`.
         """
         return 4 * jnp.maximum(self.compression, self.shear) / (density * spacing**2)
 
 
 def unit_normal(corners: Float[Array, "3 3"]) -> Vector:
-    """Of a triangle [-]."""
+    """The unit normal of a triangle [-]."""
     normal = jnp.cross(corners[1] - corners[0], corners[2] - corners[0])
     return normal / jnp.sqrt(normal @ normal)

@@ -3,9 +3,10 @@
 import hashlib
 import re
 from collections.abc import Iterable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
 
+from r2s.extras import require
 from r2s.files import write_text
 from r2s.recordings.manifest import (
     Manifest,
@@ -72,7 +73,9 @@ def _convert_one(
     is_there = file.is_file() and mark.is_file()
     if is_there and not force and mark.read_text(encoding="utf-8").strip() == made_from:
         return f"up to date, {file}"
-    recording = read_recording(root, manifest, name, lambda frames: _progress(frames, label))
+    tqdm = require("tqdm", "study", "progress bars").tqdm
+    bar = partial(tqdm, desc=label, unit=" frames", disable=None, leave=False)
+    recording = read_recording(root, manifest, name, bar)
     save(recording, file)
     write_text(mark, made_from + "\n")
     points = int(recording.mask.sum())
@@ -87,11 +90,3 @@ def _fingerprint(root: Path, files: Iterable[Path]) -> str:
         with open(file, "rb") as data:
             total.update(hashlib.file_digest(data, "sha256").digest())
     return total.hexdigest()
-
-
-def _progress(frames: Iterable[Any], label: str) -> Iterable[Any]:
-    try:
-        from tqdm import tqdm
-    except ImportError as error:
-        raise ImportError("progress needs tqdm: pip install 'r2s[study]'") from error
-    return tqdm(frames, label, unit=" frames", disable=None, leave=False)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from r2s.extras import require
 from r2s.files import read_json
 from r2s.recordings.manifest import (
     Manifest,
@@ -129,7 +130,7 @@ def _download_all(data: Dataset, folder: Path) -> Iterator[str]:
             yield _fetch_file(folder, path, download)
         except (ValueError, OSError) as error:
             problems.append(str(error))
-    _raise(problems)
+    _raise_all(problems)
 
 
 def _fetch_file(folder: Path, path: str, download: Download) -> str:
@@ -172,7 +173,7 @@ def _resume(url: str, part: Path, output: Any) -> None:
     headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={start}-"} if start else {})
     try:
         with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT) as answer:
-            if answer.status_code == 416 and _whole(answer) == start:
+            if answer.status_code == 416 and _total_size(answer) == start:
                 os.replace(part, output)  # it broke off between the last byte and the move
                 return
             if answer.status_code == 416:
@@ -194,7 +195,7 @@ def _resume(url: str, part: Path, output: Any) -> None:
     os.replace(part, output)
 
 
-def _whole(answer: Any) -> int | None:
+def _total_size(answer: Any) -> int | None:
     """The size of a file [byte] that a server names when it has no such range."""
     match = re.fullmatch(r"bytes \*/(\d+)", answer.headers.get("Content-Range", ""))
     return int(match[1]) if match else None
@@ -240,26 +241,24 @@ def _check_recordings(data: Manifest, folder: Path) -> Iterator[str]:
         folders = sorted({path.partition("/")[0] for path in missing})
         problems.append(
             f"{data.name}: cannot be downloaded automatically ({data.licence}). Get it from "
-            f"{source} and put into {folder}: {_some(folders) or 'the folders of the recordings'}"
+            f"{source} and put into {folder}: "
+            f"{_shortened(folders) or 'the folders of the recordings'}"
         )
-    _raise(problems)
+    _raise_all(problems)
 
 
-def _some(names: Iterable[str], most: int = 6) -> str:
+def _shortened(names: Iterable[str], most: int = 6) -> str:
     names = list(names)
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
 
 
-def _raise(problems: list[str]) -> None:
+def _raise_all(problems: list[str]) -> None:
     if problems:
         raise ValueError("; ".join(problems))
 
 
 def _pooch() -> Any:
-    try:
-        import pooch
-    except ImportError as error:
-        raise ImportError("downloads need pooch: pip install 'r2s[data]'") from error
+    pooch = require("pooch", "data", "downloads")
     pooch.get_logger().setLevel("ERROR")  # what is done is said here
     return pooch

@@ -135,13 +135,8 @@ def hash_values(values: np.ndarray) -> str:
 
 
 def default_manifest() -> Path:
-    """The manifest of the public DIFFCLOUD recordings.
-
-    In the repository the manifests lie beside the package, in an installation within it.
-    """
-    package = Path(__file__).parent
-    within = package / "data_manifests"
-    return (within if within.is_dir() else package.parent / "data_manifests") / "diffcloud.json"
+    """The manifest of the public DIFFCLOUD recordings, which comes with the package."""
+    return Path(__file__).parents[1] / "data_manifests" / "diffcloud.json"
 
 
 def manifest_for(folder: Path | str) -> Manifest:
@@ -194,9 +189,9 @@ def sources(folder: Path | str, manifest: Manifest, name: str) -> list[Path]:
     """
     folder = Path(folder)
     gripper = folder / manifest.scenarios[_scenario_of(manifest, name)[0]].gripper.file
-    about = (manifest_of(folder), gripper, find_rig(folder / name))
     inside = (path for path in (folder / name).rglob("*") if path.parent.name != "colour")
-    return sorted({path for path in (*about, *inside) if path is not None and path.is_file()})
+    files = (manifest_of(folder), gripper, find_rig(folder / name), *inside)
+    return sorted({path for path in files if path is not None and path.is_file()})
 
 
 def read_recording(

@@ -125,11 +125,15 @@ def make_recording(
 ) -> Recording:
     """Pad ragged clouds into a Recording.
 
-    `clouds`: one (points, 3) array [m] per frame, or None: the markers that are seen; `times`:
-    (frame,) [s], `info.time_offset` included; `handle_path`: (knot, handle, 3), or (knot, 3) for
-    one handle [m]; `handle_times`: (knot,) [s]; `force`: (sample,) or (sample, 3) [N] at
-    `force_times` [s]; `markers`: (frame, marker, 3) [m], and `markers_seen`: (frame, marker), by
-    default wherever the markers are finite. Floats take JAX's default precision.
+    - `clouds`: one (points, 3) array per frame, [m]; None: the markers that are seen.
+    - `times`: (frame,), `info.time_offset` included, [s].
+    - `handle_path`: (knot, handle, 3), or (knot, 3) for one handle, [m].
+    - `handle_times`: (knot,), [s].
+    - `force`, `force_times`: (sample,) or (sample, 3) [N], and (sample,) [s].
+    - `markers`: (frame, marker, 3), [m].
+    - `markers_seen`: (frame, marker); None: wherever the markers are finite.
+
+    Floats take JAX's default precision.
 
     Raises ValueError that names the recording, and the frame where there is one: no frames, a
     cloud that is empty or not finite or not (points, 3), times that do not increase, a path of
@@ -160,7 +164,6 @@ def make_recording(
     except ValueError as error:
         raise ValueError(f"recording {info.name}: {error}") from error
     points, mask = _pad(checked, max(map(len, checked)))
-    floats = lambda values: None if values is None else jnp.asarray(values, float)
     return Recording(
         points=jnp.asarray(points, float),
         mask=jnp.asarray(mask),
@@ -168,9 +171,9 @@ def make_recording(
         handle_path=jnp.asarray(path, float),
         handle_times=jnp.asarray(knots, float),
         info=info,
-        force=floats(log and log[0]),
-        force_times=floats(log and log[1]),
-        markers=floats(marks and marks[0]),
+        force=_floats(log and log[0]),
+        force_times=_floats(log and log[1]),
+        markers=_floats(marks and marks[0]),
         markers_seen=None if marks is None else jnp.asarray(marks[1]),
     )
 
@@ -372,6 +375,10 @@ def _check_path(path: Any, held: tuple[str, ...]) -> np.ndarray:
     if not np.isfinite(path).all():
         raise ValueError("the handle path must be finite [m]")
     return path
+
+
+def _floats(values: np.ndarray | None) -> Array | None:
+    return None if values is None else jnp.asarray(values, float)
 
 
 def _pad(clouds: Sequence[np.ndarray], width: int) -> tuple[np.ndarray, np.ndarray]:

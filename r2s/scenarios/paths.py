@@ -38,7 +38,7 @@ LIMITS: dict[str, dict[str, tuple[float, float]]] = {
     "fling": {"gap": (0.85, 1.0), "forward": (0.2, 0.45), "there": (0.4, 0.7), "back": (0.5, 0.9)},
     "shaking": {"gap": (0.85, 1.0), "amplitude": (0.03, 0.08), "frequency": (1.0, 2.0)},
 }
-"""Of each number of each scenario, between which it is drawn; units as of the functions."""
+"""Of each number of each scenario, between which it is drawn; units: see the functions."""
 
 ESTIMATION, EVALUATION = 40, 120  # motions of each scenario in the study
 

@@ -7,7 +7,7 @@ any scenario, by either solver, on any mesh and with any step.
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,7 +27,7 @@ from r2s.recordings.recording import (
     corner,
     make_recording,
 )
-from r2s.scenarios.energy import clamp_force, energy_balance
+from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
 from r2s.scenarios.paths import Route
 from r2s.scenarios.scenario import Scenario, rollout
 from r2s.scenarios.six import SIDE, Experiment
@@ -80,10 +80,10 @@ def sensing(experiment: Experiment) -> Sensing:
     middle = corners.mean(axis=0)
     eyes = middle + np.array([(-0.35, -1.1, 0.15), (0.55, -1.0, 0.4)])
     target = middle + np.array([0.0, 0.1, 0.0])
-    array = lambda values: jnp.asarray(values, float)
     low, high = corners.min(axis=0) - [0.1, 0.3, 0.1], corners.max(axis=0) + [0.1, 0.5, 0.1]
     region = (tuple(low.tolist()), tuple(high.tolist()))
-    return Sensing(tuple(Camera(array(eye), array(target)) for eye in eyes), region)
+    target = jnp.asarray(target, float)
+    return Sensing(tuple(Camera(jnp.asarray(eye, float), target) for eye in eyes), region)
 
 
 WHOLE = Sensing((), ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), 10_000, 0.0, 0.0, margin=-math.inf)
@@ -103,22 +103,29 @@ def record(
     solver: Callable[[Scenario, Fabric], Solver] | None = None,
     key: PRNGKeyArray,
 ) -> Recording:
-    """A recording of an experiment with a fabric; `name` and `trial` say which.
+    """Record a simulated experiment with a fabric.
 
-    Seen by default as `sensing` says. Made by the cloth with `shape` vertices and steps of at most
-    `max_step` [s], with `self_contact` so that it does not pass through itself; or by another
-    solver, such as `r2s.scenarios.material_points`. A finer mesh and shorter steps than the
-    estimators' make a recording that is not their own model's. That of a stretching has markers and
-    the force on the pulled clamp. The same key gives the same recording. Raises `RuntimeError` when
-    the simulation
-    diverges.
+    - `name`, `trial`: of the fabric and of the repetition.
+    - `seen`: cameras and their errors; None: those of `sensing`.
+    - `shape`: vertices along warp and weft. `max_step`: longest time step, [s]. A finer mesh and
+      shorter steps than the estimators' make a recording that is not their own model's.
+    - `self_contact`: whether the sheet touches itself.
+    - `solver`: makes another solver than the cloth, such as `r2s.scenarios.material_points`.
+    - `key`: the same one gives the same recording.
+
+    The recording of a stretching has markers and the force on the pulled clamp. Raises
+    `RuntimeError` that says why when the simulation diverges.
     """
     seen = sensing(experiment) if seen is None else seen
     scenario = experiment.scenario(shape, self_contact)
-    about = scenario, fabric, max_step, None if solver is None else solver(scenario, fabric)
-    found = _account(*about) if experiment.name == "stretching" else None
-    moved = (_motion(*about) if found is None else found).x
-    _check(moved, name)
+    made = None if solver is None else solver(scenario, fabric)
+    balance = None
+    if experiment.name == "stretching":
+        balance = _energy_balance(scenario, fabric, max_step, made)
+    x = balance.x if balance is not None else _rollout(scenario, fabric, max_step, made).x
+    if not jnp.all(jnp.isfinite(x)):
+        failure = _rollout(scenario, fabric, max_step, made).explain()
+        raise RuntimeError(f"the simulation of {name} {failure}")
     errors = f"camera noise {1e3 * seen.noise:g} mm, {seen.outliers:.0%} outliers"
     errors += f", {seen.dropped:.0%} dropped" if seen.dropped else ""
     info = RecordingInfo(
@@ -133,31 +140,31 @@ def record(
         verified=None,
         wind=experiment.wind,
     )
-    clouds = _clouds(moved, scenario, seen, key)
+    clouds = _clouds(x, scenario, seen, key)
     times = np.asarray(experiment.times) + seen.time_offset
-    route = _lasting(experiment.route, times[-1])
-    if found is None:
-        return make_recording(clouds, times, route.path, route.times, info)
+    route = _extended(experiment.route, times[-1])
+    measured = {} if balance is None else _measured(experiment, scenario, balance, key)
+    return make_recording(clouds, times, route.path, route.times, info, **measured)
+
+
+def _measured(
+    experiment: Experiment, scenario: Scenario, balance: EnergyBalance, key: PRNGKeyArray
+) -> dict[str, Any]:
+    """The force on the pulled clamp and the markers of a stretching, with their errors."""
     key_markers, key_force = jr.split(jr.fold_in(key, 1))
-    force = np.asarray(clamp_force(scenario, found))
-    force = force + FORCE_NOISE * np.asarray(jr.normal(key_force, force.shape, float))
-    return make_recording(
-        clouds,
-        times,
-        route.path,
-        route.times,
-        info,
-        force=force,
-        force_times=experiment.times,
-        markers=_markers(moved, scenario, key_markers),
-    )
+    force = np.asarray(clamp_force(scenario, balance))
+    return {
+        "force": force + FORCE_NOISE * np.asarray(jr.normal(key_force, force.shape, float)),
+        "force_times": experiment.times,
+        "markers": _markers(balance.x, scenario, key_markers),
+    }
 
 
 def lift(fabric: Fabric, name: str, trial: int, *, key: PRNGKeyArray) -> Recording:
-    """A recording of one corner lifted from the table by 0.35 m and drawn inward.
+    """Record one corner that is lifted from the table by 0.35 m and drawn inward.
 
     `trial` names the repetition, `key` its noise and the 2 mm by which its path differs. Raises
-    `RuntimeError` when the simulation diverges.
+    as `record`.
     """
     inward = 0.15 / np.sqrt(2)
     knots = [(0.0, 0.0, 0.002), (0.5 * inward, 0.5 * inward, 0.2), (inward, inward, 0.35)]
@@ -165,7 +172,7 @@ def lift(fabric: Fabric, name: str, trial: int, *, key: PRNGKeyArray) -> Recordi
 
 
 def fold(fabric: Fabric, name: str, trial: int, *, key: PRNGKeyArray) -> Recording:
-    """A recording of one corner brought over to the opposite one; otherwise as `lift`."""
+    """Record one corner that is brought over to the opposite one; otherwise as `lift`."""
     angles = np.linspace(0, np.pi, 9)
     reach, height = 0.46 * SIDE, 0.5 * SIDE
     knots = [(reach * (1 - np.cos(a)), reach * (1 - np.cos(a)), height * np.sin(a)) for a in angles]
@@ -199,14 +206,7 @@ def _record(fabric, name, scenario, trial, held, knots, frames_used, key) -> Rec
     return record(experiment, fabric, name, trial, key=key_view)
 
 
-def _check(x: Float[Array, "frame vertex 3"], name: str) -> None:
-    finite = np.isfinite(np.asarray(x)).all(axis=(1, 2))
-    if not finite.all():
-        first = int(np.argmin(finite))
-        raise RuntimeError(f"the simulation of {name} diverged in frame {first}: positions")
-
-
-def _lasting(route: Route, end: float) -> Route:
+def _extended(route: Route, end: float) -> Route:
     """The route, at rest after its end until `end` [s]."""
     if route.times[-1] >= end:
         return route
@@ -214,8 +214,8 @@ def _lasting(route: Route, end: float) -> Route:
     return Route(times, np.concatenate([route.path, route.path[-1:]]))
 
 
-_motion = eqx.filter_jit(rollout)
-_account = eqx.filter_jit(energy_balance)
+_rollout = eqx.filter_jit(rollout)
+_energy_balance = eqx.filter_jit(energy_balance)
 
 
 def _markers(x, scenario: Scenario, key) -> np.ndarray:
@@ -224,8 +224,8 @@ def _markers(x, scenario: Scenario, key) -> np.ndarray:
     along = (np.arange(MARKERS) + 0.5) / MARKERS
     places = np.stack(np.meshgrid(along, along, indexing="ij"), -1).reshape(-1, 2)
     places = jnp.asarray(places * np.asarray(mesh.rest).max(axis=0), float)
-    flat = lambda points: jnp.pad(points, ((0, 0), (0, 1)))
-    faces, weights = nearest(flat(places), flat(mesh.rest), mesh.faces)
+    in_plane = (0, 0), (0, 1)  # z = 0
+    faces, weights = nearest(jnp.pad(places, in_plane), jnp.pad(mesh.rest, in_plane), mesh.faces)
     markers = jnp.einsum("mk,tmki->tmi", weights, x[:, mesh.faces[faces]])
     return np.asarray(markers + MARKER_NOISE * jr.normal(key, markers.shape, float))
 
@@ -241,8 +241,9 @@ def _clouds(x, scenario: Scenario, seen: Sensing, key) -> list[np.ndarray]:
 
 @eqx.filter_jit
 def _observe(x, faces, resolution: int, lowest, seen: Sensing, keys):
-    frame = lambda x, key: _observe_frame(x, faces, resolution, lowest, seen, key)
-    return jax.vmap(frame)(x, keys)
+    return jax.vmap(
+        lambda x, key: _observe_frame(x, faces, resolution, lowest, seen, key),
+    )(x, keys)
 
 
 def _observe_frame(x: Float[Array, "vertex 3"], faces, resolution: int, lowest, seen: Sensing, key):

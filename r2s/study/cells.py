@@ -1,7 +1,7 @@
 """Cells of a study: pure functions of their configuration, each kept in one file.
 
-A cell is a frozen dataclass: what it is made from are fields, other cells among them. Its key is a
-hash of all of that, so a file that is there for a key is the result, and is not made again.
+A cell is a frozen dataclass whose fields say what it is made from, other cells among them. Its key
+is a hash of all of that, so a file that is there for a key is the result, and is not made again.
 """
 
 import json
@@ -11,7 +11,7 @@ import tempfile
 import time
 import zipfile
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from hashlib import sha256
@@ -23,7 +23,7 @@ from r2s.files import write_bytes
 
 FORMAT = "r2s-cell/1"
 KEY_LENGTH = 16  # of a key in the name of a file, hexadecimal digits
-ABOUT = "about.json"
+METADATA = "about.json"  # among the files of a result
 VERSIONS = {name: version(name) for name in ("r2s", "jax", "jaxlib", "numpy")}
 
 
@@ -45,14 +45,14 @@ class Cell:
 
     @property
     def alike(self) -> str:
-        """Cells of the same value run faster one after the other: they compile once."""
+        """The group of the cell. Those of one group compile once, and run one after the other."""
         return self.kind
 
     @abstractmethod
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
-        """Write the result's files into the folder `out`; what is to be noted of it.
+        """Write the result's files into the folder `out`, and return what is to be noted of it.
 
-        The results of `needs` are opened in the study's `folder`. The same cell gives the same
+        The results of `dependencies` are in the study's `folder`. The same cell gives the same
         numbers.
         """
 
@@ -70,15 +70,26 @@ class Cell:
         return zipfile.is_zipfile(self.path(folder))
 
 
-def needs(cell: Cell) -> tuple[Cell, ...]:
+def dependencies(cell: Cell) -> tuple[Cell, ...]:
     """The cells that a cell is made from: those in its fields."""
-    found: list[Cell] = []
-    for field in fields(cell):
-        value = getattr(cell, field.name)
-        for part in value if isinstance(value, tuple) else (value,):
-            if isinstance(part, Cell) and part not in found:
-                found.append(part)
-    return tuple(found)
+    values = [getattr(cell, field.name) for field in fields(cell)]
+    parts = [part for value in values for part in (value if isinstance(value, tuple) else [value])]
+    return tuple(dict.fromkeys(part for part in parts if isinstance(part, Cell)))
+
+
+def with_dependencies(cells: Iterable[Cell]) -> list[Cell]:
+    """The cells and all that they need, what is needed first."""
+    found: dict[Cell, None] = {}
+
+    def visit(cell: Cell) -> None:
+        if cell not in found:
+            for need in dependencies(cell):
+                visit(need)
+            found[cell] = None
+
+    for cell in cells:
+        visit(cell)
+    return list(found)
 
 
 def execute(cell: Cell, folder: Path) -> None:
@@ -89,7 +100,7 @@ def execute(cell: Cell, folder: Path) -> None:
     began, spent = time.perf_counter(), time.process_time()
     with tempfile.TemporaryDirectory(prefix="r2s-") as scratch:
         noted = cell.make(folder, Path(scratch))
-        about = {
+        metadata = {
             "format": FORMAT,
             "key": cell.key,
             "kind": cell.kind,
@@ -101,22 +112,22 @@ def execute(cell: Cell, folder: Path) -> None:
             "peak_memory_MB": _peak_memory(),  # of the process so far
             **noted,
         }
-        packed = _pack(Path(scratch), about)
+        packed = _pack(Path(scratch), metadata)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, packed)
 
 
-def about(cell: Cell, folder: Path) -> dict[str, Any]:
+def read_metadata(cell: Cell, folder: Path) -> dict[str, Any]:
     """What was noted of a cell that is made: configuration, versions, times, memory, divergence."""
     with zipfile.ZipFile(cell.path(folder)) as packed:
-        return json.loads(packed.read(ABOUT))
+        return json.loads(packed.read(METADATA))
 
 
 @contextmanager
-def opened(cell: Cell, folder: Path) -> Iterator[Path]:
+def result_files(cell: Cell, folder: Path) -> Iterator[Path]:
     """A folder with the files of a cell that is made, for as long as the context lasts.
 
-    Raises `FileNotFoundError` when it is not, and `zipfile.BadZipFile` when it is damaged.
+    Raises `FileNotFoundError` when it is not made, and `zipfile.BadZipFile` when it is damaged.
     """
     with tempfile.TemporaryDirectory(prefix="r2s-") as scratch:
         with zipfile.ZipFile(cell.path(folder)) as packed:
@@ -124,8 +135,8 @@ def opened(cell: Cell, folder: Path) -> Iterator[Path]:
         yield Path(scratch)
 
 
-def _pack(scratch: Path, about: dict[str, Any]) -> bytes:
-    (scratch / ABOUT).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+def _pack(scratch: Path, metadata: dict[str, Any]) -> bytes:
+    (scratch / METADATA).write_text(json.dumps(metadata, indent=2) + "\n", encoding="utf-8")
     whole = scratch / ".whole.zip"
     with zipfile.ZipFile(whole, "w", zipfile.ZIP_DEFLATED) as packed:
         for file in sorted(scratch.iterdir()):

@@ -1,18 +1,19 @@
-"""Runs the cells of a study in the order of their needs, here or on workers.
+"""Runs the cells of a study in the order of their dependencies, here or on workers.
 
 Nothing that is finished is lost: a result is there whole or not at all, a cell that fails does not
 stop the others, and a run that was killed goes on where it was.
 """
 
 import sys
-from collections import defaultdict, deque
-from collections.abc import Iterable, Iterator
+from collections import deque
+from collections.abc import Container, Iterable, Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from tqdm import tqdm
 
-from r2s.study.cells import Cell, execute, needs
+from r2s.study.cells import Cell, dependencies, execute, with_dependencies
 
 
 @runtime_checkable
@@ -20,16 +21,18 @@ class Runner(Protocol):
     """What makes cells: here one after the other, or elsewhere many at once."""
 
     def submit(self, cell: Cell, folder: Path) -> None:
-        """Take a cell whose needs are made."""
+        """Take a cell whose dependencies are made."""
         ...
 
     def finished(self) -> Iterator[tuple[Cell, str]]:
-        """Each cell when it is done, with why it failed, or "". Others may be submitted meanwhile;
-        ends when none is left."""
+        """Yield each cell when it is done, with why it failed, or "".
+
+        Others may be submitted meanwhile. The iterator ends when none is left.
+        """
         ...
 
     def close(self) -> None:
-        """Give back workers."""
+        """Release the workers."""
         ...
 
 
@@ -53,7 +56,7 @@ class Serial:
             yield cell, self.make(cell, folder)
 
     def make(self, cell: Cell, folder: Path) -> str:
-        """Why it failed, or ""."""
+        """Make a cell and return why it failed, or ""."""
         return attempt(cell, folder)
 
     def close(self) -> None:
@@ -61,7 +64,10 @@ class Serial:
 
 
 def attempt(cell: Cell, folder: Path, key: str | None = None) -> str:
-    """Make a cell; why it failed, or "". `key`: what it is to the caller, who may be elsewhere."""
+    """Make a cell and return why it failed, or "".
+
+    `key`: the cell's key in the process that asks, which may have another version of r2s.
+    """
     if key not in (None, cell.key):
         return "a worker has another version of r2s: install the same everywhere"
     try:
@@ -71,56 +77,36 @@ def attempt(cell: Cell, folder: Path, key: str | None = None) -> str:
     return ""
 
 
-def closure(cells: Iterable[Cell]) -> list[Cell]:
-    """The cells and all that they need, what is needed first."""
-    found: dict[Cell, None] = {}
-
-    def visit(cell: Cell) -> None:
-        if cell not in found:
-            for need in needs(cell):
-                visit(need)
-            found[cell] = None
-
-    for cell in cells:
-        visit(cell)
-    return list(found)
-
-
 def run(cells: Iterable[Cell], folder: Path, runner: Runner) -> dict[Cell, str]:
-    """Make the cells and what they need; those that are missing at the end, each with its reason.
+    """Make cells and what they need; return those that are missing at the end, with the reason.
 
-    Those that are made already are left alone, those that failed before are tried again.
+    Cells that are made already are left alone, those that failed before are tried again.
     """
-    waiting = {cell: None for cell in closure(cells) if not cell.is_made(folder)}
-    wanting = {cell: {need for need in needs(cell) if need in waiting} for cell in waiting}
-    dependents = defaultdict(list)
-    for cell, missing in wanting.items():
-        for need in missing:
-            dependents[need].append(cell)
+    waiting = {cell: None for cell in with_dependencies(cells) if not cell.is_made(folder)}
+    order = TopologicalSorter({cell: _waiting_for(cell, waiting) for cell in waiting})
+    order.prepare()
     failed: dict[Cell, str] = {}
     shape = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}, about {remaining} left{postfix}"
     total = sum(cell.weight for cell in waiting)
     with tqdm(total=total, desc="study", bar_format=shape, disable=None, smoothing=0.1) as bar:
-        for cell in waiting:
-            if not wanting[cell]:
-                runner.submit(cell, folder)
+        for cell in order.get_ready():
+            runner.submit(cell, folder)
         for cell, reason in runner.finished() if waiting else ():
             bar.update(cell.weight)
             bar.set_postfix_str(f"{cell.kind} {cell.name}")
             if reason:
                 tqdm.write(f"missing: {cell.kind} {cell.name}: {reason}", file=sys.stderr)
-                _give_up(cell, reason, dependents, failed)
+                failed[cell] = reason
                 continue
-            for other in dependents[cell]:
-                wanting[other].discard(cell)
-                if not wanting[other] and other not in failed:
-                    runner.submit(other, folder)
+            order.done(cell)
+            for other in order.get_ready():
+                runner.submit(other, folder)
+    for cell in waiting:  # what is needed comes first
+        lost = [need for need in _waiting_for(cell, waiting) if need in failed]
+        if lost:
+            failed[cell] = f"needs {lost[0].kind} {lost[0].name}, which is missing"
     return failed
 
 
-def _give_up(cell: Cell, reason: str, dependents, failed: dict[Cell, str]) -> None:
-    """Note that a cell failed, and all that need it."""
-    failed[cell] = reason
-    for other in dependents[cell]:
-        if other not in failed:
-            _give_up(other, f"needs {cell.kind} {cell.name}, which is missing", dependents, failed)
+def _waiting_for(cell: Cell, waiting: Container[Cell]) -> list[Cell]:
+    return [need for need in dependencies(cell) if need in waiting]

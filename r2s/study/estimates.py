@@ -15,7 +15,7 @@ from r2s.estimation.physnet.method import TrainingBudget, train_network
 from r2s.estimation.registry import METHODS
 from r2s.fabrics.fabric import Fabric
 from r2s.files import write_json
-from r2s.study.cells import Cell, opened
+from r2s.study.cells import Cell, result_files
 from r2s.study.sources import Source, read
 
 ESTIMATE, NETWORK = "estimate.json", "network.eqx"
@@ -131,7 +131,7 @@ class EstimateCell(Cell):
             return self._method().estimate(recordings, space, budget, key=key)
         if self.network is None:
             raise ValueError("PhysNet needs a trained network")
-        with opened(self.network, folder) as files:
+        with result_files(self.network, folder) as files:
             method = self._method(network=files / NETWORK)
             return method.estimate(recordings, space, budget, key=key)
 
@@ -161,7 +161,7 @@ class EstimateCell(Cell):
 
 def read_estimate(cell: EstimateCell, folder: Path) -> Estimate | None:
     """The estimate of a cell that is made; None where it diverged."""
-    with opened(cell, folder) as files:
+    with result_files(cell, folder) as files:
         if not (files / ESTIMATE).exists():
             return None
         return from_json(json.loads((files / ESTIMATE).read_text(encoding="utf-8")))

@@ -13,30 +13,30 @@ import numpy as np
 from jaxtyping import Float
 
 from r2s.evaluation import prediction_error
+from r2s.evaluation.prediction_error import Motion
 from r2s.fabrics.fabric import Fabric
 from r2s.files import write_json
 from r2s.mpm.sheet import Sheet, longest_edge, stable_step
 from r2s.recordings.recording import Recording
 from r2s.scenarios.on_points import EDGE, MEMBRANE_DAMPING, grid_around
-from r2s.scenarios.scenario import Scenario, from_recording, rollout
-from r2s.study.cells import Cell, opened
+from r2s.scenarios.scenario import Scenario, from_recording
+from r2s.study.cells import Cell, result_files
+from r2s.study.configuration import Configuration
 from r2s.study.estimates import EstimateCell, default_fabric, read_estimate
 from r2s.study.sources import GivenRecording, Source, read
-from r2s.study.statistics.panel import Column
 
 MEASURED, MOTION = "measured.json", "motion.npz"
 LADDER = math.sqrt(2)  # steps between frames are powers of this: few programs to compile
-
-_motion = eqx.filter_jit(rollout)
 
 
 @dataclass(frozen=True)
 class EvaluationCell(Cell):
     """How near simulations of a fabric come to recordings of one scenario.
 
-    - `estimate`: whose fabric; None: the default one of `solver` with that areal `density`.
-    - `recordings`: judged against, together, since they compile once.
-    - `other`: `estimate` is that of another fabric, for comparison.
+    - `estimate`: whose fabric is judged; None: the default one of `solver` with an areal `density`
+      [kg/m^2].
+    - `recordings`: what it is judged by, together, since they compile once.
+    - `other`: whether `estimate` is that of another fabric, for comparison.
     - `every`: 1 compares all frames that count, 3 every third.
     """
 
@@ -57,11 +57,11 @@ class EvaluationCell(Cell):
         return self.recordings[0].scenario
 
     @property
-    def column(self) -> Column:
+    def configuration(self) -> Configuration:
         """Whose fabric it is: an approach's on a solver, or the default one."""
         if self.estimate is None:
-            return Column("", self.solver, "")
-        return Column(self.estimate.approach, self.solver, self.estimate.scenario)
+            return Configuration("", self.solver, "")
+        return Configuration(self.estimate.approach, self.solver, self.estimate.scenario)
 
     @property
     def repeat(self) -> str:
@@ -79,28 +79,24 @@ class EvaluationCell(Cell):
         return f"evaluations {self.solver} {self.scenario}"
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
-        """Metrics of every recording, and the motion beside the first."""
+        """Simulate every recording's motion: metrics of each, the motion beside the first, and why
+        a run diverged."""
         recordings = [read(source, folder) for source in self.recordings]
         fabric = self._fabric(folder)
         if fabric is None:
-            shape = (len(recordings[0].times), 81, 3)
-            motions = [np.full(shape, np.nan)] * len(recordings)
+            lost = np.full((len(recordings[0].times), 81, 3), np.nan)
+            motions = [Motion(lost, "the estimate diverged")] * len(recordings)
         else:
             motions = predict(recordings, fabric, self.solver)
-        measured = {
-            source.name: prediction_error.against_motion(
-                recording, x, self.every, isinstance(source, GivenRecording)
-            )
-            for source, recording, x in zip(self.recordings, recordings, motions, strict=True)
-        }
-        plain = {name: {k: _plain(v) for k, v in row.items()} for name, row in measured.items()}
-        write_json(out / MEASURED, plain)
-        np.savez_compressed(out / MOTION, x=np.asarray(motions[0], np.float32))
-        diverged = [
-            source.name
-            for source, x in zip(self.recordings, motions, strict=True)
-            if not np.isfinite(x).all()
-        ]
+        measured, diverged = {}, {}
+        for source, recording, motion in zip(self.recordings, recordings, motions, strict=True):
+            is_cropped = isinstance(source, GivenRecording)
+            found = prediction_error.against_motion(recording, motion.x, self.every, is_cropped)
+            measured[source.name] = {name: _json_number(value) for name, value in found.items()}
+            if motion.failure:
+                diverged[source.name] = motion.failure
+        write_json(out / MEASURED, measured)
+        np.savez_compressed(out / MOTION, x=np.asarray(motions[0].x, np.float32))
         return {"diverged": diverged, "runs": len(recordings)}
 
     def _fabric(self, folder: Path) -> Fabric | None:
@@ -112,23 +108,25 @@ class EvaluationCell(Cell):
 
 def read_measured(cell: EvaluationCell, folder: Path) -> dict[str, dict[str, float]]:
     """The metrics of each recording by name; NaN where the motion diverged."""
-    with opened(cell, folder) as files:
+    with result_files(cell, folder) as files:
         stored = json.loads((files / MEASURED).read_text(encoding="utf-8"))
-    number = lambda value: math.nan if value is None else value
-    return {name: {k: number(v) for k, v in row.items()} for name, row in stored.items()}
+    return {
+        name: {metric: math.nan if value is None else value for metric, value in row.items()}
+        for name, row in stored.items()
+    }
 
 
 def read_motion(cell: EvaluationCell, folder: Path) -> Float[np.ndarray, "frame vertex 3"]:
     """Positions [m] of the motion beside the first recording."""
-    with opened(cell, folder) as files, np.load(files / MOTION) as stored:
+    with result_files(cell, folder) as files, np.load(files / MOTION) as stored:
         return stored["x"]
 
 
-def predict(
-    recordings: list[Recording], fabric: Fabric, solver: str
-) -> list[Float[np.ndarray, "frame vertex 3"]]:
-    """Positions [m] of a fabric in the motions of recordings of one scenario; NaN from where one
-    diverged. By the cloth, or by material points in a grid that serves them all."""
+def predict(recordings: list[Recording], fabric: Fabric, solver: str) -> list[Motion]:
+    """The motions of a fabric in recordings of one scenario.
+
+    `solver`: "cloth", or "points" for material points in a grid that serves all recordings.
+    """
     scenarios = [from_recording(recording) for recording in recordings]
     most = max(scenario.substeps for scenario in scenarios)
     alike = [dataclasses.replace(scenario, substeps=most) for scenario in scenarios]
@@ -136,9 +134,7 @@ def predict(
     motions = []
     for scenario in alike:
         own = sheet and eqx.tree_at(lambda s: s.scene, sheet, scenario.scene)
-        moved = _motion(scenario, fabric, solver=own)
-        ok = np.logical_and.accumulate(np.asarray(moved.ok))[:, None, None]
-        motions.append(np.where(ok, np.asarray(moved.x), np.nan))
+        motions.append(prediction_error.predict_motion(scenario, fabric, own))
     return motions
 
 
@@ -155,5 +151,5 @@ def _points(scenarios: list[Scenario], fabric: Fabric) -> Sheet:
     return Sheet.make(first.scene, grid, fabric, first.interval / substeps, MEMBRANE_DAMPING)
 
 
-def _plain(value: float) -> float | None:
+def _json_number(value: float) -> float | None:
     return value if math.isfinite(value) else None

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from r2s.study import engine, matrix, results
-from r2s.study.subprocesses import Apart
+from r2s.study.subprocesses import OneProcess
 
 
 def study(
@@ -15,7 +15,7 @@ def study(
     paper: Path | None = None,
     density: float = 0.15,
     materials: str = "",
-    columns: Sequence[str] | None = None,
+    configurations: Sequence[str] | None = None,
     fabrics: Sequence[str] | None = None,
     repeats: int | None = None,
     judged: int | None = None,
@@ -25,22 +25,24 @@ def study(
     slurm: int = 0,
     compilation_cache: Path | None = None,
 ) -> int:
-    """Make all cells that are not there, and write results and report; how many are missing.
+    """Make all cells that are not there, write results and report, and return how many are missing.
 
-    - `preset`: in `matrix.PRESETS`; `columns` (such as "diffcloud-cloth-lifting"), `fabrics`,
-      `repeats`, `judged` and `seed` change it, see `matrix.Plan`.
+    - `preset`: in `matrix.PRESETS`. `configurations` (such as "diffcloud-cloth-lifting"),
+      `fabrics`, `repeats`, `judged` and `seed` change it, see `matrix.Plan`.
     - `data`: a folder of recordings, of an areal `density` [kg/m^2]; None: synthetic ones.
-    - `paper`: a folder with the tables of Ru et al. 2025. - `materials`: see `truths.Making`.
+    - `paper`: a folder with the tables of Ru et al. 2025.
+    - `materials`: a folder of measured tables, see `sources.TruthSettings`.
     - `workers`: processes of this machine (one: cell after cell); or `slurm` jobs; or those of a
-      Dask `scheduler`.
+      Dask `scheduler`. `compilation_cache`: where workers keep compiled programs.
 
     Raises `ValueError` for settings that make no sense, `OSError`, and `ImportError` that names the
     extra for workers.
     """
     if preset not in matrix.PRESETS:
         raise ValueError(f"no preset {preset!r}; there are {', '.join(matrix.PRESETS)}")
-    changes = columns, fabrics, repeats, judged, materials, seed
-    plan = matrix.narrowed(matrix.PRESETS[preset], *changes)
+    plan = matrix.with_changes(
+        matrix.PRESETS[preset], configurations, fabrics, repeats, judged, materials, seed
+    )
     cells = matrix.synthetic(plan) if data is None else matrix.recorded(data, density, plan)
     runner = _runner(workers, scheduler, slurm, compilation_cache)
     try:
@@ -53,7 +55,7 @@ def study(
 
 def _runner(workers: int, scheduler: str, slurm: int, cache: Path | None) -> engine.Runner:
     if not (workers > 1 or scheduler or slurm):
-        return Apart()
+        return OneProcess()
     from r2s.study import cluster
 
     if scheduler:

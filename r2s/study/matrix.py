@@ -1,255 +1,284 @@
-"""Which cells a study has: columns (approach, solver, scenario) by fabrics by motions."""
+"""Which cells a study has: configurations (approach, solver, scenario) by fabrics by motions."""
 
 import dataclasses
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from r2s.estimation.method import default_space
 from r2s.fabrics import presets
 from r2s.scenarios.paths import ESTIMATION, EVALUATION
+from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
 from r2s.study.estimates import SOLVERS, Budgets, EstimateCell, TrainedNetwork
 from r2s.study.evaluations import EvaluationCell
 from r2s.study.sources import (
     GivenRecording,
-    Making,
     Source,
     SyntheticRecording,
-    given,
-    measured,
+    TruthSettings,
+    find_recordings,
     strain_dependent,
+    with_measured_tables,
 )
-from r2s.study.statistics.panel import MOTIONS, PAPER_COLUMNS, Column
 
 ESTIMATED_FROM = ("lifting", "wind", "stretching")
-TOGETHER = 10  # recordings in a cell that judges
+TOGETHER = 10  # recordings that one cell judges
 PULLS = (0.0, 45.0, 90.0)  # [degrees], from which PINN estimates together
+FEWER_FABRICS = 32  # at most, to train PhysNet's network on material points
 
-
-FULL = PAPER_COLUMNS + tuple(
-    Column(approach, solver, scenario)
+FULL = PAPER_CONFIGURATIONS + tuple(
+    Configuration(approach, solver, scenario)
     for approach, solvers in SOLVERS.items()
     for solver in solvers
     for scenario in ESTIMATED_FROM
-    if (approach, solver, scenario) not in PAPER_COLUMNS
+    if (approach, solver, scenario) not in PAPER_CONFIGURATIONS
     # the network's maps of lifts and winds are balanced as an orthotropic sheet alone
     and not (approach == "pinn" and solver == "points" and scenario != "stretching")
 )
-"""The columns of the study, and those that it calls unsupported."""
+"""The configurations of the paper, and those that it calls unsupported."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A study of synthetic recordings.
+    """The settings of a study.
 
-    - `columns`, `fabrics`: which. - `repeats`: estimates of each, from other motions.
-    - `judged`: motions of each of `MOTIONS` to judge by. - `making`, `spent`, `seed`.
+    - `configurations`, `fabrics`: which to estimate.
+    - `repeats`: estimates of each, from other motions.
+    - `judged`: motions of each of `MOTIONS` to judge by.
+    - `truth`: how synthetic recordings are made. `budgets`: what estimates may cost.
     - `every`: 1 compares all frames that count, 3 every third.
     """
 
-    columns: tuple[Column, ...]
+    configurations: tuple[Configuration, ...]
     fabrics: tuple[str, ...]
     repeats: int
     judged: int
-    making: Making = Making()
-    spent: Budgets = Budgets()
+    truth: TruthSettings = TruthSettings()
+    budgets: Budgets = Budgets()
     seed: int = 0
     every: int = 1
 
 
-ALL = Plan(FULL, tuple(presets.FIVE), ESTIMATION, EVALUATION // len(MOTIONS), Making(layers=True))
-LITTLE = Budgets(
-    coarse=16,
-    starts=2,
-    iterations=15,
-    points_coarse=4,
-    points_starts=1,
-    points_iterations=2,
-    calls=40,
-    fabrics=32,
-    epochs=2,
-    steps=40,
+ALL = Plan(
+    configurations=FULL,
+    fabrics=tuple(presets.FIVE),
+    repeats=ESTIMATION,
+    judged=EVALUATION // len(MOTIONS),
+    truth=TruthSettings(self_contact=True),
 )
 SMALL = Plan(
-    columns=tuple(
-        Column(*names)
-        for names in (
-            ("diffcloud", "cloth", "lifting"),
-            ("diffcloud", "cloth", "wind"),
-            ("diffcp", "points", "lifting"),
-            ("physnet", "cloth", "lifting"),
-            ("pinn", "points", "stretching"),
-            ("pinn", "cloth", "stretching"),
-        )
+    configurations=(
+        Configuration("diffcloud", "cloth", "lifting"),
+        Configuration("diffcloud", "cloth", "wind"),
+        Configuration("diffcp", "points", "lifting"),
+        Configuration("physnet", "cloth", "lifting"),
+        Configuration("pinn", "points", "stretching"),
+        Configuration("pinn", "cloth", "stretching"),
     ),
     fabrics=("camel_ponte_roma", "grey_interlock"),
     repeats=1,
     judged=2,
-    spent=LITTLE,
+    budgets=Budgets(
+        coarse=16,
+        starts=2,
+        iterations=15,
+        points_coarse=4,
+        points_starts=1,
+        points_iterations=2,
+        calls=40,
+        fabrics=32,
+        epochs=2,
+        steps=40,
+    ),
     every=3,
 )
 PRESETS = {
     "small": SMALL,
-    "paper": dataclasses.replace(ALL, columns=PAPER_COLUMNS),
+    "paper": dataclasses.replace(ALL, configurations=PAPER_CONFIGURATIONS),
     "full": ALL,
 }
 
 
-def named(text: str) -> Column:
-    """The column written as "diffcloud-cloth-lifting"; `ValueError` says which there are."""
+def configuration_named(text: str) -> Configuration:
+    """The configuration written as "diffcloud-cloth-lifting"; ValueError names all there are."""
     names = {"-".join(each): each for each in FULL}
     if text not in names:
-        raise ValueError(f"no column {text!r}; there are {', '.join(names)}")
+        raise ValueError(f"no configuration {text!r}; there are {', '.join(names)}")
     return names[text]
 
 
-def narrowed(
+def with_changes(
     plan: Plan,
-    columns: Sequence[str] | None = None,
+    configurations: Sequence[str] | None = None,
     fabrics: Sequence[str] | None = None,
     repeats: int | None = None,
     judged: int | None = None,
     materials: str = "",
     seed: int = 0,
 ) -> Plan:
-    """A plan with other columns, fabrics, numbers, measured tables or another seed; None: as it is.
+    """A plan with other settings; None, or nothing, leaves one as it is.
 
-    Raises `ValueError` for numbers below 1, and what `truths.measured` raises.
+    - `configurations`: their names, such as "diffcloud-cloth-lifting".
+    - `materials`: a folder of measured tables, see `TruthSettings`.
+
+    Raises `ValueError` for numbers below 1 and unknown names, and what `with_measured_tables`
+    raises.
     """
     for name, number in (("repeats", repeats), ("judged", judged)):
         if number is not None and number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
-    chosen, making = tuple(fabrics or plan.fabrics), plan.making
+    chosen, truth = tuple(fabrics or plan.fabrics), plan.truth
     return dataclasses.replace(
         plan,
-        columns=plan.columns if not columns else tuple(map(named, columns)),
+        configurations=tuple(map(configuration_named, configurations or ())) or plan.configurations,
         fabrics=chosen,
         repeats=plan.repeats if repeats is None else repeats,
         judged=plan.judged if judged is None else judged,
-        making=making if not materials else measured(making, Path(materials), chosen),
+        truth=with_measured_tables(truth, Path(materials), chosen) if materials else truth,
         seed=seed,
     )
 
 
 def synthetic(plan: Plan) -> list[EvaluationCell]:
-    """The cells that judge of a study of synthetic recordings; they need all others.
+    """The evaluations of a study of synthetic recordings, which need all other cells.
 
     Raises `ValueError` for an unknown fabric.
     """
+
+    def recording(fabric: str, scenario: str, number: int, is_unseen: bool, angle=None):
+        return SyntheticRecording(
+            fabric, scenario, number, is_unseen, plan.truth, plan.seed, angle=angle
+        )
+
     found = []
     for fabric in plan.fabrics:
-        density = float(strain_dependent(fabric, plan.making).density)
-        unseen = {
-            scenario: tuple(
-                SyntheticRecording(fabric, scenario, number, True, plan.making, plan.seed)
-                for number in range(plan.judged)
-            )
+        density = float(strain_dependent(fabric, plan.truth).density)
+        unseen = [
+            tuple(recording(fabric, scenario, number, True) for number in range(plan.judged))
             for scenario in MOTIONS
-        }
-        estimates = [
-            _estimated(column, fabric, density, plan, repeat)
-            for column in plan.columns
-            for repeat in range(plan.repeats)
         ]
-        found += _judged(estimates, fabric, density, unseen, plan.every)
+        estimates = []
+        for configuration in plan.configurations:
+            scenario = configuration.estimated_from
+            is_pulled = configuration.approach == "pinn" and scenario == "stretching"
+            for repeat in range(plan.repeats):
+                sources = tuple(
+                    recording(fabric, scenario, repeat, False, angle)
+                    for angle in (PULLS if is_pulled else (None,))
+                )
+                estimates.append(_estimate(configuration, sources, density, plan, repeat))
+        found += _evaluations(estimates, fabric, density, unseen, plan.every)
     return found
 
 
 def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationCell]:
-    """Likewise of the recordings in a folder, with an areal density to assume [kg/m^2]: those
-    columns of the plan that have recordings to estimate from.
+    """The evaluations of a study of the recordings in a folder.
 
-    A repeat is a recording. Judged by `MOTIONS` of the same fabric and trial (of all trials where
-    that trial has none), also with the estimate of another fabric. Raises what `truths.given`
-    raises, and `ValueError` for a density that is none, when no column has a recording to estimate
-    from, or none is there to judge by.
+    - `density`: areal density to assume, [kg/m^2].
+    - `plan`: gives configurations, of which those count that have recordings to estimate from, and
+      budgets.
+
+    A repeat is a recording. An estimate is judged by `MOTIONS` of the same fabric and trial (of all
+    trials where that trial has none), and beside the estimate of another fabric. Raises what
+    `find_recordings` raises, and `ValueError` for a density that is none, when no configuration
+    has a recording to estimate from, or none is there to judge by.
     """
-    default_space("cloth", density)
-    columns = plan.columns
+    default_space("cloth", density)  # refuses a density that is none
     # clouds of real cameras need all of the search, and there are few frames to judge by
     search = {name: getattr(Budgets, name) for name in ("coarse", "starts", "iterations")}
-    plan = dataclasses.replace(plan, spent=dataclasses.replace(plan.spent, **search), every=1)
-    every = given(folder)
-    seen = [r for r in every if r.scenario in {column.estimated_from for column in columns}]
-    unseen = [r for r in every if r.scenario in MOTIONS]
+    plan = dataclasses.replace(plan, budgets=dataclasses.replace(plan.budgets, **search), every=1)
+    recordings = find_recordings(folder)
+    sources = {configuration.estimated_from for configuration in plan.configurations}
+    seen = [r for r in recordings if r.scenario in sources]
+    unseen = [r for r in recordings if r.scenario in MOTIONS]
     if not seen or not unseen:
         raise ValueError(
             f"{folder}: nothing to estimate from ({', '.join(ESTIMATED_FROM)}) or to judge by "
-            f"({', '.join(MOTIONS)}); found {sorted({r.scenario for r in every})}"
+            f"({', '.join(MOTIONS)}); found {sorted({r.scenario for r in recordings})}"
         )
     found: list[EvaluationCell] = []
-    for column in columns:
-        own = [r for r in seen if r.scenario == column.estimated_from]
-        estimates = [_from_given(column, r, density, plan, i) for i, r in enumerate(own)]
+    for configuration in plan.configurations:
+        own = [r for r in seen if r.scenario == configuration.estimated_from]
+        estimates = [
+            _estimate(configuration, (recording,), density, plan, repeat)
+            for repeat, recording in enumerate(own)
+        ]
         for index, (recording, estimate) in enumerate(zip(own, estimates, strict=True)):
-            by = _by_scenario(_of_trial(unseen, recording))
-            found += _judged([estimate], recording.fabric, density, by, plan.every)
+            judged = _by_scenario(_of_trial(unseen, recording))
+            found += _evaluations([estimate], recording.fabric, density, judged, plan.every)
             other = _other_fabric(own, index)
             if other is not None:
-                about = column.solver, density, recording.fabric
                 found += [
-                    EvaluationCell(estimates[other], *about, r, True, plan.every)
-                    for r in by.values()
+                    EvaluationCell(
+                        estimate=estimates[other],
+                        solver=configuration.solver,
+                        density=density,
+                        fabric=recording.fabric,
+                        recordings=together,
+                        other=True,
+                        every=plan.every,
+                    )
+                    for together in judged
                 ]
-    return list(dict.fromkeys(found))  # columns share the default fabric
+    return list(dict.fromkeys(found))  # configurations share the default fabric
 
 
-def _judged(estimates, fabric: str, density: float, unseen, every: int) -> list[EvaluationCell]:
-    """Cells for estimates of a fabric, and for the default fabric on each solver."""
+def _evaluations(
+    estimates: Sequence[EstimateCell],
+    fabric: str,
+    density: float,
+    judged: Iterable[tuple[Source, ...]],
+    every: int,
+) -> list[EvaluationCell]:
+    """Cells for estimates of a fabric, and first for the default fabric on each of their solvers.
+
+    `judged`: the recordings of each scenario.
+    """
     solvers = dict.fromkeys(estimate.solver for estimate in estimates)
-    of = lambda solver: (solver, density, fabric)
-    whose = [(None, of(solver)) for solver in solvers] + [(e, of(e.solver)) for e in estimates]
+    whose = [(None, solver) for solver in solvers] + [(each, each.solver) for each in estimates]
     return [
-        EvaluationCell(estimate, *about, recordings[first : first + TOGETHER], every=every)
-        for estimate, about in whose
-        for recordings in unseen.values()
+        EvaluationCell(
+            estimate, solver, density, fabric, recordings[first : first + TOGETHER], every=every
+        )
+        for estimate, solver in whose
+        for recordings in judged
         for first in range(0, len(recordings), TOGETHER)
     ]
 
 
-def _estimated(
-    column: Column, fabric: str, density: float, plan: Plan, repeat: int
-) -> EstimateCell:
-    make = lambda angle: SyntheticRecording(
-        fabric, column.estimated_from, repeat, False, plan.making, plan.seed, angle=angle
-    )
-    several = column.approach == "pinn" and column.estimated_from == "stretching"
-    sources = tuple(make(angle) for angle in (PULLS if several else (None,)))
-    return _estimate(column, fabric, sources, density, plan, repeat)
-
-
-def _from_given(column: Column, recording: GivenRecording, density: float, plan: Plan, repeat: int):
-    return _estimate(column, recording.fabric, (recording,), density, plan, repeat)
-
-
 def _estimate(
-    column: Column, fabric: str, sources: tuple[Source, ...], density: float, plan: Plan, repeat
+    configuration: Configuration,
+    sources: tuple[Source, ...],
+    density: float,
+    plan: Plan,
+    repeat: int,
 ) -> EstimateCell:
-    spent, network = plan.spent, None
-    if column.approach == "physnet":
-        on_points = dataclasses.replace(spent, fabrics=min(spent.fabrics, 32))
-        spent = on_points if column.solver == "points" else spent
-        network = TrainedNetwork(column.solver, column.estimated_from, spent, plan.seed)
-    about = column.approach, column.solver, fabric, sources, density
-    return EstimateCell(*about, spent, network, repeat)
+    approach, solver, scenario = configuration
+    budgets, network = plan.budgets, None
+    if approach == "physnet":
+        if solver == "points":
+            fewer = min(budgets.fabrics, FEWER_FABRICS)
+            budgets = dataclasses.replace(budgets, fabrics=fewer)
+        network = TrainedNetwork(solver, scenario, budgets, plan.seed)
+    fabric = sources[0].fabric
+    return EstimateCell(approach, solver, fabric, sources, density, budgets, network, repeat)
 
 
-def _by_scenario(recordings: list[GivenRecording]) -> dict[str, tuple[GivenRecording, ...]]:
-    found: dict[str, tuple[GivenRecording, ...]] = defaultdict(tuple)
+def _by_scenario(recordings: Iterable[GivenRecording]) -> list[tuple[GivenRecording, ...]]:
+    found: Mapping[str, list[GivenRecording]] = defaultdict(list)
     for recording in recordings:
-        found[recording.scenario] += (recording,)
-    return dict(found)
+        found[recording.scenario].append(recording)
+    return [tuple(together) for together in found.values()]
 
 
 def _of_trial(unseen: list[GivenRecording], recording: GivenRecording) -> list[GivenRecording]:
     same = [r for r in unseen if r.fabric == recording.fabric]
-    trial = [r for r in same if r.trial == recording.trial]
-    return trial or same
+    return [r for r in same if r.trial == recording.trial] or same
 
 
-def _other_fabric(recordings: list[GivenRecording], index: int) -> int | None:
+def _other_fabric(recordings: Sequence[GivenRecording], index: int) -> int | None:
     """The next recording of another fabric, going round."""
     order = [(index + step) % len(recordings) for step in range(1, len(recordings))]
-    mine = recordings[index].fabric
-    return next((i for i in order if recordings[i].fabric != mine), None)
+    fabric = recordings[index].fabric
+    return next((i for i in order if recordings[i].fabric != fabric), None)

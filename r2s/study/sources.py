@@ -1,7 +1,8 @@
-"""What a study estimates from and judges against: recordings, made or given.
+"""What a study estimates from and judges by: recordings, synthetic or given.
 
-Those that are made are not the estimators' own model: their mesh is finer, their steps are shorter,
-and their fabrics stiffen with the strain and soften with the curvature, as measured ones do.
+Synthetic recordings are not the estimators' own model: their mesh is finer, their steps are
+shorter, and their fabrics stiffen with the strain and soften with the curvature, as measured ones
+do.
 """
 
 import dataclasses
@@ -25,7 +26,7 @@ from r2s.recordings import manifest
 from r2s.recordings.recording import Recording, load, save
 from r2s.scenarios import synthetic
 from r2s.scenarios.six import SIX, Experiment, varied
-from r2s.study.cells import Cell, opened
+from r2s.study.cells import Cell, result_files
 
 RECORDING = "recording.npz"
 SOFTENED = (1.0, 0.9, 0.8, 0.75, 0.7)  # bending at curvatures of 0, 10, ... 40 1/m over that at 0
@@ -33,16 +34,18 @@ SAME_SCENARIO = {"lift": "lifting", "fold": "folding"}  # how recordings of othe
 
 
 @dataclass(frozen=True)
-class Making:
-    """How recordings are made.
+class TruthSettings:
+    """How synthetic recordings are made.
 
-    - `shape`: vertices along warp and weft. - `max_step`: of the time, [s].
+    - `shape`: vertices along warp and weft.
+    - `max_step`: longest time step, [s].
     - `stiffening`: membrane stiffness at an extension of 16.7 % over that of the preset, which is
-      at zero strain; 0: constant stiffness, bending too, as the estimators assume. Assumed, not
-      measured.
+      at zero strain. Assumed, not measured. 0: constant stiffness, of the membrane and in bending,
+      as the estimators assume.
     - `materials`: a folder of ARCSim material files, FABRIC.json, with measured tables to take
-      instead; "": none. - `materials_digest`: of those files, from `measured`. - `layers`: the
-      sheet touches itself.
+      instead; "": none.
+    - `materials_digest`: a hash of those files, from `with_measured_tables`.
+    - `self_contact`: whether the sheet touches itself.
     """
 
     shape: tuple[int, int] = (17, 17)
@@ -50,7 +53,7 @@ class Making:
     stiffening: float = 2.0
     materials: str = ""
     materials_digest: str = ""
-    layers: bool = False
+    self_contact: bool = False
 
 
 @dataclass(frozen=True)
@@ -59,8 +62,8 @@ class SyntheticRecording(Cell):
 
     - `number`: 0 is the motion of the scenario without any numbers; others are drawn within
       `r2s.scenarios.paths.LIMITS`, the same for all fabrics.
-    - `unseen`: drawn to be judged by, none of which is one to estimate from; its clouds are all of
-      the surface, without any error.
+    - `unseen`: whether its motion is drawn to be judged by; none of these is one to estimate from.
+      Its clouds are all of the surface, without any error.
     - `angle`: from the pull of a stretching to the warp [degrees], for `r2s.estimation.pinn`; None:
       a motion of `r2s.scenarios`.
     """
@@ -72,7 +75,7 @@ class SyntheticRecording(Cell):
     scenario: str
     number: int = 0
     unseen: bool = False
-    making: Making = Making()
+    truth: TruthSettings = TruthSettings()
     seed: int = 0
     angle: float | None = None
 
@@ -86,21 +89,21 @@ class SyntheticRecording(Cell):
         return f"recordings {self.scenario}"
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
-        """A recording."""
-        fabric, making = strain_dependent(self.fabric, self.making), self.making
+        """Simulate the recording."""
+        fabric, truth = strain_dependent(self.fabric, self.truth), self.truth
         key = jr.fold_in(jr.key(self.seed), _number(self.fabric, self.scenario, self.number))
         if self.angle is not None:
-            about = {"shape": making.shape, "key": jr.fold_in(key, round(self.angle))}
-            made = pulled(fabric, self.fabric, math.radians(self.angle), **about)
+            angle, key = math.radians(self.angle), jr.fold_in(key, round(self.angle))
+            made = pulled(fabric, self.fabric, angle, shape=truth.shape, key=key)
         else:
             made = synthetic.record(
                 self._experiment(),
                 fabric,
                 self.fabric,
                 seen=synthetic.WHOLE if self.unseen else None,
-                shape=making.shape,
-                max_step=making.max_step,
-                self_contact=making.layers and self.scenario == "folding",
+                shape=truth.shape,
+                max_step=truth.max_step,
+                self_contact=truth.self_contact and self.scenario == "folding",
                 key=key,
             )
         info = dataclasses.replace(made.info, name=self.name, trial=str(self.number))
@@ -116,7 +119,7 @@ class SyntheticRecording(Cell):
 
 @dataclass(frozen=True)
 class GivenRecording(Cell):
-    """A recording in a folder with its manifest; `digest` is of its files, from `given`."""
+    """A recording in a folder with its manifest; `digest`: a hash of its files."""
 
     kind: ClassVar[str] = "recordings"
 
@@ -132,7 +135,7 @@ class GivenRecording(Cell):
         return self.recording
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
-        """The recording, as it was read."""
+        """Read the recording, and keep it as it was read."""
         rules = manifest.manifest_for(self.folder)
         read = manifest.read_recording(self.folder, rules, self.recording)
         save(read, out / RECORDING)
@@ -142,7 +145,7 @@ class GivenRecording(Cell):
 Source = SyntheticRecording | GivenRecording
 
 
-def given(folder: Path) -> list[GivenRecording]:
+def find_recordings(folder: Path) -> list[GivenRecording]:
     """The recordings in a folder, by its own manifest or that of DIFFCLOUD.
 
     Raises what `r2s.recordings.manifest` raises, and `ValueError` when there is none.
@@ -154,16 +157,25 @@ def given(folder: Path) -> list[GivenRecording]:
         for file in manifest.sources(folder, rules, name):
             digest.update(file.read_bytes())
         info = manifest.read_recording(folder, rules, name).info
-        scenario = SAME_SCENARIO.get(info.scenario, info.scenario)
-        about = str(folder), name, info.fabric, scenario, info.trial
-        found.append(GivenRecording(*about, digest.hexdigest()))
+        found.append(
+            GivenRecording(
+                folder=str(folder),
+                recording=name,
+                fabric=info.fabric,
+                scenario=SAME_SCENARIO.get(info.scenario, info.scenario),
+                trial=info.trial,
+                digest=digest.hexdigest(),
+            )
+        )
     if not found:
         raise ValueError(f"{folder}: no recording that a manifest describes")
     return found
 
 
-def measured(making: Making, folder: Path, fabrics: Sequence[str]) -> Making:
-    """Recordings made with the measured tables in a folder, one file FABRIC.json for each fabric.
+def with_measured_tables(
+    truth: TruthSettings, folder: Path, fabrics: Sequence[str]
+) -> TruthSettings:
+    """Settings with the measured tables in a folder, one file FABRIC.json for each fabric.
 
     Raises `FileNotFoundError` for one that is missing, and what `r2s.fabrics.arcsim.read_material`
     raises.
@@ -174,18 +186,18 @@ def measured(making: Making, folder: Path, fabrics: Sequence[str]) -> Making:
         read_material(file)
         digest.update(file.read_bytes())
     return dataclasses.replace(
-        making, materials=str(folder), materials_digest=digest.hexdigest()[:16]
+        truth, materials=str(folder), materials_digest=digest.hexdigest()[:16]
     )
 
 
 def read(source: Source, folder: Path) -> Recording:
     """The recording of a cell that is made."""
-    with opened(source, folder) as files:
+    with result_files(source, folder) as files:
         return load(files / RECORDING)
 
 
-def strain_dependent(name: str, making: Making = Making()) -> Fabric:
-    """The fabric that a recording is made with; see `Making`.
+def strain_dependent(name: str, truth: TruthSettings = TruthSettings()) -> Fabric:
+    """The fabric that a recording is made with; see `TruthSettings`.
 
     The stiffening table is `TableMembrane`'s: linear in the principal stretch, up to `stiffening`
     times the preset's numbers at 16.7 %, alike in all directions. Bending softens with curvature
@@ -193,14 +205,14 @@ def strain_dependent(name: str, making: Making = Making()) -> Fabric:
     """
     if name not in presets.FIVE:
         raise ValueError(f"no preset {name!r}; there are {', '.join(presets.FIVE)}")
-    if making.materials:
-        return read_material(Path(making.materials) / f"{name}.json")
+    if truth.materials:
+        return read_material(Path(truth.materials) / f"{name}.json")
     fabric = presets.FIVE[name]()
-    if not making.stiffening:
+    if not truth.stiffening:
         return fabric
     law, bending = constant_laws(fabric)
     published = np.array([law.c11, law.c12, law.c22, 2 * law.c33])  # theirs acts on E12
-    rows = np.stack([published, *[making.stiffening * published] * 5])
+    rows = np.stack([published, *[truth.stiffening * published] * 5])
     columns = HINGE_FACTOR * float(bending.stiffness) * np.tile(SOFTENED, (3, 1))
     return dataclasses.replace(
         fabric,
@@ -210,11 +222,11 @@ def strain_dependent(name: str, making: Making = Making()) -> Fabric:
 
 
 def small_strain(name: str) -> Fabric:
-    """What an estimate of a made recording is compared with: the preset, whose constant stiffness
-    is that of `strain_dependent` at zero strain and curvature."""
+    """The preset, whose constant stiffness is that of `strain_dependent` at zero strain and
+    curvature: what an estimate from a synthetic recording is compared with."""
     return presets.FIVE[name]()
 
 
 def _number(*parts: Any) -> int:
-    """A number below 2^31 that goes with the parts."""
+    """A number below 2^31 that depends on the parts alone."""
     return int.from_bytes(sha256(repr(parts).encode()).digest()[:4], "big") >> 1

@@ -13,14 +13,17 @@ from r2s.study.environment import environment, one_core
 TRIES = 2  # of a cell whose process died
 
 
-class Apart(Serial):
-    """As `Serial`, but with the same numbers as workers: linear algebra is threaded as the
-    environment said when it was loaded, and sums in another order are other numbers."""
+class OneProcess(Serial):
+    """Make cells as `Serial` does, but with the same numbers as workers.
+
+    Linear algebra is threaded as the environment said when it was loaded, and sums in another
+    order are other numbers.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         os.environ.update(environment(1))  # the process inherits it
-        self._pool = self._started()
+        self._pool = self._start()
 
     def make(self, cell: Cell, folder: Path) -> str:
         reason = ""
@@ -29,12 +32,12 @@ class Apart(Serial):
                 return self._pool.submit(attempt, cell, folder, cell.key).result()
             except BrokenProcessPool as error:
                 reason = f"{type(error).__name__}: {error}"
-                self._pool = self._started()
+                self._pool = self._start()
         return reason
 
     def close(self) -> None:
         self._pool.shutdown(cancel_futures=True)
 
     @staticmethod
-    def _started() -> ProcessPoolExecutor:
+    def _start() -> ProcessPoolExecutor:
         return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=one_core)

@@ -9,13 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from r2s.extras import require
 from r2s.fabrics.fabric import Fabric
 from r2s.viewer.subject import Moved, Subject, error_used, move
-
-try:
-    import viser
-except ImportError as error:
-    raise ImportError("a page with sliders needs viser: pip install 'r2s[viz]'") from error
 
 CLOTH, CLOUD, GRIPPER = (0, 114, 178), (213, 94, 0), (30, 30, 30)  # Okabe and Ito's
 POINT = 0.003  # [m], of a cloud
@@ -25,13 +21,14 @@ PAUSE = 0.02  # [s], between looks at what has changed
 class Page:
     """A server on a thread of its own, until `close`.
 
-    Only the last of the places that a slider was dragged through is simulated. `moved` is what the
-    page shows, `u` where in the space it lies, `failure` why there is no motion of it; `latest`
-    waits for what the sliders ask for.
+    Only the last of the places that a slider was dragged through is simulated. `moved` is the
+    motion that the page shows, `u` the place of its fabric in the space, and `failure` the reason
+    when there is no motion of it; `latest` waits for the motion that the sliders ask for.
 
+    - `subject`: the motion, the space of fabrics and the recording.
     - `u`: where the sliders begin, in the unit cube of the subject's space.
-    - `save`: called with the fabric that is shown when the button for that is pressed, gives what
-      to say; None: no button.
+    - `save`: called with the fabric that is shown when its button is pressed; returns the text
+      of the notification. None: no button.
     - `host`, `port`: 127.0.0.1 lets nobody in from other machines.
 
     Raises `OSError` when the port is taken.
@@ -46,11 +43,12 @@ class Page:
         host: str = "127.0.0.1",
         port: int = 8080,
     ):
+        viser = require("viser", "viz", "a page with sliders")
         self.subject, self.u = subject, np.asarray(u)
         self.moved: Moved = move(subject, jnp.asarray(u))
         self.failure = ""
-        self._asked, self._stop = threading.Event(), threading.Event()
-        self._shown = threading.Lock()
+        self._changed, self._stop = threading.Event(), threading.Event()
+        self._drawing = threading.Lock()
         self.server = viser.ViserServer(host=host, port=port, label="r2s", verbose=False)
         if self.server.get_port() != port:
             taken = self.server.get_port()
@@ -71,7 +69,7 @@ class Page:
         """What the sliders ask for now, simulated; `TimeoutError` after `timeout` [s]."""
         end = time.monotonic() + timeout
         while time.monotonic() < end:
-            if not self._asked.is_set() and np.array_equal(self.u, self._wanted()):
+            if not self._changed.is_set() and np.array_equal(self.u, self._wanted()):
                 return self.moved
             time.sleep(PAUSE)
         raise TimeoutError(f"no motion within {timeout:g} s of the sliders' last move")
@@ -99,7 +97,7 @@ class Page:
             hint = f"{bound.low:g} to {bound.high:g} {bound.unit}"
             hint += ", on a logarithmic scale" if bound.log else ""
             slider = gui.add_slider(bound.name, 0.0, 1.0, 0.01, float(place), hint=hint)
-            slider.on_update(lambda _: self._asked.set())
+            slider.on_update(lambda _: self._changed.set())
             self._sliders.append(slider)
         self._text = gui.add_markdown("")  # what they stand for
         if save is not None:
@@ -114,11 +112,11 @@ class Page:
 
     def _save(self, save: Callable[[Fabric], str], event: Any) -> None:
         try:
-            title, told = "saved", save(self.subject.space(jnp.asarray(self.u)))
+            title, text = "saved", save(self.subject.space(jnp.asarray(self.u)))
         except (OSError, ValueError) as error:
-            title, told = "not saved", f"{error}"
+            title, text = "not saved", f"{error}"
         if event.client is not None:
-            event.client.add_notification(title, told)
+            event.client.add_notification(title, text)
 
     def _wanted(self) -> np.ndarray:
         return np.array([slider.value for slider in self._sliders], self.u.dtype)
@@ -127,8 +125,8 @@ class Page:
         interval = self.subject.scenario.interval
         due = time.monotonic()
         while not self._stop.is_set():
-            if self._asked.is_set():
-                self._asked.clear()
+            if self._changed.is_set():
+                self._changed.clear()
                 wanted = self._wanted()
                 try:
                     self.moved, self.failure = move(self.subject, jnp.asarray(wanted)), ""
@@ -143,7 +141,7 @@ class Page:
 
     def _draw(self) -> None:
         """The frame of the slider."""
-        with self._shown:
+        with self._drawing:
             frame, moved, scene = int(self._frame.value), self.moved, self.server.scene
             faces = np.asarray(self.subject.scenario.scene.mesh.faces)
             x = np.asarray(moved.x[frame], np.float32)
@@ -159,13 +157,13 @@ class Page:
                     mask = np.asarray(self.subject.clouds.mask[frame])
                     seen = np.asarray(self.subject.clouds.points[frame])[mask]
                     self._points("/recording", seen, CLOUD, POINT)
-                self._text.content = self._told(frame)
+                self._text.content = self._describe(frame)
 
     def _points(self, name: str, points: np.ndarray, color: tuple, size: float) -> None:
         look = {"point_size": size, "point_shape": "circle", "precision": "float32"}
         self.server.scene.add_point_cloud(name, points.astype(np.float32), color, **look)
 
-    def _told(self, frame: int) -> str:
+    def _describe(self, frame: int) -> str:
         """The numbers of the fabric, and the distance of the recording."""
         space, moved = self.subject.space, self.moved
         values = np.asarray(space.values(jnp.asarray(self.u)))
@@ -176,8 +174,8 @@ class Page:
         lines = ["| | | |", "|---|---|---|", *rows, ""]
         if self.failure:
             lines.append(self.failure)
-        elif not moved.ok.all():
-            lines.append(f"The simulation diverged in frame {int(np.argmin(moved.ok))}.")
+        elif failure := moved.motion.explain():
+            lines.append(f"The simulation {failure}")
         elif self.subject.clouds is not None:
             error = 1e3 * float(moved.error[frame]), 1e3 * float(error_used(self.subject, moved))
             first, last = self.subject.frames_used

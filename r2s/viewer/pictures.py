@@ -1,6 +1,6 @@
 """Pictures of a recording: a contact sheet and a video of clouds, grippers, and simulated cloth.
 
-Where a force was recorded, its curve runs below, with the frames that are shown.
+Where a force was recorded, its curve is drawn below, with a dot for each frame of the picture.
 
     show(open_recording("recording.npz"), "out", load_trajectory("trajectory.npz"))
 
@@ -10,28 +10,24 @@ Needs matplotlib: pip install 'r2s[study]'; the video is an MP4 where OpenCV is 
 
 import io
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Integer
 
+from r2s.extras import require
 from r2s.files import write_bytes
-from r2s.recordings.manifest import manifest_for, read_recording, read_recordings
-from r2s.recordings.recording import Recording, SheetPlacement, cloud, corner, load
+from r2s.recordings.open import SimulatedCloth
+from r2s.recordings.recording import Recording, SheetPlacement, cloud, corner
 from r2s.viewer import video_writer
 
-try:
-    # The object API alone: pyplot would keep every figure, and choose a backend for the caller.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.colors import to_rgba
-    from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
-    from matplotlib.ticker import MaxNLocator
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-except ImportError as error:
-    raise ImportError("pictures need matplotlib: pip install 'r2s[study]'") from error
+# The object API alone: pyplot would keep every figure, and choose a backend for the caller.
+require("matplotlib", "study", "pictures")
+from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
+from matplotlib.lines import Line2D  # noqa: E402
+from matplotlib.ticker import MaxNLocator  # noqa: E402
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # noqa: E402
 
 # Okabe and Ito's colours, which the colour-blind can tell apart.
 CLOTH, CLOUD, GRIPPER, MARKER, GREY = "#0072B2", "#D55E00", "#000000", "#009E73", "#8c8c8c"
@@ -43,70 +39,6 @@ STRIP = 1.7  # [inch], height of the force's curve
 Video = Literal["auto", "gif", "mp4", "none"]
 
 
-@dataclass(frozen=True)
-class SimulatedCloth:
-    """A cloth to draw over a recording: `x` [m] at its frames, and the triangles `faces`."""
-
-    x: Float[np.ndarray, "frame vertex 3"]
-    faces: Integer[np.ndarray, "face 3"]
-
-
-def open_recording(path: Path | str) -> Recording:
-    """A recording from an NPZ, or from a folder of frames.
-
-    A folder's manifest is the `manifest.json` beside it, else that of DIFFCLOUD; a folder that
-    holds a manifest.json and one recording is taken for that. Raises FileNotFoundError or
-    ValueError that names the path, and the recordings there are when there are several.
-    """
-    path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such recording, neither an NPZ nor a folder")
-    if path.is_file():
-        return load(path)
-    path = path.resolve()
-    if (path / "manifest.json").exists():
-        manifest = manifest_for(path)
-        names = read_recordings(path, manifest)
-        if len(names) != 1:
-            known = ", ".join(names) or "none that fits its manifest"
-            raise ValueError(f"{path}: name one of its recordings, as {path}/NAME: {known}")
-        return read_recording(path, manifest, names[0])
-    return read_recording(path.parent, manifest_for(path.parent), path.name)
-
-
-def save_trajectory(path: Path | str, x: Any, faces: Any) -> None:
-    """Write a cloth for `load_trajectory`: `x` (frame, vertex, 3) [m], `faces` (face, 3)."""
-    buffer = io.BytesIO()
-    np.savez(buffer, x=np.asarray(x), faces=np.asarray(faces))
-    write_bytes(path, buffer.getvalue())
-
-
-def load_trajectory(path: Path | str) -> SimulatedCloth:
-    """Read what `save_trajectory` wrote: an NPZ with `x` and `faces`.
-
-    Raises FileNotFoundError, or a ValueError that names the file: damaged, arrays that are missing
-    or of other shapes, faces of vertices that there are not. Positions that are not finite may be
-    there: a run that diverged is drawn as far as it went.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            if lacking := [name for name in ("x", "faces") if name not in file]:
-                raise ValueError(f"lacks the array {lacking[0]!r}, has {', '.join(file)}")
-            x, faces = np.asarray(file["x"], float), np.asarray(file["faces"])
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # a damaged archive raises anything
-        raise ValueError(f"{path}: no trajectory (NPZ with x and faces): {error}") from error
-    if x.ndim != 3 or x.shape[2] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
-        raise ValueError(
-            f"{path}: expected x (frame, vertex, 3) [m] and faces (face, 3), found {x.shape} and "
-            f"{faces.shape}"
-        )
-    if faces.dtype.kind not in "iu" or faces.min(initial=0) < 0 or faces.max() >= x.shape[1]:
-        raise ValueError(f"{path}: faces must be numbers of the {x.shape[1]} vertices")
-    return SimulatedCloth(x, faces)
-
-
 def show(
     recording: Recording,
     folder: Path | str,
@@ -115,10 +47,10 @@ def show(
 ) -> list[Path]:
     """Write `NAME.png`, a contact sheet, and `NAME.gif` or `NAME.mp4`, in real time; their paths.
 
-    Clouds, grippers with their path so far, markers and the force where there are any, the sheet's
-    outline at rest, and the table; one scale for all axes, in metres, for all frames. Raises
-    ValueError when
-    the cloth has another number of frames, ImportError that names the extra, OSError.
+    They show clouds, grippers with their path so far, markers and the force where there are any,
+    the sheet's outline at rest, and the table; all axes of all frames have one scale, in metres.
+    Raises ValueError when the cloth has another number of frames, ImportError that names the
+    extra, OSError.
     """
     if cloth is not None and len(cloth.x) != len(recording.times):
         raise ValueError(
@@ -139,11 +71,11 @@ def show(
 
 def contact_sheet(path: Path, recording: Recording, cloth: SimulatedCloth | None = None) -> Path:
     """Write up to twelve frames, spread over the recording, as one PNG."""
+    content = _Content.make(recording, cloth)
     count = len(recording.times)
     frames = np.unique(np.linspace(0, count - 1, min(PANELS, count)).round().astype(int))
     columns = min(4, len(frames))
     rows = -(-len(frames) // columns)
-    box, dots = _limits(recording, cloth), _thinned(recording)
     strip = 0.0 if recording.force is None else STRIP
     height = 3.3 * rows + 0.9 + strip  # [inch]
     figure = Figure(figsize=(3.6 * columns, height))
@@ -151,14 +83,14 @@ def contact_sheet(path: Path, recording: Recording, cloth: SimulatedCloth | None
     figure.subplots_adjust(0.0, bottom, 0.96, top - 0.02, wspace=0.06, hspace=0.1)
     for i, frame in enumerate(frames):
         axes: Any = figure.add_subplot(rows, columns, i + 1, projection="3d")
-        _dress(axes, recording, box)
-        _draw(axes, recording, dots, cloth, int(frame), box)
+        _set_up(axes, content)
+        _draw(axes, content, int(frame))
         axes.set_title(_caption(recording, int(frame)), fontsize=9, y=0.98)
     if strip:
         curve = _force_curve(figure, recording, 0.75 / height, (strip - 0.45) / height)
-        _mark(curve, recording, frames)
+        _mark_frames(curve, recording, frames)
     figure.suptitle(_title(recording), fontsize=12)
-    _legend(figure, recording, cloth, box)
+    _legend(figure, content)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=100)
     write_bytes(path, buffer.getvalue())
@@ -175,24 +107,49 @@ def write_mp4(path: Path, recording: Recording, cloth: SimulatedCloth | None = N
     return video_writer.write_mp4(path, _pictures(recording, cloth), _interval(recording))
 
 
+class _Content(NamedTuple):
+    """What the panels show.
+
+    - `clouds`: points [m] of each frame, thinned.
+    - `low`, `high`: corners [m] of the box that is drawn.
+    """
+
+    recording: Recording
+    cloth: SimulatedCloth | None
+    clouds: list[np.ndarray]
+    low: np.ndarray
+    high: np.ndarray
+
+    @classmethod
+    def make(cls, recording: Recording, cloth: SimulatedCloth | None) -> "_Content":
+        generator = np.random.default_rng(0)
+        frames = (cloud(recording, frame) for frame in range(len(recording.times)))
+        clouds = [generator.permutation(points)[:MOST_DOTS] for points in frames]
+        return cls(recording, cloth, clouds, *_limits(recording, cloth, np.concatenate(clouds)))
+
+    def visible(self, points: np.ndarray) -> np.ndarray:
+        """Which points [m] are in the box; False where one is not finite."""
+        return _inside(points, self.low, self.high)
+
+
 def _pictures(recording: Recording, cloth: SimulatedCloth | None) -> Iterator[np.ndarray]:
     """Each frame as a picture, (height, width, 3) in 0..255, of even sides."""
-    box, dots = _limits(recording, cloth), _thinned(recording)
+    content = _Content.make(recording, cloth)
     strip = 0.0 if recording.force is None else STRIP - 0.1  # [inch]: sides of even pixels
     height = 5.6 + strip
     figure = Figure(figsize=(6.4, height), dpi=100)
     canvas = FigureCanvasAgg(figure)
     figure.subplots_adjust(0.0, (0.34 + strip) / height, 0.96, 1 - 0.39 / height)
     axes: Any = figure.add_subplot(projection="3d")
-    _dress(axes, recording, box)
+    _set_up(axes, content)
     figure.suptitle(_title(recording), fontsize=11)
-    _legend(figure, recording, cloth, box)
+    _legend(figure, content)
     caption = figure.text(0.02, 1 - 0.56 / height, "", fontsize=10)
     curve = strip and _force_curve(figure, recording, 0.7 / height, (strip - 0.45) / height)
     for frame in range(len(recording.times)):
-        drawn = _draw(axes, recording, dots, cloth, frame, box)
+        drawn = _draw(axes, content, frame)
         if strip:
-            drawn += _mark(curve, recording, np.array([frame]))
+            drawn += _mark_frames(curve, recording, np.array([frame]))
         caption.set_text(_caption(recording, frame))
         canvas.draw()
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
@@ -200,9 +157,9 @@ def _pictures(recording: Recording, cloth: SimulatedCloth | None) -> Iterator[np
             artist.remove()
 
 
-def _dress(axes: Any, recording: Recording, box: tuple[np.ndarray, np.ndarray]) -> None:
+def _set_up(axes: Any, content: _Content) -> None:
     """Limits, one scale for all axes, labels, and what does not move: table and sheet at rest."""
-    low, high = box
+    low, high, info = content.low, content.high, content.recording.info
     axes.patch.set_alpha(0)  # it would cover the labels of the panel to the left
     axes.computed_zorder = False  # the dots lie over the cloth, whatever their depth
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
@@ -216,48 +173,33 @@ def _dress(axes: Any, recording: Recording, box: tuple[np.ndarray, np.ndarray]) 
         axis.pane.set_alpha(0.4)
     axes.tick_params(labelsize=7, pad=-3)
     axes.tick_params("z", pad=1)
-    height = recording.info.table_height
-    axes.plot(
-        *_outline(recording.info.sheet).T, color=GREY, linewidth=0.9, linestyle="--", zorder=2
-    )
-    if low[2] <= height <= high[2]:
+    axes.plot(*_outline(info.sheet).T, color=GREY, linewidth=0.9, linestyle="--", zorder=2)
+    if low[2] <= info.table_height <= high[2]:
         edge = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * (high - low)[:2] + low[:2]
-        axes.plot(*edge.T, np.full(5, height), color=GREY, linewidth=0.6, zorder=1)
+        axes.plot(*edge.T, np.full(5, info.table_height), color=GREY, linewidth=0.6, zorder=1)
 
 
-def _draw(
-    axes: Any,
-    recording: Recording,
-    dots: list[np.ndarray],
-    cloth: SimulatedCloth | None,
-    frame: int,
-    box: tuple[np.ndarray, np.ndarray],
-) -> list[Any]:
+def _draw(axes: Any, content: _Content, frame: int) -> list[Any]:
     """Draw what moves, as it is in a frame."""
-    drawn = []
+    drawn, recording, cloth = [], content.recording, content.cloth
     if cloth is not None:
         x = cloth.x[frame]
-        shown = cloth.faces[_inside(x, *box)[cloth.faces].all(axis=1)]
-        style: dict[str, Any] = {
-            "facecolor": to_rgba(CLOTH, 0.25),
-            "edgecolor": to_rgba(CLOTH, 0.7),
-        }
-        sheet = Poly3DCollection(x[shown], linewidth=0.35, zorder=3, **style)
+        faces = cloth.faces[content.visible(x)[cloth.faces].all(axis=1)]
+        style: dict[str, Any] = {"facecolor": (CLOTH, 0.25), "edgecolor": (CLOTH, 0.7)}
+        sheet = Poly3DCollection(x[faces], linewidth=0.35, zorder=3, **style)
         drawn.append(axes.add_collection3d(sheet))
-        if len(shown) < len(cloth.faces):
+        if len(faces) < len(cloth.faces):
             text = "part of the cloth is out of the picture"
-            drawn.append(
-                axes.text2D(0.5, 0.02, text, fontsize=8, ha="center", transform=axes.transAxes)
-            )
-    points = dots[frame]
-    points = points[_inside(points, *box)]
-    options: dict[str, Any] = {"linewidths": 0, "depthshade": False}
-    drawn.append(axes.scatter(*points.T, s=2.2, color=CLOUD, zorder=5, **options))
+            place = {"ha": "center", "transform": axes.transAxes}
+            drawn.append(axes.text2D(0.5, 0.02, text, fontsize=8, **place))
+    points = content.clouds[frame]
+    points = points[content.visible(points)]
+    dots: dict[str, Any] = {"linewidths": 0, "depthshade": False}
+    drawn.append(axes.scatter(*points.T, s=2.2, color=CLOUD, zorder=5, **dots))
     if recording.markers is not None and recording.markers_seen is not None:
         seen = np.asarray(recording.markers)[frame][np.asarray(recording.markers_seen)[frame]]
-        drawn.append(
-            axes.scatter(*seen.T, s=14, color=MARKER, marker="x", zorder=6, depthshade=False)
-        )
+        crosses: dict[str, Any] = {"marker": "x", "depthshade": False}
+        drawn.append(axes.scatter(*seen.T, s=14, color=MARKER, zorder=6, **crosses))
     for path in _grippers(recording, frame):
         drawn += axes.plot(*path.T, color=GRIPPER, linewidth=0.9, zorder=7)
         drawn += axes.plot(*path[-1:].T, "o", color=GRIPPER, markersize=5, zorder=8)
@@ -279,7 +221,7 @@ def _force_curve(figure: Any, recording: Recording, bottom: float, height: float
     return axes
 
 
-def _mark(axes: Any, recording: Recording, frames: np.ndarray) -> list[Any]:
+def _mark_frames(axes: Any, recording: Recording, frames: np.ndarray) -> list[Any]:
     """Dots on the curve of the force at frames; none where the log does not reach."""
     times = np.asarray(recording.times)[frames]
     options: dict[str, Any] = {"left": np.nan, "right": np.nan}
@@ -303,32 +245,27 @@ def _grippers(recording: Recording, frame: int) -> list[np.ndarray]:
     return [np.concatenate([before[:, i], here[i : i + 1]]) for i in range(path.shape[1])]
 
 
-def _thinned(recording: Recording) -> list[np.ndarray]:
-    generator = np.random.default_rng(0)
-    clouds = (cloud(recording, frame) for frame in range(len(recording.times)))
-    return [generator.permutation(points)[:MOST_DOTS] for points in clouds]
-
-
 def _inside(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     within = (points >= low) & (points <= high)  # False where a point is not finite
     return np.asarray(within.all(axis=1))
 
 
-def _limits(recording: Recording, cloth: SimulatedCloth | None) -> tuple[np.ndarray, np.ndarray]:
-    """The corners [m] of a box around the sheet at rest, the grippers, the cloud and the cloth.
+def _limits(
+    recording: Recording, cloth: SimulatedCloth | None, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The corners [m] of a box around the sheet at rest, the grippers, the points and the cloth.
 
     What is farther from the first two than half of the sheet's side flew off, or is no cloth; but
-    most of the cloud is always in.
+    most of the points are always in.
     """
     sheet = recording.info.sheet
     path = np.asarray(recording.handle_path).reshape(-1, 3)
     known = np.concatenate([path, _outline(sheet)])
     low, high, reach = known.min(axis=0), known.max(axis=0), 0.5 * max(sheet.size)
     around = low - reach, high + reach
-    dots = np.concatenate(_thinned(recording))
-    near = dots[_inside(dots, *around)]
-    if len(near) < 0.8 * len(dots):
-        near = dots
+    near = points[_inside(points, *around)]
+    if len(near) < 0.8 * len(points):
+        near = points
     if len(near):
         ends = np.percentile(near, [0.5, 99.5], axis=0)
         low, high = np.minimum(low, ends[0]), np.maximum(high, ends[1])
@@ -364,11 +301,8 @@ def _caption(recording: Recording, frame: int) -> str:
     return f"frame {frame}, {float(recording.times[frame]):.2f} s{counts}"
 
 
-def _legend(
-    figure: Any, recording: Recording, cloth: SimulatedCloth | None, box: tuple[Any, Any]
-) -> None:
-    dots = np.concatenate(_thinned(recording))
-    outside = 1 - float(_inside(dots, *box).mean())
+def _legend(figure: Any, content: _Content) -> None:
+    outside = 1 - float(content.visible(np.concatenate(content.clouds)).mean())
     left_out = f" ({outside:.1%} out of the picture)" if outside >= 5e-4 else ""
     dot: dict[str, Any] = {"linestyle": "", "marker": "o"}
     handles = [
@@ -376,17 +310,11 @@ def _legend(
         Line2D([], [], color=GRIPPER, marker="o", markersize=5, linewidth=1, label="gripper"),
         Line2D([], [], color=GREY, linestyle="--", linewidth=1, label="sheet at rest"),
     ]
-    if recording.markers is not None:
+    if content.recording.markers is not None:
         handles.append(Line2D([], [], color=MARKER, linestyle="", marker="x", label="marker"))
-    if cloth is not None:
+    if content.cloth is not None:
         handles.append(Line2D([], [], color=CLOTH, linewidth=5, alpha=0.5, label="simulated cloth"))
     narrow = figure.get_figwidth() < 8
-    spacing = {"columnspacing": 0.9, "handletextpad": 0.3} if narrow else {}
-    figure.legend(
-        handles=handles,
-        loc="lower center",
-        ncols=len(handles),
-        frameon=False,
-        fontsize=7.5 if narrow else 9,
-        **spacing,
-    )
+    spacing: dict[str, Any] = {"columnspacing": 0.9, "handletextpad": 0.3} if narrow else {}
+    spacing |= {"loc": "lower center", "ncols": len(handles), "frameon": False}
+    figure.legend(handles=handles, fontsize=7.5 if narrow else 9, **spacing)

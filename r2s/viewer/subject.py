@@ -14,6 +14,7 @@ from r2s.fabrics.parameters import ParameterSpace
 from r2s.recordings.recording import Recording, subsample
 from r2s.scenarios import Experiment
 from r2s.scenarios.scenario import Scenario, from_recording, rollout
+from r2s.solver import Trajectory
 
 MOST_POINTS = 1500  # of a cloud: more change neither the picture nor the distance
 
@@ -21,7 +22,9 @@ MOST_POINTS = 1500  # of a cloud: more change neither the picture nor the distan
 class Subject(eqx.Module):
     """A motion that any member of a space can make.
 
-    - `scenario`, `family`. - `clouds`: of a recording, all its frames; None: there is none.
+    - `scenario`: the motion.
+    - `space`: the fabrics that the sliders reach.
+    - `clouds`: points of a recording, in all its frames; None: there is none.
     - `frames_used`: the first and the last frame that count.
     """
 
@@ -34,14 +37,23 @@ class Subject(eqx.Module):
 class Moved(NamedTuple):
     """A motion of a subject.
 
-    - `x`: positions [m]. - `ok`: whether they are to be trusted, frame by frame.
+    - `motion`: positions, and whether and why it failed.
     - `error`: mean distance [m] from the recorded points to the sheet in each frame; NaN where
       there are none, or the simulation diverged.
     """
 
-    x: Float[Array, "frame vertex 3"]
-    ok: Bool[Array, " frame"]
+    motion: Trajectory
     error: Float[Array, " frame"]
+
+    @property
+    def x(self) -> Float[Array, "frame vertex 3"]:
+        """Positions [m]."""
+        return self.motion.x
+
+    @property
+    def ok(self) -> Bool[Array, " frame"]:
+        """Whether the positions of each frame are finite."""
+        return self.motion.ok
 
 
 def of_recording(
@@ -71,17 +83,17 @@ def move(subject: Subject, u: Float[Array, " dim"]) -> Moved:
 
     A cloud's distance is that of `chamfer_real_to_sim`, but to the surface itself.
     """
-    moved = rollout(subject.scenario, subject.space(u))
+    motion = rollout(subject.scenario, subject.space(u))
     if subject.clouds is None:
-        return Moved(moved.x, moved.ok, jnp.full(moved.ok.shape, jnp.nan))
+        return Moved(motion, jnp.full(motion.ok.shape, jnp.nan))
     faces = subject.scenario.scene.mesh.faces
 
     def distance(frame):
         points, mask, x = frame
         return masked_mean(surface_residuals(points, mask, x, faces)[0], mask)
 
-    error = jax.lax.map(distance, (subject.clouds.points, subject.clouds.mask, moved.x))
-    return Moved(moved.x, moved.ok, jnp.where(moved.ok, error, jnp.nan))
+    error = jax.lax.map(distance, (subject.clouds.points, subject.clouds.mask, motion.x))
+    return Moved(motion, jnp.where(motion.ok, error, jnp.nan))
 
 
 def error_used(subject: Subject, moved: Moved) -> Float[Array, ""]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
+from r2s.extras import require
 from r2s.files import write_bytes
 
 Pictures = Iterable[UInt8[np.ndarray, "height width 3"]]
@@ -45,12 +46,7 @@ def write_mp4(path: Path, pictures: Pictures, interval: float) -> Path:
 
     Needs OpenCV: pip install 'r2s[camera]'. Raises OSError where it cannot write MP4.
     """
-    try:
-        import cv2
-    except ImportError as error:
-        raise ImportError("an MP4 needs OpenCV: pip install 'r2s[camera]'; or ask for a GIF") from (
-            error
-        )
+    cv2 = require("cv2", "camera", "videos as MP4 (a GIF needs no extra)")
     with tempfile.TemporaryDirectory(dir=path.parent) as place:
         part = Path(place) / "video.mp4"
         writer = None
@@ -70,7 +66,7 @@ def write_mp4(path: Path, pictures: Pictures, interval: float) -> Path:
 def has_opencv() -> bool:
     """Whether OpenCV is installed."""
     try:
-        import cv2  # noqa: F401
+        require("cv2", "camera", "videos as MP4")
     except ImportError:
         return False
     return True

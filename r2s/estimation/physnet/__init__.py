@@ -1,13 +1,15 @@
-"""PhysNet: a network that maps depth images of fabrics to a map where alike fabrics lie close.
+"""PhysNet: an embedding of depth images of fabrics in which similar fabrics lie close together.
 
 After Duan, Boyd, Aragon-Camarasa and Aizawa 2022 ("Learning physics properties of fabrics and
 garments with a physics similarity neural network").
 
-- `views`: depth images of points, from where the recording's camera is.
-- `preprocess`: from depth to what the network sees, for real and simulated depth alike.
+- `views`: depth images of points, from the position of the recording's camera.
+- `preprocess`: the grey images that the network sees, from measured or simulated depth.
 - `dataset`: simulated motions of many fabrics as shards of depth images.
 - `network`: the embedding.
-- `triplets`: which images are compared, and the loss.
+- `triplets`: batches, triplets and their loss.
 - `training`: epochs, checkpoints, validation.
-- `pictures`: the physics similarity map, and learning curves.
+- `estimator`: the estimate of a fabric from images.
+- `emulator`, `bayes`: the searches of the estimate and of the published recipe.
+- `search_file`: the file of a search, from which it continues.
 """

@@ -1,4 +1,4 @@
-"""Training data: motions of many fabrics as depth images, in shards that a seed makes again."""
+"""Training data: depth images of simulated motions of many fabrics, in reproducible shards."""
 
 import dataclasses
 import hashlib
@@ -32,22 +32,23 @@ from r2s.scenarios.scenario import Scenario, rollout
 from r2s.scenarios.six import SIX, Experiment, varied
 
 FORMAT = "r2s-physnet-data/2"
-STEP = 1e-4  # [m], of the depths in the files
+DEPTH_UNIT = 1e-4  # [m], of the depths in the files
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What a data set holds; all of it follows from these.
+    """The settings that determine a data set.
 
     - `scenario`: a name in `r2s.scenarios.SIX`.
-    - `num_fabrics`: the classes, drawn evenly from the unit cube of the space.
-    - `num_levels`: motions of each, the same for all of a shard; see `levels`.
-    - `num_frames`: kept of each motion, evenly spread over those that count.
-    - `size`: of the images, [pixel]. - `shape`: vertices along warp and weft.
-    - `density` [kg/m^2], `thickness` [m], `ranges`: of the space; no ranges: its own.
-    - `isotropic`: fabrics of E h and Poisson's ratio, not orthotropic ones.
-    - `material_points`: by these instead of the cloth.
-    - `per_shard`: fabrics in a file. - `seed`.
+    - `num_fabrics`: fabrics, drawn uniformly from the unit cube of the space.
+    - `num_levels`: motions of each fabric, the same for all of a shard; see `levels`.
+    - `num_frames`: frames of each motion, evenly spread over those that count.
+    - `size`: side of the images, [pixel].
+    - `shape`: vertices of the sheet along warp and weft.
+    - `density` [kg/m^2], `thickness` [m], `ranges`: of the space; without ranges its defaults.
+    - `material_points`: whether material points simulate the motions, and not the cloth.
+    - `per_shard`: fabrics in a file.
+    - `isotropic`: whether fabrics are isotropic (E h and Poisson's ratio), and not orthotropic.
     """
 
     scenario: str = "lifting"
@@ -66,7 +67,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         plain = self._plain().ranges
-        if not self.ranges:  # written down with the data, whatever they will be by default
+        if not self.ranges:  # stored with the data, so that later defaults do not change them
             object.__setattr__(self, "ranges", plain)
         names, expected = ([bound.name for bound in ranges] for ranges in (self.ranges, plain))
         if names[: len(expected)] != expected:
@@ -79,6 +80,7 @@ class Settings:
 
     @property
     def space(self) -> ParameterSpace:
+        """The fabrics from which those of the data are drawn."""
         return dataclasses.replace(self._plain(), ranges=self.ranges)
 
     def _plain(self) -> OrthotropicSpace | IsotropicSpace:
@@ -89,7 +91,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Manifest:
-    """`manifest.json`: how the data were made, the view, and the SHA-256 of every shard so far."""
+    """The file `manifest.json`: settings and view of the data, and the SHA-256 of every shard."""
 
     format: str
     settings: Settings
@@ -98,10 +100,11 @@ class Manifest:
 
 
 class Data(NamedTuple):
-    """Images of motions; a motion that diverged is left out.
+    """Images of all motions that did not diverge.
 
-    - `depth`: in units of `STEP`, 0 where there is none.
-    - `fabric`: which one a motion is of. - `places`: of all fabrics in the unit cube.
+    - `depth`: depths in units of `DEPTH_UNIT`; 0 where there is none.
+    - `fabric`: index of each motion's fabric.
+    - `places`: all fabrics as points of the unit cube.
     """
 
     depth: UInt[np.ndarray, "motion frame down across"]
@@ -110,9 +113,9 @@ class Data(NamedTuple):
 
 
 @eqx.filter_jit
-def _moved(scenarios: Scenario, fabrics: Fabric, solver: Sheet | None):
+def _rollouts(scenarios: Scenario, fabrics: Fabric, solver: Sheet | None):
     def one(scenario: Scenario, fabric: Fabric):
-        # the grid serves all scenarios, the fan is each one's own
+        # the grid serves all scenarios, but each has a fan of its own
         own = solver and eqx.tree_at(lambda s: s.scene, solver, scenario.scene)
         found = rollout(scenario, fabric, solver=own)
         return found.x, jnp.all(found.ok) & jnp.all(jnp.isfinite(found.x))
@@ -120,18 +123,18 @@ def _moved(scenarios: Scenario, fabrics: Fabric, solver: Sheet | None):
     return eqx.filter_vmap(one)(scenarios, fabrics)
 
 
-_seen = eqx.filter_jit(eqx.filter_vmap(depths_of_sheet, in_axes=(None, 0, None, None)))
+_depths = eqx.filter_jit(eqx.filter_vmap(depths_of_sheet, in_axes=(None, 0, None, None)))
 
 
 def make(
     folder: Path | str, settings: Settings, progress: bool = True, view: View | None = None
 ) -> Manifest:
-    """Write the shards of a data set that are not there yet, and its manifest after each.
+    """Write the missing shards of a data set, and its manifest after each.
 
-    A shard depends on the seed and on its own number alone, so an interrupted call goes on with
-    the same numbers. The view is that of all motions of the first shard, or the one given: that of
-    other data, for their network. Raises `ValueError` when the folder has data of other settings or
-    of another view.
+    A shard depends on the settings and on its own number alone, so that an interrupted call can be
+    repeated. Without a `view`, such as that of the data of an existing network, the motions of the
+    first shard determine it. Raises `ValueError` when the folder has data of other settings or of
+    another view.
     """
     from tqdm import tqdm
 
@@ -148,15 +151,15 @@ def make(
     shards = dict(known.shards) if known else {}
     view = known.view if known else view
     starts = range(0, settings.num_fabrics, settings.per_shard)
-    shared = None
+    shared = None  # until a shard is missing
     for number, _ in enumerate(tqdm(starts, "shards", disable=None if progress else True)):
         name = f"{number:04d}.npz"
         if view is not None and _is_whole(folder / name, shards.get(name)):
             continue
-        shared = alike(settings) if shared is None else shared
+        shared = _shared(settings) if shared is None else shared
         experiments, places, x, ok = _simulate(settings, number, shared)
-        if view is None:  # the first shard says where sheets go
-            view = _fit(settings, experiments[0], x[ok])
+        if view is None:
+            view = _fitted_view(settings, experiments[0], x[ok])
         shards[name] = _write(folder / name, settings, view, places, x, ok)
         manifest = Manifest(FORMAT, settings, view, dict(sorted(shards.items())))
         write_json(folder / "manifest.json", asdict(manifest))
@@ -164,7 +167,7 @@ def make(
 
 
 def load_manifest(folder: Path | str) -> Manifest:
-    """The manifest of a data set; `ValueError` that names the file when it is none."""
+    """The manifest of a data set. Raises `ValueError` that names the file when it is damaged."""
     path = Path(folder) / "manifest.json"
     manifest = read_json(path, Manifest)
     if manifest.format != FORMAT:
@@ -175,11 +178,12 @@ def load_manifest(folder: Path | str) -> Manifest:
 def load(folder: Path | str) -> Data:
     """All shards of a data set. Raises `ValueError` that names what is missing or damaged."""
     folder = Path(folder)
-    settings, shards = load_manifest(folder).settings, load_manifest(folder).shards
+    manifest = load_manifest(folder)
+    settings, shards = manifest.settings, manifest.shards
     expected = -(-settings.num_fabrics // settings.per_shard)
     if len(shards) != expected:
         raise ValueError(
-            f"{folder} has {len(shards)} of {expected} shards: make the data set again, it goes on"
+            f"{folder} has {len(shards)} of {expected} shards: call `make` again, it goes on"
         )
     parts: list[Any] = []
     for name, digest in shards.items():
@@ -195,30 +199,16 @@ def load(folder: Path | str) -> Data:
 
 
 def levels(settings: Settings, number: int = 0) -> list[Experiment]:
-    """The motions of every fabric of a shard: the scenario's own, and others within
-    `trajectories.LIMITS`, of which each shard has its own: so a network cannot learn them by heart.
+    """The motions of every fabric of a shard: the scenario's own, and random variations of it.
+
+    Each shard has variations of its own, so that a network cannot learn them by heart.
     """
-    key = jr.fold_in(jr.key(settings.seed), 2**20 + number)  # not that of the fabrics
+    key = jr.fold_in(jr.key(settings.seed), 2**20 + number)  # different from that of the fabrics
     return [SIX[settings.scenario](), *varied(settings.scenario, settings.num_levels - 1, key=key)]
 
 
-def every_level(settings: Settings) -> list[Experiment]:
-    """The motions of all shards."""
-    shards = -(-settings.num_fabrics // settings.per_shard)
-    first, *others = levels(settings)
-    return [first, *others, *(e for i in range(1, shards) for e in levels(settings, i)[1:])]
-
-
-def stacked(scenarios: list[Scenario], most: int | None = None) -> Scenario:
-    """Scenarios with a leading axis on their arrays, all with `most` steps between frames, or as
-    the one with most."""
-    most = max(scenario.substeps for scenario in scenarios) if most is None else most
-    alike = [dataclasses.replace(scenario, substeps=most) for scenario in scenarios]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *alike)
-
-
 def solver_of(settings: Settings, scenarios: list[Scenario]) -> Sheet | None:
-    """None for the cloth; else material points whose step and grid serve all these motions."""
+    """None for the cloth, or material points whose step and grid serve all these motions."""
     if not settings.material_points:
         return None
     paths, times = (
@@ -231,36 +221,36 @@ def solver_of(settings: Settings, scenarios: list[Scenario]) -> Sheet | None:
 
 
 def kept_frames(used: tuple[int, int], number: int) -> tuple[int, ...]:
-    """`number` frames evenly spread from the first to the last that counts."""
+    """The indices of `number` frames, evenly spread from the first to the last that counts."""
     first, last = used
     return tuple(int(frame) for frame in np.linspace(first, last, number).round())
 
 
-class Alike(NamedTuple):
-    """What all shards share, so that they compile once: steps between frames, and the solver."""
-
-    substeps: int
-    solver: Sheet | None
-
-
-def alike(settings: Settings) -> Alike:
-    """For the motions of all shards."""
-    scenarios = [experiment.scenario(settings.shape) for experiment in every_level(settings)]
-    return Alike(max(s.substeps for s in scenarios), solver_of(settings, scenarios))
+def _shared(settings: Settings) -> tuple[int, Sheet | None]:
+    """The steps between frames and the solver of all shards, so that they compile once."""
+    shards = -(-settings.num_fabrics // settings.per_shard)
+    experiments = [experiment for i in range(shards) for experiment in levels(settings, i)[i > 0 :]]
+    scenarios = [experiment.scenario(settings.shape) for experiment in experiments]
+    return max(s.substeps for s in scenarios), solver_of(settings, scenarios)
 
 
-def _simulate(settings: Settings, number: int, alike: Alike):
-    """The experiments of a shard, its fabrics' places, and their motions [m], with which are ok."""
+def _simulate(settings: Settings, number: int, shared: tuple[int, Sheet | None]):
+    """Experiments, places of the fabrics, motions [m] and which of them are ok, of a shard."""
+    substeps, solver = shared
     first = number * settings.per_shard
     count = min(settings.per_shard, settings.num_fabrics - first)
-    # always a whole shard, so that it compiles once and the last fabrics do not depend on how many
+    # always a whole shard, so that it compiles once and does not depend on the number of fabrics
     key = jr.fold_in(jr.key(settings.seed), number)
     places = jr.uniform(key, (settings.per_shard, len(settings.ranges)), float)
     experiments = levels(settings, number)
-    scenarios = [experiment.scenario(settings.shape) for experiment in experiments]
+    scenarios = [
+        dataclasses.replace(experiment.scenario(settings.shape), substeps=substeps)
+        for experiment in experiments
+    ]
     fabrics = jax.vmap(settings.space)(jnp.repeat(places, settings.num_levels, axis=0))
-    repeated = stacked(scenarios * settings.per_shard, alike.substeps)
-    x, ok = _moved(repeated, fabrics, alike.solver)
+    repeated = scenarios * settings.per_shard
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *repeated)
+    x, ok = _rollouts(stacked, fabrics, solver)
     motions = count * settings.num_levels
     frames = np.array(kept_frames(experiments[0].frames_used, settings.num_frames))
     return (
@@ -271,19 +261,20 @@ def _simulate(settings: Settings, number: int, alike: Alike):
     )
 
 
-def _fit(settings: Settings, experiment: Experiment, x: np.ndarray) -> View:
+def _fitted_view(settings: Settings, experiment: Experiment, x: np.ndarray) -> View:
     points = x.reshape(-1, 3)
     return view_around(eye_of(experiment), points, settings.size, floor_of(experiment))
 
 
 def _write(path: Path, settings: Settings, view: View, places, x, ok) -> str:
-    """Write a shard; its SHA-256. Depths are in units of `STEP`, as cameras give them."""
+    """Write a shard with depths in units of `DEPTH_UNIT`, and return its SHA-256."""
     experiment = SIX[settings.scenario]()
     faces = experiment.scenario(settings.shape).scene.mesh.faces
     fine = per_face(view, settings.shape, experiment.sheet.size)
-    depth = np.asarray(_seen(view, jnp.asarray(np.where(np.isfinite(x), x, 0)), faces, fine))
+    x = jnp.asarray(np.where(np.isfinite(x), x, 0))
+    depth = np.rint(np.asarray(_depths(view, x, faces, fine)) / DEPTH_UNIT).astype(np.uint16)
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, depth=np.rint(depth / STEP).astype(np.uint16), places=places, ok=ok)
+    np.savez_compressed(buffer, depth=depth, places=places, ok=ok)
     write_bytes(path, buffer.getvalue())
     return hashlib.sha256(buffer.getvalue()).hexdigest()
 

@@ -1,8 +1,8 @@
-"""Bayesian optimisation of answers that are vectors, towards a target.
+"""Search for the place whose answer, a vector, is nearest to a target.
 
-A Gaussian process emulates each principal part of the answers, not the loss: 80 answers of some
-numbers each say more of where the target lies than 80 losses (composite Bayesian optimisation,
-Astudillo and Frazier 2019). It knows nothing of fabrics.
+A Gaussian process emulates each principal component of the answers, because 80 answers of many
+numbers say more of where the target lies than 80 losses (composite Bayesian optimisation, Astudillo
+and Frazier 2019). It is our own, since scikit-optimize models a scalar loss and no vector.
 """
 
 import warnings
@@ -16,13 +16,13 @@ from jaxtyping import Float
 from r2s.estimation import checkpoint
 from r2s.estimation.physnet.bayes import CENTRES, candidates, even
 
-PARTS = 10  # of the answers, of the greatest variance, at most
-FIRST = 0.4  # of the calls, that fill the cube evenly
+COMPONENTS = 10  # principal components of the answers, at most
+FIRST = 0.4  # share of the calls that fill the cube evenly
 Respond = Callable[[Float[np.ndarray, "place dim"]], Float[np.ndarray, "place part"]]
 
 
 class Trials(NamedTuple):
-    """What was tried, in order: places in the unit cube, and answers; NaN where one failed."""
+    """Places in the unit cube in the order of the calls, and answers; NaN where a call failed."""
 
     places: Float[np.ndarray, "call dim"]
     answers: Float[np.ndarray, "call part"]
@@ -46,12 +46,15 @@ def minimise(
 ) -> Trials:
     """Trials, of which the last is where the target most likely lies.
 
-    The first `FIRST` of the calls fill the cube; then each batch is drawn by how likely the target
-    is there, by the emulator and the error of the target. That is estimated from the least loss,
-    and counts as shared by so many parts (`shared`), such as those of all frames. The same seed
-    gives the same trials; saved to `path` after every batch, they go on from there. Raises
-    `ValueError` when that is of another search or for fewer than `dim` + 2 calls, and
-    `RuntimeError` when all calls fail.
+    - `respond`: gives the answers of up to `batch` places.
+    - `shared`: number of parts of an answer, such as frames, that share one error of the target.
+    - `path`: file that keeps the trials after every batch, and from which the search continues.
+    - `progress`: called with the trials after every batch.
+
+    The share `FIRST` of the calls fills the cube. Then each batch is drawn by the likelihood of the
+    target, from the emulator's deviation and the error of the target, which the least loss
+    estimates. The same seed gives the same trials. Raises `ValueError` when the file is of another
+    search or for fewer than `dim` + 2 calls, and `RuntimeError` when all calls fail.
     """
     if num_calls < dim + 2:
         raise ValueError(f"expected at least {dim + 2} calls in {dim} dimensions, got {num_calls}")
@@ -65,7 +68,8 @@ def minimise(
             places = first[done : min(done + batch, num_calls)]
         else:
             number = min(batch, num_calls - 1 - done)
-            places = _asked(trials, target, shared, number, np.random.default_rng([seed, done]))
+            generator = np.random.default_rng([seed, done])
+            places = _ask(trials, target, shared, number, generator)
         answers = respond(places)
         told = np.concatenate([trials.answers, answers])
         trials = Trials(np.concatenate([trials.places, places]), told)
@@ -76,8 +80,8 @@ def minimise(
     return trials
 
 
-def _asked(trials: Trials, target, shared: int, number: int, generator) -> np.ndarray:
-    """Places drawn by their likelihood; for the last of all calls (0) the likeliest."""
+def _ask(trials: Trials, target, shared: int, number: int, generator) -> np.ndarray:
+    """`number` places drawn by their likelihood; for 0, the last call, the most likely one."""
     losses = trials.losses(target)
     kept = np.isfinite(losses)
     if not kept.any():
@@ -97,26 +101,26 @@ def _asked(trials: Trials, target, shared: int, number: int, generator) -> np.nd
 
 
 def _misfit(places, answers, target, variance: float) -> Callable[[np.ndarray], np.ndarray]:
-    """How unlikely the target is at places: -2 log of its likelihood, by a fitted emulator."""
-    middle = answers.mean(axis=0)
-    _, _, axes = np.linalg.svd(answers - middle, full_matrices=False)
-    axes = axes[: min(PARTS, len(axes))]
-    wanted = (target - middle) @ axes.T
-    processes = [_process(places, part) for part in ((answers - middle) @ axes.T).T]
+    """Minus twice the log-likelihood of the target at places, by an emulator of the answers."""
+    mean = answers.mean(axis=0)
+    _, _, axes = np.linalg.svd(answers - mean, full_matrices=False)
+    axes = axes[:COMPONENTS]
+    wanted = (target - mean) @ axes.T
+    processes = [_process(places, component) for component in ((answers - mean) @ axes.T).T]
 
     def misfit(tried: np.ndarray) -> np.ndarray:
         total = np.zeros(len(tried))
         for process, value in zip(processes, wanted, strict=True):
-            mean, deviation = process.predict(tried, return_std=True)
-            spread = deviation**2 + variance
-            total += (mean - value) ** 2 / spread + np.log(spread)
+            expected, deviation = process.predict(tried, return_std=True)
+            total_variance = deviation**2 + variance
+            total += (expected - value) ** 2 / total_variance + np.log(total_variance)
         return total
 
     return misfit
 
 
 def _process(places: np.ndarray, values: np.ndarray) -> Any:
-    """A Gaussian process of one part, fitted."""
+    """A Gaussian process fitted to one component."""
     try:
         from sklearn.gaussian_process import GaussianProcessRegressor
         from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel

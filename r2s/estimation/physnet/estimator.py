@@ -1,12 +1,13 @@
 """PhysNet: a fabric from depth images, by a search on the physics similarity map.
 
-After Duan et al. 2022. The loss is the distance, frame by frame, between where a trained network
-puts the recorded and the simulated images. Both pass the same preprocessing, and the simulation
-follows the recorded gripper.
+After Duan et al. 2022. The loss is the distance, frame by frame, between the points that a trained
+network gives the recorded and the simulated images. Both pass the same preprocessing, and the
+simulation follows the recorded gripper.
 """
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import equinox as eqx
@@ -17,7 +18,6 @@ from jaxtyping import Array, Float
 
 from r2s.estimation.estimate import Estimate, point_estimate
 from r2s.estimation.physnet import bayes, emulator
-from r2s.estimation.physnet.bayes import History, Objective
 from r2s.estimation.physnet.network import PhysNet
 from r2s.estimation.physnet.preprocess import grey
 from r2s.estimation.physnet.training import Training
@@ -31,11 +31,16 @@ Images = Float[np.ndarray, "frame down across"]
 
 
 class Sighting(eqx.Module):
-    """A recorded motion on the map, and how to simulate it.
+    """A recorded motion on the map, and all that its simulation needs.
 
-    - `scenario`, `frames`: which of its frames were seen. - `points`: where those images lie.
-    - `family`: the fabrics to choose from. - `solver`: None for the cloth.
-    - `cameras`: what is in the frame of each, of `frustum`; None: all of the sheet is.
+    - `scenario`: the motion.
+    - `points`: points of the recorded images on the map.
+    - `space`: the fabrics among which is searched.
+    - `network`: the embedding.
+    - `solver`: None for the cloth.
+    - `frames`: frames of the scenario at which the images were recorded.
+    - `view`, `per_face`: see `views.depths_of_sheet`.
+    - `cameras`: planes of the cameras' frames (`frustum`); None: all of the sheet was in them.
     """
 
     scenario: Scenario
@@ -59,9 +64,12 @@ class Sighting(eqx.Module):
         solver: Solver | None = None,
         cameras: Sequence[DepthCamera] = (),
     ) -> "Sighting":
-        """From images of `r2s.estimation.physnet.preprocess` at some frames of a scenario.
+        """A sighting from recorded images.
 
-        Where `cameras` are given, simulated images too lack what all of them have out of frame.
+        - `images`: of `r2s.estimation.physnet.preprocess`, one for each of the `frames`.
+        - `training`: the trained network with its view.
+        - `cameras`: what is out of the frame of all of them is left out of simulated images too.
+
         Raises `ValueError` when images and frames differ in number, or a frame is not simulated.
         """
         if len(images) != len(frames) or not all(0 <= f < scenario.num_frames for f in frames):
@@ -74,26 +82,33 @@ class Sighting(eqx.Module):
         along = tuple(len(np.unique(rest[:, axis].round(6))) for axis in (0, 1))
         width, height = (float(side) for side in np.ptp(rest, axis=0))
         fine = per_face(training.view, (along[0], along[1]), (width, height))
-        about = frames, training.view, fine
         planes = [frustum(camera) for camera in cameras]
-        planes = jnp.asarray(np.stack(planes), float) if planes else None
-        return cls(scenario, points, space, training.network, solver, *about, planes)
+        return cls(
+            scenario=scenario,
+            points=points,
+            space=space,
+            network=training.network,
+            solver=solver,
+            frames=frames,
+            view=training.view,
+            per_face=fine,
+            cameras=jnp.asarray(np.stack(planes), float) if planes else None,
+        )
 
 
 @eqx.filter_jit
 def embedded(
     network: PhysNet, images: Float[Array, "image down across"]
 ) -> Float[Array, "image dim"]:
-    """Where images lie on the map."""
+    """The points of images on the map."""
     return jax.vmap(network)(images)
 
 
 @eqx.filter_jit
 def answers(sighting: Sighting, places: Float[Array, "place dim"]) -> Float[Array, "place part"]:
-    """Where the simulated frames of each fabric lie on the map, one after the other.
+    """The points on the map of the simulated frames of each fabric, as one vector (see `_flat`).
 
-    In units in which the root mean square of the parts' differences is that of the frames'
-    distances. NaN where the simulation diverges.
+    It is NaN where the simulation diverges.
     """
 
     def of_place(place):
@@ -101,9 +116,8 @@ def answers(sighting: Sighting, places: Float[Array, "place dim"]) -> Float[Arra
         found = rollout(sighting.scenario, fabric, solver=sighting.solver)
         x = found.x[jnp.array(sighting.frames)]
         faces = sighting.scenario.scene.mesh.faces
-        about = sighting.per_face, sighting.cameras
-        depth = depths_of_sheet(sighting.view, x, faces, *about)
-        images = jax.vmap(lambda image: grey(sighting.view, image))(depth)
+        depth = depths_of_sheet(sighting.view, x, faces, sighting.per_face, sighting.cameras)
+        images = jax.vmap(partial(grey, sighting.view))(depth)
         points = jax.vmap(sighting.network)(images)
         whole = jnp.all(found.ok) & jnp.all(jnp.isfinite(x))
         return jnp.where(whole, _flat(points), jnp.nan)
@@ -112,27 +126,20 @@ def answers(sighting: Sighting, places: Float[Array, "place dim"]) -> Float[Arra
 
 
 def _flat(points: Float[Array, "frame dim"]) -> Float[Array, " part"]:
+    """Points as one vector, scaled so that the root mean square difference of two such vectors is
+    that of the frames' distances."""
     return points.reshape(-1) * jnp.sqrt(jnp.asarray(points.shape[-1], points.dtype))
 
 
 def target_of(sighting: Sighting) -> Float[np.ndarray, " part"]:
-    """Where the recorded frames lie on the map, in the units of `answers`."""
+    """The answer that a search is to reach: that of the recorded images."""
     return np.asarray(_flat(sighting.points))
-
-
-def distances(sighting: Sighting, places: Float[Array, "place dim"]) -> Float[Array, " place"]:
-    """The rms distance [-] on the map between the recorded frames and those of each fabric.
-
-    NaN where the simulation diverges.
-    """
-    squares = (answers(sighting, places) - _flat(sighting.points)[None]) ** 2
-    return jnp.sqrt(jnp.mean(squares, axis=1))
 
 
 def responses(
     sighting: Sighting, batch: int
 ) -> Callable[[Float[np.ndarray, "place dim"]], Float[np.ndarray, "place part"]]:
-    """The answers of any number of places up to `batch`, simulated together."""
+    """The function from up to `batch` places to their answers, simulated together."""
 
     def respond(places):
         padded = np.full((batch, places.shape[1]), 0.5)  # so that it compiles once
@@ -142,10 +149,17 @@ def responses(
     return respond
 
 
-def objective(sighting: Sighting, batch: int) -> Objective:
-    """The loss of places, simulated `batch` together, for `r2s.estimation.physnet.bayes`."""
-    respond, target = responses(sighting, batch), target_of(sighting)
-    return lambda places: np.sqrt(((respond(places) - target) ** 2).mean(axis=1))
+def objective(sighting: Sighting, batch: int) -> bayes.Objective:
+    """The function from up to `batch` places to the rms distances of their frames on the map.
+
+    A distance is NaN where the simulation diverges.
+    """
+    respond, recorded = responses(sighting, batch), target_of(sighting)
+
+    def distances(places: Float[np.ndarray, "place dim"]) -> Float[np.ndarray, " place"]:
+        return np.sqrt(((respond(places) - recorded) ** 2).mean(axis=1))
+
+    return distances
 
 
 def estimate(
@@ -159,46 +173,63 @@ def estimate(
 ) -> Estimate:
     """The fabric most likely to look as recorded, by `num_calls` simulations.
 
-    Where its images lie on the map is emulated, as of `r2s.estimation.physnet.emulator`; the last
-    simulation is of the estimate. Goes on from `path`. The losses are distances on the map, without
-    unit. Gives no deviations: repeat with other seeds. Raises `RuntimeError` when all simulations
+    - `batch`: simulations that run together.
+    - `path`: file of the search, from which it continues.
+    - `progress`: called with the trials after every batch.
+
+    An emulator (`r2s.estimation.physnet.emulator`) predicts the points of simulated images; the
+    last simulation is that of the estimate. Losses are distances on the map, without unit. There
+    are no standard errors: repeat with other seeds. Raises `RuntimeError` when all simulations
     diverge, or the last one.
     """
     began = time.perf_counter()
-    target = target_of(sighting)
-    about = {"num_calls": num_calls, "batch": batch, "seed": seed, "path": path}
-    frames = len(sighting.frames)  # the error of the images counts as the same in all of them
-    dim = sighting.space.dim
     trials = emulator.minimise(
-        responses(sighting, batch), target, dim, shared=frames, progress=progress, **about
+        responses(sighting, batch),
+        target_of(sighting),
+        sighting.space.dim,
+        num_calls=num_calls,
+        batch=batch,
+        shared=len(sighting.frames),  # the error of the images counts as the same in all of them
+        seed=seed,
+        path=path,
+        progress=progress,
     )
-    losses = trials.losses(target)
+    losses = trials.losses(target_of(sighting))
     if not np.isfinite(losses[-1]):
         raise RuntimeError("the simulation of the estimate diverged: narrow the ranges")
     name = f"physnet (emulated answers, {num_calls} simulations)"
-    return _told(sighting, name, trials.places, losses, -1, began)
+    return _estimate(sighting, name, trials.places, losses, -1, began)
 
 
-def original(
+def published_recipe(
     sighting: Sighting,
     *,
     num_calls: int = 80,
     batch: int = 4,
     seed: int = 0,
     path: Path | str | None = None,
-    progress: Callable[[History], None] | None = None,
+    progress: Callable[[bayes.History], None] | None = None,
 ) -> Estimate:
-    """The fabric of the least distance on the map among `num_calls` simulations, by Bayesian
-    optimisation of that distance, as in the study; otherwise as `estimate`."""
+    """The fabric of the least distance on the map among `num_calls` simulations.
+
+    Bayesian optimisation of that distance (`r2s.estimation.physnet.bayes`) chooses them, as in the
+    study of Duan et al. The arguments are those of `estimate`.
+    """
     began = time.perf_counter()
-    about = {"num_calls": num_calls, "batch": batch, "seed": seed, "path": path}
-    lossy, dim = objective(sighting, batch), sighting.space.dim
-    history = bayes.minimise(lossy, dim, progress=progress, **about)
+    history = bayes.minimise(
+        objective(sighting, batch),
+        sighting.space.dim,
+        num_calls=num_calls,
+        batch=batch,
+        seed=seed,
+        path=path,
+        progress=progress,
+    )
     name = f"physnet (Bayesian optimisation, {num_calls} simulations)"
-    return _told(sighting, name, history.places, history.losses, history.best, began)
+    return _estimate(sighting, name, history.places, history.losses, history.best, began)
 
 
-def _told(sighting: Sighting, name: str, places, losses, best: int, began: float) -> Estimate:
+def _estimate(sighting: Sighting, name: str, places, losses, best: int, began: float) -> Estimate:
     space = sighting.space
     values = np.asarray(jax.vmap(space.values)(jnp.asarray(places, float)))
     return point_estimate(

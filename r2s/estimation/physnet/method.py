@@ -142,6 +142,6 @@ class PublishedPhysNet(PhysNetMethod):
             if self.progress is not None:
                 self.progress(len(history.losses), float(np.nanmin(history.losses)))
 
-        return estimator.original(
+        return estimator.published_recipe(
             seen, num_calls=evaluations, seed=seed, path=self.checkpoint, progress=report
         )

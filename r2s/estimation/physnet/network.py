@@ -1,11 +1,12 @@
-"""The embedding: a grey depth image to a point of the physics similarity map.
+"""The embedding of a grey depth image as a point of the physics similarity map.
 
-Two networks with the same weights, the branches of a Siamese network, are one function called
-twice. Architecture: 5 x 5 convolutions with PReLU, each followed by 2 x 2 max-pooling, then fully
-connected layers down to the map.
+The branches of a Siamese network share their weights, so that one function serves for all of them.
+It has 5 x 5 convolutions with PReLU and 2 x 2 max-pooling, then fully connected layers.
 """
 
 from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
 
 import equinox as eqx
 import jax
@@ -13,13 +14,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 KERNEL = 5
-SLOPE = 0.25  # where PReLU starts
+SLOPE = 0.25  # initial slope of PReLU
 
 
 @dataclass(frozen=True)
 class Architecture:
-    """- `size`: of the image, [pixel]. - `channels`: of the convolutions. - `hidden`: widths of the
-    fully connected layers. - `dim`: of the map.
+    """The sizes of a network.
+
+    - `size`: side of the image, [pixel].
+    - `channels`: output channels of the convolutions.
+    - `hidden`: widths of the hidden fully connected layers.
+    - `dim`: dimensions of the map.
 
     Raises `ValueError` when the image cannot be halved as often as there are convolutions.
     """
@@ -42,7 +47,7 @@ DEEPER = Architecture(channels=(16, 32, 64, 128), dim=8)  # five times as fast a
 
 
 class PhysNet(eqx.Module):
-    """The embedding of one image; `jax.vmap` for many. `slopes` are those of every PReLU."""
+    """The embedding of one image. `slopes` are those of the PReLU after each layer but the last."""
 
     convolutions: list[eqx.nn.Conv2d]
     layers: list[eqx.nn.Linear]
@@ -51,25 +56,22 @@ class PhysNet(eqx.Module):
 
     @classmethod
     def make(cls, architecture: Architecture, *, key: PRNGKeyArray) -> "PhysNet":
-        """An untrained network; the same key gives the same."""
+        """An untrained network."""
         channels = (1, *architecture.channels)
         side = architecture.size // 2 ** len(architecture.channels)
         widths = (channels[-1] * side**2, *architecture.hidden, architecture.dim)
         keys = iter(jax.random.split(key, len(channels) + len(widths)))
-        pairs = lambda numbers: zip(numbers[:-1], numbers[1:], strict=True)
-        convolve = lambda a, b, key: eqx.nn.Conv2d(a, b, KERNEL, padding=KERNEL // 2, key=key)
+        convolution = partial(eqx.nn.Conv2d, kernel_size=KERNEL, padding=KERNEL // 2)
+        slopes = jnp.full(len(architecture.channels) + len(architecture.hidden), SLOPE, float)
         return cls(
-            [_scaled(convolve, a, b, next(keys)) for a, b in pairs(channels)],
-            [
-                _scaled(lambda a, b, key: eqx.nn.Linear(a, b, key=key), a, b, next(keys))
-                for a, b in pairs(widths)
-            ],
-            jnp.full(len(architecture.channels) + len(architecture.hidden), SLOPE, float),
+            [_he_layer(convolution, a, b, next(keys)) for a, b in pairwise(channels)],
+            [_he_layer(eqx.nn.Linear, a, b, next(keys)) for a, b in pairwise(widths)],
+            slopes,
             architecture,
         )
 
     def __call__(self, image: Float[Array, "down across"]) -> Float[Array, " dim"]:
-        """Where an image lies on the map. Raises `ValueError` when it is of another size."""
+        """The point of an image on the map. Raises `ValueError` for an image of another size."""
         size = self.architecture.size
         if image.shape != (size, size):
             raise ValueError(f"expected an image of {size} x {size} pixels, found {image.shape}")
@@ -83,9 +85,9 @@ class PhysNet(eqx.Module):
         return self.layers[-1](values)
 
 
-def _scaled(make, inputs: int, outputs: int, key: PRNGKeyArray):
-    """A layer whose outputs vary as much as its inputs (He et al. 2015), with biases of zero."""
-    layer = make(inputs, outputs, key)
+def _he_layer(make, inputs: int, outputs: int, key: PRNGKeyArray):
+    """A layer with the normal initial weights of He et al. 2015 and biases of zero."""
+    layer = make(inputs, outputs, key=key)
     weight = layer.weight
     scale = jnp.sqrt(2 / (weight.size // outputs)).astype(weight.dtype)
     weight = scale * jax.random.normal(key, weight.shape, weight.dtype)
@@ -97,6 +99,6 @@ def _prelu(values: Array, slope: Float[Array, ""]) -> Array:
 
 
 def _halved(values: Float[Array, "channel down across"]) -> Array:
-    """The greatest of each 2 x 2 pixels."""
+    """The maximum of each 2 x 2 pixels."""
     channel, down, across = values.shape
     return jnp.max(values.reshape(channel, down // 2, 2, across // 2, 2), axis=(2, 4))

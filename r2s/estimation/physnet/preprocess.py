@@ -1,5 +1,6 @@
-"""From depth to the grey image that the network sees, for real and simulated depth alike."""
+"""The grey image that the network sees, from measured or simulated depth."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -12,30 +13,28 @@ from r2s.recordings.cameras.calibration import DepthCamera
 from r2s.recordings.cameras.depth import back_project, moved
 from r2s.recordings.recording import Recording
 
-ALIKE = 2  # neighbours within `views.LAYER` of a pixel, with fewer of which it is a stray
-# pixels of a measured image within 2 of one, itself included; with fewer it is a stray that `REACH`
-# has spread
-SPECK = 5
-AROUND = 5  # of 8 neighbours with depth, from which a hole is filled
+ALIKE = 2  # least number of 8 neighbours within `views.LAYER` of a pixel that is no stray
+SPECK = 5  # the same among 5 x 5 pixels, where `REACH` has spread measured points
+AROUND = 5  # least number of 8 neighbours with depth, from which a hole is filled
 PASSES = 2  # of filling: holes of up to about 4 pixels across
-DARKEST = 0.2  # what is as far as the view goes; nothing at all is 0
-REACH = 0.25  # of the distance between measured points: half the side of what one stands for
-LEAST = 20  # pixels with depth, in an image of 64 x 64; else there is nothing to recognise
+DARKEST = 0.2  # grey of the farthest depth; a pixel without depth is 0
+REACH = 0.25  # half the side of the square of a measured point, over the distance between points
+LEAST = 20  # least number of pixels with depth, in an image of 64 x 64
 
 
 class Flaws(NamedTuple):
-    """What training images suffer; each share is drawn anew for an image, from 0 to what is here.
+    """The errors of training images. Shares and scales are upper ends, drawn anew for each image.
 
-    Chosen by what `r2s.recordings.cameras.flaws.TYPICAL` and clouds of two cameras do to images of
-    64 x 64: of the pixels at a border 5 to 22 % are lost, beside it up to 10 % gained, and a tenth
-    of the depths there are more than 6 to 8 mm wrong.
+    The defaults are from the effect of `r2s.recordings.cameras.flaws.TYPICAL` and of clouds of two
+    cameras on images of 64 x 64: 5 to 22 % of the pixels at a border are lost, up to 10 % beside it
+    are gained, and a tenth of the depths there are more than 6 to 8 mm wrong.
 
-    - `noise`: standard deviation of depth at 1 m, growing with its square, [m].
-    - `holes`: share of the pixels that have no depth.
-    - `strays`: share of all pixels with any depth, the same in every image.
-    - `lost`: share of the pixels at a border, also one between layers, that have no depth.
-    - `gained`: share of the pixels just outside of a border that have the depth inside.
-    - `flying`: scale of the (Laplacian) error of depth at a border, [m].
+    - `noise`: standard deviation of depth at 1 m, which grows with its square, [m].
+    - `holes`: share of the pixels that lose their depth.
+    - `strays`: share of the pixels with a random depth, the same in every image.
+    - `lost`: share of the pixels at a border, also one between layers, that lose their depth.
+    - `gained`: share of the pixels just outside of a border that get the depth inside.
+    - `flying`: scale of the Laplacian error of depth at a border, [m].
     """
 
     noise: float = 2e-3
@@ -47,9 +46,8 @@ class Flaws(NamedTuple):
 
 
 def grey(view: View, depth: Float[Array, "down across"]) -> Float[Array, "down across"]:
-    """The image of a depth image [m] in a view: near white (1), far grey, none 0.
-
-    Strays are dropped, and then holes filled.
+    """The grey image of a depth image [m]: 1 for the nearest depth, `DARKEST` for the farthest,
+    0 for none. Strays are dropped before holes are filled.
     """
     depth = filled(without_strays(depth))
     shade = (view.far - depth) / (view.far - view.near)
@@ -57,13 +55,13 @@ def grey(view: View, depth: Float[Array, "down across"]) -> Float[Array, "down a
 
 
 def without_strays(depth: Float[Array, "down across"]) -> Float[Array, "down across"]:
-    """Depth [m] without the pixels with fewer than `ALIKE` neighbours at about their depth."""
-    near = lambda other: ((other > 0) & (jnp.abs(other - depth) < LAYER)).astype(depth.dtype)
-    return jnp.where(sum(near(other) for other in _around(depth)) >= ALIKE, depth, 0)
+    """Depth [m] without the pixels that have fewer than `ALIKE` neighbours near their depth."""
+    near = [(other > 0) & (jnp.abs(other - depth) < LAYER) for other in _around(depth)]
+    return jnp.where(sum(each.astype(int) for each in near) >= ALIKE, depth, 0)
 
 
 def filled(depth: Float[Array, "down across"]) -> Float[Array, "down across"]:
-    """Depth [m] with the mean of its neighbours in pixels that have none but are surrounded."""
+    """Depth [m] where pixels without depth get the mean of at least `AROUND` neighbours."""
     for _ in range(PASSES):
         there = depth > 0
         number = sum((other > 0).astype(depth.dtype) for other in _around(depth))
@@ -73,7 +71,7 @@ def filled(depth: Float[Array, "down across"]) -> Float[Array, "down across"]:
 
 
 def _around(values: Float[Array, "down across"]) -> list[Float[Array, "down across"]]:
-    """The 8 neighbours of every pixel; outside of the image 0."""
+    """The 8 neighbours of every pixel; 0 outside of the image."""
     padded, (rows, columns) = jnp.pad(values, 1), values.shape
     shifts = [(i, j) for i in range(3) for j in range(3) if (i, j) != (1, 1)]
     return [padded[i : i + rows, j : j + columns] for i, j in shifts]
@@ -82,20 +80,19 @@ def _around(values: Float[Array, "down across"]) -> list[Float[Array, "down acro
 def flawed(
     depth: Float[Array, "down across"], view: View, flaws: Flaws, key: Array
 ) -> Float[Array, "down across"]:
-    """Depth [m] as cameras and clouds give it: with noise, holes, strays and ragged borders."""
+    """Depth [m] with noise, holes, strays and ragged borders, as cameras and clouds give it."""
     key_shares, key_border, key_noise, key_holes, key_stray, key_where = jax.random.split(key, 6)
     share = jax.random.uniform(key_shares, (4,), depth.dtype)
-    uniform = lambda key: jax.random.uniform(key, depth.shape, depth.dtype)
     depth = _ragged(depth, flaws, share[:3], key_border)
     error = flaws.noise * depth**2 * jax.random.normal(key_noise, depth.shape, depth.dtype)
-    kept = uniform(key_holes) >= flaws.holes * share[3]
-    depth = jnp.where(kept & (depth > 0), depth + error, 0)
-    where = view.near + (view.far - view.near) * uniform(key_where)
-    return jnp.where(uniform(key_stray) < flaws.strays, where, depth)
+    keys = key_holes, key_stray, key_where
+    hole, stray, where = (jax.random.uniform(k, depth.shape, depth.dtype) for k in keys)
+    depth = jnp.where((hole >= flaws.holes * share[3]) & (depth > 0), depth + error, 0)
+    return jnp.where(stray < flaws.strays, view.near + (view.far - view.near) * where, depth)
 
 
 def _ragged(depth: Float[Array, "down across"], flaws: Flaws, share: Float[Array, "3"], key: Array):
-    """Depth [m] whose borders have lost, gained and wrong pixels."""
+    """Depth [m] with lost, gained and wrong pixels at its borders."""
     key_lost, key_error = jax.random.split(key)
     around = _around(depth)
     there = depth > 0
@@ -117,7 +114,7 @@ def of_points(
 ) -> Float[Array, "down across"]:
     """The depth image [m] of measured points [m], as large as that of the surface they lie on.
 
-    Simulated surfaces are sampled up to their borders; measured points only come near them.
+    Simulated surfaces are sampled up to their borders, which measured points do not reach.
     """
     covered = jnp.sum(depth_of(view, points, mask) > 0)
     apart = jnp.sqrt(covered / jnp.maximum(jnp.sum(mask), 1)).astype(points.dtype)
@@ -125,7 +122,7 @@ def of_points(
 
 
 def without_specks(depth: Float[Array, "down across"]) -> Float[Array, "down across"]:
-    """Depth [m] without the pixels with fewer than `SPECK` within 2 pixels at about their depth."""
+    """Depth [m] without the pixels that have fewer than `SPECK` around them near their depth."""
     padded, (rows, columns) = jnp.pad(depth, 2), depth.shape
     others = [padded[i : i + rows, j : j + columns] for i in range(5) for j in range(5)]
     near = [((depth > 0) & (jnp.abs(other - depth) < 2 * LAYER)).astype(int) for other in others]
@@ -133,8 +130,11 @@ def without_specks(depth: Float[Array, "down across"]) -> Float[Array, "down acr
 
 
 def of_clouds(view: View, recording: Recording, frames: tuple[int, ...]) -> np.ndarray:
-    """Images (frame, down, across) of a recording's clouds at some frames, checked."""
-    see = jax.jit(jax.vmap(lambda points, mask: of_points(view, points, mask)))
+    """The images (frame, down, across) of a recording's clouds at some frames.
+
+    Raises `ValueError` as `of_depths` does.
+    """
+    see = jax.jit(jax.vmap(partial(of_points, view)))
     chosen = np.array(frames)
     depth = see(recording.points[chosen], recording.mask[chosen])
     return of_depths(view, np.asarray(depth), recording.info.name, frames)
@@ -147,9 +147,10 @@ def of_camera(
     masks: Bool[np.ndarray, "frame down across"],
     name: str = "depth images",
 ) -> np.ndarray:
-    """Images in a view of what a calibrated camera measured [m] where the masks are, checked.
+    """The images in a view of the depths [m] that a calibrated camera measured inside of masks.
 
     The camera may have another resolution, lens and pose than the view: its pixels become points.
+    Raises `ValueError` for images of another resolution or unit, and as `of_depths` does.
     """
     across, down = camera.resolution
     if depths.shape[1:] != (down, across) or masks.shape != depths.shape:
@@ -157,7 +158,7 @@ def of_camera(
             f"{name}: expected depths and masks of {down} x {across} pixels (down, across), found "
             f"{depths.shape[1:]} and {masks.shape[1:]}: use the resolution of the calibration"
         )
-    see = jax.jit(lambda points, mask: of_points(view, points, mask))
+    see = jax.jit(partial(of_points, view))
     images = []
     for depth, mask in zip(depths, masks, strict=True):
         everywhere = np.ones(depth.shape, bool)  # all pixels, so that it compiles once
@@ -175,10 +176,10 @@ def of_depths(
     name: str = "depth images",
     frames: tuple[int, ...] = (),
 ) -> np.ndarray:
-    """Images of depths [m] in the view's own pixels.
+    """The images of depths [m] in the view's own pixels.
 
-    Raises `ValueError` that names the frame: another size, not finite, no depth, or depths that are
-    not in metres or not where the view looks.
+    Raises `ValueError` that names the frame when depths have another size, are not finite, are
+    missing, are not in metres or are not where the view looks.
     """
     if depths.ndim != 3 or depths.shape[1:] != (view.size, view.size):
         raise ValueError(
@@ -201,7 +202,7 @@ def of_depths(
                 f"{at}: the median depth is {middle:g} m, the view expects {view.near:g} to "
                 f"{view.far:g} m: give depths in metres, from the view's camera"
             )
-    return np.asarray(jax.jit(jax.vmap(lambda d: grey(view, d)))(jnp.asarray(depths, float)))
+    return np.asarray(jax.jit(jax.vmap(partial(grey, view)))(jnp.asarray(depths, float)))
 
 
 def _check_unit(depths: np.ndarray, masks: np.ndarray, name: str) -> None:

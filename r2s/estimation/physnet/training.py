@@ -1,7 +1,8 @@
-"""Training the embedding with triplets: two images of one fabric, moved differently, and another.
+"""Training of the embedding with triplets: two images of one fabric in different motions, and one
+of another fabric.
 
-The triplet loss of squared distances, margin 1 (Schroff, Kalenichenko and Philbin 2015). Fabrics,
-not images, are held back for validation.
+The loss is that of Schroff, Kalenichenko and Philbin 2015: squared distances with a margin of 1.
+Training and validation have different fabrics.
 """
 
 import io
@@ -19,7 +20,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from r2s.estimation.physnet.dataset import STEP, Data
+from r2s.estimation.physnet.dataset import DEPTH_UNIT, Data
 from r2s.estimation.physnet.network import DEEPER, Architecture, PhysNet
 from r2s.estimation.physnet.preprocess import Flaws, flawed, grey
 from r2s.estimation.physnet.triplets import (
@@ -34,21 +35,23 @@ from r2s.estimation.physnet.triplets import (
 from r2s.estimation.physnet.views import View
 from r2s.files import write_bytes
 
-FORMAT = "r2s-physnet/1"
-EMBEDDED = 256  # images at once
+FORMAT = "r2s-physnet/2"
+EARLIER = "r2s-physnet/1"  # of version 0.2.0
+CHUNK = 256  # images that are embedded at once
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How to train.
+    """The settings of a training.
 
-    - `epochs`, `steps`: steps in each epoch.
-    - `fabrics`, `images`: in a batch, and of each of them, from different motions.
+    - `epochs`, `steps`: number of epochs, and of steps in each.
+    - `fabrics`, `images`: fabrics in a batch, and images of each, from different motions.
     - `rate`, `decay`, `decay_every`: Adam's learning rate, times `decay` every so many epochs.
-    - `margin`: by which squared distance another fabric is to be farther away.
-    - `hard`: of each image's triplets only the hardest; else all of the batch.
-    - `held_back`: share of the fabrics for validation. - `triplets`: to validate with.
-    - `flaws`: of the images, to train and to validate with.
+    - `margin`: squared distance by which another fabric is to be farther away.
+    - `hard`: whether only the hardest triplet of each image counts.
+    - `validation`: share of the fabrics for validation.
+    - `triplets`: number of triplets for validation.
+    - `flaws`: errors of the images, in training and validation.
     """
 
     epochs: int = 9
@@ -60,22 +63,22 @@ class Schedule:
     decay_every: int = 5
     margin: float = 1.0
     hard: bool = False
-    held_back: float = 0.15
+    validation: float = 0.15
     triplets: int = 4000
     flaws: Flaws = Flaws()
     seed: int = 0
 
 
 class Row(NamedTuple):
-    """One epoch: the mean loss of training; loss and triplet accuracy of validation."""
+    """The results of an epoch: mean training loss, validation loss, triplet accuracy."""
 
     loss: float
-    held_back_loss: float
+    validation_loss: float
     accuracy: float
 
 
 class Training(NamedTuple):
-    """A training so far. The next epoch depends on nothing else but the data."""
+    """The state of a training. With the data it determines the next epoch."""
 
     network: PhysNet
     optimiser: Any
@@ -85,7 +88,7 @@ class Training(NamedTuple):
 
 
 def begin(view: View, architecture: Architecture = DEEPER, schedule: Schedule | None = None):
-    """An untrained network for a view."""
+    """A training without epochs. Raises `ValueError` when network and view differ in size."""
     schedule = Schedule() if schedule is None else schedule
     if architecture.size != view.size:
         raise ValueError(
@@ -106,9 +109,9 @@ def train(
 
     Raises `FloatingPointError` when the loss is not finite.
     """
-    taught, held_back = divide(data, training.schedule)
+    taught, validation = divide(data, training.schedule)
     while len(training.curve) < training.schedule.epochs:
-        training = epoch(training, taught, held_back)
+        training = epoch(training, taught, validation)
         if path is not None:
             save(training, path)
         if progress is not None:
@@ -116,8 +119,8 @@ def train(
     return training
 
 
-def epoch(training: Training, taught: Split, held_back: Split) -> Training:
-    """One epoch more."""
+def epoch(training: Training, taught: Split, validation: Split) -> Training:
+    """The training after one more epoch."""
     schedule, number = training.schedule, len(training.curve)
     generator = np.random.default_rng([schedule.seed, number])
     network, optimiser = training.network, training.optimiser
@@ -126,29 +129,28 @@ def epoch(training: Training, taught: Split, held_back: Split) -> Training:
         chosen = draw(taught, schedule.fabrics, schedule.images, generator)
         key = jr.fold_in(jr.key(schedule.seed), number * schedule.steps + step)
         depth = jnp.asarray(taught.depth[chosen])
-        about = depth, schedule, training.view, key
-        network, optimiser, loss = _step(network, optimiser, *about)
+        network, optimiser, loss = _step(network, optimiser, depth, schedule, training.view, key)
         losses.append(loss)
     loss = float(np.mean([float(value) for value in losses]))
     if not np.isfinite(loss):
         raise FloatingPointError(
             f"the loss is {loss} in epoch {number}: lower the learning rate {schedule.rate:g}"
         )
-    row = Row(loss, *judge(network, training.view, held_back, schedule))
+    row = Row(loss, *judge(network, training.view, validation, schedule))
     return training._replace(network=network, optimiser=optimiser, curve=(*training.curve, row))
 
 
 def divide(data: Data, schedule: Schedule) -> tuple[Split, Split]:
-    """Images of the fabrics to train with, and of those held back; see `triplets.split`."""
-    return split(data, schedule.held_back, schedule.fabrics, schedule.seed)
+    """Images of the fabrics for training and for validation; see `triplets.split`."""
+    return split(data, schedule.validation, schedule.fabrics, schedule.seed)
 
 
 def embed(network: PhysNet, view: View, depth: Images, flaws: Flaws | None, seed: int = 0):
-    """Where images (in units of `dataset.STEP`) lie on the map; with flaws where given."""
+    """Points on the map of images in units of `dataset.DEPTH_UNIT`, with flaws where given."""
     parts = []
-    for start in range(0, len(depth), EMBEDDED):
-        some = depth[start : start + EMBEDDED]
-        padded = np.zeros((EMBEDDED, *depth.shape[1:]), depth.dtype)
+    for start in range(0, len(depth), CHUNK):
+        some = depth[start : start + CHUNK]
+        padded = np.zeros((CHUNK, *depth.shape[1:]), depth.dtype)
         padded[: len(some)] = some
         key = jr.fold_in(jr.key(seed), start)
         parts.append(
@@ -158,7 +160,7 @@ def embed(network: PhysNet, view: View, depth: Images, flaws: Flaws | None, seed
 
 
 def judge(network: PhysNet, view: View, images: Split, schedule: Schedule) -> tuple[float, float]:
-    """Mean loss and accuracy of triplets: the share in which the positive is the nearer one."""
+    """The mean loss of triplets, and the share of them in which the positive is nearer."""
     points = embed(network, view, images.depth, schedule.flaws, schedule.seed)
     anchor, positive, negative = points[triplets(images, schedule.triplets, schedule.seed).T]
     near, far = (((anchor - other) ** 2).sum(axis=1) for other in (positive, negative))
@@ -173,7 +175,7 @@ def _adam(schedule: Schedule) -> optax.GradientTransformation:
 
 
 def _shown(depth, view: View, flaws: Flaws | None, key) -> Float[Array, "image down across"]:
-    depth = depth.astype(float) * STEP
+    depth = depth.astype(float) * DEPTH_UNIT
 
     def one(depth, key):
         if flaws is not None:
@@ -204,7 +206,7 @@ def _step(network: PhysNet, optimiser, depth, schedule: Schedule, view: View, ke
 
 
 def save(training: Training, path: Path | str) -> None:
-    """Write a training: one line of JSON with what it is, then the numbers."""
+    """Write a training: one line of JSON with its settings, then the arrays."""
     header = {
         "format": FORMAT,
         "architecture": asdict(training.network.architecture),
@@ -219,7 +221,7 @@ def save(training: Training, path: Path | str) -> None:
 
 
 def load(path: Path | str, expected: Architecture | None = None) -> Training:
-    """Read what `save` wrote.
+    """Read a training that `save` wrote.
 
     Raises `FileNotFoundError`, or `ValueError` that names the file when it is damaged, of another
     format, or not of the `expected` architecture.
@@ -230,13 +232,15 @@ def load(path: Path | str, expected: Architecture | None = None) -> Training:
             found = header["format"]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: no training of PhysNet: {error}") from error
-        if found != FORMAT:
+        if found not in (FORMAT, EARLIER):
             raise ValueError(f"{path}: expected format {FORMAT}, found {found}")
         architecture = Architecture(**_tuples(header["architecture"]))
         if expected is not None and architecture != expected:
             raise ValueError(f"{path}: expected {expected}, found {architecture}")
         view = View(**_tuples(header["view"]))
         schedule = {**header["schedule"], "flaws": Flaws(*header["schedule"]["flaws"])}
+        if found == EARLIER:
+            schedule["validation"] = schedule.pop("held_back")
         empty = begin(view, architecture, Schedule(**schedule))
         try:
             network, optimiser = eqx.tree_deserialise_leaves(file, (empty.network, empty.optimiser))
@@ -247,7 +251,7 @@ def load(path: Path | str, expected: Architecture | None = None) -> Training:
 
 
 def _tuples(values: dict[str, Any]) -> dict[str, Any]:
-    """Lists, as JSON has them, as the tuples that they were."""
+    """The values with tuples in place of JSON's lists."""
     return {
         key: tuple(value) if isinstance(value, list) else value for key, value in values.items()
     }

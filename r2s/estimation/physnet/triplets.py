@@ -1,11 +1,11 @@
-"""Which images are compared, and the triplet loss of where they lie on the map."""
+"""Batches and triplets of images, and the triplet loss of their points on the map."""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt
+from jaxtyping import Array, Bool, Float, Int, UInt
 
 from r2s.estimation.physnet.dataset import Data
 
@@ -13,31 +13,32 @@ Images = UInt[np.ndarray, "image down across"]
 
 
 class Split(NamedTuple):
-    """Images in units of `dataset.STEP`, and of each the fabric and the motion."""
+    """Images in units of `dataset.DEPTH_UNIT`, with the fabric and the motion of each."""
 
     depth: Images
     fabric: Int[np.ndarray, " image"]
     motion: Int[np.ndarray, " image"]
 
 
-def split(data: Data, held_back: float, needed: int, seed: int) -> tuple[Split, Split]:
-    """Images of the fabrics to train with, at least `needed`, and of the share `held_back`.
+def split(data: Data, validation: float, needed: int, seed: int) -> tuple[Split, Split]:
+    """Images of the fabrics for training, and of the share `validation` of the fabrics.
 
-    Raises `ValueError` when either has too few fabrics for a batch or a triplet.
+    Raises `ValueError` for fewer than two validation fabrics or `needed` training fabrics.
     """
     count = len(data.places)
     order = np.random.default_rng([seed, 0, 1]).permutation(count)
-    number = round(held_back * count)
+    number = round(validation * count)
     if number < 2 or count - number < needed:
         raise ValueError(
-            f"{count} fabrics, of which {number} are held back: expected at least 2 of these, and "
-            f"{needed} more for a batch"
+            f"{count} fabrics, of which {number} are for validation: expected at least 2 of these, "
+            f"and {needed} more for a batch"
         )
     unseen = np.isin(data.fabric, order[:number])
     return images_of(data, ~unseen), images_of(data, unseen)
 
 
-def images_of(data: Data, motions: np.ndarray) -> Split:
+def images_of(data: Data, motions: Bool[np.ndarray, " motion"]) -> Split:
+    """All images of some motions that are not empty."""
     depth = data.depth[motions]
     frames = depth.shape[1]
     fabric = np.repeat(data.fabric[motions], frames)
@@ -48,7 +49,7 @@ def images_of(data: Data, motions: np.ndarray) -> Split:
 
 
 def triplets(images: Split, number: int, seed: int) -> Int[np.ndarray, "triplet 3"]:
-    """Anchor, positive, negative: two motions of one fabric, and another fabric; at any frames."""
+    """Anchors, positives and negatives: two motions of one fabric, and another; any frames."""
     generator = np.random.default_rng([seed, 2])
     anchor = generator.integers(len(images.fabric), size=number)
     positive, negative = np.empty_like(anchor), np.empty_like(anchor)
@@ -72,7 +73,7 @@ def all_triplets(points: Float[Array, "fabric image dim"], margin: float) -> Flo
 def hardest_triplets(points: Float[Array, "fabric image dim"], margin: float) -> Float[Array, ""]:
     """The mean loss of every image with its farthest positive and its nearest negative.
 
-    Of Hermans, Beyer and Leibe 2017, "In defense of the triplet loss".
+    See Hermans, Beyer and Leibe 2017, "In defense of the triplet loss".
     """
     squares, alike, _ = _pairs(points)
     farthest = jnp.max(jnp.where(alike, squares, 0), axis=1)
@@ -81,7 +82,7 @@ def hardest_triplets(points: Float[Array, "fabric image dim"], margin: float) ->
 
 
 def _pairs(points):
-    """Squared distances of all images of a batch; which are of one fabric; which are the same."""
+    """Squared distances of all pairs of images; which are of one fabric; which are of one image."""
     fabrics, images, dim = points.shape
     flat = points.reshape(-1, dim)
     squares = jnp.sum((flat[:, None] - flat[None]) ** 2, axis=2)
@@ -92,7 +93,7 @@ def _pairs(points):
 def draw(
     images: Split, fabrics: int, count: int, generator: np.random.Generator
 ) -> Int[np.ndarray, "fabric image"]:
-    """A batch: numbers of `count` images of each of some fabrics, of other motions at any frame."""
+    """A batch: indices of `count` images of each fabric, of different motions if possible."""
     numbers = np.unique(images.fabric)
     chosen = generator.choice(numbers, fabrics, replace=False)
     rows = []

@@ -1,7 +1,6 @@
-"""Depth images of points: a simulated surface, a recorded cloud, or what a real camera measured.
+"""Depth images of points of a simulated surface, a recorded cloud or a camera's measurement.
 
-All of them go through `depth_of`, so that a network that was trained on simulated images meets
-recorded ones cropped and scaled alike.
+All of them pass `depth_of`, which crops and scales simulated and recorded images alike.
 """
 
 from dataclasses import dataclass
@@ -17,18 +16,19 @@ from r2s.scenarios.six import Experiment
 from r2s.scenarios.synthetic import sensing
 
 Triple = tuple[float, float, float]
-LAYER = 0.02  # [m]: points of one pixel that lie deeper behind its nearest are of another layer
-MARGIN = 0.08  # of the image and of the depths, around all that was seen
+LAYER = 0.02  # [m], by which points of another layer lie behind the nearest of a pixel
+MARGIN = 0.08  # around all points, as a share of the image and of the range of depths
 
 
 @dataclass(frozen=True)
 class View:
-    """A square pinhole image: where its camera is, and which depths it tells apart.
+    """The camera of a square pinhole image, and the range of its depths.
 
-    - `position`, `target`: of the camera, [m]; up in its image is up.
-    - `focal_length`: [pixel]. - `size`: [pixel].
+    - `position`, `target`: the camera and the point at which it looks, [m]; up stays up.
+    - `focal_length`: [pixel].
+    - `size`: side of the image, [pixel].
     - `near`, `far`: depths that become white and black, [m].
-    - `floor`: height [m] below which fabric is not told from the table, and left out.
+    - `floor`: height below which points are left out, as fabric and table look alike there, [m].
     """
 
     position: Triple
@@ -49,13 +49,18 @@ class View:
 
 
 def eye_of(experiment: Experiment) -> Triple:
-    """Where the first camera of `r2s.scenarios.synthetic.sensing` is, [m]."""
+    """The position of the first camera of `r2s.scenarios.synthetic.sensing`, [m]."""
     x, y, z = (float(value) for value in sensing(experiment).cameras[0].position)
     return x, y, z
 
 
 def view_around(eye: Triple, points: Float[np.ndarray, "point 3"], size: int, floor: float) -> View:
-    """The view from a place that holds all points [m] above the floor, with `MARGIN` around them.
+    """The view from a position that holds all points above the floor, with `MARGIN` around them.
+
+    - `eye`: position of the camera, [m].
+    - `points`: [m].
+    - `size`: side of the image, [pixel].
+    - `floor`: as in `View`, [m].
 
     Raises `ValueError` when no point is above the floor.
     """
@@ -82,7 +87,7 @@ def view_around(eye: Triple, points: Float[np.ndarray, "point 3"], size: int, fl
 
 
 def floor_of(experiment: Experiment) -> float:
-    """The height [m] below which the cameras of an experiment cannot tell sheet from table."""
+    """The height [m] below which the cameras of an experiment see sheet and table alike."""
     return experiment.table_height + max(sensing(experiment).margin, -1.0)
 
 
@@ -94,9 +99,9 @@ def depth_of(
 ) -> Float[Array, "down across"]:
     """The depth [m] of the nearest layer of points [m] in each pixel, 0 where there is none.
 
-    The mean of the points within `LAYER` of the nearest: many points in a pixel lessen noise.
-    With `reach` [pixel], a point stands for a square of twice that side around it: few points of a
-    surface lie at its very border, so that without it the surface looks smaller than it is.
+    It is the mean of the points within `LAYER` of the nearest, which lessens noise. With `reach`
+    [pixel], a point covers a square of twice that side: few points of a surface lie at its border,
+    so that the surface would look smaller than it is.
     """
     eye, target = (jnp.asarray(place, points.dtype) for place in (view.position, view.target))
     camera = Camera(eye, target, view.focal_length, (view.size, view.size))
@@ -127,8 +132,8 @@ def depths_of_sheet(
 ) -> Float[Array, "frame down across"]:
     """Depth images [m] of a moving mesh [m], from `per_face`^2 points on every face.
 
-    With `frames`, each of `r2s.recordings.cameras.calibration.frustum`, what none of the cameras
-    has in its frame is left out.
+    `frames` are the planes of `r2s.recordings.cameras.calibration.frustum` of some cameras: points
+    that are in the frame of none of them are left out. None keeps all points.
     """
 
     def of_frame(x):
@@ -142,12 +147,15 @@ def depths_of_sheet(
 def in_frame(
     points: Float[Array, "point 3"], frames: Float[Array, "camera 4 4"]
 ) -> Bool[Array, " point"]:
-    """Which points [m] at least one camera has in its frame; `frames` as of `depths_of_sheet`."""
+    """Which points [m] are in the frame of at least one camera; see `depths_of_sheet`."""
     sides = jnp.einsum("cki,pi->pck", frames[..., :3], points) + frames[None, :, :, 3]
     return jnp.any(jnp.all(sides >= 0, axis=-1), axis=-1)
 
 
 def per_face(view: View, shape: tuple[int, int], size: tuple[float, float]) -> int:
-    """How finely to sample a mesh of `shape` vertices so that points lie half a pixel apart."""
+    """The number of points along a face's edge that lie half a pixel apart.
+
+    `shape` and `size` [m] are the vertices and sides of the mesh along warp and weft.
+    """
     edge = max(side / (count - 1) for side, count in zip(size, shape, strict=True))
     return int(np.ceil(2 * edge * view.focal_length / view.near))

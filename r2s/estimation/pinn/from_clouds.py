@@ -2,29 +2,40 @@
 
 A network from (X, Y, t) to places is fitted, with the fabric, to the clouds (each point to the
 nearest place of the network's own map, matched again and again), to the grippers' path, and to the
-balance of forces in the weak form, where gravity, the areal density being known, gives the scale.
-It begins as a middling fabric moves in the cloth solver. Gauss and Newton's steps give the
-information on the fabric with the whole map unknown beside it: what the clouds do not determine
-keeps the deviation of its range.
+balance of forces in the weak form. Gravity gives the scale, since the areal density is known. The
+fit begins with the motion of a middling fabric in the cloth solver. Levenberg-Marquardt steps give
+the information on the fabric with the whole map unknown beside it: what the clouds do not determine
+keeps the standard error of its range.
 
-It does not find the fabric: the map comes to lie within 2 mm of the points and forces balance to
-1 %, but with a stiffness far too low, also when it begins with the true one. Clouds say nothing of
-how the sheet lies within its surface, what rests on the table is unseen, and a softer fabric makes
-less of the roughness of the map. For clouds there is `r2s.estimation.diffcloud`.
+It does not find the fabric. The map comes to lie within 2 mm of the points and forces balance to
+1 %, but with a stiffness far too low, also when it begins with the true one. Clouds do not say how
+the sheet lies within its surface, the part on the table is unseen, and a softer fabric makes less
+of the roughness of the map. For clouds there is `r2s.estimation.diffcloud`.
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from r2s.estimation.estimate import Estimate, Nuisance
-from r2s.estimation.pinn.clouds import (
+from r2s.estimation.pinn.hanging_sheet import (
+    Hanging,
+    Splines,
+    loose,
+    splines,
+    virtual_work,
+    work_scale,
+)
+from r2s.estimation.pinn.levenberg_marquardt import FIRST, Term, least_squares, marginal
+from r2s.estimation.pinn.matching import (
     Rows,
     Sight,
     above,
@@ -35,18 +46,8 @@ from r2s.estimation.pinn.clouds import (
     placed,
     sight_of,
 )
-from r2s.estimation.pinn.exact import PRIOR, clipped, ranged, weights_of, with_weights
-from r2s.estimation.pinn.laws import green
-from r2s.estimation.pinn.levenberg import FIRST, Term, Unknown, least_squares, marginal
 from r2s.estimation.pinn.network import Network, X, Y, at_time
-from r2s.estimation.pinn.shell import (
-    Hanging,
-    Splines,
-    loose,
-    splines,
-    virtual_work,
-    work_scale,
-)
+from r2s.estimation.pinn.stress import green
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace
 from r2s.geometry.mesh import Mesh, rectangle
@@ -54,29 +55,33 @@ from r2s.recordings.recording import Recording
 from r2s.scenarios.scenario import GUST, JET, from_recording, rollout
 from r2s.world.air import Air, Fan
 
-GRIP = 3e-4  # [m], to which the gripper's path is known
-BEGIN = 5e-3  # [m], to which the network first follows the cloth solver
-LOW = 0.01  # [m] above the table, below which it may touch
-STRAIN = 0.02  # on the table, where nothing else says how the sheet is stretched
-GUST_OVER = GUST + 1.0  # [s] after the first frame, when the wind blows evenly
-ALIKE = 8  # frames of a lift over which what is not modelled errs alike; of a wind all
-SHARPER = 0.7  # what a round leaves of the deviation that distances are divided by
+GRIP = 3e-4  # standard error of the grippers' path, [m]
+BEGIN = 5e-3  # that of the cloth solver's motion, which the network follows at first, [m]
+LOW = 0.01  # height above the table below which the sheet may touch it, [m]
+STRAIN = 0.02  # standard deviation of the strain on the table, where nothing else gives it, [-]
+GUST_OVER = GUST + 1.0  # time after the first frame when the wind blows evenly, [s]
+ALIKE = 8  # frames of a lift over which model errors are alike; in a wind they are in all
+SHARPER = 0.7  # of the noise of the points: what a round leaves of it
 SETTLED = 2e-3  # of the ranges: a round that moves the fabric less is the last
-FIRM = 1e3  # one over the deviation of a fabric that is held
-COARSE, FINE = (7, 7), (33, 33)  # vertices: of what is tested on the table, and of the matching
+INSIDE = 1e-3  # least distance from the ends of the ranges
+PRIOR = 12.0**0.5  # one over the standard deviation of a uniform distribution on 0..1
+FIRM = 1e3  # the same of a fabric that is held
+COARSE, FINE = (7, 7), (33, 33)  # vertices of what is tested on the table, and of the matching
 
 
 @dataclass(frozen=True)
 class Settings:
     """How to fit.
 
-    - `frames`: of those that count, evenly. - `points`: of each, matched. - `balanced`: of these
-      frames every so many-th is tested for balance.
-    - `tolerance`: to which forces balance, of the stress from the sheet's own weight, [-].
-    - `begin`, `rounds`, `steps`: at first; of matching, at most; and in each round.
-    - `held`: rounds in which the fabric stays what it begins with, so that it does not go soft to
-      suit a rough map.
-    - `noise`: of the points, to which the fit comes nearer from round to round, [m].
+    - `frames`: number of frames, evenly among those that count.
+    - `points`: number of points in each that are matched.
+    - `balanced`: every so many-th of the frames is tested for balance.
+    - `tolerance`: to which forces balance, over the stress from the sheet's own weight, [-].
+    - `begin`: steps at first, to the motion of the cloth solver.
+    - `rounds`: of matching, at most. `steps`: in each round.
+    - `held`: first rounds, in which the fabric does not move, so that it does not go soft to suit a
+      rough map.
+    - `noise`: of the points [m]. The fit comes nearer to it from round to round.
     - `width`, `layers`: of the network.
     """
 
@@ -93,14 +98,63 @@ class Settings:
     layers: int = 4
 
 
-class About(eqx.Module):
-    """What rows of residuals share; see `r2s.estimation.pinn.exact.About`."""
+Theta = Float[Array, " theta"]  # parameters of the network, then the place in the parameter space
+Report = Callable[[int, float, np.ndarray], None]
+
+
+class Shared(eqx.Module):
+    """What all rows of residuals share.
+
+    - `likeness`: a network; theta has parameters for it.
+    - `space`: theta ends with a place in it.
+    - `hanging`: what acts on the sheet.
+    - `parts`: the virtual displacements.
+    - `tolerance`: see `Settings`.
+    """
 
     likeness: Network
     space: ParameterSpace
     hanging: Hanging
     parts: Splines
     tolerance: Float[Array, ""]
+
+    def network(self, theta: Theta) -> Network:
+        """The network of theta."""
+        return with_parameters(self.likeness, theta)
+
+
+def parameters_of(network: Network) -> Float[np.ndarray, " parameter"]:
+    """The parameters of a network as one vector."""
+    return np.asarray(ravel_pytree(network.params)[0], np.float64)
+
+
+def with_parameters(likeness: Network, theta: Theta) -> Network:
+    """A network like another one, whose parameters are the first numbers of a vector."""
+    own, unravel = ravel_pytree(likeness.params)
+    return eqx.tree_at(lambda n: n.params, likeness, unravel(theta[: len(own)]))
+
+
+def prior(place: Float[np.ndarray, " dim"], weight: float = PRIOR) -> Term:
+    """Rows that draw the end of theta to a `place` in the space, with a weight [-].
+
+    To the middle of the space, with the default weight, it is the ranges as a flat prior.
+    """
+    rows = jnp.arange(-len(place), 0), jnp.asarray(place, float)
+    return Term(_of_prior, jnp.asarray(weight, float), rows)
+
+
+def _of_prior(theta: Theta, weight: Array, row) -> Array:
+    which, at = row
+    return weight * (theta[which] - at)[None]
+
+
+def clipped(dim: int) -> Callable[[np.ndarray], np.ndarray]:
+    """A function that keeps the last `dim` numbers of theta within the ranges."""
+
+    def inside(theta: np.ndarray) -> np.ndarray:
+        return np.append(theta[:-dim], np.clip(theta[-dim:], INSIDE, 1 - INSIDE))
+
+    return inside
 
 
 def estimate(
@@ -109,79 +163,97 @@ def estimate(
     settings: Settings = Settings(),
     *,
     begin: Float[np.ndarray, " dim"] | None = None,
-    report: Any = None,
+    report: Report | None = None,
     key: PRNGKeyArray,
 ) -> Estimate:
     """The fabric of a recording of a sheet that is lifted or hangs, from its clouds.
 
-    `begin` is the place in the space of the fabric to begin with, by default the middle. `report`
-    is called after each round with its number, the spread of the distances [m] and the
-    parameters. An estimate that still moved in its last round has not converged, and has no
-    standard errors. Raises `ValueError` for too few frames, `RuntimeError` when the solver or the
-    network diverges.
+    An estimate that still moved in its last round has not converged, and has no standard errors.
+
+    - `begin`: place in the space of the fabric to begin with, by default the middle.
+    - `report`: called after each round with its number, the spread of the distances [m] and the
+      parameters of the fabric.
+
+    Raises `ValueError` for too few frames, `RuntimeError` when the solver or the network diverges.
     """
     if settings.rounds < 1:
         raise ValueError(f"at least one round is needed, got {settings.rounds}")
     began = time.perf_counter()
     frames = _frames(recording, settings.frames)
     sight = sight_of(recording, frames, settings.points)
-    about = _about(recording, space, sight, settings, key)
+    shared = _shared(recording, space, sight, settings, key)
     held = fixed(sight.corners, sight.times, sight.grips, GRIP)
     place = np.full(space.dim, 0.5) if begin is None else np.asarray(begin, np.float64)
     solver = _of_solver(recording, space(jnp.asarray(place, float)), sight, frames)
-    unknown = np.concatenate([weights_of(about.likeness), place])
-    terms = [_rows(about, held), _rows(about, solver), ranged(place)]
-    unknown = least_squares(terms, unknown, settings.begin, inside=clipped(space.dim)).unknown
-    found = _rounds(about, sight, held, unknown, recording.info.sheet.held, settings, report)
-    still = recording.info.wind is not None
-    few = len(frames) if still else max(1.0, ALIKE * len(frames) / _counted(recording))
+    theta = np.concatenate([parameters_of(shared.likeness), place])
+    terms = [_rows(shared, held), _rows(shared, solver), prior(place)]
+    theta = least_squares(terms, theta, settings.begin, inside=clipped(space.dim)).parameters
+    found = _rounds(shared, sight, held, theta, recording.info.sheet.held, settings, report)
+    in_wind = recording.info.wind is not None
+    alike = len(frames) if in_wind else max(1.0, ALIKE * len(frames) / _counted(recording))
     words = f"clouds of {recording.info.scenario}"
-    return _estimate(words, space, found, few, time.perf_counter() - began)
+    return _estimate(words, space, found, alike, time.perf_counter() - began)
 
 
 class Found(NamedTuple):
     """Where the rounds arrived.
 
-    - `unknown`, `information`: on it. - `settled`: the fabric hardly moved in the last round.
-    - `history`: square of the spread of the distances [m^2] and the parameters, of every round.
+    - `place`: in the parameter space. `information`: on it.
+    - `settled`: whether the fabric hardly moved in the last round.
+    - `history`: square of the spread of the distances [m^2] and parameters, of every round.
     """
 
-    unknown: np.ndarray
+    place: np.ndarray
     information: np.ndarray
     settled: bool
     history: list[tuple[float, np.ndarray]]
 
 
-def _rounds(about: About, sight: Sight, held: Rows, unknown, names, settings, report) -> Found:
-    """Match, and make a few steps; the fabric follows when the map is in balance."""
-    size, dim = (float(sight.size[0]), float(sight.size[1])), about.space.dim
+def _rounds(
+    shared: Shared,
+    sight: Sight,
+    held: Rows,
+    theta: np.ndarray,
+    names: tuple[str, ...],
+    settings: Settings,
+    report: Report | None,
+) -> Found:
+    """Match points and make a few steps, again and again.
+
+    The fabric follows when the map is in balance.
+    """
+    size, dim = (float(sight.size[0]), float(sight.size[1])), shared.space.dim
     fine, coarse = rectangle(size, FINE), rectangle(size, COARSE)
     damping, history, settled, information = FIRST, [], False, np.zeros((dim, dim))
-    deviation = np.inf
-    firm, free = ranged(unknown[-dim:], FIRM), ranged(np.full(dim, 0.5))
+    noise = np.inf
+    firm, free = prior(theta[-dim:], FIRM), prior(np.full(dim, 0.5))
     for number in range(settings.rounds):
-        network = with_weights(about.likeness, jnp.asarray(unknown, float))
+        network = shared.network(jnp.asarray(theta, float))
         near, spread = matched(network, sight, fine)
         # not the spread itself: what is far off would never be worth coming nearer
-        deviation = max(settings.noise, min(float(spread), SHARPER * deviation))
-        near = near._replace(weight=near.weight * (float(spread) / deviation))
-        terms = [_rows(about, held), _rows(about, near), _rows(about, bordered(network, sight))]
-        terms += _of_table(network, about, sight, coarse)
-        terms.append(firm if number < settings.held else free)
-        terms.append(_of_balance(network, about, sight, names, settings.balanced))
-        found = least_squares(terms, unknown, settings.steps, inside=clipped(dim), damping=damping)
-        moved = np.abs(found.unknown - unknown)[-dim:].max()
-        unknown, damping = found.unknown, min(found.damping, FIRST)
+        noise = max(settings.noise, min(float(spread), SHARPER * noise))
+        near = near._replace(weight=near.weight * (float(spread) / noise))
+        terms = [
+            _rows(shared, held),
+            _rows(shared, near),
+            _rows(shared, bordered(network, sight)),
+            *_of_table(network, shared, sight, coarse),
+            firm if number < settings.held else free,
+            _of_balance(network, shared, sight, names, settings.balanced),
+        ]
+        found = least_squares(terms, theta, settings.steps, inside=clipped(dim), damping=damping)
+        moved = np.abs(found.parameters - theta)[-dim:].max()
+        theta, damping = found.parameters, min(found.damping, FIRST)
         information = found.information
-        values = np.asarray(about.space.values(jnp.asarray(unknown[-dim:], float)))
+        values = np.asarray(shared.space.values(jnp.asarray(theta[-dim:], float)))
         history.append((float(spread) ** 2, values))
         if report is not None:
             report(number, float(spread), values)
-        sharp = number > settings.held and deviation == settings.noise
+        sharp = number > settings.held and noise == settings.noise
         settled = sharp and bool(moved < SETTLED)
         if settled:
             break
-    return Found(unknown, marginal(information, dim), settled, history)
+    return Found(theta[-dim:], marginal(information, dim), settled, history)
 
 
 def _counted(recording: Recording) -> int:
@@ -190,7 +262,7 @@ def _counted(recording: Recording) -> int:
 
 
 def _frames(recording: Recording, number: int) -> np.ndarray:
-    """Evenly of those that count; in a wind of those when it blows evenly."""
+    """Evenly spaced frames among those that count; in a wind, among those when it blows evenly."""
     first, last = recording.info.frames_used
     times = np.asarray(recording.times)
     if recording.info.wind is not None:
@@ -203,25 +275,35 @@ def _frames(recording: Recording, number: int) -> np.ndarray:
     return np.unique(np.linspace(first, last, number).round().astype(int))
 
 
-def _about(recording, space, sight: Sight, settings: Settings, key) -> About:
-    array = lambda value: jnp.asarray(value, float)
-    axes, wind = axes_of(recording), np.zeros(3)
-    fan = None
+def _shared(
+    recording: Recording,
+    space: ParameterSpace,
+    sight: Sight,
+    settings: Settings,
+    key: PRNGKeyArray,
+) -> Shared:
+    axes, wind, fan = axes_of(recording), np.zeros(3), None
     if recording.info.wind is not None and any(recording.info.wind):
         wind = axes @ np.asarray(recording.info.wind)
         middle, side = np.append(np.asarray(sight.size) / 2, 0), float(jnp.min(sight.size))
-        fan = Fan(array(middle), array(wind), array(JET[0] * side), array(JET[1] * side))
-    low = jnp.zeros(3, float)
-    high = jnp.append(sight.size, sight.times[-1])
-    scale = jnp.max(sight.size) / 4
-    make = {"axes": 3, "width": settings.width, "layers": settings.layers}
-    likeness = Network.make(low, high, scale, **make, key=key)
-    hanging = Hanging(sight.size, -sight.up, Air.make(), fan, array(wind))
-    return About(likeness, space, hanging, splines(), array(settings.tolerance))
+        parts = middle, wind, JET[0] * side, JET[1] * side
+        fan = Fan(*(jnp.asarray(part, float) for part in parts))
+    likeness = Network.make(
+        jnp.zeros(3, float),
+        jnp.append(sight.size, sight.times[-1]),
+        jnp.max(sight.size) / 4,
+        axes=3,
+        width=settings.width,
+        layers=settings.layers,
+        key=key,
+    )
+    hanging = Hanging(sight.size, -sight.up, Air.make(), fan, jnp.asarray(wind, float))
+    tolerance = jnp.asarray(settings.tolerance, float)
+    return Shared(likeness, space, hanging, splines(), tolerance)
 
 
 def _of_solver(recording: Recording, fabric: Fabric, sight: Sight, frames: np.ndarray) -> Rows:
-    """Rows that draw the map to how a fabric moves in the cloth solver."""
+    """Rows that draw the map to the motion of a fabric in the cloth solver."""
     scenario = from_recording(recording)
     moved = eqx.filter_jit(rollout)(scenario, fabric)
     x = np.asarray(moved.x, np.float64)[frames]
@@ -231,70 +313,75 @@ def _of_solver(recording: Recording, fabric: Fabric, sight: Sight, frames: np.nd
     return fixed(scenario.scene.mesh.rest, sight.times, jnp.asarray(local, float), BEGIN)
 
 
-def _rows(about: About, rows: Rows) -> Term:
-    return Term(_of_row, about, rows)
+def _rows(shared: Shared, rows: Rows) -> Term:
+    return Term(_of_row, shared, rows)
 
 
-def _of_row(unknown: Unknown, about: About, row: Rows) -> Array:
-    at = placed(with_weights(about.likeness, unknown), row.place[None])[0]
+def _of_row(theta: Theta, shared: Shared, row: Rows) -> Array:
+    at = placed(shared.network(theta), row.place[None])[0]
     return (row.weight * (row.direction @ (at - row.target)))[None]
 
 
-def _of_table(network: Network, about: About, sight: Sight, mesh: Mesh) -> list[Term]:
-    """What keeps the map above the table, and unstretched where it lies on it."""
+def _of_table(network: Network, shared: Shared, sight: Sight, mesh: Mesh) -> list[Term]:
+    """Terms that keep the map above the table, and unstretched where it lies on it."""
     lifted = above(network, sight, mesh)
     height = placed(network, lifted.place) @ sight.up - sight.table
     weight = jnp.where(height < LOW, 1 / STRAIN, 0.0)
-    return [_rows(about, lifted), Term(_of_strain, about, (lifted.place, weight))]
+    return [_rows(shared, lifted), Term(_of_strain, shared, (lifted.place, weight))]
 
 
-def _of_strain(unknown: Unknown, about: About, row) -> Array:
+def _of_strain(theta: Theta, shared: Shared, row) -> Array:
     place, weight = row
-    jet = with_weights(about.likeness, unknown).jet(place[None], ())
+    jet = shared.network(theta).jet(place[None], ())
     return weight * green(jnp.stack([jet.first[X, 0], jet.first[Y, 0]], axis=1))
 
 
-def _of_balance(network: Network, about: About, sight: Sight, grips, every: int) -> Term:
-    """Forces in every so many-th frame, where the sheet is neither held nor on the table."""
+def _of_balance(
+    network: Network, shared: Shared, sight: Sight, grips: tuple[str, ...], every: int
+) -> Term:
+    """The work of all forces in every so many-th frame, where the sheet is neither held nor on the
+    table."""
     names = ("origin", "warp", "weft", "opposite")  # in the order of `loose`
     held = jnp.array([name in grips for name in names])
-    places = about.parts.nodes * sight.size[None]
+    places = shared.parts.nodes * sight.size[None]
 
-    def free(time):
+    def free(time: Float[Array, ""]) -> Bool[Array, " function"]:
         low = placed(network, at_time(places, time)) @ sight.up - sight.table < LOW
-        return loose(about.parts, held, low)
+        return loose(shared.parts, held, low)
 
     times = sight.times[every // 2 :: every]
-    return Term(_of_work, about, (times, jax.vmap(free)(times)), 1)
+    return Term(_of_work, shared, (times, jax.vmap(free)(times)), 1)
 
 
-def _of_work(unknown: Unknown, about: About, row) -> Array:
+def _of_work(theta: Theta, shared: Shared, row) -> Array:
     time, free = row
-    fabric = about.space(unknown[-about.space.dim :])
-    network = with_weights(about.likeness, unknown)
-    work = virtual_work(network, about.hanging, fabric, about.parts, time)
-    scale = about.tolerance * work_scale(about.hanging, fabric.density, about.parts)
+    fabric = shared.space(theta[-shared.space.dim :])
+    work = virtual_work(shared.network(theta), shared.hanging, fabric, shared.parts, time)
+    scale = shared.tolerance * work_scale(shared.hanging, fabric.density, shared.parts)
     return jnp.where(free[:, None], work / scale[:, None], 0).ravel()
 
 
 def _estimate(
-    words: str, space: ParameterSpace, found: Found, few: float, seconds: float
+    words: str, space: ParameterSpace, found: Found, alike: float, seconds: float
 ) -> Estimate:
-    """What errs alike in `few` frames counts once. Without deviations while the fabric moves: what
-    a linear model says of a place far from the best one is wrong."""
+    """The estimate of the last round. What errs alike in `alike` frames counts once.
+
+    While the fabric moves there are no standard errors: what a linear model says of a place far
+    from the best one is wrong.
+    """
     own = found.information - PRIOR**2 * np.eye(space.dim)
-    covariance = np.linalg.inv(own / few + PRIOR**2 * np.eye(space.dim))
+    covariance = np.linalg.inv(own / alike + PRIOR**2 * np.eye(space.dim))
     lengths = np.array([np.log(r.high / r.low) if r.log else r.high - r.low for r in space.ranges])
-    deviations = np.sqrt(np.diag(covariance)) * (1.0 if found.settled else np.nan)
-    place = jnp.asarray(found.unknown[-space.dim :], float)
+    errors = np.sqrt(np.diag(covariance)) * (1.0 if found.settled else np.nan)
+    place = jnp.asarray(found.place, float)
     squares = np.array([square for square, _ in found.history])[:, None]
     return Estimate(
         approach=f"pinn (weak form, {words})",
         fabric=space(place),
         ranges=space.ranges,
         values=np.asarray(space.values(place)),
-        standard_errors=lengths * deviations,
-        correlation=covariance / np.outer(deviations, deviations),
+        standard_errors=lengths * errors,
+        correlation=covariance / np.outer(errors, errors),
         nuisances=(Nuisance("spread of distances", "m", float(squares[-1, 0] ** 0.5), np.nan),),
         loss=float(squares[-1, 0]),
         losses=squares,

@@ -1,8 +1,7 @@
 """The losses of the physics-informed network: markers, equation of motion, edges.
 
-All are residuals over what they may well be, squared and averaged: about 1 each when everything
-is as good as markers and load cell are, so that no weights need tuning. `plain_scales` leave them
-in SI units, as the paper has them.
+Each is the mean square of a residual over its known magnitude (`Scales`). It is about 1 when the
+fit is as good as markers and load cell are, so that no weights need tuning.
 """
 
 from typing import NamedTuple
@@ -13,23 +12,25 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from r2s.estimation.pinn.data import Pull
-from r2s.estimation.pinn.laws import Strain, divergence, green, nominal_stress
 from r2s.estimation.pinn.network import STRONG, DisplacementField, Jet, T
+from r2s.estimation.pinn.pulls import Pull
+from r2s.estimation.pinn.stress import Strain, divergence, green, nominal_stress
 from r2s.fabrics.fabric import Fabric
 from r2s.units import Scalar
 from r2s.world.contact import friction_dissipation
 
-TOLERANCE = 0.01  # of the stress in the sheet, to which equations are to hold
-EDGE_NODES = 6  # of Gauss, along an edge
+TOLERANCE = 0.01  # to which equations are to hold, of the stress in the sheet
+EDGE_NODES = 6  # of Gauss's quadrature along an edge
 
 
 class Losses(NamedTuple):
-    """Named terms of a loss, each [-] once scaled.
+    """Terms of a loss, each [-] once scaled.
 
-    - `data`: distance of the markers. - `motion`: residual of the equation of motion.
+    - `data`: distance of the markers.
+    - `motion`: residual of the equation of motion.
     - `traction`: of the far clamp against the measured force; 0 without one.
-    - `free`: traction on the free edges. - `clamps`: displacement at the clamps.
+    - `free`: traction on the free edges.
+    - `clamps`: displacement at the clamps.
     """
 
     data: Float[Array, ""]
@@ -40,8 +41,12 @@ class Losses(NamedTuple):
 
 
 class Scales(NamedTuple):
-    """What residuals are divided by: markers [m], clamps [m], stress [N/m], force [N], and the
-    length [m] over which stress changes."""
+    """Known magnitudes that residuals are divided by.
+
+    - `marker`, `clamp`: of displacements there, [m].
+    - `stress`: [N/m]. `length`: over which the stress changes, [m].
+    - `force`: [N].
+    """
 
     marker: Float[Array, ""]
     clamp: Float[Array, ""]
@@ -51,9 +56,10 @@ class Scales(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Where equations are tested: places (X, Y) [m] and numbers of frames.
+    """Places (X, Y) [m] and numbers of frames where equations are tested.
 
-    `inner` in the sheet, `edge` on its free edges.
+    - `inner`, `inner_frame`: in the sheet.
+    - `edge`, `edge_frame`: on its free edges.
     """
 
     inner: Float[Array, "*pull point 2"]
@@ -62,37 +68,31 @@ class Points(NamedTuple):
     edge_frame: Int[Array, "*pull side"]
 
 
-def plain_scales() -> Scales:
-    """All 1, for losses in SI units."""
-    return Scales(*(jnp.ones((), float) for _ in Scales._fields))
-
-
 def scales_of(pull: Pull, fabric: Fabric, marker: Scalar, force: Scalar) -> Scales:
-    """Known magnitudes: the noise of markers [m] and force [N], and the stress in the sheet.
+    """Scales from the noise of markers [m] and force [N], and the stress in the sheet.
 
-    The stress is the measured force over the width; without force that of the `fabric` as it is
-    now, so that a soft one is not preferred.
+    The stress is the measured force over the width. Without a force it is that of the `fabric` as
+    it is now, held constant, so that a soft one is not preferred.
     """
     stretch = jnp.max(jnp.abs(pull.displacement)) / pull.size[0]
     stress = jax.lax.stop_gradient(fabric.membrane.c11) * stretch
     if pull.force is not None:
         stress = jnp.max(jnp.abs(pull.force)) / pull.size[1]
-    array = lambda value: jnp.asarray(value, float)
-    return Scales(
-        array(marker), array(marker) / 5, TOLERANCE * stress, array(force), jnp.min(pull.size)
-    )
+    marker, force = jnp.asarray(marker, float), jnp.asarray(force, float)
+    return Scales(marker, marker / 5, TOLERANCE * stress, force, jnp.min(pull.size))
 
 
 def draw_points(pull: Pull, count: int, *, key: PRNGKeyArray) -> Points:
     """Points drawn evenly over a sheet, its free edges and the frames; an eighth on the edges."""
     keys = jr.split(key, 5)
     sides = max(count // 8, 2)
-    frames = lambda key, number: jr.randint(key, (number,), 0, len(pull.times), int)
     inner = jr.uniform(keys[0], (count, 2), float) * pull.size[None]
     along = jr.uniform(keys[1], (sides,), float) * pull.size[0]
     across = jr.bernoulli(keys[2], 0.5, (sides,)).astype(float) * pull.size[1]
     edge = jnp.stack([along, across], axis=1)
-    return Points(inner, frames(keys[3], count), edge, frames(keys[4], sides))
+    inner_frame = jr.randint(keys[3], (count,), 0, len(pull.times), int)
+    edge_frame = jr.randint(keys[4], (sides,), 0, len(pull.times), int)
+    return Points(inner, inner_frame, edge, edge_frame)
 
 
 def field(
@@ -102,8 +102,10 @@ def field(
     frames: Int[Array, " point"],
     pairs: tuple[tuple[int, int], ...] = (),
 ) -> Jet:
-    """Displacements [m] with derivatives: the network's, on top of what goes evenly from clamp to
-    clamp."""
+    """Displacements [m] with derivatives: the network's plus the even stretch between the clamps.
+
+    `pairs` of inputs are those of the second derivatives.
+    """
     inputs = jnp.concatenate([places, pull.times[frames][:, None]], axis=1)
     jet = network.jet(inputs, pairs)
     share = (places[:, 0] / pull.size[0])[:, None]
@@ -123,7 +125,7 @@ def displacement(
     places: Float[Array, "point 2"],
     frames: Int[Array, " point"],
 ) -> Float[Array, "point axis"]:
-    """Displacements [m] as of `field`, without derivatives."""
+    """Displacements [m], see `field`, without derivatives."""
     share = (places[:, 0] / pull.size[0])[:, None]
     near, far = pull.near.value[frames], pull.far.value[frames]
     inputs = jnp.concatenate([places, pull.times[frames][:, None]], axis=1)
@@ -131,7 +133,7 @@ def displacement(
 
 
 def gradients(jet: Jet) -> Float[Array, "point axis 2"]:
-    """Of the displacement in X and Y, [-]."""
+    """Gradients [-] of the displacement in X and Y."""
     return jnp.moveaxis(jet.first[:2], 0, -1)
 
 
@@ -141,9 +143,9 @@ def load(
     velocity: Float[Array, " axis"],
     acceleration: Float[Array, " axis"],
 ) -> Float[Array, " axis"]:
-    """What the stress must balance at a point: inertia, damping and friction less weight, [N/m^2].
+    """Load [N/m^2] that the stress must balance: inertia, damping and friction, less the weight.
 
-    Its friction is that of the cloth solver on a table (`r2s.world.contact`).
+    The friction is that of the cloth solver on a table (`r2s.world.contact`).
     """
     limit = fabric.friction * fabric.density * pull.normal
     friction = jax.grad(friction_dissipation, argnums=1)(limit, velocity)
@@ -154,7 +156,7 @@ def load(
 def motion_residual(
     network: DisplacementField, pull: Pull, fabric: Fabric, places, frames, strain: Strain = green
 ) -> Float[Array, "point axis"]:
-    """Residual [N/m^2] of the equation of motion at points and frames: stress against load."""
+    """Residual [N/m^2] of the equation of motion: divergence of the stress less the load."""
     jet = field(network, pull, places, frames, STRONG)
     xx, xy, yy, tt = jet.second
     changes = jnp.stack([jnp.stack([xx, xy], -1), jnp.stack([xy, yy], -1)], axis=1)
@@ -169,7 +171,7 @@ def motion_residual(
 def edge_force(
     network: DisplacementField, pull: Pull, fabric: Fabric, strain: Strain = green
 ) -> Float[Array, "frame axis"]:
-    """The force [N] on the far clamp: the traction, integrated over the edge in every frame."""
+    """Force [N] on the far clamp in every frame: the traction, integrated over the edge."""
     nodes, weights = gauss(EDGE_NODES)
     number = len(pull.times)
     y = jnp.tile(nodes * pull.size[1], number)
@@ -183,7 +185,7 @@ def edge_force(
 
 
 def marker_residual(network: DisplacementField, pull: Pull) -> Float[Array, "frame marker axis"]:
-    """How far [m] the network is from the markers; zero where they are not seen."""
+    """Differences [m] of the network from the markers; zero where they are not seen."""
     number, markers, axes = pull.displacement.shape
     places = jnp.tile(pull.places, (number, 1))
     moved = displacement(network, pull, places, jnp.repeat(jnp.arange(number), markers))
@@ -192,7 +194,7 @@ def marker_residual(network: DisplacementField, pull: Pull) -> Float[Array, "fra
 
 
 def clamp_residual(network: DisplacementField, pull: Pull) -> Float[Array, "point axis"]:
-    """How far [m] the network is from the clamps, at nodes on both of them in every frame."""
+    """Differences [m] of the network from both clamps, at nodes along them in every frame."""
     nodes, _ = gauss(EDGE_NODES)
     number = len(pull.times)
     y = jnp.tile(nodes * pull.size[1], 2 * number)
@@ -204,7 +206,7 @@ def clamp_residual(network: DisplacementField, pull: Pull) -> Float[Array, "poin
 
 
 def common_losses(network: DisplacementField, pull: Pull, scales: Scales):
-    """The losses of markers and clamps, which every form has."""
+    """The losses of markers and clamps, which strong and weak form share."""
     off = marker_residual(network, pull)
     share = jnp.mean(pull.seen, dtype=off.dtype)
     data = jnp.mean((off / scales.marker) ** 2) / share
@@ -219,7 +221,7 @@ def strong_losses(
     scales: Scales,
     strain: Strain = green,
 ) -> Losses:
-    """The losses with the equation of motion at every point of `points`, and tractions at edges."""
+    """The losses with the equation of motion at `points`, and tractions at the edges."""
     data, clamps = common_losses(network, pull, scales)
     off = motion_residual(network, pull, fabric, points.inner, points.inner_frame, strain)
     motion = jnp.mean((off * scales.length / scales.stress) ** 2)
@@ -236,6 +238,6 @@ def strong_losses(
 
 
 def gauss(number: int) -> tuple[Float[Array, " node"], Float[Array, " node"]]:
-    """Nodes and weights of Gauss and Legendre on 0..1."""
+    """Nodes and weights of the Gauss-Legendre quadrature on 0..1."""
     nodes, weights = np.polynomial.legendre.leggauss(number)
     return jnp.asarray((nodes + 1) / 2, float), jnp.asarray(weights / 2, float)

@@ -1,10 +1,10 @@
-"""The network: a multilayer perceptron from (X, Y, t) to a displacement, with its derivatives.
+"""A multilayer perceptron from (X, Y, t) to a displacement, with its derivatives.
 
-The derivatives are carried forward through the layers beside the value, all in one matrix product
-a layer: no backward pass is nested in another.
+The network is a module of flax. Its derivatives are carried forward through the layers beside the
+value, all in one matrix product for each layer: no backward pass is nested in another.
 """
 
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -12,18 +12,25 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
-WIDTH, LAYERS = 50, 7  # the paper's seven layers: six hidden ones and the last
+try:
+    import flax.linen as nn
+except ImportError as error:
+    raise ImportError("the physics-informed network needs flax: pip install 'r2s[pinn]'") from error
+
+WIDTH, LAYERS = 50, 7  # of the published network: six hidden layers and the last one
 X, Y, T = range(3)  # the inputs
-STRONG = ((X, X), (X, Y), (Y, Y), (T, T))  # second derivatives of the equation of motion
-WEAK = ((X, T), (Y, T), (T, T))  # of the virtual work: none of second order in space
+STRONG = ((X, X), (X, Y), (Y, Y), (T, T))  # second derivatives in the equation of motion
+WEAK = ((X, T), (Y, T), (T, T))  # second derivatives in the virtual work: none in space alone
+
+Pairs = tuple[tuple[int, int], ...]  # inputs in which a second derivative is taken
 
 
 class Jet(eqx.Module):
     """Displacements at points, with derivatives.
 
-    - `value`: [m].
-    - `first`: in X [-], Y [-] and t [m/s].
-    - `second`: of the pairs that were asked for, in their units.
+    - `value`: displacements [m].
+    - `first`: derivatives in X [-], Y [-] and t [m/s].
+    - `second`: derivatives in the pairs of inputs that were asked for, in their units.
     """
 
     value: Float[Array, "*point axis"]
@@ -33,27 +40,85 @@ class Jet(eqx.Module):
 
 @runtime_checkable
 class DisplacementField(Protocol):
-    """What the losses ask of a network; an exact solution will do."""
+    """What the losses ask of a network. An exact solution in closed form has it too."""
 
     def __call__(self, points: Float[Array, "point 3"]) -> Float[Array, "point axis"]:
         """Displacements [m] at points (X [m], Y [m], t [s])."""
         ...
 
-    def jet(self, points: Float[Array, "point 3"], pairs: tuple[tuple[int, int], ...]) -> Jet:
-        """Displacements with first derivatives, and second ones in pairs of inputs."""
+    def jet(self, points: Float[Array, "point 3"], pairs: Pairs) -> Jet:
+        """Displacements with first derivatives, and second ones in `pairs` of inputs."""
         ...
 
 
-class Network(eqx.Module):
-    """Displacement [m] at material points and times, by layers of tanh.
+class Perceptron(nn.Module):
+    """Layers of tanh, the last one linear, from three inputs in -1..1 to `axes` outputs.
 
-    - `weights`, `biases`: of the layers.
+    - `axes`: number of outputs.
+    - `width`: of the hidden layers.
+    - `layers`: how many there are, with the last one.
+    """
+
+    axes: int
+    width: int
+    layers: int
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Widths from the inputs to the outputs."""
+        return (3, *(self.layers - 1) * (self.width,), self.axes)
+
+    def setup(self) -> None:
+        shapes = list(zip(self.sizes, self.sizes[1:], strict=False))
+        draw, zeros = nn.initializers.glorot_normal(), nn.initializers.zeros
+        self.kernels = [self.param(f"kernel_{i}", draw, shape) for i, shape in enumerate(shapes)]
+        self.biases = [self.param(f"bias_{i}", zeros, shape[1:]) for i, shape in enumerate(shapes)]
+
+    def __call__(self, inputs: Float[Array, "point 3"]) -> Float[Array, "point axis"]:
+        """Outputs at inputs."""
+        *hidden, (kernel, bias) = zip(self.kernels, self.biases, strict=True)
+        for inner, offset in hidden:
+            inputs = jnp.tanh(inputs @ inner + offset[None])
+        return inputs @ kernel + bias[None]
+
+    def jet(self, inputs: Float[Array, "point 3"], radius: Float[Array, " 3"], pairs: Pairs) -> Jet:
+        """Outputs with their first derivatives, and second ones in `pairs`.
+
+        Derivatives are in the inputs times their `radius`. Through z = tanh(a) they are
+        z_i = z' a_i and z_ij = z' a_ij + z'' a_i a_j, where z' = 1 - z^2 and z'' = -2 z z'.
+        """
+        (kernel, bias), *layers = zip(self.kernels, self.biases, strict=True)
+        value = inputs @ kernel + bias[None]
+        slopes = [jnp.broadcast_to(row, value.shape) for row in kernel / radius[:, None]]
+        curves = [jnp.zeros_like(value) for _ in pairs]
+        for kernel, bias in layers:
+            z = jnp.tanh(value)
+            slope = 1 - z**2
+            curve = -2 * z * slope
+            # lists, because gradients of indexed arrays are slow scatters
+            curves = [
+                slope * own + curve * slopes[i] * slopes[j]
+                for own, (i, j) in zip(curves, pairs, strict=True)
+            ]
+            slopes = [slope * own for own in slopes]
+            product = jnp.concatenate([z, *slopes, *curves]) @ kernel
+            value, *parts = jnp.split(product, 4 + len(pairs))
+            value, slopes, curves = value + bias[None], parts[:3], parts[3:]
+        none = jnp.zeros((0, *value.shape), value.dtype)
+        return Jet(value, jnp.stack(slopes), jnp.stack(curves) if pairs else none)
+
+
+class Network(eqx.Module):
+    """Displacement [m] at material points and times: a perceptron with parameters and scales.
+
+    - `module`: the perceptron.
+    - `params`: its kernels and biases by name, as flax has them.
     - `centre`, `radius`: of the inputs X [m], Y [m], t [s], which become -1..1.
     - `scale`: displacement [m] that an output of 1 stands for.
     """
 
-    weights: tuple[Float[Array, "*batch _ _"], ...]
-    biases: tuple[Float[Array, "*batch _"], ...]
+    module: Perceptron = eqx.field(static=True)
+    params: dict[str, Array]
     centre: Float[Array, "*batch 3"]
     radius: Float[Array, "*batch 3"]
     scale: Float[Array, "*batch"]
@@ -68,53 +133,39 @@ class Network(eqx.Module):
         axes: int = 2,
         width: int = WIDTH,
         layers: int = LAYERS,
+        shrink: float = 1.0,
         key: PRNGKeyArray,
     ) -> "Network":
-        """A network with random weights (Glorot) for inputs between `low` and `high` [m, m, s]."""
-        sizes = (3, *(layers - 1) * (width,), axes)
-        draw = jax.nn.initializers.glorot_normal()
-        keys, dtype = jr.split(key, layers), jnp.zeros((), float).dtype
-        weights = [draw(k, (sizes[i], sizes[i + 1]), dtype) for i, k in enumerate(keys)]
-        biases = [jnp.zeros(size, float) for size in sizes[1:]]
-        centre, radius = (low + high) / 2, (high - low) / 2
-        return cls(tuple(weights), tuple(biases), centre, radius, scale)
+        """A network with random kernels (Glorot) and no biases.
+
+        - `low`, `high`: ends of the inputs [m, m, s].
+        - `scale`: displacement [m] that an output of 1 stands for.
+        - `axes`, `width`, `layers`: see `Perceptron`.
+        - `shrink`: what the last kernel is divided by, for a motion that begins small.
+        """
+        module = Perceptron(axes, width, layers)
+        draw, dtype = jax.nn.initializers.glorot_normal(), jnp.zeros((), float).dtype
+        shapes, params = zip(module.sizes, module.sizes[1:], strict=False), {}
+        for i, (shape, key_layer) in enumerate(zip(shapes, jr.split(key, layers), strict=True)):
+            params[f"kernel_{i}"] = draw(key_layer, shape, dtype)
+            params[f"bias_{i}"] = jnp.zeros(shape[1], dtype)
+        params[f"kernel_{layers - 1}"] /= shrink
+        return cls(module, params, (low + high) / 2, (high - low) / 2, scale)
 
     def __call__(self, points: Float[Array, "point 3"]) -> Float[Array, "point axis"]:
         """Displacements [m] at points (X [m], Y [m], t [s])."""
-        z = (points - self.centre[None]) / self.radius[None]
-        *hidden, (weight, bias) = zip(self.weights, self.biases, strict=True)
-        for inner, offset in hidden:
-            z = jnp.tanh(z @ inner + offset[None])
-        return self.scale * (z @ weight + bias[None])
+        return self.scale * self._apply(points)
 
-    def jet(self, points: Float[Array, "point 3"], pairs: tuple[tuple[int, int], ...]) -> Jet:
-        """Displacements [m] with their first derivatives and second ones in `pairs` of inputs.
+    def jet(self, points: Float[Array, "point 3"], pairs: Pairs) -> Jet:
+        """Displacements [m] with first derivatives, and second ones in `pairs` of inputs."""
+        found = self._apply(points, self.radius, pairs, method=Perceptron.jet)
+        return jax.tree.map(lambda part: self.scale * part, found)
 
-        Through z = tanh(a): z_i = z' a_i, z_ij = z' a_ij + z'' a_i a_j, where z' = 1 - z^2 and
-        z'' = -2 z z'.
-        """
-        (weight, bias), *layers = zip(self.weights, self.biases, strict=True)
-        value = (points - self.centre[None]) / self.radius[None] @ weight + bias[None]
-        slopes = [jnp.broadcast_to(row, value.shape) for row in weight / self.radius[:, None]]
-        curves = [jnp.zeros_like(value) for _ in pairs]
-        for weight, bias in layers:
-            z = jnp.tanh(value)
-            slope = 1 - z**2
-            curve = -2 * z * slope
-            # lists, because gradients of indexed arrays are slow scatters
-            curves = [
-                slope * own + curve * slopes[i] * slopes[j]
-                for own, (i, j) in zip(curves, pairs, strict=True)
-            ]
-            slopes = [slope * own for own in slopes]
-            product = jnp.concatenate([z, *slopes, *curves]) @ weight
-            value, *parts = jnp.split(product, 4 + len(pairs))
-            value, slopes, curves = value + bias[None], parts[:3], parts[3:]
-        none = jnp.zeros((0, *value.shape), value.dtype)
-        second = jnp.stack(curves) if pairs else none
-        return Jet(self.scale * value, self.scale * jnp.stack(slopes), self.scale * second)
+    def _apply(self, points: Float[Array, "point 3"], *rest, method=None) -> Any:
+        inputs = (points - self.centre[None]) / self.radius[None]
+        return self.module.apply({"params": self.params}, inputs, *rest, method=method)
 
 
 def at_time(places: Float[Array, "place 2"], time: Float[Array, ""]) -> Float[Array, "place 3"]:
-    """Places (X, Y) [m] at one time [s]: what a network of three axes takes."""
+    """Inputs (X [m], Y [m], t [s]) of a network, from places and one time."""
     return jnp.concatenate([places, jnp.broadcast_to(time, (len(places), 1))], axis=1)

@@ -1,4 +1,4 @@
-"""Recordings of a known fabric that is pulled along any direction, by the cloth solver."""
+"""Synthetic recordings of a known fabric that is pulled along any direction."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimation.pinn.laws import TurnedMembrane
+from r2s.estimation.pinn.stress import TurnedMembrane
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh
 from r2s.geometry.surface import nearest
@@ -17,7 +17,7 @@ from r2s.scenarios import clamp_force, energy_balance, stretching
 from r2s.scenarios.synthetic import MARKER_NOISE, MARKERS
 
 FRAMES = 39  # of 1/30 s
-FORCE_NOISE = 0.01  # of the largest force
+FORCE_NOISE = 0.01  # over the largest force
 
 _account = eqx.filter_jit(energy_balance)
 
@@ -35,12 +35,17 @@ def pulled(
     key: PRNGKeyArray,
     strain: float = 0.04,
 ) -> Recording:
-    """A stretching of a fabric whose warp is turned from the pull by an `angle` [rad].
+    """A stretching of a fabric, with 81 markers and the force on the pulled clamp.
 
-    81 markers with `marker_noise` [m], and a force with `force_noise` [-] of its greatest. Steps
-    of at most `max_step` [s]: by default one a frame, so that a force is that at its frame's time
-    and not a mean. The pull is by `strain` [-] of the sheet's length. Raises `RuntimeError` when
-    it diverges.
+    - `name`: of the fabric, in the recording's.
+    - `angle`: from the pull to the warp, [rad].
+    - `shape`: vertices of the sheet along its sides.
+    - `marker_noise` [m], `force_noise`: over the largest force [-].
+    - `max_step`: longest time step [s]; by default one a frame, so that a force is that at its
+      frame's time and not a mean.
+    - `strain`: by which the sheet is pulled, of its length [-].
+
+    Raises `RuntimeError` when the simulation diverges.
     """
     experiment = stretching(num_frames=frames, strain=strain)
     scenario = experiment.scenario(shape)
@@ -78,10 +83,10 @@ def pulled(
 
 
 def _markers(mesh: Mesh, x: Float[Array, "frame vertex 3"]) -> np.ndarray:
-    """Places [m] of 9 x 9 markers in each frame, each in the middle of its cell of the sheet."""
+    """Positions [m] of 9 x 9 markers in each frame, each in the middle of its cell of the sheet."""
     along = (np.arange(MARKERS) + 0.5) / MARKERS
     places = np.stack(np.meshgrid(along, along, indexing="ij"), -1).reshape(-1, 2)
     places = jnp.asarray(places * np.asarray(mesh.rest).max(axis=0), float)
-    flat = lambda points: jnp.pad(points, ((0, 0), (0, 1)))
-    faces, weights = nearest(flat(places), flat(mesh.rest), mesh.faces)
+    flat_places, flat_rest = (jnp.pad(p, ((0, 0), (0, 1))) for p in (places, mesh.rest))
+    faces, weights = nearest(flat_places, flat_rest, mesh.faces)
     return np.asarray(jnp.einsum("mk,tmki->tmi", weights, x[:, mesh.faces[faces]]))

@@ -1,7 +1,12 @@
-"""Training: Adam, then L-BFGS, on all losses at once, with the stiffness among the unknowns."""
+"""Training of networks: Adam, then L-BFGS, on all losses at once, with the stiffness among them.
+
+Both optimisers are optax's. The training goes in chunks of epochs; points are drawn anew for each,
+and after each one a checkpoint may be written.
+"""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,8 +17,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimation.pinn.data import Pull
-from r2s.estimation.pinn.laws import Strain, green
+from r2s.estimation import checkpoint as checkpoints
 from r2s.estimation.pinn.losses import (
     Losses,
     Points,
@@ -23,18 +27,20 @@ from r2s.estimation.pinn.losses import (
     strong_losses,
 )
 from r2s.estimation.pinn.network import LAYERS, Network
+from r2s.estimation.pinn.pulls import Pull
+from r2s.estimation.pinn.stress import Strain, green
 from r2s.fabrics.parameters import ParameterSpace
 
-LossesOf = Callable[..., Losses]
 NOISE = (2e-4, 0.01)  # of markers [m], and of the force over its greatest [-]
+SHRINK = 10.0  # the last kernel is small at first, since the even stretch is given
 
 
 class Model(eqx.Module):
     """What is trained: a network for each pull, and the fabric that they share.
 
-    - `networks`: with a leading axis, one a pull.
-    - `free`: unbounded; its sigmoid is a place in the space's unit cube, so that no bound is left:
-      C stays positive definite, and Poisson's ratio within its range.
+    - `networks`: with a leading axis of pulls.
+    - `free`: unbounded parameters. Their sigmoid is a place in the space's unit cube, so that C
+      stays positive definite and Poisson's ratio within its range.
     """
 
     networks: Network
@@ -42,7 +48,7 @@ class Model(eqx.Module):
 
     @property
     def place(self) -> Float[Array, "*batch dim"]:
-        """Where the fabric lies in its space."""
+        """Where the fabric lies in its space's unit cube."""
         return jax.nn.sigmoid(self.free)
 
 
@@ -50,17 +56,19 @@ class Model(eqx.Module):
 class Recipe:
     """How to train.
 
-    - `losses`: `strong_losses` or `r2s.estimation.pinn.weak.weak_losses`. - `weights`: of their
-      terms, in the order of `Losses`; 0 leaves one out. - `strain`: `green` or `small`.
-    - `warm_up`, `adam`, `lbfgs`: epochs without and with physics by Adam, and iterations.
-    - `rate`: of Adam, falling to a hundredth by a cosine. - `fabric_rate`: that of the fabric's
-      parameters, as a multiple.
-    - `points`: in each sheet, drawn anew every `redraw` epochs, half of them where the equation of
-      motion is least fulfilled.
+    - `losses`: `strong_losses` or `r2s.estimation.pinn.weak_form.weak_losses`.
+    - `weights`: of the terms, in the order of `Losses`; 0 leaves one out.
+    - `strain`: `green` or `small`.
+    - `warm_up`, `adam`: epochs of Adam without and with physics.
+    - `lbfgs`: iterations of L-BFGS after them.
+    - `rate`: of Adam, which falls to a hundredth by a cosine.
+    - `fabric_rate`: that of the fabric's parameters, as a multiple.
+    - `points`: number of points in each sheet where equations are tested.
+    - `redraw`: epochs in a chunk.
     - `width`, `layers`: of the network.
     """
 
-    losses: LossesOf = strong_losses
+    losses: Callable[..., Losses] = strong_losses
     weights: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0, 1.0)
     strain: Strain = green
     warm_up: int = 500
@@ -73,11 +81,21 @@ class Recipe:
     width: int = 32
     layers: int = LAYERS
 
+    @property
+    def adam_chunks(self) -> int:
+        """Number of chunks that Adam makes."""
+        return -(-(self.warm_up + self.adam) // self.redraw)
+
+    @property
+    def chunks(self) -> int:
+        """Number of chunks of the whole training."""
+        return self.adam_chunks + -(-self.lbfgs // self.redraw)
+
 
 class Trained(NamedTuple):
-    """Models, and their losses [-] and places in the space's cube after each chunk of training.
+    """Trained models, and their course after each chunk; all with a leading axis of fabrics.
 
-    All with a leading axis, one a fabric.
+    - `losses`: [-]. - `places`: of the fabrics in the space's unit cube.
     """
 
     model: Model
@@ -87,27 +105,31 @@ class Trained(NamedTuple):
 
 def init(space: ParameterSpace, pulls: Pull, recipe: Recipe, *, key: PRNGKeyArray) -> Model:
     """An untrained model of stacked pulls, its fabric in the middle of the space."""
-    number = pulls.angle.shape[0]
 
     def network(pull: Pull, key: PRNGKeyArray) -> Network:
-        zero = jnp.zeros((1,), float)
         high = jnp.concatenate([pull.size, pull.times[-1:]])
-        low = jnp.concatenate([jnp.zeros_like(pull.size), zero])
-        scale = jnp.max(jnp.abs(pull.displacement)) / 2
-        axes = pull.displacement.shape[-1]
-        about = {"axes": axes, "width": recipe.width, "layers": recipe.layers}
-        made = Network.make(low, high, scale, **about, key=key)
-        *hidden, last = made.weights  # small, since what goes from clamp to clamp is given
-        return eqx.tree_at(lambda n: n.weights, made, (*hidden, last / 10))
+        return Network.make(
+            jnp.zeros_like(high),
+            high,
+            jnp.max(jnp.abs(pull.displacement)) / 2,
+            axes=pull.displacement.shape[-1],
+            width=recipe.width,
+            layers=recipe.layers,
+            shrink=SHRINK,
+            key=key,
+        )
 
-    return Model(jax.vmap(network)(pulls, jr.split(key, number)), jnp.zeros(space.dim, float))
+    keys = jr.split(key, pulls.angle.shape[0])
+    return Model(jax.vmap(network)(pulls, keys), jnp.zeros(space.dim, float))
 
 
 def trainable(model: Model) -> Any:
-    """True for what is trained of a model: weights, biases and the fabric, not the scaling."""
+    """A tree like the model, true for what is trained: the networks' parameters and the fabric."""
     none = jax.tree.map(lambda _: False, model)
-    parts = lambda m: (m.networks.weights, m.networks.biases, m.free)
-    return eqx.tree_at(parts, none, jax.tree.map(lambda _: True, parts(model)))
+    parts = (none.networks.params, none.free)
+    return eqx.tree_at(
+        lambda m: (m.networks.params, m.free), none, jax.tree.map(lambda _: True, parts)
+    )
 
 
 def total(
@@ -119,11 +141,12 @@ def total(
     weight,
     recipe: Recipe,
 ) -> tuple[Array, Losses]:
-    """The sum of all losses with those of physics times `weight` [-], and the losses themselves."""
+    """The sum of all losses, those of physics times `weight` [-], and the losses themselves."""
     fabric = space(model.place)
 
     def of_pull(network: Network, pull: Pull, points: Points) -> Losses:
-        scales = scales_of(pull, fabric, noise[0], noise[1] * _greatest(pull))
+        greatest = jnp.ones((), float) if pull.force is None else jnp.max(jnp.abs(pull.force))
+        scales = scales_of(pull, fabric, noise[0], noise[1] * greatest)
         return recipe.losses(network, pull, fabric, points, scales, recipe.strain)
 
     each = jax.vmap(of_pull)(model.networks, pulls, points)
@@ -133,16 +156,13 @@ def total(
     return data + clamps + weight * (motion + traction + free), losses
 
 
-def _greatest(pull: Pull) -> Array:
-    return jnp.ones((), float) if pull.force is None else jnp.max(jnp.abs(pull.force))
-
-
 def redrawn(
     model: Model, space: ParameterSpace, pulls: Pull, recipe: Recipe, key: PRNGKeyArray
 ) -> Points:
-    """New points: half of them even, half where the equation of motion is least fulfilled.
+    """New points for every pull.
 
-    The latter are drawn from four times as many, with chances that rise with the residual.
+    In the strong form half of them are drawn from four times as many, with chances that grow with
+    the residual of the equation of motion there.
     """
     fabric = space(model.place)
 
@@ -167,7 +187,7 @@ def redrawn(
 
 
 class Progress(NamedTuple):
-    """Where Adam is: the model, its optimiser, and the number of epochs done."""
+    """State of a training: models, state of Adam, and number of epochs of Adam that are done."""
 
     model: Model
     state: Any
@@ -177,8 +197,7 @@ class Progress(NamedTuple):
 def adam(recipe: Recipe) -> optax.GradientTransformation:
     """Adam with the recipe's rates."""
     epochs = recipe.warm_up + recipe.adam
-    schedule = optax.cosine_decay_schedule(recipe.rate, max(epochs, 1), 0.01)
-    return optax.adam(schedule)
+    return optax.adam(optax.cosine_decay_schedule(recipe.rate, max(epochs, 1), 0.01))
 
 
 @eqx.filter_jit
@@ -188,29 +207,31 @@ def adam_chunk(
     pulls: Pull,
     noise: Array,
     recipe: Recipe,
-    epochs: int,
-    key,
+    key: PRNGKeyArray,
 ) -> tuple[Progress, Losses]:
-    """Some epochs of Adam for every fabric, on points drawn anew; the losses of the last one."""
+    """A chunk of epochs of Adam for every fabric, and the losses of the last epoch."""
     which, optimiser = trainable(progress.model), adam(recipe)
-    faster = lambda change: recipe.fabric_rate * change
 
     def run(progress: Progress, space: ParameterSpace, pulls: Pull, key: PRNGKeyArray):
         points = redrawn(progress.model, space, pulls, recipe, key)
 
         def epoch(progress: Progress, _):
             weight = (progress.epoch >= recipe.warm_up).astype(float)
-            weights, fixed = eqx.partition(progress.model, which)
-            loss = lambda weights: total(
-                eqx.combine(weights, fixed), space, pulls, points, noise, weight, recipe
-            )
-            gradient, losses = jax.grad(loss, has_aux=True)(weights)
+            params, fixed = eqx.partition(progress.model, which)
+
+            def loss(params):
+                model = eqx.combine(params, fixed)
+                return total(model, space, pulls, points, noise, weight, recipe)
+
+            gradient, losses = jax.grad(loss, has_aux=True)(params)
             change, state = optimiser.update(gradient, progress.state)
-            change = eqx.tree_at(lambda m: m.free, change, replace_fn=faster)
+            change = eqx.tree_at(
+                lambda m: m.free, change, replace_fn=lambda free: recipe.fabric_rate * free
+            )
             model = eqx.apply_updates(progress.model, change)
             return Progress(model, state, progress.epoch + 1), losses
 
-        return jax.lax.scan(epoch, progress, None, epochs)
+        return jax.lax.scan(epoch, progress, None, recipe.redraw)
 
     keys = jr.split(key, progress.epoch.shape[0])
     progress, losses = jax.vmap(run)(progress, spaces, pulls, keys)
@@ -219,42 +240,47 @@ def adam_chunk(
 
 @eqx.filter_jit
 def lbfgs_chunk(
-    model: Model,
+    progress: Progress,
     spaces: ParameterSpace,
     pulls: Pull,
     noise: Array,
     recipe: Recipe,
-    iterations: int,
-    key,
-) -> tuple[Model, Losses]:
-    """Some iterations of L-BFGS for every fabric, with a line search, on points drawn anew.
+    key: PRNGKeyArray,
+) -> tuple[Progress, Losses]:
+    """A chunk of iterations of L-BFGS with a line search for every fabric, and the last losses.
 
     It begins without memory: the curvature that it remembered would be of other points.
     """
-    which, optimiser = trainable(model), optax.lbfgs()
+    which, optimiser = trainable(progress.model), optax.lbfgs()
 
     def run(model: Model, space: ParameterSpace, pulls: Pull, key: PRNGKeyArray):
         points = redrawn(model, space, pulls, recipe, key)
-        weights, fixed = eqx.partition(model, which)
-        loss = lambda weights: total(
-            eqx.combine(weights, fixed), space, pulls, points, noise, 1.0, recipe
-        )
-        value_of = lambda weights: loss(weights)[0]
-        again = optax.value_and_grad_from_state(value_of)
+        params, fixed = eqx.partition(model, which)
+
+        def losses(params):
+            model = eqx.combine(params, fixed)
+            return total(model, space, pulls, points, noise, 1.0, recipe)
+
+        def loss(params):
+            return losses(params)[0]
+
+        value_and_grad = optax.value_and_grad_from_state(loss)
 
         def iterate(carried, _):
-            weights, state = carried
-            value, gradient = again(weights, state=state)
+            params, state = carried
+            value, gradient = value_and_grad(params, state=state)
             change, state = optimiser.update(
-                gradient, state, weights, value=value, grad=gradient, value_fn=value_of
+                gradient, state, params, value=value, grad=gradient, value_fn=loss
             )
-            return (eqx.apply_updates(weights, change), state), None
+            return (eqx.apply_updates(params, change), state), None
 
-        begin = weights, optimiser.init(weights)
-        (weights, _), _ = jax.lax.scan(iterate, begin, None, iterations)
-        return eqx.combine(weights, fixed), loss(weights)[1]
+        begin = params, optimiser.init(params)
+        (params, _), _ = jax.lax.scan(iterate, begin, None, recipe.redraw)
+        return eqx.combine(params, fixed), losses(params)[1]
 
-    return jax.vmap(run)(model, spaces, pulls, jr.split(key, model.free.shape[0]))
+    keys = jr.split(key, progress.epoch.shape[0])
+    model, losses = jax.vmap(run)(progress.model, spaces, pulls, keys)
+    return progress._replace(model=model), losses
 
 
 def train(
@@ -263,49 +289,69 @@ def train(
     recipe: Recipe = Recipe(),
     *,
     noise: tuple[float, float] = NOISE,
-    report: Callable[[Losses, np.ndarray], None] | None = None,
+    report: Callable[[int, Losses], None] | None = None,
+    checkpoint: Path | None = None,
     key: PRNGKeyArray,
 ) -> Trained:
     """Train a network for each pull of each fabric, and the fabrics, all together.
 
-    `spaces` and `pulls` have a leading axis of fabrics, `pulls` then one of pulls. `noise`: of
-    the markers [m], and of the force over its greatest [-]. `report` is called after every chunk
-    with the losses and the places in the spaces. Raises `RuntimeError` when a loss is not finite.
+    - `spaces`, `pulls`: with a leading axis of fabrics; `pulls` have one of pulls after it.
+    - `noise`: of the markers [m], and of the force over its greatest [-].
+    - `report`: called after every chunk with its number and the losses.
+    - `checkpoint`: a file that is written after every chunk, and from which a killed training of
+      the same problem goes on.
+
+    Raises `RuntimeError` when a loss is not finite, `ValueError` for a checkpoint of another
+    problem.
     """
-    key_init, key = jr.split(key)
-    number = pulls.angle.shape[0]
-    begin = lambda space, pulls, key: init(space, pulls, recipe, key=key)
-    model = jax.vmap(begin)(spaces, pulls, jr.split(key_init, number))
-    weights, _ = eqx.partition(model, trainable(model))
-    state = jax.vmap(adam(recipe).init)(weights)
-    progress = Progress(model, state, jnp.zeros(number, int))
-    about = spaces, pulls, jnp.asarray(noise, float), recipe
-    history: list[tuple[Losses, np.ndarray]] = []
+    key_init, key_chunks = jr.split(key)
+    number, weights = pulls.angle.shape[0], jnp.asarray(noise, float)
 
-    def note(losses: Losses, model: Model) -> None:
-        history.append((jax.tree.map(np.asarray, losses), np.asarray(model.place)))
-        if not all(np.isfinite(values).all() for values in history[-1][0]):
-            raise RuntimeError(f"training diverged in chunk {len(history)}: {history[-1][0]}")
+    def begin(space: ParameterSpace, pulls: Pull, key: PRNGKeyArray) -> Progress:
+        model = init(space, pulls, recipe, key=key)
+        state = adam(recipe).init(eqx.filter(model, trainable(model)))
+        return Progress(model, state, jnp.zeros((), int))
+
+    progress = jax.vmap(begin)(spaces, pulls, jr.split(key_init, number))
+    history: list[tuple[Losses, Array]] = []
+    run = {"kind": "training of networks"}
+    if checkpoint is not None:
+        run["run"] = checkpoints.fingerprint(spaces, pulls, weights, _settings(recipe), key)
+        progress, history = _resumed(checkpoint, run, progress)
+    for chunk in range(len(history), recipe.chunks):
+        make = adam_chunk if chunk < recipe.adam_chunks else lbfgs_chunk
+        key_chunk = jr.fold_in(key_chunks, chunk)
+        progress, losses = make(progress, spaces, pulls, weights, recipe, key_chunk)
+        if not all(bool(jnp.isfinite(values).all()) for values in losses):
+            raise RuntimeError(f"training diverged in chunk {chunk + 1}: {losses}")
+        history.append((losses, progress.model.place))
+        if checkpoint is not None:
+            arrays = checkpoints.arrays_of((progress, _stacked(history)))
+            checkpoints.save(checkpoint, arrays, run)
         if report is not None:
-            report(*history[-1])
-
-    for chunk in range(adam_chunks(recipe)):
-        progress, losses = adam_chunk(progress, *about, recipe.redraw, jr.fold_in(key, chunk))
-        note(losses, progress.model)
-    model = progress.model
-    for chunk in range(chunks(recipe) - adam_chunks(recipe)):
-        key_points = jr.fold_in(key, adam_chunks(recipe) + chunk)
-        model, losses = lbfgs_chunk(model, *about, recipe.redraw, key_points)
-        note(losses, model)
-    stack = jax.tree.map(lambda *values: np.stack(values, 1), *(losses for losses, _ in history))
-    return Trained(model, stack, np.stack([place for _, place in history], 1))
+            report(chunk, losses)
+    losses, places = jax.tree.map(np.asarray, _stacked(history))
+    return Trained(progress.model, losses, places)
 
 
-def adam_chunks(recipe: Recipe) -> int:
-    """How many chunks of `redraw` epochs Adam makes."""
-    return -(-(recipe.warm_up + recipe.adam) // recipe.redraw)
+def _stacked(history: list[tuple[Losses, Array]]) -> tuple[Losses, Array]:
+    """Losses and places with an axis of chunks after that of fabrics."""
+    return jax.tree.map(lambda *values: jnp.stack(values, 1), *history)
 
 
-def chunks(recipe: Recipe) -> int:
-    """How many chunks a training has, each of `redraw` epochs or iterations."""
-    return adam_chunks(recipe) + -(-recipe.lbfgs // recipe.redraw)
+def _resumed(path: Path, run: dict[str, str], progress: Progress):
+    """The state of a training and its history, from a checkpoint if there is one."""
+    place = progress.model.place
+    likeness = progress, (Losses(place, place, place, place, place), place)
+    stored = checkpoints.load(path, run)
+    if stored is None:
+        return progress, []
+    progress, course = checkpoints.tree_from(stored, likeness)
+    chunks = range(course[1].shape[1])
+    return progress, [jax.tree.map(lambda values, at=at: values[:, at], course) for at in chunks]
+
+
+def _settings(recipe: Recipe) -> dict[str, Any]:
+    """The fields of a recipe, functions by name."""
+    values = {field.name: getattr(recipe, field.name) for field in fields(recipe)}
+    return {name: getattr(value, "__name__", value) for name, value in values.items()}

@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
-from r2s.extras import opencv
+from r2s.extras import require
 from r2s.recordings.cameras.camera import Camera
 
 Row = tuple[float, float, float, float]
@@ -122,7 +122,11 @@ def project(
     if not any(camera.distortion):
         return points[:, :2] / points[:, 2:] * camera.focal_length + camera.centre
     still, lens = np.zeros(3), np.array(camera.distortion)
-    return opencv().projectPoints(points, still, still, matrix(camera), lens)[0].reshape(-1, 2)
+    return (
+        require("cv2", "camera", "lens distortion")
+        .projectPoints(points, still, still, matrix(camera), lens)[0]
+        .reshape(-1, 2)
+    )
 
 
 @lru_cache(maxsize=8)  # the same for every frame; 15 MB at 720p
@@ -135,7 +139,9 @@ def rays(camera: DepthCamera) -> Float[np.ndarray, "down across 2"]:
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
     if any(camera.distortion):
         lens = np.array(camera.distortion)
-        flat = opencv().undistortPoints(pixels.reshape(-1, 1, 2), matrix(camera), lens)
+        flat = require("cv2", "camera", "lens distortion").undistortPoints(
+            pixels.reshape(-1, 1, 2), matrix(camera), lens
+        )
         directions = flat.reshape(pixels.shape)
     else:
         directions = (pixels - camera.centre) / camera.focal_length

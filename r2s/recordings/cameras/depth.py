@@ -6,20 +6,18 @@ from jaxtyping import Bool, Float
 from r2s.recordings.cameras.calibration import DepthCamera, rays
 
 
-def steps(depth: Float[np.ndarray, "down across"], limit: float) -> Bool[np.ndarray, "down across"]:
+def depth_jumps(
+    depth: Float[np.ndarray, "down across"], limit: float
+) -> Bool[np.ndarray, "down across"]:
     """Pixels at which the depth [m] jumps by more than `limit` [m] to a neighbour that has one.
 
     There a pixel sees two surfaces at once, and cameras report a depth in between.
     """
     jumps = np.zeros(depth.shape, bool)
-    for axis in (0, 1):
-        near, far = (slice(None, -1), slice(1, None))
-        first, second = (
-            depth[tuple(part if axis == a else slice(None) for a in (0, 1))] for part in (near, far)
-        )
-        jump = (np.abs(first - second) > limit) & (first > 0) & (second > 0)
-        for part in (near, far):
-            jumps[tuple(part if axis == a else slice(None) for a in (0, 1))] |= jump
+    for lines, marked in ((depth, jumps), (depth.T, jumps.T)):  # of two rows, of two columns
+        jump = (np.abs(np.diff(lines, axis=0)) > limit) & (lines[1:] > 0) & (lines[:-1] > 0)
+        marked[1:] |= jump
+        marked[:-1] |= jump
     return jumps
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from r2s.recordings.cameras.calibration import DepthCamera, rays
-from r2s.recordings.cameras.depth import from_world, steps
+from r2s.recordings.cameras.depth import depth_jumps, from_world
 
 STEP = 0.02  # [m]: a jump in depth that counts as an edge
 
@@ -47,7 +47,7 @@ def flawed_depth(
     """A rendered depth image [m] (with the faces that it shows) as a real camera gives it."""
     found = depth > 0
     flawed = depth.copy()
-    edges = np.flatnonzero(steps(depth, STEP))
+    edges = np.flatnonzero(depth_jumps(depth, STEP))
     chance = generator.random(len(edges))
     mixed = edges[chance < flaws.edge_mixed]
     flawed.flat[mixed] = _mix(depth, mixed, generator)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-from r2s.extras import opencv
+from r2s.extras import require
 from r2s.files import write_bytes
 
 DEPTHS, MASKS, COLOURS = (".png", ".npy"), (".png",), (".png", ".jpg", ".jpeg")
@@ -65,7 +65,7 @@ def encode_depth(depth: Float[np.ndarray, "down across"], scale: float) -> bytes
 
 def encode_png(image: Num[np.ndarray, "down across *channel"]) -> bytes:
     """An image of 8 or 16 bits as PNG; colour in the order blue, green, red."""
-    cv2 = opencv()
+    cv2 = require("cv2", "camera", "depth images")
     return cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
 
 
@@ -101,7 +101,7 @@ def _check_unit(path: Path, depth: np.ndarray, scale: float) -> None:
 
 
 def _read_png(path: Path) -> np.ndarray:
-    cv2 = opencv()
+    cv2 = require("cv2", "camera", "depth images")
     data = path.read_bytes()
     if not data.startswith(PNG_START):
         raise ValueError(

@@ -32,9 +32,9 @@ from r2s.files import read_json, write_json
 from r2s.recordings.cameras import images
 from r2s.recordings.cameras.calibration import DepthCamera
 from r2s.recordings.cameras.cleaning import Cleaning, clean, inside
-from r2s.recordings.cameras.depth import back_project, from_world, moved, steps
+from r2s.recordings.cameras.depth import back_project, depth_jumps, from_world, moved
 from r2s.recordings.cameras.timing import pair, read_times
-from r2s.recordings.readers.clouds import find_numbered
+from r2s.recordings.readers.numbered import find_numbered
 from r2s.recordings.recording import Recording, RecordingInfo, make_recording
 
 NAME = "cameras.json"
@@ -234,7 +234,7 @@ def _camera_cloud(
             )
         where &= mask
     if rig.clean.edge > 0:
-        where &= ~steps(depth, rig.clean.edge)
+        where &= ~depth_jumps(depth, rig.clean.edge)
     seen = back_project(camera, depth, where)
     points = moved(np.array(camera.to_world), seen)
     kept = inside(points, rig.clean)

@@ -1,11 +1,14 @@
-"""Point clouds in files: one reader per format, and the numbered frames of a folder."""
+"""Point clouds in files: one reader per format."""
 
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+
+from r2s.extras import require
+from r2s.recordings.readers.numbered import find_numbered
 
 
 def read_cloud(path: Path | str) -> Float[np.ndarray, "point 3"]:
@@ -53,51 +56,8 @@ def read_values(path: Path | str) -> Float[np.ndarray, "..."]:
 
 
 def find_frames(folder: Path | str, first: int | None = None) -> list[Path]:
-    """The numbered clouds of a folder (`000.npy`, `frame_12.ply`), sorted by their number.
-
-    The number is the last group of digits in the name. `first` is the number that the first frame
-    must have (None: any). Other files and hidden files are passed over.
-
-    Raises FileNotFoundError (no such folder, no frames) or ValueError (mixed formats, two files
-    of one number, a number that is missing).
-    """
+    """The numbered clouds of a folder, by their number; arguments and errors: `find_numbered`."""
     return list(find_numbered(folder, READERS, first).values())
-
-
-def find_numbered(
-    folder: Path | str, suffixes: Collection[str], first: int | None = None
-) -> dict[int, Path]:
-    """The numbered files of a folder with one of these suffixes, by number; else `find_frames`."""
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder")
-    found = [(_frame_number(path, suffixes), path) for path in sorted(folder.iterdir())]
-    numbered = [(number, path) for number, path in found if number is not None]
-    if not numbered:
-        formats = f"formats: {', '.join(suffixes)}"
-        raise FileNotFoundError(
-            f"{folder}: no numbered frames such as 000{next(iter(suffixes))} ({formats})"
-        )
-    formats = sorted({path.suffix.lower() for _, path in numbered})
-    if len(formats) > 1:
-        raise ValueError(f"{folder}: frames of mixed formats: {', '.join(formats)}")
-    frames: dict[int, Path] = {}
-    for number, path in numbered:
-        if number in frames:
-            names = f"{frames[number].name} and {path.name}"
-            raise ValueError(f"{folder}: frame {number} is there twice: {names}: remove one")
-        frames[number] = path
-    start = min(frames) if first is None else first
-    for number in range(start, max(frames)):
-        if number not in frames:
-            found = f"found {len(frames)} frames from {min(frames)} to {max(frames)}"
-            raise ValueError(
-                f"{folder}: frame {number} is missing ({found}): restore it, or number the frames "
-                "without gaps"
-            )
-    if min(frames) < start:
-        raise ValueError(f"{folder}: frame {min(frames)} comes before the first frame, {start}")
-    return {number: frames[number] for number in sorted(frames)}
 
 
 def voxel_means(points: Float[np.ndarray, "point 3"], voxel: float) -> Float[np.ndarray, "cell 3"]:
@@ -118,13 +78,6 @@ def _ravel(cells: np.ndarray, shape: np.ndarray) -> np.ndarray:
     return (cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2]
 
 
-def _frame_number(path: Path, suffixes: Collection[str]) -> int | None:
-    if path.name.startswith(".") or path.suffix.lower() not in suffixes or not path.is_file():
-        return None
-    digits = re.findall(r"[0-9]+", path.stem)
-    return int(digits[-1]) if digits else None
-
-
 def _read_npy(path: Path) -> np.ndarray:
     values = np.load(path, allow_pickle=False)
     if not isinstance(values, np.ndarray):
@@ -135,10 +88,7 @@ def _read_npy(path: Path) -> np.ndarray:
 
 
 def _read_ply(path: Path) -> np.ndarray:
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ImportError(f"{path}: reading ply needs trimesh: pip install 'r2s[study]'") from error
+    trimesh = require("trimesh", "study", f"{path}: clouds in ply files")
     count = _ply_vertices(path.read_bytes())
     if count == 0:
         return np.zeros((0, 3))
@@ -175,22 +125,15 @@ def _read_obj(path: Path) -> np.ndarray:
 
 
 def _read_xyz(path: Path) -> np.ndarray:
-    lines = [line.split("#")[0].replace(",", " ").split() for line in path.read_text().splitlines()]
-    rows = [line for line in lines if line]
-    widths = {len(row) for row in rows}
-    if len(widths) > 1:
-        raise ValueError(f"rows of {min(widths)} to {max(widths)} columns")
-    return np.array(rows, np.float64) if rows else np.zeros((0, 3))
+    lines = [line.split("#")[0].replace(",", " ") for line in path.read_text().splitlines()]
+    rows = [line for line in lines if line.strip()]
+    return np.loadtxt(rows, ndmin=2) if rows else np.zeros((0, 3))
 
 
 def _read_pcd(path: Path) -> np.ndarray:
     if not path.is_file():  # before pypcd4, which wraps this error
         raise FileNotFoundError(f"{path}: no such file")
-    try:
-        from pypcd4 import PointCloud  # pyright: ignore[reportPrivateImportUsage]
-    except ImportError as error:
-        raise ImportError(f"{path}: reading pcd needs pypcd4: pip install 'r2s[pcd]'") from error
-    cloud = PointCloud.from_path(path)
+    cloud = require("pypcd4", "pcd", f"{path}: clouds in pcd files").PointCloud.from_path(path)
     values = cloud.numpy(("x", "y", "z"))
     if len(values) != cloud.points:
         raise ValueError(f"the header promises {cloud.points} points, found {len(values)}")

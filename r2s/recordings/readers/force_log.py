@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from scipy.interpolate import make_interp_spline
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 NEWTONS = {"N": 1.0, "mN": 1e-3, "cN": 1e-2, "kN": 1e3, "gf": 9.80665e-3, "kgf": 9.80665}
@@ -144,22 +145,11 @@ def estimate_offset(
 
 def _means(log: ForceLog, at: np.ndarray, half: float) -> np.ndarray:
     """The mean force within `half` [s] of times on the log's clock, as far as the log goes."""
-    steps = 0.5 * (log.force[1:] + log.force[:-1]) * np.diff(log.times)
-    total = np.concatenate([[0.0], np.cumsum(steps)])
+    integral = make_interp_spline(log.times, log.force, k=1).antiderivative()
     low, high = (np.clip(at + sign * half, log.times[0], log.times[-1]) for sign in (-1, 1))
     width = high - low
-    mean = (_integral(log, total, high) - _integral(log, total, low)) / np.where(
-        width > 0, width, 1
-    )
+    mean = (integral(high) - integral(low)) / np.where(width > 0, width, 1)
     return np.where(width > 0, mean, np.interp(at, log.times, log.force))
-
-
-def _integral(log: ForceLog, total: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """The integral of the force from the log's start [N s], linear between samples."""
-    left = np.clip(np.searchsorted(log.times, at, side="right") - 1, 0, len(log.times) - 2)
-    part = at - log.times[left]
-    slope = (log.force[left + 1] - log.force[left]) / (log.times[left + 1] - log.times[left])
-    return total[left] + log.force[left] * part + 0.5 * slope * part**2
 
 
 def _cubic(displacement: np.ndarray) -> np.ndarray:

@@ -4,38 +4,44 @@
     homography = plane_homography(corners_in_pixels, corners_in_metres)  # plane
     markers = to_metres(homography, tracks.pixels)
 
-The centre of a dot is that of its area in the image, which a tilted camera moves off the middle of
-the dot: by 0.01 px for dots of 16 px at a moderate tilt, and by the square of their size.
+OpenCV detects the dots and finds their grid in the first frame; the rest is ours, since OpenCV has
+no tracker for dots that are covered for a while and come back. The centre of a dot is that of its
+area in the image, which a tilted camera moves off the middle of the dot: by 0.01 px for dots of
+16 px at a moderate tilt, and by the square of their size.
 
-Images are grey, (height, width); places in them are (x, y), x to the right and y down, [px], whole
-numbers at the centres of pixels. Needs OpenCV: pip install 'r2s[camera]'.
+Images are grey, 8 bits, (height, width); places in them are (x, y), x to the right and y down,
+[px], whole numbers at the centres of pixels. Needs OpenCV: pip install 'r2s[camera]'.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 from scipy.spatial import KDTree
 
-from r2s.extras import opencv
+from r2s.extras import require
 
 Places = Float[np.ndarray, "dot 2"]
 
-CONTRAST = 0.12  # a dot differs from the cloth around it by at least this part of its brightness
+CONTRAST = 0.12  # a dot differs from the cloth by at least this part of its brightness
 ROUND = 0.6  # least ratio of a dot's width to its length, in the image
-AREA_CHANGE = 1.3  # factor by which a dot may differ from the others in how its area changed
+CIRCULAR = 0.8  # least 4 pi area / perimeter^2 of a dot; of half a disc it is 0.75
+SIZE_CHANGE = 1.14  # factor by which a dot may differ from the others in how its diameter changed
+SMALLEST, LARGEST = 4.0, 6.0  # [px] a dot is across at least; at most this part of the image
+STEP = 3  # grey levels from one threshold to the next
+FIRST_BLUR = 1.6  # [px], before the size of the dots is known
 GATE = 0.4  # of the spacing: farther from its prediction a dot is another one
 CREDIBLE = 0.2  # of the spacing: farther from the smooth motion of all a dot is no marker
 
 
 @dataclass(frozen=True)
 class Dots:
-    """Dots in an image: `centres` [px] to a fraction of a pixel, `areas` [px^2]."""
+    """Dots in an image: `centres` to a fraction of a pixel, and `sizes` (diameters), both [px]."""
 
     centres: Places
-    areas: Float[np.ndarray, " dot"]
+    sizes: Float[np.ndarray, " dot"]
 
 
 @dataclass(frozen=True)
@@ -60,11 +66,14 @@ def track(
 ) -> Tracks:
     """Follow the dots of a grid of `shape` (rows, columns) through the frames of a video.
 
-    All must be seen in the first frame, which says which is which (see `find_grid` for `origin`,
-    the place [px] of the first). From frame to frame a dot goes on as it went, and must be met
-    within 0.4 of the grid's spacing of there. A dot that is covered, in part too, is not seen; it
-    is found again where the others, by a smooth motion of all, say that it should be. `dark`: the
-    dots are darker than the cloth.
+    All must be seen in the first frame, which says which is which. From frame to frame a dot is
+    expected to keep its velocity, and must be found within 0.4 of the grid's spacing of that place.
+    A dot that is covered, even in part, is not seen; it is found again where a smooth motion of the
+    others says that it should be.
+
+    - `frames`: grey images, such as those of `r2s.recordings.readers.video.read_grey`.
+    - `dark`: whether the dots are darker than the cloth.
+    - `origin`: place of the first marker in the first frame, [px]; see `find_grid`.
 
     Raises ValueError that names the frame: no frames, fewer dots than the grid has in the first
     one, fewer than half of them in a later one.
@@ -87,20 +96,41 @@ def detect(image: np.ndarray, dark: bool = True, diameter: float | None = None) 
     """The round dots of an image, darker (or, if not `dark`, brighter) than what is around them.
 
     `diameter` [px] is about that of a dot; when None, that of most of the round dots in the image.
-    Each is compared with the brightness around it, so uneven light does not move its centre.
-    Raises ValueError when there is no dot.
+    OpenCV's blob detector looks at the image through many thresholds, so uneven light moves no
+    centre. Raises ValueError when there is no dot.
     """
     if diameter is None:
-        diameter = _usual_diameter(image, dark)
-    contrast = _contrast(image, dark, diameter)
-    boxes, areas, near = _blobs(contrast, 0.5 * max(CONTRAST, _strength(contrast)))
-    round_ = boxes.min(axis=1) >= ROUND * boxes.max(axis=1)
-    full = areas >= 0.6 * np.pi / 4 * boxes.prod(axis=1)
-    usual = np.pi / 4 * diameter**2
-    kept = round_ & full & (areas > 0.35 * usual) & (areas < 2.5 * usual)
-    if not kept.any():
+        largest = min(image.shape) / LARGEST
+        sizes = _blobs(image, dark, FIRST_BLUR, (SMALLEST, largest)).sizes
+        if not len(sizes):
+            raise ValueError(
+                "no round dots in the image: are they darker than the cloth, and in focus"
+            )
+        alike = np.abs(np.log(sizes[:, None] / sizes)) < 0.25
+        diameter = float(np.median(sizes[alike[alike.sum(axis=1).argmax()]]))
+    limits = 0.6 * diameter, 1.6 * diameter
+    dots = _blobs(image, dark, max(0.8, 0.1 * diameter), limits)
+    if not len(dots.centres):
         raise ValueError(f"no round dots of about {diameter:.0f} px across: is the light on?")
-    return Dots(_centres(contrast, near[kept], diameter), areas[kept])
+    return dots
+
+
+def _blobs(image: np.ndarray, dark: bool, blur: float, diameters: tuple[float, float]) -> Dots:
+    """Round blobs with diameters [px] between two limits, in an image smoothed by `blur` [px]."""
+    cv2 = require("cv2", "camera", "markers")
+    options = cv2.SimpleBlobDetector.Params()
+    options.blobColor = 0 if dark else 255
+    options.minThreshold, options.maxThreshold, options.thresholdStep = 5, 250, STEP
+    options.minRepeatability = max(2, int(CONTRAST * np.median(image) / STEP))
+    options.minArea, options.maxArea = (np.pi / 4 * size**2 for size in diameters)
+    options.minDistBetweenBlobs = diameters[0]
+    options.filterByConvexity = False
+    options.filterByCircularity, options.minCircularity = True, CIRCULAR
+    options.filterByInertia, options.minInertiaRatio = True, ROUND**2
+    smooth = cv2.GaussianBlur(image, (0, 0), blur)
+    found = cv2.SimpleBlobDetector.create(options).detect(smooth)
+    centres = np.array([blob.pt for blob in found], float).reshape(-1, 2)
+    return Dots(centres, np.array([blob.size for blob in found], float))
 
 
 def find_grid(
@@ -111,202 +141,65 @@ def find_grid(
     The grid may be turned and seen at an angle; dots that are off it are left out. Seen from above
     it is never mirrored, but dots alone do not say where it begins: its first marker is the corner
     nearest to `origin` [px], or else the one from which the columns run most to the right and the
-    rows most downward. Raises ValueError when the grid is not there as a whole, or when `origin`
-    is at a corner from which rows and columns have the other's length.
+    rows most downward. Raises ValueError when the grid is not there as a whole, when the dots go on
+    beside it, or when `origin` is at a corner from which rows and columns have the other's length.
     """
-    cells = _grow(places)
     rows, columns = shape
-    window = _window(cells, shape)
-    if window is None:
-        found = len(cells)
-        low, high = np.min(list(cells.values()), axis=0), np.max(list(cells.values()), axis=0)
-        spans = " x ".join(str(n) for n in high - low + 1)
-        raise ValueError(
-            f"expected a grid of {rows} x {columns} markers, found {found} in one that spans "
-            f"{spans}: start at a frame that shows all, in focus, with none covered"
-        )
-    turns = [t for k in range(4) if (t := np.rot90(window, k)).shape == shape]
-    firsts = np.array([places[turn[0, 0]] for turn in turns])
-    if origin is not None:
-        corners = places[[window[0, 0], window[0, -1], window[-1, 0], window[-1, -1]]]
-        nearest = corners[np.argmin(np.linalg.norm(corners - np.array(origin), axis=1))]
-        distance = np.linalg.norm(firsts - nearest, axis=1)
-        if distance.min() > 0:
-            raise ValueError(
-                f"from the corner at {tuple(np.round(nearest).tolist())} px the grid has not "
-                f"{rows} rows and {columns} columns, seen unmirrored: swap them, or name another"
-            )
-        return turns[int(distance.argmin())].reshape(-1)
-    upright = [_uprightness(places, turn) for turn in turns]
-    return turns[int(np.argmax(upright))].reshape(-1)
-
-
-# From image to dots
-
-
-def _contrast(image: np.ndarray, dark: bool, diameter: float) -> np.ndarray:
-    """By which part each pixel differs from the cloth around it; float32, 0 on the cloth."""
-    cv2 = opencv()
-    grey = np.asarray(image, np.float32) + 1
-    smooth = cv2.GaussianBlur(grey, (0, 0), max(0.8, 0.1 * diameter))
-    kernel = np.ones((2 * round(diameter) + 1,) * 2, np.uint8)
-    # Without the dots: a closing fills the dark ones, an opening takes the bright ones away.
-    operation = cv2.MORPH_CLOSE if dark else cv2.MORPH_OPEN
-    cloth = cv2.blur(cv2.morphologyEx(smooth, operation, kernel), (round(diameter) | 1,) * 2)
-    return (1 - smooth / cloth) if dark else (smooth / cloth - 1)
-
-
-def _strength(contrast: np.ndarray) -> float:
-    """The contrast inside of most dots: the middle of what stands out from the noise."""
-    noise = 1.5 * float(np.median(np.abs(contrast[::4, ::4])))
-    above = contrast[contrast > max(CONTRAST, 6 * noise)]
-    return float(np.median(above)) if len(above) else 0.0
-
-
-def _blobs(contrast: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Widths and heights, areas and middles [px] of what stands out, off the image's edges."""
-    cv2 = opencv()
-    above = (contrast > threshold).astype(np.uint8)
-    _, _, stats, middles = cv2.connectedComponentsWithStats(above, connectivity=8)
-    height, width = contrast.shape
-    left, top, w, h, area = stats[1:].T
-    inside = (left > 0) & (top > 0) & (left + w < width) & (top + h < height) & (area >= 5)
-    boxes = np.stack([w, h], axis=1)[inside].astype(float)
-    return boxes, area[inside].astype(float), middles[1:][inside]
-
-
-def _usual_diameter(image: np.ndarray, dark: bool) -> float:
-    """The diameter [px] that most round dots have, whatever their size."""
-    best, most = 0.0, 0
-    for guess in (6.0, 12.0, 24.0, 48.0, 96.0):
-        if 4 * guess > min(image.shape):
-            break
-        contrast = _contrast(image, dark, guess)
-        boxes, areas, _ = _blobs(contrast, 0.5 * max(CONTRAST, _strength(contrast)))
-        if not len(areas):
-            continue
-        fine = (boxes.min(axis=1) >= ROUND * boxes.max(axis=1)) & (areas >= 12)
-        fine &= areas >= 0.6 * np.pi / 4 * boxes.prod(axis=1)
-        sizes = np.sqrt(4 / np.pi * areas[fine])
-        sizes = sizes[(sizes > 0.5 * guess) & (sizes < 2.2 * guess)]
-        if not len(sizes):
-            continue
-        alike = np.abs(np.log(sizes[:, None] / sizes)) < 0.25
-        count = int(alike.sum(axis=1).max())
-        if count > 1.05 * most:  # of guesses that find as many, the smallest
-            best, most = float(np.median(sizes[alike[alike.sum(axis=1).argmax()]])), count
-    if most == 0:
-        raise ValueError("no round dots in the image: are they darker than the cloth, and in focus")
-    return best
-
-
-def _centres(contrast: np.ndarray, near: np.ndarray, diameter: float) -> np.ndarray:
-    """Centres of the dots' contrast, in round windows that move until the dot is in the middle."""
-    radius = 0.75 * diameter + 1
-    reach = int(np.ceil(radius)) + 1
-    steps = np.arange(-reach, reach + 1)
-    padded = np.pad(contrast, reach + 1)
-    centres = near.copy()
-    for _ in range(4):
-        middle = np.rint(centres).astype(int)
-        x = middle[:, 0, None, None] + steps[None, None, :]
-        y = middle[:, 1, None, None] + steps[None, :, None]
-        x_there = np.clip(x + reach + 1, 0, padded.shape[1] - 1)
-        y_there = np.clip(y + reach + 1, 0, padded.shape[0] - 1)
-        away = np.hypot(x - centres[:, 0, None, None], y - centres[:, 1, None, None])
-        edge = np.clip(radius - away + 0.5, 0, 1)  # soft: else the sums jump from pixel to pixel
-        weight = np.maximum(padded[y_there, x_there], 0) * edge
-        total = np.maximum(weight.sum(axis=(1, 2)), 1e-12)
-        moved = [(weight * axis).sum(axis=(1, 2)) / total for axis in (x, y)]
-        centres = np.stack(moved, axis=1)
-    return centres
+    grid = _unmirrored(places, _circles_grid(places, shape))
+    _check_whole(places, grid)
+    turns = [turn for k in range(4) if (turn := np.rot90(grid, k)).shape == shape]
+    if origin is None:
+        return max(turns, key=lambda turn: _uprightness(places, turn)).reshape(-1)
+    ends = grid[[0, 0, -1, -1], [0, -1, 0, -1]]
+    nearest = ends[np.linalg.norm(places[ends] - np.array(origin), axis=1).argmin()]
+    for turn in turns:
+        if turn[0, 0] == nearest:
+            return turn.reshape(-1)
+    raise ValueError(
+        f"from the corner at {tuple(np.round(places[nearest]).tolist())} px the grid has not "
+        f"{rows} rows and {columns} columns, seen unmirrored: swap them, or name another"
+    )
 
 
 # From dots to a grid
 
 
-def _grow(places: np.ndarray) -> dict[int, tuple[int, int]]:
-    """The cell (row, column) of each dot of the largest grid that grows from one of the dots.
+def _circles_grid(places: Places, shape: tuple[int, int]) -> Integer[np.ndarray, "row column"]:
+    """The dots of a grid as OpenCV finds it, from any of its corners, mirrored or not."""
+    cv2 = require("cv2", "camera", "markers")
+    dots = np.asarray(places, np.float32)[:, None]
+    if min(shape) < 2:
+        raise ValueError(f"a grid has two rows and columns or more, found the shape {shape}")
+    is_there, found = False, np.zeros(0)
+    if len(places) >= shape[0] * shape[1]:
+        flags = cv2.CALIB_CB_SYMMETRIC_GRID
+        finder = cv2.CirclesGridFinderParameters()
+        is_there, found = cv2.findCirclesGrid(dots, shape[::-1], flags, None, finder)
+    if not is_there:
+        raise ValueError(
+            f"expected a grid of {shape[0]} x {shape[1]} markers, found {len(places)} dots that "
+            "make none: start at a frame that shows all, in focus, with none covered"
+        )
+    return np.asarray(KDTree(places).query(found.reshape(-1, 2))[1]).reshape(shape)
 
-    Each step goes by the local spacing, so that turns, perspective and a stretch do no harm.
-    """
-    if len(places) < 4:
-        raise ValueError(f"a grid needs at least four dots, found {len(places)}")
+
+def _unmirrored(places: Places, grid: np.ndarray) -> np.ndarray:
+    """The grid with its columns reversed if they are not to its rows as right is to down."""
+    along, down = places[grid[0, -1]] - places[grid[0, 0]], places[grid[-1, 0]] - places[grid[0, 0]]
+    return grid if along[0] * down[1] > along[1] * down[0] else grid[:, ::-1]
+
+
+def _check_whole(places: Places, grid: np.ndarray) -> None:
+    """Refuse a grid beside which another full row or column of dots lies."""
     tree = KDTree(places)
-    best: dict[int, tuple[int, int]] = {}
-    # From the middle outward: a seed in the grid finds all of it, a speck finds next to nothing.
-    order = np.argsort(np.linalg.norm(places - np.median(places, axis=0), axis=1))
-    for seed in order[:12]:
-        cells = _grow_from(places, tree, int(seed))
-        best = cells if len(cells) > len(best) else best
-        if 2 * len(best) > len(places):
-            break
-    return best
-
-
-def _grow_from(places: np.ndarray, tree: Any, seed: int) -> dict[int, tuple[int, int]]:
-    axes = _seed_axes(places, tree, seed)
-    if axes is None:
-        return {seed: (0, 0)}
-    cells, taken = {seed: (0, 0)}, {(0, 0): seed}
-    steps = {seed: axes}  # each dot's own vectors to the next column and to the next row
-    queue = [seed]
-    while queue:
-        here = queue.pop(0)
-        for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
-            vector = steps[here][axis] * sign
-            row, column = cells[here]
-            cell = (row + sign, column) if axis == 1 else (row, column + sign)
-            if cell in taken:
-                continue
-            distance, there = tree.query(places[here] + vector)
-            if there in cells or distance > 0.3 * np.linalg.norm(vector):
-                continue
-            met = sign * (places[there] - places[here])
-            own = steps[here].copy()
-            own[axis] = met
-            cells[int(there)], taken[cell], steps[int(there)] = cell, int(there), own
-            queue.append(int(there))
-    return cells
-
-
-def _seed_axes(places: np.ndarray, tree: Any, seed: int) -> np.ndarray | None:
-    """Vectors [px] from a dot to the next column and to the next row, or None."""
-    count = min(9, len(places))
-    _, near = tree.query(places[seed], count)
-    vectors = places[near[1:]] - places[seed]
-    first = vectors[0]
-    for second in vectors[1:]:
-        lengths = np.linalg.norm(first), np.linalg.norm(second)
-        sine = np.cross(np.append(first, 0), np.append(second, 0))[2] / (lengths[0] * lengths[1])
-        if abs(sine) > 0.7 and lengths[1] < 2.2 * lengths[0]:
-            # never mirrored: rows are to columns as down is to right
-            return np.array([first, second] if sine > 0 else [second, first])
-    return None
-
-
-def _window(cells: dict[int, tuple[int, int]], shape: tuple[int, int]) -> np.ndarray | None:
-    """The dots of the one full block of `shape`, or of its transpose, among the cells."""
-    low = np.min(list(cells.values()), axis=0)
-    size = np.max(list(cells.values()), axis=0) - low + 1
-    table = np.full(size, -1)
-    for dot, cell in cells.items():
-        table[tuple(np.array(cell) - low)] = dot
-    for rows, columns in dict.fromkeys([shape, shape[::-1]]):
-        full = [
-            block
-            for i in range(size[0] - rows + 1)
-            for j in range(size[1] - columns + 1)
-            if ((block := table[i : i + rows, j : j + columns]) >= 0).all()
-        ]
-        if len(full) > 1:
+    for side in (grid, grid[::-1], grid.T, grid.T[::-1]):
+        step = places[side[0]] - places[side[1]]
+        distance = tree.query(places[side[0]] + step)[0]
+        if (distance < 0.3 * np.linalg.norm(step, axis=1)).all():
             raise ValueError(
-                f"more than one grid of {rows} x {columns} fits the {size[0]} x {size[1]} dots "
-                "that are seen: give the shape of the whole grid, or cut the image"
+                f"more than one grid of {grid.shape[0]} x {grid.shape[1]} fits the dots that are "
+                "seen: give the shape of the whole grid, or cut the image"
             )
-        if full:
-            return full[0]
-    return None
 
 
 def _uprightness(places: np.ndarray, grid: np.ndarray) -> float:
@@ -325,7 +218,7 @@ class _State:
 
     places: np.ndarray
     velocities: np.ndarray
-    areas: np.ndarray  # [px^2], in the first frame
+    sizes: np.ndarray  # [px], in the first frame
     seen: np.ndarray
     basis: np.ndarray  # smooth functions on the grid, (marker, function)
     spacing: float  # [px]
@@ -336,12 +229,22 @@ class _State:
 def _begin(image: np.ndarray, shape: tuple[int, int], dark: bool, origin: Any) -> _State:
     dots = detect(image, dark)
     grid = find_grid(dots.centres, shape, origin)
-    places, areas = dots.centres[grid], dots.areas[grid]
-    spacing = float(np.median(KDTree(places).query(places, 2)[0][:, 1]))
-    diameter = float(np.sqrt(4 / np.pi * np.median(areas)))
-    seen = np.ones(len(grid), bool)
-    still = np.zeros_like(places)
-    return _State(places, still, areas, seen, _smooth(shape), spacing, diameter, dark)
+    places, sizes = dots.centres[grid], dots.sizes[grid]
+    return _State(
+        places=places,
+        velocities=np.zeros_like(places),
+        sizes=sizes,
+        seen=np.ones(len(grid), bool),
+        basis=_smooth(shape),
+        spacing=_spacing(places),
+        diameter=float(np.median(sizes)),
+        dark=dark,
+    )
+
+
+def _spacing(places: Places) -> float:
+    """The median distance [px] of a marker from the next."""
+    return float(np.median(KDTree(places).query(places, 2)[0][:, 1]))
 
 
 def _follow(state: _State, image: np.ndarray) -> _State:
@@ -360,11 +263,8 @@ def _follow(state: _State, image: np.ndarray) -> _State:
         )
     hidden = _carried(state, dots, match, ahead)
     places = np.where(seen[:, None], dots.centres[match], hidden)
-    spacing = float(np.median(KDTree(places).query(places, 2)[0][:, 1]))
     velocities = np.where(state.seen[:, None], places - state.places, 0.0)
-    return _State(
-        places, velocities, state.areas, seen, state.basis, spacing, state.diameter, state.dark
-    )
+    return replace(state, places=places, velocities=velocities, seen=seen, spacing=_spacing(places))
 
 
 def _assign(ahead: np.ndarray, dots: Dots, state: _State, wanted: np.ndarray) -> np.ndarray:
@@ -374,9 +274,9 @@ def _assign(ahead: np.ndarray, dots: Dots, state: _State, wanted: np.ndarray) ->
     mutual = back[nearest] == np.arange(len(ahead))
     near = wanted & mutual & (distance < GATE * state.spacing)
     # A dot that is half covered is smaller than the stretch makes the others, and its centre off.
-    ratio = dots.areas[nearest] / state.areas
+    ratio = dots.sizes[nearest] / state.sizes
     common = np.median(ratio[near]) if near.any() else 1.0
-    kept = near & (np.abs(np.log(ratio / common)) < np.log(AREA_CHANGE))
+    kept = near & (np.abs(np.log(ratio / common)) < np.log(SIZE_CHANGE))
     return np.where(kept, nearest, -1)
 
 
@@ -403,12 +303,13 @@ def _motion(state: _State, dots: Dots, match: np.ndarray) -> np.ndarray | None:
 
 
 def _carried(state: _State, dots: Dots, match: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+    """Places [px] to which the motion of the matched dots carries all markers; else `ahead`."""
     motion = _motion(state, dots, match)
     return ahead if motion is None else state.places + motion
 
 
 def _credible(state: _State, dots: Dots, match: np.ndarray) -> np.ndarray:
-    """Which matches move nearly as the others do."""
+    """Whether each match moves nearly as the others do."""
     motion = _motion(state, dots, match)
     if motion is None:
         return match >= 0

@@ -7,7 +7,7 @@ Places in an image are (x, y), x to the right and y down, [px]. Needs OpenCV: pi
 import numpy as np
 from jaxtyping import Float
 
-from r2s.extras import opencv
+from r2s.extras import require
 
 
 def plane_homography(
@@ -21,15 +21,15 @@ def plane_homography(
     four, when three of four lie on a line, or when it misses a point by more than `tolerance` [m]:
     then two are swapped, one is misread, or the lens bends (see `undistort`).
     """
-    cv2 = opencv()
+    cv2 = require("cv2", "camera", "the plane of the table")
     if len(pixels) < 4 or len(pixels) != len(metres):
         found = f"found {len(pixels)} in the image and {len(metres)} on the table"
         raise ValueError(f"a plane needs at least four points, known in both: {found}")
     for name, points in (("image", pixels), ("table", metres)):
         if not np.isfinite(points).all():
             raise ValueError(f"the points in the {name} must be finite")
-        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-        if spread[1] < 1e-3 * spread[0]:
+        extent = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        if extent[1] < 1e-3 * extent[0]:
             raise ValueError(f"the points in the {name} lie on a line: spread them over the table")
     found, _ = cv2.findHomography(np.asarray(pixels, float), np.asarray(metres, float), 0)
     if found is None or not np.isfinite(found).all():
@@ -51,7 +51,7 @@ def checkerboard(
     `shape`: inner corners along the two sides, the first side being the x axis of the table;
     `square` [m]: side of a field. Raises ValueError when it is not seen.
     """
-    cv2 = opencv()
+    cv2 = require("cv2", "camera", "the plane of the table")
     found, corners = cv2.findChessboardCornersSB(image, shape, None, cv2.CALIB_CB_ACCURACY)
     if not found:
         raise ValueError(
@@ -81,6 +81,6 @@ def undistort(
     distortion: Float[np.ndarray, " coefficient"],
 ) -> Float[np.ndarray, "*_ 2"]:
     """Places [px] as a lens without distortion would show them, by OpenCV's camera model."""
-    cv2 = opencv()
+    cv2 = require("cv2", "camera", "the plane of the table")
     flat = np.ascontiguousarray(pixels.reshape(-1, 1, 2), float)
     return cv2.undistortPoints(flat, matrix, distortion, P=matrix).reshape(pixels.shape)

@@ -1,13 +1,13 @@
 """Grey frames of a video file or of a folder of images. Needs OpenCV: pip install 'r2s[camera]'."""
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 
-from r2s.extras import opencv
+from r2s.extras import require
+from r2s.recordings.readers.numbered import find_numbered
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
@@ -15,12 +15,11 @@ IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 def read_grey(path: Path | str) -> Iterator[UInt8[np.ndarray, "height width"]]:
     """The frames of a video, one after the other, as grey images.
 
-    `path`: a video file, or a folder of images, which come in the order of the last number in
-    their names.
+    `path`: a video file, or a folder of images of one format, numbered as for `find_numbered`.
 
     Raises FileNotFoundError, ImportError (names the extra), or a ValueError that names the file
-    and the frame: no video, no images, one that is damaged, of another size than the first, two of
-    one number, a number that is missing, a video that ends early.
+    and the frame: no video, no images, one that is damaged or of another size than the first, a
+    video that ends early; and as `find_numbered`.
     """
     path = Path(path)
     frames = _images(path) if path.is_dir() else _video(path)
@@ -36,8 +35,8 @@ def read_grey(path: Path | str) -> Iterator[UInt8[np.ndarray, "height width"]]:
 
 
 def _images(folder: Path) -> Iterator[tuple[Path, np.ndarray]]:
-    cv2 = opencv()
-    for file in _numbered(folder):
+    cv2 = require("cv2", "camera", "videos and images")
+    for file in find_numbered(folder, IMAGES).values():
         data = file.read_bytes()
         # libpng hands out the rows that it has: a cut file must be told by its missing end
         cut = file.suffix.lower() == ".png" and b"IEND" not in data[-16:]
@@ -48,33 +47,10 @@ def _images(folder: Path) -> Iterator[tuple[Path, np.ndarray]]:
         yield file, np.asarray(image, np.uint8)
 
 
-def _numbered(folder: Path) -> list[Path]:
-    found: dict[int, Path] = {}
-    for file in sorted(folder.iterdir()):
-        digits = re.findall(r"[0-9]+", file.stem)
-        if file.name.startswith(".") or file.suffix.lower() not in IMAGES or not digits:
-            continue
-        number = int(digits[-1])
-        if number in found:
-            raise ValueError(
-                f"{folder}: frame {number} is there twice: {found[number].name} and {file.name}"
-            )
-        found[number] = file
-    if not found:
-        raise FileNotFoundError(f"{folder}: no numbered images such as 000.png")
-    for number in range(min(found), max(found)):
-        if number not in found:
-            raise ValueError(
-                f"{folder}: frame {number} is missing, of {min(found)} to {max(found)}: times are "
-                "counted by frames, so restore it, or split the recording there"
-            )
-    return [found[number] for number in sorted(found)]
-
-
 def _video(path: Path) -> Iterator[tuple[Path, np.ndarray]]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such video file or folder of images")
-    cv2 = opencv()
+    cv2 = require("cv2", "camera", "videos and images")
     capture = cv2.VideoCapture(str(path))
     try:
         if not capture.isOpened():

@@ -1,39 +1,41 @@
-"""Charts of a study: mean ranks, shares of the variance, distances of every column. Each one PNG.
+"""Charts of a study, each one PNG: mean ranks, shares of the variance, distances.
 
 Needs matplotlib: pip install 'r2s[study]'. Each function returns `path`, and raises OSError that
 names it when it cannot be written.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from r2s.evaluation.statistics import LEVEL, SIGNIFICANCE
 from r2s.study.report.figures import (
     BLUE,
+    GREEN,
     GREY,
-    LABEL_COLOURS,
     ORANGE,
     SKY,
     VERMILION,
     Figure,
+    colour_of,
     save,
 )
-from r2s.study.statistics.distances import Means
+from r2s.study.statistics.distances import means
 from r2s.study.statistics.factors import REST, Shares
-from r2s.study.statistics.panel import LEVEL, Column
-from r2s.study.statistics.ranks import SIGNIFICANCE, Ranks
+from r2s.study.statistics.ranks import Ranks
+from r2s.study.statistics.result_array import ResultArray
 
-MOTION_COLOURS = (BLUE, ORANGE, "#009E73")
+SHARE_COLOURS = (BLUE, ORANGE, GREEN, GREY, SKY, VERMILION)
 
 
 def rank_chart(path: Path | str, ranks: Mapping[str, Ranks]) -> Path:
-    """Mean ranks with intervals, a panel each, the best at the top.
+    """Mean ranks with intervals, a results each, the best at the top.
 
     The bar below is as long as two mean ranks must be apart to be told from each other.
     """
-    count = max(len(each.columns) for each in ranks.values())
+    count = max(len(each.configurations) for each in ranks.values())
     across = min(2, len(ranks))
     down = -(-len(ranks) // across)
     size = (5.6 * across, 0.4 + (1.5 + 0.3 * count) * down)
@@ -46,7 +48,7 @@ def rank_chart(path: Path | str, ranks: Mapping[str, Ranks]) -> Path:
         places = np.arange(len(order))
         axes.hlines(places, each.low[order], each.high[order], color=BLUE, linewidth=5, alpha=0.35)
         axes.plot(each.mean[order], places, "o", color=BLUE, markersize=6)
-        axes.set_yticks(places, [each.columns[i].label for i in order], fontsize=8.5)
+        axes.set_yticks(places, [each.configurations[i].label for i in order], fontsize=8.5)
         axes.set(xlabel="mean rank (1 is best)", xlim=(0.7, len(order) + 0.3))
         axes.set_title(f"{title}: {each.trajectories} trajectories", fontsize=11)
         start, below = 1.0, len(order) - 0.1
@@ -55,22 +57,21 @@ def rank_chart(path: Path | str, ranks: Mapping[str, Ranks]) -> Path:
         axes.text(start, below + 0.2, text, fontsize=7.5, color=VERMILION, va="top")
         axes.set_ylim(len(order) + 0.6, -0.6)
         axes.grid(axis="x", alpha=0.3)
-    figure.suptitle(f"Ranks of the columns, with {LEVEL:.0%} intervals", fontsize=12)
+    figure.suptitle(f"Ranks of the configurations, with {LEVEL:.0%} intervals", fontsize=12)
     return save(figure, path)
 
 
 def share_chart(path: Path | str, shares: Mapping[str, Shares]) -> Path:
-    """Shares of the variance of the log distance, grouped by factor, with intervals."""
+    """Draw shares of the variance of the log distance, grouped by factor, with intervals."""
     factors = list(dict.fromkeys(name for each in shares.values() for name in each.factors))
     factors.sort(key=lambda name: name == REST)  # last
     figure = Figure(figsize=(max(6.5, 1.3 * len(factors) + 1.5), 4.2), layout="constrained")
     axes = figure.add_subplot()
     width = 0.84 / max(1, len(shares))
-    colours = (*MOTION_COLOURS, GREY, SKY, VERMILION)
     for i, (title, each) in enumerate(shares.items()):
         where = np.array([factors.index(name) for name in each.factors], float)
         where += (i - (len(shares) - 1) / 2) * width
-        axes.bar(where, 100 * each.share, 0.92 * width, label=title, color=colours[i % 6])
+        axes.bar(where, 100 * each.share, 0.92 * width, label=title, color=SHARE_COLOURS[i % 6])
         ends: dict[str, Any] = {"color": "black", "linewidth": 1.0}
         axes.vlines(where, 100 * each.low, 100 * each.high, **ends)
     axes.set_xticks(range(len(factors)), factors)
@@ -84,34 +85,33 @@ def share_chart(path: Path | str, shares: Mapping[str, Shares]) -> Path:
     return save(figure, path)
 
 
-def distance_chart(
-    path: Path | str, found: Mapping[str, tuple[Sequence[Column], Means]], title: str
-) -> Path:
-    """Mean distances [m], shown in mm, of all columns: a panel a motion, on one scale."""
-    columns = list(dict.fromkeys(c for columns, _ in found.values() for c in columns))
-    size = (2.6 + 2.9 * len(found), 1.6 + 0.34 * len(columns))
+def distance_chart(path: Path | str, parts: Mapping[str, ResultArray], title: str) -> Path:
+    """Draw the mean distances of all configurations, a panel for each motion, on one scale."""
+    found = {motion: means(part) for motion, part in parts.items()}
+    order = list(dict.fromkeys(c for part in parts.values() for c in part.configurations))
+    size = (2.6 + 2.9 * len(found), 1.6 + 0.34 * len(order))
     figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
-    finite = [1e3 * each.high[np.isfinite(each.high)] for _, each in found.values()]
+    finite = [1e3 * each.high[np.isfinite(each.high)] for each in found.values()]
     right = 1.12 * max((float(values.max()) for values in finite if len(values)), default=1.0)
-    for axes, (motion, (there, each)) in zip(panels, found.items(), strict=True):
-        for i, column in enumerate(there):
-            place, colour = columns.index(column), LABEL_COLOURS[columns.index(column) % 12]
+    for axes, (motion, each) in zip(panels, found.items(), strict=True):
+        for i, configuration in enumerate(parts[motion].configurations):
+            place = order.index(configuration)
             if not np.isfinite(each.mean[i]):
                 axes.text(0.02 * right, place, "diverged", fontsize=8, va="center", color=VERMILION)
                 continue
             low, mean, high = 1e3 * each.low[i], 1e3 * each.mean[i], 1e3 * each.high[i]
-            axes.hlines(place, low, high, color=colour, linewidth=5, alpha=0.4)
-            axes.plot(mean, place, "o", color=colour, markersize=6)
+            axes.hlines(place, low, high, color=colour_of(place), linewidth=5, alpha=0.4)
+            axes.plot(mean, place, "o", color=colour_of(place), markersize=6)
             if each.diverged[i]:
                 text = f"{each.diverged[i]}/{each.runs[i]} diverged"
                 side: dict[str, Any] = {"ha": "left", "x": high + 0.015 * right}
                 if high > 0.65 * right:
                     side = {"ha": "right", "x": low - 0.015 * right}
                 axes.text(y=place, s=text, fontsize=7, va="center", color=VERMILION, **side)
-        axes.set(xlabel="distance [mm]", xlim=(0, right), ylim=(len(columns) - 0.4, -0.6))
+        axes.set(xlabel="distance [mm]", xlim=(0, right), ylim=(len(order) - 0.4, -0.6))
         axes.set_title(motion, fontsize=11)
         axes.grid(axis="x", alpha=0.3)
-    panels[0].set_yticks(range(len(columns)), [c.label for c in columns], fontsize=8.5)
+    panels[0].set_yticks(range(len(order)), [c.label for c in order], fontsize=8.5)
     figure.suptitle(title, fontsize=12)
     return save(figure, path)

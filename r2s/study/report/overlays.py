@@ -1,29 +1,29 @@
-"""Simulated sheets beside the recording: a picture of all columns, and a video of a recording.
+"""Simulated sheets beside the recording: a picture of all configurations, and a video.
 
 Needs matplotlib: pip install 'r2s[study]'. Videos are MP4 where OpenCV is installed (extra
 camera), else GIF.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
 
+from r2s.study.configuration import MOTIONS
 from r2s.study.report.figures import (
-    LABEL_COLOURS,
     Figure,
     MaxNLocator,
     Poly3DCollection,
+    colour_of,
     inside,
     limits,
     save,
     thin,
     to_rgba,
 )
-from r2s.study.report.scenes import Shown
-from r2s.study.statistics.panel import MOTIONS
+from r2s.study.report.motions import MotionComparison
 from r2s.viewer import video_writer
 
 DOTS = "#404040"
@@ -32,17 +32,15 @@ RECORDING = "recording [m]"
 ACROSS = 5  # panels in a row of a video, at most
 
 
-def overview(path: Path | str, shown: Sequence[Shown]) -> Path:
-    """A row a recording, a column of the study each, and the recording at the right.
+def overview(path: Path | str, comparisons: Sequence[MotionComparison]) -> Path:
+    """Draw a row for each recording: the sheet of every configuration, and the points at the right.
 
-    Recordings come in the order folding, fling, shaking. Of each the frame is shown, in its later
-    half, whose cloud is farthest from the first frame's. Panels of a row share their limits. What
-    flew out of them is left out, and said. Raises ValueError without a recording.
+    Recordings come in the order of `MOTIONS`, each at its `late_frame`. Panels of a row share their
+    limits; what flew out of them is left out, and said. Raises ValueError without a recording.
     """
-    if not shown:
+    if not comparisons:
         raise ValueError("no recording to show")
-    order = {motion: i for i, motion in enumerate(MOTIONS)}
-    rows = sorted(shown, key=lambda each: order.get(each.evaluated_on, len(order)))
+    rows = in_order(comparisons)
     labels = list(dict.fromkeys(label for each in rows for label in each.motions))
     size = (0.9 + 1.7 * (len(labels) + 1), 0.5 + 1.8 * len(rows))  # [inch]
     figure = Figure(figsize=size)
@@ -61,8 +59,7 @@ def overview(path: Path | str, shown: Sequence[Shown]) -> Path:
             if sheet is None:
                 axes.text2D(0.5, 0.5, "not run", ha="center", fontsize=9, transform=axes.transAxes)
                 continue
-            colour = LABEL_COLOURS[labels.index(label) % len(LABEL_COLOURS)]
-            _draw(axes, dots[:400], sheet[frame], each.faces, box, colour)
+            _draw(axes, dots[:400], sheet[frame], each.faces, box, colour_of(labels.index(label)))
         _dress(row[-1], box, is_labelled=True)
         _draw(row[-1], dots, None, each.faces, box, DOTS)
         middle = row[0].get_position()
@@ -78,31 +75,39 @@ def overview(path: Path | str, shown: Sequence[Shown]) -> Path:
     return save(figure, path)
 
 
-def late_frame(shown: Shown) -> int:
+def in_order(comparisons: Iterable[MotionComparison]) -> list[MotionComparison]:
+    """Recordings in the order of `MOTIONS`, others after them."""
+    order = {motion: i for i, motion in enumerate(MOTIONS)}
+    return sorted(comparisons, key=lambda each: order.get(each.evaluated_on, len(order)))
+
+
+def late_frame(comparison: MotionComparison) -> int:
     """The frame of the later half whose points are, on average, farthest from the first cloud.
 
     Clouds with less than half of the points of the largest do not count: cameras saw little then.
     """
-    counts = [len(cloud) for cloud in shown.clouds]
+    counts = [len(cloud) for cloud in comparison.clouds]
     full = [i for i, count in enumerate(counts) if count and 2 * count >= max(counts)]
     later = [i for i in full if i >= len(counts) // 2] or full or [len(counts) - 1]
-    tree = KDTree(shown.clouds[full[0]]) if full else None
-    away = [0.0 if tree is None else float(tree.query(shown.clouds[i])[0].mean()) for i in later]
+    tree = KDTree(comparison.clouds[full[0]]) if full else None
+    away = [
+        0.0 if tree is None else float(tree.query(comparison.clouds[i])[0].mean()) for i in later
+    ]
     return later[int(np.argmax(away))]
 
 
-def video(folder: Path, shown: Shown) -> Path:
-    """All columns of a recording side by side, over its points, in real time; the path."""
-    interval = float(np.median(np.diff(shown.times))) if len(shown.times) > 1 else 1.0
-    stem = shown.recording.replace("/", "_")
-    return video_writer.write_video(folder, stem, pictures(shown), interval)
+def video(folder: Path, comparison: MotionComparison) -> Path:
+    """Write a video of all configurations side by side, over the points, in real time; its path."""
+    interval = float(np.median(np.diff(comparison.times))) if len(comparison.times) > 1 else 1.0
+    stem = comparison.recording.replace("/", "_")
+    return video_writer.write_video(folder, stem, pictures(comparison), interval)
 
 
-def pictures(shown: Shown) -> Iterator[np.ndarray]:
+def pictures(comparison: MotionComparison) -> Iterator[np.ndarray]:
     """Each frame as a picture, (height, width, 3) in 0..255, of even sides."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    labels, box = [*shown.motions, ""], _box(shown)
+    labels, box = [*comparison.motions, ""], _box(comparison)
     across = min(ACROSS, len(labels))
     down = -(-len(labels) // across)
     figure = Figure(figsize=(2.4 * across, 2.5 * down + 0.3), dpi=100)
@@ -115,28 +120,28 @@ def pictures(shown: Shown) -> Iterator[np.ndarray]:
         _dress(axes, box, is_labelled=not label)
         axes.set_title(label or RECORDING, fontsize=9, y=0.97)
     caption = figure.text(0.01, 0.995, "", va="top", fontsize=10)
-    for frame in range(len(shown.times)):
+    for frame in range(len(comparison.times)):
         drawn = []
         for i, (label, axes) in enumerate(zip(labels, panels, strict=False)):
-            sheet = shown.motions[label][frame] if label else None
-            colour = LABEL_COLOURS[i % len(LABEL_COLOURS)]
-            drawn += _draw(axes, thin(shown.clouds[frame])[:600], sheet, shown.faces, box, colour)
-        caption.set_text(f"{shown.recording}, {shown.times[frame]:.2f} s")
+            sheet = comparison.motions[label][frame] if label else None
+            dots = thin(comparison.clouds[frame])[:600]
+            drawn += _draw(axes, dots, sheet, comparison.faces, box, colour_of(i))
+        caption.set_text(f"{comparison.recording}, {comparison.times[frame]:.2f} s")
         canvas.draw()
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
         for artist in drawn:
             artist.remove()
 
 
-def _box(shown: Shown, frame: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+def _box(comparison: MotionComparison, frame: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Limits [m] that hold the recording and sheets that did not fly off; or those of a frame."""
-    dots = [thin(cloud) for cloud in shown.clouds]
-    sheets = [x.reshape(-1, 3) for x in shown.motions.values()]
+    dots = [thin(cloud) for cloud in comparison.clouds]
+    sheets = [x.reshape(-1, 3) for x in comparison.motions.values()]
     every = np.concatenate(dots) if any(map(len, dots)) else np.zeros((1, 3))
     low, high = limits(every, np.concatenate([np.zeros((0, 3)), *sheets]))
     if frame is None:
         return low, high
-    here = np.concatenate([dots[frame], *(x[frame] for x in shown.motions.values())])
+    here = np.concatenate([dots[frame], *(x[frame] for x in comparison.motions.values())])
     here = here[inside(here, low, high)]
     if not len(here):
         return low, high
@@ -167,10 +172,10 @@ def _draw(axes: Any, dots: Any, sheet: Any, faces: Any, box: Any, colour: str) -
     # Three-dimensional axes do not clip: what lies outside would run over the other panels.
     dots = dots[inside(dots, *box)]
     if sheet is not None:
-        shown = faces[inside(sheet, *box)[faces].all(axis=1)]
+        kept = faces[inside(sheet, *box)[faces].all(axis=1)]
         style: dict[str, Any] = {"facecolor": to_rgba(colour, 0.35), "edgecolor": colour}
-        drawn.append(axes.add_collection3d(Poly3DCollection(sheet[shown], linewidth=0.3, **style)))
-        if len(shown) < len(faces):
+        drawn.append(axes.add_collection3d(Poly3DCollection(sheet[kept], linewidth=0.3, **style)))
+        if len(kept) < len(faces):
             text = "diverged" if not np.isfinite(sheet).all() else "part is out of the picture"
             where: dict[str, Any] = {"ha": "center", "transform": axes.transAxes}
             drawn.append(axes.text2D(0.5, 0.02, text, fontsize=8, **where))

@@ -1,14 +1,14 @@
 """One HTML file that holds a whole study: words, tables and pictures, without any link."""
 
 import base64
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
 from r2s.files import write_text
-from r2s.study.statistics import tables
-from r2s.study.statistics.tables import Table
+from r2s.study import tables
+from r2s.study.tables import Table
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -78,15 +78,13 @@ def write_report(
     path: Path | str,
     title: str,
     intro: str,
-    settings: Mapping[str, str],
     sections: Sequence[Section],
 ) -> None:
     """Write a report as one HTML file, which needs no other file and no network.
 
-    `intro`: paragraphs of plain text, apart by empty lines; `settings`: what the study was run
-    with, shown as a table unless empty. All text but `Section.html` is escaped. Raises
-    FileNotFoundError that names a figure that is missing, ValueError that names one that is no
-    PNG, and OSError that names `path`; then nothing is written.
+    `intro`: paragraphs of plain text, apart by empty lines. All text but `Section.html` is escaped.
+    Raises FileNotFoundError that names a figure that is missing, ValueError that names one that is
+    no PNG, and OSError that names `path`; then nothing is written.
     """
     paragraphs = [part for part in intro.split("\n\n") if part.strip()]
     body = "".join(map(_section, sections))
@@ -94,7 +92,7 @@ def write_report(
         f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
-        f"<h1>{escape(title)}</h1>\n{_paragraphs(paragraphs)}{_settings(settings)}{body}"
+        f"<h1>{escape(title)}</h1>\n{_paragraphs(paragraphs)}{body}"
         f"<script>{SCRIPT}</script>\n</body>\n</html>\n"
     )
     write_text(path, text)
@@ -110,16 +108,6 @@ def _section(section: Section) -> str:
 
 def _paragraphs(paragraphs: Iterable[str]) -> str:
     return "".join(f"<p>{escape(text.strip())}</p>\n" for text in paragraphs)
-
-
-def _settings(settings: Mapping[str, str]) -> str:
-    if not settings:
-        return ""
-    lines = "".join(
-        f'<tr><th scope="row">{escape(name)}</th><td>{escape(value)}</td></tr>\n'
-        for name, value in settings.items()
-    )
-    return f'<div class="wide">\n<table>\n<caption>Settings</caption>\n{lines}</table>\n</div>\n'
 
 
 def _figure(path: Path, caption: str) -> str:

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from r2s.study.report.figures import LABEL_COLOURS
+from r2s.study.report.figures import colour_of
+from r2s.study.report.motions import MotionComparison
 from r2s.study.report.player_script import SCRIPT, STYLE
-from r2s.study.report.scenes import Shown
 
 STEP = 1e-4  # [m], to which positions are rounded
 LARGEST = 32767  # steps from the middle
@@ -23,26 +23,28 @@ BUDGET = 950_000  # characters of positions for each recording
 FEWEST_POINTS, MOST_POINTS = 150, 800  # of a cloud, in a frame
 
 
-def viewer(shown: Sequence[Shown], name: str = "viewer") -> str:
-    """The fragment, for `Section.html`; `name` is its id, another one for each in a page.
+def viewer(comparisons: Sequence[MotionComparison], name: str = "viewer") -> str:
+    """The fragment, for `Section.html`; the text is empty without anything to show.
+
+    - `name`: the id of its element, another one for each viewer of a page.
 
     Of long or fine recordings every second frame is kept, or fewer, and of clouds as many points as
-    there is room for. Without anything to show, an empty text.
+    there is room for.
     """
-    if not shown:
+    if not comparisons:
         return ""
-    labels = list(dict.fromkeys(label for each in shown for label in each.motions))
+    labels = list(dict.fromkeys(label for each in comparisons for label in each.motions))
     content = {
         "step": STEP,
         "absent": ABSENT,
         "labels": labels,
-        "colours": [LABEL_COLOURS[i % len(LABEL_COLOURS)] for i in range(len(labels))],
-        "recordings": [_packed(each) for each in shown],
+        "colours": [colour_of(i) for i in range(len(labels))],
+        "recordings": [_packed(each) for each in comparisons],
     }
     # "<" would end the element that holds it.
     text = json.dumps(content, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     choices = "".join(
-        f'<option value="{i}">{escape(_title(each))}</option>' for i, each in enumerate(shown)
+        f'<option value="{i}">{escape(_title(each))}</option>' for i, each in enumerate(comparisons)
     )
     return (
         f'<style>{STYLE}</style>\n<div class="viewer" id="{escape(name)}">\n'
@@ -59,32 +61,34 @@ def viewer(shown: Sequence[Shown], name: str = "viewer") -> str:
     )
 
 
-def _title(shown: Shown) -> str:
-    return f"{shown.evaluated_on}, {shown.fabric.replace('_', ' ')} ({shown.recording})"
+def _title(comparison: MotionComparison) -> str:
+    return (
+        f"{comparison.evaluated_on}, {comparison.fabric.replace('_', ' ')} ({comparison.recording})"
+    )
 
 
-def _packed(shown: Shown) -> dict[str, Any]:
-    frames, points = _kept(shown)
+def _packed(comparison: MotionComparison) -> dict[str, Any]:
+    frames, points = _kept(comparison)
     generator = np.random.default_rng(0)
-    clouds = [generator.permutation(_finite(shown.clouds[i]))[:points] for i in frames]
-    middle, radius = _around(clouds, [x[frames] for x in shown.motions.values()])
+    clouds = [generator.permutation(_finite(comparison.clouds[i]))[:points] for i in frames]
+    middle, radius = _around(clouds, [x[frames] for x in comparison.motions.values()])
     return {
-        "recording": shown.recording,
-        "times": [round(float(shown.times[i]), 4) for i in frames],
+        "recording": comparison.recording,
+        "times": [round(float(comparison.times[i]), 4) for i in frames],
         "middle": [round(float(value), 4) for value in middle],
         "radius": round(float(radius), 4),
         "counts": [len(cloud) for cloud in clouds],
         "points": _encoded(np.concatenate(clouds), middle),
-        "faces": _base64(np.asarray(shown.faces, "<u2")),
-        "sheets": {label: _encoded(x[frames], middle) for label, x in shown.motions.items()},
+        "faces": _base64(np.asarray(comparison.faces, "<u2")),
+        "sheets": {label: _encoded(x[frames], middle) for label, x in comparison.motions.items()},
     }
 
 
-def _kept(shown: Shown) -> tuple[np.ndarray, int]:
+def _kept(comparison: MotionComparison) -> tuple[np.ndarray, int]:
     """Which frames, and how many points of each, fit into the budget."""
-    vertices = sum(x.shape[1] for x in shown.motions.values())
-    for stride in range(1, len(shown.times) + 1):
-        frames = np.arange(0, len(shown.times), stride)
+    vertices = sum(x.shape[1] for x in comparison.motions.values())
+    for stride in range(1, len(comparison.times) + 1):
+        frames = np.arange(0, len(comparison.times), stride)
         room = BUDGET / 8 / len(frames) - vertices  # 3 numbers of 2 bytes are 8 characters
         if room >= FEWEST_POINTS:
             return frames, int(min(room, MOST_POINTS))

@@ -1,4 +1,4 @@
-"""Tables of our distances, in millimetres: a line a column, a cell a motion, with intervals."""
+"""Mean distances with intervals, and their tables: a line a configuration, a cell a motion."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -7,18 +7,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Integer
 
-from r2s.study.statistics.panel import (
-    APPROACHES,
-    LEVEL,
-    Panel,
-    by_metric,
+from r2s.evaluation.statistics import LEVEL, interval
+from r2s.study.configuration import APPROACHES
+from r2s.study.rows import Row, by_metric
+from r2s.study.statistics.result_array import (
+    ResultArray,
     by_motion,
-    interval,
-    make_panel,
-    over_repeats,
+    mean_over_repeats,
     resamples,
+    result_array,
+    safe_ratio,
 )
-from r2s.study.statistics.tables import MISSING, Row, Table, significant
+from r2s.study.tables import MISSING, Table, significant
 
 METRICS = (
     "chamfer_real_to_sim",
@@ -30,71 +30,78 @@ METRICS = (
     "chamfer_cropped",
     "hausdorff_cropped",
 )
-OWN = "own"  # what a column was estimated from
+OWN = "own"  # what a configuration was estimated from
 
 
 class Means(NamedTuple):
     """Means [unit] over trajectories and repeats that did not diverge, with their interval."""
 
-    mean: Float[np.ndarray, " column"]
-    low: Float[np.ndarray, " column"]
-    high: Float[np.ndarray, " column"]
-    diverged: Integer[np.ndarray, " column"]
-    runs: Integer[np.ndarray, " column"]
+    mean: Float[np.ndarray, " configuration"]
+    low: Float[np.ndarray, " configuration"]
+    high: Float[np.ndarray, " configuration"]
+    diverged: Integer[np.ndarray, " configuration"]
+    runs: Integer[np.ndarray, " configuration"]
 
 
-def means(panel: Panel) -> Means:
-    """The mean of each column: first over repeats, then over trajectories.
+def means(results: ResultArray) -> Means:
+    """The mean of each configuration: first over repeats, then over trajectories.
 
     Runs that diverged have no distance: they are counted, not averaged.
     """
-    every = _over_trajectories(over_repeats(panel, diverged=np.nan), np.ones(panel.values.shape[1]))
-    drawn = np.array(
-        [
-            _over_trajectories(over_repeats(panel, weights, np.nan), weights.trajectory)
-            for weights in resamples(panel)
-        ]
-    ).reshape(-1, len(panel.columns))
-    ends = np.array([interval(samples) for samples in drawn.T]).reshape(-1, 2)
-    runs = panel.present.sum(axis=(1, 2))
-    lost = (panel.present & ~np.isfinite(panel.values)).sum(axis=(1, 2))
-    return Means(every, ends[:, 0], ends[:, 1], lost, runs)
+    of_all = mean_over_repeats(results, diverged=np.nan)
+    drawn = [
+        _over_trajectories(mean_over_repeats(results, weights, np.nan), weights.trajectory)
+        for weights in resamples(results)
+    ]
+    samples = np.array(drawn).reshape(-1, len(results.configurations))
+    ends = np.array([interval(each) for each in samples.T]).reshape(-1, 2)
+    return Means(
+        _over_trajectories(of_all, np.ones(of_all.shape[1])),
+        ends[:, 0],
+        ends[:, 1],
+        results.diverged.sum(axis=(1, 2)),
+        results.present.sum(axis=(1, 2)),
+    )
 
 
 def _over_trajectories(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     known = weights * np.isfinite(values)
-    total, count = (known * np.nan_to_num(values)).sum(axis=1), known.sum(axis=1)
-    return np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0)
+    return safe_ratio((known * np.nan_to_num(values)).sum(axis=1), known.sum(axis=1))
+
+
+def distance_tables(rows: Iterable[Row]) -> dict[str, Table]:
+    """The tables of all metrics in metres that there are."""
+    rows_of = by_metric(rows)
+    return {
+        metric: distance_table(rows_of[metric], metric) for metric in METRICS if metric in rows_of
+    }
 
 
 def distance_table(rows: Sequence[Row], metric: str) -> Table:
-    """One metric: a line a column of the study, a cell a motion: mean and interval.
+    """The table of one metric: a line a configuration, a cell a motion with mean and interval.
 
-    Last comes what each was estimated from, "own"; last lines are what to compare with: default
-    fabrics, estimates of another fabric, another trial. Metres are shown in millimetres.
+    The last column, "own", is what each was estimated from. The last lines are what to compare
+    with: default fabrics, estimates of another fabric, another trial. Metres are shown in
+    millimetres.
     """
     rows = _with_references(rows)
-    found = by_motion(make_panel(rows, metric))
-    found[OWN] = make_panel(rows, metric, own=True)
-    shown = {motion: _cells(panel) for motion, panel in found.items() if panel.columns}
-    columns = dict.fromkeys(column for panel in found.values() for column in panel.columns)
-    units = {panel.unit for panel in found.values() if panel.columns}
-    unit = " [mm]" if units == {"m"} else ""
-    lines = tuple(
-        (column.label, *(cells.get(column, MISSING) for cells in shown.values()))
-        for column in columns
-    )
+    found = by_motion(result_array(rows, metric))
+    found[OWN] = result_array(rows, metric, own=True)
+    found = {motion: results for motion, results in found.items() if results.configurations}
+    shown = {motion: _cells(results) for motion, results in found.items()}
+    lines = dict.fromkeys(c for results in found.values() for c in results.configurations)
+    unit = " [mm]" if {results.unit for results in found.values()} == {"m"} else ""
     return Table(
-        ("column", *(motion + unit for motion in shown)),
-        lines,
+        ("configuration", *(motion + unit for motion in shown)),
+        tuple((c.label, *(cells.get(c, MISSING) for cells in shown.values())) for c in lines),
         f"{metric}{unit}: mean over recordings and repeats, {LEVEL:.0%} interval by a bootstrap "
         'over both, and how many runs diverged (not in the mean). "own": the recordings that a '
-        "column was estimated from.",
+        "configuration was estimated from.",
     )
 
 
 def _with_references(rows: Iterable[Row]) -> list[Row]:
-    """Rows in which estimates of another fabric, and of another trial, are columns as well."""
+    """Rows in which estimates of another fabric, and another trial, are configurations as well."""
     rows = list(rows)
     found = []
     for row in rows:
@@ -106,14 +113,14 @@ def _with_references(rows: Iterable[Row]) -> list[Row]:
     return rows + found
 
 
-def _cells(panel: Panel) -> dict[object, str]:
-    found = means(panel)
-    in_mm = panel.unit == "m"
+def _cells(results: ResultArray) -> dict[object, str]:
+    in_mm = results.unit == "m"
     scale = 1e3 if in_mm else 1.0
+    numbers = zip(*(part.tolist() for part in means(results)), strict=True)
     return {
-        column: cell(scale * mean, scale * low, scale * high, diverged, runs, in_mm)
-        for column, mean, low, high, diverged, runs in zip(
-            panel.columns, *(numbers.tolist() for numbers in found), strict=True
+        configuration: cell(scale * mean, scale * low, scale * high, diverged, runs, in_mm)
+        for configuration, (mean, low, high, diverged, runs) in zip(
+            results.configurations, numbers, strict=True
         )
     }
 
@@ -122,16 +129,7 @@ def cell(mean: float, low: float, high: float, diverged: int, runs: int, in_mm: 
     """A mean, its interval where there is one, and how many of the runs diverged."""
     if diverged == runs:
         return "diverged" if runs else MISSING
-    show = (lambda value: f"{value:.1f}") if in_mm else significant
-    text = show(mean)
+    text, *ends = (f"{x:.1f}" if in_mm else significant(x) for x in (mean, low, high))
     if low < high:
-        text += f" [{show(low)}, {show(high)}]"
+        text += f" [{', '.join(ends)}]"
     return text + (f" ({diverged} of {runs} diverged)" if diverged else "")
-
-
-def distance_tables(rows: Iterable[Row]) -> dict[str, Table]:
-    """The tables of all metrics in metres that there are."""
-    rows_of = by_metric(rows)
-    return {
-        metric: distance_table(rows_of[metric], metric) for metric in METRICS if metric in rows_of
-    }

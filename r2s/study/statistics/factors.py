@@ -1,7 +1,8 @@
 """How much of the variance of the logarithm of a distance each factor of the study explains.
 
-Factors: the approach, the solver and the scenario that a column is made of; the fabric; the motion
-that is judged, and in it the trajectory; the rest is interactions and the spread of repeats.
+Factors are the approach, the solver and the scenario that a configuration is made of; the fabric;
+the motion that is judged, and in it the trajectory. The rest is interactions and the spread of
+repeats.
 
 The design is not balanced, and partly confounded: an approach that works from one scenario only
 cannot be told from that scenario. So there is no one share of a factor: what it adds to the
@@ -14,18 +15,19 @@ a share of zero on average, which may come out slightly below.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import permutations
+from itertools import combinations, permutations
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 
-from r2s.study.statistics.panel import LEVEL, Panel, Weights, interval, resamples
-from r2s.study.statistics.tables import MISSING, Table
+from r2s.evaluation.statistics import LEVEL, interval
+from r2s.study.statistics.result_array import ResultArray, Weights, resamples
+from r2s.study.tables import MISSING, Table
 
 NESTED = {"trajectory": ("fabric", "motion")}  # what must enter before it
 REST = "rest"
-ROUNDING = 1e-9  # of singular values: what is dependent on the other columns
+ROUNDING = 1e-9  # of singular values: what is dependent on other columns of the design
 
 
 class Shares(NamedTuple):
@@ -51,52 +53,55 @@ class _Data(NamedTuple):
     y: Float[np.ndarray, " value"]
     levels: dict[str, Integer[np.ndarray, " value"]]  # but for trajectories
     trajectory: Integer[np.ndarray, " value"]  # ascending
-    where: tuple[np.ndarray, ...]  # of the values in the panel
+    where: tuple[np.ndarray, ...]  # of the values in the array of results
 
 
-def variance_shares(panel: Panel, draws: int | None = None, seed: int = 0) -> Shares | None:
-    """The shares for a panel without default fabrics; None where nothing varies."""
-    data = _data(panel)
+def variance_shares(results: ResultArray, draws: int | None = None, seed: int = 0) -> Shares | None:
+    """The shares of the variance without default fabrics; None where nothing varies.
+
+    `draws`: of the bootstrap, see `resamples`.
+    """
+    data = _data(results)
     if len(data.y) < 3 or np.ptp(data.y) == 0:
         return None
     names = tuple(name for name, level in data.levels.items() if level.max() > 0)
-    nested = len(np.unique(data.trajectory)) > len(_cells(data, ("fabric", "motion")))
-    factors = (*names, *(("trajectory",) if nested else ()))
+    cells = set(zip(data.levels["fabric"].tolist(), data.levels["motion"].tolist(), strict=True))
+    is_nested = len(np.unique(data.trajectory)) > len(cells)
+    factors = (*names, "trajectory") if is_nested else names
     if not factors:
         return None
-    found = _shares(data, factors, np.ones(len(data.y)))
-    drawn = [_shares(data, factors, w) for w in _weights(data, resamples(panel, draws, seed))]
+    drawn = [_shares(data, factors, w) for w in _weights(data, resamples(results, draws, seed))]
     ends = np.array([interval(samples) for samples in np.array(drawn).T])
-    lost = int((panel.present & ~np.isfinite(panel.values)).sum())
     return Shares(
-        (*factors, REST),
-        found,
-        ends[:, 0],
-        ends[:, 1],
-        float(data.y.std()),
-        _confounded(data, names),
-        len(data.y),
-        lost,
+        factors=(*factors, REST),
+        share=_shares(data, factors, np.ones(len(data.y))),
+        low=ends[:, 0],
+        high=ends[:, 1],
+        deviation=float(data.y.std()),
+        confounded=_confounded(data, names),
+        count=len(data.y),
+        diverged=int(results.diverged.sum()),
     )
 
 
-def _data(panel: Panel) -> _Data:
-    """One entry a finite distance, those of a trajectory side by side."""
-    estimates = np.array([bool(column.approach) for column in panel.columns], bool)
-    known = np.isfinite(panel.values) & (np.nan_to_num(panel.values) > 0)
-    trajectory, column, repeat = np.nonzero((known & estimates[:, None, None]).transpose(1, 0, 2))
-    columns = [panel.columns[i] for i in column]
-    places = [panel.trajectories[i] for i in trajectory]
+def _data(results: ResultArray) -> _Data:
+    """One entry for each finite distance, those of a trajectory side by side."""
+    estimates = np.array([bool(c.approach) for c in results.configurations], bool)
+    known = np.isfinite(results.values) & (np.nan_to_num(results.values) > 0)
+    known &= estimates[:, None, None]
+    trajectory, configuration, repeat = np.nonzero(known.transpose(1, 0, 2))
+    configurations = [results.configurations[i] for i in configuration]
+    places = [results.trajectories[i] for i in trajectory]
     named = {
-        "approach": [c.approach for c in columns],
-        "solver": [c.solver for c in columns],
-        "scenario": [c.estimated_from for c in columns],
+        "approach": [c.approach for c in configurations],
+        "solver": [c.solver for c in configurations],
+        "scenario": [c.estimated_from for c in configurations],
         "fabric": [t.fabric for t in places],
         "motion": [t.evaluated_on for t in places],
     }
     levels = {name: np.unique(texts, return_inverse=True)[1] for name, texts in named.items()}
-    where = column, trajectory, repeat
-    return _Data(np.log(panel.values[where]), levels, trajectory, where)
+    where = configuration, trajectory, repeat
+    return _Data(np.log(results.values[where]), levels, trajectory, where)
 
 
 def _weights(data: _Data, drawn: Iterator[Weights]) -> Iterator[np.ndarray]:
@@ -122,13 +127,15 @@ def _shares(data: _Data, factors: tuple[str, ...], weights: np.ndarray) -> np.nd
 
 
 def _orders(factors: tuple[str, ...]) -> list[tuple[str, ...]]:
-    allowed = lambda order: all(
-        order.index(outer) < order.index(inner)
-        for inner, outers in NESTED.items()
-        for outer in outers
-        if inner in order and outer in order
-    )
-    return [order for order in permutations(factors) if allowed(order)]
+    def is_allowed(order: tuple[str, ...]) -> bool:
+        return all(
+            order.index(outer) < order.index(inner)
+            for inner, outers in NESTED.items()
+            for outer in outers
+            if inner in order and outer in order
+        )
+
+    return list(filter(is_allowed, permutations(factors)))
 
 
 class _Design:
@@ -183,42 +190,35 @@ class _Design:
         return 1 - left * self.count / free / total if total > 0 else 0.0
 
 
-def _cells(data: _Data, names: Sequence[str]) -> set[tuple[int, ...]]:
-    return set(zip(*(data.levels[name].tolist() for name in names), strict=True))
-
-
 def _confounded(data: _Data, names: Sequence[str]) -> tuple[tuple[str, str], ...]:
     """Pairs of factors of which a level of one comes with just one level of the other."""
     found = []
-    for i, one in enumerate(names):
-        for other in names[i + 1 :]:
-            pairs: Bool[np.ndarray, "a b"] = np.zeros(
-                (data.levels[one].max() + 1, data.levels[other].max() + 1), bool
-            )
-            pairs[data.levels[one], data.levels[other]] = True
-            if (pairs.sum(axis=0) == 1).any() or (pairs.sum(axis=1) == 1).any():
-                found.append((one, other))
+    for one, other in combinations(names, 2):
+        shape = data.levels[one].max() + 1, data.levels[other].max() + 1
+        pairs: Bool[np.ndarray, "a b"] = np.zeros(shape, bool)
+        pairs[data.levels[one], data.levels[other]] = True
+        if (pairs.sum(axis=0) == 1).any() or (pairs.sum(axis=1) == 1).any():
+            found.append((one, other))
     return tuple(found)
 
 
 def share_table(found: Mapping[str, Shares], caption: str) -> Table:
     """Shares by motion, [%]: a line a factor."""
-    shown = {motion: _cells_of(each) for motion, each in found.items()}
-    factors = dict.fromkeys(name for cells in shown.values() for name in cells if name != REST)
+    shown = [_cells(each) for each in found.values()]
+    factors = dict.fromkeys(name for cells in shown for name in cells if name != REST)
     return Table(
         ("factor", *(f"{motion} [%]" for motion in found)),
-        tuple((name, *(c.get(name, MISSING) for c in shown.values())) for name in (*factors, REST)),
+        tuple((name, *(c.get(name, MISSING) for c in shown)) for name in (*factors, REST)),
         f"{caption}: shares of the variance of the log distance, and {LEVEL:.0%} interval. "
-        f"{explained(found)}",
+        f"{_in_words(found)}",
         foot=1,
     )
 
 
-def _cells_of(shares: Shares) -> dict[str, str]:
-    numbers = zip(shares.factors, shares.share, shares.low, shares.high, strict=True)
+def _cells(shares: Shares) -> dict[str, str]:
     return {
         name: f"{_percent(share)} [{_percent(low)}, {_percent(high)}]"
-        for name, share, low, high in numbers
+        for name, share, low, high in zip(*shares[:4], strict=True)
     }
 
 
@@ -226,8 +226,8 @@ def _percent(share: float) -> str:
     return f"{100 * share:.1f}".replace("-0.0", "0.0")
 
 
-def explained(found: Mapping[str, Shares]) -> str:
-    """What the shares are of, in words."""
+def _in_words(found: Mapping[str, Shares]) -> str:
+    """What the shares are of."""
     counts = ", ".join(
         f"{each.count} on {motion} (deviation of the logarithm {100 * each.deviation:.0f} %"
         + (f"; {each.diverged} more diverged, and have none)" if each.diverged else ")")

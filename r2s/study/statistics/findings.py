@@ -4,19 +4,21 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from r2s.evaluation.statistics import LEVEL
+from r2s.study.rows import Row
 from r2s.study.statistics.conclusions import CONCLUSIONS
 from r2s.study.statistics.hypotheses import Comparison, Verdict, judge
-from r2s.study.statistics.panel import LEVEL, make_panel
 from r2s.study.statistics.paper import Paper
-from r2s.study.statistics.tables import MISSING, Row, Table, significant
+from r2s.study.statistics.result_array import result_array
+from r2s.study.tables import MISSING, Table, significant
 
 MOST_IN_WORDS = 3
 
 
 def find(rows: Sequence[Row], paper: Paper, metric: str = "chamfer") -> list[Verdict]:
     """The answers to all conclusions, by one metric."""
-    panel = make_panel(rows, metric)
-    return judge([conclusion(panel, paper) for conclusion in CONCLUSIONS])
+    results = result_array(rows, metric)
+    return judge([conclusion(results, paper) for conclusion in CONCLUSIONS])
 
 
 def finding_table(verdicts: Sequence[Verdict], metric: str) -> Table:
@@ -66,7 +68,8 @@ def _numbers(comparison: Comparison, p: float) -> tuple[str, ...]:
 
 def in_words(verdict: Verdict) -> str:
     """The answer and what it rests on: all comparisons, or of many those that decide."""
-    judged = list(zip(verdict.claim.comparisons, verdict.answers, verdict.corrected, strict=True))
+    claim = verdict.claim
+    judged = list(zip(claim.comparisons, verdict.answers, verdict.corrected, strict=True))
     shown = judged
     if len(judged) > MOST_IN_WORDS:
         refuted = [each for each in judged if each[1] == "does not hold"]
@@ -74,13 +77,10 @@ def in_words(verdict: Verdict) -> str:
         closest = min(judged, key=lambda each: np.nan_to_num(each[0].ratio, nan=np.inf))
         shown = (refuted or open_ones or [closest])[:MOST_IN_WORDS]
     said = "; ".join(_said(comparison, p) for comparison, _, p in shown)
+    said = said[:1].upper() + said[1:]
     rest = f"; and {len(judged) - len(shown)} more in the table" if len(shown) < len(judged) else ""
-    note = f" {verdict.claim.note}" if verdict.claim.note else ""
-    return f"{verdict.answer.capitalize()}: {verdict.claim.words} {_capital(said)}{rest}.{note}"
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
+    note = f" {claim.note}" if claim.note else ""
+    return f"{verdict.answer.capitalize()}: {claim.words} {said}{rest}.{note}"
 
 
 def _said(comparison: Comparison, p: float) -> str:

@@ -1,8 +1,8 @@
-"""The tables of the study (Ru et al. 2025) beside ours, in its units.
+"""The tables of the paper (Ru et al. 2025) beside ours, in its units.
 
 Its numbers are not part of this package: `read_paper` reads them from a folder that the user has,
 with `folding.csv`, `fling.csv` and `shaking.csv`. Their header is `metric,fabric` and then one
-name a column, such as `diffcloud-diffsim-lifting`; `metric` is CD or HD.
+name for each configuration, such as `diffcloud-diffsim-lifting`; `metric` is CD or HD.
 """
 
 import csv
@@ -12,52 +12,50 @@ from pathlib import Path
 
 import numpy as np
 
+from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
+from r2s.study.rows import Row, by_metric
 from r2s.study.statistics.distances import cell
-from r2s.study.statistics.panel import (
-    MOTIONS,
-    PAPER_COLUMNS,
-    Column,
-    Panel,
-    by_metric,
-    make_panel,
-    over_repeats,
+from r2s.study.statistics.result_array import (
+    ResultArray,
+    mean_over_repeats,
+    result_array,
     select,
 )
-from r2s.study.statistics.tables import MISSING, Row, Table
+from r2s.study.tables import MISSING, Table
 
 CITED = "Ru et al. 2025, tables"
 SOLVERS = {"diffsim": "cloth", "difftaichi": "points"}
 METRICS = {"CD": "paper_chamfer", "HD": "paper_hausdorff"}
 AVERAGE = "Average"
 
-# By motion and metric, then column and fabric (named as our presets).
-Paper = Mapping[tuple[str, str], Mapping[Column, Mapping[str, float]]]
+# Values by motion and metric, then by configuration and fabric (named as our presets).
+Paper = Mapping[tuple[str, str], Mapping[Configuration, Mapping[str, float]]]
 
 
 def read_paper(folder: Path | str | None) -> Paper:
-    """The study's three tables; none at all without a folder.
+    """Read the paper's three tables; the result is empty without a folder.
 
     Lines of averages are left out: they are made again from the others. Raises FileNotFoundError,
-    or a ValueError that names the file and the line: another header, an unknown column, metric or
-    fabric given twice, a cell that is missing or no positive number.
+    or a ValueError that names the file and the line: another header, an unknown configuration,
+    metric or fabric given twice, a cell that is missing or no positive number.
     """
     if folder is None:
         return {}
     return {
-        (motion, metric): columns
+        (motion, metric): table
         for motion in MOTIONS
-        for metric, columns in _read(Path(folder) / f"{motion}.csv").items()
+        for metric, table in _read(Path(folder) / f"{motion}.csv").items()
     }
 
 
-def _read(path: Path) -> dict[str, dict[Column, dict[str, float]]]:
-    found: dict[str, dict[Column, dict[str, float]]] = {}
+def _read(path: Path) -> dict[str, dict[Configuration, dict[str, float]]]:
+    found: dict[str, dict[Configuration, dict[str, float]]] = {}
     with open(path, newline="", encoding="utf-8") as file:
         lines = csv.reader(file)
         header = next(lines, [])
         if header[:2] != ["metric", "fabric"] or len(header) < 3:
             raise ValueError(f"{path}, line 1: expected metric,fabric,COLUMNS, found {header}")
-        columns = [_column(path, name) for name in header[2:]]
+        configurations = [_configuration(path, name) for name in header[2:]]
         for cells in lines:
             where = f"{path}, line {lines.line_num}"
             if len(cells) != len(header):
@@ -68,21 +66,21 @@ def _read(path: Path) -> dict[str, dict[Column, dict[str, float]]]:
                 continue
             fabric = cells[1].strip().lower().replace(" ", "_")
             table = found.setdefault(METRICS[cells[0]], {})
-            for column, text in zip(columns, cells[2:], strict=True):
-                values = table.setdefault(column, {})
+            for configuration, text in zip(configurations, cells[2:], strict=True):
+                values = table.setdefault(configuration, {})
                 if fabric in values:
                     raise ValueError(f"{where}: {cells[0]} of {cells[1]} is given twice")
                 values[fabric] = _positive(where, text)
     return found
 
 
-def _column(path: Path, name: str) -> Column:
+def _configuration(path: Path, name: str) -> Configuration:
     parts = name.split("-")
     if len(parts) != 3 or parts[1] not in SOLVERS:
         known = " or ".join(SOLVERS)
         raise ValueError(f"{path}, line 1: expected APPROACH-SIMULATOR-SCENARIO with {known}, "
                          f"found {name!r}")  # fmt: skip
-    return Column(parts[0], SOLVERS[parts[1]], parts[2])
+    return Configuration(parts[0], SOLVERS[parts[1]], parts[2])
 
 
 def _positive(where: str, text: str) -> float:
@@ -95,62 +93,61 @@ def _positive(where: str, text: str) -> float:
     return value
 
 
-def average(paper: Paper, motion: str, metric: str, columns: Sequence[Column]) -> float:
-    """The mean over fabrics and columns in the study's tables, [-]; NaN when one is not there."""
+def average(
+    paper: Paper, motion: str, metric: str, configurations: Sequence[Configuration]
+) -> float:
+    """The mean over fabrics and configurations of the paper, [-]; NaN when one is not there."""
     table = paper.get((motion, metric), {})
-    if not columns or any(column not in table for column in columns):
+    if not configurations or any(each not in table for each in configurations):
         return math.nan
-    return float(np.mean([np.mean(list(table[column].values())) for column in columns]))
+    return float(np.mean([np.mean(list(table[each].values())) for each in configurations]))
 
 
 def beside_paper(rows: Sequence[Row], paper: Paper, motion: str, metric: str) -> Table:
-    """One line a fabric, and their mean: each column of ours beside the same of the study.
+    """The table of one motion: each configuration of ours beside the same of the paper.
 
-    `metric`: paper_chamfer or paper_hausdorff. Ours: means over recordings and repeats that did
-    not diverge, and how many did.
+    There is a line for each fabric, and one for their mean. `metric` is paper_chamfer or
+    paper_hausdorff. Ours are means over recordings and repeats that did not diverge, and how many
+    did.
     """
-    panel = make_panel(rows, metric, (motion,))
+    results = result_array(rows, metric, (motion,))
     theirs = paper.get((motion, metric), {})
-    columns = (
-        *(column for column in PAPER_COLUMNS if column in panel.columns or column in theirs),
-        *(column for column in panel.columns if column not in PAPER_COLUMNS),
+    ours = results.configurations
+    shown = [c for c in PAPER_CONFIGURATIONS if c in ours or c in theirs]
+    shown += [c for c in ours if c not in PAPER_CONFIGURATIONS]
+    fabrics = list(
+        dict.fromkeys((*results.fabrics, *(f for each in theirs.values() for f in each)))
     )
-    fabrics = dict.fromkeys(t.fabric for t in panel.trajectories)
-    fabrics |= dict.fromkeys(fabric for values in theirs.values() for fabric in values)
-    header, lines = ["fabric"], [[name.replace("_", " ")] for name in fabrics]
-    foot = ["mean"]
-    for column in columns:
-        sides = {column.label: _ours(panel, column, list(fabrics))} if panel.columns else {}
-        if column in theirs:
-            sides[f"{column.label}, paper"] = _theirs(theirs[column], list(fabrics))
-        for label, cells in sides.items():
-            header.append(label)
-            for line, text in zip([*lines, foot], cells, strict=True):
-                line.append(text)
+    columns = {"fabric": [*(name.replace("_", " ") for name in fabrics), "mean"]}
+    for configuration in shown:
+        if ours:
+            columns[configuration.label] = _ours(results, configuration, fabrics)
+        if configuration in theirs:
+            columns[f"{configuration.label}, paper"] = _theirs(theirs[configuration], fabrics)
     kind = "Chamfer distance" if metric == METRICS["CD"] else "Hausdorff distance"
     cited = f"; paper: {CITED}" if theirs else ""
     return Table(
-        tuple(header),
-        tuple(map(tuple, [*lines, foot])),
+        tuple(columns),
+        tuple(zip(*columns.values(), strict=True)),
         f"{kind} on {motion}, in the units of the paper [-]{cited}",
         foot=1,
     )
 
 
-def _ours(panel: Panel, column: Column, fabrics: list[str]) -> list[str]:
-    """A cell a fabric, and the mean of the fabrics."""
-    part = select(panel, lambda c: c == column)
-    shown, means = [], []
-    for fabric in fabrics:
-        one = select(part, trajectories=lambda t, fabric=fabric: t.fabric == fabric)
-        values = over_repeats(one, diverged=np.nan)
-        known = values[np.isfinite(values)]
-        mean = float(known.mean()) if len(known) else math.nan
-        shown.append(cell(mean, math.nan, math.nan, *_counts(one), in_mm=False))
-        means += [mean] if one.present.any() else []
-    known = [mean for mean in means if math.isfinite(mean)]
-    mean = float(np.mean(known)) if known else math.nan
-    return [*shown, cell(mean, math.nan, math.nan, *_counts(part), in_mm=False)]
+def _ours(results: ResultArray, configuration: Configuration, fabrics: list[str]) -> list[str]:
+    """A cell for each fabric, and one for the mean of the fabrics."""
+    part = select(results, lambda c: c == configuration)
+    parts = [select(part, trajectories=lambda t, name=name: t.fabric == name) for name in fabrics]
+    means = [_finite_mean(mean_over_repeats(each, diverged=np.nan)) for each in parts]
+    return [
+        cell(mean, math.nan, math.nan, int(each.diverged.sum()), int(each.present.sum()), False)
+        for mean, each in zip([*means, _finite_mean(np.array(means))], [*parts, part], strict=True)
+    ]
+
+
+def _finite_mean(values: np.ndarray) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) else math.nan
 
 
 def _theirs(values: Mapping[str, float], fabrics: list[str]) -> list[str]:
@@ -159,13 +156,8 @@ def _theirs(values: Mapping[str, float], fabrics: list[str]) -> list[str]:
     return [*shown, f"{np.mean(list(values.values())):.3f}"]
 
 
-def _counts(panel: Panel) -> tuple[int, int]:
-    lost = panel.present & ~np.isfinite(panel.values)
-    return int(lost.sum()), int(panel.present.sum())
-
-
 def paper_tables(rows: Sequence[Row], paper: Paper) -> dict[str, Table]:
-    """The tables of all motions and both metrics for which we, or the study, have numbers."""
+    """The tables of all motions and both metrics for which we, or the paper, have numbers."""
     found, rows_of = {}, by_metric(rows)
     for motion in MOTIONS:
         for metric in METRICS.values():

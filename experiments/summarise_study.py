@@ -1,0 +1,53 @@
+"""Copy the tables of a study that the documents show, and put them into the documents.
+
+python experiments/summarise_study.py results     # the folder that `make study` left
+
+Each table becomes a file of OUT, which says what made it, and replaces what stands between the two
+marks of its name in a document.
+"""
+
+import csv
+import time
+from pathlib import Path
+
+from _tables import Line, command_line, insert, keep, shown
+
+# by the study's name: the document, the name there, a caption, and columns (none named: all)
+TABLES = {
+    "chamfer_real_to_sim": (
+        *("README.md", "study_small"),
+        "Distance from the true surface to the simulation: mean [90 % interval].",
+    ),
+    "findings": (
+        *("docs/results.md", "study_small_findings"),
+        *("Conclusions of the paper, tested here.", "conclusion", "chamfer_real_to_sim"),
+    ),
+    "parameters_cloth": (
+        *("docs/results.md", "study_small_parameters"),
+        *("Stiffness along warp and weft.", "recording", "warp", "weft"),
+    ),
+}
+
+
+def table(results: Path, name: str) -> list[Line]:
+    """Read a table of a study."""
+    return list(csv.DictReader(open(results / "tables" / f"{name}.csv", encoding="utf-8")))
+
+
+if __name__ == "__main__":
+    parser = command_line(__doc__, "docs/results")
+    parser.add_argument("results", type=Path)
+    a = parser.parse_args()
+    version = {x["setting"]: x["value"] for x in table(a.results, "settings")}["version of r2s"]
+    seconds = sum(float(x["CPU seconds in all"]) for x in table(a.results, "costs"))
+    made = time.gmtime((a.results / "results.csv").stat().st_mtime)
+    facts = {
+        "command": "make study; python experiments/summarise_study.py results",
+        "version": f"r2s {version}",
+        "date": time.strftime("%Y-%m-%d", made),
+        "cost": f"{seconds / 60:.0f} CPU minutes",
+    }
+    for source, (document, name, caption, *columns) in TABLES.items():
+        whole, path = table(a.results, source), a.out / f"{name}.csv"
+        keep(path, [{column: x[column] for column in columns or x} for x in whole], caption, facts)
+        insert(Path(document), name, shown(path))

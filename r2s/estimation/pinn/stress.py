@@ -1,0 +1,100 @@
+"""Strain, stress and its divergence in a sheet, from the laws of `r2s.laws.membrane`.
+
+The sheet has sides X (the pull) and Y. The law is in the axes of warp and weft, which are turned
+by an `angle` from X. Stress is force per width [N/m]: no thickness enters.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from r2s.fabrics.fabric import Fabric
+
+Gradient = Float[Array, "axis 2"]  # of displacement or position in X and Y, [-]
+Voigt = Float[Array, " 3"]  # strain (E11, E22, 2 E12) [-], or stress (S11, S22, S12) [N/m]
+Strain = Callable[[Gradient], Voigt]
+
+
+def green(gradient: Gradient) -> Voigt:
+    """Green strain [-] of a gradient of displacement, exact for any rotation and out of plane."""
+    f = gradient + jnp.eye(gradient.shape[0], 2, dtype=gradient.dtype)
+    return jnp.stack([(f[:, 0] @ f[:, 0] - 1) / 2, (f[:, 1] @ f[:, 1] - 1) / 2, f[:, 0] @ f[:, 1]])
+
+
+def small(gradient: Gradient) -> Voigt:
+    """Small strain [-] of a gradient of displacement, with the engineering shear."""
+    return jnp.stack([gradient[0, 0], gradient[1, 1], gradient[0, 1] + gradient[1, 0]])
+
+
+def turned(strain: Voigt, angle: Float[Array, ""]) -> Voigt:
+    """The strain [-] in axes that are turned by an angle [rad] from X towards Y."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    e11, e22, shear = strain
+    first = c**2 * e11 + s**2 * e22 + c * s * shear
+    second = s**2 * e11 + c**2 * e22 - c * s * shear
+    return jnp.stack([first, second, 2 * c * s * (e22 - e11) + (c**2 - s**2) * shear])
+
+
+class TurnedMembrane(eqx.Module):
+    """A membrane law whose warp is turned in the sheet, for a sheet that is cut on the bias.
+
+    - `law`: any `MembraneLaw`.
+    - `angle`: from the sheet's first side to the warp, [rad].
+    """
+
+    law: Any
+    angle: Float[Array, "*batch"]
+
+    def at(self, strain: Voigt) -> "TurnedMembrane":
+        """The law that a time step uses which starts near this strain [-]."""
+        return TurnedMembrane(self.law.at(turned(strain, self.angle)), self.angle)
+
+    def energy_density(self, strain: Voigt) -> Float[Array, ""]:
+        """Energy per rest area [J/m^2] at a Green strain [-]."""
+        return self.law.energy_density(turned(strain, self.angle))
+
+
+def nominal_stress(
+    fabric: Fabric,
+    angle: Float[Array, ""],
+    gradient: Gradient,
+    rate: Gradient | None = None,
+    strain: Strain = green,
+) -> Gradient:
+    """First Piola-Kirchhoff stress [N/m], the derivative of the energy in the gradient.
+
+    Its first column is the traction on an edge across X, per width at rest. In Green strain it is
+    F S, in small strain the symmetric stress.
+
+    - `angle`: from X to the warp, [rad].
+    - `gradient`: of the displacement, [-].
+    - `rate`: of the gradient [1/s]. With it the stress has the part of Kelvin-Voigt damping:
+      `fabric.damping` times the stiffness times the rate of strain.
+    - `strain`: `green` or `small`.
+    """
+    energy = TurnedMembrane(fabric.membrane, angle).energy_density
+    at, pull_back = jax.vjp(strain, gradient)
+    if rate is not None:
+        at = at + fabric.damping * jax.jvp(strain, (gradient,), (rate,))[1]
+    return pull_back(jax.grad(energy)(at))[0]
+
+
+def divergence(
+    fabric: Fabric,
+    angle: Float[Array, ""],
+    gradient: Gradient,
+    changes: Float[Array, "2 axis 2"],
+    strain: Strain = green,
+) -> Float[Array, " axis"]:
+    """Divergence [N/m^2] of the nominal stress, from derivatives `changes` [1/m] of the gradient.
+
+    It leaves damping out, whose divergence would need third derivatives.
+    """
+    stress = partial(nominal_stress, fabric, angle, strain=strain)
+    along_x, along_y = (jax.jvp(stress, (gradient,), (change,))[1] for change in changes)
+    return along_x[:, 0] + along_y[:, 1]

@@ -1,0 +1,37 @@
+"""What a study compares: configurations, judged on three motions that no estimate has seen."""
+
+from typing import NamedTuple
+
+APPROACHES = {"diffcloud": "DIFFCLOUD", "diffcp": "DiffCP", "physnet": "PhysNet", "pinn": "PINN"}
+MOTIONS = ("folding", "fling", "shaking")  # that no estimate has seen
+
+
+class Configuration(NamedTuple):
+    """An approach on a solver that estimates from a scenario.
+
+    The default fabric on a solver is a configuration too, without approach and scenario.
+    """
+
+    approach: str
+    solver: str
+    estimated_from: str
+
+    @property
+    def label(self) -> str:
+        if not self.approach:
+            return f"default {self.solver}"
+        named = APPROACHES.get(self.approach, self.approach)
+        return f"{named} {self.solver} {self.estimated_from}".strip()
+
+
+PAPER_CONFIGURATIONS = (
+    Configuration("diffcloud", "cloth", "lifting"),
+    Configuration("diffcloud", "cloth", "wind"),
+    Configuration("diffcp", "points", "lifting"),
+    Configuration("physnet", "cloth", "lifting"),
+    Configuration("physnet", "cloth", "wind"),
+    Configuration("physnet", "points", "lifting"),
+    Configuration("pinn", "points", "stretching"),
+    Configuration("pinn", "cloth", "stretching"),
+)
+"""The configurations in the tables of Ru et al. 2025, in their order."""

@@ -1,0 +1,141 @@
+"""The sections of a report that compare configurations, whose tables are kept."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from r2s.evaluation.statistics import LEVEL
+from r2s.study.report import charts
+from r2s.study.report.page import Section
+from r2s.study.rows import Row
+from r2s.study.statistics import factors, findings, ranks
+from r2s.study.statistics.distances import METRICS, distance_tables, means
+from r2s.study.statistics.paper import CITED, Paper, paper_tables
+from r2s.study.statistics.result_array import ResultArray, by_motion
+from r2s.study.tables import Table, significant
+
+Keep = Callable[[str, Table], Table]  # writes a table under a name, and returns it
+
+
+def findings_section(
+    rows_of: Mapping[str, Sequence[Row]],
+    metrics: Sequence[str],
+    results: ResultArray,
+    paper: Paper,
+    keep: Keep,
+) -> list[Section]:
+    """The conclusions of the paper, by each of `metrics`; in words by the first of them."""
+    if not metrics:
+        return [Section("Findings", ("There are no results yet.",))]
+    found = {metric: findings.find(rows_of[metric], paper, metric) for metric in metrics}
+    first = found[metrics[0]]
+    words = [
+        *_headlines(results),
+        "Each conclusion of the paper is a test on these numbers. Ratios are of distances, or of "
+        "what is named, with their interval; they are above 1 where the conclusion is right. All "
+        "p are Wilcoxon's signed-rank test with Holm's correction.",
+        *(findings.in_words(verdict) for verdict in first),
+    ]
+    if not paper:
+        words.append("The tables of the paper were not given: its own numbers are not shown.")
+    lines = tuple(
+        (first[i].claim.words, *(found[metric][i].answer for metric in metrics))
+        for i in range(len(first))
+    )
+    caption = f"Which conclusions of the paper ({CITED}) hold here, by metric"
+    shown = (
+        keep("findings", Table(("conclusion", *metrics), lines, caption)),
+        keep(f"findings_{metrics[0]}", findings.finding_table(first, metrics[0])),
+    )
+    return [Section("Findings", tuple(words), shown)]
+
+
+def _headlines(results: ResultArray) -> list[str]:
+    """The best configurations of each motion, beside the default fabric."""
+    scale, unit = (1e3, " mm") if results.unit == "m" else (1.0, "")
+    found = []
+    for motion, part in by_motion(results).items():
+        numbers = zip(part.configurations, *means(part), strict=True)
+        finite = [each for each in numbers if np.isfinite(each[1])]
+        best, defaults = [], []
+        for configuration, *ends, diverged, runs in sorted(finite, key=lambda each: each[1]):
+            mean, low, high = (significant(scale * end) for end in ends)
+            lost = f"; {diverged} of {runs} diverged" if diverged else ""
+            words = f"{configuration.label} {mean}{unit} ({low} to {high}{lost})"
+            (best if configuration.approach else defaults).append(words)
+        if best:
+            compared = f"; {', '.join(defaults)}" if defaults else ""
+            found.append(f"Least {results.metric} in {motion}: {', '.join(best[:3])}{compared}.")
+    return found
+
+
+def distance_sections(
+    out: Path, rows: Sequence[Row], results: ResultArray, paper: Paper, keep: Keep
+) -> list[Section]:
+    """Distances in millimetres, and in the units of the paper beside its own."""
+    sections = []
+    ours = tuple(keep(name, table) for name, table in distance_tables(rows).items())
+    if ours:
+        figures: tuple[tuple[Path, str], ...] = ()
+        if results.metric in METRICS and results.trajectories:
+            path, parts = out / "figures" / "distances.png", by_motion(results)
+            charts.distance_chart(path, parts, results.metric)
+            caption = f"Mean {results.metric} of every configuration, with {LEVEL:.0%} intervals."
+            figures = ((path, caption),)
+        sections.append(Section("Distances in millimetres", (), ours, figures))
+    beside = tuple(keep(name, table) for name, table in paper_tables(rows, paper).items())
+    if beside:
+        words = (
+            "Every cloud is centred on its first frame's centroid and divided by half of its first "
+            "frame's largest radius; Chamfer distances are means of squares, both directions "
+            "summed. That hides errors of size, and clouds that were seen in part are compared "
+            "with whole sheets."
+        )
+        sections.append(Section("In the units of the paper", (words,), beside))
+    return sections
+
+
+def _parts(results: ResultArray) -> dict[str, ResultArray]:
+    """Each motion, and all of them together where there are several."""
+    parts = by_motion(results)
+    return parts | ({"all motions": results} if len(parts) > 1 else {})
+
+
+def rank_section(out: Path, results: ResultArray, keep: Keep) -> list[Section]:
+    """Mean ranks of the configurations."""
+    found = {
+        motion: ranked
+        for motion, part in _parts(results).items()
+        if (ranked := ranks.rank(part)) is not None
+    }
+    if not found:
+        return []
+    shown = (keep("ranks", ranks.rank_table(found, f"Ranks by {results.metric}")),)
+    path = charts.rank_chart(out / "figures" / "ranks.png", found)
+    words = (
+        "Configurations are ranked within each recording, so that hard recordings count no more. "
+        "Intervals reach rather too far to the middle, where estimates were repeated: resampled, "
+        "their means scatter more."
+    )
+    return [Section("Ranks", (words,), shown, ((path, "Mean ranks with their intervals."),))]
+
+
+def factor_section(out: Path, results: ResultArray, keep: Keep) -> list[Section]:
+    """Shares of the variance that each factor of the study explains."""
+    found = {
+        motion: shares
+        for motion, part in _parts(results).items()
+        if (shares := factors.variance_shares(part)) is not None
+    }
+    if not found:
+        return []
+    shown = (keep("factors", factors.share_table(found, f"By {results.metric}")),)
+    path = charts.share_chart(out / "figures" / "factors.png", found)
+    words = (
+        "How much of the variance of the logarithm of the distance each factor explains, whatever "
+        "the order in which factors are looked at. The rest is interactions, such as a solver that "
+        "is good for one fabric, and the spread of repeats."
+    )
+    caption = "Shares of the variance, by what was judged."
+    return [Section("What matters", (words,), shown, ((path, caption),))]

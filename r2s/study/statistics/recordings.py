@@ -1,0 +1,63 @@
+"""Tables of recorded data: each recording's error beside what it is compared with."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from r2s.study.configuration import Configuration
+from r2s.study.rows import BASELINES, Row
+from r2s.study.tables import MISSING, Table
+
+METRIC = "chamfer_real_to_sim"  # in metres, shown in millimetres
+
+
+def recording_tables(rows: Sequence[Row]) -> dict[str, Table]:
+    """A table for each configuration and scenario: a line a recording, last their means.
+
+    Beside each recording's error stand that of the default fabric, of another fabric's estimate and
+    of another trial. There are tables of given recordings alone, where an estimate is judged by
+    what belongs to it. Where several estimates are judged by one recording, the first counts.
+    """
+    configurations = dict.fromkeys(
+        Configuration(row.approach, row.solver, row.estimated_from)
+        for row in rows
+        if row.approach and row.baseline == "other_fabric"
+    )
+    found = {}
+    for configuration in configurations:
+        theirs = [row for row in rows if row.metric == METRIC and _belongs(row, configuration)]
+        for scenario in dict.fromkeys(row.evaluated_on for row in theirs):
+            table = _table(configuration, [r for r in theirs if r.evaluated_on == scenario])
+            found[f"{'_'.join(configuration)}_on_{scenario}"] = table
+    return found
+
+
+def _belongs(row: Row, configuration: Configuration) -> bool:
+    """Whether a row is of a configuration, or of what it is compared with."""
+    approach, solver, scenario = configuration
+    source = row.approach, row.estimated_from
+    return source in ((approach, scenario), ("", "")) and row.solver in (solver, "")
+
+
+def _table(configuration: Configuration, rows: Sequence[Row]) -> Table:
+    errors: dict[tuple[str, str], dict[str, float]] = {}
+    for row in rows:
+        errors.setdefault((row.fabric, row.recording), {}).setdefault(row.baseline, row.value)
+    means = {
+        name: float(np.mean(present))
+        for name in BASELINES
+        if (present := [line[name] for line in errors.values() if name in line])
+    }
+    return Table(
+        header=("fabric", "recording", *(f"{words} [mm]" for words in BASELINES.values())),
+        rows=(
+            *((*names, *_cells(line)) for names, line in errors.items()),
+            ("mean", "", *_cells(means)),
+        ),
+        caption=f"{configuration.label}: {METRIC} [mm] on {rows[0].evaluated_on}",
+        foot=1,
+    )
+
+
+def _cells(line: dict[str, float]) -> list[str]:
+    return [f"{1e3 * line[name]:.1f}" if name in line else MISSING for name in BASELINES]

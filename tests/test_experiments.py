@@ -1,0 +1,111 @@
+"""The drivers of experiments are short, say how they are run, and keep what made their tables."""
+
+import importlib
+import re
+from pathlib import Path
+from types import ModuleType
+
+import jax
+import numpy as np
+import pytest
+
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+DRIVERS = sorted(path.stem for path in EXPERIMENTS.glob("[a-z]*.py"))
+LINES = [{"fabric": "denim", "error": "1.5 mm"}, {"fabric": "knit", "error": "-"}]
+
+
+@pytest.fixture
+def module(monkeypatch: pytest.MonkeyPatch):
+    """Import a module of the folder, as Python does for a driver that is run."""
+    monkeypatch.syspath_prepend(str(EXPERIMENTS))
+    return importlib.import_module
+
+
+@pytest.fixture
+def tables(module) -> ModuleType:
+    return module("_tables")
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_a_driver_is_short_and_says_how_it_is_run(name: str) -> None:
+    lines = (EXPERIMENTS / f"{name}.py").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 60
+    assert any(line.startswith(f"python experiments/{name}.py") for line in lines[:6])
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_a_driver_finds_all_that_it_imports(name: str, module) -> None:
+    if name == "another_simulator":
+        pytest.importorskip("mujoco", reason="needs r2s[bench]")
+    pytest.importorskip("psutil", reason="needs r2s[study]")
+    assert module(name).__doc__
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_the_options_that_a_driver_shows_are_its_own(name: str) -> None:
+    text = (EXPERIMENTS / f"{name}.py").read_text(encoding="utf-8")
+    _, document, code = text.split('"""', 2)
+    known = {"--out", *re.findall(r'(?:add|parser\.add_argument)\("(--[a-z-]+)"', code)}
+    assert set(re.findall(r"(--[a-z-]+)", document)) <= known
+
+
+def test_a_table_says_what_made_it_and_is_read_back(tables, tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "table.csv"
+    tables.write(path, LINES, "Errors.", {"machine": "a clock"})
+    lines, facts = tables.read(path)
+    assert lines == LINES
+    assert {"command", "version", "date"} < set(facts)
+    assert facts["table"] == "Errors." and facts["machine"] == "a clock"
+    shown = tables.shown(path)
+    assert "| denim | 1.5 mm |" in shown and "a clock" in shown
+
+
+def test_a_table_goes_between_its_marks_or_is_refused(tables, tmp_path: Path) -> None:
+    document = tmp_path / "guide.md"
+    document.write_text("before\n<!-- one -->\nold\n<!-- end of one -->\nafter\n")
+    tables.insert(document, "one", "new\n")
+    expected = "before\n<!-- one -->\nnew\n<!-- end of one -->\nafter\n"
+    assert document.read_text() == expected
+    with pytest.raises(ValueError, match="end of two"):
+        tables.insert(document, "two", "new\n")
+    assert document.read_text() == expected
+
+
+def test_jobs_that_are_done_are_not_done_again(tables, tmp_path: Path) -> None:
+    made = []
+
+    def make(fabric: str) -> dict[str, str]:
+        made.append(fabric)
+        return {"error": fabric.upper()}
+
+    path, jobs = tmp_path / "runs.csv", [{"fabric": "denim"}, {"fabric": "knit"}]
+    tables.resumed(path, "Errors.", jobs[:1], make)
+    lines = tables.resumed(path, "Errors.", jobs, make)
+    assert made == ["denim", "knit"]
+    assert lines == tables.read(path)[0] == [job | {"error": job["fabric"].upper()} for job in jobs]
+
+
+def test_a_folder_without_the_scenario_is_named(module, tmp_path: Path) -> None:
+    manifest = '{"format": "none"}'
+    (tmp_path / "empty.npz").unlink(missing_ok=True)
+    (tmp_path / "manifest.json").write_text(manifest)
+    with pytest.raises(ValueError, match=str(tmp_path)):
+        module("_common").recordings_in(tmp_path, "lift")
+
+
+@pytest.mark.slow(group="motions")
+def test_an_exported_fabric_hangs_in_mujoco_as_ours_does(module) -> None:
+    """As users run it: in single precision, promotion as usual."""
+    pytest.importorskip("mujoco", reason="needs r2s[bench]")
+    with (
+        jax.enable_x64(False),
+        jax.numpy_dtype_promotion("standard"),
+        jax.numpy_rank_promotion("allow"),
+    ):
+        driver, peer = module("another_simulator"), module("_mujoco")
+        scenario = peer.scenario_of("drape")
+        ours = np.asarray(driver.r2s.rollout(scenario, driver.FABRIC).x)
+        theirs = peer.in_mujoco(scenario, driver.FABRIC)
+    distance = np.sqrt(np.mean(np.sum((ours[-1] - theirs[-1]) ** 2, axis=-1))) / peer.SIDE
+    moved = np.sqrt(np.mean(np.sum((ours[-1] - ours[0]) ** 2, axis=-1))) / peer.SIDE
+    assert distance < 0.05 < moved
