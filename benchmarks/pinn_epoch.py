@@ -81,9 +81,9 @@ def _problem():
     import jax
     import jax.numpy as jnp
     import jax.random as jr
-    from r2s.estimation.pinn.data import Clamp, Pull, stacked
 
     from r2s.estimation.pinn.published_recipe import begin
+    from r2s.estimation.pinn.pulls import Clamp, Pull, stacked
     from r2s.fabrics.parameters import OrthotropicSpace
 
     def array(value):

@@ -17,6 +17,7 @@ from r2s.estimation.checkpoint import arrays_of, load, read, save, tree_from
 from r2s.estimation.estimate import describe, point_estimate
 from r2s.estimation.estimate_json import as_json, from_json
 from r2s.estimation.method import Budget, default_space, seed_of
+from r2s.estimation.pinn import from_pulls, published_recipe
 from r2s.estimation.registry import METHODS
 from r2s.fabrics import presets
 from r2s.fabrics.fabric_json import fabric_as_json, fabric_from_json
@@ -267,3 +268,8 @@ def test_a_checkpoint_is_of_one_run(tmp_path):
     np.savez(path, places=np.zeros(2))
     with pytest.raises(ValueError, match=r"run\.npz is no checkpoint"):
         read(path)
+
+
+def test_the_usual_budgets_of_the_network_are_those_of_its_recipes():
+    assert METHODS["pinn"].budget.iterations == from_pulls.QUICK.adam
+    assert METHODS["pinn-published"].budget.iterations == published_recipe.EPOCHS

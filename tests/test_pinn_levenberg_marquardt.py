@@ -210,7 +210,7 @@ def test_the_network_alone_finds_the_fabric_of_an_exact_field(name):
     dim = min(space.dim, 4)
     place = jnp.array([0.45, 0.6])
     fabric = FABRIC if name == "orthotropic" else space(place)
-    truth = space.values(space.locate(fabric) if name == "orthotropic" else place)
+    truth = space.values(space.to_unit(fabric) if name == "orthotropic" else place)
     with jax.numpy_dtype_promotion("standard"):
         found = fabric_of(space, wave_pull(fabric))
     values = space.values(jnp.asarray(found))

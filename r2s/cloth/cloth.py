@@ -78,7 +78,7 @@ class Cloth(eqx.Module):
         tolerance: float | None = None,
         max_iterations: int = 200,
     ) -> "Cloth":
-        """A cloth solver for a scene; not under `jax.jit`, since its sizes follow from the mesh.
+        """A cloth solver for a scene, whose table and air may be traced, but not its mesh.
 
         Raises `ValueError` for a step that is not positive, or too long for self-contact.
         """
@@ -181,10 +181,11 @@ class Cloth(eqx.Module):
 
 
 def prepare_mesh(scene: Scene, self_contact: bool) -> tuple[Elimination, SelfContact | None]:
-    """What a cloth solver makes of the mesh of its scene, once."""
+    """What a cloth solver makes of the mesh of its scene, once; the mesh must not be traced."""
     couples_all = self_contact and scene.mesh.rest.shape[0] <= SMALL
-    search = SelfContact.make(scene.mesh) if self_contact else None
-    return Elimination.make(scene.mesh, couples_all), search
+    with jax.ensure_compile_time_eval():  # sizes follow from the mesh, also under `jax.jit`
+        search = SelfContact.make(scene.mesh) if self_contact else None
+        return Elimination.make(scene.mesh, couples_all), search
 
 
 def _anchor(now: Array, before: Array) -> Array:

@@ -20,6 +20,7 @@ EXTRAS = {
     "data": ("pooch",),
     "cli": ("tyro", "psutil"),
     "physnet": ("skopt", "sklearn"),
+    "pinn": ("flax",),
     "cma": ("cma",),
     "cluster": ("dask", "distributed", "dask_jobqueue"),
     "viz": ("viser",),

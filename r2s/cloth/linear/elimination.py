@@ -22,7 +22,7 @@ class Elimination(eqx.Module):
 
     @classmethod
     def make(cls, mesh: Mesh, couples_all: bool = False) -> "Elimination":
-        """The elimination of a mesh; not under `jax.jit`, since its sizes follow from the mesh.
+        """The elimination of a mesh that is not traced, since its sizes follow from the mesh.
 
         With `couples_all` any two vertices may be coupled, as self-contact does in small meshes.
         """

@@ -119,7 +119,7 @@ class PhysNetMethod(Method):
         )
 
     def _search(self, seen: estimator.Sighting, evaluations: int, seed: int) -> Estimate:
-        target = estimator.target(seen)
+        target = estimator.target_of(seen)
 
         def report(trials: emulator.Trials) -> None:
             if self.progress is not None:

@@ -10,7 +10,6 @@ import numpy as np
 
 from r2s.estimation.estimate import point_estimate
 from r2s.estimation.method import ANY, Budget, Method
-from r2s.estimation.pinn import from_clouds, from_pulls, published_recipe
 from r2s.estimation.pinn.pulls import Pull, pull_from, stacked
 from r2s.recordings.recording import Recording
 
@@ -32,7 +31,7 @@ class PINN(Method):
     """
 
     name = "pinn"
-    budget = Budget(iterations=from_pulls.QUICK.adam)
+    budget = Budget(iterations=200)
     heeds = ("iterations",)
     supports = {"cloth": ANY, "points": ("stretching",)}
     refusals = REFUSALS
@@ -41,6 +40,8 @@ class PINN(Method):
     angles: tuple[float, ...] = ()
 
     def _estimate(self, recordings, space, budget, key):
+        from r2s.estimation.pinn import from_clouds, from_pulls  # need flax
+
         if all(each.info.scenario == "stretching" for each in recordings):
             recipe = dataclasses.replace(from_pulls.QUICK, adam=budget.iterations)
             return from_pulls.estimate(
@@ -74,7 +75,7 @@ class PublishedPINN(Method):
     """
 
     name = "pinn-published"
-    budget = Budget(iterations=published_recipe.EPOCHS)
+    budget = Budget(iterations=10_000)
     heeds = ("iterations",)
     supports = {"cloth": ("stretching",), "points": ("stretching",)}
     several = True
@@ -82,6 +83,8 @@ class PublishedPINN(Method):
     angles: tuple[float, ...] = ()
 
     def _estimate(self, recordings, space, budget, key):
+        from r2s.estimation.pinn import published_recipe  # needs flax
+
         began = time.perf_counter()
         pulls = pulls_of(recordings, self.angles, without_force=True)
         middle, epochs = jnp.full(space.dim, 0.5, float), budget.iterations
