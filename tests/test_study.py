@@ -60,6 +60,7 @@ def test_the_true_fabric_is_nearer_than_another_and_than_noise_allows(fold, pred
     assert truth["hausdorff"] >= truth["chamfer"]
 
 
+@pytest.mark.slow(group="study")
 def test_a_whole_surface_tells_the_true_fabric_by_every_metric():
     experiment, fabric = SIX["fling"](), presets.grey_interlock()
     seen = synthetic.record(experiment, fabric, "grey", seen=synthetic.WHOLE, key=jr.key(0))
