@@ -33,6 +33,8 @@ from r2s.world.scene import Control, Scene
 
 # Of the tests that take minutes: each group takes less than twenty on two cores.
 SLOW_GROUPS = ("cloth", "points", "motions", "estimates", "pinn", "physnet", "study", "documents")
+# Files that take longest. They come first, so that no process ends long after the other.
+LONG = ("test_estimators", "test_study", "test_contract", "test_pinn_estimate", "test_cloth")
 MOST_MEMORY = 1000  # [MB]: a process that holds more lets its compiled programs go
 # Tracing makes many objects that stay: to count them again and again took a quarter of its time.
 gc.set_threshold(100_000, 50, 100)
@@ -59,7 +61,8 @@ def keep_programs(folder: str) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Refuse a slow test of no group, which `make test-slow` would never run."""
+    """Begin with the longest files; refuse a slow test of no group, which no command would run."""
+    items.sort(key=lambda item: item.path.stem not in LONG)
     for item in items:
         slow = item.get_closest_marker("slow")
         if slow is not None and slow.kwargs.get("group") not in SLOW_GROUPS:

@@ -173,6 +173,7 @@ def test_the_network_takes_a_stretching(name):
         assert not found.converged and found.approach == "pinn-published (10 epochs, no force)"
 
 
+@pytest.mark.slow(group="estimates")
 def test_a_descent_that_arrives_has_converged_and_a_truth_beyond_a_bound_is_named(recording):
     """Its shear stiffness lies above the range, whose upper bound the estimate reaches."""
     truth = float(SPACE.values(SPACE.to_unit(FABRIC))[2])

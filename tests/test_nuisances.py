@@ -42,6 +42,7 @@ def lifted():
     return Problem.make(record, FAMILY, num_points=60, shape=(4, 4))
 
 
+@pytest.mark.slow(group="estimates")
 def test_heavier_stiffer_and_in_denser_air_a_sheet_moves_alike(blown):
     """All forces and the mass by one factor: without it known, wind cannot tell the three apart."""
     problem = dataclasses.replace(blown, nuisance_prior=NuisancePrior(density=0.5, air=0.5))

@@ -140,6 +140,7 @@ def test_estimates_of_several_fabrics_at_once():
         assert "2 pulls" in each.estimate.approach
 
 
+@pytest.mark.slow(group="pinn")
 def test_without_force_the_report_says_so():
     with jax.numpy_dtype_promotion("standard"):
         found = estimate([even_pull(force=False)], FAMILY, TINY, key=jr.key(0)).estimate
