@@ -32,6 +32,30 @@ def test_every_manifest_is_package_data() -> None:
     assert listed == set(MANIFESTS.rglob("*.json")) != set()
 
 
+# where a library is imported by another name than it is installed by
+IMPORTED_AS = {
+    "dask-jobqueue": "dask_jobqueue",
+    "opencv-python-headless": "cv2",
+    "scikit-learn": "sklearn",
+    "scikit-optimize": "skopt",
+    "warp-lang": "warp",
+}
+
+
+def test_every_library_that_is_declared_is_imported() -> None:
+    """All but the tools of development, which are run as commands."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = {k: v for k, v in project["optional-dependencies"].items() if k != "dev"}
+    listed = [text for group in (project["dependencies"], *extras.values()) for text in group]
+    names = {re.split(r"[<>=!]", text)[0] for text in listed}
+    folders = (ROOT / each for each in ("r2s", "experiments", "benchmarks"))
+    source = "\n".join(p.read_text() for folder in folders for p in folder.rglob("*.py"))
+    for name in names:
+        module = IMPORTED_AS.get(name, name)
+        used = rf"(import|from) {module}\b|require\(\s*\"{module}[\".]|import_module\(\"{module}"
+        assert re.search(used, source), f"{name} is declared and not imported"
+
+
 def build_wheel(folder: Path) -> Path:
     """From a copy, since building leaves files behind."""
     source = folder / "source"

@@ -26,7 +26,7 @@ EXTRAS = {
     "viz": ("viser",),
     "bench": ("mujoco", "newton", "warp", "taichi"),
 }
-PACKAGES = ("r2s", "jax", "jaxlib", "equinox", "optax", "optimistix", "lineax", "numpy")
+PACKAGES = ("r2s", "jax", "jaxlib", "equinox", "optax", "lineax", "numpy")
 PLAUSIBLE = {  # of fabrics for clothes and the household
     "density": (0.05, 1.0, "kg/m^2", "an areal density: a T-shirt has 0.15, denim 0.4"),
     "damping": (0.0, 0.1, "s", "a time"),
