@@ -16,6 +16,7 @@ from r2s.laws.bending import HingeBending
 from r2s.laws.tables import HINGE_FACTOR, TableBending
 from r2s.recordings.recording import RecordingInfo, make_recording
 from r2s.scenarios.energy import stored_energy, stretch
+from r2s.scenarios.on_points import material_points
 from r2s.scenarios.paths import Route
 from r2s.scenarios.scenario import from_recording, rollout
 from r2s.scenarios.six import CLEARANCE, SIX
@@ -192,3 +193,9 @@ def test_the_energy_of_a_table_law_is_that_of_its_stiffness_there():
 
     table = TableBending(jnp.full((3, 5), HINGE_FACTOR * 1e-5))
     assert of(table) == pytest.approx(of(HingeBending(jnp.asarray(1e-5))), rel=1e-12)
+
+
+def test_material_points_refuse_the_self_contact_of_the_cloth():
+    scenario = SIX["folding"]().scenario((5, 5), self_contact=True)
+    with pytest.raises(ValueError, match="comes from the grid"):
+        material_points(scenario, presets.grey_interlock())

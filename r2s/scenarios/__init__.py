@@ -1,13 +1,14 @@
 """The six scenarios of the study, for any fabric and either solver.
 
-- `experiments`: lifting, wind, stretching, folding, fling, shaking; and varied at random.
-- `points`: the same on material points.
-- `forces`: those of the grippers.
-- `energy_balance`: a motion with its forces, also on a clamp, and where the energy goes.
+- `scenario`: a sheet at rest, what holds it, how that moves, which frames count; `rollout`.
+- `six`: lifting, wind, stretching, folding, fling, shaking; and varied at random.
+- `paths`: how grippers move in them. `on_points`: the same on material points.
+- `gripper_forces`, `energy`: what grippers feel, and where the energy goes.
+- `synthetic`: recordings of a known fabric, seen by cameras.
 """
 
 from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
-from r2s.scenarios.on_points import material_points, motion_of_points
+from r2s.scenarios.on_points import material_points
 from r2s.scenarios.six import (
     SIX,
     Experiment,
@@ -30,7 +31,6 @@ __all__ = [
     "folding",
     "lifting",
     "material_points",
-    "motion_of_points",
     "shaking",
     "stretching",
     "varied",

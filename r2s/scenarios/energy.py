@@ -29,7 +29,7 @@ class EnergyBalance(eqx.Module):
     - `grippers`, `air`: the work that they have done on the sheet since the first frame. That of
       still air is negative.
     - `dissipated`: what has gone since then, by internal and mass damping, friction, and the
-      formula of the time steps: the work less what the sheet holds more. Energy between layers
+      formula of the time steps: the work less what the sheet holds more. Energy of self-contact
       and in the table's contact counts as gone until it comes back.
     """
 

@@ -20,10 +20,10 @@ def step_with_forces(
 ) -> tuple[Any, Forces]:
     """`solver.step`, and the mean forces [N] of the grippers on the held vertices in that step.
 
-    Of the cloth: the derivative of the step's potential in the place of the held vertices, which
-    vanishes for free ones; contact of layers is left out. Of material points: the momentum that
-    the grippers give, over the step. Either has the weight and the inertia of the held vertices
-    in it. Raises `TypeError` for another solver.
+    For the cloth they are the derivative of the step's potential in the place of the held vertices,
+    which vanishes for free ones; self-contact is left out. For material points they are the
+    momentum that the grippers give, over the step. Either has the weight and the inertia of the
+    held vertices in it. Raises `TypeError` for another solver.
     """
     if isinstance(solver, Braked):
         fabric = solver.braked(fabric, state)

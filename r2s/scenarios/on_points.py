@@ -7,8 +7,7 @@ import numpy as np
 from r2s.fabrics.fabric import Fabric
 from r2s.mpm.grid import Grid
 from r2s.mpm.sheet import Sheet, longest_edge, stable_step
-from r2s.scenarios.scenario import Scenario, rollout
-from r2s.solver import Trajectory
+from r2s.scenarios.scenario import Scenario
 
 MEMBRANE_DAMPING = 1e-4  # [s]: what is longer costs ten times as many steps, and shows in no motion
 EDGE = 1.5  # longest edge of the mesh over the grid's spacing
@@ -21,13 +20,18 @@ def material_points(
     spacing: float | None = None,
     membrane_damping: float | None = MEMBRANE_DAMPING,
 ) -> Sheet:
-    """A solver of material points for a scenario: `motion(scenario, fabric, solver=...)`.
+    """A solver of material points for a scenario: `rollout(scenario, fabric, solver=...)`.
 
     `fabric` is the stiffest that it will be used for. The grid's `spacing` [m] is by default the
-    mesh's longest edge over `EDGE`; layers that lie on each other are about a spacing apart. The
+    mesh's longest edge over `EDGE`; folds that lie on each other are about a spacing apart. The
     membrane's damping time [s] is as in `r2s.mpm.Sheet`. The steps fill the time between frames.
-    Raises `ValueError` when the mesh is too coarse for the grid, or the scenario has layers.
+    Raises `ValueError` when the mesh is too coarse for the grid, or the scenario has
+    self-contact of the cloth.
     """
+    if scenario.self_contact is not None:
+        raise ValueError(
+            "self-contact of material points comes from the grid: make the scenario without it"
+        )
     mesh = scenario.scene.mesh
     spacing = longest_edge(mesh) / EDGE if spacing is None else spacing
     limit = float(stable_step(mesh, spacing, fabric, membrane_damping))
@@ -35,11 +39,6 @@ def material_points(
     # the limit is in float32, and a step must not be above it by a rounding
     dt = scenario.interval / (substeps + 1)
     return Sheet.make(scenario.scene, grid_around(scenario, spacing), fabric, dt, membrane_damping)
-
-
-def motion_of_points(scenario: Scenario, fabric: Fabric) -> Trajectory:
-    """A motion by material points, with their defaults; the fabric not traced."""
-    return rollout(scenario, fabric, solver=material_points(scenario, fabric))
 
 
 def grid_around(scenario: Scenario, spacing: float) -> Grid:

@@ -233,7 +233,7 @@ def rollout(
 
     By the cloth, in steps of equal size that fill the time between frames: the scenario's, or as
     many as it takes that none is above `max_step` [s]. Or by another `solver` of the same scene,
-    whose own step divides that time, such as of `r2s.scenarios.on_points.material_points`.
+    whose own step divides that time, see `r2s.scenarios.on_points.material_points`.
     """
     solver, substeps = stepped(scenario, max_step, solver)
     moved = simulate(solver, fabric, begin(solver, scenario), scenario.controls(substeps))
@@ -246,7 +246,7 @@ def stepped(
 ) -> tuple[Solver, int]:
     """The solver of a motion, which brakes the sheet before its first frame, and its steps a frame.
 
-    Arguments as of `rollout`. Raises `ValueError` when a solver's step does not fit.
+    The arguments are those of `rollout`. Raises `ValueError` when a solver's step does not fit.
     """
     if solver is None:
         substeps = scenario.substeps
@@ -310,7 +310,7 @@ class Braked(eqx.Module):
     dt: float = eqx.field(static=True)
 
     def init(self, x: Float[Array, "vertex 3"], *rates: Array | None) -> BrakedState:
-        """At positions [m]; `rates` as of the solver, by default at rest."""
+        """At positions [m]; `rates` go to the solver; by default it is at rest."""
         return BrakedState(self.solver.init(x, *rates), jnp.zeros((), int))
 
     def step(self, fabric: Fabric, state: BrakedState, control: Control) -> BrakedState:
