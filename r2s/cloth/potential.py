@@ -203,8 +203,8 @@ def _bending_hessians(step: IncrementalPotential, x: Positions):
     gradients = step.bending.gradients(step.mesh, hinge_curvature_gradients(step.mesh, x))
     elements = _bending_elements(step, _curvatures(step, x))
     stiffness = _map(jax.hessian(_element_bending_energy, argnums=3), step, *elements)
-    count, size = gradients.shape[:2]
-    stiffness = stiffness.reshape(count, size, size)  # of hinges it is a number
+    if stiffness.ndim == 1:  # of a scalar curvature
+        return jnp.einsum("e,eva,ewb->evawb", stiffness, gradients[:, 0], gradients[:, 0])
     return jnp.einsum("eiva,eij,ejwb->evawb", gradients, stiffness, gradients)
 
 
