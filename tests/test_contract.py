@@ -104,7 +104,10 @@ def ran(name: str, recording, space, solver=None, **others):
         return method.estimate([recording], space, TINY[name], key=jr.key(0))
 
 
-@pytest.mark.parametrize("name", ["diffcloud", "cma-es"])
+DIFFCLOUD = pytest.param("diffcloud", marks=pytest.mark.slow(group="estimates"))
+
+
+@pytest.mark.parametrize("name", [DIFFCLOUD, "cma-es"])
 def test_a_method_keeps_the_contract_on_the_cloth(recording, name):
     if name == "cma-es":
         pytest.importorskip("cma")

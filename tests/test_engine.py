@@ -185,6 +185,7 @@ def test_a_process_apart_has_a_workers_environment_and_may_die(tmp_path, monkeyp
     assert os.environ["OPENBLAS_NUM_THREADS"] == "1"
 
 
+@pytest.mark.slow(group="study")
 def test_workers_of_dask_make_the_same_and_survive_a_kill(tmp_path):
     cluster = pytest.importorskip("r2s.study.cluster", reason="needs the extra cluster")
     sums = [Sum((Number(i, 0.2), Number(i + 1, 0.2)), f"s{i}") for i in range(6)]

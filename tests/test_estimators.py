@@ -81,7 +81,7 @@ def test_the_objective_has_the_gradient_that_differences_have(kind, scale, reque
     width = 1e-4 if kind == "small" else 1e-3  # forces of a stiff sheet are rounded more
     least = 1e-6 * float(jnp.max(jnp.abs(found)))
     assert normal.loss == pytest.approx(float(jax.jit(_loss)(problems, theta, scale)))
-    for index in range(14):
+    for index in range(1 if scale else 0, 14, 2):  # at each scale the other half of them
         steps = [normal_at(problems, theta.at[index].add(s * width), scale).loss for s in (1, -1)]
         difference = float(steps[0] - steps[1]) / (2 * width)
         assert float(found[index]) == pytest.approx(difference, rel=2e-3, abs=least)

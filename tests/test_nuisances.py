@@ -161,6 +161,7 @@ def test_where_derivatives_overflow_nothing_is_known(lifted):
     assert disagreement(problems, broken, prior, near) == np.inf
 
 
+@pytest.mark.slow(group="estimates")
 def test_deviations_are_from_the_frames_on_which_places_agree(lifted, monkeypatch):
     """Of all frames if they do on them, or nowhere; else of the largest share."""
     problems, budget = (lifted,), Budget(shares=(0.5,), around=2)

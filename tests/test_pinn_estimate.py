@@ -172,6 +172,7 @@ def test_training_lowers_the_losses_of_the_strong_form():
     assert terms[0, -1] < 0.2 * terms[0, 0]
 
 
+@pytest.mark.slow(group="pinn")
 def test_a_killed_training_goes_on_from_its_checkpoint(tmp_path):
     """To the same network, after a chunk of Adam and after one of L-BFGS."""
     pulls = jax.tree.map(lambda leaf: leaf[None], stacked([even_pull()]))

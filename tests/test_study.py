@@ -198,6 +198,7 @@ def tiny(monkeypatch):
     return matrix.synthetic(plan)[-1:], made
 
 
+@pytest.mark.slow(group="study")
 def test_an_estimate_is_made_once_and_judged(tiny, tmp_path):
     cells, made = tiny
     assert engine.run(cells, tmp_path, engine.Serial()) == {}
