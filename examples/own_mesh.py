@@ -17,7 +17,6 @@ import numpy as np
 import trimesh
 
 import r2s
-from r2s.fabrics import presets
 
 
 def write_disc(path: Path, radius: float = 0.15, rings: int = 5) -> None:
@@ -56,6 +55,6 @@ if __name__ == "__main__":
     handles = jnp.broadcast_to(start[middle], (1, 75, len(middle), 3))
     controls = r2s.Control(handles, jnp.zeros((1, 75, 3)))
     moved = eqx.filter_jit(r2s.simulate)(
-        solver, presets.black_denim(), solver.init(start), controls
+        solver, r2s.presets.black_denim(), solver.init(start), controls
     )
     print(f"{len(sheet.rest)} vertices; the edge hangs {-1e3 * moved.x[-1, :, 2].min():.1f} mm low")
