@@ -158,6 +158,7 @@ def test_physnet_trains_its_network_once(recording, tmp_path, monkeypatch):
     assert not list(tmp_path.glob("*.images"))
     for name, each in found.items():
         assert each.approach.startswith("physnet") and each.losses.shape == (9, 1), name
+        assert each.loss_unit == "-"
         assert np.isfinite(each.loss) and each.converged is False
 
 

@@ -12,6 +12,7 @@ from mpm_bodies import momenta, states, still
 
 import r2s
 from r2s.fabrics.fabric import Fabric
+from r2s.failures import Failure
 from r2s.geometry.elements import vertex_masses
 from r2s.laws.bending import HingeBending
 from r2s.mpm import Grid, Sheet
@@ -240,3 +241,19 @@ def test_what_cannot_work_is_refused(sheet, elastic):
         solver_of(r2s.rectangle((0.4, 0.4), (3, 3)), elastic)
     with pytest.raises(ValueError, match="outside the grid"):
         solver_of(sheet, elastic).init(flat(sheet, 1.0))
+
+
+def test_a_sheet_that_is_carried_out_of_the_grid_ends_the_run(sheet, elastic):
+    """Also where every vertex is held, and its place known all the time."""
+    solver = solver_of(sheet, elastic, held=tuple(range(25)))
+    x, height = flat(sheet), jnp.linspace(0, 0.5, 60)[None, :, None, None]
+    path = x[None, None] + height * jnp.array([[[[0.0, 0.0, 1.0]]]])
+    moved = r2s.simulate(solver, elastic, solver.init(x), Control(path, jnp.zeros((1, 60, 3))))
+    assert moved.failure == Failure.GRID and not moved.ok[0]
+    assert int(moved.failed_step) == int(jnp.argmax(path[0, :, 0, 2] > solver_top(solver)))
+
+
+def solver_top(solver):
+    """The greatest height [m] of a particle in the grid."""
+    grid = solver.background.grid
+    return float(grid.lower[2]) + (grid.shape[2] - 1.5) * grid.spacing

@@ -5,7 +5,6 @@ Needs cma: pip install 'r2s[cma]'.
 
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,6 +18,7 @@ from r2s.estimation.gauss_newton import Problems, loss_at, theta_indices, theta_
 from r2s.estimation.method import ANY, Budget, Method, Progress
 from r2s.estimation.normal_equations import Loss
 from r2s.estimation.problem import Problem
+from r2s.extras import require
 
 DIVERGED = 1.0  # [m^2]: the loss of a run that diverged, above that of any that did not
 WIDTH = 0.25  # of the unit cube: the first standard deviation
@@ -40,7 +40,7 @@ class CMAES(Method):
     several = True
 
     def _estimate(self, recordings, space, budget, key):
-        _cma()
+        require("cma", "cma", "CMA-ES")  # before anything is simulated
         if self.chosen_solver == "points":
             problems = problems_on_points(recordings, space, self.shape)
         else:
@@ -78,7 +78,7 @@ def search(
         "verbose": -9,
         "CMA_stds": [1.0] * space.dim + [2.0] * len(moved),
     }
-    strategy = _cma().CMAEvolutionStrategy(first, WIDTH, options)
+    strategy = require("cma", "cma", "CMA-ES").CMAEvolutionStrategy(first, WIDTH, options)
     losses, history, best = [], [], (np.inf, first)
     while not strategy.stop():
         asked = np.array(strategy.ask())
@@ -105,14 +105,6 @@ def search(
         time.perf_counter() - began,
         converged=any(name in strategy.stop() for name in ARRIVED),
     )
-
-
-def _cma() -> Any:
-    try:
-        import cma
-    except ImportError as error:
-        raise ImportError("CMA-ES needs cma: pip install 'r2s[cma]'") from error
-    return cma
 
 
 def _unit(dim: int, proposal: np.ndarray) -> Array:

@@ -51,7 +51,7 @@ class Estimate:
       that gives none. The ranges count as a flat prior.
     - `correlation`: of the parameters, [-].
     - `nuisances`: quantities of the recordings that were not known exactly.
-    - `loss`: at the estimate, [m^2]; of PhysNet a distance on its map, [-].
+    - `loss`: at the estimate, in its `loss_unit`: of PhysNet a distance on its map, [-].
     - `losses`, `history`: loss and parameters of every iteration and start. The losses of two
       stages of a descent do not compare: each counts other frames, or leaves outliers out.
     - `seconds`: how long it took, compilation included.
@@ -71,6 +71,7 @@ class Estimate:
     history: np.ndarray
     seconds: float
     converged: bool | None
+    loss_unit: str = "m^2"
 
     @property
     def at_bounds(self) -> dict[str, Literal["lower", "upper"]]:
@@ -133,6 +134,7 @@ def point_estimate(
     history: np.ndarray,
     seconds: float,
     converged: bool = False,
+    loss_unit: str = "m^2",
 ) -> Estimate:
     """An estimate at a `place` of the space's unit cube, from a method without standard errors.
 
@@ -152,6 +154,7 @@ def point_estimate(
         history=history,
         seconds=seconds,
         converged=converged,
+        loss_unit=loss_unit,
     )
 
 

@@ -45,7 +45,7 @@ def as_json(estimate: Estimate) -> dict[str, Any]:
             for each in estimate.nuisances
         ],
         "loss": _finite_or_none(estimate.loss),
-        "loss_unit": "m^2",
+        "loss_unit": estimate.loss_unit,
         "seconds": estimate.seconds,
         "losses": _nested(estimate.losses),
         "history": _nested(estimate.history),
@@ -83,6 +83,7 @@ def from_json(stored: dict[str, Any]) -> Estimate:
         history=_numbers(stored.get("history", [])),
         seconds=stored["seconds"],
         converged=stored["converged"],
+        loss_unit=stored["loss_unit"],
     )
 
 

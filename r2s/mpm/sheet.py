@@ -164,7 +164,9 @@ class Sheet(eqx.Module):
         v = v.at[held].set(carried)
         moved = state.x + dt * v
         failure = failure_of_step(self.background.grid, state.x, moved, (fabric, control))
-        x = self.background.project(moved).at[held].set(control.handles)
+        inside = self.background.grid.inside(control.handles)[:, None]
+        handles = jnp.where(inside, control.handles, jnp.nan)
+        x = self.background.project(moved).at[held].set(handles)
         failure = first_failure(state.failure, failure)
         return SheetState(x, v, C, d, failure), impulse / dt
 

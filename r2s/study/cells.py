@@ -44,7 +44,7 @@ class Cell:
         """What people call it; need not be unique."""
 
     @property
-    def alike(self) -> str:
+    def compilation_group(self) -> str:
         """The group of the cell. Those of one group compile once, and run one after the other."""
         return self.kind
 
@@ -97,7 +97,7 @@ def execute(cell: Cell, folder: Path) -> None:
     path = cell.path(folder)
     if cell.is_made(folder):
         return
-    began, spent = time.perf_counter(), time.process_time()
+    began, cpu_began = time.perf_counter(), time.process_time()
     with tempfile.TemporaryDirectory(prefix="r2s-") as scratch:
         noted = cell.make(folder, Path(scratch))
         metadata = {
@@ -108,7 +108,7 @@ def execute(cell: Cell, folder: Path) -> None:
             "config": repr(cell),
             "versions": VERSIONS,
             "seconds": time.perf_counter() - began,
-            "cpu_seconds": time.process_time() - spent,
+            "cpu_seconds": time.process_time() - cpu_began,
             "peak_memory_MB": _peak_memory(),  # of the process so far
             **noted,
         }

@@ -98,7 +98,7 @@ class Workers:
         # asked of the scheduler: the client's own list is emptied by its refresh now and then.
         # None yet where jobs wait in a queue: then any worker will do.
         workers = sorted(self._client.nthreads())
-        home = self._homes.setdefault(cell.alike, len(self._homes))
+        home = self._homes.setdefault(cell.compilation_group, len(self._homes))
         future = self._client.submit(
             attempt,
             cell,

@@ -36,7 +36,7 @@ def costs(cells: Iterable[Cell], folder: Path) -> list[Cost]:
     groups = defaultdict(list)
     for cell in with_dependencies(cells):
         if cell.is_made(folder):
-            groups[cell.alike].append(read_metadata(cell, folder))
+            groups[cell.compilation_group].append(read_metadata(cell, folder))
     return [
         Cost(
             group=group,
@@ -66,7 +66,9 @@ def forecast(costs: Sequence[Cost], plan: Plan) -> Table:
     seconds = {cost.group: cost.each for cost in costs}
     counts: dict[str, int] = defaultdict(int)
     for cell in with_dependencies(synthetic(plan)):
-        counts[cell.alike] += len(cell.recordings) if isinstance(cell, EvaluationCell) else 1
+        counts[cell.compilation_group] += (
+            len(cell.recordings) if isinstance(cell, EvaluationCell) else 1
+        )
     hours = {group: seconds.get(group, math.nan) * count / 3600 for group, count in counts.items()}
     total = sum(value for value in hours.values() if not math.isnan(value))
     lines = [

@@ -48,11 +48,11 @@ class Serial:
 
     def finished(self) -> Iterator[tuple[Cell, str]]:
         while self._waiting:
-            alike = (i for i, (cell, _) in enumerate(self._waiting) if cell.alike == self._last)
-            index = next(alike, 0)
+            groups = [cell.compilation_group for cell, _ in self._waiting]
+            index = groups.index(self._last) if self._last in groups else 0
             cell, folder = self._waiting[index]
             del self._waiting[index]
-            self._last = cell.alike
+            self._last = cell.compilation_group
             yield cell, self.make(cell, folder)
 
     def make(self, cell: Cell, folder: Path) -> str:

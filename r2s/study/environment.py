@@ -3,6 +3,8 @@
 import os
 from pathlib import Path
 
+from r2s.extras import require
+
 ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 LOOK = 0.1  # [s], to see which core is idle
 
@@ -24,10 +26,7 @@ def one_core(number: int | None = None) -> None:
         return
     cores = sorted(os.sched_getaffinity(0))
     if number is None:
-        try:
-            import psutil
-        except ImportError as error:
-            raise ImportError("to see idle cores needs psutil: pip install 'r2s[cli]'") from error
+        psutil = require("psutil", "cli", "the search for an idle core")
         busy = dict(enumerate(psutil.cpu_percent(interval=LOOK, percpu=True)))
         # some containers show their cores' times under other numbers
         number = min(range(len(cores)), key=lambda i: busy.get(cores[i], 0.0))

@@ -55,7 +55,7 @@ class TrainedNetwork(Cell):
 
     solver: str
     scenario: str
-    spent: Budgets = Budgets()
+    budgets: Budgets = Budgets()
     seed: int = 0
 
     @property
@@ -64,8 +64,8 @@ class TrainedNetwork(Cell):
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
         """A trained network; the simulated images are not kept."""
-        spent = TrainingBudget(self.spent.fabrics, self.spent.epochs, self.spent.steps)
-        trained = train_network(out / NETWORK, self.scenario, self.solver, spent, self.seed)
+        budget = TrainingBudget(self.budgets.fabrics, self.budgets.epochs, self.budgets.steps)
+        trained = train_network(out / NETWORK, self.scenario, self.solver, budget, self.seed)
         return {"seed": self.seed, "triplet_accuracy": trained.curve[-1].accuracy}
 
 
@@ -88,7 +88,7 @@ class EstimateCell(Cell):
     fabric: str
     sources: tuple[Source, ...]
     density: float
-    spent: Budgets = Budgets()
+    budgets: Budgets = Budgets()
     network: TrainedNetwork | None = None
     repeat: int = 0
 
@@ -109,7 +109,7 @@ class EstimateCell(Cell):
         return f"{self.approach}_{self.solver}_{self.scenario}_{self.fabric}_{self.repeat}"
 
     @property
-    def alike(self) -> str:
+    def compilation_group(self) -> str:
         return f"estimates {self.approach} {self.solver} {self.scenario}"
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
@@ -141,19 +141,19 @@ class EstimateCell(Cell):
         return METHODS[self.approach](solver=self.solver, shape=SHAPES[self.solver], **others)
 
     def _budget(self) -> Budget:
-        spent, usual = self.spent, METHODS[self.approach].budget
+        budgets, usual = self.budgets, METHODS[self.approach].budget
         numbers = {
             "diffcloud": {
-                "coarse": spent.coarse,
-                "starts": spent.starts,
-                "iterations": spent.iterations,
+                "coarse": budgets.coarse,
+                "starts": budgets.starts,
+                "iterations": budgets.iterations,
             },
             "diffcp": {
-                "coarse": spent.points_coarse,
-                "starts": spent.points_starts,
-                "iterations": spent.points_iterations,
+                "coarse": budgets.points_coarse,
+                "starts": budgets.points_starts,
+                "iterations": budgets.points_iterations,
             },
-            "physnet": {"evaluations": spent.calls},
+            "physnet": {"evaluations": budgets.calls},
             "pinn": {},
         }
         return usual._replace(**numbers[self.approach])

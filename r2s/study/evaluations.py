@@ -75,7 +75,7 @@ class EvaluationCell(Cell):
         return f"{whose}_on_{on}{self.scenario}_{self.recordings[0].name.split('_')[-1]}"
 
     @property
-    def alike(self) -> str:
+    def compilation_group(self) -> str:
         return f"evaluations {self.solver} {self.scenario}"
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
@@ -129,10 +129,10 @@ def predict(recordings: list[Recording], fabric: Fabric, solver: str) -> list[Mo
     """
     scenarios = [from_recording(recording) for recording in recordings]
     most = max(scenario.substeps for scenario in scenarios)
-    alike = [dataclasses.replace(scenario, substeps=most) for scenario in scenarios]
-    sheet = _points(alike, fabric) if solver == "points" else None
+    in_equal_steps = [dataclasses.replace(scenario, substeps=most) for scenario in scenarios]
+    sheet = _points(in_equal_steps, fabric) if solver == "points" else None
     motions = []
-    for scenario in alike:
+    for scenario in in_equal_steps:
         own = sheet and eqx.tree_at(lambda s: s.scene, sheet, scenario.scene)
         motions.append(prediction_error.predict_motion(scenario, fabric, own))
     return motions

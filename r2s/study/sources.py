@@ -85,7 +85,7 @@ class SyntheticRecording(Cell):
         return f"{self.scenario}_{self.fabric}{turned}_{'u' * self.unseen}{self.number}"
 
     @property
-    def alike(self) -> str:
+    def compilation_group(self) -> str:
         return f"recordings {self.scenario}"
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:

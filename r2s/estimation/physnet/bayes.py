@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from r2s.estimation import checkpoint
+from r2s.extras import require
 
 Objective = Callable[[Float[np.ndarray, "place dim"]], Float[np.ndarray, " place"]]
 UNKNOWN_PENALTY = 1.0  # of a failed call while no loss is finite
@@ -188,13 +189,10 @@ def _most_promising(
 
 def _process(dim: int, random: Any = None, kernel: Any = None) -> Any:
     """A Gaussian process whose kernel is given, or is to be fitted."""
-    try:
-        from skopt.learning import GaussianProcessRegressor
-        from skopt.learning.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
-    except ImportError as error:
-        raise ImportError(
-            "Bayesian optimisation needs scikit-optimize: pip install 'r2s[physnet]'"
-        ) from error
+    require("skopt", "physnet", "Bayesian optimisation")
+    from skopt.learning import GaussianProcessRegressor
+    from skopt.learning.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
+
     make: Any = GaussianProcessRegressor  # its annotations lack some of its arguments
     if kernel is not None:
         return make(kernel, optimizer=None, normalize_y=True)

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from r2s.estimation import checkpoint
 from r2s.estimation.physnet.bayes import CENTRES, candidates, even
+from r2s.extras import require
 
 COMPONENTS = 10  # principal components of the answers, at most
 FIRST = 0.4  # share of the calls that fill the cube evenly
@@ -121,11 +122,10 @@ def _misfit(places, answers, target, variance: float) -> Callable[[np.ndarray], 
 
 def _process(places: np.ndarray, values: np.ndarray) -> Any:
     """A Gaussian process fitted to one component."""
-    try:
-        from sklearn.gaussian_process import GaussianProcessRegressor
-        from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
-    except ImportError as error:
-        raise ImportError("the search needs scikit-learn: pip install 'r2s[physnet]'") from error
+    require("sklearn", "physnet", "the search")
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
     smooth = ConstantKernel(1.0, (0.1, 100.0)) * RBF([1.0] * places.shape[1], (0.2, 20.0))
     process = GaussianProcessRegressor(smooth + WhiteKernel(1e-2, (1e-4, 1.0)), normalize_y=True)
     with warnings.catch_warnings():  # that a length or the noise is at its bound

@@ -240,4 +240,5 @@ def _estimate(sighting: Sighting, name: str, places, losses, best: int, began: f
         losses[:, None],
         values[:, None],
         time.perf_counter() - began,
+        loss_unit="-",
     )
