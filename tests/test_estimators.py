@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.estimation import adam, cma_es, descent, diffcloud, gauss_newton
+from r2s.estimation import adam, cma_es, descent, diffcloud, gauss_newton, identifiability
 from r2s.estimation.descent import Budget, descend
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.estimate_json import as_json, from_json
@@ -245,6 +245,21 @@ def test_an_estimate_lowers_the_loss_and_survives_its_file(estimated):
     names = ["density ratio", "air ratio", "shift x", "shift y", "shift z", "turn", "time"]
     assert [c.name for c in again.nuisances] == names
     assert again.nuisances == found.nuisances and again.combinations == found.combinations
+
+
+@pytest.mark.slow(group="estimates")
+def test_a_profile_rises_from_the_estimate(small):
+    """To both sides of it, although all other parameters follow."""
+    budget = Budget(coarse=0, starts=1, iterations=12, around=0)
+    place = FAMILY.to_unit(FABRIC)
+    found = descend(small, budget, start=place, key=jr.key(0))
+    value = float(found.values[0])
+    values = value * np.array([0.1, 1.0, 10.0])
+    losses = identifiability.profile(small, found, "warp", values)
+    assert losses[1] == pytest.approx(found.loss, rel=0.02)
+    assert losses[0] > 1.02 * losses[1] and losses[2] > 1.02 * losses[1]
+    with pytest.raises(ValueError, match="no parameter 'C99': the estimate has warp"):
+        identifiability.profile(small, found, "C99", values)
 
 
 def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(small, estimated, tmp_path):
