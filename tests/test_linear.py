@@ -10,6 +10,7 @@ from r2s.cloth.linear.dissection import levels
 from r2s.cloth.linear.elimination import Elimination
 from r2s.cloth.linear.factor import factor, solve
 from r2s.cloth.linear.pattern import assemble, dense, pinned, product
+from r2s.cloth.linear.system import Far, apply_inverse, prepare
 from r2s.geometry.mesh import Mesh, rectangle
 
 
@@ -140,3 +141,34 @@ def test_a_solution_is_transposed_by_itself(problem):
 
     (back,) = jax.linear_transpose(run, right)(other)
     assert np.asarray(back) == pytest.approx(np.asarray(run(other)), rel=1e-8, abs=1e-10)
+
+
+@pytest.mark.parametrize("is_definite", [True, False])
+def test_couplings_outside_of_the_pattern_are_solved_and_transposed(is_definite):
+    """Springs between far places, a hundred times as stiff as the sheet; two vertices are held."""
+    mesh = rectangle((1.0, 1.0), (5, 5))
+    equations = Elimination.make(mesh)
+    random = np.random.default_rng(0)
+    roots = random.normal(size=(len(mesh.hinges), 12, 12))
+    hinges = jnp.asarray((roots @ roots.transpose(0, 2, 1)).reshape(-1, 4, 3, 4, 3))
+    blocks = assemble(equations.pattern, jnp.tile(jnp.eye(3), (25, 1, 1)), hinges=hinges)
+    spring = 30 * random.normal(size=(2, 12))
+    matrices = jnp.asarray(np.einsum("pi,pj->pij", spring, spring).reshape(-1, 4, 3, 4, 3))
+    far = Far(jnp.array([[0, 1, 23, 24], [2, 3, 20, 21]]), matrices)
+    free = jnp.ones(25, bool).at[jnp.array([0, 12])].set(False)
+    system = prepare(equations, blocks, far, free, is_definite)
+
+    def run(b):
+        return apply_inverse(equations, system, b, is_definite)
+
+    right, other = jnp.asarray(random.normal(size=(2, 25, 3)))
+    both = free[equations.pattern.rows] & free[equations.pattern.columns]
+    x = jnp.where(free[:, None], jax.jit(run)(right), 0)
+    force = product(equations.pattern, jnp.where(both[:, None, None], blocks, 0), x) + far.times(x)
+    left = np.asarray(jnp.where(free[:, None], force - right, 0))
+    assert np.linalg.norm(left) < 1e-7 * np.linalg.norm(right)
+    (back,) = jax.linear_transpose(run, right)(other)
+    assert float(jnp.vdot(back, right)) == pytest.approx(
+        float(jnp.vdot(other, run(right))), rel=1e-6
+    )
+    assert np.all(np.asarray(run(jnp.zeros_like(right))) == 0)

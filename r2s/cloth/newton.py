@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
+from r2s.cloth.linear.pattern import raise_diagonal
 from r2s.cloth.linear.system import System, apply_inverse, prepare
 from r2s.cloth.potential import IncrementalPotential, far_couplings, hessian, potential, residual
 from r2s.failures import Failure
@@ -17,6 +18,7 @@ Positions = Float[Array, "vertex 3"]
 CONVEX_ITERATIONS = 3  # before the exact Hessian is tried
 SLOW = 0.6  # a step that is longer than this much of the one before calls for the exact Hessian,
 STALE = 0.6  # and longer than this much for new factors
+FIRST_SHIFT, LAST_SHIFT = 10, 1e-2  # of the diagonal: in units of its rounding; at most
 SHORTEST, LONGEST = 1e-6, 64.0  # fractions of a Newton step that are tried
 SAVED = "positions"  # what a checkpointed rollout keeps of a step
 
@@ -30,6 +32,7 @@ class _Search(NamedTuple):
     is_stale: Bool[Array, ""]  # whether the next step needs new factors
     blend: Float[Array, ""]  # share of the exact Hessian in them
     limit: Float[Array, ""]  # blend at which it may be indefinite
+    shift: Float[Array, ""]  # share of the diagonal that is added, where rounding spoils factors
     count: Array
 
 
@@ -65,7 +68,7 @@ def _newton(tolerance, max_iterations, step, start, free):
     def iterate(state: _Search) -> _Search:
         system = jax.lax.cond(
             state.is_stale,
-            lambda: prepare(elimination, *_second(step, state.x, state.blend), free),
+            lambda: prepare(elimination, *_second(step, state.x, state.blend, state.shift), free),
             lambda: state.system,
         )
         direction = -apply_inverse(elimination, system, state.force)
@@ -77,7 +80,8 @@ def _newton(tolerance, max_iterations, step, start, free):
         # a search that found nothing has not arrived
         moved = jnp.where(length > 0, length * full, full)
         # where even the convex stand-in gives no direction it is NaN, and the loop ends
-        moved = jnp.where(usable, moved, jnp.where(state.blend == 0, full, state.moved))
+        is_lost = (state.blend == 0) & (state.shift > LAST_SHIFT)
+        moved = jnp.where(usable, moved, jnp.where(is_lost, full, state.moved))
         is_slow = (moved > SLOW * state.moved) & (state.count >= CONVEX_ITERATIONS)
         blend = jnp.where(is_slow, (state.blend + state.limit) / 2, state.blend)
         return _Search(
@@ -89,6 +93,7 @@ def _newton(tolerance, max_iterations, step, start, free):
             is_stale=~usable | (length != 1) | (moved > STALE * state.moved),
             blend=jnp.where(usable, jnp.minimum(blend, 1), state.blend / 2),
             limit=jnp.where(usable, jnp.minimum(1.2 * state.limit, 2), state.blend),
+            shift=_next_shift(state, usable),
             count=state.count + 1,
         )
 
@@ -114,6 +119,7 @@ def _begin(step, start, free, evaluate) -> _Search:
         is_stale=jnp.ones((), bool),
         blend=zero,
         limit=zero + 2,
+        shift=zero,
         count=jnp.zeros((), int),
     )
 
@@ -126,9 +132,18 @@ def _failure(found: _Search, tolerance: float) -> Int[Array, ""]:
     return jnp.where(converged, Failure.NONE.value, reason)
 
 
-def _second(step, x, blend: Array | float = 1.0):
-    """The second derivative [N/m] of the potential, or its convex stand-in."""
-    return hessian(step, x, blend), far_couplings(step, x)
+def _next_shift(state: _Search, usable: Array) -> Array:
+    """More of it where rounding made the convex stand-in indefinite, less where it did not."""
+    least = FIRST_SHIFT * jnp.finfo(state.shift.dtype).eps
+    more = jnp.where(state.blend == 0, jnp.maximum(4 * state.shift, least), state.shift)
+    less = jnp.where(state.shift > least, state.shift / 2, 0)
+    return jnp.where(usable, less, more)
+
+
+def _second(step, x, blend: Array | float = 1.0, shift: Array | float = 0.0):
+    """The second derivative [N/m] of the potential, or its convex stand-in, its diagonal raised."""
+    blocks = raise_diagonal(step.elimination.pattern, hessian(step, x, blend), shift)
+    return blocks, far_couplings(step, x)
 
 
 class _Length(NamedTuple):

@@ -107,6 +107,14 @@ def pinned(
     return blocks.at[pattern.diagonal].add(held, unique_indices=True)
 
 
+def raise_diagonal(
+    pattern: Pattern, blocks: Float[Array, "block 3 3"], share: Float[Array, ""] | float
+) -> Float[Array, "block 3 3"]:
+    """The blocks with the diagonal of the matrix raised by a share [-] of itself."""
+    raised = 1 + share * jnp.eye(3, dtype=blocks.dtype)
+    return blocks.at[pattern.diagonal].multiply(raised, unique_indices=True)
+
+
 def product(
     pattern: Pattern, blocks: Float[Array, "block 3 3"], x: Float[Array, "vertex 3"]
 ) -> Float[Array, "vertex 3"]:

@@ -6,6 +6,7 @@ factors precondition.
 """
 
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -81,32 +82,46 @@ def apply_inverse(
     """
     if system.far is None:
         return solve(elimination.levels, system.factors, right)
-    shape = jax.ShapeDtypeStruct(right.shape, right.dtype)
-    epsilon = float(jnp.finfo(right.dtype).eps)
-    tags: list[object] = [lx.symmetric_tag]
-    if is_definite:
-        tags.append(lx.positive_semidefinite_tag)
-        tolerance = epsilon**0.5 / 10
-        solver = lx.CG(rtol=tolerance, atol=0.0, norm=jnp.linalg.norm, max_steps=ITERATIONS)
-    else:
-        solver = lx.GMRES(
-            rtol=50 * epsilon,
-            atol=0.0,
-            norm=jnp.linalg.norm,
-            max_steps=ITERATIONS,
-            restart=RESTART,
-            stagnation_iters=RESTART,
+    matrix, factors = (
+        lx.FunctionLinearOperator(
+            function,
+            jax.ShapeDtypeStruct(right.shape, right.dtype),
+            frozenset([lx.symmetric_tag, lx.positive_semidefinite_tag][: 1 + is_definite]),
         )
-    matrix = lx.FunctionLinearOperator(
-        partial(_times, elimination.pattern, system), shape, frozenset(tags)
+        for function in (
+            partial(_times, elimination.pattern, system),
+            partial(solve, elimination.levels, system.factors),
+        )
     )
-    factors = lx.FunctionLinearOperator(
-        partial(solve, elimination.levels, system.factors), shape, frozenset(tags)
+    solver = _conjugate_gradients(right.dtype) if is_definite else _gmres(right.dtype)
+
+    def solved(_, right):
+        options = {"preconditioner": factors}
+        # of unit size, for an absolute tolerance: a relative one is NaN at the zeros of held rows
+        size = jnp.linalg.norm(right)
+        unit = right / jnp.where(size > 0, size, 1)
+        x = size * lx.linear_solve(matrix, unit, solver, options=options, throw=False).value
+        left = jnp.linalg.norm(right - matrix.mv(x))
+        return jnp.where(left <= TOLERATED * jnp.linalg.norm(right), x, jnp.nan)
+
+    # the check of what is left is not linear: only from outside is the whole
+    return jax.lax.custom_linear_solve(matrix.mv, right, solved, solved, symmetric=True)
+
+
+def _conjugate_gradients(dtype: Any) -> lx.CG:
+    tolerance = float(jnp.finfo(dtype).eps) ** 0.5 / 10
+    return lx.CG(rtol=0.0, atol=tolerance, norm=jnp.linalg.norm, max_steps=ITERATIONS)
+
+
+def _gmres(dtype: Any) -> lx.GMRES:
+    return lx.GMRES(
+        rtol=0.0,
+        atol=50 * float(jnp.finfo(dtype).eps),
+        norm=jnp.linalg.norm,
+        max_steps=ITERATIONS,
+        restart=RESTART,
+        stagnation_iters=RESTART,
     )
-    options = {"preconditioner": factors}
-    x = lx.linear_solve(matrix, right, solver, options=options, throw=False).value
-    left = jnp.linalg.norm(right - matrix.mv(x))
-    return jnp.where(left <= TOLERATED * jnp.linalg.norm(right), x, jnp.nan)
 
 
 def _times(pattern: Pattern, system: System, x: Vector) -> Vector:
