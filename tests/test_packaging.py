@@ -76,9 +76,20 @@ def commands_of(document: Path) -> list[str]:
     return [command for command in found if not re.search(r"recordings|diffcloud", command)]
 
 
+def heed_interrupts() -> None:
+    """In a child: what runs in a shell's background inherits that they are ignored."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def run_until_shown(command: str, **about) -> None:
     """A command that shows a page until it is interrupted."""
-    process = subprocess.Popen(shlex.split(command), stdout=subprocess.PIPE, text=True, **about)
+    process = subprocess.Popen(
+        shlex.split(command),
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=heed_interrupts,
+        **about,
+    )
     assert process.stdout is not None
     try:
         for line in process.stdout:
