@@ -205,7 +205,7 @@ def test_a_killed_training_goes_on_from_its_checkpoint(tmp_path):
             checkpoint=file,
             key=jr.key(5),
         )
-        with pytest.raises(ValueError, match="another recording, space or setting"):
+        with pytest.raises(ValueError, match="is of another run"):
             train(spaces, pulls, few, checkpoint=file, key=jr.key(6))
     assert made == [3]
     np.testing.assert_array_equal(resumed.places, whole.places)

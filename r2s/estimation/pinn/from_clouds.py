@@ -190,7 +190,7 @@ def estimate(
     theta = least_squares(terms, theta, settings.begin, inside=clipped(space.dim)).parameters
     found = _rounds(shared, sight, held, theta, recording.info.sheet.held, settings, report)
     in_wind = recording.info.wind is not None
-    alike = len(frames) if in_wind else max(1.0, ALIKE * len(frames) / _counted(recording))
+    alike = float(len(frames)) if in_wind else max(1.0, ALIKE * len(frames) / _counted(recording))
     words = f"clouds of {recording.info.scenario}"
     return _estimate(words, space, found, alike, time.perf_counter() - began)
 
