@@ -96,7 +96,7 @@ WHERE = {  # what to differ, and by how much [in its unit]
     "thickness": (lambda i: i.fabric.thickness, 1e-8),
     "mass damping": (lambda i: i.fabric.mass_damping, 1e-5),
     "positions": (lambda i: i.x, 1e-9),
-    "velocities": (lambda i: i.v, 1e-7),
+    "velocities": (lambda i: i.v, 1e-6),
     "path": (lambda i: i.path, 1e-8),
     "table height": (lambda i: i.height, 1e-8),
     "wind": (lambda i: i.wind, 1e-5),

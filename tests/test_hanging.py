@@ -23,6 +23,7 @@ def bent(rest, radius):
     return jnp.stack([radius * jnp.sin(angle), rest[:, 1], radius * (1 - jnp.cos(angle))], axis=1)
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_flat_sheet_is_laid_onto_a_cylinder_without_stretch():
     """An isometry: points of the bent sheet, and the length of every edge, say where it is."""
     mesh = rectangle((SIDE, SIDE), (9, 9))

@@ -66,6 +66,7 @@ def free_port():
         return tried.getsockname()[1]
 
 
+@pytest.mark.slow(group="documents")
 def test_the_error_is_the_distance_to_dense_samples_of_the_sheet(recording, subject):
     moved = subjects.move(subject, subjects.place(subject, presets.black_denim()))
     first, last = subject.frames_used

@@ -119,6 +119,7 @@ def test_a_sheet_thrown_at_another_does_not_tunnel(speed):
     assert np.min(states.x[:, 16:, 2]) > 1e-4  # a step of 5 m/s is 83 mm
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_layer_rests_on_another_with_its_weight():
     mesh, x = two_sheets(0.9e-3)
     solver = with_self_contact(cloth(mesh, held=range(16)))

@@ -184,6 +184,7 @@ def test_deviations_are_from_the_frames_on_which_places_agree(lifted, monkeypatc
     assert np.max(np.abs(np.diag(half) / np.diag(whole) - 1)) > 0.1
 
 
+@pytest.mark.slow(group="estimates")
 def test_an_estimate_says_what_was_in_doubt(lifted):
     """And places around its end have a say in its deviations alone."""
     budget = Budget(coarse=0, starts=1, iterations=1, around=0)

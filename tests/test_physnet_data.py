@@ -35,6 +35,7 @@ def sighting(folder):
     return Sighting.make(scenario, images, frames, TINY.space, untrained)
 
 
+@pytest.mark.slow(group="physnet")
 def test_holds_what_the_settings_say(folder):
     data, manifest = dataset.load(folder), dataset.load_manifest(folder)
     assert data.depth.shape == (6, 2, 16, 16) and data.places.shape == (3, 7)
@@ -82,6 +83,7 @@ def test_ranges_are_those_of_the_family_unless_given():
     assert float(narrow.space.values(jnp.ones(2))[0]) == pytest.approx(20)
 
 
+@pytest.mark.slow(group="physnet")
 def test_the_distance_is_least_at_the_fabric_that_was_seen(sighting, folder):
     truth = jnp.asarray(dataset.load(folder).places[0])
     rough, soft = truth.at[6].set(1 - truth[6]), truth.at[2].set(1 - truth[2])

@@ -51,6 +51,7 @@ def trained(data):
         return training.train(training.begin(VIEW, SMALL, SHORT), data)
 
 
+@pytest.mark.slow(group="physnet")
 def test_learns_to_tell_unseen_classes_apart(data, trained):
     _, validation = training.divide(data, SHORT)
     untrained = training.begin(VIEW, SMALL, SHORT).network

@@ -84,6 +84,7 @@ def test_grippers_bear_the_weight(shaken):
     assert held[0, 0] == pytest.approx(held[0, 1] * [-1, 1, 1], abs=0.05 * weight)
 
 
+@pytest.mark.slow(group="motions")
 @pytest.mark.parametrize("kind", ["cloth", "points"])
 def test_a_uniaxial_pull_has_the_force_of_the_law(kind):
     """Without Poisson's effect and friction: C11 E11 (1 + strain) on the width, E11 Green's."""

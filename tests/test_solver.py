@@ -26,6 +26,7 @@ def loss(sheet, fabric):
     return make
 
 
+@pytest.mark.slow(group="cloth")
 def test_what_is_kept_does_not_change_the_gradient(loss, fabric):
     kept, solved = (eqx.filter_jit(jax.grad(loss(3, keep)))(fabric) for keep in (True, False))
     for a, b in zip(jax.tree.leaves(kept), jax.tree.leaves(solved), strict=True):

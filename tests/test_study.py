@@ -222,6 +222,7 @@ def test_an_estimate_is_made_once_and_judged(tiny, tmp_path):
     assert lines["evaluations cloth fling"][1:] == ("not measured", "-")
 
 
+@pytest.mark.slow(group="study")
 def test_an_estimate_that_diverges_is_a_result(tiny, tmp_path, monkeypatch):
     cells, _ = tiny
 

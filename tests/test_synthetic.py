@@ -38,6 +38,7 @@ def recording():
     return synthetic.lift(presets.grey_interlock(), "grey", 1, key=jr.key(0))
 
 
+@pytest.mark.slow(group="motions")
 def test_the_same_key_gives_the_same_recording(recording):
     again = synthetic.lift(presets.grey_interlock(), "grey", 1, key=jr.key(0))
     np.testing.assert_array_equal(recording.points, again.points)

@@ -308,6 +308,7 @@ def test_derivatives_of_a_step_agree_with_differences(sheet):
     assert found == pytest.approx(np.array(expected), rel=1e-4, abs=1e-7)
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_sheet_of_equal_rows_moves_like_one_of_constant_stiffness(sheet):
     solver = cloth(sheet, FIRST_ROW)
     state = solver.init(1.02 * flat(sheet))
