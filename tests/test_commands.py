@@ -231,6 +231,7 @@ def test_a_run_that_diverges_says_why(
     assert re.search(f"the simulation {FAILED}", capsys.readouterr().out)
 
 
+@pytest.mark.slow(group="documents")
 def test_a_recording_that_cannot_be_simulated_says_why(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

@@ -80,6 +80,7 @@ def test_the_error_is_the_distance_to_dense_samples_of_the_sheet(recording, subj
     assert float(subjects.error_used(subject, moved)) == pytest.approx(expected, abs=1e-3)
 
 
+@pytest.mark.slow(group="documents")
 def test_the_true_fabric_is_nearest_and_a_softer_one_hangs_lower(subject):
     truth = subjects.place(subject, presets.grey_interlock())
 

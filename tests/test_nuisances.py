@@ -62,6 +62,7 @@ def test_heavier_stiffer_and_in_denser_air_a_sheet_moves_alike(blown):
     assert float(jnp.max(jnp.abs(heavier - plain))) > 5e-3
 
 
+@pytest.mark.slow(group="estimates")
 def test_the_air_is_in_doubt_where_a_wind_blows(blown, lifted):
     assert (
         blown.nuisance_prior == NuisancePrior(air=0.1) and lifted.nuisance_prior == NuisancePrior()

@@ -46,6 +46,7 @@ def test_holds_what_the_settings_say(folder):
     assert not np.array_equal(data.depth[0], data.depth[1])  # motions differ
 
 
+@pytest.mark.slow(group="physnet")
 def test_goes_on_where_it_stopped_with_the_same_bytes(folder):
     before = dataset.load_manifest(folder)
     kept = (folder / "0000.npz").stat().st_mtime_ns
@@ -93,6 +94,7 @@ def test_the_distance_is_least_at_the_fabric_that_was_seen(sighting, folder):
     assert np.isnan(found[3])
 
 
+@pytest.mark.slow(group="physnet")
 def test_an_estimate_goes_on_and_is_the_last_of_what_was_tried(sighting, tmp_path):
     pytest.importorskip("sklearn")
     path = tmp_path / "trials.npz"

@@ -60,6 +60,7 @@ def test_learns_to_tell_unseen_classes_apart(data, trained):
     assert trained.curve[-1].loss < 0.7 * trained.curve[0].loss
 
 
+@pytest.mark.slow(group="physnet")
 def test_an_interrupted_training_makes_the_same_numbers(data, trained, tmp_path):
     path = tmp_path / "training.eqx"
     taught, validation = training.divide(data, SHORT)

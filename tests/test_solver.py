@@ -33,6 +33,7 @@ def test_what_is_kept_does_not_change_the_gradient(loss, fabric):
         assert np.asarray(a) == pytest.approx(np.asarray(b), rel=1e-9, abs=1e-15)
 
 
+@pytest.mark.slow(group="cloth")
 def test_memory_is_predicted_without_a_run(loss, fabric):
     short, long = (predicted_memory(jax.grad(loss(frames, True)), fabric) for frames in (3, 43))
     # 40 frames more: four arrays of the state, and the solutions of two steps, 25 x 3 float64 each
