@@ -48,7 +48,7 @@ class Trajectory(eqx.Module):
     """A motion, and whether and where it failed. Under `jax.vmap` every field has a batch axis.
 
     - `x`: positions at the end of every frame, [m].
-    - `ok`: whether they are finite; False from the frame on in which a run failed.
+    - `ok`: whether they are finite and nothing failed; False from the frame on in which a run did.
     - `failure`: why, an `r2s.failures.Failure`; 0: it did not fail.
     - `failed_frame`, `failed_step`: the frame, and the step in it, of the first failure; -1: none.
     """
@@ -110,7 +110,8 @@ def simulate(
     frame = jax.checkpoint(frame, policy=policy)
 
     _, (x, failures) = jax.lax.scan(frame, start, controls)
-    ok = jnp.all(jnp.isfinite(x), axis=(1, 2))
+    unfailed = jnp.all(failures == Failure.NONE.value, axis=1)
+    ok = jnp.all(jnp.isfinite(x), axis=(1, 2)) & jnp.cumprod(unfailed).astype(bool)
     return Trajectory(x, ok, *_first_failure(failures))
 
 

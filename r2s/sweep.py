@@ -61,9 +61,9 @@ def stream(
       depends on is not looked at: take another folder for another function.
     - `devices`: a mesh with the axis "member"; by default all devices of all processes.
 
-    What diverges is in the results (NaN, or `ok = False`), and stops nothing as long as the
-    environment variable EQX_ON_ERROR was "nan" when equinox was imported. Raises `ValueError` for
-    arrays of different lengths, or none.
+    What diverges is in the results, and stops nothing: NaN, and of a `r2s.Trajectory`, if the
+    function returns it, `ok` and the reason. Raises `ValueError` for arrays of different lengths,
+    or none.
     """
     devices = all_devices() if devices is None else devices
     count = _length(members)

@@ -156,6 +156,11 @@ def test_physnet_trains_its_network_once(recording, tmp_path, monkeypatch):
             found[name] = method.estimate([recording], SPACE, Budget(evaluations=9), key=jr.key(0))
             others["training_budget"] = TrainingBudget(0)  # what is there is not trained again
     assert not list(tmp_path.glob("*.images"))
+    blown = dataclasses.replace(
+        recording, info=dataclasses.replace(recording.info, scenario="wind")
+    )
+    with pytest.raises(ValueError, match="trained for lifting on cloth, .* one for wind on cloth"):
+        METHODS["physnet"](**others).estimate([blown], SPACE, key=jr.key(0))
     for name, each in found.items():
         assert each.approach.startswith("physnet") and each.losses.shape == (9, 1), name
         assert each.loss_unit == "-"

@@ -19,6 +19,7 @@ CONVEX_ITERATIONS = 3  # before the exact Hessian is tried
 SLOW = 0.6  # a step that is longer than this much of the one before calls for the exact Hessian,
 STALE = 0.6  # and longer than this much for new factors
 FIRST_SHIFT, LAST_SHIFT = 10, 1e-2  # of the diagonal: in units of its rounding; at most
+LEAST_BLEND = 1e-3  # of the exact Hessian: below it the convex stand-in is tried alone
 SHORTEST, LONGEST = 1e-6, 64.0  # fractions of a Newton step that are tried
 SAVED = "positions"  # what a checkpointed rollout keeps of a step
 
@@ -91,14 +92,16 @@ def _newton(tolerance, max_iterations, step, start, free):
             moved=moved,
             system=system,
             is_stale=~usable | (length != 1) | (moved > STALE * state.moved),
-            blend=jnp.where(usable, jnp.minimum(blend, 1), state.blend / 2),
-            limit=jnp.where(usable, jnp.minimum(1.2 * state.limit, 2), state.blend),
+            blend=jnp.where(usable, jnp.minimum(blend, 1), _less(state.blend)),
+            limit=jnp.where(usable, jnp.minimum(1.2 * state.limit, 2), _limit(state)),
             shift=_next_shift(state, usable),
             count=state.count + 1,
         )
 
     def unfinished(state: _Search):
-        goes_on = (state.moved > tolerance) & (state.count < max_iterations)
+        # a raised diagonal shortens steps: what is short with one may be far from the minimum
+        is_raised = state.shift > FIRST_SHIFT * jnp.finfo(state.shift.dtype).eps
+        goes_on = ((state.moved > tolerance) | is_raised) & (state.count < max_iterations)
         return goes_on & jnp.isfinite(state.value)
 
     found = jax.lax.while_loop(unfinished, iterate, _begin(step, start, free, evaluate))
@@ -130,6 +133,16 @@ def _failure(found: _Search, tolerance: float) -> Int[Array, ""]:
     reason = jnp.where(jnp.isfinite(found.value), reason, Failure.NON_FINITE.value)
     converged = (found.moved <= tolerance) & jnp.isfinite(found.value)
     return jnp.where(converged, Failure.NONE.value, reason)
+
+
+def _less(blend: Array) -> Array:
+    """Half of the exact Hessian's share; none where little is left."""
+    return jnp.where(blend > LEAST_BLEND, blend / 2, 0)
+
+
+def _limit(state: _Search) -> Array:
+    """The blend at which the Hessian was found indefinite; the convex stand-in is only rounded."""
+    return jnp.where(state.blend > 0, state.blend, state.limit)
 
 
 def _next_shift(state: _Search, usable: Array) -> Array:

@@ -29,7 +29,8 @@ class EstimateCard:
 
     RECORDING is an NPZ of r2s, a folder of them, or a folder of frames with its manifest; several
     are taken for the same fabric. Says whether the method converged, and which numbers ended at a
-    bound of their range. A killed run goes on where it was, from FILE.progress.npz.
+    bound of their range. A killed run of diffcloud, diffcp, physnet, or pinn from pulls goes on
+    where it was, from FILE.progress.npz.
 
     diffcloud differentiates through the cloth, diffcp through material points, cma-es tries fabrics
     on either. pinn fits a network to the markers and force of stretchings, or to the clouds of
@@ -66,8 +67,8 @@ class EstimateCard:
     """pinn: from each pull to the warp; by default 0."""
     network: Annotated[Path | None, arg(metavar="FILE")] = None
     """physnet: its trained network; by default that of --out with .network."""
-    shape: tuple[int, int] = (9, 9)
-    """Vertices of the simulated sheet."""
+    shape: tuple[int, int] | None = None
+    """Vertices of the simulated sheet (9 9)."""
     seed: int = 0
     """Of the coarse search or the network."""
     date: str = ""
@@ -124,11 +125,13 @@ class EstimateCard:
         for name, value in own.items():
             if value and name not in known:
                 raise ValueError(f"--{name} is not of {self.method}")
+        if self.shape is not None and not kind.takes_shape:
+            raise ValueError(f"--shape is not of {self.method}: its sheet is its own")
         if self.network is None:
             own["network"] = self.out.with_name(f"{self.out.name}.network")
         return kind(
             solver=self.solver,
-            shape=self.shape,
+            shape=self.shape or (9, 9),
             checkpoint=self._progress_file,
             progress=progress,
             **{name: value for name, value in own.items() if name in known},

@@ -27,23 +27,20 @@ class Evaluate:
     json: Json = False
 
     def run(self) -> int:
-        import equinox as eqx
-
         from r2s.commands.common import load_card, print_result
         from r2s.evaluation import prediction_error
         from r2s.recordings.open import open_recordings
-        from r2s.scenarios.scenario import from_recording, rollout
+        from r2s.scenarios.scenario import from_recording
 
         card, found, failures, lines = load_card(self.fabric), {}, {}, []
         for recording in open_recordings(self.recordings):
-            x = prediction_error.predict(recording, card.fabric)
-            metrics = prediction_error.against_motion(recording, x)
+            motion = prediction_error.predict_motion(from_recording(recording), card.fabric)
+            metrics = prediction_error.against_motion(recording, motion.x)
             name = recording.info.name
             found[name] = metrics
             lines += [f"{name}:", *(_line(metric, value) for metric, value in metrics.items())]
             if math.isnan(metrics["chamfer_real_to_sim"]):
-                motion = eqx.filter_jit(rollout)(from_recording(recording), card.fabric)
-                failures[name] = motion.explain()
+                failures[name] = motion.failure
                 lines.append(f"    the simulation {failures[name]}")
         if not found:
             raise ValueError("no recording: name an NPZ, or a folder that holds some")

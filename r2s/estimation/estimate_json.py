@@ -24,7 +24,7 @@ def as_json(estimate: Estimate) -> dict[str, Any]:
     )
     for bound, value, standard_error, identifiable in rows:
         parameters[bound.name] = {
-            "value": float(value),
+            "value": _finite_or_none(value),
             "unit": bound.unit,
             "standard_error": _finite_or_none(standard_error),
             "standard_error_is": "relative" if bound.log else "absolute",
@@ -41,7 +41,11 @@ def as_json(estimate: Estimate) -> dict[str, Any]:
         "fabric": fabric_as_json(estimate.fabric),
         "combinations": [each._asdict() for each in estimate.combinations],
         "nuisances": [
-            each._asdict() | {"standard_error": _finite_or_none(each.standard_error)}
+            each._asdict()
+            | {
+                "value": _finite_or_none(each.value),
+                "standard_error": _finite_or_none(each.standard_error),
+            }
             for each in estimate.nuisances
         ],
         "loss": _finite_or_none(estimate.loss),
@@ -75,7 +79,12 @@ def from_json(stored: dict[str, Any]) -> Estimate:
         standard_errors=_numbers([p["standard_error"] for p in parameters.values()]),
         correlation=_numbers(stored["correlation"]),
         nuisances=tuple(
-            Nuisance(**each | {"standard_error": _number(each["standard_error"])})
+            Nuisance(
+                each["name"],
+                each["unit"],
+                _number(each["value"]),
+                _number(each["standard_error"]),
+            )
             for each in stored["nuisances"]
         ),
         loss=_number(stored["loss"]),

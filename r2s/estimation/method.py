@@ -65,6 +65,7 @@ class Method(abc.ABC):
     - `supports`: solver by solver the scenarios that it estimates from; None: all of them.
     - `refusals`: solver by solver why it does not support it.
     - `several`: whether it takes more than one recording of a fabric.
+    - `takes_shape`: whether the `shape` of its simulated sheet can be chosen.
 
     Of one instance:
 
@@ -80,6 +81,7 @@ class Method(abc.ABC):
     supports: ClassVar[Mapping[str, tuple[str, ...] | None]]
     refusals: ClassVar[Mapping[str, str]] = {}
     several: ClassVar[bool] = False
+    takes_shape: ClassVar[bool] = True
 
     solver: str | None = None
     shape: tuple[int, int] = (9, 9)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from r2s.estimation.method import default_space
+from r2s.estimation.registry import METHODS
 from r2s.fabrics import presets
 from r2s.scenarios.paths import ESTIMATION, EVALUATION
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
@@ -33,8 +34,7 @@ FULL = PAPER_CONFIGURATIONS + tuple(
     for solver in solvers
     for scenario in ESTIMATED_FROM
     if (approach, solver, scenario) not in PAPER_CONFIGURATIONS
-    # the network's maps of lifts and winds are balanced as an orthotropic sheet alone
-    and not (approach == "pinn" and solver == "points" and scenario != "stretching")
+    and not METHODS[approach].refusal(solver, scenario)
 )
 """The configurations of the paper, and those that it calls unsupported."""
 

@@ -60,7 +60,8 @@ def train_network(
     images = path.with_name(f"{path.name}.images")
     view = dataset.make(images, settings, progress=progress).view
     schedule = training.Schedule(epochs=budget.epochs, steps=budget.steps, seed=seed)
-    begun = training.load(path) if path.exists() else training.begin(view, schedule=schedule)
+    begun = training.begin(view, schedule=schedule)._replace(data=f"{scenario} on {solver}")
+    begun = training.load(path) if path.exists() else begun
     trained = training.train(
         begun, dataset.load(images), path, progress=_print_epoch if progress else None
     )
@@ -86,6 +87,7 @@ class PhysNetMethod(Method):
     heeds = ("evaluations",)
     supports = {"cloth": ANY, "points": ANY}
     library: ClassVar[str] = "sklearn"
+    takes_shape = False
 
     network: Path | None = None
     training_budget: TrainingBudget = TrainingBudget()
@@ -94,7 +96,7 @@ class PhysNetMethod(Method):
         if importlib.util.find_spec(self.library) is None:
             raise ImportError(f"{self.name} needs {self.library}: pip install 'r2s[physnet]'")
         recording, solver = recordings[0], self.chosen_solver
-        trained = self._trained(recording)
+        trained = self._trained(recording, seed_of(key))
         scenario = from_recording(recording, NETWORK_SHAPE[solver])
         frames = dataset.kept_frames(recording.info.frames_used, dataset.Settings.num_frames)
         images = preprocess.of_clouds(trained.view, recording, frames)
@@ -103,11 +105,17 @@ class PhysNetMethod(Method):
         seen = estimator.Sighting.make(scenario, images, frames, space, trained, simulator)
         return self._search(seen, budget.evaluations, seed_of(key))
 
-    def _trained(self, recording: Recording) -> training.Training:
+    def _trained(self, recording: Recording, seed: int) -> training.Training:
         if self.network is None:
             raise ValueError("PhysNet needs a file for its trained network")
         if self.network.exists():
             trained = training.load(self.network)
+            needed = f"{recording.info.scenario} on {self.chosen_solver}"
+            if trained.data not in ("", needed):
+                raise ValueError(
+                    f"{self.network}: the network was trained for {trained.data}, the recording "
+                    f"needs one for {needed}: name another file"
+                )
             if len(trained.curve) >= trained.schedule.epochs:
                 return trained
         return train_network(
@@ -115,6 +123,7 @@ class PhysNetMethod(Method):
             recording.info.scenario,
             self.chosen_solver,
             self.training_budget,
+            seed=seed,
             progress=self.progress is not None,
         )
 

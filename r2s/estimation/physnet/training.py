@@ -78,13 +78,17 @@ class Row(NamedTuple):
 
 
 class Training(NamedTuple):
-    """The state of a training. With the data it determines the next epoch."""
+    """The state of a training. With the data it determines the next epoch.
+
+    - `data`: what the data show, such as "lifting on cloth"; "" where a file does not say.
+    """
 
     network: PhysNet
     optimiser: Any
     schedule: Schedule
     view: View
     curve: tuple[Row, ...]
+    data: str = ""
 
 
 def begin(view: View, architecture: Architecture = DEEPER, schedule: Schedule | None = None):
@@ -213,6 +217,7 @@ def save(training: Training, path: Path | str) -> None:
         "schedule": asdict(training.schedule),
         "view": asdict(training.view),
         "curve": training.curve,
+        "data": training.data,
     }
     buffer = io.BytesIO()
     buffer.write(json.dumps(header).encode() + b"\n")
@@ -247,7 +252,8 @@ def load(path: Path | str, expected: Architecture | None = None) -> Training:
         except Exception as error:  # a damaged file raises anything
             raise ValueError(f"{path}: damaged: {error}") from error
     curve = tuple(Row(*row) for row in header["curve"])
-    return empty._replace(network=network, optimiser=optimiser, curve=curve)
+    data = header.get("data", "")
+    return empty._replace(network=network, optimiser=optimiser, curve=curve, data=data)
 
 
 def _tuples(values: dict[str, Any]) -> dict[str, Any]:

@@ -36,6 +36,7 @@ class PINN(Method):
     supports = {"cloth": ANY, "points": ("stretching",)}
     refusals = REFUSALS
     several = True
+    takes_shape = False
 
     angles: tuple[float, ...] = ()
 
@@ -79,6 +80,7 @@ class PublishedPINN(Method):
     heeds = ("iterations",)
     supports = {"cloth": ("stretching",), "points": ("stretching",)}
     several = True
+    takes_shape = False
 
     angles: tuple[float, ...] = ()
 
