@@ -102,7 +102,7 @@ def _newton(tolerance, max_iterations, step, start, free):
         # a raised diagonal shortens steps: what is short with one may be far from the minimum
         is_raised = state.shift > FIRST_SHIFT * jnp.finfo(state.shift.dtype).eps
         goes_on = ((state.moved > tolerance) | is_raised) & (state.count < max_iterations)
-        return goes_on & jnp.isfinite(state.value)
+        return goes_on & jnp.isfinite(state.value) & ~jnp.isnan(state.moved)
 
     found = jax.lax.while_loop(unfinished, iterate, _begin(step, start, free, evaluate))
     code = _failure(found, tolerance)
