@@ -54,6 +54,7 @@ def dropped(air: float = 0.0, brake: float | None = None) -> Scenario:
     )
 
 
+@pytest.mark.slow(group="motions")
 def test_a_sheet_that_is_let_go_falls_freely_from_the_first_step_on(fabric):
     scenario = dropped()
     corner = 8  # farthest from the held one, which it does not feel yet

@@ -105,9 +105,10 @@ def ran(name: str, recording, space, solver=None, **others):
 
 
 DIFFCLOUD = pytest.param("diffcloud", marks=pytest.mark.slow(group="estimates"))
+CMA_ES = pytest.param("cma-es", marks=pytest.mark.slow(group="estimates"))
 
 
-@pytest.mark.parametrize("name", [DIFFCLOUD, "cma-es"])
+@pytest.mark.parametrize("name", [DIFFCLOUD, CMA_ES])
 def test_a_method_keeps_the_contract_on_the_cloth(recording, name):
     if name == "cma-es":
         pytest.importorskip("cma")

@@ -68,6 +68,7 @@ def fabric_of(setting, damping):
     return Fabric(setting.density, *laws, jnp.asarray(damping), zero, thickness, zero)
 
 
+@pytest.mark.slow(group="motions")
 @pytest.mark.parametrize("path", recordings("edge_*"))
 def test_a_sheet_hung_by_its_edge_has_its_rest_shape(path):
     setting, recorded = load(path)

@@ -139,7 +139,7 @@ engine.run(cells, Path({folder!r}), engine.Serial())
 """
 
 
-@pytest.mark.parametrize("after", [0.1, 0.25])
+@pytest.mark.parametrize("after", [pytest.param(0.1, marks=pytest.mark.slow(group="study")), 0.25])
 def test_a_run_that_was_killed_goes_on(tmp_path, after):
     code = STUDY.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
     killed = subprocess.Popen([sys.executable, "-c", code])

@@ -92,6 +92,7 @@ def test_the_true_fabric_is_nearest_and_a_softer_one_hangs_lower(subject):
     assert softer.x[-1, :, 2].min() <= at(truth).x[-1, :, 2].min() + 1e-4
 
 
+@pytest.mark.slow(group="documents")
 def test_without_a_recording_there_is_no_error():
     experiment = lifting(num_frames=3, moving=0.1)
     subject = subjects.of_experiment(experiment, OrthotropicSpace.make(0.2), (3, 3))

@@ -108,7 +108,7 @@ def test_a_corner_folded_over_passes_through_nothing():
     assert max(through[1]) == 0
 
 
-@pytest.mark.parametrize("speed", [1.0, 5.0])
+@pytest.mark.parametrize("speed", [pytest.param(1.0, marks=pytest.mark.slow(group="cloth")), 5.0])
 def test_a_sheet_thrown_at_another_does_not_tunnel(speed):
     mesh, x = two_sheets(0.02)
     solver = with_self_contact(cloth(mesh, held=range(16), dt=1 / 60))
@@ -140,7 +140,9 @@ def test_a_layer_rests_on_another_with_its_weight():
     assert jnp.sum(push, axis=0) == pytest.approx(0, abs=1e-9 * weight)  # action is reaction
 
 
-@pytest.mark.parametrize("friction", [0.1, 1.0])
+@pytest.mark.parametrize(
+    "friction", [pytest.param(0.1, marks=pytest.mark.slow(group="cloth")), 1.0]
+)
 def test_friction_between_layers_is_that_of_coulomb(friction):
     mesh, x = two_sheets(0.96647e-3)  # where it carries the weight
     fabric = Fabric.make(0.2, (600.0, 10.0, 600.0, 200.0), 1e-4, friction=friction)

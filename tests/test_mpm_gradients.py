@@ -217,7 +217,7 @@ def test_a_gradient_needs_a_tenth_of_the_memory_of_all_states():
 @pytest.mark.parametrize(
     "name, law",
     [
-        ("fcr", FixedCorotated),
+        pytest.param("fcr", FixedCorotated, marks=pytest.mark.slow(group="points")),
         pytest.param("nh", NeoHookean, marks=pytest.mark.slow(group="points")),
     ],
 )

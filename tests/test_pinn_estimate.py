@@ -217,6 +217,7 @@ def test_the_papers_weight_anneals():
     np.testing.assert_allclose(published_recipe.weight(epochs), [0.1, 0.1, 0.2, 0.9, 1.0, 1.0])
 
 
+@pytest.mark.slow(group="pinn")
 def test_the_papers_recipe_runs_and_sees_no_force(monkeypatch):
     monkeypatch.setattr(published_recipe, "LAYERS", 3)
     monkeypatch.setattr(published_recipe, "WIDTH", 5)
@@ -227,6 +228,7 @@ def test_the_papers_recipe_runs_and_sees_no_force(monkeypatch):
     assert course.data.shape == (2,) and np.isfinite(course.motion).all()
 
 
+@pytest.mark.slow(group="pinn")
 def test_a_step_that_went_astray_is_taken_back(monkeypatch):
     """To the model before it and without memory, when the losses are greater than they were."""
     monkeypatch.setattr(published_recipe, "LAYERS", 3)
@@ -246,6 +248,7 @@ def test_a_step_that_went_astray_is_taken_back(monkeypatch):
     assert np.isinf(state.before)
 
 
+@pytest.mark.slow(group="pinn")
 def test_the_gradient_made_along_with_the_sum_is_that_of_the_sum():
     """Of the recipe's loss of the motion, in the networks and the fabric of two pulls."""
     pulls = published_recipe.plain(stacked([even_pull(frames=4), even_pull(frames=4)]))

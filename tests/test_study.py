@@ -260,6 +260,7 @@ def test_a_wrong_call_says_what_is_wrong_and_writes_nothing(
     assert not out.exists()
 
 
+@pytest.mark.slow(group="study")
 def test_an_estimate_without_memory_is_missing_and_no_divergence(tiny, tmp_path, monkeypatch):
     estimated = tiny[0][0].estimate
 
