@@ -59,6 +59,9 @@ def crossings(mesh: Mesh, x) -> int:
     return int(np.sum(~shared & (at > 0) & (at < 1) & (u > 0) & (v > 0) & (u + v < 1)))
 
 
+SLIPPERY = pytest.param(0.1, marks=pytest.mark.slow(group="cloth"))
+
+
 def as_if_large(mesh: Mesh) -> SelfContact:
     """As they are made for a large mesh."""
     return SelfContact(build_bvh(np.asarray(mesh.faces), np.asarray(mesh.rest)), 256)
