@@ -115,12 +115,10 @@ class EstimateCard:
 
     def _method(self, progress: "Progress | None") -> "Method":
         """The method with the fields that were asked for; `ValueError` for one that it lacks."""
-        from dataclasses import fields
-
         from r2s.estimation.registry import METHODS
 
         kind = METHODS[self.method]
-        known = {field.name for field in fields(kind)}
+        known = kind.options()
         own: dict[str, Any] = {"angles": self.angles, "network": self.network}
         for name, value in own.items():
             if value and name not in known:

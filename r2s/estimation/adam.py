@@ -14,6 +14,7 @@ from r2s.estimation.estimate import Estimate, point_estimate
 from r2s.estimation.gauss_newton import Problems, loss_at, theta_length
 from r2s.estimation.method import Progress
 from r2s.estimation.normal_equations import Loss
+from r2s.estimation.prediction import explain
 from r2s.estimation.problem import Problem
 
 EDGE = 1e-3  # of the unit cube: beyond it the sigmoid's slope is lost
@@ -60,7 +61,10 @@ def descend(
             progress(epoch, min(losses))
     history = np.stack([np.asarray(space.values(place)) for place in places])
     if not np.isfinite(losses[0]):
-        raise RuntimeError(f"{approach}: the simulation diverged at the start, {history[0]}")
+        nothing = jnp.zeros(theta_length(problems[:1]) - space.dim, float)
+        why = explain(problems[0], jnp.concatenate([places[0], nothing]))
+        why = why or "has a loss that is not finite"
+        raise RuntimeError(f"{approach}: the simulation of the start, {history[0]}, {why}")
     best = int(np.argmin(np.where(np.isfinite(losses), losses, np.inf)))
     return point_estimate(
         approach,

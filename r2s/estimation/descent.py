@@ -17,7 +17,7 @@ from r2s.estimation import gauss_newton, standard_errors
 from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
 from r2s.estimation.method import Budget, Progress
-from r2s.estimation.prediction import fabric_at
+from r2s.estimation.prediction import explain, fabric_at
 from r2s.estimation.problem import OWN, SHARED, UNITS, Problem, beginning
 
 INITIAL_DAMPING = 1e-2
@@ -107,9 +107,11 @@ def _begin(problems: Problems, budget: Budget, start, key) -> Row:
     if budget.coarse:
         losses = losses_of(_seen(problems, budget, 0), thetas)
         if not np.any(np.isfinite(losses)):
+            theta = thetas[0, theta_indices(problems, 0)]
             raise RuntimeError(
-                f"all {count} simulations of the coarse search diverged: check the recording's "
-                "units and gripper path, or narrow the space's ranges"
+                f"all {count} simulations of the coarse search diverged, the first "
+                f"{explain(problems[0], theta)} Check the recording's units and gripper path, or "
+                "narrow the space's ranges."
             )
         thetas = thetas[np.argsort(losses)]
     return _fresh(problems, budget, list(thetas[: budget.starts]), 0.0, 0)

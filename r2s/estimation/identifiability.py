@@ -13,6 +13,7 @@ from r2s.estimation import descent, gauss_newton
 from r2s.estimation.descent import Budget
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import Descent, Problems
+from r2s.estimation.prediction import explain
 from r2s.estimation.problem import Problem
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace, Range
@@ -35,7 +36,9 @@ def sensitivity(problems: Problem | Problems, fabric: Fabric) -> Estimate:
     scale = jnp.asarray(NOISE, float)
     normal = _normal(problems, theta, scale)
     if not np.isfinite(float(normal.loss)):
-        raise RuntimeError("the simulation of the motion diverged")
+        which = gauss_newton.theta_indices(problems, 0)
+        why = explain(problems[0], theta[which]) or "has a loss that is not finite"
+        raise RuntimeError(f"the simulation of the motion {why}")
     zero = jnp.zeros((), float)
     end = Descent(theta, normal, zero, zero, scale, jnp.zeros((), int))
     key = jax.random.key(0)

@@ -7,6 +7,7 @@ checkpoint, a trained network) are its fields. `r2s.estimation.registry.METHODS`
 """
 
 import abc
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -120,6 +121,12 @@ class Method(abc.ABC):
     def chosen_solver(self) -> str:
         """The solver of this instance, or the first that the method supports."""
         return self.solver or next(iter(self.supports))
+
+    @classmethod
+    def options(cls) -> frozenset[str]:
+        """Names of the fields that this method has beside those of all methods."""
+        own = {field.name for field in dataclasses.fields(cls)}
+        return frozenset(own - {field.name for field in dataclasses.fields(Method)})
 
     @classmethod
     def refusal(cls, solver: str, scenario: str) -> str:

@@ -129,9 +129,17 @@ def _secants(moved, place, width: float, dim: int):
     return jax.tree.map(slope, outs), (first, jnp.all(ok))
 
 
-def _move(problem: Problem, theta: Theta):
-    """Vertices at all frames [m] and the clamp's force at those that count [N]; whether finite."""
-    fabric = fabric_at(problem, theta)
+def explain(problem: Problem, theta: Theta) -> str:
+    """Say why the run at a theta fails, in which frame and step; "" where it does not.
+
+    It is simulated once more: for an error, not for a search.
+    """
+    scenario, fabric, solver = _conditions(problem, theta)
+    return eqx.filter_jit(rollout)(scenario, fabric, solver=solver).explain()
+
+
+def _conditions(problem: Problem, theta: Theta):
+    """Scenario, fabric and solver (None: the cloth) at a theta."""
     ratio = jnp.exp(problem.nuisance_prior.air * theta[problem.space.dim + 1])
 
     def thicken(part):
@@ -139,8 +147,13 @@ def _move(problem: Problem, theta: Theta):
             lambda part: part.scene.air.density, part, replace_fn=lambda density: density * ratio
         )
 
-    scenario = thicken(problem.scenario)
     solver = None if problem.solver is None else thicken(problem.solver)
+    return thicken(problem.scenario), fabric_at(problem, theta), solver
+
+
+def _move(problem: Problem, theta: Theta):
+    """Vertices at all frames [m] and the clamp's force at those that count [N]; whether finite."""
+    scenario, fabric, solver = _conditions(problem, theta)
     if problem.force is None:
         moved = rollout(scenario, fabric, solver=solver)
         return (moved.x, None), jnp.all(moved.ok)

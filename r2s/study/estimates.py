@@ -1,6 +1,7 @@
 """Cells that estimate: each approach from each scenario, on either solver."""
 
 import json
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -26,24 +27,13 @@ SOLVERS = {name: tuple(METHODS[name].supports) for name in APPROACHES}
 
 @dataclass(frozen=True)
 class Budgets:
-    """What estimates may cost.
+    """What estimates may cost: by approach, and the training of PhysNet's network."""
 
-    - `coarse`, `starts`, `iterations`: of DIFFCLOUD, see `r2s.estimation.method.Budget`.
-    - `points_coarse`, `points_starts`, `points_iterations`: likewise of DiffCP.
-    - `calls`: simulations of PhysNet's search.
-    - `fabrics`, `epochs`, `steps`: of the training of its network.
-    """
-
-    coarse: int = 24
-    starts: int = 3
-    iterations: int = 25
-    points_coarse: int = 12
-    points_starts: int = 2
-    points_iterations: int = 25
-    calls: int = 80
-    fabrics: int = 512
-    epochs: int = 9
-    steps: int = 80
+    diffcloud: Budget = METHODS["diffcloud"].budget
+    diffcp: Budget = METHODS["diffcp"].budget
+    physnet: Budget = METHODS["physnet"].budget
+    pinn: Budget = METHODS["pinn"].budget
+    training: TrainingBudget = TrainingBudget()
 
 
 @dataclass(frozen=True)
@@ -55,7 +45,7 @@ class TrainedNetwork(Cell):
 
     solver: str
     scenario: str
-    budgets: Budgets = Budgets()
+    budget: TrainingBudget = TrainingBudget()
     seed: int = 0
 
     @property
@@ -64,8 +54,7 @@ class TrainedNetwork(Cell):
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
         """A trained network; the simulated images are not kept."""
-        budget = TrainingBudget(self.budgets.fabrics, self.budgets.epochs, self.budgets.steps)
-        trained = train_network(out / NETWORK, self.scenario, self.solver, budget, self.seed)
+        trained = train_network(out / NETWORK, self.scenario, self.solver, self.budget, self.seed)
         return {"seed": self.seed, "triplet_accuracy": trained.curve[-1].accuracy}
 
 
@@ -88,7 +77,7 @@ class EstimateCell(Cell):
     fabric: str
     sources: tuple[Source, ...]
     density: float
-    budgets: Budgets = Budgets()
+    budget: Budget
     network: TrainedNetwork | None = None
     repeat: int = 0
 
@@ -126,37 +115,17 @@ class EstimateCell(Cell):
         return {"seed": self.repeat, "diverged": ""}
 
     def _estimated(self, recordings, space, folder: Path) -> Estimate:
-        key, budget = jr.key(self.repeat), self._budget()
-        if self.approach != "physnet":
-            return self._method().estimate(recordings, space, budget, key=key)
-        if self.network is None:
-            raise ValueError("PhysNet needs a trained network")
-        with result_files(self.network, folder) as files:
-            method = self._method(network=files / NETWORK)
-            return method.estimate(recordings, space, budget, key=key)
+        key, network = jr.key(self.repeat), self.network
+        with nullcontext() if network is None else result_files(network, folder) as files:
+            return self._method(files).estimate(recordings, space, self.budget, key=key)
 
-    def _method(self, **others: Any) -> Method:
-        if self.approach == "pinn":
-            others["angles"] = tuple(getattr(each, "angle", None) or 0.0 for each in self.sources)
-        return METHODS[self.approach](solver=self.solver, shape=SHAPES[self.solver], **others)
-
-    def _budget(self) -> Budget:
-        budgets, usual = self.budgets, METHODS[self.approach].budget
-        numbers = {
-            "diffcloud": {
-                "coarse": budgets.coarse,
-                "starts": budgets.starts,
-                "iterations": budgets.iterations,
-            },
-            "diffcp": {
-                "coarse": budgets.points_coarse,
-                "starts": budgets.points_starts,
-                "iterations": budgets.points_iterations,
-            },
-            "physnet": {"evaluations": budgets.calls},
-            "pinn": {},
-        }
-        return usual._replace(**numbers[self.approach])
+    def _method(self, network: Path | None) -> Method:
+        """The method with what it takes beside the recordings."""
+        kind = METHODS[self.approach]
+        angles = tuple(getattr(each, "angle", None) or 0.0 for each in self.sources)
+        others = {"angles": angles, "network": network and network / NETWORK}
+        taken = {name: value for name, value in others.items() if name in kind.options()}
+        return kind(solver=self.solver, shape=SHAPES[self.solver], **taken)
 
 
 def read_estimate(cell: EstimateCell, folder: Path) -> Estimate | None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from r2s.estimation.method import default_space
+from r2s.estimation.physnet.method import TrainingBudget
 from r2s.estimation.registry import METHODS
 from r2s.fabrics import presets
 from r2s.scenarios.paths import ESTIMATION, EVALUATION
@@ -80,16 +81,10 @@ SMALL = Plan(
     repeats=1,
     judged=2,
     budgets=Budgets(
-        coarse=16,
-        starts=2,
-        iterations=15,
-        points_coarse=4,
-        points_starts=1,
-        points_iterations=2,
-        calls=40,
-        fabrics=32,
-        epochs=2,
-        steps=40,
+        diffcloud=METHODS["diffcloud"].budget._replace(coarse=16, starts=2, iterations=15),
+        diffcp=METHODS["diffcp"].budget._replace(coarse=4, starts=1, iterations=2),
+        physnet=METHODS["physnet"].budget._replace(evaluations=40),
+        training=TrainingBudget(fabrics=32, epochs=2, steps=40),
     ),
     every=3,
 )
@@ -186,8 +181,8 @@ def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationCell]:
     """
     default_space("cloth", density)  # refuses a density that is none
     # clouds of real cameras need all of the search, and there are few frames to judge by
-    search = {name: getattr(Budgets, name) for name in ("coarse", "starts", "iterations")}
-    plan = dataclasses.replace(plan, budgets=dataclasses.replace(plan.budgets, **search), every=1)
+    budgets = dataclasses.replace(plan.budgets, diffcloud=METHODS["diffcloud"].budget)
+    plan = dataclasses.replace(plan, budgets=budgets, every=1)
     recordings = find_recordings(folder)
     sources = {configuration.estimated_from for configuration in plan.configurations}
     seen = [r for r in recordings if r.scenario in sources]
@@ -255,14 +250,15 @@ def _estimate(
     repeat: int,
 ) -> EstimateCell:
     approach, solver, scenario = configuration
-    budgets, network = plan.budgets, None
-    if approach == "physnet":
+    budget, network = getattr(plan.budgets, approach), None
+    if "network" in METHODS[approach].options():
+        training = plan.budgets.training
         if solver == "points":
-            fewer = min(budgets.fabrics, FEWER_FABRICS)
-            budgets = dataclasses.replace(budgets, fabrics=fewer)
-        network = TrainedNetwork(solver, scenario, budgets, plan.seed)
+            fewer = min(training.fabrics, FEWER_FABRICS)
+            training = dataclasses.replace(training, fabrics=fewer)
+        network = TrainedNetwork(solver, scenario, training, plan.seed)
     fabric = sources[0].fabric
-    return EstimateCell(approach, solver, fabric, sources, density, budgets, network, repeat)
+    return EstimateCell(approach, solver, fabric, sources, density, budget, network, repeat)
 
 
 def _by_scenario(recordings: Iterable[GivenRecording]) -> list[tuple[GivenRecording, ...]]:

@@ -196,7 +196,9 @@ def estimate(
     )
     losses = trials.losses(target_of(sighting))
     if not np.isfinite(losses[-1]):
-        raise RuntimeError("the simulation of the estimate diverged: narrow the ranges")
+        fabric = sighting.space(jnp.asarray(trials.places[-1], float))
+        moved = eqx.filter_jit(rollout)(sighting.scenario, fabric, solver=sighting.solver)
+        raise RuntimeError(f"the simulation of the estimate {moved.explain()} Narrow the ranges.")
     name = f"physnet (emulated answers, {num_calls} simulations)"
     return _estimate(sighting, name, trials.places, losses, -1, began)
 

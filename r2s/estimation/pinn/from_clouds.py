@@ -308,7 +308,7 @@ def _of_solver(recording: Recording, fabric: Fabric, sight: Sight, frames: np.nd
     moved = eqx.filter_jit(rollout)(scenario, fabric)
     x = np.asarray(moved.x, np.float64)[frames]
     if not np.isfinite(x).all():
-        raise RuntimeError(f"recording {recording.info.name}: the cloth solver diverged")
+        raise RuntimeError(f"recording {recording.info.name}: the cloth {moved.explain()}")
     local = (x - np.asarray(recording.info.sheet.origin)) @ axes_of(recording).T
     return fixed(scenario.scene.mesh.rest, sight.times, jnp.asarray(local, float), BEGIN)
 
