@@ -242,3 +242,7 @@ def test_a_recording_that_cannot_be_simulated_says_why(
     result = json.loads(capsys.readouterr().out)
     assert re.match(FAILED, result["failures"]["storm"])
     assert result["recordings"]["storm"]["chamfer_real_to_sim"] is None
+    budget = ["--shape", "3", "3", "--coarse", "1", "--starts", "1"]
+    command = ["estimate", str(tmp_path / "storm.npz"), "--density", "0.32", *budget]
+    assert main([*command, "--out", str(tmp_path / "card.json")]) != 0
+    assert re.search(f"all 1 simulations .* the first {FAILED}", capsys.readouterr().err)
