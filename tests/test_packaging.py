@@ -76,20 +76,16 @@ def commands_of(document: Path) -> list[str]:
     return [command for command in found if not re.search(r"recordings|diffcloud", command)]
 
 
-def heed_interrupts() -> None:
-    """In a child: what runs in a shell's background inherits that they are ignored."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+# what runs in a shell's background inherits that interrupts are ignored
+HEED = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); " + (
+    "os.execvp(sys.argv[1], sys.argv[1:])"
+)
 
 
 def run_until_shown(command: str, **about) -> None:
     """A command that shows a page until it is interrupted."""
-    process = subprocess.Popen(
-        shlex.split(command),
-        stdout=subprocess.PIPE,
-        text=True,
-        preexec_fn=heed_interrupts,
-        **about,
-    )
+    heeding = [sys.executable, "-c", HEED, *shlex.split(command)]
+    process = subprocess.Popen(heeding, stdout=subprocess.PIPE, text=True, **about)
     assert process.stdout is not None
     try:
         for line in process.stdout:
