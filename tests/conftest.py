@@ -23,6 +23,7 @@ import psutil
 import pytest
 
 from r2s.cloth.cloth import Cloth, ClothState
+from r2s.cloth.linear.pattern import Pattern
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.elements import hinge_angles, hinge_curvatures, strains, vertex_masses
 from r2s.geometry.mesh import Mesh, rectangle
@@ -199,3 +200,11 @@ def directional_difference(function, at, direction, size: float):
         return jax.tree.map(lambda a, d: a + sign * size * d, at, direction)
 
     return (function(moved(1)) - function(moved(-1))) / (2 * size)
+
+
+def dense(pattern: Pattern, blocks: jax.Array) -> jax.Array:
+    """The matrix with all its zeros, coordinates ordered (vertex, axis)."""
+    count = pattern.diagonal.shape[0]
+    matrix = jnp.zeros((count, 3, count, 3), blocks.dtype)
+    matrix = matrix.at[pattern.rows, :, pattern.columns, :].set(blocks)
+    return matrix.reshape(3 * count, 3 * count)

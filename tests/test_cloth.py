@@ -13,6 +13,7 @@ from conftest import (
     SHAPE,
     SIZE,
     cloth,
+    dense,
     directional_difference,
     energy,
     everywhere,
@@ -23,7 +24,6 @@ from conftest import (
 )
 
 from r2s.cloth.cloth import ClothState
-from r2s.cloth.linear.pattern import dense
 from r2s.cloth.potential import hessian, potential, residual
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.elements import vertex_masses

@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.spatial
+from conftest import dense
 
 from r2s.cloth.linear.dissection import levels
 from r2s.cloth.linear.elimination import Elimination
 from r2s.cloth.linear.factor import factor, solve
-from r2s.cloth.linear.pattern import assemble, dense, pinned, product
+from r2s.cloth.linear.pattern import assemble, pinned, product
 from r2s.cloth.linear.system import Far, apply_inverse, prepare
 from r2s.geometry.mesh import Mesh, rectangle
 

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import dense
 
 from r2s.cloth.linear.elimination import Elimination
-from r2s.cloth.linear.pattern import dense
 from r2s.cloth.linear.system import Far, apply_inverse, prepare
 from r2s.geometry.mesh import rectangle
 

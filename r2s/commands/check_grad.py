@@ -22,7 +22,7 @@ class CheckGrad:
     """
 
     scenario: Annotated[Positional[ScenarioName], arg(metavar="SCENARIO")]
-    """Of the study."""
+    """A scenario of the study."""
     fabric: FabricName = "grey_interlock"
     motion: Motion = ()
     solver: SolverName = "cloth"

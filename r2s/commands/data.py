@@ -30,7 +30,7 @@ class Fetch:
     """
 
     name: Annotated[Positional[str], arg(metavar="NAME")]
-    """Of the data set; `r2s data list` shows them."""
+    """Name of the data set; `r2s data list` shows them."""
     to: Annotated[Path, arg(metavar="FOLDER")]
     """Where it is, or shall be."""
     manifests: Manifests = None
@@ -76,7 +76,7 @@ class Convert:
     """
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
-    """Of recordings, or of one."""
+    """A folder of recordings, or of one."""
     to: Annotated[Path, arg(metavar="OUT")]
     """Where NAME.npz goes, and NAME.sha256 of what it was made from; made when it is not there."""
     only: Annotated[str, arg(metavar="REGEX")] = ""

@@ -55,7 +55,7 @@ class Doctor:
     mesh: Annotated[Path | None, arg(metavar="FILE")] = None
     """A flat triangle mesh in metres, as OBJ, PLY or STL."""
     scenario: Annotated[ScenarioName | None, arg(metavar="SCENARIO")] = None
-    """Of the study."""
+    """A scenario of the study, whose motion is checked, too."""
     motion: Motion = ()
     shape: Shape = (9, 9)
     json: Json = False

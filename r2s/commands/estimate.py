@@ -54,7 +54,7 @@ class EstimateCard:
     """What simulates: the cloth (orthotropic fabrics) or material points (isotropic ones); by
     default what the method supports."""
     name: str = ""
-    """Of the fabric; by default that of the recording."""
+    """Name of the fabric; by default that of the recording."""
     coarse: int | None = None
     """Places of the range that are tried first (diffcloud 24, diffcp 12)."""
     starts: int | None = None
@@ -70,7 +70,7 @@ class EstimateCard:
     shape: tuple[int, int] | None = None
     """Vertices of the simulated sheet (9 9)."""
     seed: int = 0
-    """Of the coarse search or the network."""
+    """Seed of the coarse search, or of the network and its search."""
     date: str = ""
     """To write on the card; r2s looks at no clock."""
     json: bool = False

@@ -31,7 +31,7 @@ class Export:
     out: Annotated[Path, arg(metavar="FILE")]
     """What is written."""
     size: tuple[float, float] = (0.3, 0.3)
-    """Of the sheet, warp and weft [m]; stiffness of edges depends on the mesh."""
+    """Sides of the sheet, warp and weft [m]; stiffness of edges depends on the mesh."""
     shape: Shape = (9, 9)
     isotropic: bool = False
     """The nearest isotropic sheet alone."""

@@ -21,14 +21,14 @@ class Sensitivity:
     """
 
     scenario: Annotated[Positional[ScenarioName], arg(metavar="SCENARIO")]
-    """Of the study."""
+    """A scenario of the study."""
     fabric: str = "grey_interlock"
     """A preset of `r2s.fabrics.presets`."""
     motion: Motion = ()
     noise: float = 1e-3
-    """Of each coordinate of a point, a standard deviation [m]."""
+    """Standard deviation of each coordinate of a point [m]."""
     seed: int = 0
-    """Of the noise."""
+    """Seed of the noise."""
     json: Json = False
 
     def run(self) -> None:

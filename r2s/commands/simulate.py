@@ -23,7 +23,7 @@ class Simulate:
     """
 
     scenario: Annotated[Positional[ScenarioName], arg(metavar="SCENARIO")]
-    """Of the study."""
+    """A scenario of the study."""
     out: Annotated[Path, arg(metavar="FILE")]
     """NPZ of the motion."""
     fabric: FabricName = "grey_interlock"
@@ -35,7 +35,7 @@ class Simulate:
     recording: Annotated[Path | None, arg(metavar="FILE")] = None
     """Also write a synthetic recording, as NPZ."""
     seed: int = 0
-    """Of the recording's noise."""
+    """Seed of the recording's noise."""
     json: Json = False
 
     def run(self) -> int:

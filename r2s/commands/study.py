@@ -44,7 +44,7 @@ class Study:
     judged: int | None = None
     """Motions to judge by, of each scenario."""
     seed: int = 0
-    """Of all that is drawn."""
+    """Seed of all that is drawn."""
     workers: int = 1
     """Processes on this machine (more than one: extra cluster)."""
     slurm: int = 0

@@ -121,13 +121,3 @@ def product(
     """The matrix times a vector."""
     parts = jnp.einsum("bij,bj->bi", blocks, x[pattern.columns])
     return jnp.zeros_like(x).at[pattern.rows].add(parts, indices_are_sorted=True)
-
-
-def dense(
-    pattern: Pattern, blocks: Float[Array, "block 3 3"]
-) -> Float[Array, "coordinate coordinate"]:
-    """The matrix with all its zeros, coordinates ordered (vertex, axis)."""
-    count = pattern.diagonal.shape[0]
-    matrix = jnp.zeros((count, 3, count, 3), blocks.dtype)
-    matrix = matrix.at[pattern.rows, :, pattern.columns, :].set(blocks)
-    return matrix.reshape(3 * count, 3 * count)
