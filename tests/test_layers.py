@@ -143,9 +143,7 @@ def test_a_layer_rests_on_another_with_its_weight():
     assert jnp.sum(push, axis=0) == pytest.approx(0, abs=1e-9 * weight)  # action is reaction
 
 
-@pytest.mark.parametrize(
-    "friction", [pytest.param(0.1, marks=pytest.mark.slow(group="cloth")), 1.0]
-)
+@pytest.mark.parametrize("friction", [SLIPPERY, 1.0])
 def test_friction_between_layers_is_that_of_coulomb(friction):
     mesh, x = two_sheets(0.96647e-3)  # where it carries the weight
     fabric = Fabric.make(0.2, (600.0, 10.0, 600.0, 200.0), 1e-4, friction=friction)

@@ -82,11 +82,10 @@ def apply_inverse(
     """
     if system.far is None:
         return solve(elimination.levels, system.factors, right)
+    tags = {lx.symmetric_tag, lx.positive_semidefinite_tag} if is_definite else {lx.symmetric_tag}
     matrix, factors = (
         lx.FunctionLinearOperator(
-            function,
-            jax.ShapeDtypeStruct(right.shape, right.dtype),
-            frozenset([lx.symmetric_tag, lx.positive_semidefinite_tag][: 1 + is_definite]),
+            function, jax.ShapeDtypeStruct(right.shape, right.dtype), frozenset(tags)
         )
         for function in (
             partial(_times, elimination.pattern, system),
