@@ -31,6 +31,12 @@ LAWS = {
     "membrane": (MEMBRANES, "N/m"),
     "bending": ((*BENDINGS, TableBending, DiffSimTableBending), "N m"),
 }
+TABLE_SHAPES = {
+    TableMembrane: (6, 4),
+    DiffSimTableMembrane: (6, 4),
+    TableBending: (3, 5),
+    DiffSimTableBending: (3, 5),
+}
 OTHER_UNITS = {"poissons_ratio": "-", "spacing": "m", "SpringBending.stiffness": "N/m"}
 
 
@@ -140,7 +146,7 @@ def _law_from(stored: Any, part: str) -> Any:
     expect(name in kinds, f"{where}: law", f"one of {', '.join(kinds)}", name)
     kind = kinds[name]  # pyright: ignore[reportArgumentType]
     check_keys(stored, ("law", *_field_names(kind)), where)
-    shape = ((6, 4) if part == "membrane" else (3, 5)) if "Table" in kind.__name__ else ()
+    shape = TABLE_SHAPES.get(kind, ())
     return kind(
         **{
             n: _value(stored[n], _unit(part, kind, n), f"{where}: {n}", shape)
