@@ -25,7 +25,7 @@ import pytest
 from r2s.cloth.cloth import Cloth, ClothState
 from r2s.cloth.linear.pattern import Pattern
 from r2s.fabrics.fabric import Fabric
-from r2s.geometry.elements import hinge_angles, hinge_curvatures, strains, vertex_masses
+from r2s.geometry.elements import strains, vertex_masses
 from r2s.geometry.mesh import Mesh, rectangle
 from r2s.units import GRAVITY
 from r2s.world.air import Air
@@ -180,9 +180,10 @@ def roll(solver: Cloth, fabric: Fabric, state: ClothState, count: int, path=None
 def stored_energy(mesh: Mesh, fabric: Fabric, x):
     """Energy [J] in the strains and curvatures of a sheet."""
     membrane = jax.vmap(fabric.membrane.energy_density)(strains(mesh, x))
-    hinges = hinge_curvatures(mesh, hinge_angles(mesh, x))
-    bending = jax.vmap(fabric.bending.energy_density)(fabric.bending.curvatures(mesh, hinges))
-    return jnp.sum(mesh.area * membrane) + jnp.sum(fabric.bending.areas(mesh) * bending)
+    bent = fabric.bending.bends(mesh).curvatures_at(x)
+    bending = jax.vmap(fabric.bending.energy_density)(fabric.bending.curvatures(mesh, bent))
+    of_bending = jnp.sum(fabric.bending.areas(mesh) * bending)
+    return jnp.sum(mesh.samples.areas.ravel() * membrane) + of_bending
 
 
 @eqx.filter_jit

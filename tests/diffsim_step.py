@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from r2s.geometry.elements import green_strain, hinge_angle, hinge_angles, hinge_curvatures
+from r2s.geometry.bends import hinge_angle
 from r2s.geometry.mesh import Mesh
+from r2s.geometry.strain_samples import green_strain
 from r2s.laws.tables import DiffSimTableBending, DiffSimTableMembrane
 
 FOLDER = Path(__file__).parents[2] / "shared" / "data" / "diffsim_reference"
@@ -173,7 +174,7 @@ def _internal(setting, x, x_before):
     """Forces [N] of membrane and bending, and minus their approximate derivative [N/m]."""
     mesh = setting.mesh
     laws = jax.vmap(setting.bending.at)(
-        mesh.hinge_direction, hinge_curvatures(mesh, hinge_angles(mesh, x_before))
+        mesh.hinge_direction, mesh.hinge_bends.curvatures_at(x_before)
     )
 
     def of_face(*element):
@@ -182,7 +183,7 @@ def _internal(setting, x, x_before):
     force = jnp.zeros(x.size)
     matrix = jnp.zeros((x.size, x.size))
     for elements, (forces, stiffness) in (
-        (mesh.faces, jax.vmap(of_face)(x[mesh.faces], mesh.inverse, mesh.area)),
+        (mesh.faces, jax.vmap(of_face)(x[mesh.faces], mesh.samples.gradients[:, 0], mesh.area)),
         (mesh.hinges, jax.vmap(_hinge)(x[mesh.hinges], laws, mesh.hinge_length, mesh.hinge_area)),
     ):
         axes = [3 * elements + axis for axis in range(3)]
@@ -192,13 +193,12 @@ def _internal(setting, x, x_before):
     return force, matrix
 
 
-def _face(table, corners, inverse, area):
-    strain = green_strain(corners, inverse)
+def _face(table, corners, shape, area):
+    strain = green_strain(corners, shape)
     law = table.at(strain)
     stress, tangent = jax.grad(law.energy_density)(strain), jax.hessian(law.energy_density)(strain)
-    jacobian = jax.jacfwd(green_strain)(corners, inverse).reshape(3, 9)
+    jacobian = jax.jacfwd(green_strain)(corners, shape).reshape(3, 9)
     tension = (tangent @ jnp.maximum(strain, 0).at[2].set(0))[:2]
-    shape = jnp.concatenate([-jnp.sum(inverse, axis=0, keepdims=True), inverse])
     geometric = jnp.kron(shape @ jnp.diag(tension) @ shape.T, jnp.eye(3))
     return -area * jacobian.T @ stress, area * (jacobian.T @ tangent @ jacobian + geometric)
 

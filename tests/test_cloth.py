@@ -195,7 +195,7 @@ def disturbed(sheet):
     both = eqx.filter_jit(lambda at, x: (matrix(at, x, 1.0), matrix(at, x, 0.0), residual(at, x)))
 
     def state(seed):
-        noise = jnp.asarray(np.random.default_rng(seed).normal(size=(4, 25, 3))) * 5e-3
+        noise = jnp.asarray(np.random.default_rng(seed).normal(size=(4, 25, 3))) * 8e-3
         x = flat(sheet, 2e-3) + noise[0]
         start = ClothState(x, 20 * noise[1], x + noise[2], 20 * noise[1])
         control = Control(x[:5], jnp.array([2.0, 1.0, -1.0]))

@@ -52,17 +52,18 @@ def problem(request):
         roots = random.normal(size=(count, 3 * corners, 3 * corners))
         return jnp.asarray((roots @ roots.transpose(0, 2, 1)).reshape(-1, corners, 3, corners, 3))
 
-    parts = elements(len(mesh.faces), 3), elements(len(mesh.hinges), 4)
+    corners = mesh.samples.corners
+    parts = elements(*corners.shape), elements(len(mesh.hinges), 4)
     vertices = jnp.tile(jnp.eye(3), (len(mesh.rest), 1, 1))
     equations = Elimination.make(mesh)
-    blocks = jax.jit(assemble)(equations.pattern, vertices, faces=parts[0], hinges=parts[1])
+    blocks = jax.jit(assemble)(equations.pattern, vertices, samples=parts[0], hinges=parts[1])
     return mesh, equations, parts, blocks
 
 
 def test_elements_add_up(problem):
     mesh, equations, parts, blocks = problem
     matrix = np.zeros((len(mesh.rest), 3, len(mesh.rest), 3))
-    for elements, matrices in zip((mesh.faces, mesh.hinges), parts, strict=True):
+    for elements, matrices in zip((mesh.samples.corners, mesh.hinges), parts, strict=True):
         for element, part in zip(np.asarray(elements), np.asarray(matrices), strict=True):
             for i, row in enumerate(element):
                 for j, column in enumerate(element):

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.geometry.mesh import Mesh, borders, corner, rectangle
+from r2s.geometry.mesh import ELEMENTS, Mesh, borders, corner, rectangle
 
 sides = st.floats(0.01, 10)
 counts = st.integers(2, 6)
@@ -62,10 +62,16 @@ def test_hinges_measure_their_edge_and_triangles(sheet):
     assert sheet.hinge_area == pytest.approx(cell**2, rel=1e-12)
 
 
-def test_inverse_takes_the_rest_edges_to_the_unit_vectors(sheet):
-    corners = sheet.rest[sheet.faces]
-    edges = jnp.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)
-    assert sheet.inverse @ edges == pytest.approx(np.tile(np.eye(2), (32, 1, 1)), abs=1e-12)
+@pytest.mark.parametrize("elements", ELEMENTS)
+@given(st.tuples(sides, sides), st.tuples(counts, counts))
+@few
+def test_samples_share_out_the_sheet_and_know_the_slope_of_a_plane(elements, size, shape):
+    samples = rectangle(size, shape, elements).samples
+    rest = rectangle(size, shape).rest
+    assert jnp.sum(samples.areas) == pytest.approx(size[0] * size[1], rel=1e-12)
+    height = rest @ jnp.array([0.3, -0.7])
+    slopes = jnp.einsum("ec,esca->esa", height[samples.corners], samples.gradients)
+    assert slopes.reshape(-1, 2) == pytest.approx(np.tile([0.3, -0.7], (slopes.size // 2, 1)))
 
 
 def test_corners_are_where_they_are_called():

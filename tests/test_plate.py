@@ -13,8 +13,7 @@ from scipy.spatial import Delaunay
 
 from r2s.cloth.potential import hessian, residual
 from r2s.fabrics.fabric import Fabric
-from r2s.geometry.elements import hinge_angles, hinge_curvatures
-from r2s.geometry.mesh import Mesh, rectangle
+from r2s.geometry.mesh import ELEMENTS, Mesh, rectangle
 from r2s.laws.plate import OrthotropicPlate, PlateBending
 from r2s.world.scene import Control
 
@@ -38,9 +37,7 @@ def irregular(seed: int = 0, count: int = 40) -> Mesh:
 
 
 MESHES = {
-    "falling": rectangle((0.2, 0.3), (5, 6)),
-    "rising": rectangle((0.2, 0.3), (5, 6), "rising"),
-    "alternating": rectangle((0.2, 0.3), (5, 6), "alternating"),
+    **{name: rectangle((0.2, 0.3), (5, 6), name) for name in ELEMENTS},
     "irregular": irregular(),
 }
 
@@ -52,11 +49,14 @@ def bent(mesh: Mesh, k11, k22, k12):
 
 
 def seen(mesh: Mesh, x):
-    return mesh.patches.curvatures(hinge_curvatures(mesh, hinge_angles(mesh, x)))
+    return mesh.plate.curvatures(mesh.plate.bends.curvatures_at(x))
 
 
-def inner_faces(mesh: Mesh):
-    """The faces with a hinge on each edge."""
+def inner_elements(mesh: Mesh):
+    """The faces with a hinge on each edge, the vertices with a cell of their own area."""
+    if len(mesh.plate.areas) == len(mesh.rest):
+        areas, twists = np.asarray(mesh.plate.areas), np.asarray(mesh.plate.to_curvature[:, 2, 2])
+        return (areas > 0.9 * areas.max()) & (twists > 0)
     corners = np.asarray(mesh.faces)
     edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]))
     _, index, count = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
@@ -68,9 +68,9 @@ def inner_faces(mesh: Mesh):
 def test_a_constant_curvature_is_seen_exactly(name, k11, k22, k12):
     mesh = MESHES[name]
     found = seen(mesh, bent(mesh, *(SLIGHT * jnp.asarray(k, float) for k in (k11, k22, k12))))
-    # downwards is positive, for hinges and faces
+    # downwards is positive
     expected = -SLIGHT * np.array([k11, k22, 2 * k12])
-    inner = inner_faces(mesh)
+    inner = inner_elements(mesh)
     assert inner.sum() > 10
     np.testing.assert_allclose(
         np.asarray(found)[inner], expected[None] + 0 * found[inner], atol=1e-9
@@ -82,7 +82,7 @@ def test_a_face_at_the_border_takes_the_least_curvature_that_its_hinges_allow():
     exact = np.linalg.norm(SLIGHT * np.array([0.4, -0.7, 0.2, 0.2]))
     k11, k22, twice = np.asarray(seen(mesh, bent(mesh, *(SLIGHT * jnp.array([0.4, -0.7, 0.2]))))).T
     found = np.sqrt(k11**2 + k22**2 + twice**2 / 2)
-    border = ~inner_faces(mesh)
+    border = ~inner_elements(mesh)
     assert border.sum() > 10 and np.all(found[border] <= exact * (1 + 1e-6))
     # faces at the sides along the warp see bending along it; those at its two ends do not
     cylinder = np.asarray(seen(mesh, bent(mesh, SLIGHT, 0.0, 0.0)))
@@ -95,13 +95,13 @@ def test_a_single_triangle_has_no_curvature():
     assert np.all(np.asarray(seen(mesh, bent(mesh, 1.0, 1.0, 0.0))) == 0)
 
 
-@pytest.mark.parametrize("name", ["falling", "rising", "irregular"])
+@pytest.mark.parametrize("name", ["quadrilaterals", "falling", "rising", "irregular"])
 @pytest.mark.parametrize("angle", [0.0, 22.5, 45.0, 90.0, 135.0])
 def test_a_plate_bends_alike_in_all_directions(name, angle):
     mesh, (c, s) = MESHES[name], (np.cos(np.radians(angle)), np.sin(np.radians(angle)))
     curvature = np.asarray(seen(mesh, bent(mesh, *(SLIGHT * jnp.array([c * c, s * s, c * s])))))
     law = PlateBending.make(2e-5, 0.3)
-    densities = jax.vmap(law.energy_density)(jnp.asarray(curvature))[inner_faces(mesh)]
+    densities = jax.vmap(law.energy_density)(jnp.asarray(curvature))[inner_elements(mesh)]
     assert densities == pytest.approx(2e-5 * SLIGHT**2 / 2, rel=1e-4)
 
 

@@ -18,13 +18,8 @@ from r2s.cloth.potential import IncrementalPotential
 from r2s.cloth.self_contact.detection import SMALL, SelfContact, colliding, touching
 from r2s.fabrics.fabric import Fabric
 from r2s.failures import Failure, first_failure, no_failure
-from r2s.geometry.elements import (
-    area_normals,
-    hinge_angles,
-    hinge_curvatures,
-    strains,
-    unwrapped,
-)
+from r2s.geometry.bends import unwrapped
+from r2s.geometry.elements import area_normals
 from r2s.world import contact
 from r2s.world.scene import Control, Scene
 
@@ -122,14 +117,15 @@ class Cloth(eqx.Module):
         """What this step minimises, without self-contact. BDF2: 2 dt v' = 3 x' - 4 x + x_before."""
         mesh = self.scene.mesh
         depth = self.scene.table.depth(state.x, fabric.thickness)
-        angles = hinge_angles(mesh, state.x)
-        angles_before = unwrapped(hinge_angles(mesh, state.x_before), angles)
-        strain, strain_before = strains(mesh, state.x), strains(mesh, state.x_before)
-        bent = hinge_curvatures(mesh, _extrapolated(angles, angles_before))
+        bends = fabric.bending.bends(mesh)
+        angles = bends.angles(state.x)
+        angles_before = unwrapped(bends.angles(state.x_before), angles)
+        strain, strain_before = (mesh.samples.strains(x) for x in (state.x, state.x_before))
+        bent = bends.curvatures(_extrapolated(angles, angles_before))
         return IncrementalPotential(
             mesh=mesh,
             fabric=fabric,
-            membrane=jax.vmap(fabric.membrane.at)(_extrapolated(strain, strain_before)),
+            membrane=jax.vmap(jax.vmap(fabric.membrane.at))(_extrapolated(strain, strain_before)),
             bending=fabric.bending.on_elements(mesh, bent),
             air=self.scene.air,
             table=self.scene.table,
@@ -137,11 +133,11 @@ class Cloth(eqx.Module):
             x_anchor=_anchor(state.x, state.x_before),
             v_anchor=_anchor(state.v, state.v_before),
             strain_anchor=_anchor(strain, strain_before),
-            curvature_anchor=hinge_curvatures(mesh, _anchor(angles, angles_before)),
+            curvature_anchor=bends.curvatures(_anchor(angles, angles_before)),
             angles=angles,
             area_normals=area_normals(mesh, state.x),
             friction_limit=fabric.friction * mesh.vertex_area * contact.pressure(depth),
-            wind=self.scene.wind_on_faces(_extrapolated(state.x, state.x_before), control.wind),
+            wind=self.scene.wind_on_elements(_extrapolated(state.x, state.x_before), control.wind),
             elimination=self.elimination,
         )
 

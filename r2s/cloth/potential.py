@@ -24,16 +24,9 @@ from r2s.cloth.linear.pattern import add_between, add_elements, assemble
 from r2s.cloth.linear.system import Far
 from r2s.cloth.self_contact.contacts import Contacts, contact_energy, contact_hessians
 from r2s.fabrics.fabric import Fabric
-from r2s.geometry.elements import (
-    curvature_per_angle,
-    green_strain,
-    hinge_angle_gradient,
-    hinge_angles,
-    hinge_curvature_gradients,
-    hinge_curvatures,
-    unwrapped,
-)
+from r2s.geometry.bends import unwrapped
 from r2s.geometry.mesh import Mesh
+from r2s.geometry.strain_samples import green_strain, green_strain_gradient
 from r2s.laws.bending import BendingLaw
 from r2s.laws.membrane import MembraneLaw
 from r2s.units import GRAVITY
@@ -51,12 +44,12 @@ class IncrementalPotential(eqx.Module):
     - `membrane`, `bending`: the fabric's laws as they stand in this step, one for each element.
     - `rate`: of the time-stepping formula, [1/s].
     - `x_anchor`, `v_anchor`: what the formula's velocity [m/s] and acceleration start from.
-    - `strain_anchor`, `curvature_anchor`: likewise for the rates of strain [-] and of the hinges'
+    - `strain_anchor`, `curvature_anchor`: likewise for the rates of strain [-] and of the bends'
       curvature [1/m].
-    - `angles`: of the hinges at the start of the step, [rad].
-    - `area_normals`: of the faces at the start of the step, [m^2].
+    - `angles`: of the bends at the start of the step, [rad].
+    - `area_normals`: of the elements at the start of the step, [m^2].
     - `friction_limit`: coefficient times normal force at the start of the step, [N].
-    - `wind`: on the faces, [m/s].
+    - `wind`: on the elements, [m/s].
     - `elimination`: how its Hessian is eliminated.
     - `contacts`: of the sheet with itself; None: it passes through itself.
     """
@@ -70,19 +63,19 @@ class IncrementalPotential(eqx.Module):
     rate: Float[Array, ""]
     x_anchor: Positions
     v_anchor: Positions
-    strain_anchor: Float[Array, "face 3"]
-    curvature_anchor: Float[Array, " hinge"]
-    angles: Float[Array, " hinge"]
-    area_normals: Float[Array, "face 3"]
+    strain_anchor: Float[Array, "element sample 3"]
+    curvature_anchor: Float[Array, " bend"]
+    angles: Float[Array, " bend"]
+    area_normals: Float[Array, "element 3"]
     friction_limit: Float[Array, " vertex"]
-    wind: Float[Array, "face 3"]
+    wind: Float[Array, "element 3"]
     elimination: Elimination
     contacts: Contacts | None = None
 
 
 def potential(step: IncrementalPotential, x: Positions) -> Float[Array, ""]:
     """The incremental potential [J] at new positions [m]."""
-    total = jnp.sum(_map(_face_energy, step, x[step.mesh.faces], *_faces(step)))
+    total = jnp.sum(_map(_element_energy, step, x[step.mesh.samples.corners], *_elements(step)))
     total += _bending_energy(step, _curvatures(step, x))
     total += jnp.sum(_map(_vertex_energy, step, x, *_vertices(step)))
     if step.contacts is None:
@@ -103,18 +96,21 @@ def hessian(
     """Second derivative [N/m] of the potential, as blocks of its pattern, but for `far_couplings`.
 
     With a `hessian_blend` of 0 it is a positive definite stand-in, whose Newton steps always
-    descend: it leaves out the second derivative of the hinge angle, and the geometric stiffness of
-    compressed directions, as is usual for cloth (Choi and Ko 2002). Between 0 and 1 it has that
+    descend: it leaves out the second derivative of the bends' angles, and the geometric stiffness
+    of compressed directions, as is usual for cloth (Choi and Ko 2002). Between 0 and 1 it has that
     fraction of these.
     """
     pattern, blend = step.elimination.pattern, jnp.asarray(hessian_blend, x.dtype)
-    faces = _map(_face_hessian, step, x[step.mesh.faces], *_faces(step), fixed=(blend,))
-    bending = {step.bending.element: _bending_hessians(step, x)}
+    corners = x[step.mesh.samples.corners]
+    samples = _map(_element_hessian, step, corners, *_elements(step), fixed=(blend,))
     vertices = _map(jax.hessian(_vertex_energy, argnums=1), step, x, *_vertices(step))
-    blocks = assemble(pattern, vertices, faces=faces, **bending)
+    bending = {step.bending.element: _bending_hessians(step, x)}
+    blocks = assemble(pattern, vertices, samples=samples, **bending)
     blocks = jax.lax.cond(
         blend > 0,
-        lambda: add_elements(blocks, pattern.hinges, blend * _angle_hessians(step, x)),
+        lambda: add_elements(
+            blocks, pattern.slots[step.bending.bend], blend * _angle_hessians(step, x)
+        ),
         lambda: blocks,
     )
     if step.contacts is None or not step.elimination.couples_all:
@@ -134,10 +130,10 @@ def _map(function: Callable, step: IncrementalPotential, *elements: Any, fixed: 
     return jax.vmap(lambda *element: function(step, *fixed, *element))(*elements)
 
 
-def _faces(step: IncrementalPotential):
-    mesh = step.mesh
-    rest = mesh.faces, step.membrane, mesh.inverse, mesh.area
-    return *rest, step.strain_anchor, step.area_normals, step.wind
+def _elements(step: IncrementalPotential):
+    samples = step.mesh.samples
+    strain = step.membrane, samples.gradients, samples.areas, step.strain_anchor
+    return strain, (samples.corners, step.area_normals, step.wind)
 
 
 def _vertices(step: IncrementalPotential):
@@ -155,15 +151,18 @@ def _viscoelastic_energy(step, law: Any, strain: Array, anchor: Array) -> Array:
     return law.energy_density(strain) + viscosity / 2 * jnp.sum(change * tangent_change)
 
 
-def _drag_energy(step, face, normal, wind, middle):
-    velocity = step.rate * (middle - step.x_anchor[face].mean(axis=0))
+def _element_energy(step, corners, samples, drag):
+    """Of membrane and drag, [J]."""
+
+    def at_sample(law, gradients, area, anchor):
+        return area * _viscoelastic_energy(step, law, green_strain(corners, gradients), anchor)
+
+    return jnp.sum(jax.vmap(at_sample)(*samples)) + _drag_energy(step, corners.mean(axis=0), *drag)
+
+
+def _drag_energy(step, middle, corners, normal, wind):
+    velocity = step.rate * (middle - step.x_anchor[corners].mean(axis=0))
     return step.air.dissipation(velocity - wind, normal) / step.rate
-
-
-def _face_energy(step, corners, face, law, inverse, area, anchor, normal, wind):
-    strain = green_strain(corners, inverse)
-    drag = _drag_energy(step, face, normal, wind, corners.mean(axis=0))
-    return area * _viscoelastic_energy(step, law, strain, anchor) + drag
 
 
 def _vertex_energy(step, x, x_anchor, v_anchor, area, limit):
@@ -180,27 +179,29 @@ def _vertex_energy(step, x, x_anchor, v_anchor, area, limit):
     )
 
 
-def _curvatures(step: IncrementalPotential, x: Positions) -> Float[Array, " hinge"]:
-    return hinge_curvatures(step.mesh, unwrapped(hinge_angles(step.mesh, x), step.angles))
+def _curvatures(step: IncrementalPotential, x: Positions) -> Float[Array, " bend"]:
+    bends = step.bending.bends(step.mesh)
+    return bends.curvatures(unwrapped(bends.angles(x), step.angles))
 
 
-def _bending_elements(step: IncrementalPotential, hinges: Float[Array, " hinge"]):
+def _bending_elements(step: IncrementalPotential, bends: Float[Array, " bend"]):
     mesh, law = step.mesh, step.bending
     before = law.curvatures(mesh, step.curvature_anchor)
-    return law.areas(mesh), law, law.curvatures(mesh, hinges), before
+    return law.areas(mesh), law, law.curvatures(mesh, bends), before
 
 
 def _element_bending_energy(step, area, law, curvature, anchor):
     return area * _viscoelastic_energy(step, law, curvature, anchor)
 
 
-def _bending_energy(step: IncrementalPotential, hinges: Float[Array, " hinge"]):
-    return jnp.sum(_map(_element_bending_energy, step, *_bending_elements(step, hinges)))
+def _bending_energy(step: IncrementalPotential, bends: Float[Array, " bend"]):
+    return jnp.sum(_map(_element_bending_energy, step, *_bending_elements(step, bends)))
 
 
 def _bending_hessians(step: IncrementalPotential, x: Positions):
     """Second derivatives [N/m] of the bending energy of each element, but for `_angle_hessians`."""
-    gradients = step.bending.gradients(step.mesh, hinge_curvature_gradients(step.mesh, x))
+    mesh, law = step.mesh, step.bending
+    gradients = law.gradients(mesh, law.bends(mesh).gradients(x))
     elements = _bending_elements(step, _curvatures(step, x))
     stiffness = _map(jax.hessian(_element_bending_energy, argnums=3), step, *elements)
     if stiffness.ndim == 1:  # of a scalar curvature
@@ -209,10 +210,9 @@ def _bending_hessians(step: IncrementalPotential, x: Positions):
 
 
 def _angle_hessians(step: IncrementalPotential, x: Positions):
-    """What the second derivative [N/m] of the bending energy owes to that of the hinges' angles."""
+    """What the second derivative [N/m] of the bending energy owes to that of the bends' angles."""
     moments = jax.grad(_bending_energy, argnums=1)(step, _curvatures(step, x))
-    second = jax.vmap(jax.jacfwd(hinge_angle_gradient))(x[step.mesh.hinges])
-    return jnp.einsum("h,haibj->haibj", curvature_per_angle(step.mesh) * moments, second)
+    return step.bending.bends(step.mesh).second_derivatives(x, moments)
 
 
 def _contact_hessians(step: IncrementalPotential, x: Positions):
@@ -220,21 +220,24 @@ def _contact_hessians(step: IncrementalPotential, x: Positions):
     return contact_hessians(step.contacts, step.fabric.thickness, step.rate, x, step.x_anchor)
 
 
-def _face_hessian(step, blend, corners, face, law, inverse, area, anchor, normal, wind):
-    # exact with all of the stress, since the Green strain is quadratic in the corners
-    strain, vjp = jax.vjp(lambda corners: green_strain(corners, inverse), corners)
-    jacobian = jax.vmap(vjp)(jnp.eye(3, dtype=strain.dtype))[0]  # (strain, corner, axis)
+def _element_hessian(step, blend, corners, samples, drag):
+    def at_sample(law, gradients, area, anchor):
+        # exact with all of the stress, since the Green strain is quadratic in the corners
+        def energy(strain):
+            return _viscoelastic_energy(step, law, strain, anchor)
 
-    def energy(strain):
-        return _viscoelastic_energy(step, law, strain, anchor)
+        strain = green_strain(corners, gradients)
+        stress, tangent = jax.grad(energy)(strain), jax.hessian(energy)(strain)
+        by_corners = green_strain_gradient(corners, gradients)
+        material = jnp.einsum("sai,st,tbj->aibj", by_corners, tangent, by_corners)
+        carried = blend * _symmetric(stress) + (1 - blend) * _tension(stress)
+        geometric = jnp.einsum("as,st,bt,ij->aibj", gradients, carried, gradients, jnp.eye(3))
+        return area * (material + geometric)
 
-    stress, tangent = jax.grad(energy)(strain), jax.hessian(energy)(strain)
-    material = jnp.einsum("sai,st,tbj->aibj", jacobian, tangent, jacobian)
-    shape = jnp.concatenate([-jnp.sum(inverse, axis=0, keepdims=True), inverse])
-    carried = blend * _symmetric(stress) + (1 - blend) * _tension(stress)
-    geometric = jnp.einsum("as,st,bt,ij->aibj", shape, carried, shape, jnp.eye(3))
-    drag = jax.hessian(_drag_energy, argnums=4)(step, face, normal, wind, corners.mean(axis=0))
-    return area * (material + geometric) + jnp.einsum("ab,ij->aibj", jnp.full((3, 3), 1 / 9), drag)
+    membrane = jnp.sum(jax.vmap(at_sample)(*samples), axis=0)
+    count = len(corners)
+    of_middle = jax.hessian(_drag_energy, argnums=1)(step, corners.mean(axis=0), *drag)
+    return membrane + jnp.broadcast_to(of_middle[None, :, None], membrane.shape) / count**2
 
 
 def _symmetric(stress: Float[Array, " 3"]) -> Float[Array, "2 2"]:

@@ -15,7 +15,6 @@ from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
 from r2s.fabrics.fabric import Fabric
-from r2s.geometry.elements import hinge_angles, hinge_curvatures
 from r2s.geometry.mesh import Mesh
 from r2s.laws.bending import HingeBending
 from r2s.laws.plate import PlateBending
@@ -131,7 +130,8 @@ def errors(exported: dict[str, float], own: dict[str, float]) -> dict[str, float
 
 
 def hinged(mesh: Mesh, stiffness: float) -> dict[str, float]:
-    """Bending stiffness [N m] of a mesh of hinges, bent to a cylinder along each direction.
+    """Bending stiffness [N m] of the triangles of a mesh as hinges, bent to a cylinder along each
+    direction.
 
     `stiffness`: of the hinges, [N m].
 
@@ -139,19 +139,20 @@ def hinged(mesh: Mesh, stiffness: float) -> dict[str, float]:
     `r2s.laws.bending`), and in part three times as much where all diagonals are parallel.
     """
     hinges, plate = HingeBending(jnp.ones((), float)), PlateBending.make(1.0)
+    mesh = Mesh.make(np.asarray(mesh.rest), np.asarray(mesh.faces))
     middle = np.asarray(mesh.rest) - np.asarray(mesh.rest).mean(axis=0)
     found = {}
     for name, angle in DIRECTIONS.items():
         along = middle @ [np.cos(angle), np.sin(angle)]
         lifted = np.concatenate([middle, EPSILON * along[:, None] ** 2 / 2], axis=1)
-        angles = hinge_angles(mesh, jnp.asarray(lifted, float))
-        of_hinges, of_plate = (_energy(mesh, law, angles) for law in (hinges, plate))
+        of_hinges, of_plate = (_energy(mesh, law, lifted) for law in (hinges, plate))
         found[name] = stiffness * of_hinges / of_plate
     return found
 
 
-def _energy(mesh: Mesh, law: Any, angles) -> float:
-    density = jax.vmap(law.energy_density)(law.curvatures(mesh, hinge_curvatures(mesh, angles)))
+def _energy(mesh: Mesh, law: Any, x) -> float:
+    bent = law.bends(mesh).curvatures_at(jnp.asarray(x, float))
+    density = jax.vmap(law.energy_density)(law.curvatures(mesh, bent))
     return float(jnp.sum(law.areas(mesh) * density))
 
 

@@ -1,6 +1,8 @@
 """The geometry of a sheet, apart from what it is made of.
 
-- `mesh`: the rest shape, a triangle mesh in material coordinates.
-- `patches`: the curvature of a face from the hinges around it.
+- `mesh`: the rest shape, in material coordinates.
+- `strain_samples`: where its strain is taken, in triangles or quadrilaterals.
+- `bends`, `plate_elements`: where its curvature is taken, angles first.
+- `elements`: strains, normals and masses of a moved sheet.
 - `surface`: points on a moved sheet, and the nearest one to a point in space.
 """

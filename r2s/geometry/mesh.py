@@ -1,45 +1,54 @@
-"""The rest shape of a sheet: a triangle mesh in material coordinates, and what follows from it."""
+"""The rest shape of a sheet: a mesh in material coordinates, and what follows from it."""
+
+import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from r2s.geometry.patches import Patches
+from r2s.geometry.bends import Bends
+from r2s.geometry.plate_elements import PlateElements
+from r2s.geometry.strain_samples import StrainSamples, cells
 
+ELEMENTS = ("quadrilaterals", "falling", "rising", "alternating")  # of a rectangle
 SMALLEST, LARGEST = 1e-3, 50.0  # [m], of sheets
 
 
 class Mesh(eqx.Module):
-    """A flat sheet of triangles at rest, with its warp along the first material axis.
+    """A flat sheet at rest, with its warp along the first material axis.
+
+    Its surface is made of triangles, where cameras and the sheet itself meet it. Strain, drag and
+    curvature are those of the triangles, too, or those of the cells and vertices of a grid
+    (`rectangle`).
 
     - `rest`: material coordinates (warp, weft), [m].
-    - `faces`: corners, counter-clockwise in material coordinates.
+    - `faces`: corners of the triangles, counter-clockwise in material coordinates.
     - `hinges`: the two ends of each inner edge, then the two vertices opposite to it.
-    - `inverse`: inverse of each face's rest edges, [1/m].
-    - `area`, `vertex_area`: rest areas of the faces, and a third of them at each vertex, [m^2].
+    - `area`, `vertex_area`: rest areas of the faces, and what they share out to each vertex, [m^2].
     - `hinge_length`, `hinge_area`: of each hinge's edge [m], and its two faces together [m^2].
     - `hinge_direction`: angle between the warp and the line that the hinge bends, which is at right
       angles to its edge, 0 to pi/2 [rad].
-    - `rest_curvature`: of each hinge where it stores no energy, [1/m]; 0 for a flat sheet.
-    - `patches`: the faces with the hinges around them.
+    - `hinge_bends`: the hinges as what bends.
+    - `samples`: where its strain is taken, in elements which meet the air, too.
+    - `plate`: where its curvature is taken.
     """
 
     rest: Float[Array, "vertex 2"]
     faces: Int[Array, "face 3"]
     hinges: Int[Array, "hinge 4"]
-    inverse: Float[Array, "face 2 2"]
     area: Float[Array, " face"]
     vertex_area: Float[Array, " vertex"]
     hinge_length: Float[Array, " hinge"]
     hinge_area: Float[Array, " hinge"]
     hinge_direction: Float[Array, " hinge"]
-    rest_curvature: Float[Array, " hinge"]
-    patches: Patches
+    hinge_bends: Bends
+    samples: StrainSamples
+    plate: PlateElements
 
     @classmethod
     def make(cls, rest: Float[np.ndarray, "vertex 2"], faces: Int[np.ndarray, "face 3"]) -> "Mesh":
-        """A mesh from material coordinates [m] and triangles.
+        """A mesh of linear triangles, from material coordinates [m].
 
         Raises `ValueError` for wrong shapes, indices out of range, vertices in no face, an edge of
         more than two faces, faces that are degenerate or clockwise, and a sheet so large or small
@@ -59,18 +68,21 @@ class Mesh(eqx.Module):
         ends = rest[hinges[:, 0]] - rest[hinges[:, 1]]
         vertex_area = np.zeros(len(rest))
         np.add.at(vertex_area, faces.ravel(), np.repeat(area / 3, 3))
+        length = np.linalg.norm(ends, axis=-1)
+        hinge_area = area[hinge_faces].sum(axis=-1)
+        bends = Bends.of_hinges(hinges, length / hinge_area)
         return cls(
             rest=jnp.asarray(rest, float),
             faces=jnp.asarray(faces, int),
             hinges=jnp.asarray(hinges, int),
-            inverse=jnp.asarray(np.linalg.inv(edges.transpose(0, 2, 1)), float),
             area=jnp.asarray(area, float),
             vertex_area=jnp.asarray(vertex_area, float),
-            hinge_length=jnp.asarray(np.linalg.norm(ends, axis=-1), float),
-            hinge_area=jnp.asarray(area[hinge_faces].sum(axis=-1), float),
+            hinge_length=jnp.asarray(length, float),
+            hinge_area=jnp.asarray(hinge_area, float),
             hinge_direction=jnp.asarray(np.arctan2(*np.abs(ends.T)), float),
-            rest_curvature=jnp.zeros(len(hinges), float),
-            patches=Patches.make(rest, faces, hinges),
+            hinge_bends=bends,
+            samples=StrainSamples.of_triangles(rest, faces),
+            plate=PlateElements.of_triangles(rest, faces, hinges, area, bends),
         )
 
 
@@ -134,15 +146,16 @@ def borders(mesh: Mesh) -> Bool[Array, "face 3"]:
 
 
 def rectangle(
-    size: tuple[float, float], shape: tuple[int, int] = (9, 9), diagonals: str = "falling"
+    size: tuple[float, float], shape: tuple[int, int] = (9, 9), elements: str = "quadrilaterals"
 ) -> Mesh:
     """A rectangle of `size` (warp, weft) [m] with `shape` vertices along warp and weft.
 
-    Vertex (i, j) has the index i * shape[1] + j. The `diagonals` of its cells are "falling" (from
-    the warp's corner to the weft's, where the sheet bends when its origin is lifted), "rising"
-    (from the origin to the opposite corner) or "alternating" (favours neither, bends too softly).
+    Vertex (i, j) has the index i * shape[1] + j. The `elements` that its strain and its curvature
+    are taken in are "quadrilaterals", which favour no direction, or triangles as of any other mesh,
+    whose folds the diagonals of the cells direct: "falling" (from the warp's corner to the weft's),
+    "rising" (from the origin to the opposite corner) or "alternating" (which bends too softly).
 
-    Raises `ValueError` when a side is not positive or has no two vertices, or for other diagonals.
+    Raises `ValueError` when a side is not positive or has no two vertices, or for other elements.
 
     >>> sheet = rectangle((0.3, 0.2), (4, 3))
     >>> sheet.rest.shape, sheet.faces.shape
@@ -154,22 +167,30 @@ def rectangle(
     warp, weft = np.meshgrid(
         np.linspace(0, size[0], rows), np.linspace(0, size[1], columns), indexing="ij"
     )
-    index = np.arange(rows * columns).reshape(shape)
-    a, b = index[:-1, :-1].ravel(), index[1:, :-1].ravel()  # corners (0, 0) and (1, 0) of a cell
-    c, d = index[1:, 1:].ravel(), index[:-1, 1:].ravel()
-    rises = _rises(diagonals, rows - 1, columns - 1).ravel()[:, None]
+    a, b, c, d = cells(shape).T
+    rises = _rises(elements, rows - 1, columns - 1).ravel()[:, None]
     first = np.where(rises, np.stack([a, b, c], 1), np.stack([a, b, d], 1))
     second = np.where(rises, np.stack([a, c, d], 1), np.stack([b, c, d], 1))
-    return Mesh.make(np.stack([warp.ravel(), weft.ravel()], 1), np.concatenate([first, second]))
+    mesh = Mesh.make(np.stack([warp.ravel(), weft.ravel()], 1), np.concatenate([first, second]))
+    if elements != "quadrilaterals":
+        return mesh
+    spacing = size[0] / (rows - 1), size[1] / (columns - 1)
+    plate = PlateElements.of_grid(spacing, shape)
+    return dataclasses.replace(
+        mesh,
+        vertex_area=plate.areas,  # a vertex is an element of the plate
+        samples=StrainSamples.of_grid(spacing, shape),
+        plate=plate,
+    )
 
 
-def _rises(diagonals: str, rows: int, columns: int) -> np.ndarray:
+def _rises(elements: str, rows: int, columns: int) -> np.ndarray:
     """Whether the diagonal of a cell goes from its origin to its opposite corner."""
-    if diagonals == "alternating":
+    if elements == "alternating":
         return np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0
-    if diagonals not in ("falling", "rising"):
-        raise ValueError(f"diagonals are falling, rising or alternating, got {diagonals!r}")
-    return np.full((rows, columns), diagonals == "rising")
+    if elements not in ELEMENTS:
+        raise ValueError(f"elements are {', '.join(ELEMENTS)}, got {elements!r}")
+    return np.full((rows, columns), elements == "rising")
 
 
 def corner(shape: tuple[int, int], name: str) -> int:

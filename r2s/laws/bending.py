@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from r2s.geometry.bends import Bends
 from r2s.geometry.mesh import Mesh
 from r2s.units import Scalar, isotropic_bending
 
@@ -29,13 +30,18 @@ class BendingLaw(eqx.Module):
     """What the solvers ask of a bending law, which owns the element that it acts on.
 
     A law of one's own derives from `HingeLaw` (the angle between two triangles) or from
-    `r2s.laws.plate.PlateLaw` (the curvature tensor of a face). Curvatures of all hinges of a sheet
-    go in (`r2s.geometry.elements.hinge_curvatures`).
+    `r2s.laws.plate.PlateLaw` (the curvature tensor). Curvatures of all its bends go in
+    (`r2s.geometry.bends`).
 
-    - `element`: "hinges" or "patches", the vertices of its elements in a sparse matrix.
+    - `element`, `bend`: what its elements and its bends are called in the pattern of a matrix.
     """
 
     element: eqx.AbstractClassVar[str]
+    bend: eqx.AbstractClassVar[str]
+
+    @abstractmethod
+    def bends(self, mesh: Mesh) -> Bends:
+        """What it sees of a bent sheet."""
 
     @abstractmethod
     def vertices(self, mesh: Mesh) -> Int[Array, "element corner"]:
@@ -46,18 +52,18 @@ class BendingLaw(eqx.Module):
         """The rest areas [m^2] of the elements."""
 
     @abstractmethod
-    def curvatures(self, mesh: Mesh, hinges: Float[Array, " hinge"]) -> Float[Array, "element ..."]:
-        """The curvatures [1/m] of the elements, from those of all hinges."""
+    def curvatures(self, mesh: Mesh, bends: Float[Array, " bend"]) -> Float[Array, "element ..."]:
+        """The curvatures [1/m] of the elements, from those of all bends."""
 
     @abstractmethod
     def gradients(
-        self, mesh: Mesh, hinges: Float[Array, "hinge 4 3"]
+        self, mesh: Mesh, bends: Float[Array, "bend corner 3"]
     ) -> Float[Array, "element strain corner 3"]:
-        """Derivatives [1/m^2] of the elements' curvatures in their vertices, from the hinges'."""
+        """Derivatives [1/m^2] of the elements' curvatures in their vertices, from the bends'."""
 
     @abstractmethod
-    def on_elements(self, mesh: Mesh, hinges: Float[Array, " hinge"]) -> Any:
-        """The law of every element in a time step that starts near these hinge curvatures [1/m]."""
+    def on_elements(self, mesh: Mesh, bends: Float[Array, " bend"]) -> Any:
+        """The law of every element in a time step that starts near these curvatures [1/m]."""
 
     @abstractmethod
     def stiffness_along(self, angle: float) -> Float[Array, ""]:
@@ -68,6 +74,7 @@ class HingeLaw(BendingLaw):
     """A bending law of hinges: of the angle between two triangles."""
 
     element: ClassVar[str] = "hinges"
+    bend: ClassVar[str] = "hinges"
 
     @abstractmethod
     def at(self, direction: Float[Array, ""], curvature: Float[Array, ""]) -> Any:
@@ -78,6 +85,10 @@ class HingeLaw(BendingLaw):
         right angles to its edge: 0 when warp yarns bend, pi/2 for weft yarns.
         """
 
+    def bends(self, mesh: Mesh) -> Bends:
+        """The hinges."""
+        return mesh.hinge_bends
+
     def vertices(self, mesh: Mesh) -> Int[Array, "hinge 4"]:
         """The ends of each hinge's edge, then the vertices opposite to it."""
         return mesh.hinges
@@ -86,21 +97,21 @@ class HingeLaw(BendingLaw):
         """The rest areas [m^2] of the hinges' two faces together."""
         return mesh.hinge_area
 
-    def curvatures(self, mesh: Mesh, hinges: Float[Array, " hinge"]) -> Float[Array, " hinge"]:
+    def curvatures(self, mesh: Mesh, bends: Float[Array, " hinge"]) -> Float[Array, " hinge"]:
         """The curvatures of the hinges themselves, [1/m]."""
         del mesh
-        return hinges
+        return bends
 
     def gradients(
-        self, mesh: Mesh, hinges: Float[Array, "hinge 4 3"]
+        self, mesh: Mesh, bends: Float[Array, "hinge 4 3"]
     ) -> Float[Array, "hinge 1 4 3"]:
         """The gradients of the hinges themselves, [1/m^2]."""
         del mesh
-        return hinges[:, None]
+        return bends[:, None]
 
-    def on_elements(self, mesh: Mesh, hinges: Float[Array, " hinge"]) -> Any:
+    def on_elements(self, mesh: Mesh, bends: Float[Array, " hinge"]) -> Any:
         """The law of every hinge, by its direction and curvature [1/m]."""
-        return jax.vmap(self.at)(mesh.hinge_direction, hinges)
+        return jax.vmap(self.at)(mesh.hinge_direction, bends)
 
     def stiffness_along(self, angle: float) -> Float[Array, ""]:
         """Stiffness [N m] of a hinge that bends at an angle [rad], 0 to pi, to the warp."""

@@ -66,12 +66,12 @@ class OrthotropicMembrane(eqx.Module):
 class SpringMembrane(eqx.Module):
     """Springs along warp, weft and both biases: the mass-spring model, as energy of a strain.
 
-    On a grid of squares its energy is that of springs on the edges and on both diagonals of every
-    cell (for the diagonal that is no edge: as long as the cell is bent little). Small strains see
-    an orthotropic membrane with C11 = warp + shear / 2, C22 = weft + shear / 2 and
-    C12 = C33 = shear / 2: springs cannot choose the coupling apart from the shear (Cauchy).
+    On a grid of squares in triangles its energy is that of springs on the edges and on both
+    diagonals of every cell (for the diagonal that is no edge: as long as the cell is bent little).
+    Small strains see an orthotropic membrane with C11 = warp + shear / 2, C22 = weft + shear / 2
+    and C12 = C33 = shear / 2: springs cannot choose the coupling apart from the shear (Cauchy).
 
-    - `warp`, `weft`: of the structural springs, force per width and stretch, [N/m].
+    - `warp``, `weft`: of the structural springs, force per width and stretch, [N/m].
     - `shear`: likewise of the springs at +45 and -45 degrees, [N/m].
     """
 

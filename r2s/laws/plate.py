@@ -1,9 +1,8 @@
 """Bending of a sheet as a thin plate: the energy in its curvature tensor.
 
-A plate law sees the curvature (k11, k22, 2 k12) of a face, by warp and weft
-(`r2s.geometry.patches`), as a membrane law sees its strain. It bends alike in all directions of a
-regular mesh whose diagonals are parallel (`r2s.geometry.mesh.rectangle`), and twists as a plate
-does, which hinges (`r2s.laws.bending`) do not.
+A plate law sees the curvature (k11, k22, 2 k12) of an element, by warp and weft
+(`r2s.geometry.plate_elements`), as a membrane law sees a strain. It bends alike in all directions
+of a rectangle, and twists as a plate does, which hinges (`r2s.laws.bending`) do not.
 """
 
 import math
@@ -14,45 +13,55 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from r2s.geometry.bends import Bends
 from r2s.geometry.mesh import Mesh
 from r2s.laws.bending import BendingLaw
 from r2s.units import Scalar, isotropic_bending
 
 
 class PlateLaw(BendingLaw):
-    """A bending law of faces: of their curvature tensor."""
+    """A bending law of faces or vertices: of their curvature tensor.
 
-    element: ClassVar[str] = "patches"
+    The weft must be an axis of symmetry, so that small twists do not bend the sheet: curvature and
+    twist of a grid are not seen at one place.
+    """
+
+    element: ClassVar[str] = "plate"
+    bend: ClassVar[str] = "plate_bends"
 
     @abstractmethod
     def at(self, curvature: Float[Array, " 3"]) -> "PlateLaw":
-        """The law that a time step uses for a face which starts near this curvature [1/m]."""
+        """The law of a time step for an element which starts near this curvature [1/m]."""
 
     @abstractmethod
     def energy_density(self, curvature: Float[Array, " 3"]) -> Float[Array, ""]:
         """Energy per rest area [J/m^2] at a curvature (k11, k22, 2 k12) [1/m]."""
 
-    def vertices(self, mesh: Mesh) -> Int[Array, "face 6"]:
-        """The corners of each face, then the vertices beyond its edges."""
-        return mesh.patches.vertices
+    def bends(self, mesh: Mesh) -> Bends:
+        """Those of the mesh's plate elements."""
+        return mesh.plate.bends
 
-    def areas(self, mesh: Mesh) -> Float[Array, " face"]:
-        """The rest areas [m^2] of the faces."""
-        return mesh.area
+    def vertices(self, mesh: Mesh) -> Int[Array, "element place"]:
+        """The vertices that each element's curvature depends on."""
+        return mesh.plate.vertices
 
-    def curvatures(self, mesh: Mesh, hinges: Float[Array, " hinge"]) -> Float[Array, "face 3"]:
-        """The curvatures (k11, k22, 2 k12) [1/m] of the faces, from those of the hinges."""
-        return mesh.patches.curvatures(hinges)
+    def areas(self, mesh: Mesh) -> Float[Array, " element"]:
+        """The rest areas [m^2] of the elements."""
+        return mesh.plate.areas
+
+    def curvatures(self, mesh: Mesh, bends: Float[Array, " bend"]) -> Float[Array, "element 3"]:
+        """The curvatures (k11, k22, 2 k12) [1/m] of the elements, from those of the bends."""
+        return mesh.plate.curvatures(bends)
 
     def gradients(
-        self, mesh: Mesh, hinges: Float[Array, "hinge 4 3"]
-    ) -> Float[Array, "face 3 6 3"]:
-        """Derivatives [1/m^2] of the faces' curvatures in their vertices, from the hinges'."""
-        return mesh.patches.gradients(hinges)
+        self, mesh: Mesh, bends: Float[Array, "bend corner 3"]
+    ) -> Float[Array, "element 3 place 3"]:
+        """Derivatives [1/m^2] of the elements' curvatures in their vertices, from the bends'."""
+        return mesh.plate.gradients(bends)
 
-    def on_elements(self, mesh: Mesh, hinges: Float[Array, " hinge"]) -> Any:
-        """The law of every face, by its curvature."""
-        return jax.vmap(self.at)(self.curvatures(mesh, hinges))
+    def on_elements(self, mesh: Mesh, bends: Float[Array, " bend"]) -> Any:
+        """The law of every element, by its curvature."""
+        return jax.vmap(self.at)(self.curvatures(mesh, bends))
 
     def stiffness_along(self, angle: float) -> Float[Array, ""]:
         """Stiffness [N m] of the flat plate against a cylinder at an angle [rad] to the warp."""

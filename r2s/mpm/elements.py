@@ -11,15 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r2s.fabrics.fabric import Fabric
-from r2s.geometry.elements import (
-    green_strain,
-    hinge_angles,
-    hinge_curvature_gradients,
-    hinge_curvatures,
-    strains,
-    vertex_masses,
-)
+from r2s.geometry.elements import strains, vertex_masses
 from r2s.geometry.mesh import Mesh
+from r2s.geometry.strain_samples import green_strain_gradient
 
 Vertices = Float[Array, "vertex 3"]
 
@@ -36,15 +30,16 @@ def elastic_force(
     def stretch(x: Vertices) -> Array:
         return strains(mesh, x)
 
-    def hinges(x: Vertices) -> Array:
-        return hinge_curvatures(mesh, hinge_angles(mesh, x))
+    bends = fabric.bending.bends(mesh)
 
     def bend(x: Vertices) -> Array:
-        return fabric.bending.curvatures(mesh, hinges(x))
+        return fabric.bending.curvatures(mesh, bends.curvatures_at(x))
 
     stretched = jax.vmap(fabric.membrane.at)(stretch(x))
-    membrane = _resistance(stretched, stretch, mesh.area, membrane_damping, x, v)
-    bent = fabric.bending.on_elements(mesh, hinges(x))
+    membrane = _resistance(
+        stretched, stretch, mesh.samples.areas.reshape(-1), membrane_damping, x, v
+    )
+    bent = fabric.bending.on_elements(mesh, bends.curvatures_at(x))
     areas = fabric.bending.areas(mesh)
     return membrane + _resistance(bent, bend, areas, fabric.damping, x, v)
 
@@ -72,15 +67,22 @@ def _resistance(
 def membrane_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
     """A bound on the square of the membrane's highest frequency [1/s^2], flat and unstrained.
 
-    The bound is that of the worst face, with a third of its mass at each corner (Fried 1972).
+    The bound is that of the worst element, with its mass in equal parts at its corners (Fried
+    1972).
     """
     tangent = _tangent(fabric.membrane.at, fabric.membrane)
+    samples = mesh.samples
+    count = samples.corners.shape[1]
 
-    def square(corners, inverse):
-        rates = jax.jacobian(lambda corners: green_strain(corners, inverse))(corners)
-        return 3 * _largest(tangent, rates.reshape(3, 9)) / fabric.density
+    def square(corners, gradients, areas):
+        rates = jax.vmap(green_strain_gradient, in_axes=(None, 0))(corners, gradients)
+        rates = rates.reshape(*rates.shape[:2], -1)
+        share = areas / jnp.sum(areas)
+        stiffness = jnp.einsum("q,qsi,st,qtj->ij", share, rates, tangent, rates)
+        return count * jnp.linalg.eigvalsh(stiffness)[-1] / fabric.density
 
-    return jnp.max(jax.vmap(square)(_flat(mesh)[mesh.faces], mesh.inverse))
+    corners = _flat(mesh)[samples.corners]
+    return jnp.max(jax.vmap(square)(corners, samples.gradients, samples.areas))
 
 
 def bending_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
@@ -89,15 +91,16 @@ def bending_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
     The bound is that of the worst face or hinge, with the vertices' masses in equal parts among
     the elements that share them.
     """
-    if not mesh.hinges.shape[0]:
-        return jnp.zeros((), float)
     mass = vertex_masses(mesh, fabric.density)
     law = fabric.bending
+    bends = law.bends(mesh)
+    if not bends.vertices.shape[0]:
+        return jnp.zeros((), float)
     vertices, areas = law.vertices(mesh), law.areas(mesh)
-    rates = law.gradients(mesh, hinge_curvature_gradients(mesh, _flat(mesh)))
+    rates = law.gradients(mesh, bends.gradients(_flat(mesh)))
     count, size = rates.shape[:2]
-    hinges = jnp.zeros(mesh.hinges.shape[0], mesh.rest.dtype)
-    laws, flat = law.on_elements(mesh, hinges), law.curvatures(mesh, hinges)
+    unbent = jnp.zeros(bends.vertices.shape[0], mesh.rest.dtype)
+    laws, flat = law.on_elements(mesh, unbent), law.curvatures(mesh, unbent)
     tangents = jax.vmap(lambda law, k: jax.hessian(law.energy_density)(k))(laws, flat)
     tangents = tangents.reshape(count, size, size)  # of a hinge it is a number
     sharing = jnp.zeros(mass.shape, float).at[vertices].add(1)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r2s.fabrics.fabric import Fabric
-from r2s.geometry.elements import hinge_angles, hinge_curvatures, strains, vertex_masses
+from r2s.geometry.elements import strains, vertex_masses
 from r2s.geometry.mesh import Mesh
 from r2s.scenarios.gripper_forces import step_with_forces
 from r2s.scenarios.scenario import Scenario, begin, stepped
@@ -112,11 +112,13 @@ def stored_energy(mesh: Mesh, fabric: Fabric, x: Float[Array, "vertex 3"]) -> Fl
     Of laws by table: that of a sheet which has had the stiffness it has there all along.
     """
     membrane = jax.vmap(fabric.membrane.energy_density)(strains(mesh, x))
-    hinges = hinge_curvatures(mesh, hinge_angles(mesh, x))
-    laws = fabric.bending.on_elements(mesh, hinges)
-    curvatures = fabric.bending.curvatures(mesh, hinges)
+    bends = fabric.bending.bends(mesh)
+    bent = bends.curvatures_at(x)
+    laws = fabric.bending.on_elements(mesh, bent)
+    curvatures = fabric.bending.curvatures(mesh, bent)
     bending = jax.vmap(lambda law, curvature: law.energy_density(curvature))(laws, curvatures)
-    return jnp.sum(mesh.area * membrane) + jnp.sum(fabric.bending.areas(mesh) * bending)
+    areas = mesh.samples.areas.reshape(-1)
+    return jnp.sum(areas * membrane) + jnp.sum(fabric.bending.areas(mesh) * bending)
 
 
 def _drag(scenario: Scenario, state: Any, after: Any, control: Control):
@@ -126,8 +128,8 @@ def _drag(scenario: Scenario, state: Any, after: Any, control: Control):
     return drag_on_vertices(scene.mesh, scene.air, scene.fan, x, v, control.wind)
 
 
-def stretch(mesh: Mesh, x: Float[Array, "frame vertex 3"]) -> Float[Array, "frame face"]:
-    """The greatest principal stretch less one [-] of every face at positions [m]."""
+def stretch(mesh: Mesh, x: Float[Array, "frame vertex 3"]) -> Float[Array, "frame sample"]:
+    """The greatest principal stretch less one [-] of every strain sample at positions [m]."""
 
     def of_frame(x):
         e11, e22, shear = jnp.moveaxis(strains(mesh, x), -1, 0)

@@ -87,17 +87,19 @@ def from_placement(
     times: Float[np.ndarray, " frame"],
     shape: tuple[int, int] = (9, 9),
     *,
+    elements: str = "quadrilaterals",
     clamps: tuple[tuple[str, str], ...] = (),
     wind: tuple[float, float, float] | None = None,
     self_contact: bool = False,
 ) -> Scenario:
     """A scenario for a rectangular sheet, held at named corners, over a table.
 
-    `path` [m] and `path_times` [s] are the grippers', `times` [s] the frames', `shape` the
-    vertices along warp and weft. `clamps` are pairs of held corners: all of the side between them
-    is held, straight and evenly spread. `wind` [m/s] is that of a fan in front of the sheet's
-    middle, which starts with the first frame. With `self_contact` it does not pass
-    through itself.
+    - `path` [m], `path_times` [s]: of the grippers. `times`: of the frames, [s].
+    - `shape`, `elements`: of the mesh (`r2s.geometry.mesh.rectangle`).
+    - `clamps`: pairs of held corners: all of the side between them is held, straight and evenly
+      spread.
+    - `wind`: of a fan in front of the sheet's middle, which starts with the first frame, [m/s].
+    - `self_contact`: the sheet does not pass through itself.
 
     Before the first frame the grippers go from the sheet's corners to where the path begins; a
     sheet that hangs, its plane not horizontal, also comes to rest, braked by `BRAKE` for
@@ -105,7 +107,7 @@ def from_placement(
     """
     times = np.asarray(times)
     interval = _interval(times)
-    mesh = rectangle(sheet.size, shape)
+    mesh = rectangle(sheet.size, shape, elements)
     axes = np.array([sheet.warp, sheet.weft])
     normal = np.cross(*axes)
     hangs = abs(normal[2]) < 0.9

@@ -47,9 +47,14 @@ class Experiment(NamedTuple):
     clamps: tuple[tuple[str, str], ...] = ()
     table_height: float = 0.0
 
-    def scenario(self, shape: tuple[int, int] = (9, 9), self_contact: bool = False) -> Scenario:
-        """On a mesh of `shape` vertices along warp and weft; with `self_contact` it
-        does not pass through itself."""
+    def scenario(
+        self,
+        shape: tuple[int, int] = (9, 9),
+        self_contact: bool = False,
+        elements: str = "quadrilaterals",
+    ) -> Scenario:
+        """On a mesh of `shape` vertices along warp and weft, made of `elements`
+        (`r2s.geometry.mesh.rectangle`); with `self_contact` it does not pass through itself."""
         return from_placement(
             self.sheet,
             self.table_height,
@@ -57,6 +62,7 @@ class Experiment(NamedTuple):
             jnp.asarray(self.route.times, float),
             self.times,
             shape,
+            elements=elements,
             clamps=self.clamps,
             wind=self.wind,
             self_contact=self_contact,

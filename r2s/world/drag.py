@@ -1,9 +1,10 @@
-"""Wind and still air on the triangles of a sheet, as forces on its vertices."""
+"""Wind and still air on the elements of a sheet, as forces on its vertices."""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from r2s.geometry.elements import area_normals
 from r2s.geometry.mesh import Mesh
 from r2s.world.air import Air, Fan
 
@@ -15,12 +16,12 @@ def drag_on_vertices(
 ) -> Vertices:
     """The drag [N], from positions [m], velocities [m/s] and the wind [m/s] of a control.
 
-    That on a face goes in equal parts to its corners.
+    That on an element goes in equal parts to its corners.
     """
     strength = 1.0 if fan is None else fan(x)[:, None]
     flow = v - jnp.broadcast_to(wind, x.shape) * strength
-    corners = x[mesh.faces]
-    normals = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
-    relative = jnp.mean(flow[mesh.faces], axis=1)
-    force = -jax.vmap(jax.grad(air.dissipation))(relative, normals) / 3
-    return jnp.zeros_like(x).at[mesh.faces].add(force[:, None])
+    corners = mesh.samples.corners
+    relative = jnp.mean(flow[corners], axis=1)
+    force = -jax.vmap(jax.grad(air.dissipation))(relative, area_normals(mesh, x))
+    share = force[:, None] / corners.shape[1]
+    return jnp.zeros_like(x).at[corners].add(share)

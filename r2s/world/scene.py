@@ -47,12 +47,13 @@ class Scene(eqx.Module):
         """Positions with the held vertices put to `handles` [m]."""
         return x.at[self.held].set(handles)
 
-    def wind_on_faces(
+    def wind_on_elements(
         self, x: Float[Array, "vertex 3"], wind: Float[Array, "*vertex 3"]
-    ) -> Float[Array, "face 3"]:
-        """The wind [m/s] at the middle of every face, of a sheet at `x` [m]."""
+    ) -> Float[Array, "element 3"]:
+        """The wind [m/s] at the middle of every element, of a sheet at `x` [m]."""
         strength = 1.0 if self.fan is None else self.fan(x)[:, None]
-        return jnp.mean((jnp.broadcast_to(wind, x.shape) * strength)[self.mesh.faces], axis=1)
+        at_vertices = jnp.broadcast_to(wind, x.shape) * strength
+        return jnp.mean(at_vertices[self.mesh.samples.corners], axis=1)
 
 
 def along_path(

@@ -27,9 +27,14 @@ class Elimination(eqx.Module):
         With `couples_all` any two vertices may be coupled, as self-contact does in small meshes.
         """
         rest = np.asarray(mesh.rest)
-        elements = (np.asarray(e) for e in (mesh.faces, mesh.hinges, mesh.patches.vertices))
-        make = Pattern.full if couples_all else Pattern.make
-        pattern = make(len(rest), *elements)
+        elements = {
+            "samples": mesh.samples.corners,
+            "hinges": mesh.hinges,
+            "plate": mesh.plate.vertices,
+            "plate_bends": mesh.plate.bends.vertices,
+        }
+        elements = {kind: np.asarray(vertices) for kind, vertices in elements.items()}
+        pattern = Pattern.make(len(rest), elements, is_full=couples_all)
         rows, columns = np.asarray(pattern.rows), np.asarray(pattern.columns)
         leaf = {"leaf": len(rest)} if couples_all else {}
         return cls(pattern, levels(rest, rows, columns, **leaf), couples_all)

@@ -1,5 +1,7 @@
 """Which pairs of vertices share an element, and the sum of element matrices into blocks."""
 
+from collections.abc import Mapping
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -11,54 +13,34 @@ class Pattern(eqx.Module):
 
     - `rows`, `columns`: the vertices of every block, both triangles and the diagonal, sorted.
     - `diagonal`: the block of every vertex with itself.
-    - `faces`, `hinges`, `patches`: the block to which each pair of vertices of an element adds.
+    - `slots`: by kind of element, the block to which each pair of its vertices adds.
     """
 
     rows: Int[Array, " block"]
     columns: Int[Array, " block"]
     diagonal: Int[Array, " vertex"]
-    faces: Int[Array, "face 3 3"]
-    hinges: Int[Array, "hinge 4 4"]
-    patches: Int[Array, "face 6 6"]
+    slots: dict[str, Int[Array, "element corner corner"]]
 
     @classmethod
     def make(
         cls,
         count: int,
-        faces: Int[np.ndarray, "face 3"],
-        hinges: Int[np.ndarray, "hinge 4"],
-        patches: Int[np.ndarray, "face 6"],
+        elements: Mapping[str, Int[np.ndarray, "element corner"]],
+        is_full: bool = False,
     ) -> "Pattern":
-        """The pattern of `count` vertices and their elements."""
+        """The pattern of `count` vertices and their elements; full, with a block for every pair."""
         every = np.arange(count)
-        keys = [every * count + every]
-        for elements in (faces, hinges, patches):
-            keys.append((elements[:, :, None] * count + elements[:, None, :]).ravel())
-        unique, where = np.unique(np.concatenate(keys), return_inverse=True)
-        ends = np.cumsum([len(part) for part in keys])
-        parts = (
-            unique // count,
-            unique % count,
-            where[: ends[0]],
-            where[ends[0] : ends[1]].reshape(-1, 3, 3),
-            where[ends[1] : ends[2]].reshape(-1, 4, 4),
-            where[ends[2] :].reshape(-1, 6, 6),
+        keys = {kind: e[:, :, None] * count + e[:, None, :] for kind, e in elements.items()}
+        own = every * count + every
+        blocks = np.unique(np.concatenate([own, *(key.ravel() for key in keys.values())]))
+        blocks = np.arange(count * count) if is_full else blocks
+        slots = {kind: np.searchsorted(blocks, key) for kind, key in keys.items()}
+        return cls(
+            rows=jnp.asarray(blocks // count, int),
+            columns=jnp.asarray(blocks % count, int),
+            diagonal=jnp.asarray(np.searchsorted(blocks, own), int),
+            slots={kind: jnp.asarray(slot, int) for kind, slot in slots.items()},
         )
-        return cls(*(jnp.asarray(part, int) for part in parts))
-
-    @classmethod
-    def full(
-        cls,
-        count: int,
-        faces: Int[np.ndarray, "face 3"],
-        hinges: Int[np.ndarray, "hinge 4"],
-        patches: Int[np.ndarray, "face 6"],
-    ) -> "Pattern":
-        """The pattern in which every pair of `count` vertices has a block."""
-        rows, columns = np.divmod(np.arange(count * count), count)
-        elements = (e[:, :, None] * count + e[:, None, :] for e in (faces, hinges, patches))
-        parts = rows, columns, np.arange(count) * (count + 1), *elements
-        return cls(*(jnp.asarray(part, int) for part in parts))
 
 
 def assemble(
@@ -68,12 +50,12 @@ def assemble(
 ) -> Float[Array, "block 3 3"]:
     """The blocks that the matrices of vertices and of elements add up to.
 
-    `elements` are matrices (corner, axis, corner, axis) by kind: `faces`, `hinges`, `patches`.
+    `elements` are matrices (corner, axis, corner, axis) by kind.
     """
     blocks = jnp.zeros((pattern.rows.shape[0], 3, 3), vertices.dtype)
     blocks = blocks.at[pattern.diagonal].add(vertices, unique_indices=True)
     for kind, matrices in elements.items():
-        blocks = add_elements(blocks, getattr(pattern, kind), matrices)
+        blocks = add_elements(blocks, pattern.slots[kind], matrices)
     return blocks
 
 
