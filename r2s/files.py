@@ -36,6 +36,14 @@ def write_bytes(path: Path | str, data: bytes) -> None:
             temporary.unlink()
 
 
+def check_folders(*paths: Path | None) -> None:
+    """Raise `FileNotFoundError` where the folder of a file that will be written is missing: before
+    the work of making what is in it."""
+    for path in paths:
+        if path is not None and not path.absolute().parent.is_dir():
+            raise FileNotFoundError(f"{path}: there is no folder {path.parent} to write it to")
+
+
 def write_text(path: Path | str, text: str) -> None:
     """Write `text` as UTF-8 to `path`, whole or not at all; raises as `write_bytes`."""
     write_bytes(path, text.encode())

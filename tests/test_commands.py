@@ -58,6 +58,11 @@ def test_an_error_is_one_line_and_1(tmp_path: Path, capsys: pytest.CaptureFixtur
     for arguments, words in (
         (["simulate", "lifting", "--fabric", "felt", *out], "felt: no such card, and no preset"),
         (["simulate", "lifting", "--fabric", str(broken), *out], "broken.json: no fabric card"),
+        (["simulate", "lifting", "--out", str(tmp_path / "no" / "x.npz")], "there is no folder"),
+        (
+            ["estimate", "x.npz", "--density", "1", "--out", str(tmp_path / "no" / "x.json")],
+            "there is no folder",
+        ),
         (["simulate", "lifting", "--motion", "heigt=1", *out], "lifting has no heigt; it takes he"),
         (["simulate", "lifting", "--motion", "height", *out], "expects NAME=NUMBER"),
         (

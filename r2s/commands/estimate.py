@@ -83,8 +83,10 @@ class EstimateCard:
         from r2s.estimation import cards
         from r2s.estimation.estimate import describe
         from r2s.estimation.method import default_space
+        from r2s.files import check_folders
         from r2s.recordings.open import open_recordings
 
+        check_folders(self.out)
         seen = list(open_recordings(self.recordings))
         if not seen:
             raise ValueError("no recording: name an NPZ, or a folder that holds some")

@@ -45,11 +45,13 @@ class Simulate:
 
         from r2s import scenarios
         from r2s.commands.common import load_card, make_experiment, print_result
+        from r2s.files import check_folders
         from r2s.recordings.open import save_trajectory
         from r2s.recordings.recording import save
         from r2s.scenarios import synthetic
         from r2s.scenarios.scenario import rollout
 
+        check_folders(self.out, self.recording)
         if self.self_contact and self.solver == "points":
             raise ValueError(
                 "--self-contact is of the cloth: material points touch through their grid"
