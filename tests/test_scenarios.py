@@ -100,6 +100,11 @@ def test_a_uniaxial_pull_has_the_force_of_the_law(kind):
     assert force[0, 0] == pytest.approx(0, abs=0.01 * expected)
 
 
+def test_a_wind_of_no_speed_is_none():
+    scenario = scenarios.wind(speed=0.0, num_frames=3).scenario((3, 3))
+    assert scenario.scene.fan is None and not np.any(scenario.controls(1).wind)
+
+
 def test_wind_blows_in_the_middle_after_the_first_frame():
     scenario = scenarios.wind(speed=3.0, aside=90.0).scenario(SHAPE)
     controls = scenario.controls(2)

@@ -76,7 +76,7 @@ def deformation_gradient(
 
     `corners` are positions [m], `gradients` those of their shape functions [1/m].
     """
-    return corners.T @ gradients
+    return jnp.sum(corners[:, :, None] * gradients[:, None], axis=0)
 
 
 def green_strain(

@@ -122,6 +122,7 @@ def from_placement(
     begin = min(times[0], float(path_times[0]))
     knots = jnp.asarray([begin - lead_in * interval, begin - lead_in * interval / 2], float)
     at_rest = jnp.asarray(start[held], float)
+    wind = wind if wind is not None and any(wind) else None
     rising, rising_times = (None, None) if wind is None else _gust(wind, float(times[0]))
     fan = None if wind is None else _fan(sheet, wind)
     scene = Scene(mesh, jnp.asarray(held), Table.make(table_height), Air.make(), fan)
@@ -221,7 +222,7 @@ def from_recording(recording: Recording, shape: tuple[int, int] = (9, 9)) -> Sce
         np.asarray(recording.times),
         shape,
         clamps=CLAMPS if info.scenario == "stretching" else (),
-        wind=info.wind if info.wind is not None and any(info.wind) else None,
+        wind=info.wind,
     )
 
 
