@@ -26,6 +26,7 @@ from r2s.estimation.registry import METHODS
 from r2s.evaluation.metrics import distances
 from r2s.fabrics import presets
 from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.fold_length import fold_length
 from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
 from r2s.failures import Failure
 from r2s.geometry.mesh import Mesh, rectangle
@@ -50,6 +51,7 @@ from r2s.world.scene import Control, Scene
 __all__ = [
     # what a fabric is
     "Fabric",
+    "fold_length",
     "presets",
     "MembraneLaw",
     "OrthotropicMembrane",

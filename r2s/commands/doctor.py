@@ -62,6 +62,7 @@ class Doctor:
 
     def run(self) -> int:
         from r2s.commands.common import load_card, print_result
+        from r2s.fabrics.fold_length import fold_length
 
         result, lines, wrong = installation()
         if self.fabric:
@@ -69,7 +70,9 @@ class Doctor:
             found = list(implausible(card.fabric))
             wrong += [f"{card.name}: {text}" for text in found]
             lines.append(f"fabric {card.name}: {'see below' if found else 'plausible'}")
-            result["fabric"] = {"name": card.name, "implausible": found}
+            length = float(fold_length(card.fabric))
+            lines.append(f"    it folds at {1e3 * length:.1f} mm: longer cells cannot follow")
+            result["fabric"] = {"name": card.name, "implausible": found, "fold_length_m": length}
         if self.mesh is not None:
             result["mesh"], text = _mesh(self.mesh)
             lines.append(text)
