@@ -3,88 +3,24 @@
 python experiments/mesh_error.py --fabrics grey_interlock --motions lifting      # 15 minutes
 python experiments/mesh_error.py                                                 # a day
 
-Distances [mm] to the finest quadrilaterals, rms over the 25 places that all meshes share: mean over
-the motion, and at its end. Variants switch parts off: "stiff" bends 20 times as hard, so that every
-mesh resolves its folds; "rough" does not slide on the table. A sheet that hangs buckles to either
-side: it is mirrored where that is nearer. Motions that are in OUT's folder are not made again.
+Distances [mm] to the finest quadrilaterals, rms over the 25 places that all meshes share. Variants
+switch parts: "stiff" bends 20 times as hard, "rough" does not slide on the table. A sheet that
+hangs buckles to either side: it is mirrored where that is nearer. What is in OUT's folder stays.
 """
 
-import dataclasses
 import itertools
-from pathlib import Path
 
-import equinox as eqx
-import jax.numpy as jnp
-import numpy as np
+from _motions import MOTIONS, VARIANTS, distance, places
 from _tables import Line, command_line, keep
 
-from r2s import scenarios
 from r2s.fabrics import presets
-from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import ELEMENTS
-from r2s.recordings.recording import corner
-from r2s.scenarios.paths import Route, ease
-from r2s.scenarios.scenario import rollout
-from r2s.scenarios.six import ALL_CORNERS, Experiment, on_table
-
-SIDE, MAX_STEP = 0.45, 1 / 90  # [m], [s]
-run = eqx.filter_jit(rollout)
-
-
-def drape() -> Experiment:
-    """A sheet held by its four corners, which come together by a quarter and stay."""
-    sheet, times = on_table((SIDE, SIDE), ALL_CORNERS, 0.5), np.arange(31) / 15
-    corners = np.array([corner(sheet, name) for name in ALL_CORNERS])
-    nearer = corners + 0.25 * (corners.mean(axis=0) - corners)
-    done = ease(times)[:, None, None]
-    path = corners + done * (nearer - corners)
-    return Experiment("drape", sheet, Route(times, path), times, (0, 30))
-
-
-MOTIONS = {
-    "lifting": lambda: scenarios.lifting(num_frames=46),
-    "folding": lambda: scenarios.folding(num_frames=46),
-    "wind": lambda: scenarios.wind(num_frames=31),
-    "fling": lambda: scenarios.fling(num_frames=22),
-    "drape": drape,
-    "hang": lambda: scenarios.wind(speed=0.0, num_frames=3),
-}
-VARIANTS = ("as it is", "stiff", "rough")
-
-
-def variant(fabric: Fabric, name: str) -> Fabric:
-    """The fabric with one of its parts switched."""
-    if name == "stiff":
-        return eqx.tree_at(lambda f: f.bending.stiffness, fabric, 20 * fabric.bending.stiffness)
-    friction = jnp.asarray(5.0, float) if name == "rough" else fabric.friction
-    return dataclasses.replace(fabric, friction=friction)
-
-
-def places(folder: Path, key: tuple[str, str, str, str, int]) -> np.ndarray:
-    """The shared places [m] of a motion, (frame, 5, 5, 3); NaN from where it fails on."""
-    path = folder / ("-".join(map(str, key)).replace(" ", "_") + ".npy")
-    if not path.exists():
-        motion, fabric, name, elements, count = key
-        scenario = MOTIONS[motion]().scenario((count, count), elements=elements)
-        x = np.asarray(run(scenario, variant(presets.FIVE[fabric](), name), MAX_STEP).x)
-        every = (count - 1) // 4
-        folder.mkdir(parents=True, exist_ok=True)
-        np.save(path, x.reshape(len(x), count, count, 3)[:, ::every, ::every])
-    return np.load(path)
-
-
-def distance(motion: str, x: np.ndarray, finest: np.ndarray) -> np.ndarray:
-    """Distance [mm] from the finest mesh's motion in every frame."""
-    both = [finest, finest * [1, -1, 1]] if motion == "hang" else [finest]
-    each = [np.sqrt(((x - y) ** 2).sum(axis=-1).mean(axis=(1, 2))) for y in both]
-    return 1e3 * min(each, key=np.mean)
-
 
 if __name__ == "__main__":
     parser = command_line(__doc__, "results/mesh_error.csv")
-    parser.add_argument("--motions", nargs="*", default=list(MOTIONS), choices=MOTIONS)
-    parser.add_argument("--fabrics", nargs="*", default=list(presets.FIVE), choices=presets.FIVE)
-    parser.add_argument("--elements", nargs="*", default=list(ELEMENTS), choices=ELEMENTS)
+    options = {"motions": MOTIONS, "fabrics": presets.FIVE, "elements": ELEMENTS}
+    for option, choices in options.items():
+        parser.add_argument(f"--{option}", nargs="*", default=[*choices], choices=choices)
     parser.add_argument("--variants", nargs="*", default=["as it is"], choices=VARIANTS)
     parser.add_argument("--sizes", nargs="*", type=int, default=[9, 13, 17, 25, 33])
     a = parser.parse_args()
@@ -97,7 +33,9 @@ if __name__ == "__main__":
             for count in a.sizes:
                 x = places(folder, (motion, fabric, name, elements, count))
                 found = distance(motion, x, finest)
-                line[f"{count}"] = f"{found.mean():.2f}"
-                line[f"{count} at the end"] = f"{found[-1]:.2f}"
+                line |= {
+                    f"{count}": f"{found.mean():.2f}",
+                    f"{count} at the end": f"{found[-1]:.2f}",
+                }
             lines.append(line)
             keep(a.out, lines, "Distance [mm] from the finest mesh, mean and at the end.")

@@ -21,6 +21,7 @@ STALE = 0.6  # and longer than this much for new factors
 FIRST_SHIFT, LAST_SHIFT = 10, 1e-2  # of the diagonal: in units of its rounding; at most
 LEAST_BLEND = 1e-3  # of the exact Hessian: below it the convex stand-in is tried alone
 SHORTEST, LONGEST = 1e-6, 64.0  # fractions of a Newton step that are tried
+ROUNDING, NOISE = 8, 1000  # of a potential, in units of its last place: usual, and at most
 SAVED = "positions"  # what a checkpointed rollout keeps of a step
 
 
@@ -171,16 +172,19 @@ def _line_search(evaluate, state: _Search, direction, slope):
     """How much of a direction to go [-], 0 if no length will do; potential and force there.
 
     The first of 1, 1/2, 1/4, ... that lowers the potential enough (Armijo) and ends short of where
-    it would rise as steeply as it fell; the second test is for the last Newton steps, whose gain
-    rounding hides. If that is 1, the last of 1, 2, 4, ... up to which the potential falls steeply:
+    it would rise as steeply as it fell. The gain of the last Newton steps is hidden by the noise of
+    a sum of many energies: there it is enough that the slope is half of what it was (as Hager and
+    Zhang 2005 do). If that is 1, the last of 1, 2, 4, ... up to which the potential falls steeply:
     away from a shape that is about to buckle the convex stand-in is far too cautious.
     """
-    rounding = 8 * jnp.finfo(direction.dtype).eps * jnp.abs(state.value)
+    last_place = jnp.finfo(direction.dtype).eps * jnp.abs(state.value)
 
     def look(at: _Length) -> _Length:
         value, force = evaluate(state.x + at.trial * direction)
         ahead = jnp.sum(direction * force)
-        enough = value <= state.value + 1e-4 * at.trial * slope + rounding
+        gain = value - state.value
+        enough = gain <= 1e-4 * at.trial * slope + ROUNDING * last_place
+        enough |= (gain <= NOISE * last_place) & (jnp.abs(ahead) <= -0.5 * slope)
         is_fine = enough & (ahead <= -0.5 * slope)
         is_steep = enough & (ahead < 0.5 * slope)
         grows = is_steep & (at.trial >= 1) & (at.trial < LONGEST)
