@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +16,8 @@ from r2s.cloth.potential import hessian, residual
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import ELEMENTS, Mesh, rectangle
 from r2s.laws.plate import OrthotropicPlate, PlateBending
+from r2s.scenarios.scenario import rollout
+from r2s.scenarios.six import lifting
 from r2s.world.scene import Control
 
 SLIGHT = 1e-4  # so that angles are slopes
@@ -163,3 +166,12 @@ def test_a_stiff_plate_keeps_its_energy_account(sheet, fabric):
     after = step(solver, fabric, solver.init(x), Control(jnp.zeros((0, 3)), jnp.zeros(3)))
     stored = stored_energy(sheet, fabric, x)
     assert stored > 1e-6 and stored_energy(sheet, fabric, after.x) < stored
+
+
+def test_quadrilaterals_favour_neither_warp_nor_weft_nor_a_diagonal():
+    fabric = Fabric.make(0.2, (60.0, 20.0, 60.0, 20.0), 2e-5)
+    lift = lifting(num_frames=40).scenario((9, 9))
+    x = np.asarray(eqx.filter_jit(rollout)(lift, fabric).x).reshape(-1, 9, 9, 3)
+    mirrored = x.transpose(0, 2, 1, 3)[..., [1, 0, 2]]  # about the diagonal through the grip
+    assert np.ptp(x[-1, ..., 2]) > 0.2
+    np.testing.assert_allclose(x, mirrored, atol=1e-9)

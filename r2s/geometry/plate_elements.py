@@ -8,9 +8,10 @@ is the same). Where a face lies at the border of the sheet and lacks hinges, it 
 curvature that bends those it has.
 
 In a grid an element is a vertex. Its line along the warp turns by k11 times the spacing, that along
-the weft by k22 times it, and from one side of a cell to the other the sheet twists by k12 times it:
-second differences, each at its own place, so that no wave of the vertices is free. At the border of
-the sheet the curvature across it is that of the next line.
+the weft by k22 times it, and from one side of a cell to the other the sheet twists by k12 times it
+(the mean over the two pairs of sides): second differences, each at its own place, so that no wave
+of the vertices is free. At the border of the sheet the curvature across it is that of the next
+line.
 """
 
 import equinox as eqx
@@ -24,8 +25,9 @@ from r2s.geometry.strain_samples import cells
 # Start and end of the axis, ends of the left and the right wing, in terms of a bend's vertices: the
 # turn of a line, from its own vertex, the next and the last along it, the next and the last across;
 TURN = np.array([[1, 0, 0, 0, 0], [1, 0, 0, 1, -1], [0, 1, 0, 0, 0], [0, 0, 1, 0, 0]], float)
-# the twist of a cell, about the line between the middles of the sides along the warp.
-TWIST = np.array([[1, 1, 0, 0, 0], [0, 0, 1, 1, 0], [3, -1, 0, 0, 0], [1, 1, 2, -2, 0]], float) / 2
+# the twist of a cell between its sides along the warp, and between those along the weft.
+TURN_WARP = np.array([[1, 1, 0, 0, 0], [0, 0, 1, 1, 0], [3, -1, 0, 0, 0], [1, 1, 2, -2, 0]]) / 2
+TURN_WEFT = np.array([[1, 0, 0, 1, 0], [0, 1, 1, 0, 0], [1, -2, 2, 1, 0], [3, 0, 0, -1, 0]]) / 2
 SINGULAR = 1e-3  # of the greatest singular value: directions that the hinges do not see
 
 
@@ -43,9 +45,9 @@ class PlateElements(eqx.Module):
     bends: Bends
     areas: Float[Array, " element"]
     vertices: Int[Array, "element place"]
-    of_element: Int[Array, "element 3"]
-    places: Int[Array, "element 3 place"]
-    to_curvature: Float[Array, "element 3 3"]
+    of_element: Int[Array, "element each"]
+    places: Int[Array, "element each place"]
+    to_curvature: Float[Array, "element 3 each"]
 
     @classmethod
     def of_triangles(
@@ -66,20 +68,20 @@ class PlateElements(eqx.Module):
         """The vertices of a grid of `shape` vertices, [m] apart along warp and weft."""
         bends, (warp, weft, twist) = _grid_bends(spacing, shape)
         areas = np.prod(spacing) * np.outer(*map(_share, shape))
-        of_element = np.full((*shape, 3), -1)
+        of_element = np.full((*shape, 4), -1)
         if warp:
             of_element[..., 0] = _inner(np.arange(warp).reshape(-1, shape[1]))
         if weft:
             lines = warp + np.arange(weft).reshape(-1, shape[0])
             of_element[..., 1] = _inner(lines).T
-        first = warp + weft
-        of_element[:-1, :-1, 2] = first + np.arange(twist).reshape(np.array(shape) - 1)
-        to_curvature = np.zeros((*shape, 3, 3))
+        of_cells = warp + weft + np.arange(twist).reshape(np.array(shape) - 1)
+        of_element[:-1, :-1, 2], of_element[:-1, :-1, 3] = of_cells, of_cells + twist
+        to_curvature = np.zeros((*shape, 3, 4))
         to_curvature[..., 0, 0] = to_curvature[..., 1, 1] = 1
         # the twist of a cell counts with the cell's area, at the vertex that is its origin
-        to_curvature[..., 2, 2] = np.sqrt(np.prod(spacing) / areas)
+        to_curvature[..., 2, 2:] = np.sqrt(np.prod(spacing) / areas)[..., None] / 2
         to_curvature *= (of_element >= 0)[:, :, None]
-        flat = of_element.reshape(-1, 3), to_curvature.reshape(-1, 3, 3)
+        flat = of_element.reshape(-1, 4), to_curvature.reshape(-1, 3, 4)
         return cls._of(bends, areas.ravel(), *flat)
 
     @classmethod
@@ -97,13 +99,14 @@ class PlateElements(eqx.Module):
     def curvatures(self, bends: Float[Array, " bend"]) -> Float[Array, "element 3"]:
         """Curvature (k11, k22, 2 k12) [1/m] of the elements from that of all bends [1/m]."""
         if not bends.shape[0]:
-            return jnp.zeros(self.of_element.shape, bends.dtype)
+            return jnp.zeros((self.of_element.shape[0], 3), bends.dtype)
         return jnp.einsum("eib,eb->ei", self.to_curvature, bends[self.of_element])
 
     def gradients(self, bends: Float[Array, "bend corner 3"]) -> Float[Array, "element 3 place 3"]:
         """Derivatives of the elements' curvatures in their vertices, from the bends'."""
         if not bends.shape[0]:
-            return jnp.zeros((*self.places.shape, 3), bends.dtype)
+            count, _, width = self.places.shape
+            return jnp.zeros((count, 3, width, 3), bends.dtype)
         padded = jnp.pad(bends, ((0, 0), (0, 1), (0, 0)))
         of_element = padded[self.of_element[:, :, None], self.places]
         return jnp.einsum("eib,ebva->eiva", self.to_curvature, of_element)
@@ -137,11 +140,15 @@ def _grid_bends(
     warp, warp_weights = _turns(index)
     weft, weft_weights = _turns(index.T)
     twist = cells(shape)
-    vertices = np.concatenate([warp, weft, np.pad(twist, ((0, 0), (0, 1)), mode="edge")])
+    cell = np.pad(twist, ((0, 0), (0, 1)), mode="edge")
+    vertices = np.concatenate([warp, weft, cell, cell])
     # to the left of the axis is what is ahead of it along the weft, but behind it along the warp
     weights = [warp_weights[:, [0, 1, 3, 2]], weft_weights]
-    weights.append(np.broadcast_to(TWIST, (len(twist), 4, 5)))
-    lengths = [spacing[0]] * len(warp) + [spacing[1]] * len(weft) + [spacing[1] / 2] * len(twist)
+    weights += [np.broadcast_to(each, (len(twist), 4, 5)) for each in (TURN_WARP, TURN_WEFT)]
+    lengths = np.repeat(
+        [spacing[0], spacing[1], spacing[1] / 2, spacing[0] / 2],
+        [len(warp), len(weft), len(twist), len(twist)],
+    )
     bends = Bends(
         vertices=jnp.asarray(vertices, int),
         weights=jnp.asarray(np.concatenate(weights), float),
