@@ -18,9 +18,9 @@ from r2s.geometry.mesh import ELEMENTS
 
 if __name__ == "__main__":
     parser = command_line(__doc__, "results/mesh_error.csv")
-    options = {"motions": MOTIONS, "fabrics": presets.FIVE, "elements": ELEMENTS}
-    for option, choices in options.items():
-        parser.add_argument(f"--{option}", nargs="*", default=[*choices], choices=choices)
+    parser.add_argument("--motions", nargs="*", default=list(MOTIONS), choices=MOTIONS)
+    parser.add_argument("--fabrics", nargs="*", default=list(presets.FIVE), choices=presets.FIVE)
+    parser.add_argument("--elements", nargs="*", default=list(ELEMENTS), choices=ELEMENTS)
     parser.add_argument("--variants", nargs="*", default=["as it is"], choices=VARIANTS)
     parser.add_argument("--sizes", nargs="*", type=int, default=[9, 13, 17, 25, 33])
     a = parser.parse_args()

@@ -39,12 +39,13 @@ class Bends(eqx.Module):
         return cls(jnp.asarray(hinges, int), None, jnp.asarray(per_angle, float), flat)
 
     def corners(self, x: Positions) -> Float[Array, "bend 4 3"]:
-        """The corners of every bend [m]."""
+        """The corners of every bend [m], up to a shift of each."""
         of_bend = x[self.vertices]
         if self.weights is None:
             return of_bend
+        from_first = of_bend - of_bend[:, :1]  # places in the world would cost precision
         # a sum that XLA fuses: batched products of small matrices take it eight times as long
-        return jnp.sum(self.weights[..., None] * of_bend[:, None], axis=2)
+        return jnp.sum(self.weights[..., None] * from_first[:, None], axis=2)
 
     def angles(self, x: Positions) -> Float[Array, " bend"]:
         """Angle [rad] of every bend."""

@@ -76,7 +76,9 @@ def deformation_gradient(
 
     `corners` are positions [m], `gradients` those of their shape functions [1/m].
     """
-    return jnp.sum(corners[:, :, None] * gradients[:, None], axis=0)
+    # from one corner on, as the gradients add up to zero: places in the world would cost precision
+    edges = jnp.stack([corner - corners[0] for corner in corners[1:]], axis=1)
+    return edges @ gradients[1:]
 
 
 def green_strain(
