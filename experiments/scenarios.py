@@ -3,7 +3,7 @@
 python experiments/scenarios.py      # about 10 minutes on one core
 
 Printed for each run: the lowest vertex above the table, the greatest stretch (mean of a frame; of a
-face farther than 10 cm from a gripper), the work of the grippers and what was dissipated in all,
+sample farther than 10 cm from a gripper), the work of the grippers and what was dissipated in all,
 and the least that was dissipated in one frame: negative where energy came from nowhere.
 """
 
@@ -28,7 +28,10 @@ def figures(scenario: Scenario, found: EnergyBalance) -> Line:
     """What has to hold of a motion, and its energies [mJ] from the first to the last frame."""
     mesh, held = scenario.scene.mesh, scenario.scene.held
     rest, stretched = np.asarray(mesh.rest), np.asarray(stretch(mesh, found.x))
-    apart = rest[np.asarray(mesh.faces)].mean(axis=1)[:, None] - rest[np.asarray(held)]
+    samples = mesh.samples
+    middles = rest[np.asarray(samples.corners)].mean(axis=1)  # of elements, each with its samples
+    middles = np.repeat(middles, samples.areas.shape[1], axis=0)
+    apart = middles[:, None] - rest[np.asarray(held)]
     far = np.linalg.norm(apart, axis=2).min(axis=1) > GRIP
     lowest = np.asarray(found.x)[..., 2].min() - float(scenario.scene.table.height)
     work, lost = 1e3 * np.asarray(found.grippers), 1e3 * np.asarray(found.dissipated)

@@ -26,8 +26,8 @@ from r2s.geometry.strain_samples import cells
 # turn of a line, from its own vertex, the next and the last along it, the next and the last across;
 TURN = np.array([[1, 0, 0, 0, 0], [1, 0, 0, 1, -1], [0, 1, 0, 0, 0], [0, 0, 1, 0, 0]], float)
 # the twist of a cell between its sides along the warp, and between those along the weft.
-TURN_WARP = np.array([[1, 1, 0, 0, 0], [0, 0, 1, 1, 0], [3, -1, 0, 0, 0], [1, 1, 2, -2, 0]]) / 2
-TURN_WEFT = np.array([[1, 0, 0, 1, 0], [0, 1, 1, 0, 0], [1, -2, 2, 1, 0], [3, 0, 0, -1, 0]]) / 2
+TWIST_WARP = np.array([[1, 1, 0, 0, 0], [0, 0, 1, 1, 0], [3, -1, 0, 0, 0], [1, 1, 2, -2, 0]]) / 2
+TWIST_WEFT = np.array([[1, 0, 0, 1, 0], [0, 1, 1, 0, 0], [1, -2, 2, 1, 0], [3, 0, 0, -1, 0]]) / 2
 SINGULAR = 1e-3  # of the greatest singular value: directions that the hinges do not see
 
 
@@ -144,7 +144,7 @@ def _grid_bends(
     vertices = np.concatenate([warp, weft, cell, cell])
     # to the left of the axis is what is ahead of it along the weft, but behind it along the warp
     weights = [warp_weights[:, [0, 1, 3, 2]], weft_weights]
-    weights += [np.broadcast_to(each, (len(twist), 4, 5)) for each in (TURN_WARP, TURN_WEFT)]
+    weights += [np.broadcast_to(each, (len(twist), 4, 5)) for each in (TWIST_WARP, TWIST_WEFT)]
     lengths = np.repeat(
         [spacing[0], spacing[1], spacing[1] / 2, spacing[0] / 2],
         [len(warp), len(weft), len(twist), len(twist)],
