@@ -28,10 +28,8 @@ def figures(scenario: Scenario, found: EnergyBalance) -> Line:
     """What has to hold of a motion, and its energies [mJ] from the first to the last frame."""
     mesh, held = scenario.scene.mesh, scenario.scene.held
     rest, stretched = np.asarray(mesh.rest), np.asarray(stretch(mesh, found.x))
-    samples = mesh.samples
-    middles = rest[np.asarray(samples.corners)].mean(axis=1)  # of elements, each with its samples
-    middles = np.repeat(middles, samples.areas.shape[1], axis=0)
-    apart = middles[:, None] - rest[np.asarray(held)]
+    elements = rest[np.asarray(mesh.samples.corners)].mean(axis=1)[:, None] - rest[np.asarray(held)]
+    apart = np.repeat(elements, mesh.samples.areas.shape[1], axis=0)
     far = np.linalg.norm(apart, axis=2).min(axis=1) > GRIP
     lowest = np.asarray(found.x)[..., 2].min() - float(scenario.scene.table.height)
     work, lost = 1e3 * np.asarray(found.grippers), 1e3 * np.asarray(found.dissipated)
