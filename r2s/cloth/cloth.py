@@ -20,6 +20,7 @@ from r2s.fabrics.fabric import Fabric
 from r2s.failures import Failure, first_failure, no_failure
 from r2s.geometry.bends import unwrapped
 from r2s.geometry.elements import area_normals
+from r2s.laws.wrinkling import membrane_on_samples
 from r2s.world import contact
 from r2s.world.scene import Control, Scene
 
@@ -125,7 +126,9 @@ class Cloth(eqx.Module):
         return IncrementalPotential(
             mesh=mesh,
             fabric=fabric,
-            membrane=jax.vmap(jax.vmap(fabric.membrane.at))(_extrapolated(strain, strain_before)),
+            membrane=membrane_on_samples(
+                mesh.samples, fabric.membrane, fabric.bending, _extrapolated(strain, strain_before)
+            ),
             bending=fabric.bending.on_elements(mesh, bent),
             air=self.scene.air,
             table=self.scene.table,

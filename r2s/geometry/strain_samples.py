@@ -21,11 +21,14 @@ class StrainSamples(eqx.Module):
     - `corners`: vertices of each element.
     - `gradients`: of the corners' shape functions in material coordinates, [1/m].
     - `areas`: rest area that each sample stands for, [m^2].
+    - `hidden_waves`: wavenumber of the longest wrinkles that an element does not show, [1/m]; None:
+      its compression is never that of wrinkles.
     """
 
     corners: Int[Array, "element corner"]
     gradients: Float[Array, "element sample corner 2"]
     areas: Float[Array, "element sample"]
+    hidden_waves: Float[Array, " element"] | None
 
     @classmethod
     def of_triangles(
@@ -48,12 +51,18 @@ class StrainSamples(eqx.Module):
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
         along = signs * (1 + signs * places[:, None])[..., ::-1] / 2  # (sample, corner, axis)
         gradients = np.broadcast_to(along / np.array(spacing), (len(corners), 4, 4, 2))
-        return cls._of(corners, gradients, np.full((len(corners), 4), np.prod(spacing) / 4))
+        areas = np.full((len(corners), 4), np.prod(spacing) / 4)
+        # nodes can take a wave of two cells, but not one of a single cell
+        waves = np.full(len(corners), 2 * np.pi / np.prod(spacing) ** 0.5)
+        return cls._of(corners, gradients, areas, jnp.asarray(waves, float))
 
     @classmethod
-    def _of(cls, corners, gradients, areas) -> "StrainSamples":
+    def _of(cls, corners, gradients, areas, hidden_waves=None) -> "StrainSamples":
         return cls(
-            jnp.asarray(corners, int), jnp.asarray(gradients, float), jnp.asarray(areas, float)
+            jnp.asarray(corners, int),
+            jnp.asarray(gradients, float),
+            jnp.asarray(areas, float),
+            hidden_waves,
         )
 
     def strains(self, x: Float[Array, "vertex 3"]) -> Float[Array, "element sample 3"]:
