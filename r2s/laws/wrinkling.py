@@ -30,8 +30,10 @@ LEAST = 1e-3  # stiffness that wrinkles are found against, of the largest
 ROOT = 2**0.5
 DESCENTS, SOLVES = 2, 6  # to rounding in 200,000 random cases of float64
 
-Symmetric = Float[Array, " 3"]  # (11, 22, sqrt(2) 12): its squares add up to the matrix's
-Matrix = Float[Array, "3 3"]
+Number = Float[Array, ""]
+# Numbers, not arrays of three: those of all samples are then worked on side by side.
+Vector = tuple[Number, Number, Number]  # of a symmetric matrix: (11, 22, sqrt(2) 12)
+Matrix = tuple[Vector, Vector, Vector]
 
 
 class Wrinkled(eqx.Module):
@@ -45,7 +47,7 @@ class Wrinkled(eqx.Module):
     """
 
     law: MembraneLaw
-    stiffness: Matrix
+    stiffness: Float[Array, "3 3"]
     critical: Float[Array, ""]
 
     def energy_density(self, strain: Float[Array, " 3"]) -> Float[Array, ""]:
@@ -76,8 +78,8 @@ def membrane_on_samples(
 
 @jax.custom_jvp
 def released(
-    stiffness: Matrix, critical: Float[Array, ""], strain: Float[Array, " 3"]
-) -> Float[Array, ""]:
+    stiffness: Float[Array, "3 3"], critical: Number, strain: Float[Array, " 3"]
+) -> Number:
     """The energy per area [J/m^2] that wrinkles release, zero or more.
 
     - `stiffness`: against (E11, E22, 2 E12), positive definite, [N/m].
@@ -91,112 +93,144 @@ def released(
 def _released_jvp(primals, tangents):
     # the hidden strain is optimal, so its change does not count (it does in the next derivative)
     hidden = _hidden(*primals)
-    value, change = jax.jvp(lambda *given: -_cost(hidden, *given), primals, tangents)
-    return value, change
+    return jax.jvp(lambda *given: -_cost(hidden, *given), primals, tangents)
 
 
-def _cost(hidden: Symmetric, stiffness: Matrix, critical, strain) -> Float[Array, ""]:
-    """What hidden wrinkles cost [J/m^2], on the scales of `_scales`."""
+def _cost(hidden: Vector, stiffness, critical, strain) -> Number:
+    """What hidden wrinkles cost [J/m^2], on the scales of `_problem`."""
     quadratic, linear, _ = _problem(stiffness, critical, strain)
-    return hidden @ quadratic @ hidden / 2 + linear @ hidden
+    return _dot(hidden, _times(quadratic, hidden)) / 2 + _dot(linear, hidden)
 
 
-def _problem(stiffness: Matrix, critical, strain) -> tuple[Matrix, Symmetric, Array]:
+def _problem(stiffness, critical, strain) -> tuple[Matrix, Vector, Number]:
     """Second and first derivative of the cost without wrinkles; a bound on the second.
 
     Wrinkles are scaled along warp and weft by fourth roots of their stiffness, which keeps them
     symmetric and positive, and makes all fabrics alike.
     """
-    warp, weft = stiffness[0, 0] ** -0.5, stiffness[1, 1] ** -0.5
-    to_strain = jnp.stack([warp, weft, ROOT * jnp.sqrt(warp * weft)])  # with 2 E12
-    scaled = stiffness * to_strain * to_strain[:, None]
-    limit = jnp.array([[1, CROSS, 1], [CROSS, 1, 1], [1, 1, jnp.inf]], scaled.dtype)
-    quadratic = jnp.clip(scaled, -limit, limit) + LEAST * jnp.eye(3, dtype=scaled.dtype)
-    price = critical * jnp.stack([warp, weft, jnp.zeros_like(warp)])
-    bound = jnp.max(jnp.sum(jnp.abs(quadratic), axis=1))
-    return quadratic, to_strain * (stiffness @ strain) + price, bound
+    (c11, c12, c13), (_, c22, c23), (_, _, c33) = (tuple(row) for row in stiffness)
+    e11, e22, shear = strain
+    warp, weft = jax.lax.rsqrt(c11), jax.lax.rsqrt(c22)
+    both = warp * weft
+    bias = ROOT * jnp.sqrt(both)  # with 2 E12
+    coupling = jnp.clip(c12 * both, -CROSS, CROSS)
+    first, second = c13 * warp * bias, c23 * weft * bias
+    ones = jnp.ones_like(warp) + LEAST
+    last = c33 * bias * bias + LEAST
+    quadratic = (ones, coupling, first), (coupling, ones, second), (first, second, last)
+    linear = (
+        warp * (c11 * e11 + c12 * e22 + c13 * shear + critical),
+        weft * (c12 * e11 + c22 * e22 + c23 * shear + critical),
+        bias * (c13 * e11 + c23 * e22 + c33 * shear),
+    )
+    sums = [abs(row[0]) + abs(row[1]) + abs(row[2]) for row in quadratic]
+    return quadratic, linear, jnp.maximum(jnp.maximum(sums[0], sums[1]), sums[2])
 
 
 @jax.custom_jvp
-def _hidden(stiffness: Matrix, critical, strain) -> Symmetric:
+def _hidden(stiffness, critical, strain) -> Vector:
     """The scaled wrinkles that release most: projected descents, then a semismooth Newton method."""
-    quadratic, linear, bound = _problem(stiffness, critical, strain)
+    problem = _problem(stiffness, critical, strain)
 
     def descent(hidden, _):
-        return _positive(hidden - (quadratic @ hidden + linear) / bound), None
+        return _positive(_descended(hidden, problem)), None
 
     def solve(hidden, _):
-        before = hidden - (quadratic @ hidden + linear) / bound
-        slope = _positive_slope(before)
-        matrix = jnp.eye(3, dtype=slope.dtype) - slope + slope @ quadratic / bound
-        return hidden - _solve3(matrix, hidden - _positive(before)), None
+        before = _descended(hidden, problem)
+        short = tuple(a - b for a, b in zip(hidden, _positive(before), strict=True))
+        change = _solve(_system(before, problem), short)
+        return tuple(a - b for a, b in zip(hidden, change, strict=True)), None
 
-    hidden, _ = jax.lax.scan(descent, jnp.zeros_like(linear), length=DESCENTS, unroll=True)
-    hidden, _ = jax.lax.scan(solve, hidden, length=SOLVES, unroll=True)
-    return hidden
+    none = jnp.zeros_like(problem[1][0])
+    hidden, _ = jax.lax.scan(descent, (none, none, none), length=DESCENTS)
+    return jax.lax.scan(solve, hidden, length=SOLVES)[0]
 
 
 @_hidden.defjvp
 def _hidden_jvp(primals, tangents):
     """By the implicit function theorem, from what the wrinkles solve."""
     hidden = _hidden(*primals)
-
-    def before(*given):
-        quadratic, linear, bound = _problem(*given)
-        return hidden - (quadratic @ hidden + linear) / bound
-
-    quadratic, _, bound = _problem(*primals)
-    unprojected, change = jax.jvp(before, primals, tangents)
-    slope = _positive_slope(unprojected)
-    matrix = jnp.eye(3, dtype=slope.dtype) - slope + slope @ quadratic / bound
-    return hidden, _solve3(matrix, slope @ change)
+    before, change = jax.jvp(lambda *p: _descended(hidden, _problem(*p)), primals, tangents)
+    right = _times(_positive_slope(before), change)
+    return hidden, _solve(_system(before, _problem(*primals)), right)
 
 
-def _principal(matrix: Symmetric) -> tuple[Array, Array, Array, Array]:
+def _descended(hidden: Vector, problem) -> Vector:
+    quadratic, linear, bound = problem
+    slope = _times(quadratic, hidden)
+    one, two, three = (h - (s + f) / bound for h, s, f in zip(hidden, slope, linear, strict=True))
+    return one, two, three
+
+
+def _system(before: Vector, problem) -> Matrix:
+    """The derivative of the wrinkles' equation, hidden = _positive(descended), in them."""
+    quadratic, _, bound = problem
+    slope = _positive_slope(before)
+    columns = [_times(slope, row) for row in quadratic]  # the matrix is symmetric
+
+    def entry(i, j):
+        return columns[j][i] / bound - slope[i][j] + (1.0 if i == j else 0.0)
+
+    one, two, three = ((entry(i, 0), entry(i, 1), entry(i, 2)) for i in range(3))
+    return one, two, three
+
+
+def _principal(matrix: Vector) -> tuple[Number, Number, Number, Number]:
     """Mean and radius of the principal values; cosine and sine of twice the first one's angle."""
     mean, half, shear = (matrix[0] + matrix[1]) / 2, (matrix[0] - matrix[1]) / 2, matrix[2] / ROOT
     squared = half**2 + shear**2
     has_axes = squared > jnp.finfo(squared.dtype).tiny
-    radius = jnp.where(has_axes, jnp.sqrt(jnp.where(has_axes, squared, 1)), 0)
-    length = jnp.where(has_axes, radius, 1)
+    length = jnp.sqrt(jnp.where(has_axes, squared, 1))
+    radius = jnp.where(has_axes, length, 0)
     return mean, radius, jnp.where(has_axes, half / length, 1), shear / length
 
 
-def _positive(matrix: Symmetric) -> Symmetric:
+def _positive(matrix: Vector) -> Vector:
     """The nearest matrix without negative principal values."""
     mean, radius, cosine, sine = _principal(matrix)
     high, low = jnp.maximum(mean + radius, 0), jnp.maximum(mean - radius, 0)
-    half = (high - low) / 2
-    return (high + low) / 2 * jnp.array([1.0, 1, 0]) + half * jnp.stack(
-        [cosine, -cosine, ROOT * sine]
-    )
+    middle, half = (high + low) / 2, (high - low) / 2
+    return middle + half * cosine, middle - half * cosine, ROOT * half * sine
 
 
-def _positive_slope(matrix: Symmetric) -> Matrix:
+def _positive_slope(matrix: Vector) -> Matrix:
     """The derivative of `_positive`."""
     mean, radius, cosine, sine = _principal(matrix)
     high, low = mean + radius, mean - radius
-    along, across = (high > 0) * 1.0, (low > 0) * 1.0
-    width = jnp.where(radius > 0, 2 * radius, 1)
-    turned = (jnp.maximum(high, 0) - jnp.maximum(low, 0)) / width
+    along, across = jnp.where(high > 0, 1.0, 0.0), jnp.where(low > 0, 1.0, 0.0)
+    turned = (jnp.maximum(high, 0) - jnp.maximum(low, 0)) / jnp.where(radius > 0, 2 * radius, 1)
     turned = jnp.where(radius > 0, turned, along)
-    sum_, difference = jnp.array([1.0, 1, 0]), jnp.stack([cosine, -cosine, ROOT * sine])
-    first, second = (sum_ + difference) / 2, (sum_ - difference) / 2
-    third = jnp.stack([-sine, sine, ROOT * cosine]) / ROOT
-    return (
-        along * jnp.outer(first, first)
-        + across * jnp.outer(second, second)
-        + turned * jnp.outer(third, third)
+    parts = (
+        (along, ((1 + cosine) / 2, (1 - cosine) / 2, sine / ROOT)),
+        (across, ((1 - cosine) / 2, (1 + cosine) / 2, -sine / ROOT)),
+        (turned, (-sine / ROOT, sine / ROOT, cosine)),
     )
 
+    def entry(i, j):
+        return sum(weight * axis[i] * axis[j] for weight, axis in parts)
 
-def _solve3(matrix: Matrix, right: Symmetric) -> Symmetric:
-    """The solution of three equations, without a call per sample into LAPACK."""
-    rows = jnp.stack(
-        [
-            jnp.cross(matrix[1], matrix[2]),
-            jnp.cross(matrix[2], matrix[0]),
-            jnp.cross(matrix[0], matrix[1]),
-        ]
+    one, two, three = ((entry(i, 0), entry(i, 1), entry(i, 2)) for i in range(3))
+    return one, two, three
+
+
+def _dot(a: Vector, b: Vector) -> Number:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _times(matrix: Matrix, vector: Vector) -> Vector:
+    return _dot(matrix[0], vector), _dot(matrix[1], vector), _dot(matrix[2], vector)
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _solve(matrix: Matrix, right: Vector) -> Vector:
+    """The solution of three equations (Cramer's rule)."""
+    first, second, third = matrix
+    rows = _cross(second, third), _cross(third, first), _cross(first, second)
+    scale = 1 / _dot(first, rows[0])
+    one, two, three = (
+        scale * _dot(right, (rows[0][i], rows[1][i], rows[2][i])) for i in range(3)
     )
-    return right @ rows / (matrix[0] @ rows[0])
+    return one, two, three
