@@ -20,6 +20,7 @@ from r2s.fabrics.fabric import Fabric
 from r2s.failures import Failure, first_failure, no_failure
 from r2s.geometry.bends import unwrapped
 from r2s.geometry.elements import area_normals
+from r2s.laws.membrane import MembraneLaw
 from r2s.laws.wrinkling import membrane_on_samples
 from r2s.world import contact
 from r2s.world.scene import Control, Scene
@@ -122,20 +123,23 @@ class Cloth(eqx.Module):
         angles = bends.angles(state.x)
         angles_before = unwrapped(bends.angles(state.x_before), angles)
         strain, strain_before = (mesh.samples.strains(x) for x in (state.x, state.x_before))
+        strain_anchor = _anchor(strain, strain_before)
+        membrane = membrane_on_samples(
+            mesh.samples, fabric.membrane, fabric.bending, _extrapolated(strain, strain_before)
+        )
         bent = bends.curvatures(_extrapolated(angles, angles_before))
         return IncrementalPotential(
             mesh=mesh,
             fabric=fabric,
-            membrane=membrane_on_samples(
-                mesh.samples, fabric.membrane, fabric.bending, _extrapolated(strain, strain_before)
-            ),
+            membrane=membrane,
+            membrane_tangent=jax.vmap(jax.vmap(_tangent))(membrane, strain_anchor),
             bending=fabric.bending.on_elements(mesh, bent),
             air=self.scene.air,
             table=self.scene.table,
             rate=jnp.asarray(1.5 / self.dt, float),
             x_anchor=_anchor(state.x, state.x_before),
             v_anchor=_anchor(state.v, state.v_before),
-            strain_anchor=_anchor(strain, strain_before),
+            strain_anchor=strain_anchor,
             curvature_anchor=bends.curvatures(_anchor(angles, angles_before)),
             angles=angles,
             area_normals=area_normals(mesh, state.x),
@@ -185,6 +189,11 @@ def prepare_mesh(scene: Scene, self_contact: bool) -> tuple[Elimination, SelfCon
     with jax.ensure_compile_time_eval():  # sizes follow from the mesh, also under `jax.jit`
         search = SelfContact.make(scene.mesh) if self_contact else None
         return Elimination.make(scene.mesh, couples_all), search
+
+
+def _tangent(law: MembraneLaw, strain: Float[Array, " 3"]) -> Float[Array, "3 3"]:
+    """Stiffness [N/m] at a strain [-]."""
+    return jax.hessian(law.energy_density)(strain)
 
 
 def _anchor(now: Array, before: Array) -> Array:

@@ -42,6 +42,7 @@ class IncrementalPotential(eqx.Module):
     """All that a step's potential depends on, beside the new positions.
 
     - `membrane`, `bending`: the fabric's laws as they stand in this step, one for each element.
+    - `membrane_tangent`: stiffness [N/m] of every sample at `strain_anchor`, for its viscosity.
     - `rate`: of the time-stepping formula, [1/s].
     - `x_anchor`, `v_anchor`: what the formula's velocity [m/s] and acceleration start from.
     - `strain_anchor`, `curvature_anchor`: likewise for the rates of strain [-] and of the bends'
@@ -57,6 +58,7 @@ class IncrementalPotential(eqx.Module):
     mesh: Mesh
     fabric: Fabric
     membrane: MembraneLaw
+    membrane_tangent: Float[Array, "element sample 3 3"]
     bending: BendingLaw
     air: Air
     table: Table
@@ -132,7 +134,8 @@ def _map(function: Callable, step: IncrementalPotential, *elements: Any, fixed: 
 
 def _elements(step: IncrementalPotential):
     samples = step.mesh.samples
-    strain = step.membrane, samples.gradients, samples.areas, step.strain_anchor
+    laws = step.membrane, step.membrane_tangent
+    strain = *laws, samples.gradients, samples.areas, step.strain_anchor
     return strain, (samples.corners, step.area_normals, step.wind)
 
 
@@ -140,22 +143,27 @@ def _vertices(step: IncrementalPotential):
     return step.x_anchor, step.v_anchor, step.mesh.vertex_area, step.friction_limit
 
 
-def _viscoelastic_energy(step, law: Any, strain: Array, anchor: Array) -> Array:
-    """Stored energy and dissipation of one element, per area [J/m^2].
+def _viscous_energy(step, change: Array, stress_change: Array) -> Array:
+    """Dissipation of one element in a step, per area [J/m^2].
 
-    The viscous stress is damping x tangent x rate, with the law's tangent at the anchor.
+    The viscous stress is damping x tangent x rate, with the law's tangent at the anchor, from where
+    the strain has changed.
     """
+    return step.fabric.damping * step.rate / 2 * jnp.sum(change * stress_change)
+
+
+def _sample_energy(step, law: MembraneLaw, tangent: Array, strain: Array, anchor: Array) -> Array:
+    """Stored energy and dissipation of the membrane, per area [J/m^2]."""
     change = strain - anchor
-    _, tangent_change = jax.jvp(jax.grad(law.energy_density), (anchor,), (change,))
-    viscosity = step.fabric.damping * step.rate
-    return law.energy_density(strain) + viscosity / 2 * jnp.sum(change * tangent_change)
+    return law.energy_density(strain) + _viscous_energy(step, change, jnp.sum(tangent * change, axis=1))
 
 
 def _element_energy(step, corners, samples, drag):
     """Of membrane and drag, [J]."""
 
-    def at_sample(law, gradients, area, anchor):
-        return area * _viscoelastic_energy(step, law, green_strain(corners, gradients), anchor)
+    def at_sample(law, tangent, gradients, area, anchor):
+        strain = green_strain(corners, gradients)
+        return area * _sample_energy(step, law, tangent, strain, anchor)
 
     return jnp.sum(jax.vmap(at_sample)(*samples)) + _drag_energy(step, corners.mean(axis=0), *drag)
 
@@ -191,7 +199,9 @@ def _bending_elements(step: IncrementalPotential, bends: Float[Array, " bend"]):
 
 
 def _element_bending_energy(step, area, law, curvature, anchor):
-    return area * _viscoelastic_energy(step, law, curvature, anchor)
+    change = curvature - anchor
+    _, moment_change = jax.jvp(jax.grad(law.energy_density), (anchor,), (change,))
+    return area * (law.energy_density(curvature) + _viscous_energy(step, change, moment_change))
 
 
 def _bending_energy(step: IncrementalPotential, bends: Float[Array, " bend"]):
@@ -221,10 +231,10 @@ def _contact_hessians(step: IncrementalPotential, x: Positions):
 
 
 def _element_hessian(step, blend, corners, samples, drag):
-    def at_sample(law, gradients, area, anchor):
+    def at_sample(law, tangent_before, gradients, area, anchor):
         # exact with all of the stress, since the Green strain is quadratic in the corners
         def energy(strain):
-            return _viscoelastic_energy(step, law, strain, anchor)
+            return _sample_energy(step, law, tangent_before, strain, anchor)
 
         strain = green_strain(corners, gradients)
         stress, tangent = jax.grad(energy)(strain), jax.hessian(energy)(strain)

@@ -28,7 +28,8 @@ SHARE = 0.05  # of the resistance to compression that stays, so that no state is
 CROSS = 0.98  # of the coupling at most, against which wrinkles are found
 LEAST = 1e-3  # stiffness that wrinkles are found against, of the largest
 ROOT = 2**0.5
-DESCENTS, SOLVES = 2, 6  # to rounding in 200,000 random cases of float64
+# to rounding in 200,000 random cases
+DESCENTS, SOLVES = 2, {jnp.dtype("float32"): 4, jnp.dtype("float64"): 6}
 
 Number = Float[Array, ""]
 # Numbers, not arrays of three: those of all samples are then worked on side by side.
@@ -143,7 +144,7 @@ def _hidden(stiffness, critical, strain) -> Vector:
 
     none = jnp.zeros_like(problem[1][0])
     hidden, _ = jax.lax.scan(descent, (none, none, none), length=DESCENTS)
-    return jax.lax.scan(solve, hidden, length=SOLVES)[0]
+    return jax.lax.scan(solve, hidden, length=SOLVES[none.dtype])[0]
 
 
 @_hidden.defjvp
