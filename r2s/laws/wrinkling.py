@@ -47,9 +47,13 @@ class Wrinkled(eqx.Module):
     - `critical`: compressive stress at which it buckles, [N/m].
     """
 
-    law: MembraneLaw
-    stiffness: Float[Array, "3 3"]
-    critical: Float[Array, ""]
+    law: Any
+    stiffness: Float[Array, "*batch 3 3"]
+    critical: Float[Array, "*batch"]
+
+    def at(self, strain: Float[Array, " 3"]) -> "Wrinkled":
+        """Itself: it is the law of a time step already."""
+        return self
 
     def energy_density(self, strain: Float[Array, " 3"]) -> Float[Array, ""]:
         """Energy per rest area [J/m^2] at a Green strain (E11, E22, 2 E12) [-]."""
