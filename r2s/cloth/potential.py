@@ -155,7 +155,9 @@ def _viscous_energy(step, change: Array, stress_change: Array) -> Array:
 def _sample_energy(step, law: MembraneLaw, tangent: Array, strain: Array, anchor: Array) -> Array:
     """Stored energy and dissipation of the membrane, per area [J/m^2]."""
     change = strain - anchor
-    return law.energy_density(strain) + _viscous_energy(step, change, jnp.sum(tangent * change[None], axis=1))
+    return law.energy_density(strain) + _viscous_energy(
+        step, change, jnp.sum(tangent * change[None], axis=1)
+    )
 
 
 def _element_energy(step, corners, samples, drag):

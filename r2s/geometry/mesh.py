@@ -11,7 +11,7 @@ from r2s.geometry.bends import Bends
 from r2s.geometry.plate_elements import PlateElements
 from r2s.geometry.strain_samples import StrainSamples, cells
 
-ELEMENTS = ("quadrilaterals", "falling", "rising", "alternating")  # of a rectangle
+ELEMENTS = ("quadrilaterals", "wrinkling", "falling", "rising", "alternating")  # of a rectangle
 SMALLEST, LARGEST = 1e-3, 50.0  # [m], of sheets
 
 
@@ -151,7 +151,8 @@ def rectangle(
     """A rectangle of `size` (warp, weft) [m] with `shape` vertices along warp and weft.
 
     Vertex (i, j) has the index i * shape[1] + j. The `elements` that its strain and its curvature
-    are taken in are "quadrilaterals", which favour no direction, or triangles as of any other mesh,
+    are taken in are "quadrilaterals", which favour no direction; "wrinkling", which are these, but
+    give way where they are compressed (`r2s.laws.wrinkling`); or triangles as of any other mesh,
     whose folds the diagonals of the cells direct: "falling" (from the warp's corner to the weft's),
     "rising" (from the origin to the opposite corner) or "alternating" (which bends too softly).
 
@@ -172,14 +173,14 @@ def rectangle(
     first = np.where(rises, np.stack([a, b, c], 1), np.stack([a, b, d], 1))
     second = np.where(rises, np.stack([a, c, d], 1), np.stack([b, c, d], 1))
     mesh = Mesh.make(np.stack([warp.ravel(), weft.ravel()], 1), np.concatenate([first, second]))
-    if elements != "quadrilaterals":
+    if elements not in ("quadrilaterals", "wrinkling"):
         return mesh
     spacing = size[0] / (rows - 1), size[1] / (columns - 1)
     plate = PlateElements.of_grid(spacing, shape)
     return dataclasses.replace(
         mesh,
         vertex_area=plate.areas,  # a vertex is an element of the plate
-        samples=StrainSamples.of_grid(spacing, shape),
+        samples=StrainSamples.of_grid(spacing, shape, elements == "wrinkling"),
         plate=plate,
     )
 

@@ -41,10 +41,12 @@ class StrainSamples(eqx.Module):
         return cls._of(faces, gradients[:, None], np.linalg.det(edges)[:, None] / 2)
 
     @classmethod
-    def of_grid(cls, spacing: tuple[float, float], shape: tuple[int, int]) -> "StrainSamples":
+    def of_grid(
+        cls, spacing: tuple[float, float], shape: tuple[int, int], wrinkling: bool = False
+    ) -> "StrainSamples":
         """Four samples in each cell of a grid of `shape` vertices, [m] apart along warp and weft.
 
-        The corners of a cell are (0, 0), (1, 0), (1, 1) and (0, 1).
+        Of `wrinkling` cells the compression gives way (`r2s.laws.wrinkling`). The corners of a cell are (0, 0), (1, 0), (1, 1) and (0, 1).
         """
         corners = cells(shape)
         places = GAUSS * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
@@ -54,7 +56,8 @@ class StrainSamples(eqx.Module):
         areas = np.full((len(corners), 4), np.prod(spacing) / 4)
         # nodes can take a wave of two cells, but not one of a single cell
         waves = np.full(len(corners), 2 * np.pi / np.prod(spacing) ** 0.5)
-        return cls._of(corners, gradients, areas, jnp.asarray(waves, float))
+        hidden_waves = jnp.asarray(waves, float) if wrinkling else None
+        return cls._of(corners, gradients, areas, hidden_waves)
 
     @classmethod
     def _of(cls, corners, gradients, areas, hidden_waves=None) -> "StrainSamples":

@@ -69,7 +69,7 @@ def membrane_on_samples(
 ) -> Any:
     """The membrane law of every sample in a time step that starts near a strain [-].
 
-    On quadrilaterals these are `Wrinkled`. The bending stiffness is the mean along warp and weft.
+    On cells that wrinkle these are `Wrinkled`. The bending stiffness is the mean along warp and weft.
     """
     laws = jax.vmap(jax.vmap(membrane.at))(strain)
     if samples.hidden_waves is None:
@@ -134,7 +134,7 @@ def _problem(stiffness, critical, strain) -> tuple[Matrix, Vector, Number]:
 
 @jax.custom_jvp
 def _hidden(stiffness, critical, strain) -> Vector:
-    """The scaled wrinkles that release most: projected descents, then a semismooth Newton method."""
+    """The scaled wrinkles that release most: descents, then a semismooth Newton method."""
     problem = _problem(stiffness, critical, strain)
 
     def descent(hidden, _):
@@ -235,7 +235,5 @@ def _solve(matrix: Matrix, right: Vector) -> Vector:
     first, second, third = matrix
     rows = _cross(second, third), _cross(third, first), _cross(first, second)
     scale = 1 / _dot(first, rows[0])
-    one, two, three = (
-        scale * _dot(right, (rows[0][i], rows[1][i], rows[2][i])) for i in range(3)
-    )
+    one, two, three = (scale * _dot(right, (rows[0][i], rows[1][i], rows[2][i])) for i in range(3))
     return one, two, three

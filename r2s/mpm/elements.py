@@ -14,6 +14,7 @@ from r2s.fabrics.fabric import Fabric
 from r2s.geometry.elements import strains, vertex_masses
 from r2s.geometry.mesh import Mesh
 from r2s.geometry.strain_samples import green_strain_gradient
+from r2s.laws.wrinkling import membrane_on_samples
 
 Vertices = Float[Array, "vertex 3"]
 
@@ -35,7 +36,9 @@ def elastic_force(
     def bend(x: Vertices) -> Array:
         return fabric.bending.curvatures(mesh, bends.curvatures_at(x))
 
-    stretched = jax.vmap(fabric.membrane.at)(stretch(x))
+    strain = mesh.samples.strains(x)
+    laws = membrane_on_samples(mesh.samples, fabric.membrane, fabric.bending, strain)
+    stretched = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), laws)
     membrane = _resistance(
         stretched, stretch, mesh.samples.areas.reshape(-1), membrane_damping, x, v
     )

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.elements import strains, vertex_masses
 from r2s.geometry.mesh import Mesh
+from r2s.laws.wrinkling import membrane_on_samples
 from r2s.scenarios.gripper_forces import step_with_forces
 from r2s.scenarios.scenario import Scenario, begin, stepped
 from r2s.solver import Solver
@@ -111,14 +112,15 @@ def stored_energy(mesh: Mesh, fabric: Fabric, x: Float[Array, "vertex 3"]) -> Fl
 
     Of laws by table: that of a sheet which has had the stiffness it has there all along.
     """
-    membrane = jax.vmap(fabric.membrane.energy_density)(strains(mesh, x))
+    strain = mesh.samples.strains(x)
+    stretched = membrane_on_samples(mesh.samples, fabric.membrane, fabric.bending, strain)
+    membrane = jax.vmap(jax.vmap(lambda law, strain: law.energy_density(strain)))(stretched, strain)
     bends = fabric.bending.bends(mesh)
     bent = bends.curvatures_at(x)
     laws = fabric.bending.on_elements(mesh, bent)
     curvatures = fabric.bending.curvatures(mesh, bent)
     bending = jax.vmap(lambda law, curvature: law.energy_density(curvature))(laws, curvatures)
-    areas = mesh.samples.areas.reshape(-1)
-    return jnp.sum(areas * membrane) + jnp.sum(fabric.bending.areas(mesh) * bending)
+    return jnp.sum(mesh.samples.areas * membrane) + jnp.sum(fabric.bending.areas(mesh) * bending)
 
 
 def _drag(scenario: Scenario, state: Any, after: Any, control: Control):

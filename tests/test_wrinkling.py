@@ -1,0 +1,87 @@
+"""Cells that wrinkle: their energy is the least over wrinkles that the mesh does not show."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from r2s import rectangle
+from r2s.fabrics import presets
+from r2s.laws.wrinkling import LEAST, membrane_on_samples, released
+
+CRITICAL = 0.5  # [N/m]
+value = jax.jit(released)
+slope = jax.jit(jax.grad(released, argnums=2))
+curvature = jax.jit(jax.hessian(released, argnums=2))
+
+
+def stiffness(name: str) -> np.ndarray:
+    law = presets.FIVE[name]().membrane
+    return np.array(jax.hessian(law.energy_density)(jnp.zeros(3, float)), float)
+
+
+def strains(count: int) -> np.ndarray:
+    return np.random.default_rng(0).normal(size=(count, 3)) * 0.1
+
+
+def by_search(matrix: np.ndarray, strain: np.ndarray) -> float:
+    """What wrinkles release, by descent over the Cholesky factor of their shortening."""
+
+    def cost(root):
+        a, b, c = root
+        hidden = jnp.stack([a**2, b**2 + c**2, 2 * a * b])
+        changed = strain + hidden
+        kept = strain @ matrix @ strain / 2
+        return changed @ matrix @ changed / 2 - kept + CRITICAL * (hidden[0] + hidden[1])
+
+    step = jax.jit(jax.value_and_grad(cost))
+    starts = np.array([[0.3, 0, 0.3], [0.3, 0.2, 0.1], [0.1, 0.3, 0.1], [0.3, -0.2, 0.1]])
+    ends = [minimize(lambda x: tuple(map(np.array, step(x))), s, jac=True) for s in starts]
+    return -min(min(end.fun for end in ends), 0.0)
+
+
+@pytest.mark.parametrize("name", presets.FIVE)
+def test_wrinkles_release_what_a_search_finds(name):
+    matrix = stiffness(name)
+    for strain in strains(6):
+        found = float(value(matrix, jnp.asarray(CRITICAL), strain))
+        assert found == pytest.approx(by_search(matrix, strain), rel=20 * LEAST, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", presets.FIVE)
+def test_derivatives_agree_with_differences_and_the_rest_is_convex(name):
+    matrix, h, at = stiffness(name), 1e-6, jnp.asarray(CRITICAL)
+
+    def differences(f, strain):
+        steps = h * np.eye(3)
+        ahead, behind = ([f(matrix, at, strain + s * e) for e in steps] for s in (1, -1))
+        return (np.array(ahead) - np.array(behind)) / (2 * h)
+
+    for strain in strains(20):
+        np.testing.assert_allclose(slope(matrix, at, strain), differences(value, strain), atol=1e-6)
+        second = np.array(curvature(matrix, at, strain))
+        tolerance = 1e-6 * matrix.max()
+        np.testing.assert_allclose(second, differences(slope, strain), atol=tolerance)
+        assert np.linalg.eigvalsh(matrix - second).min() > 0
+
+
+def test_below_the_critical_stress_nothing_is_released():
+    matrix = stiffness("black_denim")
+    almost = np.linalg.solve(matrix, [-0.99 * CRITICAL, 0.3, 0])
+    beyond = np.linalg.solve(matrix, [-1.1 * CRITICAL, 0.3, 0])
+    assert value(matrix, jnp.asarray(CRITICAL), almost) == 0
+    assert value(matrix, jnp.asarray(CRITICAL), beyond) > 0
+
+
+def test_the_critical_stress_grows_as_cells_shrink():
+    fabric = presets.grey_interlock()
+
+    def critical(count):
+        samples = rectangle((0.2, 0.2), (count, count), "wrinkling").samples
+        none = jnp.zeros((*samples.areas.shape, 3), float)
+        return membrane_on_samples(samples, fabric.membrane, fabric.bending, none).critical[0, 0]
+
+    assert critical(9) == pytest.approx(4 * critical(5), rel=1e-6)
+    expected = float(fabric.bending.stiffness) * (2 * np.pi / 0.05) ** 2
+    assert float(critical(5)) == pytest.approx(expected, rel=1e-5)
