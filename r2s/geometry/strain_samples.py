@@ -46,7 +46,8 @@ class StrainSamples(eqx.Module):
     ) -> "StrainSamples":
         """Four samples in each cell of a grid of `shape` vertices, [m] apart along warp and weft.
 
-        Of `wrinkling` cells the compression gives way (`r2s.laws.wrinkling`). The corners of a cell are (0, 0), (1, 0), (1, 1) and (0, 1).
+        The corners of a cell are (0, 0), (1, 0), (1, 1) and (0, 1). Of `wrinkling` cells the
+        compression gives way (`r2s.laws.wrinkling`).
         """
         corners = cells(shape)
         places = GAUSS * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])

@@ -69,7 +69,8 @@ def membrane_on_samples(
 ) -> Any:
     """The membrane law of every sample in a time step that starts near a strain [-].
 
-    On cells that wrinkle these are `Wrinkled`. The bending stiffness is the mean along warp and weft.
+    On cells that wrinkle these are `Wrinkled`. The bending stiffness is the mean of warp and
+    weft.
     """
     laws = jax.vmap(jax.vmap(membrane.at))(strain)
     if samples.hidden_waves is None:
