@@ -213,7 +213,8 @@ def _positive_slope(matrix: Vector) -> Matrix:
     )
 
     def entry(i, j):
-        return sum(weight * axis[i] * axis[j] for weight, axis in parts)
+        terms = [weight * axis[i] * axis[j] for weight, axis in parts]
+        return terms[0] + terms[1] + terms[2]
 
     one, two, three = ((entry(i, 0), entry(i, 1), entry(i, 2)) for i in range(3))
     return one, two, three
