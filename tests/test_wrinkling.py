@@ -9,6 +9,8 @@ from scipy.optimize import minimize
 from r2s import rectangle
 from r2s.fabrics import presets
 from r2s.laws.wrinkling import LEAST, membrane_on_samples, released
+from r2s.mpm.elements import elastic_force
+from r2s.scenarios.energy import stored_energy
 
 CRITICAL = 0.5  # [N/m]
 value = jax.jit(released)
@@ -64,6 +66,21 @@ def test_derivatives_agree_with_differences_and_the_rest_is_convex(name):
         tolerance = 1e-6 * matrix.max()
         np.testing.assert_allclose(second, differences(slope, strain), atol=tolerance)
         assert np.linalg.eigvalsh(matrix - second).min() > 0
+
+
+def test_forces_on_material_points_are_those_of_the_stored_energy():
+    mesh, fabric = rectangle((0.2, 0.2), (5, 5), "wrinkling"), presets.grey_interlock()
+    noise = np.random.default_rng(1).normal(size=(25, 3)) * 2e-3
+    x = jnp.asarray(np.pad(0.95 * np.array(mesh.rest), ((0, 0), (0, 1))) + noise)
+
+    def stored(mesh):
+        return lambda x: stored_energy(mesh, fabric, x)
+
+    force = jax.jit(lambda x: elastic_force(mesh, fabric, jnp.asarray(0.01), x, 0 * x))(x)
+    expected = -jax.jit(jax.grad(stored(mesh)))(x)
+    np.testing.assert_allclose(force, expected, atol=1e-6 * np.abs(expected).max())
+    stiffer = stored(rectangle((0.2, 0.2), (5, 5)))
+    assert jax.jit(stored(mesh))(x) < 0.5 * jax.jit(stiffer)(x)
 
 
 def test_below_the_critical_stress_nothing_is_released():

@@ -28,7 +28,7 @@ SHARE = 0.05  # of the resistance to compression that stays, so that no state is
 CROSS = 0.98  # of the coupling at most, against which wrinkles are found
 LEAST = 1e-3  # stiffness that wrinkles are found against, of the largest
 ROOT = 2**0.5
-# to rounding in 200,000 random cases
+# Of 200,000 random cases 6 solves end within rounding, 4 within 5e-5 (all but 1 %: 1e-8).
 DESCENTS, SOLVES = 2, {jnp.dtype("float32"): 4, jnp.dtype("float64"): 6}
 
 Number = Float[Array, ""]
