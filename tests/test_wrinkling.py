@@ -1,11 +1,13 @@
 """Cells that wrinkle: their energy is the least over wrinkles that the mesh does not show."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+import r2s
 from r2s import rectangle
 from r2s.fabrics import presets
 from r2s.laws.wrinkling import LEAST, membrane_on_samples, released
@@ -81,6 +83,25 @@ def test_forces_on_material_points_are_those_of_the_stored_energy():
     np.testing.assert_allclose(force, expected, atol=1e-6 * np.abs(expected).max())
     stiffer = stored(rectangle((0.2, 0.2), (5, 5)))
     assert jax.jit(stored(mesh))(x) < 0.5 * jax.jit(stiffer)(x)
+
+
+def test_a_motion_of_wrinkled_cells_has_the_gradient_that_differences_have():
+    sheet = rectangle((0.2, 0.2), (5, 5), "wrinkling")
+    scene = r2s.Scene(sheet, jnp.array([0, 4]), r2s.Table.make(-jnp.inf), r2s.Air.make())
+    solver, start = r2s.Cloth.make(scene, dt=0.01), jnp.pad(sheet.rest, ((0, 0), (0, 1)))
+    nearer = jnp.outer(jnp.linspace(0, 0.04, 10), jnp.array([0.0, 1, 0]))
+    path = start[jnp.array([0, 4])][None] + jnp.stack([nearer, -nearer], axis=1)
+    controls = r2s.Control(path[None], jnp.zeros((1, 10, 3)))
+    knit = presets.grey_interlock()
+
+    def height(stiffness):
+        fabric = eqx.tree_at(lambda f: f.bending.stiffness, knit, stiffness)
+        return jnp.mean(r2s.simulate(solver, fabric, solver.init(start), controls).x[-1, :, 2])
+
+    height, at = jax.jit(height), jnp.asarray(5.5e-6)
+    slope, h = jax.jit(jax.grad(height))(at), 1e-9
+    differences = (height(at + h) - height(at - h)) / (2 * h)
+    assert float(slope) == pytest.approx(float(differences), rel=1e-4)
 
 
 def test_below_the_critical_stress_nothing_is_released():
