@@ -9,10 +9,13 @@ B k^2 tr L, with the bending stiffness B. The energy that is left is
 
     min over L >= 0 of  W(E + L) + B k^2 tr L
 
-(the relaxed energy of tension fields, Pipkin 1986, with a price on wrinkles). Below the critical
-stress B k^2 = B (2 pi / cell)^2 nothing changes, and that grows without limit as cells shrink.
+(the relaxed energy of tension fields, Pipkin 1986, with a price on wrinkles). The critical
+stress B k^2 = B (2 pi / cell)^2 grows without limit as cells shrink. Wrinkles do not begin at once
+there, but from half of it on (a term of the cost that is convex, too), so that the stiffness has no
+jump: Newton's method goes to and fro over jumps.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -27,6 +30,9 @@ from r2s.laws.membrane import MembraneLaw
 SHARE = 0.05  # of the resistance to compression that stays, so that no state is left without any
 CROSS = 0.98  # of the coupling at most, against which wrinkles are found
 LEAST = 1e-3  # stiffness that wrinkles are found against, of the largest
+ONSET = 0.5  # of the critical stress, on either side of it, over which wrinkles begin
+FEWEST = 1e-5  # strain at which they begin at least, without bending
+MOST = 0.4  # Green strain that they hide: a cell without length (0.5) would have bends without end
 ROOT = 2**0.5
 # Of 200,000 random cases 6 solves end within rounding, 4 within 5e-5 (all but 1 %: 1e-8).
 DESCENTS, SOLVES = 2, {jnp.dtype("float32"): 4, jnp.dtype("float64"): 6}
@@ -104,18 +110,23 @@ def _released_jvp(primals, tangents):
 
 def _cost(hidden: Vector, stiffness, critical, strain) -> Number:
     """What hidden wrinkles cost [J/m^2], on the scales of `_problem`."""
-    quadratic, linear, _ = _problem(stiffness, critical, strain)
-    return _dot(hidden, _times(quadratic, hidden)) / 2 + _dot(linear, hidden)
+    quadratic, linear, bound, width, most = _problem(stiffness, critical, strain)
+    mean, radius, _, _ = _principal(hidden)
+    limits = _limits(mean + radius, most) + _limits(mean - radius, most)
+    slope = _times(quadratic, hidden)
+    return width**2 * (_dot(hidden, slope) / 2 + _dot(linear, hidden) + bound * limits)
 
 
-def _problem(stiffness, critical, strain) -> tuple[Matrix, Vector, Number]:
-    """Second and first derivative of the cost without wrinkles; a bound on the second.
+def _problem(stiffness, critical, strain) -> tuple[Matrix, Vector, Number, Number, Number]:
+    """Second and first derivative of the cost without wrinkles; a bound on the second; the unit;
+    the most of them in this unit.
 
     Wrinkles are scaled along warp and weft by fourth roots of their stiffness, which keeps them
-    symmetric and positive, and makes all fabrics alike.
+    symmetric and positive, and makes all fabrics alike. Their unit is that of their onset.
     """
     (c11, c12, c13), (_, c22, c23), (_, _, c33) = (tuple(row) for row in stiffness)
     e11, e22, shear = strain
+    critical = jnp.maximum(critical, FEWEST * jnp.sqrt(c11 * c22))
     warp, weft = jax.lax.rsqrt(c11), jax.lax.rsqrt(c22)
     both = warp * weft
     bias = ROOT * jnp.sqrt(both)  # with 2 E12
@@ -124,26 +135,30 @@ def _problem(stiffness, critical, strain) -> tuple[Matrix, Vector, Number]:
     ones = jnp.ones_like(warp) + LEAST
     last = c33 * bias * bias + LEAST
     quadratic = (ones, coupling, first), (coupling, ones, second), (first, second, last)
-    linear = (
-        warp * (c11 * e11 + c12 * e22 + c13 * shear + critical),
-        weft * (c12 * e11 + c22 * e22 + c23 * shear + critical),
-        bias * (c13 * e11 + c23 * e22 + c33 * shear),
-    )
     sums = [abs(row[0]) + abs(row[1]) + abs(row[2]) for row in quadratic]
-    return quadratic, linear, jnp.maximum(jnp.maximum(sums[0], sums[1]), sums[2])
+    bound = jnp.maximum(jnp.maximum(sums[0], sums[1]), sums[2])
+    width = ONSET * critical * jnp.minimum(warp, weft) / bound
+    most = jnp.maximum(MOST / jnp.maximum(warp, weft) / width, 2)
+    linear = (
+        warp * (c11 * e11 + c12 * e22 + c13 * shear + critical) / width,
+        weft * (c12 * e11 + c22 * e22 + c23 * shear + critical) / width,
+        bias * (c13 * e11 + c23 * e22 + c33 * shear) / width,
+    )
+    return quadratic, linear, bound, width, most
 
 
 @jax.custom_jvp
 def _hidden(stiffness, critical, strain) -> Vector:
     """The scaled wrinkles that release most: descents, then a semismooth Newton method."""
     problem = _problem(stiffness, critical, strain)
+    most = problem[-1]
 
     def descent(hidden, _):
-        return _positive(_descended(hidden, problem)), None
+        return _limited(_descended(hidden, problem), most), None
 
     def solve(hidden, _):
         before = _descended(hidden, problem)
-        short = tuple(a - b for a, b in zip(hidden, _positive(before), strict=True))
+        short = tuple(a - b for a, b in zip(hidden, _limited(before, most), strict=True))
         change = _solve(_system(before, problem), short)
         return tuple(a - b for a, b in zip(hidden, change, strict=True)), None
 
@@ -156,22 +171,29 @@ def _hidden(stiffness, critical, strain) -> Vector:
 def _hidden_jvp(primals, tangents):
     """By the implicit function theorem, from what the wrinkles solve."""
     hidden = _hidden(*primals)
-    before, change = jax.jvp(lambda *p: _descended(hidden, _problem(*p)), primals, tangents)
-    right = _times(_positive_slope(before), change)
+
+    def limit(*given):
+        problem = _problem(*given)
+        return _descended(hidden, problem), problem[-1]
+
+    (before, most), (change, more) = jax.jvp(limit, primals, tangents)
+    right = _times(_limited_slope(before, most), change)
+    at_most = _of_principal(lambda value: jnp.clip((value - most + 1) / 2, 0, 1), before)
+    right = tuple(a + more * b for a, b in zip(right, at_most, strict=True))
     return hidden, _solve(_system(before, _problem(*primals)), right)
 
 
 def _descended(hidden: Vector, problem) -> Vector:
-    quadratic, linear, bound = problem
+    quadratic, linear, bound, _, _ = problem
     slope = _times(quadratic, hidden)
     one, two, three = (h - (s + f) / bound for h, s, f in zip(hidden, slope, linear, strict=True))
     return one, two, three
 
 
 def _system(before: Vector, problem) -> Matrix:
-    """The derivative of the wrinkles' equation, hidden = _positive(descended), in them."""
-    quadratic, _, bound = problem
-    slope = _positive_slope(before)
+    """The derivative of the wrinkles' equation, hidden = _limited(descended), in them."""
+    quadratic, _, bound, _, most = problem
+    slope = _limited_slope(before, most)
     columns = [_times(slope, row) for row in quadratic]  # the matrix is symmetric
 
     def entry(i, j):
@@ -191,21 +213,47 @@ def _principal(matrix: Vector) -> tuple[Number, Number, Number, Number]:
     return mean, radius, jnp.where(has_axes, half / length, 1), shear / length
 
 
-def _positive(matrix: Vector) -> Vector:
-    """The nearest matrix without negative principal values."""
+def _between(value: Number, most: Number) -> Number:
+    """The value between none and most; parabolas from 1 before these to 1 beyond."""
+    low = jnp.where(value < 1, jnp.clip(value + 1, 0, 2) ** 2 / 4, value)
+    return jnp.where(value > most - 1, most - jnp.clip(most + 1 - value, 0, 2) ** 2 / 4, low)
+
+
+def _between_slope(value: Number, most: Number) -> Number:
+    return jnp.clip((value + 1) / 2, 0, 1) * jnp.clip((most + 1 - value) / 2, 0, 1)
+
+
+def _limits(value: Number, most: Number) -> Number:
+    """The convex function between none and most whose proximal map is `_between`."""
+    left = most - value
+    return _edge(value) + jnp.where(left < 1, _edge(left) + 1 / 6, 0)
+
+
+def _edge(inside: Number) -> Number:
+    inside = jnp.clip(inside, 0, 1)
+    root = jnp.sqrt(jnp.where(inside > 0, inside, 1))
+    return jnp.where(inside > 0, 4 / 3 * inside * root - inside - inside**2 / 2, 0)
+
+
+def _of_principal(function: Callable[[Number], Number], matrix: Vector) -> Vector:
+    """The matrix with a function of its principal values."""
     mean, radius, cosine, sine = _principal(matrix)
-    high, low = jnp.maximum(mean + radius, 0), jnp.maximum(mean - radius, 0)
+    high, low = function(mean + radius), function(mean - radius)
     middle, half = (high + low) / 2, (high - low) / 2
     return middle + half * cosine, middle - half * cosine, ROOT * half * sine
 
 
-def _positive_slope(matrix: Vector) -> Matrix:
-    """The derivative of `_positive`."""
+def _limited(matrix: Vector, most: Number) -> Vector:
+    return _of_principal(lambda value: _between(value, most), matrix)
+
+
+def _limited_slope(matrix: Vector, most: Number) -> Matrix:
+    """The derivative of `_limited`."""
     mean, radius, cosine, sine = _principal(matrix)
     high, low = mean + radius, mean - radius
-    along, across = jnp.where(high > 0, 1.0, 0.0), jnp.where(low > 0, 1.0, 0.0)
-    turned = (jnp.maximum(high, 0) - jnp.maximum(low, 0)) / jnp.where(radius > 0, 2 * radius, 1)
-    turned = jnp.where(radius > 0, turned, along)
+    along, across = (_between_slope(value, most) for value in (high, low))
+    turned = _between(high, most) - _between(low, most)
+    turned = jnp.where(radius > 0, turned / jnp.where(radius > 0, 2 * radius, 1), along)
     parts = (
         (along, ((1 + cosine) / 2, (1 - cosine) / 2, sine / ROOT)),
         (across, ((1 - cosine) / 2, (1 + cosine) / 2, -sine / ROOT)),
