@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import SIZE, everywhere, flat, rotation, stored_energy
+from conftest import SIZE, everywhere, flat, rotation
 from mpm_bodies import momenta, states, still
 
 import r2s
@@ -19,6 +19,7 @@ from r2s.mpm import Grid, Sheet
 from r2s.mpm.elements import bending_frequency, elastic_force, membrane_frequency
 from r2s.mpm.sheet import stable_step
 from r2s.mpm.transverse import Transverse, unit_normal
+from r2s.scenarios.energy import stored_energy
 from r2s.units import GRAVITY
 from r2s.world.air import Air
 from r2s.world.contact import Table

@@ -19,10 +19,13 @@ AMPLITUDE = 1e-5 * LENGTH  # [m]
 
 
 def strip(axis: int):
-    """A strip along warp (0) or weft (1), and how far along it its vertices are [m]."""
+    """A strip along warp (0) or weft (1), and how far along it its vertices are [m].
+
+    Its cells do not wrinkle: without bending they would give way to half of every wave.
+    """
     size, shape = [WIDTH] * 2, [3, 3]
     size[axis], shape[axis] = LENGTH, CELLS + 1
-    mesh = rectangle((size[0], size[1]), (shape[0], shape[1]))
+    mesh = rectangle((size[0], size[1]), (shape[0], shape[1]), "quadrilaterals")
     return mesh, np.asarray(mesh.rest[:, axis])
 
 

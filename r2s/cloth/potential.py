@@ -238,8 +238,12 @@ def _element_hessian(step, blend, corners, samples, drag):
         def energy(strain):
             return _sample_energy(step, law, tangent_before, strain, anchor)
 
+        def stresses(strain):
+            stress = jax.grad(energy)(strain)
+            return stress, stress
+
         strain = green_strain(corners, gradients)
-        stress, tangent = jax.grad(energy)(strain), jax.hessian(energy)(strain)
+        tangent, stress = jax.jacfwd(stresses, has_aux=True)(strain)
         by_corners = green_strain_gradient(corners, gradients)
         material = jnp.einsum("sai,st,tbj->aibj", by_corners, tangent, by_corners)
         carried = blend * _symmetric(stress) + (1 - blend) * _tension(stress)

@@ -11,7 +11,7 @@ from r2s.geometry.bends import Bends
 from r2s.geometry.plate_elements import PlateElements
 from r2s.geometry.strain_samples import StrainSamples, cells
 
-ELEMENTS = ("quadrilaterals", "wrinkling", "falling", "rising", "alternating")  # of a rectangle
+ELEMENTS = ("wrinkling", "quadrilaterals", "falling", "rising", "alternating")  # of a rectangle
 SMALLEST, LARGEST = 1e-3, 50.0  # [m], of sheets
 
 
@@ -146,7 +146,7 @@ def borders(mesh: Mesh) -> Bool[Array, "face 3"]:
 
 
 def rectangle(
-    size: tuple[float, float], shape: tuple[int, int] = (9, 9), elements: str = "quadrilaterals"
+    size: tuple[float, float], shape: tuple[int, int] = (9, 9), elements: str = "wrinkling"
 ) -> Mesh:
     """A rectangle of `size` (warp, weft) [m] with `shape` vertices along warp and weft.
 

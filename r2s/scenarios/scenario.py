@@ -87,7 +87,7 @@ def from_placement(
     times: Float[np.ndarray, " frame"],
     shape: tuple[int, int] = (9, 9),
     *,
-    elements: str = "quadrilaterals",
+    elements: str = "wrinkling",
     clamps: tuple[tuple[str, str], ...] = (),
     wind: tuple[float, float, float] | None = None,
     self_contact: bool = False,

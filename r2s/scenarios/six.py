@@ -51,7 +51,7 @@ class Experiment(NamedTuple):
         self,
         shape: tuple[int, int] = (9, 9),
         self_contact: bool = False,
-        elements: str = "quadrilaterals",
+        elements: str = "wrinkling",
     ) -> Scenario:
         """On a mesh of `shape` vertices along warp and weft, made of `elements`
         (`r2s.geometry.mesh.rectangle`); with `self_contact` it does not pass through itself."""
