@@ -82,6 +82,28 @@ def values_of(found: Estimate) -> dict[str, str]:
     return line | {"converged": "yes" if found.converged else "no"}
 
 
+def fitted_to_truth(space: ParameterSpace, truth: Fabric, found: Estimate) -> dict[str, str]:
+    """An estimate beside the truth as a line of a table, as `values_of`.
+
+    Parameters on a logarithmic scale are divided by the truth, of others the truth is subtracted.
+    """
+    line, true = {}, np.asarray(space.values(space.to_unit(truth)))
+    numbers = zip(
+        found.ranges, true, found.values, found.standard_errors, found.identifiable, strict=True
+    )
+    for bound, expected, value, error, known in numbers:
+        text = f"{value / expected:.3f}" if bound.log else f"{value - expected:+.3f}"
+        text += f" ± {error:.3f}"
+        line[bound.name] = text if known else f"({text})"
+    if found.mesh_bias is not None:
+        names = [bound.name for bound in found.ranges]
+        line |= {
+            f"mesh: {name}": f"{bias:.3f}"
+            for name, bias in zip(names, found.mesh_bias, strict=True)
+        }
+    return line | {"converged": "yes" if found.converged else "no"}
+
+
 def frames_of(recording: Recording) -> range:
     """The numbers of the frames that count."""
     return range(recording.info.frames_used[0], recording.info.frames_used[1] + 1)

@@ -101,10 +101,30 @@ def test_a_recording_is_simulated_and_judged(tmp_path: Path, capsys: pytest.Capt
     assert main([*command, "--recording", str(recording)]) == 0
     assert load(recording).info.fabric == "black_denim"
     capsys.readouterr()
-    assert main(["evaluate", "black_denim", str(recording), "--json"]) == 0
+    assert main(["evaluate", "black_denim", str(recording), "--shape", "3", "3", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     (metrics,) = told["recordings"].values()
-    assert 0 < metrics["chamfer_real_to_sim"] < 0.02 and told["units"]["hausdorff"] == "m"
+    assert 0 < metrics["chamfer_real_to_sim"] < 0.01 and told["units"]["hausdorff"] == "m"
+    (mesh,) = told["meshes"].values()
+    assert mesh["shape"] == [3, 3] and mesh["mesh_error_m"] > 0.005
+
+
+def test_export_warns_of_a_mesh_that_is_too_coarse(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    command = ["export", "grey_interlock", "--to", "mujoco", "--out", str(tmp_path / "x.xml")]
+    assert main([*command, "--size", "0.45", "0.45", "--shape", "5", "5"]) == 0
+    assert "warning: a mesh of 5 x 5 is coarse" in capsys.readouterr().out
+    assert main([*command, "--size", "0.2", "0.2", "--shape", "17", "17"]) == 0
+    assert "warning" not in capsys.readouterr().out
+
+
+def test_the_doctor_says_which_mesh_a_fabric_needs(capsys: pytest.CaptureFixture) -> None:
+    assert main(["doctor", "--fabric", "grey_interlock"]) == 0
+    told = capsys.readouterr().out
+    assert re.search(r"folding: \d+\.\d mm, too coarse, take 33 x 33", told)
+    assert main(["doctor", "--fabric", "grey_interlock", "--shape", "65", "65"]) == 0
+    assert re.search(r"folding: \d\.\d mm, enough", capsys.readouterr().out)
 
 
 def test_exports_are_files_and_say_what_is_lost(

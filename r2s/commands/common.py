@@ -11,6 +11,7 @@ from tyro.conf import arg
 
 if TYPE_CHECKING:
     from r2s.estimation.cards import Card
+    from r2s.fabrics.fabric import Fabric
     from r2s.scenarios import Experiment
 
 NOT_NUMBERS = {"path", "route", "size", "held"}  # parameters of an experiment that are no numbers
@@ -30,6 +31,10 @@ Motion = Annotated[
     ),
 ]
 Shape = Annotated[tuple[int, int], arg(help="Vertices along warp and weft.")]
+ChosenShape = Annotated[
+    tuple[int, int] | None,
+    arg(help="Vertices along warp and weft; by default as many as the fabric's folds need."),
+]
 SolverName = Annotated[
     Literal["cloth", "points"], arg(help="The implicit cloth, or material points.")
 ]
@@ -85,6 +90,33 @@ def make_experiment(scenario: str, motion: Iterable[str]) -> "Experiment":
         return make(**numbers)
     except TypeError as error:
         raise ValueError(f"{scenario}: {error}") from None
+
+
+def choose_shape(
+    asked: tuple[int, int] | None, fabric: "Fabric", size: tuple[float, float], motion: str
+) -> tuple[tuple[int, int], dict[str, Any], list[str]]:
+    """The shape that was asked for, or else that of `r2s.scenarios.resolution`.
+
+    Also what a result tells of it, and lines for people: the error it is expected to leave, or a
+    warning where that is too large.
+    """
+    from r2s.scenarios import resolution
+
+    shape = asked or resolution.shape_for(fabric, size, motion)
+    error = resolution.mesh_error(fabric, size, shape, motion)
+    words = f"mesh of {shape[0]} x {shape[1]}: expected error {1e3 * error:.1f} mm"
+    told = {"shape": list(shape), "mesh_error_m": error}
+    return shape, told, mesh_warning(shape, fabric, size, motion) or [words]
+
+
+def mesh_warning(
+    shape: tuple[int, int], fabric: "Fabric", size: tuple[float, float], motion: str
+) -> list[str]:
+    """A line where a mesh is too coarse for a fabric; none where it is not."""
+    from r2s.scenarios import resolution
+
+    text = resolution.warning(fabric, size, shape, motion)
+    return [f"warning: {text}"] if text else []
 
 
 def print_result(as_json: bool, content: Mapping[str, Any], lines: Iterable[str]) -> None:

@@ -34,6 +34,7 @@ PLAUSIBLE = {  # of fabrics for clothes and the household
     "thickness": (1e-4, 5e-3, "m", "of the sheet"),
     "mass_damping": (0.0, 20.0, "1/s", "a rate"),
 }
+SIDE = 0.45  # [m], the study's sheets
 STIFF = (1.0, 1e5, "N/m", "a force per width: a modulus in Pa times the thickness in m")
 BENDS = (1e-8, 1e-2, "N m", "a moment per curvature and width: 1 mN mm is 1e-6 N m")
 
@@ -72,7 +73,16 @@ class Doctor:
             lines.append(f"fabric {card.name}: {'see below' if found else 'plausible'}")
             length = float(fold_length(card.fabric))
             lines.append(f"    it folds at {1e3 * length:.1f} mm: longer cells cannot follow")
-            result["fabric"] = {"name": card.name, "implausible": found, "fold_length_m": length}
+            errors = mesh_errors(card.fabric, self.shape)
+            mesh = f"{self.shape[0]} x {self.shape[1]} vertices"
+            lines.append(f"    expected errors of a sheet of {SIDE} m with {mesh}:")
+            lines += [f"        {name}: {text}" for name, (_, text) in errors.items()]
+            result["fabric"] = {
+                "name": card.name,
+                "implausible": found,
+                "fold_length_m": length,
+                "mesh_error_m": {name: error for name, (error, _) in errors.items()},
+            }
         if self.mesh is not None:
             result["mesh"], text = _mesh(self.mesh)
             lines.append(text)
@@ -120,6 +130,20 @@ class Doctor:
             f"{memory / 1e6:.1f} MB, with its gradient {gradient_memory / 1e6:.1f} MB",
             f"    on material points: steps of {1e3 * points.dt:.3f} ms",
         ]
+
+
+def mesh_errors(fabric: "Fabric", shape: tuple[int, int]) -> dict[str, tuple[float, str]]:
+    """The error [m] that a mesh leaves in each motion of a fabric, and in words."""
+    from r2s.scenarios import resolution
+
+    found = {}
+    for motion in resolution.TABLE:
+        error = resolution.mesh_error(fabric, (SIDE, SIDE), shape, motion)
+        fine = resolution.shape_for(fabric, (SIDE, SIDE), motion)
+        is_enough = error <= resolution.ENOUGH
+        advice = "enough" if is_enough else f"too coarse, take {fine[0]} x {fine[1]}"
+        found[motion] = error, f"{1e3 * error:.1f} mm, {advice}"
+    return found
 
 
 def installation() -> tuple[dict[str, Any], list[str], list[str]]:

@@ -1,6 +1,6 @@
 """`r2s estimate`: recordings to a fabric card."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 if TYPE_CHECKING:
+    from r2s.estimation.estimate import Estimate
     from r2s.estimation.method import Budget, Method, Progress
+    from r2s.recordings.recording import Recording
 
 MethodName = Literal[
     "diffcloud",
@@ -68,7 +70,8 @@ class EstimateCard:
     network: Annotated[Path | None, arg(metavar="FILE")] = None
     """physnet: its trained network; by default that of --out with .network."""
     shape: tuple[int, int] | None = None
-    """Vertices of the simulated sheet (9 9)."""
+    """Vertices of the simulated sheet; by default diffcloud goes to finer meshes until one resolves
+    the fabric, others take 9 9."""
     seed: int = 0
     """Seed of the coarse search, or of the network and its search."""
     date: str = ""
@@ -105,10 +108,10 @@ class EstimateCard:
         )
         card = cards.Card.make(self.name or seen[0].info.fabric, estimate, provenance)
         cards.write(self.out, card)
-        self._progress_file.unlink(missing_ok=True)
-        print_result(
-            self.json, cards.as_json(card), [*describe(estimate), f"{self.out}: {card.name}"]
-        )
+        for path in self.out.parent.glob(f"{self._progress_file.stem}*.npz"):
+            path.unlink()
+        lines = [*describe(estimate), *_warnings(estimate, seen), f"{self.out}: {card.name}"]
+        print_result(self.json, cards.as_json(card), lines)
         return 0
 
     @property
@@ -131,7 +134,7 @@ class EstimateCard:
             own["network"] = self.out.with_name(f"{self.out.name}.network")
         return kind(
             solver=self.solver,
-            shape=self.shape or (9, 9),
+            shape=self.shape,
             checkpoint=self._progress_file,
             progress=progress,
             **{name: value for name, value in own.items() if name in known},
@@ -147,6 +150,17 @@ class EstimateCard:
                 takes = ", ".join(f"--{each}" for each in method.heeds)
                 raise ValueError(f"--{name} is not of {method.name}: it takes {takes}")
         return method.budget._replace(**asked)
+
+
+def _warnings(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[str]:
+    """Where the mesh of the estimate is too coarse for the fabric that came out."""
+    from r2s.commands.common import mesh_warning
+
+    if estimate.shape is None:
+        return []
+    motions = dict.fromkeys((each.info.sheet.size, each.info.scenario) for each in recordings)
+    shape, fabric = estimate.shape, estimate.fabric
+    return [line for each in motions for line in mesh_warning(shape, fabric, *each)]
 
 
 class _bar:

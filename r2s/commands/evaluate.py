@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from r2s.commands.common import FabricName, Json
+from r2s.commands.common import ChosenShape, FabricName, Json
 
 
 @dataclass(frozen=True)
@@ -24,21 +24,27 @@ class Evaluate:
     fabric: Positional[FabricName]
     recordings: Annotated[Positional[tuple[Path, ...]], arg(metavar="RECORDING")]
     """NPZ, or folders."""
+    shape: ChosenShape = None
     json: Json = False
 
     def run(self) -> int:
-        from r2s.commands.common import load_card, print_result
+        from r2s.commands.common import choose_shape, load_card, print_result
         from r2s.evaluation import prediction_error
         from r2s.recordings.open import open_recordings
         from r2s.scenarios.scenario import from_recording
 
         card, found, failures, lines = load_card(self.fabric), {}, {}, []
+        meshes: dict[str, dict] = {}
         for recording in open_recordings(self.recordings):
-            motion = prediction_error.predict_motion(from_recording(recording), card.fabric)
-            metrics = prediction_error.against_motion(recording, motion.x)
-            name = recording.info.name
+            name, size = recording.info.name, recording.info.sheet.size
+            shape, meshes[name], words = choose_shape(
+                self.shape, card.fabric, size, recording.info.scenario
+            )
+            motion = prediction_error.predict_motion(from_recording(recording, shape), card.fabric)
+            metrics = prediction_error.against_motion(recording, motion.x, shape=shape)
             found[name] = metrics
-            lines += [f"{name}:", *(_line(metric, value) for metric, value in metrics.items())]
+            lines += [f"{name}:", *(f"    {line}" for line in words)]
+            lines += [_line(metric, value) for metric, value in metrics.items()]
             if math.isnan(metrics["chamfer_real_to_sim"]):
                 failures[name] = motion.failure
                 lines.append(f"    the simulation {failures[name]}")
@@ -46,6 +52,7 @@ class Evaluate:
             raise ValueError("no recording: name an NPZ, or a folder that holds some")
         units = {name: prediction_error.UNITS.get(name, "m") for name in next(iter(found.values()))}
         result = {"fabric": card.name, "units": units, "recordings": found, "failures": failures}
+        result["meshes"] = meshes
         print_result(self.json, result, lines)
         return 1 if failures else 0
 

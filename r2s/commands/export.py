@@ -38,7 +38,7 @@ class Export:
     json: Json = False
 
     def run(self) -> int:
-        from r2s.commands.common import load_card, print_result
+        from r2s.commands.common import load_card, mesh_warning, print_result
 
         card = load_card(self.fabric)
         loss = self._write(card.fabric, card.name)
@@ -54,6 +54,8 @@ class Export:
             errors = getattr(loss, part).items()
             if errors:
                 lines.append(f"{part}: " + ", ".join(f"{name} {e:+.1%}" for name, e in errors))
+        if self.to != "arcsim":
+            lines += mesh_warning(self.shape, card.fabric, self.size, "lifting")
         print_result(self.json, result, [*lines, *(f"lost: {text}" for text in loss.lost)])
         return 0
 

@@ -32,11 +32,14 @@ class Sensitivity:
     json: Json = False
 
     def run(self) -> None:
-        from r2s.commands.common import parse_numbers, print_result
+        from r2s.commands.common import mesh_warning, parse_numbers, print_result
         from r2s.estimation.estimate import describe
         from r2s.estimation.estimate_json import as_json
         from r2s.estimation.experiment_design import evaluate_design
+        from r2s.estimation.method import COARSEST
+        from r2s.scenarios.six import SIDE
 
         numbers = parse_numbers(self.motion)
         found = evaluate_design(self.scenario, self.fabric, numbers, self.noise, self.seed)
-        print_result(self.json, as_json(found), describe(found))
+        coarse = mesh_warning(COARSEST, found.fabric, (SIDE, SIDE), self.scenario)
+        print_result(self.json, as_json(found), [*describe(found), *coarse])

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from r2s.commands.common import FabricName, Json, Motion, ScenarioName, Shape, SolverName
+from r2s.commands.common import ChosenShape, FabricName, Json, Motion, ScenarioName, SolverName
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Simulate:
     units.
 
         r2s simulate lifting --fabric black_denim --motion height=0.3 --out lift.npz
-        r2s simulate fling --fabric mine.json --shape 17 17 --out x.npz --recording fling.npz
+        r2s simulate fling --fabric mine.json --shape 33 33 --out x.npz --recording fling.npz
     """
 
     scenario: Annotated[Positional[ScenarioName], arg(metavar="SCENARIO")]
@@ -29,7 +29,7 @@ class Simulate:
     fabric: FabricName = "grey_interlock"
     motion: Motion = ()
     solver: SolverName = "cloth"
-    shape: Shape = (9, 9)
+    shape: ChosenShape = None
     self_contact: bool = False
     """The sheet touches itself (cloth only; slower)."""
     recording: Annotated[Path | None, arg(metavar="FILE")] = None
@@ -44,7 +44,7 @@ class Simulate:
         import numpy as np
 
         from r2s import scenarios
-        from r2s.commands.common import load_card, make_experiment, print_result
+        from r2s.commands.common import choose_shape, load_card, make_experiment, print_result
         from r2s.files import check_folders
         from r2s.recordings.open import save_trajectory
         from r2s.recordings.recording import save
@@ -57,13 +57,15 @@ class Simulate:
                 "--self-contact is of the cloth: material points touch through their grid"
             )
         card, experiment = load_card(self.fabric), make_experiment(self.scenario, self.motion)
-        scenario, fabric = experiment.scenario(self.shape, self.self_contact), card.fabric
+        fabric, size = card.fabric, experiment.sheet.size
+        shape, told, of_mesh = choose_shape(self.shape, fabric, size, self.scenario)
+        scenario = experiment.scenario(shape, self.self_contact)
         make_solver = scenarios.material_points if self.solver == "points" else None
         solver = None if make_solver is None else make_solver(scenario, fabric)
         motion = eqx.filter_jit(rollout)(scenario, fabric, solver=solver)
         ok, failure = np.asarray(motion.ok), motion.explain()
         save_trajectory(self.out, motion.x, scenario.scene.mesh.faces)
-        lines = [f"{self.out}: {len(ok)} frames of {motion.x.shape[1]} vertices"]
+        lines = [f"{self.out}: {len(ok)} frames of {motion.x.shape[1]} vertices", *of_mesh]
         if failure:
             lines.append(f"the simulation {failure}")
         elif self.recording is not None:
@@ -71,7 +73,7 @@ class Simulate:
                 experiment,
                 fabric,
                 card.name,
-                shape=self.shape,
+                shape=shape,
                 self_contact=self.self_contact,
                 solver=make_solver,
                 key=jax.random.key(self.seed),
@@ -84,6 +86,7 @@ class Simulate:
             "solver": self.solver,
             "frames": len(ok),
             "vertices": int(motion.x.shape[1]),
+            **told,
             "interval_s": scenario.interval,
             "diverged_in_frame": int(np.argmin(ok)) if failure else None,
             "failure": failure or None,

@@ -42,9 +42,10 @@ class CMAES(Method):
     def _estimate(self, recordings, space, budget, key):
         require("cma", "cma", "CMA-ES")  # before anything is simulated
         if self.chosen_solver == "points":
-            problems = problems_on_points(recordings, space, self.shape)
+            problems = problems_on_points(recordings, space, self.chosen_shape)
         else:
-            problems = tuple(Problem.make(each, space, shape=self.shape) for each in recordings)
+            shape = self.chosen_shape
+            problems = tuple(Problem.make(each, space, shape=shape) for each in recordings)
         return search(problems, evaluations=budget.evaluations, progress=self.progress, key=key)
 
 

@@ -5,6 +5,7 @@ import itertools
 import math
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,9 +17,11 @@ from r2s.estimation import checkpoint as checkpoints
 from r2s.estimation import gauss_newton, standard_errors
 from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
+from r2s.estimation.mesh_bias import OtherMesh, mesh_bias
 from r2s.estimation.method import Budget, Progress
-from r2s.estimation.prediction import explain, fabric_at
+from r2s.estimation.prediction import Theta, explain, fabric_at
 from r2s.estimation.problem import OWN, SHARED, UNITS, Problem, beginning
+from r2s.fabrics.fabric import Fabric
 
 INITIAL_DAMPING = 1e-2
 # of the prior's weight, which is about twice what a change by one standard error costs
@@ -48,6 +51,26 @@ _sample_around = eqx.filter_jit(standard_errors.sample_around)
 DEFAULT = Budget(shares=(0.25, 0.5))
 
 
+class Search(NamedTuple):
+    """- `problems`: what was searched for. - `rows`: all descents in every iteration.
+    - `seconds`: how long it took.
+    """
+
+    problems: Problems
+    rows: list[Row]
+    seconds: float
+
+    @property
+    def theta(self) -> Theta:
+        """The end of the best descent, see `r2s.estimation.prediction`."""
+        return _best(self.rows[-1])[1].theta
+
+    @property
+    def fabric(self) -> Fabric:
+        """The fabric there."""
+        return fabric_at(self.problems[0], self.theta[theta_indices(self.problems, 0)])
+
+
 def descend(
     problems: Problem | Problems,
     budget: Budget = DEFAULT,
@@ -72,6 +95,21 @@ def descend(
     `ValueError` for no starts, for an odd number of places around the end, and for shares that do
     not rise between 0 and 1.
     """
+    problems = (problems,) if isinstance(problems, Problem) else problems
+    found = search(problems, budget, start=start, checkpoint=checkpoint, progress=progress, key=key)
+    return judged(found, budget, approach=approach, key=key)
+
+
+def search(
+    problems: Problems,
+    budget: Budget,
+    *,
+    start: Float[Array, " start"] | None = None,
+    checkpoint: Path | None = None,
+    progress: Progress | None = None,
+    key: PRNGKeyArray,
+) -> Search:
+    """The descents of `descend`, whose arguments these are; a `start` may be a whole theta."""
     if budget.starts < 1:
         raise ValueError(f"an estimate needs a start or more, got {budget.starts}")
     if any(not low < high for low, high in itertools.pairwise((0.0, *budget.shares, 1.0))):
@@ -79,7 +117,6 @@ def descend(
     if budget.around < 0 or budget.around % 2:
         raise ValueError(f"places around the end are in pairs: an even number, got {budget.around}")
     began = time.perf_counter()
-    problems = (problems,) if isinstance(problems, Problem) else problems
     run = _run_of(problems, budget, start, key) if checkpoint else {}
     rows = _resumed(checkpoint, run, budget) if checkpoint else []
     if not rows:
@@ -90,20 +127,41 @@ def descend(
             checkpoints.save(checkpoint, checkpoints.arrays_of(_stacked(rows)), run)
         if progress is not None:
             progress(len(rows) - 2, float(_best(row)[1].normal.loss))
-    which, best = _best(rows[-1])
-    stage = _rows_of_stage(rows, int(best.stage))
-    converged = _arrived(problems, stage, which, _weight(problems, best.normal))
+    return Search(problems, rows, time.perf_counter() - began)
+
+
+def judged(
+    found: Search,
+    budget: Budget,
+    *,
+    approach: str = "diffcloud",
+    other_mesh: OtherMesh | None = None,
+    key: PRNGKeyArray,
+) -> Estimate:
+    """The estimate at the end of a search, with its standard errors.
+
+    `other_mesh`: by which its bias by its mesh is judged (`r2s.estimation.mesh_bias`), which the
+    standard errors then hold.
+    """
+    began, problems = time.perf_counter(), found.problems
+    which, best = _best(found.rows[-1])
+    stage, prior = _rows_of_stage(found.rows, int(best.stage)), _weight(problems, best.normal)
     covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1))
-    seconds = time.perf_counter() - began
-    return collect(problems, rows, covariance, approach, seconds, converged)
+    bias = None
+    if other_mesh is not None:
+        bias = mesh_bias(problems, other_mesh, best, prior, budget.width)
+        covariance = covariance + np.outer(bias, bias)
+    seconds = found.seconds + time.perf_counter() - began
+    converged = _arrived(problems, stage, which, prior)
+    return collect(problems, found.rows, covariance, approach, seconds, converged, bias)
 
 
 def _begin(problems: Problems, budget: Budget, start, key) -> Row:
     dim, count = problems[0].space.dim, max(budget.coarse, budget.starts)
     start = jnp.full(dim, 0.5, float) if start is None else start
-    places = jax.random.uniform(key, (count, dim), float).at[0].set(start)
+    places = jax.random.uniform(key, (count, dim), float)
     nothing = jnp.zeros((count, gauss_newton.theta_length(problems) - dim), float)
-    thetas = jnp.concatenate([places, nothing], axis=1)
+    thetas = jnp.concatenate([places, nothing], axis=1).at[0, : len(start)].set(start)
     if budget.coarse:
         losses = losses_of(_seen(problems, budget, 0), thetas)
         if not np.any(np.isfinite(losses)):
@@ -323,20 +381,26 @@ def collect(
     approach: str,
     seconds: float,
     converged: bool | None,
+    bias: Float[np.ndarray, " theta"] | None = None,
 ) -> Estimate:
-    """The estimate of the best descent in the last of some iterations, from its covariance."""
+    """The estimate of the best descent in the last of some iterations, from its covariance.
+
+    `bias` is that of its mesh, which the covariance holds already.
+    """
     space = problems[0].space
     _, best = _best(rows[-1])
     of_fabric = covariance[: space.dim, : space.dim]
     deviation = np.sqrt(np.diag(of_fabric))
     descents = _stacked(rows)
     values_of = jax.vmap(jax.vmap(space.values))
+    widths = np.array([bound.width for bound in space.ranges])
     return Estimate(
         approach=approach,
         fabric=fabric_at(problems[0], best.theta[theta_indices(problems, 0)]),
         ranges=space.ranges,
         values=np.asarray(space.values(best.theta[: space.dim])),
-        standard_errors=deviation * np.array([bound.width for bound in space.ranges]),
+        standard_errors=deviation * widths,
+        mesh_bias=None if bias is None else np.abs(bias[: space.dim]) * widths,
         correlation=of_fabric / np.outer(deviation, deviation),
         nuisances=nuisances(problems, np.asarray(best.theta), np.sqrt(np.diag(covariance))),
         loss=float(_loss(problems, best.theta)),

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r2s.estimation import adam
-from r2s.estimation.descent import DEFAULT, descend
+from r2s.estimation.descent import DEFAULT
 from r2s.estimation.estimate import Estimate
+from r2s.estimation.mesh_ladder import descend_by_meshes
 from r2s.estimation.method import ANY, Budget, Method, Progress
 from r2s.estimation.prediction import Prediction
 from r2s.estimation.problem import Problem
@@ -42,9 +43,14 @@ class DiffCloud(Method):
     several = True
 
     def _estimate(self, recordings, space, budget, key):
-        problems = tuple(Problem.make(each, space, shape=self.shape) for each in recordings)
-        return descend(
-            problems, budget, checkpoint=self.checkpoint, progress=self.progress, key=key
+        return descend_by_meshes(
+            recordings,
+            space,
+            budget,
+            shape=self.shape,
+            checkpoint=self.checkpoint,
+            progress=self.progress,
+            key=key,
         )
 
 
@@ -65,7 +71,7 @@ class PublishedDiffCloud(Method):
 
     def _estimate(self, recordings, space, budget, key):
         del key  # it starts in the middle
-        problem = Problem.make(recordings[0], space, shape=self.shape)
+        problem = Problem.make(recordings[0], space, shape=self.chosen_shape)
         assumed = space.middle() if self.assumed is None else self.assumed
         return published_recipe(problem, assumed, epochs=budget.iterations, progress=self.progress)
 

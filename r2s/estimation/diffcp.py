@@ -43,7 +43,7 @@ class DiffCP(Method):
     several = True
 
     def _estimate(self, recordings, space, budget, key):
-        problems = problems_on_points(recordings, space, self.shape)
+        problems = problems_on_points(recordings, space, self.chosen_shape)
         return descend(
             problems,
             budget,
@@ -66,7 +66,7 @@ class PublishedDiffCP(Method):
 
     def _estimate(self, recordings, space, budget, key):
         del key  # it starts where the public code does
-        (problem,) = problems_on_points(recordings, space, self.shape)
+        (problem,) = problems_on_points(recordings, space, self.chosen_shape)
         return published_recipe(problem, epochs=budget.iterations, progress=self.progress)
 
 

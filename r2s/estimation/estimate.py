@@ -57,6 +57,10 @@ class Estimate:
     - `seconds`: how long it took, compilation included.
     - `converged`: whether the method stopped by its own criterion; False when its budget ended it.
       None: nothing was fitted, or a file of version 0.2.0 does not say.
+    - `mesh_bias`: how far each parameter is expected to be off for its mesh alone, as the standard
+      errors, which hold it (`r2s.estimation.mesh_bias`). None: that was not judged.
+    - `shape`: vertices of the simulated sheet along warp and weft; None: it has none, or a file
+      does not say.
     """
 
     approach: str
@@ -72,6 +76,8 @@ class Estimate:
     seconds: float
     converged: bool | None
     loss_unit: str = "m^2"
+    mesh_bias: np.ndarray | None = None
+    shape: tuple[int, int] | None = None
 
     @property
     def at_bounds(self) -> dict[str, Literal["lower", "upper"]]:
@@ -178,6 +184,12 @@ def describe(estimate: Estimate) -> list[str]:
         end = f", at its {side} bound {limit:g}" if side else ""
         unit = "" if bound.unit == "-" else f" {bound.unit}"
         lines.append(f"{bound.name:14s}{value:10.4g}{unit:6s} +- {spread:8s}{word}{end}")
+    if estimate.shape is not None:
+        lines.append(f"mesh: {estimate.shape[0]} x {estimate.shape[1]} vertices")
+    if estimate.mesh_bias is not None:
+        pairs = zip(estimate.ranges, estimate.mesh_bias, strict=True)
+        parts = [f"{r.name} {b:.0%}" if r.log else f"{r.name} {b:.2f}" for r, b in pairs]
+        lines.append(f"of the errors the mesh makes: {', '.join(parts)}")
     for found in estimate.combinations:
         powers = " ".join(f"{name}^{power:g}" for name, power in found.exponents.items())
         lines.append(f"known to {found.standard_error:.1%}: {powers}")

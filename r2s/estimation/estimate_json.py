@@ -40,6 +40,8 @@ def as_json(estimate: Estimate) -> dict[str, Any]:
         "correlation": _nested(estimate.correlation),
         "fabric": fabric_as_json(estimate.fabric),
         "combinations": [each._asdict() for each in estimate.combinations],
+        "shape": None if estimate.shape is None else list(estimate.shape),
+        "mesh_bias": None if estimate.mesh_bias is None else _nested(estimate.mesh_bias),
         "nuisances": [
             each._asdict()
             | {
@@ -93,6 +95,8 @@ def from_json(stored: dict[str, Any]) -> Estimate:
         seconds=stored["seconds"],
         converged=stored["converged"],
         loss_unit=stored["loss_unit"],
+        shape=None if stored.get("shape") is None else tuple(stored["shape"]),
+        mesh_bias=None if stored.get("mesh_bias") is None else _numbers(stored["mesh_bias"]),
     )
 
 

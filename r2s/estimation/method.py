@@ -24,6 +24,7 @@ from r2s.recordings.recording import Recording
 SOLVERS = ("cloth", "points")
 Progress = Callable[[int, float], None]  # told the iteration and the best loss
 ANY = None  # every scenario
+COARSEST = (9, 9)  # vertices of a simulated sheet
 
 
 class Budget(NamedTuple):
@@ -71,7 +72,8 @@ class Method(abc.ABC):
     Of one instance:
 
     - `solver`: "cloth", or "points" (material points); None: the first that the method supports.
-    - `shape`: vertices of the simulated sheet along warp and weft.
+    - `shape`: vertices of the simulated sheet along warp and weft; None: those of the method
+      (`diffcloud`: by meshes that resolve the fabric, see `r2s.estimation.mesh_ladder`).
     - `checkpoint`: a file that a killed run goes on from; None: it begins again.
     - `progress`: called with the iteration and the best loss so far.
     """
@@ -85,7 +87,7 @@ class Method(abc.ABC):
     takes_shape: ClassVar[bool] = True
 
     solver: str | None = None
-    shape: tuple[int, int] = (9, 9)
+    shape: tuple[int, int] | None = None
     checkpoint: Path | None = None
     progress: Progress | None = None
 
@@ -121,6 +123,11 @@ class Method(abc.ABC):
     def chosen_solver(self) -> str:
         """The solver of this instance, or the first that the method supports."""
         return self.solver or next(iter(self.supports))
+
+    @property
+    def chosen_shape(self) -> tuple[int, int]:
+        """The shape of this instance, or `COARSEST`."""
+        return self.shape or COARSEST
 
     @classmethod
     def options(cls) -> frozenset[str]:

@@ -15,6 +15,7 @@ from r2s.scenarios.scenario import Scenario, from_recording, rollout
 from r2s.solver import Solver
 
 SAMPLES = 9  # squared, on each face: 10,368 points on 128 faces, the study's 10,000
+ALL_SAMPLES = SAMPLES**2 * 128  # about as many on any mesh
 UNITS = {"paper_chamfer": "-", "paper_hausdorff": "-"}  # all others are in metres
 
 _rollout = eqx.filter_jit(rollout)  # compiled once for all recordings of as many frames and knots
@@ -45,19 +46,21 @@ def against_motion(
     x: Float[np.ndarray, "frame vertex 3"],
     every: int = 1,
     crop: bool = True,
+    shape: tuple[int, int] = (9, 9),
 ) -> dict[str, float]:
     """Metrics of a motion against a recording, means over the frames that count.
 
-    - `x`: the positions of the motion, [m].
+    - `x`: the positions of the motion, [m]. `shape`: its vertices along warp and weft.
     - `every`: 1 compares all frames that count, 3 every third.
     - `crop`: whether to add the metrics that leave out what lies below the recording, see `_frame`.
 
     All metrics are NaN when the motion diverged in these frames.
     """
     first, last = recording.info.frames_used
-    faces = from_recording(recording).scene.mesh.faces
+    faces = from_recording(recording, shape).scene.mesh.faces
+    samples = max(round((ALL_SAMPLES / len(faces)) ** 0.5), 1)
     used = range(first, last + 1, every)
-    simulated = np.asarray(_sample(jnp.asarray(x[np.array(used)]), faces, SAMPLES))
+    simulated = np.asarray(_sample(jnp.asarray(x[np.array(used)]), faces, samples))
     return _mean([cloud(recording, frame) for frame in used], list(simulated), crop)
 
 

@@ -1,0 +1,91 @@
+"""How far an estimate would go on a finer mesh: one step of Gauss-Newton with that mesh's motion.
+
+The prediction is made on another mesh, its derivative is that of the mesh of the estimate, laid
+onto the other's vertices. Where the meshes agree on the fabric the step is next to nothing. From
+that mesh it is extrapolated to one without end (Richardson), by the order of the error in
+`r2s.scenarios.resolution`.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from r2s.estimation import normal_equations
+from r2s.estimation.gauss_newton import (
+    Descent,
+    Problems,
+    prior_terms,
+    recording_weights,
+    theta_indices,
+    theta_length,
+)
+from r2s.estimation.prediction import Sensitivity, predict, sensitivities
+from r2s.estimation.problem import Problem
+from r2s.geometry.surface import nearest
+from r2s.scenarios.resolution import ORDER
+
+_predict = eqx.filter_jit(predict)
+_sensitivities = eqx.filter_jit(sensitivities)
+_equations = eqx.filter_jit(normal_equations.normal_equations_of)
+
+
+class OtherMesh(NamedTuple):
+    """- `problems`: the same recordings on another mesh.
+    - `factor`: from a step to that mesh to one to a mesh without end, see `factor`.
+    """
+
+    problems: Problems
+    factor: float
+
+
+def factor(ratio: float) -> float:
+    """From a step to a mesh whose cells are `ratio` times as long, to one to a mesh without end."""
+    return 1 / (1 - ratio**ORDER)
+
+
+def mesh_bias(
+    problems: Problems, other: OtherMesh, end: Descent, prior: Array, width: float | None = None
+) -> Float[np.ndarray, " theta"]:
+    """How far theta is from where meshes without end would lead, as far as one step says.
+
+    The Gauss-Newton step on the own mesh is subtracted, since a descent seldom ends at the very
+    minimum. Where a motion fails, or the step is longer than the range, it is the whole range: the
+    mesh tells nothing then.
+
+    - `prior`: its weight, see `r2s.estimation.gauss_newton.prior_weight`.
+    - `width`: of slopes, see `r2s.estimation.prediction.sensitivities`.
+    """
+    size = theta_length(problems)
+    gradients, matrices = np.zeros((2, size)), np.zeros((2, size, size))
+    for which, share in enumerate(recording_weights(problems)):
+        index = theta_indices(problems, which)
+        here, there, theta = problems[which], other.problems[which], end.theta[index]
+        seen, slope = _sensitivities(here, theta, width)
+        laid = _laid_onto(here, there, slope)
+        for side, each in enumerate([(here, seen, slope), (there, _predict(there, theta), laid)]):
+            found = _equations(*each, end.scale)
+            gradients[side, index] += share * np.asarray(found.scores).sum(axis=0)
+            matrix = share * np.asarray(found.matrices).sum(axis=0)
+            matrices[side][np.ix_(index, index)] += matrix
+    off, precision = (np.asarray(part) for part in prior_terms(problems, end.theta))
+    least = float(prior) * precision
+    own, others = (_step(gradients[side], matrices[side], off, least) for side in (0, 1))
+    bias = other.factor * (others - own)
+    return np.clip(np.where(np.isfinite(bias), bias, 1.0), -1, 1)
+
+
+def _step(gradient: np.ndarray, matrix: np.ndarray, off: np.ndarray, prior: np.ndarray):
+    return np.linalg.solve(matrix + np.diag(prior), -gradient - prior * off)
+
+
+def _laid_onto(here: Problem, there: Problem, slope: Sensitivity) -> Sensitivity:
+    """A derivative on one mesh at the vertices of another."""
+    meshes = here.scenario.scene.mesh, there.scenario.scene.mesh
+    own, other = (jnp.pad(mesh.rest, ((0, 0), (0, 1))) for mesh in meshes)
+    face, weights = nearest(other, own, meshes[0].faces)
+    corners = meshes[0].faces[face]
+    laid = jnp.einsum("vk,fvkiu->fviu", weights, slope.x[:, corners])
+    return Sensitivity(laid, slope.force)

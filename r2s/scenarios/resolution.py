@@ -1,0 +1,97 @@
+"""What error a mesh leaves in a motion of a fabric, and which mesh is fine enough for it.
+
+A sheet's error depends on how long its cells are beside the fabric's fold length
+(`r2s.fold_length`). `TABLE` is measured (`experiments/mesh_error.py`, sheets of 0.45 m): geometric
+means over the five fabrics of the distance of 9 x 9 and 17 x 17 vertices from 33 x 33, and for the
+error of these the share of the distance of 17 x 17 that the power `ORDER` leaves. Between the
+entries the logarithms are interpolated; beyond them the error is that power of the cells' length.
+"""
+
+import math
+
+import numpy as np
+
+from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.fold_length import fold_length
+from r2s.scenarios.six import SIDE
+
+Shape = tuple[int, int]
+
+# by motion: cell / fold length [-], and error [m], rms over the sheet and mean over the motion
+TABLE: dict[str, tuple[tuple[float, float], ...]] = {
+    "lifting": ((0.83, 1.5e-3), (1.66, 4.2e-3), (3.31, 5.2e-3)),
+    "wind": ((0.83, 4.3e-3), (1.66, 12.1e-3), (3.31, 19.0e-3)),
+    "folding": ((0.83, 2.7e-3), (1.66, 7.6e-3), (3.31, 17.4e-3)),
+    "drape": ((0.83, 0.8e-3), (1.66, 2.4e-3), (3.31, 4.4e-3)),
+    "hang": ((0.83, 3.8e-3), (1.66, 10.6e-3), (3.31, 15.2e-3)),
+    "fling": ((0.83, 7.1e-3), (1.66, 20.0e-3), (3.31, 26.0e-3)),
+}
+ORDER = 1.5  # of the error in the cells' length, where it is not measured
+ENOUGH = 5e-3  # [m], error of a mesh that is fine enough, of sheets of the study's size
+LADDER = (9, 17, 33)  # vertices along the longer side
+
+
+def mesh_error(fabric: Fabric, size: tuple[float, float], shape: Shape, motion: str) -> float:
+    """Expected error [m] of a motion on a mesh, rms over the sheet and mean over the motion.
+
+    - `size`: of the sheet, [m]. `shape`: of the mesh, vertices along warp and weft.
+    - `motion`: one of `TABLE`; of another, the largest of all.
+
+    Fabrics scatter about it by a factor of about 1.5.
+    """
+    ratio = longest_cell(size, shape) / float(fold_length(fabric))
+    tables = [TABLE[motion]] if motion in TABLE else list(TABLE.values())
+    return max(max(size) / SIDE * _interpolated(table, ratio) for table in tables)
+
+
+def _interpolated(table: tuple[tuple[float, float], ...], ratio: float) -> float:
+    ratios, errors = np.array(table).T
+    inside = np.clip(ratio, ratios[0], ratios[-1])
+    error = np.exp(np.interp(np.log(inside), np.log(ratios), np.log(errors)))
+    return float(error * (ratio / inside) ** ORDER)
+
+
+def longest_cell(size: tuple[float, float], shape: Shape) -> float:
+    """The longer side [m] of a rectangle's cells."""
+    return max(side / (count - 1) for side, count in zip(size, shape, strict=True))
+
+
+def shape_for(
+    fabric: Fabric, size: tuple[float, float], motion: str, enough: float = ENOUGH
+) -> Shape:
+    """The coarsest of some meshes (`ladder`) whose error is `enough` [m]; else the finest.
+
+    >>> from r2s.fabrics import presets
+    >>> shape_for(presets.black_denim(), (0.45, 0.45), "lifting")
+    (9, 9)
+    """
+    enough = enough * max(size) / SIDE
+    for shape in ladder(size):
+        if mesh_error(fabric, size, shape, motion) <= enough:
+            return shape
+    return ladder(size)[-1]
+
+
+def ladder(size: tuple[float, float]) -> list[Shape]:
+    """Meshes of a sheet [m] from coarse to fine, each with half the cells of the one before."""
+    longer = max(size)
+
+    def cells(count: int, side: float) -> int:
+        return max(math.ceil((count - 1) * side / longer - 1e-6), 2)
+
+    return [(cells(n, size[0]) + 1, cells(n, size[1]) + 1) for n in LADDER]
+
+
+def warning(fabric: Fabric, size: tuple[float, float], shape: Shape, motion: str) -> str:
+    """A line for people, with the figure, when a mesh is too coarse for a fabric; else empty."""
+    error = mesh_error(fabric, size, shape, motion)
+    if error <= ENOUGH * max(size) / SIDE:
+        return ""
+    finer = shape_for(fabric, size, motion)
+    advice = "the finest that was measured" if finer == shape else f"try {finer[0]} x {finer[1]}"
+    return (
+        f"a mesh of {shape[0]} x {shape[1]} is coarse for this fabric: it folds at "
+        f"{1e3 * float(fold_length(fabric)):.0f} mm, the cells are "
+        f"{1e3 * longest_cell(size, shape):.0f} mm long, so that a motion is expected to be "
+        f"{1e3 * error:.0f} mm off ({advice})"
+    )

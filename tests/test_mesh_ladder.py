@@ -1,0 +1,96 @@
+"""Estimates by meshes: what one owes to its mesh, and when a finer one is taken."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+from r2s import scenarios
+from r2s.estimation import descent, mesh_ladder
+from r2s.estimation.gauss_newton import theta_length
+from r2s.estimation.mesh_bias import OtherMesh, factor, mesh_bias
+from r2s.estimation.method import Budget
+from r2s.estimation.problem import NuisancePrior, Problem
+from r2s.fabrics import presets
+from r2s.fabrics.parameters import IsotropicSpace
+from r2s.scenarios import resolution, synthetic
+
+EXACT = NuisancePrior(0.0, 0.0)
+SMALL = Budget(coarse=2, starts=1, iterations=4, around=0)
+SPACE = IsotropicSpace.make(float(presets.grey_interlock().density))
+PLACE = jnp.array([0.5, 0.5])
+
+
+def lift(stiffer: float = 1.0):
+    """A recorded lift of a fabric that is stiffer than that at `PLACE`, without noise."""
+    motion: dict[str, Any] = {"height": 0.2, "inward": 0.1, "moving": 0.4}
+    experiment = scenarios.lifting(num_frames=6, interval=1 / 10, **motion)
+    fabric = SPACE(PLACE.at[0].add(np.log(stiffer) / SPACE.ranges[0].width))
+    seen = synthetic.WHOLE._replace(points=300)
+    return synthetic.record(experiment, fabric, "knit", seen=seen, shape=(5, 5), key=jr.key(0))
+
+
+def problem(stiffer: float, shape=(5, 5)) -> Problem:
+    return Problem.make(lift(stiffer), SPACE, shape=shape, nuisance_prior=EXACT)
+
+
+@pytest.fixture(scope="module")
+def end():
+    """A descent that stands at the true fabric."""
+    problems = (problem(1.0),)
+    theta = jnp.zeros(theta_length(problems)).at[:2].set(PLACE)
+    (found,) = descent._fresh(problems, SMALL, [theta], 0.0, 0)
+    return problems, found
+
+
+@pytest.mark.slow(group="estimates")
+def test_the_same_mesh_has_no_bias(end):
+    problems, found = end
+    bias = mesh_bias(problems, OtherMesh(problems, 1.0), found, jnp.asarray(1e-12))
+    np.testing.assert_allclose(bias, 0, atol=1e-9)
+
+
+@pytest.mark.slow(group="estimates")
+def test_a_mesh_that_moves_like_a_stiffer_fabric_has_the_bias_of_that_stiffness(end):
+    problems, found = end
+    other = OtherMesh((problem(1.05),), 2.0)
+    bias = mesh_bias(problems, other, found, jnp.asarray(1e-12))
+    assert bias[0] * SPACE.ranges[0].width == pytest.approx(2 * np.log(1.05), rel=0.2)
+
+
+@pytest.mark.slow(group="estimates")
+def test_a_motion_that_fails_leaves_the_whole_range_in_doubt(end):
+    problems, found = end
+    broken = eqx.tree_at(lambda p: p.scenario.path, problems[0], replace_fn=lambda p: p * jnp.nan)
+    bias = mesh_bias(problems, OtherMesh((broken,), 1.0), found, jnp.asarray(1e-12))
+    np.testing.assert_allclose(np.abs(bias[:2]), 1)
+
+
+def test_steps_to_finer_and_coarser_meshes_lead_to_the_same_limit():
+    """An error c h^p: the step from h to h / 2 and that from h to 2 h, times their factors."""
+    order, error = resolution.ORDER, 0.3
+    finer = error * (1 - 0.5**order) * factor(0.5)
+    coarser = error * (1 - 2.0**order) * factor(2.0)
+    assert finer == pytest.approx(error) and coarser == pytest.approx(error)
+
+
+@pytest.mark.slow(group="estimates")
+@pytest.mark.parametrize(("enough", "shape"), [(1e9, (3, 3)), (1e-9, (5, 5))])
+def test_a_finer_mesh_is_taken_where_the_coarse_one_is_not_enough(enough, shape, monkeypatch):
+    monkeypatch.setattr(resolution, "LADDER", (3, 5))
+    monkeypatch.setattr(resolution, "ENOUGH", enough)
+    found = mesh_ladder.descend_by_meshes([lift()], SPACE, SMALL, key=jr.key(0))
+    assert found.shape == shape
+    assert found.mesh_bias is not None and np.all(found.standard_errors >= found.mesh_bias)
+    assert found.values[0] == pytest.approx(float(SPACE.values(PLACE)[0]), rel=0.1)
+
+
+@pytest.mark.slow(group="estimates")
+def test_a_shape_that_is_asked_for_is_kept(monkeypatch):
+    monkeypatch.setattr(resolution, "LADDER", (3, 5))
+    monkeypatch.setattr(resolution, "ENOUGH", 1e-9)
+    found = mesh_ladder.descend_by_meshes([lift()], SPACE, SMALL, shape=(3, 3), key=jr.key(0))
+    assert found.shape == (3, 3)
