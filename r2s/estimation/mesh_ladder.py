@@ -37,8 +37,8 @@ def descend_by_meshes(
     """The fabric that explains some recordings, on a mesh of `shape` or on one that resolves it.
 
     The other arguments are those of `r2s.estimation.descent.descend`; each mesh has a checkpoint.
-    Its `mesh_bias` is judged by a mesh of half the cells, or of twice the cells where that would be
-    finer than all of `r2s.scenarios.resolution.LADDER`.
+    Its `mesh_bias` is judged by a mesh whose cells are half as long, or twice as long where that
+    would be finer than all of `r2s.scenarios.resolution.LADDER`.
     """
 
     def climb(shape: Shape, before: Search | None, path: Path | None) -> Search:

@@ -73,7 +73,7 @@ def shape_for(
 
 
 def ladder(size: tuple[float, float]) -> list[Shape]:
-    """Meshes of a sheet [m] from coarse to fine, each with half the cells of the one before."""
+    """Meshes of a sheet [m] from coarse to fine, the cells of each half as long as those before."""
     longer = max(size)
 
     def cells(count: int, side: float) -> int:
