@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from r2s import scenarios
 from r2s.estimation.estimate import Estimate
+from r2s.estimation.gauss_newton import loss_at, theta_length
 from r2s.estimation.problem import Problem
 from r2s.evaluation import prediction_error
 from r2s.fabrics import presets
@@ -102,6 +104,15 @@ def fitted_to_truth(space: ParameterSpace, truth: Fabric, found: Estimate) -> di
             for name, bias in zip(names, found.mesh_bias, strict=True)
         }
     return line | {"converged": "yes" if found.converged else "no"}
+
+
+def loss_of_truth(
+    recording: Recording, space: ParameterSpace, truth: Fabric, shape: tuple[int, int]
+) -> float:
+    """The loss [m^2] of the true fabric on a mesh."""
+    problems = (Problem.make(recording, space, shape=shape),)
+    theta = jnp.zeros(theta_length(problems), float).at[: space.dim].set(space.to_unit(truth))
+    return float(eqx.filter_jit(loss_at)(problems, theta))
 
 
 def frames_of(recording: Recording) -> range:

@@ -122,6 +122,7 @@ def _jvp_of_moving(function, primals, tangents):
     return jax.jvp(of_moving, [primals[i] for i in moving], [tangents[i] for i in moving])
 
 
+@jax.jit
 def _cost(hidden: Vector, stiffness, critical, strain) -> Number:
     """What hidden wrinkles cost [J/m^2], on the scales of `_problem`."""
     quadratic, linear, bound, width, most = _problem(stiffness, critical, strain)
@@ -131,6 +132,7 @@ def _cost(hidden: Vector, stiffness, critical, strain) -> Number:
     return width**2 * (_dot(hidden, slope) / 2 + _dot(linear, hidden) + bound * limits)
 
 
+@jax.jit
 def _problem(stiffness, critical, strain) -> tuple[Matrix, Vector, Number, Number, Number]:
     """Second and first derivative of the cost without wrinkles; a bound on the second; the unit;
     the most of them in this unit.
@@ -214,6 +216,7 @@ def _descended(hidden: Vector, problem) -> Vector:
     return one, two, three
 
 
+@jax.jit
 def _system(before: Vector, problem) -> Matrix:
     """The derivative of the wrinkles' equation, hidden = _limited(descended), in them."""
     quadratic, _, bound, _, most = problem
@@ -267,10 +270,12 @@ def _of_principal(function: Callable[[Number], Number], matrix: Vector) -> Vecto
     return middle + half * cosine, middle - half * cosine, ROOT * half * sine
 
 
+@jax.jit
 def _limited(matrix: Vector, most: Number) -> Vector:
     return _of_principal(lambda value: _between(value, most), matrix)
 
 
+@jax.jit
 def _limited_slope(matrix: Vector, most: Number) -> Matrix:
     """The derivative of `_limited`."""
     mean, radius, cosine, sine = _principal(matrix)
@@ -304,6 +309,7 @@ def _cross(a: Vector, b: Vector) -> Vector:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
+@jax.jit
 def _solve(matrix: Matrix, right: Vector) -> Vector:
     """The solution of three equations (Cramer's rule)."""
     first, second, third = matrix

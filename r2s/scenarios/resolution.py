@@ -63,7 +63,7 @@ def shape_for(
 
     >>> from r2s.fabrics import presets
     >>> shape_for(presets.black_denim(), (0.45, 0.45), "lifting")
-    (9, 9)
+    (17, 17)
     """
     enough = enough * max(size) / SIDE
     for shape in ladder(size):
