@@ -34,7 +34,6 @@ PLAUSIBLE = {  # of fabrics for clothes and the household
     "thickness": (1e-4, 5e-3, "m", "of the sheet"),
     "mass_damping": (0.0, 20.0, "1/s", "a rate"),
 }
-SIDE = 0.45  # [m], the study's sheets
 STIFF = (1.0, 1e5, "N/m", "a force per width: a modulus in Pa times the thickness in m")
 BENDS = (1e-8, 1e-2, "N m", "a moment per curvature and width: 1 mN mm is 1e-6 N m")
 
@@ -64,6 +63,7 @@ class Doctor:
     def run(self) -> int:
         from r2s.commands.common import load_card, print_result
         from r2s.fabrics.fold_length import fold_length
+        from r2s.scenarios.six import SIDE
 
         result, lines, wrong = installation()
         if self.fabric:
@@ -135,6 +135,7 @@ class Doctor:
 def mesh_errors(fabric: "Fabric", shape: tuple[int, int]) -> dict[str, tuple[float, str]]:
     """The error [m] that a mesh leaves in each motion of a fabric, and in words."""
     from r2s.scenarios import resolution
+    from r2s.scenarios.six import SIDE
 
     found = {}
     for motion in resolution.TABLE:
