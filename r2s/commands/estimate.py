@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from glob import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -108,7 +109,7 @@ class EstimateCard:
         )
         card = cards.Card.make(self.name or seen[0].info.fabric, estimate, provenance)
         cards.write(self.out, card)
-        for path in self.out.parent.glob(f"{self._progress_file.stem}*.npz"):
+        for path in self.out.parent.glob(f"{escape(self._progress_file.stem)}*.npz"):
             path.unlink()
         lines = [*describe(estimate), *_warnings(estimate, seen), f"{self.out}: {card.name}"]
         print_result(self.json, cards.as_json(card), lines)

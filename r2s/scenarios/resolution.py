@@ -26,6 +26,8 @@ TABLE: dict[str, tuple[tuple[float, float], ...]] = {
     "hang": ((0.83, 3.8e-3), (1.66, 10.6e-3), (3.31, 15.2e-3)),
     "fling": ((0.83, 7.1e-3), (1.66, 20.0e-3), (3.31, 26.0e-3)),
 }
+SAME = {"lift": "lifting", "fold": "folding"}  # names that recordings have
+TAUT = ("stretching",)  # what has no folds, and was not measured
 ORDER = 1.5  # of the error in the cells' length, where it is not measured
 ENOUGH = 5e-3  # [m], error of a mesh that is fine enough, of sheets of the study's size
 LADDER = (9, 17, 33)  # vertices along the longer side
@@ -35,10 +37,14 @@ def mesh_error(fabric: Fabric, size: tuple[float, float], shape: Shape, motion: 
     """Expected error [m] of a motion on a mesh, rms over the sheet and mean over the motion.
 
     - `size`: of the sheet, [m]. `shape`: of the mesh, vertices along warp and weft.
-    - `motion`: one of `TABLE`; of another, the largest of all.
+    - `motion`: one of `TABLE`, or its name in recordings (`SAME`); of another, the largest of all.
+      NaN for what is `TAUT`: it has no folds, and was not measured.
 
     Fabrics scatter about it by a factor of about 1.5.
     """
+    motion = SAME.get(motion, motion)
+    if motion in TAUT:
+        return math.nan
     ratio = longest_cell(size, shape) / float(fold_length(fabric))
     tables = [TABLE[motion]] if motion in TABLE else list(TABLE.values())
     return max(max(size) / SIDE * _interpolated(table, ratio) for table in tables)
@@ -67,7 +73,7 @@ def shape_for(
     """
     enough = enough * max(size) / SIDE
     for shape in ladder(size):
-        if mesh_error(fabric, size, shape, motion) <= enough:
+        if not mesh_error(fabric, size, shape, motion) > enough:  # NaN: no folds to resolve
             return shape
     return ladder(size)[-1]
 
@@ -85,7 +91,7 @@ def ladder(size: tuple[float, float]) -> list[Shape]:
 def warning(fabric: Fabric, size: tuple[float, float], shape: Shape, motion: str) -> str:
     """A line for people, with the figure, when a mesh is too coarse for a fabric; else empty."""
     error = mesh_error(fabric, size, shape, motion)
-    if error <= ENOUGH * max(size) / SIDE:
+    if not error > ENOUGH * max(size) / SIDE:
         return ""
     finer = shape_for(fabric, size, motion)
     advice = "the finest that was measured" if finer == shape else f"try {finer[0]} x {finer[1]}"
