@@ -84,6 +84,17 @@ def timed(call: Callable[[], Any], repeats: int, budget: float) -> tuple[Row, An
     return row, result
 
 
+def in_turn(calls: Sequence[Callable[[], Any]], repeats: int) -> list[float]:
+    """The least CPU seconds of each call, which take turns, so that all meet the same machine."""
+    least = [float("inf")] * len(calls)
+    for _ in range(repeats):
+        for i, call in enumerate(calls):
+            before = time.process_time()
+            jax.block_until_ready(call())
+            least[i] = min(least[i], time.process_time() - before)
+    return least
+
+
 def prefixed(prefix: str, row: Row) -> Row:
     """The row with its names changed."""
     return {f"{prefix}_{name}": value for name, value in row.items()}

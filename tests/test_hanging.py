@@ -58,7 +58,8 @@ def test_fabrics_come_to_rest_in_the_buckled_shape_that_was_seen():
     they start near it."""
     denim = presets.black_denim()
     space = OrthotropicSpace.make(float(denim.density))
-    scenario = scenarios.wind(num_frames=2).scenario((9, 9), False)
+    # of triangles, whose diagonals give them more shapes to choose from
+    scenario = scenarios.wind(num_frames=2).scenario((9, 9), False, elements="falling")
     place = space.to_unit(denim)
     changed = place + jnp.array([-0.015, -0.06, 0.0, -0.02, 0.01, 0.09, -0.06])
     rest = jax.jit(lambda scenario, u: rollout(scenario, space(u)).x[0])
