@@ -10,6 +10,7 @@ turns. Then the whole lift: CPU seconds of a run, and of its compilation.
 
 import argparse
 import time
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -29,6 +30,7 @@ from r2s.world.scene import Control
 FRAMES, LATE, STEP = 46, 30, 1 / 60  # of 1/15 s; which the state is of; [s]
 INTERVAL = 1 / 15  # [s]
 TRIANGLES = "falling"
+COLUMNS = ("evaluation", "newton step", "lift", "compile")
 
 
 def evaluation(step, x):
@@ -68,6 +70,10 @@ def prepared(elements: str, size: int):
     return row, timed
 
 
+def _beside(name: str, least: measure.Row, row: measure.Row) -> str:
+    return f"{row[name]:.3g} ({row[name] / least[name]:.2f} x)"
+
+
 def main(options: argparse.Namespace) -> None:
     print(", ".join(f"{name}: {value}" for name, value in measure.machine().items()))
     for size in options.sizes:
@@ -79,14 +85,7 @@ def main(options: argparse.Namespace) -> None:
         rows = [row for row, _ in kinds.values()]
         least = kinds[TRIANGLES][0] if TRIANGLES in kinds else rows[0]
         columns = {"elements": lambda row: row["elements"]}
-        columns |= {
-            f"{name} ms": lambda row, name=name: f"{1e3 * row[name]:.3g} ({row[name] / least[name]:.2f} x)"
-            for name in ("evaluation", "newton step")
-        }
-        columns |= {
-            f"{name} s": lambda row, name=name: f"{row[name]:.3g} ({row[name] / least[name]:.2f} x)"
-            for name in ("lift", "compile")
-        }
+        columns |= {f"{name} s": partial(_beside, name, least) for name in COLUMNS}
         measure.show(f"{size} vertices a side", rows, columns)
 
 

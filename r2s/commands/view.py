@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from r2s.fabrics.parameters import ParameterSpace
     from r2s.viewer.subject import Subject
 
+Size = tuple[float, float]
+
 
 @dataclass(frozen=True)
 class View:
@@ -44,16 +46,18 @@ class View:
     def run(self) -> None:
         import time
 
-        from r2s.commands.common import load_card
+        from r2s.commands.common import load_card, mesh_warning
         from r2s.fabrics.parameters import OrthotropicSpace
         from r2s.viewer.page import Page
         from r2s.viewer.subject import place
 
         card = load_card(self.fabric)
-        subject = self._subject(OrthotropicSpace.make(float(card.fabric.density)))
+        subject, motion = self._subject(OrthotropicSpace.make(float(card.fabric.density)))
         save = None if self.save is None else lambda fabric: self._save_card(card, fabric)
         start = place(subject, card.fabric)
         page = Page(subject, start, save=save, host=self.host, port=self.port)
+        for line in mesh_warning(self.shape, card.fabric, *motion):
+            print(line)
         print(f"{page.url} (Ctrl-C ends)", flush=True)
         try:
             while True:
@@ -61,16 +65,19 @@ class View:
         except KeyboardInterrupt:
             page.close()
 
-    def _subject(self, space: "ParameterSpace") -> "Subject":
+    def _subject(self, space: "ParameterSpace") -> "tuple[Subject, tuple[Size, str]]":
+        """What is shown; the sheet's size [m] and the name of the motion."""
         from r2s.commands.common import make_experiment
         from r2s.recordings.open import open_recording
         from r2s.viewer.subject import of_experiment, of_recording
 
         if self.recording is None:
-            return of_experiment(make_experiment(self.scenario, self.motion), space, self.shape)
+            made = make_experiment(self.scenario, self.motion)
+            return of_experiment(made, space, self.shape), (made.sheet.size, made.name)
         if self.motion:
             raise ValueError("--motion is of a scenario: a recording has its own motion")
-        return of_recording(open_recording(self.recording), space, self.shape)
+        seen = open_recording(self.recording)
+        return of_recording(seen, space, self.shape), (seen.info.sheet.size, seen.info.scenario)
 
     def _save_card(self, card: "Card", fabric: "Fabric") -> str:
         from r2s.estimation import cards
