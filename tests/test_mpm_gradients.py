@@ -153,7 +153,7 @@ SHEET_WHERE = {
     "density": (lambda i: i.fabric.density, 1e-6),
     "c11": (lambda i: i.fabric.membrane.c11, 1e-3),
     "c33": (lambda i: i.fabric.membrane.c33, 1e-3),
-    "bending": (lambda i: i.fabric.bending.stiffness, 1e-8),
+    "bending": (lambda i: i.fabric.bending.stiffness, 1e-10),
     "damping": (lambda i: i.fabric.damping, 1e-7),
     "friction": (lambda i: i.fabric.friction, 1e-5),
     "mass damping": (lambda i: i.fabric.mass_damping, 1e-5),
