@@ -106,12 +106,12 @@ def fitted_to_truth(space: ParameterSpace, truth: Fabric, found: Estimate) -> di
     return line | {"converged": "yes" if found.converged else "no"}
 
 
-def loss_of_truth(
-    recording: Recording, space: ParameterSpace, truth: Fabric, shape: tuple[int, int]
+def loss_of(
+    recording: Recording, space: ParameterSpace, fabric: Fabric, shape: tuple[int, int]
 ) -> float:
-    """The loss [m^2] of the true fabric on a mesh."""
+    """The loss [m^2] of a fabric on a mesh."""
     problems = (Problem.make(recording, space, shape=shape),)
-    theta = jnp.zeros(theta_length(problems), float).at[: space.dim].set(space.to_unit(truth))
+    theta = jnp.zeros(theta_length(problems), float).at[: space.dim].set(space.to_unit(fabric))
     return float(eqx.filter_jit(loss_at)(problems, theta))
 
 

@@ -20,7 +20,8 @@ from r2s.fabrics.fabric import Fabric
 from r2s.failures import Failure, first_failure, no_failure
 from r2s.geometry.bends import unwrapped
 from r2s.geometry.elements import area_normals
-from r2s.laws.membrane import MembraneLaw
+from r2s.geometry.strain_samples import on_samples
+from r2s.laws.membrane import MembraneLaw, stress_and_tangent
 from r2s.laws.wrinkling import membrane_on_samples
 from r2s.world import contact
 from r2s.world.scene import Control, Scene
@@ -132,7 +133,7 @@ class Cloth(eqx.Module):
             mesh=mesh,
             fabric=fabric,
             membrane=membrane,
-            membrane_tangent=jax.vmap(jax.vmap(_tangent))(membrane, strain_anchor),
+            membrane_tangent=on_samples(_tangent, membrane, strain_anchor),
             bending=fabric.bending.on_elements(mesh, bent),
             air=self.scene.air,
             table=self.scene.table,
@@ -193,7 +194,7 @@ def prepare_mesh(scene: Scene, self_contact: bool) -> tuple[Elimination, SelfCon
 
 def _tangent(law: MembraneLaw, strain: Float[Array, " 3"]) -> Float[Array, "3 3"]:
     """Stiffness [N/m] at a strain [-]."""
-    return jax.hessian(law.energy_density)(strain)
+    return stress_and_tangent(law.energy_density, strain)[1]
 
 
 def _anchor(now: Array, before: Array) -> Array:

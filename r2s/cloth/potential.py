@@ -12,6 +12,7 @@ lagged: the drag takes the normals, and the friction the normal force, of the st
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -26,9 +27,9 @@ from r2s.cloth.self_contact.contacts import Contacts, contact_energy, contact_he
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.bends import unwrapped
 from r2s.geometry.mesh import Mesh
-from r2s.geometry.strain_samples import green_strain, green_strain_gradient
+from r2s.geometry.strain_samples import green_strain_gradient, on_samples
 from r2s.laws.bending import BendingLaw
-from r2s.laws.membrane import MembraneLaw
+from r2s.laws.membrane import MembraneLaw, stress_and_tangent
 from r2s.units import GRAVITY
 from r2s.world import contact
 from r2s.world.air import Air
@@ -77,7 +78,10 @@ class IncrementalPotential(eqx.Module):
 
 def potential(step: IncrementalPotential, x: Positions) -> Float[Array, ""]:
     """The incremental potential [J] at new positions [m]."""
-    total = jnp.sum(_map(_element_energy, step, x[step.mesh.samples.corners], *_elements(step)))
+    samples = step.mesh.samples
+    membrane = on_samples(partial(_sample_energy, step), *_samples(step, x))
+    total = jnp.sum(samples.areas * membrane)
+    total += jnp.sum(_map(_drag_energy, step, _middles(step, x), *_drag(step)))
     total += _bending_energy(step, _curvatures(step, x))
     total += jnp.sum(_map(_vertex_energy, step, x, *_vertices(step)))
     if step.contacts is None:
@@ -103,8 +107,7 @@ def hessian(
     fraction of these.
     """
     pattern, blend = step.elimination.pattern, jnp.asarray(hessian_blend, x.dtype)
-    corners = x[step.mesh.samples.corners]
-    samples = _map(_element_hessian, step, corners, *_elements(step), fixed=(blend,))
+    samples = _membrane_hessians(step, x, blend) + _drag_hessians(step, x)
     vertices = _map(jax.hessian(_vertex_energy, argnums=1), step, x, *_vertices(step))
     bending = {step.bending.element: _bending_hessians(step, x)}
     blocks = assemble(pattern, vertices, samples=samples, **bending)
@@ -127,16 +130,22 @@ def far_couplings(step: IncrementalPotential, x: Positions) -> Far | None:
     return Far(step.contacts.stencils, _contact_hessians(step, x))
 
 
-def _map(function: Callable, step: IncrementalPotential, *elements: Any, fixed: tuple = ()) -> Any:
-    """`function(step, *fixed, *element)` of all elements."""
-    return jax.vmap(lambda *element: function(step, *fixed, *element))(*elements)
+def _map(function: Callable, step: IncrementalPotential, *elements: Any) -> Any:
+    """`function(step, *element)` of all elements."""
+    return jax.vmap(lambda *element: function(step, *element))(*elements)
 
 
-def _elements(step: IncrementalPotential):
-    samples = step.mesh.samples
-    laws = step.membrane, step.membrane_tangent
-    strain = *laws, samples.gradients, samples.areas, step.strain_anchor
-    return strain, (samples.corners, step.area_normals, step.wind)
+def _samples(step: IncrementalPotential, x: Positions):
+    strain = step.mesh.samples.strains(x)
+    return step.membrane, step.membrane_tangent, strain, step.strain_anchor
+
+
+def _drag(step: IncrementalPotential):
+    return step.mesh.samples.corners, step.area_normals, step.wind
+
+
+def _middles(step: IncrementalPotential, x: Positions) -> Float[Array, "element 3"]:
+    return x[step.mesh.samples.corners].mean(axis=1)
 
 
 def _vertices(step: IncrementalPotential):
@@ -158,16 +167,6 @@ def _sample_energy(step, law: MembraneLaw, tangent: Array, strain: Array, anchor
     return law.energy_density(strain) + _viscous_energy(
         step, change, jnp.sum(tangent * change[None], axis=1)
     )
-
-
-def _element_energy(step, corners, samples, drag):
-    """Of membrane and drag, [J]."""
-
-    def at_sample(law, tangent, gradients, area, anchor):
-        strain = green_strain(corners, gradients)
-        return area * _sample_energy(step, law, tangent, strain, anchor)
-
-    return jnp.sum(jax.vmap(at_sample)(*samples)) + _drag_energy(step, corners.mean(axis=0), *drag)
 
 
 def _drag_energy(step, middle, corners, normal, wind):
@@ -232,28 +231,33 @@ def _contact_hessians(step: IncrementalPotential, x: Positions):
     return contact_hessians(step.contacts, step.fabric.thickness, step.rate, x, step.x_anchor)
 
 
-def _element_hessian(step, blend, corners, samples, drag):
-    def at_sample(law, tangent_before, gradients, area, anchor):
+def _membrane_hessians(step: IncrementalPotential, x: Positions, blend: Float[Array, ""]):
+    """Second derivatives [N/m] of each element's membrane energy in its corners."""
+    samples = step.mesh.samples
+
+    def at_sample(law, tangent_before, strain, anchor, corners, gradients, area):
         # exact with all of the stress, since the Green strain is quadratic in the corners
         def energy(strain):
             return _sample_energy(step, law, tangent_before, strain, anchor)
 
-        def stresses(strain):
-            stress = jax.grad(energy)(strain)
-            return stress, stress
-
-        strain = green_strain(corners, gradients)
-        tangent, stress = jax.jacfwd(stresses, has_aux=True)(strain)
+        stress, tangent = stress_and_tangent(energy, strain)
         by_corners = green_strain_gradient(corners, gradients)
         material = jnp.einsum("sai,st,tbj->aibj", by_corners, tangent, by_corners)
         carried = blend * _symmetric(stress) + (1 - blend) * _tension(stress)
         geometric = jnp.einsum("as,st,bt,ij->aibj", gradients, carried, gradients, jnp.eye(3))
         return area * (material + geometric)
 
-    membrane = jnp.sum(jax.vmap(at_sample)(*samples), axis=0)
-    count = len(corners)
-    of_middle = jax.hessian(_drag_energy, argnums=1)(step, corners.mean(axis=0), *drag)
-    return membrane + jnp.broadcast_to(of_middle[None, :, None], membrane.shape) / count**2
+    corners = jnp.repeat(x[samples.corners][:, None], samples.areas.shape[1], axis=1)
+    every = on_samples(at_sample, *_samples(step, x), corners, samples.gradients, samples.areas)
+    return jnp.sum(every, axis=1)
+
+
+def _drag_hessians(step: IncrementalPotential, x: Positions):
+    """Second derivatives [N/m] of each element's drag in its corners, equal in all of them."""
+    of_middle = _map(jax.hessian(_drag_energy, argnums=1), step, _middles(step, x), *_drag(step))
+    count = step.mesh.samples.corners.shape[1]
+    shape = len(of_middle), count, 3, count, 3
+    return jnp.broadcast_to(of_middle[:, None, :, None], shape) / count**2
 
 
 def _symmetric(stress: Float[Array, " 3"]) -> Float[Array, "2 2"]:

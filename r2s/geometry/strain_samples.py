@@ -6,6 +6,9 @@ grid is bilinear, with 2 x 2 Gauss points: it bends in its plane and folds along
 triangle cannot follow without stretching, and favours neither of its diagonals.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -73,6 +76,17 @@ class StrainSamples(eqx.Module):
         """Green strain (E11, E22, 2 E12) [-] of every sample, at positions [m]."""
         of_element = jax.vmap(green_strain, in_axes=(None, 0))
         return jax.vmap(of_element)(x[self.corners], self.gradients)
+
+
+def on_samples(function: Callable, *arrays: Any) -> Any:
+    """`function` of every sample, of pytrees of arrays whose first axes are (element, sample).
+
+    All samples are in one row meanwhile: rows of an element's four leave vector units idle.
+    """
+    first = jax.tree.leaves(arrays)[0].shape[:2]
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), arrays)
+    found = jax.vmap(function)(*flat)
+    return jax.tree.map(lambda leaf: leaf.reshape(*first, *leaf.shape[1:]), found)
 
 
 def cells(shape: tuple[int, int]) -> Int[np.ndarray, "cell 4"]:

@@ -5,9 +5,11 @@ gives the law that a time step uses. A law whose energy says it all returns itse
 stiffness follows the strain (`r2s.laws.tables`) returns its stiffness there.
 """
 
+from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -104,3 +106,17 @@ class SpringMembrane(eqx.Module):
         structural = self.warp * extension(e11) ** 2 + self.weft * extension(e22) ** 2
         biases = extension(mean + half) ** 2 + extension(mean - half) ** 2
         return (structural + self.shear * biases) / 2
+
+
+def stress_and_tangent(
+    energy: Callable[[Array], Array], strain: Float[Array, " 3"]
+) -> tuple[Float[Array, " 3"], Float[Array, "3 3"]]:
+    """First and second derivative of an energy density [J/m^2] in a strain (or a curvature).
+
+    As `jax.grad` and `jax.hessian` give them, but the directions are not a batch: of many samples
+    side by side that would be the innermost axis, three long, and leave vector units idle.
+    """
+    stress, push = jax.linearize(jax.grad(energy), strain)
+    return stress, jnp.stack(
+        [push(direction) for direction in jnp.eye(3, dtype=strain.dtype)], axis=1
+    )

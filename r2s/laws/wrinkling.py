@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-from r2s.geometry.strain_samples import StrainSamples
+from r2s.geometry.strain_samples import StrainSamples, on_samples
 from r2s.laws.bending import BendingLaw
 from r2s.laws.membrane import MembraneLaw
 
@@ -79,14 +79,15 @@ def membrane_on_samples(
     On cells that wrinkle these are `Wrinkled`. The bending stiffness is the mean of warp and
     weft.
     """
-    laws = jax.vmap(jax.vmap(membrane.at))(strain)
+    laws = on_samples(membrane.at, strain)
     if samples.hidden_waves is None:
         return laws
-    zero = jnp.zeros_like(strain)
-    stiffness = jax.vmap(jax.vmap(lambda law, none: jax.hessian(law.energy_density)(none)))
+    stiffness = on_samples(
+        lambda law, none: jax.hessian(law.energy_density)(none), laws, 0 * strain
+    )
     bent = (bending.stiffness_along(0.0) + bending.stiffness_along(jnp.pi / 2)) / 2
     critical = bent * samples.hidden_waves[:, None] ** 2
-    return Wrinkled(laws, stiffness(laws, zero), jnp.broadcast_to(critical, strain.shape[:2]))
+    return Wrinkled(laws, stiffness, jnp.broadcast_to(critical, strain.shape[:2]))
 
 
 @jax.custom_jvp
@@ -104,16 +105,25 @@ def released(
 
 def _released_jvp(primals, tangents):
     # the hidden strain is optimal, so its change does not count (it does in the next derivative)
-    hidden = _hidden(*primals)
-    return _jvp_of_moving(lambda *given: -_cost(hidden, *given), primals, tangents)
+    hidden, (*law, strain) = _hidden(*primals), primals
+    value, change = _jvp_of_moving(lambda *law: -_cost(hidden, *law, strain), law, tangents[:2])
+    if _moves(tangents[2]):
+        width = _problem(*primals)[3]
+        release = _times(_transposed(_by_strain(primals[0])), hidden)
+        change = change - width * _dot(release, tuple(tangents[2]))
+    return value, change
 
 
 released.defjvp(_released_jvp, symbolic_zeros=True)
 
 
+def _moves(tangent) -> bool:
+    return not isinstance(tangent, SymbolicZero)
+
+
 def _jvp_of_moving(function, primals, tangents):
     """`jax.jvp` in those arguments that have a tangent: the others cost nothing."""
-    moving = [i for i, each in enumerate(tangents) if not isinstance(each, SymbolicZero)]
+    moving = [i for i, each in enumerate(tangents) if _moves(each)]
 
     def of_moving(*given):
         every = dict(enumerate(primals)) | dict(zip(moving, given, strict=True))
@@ -141,12 +151,9 @@ def _problem(stiffness, critical, strain) -> tuple[Matrix, Vector, Number, Numbe
     symmetric and positive, and makes all fabrics alike. Their unit is that of their onset.
     """
     (c11, c12, c13), (_, c22, c23), (_, _, c33) = (tuple(row) for row in stiffness)
-    e11, e22, shear = strain
     critical = jnp.maximum(critical, FEWEST * jnp.sqrt(c11 * c22))
-    warp, weft = jax.lax.rsqrt(c11), jax.lax.rsqrt(c22)
-    both = warp * weft
-    bias = ROOT * jnp.sqrt(both)  # with 2 E12
-    coupling = jnp.clip(c12 * both, -CROSS, CROSS)
+    warp, weft, bias = _scales(stiffness)
+    coupling = jnp.clip(c12 * warp * weft, -CROSS, CROSS)
     first, second = c13 * warp * bias, c23 * weft * bias
     ones = jnp.ones_like(warp) + LEAST
     last = c33 * bias * bias + LEAST
@@ -155,12 +162,24 @@ def _problem(stiffness, critical, strain) -> tuple[Matrix, Vector, Number, Numbe
     bound = jnp.maximum(jnp.maximum(sums[0], sums[1]), sums[2])
     width = ONSET * critical * jnp.minimum(warp, weft) / bound
     most = jnp.maximum(MOST / jnp.maximum(warp, weft) / width, 2)
-    linear = (
-        warp * (c11 * e11 + c12 * e22 + c13 * shear + critical) / width,
-        weft * (c12 * e11 + c22 * e22 + c23 * shear + critical) / width,
-        bias * (c13 * e11 + c23 * e22 + c33 * shear) / width,
-    )
+    one, two, three = _times(_by_strain(stiffness), tuple(strain))
+    linear = (one + warp * critical) / width, (two + weft * critical) / width, three / width
     return quadratic, linear, bound, width, most
+
+
+def _scales(stiffness) -> Vector:
+    """Of wrinkles (11, 22, sqrt(2) 12), [sqrt(m / N)]."""
+    warp, weft = jax.lax.rsqrt(stiffness[0, 0]), jax.lax.rsqrt(stiffness[1, 1])
+    return warp, weft, ROOT * jnp.sqrt(warp * weft)  # with 2 E12
+
+
+def _by_strain(stiffness) -> Matrix:
+    """The derivative of the cost's slope in the strain, times the unit of wrinkles."""
+    one, two, three = (
+        (scale * stiffness[i, 0], scale * stiffness[i, 1], scale * stiffness[i, 2])
+        for i, scale in enumerate(_scales(stiffness))
+    )
+    return one, two, three
 
 
 @jax.custom_jvp
@@ -193,17 +212,29 @@ def _hidden(stiffness, critical, strain) -> Vector:
 
 def _hidden_jvp(primals, tangents):
     """By the implicit function theorem, from what the wrinkles solve."""
-    hidden = _hidden(*primals)
+    hidden, (*law, strain) = _hidden(*primals), primals
+    problem = _problem(*primals)
+    before = _descended(hidden, problem)
+    system, slope = _system(before, problem), _limited_slope(before, problem[-1])
+    none = jnp.zeros_like(hidden[0])
+    total: Vector = none, none, none
+    if _moves(tangents[2]):
+        _, _, bound, width, _ = problem
+        columns = [_solve(system, _times(slope, by)) for by in _transposed(_by_strain(primals[0]))]
+        change = _times(_transposed(columns), tuple(tangents[2]))
+        total = tuple(a - b / (bound * width) for a, b in zip(total, change, strict=True))
+    if _moves(tangents[0]) or _moves(tangents[1]):
 
-    def limit(*given):
-        problem = _problem(*given)
-        return _descended(hidden, problem), problem[-1]
+        def limit(*law):
+            problem = _problem(*law, strain)
+            return _descended(hidden, problem), problem[-1]
 
-    (before, most), (change, more) = _jvp_of_moving(limit, primals, tangents)
-    right = _times(_limited_slope(before, most), change)
-    at_most = _of_principal(lambda value: jnp.clip((value - most + 1) / 2, 0, 1), before)
-    right = tuple(a + more * b for a, b in zip(right, at_most, strict=True))
-    return hidden, _solve(_system(before, _problem(*primals)), right)
+        _, (change, more) = _jvp_of_moving(limit, law, tangents[:2])
+        at_most = _of_principal(lambda value: jnp.clip((value - problem[-1] + 1) / 2, 0, 1), before)
+        right = zip(_times(slope, change), at_most, strict=True)
+        change = _solve(system, tuple(a + more * b for a, b in right))
+        total = tuple(a + b for a, b in zip(total, change, strict=True))
+    return hidden, total
 
 
 _hidden.defjvp(_hidden_jvp, symbolic_zeros=True)
@@ -303,6 +334,11 @@ def _dot(a: Vector, b: Vector) -> Number:
 
 def _times(matrix: Matrix, vector: Vector) -> Vector:
     return _dot(matrix[0], vector), _dot(matrix[1], vector), _dot(matrix[2], vector)
+
+
+def _transposed(matrix) -> Matrix:
+    one, two, three = zip(*matrix, strict=True)
+    return one, two, three
 
 
 def _cross(a: Vector, b: Vector) -> Vector:

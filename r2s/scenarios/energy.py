@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.elements import strains, vertex_masses
 from r2s.geometry.mesh import Mesh
+from r2s.geometry.strain_samples import on_samples
 from r2s.laws.wrinkling import membrane_on_samples
 from r2s.scenarios.gripper_forces import step_with_forces
 from r2s.scenarios.scenario import Scenario, begin, stepped
@@ -114,7 +115,7 @@ def stored_energy(mesh: Mesh, fabric: Fabric, x: Float[Array, "vertex 3"]) -> Fl
     """
     strain = mesh.samples.strains(x)
     stretched = membrane_on_samples(mesh.samples, fabric.membrane, fabric.bending, strain)
-    membrane = jax.vmap(jax.vmap(lambda law, strain: law.energy_density(strain)))(stretched, strain)
+    membrane = on_samples(lambda law, strain: law.energy_density(strain), stretched, strain)
     bends = fabric.bending.bends(mesh)
     bent = bends.curvatures_at(x)
     laws = fabric.bending.on_elements(mesh, bent)
