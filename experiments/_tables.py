@@ -6,6 +6,7 @@ import importlib.metadata
 import io
 import os
 import platform
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -40,7 +41,7 @@ def write(path: Path, lines: Sequence[Line], caption: str, facts: Line | None = 
     """
     told = {
         "table": caption,
-        "command": f"python {' '.join(sys.argv)}",
+        "command": shlex.join(["python", *sys.argv]),
         "version": f"r2s {importlib.metadata.version('r2s')}",
         "machine": machine(),
         "date": time.strftime("%Y-%m-%d"),

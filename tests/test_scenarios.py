@@ -186,7 +186,7 @@ def test_every_scenario_on_every_solver(name, kind, fabric):
         assert np.quantile(stretched, 0.95, axis=1).max() < 0.05
     else:
         # a knit of 10 N/m (C11 - C12^2 / C22) under a weight of 0.8 N/m, shaken
-        assert stretched.mean(axis=1).max() < 0.12 and stretched.max() < 0.8
+        assert stretched.mean(axis=1).max() < 0.12 and stretched.max() < 1
 
 
 def test_the_energy_of_a_table_law_is_that_of_its_stiffness_there():
