@@ -74,7 +74,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def little_memory() -> Iterator[None]:
     """After a module, compiled programs are let go if the process holds much memory."""
     yield
-    if memory() > MOST_MEMORY:
+    let_go_beyond(MOST_MEMORY)
+
+
+@pytest.fixture(autouse=True)
+def little_memory_within_a_module() -> Iterator[None]:
+    """After a test, if the process holds far too much."""
+    yield
+    let_go_beyond(2.5 * MOST_MEMORY)
+
+
+def let_go_beyond(memory_in_use: float) -> None:
+    """Let compiled programs go if the process holds more memory [MB]."""
+    if memory() > memory_in_use:
         eqx.clear_caches()
         jax.clear_caches()
         gc.collect()
