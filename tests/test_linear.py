@@ -1,5 +1,7 @@
 """Sparse matrices over a mesh: elements add up, and the factor solves."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 import scipy.spatial
 from conftest import dense
 
+from r2s.cloth.linear.band import Band
 from r2s.cloth.linear.dissection import levels
 from r2s.cloth.linear.elimination import Elimination
 from r2s.cloth.linear.factor import factor, solve
@@ -42,10 +45,16 @@ MESHES = {
 }
 
 
-@pytest.fixture(scope="module", params=MESHES)
+def orders(mesh, pattern):
+    """A mesh's equations by either order of elimination."""
+    places = np.asarray(mesh.rest), np.asarray(pattern.rows), np.asarray(pattern.columns)
+    return {"band": Band.make(*places), "dissection": levels(*places)}
+
+
+@pytest.fixture(scope="module", params=itertools.product(MESHES, ("band", "dissection")), ids=str)
 def problem(request):
     """A mesh, and the blocks of a random positive definite matrix over it."""
-    mesh = MESHES[request.param]()
+    mesh = MESHES[request.param[0]]()
     random = np.random.default_rng(0)
 
     def elements(count, corners):
@@ -55,7 +64,8 @@ def problem(request):
     corners = mesh.samples.corners
     parts = elements(*corners.shape), elements(len(mesh.hinges), 4)
     vertices = jnp.tile(jnp.eye(3), (len(mesh.rest), 1, 1))
-    equations = Elimination.make(mesh)
+    pattern = Elimination.make(mesh).pattern
+    equations = Elimination(pattern, orders(mesh, pattern)[request.param[1]])
     blocks = jax.jit(assemble)(equations.pattern, vertices, samples=parts[0], hinges=parts[1])
     return mesh, equations, parts, blocks
 
@@ -78,7 +88,7 @@ def test_elements_add_up(problem):
 def test_the_factor_solves(problem):
     mesh, equations, _, blocks = problem
     right = jnp.asarray(np.random.default_rng(1).normal(size=(len(mesh.rest), 3)))
-    x = solved(equations.levels, factored(equations.levels, blocks), right)
+    x = solved(equations.order, factored(equations.order, blocks), right)
     expected = np.linalg.solve(np.asarray(dense(equations.pattern, blocks)), right.ravel())
     assert np.asarray(x).ravel() == pytest.approx(expected, rel=1e-8, abs=1e-9)
     assert np.asarray(product(equations.pattern, blocks, x)) == pytest.approx(
@@ -87,13 +97,14 @@ def test_the_factor_solves(problem):
 
 
 @pytest.mark.slow(group="cloth")
-def test_every_depth_of_dissection_gives_the_same(problem):
+def test_every_depth_of_dissection_and_every_group_gives_the_same(problem):
     mesh, equations, _, blocks = problem
     right = jnp.ones((len(mesh.rest), 3))
-    expected = solved(equations.levels, factored(equations.levels, blocks), right)
+    expected = solved(equations.order, factored(equations.order, blocks), right)
     rows, columns = np.asarray(equations.pattern.rows), np.asarray(equations.pattern.columns)
-    for leaf in (6, 1000):
-        others = levels(np.asarray(mesh.rest), rows, columns, leaf)
+    places = np.asarray(mesh.rest), rows, columns
+    depths = [levels(*places, leaf) for leaf in (6, 1000)]
+    for others in (*depths, *(Band.make(*places, size) for size in (1, 3, 1000))):
         found = solved(others, factored(others, blocks), right)
         assert np.asarray(found) == pytest.approx(np.asarray(expected), rel=1e-8, abs=1e-10)
 
@@ -101,7 +112,9 @@ def test_every_depth_of_dissection_gives_the_same(problem):
 def test_every_vertex_is_eliminated_once(problem):
     mesh, equations = problem[:2]
     count = len(mesh.rest)
-    pivots = np.concatenate([np.asarray(level.pivots).ravel() for level in equations.levels])
+    order = equations.order
+    parts = [order.order] if isinstance(order, Band) else [level.pivots for level in order]
+    pivots = np.concatenate([np.asarray(part).ravel() for part in parts])
     assert np.array_equal(np.sort(pivots[pivots < count]), np.arange(count))
 
 
@@ -109,7 +122,7 @@ def test_an_indefinite_matrix_has_no_factor(problem):
     mesh, equations, _, blocks = problem
     vertex = len(mesh.rest) // 2
     bad = blocks.at[equations.pattern.diagonal[vertex], 0, 0].set(-1.0)
-    x = solved(equations.levels, factored(equations.levels, bad), jnp.ones((len(mesh.rest), 3)))
+    x = solved(equations.order, factored(equations.order, bad), jnp.ones((len(mesh.rest), 3)))
     assert not np.all(np.isfinite(x))
 
 
@@ -118,11 +131,18 @@ def test_an_indefinite_matrix_is_solved_when_asked(problem):
     vertex = len(mesh.rest) // 2
     bad = blocks.at[equations.pattern.diagonal[vertex], 0, 0].add(-500.0)
     right = jnp.ones((len(mesh.rest), 3))
-    x = solved(equations.levels, factored(equations.levels, bad, is_definite=False), right)
+    x = solved(equations.order, factored(equations.order, bad, is_definite=False), right)
     matrix = np.asarray(dense(equations.pattern, bad))
     assert np.linalg.eigvalsh(matrix)[0] < 0
     expected = np.linalg.solve(matrix, np.ones(len(matrix)))
     assert np.asarray(x).ravel() == pytest.approx(expected, rel=1e-7, abs=1e-9)
+
+
+def test_a_wide_mesh_is_dissected_and_a_narrow_one_is_a_band():
+    square, long = rectangle((1.0, 1.0), (90, 90)), rectangle((9.0, 1.0), (180, 20))
+    assert not isinstance(Elimination.make(square).order, Band)
+    narrow = Elimination.make(long).order
+    assert isinstance(narrow, Band) and narrow.width == 2 * 20 + 2
 
 
 def test_held_vertices_do_not_move(problem):
@@ -130,7 +150,7 @@ def test_held_vertices_do_not_move(problem):
     free = jnp.ones(len(mesh.rest), bool).at[jnp.array([0, 2])].set(False)
     right = jnp.where(free[:, None], jnp.ones((len(mesh.rest), 3)), 0.0)
     x = solved(
-        equations.levels, factored(equations.levels, pinned(equations.pattern, blocks, free)), right
+        equations.order, factored(equations.order, pinned(equations.pattern, blocks, free)), right
     )
     assert np.all(np.asarray(x)[[0, 2]] == 0)
     force = np.asarray(product(equations.pattern, blocks, x))[np.asarray(free)]
@@ -139,11 +159,11 @@ def test_held_vertices_do_not_move(problem):
 
 def test_a_solution_is_transposed_by_itself(problem):
     mesh, equations, _, blocks = problem
-    factors = factored(equations.levels, blocks)
+    factors = factored(equations.order, blocks)
     right, other = jnp.asarray(np.random.default_rng(2).normal(size=(2, len(mesh.rest), 3)))
 
     def run(b):
-        return solved(equations.levels, factors, b)
+        return solved(equations.order, factors, b)
 
     (back,) = jax.linear_transpose(run, right)(other)
     assert np.asarray(back) == pytest.approx(np.asarray(run(other)), rel=1e-8, abs=1e-10)

@@ -3,21 +3,25 @@
 import equinox as eqx
 import numpy as np
 
-from r2s.cloth.linear.dissection import Level, levels
+from r2s.cloth.linear.band import Band
+from r2s.cloth.linear.dissection import levels
+from r2s.cloth.linear.factor import Order
 from r2s.cloth.linear.pattern import Pattern
 from r2s.geometry.mesh import Mesh
+
+WIDEST = 160  # vertices: of wider bands nested dissection is faster (`benchmarks/factors.py`)
 
 
 class Elimination(eqx.Module):
     """What depends on a mesh alone in the solution of its linear systems.
 
     - `pattern`: the blocks of the matrix.
-    - `levels`: the order in which vertices are eliminated, root first.
+    - `order`: in which vertices are eliminated: a band where it is narrow, or by dissection.
     - `couples_all`: whether every pair of vertices has a block.
     """
 
     pattern: Pattern
-    levels: tuple[Level, ...]
+    order: Order
     couples_all: bool = eqx.field(static=True, default=False)
 
     @classmethod
@@ -35,6 +39,9 @@ class Elimination(eqx.Module):
         }
         elements = {kind: np.asarray(vertices) for kind, vertices in elements.items()}
         pattern = Pattern.make(len(rest), elements, is_full=couples_all)
-        rows, columns = np.asarray(pattern.rows), np.asarray(pattern.columns)
-        leaf = {"leaf": len(rest)} if couples_all else {}
-        return cls(pattern, levels(rest, rows, columns, **leaf), couples_all)
+        blocks = np.asarray(pattern.rows), np.asarray(pattern.columns)
+        if couples_all:
+            return cls(pattern, levels(rest, *blocks, leaf=len(rest)), couples_all)
+        narrow = Band.make(rest, *blocks)
+        order = narrow if narrow.width <= WIDEST else levels(rest, *blocks)
+        return cls(pattern, order, couples_all)

@@ -49,7 +49,7 @@ class System(eqx.Module):
     - `blocks`, `free`: what `far` needs to multiply with the whole; None without it.
     """
 
-    factors: tuple[Factor, ...]
+    factors: Factor
     far: Far | None = None
     blocks: Float[Array, "block 3 3"] | None = None
     free: Bool[Array, " vertex"] | None = None
@@ -67,7 +67,7 @@ def prepare(
     With `is_definite` it holds NaN where the blocks are not positive definite.
     """
     blocks = pinned(elimination.pattern, blocks, free)
-    factors = factor(elimination.levels, blocks, is_definite)
+    factors = factor(elimination.order, blocks, is_definite)
     return System(factors) if far is None else System(factors, far, blocks, free)
 
 
@@ -81,7 +81,7 @@ def apply_inverse(
     preconditioned by the factors; NaN where they did not converge.
     """
     if system.far is None:
-        return solve(elimination.levels, system.factors, right)
+        return solve(elimination.order, system.factors, right)
     tags = {lx.symmetric_tag, lx.positive_semidefinite_tag} if is_definite else {lx.symmetric_tag}
     matrix, factors = (
         lx.FunctionLinearOperator(
@@ -89,7 +89,7 @@ def apply_inverse(
         )
         for function in (
             partial(_times, elimination.pattern, system),
-            partial(solve, elimination.levels, system.factors),
+            partial(solve, elimination.order, system.factors),
         )
     )
     solver = _conjugate_gradients(right.dtype) if is_definite else _gmres(right.dtype)
