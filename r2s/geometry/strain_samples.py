@@ -24,14 +24,14 @@ class StrainSamples(eqx.Module):
     - `corners`: vertices of each element.
     - `gradients`: of the corners' shape functions in material coordinates, [1/m].
     - `areas`: rest area that each sample stands for, [m^2].
-    - `hidden_waves`: wavenumber of the longest wrinkles that an element does not show, [1/m]; None:
-      its compression is never that of wrinkles.
+    - `hidden_waves`: wavenumber of the longest wrinkles that an element does not show, along warp
+      and weft, [1/m]; None: its compression is never that of wrinkles.
     """
 
     corners: Int[Array, "element corner"]
     gradients: Float[Array, "element sample corner 2"]
     areas: Float[Array, "element sample"]
-    hidden_waves: Float[Array, " element"] | None
+    hidden_waves: Float[Array, "element 2"] | None
 
     @classmethod
     def of_triangles(
@@ -59,7 +59,7 @@ class StrainSamples(eqx.Module):
         gradients = np.broadcast_to(along / np.array(spacing), (len(corners), 4, 4, 2))
         areas = np.full((len(corners), 4), np.prod(spacing) / 4)
         # nodes can take a wave of two cells, but not one of a single cell
-        waves = np.full(len(corners), 2 * np.pi / np.prod(spacing) ** 0.5)
+        waves = np.broadcast_to(2 * np.pi / np.array(spacing), (len(corners), 2))
         hidden_waves = jnp.asarray(waves, float) if wrinkling else None
         return cls._of(corners, gradients, areas, hidden_waves)
 

@@ -5,14 +5,14 @@ mesh's own. A cell cannot take a shorter one, nor a fold across its middle, but 
 membrane, hundreds of times as stiff as bending: the mesh locks. So the strain of a sample is
 shortened by wrinkles that are not seen, L >= 0 (a symmetric matrix), which cost as much as the
 shortest of them, of one cell's length: waves of wavenumber k and shortening L store the energy
-B k^2 tr L, with the bending stiffness B. The energy that is left is
+B k^2 L, with the bending stiffness B, along either side of the cell. The energy that is left is
 
-    min over L >= 0 of  W(E + L) + B k^2 tr L
+    min over L >= 0 of  W(E + L) + B (k1^2 L11 + k2^2 L22)
 
 (the relaxed energy of tension fields, Pipkin 1986, with a price on wrinkles). The critical
-stress B k^2 = B (2 pi / cell)^2 grows without limit as cells shrink. Wrinkles do not begin at once
-there, but from half of it on (a term of the cost that is convex, too), so that the stiffness has no
-jump: Newton's method goes to and fro over jumps.
+stress B k^2 = B (2 pi / side)^2 grows without limit as cells shrink. Wrinkles do not begin at once
+there, but from half of it on (a term of the cost that is convex, too; along the yarns that are less
+stiff nearer to it), so that the stiffness has no jump: Newton's method goes to and fro over jumps.
 """
 
 from collections.abc import Callable
@@ -51,12 +51,12 @@ class Wrinkled(eqx.Module):
 
     - `law`: the law of a sheet without them.
     - `stiffness`: its second derivative at zero strain, [N/m].
-    - `critical`: compressive stress at which it buckles, [N/m].
+    - `critical`: compressive stress at which it buckles along warp and weft, [N/m].
     """
 
     law: Any
     stiffness: Float[Array, "*batch 3 3"]
-    critical: Float[Array, "*batch"]
+    critical: Float[Array, "*batch 2"]
 
     def at(self, strain: Float[Array, " 3"]) -> "Wrinkled":
         """Itself: it is the law of a time step already."""
@@ -87,28 +87,36 @@ def membrane_on_samples(
     )
     bent = (bending.stiffness_along(0.0) + bending.stiffness_along(jnp.pi / 2)) / 2
     critical = bent * samples.hidden_waves[:, None] ** 2
-    return Wrinkled(laws, stiffness, jnp.broadcast_to(critical, strain.shape[:2]))
+    return Wrinkled(laws, stiffness, jnp.broadcast_to(critical, (*strain.shape[:2], 2)))
 
 
 @jax.custom_jvp
 def released(
-    stiffness: Float[Array, "3 3"], critical: Number, strain: Float[Array, " 3"]
+    stiffness: Float[Array, "3 3"], critical: Float[Array, " 2"], strain: Float[Array, " 3"]
 ) -> Number:
     """The energy per area [J/m^2] that wrinkles release, zero or more.
 
     - `stiffness`: against (E11, E22, 2 E12), positive definite, [N/m].
-    - `critical`: compressive stress at which they begin, [N/m].
+    - `critical`: compressive stress at which they begin along warp and weft, [N/m].
     - `strain`: (E11, E22, 2 E12) [-].
     """
-    return -_cost(_hidden(stiffness, critical, strain), stiffness, critical, strain)
+    most = _problem(stiffness, critical, strain)[-1]
+    return -_cost(_hidden(stiffness, critical, strain), most, stiffness, critical, strain)
 
 
 def _released_jvp(primals, tangents):
-    # the hidden strain is optimal, so its change does not count (it does in the next derivative)
+    # the hidden strain is optimal, so its change does not count (it does in the next derivative),
+    # but where it is the most that there is, it goes with that
     hidden, (*law, strain) = _hidden(*primals), primals
-    value, change = _jvp_of_moving(lambda *law: -_cost(hidden, *law, strain), law, tangents[:2])
+    problem = _problem(*primals)
+    _, _, bound, width, most = problem
+    value, change = _jvp_of_moving(
+        lambda *law: -_cost(hidden, most, *law, strain), law, tangents[:2]
+    )
+    if _moves(tangents[0]) or _moves(tangents[1]):
+        _, more = _jvp_of_moving(lambda *law: _problem(*law, strain)[-1], law, tangents[:2])
+        change = change + width**2 * bound * _held_back(_descended(hidden, problem), most) * more
     if _moves(tangents[2]):
-        width = _problem(*primals)[3]
         release = _times(_transposed(_by_strain(primals[0])), hidden)
         change = change - width * _dot(release, tuple(tangents[2]))
     return value, change
@@ -133,9 +141,9 @@ def _jvp_of_moving(function, primals, tangents):
 
 
 @jax.jit
-def _cost(hidden: Vector, stiffness, critical, strain) -> Number:
-    """What hidden wrinkles cost [J/m^2], on the scales of `_problem`."""
-    quadratic, linear, bound, width, most = _problem(stiffness, critical, strain)
+def _cost(hidden: Vector, most: Number, stiffness, critical, strain) -> Number:
+    """What hidden wrinkles cost [J/m^2], on the scales of `_problem`, with a limit `most`."""
+    quadratic, linear, bound, width, _ = _problem(stiffness, critical, strain)
     mean, radius, _, _ = _principal(hidden)
     limits = _limits(mean + radius, most) + _limits(mean - radius, most)
     slope = _times(quadratic, hidden)
@@ -151,25 +159,29 @@ def _problem(stiffness, critical, strain) -> tuple[Matrix, Vector, Number, Numbe
     symmetric and positive, and makes all fabrics alike. Their unit is that of their onset.
     """
     (c11, c12, c13), (_, c22, c23), (_, _, c33) = (tuple(row) for row in stiffness)
-    critical = jnp.maximum(critical, FEWEST * jnp.sqrt(c11 * c22))
     warp, weft, bias = _scales(stiffness)
+    first_critical, second_critical = jnp.maximum(critical, FEWEST / (warp * weft))
     coupling = jnp.clip(c12 * warp * weft, -CROSS, CROSS)
     first, second = c13 * warp * bias, c23 * weft * bias
-    ones = jnp.ones_like(warp) + LEAST
+    along, across = c11 * warp * warp + LEAST, c22 * weft * weft + LEAST
     last = c33 * bias * bias + LEAST
-    quadratic = (ones, coupling, first), (coupling, ones, second), (first, second, last)
+    quadratic = (along, coupling, first), (coupling, across, second), (first, second, last)
     sums = [abs(row[0]) + abs(row[1]) + abs(row[2]) for row in quadratic]
     bound = jnp.maximum(jnp.maximum(sums[0], sums[1]), sums[2])
-    width = ONSET * critical * jnp.minimum(warp, weft) / bound
+    width = ONSET * jnp.minimum(first_critical * warp, second_critical * weft) / bound
     most = jnp.maximum(MOST / jnp.maximum(warp, weft) / width, 2)
     one, two, three = _times(_by_strain(stiffness), tuple(strain))
-    linear = (one + warp * critical) / width, (two + weft * critical) / width, three / width
+    one, two = one + warp * first_critical, two + weft * second_critical
+    linear = one / width, two / width, three / width
     return quadratic, linear, bound, width, most
 
 
 def _scales(stiffness) -> Vector:
     """Of wrinkles (11, 22, sqrt(2) 12), [sqrt(m / N)]."""
-    warp, weft = jax.lax.rsqrt(stiffness[0, 0]), jax.lax.rsqrt(stiffness[1, 1])
+    c11, c22, c33 = stiffness[0, 0], stiffness[1, 1], stiffness[2, 2]
+    # laws by table may have no stiffness along one of them
+    least = LEAST**2 * (c11 + c22 + c33) + jnp.finfo(c11.dtype).tiny ** 0.5
+    warp, weft = (jax.lax.rsqrt(jnp.maximum(c, least)) for c in (c11, c22))
     return warp, weft, ROOT * jnp.sqrt(warp * weft)  # with 2 E12
 
 
@@ -287,6 +299,15 @@ def _limits(value: Number, most: Number) -> Number:
     return _edge(value) + jnp.where(left < 1, _edge(left) + 1 / 6, 0)
 
 
+def _held_back(before: Vector, most: Number) -> Number:
+    """By how much the principal values of `_limited` fall short of those before, near the most."""
+    mean, radius, _, _ = _principal(before)
+    parts = (
+        jnp.where(v > most - 1, v - _between(v, most), 0) for v in (mean + radius, mean - radius)
+    )
+    return sum(parts, start=jnp.zeros_like(mean))
+
+
 def _edge(inside: Number) -> Number:
     inside = jnp.clip(inside, 0, 1)
     root = jnp.sqrt(jnp.where(inside > 0, inside, 1))
@@ -312,8 +333,10 @@ def _limited_slope(matrix: Vector, most: Number) -> Matrix:
     mean, radius, cosine, sine = _principal(matrix)
     high, low = mean + radius, mean - radius
     along, across = (_between_slope(value, most) for value in (high, low))
-    turned = _between(high, most) - _between(low, most)
-    turned = jnp.where(radius > 0, turned / jnp.where(radius > 0, 2 * radius, 1), along)
+    # differences of almost equal values are lost in rounding
+    is_round = radius <= jnp.finfo(radius.dtype).eps ** (1 / 3) * (1 + abs(mean))
+    quotient = (_between(high, most) - _between(low, most)) / jnp.where(is_round, 1, 2 * radius)
+    turned = jnp.where(is_round, (along + across) / 2, quotient)
     parts = (
         (along, ((1 + cosine) / 2, (1 - cosine) / 2, sine / ROOT)),
         (across, ((1 - cosine) / 2, (1 + cosine) / 2, -sine / ROOT)),
