@@ -122,7 +122,7 @@ def test_export_warns_of_a_mesh_that_is_too_coarse(
 def test_the_doctor_says_which_mesh_a_fabric_needs(capsys: pytest.CaptureFixture) -> None:
     assert main(["doctor", "--fabric", "grey_interlock"]) == 0
     told = capsys.readouterr().out
-    assert re.search(r"folding: \d+\.\d mm, too coarse, take 33 x 33", told)
+    assert re.search(r"folding: \d+\.\d mm, too coarse, try 33 x 33", told)
     assert main(["doctor", "--fabric", "grey_interlock", "--shape", "65", "65"]) == 0
     assert re.search(r"folding: \d\.\d mm, enough", capsys.readouterr().out)
 

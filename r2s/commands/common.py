@@ -3,6 +3,7 @@
 import inspect
 import json
 import math
+import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -121,9 +122,15 @@ def mesh_warning(
 
 
 def print_result(as_json: bool, content: Mapping[str, Any], lines: Iterable[str]) -> None:
-    """Print one JSON object, with null for numbers that are not finite, or lines for people."""
+    """Print one JSON object, with null for numbers that are not finite, or lines for people.
+
+    Beside the object warnings go to the error stream.
+    """
     if as_json:
         print(json.dumps(_finite(content), allow_nan=False))
+        for line in lines:
+            if line.startswith("warning: "):
+                print(line, file=sys.stderr)
         return
     for line in lines:
         print(line)

@@ -140,10 +140,11 @@ def mesh_errors(fabric: "Fabric", shape: tuple[int, int]) -> dict[str, tuple[flo
     found = {}
     for motion in resolution.TABLE:
         error = resolution.mesh_error(fabric, (SIDE, SIDE), shape, motion)
-        fine = resolution.shape_for(fabric, (SIDE, SIDE), motion)
-        is_enough = error <= resolution.ENOUGH
-        advice = "enough" if is_enough else f"too coarse, take {fine[0]} x {fine[1]}"
-        found[motion] = error, f"{1e3 * error:.1f} mm, {advice}"
+        words = "enough"
+        if error > resolution.ENOUGH:
+            instead = resolution.advice(fabric, (SIDE, SIDE), shape, motion)
+            words = f"too coarse, {instead}"
+        found[motion] = error, f"{1e3 * error:.1f} mm, {words}"
     return found
 
 

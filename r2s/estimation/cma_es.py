@@ -4,7 +4,7 @@ Needs cma: pip install 'r2s[cma]'.
 """
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -46,7 +46,8 @@ class CMAES(Method):
         else:
             shape = self.chosen_shape
             problems = tuple(Problem.make(each, space, shape=shape) for each in recordings)
-        return search(problems, evaluations=budget.evaluations, progress=self.progress, key=key)
+        found = search(problems, evaluations=budget.evaluations, progress=self.progress, key=key)
+        return replace(found, shape=self.chosen_shape)
 
 
 def search(

@@ -73,7 +73,8 @@ class PublishedDiffCloud(Method):
         del key  # it starts in the middle
         problem = Problem.make(recordings[0], space, shape=self.chosen_shape)
         assumed = space.middle() if self.assumed is None else self.assumed
-        return published_recipe(problem, assumed, epochs=budget.iterations, progress=self.progress)
+        found = published_recipe(problem, assumed, epochs=budget.iterations, progress=self.progress)
+        return dataclasses.replace(found, shape=self.chosen_shape)
 
 
 class MultiplierSpace(ParameterSpace):

@@ -6,7 +6,7 @@ width of the range; `PublishedDiffCP` has the public settings.
 """
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,7 @@ class DiffCP(Method):
 
     def _estimate(self, recordings, space, budget, key):
         problems = problems_on_points(recordings, space, self.chosen_shape)
-        return descend(
+        found = descend(
             problems,
             budget,
             approach=self.name,
@@ -52,6 +52,7 @@ class DiffCP(Method):
             progress=self.progress,
             key=key,
         )
+        return replace(found, shape=self.chosen_shape)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +68,8 @@ class PublishedDiffCP(Method):
     def _estimate(self, recordings, space, budget, key):
         del key  # it starts where the public code does
         (problem,) = problems_on_points(recordings, space, self.chosen_shape)
-        return published_recipe(problem, epochs=budget.iterations, progress=self.progress)
+        found = published_recipe(problem, epochs=budget.iterations, progress=self.progress)
+        return replace(found, shape=self.chosen_shape)
 
 
 def problems_on_points(

@@ -37,35 +37,39 @@ def descend_by_meshes(
     """The fabric that explains some recordings, on a mesh of `shape` or on one that resolves it.
 
     The other arguments are those of `r2s.estimation.descent.descend`; each mesh has a checkpoint.
+    The `shape` of the estimate is that of the largest sheet.
     Its `mesh_bias` is judged by a mesh whose cells are half as long, or twice as long where that
     would be finer than all of `r2s.scenarios.resolution.LADDER`.
     """
 
-    def climb(shape: Shape, before: Search | None, path: Path | None) -> Search:
+    def climb(shapes: list[Shape], before: Search | None, path: Path | None) -> Search:
         start, more = (None, budget) if before is None else (before.theta, near(budget))
-        problems = _problems(recordings, space, shape)
+        problems = _problems(recordings, space, shapes)
         return search(problems, more, start=start, checkpoint=path, progress=progress, key=key)
 
-    rungs = [shape] if shape else ladder(recordings)
+    rungs = [[shape] * len(recordings)] if shape else ladder(recordings)
     found = climb(rungs[0], None, checkpoint)
     last = rungs[0]
     for finer in rungs[1:]:
         if not is_too_coarse(recordings, found, last):
             break
-        path = checkpoint and checkpoint.with_suffix(f".{finer[0]}x{finer[1]}.npz")
+        rows, columns = finer[0]
+        path = checkpoint and checkpoint.with_suffix(f".{rows}x{columns}.npz")
         found, last = climb(finer, found, path), finer
     other = _other_mesh(recordings, space, last)
-    return dataclasses.replace(judged(found, budget, other_mesh=other, key=key), shape=last)
+    estimate = judged(found, budget, other_mesh=other, key=key)
+    return dataclasses.replace(estimate, shape=last[_largest(recordings)])
 
 
-def ladder(recordings: Recordings) -> list[Shape]:
-    """The meshes to go by, from coarse to fine: those of the largest sheet."""
-    return resolution.ladder(max((each.info.sheet.size for each in recordings), key=max))
+def ladder(recordings: Recordings) -> list[list[Shape]]:
+    """The meshes to go by, from coarse to fine: on each rung that of every recording."""
+    return [list(rung) for rung in zip(*map(_meshes, recordings), strict=True)]
 
 
-def is_too_coarse(recordings: Recordings, found: Search, shape: Shape) -> bool:
+def is_too_coarse(recordings: Recordings, found: Search, shapes: Sequence[Shape]) -> bool:
     """Whether a mesh does not resolve the fabric that was found on it, in some recording."""
-    return any(resolution.warning(found.fabric, *_motion(each, shape)) for each in recordings)
+    pairs = zip(recordings, shapes, strict=True)
+    return any(resolution.warning(found.fabric, *_motion(each, shape)) for each, shape in pairs)
 
 
 def near(budget: Budget) -> Budget:
@@ -77,13 +81,32 @@ def _motion(recording: Recording, shape: Shape):
     return recording.info.sheet.size, shape, recording.info.scenario
 
 
-def _problems(recordings: Recordings, space: ParameterSpace, shape: Shape) -> tuple[Problem, ...]:
-    return tuple(Problem.make(each, space, shape=shape) for each in recordings)
+def _meshes(recording: Recording) -> list[Shape]:
+    return resolution.ladder(recording.info.sheet.size)
 
 
-def _other_mesh(recordings: Recordings, space: ParameterSpace, shape: Shape) -> OtherMesh:
-    """The mesh by which that of `shape` is judged."""
-    is_finest = max(shape) >= max(resolution.LADDER)
-    rows, columns = (((n - 1) // 2 if is_finest else 2 * (n - 1)) + 1 for n in shape)
-    problems = _problems(recordings, space, (rows, columns))
+def _largest(recordings: Recordings) -> int:
+    """Which recording has the largest sheet."""
+    return max(range(len(recordings)), key=lambda i: max(recordings[i].info.sheet.size))
+
+
+def _problems(
+    recordings: Recordings, space: ParameterSpace, shapes: Sequence[Shape]
+) -> tuple[Problem, ...]:
+    pairs = zip(recordings, shapes, strict=True)
+    return tuple(Problem.make(each, space, shape=shape) for each, shape in pairs)
+
+
+def _other_mesh(
+    recordings: Recordings, space: ParameterSpace, shapes: Sequence[Shape]
+) -> OtherMesh:
+    """The meshes by which those of `shapes` are judged."""
+    is_finest = max(map(max, shapes)) >= max(resolution.LADDER)
+
+    def other(count: int) -> int:
+        cells = (count - 1) // 2 if is_finest else 2 * (count - 1)
+        return max(cells, 1) + 1
+
+    others = [(other(rows), other(columns)) for rows, columns in shapes]
+    problems = _problems(recordings, space, others)
     return OtherMesh(problems, factor(2.0 if is_finest else 0.5))
