@@ -39,7 +39,7 @@ class CheckGrad:
         import jax
         import jax.numpy as jnp
 
-        from r2s.commands.common import load_card, make_experiment, print_result
+        from r2s.commands.common import load_card, make_experiment, mesh_warning, print_result
         from r2s.gradient_check import compare
         from r2s.scenarios import material_points
         from r2s.scenarios.scenario import rollout
@@ -70,6 +70,7 @@ class CheckGrad:
             numbers = f"{row.value:12.4g}{row.derivative:14.6g}{row.differences:14.6g}"
             lines.append(f"{row.parameter:22s}{numbers}  {row.verdict}")
         lines += [f"the simulation {failure}"] if failure else []
+        lines += mesh_warning(self.shape, fabric, scenario.size, self.scenario)
         lines.append("all derivatives agree" if agree else "NOT all derivatives agree")
         result = {
             "scenario": self.scenario,

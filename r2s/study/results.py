@@ -10,10 +10,14 @@ import numpy as np
 
 from r2s.estimation.method import default_space
 from r2s.evaluation import prediction_error
+from r2s.fabrics.fold_length import fold_length
 from r2s.files import write_text
 from r2s.recordings.recording import Recording, cloud
+from r2s.scenarios.resolution import ENOUGH, mesh_error
 from r2s.scenarios.scenario import from_recording
+from r2s.scenarios.six import SIDE
 from r2s.study.cells import Cell, result_files, with_dependencies
+from r2s.study.configuration import MOTIONS
 from r2s.study.costs import cost_table, costs, forecast
 from r2s.study.estimates import ESTIMATE, EstimateCell, read_estimate
 from r2s.study.evaluations import EvaluationCell, read_measured, read_motion
@@ -23,7 +27,14 @@ from r2s.study.rows import Row, write_rows
 from r2s.study.sources import Source, SyntheticRecording, read, small_strain
 from r2s.study.statistics.parameters import Estimated
 from r2s.study.statistics.recordings import recording_tables
+from r2s.study.tables import Table, significant
 
+MESHES = (
+    "What the mesh of each estimate is expected to leave in the motion that it was made from, and "
+    "in those it is judged on, for the fabric that came out: the distance from a fine sheet of the "
+    "same fabric, over the sheet and the motion. Differences between configurations that are "
+    "smaller may be the mesh's."
+)
 PRINTED = ("findings.md", "chamfer_real_to_sim*.md", "diff*_on_*.md")  # the others are in files
 
 
@@ -86,6 +97,7 @@ def _publish(
         paper,
         [
             ("Costs", "", {"costs": cost_table(took)} if took else {}),
+            ("Meshes", MESHES, {"meshes": mesh_table(cells, out)}),
             ("Every recording", "Mean over the frames that count.", recording_tables(found)),
             ("What larger studies would take", "From the costs of this one.", forecasts),
         ],
@@ -162,6 +174,23 @@ def estimates_made(cells: Iterable[EvaluationCell], folder: Path) -> list[Estima
     """The estimates that cells need and that are made."""
     needed = with_dependencies(cells)
     return [cell for cell in needed if isinstance(cell, EstimateCell) and cell.is_made(folder)]
+
+
+def mesh_table(cells: Iterable[EvaluationCell], folder: Path) -> Table:
+    """What error the mesh of each estimate is expected to leave (`r2s.scenarios.resolution`)."""
+    lines = []
+    for cell in estimates_made(cells, folder):
+        estimate = read_estimate(cell, folder)
+        if estimate is None or estimate.shape is None:
+            continue
+        sheet = (SIDE, SIDE), estimate.shape
+        errors = [mesh_error(estimate.fabric, *sheet, name) for name in (cell.scenario, *MOTIONS)]
+        folds = significant(1e3 * float(fold_length(estimate.fabric)))
+        told = [significant(1e3 * error) if np.isfinite(error) else "-" for error in errors]
+        lines.append((cell.name, f"{estimate.shape[0]} x {estimate.shape[1]}", folds, *told))
+    motions = (f"{name} [mm]" for name in ("estimated from", *MOTIONS))
+    header = ("estimate", "mesh", "fold length [mm]", *motions)
+    return Table(header, tuple(lines), f"Expected errors of meshes; {1e3 * ENOUGH:.0f} mm is fine")
 
 
 def parameters(cells: Iterable[EvaluationCell], folder: Path) -> dict[str, list[Estimated]]:
