@@ -85,7 +85,10 @@ def test_a_finer_mesh_is_taken_where_the_coarse_one_is_not_enough(enough, shape,
     found = mesh_ladder.descend_by_meshes([lift()], SPACE, SMALL, key=jr.key(0))
     assert found.shape == shape
     assert found.mesh_bias is not None and np.all(found.standard_errors >= found.mesh_bias)
-    assert found.values[0] == pytest.approx(float(SPACE.values(PLACE)[0]), rel=0.1)
+    truth = float(SPACE.values(PLACE)[0])
+    if shape == (5, 5):  # the mesh of the truth
+        assert found.values[0] == pytest.approx(truth, rel=0.1)
+    assert abs(np.log(found.values[0] / truth)) < 3 * found.standard_errors[0]
 
 
 @pytest.mark.slow(group="estimates")

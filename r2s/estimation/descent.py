@@ -16,7 +16,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from r2s.estimation import checkpoint as checkpoints
 from r2s.estimation import gauss_newton, standard_errors
 from r2s.estimation.estimate import Estimate, Nuisance
-from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
+from r2s.estimation.gauss_newton import (
+    Descent,
+    Normal,
+    Problems,
+    prior_terms,
+    theta_indices,
+)
 from r2s.estimation.mesh_bias import OtherMesh, mesh_bias
 from r2s.estimation.method import Budget, Progress
 from r2s.estimation.prediction import Theta, explain, fabric_at
@@ -288,7 +294,8 @@ def covariance_at(
     It comes from as many of the frames as agree. Where Gauss-Newton steps from places around the
     end lead apart, the end of the motion depends on the fabric so steeply that its derivatives say
     nothing; then the budget's shares of the frames are tried, the largest first. If these do not
-    agree either, the covariance is that of all frames.
+    agree either, the covariance is that of all frames. A beginning that says nothing of the fabric,
+    since nothing has moved yet, agrees with everything, and does not count.
     """
     found = []
     for share in (1.0, *reversed(budget.shares)):
@@ -300,9 +307,19 @@ def covariance_at(
         prior = _weight(problems, here.normal)
         neighbours = _normals_around(seen, budget, here, prior, key)
         found.append(np.asarray(_covariance(problems, here, prior, neighbours, is_truth)))
-        if not neighbours or float(_disagreement(problems, here, prior, neighbours)) < ROUGH:
+        agrees = not neighbours or float(_disagreement(problems, here, prior, neighbours)) < ROUGH
+        if agrees and _tells(problems, here, prior):
             return found[-1]
     return found[0]
+
+
+def _tells(problems: Problems, end: Descent, prior) -> bool:
+    """Whether the data weigh more than the prior in some direction of the fabric's space."""
+    fabric = slice(problems[0].space.dim)
+    _, precision = prior_terms(problems, end.theta)
+    scale = np.sqrt(np.asarray(prior * precision)[fabric])
+    matrix = np.asarray(end.normal.matrix)[fabric, fabric] / np.outer(scale, scale)
+    return bool(np.all(np.isfinite(matrix)) and np.linalg.eigvalsh(matrix)[-1] > 1)
 
 
 def _normals_around(
