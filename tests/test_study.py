@@ -185,7 +185,8 @@ def tiny(monkeypatch):
         middle = jnp.full(space.dim, 0.5)
         values = np.asarray(space.values(middle))
         losses = np.full((1, 1), 1e-4)
-        return point_estimate("fake", space, middle, 1e-4, losses, values[None, None], 0.1)
+        found = point_estimate("fake", space, middle, 1e-4, losses, values[None, None], 0.1)
+        return dataclasses.replace(found, shape=method.shape)
 
     monkeypatch.setattr(DiffCloud, "_estimate", fake)
     plan = matrix.Plan(
@@ -212,6 +213,8 @@ def test_an_estimate_is_made_once_and_judged(tiny, tmp_path):
     (entry,) = results.parameters(cells, tmp_path)["cloth"]
     assert entry.ranges[0].unit == "N/m" and not np.isfinite(entry.standard_errors).any()
     assert np.isfinite(entry.truth).all()  # those of the preset
+    meshes = results.mesh_table(cells, tmp_path)
+    assert len(meshes.rows) == 1 and all(float(each) > 0 for each in meshes.rows[0][2:4])
     # what more of the same would cost
     plan = matrix.Plan((Configuration("diffcloud", "cloth", "lifting"),), ("grey_interlock",), 3, 4)
     table = forecast(costs(cells, tmp_path), plan)

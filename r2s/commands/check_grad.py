@@ -51,9 +51,8 @@ class CheckGrad:
         card = load_card(self.fabric)
         with jax.enable_x64(True):
             fabric = card.fabric
-            scenario = make_experiment(self.scenario, self.motion).scenario(
-                self.shape, self.self_contact
-            )
+            experiment = make_experiment(self.scenario, self.motion)
+            scenario = experiment.scenario(self.shape, self.self_contact)
             solver = material_points(scenario, fabric) if self.solver == "points" else None
 
             def loss(fabric):
@@ -70,7 +69,7 @@ class CheckGrad:
             numbers = f"{row.value:12.4g}{row.derivative:14.6g}{row.differences:14.6g}"
             lines.append(f"{row.parameter:22s}{numbers}  {row.verdict}")
         lines += [f"the simulation {failure}"] if failure else []
-        lines += mesh_warning(self.shape, fabric, scenario.size, self.scenario)
+        lines += mesh_warning(self.shape, fabric, experiment.sheet.size, self.scenario)
         lines.append("all derivatives agree" if agree else "NOT all derivatives agree")
         result = {
             "scenario": self.scenario,
