@@ -1,5 +1,6 @@
 """The study: what a figure means, which cells there are, and that nothing is made twice."""
 
+import dataclasses
 import os
 import runpy
 import sys
