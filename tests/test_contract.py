@@ -184,19 +184,19 @@ def test_the_network_takes_a_stretching(name):
 
 
 @pytest.mark.slow(group="estimates")
-def test_a_descent_that_arrives_has_converged_and_a_truth_beyond_a_bound_is_named():
-    """Its warp stiffness, which the force of a pull tells, lies above the range."""
-    experiment = scenarios.stretching(num_frames=4, interval=1 / 10)
-    pulled = synthetic.record(experiment, FABRIC, "grey", shape=(4, 4), key=jr.key(1))
-    truth = float(SPACE.values(SPACE.to_unit(FABRIC))[0])
-    beyond = narrowed("warp", truth / 30, truth / 3)
+def test_a_descent_that_arrives_has_converged_and_a_truth_beyond_a_bound_is_named(recording):
+    """Its shear stiffness lies above the range, whose upper bound the estimate reaches."""
+    truth = float(SPACE.values(SPACE.to_unit(FABRIC))[2])
+    beyond = narrowed("shear", truth / 30, truth / 10)
     method = METHODS["diffcloud"](shape=(4, 4))
     budget = Budget(coarse=0, starts=1, iterations=40, around=0)
-    found = method.estimate([pulled], beyond, budget, key=jr.key(0))
-    assert found.converged and found.at_bounds.get("warp") == "upper"
-    assert any(line.startswith("warp") and "at its upper bound" in line for line in describe(found))
-    inside = method.estimate([pulled], SPACE, budget, key=jr.key(0))
-    assert inside.converged and "warp" not in inside.at_bounds
+    found = method.estimate([recording], beyond, budget, key=jr.key(0))
+    assert found.converged and found.at_bounds.get("shear") == "upper"
+    assert any(
+        line.startswith("shear") and "at its upper bound" in line for line in describe(found)
+    )
+    inside = method.estimate([recording], SPACE, budget, key=jr.key(0))
+    assert inside.converged and "shear" not in inside.at_bounds
 
 
 def test_bounds_are_named_at_both_ends_and_nowhere_else():

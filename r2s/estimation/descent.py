@@ -16,13 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from r2s.estimation import checkpoint as checkpoints
 from r2s.estimation import gauss_newton, standard_errors
 from r2s.estimation.estimate import Estimate, Nuisance
-from r2s.estimation.gauss_newton import (
-    Descent,
-    Normal,
-    Problems,
-    prior_terms,
-    theta_indices,
-)
+from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
 from r2s.estimation.mesh_bias import OtherMesh, mesh_bias
 from r2s.estimation.method import Budget, Progress
 from r2s.estimation.prediction import Theta, explain, fabric_at
@@ -51,6 +45,7 @@ _remaining = eqx.filter_jit(gauss_newton.remaining)
 _weight = eqx.filter_jit(gauss_newton.prior_weight)
 _covariance = eqx.filter_jit(standard_errors.covariance)
 _disagreement = eqx.filter_jit(standard_errors.disagreement)
+_tells = eqx.filter_jit(standard_errors.tells)
 _sample_around = eqx.filter_jit(standard_errors.sample_around)
 
 
@@ -308,18 +303,9 @@ def covariance_at(
         neighbours = _normals_around(seen, budget, here, prior, key)
         found.append(np.asarray(_covariance(problems, here, prior, neighbours, is_truth)))
         agrees = not neighbours or float(_disagreement(problems, here, prior, neighbours)) < ROUGH
-        if agrees and _tells(problems, here, prior):
+        if agrees and (share == 1 or bool(_tells(problems, here, prior))):
             return found[-1]
     return found[0]
-
-
-def _tells(problems: Problems, end: Descent, prior) -> bool:
-    """Whether the data weigh more than the prior in some direction of the fabric's space."""
-    fabric = slice(problems[0].space.dim)
-    _, precision = prior_terms(problems, end.theta)
-    scale = np.sqrt(np.asarray(prior * precision)[fabric])
-    matrix = np.asarray(end.normal.matrix)[fabric, fabric] / np.outer(scale, scale)
-    return bool(np.all(np.isfinite(matrix)) and np.linalg.eigvalsh(matrix)[-1] > 1)
 
 
 def _normals_around(

@@ -6,7 +6,7 @@ nearby places, so that a rough or unconverged fit reports larger errors.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from r2s.estimation.gauss_newton import MARGIN, Descent, Normal, Problems, prior_terms
 from r2s.estimation.prediction import Theta
@@ -54,6 +54,15 @@ def disagreement(
     _, root = _sandwich(problems, end, prior)
     far = jnp.linalg.norm(jnp.linalg.solve(root, (led - led[:1]).T), axis=0)[1:]
     return jnp.median(jnp.where(jnp.isfinite(far), far, jnp.inf))
+
+
+def tells(problems: Problems, end: Descent, prior) -> Bool[Array, ""]:
+    """Whether the data weigh more than the prior in some direction of the fabric's space."""
+    fabric = slice(problems[0].space.dim)
+    _, precision = prior_terms(problems, end.theta)
+    root = jnp.sqrt(prior * precision[fabric])
+    weights = jnp.linalg.eigvalsh(end.normal.matrix[fabric, fabric] / jnp.outer(root, root))
+    return weights[-1] > 1  # NaN does not
 
 
 def sample_around(

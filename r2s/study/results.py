@@ -15,7 +15,6 @@ from r2s.files import write_text
 from r2s.recordings.recording import Recording, cloud
 from r2s.scenarios.resolution import ENOUGH, mesh_error
 from r2s.scenarios.scenario import from_recording
-from r2s.scenarios.six import SIDE
 from r2s.study.cells import Cell, result_files, with_dependencies
 from r2s.study.configuration import MOTIONS
 from r2s.study.costs import cost_table, costs, forecast
@@ -85,7 +84,7 @@ def _publish(
                 write_text(out / f"estimates/{cell.name}.json", (files / ESTIMATE).read_text())
     for old in (out / "tables").glob("*.*"):
         old.unlink()
-    took = costs(cells, out)
+    took, meshes = costs(cells, out), mesh_table(cells, out)
     forecasts = {f"forecast_{name}": forecast(took, larger) for name, larger in PRESETS.items()}
     full.publish(
         out,
@@ -97,7 +96,7 @@ def _publish(
         paper,
         [
             ("Costs", "", {"costs": cost_table(took)} if took else {}),
-            ("Meshes", MESHES, {"meshes": mesh_table(cells, out)}),
+            ("Meshes", MESHES, {"meshes": meshes} if meshes.rows else {}),
             ("Every recording", "Mean over the frames that count.", recording_tables(found)),
             ("What larger studies would take", "From the costs of this one.", forecasts),
         ],
@@ -177,14 +176,20 @@ def estimates_made(cells: Iterable[EvaluationCell], folder: Path) -> list[Estima
 
 
 def mesh_table(cells: Iterable[EvaluationCell], folder: Path) -> Table:
-    """What error the mesh of each estimate is expected to leave (`r2s.scenarios.resolution`)."""
+    """What error the mesh of each estimate is expected to leave (`r2s.scenarios.resolution`).
+
+    As it was measured on the cloth, for a sheet of the size of the recording it was made from.
+    """
     lines = []
     for cell in estimates_made(cells, folder):
         estimate = read_estimate(cell, folder)
         if estimate is None or estimate.shape is None:
             continue
-        sheet = (SIDE, SIDE), estimate.shape
-        errors = [mesh_error(estimate.fabric, *sheet, name) for name in (cell.scenario, *MOTIONS)]
+        size = read(cell.sources[0], folder).info.sheet.size
+        errors = [
+            mesh_error(estimate.fabric, size, estimate.shape, motion)
+            for motion in (cell.scenario, *MOTIONS)
+        ]
         folds = significant(1e3 * float(fold_length(estimate.fabric)))
         told = [significant(1e3 * error) if np.isfinite(error) else "-" for error in errors]
         lines.append((cell.name, f"{estimate.shape[0]} x {estimate.shape[1]}", folds, *told))
