@@ -13,10 +13,10 @@ from mpm_bodies import momenta, states, still
 import r2s
 from r2s.fabrics.fabric import Fabric
 from r2s.failures import Failure
+from r2s.forces.elements import bending_frequency, elastic_force, membrane_frequency
 from r2s.geometry.elements import vertex_masses
 from r2s.laws.bending import HingeBending
 from r2s.mpm import Grid, Sheet
-from r2s.mpm.elements import bending_frequency, elastic_force, membrane_frequency
 from r2s.mpm.sheet import stable_step
 from r2s.mpm.transverse import Transverse, unit_normal
 from r2s.scenarios.energy import stored_energy

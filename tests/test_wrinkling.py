@@ -10,8 +10,8 @@ from scipy.optimize import minimize
 import r2s
 from r2s import rectangle
 from r2s.fabrics import presets
+from r2s.forces.elements import elastic_force
 from r2s.laws.wrinkling import LEAST, membrane_on_samples, released
-from r2s.mpm.elements import elastic_force
 from r2s.scenarios.energy import stored_energy
 
 CRITICAL = 0.5  # [N/m]

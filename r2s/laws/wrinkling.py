@@ -16,7 +16,7 @@ stiff nearer to it), so that the stiffness has no jump: Newton's method goes to 
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -262,8 +262,11 @@ def _descended(hidden: Vector, problem) -> Vector:
 @jax.jit
 def _system(before: Vector, problem) -> Matrix:
     """The derivative of the wrinkles' equation, hidden = _limited(descended), in them."""
-    quadratic, _, bound, _, most = problem
-    slope = _limited_slope(before, most)
+    return _system_of(_limited_slope(before, problem[-1]), problem)
+
+
+def _system_of(slope: Matrix, problem) -> Matrix:
+    quadratic, _, bound, _, _ = problem
     columns = [_times(slope, row) for row in quadratic]  # the matrix is symmetric
 
     def entry(i, j):
@@ -376,3 +379,60 @@ def _solve(matrix: Matrix, right: Vector) -> Vector:
     scale = 1 / _dot(first, rows[0])
     one, two, three = (scale * _dot(right, (rows[0][i], rows[1][i], rows[2][i])) for i in range(3))
     return one, two, three
+
+
+def _inverse(matrix: Matrix) -> Matrix:
+    first, second, third = matrix
+    rows = _cross(second, third), _cross(third, first), _cross(first, second)
+    scale = 1 / _dot(first, rows[0])
+    one, two, three = _transposed(rows)
+
+    def scaled(row):
+        return scale * row[0], scale * row[1], scale * row[2]
+
+    return scaled(one), scaled(two), scaled(three)
+
+
+class Hiding(NamedTuple):
+    """What the search for wrinkles needs of a law, at any strain; scaled as in `_problem`.
+
+    Numbers, or arrays of numbers side by side.
+    """
+
+    quadratic: Matrix
+    linear: Vector
+    bound: Number
+    width: Number
+    most: Number
+    by_strain: Matrix
+
+
+def hiding(stiffness: Array, critical: Array) -> Hiding:
+    """From a law's stiffness (3, 3, ...) [N/m] and its critical stress (2, ...) [N/m]."""
+    none = jnp.zeros_like(stiffness[0, 0])
+    return Hiding(*_problem(stiffness, critical, (none, none, none)), _by_strain(stiffness))
+
+
+def follow(law: Hiding, strain: Vector, rate: Vector, hidden: Vector) -> tuple[Vector, Vector]:
+    """The scaled wrinkles at a strain by one Newton step from those nearby, and their rate [1/s].
+
+    `rate` is that of the strain, [1/s].
+    """
+    moved = _times(law.by_strain, strain)
+    linear = tuple(f + m / law.width for f, m in zip(law.linear, moved, strict=True))
+    problem = law.quadratic, linear, law.bound, law.width, law.most
+    before = _descended(hidden, problem)
+    slope = _limited_slope(before, law.most)
+    inverse = _inverse(_system_of(slope, problem))
+    short = tuple(a - b for a, b in zip(hidden, _limited(before, law.most), strict=True))
+    one, two, three = (a - b for a, b in zip(hidden, _times(inverse, short), strict=True))
+    pushed = _times(inverse, _times(slope, _times(law.by_strain, rate)))
+    unit = -1 / (law.bound * law.width)
+    return (one, two, three), (unit * pushed[0], unit * pushed[1], unit * pushed[2])
+
+
+def relieved(law: Hiding, hidden: Vector) -> Vector:
+    """What scaled wrinkles take off the compressive stress (S11, S22, S12), [N/m]."""
+    one, two, three = _times(_transposed(law.by_strain), hidden)
+    unit = (1 - SHARE) * law.width
+    return unit * one, unit * two, unit * three

@@ -12,10 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from r2s.failures import first_failure, no_failure
+from r2s.forces.stability import check_step, longest_step
 from r2s.geometry.mesh import Mesh
 from r2s.laws.solid import Solid, product
 from r2s.mpm.background import Background, Held
-from r2s.mpm.stability import check_step, failure_of_step, longest_step
+from r2s.mpm.stability import failure_of_step
 from r2s.mpm.transfer import affine_factor
 from r2s.world.air import Air, Fan
 from r2s.world.drag import drag_on_vertices

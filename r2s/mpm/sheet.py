@@ -15,11 +15,12 @@ from jaxtyping import Array, Float, Int
 
 from r2s.fabrics.fabric import Fabric
 from r2s.failures import first_failure, no_failure
+from r2s.forces.elements import bending_frequency, elastic_force, membrane_frequency
+from r2s.forces.stability import check_step, longest_step
 from r2s.geometry.mesh import Mesh
 from r2s.mpm.background import Background
-from r2s.mpm.elements import bending_frequency, elastic_force, membrane_frequency
 from r2s.mpm.grid import Grid
-from r2s.mpm.stability import check_step, failure_of_step, longest_step
+from r2s.mpm.stability import failure_of_step
 from r2s.mpm.transfer import affine_factor
 from r2s.mpm.transverse import Transverse, unit_normal
 from r2s.world.drag import drag_on_vertices

@@ -1,0 +1,6 @@
+"""Forces on the vertices of a sheet, for explicit steps; both explicit solvers use them.
+
+- `elements`: of membrane and bending on any mesh, and bounds on their frequencies.
+- `grid`: the same on the grid of a `rectangle`, by slices; `layout`: how its arrays lie.
+- `vectors`: vectors as tuples of arrays. `laws`: what the laws say of these.
+"""

@@ -1,0 +1,89 @@
+"""What laws of one element say of arrays of strains or curvatures side by side."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from r2s.fabrics.fabric import Fabric
+from r2s.forces.vectors import Vector, add, scale
+from r2s.laws.membrane import OrthotropicMembrane
+from r2s.laws.plate import OrthotropicPlate, PlateBending
+from r2s.laws.wrinkling import Hiding, hiding
+
+CONSTANT = OrthotropicMembrane, PlateBending, OrthotropicPlate
+Matrix = tuple[Vector, Vector, Vector]
+
+
+class Response(NamedTuple):
+    """A law for arrays (place), or (place, member).
+
+    - `law`: of one element, or one of each member along the last axis of its arrays.
+    - `stiffness`: (3, 3, ...), of a law whose stiffness is constant; None: of any other.
+    - `batched`: whether there are members.
+    """
+
+    law: Any
+    stiffness: Array | None
+    batched: bool
+
+    def stress(self, strain: Vector, rate: Vector, damping: Array) -> tuple[Vector, Array]:
+        """Stress with its viscosity, and stiffness at zero strain (3, 3, ...).
+
+        - `rate`: of the strain, [1/s]; `damping`: damping time, [s].
+        """
+        if self.stiffness is not None:
+            strained = add(strain, scale(damping, rate))
+            one, two, three = (_row(row, strained) for row in self.stiffness)
+            return (one, two, three), self.stiffness
+        both = jnp.stack(strain), jnp.stack(rate)
+        of_places = jax.vmap(_stresses, in_axes=(None, 1, 1), out_axes=-1)
+        if self.batched:
+            of_places = jax.vmap(of_places, in_axes=-1, out_axes=-1)
+        (one, two, three), viscous, stiffness = of_places(self.law, *both)
+        return add((one, two, three), scale(damping, tuple(viscous))), stiffness
+
+
+def response(law: Any, batched: bool) -> Response:
+    """Of a membrane or a plate."""
+    if not isinstance(law, CONSTANT):
+        return Response(law, None, batched)
+
+    def of_one(law):
+        return jax.hessian(law.energy_density)(jnp.zeros(3, jax.tree.leaves(law)[0].dtype))
+
+    if not batched:
+        return Response(law, of_one(law), False)
+    return Response(law, jax.vmap(of_one, in_axes=-1, out_axes=-1)(law)[:, :, None], True)
+
+
+def critical_stress(fabric: Fabric, waves: tuple[float, float], batched: bool) -> Array:
+    """Compressive stress (2, ...) [N/m] at which cells buckle, as in `r2s.laws.wrinkling`."""
+
+    def of_one(law):
+        return (law.stiffness_along(0.0) + law.stiffness_along(jnp.pi / 2)) / 2
+
+    squares = jnp.asarray([wave**2 for wave in waves], float)
+    if not batched:
+        return of_one(fabric.bending) * squares
+    bent = jax.vmap(of_one, in_axes=-1)(fabric.bending)
+    return squares[:, None, None] * bent[None, None]
+
+
+def hiding_of(law: Response, critical: Array, stiffness: Array) -> Hiding:
+    """What wrinkles depend on, beside the strain."""
+    rank = stiffness.ndim - 1
+    if law.stiffness is None and not law.batched:
+        critical = critical[:, None]
+    return hiding(stiffness, critical.reshape(*critical.shape, *(1,) * (rank - critical.ndim)))
+
+
+def _row(row: Array, strain: Vector) -> Array:
+    return row[0] * strain[0] + row[1] * strain[1] + row[2] * strain[2]
+
+
+def _stresses(law: Any, strain: Array, rate: Array) -> tuple[Array, Array, Array]:
+    here = law.at(strain)
+    stress, viscous = jax.jvp(jax.grad(here.energy_density), (strain,), (rate,))
+    return stress, viscous, jax.hessian(here.energy_density)(jnp.zeros_like(strain))

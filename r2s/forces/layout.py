@@ -1,0 +1,133 @@
+"""How the arrays of a grid lie: its vertices in one row, with room on either side.
+
+Vertex (i, j) has the place i * columns + j. Neighbours are slices of the row, a shift apart: the
+places that are no cell (or no inner vertex) are computed along, and count for nothing. Beside the
+vertices there is room for two lines, so that no slice ends outside. A batch is the last axis.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from r2s.forces.vectors import Vector, dot, scale, subtract
+
+
+class Layout(NamedTuple):
+    """A grid, static.
+
+    - `shape`: vertices along warp and weft. `spacing`: between them, [m].
+    - `batched`: whether arrays have a last axis of members.
+    """
+
+    shape: tuple[int, int]
+    spacing: tuple[float, float]
+    batched: bool = False
+
+    @property
+    def count(self) -> int:
+        """Number of vertices."""
+        return self.shape[0] * self.shape[1]
+
+    @property
+    def room(self) -> int:
+        """Places before the first vertex, and after the last one."""
+        return 2 * self.shape[1]
+
+    @property
+    def first_cell(self) -> int:
+        """The first place from which a cell could reach vertex 0."""
+        return -self.shape[1] - 1
+
+    def constant(self, values: np.ndarray, first: int, like: Array) -> Array:
+        """Numbers of the vertices as an array that begins at a place, zero outside."""
+        row = np.pad(np.asarray(values, float).ravel(), self.room)[first + self.room :]
+        row = row[: self.length(first)]
+        return jnp.asarray(row[:, None] if self.batched else row, like.dtype)
+
+    def length(self, first: int) -> int:
+        """Of arrays that begin at a place: cells end with the vertices, bends as far after them as
+        they begin before.
+        """
+        return self.count - first if first == self.first_cell else self.count - 2 * first
+
+    def padded(self, array: Array, first: int, last: int) -> Array:
+        """With zeros before the first and after the last place."""
+        widths = [(first, last)] + [(0, 0)] * (array.ndim - 1)
+        return jnp.pad(array, widths)
+
+    def wide(self, x: Array) -> Vector:
+        """Components of vectors of the vertices (vertex, 3, ...), with room on either side."""
+        one, two, three = (self.padded(x[:, i], self.room, self.room) for i in range(3))
+        return one, two, three
+
+    @property
+    def vertex_areas(self) -> np.ndarray:
+        """Rest areas of the vertices, [m^2]."""
+        along = [np.ones(count) for count in self.shape]
+        for each in along:
+            each[[0, -1]] = 0.5
+        return np.prod(self.spacing) * np.outer(*along)
+
+    def row(self, number: Array) -> Array:
+        """A number of each member, for arrays (place, member)."""
+        return number[None] if self.batched else number
+
+    def to_cells(self, samples: Array) -> tuple[Vector, ...]:
+        """Vectors (cell, sample, 3, ...) of the cells alone, for each sample at all places."""
+        rows, columns = self.shape
+        found = []
+        for sample in range(samples.shape[1]):
+            of_sample = samples[:, sample].reshape(rows - 1, columns - 1, *samples.shape[2:])
+            widths = [(0, 1), (0, 1)] + [(0, 0)] * (of_sample.ndim - 2)
+            flat = jnp.pad(of_sample, widths).reshape(self.count, *samples.shape[2:])
+            wide = self.padded(flat, -self.first_cell, 0)
+            found.append((wide[:, 0], wide[:, 1], wide[:, 2]))
+        return tuple(found)
+
+    def from_cells(self, samples: tuple[Vector, ...]) -> Array:
+        """The reverse of `to_cells`."""
+        rows, columns = self.shape
+        both = jnp.stack([jnp.stack(each, axis=1) for each in samples], axis=1)
+        both = both[-self.first_cell :].reshape(*self.shape, *both.shape[1:])
+        return both[:-1, :-1].reshape((rows - 1) * (columns - 1), *both.shape[2:])
+
+    def flow(self, x: Vector, v: Vector, wind: Array, fan: Any) -> Vector:
+        """Velocities [m/s] less the wind's: one for all vertices (3, ...), or (vertex, 3, ...)."""
+        if wind.ndim == (2 if self.batched else 1):
+            blowing = tuple(self.row(each) for each in wind)
+        else:
+            blowing = self.wide(wind)
+        if fan is not None:
+            blowing = scale(strength(fan, self, x), blowing)
+        return subtract(v, blowing)
+
+    def index(self) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column of every vertex."""
+        rows, columns = np.indices(self.shape)
+        return rows, columns
+
+
+def part(array: Array, begin: int, length: int) -> Array:
+    """Some places of a row."""
+    return array[begin : begin + length]
+
+
+def is_cell(layout: Layout, like: Array) -> Array:
+    """Which places are the origin of a cell."""
+    rows, columns = layout.index()
+    inside = (rows < layout.shape[0] - 1) & (columns < layout.shape[1] - 1)
+    return layout.constant(inside, layout.first_cell, like) > 0
+
+
+def strength(fan: Any, layout: Layout, x: Vector) -> Array:
+    """The fraction of the wind at every place, as of `r2s.world.air.Fan`."""
+    centre, axis = (tuple(layout.row(each) for each in part) for part in (fan.centre, fan.axis))
+    offset = subtract(x, centre)
+    along = scale(1 / jnp.sqrt(dot(axis, axis)), axis)
+    across = subtract(offset, scale(dot(offset, along), along))
+    radius, edge = layout.row(fan.radius), layout.row(fan.edge)
+    distance = jnp.sqrt(dot(across, across) + (edge / 4) ** 2)
+    return jax.nn.sigmoid(4 * (radius - distance) / edge)

@@ -1,0 +1,38 @@
+"""Vectors as tuples of arrays, one for each component: loops over them vectorise."""
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+Vector = tuple[Array, Array, Array]
+
+
+def add(*vectors: Vector) -> Vector:
+    """The sum."""
+    x, y, z = (sum(parts[1:], start=parts[0]) for parts in zip(*vectors, strict=True))
+    return x, y, z
+
+
+def subtract(a: Vector, b: Vector) -> Vector:
+    """a - b."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+def scale(factor: Array | float, a: Vector) -> Vector:
+    """A number times a vector."""
+    return factor * a[0], factor * a[1], factor * a[2]
+
+
+def dot(a: Vector, b: Vector) -> Array:
+    """The scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """The vector product."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def where(condition: Array, a: Vector, b: Vector) -> Vector:
+    """`a` where a condition holds, elsewhere `b`."""
+    x, y, z = (jnp.where(condition, p, q) for p, q in zip(a, b, strict=True))
+    return x, y, z
