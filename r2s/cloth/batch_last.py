@@ -32,7 +32,7 @@ def batch_last(function: Callable[[bool, Any], Any]) -> Callable[[Any], Any]:
             )
             return leaf.reshape(*leaf.shape[:-2], count * size)
 
-        merged = of_members(jax.tree.map(merged, arrays, in_batched))
+        merged = of_members(jax.tree.map(merged, arrays, in_batched[0]))
         found = jax.tree.map(
             lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], count, size), -1, 0), merged
         )
@@ -49,7 +49,7 @@ def batch_last(function: Callable[[bool, Any], Any]) -> Callable[[Any], Any]:
                 return jnp.moveaxis(leaf, 0, -1)
             return jnp.broadcast_to(leaf[..., None], (*leaf.shape, size))
 
-        found = of_members(jax.tree.map(last, arrays, in_batched))
+        found = of_members(jax.tree.map(last, arrays, in_batched[0]))
         found = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), found)
         return found, jax.tree.map(lambda _: True, found)
 

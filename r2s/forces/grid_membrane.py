@@ -26,7 +26,7 @@ def membrane_force(
     layout: Layout, laws: Any, corners: Corners, rates: Corners, hidden: Wrinkles
 ) -> tuple[list[Vector], Wrinkles]:
     """Forces [N] on the corners of the cells, and the wrinkles of the samples."""
-    warps, wefts = _sides(layout, corners)
+    warps, wefts = jax.lax.optimization_barrier(_sides(layout, corners))
     warp_rates, weft_rates = _sides(layout, rates)
     stresses, found = [], []
     for sample, (along, across) in enumerate(SAMPLES):
@@ -46,8 +46,9 @@ def membrane_force(
             stress = add(stress, relieved(law, total))
             found.append(moved)
         stresses.append(stress)
-    if hidden is not None:
-        stresses, found = jax.lax.optimization_barrier((stresses, found))
+    # XLA drops these barriers on the CPU before it fuses, and makes the stresses again for each of
+    # the forces: slow; a way to keep them in memory is to be found
+    stresses, found = jax.lax.optimization_barrier((stresses, found))
     return _forces(layout, warps, wefts, stresses), tuple(found) if hidden is not None else None
 
 
@@ -79,12 +80,12 @@ def _forces(layout: Layout, warps, wefts, stresses) -> list[Vector]:
         weight = jnp.where(inside, area / layout.spacing[axis], 0)
         return scale(weight, total)
 
-    first, second = (pull(place, 0) for place in (0, 1))
+    pulls = [pull(place, axis) for axis in (0, 1) for place in (0, 1)]
+    first, second, third, fourth = jax.lax.optimization_barrier(pulls)
     near = add(scale(PLACES[1], first), scale(PLACES[0], second))
     far = add(scale(PLACES[0], first), scale(PLACES[1], second))
-    first, second = (pull(place, 1) for place in (0, 1))
-    left = add(scale(PLACES[1], first), scale(PLACES[0], second))
-    right = add(scale(PLACES[0], first), scale(PLACES[1], second))
+    left = add(scale(PLACES[1], third), scale(PLACES[0], fourth))
+    right = add(scale(PLACES[0], third), scale(PLACES[1], fourth))
     none = scale(0.0, near)
     of_a, of_b = add(near, left), subtract(right, near)
     return [of_a, of_b, subtract(subtract(none, far), right), subtract(far, left)]
