@@ -61,14 +61,14 @@ def test_a_batch_is_its_members(sheet, fabric):
     solver = explicit(sheet, fabric, held=(0, 4))
     start = solver.init(flat(sheet))
     control = Control(flat(sheet)[jnp.array([0, 4])] + 0.002, jnp.array([0.5, 0.0, 0.0]))
+    membrane = fabric.membrane
     scales = jnp.array([0.5, 0.8, 1.0, 0.9])
 
     def moved(softer, lighter):
-        of = eqx.tree_at(lambda f: f.membrane, fabric, jax.tree.map(lambda c: c * softer, MEMBRANE))
+        of = eqx.tree_at(lambda f: f.membrane, fabric, jax.tree.map(lambda c: c * softer, membrane))
         of = eqx.tree_at(lambda f: f.density, of, fabric.density / lighter)
         return solver.step(of, start, control).x
 
-    MEMBRANE = fabric.membrane
     alone = jnp.stack([eqx.filter_jit(moved)(s, jnp.ones(())) for s in scales])
     batch = eqx.filter_jit(jax.vmap(moved))(scales, jnp.ones(4))
     assert batch == pytest.approx(np.asarray(alone), abs=1e-10)

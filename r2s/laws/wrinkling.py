@@ -38,7 +38,7 @@ ROOT = 2**0.5
 # Of 100,000 fabrics and strains at random none needs more than 10 solves in float64.
 DESCENTS, SOLVES, CLOSE = 2, 12, 16  # the last in units of rounding
 
-Number = Float[Array, ""]
+Number = Float[Array, "..."]  # of one sample, or of many side by side
 # Numbers, not arrays of three: those of all samples are then worked on side by side.
 Vector = tuple[Number, Number, Number]  # of a symmetric matrix: (11, 22, sqrt(2) 12)
 Matrix = tuple[Vector, Vector, Vector]
@@ -160,7 +160,8 @@ def _problem(stiffness, critical, strain) -> tuple[Matrix, Vector, Number, Numbe
     """
     (c11, c12, c13), (_, c22, c23), (_, _, c33) = (tuple(row) for row in stiffness)
     warp, weft, bias = _scales(stiffness)
-    first_critical, second_critical = jnp.maximum(critical, FEWEST / (warp * weft))
+    least = FEWEST / (warp * weft)
+    first_critical, second_critical = (jnp.maximum(each, least) for each in critical)
     coupling = jnp.clip(c12 * warp * weft, -CROSS, CROSS)
     first, second = c13 * warp * bias, c23 * weft * bias
     along, across = c11 * warp * warp + LEAST, c22 * weft * weft + LEAST
