@@ -194,7 +194,7 @@ def prepare_mesh(scene: Scene, self_contact: bool) -> tuple[Elimination, SelfCon
 
 def _tangent(law: MembraneLaw, strain: Float[Array, " 3"]) -> Float[Array, "3 3"]:
     """Stiffness [N/m] at a strain [-]."""
-    return stress_and_tangent(law.energy_density, strain)[1]
+    return stress_and_tangent(law, strain)[1]
 
 
 def _anchor(now: Array, before: Array) -> Array:

@@ -16,7 +16,7 @@ stiff nearer to it), so that the stiffness has no jump: Newton's method goes to 
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 
 from r2s.geometry.strain_samples import StrainSamples, on_samples
 from r2s.laws.bending import BendingLaw
-from r2s.laws.membrane import MembraneLaw
+from r2s.laws.membrane import MembraneLaw, stress_and_tangent
 
 SHARE = 0.05  # of the resistance to compression that stays, so that no state is left without any
 CROSS = 0.98  # of the coupling at most, against which wrinkles are found
@@ -42,6 +42,24 @@ Number = Float[Array, ""]
 # Numbers, not arrays of three: those of all samples are then worked on side by side.
 Vector = tuple[Number, Number, Number]  # of a symmetric matrix: (11, 22, sqrt(2) 12)
 Matrix = tuple[Vector, Vector, Vector]
+# Second and first derivative of the cost; a bound on the second; the unit; the most of wrinkles.
+Problem = tuple[Matrix, Vector, Number, Number, Number]
+
+
+class Prepared(NamedTuple):
+    """The search for wrinkles without its strain, on the scales of `_prepare`.
+
+    - `quadratic`: second derivative of their cost.
+    - `offset`, `by_strain`: its first derivative at no strain, and by strain.
+    - `bound`: on the second derivative. `width`: their unit. `most`: of them, in this unit.
+    """
+
+    quadratic: Matrix
+    offset: Vector
+    by_strain: Matrix
+    bound: Number
+    width: Number
+    most: Number
 
 
 class Wrinkled(eqx.Module):
@@ -52,20 +70,85 @@ class Wrinkled(eqx.Module):
     - `law`: the law of a sheet without them.
     - `stiffness`: its second derivative at zero strain, [N/m].
     - `critical`: compressive stress at which it buckles along warp and weft, [N/m].
+    - `prepared`: what follows from both for the search for wrinkles.
+    - `hidden`: wrinkles that are known already, as `search` finds them; None: they are searched for.
     """
 
     law: Any
     stiffness: Float[Array, "*batch 3 3"]
     critical: Float[Array, "*batch 2"]
+    prepared: Prepared
+    hidden: Vector | None = None
 
     def at(self, strain: Float[Array, " 3"]) -> "Wrinkled":
         """Itself: it is the law of a time step already."""
         return self
 
     def energy_density(self, strain: Float[Array, " 3"]) -> Float[Array, ""]:
-        """Energy per rest area [J/m^2] at a Green strain (E11, E22, 2 E12) [-]."""
-        freed = released(self.stiffness, self.critical, strain)
+        """Energy per rest area [J/m^2] at a Green strain (E11, E22, 2 E12) [-].
+
+        With known wrinkles the first derivative is right, since they are optimal, but no other.
+        """
+        if self.hidden is None:
+            freed = released(self.stiffness, self.critical, strain)
+        else:
+            freed = -_cost_of(self.hidden, _at_strain(self.prepared, tuple(strain)))
         return self.law.energy_density(strain) - (1 - SHARE) * freed
+
+    def stress_and_tangent(
+        self, strain: Float[Array, " 3"]
+    ) -> tuple[Float[Array, " 3"], Float[Array, "3 3"]]:
+        """First and second derivative [N/m] of `energy_density`, in closed form."""
+        stress, tangent = stress_and_tangent(self.law, strain)
+        hidden = self.hidden
+        if hidden is None:
+            hidden = _hidden(self.stiffness, self.critical, strain)
+        problem = _at_strain(self.prepared, tuple(strain))
+        before = _descended(hidden, problem)
+        slope, inverse = _limited_slope(before, problem[-1]), _inverse(_system(before, problem))
+        by_strain, _, width, _ = self.prepared[2:]
+        softer = _product(_product(_transposed(by_strain), inverse), _product(slope, by_strain))
+        scale = (1 - SHARE) * width**2
+        relief = jnp.stack(_times(_transposed(by_strain), hidden))
+        softening = jnp.stack([jnp.stack(row) for row in softer])
+        return stress + scale * relief, tangent - scale / self.prepared.bound * softening
+
+
+def search(law: Any, strain: Float[Array, "element sample 3"], start: Any = None) -> Any:
+    """The wrinkles of all samples at a strain [-], for `Wrinkled.hidden`, without derivatives.
+
+    Each is an array over all samples. None for a law that has none. A `start` near them, such as
+    those at a strain close by, makes it shorter.
+    """
+    if not isinstance(law, Wrinkled):
+        return None
+    strain = jax.lax.stop_gradient(strain).reshape(-1, 3)
+    prepared = jax.lax.stop_gradient(jax.tree.map(jnp.ravel, law.prepared))
+    problem = _at_strain(prepared, (strain[:, 0], strain[:, 1], strain[:, 2]))
+    start = no_wrinkles(law) if start is None else start
+    flat = _search(problem, jax.tree.map(jnp.ravel, start))
+    return jax.tree.map(lambda leaf: leaf.reshape(law.prepared.width.shape), flat)
+
+
+def no_wrinkles(law: Any) -> Any:
+    """A start for `search`."""
+    if not isinstance(law, Wrinkled):
+        return None
+    none = jnp.zeros_like(law.prepared.width)
+    return none, none, none
+
+
+def with_wrinkles(law: Any, hidden: Any) -> Any:
+    """The law of all samples with wrinkles that `search` found."""
+    return law if hidden is None else eqx.tree_at(_its_wrinkles, law, hidden, is_leaf=_is_none)
+
+
+def _its_wrinkles(law: Wrinkled) -> Any:
+    return law.hidden
+
+
+def _is_none(leaf: Any) -> bool:
+    return leaf is None
 
 
 def membrane_on_samples(
@@ -87,7 +170,8 @@ def membrane_on_samples(
     )
     bent = (bending.stiffness_along(0.0) + bending.stiffness_along(jnp.pi / 2)) / 2
     critical = bent * samples.hidden_waves[:, None] ** 2
-    return Wrinkled(laws, stiffness, jnp.broadcast_to(critical, (*strain.shape[:2], 2)))
+    critical = jnp.broadcast_to(critical, (*strain.shape[:2], 2))
+    return Wrinkled(laws, stiffness, critical, on_samples(_prepare, stiffness, critical))
 
 
 @jax.custom_jvp
@@ -142,8 +226,13 @@ def _jvp_of_moving(function, primals, tangents):
 
 @jax.jit
 def _cost(hidden: Vector, most: Number, stiffness, critical, strain) -> Number:
-    """What hidden wrinkles cost [J/m^2], on the scales of `_problem`, with a limit `most`."""
+    """What hidden wrinkles cost [J/m^2], on the scales of `_prepare`, with a limit `most`."""
     quadratic, linear, bound, width, _ = _problem(stiffness, critical, strain)
+    return _cost_of(hidden, (quadratic, linear, bound, width, most))
+
+
+def _cost_of(hidden: Vector, problem: Problem) -> Number:
+    quadratic, linear, bound, width, most = problem
     mean, radius, _, _ = _principal(hidden)
     limits = _limits(mean + radius, most) + _limits(mean - radius, most)
     slope = _times(quadratic, hidden)
@@ -151,9 +240,8 @@ def _cost(hidden: Vector, most: Number, stiffness, critical, strain) -> Number:
 
 
 @jax.jit
-def _problem(stiffness, critical, strain) -> tuple[Matrix, Vector, Number, Number, Number]:
-    """Second and first derivative of the cost without wrinkles; a bound on the second; the unit;
-    the most of them in this unit.
+def _prepare(stiffness: Float[Array, "3 3"], critical: Float[Array, " 2"]) -> Prepared:
+    """What the search needs of a law.
 
     Wrinkles are scaled along warp and weft by fourth roots of their stiffness, which keeps them
     symmetric and positive, and makes all fabrics alike. Their unit is that of their onset.
@@ -170,10 +258,24 @@ def _problem(stiffness, critical, strain) -> tuple[Matrix, Vector, Number, Numbe
     bound = jnp.maximum(jnp.maximum(sums[0], sums[1]), sums[2])
     width = ONSET * jnp.minimum(first_critical * warp, second_critical * weft) / bound
     most = jnp.maximum(MOST / jnp.maximum(warp, weft) / width, 2)
-    one, two, three = _times(_by_strain(stiffness), tuple(strain))
-    one, two = one + warp * first_critical, two + weft * second_critical
-    linear = one / width, two / width, three / width
-    return quadratic, linear, bound, width, most
+    one, two, three = (
+        (row[0] / width, row[1] / width, row[2] / width) for row in _by_strain(stiffness)
+    )
+    offset = warp * first_critical / width, weft * second_critical / width, 0 * width
+    return Prepared(quadratic, offset, (one, two, three), bound, width, most)
+
+
+def _problem(stiffness, critical, strain) -> Problem:
+    return _at_strain(_prepare(stiffness, critical), tuple(strain))
+
+
+def _at_strain(prepared: Prepared, strain: Vector) -> Problem:
+    """Second and first derivative of the cost without wrinkles; a bound on the second; the unit;
+    the most of them in this unit.
+    """
+    quadratic, offset, by_strain, bound, width, most = prepared
+    one, two, three = (a + b for a, b in zip(_times(by_strain, strain), offset, strict=True))
+    return quadratic, (one, two, three), bound, width, most
 
 
 def _scales(stiffness) -> Vector:
@@ -197,10 +299,14 @@ def _by_strain(stiffness) -> Matrix:
 @jax.custom_jvp
 def _hidden(stiffness, critical, strain) -> Vector:
     """The scaled wrinkles that release most: descents, then a semismooth Newton method."""
-    problem = _problem(stiffness, critical, strain)
-    most = problem[-1]
+    none = jnp.zeros_like(stiffness[0, 0])
+    return _search(_problem(stiffness, critical, strain), (none, none, none))
 
-    close = CLOSE * jnp.finfo(problem[1][0].dtype).eps
+
+def _search(problem: Problem, start: Vector) -> Vector:
+    """The scaled wrinkles, from a start: of one sample, or of all in arrays."""
+    most = problem[-1]
+    close = CLOSE * jnp.finfo(most.dtype).eps
 
     def descent(hidden, _):
         return _limited(_descended(hidden, problem), most), None
@@ -212,14 +318,13 @@ def _hidden(stiffness, critical, strain) -> Vector:
         change = _solve(_system(before, problem), short)
         off = sum(abs(part) for part in short) / (1 + sum(abs(part) for part in hidden))
         new = tuple(a - b for a, b in zip(hidden, change, strict=True))
-        return new, off, count + 1
+        return new, jnp.max(off), count + 1
 
     def goes_on(state):
         return (state[1] > close) & (state[2] < SOLVES)
 
-    none = jnp.zeros_like(problem[1][0])
-    hidden, _ = jax.lax.scan(descent, (none, none, none), length=DESCENTS)
-    return jax.lax.while_loop(goes_on, solve, (hidden, none + jnp.inf, 0))[0]
+    hidden, _ = jax.lax.scan(descent, start, length=DESCENTS)
+    return jax.lax.while_loop(goes_on, solve, (hidden, jnp.full((), jnp.inf, most.dtype), 0))[0]
 
 
 def _hidden_jvp(primals, tangents):
@@ -347,8 +452,8 @@ def _limited_slope(matrix: Vector, most: Number) -> Matrix:
         terms = [weight * axis[i] * axis[j] for weight, axis in parts]
         return terms[0] + terms[1] + terms[2]
 
-    one, two, three = ((entry(i, 0), entry(i, 1), entry(i, 2)) for i in range(3))
-    return one, two, three
+    a, b, c, d, e, f = (entry(*at) for at in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
+    return (a, b, c), (b, d, e), (c, e, f)
 
 
 def _dot(a: Vector, b: Vector) -> Number:
@@ -366,6 +471,20 @@ def _transposed(matrix) -> Matrix:
 
 def _cross(a: Vector, b: Vector) -> Vector:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _product(left: Matrix, right: Matrix) -> Matrix:
+    columns = _transposed(right)
+    one, two, three = ((_dot(r, columns[0]), _dot(r, columns[1]), _dot(r, columns[2])) for r in left)
+    return one, two, three
+
+
+def _inverse(matrix: Matrix) -> Matrix:
+    first, second, third = matrix
+    rows = _cross(second, third), _cross(third, first), _cross(first, second)
+    scale = 1 / _dot(first, rows[0])
+    one, two, three = ((scale * a, scale * b, scale * c) for a, b, c in _transposed(rows))
+    return one, two, three
 
 
 @jax.jit
