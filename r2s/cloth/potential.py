@@ -30,7 +30,8 @@ from r2s.geometry.mesh import Mesh
 from r2s.geometry.strain_samples import on_samples
 from r2s.laws.bending import BendingLaw
 from r2s.laws.membrane import MembraneLaw, stress_and_tangent
-from r2s.laws.wrinkling import search, with_wrinkles
+from r2s.laws.wrinkling import Wrinkled, given_way, search, with_wrinkles
+from r2s.once import once
 from r2s.units import GRAVITY
 from r2s.world import contact
 from r2s.world.air import Air
@@ -121,6 +122,8 @@ def hessian(
     of compressed directions, as is usual for cloth (Choi and Ko 2002). Between 0 and 1 it has that
     fraction of these. `wrinkles` are those that were found at `x`; None: they are searched for.
     """
+    if wrinkles is None:
+        wrinkles = find_wrinkles(step, x)
     pattern, blend = step.elimination.pattern, jnp.asarray(hessian_blend, x.dtype)
     samples = _membrane_hessians(step, x, blend, wrinkles) + _drag_hessians(step, x)
     vertices = _map(jax.hessian(_vertex_energy, argnums=1), step, x, *_vertices(step))
@@ -255,15 +258,22 @@ def _membrane_hessians(
     the last axis, so that they are worked on side by side.
     """
     samples = step.mesh.samples
-    stress, tangent = on_samples(partial(_stress_and_tangent, step), *_samples(step, x, wrinkles))
-    stress, tangent = (samples.areas[..., None] * stress, samples.areas[..., None, None] * tangent)
-    carried = blend * stress + (1 - blend) * on_samples(_tension, stress)
+    law, tangent_before, strain, anchor = _samples(step, x, wrinkles)
+    base = law.law if isinstance(law, Wrinkled) else law
+    parts = on_samples(partial(_stress_and_tangent, step), base, tangent_before, strain, anchor)
+    stress, tangent = jnp.moveaxis(parts[0], -1, 0), jnp.moveaxis(parts[1], (-2, -1), (0, 1))
+    if isinstance(law, Wrinkled):
+        relief, softening = given_way(law, strain)
+        stress, tangent = stress + relief, tangent + softening
+    stress, tangent = samples.areas[None] * stress, samples.areas[None, None] * tangent
+    carried = blend * stress + (1 - blend) * _tension(stress)
     corners = jnp.moveaxis(x[samples.corners], 0, -1)
     corners = corners - corners[:1]  # places in the world would cost precision
-    slopes, stress, tangent = (
-        jnp.moveaxis(each, 0, -1) for each in (samples.gradients, carried, tangent)
-    )
-    every = [_from_sample(corners, *each) for each in zip(slopes, stress, tangent, strict=True)]
+    slopes = jnp.moveaxis(samples.gradients, 0, -1)
+    every = [
+        _from_sample(corners, slopes[q], carried[:, :, q], tangent[:, :, :, q])
+        for q in range(len(slopes))
+    ]
     return jnp.moveaxis(sum(every[1:], start=every[0]), -1, 0)
 
 
@@ -274,12 +284,15 @@ def _from_sample(
     tangent: Float[Array, "3 3 element"],
 ) -> Float[Array, "corner 3 corner 3 element"]:
     """The share of one sample of every element, whose stress and tangent hold its area."""
-    along, across = slopes[:, :1], slopes[:, 1:]
-    warp, weft = jnp.sum(along * corners, axis=0)[None], jnp.sum(across * corners, axis=0)[None]
-    rates = along * warp, across * weft, along * weft + across * warp  # of strain, in the corners
+
+    def rates_and_rows(corners, slopes, tangent):
+        along, across = slopes[:, :1], slopes[:, 1:]
+        warp, weft = (jnp.sum(each * corners, axis=0)[None] for each in (along, across))
+        rates = along * warp, across * weft, along * weft + across * warp  # of strain, in corners
+        return rates, [sum(tangent[i, j][None, None] * rates[j] for j in range(3)) for i in range(3)]
+
     total = _carried(slopes, stress)
-    for i, rate in enumerate(rates):
-        row = sum(tangent[i, j][None, None] * rates[j] for j in range(3))
+    for rate, row in zip(*once(rates_and_rows, corners, slopes, tangent), strict=True):
         total = total + rate[:, :, None, None] * row[None, None]
     return total
 
@@ -308,7 +321,7 @@ def _drag_hessians(step: IncrementalPotential, x: Positions):
     return jnp.broadcast_to(of_middle[:, None, :, None], shape) / count**2
 
 
-def _tension(stress: Float[Array, " 3"]) -> Float[Array, " 3"]:
+def _tension(stress: Float[Array, "3 *sample"]) -> Float[Array, "3 *sample"]:
     """The part of a symmetric stress (S11, S22, S12) whose principal values are positive."""
     mean, half = (stress[0] + stress[1]) / 2, (stress[0] - stress[1]) / 2
     radius = jnp.sqrt(half**2 + stress[2] ** 2)

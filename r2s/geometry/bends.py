@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from r2s.once import once
+
 Positions = Float[Array, "vertex 3"]
 
 
@@ -78,14 +80,21 @@ class Bends(eqx.Module):
         vectors, shares = (
             (each[1] - each[0], each[2] - each[0], each[3] - each[0]) for each in (corners, weights)
         )
-        second = _angle_second_derivatives(*vectors)
+        second = once(_angle_second_derivatives, *vectors)
         scale = (moments * self.per_angle)[None, None]
-        rows = [
-            sum(scale * shares[j][:, None, None] * second[i, j][None] for j in range(3) if (i, j) in second)
-            for i in range(3)
-        ]
+
+        def spread(second):
+            return [
+                sum(scale * shares[j][:, None, None] * second[i, j][None] for j in _PARTS[i])
+                for i in range(3)
+            ]
+
+        rows = once(spread, second)
         total = sum(shares[i][:, None, None, None] * rows[i].swapaxes(0, 1)[None] for i in range(3))
         return jnp.moveaxis(total, -1, 0)
+
+
+_PARTS = ((0, 1, 2), (0, 1), (0, 2))  # the two wings are not coupled
 
 
 def _angle_second_derivatives(

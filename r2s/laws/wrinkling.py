@@ -27,6 +27,7 @@ from jaxtyping import Array, Float
 from r2s.geometry.strain_samples import StrainSamples, on_samples
 from r2s.laws.bending import BendingLaw
 from r2s.laws.membrane import MembraneLaw, stress_and_tangent
+from r2s.once import once
 
 SHARE = 0.05  # of the resistance to compression that stays, so that no state is left without any
 CROSS = 0.98  # of the coupling at most, against which wrinkles are found
@@ -100,18 +101,28 @@ class Wrinkled(eqx.Module):
     ) -> tuple[Float[Array, " 3"], Float[Array, "3 3"]]:
         """First and second derivative [N/m] of `energy_density`, in closed form."""
         stress, tangent = stress_and_tangent(self.law, strain)
-        hidden = self.hidden
-        if hidden is None:
-            hidden = _hidden(self.stiffness, self.critical, strain)
-        problem = _at_strain(self.prepared, tuple(strain))
-        before = _descended(hidden, problem)
-        slope, inverse = _limited_slope(before, problem[-1]), _inverse(_system(before, problem))
-        by_strain, _, width, _ = self.prepared[2:]
-        softer = _product(_product(_transposed(by_strain), inverse), _product(slope, by_strain))
-        scale = (1 - SHARE) * width**2
-        relief = jnp.stack(_times(_transposed(by_strain), hidden))
-        softening = jnp.stack([jnp.stack(row) for row in softer])
-        return stress + scale * relief, tangent - scale / self.prepared.bound * softening
+        known = self
+        if self.hidden is None:
+            known = with_wrinkles(self, _hidden(self.stiffness, self.critical, strain))
+        relief, softening = given_way(known, strain)
+        return stress + relief, tangent + softening
+
+
+def given_way(
+    law: Wrinkled, strain: Float[Array, "*sample 3"]
+) -> tuple[Float[Array, "3 *sample"], Float[Array, "3 3 *sample"]]:
+    """What known wrinkles add to stress and tangent [N/m] of the law of one sample, or of all."""
+    assert law.hidden is not None
+    by_strain, hidden = law.prepared.by_strain, law.hidden
+    problem = _at_strain(law.prepared, (strain[..., 0], strain[..., 1], strain[..., 2]))
+    before = _descended(hidden, problem)
+    slope = once(_limited_slope, before, problem[-1])
+    inverse = once(lambda *system: _inverse(_off_balance(*system)), slope, problem)
+    scale = (1 - SHARE) * law.prepared.width**2
+    relief = jnp.stack(_times(_transposed(by_strain), hidden))
+    softer = _product(_product(_transposed(by_strain), inverse), _product(slope, by_strain))
+    softening = jnp.stack([jnp.stack(row) for row in softer])
+    return scale[None] * relief, -(scale / law.prepared.bound)[None, None] * softening
 
 
 def search(law: Any, strain: Float[Array, "element sample 3"], start: Any = None) -> Any:
@@ -367,8 +378,11 @@ def _descended(hidden: Vector, problem) -> Vector:
 @jax.jit
 def _system(before: Vector, problem) -> Matrix:
     """The derivative of the wrinkles' equation, hidden = _limited(descended), in them."""
-    quadratic, _, bound, _, most = problem
-    slope = _limited_slope(before, most)
+    return _off_balance(_limited_slope(before, problem[-1]), problem)
+
+
+def _off_balance(slope: Matrix, problem: Problem) -> Matrix:
+    quadratic, _, bound, _, _ = problem
     columns = [_times(slope, row) for row in quadratic]  # the matrix is symmetric
 
     def entry(i, j):
