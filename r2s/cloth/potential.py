@@ -301,8 +301,9 @@ def _carried(slopes, stress) -> Float[Array, "corner 3 corner 3 element"]:
     """The geometric stiffness of one sample of every element."""
     one, two = slopes[:, None, 0], slopes[:, None, 1]
     other_one, other_two = slopes[None, :, 0], slopes[None, :, 1]
-    by_corners = one * (stress[0] * other_one + stress[2] * other_two)
-    by_corners += two * (stress[2] * other_one + stress[1] * other_two)
+    first, second, shear = stress[:, None, None]
+    by_corners = one * (first * other_one + shear * other_two)
+    by_corners += two * (shear * other_one + second * other_two)
     return by_corners[:, None, :, None] * jnp.eye(3, dtype=stress.dtype)[None, :, None, :, None]
 
 

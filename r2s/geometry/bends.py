@@ -81,7 +81,7 @@ class Bends(eqx.Module):
             (each[1] - each[0], each[2] - each[0], each[3] - each[0]) for each in (corners, weights)
         )
         second = once(_angle_second_derivatives, *vectors)
-        scale = (moments * self.per_angle)[None, None]
+        scale = (moments * self.per_angle)[None, None, None]
 
         def spread(second):
             return [

@@ -39,7 +39,7 @@ ROOT = 2**0.5
 # Of 100,000 fabrics and strains at random none needs more than 10 solves in float64.
 DESCENTS, SOLVES, CLOSE = 2, 12, 16  # the last in units of rounding
 
-Number = Float[Array, ""]
+Number = Float[Array, "*sample"]
 # Numbers, not arrays of three: those of all samples are then worked on side by side.
 Vector = tuple[Number, Number, Number]  # of a symmetric matrix: (11, 22, sqrt(2) 12)
 Matrix = tuple[Vector, Vector, Vector]
