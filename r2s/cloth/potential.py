@@ -30,7 +30,7 @@ from r2s.geometry.mesh import Mesh
 from r2s.geometry.strain_samples import on_samples
 from r2s.laws.bending import BendingLaw
 from r2s.laws.membrane import MembraneLaw, stress_and_tangent
-from r2s.laws.wrinkling import Wrinkled, given_way, search, with_wrinkles
+from r2s.laws.wrinkling import Columns, Wrinkled, given_way, search, with_wrinkles
 from r2s.once import once
 from r2s.units import GRAVITY
 from r2s.world import contact
@@ -289,7 +289,9 @@ def _from_sample(
         along, across = slopes[:, :1], slopes[:, 1:]
         warp, weft = (jnp.sum(each * corners, axis=0)[None] for each in (along, across))
         rates = along * warp, across * weft, along * weft + across * warp  # of strain, in corners
-        return rates, [sum(tangent[i, j][None, None] * rates[j] for j in range(3)) for i in range(3)]
+        return rates, [
+            sum(tangent[i, j][None, None] * rates[j] for j in range(3)) for i in range(3)
+        ]
 
     total = _carried(slopes, stress)
     for rate, row in zip(*once(rates_and_rows, corners, slopes, tangent), strict=True):
@@ -322,7 +324,7 @@ def _drag_hessians(step: IncrementalPotential, x: Positions):
     return jnp.broadcast_to(of_middle[:, None, :, None], shape) / count**2
 
 
-def _tension(stress: Float[Array, "3 *sample"]) -> Float[Array, "3 *sample"]:
+def _tension(stress: Columns) -> Columns:
     """The part of a symmetric stress (S11, S22, S12) whose principal values are positive."""
     mean, half = (stress[0] + stress[1]) / 2, (stress[0] - stress[1]) / 2
     radius = jnp.sqrt(half**2 + stress[2] ** 2)

@@ -5,7 +5,6 @@ gives the law that a time step uses. A law whose energy says it all returns itse
 stiffness follows the strain (`r2s.laws.tables`) returns its stiffness there.
 """
 
-from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx

@@ -40,6 +40,8 @@ ROOT = 2**0.5
 DESCENTS, SOLVES, CLOSE = 2, 12, 16  # the last in units of rounding
 
 Number = Float[Array, "*sample"]
+Columns = Float[Array, "3 *sample"]
+Tangents = Float[Array, "3 3 *sample"]
 # Numbers, not arrays of three: those of all samples are then worked on side by side.
 Vector = tuple[Number, Number, Number]  # of a symmetric matrix: (11, 22, sqrt(2) 12)
 Matrix = tuple[Vector, Vector, Vector]
@@ -72,7 +74,7 @@ class Wrinkled(eqx.Module):
     - `stiffness`: its second derivative at zero strain, [N/m].
     - `critical`: compressive stress at which it buckles along warp and weft, [N/m].
     - `prepared`: what follows from both for the search for wrinkles.
-    - `hidden`: wrinkles that are known already, as `search` finds them; None: they are searched for.
+    - `hidden`: wrinkles that are known already, from `search`; None: they are searched for.
     """
 
     law: Any
@@ -93,7 +95,7 @@ class Wrinkled(eqx.Module):
         if self.hidden is None:
             freed = released(self.stiffness, self.critical, strain)
         else:
-            freed = -_cost_of(self.hidden, _at_strain(self.prepared, tuple(strain)))
+            freed = -_cost_of(self.hidden, _at_strain(self.prepared, _columns(strain)))
         return self.law.energy_density(strain) - (1 - SHARE) * freed
 
     def stress_and_tangent(
@@ -108,13 +110,11 @@ class Wrinkled(eqx.Module):
         return stress + relief, tangent + softening
 
 
-def given_way(
-    law: Wrinkled, strain: Float[Array, "*sample 3"]
-) -> tuple[Float[Array, "3 *sample"], Float[Array, "3 3 *sample"]]:
+def given_way(law: Wrinkled, strain: Float[Array, "*sample 3"]) -> tuple[Columns, Tangents]:
     """What known wrinkles add to stress and tangent [N/m] of the law of one sample, or of all."""
     assert law.hidden is not None
     by_strain, hidden = law.prepared.by_strain, law.hidden
-    problem = _at_strain(law.prepared, (strain[..., 0], strain[..., 1], strain[..., 2]))
+    problem = _at_strain(law.prepared, _columns(strain))
     before = _descended(hidden, problem)
     slope = once(_limited_slope, before, problem[-1])
     inverse = once(lambda *system: _inverse(_off_balance(*system)), slope, problem)
@@ -135,7 +135,7 @@ def search(law: Any, strain: Float[Array, "element sample 3"], start: Any = None
         return None
     strain = jax.lax.stop_gradient(strain).reshape(-1, 3)
     prepared = jax.lax.stop_gradient(jax.tree.map(jnp.ravel, law.prepared))
-    problem = _at_strain(prepared, (strain[:, 0], strain[:, 1], strain[:, 2]))
+    problem = _at_strain(prepared, _columns(strain))
     start = no_wrinkles(law) if start is None else start
     flat = _search(problem, jax.tree.map(jnp.ravel, start))
     return jax.tree.map(lambda leaf: leaf.reshape(law.prepared.width.shape), flat)
@@ -209,7 +209,7 @@ def _released_jvp(primals, tangents):
         lambda *law: -_cost(hidden, most, *law, strain), law, tangents[:2]
     )
     if _moves(tangents[0]) or _moves(tangents[1]):
-        _, more = _jvp_of_moving(lambda *law: _problem(*law, strain)[-1], law, tangents[:2])
+        _, more = _jvp_of_moving(lambda *law: _prepare(*law).most, law, tangents[:2])
         change = change + width**2 * bound * _held_back(_descended(hidden, problem), most) * more
     if _moves(tangents[2]):
         release = _times(_transposed(_by_strain(primals[0])), hidden)
@@ -277,7 +277,11 @@ def _prepare(stiffness: Float[Array, "3 3"], critical: Float[Array, " 2"]) -> Pr
 
 
 def _problem(stiffness, critical, strain) -> Problem:
-    return _at_strain(_prepare(stiffness, critical), tuple(strain))
+    return _at_strain(_prepare(stiffness, critical), _columns(strain))
+
+
+def _columns(strain: Float[Array, "*sample 3"]) -> Vector:
+    return strain[..., 0], strain[..., 1], strain[..., 2]
 
 
 def _at_strain(prepared: Prepared, strain: Vector) -> Problem:
@@ -350,11 +354,12 @@ def _hidden_jvp(primals, tangents):
         _, _, bound, width, _ = problem
         columns = [_solve(system, _times(slope, by)) for by in _transposed(_by_strain(primals[0]))]
         change = _times(_transposed(columns), tuple(tangents[2]))
-        total = tuple(a - b / (bound * width) for a, b in zip(total, change, strict=True))
+        one, two, three = (-change[i] / (bound * width) for i in range(3))
+        total = one, two, three
     if _moves(tangents[0]) or _moves(tangents[1]):
 
         def limit(*law):
-            problem = _problem(*law, strain)
+            problem = _at_strain(_prepare(*law), _columns(strain))
             return _descended(hidden, problem), problem[-1]
 
         _, (change, more) = _jvp_of_moving(limit, law, tangents[:2])
@@ -489,7 +494,9 @@ def _cross(a: Vector, b: Vector) -> Vector:
 
 def _product(left: Matrix, right: Matrix) -> Matrix:
     columns = _transposed(right)
-    one, two, three = ((_dot(r, columns[0]), _dot(r, columns[1]), _dot(r, columns[2])) for r in left)
+    one, two, three = (
+        (_dot(r, columns[0]), _dot(r, columns[1]), _dot(r, columns[2])) for r in left
+    )
     return one, two, three
 
 
