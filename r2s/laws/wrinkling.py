@@ -93,7 +93,7 @@ class Wrinkled(eqx.Module):
         With known wrinkles the first derivative is right, since they are optimal, but no other.
         """
         if self.hidden is None:
-            freed = released(self.stiffness, self.critical, strain)
+            freed = _released(self.prepared, strain)
         else:
             freed = -_cost_of(self.hidden, _at_strain(self.prepared, _columns(strain)))
         return self.law.energy_density(strain) - (1 - SHARE) * freed
@@ -105,7 +105,7 @@ class Wrinkled(eqx.Module):
         stress, tangent = stress_and_tangent(self.law, strain)
         known = self
         if self.hidden is None:
-            known = with_wrinkles(self, _hidden(self.stiffness, self.critical, strain))
+            known = with_wrinkles(self, _hidden(self.prepared, strain))
         relief, softening = given_way(known, strain)
         return stress + relief, tangent + softening
 
@@ -185,7 +185,6 @@ def membrane_on_samples(
     return Wrinkled(laws, stiffness, critical, on_samples(_prepare, stiffness, critical))
 
 
-@jax.custom_jvp
 def released(
     stiffness: Float[Array, "3 3"], critical: Float[Array, " 2"], strain: Float[Array, " 3"]
 ) -> Number:
@@ -195,54 +194,68 @@ def released(
     - `critical`: compressive stress at which they begin along warp and weft, [N/m].
     - `strain`: (E11, E22, 2 E12) [-].
     """
-    most = _problem(stiffness, critical, strain)[-1]
-    return -_cost(_hidden(stiffness, critical, strain), most, stiffness, critical, strain)
+    return _released(_prepare(stiffness, critical), strain)
+
+
+@jax.custom_jvp
+def _released(prepared: Prepared, strain: Float[Array, " 3"]) -> Number:
+    problem = _at_strain(prepared, _columns(strain))
+    return -_cost_of(_hidden(prepared, strain), problem)
 
 
 def _released_jvp(primals, tangents):
     # the hidden strain is optimal, so its change does not count (it does in the next derivative),
     # but where it is the most that there is, it goes with that
-    hidden, (*law, strain) = _hidden(*primals), primals
-    problem = _problem(*primals)
-    _, _, bound, width, most = problem
-    value, change = _jvp_of_moving(
-        lambda *law: -_cost(hidden, most, *law, strain), law, tangents[:2]
-    )
-    if _moves(tangents[0]) or _moves(tangents[1]):
-        _, more = _jvp_of_moving(lambda *law: _prepare(*law).most, law, tangents[:2])
-        change = change + width**2 * bound * _held_back(_descended(hidden, problem), most) * more
-    if _moves(tangents[2]):
-        release = _times(_transposed(_by_strain(primals[0])), hidden)
-        change = change - width * _dot(release, tuple(tangents[2]))
+    (prepared, strain), hidden = primals, _hidden(*primals)
+    _, _, _, bound, width, most = prepared
+    problem = _at_strain(prepared, _columns(strain))
+    value = -_cost_of(hidden, problem)
+    change = jnp.zeros_like(value)
+    if _moves(tangents[0]):
+
+        def limited(prepared):
+            quadratic, linear, bound, width, _ = _at_strain(prepared, _columns(strain))
+            return -_cost_of(hidden, (quadratic, linear, bound, width, most)), prepared.most
+
+        _, (fixed, more) = _jvp_of_moving(limited, prepared, tangents[0])
+        held = _held_back(_descended(hidden, problem), most)
+        change = fixed + width**2 * bound * held * more
+    if _moves(tangents[1]):
+        release = _times(_transposed(prepared.by_strain), hidden)
+        change = change - width**2 * _dot(release, _columns(tangents[1]))
     return value, change
 
 
-released.defjvp(_released_jvp, symbolic_zeros=True)
+_released.defjvp(_released_jvp, symbolic_zeros=True)
 
 
-def _moves(tangent) -> bool:
-    return not isinstance(tangent, SymbolicZero)
+def _moves(tangents) -> bool:
+    return not all(isinstance(each, SymbolicZero) for each in _leaves(tangents))
 
 
-def _jvp_of_moving(function, primals, tangents):
-    """`jax.jvp` in those arguments that have a tangent: the others cost nothing."""
-    moving = [i for i, each in enumerate(tangents) if _moves(each)]
+def _leaves(tangents) -> list:
+    return jax.tree.leaves(tangents, is_leaf=_is_zero)
+
+
+def _is_zero(tangent) -> bool:
+    return isinstance(tangent, SymbolicZero)
+
+
+def _jvp_of_moving(function, primal, tangent):
+    """`jax.jvp` in those arrays that have a tangent: the others cost nothing."""
+    leaves, structure = jax.tree.flatten(primal)
+    tangents = _leaves(tangent)
+    moving = [i for i, each in enumerate(tangents) if not _is_zero(each)]
 
     def of_moving(*given):
-        every = dict(enumerate(primals)) | dict(zip(moving, given, strict=True))
-        return function(*every.values())
+        every = dict(enumerate(leaves)) | dict(zip(moving, given, strict=True))
+        return function(structure.unflatten(every.values()))
 
-    return jax.jvp(of_moving, [primals[i] for i in moving], [tangents[i] for i in moving])
-
-
-@jax.jit
-def _cost(hidden: Vector, most: Number, stiffness, critical, strain) -> Number:
-    """What hidden wrinkles cost [J/m^2], on the scales of `_prepare`, with a limit `most`."""
-    quadratic, linear, bound, width, _ = _problem(stiffness, critical, strain)
-    return _cost_of(hidden, (quadratic, linear, bound, width, most))
+    return jax.jvp(of_moving, [leaves[i] for i in moving], [tangents[i] for i in moving])
 
 
 def _cost_of(hidden: Vector, problem: Problem) -> Number:
+    """What hidden wrinkles cost [J/m^2], on the scales of `_prepare`."""
     quadratic, linear, bound, width, most = problem
     mean, radius, _, _ = _principal(hidden)
     limits = _limits(mean + radius, most) + _limits(mean - radius, most)
@@ -274,10 +287,6 @@ def _prepare(stiffness: Float[Array, "3 3"], critical: Float[Array, " 2"]) -> Pr
     )
     offset = warp * first_critical / width, weft * second_critical / width, 0 * width
     return Prepared(quadratic, offset, (one, two, three), bound, width, most)
-
-
-def _problem(stiffness, critical, strain) -> Problem:
-    return _at_strain(_prepare(stiffness, critical), _columns(strain))
 
 
 def _columns(strain: Float[Array, "*sample 3"]) -> Vector:
@@ -312,10 +321,10 @@ def _by_strain(stiffness) -> Matrix:
 
 
 @jax.custom_jvp
-def _hidden(stiffness, critical, strain) -> Vector:
+def _hidden(prepared: Prepared, strain: Float[Array, " 3"]) -> Vector:
     """The scaled wrinkles that release most: descents, then a semismooth Newton method."""
-    none = jnp.zeros_like(stiffness[0, 0])
-    return _search(_problem(stiffness, critical, strain), (none, none, none))
+    none = jnp.zeros_like(prepared.width)
+    return _search(_at_strain(prepared, _columns(strain)), (none, none, none))
 
 
 def _search(problem: Problem, start: Vector) -> Vector:
@@ -344,30 +353,28 @@ def _search(problem: Problem, start: Vector) -> Vector:
 
 def _hidden_jvp(primals, tangents):
     """By the implicit function theorem, from what the wrinkles solve."""
-    hidden, (*law, strain) = _hidden(*primals), primals
-    problem = _problem(*primals)
-    before = _descended(hidden, problem)
-    system, slope = _system(before, problem), _limited_slope(before, problem[-1])
+    (prepared, strain), hidden = primals, _hidden(*primals)
+    problem = _at_strain(prepared, _columns(strain))
+    before, most = _descended(hidden, problem), prepared.most
+    slope = _limited_slope(before, most)
     none = jnp.zeros_like(hidden[0])
-    total: Vector = none, none, none
-    if _moves(tangents[2]):
-        _, _, bound, width, _ = problem
-        columns = [_solve(system, _times(slope, by)) for by in _transposed(_by_strain(primals[0]))]
-        change = _times(_transposed(columns), tuple(tangents[2]))
-        one, two, three = (-change[i] / (bound * width) for i in range(3))
-        total = one, two, three
-    if _moves(tangents[0]) or _moves(tangents[1]):
+    right: Vector = none, none, none
+    if _moves(tangents[1]):
+        change = _times(prepared.by_strain, _columns(tangents[1]))
+        one, two, three = (-each / prepared.bound for each in _times(slope, change))
+        right = one, two, three
+    if _moves(tangents[0]):
 
-        def limit(*law):
-            problem = _at_strain(_prepare(*law), _columns(strain))
-            return _descended(hidden, problem), problem[-1]
+        def limit(prepared):
+            problem = _at_strain(prepared, _columns(strain))
+            return _descended(hidden, problem), prepared.most
 
-        _, (change, more) = _jvp_of_moving(limit, law, tangents[:2])
-        at_most = _of_principal(lambda value: jnp.clip((value - problem[-1] + 1) / 2, 0, 1), before)
-        right = zip(_times(slope, change), at_most, strict=True)
-        change = _solve(system, tuple(a + more * b for a, b in right))
-        total = tuple(a + b for a, b in zip(total, change, strict=True))
-    return hidden, total
+        _, (change, more) = _jvp_of_moving(limit, prepared, tangents[0])
+        at_most = _of_principal(lambda value: jnp.clip((value - most + 1) / 2, 0, 1), before)
+        parts = zip(right, _times(slope, change), at_most, strict=True)
+        one, two, three = (a + b + more * c for a, b, c in parts)
+        right = one, two, three
+    return hidden, _solve(_off_balance(slope, problem), right)
 
 
 _hidden.defjvp(_hidden_jvp, symbolic_zeros=True)
