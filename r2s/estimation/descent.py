@@ -22,6 +22,7 @@ from r2s.estimation.method import Budget, Progress
 from r2s.estimation.prediction import Theta, explain, fabric_at
 from r2s.estimation.problem import OWN, SHARED, UNITS, Problem, beginning
 from r2s.fabrics.fabric import Fabric
+from r2s.kept import kept
 
 INITIAL_DAMPING = 1e-2
 # of the prior's weight, which is about twice what a change by one standard error costs
@@ -34,8 +35,8 @@ ROUGH = 3.0  # standard errors, by which places around an end lead apart
 Row = list[Descent]  # one iteration: the descents of all starts
 
 # compiled once in a process for all recordings of as many frames, knots and points
-_loss = eqx.filter_jit(gauss_newton.loss_at)
-_normal = eqx.filter_jit(gauss_newton.normal_at)
+_loss = kept(gauss_newton.loss_at)
+_normal = kept(gauss_newton.normal_at)
 _losses = eqx.filter_jit(eqx.filter_vmap(gauss_newton.loss_at, in_axes=(None, 0)))
 _normals = eqx.filter_jit(eqx.filter_vmap(gauss_newton.normal_at, in_axes=(None, 0, 0, None)))
 _propose = eqx.filter_jit(gauss_newton.propose)
