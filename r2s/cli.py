@@ -54,8 +54,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        if NO_CACHE in arguments:
-            programs.forget()
         command = tyro.cli(
             Command,  # pyright: ignore[reportArgumentType]
             prog="r2s",
@@ -83,12 +81,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def command() -> int:
     """`main` in a process of its own, which keeps what it compiles."""
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA doubts every program from a file
     gc.set_threshold(100_000, 50, 100)  # to trace makes many objects that stay
     os.environ["XLA_FLAGS"] = one_thread(os.environ.get("XLA_FLAGS", ""))  # JAX has not begun yet
     if sys.argv[1:2] in (["estimate"], ["view"]):  # others mostly compile, faster on all cores
         one_core()
-    if NO_CACHE not in sys.argv:
+    if NO_CACHE in sys.argv:
+        programs.forget()
+    else:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
             programs.keep()

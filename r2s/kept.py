@@ -7,6 +7,7 @@ arguments. What was lowered is stored by `jax.export`, and is what runs in the f
 that all get the same numbers.
 """
 
+import dataclasses
 import functools
 import hashlib
 import io
@@ -14,6 +15,7 @@ import os
 import pickle
 import platform
 import threading
+import weakref
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
@@ -51,6 +53,7 @@ class Kept:
         self._function, self._jitted = function, eqx.filter_jit(function)
         self._ready: dict[Any, Callable] = {}
         self._lock = threading.Lock()
+        _all.add(self)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         dynamic, static = eqx.partition((args, kwargs), eqx.is_array)
@@ -95,11 +98,11 @@ class Kept:
                 return out
 
             exported = jax.export.export(jax.jit(noted))(specs)
-            content = pickle.dumps((bytes(exported.serialize()), found[-1]))
+            content = pickle.dumps((_parts(exported), found[-1]))
             if store is not None:
                 store.put(key, content)
-        text, out_like = pickle.loads(content)
-        call = jax.jit(jax.export.deserialize(bytearray(text)).call)
+        parts, out_like = pickle.loads(content)
+        call = jax.jit(jax.export.Exported(**parts, _get_vjp=None).call)
         compiled, structure = call.lower(specs).compile(), jax.tree.structure(out_like)
         return lambda leaves: jax.tree.unflatten(structure, compiled(_arrays(leaves)))
 
@@ -111,6 +114,15 @@ class Kept:
         return run
 
 
+_all: weakref.WeakSet[Kept] = weakref.WeakSet()
+
+
+def let_go() -> None:
+    """Let all programs go from memory, as `jax.clear_caches` does with its own."""
+    for each in _all:
+        each._ready.clear()
+
+
 def kept(function: Callable) -> Kept:
     """`Kept`, as a decorator."""
     return Kept(function)
@@ -118,6 +130,12 @@ def kept(function: Callable) -> Kept:
 
 def _shape(leaf: Any) -> tuple:
     return leaf.shape, str(leaf.dtype)
+
+
+def _parts(exported: jax.export.Exported) -> dict[str, Any]:
+    """The fields of what was exported; its own way to write them needs one more library."""
+    names = (each.name for each in dataclasses.fields(exported))
+    return {name: getattr(exported, name) for name in names if name != "_get_vjp"}
 
 
 def _arrays(leaves: list) -> list:

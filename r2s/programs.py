@@ -136,8 +136,9 @@ _in_use: list[Programs] = []  # of this process, as JAX's own is
 
 
 def forget() -> None:
-    """Keep no programs from now on, and read none."""
+    """Keep no programs from now on, and read none: here, and in processes that begin from here."""
     jax.config.update(ENABLED, False)
+    os.environ[ENABLED.upper()] = "false"
 
 
 def user_folder() -> Path:
