@@ -51,7 +51,6 @@ class Simulate:
         from r2s.recordings.recording import save
         from r2s.scenarios import synthetic
         from r2s.scenarios.scenario import rollout
-        from r2s.study.environment import one_core
 
         check_folders(self.out, self.recording)
         if self.self_contact and self.solver == "points":
@@ -67,7 +66,6 @@ class Simulate:
         with Waiting("compiling the motion") as line:
             moved = kept(rollout)
             moved.prepare(scenario, fabric, solver=solver)
-            one_core()  # threads that wait for each other cost more than they compute
             line.say(f"simulating {scenario.num_frames} frames")
             motion = moved(scenario, fabric, solver=solver)
             ok, failure = np.asarray(motion.ok), motion.explain()

@@ -70,7 +70,7 @@ def slurm(
 
 
 class OneCore(WorkerPlugin):
-    """A core for each worker of a machine, by the number at the end of its name; it keeps programs."""
+    """A core for each worker of a machine, by the number at the end of its name, and programs."""
 
     def setup(self, worker: Any) -> None:
         begin_worker(int(re.findall(r"\d+", str(worker.name))[-1]))

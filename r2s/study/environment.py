@@ -19,10 +19,9 @@ def one_thread(flags: str) -> str:
 def one_core(number: int | None = None) -> None:
     """Bind this process to one of its cores: by a number, or the idlest.
 
-    Threads that run already are bound, too: a command may compile on all cores, and then compute on
-    one. XLA's flags leave it two threads on two cores, which spin while they wait for each other: beside
-    other work a lift takes 2 to 8 CPU seconds instead of 0.11. Only Linux can bind processes;
-    elsewhere nothing is done.
+    Before JAX begins: it makes as many threads as it then has cores, and these spin while they wait
+    for each other. Beside other work a lift takes 2 to 8 CPU seconds instead of 0.11, whatever XLA's
+    flags say. Only Linux can bind processes; elsewhere nothing is done.
     """
     if not hasattr(os, "sched_setaffinity"):
         return
@@ -32,15 +31,11 @@ def one_core(number: int | None = None) -> None:
         busy = dict(enumerate(psutil.cpu_percent(interval=LOOK, percpu=True)))
         # some containers show their cores' times under other numbers
         number = min(range(len(cores)), key=lambda i: busy.get(cores[i], 0.0))
-    for thread in os.listdir("/proc/self/task"):
-        try:
-            os.sched_setaffinity(int(thread), {cores[number % len(cores)]})
-        except ProcessLookupError:  # it has ended
-            pass
+    os.sched_setaffinity(0, {cores[number % len(cores)]})
 
 
 def begin_worker(number: int | None = None) -> None:
-    """What a process that makes cells does first: it binds itself (`one_core`) and keeps programs."""
+    """What a process that makes cells does first: it binds itself and keeps its programs."""
     one_core(number)
     programs.keep()
 
