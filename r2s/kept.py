@@ -71,7 +71,8 @@ class Kept:
         leaves, tree = jax.tree.flatten(dynamic)
         shapes = tuple(_shape(leaf) for leaf in leaves)
         known = (tree, shapes, *jax.tree.flatten(static))
-        known = (*known[:2], tuple(known[2]), known[3])
+        settings = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+        known = (*known[:2], tuple(known[2]), known[3], settings)
         with self._lock:
             if known not in self._ready:
                 self._ready[known] = self._make(dynamic, static, shapes)

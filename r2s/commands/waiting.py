@@ -3,7 +3,7 @@
 import sys
 import threading
 import time
-from typing import TextIO
+from typing import Any
 
 TICK = 1.0  # [s]
 
@@ -16,7 +16,7 @@ class Waiting:
     written to a `stream` that is no terminal.
     """
 
-    def __init__(self, words: str, stream: TextIO | None = None, tick: float = TICK) -> None:
+    def __init__(self, words: str, stream: Any = None, tick: float = TICK) -> None:
         self._stream = sys.stderr if stream is None else stream
         self._shown = self._stream.isatty()
         self._words, self._numbers, self._began, self._since = words, "", *[time.monotonic()] * 2

@@ -20,8 +20,8 @@ def one_core(number: int | None = None) -> None:
     """Bind this process to one of its cores: by a number, or the idlest.
 
     Before JAX begins: it makes as many threads as it then has cores, and these spin while they wait
-    for each other. Beside other work a lift takes 2 to 8 CPU seconds instead of 0.11, whatever XLA's
-    flags say. Only Linux can bind processes; elsewhere nothing is done.
+    for each other. Beside other work a lift takes 2 to 8 CPU seconds instead of 0.11, whatever
+    XLA's flags say. Only Linux can bind processes; elsewhere nothing is done.
     """
     if not hasattr(os, "sched_setaffinity"):
         return
