@@ -26,6 +26,7 @@ import equinox as eqx
 import jax
 import jax.export
 import jax.numpy as jnp
+from jax.core import Tracer
 
 from r2s import programs
 
@@ -58,7 +59,7 @@ class Kept:
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         dynamic, static = eqx.partition((args, kwargs), eqx.is_array)
         leaves, _ = jax.tree.flatten(dynamic)
-        if programs.kept() is None or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        if programs.kept() is None or any(isinstance(leaf, Tracer) for leaf in leaves):
             return self._jitted(*args, **kwargs)
         return self._program(dynamic, static)(leaves)
 
