@@ -83,7 +83,8 @@ def command() -> int:
     """`main` in a process of its own, which keeps what it compiles."""
     gc.set_threshold(100_000, 50, 100)  # to trace makes many objects that stay
     os.environ["XLA_FLAGS"] = one_thread(os.environ.get("XLA_FLAGS", ""))  # JAX has not begun yet
-    if sys.argv[1:2] in (["simulate"], ["estimate"], ["view"]):  # others mostly compile
+    named = [each for each in sys.argv[1:] if each != NO_CACHE][:1]
+    if named in (["simulate"], ["estimate"], ["view"]):  # others mostly compile
         one_core()
     if NO_CACHE in sys.argv:
         programs.forget()

@@ -6,12 +6,13 @@ user's cache folder and read it from there; tracing and lowering remain.
 JAX's own files are neither written whole nor checked, and it never replaces one that is damaged. So
 the folder is of `Programs`: a file has a checksum before its program, is renamed into place, and is
 removed where it is damaged; the oldest go when all are too large. Any number of processes may share
-it.
+it. Who can write there can have this process run what they like: the folder must be the user's own.
 """
 
 import hashlib
 import os
 import platform
+import stat
 import sys
 import tempfile
 import warnings
@@ -30,12 +31,13 @@ class Programs:
 
     - `folder`: where the files are. - `most`: size of all files together, [byte].
 
-    Raises `OSError` when the folder can't be made or written.
+    Raises `OSError` when the folder can't be made or written, or others can write it.
     """
 
     def __init__(self, folder: Path, most: int = MOST) -> None:
         self._path, self._most, self._full = folder, most, False
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _check_owner(folder)
         with tempfile.TemporaryFile(dir=folder):
             pass
 
@@ -168,8 +170,16 @@ def machine() -> str:
     return hashlib.sha256("\n".join(told).encode()).hexdigest()[:12]
 
 
+def _check_owner(folder: Path) -> None:
+    if not hasattr(os, "getuid"):  # Windows: a user's folders are closed to others
+        return
+    found = folder.stat()
+    if found.st_uid != os.getuid() or found.st_mode & stat.S_IWOTH:
+        raise PermissionError(f"{folder}: others can write it, and programs are run as they are")
+
+
 def _write(file: Path, content: bytes) -> None:
-    number, name = tempfile.mkstemp(dir=file.parent)
+    number, name = tempfile.mkstemp(dir=file.parent, suffix=SUFFIX)  # one left behind goes, too
     try:
         with os.fdopen(number, "wb") as stream:
             stream.write(content)

@@ -1,5 +1,6 @@
 """What a user sees while a command computes: what it does, and for how long."""
 
+import shutil
 import sys
 import threading
 import time
@@ -56,5 +57,6 @@ class Waiting:
         here, all_ = now - self._since, now - self._began
         text = f"{self._words}{self._numbers}: {here:.0f} s, {all_:.0f} s in all"
         with self._lock:
-            self._stream.write(f"\r\x1b[K{text}")
+            width = shutil.get_terminal_size().columns - 1  # a line that is folded would stay
+            self._stream.write(f"\r\x1b[K{text[:width]}")
             self._stream.flush()

@@ -7,15 +7,18 @@ import sys
 import equinox as eqx
 import jax
 
-from r2s import kept
+from r2s import kept, programs
 from r2s.extras import require
 
 
 def let_go_beyond(most: float) -> None:
     """Let compiled programs go if this process holds more memory than `most` [byte].
 
-    Those that are kept in files (`r2s.programs`) are soon there again.
+    Those that are kept in files (`r2s.programs`) are soon there again; where none are, nothing is
+    let go.
     """
+    if programs.kept() is None:
+        return
     psutil = require("psutil", "study", "a study")
     if psutil.Process().memory_info().rss <= most:
         return
