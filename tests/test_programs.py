@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import pytest
 from jax._src import compilation_cache
 
+import r2s.kept
 from r2s import programs
 from r2s.fabrics import presets
 from r2s.fabrics.fold_length import fold_length
@@ -92,13 +93,49 @@ def test_a_kept_function_is_not_traced_again(folder: Path, monkeypatch: pytest.M
 
 
 def test_other_shapes_and_static_parts_are_other_programs(folder: Path) -> None:
-    mean = Kept(presets_mean)
-    assert mean(jnp.ones(3), 2) == 2 and mean(jnp.ones(3), 3) == 3
-    assert mean(jnp.ones((2, 2)), 3) == 3
+    times = Kept(jax.lax.mul)  # of a library whose version is in the key
+    assert jnp.array_equal(times(jnp.ones(3), jnp.full(3, 2.0)), jnp.full(3, 2.0))
+    total = Kept(jnp.full_like)
+    assert total(jnp.ones(3), 2).sum() == 6 and total(jnp.ones(3), 3).sum() == 9
+    assert total(jnp.ones((2, 2)), 3).sum() == 12
+    assert total(jnp.ones(3, jnp.int32), 3).dtype == jnp.int32
 
 
-def presets_mean(x: jax.Array, factor: int) -> jax.Array:
-    return factor * jnp.mean(x)
+def test_equal_numbers_of_other_types_are_other_programs(folder: Path) -> None:
+    full = Kept(jnp.full)
+    kinds = [full((2,), value).dtype.kind for value in (1, 1.0, True)]
+    assert kinds == ["i", "f", "b"]
+
+
+def test_a_source_that_changed_since_the_process_began_is_not_kept(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(r2s.kept, "BEGAN", 0.0)
+    fabric = presets.grey_interlock()
+    assert kept(fold_length)(fabric) == pytest.approx(float(fold_length(fabric)), rel=1e-6)
+    assert not [file for file in files(folder) if file.name.startswith("traced")]
+
+
+def test_a_folder_that_others_can_write_is_refused(tmp_path: Path) -> None:
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    shared.chmod(0o777)
+    with pytest.raises(PermissionError, match="others can write it"):
+        Programs(shared)
+
+
+def test_to_import_r2s_leaves_the_cache_of_jax_alone() -> None:
+    told = "import jax; before = dict(jax.config.values); import r2s, r2s.cli, r2s.kept\n"
+    told += f"before = [before[name] for name in {SETTINGS}]\n"
+    told += f"after = [jax.config.values[name] for name in {SETTINGS}]\n"
+    told += "from jax._src import compilation_cache as cache\n"
+    told += "assert after == before and r2s.programs.kept() is None\n"
+    told += "assert cache.get_file_cache.__module__ == cache.__name__"
+    subprocess.run([sys.executable, "-c", told], check=True, timeout=120)
+
+
+def last(pair: tuple) -> jax.Array:
+    return pair[1]
 
 
 class Foreign(eqx.Module):
@@ -108,8 +145,11 @@ class Foreign(eqx.Module):
 
 
 def test_a_class_of_unknown_source_is_compiled_but_not_kept(folder: Path) -> None:
-    run = Kept(lambda foreign, x: foreign.factor * x)
-    assert run(Foreign(2), jnp.ones(())) == 2
+    run = Kept(lambda x: 2 * x)  # a function of unknown source
+    assert run(jnp.ones(())) == 2
+    assert jax.tree.leaves(Kept(eqx.tree_at)(last, (Foreign(2), jnp.ones(())), jnp.zeros(()))) == [
+        0
+    ]
     assert not [file for file in files(folder) if file.name.startswith("traced")]
 
 
