@@ -130,7 +130,9 @@ def record(
     if motion is None and (balance is None or not np.isfinite(balance.x).all()):
         made = None if solver is None else solver(scenario, fabric)
         motion = _rollout(scenario, fabric, max_step, made)
-    x = balance.x if balance is not None or motion is None else motion.x
+    found = motion if balance is None else balance
+    assert found is not None
+    x = found.x
     if x.shape != (scenario.num_frames, *scenario.start.shape):
         raise ValueError(
             f"expected a motion of {scenario.num_frames} frames and {len(scenario.start)} "
