@@ -8,6 +8,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from r2s import programs
 from r2s.study.main import study
 
 if __name__ == "__main__":
@@ -29,8 +30,12 @@ if __name__ == "__main__":
     add("--scheduler", default="", help="address of a Dask scheduler, such as tcp://node:8786")
     add("--slurm", type=int, default=0, help="jobs of a Slurm cluster")
     add("--compilation-cache", type=Path, help="folder where workers keep compiled programs")
+    add("--no-cache", action="store_true", help="keep no compiled programs, and read none")
+    settings = vars(parser.parse_args())
+    if settings.pop("no_cache"):
+        programs.forget()
     try:
-        missing = study(**vars(parser.parse_args()))
+        missing = study(**settings)
         sys.exit(f"{missing} cells are missing: see the report" if missing else 0)
     except (ValueError, OSError, ImportError) as error:
         sys.exit(f"error: {error}")

@@ -4,6 +4,7 @@ Exit codes: 0; 1 for an error, in one line on stderr; 2 for wrong usage. The com
 `r2s.commands`.
 """
 
+import gc
 import os
 import sys
 import warnings
@@ -16,6 +17,7 @@ try:
 except ImportError:
     sys.exit("r2s: error: the command line needs tyro: pip install 'r2s[cli]'")
 
+from r2s import programs
 from r2s.commands.check_grad import CheckGrad
 from r2s.commands.data import Data
 from r2s.commands.doctor import Doctor
@@ -29,6 +31,7 @@ from r2s.commands.study import Study
 from r2s.commands.view import View
 from r2s.study.environment import one_core, one_thread
 
+NO_CACHE = "--no-cache"
 Command = (
     Annotated[Data, subcommand("data")]
     | Annotated[Show, subcommand("show")]
@@ -49,12 +52,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Raises SystemExit, with 0 after --help and 2 after a wrong usage, whose message is on stderr.
     """
+    arguments = sys.argv[1:] if arguments is None else arguments
     try:
         command = tyro.cli(
             Command,  # pyright: ignore[reportArgumentType]
             prog="r2s",
-            description="r2s: real-to-sim for fabrics. Each command tells more with --help.",
-            args=arguments,
+            description=(
+                "r2s: real-to-sim for fabrics. Each command tells more with --help. Compiled "
+                "programs are kept in the cache folder of the user, or in that of "
+                f"JAX_COMPILATION_CACHE_DIR; {NO_CACHE}, with any command, keeps and reads none."
+            ),
+            args=[each for each in arguments if each != NO_CACHE],
             config=(OmitArgPrefixes, OmitSubcommandPrefixes, FlagCreatePairsOff),
         )
         with warnings.catch_warnings():
@@ -72,10 +80,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def command() -> int:
-    """`main` in a process of its own."""
+    """`main` in a process of its own, which keeps what it compiles."""
+    gc.set_threshold(100_000, 50, 100)  # to trace makes many objects that stay
     os.environ["XLA_FLAGS"] = one_thread(os.environ.get("XLA_FLAGS", ""))  # JAX has not begun yet
-    if sys.argv[1:2] in (["estimate"], ["view"]):  # others mostly compile, faster on all cores
+    named = [each for each in sys.argv[1:] if each != NO_CACHE][:1]
+    if named in (["simulate"], ["estimate"], ["view"]):  # others mostly compile
         one_core()
+    if NO_CACHE in sys.argv:
+        programs.forget()
+    else:
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            programs.keep()
     return main()
 
 

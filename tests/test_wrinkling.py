@@ -11,6 +11,7 @@ import r2s
 from r2s import rectangle
 from r2s.fabrics import presets
 from r2s.forces.elements import elastic_force
+from r2s.laws import wrinkling
 from r2s.laws.wrinkling import LEAST, membrane_on_samples, released
 from r2s.scenarios.energy import stored_energy
 
@@ -185,3 +186,57 @@ def test_without_stiffness_along_a_yarn_all_is_finite(diagonal):
         for found in (value(matrix, at, strain), slope(matrix, at, strain)):
             assert jnp.all(jnp.isfinite(found))
         assert jnp.all(jnp.isfinite(curvature(matrix, at, strain)))
+
+
+def test_a_search_from_other_wrinkles_ends_at_the_same_ones():
+    """Wherever it starts: the energy that is left is convex, so that there is one minimum."""
+    random = np.random.default_rng(1)
+    count = 2000
+    warp, weft = np.exp(random.uniform(np.log(3), np.log(3000), (2, count)))
+    matrix = np.zeros((count, 3, 3))
+    matrix[:, 0, 0], matrix[:, 1, 1] = warp, weft
+    coupling = random.uniform(-0.97, 0.97, count) * np.sqrt(warp * weft)
+    matrix[:, 0, 1] = matrix[:, 1, 0] = coupling
+    matrix[:, 2, 2] = np.exp(random.uniform(0, np.log(1000), count))
+    critical = np.repeat(np.exp(random.uniform(np.log(1e-3), np.log(5), (count, 1))), 2, axis=1)
+    strain = random.normal(size=(1, count, 3)) * 0.1
+    laws = wrinkling.Wrinkled(
+        r2s.OrthotropicMembrane(*jnp.asarray([[warp], [coupling], [weft], [matrix[:, 2, 2]]])),
+        jnp.asarray(matrix[None]),
+        jnp.asarray(critical[None]),
+        jax.vmap(jax.vmap(wrinkling._prepare))(
+            jnp.asarray(matrix[None]), jnp.asarray(critical[None])
+        ),
+    )
+    found = wrinkling.search(laws, jnp.asarray(strain))
+    others = wrinkling.search(laws, jnp.asarray(random.permutation(strain, axis=1)))
+    again = wrinkling.search(laws, jnp.asarray(strain), others)
+    assert np.mean(np.abs(np.asarray(found[0])) > 1) > 0.2  # there is something to find
+    for one, other in zip(found, again, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", presets.FIVE)
+def test_known_wrinkles_give_the_energy_its_slope_and_the_closed_form_its_curvature(name):
+    sheet, fabric = rectangle((0.3, 0.2), (3, 2)), presets.FIVE[name]()
+    strain = jnp.asarray(strains(2 * 4).reshape(2, 4, 3))
+    law = membrane_on_samples(sheet.samples, fabric.membrane, fabric.bending, 0 * strain)
+    known = wrinkling.with_wrinkles(law, wrinkling.search(law, strain))
+
+    def energies(law, strain):
+        return jax.vmap(jax.vmap(lambda law, strain: law.energy_density(strain)))(law, strain)
+
+    def slopes(law, strain):
+        return jax.vmap(jax.vmap(lambda law, strain: jax.grad(law.energy_density)(strain)))(
+            law, strain
+        )
+
+    np.testing.assert_allclose(energies(known, strain), energies(law, strain), rtol=1e-9)
+    np.testing.assert_allclose(slopes(known, strain), slopes(law, strain), rtol=1e-7, atol=1e-9)
+    stress, tangent = jax.vmap(jax.vmap(lambda law, e: law.stress_and_tangent(e)))(law, strain)
+    np.testing.assert_allclose(stress, slopes(law, strain), rtol=1e-7, atol=1e-9)
+    by_derivative = jax.vmap(jax.vmap(lambda law, e: jax.hessian(law.energy_density)(e)))(
+        law, strain
+    )
+    largest = float(jnp.max(jnp.abs(by_derivative)))
+    np.testing.assert_allclose(tangent, by_derivative, rtol=0, atol=1e-9 * largest)

@@ -27,9 +27,11 @@ from r2s.cloth.self_contact.contacts import Contacts, contact_energy, contact_he
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.bends import unwrapped
 from r2s.geometry.mesh import Mesh
-from r2s.geometry.strain_samples import green_strain_gradient, on_samples
+from r2s.geometry.strain_samples import on_samples
 from r2s.laws.bending import BendingLaw
 from r2s.laws.membrane import MembraneLaw, stress_and_tangent
+from r2s.laws.wrinkling import Columns, Wrinkled, given_way, search, with_wrinkles
+from r2s.once import once
 from r2s.units import GRAVITY
 from r2s.world import contact
 from r2s.world.air import Air
@@ -76,10 +78,13 @@ class IncrementalPotential(eqx.Module):
     contacts: Contacts | None = None
 
 
-def potential(step: IncrementalPotential, x: Positions) -> Float[Array, ""]:
-    """The incremental potential [J] at new positions [m]."""
+def potential(step: IncrementalPotential, x: Positions, wrinkles: Any = None) -> Float[Array, ""]:
+    """The incremental potential [J] at new positions [m].
+
+    With `wrinkles` that were searched for at `x` its derivative is right, but no second one.
+    """
     samples = step.mesh.samples
-    membrane = on_samples(partial(_sample_energy, step), *_samples(step, x))
+    membrane = on_samples(partial(_sample_energy, step), *_samples(step, x, wrinkles))
     total = jnp.sum(samples.areas * membrane)
     total += jnp.sum(_map(_drag_energy, step, _middles(step, x), *_drag(step)))
     total += _bending_energy(step, _curvatures(step, x))
@@ -95,19 +100,32 @@ def residual(step: IncrementalPotential, x: Positions) -> Positions:
     return jax.grad(potential, argnums=1)(step, x)
 
 
+def find_wrinkles(step: IncrementalPotential, x: Positions, near: Any = None) -> Any:
+    """The wrinkles of all samples at positions [m], without derivatives; None where there are none.
+
+    Those of positions that are `near` make the search shorter.
+    """
+    return search(step.membrane, step.mesh.samples.strains(x), near)
+
+
 @jax.jit
 def hessian(
-    step: IncrementalPotential, x: Positions, hessian_blend: Float[Array, ""] | float = 1.0
+    step: IncrementalPotential,
+    x: Positions,
+    hessian_blend: Float[Array, ""] | float = 1.0,
+    wrinkles: Any = None,
 ) -> Blocks:
     """Second derivative [N/m] of the potential, as blocks of its pattern, but for `far_couplings`.
 
     With a `hessian_blend` of 0 it is a positive definite stand-in, whose Newton steps always
     descend: it leaves out the second derivative of the bends' angles, and the geometric stiffness
     of compressed directions, as is usual for cloth (Choi and Ko 2002). Between 0 and 1 it has that
-    fraction of these.
+    fraction of these. `wrinkles` are those that were found at `x`; None: they are searched for.
     """
+    if wrinkles is None:
+        wrinkles = find_wrinkles(step, x)
     pattern, blend = step.elimination.pattern, jnp.asarray(hessian_blend, x.dtype)
-    samples = _membrane_hessians(step, x, blend) + _drag_hessians(step, x)
+    samples = _membrane_hessians(step, x, blend, wrinkles) + _drag_hessians(step, x)
     vertices = _map(jax.hessian(_vertex_energy, argnums=1), step, x, *_vertices(step))
     bending = {step.bending.element: _bending_hessians(step, x)}
     blocks = assemble(pattern, vertices, samples=samples, **bending)
@@ -135,9 +153,9 @@ def _map(function: Callable, step: IncrementalPotential, *elements: Any) -> Any:
     return jax.vmap(lambda *element: function(step, *element))(*elements)
 
 
-def _samples(step: IncrementalPotential, x: Positions):
-    strain = step.mesh.samples.strains(x)
-    return step.membrane, step.membrane_tangent, strain, step.strain_anchor
+def _samples(step: IncrementalPotential, x: Positions, wrinkles: Any = None):
+    strain, law = step.mesh.samples.strains(x), with_wrinkles(step.membrane, wrinkles)
+    return law, step.membrane_tangent, strain, step.strain_anchor
 
 
 def _drag(step: IncrementalPotential):
@@ -231,25 +249,71 @@ def _contact_hessians(step: IncrementalPotential, x: Positions):
     return contact_hessians(step.contacts, step.fabric.thickness, step.rate, x, step.x_anchor)
 
 
-def _membrane_hessians(step: IncrementalPotential, x: Positions, blend: Float[Array, ""]):
-    """Second derivatives [N/m] of each element's membrane energy in its corners."""
+def _membrane_hessians(
+    step: IncrementalPotential, x: Positions, blend: Float[Array, ""], wrinkles: Any
+):
+    """Second derivatives [N/m] of each element's membrane energy in its corners.
+
+    Exact with all of the stress, since the Green strain is quadratic in the corners. Elements are
+    the last axis, so that they are worked on side by side.
+    """
     samples = step.mesh.samples
+    law, tangent_before, strain, anchor = _samples(step, x, wrinkles)
+    base = law.law if isinstance(law, Wrinkled) else law
+    parts = on_samples(partial(_stress_and_tangent, step), base, tangent_before, strain, anchor)
+    stress, tangent = jnp.moveaxis(parts[0], -1, 0), jnp.moveaxis(parts[1], (-2, -1), (0, 1))
+    if isinstance(law, Wrinkled):
+        relief, softening = given_way(law, strain)
+        stress, tangent = stress + relief, tangent + softening
+    stress, tangent = samples.areas[None] * stress, samples.areas[None, None] * tangent
+    carried = blend * stress + (1 - blend) * _tension(stress)
+    corners = jnp.moveaxis(x[samples.corners], 0, -1)
+    corners = corners - corners[:1]  # places in the world would cost precision
+    slopes = jnp.moveaxis(samples.gradients, 0, -1)
+    every = [
+        _from_sample(corners, slopes[q], carried[:, :, q], tangent[:, :, :, q])
+        for q in range(len(slopes))
+    ]
+    return jnp.moveaxis(sum(every[1:], start=every[0]), -1, 0)
 
-    def at_sample(law, tangent_before, strain, anchor, corners, gradients, area):
-        # exact with all of the stress, since the Green strain is quadratic in the corners
-        def energy(strain):
-            return _sample_energy(step, law, tangent_before, strain, anchor)
 
-        stress, tangent = stress_and_tangent(energy, strain)
-        by_corners = green_strain_gradient(corners, gradients)
-        material = jnp.einsum("sai,st,tbj->aibj", by_corners, tangent, by_corners)
-        carried = blend * _symmetric(stress) + (1 - blend) * _tension(stress)
-        geometric = jnp.einsum("as,st,bt,ij->aibj", gradients, carried, gradients, jnp.eye(3))
-        return area * (material + geometric)
+def _from_sample(
+    corners: Float[Array, "corner 3 element"],
+    slopes: Float[Array, "corner 2 element"],
+    stress: Float[Array, "3 element"],
+    tangent: Float[Array, "3 3 element"],
+) -> Float[Array, "corner 3 corner 3 element"]:
+    """The share of one sample of every element, whose stress and tangent hold its area."""
 
-    corners = jnp.repeat(x[samples.corners][:, None], samples.areas.shape[1], axis=1)
-    every = on_samples(at_sample, *_samples(step, x), corners, samples.gradients, samples.areas)
-    return jnp.sum(every, axis=1)
+    def rates_and_rows(corners, slopes, tangent):
+        along, across = slopes[:, :1], slopes[:, 1:]
+        warp, weft = (jnp.sum(each * corners, axis=0)[None] for each in (along, across))
+        rates = along * warp, across * weft, along * weft + across * warp  # of strain, in corners
+        return rates, [
+            sum(tangent[i, j][None, None] * rates[j] for j in range(3)) for i in range(3)
+        ]
+
+    total = _carried(slopes, stress)
+    for rate, row in zip(*once(rates_and_rows, corners, slopes, tangent), strict=True):
+        total = total + rate[:, :, None, None] * row[None, None]
+    return total
+
+
+def _carried(slopes, stress) -> Float[Array, "corner 3 corner 3 element"]:
+    """The geometric stiffness of one sample of every element."""
+    one, two = slopes[:, None, 0], slopes[:, None, 1]
+    other_one, other_two = slopes[None, :, 0], slopes[None, :, 1]
+    first, second, shear = stress[:, None, None]
+    by_corners = one * (first * other_one + shear * other_two)
+    by_corners += two * (shear * other_one + second * other_two)
+    return by_corners[:, None, :, None] * jnp.eye(3, dtype=stress.dtype)[None, :, None, :, None]
+
+
+def _stress_and_tangent(step, law: MembraneLaw, tangent_before: Array, strain: Array, anchor):
+    """First and second derivative [N/m] of `_sample_energy` in the strain."""
+    stress, tangent = stress_and_tangent(law, strain)
+    viscous = step.fabric.damping * step.rate * tangent_before
+    return stress + jnp.sum(viscous * (strain - anchor)[None], axis=1), tangent + viscous
 
 
 def _drag_hessians(step: IncrementalPotential, x: Positions):
@@ -260,16 +324,11 @@ def _drag_hessians(step: IncrementalPotential, x: Positions):
     return jnp.broadcast_to(of_middle[:, None, :, None], shape) / count**2
 
 
-def _symmetric(stress: Float[Array, " 3"]) -> Float[Array, "2 2"]:
-    """The matrix of a stress (S11, S22, S12)."""
-    return jnp.stack([jnp.stack([stress[0], stress[2]]), jnp.stack([stress[2], stress[1]])])
-
-
-def _tension(stress: Float[Array, " 3"]) -> Float[Array, "2 2"]:
+def _tension(stress: Columns) -> Columns:
     """The part of a symmetric stress (S11, S22, S12) whose principal values are positive."""
     mean, half = (stress[0] + stress[1]) / 2, (stress[0] - stress[1]) / 2
     radius = jnp.sqrt(half**2 + stress[2] ** 2)
     high, low = jnp.maximum(mean + radius, 0), jnp.maximum(mean - radius, 0)
     slope = (high - low) / jnp.where(radius > 0, 2 * radius, 1)
-    deviator = _symmetric(jnp.stack([half, -half, stress[2]]))
-    return (high + low) / 2 * jnp.eye(2) + slope * deviator
+    middle = (high + low) / 2
+    return jnp.stack([middle + slope * half, middle - slope * half, slope * stress[2]])

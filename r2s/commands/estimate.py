@@ -1,6 +1,6 @@
 """`r2s estimate`: recordings to a fabric card."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from glob import escape
 from pathlib import Path
@@ -84,6 +84,7 @@ class EstimateCard:
         import jax
 
         from r2s.commands.common import print_result
+        from r2s.commands.waiting import Waiting
         from r2s.estimation import cards
         from r2s.estimation.estimate import describe
         from r2s.estimation.method import default_space
@@ -94,7 +95,7 @@ class EstimateCard:
         seen = list(open_recordings(self.recordings))
         if not seen:
             raise ValueError("no recording: name an NPZ, or a folder that holds some")
-        with _bar() as progress:
+        with Waiting("reading the recordings") as progress:
             method = self._method(progress)
             method.check(seen)
             space = default_space(method.chosen_solver, self.density)
@@ -162,26 +163,3 @@ def _warnings(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[s
     motions = dict.fromkeys((each.info.sheet.size, each.info.scenario) for each in recordings)
     shape, fabric = estimate.shape, estimate.fabric
     return [line for each in motions for line in mesh_warning(shape, fabric, *each)]
-
-
-class _bar:
-    """A progress bar on stderr, where tqdm is installed."""
-
-    def __enter__(self) -> Callable[[int, float], None] | None:
-        try:
-            from tqdm import tqdm
-        except ImportError:
-            self.bar = None
-            return None
-        self.bar = bar = tqdm(desc="iterations", disable=None)
-
-        def report(iteration: int, loss: float) -> None:
-            del iteration
-            bar.set_postfix_str(f"root of loss {loss**0.5:.3g}")
-            bar.update()
-
-        return report
-
-    def __exit__(self, *_) -> None:
-        if self.bar is not None:
-            self.bar.close()

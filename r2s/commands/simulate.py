@@ -39,13 +39,14 @@ class Simulate:
     json: Json = False
 
     def run(self) -> int:
-        import equinox as eqx
         import jax
         import numpy as np
 
         from r2s import scenarios
         from r2s.commands.common import choose_shape, load_card, make_experiment, print_result
+        from r2s.commands.waiting import Waiting
         from r2s.files import check_folders
+        from r2s.kept import kept
         from r2s.recordings.open import save_trajectory
         from r2s.recordings.recording import save
         from r2s.scenarios import synthetic
@@ -62,22 +63,28 @@ class Simulate:
         scenario = experiment.scenario(shape, self.self_contact)
         make_solver = scenarios.material_points if self.solver == "points" else None
         solver = None if make_solver is None else make_solver(scenario, fabric)
-        motion = eqx.filter_jit(rollout)(scenario, fabric, solver=solver)
-        ok, failure = np.asarray(motion.ok), motion.explain()
+        with Waiting("compiling the motion") as line:
+            moved = kept(rollout)
+            moved.prepare(scenario, fabric, solver=solver)
+            line.say(f"simulating {scenario.num_frames} frames")
+            motion = moved(scenario, fabric, solver=solver)
+            ok, failure = np.asarray(motion.ok), motion.explain()
         save_trajectory(self.out, motion.x, scenario.scene.mesh.faces)
         lines = [f"{self.out}: {len(ok)} frames of {motion.x.shape[1]} vertices", *of_mesh]
         if failure:
             lines.append(f"the simulation {failure}")
         elif self.recording is not None:
-            made = synthetic.record(
-                experiment,
-                fabric,
-                card.name,
-                shape=shape,
-                self_contact=self.self_contact,
-                solver=make_solver,
-                key=jax.random.key(self.seed),
-            )
+            with Waiting("recording the motion"):
+                made = synthetic.record(
+                    experiment,
+                    fabric,
+                    card.name,
+                    shape=shape,
+                    self_contact=self.self_contact,
+                    solver=make_solver,
+                    motion=motion,
+                    key=jax.random.key(self.seed),
+                )
             save(made, self.recording)
             lines.append(f"{self.recording}: {made.points.shape[1]} points a frame at most")
         result = {

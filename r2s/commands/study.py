@@ -52,7 +52,7 @@ class Study:
     scheduler: str = ""
     """Address of a Dask scheduler, such as tcp://node:8786."""
     compilation_cache: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Where workers keep compiled programs; not for CPUs."""
+    """Where workers keep compiled programs; by default the user's cache folder."""
 
     def run(self) -> int:
         from r2s.study.main import study

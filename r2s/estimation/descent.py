@@ -18,10 +18,11 @@ from r2s.estimation import gauss_newton, standard_errors
 from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
 from r2s.estimation.mesh_bias import OtherMesh, mesh_bias
-from r2s.estimation.method import Budget, Progress
+from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import Theta, explain, fabric_at
 from r2s.estimation.problem import OWN, SHARED, UNITS, Problem, beginning
 from r2s.fabrics.fabric import Fabric
+from r2s.kept import kept
 
 INITIAL_DAMPING = 1e-2
 # of the prior's weight, which is about twice what a change by one standard error costs
@@ -34,8 +35,8 @@ ROUGH = 3.0  # standard errors, by which places around an end lead apart
 Row = list[Descent]  # one iteration: the descents of all starts
 
 # compiled once in a process for all recordings of as many frames, knots and points
-_loss = eqx.filter_jit(gauss_newton.loss_at)
-_normal = eqx.filter_jit(gauss_newton.normal_at)
+_loss = kept(gauss_newton.loss_at)
+_normal = kept(gauss_newton.normal_at)
 _losses = eqx.filter_jit(eqx.filter_vmap(gauss_newton.loss_at, in_axes=(None, 0)))
 _normals = eqx.filter_jit(eqx.filter_vmap(gauss_newton.normal_at, in_axes=(None, 0, 0, None)))
 _propose = eqx.filter_jit(gauss_newton.propose)
@@ -121,7 +122,8 @@ def search(
     run = _run_of(problems, budget, start, key) if checkpoint else {}
     rows = _resumed(checkpoint, run, budget) if checkpoint else []
     if not rows:
-        rows = [_begin(problems, budget, start, key)]
+        rows = [_begin(problems, budget, start, progress, key)]
+    tell(progress, "descents")
     while (row := _next(problems, budget, rows)) is not None:
         rows.append(row)
         if checkpoint is not None:
@@ -157,14 +159,14 @@ def judged(
     return collect(problems, found.rows, covariance, approach, seconds, converged, bias)
 
 
-def _begin(problems: Problems, budget: Budget, start, key) -> Row:
+def _begin(problems: Problems, budget: Budget, start, progress, key) -> Row:
     dim, count = problems[0].space.dim, max(budget.coarse, budget.starts)
     start = jnp.full(dim, 0.5, float) if start is None else start
     places = jax.random.uniform(key, (count, dim), float)
     nothing = jnp.zeros((count, gauss_newton.theta_length(problems) - dim), float)
     thetas = jnp.concatenate([places, nothing], axis=1).at[0, : len(start)].set(start)
     if budget.coarse:
-        losses = losses_of(_seen(problems, budget, 0), thetas)
+        losses = losses_of(_seen(problems, budget, 0), thetas, progress)
         if not np.any(np.isfinite(losses)):
             theta = thetas[0, theta_indices(problems, 0)]
             raise RuntimeError(
@@ -173,15 +175,23 @@ def _begin(problems: Problems, budget: Budget, start, key) -> Row:
                 "narrow the space's ranges."
             )
         thetas = thetas[np.argsort(losses)]
+    tell(progress, "compiling the derivatives")
     return _fresh(problems, budget, list(thetas[: budget.starts]), 0.0, 0)
 
 
-def losses_of(problems: Problems, thetas: Float[Array, "start theta"]) -> np.ndarray:
+def losses_of(
+    problems: Problems, thetas: Float[Array, "start theta"], progress: Progress | None = None
+) -> np.ndarray:
     """The losses [m^2] of many thetas, simulated together; on a CPU one by one, since it gains
     nothing by simulating together."""
     if jax.default_backend() != "cpu":
         return np.asarray(_losses(problems, thetas))
-    return np.array([float(_loss(problems, theta)) for theta in thetas])
+    tell(progress, "compiling the motion")
+    losses = []
+    for number, theta in enumerate(thetas, 1):
+        losses.append(float(_loss(problems, theta)))
+        tell(progress, f"coarse search {number} of {len(thetas)}")
+    return np.array(losses)
 
 
 def _normals_of(

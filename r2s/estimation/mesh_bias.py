@@ -8,7 +8,6 @@ that mesh it is extrapolated to one without end (Richardson), by the order of th
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -25,11 +24,12 @@ from r2s.estimation.gauss_newton import (
 from r2s.estimation.prediction import Sensitivity, predict, sensitivities
 from r2s.estimation.problem import Problem
 from r2s.geometry.surface import nearest
+from r2s.kept import kept
 from r2s.scenarios.resolution import ORDER
 
-_predict = eqx.filter_jit(predict)
-_sensitivities = eqx.filter_jit(sensitivities)
-_equations = eqx.filter_jit(normal_equations.normal_equations_of)
+_predict = kept(predict)
+_sensitivities = kept(sensitivities)
+_equations = kept(normal_equations.normal_equations_of)
 
 
 class OtherMesh(NamedTuple):

@@ -14,7 +14,7 @@ from jaxtyping import PRNGKeyArray
 from r2s.estimation.descent import Search, judged, search
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.mesh_bias import OtherMesh, factor
-from r2s.estimation.method import Budget, Progress
+from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.problem import Problem
 from r2s.fabrics.parameters import ParameterSpace
 from r2s.recordings.recording import Recording
@@ -56,6 +56,7 @@ def descend_by_meshes(
         rows, columns = finer[0]
         path = checkpoint and checkpoint.with_suffix(f".{rows}x{columns}.npz")
         found, last = climb(finer, found, path), finer
+    tell(progress, "standard errors")
     other = _other_mesh(recordings, space, last)
     estimate = judged(found, budget, other_mesh=other, key=key)
     return dataclasses.replace(estimate, shape=last[_largest(recordings)])

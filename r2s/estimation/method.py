@@ -24,6 +24,15 @@ from r2s.recordings.recording import Recording
 SOLVERS = ("cloth", "points")
 Progress = Callable[[int, float], None]  # told the iteration and the best loss
 ANY = None  # every scenario
+
+
+def tell(progress: Progress | None, words: str) -> None:
+    """Say what is done now to a progress that has a method `say`."""
+    say = getattr(progress, "say", None)
+    if say is not None:
+        say(words)
+
+
 COARSEST = (9, 9)  # vertices of a simulated sheet
 
 
@@ -75,7 +84,7 @@ class Method(abc.ABC):
     - `shape`: vertices of the simulated sheet along warp and weft; None: those of the method
       (`diffcloud`: by meshes that resolve the fabric, see `r2s.estimation.mesh_ladder`).
     - `checkpoint`: a file that a killed run goes on from; None: it begins again.
-    - `progress`: called with the iteration and the best loss so far.
+    - `progress`: called with the iteration and the best loss so far, see also `tell`.
     """
 
     name: ClassVar[str]

@@ -10,7 +10,7 @@ from r2s.fabrics.fabric import Fabric
 from r2s.forces.vectors import Vector, add, scale
 from r2s.laws.membrane import OrthotropicMembrane
 from r2s.laws.plate import OrthotropicPlate, PlateBending
-from r2s.laws.wrinkling import Hiding, hiding
+from r2s.laws.wrinkling import Prepared, hiding
 
 CONSTANT = OrthotropicMembrane, PlateBending, OrthotropicPlate
 Matrix = tuple[Vector, Vector, Vector]
@@ -71,7 +71,7 @@ def critical_stress(fabric: Fabric, waves: tuple[float, float], batched: bool) -
     return squares[:, None, None] * bent[None, None]
 
 
-def hiding_of(law: Response, critical: Array, stiffness: Array) -> Hiding:
+def hiding_of(law: Response, critical: Array, stiffness: Array) -> Prepared:
     """What wrinkles depend on, beside the strain."""
     rank = stiffness.ndim - 1
     if law.stiffness is None and not law.batched:

@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from r2s.once import once
+
 Positions = Float[Array, "vertex 3"]
 
 
@@ -70,11 +72,70 @@ class Bends(eqx.Module):
         self, x: Positions, moments: Float[Array, " bend"]
     ) -> Float[Array, "bend corner 3 corner 3"]:
         """`moments` times the second derivative of every bend's curvature in its vertices."""
-        second = jax.vmap(jax.jacfwd(hinge_angle_gradient))(self.corners(x))
-        second = (moments * self.per_angle)[:, None, None, None, None] * second
-        if self.weights is None:
-            return second
-        return jnp.einsum("bcv,bcidj,bdw->bviwj", self.weights, second, self.weights)
+        corners = jnp.moveaxis(self.corners(x), 0, -1)
+        weights = jnp.eye(4, dtype=x.dtype)[..., None]
+        if self.weights is not None:
+            weights = jnp.moveaxis(self.weights, 0, -1)
+        # the angle depends on the axis and the two wings
+        vectors, shares = (
+            (each[1] - each[0], each[2] - each[0], each[3] - each[0]) for each in (corners, weights)
+        )
+        second = once(_angle_second_derivatives, *vectors)
+        scale = (moments * self.per_angle)[None, None, None]
+
+        def spread(second):
+            return [
+                sum(scale * shares[j][:, None, None] * second[i, j][None] for j in _PARTS[i])
+                for i in range(3)
+            ]
+
+        rows = once(spread, second)
+        total = sum(shares[i][:, None, None, None] * rows[i].swapaxes(0, 1)[None] for i in range(3))
+        return jnp.moveaxis(total, -1, 0)
+
+
+_PARTS = ((0, 1, 2), (0, 1), (0, 2))  # the two wings are not coupled
+
+
+def _angle_second_derivatives(
+    axis: Float[Array, "3 bend"], left: Float[Array, "3 bend"], right: Float[Array, "3 bend"]
+) -> dict[tuple[int, int], Float[Array, "3 3 bend"]]:
+    """Second derivatives [rad/m^2] of the angle of bends in their axis (0), left (1) and right (2)
+    wing [m]; those that are not there are zero. Bends are the last axis, to be worked on side by
+    side.
+
+    In a wing the derivative of the angle is -+ |axis| n / |n|^2 with n = axis x wing, in the axis
+    it is that of either wing times minus the wing's share along the axis (`hinge_angle_gradient`).
+    """
+    found = {}
+    squared = jnp.sum(axis**2, axis=0)[None]
+    length = jnp.sqrt(squared)
+    of_axis = jnp.zeros((3, 3, axis.shape[1]), axis.dtype)
+    for place, wing, sign in ((1, left, 1), (2, right, -1)):
+        normal = sign * jnp.cross(axis, wing, axis=0)
+        area = jnp.sum(normal**2, axis=0)[None]
+        unit = normal / jnp.sqrt(area)
+        scale = (sign * length / area)[None]
+        gradient = -length * normal / area
+        in_wing = -scale * (_cross_matrix(axis) - 2 * _outer(unit, jnp.cross(unit, axis, axis=0)))
+        in_axis = scale * (_cross_matrix(wing) - 2 * _outer(unit, jnp.cross(unit, wing, axis=0)))
+        in_axis = in_axis - _outer(normal / area, axis / length)
+        share = jnp.sum(wing * axis, axis=0)[None] / squared
+        of_axis -= _outer(gradient, (wing - 2 * share * axis) / squared) + share[None] * in_axis
+        found[place, place], found[place, 0] = in_wing, in_axis
+        found[0, place] = in_axis.swapaxes(0, 1)
+    return found | {(0, 0): of_axis}
+
+
+def _outer(a: Float[Array, "3 bend"], b: Float[Array, "3 bend"]) -> Float[Array, "3 3 bend"]:
+    return a[:, None] * b[None]
+
+
+def _cross_matrix(a: Float[Array, "3 bend"]) -> Float[Array, "3 3 bend"]:
+    """The matrix of a x."""
+    none = jnp.zeros_like(a[0])
+    rows = (none, -a[2], a[1]), (a[2], none, -a[0]), (-a[1], a[0], none)
+    return jnp.stack([jnp.stack(row) for row in rows])
 
 
 @jax.custom_jvp

@@ -26,7 +26,8 @@ from jaxtyping import Array, Float
 
 from r2s.geometry.strain_samples import StrainSamples, on_samples
 from r2s.laws.bending import BendingLaw
-from r2s.laws.membrane import MembraneLaw
+from r2s.laws.membrane import MembraneLaw, stress_and_tangent
+from r2s.once import once
 
 SHARE = 0.05  # of the resistance to compression that stays, so that no state is left without any
 CROSS = 0.98  # of the coupling at most, against which wrinkles are found
@@ -38,10 +39,30 @@ ROOT = 2**0.5
 # Of 100,000 fabrics and strains at random none needs more than 10 solves in float64.
 DESCENTS, SOLVES, CLOSE = 2, 12, 16  # the last in units of rounding
 
-Number = Float[Array, "..."]  # of one sample, or of many side by side
+Number = Float[Array, "*sample"]
+Columns = Float[Array, "3 *sample"]
+Tangents = Float[Array, "3 3 *sample"]
 # Numbers, not arrays of three: those of all samples are then worked on side by side.
 Vector = tuple[Number, Number, Number]  # of a symmetric matrix: (11, 22, sqrt(2) 12)
 Matrix = tuple[Vector, Vector, Vector]
+# Second and first derivative of the cost; a bound on the second; the unit; the most of wrinkles.
+Problem = tuple[Matrix, Vector, Number, Number, Number]
+
+
+class Prepared(NamedTuple):
+    """The search for wrinkles without its strain, on the scales of `_prepare`.
+
+    - `quadratic`: second derivative of their cost.
+    - `offset`, `by_strain`: its first derivative at no strain, and by strain.
+    - `bound`: on the second derivative. `width`: their unit. `most`: of them, in this unit.
+    """
+
+    quadratic: Matrix
+    offset: Vector
+    by_strain: Matrix
+    bound: Number
+    width: Number
+    most: Number
 
 
 class Wrinkled(eqx.Module):
@@ -52,20 +73,93 @@ class Wrinkled(eqx.Module):
     - `law`: the law of a sheet without them.
     - `stiffness`: its second derivative at zero strain, [N/m].
     - `critical`: compressive stress at which it buckles along warp and weft, [N/m].
+    - `prepared`: what follows from both for the search for wrinkles.
+    - `hidden`: wrinkles that are known already, from `search`; None: they are searched for.
     """
 
     law: Any
     stiffness: Float[Array, "*batch 3 3"]
     critical: Float[Array, "*batch 2"]
+    prepared: Prepared
+    hidden: Vector | None = None
 
     def at(self, strain: Float[Array, " 3"]) -> "Wrinkled":
         """Itself: it is the law of a time step already."""
         return self
 
     def energy_density(self, strain: Float[Array, " 3"]) -> Float[Array, ""]:
-        """Energy per rest area [J/m^2] at a Green strain (E11, E22, 2 E12) [-]."""
-        freed = released(self.stiffness, self.critical, strain)
+        """Energy per rest area [J/m^2] at a Green strain (E11, E22, 2 E12) [-].
+
+        With known wrinkles the first derivative is right, since they are optimal, but no other.
+        """
+        if self.hidden is None:
+            freed = _released(self.prepared, strain)
+        else:
+            freed = -_cost_of(self.hidden, _at_strain(self.prepared, _columns(strain)))
         return self.law.energy_density(strain) - (1 - SHARE) * freed
+
+    def stress_and_tangent(
+        self, strain: Float[Array, " 3"]
+    ) -> tuple[Float[Array, " 3"], Float[Array, "3 3"]]:
+        """First and second derivative [N/m] of `energy_density`, in closed form."""
+        stress, tangent = stress_and_tangent(self.law, strain)
+        known = self
+        if self.hidden is None:
+            known = with_wrinkles(self, _hidden(self.prepared, strain))
+        relief, softening = given_way(known, strain)
+        return stress + relief, tangent + softening
+
+
+def given_way(law: Wrinkled, strain: Float[Array, "*sample 3"]) -> tuple[Columns, Tangents]:
+    """What known wrinkles add to stress and tangent [N/m] of the law of one sample, or of all."""
+    assert law.hidden is not None
+    by_strain, hidden = law.prepared.by_strain, law.hidden
+    problem = _at_strain(law.prepared, _columns(strain))
+    before = _descended(hidden, problem)
+    slope = once(_limited_slope, before, problem[-1])
+    inverse = once(lambda *system: _inverse(_off_balance(*system)), slope, problem)
+    scale = (1 - SHARE) * law.prepared.width**2
+    relief = jnp.stack(_times(_transposed(by_strain), hidden))
+    softer = _product(_product(_transposed(by_strain), inverse), _product(slope, by_strain))
+    softening = jnp.stack([jnp.stack(row) for row in softer])
+    return scale[None] * relief, -(scale / law.prepared.bound)[None, None] * softening
+
+
+def search(law: Any, strain: Float[Array, "element sample 3"], start: Any = None) -> Any:
+    """The wrinkles of all samples at a strain [-], for `Wrinkled.hidden`, without derivatives.
+
+    Each is an array over all samples. None for a law that has none. A `start` near them, such as
+    those at a strain close by, makes it shorter.
+    """
+    if not isinstance(law, Wrinkled):
+        return None
+    strain = jax.lax.stop_gradient(strain).reshape(-1, 3)
+    prepared = jax.lax.stop_gradient(jax.tree.map(jnp.ravel, law.prepared))
+    problem = _at_strain(prepared, _columns(strain))
+    start = no_wrinkles(law) if start is None else start
+    flat = _search(problem, jax.tree.map(jnp.ravel, start))
+    return jax.tree.map(lambda leaf: leaf.reshape(law.prepared.width.shape), flat)
+
+
+def no_wrinkles(law: Any) -> Any:
+    """A start for `search`."""
+    if not isinstance(law, Wrinkled):
+        return None
+    none = jnp.zeros_like(law.prepared.width)
+    return none, none, none
+
+
+def with_wrinkles(law: Any, hidden: Any) -> Any:
+    """The law of all samples with wrinkles that `search` found."""
+    return law if hidden is None else eqx.tree_at(_its_wrinkles, law, hidden, is_leaf=_is_none)
+
+
+def _its_wrinkles(law: Wrinkled) -> Any:
+    return law.hidden
+
+
+def _is_none(leaf: Any) -> bool:
+    return leaf is None
 
 
 def membrane_on_samples(
@@ -87,10 +181,10 @@ def membrane_on_samples(
     )
     bent = (bending.stiffness_along(0.0) + bending.stiffness_along(jnp.pi / 2)) / 2
     critical = bent * samples.hidden_waves[:, None] ** 2
-    return Wrinkled(laws, stiffness, jnp.broadcast_to(critical, (*strain.shape[:2], 2)))
+    critical = jnp.broadcast_to(critical, (*strain.shape[:2], 2))
+    return Wrinkled(laws, stiffness, critical, on_samples(_prepare, stiffness, critical))
 
 
-@jax.custom_jvp
 def released(
     stiffness: Float[Array, "3 3"], critical: Float[Array, " 2"], strain: Float[Array, " 3"]
 ) -> Number:
@@ -100,50 +194,97 @@ def released(
     - `critical`: compressive stress at which they begin along warp and weft, [N/m].
     - `strain`: (E11, E22, 2 E12) [-].
     """
-    most = _problem(stiffness, critical, strain)[-1]
-    return -_cost(_hidden(stiffness, critical, strain), most, stiffness, critical, strain)
+    return _released(_prepare(stiffness, critical), strain)
+
+
+def hiding(stiffness: Tangents, critical: Float[Array, "2 *sample"]) -> Prepared:
+    """From a law's stiffness and its critical stress [N/m], or from those of laws side by side."""
+    return _prepare(stiffness, critical)
+
+
+def follow(law: Prepared, strain: Vector, rate: Vector, hidden: Vector) -> tuple[Vector, Vector]:
+    """The scaled wrinkles at a strain by one Newton step from those nearby, and their rate [1/s].
+
+    `rate` is that of the strain, [1/s].
+    """
+    problem = _at_strain(law, strain)
+    before = _descended(hidden, problem)
+    slope = _limited_slope(before, law.most)
+    inverse = _inverse(_off_balance(slope, problem))
+    short = tuple(a - b for a, b in zip(hidden, _limited(before, law.most), strict=True))
+    one, two, three = (a - b for a, b in zip(hidden, _times(inverse, short), strict=True))
+    pushed = _times(inverse, _times(slope, _times(law.by_strain, rate)))
+    unit = -1 / law.bound
+    return (one, two, three), (unit * pushed[0], unit * pushed[1], unit * pushed[2])
+
+
+def relieved(law: Prepared, hidden: Vector) -> Vector:
+    """What scaled wrinkles take off the compressive stress (S11, S22, S12), [N/m]."""
+    one, two, three = _times(_transposed(law.by_strain), hidden)
+    unit = (1 - SHARE) * law.width**2
+    return unit * one, unit * two, unit * three
+
+
+@jax.custom_jvp
+def _released(prepared: Prepared, strain: Float[Array, " 3"]) -> Number:
+    problem = _at_strain(prepared, _columns(strain))
+    return -_cost_of(_hidden(prepared, strain), problem)
 
 
 def _released_jvp(primals, tangents):
     # the hidden strain is optimal, so its change does not count (it does in the next derivative),
     # but where it is the most that there is, it goes with that
-    hidden, (*law, strain) = _hidden(*primals), primals
-    problem = _problem(*primals)
-    _, _, bound, width, most = problem
-    value, change = _jvp_of_moving(
-        lambda *law: -_cost(hidden, most, *law, strain), law, tangents[:2]
-    )
-    if _moves(tangents[0]) or _moves(tangents[1]):
-        _, more = _jvp_of_moving(lambda *law: _problem(*law, strain)[-1], law, tangents[:2])
-        change = change + width**2 * bound * _held_back(_descended(hidden, problem), most) * more
-    if _moves(tangents[2]):
-        release = _times(_transposed(_by_strain(primals[0])), hidden)
-        change = change - width * _dot(release, tuple(tangents[2]))
+    (prepared, strain), hidden = primals, _hidden(*primals)
+    _, _, _, bound, width, most = prepared
+    problem = _at_strain(prepared, _columns(strain))
+    value = -_cost_of(hidden, problem)
+    change = jnp.zeros_like(value)
+    if _moves(tangents[0]):
+
+        def limited(prepared):
+            quadratic, linear, bound, width, _ = _at_strain(prepared, _columns(strain))
+            return -_cost_of(hidden, (quadratic, linear, bound, width, most)), prepared.most
+
+        _, (fixed, more) = _jvp_of_moving(limited, prepared, tangents[0])
+        held = _held_back(_descended(hidden, problem), most)
+        change = fixed + width**2 * bound * held * more
+    if _moves(tangents[1]):
+        release = _times(_transposed(prepared.by_strain), hidden)
+        change = change - width**2 * _dot(release, _columns(tangents[1]))
     return value, change
 
 
-released.defjvp(_released_jvp, symbolic_zeros=True)
+_released.defjvp(_released_jvp, symbolic_zeros=True)
 
 
-def _moves(tangent) -> bool:
-    return not isinstance(tangent, SymbolicZero)
+def _moves(tangents) -> bool:
+    return not all(isinstance(each, SymbolicZero) for each in _leaves(tangents))
 
 
-def _jvp_of_moving(function, primals, tangents):
-    """`jax.jvp` in those arguments that have a tangent: the others cost nothing."""
-    moving = [i for i, each in enumerate(tangents) if _moves(each)]
+def _leaves(tangents) -> list:
+    return jax.tree.leaves(tangents, is_leaf=_is_zero)
+
+
+def _is_zero(tangent) -> bool:
+    return isinstance(tangent, SymbolicZero)
+
+
+def _jvp_of_moving(function, primal, tangent):
+    """`jax.jvp` in those arrays that have a tangent: the others cost nothing."""
+    leaves, structure = jax.tree.flatten(primal)
+    tangents = _leaves(tangent)
+    moving = [i for i, each in enumerate(tangents) if not _is_zero(each)]
 
     def of_moving(*given):
-        every = dict(enumerate(primals)) | dict(zip(moving, given, strict=True))
-        return function(*every.values())
+        every = dict(enumerate(leaves)) | dict(zip(moving, given, strict=True))
+        return function(structure.unflatten(every.values()))
 
-    return jax.jvp(of_moving, [primals[i] for i in moving], [tangents[i] for i in moving])
+    return jax.jvp(of_moving, [leaves[i] for i in moving], [tangents[i] for i in moving])
 
 
-@jax.jit
-def _cost(hidden: Vector, most: Number, stiffness, critical, strain) -> Number:
-    """What hidden wrinkles cost [J/m^2], on the scales of `_problem`, with a limit `most`."""
-    quadratic, linear, bound, width, _ = _problem(stiffness, critical, strain)
+def _cost_of(hidden: Vector, problem: Problem) -> Number:
+    """What hidden wrinkles cost [J/m^2], on the scales of `_prepare`."""
+    quadratic, linear, bound, width, most = problem
     mean, radius, _, _ = _principal(hidden)
     limits = _limits(mean + radius, most) + _limits(mean - radius, most)
     slope = _times(quadratic, hidden)
@@ -151,9 +292,8 @@ def _cost(hidden: Vector, most: Number, stiffness, critical, strain) -> Number:
 
 
 @jax.jit
-def _problem(stiffness, critical, strain) -> tuple[Matrix, Vector, Number, Number, Number]:
-    """Second and first derivative of the cost without wrinkles; a bound on the second; the unit;
-    the most of them in this unit.
+def _prepare(stiffness: Tangents, critical: Float[Array, "2 *sample"]) -> Prepared:
+    """What the search needs of a law.
 
     Wrinkles are scaled along warp and weft by fourth roots of their stiffness, which keeps them
     symmetric and positive, and makes all fabrics alike. Their unit is that of their onset.
@@ -171,10 +311,24 @@ def _problem(stiffness, critical, strain) -> tuple[Matrix, Vector, Number, Numbe
     bound = jnp.maximum(jnp.maximum(sums[0], sums[1]), sums[2])
     width = ONSET * jnp.minimum(first_critical * warp, second_critical * weft) / bound
     most = jnp.maximum(MOST / jnp.maximum(warp, weft) / width, 2)
-    one, two, three = _times(_by_strain(stiffness), tuple(strain))
-    one, two = one + warp * first_critical, two + weft * second_critical
-    linear = one / width, two / width, three / width
-    return quadratic, linear, bound, width, most
+    one, two, three = (
+        (row[0] / width, row[1] / width, row[2] / width) for row in _by_strain(stiffness)
+    )
+    offset = warp * first_critical / width, weft * second_critical / width, 0 * width
+    return Prepared(quadratic, offset, (one, two, three), bound, width, most)
+
+
+def _columns(strain: Float[Array, "*sample 3"]) -> Vector:
+    return strain[..., 0], strain[..., 1], strain[..., 2]
+
+
+def _at_strain(prepared: Prepared, strain: Vector) -> Problem:
+    """Second and first derivative of the cost without wrinkles; a bound on the second; the unit;
+    the most of them in this unit.
+    """
+    quadratic, offset, by_strain, bound, width, most = prepared
+    one, two, three = (a + b for a, b in zip(_times(by_strain, strain), offset, strict=True))
+    return quadratic, (one, two, three), bound, width, most
 
 
 def _scales(stiffness) -> Vector:
@@ -196,12 +350,16 @@ def _by_strain(stiffness) -> Matrix:
 
 
 @jax.custom_jvp
-def _hidden(stiffness, critical, strain) -> Vector:
+def _hidden(prepared: Prepared, strain: Float[Array, " 3"]) -> Vector:
     """The scaled wrinkles that release most: descents, then a semismooth Newton method."""
-    problem = _problem(stiffness, critical, strain)
-    most = problem[-1]
+    none = jnp.zeros_like(prepared.width)
+    return _search(_at_strain(prepared, _columns(strain)), (none, none, none))
 
-    close = CLOSE * jnp.finfo(problem[1][0].dtype).eps
+
+def _search(problem: Problem, start: Vector) -> Vector:
+    """The scaled wrinkles, from a start: of one sample, or of all in arrays."""
+    most = problem[-1]
+    close = CLOSE * jnp.finfo(most.dtype).eps
 
     def descent(hidden, _):
         return _limited(_descended(hidden, problem), most), None
@@ -213,41 +371,39 @@ def _hidden(stiffness, critical, strain) -> Vector:
         change = _solve(_system(before, problem), short)
         off = sum(abs(part) for part in short) / (1 + sum(abs(part) for part in hidden))
         new = tuple(a - b for a, b in zip(hidden, change, strict=True))
-        return new, off, count + 1
+        return new, jnp.max(off), count + 1
 
     def goes_on(state):
         return (state[1] > close) & (state[2] < SOLVES)
 
-    none = jnp.zeros_like(problem[1][0])
-    hidden, _ = jax.lax.scan(descent, (none, none, none), length=DESCENTS)
-    return jax.lax.while_loop(goes_on, solve, (hidden, none + jnp.inf, 0))[0]
+    hidden, _ = jax.lax.scan(descent, start, length=DESCENTS)
+    return jax.lax.while_loop(goes_on, solve, (hidden, jnp.full((), jnp.inf, most.dtype), 0))[0]
 
 
 def _hidden_jvp(primals, tangents):
     """By the implicit function theorem, from what the wrinkles solve."""
-    hidden, (*law, strain) = _hidden(*primals), primals
-    problem = _problem(*primals)
-    before = _descended(hidden, problem)
-    system, slope = _system(before, problem), _limited_slope(before, problem[-1])
+    (prepared, strain), hidden = primals, _hidden(*primals)
+    problem = _at_strain(prepared, _columns(strain))
+    before, most = _descended(hidden, problem), prepared.most
+    slope = _limited_slope(before, most)
     none = jnp.zeros_like(hidden[0])
-    total: Vector = none, none, none
-    if _moves(tangents[2]):
-        _, _, bound, width, _ = problem
-        columns = [_solve(system, _times(slope, by)) for by in _transposed(_by_strain(primals[0]))]
-        change = _times(_transposed(columns), tuple(tangents[2]))
-        total = tuple(a - b / (bound * width) for a, b in zip(total, change, strict=True))
-    if _moves(tangents[0]) or _moves(tangents[1]):
+    right: Vector = none, none, none
+    if _moves(tangents[1]):
+        change = _times(prepared.by_strain, _columns(tangents[1]))
+        one, two, three = (-each / prepared.bound for each in _times(slope, change))
+        right = one, two, three
+    if _moves(tangents[0]):
 
-        def limit(*law):
-            problem = _problem(*law, strain)
-            return _descended(hidden, problem), problem[-1]
+        def limit(prepared):
+            problem = _at_strain(prepared, _columns(strain))
+            return _descended(hidden, problem), prepared.most
 
-        _, (change, more) = _jvp_of_moving(limit, law, tangents[:2])
-        at_most = _of_principal(lambda value: jnp.clip((value - problem[-1] + 1) / 2, 0, 1), before)
-        right = zip(_times(slope, change), at_most, strict=True)
-        change = _solve(system, tuple(a + more * b for a, b in right))
-        total = tuple(a + b for a, b in zip(total, change, strict=True))
-    return hidden, total
+        _, (change, more) = _jvp_of_moving(limit, prepared, tangents[0])
+        at_most = _of_principal(lambda value: jnp.clip((value - most + 1) / 2, 0, 1), before)
+        parts = zip(right, _times(slope, change), at_most, strict=True)
+        one, two, three = (a + b + more * c for a, b, c in parts)
+        right = one, two, three
+    return hidden, _solve(_off_balance(slope, problem), right)
 
 
 _hidden.defjvp(_hidden_jvp, symbolic_zeros=True)
@@ -263,10 +419,10 @@ def _descended(hidden: Vector, problem) -> Vector:
 @jax.jit
 def _system(before: Vector, problem) -> Matrix:
     """The derivative of the wrinkles' equation, hidden = _limited(descended), in them."""
-    return _system_of(_limited_slope(before, problem[-1]), problem)
+    return _off_balance(_limited_slope(before, problem[-1]), problem)
 
 
-def _system_of(slope: Matrix, problem) -> Matrix:
+def _off_balance(slope: Matrix, problem: Problem) -> Matrix:
     quadratic, _, bound, _, _ = problem
     columns = [_times(slope, row) for row in quadratic]  # the matrix is symmetric
 
@@ -351,8 +507,8 @@ def _limited_slope(matrix: Vector, most: Number) -> Matrix:
         terms = [weight * axis[i] * axis[j] for weight, axis in parts]
         return terms[0] + terms[1] + terms[2]
 
-    one, two, three = ((entry(i, 0), entry(i, 1), entry(i, 2)) for i in range(3))
-    return one, two, three
+    a, b, c, d, e, f = (entry(*at) for at in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
+    return (a, b, c), (b, d, e), (c, e, f)
 
 
 def _dot(a: Vector, b: Vector) -> Number:
@@ -372,6 +528,22 @@ def _cross(a: Vector, b: Vector) -> Vector:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
+def _product(left: Matrix, right: Matrix) -> Matrix:
+    columns = _transposed(right)
+    one, two, three = (
+        (_dot(r, columns[0]), _dot(r, columns[1]), _dot(r, columns[2])) for r in left
+    )
+    return one, two, three
+
+
+def _inverse(matrix: Matrix) -> Matrix:
+    first, second, third = matrix
+    rows = _cross(second, third), _cross(third, first), _cross(first, second)
+    scale = 1 / _dot(first, rows[0])
+    one, two, three = ((scale * a, scale * b, scale * c) for a, b, c in _transposed(rows))
+    return one, two, three
+
+
 @jax.jit
 def _solve(matrix: Matrix, right: Vector) -> Vector:
     """The solution of three equations (Cramer's rule)."""
@@ -380,60 +552,3 @@ def _solve(matrix: Matrix, right: Vector) -> Vector:
     scale = 1 / _dot(first, rows[0])
     one, two, three = (scale * _dot(right, (rows[0][i], rows[1][i], rows[2][i])) for i in range(3))
     return one, two, three
-
-
-def _inverse(matrix: Matrix) -> Matrix:
-    first, second, third = matrix
-    rows = _cross(second, third), _cross(third, first), _cross(first, second)
-    scale = 1 / _dot(first, rows[0])
-    one, two, three = _transposed(rows)
-
-    def scaled(row):
-        return scale * row[0], scale * row[1], scale * row[2]
-
-    return scaled(one), scaled(two), scaled(three)
-
-
-class Hiding(NamedTuple):
-    """What the search for wrinkles needs of a law, at any strain; scaled as in `_problem`.
-
-    Numbers, or arrays of numbers side by side.
-    """
-
-    quadratic: Matrix
-    linear: Vector
-    bound: Number
-    width: Number
-    most: Number
-    by_strain: Matrix
-
-
-def hiding(stiffness: Array, critical: Array) -> Hiding:
-    """From a law's stiffness (3, 3, ...) [N/m] and its critical stress (2, ...) [N/m]."""
-    none = jnp.zeros_like(stiffness[0, 0])
-    return Hiding(*_problem(stiffness, critical, (none, none, none)), _by_strain(stiffness))
-
-
-def follow(law: Hiding, strain: Vector, rate: Vector, hidden: Vector) -> tuple[Vector, Vector]:
-    """The scaled wrinkles at a strain by one Newton step from those nearby, and their rate [1/s].
-
-    `rate` is that of the strain, [1/s].
-    """
-    moved = _times(law.by_strain, strain)
-    linear = tuple(f + m / law.width for f, m in zip(law.linear, moved, strict=True))
-    problem = law.quadratic, linear, law.bound, law.width, law.most
-    before = _descended(hidden, problem)
-    slope = _limited_slope(before, law.most)
-    inverse = _inverse(_system_of(slope, problem))
-    short = tuple(a - b for a, b in zip(hidden, _limited(before, law.most), strict=True))
-    one, two, three = (a - b for a, b in zip(hidden, _times(inverse, short), strict=True))
-    pushed = _times(inverse, _times(slope, _times(law.by_strain, rate)))
-    unit = -1 / (law.bound * law.width)
-    return (one, two, three), (unit * pushed[0], unit * pushed[1], unit * pushed[2])
-
-
-def relieved(law: Hiding, hidden: Vector) -> Vector:
-    """What scaled wrinkles take off the compressive stress (S11, S22, S12), [N/m]."""
-    one, two, three = _times(_transposed(law.by_strain), hidden)
-    unit = (1 - SHARE) * law.width
-    return unit * one, unit * two, unit * three

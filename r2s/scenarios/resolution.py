@@ -13,6 +13,7 @@ import numpy as np
 
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.fold_length import fold_length
+from r2s.kept import kept
 from r2s.scenarios.six import SIDE
 
 Shape = tuple[int, int]
@@ -32,6 +33,8 @@ ORDER = 1.0  # of the error in the cells' length, where it is not measured
 ENOUGH = 6e-3  # [m], error of a mesh that is fine enough, of sheets of the study's size: a choice
 LADDER = (9, 17, 33)  # vertices along the longer side
 
+_fold_length = kept(fold_length)  # the derivatives in it take seconds one by one
+
 
 def mesh_error(fabric: Fabric, size: tuple[float, float], shape: Shape, motion: str) -> float:
     """Expected error [m] of a motion on a mesh, rms over the sheet and mean over the motion.
@@ -46,7 +49,7 @@ def mesh_error(fabric: Fabric, size: tuple[float, float], shape: Shape, motion: 
     motion = SAME.get(motion, motion)
     if motion in TAUT:
         return math.nan
-    cell, length = longest_cell(size, shape), float(fold_length(fabric))
+    cell, length = longest_cell(size, shape), float(_fold_length(fabric))
     if not length:
         return math.inf
     ratio = cell / length
@@ -101,7 +104,7 @@ def warning(fabric: Fabric, size: tuple[float, float], shape: Shape, motion: str
         return ""
     return (
         f"a mesh of {shape[0]} x {shape[1]} is coarse for this fabric: it folds at "
-        f"{1e3 * float(fold_length(fabric)):.0f} mm, the cells are "
+        f"{1e3 * float(_fold_length(fabric)):.0f} mm, the cells are "
         f"{1e3 * longest_cell(size, shape):.0f} mm long, so that a motion is expected to be "
         f"{1e3 * error:.0f} mm off ({advice(fabric, size, shape, motion)})"
     )

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.surface import nearest, sample
+from r2s.kept import kept
 from r2s.mpm.sheet import longest_edge
 from r2s.recordings.cameras.camera import Camera
 from r2s.recordings.recording import (
@@ -31,7 +32,7 @@ from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
 from r2s.scenarios.paths import Route
 from r2s.scenarios.scenario import Scenario, rollout
 from r2s.scenarios.six import SIDE, Experiment
-from r2s.solver import Solver
+from r2s.solver import Solver, Trajectory
 
 NUM_FRAMES, FRAME_RATE = 60, 15.0  # the study's
 SPACING = SIDE * math.sqrt(2) / 80  # [m], between samples of the surface
@@ -101,6 +102,7 @@ def record(
     max_step: float | None = None,
     self_contact: bool = False,
     solver: Callable[[Scenario, Fabric], Solver] | None = None,
+    motion: Trajectory | None = None,
     key: PRNGKeyArray,
 ) -> Recording:
     """Record a simulated experiment with a fabric.
@@ -111,20 +113,33 @@ def record(
       shorter steps than the estimators' make a recording that is not their own model's.
     - `self_contact`: whether the sheet touches itself.
     - `solver`: makes another solver than the cloth, such as `r2s.scenarios.material_points`.
+    - `motion`: that of these arguments, where it is known already; None: it is simulated here. A
+      stretching is simulated in any case, with its forces.
     - `key`: the same one gives the same recording.
 
     The recording of a stretching has markers and the force on the pulled clamp. Raises
-    `RuntimeError` that says why when the simulation diverges.
+    `RuntimeError` that says why when the simulation diverges, and `ValueError` for a motion of
+    another shape.
     """
     seen = sensing(experiment) if seen is None else seen
     scenario = experiment.scenario(shape, self_contact)
-    made = None if solver is None else solver(scenario, fabric)
     balance = None
     if experiment.name == "stretching":
+        made = None if solver is None else solver(scenario, fabric)
         balance = _energy_balance(scenario, fabric, max_step, made)
-    x = balance.x if balance is not None else _rollout(scenario, fabric, max_step, made).x
-    if not jnp.all(jnp.isfinite(x)):
-        failure = _rollout(scenario, fabric, max_step, made).explain()
+    if motion is None and (balance is None or not np.isfinite(balance.x).all()):
+        made = None if solver is None else solver(scenario, fabric)
+        motion = _rollout(scenario, fabric, max_step, made)
+    found = motion if balance is None else balance
+    assert found is not None
+    x = found.x
+    if x.shape != (scenario.num_frames, *scenario.start.shape):
+        raise ValueError(
+            f"expected a motion of {scenario.num_frames} frames and {len(scenario.start)} "
+            f"vertices, got {x.shape}"
+        )
+    if not np.isfinite(x).all():
+        failure = "" if motion is None else motion.explain()
         raise RuntimeError(f"the simulation of {name} {failure}")
     errors = f"camera noise {1e3 * seen.noise:g} mm, {seen.outliers:.0%} outliers"
     errors += f", {seen.dropped:.0%} dropped" if seen.dropped else ""
@@ -214,8 +229,8 @@ def _extended(route: Route, end: float) -> Route:
     return Route(times, np.concatenate([route.path, route.path[-1:]]))
 
 
-_rollout = eqx.filter_jit(rollout)
-_energy_balance = eqx.filter_jit(energy_balance)
+_rollout = kept(rollout)
+_energy_balance = kept(energy_balance)
 
 
 def _markers(x, scenario: Scenario, key) -> np.ndarray:

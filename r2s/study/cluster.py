@@ -11,7 +11,7 @@ from typing import Any
 
 from r2s.study.cells import Cell
 from r2s.study.engine import attempt
-from r2s.study.environment import environment, one_core
+from r2s.study.environment import begin_worker, environment
 
 try:
     from dask import config
@@ -70,10 +70,10 @@ def slurm(
 
 
 class OneCore(WorkerPlugin):
-    """A core for each worker of a machine, by the number at the end of its name."""
+    """A core for each worker of a machine, by the number at the end of its name, and programs."""
 
     def setup(self, worker: Any) -> None:
-        one_core(int(re.findall(r"\d+", str(worker.name))[-1]))
+        begin_worker(int(re.findall(r"\d+", str(worker.name))[-1]))
 
 
 def _bound(cluster: Any) -> Client:

@@ -14,6 +14,9 @@ from typing import Protocol, runtime_checkable
 from tqdm import tqdm
 
 from r2s.study.cells import Cell, dependencies, execute, with_dependencies
+from r2s.study.memory import let_go_beyond
+
+MOST_MEMORY = 0.9e9  # [byte]: a process that holds more after a cell lets its programs go
 
 
 @runtime_checkable
@@ -74,6 +77,8 @@ def attempt(cell: Cell, folder: Path, key: str | None = None) -> str:
         execute(cell, folder)
     except Exception as error:  # whatever it is, the other cells go on
         return f"{type(error).__name__}: {error}"
+    finally:
+        let_go_beyond(MOST_MEMORY)
     return ""
 
 

@@ -1,26 +1,39 @@
 """What a process that makes cells has in its environment, before JAX looks at it."""
 
 import os
+from importlib.metadata import version
 from pathlib import Path
 
+from r2s import programs
 from r2s.extras import require
 
 ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+# Compiles a step in 60 to 70 % of the time, and it runs as fast. XLA ends a process whose flags it
+# does not know: only releases that do are asked.
+COMPILE_FAST, KNOWN_TO = "--xla_cpu_use_fusion_emitters=false", "0.10."
 LOOK = 0.1  # [s], to see which core is idle
 
 
 def one_thread(flags: str) -> str:
-    """XLA's flags, with linear algebra in one thread: sheets are too small for more. It is not
-    enough on a busy machine: see `one_core`."""
-    return flags if ONE_THREAD in flags else f"{flags} {ONE_THREAD}".strip()
+    """XLA's flags, with linear algebra in one thread, since sheets are too small for more, and
+    with less work for the compiler.
+
+    It is not enough on a busy machine: see `one_core`. XLA reads no further than the last word, so
+    what is there comes first.
+    """
+    if ONE_THREAD in flags:
+        return flags
+    is_known = version("jaxlib").startswith(KNOWN_TO) and "fusion_emitters" not in flags
+    parts = [flags, COMPILE_FAST if is_known else "", ONE_THREAD]
+    return " ".join(part for part in parts if part)
 
 
 def one_core(number: int | None = None) -> None:
-    """Bind this process, before JAX begins, to one of its cores: by a number, or the idlest.
+    """Bind this process to one of its cores: by a number, or the idlest.
 
-    XLA's flags leave it two threads on two cores, which spin while they wait for each other: beside
-    other work a lift takes 2 to 8 CPU seconds instead of 0.11. Only Linux can bind processes;
-    elsewhere nothing is done.
+    Before JAX begins: it makes as many threads as it then has cores, and these spin while they wait
+    for each other. Beside other work a lift takes 2 to 8 CPU seconds instead of 0.11, whatever
+    XLA's flags say. Only Linux can bind processes; elsewhere nothing is done.
     """
     if not hasattr(os, "sched_setaffinity"):
         return
@@ -33,18 +46,26 @@ def one_core(number: int | None = None) -> None:
     os.sched_setaffinity(0, {cores[number % len(cores)]})
 
 
+def begin_worker(number: int | None = None) -> None:
+    """What a process that makes cells does first: it binds itself and keeps its programs."""
+    one_core(number)
+    programs.keep()
+
+
 def environment(workers: int, compilation_cache: Path | None = None) -> dict[str, str]:
     """What a worker's environment holds before it imports JAX, for so many on a machine.
 
     One thread each: sums in another order would give other numbers, and a study is to have the same
     on any runner. All of them share the memory of its GPUs, if there are any; a fabric that goes
-    wrong in a batch does not stop the others. Compiled programs are kept in `compilation_cache`.
+    wrong in a batch does not stop the others. Compiled programs are kept in `compilation_cache`,
+    by default where `r2s.programs.keep` has them.
     """
     one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     found = one | {
         "XLA_FLAGS": one_thread(os.environ.get("XLA_FLAGS", "")),
         "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.9 / workers:.3f}",
         "EQX_ON_ERROR": "nan",
+        "TF_CPP_MIN_LOG_LEVEL": os.environ.get("TF_CPP_MIN_LOG_LEVEL", "3"),  # see `r2s_command`
     }
     if compilation_cache is not None:
         found |= {"JAX_COMPILATION_CACHE_DIR": str(compilation_cache)}

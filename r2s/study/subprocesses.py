@@ -8,7 +8,7 @@ from pathlib import Path
 
 from r2s.study.cells import Cell
 from r2s.study.engine import Serial, attempt
-from r2s.study.environment import environment, one_core
+from r2s.study.environment import begin_worker, environment
 
 TRIES = 2  # of a cell whose process died
 
@@ -40,4 +40,4 @@ class OneProcess(Serial):
 
     @staticmethod
     def _start() -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=one_core)
+        return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=begin_worker)

@@ -1,0 +1,25 @@
+"""Values that XLA works out once."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+
+def once(function: Callable, *arguments: Any) -> Any:
+    """`function` of arrays, whose results are kept in memory.
+
+    On a CPU XLA fuses what is worked out into the loops of all who use it, and there works it out
+    again for each of their numbers (`jax.lax.optimization_barrier` is gone before that). Only a
+    branch that may be taken or not holds it back: it is always taken.
+    """
+    function = jax.jit(function)  # traced once for its shapes and for its branch
+    shapes = jax.eval_shape(function, *arguments)
+    first = jnp.ravel(jax.tree.leaves(arguments)[0])[0]
+    always = (first <= 0) | ~(first <= 0)
+    return jax.lax.cond(
+        jax.lax.optimization_barrier(always),
+        lambda: function(*arguments),
+        lambda: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes),
+    )
