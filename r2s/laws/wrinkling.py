@@ -39,7 +39,7 @@ ROOT = 2**0.5
 # Of 100,000 fabrics and strains at random none needs more than 10 solves in float64.
 DESCENTS, SOLVES, CLOSE = 2, 12, 16  # the last in units of rounding
 
-Number = Float[Array, "*sample"]
+Number = Float[Array, "..."]  # of one sample, or of many; what all share may be one
 Columns = Float[Array, "3 *sample"]
 Tangents = Float[Array, "3 3 *sample"]
 # Numbers, not arrays of three: those of all samples are then worked on side by side.
@@ -197,7 +197,7 @@ def released(
     return _released(_prepare(stiffness, critical), strain)
 
 
-def hiding(stiffness: Tangents, critical: Float[Array, "2 *sample"]) -> Prepared:
+def hiding(stiffness: Float[Array, "3 3 ..."], critical: Float[Array, "2 ..."]) -> Prepared:
     """From a law's stiffness and its critical stress [N/m], or from those of laws side by side."""
     return _prepare(stiffness, critical)
 
@@ -292,7 +292,7 @@ def _cost_of(hidden: Vector, problem: Problem) -> Number:
 
 
 @jax.jit
-def _prepare(stiffness: Tangents, critical: Float[Array, "2 *sample"]) -> Prepared:
+def _prepare(stiffness: Float[Array, "3 3 ..."], critical: Float[Array, "2 ..."]) -> Prepared:
     """What the search needs of a law.
 
     Wrinkles are scaled along warp and weft by fourth roots of their stiffness, which keeps them
