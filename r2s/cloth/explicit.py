@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from r2s.cloth.batch_last import batch_last
@@ -108,7 +109,7 @@ class ExplicitCloth(eqx.Module):
 
     def check(self, fabric: Fabric) -> None:
         """Raises `ValueError` when the substeps are too long for a fabric, unless it is traced."""
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(fabric)):
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(fabric)):
             return
         with jax.ensure_compile_time_eval():
             longest = shortest(self.scene.mesh, fabric, self.membrane_damping)

@@ -97,12 +97,16 @@ class Layout(NamedTuple):
     def flow(self, x: Vector, v: Vector, wind: Array, fan: Any) -> Vector:
         """Velocities [m/s] less the wind's: one for all vertices (3, ...), or (vertex, 3, ...)."""
         if wind.ndim == (2 if self.batched else 1):
-            blowing = tuple(self.row(each) for each in wind)
+            blowing = self.rows(wind)
         else:
             blowing = self.wide(wind)
         if fan is not None:
             blowing = scale(strength(fan, self, x), blowing)
         return subtract(v, blowing)
+
+    def rows(self, vector: Array) -> Vector:
+        """A vector for all vertices, (3, ...)."""
+        return self.row(vector[0]), self.row(vector[1]), self.row(vector[2])
 
     def index(self) -> tuple[np.ndarray, np.ndarray]:
         """Row and column of every vertex."""
@@ -124,7 +128,7 @@ def is_cell(layout: Layout, like: Array) -> Array:
 
 def strength(fan: Any, layout: Layout, x: Vector) -> Array:
     """The fraction of the wind at every place, as of `r2s.world.air.Fan`."""
-    centre, axis = (tuple(layout.row(each) for each in part) for part in (fan.centre, fan.axis))
+    centre, axis = layout.rows(fan.centre), layout.rows(fan.axis)
     offset = subtract(x, centre)
     along = scale(1 / jnp.sqrt(dot(axis, axis)), axis)
     across = subtract(offset, scale(dot(offset, along), along))

@@ -8,8 +8,10 @@ Vector = tuple[Array, Array, Array]
 
 def add(*vectors: Vector) -> Vector:
     """The sum."""
-    x, y, z = (sum(parts[1:], start=parts[0]) for parts in zip(*vectors, strict=True))
-    return x, y, z
+    total = vectors[0]
+    for other in vectors[1:]:
+        total = total[0] + other[0], total[1] + other[1], total[2] + other[2]
+    return total
 
 
 def subtract(a: Vector, b: Vector) -> Vector:
