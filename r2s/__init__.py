@@ -5,8 +5,8 @@ Rooms, in the order in which they build on each other:
 - `units`, `failures`: constants and conversions; why a run failed.
 - `geometry`: the sheet at rest, and what a moved one shows. `laws`: energies of one element.
 - `fabrics`: what is estimated. `world`: what a fabric meets: air, table, grippers.
-- `forces`: those of elements, for explicit steps. `cloth`, `mpm`: the two solvers. `solver`: from steps to
-  motions.
+- `forces`: those of elements, for explicit steps.
+- `cloth`, `mpm`: the two solvers. `solver`: from steps to motions.
 - `recordings`: observations, from files to one form. `scenarios`: the six experiments.
 - `evaluation`: how near a simulation comes. `estimation`: fabrics from recordings.
 - `sweep`, `gradient_check`: thousands of fabrics at once; derivatives against differences.
