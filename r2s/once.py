@@ -12,11 +12,15 @@ def once(function: Callable, *arguments: Any) -> Any:
 
     On a CPU XLA fuses what is worked out into the loops of all who use it, and there works it out
     again for each of their numbers (`jax.lax.optimization_barrier` is gone before that). Only a
-    branch that may be taken or not holds it back: it is always taken.
+    branch that may be taken or not holds it back: it is always taken. Where there is no number
+    there is nothing to hold.
     """
     function = jax.jit(function)  # traced once for its shapes and for its branch
     shapes = jax.eval_shape(function, *arguments)
-    first = jnp.ravel(jax.tree.leaves(arguments)[0])[0]
+    numbers = jax.tree.leaves(arguments)[0]
+    if not numbers.size:
+        return function(*arguments)
+    first = jnp.ravel(numbers)[0]
     always = (first <= 0) | ~(first <= 0)
     return jax.lax.cond(
         jax.lax.optimization_barrier(always),

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.bends import hinge_angle, unwrapped
-from r2s.geometry.mesh import rectangle
+from r2s.geometry.mesh import Mesh, rectangle
 
 STIFFNESS = 3e-5  # [N m]
 gradient = jax.jit(jax.grad(hinge_angle))
@@ -115,3 +115,10 @@ def test_second_derivatives_of_bends_are_those_of_their_gradients(elements):
         expected = jax.jacfwd(corner_gradients)(x[vertices], index) * moments[index]
         largest = float(jnp.max(jnp.abs(expected)))
         np.testing.assert_allclose(found[index], expected, rtol=0, atol=1e-10 * largest)
+
+
+def test_a_sheet_without_a_bend_has_no_second_derivatives():
+    triangle = Mesh.make(np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]]), np.array([[0, 1, 2]]))
+    bends = triangle.plate.bends
+    x = jnp.pad(triangle.rest, ((0, 0), (0, 1)))
+    assert bends.second_derivatives(x, jnp.zeros(0)).shape == (0, 4, 3, 4, 3)
