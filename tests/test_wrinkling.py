@@ -202,7 +202,6 @@ def test_a_search_from_other_wrinkles_ends_at_the_same_ones():
     strain = random.normal(size=(1, count, 3)) * 0.1
     laws = wrinkling.Wrinkled(
         r2s.OrthotropicMembrane(*jnp.asarray([[warp], [coupling], [weft], [matrix[:, 2, 2]]])),
-        jnp.asarray(matrix[None]),
         jnp.asarray(critical[None]),
         jax.vmap(jax.vmap(wrinkling._prepare))(
             jnp.asarray(matrix[None]), jnp.asarray(critical[None])

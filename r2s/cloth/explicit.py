@@ -104,7 +104,7 @@ class ExplicitCloth(eqx.Module):
         if substeps is None:
             substeps = max(1, math.ceil(dt / longest * (1 + 1e-6)))
         solver = cls(scene, damping, float(dt), substeps, grid)
-        solver.check(fabric)
+        solver._check_substep(longest)
         return solver
 
     def check(self, fabric: Fabric) -> None:
@@ -112,7 +112,9 @@ class ExplicitCloth(eqx.Module):
         if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(fabric)):
             return
         with jax.ensure_compile_time_eval():
-            longest = shortest(self.scene.mesh, fabric, self.membrane_damping)
+            self._check_substep(shortest(self.scene.mesh, fabric, self.membrane_damping))
+
+    def _check_substep(self, longest: float) -> None:
         material = f"the fabric and the mesh (dt = {self.dt:g} s in {self.substeps} substeps)"
         check_step(self.dt / self.substeps, jnp.asarray(longest), material)
 

@@ -1,6 +1,5 @@
 """Vectors as tuples of arrays, one for each component: loops over them vectorise."""
 
-import jax.numpy as jnp
 from jaxtyping import Array
 
 Vector = tuple[Array, Array, Array]
@@ -32,9 +31,3 @@ def dot(a: Vector, b: Vector) -> Array:
 def cross(a: Vector, b: Vector) -> Vector:
     """The vector product."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def where(condition: Array, a: Vector, b: Vector) -> Vector:
-    """`a` where a condition holds, elsewhere `b`."""
-    x, y, z = (jnp.where(condition, p, q) for p, q in zip(a, b, strict=True))
-    return x, y, z

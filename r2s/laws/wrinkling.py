@@ -71,14 +71,12 @@ class Wrinkled(eqx.Module):
     What gives way is that of the law's stiffness at zero strain, all but `SHARE` of it.
 
     - `law`: the law of a sheet without them.
-    - `stiffness`: its second derivative at zero strain, [N/m].
     - `critical`: compressive stress at which it buckles along warp and weft, [N/m].
-    - `prepared`: what follows from both for the search for wrinkles.
+    - `prepared`: what the search for wrinkles needs of that stiffness and stress.
     - `hidden`: wrinkles that are known already, from `search`; None: they are searched for.
     """
 
     law: Any
-    stiffness: Float[Array, "*batch 3 3"]
     critical: Float[Array, "*batch 2"]
     prepared: Prepared
     hidden: Vector | None = None
@@ -182,7 +180,7 @@ def membrane_on_samples(
     bent = (bending.stiffness_along(0.0) + bending.stiffness_along(jnp.pi / 2)) / 2
     critical = bent * samples.hidden_waves[:, None] ** 2
     critical = jnp.broadcast_to(critical, (*strain.shape[:2], 2))
-    return Wrinkled(laws, stiffness, critical, on_samples(_prepare, stiffness, critical))
+    return Wrinkled(laws, critical, on_samples(_prepare, stiffness, critical))
 
 
 def released(
