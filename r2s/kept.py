@@ -74,6 +74,12 @@ class Kept:
             return self._jitted(*args, **kwargs)
         return self._program(dynamic, static)(leaves)
 
+    def prepare(self, *args: Any, **kwargs: Any) -> None:
+        """Trace and compile for these arguments, and run nothing; from any thread."""
+        dynamic, static = eqx.partition((args, kwargs), eqx.is_array)
+        if programs.kept() is not None and _plain(jax.tree.leaves(dynamic)):
+            self._program(dynamic, static)
+
     def _program(self, dynamic: Any, static: Any) -> Callable:
         leaves, tree = jax.tree.flatten(dynamic)
         shapes = tuple(_shape(leaf) for leaf in leaves)
