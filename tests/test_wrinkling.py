@@ -203,7 +203,7 @@ def test_a_search_from_other_wrinkles_ends_at_the_same_ones():
     laws = wrinkling.Wrinkled(
         r2s.OrthotropicMembrane(*jnp.asarray([[warp], [coupling], [weft], [matrix[:, 2, 2]]])),
         jnp.asarray(critical[None]),
-        jax.vmap(jax.vmap(wrinkling._prepare))(
+        jax.vmap(jax.vmap(wrinkling.prepare_search))(
             jnp.asarray(matrix[None]), jnp.asarray(critical[None])
         ),
     )

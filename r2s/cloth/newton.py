@@ -180,7 +180,7 @@ def _judged(at: _Point, line: _Line, point: _Point) -> tuple[_Line, Bool[Array, 
         length=jnp.where(is_fine, line.trial, line.length),
         best=jax.tree.map(partial(jnp.where, is_fine), point, line.best),
     )
-    return line, grows | shrinks
+    return line, (grows | shrinks) & line.usable  # without a direction there is nothing to find
 
 
 def _moved(state: _Search, line: _Line, goes_on: Bool[Array, ""]) -> _Search:

@@ -6,7 +6,7 @@ The table's push and its friction are those of the substep's end, so that neithe
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from r2s.forces.vectors import Vector
+from r2s.geometry.vectors import Vector
 from r2s.units import GRAVITY
 from r2s.world.contact import PRESSURE_STIFFNESS, SLIP_SPEED
 

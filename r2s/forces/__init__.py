@@ -2,5 +2,5 @@
 
 - `elements`: of membrane and bending on any mesh, and bounds on their frequencies.
 - `grid`: the same on the grid of a `rectangle`, by slices; `layout`: how its arrays lie.
-- `vectors`: vectors as tuples of arrays. `laws`: what the laws say of these.
+- `laws`: what the laws of one element say of arrays side by side.
 """

@@ -15,7 +15,7 @@ from r2s.forces.grid_bending import bending_force, twists
 from r2s.forces.grid_membrane import Wrinkles, membrane_force
 from r2s.forces.laws import Response, critical_stress, response
 from r2s.forces.layout import Layout, is_cell, part
-from r2s.forces.vectors import Vector, add, cross, dot, scale, subtract
+from r2s.geometry.vectors import Vector, add, cross, dot, scale, subtract
 from r2s.world.air import STILL, Air
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from r2s.forces.layout import Layout, is_cell, part
-from r2s.forces.vectors import Vector, add, cross, dot, scale, subtract
+from r2s.geometry.vectors import Vector, add, cross, dot, scale, subtract
 
 
 class Turned(NamedTuple):

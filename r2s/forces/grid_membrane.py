@@ -12,8 +12,8 @@ from jaxtyping import Array
 
 from r2s.forces.laws import hiding_of
 from r2s.forces.layout import Layout, is_cell
-from r2s.forces.vectors import Vector, add, dot, scale, subtract
 from r2s.geometry.strain_samples import GAUSS
+from r2s.geometry.vectors import Vector, add, dot, scale, subtract
 from r2s.laws.wrinkling import follow, relieved
 
 PLACES = (1 - GAUSS) / 2, (1 + GAUSS) / 2  # of two points on (0, 1)

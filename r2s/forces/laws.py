@@ -7,13 +7,12 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from r2s.fabrics.fabric import Fabric
-from r2s.forces.vectors import Vector, add, scale
+from r2s.geometry.vectors import Vector, add, dot, scale
 from r2s.laws.membrane import OrthotropicMembrane
 from r2s.laws.plate import OrthotropicPlate, PlateBending
-from r2s.laws.wrinkling import Prepared, hiding
+from r2s.laws.wrinkling import Prepared, prepare_search
 
 CONSTANT = OrthotropicMembrane, PlateBending, OrthotropicPlate
-Matrix = tuple[Vector, Vector, Vector]
 
 
 class Response(NamedTuple):
@@ -35,7 +34,7 @@ class Response(NamedTuple):
         """
         if self.stiffness is not None:
             strained = add(strain, scale(damping, rate))
-            one, two, three = (_row(row, strained) for row in self.stiffness)
+            one, two, three = (dot((row[0], row[1], row[2]), strained) for row in self.stiffness)
             return (one, two, three), self.stiffness
         both = jnp.stack(strain), jnp.stack(rate)
         of_places = jax.vmap(_stresses, in_axes=(None, 1, 1), out_axes=-1)
@@ -76,11 +75,9 @@ def hiding_of(law: Response, critical: Array, stiffness: Array) -> Prepared:
     rank = stiffness.ndim - 1
     if law.stiffness is None and not law.batched:
         critical = critical[:, None]
-    return hiding(stiffness, critical.reshape(*critical.shape, *(1,) * (rank - critical.ndim)))
-
-
-def _row(row: Array, strain: Vector) -> Array:
-    return row[0] * strain[0] + row[1] * strain[1] + row[2] * strain[2]
+    return prepare_search(
+        stiffness, critical.reshape(*critical.shape, *(1,) * (rank - critical.ndim))
+    )
 
 
 def _stresses(law: Any, strain: Array, rate: Array) -> tuple[Array, Array, Array]:

@@ -5,14 +5,15 @@ places that are no cell (or no inner vertex) are computed along, and count for n
 vertices there is room for two lines, so that no slice ends outside. A batch is the last axis.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from r2s.forces.vectors import Vector, dot, scale, subtract
+from r2s.geometry.vectors import Vector, scale, subtract
+from r2s.world.air import Fan
 
 
 class Layout(NamedTuple):
@@ -94,14 +95,16 @@ class Layout(NamedTuple):
         both = both[-self.first_cell :].reshape(*self.shape, *both.shape[1:])
         return both[:-1, :-1].reshape((rows - 1) * (columns - 1), *both.shape[2:])
 
-    def flow(self, x: Vector, v: Vector, wind: Array, fan: Any) -> Vector:
+    def flow(self, x: Vector, v: Vector, wind: Array, fan: Fan | None) -> Vector:
         """Velocities [m/s] less the wind's: one for all vertices (3, ...), or (vertex, 3, ...)."""
         if wind.ndim == (2 if self.batched else 1):
             blowing = self.rows(wind)
         else:
             blowing = self.wide(wind)
         if fan is not None:
-            blowing = scale(strength(fan, self, x), blowing)
+            blows = jax.vmap(Fan.__call__, -1, -1) if self.batched else Fan.__call__
+            strength = blows(fan, jnp.stack(x, axis=1))
+            blowing = scale(strength, blowing)
         return subtract(v, blowing)
 
     def rows(self, vector: Array) -> Vector:
@@ -124,14 +127,3 @@ def is_cell(layout: Layout, like: Array) -> Array:
     rows, columns = layout.index()
     inside = (rows < layout.shape[0] - 1) & (columns < layout.shape[1] - 1)
     return layout.constant(inside, layout.first_cell, like) > 0
-
-
-def strength(fan: Any, layout: Layout, x: Vector) -> Array:
-    """The fraction of the wind at every place, as of `r2s.world.air.Fan`."""
-    centre, axis = layout.rows(fan.centre), layout.rows(fan.axis)
-    offset = subtract(x, centre)
-    along = scale(1 / jnp.sqrt(dot(axis, axis)), axis)
-    across = subtract(offset, scale(dot(offset, along), along))
-    radius, edge = layout.row(fan.radius), layout.row(fan.edge)
-    distance = jnp.sqrt(dot(across, across) + (edge / 4) ** 2)
-    return jax.nn.sigmoid(4 * (radius - distance) / edge)

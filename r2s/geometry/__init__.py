@@ -4,5 +4,6 @@
 - `strain_samples`: where its strain is taken, in triangles or quadrilaterals.
 - `bends`, `plate_elements`: where its curvature is taken, angles first.
 - `elements`: strains, normals and masses of a moved sheet.
+- `vectors`: vectors and small matrices as tuples of arrays.
 - `surface`: points on a moved sheet, and the nearest one to a point in space.
 """

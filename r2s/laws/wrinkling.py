@@ -21,12 +21,23 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from r2s.geometry.strain_samples import StrainSamples, on_samples
+from r2s.geometry.vectors import (
+    Matrix,
+    Number,
+    Vector,
+    dot,
+    inverse,
+    product,
+    solve,
+    times,
+    transposed,
+)
 from r2s.laws.bending import BendingLaw
 from r2s.laws.membrane import MembraneLaw, stress_and_tangent
+from r2s.laws.moving_tangents import jvp_of_moving, moves
 from r2s.once import once
 
 SHARE = 0.05  # of the resistance to compression that stays, so that no state is left without any
@@ -39,18 +50,15 @@ ROOT = 2**0.5
 # Of 100,000 fabrics and strains at random none needs more than 10 solves in float64.
 DESCENTS, SOLVES, CLOSE = 2, 12, 16  # the last in units of rounding
 
-Number = Float[Array, "..."]  # of one sample, or of many; what all share may be one
 Columns = Float[Array, "3 *sample"]
 Tangents = Float[Array, "3 3 *sample"]
-# Numbers, not arrays of three: those of all samples are then worked on side by side.
-Vector = tuple[Number, Number, Number]  # of a symmetric matrix: (11, 22, sqrt(2) 12)
-Matrix = tuple[Vector, Vector, Vector]
+# A `Vector` is a symmetric matrix (11, 22, sqrt(2) 12), of one sample or of all side by side.
 # Second and first derivative of the cost; a bound on the second; the unit; the most of wrinkles.
 Problem = tuple[Matrix, Vector, Number, Number, Number]
 
 
 class Prepared(NamedTuple):
-    """The search for wrinkles without its strain, on the scales of `_prepare`.
+    """The search for wrinkles without its strain, on the scales of `prepare_search`.
 
     - `quadratic`: second derivative of their cost.
     - `offset`, `by_strain`: its first derivative at no strain, and by strain.
@@ -115,10 +123,10 @@ def given_way(law: Wrinkled, strain: Float[Array, "*sample 3"]) -> tuple[Columns
     problem = _at_strain(law.prepared, _columns(strain))
     before = _descended(hidden, problem)
     slope = once(_limited_slope, before, problem[-1])
-    inverse = once(lambda *system: _inverse(_off_balance(*system)), slope, problem)
+    solved = once(lambda *system: inverse(_off_balance(*system)), slope, problem)
     scale = (1 - SHARE) * law.prepared.width**2
-    relief = jnp.stack(_times(_transposed(by_strain), hidden))
-    softer = _product(_product(_transposed(by_strain), inverse), _product(slope, by_strain))
+    relief = jnp.stack(times(transposed(by_strain), hidden))
+    softer = product(product(transposed(by_strain), solved), product(slope, by_strain))
     softening = jnp.stack([jnp.stack(row) for row in softer])
     return scale[None] * relief, -(scale / law.prepared.bound)[None, None] * softening
 
@@ -180,7 +188,7 @@ def membrane_on_samples(
     bent = (bending.stiffness_along(0.0) + bending.stiffness_along(jnp.pi / 2)) / 2
     critical = bent * samples.hidden_waves[:, None] ** 2
     critical = jnp.broadcast_to(critical, (*strain.shape[:2], 2))
-    return Wrinkled(laws, critical, on_samples(_prepare, stiffness, critical))
+    return Wrinkled(laws, critical, on_samples(prepare_search, stiffness, critical))
 
 
 def released(
@@ -192,12 +200,7 @@ def released(
     - `critical`: compressive stress at which they begin along warp and weft, [N/m].
     - `strain`: (E11, E22, 2 E12) [-].
     """
-    return _released(_prepare(stiffness, critical), strain)
-
-
-def hiding(stiffness: Float[Array, "3 3 ..."], critical: Float[Array, "2 ..."]) -> Prepared:
-    """From a law's stiffness and its critical stress [N/m], or from those of laws side by side."""
-    return _prepare(stiffness, critical)
+    return _released(prepare_search(stiffness, critical), strain)
 
 
 def follow(law: Prepared, strain: Vector, rate: Vector, hidden: Vector) -> tuple[Vector, Vector]:
@@ -208,17 +211,17 @@ def follow(law: Prepared, strain: Vector, rate: Vector, hidden: Vector) -> tuple
     problem = _at_strain(law, strain)
     before = _descended(hidden, problem)
     slope = _limited_slope(before, law.most)
-    inverse = _inverse(_off_balance(slope, problem))
+    solved = inverse(_off_balance(slope, problem))
     short = tuple(a - b for a, b in zip(hidden, _limited(before, law.most), strict=True))
-    one, two, three = (a - b for a, b in zip(hidden, _times(inverse, short), strict=True))
-    pushed = _times(inverse, _times(slope, _times(law.by_strain, rate)))
+    one, two, three = (a - b for a, b in zip(hidden, times(solved, short), strict=True))
+    pushed = times(solved, times(slope, times(law.by_strain, rate)))
     unit = -1 / law.bound
     return (one, two, three), (unit * pushed[0], unit * pushed[1], unit * pushed[2])
 
 
 def relieved(law: Prepared, hidden: Vector) -> Vector:
     """What scaled wrinkles take off the compressive stress (S11, S22, S12), [N/m]."""
-    one, two, three = _times(_transposed(law.by_strain), hidden)
+    one, two, three = times(transposed(law.by_strain), hidden)
     unit = (1 - SHARE) * law.width**2
     return unit * one, unit * two, unit * three
 
@@ -237,60 +240,35 @@ def _released_jvp(primals, tangents):
     problem = _at_strain(prepared, _columns(strain))
     value = -_cost_of(hidden, problem)
     change = jnp.zeros_like(value)
-    if _moves(tangents[0]):
+    if moves(tangents[0]):
 
         def limited(prepared):
             quadratic, linear, bound, width, _ = _at_strain(prepared, _columns(strain))
             return -_cost_of(hidden, (quadratic, linear, bound, width, most)), prepared.most
 
-        _, (fixed, more) = _jvp_of_moving(limited, prepared, tangents[0])
+        _, (fixed, more) = jvp_of_moving(limited, prepared, tangents[0])
         held = _held_back(_descended(hidden, problem), most)
         change = fixed + width**2 * bound * held * more
-    if _moves(tangents[1]):
-        release = _times(_transposed(prepared.by_strain), hidden)
-        change = change - width**2 * _dot(release, _columns(tangents[1]))
+    if moves(tangents[1]):
+        release = times(transposed(prepared.by_strain), hidden)
+        change = change - width**2 * dot(release, _columns(tangents[1]))
     return value, change
 
 
 _released.defjvp(_released_jvp, symbolic_zeros=True)
 
 
-def _moves(tangents) -> bool:
-    return not all(isinstance(each, SymbolicZero) for each in _leaves(tangents))
-
-
-def _leaves(tangents) -> list:
-    return jax.tree.leaves(tangents, is_leaf=_is_zero)
-
-
-def _is_zero(tangent) -> bool:
-    return isinstance(tangent, SymbolicZero)
-
-
-def _jvp_of_moving(function, primal, tangent):
-    """`jax.jvp` in those arrays that have a tangent: the others cost nothing."""
-    leaves, structure = jax.tree.flatten(primal)
-    tangents = _leaves(tangent)
-    moving = [i for i, each in enumerate(tangents) if not _is_zero(each)]
-
-    def of_moving(*given):
-        every = dict(enumerate(leaves)) | dict(zip(moving, given, strict=True))
-        return function(structure.unflatten(every.values()))
-
-    return jax.jvp(of_moving, [leaves[i] for i in moving], [tangents[i] for i in moving])
-
-
 def _cost_of(hidden: Vector, problem: Problem) -> Number:
-    """What hidden wrinkles cost [J/m^2], on the scales of `_prepare`."""
+    """What hidden wrinkles cost [J/m^2], on the scales of `prepare_search`."""
     quadratic, linear, bound, width, most = problem
     mean, radius, _, _ = _principal(hidden)
     limits = _limits(mean + radius, most) + _limits(mean - radius, most)
-    slope = _times(quadratic, hidden)
-    return width**2 * (_dot(hidden, slope) / 2 + _dot(linear, hidden) + bound * limits)
+    slope = times(quadratic, hidden)
+    return width**2 * (dot(hidden, slope) / 2 + dot(linear, hidden) + bound * limits)
 
 
 @jax.jit
-def _prepare(stiffness: Float[Array, "3 3 ..."], critical: Float[Array, "2 ..."]) -> Prepared:
+def prepare_search(stiffness: Float[Array, "3 3 ..."], critical: Float[Array, "2 ..."]) -> Prepared:
     """What the search needs of a law.
 
     Wrinkles are scaled along warp and weft by fourth roots of their stiffness, which keeps them
@@ -325,7 +303,7 @@ def _at_strain(prepared: Prepared, strain: Vector) -> Problem:
     the most of them in this unit.
     """
     quadratic, offset, by_strain, bound, width, most = prepared
-    one, two, three = (a + b for a, b in zip(_times(by_strain, strain), offset, strict=True))
+    one, two, three = (a + b for a, b in zip(times(by_strain, strain), offset, strict=True))
     return quadratic, (one, two, three), bound, width, most
 
 
@@ -362,11 +340,11 @@ def _search(problem: Problem, start: Vector) -> Vector:
     def descent(hidden, _):
         return _limited(_descended(hidden, problem), most), None
 
-    def solve(state):
+    def improve(state):
         hidden, _, count = state
         before = _descended(hidden, problem)
         short = tuple(a - b for a, b in zip(hidden, _limited(before, most), strict=True))
-        change = _solve(_system(before, problem), short)
+        change = solve(_system(before, problem), short)
         off = sum(abs(part) for part in short) / (1 + sum(abs(part) for part in hidden))
         new = tuple(a - b for a, b in zip(hidden, change, strict=True))
         return new, jnp.max(off), count + 1
@@ -375,7 +353,7 @@ def _search(problem: Problem, start: Vector) -> Vector:
         return (state[1] > close) & (state[2] < SOLVES)
 
     hidden, _ = jax.lax.scan(descent, start, length=DESCENTS)
-    return jax.lax.while_loop(goes_on, solve, (hidden, jnp.full((), jnp.inf, most.dtype), 0))[0]
+    return jax.lax.while_loop(goes_on, improve, (hidden, jnp.full((), jnp.inf, most.dtype), 0))[0]
 
 
 def _hidden_jvp(primals, tangents):
@@ -386,22 +364,22 @@ def _hidden_jvp(primals, tangents):
     slope = _limited_slope(before, most)
     none = jnp.zeros_like(hidden[0])
     right: Vector = none, none, none
-    if _moves(tangents[1]):
-        change = _times(prepared.by_strain, _columns(tangents[1]))
-        one, two, three = (-each / prepared.bound for each in _times(slope, change))
+    if moves(tangents[1]):
+        change = times(prepared.by_strain, _columns(tangents[1]))
+        one, two, three = (-each / prepared.bound for each in times(slope, change))
         right = one, two, three
-    if _moves(tangents[0]):
+    if moves(tangents[0]):
 
         def limit(prepared):
             problem = _at_strain(prepared, _columns(strain))
             return _descended(hidden, problem), prepared.most
 
-        _, (change, more) = _jvp_of_moving(limit, prepared, tangents[0])
+        _, (change, more) = jvp_of_moving(limit, prepared, tangents[0])
         at_most = _of_principal(lambda value: jnp.clip((value - most + 1) / 2, 0, 1), before)
-        parts = zip(right, _times(slope, change), at_most, strict=True)
+        parts = zip(right, times(slope, change), at_most, strict=True)
         one, two, three = (a + b + more * c for a, b, c in parts)
         right = one, two, three
-    return hidden, _solve(_off_balance(slope, problem), right)
+    return hidden, solve(_off_balance(slope, problem), right)
 
 
 _hidden.defjvp(_hidden_jvp, symbolic_zeros=True)
@@ -409,7 +387,7 @@ _hidden.defjvp(_hidden_jvp, symbolic_zeros=True)
 
 def _descended(hidden: Vector, problem) -> Vector:
     quadratic, linear, bound, _, _ = problem
-    slope = _times(quadratic, hidden)
+    slope = times(quadratic, hidden)
     one, two, three = (h - (s + f) / bound for h, s, f in zip(hidden, slope, linear, strict=True))
     return one, two, three
 
@@ -422,7 +400,7 @@ def _system(before: Vector, problem) -> Matrix:
 
 def _off_balance(slope: Matrix, problem: Problem) -> Matrix:
     quadratic, _, bound, _, _ = problem
-    columns = [_times(slope, row) for row in quadratic]  # the matrix is symmetric
+    columns = [times(slope, row) for row in quadratic]  # the matrix is symmetric
 
     def entry(i, j):
         return columns[j][i] / bound - slope[i][j] + (1.0 if i == j else 0.0)
@@ -507,46 +485,3 @@ def _limited_slope(matrix: Vector, most: Number) -> Matrix:
 
     a, b, c, d, e, f = (entry(*at) for at in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
     return (a, b, c), (b, d, e), (c, e, f)
-
-
-def _dot(a: Vector, b: Vector) -> Number:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _times(matrix: Matrix, vector: Vector) -> Vector:
-    return _dot(matrix[0], vector), _dot(matrix[1], vector), _dot(matrix[2], vector)
-
-
-def _transposed(matrix) -> Matrix:
-    one, two, three = zip(*matrix, strict=True)
-    return one, two, three
-
-
-def _cross(a: Vector, b: Vector) -> Vector:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def _product(left: Matrix, right: Matrix) -> Matrix:
-    columns = _transposed(right)
-    one, two, three = (
-        (_dot(r, columns[0]), _dot(r, columns[1]), _dot(r, columns[2])) for r in left
-    )
-    return one, two, three
-
-
-def _inverse(matrix: Matrix) -> Matrix:
-    first, second, third = matrix
-    rows = _cross(second, third), _cross(third, first), _cross(first, second)
-    scale = 1 / _dot(first, rows[0])
-    one, two, three = ((scale * a, scale * b, scale * c) for a, b, c in _transposed(rows))
-    return one, two, three
-
-
-@jax.jit
-def _solve(matrix: Matrix, right: Vector) -> Vector:
-    """The solution of three equations (Cramer's rule)."""
-    first, second, third = matrix
-    rows = _cross(second, third), _cross(third, first), _cross(first, second)
-    scale = 1 / _dot(first, rows[0])
-    one, two, three = (scale * _dot(right, (rows[0][i], rows[1][i], rows[2][i])) for i in range(3))
-    return one, two, three
