@@ -4,9 +4,9 @@ The warp of a bilinear cell is linear along its weft, and the other way round, s
 Gauss points share two of each.
 """
 
+from functools import partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -15,6 +15,7 @@ from r2s.forces.layout import Layout, is_cell
 from r2s.geometry.strain_samples import GAUSS
 from r2s.geometry.vectors import Vector, add, dot, scale, subtract
 from r2s.laws.wrinkling import follow, relieved
+from r2s.once import once
 
 PLACES = (1 - GAUSS) / 2, (1 + GAUSS) / 2  # of two points on (0, 1)
 SAMPLES = (0, 0), (1, 0), (1, 1), (0, 1)  # places along warp and weft, as in `StrainSamples`
@@ -26,7 +27,14 @@ def membrane_force(
     layout: Layout, laws: Any, corners: Corners, rates: Corners, hidden: Wrinkles
 ) -> tuple[list[Vector], Wrinkles]:
     """Forces [N] on the corners of the cells, and the wrinkles of the samples."""
-    warps, wefts = jax.lax.optimization_barrier(_sides(layout, corners))
+    warps, wefts = _sides(layout, corners)
+    stresses, found = once(partial(_stresses, layout, laws), corners, rates, hidden)
+    return _forces(layout, warps, wefts, stresses), found
+
+
+def _stresses(layout: Layout, laws: Any, corners: Corners, rates: Corners, hidden: Wrinkles):
+    """Of the four samples of every cell, with viscosity, and their wrinkles."""
+    warps, wefts = _sides(layout, corners)
     warp_rates, weft_rates = _sides(layout, rates)
     stresses, found = [], []
     for sample, (along, across) in enumerate(SAMPLES):
@@ -46,10 +54,7 @@ def membrane_force(
             stress = add(stress, relieved(law, total))
             found.append(moved)
         stresses.append(stress)
-    # XLA drops these barriers on the CPU before it fuses, and makes the stresses again for each of
-    # the forces: slow; a way to keep them in memory is to be found
-    stresses, found = jax.lax.optimization_barrier((stresses, found))
-    return _forces(layout, warps, wefts, stresses), tuple(found) if hidden is not None else None
+    return stresses, tuple(found) if hidden is not None else None
 
 
 def _sides(layout: Layout, corners: Corners) -> tuple[list[Vector], list[Vector]]:
@@ -81,7 +86,7 @@ def _forces(layout: Layout, warps, wefts, stresses) -> list[Vector]:
         return scale(weight, total)
 
     pulls = [pull(place, axis) for axis in (0, 1) for place in (0, 1)]
-    first, second, third, fourth = jax.lax.optimization_barrier(pulls)
+    first, second, third, fourth = pulls
     near = add(scale(PLACES[1], first), scale(PLACES[0], second))
     far = add(scale(PLACES[0], first), scale(PLACES[1], second))
     left = add(scale(PLACES[1], third), scale(PLACES[0], fourth))
