@@ -3,9 +3,9 @@
 The strains, curvatures and laws are those of `r2s.forces.elements` on a `rectangle`.
 """
 
+from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -16,6 +16,7 @@ from r2s.forces.grid_membrane import Wrinkles, membrane_force
 from r2s.forces.laws import Response, critical_stress, response
 from r2s.forces.layout import Layout, is_cell, part
 from r2s.geometry.vectors import Vector, add, cross, dot, scale, subtract
+from r2s.once import once
 from r2s.world.air import STILL, Air
 
 
@@ -60,9 +61,9 @@ def grid_force(
     corners, rates = cell_corners(layout, x), cell_corners(layout, v)
     of_cells, hidden = membrane_force(layout, laws, corners, rates, hidden)
     pushed = _drag(layout, air, corners, cell_corners(layout, flow))
-    of_twists, of_turns = bending_force(layout, laws, x, v, twists(layout, corners, rates))
+    twisted = once(partial(twists, layout), corners, rates)
+    of_twists, of_turns = bending_force(layout, laws, x, v, twisted)
     total = [add(a, b, pushed) for a, b in zip(of_cells, of_twists, strict=True)]
-    total = jax.lax.optimization_barrier(total)
     return add(to_vertices(layout, total), of_turns), hidden
 
 

@@ -4,15 +4,16 @@ The same as `PlateElements.of_grid`: a vertex has the curvatures of its two turn
 ones at the border, and of the cell whose origin it is.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from r2s.forces.layout import Layout, is_cell, part
 from r2s.geometry.vectors import Vector, add, cross, dot, scale, subtract
+from r2s.once import once
 
 
 class Turned(NamedTuple):
@@ -84,13 +85,12 @@ def bending_force(
     layout: Layout, laws: Any, x: Vector, v: Vector, twisted: tuple[Turned, Turned]
 ) -> tuple[list[Vector], Vector]:
     """Forces [N] of the twists on the corners of the cells, and of the turns on the vertices."""
-    turned = turns(layout, x, v)
-    turned, twisted = jax.lax.optimization_barrier((turned, twisted))
+    turned = once(partial(turns, layout), x, v)
     curvature = _curvature(layout, turned, twisted, "angle")
     rate = _curvature(layout, turned, twisted, "rate")
     (warp, weft, twist), _ = laws.bending.stress(curvature, rate, laws.damping)
     areas = layout.constant(layout.vertex_areas, 0, warp)
-    moments = jax.lax.optimization_barrier((areas * warp, areas * weft, areas * twist))
+    moments = areas * warp, areas * weft, areas * twist
     of_turns = [_turn_force(layout, axis, turned[axis], moments[axis]) for axis in (0, 1)]
     return _twist_force(layout, twisted, moments[2]), add(*of_turns)
 
@@ -166,7 +166,7 @@ def _turn_force(layout: Layout, axis: int, turned: Turned, moment: Array) -> Vec
     has_next, has_last = (border(layout, 1 - axis, end, here) for end in (-1, 0))
     forward, backward = scale(has_next, of_axis), scale(has_last, of_axis)
     own = subtract(subtract(backward, forward), add(of_next, of_last))
-    parts = jax.lax.optimization_barrier((own, of_next, of_last, forward, backward))
+    parts = own, of_next, of_last, forward, backward
     beside, aside = _step(layout, 1 - axis)
 
     def of_component(i: int) -> Array:
