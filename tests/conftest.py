@@ -6,7 +6,6 @@ the other process, for processes that tests start, and for the next run; and the
 process holds too much.
 """
 
-import ctypes
 import gc
 import os
 import resource
@@ -27,6 +26,7 @@ from r2s.cloth.linear.pattern import Pattern
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.elements import strains, vertex_masses
 from r2s.geometry.mesh import Mesh, rectangle
+from r2s.study.memory import let_go
 from r2s.units import GRAVITY
 from r2s.world.air import Air
 from r2s.world.contact import Table
@@ -87,11 +87,7 @@ def little_memory_within_a_module() -> Iterator[None]:
 def let_go_beyond(memory_in_use: float) -> None:
     """Let compiled programs go if the process holds more memory [MB]."""
     if memory() > memory_in_use:
-        eqx.clear_caches()
-        jax.clear_caches()
-        gc.collect()
-        if sys.platform == "linux":  # what was freed goes back to the system
-            ctypes.CDLL(None).malloc_trim(0)
+        let_go()
 
 
 def memory() -> float:

@@ -1,5 +1,7 @@
 """Explicit steps of the cloth: forces on the grid, falls, batches, and what is refused."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,7 +17,7 @@ from r2s.forces.grid import grid_force, laws_on_grid
 from r2s.forces.layout import Layout
 from r2s.laws.plate import PlateBending
 from r2s.units import GRAVITY
-from r2s.world.air import Air
+from r2s.world.air import Air, Fan
 from r2s.world.contact import Table
 from r2s.world.drag import drag_on_vertices
 from r2s.world.scene import Control, Scene
@@ -91,6 +93,84 @@ def test_a_step_that_explodes_is_a_recorded_failure(sheet, fabric):
     start = solver.init(flat(sheet).at[0, 0].set(jnp.nan))
     control = Control(jnp.zeros((0, 3)), jnp.zeros(3))
     assert int(eqx.filter_jit(solver.step)(fabric, start, control).failure) == Failure.NON_FINITE
+
+
+def moved(solver, fabric, wind=(0.0, 0.0, 0.0), height=0.0, v=None, steps=1):
+    """After some steps whose grippers stay."""
+    x = flat(solver.scene.mesh, height)
+    state = solver.init(x, v)
+    control = Control(x[solver.scene.held], jnp.array(wind))
+    run = eqx.filter_jit(solver.step)
+    for _ in range(steps):
+        state = run(fabric, state, control)
+    return state
+
+
+def test_the_grid_moves_as_any_mesh_does_in_the_wind_of_a_fan(fabric):
+    mesh = r2s.rectangle((0.3, 0.2), (4, 5), "quadrilaterals")
+    fan = Fan(*(jnp.asarray(v) for v in ((0.1, 0.1, -0.2), (0.0, 0.3, 1.0), 0.1, 0.05)))
+    scene = Scene(mesh, jnp.array([0]), Table.make(-jnp.inf), Air.make(), fan)
+    grid = ExplicitCloth.make(scene, 0.01, fabric)
+    gathers = dataclasses.replace(grid, grid=None)
+    assert grid.grid is not None
+    one, other = (moved(each, fabric, (0.0, 2.0, 5.0), steps=3) for each in (grid, gathers))
+    still = moved(grid, fabric, steps=3)
+    assert jnp.max(jnp.abs(one.x - still.x)) > 1e-4  # the wind is felt
+    np.testing.assert_allclose(one.x, other.x, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(one.v, other.v, rtol=0, atol=1e-9)
+
+
+def test_laws_that_are_not_constant_move_the_grid_as_any_mesh(fabric):
+    springs = r2s.SpringMembrane(*(jnp.asarray(c) for c in (300.0, 200.0, 80.0)))
+    fabric = eqx.tree_at(lambda f: f.membrane, fabric, springs)
+    mesh = r2s.rectangle((0.3, 0.2), (4, 5), "quadrilaterals")
+    scene = Scene(mesh, jnp.array([0]), Table.make(-jnp.inf), Air.make())
+    grid = ExplicitCloth.make(scene, 0.005, fabric)
+    gathers = dataclasses.replace(grid, grid=None)
+    v = jax.random.normal(jax.random.key(0), (len(mesh.rest), 3))
+    one, other = (moved(each, fabric, v=v, steps=2) for each in (grid, gathers))
+    np.testing.assert_allclose(one.x, other.x, rtol=0, atol=1e-10)
+
+
+def test_friction_stops_a_sliding_sheet_after_the_way_of_coulomb(fabric):
+    """Speed falls by friction times gravity a second."""
+    mesh = r2s.rectangle((0.3, 0.2), (3, 3), "quadrilaterals")
+    rest = fabric.thickness - 1e-4
+    solver = explicit(mesh, fabric, table=0.0, dt=0.01)
+    v = jnp.zeros((9, 3)).at[:, 0].set(0.3)
+    slid = moved(solver, fabric, height=rest, v=v, steps=3)
+    lost = 0.3 - jnp.mean(slid.v[:, 0])
+    assert float(lost) == pytest.approx(float(fabric.friction) * GRAVITY * 0.03, rel=0.05)
+    assert float(jnp.mean(moved(solver, fabric, height=rest, v=v, steps=30).v[:, 0])) < 1e-3
+
+
+def test_substeps_that_are_too_long_for_a_traced_fabric_are_a_recorded_failure(sheet, fabric):
+    solver = explicit(sheet, fabric)
+    stiff = eqx.tree_at(
+        lambda f: f.membrane, fabric, jax.tree.map(lambda c: 1e4 * c, fabric.membrane)
+    )
+    v = jax.random.normal(jax.random.key(0), (len(sheet.rest), 3))
+    exploded = moved(solver, stiff, v=v, steps=4)
+    assert int(exploded.failure) == Failure.TIME_STEP
+
+
+def test_a_motion_in_explicit_steps_has_its_derivative(fabric):
+    sheet = r2s.rectangle((0.2, 0.2), (3, 3), "quadrilaterals")
+    solver = explicit(sheet, fabric, held=(0,), dt=0.005)
+    start = solver.init(flat(sheet))
+    control = Control(flat(sheet)[:1], jnp.zeros(3))
+
+    def sagged(factor):
+        of = eqx.tree_at(
+            lambda f: f.bending, fabric, PlateBending.make(1e-4 * factor, jnp.zeros(()))
+        )
+        return jnp.sum(solver.step(of, start, control).x[:, 2] ** 2)
+
+    sagged = jax.jit(sagged)
+    step = 1e-4
+    difference = (sagged(1 + step) - sagged(1 - step)) / (2 * step)
+    forward = jax.jit(jax.jacfwd(sagged))(1.0)
+    assert float(forward) == pytest.approx(float(difference), rel=1e-6)
 
 
 def test_a_short_hang_is_that_of_small_implicit_steps(sheet, fabric):

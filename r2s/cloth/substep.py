@@ -37,7 +37,9 @@ def moved_velocity(
     stiff = braking * dt**2 * PRESSURE_STIFFNESS / density
     depth = 2 * free / (1 + jnp.sqrt(1 + 4 * stiff * free))
     pushed = braking * dt * PRESSURE_STIFFNESS / density * depth**2
-    kept = _kept_slip(jnp.sqrt(along**2 + across**2), friction * pushed)
+    # a root that has a derivative where nothing slides
+    speed = jnp.sqrt(along**2 + across**2 + jnp.finfo(along.dtype).tiny)
+    kept = _kept_slip(speed, friction * pushed)
     return kept * along, kept * across, up + pushed
 
 
@@ -46,7 +48,6 @@ def _kept_slip(speed: Array, loss: Array) -> Array:
 
     With r the speed that is left, r + loss r / sqrt(r^2 + SLIP_SPEED^2) = speed.
     """
-    speed = jnp.maximum(speed, jnp.finfo(speed.dtype).tiny ** 0.5)
     left = jnp.maximum(speed - loss, speed * SLIP_SPEED / (SLIP_SPEED + loss))
     for _ in range(SOLVES):
         squared = left**2 + SLIP_SPEED**2

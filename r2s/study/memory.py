@@ -22,6 +22,11 @@ def let_go_beyond(most: float) -> None:
     psutil = require("psutil", "study", "a study")
     if psutil.Process().memory_info().rss <= most:
         return
+    let_go()
+
+
+def let_go() -> None:
+    """Let all compiled programs of this process go, and give their memory back."""
     kept.let_go()
     eqx.clear_caches()
     jax.clear_caches()
