@@ -54,8 +54,8 @@ class Cloth(eqx.Module):
     - `elimination`: how the linear systems of its mesh are solved.
     - `dt`: step, [s].
     - `self_contact`: how the sheet finds contacts with itself; None: it passes through itself.
-    - `tolerance`: the solve ends when no coordinate changes by more, [m]. None: as much as shows in
-      no loss (`loss_tolerance`) in float32, 1e-11 in float64.
+    - `tolerance`: the solve ends when no coordinate changes by more, [m]. None: `loss_tolerance` in
+      float32, 1e-11 in float64.
     - `max_iterations`: of Newton's method; a step that needs more fails.
     """
 
@@ -195,10 +195,13 @@ def prepare_mesh(scene: Scene, self_contact: bool) -> tuple[Elimination, SelfCon
 
 
 def loss_tolerance(dt: float) -> float:
-    """The tolerance [m] of a step [s] whose errors are lost in those of the time step.
+    """The tolerance [m] of a step [s] whose errors are lost in those of mesh and time step.
 
-    At 1/60 s it is 1e-5 m, which moves the loss of a lift by some 0.002 mm; it shrinks with the
-    square of the step, as what the formula leaves in it, down to 1e-6 m, near the rounding.
+    It is 1e-5 m at 1/60 s and above, and shrinks with the square of the step, as what the formula
+    leaves in it, down to 1e-6 m, near the rounding. Lifts of three fabrics in steps of 1/45 s move
+    by 0.007 to 0.017 mm from 1e-6 m at 9 x 9 vertices, and by 0.014 to 0.31 mm at 17 x 17 (rms over
+    the motion), where a vertex that is about to buckle goes up to 7 mm another way. There 1e-6 m
+    itself differs by 0.18 mm from half of it.
     """
     return min(max(1e-5 * (60 * dt) ** 2, 1e-6), 1e-5)
 
