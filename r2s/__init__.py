@@ -16,6 +16,7 @@ The names below are the public surface; what changes here is in the changelog.
 """
 
 from r2s.cloth.cloth import Cloth, ClothState
+from r2s.cloth.explicit import ExplicitCloth
 from r2s.estimation.cards import Card, Provenance
 from r2s.estimation.cards import read as read_card
 from r2s.estimation.cards import write as write_card
@@ -40,6 +41,7 @@ from r2s.recordings.recording import Recording, RecordingInfo, SheetPlacement, m
 from r2s.recordings.recording import load as load_recording
 from r2s.recordings.recording import save as save_recording
 from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
+from r2s.scenarios.in_explicit_steps import explicit_cloth
 from r2s.scenarios.on_points import material_points
 from r2s.scenarios.scenario import Scenario, from_recording, rollout
 from r2s.scenarios.six import Experiment, fling, folding, lifting, shaking, stretching, wind
@@ -77,6 +79,7 @@ __all__ = [
     "Solver",
     "Cloth",
     "ClothState",
+    "ExplicitCloth",
     "simulate",
     "Trajectory",
     "Failure",
@@ -91,6 +94,7 @@ __all__ = [
     "fling",
     "shaking",
     "rollout",
+    "explicit_cloth",
     "material_points",
     "energy_balance",
     "EnergyBalance",

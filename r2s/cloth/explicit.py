@@ -128,6 +128,16 @@ class ExplicitCloth(eqx.Module):
 
     def step(self, fabric: Fabric, state: ExplicitState, control: Control) -> ExplicitState:
         """The state `dt` later, with the held vertices at `control.handles`."""
+        return self._step(fabric, state, control, False)[0]
+
+    def step_with_forces(
+        self, fabric: Fabric, state: ExplicitState, control: Control
+    ) -> tuple[ExplicitState, Float[Array, "handle 3"]]:
+        """The state `dt` later, and the grippers' mean forces [N] on the held vertices."""
+        after, impulse = self._step(fabric, state, control, True)
+        return after, impulse[self.scene.held] / self.dt
+
+    def _step(self, fabric: Fabric, state: ExplicitState, control: Control, with_impulse: bool):
         scene = self.scene
         carried = jnp.zeros_like(state.x)
         carried = carried.at[scene.held].set((control.handles - state.x[scene.held]) / self.dt)
@@ -143,16 +153,17 @@ class ExplicitCloth(eqx.Module):
             scene.air,
             scene.fan,
             self.membrane_damping,
+            jnp.zeros_like(state.x) if with_impulse else None,
         )
         if self.grid is not None and isinstance(fabric.bending, PlateLaw):
-            x, v, hidden = self._on_grid(inputs)
+            x, v, hidden, impulse = self._on_grid(inputs)
         else:
-            x, v, hidden = self._by_gathers(inputs)
+            x, v, hidden, impulse = self._by_gathers(inputs)
         x = scene.place(x, control.handles)
         failure = first_failure(
             state.failure, _failure((state.x, state.v, fabric, control), (x, v))
         )
-        return ExplicitState(x, v, hidden, failure)
+        return ExplicitState(x, v, hidden, failure), impulse
 
     @property
     def _wrinkles(self) -> bool:
@@ -173,17 +184,20 @@ class ExplicitCloth(eqx.Module):
         free, carried = inputs.is_free > 0, tuple(inputs.carried.T)
 
         def substep(state, _):
-            x, v = state
+            x, v, impulse = state
             force = elastic_force(mesh, fabric, inputs.membrane_damping, x, v)
             force += drag_on_vertices(mesh, inputs.air, inputs.fan, x, v, inputs.wind)
             height = x[:, 2] - inputs.table_height - fabric.thickness
             others = fabric.density, fabric.friction, fabric.mass_damping
             moved = moved_velocity(dt, tuple(force.T), mass, tuple(v.T), height, *others)
             v = jnp.stack([jnp.where(free, m, c) for m, c in zip(moved, carried, strict=True)], 1)
-            return (x + dt * v, v), None
+            if impulse is not None:
+                impulse += mass[:, None] * (v - jnp.stack(moved, axis=1))
+            return (x + dt * v, v, impulse), None
 
-        (x, v), _ = jax.lax.scan(substep, (inputs.x, inputs.v), length=self.substeps)
-        return x, v, inputs.hidden
+        start = inputs.x, inputs.v, inputs.impulse
+        (x, v, impulse), _ = jax.lax.scan(substep, start, length=self.substeps)
+        return x, v, inputs.hidden, impulse
 
 
 class _Inputs(NamedTuple):
@@ -200,10 +214,11 @@ class _Inputs(NamedTuple):
     air: Air
     fan: Any
     membrane_damping: Array
+    impulse: Array | None  # [N s], of the grippers, added up; None: it is not asked for
 
 
 def _advance_grid(shape, spacing, dt, substeps: int, batched: bool, inputs: _Inputs):
-    """Positions, velocities and wrinkles after the substeps of a step."""
+    """Positions, velocities, wrinkles and impulses after the substeps of a step."""
     layout = Layout(shape, spacing, batched)
     fabric, count, room = inputs.fabric, layout.count, layout.room
     dt = jnp.asarray(dt / substeps, inputs.x.dtype)
@@ -223,22 +238,29 @@ def _advance_grid(shape, spacing, dt, substeps: int, batched: bool, inputs: _Inp
         return tuple(w.at[room : room + count].set(a) for w, a in zip(wide, arrays, strict=True))
 
     def substep(_, state):
-        x, v, hidden = state
+        x, v, hidden, impulse = state
         flow = layout.flow(x, v, inputs.wind, inputs.fan)
         force, hidden = grid_force(layout, laws, air, x, v, flow, hidden)
         here, before = inner(x), inner(v)
         height = here[2] - contact
         others = row["density"], row["friction"], row["mass_damping"]
-        moved = moved_velocity(dt, force, mass, before, height, *others)
-        moved = tuple(jnp.where(free, m, c) for m, c in zip(moved, carried, strict=True))
+        unheld = moved_velocity(dt, force, mass, before, height, *others)
+        moved = tuple(jnp.where(free, m, c) for m, c in zip(unheld, carried, strict=True))
+        if impulse is not None:
+            given = zip(impulse, moved, unheld, strict=True)
+            impulse = tuple(i + mass * (m - u) for i, m, u in given)
         placed = tuple(a + dt * b for a, b in zip(here, moved, strict=True))
-        return put(x, placed), put(v, moved), hidden
+        return put(x, placed), put(v, moved), hidden, impulse
 
     hidden = None if inputs.hidden is None else layout.to_cells(inputs.hidden)
-    start = layout.wide(inputs.x), layout.wide(inputs.v), hidden
-    x, v, hidden = jax.lax.fori_loop(0, substeps, substep, start)
+    impulse = None
+    if inputs.impulse is not None:
+        impulse = tuple(inputs.impulse[:, i] for i in range(3))
+    start = layout.wide(inputs.x), layout.wide(inputs.v), hidden, impulse
+    x, v, hidden, impulse = jax.lax.fori_loop(0, substeps, substep, start)
     hidden = None if hidden is None else layout.from_cells(hidden)
-    return jnp.stack(inner(x), axis=1), jnp.stack(inner(v), axis=1), hidden
+    impulse = None if impulse is None else jnp.stack(impulse, axis=1)
+    return jnp.stack(inner(x), axis=1), jnp.stack(inner(v), axis=1), hidden, impulse
 
 
 def _failure(inputs: Any, results: Any) -> Int[Array, ""]:

@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from r2s.commands.common import ChosenShape, FabricName, Json, Motion, ScenarioName, SolverName
+from r2s.commands.common import ChosenShape, FabricName, Json, Motion, ScenarioName
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,8 @@ class Simulate:
     """NPZ of the motion."""
     fabric: FabricName = "grey_interlock"
     motion: Motion = ()
-    solver: SolverName = "cloth"
+    solver: Literal["cloth", "explicit", "points"] = "cloth"
+    """The implicit cloth, the cloth in explicit steps, or material points."""
     shape: ChosenShape = None
     self_contact: bool = False
     """The sheet touches itself (cloth only; slower)."""
@@ -53,15 +54,20 @@ class Simulate:
         from r2s.scenarios.scenario import rollout
 
         check_folders(self.out, self.recording)
-        if self.self_contact and self.solver == "points":
+        if self.self_contact and self.solver != "cloth":
             raise ValueError(
-                "--self-contact is of the cloth: material points touch through their grid"
+                "--self-contact is of the implicit cloth: explicit steps have none, and material "
+                "points touch through their grid"
             )
         card, experiment = load_card(self.fabric), make_experiment(self.scenario, self.motion)
         fabric, size = card.fabric, experiment.sheet.size
         shape, told, of_mesh = choose_shape(self.shape, fabric, size, self.scenario)
         scenario = experiment.scenario(shape, self.self_contact)
-        make_solver = scenarios.material_points if self.solver == "points" else None
+        make_solver = {
+            "cloth": None,
+            "explicit": scenarios.explicit_cloth,
+            "points": scenarios.material_points,
+        }[self.solver]
         solver = None if make_solver is None else make_solver(scenario, fabric)
         with Waiting("compiling the motion") as line:
             moved = kept(rollout)

@@ -1,13 +1,15 @@
-"""The six scenarios of the study, for any fabric and either solver.
+"""The six scenarios of the study, for any fabric and solver.
 
 - `scenario`: a sheet at rest, what holds it, how that moves, which frames count; `rollout`.
 - `six`: lifting, wind, stretching, folding, fling, shaking; and varied at random.
-- `paths`: how grippers move in them. `on_points`: the same on material points.
+- `paths`: how grippers move in them.
+- `on_points`, `in_explicit_steps`: the same on material points, and by explicit steps of the cloth.
 - `gripper_forces`, `energy`: what grippers feel, and where the energy goes.
 - `synthetic`: recordings of a known fabric, seen by cameras.
 """
 
 from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
+from r2s.scenarios.in_explicit_steps import explicit_cloth
 from r2s.scenarios.on_points import material_points
 from r2s.scenarios.six import (
     SIX,
@@ -27,6 +29,7 @@ __all__ = [
     "Experiment",
     "energy_balance",
     "clamp_force",
+    "explicit_cloth",
     "fling",
     "folding",
     "lifting",

@@ -1,4 +1,4 @@
-"""What grippers feel: the forces with which they hold a sheet, of either solver."""
+"""What grippers feel: the forces with which they hold a sheet, of any solver."""
 
 from typing import Any
 
@@ -6,6 +6,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from r2s.cloth.cloth import Cloth, ClothState
+from r2s.cloth.explicit import ExplicitCloth
 from r2s.cloth.potential import residual
 from r2s.fabrics.fabric import Fabric
 from r2s.mpm.sheet import Sheet
@@ -21,7 +22,7 @@ def step_with_forces(
     """`solver.step`, and the mean forces [N] of the grippers on the held vertices in that step.
 
     For the cloth they are the derivative of the step's potential in the place of the held vertices,
-    which vanishes for free ones; self-contact is left out. For material points they are the
+    which vanishes for free ones; self-contact is left out. For explicit steps and material points they are the
     momentum that the grippers give, over the step. Either has the weight and the inertia of the
     held vertices in it. Raises `TypeError` for another solver.
     """
@@ -32,9 +33,9 @@ def step_with_forces(
     if isinstance(solver, Cloth):
         after = solver.step(fabric, state, control)
         return after, _cloth_forces(solver, fabric, state, control, after)
-    if isinstance(solver, Sheet):
+    if isinstance(solver, ExplicitCloth | Sheet):
         return solver.step_with_forces(fabric, state, control)
-    raise TypeError(f"forces are known of Cloth and Sheet, got {type(solver).__name__}")
+    raise TypeError(f"forces are known of Cloth, ExplicitCloth and Sheet, got {type(solver).__name__}")
 
 
 def _cloth_forces(
