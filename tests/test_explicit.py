@@ -12,10 +12,14 @@ from conftest import cloth, flat, step
 import r2s
 from r2s.cloth.explicit import ExplicitCloth, stable_step
 from r2s.failures import Failure
-from r2s.forces.elements import elastic_force
+from r2s.forces.elements import bending_force, membrane_force, membrane_stress
 from r2s.forces.grid import grid_force, laws_on_grid
+from r2s.forces.grid_membrane import Samples
 from r2s.forces.layout import Layout
+from r2s.forces.stability import SAFETY, longest_relaxing_step
+from r2s.forces.viscosity import Viscosity
 from r2s.laws.plate import PlateBending
+from r2s.scenarios.energy import stored_energy
 from r2s.units import GRAVITY
 from r2s.world.air import Air, Fan
 from r2s.world.contact import Table
@@ -36,16 +40,34 @@ def test_forces_on_the_grid_are_those_by_gathers(shape, elements, fabric):
     x = flat(mesh) + 0.01 * jax.random.normal(jax.random.key(0), (mesh.rest.shape[0], 3))
     v = jax.random.normal(jax.random.key(1), x.shape)
     layout = Layout(shape, (0.3 / (shape[0] - 1), 0.2 / (shape[1] - 1)))
-    laws = laws_on_grid(layout, fabric, jnp.asarray(0.01), elements == "wrinkling")
-    none = jnp.zeros(layout.length(layout.first_cell))
-    hidden = ((none,) * 3,) * 4 if elements == "wrinkling" else None
+    viscosity = Viscosity(jnp.asarray(3.0), jnp.asarray(0.2))
+    laws = laws_on_grid(layout, fabric, viscosity, elements == "wrinkling")
+    count = mesh.samples.areas.size
+    past = jax.random.normal(jax.random.key(2), (count, 3))
+    none = jnp.zeros(4 * layout.length(layout.first_cell))
+    relaxed = layout.to_cells(past.reshape(-1, 4, 3))
+    samples = Samples(relaxed, (none, none, none) if elements == "wrinkling" else None)
     wide, rates = layout.wide(x), layout.wide(v)
-    run = jax.jit(lambda hidden: grid_force(layout, laws, Air.make(), wide, rates, rates, hidden))
+    begun = jnp.asarray(True)
+
+    def on_grid(samples):
+        return grid_force(layout, laws, Air.make(), wide, rates, rates, samples, begun)
+
+    run = jax.jit(on_grid)
     for _ in range(12):  # of Newton's method for the wrinkles
-        found, hidden = run(hidden)
-    expected = elastic_force(mesh, fabric, jnp.asarray(0.01), x, v)
-    expected += drag_on_vertices(mesh, Air.make(), None, x, v, jnp.zeros(3))
+        found, after = run(samples)
+        samples = after._replace(relaxed=relaxed)
+
+    def by_gathers(x, v):
+        stress, remembered = viscosity.resist(membrane_stress(mesh, fabric, x), past, begun)
+        force = membrane_force(mesh, x, stress) + bending_force(mesh, fabric, x, v)
+        drag = drag_on_vertices(mesh, Air.make(), None, x, v, jnp.zeros(3))
+        return force + drag, remembered
+
+    expected, remembered = jax.jit(by_gathers)(x, v)
     assert jnp.stack(found, axis=1) == pytest.approx(np.asarray(expected), rel=1e-9, abs=1e-11)
+    kept = layout.from_cells(after.relaxed).reshape(-1, 3)
+    assert kept == pytest.approx(np.asarray(remembered), rel=1e-9, abs=1e-9)
 
 
 def test_a_free_sheet_falls_as_a_stone(sheet, fabric):
@@ -188,3 +210,88 @@ def test_a_short_hang_is_that_of_small_implicit_steps(sheet, fabric):
     moved = jnp.max(jnp.abs(state.x - flat(sheet)))
     assert moved > 0.02
     assert jnp.max(jnp.abs(state.x - other.x)) < 0.05 * moved
+
+
+@pytest.mark.parametrize("relaxation", [0.0, 1e-3, 1e-2])
+def test_the_longest_step_is_where_a_relaxing_spring_begins_to_explode(relaxation):
+    square, damping = 4e6, 5e-3  # [1/s^2], [s]
+    times = jnp.asarray(damping), jnp.asarray(relaxation)
+    none = [(jnp.zeros(()), jnp.zeros(()))]
+    limit = float(longest_relaxing_step(jnp.asarray(square), *times, none)) / SAFETY
+
+    def growth(dt):
+        """Of the fastest mode of position, dt times velocity and relaxed position."""
+        share, rate = (float(part) for part in Viscosity.make(*times, jnp.asarray(dt)))
+        k = dt**2 * square
+        v = np.array([-k * (1 + share), 1, k * share])
+        matrix = np.array([v + [1, 0, 0], v, [rate, 0, 1 - rate]])
+        return np.abs(np.linalg.eigvals(matrix)).max()
+
+    assert growth(0.999 * limit) < 1 + 1e-9
+    assert growth(1.001 * limit) > 1
+
+
+def test_slow_changes_are_damped_as_by_kelvin_and_voigt_and_sudden_ones_stiffened():
+    damping, relaxation, dt, rate = 0.01, 2e-3, 5e-4, 30.0  # [s], [s], [s], [N/(m s)]
+    times = (jnp.asarray(time) for time in (damping, relaxation, dt))
+    viscosity, relaxed = Viscosity.make(*times), jnp.zeros(())
+    begun = jnp.asarray(True)
+    stress = total = jnp.zeros(())
+    for count in range(1, 101):
+        stress = jnp.asarray(rate * dt * count)
+        total, relaxed = viscosity.resist(stress, relaxed, begun)
+    assert float(total - stress) == pytest.approx(damping * rate, rel=1e-6)
+    sudden, _ = viscosity.resist(jnp.ones(()), jnp.zeros(()), begun)
+    assert float(sudden) == pytest.approx(1 + damping / (relaxation + dt))
+    first, caught_up = viscosity.resist(jnp.ones(()), jnp.zeros(()), ~begun)
+    assert float(first) == float(caught_up) == 1.0
+
+
+def test_a_free_sheet_keeps_its_momentum_and_loses_energy(sheet, fabric):
+    solver = explicit(sheet, fabric, dt=0.01)
+    v = jax.random.normal(jax.random.key(3), (len(sheet.rest), 3))
+    state, run = solver.init(flat(sheet), v), eqx.filter_jit(solver.step)
+    stored_of = jax.jit(lambda x: stored_energy(sheet, fabric, x))
+    mass = fabric.density * sheet.vertex_area[:, None]
+    control = Control(jnp.zeros((0, 3)), jnp.zeros(3))
+    momentum, energies = jnp.sum(mass * v, axis=0), []
+    for count in range(1, 6):
+        state = run(fabric, state, control)
+        fallen = jnp.sum(mass) * jnp.array([0.0, 0.0, -GRAVITY]) * count * solver.dt
+        now = jnp.sum(mass * state.v, axis=0)
+        assert now == pytest.approx(np.asarray(momentum + fallen), abs=1e-12)
+        relative = state.v - now[None] / jnp.sum(mass)
+        stored = stored_of(state.x)
+        energies.append(float(stored + jnp.sum(mass * relative**2) / 2))
+    assert np.all(np.diff(energies) < 0)
+
+
+def test_grippers_carry_the_weight_of_a_sheet_at_rest(fabric):
+    """On any mesh and on the grid, and through the account of energy."""
+    scenario = r2s.wind((0.2, 0.2), speed=0.0, num_frames=3).scenario((4, 4))
+    solver = r2s.explicit_cloth(scenario, fabric)
+    weight = float(fabric.density) * 0.04 * GRAVITY
+    for each in (solver, dataclasses.replace(solver, grid=None)):
+        found = eqx.filter_jit(r2s.energy_balance)(scenario, fabric, None, each)
+        assert float(jnp.sum(found.forces[-1], axis=0)[2]) == pytest.approx(weight, rel=1e-3)
+        assert float(found.dissipated[-1]) > -1e-6
+
+
+def test_explicit_steps_of_a_lift_go_where_small_implicit_ones_go(fabric):
+    scenario = r2s.lifting((0.3, 0.3), num_frames=12, moving=0.6).scenario((5, 5))
+    run = eqx.filter_jit(r2s.rollout)
+    fine = run(scenario, fabric, 1 / 480).x
+    explicit = run(scenario, fabric, None, r2s.explicit_cloth(scenario, fabric)).x
+    light = r2s.explicit_cloth(scenario, fabric, membrane_damping=1e-4)
+    apart, lightly = (
+        float(jnp.sqrt(jnp.mean(jnp.sum((x - fine) ** 2, axis=2))))
+        for x in (explicit, run(scenario, fabric, None, light).x)
+    )
+    assert apart < 1e-3
+    assert lightly > 3 * apart  # the membrane's damping is felt
+
+
+def test_explicit_steps_refuse_self_contact_and_say_what_has_it(fabric):
+    scenario = r2s.folding((0.2, 0.2)).scenario((4, 4), self_contact=True)
+    with pytest.raises(ValueError, match="material_points"):
+        r2s.explicit_cloth(scenario, fabric)

@@ -1,8 +1,9 @@
 """The cloth in explicit steps: as many symplectic substeps in a step as its waves need.
 
-The physics are those of `r2s.cloth.cloth.Cloth`. A substep needs no solve, and all its arrays are
-worked on side by side: of a batch, its members. It pays where many fabrics or motions are needed
-at once. For derivatives the implicit cloth is better: these would go through every substep.
+The physics are those of `r2s.cloth.cloth.Cloth`, but for the fastest waves of the membrane
+(`r2s.forces.viscosity`). A substep needs no solve, and all its arrays are worked on side by side:
+of a batch, its members. For derivatives the implicit cloth is better: these would go through every
+substep.
 """
 
 import math
@@ -14,16 +15,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from r2s.cloth.batch_last import batch_last
 from r2s.cloth.substep import moved_velocity
 from r2s.fabrics.fabric import Fabric
 from r2s.failures import Failure, first_failure, no_failure
-from r2s.forces.elements import bending_frequency, elastic_force, membrane_frequency
+from r2s.forces import elements
 from r2s.forces.grid import grid_force, laws_on_grid
+from r2s.forces.grid_membrane import Samples
 from r2s.forces.layout import Layout
-from r2s.forces.stability import check_step, longest_step
+from r2s.forces.stability import check_step, longest_relaxing_step
+from r2s.forces.viscosity import Viscosity
 from r2s.geometry.mesh import Mesh
 from r2s.laws.plate import PlateLaw
 from r2s.world.air import Air
@@ -31,8 +34,9 @@ from r2s.world.drag import drag_on_vertices
 from r2s.world.scene import Control, Scene
 
 Positions = Float[Array, "vertex 3"]
+OfSamples = Float[Array, "element sample 3"]
 
-MEMBRANE_DAMPING = 1e-4  # [s]: what is longer costs many times the substeps, and hardly shows
+RELAXATION = 2e-3  # [s]: docs/solvers.md says what motions differ by
 REFUSED = (
     "explicit steps do not know contact of the sheet with itself: take the implicit cloth, "
     "r2s.Cloth.make(..., self_contact=True), or material points, r2s.material_points"
@@ -41,14 +45,18 @@ REFUSED = (
 
 class ExplicitState(eqx.Module):
     """- `x`, `v`: positions [m] and velocities [m/s], world frame, z up.
+    - `relaxed`: stress of every sample that its viscosity remembers, [N/m].
     - `hidden`: scaled wrinkles of every sample, from where the next substep goes on; None: the mesh
       has none, or is no grid.
+    - `begun`: whether there was a step.
     - `failure`: the first `r2s.failures.Failure` of the run so far.
     """
 
     x: Positions
     v: Positions
-    hidden: Float[Array, "element sample 3"] | None
+    relaxed: OfSamples
+    hidden: OfSamples | None
+    begun: Bool[Array, ""]
     failure: Int[Array, ""]
 
 
@@ -58,14 +66,16 @@ class ExplicitCloth(eqx.Module):
     `make` makes one. `jax.vmap` of `step` runs a batch with its members side by side.
 
     - `scene`: sheet, held vertices, table, air.
-    - `membrane_damping`: damping time of the membrane, [s]; the fabric's holds for bending alone.
+    - `membrane_damping`: damping time of the membrane, [s]; None: the fabric's.
+    - `relaxation`: of the membrane's viscosity, [s].
     - `dt`: step, [s]. `substeps`: in a step.
     - `grid`: vertices along warp and weft of a rectangle of quadrilaterals, and the spacing
       between them [m]; None: any other mesh, whose forces take several times as long.
     """
 
     scene: Scene
-    membrane_damping: Float[Array, ""]
+    membrane_damping: Float[Array, ""] | None
+    relaxation: Float[Array, ""]
     dt: float = eqx.field(static=True)
     substeps: int = eqx.field(static=True)
     grid: tuple[tuple[int, int], tuple[float, float]] | None = eqx.field(static=True)
@@ -76,7 +86,8 @@ class ExplicitCloth(eqx.Module):
         scene: Scene,
         dt: float,
         fabric: Fabric,
-        membrane_damping: float = MEMBRANE_DAMPING,
+        membrane_damping: float | None = None,
+        relaxation: float = RELAXATION,
         *,
         substeps: int | None = None,
         self_contact: bool = False,
@@ -85,6 +96,8 @@ class ExplicitCloth(eqx.Module):
 
         - `fabric`: the stiffest that it will be used for; of a batch, with a leading axis on every
           array, that is the member which needs the shortest substeps.
+        - `membrane_damping`: as in `ExplicitCloth`. `relaxation`: of its viscosity, [s]
+          (`r2s.forces.viscosity`); 0: plain Kelvin-Voigt damping, in far shorter substeps.
         - `substeps`: in a step; None: the fewest below `stable_step`.
 
         Raises `ValueError` for a step that is not positive, for substeps that are too long, with
@@ -92,18 +105,19 @@ class ExplicitCloth(eqx.Module):
         """
         if self_contact:
             raise ValueError(REFUSED)
-        if not (dt > 0 and membrane_damping >= 0):
+        if not (dt > 0 and relaxation >= 0 and (membrane_damping or 0) >= 0):
             raise ValueError(
-                f"dt must be positive and the damping time not negative, got {dt} s and "
-                f"{membrane_damping} s"
+                "dt must be positive, damping time and relaxation not negative, got "
+                f"{dt} s, {membrane_damping} s and {relaxation} s"
             )
-        damping = jnp.asarray(membrane_damping, float)
+        damping = None if membrane_damping is None else jnp.asarray(membrane_damping, float)
+        relaxing = jnp.asarray(relaxation, float)
         with jax.ensure_compile_time_eval():
-            longest = shortest(scene.mesh, fabric, damping)
+            longest = shortest(scene.mesh, fabric, damping, relaxing)
             grid = grid_of(scene.mesh)
         if substeps is None:
             substeps = max(1, math.ceil(dt / longest * (1 + 1e-6)))
-        solver = cls(scene, damping, float(dt), substeps, grid)
+        solver = cls(scene, damping, relaxing, float(dt), substeps, grid)
         solver._check_substep(longest)
         return solver
 
@@ -112,7 +126,8 @@ class ExplicitCloth(eqx.Module):
         if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(fabric)):
             return
         with jax.ensure_compile_time_eval():
-            self._check_substep(shortest(self.scene.mesh, fabric, self.membrane_damping))
+            times = self.membrane_damping, self.relaxation
+            self._check_substep(shortest(self.scene.mesh, fabric, *times))
 
     def _check_substep(self, longest: float) -> None:
         material = f"the fabric and the mesh (dt = {self.dt:g} s in {self.substeps} substeps)"
@@ -121,10 +136,9 @@ class ExplicitCloth(eqx.Module):
     def init(self, x: Positions, v: Positions | None = None) -> ExplicitState:
         """A state from positions [m] and velocities [m/s] (default: zero)."""
         v = jnp.zeros_like(x) if v is None else v
-        hidden = None
-        if self._wrinkles:
-            hidden = jnp.zeros((*self.scene.mesh.samples.areas.shape, 3), x.dtype)
-        return ExplicitState(x, v, hidden, no_failure())
+        none = jnp.zeros((*self.scene.mesh.samples.areas.shape, 3), x.dtype)
+        hidden = none if self._wrinkles else None
+        return ExplicitState(x, v, none, hidden, jnp.asarray(False), no_failure())
 
     def step(self, fabric: Fabric, state: ExplicitState, control: Control) -> ExplicitState:
         """The state `dt` later, with the held vertices at `control.handles`."""
@@ -138,38 +152,44 @@ class ExplicitCloth(eqx.Module):
         return after, impulse[self.scene.held] / self.dt
 
     def _step(self, fabric: Fabric, state: ExplicitState, control: Control, with_impulse: bool):
-        scene = self.scene
+        scene, dtype = self.scene, state.x.dtype
         carried = jnp.zeros_like(state.x)
         carried = carried.at[scene.held].set((control.handles - state.x[scene.held]) / self.dt)
+        damping = fabric.damping if self.membrane_damping is None else self.membrane_damping
+        substep = jnp.asarray(self.dt / self.substeps, dtype)
         inputs = _Inputs(
             fabric,
-            state.x,
-            state.v,
-            state.hidden,
+            _Moving(
+                state.x,
+                state.v,
+                state.relaxed,
+                state.hidden,
+                state.begun,
+                jnp.zeros_like(state.x) if with_impulse else None,
+            ),
             carried,
-            scene.is_free.astype(state.x.dtype),
+            scene.is_free.astype(dtype),
             control.wind,
             scene.table.height,
             scene.air,
             scene.fan,
-            self.membrane_damping,
-            jnp.zeros_like(state.x) if with_impulse else None,
+            Viscosity.make(damping, self.relaxation, substep),
         )
         if self.grid is not None and isinstance(fabric.bending, PlateLaw):
-            x, v, hidden, impulse = self._on_grid(inputs)
+            moved = self._on_grid(inputs)
         else:
-            x, v, hidden, impulse = self._by_gathers(inputs)
-        x = scene.place(x, control.handles)
-        failure = first_failure(
-            state.failure, _failure((state.x, state.v, fabric, control), (x, v))
-        )
-        return ExplicitState(x, v, hidden, failure), impulse
+            moved = self._by_gathers(inputs)
+        x = scene.place(moved.x, control.handles)
+        asked = state.x, state.v, fabric, control
+        failure = first_failure(state.failure, _failure(asked, (x, moved.v)))
+        after = ExplicitState(x, moved.v, moved.relaxed, moved.hidden, moved.begun, failure)
+        return after, moved.impulse
 
     @property
     def _wrinkles(self) -> bool:
         return self.grid is not None and self.scene.mesh.samples.hidden_waves is not None
 
-    def _on_grid(self, inputs: "_Inputs"):
+    def _on_grid(self, inputs: "_Inputs") -> "_Moving":
         assert self.grid is not None
         arrays, static = eqx.partition(inputs, eqx.is_array)
         advance = partial(_advance_grid, *self.grid, self.dt, self.substeps)
@@ -177,15 +197,19 @@ class ExplicitCloth(eqx.Module):
             arrays
         )
 
-    def _by_gathers(self, inputs: "_Inputs"):
-        mesh, dt = self.scene.mesh, jnp.asarray(self.dt / self.substeps, inputs.x.dtype)
-        fabric = inputs.fabric
+    def _by_gathers(self, inputs: "_Inputs") -> "_Moving":
+        mesh, fabric, start = self.scene.mesh, inputs.fabric, inputs.start
+        dt = jnp.asarray(self.dt / self.substeps, start.x.dtype)
         mass = fabric.density * mesh.vertex_area
         free, carried = inputs.is_free > 0, tuple(inputs.carried.T)
 
-        def substep(state, _):
-            x, v, impulse = state
-            force = elastic_force(mesh, fabric, inputs.membrane_damping, x, v)
+        def substep(moving: _Moving, _):
+            x, v, impulse = moving.x, moving.v, moving.impulse
+            past = moving.relaxed.reshape(-1, 3)
+            stress = elements.membrane_stress(mesh, fabric, x)
+            stress, relaxed = inputs.viscosity.resist(stress, past, moving.begun)
+            force = elements.membrane_force(mesh, x, stress)
+            force += elements.bending_force(mesh, fabric, x, v)
             force += drag_on_vertices(mesh, inputs.air, inputs.fan, x, v, inputs.wind)
             height = x[:, 2] - inputs.table_height - fabric.thickness
             others = fabric.density, fabric.friction, fabric.mass_damping
@@ -193,39 +217,48 @@ class ExplicitCloth(eqx.Module):
             v = jnp.stack([jnp.where(free, m, c) for m, c in zip(moved, carried, strict=True)], 1)
             if impulse is not None:
                 impulse += mass[:, None] * (v - jnp.stack(moved, axis=1))
-            return (x + dt * v, v, impulse), None
+            relaxed = relaxed.reshape(moving.relaxed.shape)
+            begun = jnp.ones_like(moving.begun)
+            return _Moving(x + dt * v, v, relaxed, moving.hidden, begun, impulse), None
 
-        start = inputs.x, inputs.v, inputs.impulse
-        (x, v, impulse), _ = jax.lax.scan(substep, start, length=self.substeps)
-        return x, v, inputs.hidden, impulse
+        return jax.lax.scan(substep, start, length=self.substeps)[0]
+
+
+class _Moving(NamedTuple):
+    """What a substep changes, as in `ExplicitState`."""
+
+    x: Any
+    v: Any
+    relaxed: Any
+    hidden: Any
+    begun: Array
+    impulse: Any  # [N s], of the grippers, added up; None: it is not asked for
 
 
 class _Inputs(NamedTuple):
     """All that a step depends on; with a batch as last axis in `_advance_grid`."""
 
     fabric: Fabric
-    x: Array
-    v: Array
-    hidden: Array | None
+    start: _Moving
     carried: Array  # velocities of held vertices
     is_free: Array
     wind: Array
     table_height: Array
     air: Air
     fan: Any
-    membrane_damping: Array
-    impulse: Array | None  # [N s], of the grippers, added up; None: it is not asked for
+    viscosity: Viscosity
 
 
-def _advance_grid(shape, spacing, dt, substeps: int, batched: bool, inputs: _Inputs):
-    """Positions, velocities, wrinkles and impulses after the substeps of a step."""
+def _advance_grid(shape, spacing, dt, substeps: int, batched: bool, inputs: _Inputs) -> _Moving:
+    """What the substeps of a step change."""
     layout = Layout(shape, spacing, batched)
-    fabric, count, room = inputs.fabric, layout.count, layout.room
-    dt = jnp.asarray(dt / substeps, inputs.x.dtype)
-    laws = laws_on_grid(layout, fabric, inputs.membrane_damping, inputs.hidden is not None)
+    fabric, start, count, room = inputs.fabric, inputs.start, layout.count, layout.room
+    dt = jnp.asarray(dt / substeps, start.x.dtype)
+    viscosity = jax.tree.map(layout.row, inputs.viscosity)
+    laws = laws_on_grid(layout, fabric, viscosity, start.hidden is not None)
     names = ("density", "friction", "mass_damping", "thickness")
     row = {name: layout.row(getattr(fabric, name)) for name in names}
-    mass = row["density"] * layout.constant(layout.vertex_areas, 0, inputs.x)
+    mass = row["density"] * layout.constant(layout.vertex_areas, 0, start.x)
     contact = layout.row(inputs.table_height) + row["thickness"]
     air = jax.tree.map(layout.row, inputs.air)
     free = inputs.is_free > 0
@@ -237,10 +270,11 @@ def _advance_grid(shape, spacing, dt, substeps: int, batched: bool, inputs: _Inp
     def put(wide, arrays):
         return tuple(w.at[room : room + count].set(a) for w, a in zip(wide, arrays, strict=True))
 
-    def substep(_, state):
-        x, v, hidden, impulse = state
+    def substep(_, moving: _Moving) -> _Moving:
+        x, v, impulse = moving.x, moving.v, moving.impulse
         flow = layout.flow(x, v, inputs.wind, inputs.fan)
-        force, hidden = grid_force(layout, laws, air, x, v, flow, hidden)
+        samples = Samples(moving.relaxed, moving.hidden)
+        force, samples = grid_force(layout, laws, air, x, v, flow, samples, moving.begun)
         here, before = inner(x), inner(v)
         height = here[2] - contact
         others = row["density"], row["friction"], row["mass_damping"]
@@ -250,17 +284,31 @@ def _advance_grid(shape, spacing, dt, substeps: int, batched: bool, inputs: _Inp
             given = zip(impulse, moved, unheld, strict=True)
             impulse = tuple(i + mass * (m - u) for i, m, u in given)
         placed = tuple(a + dt * b for a, b in zip(here, moved, strict=True))
-        return put(x, placed), put(v, moved), hidden, impulse
+        begun = jnp.ones_like(moving.begun)
+        return _Moving(put(x, placed), put(v, moved), *samples, begun, impulse)
 
-    hidden = None if inputs.hidden is None else layout.to_cells(inputs.hidden)
-    impulse = None
-    if inputs.impulse is not None:
-        impulse = tuple(inputs.impulse[:, i] for i in range(3))
-    start = layout.wide(inputs.x), layout.wide(inputs.v), hidden, impulse
-    x, v, hidden, impulse = jax.lax.fori_loop(0, substeps, substep, start)
-    hidden = None if hidden is None else layout.from_cells(hidden)
-    impulse = None if impulse is None else jnp.stack(impulse, axis=1)
-    return jnp.stack(inner(x), axis=1), jnp.stack(inner(v), axis=1), hidden, impulse
+    def columns(array: Array | None):
+        return None if array is None else tuple(array[:, i] for i in range(3))
+
+    def stacked(arrays):
+        return None if arrays is None else jnp.stack(arrays, axis=1)
+
+    of_samples = (start.relaxed, start.hidden)
+    relaxed, hidden = (None if s is None else layout.to_cells(s) for s in of_samples)
+    moving = _Moving(
+        layout.wide(start.x),
+        layout.wide(start.v),
+        relaxed,
+        hidden,
+        layout.row(start.begun),
+        columns(start.impulse),
+    )
+    end = jax.lax.fori_loop(0, substeps, substep, moving)
+    of_samples = (end.relaxed, end.hidden)
+    relaxed, hidden = (None if s is None else layout.from_cells(s) for s in of_samples)
+    begun = end.begun[0] if batched else end.begun
+    impulse = stacked(end.impulse)
+    return _Moving(stacked(inner(end.x)), stacked(inner(end.v)), relaxed, hidden, begun, impulse)
 
 
 def _failure(inputs: Any, results: Any) -> Int[Array, ""]:
@@ -275,27 +323,28 @@ def _all_finite(tree: Any) -> Array:
 
 @eqx.filter_jit
 def stable_step(
-    mesh: Mesh, fabric: Fabric, membrane_damping: Float[Array, ""] | float = MEMBRANE_DAMPING
+    mesh: Mesh,
+    fabric: Fabric,
+    membrane_damping: Float[Array, ""] | float | None = None,
+    relaxation: Float[Array, ""] | float = RELAXATION,
 ) -> Float[Array, ""]:
     """The longest substep [s] that is stable for a fabric near its rest shape.
 
-    `membrane_damping`: as in `ExplicitCloth`, [s]. The squares of the highest frequencies of
-    membrane and bending have bounds that add. Table and friction do not limit it.
+    `membrane_damping`, `relaxation`: as in `ExplicitCloth`, [s]. The squares of the highest
+    frequencies of membrane and bending have bounds that add. Table and friction do not limit it.
     """
-    return longest_step(
-        [
-            (membrane_frequency(mesh, fabric), jnp.asarray(membrane_damping, float)),
-            (bending_frequency(mesh, fabric), fabric.damping),
-        ]
-    )
+    damping = fabric.damping if membrane_damping is None else jnp.asarray(membrane_damping, float)
+    bending = elements.bending_frequency(mesh, fabric), fabric.damping
+    stretching = elements.membrane_frequency(mesh, fabric)
+    return longest_relaxing_step(stretching, damping, jnp.asarray(relaxation, float), [bending])
 
 
-def shortest(mesh: Mesh, fabric: Fabric, membrane_damping: Array) -> float:
+def shortest(mesh: Mesh, fabric: Fabric, damping: Array | None, relaxation: Array) -> float:
     """The least `stable_step` [s] of a fabric, or of all members of a batch."""
     limit = stable_step
     for _ in range(jnp.ndim(fabric.density)):
-        limit = eqx.filter_vmap(limit, in_axes=(None, 0, None))
-    return float(np.min(np.asarray(limit(mesh, fabric, membrane_damping))))
+        limit = eqx.filter_vmap(limit, in_axes=(None, 0, None, None))
+    return float(np.min(np.asarray(limit(mesh, fabric, damping, relaxation))))
 
 
 def grid_of(mesh: Mesh) -> tuple[tuple[int, int], tuple[float, float]] | None:

@@ -4,6 +4,7 @@ Strains, curvatures and laws are those of `r2s.Cloth`; here they give forces, fo
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -22,29 +23,48 @@ Vertices = Float[Array, "vertex 3"]
 def elastic_force(
     mesh: Mesh, fabric: Fabric, membrane_damping: Float[Array, ""], x: Vertices, v: Vertices
 ) -> Vertices:
-    """Forces [N] of membrane and bending with their viscosity on the vertices.
+    """Forces [N] of membrane and bending with Kelvin-Voigt viscosity on the vertices.
 
     - `membrane_damping`: damping time of the membrane, [s]; the fabric's holds for bending alone.
     - `x`, `v`: positions [m] and velocities [m/s].
     """
+    areas = mesh.samples.areas.reshape(-1)
+    laws, stretch = _samples_laws(mesh, fabric, x), partial(strains, mesh)
+    membrane = _resistance(laws, stretch, areas, membrane_damping, x, v)
+    return membrane + bending_force(mesh, fabric, x, v)
 
-    def stretch(x: Vertices) -> Array:
-        return strains(mesh, x)
 
+def membrane_stress(mesh: Mesh, fabric: Fabric, x: Vertices) -> Float[Array, "sample 3"]:
+    """Of all strain samples at positions [m], [N/m]."""
+    return _stresses(_samples_laws(mesh, fabric, x), strains(mesh, x))
+
+
+def membrane_force(mesh: Mesh, x: Vertices, stress: Float[Array, "sample 3"]) -> Vertices:
+    """Forces [N] of stresses [N/m] on the vertices."""
+    _, to_forces = jax.vjp(partial(strains, mesh), x)
+    return -to_forces(mesh.samples.areas.reshape(-1)[:, None] * stress)[0]
+
+
+def bending_force(mesh: Mesh, fabric: Fabric, x: Vertices, v: Vertices) -> Vertices:
+    """Forces [N] of bending with Kelvin-Voigt viscosity on the vertices."""
     bends = fabric.bending.bends(mesh)
 
     def bend(x: Vertices) -> Array:
         return fabric.bending.curvatures(mesh, bends.curvatures_at(x))
 
+    bent = fabric.bending.on_elements(mesh, bends.curvatures_at(x))
+    return _resistance(bent, bend, fabric.bending.areas(mesh), fabric.damping, x, v)
+
+
+def _samples_laws(mesh: Mesh, fabric: Fabric, x: Vertices) -> Any:
+    """The membrane law of every strain sample, in a row."""
     strain = mesh.samples.strains(x)
     laws = membrane_on_samples(mesh.samples, fabric.membrane, fabric.bending, strain)
-    stretched = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), laws)
-    membrane = _resistance(
-        stretched, stretch, mesh.samples.areas.reshape(-1), membrane_damping, x, v
-    )
-    bent = fabric.bending.on_elements(mesh, bends.curvatures_at(x))
-    areas = fabric.bending.areas(mesh)
-    return membrane + _resistance(bent, bend, areas, fabric.damping, x, v)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), laws)
+
+
+def _stresses(laws: Any, strain: Array) -> Array:
+    return jax.vmap(lambda law, s: jax.grad(law.energy_density)(s))(laws, strain)
 
 
 def _resistance(
@@ -57,11 +77,8 @@ def _resistance(
 ) -> Vertices:
     """Minus the derivative in x of the energy of a strain measure, with its viscosity [N]."""
 
-    def stresses(strain: Array) -> Array:
-        return jax.vmap(lambda law, s: jax.grad(law.energy_density)(s))(laws, strain)
-
     strain, rate = jax.jvp(measure, (x,), (v,))
-    stress, viscous = jax.jvp(stresses, (strain,), (rate,))
+    stress, viscous = jax.jvp(partial(_stresses, laws), (strain,), (rate,))
     _, to_forces = jax.vjp(measure, x)
     areas = areas if strain.ndim == 1 else areas[:, None]
     return -to_forces(areas * (stress + damping * viscous))[0]

@@ -12,9 +12,10 @@ from jaxtyping import Array
 
 from r2s.fabrics.fabric import Fabric
 from r2s.forces.grid_bending import bending_force, twists
-from r2s.forces.grid_membrane import Wrinkles, membrane_force
+from r2s.forces.grid_membrane import Samples, membrane_force
 from r2s.forces.laws import Response, critical_stress, response
 from r2s.forces.layout import Layout, is_cell, part
+from r2s.forces.viscosity import Viscosity
 from r2s.geometry.vectors import Vector, add, cross, dot, scale, subtract
 from r2s.once import once
 from r2s.world.air import STILL, Air
@@ -24,47 +25,55 @@ class GridLaws(NamedTuple):
     """A fabric as the grid's forces need it; all that does not change from substep to substep.
 
     - `critical`: compressive stress at which cells buckle (2, ...) [N/m]; None: they do not.
-    - `damping`, `membrane_damping`: damping times of bending and membrane, [s].
+    - `damping`: damping time of bending, [s]. `viscosity`: of the membrane.
     """
 
     membrane: Response
     bending: Response
     critical: Array | None
     damping: Array
-    membrane_damping: Array
+    viscosity: Viscosity
 
 
-def laws_on_grid(
-    layout: Layout, fabric: Fabric, membrane_damping: Array, wrinkling: bool
-) -> GridLaws:
-    """Of a fabric whose arrays have the members, if any, as their last axis."""
+def laws_on_grid(layout: Layout, fabric: Fabric, viscosity: Viscosity, wrinkling: bool) -> GridLaws:
+    """Of a fabric whose arrays have the members, if any, as their last axis.
+
+    The viscosity fits arrays (place, member).
+    """
     waves = 2 * np.pi / layout.spacing[0], 2 * np.pi / layout.spacing[1]
     return GridLaws(
         response(fabric.membrane, layout.batched),
         response(fabric.bending, layout.batched),
         critical_stress(fabric, waves, layout.batched) if wrinkling else None,
         layout.row(fabric.damping),
-        layout.row(membrane_damping),
+        viscosity,
     )
 
 
 def grid_force(
-    layout: Layout, laws: GridLaws, air: Air, x: Vector, v: Vector, flow: Vector, hidden: Wrinkles
-) -> tuple[Vector, Wrinkles]:
-    """Forces [N] on the vertices, and the wrinkles at these positions.
+    layout: Layout,
+    laws: GridLaws,
+    air: Air,
+    x: Vector,
+    v: Vector,
+    flow: Vector,
+    samples: Samples,
+    begun: Array,
+) -> tuple[Vector, Samples]:
+    """Forces [N] on the vertices, and what the samples remember of this substep.
 
     - `x`, `v`: positions [m] and velocities [m/s], with room (`Layout`).
     - `air`: its numbers fit arrays (place, member).
     - `flow`: velocities less the wind's, [m/s].
-    - `hidden`: scaled wrinkles of the substep before.
+    - `samples`: of the substep before, if it has `begun`.
     """
     corners, rates = cell_corners(layout, x), cell_corners(layout, v)
-    of_cells, hidden = membrane_force(layout, laws, corners, rates, hidden)
+    of_cells, samples = membrane_force(layout, laws, corners, samples, begun)
     pushed = _drag(layout, air, corners, cell_corners(layout, flow))
     twisted = once(partial(twists, layout), corners, rates)
     of_twists, of_turns = bending_force(layout, laws, x, v, twisted)
     total = [add(a, b, pushed) for a, b in zip(of_cells, of_twists, strict=True)]
-    return add(to_vertices(layout, total), of_turns), hidden
+    return add(to_vertices(layout, total), of_turns), samples
 
 
 def cell_corners(layout: Layout, x: Vector) -> tuple[Vector, Vector, Vector, Vector]:

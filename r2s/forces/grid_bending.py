@@ -88,7 +88,7 @@ def bending_force(
     turned = once(partial(turns, layout), x, v)
     curvature = _curvature(layout, turned, twisted, "angle")
     rate = _curvature(layout, turned, twisted, "rate")
-    (warp, weft, twist), _ = laws.bending.stress(curvature, rate, laws.damping)
+    warp, weft, twist = laws.bending.damped(curvature, rate, laws.damping)
     areas = layout.constant(layout.vertex_areas, 0, warp)
     moments = areas * warp, areas * weft, areas * twist
     of_turns = [_turn_force(layout, axis, turned[axis], moments[axis]) for axis in (0, 1)]

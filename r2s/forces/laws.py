@@ -27,21 +27,33 @@ class Response(NamedTuple):
     stiffness: Array | None
     batched: bool
 
-    def stress(self, strain: Vector, rate: Vector, damping: Array) -> tuple[Vector, Array]:
-        """Stress with its viscosity, and stiffness at zero strain (3, 3, ...).
+    def elastic(self, strain: Vector) -> tuple[Vector, Array]:
+        """Stress, and stiffness at zero strain (3, 3, ...)."""
+        if self.stiffness is not None:
+            return self._linear(strain), self.stiffness
+        (one, two, three), _, stiffness = self._of_places(strain, strain)
+        return (one, two, three), stiffness
+
+    def damped(self, strain: Vector, rate: Vector, damping: Array) -> Vector:
+        """Stress with Kelvin-Voigt viscosity.
 
         - `rate`: of the strain, [1/s]; `damping`: damping time, [s].
         """
         if self.stiffness is not None:
-            strained = add(strain, scale(damping, rate))
-            one, two, three = (dot((row[0], row[1], row[2]), strained) for row in self.stiffness)
-            return (one, two, three), self.stiffness
-        both = jnp.stack(strain), jnp.stack(rate)
+            return self._linear(add(strain, scale(damping, rate)))
+        (one, two, three), viscous, _ = self._of_places(strain, rate)
+        return add((one, two, three), scale(damping, tuple(viscous)))
+
+    def _linear(self, strain: Vector) -> Vector:
+        assert self.stiffness is not None
+        one, two, three = (dot((row[0], row[1], row[2]), strain) for row in self.stiffness)
+        return one, two, three
+
+    def _of_places(self, strain: Vector, rate: Vector):
         of_places = jax.vmap(_stresses, in_axes=(None, 1, 1), out_axes=-1)
         if self.batched:
             of_places = jax.vmap(of_places, in_axes=-1, out_axes=-1)
-        (one, two, three), viscous, stiffness = of_places(self.law, *both)
-        return add((one, two, three), scale(damping, tuple(viscous))), stiffness
+        return of_places(self.law, jnp.stack(strain), jnp.stack(rate))
 
 
 def response(law: Any, batched: bool) -> Response:

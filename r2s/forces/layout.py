@@ -76,24 +76,24 @@ class Layout(NamedTuple):
         """A number of each member, for arrays (place, member)."""
         return number[None] if self.batched else number
 
-    def to_cells(self, samples: Array) -> tuple[Vector, ...]:
-        """Vectors (cell, sample, 3, ...) of the cells alone, for each sample at all places."""
+    def to_cells(self, samples: Array) -> Vector:
+        """Vectors (cell, sample, 3, ...) of the cells alone: a row of all places of each sample."""
         rows, columns = self.shape
-        found = []
-        for sample in range(samples.shape[1]):
-            of_sample = samples[:, sample].reshape(rows - 1, columns - 1, *samples.shape[2:])
-            widths = [(0, 1), (0, 1)] + [(0, 0)] * (of_sample.ndim - 2)
-            flat = jnp.pad(of_sample, widths).reshape(self.count, *samples.shape[2:])
-            wide = self.padded(flat, -self.first_cell, 0)
-            found.append((wide[:, 0], wide[:, 1], wide[:, 2]))
-        return tuple(found)
+        cells = samples.reshape(rows - 1, columns - 1, *samples.shape[1:])
+        widths = [(0, 1), (0, 1)] + [(0, 0)] * (cells.ndim - 2)
+        flat = jnp.pad(cells, widths).reshape(self.count, *samples.shape[1:])
+        wide = jnp.moveaxis(self.padded(flat, -self.first_cell, 0), 1, 0)
+        row = wide.reshape(-1, *samples.shape[2:])
+        return row[:, 0], row[:, 1], row[:, 2]
 
-    def from_cells(self, samples: tuple[Vector, ...]) -> Array:
+    def from_cells(self, row: Vector) -> Array:
         """The reverse of `to_cells`."""
         rows, columns = self.shape
-        both = jnp.stack([jnp.stack(each, axis=1) for each in samples], axis=1)
-        both = both[-self.first_cell :].reshape(*self.shape, *both.shape[1:])
-        return both[:-1, :-1].reshape((rows - 1) * (columns - 1), *both.shape[2:])
+        both = jnp.stack(row, axis=1)
+        wide = both.reshape(-1, self.length(self.first_cell), *both.shape[1:])
+        cells = jnp.moveaxis(wide[:, -self.first_cell :], 0, 1)
+        square = cells.reshape(*self.shape, *cells.shape[1:])[:-1, :-1]
+        return square.reshape((rows - 1) * (columns - 1), *cells.shape[1:])
 
     def flow(self, x: Vector, v: Vector, wind: Array, fan: Fan | None) -> Vector:
         """Velocities [m/s] less the wind's: one for all vertices (3, ...), or (vertex, 3, ...)."""

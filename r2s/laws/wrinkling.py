@@ -55,6 +55,7 @@ Tangents = Float[Array, "3 3 *sample"]
 # A `Vector` is a symmetric matrix (11, 22, sqrt(2) 12), of one sample or of all side by side.
 # Second and first derivative of the cost; a bound on the second; the unit; the most of wrinkles.
 Problem = tuple[Matrix, Vector, Number, Number, Number]
+Principal = tuple[Number, Number, Number, Number]  # see `_principal`
 
 
 class Prepared(NamedTuple):
@@ -203,20 +204,29 @@ def released(
     return _released(prepare_search(stiffness, critical), strain)
 
 
-def follow(law: Prepared, strain: Vector, rate: Vector, hidden: Vector) -> tuple[Vector, Vector]:
-    """The scaled wrinkles at a strain by one Newton step from those nearby, and their rate [1/s].
+def follow(law: Prepared, strain: Vector, hidden: Vector) -> Vector:
+    """The scaled wrinkles at a strain by one Newton step from those nearby."""
+    # in stages: XLA works each of a stage's results out from the beginning
+    problem = law.quadratic, law.offset, law.bound, law.width, law.most
+    principal = once(_principal_at, law, strain, hidden)
+    slope, short = once(_off, law, principal, hidden)
+    matrix = once(_off_balance, slope, problem)
+    return once(_followed, matrix, short, hidden)
 
-    `rate` is that of the strain, [1/s].
-    """
-    problem = _at_strain(law, strain)
-    before = _descended(hidden, problem)
-    slope = _limited_slope(before, law.most)
-    solved = inverse(_off_balance(slope, problem))
-    short = tuple(a - b for a, b in zip(hidden, _limited(before, law.most), strict=True))
-    one, two, three = (a - b for a, b in zip(hidden, times(solved, short), strict=True))
-    pushed = times(solved, times(slope, times(law.by_strain, rate)))
-    unit = -1 / law.bound
-    return (one, two, three), (unit * pushed[0], unit * pushed[1], unit * pushed[2])
+
+def _principal_at(law: Prepared, strain: Vector, hidden: Vector):
+    return _principal(_descended(hidden, _at_strain(law, strain)))
+
+
+def _off(law: Prepared, principal, hidden: Vector):
+    limited = _limited_at(principal, law.most)
+    one, two, three = (a - b for a, b in zip(hidden, limited, strict=True))
+    return _slope_at(principal, law.most), (one, two, three)
+
+
+def _followed(matrix: Matrix, short: Vector, hidden: Vector) -> Vector:
+    one, two, three = (a - b for a, b in zip(hidden, solve(matrix, short), strict=True))
+    return one, two, three
 
 
 def relieved(law: Prepared, hidden: Vector) -> Vector:
@@ -375,7 +385,9 @@ def _hidden_jvp(primals, tangents):
             return _descended(hidden, problem), prepared.most
 
         _, (change, more) = jvp_of_moving(limit, prepared, tangents[0])
-        at_most = _of_principal(lambda value: jnp.clip((value - most + 1) / 2, 0, 1), before)
+        at_most = _of_principal(
+            lambda value: jnp.clip((value - most + 1) / 2, 0, 1), _principal(before)
+        )
         parts = zip(right, times(slope, change), at_most, strict=True)
         one, two, three = (a + b + more * c for a, b, c in parts)
         right = one, two, three
@@ -409,7 +421,7 @@ def _off_balance(slope: Matrix, problem: Problem) -> Matrix:
     return one, two, three
 
 
-def _principal(matrix: Vector) -> tuple[Number, Number, Number, Number]:
+def _principal(matrix: Vector) -> Principal:
     """Mean and radius of the principal values; cosine and sine of twice the first one's angle."""
     mean, half, shear = (matrix[0] + matrix[1]) / 2, (matrix[0] - matrix[1]) / 2, matrix[2] / ROOT
     squared = half**2 + shear**2
@@ -450,9 +462,9 @@ def _edge(inside: Number) -> Number:
     return jnp.where(inside > 0, 4 / 3 * inside * root - inside - inside**2 / 2, 0)
 
 
-def _of_principal(function: Callable[[Number], Number], matrix: Vector) -> Vector:
+def _of_principal(function: Callable[[Number], Number], principal: Principal) -> Vector:
     """The matrix with a function of its principal values."""
-    mean, radius, cosine, sine = _principal(matrix)
+    mean, radius, cosine, sine = principal
     high, low = function(mean + radius), function(mean - radius)
     middle, half = (high + low) / 2, (high - low) / 2
     return middle + half * cosine, middle - half * cosine, ROOT * half * sine
@@ -460,13 +472,21 @@ def _of_principal(function: Callable[[Number], Number], matrix: Vector) -> Vecto
 
 @jax.jit
 def _limited(matrix: Vector, most: Number) -> Vector:
-    return _of_principal(lambda value: _between(value, most), matrix)
+    return _limited_at(_principal(matrix), most)
+
+
+def _limited_at(principal: Principal, most: Number) -> Vector:
+    return _of_principal(lambda value: _between(value, most), principal)
 
 
 @jax.jit
 def _limited_slope(matrix: Vector, most: Number) -> Matrix:
     """The derivative of `_limited`."""
-    mean, radius, cosine, sine = _principal(matrix)
+    return _slope_at(_principal(matrix), most)
+
+
+def _slope_at(principal: Principal, most: Number) -> Matrix:
+    mean, radius, cosine, sine = principal
     high, low = mean + radius, mean - radius
     along, across = (_between_slope(value, most) for value in (high, low))
     # differences of almost equal values are lost in rounding

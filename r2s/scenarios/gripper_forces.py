@@ -22,9 +22,9 @@ def step_with_forces(
     """`solver.step`, and the mean forces [N] of the grippers on the held vertices in that step.
 
     For the cloth they are the derivative of the step's potential in the place of the held vertices,
-    which vanishes for free ones; self-contact is left out. For explicit steps and material points they are the
-    momentum that the grippers give, over the step. Either has the weight and the inertia of the
-    held vertices in it. Raises `TypeError` for another solver.
+    which vanishes for free ones; self-contact is left out. In explicit steps and for
+    material points they are the momentum that the grippers give, over the step. All have the weight
+    and the inertia of the held vertices in them. Raises `TypeError` for another solver.
     """
     if isinstance(solver, Braked):
         fabric = solver.braked(fabric, state)
@@ -35,7 +35,9 @@ def step_with_forces(
         return after, _cloth_forces(solver, fabric, state, control, after)
     if isinstance(solver, ExplicitCloth | Sheet):
         return solver.step_with_forces(fabric, state, control)
-    raise TypeError(f"forces are known of Cloth, ExplicitCloth and Sheet, got {type(solver).__name__}")
+    raise TypeError(
+        f"forces are known of Cloth, ExplicitCloth and Sheet, got {type(solver).__name__}"
+    )
 
 
 def _cloth_forces(

@@ -2,7 +2,7 @@
 
 import math
 
-from r2s.cloth.explicit import MEMBRANE_DAMPING, ExplicitCloth
+from r2s.cloth.explicit import RELAXATION, ExplicitCloth
 from r2s.fabrics.fabric import Fabric
 from r2s.scenarios.scenario import Scenario
 
@@ -11,13 +11,16 @@ MAX_STEP = 1 / 120
 
 
 def explicit_cloth(
-    scenario: Scenario, fabric: Fabric, membrane_damping: float = MEMBRANE_DAMPING
+    scenario: Scenario,
+    fabric: Fabric,
+    membrane_damping: float | None = None,
+    relaxation: float = RELAXATION,
 ) -> ExplicitCloth:
     """A solver in explicit steps for a scenario: `rollout(scenario, fabric, solver=...)`.
 
     `fabric` is the stiffest that it will be used for, or a batch of all of them. The membrane's
-    damping time [s] is as in `r2s.cloth.explicit.ExplicitCloth`. The steps, of at most `MAX_STEP`,
-    fill the time between frames. Raises `ValueError` for a scenario with self-contact.
+    damping time and relaxation [s] are as in `r2s.ExplicitCloth.make`. The steps, of at most
+    `MAX_STEP`, fill the time between frames. Raises `ValueError` for a scenario with self-contact.
     """
     steps = max(scenario.substeps, math.ceil(scenario.interval / MAX_STEP - 1e-9))
     return ExplicitCloth.make(
@@ -25,5 +28,6 @@ def explicit_cloth(
         scenario.interval / steps,
         fabric,
         membrane_damping,
+        relaxation,
         self_contact=scenario.self_contact is not None,
     )
