@@ -23,7 +23,7 @@ import parts
 
 from r2s import files
 
-PARTS = ("hang", "lift", "compile", "scaling", "batch", "memory")
+PARTS = ("hang", "lift", "compile", "scaling", "batch", "explicit", "memory")
 
 
 def main(options: argparse.Namespace) -> None:

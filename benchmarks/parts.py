@@ -18,6 +18,10 @@ from measure import Row
 SCALING_FRAMES = 20  # of hang, a step each
 LIFT_AIMS = "aims: 0.15 s, 100 MB"
 SPREAD = 3.0  # of the stiffness and density in a batch, either way
+SPREADS = 1.1, 3.0  # of all numbers of the fabrics that are compared with implicit ones
+JUDGED = 4  # fabrics whose errors are known
+IMPLICIT = 1, 2, 4, 8, 16  # implicit steps in 1/60 s
+FINEST = 64  # of the reference
 
 
 def hang(options) -> list[Row]:
@@ -140,6 +144,92 @@ def _batched(name: str, function, members, singles, setting, options) -> Row:
         **measure.prefixed("together", row),
         **measure.prefixed("alone", apart),
     }
+
+
+def explicit(options) -> list[Row]:
+    """A batch of fabrics in explicit steps, against implicit steps of the same error, one by one.
+
+    Errors are distances of the first half second from implicit steps of 1/3840 s in float64, of the
+    first `JUDGED` members.
+    """
+    rows = []
+    for size in options.sizes or [9, 17]:
+        for spread in SPREADS:
+            random = np.random.default_rng(0)
+            members = _varied(scenes.fabric(options.damping), spread, options.members, random)
+            rows += _explicit(size, spread, members, options)
+    columns = {
+        "side": lambda row: str(row["size"]),
+        "spread": lambda row: f"{row['spread']:g}",
+        "steps": lambda row: row["steps"],
+        "error mm": lambda row: f"{row['error_mm']:.3f}",
+        "CPU s a fabric": lambda row: f"{row['cpu_s']:.4f}",
+        "explicit is faster": lambda row: f"{row['ratio']:.1f} x",
+        "built s": lambda row: f"{row['build_s']:.1f}",
+    }
+    title = f"explicit: hang of {options.members} fabrics together, implicit ones one by one"
+    measure.show(f"{title} (aims: 10 x at 9, 8 x at 17, of the same error)", rows, columns)
+    return rows
+
+
+def _varied(fabric, spread: float, count: int, random):
+    def factor():
+        return jnp.asarray(spread ** random.uniform(-1, 1, count), float)
+
+    return jax.tree.map(lambda leaf: leaf * factor(), fabric)
+
+
+def _explicit(size: int, spread: float, members, options) -> list[Row]:
+    """One explicit row, and those of implicit steps with their times over the explicit one."""
+    singles = [jax.tree.map(itemgetter(i), members) for i in range(options.members)]
+    measure.progress(f"explicit, {size} a side, spread {spread:g}: references")
+    truths = _references(size, singles[:JUDGED])
+    half = scenes.FRAMES // 2
+
+    def error(found) -> float:
+        pairs = zip(found, truths, strict=True)
+        return float(np.mean([1e3 * np.sqrt(((x - y) ** 2).sum(-1).mean()) for x, y in pairs]))
+
+    setting = scenes.explicit_hang(size, members)
+    batched = eqx.filter_vmap(scenes.motion, in_axes=(eqx.if_array(0), None, None, None))
+    run, seconds = measure.built(lambda: eqx.filter_jit(batched).lower(members, *setting).compile())
+    call = partial(_finished, run, members, *setting)
+    times, x = measure.timed(call, options.repeats, options.budget)
+    common = {"part": "explicit", "size": size, "spread": spread}
+    own = times["cpu_s"] / options.members
+    solver = setting[0]
+    rate = solver.substeps / solver.dt
+    rows: list[Row] = [{**common, "steps": f"{rate:.0f} explicit", "build_s": seconds}]
+    rows[0] |= {"error_mm": error(np.asarray(x)[:JUDGED, :half]), "cpu_s": own, "ratio": 1.0}
+    for substeps in IMPLICIT:
+        measure.progress(f"explicit, {size} a side: {60 * substeps} implicit steps")
+        setting = scenes.hang(size, substeps)
+        alone, seconds = measure.built(
+            partial(eqx.filter_jit(scenes.motion).lower(singles[0], *setting).compile)
+        )
+        some = singles[: max(JUDGED, options.members // 8)]
+        jax.block_until_ready(alone(singles[0], *setting))
+        runs = (partial(_finished, alone, one, *setting) for one in some)
+        each = [measure.timed(run, 1, 0.0) for run in runs]
+        spent = float(np.mean([row["cpu_s"] for row, _ in each]))
+        found = [np.asarray(x)[:half] for _, x in each[:JUDGED]]
+        row = {**common, "steps": f"{60 * substeps} implicit", "build_s": seconds}
+        rows.append(row | {"error_mm": error(found), "cpu_s": spent, "ratio": spent / own})
+    return rows
+
+
+def _finished(run, *arguments):
+    return jax.block_until_ready(run(*arguments))
+
+
+def _references(size: int, singles: list) -> list[np.ndarray]:
+    """The first half second of some fabrics, in float64."""
+    frames = scenes.FRAMES // 2
+    with jax.enable_x64(True):
+        setting = scenes.hang(size, FINEST, frames)
+        precise = [jax.tree.map(lambda leaf: leaf.astype(float), one) for one in singles]
+        run = eqx.filter_jit(scenes.motion).lower(precise[0], *setting).compile()
+        return [np.asarray(run(one, *setting)) for one in precise]
 
 
 def memory(options) -> list[Row]:

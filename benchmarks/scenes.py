@@ -28,6 +28,7 @@ MEMBRANE = tuple(
 )  # C11, C12, C22, C33, [N/m]
 BENDING = float(isotropic_bending(YOUNGS_MODULUS, POISSONS_RATIO, THICKNESS))  # [N m]
 FRAMES = 60  # of 1/60 s
+EXPLICIT_STEPS = 2  # in a frame, each of as many substeps as are needed
 LIFT_FRAMES, LIFT_STEP = 60, 0.04  # [s]
 LIFT_SHIFT = (0.25, 0.25, 0.5)  # [m]
 
@@ -63,6 +64,13 @@ def hang(size: int, substeps: int, frames: int = FRAMES):
     return solver, solver.init(x, acceleration=falling), controls
 
 
+def explicit_hang(size: int, fabric: r2s.Fabric, frames: int = FRAMES):
+    """As `hang`, in explicit steps of a frame, for a fabric or a batch of them."""
+    solver, start, controls = hang(size, EXPLICIT_STEPS, frames)
+    explicit = r2s.ExplicitCloth.make(solver.scene, solver.dt, fabric)
+    return explicit, explicit.init(start.x), controls
+
+
 def lift(size: int):
     """Fabric, solver, start and controls of "lift"."""
     mesh = sheet(size)
@@ -80,7 +88,7 @@ def loss(x: Motion, start: Float[Array, "vertex 3"]) -> Float[Array, ""]:
     return jnp.mean(jnp.sum((x - start) ** 2, axis=-1))
 
 
-def motion(fabric: r2s.Fabric, solver: r2s.Cloth, start: r2s.ClothState, controls: r2s.Control):
+def motion(fabric: r2s.Fabric, solver, start, controls: r2s.Control):
     """The positions [m] at the end of every frame."""
     return r2s.simulate(solver, fabric, start, controls).x
 

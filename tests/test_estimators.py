@@ -61,7 +61,7 @@ def estimated(small):
 
 def normal_at(problems, theta, scale=0.0):
     """By the program that a descent runs, which is compiled once for both."""
-    return descent._normal(problems, theta, jnp.asarray(scale, float), None)
+    return descent.normal_of(problems, theta, jnp.asarray(scale, float))
 
 
 AWAY = jnp.array([0.1, -0.2, 0.1, 0.3, 0.2, -0.1, 0.4])

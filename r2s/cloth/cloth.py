@@ -20,9 +20,7 @@ from r2s.fabrics.fabric import Fabric
 from r2s.failures import Failure, first_failure, no_failure
 from r2s.geometry.bends import unwrapped
 from r2s.geometry.elements import area_normals
-from r2s.geometry.strain_samples import on_samples
-from r2s.laws.membrane import MembraneLaw, stress_and_tangent
-from r2s.laws.wrinkling import membrane_on_samples
+from r2s.laws.wrinkling import membrane_on_samples, tangents_on_samples
 from r2s.world import contact
 from r2s.world.scene import Control, Scene
 
@@ -134,7 +132,7 @@ class Cloth(eqx.Module):
             mesh=mesh,
             fabric=fabric,
             membrane=membrane,
-            membrane_tangent=on_samples(_tangent, membrane, strain_anchor),
+            membrane_tangent=tangents_on_samples(membrane, strain_anchor),
             bending=fabric.bending.on_elements(mesh, bent),
             air=self.scene.air,
             table=self.scene.table,
@@ -204,11 +202,6 @@ def loss_tolerance(dt: float) -> float:
     itself differs by 0.18 mm from half of it.
     """
     return min(max(1e-5 * (60 * dt) ** 2, 1e-6), 1e-5)
-
-
-def _tangent(law: MembraneLaw, strain: Float[Array, " 3"]) -> Float[Array, "3 3"]:
-    """Stiffness [N/m] at a strain [-]."""
-    return stress_and_tangent(law, strain)[1]
 
 
 def _anchor(now: Array, before: Array) -> Array:

@@ -19,24 +19,43 @@ from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
 from r2s.estimation.mesh_bias import OtherMesh, mesh_bias
 from r2s.estimation.method import Budget, Progress, tell
-from r2s.estimation.prediction import Theta, explain, fabric_at
+from r2s.estimation.prediction import (
+    Theta,
+    compiled_predict,
+    compiled_sensitivities,
+    explain,
+    fabric_at,
+    motion_alone,
+)
 from r2s.estimation.problem import OWN, SHARED, UNITS, Problem, beginning
 from r2s.fabrics.fabric import Fabric
 from r2s.kept import kept
 
 INITIAL_DAMPING = 1e-2
-# of the prior's weight, which is about twice what a change by one standard error costs
-CLOSE = 5e-3
 STRICT, SCALES = 3.0, (3e-3, 0.015)  # of the spread, and between [m]: beyond lies an outlier
-PATIENCE = 6  # iterations without a gain
 HALVING, FEWEST = 3, 3  # iterations, after each of which half go on, but no fewer than this
 ROUGH = 3.0  # standard errors, by which places around an end lead apart
 
+
+class Stop(NamedTuple):
+    """When a descent has arrived.
+
+    - `close`: when its next step promises to gain less, over the prior's weight, which is about
+      twice what a change by one standard error costs.
+    - `patience`: when so many iterations gained less.
+    """
+
+    close: float
+    patience: int
+
+
+# At a tenth of a standard error, or, where another descent goes on from there, at a half.
+AT_THE_END, ON_THE_WAY = Stop(5e-3, 4), Stop(0.125, 2)
 Row = list[Descent]  # one iteration: the descents of all starts
 
 # compiled once in a process for all recordings of as many frames, knots and points
-_loss = kept(gauss_newton.loss_at)
-_normal = kept(gauss_newton.normal_at)
+_loss_from = kept(gauss_newton.loss_from)
+_normal_from = kept(gauss_newton.normal_from)
 _losses = eqx.filter_jit(eqx.filter_vmap(gauss_newton.loss_at, in_axes=(None, 0)))
 _normals = eqx.filter_jit(eqx.filter_vmap(gauss_newton.normal_at, in_axes=(None, 0, 0, None)))
 _propose = eqx.filter_jit(gauss_newton.propose)
@@ -155,8 +174,9 @@ def judged(
         bias = mesh_bias(problems, other_mesh, best, prior, budget.width)
         covariance = covariance + np.outer(bias, bias)
     seconds = found.seconds + time.perf_counter() - began
-    converged = _arrived(problems, stage, which, prior)
-    return collect(problems, found.rows, covariance, approach, seconds, converged, bias)
+    converged = _arrived(problems, stage, which, prior, _stop(budget, int(best.stage)))
+    loss = end_loss(problems, best.theta, budget.width)
+    return collect(problems, found.rows, covariance, approach, seconds, converged, loss, bias)
 
 
 def _begin(problems: Problems, budget: Budget, start, progress, key) -> Row:
@@ -189,9 +209,28 @@ def losses_of(
     tell(progress, "compiling the motion")
     losses = []
     for number, theta in enumerate(thetas, 1):
-        losses.append(float(_loss(problems, theta)))
+        losses.append(_loss(problems, theta))
         tell(progress, f"coarse search {number} of {len(thetas)}")
     return np.array(losses)
+
+
+def _loss(problems: Problems, theta: Theta) -> float:
+    pairs = _places(problems, theta)
+    return float(_loss_from(problems, [compiled_predict(*pair) for pair in pairs]))
+
+
+def normal_of(problems: Problems, theta: Theta, scale: Array, width: float | None = None) -> Normal:
+    """`gauss_newton.normal_at` in two programs, of which the larger depends on no cloud."""
+    found = [compiled_sensitivities(*pair, width) for pair in _places(problems, theta)]
+    return _normal_from(problems, theta, found, scale)
+
+
+def _places(problems: Problems, theta: Theta) -> list[tuple[Problem, Theta]]:
+    indices = (theta_indices(problems, which) for which in range(len(problems)))
+    return [
+        (motion_alone(problem), theta[jnp.asarray(index)])
+        for problem, index in zip(problems, indices, strict=True)
+    ]
 
 
 def _normals_of(
@@ -203,7 +242,7 @@ def _normals_of(
     """
     if jax.default_backend() == "cpu" or len(thetas) == 1:
         pairs = zip(thetas, scales, strict=True)
-        return [_normal(problems, theta, scale, width) for theta, scale in pairs]
+        return [normal_of(problems, theta, scale, width) for theta, scale in pairs]
     more = 2 ** math.ceil(math.log2(len(thetas))) - len(thetas)
     filled = (jnp.stack([*parts, *[parts[-1]] * more]) for parts in (thetas, scales))
     found = _normals(problems, *filled, width)
@@ -242,7 +281,9 @@ def _next(problems: Problems, budget: Budget, rows: list[Row]) -> Row | None:
     now = int(best.stage)
     stage = _rows_of_stage(rows, now)
     prior = _weight(problems, best.normal)
-    moving = [i for i in _kept(row, len(stage)) if not _arrived(problems, stage, i, prior)]
+    stop = _stop(budget, now)
+    kept_on = _kept(row, len(stage))
+    moving = [i for i in kept_on if not _arrived(problems, stage, i, prior, stop)]
     if not moving or len(stage) > budget.iterations:
         return _later(problems, budget, row)
     seen = _seen(problems, budget, now)
@@ -280,7 +321,7 @@ def _later(problems: Problems, budget: Budget, row: Row) -> Row | None:
     """
     which, best = _best(row)
     stage = int(best.stage) + 1
-    if stage > len(budget.shares) + 1:
+    if stage > _last_stage(budget):
         return None
     loose = best
     if _share(budget, stage) != _share(budget, stage - 1):
@@ -307,7 +348,7 @@ def covariance_at(
         seen, here = problems, end
         if share < 1:
             seen = tuple(beginning(problem, share) for problem in problems)
-            normal = _normal(seen, end.theta, end.scale, budget.width)
+            normal = normal_of(seen, end.theta, end.scale, budget.width)
             here = dataclasses.replace(end, normal=normal)
         prior = _weight(problems, here.normal)
         neighbours = _normals_around(seen, budget, here, prior, key)
@@ -337,23 +378,32 @@ def _best(row: Row) -> tuple[int, Descent]:
     return which, row[which]
 
 
-def _arrived(problems: Problems, stage: list[Row], start: int, prior) -> bool:
+def _last_stage(budget: Budget) -> int:
+    return len(budget.shares) + 1
+
+
+def _stop(budget: Budget, stage: int) -> Stop:
+    is_last = stage == _last_stage(budget)
+    return AT_THE_END if is_last and not budget.leads_on else ON_THE_WAY
+
+
+def _arrived(problems: Problems, stage: list[Row], start: int, prior, stop: Stop) -> bool:
     """Whether a descent is at its end.
 
-    It is when its next step promises to gain next to nothing, when its last `PATIENCE` iterations
-    have gained nothing, or when it diverged.
+    It is when its next step promises to gain next to nothing, when its latest iterations have
+    gained next to nothing, or when it diverged.
     """
     now = stage[-1][start]
     if not np.isfinite(float(now.normal.loss)):
         return True
-    least = CLOSE * float(prior)
+    least = stop.close * float(prior)
     if len(stage) > 1 and float(_remaining(problems, now, prior)) < least:
         return True
-    if len(stage) <= PATIENCE:
+    if len(stage) <= stop.patience:
         return False
     values = [
         float(_objective(problems, d.theta, d.normal.loss, prior))
-        for d in (stage[-1 - PATIENCE][start], now)
+        for d in (stage[-1 - stop.patience][start], now)
     ]
     return not values[1] < values[0] - least
 
@@ -394,6 +444,7 @@ def collect(
     approach: str,
     seconds: float,
     converged: bool | None,
+    loss: float,
     bias: Float[np.ndarray, " theta"] | None = None,
 ) -> Estimate:
     """The estimate of the best descent in the last of some iterations, from its covariance.
@@ -416,12 +467,19 @@ def collect(
         mesh_bias=None if bias is None else np.abs(bias[: space.dim]) * widths,
         correlation=of_fabric / np.outer(deviation, deviation),
         nuisances=nuisances(problems, np.asarray(best.theta), np.sqrt(np.diag(covariance))),
-        loss=float(_loss(problems, best.theta)),
+        loss=loss,
         losses=np.asarray(descents.normal.loss),
         history=np.asarray(values_of(jnp.asarray(descents.theta[..., : space.dim]))),
         seconds=seconds,
         converged=converged,
     )
+
+
+def end_loss(problems: Problems, theta: Theta, width: float | None = None) -> float:
+    """The loss [m^2] at the end of a descent, by the program that it has compiled already."""
+    pairs = _places(problems, theta)
+    found = [compiled_sensitivities(*pair, width)[0] for pair in pairs]
+    return float(_loss_from(problems, found))
 
 
 def nuisances(problems: Problems, theta: np.ndarray, deviation: np.ndarray) -> tuple[Nuisance, ...]:

@@ -15,6 +15,7 @@ limit, where ours arrived after 21, 22 and 16, and which gives no normal equatio
 the standard errors.
 """
 
+from collections.abc import Sequence
 from functools import partial
 
 import equinox as eqx
@@ -24,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from r2s.estimation import normal_equations
-from r2s.estimation.prediction import Theta, predict, sensitivities
+from r2s.estimation.prediction import Prediction, Sensitivity, Theta, predict, sensitivities
 from r2s.estimation.problem import OWN, SHARED, Problem
 
 Problems = tuple[Problem, ...]
@@ -101,15 +102,25 @@ def loss_at(
     - `loss`: of one recording; None: the robust one.
     - `scale`: of the robust loss [m], see `r2s.evaluation.losses.robust`.
     """
-    total = jnp.zeros((), theta.dtype)
-    for which, (problem, share) in enumerate(
-        zip(problems, recording_weights(problems), strict=True)
-    ):
-        seen = predict(problem, theta[theta_indices(problems, which)])
+    seen = [predict(each, theta[theta_indices(problems, i)]) for i, each in enumerate(problems)]
+    return loss_from(problems, seen, loss, scale)
+
+
+def loss_from(
+    problems: Problems,
+    seen: Sequence[Prediction],
+    loss: normal_equations.Loss | None = None,
+    scale: normal_equations.Scale = 0.0,
+) -> Float[Array, ""]:
+    """`loss_at` a theta from what it predicts of each recording."""
+    total = jnp.zeros((), float)
+    for problem, share, found in zip(problems, recording_weights(problems), seen, strict=True):
         value = (
-            normal_equations.loss_of(problem, seen, scale) if loss is None else loss(problem, seen)
+            normal_equations.loss_of(problem, found, scale)
+            if loss is None
+            else loss(problem, found)
         )
-        total += share * jnp.where(seen.ok, value, jnp.inf)
+        total += share * jnp.where(found.ok, value, jnp.inf)
     return total
 
 
@@ -124,12 +135,26 @@ def normal_at(
     - `scale`: of the robust loss [m], see `r2s.evaluation.losses.robust`.
     - `width`: over which slopes are taken, see `r2s.estimation.prediction.sensitivities`.
     """
+    found = [
+        sensitivities(each, theta[theta_indices(problems, i)], width)
+        for i, each in enumerate(problems)
+    ]
+    return normal_from(problems, theta, found, scale)
+
+
+def normal_from(
+    problems: Problems,
+    theta: Theta,
+    predicted: Sequence[tuple[Prediction, Sensitivity]],
+    scale: normal_equations.Scale = 0.0,
+) -> Normal:
+    """`normal_at` a theta from what it predicts of each recording, and its derivative."""
     losses, spreads, scores, matrices, noise = [], [], [], [], []
-    for which, (problem, share) in enumerate(
-        zip(problems, recording_weights(problems), strict=True)
+    weights = recording_weights(problems)
+    for which, (problem, share, (seen, slope)) in enumerate(
+        zip(problems, weights, predicted, strict=True)
     ):
         index = theta_indices(problems, which)
-        seen, slope = sensitivities(problem, theta[index], width)
         found = normal_equations.normal_equations_of(problem, seen, slope, scale)
         losses.append(share * jnp.where(seen.ok, found.loss, jnp.inf))
         spreads.append(share * found.spread**2)

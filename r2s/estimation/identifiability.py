@@ -34,7 +34,7 @@ def sensitivity(problems: Problem | Problems, fabric: Fabric) -> Estimate:
     nuisances = jnp.zeros(gauss_newton.theta_length(problems) - space.dim, float)
     theta = jnp.concatenate([place, nuisances])
     scale = jnp.asarray(NOISE, float)
-    normal = _normal(problems, theta, scale)
+    normal = descent.normal_of(problems, theta, scale)
     if not np.isfinite(float(normal.loss)):
         which = gauss_newton.theta_indices(problems, 0)
         why = explain(problems[0], theta[which]) or "has a loss that is not finite"
@@ -43,10 +43,8 @@ def sensitivity(problems: Problem | Problems, fabric: Fabric) -> Estimate:
     end = Descent(theta, normal, zero, zero, scale, jnp.zeros((), int))
     key = jax.random.key(0)
     covariance = descent.covariance_at(problems, descent.DEFAULT, end, key, is_truth=True)
-    return descent.collect(problems, [[end]], covariance, "sensitivity", 0.0, None)
-
-
-_normal = eqx.filter_jit(gauss_newton.normal_at)
+    loss = descent.end_loss(problems, theta)
+    return descent.collect(problems, [[end]], covariance, "sensitivity", 0.0, None, loss)
 
 
 class FixedParameter(ParameterSpace):

@@ -21,14 +21,17 @@ from r2s.estimation.gauss_newton import (
     theta_indices,
     theta_length,
 )
-from r2s.estimation.prediction import Sensitivity, predict, sensitivities
+from r2s.estimation.prediction import (
+    Sensitivity,
+    compiled_predict,
+    compiled_sensitivities,
+    motion_alone,
+)
 from r2s.estimation.problem import Problem
 from r2s.geometry.surface import nearest
 from r2s.kept import kept
 from r2s.scenarios.resolution import ORDER
 
-_predict = kept(predict)
-_sensitivities = kept(sensitivities)
 _equations = kept(normal_equations.normal_equations_of)
 
 
@@ -63,9 +66,10 @@ def mesh_bias(
     for which, share in enumerate(recording_weights(problems)):
         index = theta_indices(problems, which)
         here, there, theta = problems[which], other.problems[which], end.theta[index]
-        seen, slope = _sensitivities(here, theta, width)
+        seen, slope = compiled_sensitivities(motion_alone(here), theta, width)
         laid = _laid_onto(here, there, slope)
-        for side, each in enumerate([(here, seen, slope), (there, _predict(there, theta), laid)]):
+        finer = compiled_predict(motion_alone(there), theta)
+        for side, each in enumerate([(here, seen, slope), (there, finer, laid)]):
             found = _equations(*each, end.scale)
             gradients[side, index] += share * np.asarray(found.scores).sum(axis=0)
             matrix = share * np.asarray(found.matrices).sum(axis=0)

@@ -1,22 +1,32 @@
 """From a coarse mesh to one that resolves the fabric that was found.
 
-The search over all of the range is made on the coarsest mesh. Where `r2s.scenarios.resolution`
-says that the fabric found there needs a finer one, the descent goes on from it on the next, with
-the nuisances that were found.
+The search over all of the range is made on the coarsest mesh, and ends early. Where
+`r2s.scenarios.resolution` says that the fabric found there needs a finer one, the descent goes on
+from it on the next, with the nuisances that were found; else it goes on to its end.
 """
 
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
+from r2s.estimation.ahead import compiling_ahead
 from r2s.estimation.descent import Search, judged, search
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.mesh_bias import OtherMesh, factor
 from r2s.estimation.method import Budget, Progress, tell
+from r2s.estimation.prediction import (
+    compiled_predict,
+    compiled_sensitivities,
+    motion_alone,
+    theta_length,
+)
 from r2s.estimation.problem import Problem
+from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace
+from r2s.kept import Kept
 from r2s.recordings.recording import Recording
 from r2s.scenarios import resolution
 from r2s.scenarios.resolution import Shape
@@ -42,24 +52,48 @@ def descend_by_meshes(
     would be finer than all of `r2s.scenarios.resolution.LADDER`.
     """
 
-    def climb(shapes: list[Shape], before: Search | None, path: Path | None) -> Search:
+    def climb(shapes: list[Shape], before: Search | None, leads_on: bool) -> Search:
         start, more = (None, budget) if before is None else (before.theta, near(budget))
+        path = checkpoint
+        if path and before is not None:
+            rows, columns = shapes[0]
+            path = path.with_suffix(f".{rows}x{columns}{'' if leads_on else '.end'}.npz")
         problems = _problems(recordings, space, shapes)
+        more = more._replace(leads_on=leads_on)
         return search(problems, more, start=start, checkpoint=path, progress=progress, key=key)
 
     rungs = [[shape] * len(recordings)] if shape else ladder(recordings)
-    found = climb(rungs[0], None, checkpoint)
-    last = rungs[0]
-    for finer in rungs[1:]:
-        if not is_too_coarse(recordings, found, last):
-            break
-        rows, columns = finer[0]
-        path = checkpoint and checkpoint.with_suffix(f".{rows}x{columns}.npz")
-        found, last = climb(finer, found, path), finer
-    tell(progress, "standard errors")
-    other = _other_mesh(recordings, space, last)
-    estimate = judged(found, budget, other_mesh=other, key=key)
+    found = None
+    with compiling_ahead() as prepare:
+        for function, problem in _needed(recordings, space, rungs):
+            theta = jnp.zeros(theta_length(problem), float)
+            more = (budget.width,) if function is compiled_sensitivities else ()
+            prepare(function, motion_alone(problem), theta, *more)
+        for last in rungs[:-1]:
+            found = climb(last, found, True)
+            if not is_too_coarse(recordings, found.fabric, last):
+                break
+        else:
+            last = rungs[-1]
+        found = climb(last, found, False)
+        tell(progress, "standard errors")
+        other = _other_mesh(recordings, space, last)
+        estimate = judged(found, budget, other_mesh=other, key=key)
     return dataclasses.replace(estimate, shape=last[_largest(recordings)])
+
+
+def _needed(
+    recordings: Recordings, space: ParameterSpace, rungs: Sequence[Sequence[Shape]]
+) -> list[tuple[Kept, Problem]]:
+    """The programs that will be needed if the fabric is that in the middle of the space."""
+    found: list[tuple[Kept, Problem]] = []
+    for shapes in rungs:
+        problems = _problems(recordings, space, shapes)
+        found += [(compiled_sensitivities, problem) for problem in problems]
+        if shapes is rungs[-1] or not is_too_coarse(recordings, space.middle(), shapes):
+            others = _other_mesh(recordings, space, shapes).problems
+            return found + [(compiled_predict, problem) for problem in others]
+    return found
 
 
 def ladder(recordings: Recordings) -> list[list[Shape]]:
@@ -67,10 +101,10 @@ def ladder(recordings: Recordings) -> list[list[Shape]]:
     return [list(rung) for rung in zip(*map(_meshes, recordings), strict=True)]
 
 
-def is_too_coarse(recordings: Recordings, found: Search, shapes: Sequence[Shape]) -> bool:
-    """Whether a mesh does not resolve the fabric that was found on it, in some recording."""
+def is_too_coarse(recordings: Recordings, fabric: Fabric, shapes: Sequence[Shape]) -> bool:
+    """Whether a mesh does not resolve a fabric, in some recording."""
     pairs = zip(recordings, shapes, strict=True)
-    return any(resolution.warning(found.fabric, *_motion(each, shape)) for each, shape in pairs)
+    return any(resolution.warning(fabric, *_motion(each, shape)) for each, shape in pairs)
 
 
 def near(budget: Budget) -> Budget:

@@ -43,8 +43,8 @@ class Budget(NamedTuple):
     - `starts`: how many of the best places are descended from, side by side. Of more than three
       descents the better half go on every three iterations, until three are left.
     - `iterations`: at most, of each stage of a descent. First all starts descend until each has
-      arrived, which is when its next step promises to change no parameter by more than about a
-      tenth of its standard error; then the best one descends with outliers left out. Of a method
+      arrived; then the best one descends with outliers left out, until its next step promises to
+      change no parameter by more than about a tenth of its standard error. Of a method
       that trains: its epochs.
     - `width`: over which slopes are taken, see `r2s.estimation.prediction.sensitivities`.
     - `shares`: of the frames, from the first, that count before all of them do. All starts descend
@@ -54,6 +54,8 @@ class Budget(NamedTuple):
     - `around`: an even number of places around the end, from which Gauss-Newton steps are taken;
       the standard errors grow by how far these steps end from it, see `descent.covariance_at`.
     - `evaluations`: simulations of a search without derivatives.
+    - `leads_on`: whether other descents go on from the end of these, on a finer mesh. Such a one
+      ends within about half a standard error, as all do that are not in the last stage.
     """
 
     coarse: int = 24
@@ -63,6 +65,7 @@ class Budget(NamedTuple):
     shares: tuple[float, ...] = ()
     around: int = 8
     evaluations: int = 80
+    leads_on: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -132,6 +132,24 @@ def given_way(law: Wrinkled, strain: Float[Array, "*sample 3"]) -> tuple[Columns
     return scale[None] * relief, -(scale / law.prepared.bound)[None, None] * softening
 
 
+def tangents_on_samples(
+    law: Any, strain: Float[Array, "element sample 3"]
+) -> Float[Array, "element sample 3 3"]:
+    """The stiffness [N/m] of every sample at its strain [-].
+
+    Wrinkles are found for all side by side: their derivative takes a tenth of the time it takes
+    sample by sample.
+    """
+    if not isinstance(law, Wrinkled):
+        return on_samples(lambda law, strain: stress_and_tangent(law, strain)[1], law, strain)
+    tangent = on_samples(lambda law, strain: stress_and_tangent(law, strain)[1], law.law, strain)
+    flat = jax.tree.map(jnp.ravel, law.prepared)
+    hidden = _hidden(flat, strain.reshape(-1, 3))
+    row = Wrinkled(None, law.critical, flat, hidden)
+    softening = jnp.moveaxis(given_way(row, strain.reshape(-1, 3))[1], -1, 0)
+    return tangent + softening.reshape(tangent.shape)
+
+
 def search(law: Any, strain: Float[Array, "element sample 3"], start: Any = None) -> Any:
     """The wrinkles of all samples at a strain [-], for `Wrinkled.hidden`, without derivatives.
 
