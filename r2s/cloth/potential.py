@@ -30,7 +30,14 @@ from r2s.geometry.mesh import Mesh
 from r2s.geometry.strain_samples import on_samples
 from r2s.laws.bending import BendingLaw
 from r2s.laws.membrane import MembraneLaw, stress_and_tangent
-from r2s.laws.wrinkling import Columns, Wrinkled, given_way, search, with_wrinkles
+from r2s.laws.wrinkling import (
+    Columns,
+    Wrinkled,
+    given_way,
+    search,
+    stress_on_samples,
+    with_wrinkles,
+)
 from r2s.once import once
 from r2s.units import GRAVITY
 from r2s.world import contact
@@ -85,8 +92,12 @@ def potential(step: IncrementalPotential, x: Positions, wrinkles: Any = None) ->
     """
     samples = step.mesh.samples
     membrane = on_samples(partial(_sample_energy, step), *_samples(step, x, wrinkles))
-    total = jnp.sum(samples.areas * membrane)
-    total += jnp.sum(_map(_drag_energy, step, _middles(step, x), *_drag(step)))
+    return jnp.sum(samples.areas * membrane) + _others(step, x)
+
+
+def _others(step: IncrementalPotential, x: Positions) -> Float[Array, ""]:
+    """The potential [J] without that of the membrane."""
+    total = jnp.sum(_map(_drag_energy, step, _middles(step, x), *_drag(step)))
     total += _bending_energy(step, _curvatures(step, x))
     total += jnp.sum(_map(_vertex_energy, step, x, *_vertices(step)))
     if step.contacts is None:
@@ -96,8 +107,16 @@ def potential(step: IncrementalPotential, x: Positions, wrinkles: Any = None) ->
 
 @jax.jit  # so that it is traced once for all uses in a motion and its derivatives
 def residual(step: IncrementalPotential, x: Positions) -> Positions:
-    """The derivative [N] of the potential; zero where the forces on every vertex balance."""
-    return jax.grad(potential, argnums=1)(step, x)
+    """The derivative [N] of the potential; zero where the forces on every vertex balance.
+
+    The membrane's is by its stress in closed form, whose derivatives are cheaper.
+    """
+    samples = step.mesh.samples
+    strain, to_forces = jax.vjp(samples.strains, x)
+    change = strain - step.strain_anchor
+    viscous = jnp.sum(step.membrane_tangent * change[:, :, None], axis=3)
+    stress = stress_on_samples(step.membrane, strain) + step.fabric.damping * step.rate * viscous
+    return to_forces(samples.areas[:, :, None] * stress)[0] + jax.grad(_others, argnums=1)(step, x)
 
 
 def find_wrinkles(step: IncrementalPotential, x: Positions, near: Any = None) -> Any:

@@ -1,6 +1,7 @@
 """What a process that makes cells has in its environment, before JAX looks at it."""
 
 import os
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
@@ -28,15 +29,16 @@ def one_thread(flags: str) -> str:
     return " ".join(part for part in parts if part)
 
 
-def one_core(number: int | None = None) -> None:
+def one_core(number: int | None = None) -> set[int]:
     """Bind this process to one of its cores: by a number, or the idlest.
 
     Before JAX begins: it makes as many threads as it then has cores, and these spin while they wait
     for each other. Beside other work a lift takes 2 to 8 CPU seconds instead of 0.11, whatever
-    XLA's flags say. Only Linux can bind processes; elsewhere nothing is done.
+    XLA's flags say. Only Linux can bind processes; elsewhere nothing is done. Gives the cores that
+    it had, none where it cannot be bound.
     """
     if not hasattr(os, "sched_setaffinity"):
-        return
+        return set()
     cores = sorted(os.sched_getaffinity(0))
     if number is None:
         psutil = require("psutil", "cli", "the search for an idle core")
@@ -44,6 +46,21 @@ def one_core(number: int | None = None) -> None:
         # some containers show their cores' times under other numbers
         number = min(range(len(cores)), key=lambda i: busy.get(cores[i], 0.0))
     os.sched_setaffinity(0, {cores[number % len(cores)]})
+    return set(cores)
+
+
+def any_core(cores: set[int]) -> None:
+    """Let all threads of this process run on some cores, once JAX has begun.
+
+    It made its threads for the one core that `one_core` left it, and keeps to as many; but what is
+    compiled ahead (`r2s.estimation.ahead`) runs beside it on another core.
+    """
+    import jax
+
+    jax.devices()
+    for thread in Path("/proc/self/task").iterdir() if cores else ():
+        with suppress(ProcessLookupError):
+            os.sched_setaffinity(int(thread.name), cores)
 
 
 def begin_worker(number: int | None = None) -> None:
