@@ -29,7 +29,8 @@ from r2s.commands.show import Show
 from r2s.commands.simulate import Simulate
 from r2s.commands.study import Study
 from r2s.commands.view import View
-from r2s.study.environment import any_core, one_core, one_thread
+from r2s.cores import COMPILE_ON
+from r2s.study.environment import one_core, one_thread
 
 NO_CACHE = "--no-cache"
 Command = (
@@ -86,8 +87,7 @@ def command() -> int:
     named = [each for each in sys.argv[1:] if each != NO_CACHE][:1]
     if named in (["simulate"], ["estimate"], ["view"]):  # others mostly compile
         cores = one_core()
-        if named == ["estimate"] and not {"-h", "--help"} & set(sys.argv):
-            any_core(cores)
+        os.environ.setdefault(COMPILE_ON, ",".join(map(str, sorted(cores))))
     if NO_CACHE in sys.argv:
         programs.forget()
     else:

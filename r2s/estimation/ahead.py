@@ -7,6 +7,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from r2s import programs
+from r2s.cores import compiling
 
 
 @contextmanager
@@ -14,7 +15,8 @@ def compiling_ahead() -> Iterator[Callable[..., None]]:
     """A function that compiles a `r2s.kept.Kept` for some arguments, one after the other.
 
     It returns at once. Who calls the kept function before it is ready waits for it. Nothing is
-    compiled ahead where no programs are kept. At the end what has not begun is left out.
+    compiled ahead where no programs are kept. It is on the cores of `r2s.cores.compiling`. At the
+    end what has not begun is left out.
     """
     more, waiting, is_over = threading.Condition(), deque[tuple[Any, tuple]](), False
 
@@ -26,7 +28,8 @@ def compiling_ahead() -> Iterator[Callable[..., None]]:
                     return
                 function, arguments = waiting.popleft()
             with suppress(Exception):  # it is raised again where the function is called
-                function.prepare(*arguments)
+                with compiling():
+                    function.prepare(*arguments)
 
     thread = threading.Thread(target=run, name="compiling ahead", daemon=True)
 

@@ -1,7 +1,6 @@
 """What a process that makes cells has in its environment, before JAX looks at it."""
 
 import os
-from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
@@ -47,20 +46,6 @@ def one_core(number: int | None = None) -> set[int]:
         number = min(range(len(cores)), key=lambda i: busy.get(cores[i], 0.0))
     os.sched_setaffinity(0, {cores[number % len(cores)]})
     return set(cores)
-
-
-def any_core(cores: set[int]) -> None:
-    """Let all threads of this process run on some cores, once JAX has begun.
-
-    It made its threads for the one core that `one_core` left it, and keeps to as many; but what is
-    compiled ahead (`r2s.estimation.ahead`) runs beside it on another core.
-    """
-    import jax
-
-    jax.devices()
-    for thread in Path("/proc/self/task").iterdir() if cores else ():
-        with suppress(ProcessLookupError):
-            os.sched_setaffinity(int(thread.name), cores)
 
 
 def begin_worker(number: int | None = None) -> None:
