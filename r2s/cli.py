@@ -29,7 +29,6 @@ from r2s.commands.show import Show
 from r2s.commands.simulate import Simulate
 from r2s.commands.study import Study
 from r2s.commands.view import View
-from r2s.cores import COMPILE_ON
 from r2s.study.environment import one_core, one_thread
 
 NO_CACHE = "--no-cache"
@@ -86,8 +85,7 @@ def command() -> int:
     os.environ["XLA_FLAGS"] = one_thread(os.environ.get("XLA_FLAGS", ""))  # JAX has not begun yet
     named = [each for each in sys.argv[1:] if each != NO_CACHE][:1]
     if named in (["simulate"], ["estimate"], ["view"]):  # others mostly compile
-        cores = one_core()
-        os.environ.setdefault(COMPILE_ON, ",".join(map(str, sorted(cores))))
+        one_core()
     if NO_CACHE in sys.argv:
         programs.forget()
     else:

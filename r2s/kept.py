@@ -52,14 +52,6 @@ SETTINGS = (
 BEGAN = time.time() - time.process_time()  # [s], of this process, or a little later
 
 
-class _Slot:
-    """A program, or None while it is made."""
-
-    def __init__(self) -> None:
-        self.lock = threading.Lock()
-        self.program: Callable | None = None
-
-
 class Kept:
     """A function of pytrees, compiled as by `equinox.filter_jit`, and kept.
 
@@ -71,7 +63,7 @@ class Kept:
     def __init__(self, function: Callable) -> None:
         functools.update_wrapper(self, function)
         self._function, self._jitted = function, eqx.filter_jit(function)
-        self._ready: dict[Any, _Slot] = {}
+        self._ready: dict[Any, Callable] = {}
         self._lock = threading.Lock()
         _all.add(self)
 
@@ -95,11 +87,9 @@ class Kept:
         typed = tuple((type(part), part) for part in parts)  # 2 is not 2.0, though they are equal
         known = (tree, shapes, typed, static_tree, _settings())
         with self._lock:
-            slot = self._ready.setdefault(known, _Slot())
-        with slot.lock:  # others are made meanwhile, and those that are ready are called
-            if slot.program is None:
-                slot.program = self._make(dynamic, static, shapes)
-            return slot.program
+            if known not in self._ready:
+                self._ready[known] = self._make(dynamic, static, shapes)
+            return self._ready[known]
 
     def _make(self, dynamic: Any, static: Any, shapes: tuple) -> Callable:
         store = programs.kept()

@@ -173,7 +173,7 @@ def test_deviations_are_from_the_frames_on_which_places_agree(lifted, monkeypatc
         agree = iter(agree)
         monkeypatch.setattr(descent, "_disagreement", lambda *_: 0.0 if next(agree) else np.inf)
         seen = problems if share == 1 else (beginning(lifted, share),)
-        normal = descent._normal(seen, theta, zero, None)
+        normal = descent.normal_of(seen, theta, zero, None)
         end = Descent(theta, normal, zero, zero, zero, jnp.zeros((), int))
         return covariance_at(seen, budget, end, jr.key(0))
 

@@ -9,24 +9,15 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from r2s.estimation.ahead import compiling_ahead
 from r2s.estimation.descent import Search, judged, search
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.mesh_bias import OtherMesh, factor
 from r2s.estimation.method import Budget, Progress, tell
-from r2s.estimation.prediction import (
-    compiled_predict,
-    compiled_sensitivities,
-    motion_alone,
-    theta_length,
-)
 from r2s.estimation.problem import Problem
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace
-from r2s.kept import Kept
 from r2s.recordings.recording import Recording
 from r2s.scenarios import resolution
 from r2s.scenarios.resolution import Shape
@@ -64,36 +55,17 @@ def descend_by_meshes(
 
     rungs = [[shape] * len(recordings)] if shape else ladder(recordings)
     found = None
-    with compiling_ahead() as prepare:
-        for function, problem in _needed(recordings, space, rungs):
-            theta = jnp.zeros(theta_length(problem), float)
-            more = (budget.width,) if function is compiled_sensitivities else ()
-            prepare(function, motion_alone(problem), theta, *more)
-        for last in rungs[:-1]:
-            found = climb(last, found, True)
-            if not is_too_coarse(recordings, found.fabric, last):
-                break
-        else:
-            last = rungs[-1]
-        found = climb(last, found, False)
-        tell(progress, "standard errors")
-        other = _other_mesh(recordings, space, last)
-        estimate = judged(found, budget, other_mesh=other, key=key)
+    for last in rungs[:-1]:
+        found = climb(last, found, True)
+        if not is_too_coarse(recordings, found.fabric, last):
+            break
+    else:
+        last = rungs[-1]
+    found = climb(last, found, False)
+    tell(progress, "standard errors")
+    other = _other_mesh(recordings, space, last)
+    estimate = judged(found, budget, other_mesh=other, key=key)
     return dataclasses.replace(estimate, shape=last[_largest(recordings)])
-
-
-def _needed(
-    recordings: Recordings, space: ParameterSpace, rungs: Sequence[Sequence[Shape]]
-) -> list[tuple[Kept, Problem]]:
-    """The programs that will be needed if the fabric is that in the middle of the space."""
-    found: list[tuple[Kept, Problem]] = []
-    for shapes in rungs:
-        problems = _problems(recordings, space, shapes)
-        found += [(compiled_sensitivities, problem) for problem in problems]
-        if shapes is rungs[-1] or not is_too_coarse(recordings, space.middle(), shapes):
-            others = _other_mesh(recordings, space, shapes).problems
-            return found + [(compiled_predict, problem) for problem in others]
-    return found
 
 
 def ladder(recordings: Recordings) -> list[list[Shape]]:

@@ -28,16 +28,15 @@ def one_thread(flags: str) -> str:
     return " ".join(part for part in parts if part)
 
 
-def one_core(number: int | None = None) -> set[int]:
+def one_core(number: int | None = None) -> None:
     """Bind this process to one of its cores: by a number, or the idlest.
 
     Before JAX begins: it makes as many threads as it then has cores, and these spin while they wait
     for each other. Beside other work a lift takes 2 to 8 CPU seconds instead of 0.11, whatever
-    XLA's flags say. Only Linux can bind processes; elsewhere nothing is done. Gives the cores that
-    it had, none where it cannot be bound.
+    XLA's flags say. Only Linux can bind processes; elsewhere nothing is done.
     """
     if not hasattr(os, "sched_setaffinity"):
-        return set()
+        return
     cores = sorted(os.sched_getaffinity(0))
     if number is None:
         psutil = require("psutil", "cli", "the search for an idle core")
@@ -45,7 +44,6 @@ def one_core(number: int | None = None) -> set[int]:
         # some containers show their cores' times under other numbers
         number = min(range(len(cores)), key=lambda i: busy.get(cores[i], 0.0))
     os.sched_setaffinity(0, {cores[number % len(cores)]})
-    return set(cores)
 
 
 def begin_worker(number: int | None = None) -> None:
