@@ -67,7 +67,7 @@ def test_an_error_is_one_line_and_1(tmp_path: Path, capsys: pytest.CaptureFixtur
         (["simulate", "lifting", "--motion", "height", *out], "expects NAME=NUMBER"),
         (
             ["simulate", "wind", "--self-contact", "--solver", "points", *out],
-            "--self-contact is of the cloth",
+            "--self-contact is of the implicit cloth",
         ),
         (["estimate", str(tmp_path / "no.npz"), "--density", "0.2", *out], "no.npz: no such"),
         (["evaluate", "black_denim", str(tmp_path / "no.npz")], "no.npz: no such recording"),

@@ -368,8 +368,11 @@ def _by_strain(stiffness) -> Matrix:
 
 
 @jax.custom_jvp
-def _hidden(prepared: Prepared, strain: Float[Array, " 3"]) -> Vector:
-    """The scaled wrinkles that release most: descents, then a semismooth Newton method."""
+def _hidden(prepared: Prepared, strain: Float[Array, "*sample 3"]) -> Vector:
+    """The scaled wrinkles that release most: descents, then a semismooth Newton method.
+
+    Of one sample, or of all in a row.
+    """
     none = jnp.zeros_like(prepared.width)
     return _search(_at_strain(prepared, _columns(strain)), (none, none, none))
 
