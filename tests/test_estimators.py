@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.estimation import adam, cma_es, descent, diffcloud, gauss_newton, identifiability
+from r2s.estimation import (
+    adam,
+    cma_es,
+    compiled,
+    descent,
+    diffcloud,
+    gauss_newton,
+    identifiability,
+)
 from r2s.estimation.descent import Budget, descend
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.estimate_json import as_json, from_json
@@ -61,7 +69,7 @@ def estimated(small):
 
 def normal_at(problems, theta, scale=0.0):
     """By the program that a descent runs, which is compiled once for both."""
-    return descent.normal_of(problems, theta, jnp.asarray(scale, float))
+    return compiled.normal_at(problems, theta, jnp.asarray(scale, float))
 
 
 AWAY = jnp.array([0.1, -0.2, 0.1, 0.3, 0.2, -0.1, 0.4])

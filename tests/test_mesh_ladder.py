@@ -10,6 +10,7 @@ import pytest
 
 from r2s import scenarios
 from r2s.estimation import descent, mesh_ladder
+from r2s.estimation.compiled import derivatives_at
 from r2s.estimation.gauss_newton import theta_length
 from r2s.estimation.mesh_bias import OtherMesh, factor, mesh_bias
 from r2s.estimation.method import Budget
@@ -49,23 +50,26 @@ def end():
 @pytest.mark.slow(group="estimates")
 def test_the_same_mesh_has_no_bias(end):
     problems, found = end
-    bias = mesh_bias(problems, OtherMesh(problems, 1.0), found, jnp.asarray(1e-12))
+    seen = derivatives_at(problems, found.theta)
+    bias = mesh_bias(problems, OtherMesh(problems, 1.0), found, jnp.asarray(1e-12), seen)
     np.testing.assert_allclose(bias, 0, atol=1e-9)
 
 
 @pytest.mark.slow(group="estimates")
 def test_a_mesh_that_moves_like_a_stiffer_fabric_has_the_bias_of_that_stiffness(end):
     problems, found = end
+    seen = derivatives_at(problems, found.theta)
     other = OtherMesh((problem(1.05),), 2.0)
-    bias = mesh_bias(problems, other, found, jnp.asarray(1e-12))
+    bias = mesh_bias(problems, other, found, jnp.asarray(1e-12), seen)
     assert bias[0] * SPACE.ranges[0].width == pytest.approx(2 * np.log(1.05), rel=0.2)
 
 
 @pytest.mark.slow(group="estimates")
 def test_a_motion_that_fails_leaves_the_whole_range_in_doubt(end):
     problems, found = end
+    seen = derivatives_at(problems, found.theta)
     broken = eqx.tree_at(lambda p: p.scenario.path, problems[0], replace_fn=lambda p: p * jnp.nan)
-    bias = mesh_bias(problems, OtherMesh((broken,), 1.0), found, jnp.asarray(1e-12))
+    bias = mesh_bias(problems, OtherMesh((broken,), 1.0), found, jnp.asarray(1e-12), seen)
     np.testing.assert_allclose(np.abs(bias[:2]), 1)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.estimation import descent, gauss_newton
+from r2s.estimation import compiled, descent, gauss_newton
 from r2s.estimation.descent import Budget, covariance_at, descend, nuisances
 from r2s.estimation.estimate import describe
 from r2s.estimation.gauss_newton import Descent, Normal
@@ -179,7 +179,7 @@ def test_deviations_are_from_the_frames_on_which_places_agree(monkeypatch):
         agree = iter(agree)
         monkeypatch.setattr(descent, "_disagreement", lambda *_: 0.0 if next(agree) else np.inf)
         seen = problems if share == 1 else (beginning(lifted, share),)
-        normal = descent.normal_of(seen, theta, zero, None)
+        normal = compiled.normal_at(seen, theta, zero, None)
         end = Descent(theta, normal, zero, zero, zero, jnp.zeros((), int))
         return covariance_at(seen, budget, end, jr.key(0))
 

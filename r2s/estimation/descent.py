@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import math
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -15,21 +14,20 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation import checkpoint as checkpoints
 from r2s.estimation import gauss_newton, standard_errors
+from r2s.estimation.compiled import (
+    derivatives_at,
+    loss_from,
+    losses_at,
+    normal_at,
+    normals_at,
+)
 from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
 from r2s.estimation.mesh_bias import OtherMesh, mesh_bias
 from r2s.estimation.method import Budget, Progress, tell
-from r2s.estimation.prediction import (
-    Theta,
-    compiled_predict,
-    compiled_sensitivities,
-    explain,
-    fabric_at,
-    motion_alone,
-)
+from r2s.estimation.prediction import Theta, explain, fabric_at
 from r2s.estimation.problem import OWN, SHARED, UNITS, Problem, beginning
 from r2s.fabrics.fabric import Fabric
-from r2s.kept import kept
 
 INITIAL_DAMPING = 1e-2
 STRICT, SCALES = 3.0, (3e-3, 0.015)  # of the spread, and between [m]: beyond lies an outlier
@@ -53,11 +51,6 @@ class Stop(NamedTuple):
 AT_THE_END, ON_THE_WAY = Stop(5e-3, 4), Stop(0.125, 2)
 Row = list[Descent]  # one iteration: the descents of all starts
 
-# compiled once in a process for all recordings of as many frames, knots and points
-_loss_from = kept(gauss_newton.loss_from)
-_normal_from = kept(gauss_newton.normal_from)
-_losses = eqx.filter_jit(eqx.filter_vmap(gauss_newton.loss_at, in_axes=(None, 0)))
-_normals = eqx.filter_jit(eqx.filter_vmap(gauss_newton.normal_at, in_axes=(None, 0, 0, None)))
 _propose = eqx.filter_jit(gauss_newton.propose)
 _accept = eqx.filter_jit(gauss_newton.accept)
 _objective = eqx.filter_jit(gauss_newton.objective)
@@ -169,13 +162,13 @@ def judged(
     which, best = _best(found.rows[-1])
     stage, prior = _rows_of_stage(found.rows, int(best.stage)), _weight(problems, best.normal)
     covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1))
-    bias = None
+    predicted, bias = derivatives_at(problems, best.theta, budget.width), None
     if other_mesh is not None:
-        bias = mesh_bias(problems, other_mesh, best, prior, budget.width)
+        bias = mesh_bias(problems, other_mesh, best, prior, predicted)
         covariance = covariance + np.outer(bias, bias)
     seconds = found.seconds + time.perf_counter() - began
     converged = _arrived(problems, stage, which, prior, _stop(budget, int(best.stage)))
-    loss = end_loss(problems, best.theta, budget.width)
+    loss = loss_from(problems, [seen for seen, _ in predicted])
     return collect(problems, found.rows, covariance, approach, seconds, converged, loss, bias)
 
 
@@ -186,7 +179,7 @@ def _begin(problems: Problems, budget: Budget, start, progress, key) -> Row:
     nothing = jnp.zeros((count, gauss_newton.theta_length(problems) - dim), float)
     thetas = jnp.concatenate([places, nothing], axis=1).at[0, : len(start)].set(start)
     if budget.coarse:
-        losses = losses_of(_seen(problems, budget, 0), thetas, progress)
+        losses = losses_at(_seen(problems, budget, 0), thetas, progress)
         if not np.any(np.isfinite(losses)):
             theta = thetas[0, theta_indices(problems, 0)]
             raise RuntimeError(
@@ -197,56 +190,6 @@ def _begin(problems: Problems, budget: Budget, start, progress, key) -> Row:
         thetas = thetas[np.argsort(losses)]
     tell(progress, "compiling the derivatives")
     return _fresh(problems, budget, list(thetas[: budget.starts]), 0.0, 0)
-
-
-def losses_of(
-    problems: Problems, thetas: Float[Array, "start theta"], progress: Progress | None = None
-) -> np.ndarray:
-    """The losses [m^2] of many thetas, simulated together; on a CPU one by one, since it gains
-    nothing by simulating together."""
-    if jax.default_backend() != "cpu":
-        return np.asarray(_losses(problems, thetas))
-    tell(progress, "compiling the motion")
-    losses = []
-    for number, theta in enumerate(thetas, 1):
-        losses.append(_loss(problems, theta))
-        tell(progress, f"coarse search {number} of {len(thetas)}")
-    return np.array(losses)
-
-
-def _loss(problems: Problems, theta: Theta) -> float:
-    pairs = _places(problems, theta)
-    return float(_loss_from(problems, [compiled_predict(*pair) for pair in pairs]))
-
-
-def normal_of(problems: Problems, theta: Theta, scale: Array, width: float | None = None) -> Normal:
-    """`gauss_newton.normal_at` in two programs, of which the larger depends on no cloud."""
-    found = [compiled_sensitivities(*pair, width) for pair in _places(problems, theta)]
-    return _normal_from(problems, theta, found, scale)
-
-
-def _places(problems: Problems, theta: Theta) -> list[tuple[Problem, Theta]]:
-    indices = (theta_indices(problems, which) for which in range(len(problems)))
-    return [
-        (motion_alone(problem), theta[jnp.asarray(index)])
-        for problem, index in zip(problems, indices, strict=True)
-    ]
-
-
-def _normals_of(
-    problems: Problems, thetas: list, scales: list, width: float | None
-) -> list[Normal]:
-    """The normal equations at many thetas; see `losses_of`.
-
-    Together in numbers that are powers of two, so that few sizes are compiled.
-    """
-    if jax.default_backend() == "cpu" or len(thetas) == 1:
-        pairs = zip(thetas, scales, strict=True)
-        return [normal_of(problems, theta, scale, width) for theta, scale in pairs]
-    more = 2 ** math.ceil(math.log2(len(thetas))) - len(thetas)
-    filled = (jnp.stack([*parts, *[parts[-1]] * more]) for parts in (thetas, scales))
-    found = _normals(problems, *filled, width)
-    return [jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(len(thetas))]
 
 
 def _share(budget: Budget, stage: int) -> float:
@@ -267,7 +210,7 @@ def _fresh(problems: Problems, budget: Budget, thetas: list, scale: float, stage
         jnp.asarray(number, float) for number in (INITIAL_DAMPING, gauss_newton.GROWTH, scale)
     )
     seen = _seen(problems, budget, stage)
-    normals = _normals_of(seen, thetas, [limit] * len(thetas), budget.width)
+    normals = normals_at(seen, thetas, [limit] * len(thetas), budget.width)
     return [
         Descent(theta, normal, damping, growth, limit, jnp.asarray(stage))
         for theta, normal in zip(thetas, normals, strict=True)
@@ -288,7 +231,7 @@ def _next(problems: Problems, budget: Budget, rows: list[Row]) -> Row | None:
         return _later(problems, budget, row)
     seen = _seen(problems, budget, now)
     trials = [_propose(problems, row[i], prior) for i in moving]
-    tried = _normals_of(seen, trials, [row[i].scale for i in moving], budget.width)
+    tried = normals_at(seen, trials, [row[i].scale for i in moving], budget.width)
     after = list(row)
     for i, trial, normal in zip(moving, trials, tried, strict=True):
         after[i] = _accept(problems, row[i], trial, normal, prior)
@@ -348,7 +291,7 @@ def covariance_at(
         seen, here = problems, end
         if share < 1:
             seen = tuple(beginning(problem, share) for problem in problems)
-            normal = normal_of(seen, end.theta, end.scale, budget.width)
+            normal = normal_at(seen, end.theta, end.scale, budget.width)
             here = dataclasses.replace(end, normal=normal)
         prior = _weight(problems, here.normal)
         neighbours = _normals_around(seen, budget, here, prior, key)
@@ -366,7 +309,7 @@ def _normals_around(
     if not budget.around:
         return []
     places = list(_sample_around(problems, end, prior, budget.around, key))
-    normals = _normals_of(problems, places, [end.scale] * len(places), budget.width)
+    normals = normals_at(problems, places, [end.scale] * len(places), budget.width)
     return list(zip(places, normals, strict=True))
 
 
@@ -473,13 +416,6 @@ def collect(
         seconds=seconds,
         converged=converged,
     )
-
-
-def end_loss(problems: Problems, theta: Theta, width: float | None = None) -> float:
-    """The loss [m^2] at the end of a descent, by the program that it has compiled already."""
-    pairs = _places(problems, theta)
-    found = [compiled_sensitivities(*pair, width)[0] for pair in pairs]
-    return float(_loss_from(problems, found))
 
 
 def nuisances(problems: Problems, theta: np.ndarray, deviation: np.ndarray) -> tuple[Nuisance, ...]:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r2s.estimation import descent, gauss_newton
+from r2s.estimation import compiled, descent, gauss_newton
 from r2s.estimation.descent import Budget
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import Descent, Problems
@@ -34,7 +34,7 @@ def sensitivity(problems: Problem | Problems, fabric: Fabric) -> Estimate:
     nuisances = jnp.zeros(gauss_newton.theta_length(problems) - space.dim, float)
     theta = jnp.concatenate([place, nuisances])
     scale = jnp.asarray(NOISE, float)
-    normal = descent.normal_of(problems, theta, scale)
+    normal = compiled.normal_at(problems, theta, scale)
     if not np.isfinite(float(normal.loss)):
         which = gauss_newton.theta_indices(problems, 0)
         why = explain(problems[0], theta[which]) or "has a loss that is not finite"
@@ -43,7 +43,8 @@ def sensitivity(problems: Problem | Problems, fabric: Fabric) -> Estimate:
     end = Descent(theta, normal, zero, zero, scale, jnp.zeros((), int))
     key = jax.random.key(0)
     covariance = descent.covariance_at(problems, descent.DEFAULT, end, key, is_truth=True)
-    loss = descent.end_loss(problems, theta)
+    seen = [found for found, _ in compiled.derivatives_at(problems, theta)]
+    loss = compiled.loss_from(problems, seen)
     return descent.collect(problems, [[end]], covariance, "sensitivity", 0.0, None, loss)
 
 

@@ -6,13 +6,14 @@ that mesh it is extrapolated to one without end (Richardson), by the order of th
 `r2s.scenarios.resolution`.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r2s.estimation import normal_equations
+from r2s.estimation import compiled, normal_equations
 from r2s.estimation.gauss_newton import (
     Descent,
     Problems,
@@ -21,13 +22,8 @@ from r2s.estimation.gauss_newton import (
     theta_indices,
     theta_length,
 )
-from r2s.estimation.prediction import (
-    Sensitivity,
-    compiled_predict,
-    compiled_sensitivities,
-    motion_alone,
-)
-from r2s.estimation.problem import Problem
+from r2s.estimation.prediction import Prediction, Sensitivity
+from r2s.estimation.problem import Problem, motion_alone
 from r2s.geometry.surface import nearest
 from r2s.kept import kept
 from r2s.scenarios.resolution import ORDER
@@ -50,7 +46,11 @@ def factor(ratio: float) -> float:
 
 
 def mesh_bias(
-    problems: Problems, other: OtherMesh, end: Descent, prior: Array, width: float | None = None
+    problems: Problems,
+    other: OtherMesh,
+    end: Descent,
+    prior: Array,
+    predicted: Sequence[tuple[Prediction, Sensitivity]],
 ) -> Float[np.ndarray, " theta"]:
     """How far theta is from where meshes without end would lead, as far as one step says.
 
@@ -59,16 +59,16 @@ def mesh_bias(
     mesh tells nothing then.
 
     - `prior`: its weight, see `r2s.estimation.gauss_newton.prior_weight`.
-    - `width`: of slopes, see `r2s.estimation.prediction.sensitivities`.
+    - `predicted`: at the end, with its derivative (`r2s.estimation.compiled.derivatives_at`).
     """
     size = theta_length(problems)
     gradients, matrices = np.zeros((2, size)), np.zeros((2, size, size))
     for which, share in enumerate(recording_weights(problems)):
         index = theta_indices(problems, which)
         here, there, theta = problems[which], other.problems[which], end.theta[index]
-        seen, slope = compiled_sensitivities(motion_alone(here), theta, width)
+        seen, slope = predicted[which]
         laid = _laid_onto(here, there, slope)
-        finer = compiled_predict(motion_alone(there), theta)
+        finer = compiled.predicted(motion_alone(there), theta)
         for side, each in enumerate([(here, seen, slope), (there, finer, laid)]):
             found = _equations(*each, end.scale)
             gradients[side, index] += share * np.asarray(found.scores).sum(axis=0)

@@ -16,7 +16,6 @@ from jaxtyping import Array, Bool, Float
 
 from r2s.estimation.problem import OWN, SHARED, Problem
 from r2s.fabrics.fabric import Fabric
-from r2s.kept import kept
 from r2s.scenarios.energy import clamp_force, energy_balance
 from r2s.scenarios.scenario import rollout
 
@@ -95,14 +94,6 @@ def sensitivities(
         Prediction(seen_from(x), force, ok),
         Sensitivity(jnp.concatenate([slope_x, own], axis=-1), slope_force),
     )
-
-
-def motion_alone(problem: Problem) -> Problem:
-    """The problem without clouds and markers, on which no prediction depends.
-
-    What is compiled for it serves recordings of any number of points.
-    """
-    return dataclasses.replace(problem, clouds=None, markers=None)
 
 
 def _moving(problem: Problem) -> list[int]:
@@ -196,8 +187,3 @@ def _delayed(x: Float[Array, "all vertex 3"], delay: Float[Array, ""]) -> Array:
     slope, curve = (there - before) / 2, before - 2.5 * here + 2 * there - after / 2
     twist = (after - before) / 2 + 1.5 * (here - there)
     return here + part * (slope + part * (curve + part * twist))
-
-
-# compiled once in a process for all recordings of as many frames and knots, on a mesh
-compiled_predict = kept(predict)
-compiled_sensitivities = kept(sensitivities)

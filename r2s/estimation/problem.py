@@ -183,6 +183,11 @@ def window(problem: Problem, first: int, last: int) -> Problem:
     )
 
 
+def motion_alone(problem: Problem) -> Problem:
+    """The problem without clouds and markers, on which no prediction depends."""
+    return dataclasses.replace(problem, clouds=None, markers=None)
+
+
 def beginning(problem: Problem, share: float) -> Problem:
     """The problem with nothing seen after a share of the frames in which something was seen.
 

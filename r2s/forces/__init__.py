@@ -2,5 +2,7 @@
 
 - `elements`: of membrane and bending on any mesh, and bounds on their frequencies.
 - `grid`: the same on the grid of a `rectangle`, by slices; `layout`: how its arrays lie.
+- `viscosity`: of a membrane whose fast waves are not to shorten the steps; `stability`: how long
+  these may be.
 - `laws`: what the laws of one element say of arrays side by side.
 """

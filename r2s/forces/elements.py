@@ -15,7 +15,7 @@ from r2s.fabrics.fabric import Fabric
 from r2s.geometry.elements import strains, vertex_masses
 from r2s.geometry.mesh import Mesh
 from r2s.geometry.strain_samples import green_strain_gradient
-from r2s.laws.wrinkling import membrane_on_samples
+from r2s.laws.wrinkling import membrane_on_samples, stress_on_samples
 
 Vertices = Float[Array, "vertex 3"]
 
@@ -28,15 +28,19 @@ def elastic_force(
     - `membrane_damping`: damping time of the membrane, [s]; the fabric's holds for bending alone.
     - `x`, `v`: positions [m] and velocities [m/s].
     """
+    strain = mesh.samples.strains(x)
+    laws = membrane_on_samples(mesh.samples, fabric.membrane, fabric.bending, strain)
+    row = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), laws)
     areas = mesh.samples.areas.reshape(-1)
-    laws, stretch = _samples_laws(mesh, fabric, x), partial(strains, mesh)
-    membrane = _resistance(laws, stretch, areas, membrane_damping, x, v)
+    membrane = _resistance(row, partial(strains, mesh), areas, membrane_damping, x, v)
     return membrane + bending_force(mesh, fabric, x, v)
 
 
 def membrane_stress(mesh: Mesh, fabric: Fabric, x: Vertices) -> Float[Array, "sample 3"]:
     """Of all strain samples at positions [m], [N/m]."""
-    return _stresses(_samples_laws(mesh, fabric, x), strains(mesh, x))
+    strain = mesh.samples.strains(x)
+    laws = membrane_on_samples(mesh.samples, fabric.membrane, fabric.bending, strain)
+    return stress_on_samples(laws, strain).reshape(-1, 3)
 
 
 def membrane_force(mesh: Mesh, x: Vertices, stress: Float[Array, "sample 3"]) -> Vertices:
@@ -56,17 +60,6 @@ def bending_force(mesh: Mesh, fabric: Fabric, x: Vertices, v: Vertices) -> Verti
     return _resistance(bent, bend, fabric.bending.areas(mesh), fabric.damping, x, v)
 
 
-def _samples_laws(mesh: Mesh, fabric: Fabric, x: Vertices) -> Any:
-    """The membrane law of every strain sample, in a row."""
-    strain = mesh.samples.strains(x)
-    laws = membrane_on_samples(mesh.samples, fabric.membrane, fabric.bending, strain)
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), laws)
-
-
-def _stresses(laws: Any, strain: Array) -> Array:
-    return jax.vmap(lambda law, s: jax.grad(law.energy_density)(s))(laws, strain)
-
-
 def _resistance(
     laws: Any,
     measure: Callable[[Vertices], Array],
@@ -77,8 +70,11 @@ def _resistance(
 ) -> Vertices:
     """Minus the derivative in x of the energy of a strain measure, with its viscosity [N]."""
 
+    def stresses(strain: Array) -> Array:
+        return jax.vmap(lambda law, s: jax.grad(law.energy_density)(s))(laws, strain)
+
     strain, rate = jax.jvp(measure, (x,), (v,))
-    stress, viscous = jax.jvp(partial(_stresses, laws), (strain,), (rate,))
+    stress, viscous = jax.jvp(stresses, (strain,), (rate,))
     _, to_forces = jax.vjp(measure, x)
     areas = areas if strain.ndim == 1 else areas[:, None]
     return -to_forces(areas * (stress + damping * viscous))[0]

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -37,10 +38,12 @@ def longest_relaxing_step(
     amplitude changes its sign from step to step.
     """
     step = longest_step([(membrane, jnp.zeros((), float)), *others]) / SAFETY
-    for _ in range(STEPS):  # from above, each at least halves the missing orders of magnitude
+
+    def nearer(_, step):  # from above: each at least halves the missing orders of magnitude
         stiffer = membrane * (1 + 2 * damping / (2 * relaxation + step))
-        step = longest_step([(stiffer, jnp.zeros((), float)), *others]) / SAFETY
-    return SAFETY * step
+        return longest_step([(stiffer, jnp.zeros((), float)), *others]) / SAFETY
+
+    return SAFETY * jax.lax.fori_loop(0, STEPS, nearer, step)
 
 
 def check_step(dt: float, longest: Float[Array, ""], material: str) -> None:

@@ -15,7 +15,6 @@ there, but from half of it on (a term of the cost that is convex, too; along the
 stiff nearer to it), so that the stiffness has no jump: Newton's method goes to and fro over jumps.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -38,6 +37,17 @@ from r2s.geometry.vectors import (
 from r2s.laws.bending import BendingLaw
 from r2s.laws.membrane import MembraneLaw, stress_and_tangent
 from r2s.laws.moving_tangents import jvp_of_moving, moves
+from r2s.laws.wrinkle_limits import (
+    ROOT,
+    held_back,
+    limited,
+    limited_at,
+    limited_slope,
+    limits,
+    of_principal,
+    principal_of,
+    slope_at,
+)
 from r2s.once import once
 
 SHARE = 0.05  # of the resistance to compression that stays, so that no state is left without any
@@ -46,7 +56,6 @@ LEAST = 1e-3  # stiffness that wrinkles are found against, of the largest
 ONSET = 0.5  # of the critical stress, on either side of it, over which wrinkles begin
 FEWEST = 1e-5  # strain at which they begin at least, without bending
 MOST = 0.4  # Green strain that they hide: a cell without length (0.5) would have bends without end
-ROOT = 2**0.5
 # Of 100,000 fabrics and strains at random none needs more than 10 solves in float64.
 DESCENTS, SOLVES, CLOSE = 2, 12, 16  # the last in units of rounding
 
@@ -55,7 +64,6 @@ Tangents = Float[Array, "3 3 *sample"]
 # A `Vector` is a symmetric matrix (11, 22, sqrt(2) 12), of one sample or of all side by side.
 # Second and first derivative of the cost; a bound on the second; the unit; the most of wrinkles.
 Problem = tuple[Matrix, Vector, Number, Number, Number]
-Principal = tuple[Number, Number, Number, Number]  # see `_principal`
 
 
 class Prepared(NamedTuple):
@@ -122,8 +130,8 @@ def given_way(law: Wrinkled, strain: Float[Array, "*sample 3"]) -> tuple[Columns
     assert law.hidden is not None
     by_strain, hidden = law.prepared.by_strain, law.hidden
     problem = _at_strain(law.prepared, _columns(strain))
-    principal = once(lambda *at: _principal(_descended(*at)), hidden, problem)
-    slope = once(_slope_at, principal, problem[-1])
+    principal = once(_principal_at, law.prepared, _columns(strain), hidden)
+    slope = once(slope_at, principal, problem[-1])
     solved = once(lambda *system: inverse(_off_balance(*system)), slope, problem)
     scale = (1 - SHARE) * law.prepared.width**2
     relief = jnp.stack(times(transposed(by_strain), hidden))
@@ -247,13 +255,13 @@ def follow(law: Prepared, strain: Vector, hidden: Vector) -> Vector:
 
 
 def _principal_at(law: Prepared, strain: Vector, hidden: Vector):
-    return _principal(_descended(hidden, _at_strain(law, strain)))
+    return principal_of(_descended(hidden, _at_strain(law, strain)))
 
 
 def _off(law: Prepared, principal, hidden: Vector):
-    limited = _limited_at(principal, law.most)
-    one, two, three = (a - b for a, b in zip(hidden, limited, strict=True))
-    return _slope_at(principal, law.most), (one, two, three)
+    within = limited_at(principal, law.most)
+    one, two, three = (a - b for a, b in zip(hidden, within, strict=True))
+    return slope_at(principal, law.most), (one, two, three)
 
 
 def _followed(matrix: Matrix, short: Vector, hidden: Vector) -> Vector:
@@ -284,12 +292,12 @@ def _released_jvp(primals, tangents):
     change = jnp.zeros_like(value)
     if moves(tangents[0]):
 
-        def limited(prepared):
+        def released_and_most(prepared):
             quadratic, linear, bound, width, _ = _at_strain(prepared, _columns(strain))
             return -_cost_of(hidden, (quadratic, linear, bound, width, most)), prepared.most
 
-        _, (fixed, more) = jvp_of_moving(limited, prepared, tangents[0])
-        held = _held_back(_descended(hidden, problem), most)
+        _, (fixed, more) = jvp_of_moving(released_and_most, prepared, tangents[0])
+        held = held_back(_descended(hidden, problem), most)
         change = fixed + width**2 * bound * held * more
     if moves(tangents[1]):
         release = times(transposed(prepared.by_strain), hidden)
@@ -303,10 +311,10 @@ _released.defjvp(_released_jvp, symbolic_zeros=True)
 def _cost_of(hidden: Vector, problem: Problem) -> Number:
     """What hidden wrinkles cost [J/m^2], on the scales of `prepare_search`."""
     quadratic, linear, bound, width, most = problem
-    mean, radius, _, _ = _principal(hidden)
-    limits = _limits(mean + radius, most) + _limits(mean - radius, most)
+    mean, radius, _, _ = principal_of(hidden)
+    edges = limits(mean + radius, most) + limits(mean - radius, most)
     slope = times(quadratic, hidden)
-    return width**2 * (dot(hidden, slope) / 2 + dot(linear, hidden) + bound * limits)
+    return width**2 * (dot(hidden, slope) / 2 + dot(linear, hidden) + bound * edges)
 
 
 @jax.jit
@@ -383,12 +391,12 @@ def _search(problem: Problem, start: Vector) -> Vector:
     close = CLOSE * jnp.finfo(most.dtype).eps
 
     def descent(hidden, _):
-        return _limited(_descended(hidden, problem), most), None
+        return limited(_descended(hidden, problem), most), None
 
     def improve(state):
         hidden, _, count = state
         before = _descended(hidden, problem)
-        short = tuple(a - b for a, b in zip(hidden, _limited(before, most), strict=True))
+        short = tuple(a - b for a, b in zip(hidden, limited(before, most), strict=True))
         change = solve(_system(before, problem), short)
         off = sum(abs(part) for part in short) / (1 + sum(abs(part) for part in hidden))
         new = tuple(a - b for a, b in zip(hidden, change, strict=True))
@@ -406,7 +414,7 @@ def _hidden_jvp(primals, tangents):
     (prepared, strain), hidden = primals, _hidden(*primals)
     problem = _at_strain(prepared, _columns(strain))
     before, most = _descended(hidden, problem), prepared.most
-    slope = _limited_slope(before, most)
+    slope = limited_slope(before, most)
     none = jnp.zeros_like(hidden[0])
     right: Vector = none, none, none
     if moves(tangents[1]):
@@ -420,8 +428,8 @@ def _hidden_jvp(primals, tangents):
             return _descended(hidden, problem), prepared.most
 
         _, (change, more) = jvp_of_moving(limit, prepared, tangents[0])
-        at_most = _of_principal(
-            lambda value: jnp.clip((value - most + 1) / 2, 0, 1), _principal(before)
+        at_most = of_principal(
+            lambda value: jnp.clip((value - most + 1) / 2, 0, 1), principal_of(before)
         )
         parts = zip(right, times(slope, change), at_most, strict=True)
         one, two, three = (a + b + more * c for a, b, c in parts)
@@ -441,8 +449,8 @@ def _descended(hidden: Vector, problem) -> Vector:
 
 @jax.jit
 def _system(before: Vector, problem) -> Matrix:
-    """The derivative of the wrinkles' equation, hidden = _limited(descended), in them."""
-    return _off_balance(_limited_slope(before, problem[-1]), problem)
+    """The derivative of the wrinkles' equation, hidden = limited(descended), in them."""
+    return _off_balance(limited_slope(before, problem[-1]), problem)
 
 
 def _off_balance(slope: Matrix, problem: Problem) -> Matrix:
@@ -454,89 +462,3 @@ def _off_balance(slope: Matrix, problem: Problem) -> Matrix:
 
     one, two, three = ((entry(i, 0), entry(i, 1), entry(i, 2)) for i in range(3))
     return one, two, three
-
-
-def _principal(matrix: Vector) -> Principal:
-    """Mean and radius of the principal values; cosine and sine of twice the first one's angle."""
-    mean, half, shear = (matrix[0] + matrix[1]) / 2, (matrix[0] - matrix[1]) / 2, matrix[2] / ROOT
-    squared = half**2 + shear**2
-    has_axes = squared > jnp.finfo(squared.dtype).tiny
-    length = jnp.sqrt(jnp.where(has_axes, squared, 1))
-    radius = jnp.where(has_axes, length, 0)
-    return mean, radius, jnp.where(has_axes, half / length, 1), shear / length
-
-
-def _between(value: Number, most: Number) -> Number:
-    """The value between none and most; parabolas from 1 before these to 1 beyond."""
-    low = jnp.where(value < 1, jnp.clip(value + 1, 0, 2) ** 2 / 4, value)
-    return jnp.where(value > most - 1, most - jnp.clip(most + 1 - value, 0, 2) ** 2 / 4, low)
-
-
-def _between_slope(value: Number, most: Number) -> Number:
-    return jnp.clip((value + 1) / 2, 0, 1) * jnp.clip((most + 1 - value) / 2, 0, 1)
-
-
-def _limits(value: Number, most: Number) -> Number:
-    """The convex function between none and most whose proximal map is `_between`."""
-    left = most - value
-    return _edge(value) + jnp.where(left < 1, _edge(left) + 1 / 6, 0)
-
-
-def _held_back(before: Vector, most: Number) -> Number:
-    """By how much the principal values of `_limited` fall short of those before, near the most."""
-    mean, radius, _, _ = _principal(before)
-    parts = (
-        jnp.where(v > most - 1, v - _between(v, most), 0) for v in (mean + radius, mean - radius)
-    )
-    return sum(parts, start=jnp.zeros_like(mean))
-
-
-def _edge(inside: Number) -> Number:
-    inside = jnp.clip(inside, 0, 1)
-    root = jnp.sqrt(jnp.where(inside > 0, inside, 1))
-    return jnp.where(inside > 0, 4 / 3 * inside * root - inside - inside**2 / 2, 0)
-
-
-def _of_principal(function: Callable[[Number], Number], principal: Principal) -> Vector:
-    """The matrix with a function of its principal values."""
-    mean, radius, cosine, sine = principal
-    high, low = function(mean + radius), function(mean - radius)
-    middle, half = (high + low) / 2, (high - low) / 2
-    return middle + half * cosine, middle - half * cosine, ROOT * half * sine
-
-
-@jax.jit
-def _limited(matrix: Vector, most: Number) -> Vector:
-    return _limited_at(_principal(matrix), most)
-
-
-def _limited_at(principal: Principal, most: Number) -> Vector:
-    return _of_principal(lambda value: _between(value, most), principal)
-
-
-@jax.jit
-def _limited_slope(matrix: Vector, most: Number) -> Matrix:
-    """The derivative of `_limited`."""
-    return _slope_at(_principal(matrix), most)
-
-
-def _slope_at(principal: Principal, most: Number) -> Matrix:
-    mean, radius, cosine, sine = principal
-    high, low = mean + radius, mean - radius
-    along, across = (_between_slope(value, most) for value in (high, low))
-    # differences of almost equal values are lost in rounding
-    is_round = radius <= jnp.finfo(radius.dtype).eps ** (1 / 3) * (1 + abs(mean))
-    quotient = (_between(high, most) - _between(low, most)) / jnp.where(is_round, 1, 2 * radius)
-    turned = jnp.where(is_round, (along + across) / 2, quotient)
-    parts = (
-        (along, ((1 + cosine) / 2, (1 - cosine) / 2, sine / ROOT)),
-        (across, ((1 - cosine) / 2, (1 + cosine) / 2, -sine / ROOT)),
-        (turned, (-sine / ROOT, sine / ROOT, cosine)),
-    )
-
-    def entry(i, j):
-        terms = [weight * axis[i] * axis[j] for weight, axis in parts]
-        return terms[0] + terms[1] + terms[2]
-
-    a, b, c, d, e, f = (entry(*at) for at in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
-    return (a, b, c), (b, d, e), (c, e, f)

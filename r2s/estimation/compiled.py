@@ -1,0 +1,86 @@
+"""Loss and normal equations at many thetas, in compiled programs.
+
+What moves is compiled apart from what was seen of it, which is most of the work: one such program
+serves recordings of any number of points, all stages of a descent, and its end.
+"""
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from r2s.estimation import gauss_newton
+from r2s.estimation.gauss_newton import Normal, Problems, theta_indices
+from r2s.estimation.method import Progress, tell
+from r2s.estimation.prediction import Prediction, Sensitivity, Theta, predict, sensitivities
+from r2s.estimation.problem import Problem, motion_alone
+from r2s.kept import kept
+
+# compiled once in a process for all recordings of as many frames and knots, on a mesh
+predicted = kept(predict)
+_sensitivities = kept(sensitivities)
+_loss_from = kept(gauss_newton.loss_from)
+_normal_from = kept(gauss_newton.normal_from)
+_losses = eqx.filter_jit(eqx.filter_vmap(gauss_newton.loss_at, in_axes=(None, 0)))
+_normals = eqx.filter_jit(eqx.filter_vmap(gauss_newton.normal_at, in_axes=(None, 0, 0, None)))
+
+
+def derivatives_at(
+    problems: Problems, theta: Theta, width: float | None = None
+) -> list[tuple[Prediction, Sensitivity]]:
+    """What each recording would show at a theta, and its derivative.
+
+    `width`: as in `r2s.estimation.prediction.sensitivities`.
+    """
+    return [_sensitivities(*pair, width) for pair in _places(problems, theta)]
+
+
+def loss_from(problems: Problems, seen: Sequence[Prediction]) -> float:
+    """The robust loss [m^2] of what is predicted of each recording."""
+    return float(_loss_from(problems, list(seen)))
+
+
+def normal_at(problems: Problems, theta: Theta, scale: Array, width: float | None = None) -> Normal:
+    """`r2s.estimation.gauss_newton.normal_at`."""
+    return _normal_from(problems, theta, derivatives_at(problems, theta, width), scale)
+
+
+def losses_at(
+    problems: Problems, thetas: Float[Array, "start theta"], progress: Progress | None = None
+) -> np.ndarray:
+    """The losses [m^2] of many thetas, simulated together; on a CPU one by one, since it gains
+    nothing by simulating together."""
+    if jax.default_backend() != "cpu":
+        return np.asarray(_losses(problems, thetas))
+    tell(progress, "compiling the motion")
+    losses = []
+    for number, theta in enumerate(thetas, 1):
+        seen = [predicted(*pair) for pair in _places(problems, theta)]
+        losses.append(loss_from(problems, seen))
+        tell(progress, f"coarse search {number} of {len(thetas)}")
+    return np.array(losses)
+
+
+def normals_at(problems: Problems, thetas: list, scales: list, width: float | None) -> list[Normal]:
+    """The normal equations at many thetas; see `losses_at`.
+
+    Together in numbers that are powers of two, so that few sizes are compiled.
+    """
+    if jax.default_backend() == "cpu" or len(thetas) == 1:
+        pairs = zip(thetas, scales, strict=True)
+        return [normal_at(problems, theta, scale, width) for theta, scale in pairs]
+    more = 2 ** math.ceil(math.log2(len(thetas))) - len(thetas)
+    filled = (jnp.stack([*parts, *[parts[-1]] * more]) for parts in (thetas, scales))
+    found = _normals(problems, *filled, width)
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(len(thetas))]
+
+
+def _places(problems: Problems, theta: Theta) -> list[tuple[Problem, Theta]]:
+    """Of each recording what moves, and its own part of theta."""
+    indices = (jnp.asarray(theta_indices(problems, i)) for i in range(len(problems)))
+    pairs = zip(problems, indices, strict=True)
+    return [(motion_alone(problem), theta[index]) for problem, index in pairs]
