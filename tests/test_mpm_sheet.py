@@ -230,6 +230,36 @@ def test_held_vertices_follow_their_path_exactly(sheet, elastic):
     assert np.array_equal(np.asarray(moved.x)[:, [0, 4]], np.asarray(path[0]))
 
 
+def test_a_grid_of_cells_moves_as_the_same_mesh_by_gathers():
+    """Wrinkles, drag and viscosity included; wrinkles that are followed are those found anew."""
+    mesh = r2s.rectangle((0.2, 0.15), (5, 4))
+    fabric = Fabric.make(0.3, (40.0, 2.0, 30.0, 8.0), 1e-5, damping=2e-3, friction=0.4)
+    solver = solver_of(mesh, fabric, held=(0,), table=0.0, air=1.2, dt=2e-4)
+    assert solver.cells is not None
+    x = flat(mesh, 1e-3)
+    rise = jnp.linspace(0, 0.05, 100)[None, :, None, None]
+    path = x[:1][None, None] + rise * jnp.ones((1, 1, 1, 3))
+    controls = Control(path, jnp.broadcast_to(jnp.array([0.5, 0.0, 1.0]), (1, 100, 3)))
+    found = states(solver, fabric, solver.init(x), controls)
+    gathers = dataclasses.replace(solver, cells=None)
+    expected = states(gathers, fabric, gathers.init(x), controls)
+    moved = np.max(np.abs(np.asarray(expected.x[-1] - x)))
+    assert moved > 0.01
+    assert np.asarray(found.x) == pytest.approx(np.asarray(expected.x), abs=1e-6 * moved)
+
+
+def test_a_membrane_that_damps_for_longer_than_it_relaxes_needs_no_shorter_steps(sheet, elastic):
+    limits = [
+        float(
+            stable_step(
+                sheet, SPACING, eqx.tree_at(lambda f: f.membrane.c11, elastic, jnp.asarray(1e3)), t
+            )
+        )
+        for t in (0.0, 0.01, 0.1)
+    ]
+    assert limits[0] > limits[1] > limits[2] > limits[0] / np.sqrt(1 + 0.1 / 2e-3) * 0.99
+
+
 def test_what_cannot_work_is_refused(sheet, elastic):
     limit = float(stable_step(sheet, SPACING, elastic))
     with pytest.raises(ValueError, match=f"limited by .* to {limit:.4g} s, got dt = 0.1 s"):

@@ -17,26 +17,25 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from r2s.cloth.batch_last import batch_last
 from r2s.cloth.substep import moved_velocity
 from r2s.fabrics.fabric import Fabric
 from r2s.failures import Failure, first_failure, no_failure
 from r2s.forces import elements
+from r2s.forces.batch_last import batch_last
 from r2s.forces.grid import grid_force, laws_on_grid
 from r2s.forces.grid_membrane import Samples
 from r2s.forces.layout import Layout
+from r2s.forces.sheet import Cells, ForceInputs, Memory, cells_of, force_by_gathers, no_memory
 from r2s.forces.stability import check_step, longest_relaxing_step
-from r2s.forces.viscosity import Viscosity
+from r2s.forces.viscosity import RELAXATION, Viscosity
 from r2s.geometry.mesh import Mesh
 from r2s.laws.plate import PlateLaw
 from r2s.world.air import Air
-from r2s.world.drag import drag_on_vertices
 from r2s.world.scene import Control, Scene
 
 Positions = Float[Array, "vertex 3"]
 OfSamples = Float[Array, "element sample 3"]
 
-RELAXATION = 2e-3  # [s]: docs/solvers.md says what motions differ by
 REFUSED = (
     "explicit steps do not know contact of the sheet with itself: take the implicit cloth, "
     "r2s.Cloth.make(..., self_contact=True), or material points, r2s.material_points"
@@ -78,7 +77,7 @@ class ExplicitCloth(eqx.Module):
     relaxation: Float[Array, ""]
     dt: float = eqx.field(static=True)
     substeps: int = eqx.field(static=True)
-    grid: tuple[tuple[int, int], tuple[float, float]] | None = eqx.field(static=True)
+    grid: Cells | None = eqx.field(static=True)
 
     @classmethod
     def make(
@@ -114,7 +113,7 @@ class ExplicitCloth(eqx.Module):
         relaxing = jnp.asarray(relaxation, float)
         with jax.ensure_compile_time_eval():
             longest = shortest(scene.mesh, fabric, damping, relaxing)
-            grid = grid_of(scene.mesh)
+            grid = cells_of(scene.mesh)
         if substeps is None:
             substeps = max(1, math.ceil(dt / longest * (1 + 1e-6)))
         solver = cls(scene, damping, relaxing, float(dt), substeps, grid)
@@ -136,9 +135,7 @@ class ExplicitCloth(eqx.Module):
     def init(self, x: Positions, v: Positions | None = None) -> ExplicitState:
         """A state from positions [m] and velocities [m/s] (default: zero)."""
         v = jnp.zeros_like(x) if v is None else v
-        none = jnp.zeros((*self.scene.mesh.samples.areas.shape, 3), x.dtype)
-        hidden = none if self._wrinkles else None
-        return ExplicitState(x, v, none, hidden, jnp.asarray(False), no_failure())
+        return ExplicitState(x, v, *no_memory(self.scene.mesh, self.grid, x.dtype), no_failure())
 
     def step(self, fabric: Fabric, state: ExplicitState, control: Control) -> ExplicitState:
         """The state `dt` later, with the held vertices at `control.handles`."""
@@ -185,10 +182,6 @@ class ExplicitCloth(eqx.Module):
         after = ExplicitState(x, moved.v, moved.relaxed, moved.hidden, moved.begun, failure)
         return after, moved.impulse
 
-    @property
-    def _wrinkles(self) -> bool:
-        return self.grid is not None and self.scene.mesh.samples.hidden_waves is not None
-
     def _on_grid(self, inputs: "_Inputs") -> "_Moving":
         assert self.grid is not None
         arrays, static = eqx.partition(inputs, eqx.is_array)
@@ -202,24 +195,20 @@ class ExplicitCloth(eqx.Module):
         dt = jnp.asarray(self.dt / self.substeps, start.x.dtype)
         mass = fabric.density * mesh.vertex_area
         free, carried = inputs.is_free > 0, tuple(inputs.carried.T)
+        around = inputs.viscosity, inputs.air, inputs.fan
 
         def substep(moving: _Moving, _):
             x, v, impulse = moving.x, moving.v, moving.impulse
-            past = moving.relaxed.reshape(-1, 3)
-            stress = elements.membrane_stress(mesh, fabric, x)
-            stress, relaxed = inputs.viscosity.resist(stress, past, moving.begun)
-            force = elements.membrane_force(mesh, x, stress)
-            force += elements.bending_force(mesh, fabric, x, v)
-            force += drag_on_vertices(mesh, inputs.air, inputs.fan, x, v, inputs.wind)
+            memory = Memory(moving.relaxed, moving.hidden, moving.begun)
+            asked = ForceInputs(fabric, *around, x, v, inputs.wind, memory)
+            force, memory = force_by_gathers(mesh, asked)
             height = x[:, 2] - inputs.table_height - fabric.thickness
             others = fabric.density, fabric.friction, fabric.mass_damping
             moved = moved_velocity(dt, tuple(force.T), mass, tuple(v.T), height, *others)
             v = jnp.stack([jnp.where(free, m, c) for m, c in zip(moved, carried, strict=True)], 1)
             if impulse is not None:
                 impulse += mass[:, None] * (v - jnp.stack(moved, axis=1))
-            relaxed = relaxed.reshape(moving.relaxed.shape)
-            begun = jnp.ones_like(moving.begun)
-            return _Moving(x + dt * v, v, relaxed, moving.hidden, begun, impulse), None
+            return _Moving(x + dt * v, v, *memory, impulse), None
 
         return jax.lax.scan(substep, start, length=self.substeps)[0]
 
@@ -345,15 +334,3 @@ def shortest(mesh: Mesh, fabric: Fabric, damping: Array | None, relaxation: Arra
     for _ in range(jnp.ndim(fabric.density)):
         limit = eqx.filter_vmap(limit, in_axes=(None, 0, None, None))
     return float(np.min(np.asarray(limit(mesh, fabric, damping, relaxation))))
-
-
-def grid_of(mesh: Mesh) -> tuple[tuple[int, int], tuple[float, float]] | None:
-    """Vertices along warp and weft of a `rectangle` of quadrilaterals, and their spacing [m]."""
-    corners = np.asarray(mesh.samples.corners)
-    if corners.shape[1] != 4:
-        return None
-    rest = np.asarray(mesh.rest, float)
-    columns = int(corners[0, 1] - corners[0, 0])
-    shape = len(rest) // columns, columns
-    size = rest[-1] - rest[0]
-    return shape, (float(size[0]) / (shape[0] - 1), float(size[1]) / (columns - 1))

@@ -1,7 +1,9 @@
 """Forces on the vertices of a sheet, for explicit steps; both explicit solvers use them.
 
+- `sheet`: all of them, from substep to substep.
 - `elements`: of membrane and bending on any mesh, and bounds on their frequencies.
 - `grid`: the same on the grid of a `rectangle`, by slices; `layout`: how its arrays lie.
+- `batch_last`: members of a batch side by side.
 - `viscosity`: of a membrane whose fast waves are not to shorten the steps; `stability`: how long
   these may be.
 - `laws`: what the laws of one element say of arrays side by side.

@@ -12,6 +12,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
+RELAXATION = 2e-3  # [s]: docs/solvers.md says what motions differ by
+
 
 class Viscosity(NamedTuple):
     """Of substeps of one length, all dimensionless.

@@ -1,18 +1,20 @@
 """The grid that particles move through, with gravity, table, walls and grippers at its nodes."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r2s.mpm.grid import Grid
-from r2s.mpm.transfer import affine_factor, g2p, g2p_plain, p2g, p2g_few, p2g_plain
+from r2s.mpm.transfer import affine_factor, g2p, g2p_plain, g2p_through, p2g, p2g_few, p2g_plain
 from r2s.units import GRAVITY
 from r2s.world.contact import SLIP_SPEED, Table
 
 Vectors = Float[Array, "particle axis"]
 Matrices = Float[Array, "particle axis axis"]
-Field = Float[Array, "node axis"]
+Columns = list[Float[Array, "_ _"]]  # (1, node) or (node, 1)
 
 GRIPPED = 0.25  # share of a node's mass; at the border of held and free particles it is a half
 
@@ -91,19 +93,47 @@ class Background(eqx.Module):
             slopes = jnp.concatenate([affine, still], axis=1)
             nodes = (p2g_plain if self.forward_mode else p2g)(self.grid, x, values, slopes)
         floor = self.mass_floor * jnp.mean(mass)
+        gripped = held is not None and held.x.shape[0]
+        if not gripped and 3 ** x.shape[1] * x.shape[0] < nodes.shape[0]:
+            velocity = partial(self._velocity, dt, friction, floor, None)
+            v, moment = g2p_through(self.grid, x, nodes, velocity, self.forward_mode)
+            return v, affine_factor(self.grid) * moment
         with jax.named_scope("grid"):
-            v = quotient(nodes[:, :-1], nodes[:, -1:] + floor)
-            up = jnp.eye(v.shape[1], dtype=v.dtype)[-1:]
-            v = v - dt * self.gravity * up
-            if held is not None and held.x.shape[0]:
-                v = self._gripped(v, nodes[:, -1:], floor, held)
-            v = self._walled(self._on_table(v, friction))
+            columns = jnp.split(nodes, nodes.shape[1], axis=1)
+            own = held if gripped else None
+            v = self._velocity(dt, friction, floor, own, columns, self._index())
+            v = jnp.concatenate(v, axis=1)
         with jax.named_scope("grid_to_particles"):
             get = g2p_plain if self.forward_mode else g2p
             v, moment = get(self.grid, x, v)
         return v, affine_factor(self.grid) * moment
 
-    def _gripped(self, v: Field, mass: Array, floor: Array, held: Held) -> Field:
+    def _velocity(
+        self,
+        dt: float,
+        friction: Array,
+        floor: Array,
+        held: Held | None,
+        nodes: Columns,
+        index: list[Array],
+    ) -> Columns:
+        """Velocities [m/s] of nodes from their momenta [kg m/s] and masses [kg], by axes."""
+        *momentum, mass = nodes
+        v = [quotient(each, mass + floor) for each in momentum]
+        v[-1] = v[-1] - dt * self.gravity
+        if held is not None:
+            v = self._gripped(v, mass, floor, held)
+        return self._walled(self._on_table(v, friction, index[-1]), index)
+
+    def _index(self) -> list[Array]:
+        """Of each axis, the indices of all nodes, each (node, 1)."""
+        shape = self.grid.shape
+        return [
+            jax.lax.broadcasted_iota(jnp.asarray(0).dtype, shape, axis).reshape(-1, 1)
+            for axis in range(len(shape))
+        ]
+
+    def _gripped(self, v: Columns, mass: Array, floor: Array, held: Held) -> Columns:
         """Velocities that blend into the grippers' where up to `GRIPPED` of the mass is held.
 
         Beyond that share a node has the grippers' velocity: nodes that are held only in part would
@@ -111,41 +141,38 @@ class Background(eqx.Module):
         """
         values = jnp.concatenate([held.mass[:, None] * held.v, held.mass[:, None]], axis=1)
         nodes = p2g_few(self.grid, held.x, values)
-        share = quotient(nodes[:, -1:], mass + floor)
-        carried = quotient(nodes[:, :-1], nodes[:, -1:] + floor)
-        return v + jnp.minimum(share / GRIPPED, 1) * (carried - v)
+        *carried, weight = jnp.split(nodes, nodes.shape[1], axis=1)
+        share = jnp.minimum(quotient(weight, mass + floor) / GRIPPED, 1)
+        grip = [quotient(each, weight + floor) for each in carried]
+        return [u + share * (g - u) for u, g in zip(v, grip, strict=True)]
 
-    def _on_table(self, v: Field, friction: Float[Array, ""]) -> Field:
+    def _on_table(self, v: Columns, friction: Float[Array, ""], index: Array) -> Columns:
         """Velocities [m/s] that do not point into the table and slide on it by Coulomb's law.
 
         The lost normal velocity times the friction coefficient bounds the lost sliding velocity.
         """
         if self.table is None:
             return v
-        up = self.grid.axes[-1]
-        below = jnp.broadcast_to(
-            up <= self.table.height + 1e-6 * self.grid.spacing, self.grid.shape
-        )
-        below = below.reshape(-1, 1)
+        height = self.grid.lower[-1] + self.grid.spacing * index.astype(v[-1].dtype)
+        below = height <= self.table.height + 1e-6 * self.grid.spacing
+        *along, normal = v
         if self.sticky:
-            return jnp.where(below, 0, v)
-        along, normal = v[:, :-1], v[:, -1:]
+            return [jnp.where(below, 0, each) for each in v]
         impulse = jnp.maximum(-normal, 0)
-        speed = jnp.sqrt(jnp.sum(along**2, axis=1, keepdims=True) + SLIP_SPEED**2)
+        speed = jnp.sqrt(sum(each**2 for each in along) + SLIP_SPEED**2)
         kept = jnp.maximum(1 - friction * impulse / speed, 0)
-        return jnp.where(below, jnp.concatenate([kept * along, jnp.maximum(normal, 0)], axis=1), v)
+        slid = [jnp.where(below, kept * each, each) for each in along]
+        return [*slid, jnp.where(below, jnp.maximum(normal, 0), normal)]
 
-    def _walled(self, v: Field) -> Field:
+    def _walled(self, v: Columns, index: list[Array]) -> Columns:
         """Velocities [m/s] that do not point out through the walls."""
         if not self.walls:
             return v
         columns = []
-        for i, count in enumerate(self.grid.shape):
-            index = jnp.arange(count).reshape([-1 if i == k else 1 for k in range(v.shape[1])])
-            spaced = jnp.broadcast_to(index, self.grid.shape).reshape(-1)
-            low = jnp.where(spaced < self.walls, jnp.maximum(v[:, i], 0), v[:, i])
-            columns.append(jnp.where(spaced > count - self.walls, jnp.minimum(low, 0), low))
-        return jnp.stack(columns, axis=1)
+        for each, place, count in zip(v, index, self.grid.shape, strict=True):
+            low = jnp.where(place < self.walls, jnp.maximum(each, 0), each)
+            columns.append(jnp.where(place > count - self.walls, jnp.minimum(low, 0), low))
+        return columns
 
     def project(self, x: Vectors) -> Vectors:
         """Positions [m] lifted onto the table, and NaN where they are off the grid."""
@@ -157,8 +184,8 @@ class Background(eqx.Module):
 
 @jax.custom_jvp
 def quotient(
-    numerator: Float[Array, "node channel"], denominator: Float[Array, "node 1"]
-) -> Float[Array, "node channel"]:
+    numerator: Float[Array, "_ _"], denominator: Float[Array, "_ _"]
+) -> Float[Array, "_ _"]:
     """The ratio, with derivatives that do not square its denominator, which may be tiny.
 
     The cotangent of a node is as small as its mass, so that their ratio is safe in float32 too.

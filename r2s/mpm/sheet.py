@@ -15,15 +15,16 @@ from jaxtyping import Array, Float, Int
 
 from r2s.fabrics.fabric import Fabric
 from r2s.failures import first_failure, no_failure
-from r2s.forces.elements import bending_frequency, elastic_force, membrane_frequency
-from r2s.forces.stability import check_step, longest_step
+from r2s.forces.elements import bending_frequency, membrane_frequency
+from r2s.forces.sheet import Cells, ForceInputs, Memory, cells_of, no_memory, sheet_force
+from r2s.forces.stability import check_step, longest_relaxing_step
+from r2s.forces.viscosity import RELAXATION, Viscosity
 from r2s.geometry.mesh import Mesh
 from r2s.mpm.background import Background
 from r2s.mpm.grid import Grid
 from r2s.mpm.stability import failure_of_step
 from r2s.mpm.transfer import affine_factor
 from r2s.mpm.transverse import Transverse, unit_normal
-from r2s.world.drag import drag_on_vertices
 from r2s.world.scene import Control, Scene
 
 Vertices = Float[Array, "vertex 3"]
@@ -39,6 +40,7 @@ class SheetState(eqx.Module):
     - `x`, `v`: positions [m] and velocities [m/s] of the vertices.
     - `C`: affine velocity matrices of the vertices, [1/s].
     - `d`: transverse directions of the faces, [-].
+    - `memory`: of the membrane's samples.
     - `failure`: the first `r2s.failures.Failure` of the run so far.
     """
 
@@ -46,6 +48,7 @@ class SheetState(eqx.Module):
     v: Float[Array, "vertex 3"]
     C: Float[Array, "vertex 3 3"]
     d: Float[Array, "face 3"]
+    memory: Memory
     failure: Int[Array, ""]
 
 
@@ -58,17 +61,19 @@ class Sheet(eqx.Module):
     - `scene`: sheet, held vertices, air; its table is the background's.
     - `background`: grid, table, walls, gravity.
     - `transverse`: compression and shear between layers.
-    - `membrane_damping`: damping time of the membrane, [s]; the fabric's then holds for bending
-      alone; None: the fabric's. A long damping time of the membrane's high frequencies, which no
-      motion of a sheet shows, would need short steps.
+    - `membrane_damping`: damping time of the membrane, [s]; None: the fabric's.
+    - `relaxation`: of the membrane's viscosity, [s].
     - `dt`: step, [s].
+    - `cells`: as in `ExplicitCloth.grid`.
     """
 
     scene: Scene
     background: Background
     transverse: Transverse
     membrane_damping: Float[Array, ""] | None
+    relaxation: Float[Array, ""]
     dt: float = eqx.field(static=True)
+    cells: Cells | None = eqx.field(static=True)
 
     @classmethod
     def make(
@@ -78,6 +83,7 @@ class Sheet(eqx.Module):
         fabric: Fabric,
         dt: float,
         membrane_damping: float | None = None,
+        relaxation: float = RELAXATION,
         compression: float = CONTACT,
         shear: float = CONTACT,
         walls: int = 0,
@@ -88,7 +94,7 @@ class Sheet(eqx.Module):
 
         - `fabric`: the stiffest fabric that the solver will be used for.
         - `dt`: step, [s].
-        - `membrane_damping`: as in `Sheet`, [s].
+        - `membrane_damping`, `relaxation`: as in `ExplicitCloth.make`, [s].
         - `compression`, `shear`: stiffnesses between layers, [N/m].
         - `walls`, `sticky`, `forward_mode`: as in `Background`.
 
@@ -114,7 +120,9 @@ class Sheet(eqx.Module):
             background,
             between_layers(compression, shear),
             None if membrane_damping is None else jnp.asarray(membrane_damping, float),
+            jnp.asarray(relaxation, float),
             float(dt),
+            cells_of(scene.mesh),
         )
         solver.check(fabric)
         return solver
@@ -123,7 +131,8 @@ class Sheet(eqx.Module):
         """Raises `ValueError` when the step is too long for a fabric, unless that is traced."""
         mesh, spacing = self.scene.mesh, self.background.grid.spacing
         with jax.ensure_compile_time_eval():
-            longest = stable_step(mesh, spacing, fabric, self.membrane_damping, self.transverse)
+            times = self.membrane_damping, self.relaxation
+            longest = stable_step(mesh, spacing, fabric, *times, self.transverse)
         check_step(self.dt, longest, "the fabric, the mesh and the grid")
 
     def init(self, x: Vertices, v: Vertices | None = None) -> SheetState:
@@ -134,7 +143,9 @@ class Sheet(eqx.Module):
         self.background.grid.check(x)
         v = jnp.zeros_like(x) if v is None else v
         normals = jax.vmap(unit_normal)(x[self.scene.mesh.faces])
-        return SheetState(x, v, jnp.zeros((*x.shape, 3), x.dtype), normals, no_failure())
+        none = jnp.zeros((*x.shape, 3), x.dtype)
+        memory = no_memory(self.scene.mesh, self.cells, x.dtype)
+        return SheetState(x, v, none, normals, memory, no_failure())
 
     def step(self, fabric: Fabric, state: SheetState, control: Control) -> SheetState:
         """The state `dt` later, with the held vertices at `control.handles`."""
@@ -152,7 +163,8 @@ class Sheet(eqx.Module):
         mass = fabric.density * mesh.vertex_area
         d = self._transverse_directions(fabric, state)
         force, stress = self._transverse_forces(state.x, d)
-        force += self._sheet_forces(fabric, state, control)
+        of_sheet, memory = self._sheet_forces(fabric, state, control)
+        force += of_sheet
         momentum = mass[:, None] * (1 - dt * fabric.mass_damping) * state.v + dt * force
         carried = (control.handles - state.x[held]) / dt
         momentum_held = mass[held][:, None] * carried
@@ -169,7 +181,7 @@ class Sheet(eqx.Module):
         handles = jnp.where(inside, control.handles, jnp.nan)
         x = self.background.project(moved).at[held].set(handles)
         failure = first_failure(state.failure, failure)
-        return SheetState(x, v, C, d, failure), impulse / dt
+        return SheetState(x, v, C, d, memory, failure), impulse / dt
 
     def _transverse_directions(self, fabric: Fabric, state: SheetState) -> Float[Array, "face 3"]:
         """The directions that the grid's velocity gradient carries, after the return mapping."""
@@ -190,12 +202,16 @@ class Sheet(eqx.Module):
         force = jnp.zeros_like(x).at[mesh.faces].add(mesh.area[:, None, None] * forces)
         return force, stress
 
-    def _sheet_forces(self, fabric: Fabric, state: SheetState, control: Control) -> Vertices:
-        """Forces [N] of membrane, bending and air on the vertices."""
+    def _sheet_forces(
+        self, fabric: Fabric, state: SheetState, control: Control
+    ) -> tuple[Vertices, Memory]:
+        """Forces [N] of membrane, bending and air on the vertices, and the samples' memory."""
         scene, x, v = self.scene, state.x, state.v
         damping = fabric.damping if self.membrane_damping is None else self.membrane_damping
-        drag = drag_on_vertices(scene.mesh, scene.air, scene.fan, x, v, control.wind)
-        return elastic_force(scene.mesh, fabric, damping, x, v) + drag
+        viscosity = Viscosity.make(damping, self.relaxation, jnp.asarray(self.dt, x.dtype))
+        around = viscosity, scene.air, scene.fan
+        inputs = ForceInputs(fabric, *around, x, v, control.wind, state.memory)
+        return sheet_force(scene.mesh, self.cells, inputs)
 
 
 @eqx.filter_jit
@@ -204,12 +220,13 @@ def stable_step(
     spacing: float,
     fabric: Fabric,
     membrane_damping: Float[Array, ""] | float | None = None,
+    relaxation: Float[Array, ""] | float = RELAXATION,
     transverse: Transverse | None = None,
 ) -> Float[Array, ""]:
     """The longest step [s] that is stable for a fabric near its rest shape.
 
     - `spacing`: spacing of the grid, [m].
-    - `membrane_damping`: as in `Sheet`, [s].
+    - `membrane_damping`, `relaxation`: as in `Sheet`, [s].
     - `transverse`: compression and shear between layers; None: the default stiffnesses.
 
     The squares of the highest frequencies of membrane, bending and layers have bounds that add.
@@ -218,12 +235,14 @@ def stable_step(
     if transverse is None:
         transverse = between_layers()
     damping = fabric.damping if membrane_damping is None else jnp.asarray(membrane_damping, float)
-    return longest_step(
+    return longest_relaxing_step(
+        membrane_frequency(mesh, fabric),
+        damping,
+        jnp.asarray(relaxation, float),
         [
-            (membrane_frequency(mesh, fabric), damping),
             (bending_frequency(mesh, fabric), fabric.damping),
             (transverse.frequency(fabric.density, spacing), jnp.zeros((), float)),
-        ]
+        ],
     )
 
 

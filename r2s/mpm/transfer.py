@@ -18,17 +18,21 @@ their own for the reverse mode, which gathers once for all that it needs: half t
 
 import itertools
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from r2s.mpm.grid import Grid
+from r2s.once import once
 
 Points = Float[Array, "particle axis"]
 Values = Float[Array, "particle channel"]
 Slopes = Float[Array, "particle channel axis"]
 Nodes = Float[Array, "node channel"]
+Columns = list[Float[Array, "_ _"]]  # (1, node) or (node, 1)
 
 
 def affine_factor(grid: Grid) -> float:
@@ -55,6 +59,51 @@ def g2p_plain(grid: Grid, x: Points, nodes: Nodes) -> tuple[Values, Slopes]:
     value, *moments = _g2p_axis(stencil.weights, stencil.rows(nodes))
     moment = jnp.stack(moments, axis=2) * grid.spacing
     return value, moment - value[:, :, None] * stencil.away[:, None]
+
+
+def g2p_through(
+    grid: Grid,
+    x: Points,
+    nodes: Nodes,
+    function: Callable[[Columns, list[Array]], Columns],
+    forward_mode: bool = False,
+) -> tuple[Float[Array, "particle found"], Float[Array, "particle found axis"]]:
+    """`g2p_plain` of a function of each node, worked out around the particles alone.
+
+    The function gets the channels of the nodes, each (1, node), and, of each axis, their indices.
+    It costs less than at all nodes where these are more than the particles' stencils.
+    `forward_mode`: as in `Background`.
+    """
+    stencil = _Stencil(grid, x)
+    columns = (_around_plain if forward_mode else _around)(grid, stencil.first, nodes)
+    return stencil.means(once(function, columns, stencil.index()))
+
+
+def _around_plain(grid: Grid, first: Int[Array, " particle"], nodes: Nodes) -> Columns:
+    """Of each channel, the nodes around all particles, of one offset after another."""
+    where = (jnp.asarray(_offsets(grid), first.dtype)[:, None] + first[None]).reshape(1, -1)
+    channels = range(nodes.shape[1])
+    return [nodes.at[where, channel].get(mode="promise_in_bounds") for channel in channels]
+
+
+@jax.custom_vjp
+def _around(grid: Grid, first: Int[Array, " particle"], nodes: Nodes) -> Columns:
+    """`_around_plain` with a reverse mode that adds whole nodes into one field."""
+    return _around_plain(grid, first, nodes)
+
+
+def _around_forward(grid, first, nodes):
+    return _around_plain(grid, first, nodes), (grid, first)
+
+
+def _around_reverse(saved, columns):
+    grid, first = saved
+    offsets = _offsets(grid)
+    rows = _kept(jnp.concatenate(columns).reshape(len(columns), len(offsets), -1))
+    nodes = jnp.zeros((math.prod(grid.shape), len(columns)), rows.dtype)
+    for i, offset in enumerate(offsets):
+        nodes = nodes.at[first + offset].add(rows[:, i].T, mode="promise_in_bounds")
+    return _no_slope(grid), np.zeros(first.shape, jax.dtypes.float0), nodes
 
 
 def p2g_few(grid: Grid, x: Points, values: Values) -> Nodes:
@@ -132,6 +181,7 @@ def _no_slope(grid: Grid) -> Grid:
     return jax.tree.map(jnp.zeros_like, grid)
 
 
+_around.defvjp(_around_forward, _around_reverse)
 p2g.defvjp(_p2g_forward, _p2g_reverse)
 g2p.defvjp(_g2p_forward, _g2p_reverse)
 
@@ -139,7 +189,7 @@ g2p.defvjp(_g2p_forward, _g2p_reverse)
 class _Stencil:
     """The nodes that each particle touches: three along each axis.
 
-    - `first`: index of the first of them.
+    - `first`: index of the first of them. `corner`: its index along each axis.
     - `away`: vector from that node to the particle, [m].
     - `weights`, `rates`: weights of the three nodes along each axis, [-], and derivatives, [1/m].
     """
@@ -152,6 +202,7 @@ class _Stencil:
         place = place - first.astype(place.dtype)
         strides = jnp.asarray(_strides(grid), int)[None]
         self.first = jnp.sum(first * strides, axis=1)
+        self.corner = list(first.T)
         self.away = place * grid.spacing
         self.spacing = grid.spacing
         axes = range(x.shape[1])
@@ -165,6 +216,26 @@ class _Stencil:
         """The field at each of the nodes."""
         wheres = [self.first + offset for offset in self._offsets]
         return [nodes.at[where].get(mode="promise_in_bounds") for where in wheres]
+
+    def index(self) -> list[Int[Array, "1 node"]]:
+        """Of each axis, the indices of all rows one after another."""
+        steps = np.array(list(itertools.product(range(3), repeat=len(self.corner))))
+        return [
+            (jnp.asarray(steps[:, i, None], int) + corner[None]).reshape(1, -1)
+            for i, corner in enumerate(self.corner)
+        ]
+
+    def means(self, columns: Columns) -> tuple[Values, Slopes]:
+        """Weighted means and first moments of a field's rows, of one offset after another."""
+        weights = [[weight[:, 0] for weight in axis] for axis in self.weights]
+        of_channels = []
+        for column in columns:
+            # `split`, whose reverse is one array: that of slices is one of each
+            rows = jnp.split(column.reshape(-1, len(self.first)), len(self._offsets))
+            of_channels.append(_g2p_axis(weights, [row[0] for row in rows]))
+        value, *moments = (jnp.stack(parts, axis=1) for parts in zip(*of_channels, strict=True))
+        moment = jnp.stack(moments, axis=2) * self.spacing
+        return value, moment - value[:, :, None] * self.away[:, None]
 
     def affine(self, values: Values, slopes: Slopes) -> tuple[Values, list[Values]]:
         """The particles' affine fields at their first nodes, and the steps between nodes."""
