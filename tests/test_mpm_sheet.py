@@ -245,7 +245,7 @@ def test_a_grid_of_cells_moves_as_the_same_mesh_by_gathers():
     expected = states(gathers, fabric, gathers.init(x), controls)
     moved = np.max(np.abs(np.asarray(expected.x[-1] - x)))
     assert moved > 0.01
-    assert np.asarray(found.x) == pytest.approx(np.asarray(expected.x), abs=1e-6 * moved)
+    assert np.asarray(found.x) == pytest.approx(np.asarray(expected.x), abs=1e-5 * moved)
 
 
 def test_a_membrane_that_damps_for_longer_than_it_relaxes_needs_no_shorter_steps(sheet, elastic):
