@@ -231,7 +231,7 @@ def test_held_vertices_follow_their_path_exactly(sheet, elastic):
 
 
 def test_a_grid_of_cells_moves_as_the_same_mesh_by_gathers():
-    """Wrinkles, drag and viscosity included; wrinkles that are followed are those found anew."""
+    """Wrinkles, drag and viscosity included; wrinkles that are followed lag a little behind."""
     mesh = r2s.rectangle((0.2, 0.15), (5, 4))
     fabric = Fabric.make(0.3, (40.0, 2.0, 30.0, 8.0), 1e-5, damping=2e-3, friction=0.4)
     solver = solver_of(mesh, fabric, held=(0,), table=0.0, air=1.2, dt=2e-4)
@@ -245,7 +245,7 @@ def test_a_grid_of_cells_moves_as_the_same_mesh_by_gathers():
     expected = states(gathers, fabric, gathers.init(x), controls)
     moved = np.max(np.abs(np.asarray(expected.x[-1] - x)))
     assert moved > 0.01
-    assert np.asarray(found.x) == pytest.approx(np.asarray(expected.x), abs=1e-5 * moved)
+    assert np.asarray(found.x) == pytest.approx(np.asarray(expected.x), abs=1e-4 * moved)
 
 
 def test_a_membrane_that_damps_for_longer_than_it_relaxes_needs_no_shorter_steps(sheet, elastic):
