@@ -79,7 +79,7 @@ def normals_at(problems: Problems, thetas: list, scales: list, width: float | No
     return [jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(len(thetas))]
 
 
-def _places(problems: Problems, theta: Theta) -> list[tuple[Problem, Theta]]:
+def _places(problems: Problems, theta: Theta) -> list[tuple[Problem, Array]]:
     """Of each recording what moves, and its own part of theta."""
     indices = (jnp.asarray(theta_indices(problems, i)) for i in range(len(problems)))
     pairs = zip(problems, indices, strict=True)
