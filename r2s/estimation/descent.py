@@ -47,8 +47,9 @@ class Stop(NamedTuple):
     patience: int
 
 
-# At a tenth of a standard error, or, where another descent goes on from there, at a half.
-AT_THE_END, ON_THE_WAY = Stop(5e-3, 4), Stop(0.125, 2)
+# At a tenth of a standard error, or, where another descent goes on from there, at a quarter (a half
+# is too early: outliers that are left out from there on may hold it there).
+AT_THE_END, ON_THE_WAY = Stop(5e-3, 4), Stop(0.03, 2)
 Row = list[Descent]  # one iteration: the descents of all starts
 
 _propose = eqx.filter_jit(gauss_newton.propose)
