@@ -29,7 +29,7 @@ def measured(motion: str, number: str) -> Line:
     error = max(found[name].rms for name in VARIANTS[:2])
     is_chaotic = found[VARIANTS[2]].worst > ENOUGH
     verdict = "converged" if error < ENOUGH else "chaotic" if is_chaotic else "not converged"
-    return {name: shown(found[name]) for name in VARIANTS} | {"": verdict}
+    return {name: shown(found[name]) for name in VARIANTS} | {"verdict": verdict}
 
 
 if __name__ == "__main__":

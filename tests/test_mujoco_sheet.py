@@ -1,5 +1,6 @@
 """A sheet of MuJoCo's flex follows its grippers, lies on its table, and is a part of a study."""
 
+import dataclasses
 import importlib.util
 import sys
 
@@ -17,7 +18,7 @@ from r2s.study.estimates import EstimateCell
 from r2s.study.main import study
 from r2s.study.mujoco_error import difference, differences, places
 from r2s.study.mujoco_recording import FABRIC, MujocoRecording
-from r2s.study.mujoco_sheet import Material, Resolution, motion
+from r2s.study.mujoco_sheet import Material, Resolution, motion, moved
 from r2s.study.sources import SyntheticRecording, read
 
 has_mujoco = importlib.util.find_spec("mujoco") is not None
@@ -68,9 +69,11 @@ def test_the_same_sheet_moves_alike_and_another_does_not(moves):
 
 
 @needs_mujoco
-def test_a_sheet_that_diverges_is_an_error():
-    with pytest.raises(RuntimeError, match="diverged"):
-        motion(SIX["fling"](), Material(density=1e-6, air=1e9), COARSE)
+def test_a_sheet_that_is_lost_is_an_error_that_says_when():
+    scenario = SIX["lifting"]().scenario(COARSE.shape)
+    torn = dataclasses.replace(scenario, path=scenario.path.at[-1].set(jnp.nan))
+    with pytest.raises(RuntimeError, match=r"diverged after 3\.\d+ s"):
+        moved(torn, step=COARSE.step)
 
 
 def test_shared_places_are_the_same_on_all_meshes_and_differ_by_what_they_are_moved():

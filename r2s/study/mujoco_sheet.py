@@ -38,13 +38,13 @@ class Material(NamedTuple):
     - `air`: density of the medium, [kg/m^3].
     """
 
-    young: float = 16e3
+    young: float = 12e3
     poisson: float = 0.3
-    thickness: float = 2.5e-3
-    damping: float = 0.01
+    thickness: float = 3.2e-3
+    damping: float = 0.02
     density: float = 0.2
     radius: float = 1e-3
-    friction: float = 0.4
+    friction: float = 0.8
     solref: tuple[float, float] = (0.005, 1.0)
     solimp: tuple[float, float, float] = (0.9, 0.95, 0.001)
     air: float = AIR_DENSITY
@@ -54,7 +54,7 @@ class Resolution(NamedTuple):
     """- `shape`: vertices along warp and weft. - `step`: longest time step, [s]."""
 
     shape: tuple[int, int] = (25, 25)
-    step: float = 2e-3
+    step: float = 1.6e-3
 
 
 SHEET, CONVERGED = Material(), Resolution()
@@ -148,7 +148,7 @@ def _mjcf(scenario: Scenario, material: Material, dt: float) -> str:
     )
     return f"""<mujoco>
   <option timestep="{dt!r}" gravity="0 0 -{GRAVITY}" density="{material.air}"
-      integrator="discrete"/>
+      integrator="discrete" solver="CG" cone="elliptic"/>
   <size memory="1G"/>
   <worldbody>
     <geom type="plane" size="0 0 1" pos="0 0 {float(scenario.scene.table.height)}" {contact}/>
