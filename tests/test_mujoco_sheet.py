@@ -15,6 +15,7 @@ from r2s.study.cells import with_dependencies
 from r2s.study.configuration import MOTIONS
 from r2s.study.drawn import experiment_of
 from r2s.study.estimates import EstimateCell
+from r2s.study.evaluations import EvaluationCell, read_measured, read_motion
 from r2s.study.main import study
 from r2s.study.mujoco_error import difference, differences, places
 from r2s.study.mujoco_recording import FABRIC, MujocoRecording
@@ -147,3 +148,16 @@ def test_a_study_without_the_wheel_says_so_before_it_makes_anything(tmp_path, mo
     with pytest.raises(ImportError, match=r"r2s\[mujoco\].*leave mujoco_flex out of --fabrics"):
         study(out=out)
     assert not out.exists()
+
+
+@pytest.mark.slow(group="study")
+@needs_mujoco
+def test_ours_predicts_the_sheet_of_mujoco_from_where_it_hangs(tmp_path):
+    cell = MujocoRecording("fling", 0, unseen=True, resolution=Resolution((13, 13), 2e-3))
+    judged = EvaluationCell(None, "cloth", Material().density, FABRIC, (cell,), every=3)
+    assert engine.run([judged], tmp_path, engine.Serial()) == {}
+    (found,) = read_measured(judged, tmp_path).values()
+    assert found["chamfer_real_to_sim"] < 0.03
+    x = read_motion(judged, tmp_path)[0]
+    start = motion(experiment_of("fling", 0, True, 0), resolution=cell.resolution)[0]
+    assert start[:, 2].min() == pytest.approx(x[:, 2].min(), abs=0.02)

@@ -57,7 +57,7 @@ class Resolution(NamedTuple):
     step: float = 1.6e-3
 
 
-SHEET, CONVERGED = Material(), Resolution()
+SHEET, STUDIED = Material(), Resolution()
 
 
 def mujoco_module() -> Any:
@@ -66,7 +66,7 @@ def mujoco_module() -> Any:
 
 
 def moved(
-    scenario: Scenario, material: Material = SHEET, step: float = CONVERGED.step
+    scenario: Scenario, material: Material = SHEET, step: float = STUDIED.step
 ) -> Float[np.ndarray, "frame vertex 3"]:
     """Positions [m] of the sheet in the frames of a scenario.
 
@@ -116,7 +116,7 @@ def moved(
 def motion(
     experiment: Experiment,
     material: Material = SHEET,
-    resolution: Resolution = CONVERGED,
+    resolution: Resolution = STUDIED,
 ) -> Float[np.ndarray, "frame vertex 3"]:
     """Positions [m] of the sheet in the frames of an experiment; raises as `moved`.
 
