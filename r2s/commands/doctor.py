@@ -24,6 +24,7 @@ EXTRAS = {
     "cma": ("cma",),
     "cluster": ("dask", "distributed", "dask_jobqueue"),
     "viz": ("viser",),
+    "mujoco": ("mujoco",),
     "bench": ("mujoco", "newton", "warp", "taichi"),
 }
 PACKAGES = ("r2s", "jax", "jaxlib", "equinox", "optax", "lineax", "numpy")

@@ -141,6 +141,28 @@ def record(
     if not np.isfinite(x).all():
         failure = "" if motion is None else motion.explain()
         raise RuntimeError(f"the simulation of {name} {failure}")
+    measured = {} if balance is None else _measured(experiment, scenario, balance, key)
+    return seen_of(x, experiment, scenario, name, trial, seen, measured, key=key)
+
+
+def seen_of(
+    x: Float[Array, "frame vertex 3"],
+    experiment: Experiment,
+    scenario: Scenario,
+    name: str,
+    trial: int,
+    seen: Sensing,
+    measured: dict[str, Any] | None = None,
+    *,
+    key: PRNGKeyArray,
+) -> Recording:
+    """What cameras record of a motion that is known, whoever made it.
+
+    - `x`: positions of the vertices of `scenario`, which is `experiment` on a mesh, [m].
+    - `measured`: what else there is, see `r2s.recordings.recording.make_recording`.
+
+    The others are those of `record`.
+    """
     errors = f"camera noise {1e3 * seen.noise:g} mm, {seen.outliers:.0%} outliers"
     errors += f", {seen.dropped:.0%} dropped" if seen.dropped else ""
     info = RecordingInfo(
@@ -158,8 +180,7 @@ def record(
     clouds = _clouds(x, scenario, seen, key)
     times = np.asarray(experiment.times) + seen.time_offset
     route = _extended(experiment.route, times[-1])
-    measured = {} if balance is None else _measured(experiment, scenario, balance, key)
-    return make_recording(clouds, times, route.path, route.times, info, **measured)
+    return make_recording(clouds, times, route.path, route.times, info, **(measured or {}))
 
 
 def _measured(

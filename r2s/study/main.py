@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from r2s.study import engine, matrix, results
+from r2s.study.mujoco_recording import FABRIC
+from r2s.study.mujoco_sheet import mujoco_module
 from r2s.study.subprocesses import OneProcess
 
 
@@ -43,6 +45,8 @@ def study(
     plan = matrix.with_changes(
         matrix.PRESETS[preset], configurations, fabrics, repeats, judged, materials, seed
     )
+    if data is None and FABRIC in plan.fabrics:
+        _has_mujoco()
     cells = matrix.synthetic(plan) if data is None else matrix.recorded(data, density, plan)
     runner = _runner(workers, scheduler, slurm, compilation_cache)
     try:
@@ -51,6 +55,14 @@ def study(
         runner.close()
     results.publish(cells, failed, out, plan, str(data or "synthetic"), paper)
     return len(failed)
+
+
+def _has_mujoco() -> None:
+    """Raise before anything is made when MuJoCo is not there."""
+    try:
+        mujoco_module()
+    except ImportError as error:
+        raise ImportError(f"{error}, or leave {FABRIC} out of --fabrics") from error
 
 
 def _runner(workers: int, scheduler: str, slurm: int, cache: Path | None) -> engine.Runner:

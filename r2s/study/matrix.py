@@ -14,6 +14,10 @@ from r2s.scenarios.paths import ESTIMATION, EVALUATION
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
 from r2s.study.estimates import SOLVERS, Budgets, EstimateCell, TrainedNetwork
 from r2s.study.evaluations import EvaluationCell
+from r2s.study.mujoco_recording import FABRIC as FLEX
+from r2s.study.mujoco_recording import SCENARIOS as IN_MUJOCO
+from r2s.study.mujoco_recording import MujocoRecording
+from r2s.study.mujoco_sheet import Material
 from r2s.study.sources import (
     GivenRecording,
     Source,
@@ -63,7 +67,7 @@ class Plan:
 
 ALL = Plan(
     configurations=FULL,
-    fabrics=tuple(presets.FIVE),
+    fabrics=(*presets.FIVE, FLEX),
     repeats=ESTIMATION,
     judged=EVALUATION // len(MOTIONS),
     truth=TruthSettings(self_contact=True),
@@ -77,7 +81,7 @@ SMALL = Plan(
         Configuration("pinn", "points", "stretching"),
         Configuration("pinn", "cloth", "stretching"),
     ),
-    fabrics=("camel_ponte_roma", "grey_interlock"),
+    fabrics=("camel_ponte_roma", "grey_interlock", FLEX),
     repeats=1,
     judged=2,
     budgets=Budgets(
@@ -124,13 +128,14 @@ def with_changes(
         if number is not None and number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
     chosen, truth = tuple(fabrics or plan.fabrics), plan.truth
+    measured = [fabric for fabric in chosen if fabric != FLEX]
     return dataclasses.replace(
         plan,
         configurations=tuple(map(configuration_named, configurations or ())) or plan.configurations,
         fabrics=chosen,
         repeats=plan.repeats if repeats is None else repeats,
         judged=plan.judged if judged is None else judged,
-        truth=with_measured_tables(truth, Path(materials), chosen) if materials else truth,
+        truth=with_measured_tables(truth, Path(materials), measured) if materials else truth,
         seed=seed,
     )
 
@@ -138,17 +143,20 @@ def with_changes(
 def synthetic(plan: Plan) -> list[EvaluationCell]:
     """The evaluations of a study of synthetic recordings, which need all other cells.
 
-    Raises `ValueError` for an unknown fabric.
+    The sheet of MuJoCo has the configurations whose scenario it knows. Raises `ValueError` for an
+    unknown fabric.
     """
 
-    def recording(fabric: str, scenario: str, number: int, is_unseen: bool, angle=None):
+    def recording(fabric: str, scenario: str, number: int, is_unseen: bool, angle=None) -> Source:
+        if fabric == FLEX:
+            return MujocoRecording(scenario, number, is_unseen, plan.seed)
         return SyntheticRecording(
             fabric, scenario, number, is_unseen, plan.truth, plan.seed, angle=angle
         )
 
     found = []
     for fabric in plan.fabrics:
-        density = float(strain_dependent(fabric, plan.truth).density)
+        density = _density(fabric, plan.truth)
         unseen = [
             tuple(recording(fabric, scenario, number, True) for number in range(plan.judged))
             for scenario in MOTIONS
@@ -156,6 +164,8 @@ def synthetic(plan: Plan) -> list[EvaluationCell]:
         estimates = []
         for configuration in plan.configurations:
             scenario = configuration.estimated_from
+            if fabric == FLEX and scenario not in IN_MUJOCO:
+                continue
             is_pulled = configuration.approach == "pinn" and scenario == "stretching"
             for repeat in range(plan.repeats):
                 sources = tuple(
@@ -165,6 +175,13 @@ def synthetic(plan: Plan) -> list[EvaluationCell]:
                 estimates.append(_estimate(configuration, sources, density, plan, repeat))
         found += _evaluations(estimates, fabric, density, unseen, plan.every)
     return found
+
+
+def _density(fabric: str, truth: TruthSettings) -> float:
+    """Areal density as weighed, [kg/m^2]."""
+    if fabric == FLEX:
+        return Material().density
+    return float(strain_dependent(fabric, truth).density)
 
 
 def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationCell]:

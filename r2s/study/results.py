@@ -23,7 +23,7 @@ from r2s.study.evaluations import EvaluationCell, read_measured, read_motion
 from r2s.study.matrix import PRESETS, Plan
 from r2s.study.report.motions import MotionComparison
 from r2s.study.rows import Row, write_rows
-from r2s.study.sources import Source, SyntheticRecording, read, small_strain
+from r2s.study.sources import GivenRecording, Source, SyntheticRecording, read, small_strain
 from r2s.study.statistics.parameters import Estimated
 from r2s.study.statistics.recordings import recording_tables
 from r2s.study.tables import Table, significant
@@ -142,7 +142,7 @@ def _repeatability(cells: Sequence[EvaluationCell], folder: Path) -> list[Row]:
     """How far two trials of a fabric in a motion are from each other, for given recordings."""
     trials = defaultdict(list)
     for source in dict.fromkeys(source for cell in cells for source in cell.recordings):
-        if not isinstance(source, SyntheticRecording) and source.is_made(folder):
+        if isinstance(source, GivenRecording) and source.is_made(folder):
             trials[source.fabric, source.scenario].append(source)
     found = []
     for (fabric, scenario), sources in trials.items():
@@ -218,7 +218,8 @@ def parameters(cells: Iterable[EvaluationCell], folder: Path) -> dict[str, list[
 
 
 def _true_values(cell: EstimateCell, count: int) -> np.ndarray:
-    """The parameters at small strain of a synthetic recording's fabric; NaN where unknown."""
+    """The parameters at small strain of a synthetic recording's fabric; NaN where unknown, as of
+    given recordings and of another simulator's sheet."""
     source = cell.sources[0]
     is_known = isinstance(source, SyntheticRecording) and not source.truth.materials
     if cell.solver != "cloth" or not is_known:

@@ -2,7 +2,7 @@
 
 Synthetic recordings are not the estimators' own model: their mesh is finer, their steps are
 shorter, and their fabrics stiffen with the strain and soften with the curvature, as measured ones
-do.
+do. Those of a sheet of MuJoCo are of another simulator altogether (`r2s.study.mujoco_recording`).
 """
 
 import dataclasses
@@ -25,10 +25,11 @@ from r2s.laws.tables import HINGE_FACTOR, TableBending, TableMembrane
 from r2s.recordings import manifest
 from r2s.recordings.recording import Recording, load, save
 from r2s.scenarios import synthetic
-from r2s.scenarios.six import SIX, Experiment, varied
+from r2s.scenarios.six import Experiment
 from r2s.study.cells import Cell, result_files
+from r2s.study.drawn import RECORDING, experiment_of, number_of
+from r2s.study.mujoco_recording import MujocoRecording
 
-RECORDING = "recording.npz"
 SOFTENED = (1.0, 0.9, 0.8, 0.75, 0.7)  # bending at curvatures of 0, 10, ... 40 1/m over that at 0
 SAME_SCENARIO = {"lift": "lifting", "fold": "folding"}  # how recordings of others call them
 
@@ -91,7 +92,7 @@ class SyntheticRecording(Cell):
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
         """Simulate the recording."""
         fabric, truth = strain_dependent(self.fabric, self.truth), self.truth
-        key = jr.fold_in(jr.key(self.seed), _number(self.fabric, self.scenario, self.number))
+        key = jr.fold_in(jr.key(self.seed), number_of(self.fabric, self.scenario, self.number))
         if self.angle is not None:
             angle, key = math.radians(self.angle), jr.fold_in(key, round(self.angle))
             made = pulled(fabric, self.fabric, angle, shape=truth.shape, key=key)
@@ -111,10 +112,7 @@ class SyntheticRecording(Cell):
         return {"seed": self.seed, "frames": len(made.times)}
 
     def _experiment(self) -> Experiment:
-        if self.number == 0 and not self.unseen:
-            return SIX[self.scenario]()
-        key = jr.fold_in(jr.key(self.seed), 2 * self.number + self.unseen)
-        return varied(self.scenario, 1, key=key)[0]
+        return experiment_of(self.scenario, self.number, self.unseen, self.seed)
 
 
 @dataclass(frozen=True)
@@ -142,7 +140,7 @@ class GivenRecording(Cell):
         return {"frames": len(read.times), "verified": read.info.verified}
 
 
-Source = SyntheticRecording | GivenRecording
+Source = SyntheticRecording | MujocoRecording | GivenRecording
 
 
 def find_recordings(folder: Path) -> list[GivenRecording]:
@@ -225,8 +223,3 @@ def small_strain(name: str) -> Fabric:
     """The preset, whose constant stiffness is that of `strain_dependent` at zero strain and
     curvature: what an estimate from a synthetic recording is compared with."""
     return presets.FIVE[name]()
-
-
-def _number(*parts: Any) -> int:
-    """A number below 2^31 that depends on the parts alone."""
-    return int.from_bytes(sha256(repr(parts).encode()).digest()[:4], "big") >> 1

@@ -1,0 +1,27 @@
+"""Which motions and random numbers a study's recordings have."""
+
+from hashlib import sha256
+from typing import Any
+
+import jax.random as jr
+
+from r2s.scenarios.six import SIX, Experiment, varied
+
+RECORDING = "recording.npz"
+
+
+def experiment_of(scenario: str, number: int, unseen: bool, seed: int) -> Experiment:
+    """Motion `number` of a scenario, the same for all fabrics.
+
+    0 is that without any numbers; others are drawn within `r2s.scenarios.paths.LIMITS`. None that
+    is `unseen`, to be judged by, is one to estimate from.
+    """
+    if number == 0 and not unseen:
+        return SIX[scenario]()
+    key = jr.fold_in(jr.key(seed), 2 * number + unseen)
+    return varied(scenario, 1, key=key)[0]
+
+
+def number_of(*parts: Any) -> int:
+    """A number below 2^31 that depends on the parts alone."""
+    return int.from_bytes(sha256(repr(parts).encode()).digest()[:4], "big") >> 1

@@ -1,0 +1,71 @@
+"""Cells of recordings that another simulator has made: a sheet of MuJoCo's flex."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import jax.random as jr
+
+from r2s.recordings.recording import save
+from r2s.scenarios import synthetic
+from r2s.study.cells import Cell
+from r2s.study.drawn import RECORDING, experiment_of, number_of
+from r2s.study.mujoco_sheet import Material, Resolution, moved
+
+FABRIC = "mujoco_flex"
+SCENARIOS = ("lifting", "folding", "fling", "shaking")  # without fans and clamps
+
+
+@dataclass(frozen=True)
+class MujocoRecording(Cell):
+    """A recording of a sheet of MuJoCo; what it shares with `SyntheticRecording` means the same.
+
+    Its truth has no numbers in r2s's terms: it is there to be predicted.
+    """
+
+    kind: ClassVar[str] = "recordings"
+    weight: ClassVar[float] = 60.0
+
+    scenario: str
+    number: int = 0
+    unseen: bool = False
+    seed: int = 0
+    material: Material = Material()
+    resolution: Resolution = Resolution()
+    fabric: str = FABRIC
+
+    def __post_init__(self) -> None:
+        if self.scenario not in SCENARIOS:
+            raise ValueError(f"{FABRIC} has {', '.join(SCENARIOS)}, not {self.scenario}")
+
+    @property
+    def name(self) -> str:
+        return f"{self.scenario}_{self.fabric}_{'u' * self.unseen}{self.number}"
+
+    @property
+    def compilation_group(self) -> str:
+        return f"recordings of MuJoCo {self.scenario}"
+
+    def make(self, folder: Path, out: Path) -> dict[str, Any]:
+        """Simulate the recording; raises as `r2s.study.mujoco_sheet.moved`."""
+        experiment = experiment_of(self.scenario, self.number, self.unseen, self.seed)
+        scenario = experiment.scenario(self.resolution.shape)
+        key = jr.fold_in(
+            jr.key(self.seed), number_of(self.fabric, self.scenario, self.number, self.unseen)
+        )
+        made = synthetic.seen_of(
+            jnp.asarray(moved(scenario, self.material, self.resolution.step), float),
+            experiment,
+            scenario,
+            self.fabric,
+            self.number,
+            synthetic.WHOLE if self.unseen else synthetic.sensing(experiment),
+            key=key,
+        )
+        info = dataclasses.replace(
+            made.info, name=self.name, source=f"MuJoCo's flex: {made.info.source}"
+        )
+        save(dataclasses.replace(made, info=info), out / RECORDING)
+        return {"seed": self.seed, "frames": len(made.times)}
