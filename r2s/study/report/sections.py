@@ -33,9 +33,10 @@ def findings_section(
     words = [
         *_headlines(results),
         "Each conclusion of the paper is a test on these numbers, meant for fabrics like these: "
-        "the fabrics are the sample, and each has one number, however many recordings and estimates it "
-        "rests on. Ratios are of distances, or of what is named, with their interval; they are "
-        "above 1 where the conclusion is right. All p are Student's t test with Holm's correction.",
+        "the fabrics are the sample, and each has one number, however many recordings and "
+        "estimates it rests on. Ratios are of distances, or of what is named, with their interval; "
+        "they are above 1 where the conclusion is right. All p are Student's t test with Holm's "
+        "correction.",
         *(findings.in_words(verdict) for verdict in first),
     ]
     if not paper:

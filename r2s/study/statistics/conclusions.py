@@ -100,8 +100,8 @@ def diffcp_explodes(results: ResultArray, paper: Paper) -> Claim:
         which = "of DiffCP" if not made.any() else "of other approaches"
         return Claim(claim, (Comparison(words, lacking=f"no rows {which}"),))
     note = (
-        f"Diverged: {lost.sum()} of {made.sum()} estimates of DiffCP, {lost_other.sum()} of "
-        f"{made_other.sum()} others."
+        f"Diverged: {lost.sum():.0f} of {made.sum():.0f} estimates of DiffCP, "
+        f"{lost_other.sum():.0f} of {made_other.sum():.0f} others."
     )
     if not (lost.any() or lost_other.any()):
         lacking = "no estimate diverged, and what gradients did on the way is not in the rows"
@@ -120,7 +120,8 @@ def _diverged_estimates(
     results: ResultArray, approach: str
 ) -> tuple[Float[np.ndarray, "side fabric"], Float[np.ndarray, "side fabric"]]:
     """How many estimates diverged, and were made: of an approach, and of all others."""
-    lost, made = np.zeros((2, len(results.fabrics))), np.zeros((2, len(results.fabrics)))
+    shape = 2, len(results.fabrics)
+    lost, made = np.zeros(shape), np.zeros(shape)
     for i, configuration in enumerate(results.configurations):
         if not configuration.approach:
             continue
@@ -257,7 +258,8 @@ def _easier(
         - of_fabrics(part, np.where(is_hard, np.nan, values))
         for values in (finite_mean(logs, 1), logs)
     )  # (configuration, fabric) and (configuration, repeat, fabric)
-    of_trajectory = [part.fabrics.index(t.fabric) for t in part.trajectories]
+    place = {name: i for i, name in enumerate(part.fabrics)}
+    of_trajectory = [place[t.fabric] for t in part.trajectories]
     used = np.where(np.isfinite(numbers[:, of_trajectory]), finite_mean(logs, 1), np.nan)
     of_movement = finite_mean(used, 0)
     lost = part.diverged.sum(axis=(0, 2))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from r2s.evaluation.crossed import MOST_UNITS, POWER
-from r2s.evaluation.statistics import LEVEL
+from r2s.evaluation.statistics import LEVEL, SIGNIFICANCE
 from r2s.study.rows import Row
 from r2s.study.statistics.conclusions import CONCLUSIONS
 from r2s.study.statistics.hypotheses import Comparison, Verdict, judge
@@ -35,7 +35,7 @@ def finding_table(verdicts: Sequence[Verdict], metric: str) -> Table:
             comparison.words,
             answer if not comparison.lacking else f"cannot be told: {comparison.lacking}",
             *_numbers(comparison, p),
-            MISSING if comparison.lacking or answer != "cannot be told" else _needed(needed),
+            MISSING if comparison.lacking or answer != "cannot be told" else _needed(p, needed),
             _quoted(comparison),
         )
         for verdict in verdicts
@@ -59,7 +59,8 @@ def finding_table(verdicts: Sequence[Verdict], metric: str) -> Table:
         "side that should be smaller, and of the larger; they have no ratio, and nothing is found "
         "in favour of a side that has any. Fabrics needed: to tell a ratio as far from 1 as this "
         f"with a power of {POWER:.0%}; in brackets by the ends of the {LEVEL:.0%} interval of the "
-        "spread between fabrics. Paper: averages of Chamfer distances, which are squared.",
+        "spread between fabrics; where it is above any number more motions or estimates are needed "
+        "too. Paper: averages of Chamfer distances, which are squared.",
     )
 
 
@@ -79,8 +80,10 @@ def _numbers(comparison: Comparison, p: float) -> tuple[str, ...]:
     )
 
 
-def _needed(needed: tuple[float, float, float]) -> str:
+def _needed(p: float, needed: tuple[float, float, float]) -> str:
     """How many fabrics it would take, likely and between which numbers."""
+    if p < SIGNIFICANCE:  # what is better has diverged
+        return "no number, while runs diverge"
     if np.isnan(needed[0]):
         return "not known from one fabric"
     likely, fewest, most = (
@@ -127,5 +130,5 @@ def _said(comparison: Comparison, answer: str, p: float, needed: tuple[float, fl
     if lost != MISSING:
         told.append(f"{lost} runs of the two sides diverged (not in the ratio)")
     if answer == "cannot be told":
-        told.append(f"to tell would take this many fabrics: {_needed(needed)}")
+        told.append(f"fabrics that would tell: {_needed(p, needed)}")
     return f"{comparison.words}: {', '.join(told)}{quoted}"

@@ -121,7 +121,7 @@ def compare(
 def compared(
     words: str,
     numbers: Float[np.ndarray, " fabric"],
-    tables: Iterable[Float[np.ndarray, "fabric level"]] = (),
+    tables: Iterable[Float[np.ndarray, "fabric _"]] = (),
     diverged: tuple[int, int] = (0, 0),
     paper: tuple[float, float] | None = None,
     is_ratio: bool = True,

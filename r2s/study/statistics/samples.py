@@ -15,7 +15,8 @@ from r2s.study.statistics.result_array import ResultArray, safe_ratio
 def finite_mean(values: Float[np.ndarray, "..."], axis: int) -> Float[np.ndarray, "..."]:
     """The mean of what is finite, NaN where nothing is."""
     finite = np.isfinite(values)
-    return safe_ratio(np.where(finite, values, 0.0).sum(axis=axis), finite.sum(axis=axis))
+    total = np.asarray(np.where(finite, values, 0.0).sum(axis=axis))
+    return safe_ratio(total, np.asarray(finite.sum(axis=axis)))
 
 
 def log_distances(
@@ -34,9 +35,9 @@ def of_fabrics(
     results: ResultArray, values: Float[np.ndarray, "*more trajectory"]
 ) -> Float[np.ndarray, "*more fabric"]:
     """The mean of a fabric's trajectories that are finite."""
-    return np.stack(
-        [finite_mean(values[..., results.of_fabric(name)], -1) for name in results.fabrics], axis=-1
-    )
+    names = np.array([trajectory.fabric for trajectory in results.trajectories])
+    means = [finite_mean(values[..., names == name], -1) for name in results.fabrics]
+    return np.stack(means, axis=-1) if means else np.zeros((*values.shape[:-1], 0))
 
 
 def by_movement(
