@@ -59,10 +59,11 @@ class Spread(NamedTuple):
         return TYPICAL * float(np.exp(np.sum(np.square(self)) / 2))
 
 
-VARY = Spread(  # with what each deviation is drawn anew, the axes of AXES
+# The axes along which each deviation is drawn anew, in the order of Spread.
+VARY = (
     *("fabric", "motion number", "configuration motion fabric", "configuration fabric repeat"),
     *("configuration motion number", "configuration motion fabric number", " ".join(AXES)),
-)  # fmt: skip
+)
 
 
 def made_up(size: Size, spread: Spread, effects: Effects, seed: int) -> ResultArray:
@@ -77,7 +78,7 @@ def made_up(size: Size, spread: Spread, effects: Effects, seed: int) -> ResultAr
 
     logs = np.zeros(shape)
     for deviation, axes in zip(spread, VARY, strict=True):
-        logs += drawn(deviation, str(axes))
+        logs += drawn(deviation, axes)
     for (configuration, motion), effect in effects.items():
         logs[names.index(configuration), MOTIONS.index(motion)] += effect
     trajectories = tuple(

@@ -1,6 +1,6 @@
 """Do the study's statistics keep their promise? Made-up studies say, with effects and without.
 
-python experiments/statistics_power.py --out docs/results/statistics_power.csv    # an hour
+python experiments/statistics_power.py --out docs/results/statistics_power.csv    # 15 minutes
 
 Studies of the size of a preset are given to the functions that make the report. Without effects
 (a ratio of 1) every finding is false; with them DIFFCLOUD from lifting is better than from wind,
@@ -38,7 +38,7 @@ def line(preset: str, words: str, ratio: float, found: Measured) -> Line:
 
 if __name__ == "__main__":
     parser = command_line(__doc__, "docs/results/statistics_power.csv")
-    parser.add_argument("--studies", type=int, default=1000)
+    parser.add_argument("--studies", type=int, default=500)
     parser.add_argument(
         "--document", type=Path, help="into which to put the table, between its marks"
     )

@@ -1,6 +1,7 @@
 """Means over units that share the levels of other factors: what they are uncertain by."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from r2s.evaluation.crossed import POWER, crossed_mean, interval, p_value, units
 def test_without_other_factors_it_is_students_t():
     numbers = np.array([0.3, 0.1, -0.1, 0.4])
     found = crossed_mean(numbers)
-    theirs = stats.ttest_1samp(numbers, 0.0)
+    theirs: Any = stats.ttest_1samp(numbers, 0.0)
     assert p_value(found) == pytest.approx(theirs.pvalue)
     low, high = theirs.confidence_interval(0.9)
     assert interval(found) == pytest.approx((low, high))
@@ -64,7 +65,8 @@ def test_units_needed_have_the_power_and_one_less_does_not():
     generator = np.random.default_rng(1)
     for count, is_enough in ((int(likely), True), (int(likely) - 1, False)):
         drawn = 0.3 + found.spread * generator.normal(size=(40000, count))
-        power = np.mean(stats.ttest_1samp(drawn, 0.0, axis=1).pvalue < 0.05)
+        tested: Any = stats.ttest_1samp(drawn, 0.0, axis=1)
+        power = np.mean(tested.pvalue < 0.05)
         assert (power > POWER - 0.01) == is_enough, (count, power)
 
 

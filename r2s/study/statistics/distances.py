@@ -65,7 +65,8 @@ def means(results: ResultArray) -> Means:
         float(np.median(values[there])) if there.any() else np.nan
         for values, there in zip(worst, results.present, strict=True)
     ]
-    return Means(*found, np.array(medians), diverged, runs)
+    mean, low, high = found
+    return Means(mean, low, high, np.array(medians), diverged, runs)
 
 
 def _mean(
@@ -137,11 +138,13 @@ def _with_references(rows: Iterable[Row]) -> list[Row]:
 def _cells(results: ResultArray) -> dict[object, str]:
     in_mm = results.unit == "m"
     scale = 1e3 if in_mm else 1.0
-    numbers = zip(*(part.tolist() for part in means(results)), strict=True)
+    found = means(results)
+    lengths = (scale * np.array(found[:4])).T.tolist()
+    counts = zip(found.diverged.tolist(), found.runs.tolist(), strict=True)
     return {
-        configuration: cell(*(scale * number for number in lengths), diverged, runs, in_mm)
-        for configuration, (*lengths, diverged, runs) in zip(
-            results.configurations, numbers, strict=True
+        configuration: cell(mean, low, high, median, *lost, in_mm)
+        for configuration, (mean, low, high, median), lost in zip(
+            results.configurations, lengths, counts, strict=True
         )
     }
 
