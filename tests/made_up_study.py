@@ -1,28 +1,17 @@
 """Made-up rows and motions of a study, whose effects are known."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 
 import numpy as np
-import pytest
 
 from r2s.geometry.mesh import rectangle
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
 from r2s.study.report.motions import MotionComparison
 from r2s.study.rows import Row
-from r2s.study.statistics import result_array
 
 FABRICS = ("black_denim", "grey_interlock", "pink_solid")
 METRICS = {"chamfer": ("m", 1.0), "paper_chamfer": ("-", 20.0), "hausdorff": ("m", 3.0)}
-
-
-@contextmanager
-def few_draws(count: int = 60) -> Iterator[None]:
-    """Bootstraps of so many draws, for the sake of time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(result_array, "DRAWS", count)
-        yield
 
 
 def flat_distance(

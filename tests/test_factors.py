@@ -18,8 +18,8 @@ CROSSED = tuple(
 FABRICS = tuple(f"fabric_{i}" for i in range(6))
 
 
-def shares(rows, motions=("fling",), draws=100):
-    found = variance_shares(result_array(rows, "chamfer", motions), draws)
+def shares(rows, motions=("fling",)):
+    found = variance_shares(result_array(rows, "chamfer", motions))
     assert found is not None
     return found, dict(zip(found.factors, found.share, strict=True))
 
@@ -60,11 +60,10 @@ def test_known_shares_are_found():
         assert share[name] == pytest.approx(variance / total, abs=0.02)
     assert share["rest"] == pytest.approx(0.2**2 / total, abs=0.02)
     assert found.share.sum() == pytest.approx(1)
-    assert np.all(found.low <= found.share + 0.03) and np.all(found.high >= found.share - 0.03)
     assert found.confounded == () and found.diverged == 0
     table = share_table({"fling": found, "again": found}, "")
     assert table.header == ("factor", "fling [%]", "again [%]") and table.rows[-1][0] == "rest"
-    assert table.rows[0][1].startswith(f"{100 * share['approach']:.1f} [")
+    assert table.rows[0][1] == f"{100 * share['approach']:.1f}"
 
 
 def test_factors_without_effect_have_no_share():

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_up_study import few_draws, made_up_comparison, made_up_rows
+from made_up_study import made_up_comparison, made_up_rows
 from test_report import Page
 
 from r2s.fabrics.parameters import Range
@@ -24,12 +24,6 @@ ESTIMATED = Estimated(
     np.array([np.nan]),
 )
 COSTS = cost_table([Cost("estimates", count=3, seconds=12.345, each=4.1, peak_memory=512.0)])
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick():
-    with few_draws():
-        yield
 
 
 def some_diverged(configuration, fabric, motion, trial, repeat):
@@ -59,8 +53,8 @@ def published(tmp_path_factory):
 def test_all_parts_are_there(published):
     out, tables, page = published
     for text in (
-        "Findings", "Holds", "Distances in millimetres", "In the units of the paper", "Ranks",
-        "What matters", "Motions", "Viewer", "123 ± 12 N/m", "RuntimeError: <diverged>", "12.3",
+        "Findings", "fabrics that would tell:", "Distances in millimetres",
+        "In the units of the paper", "Ranks", "What matters", "Motions", "Viewer", "123 ± 12 N/m", "RuntimeError: <diverged>", "12.3",
         "peak memory [MB]", "recordings", "made up", "version of jax", "diverged)",
         "1 more recordings are not in it", "videos/fling_black_denim1.",
     ):  # fmt: skip

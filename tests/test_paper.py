@@ -74,7 +74,7 @@ def test_ours_stand_beside_theirs(folder):
     assert table.rows[0] == ("black denim", "0.400", "0.250", "-", "0.500", "0.800")
     assert table.rows[2] == ("pink solid", "diverged", "-", "-", "-", "0.800")
     assert table.rows[3] == ("red jet set", "-", "0.750", "-", "1.500", "-")
-    assert table.rows[4][:3] == ("mean", "0.400 (4 of 12 diverged)", "0.500")
+    assert table.rows[4][:3] == ("mean", "median 0.400 (4 of 12 diverged)", "0.500")
     assert "Ru et al. 2025" in table.caption and table.foot == 1
 
 

@@ -4,19 +4,13 @@ import math
 
 import numpy as np
 import pytest
-from made_up_study import few_draws, made_up_rows
+from made_up_study import made_up_rows
 from scipy import stats
 
 from r2s.evaluation.statistics import critical_difference
 from r2s.study.configuration import PAPER_CONFIGURATIONS
 from r2s.study.statistics.ranks import rank, rank_table
 from r2s.study.statistics.result_array import result_array
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick():
-    with few_draws():
-        yield
 
 
 def ordered(configuration, fabric, motion, trial, repeat):
@@ -30,7 +24,7 @@ def test_ranks_do_not_see_how_hard_a_trajectory_is():
     # The default, 40 mm, is first only where trajectories are hard.
     estimates = found.mean[: len(PAPER_CONFIGURATIONS)]
     assert np.all(np.diff(estimates) > 0) and np.all(found.low <= found.high)
-    assert found.by_trajectory.p < 1e-9 and found.by_fabric.blocks == 3
+    assert found.test.p < 0.01 and found.test.blocks == found.fabrics == 3
     assert found.first.sum() == pytest.approx(1)
     shown = rank_table({"fling": found}, "Ranks")
     assert (
@@ -66,7 +60,7 @@ def test_alike_columns_are_not_told_apart():
     for seed in range(20):
         found = rank(result_array(made_up_rows(seed=seed, repeats=1), "chamfer", ("fling",)))
         assert found is not None
-        p.append(found.by_trajectory.p)
+        p.append(found.test.p)
     assert stats.kstest(p, "uniform").pvalue > 1e-3
 
 
@@ -75,7 +69,7 @@ def test_too_little_to_rank():
     one = [r for r in made_up_rows(configurations=PAPER_CONFIGURATIONS[:1]) if not r.baseline]
     assert rank(result_array(one, "chamfer")) is None
     two = rank(result_array(made_up_rows(configurations=PAPER_CONFIGURATIONS[:2]), "chamfer"))
-    assert two is not None and math.isnan(two.by_trajectory.p)
+    assert two is not None and math.isnan(two.test.p)
     assert "cannot be made" in rank_table({"fling": two}, "").caption
 
 

@@ -1,7 +1,7 @@
-"""Statistics of repeated comparisons: bootstrap intervals, rank tests and their corrections."""
+"""Levels of all statistics; corrections of many tests; tests of ranks."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -9,32 +9,6 @@ from scipy import stats
 
 LEVEL = 0.9  # of every interval
 SIGNIFICANCE = 0.05  # of every test
-
-
-def interval(samples: Sequence[float] | np.ndarray) -> tuple[float, float]:
-    """The middle `LEVEL` of bootstrap samples; NaN when all are NaN."""
-    samples = np.asarray(samples, float)
-    samples = samples[~np.isnan(samples)]
-    if not len(samples):
-        return np.nan, np.nan
-    low, high = np.quantile(samples, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], method="nearest")
-    return float(low), float(high)
-
-
-def signed_rank(differences: Float[np.ndarray, " pair"]) -> tuple[float, bool]:
-    """Two-sided p of Wilcoxon's signed-rank test, and whether it speaks for a positive centre.
-
-    Infinite differences rank last, zeros are dropped.
-    """
-    finite = np.abs(differences[np.isfinite(differences)])
-    bound = 2 * finite.max(initial=1.0)
-    differences = np.clip(differences, -bound, bound)
-    differences = differences[differences != 0]
-    if not len(differences):
-        return 1.0, False
-    found: Any = stats.wilcoxon(differences)
-    ranks = np.sign(differences) * stats.rankdata(np.abs(differences))
-    return float(found.pvalue), bool(ranks.sum() > 0)
 
 
 def holm(p: Sequence[float]) -> np.ndarray:

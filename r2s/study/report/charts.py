@@ -50,7 +50,7 @@ def rank_chart(path: Path | str, ranks: Mapping[str, Ranks]) -> Path:
         axes.plot(each.mean[order], places, "o", color=BLUE, markersize=6)
         axes.set_yticks(places, [each.configurations[i].label for i in order], fontsize=8.5)
         axes.set(xlabel="mean rank (1 is best)", xlim=(0.7, len(order) + 0.3))
-        axes.set_title(f"{title}: {each.trajectories} trajectories", fontsize=11)
+        axes.set_title(f"{title}: {each.fabrics} fabrics", fontsize=11)
         start, below = 1.0, len(order) - 0.1
         axes.plot([start, start + each.difference], [below, below], "|-", color=VERMILION)
         text = f"critical difference {each.difference:.2f} ({100 * SIGNIFICANCE:.0f} %, Nemenyi)"
@@ -62,7 +62,7 @@ def rank_chart(path: Path | str, ranks: Mapping[str, Ranks]) -> Path:
 
 
 def share_chart(path: Path | str, shares: Mapping[str, Shares]) -> Path:
-    """Draw shares of the variance of the log distance, grouped by factor, with intervals."""
+    """Draw shares of the variance of the log distance, grouped by factor."""
     factors = list(dict.fromkeys(name for each in shares.values() for name in each.factors))
     factors.sort(key=lambda name: name == REST)  # last
     figure = Figure(figsize=(max(6.5, 1.3 * len(factors) + 1.5), 4.2), layout="constrained")
@@ -72,11 +72,9 @@ def share_chart(path: Path | str, shares: Mapping[str, Shares]) -> Path:
         where = np.array([factors.index(name) for name in each.factors], float)
         where += (i - (len(shares) - 1) / 2) * width
         axes.bar(where, 100 * each.share, 0.92 * width, label=title, color=SHARE_COLOURS[i % 6])
-        ends: dict[str, Any] = {"color": "black", "linewidth": 1.0}
-        axes.vlines(where, 100 * each.low, 100 * each.high, **ends)
     axes.set_xticks(range(len(factors)), factors)
     axes.set_ylabel("share of the variance [%]")
-    axes.set_title(f"What the logarithm of the distance depends on ({LEVEL:.0%} intervals)")
+    axes.set_title("What the logarithm of the distance depends on")
     axes.axhline(0, color="black", linewidth=0.8)
     axes.grid(axis="y", alpha=0.3)
     axes.set_axisbelow(True)
@@ -92,23 +90,19 @@ def distance_chart(path: Path | str, parts: Mapping[str, ResultArray], title: st
     size = (2.6 + 2.9 * len(found), 1.6 + 0.34 * len(order))
     figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
-    finite = [1e3 * each.high[np.isfinite(each.high)] for each in found.values()]
+    # Intervals of few fabrics are wide: the scale is that of the means.
+    finite = [2e3 * each.mean[np.isfinite(each.mean)] for each in found.values()]
     right = 1.12 * max((float(values.max()) for values in finite if len(values)), default=1.0)
     for axes, (motion, each) in zip(panels, found.items(), strict=True):
         for i, configuration in enumerate(parts[motion].configurations):
             place = order.index(configuration)
             if not np.isfinite(each.mean[i]):
-                axes.text(0.02 * right, place, "diverged", fontsize=8, va="center", color=VERMILION)
+                text = f"{each.diverged[i]}/{each.runs[i]} diverged"
+                axes.text(0.02 * right, place, text, fontsize=8, va="center", color=VERMILION)
                 continue
             low, mean, high = 1e3 * each.low[i], 1e3 * each.mean[i], 1e3 * each.high[i]
             axes.hlines(place, low, high, color=colour_of(place), linewidth=5, alpha=0.4)
             axes.plot(mean, place, "o", color=colour_of(place), markersize=6)
-            if each.diverged[i]:
-                text = f"{each.diverged[i]}/{each.runs[i]} diverged"
-                side: dict[str, Any] = {"ha": "left", "x": high + 0.015 * right}
-                if high > 0.65 * right:
-                    side = {"ha": "right", "x": low - 0.015 * right}
-                axes.text(y=place, s=text, fontsize=7, va="center", color=VERMILION, **side)
         axes.set(xlabel="distance [mm]", xlim=(0, right), ylim=(len(order) - 0.4, -0.6))
         axes.set_title(motion, fontsize=11)
         axes.grid(axis="x", alpha=0.3)

@@ -100,10 +100,11 @@ def _intro(
     )
     how = (
         f"Configurations are compared by {results.metric}. A simulation that diverged is a result: "
-        f"it is counted, ranks last, and is in no mean. Intervals are of {LEVEL:.0%}, a bootstrap "
-        "over recordings and over repeats of an estimate; the fabrics are given, so that they say "
-        "nothing about other fabrics. An estimate that was made once has no repeats: then its "
-        "interval does not have its spread."
+        f"it is counted, ranks last, and what has one has no mean. Intervals are of {LEVEL:.0%}, "
+        "for fabrics like these on motions like these: the fabrics are the sample (Student's t), "
+        "and what motions and repeated estimates contribute to all of them alike is added. An "
+        "estimate that was made once has no repeats: then the interval does not have what the "
+        "recording that it was made from contributes to all fabrics alike."
     )
     if undefined:
         counts = ", ".join(f"{count} of {metric}" for metric, count in undefined.items())

@@ -32,9 +32,11 @@ def findings_section(
     first = found[metrics[0]]
     words = [
         *_headlines(results),
-        "Each conclusion of the paper is a test on these numbers. Ratios are of distances, or of "
-        "what is named, with their interval; they are above 1 where the conclusion is right. All "
-        "p are Wilcoxon's signed-rank test with Holm's correction.",
+        "Each conclusion of the paper is a test on these numbers, meant for fabrics like these: "
+        "the fabrics are the sample, and each has one number, however many recordings and "
+        "estimates it rests on. Ratios are of distances, or of what is named, with their interval; "
+        "they are above 1 where the conclusion is right. All p are Student's t test with Holm's "
+        "correction.",
         *(findings.in_words(verdict) for verdict in first),
     ]
     if not paper:
@@ -56,17 +58,22 @@ def _headlines(results: ResultArray) -> list[str]:
     scale, unit = (1e3, " mm") if results.unit == "m" else (1.0, "")
     found = []
     for motion, part in by_motion(results).items():
-        numbers = zip(part.configurations, *means(part), strict=True)
-        finite = [each for each in numbers if np.isfinite(each[1])]
-        best, defaults = [], []
-        for configuration, *ends, diverged, runs in sorted(finite, key=lambda each: each[1]):
-            mean, low, high = (significant(scale * end) for end in ends)
-            lost = f"; {diverged} of {runs} diverged" if diverged else ""
-            words = f"{configuration.label} {mean}{unit} ({low} to {high}{lost})"
+        numbers = zip(part.configurations, *(each.tolist() for each in means(part)), strict=True)
+        best, defaults, lost = [], [], []
+        for configuration, *lengths, _, diverged, runs in sorted(numbers, key=lambda each: each[1]):
+            if diverged:
+                lost.append(f"{configuration.label} ({diverged} of {runs})")
+                continue
+            mean, low, high = (significant(scale * length) for length in lengths)
+            between = f" ({low} to {high})" if np.isfinite(lengths[1]) else ""
+            words = f"{configuration.label} {mean}{unit}{between}"
             (best if configuration.approach else defaults).append(words)
         if best:
             compared = f"; {', '.join(defaults)}" if defaults else ""
-            found.append(f"Least {results.metric} in {motion}: {', '.join(best[:3])}{compared}.")
+            without = f". Not ranked, for runs diverged: {', '.join(lost)}" if lost else ""
+            found.append(
+                f"Least {results.metric} in {motion}: {', '.join(best[:3])}{compared}{without}."
+            )
     return found
 
 
@@ -115,8 +122,7 @@ def rank_section(out: Path, results: ResultArray, keep: Keep) -> list[Section]:
     path = charts.rank_chart(out / "figures" / "ranks.png", found)
     words = (
         "Configurations are ranked within each recording, so that hard recordings count no more. "
-        "Intervals reach rather too far to the middle, where estimates were repeated: resampled, "
-        "their means scatter more."
+        "What diverged is last."
     )
     return [Section("Ranks", (words,), shown, ((path, "Mean ranks with their intervals."),))]
 

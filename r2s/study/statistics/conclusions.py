@@ -7,23 +7,21 @@ PhysNet.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
-from scipy import stats
+from jaxtyping import Float
 
-from r2s.evaluation.statistics import LEVEL
 from r2s.study.configuration import APPROACHES, PAPER_CONFIGURATIONS, Configuration
-from r2s.study.statistics.hypotheses import Claim, Comparison, compare, paired
+from r2s.study.statistics.hypotheses import Claim, Comparison, compare, compared
 from r2s.study.statistics.paper import METRICS, Paper, average
 from r2s.study.statistics.result_array import (
     ResultArray,
-    Weights,
-    mean_over_repeats,
     on_motion,
     safe_ratio,
     select,
 )
+from r2s.study.statistics.samples import by_movement, finite_mean, log_distances, of_fabrics
 
 LIFTING, WIND, DIFFCP = PAPER_CONFIGURATIONS[:3]
 PINN_POINTS, PINN_CLOTH = PAPER_CONFIGURATIONS[6:]
@@ -87,53 +85,51 @@ def pinn_on_points_is_best_in_fling(results: ResultArray, paper: Paper) -> Claim
 
 
 def diffcp_explodes(results: ResultArray, paper: Paper) -> Claim:
-    """DiffCP's estimates diverge more often than others: Fisher's exact test of the counts.
+    """DiffCP's estimates diverge more often than others, in the share of each fabric's estimates.
 
     An estimate counts as diverged when a motion that it predicts did. Gradients that exploded on
     the way to a fabric that can be simulated are not seen here.
     """
     del paper  # no numbers of it there
     words, claim = (
-        "estimates that diverged, against other approaches",
+        "share of the estimates that diverged, less that of other approaches",
         "The gradients of DiffCP explode: more of its estimates diverge than of others.",
     )
     (lost, lost_other), (made, made_other) = _diverged_estimates(results, "diffcp")
-    if not (made and made_other):
-        which = "of DiffCP" if not made else "of other approaches"
+    if not (made.any() and made_other.any()):
+        which = "of DiffCP" if not made.any() else "of other approaches"
         return Claim(claim, (Comparison(words, lacking=f"no rows {which}"),))
-    note = f"Diverged: {lost} of {made} estimates of DiffCP, {lost_other} of {made_other} others."
-    if not (lost or lost_other):
+    note = (
+        f"Diverged: {lost.sum():.0f} of {made.sum():.0f} estimates of DiffCP, "
+        f"{lost_other.sum():.0f} of {made_other.sum():.0f} others."
+    )
+    if not (lost.any() or lost_other.any()):
         lacking = "no estimate diverged, and what gradients did on the way is not in the rows"
         return Claim(claim, (Comparison(words, lacking=lacking),), note)
-    counts = np.array([[lost, made - lost], [lost_other, made_other - lost_other]])
-    tested: Any = stats.fisher_exact(counts)
-    odds = counts + 0.5  # half an estimate more for each count, since one may be zero
-    logarithm = float(np.log(odds[0, 0] * odds[1, 1] / (odds[0, 1] * odds[1, 0])))
-    reach = float(stats.norm.ppf((1 + LEVEL) / 2) * np.sqrt((1 / odds).sum()))
-    ratio, low, high = (float(np.exp(logarithm + side * reach)) for side in (0, -1, 1))
-    counted = Comparison(
-        f"{words} (odds ratio)",
-        pairs=made + made_other,
-        ratio=ratio,
-        low=low,
-        high=high,
-        p=float(tested.pvalue),
-        favoured=ratio > 1,
-    )
-    return Claim(claim, (counted,), note)
+    numbers = safe_ratio(lost, made) - safe_ratio(lost_other, made_other)
+    tested = compared(words, numbers, is_ratio=False)
+    # Counts may be alike in all fabrics by chance: fabrics differ at least by what counts do.
+    share = (lost + lost_other).sum() / (made + made_other).sum()
+    counted = share * (1 - share) * float(np.mean(1 / made[made > 0]))
+    spread = max(tested.found.spread, np.sqrt(counted))
+    found = tested.found._replace(spread=float(spread))
+    return Claim(claim, (replace(tested, found=found),), note)
 
 
-def _diverged_estimates(results: ResultArray, approach: str) -> tuple[list[int], list[int]]:
+def _diverged_estimates(
+    results: ResultArray, approach: str
+) -> tuple[Float[np.ndarray, "side fabric"], Float[np.ndarray, "side fabric"]]:
     """How many estimates diverged, and were made: of an approach, and of all others."""
-    lost, made = [0, 0], [0, 0]
+    shape = 2, len(results.fabrics)
+    lost, made = np.zeros(shape), np.zeros(shape)
     for i, configuration in enumerate(results.configurations):
         if not configuration.approach:
             continue
         side = 0 if configuration.approach == approach else 1
-        for fabric in results.fabrics:
+        for place, fabric in enumerate(results.fabrics):
             own = results.of_fabric(fabric)
-            lost[side] += int(results.diverged[i, own].any(axis=0).sum())
-            made[side] += int(results.present[i, own].any(axis=0).sum())
+            lost[side, place] += results.diverged[i, own].any(axis=0).sum()
+            made[side, place] += results.present[i, own].any(axis=0).sum()
     return lost, made
 
 
@@ -141,7 +137,7 @@ def physnet_varies_most(results: ResultArray, paper: Paper) -> Claim:
     """Repeats of PhysNet differ more than those of each other approach.
 
     Compared is the deviation over repeats of the logarithm of the distance, on the trajectories of
-    both. Its interval resamples trajectories alone. A repeat that diverged makes it infinite.
+    both; of several configurations of an approach the geometric mean.
     """
     del paper  # no numbers of it there
     there = {configuration.approach for configuration in results.configurations}
@@ -154,37 +150,34 @@ def physnet_varies_most(results: ResultArray, paper: Paper) -> Claim:
 
 def _varies_more(results: ResultArray, other: str) -> Comparison:
     words = f"deviation between repeats: PhysNet's over {APPROACHES[other]}'s"
-    first, second = _spread(results, other), _spread(results, "physnet")
-    kept = np.flatnonzero((first > 0) & (second > 0))  # not where there is none
-    if not len(kept):
+    if "physnet" not in {configuration.approach for configuration in results.configurations}:
+        return Comparison(words, lacking="no rows of PhysNet")
+    (first, lost), (second, lost_too) = (_log_spread(results, a) for a in (other, "physnet"))
+    found = second - first
+    if not np.isfinite(found).any():
         return Comparison(words, lacking="no trajectory with two or more repeats of both")
-    with np.errstate(invalid="ignore"):  # both diverged: no difference
-        found = np.log(second[kept]) - np.log(first[kept])
-    found[np.isnan(found)] = 0.0
-    used = {results.trajectories[i] for i in kept}
-    part = select(results, trajectories=used.__contains__)
-
-    def ratios(weights: Weights | None) -> tuple[np.ndarray, np.ndarray]:
-        return found, np.ones(len(found)) if weights is None else weights.trajectory
-
-    return paired(words, part, [t.fabric for t in part.trajectories], ratios)
+    return compared(
+        words, of_fabrics(results, found), (by_movement(results, found),), (lost, lost_too)
+    )
 
 
-def _spread(results: ResultArray, approach: str) -> np.ndarray:
-    """The deviation over repeats of the log distance, the mean of an approach's configurations:
-    NaN where there are fewer than two repeats."""
-    own = [i for i, c in enumerate(results.configurations) if c.approach == approach]
-    found = np.full((len(own), len(results.trajectories)), np.nan)
-    for row, i in enumerate(own):
-        for j, (values, present) in enumerate(
-            zip(results.values[i], results.present[i], strict=True)
-        ):
-            there = values[present]
-            if len(there) > 1:
-                is_finite = np.isfinite(there).all()
-                found[row, j] = np.std(np.log(there), ddof=1) if is_finite else np.inf
-    known = ~np.isnan(found)
-    return safe_ratio(np.where(known, found, 0.0).sum(axis=0), known.sum(axis=0))
+def _log_spread(
+    results: ResultArray, approach: str
+) -> tuple[Float[np.ndarray, " trajectory"], int]:
+    """The logarithm of the deviation over repeats of the log distance, the mean of an approach's
+    configurations, and how many runs diverged.
+
+    NaN where there are fewer than two repeats, where one diverged, and where all are alike.
+    """
+    part = select(results, lambda configuration: configuration.approach == approach)
+    values = np.where(part.values > 0, part.values, np.nan)
+    logs, count = np.log(values), part.present.sum(axis=2)
+    around = logs - finite_mean(logs, 2)[..., None]
+    squares = np.where(np.isfinite(around), around, 0.0) ** 2
+    variance = safe_ratio(squares.sum(axis=2), count - 1)
+    is_known = (variance > 0) & ~part.diverged.any(axis=2)
+    deviation = np.log(np.where(is_known, variance, np.nan)) / 2
+    return finite_mean(deviation, 0), int(part.diverged.sum())
 
 
 CONCLUSIONS = (
@@ -255,32 +248,29 @@ def _easier(
 ) -> Comparison:
     """Distances on one motion against those on another, by the same configuration and fabric."""
     words = f"{hard} over {easy}, for the same configuration and fabric"
-    part = select(results, lambda c: bool(c.approach))
-    on = {m: np.array([t.evaluated_on == m for t in part.trajectories]) for m in (easy, hard)}
-    where = {  # (fabric, trajectory)
-        motion: np.array([part.of_fabric(f) & of_motion for f in part.fabrics]).reshape(
-            len(part.fabrics), len(part.trajectories)
-        )
-        for motion, of_motion in on.items()
-    }
-    there = part.present.any(axis=2).T.astype(int)
-    both = (where[easy].astype(int) @ there > 0) & (where[hard].astype(int) @ there > 0)
-    fabric_of_pair = [part.fabrics[i] for i, _ in np.argwhere(both)]
-
-    def ratios(weights: Weights | None) -> tuple[np.ndarray, np.ndarray]:
-        values = mean_over_repeats(part, weights)
-        counts = np.ones(values.shape[1]) if weights is None else weights.trajectory
-        means = {motion: _means(values, mask * counts) for motion, mask in where.items()}
-        with np.errstate(invalid="ignore", divide="ignore"):
-            found = np.log(means[hard][both]) - np.log(means[easy][both])
-        return np.where(np.isnan(found), 0.0, found), np.ones(len(found))
-
-    return paired(words, part, fabric_of_pair, ratios, quoted)
-
-
-def _means(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The means (fabric, configuration) of distances (configuration, trajectory), infinite where
-    one diverged."""
-    known = np.isfinite(values)
-    means = safe_ratio(weights @ np.where(known, values, 0.0).T, weights @ known.T)
-    return np.where(weights @ np.isinf(values).T > 0, np.inf, means)
+    part = select(results, lambda c: bool(c.approach), lambda t: t.evaluated_on in (easy, hard))
+    if not (part.configurations and part.trajectories):
+        return Comparison(words, lacking="nothing that both were judged on", paper=quoted)
+    is_hard = np.array([t.evaluated_on == hard for t in part.trajectories])
+    logs = log_distances(part).swapaxes(1, 2)
+    numbers, of_repeats = (
+        of_fabrics(part, np.where(is_hard, values, np.nan))
+        - of_fabrics(part, np.where(is_hard, np.nan, values))
+        for values in (finite_mean(logs, 1), logs)
+    )  # (configuration, fabric) and (configuration, repeat, fabric)
+    place = {name: i for i, name in enumerate(part.fabrics)}
+    of_trajectory = [place[t.fabric] for t in part.trajectories]
+    used = np.where(np.isfinite(numbers[:, of_trajectory]), finite_mean(logs, 1), np.nan)
+    of_movement = finite_mean(used, 0)
+    lost = part.diverged.sum(axis=(0, 2))
+    return compared(
+        words,
+        finite_mean(numbers, 0),
+        (
+            by_movement(part, np.where(is_hard, of_movement, np.nan)),
+            by_movement(part, np.where(is_hard, np.nan, of_movement)),
+            finite_mean(of_repeats, 0).T,
+        ),
+        (int(lost[~is_hard].sum()), int(lost[is_hard].sum())),
+        quoted,
+    )

@@ -7,17 +7,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Integer
 
-from r2s.evaluation.statistics import LEVEL, interval
+from r2s.evaluation.crossed import crossed_mean, interval
+from r2s.evaluation.statistics import LEVEL
 from r2s.study.configuration import APPROACHES
 from r2s.study.rows import Row, by_metric
 from r2s.study.statistics.result_array import (
     ResultArray,
     by_motion,
-    mean_over_repeats,
-    resamples,
     result_array,
-    safe_ratio,
 )
+from r2s.study.statistics.samples import by_movement, finite_mean, of_fabrics
 from r2s.study.tables import MISSING, Table, significant
 
 METRICS = (
@@ -34,39 +33,61 @@ OWN = "own"  # what a configuration was estimated from
 
 
 class Means(NamedTuple):
-    """Means [unit] over trajectories and repeats that did not diverge, with their interval."""
+    """Mean distances [unit], over fabrics of the means over their trajectories and repeats.
+
+    - `mean`, `low`, `high`: with their interval; NaN where a run diverged, the interval also where
+      there is one fabric.
+    - `median`: of all runs, where one that diverged is larger than any other.
+    - `diverged`, `runs`: how many did, of how many.
+    """
 
     mean: Float[np.ndarray, " configuration"]
     low: Float[np.ndarray, " configuration"]
     high: Float[np.ndarray, " configuration"]
+    median: Float[np.ndarray, " configuration"]
     diverged: Integer[np.ndarray, " configuration"]
     runs: Integer[np.ndarray, " configuration"]
 
 
 def means(results: ResultArray) -> Means:
-    """The mean of each configuration: first over repeats, then over trajectories.
+    """The mean of each configuration.
 
-    Runs that diverged have no distance: they are counted, not averaged.
+    Intervals are for the mean over all fabrics of which these are a sample, on such motions and
+    with such estimates (`r2s.evaluation.crossed`); they are made on the logarithm of the mean, by
+    its relative error, so that they have no end below zero.
     """
-    of_all = mean_over_repeats(results, diverged=np.nan)
-    drawn = [
-        _over_trajectories(mean_over_repeats(results, weights, np.nan), weights.trajectory)
-        for weights in resamples(results)
+    diverged, runs = results.diverged.sum(axis=(1, 2)), results.present.sum(axis=(1, 2))
+    found = np.full((3, len(results.configurations)), np.nan)
+    for i in np.flatnonzero((diverged == 0) & (runs > 0)):
+        found[:, i] = _mean(results, results.values[i])
+    worst = np.where(results.diverged, np.inf, results.values)
+    medians = [
+        float(np.median(values[there])) if there.any() else np.nan
+        for values, there in zip(worst, results.present, strict=True)
     ]
-    samples = np.array(drawn).reshape(-1, len(results.configurations))
-    ends = np.array([interval(each) for each in samples.T]).reshape(-1, 2)
-    return Means(
-        _over_trajectories(of_all, np.ones(of_all.shape[1])),
-        ends[:, 0],
-        ends[:, 1],
-        results.diverged.sum(axis=(1, 2)),
-        results.present.sum(axis=(1, 2)),
+    mean, low, high = found
+    return Means(mean, low, high, np.array(medians), diverged, runs)
+
+
+def _mean(
+    results: ResultArray, values: Float[np.ndarray, "trajectory repeat"]
+) -> tuple[float, float, float]:
+    """The mean of one configuration, and its interval."""
+    values = np.where(np.isfinite(values), values, np.nan)
+    of_trajectory = finite_mean(values, 1)
+    numbers = of_fabrics(results, of_trajectory)
+    kept = np.isfinite(numbers)
+    tables = by_movement(results, of_trajectory), of_fabrics(results, values.T).T
+    found = crossed_mean(numbers[kept], [table[kept] for table in tables])
+    if found.mean <= 0:  # all of it is zero
+        return found.mean, *interval(found)
+    relative = found._replace(
+        mean=np.log(found.mean),
+        spread=found.spread / found.mean,
+        shared=found.shared / found.mean**2,
     )
-
-
-def _over_trajectories(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    known = weights * np.isfinite(values)
-    return safe_ratio((known * np.nan_to_num(values)).sum(axis=1), known.sum(axis=1))
+    low, high = interval(relative)
+    return found.mean, float(np.exp(low)), float(np.exp(high))
 
 
 def distance_tables(rows: Iterable[Row]) -> dict[str, Table]:
@@ -94,9 +115,10 @@ def distance_table(rows: Sequence[Row], metric: str) -> Table:
     return Table(
         ("configuration", *(motion + unit for motion in shown)),
         tuple((c.label, *(cells.get(c, MISSING) for cells in shown.values())) for c in lines),
-        f"{metric}{unit}: mean over recordings and repeats, {LEVEL:.0%} interval by a bootstrap "
-        'over both, and how many runs diverged (not in the mean). "own": the recordings that a '
-        "configuration was estimated from.",
+        f"{metric}{unit}: mean over fabrics of the means over recordings and repeats, and "
+        f"{LEVEL:.0%} interval for fabrics like these (Student's t: the fabrics are the sample). "
+        "Where runs diverged there is no mean: how many, and the median of all, with those that "
+        'diverged above any other. "own": the recordings that a configuration was estimated from.',
     )
 
 
@@ -116,20 +138,27 @@ def _with_references(rows: Iterable[Row]) -> list[Row]:
 def _cells(results: ResultArray) -> dict[object, str]:
     in_mm = results.unit == "m"
     scale = 1e3 if in_mm else 1.0
-    numbers = zip(*(part.tolist() for part in means(results)), strict=True)
+    found = means(results)
+    lengths = (scale * np.array(found[:4])).T.tolist()
+    counts = zip(found.diverged.tolist(), found.runs.tolist(), strict=True)
     return {
-        configuration: cell(scale * mean, scale * low, scale * high, diverged, runs, in_mm)
-        for configuration, (mean, low, high, diverged, runs) in zip(
-            results.configurations, numbers, strict=True
+        configuration: cell(mean, low, high, median, *lost, in_mm)
+        for configuration, (mean, low, high, median), lost in zip(
+            results.configurations, lengths, counts, strict=True
         )
     }
 
 
-def cell(mean: float, low: float, high: float, diverged: int, runs: int, in_mm: bool) -> str:
-    """A mean, its interval where there is one, and how many of the runs diverged."""
+def cell(
+    mean: float, low: float, high: float, median: float, diverged: int, runs: int, in_mm: bool
+) -> str:
+    """A mean and its interval where there is one; where runs diverged how many, and the median."""
     if diverged == runs:
         return "diverged" if runs else MISSING
-    text, *ends = (f"{x:.1f}" if in_mm else significant(x) for x in (mean, low, high))
-    if low < high:
-        text += f" [{', '.join(ends)}]"
-    return text + (f" ({diverged} of {runs} diverged)" if diverged else "")
+    text, *ends, middle = (
+        f"{x:.1f}" if in_mm else significant(x) for x in (mean, low, high, median)
+    )
+    if diverged:
+        lost = f"{diverged} of {runs} diverged"
+        return f"median {middle} ({lost})" if np.isfinite(median) else lost
+    return f"{text} [{', '.join(ends)}]" if low < high else text

@@ -12,17 +12,19 @@ explained variance), a trajectory always after the fabric and the motion that it
 Confounded factors share evenly what no data could tell apart, and the shares and the rest sum to
 one. The explained variance is adjusted for degrees of freedom, so that a factor without effect has
 a share of zero on average, which may come out slightly below.
+
+Shares describe these results: a few fabrics say too little of how others would share it for an
+interval that keeps what it promises.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations, permutations
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 
-from r2s.evaluation.statistics import LEVEL, interval
-from r2s.study.statistics.result_array import ResultArray, Weights, resamples
+from r2s.study.statistics.result_array import ResultArray
 from r2s.study.tables import MISSING, Table
 
 NESTED = {"trajectory": ("fabric", "motion")}  # what must enter before it
@@ -31,7 +33,7 @@ ROUNDING = 1e-9  # of singular values: what is dependent on other columns of the
 
 
 class Shares(NamedTuple):
-    """Shares of the variance, their interval by a bootstrap over trajectories and repeats.
+    """Shares of the variance.
 
     - `factors`: their names, those with one level only left out; the last is the rest.
     - `deviation`: of the logarithm of the distance, [-].
@@ -41,8 +43,6 @@ class Shares(NamedTuple):
 
     factors: tuple[str, ...]
     share: Float[np.ndarray, " factor"]
-    low: Float[np.ndarray, " factor"]
-    high: Float[np.ndarray, " factor"]
     deviation: float
     confounded: tuple[tuple[str, str], ...]
     count: int
@@ -53,14 +53,10 @@ class _Data(NamedTuple):
     y: Float[np.ndarray, " value"]
     levels: dict[str, Integer[np.ndarray, " value"]]  # but for trajectories
     trajectory: Integer[np.ndarray, " value"]  # ascending
-    where: tuple[np.ndarray, ...]  # of the values in the array of results
 
 
-def variance_shares(results: ResultArray, draws: int | None = None, seed: int = 0) -> Shares | None:
-    """The shares of the variance without default fabrics; None where nothing varies.
-
-    `draws`: of the bootstrap, see `resamples`.
-    """
+def variance_shares(results: ResultArray) -> Shares | None:
+    """The shares of the variance without default fabrics; None where nothing varies."""
     data = _data(results)
     if len(data.y) < 3 or np.ptp(data.y) == 0:
         return None
@@ -70,13 +66,9 @@ def variance_shares(results: ResultArray, draws: int | None = None, seed: int = 
     factors = (*names, "trajectory") if is_nested else names
     if not factors:
         return None
-    drawn = [_shares(data, factors, w) for w in _weights(data, resamples(results, draws, seed))]
-    ends = np.array([interval(samples) for samples in np.array(drawn).T])
     return Shares(
         factors=(*factors, REST),
-        share=_shares(data, factors, np.ones(len(data.y))),
-        low=ends[:, 0],
-        high=ends[:, 1],
+        share=_shares(data, factors),
         deviation=float(data.y.std()),
         confounded=_confounded(data, names),
         count=len(data.y),
@@ -100,21 +92,14 @@ def _data(results: ResultArray) -> _Data:
         "motion": [t.evaluated_on for t in places],
     }
     levels = {name: np.unique(texts, return_inverse=True)[1] for name, texts in named.items()}
-    where = configuration, trajectory, repeat
-    return _Data(np.log(results.values[where]), levels, trajectory, where)
+    logs = np.log(results.values[configuration, trajectory, repeat])
+    return _Data(logs, levels, trajectory)
 
 
-def _weights(data: _Data, drawn: Iterator[Weights]) -> Iterator[np.ndarray]:
-    for weights in drawn:
-        weight = weights.trajectory[data.where[1]] * weights.repeat[data.where]
-        if np.count_nonzero(weight) > 2:
-            yield weight
-
-
-def _shares(data: _Data, factors: tuple[str, ...], weights: np.ndarray) -> np.ndarray:
+def _shares(data: _Data, factors: tuple[str, ...]) -> np.ndarray:
     """The mean of what each factor adds, over the orders that nesting allows; then the rest."""
     explained = {frozenset(): 0.0}
-    design = _Design(data, weights)
+    design = _Design(data)
     added = dict.fromkeys(factors, 0.0)
     orders = _orders(factors)
     for order in orders:
@@ -139,12 +124,12 @@ def _orders(factors: tuple[str, ...]) -> list[tuple[str, ...]]:
 
 
 class _Design:
-    """The weighted sums from which the fit of any set of factors follows.
+    """The sums from which the fit of any set of factors follows.
 
     Trajectories are many: instead of a column for each, their means are taken out of the others.
     """
 
-    def __init__(self, data: _Data, weights: np.ndarray):
+    def __init__(self, data: _Data):
         blocks = {
             name: level[:, None] == np.arange(1, level.max() + 1)
             for name, level in data.levels.items()
@@ -156,17 +141,13 @@ class _Design:
             for name, start, end in zip(blocks, starts, ends, strict=True)
         }
         table = np.concatenate([*blocks.values(), data.y[:, None]], axis=1).astype(float)
-        used = weights > 0
-        table, weights, trajectory = table[used], weights[used], data.trajectory[used]
         self.count = len(table)
-        first = np.flatnonzero(np.diff(trajectory, prepend=-1))
-        heavy = table * weights[:, None]
-        sums, totals = np.add.reduceat(heavy, first), np.add.reduceat(weights, first)
-        square, total = heavy.T @ table, weights.sum()
-        mean = heavy.sum(axis=0)
+        first = np.flatnonzero(np.diff(data.trajectory, prepend=-1))
+        sums, totals = np.add.reduceat(table, first), np.diff(first, append=self.count)
+        square, total = table.T @ table, table.sum(axis=0)
         self.trajectories = len(first)
-        self.around_mean = (square - np.outer(mean, mean) / total) / total
-        self.within = (square - (sums / totals[:, None]).T @ sums) / total
+        self.around_mean = (square - np.outer(total, total) / self.count) / self.count
+        self.within = (square - (sums / totals[:, None]).T @ sums) / self.count
 
     def explained(self, factors: frozenset[str]) -> float:
         """The share of the variance that factors explain, adjusted for degrees of freedom."""
@@ -209,17 +190,14 @@ def share_table(found: Mapping[str, Shares], caption: str) -> Table:
     return Table(
         ("factor", *(f"{motion} [%]" for motion in found)),
         tuple((name, *(c.get(name, MISSING) for c in shown)) for name in (*factors, REST)),
-        f"{caption}: shares of the variance of the log distance, and {LEVEL:.0%} interval. "
+        f"{caption}: shares of the variance of the log distance in these results. "
         f"{_in_words(found)}",
         foot=1,
     )
 
 
 def _cells(shares: Shares) -> dict[str, str]:
-    return {
-        name: f"{_percent(share)} [{_percent(low)}, {_percent(high)}]"
-        for name, share, low, high in zip(*shares[:4], strict=True)
-    }
+    return {name: _percent(share) for name, share in zip(shares.factors, shares.share, strict=True)}
 
 
 def _percent(share: float) -> str:

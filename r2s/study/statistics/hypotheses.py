@@ -1,59 +1,65 @@
 """Hypotheses about configurations: comparisons with a test each, and what they say together.
 
-A comparison is paired: it has two values for each trajectory (or fabric), and the ratio of the
-second to the first, which is above one where the hypothesis is right. Wilcoxon's signed-rank test
-says whether the ratios are not centred on one. Trajectories of a fabric share its estimates, so
-that the test is surer than it should be where fabrics are few: the interval of the mean ratio, by a
-bootstrap over trajectories and repeats, and the count of fabrics that agree stand beside it.
+A comparison is a number for each fabric, the mean logarithm of the ratio of two distances, which is
+above zero where the hypothesis is right. The fabrics are the sample: intervals and tests (Student's
+t, with what motions and estimates add that fabrics have in common) are for fabrics like these.
+
+A run that diverged has no distance. A comparison leaves it out, and with it what it is compared
+with; in return nothing is found in favour of a side of which a run diverged.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float
 
-from r2s.evaluation.statistics import SIGNIFICANCE, holm, interval, signed_rank
+from r2s.evaluation.crossed import CrossedMean, crossed_mean, interval, p_value, units_needed
+from r2s.evaluation.statistics import SIGNIFICANCE, holm
 from r2s.study.configuration import Configuration
-from r2s.study.statistics.result_array import (
-    ResultArray,
-    Weights,
-    mean_over_repeats,
-    resamples,
-    select,
-)
+from r2s.study.statistics.result_array import ResultArray, select
+from r2s.study.statistics.samples import by_movement, finite_mean, log_distances, of_fabrics
 
 MARGIN = 0.05  # an interval of the ratio within 1 +- this says that there is no difference
 Answer = Literal["holds", "does not hold", "cannot be told"]
-
-# The logarithm of the ratio of each pair, and how often it was drawn.
-Ratios = Callable[[Weights | None], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
 class Comparison:
     """One test of a hypothesis; `lacking` says why there is none.
 
-    - `pairs`: how many there are; `diverged`: those of which one diverged.
-    - `ratio`: the geometric mean over pairs of which neither diverged, above 1 where the hypothesis
-      is right. `low`, `high`: its interval.
-    - `p`: two-sided, before correction, of all pairs. `favoured`: the test is for the hypothesis.
-    - `agreeing`, `fabrics`: in how many of the fabrics the median ratio is above 1.
+    - `found`: the mean over fabrics of the logarithm of the ratio (of what `words` say, where it
+      is no ratio), above zero where the hypothesis is right.
+    - `agreeing`: in how many of the fabrics it is above zero.
+    - `diverged`: runs that did, of the side that should be smaller, and of the larger.
+    - `is_ratio`: whether `found` is a logarithm.
     - `paper`: the two averages that the paper's tables have for it, [-], where there are any.
     """
 
     words: str
-    pairs: int = 0
-    ratio: float = np.nan
-    low: float = np.nan
-    high: float = np.nan
-    p: float = np.nan
-    favoured: bool = False
+    found: CrossedMean = CrossedMean(np.nan, 0, np.nan, 0.0, np.nan)
     agreeing: int = 0
-    fabrics: int = 0
+    diverged: tuple[int, int] = (0, 0)
+    is_ratio: bool = True
     paper: tuple[float, float] | None = None
-    diverged: int = 0
     lacking: str = ""
+
+    @property
+    def ratio(self) -> float:
+        """The geometric mean of the ratio; NaN where there is none."""
+        return float(np.exp(self.found.mean)) if self.is_ratio else np.nan
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Of the interval of the ratio; NaN for one fabric."""
+        low, high = np.exp(interval(self.found)).tolist()
+        return (low, high) if self.is_ratio else (np.nan, np.nan)
+
+    @property
+    def p(self) -> float:
+        """Two-sided, before correction; NaN for one fabric, or none."""
+        return p_value(self.found)
 
 
 @dataclass(frozen=True)
@@ -67,12 +73,14 @@ class Claim:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The answer to a claim, that to each of its comparisons, and their corrected p."""
+    """The answer to a claim, and for each of its comparisons an answer, the corrected p, and how
+    many fabrics would tell such a difference (`needed`)."""
 
     claim: Claim
     answer: Answer
     answers: tuple[Answer, ...]
     corrected: tuple[float, ...]
+    needed: tuple[tuple[float, float, float], ...]
 
 
 def compare(
@@ -85,8 +93,7 @@ def compare(
     """Compare configurations over the trajectories that they share.
 
     - `smaller`, `larger`: which are expected to have the smaller and the larger distances. Of
-      several the geometric mean counts. A mean with a repeat that diverged is larger than any that
-      has none.
+      several the geometric mean counts.
     - `paper`: what the paper's tables have for it.
     """
     missing = [c.label for c in (*smaller, *larger) if c not in results.configurations]
@@ -97,53 +104,45 @@ def compare(
     kept = {t for t, keep in zip(part.trajectories, complete, strict=True) if keep}
     part = select(part, trajectories=kept.__contains__)
     first, second = ([part.configurations.index(c) for c in side] for side in (smaller, larger))
-
-    def ratios(weights: Weights | None) -> tuple[np.ndarray, np.ndarray]:
-        values = np.log(mean_over_repeats(part, weights))
-        with np.errstate(invalid="ignore"):  # both diverged: no difference
-            differences = values[second].mean(axis=0) - values[first].mean(axis=0)
-        counts = np.ones(len(part.trajectories)) if weights is None else weights.trajectory
-        return np.where(np.isnan(differences), 0.0, differences), counts
-
-    return paired(words, part, [t.fabric for t in part.trajectories], ratios, paper)
-
-
-def paired(
-    words: str,
-    results: ResultArray,
-    fabrics: Sequence[str],
-    ratios: Ratios,
-    paper: tuple[float, float] | None = None,
-) -> Comparison:
-    """Compare pairs whose ratios are given, and resampled as `results` is.
-
-    `fabrics`: that of each pair. For `paper` see `compare`.
-    """
-    found, _ = ratios(None)
-    if not len(found):
-        return Comparison(words, paper=paper, lacking="nothing that both were judged on")
-    low, high = interval(np.exp([_mean(*ratios(weights)) for weights in resamples(results)]))
-    of_pair = np.array(fabrics)
-    agree = [np.median(found[of_pair == fabric]) > 0 for fabric in dict.fromkeys(fabrics)]
-    p, favoured = signed_rank(found)
-    return Comparison(
+    logs = log_distances(part)
+    of_repeats = logs[second].mean(axis=0) - logs[first].mean(axis=0)
+    over_repeats = finite_mean(logs, 2)
+    values = over_repeats[second].mean(axis=0) - over_repeats[first].mean(axis=0)
+    lost = int(part.diverged[first].sum()), int(part.diverged[second].sum())
+    return compared(
         words,
-        pairs=len(found),
-        ratio=float(np.exp(_mean(found, np.ones(len(found))))),
-        low=low,
-        high=high,
-        p=p,
-        favoured=favoured,
-        agreeing=int(sum(agree)),
-        fabrics=len(agree),
-        paper=paper,
-        diverged=int(np.isinf(found).sum()),
+        of_fabrics(part, values),
+        (by_movement(part, values), of_fabrics(part, of_repeats.T).T),
+        lost,
+        paper,
     )
 
 
-def _mean(values: np.ndarray, counts: np.ndarray) -> float:
-    known = np.isfinite(values) & (counts > 0)
-    return float(np.average(values[known], weights=counts[known])) if known.any() else np.nan
+def compared(
+    words: str,
+    numbers: Float[np.ndarray, " fabric"],
+    tables: Iterable[Float[np.ndarray, "fabric _"]] = (),
+    diverged: tuple[int, int] = (0, 0),
+    paper: tuple[float, float] | None = None,
+    is_ratio: bool = True,
+) -> Comparison:
+    """The comparison whose numbers are given; see `Comparison`, and `crossed_mean` for `tables`.
+
+    Fabrics without a number (NaN) do not count.
+    """
+    kept = np.isfinite(numbers)
+    if not kept.any():
+        why = "all of it diverged" if sum(diverged) else "nothing that both were judged on"
+        return Comparison(words, diverged=diverged, paper=paper, lacking=why)
+    numbers = numbers[kept]
+    return Comparison(
+        words,
+        found=crossed_mean(numbers, [table[kept] for table in tables]),
+        agreeing=int((numbers > 0).sum()),
+        diverged=diverged,
+        is_ratio=is_ratio,
+        paper=paper,
+    )
 
 
 def judge(claims: Sequence[Claim]) -> list[Verdict]:
@@ -151,25 +150,39 @@ def judge(claims: Sequence[Claim]) -> list[Verdict]:
 
     A comparison holds where p is below `SIGNIFICANCE` and speaks for it. It does not hold where p
     speaks against it, or where the interval of the ratio says that there is no difference to speak
-    of (`MARGIN`). A claim does not hold as soon as one of its comparisons does not.
+    of (`MARGIN`). Nothing is told in favour of a side of which a run diverged. A claim does not
+    hold as soon as one of its comparisons does not.
+
+    Fabrics needed are for a ratio as far from one as that found, but at least by `MARGIN`, and for
+    the first step of Holm's correction.
     """
-    corrected = iter(holm([c.p for claim in claims for c in claim.comparisons]).tolist())
+    p = [comparison.p for claim in claims for comparison in claim.comparisons]
+    corrected = iter(holm(p).tolist())
+    significance = SIGNIFICANCE / max(1, int(np.isfinite(p).sum()))
     verdicts = []
     for claim in claims:
-        p = tuple(next(corrected) for _ in claim.comparisons)
-        answers: list[Answer] = [_answer(c, q) for c, q in zip(claim.comparisons, p, strict=True)]
-        verdicts.append(Verdict(claim, _together(answers), tuple(answers), p))
+        own = tuple(next(corrected) for _ in claim.comparisons)
+        answers: list[Answer] = [_answer(c, q) for c, q in zip(claim.comparisons, own, strict=True)]
+        needed = tuple(_needed(comparison, significance) for comparison in claim.comparisons)
+        verdicts.append(Verdict(claim, _together(answers), tuple(answers), own, needed))
     return verdicts
 
 
 def _answer(comparison: Comparison, p: float) -> Answer:
     if comparison.lacking:
         return "cannot be told"
-    is_near = 1 / (1 + MARGIN) < comparison.low and comparison.high < 1 + MARGIN
-    is_alike = is_near and not comparison.diverged
-    if p < SIGNIFICANCE and not is_alike:
-        return "holds" if comparison.favoured else "does not hold"
-    return "does not hold" if is_alike else "cannot be told"
+    low, high = comparison.ends
+    if 1 / (1 + MARGIN) < low and high < 1 + MARGIN and not any(comparison.diverged):
+        return "does not hold"
+    is_favoured = comparison.found.mean > 0
+    if p < SIGNIFICANCE and not comparison.diverged[0 if is_favoured else 1]:
+        return "holds" if is_favoured else "does not hold"
+    return "cannot be told"
+
+
+def _needed(comparison: Comparison, significance: float) -> tuple[float, float, float]:
+    effect = max(abs(comparison.found.mean), np.log1p(MARGIN))
+    return units_needed(comparison.found, effect, significance)
 
 
 def _together(answers: Sequence[Answer]) -> Answer:

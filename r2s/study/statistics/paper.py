@@ -14,10 +14,9 @@ import numpy as np
 
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
 from r2s.study.rows import Row, by_metric
-from r2s.study.statistics.distances import cell
+from r2s.study.statistics.distances import cell, means
 from r2s.study.statistics.result_array import (
     ResultArray,
-    mean_over_repeats,
     result_array,
     select,
 )
@@ -107,8 +106,8 @@ def beside_paper(rows: Sequence[Row], paper: Paper, motion: str, metric: str) ->
     """The table of one motion: each configuration of ours beside the same of the paper.
 
     There is a line for each fabric, and one for their mean. `metric` is paper_chamfer or
-    paper_hausdorff. Ours are means over recordings and repeats that did not diverge, and how many
-    did.
+    paper_hausdorff. Ours are means over recordings and repeats; where some diverged medians, and
+    how many did.
     """
     results = result_array(rows, metric, (motion,))
     theirs = paper.get((motion, metric), {})
@@ -138,16 +137,15 @@ def _ours(results: ResultArray, configuration: Configuration, fabrics: list[str]
     """A cell for each fabric, and one for the mean of the fabrics."""
     part = select(results, lambda c: c == configuration)
     parts = [select(part, trajectories=lambda t, name=name: t.fabric == name) for name in fabrics]
-    means = [_finite_mean(mean_over_repeats(each, diverged=np.nan)) for each in parts]
-    return [
-        cell(mean, math.nan, math.nan, int(each.diverged.sum()), int(each.present.sum()), False)
-        for mean, each in zip([*means, _finite_mean(np.array(means))], [*parts, part], strict=True)
-    ]
+    return [_without_interval(each) for each in (*parts, part)]
 
 
-def _finite_mean(values: np.ndarray) -> float:
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if len(known) else math.nan
+def _without_interval(part: ResultArray) -> str:
+    """The cell of one configuration."""
+    if not part.present.any():
+        return MISSING
+    mean, _, _, median, diverged, runs = (each.item() for each in means(part))
+    return cell(mean, math.nan, math.nan, median, diverged, runs, False)
 
 
 def _theirs(values: Mapping[str, float], fabrics: list[str]) -> list[str]:

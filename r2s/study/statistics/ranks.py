@@ -11,24 +11,24 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import rankdata
 
-from r2s.evaluation.statistics import LEVEL, Friedman, critical_difference, friedman, interval
+from r2s.evaluation.crossed import crossed_mean, interval
+from r2s.evaluation.statistics import LEVEL, Friedman, critical_difference, friedman
 from r2s.study.configuration import Configuration
-from r2s.study.statistics.result_array import ResultArray, mean_over_repeats, resamples, select
+from r2s.study.statistics.result_array import ResultArray, mean_over_repeats, select
+from r2s.study.statistics.samples import by_movement, of_fabrics
 from r2s.study.tables import MISSING, Table, significant
 
 
 class Ranks(NamedTuple):
     """Mean ranks, 1 the best, of the configurations that were judged on the same trajectories.
 
-    - `low`, `high`: interval by a bootstrap over trajectories and repeats. Means of resampled
-      repeats scatter more than those of all, so that intervals reach to the middle rather too far.
+    - `mean`: over fabrics, of their means over trajectories. `low`, `high`: its interval, for
+      fabrics like these; NaN for one fabric.
     - `first`: the share of trajectories in which a configuration is the best.
-    - `trajectories`: how many count. `left_out`: configurations that lack most of them.
-    - `by_trajectory`: Friedman's test of all but default fabrics with trajectories as blocks, which
-      takes those of one fabric, with the same estimates, for independent. `by_fabric`: with
-      fabrics as blocks.
-    - `difference`: by which two mean ranks must differ to be told apart (Nemenyi), with
-      trajectories as blocks.
+    - `trajectories`, `fabrics`: how many count. `left_out`: configurations that lack most of them.
+    - `test`: Friedman's test of all but default fabrics, with fabrics as blocks.
+    - `difference`: by which two mean ranks must differ to be told apart (Nemenyi), with fabrics as
+      blocks.
     """
 
     configurations: tuple[Configuration, ...]
@@ -37,9 +37,9 @@ class Ranks(NamedTuple):
     high: Float[np.ndarray, " configuration"]
     first: Float[np.ndarray, " configuration"]
     trajectories: int
+    fabrics: int
     left_out: tuple[Configuration, ...]
-    by_trajectory: Friedman
-    by_fabric: Friedman
+    test: Friedman
     difference: float
 
 
@@ -59,27 +59,25 @@ def rank(results: ResultArray) -> Ranks | None:
     if len(part.configurations) < 2 or not part.trajectories:
         return None
     ranks = rankdata(mean_over_repeats(part), axis=0)
-    drawn = [
-        np.average(
-            rankdata(mean_over_repeats(part, weights), axis=0), axis=1, weights=weights.trajectory
-        )
-        for weights in resamples(part)
+    of_fabric = of_fabrics(part, ranks)
+    found = [
+        crossed_mean(numbers, (by_movement(part, own),))
+        for numbers, own in zip(of_fabric, ranks, strict=True)
     ]
-    ends = np.array([interval(samples) for samples in np.array(drawn).T])
-    of_fabric = np.stack([ranks[:, part.of_fabric(f)].mean(axis=1) for f in part.fabrics], axis=1)
+    ends = np.clip([interval(each) for each in found], 1, len(ranks))
     best = ranks == ranks.min(axis=0)
     estimates = [bool(configuration.approach) for configuration in part.configurations]
     return Ranks(
         configurations=part.configurations,
-        mean=ranks.mean(axis=1),
+        mean=of_fabric.mean(axis=1),
         low=ends[:, 0],
         high=ends[:, 1],
         first=(best / best.sum(axis=0)).mean(axis=1),
         trajectories=len(part.trajectories),
+        fabrics=len(part.fabrics),
         left_out=tuple(c for c in results.configurations if c not in wanted),
-        by_trajectory=friedman(ranks[estimates]),
-        by_fabric=friedman(of_fabric[estimates]),
-        difference=critical_difference(len(part.configurations), len(part.trajectories)),
+        test=friedman(of_fabric[estimates]),
+        difference=critical_difference(len(part.configurations), len(part.fabrics)),
     )
 
 
@@ -93,30 +91,37 @@ def rank_table(found: Mapping[str, Ranks], caption: str) -> Table:
     return Table(
         ("configuration", *found),
         tuple((c.label, *(cells.get(c, MISSING) for cells in shown)) for c in dict.fromkeys(order)),
-        f"{caption}: mean rank (1 is best), {LEVEL:.0%} interval, and how often the best of all. "
+        f"{caption}: mean rank (1 is best), {LEVEL:.0%} interval for fabrics like these, and how "
+        "often the best of all. Tests of ranks are for these motions. "
         f"{words}",
     )
 
 
 def _cells(ranks: Ranks) -> dict[Configuration, str]:
     return {
-        configuration: f"{mean:.2f} [{low:.2f}, {high:.2f}], {100 * first:.0f} %"
+        configuration: f"{mean:.2f}{_ends(low, high)}, {100 * first:.0f} %"
         for configuration, mean, low, high, first in zip(*ranks[:5], strict=True)
     }
 
 
+def _ends(low: float, high: float) -> str:
+    return f" [{low:.2f}, {high:.2f}]" if np.isfinite(low) else ""
+
+
 def _tests(ranks: Ranks) -> str:
     """The tests in words."""
-    words = [f"{len(ranks.configurations)} configurations, {ranks.trajectories} trajectories"]
-    for what, test in (("trajectories", ranks.by_trajectory), ("fabrics", ranks.by_fabric)):
-        if np.isfinite(test.p):
-            words.append(
-                f"Friedman's test with {test.blocks} {what} as blocks: chi² = "
-                f"{significant(test.statistic)}, p = {test.p:.2g}"
-            )
-        else:
-            words.append(f"Friedman's test with {test.blocks} {what} as blocks cannot be made")
-    words.append(f"mean ranks differ from {ranks.difference:.2f} on (Nemenyi, trajectories)")
+    words = [
+        f"{len(ranks.configurations)} configurations, {ranks.trajectories} trajectories, "
+        f"{ranks.fabrics} fabrics"
+    ]
+    blocks = "Friedman's test with the fabrics as blocks"
+    if np.isfinite(ranks.test.p):
+        words.append(
+            f"{blocks}: chi² = {significant(ranks.test.statistic)}, p = {ranks.test.p:.2g}"
+        )
+    else:
+        words.append(f"{blocks} cannot be made")
+    words.append(f"mean ranks differ from {ranks.difference:.2f} on (Nemenyi)")
     if ranks.left_out:
         missing = ", ".join(configuration.label for configuration in ranks.left_out)
         words.append(f"left out, judged on less than half: {missing}")

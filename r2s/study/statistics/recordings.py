@@ -43,16 +43,13 @@ def _table(configuration: Configuration, rows: Sequence[Row]) -> Table:
     errors: dict[tuple[str, str], dict[str, float]] = {}
     for row in rows:
         errors.setdefault((row.fabric, row.recording), {}).setdefault(row.baseline, row.value)
-    means = {
-        name: float(np.mean(present))
-        for name in BASELINES
-        if (present := [line[name] for line in errors.values() if name in line])
-    }
+    lines = list(errors.values())
+    of_all = {name: _mean([each[name] for each in lines if name in each]) for name in BASELINES}
     return Table(
         header=("fabric", "recording", *(f"{words} [mm]" for words in BASELINES.values())),
         rows=(
             *((*names, *_cells(line)) for names, line in errors.items()),
-            ("mean", "", *_cells(means)),
+            ("mean", "", *of_all.values()),
         ),
         caption=f"{configuration.label}: {METRIC} [mm] on {rows[0].evaluated_on}",
         foot=1,
@@ -60,4 +57,16 @@ def _table(configuration: Configuration, rows: Sequence[Row]) -> Table:
 
 
 def _cells(line: dict[str, float]) -> list[str]:
-    return [f"{1e3 * line[name]:.1f}" if name in line else MISSING for name in BASELINES]
+    return [_shown(line[name]) if name in line else MISSING for name in BASELINES]
+
+
+def _mean(values: Sequence[float]) -> str:
+    """The mean; where some diverged how many, for what is left says nothing of them."""
+    lost = int((~np.isfinite(values)).sum())
+    if lost:
+        return f"{lost} of {len(values)} diverged"
+    return _shown(float(np.mean(values))) if len(values) else MISSING
+
+
+def _shown(value: float) -> str:
+    return f"{1e3 * value:.1f}" if np.isfinite(value) else "diverged"

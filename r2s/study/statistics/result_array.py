@@ -1,22 +1,18 @@
 """The rows of one metric as an array: configuration by trajectory by repeat.
 
 A trajectory is one judged recording. A repeat is one of several estimates of a configuration, which
-is judged on all trajectories of its fabric. A bootstrap therefore draws repeats within a
-configuration and a fabric, and trajectories within a fabric and a motion. The fabrics themselves
-are given: intervals are about these fabrics, not about others.
+is judged on all trajectories of its fabric. Fabrics are moved alike, to judge by and to estimate
+from: trajectories that bear one number, and repeats that do, are crossed with fabrics.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Integer
+from jaxtyping import Bool, Float
 
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
 from r2s.study.rows import Row
-
-DRAWS, FEWEST_DRAWS = 1000, 200  # of a bootstrap
-LARGE = 100_000  # values, beyond which fewer draws are made: they take as long together
 
 
 class Trajectory(NamedTuple):
@@ -25,6 +21,11 @@ class Trajectory(NamedTuple):
     fabric: str
     evaluated_on: str
     recording: str
+
+    @property
+    def movement(self) -> str:
+        """What recordings of several fabrics have in common: the name without the fabric's."""
+        return self.recording.replace(self.fabric, "")
 
 
 class ResultArray(NamedTuple):
@@ -52,13 +53,6 @@ class ResultArray(NamedTuple):
     def of_fabric(self, fabric: str) -> Bool[np.ndarray, " trajectory"]:
         """Which trajectories are of a fabric."""
         return np.array([trajectory.fabric == fabric for trajectory in self.trajectories], bool)
-
-
-class Weights(NamedTuple):
-    """How often a resample has drawn each trajectory, and each repeat of its fabric."""
-
-    trajectory: Float[np.ndarray, " trajectory"]
-    repeat: Float[np.ndarray, "configuration trajectory repeat"]
 
 
 def configurations_of(rows: Iterable[Row]) -> tuple[Configuration, ...]:
@@ -147,60 +141,19 @@ def by_motion(results: ResultArray) -> dict[str, ResultArray]:
 
 
 def mean_over_repeats(
-    results: ResultArray, weights: Weights | None = None, diverged: float = np.inf
+    results: ResultArray, diverged: float = np.inf
 ) -> Float[np.ndarray, "configuration trajectory"]:
     """The mean over repeats, [unit]: NaN where absent.
 
-    Where a repeat diverged the mean is `diverged`; if that is NaN, the mean is of the others. Where
-    none of a trajectory's repeats was drawn all of them count, since each recording may have an
-    estimate of its own.
+    Where a repeat diverged the mean is `diverged`; if that is NaN, the mean is of the others.
     """
-    weight = results.present * 1.0
-    if weights is not None:
-        drawn = weight * weights.repeat
-        weight = np.where(drawn.any(axis=2, keepdims=True), drawn, weight)
-    finite = weight * np.isfinite(results.values)
-    count = finite.sum(axis=2)
-    total = np.einsum("ijk,ijk->ij", finite, np.nan_to_num(results.values))
-    means = safe_ratio(total, count)
+    finite = np.isfinite(results.values)
+    means = safe_ratio(np.where(finite, results.values, 0.0).sum(axis=2), finite.sum(axis=2))
     if np.isnan(diverged):
         return means
-    return np.where(count < weight.sum(axis=2), diverged, means)
+    return np.where(results.diverged.any(axis=2), diverged, means)
 
 
 def safe_ratio(total: np.ndarray, count: np.ndarray) -> np.ndarray:
     """`total / count`, and NaN where `count` is zero."""
     return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
-
-
-def resamples(results: ResultArray, count: int | None = None, seed: int = 0) -> Iterator[Weights]:
-    """Bootstrap draws of trajectories within fabric and motion, of repeats within configuration
-    and fabric.
-
-    `count` is `DRAWS` unless given, and for a `LARGE` array fewer, but at least `FEWEST_DRAWS`. A
-    group of one is always itself: one repeat does not tell how repeats vary.
-    """
-    generator = np.random.default_rng(seed)
-    groups = _numbered((t.fabric, t.evaluated_on) for t in results.trajectories)
-    fabrics = _numbered(t.fabric for t in results.trajectories)
-    members = [np.flatnonzero(groups == g) for g in range(groups.max(initial=-1) + 1)]
-    # How many repeats each configuration has of each fabric.
-    known = np.zeros((len(results.configurations), fabrics.max(initial=-1) + 1), int)
-    for fabric in range(known.shape[1]):
-        known[:, fabric] = results.present[:, fabrics == fabric].any(axis=1).sum(axis=1)
-    slots = np.arange(results.values.shape[2])
-    fewer = min(DRAWS, max(FEWEST_DRAWS, DRAWS * LARGE // max(1, results.values.size)))
-    for _ in range(fewer if count is None else count):
-        trajectory = np.zeros(len(results.trajectories))
-        for group in members:
-            np.add.at(trajectory, generator.choice(group, len(group)), 1.0)
-        drawn = generator.integers(0, np.maximum(known, 1)[..., None], (*known.shape, len(slots)))
-        used = slots < known[..., None]
-        repeat = ((drawn[..., None] == slots) & used[..., None]).sum(axis=2, dtype=float)
-        yield Weights(trajectory, repeat[:, fabrics])
-
-
-def _numbered(keys: Iterable[object]) -> Integer[np.ndarray, " key"]:
-    """The number of each key in the order of first appearance."""
-    numbers: dict[object, int] = {}
-    return np.array([numbers.setdefault(key, len(numbers)) for key in keys], int)
