@@ -54,7 +54,8 @@ def test_all_parts_are_there(published):
     out, tables, page = published
     for text in (
         "Findings", "fabrics that would tell:", "Distances in millimetres",
-        "In the units of the paper", "Ranks", "What matters", "Motions", "Viewer", "123 ± 12 N/m", "RuntimeError: <diverged>", "12.3",
+        "In the units of the paper", "Ranks", "What matters", "Motions", "Viewer", "123 ± 12 N/m",
+        "RuntimeError: <diverged>", "12.3",
         "peak memory [MB]", "recordings", "made up", "version of jax", "diverged)",
         "1 more recordings are not in it", "videos/fling_black_denim1.",
     ):  # fmt: skip

@@ -5,5 +5,6 @@
 - `wrinkling`: what compression leaves of a membrane's energy, by wrinkles finer than a cell.
   `wrinkle_limits`: how many there can be. `moving_tangents`: derivatives in what moves.
 - `tables`: laws from tables of measured stiffness.
+- `stiffening`: a sheet that stiffens in closed form, and softens as it bends.
 - `solid`: the stress of a piece of material, for bodies of particles.
 """

@@ -1,0 +1,65 @@
+"""A prior that was not laid around the fabrics of the study; laws that stiffen and soften."""
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+from r2s.fabrics import presets, prior
+from r2s.laws.membrane import OrthotropicMembrane
+from r2s.laws.plate import PlateBending
+from r2s.laws.stiffening import SofteningPlate, StiffeningMembrane
+
+
+def test_draws_are_fabrics_with_the_stated_spread_and_the_weight_that_is_known():
+    found = prior.draws(0.2, 4000, jr.key(0))
+    law = found.membrane
+    assert np.all(np.asarray(law.c12**2 < law.c11 * law.c22))
+    assert np.allclose(found.density, 0.2)
+    bending = np.log(np.asarray(found.bending.stiffness))
+    assert bending.mean() == pytest.approx(-9.197 + 1.230 * np.log(0.2), abs=0.05)
+    assert bending.std() == pytest.approx(0.80, rel=0.05)
+    again = prior.draws(0.2, 4000, jr.key(0))
+    assert np.array_equal(again.membrane.c11, law.c11)
+    with pytest.raises(ValueError, match="density"):
+        prior.draws(0.0, 1, jr.key(0))
+
+
+def test_the_fabrics_of_the_study_are_possible_and_not_in_the_middle():
+    """Each lies within three deviations of the prior; together they are softer than its middle."""
+    found = prior.draws(0.2, 4000, jr.key(1)).membrane
+    drawn = np.log(np.asarray(found.c11))
+    five = [np.log(float(make().membrane.c11)) for make in presets.FIVE.values()]
+    away = (np.array(five) - drawn.mean()) / drawn.std()
+    assert np.all(np.abs(away) < 3)
+    assert np.mean(away) < -0.5
+
+
+SMALL = OrthotropicMembrane(*(jnp.asarray(c) for c in (30.0, 5.0, 60.0, 10.0)))
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_yarn_is_as_much_stiffer_at_a_stretch_as_it_was_made(axis):
+    law = StiffeningMembrane.make(SMALL, 2.0, 1.167)
+    strain = (1.167**2 - 1) / 2 * jnp.eye(3)[axis]
+
+    def tangent(strain):
+        return jax.hessian(law.energy_density)(strain)[axis, axis]
+
+    assert tangent(strain) == pytest.approx(2 * float(tangent(jnp.zeros(3))))
+    assert tangent(-strain) == pytest.approx(float(tangent(jnp.zeros(3))))  # not where it wrinkles
+    at_rest = jax.hessian(SMALL.energy_density)(jnp.zeros(3))
+    assert jax.hessian(law.energy_density)(jnp.zeros(3)) == pytest.approx(np.asarray(at_rest))
+    with pytest.raises(ValueError, match="1 or more"):
+        StiffeningMembrane.make(SMALL, 0.5, 1.167)
+
+
+def test_a_plate_loses_half_of_what_it_can_at_its_knee():
+    loss, knee = 0.35, 20.0
+    law = SofteningPlate(PlateBending.make(2e-5, 0.2), jnp.asarray(loss), jnp.asarray(knee))
+    for curvature, left in ((1e-3, 1.0), (knee, 1 - loss / 2), (1e4, 1 - loss)):
+        moment = jax.grad(law.energy_density)(jnp.array([curvature, 0.0, 0.0]))[0]
+        assert moment == pytest.approx(2e-5 * curvature * left, rel=1e-4)
+    bent = jax.hessian(law.energy_density)(jnp.array([30.0, -10.0, 5.0]))
+    assert np.all(np.linalg.eigvalsh(np.asarray(bent)) > 0)
