@@ -22,6 +22,9 @@ any_row = st.builds(
     metric=names,
     unit=names,
     value=st.floats(allow_nan=False),
+    floor=st.none() | st.floats(allow_nan=False),
+    horizon=st.none() | st.floats(allow_nan=False),
+    skill=st.none() | st.floats(allow_nan=False),
 )
 
 
@@ -45,9 +48,10 @@ def test_file_of_rows(tmp_path):
     write_rows(path, [row(np.float64(0.1)), row(math.nan)])
     lines = path.read_text().splitlines()
     assert lines[0] == (
-        "approach,solver,estimated_from,fabric,repeat,recording,evaluated_on,baseline,metric,unit,value"
+        "approach,solver,estimated_from,fabric,repeat,recording,evaluated_on,baseline,metric,unit,value,"
+        "floor,horizon,skill"
     )
-    assert lines[1] == "gauss_newton,xpbd,lift,towel,1,towel_1,fold,,chamfer,m,0.1"
+    assert lines[1] == "gauss_newton,xpbd,lift,towel,1,towel_1,fold,,chamfer,m,0.1,,,"
     assert math.isnan(read_rows(path)[1].value)
     assert [entry.name for entry in tmp_path.iterdir()] == ["results.csv"]
 
@@ -57,9 +61,9 @@ def test_file_of_rows(tmp_path):
     [
         ("", "expected the header"),
         ("approach,value\n", "expected the header"),
-        (",".join(HEADER) + "\na,b\n", "line 2: expected 11 cells, found 2"),
-        (",".join(HEADER) + "\na,b,c,d,e,f,g,,h,m,many\n", "line 2: .*many"),
-        (",".join(HEADER) + "\na,b,c,d,e,f,g,best,h,m,1.0\n", "line 2: unknown baseline 'best'"),
+        (",".join(HEADER) + "\na,b\n", "line 2: expected 14 cells, found 2"),
+        (",".join(HEADER) + "\na,b,c,d,e,f,g,,h,m,many,,,\n", "line 2: .*many"),
+        (",".join(HEADER) + "\na,b,c,d,e,f,g,best,h,m,1.0,,,\n", "line 2: unknown baseline 'best'"),
     ],
 )
 def test_damaged_rows_are_refused(tmp_path, text, message):

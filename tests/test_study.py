@@ -1,6 +1,7 @@
 """The study: what a figure means, which cells there are, and that nothing is made twice."""
 
 import dataclasses
+import itertools
 import os
 import runpy
 import sys
@@ -20,16 +21,24 @@ from r2s.fabrics.arcsim import write_material
 from r2s.failures import Failure
 from r2s.recordings.recording import cloud
 from r2s.scenarios import synthetic
+from r2s.scenarios.paths import LIMITS
 from r2s.scenarios.six import SIX
 from r2s.solver import Trajectory
 from r2s.study import engine, estimates, matrix, results
 from r2s.study.cells import dependencies, read_metadata, with_dependencies
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
 from r2s.study.costs import costs, forecast
+from r2s.study.drawn import numbers_of
 from r2s.study.estimates import EstimateCell, TrainedNetwork
 from r2s.study.mujoco_recording import MujocoRecording
 from r2s.study.rows import Row, read_rows, write_rows
-from r2s.study.sources import SyntheticRecording, TruthSettings, strain_dependent
+from r2s.study.sources import (
+    STRETCH,
+    SyntheticRecording,
+    TruthSettings,
+    small_strain,
+    strain_dependent,
+)
 from r2s.study.statistics.recordings import recording_tables
 
 ROOT = Path(__file__).parents[1]
@@ -138,22 +147,36 @@ def test_what_is_judged_was_never_estimated_from():
     every = with_dependencies(matrix.synthetic(plan))
     made = [cell for cell in every if isinstance(cell, SyntheticRecording)]
     assert len({cell.path(Path()) for cell in every}) == len(every)
-    motions = [cell._experiment().route.path.tobytes() for cell in made if cell.angle is None]
+    motions = [cell.experiment.route.path.tobytes() for cell in made if cell.angle is None]
     fabrics = {cell.fabric for cell in made}
     assert len(set(motions)) == len(motions) / len(fabrics)  # all fabrics are moved alike
 
 
 def test_a_truth_has_the_stiffness_of_the_preset_at_rest_and_more_when_stretched():
-    preset, truth = presets.grey_interlock(), strain_dependent("grey_interlock", TruthSettings())
-    at_rest, stretched = (truth.membrane.at(jnp.array([e, 0.0, 0.0])) for e in (0.0, 0.3))
-    for name in ("c11", "c12", "c22", "c33"):
-        assert getattr(at_rest, name) == pytest.approx(float(getattr(preset.membrane, name)))
-        assert getattr(stretched, name) == pytest.approx(2 * float(getattr(preset.membrane, name)))
-    hinge = truth.bending.at(jnp.array(0.0), jnp.array(0.0))
-    assert float(hinge.stiffness) == pytest.approx(float(preset.bending.stiffness))
+    preset, truth = small_strain("grey_interlock"), strain_dependent("grey_interlock")
+
+    def tangent(law, strain):
+        return np.asarray(jax.hessian(law.energy_density)(jnp.asarray(strain)))
+
+    rest, stretched = [0.0, 0.0, 0.0], [(STRETCH**2 - 1) / 2, 0.0, 0.0]
+    for law, small in ((truth.membrane, preset.membrane), (truth.bending, preset.bending)):
+        assert tangent(law, rest) == pytest.approx(tangent(small, rest))
+    assert tangent(truth.membrane, stretched)[0, 0] == pytest.approx(2 * float(preset.membrane.c11))
     assert isinstance(
         strain_dependent("grey_interlock", TruthSettings(stiffening=0.0)), type(preset)
     )
+    dampings = {float(small_strain(name).damping) for name in presets.FIVE}
+    frictions = {float(small_strain(name).friction) for name in presets.FIVE}
+    assert len(dampings) == len(frictions) == len(presets.FIVE)
+
+
+def test_motions_of_different_scenarios_are_drawn_apart():
+    places = []
+    for scenario in MOTIONS:
+        low, high = np.array(list(LIMITS[scenario].values())).T
+        drawn = numbers_of(scenario, 1, True, 0)
+        places.append(((np.array(list(drawn.values())) - low) / (high - low))[:2])
+    assert all(np.max(np.abs(a - b)) > 0.01 for a, b in itertools.combinations(places, 2))
 
 
 def test_a_changed_file_of_measured_tables_is_another_recording(tmp_path):
@@ -163,18 +186,17 @@ def test_a_changed_file_of_measured_tables_is_another_recording(tmp_path):
         )
         return [cell.recordings[0] for cell in matrix.synthetic(plan)]
 
-    truth = strain_dependent("grey_interlock", TruthSettings())
+    truth, other = (presets.FIVE[name]() for name in ("grey_interlock", "pink_solid"))
     write_material(tmp_path / "grey_interlock.json", truth)
     first, again = recordings(), recordings()
-    write_material(
-        tmp_path / "grey_interlock.json", strain_dependent("pink_solid", TruthSettings())
-    )
+    write_material(tmp_path / "grey_interlock.json", other)
     changed = recordings()
     assert [cell.key for cell in first] == [cell.key for cell in again]
     assert not {cell.key for cell in first} & {cell.key for cell in changed}
     assert isinstance(changed[0], SyntheticRecording)
-    softer = strain_dependent("grey_interlock", changed[0].truth).membrane.stiffness
-    assert not np.array_equal(softer, truth.membrane.stiffness)
+    assert strain_dependent("grey_interlock", changed[0].truth).membrane.stiffness[
+        0, 0
+    ] == pytest.approx(float(other.membrane.c11))
     with pytest.raises(FileNotFoundError, match="camel_ponte_roma.json"):
         matrix.with_changes(matrix.SMALL, fabrics=["camel_ponte_roma"], materials=str(tmp_path))
 
@@ -224,7 +246,8 @@ def test_an_estimate_is_made_once_and_judged(tiny, tmp_path):
     table = forecast(costs(cells, tmp_path), plan)
     lines = {line[0]: line[1:] for line in table.rows}
     assert lines["estimates diffcloud cloth lifting"][0] == "3"
-    assert lines["evaluations cloth shaking"][0] == "16"  # 3 estimates and the default, 4 motions
+    # 3 estimates, the true fabric and the draws, in 4 motions
+    assert lines["evaluations cloth shaking"][0] == str((3 + 1 + matrix.DRAWS) * 4)
     assert float(lines["evaluations cloth shaking"][2]) > 0
     assert lines["evaluations cloth fling"][1:] == ("not measured", "-")
 
@@ -314,11 +337,13 @@ def test_given_recordings_are_shown_one_by_one():
 
     rows = [row("", 0.02), row("default", 0.03), row("other_fabric", 0.025)]
     rows += [row("repeatability", 0.01), row("", 0.09, repeat="1")]
-    (found,) = recording_tables([*rows, row("default", 0.04, "fold_silk2")]).values()
+    rows.append(row("true", 0.018))
+    draws = [row("default", 0.04, "fold_silk2"), row("default", 0.05, "fold_silk2", repeat="1")]
+    (found,) = recording_tables([*rows, *draws]).values()
     assert found.rows == (
-        ("silk", "fold_silk", "20.0", "30.0", "25.0", "10.0"),
-        ("silk", "fold_silk2", "-", "40.0", "-", "-"),
-        ("mean", "", "20.0", "35.0", "25.0", "10.0"),
+        ("silk", "fold_silk", "20.0", "30.0", "18.0", "25.0", "10.0"),
+        ("silk", "fold_silk2", "-", "45.0", "-", "-", "-"),
+        ("mean", "", "20.0", "37.5", "18.0", "25.0", "10.0"),
     )
     assert found.caption == "DIFFCLOUD cloth lifting: chamfer_real_to_sim [mm] on folding"
     assert recording_tables(rows[:2]) == {}  # as those of synthetic recordings

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from r2s.evaluation import metrics
+from r2s.evaluation.surface_distance import to_surface
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.surface import sample
 from r2s.recordings.recording import Recording, cloud
@@ -62,6 +63,19 @@ def against_motion(
     used = range(first, last + 1, every)
     simulated = np.asarray(_sample(jnp.asarray(x[np.array(used)]), faces, samples))
     return _mean([cloud(recording, frame) for frame in used], list(simulated), crop)
+
+
+def from_surface(
+    recording: Recording, x: Float[np.ndarray, "frame vertex 3"], shape: tuple[int, int] = (9, 9)
+) -> Float[np.ndarray, " frame"]:
+    """Mean distance [m] of a recording's points from a motion's surface in each frame that counts.
+
+    `x`: the positions of the motion, [m]; NaN where it diverged. `shape`: its vertices.
+    """
+    first, last = recording.info.frames_used
+    faces = from_recording(recording, shape).scene.mesh.faces
+    clouds = [cloud(recording, frame) for frame in range(first, last + 1)]
+    return to_surface(clouds, x[first : last + 1], faces)
 
 
 def against_recording(recording: Recording, other: Recording) -> dict[str, float]:

@@ -17,8 +17,8 @@ class StiffeningMembrane(eqx.Module):
     """An orthotropic membrane whose tangent stiffness along its yarns grows as they stretch.
 
     - `small`: the membrane at small strain.
-    - `growth`: g of the tangent C (1 + 3 g E^2) along a yarn at a Green strain E > 0 [-]; against
-      shear it is C33 (1 + 3/4 g (2 E12)^2), as much as along a bias that stretches as far.
+    - `growth`: g of the tangent C (1 + 3 g E^2) along a yarn at a Green strain E > 0 [-]. Against
+      shear, where yarns turn and do not stretch, it stays as it is.
     """
 
     small: OrthotropicMembrane
@@ -42,10 +42,10 @@ class StiffeningMembrane(eqx.Module):
 
     def energy_density(self, strain: Float[Array, " 3"]) -> Float[Array, ""]:
         """Energy per rest area [J/m^2] at a Green strain (E11, E22, 2 E12) [-]."""
-        e11, e22, shear = strain
+        e11, e22, _ = strain
         small = self.small
         warp, weft = jnp.maximum(e11, 0) ** 4, jnp.maximum(e22, 0) ** 4
-        more = small.c11 * warp + small.c22 * weft + small.c33 * shear**4 / 4
+        more = small.c11 * warp + small.c22 * weft
         return small.energy_density(strain) + self.growth / 4 * more
 
 

@@ -5,7 +5,8 @@ from typing import Any
 
 import jax.random as jr
 
-from r2s.scenarios.six import SIX, Experiment, varied
+from r2s.scenarios.paths import draw
+from r2s.scenarios.six import SIX, Experiment
 
 RECORDING = "recording.npz"
 
@@ -18,8 +19,14 @@ def experiment_of(scenario: str, number: int, unseen: bool, seed: int) -> Experi
     """
     if number == 0 and not unseen:
         return SIX[scenario]()
-    key = jr.fold_in(jr.key(seed), 2 * number + unseen)
-    return varied(scenario, 1, key=key)[0]
+    return SIX[scenario](**numbers_of(scenario, number, unseen, seed))
+
+
+def numbers_of(scenario: str, number: int, unseen: bool, seed: int) -> dict[str, float]:
+    """The numbers of a motion that is drawn."""
+    key = jr.fold_in(jr.key(seed), number_of(scenario))  # or scenarios would share their numbers
+    key = jr.fold_in(key, 2 * number + unseen)
+    return draw(scenario, 1, key=key)[0]
 
 
 def number_of(*parts: Any) -> int:

@@ -14,7 +14,6 @@ from r2s.estimation.estimate_json import as_json, from_json
 from r2s.estimation.method import Budget, Method, default_space
 from r2s.estimation.physnet.method import TrainingBudget, train_network
 from r2s.estimation.registry import METHODS
-from r2s.fabrics.fabric import Fabric
 from r2s.files import write_json
 from r2s.study.cells import Cell, result_files
 from r2s.study.sources import Source, read
@@ -134,8 +133,3 @@ def read_estimate(cell: EstimateCell, folder: Path) -> Estimate | None:
         if not (files / ESTIMATE).exists():
             return None
         return from_json(json.loads((files / ESTIMATE).read_text(encoding="utf-8")))
-
-
-def default_fabric(solver: str, density: float) -> Fabric:
-    """What a study compares with: the middle of the space."""
-    return default_space(solver, density).middle()

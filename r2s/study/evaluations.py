@@ -8,24 +8,30 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import jax.random as jr
 import numpy as np
 from jaxtyping import Float
 
+from r2s.cloth.explicit import ExplicitCloth
 from r2s.evaluation import prediction_error
 from r2s.evaluation.prediction_error import Motion
+from r2s.fabrics import prior
 from r2s.fabrics.fabric import Fabric
 from r2s.files import write_json
 from r2s.mpm.sheet import Sheet, longest_edge, stable_step
 from r2s.recordings.recording import Recording
+from r2s.scenarios.in_explicit_steps import explicit_cloth
 from r2s.scenarios.on_points import EDGE, MEMBRANE_DAMPING, grid_around
 from r2s.scenarios.scenario import Scenario, from_recording
 from r2s.study.cells import Cell, result_files
 from r2s.study.configuration import Configuration
-from r2s.study.estimates import EstimateCell, default_fabric, read_estimate
-from r2s.study.sources import GivenRecording, Source, read
+from r2s.study.estimates import EstimateCell, read_estimate
+from r2s.study.sources import GivenRecording, Source, read, small_strain
 
 MEASURED, MOTION = "measured.json", "motion.npz"
+SHAPES = {"cloth": (25, 25), "points": (9, 9)}  # vertices of the simulated sheet
 LADDER = math.sqrt(2)  # steps between frames are powers of this: few programs to compile
 
 
@@ -33,9 +39,13 @@ LADDER = math.sqrt(2)  # steps between frames are powers of this: few programs t
 class EvaluationCell(Cell):
     """How near simulations of a fabric come to recordings of one scenario.
 
-    - `estimate`: whose fabric is judged; None: the default one of `solver` with an areal `density`
-      [kg/m^2].
+    - `estimate`: whose fabric is judged; None: that of a draw, or the true one.
+    - `solver`: "cloth", in explicit steps on `SHAPE`, or "points", on `ON_POINTS`.
+    - `density`: areal, [kg/m^2].
     - `recordings`: what it is judged by, together, since they compile once.
+    - `draw`: a number of `r2s.fabrics.prior.draws`, which know the density alone: together these
+      are the default. None: the truth of synthetic recordings at small strain, so what a perfect
+      estimate would reach.
     - `other`: whether `estimate` is that of another fabric, for comparison.
     - `every`: 1 compares all frames that count, 3 every third.
     """
@@ -48,8 +58,16 @@ class EvaluationCell(Cell):
     density: float
     fabric: str
     recordings: tuple[Source, ...]
+    draw: int | None = None
     other: bool = False
     every: int = 1
+
+    @property
+    def baseline(self) -> str:
+        """As in `r2s.study.rows.Row`."""
+        if self.estimate is not None:
+            return "other_fabric" if self.other else ""
+        return "true" if self.draw is None else "default"
 
     @property
     def scenario(self) -> str:
@@ -65,43 +83,61 @@ class EvaluationCell(Cell):
 
     @property
     def repeat(self) -> str:
-        """Which of several estimates alike; "" for the default fabric."""
-        return "" if self.estimate is None else str(self.estimate.repeat)
+        """Which of several estimates, or draws, alike; "" for the true fabric."""
+        if self.estimate is not None:
+            return str(self.estimate.repeat)
+        return "" if self.draw is None else str(self.draw)
 
     @property
     def name(self) -> str:
-        whose = self.estimate.name if self.estimate else f"default_{self.solver}_{self.fabric}"
+        drawn = "" if self.draw is None else self.draw
+        whose = f"{self.baseline}{drawn}_{self.solver}_{self.fabric}"
+        if self.estimate is not None:
+            whose = self.estimate.name
         on = f"{self.fabric}_" if self.other else ""
         return f"{whose}_on_{on}{self.scenario}_{self.recordings[0].name.split('_')[-1]}"
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Vertices of the simulated sheet along warp and weft."""
+        return SHAPES[self.solver]
 
     @property
     def compilation_group(self) -> str:
         return f"evaluations {self.solver} {self.scenario}"
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
-        """Simulate every recording's motion: metrics of each, the motion beside the first, and why
-        a run diverged."""
+        """Simulate every recording's motion: metrics of each, its motion, its distances from the
+        recording's points in the frames that count, and why a run diverged."""
         recordings = [read(source, folder) for source in self.recordings]
         fabric = self._fabric(folder)
         if fabric is None:
-            lost = np.full((len(recordings[0].times), 81, 3), np.nan)
-            motions = [Motion(lost, "the estimate diverged")] * len(recordings)
+            count = self.shape[0] * self.shape[1]
+            lost = [np.full((len(each.times), count, 3), np.nan) for each in recordings]
+            motions = [Motion(x, "the estimate diverged") for x in lost]
         else:
             motions = predict(recordings, fabric, self.solver)
-        measured, diverged = {}, {}
+        measured, diverged, arrays = {}, {}, {}
         for source, recording, motion in zip(self.recordings, recordings, motions, strict=True):
             is_cropped = isinstance(source, GivenRecording)
-            found = prediction_error.against_motion(recording, motion.x, self.every, is_cropped)
+            args = self.every, is_cropped, self.shape
+            found = prediction_error.against_motion(recording, motion.x, *args)
+            away = prediction_error.from_surface(recording, motion.x, self.shape)
+            found["surface"] = float(np.mean(away))
             measured[source.name] = {name: _json_number(value) for name, value in found.items()}
+            arrays |= {f"x {source.name}": np.asarray(motion.x, np.float32), source.name: away}
             if motion.failure:
                 diverged[source.name] = motion.failure
         write_json(out / MEASURED, measured)
-        np.savez_compressed(out / MOTION, x=np.asarray(motions[0].x, np.float32))
+        np.savez_compressed(out / MOTION, **arrays)
         return {"diverged": diverged, "runs": len(recordings)}
 
     def _fabric(self, folder: Path) -> Fabric | None:
         if self.estimate is None:
-            return default_fabric(self.solver, self.density)
+            if self.draw is None:
+                return small_strain(self.fabric)
+            drawn = prior.draws(self.density, self.draw + 1, jr.key(self.draw))
+            return jax.tree.map(lambda leaf: leaf[self.draw], drawn)
         found = read_estimate(self.estimate, folder)
         return None if found is None else found.fabric
 
@@ -119,23 +155,44 @@ def read_measured(cell: EvaluationCell, folder: Path) -> dict[str, dict[str, flo
 def read_motion(cell: EvaluationCell, folder: Path) -> Float[np.ndarray, "frame vertex 3"]:
     """Positions [m] of the motion beside the first recording."""
     with result_files(cell, folder) as files, np.load(files / MOTION) as stored:
-        return stored["x"]
+        return stored[f"x {cell.recordings[0].name}"]
+
+
+def read_motions(
+    cell: EvaluationCell, folder: Path
+) -> dict[str, Float[np.ndarray, "frame vertex 3"]]:
+    """Positions [m] of all motions, by the recording that each is beside."""
+    with result_files(cell, folder) as files, np.load(files / MOTION) as stored:
+        return {source.name: stored[f"x {source.name}"] for source in cell.recordings}
+
+
+def read_distances(cell: EvaluationCell, folder: Path) -> dict[str, Float[np.ndarray, " frame"]]:
+    """Distances [m] of each recording's points from the sheet, by its name, in frames that count;
+    NaN where the motion diverged."""
+    with result_files(cell, folder) as files, np.load(files / MOTION) as stored:
+        return {source.name: stored[source.name] for source in cell.recordings}
 
 
 def predict(recordings: list[Recording], fabric: Fabric, solver: str) -> list[Motion]:
     """The motions of a fabric in recordings of one scenario.
 
-    `solver`: "cloth", or "points" for material points in a grid that serves all recordings.
+    `solver`: "cloth" in explicit steps, whose own error is that of their mesh alone, or "points"
+    for material points in a grid that serves all recordings.
     """
-    scenarios = [from_recording(recording) for recording in recordings]
+    scenarios = [from_recording(recording, SHAPES[solver]) for recording in recordings]
     most = max(scenario.substeps for scenario in scenarios)
     in_equal_steps = [dataclasses.replace(scenario, substeps=most) for scenario in scenarios]
-    sheet = _points(in_equal_steps, fabric) if solver == "points" else None
+    make = _points if solver == "points" else _explicit
+    shared = make(in_equal_steps, fabric)
     motions = []
     for scenario in in_equal_steps:
-        own = sheet and eqx.tree_at(lambda s: s.scene, sheet, scenario.scene)
+        own = eqx.tree_at(lambda s: s.scene, shared, scenario.scene)
         motions.append(prediction_error.predict_motion(scenario, fabric, own))
     return motions
+
+
+def _explicit(scenarios: list[Scenario], fabric: Fabric) -> ExplicitCloth:
+    return explicit_cloth(scenarios[0], fabric)
 
 
 def _points(scenarios: list[Scenario], fabric: Fabric) -> Sheet:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from r2s.study import engine, matrix, results
+from r2s.study import engine, matrix, results, verdicts
 from r2s.study.mujoco_recording import FABRIC
 from r2s.study.mujoco_sheet import mujoco_module
 from r2s.study.subprocesses import OneProcess
@@ -50,7 +50,7 @@ def study(
     cells = matrix.synthetic(plan) if data is None else matrix.recorded(data, density, plan)
     runner = _runner(workers, scheduler, slurm, compilation_cache)
     try:
-        failed = engine.run(cells, out, runner)
+        failed = engine.run([*verdicts.ensembles(cells), *cells], out, runner)
     finally:
         runner.close()
     results.publish(cells, failed, out, plan, str(data or "synthetic"), paper)

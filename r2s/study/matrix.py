@@ -29,6 +29,7 @@ from r2s.study.sources import (
 )
 
 ESTIMATED_FROM = ("lifting", "wind", "stretching")
+DRAWS = 4  # of the prior, which are the default together
 TOGETHER = 10  # recordings that one cell judges
 PULLS = (0.0, 45.0, 90.0)  # [degrees], from which PINN estimates together
 FEWER_FABRICS = 32  # at most, to train PhysNet's network on material points
@@ -243,17 +244,30 @@ def _evaluations(
     judged: Iterable[tuple[Source, ...]],
     every: int,
 ) -> list[EvaluationCell]:
-    """Cells for estimates of a fabric, and first for the default fabric on each of their solvers.
+    """Cells for estimates of a fabric, and first, on each of their solvers, for the draws that are
+    the default, and for the true fabric where it is known.
 
     `judged`: the recordings of each scenario.
     """
     solvers = dict.fromkeys(estimate.solver for estimate in estimates)
-    whose = [(None, solver) for solver in solvers] + [(each, each.solver) for each in estimates]
+    judged = list(judged)
+    is_known = all(isinstance(each, SyntheticRecording) for group in judged for each in group)
+    whose: list[tuple[EstimateCell | None, str, int | None]] = []
+    for solver in solvers:
+        whose += [(None, solver, draw) for draw in range(DRAWS)]
+        whose += [(None, solver, None)] if is_known else []
+    whose += [(each, each.solver, None) for each in estimates]
     return [
         EvaluationCell(
-            estimate, solver, density, fabric, recordings[first : first + TOGETHER], every=every
+            estimate,
+            solver,
+            density,
+            fabric,
+            recordings[first : first + TOGETHER],
+            draw=draw,
+            every=every,
         )
-        for estimate, solver in whose
+        for estimate, solver, draw in whose
         for recordings in judged
         for first in range(0, len(recordings), TOGETHER)
     ]

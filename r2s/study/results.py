@@ -27,6 +27,7 @@ from r2s.study.sources import GivenRecording, Source, SyntheticRecording, read, 
 from r2s.study.statistics.parameters import Estimated
 from r2s.study.statistics.recordings import recording_tables
 from r2s.study.tables import Table, significant
+from r2s.study.verdicts import with_verdicts
 
 MESHES = (
     "What the mesh of each estimate is expected to leave in the motion that it was made from, and "
@@ -116,11 +117,10 @@ def rows(cells: Iterable[EvaluationCell], folder: Path) -> list[Row]:
     """The rows of all cells that are made, in their order, then what two trials differ by."""
     cells = list(cells)
     found = [row for cell in cells if cell.is_made(folder) for row in _rows(cell, folder)]
-    return found + _repeatability(cells, folder)
+    return with_verdicts(found, cells, folder) + _repeatability(cells, folder)
 
 
 def _rows(cell: EvaluationCell, folder: Path) -> list[Row]:
-    baseline = "default" if cell.estimate is None else "other_fabric" if cell.other else ""
     return [
         Row(
             *cell.configuration,
@@ -128,7 +128,7 @@ def _rows(cell: EvaluationCell, folder: Path) -> list[Row]:
             repeat=cell.repeat,
             recording=name,
             evaluated_on=cell.scenario,
-            baseline=baseline,
+            baseline=cell.baseline,
             metric=metric,
             unit=prediction_error.UNITS.get(metric, "m"),
             value=value,

@@ -13,7 +13,7 @@ from r2s.study.configuration import Configuration
 
 # The values of Row.baseline, and what a table calls them.
 BASELINES = {"": "estimate"} | {
-    name: name.replace("_", " ") for name in ("default", "other_fabric", "repeatability")
+    name: name.replace("_", " ") for name in ("default", "true", "other_fabric", "repeatability")
 }
 
 
@@ -24,6 +24,8 @@ class Row:
     - `repeat`: tells apart estimates of one configuration: from other recordings, or other seeds.
     - `baseline`: "" for the estimate itself, else what it is compared with, see `BASELINES`.
     - `unit`: SI, or "-" for a number without one. `value` is in that unit.
+    - `floor`: what the recording itself is known to, in that unit. `horizon`: until when it tells
+      fabrics apart, [s]. `skill`: see `r2s.evaluation.horizon`. None: not known, or not told.
 
     Raises `ValueError` for an unknown baseline.
     """
@@ -39,6 +41,9 @@ class Row:
     metric: str
     unit: str
     value: float
+    floor: float | None = None
+    horizon: float | None = None
+    skill: float | None = None
 
     def __post_init__(self) -> None:
         if self.baseline not in BASELINES:
@@ -56,6 +61,7 @@ class Row:
 
 
 HEADER = tuple(field.name for field in fields(Row))
+TEXTS = HEADER.index("value")  # columns before it are text
 
 
 def write_rows(path: Path | str, rows: Iterable[Row]) -> None:
@@ -63,8 +69,15 @@ def write_rows(path: Path | str, rows: Iterable[Row]) -> None:
 
     `read_rows` returns the same floats, NaN and infinities included.
     """
+
     # repr of the plain float: that of NumPy's scalars reads "np.float64(...)".
-    lines = [(*astuple(row)[:-1], repr(float(row.value))) for row in rows]
+    def number(value: float | None) -> str:
+        return "" if value is None else repr(float(value))
+
+    lines = []
+    for row in rows:
+        numbers = row.value, row.floor, row.horizon, row.skill
+        lines.append((*astuple(row)[:TEXTS], *(number(each) for each in numbers)))
     write_text(path, csv_text([HEADER, *lines]))
 
 
@@ -85,7 +98,10 @@ def read_rows(path: Path | str) -> list[Row]:
             if len(cells) != len(HEADER):
                 raise ValueError(f"{where}: expected {len(HEADER)} cells, found {len(cells)}")
             try:
-                rows.append(Row(*cells[:-1], value=float(cells[-1])))
+                value, *others = cells[TEXTS:]
+                floor, horizon, skill = (float(each) if each else None for each in others)
+                told = {"floor": floor, "horizon": horizon, "skill": skill}
+                rows.append(Row(*cells[:TEXTS], value=float(value), **told))
             except ValueError as error:
                 raise ValueError(f"{where}: {error}") from error
     return rows

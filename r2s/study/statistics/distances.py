@@ -130,6 +130,8 @@ def _with_references(rows: Iterable[Row]) -> list[Row]:
         name = APPROACHES.get(row.approach, row.approach)
         if row.baseline == "other_fabric":
             found.append(replace(row, baseline="", approach=f"{name} (of another fabric)"))
+        elif row.baseline == "true":
+            found.append(replace(row, baseline="", approach="true fabric on"))
         elif row.baseline == "repeatability":
             found.append(replace(row, baseline="", approach="another trial"))
     return rows + found

@@ -1,0 +1,174 @@
+"""Cells of ensembles: how well a judged motion is known, and what other fabrics do in it.
+
+Members differ from the truth by what no one can see, or by what its mesh and steps leave. Their
+distances from it, over time, are its floor (`r2s.evaluation.horizon`).
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from r2s.evaluation.surface_distance import POINTS, to_surface
+from r2s.fabrics import presets
+from r2s.fabrics.fabric import Fabric
+from r2s.geometry.mesh import Mesh
+from r2s.geometry.surface import sample
+from r2s.recordings.recording import cloud
+from r2s.scenarios.in_explicit_steps import explicit_cloth
+from r2s.scenarios.scenario import rollout
+from r2s.scenarios.six import Experiment
+from r2s.study.cells import Cell, result_files
+from r2s.study.sources import SyntheticRecording, read, strain_dependent
+
+ENSEMBLE = "ensemble.npz"
+STIFFNESS, PATH = 1e-3, 2e-4  # [-] and [m]: what no one can tell
+FINER, COARSER = 3 / 2, 1 / 2  # cells a side: of the finer mesh, and of other fabrics' sheets
+APART = "apart "  # before the name of another fabric
+
+
+@dataclass(frozen=True)
+class EnsembleCell(Cell):
+    """The ensemble of a synthetic recording that is judged by.
+
+    No member has contact of layers, for the sake of time; a recording that has is compared with the
+    truth without.
+
+    - `others`: presets whose truths move in the same way.
+    """
+
+    kind: ClassVar[str] = "ensembles"
+    weight: ClassVar[float] = 60.0
+
+    recording: SyntheticRecording
+    others: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        return self.recording.name
+
+    @property
+    def compilation_group(self) -> str:
+        return f"ensembles {self.recording.scenario}"
+
+    def make(self, folder: Path, out: Path) -> dict[str, Any]:
+        """Distances [m] of every member from the truth, in each frame."""
+        source = self.recording
+        truth, experiment, shape = source.truth, source.experiment, source.truth.shape
+        fabric = strain_dependent(source.fabric, truth)
+        base = _moved(experiment, fabric, shape)
+        if not np.isfinite(base.x).all():
+            raise RuntimeError(f"the truth of {self.name} diverged")
+        points = _points_of(base)
+
+        def away(moved: "_Moved") -> np.ndarray:
+            return to_surface(points, moved.x, moved.mesh.faces)
+
+        recording = read(source, folder)
+        clouds = [cloud(recording, frame) for frame in range(len(recording.times))]
+        found = {
+            "recording": [to_surface(clouds, base.x, base.mesh.faces)],
+            "stiffness": [
+                away(_moved(experiment, _scaled(fabric, 1 + sign * STIFFNESS), shape))
+                for sign in (-1, 1)
+            ],
+            "path": [away(_moved(_shifted(experiment), fabric, shape))],
+            "mesh": [away(_moved(experiment, fabric, _cells(shape, FINER)))],
+            "step": [away(_moved(experiment, fabric, shape, steps=2))],
+        }
+        coarse = _cells(shape, COARSER)
+        for name in self.others:
+            other = strain_dependent(name, truth)
+            found[APART + name] = [away(_moved(experiment, other, coarse))]
+        arrays = {name: np.stack(rows) for name, rows in found.items()}
+        stored: dict[str, Any] = {"times": np.asarray(experiment.times), **arrays}
+        np.savez_compressed(out / ENSEMBLE, **stored)
+        return {"diverged": [name for name, row in arrays.items() if not np.isfinite(row).all()]}
+
+
+class Ensemble(NamedTuple):
+    """What `EnsembleCell` found: distances [m] by cause, and of other fabrics, at times [s]."""
+
+    times: Float[np.ndarray, " frame"]
+    causes: dict[str, Float[np.ndarray, "member frame"]]
+    apart: Float[np.ndarray, "other frame"]
+
+
+def read_ensemble(cell: EnsembleCell, folder: Path) -> Ensemble:
+    """The ensemble of a cell that is made."""
+    with result_files(cell, folder) as files, np.load(files / ENSEMBLE) as stored:
+        arrays = dict(stored)
+    times = arrays.pop("times")
+    causes = {name: each for name, each in arrays.items() if not name.startswith(APART)}
+    apart = [each for name, each in arrays.items() if name.startswith(APART)]
+    return Ensemble(times, causes, np.concatenate(apart))
+
+
+def ensemble_of(recording: SyntheticRecording) -> EnsembleCell:
+    """The ensemble of a recording, beside all other presets of the study."""
+    others = tuple(name for name in presets.FIVE if name != recording.fabric)
+    return EnsembleCell(recording, others)
+
+
+class _Moved(NamedTuple):
+    x: np.ndarray
+    mesh: Mesh
+
+
+_rollout = eqx.filter_jit(rollout)
+
+
+def _moved(
+    experiment: Experiment, fabric: Fabric, shape: tuple[int, int], steps: int = 1
+) -> _Moved:
+    """A motion in explicit steps; NaN from where it diverged. `steps`: times as many."""
+    scenario = experiment.scenario(shape)
+    solver = explicit_cloth(scenario, fabric)
+    solver = dataclasses.replace(solver, substeps=steps * solver.substeps)
+    moved = _rollout(scenario, fabric, solver=solver)
+    ok = np.logical_and.accumulate(np.asarray(moved.ok))[:, None, None]
+    return _Moved(np.where(ok, np.asarray(moved.x), np.nan), scenario.scene.mesh)
+
+
+def _points_of(moved: _Moved) -> list[np.ndarray]:
+    """Points of the sheet in each frame, the same places of the fabric in all."""
+    faces = moved.mesh.faces
+    resolution = max(math.ceil(math.sqrt(POINTS / len(faces))), 1)
+    points = np.asarray(jax.vmap(lambda x: sample(x, faces, resolution))(jnp.asarray(moved.x)))
+    chosen = np.random.default_rng(0).permutation(points.shape[1])[:POINTS]
+    return list(points[:, chosen])
+
+
+def _scaled(fabric: Fabric, factor: float) -> Fabric:
+    """A fabric whose energies of membrane and bending are `factor` times as large.
+
+    All laws of truths have a part `small` that is linear in its stiffnesses.
+    """
+
+    def where(f: Fabric) -> list:
+        membrane = getattr(f.membrane, "small", f.membrane)
+        bending = getattr(f.bending, "small", f.bending)
+        return [membrane, bending.stiffness]
+
+    parts = [jax.tree.map(lambda leaf: factor * leaf, part) for part in where(fabric)]
+    return eqx.tree_at(where, fabric, parts)
+
+
+def _shifted(experiment: Experiment) -> Experiment:
+    """With the first gripper aside by `PATH`, and the last one the other way."""
+    path = np.array(experiment.route.path, float)
+    path[:, 0, 0] += PATH
+    path[:, -1, 1] -= PATH
+    return experiment._replace(route=experiment.route._replace(path=path))
+
+
+def _cells(shape: tuple[int, int], factor: float) -> tuple[int, int]:
+    rows, columns = (max(round(factor * (count - 1)), 1) + 1 for count in shape)
+    return rows, columns

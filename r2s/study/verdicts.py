@@ -1,0 +1,143 @@
+"""What the distances to a surface say of a fabric: within the horizon, beside the floor, as skill.
+
+Beyond the horizon, what does not depend on the phase is compared (`r2s.evaluation.phase_free`).
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from r2s.evaluation import phase_free
+from r2s.evaluation.horizon import floor_of, horizon_of, skill, within
+from r2s.recordings.recording import cloud
+from r2s.scenarios.scenario import from_recording
+from r2s.study.ensembles import EnsembleCell, ensemble_of, read_ensemble
+from r2s.study.evaluations import EvaluationCell, read_distances, read_motions
+from r2s.study.rows import Row
+from r2s.study.sources import Source, SyntheticRecording, read
+
+SURFACE = "surface"  # the metric that is judged within the horizon
+BEYOND = "beyond "  # before the name of a feature that is compared from the horizon on
+FEWEST = 4  # frames that are compared beyond it
+
+
+class Judged(NamedTuple):
+    """What is known of a motion that is judged by.
+
+    - `times`: of the frames that count, [s]. `floor`: of each, [m]. `horizon`: [s].
+    """
+
+    times: Float[np.ndarray, " frame"]
+    floor: Float[np.ndarray, " frame"]
+    horizon: float
+
+    @property
+    def inside(self) -> Bool[np.ndarray, " frame"]:
+        """Which frames are before the horizon."""
+        return within(self.times, self.horizon)
+
+
+def ensembles(cells: Iterable[EvaluationCell]) -> list[EnsembleCell]:
+    """Of all synthetic recordings that cells judge by."""
+    sources = dict.fromkeys(source for cell in cells for source in cell.recordings)
+    return [ensemble_of(each) for each in sources if isinstance(each, SyntheticRecording)]
+
+
+def judged_motions(cells: Iterable[EvaluationCell], folder: Path) -> dict[Source, Judged]:
+    """What ensembles that are made say of each recording."""
+    found = {}
+    for cell in ensembles(cells):
+        if not cell.is_made(folder):
+            continue
+        ensemble = read_ensemble(cell, folder)
+        first, last = read(cell.recording, folder).info.frames_used
+        used = slice(first, last + 1)
+        floor, times = floor_of(ensemble.causes)[used], ensemble.times[used]
+        horizon = horizon_of(times, floor, ensemble.apart[:, used])
+        found[cell.recording] = Judged(times, floor, horizon)
+    return found
+
+
+def with_verdicts(rows: Sequence[Row], cells: Sequence[EvaluationCell], folder: Path) -> list[Row]:
+    """Rows in which those of `SURFACE` are judged within their horizon, beside floor and skill, and
+    more rows of what is compared beyond it."""
+    known = {source.name: each for source, each in judged_motions(cells, folder).items()}
+    errors = {_place(row): row for row in rows if row.metric == SURFACE}
+    more: list[Row] = []
+    for cell in cells:
+        if not cell.is_made(folder):
+            continue
+        for name, away in read_distances(cell, folder).items():
+            for row in [row for row in errors.values() if _is_of(row, cell, name)]:
+                if name in known:
+                    errors[_place(row)] = _within(row, away, known[name])
+                    more += _beyond(row, cell, known[name], folder)
+    told = _with_skills(list(errors.values()))
+    replaced = {_place(row): row for row in told}
+    return [replaced.get(_place(row), row) if row.metric == SURFACE else row for row in rows] + more
+
+
+def _place(row: Row) -> tuple[str, ...]:
+    return (
+        row.approach,
+        row.solver,
+        row.estimated_from,
+        row.fabric,
+        row.repeat,
+        row.recording,
+        row.baseline,
+    )
+
+
+def _is_of(row: Row, cell: EvaluationCell, name: str) -> bool:
+    whose = (*cell.configuration, cell.fabric, cell.repeat, name, cell.baseline)
+    return _place(row) == whose
+
+
+def _within(row: Row, away: Float[np.ndarray, " frame"], judged: Judged) -> Row:
+    inside = judged.inside
+    if not inside.any():
+        return replace(row, value=np.nan, horizon=judged.horizon)
+    value, floor = float(np.mean(away[inside])), float(np.mean(judged.floor[inside]))
+    return replace(row, value=value, floor=floor, horizon=judged.horizon)
+
+
+def _with_skills(rows: list[Row]) -> list[Row]:
+    """With the skill of each beside the default's mean error in the same recording and solver."""
+    defaults: dict[tuple[str, str, str], list[float]] = defaultdict(list)
+    for row in rows:
+        if row.baseline == "default":
+            defaults[row.solver, row.fabric, row.recording].append(row.value)
+    found = []
+    for row in rows:
+        default = defaults.get((row.solver, row.fabric, row.recording))
+        if row.floor is None or row.baseline == "default" or default is None:
+            found.append(row)
+            continue
+        told = skill(row.value, float(np.mean(default)), row.floor)
+        found.append(replace(row, skill=None if np.isnan(told) else told))
+    return found
+
+
+def _beyond(row: Row, cell: EvaluationCell, judged: Judged, folder: Path) -> list[Row]:
+    outside = np.flatnonzero(~judged.inside)
+    if len(outside) < FEWEST:
+        return []
+    (source,) = (each for each in cell.recordings if each.name == row.recording)
+    recording = read(source, folder)
+    frames = [recording.info.frames_used[0] + int(place) for place in outside]
+    x = read_motions(cell, folder)[row.recording][frames]
+    faces = np.asarray(from_recording(recording, cell.shape).scene.mesh.faces)
+    middles = np.asarray(jnp.asarray(x))[:, faces].mean(axis=2)  # as even as the clouds
+    real = [cloud(recording, frame) for frame in frames]
+    found = phase_free.differences(real, list(middles), judged.times[outside])
+    return [
+        replace(row, metric=BEYOND + name, unit=phase_free.UNITS[name], value=value)
+        for name, value in found.items()
+    ]

@@ -1,0 +1,65 @@
+"""Verdicts of a study: errors within the horizon, beside the floor, as skill; ensembles of truths."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from r2s.evaluation import phase_free
+from r2s.study import engine, results, verdicts
+from r2s.study.evaluations import EvaluationCell
+from r2s.study.rows import Row
+from r2s.study.sources import SyntheticRecording, TruthSettings, small_strain
+from r2s.study.verdicts import BEYOND, SURFACE, Judged
+
+FABRIC = "grey_interlock"
+
+
+def row(value, baseline="", repeat="0", floor: float | None = 2e-3, metric=SURFACE):
+    approach = "" if baseline else "diffcloud"
+    whose = (approach, "cloth", "lifting" if approach else "", FABRIC, repeat)
+    return Row(*whose, "fling_0", "fling", baseline, metric, "m", value, floor, 4.0)
+
+
+def test_the_default_of_a_skill_is_the_mean_of_all_draws():
+    drawn = [row(value, "default", str(i)) for i, value in enumerate((10e-3, 14e-3))]
+    told = verdicts._with_skills(
+        [row(7e-3), row(2e-3, "true", ""), row(np.nan, repeat="1"), *drawn]
+    )
+    assert [each.skill for each in told[:3]] == [pytest.approx(0.5), pytest.approx(1), -np.inf]
+    assert all(each.skill is None for each in told[3:])
+    near = [dataclasses.replace(each, value=2.5e-3) for each in drawn]
+    assert verdicts._with_skills([row(1e-3), *near])[0].skill is None  # not clearly above the floor
+    assert verdicts._with_skills([row(1e-3, floor=None), *drawn])[0].skill is None
+
+
+def test_only_what_is_within_the_horizon_counts():
+    times = np.arange(4.0)
+    judged = Judged(times, np.array([1.0, 2.0, 3.0, 90.0]) * 1e-3, 2.0)
+    found = verdicts._within(row(0.5), np.array([4.0, 6.0, 99.0, 99.0]) * 1e-3, judged)
+    assert (found.value, found.floor, found.horizon) == (5e-3, 1.5e-3, 2.0)
+    lost = verdicts._within(row(0.5), np.array([4e-3, np.nan, np.nan, np.nan]), judged)
+    assert np.isnan(lost.value)  # diverged within it
+    assert np.isnan(verdicts._within(row(0.5), times, judged._replace(horizon=0.0)).value)
+
+
+@pytest.mark.slow(group="study")
+def test_a_truth_is_judged_beside_its_own_ensemble(tmp_path, monkeypatch):
+    """A 9 x 9 truth, its prediction on the same mesh, and the whole way to the rows."""
+    monkeypatch.setattr("r2s.study.evaluations.SHAPES", {"cloth": (9, 9), "points": (9, 9)})
+    source = SyntheticRecording(FABRIC, "fling", 0, True, TruthSettings((9, 9), stiffening=0.0))
+    density = float(small_strain(FABRIC).density)
+    cells = [EvaluationCell(None, "cloth", density, FABRIC, (source,), each) for each in (None, 0)]
+    ensembles = verdicts.ensembles(cells)
+    assert engine.run([*ensembles, *cells], tmp_path, engine.Serial()) == {}
+    judged = verdicts.judged_motions(cells, tmp_path)[source]
+    assert np.all(judged.floor > 0) and judged.floor.max() < 0.1
+    rows = results.rows(cells, tmp_path)
+    (true,) = (each for each in rows if each.baseline == "true" and each.metric == SURFACE)
+    (drawn,) = (each for each in rows if each.baseline == "default" and each.metric == SURFACE)
+    assert true.value < 1e-5  # it is the truth itself
+    assert true.floor is not None and true.floor > 0
+    assert drawn.value > 3e-3 and drawn.horizon == true.horizon
+    if np.isfinite(judged.horizon):
+        beyond = {each.metric for each in rows if each.baseline == "true"}
+        assert {BEYOND + name for name in phase_free.UNITS} <= beyond
