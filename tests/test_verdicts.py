@@ -1,4 +1,4 @@
-"""Verdicts of a study: errors within the horizon, beside the floor, as skill; ensembles of truths."""
+"""Verdicts of a study: errors within the horizon, beside the floor, as skill; ensembles."""
 
 import dataclasses
 
