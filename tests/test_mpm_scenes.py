@@ -102,7 +102,7 @@ def test_a_sheet_neither_tears_nor_enters_the_table(name, fabric):
     ends = np.asarray(moved.x)[:, np.asarray(mesh.hinges)[:, :2]]
     stretch = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=-1) / np.asarray(mesh.hinge_length)
     # the knit's corner, of C11 = 31 N/m, is flung at several g
-    assert np.max(stretch) < (1.7 if name == "fling" else 1.5)
+    assert np.max(stretch) < (1.7 if name == "fling" else 1.6)
     assert np.max(np.mean(stretch, axis=1)) < 1.1
     held = np.asarray(solver.scene.held)
     assert np.array_equal(np.asarray(moved.x)[:, held], np.asarray(controls.handles)[:, -1])
