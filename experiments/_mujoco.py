@@ -1,12 +1,12 @@
 """A sheet that falls in vacuum while some vertices are carried, in r2s and in MuJoCo."""
 
 import jax.numpy as jnp
-import mujoco  # pyright: ignore[reportMissingImports]
 import numpy as np
 
 import r2s
 from r2s.cloth.linear.elimination import Elimination
 from r2s.export.mujoco import brake, mjcf
+from r2s.study.mujoco_sheet import mujoco_module
 from r2s.units import GRAVITY
 
 SIDE, SIZE, HEIGHT = 0.3, 9, 0.5  # [m], vertices a side, of the sheet that starts flat [m]
@@ -43,6 +43,7 @@ def scenario_of(motion: str) -> r2s.Scenario:
 
 def in_mujoco(scenario: r2s.Scenario, fabric: r2s.Fabric) -> np.ndarray:
     """Positions [m] (frame, vertex, 3) of the exported fabric, without contact."""
+    mujoco = mujoco_module()
     sheet, held, dt = scenario.scene.mesh, scenario.scene.held.tolist(), INTERVAL / STEPS
     text, _ = mjcf(fabric, sheet, held=tuple(held), height=HEIGHT, table=None, timestep=dt)
     model = mujoco.MjModel.from_xml_string(text)
