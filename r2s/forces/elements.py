@@ -84,9 +84,10 @@ def membrane_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
     """A bound on the square of the membrane's highest frequency [1/s^2], flat and unstrained.
 
     The bound is that of the worst element, with its mass in equal parts at its corners (Fried
-    1972).
+    1972). A law that stiffens counts as its property `stiffest`, if it has one.
     """
-    tangent = _tangent(fabric.membrane.at, fabric.membrane)
+    law = getattr(fabric.membrane, "stiffest", fabric.membrane)
+    tangent = _tangent(law.at, law)
     samples = mesh.samples
     count = samples.corners.shape[1]
 

@@ -13,40 +13,58 @@ from r2s.laws.membrane import OrthotropicMembrane
 from r2s.laws.plate import PlateBending, PlateLaw
 
 
+HALF = (2 ** (2 / 3) - 1) ** 0.5  # of the knee, where half of the growth is reached
+
+
 class StiffeningMembrane(eqx.Module):
-    """An orthotropic membrane whose tangent stiffness along its yarns grows as they stretch.
+    """An orthotropic membrane whose yarns stiffen as they stretch, up to a limit.
+
+    Along a yarn at a Green strain E > 0 the tangent is C (1 + (ratio - 1) (1 - (1 + u^2)^-3/2)),
+    u = E / knee. Against shear, where yarns turn and do not stretch, it stays as it is.
 
     - `small`: the membrane at small strain.
-    - `growth`: g of the tangent C (1 + 3 g E^2) along a yarn at a Green strain E > 0 [-]. Against
-      shear, where yarns turn and do not stretch, it stays as it is.
+    - `ratio`: of the tangent far stretched to that at rest, [-].
+    - `knee`: the Green strain of u = 1, where 65 % of the growth is reached, [-].
     """
 
     small: OrthotropicMembrane
-    growth: Float[Array, "*batch"]
+    ratio: Float[Array, "*batch"]
+    knee: Float[Array, "*batch"]
 
     @classmethod
     def make(cls, small: OrthotropicMembrane, ratio: float, stretch: float) -> "StiffeningMembrane":
-        """From the tangent stiffness along a yarn at a `stretch` (above 1) over that at rest.
+        """From the ratio, and the stretch (above 1) at which half of the growth is reached.
 
         Raises `ValueError` for a sheet that would soften, or a stretch that is none.
         """
         if not (ratio >= 1 and stretch > 1):
             raise ValueError(f"a ratio of 1 or more and a stretch above 1, got {ratio}, {stretch}")
-        strain = (stretch**2 - 1) / 2
-        growth = jnp.asarray((ratio - 1) / (3 * strain**2), float)
-        return cls(small, jnp.broadcast_to(growth, jnp.shape(small.c11)))
+        knee = (stretch**2 - 1) / 2 / HALF
+        shape = jnp.shape(small.c11)
+        return cls(small, *(jnp.broadcast_to(jnp.asarray(n, float), shape) for n in (ratio, knee)))
 
     def at(self, strain: Float[Array, " 3"]) -> "StiffeningMembrane":
         """Itself: its energy says it all."""
         return self
 
+    @property
+    def stiffest(self) -> OrthotropicMembrane:
+        """A membrane that is nowhere softer."""
+        small, more = self.small, self.ratio
+        return OrthotropicMembrane(more * small.c11, small.c12, more * small.c22, small.c33)
+
     def energy_density(self, strain: Float[Array, " 3"]) -> Float[Array, ""]:
         """Energy per rest area [J/m^2] at a Green strain (E11, E22, 2 E12) [-]."""
         e11, e22, _ = strain
         small = self.small
-        warp, weft = jnp.maximum(e11, 0) ** 4, jnp.maximum(e22, 0) ** 4
-        more = small.c11 * warp + small.c22 * weft
-        return small.energy_density(strain) + self.growth / 4 * more
+        more = small.c11 * self._grown(e11) + small.c22 * self._grown(e22)
+        return small.energy_density(strain) + (self.ratio - 1) * more
+
+    def _grown(self, strain: Float[Array, ""]) -> Float[Array, ""]:
+        """Energy over stiffness of what a ratio of 2 adds, [-]."""
+        square = (jnp.maximum(strain, 0) / self.knee) ** 2
+        root = jnp.sqrt(1 + square)
+        return self.knee**2 * (square / 2 - square / (1 + root))
 
 
 class SofteningPlate(PlateLaw):

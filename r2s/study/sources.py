@@ -30,7 +30,7 @@ from r2s.study.cells import Cell, result_files
 from r2s.study.drawn import RECORDING, experiment_of, number_of
 from r2s.study.mujoco_recording import MujocoRecording
 
-STRETCH = 1.167  # at which `TruthSettings.stiffening` holds, as in the tables of Wang et al. 2011
+STRETCH = 1.1  # where half of `TruthSettings.stiffening` is reached; Wang et al. 2011: up to 1.167
 SOFTENING, KNEE = 0.35, 20.0  # [-] and [1/m], of a `SofteningPlate`
 # Of each truth its own, drawn once within what fabrics have, since no one has measured them.
 DAMPING = {
@@ -58,9 +58,10 @@ class TruthSettings:
     - `shape`: vertices along warp and weft; of a sheet that touches itself `LAYERED` at most.
     - `max_step`: longest implicit time step, [s], of a sheet that touches itself or is stretched.
       All others go in explicit steps, which leave no error of their own.
-    - `stiffening`: stiffness along a yarn at an extension of 16.7 % over that of the preset, which
-      is at zero strain; bending softens, too (`r2s.laws.stiffening`). Assumed, not measured. 0:
-      constant stiffness, of the membrane and in bending, as the estimators assume.
+    - `stiffening`: stiffness along a yarn far stretched over that of the preset, which is at zero
+      strain; half way at an extension of 10 %. Bending softens, too (`r2s.laws.stiffening`).
+      Assumed, not measured. 0: constant stiffness, of the membrane and in bending, as the
+      estimators assume.
     - `materials`: a folder of ARCSim material files, FABRIC.json, with measured tables to take
       instead; "": none.
     - `materials_digest`: a hash of those files, from `with_measured_tables`.
