@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 from r2s.laws.membrane import OrthotropicMembrane
 from r2s.laws.plate import PlateBending, PlateLaw
 
-
 HALF = (2 ** (2 / 3) - 1) ** 0.5  # of the knee, where half of the growth is reached
 
 
