@@ -29,6 +29,15 @@ def numbers_of(scenario: str, number: int, unseen: bool, seed: int) -> dict[str,
     return draw(scenario, 1, key=key)[0]
 
 
+def pull_of(number: int, angle: float, seed: int) -> dict[str, float]:
+    """Stretch and time of a pull at an `angle` [degrees] to the warp, the same for all fabrics.
+
+    Each angle and each number has its own, drawn within `r2s.scenarios.paths.LIMITS`.
+    """
+    key = jr.fold_in(jr.key(seed), number_of("pull", number, float(angle)))
+    return draw("stretching", 1, key=key)[0]
+
+
 def number_of(*parts: Any) -> int:
     """A number below 2^31 that depends on the parts alone."""
     return int.from_bytes(sha256(repr(parts).encode()).digest()[:4], "big") >> 1

@@ -25,9 +25,9 @@ from r2s.recordings import manifest
 from r2s.recordings.recording import Recording, load, save
 from r2s.scenarios import synthetic
 from r2s.scenarios.in_explicit_steps import explicit_cloth
-from r2s.scenarios.six import Experiment
+from r2s.scenarios.six import STRETCHING_INTERVAL, Experiment
 from r2s.study.cells import Cell, result_files
-from r2s.study.drawn import RECORDING, experiment_of, number_of
+from r2s.study.drawn import RECORDING, experiment_of, number_of, pull_of
 from r2s.study.mujoco_recording import MujocoRecording
 
 STRETCH = 1.167  # at which `TruthSettings.stiffening` holds, as in the tables of Wang et al. 2011
@@ -47,6 +47,7 @@ FRICTION = {
     "pink_solid": 0.55,
     "red_jet_set": 0.28,
 }  # [-]
+PULL_FRAMES = 48  # of a pull for `r2s.estimation.pinn`: the longest ends before the last of them
 LAYERED = (17, 17)  # vertices at most of a sheet that touches itself, in implicit steps
 SAME_SCENARIO = {"lift": "lifting", "fold": "folding"}  # how recordings of others call them
 
@@ -83,8 +84,8 @@ class SyntheticRecording(Cell):
       `r2s.scenarios.paths.LIMITS`, the same for all fabrics.
     - `unseen`: whether its motion is drawn to be judged by; none of these is one to estimate from.
       Its clouds are all of the surface, without any error.
-    - `angle`: from the pull of a stretching to the warp [degrees], for `r2s.estimation.pinn`; None:
-      a motion of `r2s.scenarios`.
+    - `angle`: from the pull of a stretching to the warp [degrees], for `r2s.estimation.pinn`; each
+      angle and number has a stretch and a rate of its own. None: a motion of `r2s.scenarios`.
     """
 
     kind: ClassVar[str] = "recordings"
@@ -112,8 +113,16 @@ class SyntheticRecording(Cell):
         fabric, truth = strain_dependent(self.fabric, self.truth), self.truth
         key = jr.fold_in(jr.key(self.seed), number_of(self.fabric, self.scenario, self.number))
         if self.angle is not None:
-            angle, key = math.radians(self.angle), jr.fold_in(key, round(self.angle))
-            made = pulled(fabric, self.fabric, angle, shape=truth.shape, key=key)
+            made = pulled(
+                fabric,
+                self.fabric,
+                math.radians(self.angle),
+                shape=truth.shape,
+                frames=PULL_FRAMES,
+                steps=math.ceil(STRETCHING_INTERVAL / truth.max_step - 1e-9),
+                key=jr.fold_in(key, round(self.angle)),
+                **pull_of(self.number, self.angle, self.seed),
+            )
         else:
             layers = truth.self_contact and self.scenario == "folding"
             made = synthetic.record(
