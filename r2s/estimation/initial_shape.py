@@ -18,7 +18,6 @@ from r2s.evaluation.losses import TOUCHING, length, robust_weight, surface_resid
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh
 from r2s.scenarios.scenario import Scenario, rollout
-from r2s.solver import Solver
 
 _motion = eqx.filter_jit(rollout)
 
@@ -31,19 +30,17 @@ def as_seen(
     fabric: Fabric,
     points: Float[Array, "point 3"],
     mask: Bool[Array, " point"],
-    solver: Solver | None = None,
 ) -> Scenario:
     """A scenario of a hanging sheet that starts in the shape of its first cloud.
 
     - `fabric`: any of those to be estimated; it says how the sheet hangs where the cloud does not
       show it.
     - `points`, `mask`: the first cloud, [m].
-    - `solver`: of how it hangs, see `r2s.scenarios.rollout`; None: the cloth.
 
     The grippers, which a sheet at rest has at its corners, start where the path begins.
     """
     scene = scenario.scene
-    first = _motion(dataclasses.replace(scenario, num_frames=1), fabric, solver=solver).x[0]
+    first = _motion(dataclasses.replace(scenario, num_frames=1), fabric).x[0]
     start = registered(points, mask, first, scene.mesh, scene.is_free)
     path = scenario.path.at[0].set(scenario.path[1])
     return dataclasses.replace(scenario, start=start, path=path)

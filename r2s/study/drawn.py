@@ -9,6 +9,7 @@ from r2s.scenarios.paths import draw
 from r2s.scenarios.six import SIX, Experiment
 
 RECORDING = "recording.npz"
+START = "start.npy"  # beside it: the shape of a hanging sheet in its first frame
 
 
 def experiment_of(scenario: str, number: int, unseen: bool, seed: int) -> Experiment:

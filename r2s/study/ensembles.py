@@ -27,6 +27,7 @@ from r2s.scenarios.scenario import rollout
 from r2s.scenarios.six import Experiment
 from r2s.study.cells import Cell, result_files
 from r2s.study.sources import SyntheticRecording, read, strain_dependent
+from r2s.study.starts import started
 
 ENSEMBLE = "ensemble.npz"
 STIFFNESS, PATH = 1e-3, 2e-4  # [-] and [m]: what no one can tell
@@ -67,6 +68,8 @@ class EnsembleCell(Cell):
         if not np.isfinite(base.x).all():
             raise RuntimeError(f"the truth of {self.name} diverged")
         points = _points_of(base)
+        hangs = experiment.sheet.weft[2] != 0
+        start = base.x[0].reshape(*shape, 3) if hangs else None  # as predictions do
 
         def away(moved: "_Moved") -> np.ndarray:
             return to_surface(points, moved.x, moved.mesh.faces)
@@ -80,13 +83,13 @@ class EnsembleCell(Cell):
                 for sign in (-1, 1)
             ],
             "path": [away(_moved(_shifted(experiment), fabric, shape))],
-            "mesh": [away(_moved(experiment, fabric, _cells(shape, FINER)))],
+            "mesh": [away(_moved(experiment, fabric, _cells(shape, FINER), start=start))],
             "step": [away(_moved(experiment, fabric, shape, steps=2))],
         }
         coarse = _cells(shape, COARSER)
         for name in self.others:
             other = strain_dependent(name, truth)
-            found[APART + name] = [away(_moved(experiment, other, coarse))]
+            found[APART + name] = [away(_moved(experiment, other, coarse, start=start))]
         arrays = {name: np.stack(rows) for name, rows in found.items()}
         stored: dict[str, Any] = {"times": np.asarray(experiment.times), **arrays}
         np.savez_compressed(out / ENSEMBLE, **stored)
@@ -126,10 +129,17 @@ _rollout = eqx.filter_jit(rollout)
 
 
 def _moved(
-    experiment: Experiment, fabric: Fabric, shape: tuple[int, int], steps: int = 1
+    experiment: Experiment,
+    fabric: Fabric,
+    shape: tuple[int, int],
+    steps: int = 1,
+    start: Float[np.ndarray, "row column 3"] | None = None,
 ) -> _Moved:
-    """A motion in explicit steps; NaN from where it diverged. `steps`: times as many."""
-    scenario = experiment.scenario(shape)
+    """A motion in explicit steps; NaN from where it diverged.
+
+    `steps`: times as many. `start`: see `r2s.study.starts`.
+    """
+    scenario = started(experiment.scenario(shape), start)
     solver = explicit_cloth(scenario, fabric)
     solver = dataclasses.replace(solver, substeps=steps * solver.substeps)
     moved = _rollout(scenario, fabric, solver=solver)
