@@ -76,7 +76,7 @@ def test_a_pull_is_made_in_the_steps_of_truths_and_ends_within_its_frames(monkey
 
 @pytest.mark.slow(group="study")
 def test_shorter_steps_of_a_pull_change_the_force_that_holds_it_and_the_markers_little():
-    """On the way, in a pull twice as fast as those of the study, the force of a soft knit by 8 %."""
+    """On the way, in a pull faster than those of the study, the force of a soft knit by 8 %."""
     settings: dict[str, Any] = {"frames": 9, "moving": 0.25, "shape": (5, 5), "key": jr.key(0)}
     exact: dict[str, Any] = {"marker_noise": 0.0, "force_noise": 0.0}
     fine, finer = (pulled(FABRIC, "grey", steps=steps, **settings, **exact) for steps in (3, 6))
