@@ -17,7 +17,7 @@ from r2s.estimation.estimate import Estimate, point_estimate
 from r2s.estimation.gauss_newton import Problems, loss_at, theta_indices, theta_length
 from r2s.estimation.method import ANY, Budget, Method, Progress
 from r2s.estimation.normal_equations import Loss
-from r2s.estimation.problem import Problem
+from r2s.estimation.problem import Problem, read_by_problem
 from r2s.extras import require
 
 DIVERGED = 1.0  # [m^2]: the loss of a run that diverged, above that of any that did not
@@ -38,6 +38,9 @@ class CMAES(Method):
     heeds = ("evaluations",)
     supports = {"cloth": ANY, "points": ANY}
     several = True
+
+    def reads(self, recording):
+        return read_by_problem(recording)
 
     def _estimate(self, recordings, space, budget, key):
         require("cma", "cma", "CMA-ES")  # before anything is simulated

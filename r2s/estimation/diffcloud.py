@@ -15,13 +15,14 @@ from r2s.estimation import adam
 from r2s.estimation.descent import DEFAULT
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.mesh_ladder import descend_by_meshes
-from r2s.estimation.method import ANY, Budget, Method, Progress
+from r2s.estimation.method import ANY, Budget, Method, Progress, Reads, frames_that_count
 from r2s.estimation.prediction import Prediction
-from r2s.estimation.problem import Problem
+from r2s.estimation.problem import POINTS, Problem, read_by_problem
 from r2s.evaluation.losses import one_sided_chamfer
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace, Range
 from r2s.geometry.surface import sample
+from r2s.scenarios.scenario import from_recording
 
 STRETCH = Range("stretch multiplier", "-", 0.05, 10.0, log=False)
 MASS = Range("mass multiplier", "-", 0.1, 10.0, log=False)
@@ -41,6 +42,9 @@ class DiffCloud(Method):
     supports = {"cloth": ANY}
     refusals = REFUSALS
     several = True
+
+    def reads(self, recording):
+        return read_by_problem(recording)
 
     def _estimate(self, recordings, space, budget, key):
         return descend_by_meshes(
@@ -68,6 +72,12 @@ class PublishedDiffCloud(Method):
     refusals = REFUSALS
 
     assumed: Fabric | None = None
+
+    def reads(self, recording):
+        first, *_, last = (0, *frames_that_count(recording))
+        hangs = from_recording(recording, self.chosen_shape).brake is not None
+        is_shown = hangs and recording.info.frames_used[0] == 0  # how it hangs at first
+        return Reads((first, last) if is_shown else (last,), points=POINTS)
 
     def _estimate(self, recordings, space, budget, key):
         del key  # it starts in the middle

@@ -15,9 +15,9 @@ from jaxtyping import Array, Float
 from r2s.estimation import adam
 from r2s.estimation.descent import descend
 from r2s.estimation.estimate import Estimate
-from r2s.estimation.method import ANY, Budget, Method, Progress
+from r2s.estimation.method import ANY, Budget, Method, Progress, Reads, frames_that_count
 from r2s.estimation.prediction import Prediction
-from r2s.estimation.problem import Problem
+from r2s.estimation.problem import POINTS, Problem, read_by_problem
 from r2s.evaluation.losses import surface_residuals
 from r2s.fabrics.parameters import ParameterSpace
 from r2s.mpm.sheet import Sheet
@@ -42,6 +42,9 @@ class DiffCP(Method):
     refusals = REFUSALS
     several = True
 
+    def reads(self, recording):
+        return read_by_problem(recording)
+
     def _estimate(self, recordings, space, budget, key):
         problems = problems_on_points(recordings, space, self.chosen_shape)
         found = descend(
@@ -64,6 +67,9 @@ class PublishedDiffCP(Method):
     heeds = ("iterations",)
     supports = {"points": ANY}
     refusals = REFUSALS
+
+    def reads(self, recording):
+        return Reads(frames_that_count(recording), points=POINTS)
 
     def _estimate(self, recordings, space, budget, key):
         del key  # it starts where the public code does

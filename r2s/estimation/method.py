@@ -17,8 +17,9 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from r2s.estimation.default_spaces import on_cloth, on_points
 from r2s.estimation.estimate import Estimate
-from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace
+from r2s.fabrics.parameters import ParameterSpace
 from r2s.recordings.recording import Recording
 
 SOLVERS = ("cloth", "points")
@@ -66,6 +67,26 @@ class Budget(NamedTuple):
     around: int = 8
     evaluations: int = 80
     leads_on: bool = False
+
+
+class Reads(NamedTuple):
+    """What a method reads of a recording, beside its sheet, table, wind and the grippers' path.
+
+    - `frames`: of which it reads clouds, markers or force; the others could be missing.
+    - `points`: at most, of each cloud; 0: no clouds; None: all points.
+    - `markers`: whether it reads them. `force`: of the pulled clamp, on them.
+    """
+
+    frames: tuple[int, ...]
+    points: int | None = 0
+    markers: bool = False
+    force: bool = False
+
+
+def frames_that_count(recording: Recording) -> tuple[int, ...]:
+    """All of them, from the first to the last."""
+    first, last = recording.info.frames_used
+    return tuple(range(first, last + 1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,6 +162,10 @@ class Method(abc.ABC):
         """The shape of this instance, or `COARSEST`."""
         return self.shape or COARSEST
 
+    @abc.abstractmethod
+    def reads(self, recording: Recording) -> Reads:
+        """What an estimate from a recording depends on."""
+
     @classmethod
     def options(cls) -> frozenset[str]:
         """Names of the fields that this method has beside those of all methods."""
@@ -173,9 +198,11 @@ class Method(abc.ABC):
 
 
 def default_space(solver: str, density: float) -> ParameterSpace:
-    """The fabrics to choose from: orthotropic on the cloth, isotropic on material points."""
-    make = OrthotropicSpace.make if solver == "cloth" else IsotropicSpace.make
-    return make(density)
+    """The fabrics to choose from: orthotropic on the cloth, isotropic on material points.
+
+    See `r2s.estimation.default_spaces`. `density`: areal, [kg/m^2], else `ValueError`.
+    """
+    return on_cloth(density) if solver == "cloth" else on_points(density)
 
 
 def seed_of(key: PRNGKeyArray) -> int:

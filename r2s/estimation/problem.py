@@ -9,12 +9,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s.estimation import initial_shape
+from r2s.estimation.method import Reads, frames_that_count
 from r2s.fabrics.parameters import ParameterSpace
 from r2s.geometry.mesh import Mesh
 from r2s.geometry.surface import nearest
 from r2s.recordings.recording import Recording, subsample
 from r2s.scenarios.scenario import Scenario, from_recording
 
+POINTS = 300  # at most, of a cloud
 FORCE_SCALE = 0.02  # [m/N]: a load cell is good to 10 mN where a marker is to 0.2 mm
 
 
@@ -109,7 +111,7 @@ class Problem(eqx.Module):
         recording: Recording,
         space: ParameterSpace,
         *,
-        num_points: int = 300,
+        num_points: int = POINTS,
         voxel: float | None = None,
         shape: tuple[int, int] = (9, 9),
         seed: int = 0,
@@ -154,6 +156,18 @@ class Problem(eqx.Module):
             solver,
             default_nuisance_prior(scenario) if nuisance_prior is None else nuisance_prior,
         )
+
+
+def read_by_problem(recording: Recording) -> Reads:
+    """What `Problem.make` reads of a recording."""
+    has_markers = recording.markers is not None
+    is_pulled = recording.info.scenario == "stretching"
+    return Reads(
+        frames_that_count(recording),
+        points=0 if has_markers else POINTS,
+        markers=has_markers,
+        force=is_pulled and recording.force is not None,
+    )
 
 
 def window(problem: Problem, first: int, last: int) -> Problem:

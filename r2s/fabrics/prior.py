@@ -53,6 +53,27 @@ def draws(density: float, count: int, key: PRNGKeyArray) -> Fabric:
     )
 
 
+def middle(density: float) -> Fabric:
+    """The fabric in the middle of the prior, for an areal density [kg/m^2]: the median of every
+    number that is drawn.
+
+    Raises `ValueError` for a density that is not positive.
+    """
+    if not density > 0:
+        raise ValueError(f"the areal density must be positive, got {density} kg/m^2")
+    yarn, shear = np.exp(_membranes()[0]).tolist()
+    coupling, friction = sum(COUPLING) / 2, sum(FRICTION) / 2
+    c11 = yarn / (1 - coupling**2)
+    return Fabric.make(
+        density,
+        (c11, coupling * c11, c11, shear),
+        float(np.exp(BENDING + EXPONENT * np.log(density))),
+        damping=float(np.sqrt(DAMPING[0] * DAMPING[1])),
+        friction=friction,
+        thickness=THICKNESS,
+    )
+
+
 def _uniform(key: PRNGKeyArray, count: int, ends: tuple[float, float]) -> jax.Array:
     return jr.uniform(key, (count,), float, *ends)
 

@@ -9,6 +9,7 @@ from r2s.scenarios.paths import draw
 from r2s.scenarios.six import SIX, Experiment
 
 RECORDING = "recording.npz"
+START = "start.npy"  # beside it: the shape of a hanging sheet in its first frame
 
 
 def experiment_of(scenario: str, number: int, unseen: bool, seed: int) -> Experiment:
@@ -27,6 +28,15 @@ def numbers_of(scenario: str, number: int, unseen: bool, seed: int) -> dict[str,
     key = jr.fold_in(jr.key(seed), number_of(scenario))  # or scenarios would share their numbers
     key = jr.fold_in(key, 2 * number + unseen)
     return draw(scenario, 1, key=key)[0]
+
+
+def pull_of(number: int, angle: float, seed: int) -> dict[str, float]:
+    """Stretch and time of a pull at an `angle` [degrees] to the warp, the same for all fabrics.
+
+    Each angle and each number has its own, drawn within `r2s.scenarios.paths.LIMITS`.
+    """
+    key = jr.fold_in(jr.key(seed), number_of("pull", number, float(angle)))
+    return draw("stretching", 1, key=key)[0]
 
 
 def number_of(*parts: Any) -> int:

@@ -25,9 +25,9 @@ from r2s.recordings.recording import cloud
 from r2s.scenarios.in_explicit_steps import explicit_cloth
 from r2s.scenarios.scenario import rollout
 from r2s.scenarios.six import Experiment
-from r2s.scenarios.start import starting_as
 from r2s.study.cells import Cell, result_files
 from r2s.study.sources import SyntheticRecording, read, strain_dependent
+from r2s.study.starts import started
 
 ENSEMBLE = "ensemble.npz"
 STIFFNESS, PATH = 1e-3, 2e-4  # [-] and [m]: what no one can tell
@@ -69,9 +69,11 @@ class EnsembleCell(Cell):
         if not np.isfinite(base.x).all():
             raise RuntimeError(f"the truth of {self.name} diverged")
         points = _points_of(base)
+        hangs = experiment.sheet.weft[2] != 0
+        start = base.x[0].reshape(*shape, 3) if hangs else None  # as predictions do
 
         def away(experiment: Experiment, fabric: Fabric, shape: Any, steps: int = 1) -> np.ndarray:
-            moved = _moved(experiment, fabric, shape, steps, base)
+            moved = _moved(experiment, fabric, shape, steps, start)
             return to_surface(points, moved.x, moved.mesh.faces)
 
         recording = read(source, folder)
@@ -130,16 +132,13 @@ def _moved(
     fabric: Fabric,
     shape: tuple[int, int],
     steps: int = 1,
-    start: _Moved | None = None,
+    start: Float[np.ndarray, "row column 3"] | None = None,
 ) -> _Moved:
     """A motion in explicit steps; NaN from where it diverged.
 
-    - `steps`: times as many.
-    - `start`: another, in whose first shape this one starts; None: it starts flat.
+    `steps`: times as many. `start`: see `r2s.study.starts`.
     """
-    scenario = experiment.scenario(shape)
-    if start is not None:
-        scenario = starting_as(scenario, start.mesh, jnp.asarray(start.x[0]))
+    scenario = started(experiment.scenario(shape), start)
     solver = explicit_cloth(scenario, fabric)
     solver = dataclasses.replace(solver, substeps=steps * solver.substeps)
     moved = _rollout(scenario, fabric, solver=solver)

@@ -116,15 +116,19 @@ class EstimateCell(Cell):
     def _estimated(self, recordings, space, folder: Path) -> Estimate:
         key, network = jr.key(self.repeat), self.network
         with nullcontext() if network is None else result_files(network, folder) as files:
-            return self._method(files).estimate(recordings, space, self.budget, key=key)
+            return method_of(self, files).estimate(recordings, space, self.budget, key=key)
 
-    def _method(self, network: Path | None) -> Method:
-        """The method with what it takes beside the recordings."""
-        kind = METHODS[self.approach]
-        angles = tuple(getattr(each, "angle", None) or 0.0 for each in self.sources)
-        others = {"angles": angles, "network": network and network / NETWORK}
-        taken = {name: value for name, value in others.items() if name in kind.options()}
-        return kind(solver=self.solver, shape=SHAPES[self.solver], **taken)
+
+def method_of(cell: EstimateCell, network: Path | None = None) -> Method:
+    """The method of a cell with what it takes beside the recordings.
+
+    `network`: the folder of a trained one, which "physnet" needs to estimate.
+    """
+    kind = METHODS[cell.approach]
+    angles = tuple(getattr(each, "angle", None) or 0.0 for each in cell.sources)
+    others = {"angles": angles, "network": network and network / NETWORK}
+    taken = {name: value for name, value in others.items() if name in kind.options()}
+    return kind(solver=cell.solver, shape=SHAPES[cell.solver], **taken)
 
 
 def read_estimate(cell: EstimateCell, folder: Path) -> Estimate | None:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -28,10 +29,12 @@ from r2s.scenarios.scenario import Scenario, from_recording
 from r2s.study.cells import Cell, result_files
 from r2s.study.configuration import Configuration
 from r2s.study.estimates import EstimateCell, read_estimate
-from r2s.study.sources import GivenRecording, Source, read, small_strain
+from r2s.study.sources import GivenRecording, Source, read, read_start, small_strain
+from r2s.study.starts import started
 
 MEASURED, MOTION = "measured.json", "motion.npz"
-SHAPES = {"cloth": (25, 25), "points": (9, 9)}  # vertices of the simulated sheet
+# vertices of the simulated sheet: with 25 x 25 a fling of grey interlock is 7 mm off
+SHAPES = {"cloth": (33, 33), "points": (9, 9)}
 LADDER = math.sqrt(2)  # steps between frames are powers of this: few programs to compile
 
 
@@ -116,7 +119,8 @@ class EvaluationCell(Cell):
             lost = [np.full((len(each.times), count, 3), np.nan) for each in recordings]
             motions = [Motion(x, "the estimate diverged") for x in lost]
         else:
-            motions = predict(recordings, fabric, self.solver)
+            starts = [read_start(source, folder) for source in self.recordings]
+            motions = predict(recordings, fabric, self.solver, starts)
         measured, diverged, arrays = {}, {}, {}
         for source, recording, motion in zip(self.recordings, recordings, motions, strict=True):
             is_cropped = isinstance(source, GivenRecording)
@@ -173,13 +177,21 @@ def read_distances(cell: EvaluationCell, folder: Path) -> dict[str, Float[np.nda
         return {source.name: stored[source.name] for source in cell.recordings}
 
 
-def predict(recordings: list[Recording], fabric: Fabric, solver: str) -> list[Motion]:
+def predict(
+    recordings: list[Recording],
+    fabric: Fabric,
+    solver: str,
+    starts: Sequence[Float[np.ndarray, "row column 3"] | None] = (),
+) -> list[Motion]:
     """The motions of a fabric in recordings of one scenario.
 
     `solver`: "cloth" in explicit steps, whose own error is that of their mesh alone, or "points"
-    for material points in a grid that serves all recordings.
+    for material points in a grid that serves all recordings. `starts`: of each recording the shape
+    in its first frame [m], see `r2s.study.starts`; none: from flat sheets.
     """
     scenarios = [from_recording(recording, SHAPES[solver]) for recording in recordings]
+    if starts:
+        scenarios = [started(each, shape) for each, shape in zip(scenarios, starts, strict=True)]
     most = max(scenario.substeps for scenario in scenarios)
     in_equal_steps = [dataclasses.replace(scenario, substeps=most) for scenario in scenarios]
     make = _points if solver == "points" else _explicit

@@ -7,11 +7,13 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import jax.random as jr
+import numpy as np
 
 from r2s.recordings.recording import save
 from r2s.scenarios import synthetic
+from r2s.scenarios.six import Experiment
 from r2s.study.cells import Cell
-from r2s.study.drawn import RECORDING, experiment_of, number_of
+from r2s.study.drawn import RECORDING, START, experiment_of, number_of
 from r2s.study.mujoco_sheet import Material, Resolution, moved
 
 FABRIC = "mujoco_flex"
@@ -48,20 +50,33 @@ class MujocoRecording(Cell):
     def compilation_group(self) -> str:
         return f"recordings of MuJoCo {self.scenario}"
 
+    @property
+    def sensing(self) -> synthetic.Sensing:
+        """How cameras see it."""
+        return synthetic.WHOLE if self.unseen else synthetic.sensing(self.experiment)
+
+    @property
+    def experiment(self) -> Experiment:
+        """What is done to the sheet."""
+        return experiment_of(self.scenario, self.number, self.unseen, self.seed)
+
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
         """Simulate the recording; raises as `r2s.study.mujoco_sheet.moved`."""
-        experiment = experiment_of(self.scenario, self.number, self.unseen, self.seed)
+        experiment = self.experiment
         scenario = experiment.scenario(self.resolution.shape)
         key = jr.fold_in(
             jr.key(self.seed), number_of(self.fabric, self.scenario, self.number, self.unseen)
         )
+        x = moved(scenario, self.material, self.resolution.step)
+        if self.unseen and scenario.brake is not None:
+            np.save(out / START, x[0].reshape(*self.resolution.shape, 3))
         made = synthetic.seen_of(
-            jnp.asarray(moved(scenario, self.material, self.resolution.step), float),
+            jnp.asarray(x, float),
             experiment,
             scenario,
             self.fabric,
             self.number,
-            synthetic.WHOLE if self.unseen else synthetic.sensing(experiment),
+            self.sensing,
             key=key,
         )
         info = dataclasses.replace(

@@ -21,7 +21,9 @@ from r2s.study.costs import cost_table, costs, forecast
 from r2s.study.estimates import ESTIMATE, EstimateCell, read_estimate
 from r2s.study.evaluations import EvaluationCell, read_measured, read_motion
 from r2s.study.matrix import PRESETS, Plan
+from r2s.study.report.data_table import data_table
 from r2s.study.report.motions import MotionComparison
+from r2s.study.report.parameter_ranges import range_table, truth_settings
 from r2s.study.rows import Row, write_rows
 from r2s.study.sources import GivenRecording, Source, SyntheticRecording, read, small_strain
 from r2s.study.statistics.parameters import Estimated
@@ -34,6 +36,15 @@ MESHES = (
     "in those it is judged on, for the fabric that came out: the distance from a fine sheet of the "
     "same fabric, over the sheet and the motion. Differences between configurations that are "
     "smaller may be the mesh's."
+)
+DATA = (
+    "Approaches differ in what they are given; a difference between them may be that of their data."
+)
+RANGES = (
+    "Searches begin in the middle, or among places that are even over the range (over its "
+    "logarithm, but for the coupling and nu), so what a motion does not tell comes from here. The "
+    "prior is that of the default fabric (r2s.fabrics.prior): it was not laid around the study's "
+    "fabrics."
 )
 PRINTED = ("findings.md", "chamfer_real_to_sim*.md", "diff*_on_*.md")  # the others are in files
 
@@ -93,15 +104,31 @@ def _publish(
         motion_comparisons(cells, out),
         parameters(cells, out),
         missing,
-        {"recordings": source} | {f.name: str(getattr(plan, f.name)) for f in fields(plan)},
+        {"recordings": source}
+        | {f.name: str(getattr(plan, f.name)) for f in fields(plan)}
+        | truth_settings(plan.truth, _presets_of(cells)),
         paper,
         [
+            ("Data", DATA, _if_any(data=data_table(cells, out))),
+            ("Ranges and fixed values", RANGES, _if_any(ranges=range_table(cells))),
             ("Costs", "", {"costs": cost_table(took)} if took else {}),
-            ("Meshes", MESHES, {"meshes": meshes} if meshes.rows else {}),
+            ("Meshes", MESHES, _if_any(meshes=meshes)),
             ("Every recording", "Mean over the frames that count.", recording_tables(found)),
             ("What larger studies would take", "From the costs of this one.", forecasts),
         ],
     )
+
+
+def _if_any(**tables: Table) -> dict[str, Table]:
+    """Those that have lines."""
+    return {name: table for name, table in tables.items() if table.rows}
+
+
+def _presets_of(cells: Iterable[EvaluationCell]) -> list[str]:
+    """Fabrics of the synthetic recordings that are judged by."""
+    sources = [source for cell in cells for source in cell.recordings]
+    made = [source.fabric for source in sources if isinstance(source, SyntheticRecording)]
+    return list(dict.fromkeys(made))
 
 
 def _is_published(out: Path, mark: Path, changed: str) -> bool:

@@ -15,19 +15,23 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import jax.random as jr
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
 
 from r2s.estimation.pinn.synthetic_pulls import pulled
 from r2s.fabrics import presets
 from r2s.fabrics.arcsim import read_material
 from r2s.fabrics.fabric import Fabric, constant_laws
+from r2s.kept import kept
 from r2s.laws.stiffening import SofteningPlate, StiffeningMembrane
 from r2s.recordings import manifest
 from r2s.recordings.recording import Recording, load, save
 from r2s.scenarios import synthetic
 from r2s.scenarios.in_explicit_steps import explicit_cloth
-from r2s.scenarios.six import Experiment
+from r2s.scenarios.scenario import rollout
+from r2s.scenarios.six import STRETCHING_INTERVAL, Experiment
 from r2s.study.cells import Cell, result_files
-from r2s.study.drawn import RECORDING, experiment_of, number_of
+from r2s.study.drawn import RECORDING, START, experiment_of, number_of, pull_of
 from r2s.study.mujoco_recording import MujocoRecording
 
 STRETCH = 1.1  # where half of `TruthSettings.stiffening` is reached; Wang et al. 2011: up to 1.167
@@ -47,6 +51,7 @@ FRICTION = {
     "pink_solid": 0.55,
     "red_jet_set": 0.28,
 }  # [-]
+PULL_FRAMES = 48  # of a pull for `r2s.estimation.pinn`: the longest ends before the last of them
 LAYERED = (17, 17)  # vertices at most of a sheet that touches itself, in implicit steps
 SAME_SCENARIO = {"lift": "lifting", "fold": "folding"}  # how recordings of others call them
 
@@ -84,8 +89,8 @@ class SyntheticRecording(Cell):
       `r2s.scenarios.paths.LIMITS`, the same for all fabrics.
     - `unseen`: whether its motion is drawn to be judged by; none of these is one to estimate from.
       Its clouds are all of the surface, without any error.
-    - `angle`: from the pull of a stretching to the warp [degrees], for `r2s.estimation.pinn`; None:
-      a motion of `r2s.scenarios`.
+    - `angle`: from the pull of a stretching to the warp [degrees], for `r2s.estimation.pinn`; each
+      angle and number has a stretch and a rate of its own. None: a motion of `r2s.scenarios`.
     """
 
     kind: ClassVar[str] = "recordings"
@@ -113,29 +118,56 @@ class SyntheticRecording(Cell):
         fabric, truth = strain_dependent(self.fabric, self.truth), self.truth
         key = jr.fold_in(jr.key(self.seed), number_of(self.fabric, self.scenario, self.number))
         if self.angle is not None:
-            angle, key = math.radians(self.angle), jr.fold_in(key, round(self.angle))
-            made = pulled(fabric, self.fabric, angle, shape=truth.shape, key=key)
-        else:
-            layers = truth.self_contact and self.scenario == "folding"
-            made = synthetic.record(
-                self.experiment,
+            made = pulled(
                 fabric,
                 self.fabric,
-                seen=synthetic.WHOLE if self.unseen else None,
-                shape=min(truth.shape, LAYERED) if layers else truth.shape,
-                max_step=truth.max_step,
-                self_contact=layers,
-                solver=None if layers or self.scenario == "stretching" else explicit_cloth,
-                key=key,
+                math.radians(self.angle),
+                shape=truth.shape,
+                frames=PULL_FRAMES,
+                steps=math.ceil(STRETCHING_INTERVAL / truth.max_step - 1e-9),
+                key=jr.fold_in(key, round(self.angle)),
+                **pull_of(self.number, self.angle, self.seed),
             )
+        else:
+            made = self._recorded(fabric, out, key)
         info = dataclasses.replace(made.info, name=self.name, trial=str(self.number))
         save(dataclasses.replace(made, info=info), out / RECORDING)
         return {"seed": self.seed, "frames": len(made.times)}
+
+    def _recorded(self, fabric: Fabric, out: Path, key: PRNGKeyArray) -> Recording:
+        """A motion of `r2s.scenarios`; of one to judge by also how a hanging sheet starts."""
+        truth = self.truth
+        layers = truth.self_contact and self.scenario == "folding"
+        shape = min(truth.shape, LAYERED) if layers else truth.shape
+        motion = None
+        if not layers and self.scenario != "stretching":
+            scenario = self.experiment.scenario(shape)
+            motion = _rollout(scenario, fabric, solver=explicit_cloth(scenario, fabric))
+            if self.unseen and scenario.brake is not None:
+                np.save(out / START, np.asarray(motion.x[0]).reshape(*shape, 3))
+        return synthetic.record(
+            self.experiment,
+            fabric,
+            self.fabric,
+            seen=self.sensing,
+            shape=shape,
+            max_step=truth.max_step,
+            self_contact=layers,
+            motion=motion,
+            key=key,
+        )
 
     @property
     def experiment(self) -> Experiment:
         """What is done to the sheet."""
         return experiment_of(self.scenario, self.number, self.unseen, self.seed)
+
+    @property
+    def sensing(self) -> synthetic.Sensing | None:
+        """How cameras see it; None: a pull, of which there are markers alone."""
+        if self.angle is not None:
+            return None
+        return synthetic.WHOLE if self.unseen else synthetic.sensing(self.experiment)
 
 
 @dataclass(frozen=True)
@@ -162,6 +194,8 @@ class GivenRecording(Cell):
         save(read, out / RECORDING)
         return {"frames": len(read.times), "verified": read.info.verified}
 
+
+_rollout = kept(rollout)
 
 Source = SyntheticRecording | MujocoRecording | GivenRecording
 
@@ -215,6 +249,17 @@ def read(source: Source, folder: Path) -> Recording:
     """The recording of a cell that is made."""
     with result_files(source, folder) as files:
         return load(files / RECORDING)
+
+
+def read_start(source: Source, folder: Path) -> Float[np.ndarray, "row column 3"] | None:
+    """The truth's shape [m] in the first frame of a recording that is judged by, where it hangs.
+
+    None for a sheet that lies on the table, and for given recordings: no one knows theirs.
+    """
+    if isinstance(source, GivenRecording) or source.experiment.sheet.weft[2] == 0:
+        return None
+    with result_files(source, folder) as files:
+        return np.load(files / START)
 
 
 def strain_dependent(name: str, truth: TruthSettings = TruthSettings()) -> Fabric:

@@ -13,8 +13,9 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
+from r2s.estimation.default_spaces import RANGES
 from r2s.estimation.estimate import Estimate
-from r2s.estimation.method import ANY, Budget, Method, seed_of
+from r2s.estimation.method import ANY, Budget, Method, Reads, seed_of
 from r2s.estimation.physnet import bayes, dataset, emulator, estimator, preprocess, training
 from r2s.recordings.recording import Recording
 from r2s.scenarios.on_points import material_points
@@ -45,7 +46,7 @@ def train_network(
     The simulated images lie in a folder beside `path` until it is trained, so that a killed run
     goes on. `progress` shows a bar of the simulations, and prints a line an epoch, on stderr.
     """
-    settings = dataset.Settings(scenario, budget.fabrics, seed=seed)
+    settings = dataset.Settings(scenario, budget.fabrics, ranges=RANGES, seed=seed)
     if solver == "points":
         settings = dataset.Settings(
             scenario,
@@ -67,6 +68,11 @@ def train_network(
     )
     shutil.rmtree(images)
     return trained
+
+
+def _images_of(recording: Recording) -> tuple[int, ...]:
+    """The frames of which the network has images."""
+    return dataset.kept_frames(recording.info.frames_used, dataset.Settings.num_frames)
 
 
 def _print_epoch(epoch: int, row: training.Row) -> None:
@@ -92,13 +98,16 @@ class PhysNetMethod(Method):
     network: Path | None = None
     training_budget: TrainingBudget = TrainingBudget()
 
+    def reads(self, recording):
+        return Reads(_images_of(recording), points=None)
+
     def _estimate(self, recordings, space, budget, key):
         if importlib.util.find_spec(self.library) is None:
             raise ImportError(f"{self.name} needs {self.library}: pip install 'r2s[physnet]'")
         recording, solver = recordings[0], self.chosen_solver
         trained = self._trained(recording, seed_of(key))
         scenario = from_recording(recording, NETWORK_SHAPE[solver])
-        frames = dataset.kept_frames(recording.info.frames_used, dataset.Settings.num_frames)
+        frames = _images_of(recording)
         images = preprocess.of_clouds(trained.view, recording, frames)
         stiffest = space(jnp.ones(space.dim, float))
         simulator = None if solver == "cloth" else material_points(scenario, stiffest)

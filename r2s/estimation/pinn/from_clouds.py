@@ -179,7 +179,7 @@ def estimate(
     if settings.rounds < 1:
         raise ValueError(f"at least one round is needed, got {settings.rounds}")
     began = time.perf_counter()
-    frames = _frames(recording, settings.frames)
+    frames = np.array(frames_of(recording, settings.frames))
     sight = sight_of(recording, frames, settings.points)
     shared = _shared(recording, space, sight, settings, key)
     held = fixed(sight.corners, sight.times, sight.grips, GRIP)
@@ -261,8 +261,9 @@ def _counted(recording: Recording) -> int:
     return last - first + 1
 
 
-def _frames(recording: Recording, number: int) -> np.ndarray:
-    """Evenly spaced frames among those that count; in a wind, among those when it blows evenly."""
+def frames_of(recording: Recording, number: int = Settings.frames) -> tuple[int, ...]:
+    """Which frames are looked at: some, evenly spaced among those that count; in a wind, among
+    those when it blows evenly. Raises `ValueError` for fewer than three."""
     first, last = recording.info.frames_used
     times = np.asarray(recording.times)
     if recording.info.wind is not None:
@@ -272,7 +273,7 @@ def _frames(recording: Recording, number: int) -> np.ndarray:
             f"recording {recording.info.name}: frames {first} to {last} count, three are needed at "
             "least" + (f", {GUST_OVER:g} s after the wind rises" if recording.info.wind else "")
         )
-    return np.unique(np.linspace(first, last, number).round().astype(int))
+    return tuple(np.unique(np.linspace(first, last, number).round().astype(int)).tolist())
 
 
 def _shared(

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from r2s.estimation.estimate import point_estimate
-from r2s.estimation.method import ANY, Budget, Method
+from r2s.estimation.method import ANY, Budget, Method, Reads, frames_that_count
 from r2s.estimation.pinn.pulls import Pull, pull_from, stacked
 from r2s.recordings.recording import Recording
 
@@ -39,6 +39,14 @@ class PINN(Method):
     takes_shape = False
 
     angles: tuple[float, ...] = ()
+
+    def reads(self, recording):
+        if recording.info.scenario == "stretching":
+            return Reads(frames_that_count(recording), markers=True, force=True)
+        from r2s.estimation.pinn import from_clouds  # needs flax
+
+        # some points are matched, all of them show where the sheet ends
+        return Reads(from_clouds.frames_of(recording), points=None)
 
     def _estimate(self, recordings, space, budget, key):
         from r2s.estimation.pinn import from_clouds, from_pulls  # need flax
@@ -83,6 +91,9 @@ class PublishedPINN(Method):
     takes_shape = False
 
     angles: tuple[float, ...] = ()
+
+    def reads(self, recording):
+        return Reads(frames_that_count(recording), markers=True)
 
     def _estimate(self, recordings, space, budget, key):
         from r2s.estimation.pinn import published_recipe  # needs flax

@@ -14,6 +14,7 @@ from r2s.geometry.mesh import Mesh
 from r2s.geometry.surface import nearest
 from r2s.recordings.recording import Recording, RecordingInfo, make_recording
 from r2s.scenarios import clamp_force, energy_balance, stretching
+from r2s.scenarios.six import STRETCHING_INTERVAL
 from r2s.scenarios.synthetic import MARKER_NOISE, MARKERS
 
 FRAMES = 39  # of 1/30 s
@@ -31,9 +32,10 @@ def pulled(
     frames: int = FRAMES,
     marker_noise: float = MARKER_NOISE,
     force_noise: float = FORCE_NOISE,
-    max_step: float = 1 / 30,
+    steps: int = 1,
     key: PRNGKeyArray,
     strain: float = 0.04,
+    moving: float = 1.0,
 ) -> Recording:
     """A stretching of a fabric, with 81 markers and the force on the pulled clamp.
 
@@ -41,23 +43,30 @@ def pulled(
     - `angle`: from the pull to the warp, [rad].
     - `shape`: vertices of the sheet along its sides.
     - `marker_noise` [m], `force_noise`: over the largest force [-].
-    - `max_step`: longest time step [s]; by default one a frame, so that a force is that at its
-      frame's time and not a mean.
-    - `strain`: by which the sheet is pulled, of its length [-].
+    - `steps`: of the simulation from frame to frame. A force is that of the last of them, as a load
+      cell shows it at its frame's time, and not their mean.
+    - `strain`: by which the sheet is pulled, of its length [-]. `moving`: how long, [s].
 
-    Raises `RuntimeError` when the simulation diverges.
+    Raises `RuntimeError` when the simulation diverges, and `ValueError` for a pull that does not
+    end within the frames.
     """
-    experiment = stretching(num_frames=frames, strain=strain)
-    scenario = experiment.scenario(shape)
+    experiment = stretching(num_frames=frames, strain=strain, moving=moving)
+    # every step is a frame of what is simulated: its forces are those at its end
+    each_step = stretching(
+        num_frames=steps * (frames - 1) + 1,
+        interval=STRETCHING_INTERVAL / steps,
+        route=experiment.route,
+    )
+    scenario = each_step.scenario(shape)
     turned = dataclasses.replace(
         fabric, membrane=TurnedMembrane(fabric.membrane, jnp.asarray(angle, float))
     )
-    found = _account(scenario, turned, max_step)
+    found = _account(scenario, turned, STRETCHING_INTERVAL / steps)
     if not np.isfinite(np.asarray(found.x)).all():
         raise RuntimeError(f"the simulation of {name} diverged")
     key_markers, key_force = jr.split(key)
-    markers = _markers(scenario.scene.mesh, found.x)
-    force = np.asarray(clamp_force(scenario, found))
+    markers = _markers(scenario.scene.mesh, found.x[::steps])
+    force = np.asarray(clamp_force(scenario, found))[::steps]
     spread = force_noise * np.abs(force).max()
     info = RecordingInfo(
         name=f"stretching_{name}_{np.degrees(angle):.0f}",

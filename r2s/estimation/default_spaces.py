@@ -1,0 +1,90 @@
+"""The fabrics that an estimate chooses from when no other space is given, and where each number of
+them is from: ranges and fixed values are not laid around any fabric that is to be estimated.
+
+The middle of a range is where a search begins, and what an estimate keeps of a parameter that a
+motion does not tell.
+"""
+
+import math
+from typing import NamedTuple
+
+from r2s.fabrics import prior
+from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
+
+RANGES = (
+    Range("warp", "N/m", 6.0, 20000.0),
+    Range("weft", "N/m", 6.0, 20000.0),
+    Range("shear", "N/m", 1.0, 800.0),
+    Range("coupling", "-", -0.9, 0.9, log=False),
+    Range("bending", "N m", 1.4e-7, 1.4e-3),
+    Range("damping", "s", 3e-4, 1e-1),
+    Range("friction", "-", 0.1, 1.0),
+)
+FROM = {
+    "warp": "around the prior's median",
+    "weft": "around the prior's median",
+    "shear": "around the prior's median",
+    "coupling": "within -1 to 1, where a sheet is stable; in the middle none",
+    "bending": "a factor of 100 around the prior's median at 0.2 kg/m^2",
+    "damping": "around the prior's median, a factor of 18",
+    "friction": "physical convention",
+    "E h": "around 100 N/m, where the public code of DiffCP starts; longer would be shorter steps",
+    "nu": "isotropic solids, 0 to 0.5",
+}
+"""Of each range: what it is around. The prior is `r2s.fabrics.prior`."""
+
+
+class Fixed(NamedTuple):
+    """A number that is not estimated: its name, unit [-], value and where that is from."""
+
+    name: str
+    unit: str
+    value: float
+    origin: str
+
+
+def on_cloth(density: float) -> OrthotropicSpace:
+    """Orthotropic fabrics of an areal density, [kg/m^2]; raises as `OrthotropicSpace.make`."""
+    space = OrthotropicSpace.make(density, prior.THICKNESS)
+    return OrthotropicSpace(density=space.density, thickness=space.thickness, ranges=RANGES)
+
+
+def on_points(density: float) -> IsotropicSpace:
+    """Isotropic sheets of an areal density, [kg/m^2]; raises as `IsotropicSpace.make`.
+
+    Damping and friction are those in the middle of the prior. The sheet in the middle of the range
+    bends as the middle of the prior does, and others as plates of the same thickness.
+    """
+    usual = IsotropicSpace.make(density)
+    assumed, middle = prior.middle(density), usual.middle()
+    stiffer = float(middle.bending.stiffness) / float(assumed.bending.stiffness)
+    return IsotropicSpace.make(
+        density,
+        plate=float(usual.plate) / math.sqrt(stiffer),
+        damping=float(assumed.damping),
+        friction=float(assumed.friction),
+        thickness=prior.THICKNESS,
+    )
+
+
+def fixed(space: ParameterSpace) -> tuple[Fixed, ...]:
+    """What a space of this module does not estimate; raises `TypeError` for another one."""
+    if not isinstance(space, OrthotropicSpace | IsotropicSpace):
+        raise TypeError(f"a default space is orthotropic or isotropic, got {type(space).__name__}")
+    middle = space.middle()
+    found = [
+        Fixed("density", "kg/m^2", float(space.density), "weighed"),
+        Fixed("thickness of contact", "m", float(space.thickness), "convention"),
+        Fixed("mass damping", "1/s", float(middle.mass_damping), "none: the air brakes"),
+    ]
+    if isinstance(space, OrthotropicSpace):
+        ratio = float(middle.bending.poissons_ratio)
+        return (*found, Fixed("Poisson's ratio of bending", "-", ratio, "convention"))
+    plate = "bends as the prior's median of such a weight, in the middle of the range"
+    return (
+        *found,
+        Fixed("plate thickness", "m", float(space.plate), plate),
+        Fixed("damping", "s", float(space.damping), "the prior's median"),
+        Fixed("friction", "-", float(space.friction), "the prior's median"),
+        Fixed("anisotropy", "-", 0.0, "the space has none"),
+    )

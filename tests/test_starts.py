@@ -1,0 +1,58 @@
+"""From what shape a prediction of a hanging sheet starts."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from r2s.evaluation.surface_distance import to_surface
+from r2s.recordings.recording import cloud
+from r2s.scenarios.six import SIX
+from r2s.study.cells import execute
+from r2s.study.evaluations import SHAPES, predict
+from r2s.study.sources import SyntheticRecording, TruthSettings, read, read_start, small_strain
+from r2s.study.starts import SETTLING, started
+
+FLING = SIX["fling"](num_frames=30)
+
+
+def test_a_hanging_sheet_starts_in_the_shape_that_is_given_held_where_the_path_begins():
+    truth, other = FLING.scenario((9, 9)), FLING.scenario((5, 5))
+    shape = np.asarray(truth.start).reshape(9, 9, 3) + np.array([0.0, 0.02, 0.0])
+    moved = started(other, shape)
+    free = np.asarray(other.scene.is_free)
+    expected = shape[::2, ::2].reshape(-1, 3)  # vertices that both meshes have
+    np.testing.assert_allclose(np.asarray(moved.start)[free], expected[free], atol=1e-6)
+    held = np.asarray(moved.scene.held)
+    np.testing.assert_allclose(np.asarray(moved.start)[held], np.asarray(other.path)[1], atol=1e-6)
+    assert bool(jnp.all(moved.path[0] == moved.path[1]))
+    assert (moved.lead_in - 1) * moved.interval < SETTLING <= moved.lead_in * moved.interval + 1e-9
+    assert bool(jnp.all(moved.path_times == other.path_times))
+
+
+def test_a_sheet_on_the_table_starts_flat():
+    lying = SIX["folding"]().scenario((5, 5))
+    assert started(lying, None) is lying
+    with pytest.raises(ValueError, match="lies on the table"):
+        started(lying, np.zeros((5, 5, 3)))
+
+
+@pytest.mark.slow(group="study")
+def test_the_true_fabric_begins_where_its_recording_does(tmp_path):
+    """Flat sheets of two meshes come to rest in two shapes, a centimetre apart."""
+    source = SyntheticRecording("camel_ponte_roma", "fling", 0, True, TruthSettings())
+    execute(source, tmp_path)
+    recording, start = read(source, tmp_path), read_start(source, tmp_path)
+    assert start is not None and start.shape == (*source.truth.shape, 3)
+    faces = FLING.scenario(SHAPES["cloth"]).scene.mesh.faces
+
+    def away(starts):
+        (moved,) = predict([recording], small_strain(source.fabric), "cloth", starts)
+        clouds = [cloud(recording, frame) for frame in (0, 3)]
+        return to_surface(clouds, np.asarray(moved.x)[[0, 3]], faces)
+
+    assert np.all(away([start]) < 2e-3)
+    assert np.all(away(()) > 5e-3)
+
+
+def test_given_recordings_and_lying_sheets_have_no_start(tmp_path):
+    assert read_start(SyntheticRecording("pink_solid", "folding", 0, True), tmp_path) is None
