@@ -84,7 +84,8 @@ def _draw(
     if lost and known.any():
         last = np.flatnonzero(known)[-1]
         at = min(1e3 * mean[last], top)
-        axes.plot(times[last], at, "x", color=look.colour, markersize=9, clip_on=False)
+        cross: dict[str, Any] = {"markersize": 10, "markeredgewidth": 2.5, "clip_on": False}
+        axes.plot(times[last], at, "x", color=look.colour, zorder=8, **cross)
 
 
 def _draw_horizon(axes: Any, times: Float[np.ndarray, " frame"], horizon: float | None) -> None:

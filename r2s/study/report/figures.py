@@ -18,6 +18,7 @@ try:
     from matplotlib.colors import to_rgba as to_rgba
     from matplotlib.figure import Figure as Figure
     from matplotlib.ticker import MaxNLocator as MaxNLocator
+    from matplotlib.ticker import NullLocator as NullLocator
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection as Poly3DCollection
 except ImportError as error:
     raise ImportError("figures need matplotlib: pip install 'r2s[study]'") from error

@@ -15,6 +15,7 @@ from r2s.study.report.figures import (
     Figure,
     Looks,
     MaxNLocator,
+    NullLocator,
     Poly3DCollection,
     inside,
     limits,
@@ -25,8 +26,8 @@ from r2s.study.report.figures import (
 from r2s.study.report.motions import MotionComparison
 from r2s.viewer import video_writer
 
-DOTS = "#404040"
-VIEW = {"projection": "3d", "elev": 15, "azim": -60}
+DOTS = "#c4004f"  # unlike any sheet
+VIEW = {"projection": "3d", "elev": 15, "azim": -50}
 RECORDING = "recording [m]"
 ACROSS = 6  # panels in a row, at most
 
@@ -42,8 +43,8 @@ def sheets(path: Path | str, comparison: MotionComparison, frame: int, looks: Lo
     size = (2.0 * across, 0.35 + 2.3 * down)  # [inch]
     figure = Figure(figsize=size)
     figure.subplots_adjust(
-        left=0.2 / size[0], right=1 - 0.35 / size[0], bottom=0.1 / size[1], top=1 - 0.75 / size[1],
-        wspace=0.02, hspace=0.25,
+        left=0.2 / size[0], right=1 - 0.4 / size[0], bottom=0.2 / size[1], top=1 - 0.7 / size[1],
+        wspace=0.04, hspace=0.25,
     )  # fmt: skip
     panels = figure.subplots(down, across, subplot_kw=VIEW, squeeze=False).ravel()
     for axes in panels[len(labels) :]:
@@ -51,7 +52,7 @@ def sheets(path: Path | str, comparison: MotionComparison, frame: int, looks: Lo
     box, dots = _box(comparison, frame), thin(comparison.clouds[frame])
     for label, axes in zip(labels, panels, strict=False):
         _dress(axes, box, is_labelled=not label)
-        axes.set_title(_heading(comparison, label, frame), fontsize=9, y=0.98)
+        axes.set_title(_heading(comparison, label, frame), fontsize=9, y=1.0, va="bottom")
         sheet = comparison.motions[label][frame] if label else None
         seen = dots if sheet is None else dots[:400]
         _draw(axes, seen, sheet, comparison.faces.get(label), box, _colour(looks, label))
@@ -148,7 +149,7 @@ def _dress(axes: Any, box: tuple[np.ndarray, np.ndarray], is_labelled: bool) -> 
         return
     for i, axis in enumerate((axes.xaxis, axes.yaxis, axes.zaxis)):
         is_short = 3 * (high - low)[i] < (high - low).max()
-        axis.set_major_locator(MaxNLocator(1 if is_short else 2))
+        axis.set_major_locator(NullLocator() if is_short else MaxNLocator(2))
     axes.tick_params(labelsize=6, pad=-5)
     axes.tick_params("z", pad=-3)
 
@@ -159,12 +160,15 @@ def _draw(axes: Any, dots: Any, sheet: Any, faces: Any, box: Any, colour: str) -
     dots = dots[inside(dots, *box)]
     if sheet is not None:
         kept = faces[inside(sheet, *box)[faces].all(axis=1)]
-        style: dict[str, Any] = {"facecolor": to_rgba(colour, 0.35), "edgecolor": colour}
+        style: dict[str, Any] = {
+            "facecolor": to_rgba(colour, 0.2),
+            "edgecolor": to_rgba(colour, 0.6),
+        }
         drawn.append(axes.add_collection3d(Poly3DCollection(sheet[kept], linewidth=0.3, **style)))
         if len(kept) < len(faces):
             text = "diverged" if not np.isfinite(sheet).all() else "part is out of the picture"
             where: dict[str, Any] = {"ha": "center", "transform": axes.transAxes}
             drawn.append(axes.text2D(0.5, 0.02, text, fontsize=8, **where))
-    style = {"s": 1.2, "color": DOTS, "linewidths": 0, "depthshade": False, "zorder": 9}
+    style = {"s": 2.2, "color": DOTS, "linewidths": 0, "depthshade": False, "zorder": 9}
     drawn.append(axes.scatter(*dots.T, **style))
     return drawn

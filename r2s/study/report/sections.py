@@ -7,6 +7,7 @@ import numpy as np
 
 from r2s.evaluation.statistics import LEVEL
 from r2s.study.report import charts
+from r2s.study.report.figures import Looks
 from r2s.study.report.page import Section
 from r2s.study.rows import Row
 from r2s.study.statistics import factors, findings, ranks
@@ -78,7 +79,12 @@ def _headlines(results: ResultArray) -> list[str]:
 
 
 def distance_sections(
-    out: Path, rows: Sequence[Row], results: ResultArray, paper: Paper, keep: Keep
+    out: Path,
+    rows: Sequence[Row],
+    results: ResultArray,
+    paper: Paper,
+    looks: Looks,
+    keep: Keep,
 ) -> list[Section]:
     """Distances in millimetres, and in the units of the paper beside its own."""
     sections = []
@@ -87,7 +93,7 @@ def distance_sections(
         figures: tuple[tuple[Path, str], ...] = ()
         if results.metric in METRICS and results.trajectories:
             path, parts = out / "figures" / "distances.png", by_motion(results)
-            charts.distance_chart(path, parts, results.metric)
+            charts.distance_chart(path, parts, results.metric, looks)
             caption = f"Mean {results.metric} of every configuration, with {LEVEL:.0%} intervals."
             figures = ((path, caption),)
         sections.append(Section("Distances in millimetres", (), ours, figures))

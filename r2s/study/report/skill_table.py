@@ -10,7 +10,7 @@ from r2s.study.configuration import MOTIONS
 from r2s.study.rows import Row, by_metric
 from r2s.study.statistics.distances import cell, means, with_references
 from r2s.study.statistics.result_array import configurations_of, on_motion, result_array
-from r2s.study.statistics.skills import Skill, draws, mean_floor, skills
+from r2s.study.statistics.skills import Draws, Skill, draws, mean_floor, skills
 from r2s.study.tables import MISSING, Table, significant
 
 
@@ -37,11 +37,7 @@ def skill_table(rows: Sequence[Row], metric: str) -> Table:
             error, own = errors[configuration], skill_words(told[configuration])
             if not configuration.approach:
                 spread = draws(rows, motion, configuration)
-                low, high = (1e3 * end for end in spread.errors)
-                error = f"{error}; draws {low:.1f} to {_or_diverged(high)}"
-                own = "not told" if np.isnan(spread.skills[0]) else (
-                    f"0; draws {_number(spread.skills[0])} to {_number(spread.skills[1])}"
-                )  # fmt: skip
+                error, own = _with_draws(error, spread)
             line += [error, f"{1e3 * mean_floor(rows, motion, configuration):.2f}", own]
     header = [
         f"{motion}: {what}" for motion in motions for what in ("error [mm]", "floor [mm]", "skill")
@@ -103,7 +99,7 @@ def beyond_tables(rows: Sequence[Row], prefix: str) -> dict[str, Table]:
         ]
         recordings = {row.recording for row in chosen if row.evaluated_on == motion}
         caption = (
-            f"{motion}, from the horizon on, in {len(recordings)} recordings: how much simulation "
+            f"{motion}, from the horizon on (of {len(recordings)} recordings): how much simulation "
             f"and recording differ, mean and {LEVEL:.0%} interval over fabrics"
         )
         found[f"beyond_{motion}"] = Table(("configuration", *header), tuple(lines), caption)
@@ -137,8 +133,12 @@ def _count(number: float) -> str:
     return f"{number:.0f}" if np.isfinite(number) else "above 1000"
 
 
-def _or_diverged(millimetres: float) -> str:
-    return f"{millimetres:.1f}" if np.isfinite(millimetres) else "one that diverged"
+def _with_draws(error: str, spread: Draws) -> tuple[str, str]:
+    """The default's error with the spread of its draws, and that of its skill around zero."""
+    low, high = (f"{1e3 * end:.1f}" if np.isfinite(end) else "diverged" for end in spread.errors)
+    least, most = map(_number, spread.skills)
+    told = "not told" if np.isnan(spread.skills[0]) else f"0; draws {least} to {most}"
+    return f"{error}; draws {low} to {high}", told
 
 
 def _number(value: float) -> str:

@@ -119,7 +119,8 @@ def draws(rows: Iterable[Row], motion: str, configuration: Configuration) -> Dra
         own = [row for row in theirs if row.repeat == draw]
         errors.append(_mean_of(own, [row.value for row in own], np.inf))
         values = [
-            skill(row.value, float(np.mean(every[row.recording])), row.floor or 0.0) for row in own
+            skill(row.value, float(np.mean(every[row.recording])), float(row.floor or 0))
+            for row in own
         ]
         kept = [(row, value) for row, value in zip(own, values, strict=True) if value == value]
         if kept:
