@@ -16,6 +16,7 @@ from r2s.study.statistics.paper import CITED, Paper, paper_tables
 from r2s.study.statistics.result_array import ResultArray, by_motion
 from r2s.study.tables import Table, significant
 
+NAMES = {METRICS[0]: "distance to the surface"}  # of metrics in a sentence
 Keep = Callable[[str, Table], Table]  # writes a table under a name, and returns it
 
 
@@ -57,7 +58,7 @@ def findings_section(
 def _headlines(results: ResultArray) -> list[str]:
     """The best configurations of each motion, beside the default fabric."""
     scale, unit = (1e3, " mm") if results.unit == "m" else (1.0, "")
-    found = []
+    found, name = [], NAMES.get(results.metric, results.metric)
     for motion, part in by_motion(results).items():
         numbers = zip(part.configurations, *(each.tolist() for each in means(part)), strict=True)
         best, defaults, lost = [], [], []
@@ -72,9 +73,7 @@ def _headlines(results: ResultArray) -> list[str]:
         if best:
             compared = f"; {', '.join(defaults)}" if defaults else ""
             without = f". Not ranked, for runs diverged: {', '.join(lost)}" if lost else ""
-            found.append(
-                f"Least {results.metric} in {motion}: {', '.join(best[:3])}{compared}{without}."
-            )
+            found.append(f"Least {name} in {motion}: {', '.join(best[:3])}{compared}{without}.")
     return found
 
 

@@ -8,7 +8,7 @@ from r2s.evaluation.horizon import CLEAR
 from r2s.evaluation.statistics import LEVEL, SIGNIFICANCE
 from r2s.study.configuration import MOTIONS
 from r2s.study.rows import Row, by_metric
-from r2s.study.statistics.distances import cell, means, with_references
+from r2s.study.statistics.distances import cells_of, with_references
 from r2s.study.statistics.result_array import configurations_of, on_motion, result_array
 from r2s.study.statistics.skills import Draws, Skill, draws, mean_floor, skills
 from r2s.study.tables import MISSING, Table, significant
@@ -22,13 +22,7 @@ def skill_table(rows: Sequence[Row], metric: str) -> Table:
     motions = [motion for motion in MOTIONS if any(row.evaluated_on == motion for row in rows)]
     lines = {c: [c.label] for c in configurations_of(rows)}
     for motion in motions:
-        results = on_motion(result_array(rows, metric), motion)
-        found = means(results)
-        lengths = 1e3 * np.array(found[:4]).T
-        errors = {
-            c: cell(*lengths[i].tolist(), int(found.diverged[i]), int(found.runs[i]), True)
-            for i, c in enumerate(results.configurations)
-        }
+        errors = cells_of(on_motion(result_array(rows, metric), motion))
         told = skills(rows, motion)
         for configuration, line in lines.items():
             if configuration not in errors:
@@ -85,13 +79,10 @@ def beyond_tables(rows: Sequence[Row], prefix: str) -> dict[str, Table]:
         columns, header = [], []
         for metric, theirs in rows_of.items():
             results = result_array(theirs, metric)
-            told, in_mm = means(results), results.unit == "m"
-            lengths = (1e3 if in_mm else 1.0) * np.array(told[:4]).T
-            columns.append({
-                c: cell(*lengths[i].tolist(), int(told.diverged[i]), int(told.runs[i]), in_mm)
-                for i, c in enumerate(results.configurations)
-            })  # fmt: skip
-            header.append(f"{metric.removeprefix(prefix)} [{'mm' if in_mm else results.unit}]")
+            columns.append(cells_of(results))
+            header.append(
+                f"{metric.removeprefix(prefix)} [{'mm' if results.unit == 'm' else results.unit}]"
+            )
         lines = [
             (c.label, *(column.get(c, MISSING) for column in columns))
             for c in configurations_of(chosen)

@@ -9,7 +9,7 @@ from jaxtyping import Float, Integer
 
 from r2s.evaluation.crossed import CrossedMean, crossed_mean, interval
 from r2s.evaluation.statistics import LEVEL
-from r2s.study.configuration import APPROACHES, TRUE_FABRIC
+from r2s.study.configuration import APPROACHES, TRUE_FABRIC, Configuration
 from r2s.study.rows import Row, by_metric
 from r2s.study.statistics.result_array import (
     ResultArray,
@@ -117,7 +117,7 @@ def distance_table(rows: Sequence[Row], metric: str) -> Table:
     found = by_motion(result_array(rows, metric))
     found[OWN] = result_array(rows, metric, own=True)
     found = {motion: results for motion, results in found.items() if results.configurations}
-    shown = {motion: _cells(results) for motion, results in found.items()}
+    shown = {motion: cells_of(results) for motion, results in found.items()}
     lines = dict.fromkeys(c for results in found.values() for c in results.configurations)
     unit = " [mm]" if {results.unit for results in found.values()} == {"m"} else ""
     return Table(
@@ -146,7 +146,8 @@ def with_references(rows: Iterable[Row]) -> list[Row]:
     return rows + found
 
 
-def _cells(results: ResultArray) -> dict[object, str]:
+def cells_of(results: ResultArray) -> dict[Configuration, str]:
+    """The cell of each configuration, see `cell`; metres in millimetres."""
     in_mm = results.unit == "m"
     scale = 1e3 if in_mm else 1.0
     found = means(results)
