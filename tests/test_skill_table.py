@@ -4,6 +4,7 @@ and a run that diverged improves nothing."""
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -36,20 +37,34 @@ def errors_of(configuration: Configuration, fabric: str, trial: int, repeat: int
     return 1e-3 * (start + FABRICS.index(fabric) + 0.5 * trial + 0.2 * repeat)
 
 
+def _row(
+    whose: Configuration, repeat: str, baseline: str, value: float, *, fabric: str, recording: str,
+    motion: str, floor: float,
+) -> Row:  # fmt: skip
+    told = None if baseline == "default" else skill(value, sum(DRAWS) / len(DRAWS), floor)
+    return Row(
+        *whose,
+        fabric=fabric,
+        repeat=repeat,
+        recording=recording,
+        evaluated_on=motion,
+        baseline=baseline,
+        metric=METRIC,
+        unit="m",
+        value=value,
+        floor=floor,
+        horizon=3.0,
+        skill=told,
+    )
+
+
 def made_up(fabrics: Sequence[str] = FABRICS, motion: str = "fling") -> list[Row]:
     """Two recordings of each fabric, judged by two estimates, the true fabric and two draws."""
     rows = []
     for fabric in fabrics:
         for trial in range(2):
-            where = f"{motion}_{fabric}_{trial}", motion
-            floor, default = FLOOR[fabric], float(np.mean(DRAWS))
-
-            def row(whose, repeat, baseline, value, where=where, floor=floor, default=default,
-                    fabric=fabric):  # fmt: skip
-                told = None if baseline == "default" else skill(value, default, floor)
-                names = *whose, fabric, repeat, *where, baseline
-                return Row(*names, METRIC, "m", value, floor, 3.0, told)
-
+            recording, floor = f"{motion}_{fabric}_{trial}", FLOOR[fabric]
+            row = partial(_row, fabric=fabric, recording=recording, motion=motion, floor=floor)
             for each in (LIFTING, PINN):
                 for repeat in range(2):
                     value = errors_of(each, fabric, trial, repeat)
