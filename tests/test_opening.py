@@ -96,7 +96,7 @@ def test_a_picture_of_each_motion_is_written(tmp_path, changes):
     over_time, sheets = opening.picture_sections(tmp_path, motions, looks_of(errors))
     assert len(over_time.figures) == 4
     assert len(sheets.figures) == (0 if changes.get("horizon") == 0 else 4)
-    assert [caption.split(":")[0] for _, caption in over_time.figures] == [
+    assert [caption.split(" (")[0] for _, caption in over_time.figures] == [
         "folding, denim", "folding, knit", "fling, denim", "fling, knit"
     ]  # fmt: skip
     for path, _ in (*over_time.figures, *sheets.figures):

@@ -43,12 +43,12 @@ def picture_sections(out: Path, motions: Sequence[MotionComparison], looks: Look
         frame, name = deciding_frame(each), f"{each.evaluated_on}_{each.fabric}".replace("/", "_")
         what = f"{each.evaluated_on}, {each.fabric.replace('_', ' ')}"
         path = error_picture(out / "figures" / f"errors_{name}.png", each, looks, frame)
-        errors.append((path, f"{what}: {each.recording}, {_horizon_words(each)}."))
+        errors.append((path, f"{what} ({each.recording}): {_horizon_words(each)}."))
         if frame is None:
             left_out.append(each.recording)
             continue
         path = overlays.sheets(out / "figures" / f"sheets_{name}.png", each, frame, looks)
-        sheets.append((path, f"{what}: at {each.times[frame]:.2f} s, {_horizon_words(each)}."))
+        sheets.append((path, f"{what}: at {each.times[frame]:.2f} s; {_horizon_words(each)}."))
     unknown = [each.recording for each in motions if each.horizon is None]
     words = [OVER_TIME] + ([f"{NO_FLOOR}{_names(unknown)}."] if unknown else [])
     shown = [SHEETS]
@@ -62,10 +62,10 @@ def picture_sections(out: Path, motions: Sequence[MotionComparison], looks: Look
 
 def _horizon_words(comparison: MotionComparison) -> str:
     if comparison.horizon is None:
-        return "without a horizon"
+        return "no horizon is known"
     if comparison.horizon == float("inf"):
-        return "whose horizon is never reached"
-    return f"whose horizon is at {comparison.horizon:.2f} s"
+        return "the horizon is never reached"
+    return f"the horizon is at {comparison.horizon:.2f} s"
 
 
 def skill_sections(out: Path, rows: Sequence[Row], looks: Looks, keep: Keep) -> list[Section]:
@@ -80,7 +80,7 @@ def skill_sections(out: Path, rows: Sequence[Row], looks: Looks, keep: Keep) -> 
     found = {motion: each for motion, each in found.items() if each}
     fabrics = list(dict.fromkeys(row.fabric for row in known))
     words = [
-        f"{len(fabrics)} fabrics: {_names(fabrics)}. Rows of the true fabric are what a perfect "
+        f"Fabrics that have floors: {_names(fabrics)}. Rows of the true fabric are what a perfect "
         "estimate would reach on that solver; the default knows the fabric's weight alone, and its "
         "draws show by how much that varies."
     ]

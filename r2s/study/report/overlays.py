@@ -143,7 +143,7 @@ def _dress(axes: Any, box: tuple[np.ndarray, np.ndarray], is_labelled: bool) -> 
     axes.computed_zorder = False  # the dots lie over the cloth, whatever their depth
     axes.patch.set_alpha(0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(high - low, zoom=1.2)
+    axes.set_box_aspect(high - low, zoom=1.1)
     if not is_labelled:
         axes.set_axis_off()
         return

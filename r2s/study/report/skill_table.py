@@ -8,7 +8,7 @@ from r2s.evaluation.horizon import CLEAR
 from r2s.evaluation.statistics import LEVEL, SIGNIFICANCE
 from r2s.study.configuration import MOTIONS
 from r2s.study.rows import Row, by_metric
-from r2s.study.statistics.distances import cells_of, with_references
+from r2s.study.statistics.distances import cells_of, millimetres, with_references
 from r2s.study.statistics.result_array import configurations_of, on_motion, result_array
 from r2s.study.statistics.skills import Draws, Skill, draws, mean_floor, skills
 from r2s.study.tables import MISSING, Table, significant
@@ -126,7 +126,9 @@ def _count(number: float) -> str:
 
 def _with_draws(error: str, spread: Draws) -> tuple[str, str]:
     """The default's error with the spread of its draws, and that of its skill around zero."""
-    low, high = (f"{1e3 * end:.1f}" if np.isfinite(end) else "diverged" for end in spread.errors)
+    low, high = (
+        millimetres(1e3 * end) if np.isfinite(end) else "diverged" for end in spread.errors
+    )
     least, most = map(_number, spread.skills)
     told = "not told" if np.isnan(spread.skills[0]) else f"0; draws {least} to {most}"
     return f"{error}; draws {low} to {high}", told

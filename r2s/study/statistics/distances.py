@@ -167,10 +167,14 @@ def cell(
     """A mean and its interval where there is one; where runs diverged how many, and the median."""
     if diverged == runs:
         return "diverged" if runs else MISSING
-    text, *ends, middle = (
-        f"{x:.1f}" if in_mm else significant(x) for x in (mean, low, high, median)
-    )
+    write = millimetres if in_mm else significant
+    text, *ends, middle = (write(x) for x in (mean, low, high, median))
     if diverged:
         lost = f"{diverged} of {runs} diverged"
         return f"median {middle} ({lost})" if np.isfinite(median) else lost
     return f"{text} [{', '.join(ends)}]" if low < high else text
+
+
+def millimetres(length: float) -> str:
+    """A length [mm] to a tenth of a millimetre; below one to a hundredth."""
+    return f"{length:.1f}" if abs(length) >= 0.995 or not np.isfinite(length) else f"{length:.2f}"
