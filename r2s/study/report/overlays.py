@@ -123,17 +123,20 @@ def pictures(comparison: MotionComparison, looks: Looks) -> Iterator[np.ndarray]
 def _box(comparison: MotionComparison, frame: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Limits [m] that hold the recording and sheets that did not fly off; or those of a frame."""
     dots = [thin(cloud) for cloud in comparison.clouds]
-    sheets = [x.reshape(-1, 3) for x in comparison.motions.values()]
+    motions = list(comparison.motions.values())
+    sheets = [x.reshape(-1, 3) for x in motions]
     every = np.concatenate(dots) if any(map(len, dots)) else np.zeros((1, 3))
     low, high = limits(every, np.concatenate([np.zeros((0, 3)), *sheets]))
     if frame is None:
         return low, high
-    here = np.concatenate([dots[frame], *(x[frame] for x in comparison.motions.values())])
-    here = here[inside(here, low, high)]
-    if not len(here):
+    seen, cloth = dots[frame], np.concatenate([np.zeros((0, 3)), *(x[frame] for x in motions)])
+    seen, cloth = seen[inside(seen, low, high)], cloth[inside(cloth, low, high)]
+    if not len(seen) + len(cloth):
         return low, high
-    # Strays of the cloud do not widen the picture.
-    ends = np.percentile(here, [0.2, 99.8], axis=0)
+    # Strays of the cloud do not widen the picture; a sheet that did not fly off is all in it.
+    trimmed = [np.percentile(seen, end, axis=0) for end in (0.2, 99.8)] if len(seen) else []
+    every = np.concatenate([cloth, *(end[None] for end in trimmed)])
+    ends = every.min(axis=0), every.max(axis=0)
     margin = 0.03 * float((ends[1] - ends[0]).max()) + 1e-3
     return ends[0] - margin, ends[1] + margin
 
