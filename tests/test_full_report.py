@@ -1,7 +1,6 @@
 """The report of a whole study, also where most of it is missing."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from r2s.fabrics.parameters import Range
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS
 from r2s.study.costs import Cost, cost_table
 from r2s.study.report import full, overlays
+from r2s.study.report.figures import looks_of
 from r2s.study.report.page import PNG
 from r2s.study.statistics.parameters import Estimated
 
@@ -54,7 +54,8 @@ def test_all_parts_are_there(published):
     out, tables, page = published
     for text in (
         "Findings", "fabrics that would tell:", "Distances in millimetres",
-        "In the units of the paper", "Ranks", "What matters", "Motions", "Viewer", "123 ± 12 N/m",
+        "In the units of the paper", "Ranks", "What matters", "Error over time",
+        "Viewer", "123 ± 12 N/m",
         "RuntimeError: <diverged>", "12.3",
         "peak memory [MB]", "recordings", "made up", "version of jax", "diverged)",
         "1 more recordings are not in it", "videos/fling_black_denim1.",
@@ -71,16 +72,20 @@ def test_all_parts_are_there(published):
 def test_pictures_and_videos_are_written(published):
     out, _, page = published
     names = {path.name for path in (out / "figures").iterdir()}
-    assert names == {"distances.png", "ranks.png", "factors.png", "motions_black_denim.png"}
+    both = {
+        f"{kind}_{motion}_black_denim.png" for kind in ("errors", "sheets") for motion in MOTIONS
+    }
+    assert names == {"distances.png", "ranks.png", "factors.png"} | both
     assert all((out / "figures" / name).read_bytes().startswith(PNG) for name in names)
     assert len(page.all("img")) == len(names)
     assert len(list((out / "videos").iterdir())) == len(MOTIONS)
 
 
-def test_findings_come_first(published):
-    page = published[2]
-    text = page.text
-    assert text.index("Findings") < text.index("Distances in millimetres") < text.index("Settings")
+def test_pictures_come_first_and_tables_of_other_distances_last(published):
+    text = published[2].text
+    order = "Error over time", "Sheets at", "Findings", "Viewer", "Distances in millimetres"
+    places = [text.index(heading) for heading in (*order, "In the units of the paper", "Settings")]
+    assert places == sorted(places)
 
 
 @pytest.mark.parametrize(
@@ -102,19 +107,8 @@ def test_parts_of_a_study_are_reported(tmp_path, rows):
     assert "Configurations of the paper that have no result here" in page.text
 
 
-def test_a_late_frame_is_one_where_much_is_seen_and_has_moved():
-    shown = made_up_comparison()
-    assert overlays.late_frame(shown) == 3  # back at the start in the last
-    clouds = tuple(cloud if i < 3 else cloud[:2] for i, cloud in enumerate(shown.clouds))
-    assert overlays.late_frame(replace(shown, clouds=clouds)) < 3
-
-
 def test_pictures_of_a_video_move():
-    first, *_, last = list(overlays.pictures(made_up_comparison()))
+    shown = made_up_comparison()
+    first, *_, last = list(overlays.pictures(shown, looks_of(shown.motions)))
     assert first.shape == last.shape and first.shape[0] % 2 == first.shape[1] % 2 == 0
     assert np.mean(np.any(first != last, axis=-1)) > 0.005
-
-
-def test_nothing_to_draw_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="no recording"):
-        overlays.overview(tmp_path / "none.png", [])

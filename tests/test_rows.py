@@ -89,6 +89,14 @@ def test_a_metric_without_a_value_is_not_a_run_that_diverged():
     assert left_out == {"chamfer_cropped": 1}
 
 
+def test_what_is_judged_before_a_horizon_does_not_hide_what_diverged_after_it():
+    early = replace(row(0.1), metric="surface", horizon=0.5)
+    lost = row(math.nan)
+    assert drop_undefined([early, lost]) == ([early, lost], {})
+    whole = replace(early, horizon=math.inf)  # all of the motion
+    assert drop_undefined([whole, lost]) == ([whole], {"chamfer": 1})
+
+
 def test_a_row_counts_for_its_configuration_or_the_default_fabric():
     assert row(1.0).configuration == Configuration("gauss_newton", "xpbd", "lift")
     assert row(1.0, baseline="default").configuration == Configuration("", "xpbd", "")

@@ -7,6 +7,7 @@ import pytest
 
 from r2s.evaluation import phase_free
 from r2s.study import engine, results, verdicts
+from r2s.study.comparisons import motion_comparisons
 from r2s.study.evaluations import EvaluationCell
 from r2s.study.rows import Row
 from r2s.study.sources import SyntheticRecording, TruthSettings, small_strain
@@ -60,6 +61,11 @@ def test_a_truth_is_judged_beside_its_own_ensemble(tmp_path, monkeypatch):
     assert true.value < 1e-5  # it is the truth itself
     assert true.floor is not None and true.floor > 0
     assert drawn.value > 3e-3 and drawn.horizon == true.horizon
+    (shown,) = motion_comparisons(cells, tmp_path)
+    assert list(shown.motions) == ["true fabric on cloth", "default cloth"]
+    assert shown.horizon == judged.horizon and np.all(shown.floor == judged.floor)
+    inside = shown.mean_errors["default cloth"][shown.inside]
+    assert inside.mean() == pytest.approx(drawn.value)
     if np.isfinite(judged.horizon):
         beyond = {each.metric for each in rows if each.baseline == "true"}
         assert {BEYOND + name for name in phase_free.UNITS} <= beyond

@@ -13,6 +13,7 @@ from made_up_study import made_up_comparison
 from test_report import Page
 
 from r2s.study.report import player
+from r2s.study.report.figures import looks_of
 from r2s.study.report.motions import MotionComparison
 from r2s.study.report.page import Section, write_report
 from r2s.study.tables import Table
@@ -84,7 +85,9 @@ def recordings():
 
 
 def page(path, recordings, extra=""):
-    section = Section("Motions", ("Words.",), (TABLE,), html=player.viewer(recordings) + extra)
+    looks = looks_of(label for each in recordings for label in each.motions)
+    shown = player.viewer(recordings, looks)
+    section = Section("Motions", ("Words.",), (TABLE,), html=shown + extra)
     write_report(path, "A study", "", [section])
     return path.read_text()
 
@@ -95,7 +98,7 @@ def test_nothing_is_fetched_and_tags_are_closed(tmp_path, recordings):
     assert not re.search("https?:|//|@import|url\\(", re.sub('base64,[^"]*', "", text).lower())
     assert all("src" not in script for script in found.all("script"))
     assert len(found.all("canvas")) == 1 and len(found.all("option")) == 2
-    assert player.viewer([]) == ""
+    assert player.viewer([], {}) == ""
 
 
 def test_labels_are_escaped(tmp_path):
@@ -108,9 +111,12 @@ def test_size_of_a_long_recording():
     generator = np.random.default_rng(0)
     clouds = tuple(generator.normal(size=(3000, 3)) for _ in range(120))
     motions = {f"column {i}": generator.normal(size=(120, 81, 3)) for i in range(12)}
-    faces = np.array([[0, 1, 2]])
-    shown = MotionComparison("f", "fling", "fling_f1", np.arange(120.0), clouds, faces, motions)
-    text = player.viewer([shown])
+    faces = dict.fromkeys(motions, np.array([[0, 1, 2]]))
+    errors = dict.fromkeys(motions, np.zeros((1, 120)))
+    shown = MotionComparison(
+        "f", "fling", "fling_f1", np.arange(120.0), clouds, faces, motions, errors
+    )
+    text = player.viewer([shown], looks_of(motions))
     assert 0.5 * player.BUDGET < len(text) < player.BUDGET + 30_000
 
 
@@ -118,10 +124,15 @@ def test_what_cannot_be_shown_is_refused(unchecked):
     shown = made_up_comparison()
     with pytest.raises(ValueError, match="fling_black_denim1: expected a cloud for each of 6"):
         replace(shown, clouds=shown.clouds[:2])
+    both = dict(shown.motions)
     with pytest.raises(ValueError, match=r"fling_black_denim1, a: expected \(6, vertex, 3\)"):
-        replace(shown, motions={"a": shown.motions["a"][:3]})
+        replace(shown, motions=both | {"a": both["a"][:3]})
     with pytest.raises(ValueError, match="the faces name vertex 15"):
-        replace(shown, motions={"a": shown.motions["a"][:, :9]})
+        replace(shown, motions=both | {"a": both["a"][:, :9]})
+    with pytest.raises(ValueError, match="expected errors of a, b, found those of a"):
+        replace(shown, errors={"a": shown.errors["a"]})
+    with pytest.raises(ValueError, match=r"fling_black_denim1, a: expected errors \(run, 6\)"):
+        replace(shown, errors=dict(shown.errors) | {"a": shown.errors["a"][:, :3]})
 
 
 @needs_browser

@@ -46,8 +46,13 @@ def horizon_of(
     - `times`: of the frames, [s]. `floor`: of each, [m].
     - `apart`: distances of other fabrics in the same motion, [m]. What fabrics differ by is the
       mean over them of the root mean square over the frames, one number for the whole motion: at
-      its start none differ.
+      its start none differ. One that diverged (NaN) does not count.
+
+    Raises `ValueError` when none counts.
     """
+    apart = apart[np.isfinite(apart).all(axis=1)]
+    if not len(apart):
+        raise ValueError("a horizon needs another fabric that did not diverge")
     between = np.mean(np.sqrt(np.mean(np.square(apart), axis=1)))
     passed = np.flatnonzero(floor > share * between)
     return float(times[passed[0]]) if len(passed) else np.inf

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 APPROACHES = {"diffcloud": "DIFFCLOUD", "diffcp": "DiffCP", "physnet": "PhysNet", "pinn": "PINN"}
 MOTIONS = ("folding", "fling", "shaking")  # that no estimate has seen
+TRUE_FABRIC = "true fabric on"  # stands for an approach in the label of the true fabric
 
 
 class Configuration(NamedTuple):
@@ -22,6 +23,11 @@ class Configuration(NamedTuple):
             return f"default {self.solver}"
         named = APPROACHES.get(self.approach, self.approach)
         return f"{named} {self.solver} {self.estimated_from}".strip()
+
+
+def is_reference(label: str) -> bool:
+    """Whether a label is that of the default fabric, or of the true one, on a solver."""
+    return label.startswith(("default ", f"{TRUE_FABRIC} "))
 
 
 PAPER_CONFIGURATIONS = (

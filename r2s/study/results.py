@@ -12,20 +12,18 @@ from r2s.estimation.method import default_space
 from r2s.evaluation import prediction_error
 from r2s.fabrics.fold_length import fold_length
 from r2s.files import write_text
-from r2s.recordings.recording import Recording, cloud
 from r2s.scenarios.resolution import ENOUGH, mesh_error
-from r2s.scenarios.scenario import from_recording
 from r2s.study.cells import Cell, result_files, with_dependencies
+from r2s.study.comparisons import motion_comparisons
 from r2s.study.configuration import MOTIONS
 from r2s.study.costs import cost_table, costs, forecast
 from r2s.study.estimates import ESTIMATE, EstimateCell, read_estimate
-from r2s.study.evaluations import EvaluationCell, read_measured, read_motion
+from r2s.study.evaluations import EvaluationCell, read_measured
 from r2s.study.matrix import PRESETS, Plan
 from r2s.study.report.data_table import data_table
-from r2s.study.report.motions import MotionComparison
 from r2s.study.report.parameter_ranges import range_table, truth_settings
 from r2s.study.rows import Row, write_rows
-from r2s.study.sources import GivenRecording, Source, SyntheticRecording, read, small_strain
+from r2s.study.sources import GivenRecording, SyntheticRecording, read, small_strain
 from r2s.study.statistics.parameters import Estimated
 from r2s.study.statistics.recordings import recording_tables
 from r2s.study.tables import Table, significant
@@ -46,7 +44,8 @@ RANGES = (
     "prior is that of the default fabric (r2s.fabrics.prior): it was not laid around the study's "
     "fabrics."
 )
-PRINTED = ("findings.md", "chamfer_real_to_sim*.md", "diff*_on_*.md")  # the others are in files
+# The others are in files.
+PRINTED = ("skill.md", "findings.md", "chamfer_real_to_sim*.md", "diff*_on_*.md")
 
 
 def publish(
@@ -253,34 +252,3 @@ def _true_values(cell: EstimateCell, count: int) -> np.ndarray:
         return np.full(count, np.nan)
     space = default_space("cloth", cell.density)
     return np.asarray(space.values(space.to_unit(small_strain(cell.fabric))))
-
-
-def motion_comparisons(cells: Iterable[EvaluationCell], folder: Path) -> list[MotionComparison]:
-    """The first recording of each fabric and scenario with its simulations by all configurations
-    that are made, at the frames that count."""
-    groups: dict[Source, dict[str, np.ndarray]] = {}
-    for cell in cells:
-        label, motions = cell.configuration.label, groups.setdefault(cell.recordings[0], {})
-        if label not in motions and not cell.other and cell.is_made(folder):
-            motions[label] = read_motion(cell, folder)
-    found: dict[tuple[str, str], MotionComparison] = {}
-    for source, motions in groups.items():
-        if motions and (source.fabric, source.scenario) not in found:
-            found[source.fabric, source.scenario] = _compared(read(source, folder), source, motions)
-    return list(found.values())
-
-
-def _compared(
-    recording: Recording, source: Source, motions: dict[str, np.ndarray]
-) -> MotionComparison:
-    first, last = recording.info.frames_used
-    frames = slice(first, last + 1)
-    return MotionComparison(
-        fabric=source.fabric,
-        evaluated_on=source.scenario,
-        recording=source.name,
-        times=np.asarray(recording.times)[frames],
-        clouds=tuple(cloud(recording, frame) for frame in range(first, last + 1)),
-        faces=np.asarray(from_recording(recording).scene.mesh.faces),
-        motions={label: x[frames] for label, x in motions.items()},
-    )

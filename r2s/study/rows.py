@@ -129,12 +129,14 @@ def by_metric(rows: Iterable[Row]) -> dict[str, list[Row]]:
 def drop_undefined(rows: Iterable[Row]) -> tuple[list[Row], dict[str, int]]:
     """Leave out rows whose metric has no value though the run did not diverge.
 
-    A run did not diverge where another of its metrics is finite. Returns the other rows, and how
-    many of each metric are left out.
+    A run did not diverge where another of its metrics is finite; but what is judged within a
+    horizon says nothing of a run that diverged after it. Returns the other rows, and how many of
+    each metric are left out.
     """
     rows = list(rows)
     run = attrgetter(*HEADER[: HEADER.index("metric")])
-    finite = {run(row) for row in rows if np.isfinite(row.value)}
+    whole = [row for row in rows if row.horizon is None or row.horizon == np.inf]
+    finite = {run(row) for row in whole if np.isfinite(row.value)}
     kept, left_out = [], dict[str, int]()
     for row in rows:
         if np.isfinite(row.value) or run(row) not in finite:

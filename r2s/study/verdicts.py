@@ -51,17 +51,23 @@ def ensembles(cells: Iterable[EvaluationCell]) -> list[EnsembleCell]:
 
 def judged_motions(cells: Iterable[EvaluationCell], folder: Path) -> dict[Source, Judged]:
     """What ensembles that are made say of each recording."""
-    found = {}
-    for cell in ensembles(cells):
-        if not cell.is_made(folder):
-            continue
-        ensemble = read_ensemble(cell, folder)
-        first, last = read(cell.recording, folder).info.frames_used
-        used = slice(first, last + 1)
-        floor, times = floor_of(ensemble.causes)[used], ensemble.times[used]
-        horizon = horizon_of(times, floor, ensemble.apart[:, used])
-        found[cell.recording] = Judged(times, floor, horizon)
-    return found
+    sources = [cell.recording for cell in ensembles(cells)]
+    found = {source: judged_motion(source, folder) for source in sources}
+    return {source: judged for source, judged in found.items() if judged is not None}
+
+
+def judged_motion(source: Source, folder: Path) -> Judged | None:
+    """What the ensemble of a recording says of it; None where there is none, or it is not made."""
+    if not isinstance(source, SyntheticRecording):
+        return None
+    cell = ensemble_of(source)
+    if not cell.is_made(folder):
+        return None
+    ensemble = read_ensemble(cell, folder)
+    first, last = read(source, folder).info.frames_used
+    used = slice(first, last + 1)
+    floor, times = floor_of(ensemble.causes)[used], ensemble.times[used]
+    return Judged(times, floor, horizon_of(times, floor, ensemble.apart[:, used]))
 
 
 def with_verdicts(rows: Sequence[Row], cells: Sequence[EvaluationCell], folder: Path) -> list[Row]:
@@ -74,10 +80,10 @@ def with_verdicts(rows: Sequence[Row], cells: Sequence[EvaluationCell], folder: 
         if not cell.is_made(folder):
             continue
         for name, away in read_distances(cell, folder).items():
-            for row in [row for row in errors.values() if _is_of(row, cell, name)]:
-                if name in known:
-                    errors[_place(row)] = _within(row, away, known[name])
-                    more += _beyond(row, cell, known[name], folder)
+            place = (*cell.configuration, cell.fabric, cell.repeat, name, cell.baseline)
+            if name in known and (row := errors.get(place)) is not None:
+                errors[place] = _within(row, away, known[name])
+                more += _beyond(row, cell, known[name], folder)
     told = _with_skills(list(errors.values()))
     replaced = {_place(row): row for row in told}
     return [replaced.get(_place(row), row) if row.metric == SURFACE else row for row in rows] + more
@@ -95,14 +101,9 @@ def _place(row: Row) -> tuple[str, ...]:
     )
 
 
-def _is_of(row: Row, cell: EvaluationCell, name: str) -> bool:
-    whose = (*cell.configuration, cell.fabric, cell.repeat, name, cell.baseline)
-    return _place(row) == whose
-
-
 def _within(row: Row, away: Float[np.ndarray, " frame"], judged: Judged) -> Row:
     inside = judged.inside
-    if not inside.any():
+    if not inside.any() or not np.isfinite(away).all():  # what diverges later is lost, too
         return replace(row, value=np.nan, horizon=judged.horizon)
     value, floor = float(np.mean(away[inside])), float(np.mean(judged.floor[inside]))
     return replace(row, value=value, floor=floor, horizon=judged.horizon)

@@ -19,7 +19,7 @@ from r2s.study.report.figures import (
     SKY,
     VERMILION,
     Figure,
-    colour_of,
+    Looks,
     save,
 )
 from r2s.study.statistics.distances import means
@@ -83,7 +83,9 @@ def share_chart(path: Path | str, shares: Mapping[str, Shares]) -> Path:
     return save(figure, path)
 
 
-def distance_chart(path: Path | str, parts: Mapping[str, ResultArray], title: str) -> Path:
+def distance_chart(
+    path: Path | str, parts: Mapping[str, ResultArray], title: str, looks: Looks
+) -> Path:
     """Draw the mean distances of all configurations, a panel for each motion, on one scale."""
     found = {motion: means(part) for motion, part in parts.items()}
     order = list(dict.fromkeys(c for part in parts.values() for c in part.configurations))
@@ -101,8 +103,9 @@ def distance_chart(path: Path | str, parts: Mapping[str, ResultArray], title: st
                 axes.text(0.02 * right, place, text, fontsize=8, va="center", color=VERMILION)
                 continue
             low, mean, high = 1e3 * each.low[i], 1e3 * each.mean[i], 1e3 * each.high[i]
-            axes.hlines(place, low, high, color=colour_of(place), linewidth=5, alpha=0.4)
-            axes.plot(mean, place, "o", color=colour_of(place), markersize=6)
+            colour = looks[configuration.label].colour
+            axes.hlines(place, low, high, color=colour, linewidth=5, alpha=0.4)
+            axes.plot(mean, place, "o", color=colour, markersize=6)
         axes.set(xlabel="distance [mm]", xlim=(0, right), ylim=(len(order) - 0.4, -0.6))
         axes.set_title(motion, fontsize=11)
         axes.grid(axis="x", alpha=0.3)

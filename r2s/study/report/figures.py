@@ -4,18 +4,21 @@ Needs matplotlib: pip install 'r2s[study]'.
 """
 
 import io
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from r2s.files import write_bytes
+from r2s.study.configuration import is_reference
 
 try:
     # The object API alone: pyplot would keep every figure, and choose a backend for the caller.
     from matplotlib.colors import to_rgba as to_rgba
     from matplotlib.figure import Figure as Figure
     from matplotlib.ticker import MaxNLocator as MaxNLocator
+    from matplotlib.ticker import NullLocator as NullLocator
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection as Poly3DCollection
 except ImportError as error:
     raise ImportError("figures need matplotlib: pip install 'r2s[study]'") from error
@@ -23,9 +26,10 @@ except ImportError as error:
 # Okabe and Ito's colours, which the colour-blind can tell apart.
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 SKY, GREY = "#56B4E9", "#8c8c8c"
+INK, SAND = "#202020", "#ecdcb0"  # of the true fabric, and of a floor
 # One for each configuration, the same in every picture: Okabe and Ito's, and then darker.
 LABEL_COLOURS = (BLUE, ORANGE, GREEN, VERMILION, SKY, "#CC79A7", "#B8A800", "#5D3A9B",
-                 "#994F00", "#006CD1", "#40B0A6", GREY)  # fmt: skip
+                 "#994F00", "#006CD1", "#40B0A6", "#7D7D00")  # fmt: skip
 MOST_DOTS = 1500  # a panel; more would hide the cloth
 
 
@@ -37,9 +41,28 @@ def save(figure: Figure, path: Path | str) -> Path:
     return Path(path)
 
 
-def colour_of(index: int) -> str:
-    """The colour of the configuration with an index."""
-    return LABEL_COLOURS[index % len(LABEL_COLOURS)]
+class Look(NamedTuple):
+    """How a configuration is drawn: its colour, and its line, dashed for material points."""
+
+    colour: str
+    line: str
+
+
+def looks_of(labels: Iterable[str]) -> dict[str, Look]:
+    """The look of each label, one for a whole page: colours in the order of the configurations; the
+    true fabric is dark and the default grey, whatever their order."""
+    found, count = dict[str, Look](), 0
+    for label in labels:
+        if label in found:
+            continue
+        colour = GREY if label.startswith("default ") else INK
+        if not is_reference(label):
+            colour, count = LABEL_COLOURS[count % len(LABEL_COLOURS)], count + 1
+        found[label] = Look(colour, "--" if "points" in label.split() else "-")
+    return found
+
+
+Looks = Mapping[str, Look]
 
 
 def thin(cloud: np.ndarray) -> np.ndarray:

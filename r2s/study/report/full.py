@@ -9,8 +9,9 @@ from tqdm import tqdm
 from r2s.evaluation.statistics import LEVEL
 from r2s.study import tables
 from r2s.study.configuration import PAPER_CONFIGURATIONS
-from r2s.study.report import overlays
+from r2s.study.report import opening, overlays
 from r2s.study.report import sections as parts
+from r2s.study.report.figures import Looks, looks_of
 from r2s.study.report.motions import MotionComparison
 from r2s.study.report.page import Section, write_report
 from r2s.study.report.player import viewer
@@ -20,11 +21,17 @@ from r2s.study.statistics.paper import read_paper
 from r2s.study.statistics.parameters import Estimated, parameter_table
 from r2s.study.statistics.result_array import ResultArray, configurations_of, result_array
 from r2s.study.tables import Table
+from r2s.study.verdicts import SURFACE
 
 TITLE = "A study of fabrics: from recordings to simulations"
-# The first compares configurations: what cameras did not see of a sheet counts for none of them.
-# Hausdorff distances are those of outliers, where there are any.
-JUDGED_BY = ("chamfer_real_to_sim", "chamfer", "chamfer_cropped", "paper_chamfer")
+# The first that is there compares configurations: within the horizon, where one is known. What
+# cameras did not see of a sheet counts for none of them. Hausdorff distances are those of outliers,
+# where there are any.
+JUDGED_BY = (SURFACE, "chamfer_real_to_sim", "chamfer", "chamfer_cropped", "paper_chamfer")
+METRIC_WORDS = {
+    SURFACE: "the mean distance of a recording's points from the simulated surface (surface), in "
+    "the frames before the recording's horizon where one is known"
+}
 MOST_IN_VIEWER = 15
 VERSIONS = ("r2s", "jax", "jaxlib", "equinox", "numpy", "scipy", "matplotlib")
 
@@ -64,14 +71,20 @@ def publish(
     rows_of = by_metric(rows)
     metrics = [metric for metric in JUDGED_BY if metric in rows_of]
     results = result_array(rows, metrics[0] if metrics else JUDGED_BY[0])
+    looks = looks_of(
+        [
+            *(configuration.label for configuration in configurations_of(rows)),
+            *(label for each in motions for label in each.motions),
+        ]
+    )
     sections = [
+        *opening.picture_sections(out, motions, looks),
+        *opening.skill_sections(out, rows, looks, keep),
         *parts.findings_section(rows_of, metrics, results, paper, keep),
-        *parts.distance_sections(out, rows, results, paper, keep),
         *parts.rank_section(out, results, keep),
         *parts.factor_section(out, results, keep),
-        *_motions(out, motions),
+        *_moving(out, motions, looks),
         *_parameters(parameters or {}, keep),
-        *_missing(rows, missing, keep),
         *(
             Section(
                 heading,
@@ -81,6 +94,8 @@ def publish(
             for heading, words, theirs in more
             if theirs
         ),
+        *parts.distance_sections(out, rows, results, paper, looks, keep),
+        *_missing(rows, missing, keep),
         _settings(settings or {}, keep),
     ]
     write_report(out / "report.html", TITLE, _intro(results, missing, undefined), sections)
@@ -98,8 +113,9 @@ def _intro(
         f"{results.present.sum()} simulations, of which {results.diverged.sum()} diverged; "
         f"{len(missing)} cells are missing."
     )
+    what = METRIC_WORDS.get(results.metric, results.metric)
     how = (
-        f"Configurations are compared by {results.metric}. A simulation that diverged is a result: "
+        f"Configurations are compared by {what}. A simulation that diverged is a result: "
         f"it is counted, ranks last, and what has one has no mean. Intervals are of {LEVEL:.0%}, "
         "for fabrics like these on motions like these: the fabrics are the sample (Student's t), "
         "and what motions and repeated estimates contribute to all of them alike is added. An "
@@ -114,34 +130,22 @@ def _intro(
     return f"{text}\n\n{how}"
 
 
-def _motions(out: Path, motions: Sequence[MotionComparison]) -> list[Section]:
-    """Overlays of each fabric, a video of each motion, and the viewer."""
+def _moving(out: Path, motions: Sequence[MotionComparison], looks: Looks) -> list[Section]:
+    """A video of each motion, and the viewer."""
     if not motions:
         return []
-    pictures = []
-    for fabric in dict.fromkeys(each.fabric for each in motions):
-        path = out / "figures" / f"motions_{fabric}.png"
-        overlays.overview(path, [each for each in motions if each.fabric == fabric])
-        caption = (
-            f"{fabric.replace('_', ' ')}: a late frame of each motion, every configuration's sheet "
-            "over the recorded points, which are alone at the right."
-        )
-        pictures.append((path, caption))
     first = {each.evaluated_on: each for each in reversed(motions)}
-    filmed = overlays.in_order(first.values())
-    videos = [overlays.video(out / "videos", each) for each in tqdm(filmed, "videos", disable=None)]
-    names = ", ".join(f"videos/{path.name}" for path in videos)
-    left_out = len(motions) - MOST_IN_VIEWER
-    note = (f"{left_out} more recordings are not in it.",) if left_out > 0 else ()
-    return [
-        Section(
-            "Motions",
-            (f"Videos of all configurations side by side: {names}.",),
-            (),
-            tuple(pictures),
-        ),
-        Section("Viewer", note, html=viewer(motions[:MOST_IN_VIEWER])),
+    filmed = tqdm(overlays.in_order(first.values()), "videos", disable=None)
+    videos = [overlays.video(out / "videos", each, looks) for each in filmed]
+    words = [
+        "Videos of all configurations side by side: "
+        + ", ".join(f"videos/{path.name}" for path in videos)
+        + "."
     ]
+    left_out = len(motions) - MOST_IN_VIEWER
+    if left_out > 0:
+        words.append(f"{left_out} more recordings are not in it.")
+    return [Section("Viewer", tuple(words), html=viewer(motions[:MOST_IN_VIEWER], looks))]
 
 
 def _parameters(parameters: Mapping[str, Sequence[Estimated]], keep: Keep) -> list[Section]:

@@ -1,22 +1,22 @@
-"""Simulated sheets beside the recording: a picture of all configurations, and a video.
+"""Simulated sheets over the recorded points: a picture of a frame, and a video.
 
 Needs matplotlib: pip install 'r2s[study]'. Videos are MP4 where OpenCV is installed (extra
 camera), else GIF.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from r2s.study.configuration import MOTIONS
 from r2s.study.report.figures import (
     Figure,
+    Looks,
     MaxNLocator,
+    NullLocator,
     Poly3DCollection,
-    colour_of,
     inside,
     limits,
     save,
@@ -26,53 +26,54 @@ from r2s.study.report.figures import (
 from r2s.study.report.motions import MotionComparison
 from r2s.viewer import video_writer
 
-DOTS = "#404040"
-VIEW = {"projection": "3d", "elev": 15, "azim": -60}
+DOTS = "#c4004f"  # unlike any sheet
+VIEW = {"projection": "3d", "elev": 15, "azim": -50}
 RECORDING = "recording [m]"
-ACROSS = 5  # panels in a row of a video, at most
+ACROSS = 6  # panels in a row, at most
 
 
-def overview(path: Path | str, comparisons: Sequence[MotionComparison]) -> Path:
-    """Draw a row for each recording: the sheet of every configuration, and the points at the right.
+def sheets(path: Path | str, comparison: MotionComparison, frame: int, looks: Looks) -> Path:
+    """Draw the sheet of every configuration over the points of a frame, and the points alone last.
 
-    Recordings come in the order of `MOTIONS`, each at its `late_frame`. Panels of a row share their
-    limits; what flew out of them is left out, and said. Raises ValueError without a recording.
+    Panels share their limits; what flew out of them is left out, and said.
     """
-    if not comparisons:
-        raise ValueError("no recording to show")
-    rows = in_order(comparisons)
-    labels = list(dict.fromkeys(label for each in rows for label in each.motions))
-    size = (0.9 + 1.7 * (len(labels) + 1), 0.5 + 1.8 * len(rows))  # [inch]
+    labels = [*comparison.motions, ""]
+    across = min(ACROSS, len(labels))
+    down = -(-len(labels) // across)
+    size = (2.0 * across, 0.35 + 2.3 * down)  # [inch]
     figure = Figure(figsize=size)
     figure.subplots_adjust(
-        left=0.45 / size[0], right=1 - 0.45 / size[0], bottom=0.02, top=1 - 0.5 / size[1],
-        wspace=0.02, hspace=0.06,
+        left=0.2 / size[0], right=1 - 0.4 / size[0], bottom=0.2 / size[1], top=1 - 0.7 / size[1],
+        wspace=0.04, hspace=0.25,
     )  # fmt: skip
-    panels = figure.subplots(len(rows), len(labels) + 1, subplot_kw=VIEW, squeeze=False)
-    for each, row in zip(rows, panels, strict=True):
-        frame = late_frame(each)
-        box = _box(each, frame)
-        dots = thin(each.clouds[frame])
-        for label, axes in zip(labels, row, strict=False):
-            sheet = each.motions.get(label)
-            _dress(axes, box, is_labelled=False)
-            if sheet is None:
-                axes.text2D(0.5, 0.5, "not run", ha="center", fontsize=9, transform=axes.transAxes)
-                continue
-            _draw(axes, dots[:400], sheet[frame], each.faces, box, colour_of(labels.index(label)))
-        _dress(row[-1], box, is_labelled=True)
-        _draw(row[-1], dots, None, each.faces, box, DOTS)
-        middle = row[0].get_position()
-        text = f"{each.evaluated_on}, {each.times[frame]:.2f} s\n{each.fabric.replace('_', ' ')}"
-        figure.text(0.12 / size[0], (middle.y0 + middle.y1) / 2, text, rotation=90, va="center",
-                    ha="left", fontsize=9)  # fmt: skip
-    for label, axes in zip([*labels, RECORDING], panels[0], strict=True):
-        middle = axes.get_position()
-        words = label.rsplit(" ", 2) if label.count(" ") > 1 else [label]
-        heading = words[0] + ("\n" + " ".join(words[1:]) if len(words) > 1 else "")
-        figure.text((middle.x0 + middle.x1) / 2, 1 - 0.06 / size[1], heading, ha="center", va="top",
-                    fontsize=9)  # fmt: skip
+    panels = figure.subplots(down, across, subplot_kw=VIEW, squeeze=False).ravel()
+    for axes in panels[len(labels) :]:
+        axes.remove()
+    box, dots = _box(comparison, frame), thin(comparison.clouds[frame])
+    for label, axes in zip(labels, panels, strict=False):
+        _dress(axes, box, is_labelled=not label)
+        axes.set_title(_heading(comparison, label, frame), fontsize=9, y=1.0, va="bottom")
+        sheet = comparison.motions[label][frame] if label else None
+        seen = dots if sheet is None else dots[:400]
+        _draw(axes, seen, sheet, comparison.faces.get(label), box, _colour(looks, label))
+    title = f"{comparison.evaluated_on}, {comparison.fabric.replace('_', ' ')}"
+    text = f"{title}: {comparison.times[frame]:.2f} s"
+    figure.text(0.1 / size[0], 1 - 0.06 / size[1], text, ha="left", va="top", fontsize=11)
     return save(figure, path)
+
+
+def _heading(comparison: MotionComparison, label: str, frame: int) -> str:
+    """A label in two lines, and its error in the frame."""
+    if not label:
+        return RECORDING
+    error = 1e3 * comparison.mean_errors[label][frame]
+    told = f"{error:.1f} mm" if np.isfinite(error) else "diverged"
+    first, *rest = label.rsplit(" ", 2)
+    return f"{first}\n{' '.join(rest)}: {told}"
+
+
+def _colour(looks: Looks, label: str) -> str:
+    return looks[label].colour if label else DOTS
 
 
 def in_order(comparisons: Iterable[MotionComparison]) -> list[MotionComparison]:
@@ -81,29 +82,14 @@ def in_order(comparisons: Iterable[MotionComparison]) -> list[MotionComparison]:
     return sorted(comparisons, key=lambda each: order.get(each.evaluated_on, len(order)))
 
 
-def late_frame(comparison: MotionComparison) -> int:
-    """The frame of the later half whose points are, on average, farthest from the first cloud.
-
-    Clouds with less than half of the points of the largest do not count: cameras saw little then.
-    """
-    counts = [len(cloud) for cloud in comparison.clouds]
-    full = [i for i, count in enumerate(counts) if count and 2 * count >= max(counts)]
-    later = [i for i in full if i >= len(counts) // 2] or full or [len(counts) - 1]
-    tree = KDTree(comparison.clouds[full[0]]) if full else None
-    away = [
-        0.0 if tree is None else float(tree.query(comparison.clouds[i])[0].mean()) for i in later
-    ]
-    return later[int(np.argmax(away))]
-
-
-def video(folder: Path, comparison: MotionComparison) -> Path:
+def video(folder: Path, comparison: MotionComparison, looks: Looks) -> Path:
     """Write a video of all configurations side by side, over the points, in real time; its path."""
     interval = float(np.median(np.diff(comparison.times))) if len(comparison.times) > 1 else 1.0
     stem = comparison.recording.replace("/", "_")
-    return video_writer.write_video(folder, stem, pictures(comparison), interval)
+    return video_writer.write_video(folder, stem, pictures(comparison, looks), interval)
 
 
-def pictures(comparison: MotionComparison) -> Iterator[np.ndarray]:
+def pictures(comparison: MotionComparison, looks: Looks) -> Iterator[np.ndarray]:
     """Each frame as a picture, (height, width, 3) in 0..255, of even sides."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -122,10 +108,11 @@ def pictures(comparison: MotionComparison) -> Iterator[np.ndarray]:
     caption = figure.text(0.01, 0.995, "", va="top", fontsize=10)
     for frame in range(len(comparison.times)):
         drawn = []
-        for i, (label, axes) in enumerate(zip(labels, panels, strict=False)):
+        dots = thin(comparison.clouds[frame])[:600]
+        for label, axes in zip(labels, panels, strict=False):
             sheet = comparison.motions[label][frame] if label else None
-            dots = thin(comparison.clouds[frame])[:600]
-            drawn += _draw(axes, dots, sheet, comparison.faces, box, colour_of(i))
+            faces = comparison.faces.get(label)
+            drawn += _draw(axes, dots, sheet, faces, box, _colour(looks, label))
         caption.set_text(f"{comparison.recording}, {comparison.times[frame]:.2f} s")
         canvas.draw()
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
@@ -136,17 +123,20 @@ def pictures(comparison: MotionComparison) -> Iterator[np.ndarray]:
 def _box(comparison: MotionComparison, frame: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Limits [m] that hold the recording and sheets that did not fly off; or those of a frame."""
     dots = [thin(cloud) for cloud in comparison.clouds]
-    sheets = [x.reshape(-1, 3) for x in comparison.motions.values()]
+    motions = list(comparison.motions.values())
+    sheets = [x.reshape(-1, 3) for x in motions]
     every = np.concatenate(dots) if any(map(len, dots)) else np.zeros((1, 3))
     low, high = limits(every, np.concatenate([np.zeros((0, 3)), *sheets]))
     if frame is None:
         return low, high
-    here = np.concatenate([dots[frame], *(x[frame] for x in comparison.motions.values())])
-    here = here[inside(here, low, high)]
-    if not len(here):
+    seen, cloth = dots[frame], np.concatenate([np.zeros((0, 3)), *(x[frame] for x in motions)])
+    seen, cloth = seen[inside(seen, low, high)], cloth[inside(cloth, low, high)]
+    if not len(seen) + len(cloth):
         return low, high
-    # Strays of the cloud do not widen the picture.
-    ends = np.percentile(here, [0.2, 99.8], axis=0)
+    # Strays of the cloud do not widen the picture; a sheet that did not fly off is all in it.
+    trimmed = [np.percentile(seen, end, axis=0) for end in (0.2, 99.8)] if len(seen) else []
+    every = np.concatenate([cloth, *(end[None] for end in trimmed)])
+    ends = every.min(axis=0), every.max(axis=0)
     margin = 0.03 * float((ends[1] - ends[0]).max()) + 1e-3
     return ends[0] - margin, ends[1] + margin
 
@@ -156,13 +146,13 @@ def _dress(axes: Any, box: tuple[np.ndarray, np.ndarray], is_labelled: bool) -> 
     axes.computed_zorder = False  # the dots lie over the cloth, whatever their depth
     axes.patch.set_alpha(0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(high - low, zoom=1.2)
+    axes.set_box_aspect(high - low, zoom=1.1)
     if not is_labelled:
         axes.set_axis_off()
         return
     for i, axis in enumerate((axes.xaxis, axes.yaxis, axes.zaxis)):
         is_short = 3 * (high - low)[i] < (high - low).max()
-        axis.set_major_locator(MaxNLocator(1 if is_short else 2))
+        axis.set_major_locator(NullLocator() if is_short else MaxNLocator(2))
     axes.tick_params(labelsize=6, pad=-5)
     axes.tick_params("z", pad=-3)
 
@@ -173,12 +163,15 @@ def _draw(axes: Any, dots: Any, sheet: Any, faces: Any, box: Any, colour: str) -
     dots = dots[inside(dots, *box)]
     if sheet is not None:
         kept = faces[inside(sheet, *box)[faces].all(axis=1)]
-        style: dict[str, Any] = {"facecolor": to_rgba(colour, 0.35), "edgecolor": colour}
+        style: dict[str, Any] = {
+            "facecolor": to_rgba(colour, 0.2),
+            "edgecolor": to_rgba(colour, 0.6),
+        }
         drawn.append(axes.add_collection3d(Poly3DCollection(sheet[kept], linewidth=0.3, **style)))
         if len(kept) < len(faces):
             text = "diverged" if not np.isfinite(sheet).all() else "part is out of the picture"
             where: dict[str, Any] = {"ha": "center", "transform": axes.transAxes}
             drawn.append(axes.text2D(0.5, 0.02, text, fontsize=8, **where))
-    style = {"s": 1.2, "color": DOTS, "linewidths": 0, "depthshade": False, "zorder": 9}
+    style = {"s": 2.2, "color": DOTS, "linewidths": 0, "depthshade": False, "zorder": 9}
     drawn.append(axes.scatter(*dots.T, **style))
     return drawn

@@ -34,6 +34,9 @@ th[aria-sort=descending]::after { content: " \\25bc"; }
 td.number { text-align: right; white-space: nowrap; }
 tfoot td { font-weight: 600; }
 figure { margin: 1.5rem 0; }
+.beside { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 30rem), 1fr));
+  gap: 0 1rem; }
+.beside figure { margin: .5rem 0; min-width: 0; }
 img { display: block; max-width: 100%; height: auto; background: #ffffff; border-radius: .3rem; }
 @media (max-width: 45rem) { figure img { max-width: none; width: 45rem; } }
 """
@@ -63,8 +66,9 @@ for (const head of document.querySelectorAll("table.sortable thead th")) {
 class Section:
     """A part of a report: paragraphs, then tables, then pictures (a PNG file and its caption).
 
-    `html`, last, is put in as it is: a fragment that is trusted, such as
-    `r2s.study.report.player`'s.
+    - `html`: last, is put in as it is: a fragment that is trusted, such as
+      `r2s.study.report.player`'s.
+    - `beside`: pictures stand two in a row where the page is wide enough.
     """
 
     heading: str
@@ -72,6 +76,7 @@ class Section:
     tables: tuple[Table, ...] = ()
     figures: tuple[tuple[Path, str], ...] = ()
     html: str = ""
+    beside: bool = False
 
 
 def write_report(
@@ -101,6 +106,8 @@ def write_report(
 def _section(section: Section) -> str:
     shown = "".join(f'<div class="wide">\n{tables.html(t)}</div>\n' for t in section.tables)
     pictures = "".join(_figure(Path(path), caption) for path, caption in section.figures)
+    if section.beside and pictures:
+        pictures = f'<div class="beside">\n{pictures}</div>\n'
     heading = f"<h2>{escape(section.heading)}</h2>\n"
     body = f"{_paragraphs(section.paragraphs)}{shown}{pictures}{section.html}"
     return f"<section>\n{heading}{body}</section>\n"

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from r2s.study.report.figures import colour_of
+from r2s.study.report.figures import Looks
 from r2s.study.report.motions import MotionComparison
 from r2s.study.report.player_script import SCRIPT, STYLE
 
@@ -23,9 +23,10 @@ BUDGET = 950_000  # characters of positions for each recording
 FEWEST_POINTS, MOST_POINTS = 150, 800  # of a cloud, in a frame
 
 
-def viewer(comparisons: Sequence[MotionComparison], name: str = "viewer") -> str:
+def viewer(comparisons: Sequence[MotionComparison], looks: Looks, name: str = "viewer") -> str:
     """The fragment, for `Section.html`; the text is empty without anything to show.
 
+    - `looks`: of all labels of `comparisons`.
     - `name`: the id of its element, another one for each viewer of a page.
 
     Of long or fine recordings every second frame is kept, or fewer, and of clouds as many points as
@@ -38,7 +39,7 @@ def viewer(comparisons: Sequence[MotionComparison], name: str = "viewer") -> str
         "step": STEP,
         "absent": ABSENT,
         "labels": labels,
-        "colours": [colour_of(i) for i in range(len(labels))],
+        "colours": [looks[label].colour for label in labels],
         "recordings": [_packed(each) for each in comparisons],
     }
     # "<" would end the element that holds it.
@@ -79,7 +80,7 @@ def _packed(comparison: MotionComparison) -> dict[str, Any]:
         "radius": round(float(radius), 4),
         "counts": [len(cloud) for cloud in clouds],
         "points": _encoded(np.concatenate(clouds), middle),
-        "faces": _base64(np.asarray(comparison.faces, "<u2")),
+        "faces": {k: _base64(np.asarray(f, "<u2")) for k, f in comparison.faces.items()},
         "sheets": {label: _encoded(x[frames], middle) for label, x in comparison.motions.items()},
     }
 

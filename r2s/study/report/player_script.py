@@ -40,11 +40,14 @@ SCRIPT = """
   };
   const open = index => {
     const from = data.recordings[index], sheets = {};
-    for (const label in from.sheets) sheets[label] = metres(from.sheets[label], from.middle);
+    const faces = {};
+    for (const label in from.sheets) {
+      sheets[label] = metres(from.sheets[label], from.middle);
+      faces[label] = new Uint16Array(bytes(from.faces[label]));
+    }
     const starts = [0];
     for (const count of from.counts) starts.push(starts[starts.length - 1] + count);
-    current = { ...from, sheets, starts, points: metres(from.points, from.middle),
-      faces: new Uint16Array(bytes(from.faces)) };
+    current = { ...from, sheets, faces, starts, points: metres(from.points, from.middle) };
     slider.max = from.times.length - 1;
     slider.value = Math.floor(0.6 * slider.max);
     for (const [label, box] of boxes) {
@@ -81,8 +84,9 @@ SCRIPT = """
     const vertices = x.length / 3 / current.times.length, first = vertices * slider.value;
     const at = i => 3 * (first + i);
     let drawn = 0;
-    for (let f = 0; f < current.faces.length; f += 3) {
-      const corners = [0, 1, 2].map(k => at(current.faces[f + k]));
+    const faces = current.faces[label];
+    for (let f = 0; f < faces.length; f += 3) {
+      const corners = [0, 1, 2].map(k => at(faces[f + k]));
       if (corners.some(i => isNaN(x[i]))) continue;
       drawn++;
       const [p, q, r] = corners.map(i => place(x[i], x[i + 1], x[i + 2]));

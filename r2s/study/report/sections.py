@@ -7,6 +7,7 @@ import numpy as np
 
 from r2s.evaluation.statistics import LEVEL
 from r2s.study.report import charts
+from r2s.study.report.figures import Looks
 from r2s.study.report.page import Section
 from r2s.study.rows import Row
 from r2s.study.statistics import factors, findings, ranks
@@ -15,6 +16,7 @@ from r2s.study.statistics.paper import CITED, Paper, paper_tables
 from r2s.study.statistics.result_array import ResultArray, by_motion
 from r2s.study.tables import Table, significant
 
+NAMES = {METRICS[0]: "distance to the surface"}  # of metrics in a sentence
 Keep = Callable[[str, Table], Table]  # writes a table under a name, and returns it
 
 
@@ -56,7 +58,7 @@ def findings_section(
 def _headlines(results: ResultArray) -> list[str]:
     """The best configurations of each motion, beside the default fabric."""
     scale, unit = (1e3, " mm") if results.unit == "m" else (1.0, "")
-    found = []
+    found, name = [], NAMES.get(results.metric, results.metric)
     for motion, part in by_motion(results).items():
         numbers = zip(part.configurations, *(each.tolist() for each in means(part)), strict=True)
         best, defaults, lost = [], [], []
@@ -71,14 +73,17 @@ def _headlines(results: ResultArray) -> list[str]:
         if best:
             compared = f"; {', '.join(defaults)}" if defaults else ""
             without = f". Not ranked, for runs diverged: {', '.join(lost)}" if lost else ""
-            found.append(
-                f"Least {results.metric} in {motion}: {', '.join(best[:3])}{compared}{without}."
-            )
+            found.append(f"Least {name} in {motion}: {', '.join(best[:3])}{compared}{without}.")
     return found
 
 
 def distance_sections(
-    out: Path, rows: Sequence[Row], results: ResultArray, paper: Paper, keep: Keep
+    out: Path,
+    rows: Sequence[Row],
+    results: ResultArray,
+    paper: Paper,
+    looks: Looks,
+    keep: Keep,
 ) -> list[Section]:
     """Distances in millimetres, and in the units of the paper beside its own."""
     sections = []
@@ -87,7 +92,7 @@ def distance_sections(
         figures: tuple[tuple[Path, str], ...] = ()
         if results.metric in METRICS and results.trajectories:
             path, parts = out / "figures" / "distances.png", by_motion(results)
-            charts.distance_chart(path, parts, results.metric)
+            charts.distance_chart(path, parts, results.metric, looks)
             caption = f"Mean {results.metric} of every configuration, with {LEVEL:.0%} intervals."
             figures = ((path, caption),)
         sections.append(Section("Distances in millimetres", (), ours, figures))

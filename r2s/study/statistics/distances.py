@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Integer
 
-from r2s.evaluation.crossed import crossed_mean, interval
+from r2s.evaluation.crossed import CrossedMean, crossed_mean, interval
 from r2s.evaluation.statistics import LEVEL
-from r2s.study.configuration import APPROACHES
+from r2s.study.configuration import APPROACHES, TRUE_FABRIC, Configuration
 from r2s.study.rows import Row, by_metric
 from r2s.study.statistics.result_array import (
     ResultArray,
@@ -20,6 +20,7 @@ from r2s.study.statistics.samples import by_movement, finite_mean, of_fabrics
 from r2s.study.tables import MISSING, Table, significant
 
 METRICS = (
+    "surface",
     "chamfer_real_to_sim",
     "chamfer_sim_to_real",
     "chamfer",
@@ -69,16 +70,23 @@ def means(results: ResultArray) -> Means:
     return Means(mean, low, high, np.array(medians), diverged, runs)
 
 
-def _mean(
+def mean_over_fabrics(
     results: ResultArray, values: Float[np.ndarray, "trajectory repeat"]
-) -> tuple[float, float, float]:
-    """The mean of one configuration, and its interval."""
+) -> CrossedMean:
+    """The mean of one configuration over fabrics, of the means over trajectories and repeats."""
     values = np.where(np.isfinite(values), values, np.nan)
     of_trajectory = finite_mean(values, 1)
     numbers = of_fabrics(results, of_trajectory)
     kept = np.isfinite(numbers)
     tables = by_movement(results, of_trajectory), of_fabrics(results, values.T).T
-    found = crossed_mean(numbers[kept], [table[kept] for table in tables])
+    return crossed_mean(numbers[kept], [table[kept] for table in tables])
+
+
+def _mean(
+    results: ResultArray, values: Float[np.ndarray, "trajectory repeat"]
+) -> tuple[float, float, float]:
+    """The mean of one configuration, and its interval."""
+    found = mean_over_fabrics(results, values)
     if found.mean <= 0:  # all of it is zero
         return found.mean, *interval(found)
     relative = found._replace(
@@ -105,11 +113,11 @@ def distance_table(rows: Sequence[Row], metric: str) -> Table:
     with: default fabrics, estimates of another fabric, another trial. Metres are shown in
     millimetres.
     """
-    rows = _with_references(rows)
+    rows = with_references(rows)
     found = by_motion(result_array(rows, metric))
     found[OWN] = result_array(rows, metric, own=True)
     found = {motion: results for motion, results in found.items() if results.configurations}
-    shown = {motion: _cells(results) for motion, results in found.items()}
+    shown = {motion: cells_of(results) for motion, results in found.items()}
     lines = dict.fromkeys(c for results in found.values() for c in results.configurations)
     unit = " [mm]" if {results.unit for results in found.values()} == {"m"} else ""
     return Table(
@@ -118,11 +126,12 @@ def distance_table(rows: Sequence[Row], metric: str) -> Table:
         f"{metric}{unit}: mean over fabrics of the means over recordings and repeats, and "
         f"{LEVEL:.0%} interval for fabrics like these (Student's t: the fabrics are the sample). "
         "Where runs diverged there is no mean: how many, and the median of all, with those that "
-        'diverged above any other. "own": the recordings that a configuration was estimated from.',
+        'diverged above any other. "own": the recordings that a configuration was estimated from.'
+        + (" Frames before the horizon, where one is known." if metric == METRICS[0] else ""),
     )
 
 
-def _with_references(rows: Iterable[Row]) -> list[Row]:
+def with_references(rows: Iterable[Row]) -> list[Row]:
     """Rows in which estimates of another fabric, and another trial, are configurations as well."""
     rows = list(rows)
     found = []
@@ -131,13 +140,14 @@ def _with_references(rows: Iterable[Row]) -> list[Row]:
         if row.baseline == "other_fabric":
             found.append(replace(row, baseline="", approach=f"{name} (of another fabric)"))
         elif row.baseline == "true":
-            found.append(replace(row, baseline="", approach="true fabric on"))
+            found.append(replace(row, baseline="", approach=TRUE_FABRIC))
         elif row.baseline == "repeatability":
             found.append(replace(row, baseline="", approach="another trial"))
     return rows + found
 
 
-def _cells(results: ResultArray) -> dict[object, str]:
+def cells_of(results: ResultArray) -> dict[Configuration, str]:
+    """The cell of each configuration, see `cell`; metres in millimetres."""
     in_mm = results.unit == "m"
     scale = 1e3 if in_mm else 1.0
     found = means(results)
@@ -157,10 +167,14 @@ def cell(
     """A mean and its interval where there is one; where runs diverged how many, and the median."""
     if diverged == runs:
         return "diverged" if runs else MISSING
-    text, *ends, middle = (
-        f"{x:.1f}" if in_mm else significant(x) for x in (mean, low, high, median)
-    )
+    write = millimetres if in_mm else significant
+    text, *ends, middle = (write(x) for x in (mean, low, high, median))
     if diverged:
         lost = f"{diverged} of {runs} diverged"
         return f"median {middle} ({lost})" if np.isfinite(median) else lost
     return f"{text} [{', '.join(ends)}]" if low < high else text
+
+
+def millimetres(length: float) -> str:
+    """A length [mm] to a tenth of a millimetre; below one to a hundredth."""
+    return f"{length:.1f}" if abs(length) >= 0.995 or not np.isfinite(length) else f"{length:.2f}"

@@ -1,0 +1,143 @@
+"""Errors within the horizon beside floor and skill, over fabrics.
+
+Skills are those of `r2s.study.rows.Row.skill`: of each run in each recording in which it is told.
+"""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from r2s.evaluation.crossed import CrossedMean, interval, units_needed
+from r2s.evaluation.horizon import skill
+from r2s.evaluation.statistics import SIGNIFICANCE
+from r2s.study.configuration import Configuration
+from r2s.study.rows import Row
+from r2s.study.statistics.distances import mean_over_fabrics, with_references
+from r2s.study.statistics.result_array import ResultArray, result_array, select
+
+
+class Skill(NamedTuple):
+    """The skill of a configuration in a motion, [-].
+
+    - `mean`: over fabrics of the means over recordings and repeats; minus infinity where a run
+      diverged. `low`, `high`: of its interval; NaN then, and for one fabric.
+    - `median`: of all runs, where one that diverged is below any other.
+    - `diverged`, `runs`: how many did, of those whose skill is told.
+    - `told`, `judged`: recordings in which it is told, of how many.
+    - `found`: what the interval is made of, of the runs that did not diverge.
+    """
+
+    mean: float
+    low: float
+    high: float
+    median: float
+    diverged: int
+    runs: int
+    told: int
+    judged: int
+    found: CrossedMean
+
+    @property
+    def needed(self) -> tuple[float, float, float]:
+        """How many fabrics would tell this skill from the default's, zero (`units_needed`); NaN
+        where runs diverged, and for one fabric."""
+        if self.diverged or not self.runs:
+            return np.nan, np.nan, np.nan
+        return units_needed(self.found, self.found.mean, SIGNIFICANCE)
+
+
+def with_floor(rows: Iterable[Row], metric: str) -> list[Row]:
+    """The rows of a metric that stand beside a floor, of estimates, true fabrics and defaults; true
+    fabrics are configurations in them."""
+    known = [row for row in rows if row.metric == metric and row.floor is not None]
+    whose = [row for row in known if row.baseline in ("", "true", "default")]
+    return [row for row in with_references(whose) if row.baseline != "true"]
+
+
+def skills(rows: Iterable[Row], motion: str) -> dict[Configuration, Skill]:
+    """The skill of every configuration in a motion, from what `with_floor` returns."""
+    rows = [row for row in rows if row.evaluated_on == motion]
+    told = [replace(row, unit="-", value=row.skill) for row in rows if row.skill is not None]
+    judged = _recordings(rows)
+    results = result_array(told, told[0].metric if told else "")
+    found = {}
+    for configuration, recordings in judged.items():
+        part = select(results, configuration.__eq__)
+        found[configuration] = _skill(part, len(recordings))
+    return found
+
+
+def _recordings(rows: Iterable[Row]) -> dict[Configuration, set[str]]:
+    found: dict[Configuration, set[str]] = {}
+    for row in rows:
+        if (configuration := row.configuration) is not None:
+            found.setdefault(configuration, set()).add(row.recording)
+    return found
+
+
+def _skill(part: ResultArray, judged: int) -> Skill:
+    if not part.present.any():
+        nothing = CrossedMean(np.nan, 0, np.nan, 0.0, np.nan)
+        return Skill(np.nan, np.nan, np.nan, np.nan, 0, 0, 0, judged, nothing)
+    values, present, lost = part.values[0], part.present[0], int(part.diverged.sum())
+    found = mean_over_fabrics(part, values)
+    runs = np.where(np.isfinite(values), values, -np.inf)[present]
+    mean, ends = found.mean, interval(found)
+    if lost:
+        mean, ends = -np.inf, (np.nan, np.nan)
+    told = int(present.any(axis=1).sum())
+    return Skill(mean, *ends, float(np.median(runs)), lost, len(runs), told, judged, found)
+
+
+def mean_floor(rows: Iterable[Row], motion: str, configuration: Configuration) -> float:
+    """The mean over fabrics of the means over recordings of the floor, [unit]; NaN without any."""
+    theirs = [row for row in rows if _is_of(row, motion, configuration)]
+    floors = [replace(row, value=np.nan if row.floor is None else row.floor) for row in theirs]
+    if not floors:
+        return np.nan
+    results = result_array(floors, floors[0].metric)
+    return mean_over_fabrics(results, results.values[0]).mean
+
+
+class Draws(NamedTuple):
+    """The least and the largest of the means of the draws of a default: errors [unit], infinite
+    where one diverged, and skills [-] beside the mean over all; NaN where none is told."""
+
+    errors: tuple[float, float]
+    skills: tuple[float, float]
+
+
+def draws(rows: Iterable[Row], motion: str, configuration: Configuration) -> Draws:
+    """The spread of a default fabric's draws in a motion."""
+    theirs = [row for row in rows if _is_of(row, motion, configuration)]
+    every = {row.recording: [r.value for r in theirs if r.recording == row.recording]
+             for row in theirs}  # fmt: skip
+    errors, told = [], []
+    for draw in dict.fromkeys(row.repeat for row in theirs):
+        own = [row for row in theirs if row.repeat == draw]
+        errors.append(_mean_of(own, [row.value for row in own], np.inf))
+        values = [
+            skill(row.value, float(np.mean(every[row.recording])), float(row.floor or 0))
+            for row in own
+        ]
+        kept = [(row, value) for row, value in zip(own, values, strict=True) if value == value]
+        if kept:
+            told.append(_mean_of([row for row, _ in kept], [value for _, value in kept], -np.inf))
+    span = (min(told), max(told)) if told else (np.nan, np.nan)
+    return Draws((min(errors), max(errors)), span)
+
+
+def _mean_of(rows: list[Row], values: list[float], diverged: float) -> float:
+    """The mean over fabrics of the means over recordings; `diverged` where one is not finite."""
+    if not np.isfinite(values).all():
+        return diverged
+    of_fabric: dict[str, list[float]] = {}
+    for row, value in zip(rows, values, strict=True):
+        of_fabric.setdefault(row.fabric, []).append(value)
+    return float(np.mean([np.mean(each) for each in of_fabric.values()]))
+
+
+def _is_of(row: Row, motion: str, configuration: Configuration) -> bool:
+    return row.evaluated_on == motion and row.configuration == configuration

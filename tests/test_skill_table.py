@@ -1,0 +1,210 @@
+"""Error, floor and skill by approach: what tables say of made-up rows follows from the definitions,
+and a run that diverged improves nothing."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from r2s.evaluation.horizon import CLEAR, skill
+from r2s.study.configuration import TRUE_FABRIC, Configuration
+from r2s.study.report.figures import looks_of
+from r2s.study.report.page import PNG
+from r2s.study.report.skill_chart import skill_chart
+from r2s.study.report.skill_table import beyond_tables, needed_table, skill_table, skill_words
+from r2s.study.rows import Row
+from r2s.study.statistics.distances import means
+from r2s.study.statistics.result_array import result_array
+from r2s.study.statistics.skills import draws, mean_floor, skills, with_floor
+
+LIFTING = Configuration("diffcloud", "cloth", "lifting")
+PINN = Configuration("pinn", "cloth", "stretching")
+TRUE = Configuration(TRUE_FABRIC, "cloth", "")
+DEFAULT = Configuration("", "cloth", "")
+FABRICS = "denim", "knit", "satin"
+FLOOR = {"denim": 1e-3, "knit": 2e-3, "satin": 3e-3}
+DRAWS = (16e-3, 24e-3)
+METRIC = "surface"
+
+
+def errors_of(configuration: Configuration, fabric: str, trial: int, repeat: int) -> float:
+    """In metres, all different."""
+    start = {LIFTING: 7, PINN: 13}[configuration]
+    return 1e-3 * (start + FABRICS.index(fabric) + 0.5 * trial + 0.2 * repeat)
+
+
+def _row(
+    whose: Configuration, repeat: str, baseline: str, value: float, *, fabric: str, recording: str,
+    motion: str, floor: float,
+) -> Row:  # fmt: skip
+    told = None if baseline == "default" else skill(value, sum(DRAWS) / len(DRAWS), floor)
+    return Row(
+        *whose,
+        fabric=fabric,
+        repeat=repeat,
+        recording=recording,
+        evaluated_on=motion,
+        baseline=baseline,
+        metric=METRIC,
+        unit="m",
+        value=value,
+        floor=floor,
+        horizon=3.0,
+        skill=told,
+    )
+
+
+def made_up(fabrics: Sequence[str] = FABRICS, motion: str = "fling") -> list[Row]:
+    """Two recordings of each fabric, judged by two estimates, the true fabric and two draws."""
+    rows = []
+    for fabric in fabrics:
+        for trial in range(2):
+            recording, floor = f"{motion}_{fabric}_{trial}", FLOOR[fabric]
+            row = partial(_row, fabric=fabric, recording=recording, motion=motion, floor=floor)
+            for each in (LIFTING, PINN):
+                for repeat in range(2):
+                    value = errors_of(each, fabric, trial, repeat)
+                    rows.append(row(each, str(repeat), "", value))
+            rows.append(row(DEFAULT, "", "true", 2 * floor))
+            rows += [row(DEFAULT, str(i), "default", value) for i, value in enumerate(DRAWS)]
+    return rows
+
+
+def diverged(rows: Sequence[Row], place: int) -> list[Row]:
+    """With one run lost."""
+    lost = replace(rows[place], value=math.nan, skill=-math.inf)
+    return [lost if i == place else row for i, row in enumerate(rows)]
+
+
+def line(table, label: str) -> dict[str, str]:
+    (found,) = (row for row in table.rows if row[0] == label)
+    return dict(zip(table.header, found, strict=True))
+
+
+def test_numbers_are_those_of_the_definition():
+    rows = with_floor(made_up(), METRIC)
+    table = skill_table(rows, METRIC)
+    assert table.header[1:] == ("fling: error [mm]", "fling: floor [mm]", "fling: skill")
+    assert [each[0] for each in table.rows] == [
+        "DIFFCLOUD cloth lifting", "PINN cloth stretching", "true fabric on cloth", "default cloth"
+    ]  # fmt: skip
+    default, own, found = np.mean(DRAWS), [], line(table, LIFTING.label)
+    for fabric in FABRICS:
+        errors = [errors_of(LIFTING, fabric, i, j) for i in range(2) for j in range(2)]
+        own.append(np.mean([(default - e) / (default - FLOOR[fabric]) for e in errors]))
+    told = skills(rows, "fling")[LIFTING]
+    assert told.mean == pytest.approx(np.mean(own))
+    assert found["fling: skill"].startswith(f"{np.mean(own):.2f} [")
+    errors = [errors_of(LIFTING, f, i, j) for f in FABRICS for i in range(2) for j in range(2)]
+    assert found["fling: error [mm]"].startswith(f"{1e3 * np.mean(errors):.1f} [")
+    assert all(each[2] == "2.00" for each in table.rows)  # the floor's mean over fabrics
+    true = np.mean([(default - 2 * f) / (default - f) for f in FLOOR.values()])
+    assert line(table, TRUE.label)["fling: skill"].startswith(f"{true:.2f}")
+
+
+def test_the_interval_of_one_recording_and_repeat_is_students_over_fabrics():
+    every = with_floor(made_up(), METRIC)
+    rows = [row for row in every if row.recording.endswith("_0") and row.repeat in ("0", "")]
+    found = skills(rows, "fling")[PINN]
+    own = np.array([skill(errors_of(PINN, f, 0, 0), 20e-3, FLOOR[f]) for f in FABRICS])
+    reach = stats.t.ppf(0.95, 2) * own.std(ddof=1) / math.sqrt(3)
+    assert (found.low, found.high) == pytest.approx((own.mean() - reach, own.mean() + reach))
+    whole = skills(every, "fling")[PINN]  # motions and repeats add what they have in common
+    assert whole.high - whole.low != pytest.approx(2 * reach)
+
+
+def test_the_default_has_skill_zero_and_shows_the_spread_of_its_draws():
+    rows = with_floor(made_up(), METRIC)
+    spread = draws(rows, "fling", DEFAULT)
+    assert spread.errors == pytest.approx(DRAWS)
+    worse = [np.mean([(20e-3 - d) / (20e-3 - f) for f in FLOOR.values()]) for d in DRAWS]
+    assert spread.skills == pytest.approx(sorted(worse))
+    found = line(skill_table(rows, METRIC), DEFAULT.label)
+    assert found["fling: error [mm]"].endswith("draws 16.0 to 24.0")
+    assert found["fling: skill"] == f"0; draws {min(worse):.2f} to {max(worse):.2f}"
+
+
+@pytest.mark.parametrize("place", range(len(made_up())))
+def test_a_run_that_diverged_improves_nothing(place):
+    whole, lost = made_up(), diverged(made_up(), place)
+    (whose,) = {(c := row.configuration) or TRUE for row in [whole[place]]}
+    before, after = with_floor(whole, METRIC), with_floor(lost, METRIC)
+    first, second = (means(result_array(rows, METRIC)) for rows in (before, after))
+    i = result_array(before, METRIC).configurations.index(whose)
+    assert second.diverged[i] == 1 and math.isnan(second.mean[i])
+    assert second.median[i] >= first.median[i]
+    found = line(skill_table(after, METRIC), whose.label)
+    assert "diverged" in found["fling: error [mm]"]
+    if whose == DEFAULT:
+        assert draws(after, "fling", DEFAULT).errors[1] == math.inf
+        return
+    good, bad = (skills(rows, "fling")[whose] for rows in (before, after))
+    assert bad.mean == -math.inf and bad.median <= good.median and math.isnan(bad.high)
+    assert found["fling: skill"].startswith("-inf (1 of ")
+    assert line(needed_table(after), whose.label)["fling"].endswith("diverged")
+    others = [each for each in skills(before, "fling") if each != whose]
+    for each in others:
+        assert skill_words(skills(after, "fling")[each]) == skill_words(
+            skills(before, "fling")[each]
+        )
+
+
+def test_what_is_not_told_is_said():
+    default = sum(DRAWS) / len(DRAWS)
+    clear, near = 0.99 * default / CLEAR, 1.01 * default / CLEAR
+    rows = made_up()
+    told = [replace(r, skill=None) if r.fabric == "satin" else r for r in rows]
+    part = skill_words(skills(with_floor(told, METRIC), "fling")[PINN])
+    assert part.endswith("told in 4 of 6")
+    nothing = [replace(row, skill=None, floor=near) for row in rows]
+    found = skill_table(with_floor(nothing, METRIC), METRIC)
+    assert {each[3] for each in found.rows} == {"not told"}
+    assert math.isnan(skill(1e-3, default, near)) and skill(1e-3, default, clear) > 0
+    assert {each[1] for each in needed_table(with_floor(nothing, METRIC)).rows} == {"not told"}
+
+
+def test_one_fabric_has_no_interval():
+    rows = with_floor(made_up(FABRICS[:1]), METRIC)
+    found = skills(rows, "fling")[PINN]
+    assert math.isnan(found.low) and "[" not in skill_words(found)
+    assert "two fabrics or more" in line(needed_table(rows), PINN.label)["fling"]
+    assert mean_floor(rows, "fling", PINN) == FLOOR["denim"]
+
+
+def test_fewer_fabrics_are_needed_for_a_larger_skill():
+    rows = with_floor(made_up(), METRIC)
+    best, worse = (skills(rows, "fling")[each].needed for each in (LIFTING, PINN))
+    assert best[1] <= best[0] <= best[2] and best[0] <= worse[0]
+
+
+def test_motions_without_rows_have_no_column_and_rows_without_floor_do_not_count():
+    rows = made_up() + made_up(FABRICS[:2], "shaking")
+    without = [replace(row, floor=None, recording="other") for row in made_up(FABRICS[:1])]
+    table = skill_table(with_floor(rows + without, METRIC), METRIC)
+    assert [name.split(":")[0] for name in table.header[1:]] == 3 * ["fling"] + 3 * ["shaking"]
+    assert table.rows == skill_table(with_floor(rows, METRIC), METRIC).rows
+    assert with_floor(without, METRIC) == []
+
+
+def test_beyond_the_horizon_what_diverged_has_no_mean():
+    rows = [replace(row, metric="beyond sag", floor=None, skill=None) for row in made_up()]
+    rows += [replace(row, metric="beyond speed", unit="m/s") for row in rows]
+    (table,) = beyond_tables(rows, "beyond ").values()
+    assert table.header == ("configuration", "sag [mm]", "speed [m/s]")
+    assert {each[0] for each in table.rows} >= {LIFTING.label, TRUE.label, DEFAULT.label}
+    expected = 1e3 * np.mean([errors_of(PINN, f, i, j) for f in FABRICS for i in (0, 1)
+                              for j in (0, 1)])  # fmt: skip
+    assert line(table, PINN.label)["sag [mm]"].startswith(f"{expected:.1f} [")
+    lost = beyond_tables(diverged(rows, 0), "beyond ")["beyond_fling"]
+    assert "1 of 12 diverged" in line(lost, LIFTING.label)["sag [mm]"]
+
+
+def test_a_chart_of_skills_is_written_whatever_diverged(tmp_path):
+    rows = with_floor(diverged(made_up(), 0), METRIC)
+    looks = looks_of(each.label for each in skills(rows, "fling"))
+    path = skill_chart(tmp_path / "skill.png", {"fling": skills(rows, "fling")}, looks)
+    assert path.read_bytes().startswith(PNG)
