@@ -53,7 +53,8 @@ class IncrementalPotential(eqx.Module):
 
     - `membrane`, `bending`: the fabric's laws as they stand in this step, one for each element.
     - `membrane_tangent`: stiffness [N/m] of every sample at `strain_anchor`, for its viscosity.
-    - `rate`: of the time-stepping formula, [1/s].
+    - `rate`: of the time-stepping formula, [1/s]; `inertia`: its square, or nearly, [1/s^2].
+    - `contact_weight`: of contact and friction on the table among the forces, [-].
     - `x_anchor`, `v_anchor`: what the formula's velocity [m/s] and acceleration start from.
     - `strain_anchor`, `curvature_anchor`: likewise for the rates of strain [-] and of the bends'
       curvature [1/m].
@@ -73,6 +74,8 @@ class IncrementalPotential(eqx.Module):
     air: Air
     table: Table
     rate: Float[Array, ""]
+    inertia: Float[Array, ""]
+    contact_weight: Float[Array, ""]
     x_anchor: Positions
     v_anchor: Positions
     strain_anchor: Float[Array, "element sample 3"]
@@ -117,6 +120,13 @@ def residual(step: IncrementalPotential, x: Positions) -> Positions:
     viscous = jnp.sum(step.membrane_tangent * change[:, :, None], axis=3)
     stress = stress_on_samples(step.membrane, strain) + step.fabric.damping * step.rate * viscous
     return to_forces(samples.areas[:, :, None] * stress)[0] + jax.grad(_others, argnums=1)(step, x)
+
+
+def table_forces(step: IncrementalPotential, x: Positions) -> Positions:
+    """Pressure and friction [N] of the table on the vertices, at the end of a step, unweighted."""
+    area, limit = step.mesh.vertex_area, step.friction_limit
+    slopes = _map(jax.grad(_table_energy, argnums=1), step, x, step.x_anchor, area, limit)
+    return -slopes
 
 
 def find_wrinkles(step: IncrementalPotential, x: Positions, near: Any = None) -> Any:
@@ -214,15 +224,21 @@ def _drag_energy(step, middle, corners, normal, wind):
 def _vertex_energy(step, x, x_anchor, v_anchor, area, limit):
     mass = step.fabric.density * area
     offset = x - x_anchor - v_anchor / step.rate
-    depth = step.table.depth(x, step.fabric.thickness)
     velocity = step.rate * (x - x_anchor)
     drag = mass * step.fabric.mass_damping / 2 * jnp.sum(velocity**2)
     return (
-        mass * step.rate**2 / 2 * jnp.sum(offset**2)
+        mass * step.inertia / 2 * jnp.sum(offset**2)
         + mass * GRAVITY * x[2]
-        + area * contact.normal_potential(depth)
-        + (contact.friction_dissipation(limit, velocity[:2]) + drag) / step.rate
+        + step.contact_weight * _table_energy(step, x, x_anchor, area, limit)
+        + drag / step.rate
     )
+
+
+def _table_energy(step, x, x_anchor, area, limit):
+    depth = step.table.depth(x, step.fabric.thickness)
+    slip = step.rate * (x - x_anchor)[:2]
+    friction = contact.friction_dissipation(limit, slip)
+    return area * contact.normal_potential(depth) + friction / step.rate
 
 
 def _curvatures(step: IncrementalPotential, x: Positions) -> Float[Array, " bend"]:
