@@ -9,6 +9,8 @@ makes its bending stiffness 1e-5 N m.
 (0.25, 0.25, 0.5) m in 2.4 s and 60 steps, as in DiffSim's public examples.
 """
 
+import dataclasses
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -35,9 +37,9 @@ LIFT_SHIFT = (0.25, 0.25, 0.5)  # [m]
 Motion = Float[Array, "frame vertex 3"]
 
 
-def sheet(size: int) -> r2s.Mesh:
+def sheet(size: int, elements: str = "wrinkling") -> r2s.Mesh:
     """The square with `size` vertices a side; 0 and `size` - 1 are neighbouring corners."""
-    return r2s.rectangle((SIDE, SIDE), (size, size))
+    return r2s.rectangle((SIDE, SIDE), (size, size), elements)
 
 
 def flat(mesh: r2s.Mesh) -> Float[Array, "vertex 3"]:
@@ -51,12 +53,21 @@ def fabric(damping: float, stiffness: float = 1.0) -> r2s.Fabric:
     return r2s.Fabric.make(DENSITY, (c11, c12, c22, c33), BENDING, damping=damping)
 
 
-def hang(size: int, substeps: int, frames: int = FRAMES):
-    """Solver, start and controls of "hang" with `substeps` steps in a frame of 1/60 s."""
-    mesh = sheet(size)
+def hang(
+    size: int,
+    substeps: int,
+    frames: int = FRAMES,
+    elements: str = "wrinkling",
+    spectral_radius: float | None = None,
+):
+    """Solver, start and controls of "hang" with `substeps` steps in a frame of 1/60 s.
+
+    `elements`: of the mesh. `spectral_radius`: see `r2s.Cloth.make`.
+    """
+    mesh = sheet(size, elements)
     held = jnp.array([0, size - 1])
     scene = r2s.Scene(mesh, held, Table.make(-jnp.inf), Air.make(density=0.0))
-    solver = r2s.Cloth.make(scene, 1 / (60 * substeps))
+    solver = r2s.Cloth.make(scene, 1 / (60 * substeps), spectral_radius=spectral_radius)
     x = flat(mesh)
     falling = jnp.where(scene.is_free[:, None], jnp.array([[0.0, 0.0, -GRAVITY]]), 0)
     handles = jnp.broadcast_to(x[held], (frames, substeps, 2, 3))
@@ -64,10 +75,12 @@ def hang(size: int, substeps: int, frames: int = FRAMES):
     return solver, solver.init(x, acceleration=falling), controls
 
 
-def explicit_hang(size: int, fabric: r2s.Fabric, frames: int = FRAMES):
-    """As `hang`, in explicit steps of a frame, for a fabric or a batch of them."""
+def explicit_hang(size: int, fabric: r2s.Fabric, frames: int = FRAMES, finer: int = 1):
+    """As `hang`, in explicit steps of a frame, for a fabric or a batch of them; `finer`: times as
+    many substeps as are needed."""
     solver, start, controls = hang(size, EXPLICIT_STEPS, frames)
     explicit = r2s.ExplicitCloth.make(solver.scene, solver.dt, fabric)
+    explicit = dataclasses.replace(explicit, substeps=finer * explicit.substeps)
     return explicit, explicit.init(start.x), controls
 
 

@@ -39,8 +39,12 @@ MUJOCO = ("peer_mujoco", "'mujoco>=3.13'")
 NEWTON = ("peer_newton", "'newton>=1.8' 'warp-lang>=1.19'")
 EXPLICIT = "forward_explicit"
 DIFFERENTIABLE = "forward", "gradient"
+ALPHA, TRIANGLES = ((f"forward_{how}", f"gradient_{how}") for how in ("alpha", "triangles"))
 SYSTEMS = [
     System("r2s", "ours", "r2s", *DIFFERENTIABLE, None, EVERY_FRAME, (1, 2, 4, 8), 32),
+    System("r2s, generalised alpha", "ours", "r2s", *ALPHA, None, EVERY_FRAME, (1, 2, 4), 32),
+    System("r2s, triangles", "ours", "r2s", *TRIANGLES, None, EVERY_FRAME, (2, 4), 32),
+    System("r2s explicit", "ours", "r2s", EXPLICIT, None, None, EVERY_FRAME, (1,), 4),
     System("mass-spring (JAX)", "peer_springs", "r2s", *DIFFERENTIABLE, LIGHT, 150, (1, 2), 16),
     System("Newton explicit", *NEWTON, EXPLICIT, "gradient", 0.0, 180, (1, 2), 16),
     System("Newton explicit, damped", *NEWTON, EXPLICIT, "gradient", LIGHT, 180, (1, 2), 16),

@@ -14,6 +14,10 @@ from _tables import Line, command_line, insert, keep, shown
 
 # by the study's name: the document, the name there, a caption, and columns (none named: all)
 TABLES = {
+    "skill": (
+        *("docs/results.md", "study_small_skill"),
+        "Error, floor and skill by configuration: mean [90 % interval].",
+    ),
     "chamfer_real_to_sim": (
         *("README.md", "study_small"),
         "Distance from the true surface to the simulation: mean [90 % interval].",
