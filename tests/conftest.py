@@ -33,7 +33,17 @@ from r2s.world.contact import Table
 from r2s.world.scene import Control, Scene
 
 # Of the tests that take minutes: each group takes less than twenty on two cores.
-SLOW_GROUPS = ("cloth", "points", "motions", "estimates", "pinn", "physnet", "study", "documents")
+SLOW_GROUPS = (
+    "cloth",
+    "points",
+    "motions",
+    "estimates",
+    "pinn",
+    "physnet",
+    "study",
+    "verdicts",
+    "documents",
+)
 # Files that take longest. They come first, so that no process ends long after the other.
 LONG = ("test_estimators", "test_study", "test_contract", "test_pinn_estimate", "test_cloth")
 MOST_MEMORY = 1000  # [MB]: a process that holds more lets its compiled programs go

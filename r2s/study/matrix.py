@@ -54,6 +54,7 @@ class Plan:
     - `judged`: motions of each of `MOTIONS` to judge by.
     - `truth`: how synthetic recordings are made. `budgets`: what estimates may cost.
     - `every`: 1 compares all frames that count, 3 every third.
+    - `draws`: of the prior, which are the default together.
     """
 
     configurations: tuple[Configuration, ...]
@@ -64,6 +65,7 @@ class Plan:
     budgets: Budgets = Budgets()
     seed: int = 0
     every: int = 1
+    draws: int = DRAWS
 
 
 ALL = Plan(
@@ -92,6 +94,7 @@ SMALL = Plan(
         training=TrainingBudget(fabrics=32, epochs=2, steps=40),
     ),
     every=3,
+    draws=2,
 )
 PRESETS = {
     "small": SMALL,
@@ -174,7 +177,7 @@ def synthetic(plan: Plan) -> list[EvaluationCell]:
                     for angle in (PULLS if is_pulled else (None,))
                 )
                 estimates.append(_estimate(configuration, sources, density, plan, repeat))
-        found += _evaluations(estimates, fabric, density, unseen, plan.every)
+        found += _evaluations(estimates, fabric, density, unseen, plan)
     return found
 
 
@@ -219,7 +222,7 @@ def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationCell]:
         ]
         for index, (recording, estimate) in enumerate(zip(own, estimates, strict=True)):
             judged = _by_scenario(_of_trial(unseen, recording))
-            found += _evaluations([estimate], recording.fabric, density, judged, plan.every)
+            found += _evaluations([estimate], recording.fabric, density, judged, plan)
             other = _other_fabric(own, index)
             if other is not None:
                 found += [
@@ -242,7 +245,7 @@ def _evaluations(
     fabric: str,
     density: float,
     judged: Iterable[tuple[Source, ...]],
-    every: int,
+    plan: Plan,
 ) -> list[EvaluationCell]:
     """Cells for estimates of a fabric, and first, on each of their solvers, for the draws that are
     the default, and for the true fabric where it is known.
@@ -254,7 +257,7 @@ def _evaluations(
     is_known = all(isinstance(each, SyntheticRecording) for group in judged for each in group)
     whose: list[tuple[EstimateCell | None, str, int | None]] = []
     for solver in solvers:
-        whose += [(None, solver, draw) for draw in range(DRAWS)]
+        whose += [(None, solver, draw) for draw in range(plan.draws)]
         whose += [(None, solver, None)] if is_known else []
     whose += [(each, each.solver, None) for each in estimates]
     return [
@@ -265,7 +268,7 @@ def _evaluations(
             fabric,
             recordings[first : first + TOGETHER],
             draw=draw,
-            every=every,
+            every=plan.every,
         )
         for estimate, solver, draw in whose
         for recordings in judged

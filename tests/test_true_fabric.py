@@ -1,0 +1,37 @@
+"""The point of a study's verdicts: on converged truths the true fabric beats knowing nothing."""
+
+import numpy as np
+import pytest
+
+from r2s.fabrics import presets
+from r2s.study import engine, results, verdicts
+from r2s.study.ensembles import read_ensemble
+from r2s.study.evaluations import EvaluationCell
+from r2s.study.matrix import DRAWS
+from r2s.study.sources import SyntheticRecording, small_strain
+from r2s.study.verdicts import SURFACE
+
+CONVERGED = 4e-3  # [m], of mesh and step, mean up to the horizon
+CHAOTIC = 0.5  # [s]: a horizon before this one tells nothing
+
+
+@pytest.mark.slow(group="verdicts")
+@pytest.mark.parametrize("motion", ["fling", "shaking"])
+@pytest.mark.parametrize("fabric", presets.FIVE)
+def test_the_true_fabric_beats_the_default_where_the_truth_is_converged(tmp_path, fabric, motion):
+    source = SyntheticRecording(fabric, motion, 0, True)
+    density = float(small_strain(fabric).density)
+    draws = (None, *range(DRAWS))
+    cells = [EvaluationCell(None, "cloth", density, fabric, (source,), each) for each in draws]
+    ensembles = verdicts.ensembles(cells)
+    assert engine.run([*ensembles, *cells], tmp_path, engine.Serial()) == {}
+    found = [row for row in results.rows(cells, tmp_path) if row.metric == SURFACE]
+    (true,) = (row for row in found if row.baseline == "true")
+    drawn = [row.value for row in found if row.baseline == "default"]
+    (ensemble,) = (read_ensemble(each, tmp_path) for each in ensembles)
+    assert true.horizon is not None and true.floor is not None
+    inside = ensemble.times < true.horizon
+    left = [ensemble.causes[cause][:, inside].mean() for cause in ("mesh", "step")]
+    assert true.horizon > CHAOTIC and np.hypot(*left) < CONVERGED
+    assert true.value < np.mean(drawn)
+    assert true.skill is not None and true.skill > 0
