@@ -148,12 +148,20 @@ def kept(function: Callable) -> Kept:
 
 
 def _plain(leaves: list) -> bool:
-    """Whether a program for this machine's only device takes these arrays, and none is traced."""
+    """Whether a program for this machine's only device takes these arrays, and none is traced.
+
+    Where JAX knows float32 alone, it would convert arrays of float64 that were made elsewhere.
+    """
     if jax.device_count() > 1 or jax.config.jax_disable_jit:  # pyright: ignore
         return False
     return not any(isinstance(leaf, Tracer) for leaf in leaves) and all(
-        leaf.devices() == set(jax.devices()) for leaf in leaves
+        leaf.devices() == set(jax.devices()) and _is_of_this_precision(leaf) for leaf in leaves
     )
+
+
+def _is_of_this_precision(leaf: Any) -> bool:
+    is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.extended)
+    return is_key or leaf.dtype.itemsize < 8 or bool(jax.config.jax_enable_x64)  # pyright: ignore
 
 
 def _shape(leaf: Any) -> tuple:

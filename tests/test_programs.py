@@ -107,6 +107,15 @@ def test_equal_numbers_of_other_types_are_other_programs(folder: Path) -> None:
     assert kinds == ["i", "f", "b"]
 
 
+def test_numbers_of_another_precision_are_converted_as_jax_does(folder: Path) -> None:
+    with jax.enable_x64(True):
+        fabric = presets.black_denim()
+    with jax.enable_x64(False):
+        found = kept(fold_length)(fabric)
+        assert found.dtype == jnp.float32
+    assert float(found) == pytest.approx(float(fold_length(fabric)), rel=1e-5)
+
+
 def test_a_source_that_changed_since_the_process_began_is_not_kept(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -63,13 +63,14 @@ class CheckGrad:
             failure = ""
             if any(row.verdict == "not finite" for row in rows):
                 failure = rollout(scenario, fabric, solver=solver).explain()
+            warning = mesh_warning(self.shape, fabric, experiment.sheet.size, self.scenario)
         agree = all(row.verdict == "agrees" for row in rows)
         lines = [f"{'parameter':22s}{'value':>12s}{'derivative':>14s}{'differences':>14s}  verdict"]
         for row in rows:
             numbers = f"{row.value:12.4g}{row.derivative:14.6g}{row.differences:14.6g}"
             lines.append(f"{row.parameter:22s}{numbers}  {row.verdict}")
         lines += [f"the simulation {failure}"] if failure else []
-        lines += mesh_warning(self.shape, fabric, experiment.sheet.size, self.scenario)
+        lines += warning
         lines.append("all derivatives agree" if agree else "NOT all derivatives agree")
         result = {
             "scenario": self.scenario,

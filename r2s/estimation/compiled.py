@@ -46,7 +46,17 @@ def loss_from(problems: Problems, seen: Sequence[Prediction]) -> float:
 
 def normal_at(problems: Problems, theta: Theta, scale: Array, width: float | None = None) -> Normal:
     """`r2s.estimation.gauss_newton.normal_at`."""
-    return _normal_from(problems, theta, derivatives_at(problems, theta, width), scale)
+    return normal_from(problems, theta, derivatives_at(problems, theta, width), scale)
+
+
+def normal_from(
+    problems: Problems,
+    theta: Theta,
+    predicted: Sequence[tuple[Prediction, Sensitivity]],
+    scale: Array,
+) -> Normal:
+    """`r2s.estimation.gauss_newton.normal_from`."""
+    return _normal_from(problems, theta, list(predicted), scale)
 
 
 def losses_at(

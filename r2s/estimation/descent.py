@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,14 +19,14 @@ from r2s.estimation.compiled import (
     derivatives_at,
     loss_from,
     losses_at,
-    normal_at,
+    normal_from,
     normals_at,
 )
 from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
 from r2s.estimation.mesh_bias import OtherMesh, mesh_bias
 from r2s.estimation.method import Budget, Progress, tell
-from r2s.estimation.prediction import Theta, explain, fabric_at
+from r2s.estimation.prediction import Prediction, Sensitivity, Theta, explain, fabric_at
 from r2s.estimation.problem import OWN, SHARED, UNITS, Problem, beginning
 from r2s.fabrics.fabric import Fabric
 
@@ -33,6 +34,7 @@ INITIAL_DAMPING = 1e-2
 STRICT, SCALES = 3.0, (3e-3, 0.015)  # of the spread, and between [m]: beyond lies an outlier
 HALVING, FEWEST = 3, 3  # iterations, after each of which half go on, but no fewer than this
 ROUGH = 3.0  # standard errors, by which places around an end lead apart
+FIRST, FAR_APART = 2, 2.0  # pairs of them, and times that, where no more are needed
 
 
 class Stop(NamedTuple):
@@ -50,6 +52,7 @@ class Stop(NamedTuple):
 # At a tenth of a standard error, or, where another descent goes on from there, at a quarter (a half
 # is too early: outliers that are left out from there on may hold it there).
 AT_THE_END, ON_THE_WAY = Stop(5e-3, 4), Stop(0.03, 2)
+Predicted = Sequence[tuple[Prediction, Sensitivity]]  # of each recording
 Row = list[Descent]  # one iteration: the descents of all starts
 
 _propose = eqx.filter_jit(gauss_newton.propose)
@@ -162,8 +165,8 @@ def judged(
     began, problems = time.perf_counter(), found.problems
     which, best = _best(found.rows[-1])
     stage, prior = _rows_of_stage(found.rows, int(best.stage)), _weight(problems, best.normal)
-    covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1))
     predicted, bias = derivatives_at(problems, best.theta, budget.width), None
+    covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1), predicted)
     if other_mesh is not None:
         bias = mesh_bias(problems, other_mesh, best, prior, predicted)
         covariance = covariance + np.outer(bias, bias)
@@ -228,7 +231,8 @@ def _next(problems: Problems, budget: Budget, rows: list[Row]) -> Row | None:
     stop = _stop(budget, now)
     kept_on = _kept(row, len(stage))
     moving = [i for i in kept_on if not _arrived(problems, stage, i, prior, stop)]
-    if not moving or len(stage) > budget.iterations:
+    is_passed = budget.near and now < _last_stage(budget)
+    if is_passed or not moving or len(stage) > budget.iterations:
         return _later(problems, budget, row)
     seen = _seen(problems, budget, now)
     trials = [_propose(problems, row[i], prior) for i in moving]
@@ -277,7 +281,12 @@ def _later(problems: Problems, budget: Budget, row: Row) -> Row | None:
 
 
 def covariance_at(
-    problems: Problems, budget: Budget, end: Descent, key: PRNGKeyArray, is_truth: bool = False
+    problems: Problems,
+    budget: Budget,
+    end: Descent,
+    key: PRNGKeyArray,
+    predicted: Predicted | None = None,
+    is_truth: bool = False,
 ) -> Float[np.ndarray, "theta theta"]:
     """Covariance of theta at the end of a descent, see `r2s.estimation.standard_errors`.
 
@@ -286,32 +295,49 @@ def covariance_at(
     nothing; then the budget's shares of the frames are tried, the largest first. If these do not
     agree either, the covariance is that of all frames. A beginning that says nothing of the fabric,
     since nothing has moved yet, agrees with everything, and does not count.
+
+    `predicted`: `derivatives_at` the end, where they are known.
     """
+    if predicted is None:
+        predicted = derivatives_at(problems, end.theta, budget.width)
     found = []
     for share in (1.0, *reversed(budget.shares)):
         seen, here = problems, end
         if share < 1:
             seen = tuple(beginning(problem, share) for problem in problems)
-            normal = normal_at(seen, end.theta, end.scale, budget.width)
+            normal = normal_from(seen, end.theta, predicted, end.scale)
             here = dataclasses.replace(end, normal=normal)
         prior = _weight(problems, here.normal)
-        neighbours = _normals_around(seen, budget, here, prior, key)
+        neighbours, agrees = _around(seen, budget, here, prior, key)
         found.append(np.asarray(_covariance(problems, here, prior, neighbours, is_truth)))
-        agrees = not neighbours or float(_disagreement(problems, here, prior, neighbours)) < ROUGH
         if agrees and (share == 1 or bool(_tells(problems, here, prior))):
             return found[-1]
     return found[0]
 
 
-def _normals_around(
+def _around(
     problems: Problems, budget: Budget, end: Descent, prior, key
-) -> standard_errors.Neighbours:
-    """The normal equations at places around the end of a descent."""
+) -> tuple[standard_errors.Neighbours, bool]:
+    """The normal equations at places around the end of a descent, and whether they agree.
+
+    Where the first pairs of opposite places disagree by far, there are no others.
+    """
     if not budget.around:
-        return []
-    places = list(_sample_around(problems, end, prior, budget.around, key))
-    normals = normals_at(problems, places, [end.scale] * len(places), budget.width)
-    return list(zip(places, normals, strict=True))
+        return [], True
+    places = _sample_around(problems, end, prior, budget.around, key)
+    pairs = list(places.reshape(2, -1, places.shape[-1]).swapaxes(0, 1))
+    neighbours: standard_errors.Neighbours = []
+    for some in (pairs[:FIRST], pairs[FIRST:]):
+        thetas = [theta for pair in some for theta in pair]
+        if not thetas:
+            continue
+        normals = normals_at(problems, thetas, [end.scale] * len(thetas), budget.width)
+        neighbours += zip(thetas, normals, strict=True)
+        is_last = len(neighbours) == budget.around
+        apart = float(_disagreement(problems, end, prior, neighbours))
+        if not apart < (ROUGH if is_last else FAR_APART * ROUGH):
+            return neighbours, False
+    return neighbours, True
 
 
 def _best(row: Row) -> tuple[int, Descent]:

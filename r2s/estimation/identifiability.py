@@ -34,7 +34,8 @@ def sensitivity(problems: Problem | Problems, fabric: Fabric) -> Estimate:
     nuisances = jnp.zeros(gauss_newton.theta_length(problems) - space.dim, float)
     theta = jnp.concatenate([place, nuisances])
     scale = jnp.asarray(NOISE, float)
-    normal = compiled.normal_at(problems, theta, scale)
+    predicted = compiled.derivatives_at(problems, theta)
+    normal = compiled.normal_from(problems, theta, predicted, scale)
     if not np.isfinite(float(normal.loss)):
         which = gauss_newton.theta_indices(problems, 0)
         why = explain(problems[0], theta[which]) or "has a loss that is not finite"
@@ -42,9 +43,10 @@ def sensitivity(problems: Problem | Problems, fabric: Fabric) -> Estimate:
     zero = jnp.zeros((), float)
     end = Descent(theta, normal, zero, zero, scale, jnp.zeros((), int))
     key = jax.random.key(0)
-    covariance = descent.covariance_at(problems, descent.DEFAULT, end, key, is_truth=True)
-    seen = [found for found, _ in compiled.derivatives_at(problems, theta)]
-    loss = compiled.loss_from(problems, seen)
+    covariance = descent.covariance_at(
+        problems, descent.DEFAULT, end, key, predicted, is_truth=True
+    )
+    loss = compiled.loss_from(problems, [seen for seen, _ in predicted])
     return descent.collect(problems, [[end]], covariance, "sensitivity", 0.0, None, loss)
 
 

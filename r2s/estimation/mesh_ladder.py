@@ -81,7 +81,7 @@ def is_too_coarse(recordings: Recordings, fabric: Fabric, shapes: Sequence[Shape
 
 def near(budget: Budget) -> Budget:
     """The budget of a descent that begins near its end."""
-    return budget._replace(coarse=0, starts=1, shares=())
+    return budget._replace(coarse=0, starts=1, shares=(), near=True)
 
 
 def _motion(recording: Recording, shape: Shape):

@@ -57,6 +57,7 @@ class Budget(NamedTuple):
     - `evaluations`: simulations of a search without derivatives.
     - `leads_on`: whether other descents go on from the end of these, on a finer mesh. Such a one
       ends within about half a standard error, as all do that are not in the last stage.
+    - `near`: whether the start is near the end already: then outliers are left out from there on.
     """
 
     coarse: int = 24
@@ -67,6 +68,7 @@ class Budget(NamedTuple):
     around: int = 8
     evaluations: int = 80
     leads_on: bool = False
+    near: bool = False
 
 
 class Reads(NamedTuple):
