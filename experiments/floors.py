@@ -18,8 +18,8 @@ from r2s.study.configuration import MOTIONS
 
 CAPTION = (
     "Mean distances [mm] up to the horizon: floor of the truth, true fabric at small strain, "
-    "default (mean of draws of the prior, least to most). What fabrics differ by, and the causes of "
-    "the floor: over the whole motion."
+    "default (mean of draws of the prior, least to most). What fabrics differ by, and the causes "
+    "of the floor: over the whole motion."
 )
 
 
