@@ -11,7 +11,7 @@ from r2s.study.matrix import DRAWS
 from r2s.study.sources import SyntheticRecording, small_strain
 from r2s.study.verdicts import SURFACE
 
-CONVERGED = 5e-3  # [m], of mesh and step, mean up to the horizon: a third of what the default is off
+CONVERGED = 5e-3  # [m], of mesh and step, mean up to the horizon
 CHAOTIC = 0.5  # [s]: a horizon before this one tells nothing
 
 

@@ -9,6 +9,7 @@ from r2s.evaluation import phase_free
 from r2s.study import engine, results, verdicts
 from r2s.study.comparisons import motion_comparisons
 from r2s.study.evaluations import EvaluationCell
+from r2s.study.report.truth_table import truth_table, verdict
 from r2s.study.rows import Row
 from r2s.study.sources import SyntheticRecording, TruthSettings, small_strain
 from r2s.study.verdicts import BEYOND, SURFACE, Judged
@@ -61,6 +62,8 @@ def test_a_truth_is_judged_beside_its_own_ensemble(tmp_path, monkeypatch):
     assert true.value < 1e-5  # it is the truth itself
     assert true.floor is not None and true.floor > 0
     assert drawn.value > 3e-3 and drawn.horizon == true.horizon
+    (line,) = truth_table(cells, tmp_path).rows
+    assert line[0] == source.name and float(line[2]) == pytest.approx(1e3 * true.floor, abs=0.01)
     (shown,) = motion_comparisons(cells, tmp_path)
     assert list(shown.motions) == ["true fabric on cloth", "default cloth"]
     assert shown.horizon == judged.horizon and np.all(shown.floor == judged.floor)
@@ -69,3 +72,10 @@ def test_a_truth_is_judged_beside_its_own_ensemble(tmp_path, monkeypatch):
     if np.isfinite(judged.horizon):
         beyond = {each.metric for each in rows if each.baseline == "true"}
         assert {BEYOND + name for name in phase_free.UNITS} <= beyond
+
+
+def test_a_truth_is_converged_where_mesh_and_step_leave_little_and_chaotic_where_trifles_grow():
+    assert verdict(0.1e-3, 0.1e-3, 1.2e-3, 1.2e-3) == "converged"
+    assert verdict(0.1e-3, 0.1e-3, 3e-3, 4e-3) == "not converged: 5.0 mm"
+    assert verdict(2.1e-3, 0.1e-3, 0.1e-3, 0.1e-3) == "chaotic"
+    assert verdict(0.0, 0.0, np.inf, 0.0) == "not converged: inf mm"

@@ -22,6 +22,7 @@ from r2s.study.evaluations import EvaluationCell, read_measured
 from r2s.study.matrix import PRESETS, Plan
 from r2s.study.report.data_table import data_table
 from r2s.study.report.parameter_ranges import range_table, truth_settings
+from r2s.study.report.truth_table import truth_table
 from r2s.study.rows import Row, write_rows
 from r2s.study.sources import GivenRecording, SyntheticRecording, read, small_strain
 from r2s.study.statistics.parameters import Estimated
@@ -108,6 +109,7 @@ def _publish(
         | truth_settings(plan.truth, _presets_of(cells)),
         paper,
         [
+            ("Truths", "", _if_any(truths=truth_table(cells, out))),
             ("Data", DATA, _if_any(data=data_table(cells, out))),
             ("Ranges and fixed values", RANGES, _if_any(ranges=range_table(cells))),
             ("Costs", "", {"costs": cost_table(took)} if took else {}),

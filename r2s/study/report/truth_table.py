@@ -1,0 +1,54 @@
+"""How well the truth of every judged motion is known: horizon, floor by cause, convergence."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from r2s.study.ensembles import Ensemble, read_ensemble
+from r2s.study.evaluations import EvaluationCell
+from r2s.study.tables import Table
+from r2s.study.verdicts import Judged, ensembles, judged_motions
+
+LEAST = 2e-3  # [m]: what mesh and step may leave, mean up to the horizon
+HEADER = (
+    *("recording", "horizon [s]", "floor [mm]"),
+    *("stiffness [mm]", "path [mm]", "mesh [mm]", "step [mm]", "verdict"),
+)
+CAPTION = (
+    "Of every judged motion: until when it tells fabrics apart, and, mean up to there, its floor "
+    "and the distances from it of the truth 0.1 % stiffer, with grippers 0.2 mm aside, on a finer "
+    f"mesh and in half the step. It is converged where the last two are below {1e3 * LEAST:g} mm "
+    "together, and chaotic where the first two are not; a prediction nearer than the floor is not "
+    "told from a better one."
+)
+
+
+def truth_table(cells: Sequence[EvaluationCell], folder: Path) -> Table:
+    """A line for each recording whose ensemble is made."""
+    judged = judged_motions(cells, folder)
+    lines = [
+        _line(cell.recording.name, judged[cell.recording], read_ensemble(cell, folder))
+        for cell in ensembles(cells)
+        if cell.recording in judged
+    ]
+    return Table(HEADER, tuple(lines), CAPTION)
+
+
+def _line(name: str, judged: Judged, ensemble: Ensemble) -> tuple[str, ...]:
+    horizon = "never" if np.isinf(judged.horizon) else f"{judged.horizon:.2f}"
+    if not judged.inside.any():
+        return name, horizon, *["-"] * 5, "no frame is known"
+    inside = np.isin(ensemble.times, judged.times[judged.inside])
+    left = {cause: float(each[:, inside].mean()) for cause, each in ensemble.causes.items()}
+    means = [left[cause] for cause in ("stiffness", "path", "mesh", "step")]
+    floor = float(judged.floor[judged.inside].mean())
+    return name, horizon, *(f"{1e3 * each:.2f}" for each in (floor, *means)), verdict(*means)
+
+
+def verdict(stiffness: float, path: float, mesh: float, step: float) -> str:
+    """Of a truth, from the mean distances of its ensemble [m]."""
+    if np.hypot(stiffness, path) > LEAST:
+        return "chaotic"
+    rest = float(np.hypot(mesh, step))
+    return "converged" if rest <= LEAST else f"not converged: {1e3 * rest:.1f} mm"
