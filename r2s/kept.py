@@ -30,6 +30,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.export
+import jax.numpy as jnp
 from jax.core import Tracer
 
 from r2s import programs
@@ -160,7 +161,7 @@ def _plain(leaves: list) -> bool:
 
 
 def _is_of_this_precision(leaf: Any) -> bool:
-    is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.extended)
+    is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.extended)
     return is_key or leaf.dtype.itemsize < 8 or bool(jax.config.jax_enable_x64)  # pyright: ignore
 
 
