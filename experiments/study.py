@@ -5,11 +5,14 @@ python experiments/study.py --data FOLDER            # recordings (see README, "
 """
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
-from r2s import programs
-from r2s.study.main import study
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # before JAX: see `r2s_command`
+
+from r2s import programs  # noqa: E402
+from r2s.study.main import study  # noqa: E402
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Estimate, and judge on motions never seen.")

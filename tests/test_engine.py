@@ -185,6 +185,15 @@ def test_a_process_apart_has_a_workers_environment_and_may_die(tmp_path, monkeyp
     assert os.environ["OPENBLAS_NUM_THREADS"] == "1"
 
 
+@pytest.mark.parametrize("set_to, expected", [(None, "3"), ("1", "3"), ("0", "0")])
+def test_workers_do_not_print_what_xla_says_of_kept_programs(monkeypatch, set_to, expected):
+    if set_to is None:
+        monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL", raising=False)
+    else:
+        monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", set_to)  # JAX sets 1 where nothing is set
+    assert environment(1)["TF_CPP_MIN_LOG_LEVEL"] == expected
+
+
 @pytest.mark.slow(group="study")
 def test_workers_of_dask_make_the_same_and_survive_a_kill(tmp_path):
     cluster = pytest.importorskip("r2s.study.cluster", reason="needs the extra cluster")

@@ -11,6 +11,7 @@ ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 # Compiles a step in 60 to 70 % of the time, and it runs as fast. XLA ends a process whose flags it
 # does not know: only releases that do are asked.
 COMPILE_FAST, KNOWN_TO = "--xla_cpu_use_fusion_emitters=false", "0.10."
+JAX_LEVEL = "1"  # of XLA's messages: JAX sets it where it is not set
 LOOK = 0.1  # [s], to see which core is idle
 
 
@@ -60,12 +61,13 @@ def environment(workers: int, compilation_cache: Path | None = None) -> dict[str
     wrong in a batch does not stop the others. Compiled programs are kept in `compilation_cache`,
     by default where `r2s.programs.keep` has them.
     """
+    level = os.environ.get("TF_CPP_MIN_LOG_LEVEL", JAX_LEVEL)
     one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     found = one | {
         "XLA_FLAGS": one_thread(os.environ.get("XLA_FLAGS", "")),
         "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.9 / workers:.3f}",
         "EQX_ON_ERROR": "nan",
-        "TF_CPP_MIN_LOG_LEVEL": os.environ.get("TF_CPP_MIN_LOG_LEVEL", "3"),  # see `r2s_command`
+        "TF_CPP_MIN_LOG_LEVEL": "3" if level == JAX_LEVEL else level,  # see `r2s_command`
     }
     if compilation_cache is not None:
         found |= {"JAX_COMPILATION_CACHE_DIR": str(compilation_cache)}
