@@ -31,9 +31,10 @@ class EstimateCard:
     """Estimate a fabric from recordings of it, and write its card.
 
     RECORDING is an NPZ of r2s, a folder of them, or a folder of frames with its manifest; several
-    are taken for the same fabric. Says whether the method converged, and which numbers ended at a
-    bound of their range. A killed run of diffcloud, diffcp, physnet, or pinn from pulls goes on
-    where it was, from FILE.progress.npz.
+    are taken for the same fabric. Of three or more the last motion with clouds is held out: the
+    estimate is judged on it, beside fabrics of which only the weight is known. Says whether the
+    method converged, and which numbers ended at a bound of their range. A killed run of diffcloud,
+    diffcp, physnet, or pinn from pulls goes on where it was, from FILE.progress.npz.
 
     diffcloud differentiates through the cloth, diffcp through material points, cma-es tries fabrics
     on either. pinn fits a network to the markers and force of stretchings, or to the clouds of
@@ -42,6 +43,7 @@ class EstimateCard:
     Names with -published follow the recipes of the papers.
 
         r2s estimate lift.npz --density 0.32 --out denim.json
+        r2s estimate lift.npz wind.npz fling.npz --density 0.32 --out denim.json
         r2s estimate warp.npz weft.npz --method pinn --angles 0 90 --density 0.2 --out mine.json
     """
 
@@ -73,6 +75,8 @@ class EstimateCard:
     shape: tuple[int, int] | None = None
     """Vertices of the simulated sheet; by default diffcloud goes to finer meshes until one resolves
     the fabric, others take 9 9."""
+    hold_out: Annotated[str | None, arg(metavar="NAME|none")] = None
+    """Recording to judge the estimate by, which is not made from it; none: of all of them."""
     seed: int = 0
     """Seed of the coarse search, or of the network and its search."""
     date: str = ""
@@ -85,9 +89,9 @@ class EstimateCard:
 
         from r2s.commands.common import print_result
         from r2s.commands.waiting import Waiting
-        from r2s.estimation import cards
+        from r2s.estimation import cards, held_out
         from r2s.estimation.estimate import describe
-        from r2s.estimation.method import default_space
+        from r2s.estimation.method import COARSEST, default_space, tell
         from r2s.files import check_folders
         from r2s.recordings.open import open_recordings
 
@@ -100,9 +104,15 @@ class EstimateCard:
             method.check(seen)
             space = default_space(method.chosen_solver, self.density)
             key = jax.random.key(self.seed)
+            unseen = self._hold_out(seen)
             estimate = method.estimate(seen, space, self._budget(method), key=key)
+            judged = []
+            for each in unseen:
+                tell(progress, f"judging by {each.info.name}")
+                shape = estimate.shape or COARSEST
+                judged.append(held_out.judge(each, estimate.fabric, shape).describe())
         provenance = cards.Provenance(
-            method=f"estimated by r2s: {estimate.approach}",
+            method="; ".join([f"estimated by r2s: {estimate.approach}", *judged]),
             source="; ".join(dict.fromkeys(each.info.source for each in seen)),
             recordings=tuple((each.info.name, cards.fingerprint(each)) for each in seen),
             date=self.date,
@@ -112,9 +122,25 @@ class EstimateCard:
         cards.write(self.out, card)
         for path in self.out.parent.glob(f"{escape(self._progress_file.stem)}*.npz"):
             path.unlink()
-        lines = [*describe(estimate), *_warnings(estimate, seen), f"{self.out}: {card.name}"]
+        lines = [
+            *describe(estimate),
+            *_warnings(estimate, seen),
+            *judged,
+            f"{self.out}: {card.name}",
+        ]
         print_result(self.json, cards.as_json(card), lines)
         return 0
+
+    def _hold_out(self, seen: "list[Recording]") -> "list[Recording]":
+        """Take what is to be held out from the recordings, and return it: one, or none."""
+        from r2s.estimation import held_out
+
+        if self.angles and self.hold_out is None:
+            return []  # one pull in each direction
+        if self.angles and self.hold_out != held_out.NONE:
+            raise ValueError("--hold-out does not go with --angles: name the recordings left")
+        index = held_out.choose(seen, self.hold_out)
+        return [] if index is None else [seen.pop(index)]
 
     @property
     def _progress_file(self) -> Path:

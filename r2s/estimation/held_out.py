@@ -1,0 +1,114 @@
+"""Is an estimate better than knowing nothing? Told by a recording that it was not made from.
+
+Of three recordings or more one is held out; the estimate is judged on it beside fabrics of which
+nothing but the weight is known (`r2s.fabrics.prior`).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.random as jr
+import numpy as np
+
+from r2s.evaluation import prediction_error
+from r2s.fabrics import prior
+from r2s.fabrics.fabric import Fabric
+from r2s.recordings.recording import Recording
+from r2s.scenarios.scenario import from_recording
+
+FEWEST = 3  # recordings, of which one is held out without being asked for
+NONE = "none"  # the name by which no recording is held out
+DRAWS = 8
+
+
+class HeldOut(NamedTuple):
+    """What a recording that was held out says of an estimate.
+
+    - `recording`: its name. `error`: the mean distance of its points from the estimate's surface,
+      over the frames that count, [m]; infinite where the simulation diverged.
+    - `defaults`: the same of draws of the prior, without those that diverged, [m]. `diverged`: how
+      many did.
+    """
+
+    recording: str
+    error: float
+    defaults: tuple[float, ...]
+    diverged: int
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the estimate is nearer than the draws are on average; False where none ran."""
+        return bool(self.defaults) and self.error < float(np.mean(self.defaults))
+
+    def describe(self) -> str:
+        """One line; a warning where the estimate is no better than knowing nothing."""
+        lost = f", {self.diverged} more diverged" if self.diverged else ""
+        errors = np.array(self.defaults or (np.nan,))
+        least, most, mean = (_mm(each) for each in (errors.min(), errors.max(), errors.mean()))
+        known = f"knowing nothing {mean} mm ({least} to {most}, {len(self.defaults)} draws{lost})"
+        error = f"{_mm(self.error)} mm" if np.isfinite(self.error) else "the simulation diverged"
+        words = f"held out, {self.recording}: {error}; {known}"
+        if self.is_better:
+            best = self.error < min(self.defaults)
+            return f"{words}: better than {'every draw' if best else 'the draws on average'}"
+        return f"warning: {words}: not better than knowing nothing"
+
+
+def choose(recordings: Sequence[Recording], name: str | None = None) -> int | None:
+    """Which recording to hold out; None: none of them.
+
+    `name`: of the recording, or `NONE`; None: the last one with clouds that is no stretching (a
+    clamped sheet looks alike of any fabric), where there are `FEWEST` or more. Raises `ValueError`
+    for an unknown name, for two recordings of that name, for one without clouds, and where none
+    would be left.
+    """
+    if name == NONE:
+        return None
+    with_clouds = [i for i, each in enumerate(recordings) if has_clouds(each)]
+    if name is None:
+        moving = [i for i in with_clouds if recordings[i].info.scenario != "stretching"]
+        return moving[-1] if len(recordings) >= FEWEST and moving else None
+    found = [i for i, each in enumerate(recordings) if each.info.name == name]
+    if len(found) != 1:
+        known = ", ".join(each.info.name for each in recordings)
+        raise ValueError(f"{len(found) or 'no'} recordings are called {name!r}; there are {known}")
+    if len(recordings) < 2:
+        raise ValueError(f"{name!r} is the only recording: nothing is left to estimate from")
+    if found[0] not in with_clouds:
+        raise ValueError(f"{name!r} has no clouds to be judged by")
+    return found[0]
+
+
+def has_clouds(recording: Recording) -> bool:
+    """Whether it has clouds, and not its markers in their place, in every frame that counts."""
+    first, last = recording.info.frames_used
+    counts = np.count_nonzero(np.asarray(recording.mask), axis=1)[first : last + 1]
+    if np.any(counts == 0):
+        return False
+    return recording.markers is None or recording.points.shape[1] > recording.markers.shape[1]
+
+
+def judge(
+    recording: Recording, fabric: Fabric, shape: tuple[int, int], count: int = DRAWS
+) -> HeldOut:
+    """The errors of a fabric and of `count` draws of its density in a recording.
+
+    All are simulated by the cloth on a mesh of `shape`, in the scenario's steps.
+    """
+    drawn = prior.draws(float(fabric.density), count, jr.key(0))
+    each = [jax.tree.map(lambda leaf, i=i: leaf[i], drawn) for i in range(count)]
+    error, *others = (_error(recording, one, shape) for one in (fabric, *each))
+    finite = tuple(other for other in others if np.isfinite(other))
+    return HeldOut(recording.info.name, error, finite, count - len(finite))
+
+
+def _error(recording: Recording, fabric: Fabric, shape: tuple[int, int]) -> float:
+    scenario = from_recording(recording, shape)
+    x = prediction_error.predict_motion(scenario, fabric).x
+    away = prediction_error.from_surface(recording, x, shape)
+    return float(np.mean(away)) if np.isfinite(away).all() else float("inf")
+
+
+def _mm(value: float | np.floating) -> str:
+    return f"{1e3 * float(value):.1f}"

@@ -1,0 +1,77 @@
+"""A recording that an estimate was not made from says whether it is better than knowing nothing."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from r2s import scenarios
+from r2s.estimation import held_out
+from r2s.estimation.held_out import HeldOut
+from r2s.fabrics import presets
+from r2s.scenarios import synthetic
+
+SHAPE = (5, 5)
+
+
+def called(recording, name, scenario="lifting"):
+    info = dataclasses.replace(recording.info, name=name, scenario=scenario)
+    return dataclasses.replace(recording, info=info)
+
+
+@pytest.fixture(scope="module")
+def lift():
+    experiment = scenarios.lifting(num_frames=8, height=0.15)
+    fabric = presets.grey_interlock()
+    return synthetic.record(experiment, fabric, "interlock", shape=SHAPE, key=jax.random.key(0))
+
+
+def test_the_last_motion_with_clouds_is_held_out_of_three_or_more(lift):
+    a, b = called(lift, "a"), called(lift, "b")
+    pull = called(lift, "pull", "stretching")
+    assert held_out.choose([a, b]) is None
+    assert held_out.choose([a, b, pull]) == 1
+    assert held_out.choose([pull, pull, pull]) is None
+    assert held_out.choose([a, b, called(lift, "c")]) == 2
+    assert held_out.choose([a, b, pull], held_out.NONE) is None
+    assert held_out.choose([a, b], "a") == 0
+
+
+def test_what_cannot_be_held_out_is_named(lift):
+    a = called(lift, "a")
+    with pytest.raises(ValueError, match="'x'; there are a"):
+        held_out.choose([a], "x")
+    with pytest.raises(ValueError, match="2 recordings"):
+        held_out.choose([a, a], "a")
+    with pytest.raises(ValueError, match="nothing is left"):
+        held_out.choose([a], "a")
+    without = dataclasses.replace(a, mask=np.zeros_like(np.asarray(a.mask)))
+    with pytest.raises(ValueError, match="no clouds"):
+        held_out.choose([without, called(lift, "b")], "a")
+
+
+def test_the_true_fabric_is_better_than_draws_and_a_wrong_one_is_not(lift):
+    true = presets.grey_interlock()
+    found = held_out.judge(lift, true, SHAPE, count=3)
+    assert found.is_better and found.error < 4e-3 and len(found.defaults) + found.diverged == 3
+    board = jax.tree.map(lambda leaf: leaf, true)
+    board = dataclasses.replace(board, bending=jax.tree.map(lambda b: 1e4 * b, true.bending))
+    wrong = held_out.judge(lift, board, SHAPE, count=3)
+    assert not wrong.is_better and wrong.defaults == found.defaults
+
+
+def test_a_run_that_diverged_is_no_better_than_anything():
+    assert not HeldOut("fling", float("inf"), (1e-2,), 0).is_better
+    assert not HeldOut("fling", 1e-3, (), 8).is_better
+    assert "diverged" in HeldOut("fling", float("inf"), (1e-2,), 0).describe()
+
+
+def test_the_line_says_better_or_warns():
+    good = HeldOut("fling", 4e-3, (8e-3, 12e-3), 1).describe()
+    assert good == (
+        "held out, fling: 4.0 mm; knowing nothing 10.0 mm (8.0 to 12.0, 2 draws, 1 more diverged): "
+        "better than every draw"
+    )
+    assert HeldOut("fling", 9e-3, (8e-3, 12e-3), 0).describe().endswith("draws on average")
+    assert HeldOut("fling", 11e-3, (8e-3, 12e-3), 0).describe().startswith("warning: held out")
