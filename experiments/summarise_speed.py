@@ -1,76 +1,18 @@
 """Put what `benchmarks/cloth.py` found into docs/speed.md.
 
-python benchmarks/cloth.py --only hang --sizes 9 17 33 --references 9 17 33 --out results/speed.json
-python experiments/summarise_speed.py results/speed.json
+python experiments/summarise_speed.py results/speed.json    # that the benchmark wrote
 
-Its runs become the table `hang`, and of each system the cheapest run within 2 mm over half a second
-the table `hang_at_equal_error`: files of OUT, and between the marks of their names in the document.
+The runs of the part "hang" become the table `hang`, and of each system the cheapest run within 2 mm
+over half a second `hang_at_equal_error`: files of OUT, and between the marks of their names there.
 """
 
 import json
 from pathlib import Path
-from typing import Any
 
-from _tables import Line, command_line, insert, keep, shown
+from _speed import EQUAL, RUNS, at_equal_error, runs
+from _tables import command_line, insert, keep, shown
 
-DOCUMENT, LIMIT = Path("docs/speed.md"), 2.0  # [mm], over the first half second
-RUNS = (
-    "One second of the scene hang in CPU seconds of one core, median (least to most); error: rms "
-    "distance from the same system with its smallest steps; slope: the gradient over differences."
-)
-EQUAL = "The cheapest run of each system within 2 mm over 0.5 s, and its time over that of r2s."
-
-
-def runs(rows: list[dict[str, Any]]) -> list[Line]:
-    """Every run: times, errors and its gradient over that by differences."""
-    return [
-        {
-            "side": str(row["size"]),
-            "system": row["system"],
-            "steps": str(row["steps"]),
-            "forward [s]": _span(row, "forward_cpu_s"),
-            "value and gradient [s]": _span(row, "gradient_cpu_s"),
-            "error over 0.5 s [mm]": _number(row.get("error_half_mm")),
-            "error over 1 s [mm]": _number(row.get("error_mm")),
-            "slope": _ratio(row.get("slope"), row.get("slope_by_differences")),
-            "compiled in, forward / gradient [s]": f"{_number(row.get('forward_build_s'))} / "
-            f"{_number(row.get('gradient_build_s'))}",
-        }
-        for row in rows
-        if "limit_mm" not in row
-    ]
-
-
-def at_equal_error(rows: list[dict[str, Any]]) -> list[Line]:
-    """The cheapest run of each system that is near enough."""
-    return [
-        {
-            "side": str(row["size"]),
-            "system": row["system"],
-            "steps": str(row["steps"]),
-            "forward [s]": _number(row["forward_s"]),
-            "over r2s": _number(row["forward_ratio"]),
-            "value and gradient [s]": _number(row["gradient_s"]),
-            "over r2s's": _number(row["gradient_ratio"]),
-        }
-        for row in rows
-        if row.get("limit_mm") == LIMIT and row["error"] == "error_half_mm"
-    ]
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
-
-
-def _ratio(value: float | None, over: float | None) -> str:
-    return "-" if value is None or not over else f"{value / over:.3g}"
-
-
-def _span(row: dict[str, Any], name: str) -> str:
-    if name not in row:
-        return "-"
-    return f"{row[name]:.3g} ({row[name + '_min']:.3g} to {row[name + '_max']:.3g})"
-
+DOCUMENT = Path("docs/speed.md")
 
 if __name__ == "__main__":
     parser = command_line(__doc__, "docs/results")

@@ -31,10 +31,10 @@ SHORT = ["--motion", "num_frames=4", "moving=0.15", "--shape", "3", "3"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_has_two_examples(capsys: pytest.CaptureFixture, command: str) -> None:
+def test_help_has_two_examples_or_more(capsys: pytest.CaptureFixture, command: str) -> None:
     assert stopped(command, "--help") == 0
     text = capsys.readouterr().out
-    assert text.count(f"    r2s {command}") == 2 and "--json" in text
+    assert text.count(f"    r2s {command}") >= 2 and "--json" in text
 
 
 @pytest.mark.parametrize(

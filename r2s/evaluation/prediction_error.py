@@ -67,7 +67,7 @@ def against_motion(
 
 def from_surface(
     recording: Recording, x: Float[np.ndarray, "frame vertex 3"], shape: tuple[int, int] = (9, 9)
-) -> Float[np.ndarray, " frame"]:
+) -> Float[np.ndarray, " used"]:
     """Mean distance [m] of a recording's points from a motion's surface in each frame that counts.
 
     `x`: the positions of the motion, [m]; NaN where it diverged. `shape`: its vertices.

@@ -12,6 +12,7 @@ from r2s.study.cells import Cell, read_metadata, with_dependencies
 from r2s.study.evaluations import EvaluationCell
 from r2s.study.matrix import Plan, synthetic
 from r2s.study.tables import Table, significant
+from r2s.study.verdicts import ensembles
 
 CORES = (2, 16)  # of the machines for which a forecast is made
 
@@ -32,9 +33,10 @@ class Cost(NamedTuple):
 
 
 def costs(cells: Iterable[Cell], folder: Path) -> list[Cost]:
-    """The costs of cells and what they need, as far as they are made."""
-    groups = defaultdict(list)
-    for cell in with_dependencies(cells):
+    """The costs of cells, what they need, and their ensembles, as far as they are made."""
+    groups, cells = defaultdict(list), list(cells)
+    judges = [cell for cell in cells if isinstance(cell, EvaluationCell)]
+    for cell in with_dependencies([*ensembles(judges), *cells]):
         if cell.is_made(folder):
             groups[cell.compilation_group].append(read_metadata(cell, folder))
     return [
@@ -65,7 +67,8 @@ def forecast(costs: Sequence[Cost], plan: Plan) -> Table:
     """
     seconds = {cost.group: cost.each for cost in costs}
     counts: dict[str, int] = defaultdict(int)
-    for cell in with_dependencies(synthetic(plan)):
+    cells = synthetic(plan)
+    for cell in with_dependencies([*ensembles(cells), *cells]):
         counts[cell.compilation_group] += (
             len(cell.recordings) if isinstance(cell, EvaluationCell) else 1
         )
