@@ -35,6 +35,8 @@ from r2s.study.starts import started
 MEASURED, MOTION = "measured.json", "motion.npz"
 # vertices of the simulated sheet: with 25 x 25 a fling of grey interlock is 7 mm off
 SHAPES = {"cloth": (33, 33), "points": (9, 9)}
+# substeps a second, above which implicit steps, of so many seconds, are three times as fast
+MOST, IMPLICIT = 150_000, 1 / 240
 LADDER = math.sqrt(2)  # steps between frames are powers of this: few programs to compile
 
 
@@ -185,7 +187,8 @@ def predict(
 ) -> list[Motion]:
     """The motions of a fabric in recordings of one scenario.
 
-    `solver`: "cloth" in explicit steps, whose own error is that of their mesh alone, or "points"
+    `solver`: "cloth" in explicit steps, whose own error is that of their mesh alone (in implicit
+    ones for fabrics that need more than `MOST`: what bends so stiffly moves smoothly), or "points"
     for material points in a grid that serves all recordings. `starts`: of each recording the shape
     in its first frame [m], see `r2s.study.starts`; none: from flat sheets.
     """
@@ -196,6 +199,8 @@ def predict(
     in_equal_steps = [dataclasses.replace(scenario, substeps=most) for scenario in scenarios]
     make = _points if solver == "points" else _explicit
     shared = make(in_equal_steps, fabric)
+    if shared is None:
+        return [_implicit(scenario, fabric) for scenario in in_equal_steps]
     motions = []
     for scenario in in_equal_steps:
         own = eqx.tree_at(lambda s: s.scene, shared, scenario.scene)
@@ -203,8 +208,15 @@ def predict(
     return motions
 
 
-def _explicit(scenarios: list[Scenario], fabric: Fabric) -> ExplicitCloth:
-    return explicit_cloth(scenarios[0], fabric)
+def _explicit(scenarios: list[Scenario], fabric: Fabric) -> ExplicitCloth | None:
+    """None where there would be too many substeps."""
+    solver = explicit_cloth(scenarios[0], fabric)
+    return solver if solver.substeps / solver.dt <= MOST else None
+
+
+def _implicit(scenario: Scenario, fabric: Fabric) -> Motion:
+    steps = max(scenario.substeps, math.ceil(scenario.interval / IMPLICIT - 1e-9))
+    return prediction_error.predict_motion(dataclasses.replace(scenario, substeps=steps), fabric)
 
 
 def _points(scenarios: list[Scenario], fabric: Fabric) -> Sheet:
