@@ -1,6 +1,6 @@
 """Which approach, which simulator, which scenario? Every cell of the study, and its report.
 
-python experiments/study.py --preset small           # minutes; "paper" and "full" are for a cluster
+python experiments/study.py --preset small           # an hour; "paper" and "full" are for a cluster
 python experiments/study.py --data FOLDER            # recordings (see README, "Your recordings")
 """
 

@@ -1,14 +1,19 @@
 """From what shape a prediction of a hanging sheet starts."""
 
+import dataclasses
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from r2s.cloth.explicit import ExplicitCloth
 from r2s.evaluation.surface_distance import to_surface
+from r2s.fabrics import presets
 from r2s.recordings.recording import cloud
 from r2s.scenarios.six import SIX
 from r2s.study.cells import execute
-from r2s.study.evaluations import SHAPES, predict
+from r2s.study.evaluations import SHAPES, _explicit, predict
 from r2s.study.sources import SyntheticRecording, TruthSettings, read, read_start, small_strain
 from r2s.study.starts import SETTLING, started
 
@@ -52,6 +57,18 @@ def test_the_true_fabric_begins_where_its_recording_does(tmp_path):
 
     assert np.all(away([start]) < 2e-3)
     assert np.all(away(()) > 5e-3)
+
+
+def test_only_what_bends_and_damps_very_stiffly_is_predicted_in_implicit_steps():
+    scenarios = [FLING.scenario((33, 33))]
+    usual = presets.black_denim()
+    assert isinstance(_explicit(scenarios, usual), ExplicitCloth)
+    board = dataclasses.replace(
+        usual,
+        bending=jax.tree.map(lambda b: 0 * b + 1e-3, usual.bending),
+        damping=jnp.asarray(0.07),
+    )
+    assert _explicit(scenarios, board) is None
 
 
 def test_given_recordings_and_lying_sheets_have_no_start(tmp_path):
