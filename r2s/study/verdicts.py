@@ -103,10 +103,11 @@ def _place(row: Row) -> tuple[str, ...]:
 
 def _within(row: Row, away: Float[np.ndarray, " frame"], judged: Judged) -> Row:
     inside = judged.inside
-    if not inside.any() or not np.isfinite(away).all():  # what diverges later is lost, too
+    if not inside.any():
         return replace(row, value=np.nan, horizon=judged.horizon)
-    value, floor = float(np.mean(away[inside])), float(np.mean(judged.floor[inside]))
-    return replace(row, value=value, floor=floor, horizon=judged.horizon)
+    is_lost = not np.isfinite(away).all()  # what diverges later is lost, too
+    value, floor = np.nan if is_lost else np.mean(away[inside]), np.mean(judged.floor[inside])
+    return replace(row, value=float(value), floor=float(floor), horizon=judged.horizon)
 
 
 def _with_skills(rows: list[Row]) -> list[Row]:
