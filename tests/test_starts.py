@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 from r2s.cloth.explicit import ExplicitCloth
+from r2s.evaluation import prediction_error
+from r2s.evaluation.prediction_error import Motion
 from r2s.evaluation.surface_distance import to_surface
 from r2s.fabrics import presets
 from r2s.recordings.recording import cloud
+from r2s.scenarios.in_explicit_steps import explicit_cloth
 from r2s.scenarios.six import SIX
 from r2s.study.cells import execute
-from r2s.study.evaluations import SHAPES, _explicit, predict
+from r2s.study.evaluations import SHAPES, _explicit, _until_stable, predict
 from r2s.study.sources import SyntheticRecording, TruthSettings, read, read_start, small_strain
 from r2s.study.starts import SETTLING, started
 
@@ -69,6 +72,19 @@ def test_only_what_bends_and_damps_very_stiffly_is_predicted_in_implicit_steps()
         damping=jnp.asarray(0.07),
     )
     assert _explicit(scenarios, board) is None
+
+
+def test_a_prediction_of_the_cloth_that_is_lost_is_made_again_in_shorter_substeps(monkeypatch):
+    scenario, fabric, tried = FLING.scenario((5, 5)), presets.grey_interlock(), []
+    solver = explicit_cloth(scenario, fabric)
+
+    def motion(_, __, solver):
+        tried.append(solver.substeps)
+        return Motion(np.zeros((1, 25, 3)), "" if len(tried) > 1 else "was unstable")
+
+    monkeypatch.setattr(prediction_error, "predict_motion", motion)
+    assert _until_stable(scenario, fabric, solver).failure == ""
+    assert tried == [solver.substeps, 2 * solver.substeps]
 
 
 def test_given_recordings_and_lying_sheets_have_no_start(tmp_path):

@@ -9,9 +9,11 @@ from r2s.evaluation import phase_free
 from r2s.study import engine, results, verdicts
 from r2s.study.comparisons import motion_comparisons
 from r2s.study.evaluations import EvaluationCell
+from r2s.study.report.skill_table import skill_table
 from r2s.study.report.truth_table import truth_table, verdict
 from r2s.study.rows import Row
 from r2s.study.sources import SyntheticRecording, TruthSettings, small_strain
+from r2s.study.statistics.skills import skills, with_floor
 from r2s.study.verdicts import BEYOND, SURFACE, Judged
 
 FABRIC = "grey_interlock"
@@ -41,8 +43,24 @@ def test_only_what_is_within_the_horizon_counts():
     found = verdicts._within(row(0.5), np.array([4.0, 6.0, 99.0, 99.0]) * 1e-3, judged)
     assert (found.value, found.floor, found.horizon) == (5e-3, 1.5e-3, 2.0)
     lost = verdicts._within(row(0.5), np.array([4e-3, np.nan, np.nan, np.nan]), judged)
-    assert np.isnan(lost.value)  # diverged within it
+    assert np.isnan(lost.value) and lost.floor == 1.5e-3  # diverged within it
     assert np.isnan(verdicts._within(row(0.5), times, judged._replace(horizon=0.0)).value)
+
+
+def test_a_run_that_is_lost_counts_against_its_configuration_in_the_table():
+    times = np.arange(4.0)
+    judged = Judged(times, np.full(4, 1e-3), np.inf)
+    runs = [
+        verdicts._within(row(0.5, repeat=repeat), np.full(4, error), judged)
+        for repeat, error in (("0", 3e-3), ("1", np.nan))
+    ]
+    drawn = verdicts._within(row(0.5, "default"), np.full(4, 9e-3), judged)
+    rows = with_floor(verdicts._with_skills([*runs, drawn]), SURFACE)
+    assert len(rows) == 3
+    (lost,) = (each for c, each in skills(rows, "fling").items() if c.approach)
+    assert (lost.mean, lost.diverged, lost.runs) == (-np.inf, 1, 2)
+    line = skill_table(rows, SURFACE).rows[0]
+    assert "1 of 2 diverged" in line[1] and "1 of 2 diverged" in line[3]
 
 
 @pytest.mark.slow(group="study")
