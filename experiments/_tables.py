@@ -5,7 +5,6 @@ import csv
 import importlib.metadata
 import io
 import os
-import platform
 import shlex
 import sys
 import time
@@ -13,6 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from r2s.files import write_text
+from r2s.study.environment import processor
 
 Line = dict[str, str]  # of a table, by column
 
@@ -26,11 +26,8 @@ def command_line(document: str | None, out: str) -> argparse.ArgumentParser:
 
 def machine() -> str:
     """Describe this machine: the number of cores that may be used, and the processor."""
-    cpus = Path("/proc/cpuinfo")
-    lines = cpus.read_text().splitlines() if cpus.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{cores} cores, {names[0] if names else platform.processor() or platform.machine()}"
+    return f"{cores} cores, {processor()}"
 
 
 def write(path: Path, lines: Sequence[Line], caption: str, facts: Line | None = None) -> None:

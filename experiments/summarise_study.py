@@ -7,6 +7,7 @@ marks of its name in a document.
 """
 
 import csv
+import sys
 import time
 from pathlib import Path
 
@@ -23,7 +24,11 @@ if __name__ == "__main__":
     parser = command_line(__doc__, "docs/results")
     parser.add_argument("results", type=Path)
     a = parser.parse_args()
-    version = {x["setting"]: x["value"] for x in table(a.results, "settings")}["version of r2s"]
+    settings = {x["setting"]: x["value"] for x in table(a.results, "settings")}
+    made_by = [name for name in settings if name.startswith("cells made by ")]
+    if len(made_by) != 1:
+        sys.exit(f"error: {a.results} is mixed, make it anew: {'; '.join(made_by) or 'of none'}")
+    version = settings["version of r2s"]
     seconds = sum(float(x["CPU seconds in all"]) for x in table(a.results, "costs"))
     made = time.gmtime((a.results / "results.csv").stat().st_mtime)
     facts = {

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from r2s.files import write_bytes
+from r2s.study.environment import processor
 
 FORMAT = "r2s-cell/1"
 KEY_LENGTH = 16  # of a key in the name of a file, hexadecimal digits
@@ -107,6 +108,7 @@ def execute(cell: Cell, folder: Path) -> None:
             "name": cell.name,
             "config": repr(cell),
             "versions": VERSIONS,
+            "processor": processor(),
             "seconds": time.perf_counter() - began,
             "cpu_seconds": time.process_time() - cpu_began,
             "peak_memory_MB": _peak_memory(),  # of the process so far

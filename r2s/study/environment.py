@@ -1,6 +1,7 @@
 """What a process that makes cells has in its environment, before JAX looks at it."""
 
 import os
+import platform
 from importlib.metadata import version
 from pathlib import Path
 
@@ -72,3 +73,11 @@ def environment(workers: int, compilation_cache: Path | None = None) -> dict[str
     if compilation_cache is not None:
         found |= {"JAX_COMPILATION_CACHE_DIR": str(compilation_cache)}
     return found
+
+
+def processor() -> str:
+    """The processor's name, [-]; that of its architecture where the system tells no more."""
+    cpus = Path("/proc/cpuinfo")
+    lines = cpus.read_text().splitlines() if cpus.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

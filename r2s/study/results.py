@@ -20,6 +20,7 @@ from r2s.study.costs import cost_table, costs, forecast
 from r2s.study.estimates import ESTIMATE, EstimateCell, read_estimate
 from r2s.study.evaluations import EvaluationCell, read_measured
 from r2s.study.matrix import PRESETS, Plan
+from r2s.study.origins import origins
 from r2s.study.report.data_table import data_table
 from r2s.study.report.parameter_ranges import range_table, truth_settings
 from r2s.study.report.truth_table import truth_table
@@ -106,7 +107,8 @@ def _publish(
         missing,
         {"recordings": source}
         | {f.name: str(getattr(plan, f.name)) for f in fields(plan)}
-        | truth_settings(plan.truth, _presets_of(cells)),
+        | truth_settings(plan.truth, _presets_of(cells))
+        | {f"cells made by {words}": str(count) for words, count in origins(cells, out).items()},
         paper,
         [
             ("Truths", "", _if_any(truths=truth_table(cells, out))),
