@@ -221,8 +221,9 @@ def test_bounds_are_named_at_both_ends_and_nowhere_else():
     stored = json.loads(json.dumps(as_json(found), allow_nan=False))
     assert stored["at_bounds"] == expected and stored["converged"] is False
     assert from_json(stored).at_bounds == expected
-    (last,) = [line for line in describe(found) if line.startswith("at a bound")]
-    assert last == "at a bound: warp (lower), weft (upper), coupling (lower), friction (upper)"
+    (last,) = [line for line in describe(found) if "at a bound" in line]
+    named = "warp (lower), weft (upper), coupling (lower), friction (upper)"
+    assert last == f"warning: at a bound, beyond which the truth may lie: {named}"
 
 
 def test_an_estimate_of_version_0_2_0_is_read():

@@ -181,11 +181,27 @@ class EstimateCard:
 
 
 def _warnings(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[str]:
-    """Where the mesh of the estimate is too coarse for the fabric that came out."""
+    """Recordings that contradict each other; where the mesh of the estimate is too coarse for the
+    fabric that came out."""
     from r2s.commands.common import mesh_warning
 
+    lines = _contradiction(estimate, recordings)
     if estimate.shape is None:
-        return []
+        return lines
     motions = dict.fromkeys((each.info.sheet.size, each.info.scenario) for each in recordings)
     shape, fabric = estimate.shape, estimate.fabric
-    return [line for each in motions for line in mesh_warning(shape, fabric, *each)]
+    return [*lines, *(line for each in motions for line in mesh_warning(shape, fabric, *each))]
+
+
+def _contradiction(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[str]:
+    """Which recording contradicts the others, if one does."""
+    found = estimate.contradiction
+    if found is None:
+        return []
+    names = [each.info.name for each in recordings]
+    against = "the others" if len(names) > 2 else names[1 - found.recording]
+    return [
+        f"warning: {names[found.recording]} contradicts {against} (by chance {found.p:.1g}; "
+        f"{found.parameter} {found.errors:.1f} standard errors apart): another fabric, or its "
+        "density, scale, path or markers are not as written down"
+    ]

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation import checkpoint as checkpoints
 from r2s.estimation import gauss_newton, standard_errors
+from r2s.estimation.agreement import contradiction
 from r2s.estimation.compiled import (
     derivatives_at,
     loss_from,
@@ -173,7 +174,22 @@ def judged(
     seconds = found.seconds + time.perf_counter() - began
     converged = _arrived(problems, stage, which, prior, _stop(budget, int(best.stage)))
     loss = loss_from(problems, [seen for seen, _ in predicted])
-    return collect(problems, found.rows, covariance, approach, seconds, converged, loss, bias)
+    estimate = collect(problems, found.rows, covariance, approach, seconds, converged, loss, bias)
+    against = contradiction(problems, each_alone(problems, budget, best.theta, key), bias)
+    return dataclasses.replace(estimate, contradiction=against)
+
+
+def each_alone(
+    problems: Problems, budget: Budget, theta: Theta, key: PRNGKeyArray
+) -> list[Descent]:
+    """The ends of descents in each of several recordings alone, from a theta of all of them."""
+    if len(problems) < 2:
+        return []
+    alone = budget._replace(coarse=0, starts=1, shares=(), near=True, leads_on=True)
+    starts = (theta[theta_indices(problems, which)] for which in range(len(problems)))
+    pairs = zip(problems, starts, strict=True)
+    found = [search((problem,), alone, start=start, key=key) for problem, start in pairs]
+    return [_best(each.rows[-1])[1] for each in found]
 
 
 def _begin(problems: Problems, budget: Budget, start, progress, key) -> Row:

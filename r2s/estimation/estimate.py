@@ -27,6 +27,19 @@ class Nuisance(NamedTuple):
     standard_error: float
 
 
+class Contradiction(NamedTuple):
+    """A recording that leads elsewhere than the others, see `r2s.estimation.agreement`.
+
+    - `recording`: its index. `p`: how likely that is by chance, [-].
+    - `parameter`: in which they are the most standard errors apart, `errors`, [-].
+    """
+
+    recording: int
+    p: float
+    parameter: str
+    errors: float
+
+
 class Combination(NamedTuple):
     """A product of powers of parameters (for those on a linear scale: a sum) that is known.
 
@@ -61,6 +74,8 @@ class Estimate:
       errors, which hold it (`r2s.estimation.mesh_bias`). None: that was not judged.
     - `shape`: vertices of the simulated sheet along warp and weft; None: it has none, or a file
       does not say.
+    - `contradiction`: of the recordings the one that leads elsewhere than the others; None: none
+      does, or that was not judged.
     """
 
     approach: str
@@ -78,6 +93,7 @@ class Estimate:
     loss_unit: str = "m^2"
     mesh_bias: np.ndarray | None = None
     shape: tuple[int, int] | None = None
+    contradiction: Contradiction | None = None
 
     @property
     def at_bounds(self) -> dict[str, Literal["lower", "upper"]]:
@@ -200,6 +216,7 @@ def describe(estimate: Estimate) -> list[str]:
     if estimate.converged is not None:
         words = "yes" if estimate.converged else "no, the budget ended the search"
         lines.append(f"converged: {words}")
-        named = (f"{name} ({side})" for name, side in estimate.at_bounds.items())
-        lines.append(f"at a bound: {', '.join(named) or 'none'}")
+        named = ", ".join(f"{name} ({side})" for name, side in estimate.at_bounds.items())
+        warned = f"warning: at a bound, beyond which the truth may lie: {named}"
+        lines.append(warned if named else "at a bound: none")
     return lines

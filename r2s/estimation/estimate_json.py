@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from r2s.estimation.estimate import Estimate, Nuisance
+from r2s.estimation.estimate import Contradiction, Estimate, Nuisance
 from r2s.fabrics.fabric_json import fabric_as_json, fabric_from_json
 from r2s.fabrics.parameters import Range
 
@@ -42,6 +42,7 @@ def as_json(estimate: Estimate) -> dict[str, Any]:
         "combinations": [each._asdict() for each in estimate.combinations],
         "shape": None if estimate.shape is None else list(estimate.shape),
         "mesh_bias": None if estimate.mesh_bias is None else _nested(estimate.mesh_bias),
+        "contradiction": estimate.contradiction and estimate.contradiction._asdict(),
         "nuisances": [
             each._asdict()
             | {
@@ -97,7 +98,12 @@ def from_json(stored: dict[str, Any]) -> Estimate:
         loss_unit=stored["loss_unit"],
         shape=None if stored.get("shape") is None else tuple(stored["shape"]),
         mesh_bias=None if stored.get("mesh_bias") is None else _numbers(stored["mesh_bias"]),
+        contradiction=_contradiction(stored.get("contradiction")),
     )
+
+
+def _contradiction(stored: dict[str, Any] | None) -> Contradiction | None:
+    return None if stored is None else Contradiction(**stored)
 
 
 def upgraded(stored: dict[str, Any]) -> dict[str, Any]:

@@ -32,9 +32,9 @@ def covariance(
 
     Where derivatives are not finite only the prior is known.
     """
-    off = _step_ends(problems, end, prior, neighbours) - end.theta[None]
+    off = step_ends(problems, end, prior, neighbours) - end.theta[None]
     off = jnp.where(is_truth, off - off[:1], off)
-    sandwich, root = _sandwich(problems, end, prior)
+    sandwich, root = sandwich_of(problems, end, prior)
     far = jnp.linalg.norm(jnp.linalg.solve(root, off.T), axis=0)
     limit = FARTHEST * jnp.median(far)
     off = off * jnp.where(far > limit, limit / far, 1)[:, None]
@@ -50,8 +50,8 @@ def disagreement(
 
     Next to zero where the loss is smooth; infinite where derivatives are not finite.
     """
-    led = _step_ends(problems, end, prior, neighbours)
-    _, root = _sandwich(problems, end, prior)
+    led = step_ends(problems, end, prior, neighbours)
+    _, root = sandwich_of(problems, end, prior)
     far = jnp.linalg.norm(jnp.linalg.solve(root, (led - led[:1]).T), axis=0)[1:]
     return jnp.median(jnp.where(jnp.isfinite(far), far, jnp.inf))
 
@@ -70,14 +70,14 @@ def sample_around(
 ) -> Float[Array, "place theta"]:
     """Places one standard error away from the end of a descent, an even `count`, in opposite
     pairs."""
-    sandwich, root = _sandwich(problems, end, prior)
+    sandwich, root = sandwich_of(problems, end, prior)
     signs = jax.random.rademacher(key, (count // 2, len(sandwich)), sandwich.dtype)
     places = end.theta[None] + jnp.concatenate([signs, -signs]) @ root.T
     bounded = jnp.arange(len(sandwich)) < problems[0].space.dim
     return jnp.where(bounded[None], jnp.clip(places, MARGIN, 1 - MARGIN), places)
 
 
-def _sandwich(problems: Problems, end: Descent, prior):
+def sandwich_of(problems: Problems, end: Descent, prior):
     """The covariance of an estimate, had it arrived and were the loss smooth, and its root."""
     _, precision = prior_terms(problems, end.theta)
     inverse = jnp.linalg.inv(end.normal.matrix + prior * jnp.diag(precision))
@@ -88,7 +88,7 @@ def _sandwich(problems: Problems, end: Descent, prior):
     return sandwich, deviation[:, None] * axes * jnp.sqrt(jnp.maximum(squares, least))[None]
 
 
-def _step_ends(
+def step_ends(
     problems: Problems, end: Descent, prior, neighbours: Neighbours
 ) -> Float[Array, "place theta"]:
     """Where the Gauss-Newton steps of the end and of its neighbours lead, regardless of bounds.
