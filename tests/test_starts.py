@@ -16,7 +16,7 @@ from r2s.recordings.recording import cloud
 from r2s.scenarios.in_explicit_steps import explicit_cloth
 from r2s.scenarios.six import SIX
 from r2s.study.cells import execute
-from r2s.study.evaluations import SHAPES, _explicit, _until_stable, predict
+from r2s.study.evaluations import _explicit, _until_stable, predict
 from r2s.study.sources import SyntheticRecording, TruthSettings, read, read_start, small_strain
 from r2s.study.starts import SETTLING, started
 
@@ -45,20 +45,22 @@ def test_a_sheet_on_the_table_starts_flat():
 
 
 @pytest.mark.slow(group="study")
-def test_the_true_fabric_begins_where_its_recording_does(tmp_path):
+def test_the_true_fabric_begins_where_its_recording_does(tmp_path, monkeypatch):
     """Flat sheets of two meshes come to rest in two shapes, a centimetre apart."""
+    shape = (25, 25)
+    monkeypatch.setattr("r2s.study.evaluations.SHAPES", {"cloth": shape})
     source = SyntheticRecording("camel_ponte_roma", "fling", 0, True, TruthSettings())
     execute(source, tmp_path)
     recording, start = read(source, tmp_path), read_start(source, tmp_path)
     assert start is not None and start.shape == (*source.truth.shape, 3)
-    faces = FLING.scenario(SHAPES["cloth"]).scene.mesh.faces
+    faces = FLING.scenario(shape).scene.mesh.faces
 
     def away(starts):
         (moved,) = predict([recording], small_strain(source.fabric), "cloth", starts)
         clouds = [cloud(recording, frame) for frame in (0, 3)]
         return to_surface(clouds, np.asarray(moved.x)[[0, 3]], faces)
 
-    assert np.all(away([start]) < 2e-3)
+    assert np.all(away([start]) < 3e-3)
     assert np.all(away(()) > 5e-3)
 
 
