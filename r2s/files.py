@@ -6,6 +6,7 @@ import json
 import math
 import os
 import shutil
+import types
 import typing
 from collections.abc import Mapping
 from pathlib import Path
@@ -61,7 +62,8 @@ def write_json(path: Path | str, value: Any) -> None:
 def read_json(path: Path | str, kind: type[T]) -> T:
     """Read the dataclass `kind` from JSON: its fields, no more and (but for defaults) no less.
 
-    Fields are numbers (finite), strings, booleans, tuples (JSON lists), mappings and dataclasses.
+    Fields are numbers (finite), strings, booleans, tuples (JSON lists), mappings and dataclasses,
+    or one of these or null.
     The metadata "unknown" of a field is the hint in the error when it is missing or null. Raises
     OSError, or a ValueError that names the file and the field: no JSON, fields missing or unknown,
     values of another type, or what `kind` itself refuses.
@@ -70,7 +72,12 @@ def read_json(path: Path | str, kind: type[T]) -> T:
         value = json.loads(Path(path).read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path}: no JSON: {error}") from error
-    return _read(kind, value, f"{path}")
+    return parse(kind, value, f"{path}")
+
+
+def parse(kind: type[T], value: Any, where: str) -> T:
+    """The dataclass `kind` from what JSON gave, as `read_json`; errors begin with `where`."""
+    return _read(kind, value, where)
 
 
 def _free(folder: Path) -> str:
@@ -81,7 +88,11 @@ def _free(folder: Path) -> str:
 
 
 def _read(kind: Any, value: Any, where: str) -> Any:
-    """`value` (from JSON) as `kind`: a dataclass, tuple, mapping or plain type."""
+    """`value` (from JSON) as `kind`: a dataclass, tuple, mapping or plain type, or one or None."""
+    if isinstance(kind, types.UnionType):
+        if value is None:
+            return None
+        (kind,) = (each for each in typing.get_args(kind) if each is not types.NoneType)
     if dataclasses.is_dataclass(kind):
         return _read_fields(kind, value, where)
     arguments = typing.get_args(kind)

@@ -5,11 +5,12 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from r2s.estimation.prediction import Prediction, Sensitivity
-from r2s.estimation.problem import FORCE_SCALE, Clouds, Force, Markers, Problem
+from r2s.estimation.problem import FORCE_SCALE, Clouds, Expected, Force, Markers, Problem
 from r2s.evaluation.losses import (
+    TOUCHING,
     length,
     masked_mean,
     robust,
@@ -18,6 +19,7 @@ from r2s.evaluation.losses import (
     surface_residuals,
 )
 from r2s.geometry.mesh import Mesh, borders
+from r2s.recordings.cameras.views import in_view
 
 Scale = Float[Array, ""] | float
 Loss = Callable[[Problem, Prediction], Float[Array, ""]]  # [m^2]
@@ -25,6 +27,7 @@ Loss = Callable[[Problem, Prediction], Float[Array, ""]]  # [m^2]
 PATCHES = 3  # along a side of the sheet: what lies in one patch errs alike
 MEMORY = 8  # frames, in which it does so
 SLACK = 3e-3  # [m], which noise seldom throws a point of a depth camera beyond a border
+APART = 5e-3  # [m], about as far as points of a cloud are from each other
 FLATTEST = 0.3  # curvature of a robust loss over the mean weight, at least
 
 
@@ -61,6 +64,9 @@ def loss_of(problem: Problem, seen: Prediction, scale: Scale = 0.0) -> Float[Arr
     if problem.markers is not None:
         gap = _gaps(problem.markers, seen.x)
         total += masked_mean(robust(length(gap), scale), problem.markers.seen)
+    if problem.expected is not None:
+        gap, counts = _to_clouds(problem.expected, seen.x)
+        total += masked_mean(robust(length(gap), scale), counts)
     if problem.force is not None and seen.force is not None:
         total += _force_loss(problem.force, _force_gaps(problem.force, seen.force))
     return total
@@ -76,6 +82,8 @@ def normal_equations_of(
         parts.append(_of_clouds(problem.clouds, mesh, seen, slope, scale))
     if problem.markers is not None:
         parts.append(_of_markers(problem.markers, seen, slope, scale))
+    if problem.expected is not None:
+        parts.append(_of_expected(problem.expected, mesh, seen, slope, scale))
     if problem.force is not None and seen.force is not None and slope.force is not None:
         parts.append(_of_force(problem.force, seen.force, slope.force))
     return NormalEquations(
@@ -114,6 +122,24 @@ def _of_markers(markers: Markers, seen: Prediction, slope: Sensitivity, scale) -
     scores = jnp.einsum("fm,fmi,fmiu->mu", weight, gap, jacobian)
     matrices = jnp.einsum("fm,fmiu,fmiv->muv", weight, jacobian, jacobian)
     return _of_robust(distance, markers.seen, scale, scores, matrices)
+
+
+def _of_expected(
+    expected: Expected, mesh: Mesh, seen: Prediction, slope: Sensitivity, scale
+) -> NormalEquations:
+    gap, counts = _to_clouds(expected, seen.x)
+    distance = length(gap)
+    direction = gap / jnp.maximum(distance, TOUCHING)[..., None]
+    weight = _weights(distance, counts, scale)
+    place = jnp.einsum("sk,ski->si", expected.weights, mesh.rest[expected.vertices])
+
+    def frame(args):
+        slope, direction, distance, weight = args
+        moved = jnp.einsum("sk,skiu->siu", expected.weights, slope[expected.vertices])
+        return _by_patch(mesh, place, jnp.einsum("si,siu->su", direction, moved), distance, weight)
+
+    shares = jax.lax.map(frame, (slope.x, direction, distance, weight))
+    return _of_robust(distance, counts, scale, *(_by_time(share) for share in shares))
 
 
 def _of_force(force: Force, pulled: Array, slope: Array) -> NormalEquations:
@@ -198,6 +224,31 @@ def _residuals(clouds: Clouds, mesh: Mesh, seen: Prediction, scale: Scale):
         return surface_residuals(points, mask, x, mesh.faces, edges, slack)
 
     return jax.lax.map(frame, (clouds.points, clouds.mask, seen.x))
+
+
+def _to_clouds(
+    expected: Expected, x: Float[Array, "frame vertex 3"]
+) -> tuple[Float[Array, "frame sample 3"], Bool[Array, "frame sample"]]:
+    """From the nearest point of its cloud to each sample of the sheet [m], and which count.
+
+    Nothing counts in a frame without points. As far as points are apart from each other says
+    nothing: gaps are shorter by that, the mean distance of a random place from the nearest.
+    """
+    frozen = jax.lax.stop_gradient(x)
+
+    def frame(args):
+        x, frozen, targets, mask, grippers = args
+        samples = jnp.einsum("sk,ski->si", expected.weights, x[expected.vertices])
+        places = jnp.einsum("sk,ski->si", expected.weights, frozen[expected.vertices])
+        far = jnp.where(mask, 0, jnp.inf)
+        pairs = jnp.sum((places[:, None] - targets[None]) ** 2, axis=-1) + far[None]
+        gap = samples - targets[jnp.argmin(pairs, axis=1)]
+        counts = in_view(expected.views, places, grippers) & jnp.any(mask)
+        away = length(gap)
+        beyond = jnp.maximum(away - APART, 0) / jnp.maximum(away, TOUCHING)
+        return jnp.where(counts[:, None], beyond[:, None] * gap, 0), counts
+
+    return jax.lax.map(frame, (x, frozen, expected.targets, expected.mask, expected.grippers))
 
 
 def _gaps(markers: Markers, x: Float[Array, "frame vertex 3"]) -> Float[Array, "frame marker 3"]:

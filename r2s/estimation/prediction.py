@@ -1,9 +1,9 @@
 """What a recording would show if the sheet were of a given fabric, and how that changes with it.
 
 `theta` is a flat vector: the fabric's place in its space; then the density of the sheet and of the
-air, which all recordings of a fabric share; then of every recording the cameras' shift, turn and
-clock. All but the place are nuisances, in units of the standard deviation that
-`r2s.estimation.problem.NuisancePrior` gives them.
+air and the sheet's size, which all recordings of a fabric share; then of every recording the
+cameras' shift, turn and clock. All but the place are nuisances, in units of the standard deviation
+that `r2s.estimation.problem.NuisancePrior` gives them.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from r2s.estimation.problem import OWN, SHARED, Problem
 from r2s.fabrics.fabric import Fabric
 from r2s.scenarios.energy import clamp_force, energy_balance
-from r2s.scenarios.scenario import rollout
+from r2s.scenarios.scenario import resized, rollout
 
 Theta = Float[Array, " theta"]
 
@@ -98,9 +98,10 @@ def sensitivities(
 
 def _moving(problem: Problem) -> list[int]:
     """Indices in theta of what changes the motion: the fabric, and the density of sheet and air
-    where the prior lets them vary."""
+    and the sheet's size where the prior lets them vary."""
     dim, prior = problem.space.dim, problem.nuisance_prior
-    shared = [dim + i for i, scale in enumerate((prior.density, prior.air)) if scale]
+    scales = (prior.density, prior.air, prior.size)
+    shared = [dim + i for i, scale in enumerate(scales) if scale]
     return [*range(dim), *shared]
 
 
@@ -147,8 +148,14 @@ def _conditions(problem: Problem, theta: Theta):
             lambda part: part.scene.air.density, part, replace_fn=lambda density: density * ratio
         )
 
+    size = problem.nuisance_prior.size
+    if size and problem.solver is not None:
+        raise ValueError("the size of the sheet is estimated on the cloth alone")
+    scenario = thicken(problem.scenario)
+    if size:
+        scenario = resized(scenario, jnp.exp(size * theta[problem.space.dim + 2]))
     solver = None if problem.solver is None else thicken(problem.solver)
-    return thicken(problem.scenario), fabric_at(problem, theta), solver
+    return scenario, fabric_at(problem, theta), solver
 
 
 def _move(problem: Problem, theta: Theta):
@@ -171,7 +178,7 @@ def _seen_from(problem: Problem, x: Float[Array, "all 3"] | Array, theta: Theta)
     turn = jnp.stack([jnp.stack([cosine, -sine]), jnp.stack([sine, cosine])])
     offset = x - pivot
     turned = jnp.concatenate([offset[..., :2] @ turn.T, offset[..., 2:]], axis=-1)
-    return pivot + turned + prior.shift * own[None, None, :3]
+    return pivot + turned + (jnp.asarray(prior.shifts, x.dtype) * own[:3])[None, None]
 
 
 def _delayed(x: Float[Array, "all vertex 3"], delay: Float[Array, ""]) -> Array:

@@ -13,10 +13,14 @@ from r2s.estimation.method import Reads, frames_that_count
 from r2s.fabrics.parameters import ParameterSpace
 from r2s.geometry.mesh import Mesh
 from r2s.geometry.surface import nearest
-from r2s.recordings.recording import Recording, subsample
+from r2s.recordings.cameras.views import Views
+from r2s.recordings.recording import Doubt, Recording, subsample
 from r2s.scenarios.scenario import Scenario, from_recording
+from r2s.world.scene import along_path
 
 POINTS = 300  # at most, of a cloud
+TARGETS = 1200  # at most, of a cloud that the sheet must lie near
+SPACING = 0.012  # [m], of the samples of such a sheet
 FORCE_SCALE = 0.02  # [m/N]: a load cell is good to 10 mN where a marker is to 0.2 mm
 
 
@@ -26,39 +30,51 @@ class NuisancePrior(NamedTuple):
     These nuisances are estimated along with the fabric, so that an error of calibration is not
     taken for a property of the fabric.
 
-    - `shift`: of the cameras' frame against the grippers', [m].
+    - `shift`: of the cameras' frame against the grippers', [m]; of each axis, or of all alike.
     - `turn`: of the same, about the vertical through the first gripper, [rad].
     - `time`: delay of the cameras' clock behind the grippers', [s].
     - `density`: of the sheet, where it was not weighed, relative.
     - `air`: of the force of the air at its speed (its density, its drag), relative.
+    - `size`: of the sheet's side length, where it was not measured, relative.
     """
 
-    shift: float = 0.015
+    shift: float | tuple[float, float, float] = 0.015
     turn: float = 0.15
     time: float = 0.0
     density: float = 0.0
     air: float = 0.0
+    size: float = 0.0
+
+    @property
+    def shifts(self) -> tuple[float, float, float]:
+        """The standard deviations of the shift along x, y and z, [m]."""
+        return self.shift if isinstance(self.shift, tuple) else (self.shift, self.shift, self.shift)
 
     @property
     def scales(self) -> tuple[float, ...]:
         """The standard deviations in the order of `SHARED` and `OWN`."""
-        return (self.density, self.air, *(self.shift,) * 3, self.turn, self.time)
+        return (self.density, self.air, self.size, *self.shifts, self.turn, self.time)
 
 
 USUAL = NuisancePrior()
 WIND = 0.1  # of the wind's force: 5 % of its speed, or as much as is known of a fabric's drag
-SHARED: tuple[str, ...] = ("density", "air")  # nuisances that all recordings of a fabric share
+# nuisances that all recordings of a fabric share
+SHARED: tuple[str, ...] = ("density", "air", "size")
 OWN: tuple[str, ...] = ("shift x", "shift y", "shift z", "turn", "time")  # nuisances of each
 UNITS = {"shift x": "m", "shift y": "m", "shift z": "m", "turn": "rad", "time": "s"}
 
 
-def default_nuisance_prior(scenario: Scenario) -> NuisancePrior:
-    """The usual prior: the cameras' place may be off, and the force of a wind that blows.
+def default_nuisance_prior(scenario: Scenario, doubt: Doubt | None = None) -> NuisancePrior:
+    """What is in doubt of a recording: the cameras' place, and the force of a wind that blows.
+
+    `doubt`: what the recording says of its own; None: the usual.
 
     A sheet in wind weighs the air against its density to a part in five thousand. Were both taken
     as exact, an error of 1 % in either could be explained by half the stiffness.
     """
-    return USUAL._replace(air=0.0 if scenario.wind is None else WIND)
+    own = USUAL if doubt is None else NuisancePrior(doubt.shift, doubt.turn, doubt.time)
+    size = 0.0 if doubt is None else doubt.size
+    return own._replace(air=0.0 if scenario.wind is None else WIND, size=size)
 
 
 class Clouds(eqx.Module):
@@ -77,6 +93,23 @@ class Markers(eqx.Module):
     weights: Float[Array, "marker 3"]
 
 
+class Expected(eqx.Module):
+    """Where the sheet itself must lie near the clouds: in its parts that cameras had in view.
+
+    - `views`: the cameras, and what became of their points.
+    - `vertices`, `weights`: samples of the sheet, off its borders.
+    - `grippers`: in the frames that count, [m].
+    - `targets`, `mask`: denser clouds of these frames, [m], and which points are no padding.
+    """
+
+    views: Views = eqx.field(static=True)
+    vertices: Int[Array, "sample 3"]
+    weights: Float[Array, "sample 3"]
+    grippers: Float[Array, "frame gripper 3"]
+    targets: Float[Array, "frame target 3"]
+    mask: Bool[Array, "frame target"]
+
+
 class Force(eqx.Module):
     """Force on the clamp [N] at the frames that count, along `directions`, where measured."""
 
@@ -92,6 +125,7 @@ class Problem(eqx.Module):
     - `space`: the fabrics to choose from.
     - `frames`: which frames of the scenario count.
     - `clouds`, `markers`, `force`: what was seen in them; None: it was not.
+    - `expected`: what must have been seen of the sheet; None: nobody knows the cameras.
     - `solver`: what simulates; None: the cloth, in the scenario's steps.
     - `nuisance_prior`: how far the experiment may be off what was written down.
     """
@@ -104,6 +138,7 @@ class Problem(eqx.Module):
     force: Force | None = None
     solver: Any = None
     nuisance_prior: NuisancePrior = eqx.field(static=True, default=USUAL)
+    expected: Expected | None = None
 
     @classmethod
     def make(
@@ -139,8 +174,9 @@ class Problem(eqx.Module):
         first, last = recording.info.frames_used
         frames = slice(first, last + 1)
         markers = _markers(recording, scenario.scene.mesh, frames)
-        clouds = None
+        clouds, expected = None, None
         if markers is None:
+            expected = _expected(recording, scenario, frames, seed)
             thinned = subsample(recording, num_points, voxel, seed)
             clouds = Clouds(thinned.points[frames], thinned.mask[frames])
             if as_seen and scenario.brake is not None and first == 0:
@@ -154,7 +190,8 @@ class Problem(eqx.Module):
             markers,
             _force(recording, frames) if recording.info.scenario == "stretching" else None,
             solver,
-            default_nuisance_prior(scenario) if nuisance_prior is None else nuisance_prior,
+            nuisance_prior or default_nuisance_prior(scenario, recording.info.doubt),
+            expected,
         )
 
 
@@ -164,7 +201,7 @@ def read_by_problem(recording: Recording) -> Reads:
     is_pulled = recording.info.scenario == "stretching"
     return Reads(
         frames_that_count(recording),
-        points=0 if has_markers else POINTS,
+        points=0 if has_markers else POINTS if recording.info.views is None else TARGETS,
         markers=has_markers,
         force=is_pulled and recording.force is not None,
     )
@@ -183,7 +220,7 @@ def window(problem: Problem, first: int, last: int) -> Problem:
         )
     index = jnp.array(kept)
 
-    def pick(part: Any, names: tuple[str, str]) -> Any:
+    def pick(part: Any, names: tuple[str, ...]) -> Any:
         if part is None:
             return None
         return dataclasses.replace(part, **{name: getattr(part, name)[index] for name in names})
@@ -194,12 +231,13 @@ def window(problem: Problem, first: int, last: int) -> Problem:
         clouds=pick(problem.clouds, ("points", "mask")),
         markers=pick(problem.markers, ("positions", "seen")),
         force=pick(problem.force, ("values", "seen")),
+        expected=pick(problem.expected, ("grippers", "targets", "mask")),
     )
 
 
 def motion_alone(problem: Problem) -> Problem:
     """The problem without clouds and markers, on which no prediction depends."""
-    return dataclasses.replace(problem, clouds=None, markers=None)
+    return dataclasses.replace(problem, clouds=None, markers=None, expected=None)
 
 
 def beginning(problem: Problem, share: float) -> Problem:
@@ -224,6 +262,34 @@ def beginning(problem: Problem, share: float) -> Problem:
         clouds=hide(problem.clouds, "mask"),
         markers=hide(problem.markers, "seen"),
         force=hide(problem.force, "seen"),
+        expected=hide(problem.expected, "mask"),
+    )
+
+
+def _expected(
+    recording: Recording, scenario: Scenario, frames: slice, seed: int
+) -> Expected | None:
+    """What must be seen of the sheet of a recording whose cameras are known."""
+    views, mesh = recording.info.views, scenario.scene.mesh
+    if views is None:
+        return None
+    size = np.max(np.asarray(mesh.rest), axis=0)
+    around = [np.arange(views.border + SPACING / 2, side - views.border, SPACING) for side in size]
+    places = np.stack(np.meshgrid(*around, indexing="ij"), axis=-1).reshape(-1, 2)
+    if not len(places):
+        raise ValueError(
+            f"{recording.info.name}: a sheet of {size} m has no place off a border of "
+            f"{views.border:g} m: narrow the border of its views"
+        )
+    flat, rest = (
+        jnp.pad(jnp.asarray(part, float), ((0, 0), (0, 1))) for part in (places, mesh.rest)
+    )
+    face, weights = nearest(flat, rest, mesh.faces)
+    dense = subsample(recording, TARGETS, None, seed)
+    times = np.asarray(recording.times)[frames]
+    grippers = along_path(jnp.asarray(times), recording.handle_times, recording.handle_path)
+    return Expected(
+        views, mesh.faces[face], weights, grippers, dense.points[frames], dense.mask[frames]
     )
 
 

@@ -145,6 +145,39 @@ def borders(mesh: Mesh) -> Bool[Array, "face 3"]:
     return ~jnp.isin(edges, name(mesh.hinges[:, 0], mesh.hinges[:, 1]))
 
 
+def resized(mesh: Mesh, ratio: Float[Array, ""] | float) -> Mesh:
+    """The sheet cut `ratio` times as long and as wide, of the same vertices."""
+
+    def bends(part: Bends) -> Bends:
+        return dataclasses.replace(
+            part,
+            per_angle=part.per_angle / ratio,
+            rest_curvature=part.rest_curvature / ratio,
+        )
+
+    waves = mesh.samples.hidden_waves
+    samples = dataclasses.replace(
+        mesh.samples,
+        gradients=mesh.samples.gradients / ratio,
+        areas=mesh.samples.areas * ratio**2,
+        hidden_waves=None if waves is None else waves / ratio,
+    )
+    plate = dataclasses.replace(
+        mesh.plate, bends=bends(mesh.plate.bends), areas=mesh.plate.areas * ratio**2
+    )
+    return dataclasses.replace(
+        mesh,
+        rest=mesh.rest * ratio,
+        area=mesh.area * ratio**2,
+        vertex_area=mesh.vertex_area * ratio**2,
+        hinge_length=mesh.hinge_length * ratio,
+        hinge_area=mesh.hinge_area * ratio**2,
+        hinge_bends=bends(mesh.hinge_bends),
+        samples=samples,
+        plate=plate,
+    )
+
+
 def rectangle(
     size: tuple[float, float], shape: tuple[int, int] = (9, 9), elements: str = "wrinkling"
 ) -> Mesh:

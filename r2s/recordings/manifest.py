@@ -4,7 +4,7 @@ import hashlib
 import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,10 @@ from jaxtyping import Float
 
 from r2s.files import read_json
 from r2s.recordings.cameras.rgbd import find_rig, read_clouds, read_rig
+from r2s.recordings.cameras.views import Views, shifted
 from r2s.recordings.readers.clouds import find_frames, read_cloud, read_values
 from r2s.recordings.recording import (
+    Doubt,
     Recording,
     RecordingInfo,
     SheetPlacement,
@@ -60,6 +62,22 @@ class Gripper:
 
 
 @dataclass(frozen=True)
+class Session:
+    """Recordings that were calibrated alike, and what moves their clouds into the world.
+
+    - `recordings`: a regex for the whole folder name.
+    - `shift`: is added to their points in the world, [m]; `note` says how it was found.
+    - `workspace`: that they were cropped to, before the shift, [m]; None: that of the scenario's
+      views.
+    """
+
+    recordings: str
+    shift: Vector
+    note: str
+    workspace: tuple[Vector, Vector] | None = None
+
+
+@dataclass(frozen=True)
 class Scenario:
     """How the recordings of one experiment lie on the disk and in the world.
 
@@ -70,6 +88,10 @@ class Scenario:
     A folder for which there is a cameras.json holds RGB-D images (`r2s.recordings.cameras.rgbd`)
     instead of clouds: the cameras' own times or rate come before `frame_rate`, and `cloud`
     transforms what cameras.json calls the world. No hashes are kept of images.
+
+    - `sessions`: what moves the points of some recordings, after `cloud`, and with them the
+      `views`; a recording belongs to one of them, where there are any.
+    - `doubt`, `views`: see `r2s.recordings.recording.RecordingInfo`.
     """
 
     folder: str
@@ -82,6 +104,9 @@ class Scenario:
     frames_used: tuple[int, int]  # first and last, inclusive
     drop_repeats: bool  # keep one of points that are equal
     first_frame: int = 0
+    sessions: tuple[Session, ...] = ()
+    doubt: Doubt | None = None
+    views: Views | None = None
 
     def __post_init__(self) -> None:
         _positive("frame_rate", self.frame_rate, "Hz")
@@ -218,6 +243,8 @@ def read_recording(
         clouds, verified = [to_world(scenario.cloud, points) for points in seen], None
     else:
         times, clouds, verified = _numbered_clouds(folder, manifest, name, scenario, path, watch)
+    session = _session(scenario, name)
+    clouds = [points + np.array(session.shift) for points in clouds]
     source = f"{manifest.source.repository} {manifest.source.commit} {manifest.source.path}"
     info = RecordingInfo(
         name=name,
@@ -230,6 +257,8 @@ def read_recording(
         table_height=scenario.table_height,
         verified=verified,
         time_offset=scenario.time_offset,
+        doubt=scenario.doubt,
+        views=_moved_views(scenario.views, session),
     )
     return make_recording(
         clouds,
@@ -255,6 +284,25 @@ def _numbered_clouds(
     kept = [_distinct(points) if scenario.drop_repeats else points for points in clouds.values()]
     world = [to_world(scenario.cloud, points) for points in kept]
     return np.arange(len(frames)) / scenario.frame_rate, world, verified
+
+
+def _session(scenario: Scenario, name: str) -> Session:
+    """The session that a recording belongs to; one that moves nothing where there are none."""
+    if not scenario.sessions:
+        return Session(".*", (0.0, 0.0, 0.0), "")
+    fits = [each for each in scenario.sessions if re.fullmatch(each.recordings, name)]
+    if len(fits) != 1:
+        known = [each.recordings for each in scenario.sessions]
+        raise ValueError(f"{name!r} fits {len(fits)} sessions, expected one of: {known}")
+    return fits[0]
+
+
+def _moved_views(views: Views | None, session: Session) -> Views | None:
+    """The views of a session's recordings, in the world."""
+    if views is None:
+        return None
+    cropped = views if session.workspace is None else replace(views, workspace=session.workspace)
+    return shifted(cropped, session.shift)
 
 
 def _scenario_of(manifest: Manifest, name: str) -> tuple[str, str, str]:

@@ -12,11 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from r2s.files import write_bytes
+from r2s.files import parse, write_bytes
+from r2s.recordings.cameras.views import Views
 from r2s.recordings.readers.clouds import voxel_means
 
-FORMAT = "r2s-recording/2"
-READABLE = ("r2s-recording/1", FORMAT)  # the first knew neither force nor markers nor wind
+FORMAT = "r2s-recording/3"
+# the first knew neither force nor markers nor wind, the second neither doubt nor views
+READABLE = ("r2s-recording/1", "r2s-recording/2", FORMAT)
 CORNERS = {"origin": (0, 0), "warp": (1, 0), "weft": (0, 1), "opposite": (1, 1)}
 OPTIONAL = ("force", "force_times", "markers", "markers_seen")
 CLOCK_TOLERANCE = 1e-6  # [s], rounding when a time is a frame number over a rate
@@ -59,6 +61,29 @@ def corner(sheet: SheetPlacement, name: str) -> Float[np.ndarray, "3"]:
 
 
 @dataclass(frozen=True)
+class Doubt:
+    """Standard deviations of what was written down of a recording; 0: it is exact.
+
+    - `shift`: of the cameras' frame against that of the grippers along x, y and z, [m].
+    - `turn`: of the same about the vertical, [rad].
+    - `time`: of the cameras' clock against that of the grippers, [s].
+    - `size`: of the sheet's side length, relative.
+
+    Raises ValueError for one that is negative or not finite.
+    """
+
+    shift: tuple[float, float, float]
+    turn: float
+    time: float = 0.0
+    size: float = 0.0
+
+    def __post_init__(self) -> None:
+        for value in (*self.shift, self.turn, self.time, self.size):
+            if not (np.isfinite(value) and value >= 0):
+                raise ValueError(f"doubt: standard deviations must not be negative, found {self}")
+
+
+@dataclass(frozen=True)
 class RecordingInfo:
     """What a recording is of.
 
@@ -66,6 +91,8 @@ class RecordingInfo:
     - `wind`: of the air around the sheet, None where nobody measured it.
     - `time_offset`: what was added to the cameras' clock to give `Recording.times`; a negative one
       says that the cameras lag behind the grippers. `set_time_offset` changes it.
+    - `doubt`: how far all this may be off; None: nobody said.
+    - `views`: the cameras and what became of their points; None: nobody wrote them down.
 
     Raises ValueError for a wind or an offset that is not finite.
     """
@@ -81,6 +108,8 @@ class RecordingInfo:
     verified: bool | None  # do the files match published hashes (None: there are none)
     wind: tuple[float, float, float] | None = None  # [m/s]
     time_offset: float = 0.0  # [s]
+    doubt: Doubt | None = None
+    views: Views | None = None
 
     def __post_init__(self) -> None:
         if self.wind is not None and (len(self.wind) != 3 or not np.isfinite(self.wind).all()):
@@ -278,6 +307,9 @@ def _info_from(values: dict[str, Any]) -> RecordingInfo:
     changed = {"sheet": sheet, "frames_used": tuple(values["frames_used"])}
     if values.get("wind") is not None:
         changed["wind"] = tuple(values["wind"])
+    for name, kind in (("doubt", Doubt), ("views", Views)):
+        if values.get(name) is not None:
+            changed[name] = parse(kind, values[name], name)
     return RecordingInfo(**{**values, **changed})
 
 

@@ -1,5 +1,6 @@
 """Scenarios: a sheet at rest, what holds it, how that moves, and which frames count."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -13,6 +14,7 @@ from r2s.cloth.linear.elimination import Elimination
 from r2s.cloth.self_contact.detection import SelfContact
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh, corner, rectangle
+from r2s.geometry.mesh import resized as resized_mesh
 from r2s.recordings.recording import Recording, SheetPlacement
 from r2s.solver import Solver, Trajectory, simulate
 from r2s.world.air import Air, Fan
@@ -224,6 +226,22 @@ def from_recording(recording: Recording, shape: tuple[int, int] = (9, 9)) -> Sce
         clamps=CLAMPS if info.scenario == "stretching" else (),
         wind=info.wind,
     )
+
+
+def resized(scenario: Scenario, ratio: Float[Array, ""]) -> Scenario:
+    """The scenario of a sheet `ratio` times as long and as wide, held where it is.
+
+    Its held vertices stay where they were if there is one of them; several move apart at first.
+    """
+    held = scenario.start[scenario.scene.held]
+    fixed = jnp.mean(held, axis=0)
+
+    def grown(places: Float[Array, "place 3"]) -> Float[Array, "place 3"]:
+        return fixed + ratio * (places - fixed)
+
+    scene = dataclasses.replace(scenario.scene, mesh=resized_mesh(scenario.scene.mesh, ratio))
+    path = scenario.path.at[0].set(grown(held))
+    return dataclasses.replace(scenario, scene=scene, start=grown(scenario.start), path=path)
 
 
 def rollout(
