@@ -1,60 +1,56 @@
 """Estimate from each real lift, and judge on the unseen fold: what is learnt, what is left?
 
-python experiments/real_recordings.py recordings --density 0.15      # 20 minutes on one core
+python experiments/real_recordings.py recordings --density 0.15      # two hours on one core
 
-Errors [mm] are mean distances from the recording to the simulation: as written down, and "placed"
-where it lies nearest (at most 30 mm and 0.3 rad off), which leaves the cameras out.
+Errors [mm] are mean distances both ways between a recording and what its cameras would have seen of
+a simulation: as read, and "placed" where the recording lies nearest (at most 30 mm and 0.3 rad
+off), which leaves the cameras out. The prior's draws know the weight alone. Estimates are kept in
+the folder --kept, and not made again.
 """
 
 from pathlib import Path
 
 import jax
 import numpy as np
-from _common import frames_of, recorded_points, recordings_in, simulated_points
-from _tables import Line, command_line, keep
-from scipy.spatial import KDTree
+from _common import frames_of, recorded_points, recordings_in
+from _real import candidates, compared, errors, estimated, seen, size_of
+from _tables import command_line, keep
 
 import r2s
-from r2s.estimation.diffcloud import DiffCloud
-from r2s.evaluation import placement
+from r2s.fabrics import prior
 
-
-def distance(real: list[np.ndarray], other: list[np.ndarray]) -> float:
-    """Mean distance [mm] from recorded points to others."""
-    pairs = zip(map(KDTree, other), real, strict=True)
-    return 1e3 * float(np.mean([tree.query(points)[0].mean() for tree, points in pairs]))
-
-
-def errors(name: str, real: list[np.ndarray], others: list[list[np.ndarray]]) -> Line:
-    """Mean errors [mm] of several simulations: as written down, and placed."""
-    found = []
-    for other in others:
-        place = placement.nearest(real, other)
-        there = [placement.moved(place, points) for points in real]
-        found.append((distance(real, other), distance(there, other)))
-    written, placed = np.mean(found, axis=0)
-    return {name: f"{written:.1f}", f"{name}, placed": f"{placed:.1f}"}
-
+DRAWS = 8
 
 if __name__ == "__main__":
     parser = command_line(__doc__, "results/real_recordings.csv")
     parser.add_argument("recordings", type=Path)
     parser.add_argument("--density", type=float, default=0.15, help="areal density [kg/m^2]")
+    parser.add_argument("--kept", type=Path, default=Path("results/real_estimates"))
+    parser.add_argument("--shape", type=int, nargs=2, default=(9, 9), help="vertices")
     a = parser.parse_args()
-    space, key = r2s.OrthotropicSpace.make(a.density), jax.random.key(0)
+    shape, space = tuple(a.shape), r2s.OrthotropicSpace.make(a.density)
+    drawn = prior.draws(a.density, DRAWS, jax.random.key(0))
+    draws = [jax.tree.map(lambda leaf, i=i: leaf[i], drawn) for i in range(DRAWS)]
     lifts, folds = (recordings_in(a.recordings, name) for name in ("lift", "fold"))
-    estimates = [DiffCloud().estimate([lift], space, key=key) for lift in lifts]
-    lines: list[Line] = []
+    made = {r.info.name: (r.info, estimated(r, space, shape, a.kept)) for r in [*lifts, *folds]}
+    table: dict[str, dict[str, float]] = {}
     for fold in folds:
-        name, trial, frames = fold.info.fabric, fold.info.trial, frames_of(fold)
-        pairs = zip(lifts, estimates, strict=True)
-        alike = {r.info.fabric: e.fabric for r, e in pairs if r.info.trial == trial}
-        moved = {of: simulated_points(fold, fabric) for of, fabric in alike.items()}
-        again = [r for r in folds if r.info.fabric == name and r is not fold]
-        compared = {"estimate": [moved.pop(name)], "other fabrics": list(moved.values())}
-        compared["default fabric"] = [simulated_points(fold, space.middle())]
-        compared["other trial"] = [recorded_points(other, frames) for other in again]
-        lines.append({"recording": fold.info.name})
-        for what in filter(compared.get, compared):
-            lines[-1] |= errors(what, recorded_points(fold, frames), compared[what])
-        keep(a.out, lines, "Real folds, predicted from lifts: mean distance [mm].")
+        info, real = fold.info, recorded_points(fold, frames_of(fold))
+        groups = candidates(info, made.values())
+        moved = {n: [seen(fold, e.fabric, shape, size_of(e)) for e in g] for n, g in groups.items()}
+        moved["prior"] = [seen(fold, fabric, shape) for fabric in draws]
+        again = [r for r in folds if r.info.fabric == info.fabric and r is not fold]
+        moved["other trial"] = [recorded_points(r, frames_of(fold)) for r in again]
+        row = {}
+        for name in filter(moved.get, moved):
+            row[name], row[f"{name}, placed"] = errors(real, moved[name])
+        table[info.name] = row
+        means = {n: np.mean([row[n] for row in table.values()]) for n in row}
+        rows = [*table.items(), ("mean", means)]
+        lines = [{"recording": n} | {k: f"{v:.1f}" for k, v in r.items()} for n, r in rows]
+        keep(a.out, lines, "Real folds, predicted from lifts: mean distance both ways [mm].")
+    fabrics, tests = [fold.info.fabric for fold in folds], []
+    for end in ("", ", placed"):
+        for other in ("prior", "other fabrics' lifts", "other trial"):
+            tests.append(compared(table, fabrics, f"own lift{end}", f"{other}{end}"))
+    keep(a.out.with_stem(f"{a.out.stem}_tests"), tests, "Own lift against others [mm].")

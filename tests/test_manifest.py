@@ -292,13 +292,15 @@ def test_the_hash_script_makes_the_files_of_a_manifest(folder: Path) -> None:
     assert listed()["files"].items() <= hashes.items()
 
 
-def test_the_sheet_of_diffcloud_is_the_diamond_that_was_measured() -> None:
-    for scenario in read_manifest(default_manifest()).scenarios.values():
+def test_the_sheet_of_diffcloud_lies_as_a_diamond_of_the_size_that_was_measured() -> None:
+    scale = 0.9638  # the cameras measure lengths longer by this
+    for name, scenario in read_manifest(default_manifest()).scenarios.items():
         corners = [corner(scenario.sheet, n) for n in ("origin", "warp", "opposite", "weft")]
-        x, y, z = (np.array(corners) / 0.35).T
-        np.testing.assert_allclose(x, [0.002, 0.563, 0.002, -0.559], atol=2e-3)
-        np.testing.assert_allclose(y, [-0.818, -0.257, 0.304, -0.257], atol=3e-3)
-        np.testing.assert_allclose(z * 0.35, scenario.table_height)
+        x, y, z = np.array(corners).T
+        diagonal = 0.35 * scale * (0.304 + 0.818)
+        assert x[0] - x[2] == pytest.approx(diagonal if name == "lift" else diagonal, abs=2e-3)
+        assert y[3] - y[1] == pytest.approx(-diagonal, abs=2e-3)
+        np.testing.assert_allclose(z, scenario.table_height)
 
 
 @pytest.fixture(scope="module")
@@ -326,17 +328,21 @@ def test_all_real_recordings_are_whole_and_verified(real: dict[str, Recording]) 
 def test_the_real_gripper_paths_are_the_documented_ones(real: dict[str, Recording]) -> None:
     for recording in real.values():
         path = np.asarray(recording.handle_path)[:, 0]
-        if recording.info.scenario == "lift":
+        if recording.info.scenario == "lift":  # documented in the frame of DIFFCLOUD's simulation
             start, end, offset = (0.002, 0.304, 0.223), (0.001, -0.245, 1.107), 0.0
+            there = (0.67, 0.15, 0)
         else:
             start, end, offset = (0.002, -0.818, 0.288), (0.001, -0.008, 0.403), -0.012
-        np.testing.assert_allclose(path[0], np.array(start) * 0.35 + [0, 0, offset], atol=5e-4)
-        np.testing.assert_allclose(path[-1], np.array(end) * 0.35 + [0, 0, offset], atol=5e-4)
+            there = (0.55, 0.18, 0)
+        turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+        for at, written in ((path[0], start), (path[-1], end)):
+            expected = 0.35 * turn @ written + there + np.array([0, 0, offset])
+            np.testing.assert_allclose(at, expected, atol=5e-4)
         held = corner(recording.info.sheet, recording.info.sheet.held[0])
         np.testing.assert_allclose(path[0][:2], held[:2], atol=2e-3)
 
 
-def test_the_tops_of_the_real_lifts_follow_the_gripper(real: dict[str, Recording]) -> None:
+def test_the_tops_of_the_real_lifts_are_below_the_gripper(real: dict[str, Recording]) -> None:
     for name, recording in real.items():
         if recording.info.scenario != "lift":
             continue
@@ -347,7 +353,10 @@ def test_the_tops_of_the_real_lifts_follow_the_gripper(real: dict[str, Recording
             # The median of the highest 1 %: single points are outliers.
             top = np.median(points[points[:, 2] >= np.quantile(points[:, 2], 0.99)], axis=0)
             at = [np.interp(time, knots, path[:, axis]) for axis in range(3)]
-            distances.append(np.linalg.norm(top - at))
-        # A few frames have a whole cluster of outliers above the cloth, or lack the cloth's top.
-        assert np.median(distances) < 0.04, name
-        assert np.mean(np.array(distances) < 0.04) > 0.7, name
+            distances.append(top - at)
+        # A few frames have a whole cluster of outliers above the cloth, or lack the cloth's top;
+        # some recordings were cropped 0.34 m above the robot's base, 5 cm below the gripper.
+        across = np.linalg.norm(np.array(distances)[:, :2], axis=1)
+        assert np.median(across) < 0.02, name
+        assert np.mean(across < 0.03) > 0.7, name
+        assert -0.06 < np.median(np.array(distances)[:, 2]) < 0.03, name

@@ -59,7 +59,7 @@ def test_heavier_stiffer_and_in_denser_air_a_sheet_moves_alike(blown):
     seen = jax.jit(lambda u: predict(problem, u).x)
 
     def at(place, *ratios):
-        return seen(jnp.concatenate([place, jnp.array(ratios), jnp.zeros(5)]))
+        return seen(jnp.concatenate([place, jnp.array(ratios), jnp.zeros(6)]))
 
     plain, scaled = at(place, 0.0, 0.0), at(place + jnp.array(wider), *(change / 0.5,) * 2)
     heavier = at(place + jnp.array(wider), change / 0.5, 0.0)
@@ -72,7 +72,7 @@ def test_the_air_is_in_doubt_where_a_wind_blows(blown, lifted):
     assert (
         blown.nuisance_prior == NuisancePrior(air=0.1) and lifted.nuisance_prior == NuisancePrior()
     )
-    theta = np.arange(19.0)
+    theta = np.arange(20.0)
 
     def names(*problems):
         return [c.name for c in nuisances(problems, theta, theta)]

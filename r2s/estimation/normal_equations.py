@@ -27,7 +27,6 @@ Loss = Callable[[Problem, Prediction], Float[Array, ""]]  # [m^2]
 PATCHES = 3  # along a side of the sheet: what lies in one patch errs alike
 MEMORY = 8  # frames, in which it does so
 SLACK = 3e-3  # [m], which noise seldom throws a point of a depth camera beyond a border
-APART = 5e-3  # [m], about as far as points of a cloud are from each other
 FLATTEST = 0.3  # curvature of a robust loss over the mean weight, at least
 
 
@@ -231,13 +230,13 @@ def _to_clouds(
 ) -> tuple[Float[Array, "frame sample 3"], Bool[Array, "frame sample"]]:
     """From the nearest point of its cloud to each sample of the sheet [m], and which count.
 
-    Nothing counts in a frame without points. As far as points are apart from each other says
-    nothing: gaps are shorter by that, the mean distance of a random place from the nearest.
+    Nothing counts in a frame without points. How far points are apart from each other says nothing
+    of the sheet: gaps are shorter by that.
     """
     frozen = jax.lax.stop_gradient(x)
 
     def frame(args):
-        x, frozen, targets, mask, grippers = args
+        x, frozen, targets, mask, apart, grippers = args
         samples = jnp.einsum("sk,ski->si", expected.weights, x[expected.vertices])
         places = jnp.einsum("sk,ski->si", expected.weights, frozen[expected.vertices])
         far = jnp.where(mask, 0, jnp.inf)
@@ -245,10 +244,11 @@ def _to_clouds(
         gap = samples - targets[jnp.argmin(pairs, axis=1)]
         counts = in_view(expected.views, places, grippers) & jnp.any(mask)
         away = length(gap)
-        beyond = jnp.maximum(away - APART, 0) / jnp.maximum(away, TOUCHING)
+        beyond = jnp.maximum(away - apart, 0) / jnp.maximum(away, TOUCHING)
         return jnp.where(counts[:, None], beyond[:, None] * gap, 0), counts
 
-    return jax.lax.map(frame, (x, frozen, expected.targets, expected.mask, expected.grippers))
+    seen = expected.targets, expected.mask, expected.apart, expected.grippers
+    return jax.lax.map(frame, (x, frozen, *seen))
 
 
 def _gaps(markers: Markers, x: Float[Array, "frame vertex 3"]) -> Float[Array, "frame marker 3"]:

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import KDTree
 
 from r2s.estimation import initial_shape
 from r2s.estimation.method import Reads, frames_that_count
@@ -100,6 +101,7 @@ class Expected(eqx.Module):
     - `vertices`, `weights`: samples of the sheet, off its borders.
     - `grippers`: in the frames that count, [m].
     - `targets`, `mask`: denser clouds of these frames, [m], and which points are no padding.
+    - `apart`: how far a place among the points of a frame is from the nearest at most, [m].
     """
 
     views: Views = eqx.field(static=True)
@@ -108,6 +110,7 @@ class Expected(eqx.Module):
     grippers: Float[Array, "frame gripper 3"]
     targets: Float[Array, "frame target 3"]
     mask: Bool[Array, "frame target"]
+    apart: Float[Array, " frame"]
 
 
 class Force(eqx.Module):
@@ -231,7 +234,7 @@ def window(problem: Problem, first: int, last: int) -> Problem:
         clouds=pick(problem.clouds, ("points", "mask")),
         markers=pick(problem.markers, ("positions", "seen")),
         force=pick(problem.force, ("values", "seen")),
-        expected=pick(problem.expected, ("grippers", "targets", "mask")),
+        expected=pick(problem.expected, ("grippers", "targets", "mask", "apart")),
     )
 
 
@@ -288,9 +291,20 @@ def _expected(
     dense = subsample(recording, TARGETS, None, seed)
     times = np.asarray(recording.times)[frames]
     grippers = along_path(jnp.asarray(times), recording.handle_times, recording.handle_path)
-    return Expected(
-        views, mesh.faces[face], weights, grippers, dense.points[frames], dense.mask[frames]
-    )
+    targets, mask = dense.points[frames], dense.mask[frames]
+    clouds = [cloud[kept] for cloud, kept in zip(*map(np.asarray, (targets, mask)), strict=True)]
+    apart = jnp.asarray([_apart(cloud) for cloud in clouds], float)
+    return Expected(views, mesh.faces[face], weights, grippers, targets, mask, apart)
+
+
+def _apart(cloud: Float[np.ndarray, "point 3"]) -> float:
+    """How far [m] a random place on a sheet is from the nearest point of its cloud, at most.
+
+    On average it is as far as points are from each other; seldom twice as far.
+    """
+    if len(cloud) < 2:
+        return 0.0
+    return 2 * float(np.mean(KDTree(cloud).query(cloud, 2)[0][:, 1]))
 
 
 def _markers(recording: Recording, mesh: Mesh, frames: slice) -> Markers | None:

@@ -234,7 +234,7 @@ def resized(scenario: Scenario, ratio: Float[Array, ""]) -> Scenario:
     Its held vertices stay where they were if there is one of them; several move apart at first.
     """
     held = scenario.start[scenario.scene.held]
-    fixed = jnp.mean(held, axis=0)
+    fixed = jnp.mean(held, axis=0, keepdims=True)
 
     def grown(places: Float[Array, "place 3"]) -> Float[Array, "place 3"]:
         return fixed + ratio * (places - fixed)

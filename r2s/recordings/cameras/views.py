@@ -86,7 +86,8 @@ def in_view(
     a z-buffer whose cells are `CELL` wide where the sheet is, so samples must be closer than that.
     """
     low, high = jnp.asarray(views.workspace, samples.dtype)
-    kept = jnp.all((samples > low + views.border) & (samples < high - views.border), axis=1)
+    low, high = low[None] + views.border, high[None] - views.border
+    kept = jnp.all((samples > low) & (samples < high), axis=1)
     apart = jnp.linalg.norm(samples[:, None] - grippers[None], axis=-1)
     kept &= jnp.all(apart > views.hidden, axis=1)
     by_camera = [_unhidden(camera, samples) for camera in views.cameras]
@@ -95,11 +96,11 @@ def in_view(
 
 def _unhidden(camera: DepthCamera, samples: Float[Array, "sample 3"]) -> Bool[Array, " sample"]:
     pose = jnp.asarray(camera.to_world, samples.dtype)
-    axes = (samples - pose[:3, 3]) @ pose[:3, :3]
+    axes = (samples - pose[None, :3, 3]) @ pose[:3, :3]
     depth = axes[:, 2]
-    focal, centre = (jnp.asarray(p, samples.dtype) for p in (camera.focal_length, camera.centre))
+    lens = camera.focal_length, camera.centre, camera.resolution
+    focal, centre, size = (jnp.asarray(part, samples.dtype)[None] for part in lens)
     pixel = axes[:, :2] / depth[:, None] * focal + centre
-    size = jnp.asarray(camera.resolution, samples.dtype)
     inside = (depth > 0) & jnp.all((pixel > -0.5) & (pixel < size - 0.5), axis=1)
     # directions, not pixels: cells must not depend on how many pixels a camera has
     cell = CELL / jnp.maximum(jnp.median(depth), CELL)
@@ -128,7 +129,7 @@ def observed(
     """The points [m] that the cameras would have recorded of a mesh [m]: every pixel that sees it,
     cropped, and freed of outliers camera by camera as the recording was. Without a robot."""
     keep = Cleaning(
-        views.workspace, neighbours=views.neighbours, deviations=views.deviations, voxel=0
+        views.workspace, neighbours=views.neighbours, deviations=views.deviations, voxel=0.0
     )
     clouds = []
     for camera in views.cameras:

@@ -1,0 +1,130 @@
+"""Real recordings beside what their cameras would have seen of simulated sheets."""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _common import frames_of
+from _tables import Line
+from scipy import stats
+
+from r2s.estimation.diffcloud import DiffCloud
+from r2s.estimation.estimate import Estimate
+from r2s.estimation.estimate_json import as_json, from_json
+from r2s.evaluation import metrics, placement, prediction_error
+from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.parameters import ParameterSpace
+from r2s.files import write_json
+from r2s.recordings.cameras.views import observed
+from r2s.recordings.recording import Recording, RecordingInfo
+from r2s.scenarios.scenario import from_recording, resized
+from r2s.world.scene import along_path
+
+SIZE = "size ratio"  # the nuisance that belongs to the fabric
+ORDER = ("own lift", "other trial's lift", "other fabrics' lifts")
+Clouds = list[np.ndarray]
+
+
+def estimated(
+    recording: Recording, space: ParameterSpace, shape: tuple[int, int], kept: Path
+) -> Estimate:
+    """DIFFCLOUD's estimate from a recording; taken from the folder `kept` when it is there."""
+    file = kept / f"{recording.info.name}.{shape[0]}x{shape[1]}.json"
+    if file.exists():
+        return from_json(json.loads(file.read_text(encoding="utf-8")))
+    found = DiffCloud(shape=shape).estimate([recording], space, key=jax.random.key(0))
+    kept.mkdir(parents=True, exist_ok=True)
+    write_json(file, as_json(found))
+    return found
+
+
+def candidates(
+    fold: RecordingInfo, made: Iterable[tuple[RecordingInfo, Estimate]]
+) -> dict[str, list[Estimate]]:
+    """Estimates by what they were made from, as seen from a fold."""
+    found: dict[str, list[Estimate]] = {}
+    for info, estimate in made:
+        name = "other fabrics' lifts"
+        if info.scenario == fold.scenario:
+            name = "fold itself" if info == fold else ""
+        elif info.fabric == fold.fabric:
+            name = "own lift" if info.trial == fold.trial else "other trial's lift"
+        found.setdefault(name, []).append(estimate)
+    found.pop("", None)
+    return {name: found[name] for name in (*ORDER, "fold itself")}
+
+
+def size_of(estimate: Estimate) -> float:
+    """How much longer the sheet is than was written down, as far as an estimate says."""
+    return next((each.value for each in estimate.nuisances if each.name == SIZE), 1.0)
+
+
+def seen(
+    recording: Recording, fabric: Fabric, shape: tuple[int, int], size: float = 1.0
+) -> Clouds | None:
+    """What the recording's cameras would have seen of a fabric in the frames that count, [m].
+
+    `size`: of the sheet, relative. Without what the robot hid. None: the simulation diverged.
+    """
+    scenario, views = from_recording(recording, shape), recording.info.views
+    if views is None:
+        raise ValueError(f"{recording.info.name}: its manifest says nothing of its cameras")
+    moved = prediction_error.predict_motion(resized(scenario, jnp.asarray(size)), fabric)
+    used = np.array(frames_of(recording))
+    if not np.isfinite(moved.x[used]).all():
+        return None
+    path = along_path(recording.times, recording.handle_times, recording.handle_path)
+    faces, clouds = np.asarray(scenario.scene.mesh.faces), []
+    for x, grippers in zip(moved.x[used], np.asarray(path)[used], strict=True):
+        points = observed(views, x, faces)
+        away = np.linalg.norm(points[:, None] - grippers[None], axis=-1).min(axis=1)
+        clouds.append(points[away > views.hidden])
+    return clouds
+
+
+def errors(real: Clouds, others: list[Clouds | None]) -> tuple[float, float]:
+    """Mean distance [mm] both ways, as read and placed; infinite where a simulation diverged."""
+    found = []
+    for other in others:
+        if other is None or not all(len(points) for points in other):
+            found.append((np.inf, np.inf))
+            continue
+        place = placement.nearest(real, other)
+        there = [placement.moved(place, points) for points in real]
+        found.append((_both_ways(real, other), _both_ways(there, other)))
+    as_read, placed = np.mean(found, axis=0)
+    return float(as_read), float(placed)
+
+
+def _both_ways(real: Clouds, other: Clouds) -> float:
+    pairs = zip(real, other, strict=True)
+    return 1e3 * float(np.mean([metrics.distances(a, b)["chamfer"] for a, b in pairs]))
+
+
+def compared(table: dict[str, dict[str, float]], fabrics: list[str], one: str, other: str) -> Line:
+    """Whether one column of a table [mm] is below another: mean difference and p by sign flips.
+
+    `table`: the columns of each recording, whose `fabrics` are given. Flipped are the signs of all
+    recordings of a fabric together, since they are alike, and of every recording alone.
+    """
+    differences = np.array([row[one] - row[other] for row in table.values()])
+    names = sorted(set(fabrics))
+    by_fabric = np.array([differences[np.array(fabrics) == name].mean() for name in names])
+    return {
+        "compared": f"{one} less {other}",
+        "mean": f"{differences.mean():.1f}",
+        "better": f"{int(np.sum(differences < 0))} of {len(differences)}",
+        "p of fabrics": f"{_sign_flips(by_fabric):.3f}",
+        "p of recordings": f"{_sign_flips(differences):.3f}",
+    }
+
+
+def _sign_flips(differences: np.ndarray) -> float:
+    """Two-sided p of the mean of differences that could as well have had the other sign."""
+    test = stats.permutation_test(
+        (differences,), np.mean, permutation_type="samples", n_resamples=10_000
+    )
+    return float(test.pvalue)
