@@ -192,6 +192,7 @@ def test_windows_and_beginnings_keep_and_hide_what_should_have_been_seen(problem
     last = problem.frames[-1]
     later = window(problem, last, last)
     assert later.expected is not None and len(later.expected.targets) == 1
-    early = beginning(problem, 2 / len(problem.frames))
-    counted = np.asarray(early.expected.mask).any(axis=1)
+    early = beginning(problem, 2 / len(problem.frames)).expected
+    assert early is not None
+    counted = np.asarray(early.mask).any(axis=1)
     np.testing.assert_array_equal(counted, np.arange(len(problem.frames)) < 2)
