@@ -284,10 +284,7 @@ def _expected(
             f"{recording.info.name}: a sheet of {size} m has no place off a border of "
             f"{views.border:g} m: narrow the border of its views"
         )
-    flat, rest = (
-        jnp.pad(jnp.asarray(part, float), ((0, 0), (0, 1))) for part in (places, mesh.rest)
-    )
-    face, weights = nearest(flat, rest, mesh.faces)
+    face, weights, _ = _on_sheet(places, mesh)
     dense = subsample(recording, TARGETS, None, seed)
     times = np.asarray(recording.times)[frames]
     grippers = along_path(jnp.asarray(times), recording.handle_times, recording.handle_path)
@@ -308,24 +305,20 @@ def _apart(cloud: Float[np.ndarray, "point 3"]) -> float:
 
 
 def _markers(recording: Recording, mesh: Mesh, frames: slice) -> Markers | None:
-    """The markers, assumed to lie on the sheet at rest where the first frame shows them."""
+    """The markers at their places on the sheet, or else where the first frame shows them on it."""
     if recording.markers is None or recording.markers_seen is None:
         return None
+    if recording.marker_places is not None:
+        face, weights, _ = _on_sheet(np.asarray(recording.marker_places), mesh)
+        seen = recording.markers_seen[frames]
+        return Markers(recording.markers[frames], seen, mesh.faces[face], weights)
     sheet, seen = recording.info.sheet, np.asarray(recording.markers_seen)
     if not seen[0].all():
         lost = np.flatnonzero(~seen[0]).tolist()
         raise ValueError(f"{recording.info.name}, frame 0: markers {lost} are not seen at rest")
     offset = np.asarray(recording.markers[0]) - np.asarray(sheet.origin)
     material = offset @ np.array([sheet.warp, sheet.weft]).T
-    flat, rest = (
-        jnp.pad(jnp.asarray(places, float), ((0, 0), (0, 1))) for places in (material, mesh.rest)
-    )
-    face, weights = nearest(flat, rest, mesh.faces)
-    away = np.linalg.norm(
-        np.einsum("mk,mki->mi", weights, np.asarray(mesh.rest)[np.asarray(mesh.faces)[face]])
-        - material,
-        axis=1,
-    )
+    face, weights, away = _on_sheet(material, mesh)
     if away.max() > 0.01:
         worst = int(away.argmax())
         raise ValueError(
@@ -333,6 +326,16 @@ def _markers(recording: Recording, mesh: Mesh, frames: slice) -> Markers | None:
             "the sheet: check the sheet's size and place [m] and the markers' plane"
         )
     return Markers(recording.markers[frames], jnp.asarray(seen[frames]), mesh.faces[face], weights)
+
+
+def _on_sheet(
+    places: Float[np.ndarray, "place 2"], mesh: Mesh
+) -> tuple[Int[Array, " place"], Float[Array, "place 3"], Float[np.ndarray, " place"]]:
+    """The faces of places on a sheet [m], their weights, and how far off the sheet they are [m]."""
+    flat, rest = (jnp.pad(jnp.asarray(at, float), ((0, 0), (0, 1))) for at in (places, mesh.rest))
+    face, weights = nearest(flat, rest, mesh.faces)
+    there = np.einsum("pk,pki->pi", weights, np.asarray(mesh.rest)[np.asarray(mesh.faces)[face]])
+    return face, weights, np.linalg.norm(there - places, axis=1)
 
 
 def _force(recording: Recording, frames: slice) -> Force | None:

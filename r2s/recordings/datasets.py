@@ -23,6 +23,7 @@ from r2s.recordings.manifest import (
     read_recordings,
 )
 from r2s.recordings.readers.clouds import read_values
+from r2s.recordings.readers.swings import Bar
 
 TIMEOUT = 30  # [s], without a byte from the server
 CHUNK = 1 << 14  # [byte], of which a broken download loses at most one
@@ -67,6 +68,13 @@ class Dataset:
                 raise ValueError(f"paths must stay in the folder of the data, found {path!r}")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Swings(Dataset):
+    """A data set of swings, and how their sheet is held: `r2s.recordings.readers.swings`."""
+
+    bar: Bar
+
+
 def known_datasets(folder: Path | str | None = None) -> dict[str, Dataset | Manifest]:
     """The data sets whose manifests lie in `folder` (None: that of the project), by name.
 
@@ -96,8 +104,14 @@ def read_dataset(path: Path | str) -> Dataset | Manifest:
         value = json.loads(Path(path).read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path}: no JSON: {error}") from error
-    is_manifest = isinstance(value, dict) and "scenarios" in value
-    return read_manifest(path) if is_manifest else read_json(path, Dataset)
+    if isinstance(value, dict) and "scenarios" in value:
+        return read_manifest(path)
+    return read_json(path, Swings if isinstance(value, dict) and "bar" in value else Dataset)
+
+
+def known_bar() -> Bar:
+    """The bar of the public swings, whose manifest comes with the package."""
+    return read_json(default_manifest().parent / "swings.json", Swings).bar
 
 
 def fetch(name: str, folder: Path | str, manifests: Path | str | None = None) -> Iterator[str]:

@@ -10,7 +10,9 @@ import numpy as np
 from jaxtyping import Float, Integer
 
 from r2s.files import write_bytes
+from r2s.recordings.datasets import known_bar
 from r2s.recordings.manifest import manifest_for, read_recording, read_recordings
+from r2s.recordings.readers.swings import is_swing, read_swing
 from r2s.recordings.recording import Recording, load
 
 
@@ -23,7 +25,7 @@ class SimulatedCloth:
 
 
 def open_recording(path: Path | str) -> Recording:
-    """Read a recording from an NPZ, or from a folder of frames.
+    """Read a recording from an NPZ, also one of the public swings, or from a folder of frames.
 
     A folder's manifest is the `manifest.json` beside it, else that of DIFFCLOUD; a folder that
     holds a manifest.json and one recording is taken for that. Raises FileNotFoundError or
@@ -33,7 +35,7 @@ def open_recording(path: Path | str) -> Recording:
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such recording, neither an NPZ nor a folder")
     if path.is_file():
-        return load(path)
+        return _load(path)
     path = path.resolve()
     if (path / "manifest.json").exists():
         manifest = manifest_for(path)
@@ -45,6 +47,11 @@ def open_recording(path: Path | str) -> Recording:
     return read_recording(path.parent, manifest_for(path.parent), path.name)
 
 
+def _load(path: Path) -> Recording:
+    """Of this format, or of the public swings."""
+    return read_swing(path, known_bar()) if is_swing(path) else load(path)
+
+
 def open_recordings(paths: Sequence[Path]) -> Iterator[Recording]:
     """Read recordings: of NPZ files, of folders of them, or of folders of clouds or images.
 
@@ -53,7 +60,7 @@ def open_recordings(paths: Sequence[Path]) -> Iterator[Recording]:
     for path in paths:
         files = sorted(path.glob("*.npz")) if path.is_dir() else []
         if files and not (path / "manifest.json").exists():
-            yield from map(load, files)
+            yield from map(_load, files)
         else:
             yield open_recording(path)
 

@@ -20,7 +20,7 @@ FORMAT = "r2s-recording/3"
 # the first knew neither force nor markers nor wind, the second neither doubt nor views
 READABLE = ("r2s-recording/1", "r2s-recording/2", FORMAT)
 CORNERS = {"origin": (0, 0), "warp": (1, 0), "weft": (0, 1), "opposite": (1, 1)}
-OPTIONAL = ("force", "force_times", "markers", "markers_seen")
+OPTIONAL = ("force", "force_times", "markers", "markers_seen", "marker_places")
 CLOCK_TOLERANCE = 1e-6  # [s], rounding when a time is a frame number over a rate
 
 
@@ -125,7 +125,8 @@ class Recording(eqx.Module):
     that takes its arrays compiles once per shape (see `subsample`).
 
     `force` is what pulls at the sheet: for each sample of its log a number, or a vector in the
-    world. `markers` are places printed on the sheet, in each frame. None where not recorded.
+    world. `markers` are places printed on the sheet, in each frame; `marker_places` says where they
+    are on it, None: where the first frame shows them on the sheet at rest. None where not recorded.
     """
 
     points: Float[Array, "frame point 3"]  # [m], padded with zeros; only where mask
@@ -138,6 +139,7 @@ class Recording(eqx.Module):
     force_times: Float[Array, " sample"] | None = None  # [s], on the clock of handle_times
     markers: Float[Array, "frame marker 3"] | None = None  # [m], zero where not markers_seen
     markers_seen: Bool[Array, "frame marker"] | None = None
+    marker_places: Float[Array, "marker 2"] | None = None  # [m], along warp and weft
 
 
 def make_recording(
@@ -151,6 +153,7 @@ def make_recording(
     force_times: Any = None,
     markers: Any = None,
     markers_seen: Any = None,
+    marker_places: Any = None,
 ) -> Recording:
     """Pad ragged clouds into a Recording.
 
@@ -161,6 +164,7 @@ def make_recording(
     - `force`, `force_times`: (sample,) or (sample, 3) [N], and (sample,) [s].
     - `markers`: (frame, marker, 3), [m].
     - `markers_seen`: (frame, marker); None: wherever the markers are finite.
+    - `marker_places`: (marker, 2), where they are on the sheet along warp and weft, [m].
 
     Floats take JAX's default precision.
 
@@ -168,7 +172,7 @@ def make_recording(
     cloud that is empty or not finite or not (points, 3), times that do not increase, a path of
     another shape or of more handles than `info.sheet.held` names, a path that ends before the
     last frame, `frames_used` outside of the frames, a force without times or the reverse, markers
-    of other frames, or seen but not finite.
+    of other frames, or seen but not finite, and places of other markers, or off the sheet.
     """
     try:
         marks = _check_markers(markers, markers_seen)
@@ -185,6 +189,7 @@ def make_recording(
             )
         if marks is not None and len(marks[0]) != len(checked):
             raise ValueError(f"markers in {len(marks[0])} frames, but clouds in {len(checked)}")
+        places = _check_places(marker_places, marks, info.sheet.size)
         path = _check_path(handle_path, info.sheet.held)
         clock = _check_times(times, "times", len(checked))
         knots = _check_times(handle_times, "handle_times", len(path))
@@ -204,6 +209,7 @@ def make_recording(
         force_times=_floats(log and log[1]),
         markers=_floats(marks and marks[0]),
         markers_seen=None if marks is None else jnp.asarray(marks[1]),
+        marker_places=_floats(places),
     )
 
 
@@ -318,6 +324,24 @@ def _split(points: np.ndarray, offsets: np.ndarray) -> list[np.ndarray]:
     if offsets.ndim != 1 or list(offsets[[0, -1]]) != ends or (np.diff(offsets) < 0).any():
         raise ValueError(f"offsets must go from {ends[0]} to {ends[1]}, found {offsets}")
     return np.split(points, offsets[1:-1])
+
+
+def _check_places(
+    places: Any, marks: tuple[np.ndarray, np.ndarray] | None, size: tuple[float, float]
+) -> np.ndarray | None:
+    if places is None:
+        return None
+    if marks is None:
+        raise ValueError("marker_places without markers")
+    places, count = np.asarray(places, np.float64), marks[0].shape[1]
+    if places.shape != (count, 2):
+        raise ValueError(f"marker_places must have the shape ({count}, 2), found {places.shape}")
+    if not ((places >= -CLOCK_TOLERANCE) & (places <= np.array(size) + CLOCK_TOLERANCE)).all():
+        raise ValueError(
+            f"marker_places must lie on the sheet of {size} m, found {places.min(axis=0)} to "
+            f"{places.max(axis=0)}: in metres from its origin, along warp and weft"
+        )
+    return places
 
 
 def _check_cloud(points: Any, frame: int) -> np.ndarray:

@@ -31,6 +31,8 @@ BOW = 0.01  # [m], by which a hanging sheet starts out of its plane, so that it 
 GUST = 0.5  # [s], in which a wind rises from nothing
 JET = (1 / 3, 1 / 4)  # radius and edge of a fan's jet, of the sheet's shorter side
 CLAMPS = (("origin", "weft"), ("warp", "opposite"))  # sides that a stretching holds
+BAR = (("origin", "warp"),)  # the side that a swing holds
+CLAMPED = {"stretching": CLAMPS, "swing": BAR}  # sides that are held in a scenario
 
 
 class Scenario(eqx.Module):
@@ -213,7 +215,8 @@ def steps_between(
 def from_recording(recording: Recording, shape: tuple[int, int] = (9, 9)) -> Scenario:
     """The scenario of a recording: its sheet, table, gripper path, wind and frame times.
 
-    In a recording of "stretching" the sides between the held corners are clamped.
+    In a recording of "stretching" the sides between the held corners are clamped, in one of a
+    "swing" the side along the bar.
     """
     info = recording.info
     return from_placement(
@@ -223,7 +226,7 @@ def from_recording(recording: Recording, shape: tuple[int, int] = (9, 9)) -> Sce
         recording.handle_times,
         np.asarray(recording.times),
         shape,
-        clamps=CLAMPS if info.scenario == "stretching" else (),
+        clamps=CLAMPED.get(info.scenario, ()),
         wind=info.wind,
     )
 
