@@ -2,6 +2,7 @@
 
 - `scenario`: a sheet at rest, what holds it, how that moves, which frames count; `rollout`.
 - `six`: lifting, wind, stretching, folding, fling, shaking; and varied at random.
+- `swing`: a sheet on a moving bar.
 - `paths`: how grippers move in them.
 - `on_points`, `in_explicit_steps`: the same on material points, and by explicit steps of the cloth.
 - `gripper_forces`, `energy`: what grippers feel, and where the energy goes.
@@ -22,6 +23,7 @@ from r2s.scenarios.six import (
     varied,
     wind,
 )
+from r2s.scenarios.swing import swing
 
 __all__ = [
     "SIX",
@@ -36,6 +38,7 @@ __all__ = [
     "material_points",
     "shaking",
     "stretching",
+    "swing",
     "varied",
     "wind",
 ]

@@ -1,0 +1,66 @@
+"""What swings say of a fabric, and how far predictions of other swings are from their trackers."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from r2s.estimation.descent import Budget, descend
+from r2s.estimation.estimate import Estimate
+from r2s.estimation.problem import NuisancePrior, Problem, default_nuisance_prior
+from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.parameters import ParameterSpace
+from r2s.recordings.datasets import known_bar
+from r2s.recordings.readers.swings import read_swing
+from r2s.recordings.recording import Recording
+from r2s.scenarios.scenario import from_recording, rollout
+
+SHAPE = (8, 8)  # vertices, as many as are tracked
+DENSITY = 1.0  # relative deviation of a density that nobody measured
+BUDGET = Budget(coarse=24, starts=3, iterations=25, around=0, shares=(0.3,))
+
+_rollout = eqx.filter_jit(rollout)
+
+
+def swings(folder: Path, names: Sequence[str], duration: float) -> list[Recording]:
+    """Some recordings of a folder, or all where no names are given."""
+    bar = known_bar()
+    files = sorted(folder.glob("*.npz"))
+    chosen = [file for file in files if file.stem in names] if names else files
+    if not chosen:
+        raise ValueError(f"{folder}: no recording of {', '.join(names) or 'any name'}")
+    return [read_swing(file, bar, duration) for file in chosen]
+
+
+def estimated(recordings: Sequence[Recording], space: ParameterSpace) -> Estimate:
+    """The fabric of some swings, its density in doubt by `DENSITY`; the air is taken as known."""
+    problems = tuple(_problem(each, space) for each in recordings)
+    return descend(problems, BUDGET, key=jax.random.key(0))
+
+
+def _problem(recording: Recording, space: ParameterSpace) -> Problem:
+    scenario = from_recording(recording, SHAPE)
+    prior: NuisancePrior = default_nuisance_prior(scenario, recording.info.doubt)
+    return Problem.make(
+        recording, space, shape=SHAPE, nuisance_prior=prior._replace(density=DENSITY)
+    )
+
+
+def errors(recording: Recording, fabric: Fabric) -> Float[np.ndarray, " row"] | None:
+    """Mean distance [m] from the tracked points to where a fabric predicts them, row by row from
+    the bar down; the first row is the bar's own. None: the simulation diverged."""
+    moved = _rollout(from_recording(recording, SHAPE), fabric)
+    if not np.isfinite(moved.x).all():
+        return None
+    assert recording.markers is not None and recording.markers_seen is not None
+    away = np.linalg.norm(np.asarray(moved.x) - np.asarray(recording.markers), axis=-1)
+    away = np.where(np.asarray(recording.markers_seen), away, np.nan)
+    return np.nanmean(away.reshape(-1, *SHAPE), axis=(0, 1))
+
+
+def each_of(fabrics: Fabric, count: int) -> list[Fabric]:
+    """The fabrics of a stack of them."""
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], fabrics) for i in range(count)]
