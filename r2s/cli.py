@@ -18,6 +18,7 @@ except ImportError:
     sys.exit("r2s: error: the command line needs tyro: pip install 'r2s[cli]'")
 
 from r2s import programs
+from r2s.commands.check import Check
 from r2s.commands.check_grad import CheckGrad
 from r2s.commands.data import Data
 from r2s.commands.doctor import Doctor
@@ -34,6 +35,7 @@ from r2s.study.environment import one_core, one_thread
 NO_CACHE = "--no-cache"
 Command = (
     Annotated[Data, subcommand("data")]
+    | Annotated[Check, subcommand("check")]
     | Annotated[Show, subcommand("show")]
     | Annotated[Sensitivity, subcommand("sensitivity")]
     | Annotated[Simulate, subcommand("simulate")]

@@ -102,6 +102,7 @@ def test_a_swing_is_read_on_the_arm_s_clock_with_its_sheet_below_the_bar(file: P
     np.testing.assert_allclose(read.times, np.arange(frames) * 0.1, atol=1e-6)
     ends = bar_path(moved["tool_position"], moved["tool_quaternion_xyzw"], BAR)
     np.testing.assert_allclose(read.handle_path, ends, atol=1e-6)
+    assert read.markers is not None
     for frame, tracked in ((0, 0), (5, 4), (10, 8)):  # every 0.1 s and every 0.125 s
         expected = moved["points"][tracked].reshape(-1, 3)
         np.testing.assert_allclose(np.asarray(read.markers[frame]), expected, atol=1e-4)

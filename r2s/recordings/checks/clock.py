@@ -1,0 +1,120 @@
+"""Do the frames come when they should, and when the grippers move?"""
+
+import numpy as np
+from jaxtyping import Float
+
+from r2s.recordings.checks.finding import Finding
+from r2s.recordings.checks.sheet import FEWEST, cleaned, lies
+from r2s.recordings.recording import Recording
+
+UNEVEN = 0.05  # of the interval between frames
+RATE = (1.0, 240.0)  # [Hz]
+FASTEST = 5.0  # [m/s], of a gripper
+LATE = 0.05  # [s], or an interval between frames
+LAGS = np.arange(-50, 51) / 100  # [s], that are tried
+RATES = np.array([0.5, 0.67, 0.8, 1.0, 1.25, 1.5, 2.0])  # of the clock, that are tried
+CLEARLY = 0.25  # of what is left at another rate: then it is another
+TOP = 0.99  # quantile of height from which points are the top
+MOVES = 0.05  # [m], at least, along an axis that is compared
+UP = 0.1  # [m] above the table: a sheet that is held up
+WAITS = "check the frame rate and time_offset: does a clap or a jerk come at one time in both?"
+
+
+def check_clock(recording: Recording) -> list[Finding]:
+    """Intervals, rate, the grippers' speed, and how late the top of the cloud follows them."""
+    times = np.asarray(recording.times, np.float64)
+    gaps = np.diff(times)
+    middle = float(np.median(gaps)) if len(gaps) else np.nan
+    uneven = float(np.abs(gaps / middle - 1).max()) if len(gaps) else np.nan
+    speeds = _speeds(recording)
+    lag, rate = _lag(recording)
+    late = max(LATE, round(middle, 3)) if len(gaps) else LATE
+    moves = "when the top of the cloud moves, after the grippers do,"
+    moves = moves if np.isfinite(lag) else "the grippers do not move enough"
+    return [
+        Finding(
+            "frames", uneven, "-", -np.inf, UNEVEN, "largest deviation from an even interval",
+            "frames were dropped, or their times are not their own: resample them",
+        ),
+        Finding(
+            "rate", 1 / middle, "Hz", *RATE, "frames a second",
+            "are times in seconds?",
+        ),
+        Finding(
+            "grippers", speeds, "m/s", -np.inf, FASTEST, "greatest speed of a gripper",
+            "are the path in metres and its times in seconds?",
+        ),
+        Finding("clock", lag, "s", -late, late, moves, WAITS),
+        Finding(
+            "clock rate", rate, "-", 0.95, 1.05, "how fast the cameras' clock runs" if
+            np.isfinite(rate) else moves, WAITS,
+        ),
+    ]  # fmt: skip
+
+
+def _with_a_top(recording: Recording) -> list[int]:
+    """The frames in which grippers hold the sheet up, and the cloud shows it."""
+    knots, path = np.asarray(recording.handle_times), np.asarray(recording.handle_path)
+    lowest = recording.info.table_height + UP if lies(recording) else -np.inf
+    high = np.interp(recording.times, knots, _leader(path, 2)) > lowest
+    return [f for f in np.flatnonzero(high).tolist() if len(cleaned(recording, f)) >= FEWEST]
+
+
+def _speeds(recording: Recording) -> float:
+    path, knots = np.asarray(recording.handle_path), np.asarray(recording.handle_times)
+    if len(knots) < 2:
+        return 0.0
+    moved = np.linalg.norm(np.diff(path, axis=0), axis=-1).max(axis=1)
+    return float((moved / np.diff(knots)).max())
+
+
+def _lag(recording: Recording) -> tuple[float, float]:
+    """How late [s] the top of the cloud follows the grippers, and the rate of its clock; NaN where
+    no axis moves."""
+    times = np.asarray(recording.times, np.float64)
+    frames = _with_a_top(recording)
+    times = times[frames]
+    tops = np.array([_top(cleaned(recording, frame)) for frame in frames])
+    axes = [axis for axis in (2, 0, 1) if _range(recording, axis) > MOVES]
+    if len(recording.info.sheet.held) == 1:
+        axes = [axis for axis in axes if axis == 2]  # a single corner leans aside
+    if not axes or len(times) < 5:
+        return np.nan, np.nan
+    start = times[0]
+    left = np.array(
+        [
+            [_left(recording, start + rate * (times - start) - lag, tops, axes) for lag in LAGS]
+            for rate in RATES
+        ]
+    )
+    usual = int(np.argmin(np.abs(RATES - 1)))
+    best = np.unravel_index(left.argmin(), left.shape)
+    if left[best] > CLEARLY * left[usual].min():
+        best = (usual, int(left[usual].argmin()))
+    return float(LAGS[best[1]]), float(1 / RATES[best[0]])
+
+
+def _range(recording: Recording, axis: int) -> float:
+    return float(np.ptp(_leader(np.asarray(recording.handle_path), axis)))
+
+
+def _leader(path: Float[np.ndarray, "time gripper 3"], axis: int) -> np.ndarray:
+    """What the top of the cloud follows: the highest gripper, or the middle of all."""
+    return path[:, :, 2].max(axis=1) if axis == 2 else path[:, :, axis].mean(axis=1)
+
+
+def _left(recording: Recording, at: np.ndarray, tops: np.ndarray, axes: list[int]) -> float:
+    """What is left [m^2] of the tops' motion once that of the grippers at times is subtracted."""
+    knots = np.asarray(recording.handle_times, np.float64)
+    path = np.asarray(recording.handle_path, np.float64)
+    left = 0.0
+    for axis in axes:
+        there = np.interp(at, knots, _leader(path, axis))
+        left += float(np.var(tops[:, axis] - there))
+    return left
+
+
+def _top(points: Float[np.ndarray, "point 3"]) -> np.ndarray:
+    """The middle of the highest points."""
+    high = points[points[:, 2] >= np.quantile(points[:, 2], TOP)]
+    return np.median(high, axis=0)

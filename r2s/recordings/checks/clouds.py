@@ -1,0 +1,103 @@
+"""Are there enough points, on the sheet alone, and was none of it cut off?"""
+
+import numpy as np
+from jaxtyping import Float
+
+from r2s.recordings.cameras.cleaning import outliers
+from r2s.recordings.checks.finding import Finding
+from r2s.recordings.checks.sheet import VOXEL
+from r2s.recordings.readers.clouds import voxel_means
+from r2s.recordings.recording import CORNERS, Recording, cloud, corner
+
+FEWEST = 150  # points of a frame, thinned to 5 mm
+STRAY = 0.03  # share of a frame
+NEIGHBOURS, DEVIATIONS = 8, 6.0  # beyond which a point is alone
+BEYOND = 1.15  # of how far the sheet reaches: no point of it is there
+FACE = 0.003  # [m], as thick as the layer along a face of a box that cut the cloud
+CROWDED = 30  # points in that layer, so that a face is one
+SAME = 0.0015  # [m], within which the ends of clouds agree where a box cut them
+OFTEN = 0.3  # of the frames that count
+ABOVE = 0.025  # [m] above the table, below which clouds are often cut on purpose
+APART = 0.08  # [m], from a gripper to the nearest point
+
+
+def check_clouds(recording: Recording) -> list[Finding]:
+    """Number of points, outliers, faces of a box that cut the clouds, distance of the grippers."""
+    if recording.markers is not None:
+        return []
+    first, last = recording.info.frames_used
+    frames = list(range(first, last + 1))
+    clouds = [voxel_means(cloud(recording, frame), VOXEL) for frame in frames]
+    counts = np.array([len(points) for points in clouds])
+    held = _held(recording)[first : last + 1]
+    found = [
+        Finding(
+            "points",
+            float(np.median(counts)),
+            "-",
+            FEWEST,
+            np.inf,
+            "points of a frame, thinned to 5 mm,",
+            "move the cameras nearer, or widen masks and workspace",
+        ),
+        Finding(
+            "outliers",
+            float(np.median([_stray(recording, *pair) for pair in zip(clouds, held, strict=True)])),
+            "-",
+            -np.inf,
+            STRAY,
+            "share of points that are off the sheet",
+            "clean masks, or narrow the workspace",
+        ),
+    ]
+    near = [
+        np.linalg.norm(points[:, None] - at[None], axis=-1).min(axis=0).max()
+        for points, at in zip(clouds, held, strict=True)
+    ]
+    words = "distance from a gripper to the nearest point (median over frames)"
+    advice = "the frames of cameras and grippers differ, or the clock does"
+    found.append(Finding("grip", float(np.median(near)), "m", -np.inf, APART, words, advice))
+    return [*found, *_faces(recording, clouds)]
+
+
+def _held(recording: Recording) -> Float[np.ndarray, "frame gripper 3"]:
+    knots, path = np.asarray(recording.handle_times), np.asarray(recording.handle_path)
+    at = [np.interp(recording.times, knots, column) for column in path.reshape(len(path), -1).T]
+    return np.stack(at, axis=1).reshape(-1, *path.shape[1:])
+
+
+def _stray(
+    recording: Recording,
+    points: Float[np.ndarray, "point 3"],
+    held: Float[np.ndarray, "gripper 3"],
+) -> float:
+    """Share of points that are alone, or farther from a gripper than the sheet reaches."""
+    sheet = recording.info.sheet
+    far = np.zeros(len(points), bool)
+    for name, at in zip(sheet.held, held, strict=True):
+        reach = max(np.linalg.norm(corner(sheet, n) - corner(sheet, name)) for n in CORNERS)
+        far |= np.linalg.norm(points - at, axis=1) > BEYOND * reach
+    return float(np.mean(far | outliers(points, NEIGHBOURS, DEVIATIONS)))
+
+
+def _faces(recording: Recording, clouds: list[np.ndarray]) -> list[Finding]:
+    """Whether clouds end at one face of a box in many frames, where points crowd."""
+    found = []
+    for axis, letter in enumerate("xyz"):
+        for side, name in ((-1, "below"), (1, "above")):
+            share, place = _cut(clouds, axis, side)
+            if axis == 2 and side < 0 and place < recording.info.table_height + ABOVE:
+                continue  # the table, or a cut just above it
+            words = f"share of frames whose clouds are cut {name} {letter} = {place:.3f} m"
+            advice = "widen the workspace or the crop, or move the camera"
+            found.append(Finding(f"crop {letter}", share, "-", -np.inf, OFTEN, words, advice))
+    return found
+
+
+def _cut(clouds: list[np.ndarray], axis: int, side: int) -> tuple[float, float]:
+    """In which share of the frames clouds end, crowded, at their farthest end, and where [m]."""
+    ends = np.array([side * np.max(side * points[:, axis]) for points in clouds])
+    place = side * np.max(side * ends)
+    crowd = np.array([np.sum(side * (place - points[:, axis]) < FACE + VOXEL) for points in clouds])
+    there = (np.abs(ends - place) < SAME + VOXEL / 2) & (crowd >= CROWDED)
+    return float(np.mean(there)), float(place)
