@@ -34,8 +34,6 @@ class Check:
         found = check(open_recording(self.recording))
         suspicious = sum(each.is_suspicious for each in found)
         content = {"suspicious": suspicious, "findings": [each._asdict() for each in found]}
-        total = (
-            f"{suspicious} of {len(found)} are suspicious" if suspicious else "nothing suspicious"
-        )
+        total = f"{suspicious} of {len(found)} suspicious" if suspicious else "nothing suspicious"
         print_result(self.json, content, [*(each.describe() for each in found), total])
         return int(suspicious > 0)

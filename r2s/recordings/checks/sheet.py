@@ -47,7 +47,7 @@ def at_rest(recording: Recording) -> list[int]:
 def lies(recording: Recording) -> bool:
     """Whether the sheet lies at rest, rather than hangs."""
     sheet = recording.info.sheet
-    return abs(np.cross(sheet.warp, sheet.weft)[2]) > 0.9
+    return bool(abs(np.cross(sheet.warp, sheet.weft)[2]) > 0.9)
 
 
 def check_sheet(recording: Recording) -> list[Finding]:
