@@ -23,7 +23,7 @@ from r2s.fabrics.fabric import Fabric
 from r2s.recordings import manifest
 from r2s.recordings.recording import Recording, subsample
 
-BACK, BELOW = (10, 0, -10, -20, -30), (0, -12, -25)  # [mm], along y and z
+BACK, BELOW = (-10, 0, 10, 20, 30), (0, -12, -25)  # [mm], along x and z
 LAGS = (0, 60, 120, 180)  # [ms]
 EVERY, POINTS = 3, 300  # frames, and points of each that are compared
 
@@ -52,9 +52,9 @@ if __name__ == "__main__":
     default = r2s.OrthotropicSpace.make(0.15).middle()
     fabrics = [default, *(make() for make in presets.FIVE.values())]
     lines: list[Line] = []
-    for y, z, lag in itertools.product(BACK, BELOW, LAGS):
-        moved = [held(r, np.array([0, y, z]) / 1e3 - written, lag / 1e3) for r in folds]
-        names = {"y [mm]": f"{y}", "z [mm]": f"{z}", "lag [ms]": f"{lag}"}
+    for x, z, lag in itertools.product(BACK, BELOW, LAGS):
+        moved = [held(r, np.array([x, 0, z]) / 1e3 - written, lag / 1e3) for r in folds]
+        names = {"x [mm]": f"{x}", "z [mm]": f"{z}", "lag [ms]": f"{lag}"}
         lines.append(names | {"error [mm]": f"{error(moved, fabrics):.2f}"})
     lines.sort(key=lambda line: float(line["error [mm]"]))
     keep(a.out, lines, "Assumed fabrics on all real folds, by where the cloth is held.")
