@@ -5,6 +5,7 @@ from pathlib import Path
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -19,6 +20,7 @@ from r2s.recordings.recording import Recording
 from r2s.scenarios.scenario import from_recording, rollout
 
 SHAPE = (8, 8)  # vertices, as many as are tracked
+KNOT = 0.02  # [s], between knots of the path; the arm logs poses every 0.01 to 0.1 s
 DENSITY = 1.0  # relative deviation of a density that nobody measured
 BUDGET = Budget(coarse=24, starts=3, iterations=25, around=0, shares=(0.3,))
 
@@ -32,7 +34,18 @@ def swings(folder: Path, names: Sequence[str], duration: float) -> list[Recordin
     chosen = [file for file in files if file.stem in names] if names else files
     if not chosen:
         raise ValueError(f"{folder}: no recording of {', '.join(names) or 'any name'}")
-    return [read_swing(file, bar, duration) for file in chosen]
+    return [_alike(read_swing(file, bar, duration)) for file in chosen]
+
+
+def _alike(recording: Recording) -> Recording:
+    """With as many knots as any of its duration, so that one program serves all of them."""
+    end = float(recording.times[-1]) + KNOT
+    times = np.arange(0, end, KNOT)
+    path = np.asarray(recording.handle_path).reshape(len(recording.handle_times), -1)
+    at = [np.interp(times, np.asarray(recording.handle_times), column) for column in path.T]
+    ends = np.stack(at, axis=1).reshape(-1, *recording.handle_path.shape[1:])
+    knots = (jnp.asarray(ends, float), jnp.asarray(times, float))
+    return eqx.tree_at(lambda r: (r.handle_path, r.handle_times), recording, knots)
 
 
 def estimated(recordings: Sequence[Recording], space: ParameterSpace) -> Estimate:
