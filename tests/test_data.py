@@ -183,7 +183,7 @@ def test_a_manifest_that_is_wrong(tmp_path: Path, path: str, change: dict, words
 
 def test_the_manifests_of_the_project() -> None:
     known = known_datasets()
-    assert set(known) == {"blanco_mulero", "diffcloud", "rgbench", "study"}
+    assert set(known) == {"blanco_mulero", "diffcloud", "rgbench", "study", "swings"}
     assert isinstance(known["diffcloud"], Manifest) and isinstance(known["rgbench"], Dataset)
     assert known["rgbench"].licence == "CC-BY-4.0"
     assert "10.5281/zenodo.13823986" in known["blanco_mulero"].citation
@@ -193,7 +193,7 @@ def test_the_manifests_of_the_project() -> None:
         read_manifest(MANIFESTS / "templates" / "blanco_mulero.json")  # until it is filled in
 
 
-@pytest.mark.parametrize("name", ["rgbench", "blanco_mulero", "study"])
+@pytest.mark.parametrize("name", ["rgbench", "blanco_mulero", "study", "swings"])
 def test_what_must_be_fetched_by_hand_says_how(tmp_path: Path, name: str) -> None:
     with pytest.raises(ValueError, match=f"{name}: cannot be downloaded automatically. .* Licence"):
         list(fetch(name, tmp_path))
