@@ -12,7 +12,7 @@ TOP, LATE = 98, range(20, 25)  # percentile of height, and frames, in which the 
 def similarity(seen: np.ndarray, true: np.ndarray) -> tuple[float, np.ndarray]:
     """The scale that brings places nearest to others, and what is left of their distances [m]."""
     seen, true = seen - seen.mean(axis=0), true - true.mean(axis=0)
-    turn, _ = Rotation.align_vectors(true, seen)
+    turn = Rotation.align_vectors(true, seen)[0]
     there = turn.apply(seen)
     scale = float(np.sum(there * true) / np.sum(there**2))
     return scale, scale * there - true
