@@ -19,9 +19,8 @@ from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace
 from r2s.files import write_json
 from r2s.recordings.cameras.views import observed
-from r2s.recordings.recording import Recording, RecordingInfo
+from r2s.recordings.recording import Recording, RecordingInfo, gripper_positions
 from r2s.scenarios.scenario import from_recording, resized
-from r2s.world.scene import along_path
 
 SIZE = "size ratio"  # the nuisance that belongs to the fabric
 ORDER = ("own lift", "other trial's lift", "other fabrics' lifts")
@@ -76,9 +75,8 @@ def seen(
     used = np.array(frames_of(recording))
     if not np.isfinite(moved.x[used]).all():
         return None
-    path = along_path(recording.times, recording.handle_times, recording.handle_path)
     faces, clouds = np.asarray(scenario.scene.mesh.faces), []
-    for x, grippers in zip(moved.x[used], np.asarray(path)[used], strict=True):
+    for x, grippers in zip(moved.x[used], gripper_positions(recording)[used], strict=True):
         points = observed(views, x, faces)
         away = np.linalg.norm(points[:, None] - grippers[None], axis=-1).min(axis=1)
         clouds.append(points[away > views.hidden])

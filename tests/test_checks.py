@@ -147,7 +147,7 @@ def test_nothing_is_suspicious_in_a_good_recording(rendered):
         ("gravity 3 degrees off", {"rig": tilted(3.0)}, "gravity"),
         ("clock 0.15 s late", {"late": 0.15}, "clock"),
         ("clock 0.15 s early", {"late": -0.15}, "clock"),
-        ("a clock that runs twice as fast", {"rate": 2.0}, "grip"),
+        ("a clock that runs twice as fast", {"rate": 2.0}, "clock rate"),
         ("frames in milliseconds", {"rate": 0.001}, "rate"),
         (
             "a crop through the sheet",

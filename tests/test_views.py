@@ -11,19 +11,23 @@ import pytest
 
 from r2s import scenarios
 from r2s.estimation import compiled, normal_equations
+from r2s.estimation.default_spaces import on_points
+from r2s.estimation.diffcp import problems_on_points
 from r2s.estimation.prediction import predict
-from r2s.estimation.problem import Problem, beginning, window
+from r2s.estimation.problem import NuisancePrior, Problem, beginning, check_shared, window
 from r2s.evaluation.surface_distance import to_surface
 from r2s.fabrics import presets
 from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.geometry.mesh import rectangle
 from r2s.geometry.surface import sample
 from r2s.recordings.cameras.calibration import DepthCamera, look_at
+from r2s.recordings.cameras.cleaning import Cleaning
 from r2s.recordings.cameras.views import Views, in_view, observed, shifted
 from r2s.recordings.recording import Doubt, Recording, load, save
 from r2s.scenarios import synthetic
 
 BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+WHOLE = Cleaning(BOX, voxel=0.0, neighbours=0)
 FABRIC = presets.grey_interlock()
 FAMILY = OrthotropicSpace.make(float(FABRIC.density))
 NOBODY = jnp.full((1, 3), 9.0)  # a gripper that is far away
@@ -44,7 +48,7 @@ def sheet(height: float, side: float = 0.3) -> np.ndarray:
 def test_a_sheet_below_another_is_hidden_where_the_other_is():
     upper, lower = sheet(0.1, 0.15), sheet(0.0)
     both = jnp.asarray(np.concatenate([upper, lower]))
-    seen = np.asarray(in_view(Views((ABOVE,), BOX), both, NOBODY))
+    seen = np.asarray(in_view(Views((ABOVE,), WHOLE), both, NOBODY))
     assert seen[: len(upper)].all()
     beyond = np.abs(lower[:, :2]).max(axis=1) > 0.11  # perspective and cells widen the shadow
     below = np.abs(lower[:, :2]).max(axis=1) < 0.05
@@ -54,17 +58,19 @@ def test_a_sheet_below_another_is_hidden_where_the_other_is():
 def test_two_cameras_see_what_either_sees_and_a_gripper_hides_what_is_near_it():
     both = jnp.asarray(np.concatenate([sheet(0.1), sheet(0.0)]))
     below = camera((0.0, 0.1, -1.0))
-    of = [np.asarray(in_view(Views(c, BOX), both, NOBODY)) for c in ((ABOVE,), (below,))]
-    whole = np.asarray(in_view(Views((ABOVE, below), BOX), both, NOBODY))
+    of = [np.asarray(in_view(Views(c, WHOLE), both, NOBODY)) for c in ((ABOVE,), (below,))]
+    whole = np.asarray(in_view(Views((ABOVE, below), WHOLE), both, NOBODY))
     np.testing.assert_array_equal(whole, of[0] | of[1])
-    near = np.asarray(in_view(Views((ABOVE, below), BOX, hidden=0.1), both, jnp.zeros((1, 3))))
+    near = np.asarray(in_view(Views((ABOVE, below), WHOLE, hidden=0.1), both, jnp.zeros((1, 3))))
     np.testing.assert_array_equal(near, whole & (np.linalg.norm(both, axis=1) > 0.1))
 
 
 def test_the_workspace_less_its_border_is_what_counts():
     x = jnp.asarray(sheet(0.0))
     box = ((-0.1, -1.0, -1.0), (0.1, 1.0, 1.0))
-    seen = np.asarray(in_view(Views((ABOVE,), box, border=0.02), x, NOBODY))
+    seen = np.asarray(
+        in_view(Views((ABOVE,), dataclasses.replace(WHOLE, workspace=box), border=0.02), x, NOBODY)
+    )
     np.testing.assert_array_equal(seen, np.abs(np.asarray(x)[:, 0]) < 0.08)
 
 
@@ -74,7 +80,7 @@ def test_samples_in_view_are_those_near_which_the_exact_images_have_points():
     angle = np.clip((rest[:, 0] - 0.12) / 0.06, 0, 1) * np.pi  # folded over, 4 cm thick
     along = np.where(rest[:, 0] < 0.15, rest[:, 0], 0.3 - rest[:, 0])
     x = np.stack([along, rest[:, 1] - 0.15, 0.04 * (1 - np.cos(angle)) / 2], axis=1)
-    views = Views((camera((0.5, -0.3, 0.8), (0.1, 0.0, 0.0)),), BOX)
+    views = Views((camera((0.5, -0.3, 0.8), (0.1, 0.0, 0.0)),), WHOLE)
     faces = np.asarray(mesh.faces)
     points = observed(views, x, faces)
     assert to_surface([points], x[None], mesh.faces)[0] < 1e-6
@@ -87,8 +93,10 @@ def test_samples_in_view_are_those_near_which_the_exact_images_have_points():
 
 def test_the_outlier_filter_takes_the_borders_of_a_sheet():
     x, faces = sheet(0.0), np.asarray(rectangle((0.3, 0.3), (31, 31)).faces)
-    whole = observed(Views((ABOVE,), BOX), x, faces)
-    eroded = observed(Views((ABOVE,), BOX, neighbours=60, deviations=0.5), x, faces)
+    whole = observed(Views((ABOVE,), WHOLE), x, faces)
+    eroded = observed(
+        Views((ABOVE,), dataclasses.replace(WHOLE, neighbours=60, deviations=0.5)), x, faces
+    )
     assert len(eroded) < len(whole)
     assert np.abs(whole[:, :2]).max() - np.abs(eroded[:, :2]).max() > 2e-3
 
@@ -96,7 +104,7 @@ def test_the_outlier_filter_takes_the_borders_of_a_sheet():
 def test_views_move_with_the_clouds():
     x, faces = sheet(0.0), np.asarray(rectangle((0.3, 0.3), (31, 31)).faces)
     shift = (0.02, -0.03, 0.04)
-    views = Views((ABOVE,), ((-0.1, -1.0, -1.0), (1.0, 1.0, 1.0)))
+    views = Views((ABOVE,), dataclasses.replace(WHOLE, workspace=((-0.1, -1.0, -1.0), BOX[1])))
     moved = observed(shifted(views, shift), x + np.array(shift), faces)
     np.testing.assert_allclose(moved, observed(views, x, faces) + np.array(shift), atol=1e-9)
 
@@ -105,14 +113,13 @@ def test_views_move_with_the_clouds():
     ("changed", "words"),
     [
         ({"cameras": ()}, "need a camera"),
-        ({"workspace": (BOX[1], BOX[0])}, "least, greatest"),
-        ({"border": 1.5}, "room between"),
+        ({"border": 1.5, "hidden": 0.1}, "no room"),
         ({"hidden": -0.1}, "must not be negative"),
     ],
 )
 def test_views_that_cannot_be_are_refused(changed, words):
     with pytest.raises(ValueError, match=words):
-        dataclasses.replace(Views((ABOVE,), BOX), **changed)
+        dataclasses.replace(Views((ABOVE,), WHOLE), **changed)
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +132,8 @@ def lifted() -> Recording:
     )
     eyes = (camera((0.9, 0.2, 0.7), (0.2, 0.2, 0.1)), camera((-0.6, 0.3, 0.5), (0.2, 0.2, 0.1)))
     lowest = float(jnp.min(jnp.where(made.mask, made.points[..., 2], jnp.inf)))  # cropped there
-    views = Views(eyes, ((-1.0, -1.0, lowest), BOX[1]), border=0.01, hidden=0.02)
+    box = ((-1.0, -1.0, lowest), BOX[1])
+    views = Views(eyes, dataclasses.replace(WHOLE, workspace=box), border=0.01, hidden=0.02)
     doubt = Doubt((0.01, 0.02, 0.03), 0.1, 0.05, 0.02)
     return dataclasses.replace(made, info=dataclasses.replace(made.info, views=views, doubt=doubt))
 
@@ -196,3 +204,19 @@ def test_windows_and_beginnings_keep_and_hide_what_should_have_been_seen(problem
     assert early is not None
     counted = np.asarray(early.mask).any(axis=1)
     np.testing.assert_array_equal(counted, np.arange(len(problem.frames)) < 2)
+
+
+def test_on_material_points_the_size_is_taken_as_written_down(lifted):
+    """Else a recording that doubts its size could not be simulated on them at all."""
+    (made,) = problems_on_points([lifted], on_points(0.2), (5, 5))
+    assert made.nuisance_prior == NuisancePrior((0.01, 0.02, 0.03), 0.1, 0.05)
+    theta = theta_of(made, jnp.full(made.space.dim, 0.5))
+    assert jax.eval_shape(predict, made, theta).x.shape[1:] == (25, 3)
+
+
+def test_recordings_that_doubt_one_size_unlike_are_not_estimated_from_together(problem):
+    exact = dataclasses.replace(problem, nuisance_prior=problem.nuisance_prior._replace(size=0.0))
+    check_shared((problem, exact, problem))
+    wider = dataclasses.replace(problem, nuisance_prior=problem.nuisance_prior._replace(size=0.1))
+    with pytest.raises(ValueError, match=r"the size of a fabric is in doubt by \[0.02, 0.1\]"):
+        check_shared((problem, wider))

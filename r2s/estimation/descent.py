@@ -28,7 +28,7 @@ from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
 from r2s.estimation.mesh_bias import OtherMesh, mesh_bias
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import Prediction, Sensitivity, Theta, explain, fabric_at
-from r2s.estimation.problem import OWN, SHARED, UNITS, Problem, beginning
+from r2s.estimation.problem import OWN, SHARED, UNITS, Problem, beginning, check_shared
 from r2s.fabrics.fabric import Fabric
 
 INITIAL_DAMPING = 1e-2
@@ -135,6 +135,7 @@ def search(
         raise ValueError(f"shares of the frames must rise between 0 and 1, got {budget.shares}")
     if budget.around < 0 or budget.around % 2:
         raise ValueError(f"places around the end are in pairs: an even number, got {budget.around}")
+    check_shared(problems)
     began = time.perf_counter()
     run = _run_of(problems, budget, start, key) if checkpoint else {}
     rows = _resumed(checkpoint, run, budget) if checkpoint else []

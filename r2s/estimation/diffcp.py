@@ -97,13 +97,19 @@ def on_points(
     - `spacing`, `membrane_damping`: see `r2s.scenarios.material_points`.
     - `forward_mode`: allow exact sensitivities, which the default method does not need.
 
+    The sheet's size is taken as written down, since points are laid for one size.
+
     Make the problem of a sheet that hangs with `as_seen=False`: the points do not settle into the
     shape of their own recording from the shape that the first cloud shows.
     """
     stiffest = problem.space(jnp.ones(problem.space.dim, float))  # limits the time step
     sheet = material_points(problem.scenario, stiffest, spacing, membrane_damping)
     background = dataclasses.replace(sheet.background, forward_mode=forward_mode)
-    return dataclasses.replace(problem, solver=dataclasses.replace(sheet, background=background))
+    return dataclasses.replace(
+        problem,
+        solver=dataclasses.replace(sheet, background=background),
+        nuisance_prior=problem.nuisance_prior._replace(size=0.0),
+    )
 
 
 def squared_third(problem: Problem, seen: Prediction) -> Float[Array, ""]:

@@ -233,12 +233,11 @@ def _to_clouds(
     Nothing counts in a frame without points. How far points are apart from each other says nothing
     of the sheet: gaps are shorter by that.
     """
-    frozen = jax.lax.stop_gradient(x)
 
     def frame(args):
-        x, frozen, targets, mask, apart, grippers = args
+        x, targets, mask, apart, grippers = args
         samples = jnp.einsum("sk,ski->si", expected.weights, x[expected.vertices])
-        places = jnp.einsum("sk,ski->si", expected.weights, frozen[expected.vertices])
+        places = jax.lax.stop_gradient(samples)
         far = jnp.where(mask, 0, jnp.inf)
         pairs = jnp.sum((places[:, None] - targets[None]) ** 2, axis=-1) + far[None]
         gap = samples - targets[jnp.argmin(pairs, axis=1)]
@@ -248,7 +247,7 @@ def _to_clouds(
         return jnp.where(counts[:, None], beyond[:, None] * gap, 0), counts
 
     seen = expected.targets, expected.mask, expected.apart, expected.grippers
-    return jax.lax.map(frame, (x, frozen, *seen))
+    return jax.lax.map(frame, (x, *seen))
 
 
 def _gaps(markers: Markers, x: Float[Array, "frame vertex 3"]) -> Float[Array, "frame marker 3"]:

@@ -1,6 +1,7 @@
 """What an estimator is given: a recording to be explained by a fabric of a parameter space."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -15,9 +16,8 @@ from r2s.fabrics.parameters import ParameterSpace
 from r2s.geometry.mesh import Mesh
 from r2s.geometry.surface import nearest
 from r2s.recordings.cameras.views import Views
-from r2s.recordings.recording import Doubt, Recording, subsample
+from r2s.recordings.recording import Doubt, Recording, gripper_positions, subsample
 from r2s.scenarios.scenario import Scenario, from_recording
-from r2s.world.scene import along_path
 
 POINTS = 300  # at most, of a cloud
 TARGETS = 1200  # at most, of a cloud that the sheet must lie near
@@ -210,6 +210,19 @@ def read_by_problem(recording: Recording) -> Reads:
     )
 
 
+def check_shared(problems: Sequence[Problem]) -> None:
+    """Raise `ValueError` when recordings are in doubt of what they share by unlike deviations: in
+    their units one number would mean two things. One that takes it as exact may be among them."""
+    for name, scales in zip(
+        SHARED, zip(*(p.nuisance_prior.scales for p in problems), strict=True), strict=False
+    ):
+        if len(found := {scale for scale in scales if scale}) > 1:
+            raise ValueError(
+                f"the {name} of a fabric is in doubt by {sorted(found)} in recordings that are "
+                "estimated from together: give one deviation"
+            )
+
+
 def window(problem: Problem, first: int, last: int) -> Problem:
     """The problem in which only the frames from `first` to `last` count.
 
@@ -286,8 +299,7 @@ def _expected(
         )
     face, weights, _ = _on_sheet(places, mesh)
     dense = subsample(recording, TARGETS, None, seed)
-    times = np.asarray(recording.times)[frames]
-    grippers = along_path(jnp.asarray(times), recording.handle_times, recording.handle_path)
+    grippers = jnp.asarray(gripper_positions(recording)[frames], float)
     targets, mask = dense.points[frames], dense.mask[frames]
     clouds = [cloud[kept] for cloud, kept in zip(*map(np.asarray, (targets, mask)), strict=True)]
     apart = jnp.asarray([_apart(cloud) for cloud in clouds], float)

@@ -301,8 +301,9 @@ def _moved_views(views: Views | None, session: Session) -> Views | None:
     """The views of a session's recordings, in the world."""
     if views is None:
         return None
-    cropped = views if session.workspace is None else replace(views, workspace=session.workspace)
-    return shifted(cropped, session.shift)
+    if session.workspace is not None:
+        views = replace(views, clean=replace(views.clean, workspace=session.workspace))
+    return shifted(views, session.shift)
 
 
 def _scenario_of(manifest: Manifest, name: str) -> tuple[str, str, str]:

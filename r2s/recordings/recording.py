@@ -234,6 +234,15 @@ def cloud(recording: Recording, frame: int) -> Float[np.ndarray, "point 3"]:
     return np.asarray(recording.points)[frame][np.asarray(recording.mask)[frame]]
 
 
+def gripper_positions(recording: Recording) -> Float[np.ndarray, "frame gripper 3"]:
+    """Where the grippers are at the frames [m]: linear between knots, at rest before and after."""
+    path = np.asarray(recording.handle_path, np.float64)
+    times, knots = (np.asarray(t, np.float64) for t in (recording.times, recording.handle_times))
+    columns = path.reshape(len(path), -1).T
+    at = np.stack([np.interp(times, knots, column) for column in columns], axis=1)
+    return at.reshape(-1, *path.shape[1:])
+
+
 def subsample(recording: Recording, num_points: int, voxel: float | None, seed: int) -> Recording:
     """Thin every frame to at most `num_points`, padded to exactly that many.
 

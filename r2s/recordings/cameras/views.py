@@ -13,11 +13,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s.recordings.cameras.calibration import DepthCamera
-from r2s.recordings.cameras.cleaning import Cleaning, inside, outliers
+from r2s.recordings.cameras.cleaning import Cleaning, Corner, clean
 from r2s.recordings.cameras.depth import back_project, moved
 from r2s.recordings.cameras.render import render
-
-Corner = tuple[float, float, float]
 
 CELL = 0.015  # [m]: width, at the sheet, of the cells in which samples hide each other
 DEPTH = 0.02  # [m]: samples this much behind the nearest in their cell are hidden
@@ -28,34 +26,31 @@ class Views:
     """The cameras of a recording, and what became of their points.
 
     - `cameras`: in the world of the recording.
-    - `workspace`: least and greatest corner of the box that clouds were cropped to, [m].
-    - `neighbours`, `deviations`: of the statistical outlier filter, see
-      `r2s.recordings.cameras.cleaning.Cleaning`; 0 neighbours: there was none.
-    - `border`: width of the strip, along the borders of the sheet and of the workspace, which that
-      filter erodes and in which nothing is asked of a cloud, [m].
+    - `clean`: how the cloud of each of them was cleaned.
+    - `border`: width of the strip, along the borders of the sheet and of the workspace, which the
+      outlier filter erodes and in which nothing is asked of a cloud, [m].
     - `hidden`: distance from a gripper within which the robot's mask hides the sheet, [m].
 
-    Raises ValueError for no camera, a workspace without inside, and lengths that are negative.
+    Raises ValueError for no camera, a workspace with no room between its borders, and lengths that
+    are negative.
     """
 
     cameras: tuple[DepthCamera, ...]
-    workspace: tuple[Corner, Corner]
-    neighbours: int = 0
-    deviations: float = 3.0
+    clean: Cleaning
     border: float = 0.0
     hidden: float = 0.0
 
     def __post_init__(self) -> None:
-        low, high = np.array(self.workspace)
         if not self.cameras:
             raise ValueError("views need a camera, found none")
+        if min(self.border, self.hidden) < 0:
+            raise ValueError(f"border and hidden must not be negative, found {self}")
+        low, high = np.array(self.clean.workspace)
         if not (low + 2 * self.border < high).all():
             raise ValueError(
-                f"workspace must be [least, greatest] corner [m] with room between its borders of "
-                f"{self.border:g} m, found {low}, {high}"
+                f"a workspace from {low} to {high} m has no room between borders of "
+                f"{self.border:g} m"
             )
-        if min(self.neighbours, self.deviations, self.border, self.hidden) < 0:
-            raise ValueError("neighbours, deviations, border and hidden must not be negative")
 
 
 def shifted(views: Views, shift: Corner) -> Views:
@@ -71,8 +66,9 @@ def shifted(views: Views, shift: Corner) -> Views:
         pose[:3, 3] += shift
         rows = tuple(tuple(float(value) for value in row) for row in pose)
         cameras.append(replace(camera, to_world=rows))
-    low, high = views.workspace
-    return replace(views, cameras=tuple(cameras), workspace=(beside(low), beside(high)))
+    low, high = views.clean.workspace
+    clean = replace(views.clean, workspace=(beside(low), beside(high)))
+    return replace(views, cameras=tuple(cameras), clean=clean)
 
 
 def in_view(
@@ -85,7 +81,7 @@ def in_view(
     In view, in the workspace less its border, away from the `grippers` [m], and not behind others:
     a z-buffer whose cells are `CELL` wide where the sheet is, so samples must be closer than that.
     """
-    low, high = jnp.asarray(views.workspace, samples.dtype)
+    low, high = jnp.asarray(views.clean.workspace, samples.dtype)
     low, high = low[None] + views.border, high[None] - views.border
     kept = jnp.all((samples > low) & (samples < high), axis=1)
     apart = jnp.linalg.norm(samples[:, None] - grippers[None], axis=-1)
@@ -127,14 +123,10 @@ def observed(
     views: Views, x: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"]
 ) -> Float[np.ndarray, "point 3"]:
     """The points [m] that the cameras would have recorded of a mesh [m]: every pixel that sees it,
-    cropped, and freed of outliers camera by camera as the recording was. Without a robot."""
-    keep = Cleaning(
-        views.workspace, neighbours=views.neighbours, deviations=views.deviations, voxel=0.0
-    )
+    cleaned camera by camera as the recording was. Without a robot."""
     clouds = []
     for camera in views.cameras:
         depth, _ = render(camera, x, faces)
         points = moved(np.array(camera.to_world), back_project(camera, depth, depth > 0))
-        points = points[inside(points, keep)]
-        clouds.append(points[~outliers(points, keep.neighbours, keep.deviations)])
+        clouds.append(clean(points, views.clean, 0))
     return np.concatenate(clouds)

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from r2s.recordings.checks.finding import Finding
-from r2s.recordings.checks.sheet import FEWEST, cleaned, lies
+from r2s.recordings.checks.seen import FEWEST, Points, Seen, lies
 from r2s.recordings.recording import Recording
 
 UNEVEN = 0.05  # of the interval between frames
@@ -15,19 +15,20 @@ LAGS = np.arange(-50, 51) / 100  # [s], that are tried
 RATES = np.array([0.5, 0.67, 0.8, 1.0, 1.25, 1.5, 2.0])  # of the clock, that are tried
 CLEARLY = 0.25  # of what is left at another rate: then it is another
 TOP = 0.99  # quantile of height from which points are the top
+FRAMES = 5  # at least, that show the sheet held up
 MOVES = 0.05  # [m], at least, along an axis that is compared
 UP = 0.1  # [m] above the table: a sheet that is held up
 WAITS = "check the frame rate and time_offset: does a clap or a jerk come at one time in both?"
 
 
-def check_clock(recording: Recording) -> list[Finding]:
+def check_clock(seen: Seen) -> list[Finding]:
     """Intervals, rate, the grippers' speed, and how late the top of the cloud follows them."""
-    times = np.asarray(recording.times, np.float64)
-    gaps = np.diff(times)
+    recording = seen.recording
+    gaps = np.diff(np.asarray(recording.times, np.float64))
     middle = float(np.median(gaps)) if len(gaps) else np.nan
     uneven = float(np.abs(gaps / middle - 1).max()) if len(gaps) else np.nan
     speeds = _speeds(recording)
-    lag, rate = _lag(recording)
+    lag, rate = _lag(seen)
     late = max(LATE, round(middle, 3)) if len(gaps) else LATE
     moves = "when the top of the cloud moves, after the grippers do,"
     moves = moves if np.isfinite(lag) else "the grippers do not move enough"
@@ -52,14 +53,6 @@ def check_clock(recording: Recording) -> list[Finding]:
     ]  # fmt: skip
 
 
-def _with_a_top(recording: Recording) -> list[int]:
-    """The frames in which grippers hold the sheet up, and the cloud shows it."""
-    knots, path = np.asarray(recording.handle_times), np.asarray(recording.handle_path)
-    lowest = recording.info.table_height + UP if lies(recording) else -np.inf
-    high = np.interp(recording.times, knots, _leader(path, 2)) > lowest
-    return [f for f in np.flatnonzero(high).tolist() if len(cleaned(recording, f)) >= FEWEST]
-
-
 def _speeds(recording: Recording) -> float:
     path, knots = np.asarray(recording.handle_path), np.asarray(recording.handle_times)
     if len(knots) < 2:
@@ -68,17 +61,21 @@ def _speeds(recording: Recording) -> float:
     return float((moved / np.diff(knots)).max())
 
 
-def _lag(recording: Recording) -> tuple[float, float]:
+def _lag(seen: Seen) -> tuple[float, float]:
     """How late [s] the top of the cloud follows the grippers, and the rate of its clock; NaN where
     no axis moves."""
-    times = np.asarray(recording.times, np.float64)
-    frames = _with_a_top(recording)
-    times = times[frames]
-    tops = np.array([_top(cleaned(recording, frame)) for frame in frames])
+    recording = seen.recording
+    shown = [f for f, points in enumerate(seen.clouds) if len(points) >= FEWEST]
+    tops = {frame: _top(seen.clouds[frame]) for frame in shown}
+    lowest = recording.info.table_height + UP if lies(recording) else -np.inf
+    up = [frame for frame in shown if tops[frame][2] > lowest]
+    if len(up) < FRAMES:
+        return np.nan, np.nan
+    times, tops = np.asarray(recording.times, np.float64)[up], np.array([tops[f] for f in up])
     axes = [axis for axis in (2, 0, 1) if _range(recording, axis) > MOVES]
     if len(recording.info.sheet.held) == 1:
         axes = [axis for axis in axes if axis == 2]  # a single corner leans aside
-    if not axes or len(times) < 5:
+    if not axes:
         return np.nan, np.nan
     start = times[0]
     left = np.array(
@@ -114,7 +111,7 @@ def _left(recording: Recording, at: np.ndarray, tops: np.ndarray, axes: list[int
     return left
 
 
-def _top(points: Float[np.ndarray, "point 3"]) -> np.ndarray:
+def _top(points: Points) -> np.ndarray:
     """The middle of the highest points."""
     high = points[points[:, 2] >= np.quantile(points[:, 2], TOP)]
     return np.median(high, axis=0)

@@ -5,9 +5,9 @@ from jaxtyping import Float
 
 from r2s.recordings.cameras.cleaning import outliers
 from r2s.recordings.checks.finding import Finding
-from r2s.recordings.checks.sheet import VOXEL
-from r2s.recordings.readers.clouds import voxel_means
-from r2s.recordings.recording import CORNERS, Recording, cloud, corner
+from r2s.recordings.checks.seen import VOXEL, Seen
+from r2s.recordings.checks.sheet import reach
+from r2s.recordings.recording import Recording
 
 FEWEST = 150  # points of a frame, thinned to 5 mm
 STRAY = 0.03  # share of a frame
@@ -21,15 +21,14 @@ ABOVE = 0.025  # [m] above the table, below which clouds are often cut on purpos
 APART = 0.08  # [m], from a gripper to the nearest point
 
 
-def check_clouds(recording: Recording) -> list[Finding]:
+def check_clouds(seen: Seen) -> list[Finding]:
     """Number of points, outliers, faces of a box that cut the clouds, distance of the grippers."""
+    recording = seen.recording
     if recording.markers is not None:
         return []
     first, last = recording.info.frames_used
-    frames = list(range(first, last + 1))
-    clouds = [voxel_means(cloud(recording, frame), VOXEL) for frame in frames]
+    clouds, held = seen.thinned[first : last + 1], seen.grippers[first : last + 1]
     counts = np.array([len(points) for points in clouds])
-    held = _held(recording)[first : last + 1]
     found = [
         Finding(
             "points",
@@ -60,12 +59,6 @@ def check_clouds(recording: Recording) -> list[Finding]:
     return [*found, *_faces(recording, clouds)]
 
 
-def _held(recording: Recording) -> Float[np.ndarray, "frame gripper 3"]:
-    knots, path = np.asarray(recording.handle_times), np.asarray(recording.handle_path)
-    at = [np.interp(recording.times, knots, column) for column in path.reshape(len(path), -1).T]
-    return np.stack(at, axis=1).reshape(-1, *path.shape[1:])
-
-
 def _stray(
     recording: Recording,
     points: Float[np.ndarray, "point 3"],
@@ -75,8 +68,7 @@ def _stray(
     sheet = recording.info.sheet
     far = np.zeros(len(points), bool)
     for name, at in zip(sheet.held, held, strict=True):
-        reach = max(np.linalg.norm(corner(sheet, n) - corner(sheet, name)) for n in CORNERS)
-        far |= np.linalg.norm(points - at, axis=1) > BEYOND * reach
+        far |= np.linalg.norm(points - at, axis=1) > BEYOND * reach(sheet, name)
     return float(np.mean(far | outliers(points, NEIGHBOURS, DEVIATIONS)))
 
 

@@ -2,60 +2,29 @@
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 from r2s.recordings.checks.finding import Finding
-from r2s.recordings.readers.clouds import voxel_means
-from r2s.recordings.recording import CORNERS, Recording, cloud, corner
+from r2s.recordings.checks.seen import FEWEST, Points, Seen, lies
+from r2s.recordings.recording import CORNERS, Recording, SheetPlacement, corner
 
-Points = Float[np.ndarray, "point 3"]
-
-VOXEL = 0.005  # [m], to which clouds are thinned
-AROUND, FEW = 0.02, 4  # [m], in which a point of a sheet has more others than that
-FEWEST = 50  # points, of a frame that shows something
-STILL = 0.002  # [m], within which grippers are at rest
 CELL, MOST_SEEN = 0.02, 0.7  # [m] and share of a sheet's cells that must show its extent
 NEAR = 0.05  # [m], of the sheet's plane at rest
 ENDS = 0.005  # quantile at which an extent begins
 SCALE = 0.025  # relative, of a length; a side that was measured with a ruler is good to 0.5 %
 LEVEL, PLUMB = 1.5, 4.0  # [degrees]
 HEIGHT = 0.01  # [m]
-REACH, GROWTH = 1.06, 1.08  # of the sheet's own length
+LEAST_REACH, REACH, GROWTH = 0.6, 1.06, 1.08  # of the sheet's own length
+WHOLE = 0.85  # of that, from where on a sheet is seen whole
 STRAIN = 1.1  # of the distances between neighbouring markers
 
 CALIBRATION = "check the cameras' calibration and depth scale, and the sheet's size"
 
 
-def cleaned(recording: Recording, frame: int) -> Points:
-    """A frame's points [m], thinned, but for those that have few others around."""
-    points = voxel_means(cloud(recording, frame), VOXEL)
-    if recording.markers is not None or len(points) <= FEW:
-        return points
-    around = KDTree(points).query_ball_point(points, AROUND, return_length=True)
-    return points[np.asarray(around) > FEW]
-
-
-def at_rest(recording: Recording) -> list[int]:
-    """Frames before the grippers move; the first one at least."""
-    path, knots = np.asarray(recording.handle_path), np.asarray(recording.handle_times)
-    moved = np.linalg.norm(path - path[:1], axis=-1).max(axis=1) > STILL
-    begins = float(knots[np.argmax(moved)]) if moved.any() else np.inf
-    still = np.flatnonzero(np.asarray(recording.times) <= begins)
-    return still.tolist() or [0]
-
-
-def lies(recording: Recording) -> bool:
-    """Whether the sheet lies at rest, rather than hangs."""
-    sheet = recording.info.sheet
-    return bool(abs(np.cross(sheet.warp, sheet.weft)[2]) > 0.9)
-
-
-def check_sheet(recording: Recording) -> list[Finding]:
+def check_sheet(seen: Seen) -> list[Finding]:
     """Scale, gravity and stretch, as far as the recording shows them."""
-    first = cleaned(recording, at_rest(recording)[0])
-    found = [*_lying(recording, first)] if lies(recording) else [_plumb(recording, first)]
-    found += _reach(recording)
-    return [*found, _markers_apart(recording)]
+    recording, first = seen.recording, seen.clouds[seen.still[0]]
+    found = _lying(recording, first) if lies(recording) else [_plumb(seen.grippers[0], first)]
+    return [*found, *_reach(seen), _markers_apart(recording)]
 
 
 def _lying(recording: Recording, first: Points) -> list[Finding]:
@@ -95,45 +64,41 @@ def _seen_share(flat: Float[np.ndarray, "point 2"], size: tuple[float, float]) -
     return len(np.unique(inside, axis=0)) / float(cells.prod())
 
 
-def _plumb(recording: Recording, first: Points) -> Finding:
+def _plumb(grippers: Float[np.ndarray, "gripper 3"], first: Points) -> Finding:
     """How far a sheet that hangs at rest is from below its grippers."""
-    held = np.asarray(recording.handle_path[0]).mean(axis=0)
-    away = first.mean(axis=0) - held
+    away = first.mean(axis=0) - grippers.mean(axis=0)
     tilt = float(np.degrees(np.arctan2(np.hypot(away[0], away[1]), -away[2])))
     words = "angle from the vertical of the line from the grippers to the middle of the sheet"
     advice = "the world's z must point up: check the cameras' pose against a plumb line"
     return Finding("gravity", tilt, "degrees", -np.inf, PLUMB, words, advice)
 
 
-def _reach(recording: Recording) -> list[Finding]:
+def _reach(seen: Seen) -> list[Finding]:
     """How far points are from the grippers, over how far the sheet reaches from there."""
-    path, knots = np.asarray(recording.handle_path), np.asarray(recording.handle_times)
-    times = np.asarray(recording.times)
-    sheet, names = recording.info.sheet, recording.info.sheet.held
-    far = [max(np.linalg.norm(corner(sheet, n) - corner(sheet, h)) for n in CORNERS) for h in names]
-    ratios = []
-    for frame, time in enumerate(times):
-        points = cleaned(recording, frame)
-        if len(points) < FEWEST:
-            continue
-        for handle, farthest in enumerate(far):
-            held = [np.interp(time, knots, path[:, handle, k]) for k in range(3)]
-            reach = np.quantile(np.linalg.norm(points - held, axis=1), 1 - ENDS)
-            ratios.append((frame, reach / farthest))
-    if not ratios:
+    sheet = seen.recording.info.sheet
+    ratios = np.full(len(seen.clouds), np.nan)
+    for frame, (points, grippers) in enumerate(zip(seen.clouds, seen.grippers, strict=True)):
+        if len(points) >= FEWEST:
+            away = np.linalg.norm(points[:, None] - grippers[None], axis=-1)
+            farthest = np.quantile(away, 1 - ENDS, axis=0)
+            ratios[frame] = np.max(farthest / [reach(sheet, name) for name in sheet.held])
+    if np.isnan(ratios).all():
         nothing = f"no frame has {FEWEST} points"
-        return [Finding("reach", np.nan, "-", 0.6, REACH, nothing, CALIBRATION)]
-    numbers = np.array([ratio for _, ratio in ratios])
-    still = np.array([frame in set(at_rest(recording)) for frame, _ in ratios])
+        return [Finding("reach", np.nan, "-", LEAST_REACH, REACH, nothing, CALIBRATION)]
+    most, still = float(np.nanmax(ratios)), ratios[seen.still]
     words = "farthest point from a gripper, over how far the sheet reaches from there,"
-    found = [Finding("reach", float(numbers.max()), "-", 0.6, REACH, words, CALIBRATION)]
-    grown = float(numbers.max() / numbers[still].max()) if still.any() else np.nan
-    words = "the same, over what it is at rest,"
+    found = [Finding("reach", most, "-", LEAST_REACH, REACH, words, CALIBRATION)]
+    whole = bool((still > WHOLE).any())
+    words = "the same, over what it is at rest," if whole else "not seen whole at rest"
+    grown = most / float(np.nanmax(still)) if whole else np.nan
     advice = "the sheet stretches, or the cameras' scale changes with the place"
-    whole = still.any() and numbers[still].max() > 0.85
-    words = words if whole else "the sheet is not seen whole at rest"
-    grown = grown if whole else np.nan
     return [*found, Finding("stretch", grown, "-", -np.inf, GROWTH, words, advice)]
+
+
+def reach(sheet: SheetPlacement, held: str) -> float:
+    """How far the farthest corner is from a corner that is held, [m]."""
+    away = [np.linalg.norm(corner(sheet, name) - corner(sheet, held)) for name in CORNERS]
+    return float(max(away))
 
 
 def _markers_apart(recording: Recording) -> Finding:
