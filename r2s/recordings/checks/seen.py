@@ -34,8 +34,9 @@ class Seen(NamedTuple):
 def seen_in(recording: Recording) -> Seen:
     """What a recording shows, in metres."""
     thinned = [voxel_means(cloud(recording, f), VOXEL) for f in range(len(recording.times))]
-    has_markers = recording.markers is not None
-    clouds = thinned if has_markers else [_with_others(points) for points in thinned]
+    markers = recording.markers
+    are_markers = markers is not None and recording.points.shape[1] <= markers.shape[1]
+    clouds = thinned if are_markers else [_with_others(points) for points in thinned]
     return Seen(recording, thinned, clouds, gripper_positions(recording), _still(recording))
 
 
@@ -45,7 +46,7 @@ def lies(recording: Recording) -> bool:
     return bool(abs(np.cross(sheet.warp, sheet.weft)[2]) > 0.9)
 
 
-def _with_others(points: Points) -> Points:
+def _with_others(points: Points) -> Float[np.ndarray, "kept 3"]:
     if len(points) <= FEW:
         return points
     around = KDTree(points).query_ball_point(points, AROUND, return_length=True)

@@ -32,6 +32,7 @@ def _lying(recording: Recording, first: Points) -> list[Finding]:
     axes = np.array([sheet.warp, sheet.weft])
     flat = (first - np.array(sheet.origin)) @ axes.T
     above = (first - np.array(sheet.origin)) @ np.cross(*axes)
+    first = first[np.abs(above) < NEAR]
     near = flat[np.abs(above) < NEAR]
     whole = _seen_share(near, sheet.size) >= MOST_SEEN
     found = []
