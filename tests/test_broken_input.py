@@ -323,7 +323,7 @@ def frames_not_there(folder: Path) -> None:
             "012.pcd: 1 of 3 points are not finite, the first is point 1.*: export the cloud",
         ),
         (force_log, r"pull.csv: .*line 4"),
-        (short_npz, "a.npz: not a readable recording .r2s-recording/2.*: copy the file again"),
+        (short_npz, "a.npz: not a readable recording .r2s-recording/3.*: copy the file again"),
         (
             path_too_short,
             "recording wave: the handle path ends at .* before the last frame.*: log it longer",

@@ -25,7 +25,7 @@ from r2s.estimation.estimate_json import as_json, from_json
 from r2s.estimation.gauss_newton import Descent
 from r2s.estimation.normal_equations import loss_of, normal_equations_of
 from r2s.estimation.prediction import Prediction, Sensitivity, _delayed, predict, sensitivities
-from r2s.estimation.problem import NuisancePrior, Problem, beginning, window
+from r2s.estimation.problem import OWN, NuisancePrior, Problem, beginning, window
 from r2s.fabrics import presets
 from r2s.fabrics.parameters import OrthotropicSpace, Range
 from r2s.recordings.recording import set_time_offset
@@ -251,7 +251,7 @@ def test_an_estimate_lowers_the_loss_and_survives_its_file(estimated):
     np.testing.assert_allclose(again.values, found.values)
     np.testing.assert_allclose(again.history, found.history)
     assert float(again.fabric.membrane.c12) == pytest.approx(float(found.fabric.membrane.c12))
-    names = ["density ratio", "air ratio", "shift x", "shift y", "shift z", "turn", "time"]
+    names = ["density ratio", "air ratio", "size ratio", *OWN]
     assert [c.name for c in again.nuisances] == names
     assert again.nuisances == found.nuisances and again.combinations == found.combinations
 
