@@ -72,8 +72,3 @@ def errors(recording: Recording, fabric: Fabric) -> Float[np.ndarray, " row"] | 
     away = np.linalg.norm(np.asarray(moved.x) - np.asarray(recording.markers), axis=-1)
     away = np.where(np.asarray(recording.markers_seen), away, np.nan)
     return np.nanmean(away.reshape(-1, *SHAPE), axis=(0, 1))
-
-
-def each_of(fabrics: Fabric, count: int) -> list[Fabric]:
-    """The fabrics of a stack of them."""
-    return [jax.tree.map(lambda leaf, i=i: leaf[i], fabrics) for i in range(count)]

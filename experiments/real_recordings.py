@@ -29,8 +29,7 @@ if __name__ == "__main__":
     parser.add_argument("--shape", type=int, nargs=2, default=(9, 9), help="vertices")
     a = parser.parse_args()
     shape, space = tuple(a.shape), r2s.OrthotropicSpace.make(a.density)
-    drawn = prior.draws(a.density, DRAWS, jax.random.key(0))
-    draws = [jax.tree.map(lambda leaf, i=i: leaf[i], drawn) for i in range(DRAWS)]
+    draws = prior.fabrics(a.density, DRAWS, jax.random.key(0))
     lifts, folds = (recordings_in(a.recordings, name) for name in ("lift", "fold"))
     made = {r.info.name: (r.info, estimated(r, space, shape, a.kept)) for r in [*lifts, *folds]}
     table: dict[str, dict[str, float]] = {}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from _swings import each_of, errors, estimated, swings
+from _swings import errors, estimated, swings
 from _tables import Line, command_line, keep
 
 import r2s
@@ -30,7 +30,7 @@ if __name__ == "__main__":
     space = r2s.OrthotropicSpace.make(a.density)
     found = estimated(swings(a.recordings, LEARNT, a.seconds), space)
     print("\n".join(describe(found)), f"density {float(found.fabric.density):.3g} kg/m^2", sep="\n")
-    draws = each_of(prior.draws(a.density, DRAWS, jax.random.key(0)), DRAWS)
+    draws = prior.fabrics(a.density, DRAWS, jax.random.key(0))
     lines: list[Line] = []
     rows: list[dict[str, float]] = []
     for swing in swings(a.recordings, (), a.seconds):

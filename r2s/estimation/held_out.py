@@ -7,14 +7,13 @@ nothing but the weight is known (`r2s.fabrics.prior`).
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax
 import jax.random as jr
 import numpy as np
 
 from r2s.evaluation import prediction_error
 from r2s.fabrics import prior
 from r2s.fabrics.fabric import Fabric
-from r2s.recordings.recording import Recording
+from r2s.recordings.recording import Recording, clouds_are_markers
 from r2s.scenarios.scenario import from_recording
 
 FEWEST = 3  # recordings, of which one is held out without being asked for
@@ -84,9 +83,7 @@ def has_clouds(recording: Recording) -> bool:
     """Whether it has clouds, and not its markers in their place, in every frame that counts."""
     first, last = recording.info.frames_used
     counts = np.count_nonzero(np.asarray(recording.mask), axis=1)[first : last + 1]
-    if np.any(counts == 0):
-        return False
-    return recording.markers is None or recording.points.shape[1] > recording.markers.shape[1]
+    return bool(np.all(counts > 0)) and not clouds_are_markers(recording)
 
 
 def judge(
@@ -96,8 +93,7 @@ def judge(
 
     All are simulated by the cloth on a mesh of `shape`, in the scenario's steps.
     """
-    drawn = prior.draws(float(fabric.density), count, jr.key(0))
-    each = [jax.tree.map(lambda leaf, i=i: leaf[i], drawn) for i in range(count)]
+    each = prior.fabrics(float(fabric.density), count, jr.key(0))
     error, *others = (_error(recording, one, shape) for one in (fabric, *each))
     finite = tuple(other for other in others if np.isfinite(other))
     return HeldOut(recording.info.name, error, finite, count - len(finite))

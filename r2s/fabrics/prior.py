@@ -53,6 +53,12 @@ def draws(density: float, count: int, key: PRNGKeyArray) -> Fabric:
     )
 
 
+def fabrics(density: float, count: int, key: PRNGKeyArray) -> list[Fabric]:
+    """The `draws`, one by one."""
+    drawn = draws(density, count, key)
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], drawn) for i in range(count)]
+
+
 def middle(density: float) -> Fabric:
     """The fabric in the middle of the prior, for an areal density [kg/m^2]: the median of every
     number that is drawn.

@@ -234,6 +234,12 @@ def cloud(recording: Recording, frame: int) -> Float[np.ndarray, "point 3"]:
     return np.asarray(recording.points)[frame][np.asarray(recording.mask)[frame]]
 
 
+def clouds_are_markers(recording: Recording) -> bool:
+    """Whether markers were put in the place of clouds that nobody recorded."""
+    markers = recording.markers
+    return markers is not None and recording.points.shape[1] <= markers.shape[1]
+
+
 def gripper_positions(recording: Recording) -> Float[np.ndarray, "frame gripper 3"]:
     """Where the grippers are at the frames [m]: linear between knots, at rest before and after."""
     path = np.asarray(recording.handle_path, np.float64)

@@ -7,7 +7,7 @@ from r2s.recordings.cameras.cleaning import outliers
 from r2s.recordings.checks.finding import Finding
 from r2s.recordings.checks.seen import VOXEL, Seen
 from r2s.recordings.checks.sheet import reach
-from r2s.recordings.recording import Recording
+from r2s.recordings.recording import Recording, clouds_are_markers
 
 FEWEST = 150  # points of a frame, thinned to 5 mm
 STRAY = 0.03  # share of a frame
@@ -24,7 +24,7 @@ APART = 0.08  # [m], from a gripper to the nearest point
 def check_clouds(seen: Seen) -> list[Finding]:
     """Number of points, outliers, faces of a box that cut the clouds, distance of the grippers."""
     recording = seen.recording
-    if recording.markers is not None:
+    if clouds_are_markers(recording):
         return []
     first, last = recording.info.frames_used
     clouds, held = seen.thinned[first : last + 1], seen.grippers[first : last + 1]

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from r2s.recordings.readers.clouds import voxel_means
-from r2s.recordings.recording import Recording, cloud, gripper_positions
+from r2s.recordings.recording import Recording, cloud, clouds_are_markers, gripper_positions
 
 Points = Float[np.ndarray, "point 3"]
 
@@ -34,9 +34,8 @@ class Seen(NamedTuple):
 def seen_in(recording: Recording) -> Seen:
     """What a recording shows, in metres."""
     thinned = [voxel_means(cloud(recording, f), VOXEL) for f in range(len(recording.times))]
-    markers = recording.markers
-    are_markers = markers is not None and recording.points.shape[1] <= markers.shape[1]
-    clouds = thinned if are_markers else [_with_others(points) for points in thinned]
+    alone = clouds_are_markers(recording)  # far from each other
+    clouds = thinned if alone else [_with_others(points) for points in thinned]
     return Seen(recording, thinned, clouds, gripper_positions(recording), _still(recording))
 
 
