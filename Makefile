@@ -53,7 +53,7 @@ docs: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(RUN) -m pip install -q --disable-pip-version-check -c constraints.txt -e ".[study,pcd,camera,data,cli,physnet,pinn,cma,cluster,viz,mujoco,dev]"
+	$(RUN) -m pip install -q --disable-pip-version-check -c constraints.txt -e ".[study,pcd,camera,data,cli,physnet,pinn,laboratory,cma,cluster,viz,mujoco,dev]"
 	touch $@
 
 clean:

@@ -62,13 +62,29 @@ def _problem(recording: Recording, space: ParameterSpace) -> Problem:
     )
 
 
-def errors(recording: Recording, fabric: Fabric) -> Float[np.ndarray, " row"] | None:
+def learnt_offset(found: Estimate) -> Float[np.ndarray, " 3"]:
+    """Where the tracker's frame lies against the arm's, [m]: the mean over the swings learnt."""
+    told = {
+        axis: [n.value for n in found.nuisances if n.name.startswith(f"shift {axis}")]
+        for axis in "xyz"
+    }
+    return np.array([np.mean(values) for values in told.values()])
+
+
+def errors(
+    recording: Recording, fabric: Fabric, offset: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "2 row"]:
     """Mean distance [m] from the tracked points to where a fabric predicts them, row by row from
-    the bar down; the first row is the bar's own. None: the simulation diverged."""
+    the bar down, in the arm's frame and in one that is shifted by an offset [m]; the first row is
+    the bar's own. NaN: the simulation diverged."""
     moved = _rollout(from_recording(recording, SHAPE), fabric)
     if not np.isfinite(moved.x).all():
-        return None
+        return np.full((2, SHAPE[1]), np.nan)
     assert recording.markers is not None and recording.markers_seen is not None
-    away = np.linalg.norm(np.asarray(moved.x) - np.asarray(recording.markers), axis=-1)
-    away = np.where(np.asarray(recording.markers_seen), away, np.nan)
-    return np.nanmean(away.reshape(-1, *SHAPE), axis=(0, 1))
+    gap = np.asarray(moved.x) - np.asarray(recording.markers)
+    seen = np.asarray(recording.markers_seen)
+    found = []
+    for shift in (np.zeros(3), offset):
+        away = np.where(seen, np.linalg.norm(gap + shift, axis=-1), np.nan)
+        found.append(np.nanmean(away.reshape(-1, *SHAPE), axis=(0, 1)))
+    return np.stack(found)

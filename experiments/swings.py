@@ -4,14 +4,15 @@ python experiments/swings.py swings      # 15 minutes on one core
 
 Errors [mm] are mean distances from the tracked points to where they are predicted, over the first
 seconds of each swing. The tracker's own error is that of the row which the bar holds, whose place
-is known. The prior's draws know nothing but a usual weight.
+is known. The prior's draws know nothing but a usual weight. "placed": with the place of the
+tracker's frame as the swings learnt from tell it, the same for all that is compared.
 """
 
 from pathlib import Path
 
 import jax
 import numpy as np
-from _swings import errors, estimated, swings
+from _swings import errors, estimated, learnt_offset, swings
 from _tables import Line, command_line, keep
 
 import r2s
@@ -20,6 +21,7 @@ from r2s.fabrics import prior
 
 LEARNT = ("range030_rep01", "range060_rep04", "range090_rep02", "range120_rep01")
 DRAWS = 8
+CAPTION = "Swings predicted from four others: mean distances [mm]."
 
 if __name__ == "__main__":
     parser = command_line(__doc__, "results/swings.csv")
@@ -30,6 +32,8 @@ if __name__ == "__main__":
     space = r2s.OrthotropicSpace.make(a.density)
     found = estimated(swings(a.recordings, LEARNT, a.seconds), space)
     print("\n".join(describe(found)), f"density {float(found.fabric.density):.3g} kg/m^2", sep="\n")
+    offset = learnt_offset(found)
+    print("the tracker's frame against the arm's [mm]:", np.round(1e3 * offset, 1))
     draws = prior.fabrics(a.density, DRAWS, jax.random.key(0))
     lines: list[Line] = []
     rows: list[dict[str, float]] = []
@@ -37,14 +41,19 @@ if __name__ == "__main__":
         if swing.info.name in LEARNT:
             continue
         of = {"estimate": [found.fabric], "default": [space.middle()], "prior": draws}
-        made = {name: [errors(swing, fabric) for fabric in fabrics] for name, fabrics in of.items()}
-        kept = {name: [e for e in each if e is not None] for name, each in made.items()}
-        row = {"tracker": 1e3 * float(kept["default"][0][0])}
-        row |= {n: 1e3 * float(np.mean(e)) if e else np.inf for n, e in kept.items()}
-        row["estimate, lowest row"] = 1e3 * float(kept["estimate"][0][-1])
-        row["default, lowest row"] = 1e3 * float(kept["default"][0][-1])
-        rows.append(row | {"estimate / tracker": row["estimate"] / row["tracker"]})
-        lines.append({"swing": swing.info.name} | {n: f"{v:.2f}" for n, v in rows[-1].items()})
+        row: dict[str, float] = {}
+        made = {
+            name: np.array([errors(swing, fabric, offset) for fabric in fabrics])
+            for name, fabrics in of.items()
+        }
+        for place, how in enumerate(("", " placed")):
+            row["tracker" + how] = 1e3 * float(made["default"][0, place, 0])
+            for name, each in made.items():
+                row[name + how] = 1e3 * float(np.nanmean(each[:, place]))
+            row["estimate / tracker" + how] = row["estimate" + how] / row["tracker" + how]
+        row["diverged"] = float(sum(np.isnan(each[:, 0, 0]).sum() for each in made.values()))
+        rows.append(row)
+        lines.append({"swing": swing.info.name} | {n: f"{v:.2f}" for n, v in row.items()})
         means = {name: np.mean([row[name] for row in rows]) for name in rows[0]}
         last = {"swing": "mean"} | {name: f"{value:.2f}" for name, value in means.items()}
-        keep(a.out, [*lines, last], "Swings predicted from others: mean distances [mm].")
+        keep(a.out, [*lines, last], CAPTION)

@@ -19,7 +19,7 @@ from r2s.estimation.prediction import predict
 from r2s.estimation.problem import NuisancePrior, Problem, beginning
 from r2s.estimation.standard_errors import FARTHEST, covariance, disagreement, sample_around
 from r2s.fabrics import presets
-from r2s.fabrics.parameters import OrthotropicSpace
+from r2s.fabrics.parameters import UNIFORM_DEVIATION, OrthotropicSpace
 from r2s.scenarios import synthetic
 
 FABRIC = presets.grey_interlock()
@@ -162,7 +162,7 @@ def test_where_derivatives_overflow_nothing_is_known(lifted):
     near = [(end.theta, at(end.theta))] * 2
     known = np.diag(covariance(problems, broken, prior, near))
     dim = lifted.space.dim
-    np.testing.assert_allclose(known[:dim], gauss_newton.PRIOR_DEVIATION**2)
+    np.testing.assert_allclose(known[:dim], UNIFORM_DEVIATION**2)
     np.testing.assert_allclose(known[dim:], 1)
     assert disagreement(problems, broken, prior, near) == np.inf
 

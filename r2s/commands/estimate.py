@@ -11,7 +11,12 @@ from tyro.conf import Positional, arg
 if TYPE_CHECKING:
     from r2s.estimation.estimate import Estimate
     from r2s.estimation.method import Budget, Method, Progress
+    from r2s.fabrics.parameters import ParameterSpace
+    from r2s.laboratory.estimate import Test
+    from r2s.laboratory.files import LaboratoryTests
     from r2s.recordings.recording import Recording
+
+CONTRADICTION = 0.01  # likelihood by chance, below which it is told
 
 MethodName = Literal[
     "diffcloud",
@@ -30,8 +35,9 @@ MethodName = Literal[
 class EstimateCard:
     """Estimate a fabric from recordings of it, and write its card.
 
-    RECORDING is an NPZ of r2s, a folder of them, or a folder of frames with its manifest; several
-    are taken for the same fabric. Of three or more the last motion with clouds is held out: the
+    RECORDING is an NPZ of r2s, a folder of them, a folder of frames with its manifest, or a JSON
+    file of laboratory tests (pulls, cantilevers, drapes: docs/laboratory.md); several are taken for
+    the same fabric. Of three or more the last motion with clouds is held out: the
     estimate is judged on it, beside fabrics of which only the weight is known. Says whether the
     method converged, and which numbers ended at a bound of their range. A killed run of diffcloud,
     diffcp, physnet, or pinn from pulls goes on where it was, from FILE.progress.npz.
@@ -44,11 +50,12 @@ class EstimateCard:
 
         r2s estimate lift.npz --density 0.32 --out denim.json
         r2s estimate lift.npz wind.npz fling.npz --density 0.32 --out denim.json
+        r2s estimate tests.json lift.npz --density 0.32 --out denim.json
         r2s estimate warp.npz weft.npz --method pinn --angles 0 90 --density 0.2 --out mine.json
     """
 
     recordings: Annotated[Positional[tuple[Path, ...]], arg(metavar="RECORDING")]
-    """NPZ, or folders."""
+    """NPZ, folders, or JSON of laboratory tests."""
     density: Annotated[float, arg(metavar="KG/M^2")]
     """Areal density of the sheet: weigh it."""
     out: Annotated[Path, arg(metavar="FILE")]
@@ -58,6 +65,9 @@ class EstimateCard:
     solver: Literal["cloth", "points"] | None = None
     """What simulates: the cloth (orthotropic fabrics) or material points (isotropic ones); by
     default what the method supports."""
+    law: Literal["linear", "stiffening"] = "linear"
+    """Of the yarns: of constant stiffness, or one that grows with their stretch (three
+    numbers more)."""
     name: str = ""
     """Name of the fabric; by default that of the recording."""
     coarse: int | None = None
@@ -91,45 +101,76 @@ class EstimateCard:
         from r2s.commands.waiting import Waiting
         from r2s.estimation import cards, held_out
         from r2s.estimation.estimate import describe
-        from r2s.estimation.method import COARSEST, default_space, tell
+        from r2s.estimation.method import COARSEST, tell
         from r2s.files import check_folders
+        from r2s.laboratory.estimate import estimate, informed
+        from r2s.laboratory.files import read_tests
         from r2s.recordings.open import open_recordings
 
         check_folders(self.out)
-        seen = list(open_recordings(self.recordings))
-        if not seen:
-            raise ValueError("no recording: name an NPZ, or a folder that holds some")
+        files = [path for path in self.recordings if path.suffix == ".json"]
+        seen = list(open_recordings([path for path in self.recordings if path not in files]))
+        known = [read_tests(path) for path in files]
+        if not seen and not known:
+            raise ValueError("no recording: name an NPZ, a folder that holds some, or a JSON file")
         with Waiting("reading the recordings") as progress:
             method = self._method(progress)
-            method.check(seen)
-            space = default_space(method.chosen_solver, self.density)
-            key = jax.random.key(self.seed)
-            unseen = self._hold_out(seen)
-            estimate = method.estimate(seen, space, self._budget(method), key=key)
+            space = self._space(method)
+            tests = [test for each in known for test in each.tests]
+            told = estimate(tests, space, progress) if tests else None
+            unseen: list[Recording] = []
+            if seen:
+                method.check(seen)
+                unseen = self._hold_out(seen)
+                space = informed(space, told) if told else space
+                found = method.estimate(
+                    seen, space, self._budget(method), key=jax.random.key(self.seed)
+                )
+            else:
+                assert told is not None
+                found = told
             judged = []
             for each in unseen:
                 tell(progress, f"judging by {each.info.name}")
-                shape = estimate.shape or COARSEST
-                judged.append(held_out.judge(each, estimate.fabric, shape).describe())
+                shape = found.shape or COARSEST
+                judged.append(held_out.judge(each, found.fabric, shape).describe())
+        sources = [each.info.source for each in seen] + [each.source for each in known]
         provenance = cards.Provenance(
-            method="; ".join([f"estimated by r2s: {estimate.approach}", *judged]),
-            source="; ".join(dict.fromkeys(each.info.source for each in seen)),
-            recordings=tuple((each.info.name, cards.fingerprint(each)) for each in seen),
+            method="; ".join([f"estimated by r2s: {_approach(found, known)}", *judged]),
+            source="; ".join(dict.fromkeys(source for source in sources if source)),
+            recordings=(
+                *((each.info.name, cards.fingerprint(each)) for each in seen),
+                *((each.name, each.fingerprint) for each in known),
+            ),
             date=self.date,
             assumed=("density", "thickness", "mass_damping"),
         )
-        card = cards.Card.make(self.name or seen[0].info.fabric, estimate, provenance)
+        name = self.name or (seen[0].info.fabric if seen else known[0].name)
+        card = cards.Card.make(name, found, provenance)
         cards.write(self.out, card)
         for path in self.out.parent.glob(f"{escape(self._progress_file.stem)}*.npz"):
             path.unlink()
         lines = [
-            *describe(estimate),
-            *_warnings(estimate, seen),
+            *describe(found),
+            *_warnings(found, seen),
+            *_laboratory_lines(tests, told, found),
             *judged,
             f"{self.out}: {card.name}",
         ]
         print_result(self.json, cards.as_json(card), lines)
         return 0
+
+    def _space(self, method: "Method") -> "ParameterSpace":
+        """The fabrics to choose from; `ValueError` for a law that the solver's space lacks."""
+        from r2s.estimation.method import default_space
+        from r2s.fabrics.stiffening_space import StiffeningSpace
+
+        space = default_space(method.chosen_solver, self.density)
+        if self.law == "linear":
+            return space
+        if method.chosen_solver != "cloth":
+            raise ValueError("--law stiffening is of the cloth: material points have another one")
+        return StiffeningSpace.make(space)
 
     def _hold_out(self, seen: "list[Recording]") -> "list[Recording]":
         """Take what is to be held out from the recordings, and return it: one, or none."""
@@ -191,6 +232,39 @@ def _warnings(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[s
     motions = dict.fromkeys((each.info.sheet.size, each.info.scenario) for each in recordings)
     shape, fabric = estimate.shape, estimate.fabric
     return [*lines, *(line for each in motions for line in mesh_warning(shape, fabric, *each))]
+
+
+def _approach(found: "Estimate", known: "Sequence[LaboratoryTests]") -> str:
+    """What it was estimated with, in words."""
+    from r2s.laboratory.estimate import APPROACH
+
+    together = known and found.approach != APPROACH
+    return f"{found.approach}, after {APPROACH}" if together else found.approach
+
+
+def _laboratory_lines(
+    tests: "Sequence[Test]", told: "Estimate | None", found: "Estimate"
+) -> list[str]:
+    """How the estimate fits laboratory tests, and whether motions contradict them."""
+    from r2s.laboratory.estimate import POOR_FIT, apart, fits
+
+    if told is None:
+        return []
+    lines = []
+    for name, errors, words in fits(tests, found.fabric):
+        lines.append(f"{name}: {words}")
+        if errors > POOR_FIT:
+            lines.append(
+                f"warning: {name}: {errors:.1f} standard deviations off: another fabric, other "
+                "units, or a law that cannot follow it (try --law stiffening)"
+            )
+    p = apart(told, found)
+    if p < CONTRADICTION:
+        lines.append(
+            f"warning: the recordings contradict the laboratory tests (by chance {p:.1g}): another "
+            "fabric, or its density, scale or path are not as written down"
+        )
+    return lines
 
 
 def _contradiction(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[str]:

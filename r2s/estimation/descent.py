@@ -103,7 +103,7 @@ def descend(
     """The fabric that explains one recording, or several of one fabric.
 
     - `approach`: how the estimate names its method.
-    - `start`: in the unit cube, among the coarse places; None: the middle of the range.
+    - `start`: in the unit cube, among the coarse places; None: the mean of the space's prior.
     - `checkpoint`: a file that holds the state after every iteration. A run of the same problem
       that finds it goes on from there.
     - `progress`: called with the iteration and the best loss [m^2].
@@ -195,7 +195,8 @@ def each_alone(
 
 def _begin(problems: Problems, budget: Budget, start, progress, key) -> Row:
     dim, count = problems[0].space.dim, max(budget.coarse, budget.starts)
-    start = jnp.full(dim, 0.5, float) if start is None else start
+    usual = jnp.clip(problems[0].space.prior()[0], gauss_newton.MARGIN, 1 - gauss_newton.MARGIN)
+    start = usual if start is None else start
     places = jax.random.uniform(key, (count, dim), float)
     nothing = jnp.zeros((count, gauss_newton.theta_length(problems) - dim), float)
     thetas = jnp.concatenate([places, nothing], axis=1).at[0, : len(start)].set(start)

@@ -42,6 +42,7 @@ class DiffCloud(Method):
     supports = {"cloth": ANY}
     refusals = REFUSALS
     several = True
+    takes_prior = True
 
     def reads(self, recording):
         return read_by_problem(recording)

@@ -41,6 +41,7 @@ class DiffCP(Method):
     supports = {"points": ANY}
     refusals = REFUSALS
     several = True
+    takes_prior = True
 
     def reads(self, recording):
         return read_by_problem(recording)

@@ -31,7 +31,6 @@ from r2s.estimation.problem import OWN, SHARED, Problem
 Problems = tuple[Problem, ...]
 
 MARGIN = 1e-3  # of the unit cube, so that a start at its edge can move
-PRIOR_DEVIATION = 0.29  # of a uniform prior over the unit cube
 DAMPINGS, GROWTH = (1e-5, 1e6), 3.0
 LONGEST_STEP = 0.2  # of a parameter's range
 FINEST = 1e-5  # [m]: no recording is better
@@ -166,7 +165,7 @@ def normal_from(
         noise.append(share * found.noise)
     spread = jnp.sqrt(jnp.sum(jnp.stack(spreads)))
     score, matrix = jnp.concatenate(scores), jnp.concatenate(matrices)
-    least = jnp.diag(prior_terms(problems, theta)[1]) * least_weight(problems, spread)
+    least = prior_terms(problems, theta)[1] * least_weight(problems, spread)
     return Normal(
         jnp.sum(jnp.stack(losses)),
         spread,
@@ -208,12 +207,15 @@ def _larger(one: Array, other: Array, metric: Array) -> Float[Array, "theta thet
     return (one + other + root @ absolute @ root.T) / 2
 
 
-def prior_terms(problems: Problems, theta: Theta) -> tuple[Theta, Theta]:
-    """Difference of theta from the mean of its prior, and the precision of the prior."""
+def prior_terms(problems: Problems, theta: Theta) -> tuple[Theta, Float[Array, "theta theta"]]:
+    """Difference of theta from the mean of its prior, and the precision of the prior: that of the
+    fabric's space, and of nuisances in their standard deviations.
+    """
     dim, rest = problems[0].space.dim, theta_length(problems) - problems[0].space.dim
-    expected = jnp.concatenate([jnp.full(dim, 0.5, float), jnp.zeros(rest, float)])
-    spread = jnp.concatenate([jnp.full(dim, PRIOR_DEVIATION, float), jnp.ones(rest, float)])
-    return theta - expected, 1 / spread**2
+    mean, of_fabric = problems[0].space.prior()
+    expected = jnp.concatenate([mean, jnp.zeros(rest, float)])
+    precision = jnp.eye(dim + rest, dtype=float).at[:dim, :dim].set(of_fabric)
+    return theta - expected, precision
 
 
 def prior_weight(problems: Problems, normal: Normal) -> Float[Array, ""]:
@@ -224,7 +226,7 @@ def prior_weight(problems: Problems, normal: Normal) -> Float[Array, ""]:
     """
     _, precision = prior_terms(problems, jnp.zeros(theta_length(problems), float))
     least = least_weight(problems, normal.spread)
-    inverse = jnp.linalg.inv(normal.matrix + least * jnp.diag(precision))
+    inverse = jnp.linalg.inv(normal.matrix + least * precision)
     ratio = jnp.trace(inverse @ normal.scatter) / jnp.trace(inverse @ normal.matrix)
     return jnp.maximum(ratio, jnp.finfo(ratio.dtype).tiny)
 
@@ -238,7 +240,7 @@ def least_weight(problems: Problems, spread: Float[Array, ""]) -> Float[Array, "
 def objective(problems: Problems, theta, loss, prior) -> Float[Array, ""]:
     """Loss and prior [m^2] at a theta."""
     off, precision = prior_terms(problems, theta)
-    return loss + prior * jnp.sum(off**2 * precision) / 2
+    return loss + prior * (off @ precision @ off) / 2
 
 
 def remaining(problems: Problems, descent: Descent, prior) -> Float[Array, ""]:
@@ -253,8 +255,8 @@ def _equations(problems: Problems, descent: Descent, prior):
     """Gradient and matrix with the prior, and which parameters would leave the unit cube."""
     theta = descent.theta
     off, precision = prior_terms(problems, theta)
-    gradient = descent.normal.gradient + prior * precision * off
-    matrix = descent.normal.matrix + prior * jnp.diag(precision)
+    gradient = descent.normal.gradient + prior * precision @ off
+    matrix = descent.normal.matrix + prior * precision
     bounded = jnp.arange(theta.shape[0]) < problems[0].space.dim
     stuck = bounded & (theta <= MARGIN) & (gradient > 0)
     stuck |= bounded & (theta >= 1 - MARGIN) & (gradient < 0)

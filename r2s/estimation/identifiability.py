@@ -16,7 +16,7 @@ from r2s.estimation.gauss_newton import Descent, Problems
 from r2s.estimation.prediction import explain
 from r2s.estimation.problem import Problem
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import ParameterSpace, Range
+from r2s.fabrics.parameters import ParameterSpace, Prior, Range
 
 NOISE = 3e-3  # [m]: beyond which a distance counts as an outlier's
 
@@ -76,6 +76,14 @@ class FixedParameter(ParameterSpace):
     def to_unit(self, fabric: Fabric) -> Float[Array, " dim"]:
         """The point where a fabric lies, without the fixed parameter."""
         return jnp.delete(self.space.to_unit(fabric), self.which, assume_unique_indices=True)
+
+    def prior(self) -> Prior:
+        """What is known of the others, given the one that is fixed."""
+        mean, precision = self.space.prior()
+        others = [i for i in range(self.space.dim) if i != self.which]
+        inner = precision[jnp.ix_(jnp.array(others), jnp.array(others))]
+        pull = precision[jnp.array(others), self.which] * (self.place - mean[self.which])
+        return mean[jnp.array(others)] - jnp.linalg.solve(inner, pull), inner
 
 
 def profile(

@@ -82,7 +82,7 @@ def mesh_bias(
 
 
 def _step(gradient: np.ndarray, matrix: np.ndarray, off: np.ndarray, prior: np.ndarray):
-    return np.linalg.solve(matrix + np.diag(prior), -gradient - prior * off)
+    return np.linalg.solve(matrix + prior, -gradient - prior @ off)
 
 
 def _laid_onto(here: Problem, there: Problem, slope: Sensitivity) -> Sensitivity:

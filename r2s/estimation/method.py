@@ -19,6 +19,7 @@ from jaxtyping import PRNGKeyArray
 
 from r2s.estimation.default_spaces import on_cloth, on_points
 from r2s.estimation.estimate import Estimate
+from r2s.fabrics.informed_space import InformedSpace
 from r2s.fabrics.parameters import ParameterSpace
 from r2s.recordings.recording import Recording
 
@@ -102,6 +103,7 @@ class Method(abc.ABC):
     - `supports`: solver by solver the scenarios that it estimates from; None: all of them.
     - `refusals`: solver by solver why it does not support it.
     - `several`: whether it takes more than one recording of a fabric.
+    - `takes_prior`: whether it heeds what is known of a space beforehand (`InformedSpace`).
     - `takes_shape`: whether the `shape` of its simulated sheet can be chosen.
 
     Of one instance:
@@ -119,6 +121,7 @@ class Method(abc.ABC):
     supports: ClassVar[Mapping[str, tuple[str, ...] | None]]
     refusals: ClassVar[Mapping[str, str]] = {}
     several: ClassVar[bool] = False
+    takes_prior: ClassVar[bool] = False
     takes_shape: ClassVar[bool] = True
 
     solver: str | None = None
@@ -142,6 +145,8 @@ class Method(abc.ABC):
         install.
         """
         self.check(recordings)
+        if isinstance(space, InformedSpace) and not self.takes_prior:
+            raise ValueError(f"{self.name} takes no account of what is known of a space beforehand")
         return self._estimate(list(recordings), space, budget or self.budget, key)
 
     def check(self, recordings: Sequence[Recording]) -> None:

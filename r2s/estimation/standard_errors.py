@@ -40,7 +40,7 @@ def covariance(
     off = off * jnp.where(far > limit, limit / far, 1)[:, None]
     found = sandwich + off.T @ off / len(off)
     _, precision = prior_terms(problems, end.theta)
-    return jnp.where(jnp.all(jnp.isfinite(found)), found, jnp.diag(1 / precision))
+    return jnp.where(jnp.all(jnp.isfinite(found)), found, jnp.linalg.inv(precision))
 
 
 def disagreement(
@@ -60,9 +60,10 @@ def tells(problems: Problems, end: Descent, prior) -> Bool[Array, ""]:
     """Whether the data weigh more than the prior in some direction of the fabric's space."""
     fabric = slice(problems[0].space.dim)
     _, precision = prior_terms(problems, end.theta)
-    root = jnp.sqrt(prior * precision[fabric])
-    weights = jnp.linalg.eigvalsh(end.normal.matrix[fabric, fabric] / jnp.outer(root, root))
-    return weights[-1] > 1  # NaN does not
+    root = jnp.linalg.cholesky(prior * precision[fabric, fabric])
+    inner = jax.scipy.linalg.solve_triangular(root, end.normal.matrix[fabric, fabric], lower=True)
+    weights = jax.scipy.linalg.solve_triangular(root, inner.T, lower=True)
+    return jnp.linalg.eigvalsh(weights)[-1] > 1  # NaN does not
 
 
 def sample_around(
@@ -80,8 +81,8 @@ def sample_around(
 def sandwich_of(problems: Problems, end: Descent, prior):
     """The covariance of an estimate, had it arrived and were the loss smooth, and its root."""
     _, precision = prior_terms(problems, end.theta)
-    inverse = jnp.linalg.inv(end.normal.matrix + prior * jnp.diag(precision))
-    sandwich = inverse @ (end.normal.scatter + prior**2 * jnp.diag(precision)) @ inverse
+    inverse = jnp.linalg.inv(end.normal.matrix + prior * precision)
+    sandwich = inverse @ (end.normal.scatter + prior**2 * precision) @ inverse
     deviation = jnp.sqrt(jnp.diag(sandwich))
     squares, axes = jnp.linalg.eigh(sandwich / jnp.outer(deviation, deviation))
     least = len(squares) * jnp.finfo(squares.dtype).eps
@@ -98,8 +99,8 @@ def step_ends(
 
     def step_end(theta: Theta, normal: Normal) -> Theta:
         off, precision = prior_terms(problems, theta)
-        matrix = normal.matrix + prior * jnp.diag(precision)
-        step = jnp.linalg.solve(matrix, normal.gradient + prior * precision * off)
+        matrix = normal.matrix + prior * precision
+        step = jnp.linalg.solve(matrix, normal.gradient + prior * precision @ off)
         finite = jnp.isfinite(normal.loss) & jnp.all(jnp.isfinite(step))
         return theta - jnp.where(finite, step, 0)
 

@@ -16,6 +16,7 @@ from r2s.fabrics.fabric import Fabric
 from r2s.laws.bending import HingeBending, OrthotropicBending, SpringBending
 from r2s.laws.membrane import OrthotropicMembrane, SpringMembrane
 from r2s.laws.plate import OrthotropicPlate, PlateBending
+from r2s.laws.stiffening import SofteningPlate, StiffeningMembrane
 from r2s.laws.tables import (
     DiffSimTableBending,
     DiffSimTableMembrane,
@@ -25,8 +26,10 @@ from r2s.laws.tables import (
 
 NUMBERS = {"density": "kg/m^2", "damping": "s", "friction": "-", "thickness": "m"}
 NUMBERS |= {"mass_damping": "1/s"}
-MEMBRANES = (OrthotropicMembrane, SpringMembrane, TableMembrane, DiffSimTableMembrane)
-BENDINGS = (PlateBending, OrthotropicPlate, HingeBending, OrthotropicBending, SpringBending)
+TABLES = (TableMembrane, DiffSimTableMembrane)
+MEMBRANES = (OrthotropicMembrane, StiffeningMembrane, SpringMembrane, *TABLES)
+PLATES = (PlateBending, OrthotropicPlate, SofteningPlate)
+BENDINGS = (*PLATES, HingeBending, OrthotropicBending, SpringBending)
 LAWS = {
     "membrane": (MEMBRANES, "N/m"),
     "bending": ((*BENDINGS, TableBending, DiffSimTableBending), "N m"),
@@ -38,6 +41,9 @@ TABLE_SHAPES = {
     DiffSimTableBending: (3, 5),
 }
 OTHER_UNITS = {"poissons_ratio": "-", "spacing": "m", "SpringBending.stiffness": "N/m"}
+OTHER_UNITS |= {"ratio": "-", "loss": "-"}
+OTHER_UNITS |= {"StiffeningMembrane.knee": "-", "knee_weft": "-", "SofteningPlate.knee": "1/m"}
+WITHIN = {(StiffeningMembrane, "small"), (SofteningPlate, "small")}  # laws that hold another one
 
 
 def fabric_as_json(fabric: Fabric) -> dict[str, Any]:
@@ -58,11 +64,7 @@ def fabric_as_json(fabric: Fabric) -> dict[str, Any]:
                 f"a file holds a {part} law of r2s ({', '.join(k.__name__ for k in laws)}), got "
                 f"{type(law).__name__}"
             )
-        fields = {
-            name: _entry(getattr(law, name), _unit(part, type(law), name))
-            for name in _field_names(law)
-        }
-        stored[part] = {"law": type(law).__name__, **fields}
+        stored[part] = _law_as_json(law, part)
     return nan_to_null(stored, "fabric")
 
 
@@ -126,6 +128,15 @@ def expect(holds: bool, where: str, expected: str, found: Any) -> None:
         raise ValueError(f"{where}: expected {expected}, found {found!r}")
 
 
+def _law_as_json(law: Any, part: str) -> dict[str, Any]:
+    fields: dict[str, Any] = {}
+    for name in _field_names(law):
+        value, is_law = getattr(law, name), (type(law), name) in WITHIN
+        unit = _unit(part, type(law), name)
+        fields[name] = _law_as_json(value, part) if is_law else _entry(value, unit)
+    return {"law": type(law).__name__, **fields}
+
+
 def _entry(value: Any, unit: str) -> dict[str, Any]:
     return {"value": np.asarray(value).tolist(), "unit": unit}
 
@@ -139,20 +150,21 @@ def _unit(part: str, law: type, name: str) -> str:
     return own or OTHER_UNITS.get(name) or LAWS[part][1]
 
 
-def _law_from(stored: Any, part: str) -> Any:
+def _law_from(stored: Any, part: str, within: str = "") -> Any:
     kinds = {kind.__name__: kind for kind in LAWS[part][0]}
-    where = f"fabric: {part}"
+    where = f"fabric: {part}{within}"
     name = stored.get("law") if isinstance(stored, dict) else None
     expect(name in kinds, f"{where}: law", f"one of {', '.join(kinds)}", name)
     kind = kinds[name]  # pyright: ignore[reportArgumentType]
     check_keys(stored, ("law", *_field_names(kind)), where)
     shape = TABLE_SHAPES.get(kind, ())
-    return kind(
-        **{
-            n: _value(stored[n], _unit(part, kind, n), f"{where}: {n}", shape)
-            for n in _field_names(kind)
-        }
-    )
+    fields = {}
+    for n in _field_names(kind):
+        if (kind, n) in WITHIN:
+            fields[n] = _law_from(stored[n], part, f"{within}: {n}")
+        else:
+            fields[n] = _value(stored[n], _unit(part, kind, n), f"{where}: {n}", shape)
+    return kind(**fields)
 
 
 def _value(stored: Any, unit: str, where: str, shape: tuple[int, ...]) -> jax.Array:

@@ -58,6 +58,9 @@ class Range:
 
 
 MASS_DAMPING = Range("mass damping", "1/s", 1e-2, 10.0)
+UNIFORM_DEVIATION = 0.29  # of a uniform distribution from 0 to 1
+
+Prior = tuple[Float[Array, " dim"], Float[Array, "dim dim"]]
 
 
 class ParameterSpace(eqx.Module):
@@ -81,6 +84,12 @@ class ParameterSpace(eqx.Module):
     def values(self, u: Float[Array, " dim"]) -> Float[Array, " dim"]:
         """The parameters, in the order and the units of `ranges`, at a point of the unit cube."""
         return jnp.stack([bound.from_unit(u[i]) for i, bound in enumerate(self.ranges)])
+
+    def prior(self) -> Prior:
+        """What is known of a place before any recording: its mean, and its precision, the inverse
+        of its covariance. By default those of a uniform distribution over the cube.
+        """
+        return jnp.full(self.dim, 0.5, float), jnp.eye(self.dim, dtype=float) / UNIFORM_DEVIATION**2
 
     def middle(self) -> Fabric:
         """The fabric in the middle of all ranges: what one assumes knowing nothing."""

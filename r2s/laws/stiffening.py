@@ -23,24 +23,38 @@ class StiffeningMembrane(eqx.Module):
 
     - `small`: the membrane at small strain.
     - `ratio`: of the tangent far stretched to that at rest, [-].
-    - `knee`: the Green strain of u = 1, where 65 % of the growth is reached, [-].
+    - `knee`, `knee_weft`: of warp and weft the Green strain of u = 1, where 65 % of the growth is
+      reached, [-].
     """
 
     small: OrthotropicMembrane
     ratio: Float[Array, "*batch"]
     knee: Float[Array, "*batch"]
+    knee_weft: Float[Array, "*batch"]
 
     @classmethod
-    def make(cls, small: OrthotropicMembrane, ratio: float, stretch: float) -> "StiffeningMembrane":
-        """From the ratio, and the stretch (above 1) at which half of the growth is reached.
+    def make(
+        cls,
+        small: OrthotropicMembrane,
+        ratio: float,
+        stretch: float,
+        stretch_weft: float | None = None,
+    ) -> "StiffeningMembrane":
+        """From the ratio, and the stretch (above 1) at which half of the growth is reached, of the
+        warp and of the weft (None: alike).
 
         Raises `ValueError` for a sheet that would soften, or a stretch that is none.
         """
-        if not (ratio >= 1 and stretch > 1):
-            raise ValueError(f"a ratio of 1 or more and a stretch above 1, got {ratio}, {stretch}")
-        knee = (stretch**2 - 1) / 2 / HALF
-        shape = jnp.shape(small.c11)
-        return cls(small, *(jnp.broadcast_to(jnp.asarray(n, float), shape) for n in (ratio, knee)))
+        stretches = (stretch, stretch if stretch_weft is None else stretch_weft)
+        if not (ratio >= 1 and min(stretches) > 1):
+            raise ValueError(
+                f"a ratio of 1 or more and a stretch above 1, got {ratio}, {stretches}"
+            )
+        numbers = (ratio, *((each**2 - 1) / 2 / HALF for each in stretches))
+        more, *knees = (
+            jnp.broadcast_to(jnp.asarray(n, float), jnp.shape(small.c11)) for n in numbers
+        )
+        return cls(small, more, *knees)
 
     def at(self, strain: Float[Array, " 3"]) -> "StiffeningMembrane":
         """Itself: its energy says it all."""
@@ -56,14 +70,8 @@ class StiffeningMembrane(eqx.Module):
         """Energy per rest area [J/m^2] at a Green strain (E11, E22, 2 E12) [-]."""
         e11, e22, _ = strain
         small = self.small
-        more = small.c11 * self._grown(e11) + small.c22 * self._grown(e22)
+        more = small.c11 * _grown(e11, self.knee) + small.c22 * _grown(e22, self.knee_weft)
         return small.energy_density(strain) + (self.ratio - 1) * more
-
-    def _grown(self, strain: Float[Array, ""]) -> Float[Array, ""]:
-        """Energy over stiffness of what a ratio of 2 adds, [-]."""
-        square = (jnp.maximum(strain, 0) / self.knee) ** 2
-        root = jnp.sqrt(1 + square)
-        return self.knee**2 * (square / 2 - square / (1 + root))
 
 
 class SofteningPlate(PlateLaw):
@@ -90,3 +98,10 @@ class SofteningPlate(PlateLaw):
         full = self.small.energy_density(curvature)
         unit = self.small.stiffness * self.knee**2 / 2
         return full - self.loss * (full - unit * jnp.log1p(full / unit))
+
+
+def _grown(strain: Float[Array, ""], knee: Float[Array, ""]) -> Float[Array, ""]:
+    """Energy over stiffness of what a ratio of 2 adds to a yarn, [-]."""
+    square = (jnp.maximum(strain, 0) / knee) ** 2
+    root = jnp.sqrt(1 + square)
+    return knee**2 * (square / 2 - square / (1 + root))

@@ -5,8 +5,6 @@ offset = estimate_offset(log, times, displacement)
 force = at_frames(log, times, offset)              # [N]
 """
 
-import csv
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import make_interp_spline
 
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
-NEWTONS = {"N": 1.0, "mN": 1e-3, "cN": 1e-2, "kN": 1e3, "gf": 9.80665e-3, "kgf": 9.80665}
+from r2s.recordings.readers.columns import NEWTONS, SECONDS, read_columns
+
 WORST_FIT = 0.9  # share of the force's variance that the displacement must explain
 FINEST = 1e-3  # [s], of the offsets that are tried
 
@@ -40,28 +38,13 @@ def read_force_log(path: Path | str, time: str = "time", force: str = "force") -
     no unit, values that are no finite numbers, times that do not increase, fewer than two samples.
     """
     path = Path(path)
-    lines = _lines(path)
-    if not lines:
-        raise ValueError(f"{path}: the log is empty")
-    header = lines[0][1]
-    columns = [_column(path, header, time, SECONDS), _column(path, header, force, NEWTONS)]
-    rows = []
-    for number, cells in lines[1:]:
-        if len(cells) != len(header):
-            raise ValueError(
-                f"{path}: line {number} has {len(cells)} columns, the header {len(header)}: it is "
-                "cut short, or decimal commas part the columns (write decimal points)"
-            )
-        rows.append([_number(path, number, cells[index]) * unit for index, unit in columns])
-    if len(rows) < 2:
-        raise ValueError(f"{path}: expected two samples or more, found {len(rows)}")
-    values = np.array(rows)
+    values, lines = read_columns(path, {time: SECONDS, force: NEWTONS})
     later = np.diff(values[:, 0]) > 0
     if not later.all():
         at = int(later.argmin())
         first, then = values[at, 0], values[at + 1, 0]
         raise ValueError(
-            f"{path}: line {lines[at + 2][0]}: times must increase, found {first:g} s, then "
+            f"{path}: line {lines[at + 1]}: times must increase, found {first:g} s, then "
             f"{then:g} s: sort the log, or keep one of samples that are there twice"
         )
     return ForceLog(values[:, 0], values[:, 1], str(path))
@@ -171,51 +154,3 @@ def _explained(log: ForceLog, times: np.ndarray, basis: np.ndarray, offset: floa
     if variance < 0.25 * len(at) * float(np.var(log.force)):
         return -np.inf  # the pull is not in these frames
     return float(np.sum((basis.T @ force) ** 2)) / variance
-
-
-def _lines(path: Path) -> list[tuple[int, list[str]]]:
-    """The lines that hold something, with their numbers, as cells."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: no text in UTF-8: {error}") from error
-    kept = [
-        (number, line)
-        for number, line in enumerate(text.splitlines(), 1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if not kept:
-        return []
-    delimiter = max(",;\t", key=kept[0][1].count)
-    cells = csv.reader([line for _, line in kept], delimiter=delimiter, skipinitialspace=True)
-    numbers = [number for number, _ in kept]
-    return [(n, [c.strip() for c in row]) for n, row in zip(numbers, cells, strict=True)]
-
-
-def _column(path: Path, header: list[str], name: str, units: dict[str, float]) -> tuple[int, float]:
-    """The index of a column, and its unit in SI."""
-    pattern = re.compile(rf"{re.escape(name)}(?:[\s_]*[\[(]?\s*(\w+)\s*[\])]?)?", re.IGNORECASE)
-    found = [(i, match[1]) for i, cell in enumerate(header) if (match := pattern.fullmatch(cell))]
-    if len(found) != 1:
-        raise ValueError(
-            f"{path}: expected one column {name!r} with its unit, such as "
-            f"'{name}_{next(iter(units))}', found {len(found)} in {header}: rename it, or name "
-            "the column that is meant"
-        )
-    index, unit = found[0]
-    if unit not in units:
-        raise ValueError(
-            f"{path}: the unit of {header[index]!r} is not known: write one of {', '.join(units)} "
-            f"into the header, as in '{name} [{next(iter(units))}]'"
-        )
-    return index, units[unit]
-
-
-def _number(path: Path, line: int, cell: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise ValueError(f"{path}: line {line}: expected a finite number, found {cell!r}")
-    return value

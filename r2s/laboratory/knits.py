@@ -1,0 +1,76 @@
+"""The uniaxial pulls of knits of stitch-by-stitch (Singal et al., Nature Communications 15, 2024).
+
+Article 2622; repository sabetta/stitch-by-stitch (MIT licence), commit 0ed27f35, files
+`data/uniaxial_experiments/experimentData/outputData_{yarn} {stitch} {X,Y}.h5`: force [N] and
+tracked pins [pixel] of five pulls of a swatch. X is along the courses (rows), Y along the wales.
+Its notebook has what the files lack: the clamp that gives the scale is 35.5 mm wide, strain counts
+from the first frame of the second pull, and the first pull, of a swatch that was never stretched,
+is left out. The fabrics' weight is not given. Needs h5py: pip install 'r2s[laboratory]'.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from r2s.extras import require
+from r2s.laboratory.pull import SPECIMEN, Pull
+
+CLAMP = 0.0355  # [m]
+REFERENCE = "video2"  # whose first frame has the length at rest
+PULLS = ("video2", "video3", "video4", "video5")
+RIGHT, LEFT, LOWER, UPPER = 0, 1, -2, -1  # of the tracked pins; the last two are the clamps'
+
+
+def read_knit(path: Path | str, direction: float, specimen: float = SPECIMEN) -> list[Pull]:
+    """The pulls of one file, but for the first.
+
+    `direction`: of the pull from the warp, [rad]; of knits the warp is taken along the wales, so
+    that it is 0 for Y and pi/2 for X. `specimen`: see `Pull`.
+
+    Raises FileNotFoundError; ValueError that names the file and the pull: no such file of HDF5,
+    arrays that are missing or of other shapes; ImportError that names the extra.
+    """
+    path = Path(path)
+    h5py = require("h5py", "laboratory", "the pulls of stitch-by-stitch")
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        with h5py.File(path, "r") as file:
+            arrays = {
+                name: tuple(np.asarray(file[name][key], float) for key in ("traj", "forces"))
+                for name in PULLS
+            }
+            sizes = {key: float(file[key][0]) for key in ("clampSize", "fabricSize")}
+    except (OSError, KeyError) as error:
+        raise ValueError(f"{path}: no pulls of stitch-by-stitch: {error}") from error
+    scale = CLAMP / sizes["clampSize"]  # [m] a pixel
+    spans = {name: _spans(path, name, *each) for name, each in arrays.items()}
+    length, wide = (span[0] for span in spans[REFERENCE])
+    size = float(length * scale), sizes["fabricSize"] * scale
+    pulls = []
+    for name, (_, force) in arrays.items():
+        along, across = spans[name]
+        pulls.append(
+            Pull.make(
+                (along - length) * scale,
+                force,
+                size,
+                direction,
+                across / wide * size[1],
+                specimen,
+                f"{path.name}: {name}",
+            )
+        )
+    return pulls
+
+
+def _spans(
+    path: Path, name: str, pins: np.ndarray, force: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distances [pixel] between the clamps and between the pins at the sides, over time."""
+    if pins.ndim != 3 or pins.shape[0] < 4 or pins.shape[1:] != (2, len(force)):
+        raise ValueError(
+            f"{path}: {name}: expected pins (four or more, 2, {len(force)}), found {pins.shape}"
+        )
+    along = np.linalg.norm(pins[UPPER] - pins[LOWER], axis=0)
+    return along, np.linalg.norm(pins[RIGHT] - pins[LEFT], axis=0)

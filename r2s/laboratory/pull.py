@@ -1,0 +1,185 @@
+"""Uniaxial pulls of strips: a curve of tension over stretch, as tensile testers give it.
+
+The model is a strip in uniform strain with free sides: it stretches as it is told, and contracts
+and shears as costs it least. Clamps hold the width: a strip four times as long as wide pulls within
+3 % of it (`tests/test_laboratory.py`), a square one along the yarns of an isotropic sheet by some
+10 % more.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from r2s.fabrics.fabric import Fabric
+from r2s.laws.membrane import MembraneLaw
+
+SAMPLES = 24  # of a curve, evenly over its stretch
+SPECIMEN = 0.05  # relative, by which specimens of a fabric differ (standard deviation)
+READING = 0.02, 0.005  # of a tension: relative, and of the largest of its curve
+WIDTH = 0.02  # of a relative width
+NEWTON = 30  # iterations at most; each is exact for a law of constant stiffness
+
+
+class Pull(eqx.Module):
+    """A uniaxial pull.
+
+    - `stretch`: length over rest length, [-].
+    - `tension`: force over the strip's width at rest, [N/m].
+    - `across`: width in its middle over that at rest, [-]; NaN where it was not measured.
+    - `direction`: of the pull, from the warp, [rad].
+    - `specimen`: relative standard deviation between specimens of a fabric, [-].
+    - `name`: for messages.
+    """
+
+    stretch: Float[Array, " sample"]
+    tension: Float[Array, " sample"]
+    across: Float[Array, " sample"]
+    direction: Float[Array, ""]
+    specimen: Float[Array, ""]
+    name: str = eqx.field(static=True, default="pull")
+
+    @classmethod
+    def make(
+        cls,
+        extension: Sequence[float] | np.ndarray,
+        force: Sequence[float] | np.ndarray,
+        size: tuple[float, float],
+        direction: float = 0.0,
+        width: Sequence[float] | np.ndarray | None = None,
+        specimen: float = SPECIMEN,
+        name: str = "pull",
+    ) -> "Pull":
+        """From what a tester writes.
+
+        - `extension`, `force`: [m], [N], of a load that grows.
+        - `size`: free length between the clamps and width at rest, [m].
+        - `direction`: of the pull, from the warp, [rad].
+        - `width`: of its middle at each sample, [m], where measured.
+
+        The curve is thinned to `SAMPLES` means over equal parts of its stretch.
+
+        Raises `ValueError` that names the pull: sizes that are not positive, fewer than three
+        samples, an extension that looks like per cent or millimetres, a force that looks like
+        grams, one that does not rise.
+        """
+        length, wide = size
+        if not (0 < wide < 5 and 0 < length < 5):
+            raise ValueError(f"{name}: length and width are in metres, got {length} and {wide}")
+        extension, force = np.asarray(extension, float), np.asarray(force, float)
+        if extension.shape != force.shape or extension.ndim != 1 or len(force) < 3:
+            raise ValueError(
+                f"{name}: expected three samples or more of extension and force, found "
+                f"{extension.shape} and {force.shape}"
+            )
+        stretch, tension = 1 + extension / length, force / wide
+        middle = np.full(len(force), np.nan) if width is None else np.asarray(width, float) / wide
+        _check(name, stretch, tension, middle)
+        columns = _thinned(np.stack([stretch, tension, middle], axis=1))
+        stretches, tensions, widths = (jnp.asarray(column, float) for column in columns.T)
+        angle, spread = (jnp.asarray(number, float) for number in (direction, specimen))
+        return cls(stretches, tensions, widths, angle, spread, name)
+
+    def residuals(self, fabric: Fabric) -> Float[Array, " residual"]:
+        """How far a fabric is from the curve, in standard deviations that err independently.
+
+        All tensions of a curve err together by `specimen`, and each by its `READING`.
+        """
+        expected, across = jax.vmap(lambda s: uniaxial(fabric.membrane, s, self.direction))(
+            self.stretch
+        )
+        alone = jnp.hypot(READING[0] * self.tension, READING[1] * jnp.max(self.tension))
+        together = self.specimen * self.tension
+        covariance = jnp.diag(alone**2) + together[:, None] * together[None]
+        root = jnp.linalg.cholesky(covariance)
+        off = jax.scipy.linalg.solve_triangular(root, expected - self.tension, lower=True)
+        seen = jnp.isfinite(self.across)
+        wide = jnp.where(seen, (across - jnp.where(seen, self.across, 0)) / WIDTH, 0)
+        return jnp.concatenate([off, wide / jnp.sqrt(jnp.maximum(jnp.sum(seen), 1))])
+
+
+def uniaxial(
+    membrane: MembraneLaw, stretch: Float[Array, ""], direction: Float[Array, ""] | float
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Tension [N/m, over the rest width] and relative width [-] of a strip with free sides.
+
+    - `stretch`: length over rest length, [-].
+    - `direction`: of the pull, from the warp, [rad].
+
+    Raises `TypeError` for a law that follows the strain step by step, since it has no energy.
+    """
+    if type(membrane.at(jnp.zeros(3, float))) is not type(membrane):
+        raise TypeError(f"{type(membrane).__name__} has no energy: take its law at a strain")
+    direction = jnp.asarray(direction, float)
+    along = (stretch**2 - 1) / 2
+
+    def energy(along, free):
+        return membrane.energy_density(_in_yarns(along, free, direction))
+
+    slope = jax.grad(energy, argnums=1)
+
+    def step(free):
+        tangent = jax.jacfwd(slope, argnums=1)(along, free)
+        return free - jnp.linalg.solve(tangent, slope(along, free))
+
+    found = jax.lax.stop_gradient(
+        jax.lax.fori_loop(0, NEWTON, lambda _, free: step(free), jnp.zeros(2, float))
+    )
+    free = step(found)  # from its minimum a step has the derivatives of the minimum
+    tension = stretch * jax.grad(energy)(along, free)
+    return tension, jnp.sqrt(jnp.maximum(1 + 2 * free[0], 1e-6))
+
+
+def _in_yarns(along: Array, free: Float[Array, " 2"], direction: Array) -> Float[Array, " 3"]:
+    """Green strain (E11, E22, 2 E12) from that along, across and in shear of a strip."""
+    across, shear = free
+    c, s = jnp.cos(direction), jnp.sin(direction)
+    return jnp.stack(
+        [
+            c**2 * along + s**2 * across - c * s * shear,
+            s**2 * along + c**2 * across + c * s * shear,
+            2 * c * s * (along - across) + (c**2 - s**2) * shear,
+        ]
+    )
+
+
+def _check(name: str, stretch: np.ndarray, tension: np.ndarray, across: np.ndarray) -> None:
+    if not (np.isfinite(stretch).all() and np.isfinite(tension).all()):
+        raise ValueError(f"{name}: extension and force must be finite")
+    most = float(stretch.max()) - 1
+    if most > 4:
+        raise ValueError(
+            f"{name}: the strip would stretch to {most + 1:.1f} times its length: is the extension "
+            "in per cent, or in millimetres? It is taken in metres"
+        )
+    if most < 2e-3:
+        raise ValueError(
+            f"{name}: the strip stretches by {most:.2g} of its length at most: is the extension "
+            "in metres, and the length right?"
+        )
+    stiffest = float(np.max(tension)) / most
+    if stiffest > 2e5:
+        raise ValueError(
+            f"{name}: a stiffness of {stiffest:.3g} N/m is above that of any fabric: is the force "
+            "in grams or millinewtons? It is taken in newtons"
+        )
+    if not tension[np.argmax(stretch)] > max(0.0, float(tension[np.argmin(stretch)])):
+        raise ValueError(
+            f"{name}: the force does not rise with the extension: are columns swapped?"
+        )
+    wide = across[np.isfinite(across)]
+    if len(wide) and not (0.05 < wide.min() and wide.max() < 3):
+        raise ValueError(
+            f"{name}: widths are {wide.min():.2g} to {wide.max():.2g} of that at rest: in metres?"
+        )
+
+
+def _thinned(curve: Float[np.ndarray, "sample 3"]) -> Float[np.ndarray, "sample 3"]:
+    """Means over equal parts of the stretch; what is at rest says nothing."""
+    curve = curve[(curve[:, 0] > 1) & (curve[:, 1] > 0)]
+    ends = np.linspace(1, curve[:, 0].max() * (1 + 1e-9), SAMPLES + 1)
+    part = np.digitize(curve[:, 0], ends)
+    return np.stack([curve[part == i].mean(axis=0) for i in np.unique(part)])
