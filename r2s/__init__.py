@@ -9,6 +9,7 @@ Rooms, in the order in which they build on each other:
 - `cloth`, `mpm`: the two solvers. `solver`: from steps to motions.
 - `recordings`: observations, from files to one form. `scenarios`: the six experiments.
 - `evaluation`: how near a simulation comes. `estimation`: fabrics from recordings.
+- `laboratory`: pulls, cantilevers and drapes, and the fabrics that they tell.
 - `sweep`, `gradient_check`: thousands of fabrics at once; derivatives against differences.
 - `export`, `viewer`, `study`, `commands`: other simulators, pictures, the study, the command line.
 
@@ -29,12 +30,19 @@ from r2s.evaluation.metrics import distances
 from r2s.fabrics import presets
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.fold_length import fold_length
+from r2s.fabrics.informed_space import InformedSpace
 from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
+from r2s.fabrics.stiffening_space import StiffeningSpace
 from r2s.failures import Failure
 from r2s.geometry.mesh import Mesh, rectangle
+from r2s.laboratory.cantilever import Cantilever
+from r2s.laboratory.drape import Drape
+from r2s.laboratory.files import read_tests
+from r2s.laboratory.pull import Pull
 from r2s.laws.bending import BendingLaw, HingeBending, HingeLaw
 from r2s.laws.membrane import MembraneLaw, OrthotropicMembrane, SpringMembrane
 from r2s.laws.plate import OrthotropicPlate, PlateBending, PlateLaw
+from r2s.laws.stiffening import StiffeningMembrane
 from r2s.laws.tables import TableBending, TableMembrane
 from r2s.recordings.manifest import read_recordings
 from r2s.recordings.recording import Recording, RecordingInfo, SheetPlacement, make_recording
@@ -58,6 +66,7 @@ __all__ = [
     "presets",
     "MembraneLaw",
     "OrthotropicMembrane",
+    "StiffeningMembrane",
     "SpringMembrane",
     "TableMembrane",
     "BendingLaw",
@@ -110,10 +119,17 @@ __all__ = [
     "from_recording",
     "record",
     "distances",
+    # laboratory tests
+    "Pull",
+    "Cantilever",
+    "Drape",
+    "read_tests",
     # estimates
     "ParameterSpace",
     "OrthotropicSpace",
     "IsotropicSpace",
+    "StiffeningSpace",
+    "InformedSpace",
     "Range",
     "METHODS",
     "Method",

@@ -19,6 +19,7 @@ from r2s.estimation.prediction import predict
 from r2s.estimation.problem import NuisancePrior, Problem, beginning
 from r2s.estimation.standard_errors import FARTHEST, covariance, disagreement, sample_around
 from r2s.fabrics import presets
+from r2s.fabrics.informed_space import InformedSpace
 from r2s.fabrics.parameters import UNIFORM_DEVIATION, OrthotropicSpace
 from r2s.scenarios import synthetic
 
@@ -87,6 +88,25 @@ def test_the_air_is_in_doubt_where_a_wind_blows(blown, lifted):
     assert names(blown, blown) == ["air ratio", *numbered(1), *numbered(2)]
     (air, *_) = nuisances((blown,), theta, theta)
     assert air.value == pytest.approx(np.exp(0.1 * 8)) and air.unit == "-"
+
+
+def test_the_prior_of_theta_holds_what_is_known_of_the_fabric(lifted):
+    dim = lifted.space.dim
+    precision = np.diag(np.arange(1.0, dim + 1)) + 0.1
+    known = InformedSpace.make(lifted.space, jnp.full(dim, 0.3), jnp.asarray(precision))
+    problems = (dataclasses.replace(lifted, space=known),)
+    theta = jnp.zeros(gauss_newton.theta_length(problems))
+    off, found = gauss_newton.prior_terms(problems, theta)
+    np.testing.assert_allclose(off[:dim], -0.3, rtol=1e-6)
+    np.testing.assert_allclose(found[:dim, :dim], precision, rtol=1e-6)
+    np.testing.assert_allclose(found[dim:, dim:], np.eye(len(theta) - dim))
+    end, _ = valley(lifted, len(theta))
+    alone = dataclasses.replace(
+        end.normal, matrix=0 * end.normal.matrix, scatter=0 * end.normal.scatter
+    )
+    nothing = dataclasses.replace(end, theta=theta - off, normal=alone)
+    told = covariance(problems, nothing, 1.0, [])[:dim, :dim]
+    np.testing.assert_allclose(np.linalg.inv(told), precision, rtol=1e-6, atol=1e-9)
 
 
 def valley(lifted, size):

@@ -21,6 +21,7 @@ EXTRAS = {
     "cli": ("tyro", "psutil"),
     "physnet": ("skopt", "sklearn"),
     "pinn": ("flax",),
+    "laboratory": ("h5py",),
     "cma": ("cma",),
     "cluster": ("dask", "distributed", "dask_jobqueue"),
     "viz": ("viser",),

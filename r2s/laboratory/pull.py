@@ -177,7 +177,7 @@ def _check(name: str, stretch: np.ndarray, tension: np.ndarray, across: np.ndarr
         )
 
 
-def _thinned(curve: Float[np.ndarray, "sample 3"]) -> Float[np.ndarray, "sample 3"]:
+def _thinned(curve: Float[np.ndarray, "sample 3"]) -> Float[np.ndarray, "mean 3"]:
     """Means over equal parts of the stretch; what is at rest says nothing."""
     curve = curve[(curve[:, 0] > 1) & (curve[:, 1] > 0)]
     ends = np.linspace(1, curve[:, 0].max() * (1 + 1e-9), SAMPLES + 1)

@@ -1,6 +1,8 @@
 """Captures of RGBench: segmented PCD frames, the paths of two arms, 4 x 4 extrinsics.
 
-The layout is described in `data_manifests/rgbench.json`. Needs pypcd4: pip install 'r2s[pcd]'.
+The layout is described in `data_manifests/rgbench.json`. Where the arms' bases are follows the
+public code (both wrappers of moved points); the page on the data has left and right the other way
+round, in a frame that would be left-handed. Needs pypcd4: pip install 'r2s[pcd]'.
 """
 
 import csv
@@ -19,7 +21,7 @@ from r2s.recordings.recording import (
 )
 
 FRAME = re.compile(r"pointcloud_(\d+(?:\.\d+)?)_segmented\.pcd")
-BASES = {"left": (0.0, -0.25, 0.0), "right": (0.0, 0.25, 0.0)}  # [m], in the world
+BASES = {"left": (0.0, 0.25, 0.0), "right": (0.0, -0.25, 0.0)}  # [m], in the world
 PATH = "{}_arm_joint_states_and_end_pose.csv"
 
 
@@ -46,8 +48,8 @@ def read_capture(
         raise ValueError(f"{folder}: two arms hold the sheet, found {len(sheet.held)} held corners")
     frames = _frames(folder / "segment_pcds")
     rotation, shift = _extrinsics(folder / "calibration" / "world_to_camera_transform.json")
-    times, left = _path(folder / "joints" / PATH.format("left"), BASES["left"])
-    times_right, right = _path(folder / "joints" / PATH.format("right"), BASES["right"])
+    times, left = read_arm(folder / "joints" / PATH.format("left"), BASES["left"])
+    times_right, right = read_arm(folder / "joints" / PATH.format("right"), BASES["right"])
     other = np.stack([np.interp(times, times_right, axis) for axis in right.T], axis=1)
     start, end = times[0], min(times[-1], times_right[-1])
     stamps = np.array([stamp for stamp, _ in frames])
@@ -115,8 +117,11 @@ def _extrinsics(file: Path) -> tuple[np.ndarray, np.ndarray]:
     return rotation, matrix[:3, 3]
 
 
-def _path(file: Path, base: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Times [s], and places [m] in the world, of an arm's gripper."""
+def read_arm(file: Path, base: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Times [s], and places [m] in the world, of an arm's gripper, whose base is at `base`.
+
+    Raises FileNotFoundError, or ValueError that names the file: columns or values of a path.
+    """
     names = ("time", "pos_x", "pos_y", "pos_z")
     with open(file, encoding="utf-8", newline="") as text:
         reader = csv.DictReader(text)
