@@ -15,6 +15,7 @@ from r2s.estimation import compiled, descent, gauss_newton
 from r2s.estimation.descent import Budget, covariance_at, descend, nuisances
 from r2s.estimation.estimate import describe
 from r2s.estimation.gauss_newton import Descent, Normal
+from r2s.estimation.mesh_bias import weighed
 from r2s.estimation.prediction import predict
 from r2s.estimation.problem import NuisancePrior, Problem, beginning
 from r2s.estimation.standard_errors import FARTHEST, covariance, disagreement, sample_around
@@ -107,6 +108,36 @@ def test_the_prior_of_theta_holds_what_is_known_of_the_fabric(lifted):
     nothing = dataclasses.replace(end, theta=theta - off, normal=alone)
     told = covariance(problems, nothing, 1.0, [])[:dim, :dim]
     np.testing.assert_allclose(np.linalg.inv(told), precision, rtol=1e-6, atol=1e-9)
+
+
+def test_an_error_of_the_mesh_is_one_of_the_recordings_when_the_prior_is_weighed(lifted):
+    """The end is that of recordings and prior; as if the recordings had erred by b as well."""
+    random = np.random.default_rng(1)
+    dim, size = lifted.space.dim, gauss_newton.theta_length((lifted,))
+    root, other = random.normal(size=(2, size, 2 * size))
+    known = np.eye(size)
+    known[:dim, :dim] = (other @ other.T)[:dim, :dim]
+    mean = np.zeros(size)
+    mean[:dim] = 0.4
+    space = InformedSpace.make(
+        lifted.space, jnp.asarray(mean[:dim]), jnp.asarray(known[:dim, :dim])
+    )
+    problems = (dataclasses.replace(lifted, space=space),)
+    told, seen, bias = root @ root.T, 0.1 * random.normal(size=size), random.normal(size=size)
+    both = np.linalg.inv(told + known)
+    end, _ = valley(lifted, size)
+    prior = jnp.asarray(0.01)
+    normal = dataclasses.replace(end.normal, matrix=jnp.asarray(0.01 * told))
+    theta = both @ (told @ seen + known @ mean)
+    end = dataclasses.replace(end, theta=jnp.asarray(theta), normal=normal)
+    found = weighed(problems, end, prior, both @ told @ bias)
+    less = np.linalg.inv(np.linalg.inv(told) + np.outer(bias, bias))
+    covariance = np.linalg.inv(less + known)
+    np.testing.assert_allclose(found.covariance, covariance, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(
+        found.theta, covariance @ (less @ seen + known @ mean), rtol=1e-5, atol=1e-8
+    )
+    assert np.linalg.norm(found.bias) < np.linalg.norm(both @ told @ bias)
 
 
 def valley(lifted, size):

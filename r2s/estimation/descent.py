@@ -25,11 +25,12 @@ from r2s.estimation.compiled import (
 )
 from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
-from r2s.estimation.mesh_bias import OtherMesh, mesh_bias
+from r2s.estimation.mesh_bias import OtherMesh, mesh_bias, weighed
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import Prediction, Sensitivity, Theta, explain, fabric_at
 from r2s.estimation.problem import OWN, SHARED, UNITS, Problem, beginning, check_shared
 from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.informed_space import InformedSpace
 
 INITIAL_DAMPING = 1e-2
 STRICT, SCALES = 3.0, (3e-3, 0.015)  # of the spread, and between [m]: beyond lies an outlier
@@ -162,20 +163,29 @@ def judged(
     """The estimate at the end of a search, with its standard errors.
 
     `other_mesh`: by which its bias by its mesh is judged (`r2s.estimation.mesh_bias`), which the
-    standard errors then hold.
+    standard errors then hold. Where something is known of the fabric beforehand, the estimate goes
+    towards that as far as its mesh errs (`r2s.estimation.mesh_bias.weighed`).
     """
     began, problems = time.perf_counter(), found.problems
     which, best = _best(found.rows[-1])
     stage, prior = _rows_of_stage(found.rows, int(best.stage)), _weight(problems, best.normal)
     predicted, bias = derivatives_at(problems, best.theta, budget.width), None
     covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1), predicted)
+    loss = loss_from(problems, [seen for seen, _ in predicted])
+    rows = found.rows
     if other_mesh is not None:
         bias = mesh_bias(problems, other_mesh, best, prior, predicted)
         covariance = covariance + np.outer(bias, bias)
+        if isinstance(problems[0].space, InformedSpace):
+            theta, covariance, bias = weighed(problems, best, prior, bias)
+            inside = np.clip(theta, gauss_newton.MARGIN, 1 - gauss_newton.MARGIN)
+            theta[: problems[0].space.dim] = inside[: problems[0].space.dim]
+            best = dataclasses.replace(best, theta=jnp.asarray(theta, float))
+            rows = [*rows, [best if i == which else row for i, row in enumerate(rows[-1])]]
+            loss = float(losses_at(problems, best.theta[None])[0])
     seconds = found.seconds + time.perf_counter() - began
     converged = _arrived(problems, stage, which, prior, _stop(budget, int(best.stage)))
-    loss = loss_from(problems, [seen for seen, _ in predicted])
-    estimate = collect(problems, found.rows, covariance, approach, seconds, converged, loss, bias)
+    estimate = collect(problems, rows, covariance, approach, seconds, converged, loss, bias)
     against = contradiction(problems, each_alone(problems, budget, best.theta, key), bias)
     return dataclasses.replace(estimate, contradiction=against)
 

@@ -93,3 +93,38 @@ def _laid_onto(here: Problem, there: Problem, slope: Sensitivity) -> Sensitivity
     corners = meshes[0].faces[face]
     laid = jnp.einsum("vk,fvkiu->fviu", weights, slope.x[:, corners])
     return Sensitivity(laid, slope.force)
+
+
+class Weighed(NamedTuple):
+    """Where an estimate lies once its mesh's error counts as an error of the recordings.
+
+    - `theta`: there. `covariance`: of it. `bias`: of its mesh that is left.
+    """
+
+    theta: Float[np.ndarray, " theta"]
+    covariance: Float[np.ndarray, "theta theta"]
+    bias: Float[np.ndarray, " theta"]
+
+
+def weighed(
+    problems: Problems, end: Descent, prior: Array, bias: Float[np.ndarray, " theta"]
+) -> Weighed:
+    """An estimate that trusts its prior more where its mesh errs, from one that did not.
+
+    What the recordings tell, theta with the precision M, errs by the bias b of its mesh, of which
+    only the size is believed: its covariance is M^-1 + b b' (model discrepancy, Kennedy and O'Hagan
+    2001, of rank one). The prior is then added anew. Linear about the end.
+
+    - `prior`: its weight, see `r2s.estimation.gauss_newton.prior_weight`.
+    - `bias`: of the estimate with its prior, as `mesh_bias` gives it.
+    """
+    off, precision = (np.asarray(p, np.float64) for p in prior_terms(problems, end.theta))
+    told = np.asarray(end.normal.matrix, np.float64) / float(prior)
+    pull = (told + precision) @ bias  # M times the bias of the recordings alone
+    alone = np.linalg.lstsq(told, pull, rcond=1e-9)[0]
+    size = 1 + float(alone @ pull)
+    left = told - np.outer(pull, pull) / size
+    covariance = np.linalg.inv(left + precision)
+    moved = -covariance @ pull * float(alone @ precision @ off) / size
+    theta = np.asarray(end.theta, np.float64) + moved
+    return Weighed(theta, covariance, covariance @ left @ alone)

@@ -18,12 +18,15 @@ from jaxtyping import PRNGKeyArray
 
 from r2s.fabrics import presets
 from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.informed_space import InformedSpace
+from r2s.fabrics.parameters import ParameterSpace
 from r2s.laws.membrane import OrthotropicMembrane
 from r2s.laws.plate import PlateBending
 
 BENDING, EXPONENT, SPREAD = -9.197, 1.230, 0.80  # of the logarithms
 COUPLING, DAMPING, FRICTION = (-0.5, 0.5), (1e-3, 3e-2), (0.2, 0.8)  # -, [s], -
 THICKNESS = 1e-3  # [m]
+MANY, LEAST = 1024, 1e-2  # draws that tell a distribution; its least deviation, of a range
 
 
 def draws(density: float, count: int, key: PRNGKeyArray) -> Fabric:
@@ -57,6 +60,20 @@ def fabrics(density: float, count: int, key: PRNGKeyArray) -> list[Fabric]:
     """The `draws`, one by one."""
     drawn = draws(density, count, key)
     return [jax.tree.map(lambda leaf, i=i: leaf[i], drawn) for i in range(count)]
+
+
+def informed(space: ParameterSpace, density: float, key: PRNGKeyArray) -> InformedSpace:
+    """A space that knows of this prior: mean and covariance of places of `MANY` draws in it.
+
+    Raises `ValueError` for a density that is not positive.
+    """
+    drawn = draws(density, MANY, key)
+    places = np.asarray(jax.vmap(space.to_unit)(drawn), np.float64)
+    covariance = np.cov(places.T) + LEAST**2 * np.eye(space.dim)
+    mean = np.clip(places.mean(axis=0), 0, 1)
+    return InformedSpace.make(
+        space, jnp.asarray(mean, float), jnp.asarray(np.linalg.inv(covariance), float)
+    )
 
 
 def middle(density: float) -> Fabric:

@@ -90,7 +90,7 @@ def overhang(fabric: Fabric, direction: float = 0.0, slope: float = SLOPE) -> Fl
 
     >>> from r2s.fabrics import presets
     >>> round(float(100 * overhang(presets.black_denim())), 1)  # [cm]
-    5.7
+    3.6
     """
     stiffness = fabric.bending.stiffness_along(direction)
     return _in_lengths(float(slope)) * (stiffness / (fabric.density * GRAVITY)) ** (1 / 3)
