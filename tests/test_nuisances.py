@@ -110,8 +110,8 @@ def test_the_prior_of_theta_holds_what_is_known_of_the_fabric(lifted):
     np.testing.assert_allclose(np.linalg.inv(told), precision, rtol=1e-6, atol=1e-9)
 
 
-def test_an_error_of_the_mesh_is_one_of_the_recordings_when_the_prior_is_weighed(lifted):
-    """The end is that of recordings and prior; as if the recordings had erred by b as well."""
+def test_a_prior_counts_for_more_where_an_estimate_errs_by_more_than_noise(lifted):
+    """Against the posterior of a normal distribution; the end is that of noise alone."""
     random = np.random.default_rng(1)
     dim, size = lifted.space.dim, gauss_newton.theta_length((lifted,))
     root, other = random.normal(size=(2, size, 2 * size))
@@ -123,21 +123,27 @@ def test_an_error_of_the_mesh_is_one_of_the_recordings_when_the_prior_is_weighed
         lifted.space, jnp.asarray(mean[:dim]), jnp.asarray(known[:dim, :dim])
     )
     problems = (dataclasses.replace(lifted, space=space),)
-    told, seen, bias = root @ root.T, 0.1 * random.normal(size=size), random.normal(size=size)
+    told, seen = root @ root.T + 50 * np.eye(size), 0.1 * random.normal(size=size)
     both = np.linalg.inv(told + known)
     end, _ = valley(lifted, size)
-    prior = jnp.asarray(0.01)
     normal = dataclasses.replace(end.normal, matrix=jnp.asarray(0.01 * told))
     theta = both @ (told @ seen + known @ mean)
     end = dataclasses.replace(end, theta=jnp.asarray(theta), normal=normal)
-    found = weighed(problems, end, prior, both @ told @ bias)
-    less = np.linalg.inv(np.linalg.inv(told) + np.outer(bias, bias))
-    covariance = np.linalg.inv(less + known)
-    np.testing.assert_allclose(found.covariance, covariance, rtol=1e-5, atol=1e-9)
+    prior, none = jnp.asarray(0.01), np.zeros(size)
+
+    right = weighed(problems, end, prior, both, none)  # noise was all there is
+    np.testing.assert_allclose(right.theta, theta, rtol=1e-5)
+    np.testing.assert_allclose(right.covariance, both, rtol=1e-5, atol=1e-9)
+    less = told / 3  # the recordings err by more
+    found = weighed(problems, end, prior, np.linalg.inv(less + known), both @ told @ seen)
+    expected = np.linalg.inv(less + known)
+    np.testing.assert_allclose(found.covariance, expected, rtol=1e-5, atol=1e-9)
     np.testing.assert_allclose(
-        found.theta, covariance @ (less @ seen + known @ mean), rtol=1e-5, atol=1e-8
+        found.theta, expected @ (less @ seen + known @ mean), rtol=1e-5, atol=1e-8
     )
-    assert np.linalg.norm(found.bias) < np.linalg.norm(both @ told @ bias)
+    np.testing.assert_allclose(found.bias, expected @ less @ seen, rtol=1e-5, atol=1e-8)
+    nothing = weighed(problems, end, prior, 2 * np.linalg.inv(known), none)
+    np.testing.assert_allclose(nothing.theta, mean, rtol=1e-5, atol=1e-8)
 
 
 def valley(lifted, size):

@@ -177,7 +177,7 @@ def judged(
         bias = mesh_bias(problems, other_mesh, best, prior, predicted)
         covariance = covariance + np.outer(bias, bias)
         if isinstance(problems[0].space, InformedSpace):
-            theta, covariance, bias = weighed(problems, best, prior, bias)
+            theta, covariance, bias = weighed(problems, best, prior, covariance, bias)
             inside = np.clip(theta, gauss_newton.MARGIN, 1 - gauss_newton.MARGIN)
             theta[: problems[0].space.dim] = inside[: problems[0].space.dim]
             best = dataclasses.replace(best, theta=jnp.asarray(theta, float))

@@ -28,6 +28,8 @@ from r2s.geometry.surface import nearest
 from r2s.kept import kept
 from r2s.scenarios.resolution import ORDER
 
+RCOND = 1e-6  # of the recordings' information: less than that is none
+
 _equations = kept(normal_equations.normal_equations_of)
 
 
@@ -107,24 +109,32 @@ class Weighed(NamedTuple):
 
 
 def weighed(
-    problems: Problems, end: Descent, prior: Array, bias: Float[np.ndarray, " theta"]
+    problems: Problems,
+    end: Descent,
+    prior: Array,
+    covariance: Float[np.ndarray, "theta theta"],
+    bias: Float[np.ndarray, " theta"],
 ) -> Weighed:
-    """An estimate that trusts its prior more where its mesh errs, from one that did not.
+    """An estimate that trusts its prior more where it errs, from one that took its recordings as
+    exact but for their noise.
 
-    What the recordings tell, theta with the precision M, errs by the bias b of its mesh, of which
-    only the size is believed: its covariance is M^-1 + b b' (model discrepancy, Kennedy and O'Hagan
-    2001, of rank one). The prior is then added anew. Linear about the end.
+    A descent weighs recordings and prior by the noise. The standard errors know more: how far the
+    mesh leads astray, and how rough the loss is. What is left of the recordings' information with
+    these is what `covariance` has beyond the prior, and the prior is added to that anew (the model
+    discrepancy of Kennedy and O'Hagan 2001, linear about the end).
 
     - `prior`: its weight, see `r2s.estimation.gauss_newton.prior_weight`.
-    - `bias`: of the estimate with its prior, as `mesh_bias` gives it.
+    - `covariance`: of the end with all errors. `bias`: of its mesh, as `mesh_bias` gives it.
     """
-    off, precision = (np.asarray(p, np.float64) for p in prior_terms(problems, end.theta))
+    off, known = (np.asarray(part, np.float64) for part in prior_terms(problems, end.theta))
     told = np.asarray(end.normal.matrix, np.float64) / float(prior)
-    pull = (told + precision) @ bias  # M times the bias of the recordings alone
-    alone = np.linalg.lstsq(told, pull, rcond=1e-9)[0]
-    size = 1 + float(alone @ pull)
-    left = told - np.outer(pull, pull) / size
-    covariance = np.linalg.inv(left + precision)
-    moved = -covariance @ pull * float(alone @ precision @ off) / size
-    theta = np.asarray(end.theta, np.float64) + moved
-    return Weighed(theta, covariance, covariance @ left @ alone)
+    alone = np.linalg.lstsq(told, known @ off, rcond=RCOND)[0]  # to where recordings alone lead
+    root = np.linalg.cholesky(known)
+    inner = np.linalg.solve(root, np.linalg.inv(covariance))
+    sizes, axes = np.linalg.eigh(np.linalg.solve(root, inner.T))
+    axes = root @ axes
+    left = (axes * np.maximum(sizes - 1, 0)[None]) @ axes.T
+    errors = np.linalg.inv(left + known)
+    theta = np.asarray(end.theta, np.float64) + errors @ (left @ alone - known @ off)
+    led = np.linalg.lstsq(told, (told + known) @ bias, rcond=RCOND)[0]
+    return Weighed(theta, errors, errors @ left @ led)
