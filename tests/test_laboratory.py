@@ -433,6 +433,8 @@ def test_tests_alone_make_a_card(tmp_path: Path, capsys: pytest.CaptureFixture):
     assert card.provenance.method == "estimated by r2s: laboratory tests"
     assert card.provenance.recordings[0][0] == "tests"
     assert "cantilever 1: overhang 50.0 mm measured" in capsys.readouterr().out
+    assert main([*command, "--method", "physnet"]) == 1
+    assert "--method, --solver" in capsys.readouterr().err
     assert main([*command, "--law", "stiffening"]) == 0
     law = cards.read(tmp_path / "card.json").fabric.membrane
     assert isinstance(law, StiffeningMembrane)

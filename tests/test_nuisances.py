@@ -229,7 +229,8 @@ def test_deviations_are_from_the_frames_on_which_places_agree(monkeypatch):
     """Of all frames if they do on them, or nowhere; else of the largest share."""
     lifted = lift(8)  # of which a quarter tells something of the fabric already
     problems, budget = (lifted,), Budget(shares=(0.5,), around=2)
-    theta = jnp.concatenate([FAMILY.to_unit(FABRIC), jnp.zeros(7)])
+    nuisances = jnp.zeros(gauss_newton.theta_length(problems) - FAMILY.dim)
+    theta = jnp.concatenate([FAMILY.to_unit(FABRIC), nuisances])
     zero = jnp.zeros(())
 
     def found(agree, share=1.0, budget=budget):

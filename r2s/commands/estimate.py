@@ -117,6 +117,8 @@ class EstimateCard:
             method = self._method(progress)
             space = self._space(method)
             tests = [test for each in known for test in each.tests]
+            if not seen:
+                self._check_alone(method)
             told = estimate(tests, space, progress) if tests else None
             unseen: list[Recording] = []
             if seen:
@@ -159,6 +161,14 @@ class EstimateCard:
         ]
         print_result(self.json, cards.as_json(card), lines)
         return 0
+
+    def _check_alone(self, method: "Method") -> None:
+        """Raise `ValueError` for what laboratory tests alone have no use for."""
+        if method.name != "diffcloud" or self.solver or self.shape or self.hold_out:
+            raise ValueError(
+                "laboratory tests alone are fitted by least squares: --method, --solver, --shape "
+                "and --hold-out go with recordings of motions"
+            )
 
     def _space(self, method: "Method") -> "ParameterSpace":
         """The fabrics to choose from; `ValueError` for a law that the solver's space lacks."""

@@ -171,5 +171,5 @@ def softening(fabric: Fabric) -> tuple[str, ...]:
     return tuple(
         f"{text}; that of the flat sheet at rest is exported"
         for text, name in zip(follow, names, strict=True)
-        if "Table" in name or "Spring" in name
+        if any(word in name for word in ("Table", "Spring", "Stiffening", "Softening"))
     )
