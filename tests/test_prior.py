@@ -6,7 +6,9 @@ import jax.random as jr
 import numpy as np
 import pytest
 
+from r2s.estimation.default_spaces import on_cloth
 from r2s.fabrics import presets, prior
+from r2s.fabrics.stiffening_space import StiffeningSpace
 from r2s.laws.membrane import OrthotropicMembrane
 from r2s.laws.plate import PlateBending
 from r2s.laws.stiffening import SofteningPlate, StiffeningMembrane
@@ -73,3 +75,17 @@ def test_a_plate_loses_half_of_what_it_can_at_its_knee():
         assert moment == pytest.approx(2e-5 * curvature * left, rel=1e-4)
     bent = jax.hessian(law.energy_density)(jnp.array([30.0, -10.0, 5.0]))
     assert np.all(np.linalg.eigvalsh(np.asarray(bent)) > 0)
+
+
+@pytest.mark.parametrize("stiffens", [False, True])
+def test_a_space_that_knows_of_the_prior_has_the_mean_and_the_spread_of_its_draws(stiffens):
+    space = on_cloth(0.2)
+    space = StiffeningSpace.make(space) if stiffens else space
+    mean, precision = prior.informed(space, 0.2).prior()
+    drawn = prior.draws(0.2, 4000, jr.key(3))
+    places = np.asarray(jax.vmap(space.to_unit)(drawn))[:, :7]
+    spread = np.sqrt(np.diag(np.linalg.inv(precision)))
+    np.testing.assert_allclose(mean[:7], np.clip(places.mean(axis=0), 0, 1), atol=0.03)
+    np.testing.assert_allclose(spread[:7], places.std(axis=0), rtol=0.1)
+    if stiffens:  # of which no draw says anything
+        np.testing.assert_allclose(spread[7:], 0.29, rtol=1e-5)

@@ -68,6 +68,9 @@ class EstimateCard:
     law: Literal["linear", "stiffening"] = "linear"
     """Of the yarns: of constant stiffness, or one that grows with their stretch (three
     numbers more)."""
+    prior: Literal["flat", "fabrics"] = "flat"
+    """What is assumed beforehand: any place of the ranges alike, or what measured fabrics of this
+    weight are like. Then diffcloud trusts that more, as far as its mesh errs."""
     name: str = ""
     """Name of the fabric; by default that of the recording."""
     coarse: int | None = None
@@ -173,14 +176,16 @@ class EstimateCard:
     def _space(self, method: "Method") -> "ParameterSpace":
         """The fabrics to choose from; `ValueError` for a law that the solver's space lacks."""
         from r2s.estimation.method import default_space
+        from r2s.fabrics import prior
         from r2s.fabrics.stiffening_space import StiffeningSpace
 
         space = default_space(method.chosen_solver, self.density)
-        if self.law == "linear":
-            return space
-        if method.chosen_solver != "cloth":
-            raise ValueError("--law stiffening is of the cloth: material points have another one")
-        return StiffeningSpace.make(space)
+        asked = self.law != "linear" or self.prior != "flat"
+        if asked and method.chosen_solver != "cloth":
+            raise ValueError("--law and --prior are of the cloth: material points have their own")
+        if self.law == "stiffening":
+            space = StiffeningSpace.make(space)
+        return space if self.prior == "flat" else prior.informed(space, self.density)
 
     def _hold_out(self, seen: "list[Recording]") -> "list[Recording]":
         """Take what is to be held out from the recordings, and return it: one, or none."""

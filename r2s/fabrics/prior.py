@@ -26,7 +26,7 @@ from r2s.laws.plate import PlateBending
 BENDING, EXPONENT, SPREAD = -9.197, 1.230, 0.80  # of the logarithms
 COUPLING, DAMPING, FRICTION = (-0.5, 0.5), (1e-3, 3e-2), (0.2, 0.8)  # -, [s], -
 THICKNESS = 1e-3  # [m]
-MANY, LEAST = 1024, 1e-2  # draws that tell a distribution; its least deviation, of a range
+MANY, LEAST = 1024, 1e-3  # draws that tell a distribution; a range over which they do not vary
 
 
 def draws(density: float, count: int, key: PRNGKeyArray) -> Fabric:
@@ -62,18 +62,20 @@ def fabrics(density: float, count: int, key: PRNGKeyArray) -> list[Fabric]:
     return [jax.tree.map(lambda leaf, i=i: leaf[i], drawn) for i in range(count)]
 
 
-def informed(space: ParameterSpace, density: float, key: PRNGKeyArray) -> InformedSpace:
-    """A space that knows of this prior: mean and covariance of places of `MANY` draws in it.
+def informed(space: ParameterSpace, density: float) -> InformedSpace:
+    """A space that knows of this prior: mean and covariance of the places of `MANY` draws in it,
+    always the same. Of the numbers of a law that stiffens it knows no more than the space does.
 
     Raises `ValueError` for a density that is not positive.
     """
-    drawn = draws(density, MANY, key)
+    drawn = draws(density, MANY, jr.key(0))
     places = np.asarray(jax.vmap(space.to_unit)(drawn), np.float64)
-    covariance = np.cov(places.T) + LEAST**2 * np.eye(space.dim)
-    mean = np.clip(places.mean(axis=0), 0, 1)
-    return InformedSpace.make(
-        space, jnp.asarray(mean, float), jnp.asarray(np.linalg.inv(covariance), float)
-    )
+    varies = places.std(axis=0) > LEAST
+    mean, precision = (np.array(part, np.float64) for part in space.prior())
+    mean[varies] = np.clip(places[:, varies].mean(axis=0), 0, 1)
+    known = np.linalg.inv(np.cov(places[:, varies].T))
+    precision[np.ix_(varies, varies)] = known
+    return InformedSpace.make(space, jnp.asarray(mean, float), jnp.asarray(precision, float))
 
 
 def middle(density: float) -> Fabric:
