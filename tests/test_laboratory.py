@@ -371,6 +371,45 @@ def test_a_curve_in_other_units_is_named(tmp_path: Path, header, unit, force, wo
 
 
 @pytest.mark.parametrize(
+    "strain, force, words",
+    [
+        ([0, 0.05, 0.1, 0.05, 0], [0, 1, 2, 0.6, 0], "goes back by 100%"),
+        ([0, 0.02, 0.05, 0.08, 0.1], [0, 1, 2, 3, 0.2], "the force falls before the end"),
+        ([0, 0.05, 0.08, 0.1], [1, 1.5, 1.8, 2], "at rest the force is 50%"),
+        ([0, 0.05, 0.1], [0, -1, 2], "fewer than three samples"),
+    ],
+)
+def test_a_curve_that_is_no_pull_is_named(strain, force, words):
+    with pytest.raises(ValueError, match=words):
+        Pull.make(0.2 * np.array(strain), np.array(force, float), SIZE)
+
+
+def test_widths_do_not_make_the_errors_of_tensions_smaller():
+    """What scatters more than it should says so, with widths as without."""
+    fabric, space = presets.black_denim(), on_cloth(0.32)
+    random, found = np.random.default_rng(0), {}
+    pulls = [pulled(fabric, each) for each in ANGLES]
+    rough = [
+        dataclasses.replace(each, tension=each.tension * (1 + 0.06 * random.normal(size=24)))
+        for each in pulls
+    ]
+    for name, tests in (
+        ("with", rough),
+        ("without", [dataclasses.replace(each, across=each.across * jnp.nan) for each in rough]),
+    ):
+        found[name] = estimate(tests, space).standard_errors[2]  # of the shear
+    assert found["with"] == pytest.approx(found["without"], rel=0.2)
+
+
+def test_a_drape_that_does_not_come_to_rest_is_an_error(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(
+        Drape, "residuals", lambda self, fabric: jnp.full(1, jnp.nan) * fabric.density
+    )
+    with pytest.raises(RuntimeError, match="no specimen of the drape test comes to rest"):
+        estimate([Drape.make(0.4)], on_cloth(0.2))
+
+
+@pytest.mark.parametrize(
     "kinds, words",
     [
         ({}, "no test"),
@@ -380,6 +419,20 @@ def test_a_curve_in_other_units_is_named(tmp_path: Path, header, unit, force, wo
         ({"cantilevers": [{"direction": 45, "overhangs": [0.05]}]}, "0 to pi rad"),
         ({"cantilevers": [{"overhangs": [0.05]}]}, "cantilever 1: missing: direction"),
         ({"drapes": [{"coefficient": 42}]}, "is it in per cent"),
+        ({"cantilevers": [{"direction": "warp", "overhangs": [10**400]}]}, "list of numbers"),
+        ({"cantilevers": [{"direction": True, "overhangs": [0.05]}]}, "direction: expected"),
+        ({"source": [1], "drapes": [{"coefficient": 0.4}]}, "source: expected text"),
+        ({"drapes": [{"coefficient": 0.4, "deviation": 5}]}, "the deviation is a share"),
+        ({"drapes": [{"coefficient": 0.4, "support_radius": 0.1499}]}, "drape 1: the radii"),
+        (
+            {"pulls": [{"file": "", "direction": "warp", "length": 0.2, "width": 0.05}]},
+            "pull 1: no such file",
+        ),
+        ({"cantilevers": [{"direction": "warp", "overhangs": [10**400]}]}, "list of numbers"),
+        ({"cantilevers": [{"direction": True, "overhangs": [0.05]}]}, "direction: expected"),
+        ({"source": [1], "drapes": [{"coefficient": 0.4}]}, "source: expected text"),
+        ({"drapes": [{"coefficient": 0.4, "deviation": 5}]}, "the deviation is a share"),
+        ({"drapes": [{"coefficient": 0.4, "support_radius": 0.1499}]}, "drape 1: the radii"),
         (
             {"drapes": [{"coefficient": 0.4, "specimen_radius": 0.3, "support_radius": 0.18}]},
             "diameters",
@@ -433,6 +486,7 @@ def test_tests_alone_make_a_card(tmp_path: Path, capsys: pytest.CaptureFixture):
     assert card.provenance.method == "estimated by r2s: laboratory tests"
     assert card.provenance.recordings[0][0] == "tests"
     assert "cantilever 1: overhang 50.0 mm measured" in capsys.readouterr().out
+    assert main([*command, "--starts", "1"]) == 1
     assert main([*command, "--method", "physnet"]) == 1
     assert "--method, --solver" in capsys.readouterr().err
     assert main([*command, "--law", "stiffening"]) == 0

@@ -128,6 +128,7 @@ def test_a_prior_counts_for_more_where_an_estimate_errs_by_more_than_noise(lifte
     end, _ = valley(lifted, size)
     normal = dataclasses.replace(end.normal, matrix=jnp.asarray(0.01 * told))
     theta = both @ (told @ seen + known @ mean)
+    normal = dataclasses.replace(normal, gradient=jnp.asarray(0.01 * told @ (theta - seen)))
     end = dataclasses.replace(end, theta=jnp.asarray(theta), normal=normal)
     prior, none = jnp.asarray(0.01), np.zeros(size)
 

@@ -167,10 +167,12 @@ class EstimateCard:
 
     def _check_alone(self, method: "Method") -> None:
         """Raise `ValueError` for what laboratory tests alone have no use for."""
-        if method.name != "diffcloud" or self.solver or self.shape or self.hold_out:
+        numbers = (self.coarse, self.starts, self.iterations, self.evaluations)
+        others = (self.solver, self.shape, self.hold_out, *numbers)
+        if method.name != "diffcloud" or self.seed or any(each is not None for each in others):
             raise ValueError(
-                "laboratory tests alone are fitted by least squares: --method, --solver, --shape "
-                "and --hold-out go with recordings of motions"
+                "laboratory tests alone are fitted by least squares: --method, --solver, --shape, "
+                "--hold-out, --seed and the numbers of a search go with recordings of motions"
             )
 
     def _space(self, method: "Method") -> "ParameterSpace":

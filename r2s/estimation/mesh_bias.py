@@ -128,7 +128,8 @@ def weighed(
     """
     off, known = (np.asarray(part, np.float64) for part in prior_terms(problems, end.theta))
     told = np.asarray(end.normal.matrix, np.float64) / float(prior)
-    alone = np.linalg.lstsq(told, known @ off, rcond=RCOND)[0]  # to where recordings alone lead
+    slope = np.asarray(end.normal.gradient, np.float64) / float(prior)
+    alone = np.linalg.lstsq(told, -slope, rcond=RCOND)[0]  # to where recordings alone lead
     root = np.linalg.cholesky(known)
     inner = np.linalg.solve(root, np.linalg.inv(covariance))
     sizes, axes = np.linalg.eigh(np.linalg.solve(root, inner.T))

@@ -84,9 +84,14 @@ class Environment:
         mass = float(_value(cfg, "cloth_params.mass"))
         self.fabric = layered(card.fabric, mass / float(jnp.sum(mesh.area)))
         flat = np.concatenate([mesh.rest, np.full((len(mesh.rest), 1), self.fabric.thickness)], 1)
-        shoulders = lying[list(_value(cfg, "cloth_params.shoulder_index", ()))]
-        grips = shoulders[:, :2] if self._is_fling else self._grippers(self._grab)[:, :2]
-        self._held = KDTree(flat[:, :2]).query(grips)[1]
+        grips = self._grippers(self._grab)
+        if self._is_fling:
+            grips = lying[list(_value(cfg, "cloth_params.shoulder_index"))]
+        if len(grips) != len(ARMS):
+            raise ValueError(f"cloth_params.shoulder_index: expected two, found {len(grips)}")
+        self._held = np.asarray(KDTree(flat[:, :2]).query(grips[:, :2])[1])
+        if len(np.unique(self._held)) < len(ARMS):
+            raise ValueError("both arms hold one vertex of the sheet: take a smaller env.spacing")
         self._from = flat[self._held]
         scene = Scene(mesh, jnp.asarray(self._held), Table.make(0.0), Air.make())
         solver = Cloth.make(scene, self.dt)

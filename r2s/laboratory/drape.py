@@ -25,6 +25,7 @@ from r2s.world.scene import Control, Scene
 RADII = 0.15, 0.09  # of specimen and support [m]: the 30 cm templates of the standard
 DEVIATION = 0.03  # of a coefficient
 SHAPE = 72, 10  # vertices around, and cells from the support to the rim
+LEAST = 0.01  # [m], of the support and of the ring around it
 UNEVEN = 1e-3  # [m], of the start: what decides which folds come
 SETTLING = 1 / 30, 80  # [s], steps
 BRAKE = 3.0  # [1/s], mass damping while it settles
@@ -84,15 +85,20 @@ class Drape(eqx.Module):
                 "is it in per cent?"
             )
         specimen, support = radii
-        if not 0 < support < specimen or specimen > 0.2:
+        if not LEAST <= support <= specimen - LEAST or specimen > 0.2:
             raise ValueError(
                 f"{name}: the radii [m] of specimen and support are such as {RADII}, got {radii}: "
                 "are they diameters, or in centimetres?"
             )
-        if not deviation > 0:
-            raise ValueError(f"{name}: the deviation must be positive, got {deviation}")
+        if not 0 < deviation < 0.5:
+            raise ValueError(f"{name}: the deviation is a share such as 0.03, got {deviation}")
         value, spread = (jnp.asarray(n, float) for n in (coefficient, deviation))
         return cls(value, spread, (float(specimen), float(support)), name)
+
+    @property
+    def count(self) -> int:
+        """How many data it has."""
+        return 1
 
     def residuals(self, fabric: Fabric) -> Float[Array, " 1"]:
         """How far a fabric's coefficient is from the measured one, in standard deviations."""

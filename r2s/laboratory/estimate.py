@@ -25,7 +25,7 @@ from r2s.estimation.gauss_newton import MARGIN
 from r2s.estimation.method import Progress, tell
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.informed_space import InformedSpace
-from r2s.fabrics.parameters import ParameterSpace
+from r2s.fabrics.parameters import UNIFORM_DEVIATION, ParameterSpace
 from r2s.laboratory.cantilever import Cantilever, overhang
 from r2s.laboratory.drape import Drape, coefficient, drape, ring
 from r2s.laboratory.pull import Pull, uniaxial
@@ -35,6 +35,9 @@ Test = Pull | Cantilever | Drape
 APPROACH = "laboratory tests"
 STARTS = 8
 ENOUGH = 1e-4  # relative, of the sum of squares or of a step: there a descent ends
+FAILED = 1e6  # of every residual, where a specimen of a drape does not come to rest
+SLACK = 0.02  # of a variance: less than that a motion does not add to what tests tell
+TOLD = 0.5  # of the prior's standard error: tests tell what they know better than that
 POOR_FIT = 3.0  # standard deviations (root mean square), beyond which a test does not fit
 
 
@@ -72,7 +75,7 @@ def estimate(
         places = min(found, key=lambda each: each.cost).x[None]
     tell(progress, "simulating drapes" if len(quick) < len(tests) else "fitting")
     found = _descend(tuple(tests), space, places[0], progress)
-    if not np.isfinite(found.cost):
+    if not np.isfinite(_linearised(tuple(tests), space, jnp.asarray(found.x, float))[0]).all():
         raise RuntimeError("no specimen of the drape test comes to rest: are its radii right?")
     covariance = np.linalg.inv(_precision(tests, space, jnp.asarray(found.x, float)))
     deviation = np.sqrt(np.diag(covariance))
@@ -99,8 +102,7 @@ def estimate(
 def informed(space: ParameterSpace, found: Estimate) -> InformedSpace:
     """The space with what an estimate from laboratory tests knows of its places as their prior."""
     widths = np.array([bound.width for bound in space.ranges])
-    deviation = found.standard_errors / widths
-    covariance = found.correlation * np.outer(deviation, deviation)
+    covariance = _covariance(found, widths)
     place = space.to_unit(found.fabric)
     return InformedSpace.make(space, place, jnp.asarray(np.linalg.inv(covariance), float))
 
@@ -108,18 +110,30 @@ def informed(space: ParameterSpace, found: Estimate) -> InformedSpace:
 def apart(told: Estimate, found: Estimate) -> float:
     """How likely it is by chance that an estimate lies as far from what tests alone told, [-].
 
-    `found` has them as its prior: the distance is counted in the covariance of `told` alone.
+    `found` has the tests as its prior, so that the difference has the covariance of `told` less its
+    own (Hausman, Econometrica 46, 1978). Counted are the parameters that the tests tell.
     """
     ranges = told.ranges
+    widths = np.array([bound.width for bound in ranges])
+    told_by = np.flatnonzero(told.standard_errors < TOLD * UNIFORM_DEVIATION * widths)
+    if not len(told_by):
+        return 1.0
     places = [
         np.array(
             [float(r.to_unit(jnp.asarray(v, float))) for r, v in zip(ranges, e.values, strict=True)]
         )
         for e in (told, found)
     ]
-    deviation = told.standard_errors / np.array([bound.width for bound in ranges])
-    off = (places[1] - places[0]) / deviation
-    return float(chi2.sf(off @ np.linalg.solve(told.correlation, off), len(off)))
+    off = (places[1] - places[0])[told_by]
+    before, after = (_covariance(each, widths)[np.ix_(told_by, told_by)] for each in (told, found))
+    sizes, axes = np.linalg.eigh(before - after)
+    sizes = np.maximum(sizes, SLACK * np.max(np.linalg.eigvalsh(before)) * np.ones_like(sizes))
+    return float(chi2.sf(np.sum((axes.T @ off) ** 2 / sizes), len(off)))
+
+
+def _covariance(estimate: Estimate, widths: np.ndarray) -> np.ndarray:
+    deviation = estimate.standard_errors / widths
+    return estimate.correlation * np.outer(deviation, deviation)
 
 
 def fits(tests: Sequence[Test], fabric: Fabric) -> list[Fit]:
@@ -129,8 +143,7 @@ def fits(tests: Sequence[Test], fabric: Fabric) -> list[Fit]:
 
 def _fit(test: Test, fabric: Fabric) -> Fit:
     residuals = np.asarray(_residuals_of(test, fabric))
-    counted = residuals[residuals != 0] if isinstance(test, Pull) else residuals
-    errors = float(np.sqrt(np.mean(counted**2)))
+    errors = float(np.sqrt(np.sum(residuals**2) / test.count))
     if isinstance(test, Pull):
         expected, _ = jax.vmap(lambda s: uniaxial(fabric.membrane, s, test.direction))(test.stretch)
         off = np.asarray(expected) - np.asarray(test.tension)
@@ -161,7 +174,9 @@ def _descend(tests: tuple[Test, ...], space: ParameterSpace, start, progress: Pr
         told.append(float(value @ value) / len(value))
         if progress is not None:
             progress(len(told), min(told))
-        return np.nan_to_num(np.asarray(value, np.float64), nan=1e6), np.asarray(slope, np.float64)
+        bad = not np.isfinite(value).all() or not np.isfinite(slope).all()  # a drape that failed
+        value, slope = np.asarray(value, np.float64), np.asarray(slope, np.float64)
+        return (np.full_like(value, FAILED), np.zeros_like(slope)) if bad else (value, slope)
 
     kept: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
@@ -201,6 +216,6 @@ def _precision(tests: Sequence[Test], space: ParameterSpace, u: Float[Array, " d
     prior of the space."""
     value, slope = (np.asarray(part, np.float64) for part in _linearised(tuple(tests), space, u))
     value, slope = value[: -space.dim], slope[: -space.dim]
-    told = np.count_nonzero(value) - np.linalg.matrix_rank(slope)
-    scatter = max(1.0, float(value @ value) / max(int(told), 1))
+    left = sum(test.count for test in tests) - np.linalg.matrix_rank(slope)
+    scatter = max(1.0, float(value @ value) / max(int(left), 1))
     return slope.T @ slope / scatter + np.asarray(space.prior()[1], np.float64)

@@ -32,6 +32,7 @@ from r2s.laboratory.pull import SPECIMEN, Pull
 from r2s.recordings.readers.columns import METRES, NEWTONS, SHARES, header_of, read_columns
 
 FORMAT = "r2s-laboratory/1"
+LARGEST = 1e12  # that is still a number of a test
 DIRECTIONS = {"warp": 0.0, "bias": math.pi / 4, "weft": math.pi / 2}
 
 
@@ -61,8 +62,8 @@ def read_tests(path: Path | str) -> LaboratoryTests:
     """
     path = Path(path)
     try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        stored = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: no JSON: {error}") from error
     if not isinstance(stored, dict) or stored.get("format") != FORMAT:
         found = stored.get("format") if isinstance(stored, dict) else type(stored).__name__
@@ -71,6 +72,9 @@ def read_tests(path: Path | str) -> LaboratoryTests:
         raise ValueError(
             f"{path}: unknown: {', '.join(unknown)}; known: source, {', '.join(KINDS)}"
         )
+    source = stored.get("source", "")
+    if not isinstance(source, str):
+        raise ValueError(f"{path}: source: expected text, found {source!r}")
     tests: list[Test] = []
     for kind, make in KINDS.items():
         each = stored.get(kind, [])
@@ -83,12 +87,14 @@ def read_tests(path: Path | str) -> LaboratoryTests:
             tests += make(path.parent, where, dict(one))
     if not tests:
         raise ValueError(f"{path}: no test: it has neither {', '.join(KINDS)}")
-    return LaboratoryTests(tuple(tests), str(stored.get("source", "")), path.stem)
+    return LaboratoryTests(tuple(tests), source, path.stem)
 
 
 def _pulls(folder: Path, where: str, one: dict[str, Any]) -> list[Test]:
     direction = _direction(where, one)
     file = folder / str(_taken(where, one, "file"))
+    if not file.is_file():
+        raise FileNotFoundError(f"{where}: no such file: {file}")
     specimen = _number(where, one, "specimen", SPECIMEN)
     if file.suffix == ".h5":
         _nothing_left(where, one)
@@ -149,20 +155,22 @@ def _nothing_left(where: str, one: dict[str, Any]) -> None:
 
 def _number(where: str, one: dict[str, Any], key: str, default: float | None = None) -> float:
     value = _taken(where, one, key) if default is None else one.pop(key, default)
-    if not _is_number(value) or not np.isfinite(value):
+    if not _is_number(value):
         raise ValueError(f"{where}: {key}: expected a number, found {value!r}")
     return float(value)
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) < LARGEST  # no infinity, nor an integer that no float holds
 
 
 def _direction(where: str, one: dict[str, Any]) -> float:
     value = _taken(where, one, "direction")
     if isinstance(value, str) and value in DIRECTIONS:
         return DIRECTIONS[value]
-    if isinstance(value, int | float) and 0 <= value <= math.pi:
+    if isinstance(value, int | float) and _is_number(value) and 0 <= value <= math.pi:
         return float(value)
     known = ", ".join(DIRECTIONS)
     raise ValueError(

@@ -41,7 +41,9 @@ def read_knit(path: Path | str, direction: float, specimen: float = SPECIMEN) ->
                 for name in PULLS
             }
             sizes = {key: float(file[key][0]) for key in ("clampSize", "fabricSize")}
-    except (OSError, KeyError) as error:
+        if not min(sizes.values()) > 0:
+            raise ValueError(f"sizes must be positive, found {sizes}")
+    except Exception as error:  # a file of another layout raises anything
         raise ValueError(f"{path}: no pulls of stitch-by-stitch: {error}") from error
     scale = CLAMP / sizes["clampSize"]  # [m] a pixel
     spans = {name: _spans(path, name, *each) for name, each in arrays.items()}

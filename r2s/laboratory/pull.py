@@ -21,6 +21,7 @@ SAMPLES = 24  # of a curve, evenly over its stretch
 SPECIMEN = 0.05  # relative, by which specimens of a fabric differ (standard deviation)
 READING = 0.02, 0.005  # of a tension: relative, and of the largest of its curve
 WIDTH = 0.02  # of a relative width
+BACK, BROKEN, PRELOAD = 0.1, 0.7, 0.15  # shares of the largest, beyond which it is no pull
 NEWTON = 30  # iterations at most; each is exact for a law of constant stiffness
 
 
@@ -63,8 +64,9 @@ class Pull(eqx.Module):
         The curve is thinned to `SAMPLES` means over equal parts of its stretch.
 
         Raises `ValueError` that names the pull: sizes that are not positive, fewer than three
-        samples, an extension that looks like per cent or millimetres, a force that looks like
-        grams, one that does not rise.
+        samples, an extension that looks like per cent or millimetres, a force above that of any
+        fabric, one that does not rise, falls before the end, or is not zero at rest; a strip that
+        is let go again.
         """
         length, wide = size
         if not (0 < wide < 5 and 0 < length < 5):
@@ -75,13 +77,24 @@ class Pull(eqx.Module):
                 f"{name}: expected three samples or more of extension and force, found "
                 f"{extension.shape} and {force.shape}"
             )
+        if not 0 < specimen < 1:
+            raise ValueError(
+                f"{name}: specimen is a relative deviation such as 0.05, got {specimen}"
+            )
         stretch, tension = 1 + extension / length, force / wide
         middle = np.full(len(force), np.nan) if width is None else np.asarray(width, float) / wide
         _check(name, stretch, tension, middle)
         columns = _thinned(np.stack([stretch, tension, middle], axis=1))
+        if len(columns) < 3:
+            raise ValueError(f"{name}: fewer than three samples have a force above zero")
         stretches, tensions, widths = (jnp.asarray(column, float) for column in columns.T)
         angle, spread = (jnp.asarray(number, float) for number in (direction, specimen))
         return cls(stretches, tensions, widths, angle, spread, name)
+
+    @property
+    def count(self) -> int:
+        """How many data it has: its tensions, and all widths together."""
+        return self.tension.size + int(np.isfinite(np.asarray(self.across)).any())
 
     def residuals(self, fabric: Fabric) -> Float[Array, " residual"]:
         """How far a fabric is from the curve, in standard deviations that err independently.
@@ -166,9 +179,25 @@ def _check(name: str, stretch: np.ndarray, tension: np.ndarray, across: np.ndarr
             f"{name}: a stiffness of {stiffest:.3g} N/m is above that of any fabric: is the force "
             "in grams or millinewtons? It is taken in newtons"
         )
+    back = float(np.max(np.maximum.accumulate(stretch) - stretch))
+    if back > BACK * most:
+        raise ValueError(
+            f"{name}: the extension goes back by {back / most:.0%} of its largest: a pull is of a "
+            "load that grows; leave out what comes after"
+        )
     if not tension[np.argmax(stretch)] > max(0.0, float(tension[np.argmin(stretch)])):
         raise ValueError(
             f"{name}: the force does not rise with the extension: are columns swapped?"
+        )
+    strongest = float(np.max(tension))
+    if float(np.mean(tension[stretch > 1 + 0.98 * most])) < BROKEN * strongest:
+        raise ValueError(f"{name}: the force falls before the end: leave out what comes after")
+    early = tension[stretch < 1 + 0.02 * most]
+    at_rest = float(np.min(early)) / strongest if len(early) else 0.0
+    if at_rest > PRELOAD:
+        raise ValueError(
+            f"{name}: at rest the force is {at_rest:.0%} of the largest: take away what the tester "
+            "shows without a strip, or count the length from where it pulls"
         )
     wide = across[np.isfinite(across)]
     if len(wide) and not (0.05 < wide.min() and wide.max() < 3):

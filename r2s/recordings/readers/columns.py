@@ -79,6 +79,12 @@ def _lines(path: Path) -> list[tuple[int, list[str]]]:
     delimiter = max(",;\t", key=kept[0][1].count)
     cells = csv.reader([line for _, line in kept], delimiter=delimiter, skipinitialspace=True)
     numbers = [number for number, _ in kept]
+    try:
+        cells = list(cells)
+    except csv.Error as error:
+        raise ValueError(f"{path}: no CSV: {error}") from error
+    if len(cells) != len(numbers):
+        raise ValueError(f"{path}: a quotation mark is not closed")
     return [(n, [c.strip() for c in row]) for n, row in zip(numbers, cells, strict=True)]
 
 

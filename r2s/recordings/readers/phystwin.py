@@ -66,8 +66,9 @@ def read_case(
     folder = Path(folder)
     arrays = _arrays(folder / FILE)
     points = arrays["object_points"] * UPWARDS
-    kept = arrays["object_visibilities"].astype(bool) & arrays["object_motions_valid"].astype(bool)
-    kept[0] = arrays["object_visibilities"][0].astype(bool)  # nothing has moved yet
+    kept = arrays["object_visibilities"].astype(bool)
+    # whether a point moved plausibly is said of the step to the next frame; of the last, nothing is
+    kept[1:] &= arrays["object_motions_valid"].astype(bool)[:-1]
     clouds = [points[frame][mask] for frame, mask in enumerate(kept)]
     for frame, cloud in enumerate(clouds):
         if not len(cloud):
@@ -112,6 +113,8 @@ def _arrays(file: Path) -> dict[str, np.ndarray]:
             stored = _Arrays(stream).load()
     except Exception as error:  # a damaged pickle raises anything
         raise ValueError(f"{file}: no arrays of PhysTwin: {error}") from error
+    if not isinstance(stored, dict):
+        raise ValueError(f"{file}: expected a dictionary of arrays, found {type(stored).__name__}")
     if lacking := [name for name in ARRAYS if name not in stored]:
         raise ValueError(f"{file}: lacks {', '.join(lacking)}, has {', '.join(map(str, stored))}")
     arrays = {name: np.asarray(stored[name]) for name in ARRAYS}
