@@ -7,44 +7,16 @@ a third and of four times as many vertices. Also by how much the coefficient cha
 and with shear, for a relative change, as its derivative says.
 """
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
-import jax.random as jr
 import numpy as np
+from _laboratory import drapes_at, slopes
 from _tables import Line, command_line, keep
-from jaxtyping import Array, Float
 
 from r2s.fabrics import presets
-from r2s.fabrics.fabric import Fabric
-from r2s.laboratory.drape import Ring, coefficient, drape, ring
+from r2s.laboratory.drape import ring
 
 SEEDS = 8
 COARSE, FINE = (44, 6), (144, 20)
-
-
-@eqx.filter_jit
-def drapes_at(around: Ring, fabric: Fabric, seed: Array) -> Float[Array, ""]:
-    """The drape coefficient of a fabric."""
-    return coefficient(around, drape(around, fabric, jr.key(seed)))
-
-
-@eqx.filter_jit
-def slopes(around: Ring, fabric: Fabric) -> Float[Array, " 2"]:
-    """Change of the coefficient for a relative change of bending and of shear, [-]."""
-
-    def at(change):
-        softer = eqx.tree_at(
-            lambda f: (f.bending.stiffness, f.membrane.c33),
-            fabric,
-            (
-                fabric.bending.stiffness * jnp.exp(change[0]),
-                fabric.membrane.c33 * jnp.exp(change[1]),
-            ),
-        )
-        return coefficient(around, drape(around, softer, jr.key(0)))
-
-    return jax.jacfwd(at)(jnp.zeros(2))
 
 
 if __name__ == "__main__":

@@ -11,8 +11,7 @@ import dataclasses
 import math
 from pathlib import Path
 
-import jax
-import numpy as np
+from _laboratory import off
 from _tables import Line, command_line, keep
 
 from r2s.estimation.default_spaces import on_cloth
@@ -20,26 +19,10 @@ from r2s.fabrics.parameters import Range
 from r2s.fabrics.stiffening_space import StiffeningSpace
 from r2s.laboratory.estimate import estimate
 from r2s.laboratory.knits import read_knit
-from r2s.laboratory.pull import Pull, uniaxial
 
 YARNS, STITCHES = ("Acrylic Yarn", "Pearlized Cotton"), ("Garter", "Rib", "Seed", "Stockinette")
 DENSITY = 0.3  # [kg/m^2], assumed: pulls do not tell it
 SOFTEST = 1.0  # [N/m]: knits are softer than the prior's fabrics
-
-
-@jax.jit
-def tensions(membrane, pull: Pull):
-    """The tension [N/m] of a sheet at the stretches of a pull."""
-    return jax.vmap(lambda s: uniaxial(membrane, s, pull.direction)[0])(pull.stretch)
-
-
-def off(pulls: list[Pull], fabric) -> float:
-    """The error of the force [%], see above."""
-    found = []
-    for pull in pulls:
-        away = np.asarray(tensions(fabric.membrane, pull) - pull.tension)
-        found.append(100 * np.sqrt(np.mean(away**2)) / float(pull.tension.max()))
-    return float(np.mean(found))
 
 
 if __name__ == "__main__":

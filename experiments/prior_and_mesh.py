@@ -15,20 +15,16 @@ import itertools
 
 import jax
 import numpy as np
+from _predicted import predicted
 from _tables import Line, command_line, resumed
 
 from r2s import scenarios
 from r2s.estimation.default_spaces import on_cloth
 from r2s.estimation.diffcloud import DiffCloud
-from r2s.evaluation.prediction_error import predict_motion
 from r2s.fabrics import presets, prior
-from r2s.fabrics.fabric import Fabric
 from r2s.scenarios import synthetic
-from r2s.scenarios.scenario import Scenario, from_recording
 
-FINE, COARSE, JUDGED = (33, 33), (9, 9), (17, 17)
-MOTIONS = ("folding", "fling", "shaking")
-DRAWS = 8
+FINE, COARSE = (33, 33), (9, 9)
 PRIORS = ("fabrics", "flat")
 
 
@@ -50,24 +46,7 @@ def attempt(prior_of: str, fabric: str) -> Line:
         "errors, root mean square": f"{np.sqrt(np.mean(score**2)):.1f}",
         "largest": f"{np.max(np.abs(score)):.1f}",
     }
-    others = prior.fabrics(density, DRAWS, jax.random.key(3))
-    for name in MOTIONS:
-        seen = synthetic.record(scenarios.SIX[name](), truth, fabric, shape=JUDGED, key=key)
-        scenario = from_recording(seen, JUDGED)
-        true = predict_motion(scenario, truth).x
-        draws = [_off(scenario, each, true) for each in others]
-        line |= {
-            name: f"{_off(scenario, found.fabric, true):.1f}",
-            f"{name}, middle": f"{_off(scenario, prior.middle(density), true):.1f}",
-            f"{name}, draws": f"{np.mean(draws):.1f}",
-        }
-    return line
-
-
-def _off(scenario: Scenario, fabric: Fabric, true: np.ndarray) -> float:
-    """Mean distance of the vertices from the true ones, [mm]."""
-    x = predict_motion(scenario, fabric).x
-    return 1e3 * float(np.mean(np.linalg.norm(np.asarray(x) - np.asarray(true), axis=-1)))
+    return line | predicted(truth, fabric, found.fabric)
 
 
 if __name__ == "__main__":
