@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from r2s.fabrics.fabric import Fabric
 from r2s.laboratory.drape import Ring, coefficient, drape
-from r2s.laboratory.pull import Pull, uniaxial
+from r2s.laboratory.pull import Pull
 
 
 @eqx.filter_jit
@@ -36,17 +36,12 @@ def slopes(around: Ring, fabric: Fabric) -> Float[Array, " 2"]:
     return jax.jacfwd(at)(jnp.zeros(2))
 
 
-@jax.jit
-def tensions(membrane, pull: Pull):
-    """The tension [N/m] of a sheet at the stretches of a pull."""
-    return jax.vmap(lambda s: uniaxial(membrane, s, pull.direction)[0])(pull.stretch)
+@eqx.filter_jit
+def _misfit(pull: Pull, fabric: Fabric) -> Float[Array, ""]:
+    return pull.misfit(fabric)
 
 
-def off(pulls: list[Pull], fabric) -> float:
+def off(pulls: list[Pull], fabric: Fabric) -> float:
     """The error of the force: root mean square over samples, over the largest of a pull, [%]; the
     mean over pulls."""
-    found = []
-    for pull in pulls:
-        away = np.asarray(tensions(fabric.membrane, pull) - pull.tension)
-        found.append(100 * np.sqrt(np.mean(away**2)) / float(pull.tension.max()))
-    return float(np.mean(found))
+    return 100 * float(np.mean([float(_misfit(pull, fabric)) for pull in pulls]))

@@ -71,6 +71,14 @@ def learnt_offset(found: Estimate) -> Float[np.ndarray, " 3"]:
     return np.array([np.mean(values) for values in told.values()])
 
 
+def facts(found: Estimate) -> dict[str, str]:
+    """What the swings learnt tell, for the head of a table."""
+    shifts = ", ".join(f"{1e3 * n.value:.1f}" for n in found.nuisances if "shift z" in n.name)
+    ratio = next(n for n in found.nuisances if n.name == "density ratio")
+    density = f"{float(found.fabric.density):.3g} kg/m^2, {ratio.standard_error / ratio.value:.0%}"
+    return {"density": density, "tracker above the bar [mm]": shifts}
+
+
 def errors(
     recording: Recording, fabric: Fabric, offset: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "2 row"]:

@@ -3,8 +3,8 @@
 python experiments/drapes.py      # 6 minutes on one core
 
 Each fabric's specimen is simulated from several seeds on the usual ring, and from one on a ring of
-a third and of four times as many vertices. Also by how much the coefficient changes with bending
-and with shear, for a relative change, as its derivative says.
+a third and of four times as many cells (vertices around x cells across). Also by how much the
+coefficient changes with bending and with shear, for a relative change, as its derivative says.
 """
 
 import jax.numpy as jnp

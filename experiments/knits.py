@@ -1,4 +1,4 @@
-"""Pulls of knits, fitted by the three laws there are for a sheet's yarns.
+"""Pulls of knits, fitted with yarns of constant stiffness and with yarns that stiffen.
 
 python experiments/knits.py experimentData      # 3 minutes on one core
 

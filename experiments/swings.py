@@ -12,7 +12,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from _swings import errors, estimated, learnt_offset, swings
+from _swings import errors, estimated, facts, learnt_offset, swings
 from _tables import Line, command_line, keep
 
 import r2s
@@ -33,7 +33,7 @@ if __name__ == "__main__":
     found = estimated(swings(a.recordings, LEARNT, a.seconds), space)
     print("\n".join(describe(found)), f"density {float(found.fabric.density):.3g} kg/m^2", sep="\n")
     offset = learnt_offset(found)
-    print("the tracker's frame against the arm's [mm]:", np.round(1e3 * offset, 1))
+    told = facts(found)
     draws = prior.fabrics(a.density, DRAWS, jax.random.key(0))
     lines: list[Line] = []
     rows: list[dict[str, float]] = []
@@ -56,4 +56,4 @@ if __name__ == "__main__":
         lines.append({"swing": swing.info.name} | {n: f"{v:.2f}" for n, v in row.items()})
         means = {name: np.mean([row[name] for row in rows]) for name in rows[0]}
         last = {"swing": "mean"} | {name: f"{value:.2f}" for name, value in means.items()}
-        keep(a.out, [*lines, last], CAPTION)
+        keep(a.out, [*lines, last], CAPTION, told)

@@ -120,13 +120,15 @@ class EstimateCard:
             method = self._method(progress)
             space = self._space(method)
             tests = [test for each in known for test in each.tests]
-            if not seen:
-                self._check_alone(method)
-            told = estimate(tests, space, progress) if tests else None
-            unseen: list[Recording] = []
             if seen:
                 method.check(seen)
-                unseen = self._hold_out(seen)
+                if tests:
+                    method.check_prior()
+            else:
+                self._check_alone(method)
+            unseen = self._hold_out(seen) if seen else []
+            told = estimate(tests, space, progress) if tests else None
+            if seen:
                 space = informed(space, told) if told else space
                 found = method.estimate(
                     seen, space, self._budget(method), key=jax.random.key(self.seed)

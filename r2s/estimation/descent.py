@@ -180,9 +180,11 @@ def judged(
             theta, covariance, bias = weighed(problems, best, prior, covariance, bias)
             inside = np.clip(theta, gauss_newton.MARGIN, 1 - gauss_newton.MARGIN)
             theta[: problems[0].space.dim] = inside[: problems[0].space.dim]
-            best = dataclasses.replace(best, theta=jnp.asarray(theta, float))
+            theta = jnp.asarray(theta, float)
+            loss = float(losses_at(problems, theta[None])[0])
+            normal = dataclasses.replace(best.normal, loss=jnp.asarray(loss, float))
+            best = dataclasses.replace(best, theta=theta, normal=normal)
             rows = [*rows, [best if i == which else row for i, row in enumerate(rows[-1])]]
-            loss = float(losses_at(problems, best.theta[None])[0])
     seconds = found.seconds + time.perf_counter() - began
     converged = _arrived(problems, stage, which, prior, _stop(budget, int(best.stage)))
     estimate = collect(problems, rows, covariance, approach, seconds, converged, loss, bias)

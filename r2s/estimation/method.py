@@ -145,8 +145,8 @@ class Method(abc.ABC):
         install.
         """
         self.check(recordings)
-        if isinstance(space, InformedSpace) and not self.takes_prior:
-            raise ValueError(f"{self.name} takes no account of what is known of a space beforehand")
+        if isinstance(space, InformedSpace):
+            self.check_prior()
         return self._estimate(list(recordings), space, budget or self.budget, key)
 
     def check(self, recordings: Sequence[Recording]) -> None:
@@ -158,6 +158,11 @@ class Method(abc.ABC):
         for each in recordings:
             if reason := self.refusal(self.chosen_solver, each.info.scenario):
                 raise ValueError(f"{self.name}: {reason}")
+
+    def check_prior(self) -> None:
+        """Raise `ValueError` if the method does not heed what is known of a space beforehand."""
+        if not self.takes_prior:
+            raise ValueError(f"{self.name} takes no account of what is known of a space beforehand")
 
     @property
     def chosen_solver(self) -> str:

@@ -27,7 +27,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from scipy.ndimage import binary_closing, binary_fill_holes, label
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -37,7 +37,7 @@ from r2s.estimation import cards
 from r2s.extras import require
 from r2s.fabrics import presets
 from r2s.fabrics.fabric import Fabric, constant_laws
-from r2s.geometry.mesh import Mesh
+from r2s.geometry.mesh import Mesh, rectangle
 from r2s.recordings.readers.rgbench import BASES, read_arm
 from r2s.world.air import Air
 from r2s.world.contact import Table
@@ -74,15 +74,10 @@ class Environment:
         self._wait = float(_value(cfg, "action.fling_wait_time", 3.0))
         self._grab = float(_value(cfg, "evaluate.start_calculate_time", 0.0))
         self.dt = float(_value(cfg, "env.timestep", TIMESTEP))
-        obj = _read_obj(Path(_value(cfg, "cloth.model_path")))
-        pose = np.asarray(_value(cfg, "cloth.init_pose", [0, 0, 0, 1, 0, 0, 0]), float)
-        turn = Rotation.from_quat(pose[[4, 5, 6, 3]])  # RGBench writes w first
-        lying = turn.apply(obj) + pose[:3]
+        lying = _lying(cfg)
         mesh = garment(lying[:, :2], float(_value(cfg, "env.spacing", SPACING)))
-        name = str(_value(cfg, "env.card"))
-        card = cards.preset(name) if name in presets.MEASURED else cards.read(name)
         mass = float(_value(cfg, "cloth_params.mass"))
-        self.fabric = layered(card.fabric, mass / float(jnp.sum(mesh.area)))
+        self.fabric = layered(_fabric(cfg), mass / float(jnp.sum(mesh.area)))
         flat = np.concatenate([mesh.rest, np.full((len(mesh.rest), 1), self.fabric.thickness)], 1)
         grips = self._grippers(self._grab)
         if self._is_fling:
@@ -182,25 +177,25 @@ def garment(points: Float[np.ndarray, "point 2"], spacing: float) -> Mesh:
     largest = parts == 1 + np.argmax(np.bincount(parts.ravel())[1:])
     if largest.sum() < 0.9 * inside.sum():
         raise ValueError(f"at a spacing of {spacing} m the garment is in pieces: take a larger one")
-    rest, faces = _cells(largest)
-    return Mesh.make(low + width * rest, faces)
+    rows, columns = (int(count) for count in size)
+    whole = rectangle((float(extent[0]), float(extent[1])), (rows + 1, columns + 1), "alternating")
+    faces = np.asarray(whole.faces)[np.tile(largest.ravel(), 2)]  # two triangles a cell
+    used, faces = np.unique(faces, return_inverse=True)
+    return Mesh.make(low + np.asarray(whole.rest)[used], faces.reshape(-1, 3))
 
 
-def _cells(
-    inside: Bool[np.ndarray, "i j"],
-) -> tuple[Int[np.ndarray, "v 2"], Int[np.ndarray, "f 3"]]:
-    """Corners and triangles of the cells of a grid that are inside, diagonals alternating."""
-    i, j = np.nonzero(inside)
-    a, b, c, d = ((i + di, j + dj) for di, dj in ((0, 0), (1, 0), (1, 1), (0, 1)))
-    number = -np.ones(tuple(np.array(inside.shape) + 1), int)
-    for corner in (a, b, c, d):
-        number[corner] = 0
-    number[number == 0] = np.arange((number == 0).sum())
-    a, b, c, d = (number[corner] for corner in (a, b, c, d))
-    rises = ((i + j) % 2 == 0)[:, None]
-    first = np.where(rises, np.stack([a, b, c], 1), np.stack([a, b, d], 1))
-    second = np.where(rises, np.stack([a, c, d], 1), np.stack([b, c, d], 1))
-    return np.stack(np.nonzero(number >= 0), 1), np.concatenate([first, second])
+def _lying(cfg: Any) -> Float[np.ndarray, "vertex 3"]:
+    """Where the vertices of a garment's mesh lie at first, [m]."""
+    pose = np.asarray(_value(cfg, "cloth.init_pose", [0, 0, 0, 1, 0, 0, 0]), float)
+    turn = Rotation.from_quat(pose[[4, 5, 6, 3]])  # RGBench writes w first
+    return turn.apply(_read_obj(Path(_value(cfg, "cloth.model_path")))) + pose[:3]
+
+
+def _fabric(cfg: Any) -> Fabric:
+    """The fabric of the card that a configuration names."""
+    name = str(_value(cfg, "env.card"))
+    card = cards.preset(name) if name in presets.MEASURED else cards.read(name)
+    return card.fabric
 
 
 def _read_obj(path: Path) -> Float[np.ndarray, "vertex 3"]:

@@ -1,4 +1,4 @@
-"""Fabrics that stiffen as they stretch: an orthotropic space with two numbers more."""
+"""Fabrics that stiffen as they stretch: a space of constant stiffness, and three numbers more."""
 
 import dataclasses
 
