@@ -145,6 +145,14 @@ def test_a_wide_mesh_is_dissected_and_a_narrow_one_is_a_band():
     assert isinstance(narrow, Band) and narrow.width == 2 * 20 + 2
 
 
+def test_a_wide_band_has_groups_as_large_as_its_width():
+    mesh = rectangle((1.0, 1.0), (9, 9))
+    thin, wide = (Elimination.make(mesh, order=order).order for order in ("band", "wide band"))
+    assert isinstance(thin, Band) and isinstance(wide, Band)
+    assert wide.size == wide.width == thin.width
+    assert len(wide.order) == -(-81 // wide.width) < len(thin.order)
+
+
 def test_held_vertices_do_not_move(problem):
     mesh, equations, _, blocks = problem
     free = jnp.ones(len(mesh.rest), bool).at[jnp.array([0, 2])].set(False)

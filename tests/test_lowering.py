@@ -1,5 +1,6 @@
 """Steps, their derivatives and batches of fabrics lower for accelerators, with none at hand."""
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 import pytest
 
 import r2s
+from r2s.cloth.linear.elimination import Elimination
 from r2s.fabrics import presets
 from r2s.mpm import Grid
 from r2s.mpm.sheet import Sheet
@@ -21,6 +23,16 @@ def scene() -> r2s.Scene:
 
 def cloth() -> r2s.Cloth:
     return r2s.Cloth.make(scene(), dt=0.01)
+
+
+def by_dissection() -> r2s.Cloth:
+    """As on an accelerator, where no loop over a band of vertices is wanted."""
+    mesh = scene().mesh
+    return dataclasses.replace(cloth(), elimination=Elimination.make(mesh, order="dissection"))
+
+
+def explicit() -> r2s.ExplicitCloth:
+    return r2s.ExplicitCloth.make(scene(), 0.01, presets.black_denim())
 
 
 def points() -> Sheet:
@@ -53,7 +65,7 @@ def batch(fabric: r2s.Fabric) -> r2s.Fabric:
     return jax.tree.map(lambda leaf: jnp.stack([leaf, 1.1 * leaf]), fabric)
 
 
-@pytest.mark.parametrize("make", [cloth, points])
+@pytest.mark.parametrize("make", [cloth, by_dissection, explicit, points])
 def test_a_motion_its_gradient_and_its_batch_lower_for_accelerators(make):
     function, fabric = height(make()), presets.black_denim()
     assert "func.func public @main" in lowered(function, fabric)

@@ -1,6 +1,9 @@
 """How the equations of a mesh are solved: blocks of their matrix, and order of elimination."""
 
+from typing import Literal
+
 import equinox as eqx
+import jax
 import numpy as np
 
 from r2s.cloth.linear.band import Band
@@ -25,10 +28,17 @@ class Elimination(eqx.Module):
     couples_all: bool = eqx.field(static=True, default=False)
 
     @classmethod
-    def make(cls, mesh: Mesh, couples_all: bool = False) -> "Elimination":
+    def make(
+        cls,
+        mesh: Mesh,
+        couples_all: bool = False,
+        order: Literal["band", "wide band", "dissection"] | None = None,
+    ) -> "Elimination":
         """The elimination of a mesh that is not traced, since its sizes follow from the mesh.
 
         With `couples_all` any two vertices may be coupled, as self-contact does in small meshes.
+        `order`: a wide band has groups as large as its width, so fewer of them; None: on a CPU a
+        band where it is narrow, elsewhere dissection, which launches the fewest kernels.
         """
         rest = np.asarray(mesh.rest)
         elements = {
@@ -43,5 +53,8 @@ class Elimination(eqx.Module):
         if couples_all:
             return cls(pattern, levels(rest, *blocks, leaf=len(rest)), couples_all)
         narrow = Band.make(rest, *blocks)
-        order = narrow if narrow.width <= WIDEST else levels(rest, *blocks)
-        return cls(pattern, order, couples_all)
+        is_short = narrow.width <= WIDEST and jax.default_backend() == "cpu"
+        chosen = order or ("band" if is_short else "dissection")
+        if chosen == "dissection":
+            return cls(pattern, levels(rest, *blocks))
+        return cls(pattern, narrow if chosen == "band" else Band.make(rest, *blocks, narrow.width))
