@@ -16,6 +16,7 @@ from r2s.estimation.estimate import Estimate
 from r2s.estimation.estimate_json import as_json, from_json
 from r2s.evaluation import metrics, placement, prediction_error
 from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.informed_space import InformedSpace
 from r2s.fabrics.parameters import ParameterSpace
 from r2s.files import write_json
 from r2s.recordings.cameras.views import observed
@@ -31,7 +32,8 @@ def estimated(
     recording: Recording, space: ParameterSpace, shape: tuple[int, int], kept: Path
 ) -> Estimate:
     """DIFFCLOUD's estimate from a recording; taken from the folder `kept` when it is there."""
-    file = kept / f"{recording.info.name}.{shape[0]}x{shape[1]}.json"
+    known = ".prior" if isinstance(space, InformedSpace) else ""
+    file = kept / f"{recording.info.name}.{shape[0]}x{shape[1]}{known}.json"
     if file.exists():
         return from_json(json.loads(file.read_text(encoding="utf-8")))
     found = DiffCloud(shape=shape).estimate([recording], space, key=jax.random.key(0))
@@ -53,7 +55,7 @@ def candidates(
             name = "own lift" if info.trial == fold.trial else "other trial's lift"
         found.setdefault(name, []).append(estimate)
     found.pop("", None)
-    return {name: found[name] for name in (*ORDER, "fold itself")}
+    return {name: found[name] for name in (*ORDER, "fold itself") if name in found}
 
 
 def size_of(estimate: Estimate) -> float:
@@ -81,6 +83,21 @@ def seen(
         away = np.linalg.norm(points[:, None] - grippers[None], axis=-1).min(axis=1)
         clouds.append(points[away > views.hidden])
     return clouds
+
+
+def beside(
+    fold: Recording,
+    made: Iterable[tuple[RecordingInfo, Estimate]],
+    draws: list[Fabric],
+    shape: tuple[int, int],
+) -> dict[str, list[Clouds | None]]:
+    """What a fold's cameras would have seen of the estimated fabrics and of the prior's `draws`."""
+    groups = candidates(fold.info, made)
+    found = {
+        name: [seen(fold, each.fabric, shape, size_of(each)) for each in group]
+        for name, group in groups.items()
+    }
+    return found | {"prior": [seen(fold, fabric, shape) for fabric in draws]}
 
 
 def errors(real: Clouds, others: list[Clouds | None]) -> tuple[float, float]:

@@ -18,6 +18,18 @@ if TYPE_CHECKING:
 
 CONTRADICTION = 0.01  # likelihood by chance, below which it is told
 
+# what is wrong where a nuisance is far from what was written down
+BENT_BY = {
+    "density": "the density",
+    "air": "the wind, or the density, which the wind weighs it against,",
+    "size": "the size of the sheet, or the scale of the clouds,",
+    "shift x": "the cameras' or the grippers' place",
+    "shift y": "the cameras' or the grippers' place",
+    "shift z": "the cameras' or the grippers' place, or the table's height,",
+    "turn": "the cameras' direction",
+    "time": "the cameras' clock",
+}
+
 MethodName = Literal[
     "diffcloud",
     "diffcp",
@@ -245,7 +257,7 @@ def _warnings(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[s
     fabric that came out."""
     from r2s.commands.common import mesh_warning
 
-    lines = _contradiction(estimate, recordings)
+    lines = [*_contradiction(estimate, recordings), *_misfits(estimate, recordings)]
     if estimate.shape is None:
         return lines
     motions = dict.fromkeys((each.info.sheet.size, each.info.scenario) for each in recordings)
@@ -284,6 +296,26 @@ def _laboratory_lines(
             "fabric, or its density, scale or path are not as written down"
         )
     return lines
+
+
+def _misfits(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[str]:
+    """What of the recordings does not fit the fabric, and how much of them is left out."""
+    names = [each.info.name for each in recordings]
+    lines = []
+    for misfit in estimate.misfits:
+        name = names[misfit.recording]
+        if misfit.unit == "m":
+            lines.append(
+                f"warning: {name}: {misfit.what} is {1e3 * misfit.off:.0f} mm from its place on "
+                "the sheet, far more than the others: on another cloth, or its place is wrong"
+            )
+        else:
+            lines.append(
+                f"warning: {name}: {misfit.what} is {misfit.off:.1f} {misfit.unit} from what was "
+                f"written down: {BENT_BY[misfit.what]} may be off"
+            )
+    pairs = zip(names, estimate.left_out, strict=False)
+    return lines + [f"left out of {n}: {100 * s:.1f} % as outliers" for n, s in pairs]
 
 
 def _contradiction(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[str]:

@@ -27,6 +27,7 @@ from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
 from r2s.estimation.mesh_bias import OtherMesh, mesh_bias, weighed
 from r2s.estimation.method import Budget, Progress, tell
+from r2s.estimation.misfits import left_out, misfits
 from r2s.estimation.prediction import Prediction, Sensitivity, Theta, explain, fabric_at
 from r2s.estimation.problem import OWN, SHARED, UNITS, Problem, beginning, check_shared
 from r2s.fabrics.fabric import Fabric
@@ -189,7 +190,14 @@ def judged(
     converged = _arrived(problems, stage, which, prior, _stop(budget, int(best.stage)))
     estimate = collect(problems, rows, covariance, approach, seconds, converged, loss, bias)
     against = contradiction(problems, each_alone(problems, budget, best.theta, key), bias)
-    return dataclasses.replace(estimate, contradiction=against)
+    # the end may have moved from where this was predicted, by less than is told here
+    seen = [each for each, _ in predicted]
+    return dataclasses.replace(
+        estimate,
+        contradiction=against,
+        misfits=misfits(problems, best.theta, seen),
+        left_out=left_out(problems, seen, float(best.scale)),
+    )
 
 
 def each_alone(

@@ -40,6 +40,21 @@ class Contradiction(NamedTuple):
     errors: float
 
 
+class Misfit(NamedTuple):
+    """Something of a recording that does not fit the fabric that was found, see
+    `r2s.estimation.misfits`.
+
+    - `recording`: its index. `what`: a marker or a nuisance.
+    - `off`: how far, in `unit`: of a marker [m], of a nuisance the standard deviations of what was
+      known of it.
+    """
+
+    recording: int
+    what: str
+    off: float
+    unit: str
+
+
 class Combination(NamedTuple):
     """A product of powers of parameters (for those on a linear scale: a sum) that is known.
 
@@ -74,6 +89,8 @@ class Estimate:
       errors, which hold it (`r2s.estimation.mesh_bias`). None: that was not judged.
     - `shape`: vertices of the simulated sheet along warp and weft; None: it has none, or a file
       does not say.
+    - `misfits`: what of the recordings does not fit. `left_out`: of each the share that counts for
+      little or nothing, [-]; none where that was not judged.
     - `contradiction`: of the recordings the one that leads elsewhere than the others; None: none
       does, or that was not judged.
     """
@@ -94,6 +111,8 @@ class Estimate:
     mesh_bias: np.ndarray | None = None
     shape: tuple[int, int] | None = None
     contradiction: Contradiction | None = None
+    misfits: tuple[Misfit, ...] = ()
+    left_out: tuple[float, ...] = ()
 
     @property
     def at_bounds(self) -> dict[str, Literal["lower", "upper"]]:

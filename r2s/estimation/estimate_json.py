@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from r2s.estimation.estimate import Contradiction, Estimate, Nuisance
+from r2s.estimation.estimate import Contradiction, Estimate, Misfit, Nuisance
 from r2s.fabrics.fabric_json import fabric_as_json, fabric_from_json
 from r2s.fabrics.parameters import Range
 
@@ -43,6 +43,8 @@ def as_json(estimate: Estimate) -> dict[str, Any]:
         "shape": None if estimate.shape is None else list(estimate.shape),
         "mesh_bias": None if estimate.mesh_bias is None else _nested(estimate.mesh_bias),
         "contradiction": estimate.contradiction and estimate.contradiction._asdict(),
+        "misfits": [each._asdict() for each in estimate.misfits],
+        "left_out": list(estimate.left_out),
         "nuisances": [
             each._asdict()
             | {
@@ -99,6 +101,8 @@ def from_json(stored: dict[str, Any]) -> Estimate:
         shape=None if stored.get("shape") is None else tuple(stored["shape"]),
         mesh_bias=None if stored.get("mesh_bias") is None else _numbers(stored["mesh_bias"]),
         contradiction=_contradiction(stored.get("contradiction")),
+        misfits=tuple(Misfit(**each) for each in stored.get("misfits", ())),
+        left_out=tuple(stored.get("left_out", ())),
     )
 
 

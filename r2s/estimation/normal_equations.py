@@ -94,6 +94,23 @@ def normal_equations_of(
     )
 
 
+def marker_distances(problem: Problem, seen: Prediction) -> tuple[Array, Array] | None:
+    """How far [m] each marker is from its place on the sheet, and where it was seen, by frame and
+    marker; None without markers."""
+    if problem.markers is None:
+        return None
+    return length(_gaps(problem.markers, seen.x)), problem.markers.seen
+
+
+def point_distances(problem: Problem, seen: Prediction, scale: Scale = 0.0) -> tuple[Array, Array]:
+    """How far [m] each point is from the sheet, and which are no padding, by frame and point;
+    empty without clouds. For `scale` [m] see `r2s.evaluation.losses.robust`."""
+    if problem.clouds is None:
+        return jnp.zeros((0, 0), seen.x.dtype), jnp.zeros((0, 0), bool)
+    mesh = problem.scenario.scene.mesh
+    return _residuals(problem.clouds, mesh, seen, scale)[0], problem.clouds.mask
+
+
 def _of_clouds(
     clouds: Clouds, mesh: Mesh, seen: Prediction, slope: Sensitivity, scale
 ) -> NormalEquations:

@@ -1,0 +1,81 @@
+"""What of the recordings does not fit the fabric that was found, by name.
+
+Nothing that was recorded is left out silently: `left_out` says how much counts for little or
+nothing, `misfits` which marker lies elsewhere than the sheet, and what was written down of an
+experiment that the estimate had to bend.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from r2s.estimation.estimate import Misfit
+from r2s.estimation.gauss_newton import Problems, theta_indices
+from r2s.estimation.normal_equations import marker_distances, point_distances
+from r2s.estimation.prediction import Prediction
+from r2s.estimation.problem import OWN, SHARED, Problem
+from r2s.evaluation.losses import robust_weight
+
+STRAY, FEWEST = 5.0, 4  # times the other markers' distance; markers that are needed to say so
+LEAST = 0.01  # [m], nearer than which no marker is on another cloth
+BENT = 3.0  # standard deviations of what was known
+HALF = 0.5  # weight below which something is left out
+
+
+def misfits(
+    problems: Problems, theta: Float[Array, " theta"], predicted: Sequence[Prediction]
+) -> tuple[Misfit, ...]:
+    """The markers that stray and the nuisances that are bent, of all recordings.
+
+    - `predicted`: of each recording at `theta`, the end of an estimate.
+
+    A marker strays when the median of its distances is `STRAY` times that of the median marker and
+    at least `LEAST`; of fewer than `FEWEST` nothing is said. A nuisance is bent when it ended more
+    than `BENT` of its prior standard deviations away from what was written down.
+    """
+    found: list[Misfit] = []
+    told: set[int] = set()
+    for which, (problem, seen) in enumerate(zip(problems, predicted, strict=True)):
+        found += _strays(which, problem, seen)
+        places = theta_indices(problems, which)[problem.space.dim :]
+        names = zip((*SHARED, *OWN), problem.nuisance_prior.scales, places, strict=True)
+        for name, scale, place in names:
+            if not scale or place in told:
+                continue
+            told.add(int(place))
+            if (off := abs(float(theta[place]))) > BENT:
+                found.append(Misfit(which, name, off, "standard deviations"))
+    return tuple(found)
+
+
+def left_out(
+    problems: Problems, predicted: Sequence[Prediction], scale: float
+) -> tuple[float, ...]:
+    """Of each recording the share [-] of points or markers that counts for less than half.
+
+    - `scale`: of the loss, see `r2s.evaluation.losses.robust`.
+    """
+    shares = []
+    for problem, seen in zip(problems, predicted, strict=True):
+        distance, mask = marker_distances(problem, seen) or point_distances(problem, seen, scale)
+        is_out = np.asarray(robust_weight(distance, scale) < HALF)[np.asarray(mask)]
+        shares.append(float(is_out.mean()) if is_out.size else 0.0)
+    return tuple(shares)
+
+
+def _strays(which: int, problem: Problem, seen: Prediction) -> list[Misfit]:
+    pair = marker_distances(problem, seen)
+    if pair is None:
+        return []
+    distance = np.where(np.asarray(pair[1]), np.asarray(pair[0], np.float64), np.nan)
+    known = np.flatnonzero(~np.isnan(distance).all(axis=0))
+    if len(known) < FEWEST:
+        return []
+    typical = np.nanmedian(distance[:, known], axis=0)
+    usual = float(np.median(typical))
+    return [
+        Misfit(which, f"marker {marker}", float(away), "m")
+        for marker, away in zip(known, typical, strict=True)
+        if away > max(STRAY * usual, LEAST)
+    ]

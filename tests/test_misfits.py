@@ -1,0 +1,105 @@
+"""What of a recording does not fit a fabric is found and named, and nothing else is."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from r2s import scenarios
+from r2s.commands.estimate import _misfits
+from r2s.estimation.gauss_newton import theta_length
+from r2s.estimation.misfits import left_out, misfits
+from r2s.estimation.prediction import predict
+from r2s.estimation.problem import Problem
+from r2s.fabrics import presets
+from r2s.fabrics.parameters import OrthotropicSpace
+from r2s.scenarios import synthetic
+
+SHAPE = (5, 5)
+KNIT = presets.grey_interlock()
+SPACE = OrthotropicSpace.make(float(KNIT.density))
+STRICT = 0.01  # [m], beyond which points do not count
+
+
+def problem_of(recording) -> Problem:
+    return Problem.make(recording, SPACE, shape=SHAPE)
+
+
+def at_truth(problem):
+    """Theta of the true fabric, and what is seen of it."""
+    theta = jnp.zeros(theta_length((problem,)), float).at[: SPACE.dim].set(SPACE.to_unit(KNIT))
+    return theta, [jax.jit(predict)(problem, theta)]
+
+
+@pytest.fixture(scope="module")
+def pulled():
+    """A stretching with markers."""
+    experiment = scenarios.stretching()
+    return synthetic.record(experiment, KNIT, "pull", shape=SHAPE, key=jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def lifted():
+    """A lift with clouds."""
+    experiment = scenarios.lifting(num_frames=16, interval=0.18)
+    return synthetic.record(experiment, KNIT, "lift", shape=SHAPE, key=jax.random.key(0))
+
+
+def test_what_fits_is_not_named(pulled, lifted):
+    for recording in (pulled, lifted):
+        problem = problem_of(recording)
+        theta, seen = at_truth(problem)
+        assert misfits((problem,), theta, seen) == ()
+        (share,) = left_out((problem,), seen, STRICT)
+        assert share < 0.01
+
+
+def test_a_marker_on_another_cloth_is_named(pulled):
+    away = jnp.asarray(pulled.markers).at[1:, 2].add(jnp.array([0.0, 0.03, 0.02]))
+    problem = problem_of(dataclasses.replace(pulled, markers=away))
+    theta, seen = at_truth(problem)
+    (found,) = misfits((problem,), theta, seen)
+    assert (found.recording, found.what, found.unit) == (0, "marker 2", "m")
+    assert found.off == pytest.approx(np.hypot(0.03, 0.02), abs=2e-3)
+    count = problem.markers.seen.shape[1]
+    (share,) = left_out((problem,), seen, STRICT)
+    assert share == pytest.approx(1 / count, abs=0.02)
+
+
+def test_points_of_another_thing_are_counted(lifted):
+    mask = np.asarray(lifted.mask)
+    points = np.array(lifted.points)
+    points[:, ::5, 2] += 0.3
+    problem = problem_of(dataclasses.replace(lifted, points=jnp.asarray(points)))
+    _, seen = at_truth(problem)
+    (share,) = left_out((problem,), seen, STRICT)
+    assert share == pytest.approx(mask[:, ::5].sum() / mask.sum(), abs=0.05)
+
+
+def test_what_was_written_down_and_does_not_fit_is_named(lifted):
+    problem = problem_of(lifted)
+    theta, seen = at_truth(problem)
+    first = SPACE.dim + 3  # the shift along x, after what recordings share
+    (found,) = misfits((problem,), theta.at[first].set(-4.0), seen)
+    assert found == (0, "shift x", 4.0, "standard deviations")
+    # what is exact is not told, whatever its number
+    assert misfits((problem,), theta.at[SPACE.dim].set(9.0), seen) == ()
+
+
+def test_the_command_says_so(lifted, pulled):
+    class Found:
+        misfits = ((0, "marker 2", 0.036, "m"), (1, "air", 5.0, "standard deviations"))
+        left_out = (0.02, 0.0)
+
+    from r2s.estimation.estimate import Misfit
+
+    Found.misfits = tuple(Misfit(*each) for each in Found.misfits)
+    lines = _misfits(Found, [pulled, lifted])
+    assert "pull" in lines[0] and "marker 2 is 36 mm" in lines[0]
+    assert "lift" in lines[1] and "the density" in lines[1]
+    assert lines[2:] == [
+        f"left out of {pulled.info.name}: 2.0 % as outliers",
+        f"left out of {lifted.info.name}: 0.0 % as outliers",
+    ]
