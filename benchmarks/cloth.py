@@ -14,6 +14,7 @@ stderr, and with --out everything to a JSON file.
 
 import argparse
 import json
+import shlex
 import sys
 from pathlib import Path
 
@@ -29,6 +30,7 @@ PARTS = ("hang", "lift", "compile", "scaling", "batch", "explicit", "memory")
 def main(options: argparse.Namespace) -> None:
     jax.config.update("jax_enable_x64", options.double)
     about = measure.machine()
+    about |= {"command": shlex.join(["python", *sys.argv])}
     about |= {"float": 64 if options.double else 32, "damping_s": options.damping}
     print(", ".join(f"{name}: {value}" for name, value in about.items()))
     rows = []

@@ -14,6 +14,8 @@ registers. Lines are written as they come; with --out also to a JSON file.
 
 import argparse
 import dataclasses
+import shlex
+import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -29,11 +31,11 @@ from measure import Row
 
 import r2s
 from r2s import files
-from r2s.cloth.linear.elimination import Elimination
+from r2s.cloth.linear.elimination import ORDERS, Elimination
 from r2s.mpm import Grid, Sheet
 from r2s.mpm.sheet import stable_step
 
-ORDERS = "band", "wide band", "dissection"
+MOST = 4096  # fabrics, the stiffest of which all batches have the substeps of
 SPREAD = 1.5  # of all numbers of the fabrics, either way
 DAMPING = 0.01  # [s]
 IMPLICIT = 4  # steps in a frame of 1/60 s: within 2 mm over half a second
@@ -47,7 +49,7 @@ def fabrics(count: int) -> r2s.Fabric:
     random = np.random.default_rng(0)
 
     def factors():
-        return jnp.asarray(SPREAD ** random.uniform(-1, 1, 8192)[:count], float)
+        return jnp.asarray(SPREAD ** random.uniform(-1, 1, MOST)[:count], float)
 
     return jax.tree.map(lambda leaf: leaf * factors(), scenes.fabric(DAMPING))
 
@@ -95,7 +97,7 @@ def program(kind: str) -> Callable:
 def measured(kind: str, side: int, members: int, options: argparse.Namespace) -> Row:
     """One row: how long a batch takes, how much memory, and whether its numbers are finite."""
     batch = fabrics(members)
-    hardest = stiffest(fabrics(max(options.members)))
+    hardest = stiffest(fabrics(MOST))
     arguments, steps = setting(kind, side, hardest, options.order)
     build = eqx.filter_jit(program(kind)).lower(batch, *arguments).compile
     run, seconds = measure.built(build)
@@ -143,11 +145,12 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
                     yield measured(kind, side, members, options)
                 except jax.errors.JaxRuntimeError as error:
                     text = str(error).splitlines()[0][:200]
-                    yield {"solver": kind, "side": side, "members": members, "failed": text}
+                    named = {"solver": kind, "side": side, "members": members}
+                    yield named | {"order": options.order or "default", "failed": text}
 
 
 def main(options: argparse.Namespace) -> None:
-    about = measure.machine()
+    about = measure.machine() | {"command": shlex.join(["python", *sys.argv])}
     print(", ".join(f"{name}: {value}" for name, value in about.items()))
     found = []
     for row in rows(options):
@@ -183,7 +186,10 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--budget", type=float, default=10.0, help="repeat no longer than this [s]")
     parser.add_argument("--build-only", action="store_true", help="compile, to fill JAX's cache")
     parser.add_argument("--out", type=Path, help="JSON file")
-    return parser.parse_args()
+    options = parser.parse_args()
+    if not 1 <= min(options.members) <= max(options.members) <= MOST:
+        parser.error(f"--members must be from 1 to {MOST}")
+    return options
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ if __name__ == "__main__":
     rows = [row for row in found["rows"] if row["part"] == "hang"]
     used = ("jax", "mujoco", "newton")
     libraries = ", ".join(f"{name} {found['machine'][name]}" for name in used)
-    facts = {"libraries": libraries, "command": "python benchmarks/cloth.py --only hang"}
+    facts = {"libraries": libraries, "command": found["machine"]["command"]}
     tables = {"hang": (runs(rows), RUNS), "hang_at_equal_error": (at_equal_error(rows), EQUAL)}
     for name, (lines, caption) in tables.items():
         path = a.out / f"{name}.csv"

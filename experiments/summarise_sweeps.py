@@ -33,6 +33,7 @@ def line(device: str, row: dict[str, Any]) -> Line:
         "a fabric and step [us]": f"{row['fabric_step_us']:.3g}",
         "seconds of motion a second": f"{row['fabric_seconds_a_second']:.3g}",
         "least traffic [GB/s]": f"{row['least_traffic_gb_s']:.2g}",
+        "finite": str(row["finite"]),
         "memory [MB]": f"{row['planned_mb']:.0f}",
     }
 
@@ -45,14 +46,13 @@ if __name__ == "__main__":
     parser = command_line(__doc__, "docs/results")
     parser.add_argument("benchmarks", type=Path, nargs="+", help="files that the benchmark wrote")
     a = parser.parse_args()
-    lines, libraries = [], set()
+    lines, libraries, commands = [], set(), {}
     for found in (json.loads(path.read_text(encoding="utf-8")) for path in a.benchmarks):
         device = found["machine"]["device"].replace("cpu", "CPU, one core")
-        libraries.add(f"{device}: jax {found['machine']['jax']}")
+        libraries.add(f"{device}, jax {found['machine']['jax']}")
+        commands |= dict.fromkeys(found["machine"].get("commands", [found["machine"]["command"]]))
         lines += [line(device, row) for row in found["rows"] if "step_us" in row]
-    lines.sort(
-        key=lambda row: (row["solver"], int(row["side"]), row["device"], int(row["fabrics"]))
-    )
-    facts = {"command": "python benchmarks/sweeps.py", "libraries": "; ".join(sorted(libraries))}
+    lines.sort(key=_place)
+    facts = {"command": "; ".join(commands), "machine": "; ".join(sorted(libraries))}
     keep(a.out / "sweeps.csv", lines, CAPTION, facts)
     insert(DOCUMENT, "sweeps", shown(a.out / "sweeps.csv"))

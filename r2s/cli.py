@@ -72,7 +72,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return command.run() or 0
     except BrokenPipeError:  # whoever read the output had enough
         sys.stdout = None
-    except (ValueError, OSError, ImportError, RuntimeError) as error:
+    except (ValueError, OSError, ImportError, RuntimeError, MemoryError) as error:
+        if "RESOURCE_EXHAUSTED" in str(error):
+            error = f"{error}: take fewer frames, shorter motions or a coarser mesh"
         print(f"r2s: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

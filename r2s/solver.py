@@ -6,10 +6,12 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s.cloth.newton import SAVED
 from r2s.failures import Failure, describe, first_failure, no_failure
+from r2s.memory import planned
 from r2s.world.scene import Control
 
 State = TypeVar("State")
@@ -38,10 +40,7 @@ def predicted_memory(function: Callable, *args) -> int:
     """
     arrays, static = eqx.partition(args, eqx.is_array)
     run = jax.jit(lambda arrays: eqx.filter(function(*eqx.combine(arrays, static)), eqx.is_array))
-    plan = run.lower(arrays).compile().memory_analysis()
-    if plan is None:
-        raise RuntimeError("this backend's compiler does not say how much memory a program needs")
-    return plan.temp_size_in_bytes + plan.argument_size_in_bytes + plan.output_size_in_bytes
+    return planned(run.lower(arrays).compile())
 
 
 class Trajectory(eqx.Module):
@@ -86,14 +85,25 @@ def simulate(
     start: State,
     controls: Control,
     keep_solutions: bool = True,
+    frames: Int[Array, ""] | int | None = None,
 ) -> Trajectory:
     """The motion under `controls`, whose leading axes are (frame, substep).
+
+    A solver whose steps have a limit refuses a fabric that is too stiff for them (`ValueError`),
+    unless it is traced; then its run fails (`Failure.TIME_STEP`).
+
+    `frames`: how many are wanted, which may be traced: what comes after them is not simulated, and
+    repeats the last. None: all.
 
     A `lax.scan` over frames and steps. Reverse mode keeps one state a frame, and of every step its
     solution, so that it solves nothing again. Without `keep_solutions` it keeps no more than the
     states of the frames, and those of the steps of one frame at a time, which it solves again: the
     time of one more forward run, for the memory of about frames + substeps states.
     """
+    check = getattr(solver, "check", None)
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((solver, fabric)))
+    if check is not None and not traced:
+        check(fabric)
     names = (SAVED,) if keep_solutions else ()
     policy = jax.checkpoint_policies.save_only_these_names(*names)
 
@@ -103,13 +113,25 @@ def simulate(
 
     substep = jax.checkpoint(substep, policy=policy)
 
-    def frame(state, control):
+    def moved(state, control):
         state, failures = jax.lax.scan(substep, state, control)
         return state, (state.x, failures)  # pyright: ignore[reportAttributeAccessIssue]
 
-    frame = jax.checkpoint(frame, policy=policy)
+    def wanted(state, at):
+        number, control = at
 
-    _, (x, failures) = jax.lax.scan(frame, start, controls)
+        def still():
+            steps = jax.tree.leaves(control)[0].shape[0]
+            return state, (state.x, jnp.broadcast_to(no_failure(), (steps,)))
+
+        return jax.lax.cond(number < frames, lambda: moved(state, control), still)
+
+    if frames is None:
+        _, (x, failures) = jax.lax.scan(jax.checkpoint(moved, policy=policy), start, controls)
+    else:
+        numbers = jnp.arange(jax.tree.leaves(controls)[0].shape[0])
+        wanted = jax.checkpoint(wanted, policy=policy)
+        _, (x, failures) = jax.lax.scan(wanted, start, (numbers, controls))
     unfailed = jnp.all(failures == Failure.NONE.value, axis=1)
     ok = jnp.all(jnp.isfinite(x), axis=(1, 2)) & jnp.cumprod(unfailed).astype(bool)
     return Trajectory(x, ok, *_first_failure(failures))

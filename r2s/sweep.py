@@ -21,6 +21,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from r2s.files import write_bytes
+from r2s.memory import check, planned
 
 AXIS = "member"
 
@@ -63,13 +64,13 @@ def stream(
 
     What diverges is in the results, and stops nothing: NaN, and of a `r2s.Trajectory`, if the
     function returns it, `ok` and the reason. Raises `ValueError` for arrays of different lengths,
-    or none.
+    or none, and before it runs `MemoryError` for a chunk that does not fit the memory of a device.
     """
     devices = all_devices() if devices is None else devices
     count = _length(members)
     size = -(-min(chunk, count) // devices.size) * devices.size
     run = _sharded(function, devices)
-    like = None
+    like = compiled = None
     for first in range(0, count, size):
         part = _part(members, slice(first, first + size))
         kept = min(size, count - first)
@@ -79,7 +80,11 @@ def stream(
             yield first, _read(path, like, kept)
             continue
         whole = jax.tree.map(lambda leaf: _padded(leaf, size), part)
-        found = _on_host(run(_shard(whole, devices)), kept)
+        shards = _shard(whole, devices)
+        if compiled is None:
+            compiled = run.lower(shards).compile()
+            check(planned(compiled), f"a chunk of {size} members", f"take a chunk below {size}")
+        found = _on_host(compiled(shards), kept)
         if path is not None and jax.process_index() == 0:
             _write(path, found)
         yield first, found

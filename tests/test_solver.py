@@ -33,6 +33,30 @@ def test_what_is_kept_does_not_change_the_gradient(loss, fabric):
         assert np.asarray(a) == pytest.approx(np.asarray(b), rel=1e-9, abs=1e-15)
 
 
+def test_only_the_frames_that_are_wanted_are_simulated(sheet, fabric):
+    solver = cloth(sheet, held=(0,), air=1.2)
+    controls = Control(jnp.zeros((5, 2, 1, 3)), jnp.zeros((5, 2, 3)))
+    broken = Control(controls.handles.at[3:].set(jnp.nan), controls.wind)
+
+    @eqx.filter_jit
+    def moved(fabric, controls, frames):
+        def x(fabric):
+            found = simulate(solver, fabric, solver.init(flat(sheet)), controls, frames=frames)
+            return found.x, found
+
+        slope, found = jax.jacfwd(x, has_aux=True)(fabric)
+        return found, slope
+
+    whole, slope = moved(fabric, controls, jnp.asarray(5))
+    first, early = moved(fabric, broken, jnp.asarray(3))
+    np.testing.assert_array_equal(first.x[:3], whole.x[:3])
+    assert bool(first.ok.all()) and int(first.failure) == 0
+    for here, there in zip(jax.tree.leaves(early), jax.tree.leaves(slope), strict=True):
+        np.testing.assert_array_equal(here[:3], there[:3])
+        np.testing.assert_array_equal(here[3:], np.stack([here[2]] * 2))
+    assert not bool(moved(fabric, broken, jnp.asarray(4))[0].ok.all())
+
+
 @pytest.mark.slow(group="cloth")
 def test_memory_is_predicted_without_a_run(loss, fabric):
     short, long = (predicted_memory(jax.grad(loss(frames, True)), fabric) for frames in (3, 43))

@@ -36,6 +36,11 @@ from r2s.world.scene import Control, Scene
 Positions = Float[Array, "vertex 3"]
 OfSamples = Float[Array, "element sample 3"]
 
+ROUNDING = 1e-3  # of a limit in float32
+TRACED = (
+    "the fabric that gives the substeps must not be traced: make the solver outside of jit, grad "
+    "and vmap, of the stiffest fabric, and trace its steps"
+)
 REFUSED = (
     "explicit steps do not know contact of the sheet with itself: take the implicit cloth, "
     "r2s.Cloth.make(..., self_contact=True), or material points, r2s.material_points"
@@ -100,11 +105,15 @@ class ExplicitCloth(eqx.Module):
         - `substeps`: in a step; None: the fewest below `stable_step`.
 
         Raises `ValueError` for a step that is not positive, for substeps that are too long, with
-        their limit, and for self-contact.
+        their limit, for a fabric that is traced or has no limit, and for self-contact.
         """
         if self_contact:
             raise ValueError(REFUSED)
-        if not (dt > 0 and relaxation >= 0 and (membrane_damping or 0) >= 0):
+        if _is_traced(fabric):
+            raise ValueError(TRACED)
+        if substeps is not None and (substeps != int(substeps) or substeps < 1):
+            raise ValueError(f"substeps must be a whole number from 1 on, got {substeps}")
+        if not (math.inf > dt > 0 and relaxation >= 0 and (membrane_damping or 0) >= 0):
             raise ValueError(
                 "dt must be positive, damping time and relaxation not negative, got "
                 f"{dt} s, {membrane_damping} s and {relaxation} s"
@@ -114,15 +123,20 @@ class ExplicitCloth(eqx.Module):
         with jax.ensure_compile_time_eval():
             longest = shortest(scene.mesh, fabric, damping, relaxing)
             grid = cells_of(scene.mesh)
+        if not 0 < longest < math.inf:
+            raise ValueError(
+                f"the fabric has no longest substep (found {longest} s): its density and its "
+                "stiffness must be positive, its numbers finite"
+            )
         if substeps is None:
             substeps = max(1, math.ceil(dt / longest * (1 + 1e-6)))
-        solver = cls(scene, damping, relaxing, float(dt), substeps, grid)
+        solver = cls(scene, damping, relaxing, float(dt), int(substeps), grid)
         solver._check_substep(longest)
         return solver
 
     def check(self, fabric: Fabric) -> None:
         """Raises `ValueError` when the substeps are too long for a fabric, unless it is traced."""
-        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(fabric)):
+        if _is_traced(fabric):
             return
         with jax.ensure_compile_time_eval():
             times = self.membrane_damping, self.relaxation
@@ -177,8 +191,10 @@ class ExplicitCloth(eqx.Module):
         else:
             moved = self._by_gathers(inputs)
         x = scene.place(moved.x, control.handles)
+        longest = stable_step(scene.mesh, fabric, self.membrane_damping, self.relaxation)
+        fits = substep <= (1 + ROUNDING) * longest
         asked = state.x, state.v, fabric, control
-        failure = first_failure(state.failure, _failure(asked, (x, moved.v)))
+        failure = first_failure(state.failure, _failure(asked, (x, moved.v), fits))
         after = ExplicitState(x, moved.v, moved.relaxed, moved.hidden, moved.begun, failure)
         return after, moved.impulse
 
@@ -300,9 +316,14 @@ def _advance_grid(shape, spacing, dt, substeps: int, batched: bool, inputs: _Inp
     return _Moving(stacked(inner(end.x)), stacked(inner(end.v)), relaxed, hidden, begun, impulse)
 
 
-def _failure(inputs: Any, results: Any) -> Int[Array, ""]:
-    """Inputs that are not finite give `NON_FINITE`, results that are not `TIME_STEP`."""
-    code = jnp.where(_all_finite(results), Failure.NONE.value, Failure.TIME_STEP.value)
+def _is_traced(fabric: Fabric) -> bool:
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(fabric))
+
+
+def _failure(inputs: Any, results: Any, fits: Array) -> Int[Array, ""]:
+    """Inputs that are not finite give `NON_FINITE`; results that are not, or substeps that are too
+    long for the fabric, `TIME_STEP`."""
+    code = jnp.where(_all_finite(results) & fits, Failure.NONE.value, Failure.TIME_STEP.value)
     return jnp.where(_all_finite(inputs), code, Failure.NON_FINITE.value)
 
 

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from r2s.fabrics.fabric import Fabric
     from r2s.scenarios import Experiment
 
+A_VERTEX = 2.5e4  # [byte] of a mesh and its elimination, at least (100 x 100 vertices)
 NOT_NUMBERS = {"path", "route", "size", "held"}  # parameters of an experiment that are no numbers
 ScenarioName = Literal["lifting", "wind", "stretching", "folding", "fling", "shaking"]
 FabricName = Annotated[
@@ -86,7 +87,10 @@ def make_experiment(scenario: str, motion: Iterable[str]) -> "Experiment":
             f"{scenario} has no {', '.join(unknown)}; it takes {', '.join(sorted(known))}"
         )
     if "num_frames" in numbers:
-        numbers["num_frames"] = int(numbers["num_frames"])
+        frames = numbers["num_frames"]
+        if frames != frames or frames in (math.inf, -math.inf) or frames != int(frames):
+            raise ValueError(f"num_frames must be a whole number, got {frames:g}")
+        numbers["num_frames"] = int(frames)
     try:
         return make(**numbers)
     except TypeError as error:
@@ -101,9 +105,11 @@ def choose_shape(
     Also what a result tells of it, and lines for people: the error it is expected to leave, or a
     warning where that is too large.
     """
+    from r2s.memory import check
     from r2s.scenarios import resolution
 
     shape = asked or resolution.shape_for(fabric, size, motion)
+    check(A_VERTEX * math.prod(shape), f"a mesh of {shape[0]} x {shape[1]}", "take a coarser one")
     error = resolution.mesh_error(fabric, size, shape, motion)
     figure = f"{1e3 * error:.1f} mm" if math.isfinite(error) else "not measured"
     words = f"mesh of {shape[0]} x {shape[1]}: expected error {figure}"

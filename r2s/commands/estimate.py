@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from r2s.laboratory.files import LaboratoryTests
     from r2s.recordings.recording import Recording
 
+POOR = 0.5  # of a recording that is left out, above which it is hardly explained at all
 CONTRADICTION = 0.01  # likelihood by chance, below which it is told
 
 # what is wrong where a nuisance is far from what was written down
@@ -314,8 +315,11 @@ def _misfits(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[st
                 f"warning: {name}: {misfit.what} is {misfit.off:.1f} {misfit.unit} from what was "
                 f"written down: {BENT_BY[misfit.what]} may be off"
             )
-    pairs = zip(names, estimate.left_out, strict=False)
-    return lines + [f"left out of {n}: {100 * s:.1f} % as outliers" for n, s in pairs]
+    for name, share in zip(names, estimate.left_out, strict=False):
+        told = f"left out of {name}: {100 * share:.1f} % as outliers"
+        poor = f"warning: {told}: its density, wind, path or scale may not be as written down"
+        lines.append(poor if share > POOR else told)
+    return lines
 
 
 def _contradiction(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[str]:

@@ -39,6 +39,11 @@ def derivatives_at(
     return [_sensitivities(*pair, width) for pair in _places(problems, theta)]
 
 
+def predictions_at(problems: Problems, theta: Theta) -> list[Prediction]:
+    """What each recording would show at a theta."""
+    return [predicted(*pair) for pair in _places(problems, theta)]
+
+
 def loss_from(problems: Problems, seen: Sequence[Prediction]) -> float:
     """The robust loss [m^2] of what is predicted of each recording."""
     return float(_loss_from(problems, list(seen)))
@@ -69,8 +74,7 @@ def losses_at(
     tell(progress, "compiling the motion")
     losses = []
     for number, theta in enumerate(thetas, 1):
-        seen = [predicted(*pair) for pair in _places(problems, theta)]
-        losses.append(loss_from(problems, seen))
+        losses.append(loss_from(problems, predictions_at(problems, theta)))
         tell(progress, f"coarse search {number} of {len(thetas)}")
     return np.array(losses)
 

@@ -22,6 +22,7 @@ from r2s.estimation.compiled import (
     losses_at,
     normal_from,
     normals_at,
+    predictions_at,
 )
 from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
@@ -172,7 +173,8 @@ def judged(
     stage, prior = _rows_of_stage(found.rows, int(best.stage)), _weight(problems, best.normal)
     predicted, bias = derivatives_at(problems, best.theta, budget.width), None
     covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1), predicted)
-    loss = loss_from(problems, [seen for seen, _ in predicted])
+    seen = [each for each, _ in predicted]
+    loss = loss_from(problems, seen)
     rows = found.rows
     if other_mesh is not None:
         bias = mesh_bias(problems, other_mesh, best, prior, predicted)
@@ -182,7 +184,8 @@ def judged(
             inside = np.clip(theta, gauss_newton.MARGIN, 1 - gauss_newton.MARGIN)
             theta[: problems[0].space.dim] = inside[: problems[0].space.dim]
             theta = jnp.asarray(theta, float)
-            loss = float(losses_at(problems, theta[None])[0])
+            seen = predictions_at(problems, theta)
+            loss = loss_from(problems, seen)
             normal = dataclasses.replace(best.normal, loss=jnp.asarray(loss, float))
             best = dataclasses.replace(best, theta=theta, normal=normal)
             rows = [*rows, [best if i == which else row for i, row in enumerate(rows[-1])]]
@@ -190,8 +193,6 @@ def judged(
     converged = _arrived(problems, stage, which, prior, _stop(budget, int(best.stage)))
     estimate = collect(problems, rows, covariance, approach, seconds, converged, loss, bias)
     against = contradiction(problems, each_alone(problems, budget, best.theta, key), bias)
-    # the end may have moved from where this was predicted, by less than is told here
-    seen = [each for each, _ in predicted]
     return dataclasses.replace(
         estimate,
         contradiction=against,

@@ -1,8 +1,8 @@
 """What of the recordings does not fit the fabric that was found, by name.
 
-Nothing that was recorded is left out silently: `left_out` says how much counts for little or
-nothing, `misfits` which marker lies elsewhere than the sheet, and what was written down of an
-experiment that the estimate had to bend.
+Nothing that was recorded is left out silently: `left_out` says how much lies beyond the scale of
+the loss, three times what is usual, and counts for little or nothing; `misfits` which marker lies
+elsewhere than the sheet, and what was written down of an experiment that the estimate had to bend.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from r2s.evaluation.losses import robust_weight
 STRAY, FEWEST = 5.0, 4  # times the other markers' distance; markers that are needed to say so
 LEAST = 0.01  # [m], nearer than which no marker is on another cloth
 BENT = 3.0  # standard deviations of what was known
-HALF = 0.5  # weight below which something is left out
+LITTLE = 0.25  # weight below which something is left out: that of what lies beyond the scale
 
 
 def misfits(
@@ -52,14 +52,15 @@ def misfits(
 def left_out(
     problems: Problems, predicted: Sequence[Prediction], scale: float
 ) -> tuple[float, ...]:
-    """Of each recording the share [-] of points or markers that counts for less than half.
+    """Of each recording the share [-] of points or markers that lies beyond the scale of the loss.
 
-    - `scale`: of the loss, see `r2s.evaluation.losses.robust`.
+    - `scale`: [m], see `r2s.evaluation.losses.robust`: what lies there counts for a quarter of what
+      lies near.
     """
     shares = []
     for problem, seen in zip(problems, predicted, strict=True):
         distance, mask = marker_distances(problem, seen) or point_distances(problem, seen, scale)
-        is_out = np.asarray(robust_weight(distance, scale) < HALF)[np.asarray(mask)]
+        is_out = np.asarray(robust_weight(distance, scale) < LITTLE)[np.asarray(mask)]
         shares.append(float(is_out.mean()) if is_out.size else 0.0)
     return tuple(shares)
 

@@ -162,7 +162,7 @@ def _move(problem: Problem, theta: Theta):
     """Vertices at all frames [m] and the clamp's force at those that count [N]; whether finite."""
     scenario, fabric, solver = _conditions(problem, theta)
     if problem.force is None:
-        moved = rollout(scenario, fabric, solver=solver)
+        moved = rollout(scenario, fabric, solver=solver, frames=problem.wanted)
         return (moved.x, None), jnp.all(moved.ok)
     found = energy_balance(scenario, fabric, solver=solver)
     force = clamp_force(scenario, found)[jnp.array(problem.frames)]

@@ -1,6 +1,7 @@
 """What an estimator is given: a recording to be explained by a fabric of a parameter space."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -22,6 +23,8 @@ from r2s.scenarios.scenario import Scenario, from_recording
 POINTS = 300  # at most, of a cloud
 TARGETS = 1200  # at most, of a cloud that the sheet must lie near
 SPACING = 0.012  # [m], of the samples of such a sheet
+BETWEEN = 3  # frames after the last that is seen, of which the interpolation in time may have one
+CLOCK = 4.0  # standard deviations of a clock, by which it may be early
 FORCE_SCALE = 0.02  # [m/N]: a load cell is good to 10 mN where a marker is to 0.2 mm
 
 
@@ -129,6 +132,7 @@ class Problem(eqx.Module):
     - `frames`: which frames of the scenario count.
     - `clouds`, `markers`, `force`: what was seen in them; None: it was not.
     - `expected`: what must have been seen of the sheet; None: nobody knows the cameras.
+    - `wanted`: how many frames of the scenario have to be simulated; None: all.
     - `solver`: what simulates; None: the cloth, in the scenario's steps.
     - `nuisance_prior`: how far the experiment may be off what was written down.
     """
@@ -142,6 +146,7 @@ class Problem(eqx.Module):
     solver: Any = None
     nuisance_prior: NuisancePrior = eqx.field(static=True, default=USUAL)
     expected: Expected | None = None
+    wanted: Int[Array, ""] | None = None
 
     @classmethod
     def make(
@@ -252,8 +257,27 @@ def window(problem: Problem, first: int, last: int) -> Problem:
 
 
 def motion_alone(problem: Problem) -> Problem:
-    """The problem without clouds and markers, on which no prediction depends."""
-    return dataclasses.replace(problem, clouds=None, markers=None, expected=None)
+    """The problem without clouds and markers, on which no prediction depends but for its end.
+
+    Without a force it is not simulated beyond the last frame of which something was seen.
+    """
+    wanted = None if problem.force is not None else _wanted(problem)
+    return dataclasses.replace(problem, clouds=None, markers=None, expected=None, wanted=wanted)
+
+
+def _wanted(problem: Problem) -> Int[Array, ""]:
+    """How many frames are seen or lie between those that are, on the cameras' clock."""
+    parts = [
+        jnp.any(mask.reshape(len(mask), -1), axis=1)
+        for part, name in ((problem.clouds, "mask"), (problem.markers, "seen"))
+        if (mask := getattr(part, name, None)) is not None
+    ]
+    if not parts:
+        return jnp.asarray(problem.scenario.num_frames)
+    seen = jnp.any(jnp.stack(parts), axis=0)
+    last = jnp.max(jnp.where(seen, jnp.array(problem.frames), 0))
+    late = CLOCK * problem.nuisance_prior.time / problem.scenario.interval
+    return jnp.minimum(last + BETWEEN + math.ceil(late), problem.scenario.num_frames)
 
 
 def beginning(problem: Problem, share: float) -> Problem:

@@ -252,16 +252,20 @@ def rollout(
     fabric: Fabric,
     max_step: float | None = None,
     solver: Solver | None = None,
+    frames: Int[Array, ""] | int | None = None,
 ) -> Trajectory:
-    """How a fabric moves in a scenario: positions [m] at its frames.
+    """How a fabric moves in a scenario: positions [m] at its frames, or at the first of them.
 
     By the cloth, in steps of equal size that fill the time between frames: the scenario's, or as
     many as it takes that none is above `max_step` [s]. Or by another `solver` of the same scene,
-    whose own step divides that time, see `r2s.scenarios.on_points.material_points`.
+    whose own step divides that time, see `r2s.scenarios.on_points.material_points`. For `frames`
+    see `r2s.simulate`.
     """
     solver, substeps = stepped(scenario, max_step, solver)
-    moved = simulate(solver, fabric, begin(solver, scenario), scenario.controls(substeps))
     skipped = scenario.lead_in - 1
+    start, controls = begin(solver, scenario), scenario.controls(substeps)
+    wanted = None if frames is None else frames + skipped
+    moved = simulate(solver, fabric, start, controls, frames=wanted)
     return moved.from_frame(skipped)
 
 
@@ -270,11 +274,14 @@ def stepped(
 ) -> tuple[Solver, int]:
     """The solver of a motion, which brakes the sheet before its first frame, and its steps a frame.
 
-    The arguments are those of `rollout`. Raises `ValueError` when a solver's step does not fit.
+    The arguments are those of `rollout`. Raises `ValueError` when a solver's step does not fit, or
+    `max_step` is not positive.
     """
     if solver is None:
         substeps = scenario.substeps
         if max_step is not None:
+            if not max_step > 0:
+                raise ValueError(f"max_step [s] must be positive, got {max_step}")
             substeps = math.ceil(scenario.interval / max_step - 1e-9)
         dt = scenario.interval / substeps
         solver = Cloth(scenario.scene, scenario.elimination, dt, scenario.self_contact)
@@ -332,6 +339,11 @@ class Braked(eqx.Module):
     brake: Float[Array, ""]
     steps: int = eqx.field(static=True)
     dt: float = eqx.field(static=True)
+
+    def check(self, fabric: Fabric) -> None:
+        """Raises `ValueError` where the steps of the solver are too long for a fabric."""
+        if hasattr(self.solver, "check"):
+            self.solver.check(fabric)
 
     def init(self, x: Float[Array, "vertex 3"], *rates: Array | None) -> BrakedState:
         """At positions [m]; `rates` go to the solver; by default it is at rest."""

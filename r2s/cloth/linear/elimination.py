@@ -12,6 +12,7 @@ from r2s.cloth.linear.factor import Order
 from r2s.cloth.linear.pattern import Pattern
 from r2s.geometry.mesh import Mesh
 
+ORDERS = "band", "wide band", "dissection"
 WIDEST = 160  # vertices: of wider bands nested dissection is faster (`benchmarks/factors.py`)
 
 
@@ -38,8 +39,11 @@ class Elimination(eqx.Module):
 
         With `couples_all` any two vertices may be coupled, as self-contact does in small meshes.
         `order`: a wide band has groups as large as its width, so fewer of them; None: on a CPU a
-        band where it is narrow, elsewhere dissection, which launches the fewest kernels.
+        band where it is narrow, elsewhere dissection, which launches the fewest kernels. Where all
+        are coupled there is none to choose. Raises `ValueError` for another order.
         """
+        if order is not None and (couples_all or order not in ORDERS):
+            raise ValueError(f"order is one of {ORDERS}; None where all are coupled; got {order!r}")
         rest = np.asarray(mesh.rest)
         elements = {
             "samples": mesh.samples.corners,

@@ -29,7 +29,8 @@ class Pattern(eqx.Module):
         is_full: bool = False,
     ) -> "Pattern":
         """The pattern of `count` vertices and their elements; full, with a block for every pair."""
-        every = np.arange(count)
+        every = np.arange(count, dtype=np.int64)
+        elements = {kind: each.astype(np.int64) for kind, each in elements.items()}  # squares fit
         keys = {kind: e[:, :, None] * count + e[:, None, :] for kind, e in elements.items()}
         own = every * count + every
         blocks = np.unique(np.concatenate([own, *(key.ravel() for key in keys.values())]))
