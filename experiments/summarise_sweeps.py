@@ -50,7 +50,7 @@ if __name__ == "__main__":
     for found in (json.loads(path.read_text(encoding="utf-8")) for path in a.benchmarks):
         device = found["machine"]["device"].replace("cpu", "CPU, one core")
         libraries.add(f"{device}, jax {found['machine']['jax']}")
-        commands |= dict.fromkeys(found["machine"].get("commands", [found["machine"]["command"]]))
+        commands |= {found["machine"]["command"]: None}
         lines += [line(device, row) for row in found["rows"] if "step_us" in row]
     lines.sort(key=_place)
     facts = {"command": "; ".join(commands), "machine": "; ".join(sorted(libraries))}

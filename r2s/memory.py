@@ -24,7 +24,7 @@ def available() -> int | None:
     return None
 
 
-def check(needed: float, what: str, advice: str) -> None:
+def check(needed: float | int, what: str, advice: str) -> None:
     """Raise `MemoryError` with advice when `what` needs more memory [byte] than there is."""
     there = available()
     if there is not None and needed > there:

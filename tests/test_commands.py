@@ -17,7 +17,7 @@ from test_cli import stopped  # noqa: E402
 from test_show import recorded  # noqa: E402
 
 from r2s.cli import main  # noqa: E402
-from r2s.commands.common import make_experiment, print_result  # noqa: E402
+from r2s.commands.common import choose_shape, make_experiment, print_result  # noqa: E402
 from r2s.commands.doctor import EXCLUDED, EXTRAS, implausible  # noqa: E402
 from r2s.estimation import cards
 from r2s.estimation.cards import Card, Provenance  # noqa: E402
@@ -185,6 +185,19 @@ def test_the_doctor_looks_at_a_mesh(tmp_path: Path, capsys: pytest.CaptureFixtur
     path.write_text(corners + "f 1 2 3\nf 2 3 4\n")  # one is clockwise
     assert main(["doctor", "--mesh", str(path)]) == 1
     assert "sheet.obj: face 1 has the signed area" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("frames", ["inf", "nan", "3.5"])
+def test_a_number_of_frames_is_whole(frames: str) -> None:
+    with pytest.raises(ValueError, match="num_frames must be a whole number"):
+        make_experiment("lifting", [f"num_frames={frames}"])
+
+
+def test_a_mesh_that_does_not_fit_memory_is_refused(monkeypatch) -> None:
+    monkeypatch.setattr("r2s.memory.available", lambda: 10**9)
+    fabric = presets.grey_interlock()
+    with pytest.raises(MemoryError, match="3000 x 3000 needs .* take a coarser one"):
+        choose_shape((3000, 3000), fabric, (0.3, 0.3), "lifting")
 
 
 def test_numbers_of_a_motion_and_what_is_printed(capsys: pytest.CaptureFixture) -> None:

@@ -212,6 +212,47 @@ def test_a_short_hang_is_that_of_small_implicit_steps(sheet, fabric):
     assert jnp.max(jnp.abs(state.x - other.x)) < 0.05 * moved
 
 
+def test_a_fabric_that_is_too_stiff_for_the_substeps_is_refused_or_fails(sheet, fabric):
+    solver = explicit(sheet, fabric, held=(0,))
+    stiff = eqx.tree_at(
+        lambda f: f.membrane, fabric, jax.tree.map(lambda c: 3 * c, fabric.membrane)
+    )
+    controls = Control(jnp.zeros((2, 1, 1, 3)), jnp.zeros((2, 1, 3)))
+
+    def move(fabric):
+        return r2s.simulate(solver, fabric, solver.init(flat(sheet)), controls)
+
+    with pytest.raises(ValueError, match="limited by the fabric"):
+        move(stiff)
+    moved = eqx.filter_jit(move)  # in which it is traced
+    assert bool(moved(fabric).ok.all())
+    failed = moved(stiff)  # though nothing has exploded yet
+    assert int(failed.failure) == Failure.TIME_STEP and bool(jnp.isfinite(failed.x).all())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"substeps": -5}, "whole number"),
+        ({"dt": jnp.inf}, "dt must be positive"),
+    ],
+)
+def test_wrong_numbers_of_an_explicit_cloth_are_refused(sheet, fabric, options, message):
+    with pytest.raises(ValueError, match=message):
+        explicit(sheet, fabric, **options)
+
+
+def test_a_fabric_without_a_longest_substep_is_refused(sheet, fabric):
+    def make(fabric):
+        return explicit(sheet, fabric).substeps
+
+    for density in (0.0, -1.0, jnp.nan):
+        with pytest.raises(ValueError, match="density and its stiffness must be positive"):
+            make(eqx.tree_at(lambda f: f.density, fabric, jnp.asarray(density)))
+    with pytest.raises(ValueError, match="must not be traced"):
+        jax.jit(make)(fabric)
+
+
 @pytest.mark.parametrize("relaxation", [0.0, 1e-3, 1e-2])
 def test_the_longest_step_is_where_a_relaxing_spring_begins_to_explode(relaxation):
     square, damping = 4e6, 5e-3  # [1/s^2], [s]

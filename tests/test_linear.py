@@ -13,7 +13,7 @@ from r2s.cloth.linear.band import Band
 from r2s.cloth.linear.dissection import levels
 from r2s.cloth.linear.elimination import Elimination
 from r2s.cloth.linear.factor import factor, solve
-from r2s.cloth.linear.pattern import assemble, pinned, product
+from r2s.cloth.linear.pattern import Pattern, assemble, pinned, product
 from r2s.cloth.linear.system import Far, apply_inverse, prepare
 from r2s.geometry.mesh import Mesh, rectangle
 
@@ -151,6 +151,19 @@ def test_a_wide_band_has_groups_as_large_as_its_width():
     assert isinstance(thin, Band) and isinstance(wide, Band)
     assert wide.size == wide.width == thin.width
     assert len(wide.order) == -(-81 // wide.width) < len(thin.order)
+
+
+def test_a_pattern_holds_more_vertices_than_squares_fit_in_32_bits():
+    last = np.array([[59_998, 59_999]], np.int32)
+    pattern = Pattern.make(60_000, {"edge": last})
+    assert np.asarray(pattern.rows)[-3:].tolist() == [59_998, 59_999, 59_999]
+    assert np.asarray(pattern.columns)[-3:].tolist() == [59_999, 59_998, 59_999]
+
+
+def test_where_all_are_coupled_there_is_no_order_to_choose():
+    mesh = rectangle((1.0, 1.0), (3, 3))
+    with pytest.raises(ValueError, match="all are coupled"):
+        Elimination.make(mesh, couples_all=True, order="band")
 
 
 def test_held_vertices_do_not_move(problem):
