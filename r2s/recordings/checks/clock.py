@@ -13,9 +13,10 @@ FASTEST = 5.0  # [m/s], of a gripper
 LATE = 0.1  # [s]: clean synthetic recordings show up to 0.08
 LAGS = np.arange(-50, 51) / 100  # [s], that are tried
 RATES = np.array([0.5, 0.67, 0.8, 1.0, 1.25, 1.5, 2.0])  # of the clock, that are tried
-CLEARLY = 0.25  # of what is left at another rate: then it is another
+CLEARLY = 0.25  # of what is left as written: then another lag or rate is better
+SCALE = 0.1  # of the cameras
 TOP = 0.99  # quantile of height from which points are the top
-FRAMES = 5  # at least, that show the sheet held up
+FRAMES, MANY = 5, 10  # at least, that show the sheet held up; and that tell a rate
 MOVES = 0.05  # [m], at least, along an axis that is compared
 UP = 0.1  # [m] above the table: a sheet that is held up
 WAITS = "check the frame rate and time_offset: does a clap or a jerk come at one time in both?"
@@ -30,7 +31,7 @@ def check_clock(seen: Seen) -> list[Finding]:
     speeds = _speeds(recording)
     lag, rate = _lag(seen)
     moves = "when the top of the cloud moves, after the grippers do,"
-    moves = moves if np.isfinite(lag) else "the grippers do not move enough"
+    moves = moves if np.isfinite(lag) else "the tops of the clouds do not show it"
     return [
         Finding(
             "frames", uneven, "-", -np.inf, UNEVEN, "largest deviation from an even interval",
@@ -61,10 +62,11 @@ def _speeds(recording: Recording) -> float:
 
 
 def _lag(seen: Seen) -> tuple[float, float]:
-    """How late [s] the top of the cloud follows the grippers, and the rate of its clock; NaN where
-    no axis moves."""
+    """How late [s] the top of the cloud follows the grippers, and the rate of its clock, by the
+    frames that count; NaN where no axis moves, or the best lag is the longest that is tried."""
     recording = seen.recording
-    shown = [f for f, points in enumerate(seen.clouds) if len(points) >= FEWEST]
+    first, last = recording.info.frames_used
+    shown = [f for f in range(first, last + 1) if len(seen.clouds[f]) >= FEWEST]
     tops = {frame: _top(seen.clouds[frame]) for frame in shown}
     lowest = recording.info.table_height + UP if lies(recording) else -np.inf
     up = [frame for frame in shown if tops[frame][2] > lowest]
@@ -85,8 +87,13 @@ def _lag(seen: Seen) -> tuple[float, float]:
     )
     usual = int(np.argmin(np.abs(RATES - 1)))
     best = np.unravel_index(left.argmin(), left.shape)
-    if left[best] > CLEARLY * left[usual].min():
+    if left[best] > CLEARLY * left[usual].min() or len(up) < MANY:
         best = (usual, int(left[usual].argmin()))
+    written = (usual, int(np.argmin(np.abs(LAGS))))
+    if left[best] > CLEARLY * left[written]:
+        best = written
+    if best[1] in (0, len(LAGS) - 1):
+        return np.nan, np.nan
     return float(LAGS[best[1]]), float(1 / RATES[best[0]])
 
 
@@ -100,13 +107,20 @@ def _leader(path: Float[np.ndarray, "time gripper 3"], axis: int) -> np.ndarray:
 
 
 def _left(recording: Recording, at: np.ndarray, tops: np.ndarray, axes: list[int]) -> float:
-    """What is left [m^2] of the tops' motion once that of the grippers at times is subtracted."""
+    """What is left [m^2] of the tops' motion once that of the grippers at times is subtracted.
+
+    A robust variance, since a top may be of a stray point. A scale that is off by up to `SCALE`
+    counts for nothing: in a slow motion it looks like a lag.
+    """
     knots = np.asarray(recording.handle_times, np.float64)
     path = np.asarray(recording.handle_path, np.float64)
     left = 0.0
     for axis in axes:
         there = np.interp(at, knots, _leader(path, axis))
-        left += float(np.var(tops[:, axis] - there))
+        leads, follows = (each - np.median(each) for each in (there, tops[:, axis]))
+        size = max(float(leads @ leads), np.finfo(float).tiny)
+        off = follows - np.clip(leads @ follows / size, 1 - SCALE, 1 + SCALE) * leads
+        left += float((1.4826 * np.median(np.abs(off - np.median(off)))) ** 2)
     return left
 
 

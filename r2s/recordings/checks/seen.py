@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from r2s.recordings.readers.clouds import voxel_means
@@ -13,13 +15,15 @@ Points = Float[np.ndarray, "point 3"]
 
 VOXEL = 0.005  # [m], to which clouds are thinned
 AROUND, FEW = 0.02, 4  # [m], in which a point of a sheet has more others than that
+APART, SCRAP = 0.03, 0.05  # [m] between pieces of a cloud; share of it below which one is no sheet
 FEWEST = 50  # points, of a frame that shows something
 STILL = 0.002  # [m], within which grippers are at rest
 
 
 class Seen(NamedTuple):
     """- `recording`: all of it.
-    - `thinned`: points of each frame, [m]. `clouds`: those that have others around.
+    - `thinned`: points of each frame, [m]. `clouds`: those that have others around, and are in a
+      piece that is large enough to be a part of the sheet.
     - `grippers`: where they are in each frame, [m].
     - `still`: frames before the grippers move; the first one at least.
     """
@@ -49,7 +53,16 @@ def _with_others(points: Points) -> Float[np.ndarray, "kept 3"]:
     if len(points) <= FEW:
         return points
     around = KDTree(points).query_ball_point(points, AROUND, return_length=True)
-    return points[np.asarray(around) > FEW]
+    return _without_scraps(points[np.asarray(around) > FEW])
+
+
+def _without_scraps(points: Points) -> Float[np.ndarray, "kept 3"]:
+    if not len(points):
+        return points
+    pairs = KDTree(points).query_pairs(APART, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points),) * 2)
+    piece = connected_components(links, directed=False)[1]
+    return points[(np.bincount(piece) >= SCRAP * len(points))[piece]]
 
 
 def _still(recording: Recording) -> list[int]:
