@@ -16,7 +16,8 @@ RATES = np.array([0.5, 0.67, 0.8, 1.0, 1.25, 1.5, 2.0])  # of the clock, that ar
 CLEARLY = 0.25  # of what is left as written: then another lag or rate is better
 SCALE = 0.1  # of the cameras
 TOP = 0.99  # quantile of height from which points are the top
-FRAMES, MANY = 5, 10  # at least, that show the sheet held up; and that tell a rate
+FRAMES = 5  # at least, that show the sheet held up
+NEAR = 6e-3  # [m], within which the tops follow the grippers where nothing is wrong
 MOVES = 0.05  # [m], at least, along an axis that is compared
 UP = 0.1  # [m] above the table: a sheet that is held up
 WAITS = "check the frame rate and time_offset: does a clap or a jerk come at one time in both?"
@@ -87,10 +88,10 @@ def _lag(seen: Seen) -> tuple[float, float]:
     )
     usual = int(np.argmin(np.abs(RATES - 1)))
     best = np.unravel_index(left.argmin(), left.shape)
-    if left[best] > CLEARLY * left[usual].min() or len(up) < MANY:
+    if left[best] > CLEARLY * left[usual].min():
         best = (usual, int(left[usual].argmin()))
     written = (usual, int(np.argmin(np.abs(LAGS))))
-    if left[best] > CLEARLY * left[written]:
+    if left[written] < NEAR**2 or left[best] > CLEARLY * left[written]:
         best = written
     if best[1] in (0, len(LAGS) - 1):
         return np.nan, np.nan

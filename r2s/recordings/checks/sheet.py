@@ -9,6 +9,7 @@ from r2s.recordings.recording import CORNERS, Recording, SheetPlacement, corner
 
 CELL, MOST_SEEN = 0.02, 0.7  # [m] and share of a sheet's cells that must show its extent
 NEAR = 0.05  # [m], of the sheet's plane at rest
+LONELY = 1.15  # of the next largest: a frame that is alone so far off shows a stray thing
 ENDS = 0.005  # quantile at which an extent begins
 SCALE = 0.025  # relative, of a length; a side that was measured with a ruler is good to 0.5 %
 LEVEL, PLUMB = 1.5, 4.0  # [degrees]
@@ -86,7 +87,7 @@ def _reach(seen: Seen) -> list[Finding]:
     if np.isnan(ratios).all():
         nothing = f"no frame has {FEWEST} points"
         return [Finding("reach", np.nan, "-", LEAST_REACH, REACH, nothing, CALIBRATION)]
-    most, still = float(np.nanmax(ratios)), ratios[seen.still]
+    most, still = _most(ratios[np.isfinite(ratios)]), ratios[seen.still]
     words = "farthest point from a gripper, over how far the sheet reaches from there,"
     found = [Finding("reach", most, "-", LEAST_REACH, REACH, words, CALIBRATION)]
     whole = bool((still > WHOLE).any())
@@ -94,6 +95,14 @@ def _reach(seen: Seen) -> list[Finding]:
     grown = most / float(np.nanmax(still)) if whole else np.nan
     advice = "the sheet stretches, or the cameras' scale changes with the place"
     return [*found, Finding("stretch", grown, "-", -np.inf, GROWTH, words, advice)]
+
+
+def _most(ratios: Float[np.ndarray, " frame"]) -> float:
+    """The largest that does not stand alone."""
+    largest, *others = sorted(ratios, reverse=True)
+    while others and largest > LONELY * others[0]:
+        largest, *others = others
+    return float(largest)
 
 
 def reach(sheet: SheetPlacement, held: str) -> float:
