@@ -14,7 +14,7 @@ ENDS = 0.005  # quantile at which an extent begins
 SCALE = 0.025  # relative, of a length; a side that was measured with a ruler is good to 0.5 %
 LEVEL, PLUMB = 1.5, 4.0  # [degrees]
 HEIGHT = 0.01  # [m]
-LEAST_REACH, REACH, GROWTH = 0.6, 1.06, 1.08  # of the sheet's own length
+LEAST_REACH, REACH, GROWTH = 0.55, 1.06, 1.08  # of the sheet's own length
 WHOLE = 0.85  # of that, from where on a sheet is seen whole
 STRAIN = 1.1  # of the distances between neighbouring markers
 
