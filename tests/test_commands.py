@@ -187,6 +187,14 @@ def test_the_doctor_looks_at_a_mesh(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "sheet.obj: face 1 has the signed area" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("density", ["150", "0.0003"])
+def test_a_density_in_other_units_is_refused(tmp_path: Path, capsys, density: str) -> None:
+    save(recorded(), tmp_path / "lift.npz")
+    command = ["estimate", str(tmp_path / "lift.npz"), "--out", str(tmp_path / "a.json")]
+    assert main([*command, "--density", density]) == 1
+    assert "--density is in kg/m^2" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("frames", ["inf", "nan", "3.5"])
 def test_a_number_of_frames_is_whole(frames: str) -> None:
     with pytest.raises(ValueError, match="num_frames must be a whole number"):

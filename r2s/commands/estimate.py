@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from r2s.recordings.recording import Recording
 
 POOR = 0.5  # of a recording that is left out, above which it is hardly explained at all
+LIGHTEST, HEAVIEST = 0.005, 5.0  # [kg/m^2]: finer than any gauze, heavier than any carpet
 CONTRADICTION = 0.01  # likelihood by chance, below which it is told
 
 # what is wrong where a nuisance is far from what was written down
@@ -196,6 +197,11 @@ class EstimateCard:
         from r2s.fabrics import prior
         from r2s.fabrics.stiffening_space import StiffeningSpace
 
+        if self.density > 0 and not LIGHTEST <= self.density <= HEAVIEST:
+            raise ValueError(
+                f"--density is in kg/m^2, got {self.density:g}: fabrics have {LIGHTEST} to "
+                f"{HEAVIEST:g} (100 g/m^2 are 0.1 kg/m^2)"
+            )
         space = default_space(method.chosen_solver, self.density)
         asked = self.law != "linear" or self.prior != "flat"
         if asked and method.chosen_solver != "cloth":
@@ -317,7 +323,10 @@ def _misfits(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[st
             )
     for name, share in zip(names, estimate.left_out, strict=False):
         told = f"left out of {name}: {100 * share:.1f} % as outliers"
-        poor = f"warning: {told}: its density, wind, path or scale may not be as written down"
+        poor = (
+            f"warning: {told}: its density, wind, path or scale may not be as written down, or the "
+            "mesh is too coarse"
+        )
         lines.append(poor if share > POOR else told)
     return lines
 
