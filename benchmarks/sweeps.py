@@ -32,6 +32,7 @@ from measure import Row
 import r2s
 from r2s import files
 from r2s.cloth.linear.elimination import ORDERS, Elimination
+from r2s.memory import planned
 from r2s.mpm import Grid, Sheet
 from r2s.mpm.sheet import stable_step
 
@@ -103,7 +104,7 @@ def measured(kind: str, side: int, members: int, options: argparse.Namespace) ->
     run, seconds = measure.built(build)
     common: Row = {"order": options.order or "default"} if kind in ("implicit", "gradient") else {}
     common |= {"solver": kind, "side": side, "members": members, "steps": steps, "build_s": seconds}
-    common["planned_mb"] = _planned(run)
+    common["planned_mb"] = planned(run.compiled) / 1e6
     if options.build_only:
         return common
     call = partial(_finished, run, batch, *arguments)
@@ -122,13 +123,6 @@ def measured(kind: str, side: int, members: int, options: argparse.Namespace) ->
         "finite": int(finite.sum()),
         **times,
     }
-
-
-def _planned(run: Any) -> float:
-    """Memory [MB] that the compiler lays out for a run."""
-    plan = run.compiled.memory_analysis()
-    held = plan.temp_size_in_bytes + plan.argument_size_in_bytes + plan.output_size_in_bytes
-    return held / 1e6
 
 
 def _finished(run, *arguments):

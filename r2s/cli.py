@@ -73,9 +73,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read the output had enough
         sys.stdout = None
     except (ValueError, OSError, ImportError, RuntimeError, MemoryError) as error:
-        if "RESOURCE_EXHAUSTED" in str(error):
-            error = f"{error}: take fewer frames, shorter motions or a coarser mesh"
-        print(f"r2s: error: {' '.join(str(error).split())}", file=sys.stderr)
+        told = " ".join(str(error).split())
+        if "RESOURCE_EXHAUSTED" in told:
+            told += " Take fewer frames, shorter motions or a coarser mesh."
+        print(f"r2s: error: {told}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("r2s: error: interrupted", file=sys.stderr)

@@ -6,12 +6,12 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s.cloth.newton import SAVED
 from r2s.failures import Failure, describe, first_failure, no_failure
 from r2s.memory import planned
+from r2s.traced import is_traced
 from r2s.world.scene import Control
 
 State = TypeVar("State")
@@ -89,8 +89,9 @@ def simulate(
 ) -> Trajectory:
     """The motion under `controls`, whose leading axes are (frame, substep).
 
-    A solver whose steps have a limit refuses a fabric that is too stiff for them (`ValueError`),
-    unless it is traced; then its run fails (`Failure.TIME_STEP`).
+    A solver whose steps have a limit (its `check`) refuses a fabric that is too stiff for them by
+    `ValueError`. Where the fabric is traced the run of one that says so (its `fits`, as explicit
+    steps of a cloth have it) fails in its first step (`Failure.TIME_STEP`).
 
     `frames`: how many are wanted, which may be traced: what comes after them is not simulated, and
     repeats the last. None: all.
@@ -100,10 +101,8 @@ def simulate(
     states of the frames, and those of the steps of one frame at a time, which it solves again: the
     time of one more forward run, for the memory of about frames + substeps states.
     """
-    check = getattr(solver, "check", None)
-    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((solver, fabric)))
-    if check is not None and not traced:
-        check(fabric)
+    if hasattr(solver, "check") and not is_traced(solver, fabric):
+        solver.check(fabric)  # pyright: ignore[reportAttributeAccessIssue]
     names = (SAVED,) if keep_solutions else ()
     policy = jax.checkpoint_policies.save_only_these_names(*names)
 
@@ -132,6 +131,9 @@ def simulate(
         numbers = jnp.arange(jax.tree.leaves(controls)[0].shape[0])
         wanted = jax.checkpoint(wanted, policy=policy)
         _, (x, failures) = jax.lax.scan(wanted, start, (numbers, controls))
+    if hasattr(solver, "fits"):  # once, and not in every step
+        fits = solver.fits(fabric)  # pyright: ignore[reportAttributeAccessIssue]
+        failures = jnp.where(fits, failures, Failure.TIME_STEP.value)
     unfailed = jnp.all(failures == Failure.NONE.value, axis=1)
     ok = jnp.all(jnp.isfinite(x), axis=(1, 2)) & jnp.cumprod(unfailed).astype(bool)
     return Trajectory(x, ok, *_first_failure(failures))

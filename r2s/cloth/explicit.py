@@ -14,7 +14,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s.cloth.substep import moved_velocity
@@ -30,6 +29,7 @@ from r2s.forces.stability import check_step, longest_relaxing_step
 from r2s.forces.viscosity import RELAXATION, Viscosity
 from r2s.geometry.mesh import Mesh
 from r2s.laws.plate import PlateLaw
+from r2s.traced import is_traced
 from r2s.world.air import Air
 from r2s.world.scene import Control, Scene
 
@@ -109,7 +109,7 @@ class ExplicitCloth(eqx.Module):
         """
         if self_contact:
             raise ValueError(REFUSED)
-        if _is_traced(fabric):
+        if is_traced(fabric):
             raise ValueError(TRACED)
         if substeps is not None and (substeps != int(substeps) or substeps < 1):
             raise ValueError(f"substeps must be a whole number from 1 on, got {substeps}")
@@ -136,11 +136,16 @@ class ExplicitCloth(eqx.Module):
 
     def check(self, fabric: Fabric) -> None:
         """Raises `ValueError` when the substeps are too long for a fabric, unless it is traced."""
-        if _is_traced(fabric):
+        if is_traced(fabric):
             return
         with jax.ensure_compile_time_eval():
             times = self.membrane_damping, self.relaxation
             self._check_substep(shortest(self.scene.mesh, fabric, *times))
+
+    def fits(self, fabric: Fabric) -> Bool[Array, ""]:
+        """Whether the substeps are short enough for a fabric, which may be traced."""
+        longest = stable_step(self.scene.mesh, fabric, self.membrane_damping, self.relaxation)
+        return self.dt / self.substeps <= (1 + ROUNDING) * longest
 
     def _check_substep(self, longest: float) -> None:
         material = f"the fabric and the mesh (dt = {self.dt:g} s in {self.substeps} substeps)"
@@ -191,10 +196,8 @@ class ExplicitCloth(eqx.Module):
         else:
             moved = self._by_gathers(inputs)
         x = scene.place(moved.x, control.handles)
-        longest = stable_step(scene.mesh, fabric, self.membrane_damping, self.relaxation)
-        fits = substep <= (1 + ROUNDING) * longest
         asked = state.x, state.v, fabric, control
-        failure = first_failure(state.failure, _failure(asked, (x, moved.v), fits))
+        failure = first_failure(state.failure, _failure(asked, (x, moved.v)))
         after = ExplicitState(x, moved.v, moved.relaxed, moved.hidden, moved.begun, failure)
         return after, moved.impulse
 
@@ -316,14 +319,9 @@ def _advance_grid(shape, spacing, dt, substeps: int, batched: bool, inputs: _Inp
     return _Moving(stacked(inner(end.x)), stacked(inner(end.v)), relaxed, hidden, begun, impulse)
 
 
-def _is_traced(fabric: Fabric) -> bool:
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(fabric))
-
-
-def _failure(inputs: Any, results: Any, fits: Array) -> Int[Array, ""]:
-    """Inputs that are not finite give `NON_FINITE`; results that are not, or substeps that are too
-    long for the fabric, `TIME_STEP`."""
-    code = jnp.where(_all_finite(results) & fits, Failure.NONE.value, Failure.TIME_STEP.value)
+def _failure(inputs: Any, results: Any) -> Int[Array, ""]:
+    """Inputs that are not finite give `NON_FINITE`, results that are not `TIME_STEP`."""
+    code = jnp.where(_all_finite(results), Failure.NONE.value, Failure.TIME_STEP.value)
     return jnp.where(_all_finite(inputs), code, Failure.NON_FINITE.value)
 
 

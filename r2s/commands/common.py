@@ -88,7 +88,7 @@ def make_experiment(scenario: str, motion: Iterable[str]) -> "Experiment":
         )
     if "num_frames" in numbers:
         frames = numbers["num_frames"]
-        if frames != frames or frames in (math.inf, -math.inf) or frames != int(frames):
+        if not float(frames).is_integer():
             raise ValueError(f"num_frames must be a whole number, got {frames:g}")
         numbers["num_frames"] = int(frames)
     try:

@@ -24,13 +24,14 @@ from r2s.estimation.compiled import (
     normals_at,
     predictions_at,
 )
-from r2s.estimation.estimate import Estimate, Nuisance
+from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
 from r2s.estimation.mesh_bias import OtherMesh, mesh_bias, weighed
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.misfits import left_out, misfits
+from r2s.estimation.nuisances import nuisances
 from r2s.estimation.prediction import Prediction, Sensitivity, Theta, explain, fabric_at
-from r2s.estimation.problem import OWN, SHARED, UNITS, Problem, beginning, check_shared
+from r2s.estimation.problem import Problem, beginning, check_shared
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.informed_space import InformedSpace
 
@@ -482,22 +483,3 @@ def collect(
         seconds=seconds,
         converged=converged,
     )
-
-
-def nuisances(problems: Problems, theta: np.ndarray, deviation: np.ndarray) -> tuple[Nuisance, ...]:
-    """The nuisances of the recordings that the prior lets vary, from theta and its deviation."""
-    found, told = [], set()
-    for which, problem in enumerate(problems):
-        number = f" {which + 1}" if len(problems) > 1 else ""
-        places = theta_indices(problems, which)[problem.space.dim :]
-        rows = zip((*SHARED, *OWN), problem.nuisance_prior.scales, places, strict=True)
-        for name, scale, place in rows:
-            if not scale or place in told:
-                continue
-            told.add(place)
-            value, spread = scale * float(theta[place]), scale * float(deviation[place])
-            if name in SHARED:  # the logarithm of a ratio
-                value, spread = float(np.exp(value)), float(np.exp(value)) * spread
-            label = f"{name} ratio" if name in SHARED else name + number
-            found.append(Nuisance(label, UNITS.get(name, "-"), value, spread))
-    return tuple(found)

@@ -11,10 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from r2s.estimation.estimate import Misfit
-from r2s.estimation.gauss_newton import Problems, theta_indices
+from r2s.estimation.gauss_newton import Problems
 from r2s.estimation.normal_equations import marker_distances, point_distances
+from r2s.estimation.nuisances import free
 from r2s.estimation.prediction import Prediction
-from r2s.estimation.problem import OWN, SHARED, Problem
+from r2s.estimation.problem import Problem
 from r2s.evaluation.losses import robust_weight
 
 STRAY, FEWEST = 5.0, 4  # times the other markers' distance; markers that are needed to say so
@@ -34,18 +35,12 @@ def misfits(
     at least `LEAST`; of fewer than `FEWEST` nothing is said. A nuisance is bent when it ended more
     than `BENT` of its prior standard deviations away from what was written down.
     """
-    found: list[Misfit] = []
-    told: set[int] = set()
-    for which, (problem, seen) in enumerate(zip(problems, predicted, strict=True)):
-        found += _strays(which, problem, seen)
-        places = theta_indices(problems, which)[problem.space.dim :]
-        names = zip((*SHARED, *OWN), problem.nuisance_prior.scales, places, strict=True)
-        for name, scale, place in names:
-            if not scale or place in told:
-                continue
-            told.add(int(place))
-            if (off := abs(float(theta[place]))) > BENT:
-                found.append(Misfit(which, name, off, "standard deviations"))
+    pairs = enumerate(zip(problems, predicted, strict=True))
+    found = [stray for which, pair in pairs for stray in _strays(which, *pair)]
+    for each in free(problems):
+        off = abs(float(theta[each.place]))
+        if off > BENT:
+            found.append(Misfit(each.recording, each.name, off, "standard deviations"))
     return tuple(found)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from r2s.cloth.cloth import Cloth, prepare_mesh
 from r2s.cloth.linear.elimination import Elimination
@@ -344,6 +344,10 @@ class Braked(eqx.Module):
         """Raises `ValueError` where the steps of the solver are too long for a fabric."""
         if hasattr(self.solver, "check"):
             self.solver.check(fabric)
+
+    def fits(self, fabric: Fabric) -> Bool[Array, ""]:
+        """Whether the steps of the solver are short enough for a fabric, as far as it says."""
+        return self.solver.fits(fabric) if hasattr(self.solver, "fits") else jnp.ones((), bool)
 
     def init(self, x: Float[Array, "vertex 3"], *rates: Array | None) -> BrakedState:
         """At positions [m]; `rates` go to the solver; by default it is at rest."""
