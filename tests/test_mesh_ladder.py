@@ -43,7 +43,7 @@ def end():
     """A descent that stands at the true fabric."""
     problems = (problem(1.0),)
     theta = jnp.zeros(theta_length(problems)).at[:2].set(PLACE)
-    (found,) = descent._fresh(problems, SMALL, [theta], 0.0, 0)
+    (found,) = descent._fresh(problems, SMALL, [theta], 0.0, 0, derivatives_at)
     return problems, found
 
 

@@ -5,7 +5,8 @@ serves recordings of any number of points, all stages of a descent, and its end.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,6 +21,10 @@ from r2s.estimation.prediction import Prediction, Sensitivity, Theta, predict, s
 from r2s.estimation.problem import Problem, motion_alone
 from r2s.kept import kept
 
+Predicted = list[tuple[Prediction, Sensitivity]]  # of each recording
+Derive = Callable[[Problems, Theta, float | None], Predicted]  # as `derivatives_at`
+REMEMBERED = 128_000_000  # bytes of derivatives: a lift on 33 x 33 vertices takes 9 MB
+
 # compiled once in a process for all recordings of as many frames and knots, on a mesh
 predicted = kept(predict)
 _sensitivities = kept(sensitivities)
@@ -29,14 +34,49 @@ _losses = eqx.filter_jit(eqx.filter_vmap(gauss_newton.loss_at, in_axes=(None, 0)
 _normals = eqx.filter_jit(eqx.filter_vmap(gauss_newton.normal_at, in_axes=(None, 0, 0, None)))
 
 
-def derivatives_at(
-    problems: Problems, theta: Theta, width: float | None = None
-) -> list[tuple[Prediction, Sensitivity]]:
+def derivatives_at(problems: Problems, theta: Theta, width: float | None = None) -> Predicted:
     """What each recording would show at a theta, and its derivative.
 
     `width`: as in `r2s.estimation.prediction.sensitivities`.
     """
     return [_sensitivities(*pair, width) for pair in _places(problems, theta)]
+
+
+def remembering() -> Derive:
+    """`derivatives_at` of some problems and their beginnings, which knows where it was lately.
+
+    A descent comes back to where it was whenever a stage, a search, or the standard errors begin.
+    What was found there of more frames serves fewer, too.
+    """
+    known: dict[Any, _Known] = {}
+
+    def derive(problems: Problems, theta: Theta, width: float | None = None) -> Predicted:
+        return [one(*pair, width) for pair in _places(problems, theta)]
+
+    def one(problem: Problem, theta: Array, width: float | None):
+        frames = problem.scenario.num_frames if problem.wanted is None else int(problem.wanted)
+        place = id(problem.scenario), np.asarray(theta).tobytes(), width
+        found = known.pop(place, None)
+        if found is None or found.frames < frames:
+            found = _Known(problem.scenario, frames, _sensitivities(problem, theta, width))
+        known[place] = found
+        while len(known) > 1 and sum(each.bytes for each in known.values()) > REMEMBERED:
+            del known[next(iter(known))]
+        return found.derivatives
+
+    return derive
+
+
+class _Known(NamedTuple):
+    """Derivatives over some frames; `scenario`: held, so that its id stays its own."""
+
+    scenario: Any
+    frames: int
+    derivatives: tuple[Prediction, Sensitivity]
+
+    @property
+    def bytes(self) -> int:
+        return sum(leaf.nbytes for leaf in jax.tree.leaves(self.derivatives))
 
 
 def predictions_at(problems: Problems, theta: Theta) -> list[Prediction]:
@@ -49,9 +89,15 @@ def loss_from(problems: Problems, seen: Sequence[Prediction]) -> float:
     return float(_loss_from(problems, list(seen)))
 
 
-def normal_at(problems: Problems, theta: Theta, scale: Array, width: float | None = None) -> Normal:
-    """`r2s.estimation.gauss_newton.normal_at`."""
-    return normal_from(problems, theta, derivatives_at(problems, theta, width), scale)
+def normal_at(
+    problems: Problems,
+    theta: Theta,
+    scale: Array,
+    width: float | None = None,
+    derive: Derive = derivatives_at,
+) -> Normal:
+    """`r2s.estimation.gauss_newton.normal_at`, by derivatives that `derive` gives."""
+    return normal_from(problems, theta, derive(problems, theta, width), scale)
 
 
 def normal_from(
@@ -79,14 +125,20 @@ def losses_at(
     return np.array(losses)
 
 
-def normals_at(problems: Problems, thetas: list, scales: list, width: float | None) -> list[Normal]:
-    """The normal equations at many thetas; see `losses_at`.
+def normals_at(
+    problems: Problems,
+    thetas: list,
+    scales: list,
+    width: float | None,
+    derive: Derive = derivatives_at,
+) -> list[Normal]:
+    """The normal equations at many thetas; see `losses_at` and `normal_at`.
 
     Together in numbers that are powers of two, so that few sizes are compiled.
     """
     if jax.default_backend() == "cpu" or len(thetas) == 1:
         pairs = zip(thetas, scales, strict=True)
-        return [normal_at(problems, theta, scale, width) for theta, scale in pairs]
+        return [normal_at(problems, theta, scale, width, derive) for theta, scale in pairs]
     more = 2 ** math.ceil(math.log2(len(thetas))) - len(thetas)
     filled = (jnp.stack([*parts, *[parts[-1]] * more]) for parts in (thetas, scales))
     found = _normals(problems, *filled, width)

@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,12 +16,15 @@ from r2s.estimation import checkpoint as checkpoints
 from r2s.estimation import gauss_newton, standard_errors
 from r2s.estimation.agreement import contradiction
 from r2s.estimation.compiled import (
+    Derive,
+    Predicted,
     derivatives_at,
     loss_from,
     losses_at,
     normal_from,
     normals_at,
     predictions_at,
+    remembering,
 )
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
@@ -30,7 +32,7 @@ from r2s.estimation.mesh_bias import OtherMesh, mesh_bias, weighed
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.misfits import left_out, misfits
 from r2s.estimation.nuisances import nuisances
-from r2s.estimation.prediction import Prediction, Sensitivity, Theta, explain, fabric_at
+from r2s.estimation.prediction import Theta, explain, fabric_at
 from r2s.estimation.problem import Problem, beginning, check_shared
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.informed_space import InformedSpace
@@ -57,7 +59,6 @@ class Stop(NamedTuple):
 # At a tenth of a standard error, or, where another descent goes on from there, at a quarter (a half
 # is too early: outliers that are left out from there on may hold it there).
 AT_THE_END, ON_THE_WAY = Stop(5e-3, 4), Stop(0.03, 2)
-Predicted = Sequence[tuple[Prediction, Sensitivity]]  # of each recording
 Row = list[Descent]  # one iteration: the descents of all starts
 
 _propose = eqx.filter_jit(gauss_newton.propose)
@@ -76,12 +77,13 @@ DEFAULT = Budget(shares=(0.25, 0.5))
 
 class Search(NamedTuple):
     """- `problems`: what was searched for. - `rows`: all descents in every iteration.
-    - `seconds`: how long it took.
+    - `seconds`: how long it took. - `derive`: `remembering` where it was last.
     """
 
     problems: Problems
     rows: list[Row]
     seconds: float
+    derive: Derive
 
     @property
     def theta(self) -> Theta:
@@ -130,9 +132,13 @@ def search(
     start: Float[Array, " start"] | None = None,
     checkpoint: Path | None = None,
     progress: Progress | None = None,
+    derive: Derive | None = None,
     key: PRNGKeyArray,
 ) -> Search:
-    """The descents of `descend`, whose arguments these are; a `start` may be a whole theta."""
+    """The descents of `descend`, whose arguments these are; a `start` may be a whole theta.
+
+    `derive`: of an earlier search in the same recordings, whose end need not be derived again.
+    """
     if budget.starts < 1:
         raise ValueError(f"an estimate needs a start or more, got {budget.starts}")
     if any(not low < high for low, high in itertools.pairwise((0.0, *budget.shares, 1.0))):
@@ -140,19 +146,19 @@ def search(
     if budget.around < 0 or budget.around % 2:
         raise ValueError(f"places around the end are in pairs: an even number, got {budget.around}")
     check_shared(problems)
-    began = time.perf_counter()
+    began, derive = time.perf_counter(), derive or remembering()
     run = _run_of(problems, budget, start, key) if checkpoint else {}
     rows = _resumed(checkpoint, run, budget) if checkpoint else []
     if not rows:
-        rows = [_begin(problems, budget, start, progress, key)]
+        rows = [_begin(problems, budget, start, derive, progress, key)]
     tell(progress, "descents")
-    while (row := _next(problems, budget, rows)) is not None:
+    while (row := _next(problems, budget, rows, derive)) is not None:
         rows.append(row)
         if checkpoint is not None:
             checkpoints.save(checkpoint, checkpoints.arrays_of(_stacked(rows)), run)
         if progress is not None:
             progress(len(rows) - 2, float(_best(row)[1].normal.loss))
-    return Search(problems, rows, time.perf_counter() - began)
+    return Search(problems, rows, time.perf_counter() - began, derive)
 
 
 def judged(
@@ -172,7 +178,7 @@ def judged(
     began, problems = time.perf_counter(), found.problems
     which, best = _best(found.rows[-1])
     stage, prior = _rows_of_stage(found.rows, int(best.stage)), _weight(problems, best.normal)
-    predicted, bias = derivatives_at(problems, best.theta, budget.width), None
+    predicted, bias = found.derive(problems, best.theta, budget.width), None
     covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1), predicted)
     seen = [each for each, _ in predicted]
     loss = loss_from(problems, seen)
@@ -193,7 +199,8 @@ def judged(
     seconds = found.seconds + time.perf_counter() - began
     converged = _arrived(problems, stage, which, prior, _stop(budget, int(best.stage)))
     estimate = collect(problems, rows, covariance, approach, seconds, converged, loss, bias)
-    against = contradiction(problems, each_alone(problems, budget, best.theta, key), bias)
+    alone = each_alone(problems, budget, best.theta, key, found.derive)
+    against = contradiction(problems, alone, bias)
     return dataclasses.replace(
         estimate,
         contradiction=against,
@@ -203,19 +210,25 @@ def judged(
 
 
 def each_alone(
-    problems: Problems, budget: Budget, theta: Theta, key: PRNGKeyArray
+    problems: Problems,
+    budget: Budget,
+    theta: Theta,
+    key: PRNGKeyArray,
+    derive: Derive | None = None,
 ) -> list[Descent]:
     """The ends of descents in each of several recordings alone, from a theta of all of them."""
     if len(problems) < 2:
         return []
     alone = budget._replace(coarse=0, starts=1, shares=(), near=True, leads_on=True)
-    starts = (theta[theta_indices(problems, which)] for which in range(len(problems)))
-    pairs = zip(problems, starts, strict=True)
-    found = [search((problem,), alone, start=start, key=key) for problem, start in pairs]
-    return [_best(each.rows[-1])[1] for each in found]
+    ends = []
+    for which, problem in enumerate(problems):
+        start = theta[theta_indices(problems, which)]
+        each = search((problem,), alone, start=start, derive=derive, key=key)
+        ends.append(_best(each.rows[-1])[1])
+    return ends
 
 
-def _begin(problems: Problems, budget: Budget, start, progress, key) -> Row:
+def _begin(problems: Problems, budget: Budget, start, derive: Derive, progress, key) -> Row:
     dim, count = problems[0].space.dim, max(budget.coarse, budget.starts)
     usual = jnp.clip(problems[0].space.prior()[0], gauss_newton.MARGIN, 1 - gauss_newton.MARGIN)
     start = usual if start is None else start
@@ -233,7 +246,7 @@ def _begin(problems: Problems, budget: Budget, start, progress, key) -> Row:
             )
         thetas = thetas[np.argsort(losses)]
     tell(progress, "compiling the derivatives")
-    return _fresh(problems, budget, list(thetas[: budget.starts]), 0.0, 0)
+    return _fresh(problems, budget, list(thetas[: budget.starts]), 0.0, 0, derive)
 
 
 def _share(budget: Budget, stage: int) -> float:
@@ -248,20 +261,22 @@ def _seen(problems: Problems, budget: Budget, stage: int) -> Problems:
     return problems if share == 1 else tuple(beginning(p, share) for p in problems)
 
 
-def _fresh(problems: Problems, budget: Budget, thetas: list, scale: float, stage: int) -> Row:
+def _fresh(
+    problems: Problems, budget: Budget, thetas: list, scale: float, stage: int, derive: Derive
+) -> Row:
     """Descents that begin at some thetas, in a stage."""
     damping, growth, limit = (
         jnp.asarray(number, float) for number in (INITIAL_DAMPING, gauss_newton.GROWTH, scale)
     )
     seen = _seen(problems, budget, stage)
-    normals = normals_at(seen, thetas, [limit] * len(thetas), budget.width)
+    normals = normals_at(seen, thetas, [limit] * len(thetas), budget.width, derive)
     return [
         Descent(theta, normal, damping, growth, limit, jnp.asarray(stage))
         for theta, normal in zip(thetas, normals, strict=True)
     ]
 
 
-def _next(problems: Problems, budget: Budget, rows: list[Row]) -> Row | None:
+def _next(problems: Problems, budget: Budget, rows: list[Row], derive: Derive) -> Row | None:
     """The next iteration; None at the end."""
     row = rows[-1]
     _, best = _best(row)
@@ -273,10 +288,10 @@ def _next(problems: Problems, budget: Budget, rows: list[Row]) -> Row | None:
     moving = [i for i in kept_on if not _arrived(problems, stage, i, prior, stop)]
     is_passed = budget.near and now < _last_stage(budget)
     if is_passed or not moving or len(stage) > budget.iterations:
-        return _later(problems, budget, row)
+        return _later(problems, budget, row, derive)
     seen = _seen(problems, budget, now)
     trials = [_propose(problems, row[i], prior) for i in moving]
-    tried = normals_at(seen, trials, [row[i].scale for i in moving], budget.width)
+    tried = normals_at(seen, trials, [row[i].scale for i in moving], budget.width, derive)
     after = list(row)
     for i, trial, normal in zip(moving, trials, tried, strict=True):
         after[i] = _accept(problems, row[i], trial, normal, prior)
@@ -300,7 +315,7 @@ def _kept(row: Row, iteration: int) -> list[int]:
     return sorted(sorted(there, key=losses.__getitem__)[:count])
 
 
-def _later(problems: Problems, budget: Budget, row: Row) -> Row | None:
+def _later(problems: Problems, budget: Budget, row: Row, derive: Derive) -> Row | None:
     """The next stage, to which only the best descent goes on; None after the last.
 
     From the second stage on outliers are left out, beyond a scale that follows from the distances
@@ -313,10 +328,10 @@ def _later(problems: Problems, budget: Budget, row: Row) -> Row | None:
         return None
     loose = best
     if _share(budget, stage) != _share(budget, stage - 1):
-        (loose,) = _fresh(problems, budget, [best.theta], 0.0, stage)
+        (loose,) = _fresh(problems, budget, [best.theta], 0.0, stage, derive)
     scale = float(np.clip(STRICT * float(loose.normal.spread), *SCALES))
     after = list(row)
-    (after[which],) = _fresh(problems, budget, [best.theta], scale, stage)
+    (after[which],) = _fresh(problems, budget, [best.theta], scale, stage, derive)
     return after
 
 

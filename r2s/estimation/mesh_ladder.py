@@ -6,11 +6,13 @@ from it on the next, with the nuisances that were found; else it goes on to its 
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 
 from jaxtyping import PRNGKeyArray
 
+from r2s.estimation.compiled import remembering
 from r2s.estimation.descent import Search, judged, search
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.mesh_bias import OtherMesh, factor
@@ -43,15 +45,21 @@ def descend_by_meshes(
     would be finer than all of `r2s.scenarios.resolution.LADDER`.
     """
 
+    derive = remembering()
+
+    @functools.cache
+    def on(*shapes: Shape) -> tuple[Problem, ...]:
+        return _problems(recordings, space, shapes)
+
     def climb(shapes: list[Shape], before: Search | None, leads_on: bool) -> Search:
         start, more = (None, budget) if before is None else (before.theta, near(budget))
         path = checkpoint
         if path and before is not None:
             rows, columns = shapes[0]
             path = path.with_suffix(f".{rows}x{columns}{'' if leads_on else '.end'}.npz")
-        problems = _problems(recordings, space, shapes)
         more = more._replace(leads_on=leads_on)
-        return search(problems, more, start=start, checkpoint=path, progress=progress, key=key)
+        saved = {"checkpoint": path, "progress": progress}
+        return search(on(*shapes), more, start=start, derive=derive, key=key, **saved)
 
     rungs = [[shape] * len(recordings)] if shape else ladder(recordings)
     found = None
