@@ -168,7 +168,8 @@ def stress_on_samples(
     if not isinstance(law, Wrinkled):
         return stress
     prepared, flat = jax.tree.map(jnp.ravel, law.prepared), strain.reshape(-1, 3)
-    relief = jnp.stack(relieved(prepared, _hidden(prepared, flat)), axis=-1)
+    # once: the stack would work out all of the derivatives for each of its numbers
+    relief = jnp.stack(once(_relieved_at, prepared, flat), axis=-1)
     return stress + relief.reshape(stress.shape)
 
 
@@ -274,6 +275,10 @@ def relieved(law: Prepared, hidden: Vector) -> Vector:
     one, two, three = times(transposed(law.by_strain), hidden)
     unit = (1 - SHARE) * law.width**2
     return unit * one, unit * two, unit * three
+
+
+def _relieved_at(prepared: Prepared, strain: Float[Array, "*sample 3"]) -> Vector:
+    return relieved(prepared, _hidden(prepared, strain))
 
 
 @jax.custom_jvp
