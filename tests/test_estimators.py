@@ -392,6 +392,39 @@ def test_a_beginning_counts_as_a_window_of_the_first_frames_does(kind, request):
     np.testing.assert_allclose(early.noise[0], part.noise[0], rtol=1e-12)
 
 
+def test_where_a_descent_was_it_does_not_derive_again(small, monkeypatch):
+    """A place of all frames serves their beginning, but not the other way round; another place,
+    another width or another recording does not serve."""
+    derived = []
+
+    def derive_one(problem, theta, width):
+        derived.append((problem.scenario, float(theta[0]), width))
+        one = jnp.zeros((1, 1, 3))
+        return Prediction(one, None, jnp.array(True)), Sensitivity(one[..., None], None)
+
+    monkeypatch.setattr(compiled, "_sensitivities", derive_one)
+    derive = compiled.remembering()
+    small = dataclasses.replace(small, nuisance_prior=ALL._replace(time=0.0))
+    whole, early = (small,), (beginning(small, 0.01),)
+    other = (dataclasses.replace(small, scenario=dataclasses.replace(small.scenario)),)
+    there, elsewhere = jnp.full(15, 0.4), jnp.full(15, 0.6)
+    (first,) = derive(early, there, None)
+    (second,) = derive(whole, there, None)
+    assert first is not second and len(derived) == 2  # more frames are needed
+    for known in (whole, early, whole):
+        assert derive(known, there, None)[0] is second
+    assert len(derived) == 2
+    derive(whole, elsewhere, None)
+    derive(whole, there, 0.1)
+    derive(other, there, None)
+    assert len(derived) == 5
+    assert derive(whole, there, None)[0] is second
+    monkeypatch.setattr(compiled, "REMEMBERED", 0)  # no room: only the latest place is known
+    derive(whole, jnp.full(15, 0.7), None)
+    derive(whole, there, None)
+    assert len(derived) == 7
+
+
 def test_markers_must_lie_on_the_sheet(pull):
     record = pull
     assert record.markers is not None and record.markers_seen is not None
