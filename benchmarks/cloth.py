@@ -18,6 +18,7 @@ import shlex
 import sys
 from pathlib import Path
 
+import hang
 import jax
 import measure
 import parts
@@ -34,10 +35,15 @@ def main(options: argparse.Namespace) -> None:
     about |= {"float": 64 if options.double else 32, "damping_s": options.damping}
     print(", ".join(f"{name}: {value}" for name, value in about.items()))
     rows = []
+
+    def written(more: list[measure.Row]) -> None:
+        if options.out:
+            files.write_json(options.out, {"machine": about, "rows": rows + more})
+
+    options.written = written
     for part in options.only:
         rows += getattr(parts, part)(options)
-        if options.out:
-            files.write_json(options.out, {"machine": about, "rows": rows})
+        written([])
 
 
 def _arguments() -> argparse.Namespace:
@@ -58,6 +64,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--double", action="store_true", help="r2s and mass-spring in float64")
     parser.add_argument("--out", type=Path, help="JSON file")
     parser.add_argument("--probe", nargs=2, metavar=("SYSTEM", "SIZE"), help=argparse.SUPPRESS)
+    parser.add_argument(
+        "--system", nargs=3, metavar=("SYSTEM", "SIZE", "FOLDER"), help=argparse.SUPPRESS
+    )
     options = parser.parse_args()
     if any(size < 2 for size in options.sizes or ()) or options.repeats < 1:
         parser.error("--sizes must be at least 2 and --repeats at least 1")
@@ -70,6 +79,11 @@ if __name__ == "__main__":
     if arguments.probe:
         name, size = arguments.probe
         print(json.dumps(parts.probe(name, int(size), arguments)))
+        sys.exit()
+    if arguments.system:
+        jax.config.update("jax_enable_x64", arguments.double)
+        name, size, folder = arguments.system
+        print(json.dumps(hang.of_system(name, int(size), Path(folder), arguments)))
         sys.exit()
     try:
         main(arguments)

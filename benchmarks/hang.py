@@ -1,12 +1,17 @@
 """The scene "hang" in r2s and its peers: what each needs for which accuracy.
 
+Each system at each size has a process of its own: what one has compiled is gone with it (XLA ran
+out of room for code after some hundred programs).
+
 The accuracy of a run is its rms distance from the same system's own motion with far smaller steps,
 over all vertices and frames of 1/60 s, so that no system is judged by another's model. The sheet
 buckles after half a second, and without damping two motions that differ by little part there.
 """
 
+import tempfile
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import jax
 import measure
@@ -70,19 +75,41 @@ def _slope(call: Callable[[float], np.ndarray], size: int) -> float | None:
     return float(slope) if np.isfinite(slope) else None
 
 
-def run(options) -> list[Row]:
-    """All systems at all sizes; prints the plain table and those of equal accuracy."""
-    rows, motions = [], {}
-    for size in options.sizes:
-        for system in systems.available(options.systems):
-            compared = size in options.references
-            finest = _reference(system, size, options.damping) if compared else None
-            motions[system.name] = finest
-            apart = None if finest is None else _distance(finest, motions.get("r2s"), HALF)
-            for factor in system.factors if compared else system.factors[:1]:
-                rows.append(_run(system, size, factor, options, finest) | {"from_r2s_mm": apart})
+def run(options, written: Callable[[list[Row]], None]) -> list[Row]:
+    """All systems at all sizes; prints the plain table and those of equal accuracy.
+
+    `written`: takes the rows so far, after each system.
+    """
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for size in options.sizes:
+            for system in systems.available(options.systems):
+                given = ["--system", system.name, str(size), folder, *_flags(options)]
+                rows += measure.in_subprocess([str(Path(__file__).with_name("cloth.py")), *given])
+                written([{"part": "hang", **row} for row in rows])
     _show(rows)
     return [{"part": "hang", **row} for row in rows + _equal_accuracy(rows)]
+
+
+def _flags(options) -> list[str]:
+    flags = ["--damping", str(options.damping), "--cores", str(options.cores)]
+    flags += ["--repeats", str(options.repeats), "--budget", str(options.budget)]
+    flags += ["--references", *map(str, options.references)]
+    return flags + ["--double"] * options.double
+
+
+def of_system(name: str, size: int, folder: Path, options) -> list[Row]:
+    """The runs of one system at one size; its reference stays in a folder beside those of others."""
+    (system,) = [system for system in systems.SYSTEMS if system.name == name]
+    compared, finest, apart = size in options.references, None, None
+    if compared:
+        finest = _reference(system, size, options.damping)
+        np.save(folder / f"{name} {size}.npy", finest)
+        ours = folder / f"r2s {size}.npy"
+        apart = _distance(finest, np.load(ours), HALF) if ours.exists() else None
+    factors = system.factors if compared else system.factors[:1]
+    runs = [_run(system, size, factor, options, finest) for factor in factors]
+    return [run | {"from_r2s_mm": apart} for run in runs]
 
 
 def _number(name: str, scale: float = 1.0) -> Callable[[Row], str]:

@@ -147,7 +147,7 @@ def peak_memory(build: Callable[[], Callable[[], Any]]) -> Row:
     }
 
 
-def in_subprocess(arguments: Sequence[str]) -> Row:
+def in_subprocess(arguments: Sequence[str]) -> Any:
     """The last line of a Python program's output, read as JSON."""
     done = subprocess.run([sys.executable, *arguments], stdout=subprocess.PIPE, text=True)
     if done.returncode:

@@ -27,7 +27,7 @@ FINEST = 64  # of the reference
 def hang(options) -> list[Row]:
     """r2s and its peers: forward and gradient at several steps, and at equal accuracy."""
     options.sizes = options.sizes or [9, 33, 65]
-    return hanging.run(options)
+    return hanging.run(options, options.written)
 
 
 def lift(options) -> list[Row]:
