@@ -99,7 +99,7 @@ def _flags(options) -> list[str]:
 
 
 def of_system(name: str, size: int, folder: Path, options) -> list[Row]:
-    """The runs of one system at one size; its reference stays in a folder beside those of others."""
+    """The runs of one system at one size; its reference stays in a folder beside others."""
     (system,) = [system for system in systems.SYSTEMS if system.name == name]
     compared, finest, apart = size in options.references, None, None
     if compared:
