@@ -14,6 +14,8 @@ core (wall seconds where JAX runs on a GPU), without compilation.
 
 import argparse
 import importlib.util
+import shlex
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -30,7 +32,7 @@ LAWS = {"2d": ("corotated", "neo-hookean"), "3d": ("corotated", "neo-hookean"), 
 
 
 def main(options: argparse.Namespace) -> None:
-    about = measure.machine()
+    about = measure.machine() | {"command": shlex.join(["python", *sys.argv])}
     print(", ".join(f"{name}: {value}" for name, value in about.items()))
     rows = []
     for part in options.only:

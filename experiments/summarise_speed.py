@@ -1,30 +1,40 @@
-"""Put what `benchmarks/cloth.py` found into docs/speed.md.
+"""Put what `benchmarks/cloth.py` and `benchmarks/mpm.py` found into docs/speed.md.
 
-python experiments/summarise_speed.py results/speed.json    # that the benchmark wrote
+python experiments/summarise_speed.py results/speed.json    # that a benchmark wrote
 
 The runs of the part "hang" become the table `hang`, and of each system the cheapest run within 2 mm
-over half a second `hang_at_equal_error`: files of OUT, and between the marks of their names there.
+over half a second `hang_at_equal_error`; those of "scaling" and "memory" the tables of these names;
+those of material points `points`. Each is a file of OUT, and stands between the marks of its name.
 """
 
 import json
 from pathlib import Path
 
-from _speed import EQUAL, RUNS, at_equal_error, runs
+import _speed
 from _tables import command_line, insert, keep, shown
 
 DOCUMENT = Path("docs/speed.md")
+POINTS = ("2d", "3d", "sheet")  # parts of benchmarks/mpm.py
+TABLES = {
+    "hang": (("hang",), _speed.runs, _speed.RUNS),
+    "hang_at_equal_error": (("hang",), _speed.at_equal_error, _speed.EQUAL),
+    "scaling": (("scaling",), _speed.scaling, _speed.SCALING),
+    "memory": (("memory",), _speed.memory, _speed.MEMORY),
+    "points": (POINTS, _speed.points, _speed.POINTS),
+}
 
 if __name__ == "__main__":
     parser = command_line(__doc__, "docs/results")
     parser.add_argument("benchmark", type=Path, help="the file that the benchmark wrote")
     a = parser.parse_args()
     found = json.loads(a.benchmark.read_text(encoding="utf-8"))
-    rows = [row for row in found["rows"] if row["part"] == "hang"]
     used = ("jax", "mujoco", "newton")
     libraries = ", ".join(f"{name} {found['machine'][name]}" for name in used)
     facts = {"libraries": libraries, "command": found["machine"]["command"]}
-    tables = {"hang": (runs(rows), RUNS), "hang_at_equal_error": (at_equal_error(rows), EQUAL)}
-    for name, (lines, caption) in tables.items():
+    for name, (parts, table, caption) in TABLES.items():
+        rows = [row for row in found["rows"] if row["part"] in parts]
+        if not rows:
+            continue
         path = a.out / f"{name}.csv"
-        keep(path, lines, caption, facts)
+        keep(path, table(rows), caption, facts)
         insert(DOCUMENT, name, shown(path))

@@ -31,7 +31,7 @@ from r2s.estimation.problem import OWN, SHARED, Problem
 Problems = tuple[Problem, ...]
 
 MARGIN = 1e-3  # of the unit cube, so that a start at its edge can move
-DAMPINGS, GROWTH = (1e-5, 1e6), 3.0
+DAMPINGS, GROWTH = (1e-3, 1e6), 3.0
 LONGEST_STEP = 0.2  # of a parameter's range
 FINEST = 1e-5  # [m]: no recording is better
 
