@@ -102,6 +102,8 @@ class EstimateCard:
     shape: tuple[int, int] | None = None
     """Vertices of the simulated sheet; by default diffcloud goes to finer meshes until one resolves
     the fabric, others take 9 9."""
+    finest: bool = False
+    """diffcloud: go on to 33 vertices along the longer side, whichever fabric is found: minutes."""
     hold_out: Annotated[str | None, arg(metavar="NAME|none")] = None
     """Recording to judge the estimate by, which is not made from it; none: of all of them."""
     seed: int = 0
@@ -184,11 +186,12 @@ class EstimateCard:
     def _check_alone(self, method: "Method") -> None:
         """Raise `ValueError` for what laboratory tests alone have no use for."""
         numbers = (self.coarse, self.starts, self.iterations, self.evaluations)
-        others = (self.solver, self.shape, self.hold_out, *numbers)
+        others = (self.solver, self.shape, self.hold_out, self.finest or None, *numbers)
         if method.name != "diffcloud" or self.seed or any(each is not None for each in others):
             raise ValueError(
                 "laboratory tests alone are fitted by least squares: --method, --solver, --shape, "
-                "--hold-out, --seed and the numbers of a search go with recordings of motions"
+                "--finest, --hold-out, --seed and the numbers of a search go with recordings of "
+                "motions"
             )
 
     def _space(self, method: "Method") -> "ParameterSpace":
@@ -232,6 +235,7 @@ class EstimateCard:
         kind = METHODS[self.method]
         known = kind.options()
         own: dict[str, Any] = {"angles": self.angles, "network": self.network}
+        own["finest"] = self.finest
         for name, value in own.items():
             if value and name not in known:
                 raise ValueError(f"--{name} is not of {self.method}")

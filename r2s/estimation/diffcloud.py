@@ -34,7 +34,11 @@ REFUSALS = {"points": "it differentiates through the cloth; on material points t
 
 @dataclass(frozen=True, kw_only=True)
 class DiffCloud(Method):
-    """The method of DIFFCLOUD: Gauss-Newton descents through the cloth."""
+    """The method of DIFFCLOUD: Gauss-Newton descents through the cloth.
+
+    - `finest`: goes on to the finest mesh, whichever fabric is found on the coarsest: minutes
+      instead of one, and right where the fabric's folds decide (docs/estimators.md).
+    """
 
     name = "diffcloud"
     budget = DEFAULT
@@ -44,15 +48,20 @@ class DiffCloud(Method):
     several = True
     takes_prior = True
 
+    finest: bool = False
+
     def reads(self, recording):
         return read_by_problem(recording)
 
     def _estimate(self, recordings, space, budget, key):
+        if self.finest and self.shape:
+            raise ValueError("a shape is that of the whole estimate: leave it out for the finest")
         return descend_by_meshes(
             recordings,
             space,
             budget,
             shape=self.shape,
+            finest=self.finest,
             checkpoint=self.checkpoint,
             progress=self.progress,
             key=key,

@@ -33,11 +33,15 @@ def descend_by_meshes(
     budget: Budget,
     *,
     shape: Shape | None = None,
+    finest: bool = False,
     checkpoint: Path | None = None,
     progress: Progress | None = None,
     key: PRNGKeyArray,
 ) -> Estimate:
     """The fabric that explains some recordings, on a mesh of `shape` or on one that resolves it.
+
+    `finest`: from the coarsest mesh straight to the finest of `r2s.scenarios.resolution.LADDER`,
+    whichever fabric is found.
 
     The other arguments are those of `r2s.estimation.descent.descend`; each mesh has a checkpoint.
     The `shape` of the estimate is that of the largest sheet.
@@ -62,10 +66,12 @@ def descend_by_meshes(
         return search(on(*shapes), more, start=start, derive=derive, key=key, **saved)
 
     rungs = [[shape] * len(recordings)] if shape else ladder(recordings)
+    if finest:
+        rungs = [rungs[0], rungs[-1]]
     found = None
     for last in rungs[:-1]:
         found = climb(last, found, True)
-        if not is_too_coarse(recordings, found.fabric, last):
+        if not finest and not is_too_coarse(recordings, found.fabric, last):
             break
     else:
         last = rungs[-1]
