@@ -11,6 +11,8 @@ import pytest
 from r2s import scenarios
 from r2s.estimation import descent, mesh_ladder
 from r2s.estimation.compiled import derivatives_at
+from r2s.estimation.diffcloud import DiffCloud
+from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import theta_length
 from r2s.estimation.mesh_bias import OtherMesh, factor, mesh_bias
 from r2s.estimation.method import Budget
@@ -103,3 +105,41 @@ def test_a_shape_that_is_asked_for_is_kept(monkeypatch):
     monkeypatch.setattr(resolution, "ENOUGH", 1e-9)
     found = mesh_ladder.descend_by_meshes([lift()], SPACE, SMALL, shape=(3, 3), key=jr.key(0))
     assert found.shape == (3, 3)
+
+
+def test_the_finest_mesh_is_reached_in_one_stride(monkeypatch):
+    """From the coarsest, whose fabric would do; and it is no shape that was asked for."""
+    climbed, here = [], jnp.zeros(3)
+
+    def searched(problems, budget, *, start=None, **_):
+        mesh = problems[0].scenario.scene.mesh
+        climbed.append((len(mesh.rest), budget.leads_on, start is None))
+        return descent.Search(problems, [], 0.0, derivatives_at)
+
+    monkeypatch.setattr(descent.Search, "theta", here)
+    monkeypatch.setattr(mesh_ladder, "search", searched)
+    monkeypatch.setattr(mesh_ladder, "judged", lambda *_, **__: estimate_of_nothing())
+    monkeypatch.setattr(resolution, "LADDER", (3, 5, 9))
+    found = mesh_ladder.descend_by_meshes([lift()], SPACE, SMALL, finest=True, key=jr.key(0))
+    assert climbed == [(9, True, True), (81, False, False)]
+    assert found.shape == (9, 9)
+    with pytest.raises(ValueError, match="leave it out"):
+        DiffCloud(finest=True, shape=(9, 9)).estimate([lift()], SPACE, key=jr.key(0))
+
+
+def estimate_of_nothing() -> Estimate:
+    return Estimate(
+        approach="none",
+        fabric=SPACE(PLACE),
+        ranges=SPACE.ranges,
+        values=np.zeros(2),
+        standard_errors=np.ones(2),
+        mesh_bias=None,
+        correlation=np.eye(2),
+        nuisances=(),
+        loss=0.0,
+        losses=np.zeros((1, 1)),
+        history=np.zeros((1, 1, 2)),
+        seconds=0.0,
+        converged=True,
+    )
