@@ -86,9 +86,14 @@ class Search(NamedTuple):
     derive: Derive
 
     @property
+    def best(self) -> Descent:
+        """The best descent, at its end."""
+        return _best(self.rows[-1])[1]
+
+    @property
     def theta(self) -> Theta:
-        """The end of the best descent, see `r2s.estimation.prediction`."""
-        return _best(self.rows[-1])[1].theta
+        """That end, see `r2s.estimation.prediction`."""
+        return self.best.theta
 
     @property
     def fabric(self) -> Fabric:
@@ -188,9 +193,6 @@ def judged(
         covariance = covariance + np.outer(bias, bias)
         if isinstance(problems[0].space, InformedSpace):
             theta, covariance, bias = weighed(problems, best, prior, covariance, bias)
-            inside = np.clip(theta, gauss_newton.MARGIN, 1 - gauss_newton.MARGIN)
-            theta[: problems[0].space.dim] = inside[: problems[0].space.dim]
-            theta = jnp.asarray(theta, float)
             seen = predictions_at(problems, theta)
             loss = loss_from(problems, seen)
             normal = dataclasses.replace(best.normal, loss=jnp.asarray(loss, float))
@@ -224,7 +226,7 @@ def each_alone(
     for which, problem in enumerate(problems):
         start = theta[theta_indices(problems, which)]
         each = search((problem,), alone, start=start, derive=derive, key=key)
-        ends.append(_best(each.rows[-1])[1])
+        ends.append(each.best)
     return ends
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from r2s.estimation import compiled, normal_equations
 from r2s.estimation.gauss_newton import (
+    MARGIN,
     Descent,
     Problems,
     prior_terms,
@@ -100,10 +101,10 @@ def _laid_onto(here: Problem, there: Problem, slope: Sensitivity) -> Sensitivity
 class Weighed(NamedTuple):
     """Where an estimate lies once its mesh's error counts as an error of the recordings.
 
-    - `theta`: there. `covariance`: of it. `bias`: of its mesh that is left.
+    - `theta`: there, within the unit cube. `covariance`: of it. `bias`: of its mesh that is left.
     """
 
-    theta: Float[np.ndarray, " theta"]
+    theta: Float[Array, " theta"]
     covariance: Float[np.ndarray, "theta theta"]
     bias: Float[np.ndarray, " theta"]
 
@@ -137,5 +138,7 @@ def weighed(
     left = (axes * np.maximum(sizes - 1, 0)[None]) @ axes.T
     errors = np.linalg.inv(left + known)
     theta = np.asarray(end.theta, np.float64) + errors @ (left @ alone - known @ off)
+    dim = problems[0].space.dim
+    theta[:dim] = np.clip(theta[:dim], MARGIN, 1 - MARGIN)
     led = np.linalg.lstsq(told, (told + known) @ bias, rcond=RCOND)[0]
-    return Weighed(theta, errors, errors @ left @ led)
+    return Weighed(jnp.asarray(theta, float), errors, errors @ left @ led)

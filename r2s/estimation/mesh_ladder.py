@@ -2,21 +2,26 @@
 
 The search over all of the range is made on the coarsest mesh, and ends early. Where
 `r2s.scenarios.resolution` says that the fabric found there needs a finer one, the descent goes on
-from it on the next, with the nuisances that were found; else it goes on to its end.
+on the next, from what is left of it once the mesh's error counts, with the nuisances that were
+found; else it goes on to its end.
 """
 
 import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from r2s.estimation import gauss_newton
 from r2s.estimation.compiled import remembering
-from r2s.estimation.descent import Search, judged, search
+from r2s.estimation.descent import Search, covariance_at, judged, search
 from r2s.estimation.estimate import Estimate
-from r2s.estimation.mesh_bias import OtherMesh, factor
+from r2s.estimation.mesh_bias import OtherMesh, factor, mesh_bias, weighed
 from r2s.estimation.method import Budget, Progress, tell
+from r2s.estimation.prediction import Theta
 from r2s.estimation.problem import Problem
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace
@@ -55,31 +60,56 @@ def descend_by_meshes(
     def on(*shapes: Shape) -> tuple[Problem, ...]:
         return _problems(recordings, space, shapes)
 
-    def climb(shapes: list[Shape], before: Search | None, leads_on: bool) -> Search:
-        start, more = (None, budget) if before is None else (before.theta, near(budget))
-        path = checkpoint
-        if path and before is not None:
-            rows, columns = shapes[0]
-            path = path.with_suffix(f".{rows}x{columns}{'' if leads_on else '.end'}.npz")
+    def climb(shapes: list[Shape], before: _Rung | None, leads_on: bool) -> _Rung:
+        start, more, path = None, budget, checkpoint
+        if before is not None:
+            start, more = before.found.theta, near(budget)
+            if before.shapes != shapes:
+                tell(progress, "where to begin on the next mesh")
+                other = _other_mesh(recordings, space, before.shapes)
+                start = _onwards(before.found, budget, other, key)
+            if path:
+                rows, columns = shapes[0]
+                path = path.with_suffix(f".{rows}x{columns}{'' if leads_on else '.end'}.npz")
         more = more._replace(leads_on=leads_on)
         saved = {"checkpoint": path, "progress": progress}
-        return search(on(*shapes), more, start=start, derive=derive, key=key, **saved)
+        found = search(on(*shapes), more, start=start, derive=derive, key=key, **saved)
+        return _Rung(shapes, found)
 
     rungs = [[shape] * len(recordings)] if shape else ladder(recordings)
     if finest:
         rungs = [rungs[0], rungs[-1]]
-    found = None
-    for last in rungs[:-1]:
-        found = climb(last, found, True)
-        if not finest and not is_too_coarse(recordings, found.fabric, last):
+    at = climb(rungs[0], None, len(rungs) > 1)
+    for shapes in rungs[1:]:
+        if not finest and not is_too_coarse(recordings, at.found.fabric, at.shapes):
+            at = climb(at.shapes, at, False)  # to its end
             break
-    else:
-        last = rungs[-1]
-    found = climb(last, found, False)
+        at = climb(shapes, at, shapes is not rungs[-1])
     tell(progress, "standard errors")
-    other = _other_mesh(recordings, space, last)
-    estimate = judged(found, budget, other_mesh=other, key=key)
-    return dataclasses.replace(estimate, shape=last[_largest(recordings)])
+    other = _other_mesh(recordings, space, at.shapes)
+    estimate = judged(at.found, budget, other_mesh=other, key=key)
+    return dataclasses.replace(estimate, shape=at.shapes[_largest(recordings)])
+
+
+class _Rung(NamedTuple):
+    """What was found on the meshes of some shapes, one for each recording."""
+
+    shapes: list[Shape]
+    found: Search
+
+
+def _onwards(found: Search, budget: Budget, other: OtherMesh, key: PRNGKeyArray) -> Theta:
+    """Where a descent on a finer mesh begins, after one on a mesh that `other` judges.
+
+    As far as that mesh errs, the prior counts for more (`r2s.estimation.mesh_bias.weighed`): what
+    it made of the recordings may be far from any fabric like it.
+    """
+    problems, best = found.problems, found.best
+    prior = gauss_newton.prior_weight(problems, best.normal)
+    predicted = found.derive(problems, best.theta, budget.width)
+    bias = mesh_bias(problems, other, best, prior, predicted)
+    covariance = covariance_at(problems, budget, best, key, predicted) + np.outer(bias, bias)
+    return weighed(problems, best, prior, covariance, bias).theta
 
 
 def ladder(recordings: Recordings) -> list[list[Shape]]:
