@@ -176,9 +176,9 @@ def judged(
 ) -> Estimate:
     """The estimate at the end of a search, with its standard errors.
 
-    `other_mesh`: by which its bias by its mesh is judged (`r2s.estimation.mesh_bias`), which the
-    standard errors then hold. Where something is known of the fabric beforehand, the estimate goes
-    towards that as far as its mesh errs (`r2s.estimation.mesh_bias.weighed`).
+    `other_mesh`: by which its bias by its mesh is judged, which the standard errors then hold. Where
+    it is finer, and something is known of the fabric beforehand, the estimate goes towards that as
+    far as its mesh errs (`r2s.estimation.mesh_bias.weighed`).
     """
     began, problems = time.perf_counter(), found.problems
     which, best = _best(found.rows[-1])
@@ -186,12 +186,11 @@ def judged(
     predicted, bias = found.derive(problems, best.theta, budget.width), None
     covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1), predicted)
     seen = [each for each, _ in predicted]
-    loss = loss_from(problems, seen)
-    rows = found.rows
+    loss, rows = loss_from(problems, seen), found.rows
     if other_mesh is not None:
         bias = mesh_bias(problems, other_mesh, best, prior, predicted)
         covariance = covariance + np.outer(bias, bias)
-        if isinstance(problems[0].space, InformedSpace):
+        if isinstance(problems[0].space, InformedSpace) and other_mesh.is_finer:
             theta, covariance, bias = weighed(problems, best, prior, covariance, bias)
             seen = predictions_at(problems, theta)
             loss = loss_from(problems, seen)
@@ -225,8 +224,7 @@ def each_alone(
     ends = []
     for which, problem in enumerate(problems):
         start = theta[theta_indices(problems, which)]
-        each = search((problem,), alone, start=start, derive=derive, key=key)
-        ends.append(each.best)
+        ends.append(search((problem,), alone, start=start, derive=derive, key=key).best)
     return ends
 
 

@@ -42,6 +42,11 @@ class OtherMesh(NamedTuple):
     problems: Problems
     factor: float
 
+    @property
+    def is_finer(self) -> bool:
+        """Whether its cells are shorter: a coarser mesh says how far, but hardly where to."""
+        return self.factor > 0
+
 
 def factor(ratio: float) -> float:
     """From a step to a mesh whose cells are `ratio` times as long, to one to a mesh without end."""
