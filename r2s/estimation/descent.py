@@ -176,7 +176,7 @@ def judged(
 ) -> Estimate:
     """The estimate at the end of a search, with its standard errors.
 
-    `other_mesh`: by which its bias by its mesh is judged, which the standard errors then hold. Where
+    `other_mesh`: by which its bias by its mesh is judged, which the standard errors then hold. If
     it is finer, and something is known of the fabric beforehand, the estimate goes towards that as
     far as its mesh errs (`r2s.estimation.mesh_bias.weighed`).
     """
