@@ -118,7 +118,6 @@ def test_the_finest_mesh_is_reached_in_one_stride(monkeypatch):
 
     monkeypatch.setattr(descent.Search, "theta", here)
     monkeypatch.setattr(mesh_ladder, "search", searched)
-    monkeypatch.setattr(mesh_ladder, "_onwards", lambda *_: here)
     monkeypatch.setattr(mesh_ladder, "judged", lambda *_, **__: estimate_of_nothing())
     monkeypatch.setattr(resolution, "LADDER", (3, 5, 9))
     found = mesh_ladder.descend_by_meshes([lift()], SPACE, SMALL, finest=True, key=jr.key(0))

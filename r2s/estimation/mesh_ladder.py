@@ -2,8 +2,7 @@
 
 The search over all of the range is made on the coarsest mesh, and ends early. Where
 `r2s.scenarios.resolution` says that the fabric found there needs a finer one, the descent goes on
-on the next, from what is left of it once the mesh's error counts, with the nuisances that were
-found; else it goes on to its end.
+from it on the next, with the nuisances that were found; else it goes on to its end.
 """
 
 import dataclasses
@@ -12,16 +11,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from r2s.estimation import gauss_newton
 from r2s.estimation.compiled import remembering
-from r2s.estimation.descent import Search, covariance_at, judged, search
+from r2s.estimation.descent import Search, judged, search
 from r2s.estimation.estimate import Estimate
-from r2s.estimation.mesh_bias import OtherMesh, factor, mesh_bias, weighed
+from r2s.estimation.mesh_bias import OtherMesh, factor
 from r2s.estimation.method import Budget, Progress, tell
-from r2s.estimation.prediction import Theta
 from r2s.estimation.problem import Problem
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace
@@ -64,10 +60,6 @@ def descend_by_meshes(
         start, more, path = None, budget, checkpoint
         if before is not None:
             start, more = before.found.theta, near(budget)
-            if before.shapes != shapes:
-                tell(progress, "where to begin on the next mesh")
-                other = _other_mesh(recordings, space, before.shapes)
-                start = _onwards(before.found, budget, other, key)
             if path:
                 rows, columns = shapes[0]
                 path = path.with_suffix(f".{rows}x{columns}{'' if leads_on else '.end'}.npz")
@@ -96,20 +88,6 @@ class _Rung(NamedTuple):
 
     shapes: list[Shape]
     found: Search
-
-
-def _onwards(found: Search, budget: Budget, other: OtherMesh, key: PRNGKeyArray) -> Theta:
-    """Where a descent on a finer mesh begins, after one on a mesh that `other` judges.
-
-    As far as that mesh errs, the prior counts for more (`r2s.estimation.mesh_bias.weighed`): what
-    it made of the recordings may be far from any fabric like it.
-    """
-    problems, best = found.problems, found.best
-    prior = gauss_newton.prior_weight(problems, best.normal)
-    predicted = found.derive(problems, best.theta, budget.width)
-    bias = mesh_bias(problems, other, best, prior, predicted)
-    covariance = covariance_at(problems, budget, best, key, predicted) + np.outer(bias, bias)
-    return weighed(problems, best, prior, covariance, bias).theta
 
 
 def ladder(recordings: Recordings) -> list[list[Shape]]:
