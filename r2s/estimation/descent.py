@@ -28,7 +28,7 @@ from r2s.estimation.compiled import (
 )
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
-from r2s.estimation.mesh_bias import OtherMesh, mesh_bias, weighed
+from r2s.estimation.mesh_bias import OtherMesh, inside, mesh_bias, weighed
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.misfits import left_out, misfits
 from r2s.estimation.nuisances import nuisances
@@ -191,8 +191,8 @@ def judged(
         bias = mesh_bias(problems, other_mesh, best, prior, predicted)
         covariance = covariance + np.outer(bias, bias)
         if isinstance(problems[0].space, InformedSpace) and other_mesh.is_finer:
-            theta, covariance, bias = weighed(problems, best, prior, covariance, bias)
-            seen = predictions_at(problems, theta)
+            place, covariance, bias = weighed(problems, best, prior, covariance, bias)
+            seen = predictions_at(problems, theta := inside(problems, place))
             loss = loss_from(problems, seen)
             normal = dataclasses.replace(best.normal, loss=jnp.asarray(loss, float))
             best = dataclasses.replace(best, theta=theta, normal=normal)

@@ -23,7 +23,7 @@ from r2s.estimation.gauss_newton import (
     theta_indices,
     theta_length,
 )
-from r2s.estimation.prediction import Prediction, Sensitivity
+from r2s.estimation.prediction import Prediction, Sensitivity, Theta
 from r2s.estimation.problem import Problem, motion_alone
 from r2s.geometry.surface import nearest
 from r2s.kept import kept
@@ -106,10 +106,10 @@ def _laid_onto(here: Problem, there: Problem, slope: Sensitivity) -> Sensitivity
 class Weighed(NamedTuple):
     """Where an estimate lies once its mesh's error counts as an error of the recordings.
 
-    - `theta`: there, within the unit cube. `covariance`: of it. `bias`: of its mesh that is left.
+    - `theta`: there. `covariance`: of it. `bias`: of its mesh that is left.
     """
 
-    theta: Float[Array, " theta"]
+    theta: Float[np.ndarray, " theta"]
     covariance: Float[np.ndarray, "theta theta"]
     bias: Float[np.ndarray, " theta"]
 
@@ -143,7 +143,11 @@ def weighed(
     left = (axes * np.maximum(sizes - 1, 0)[None]) @ axes.T
     errors = np.linalg.inv(left + known)
     theta = np.asarray(end.theta, np.float64) + errors @ (left @ alone - known @ off)
-    dim = problems[0].space.dim
-    theta[:dim] = np.clip(theta[:dim], MARGIN, 1 - MARGIN)
     led = np.linalg.lstsq(told, (told + known) @ bias, rcond=RCOND)[0]
-    return Weighed(jnp.asarray(theta, float), errors, errors @ left @ led)
+    return Weighed(theta, errors, errors @ left @ led)
+
+
+def inside(problems: Problems, theta: Float[np.ndarray, " theta"]) -> Theta:
+    """Theta with the fabric's place within the unit cube."""
+    is_fabric = np.arange(len(theta)) < problems[0].space.dim
+    return jnp.asarray(np.where(is_fabric, np.clip(theta, MARGIN, 1 - MARGIN), theta), float)
