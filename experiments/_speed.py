@@ -16,7 +16,7 @@ SCALING = (
 )
 MEMORY = (
     "Resident memory of value and gradient of a second of the scene hang, at the largest step: "
-    "what the call added at its peak, with what was built before it, and of the whole process."
+    "what the call added at its peak, and with what was built before it."
 )
 POINTS = (
     "Material points, CPU seconds of one core without compilation: million particle-steps a "
@@ -84,7 +84,6 @@ def memory(rows: list[dict[str, Any]]) -> list[Line]:
             "system": row["system"],
             "call [MB]": f"{row['call_mb']:.0f}",
             "set up and call [MB]": f"{row['built_mb']:.0f}",
-            "process [MB]": f"{row['process_mb']:.0f}",
         }
         for row in rows
     ]
