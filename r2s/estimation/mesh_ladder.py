@@ -42,7 +42,7 @@ def descend_by_meshes(
     """The fabric that explains some recordings, on a mesh of `shape` or on one that resolves it.
 
     `finest`: from the coarsest mesh straight to the finest of `r2s.scenarios.resolution.LADDER`,
-    whichever fabric is found.
+    whichever fabric is found; not with a `shape`.
 
     The other arguments are those of `r2s.estimation.descent.descend`; each mesh has a checkpoint.
     The `shape` of the estimate is that of the largest sheet.
@@ -52,7 +52,7 @@ def descend_by_meshes(
 
     derive = remembering()
 
-    @functools.cache
+    @functools.cache  # the same problems again, which `derive` knows
     def on(*shapes: Shape) -> tuple[Problem, ...]:
         return _problems(recordings, space, shapes)
 
