@@ -30,7 +30,7 @@ from r2s.commands.show import Show
 from r2s.commands.simulate import Simulate
 from r2s.commands.study import Study
 from r2s.commands.view import View
-from r2s.study.environment import one_core, one_thread
+from r2s.study.environment import one_thread
 
 NO_CACHE = "--no-cache"
 Command = (
@@ -88,9 +88,6 @@ def command() -> int:
     """`main` in a process of its own, which keeps what it compiles."""
     gc.set_threshold(100_000, 50, 100)  # to trace makes many objects that stay
     os.environ["XLA_FLAGS"] = one_thread(os.environ.get("XLA_FLAGS", ""))  # JAX has not begun yet
-    named = [each for each in sys.argv[1:] if each != NO_CACHE][:1]
-    if named in (["simulate"], ["estimate"], ["view"]):  # others mostly compile
-        one_core()
     if NO_CACHE in sys.argv:
         programs.forget()
     else:

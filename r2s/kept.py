@@ -65,14 +65,17 @@ class Kept:
         functools.update_wrapper(self, function)
         self._function, self._jitted = function, eqx.filter_jit(function)
         self._ready: dict[Any, Callable] = {}
-        self._lock = threading.Lock()
+        self._compiled: set[Any] = set()
+        self._locks: dict[Any, threading.RLock] = {}  # of each program
         _all.add(self)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         dynamic, static = eqx.partition((args, kwargs), eqx.is_array)
         leaves, _ = jax.tree.flatten(dynamic)
-        if programs.kept() is None or not _plain(leaves):
+        if not _plain(leaves):
             return self._jitted(*args, **kwargs)
+        if programs.kept() is None:
+            return self._compiled_once(_known(dynamic, static), args, kwargs)
         return self._program(dynamic, static)(leaves)
 
     def prepare(self, *args: Any, **kwargs: Any) -> None:
@@ -82,33 +85,41 @@ class Kept:
             self._program(dynamic, static)
 
     def _program(self, dynamic: Any, static: Any) -> Callable:
-        leaves, tree = jax.tree.flatten(dynamic)
-        shapes = tuple(_shape(leaf) for leaf in leaves)
-        parts, static_tree = jax.tree.flatten(static)
-        typed = tuple((type(part), part) for part in parts)  # 2 is not 2.0, though they are equal
-        known = (tree, shapes, typed, static_tree, _settings())
-        with self._lock:
+        known = _known(dynamic, static)
+        with self._lock_of(known):
             if known not in self._ready:
-                self._ready[known] = self._make(dynamic, static, shapes)
+                self._ready[known] = self._make(dynamic, static, known)
             return self._ready[known]
 
-    def _make(self, dynamic: Any, static: Any, shapes: tuple) -> Callable:
+    def _compiled_once(self, known: tuple, args: tuple, kwargs: dict) -> Any:
+        """By `filter_jit`, which compiles twice what two threads call for the first time."""
+        if known in self._compiled:
+            return self._jitted(*args, **kwargs)
+        with self._lock_of(known):
+            found = self._jitted(*args, **kwargs)
+            self._compiled.add(known)
+            return found
+
+    def _lock_of(self, known: tuple) -> threading.RLock:
+        return self._locks.setdefault(known, threading.RLock())
+
+    def _make(self, dynamic: Any, static: Any, known: tuple) -> Callable:
         store = programs.kept()
         leaves, tree = jax.tree.flatten(dynamic)
         specs = [jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type) for x in leaves]
         source = _source()
         if store is None or source is None:
-            return self._alone(tree, static)
+            return self._alone(tree, static, known)
         try:
             like = jax.tree.unflatten(tree, range(len(leaves)))
             what = _pickled((self._function, like, static))
-            key = _digest(self._function.__name__, source, what, shapes)
+            key = _digest(self._function.__name__, source, what, known[1])
             content = store.get(key)
             if content is None:
                 content = self._trace(tree, static, specs)
                 store.put(key, content)
         except (pickle.PicklingError, NotImplementedError):  # the latter: calls back to Python
-            return self._alone(tree, static)
+            return self._alone(tree, static, known)
         parts, out_like = pickle.loads(content)
         call = jax.jit(jax.export.Exported(**parts, _get_vjp=None).call)
         compiled, structure = call.lower(specs).compile(), jax.tree.structure(out_like)
@@ -126,10 +137,10 @@ class Kept:
         exported = jax.export.export(jax.jit(noted))(specs)
         return pickle.dumps((_parts(exported), found[-1]))
 
-    def _alone(self, tree: Any, static: Any) -> Callable:
+    def _alone(self, tree: Any, static: Any, known: tuple) -> Callable:
         def run(leaves: list) -> Any:
             args, kwargs = eqx.combine(jax.tree.unflatten(tree, leaves), static)
-            return self._jitted(*args, **kwargs)
+            return self._compiled_once(known, args, kwargs)
 
         return run
 
@@ -141,6 +152,7 @@ def let_go() -> None:
     """Let all programs go from memory, as `jax.clear_caches` does with its own."""
     for each in _all:
         each._ready.clear()
+        each._compiled.clear()
 
 
 def kept(function: Callable) -> Kept:
@@ -163,6 +175,14 @@ def _plain(leaves: list) -> bool:
 def _is_of_this_precision(leaf: Any) -> bool:
     is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.extended)
     return is_key or leaf.dtype.itemsize < 8 or bool(jax.config.jax_enable_x64)  # pyright: ignore
+
+
+def _known(dynamic: Any, static: Any) -> tuple:
+    """What tells one program of a function from another."""
+    leaves, tree = jax.tree.flatten(dynamic)
+    parts, static_tree = jax.tree.flatten(static)
+    typed = tuple((type(part), part) for part in parts)  # 2 is not 2.0, though they are equal
+    return tree, tuple(_shape(leaf) for leaf in leaves), typed, static_tree, _settings()
 
 
 def _shape(leaf: Any) -> tuple:

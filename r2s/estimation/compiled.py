@@ -4,7 +4,9 @@ What moves is compiled apart from what was seen of it, which is most of the work
 serves recordings of any number of points, all stages of a descent, and its end.
 """
 
+import itertools
 import math
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -20,6 +22,7 @@ from r2s.estimation.method import Progress, tell
 from r2s.estimation.prediction import Prediction, Sensitivity, Theta, predict, sensitivities
 from r2s.estimation.problem import Problem, motion_alone
 from r2s.kept import kept
+from r2s.side_by_side import side_by_side
 
 Predicted = list[tuple[Prediction, Sensitivity]]  # of each recording
 Derive = Callable[[Problems, Theta, float | None], Predicted]  # as `derivatives_at`
@@ -39,7 +42,20 @@ def derivatives_at(problems: Problems, theta: Theta, width: float | None = None)
 
     `width`: as in `r2s.estimation.prediction.sensitivities`.
     """
-    return [_sensitivities(*pair, width) for pair in _places(problems, theta)]
+    return side_by_side(lambda pair: _sensitivities(*pair, width), _places(problems, theta))
+
+
+def prepare(problems: Problems, width: float | None = None, *, derivatives: bool = True) -> None:
+    """Compile what `derivatives_at`, or else `predictions_at`, will run; from any thread.
+
+    Of use where programs are kept (`r2s.programs.keep`).
+    """
+    theta = jnp.zeros(gauss_newton.theta_length(problems), float)
+    for pair in _places(problems, theta):
+        if derivatives:
+            _sensitivities.prepare(*pair, width)
+        else:
+            predicted.prepare(*pair)
 
 
 def remembering() -> Derive:
@@ -49,19 +65,22 @@ def remembering() -> Derive:
     What was found there of more frames serves fewer, too.
     """
     known: dict[Any, _Known] = {}
+    lock = threading.Lock()
 
     def derive(problems: Problems, theta: Theta, width: float | None = None) -> Predicted:
-        return [one(*pair, width) for pair in _places(problems, theta)]
+        return side_by_side(lambda pair: one(*pair, width), _places(problems, theta))
 
     def one(problem: Problem, theta: Array, width: float | None):
         frames = problem.scenario.num_frames if problem.wanted is None else int(problem.wanted)
         place = id(problem.scenario), np.asarray(theta).tobytes(), width
-        found = known.pop(place, None)
+        with lock:
+            found = known.pop(place, None)
         if found is None or found.frames < frames:
             found = _Known(problem.scenario, frames, _sensitivities(problem, theta, width))
-        known[place] = found
-        while len(known) > 1 and sum(each.bytes for each in known.values()) > REMEMBERED:
-            del known[next(iter(known))]
+        with lock:
+            known[place] = found
+            while len(known) > 1 and sum(each.bytes for each in known.values()) > REMEMBERED:
+                del known[next(iter(known))]
         return found.derivatives
 
     return derive
@@ -81,7 +100,7 @@ class _Known(NamedTuple):
 
 def predictions_at(problems: Problems, theta: Theta) -> list[Prediction]:
     """What each recording would show at a theta."""
-    return [predicted(*pair) for pair in _places(problems, theta)]
+    return side_by_side(lambda pair: predicted(*pair), _places(problems, theta))
 
 
 def loss_from(problems: Problems, seen: Sequence[Prediction]) -> float:
@@ -113,16 +132,19 @@ def normal_from(
 def losses_at(
     problems: Problems, thetas: Float[Array, "start theta"], progress: Progress | None = None
 ) -> np.ndarray:
-    """The losses [m^2] of many thetas, simulated together; on a CPU one by one, since it gains
+    """The losses [m^2] of many thetas, simulated together; on a CPU side by side, since it gains
     nothing by simulating together."""
     if jax.default_backend() != "cpu":
         return np.asarray(_losses(problems, thetas))
+    numbers = itertools.count(1)
+
+    def loss(theta: Theta) -> float:
+        found = loss_from(problems, predictions_at(problems, theta))
+        tell(progress, f"coarse search {next(numbers)} of {len(thetas)}")
+        return found
+
     tell(progress, "compiling the motion")
-    losses = []
-    for number, theta in enumerate(thetas, 1):
-        losses.append(loss_from(problems, predictions_at(problems, theta)))
-        tell(progress, f"coarse search {number} of {len(thetas)}")
-    return np.array(losses)
+    return np.array(side_by_side(loss, thetas))
 
 
 def normals_at(
@@ -138,7 +160,7 @@ def normals_at(
     """
     if jax.default_backend() == "cpu" or len(thetas) == 1:
         pairs = zip(thetas, scales, strict=True)
-        return [normal_at(problems, theta, scale, width, derive) for theta, scale in pairs]
+        return side_by_side(lambda pair: normal_at(problems, *pair, width, derive), pairs)
     more = 2 ** math.ceil(math.log2(len(thetas))) - len(thetas)
     filled = (jnp.stack([*parts, *[parts[-1]] * more]) for parts in (thetas, scales))
     found = _normals(problems, *filled, width)
