@@ -22,6 +22,10 @@ POINTS = (
     "Material points, CPU seconds of one core without compilation: million particle-steps a "
     "second, and memory of the gradient beside what all states would take."
 )
+SIDE_BY_SIDE = (
+    "A lift of 60 frames, and its derivatives in seven parameters, as in an estimate: seconds of "
+    "one of twelve, all threads of OpenBLAS or one."
+)
 EQUAL = "The cheapest run of each system within 2 mm over 0.5 s, and its time over that of r2s."
 
 
@@ -102,6 +106,21 @@ def points(rows: list[dict[str, Any]]) -> list[Line]:
             "every state [MB]": f"{row['all_states_mb']:.0f}",
             "compiled in, forward / gradient [s]": f"{_number(row['forward_build_s'])} / "
             f"{_number(row['gradient_build_s'])}",
+        }
+        for row in rows
+    ]
+
+
+def side_by_side(rows: list[dict[str, Any]]) -> list[Line]:
+    """What one of several motions takes one by one, and on threads."""
+    return [
+        {
+            "vertices a side": str(row["side"]),
+            "what": row["what"],
+            "threads of OpenBLAS": row["threads"],
+            "how": row["how"],
+            "wall [s]": f"{row['wall_s']:.3f}",
+            "CPU [s]": f"{row['cpu_s']:.3f}",
         }
         for row in rows
     ]

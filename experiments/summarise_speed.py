@@ -1,10 +1,11 @@
-"""Put what `benchmarks/cloth.py` and `benchmarks/mpm.py` found into docs/speed.md.
+"""Put what `benchmarks/cloth.py`, `mpm.py` and `side_by_side.py` found into docs/speed.md.
 
 python experiments/summarise_speed.py results/speed.json    # that a benchmark wrote
 
 The runs of the part "hang" become the table `hang`, and of each system the cheapest run within 2 mm
 over half a second `hang_at_equal_error`; those of "scaling" and "memory" the tables of these names;
-those of material points `points`. Each is a file of OUT, and stands between the marks of its name.
+those of material points `points`, those of threads `side_by_side`. Each is a file of OUT, and stands
+between the marks of its name.
 """
 
 import json
@@ -21,6 +22,7 @@ TABLES = {
     "scaling": (("scaling",), _speed.scaling, _speed.SCALING),
     "memory": (("memory",), _speed.memory, _speed.MEMORY),
     "points": (POINTS, _speed.points, _speed.POINTS),
+    "side_by_side": (("side by side",), _speed.side_by_side, _speed.SIDE_BY_SIDE),
 }
 
 if __name__ == "__main__":

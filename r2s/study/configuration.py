@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 APPROACHES = {"diffcloud": "DIFFCLOUD", "diffcp": "DiffCP", "physnet": "PhysNet", "pinn": "PINN"}
 MOTIONS = ("folding", "fling", "shaking")  # that no estimate has seen
-TRUE_FABRIC = "true fabric on"  # stands for an approach in the label of the true fabric
+# baselines that are configurations as well, and what stands for an approach in their labels
+REFERENCES = {"true": "true fabric on", "middle": "middle of the prior on"}
 
 
 class Configuration(NamedTuple):
@@ -26,8 +27,8 @@ class Configuration(NamedTuple):
 
 
 def is_reference(label: str) -> bool:
-    """Whether a label is that of the default fabric, or of the true one, on a solver."""
-    return label.startswith(("default ", f"{TRUE_FABRIC} "))
+    """Whether a label is that of no estimate, but of a fabric to compare with, on a solver."""
+    return label.startswith(("default ", *(f"{name} " for name in REFERENCES.values())))
 
 
 PAPER_CONFIGURATIONS = (

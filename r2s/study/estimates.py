@@ -14,6 +14,7 @@ from r2s.estimation.estimate_json import as_json, from_json
 from r2s.estimation.method import Budget, Method, default_space
 from r2s.estimation.physnet.method import TrainingBudget, train_network
 from r2s.estimation.registry import METHODS
+from r2s.fabrics import prior
 from r2s.files import write_json
 from r2s.study.cells import Cell, result_files
 from r2s.study.sources import Source, read
@@ -104,6 +105,8 @@ class EstimateCell(Cell):
         """An estimate; one whose every simulation diverged is a result too, and says so."""
         recordings = [read(source, folder) for source in self.sources]
         space = default_space(self.solver, self.density)
+        if METHODS[self.approach].takes_prior and self.solver == "cloth":
+            space = prior.informed(space, self.density)
         try:
             found = self._estimated(recordings, space, folder)
         except jax.errors.JaxRuntimeError:  # out of memory, say: no result, to be tried again

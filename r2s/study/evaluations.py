@@ -32,6 +32,7 @@ from r2s.study.estimates import EstimateCell, read_estimate
 from r2s.study.sources import GivenRecording, Source, read, read_start, small_strain
 from r2s.study.starts import started
 
+MIDDLE = -1  # instead of the number of a draw
 MEASURED, MOTION = "measured.json", "motion.npz"
 # vertices of the simulated sheet: with 25 x 25 a fling of grey interlock is 7 mm off
 SHAPES = {"cloth": (33, 33), "points": (9, 9)}
@@ -50,8 +51,8 @@ class EvaluationCell(Cell):
     - `density`: areal, [kg/m^2].
     - `recordings`: what it is judged by, together, since they compile once.
     - `draw`: a number of `r2s.fabrics.prior.draws`, which know the density alone: together these
-      are the default. None: the truth of synthetic recordings at small strain, so what a perfect
-      estimate would reach.
+      are the default. `MIDDLE`: the middle of that prior, the best guess. None: the truth of
+      synthetic recordings at small strain, so what a perfect estimate would reach.
     - `other`: whether `estimate` is that of another fabric, for comparison.
     - `every`: 1 compares all frames that count, 3 every third.
     """
@@ -73,7 +74,9 @@ class EvaluationCell(Cell):
         """As in `r2s.study.rows.Row`."""
         if self.estimate is not None:
             return "other_fabric" if self.other else ""
-        return "true" if self.draw is None else "default"
+        if self.draw is None:
+            return "true"
+        return "middle" if self.draw == MIDDLE else "default"
 
     @property
     def scenario(self) -> str:
@@ -89,15 +92,14 @@ class EvaluationCell(Cell):
 
     @property
     def repeat(self) -> str:
-        """Which of several estimates, or draws, alike; "" for the true fabric."""
+        """Which of several estimates, or draws, alike; "" where there is one."""
         if self.estimate is not None:
             return str(self.estimate.repeat)
-        return "" if self.draw is None else str(self.draw)
+        return "" if self.draw in (None, MIDDLE) else str(self.draw)
 
     @property
     def name(self) -> str:
-        drawn = "" if self.draw is None else self.draw
-        whose = f"{self.baseline}{drawn}_{self.solver}_{self.fabric}"
+        whose = f"{self.baseline}{self.repeat}_{self.solver}_{self.fabric}"
         if self.estimate is not None:
             whose = self.estimate.name
         on = f"{self.fabric}_" if self.other else ""
@@ -143,6 +145,8 @@ class EvaluationCell(Cell):
         if self.estimate is None:
             if self.draw is None:
                 return small_strain(self.fabric)
+            if self.draw == MIDDLE:
+                return prior.middle(self.density)
             drawn = prior.draws(self.density, self.draw + 1, jr.key(self.draw))
             return jax.tree.map(lambda leaf: leaf[self.draw], drawn)
         found = read_estimate(self.estimate, folder)

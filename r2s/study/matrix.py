@@ -13,7 +13,7 @@ from r2s.fabrics import presets
 from r2s.scenarios.paths import ESTIMATION, EVALUATION
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
 from r2s.study.estimates import SOLVERS, Budgets, EstimateCell, TrainedNetwork
-from r2s.study.evaluations import EvaluationCell
+from r2s.study.evaluations import MIDDLE, EvaluationCell
 from r2s.study.mujoco_recording import FABRIC as FLEX
 from r2s.study.mujoco_recording import SCENARIOS as IN_MUJOCO
 from r2s.study.mujoco_recording import MujocoRecording
@@ -248,7 +248,7 @@ def _evaluations(
     plan: Plan,
 ) -> list[EvaluationCell]:
     """Cells for estimates of a fabric, and first, on each of their solvers, for the draws that are
-    the default, and for the true fabric where it is known.
+    the default, the middle of their prior, and the true fabric where it is known.
 
     `judged`: the recordings of each scenario.
     """
@@ -257,7 +257,7 @@ def _evaluations(
     is_known = all(isinstance(each, SyntheticRecording) for group in judged for each in group)
     whose: list[tuple[EstimateCell | None, str, int | None]] = []
     for solver in solvers:
-        whose += [(None, solver, draw) for draw in range(plan.draws)]
+        whose += [(None, solver, draw) for draw in (*range(plan.draws), MIDDLE)]
         whose += [(None, solver, None)] if is_known else []
     whose += [(each, each.solver, None) for each in estimates]
     return [

@@ -13,7 +13,8 @@ from r2s.study.configuration import Configuration
 
 # The values of Row.baseline, and what a table calls them.
 BASELINES = {"": "estimate"} | {
-    name: name.replace("_", " ") for name in ("default", "true", "other_fabric", "repeatability")
+    name: name.replace("_", " ")
+    for name in ("default", "middle", "true", "other_fabric", "repeatability")
 }
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float, Integer
 
 from r2s.evaluation.crossed import CrossedMean, crossed_mean, interval
 from r2s.evaluation.statistics import LEVEL
-from r2s.study.configuration import APPROACHES, TRUE_FABRIC, Configuration
+from r2s.study.configuration import APPROACHES, REFERENCES, Configuration
 from r2s.study.rows import Row, by_metric
 from r2s.study.statistics.result_array import (
     ResultArray,
@@ -139,8 +139,8 @@ def with_references(rows: Iterable[Row]) -> list[Row]:
         name = APPROACHES.get(row.approach, row.approach)
         if row.baseline == "other_fabric":
             found.append(replace(row, baseline="", approach=f"{name} (of another fabric)"))
-        elif row.baseline == "true":
-            found.append(replace(row, baseline="", approach=TRUE_FABRIC))
+        elif row.baseline in REFERENCES:
+            found.append(replace(row, baseline="", approach=REFERENCES[row.baseline]))
         elif row.baseline == "repeatability":
             found.append(replace(row, baseline="", approach="another trial"))
     return rows + found
