@@ -4,8 +4,8 @@ python experiments/summarise_speed.py results/speed.json    # that a benchmark w
 
 The runs of the part "hang" become the table `hang`, and of each system the cheapest run within 2 mm
 over half a second `hang_at_equal_error`; those of "scaling" and "memory" the tables of these names;
-those of material points `points`, those of threads `side_by_side`. Each is a file of OUT, and stands
-between the marks of its name.
+those of material points `points`, those of threads `side_by_side`. Each is a file of OUT, and
+stands between the marks of its name.
 """
 
 import json

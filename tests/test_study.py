@@ -247,8 +247,8 @@ def test_an_estimate_is_made_once_and_judged(tiny, tmp_path):
     table = forecast(costs(cells, tmp_path), plan)
     lines = {line[0]: line[1:] for line in table.rows}
     assert lines["estimates diffcloud cloth lifting"][0] == "3"
-    # 3 estimates, the true fabric and the draws, in 4 motions
-    assert lines["evaluations cloth shaking"][0] == str((3 + 1 + plan.draws) * 4)
+    # 3 estimates, the true fabric, the middle of the prior and the draws, in 4 motions
+    assert lines["evaluations cloth shaking"][0] == str((3 + 2 + plan.draws) * 4)
     assert float(lines["evaluations cloth shaking"][2]) > 0
     assert lines["evaluations cloth fling"][1:] == ("not measured", "-")
 

@@ -7,18 +7,15 @@ from it on the next, with the nuisances that were found; else it goes on to its 
 
 import dataclasses
 import functools
-import itertools
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from r2s.estimation.compiled import loss_from, prepare, remembering
+from r2s.estimation.compiled import prepare, remembering
 from r2s.estimation.descent import Search, judged, search
 from r2s.estimation.estimate import Estimate
-from r2s.estimation.gauss_newton import MARGIN
 from r2s.estimation.mesh_bias import OtherMesh, factor
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import Theta
@@ -28,11 +25,9 @@ from r2s.fabrics.parameters import ParameterSpace
 from r2s.recordings.recording import Recording
 from r2s.scenarios import resolution
 from r2s.scenarios.resolution import Shape
-from r2s.side_by_side import meanwhile, side_by_side
+from r2s.side_by_side import meanwhile
 
 Recordings = Sequence[Recording]
-
-FEWER = 8  # iterations from each of several places
 
 
 def descend_by_meshes(
@@ -49,8 +44,7 @@ def descend_by_meshes(
     """The fabric that explains some recordings, on a mesh of `shape` or on one that resolves it.
 
     `finest`: from the coarsest mesh straight to the finest of `r2s.scenarios.resolution.LADDER`,
-    whichever fabric is found, and there from several places (`starts_on_the_finest`), whose best
-    end by its loss is gone on from; not with a `shape`.
+    whichever fabric is found; not with a `shape`.
 
     The other arguments are those of `r2s.estimation.descent.descend`; each mesh has a checkpoint.
     The `shape` of the estimate is that of the largest sheet.
@@ -64,40 +58,17 @@ def descend_by_meshes(
     def on(*shapes: Shape) -> tuple[Problem, ...]:
         return _problems(recordings, space, shapes)
 
-    def climb(
-        shapes: list[Shape], start: Theta | None, leads_on: bool, name: str = "", most: int = 1000
-    ) -> _Rung:
+    def climb(shapes: list[Shape], start: Theta | None, leads_on: bool) -> _Rung:
         more, path = budget, checkpoint
         if start is not None:
             more = near(budget)
             if path:
                 rows, columns = shapes[0]
-                path = path.with_suffix(f".{rows}x{columns}{name}{'' if leads_on else '.end'}.npz")
-        more = more._replace(leads_on=leads_on, iterations=min(most, budget.iterations))
-        saved = {"checkpoint": path, "progress": None if name else progress}
+                path = path.with_suffix(f".{rows}x{columns}{'' if leads_on else '.end'}.npz")
+        more = more._replace(leads_on=leads_on)
+        saved = {"checkpoint": path, "progress": progress}
         found = search(on(*shapes), more, start=start, derive=derive, key=key, **saved)
         return _Rung(shapes, found)
-
-    def best_of_several(coarse: _Rung) -> _Rung:
-        """The end of the least loss, all of it, on the finest mesh from several places."""
-        shapes, other = rungs[-1], OtherMesh(on(*_others(coarse.shapes)), factor(0.5))
-        found = judged(coarse.found, budget, other_mesh=other, key=key)
-        starts = starts_on_the_finest(space, coarse.found.theta, found.fabric)
-        done = itertools.count(1)
-
-        def attempt(numbered: tuple[int, Theta]) -> tuple[float, _Rung]:
-            number, start = numbered
-            end = climb(shapes, start, True, f".{number}", FEWER)
-            seen = [each for each, _ in derive(on(*shapes), end.found.theta, budget.width)]
-            tell(progress, f"descents on the finest mesh: {next(done)} of {len(starts)} are done")
-            return loss_from(on(*shapes), seen), end
-
-        tell(progress, f"descents on the finest mesh from {len(starts)} places")
-        return min(side_by_side(attempt, enumerate(starts)), key=lambda found: found[0])[1]
-
-    rungs = [[shape] * len(recordings)] if shape else ladder(recordings)
-    if finest:
-        rungs = [rungs[0], rungs[-1]]
 
     def needed() -> Iterator[Callable[[], None]]:
         """What will be compiled, in the order in which it will most likely be run."""
@@ -109,9 +80,6 @@ def descend_by_meshes(
 
     with meanwhile(needed()):
         at = climb(rungs[0], None, len(rungs) > 1)
-        if finest:
-            at = best_of_several(at)
-            rungs = [at.shapes, at.shapes]  # to its end
         for shapes in rungs[1:]:
             if not finest and not is_too_coarse(recordings, at.found.fabric, at.shapes):
                 at = climb(at.shapes, at.found.theta, False)  # to its end
@@ -121,19 +89,6 @@ def descend_by_meshes(
         other = OtherMesh(on(*_others(at.shapes)), factor(2.0 if _is_finest(at.shapes) else 0.5))
         estimate = judged(at.found, budget, other_mesh=other, key=key)
     return dataclasses.replace(estimate, shape=at.shapes[_largest(recordings)])
-
-
-def starts_on_the_finest(space: ParameterSpace, theta: Theta, moved: Fabric) -> list[Theta]:
-    """Places to descend from on a mesh much finer than that where `theta` was found.
-
-    There the loss has many minima, and no one place is near the best of them for all fabrics:
-    theta; where its mesh's error leads to from there (a fabric `moved`); the middle of the prior;
-    and halfway between that and the moved one.
-    """
-    there = jnp.clip(space.to_unit(moved), MARGIN, 1 - MARGIN)
-    middle = jnp.clip(space.prior()[0], MARGIN, 1 - MARGIN)
-    places = [there, middle, (there + middle) / 2]
-    return [theta, *(theta.at[: space.dim].set(place) for place in places)]
 
 
 class _Rung(NamedTuple):
