@@ -70,6 +70,10 @@ def descend_by_meshes(
         found = search(on(*shapes), more, start=start, derive=derive, key=key, **saved)
         return _Rung(shapes, found)
 
+    rungs = [[shape] * len(recordings)] if shape else ladder(recordings)
+    if finest:
+        rungs = [rungs[0], rungs[-1]]
+
     def needed() -> Iterator[Callable[[], None]]:
         """What will be compiled, in the order in which it will most likely be run."""
         for shapes in rungs[:2]:
