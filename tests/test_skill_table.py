@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from r2s.evaluation.horizon import CLEAR, skill
-from r2s.study.configuration import TRUE_FABRIC, Configuration
+from r2s.study.configuration import REFERENCES, Configuration
 from r2s.study.report.figures import looks_of
 from r2s.study.report.page import PNG
 from r2s.study.report.skill_chart import skill_chart
@@ -23,7 +23,7 @@ from r2s.study.statistics.skills import draws, mean_floor, skills, with_floor
 
 LIFTING = Configuration("diffcloud", "cloth", "lifting")
 PINN = Configuration("pinn", "cloth", "stretching")
-TRUE = Configuration(TRUE_FABRIC, "cloth", "")
+TRUE = Configuration(REFERENCES["true"], "cloth", "")
 DEFAULT = Configuration("", "cloth", "")
 FABRICS = "denim", "knit", "satin"
 FLOOR = {"denim": 1e-3, "knit": 2e-3, "satin": 3e-3}
