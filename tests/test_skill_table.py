@@ -24,10 +24,12 @@ from r2s.study.statistics.skills import draws, mean_floor, skills, with_floor
 LIFTING = Configuration("diffcloud", "cloth", "lifting")
 PINN = Configuration("pinn", "cloth", "stretching")
 TRUE = Configuration(REFERENCES["true"], "cloth", "")
+MIDDLE = Configuration(REFERENCES["middle"], "cloth", "")
 DEFAULT = Configuration("", "cloth", "")
 FABRICS = "denim", "knit", "satin"
 FLOOR = {"denim": 1e-3, "knit": 2e-3, "satin": 3e-3}
 DRAWS = (16e-3, 24e-3)
+MIDDLES = 15e-3
 METRIC = "surface"
 
 
@@ -70,6 +72,7 @@ def made_up(fabrics: Sequence[str] = FABRICS, motion: str = "fling") -> list[Row
                     value = errors_of(each, fabric, trial, repeat)
                     rows.append(row(each, str(repeat), "", value))
             rows.append(row(DEFAULT, "", "true", 2 * floor))
+            rows.append(row(DEFAULT, "", "middle", MIDDLES))
             rows += [row(DEFAULT, str(i), "default", value) for i, value in enumerate(DRAWS)]
     return rows
 
@@ -90,7 +93,8 @@ def test_numbers_are_those_of_the_definition():
     table = skill_table(rows, METRIC)
     assert table.header[1:] == ("fling: error [mm]", "fling: floor [mm]", "fling: skill")
     assert [each[0] for each in table.rows] == [
-        "DIFFCLOUD cloth lifting", "PINN cloth stretching", "true fabric on cloth", "default cloth"
+        "DIFFCLOUD cloth lifting", "PINN cloth stretching", "middle of the prior on cloth",
+        "true fabric on cloth", "default cloth",
     ]  # fmt: skip
     default, own, found = np.mean(DRAWS), [], line(table, LIFTING.label)
     for fabric in FABRICS:
@@ -104,6 +108,8 @@ def test_numbers_are_those_of_the_definition():
     assert all(each[2] == "2.00" for each in table.rows)  # the floor's mean over fabrics
     true = np.mean([(default - 2 * f) / (default - f) for f in FLOOR.values()])
     assert line(table, TRUE.label)["fling: skill"].startswith(f"{true:.2f}")
+    middle = np.mean([(default - MIDDLES) / (default - f) for f in FLOOR.values()])
+    assert line(table, MIDDLE.label)["fling: skill"].startswith(f"{middle:.2f}")
 
 
 def test_the_interval_of_one_recording_and_repeat_is_students_over_fabrics():
@@ -131,7 +137,10 @@ def test_the_default_has_skill_zero_and_shows_the_spread_of_its_draws():
 @pytest.mark.parametrize("place", range(len(made_up())))
 def test_a_run_that_diverged_improves_nothing(place):
     whole, lost = made_up(), diverged(made_up(), place)
-    (whose,) = {(c := row.configuration) or TRUE for row in [whole[place]]}
+    (whose,) = {
+        (c := row.configuration) or {"true": TRUE, "middle": MIDDLE}[row.baseline]
+        for row in [whole[place]]
+    }
     before, after = with_floor(whole, METRIC), with_floor(lost, METRIC)
     first, second = (means(result_array(rows, METRIC)) for rows in (before, after))
     i = result_array(before, METRIC).configurations.index(whose)

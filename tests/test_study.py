@@ -16,8 +16,9 @@ import pytest
 from r2s.estimation.diffcloud import DiffCloud
 from r2s.estimation.estimate import point_estimate
 from r2s.evaluation import prediction_error
-from r2s.fabrics import presets
+from r2s.fabrics import presets, prior
 from r2s.fabrics.arcsim import write_material
+from r2s.fabrics.informed_space import InformedSpace
 from r2s.failures import Failure
 from r2s.recordings.recording import cloud
 from r2s.scenarios import synthetic
@@ -224,6 +225,34 @@ def tiny(monkeypatch):
         TruthSettings((5, 5), 1 / 15),
     )
     return matrix.synthetic(plan)[-1:], made
+
+
+def test_the_middle_of_the_prior_stands_beside_every_estimate(tmp_path):
+    """On each solver and in each motion once; its fabric knows the weight alone."""
+    cells = matrix.synthetic(matrix.with_changes(matrix.SMALL, fabrics=["grey_interlock"]))
+    middles = [cell for cell in cells if cell.baseline == "middle"]
+    places = [(cell.solver, cell.scenario) for cell in middles]
+    assert sorted(places) == sorted(itertools.product(("cloth", "points"), MOTIONS))
+    found, density = middles[0]._fabric(tmp_path), middles[0].density
+    assert found is not None and middles[0].repeat == ""
+    for one, other in zip(*map(jax.tree.leaves, (found, prior.middle(density))), strict=True):
+        assert one == other
+
+
+@pytest.mark.parametrize("name", ["diffcloud-cloth-lifting", "pinn-cloth-stretching"])
+def test_who_heeds_a_prior_is_told_of_fabrics_of_this_weight(name, tmp_path, monkeypatch):
+    plan = matrix.with_changes(matrix.SMALL, [name], ["grey_interlock"])
+    cell = next(c.estimate for c in matrix.synthetic(plan) if c.estimate is not None)
+    seen = []
+
+    def told(cell, recordings, space, folder):
+        seen.append(space)
+        raise RuntimeError("enough")
+
+    monkeypatch.setattr(EstimateCell, "_estimated", told)
+    monkeypatch.setattr(estimates, "read", lambda source, folder: None)
+    assert "enough" in cell.make(tmp_path, tmp_path)["diverged"]
+    assert isinstance(seen[0], InformedSpace) == name.startswith("diffcloud")
 
 
 @pytest.mark.slow(group="study")
