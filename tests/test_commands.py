@@ -19,10 +19,13 @@ from test_show import recorded  # noqa: E402
 from r2s.cli import main  # noqa: E402
 from r2s.commands.common import choose_shape, make_experiment, print_result  # noqa: E402
 from r2s.commands.doctor import EXCLUDED, EXTRAS, implausible  # noqa: E402
+from r2s.commands.estimate import EstimateCard, _approach  # noqa: E402
 from r2s.estimation import cards
 from r2s.estimation.cards import Card, Provenance  # noqa: E402
+from r2s.estimation.registry import METHODS  # noqa: E402
 from r2s.fabrics import presets  # noqa: E402
 from r2s.fabrics.arcsim import read_material  # noqa: E402
+from r2s.fabrics.informed_space import InformedSpace  # noqa: E402
 from r2s.recordings.open import load_trajectory  # noqa: E402
 from r2s.recordings.recording import load, save  # noqa: E402
 
@@ -292,3 +295,25 @@ def test_a_recording_that_cannot_be_simulated_says_why(
     command = ["estimate", str(tmp_path / "storm.npz"), "--density", "0.32", *budget]
     assert main([*command, "--out", str(tmp_path / "card.json")]) != 0
     assert re.search(f"all 1 simulations .* the first {FAILED}", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    ("options", "is_alone", "knows"),
+    [
+        ({}, True, True),
+        ({"prior": "flat"}, True, False),
+        ({}, False, False),  # laboratory tests are the prior
+        ({"prior": "fabrics"}, False, True),
+        ({"law": "stiffening"}, True, True),
+        ({"method": "diffcp"}, True, False),  # on material points
+        ({"method": "physnet"}, True, False),
+    ],
+)
+def test_fabrics_of_this_weight_are_known_to_whom_they_help(options, is_alone, knows):
+    """What they are like beforehand, unless something better is known, or nothing is asked for."""
+    card = EstimateCard((Path("lift.npz"),), 0.2, Path("card.json"), **options)
+    method = METHODS[card.method]()
+    told = card._prior(method, is_alone)
+    assert isinstance(card._space(method, told), InformedSpace) == knows
+    words = _approach("diffcloud", (), told)
+    assert ("prior of measured fabrics" in words) == knows

@@ -82,9 +82,10 @@ class EstimateCard:
     law: Literal["linear", "stiffening"] = "linear"
     """Of the yarns: of constant stiffness, or one that grows with their stretch (three
     numbers more)."""
-    prior: Literal["flat", "fabrics"] = "flat"
+    prior: Literal["flat", "fabrics"] | None = None
     """What is assumed beforehand: any place of the ranges alike, or what measured fabrics of this
-    weight are like. Then diffcloud trusts that more, as far as its mesh errs."""
+    weight are like. Then diffcloud trusts that more, as far as its mesh errs. By default fabrics
+    for diffcloud, unless laboratory tests say what is known; flat for what takes no prior."""
     name: str = ""
     """Name of the fabric; by default that of the recording."""
     coarse: int | None = None
@@ -134,7 +135,8 @@ class EstimateCard:
             raise ValueError("no recording: name an NPZ, a folder that holds some, or a JSON file")
         with Waiting("reading the recordings") as progress:
             method = self._method(progress)
-            space = self._space(method)
+            prior = self._prior(method, not known)
+            space = self._space(method, prior)
             tests = [test for each in known for test in each.tests]
             if seen:
                 method.check(seen)
@@ -159,7 +161,9 @@ class EstimateCard:
                 judged.append(held_out.judge(each, found.fabric, shape).describe())
         sources = [each.info.source for each in seen] + [each.source for each in known]
         provenance = cards.Provenance(
-            method="; ".join([f"estimated by r2s: {_approach(found, known)}", *judged]),
+            method="; ".join(
+                [f"estimated by r2s: {_approach(found.approach, known, prior)}", *judged]
+            ),
             source="; ".join(dict.fromkeys(source for source in sources if source)),
             recordings=(
                 *((each.info.name, cards.fingerprint(each)) for each in seen),
@@ -194,8 +198,14 @@ class EstimateCard:
                 "motions"
             )
 
-    def _space(self, method: "Method") -> "ParameterSpace":
-        """The fabrics to choose from; `ValueError` for a law that the solver's space lacks."""
+    def _prior(self, method: "Method", is_alone: bool) -> str:
+        """What is assumed beforehand; `is_alone`: whether there are no laboratory tests."""
+        usual = is_alone and method.takes_prior and method.chosen_solver == "cloth"
+        return self.prior or ("fabrics" if usual else "flat")
+
+    def _space(self, method: "Method", told: str) -> "ParameterSpace":
+        """The fabrics to choose from, of which `told` is assumed beforehand; `ValueError` for a law
+        that the solver's space lacks."""
         from r2s.estimation.method import default_space
         from r2s.fabrics import prior
         from r2s.fabrics.stiffening_space import StiffeningSpace
@@ -206,12 +216,12 @@ class EstimateCard:
                 f"{HEAVIEST:g} (100 g/m^2 are 0.1 kg/m^2)"
             )
         space = default_space(method.chosen_solver, self.density)
-        asked = self.law != "linear" or self.prior != "flat"
+        asked = self.law != "linear" or told != "flat"
         if asked and method.chosen_solver != "cloth":
             raise ValueError("--law and --prior are of the cloth: material points have their own")
         if self.law == "stiffening":
             space = StiffeningSpace.make(space)
-        return space if self.prior == "flat" else prior.informed(space, self.density)
+        return space if told == "flat" else prior.informed(space, self.density)
 
     def _hold_out(self, seen: "list[Recording]") -> "list[Recording]":
         """Take what is to be held out from the recordings, and return it: one, or none."""
@@ -276,12 +286,15 @@ def _warnings(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[s
     return [*lines, *(line for each in motions for line in mesh_warning(shape, fabric, *each))]
 
 
-def _approach(found: "Estimate", known: "Sequence[LaboratoryTests]") -> str:
+def _approach(approach: str, known: "Sequence[LaboratoryTests]", prior: str) -> str:
     """What it was estimated with, in words."""
     from r2s.laboratory.estimate import APPROACH
 
-    together = known and found.approach != APPROACH
-    return f"{found.approach}, after {APPROACH}" if together else found.approach
+    if known and approach != APPROACH:
+        approach = f"{approach}, after {APPROACH}"
+    if prior == "flat":
+        return approach
+    return f"{approach}, with the prior of measured fabrics of its weight"
 
 
 def _laboratory_lines(
