@@ -12,7 +12,7 @@ def command() -> int:
     # instructions for features that the machine lacks
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     # its threads wait for each other over matrices as small as ours: a motion on 17 x 17 vertices
-    # takes 1.5 times as long on two of them as on one
+    # takes 1.6 times as long on two of them as on one
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from r2s.cli import command
 

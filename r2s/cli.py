@@ -30,6 +30,7 @@ from r2s.commands.show import Show
 from r2s.commands.simulate import Simulate
 from r2s.commands.study import Study
 from r2s.commands.view import View
+from r2s.side_by_side import leave
 from r2s.study.environment import one_thread
 
 NO_CACHE = "--no-cache"
@@ -94,7 +95,7 @@ def command() -> int:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
             programs.keep()
-    return main()
+    return leave(main())
 
 
 def _warn(message, *_, **__) -> None:

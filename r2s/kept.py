@@ -34,22 +34,10 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from r2s import programs
+from r2s.side_by_side import settings
 
 LIBRARIES = ("jax", "jaxlib", "equinox", "lineax", "numpy")
 KNOWN = {"r2s", "builtins", "copyreg", "collections", "numpy", "pathlib", *LIBRARIES}
-SETTINGS = (
-    "jax_enable_x64",
-    "jax_default_matmul_precision",
-    "jax_numpy_dtype_promotion",
-    "jax_numpy_rank_promotion",
-    "jax_debug_nans",
-    "jax_debug_infs",
-    "jax_disable_jit",
-    "jax_default_prng_impl",
-    "jax_threefry_partitionable",
-    "jax_random_seed_offset",
-    "jax_platforms",
-)
 BEGAN = time.time() - time.process_time()  # [s], of this process, or a little later
 
 
@@ -182,15 +170,11 @@ def _known(dynamic: Any, static: Any) -> tuple:
     leaves, tree = jax.tree.flatten(dynamic)
     parts, static_tree = jax.tree.flatten(static)
     typed = tuple((type(part), part) for part in parts)  # 2 is not 2.0, though they are equal
-    return tree, tuple(_shape(leaf) for leaf in leaves), typed, static_tree, _settings()
+    return tree, tuple(_shape(leaf) for leaf in leaves), typed, static_tree, settings()
 
 
 def _shape(leaf: Any) -> tuple:
     return leaf.shape, str(leaf.dtype), leaf.weak_type
-
-
-def _settings() -> tuple:
-    return tuple(getattr(jax.config, name, None) for name in SETTINGS)
 
 
 def _parts(exported: jax.export.Exported) -> dict[str, Any]:
@@ -219,7 +203,7 @@ def _pickled(part: Any) -> bytes:
 
 
 def _digest(name: str, source: str, what: bytes, shapes: tuple) -> str:
-    told = repr((source, _settings(), jax.default_backend(), shapes))
+    told = repr((source, settings(), jax.default_backend(), shapes))
     told += os.environ.get("EQX_ON_ERROR", "")
     return f"traced_{name}-{hashlib.sha256(told.encode() + what).hexdigest()}"
 

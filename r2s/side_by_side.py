@@ -1,10 +1,13 @@
 """Independent calls of compiled programs on threads, as many as this process has cores.
 
 A compiled program lets other threads run, and a sheet is too small for several cores to share one:
-two motions on 9 x 9 vertices side by side take half as long as one after the other.
+two motions on 9 x 9 vertices side by side take little more than half as long as one by one. The
+variable `R2S_THREADS` of the environment is a limit.
 """
 
+import contextvars
 import os
+import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -15,6 +18,22 @@ import jax
 
 Item = TypeVar("Item")
 Found = TypeVar("Found")
+LIMIT = "R2S_THREADS"
+MEANWHILE = "r2s meanwhile"  # name of a thread
+# of JAX, that a thread may have of its own
+SETTINGS = (
+    "jax_enable_x64",
+    "jax_default_matmul_precision",
+    "jax_numpy_dtype_promotion",
+    "jax_numpy_rank_promotion",
+    "jax_debug_nans",
+    "jax_debug_infs",
+    "jax_disable_jit",
+    "jax_default_prng_impl",
+    "jax_threefry_partitionable",
+    "jax_random_seed_offset",
+    "jax_platforms",
+)
 
 
 class _Inside(threading.local):
@@ -24,33 +43,46 @@ class _Inside(threading.local):
 _inside = _Inside()
 
 
-def side_by_side(function: Callable[[Item], Found], items: Iterable[Item]) -> list[Found]:
+def side_by_side(
+    function: Callable[[Item], Found],
+    items: Iterable[Item],
+    done: Callable[[int], None] | None = None,
+) -> list[Found]:
     """What a function gives of each item, in their order.
 
-    One after the other on other devices than a CPU, on a single core, and within such a call.
-    Precision is that of the calling thread. An error of one call is raised when all others that
-    had begun are done.
+    One after the other on other devices than a CPU, on a single core, within such a call, and where
+    JAX has settings of the calling thread alone (`with jax.debug_nans(True)`). An error of one call
+    is raised when all others that had begun are done.
+
+    `done`: told in the calling thread how many of the first results are there.
 
     >>> side_by_side(abs, [-1, 2, -3])
     [1, 2, 3]
     """
-    items = list(items)
-    threads = min(cores(), len(items))
-    if threads < 2 or _inside.already or jax.default_backend() != "cpu":
-        return [function(item) for item in items]
-    is_double = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
+    items, found = list(items), []
+    threads = 1 if _inside.already else min(cores(), len(items))
+    if threads < 2 or jax.default_backend() != "cpu" or not _are_everywhere(settings()):
+        results = map(function, items)
+        return [_told(result, number, done) for number, result in enumerate(results, 1)]
 
     def call(item: Item) -> Found:
         _inside.already = True
-        with jax.enable_x64(is_double):
-            return function(item)
+        return function(item)
 
     with ThreadPoolExecutor(threads) as pool:
-        running = [pool.submit(call, item) for item in items]
+        running = [pool.submit(contextvars.copy_context().run, call, item) for item in items]
         try:
-            return [each.result() for each in running]
+            for number, each in enumerate(running, 1):
+                found.append(_told(each.result(), number, done))
         finally:
             pool.shutdown(cancel_futures=True)
+    return found
+
+
+def _told(result: Found, number: int, done: Callable[[int], None] | None) -> Found:
+    if done is not None:
+        done(number)
+    return result
 
 
 @contextmanager
@@ -58,29 +90,65 @@ def meanwhile(calls: Iterable[Callable[[], Any]]) -> Iterator[None]:
     """Calls on a thread of their own, one after the other, while the body of a `with` runs.
 
     For what the body will wait for otherwise, such as a program to compile. Those that have not
-    begun at its end are left out, and errors too: the body meets them itself. On a single core
+    begun at its end are left out, and errors too: the body meets them itself. One that has begun
+    goes on, see `leave`. On a single core, and where JAX has settings of the calling thread alone,
     there are none.
     """
-    if cores() < 2:
+    if cores() < 2 or not _are_everywhere(settings()):
         yield
         return
-    is_double = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
+    ended = threading.Event()
 
-    def make(call: Callable[[], Any]) -> None:
-        with jax.enable_x64(is_double):
-            call()
+    def work() -> None:
+        for call in calls:
+            if ended.is_set():
+                return
+            try:
+                call()
+            except Exception:  # the body meets it itself
+                return
 
-    pool = ThreadPoolExecutor(1)
-    for call in calls:
-        pool.submit(make, call)
+    threading.Thread(target=work, name=MEANWHILE, daemon=True).start()
     try:
         yield
     finally:
-        pool.shutdown(wait=False, cancel_futures=True)
+        ended.set()
+
+
+def leave(code: int) -> int:
+    """An exit code; or, where a thread of `meanwhile` still works, the end of the process with it.
+
+    For the end of a command, which need not wait until what it has no use for is compiled.
+    """
+    if any(thread.name == MEANWHILE for thread in threading.enumerate()):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    return code
 
 
 def cores() -> int:
-    """How many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    """How many cores this process may use, or as many as `R2S_THREADS` says.
+
+    Raises `ValueError` for a limit that is no whole number from 1 on.
+    """
+    most = os.environ.get(LIMIT, "").strip()
+    if most and not (most.isdecimal() and int(most) > 0):
+        raise ValueError(f"{LIMIT} must be a whole number from 1 on, got {most!r}")
+    affinity = getattr(os, "sched_getaffinity", None)
+    found = len(affinity(0)) if affinity else os.cpu_count() or 1
+    return min(found, int(most)) if most else found
+
+
+def settings() -> tuple:
+    """JAX's `SETTINGS` of this thread."""
+    return tuple(getattr(jax.config, name, None) for name in SETTINGS)
+
+
+def _are_everywhere(here: tuple) -> bool:
+    """Whether a new thread has these settings."""
+    found: list[tuple] = []
+    thread = threading.Thread(target=lambda: found.append(settings()))
+    thread.start()
+    thread.join()
+    return found == [here]

@@ -16,7 +16,7 @@ from r2s.study.report.motions import deciding_frame
 from r2s.study.report.page import PNG
 
 LABELS = "DIFFCLOUD cloth lifting", "DiffCP points lifting"
-REFERENCES = "true fabric on cloth", "default cloth"
+REFERENCES = "true fabric on cloth", "middle of the prior on cloth", "default cloth"
 
 
 def with_errors(errors, **changes):
@@ -108,6 +108,7 @@ def test_a_picture_of_each_motion_is_written(tmp_path, changes):
 def test_a_configuration_has_one_colour_whatever_else_is_shown():
     looks = looks_of((*REFERENCES, *LABELS))
     assert looks["true fabric on cloth"].colour == INK and looks["default cloth"].colour == GREY
+    assert len({look.colour for look in looks.values()}) == len(looks)
     assert looks == looks_of((*LABELS, *REFERENCES)) | looks
     assert looks_of(LABELS)[LABELS[1]] == looks[LABELS[1]]
     assert [looks[label].line for label in LABELS] == ["-", "--"]

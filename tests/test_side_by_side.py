@@ -1,10 +1,13 @@
 """Calls on threads give what calls one after the other give."""
 
+import subprocess
+import sys
 import threading
 import time
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from r2s import kept, side_by_side
@@ -48,11 +51,54 @@ def test_an_error_is_raised_and_what_has_not_begun_is_left_out(two_cores):
     assert len(begun) < 50
 
 
-@pytest.mark.parametrize("is_double", [False, True])
-def test_precision_is_that_of_the_caller(two_cores, is_double):
-    with jax.enable_x64(is_double):
-        found = side_by_side.side_by_side(lambda x: jnp.zeros(x).dtype, [1, 2])
-    assert found == [jnp.float64 if is_double else jnp.float32] * 2
+@pytest.mark.parametrize(
+    "setting",
+    [
+        lambda: jax.enable_x64(not jax.config.jax_enable_x64),  # pyright: ignore
+        lambda: jax.debug_nans(True),
+        lambda: jax.default_matmul_precision("highest"),
+    ],
+)
+def test_settings_of_the_calling_thread_alone_hold(two_cores, setting):
+    """Threads would not have them: so the caller works itself, and nothing is made meanwhile."""
+    made = []
+    with setting():
+        here = side_by_side.settings()
+        found = side_by_side.side_by_side(lambda _: side_by_side.settings(), [1, 2])
+        with side_by_side.meanwhile([lambda: made.append(1)]):
+            time.sleep(0.05)
+    assert found == [here] * 2 and made == []
+
+
+def test_numpys_settings_hold_on_threads(two_cores):
+    with np.errstate(divide="raise"):
+        found = side_by_side.side_by_side(lambda _: np.geterr()["divide"], [1, 2])
+    assert found == ["raise"] * 2
+
+
+def test_how_many_are_done_is_told_by_the_caller(two_cores):
+    told = []
+
+    def done(number):
+        told.append((number, threading.get_ident()))
+
+    side_by_side.side_by_side(abs, range(4), done)
+    assert told == [(number, threading.get_ident()) for number in (1, 2, 3, 4)]
+
+
+@pytest.mark.parametrize(("limit", "cores"), [("1", 1), ("", None), (" 1000 ", None)])
+def test_the_environment_limits_the_threads(monkeypatch, limit, cores):
+    monkeypatch.delenv(side_by_side.LIMIT, raising=False)
+    all_of_them = side_by_side.cores()
+    monkeypatch.setenv(side_by_side.LIMIT, limit)
+    assert side_by_side.cores() == (cores or all_of_them)
+
+
+@pytest.mark.parametrize("limit", ["0", "many", "-1"])
+def test_a_limit_that_is_none_is_refused(monkeypatch, limit):
+    monkeypatch.setenv(side_by_side.LIMIT, limit)
+    with pytest.raises(ValueError, match="whole number from 1 on"):
+        side_by_side.cores()
 
 
 def test_on_one_core_the_caller_works_alone(monkeypatch):
@@ -76,6 +122,7 @@ def test_meanwhile_another_thread_works_until_the_body_ends(two_cores):
     with side_by_side.meanwhile([first, lambda: made.append(1)]):
         assert began.wait(timeout=10)  # while the body is here
     end.set()
+    time.sleep(0.1)
     assert made == []  # it had not begun
 
 
@@ -91,3 +138,19 @@ def test_two_threads_that_call_a_kept_function_first_trace_it_once(two_cores):
     found = side_by_side.side_by_side(doubled, [jnp.ones(3), 2 * jnp.ones(3)])
     assert [each.tolist() for each in found] == [[2.0] * 3, [4.0] * 3]
     assert len(traced) == 1
+
+
+def test_the_end_of_a_command_does_not_wait_for_what_is_made_meanwhile():
+    """Nor does what is written go lost."""
+    code = """
+import time
+from r2s import side_by_side
+side_by_side.cores = lambda: 2
+with side_by_side.meanwhile([lambda: time.sleep(60)]):
+    print("the body")
+raise SystemExit(side_by_side.leave(3))
+"""
+    began = time.monotonic()
+    ended = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, timeout=55)
+    assert (ended.returncode, ended.stdout) == (3, b"the body\n") and time.monotonic() - began < 50
+    assert side_by_side.leave(3) == 3

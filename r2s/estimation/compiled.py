@@ -4,7 +4,6 @@ What moves is compiled apart from what was seen of it, which is most of the work
 serves recordings of any number of points, all stages of a descent, and its end.
 """
 
-import itertools
 import math
 import threading
 from collections.abc import Callable, Sequence
@@ -136,15 +135,15 @@ def losses_at(
     nothing by simulating together."""
     if jax.default_backend() != "cpu":
         return np.asarray(_losses(problems, thetas))
-    numbers = itertools.count(1)
 
     def loss(theta: Theta) -> float:
-        found = loss_from(problems, predictions_at(problems, theta))
-        tell(progress, f"coarse search {next(numbers)} of {len(thetas)}")
-        return found
+        return loss_from(problems, predictions_at(problems, theta))
+
+    def done(number: int) -> None:
+        tell(progress, f"coarse search {number} of {len(thetas)}")
 
     tell(progress, "compiling the motion")
-    return np.array(side_by_side(loss, thetas))
+    return np.array(side_by_side(loss, thetas, done))
 
 
 def normals_at(

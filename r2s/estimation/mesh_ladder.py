@@ -7,7 +7,9 @@ from it on the next, with the nuisances that were found; else it goes on to its 
 
 import dataclasses
 import functools
+import threading
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -54,9 +56,11 @@ def descend_by_meshes(
 
     derive = remembering()
 
-    @functools.cache  # the same problems again, which `derive` knows
+    known, lock = functools.cache(partial(_problems, recordings, space)), threading.Lock()
+
     def on(*shapes: Shape) -> tuple[Problem, ...]:
-        return _problems(recordings, space, shapes)
+        with lock:  # else two threads make them twice, and `derive` knows one of these
+            return known(shapes)
 
     def climb(shapes: list[Shape], start: Theta | None, leads_on: bool) -> _Rung:
         more, path = budget, checkpoint

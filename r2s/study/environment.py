@@ -7,6 +7,7 @@ from pathlib import Path
 
 from r2s import programs
 from r2s.extras import require
+from r2s.side_by_side import LIMIT
 
 ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 # Compiles a step in 60 to 70 % of the time, and it runs as fast. XLA ends a process whose flags it
@@ -20,8 +21,7 @@ def one_thread(flags: str) -> str:
     """XLA's flags, with linear algebra in one thread, since sheets are too small for more, and
     with less work for the compiler.
 
-    It is not enough on a busy machine: see `one_core`. XLA reads no further than the last word, so
-    what is there comes first.
+    XLA reads no further than the last word, so what is there comes first.
     """
     if ONE_THREAD in flags:
         return flags
@@ -33,9 +33,8 @@ def one_thread(flags: str) -> str:
 def one_core(number: int | None = None) -> None:
     """Bind this process to one of its cores: by a number, or the idlest.
 
-    Before JAX begins: it makes as many threads as it then has cores, and these spin while they wait
-    for each other. Beside other work a lift takes 2 to 8 CPU seconds instead of 0.11, whatever
-    XLA's flags say. Only Linux can bind processes; elsewhere nothing is done.
+    Before JAX begins, which makes as many threads as it then has cores: those of several processes
+    would wait for each other. Only Linux can bind processes; elsewhere nothing is done.
     """
     if not hasattr(os, "sched_setaffinity"):
         return
@@ -65,6 +64,7 @@ def environment(workers: int, compilation_cache: Path | None = None) -> dict[str
     level = os.environ.get("TF_CPP_MIN_LOG_LEVEL", JAX_LEVEL)
     one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     found = one | {
+        LIMIT: "1",
         "XLA_FLAGS": one_thread(os.environ.get("XLA_FLAGS", "")),
         "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.9 / workers:.3f}",
         "EQX_ON_ERROR": "nan",

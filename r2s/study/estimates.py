@@ -67,6 +67,7 @@ class EstimateCell(Cell):
     - `sources`: the recordings, of one scenario; several for the pulls of "pinn" alone.
     - `density`: areal density as weighed, [kg/m^2].
     - `network`: of "physnet".
+    - `prior`: "fabrics" where what fabrics of this weight are like is known (`r2s.fabrics.prior`).
     """
 
     kind: ClassVar[str] = "estimates"
@@ -80,6 +81,7 @@ class EstimateCell(Cell):
     budget: Budget
     network: TrainedNetwork | None = None
     repeat: int = 0
+    prior: str = ""
 
     def __post_init__(self) -> None:
         scenarios = {source.scenario for source in self.sources}
@@ -105,7 +107,7 @@ class EstimateCell(Cell):
         """An estimate; one whose every simulation diverged is a result too, and says so."""
         recordings = [read(source, folder) for source in self.sources]
         space = default_space(self.solver, self.density)
-        if METHODS[self.approach].takes_prior and self.solver == "cloth":
+        if self.prior:
             space = prior.informed(space, self.density)
         try:
             found = self._estimated(recordings, space, folder)

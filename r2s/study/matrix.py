@@ -292,7 +292,9 @@ def _estimate(
             training = dataclasses.replace(training, fabrics=fewer)
         network = TrainedNetwork(solver, scenario, training, plan.seed)
     fabric = sources[0].fabric
-    return EstimateCell(approach, solver, fabric, sources, density, budget, network, repeat)
+    knows = METHODS[approach].takes_prior and solver == "cloth"
+    prior = "fabrics" if knows else ""
+    return EstimateCell(approach, solver, fabric, sources, density, budget, network, repeat, prior)
 
 
 def _by_scenario(recordings: Iterable[GivenRecording]) -> list[tuple[GivenRecording, ...]]:

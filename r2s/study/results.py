@@ -42,8 +42,9 @@ DATA = (
 )
 RANGES = (
     "Searches begin in the middle, or among places that are even over the range (over its "
-    "logarithm, but for the coupling and nu), so what a motion does not tell comes from here. The "
-    "prior is that of the default fabric (r2s.fabrics.prior): it was not laid around the study's "
+    "logarithm, but for the coupling and nu), so what a motion does not tell comes from here. "
+    "DIFFCLOUD on the cloth begins in the middle of the prior instead, and is drawn to it. That is "
+    "the prior of the default fabric (r2s.fabrics.prior): it was not laid around the study's "
     "fabrics."
 )
 # The others are in files.

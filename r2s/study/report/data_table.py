@@ -24,10 +24,11 @@ HEADER = (
     "points of a frame",
     "markers",
     "force of grippers",
+    "prior",
 )
 CAPTION = (
     "Data of every approach, as its code reads them, and of the motions to judge by; all know the "
-    "sheet, the grippers' path and the wind"
+    "sheet, the grippers' path and the wind, and some what fabrics of its weight are like (prior)"
 )
 
 
@@ -57,6 +58,7 @@ def _of_estimates(cells: list[EvaluationCell], folder: Path) -> list[tuple[str, 
             str(len(seen)),
             seen_by(cell.sources[0], reads[0]),
             *_numbers(seen, reads),
+            cell.prior or "none",
         )
     return list(found.values())
 
@@ -78,7 +80,7 @@ def _of_judged(cells: list[EvaluationCell], folder: Path) -> list[tuple[str, ...
         reads = Reads(tuple(range(first, last + 1, every[scenario])), points=None)
         by = seen_by(made[0], reads)
         lines[scenario] = ("judged by", scenario, str(len(sources)), by)
-        lines[scenario] += _numbers([recording], [reads])
+        lines[scenario] += (*_numbers([recording], [reads]), MISSING)
     return list(lines.values())
 
 

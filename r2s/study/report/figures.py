@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from r2s.files import write_bytes
-from r2s.study.configuration import is_reference
+from r2s.study.configuration import REFERENCES, is_reference
 
 try:
     # The object API alone: pyplot would keep every figure, and choose a backend for the caller.
@@ -27,9 +27,11 @@ except ImportError as error:
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 SKY, GREY = "#56B4E9", "#8c8c8c"
 INK, SAND = "#202020", "#ecdcb0"  # of the true fabric, and of a floor
+BROWN = "#8a6d5a"  # of the middle of the prior
 # One for each configuration, the same in every picture: Okabe and Ito's, and then darker.
 LABEL_COLOURS = (BLUE, ORANGE, GREEN, VERMILION, SKY, "#CC79A7", "#B8A800", "#5D3A9B",
                  "#994F00", "#006CD1", "#40B0A6", "#7D7D00")  # fmt: skip
+OF_REFERENCES = {REFERENCES["true"]: INK, REFERENCES["middle"]: BROWN}
 MOST_DOTS = 1500  # a panel; more would hide the cloth
 
 
@@ -50,12 +52,13 @@ class Look(NamedTuple):
 
 def looks_of(labels: Iterable[str]) -> dict[str, Look]:
     """The look of each label, one for a whole page: colours in the order of the configurations; the
-    true fabric is dark and the default grey, whatever their order."""
+    true fabric is dark, the middle of the prior brown and the default grey, whatever their order.
+    """
     found, count = dict[str, Look](), 0
     for label in labels:
         if label in found:
             continue
-        colour = GREY if label.startswith("default ") else INK
+        colour = next((own for name, own in OF_REFERENCES.items() if label.startswith(name)), GREY)
         if not is_reference(label):
             colour, count = LABEL_COLOURS[count % len(LABEL_COLOURS)], count + 1
         found[label] = Look(colour, "--" if "points" in label.split() else "-")

@@ -82,7 +82,9 @@ def skill_sections(out: Path, rows: Sequence[Row], looks: Looks, keep: Keep) -> 
     words = [
         f"Fabrics that have floors: {_names(fabrics)}. Rows of the true fabric are what a perfect "
         "estimate would reach on that solver; the default knows the fabric's weight alone, and its "
-        "draws show by how much that varies."
+        "draws show by how much that varies; the middle of the prior is the best guess by it. "
+        "Where an approach knows that prior (DIFFCLOUD on the cloth), it has learned what it has "
+        "beyond the middle's skill."
     ]
     if len(fabrics) < 2:
         words.append("There are no intervals: one fabric has no spread between fabrics.")

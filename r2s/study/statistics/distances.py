@@ -132,7 +132,8 @@ def distance_table(rows: Sequence[Row], metric: str) -> Table:
 
 
 def with_references(rows: Iterable[Row]) -> list[Row]:
-    """Rows in which estimates of another fabric, and another trial, are configurations as well."""
+    """Rows in which `REFERENCES`, estimates of another fabric, and another trial are configurations
+    as well."""
     rows = list(rows)
     found = []
     for row in rows:

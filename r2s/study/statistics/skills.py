@@ -49,8 +49,8 @@ class Skill(NamedTuple):
 
 
 def with_floor(rows: Iterable[Row], metric: str) -> list[Row]:
-    """The rows of a metric that stand beside a floor, of estimates, true fabrics and defaults; true
-    fabrics are configurations in them."""
+    """The rows of a metric that stand beside a floor, of estimates, `REFERENCES` and defaults; the
+    second are configurations in them."""
     known = [row for row in rows if row.metric == metric and row.floor is not None]
     whose = [row for row in known if row.baseline in ("", "default", *REFERENCES)]
     return [row for row in with_references(whose) if row.baseline not in REFERENCES]
