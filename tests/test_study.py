@@ -214,7 +214,7 @@ def tiny(monkeypatch):
         values = np.asarray(space.values(middle))
         losses = np.full((1, 1), 1e-4)
         found = point_estimate("fake", space, middle, 1e-4, losses, values[None, None], 0.1)
-        return dataclasses.replace(found, shape=method.shape)
+        return dataclasses.replace(found, shape=method.chosen_shape)
 
     monkeypatch.setattr(DiffCloud, "_estimate", fake)
     plan = matrix.Plan(
@@ -253,6 +253,7 @@ def test_who_heeds_a_prior_is_told_of_fabrics_of_this_weight(name, tmp_path, mon
     monkeypatch.setattr(estimates, "read", lambda source, folder: None)
     assert "enough" in cell.make(tmp_path, tmp_path)["diverged"]
     assert isinstance(seen[0], InformedSpace) == name.startswith("diffcloud")
+    assert (estimates.method_of(cell).shape is None) == name.startswith("diffcloud")
 
 
 @pytest.mark.slow(group="study")

@@ -68,6 +68,7 @@ class EstimateCell(Cell):
     - `density`: areal density as weighed, [kg/m^2].
     - `network`: of "physnet".
     - `prior`: "fabrics" where what fabrics of this weight are like is known (`r2s.fabrics.prior`).
+    - `resolves`: on meshes that resolve the fabric (`r2s.estimation.mesh_ladder`), not `SHAPES`.
     """
 
     kind: ClassVar[str] = "estimates"
@@ -82,6 +83,7 @@ class EstimateCell(Cell):
     network: TrainedNetwork | None = None
     repeat: int = 0
     prior: str = ""
+    resolves: bool = False
 
     def __post_init__(self) -> None:
         scenarios = {source.scenario for source in self.sources}
@@ -133,7 +135,8 @@ def method_of(cell: EstimateCell, network: Path | None = None) -> Method:
     angles = tuple(getattr(each, "angle", None) or 0.0 for each in cell.sources)
     others = {"angles": angles, "network": network and network / NETWORK}
     taken = {name: value for name, value in others.items() if name in kind.options()}
-    return kind(solver=cell.solver, shape=SHAPES[cell.solver], **taken)
+    shape = None if cell.resolves else SHAPES[cell.solver]
+    return kind(solver=cell.solver, shape=shape, **taken)
 
 
 def read_estimate(cell: EstimateCell, folder: Path) -> Estimate | None:

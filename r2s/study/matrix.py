@@ -292,9 +292,12 @@ def _estimate(
             training = dataclasses.replace(training, fabrics=fewer)
         network = TrainedNetwork(solver, scenario, training, plan.seed)
     fabric = sources[0].fabric
-    knows = METHODS[approach].takes_prior and solver == "cloth"
-    prior = "fabrics" if knows else ""
-    return EstimateCell(approach, solver, fabric, sources, density, budget, network, repeat, prior)
+    as_usual = {}
+    if (approach, solver) == ("diffcloud", "cloth"):  # as `r2s estimate` does
+        as_usual = {"prior": "fabrics", "resolves": True}
+    return EstimateCell(
+        approach, solver, fabric, sources, density, budget, network, repeat, **as_usual
+    )
 
 
 def _by_scenario(recordings: Iterable[GivenRecording]) -> list[tuple[GivenRecording, ...]]:
