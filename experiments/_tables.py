@@ -4,7 +4,6 @@ import argparse
 import csv
 import importlib.metadata
 import io
-import os
 import shlex
 import sys
 import time
@@ -12,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from r2s.files import write_text
+from r2s.side_by_side import cores
 from r2s.study.environment import processor
 
 Line = dict[str, str]  # of a table, by column
@@ -26,8 +26,7 @@ def command_line(document: str | None, out: str) -> argparse.ArgumentParser:
 
 def machine() -> str:
     """Describe this machine: the number of cores that may be used, and the processor."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{cores} cores, {processor()}"
+    return f"{cores()} cores, {processor()}"
 
 
 def write(path: Path, lines: Sequence[Line], caption: str, facts: Line | None = None) -> None:

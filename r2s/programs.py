@@ -20,6 +20,8 @@ from pathlib import Path
 
 import jax
 
+from r2s.side_by_side import cores
+
 SUFFIX = ".program"
 MOST = 1_000_000_000  # [byte] of all programs: some hundred motions with their gradients
 HEADER = hashlib.sha256().digest_size  # [byte]
@@ -161,8 +163,7 @@ def machine() -> str:
 
     A home folder may be shared by machines that do not understand each other's programs.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    told = [platform.machine(), platform.system(), f"{cores} cores"]
+    told = [platform.machine(), platform.system(), f"{cores()} cores"]
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:  # not Linux: the machine's own name

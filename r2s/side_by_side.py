@@ -60,8 +60,8 @@ def side_by_side(
     [1, 2, 3]
     """
     items, found = list(items), []
-    threads = 1 if _inside.already else min(cores(), len(items))
-    if threads < 2 or jax.default_backend() != "cpu" or not _are_everywhere(settings()):
+    count = 1 if _inside.already else min(threads(), len(items))
+    if count < 2 or jax.default_backend() != "cpu" or not _are_everywhere(settings()):
         results = map(function, items)
         return [_told(result, number, done) for number, result in enumerate(results, 1)]
 
@@ -69,7 +69,7 @@ def side_by_side(
         _inside.already = True
         return function(item)
 
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(count) as pool:
         running = [pool.submit(contextvars.copy_context().run, call, item) for item in items]
         try:
             for number, each in enumerate(running, 1):
@@ -94,7 +94,7 @@ def meanwhile(calls: Iterable[Callable[[], Any]]) -> Iterator[None]:
     goes on, see `leave`. On a single core, and where JAX has settings of the calling thread alone,
     there are none.
     """
-    if cores() < 2 or not _are_everywhere(settings()):
+    if threads() < 2 or not _are_everywhere(settings()):
         yield
         return
     ended = threading.Event()
@@ -128,16 +128,20 @@ def leave(code: int) -> int:
 
 
 def cores() -> int:
-    """How many cores this process may use, or as many as `R2S_THREADS` says.
+    """How many cores this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def threads() -> int:
+    """As many as there are `cores`, or fewer, as `R2S_THREADS` says.
 
     Raises `ValueError` for a limit that is no whole number from 1 on.
     """
     most = os.environ.get(LIMIT, "").strip()
     if most and not (most.isdecimal() and int(most) > 0):
         raise ValueError(f"{LIMIT} must be a whole number from 1 on, got {most!r}")
-    affinity = getattr(os, "sched_getaffinity", None)
-    found = len(affinity(0)) if affinity else os.cpu_count() or 1
-    return min(found, int(most)) if most else found
+    return min(cores(), int(most)) if most else cores()
 
 
 def settings() -> tuple:

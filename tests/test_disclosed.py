@@ -265,7 +265,7 @@ def test_the_data_of_every_approach_stand_in_the_table(monkeypatch, lift, pull):
     made = [cell for cell in with_dependencies(cells) if isinstance(cell, EstimateCell)]
     assert {(f"{c.approach} on {c.solver}", c.scenario) for c in made} <= set(lines)
     count, by, frames, points, markers, force, prior = lines["pinn on cloth", "stretching"]
-    assert (count, frames, points, markers, force, prior) == ("3", "6", "-", "81", "yes", "none")
+    assert (count, frames, points, markers, force, prior) == ("3", "6", "-", "81", "yes", "flat")
     assert "markers" in by
     count, by, frames, points, markers, force, _ = lines["physnet on cloth", "lifting"]
     assert (count, frames, markers, force) == ("1", "8", "-", "-") and "2 depth cameras" in by

@@ -137,10 +137,8 @@ def test_the_default_has_skill_zero_and_shows_the_spread_of_its_draws():
 @pytest.mark.parametrize("place", range(len(made_up())))
 def test_a_run_that_diverged_improves_nothing(place):
     whole, lost = made_up(), diverged(made_up(), place)
-    (whose,) = {
-        (c := row.configuration) or {"true": TRUE, "middle": MIDDLE}[row.baseline]
-        for row in [whole[place]]
-    }
+    row = whole[place]
+    whose = row.configuration or {"true": TRUE, "middle": MIDDLE}[row.baseline]
     before, after = with_floor(whole, METRIC), with_floor(lost, METRIC)
     first, second = (means(result_array(rows, METRIC)) for rows in (before, after))
     i = result_array(before, METRIC).configurations.index(whose)

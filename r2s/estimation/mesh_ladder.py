@@ -24,6 +24,7 @@ from r2s.estimation.prediction import Theta
 from r2s.estimation.problem import Problem
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace
+from r2s.programs import kept
 from r2s.recordings.recording import Recording
 from r2s.scenarios import resolution
 from r2s.scenarios.resolution import Shape
@@ -86,7 +87,7 @@ def descend_by_meshes(
         for shapes in (_others(last), last):
             yield lambda shapes=shapes: prepare(on(*shapes), derivatives=False)
 
-    with meanwhile(needed()):
+    with meanwhile(needed() if kept() else ()):
         at = climb(rungs[0], None, len(rungs) > 1)
         for shapes in rungs[1:]:
             if not finest and not is_too_coarse(recordings, at.found.fabric, at.shapes):

@@ -22,7 +22,7 @@ Group = dict[str, list[EvaluationCell]]
 
 def motion_comparisons(cells: Iterable[EvaluationCell], folder: Path) -> list[MotionComparison]:
     """The first recording of each fabric and scenario with its simulations by all configurations,
-    the true fabric and the default that are made, at the frames that count.
+    references and defaults that are made, at the frames that count.
 
     Of several estimates, or draws, the sheet is that of the one in the middle, by its error within
     the horizon. Estimates come first, the default last.

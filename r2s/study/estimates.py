@@ -67,7 +67,8 @@ class EstimateCell(Cell):
     - `sources`: the recordings, of one scenario; several for the pulls of "pinn" alone.
     - `density`: areal density as weighed, [kg/m^2].
     - `network`: of "physnet".
-    - `prior`: "fabrics" where what fabrics of this weight are like is known (`r2s.fabrics.prior`).
+    - `prior`: "fabrics" where what fabrics of this weight are like is known (`r2s.fabrics.prior`),
+      else "flat", as on the command line.
     - `resolves`: on meshes that resolve the fabric (`r2s.estimation.mesh_ladder`), not `SHAPES`.
     """
 
@@ -82,7 +83,7 @@ class EstimateCell(Cell):
     budget: Budget
     network: TrainedNetwork | None = None
     repeat: int = 0
-    prior: str = ""
+    prior: str = "flat"
     resolves: bool = False
 
     def __post_init__(self) -> None:
@@ -109,7 +110,7 @@ class EstimateCell(Cell):
         """An estimate; one whose every simulation diverged is a result too, and says so."""
         recordings = [read(source, folder) for source in self.sources]
         space = default_space(self.solver, self.density)
-        if self.prior:
+        if self.prior != "flat":
             space = prior.informed(space, self.density)
         try:
             found = self._estimated(recordings, space, folder)

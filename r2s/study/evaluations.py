@@ -85,7 +85,7 @@ class EvaluationCell(Cell):
 
     @property
     def configuration(self) -> Configuration:
-        """Whose fabric it is: an approach's on a solver, or the default one."""
+        """Whose fabric it is: an approach's on a solver, or that of none (see `baseline`)."""
         if self.estimate is None:
             return Configuration("", self.solver, "")
         return Configuration(self.estimate.approach, self.solver, self.estimate.scenario)

@@ -292,11 +292,18 @@ def _estimate(
             training = dataclasses.replace(training, fabrics=fewer)
         network = TrainedNetwork(solver, scenario, training, plan.seed)
     fabric = sources[0].fabric
-    as_usual = {}
-    if (approach, solver) == ("diffcloud", "cloth"):  # as `r2s estimate` does
-        as_usual = {"prior": "fabrics", "resolves": True}
+    as_commands_do = (approach, solver) == ("diffcloud", "cloth")  # `r2s estimate`
     return EstimateCell(
-        approach, solver, fabric, sources, density, budget, network, repeat, **as_usual
+        approach,
+        solver,
+        fabric,
+        sources,
+        density,
+        budget,
+        network,
+        repeat,
+        prior="fabrics" if as_commands_do else "flat",
+        resolves=as_commands_do,
     )
 
 

@@ -38,7 +38,8 @@ MESHES = (
     "smaller may be the mesh's."
 )
 DATA = (
-    "Approaches differ in what they are given; a difference between them may be that of their data."
+    "Approaches differ in what they are given; a difference between them, in ranks and findings "
+    "too, may be that of their data, or of the prior."
 )
 RANGES = (
     "Searches begin in the middle, or among places that are even over the range (over its "

@@ -28,7 +28,8 @@ HEADER = (
 )
 CAPTION = (
     "Data of every approach, as its code reads them, and of the motions to judge by; all know the "
-    "sheet, the grippers' path and the wind, and some what fabrics of its weight are like (prior)"
+    "sheet, the grippers' path and the wind, and with the prior fabrics what fabrics of its weight "
+    "are like"
 )
 
 
@@ -58,7 +59,7 @@ def _of_estimates(cells: list[EvaluationCell], folder: Path) -> list[tuple[str, 
             str(len(seen)),
             seen_by(cell.sources[0], reads[0]),
             *_numbers(seen, reads),
-            cell.prior or "none",
+            cell.prior,
         )
     return list(found.values())
 

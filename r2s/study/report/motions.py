@@ -81,10 +81,10 @@ class MotionComparison:
 def deciding_frame(comparison: MotionComparison) -> int | None:
     """The frame before the horizon at which what is compared is farthest apart in error.
 
-    Those are the configurations, where there are two or more, else all that there is, as the true
-    fabric and the default; a single one where it is worst. What has diverged does not count, nor do
-    clouds with less than half of the points of the largest: cameras saw little then. None where no
-    frame is left.
+    Those are the configurations, where there are two or more, else all that there is, as references
+    and the default; a single one where it is worst. What has diverged does not count, nor do clouds
+    with less than half of the points of the largest: cameras saw little then. None where no frame
+    is left.
     """
     counts = np.array([len(cloud) for cloud in comparison.clouds])
     allowed = comparison.inside & (counts > 0) & (2 * counts >= counts.max())

@@ -28,7 +28,7 @@ OVER_TIME = (
 )
 SHEETS = (
     "Before the horizon, the frame at which what is compared is farthest apart in error: the "
-    "configurations, or where there is one alone, it, the true fabric and the default. Of several "
+    "configurations, or where there is one alone, it and the fabrics to compare with. Of several "
     "estimates or draws the sheet is that of the one in the middle, the number the mean error of "
     "all. The recorded points are alone in the last panel."
 )

@@ -15,7 +15,7 @@ from r2s.study.tables import MISSING, Table, significant
 
 
 def skill_table(rows: Sequence[Row], metric: str) -> Table:
-    """A line a configuration, the true fabric and the default; by motion error, floor and skill.
+    """A line a configuration, a reference and the default; by motion error, floor and skill.
 
     `rows`: what `r2s.study.statistics.skills.with_floor` returns, in metres.
     """

@@ -110,8 +110,8 @@ def distance_table(rows: Sequence[Row], metric: str) -> Table:
     """The table of one metric: a line a configuration, a cell a motion with mean and interval.
 
     The last column, "own", is what each was estimated from. The last lines are what to compare
-    with: default fabrics, estimates of another fabric, another trial. Metres are shown in
-    millimetres.
+    with: default fabrics, `REFERENCES`, estimates of another fabric, another trial. Metres are
+    shown in millimetres.
     """
     rows = with_references(rows)
     found = by_motion(result_array(rows, metric))

@@ -14,9 +14,9 @@ METRIC = "chamfer_real_to_sim"  # in metres, shown in millimetres
 def recording_tables(rows: Sequence[Row]) -> dict[str, Table]:
     """A table for each configuration and scenario: a line a recording, last their means.
 
-    Beside each recording's error stand that of the default fabric, of another fabric's estimate and
-    of another trial. There are tables of given recordings alone, where an estimate is judged by
-    what belongs to it. Where several estimates are judged by one recording, the first counts.
+    Beside each recording's error stand those of the other `BASELINES` that there are. There are
+    tables of given recordings alone, where an estimate is judged by what belongs to it. Where
+    several estimates are judged by one recording, the first counts.
     """
     configurations = dict.fromkeys(
         Configuration(row.approach, row.solver, row.estimated_from)
