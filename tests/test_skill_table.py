@@ -15,9 +15,16 @@ from r2s.study.configuration import REFERENCES, Configuration
 from r2s.study.report.figures import looks_of
 from r2s.study.report.page import PNG
 from r2s.study.report.skill_chart import skill_chart
-from r2s.study.report.skill_table import beyond_tables, needed_table, skill_table, skill_words
+from r2s.study.report.skill_table import (
+    beyond_tables,
+    learned_table,
+    needed_table,
+    skill_table,
+    skill_words,
+)
 from r2s.study.rows import Row
 from r2s.study.statistics.distances import means
+from r2s.study.statistics.learned import learned
 from r2s.study.statistics.result_array import result_array
 from r2s.study.statistics.skills import draws, mean_floor, skills, with_floor
 
@@ -158,6 +165,57 @@ def test_a_run_that_diverged_improves_nothing(place):
         assert skill_words(skills(after, "fling")[each]) == skill_words(
             skills(before, "fling")[each]
         )
+
+
+def test_what_is_learned_is_the_error_over_that_of_the_middle_of_the_prior():
+    rows = with_floor(made_up(), METRIC)
+    found, table = learned(rows, METRIC), learned_table(rows, METRIC)
+    assert table is not None and table.header == ("configuration", "fling")
+    assert set(found) == {LIFTING, PINN, TRUE}
+    for whose in (LIFTING, PINN):
+        logs = [
+            np.mean(
+                [
+                    np.log(errors_of(whose, fabric, t, r) / MIDDLES)
+                    for t in range(2)
+                    for r in range(2)
+                ]
+            )
+            for fabric in FABRICS
+        ]
+        (comparison,) = found[whose]["fling"].claim.comparisons
+        assert comparison.ratio == pytest.approx(1 / np.exp(np.mean(logs)))
+        own = line(table, whose.label)["fling"]
+        assert own.startswith(f"{np.exp(np.mean(logs)):.2f} [")
+        assert own.endswith(f"; {sum(log < 0 for log in logs)} of 3")
+    assert found[LIFTING]["fling"].answer == "holds"  # 7 to 10 mm in each, for 15
+    assert found[PINN]["fling"].answer == "cannot be told"  # 13 to 16
+
+
+def test_an_estimate_that_is_as_good_as_the_middle_has_learned_nothing():
+    """It may have skill all the same: the middle has."""
+    alike = [
+        replace(row, value=MIDDLES * (1 + 0.01 * i), skill=0.4)
+        if row.approach == "diffcloud"
+        else row
+        for i, row in enumerate(made_up())
+    ]
+    rows = with_floor(alike, METRIC)
+    assert learned(rows, METRIC)[LIFTING]["fling"].answer != "holds"
+    assert skills(rows, "fling")[LIFTING].mean == pytest.approx(0.4)
+
+
+def test_nothing_is_learned_where_runs_diverged_or_nothing_is_told():
+    rows = made_up()
+    own = next(i for i, row in enumerate(rows) if row.approach == "diffcloud")
+    lost = with_floor(diverged(rows, own), METRIC)
+    assert learned(lost, METRIC)[LIFTING]["fling"].answer == "cannot be told"
+    table = learned_table(lost, METRIC)
+    assert table is not None and line(table, LIFTING.label)["fling"].endswith("diverged: 1 and 0")
+    untold = [replace(row, skill=None) for row in rows]
+    assert learned_table(with_floor(untold, METRIC), METRIC) is None
+    without = [row for row in rows if row.baseline != "middle"]
+    assert learned_table(with_floor(without, METRIC), METRIC) is None
 
 
 def test_what_is_not_told_is_said():

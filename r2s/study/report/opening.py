@@ -11,7 +11,12 @@ from r2s.study.report.motions import MotionComparison, deciding_frame
 from r2s.study.report.page import Section
 from r2s.study.report.sections import Keep
 from r2s.study.report.skill_chart import skill_chart
-from r2s.study.report.skill_table import beyond_tables, needed_table, skill_table
+from r2s.study.report.skill_table import (
+    beyond_tables,
+    learned_table,
+    needed_table,
+    skill_table,
+)
 from r2s.study.rows import Row
 from r2s.study.statistics.skills import skills, with_floor
 from r2s.study.verdicts import BEYOND, SURFACE
@@ -84,7 +89,7 @@ def skill_sections(out: Path, rows: Sequence[Row], looks: Looks, keep: Keep) -> 
         "estimate would reach on that solver; the default knows the fabric's weight alone, and its "
         "draws show by how much that varies; the middle of the prior is the best guess by it. "
         "Where an approach knows that prior (DIFFCLOUD on the cloth), it has learned what it has "
-        "beyond the middle's skill."
+        "beyond that: the second table."
     ]
     if len(fabrics) < 2:
         words.append("There are no intervals: one fabric has no spread between fabrics.")
@@ -94,7 +99,9 @@ def skill_sections(out: Path, rows: Sequence[Row], looks: Looks, keep: Keep) -> 
             f"or no ensemble of truths: {_names(sorted(without))}."
         )
     path = skill_chart(out / "figures" / "skill.png", found, looks)
-    shown = keep("skill", skill_table(known, SURFACE)), keep("skill_needed", needed_table(known))
+    tables = {"skill": skill_table(known, SURFACE), "learned": learned_table(known, SURFACE),
+              "skill_needed": needed_table(known)}  # fmt: skip
+    shown = tuple(keep(name, table) for name, table in tables.items() if table)
     caption = "Skill of every configuration: 0 is the default, 1 the floor."
     sections = [Section("Skill", tuple(words), shown, ((path, caption),))]
     beyond = tuple(keep(name, table) for name, table in beyond_tables(rows, BEYOND).items())

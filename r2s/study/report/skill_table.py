@@ -9,6 +9,8 @@ from r2s.evaluation.statistics import LEVEL, SIGNIFICANCE
 from r2s.study.configuration import MOTIONS
 from r2s.study.rows import Row, by_metric
 from r2s.study.statistics.distances import cells_of, millimetres, with_references
+from r2s.study.statistics.hypotheses import Verdict
+from r2s.study.statistics.learned import learned
 from r2s.study.statistics.result_array import configurations_of, on_motion, result_array
 from r2s.study.statistics.skills import Draws, Skill, draws, mean_floor, skills
 from r2s.study.tables import MISSING, Table, significant
@@ -63,6 +65,27 @@ def needed_table(rows: Sequence[Row]) -> Table:
     return Table(("configuration", *motions), tuple(lines), caption)
 
 
+def learned_table(rows: Sequence[Row], metric: str) -> Table | None:
+    """What estimates add to the middle of the prior; None where it does not stand beside them."""
+    found = learned(rows, metric)
+    compared = {motion for of in found.values() for motion, v in of.items() if not _lacking(v)}
+    motions = [motion for motion in MOTIONS if motion in compared]
+    if not motions:
+        return None
+    lines = [
+        (configuration.label, *(_learned_words(of_motion[motion]) for motion in motions))
+        for configuration, of_motion in found.items()
+    ]
+    caption = (
+        f"Error ({metric}, within the horizon) over that of the middle of the prior on the same "
+        f"solver: geometric means over fabrics with {LEVEL:.0%} intervals, p (Student's t over "
+        "fabrics, Holm's correction over this table), and in how many fabrics the error is the "
+        "smaller one. Below 1, the recording has taught more than the fabric's weight tells. Of "
+        "recordings in which skill is told; runs that diverged have no ratio, and are counted."
+    )
+    return Table(("configuration", *motions), tuple(lines), caption)
+
+
 def beyond_tables(rows: Sequence[Row], prefix: str) -> dict[str, Table]:
     """By motion: how much each configuration's motion differs, from the horizon on, in what does
     not depend on the phase.
@@ -107,6 +130,24 @@ def skill_words(found: Skill) -> str:
         return f"{_number(found.mean)} ({lost}, median {_number(found.median)}){part}"
     ends = f" [{_number(found.low)}, {_number(found.high)}]" if found.low < found.high else ""
     return f"{_number(found.mean)}{ends}{part}"
+
+
+def _lacking(verdict: Verdict) -> str:
+    (comparison,) = verdict.claim.comparisons
+    return comparison.lacking
+
+
+def _learned_words(verdict: Verdict) -> str:
+    (comparison,), (p,) = verdict.claim.comparisons, verdict.corrected
+    if comparison.lacking:
+        return comparison.lacking
+    low, high = (1 / end for end in reversed(comparison.ends))
+    ends = f" [{low:.2f}, {high:.2f}], p {p:.2g}" if np.isfinite(low) else ""
+    own, middles = comparison.diverged
+    lost = f"; diverged: {own} and {middles}" if own or middles else ""
+    return (
+        f"{1 / comparison.ratio:.2f}{ends}; {comparison.agreeing} of {comparison.found.units}{lost}"
+    )
 
 
 def _needed_words(found: Skill) -> str:

@@ -1,0 +1,44 @@
+"""What an estimate adds to knowing the weight alone: its error beside that of the prior's middle.
+
+An approach that knows the prior of fabrics can do as well as its middle by learning nothing, so
+this and not the skill (which is told against random draws of that prior) says what a recording
+has taught.
+"""
+
+from collections.abc import Sequence
+
+from r2s.study.configuration import MOTIONS, REFERENCES, Configuration
+from r2s.study.rows import Row
+from r2s.study.statistics.hypotheses import Claim, Verdict, compare, judge
+from r2s.study.statistics.result_array import on_motion, result_array
+
+
+def learned(rows: Sequence[Row], metric: str) -> dict[Configuration, dict[str, Verdict]]:
+    """By configuration and motion: whether its errors are below those of the prior's middle on the
+    same solver, in the recordings that tell a skill; corrected for all that is compared here.
+
+    `rows`: what `r2s.study.statistics.skills.with_floor` returns. The true fabric is among the
+    configurations: it says what there is to learn. Empty where no middle stands beside them.
+    """
+    results = result_array([row for row in rows if _tells(row)], metric)
+    pairs = [
+        (configuration, middle, motion)
+        for configuration in results.configurations
+        if configuration.approach not in ("", REFERENCES["middle"])
+        and (middle := Configuration(REFERENCES["middle"], configuration.solver, ""))
+        in results.configurations
+        for motion in MOTIONS
+    ]
+    claims = [
+        Claim("", (compare(motion, on_motion(results, motion), [configuration], [middle]),))
+        for configuration, middle, motion in pairs
+    ]
+    found: dict[Configuration, dict[str, Verdict]] = {}
+    for (configuration, _, motion), verdict in zip(pairs, judge(claims), strict=True):
+        found.setdefault(configuration, {})[motion] = verdict
+    return found
+
+
+def _tells(row: Row) -> bool:
+    """Whether a row is of a recording in which fabrics differ clearly beyond the floor."""
+    return row.skill is not None
