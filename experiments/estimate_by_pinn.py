@@ -1,10 +1,10 @@
 """Estimate every fabric of a folder by the physics-informed network, from its stretchings.
 
-python experiments/estimate_by_pinn.py recordings --density 0.15 --angles 0 90 45
+python experiments/estimate_by_pinn.py recordings --density 0.15
 
-The recordings have markers and the force on the clamp. All pulls of a fabric count together, in the
-order of their names; ANGLES [degrees] are those from each pull to the warp. Printed for each
-fabric: its parameters with standard errors, in brackets those that the pulls do not determine.
+The recordings have markers and the force on the clamp, and say at which angle to the warp they are
+pulled. All pulls of a fabric count together. Printed for each fabric: its parameters with standard
+errors, in brackets those that the pulls do not determine.
 """
 
 from pathlib import Path
@@ -20,10 +20,9 @@ if __name__ == "__main__":
     parser = command_line(__doc__, "results/pinn.csv")
     parser.add_argument("recordings", type=Path)
     parser.add_argument("--density", type=float, default=0.15, help="areal density [kg/m^2]")
-    parser.add_argument("--angles", type=float, nargs="*", default=[0.0])
     a = parser.parse_args()
     space, key = r2s.OrthotropicSpace.make(a.density), jax.random.key(0)
-    method = PINN(angles=tuple(a.angles))
+    method = PINN()
     lines: list[Line] = []
     for fabric, recordings in by_fabric(recordings_in(a.recordings, "stretching")).items():
         found = method.estimate(recordings, space, key=key)

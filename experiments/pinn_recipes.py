@@ -36,7 +36,7 @@ def estimated(fabric: str, pulls: str, method: str, seed: str) -> Line:
         for i, angle in enumerate(angles)
     ]
     began = time.process_time()
-    found = METHODS[method](angles=angles).estimate(recordings, space, key=key)
+    found = METHODS[method]().estimate(recordings, space, key=key)
     seconds = time.process_time() - began
     errors = relative_errors(space, truth, found.values)
     numbers = zip(space.ranges, errors, found.standard_errors, strict=True)

@@ -165,7 +165,7 @@ def test_the_network_takes_a_stretching(name):
     from r2s.estimation.pinn.synthetic_pulls import pulled
 
     pull = pulled(FABRIC, "grey", 0.0, key=jr.key(0))
-    method = METHODS[name](angles=(0.0,))  # pyright: ignore
+    method = METHODS[name]()
     with jax.numpy_dtype_promotion("standard"):
         found = method.estimate([pull], SPACE, Budget(iterations=10), key=jr.key(0))
     assert found.approach.startswith(name) and np.isfinite(found.values).all()

@@ -139,7 +139,7 @@ def test_the_network_reads_markers_and_force_and_no_clouds(pull):
         pull_from(dataclasses.replace(pull, markers=None, markers_seen=None))
     published = METHODS["pinn-published"]().reads(pull)
     assert published.markers and not published.force
-    given = [pulls_of([each], (0.0,), without_force=True) for each in (pull, without)]
+    given = [pulls_of([each], without_force=True) for each in (pull, without)]
     assert alike(*given)
 
 

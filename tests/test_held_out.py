@@ -33,6 +33,7 @@ def test_the_last_motion_with_clouds_is_held_out_of_three_or_more(lift):
     assert held_out.choose([a, b]) is None
     assert held_out.choose([a, b, pull]) == 1
     assert held_out.choose([pull, pull, pull]) is None
+    assert held_out.choose([a, pull, pull]) is None  # nothing would be left to tell of bending
     assert held_out.choose([a, b, called(lift, "c")]) == 2
     assert held_out.choose([a, b, pull], held_out.NONE) is None
     assert held_out.choose([a, b], "a") == 0

@@ -298,7 +298,7 @@ def test_the_cloths_fabric_is_found(name, monkeypatch):
     keys = jr.split(jr.key(0), 3)
     with jax.numpy_dtype_promotion("standard"):
         some = [
-            pull_from(pulled(fabric, name, angle, shape=(33, 33), key=key), angle)
+            pull_from(pulled(fabric, name, angle, shape=(33, 33), key=key))
             for angle, key in zip(ANGLES, keys, strict=True)
         ]
         found = estimate(some, space, key=jr.key(1)).estimate

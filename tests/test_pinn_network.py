@@ -11,18 +11,17 @@ from flax import serialization
 
 from r2s.estimation.pinn.network import STRONG, WEAK, Network
 from r2s.estimation.pinn.stress import (
-    TurnedMembrane,
     divergence,
     green,
     nominal_stress,
     small,
-    turned,
 )
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import IsotropicSpace
 from r2s.geometry.mesh import rectangle
 from r2s.laws.membrane import OrthotropicMembrane
 from r2s.laws.solid import LinearSolid, lame
+from r2s.laws.turned import TurnedMembrane, turned
 
 FABRIC = Fabric.make(0.3, (200.0, 40.0, 120.0, 30.0), 1e-5, damping=0.02)
 ANGLE = jnp.asarray(0.4)

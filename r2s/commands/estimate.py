@@ -65,7 +65,7 @@ class EstimateCard:
         r2s estimate lift.npz --density 0.32 --out denim.json
         r2s estimate lift.npz wind.npz fling.npz --density 0.32 --out denim.json
         r2s estimate tests.json lift.npz --density 0.32 --out denim.json
-        r2s estimate warp.npz weft.npz --method pinn --angles 0 90 --density 0.2 --out mine.json
+        r2s estimate warp.npz bias.npz lift.npz --angles 0 45 --density 0.2 --out mine.json
     """
 
     recordings: Annotated[Positional[tuple[Path, ...]], arg(metavar="RECORDING")]
@@ -97,7 +97,7 @@ class EstimateCard:
     evaluations: int | None = None
     """Simulations of a search (cma-es 600, physnet 80)."""
     angles: Annotated[tuple[float, ...], arg(metavar="DEGREES")] = ()
-    """pinn: from each pull to the warp; by default 0."""
+    """From the pull of each stretching to the warp; by default what the recordings say."""
     network: Annotated[Path | None, arg(metavar="FILE")] = None
     """physnet: its trained network; by default that of --out with .network."""
     shape: tuple[int, int] | None = None
@@ -129,7 +129,8 @@ class EstimateCard:
 
         check_folders(self.out)
         files = [path for path in self.recordings if path.suffix == ".json"]
-        seen = list(open_recordings([path for path in self.recordings if path not in files]))
+        opened = open_recordings([path for path in self.recordings if path not in files])
+        seen = self._turned(list(opened))
         known = [read_tests(path) for path in files]
         if not seen and not known:
             raise ValueError("no recording: name an NPZ, a folder that holds some, or a JSON file")
@@ -227,12 +228,23 @@ class EstimateCard:
         """Take what is to be held out from the recordings, and return it: one, or none."""
         from r2s.estimation import held_out
 
-        if self.angles and self.hold_out is None:
-            return []  # one pull in each direction
-        if self.angles and self.hold_out != held_out.NONE:
-            raise ValueError("--hold-out does not go with --angles: name the recordings left")
         index = held_out.choose(seen, self.hold_out)
         return [] if index is None else [seen.pop(index)]
+
+    def _turned(self, seen: "list[Recording]") -> "list[Recording]":
+        """The recordings, of which the stretchings are at the angles that were asked for."""
+        from dataclasses import replace
+
+        pulls = [i for i, each in enumerate(seen) if each.info.scenario == "stretching"]
+        if not self.angles:
+            return seen
+        if len(self.angles) != len(pulls):
+            raise ValueError(
+                f"--angles: got {len(self.angles)} for {len(pulls)} stretchings: give one for each"
+            )
+        for i, angle in zip(pulls, self.angles, strict=True):
+            seen[i] = replace(seen[i], info=replace(seen[i].info, angle=angle))
+        return seen
 
     @property
     def _progress_file(self) -> Path:
@@ -244,8 +256,7 @@ class EstimateCard:
 
         kind = METHODS[self.method]
         known = kind.options()
-        own: dict[str, Any] = {"angles": self.angles, "network": self.network}
-        own["finest"] = self.finest
+        own: dict[str, Any] = {"network": self.network, "finest": self.finest}
         for name, value in own.items():
             if value and name not in known:
                 raise ValueError(f"--{name} is not of {self.method}")

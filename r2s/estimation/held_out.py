@@ -58,7 +58,8 @@ def choose(recordings: Sequence[Recording], name: str | None = None) -> int | No
     """Which recording to hold out; None: none of them.
 
     `name`: of the recording, or `NONE`; None: the last one with clouds that is no stretching (a
-    clamped sheet looks alike of any fabric), where there are `FEWEST` or more. Raises `ValueError`
+    clamped sheet looks alike of any fabric), where there are `FEWEST` or more, and another such one
+    is left: pulls tell nothing of bending and damping. Raises `ValueError`
     for an unknown name, for two recordings of that name, for one without clouds, and where none
     would be left.
     """
@@ -67,7 +68,7 @@ def choose(recordings: Sequence[Recording], name: str | None = None) -> int | No
     with_clouds = [i for i, each in enumerate(recordings) if has_clouds(each)]
     if name is None:
         moving = [i for i in with_clouds if recordings[i].info.scenario != "stretching"]
-        return moving[-1] if len(recordings) >= FEWEST and moving else None
+        return moving[-1] if len(recordings) >= FEWEST and len(moving) > 1 else None
     found = [i for i, each in enumerate(recordings) if each.info.name == name]
     if len(found) != 1:
         known = ", ".join(each.info.name for each in recordings)

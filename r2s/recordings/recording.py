@@ -93,8 +93,11 @@ class RecordingInfo:
       says that the cameras lag behind the grippers. `set_time_offset` changes it.
     - `doubt`: how far all this may be off; None: nobody said.
     - `views`: the cameras and what became of their points; None: nobody wrote them down.
+    - `angle`: from the pull of a stretching to the warp: 0 where the sheet was cut along the warp,
+      45 on the bias, 90 along the weft.
 
-    Raises ValueError for a wind or an offset that is not finite.
+    Raises ValueError for a wind, an offset or an angle that is not finite, and for an angle of
+    another motion.
     """
 
     name: str
@@ -110,12 +113,20 @@ class RecordingInfo:
     time_offset: float = 0.0  # [s]
     doubt: Doubt | None = None
     views: Views | None = None
+    angle: float = 0.0  # [degrees]
 
     def __post_init__(self) -> None:
         if self.wind is not None and (len(self.wind) != 3 or not np.isfinite(self.wind).all()):
             raise ValueError(f"wind must be three finite numbers [m/s], found {self.wind}")
         if not np.isfinite(self.time_offset):
             raise ValueError(f"time_offset must be finite [s], found {self.time_offset}")
+        if not np.isfinite(self.angle):
+            raise ValueError(f"angle must be finite [degrees], found {self.angle}")
+        if self.angle and self.scenario != "stretching":
+            raise ValueError(
+                f"angle is that of a stretching to the warp, found {self.angle} degrees for "
+                f"{self.scenario!r}: other motions have the sheet's sides along warp and weft"
+            )
 
 
 class Recording(eqx.Module):

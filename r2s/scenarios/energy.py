@@ -13,7 +13,7 @@ from r2s.geometry.mesh import Mesh
 from r2s.geometry.strain_samples import on_samples
 from r2s.laws.wrinkling import membrane_on_samples
 from r2s.scenarios.gripper_forces import step_with_forces
-from r2s.scenarios.scenario import Scenario, begin, stepped
+from r2s.scenarios.scenario import Scenario, as_cut, begin, stepped
 from r2s.solver import Solver
 from r2s.units import GRAVITY
 from r2s.world.drag import drag_on_vertices
@@ -63,6 +63,7 @@ def energy_balance(
     has forces at the ends of its steps); the air's is that in the middle of the step.
     """
     solver, substeps = stepped(scenario, max_step, solver)
+    fabric = as_cut(scenario, fabric)
     mesh, held = scenario.scene.mesh, scenario.scene.held
 
     def step(carried: Any, control: Control):

@@ -15,6 +15,7 @@ from r2s.cloth.self_contact.detection import SelfContact
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh, corner, rectangle
 from r2s.geometry.mesh import resized as resized_mesh
+from r2s.laws.turned import TurnedMembrane
 from r2s.recordings.recording import Recording, SheetPlacement
 from r2s.solver import Solver, Trajectory, simulate
 from r2s.world.air import Air, Fan
@@ -50,6 +51,7 @@ class Scenario(eqx.Module):
     - `wind`, `wind_times`: of the air, [m/s] and [s], linear between; None: still air.
     - `brake`: mass damping [1/s] before the first frame, beside the fabric's; None: none.
     - `acceleration`: at the start, [m/s^2], of a sheet that is let go there; None: it is at rest.
+    - `turn`: from the sheet's first side to the warp, [rad]; None: it lies along it.
     """
 
     scene: Scene
@@ -67,6 +69,7 @@ class Scenario(eqx.Module):
     brake: Float[Array, ""] | None = None
     acceleration: Float[Array, "vertex 3"] | None = None
     self_contact: SelfContact | None = None
+    turn: Float[Array, ""] | None = None
 
     def controls(self, substeps: int) -> Control:
         """What grippers and air do at the end of every substep, axes (frame, substep)."""
@@ -216,10 +219,10 @@ def from_recording(recording: Recording, shape: tuple[int, int] = (9, 9)) -> Sce
     """The scenario of a recording: its sheet, table, gripper path, wind and frame times.
 
     In a recording of "stretching" the sides between the held corners are clamped, in one of a
-    "swing" the side along the bar.
+    "swing" the side along the bar. A stretching may be of a sheet that is cut at an angle.
     """
     info = recording.info
-    return from_placement(
+    scenario = from_placement(
         info.sheet,
         info.table_height,
         recording.handle_path,
@@ -229,6 +232,19 @@ def from_recording(recording: Recording, shape: tuple[int, int] = (9, 9)) -> Sce
         clamps=CLAMPED.get(info.scenario, ()),
         wind=info.wind,
     )
+    if info.scenario != "stretching":
+        return scenario
+    return dataclasses.replace(scenario, turn=jnp.asarray(math.radians(info.angle), float))
+
+
+def as_cut(scenario: Scenario, fabric: Fabric) -> Fabric:
+    """The fabric in the axes of the scenario's sheet, which may be cut at an angle to its warp.
+
+    The membrane alone is turned: a stretched sheet is flat, so its bending does not count.
+    """
+    if scenario.turn is None:
+        return fabric
+    return dataclasses.replace(fabric, membrane=TurnedMembrane(fabric.membrane, scenario.turn))
 
 
 def resized(scenario: Scenario, ratio: Float[Array, ""]) -> Scenario:
@@ -265,7 +281,7 @@ def rollout(
     skipped = scenario.lead_in - 1
     start, controls = begin(solver, scenario), scenario.controls(substeps)
     wanted = None if frames is None else frames + skipped
-    moved = simulate(solver, fabric, start, controls, frames=wanted)
+    moved = simulate(solver, as_cut(scenario, fabric), start, controls, frames=wanted)
     return moved.from_frame(skipped)
 
 

@@ -133,8 +133,7 @@ def method_of(cell: EstimateCell, network: Path | None = None) -> Method:
     `network`: the folder of a trained one, which "physnet" needs to estimate.
     """
     kind = METHODS[cell.approach]
-    angles = tuple(getattr(each, "angle", None) or 0.0 for each in cell.sources)
-    others = {"angles": angles, "network": network and network / NETWORK}
+    others: dict[str, Any] = {"network": network and network / NETWORK}
     taken = {name: value for name, value in others.items() if name in kind.options()}
     shape = None if cell.resolves else SHAPES[cell.solver]
     return kind(solver=cell.solver, shape=shape, **taken)

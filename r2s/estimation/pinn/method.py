@@ -1,7 +1,6 @@
 """The physics-informed network by the contract of `r2s.estimation.method`."""
 
 import dataclasses
-import math
 import time
 from dataclasses import dataclass
 
@@ -26,8 +25,6 @@ class PINN(Method):
 
     No solver simulates: "cloth" and "points" tell which space is estimated. `Budget.iterations`
     are the epochs with physics of the networks' training; of clouds the rounds, at most 30.
-
-    - `angles`: from each pull to the warp, [degrees]; none: all pulls are along the warp.
     """
 
     name = "pinn"
@@ -37,8 +34,6 @@ class PINN(Method):
     refusals = REFUSALS
     several = True
     takes_shape = False
-
-    angles: tuple[float, ...] = ()
 
     def reads(self, recording):
         if recording.info.scenario == "stretching":
@@ -54,7 +49,7 @@ class PINN(Method):
         if all(each.info.scenario == "stretching" for each in recordings):
             recipe = dataclasses.replace(from_pulls.QUICK, adam=budget.iterations)
             return from_pulls.estimate(
-                pulls_of(recordings, self.angles),
+                pulls_of(recordings),
                 space,
                 recipe,
                 progress=self.progress,
@@ -79,8 +74,6 @@ class PublishedPINN(Method):
     """The recipe of the paper, `r2s.estimation.pinn.published_recipe`, from stretchings.
 
     It starts in the middle of the space. Without force nothing fixes the scale of the stiffness.
-
-    - `angles`: from each pull to the warp, [degrees]; none: all pulls are along the warp.
     """
 
     name = "pinn-published"
@@ -90,8 +83,6 @@ class PublishedPINN(Method):
     several = True
     takes_shape = False
 
-    angles: tuple[float, ...] = ()
-
     def reads(self, recording):
         return Reads(frames_that_count(recording), markers=True)
 
@@ -99,7 +90,7 @@ class PublishedPINN(Method):
         from r2s.estimation.pinn import published_recipe  # needs flax
 
         began = time.perf_counter()
-        pulls = pulls_of(recordings, self.angles, without_force=True)
+        pulls = pulls_of(recordings, without_force=True)
         middle, epochs = jnp.full(space.dim, 0.5, float), budget.iterations
         course = published_recipe.train(
             space, stacked(pulls), middle, epochs, min(CHUNK, epochs), key=key
@@ -118,14 +109,6 @@ class PublishedPINN(Method):
         )
 
 
-def pulls_of(
-    recordings: list[Recording], angles: tuple[float, ...], without_force: bool = False
-) -> list[Pull]:
-    """The pulls of stretchings, at `angles` [degrees] to the warp."""
-    angles = angles or (0.0,) * len(recordings)
-    if len(angles) != len(recordings):
-        raise ValueError(f"got {len(angles)} angles for {len(recordings)} pulls")
-    return [
-        pull_from(recording, math.radians(angle), without_force=without_force)
-        for recording, angle in zip(recordings, angles, strict=True)
-    ]
+def pulls_of(recordings: list[Recording], without_force: bool = False) -> list[Pull]:
+    """The pulls of stretchings, each at its own angle to the warp."""
+    return [pull_from(recording, without_force=without_force) for recording in recordings]

@@ -3,6 +3,7 @@
 `pull_from` takes it from a recording and checks it.
 """
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -60,7 +61,7 @@ class Pull(eqx.Module):
 
 def pull_from(
     recording: Recording,
-    angle: float = 0.0,
+    angle: float | None = None,
     *,
     places: Float[np.ndarray, "marker 2"] | None = None,
     without_force: bool = False,
@@ -71,7 +72,8 @@ def pull_from(
     end of that side; a force of one number is taken along the pull. The model is that of a sheet in
     its plane: inertia, and on the table friction, while the table carries the weight.
 
-    - `angle`: from the pull to the warp [rad]: pi / 2 in a pull along the weft, pi / 4 on the bias.
+    - `angle`: from the pull to the warp [rad]: pi / 2 in a pull along the weft, pi / 4 on the bias;
+      None: what the recording says.
     - `places`: of the markers on the sheet at rest [m]; by default a grid with as many rows as
       columns, each marker in the middle of its cell.
     - `without_force`: leave the force out.
@@ -80,6 +82,8 @@ def pull_from(
     missing, lost, off the sheet or out of its plane, another way of holding, and a force that is
     missing, does not cover the frames, points the other way or is not in newtons.
     """
+    if angle is None:
+        angle = math.radians(recording.info.angle)
     try:
         return _pull(recording, angle, places, without_force)
     except ValueError as error:

@@ -8,7 +8,6 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimation.pinn.stress import TurnedMembrane
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh
 from r2s.geometry.surface import nearest
@@ -58,10 +57,8 @@ def pulled(
         route=experiment.route,
     )
     scenario = each_step.scenario(shape)
-    turned = dataclasses.replace(
-        fabric, membrane=TurnedMembrane(fabric.membrane, jnp.asarray(angle, float))
-    )
-    found = _account(scenario, turned, STRETCHING_INTERVAL / steps)
+    scenario = dataclasses.replace(scenario, turn=jnp.asarray(angle, float))
+    found = _account(scenario, fabric, STRETCHING_INTERVAL / steps)
     if not np.isfinite(np.asarray(found.x)).all():
         raise RuntimeError(f"the simulation of {name} diverged")
     key_markers, key_force = jr.split(key)
@@ -78,6 +75,7 @@ def pulled(
         sheet=experiment.sheet,
         table_height=experiment.table_height,
         verified=None,
+        angle=round(float(np.degrees(angle)), 9),
     )
     return make_recording(
         None,

@@ -1,0 +1,108 @@
+"""Pulls at an angle to the warp, by the cloth: another cut of the same fabric."""
+
+import dataclasses
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+from r2s import scenarios
+from r2s.commands.estimate import EstimateCard
+from r2s.estimation.method import default_space
+from r2s.estimation.pinn.synthetic_pulls import pulled
+from r2s.estimation.prediction import predict, theta_length
+from r2s.estimation.problem import Problem
+from r2s.estimation.registry import METHODS
+from r2s.fabrics import presets
+from r2s.recordings.recording import load, save
+from r2s.scenarios.scenario import as_cut, from_recording, rollout
+
+FABRIC = presets.camel_ponte_roma()
+SPACE = default_space("cloth", float(FABRIC.density))
+SHAPE = (4, 4)
+EXACT = {"marker_noise": 0.0, "force_noise": 0.0, "steps": 2}  # those of the scenario
+_predict, _rollout = eqx.filter_jit(predict), eqx.filter_jit(rollout)
+
+
+def pull_of(degrees, key=0, **noise):
+    """A short pull, recorded by markers and the clamp's force."""
+    options = {"shape": SHAPE, "frames": 7, "strain": 0.03, "moving": 0.15, "key": jr.key(key)}
+    return pulled(FABRIC, "camel", math.radians(degrees), **options, **noise)
+
+
+@pytest.fixture(scope="module")
+def bias():
+    """Without noise."""
+    return pull_of(30.0, **EXACT)
+
+
+def at_angle(recording, degrees):
+    """The recording as if the sheet had been cut at another angle."""
+    return dataclasses.replace(recording, info=dataclasses.replace(recording.info, angle=degrees))
+
+
+def test_the_true_fabric_predicts_a_pull_at_its_angle_and_no_other(bias):
+    assert bias.info.angle == 30.0
+    off = {}
+    for degrees in (30.0, 70.0):
+        problem = Problem.make(at_angle(bias, degrees), SPACE, shape=SHAPE)
+        theta = jnp.zeros(theta_length(problem)).at[: SPACE.dim].set(SPACE.to_unit(FABRIC))
+        seen, markers, force = _predict(problem, theta), problem.markers, problem.force
+        assert markers is not None and force is not None and seen.force is not None
+        at = jnp.einsum("mk,tmki->tmi", markers.weights, seen.x[:, markers.vertices])
+        away = float(jnp.abs(at - markers.positions).max())
+        missing = jnp.abs(seen.force - force.values).max() / jnp.abs(force.values).max()
+        off[degrees] = away, float(missing)
+    # a force is recorded at the frames, and predicted as the mean since the frame before
+    assert off[30.0][0] < 2e-4 and off[30.0][1] < 0.1
+    assert off[70.0][0] > 3 * off[30.0][0] and off[70.0][1] > 2.5 * off[30.0][1]
+
+
+def test_a_pull_along_the_weft_is_that_of_a_fabric_whose_yarns_are_swapped(bias):
+    law = FABRIC.membrane
+    swapped = dataclasses.replace(law, c11=law.c22, c22=law.c11)
+    across, along = (from_recording(at_angle(bias, each), SHAPE) for each in (90.0, 0.0))
+    found = _rollout(across, FABRIC).x, _rollout(along, FABRIC).x
+    turned = _rollout(along, dataclasses.replace(FABRIC, membrane=swapped)).x
+    np.testing.assert_allclose(found[0], turned, atol=2e-6)
+    assert float(jnp.abs(found[1] - turned).max()) > 1e-4
+
+
+def test_a_sheet_that_is_cut_along_its_yarns_has_the_laws_of_the_fabric():
+    assert as_cut(scenarios.lifting(num_frames=4, interval=1.0).scenario(SHAPE), FABRIC) is FABRIC
+
+
+def test_the_angle_is_part_of_a_recording_and_of_a_stretching_alone(bias, tmp_path):
+    save(bias, tmp_path / "bias.npz")
+    assert load(tmp_path / "bias.npz").info.angle == 30.0
+    with pytest.raises(ValueError, match="finite"):
+        dataclasses.replace(bias.info, angle=float("nan"))
+    with pytest.raises(ValueError, match="'lifting'"):
+        dataclasses.replace(bias.info, scenario="lifting")
+
+
+def test_angles_of_the_command_line_are_those_of_the_stretchings_in_their_order(bias, tmp_path):
+    info = dataclasses.replace(bias.info, scenario="wind", angle=0.0)
+    other = dataclasses.replace(bias, info=info)
+    command = EstimateCard((), 0.2, tmp_path / "out.json", angles=(45.0, 90.0))
+    found = command._turned([bias, other, bias])
+    assert [each.info.angle for each in found] == [45.0, 0.0, 90.0]
+    with pytest.raises(ValueError, match="got 2 for 1 stretching"):
+        command._turned([bias])
+
+
+@pytest.mark.slow(group="estimates")
+def test_diffcloud_finds_the_membrane_from_pulls_in_three_directions():
+    """Each direction tells its own stiffness: of one alone the others are not determined."""
+    recordings = [pull_of(each, key=i) for i, each in enumerate((0.0, 45.0, 90.0))]
+    found = METHODS["diffcloud"](shape=SHAPE).estimate(recordings, SPACE, key=jax.random.key(0))
+    truth = np.asarray(SPACE.values(SPACE.to_unit(FABRIC)))
+    own = [i for i, each in enumerate(SPACE.ranges) if each.name in ("warp", "weft", "shear")]
+    assert len(own) == 3
+    assert np.abs(found.values - truth)[own].max() < 0.05
+    alone = METHODS["diffcloud"](shape=SHAPE).estimate(recordings[:1], SPACE, key=jax.random.key(0))
+    assert (alone.standard_errors[own[1:]] > 3 * found.standard_errors[own[1:]]).all()
