@@ -3,6 +3,10 @@
 A compiled program lets other threads run, and a sheet is too small for several cores to share one:
 two motions on 9 x 9 vertices side by side take little more than half as long as one by one. The
 variable `R2S_THREADS` of the environment is a limit.
+
+No such program may factor matrices in batches (`jax.vmap` of `jnp.linalg.solve`): in jaxlib 0.10.1
+these occupy a thread of its pool while they wait for others of it, so two of them side by side may
+wait for ever.
 """
 
 import contextvars

@@ -1,5 +1,6 @@
 """Calls on threads give what calls one after the other give."""
 
+import re
 import subprocess
 import sys
 import threading
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from r2s import kept, side_by_side
+from r2s.estimation import gauss_newton
 
 
 @pytest.fixture
@@ -153,3 +155,19 @@ raise SystemExit(side_by_side.leave(3))
     ended = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, timeout=55)
     assert (ended.returncode, ended.stdout) == (3, b"the body\n") and time.monotonic() - began < 50
     assert side_by_side.leave(3) == 3
+
+
+def batches(function, *args):
+    """Calls of LAPACK in a program that take a batch of matrices."""
+    text = jax.jit(function).lower(*args).as_text()
+    calls = [line for line in text.splitlines() if "custom_call @lapack" in line]
+    assert calls
+    return [line for line in calls if re.search(r"tensor<(?!1x)\d+x\d+x\d+xf", line)]
+
+
+def test_what_runs_side_by_side_factors_no_batch_of_matrices():
+    """Two programs that do wait for each other for ever, each in a thread of jaxlib's only pool."""
+    scores, prior = jnp.ones((12, 5)), jnp.eye(5)
+    matrices = jnp.broadcast_to(prior, (12, 5, 5))
+    assert batches(jax.vmap(jnp.linalg.solve), matrices, scores)
+    assert not batches(gauss_newton.scatter, scores, matrices, jnp.ones(12), prior)

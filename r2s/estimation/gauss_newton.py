@@ -193,7 +193,8 @@ def scatter(
     # a cluster that alone tells something would leave nothing behind, but for rounding
     share = 1 - 16 * jnp.finfo(scores.dtype).eps
     left = jnp.eye(len(prior), dtype=scores.dtype)[None] - share * matrices @ jnp.linalg.inv(whole)
-    alone = jax.vmap(jnp.linalg.solve)(left, scores)
+    # one by one: batches of LAPACK in two programs at once wait for each other for ever
+    alone = jax.lax.map(lambda each: jnp.linalg.solve(*each), (left, scores))
     return _larger(alone.T @ alone, jnp.einsum("c,cuv->uv", noise, matrices), whole)
 
 
