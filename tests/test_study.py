@@ -35,6 +35,7 @@ from r2s.study.mujoco_recording import MujocoRecording
 from r2s.study.rows import Row, read_rows, write_rows
 from r2s.study.sources import (
     STRETCH,
+    GivenRecording,
     SyntheticRecording,
     TruthSettings,
     small_strain,
@@ -237,6 +238,36 @@ def test_the_middle_of_the_prior_stands_beside_every_estimate(tmp_path):
     assert found is not None and middles[0].repeat == ""
     for one, other in zip(*map(jax.tree.leaves, (found, prior.middle(density))), strict=True):
         assert one == other
+
+
+def test_a_lift_and_the_pulls_of_the_network_are_estimated_from_together():
+    names = ["diffcloud-cloth-lifting+stretching", "pinn-cloth-stretching"]
+    plan = matrix.with_changes(matrix.SMALL, names, ["grey_interlock", "mujoco_flex"])
+    every = {c.estimate for c in matrix.synthetic(plan) if c.estimate is not None}
+    both, pulls = sorted(every, key=lambda each: each.approach)  # none of MuJoCo's sheet
+    assert both.scenario == "lifting+stretching" and pulls.scenario == "stretching"
+    assert [each.scenario for each in both.sources[:1]] == ["lifting"]
+    assert both.sources[1:] == pulls.sources
+    assert [getattr(each, "angle", None) for each in pulls.sources] == [0.0, 45.0, 90.0]
+    label = "DIFFCLOUD cloth lifting+stretching"
+    assert label in {c.configuration.label for c in matrix.synthetic(plan)}
+    with pytest.raises(ValueError, match="from one recording, got 4"):
+        dataclasses.replace(both, approach="physnet")
+
+
+def test_given_recordings_of_one_fabric_and_trial_go_together():
+    def given(name, fabric, scenario, trial):
+        return GivenRecording("", name, fabric, scenario, trial, "")
+
+    every = [
+        given("pull", "knit", "stretching", "1"),
+        given("lift", "knit", "lifting", "1"),
+        given("lift of another trial", "knit", "lifting", "2"),
+        given("lift of another fabric", "denim", "lifting", "1"),
+    ]
+    (found,) = matrix._together(every, ("lifting", "stretching"))
+    assert [each.name for each in found] == ["lift", "pull"]
+    assert len(matrix._together(every, ("lifting",))) == 3
 
 
 @pytest.mark.parametrize("name", ["diffcloud-cloth-lifting", "pinn-cloth-stretching"])

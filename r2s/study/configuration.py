@@ -3,20 +3,26 @@
 from typing import NamedTuple
 
 APPROACHES = {"diffcloud": "DIFFCLOUD", "diffcp": "DiffCP", "physnet": "PhysNet", "pinn": "PINN"}
+TOGETHER = "+"  # between scenarios that are estimated from together
 MOTIONS = ("folding", "fling", "shaking")  # that no estimate has seen
 # baselines that are configurations as well, and what stands for an approach in their labels
 REFERENCES = {"true": "true fabric on", "middle": "middle of the prior on"}
 
 
 class Configuration(NamedTuple):
-    """An approach on a solver that estimates from a scenario.
+    """An approach on a solver that estimates from a scenario, or from several together.
 
     The default fabric on a solver is a configuration too, without approach and scenario.
     """
 
     approach: str
     solver: str
-    estimated_from: str
+    estimated_from: str  # several: "lifting+stretching"
+
+    @property
+    def scenarios(self) -> tuple[str, ...]:
+        """What it estimates from."""
+        return tuple(self.estimated_from.split(TOGETHER))
 
     @property
     def label(self) -> str:
@@ -42,3 +48,6 @@ PAPER_CONFIGURATIONS = (
     Configuration("pinn", "cloth", "stretching"),
 )
 """The configurations in the tables of Ru et al. 2025, in their order."""
+
+TOGETHER_CONFIGURATIONS = (Configuration("diffcloud", "cloth", f"lifting{TOGETHER}stretching"),)
+"""What the paper does not have: a lift, and pulls in three directions, of one fabric together."""

@@ -17,6 +17,7 @@ from r2s.estimation.registry import METHODS
 from r2s.fabrics import prior
 from r2s.files import write_json
 from r2s.study.cells import Cell, result_files
+from r2s.study.configuration import TOGETHER
 from r2s.study.sources import Source, read
 
 ESTIMATE, NETWORK = "estimate.json", "network.eqx"
@@ -64,7 +65,8 @@ class EstimateCell(Cell):
 
     - `approach`: "diffcloud", "diffcp", "physnet" or "pinn".
     - `solver`: "cloth" or "points".
-    - `sources`: the recordings, of one scenario; several for the pulls of "pinn" alone.
+    - `sources`: the recordings; several for the pulls of "pinn", and for approaches that estimate
+      from several scenarios together.
     - `density`: areal density as weighed, [kg/m^2].
     - `network`: of "physnet".
     - `prior`: "fabrics" where what fabrics of this weight are like is known (`r2s.fabrics.prior`),
@@ -87,16 +89,15 @@ class EstimateCell(Cell):
     resolves: bool = False
 
     def __post_init__(self) -> None:
-        scenarios = {source.scenario for source in self.sources}
-        if len(scenarios) != 1:
-            raise ValueError(f"an estimate is from one scenario, got {sorted(scenarios)}")
+        if len(self.sources) > 1 and not METHODS[self.approach].several:
+            raise ValueError(f"{self.approach} is from one recording, got {len(self.sources)}")
         if self.solver not in SOLVERS[self.approach]:
             raise ValueError(f"{self.approach} is not on {self.solver}: {SOLVERS[self.approach]}")
 
     @property
     def scenario(self) -> str:
-        """What it is estimated from."""
-        return self.sources[0].scenario
+        """What it is estimated from, as in `Configuration.estimated_from`."""
+        return TOGETHER.join(dict.fromkeys(source.scenario for source in self.sources))
 
     @property
     def name(self) -> str:

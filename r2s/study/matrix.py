@@ -11,7 +11,12 @@ from r2s.estimation.physnet.method import TrainingBudget
 from r2s.estimation.registry import METHODS
 from r2s.fabrics import presets
 from r2s.scenarios.paths import ESTIMATION, EVALUATION
-from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
+from r2s.study.configuration import (
+    MOTIONS,
+    PAPER_CONFIGURATIONS,
+    TOGETHER_CONFIGURATIONS,
+    Configuration,
+)
 from r2s.study.estimates import SOLVERS, Budgets, EstimateCell, TrainedNetwork
 from r2s.study.evaluations import MIDDLE, EvaluationCell
 from r2s.study.mujoco_recording import FABRIC as FLEX
@@ -31,10 +36,10 @@ from r2s.study.sources import (
 ESTIMATED_FROM = ("lifting", "wind", "stretching")
 DRAWS = 4  # of the prior, which are the default together
 TOGETHER = 10  # recordings that one cell judges
-PULLS = (0.0, 45.0, 90.0)  # [degrees], from which PINN estimates together
+PULLS = (0.0, 45.0, 90.0)  # [degrees], of stretchings that are estimated from together
 FEWER_FABRICS = 32  # at most, to train PhysNet's network on material points
 
-FULL = PAPER_CONFIGURATIONS + tuple(
+FULL = (*PAPER_CONFIGURATIONS, *TOGETHER_CONFIGURATIONS) + tuple(
     Configuration(approach, solver, scenario)
     for approach, solvers in SOLVERS.items()
     for solver in solvers
@@ -42,7 +47,7 @@ FULL = PAPER_CONFIGURATIONS + tuple(
     if (approach, solver, scenario) not in PAPER_CONFIGURATIONS
     and not METHODS[approach].refusal(solver, scenario)
 )
-"""The configurations of the paper, and those that it calls unsupported."""
+"""The configurations of the paper, those that it calls unsupported, and those that it lacks."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +88,7 @@ SMALL = Plan(
         Configuration("physnet", "cloth", "lifting"),
         Configuration("pinn", "points", "stretching"),
         Configuration("pinn", "cloth", "stretching"),
+        *TOGETHER_CONFIGURATIONS,
     ),
     fabrics=("camel_ponte_roma", "grey_interlock", FLEX),
     repeats=1,
@@ -167,18 +173,24 @@ def synthetic(plan: Plan) -> list[EvaluationCell]:
         ]
         estimates = []
         for configuration in plan.configurations:
-            scenario = configuration.estimated_from
-            if fabric == FLEX and scenario not in IN_MUJOCO:
+            if fabric == FLEX and not set(configuration.scenarios) <= set(IN_MUJOCO):
                 continue
-            is_pulled = configuration.approach == "pinn" and scenario == "stretching"
             for repeat in range(plan.repeats):
                 sources = tuple(
                     recording(fabric, scenario, repeat, False, angle)
-                    for angle in (PULLS if is_pulled else (None,))
+                    for scenario in configuration.scenarios
+                    for angle in _angles(configuration, scenario)
                 )
                 estimates.append(_estimate(configuration, sources, density, plan, repeat))
         found += _evaluations(estimates, fabric, density, unseen, plan)
     return found
+
+
+def _angles(configuration: Configuration, scenario: str) -> tuple[float | None, ...]:
+    """To the warp [degrees], of the stretchings of a scenario; None: one along the warp, as the
+    other approaches take it."""
+    is_pulled = configuration.approach == "pinn" or len(configuration.scenarios) > 1
+    return PULLS if is_pulled and scenario == "stretching" else (None,)
 
 
 def _density(fabric: str, truth: TruthSettings) -> float:
@@ -205,8 +217,8 @@ def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationCell]:
     budgets = dataclasses.replace(plan.budgets, diffcloud=METHODS["diffcloud"].budget)
     plan = dataclasses.replace(plan, budgets=budgets, every=1)
     recordings = find_recordings(folder)
-    sources = {configuration.estimated_from for configuration in plan.configurations}
-    seen = [r for r in recordings if r.scenario in sources]
+    wanted = {each for c in plan.configurations for each in c.scenarios}
+    seen = [r for r in recordings if r.scenario in wanted]
     unseen = [r for r in recordings if r.scenario in MOTIONS]
     if not seen or not unseen:
         raise ValueError(
@@ -215,11 +227,12 @@ def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationCell]:
         )
     found: list[EvaluationCell] = []
     for configuration in plan.configurations:
-        own = [r for r in seen if r.scenario == configuration.estimated_from]
+        sources = _together(seen, configuration.scenarios)
         estimates = [
-            _estimate(configuration, (recording,), density, plan, repeat)
-            for repeat, recording in enumerate(own)
+            _estimate(configuration, each, density, plan, repeat)
+            for repeat, each in enumerate(sources)
         ]
+        own = [each[0] for each in sources]
         for index, (recording, estimate) in enumerate(zip(own, estimates, strict=True)):
             judged = _by_scenario(_of_trial(unseen, recording))
             found += _evaluations([estimate], recording.fabric, density, judged, plan)
@@ -312,6 +325,24 @@ def _by_scenario(recordings: Iterable[GivenRecording]) -> list[tuple[GivenRecord
     for recording in recordings:
         found[recording.scenario].append(recording)
     return [tuple(together) for together in found.values()]
+
+
+def _together(
+    recordings: Iterable[GivenRecording], scenarios: Sequence[str]
+) -> list[tuple[GivenRecording, ...]]:
+    """The recordings of each estimate: those of one scenario each alone, those of several by fabric
+    and trial, where all of them are there."""
+    if len(scenarios) == 1:
+        return [(each,) for each in recordings if each.scenario == scenarios[0]]
+    trials: Mapping[tuple[str, str], list[GivenRecording]] = defaultdict(list)
+    for each in recordings:
+        if each.scenario in scenarios:
+            trials[each.fabric, each.trial].append(each)
+    return [
+        tuple(sorted(every, key=lambda each: scenarios.index(each.scenario)))
+        for every in trials.values()
+        if {each.scenario for each in every} == set(scenarios)
+    ]
 
 
 def _of_trial(unseen: list[GivenRecording], recording: GivenRecording) -> list[GivenRecording]:

@@ -220,7 +220,7 @@ def mesh_table(cells: Iterable[EvaluationCell], folder: Path) -> Table:
         size = read(cell.sources[0], folder).info.sheet.size
         errors = [
             mesh_error(estimate.fabric, size, estimate.shape, motion)
-            for motion in (cell.scenario, *MOTIONS)
+            for motion in (cell.sources[0].scenario, *MOTIONS)
         ]
         folds = significant(1e3 * float(fold_length(estimate.fabric)))
         told = [significant(1e3 * error) if np.isfinite(error) else "-" for error in errors]

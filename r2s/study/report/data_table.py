@@ -57,7 +57,7 @@ def _of_estimates(cells: list[EvaluationCell], folder: Path) -> list[tuple[str, 
             label,
             cell.scenario,
             str(len(seen)),
-            seen_by(cell.sources[0], reads[0]),
+            "; ".join(dict.fromkeys(map(seen_by, cell.sources, reads))),
             *_numbers(seen, reads),
             cell.prior,
         )
