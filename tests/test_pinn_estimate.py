@@ -122,6 +122,31 @@ def test_sensitivities_of_the_motion_in_balance_against_differences():
         np.testing.assert_allclose(slope, differences, rtol=2e-2, atol=2e-2 * np.abs(slope).max())
 
 
+def test_a_frame_that_is_not_in_balance_does_not_count():
+    """Its derivative may come out as anything, and would decide the estimate."""
+    pull = even_pull()
+    basis = basis_of(pull, (3, 3))
+    even, off, start = prepared(small_network(pull), pull, basis)
+    place = jnp.asarray([0.5, 0.4, 0.6, 0.7, 0.5, 0.5, 0.5])
+    solved = solve(FAMILY, place, pull, basis, even, off, start)
+    whole = reduced(solved, pull, basis)
+    assert solved.balanced.all() and whole.is_complete
+    frames, lost = len(pull.times), 3
+    broken = solved._replace(
+        balanced=solved.balanced.at[lost].set(False),
+        by_now=solved.by_now.at[lost].multiply(1e-9),
+        by_place=solved.by_place.at[lost].multiply(1e9),
+    )
+    found = reduced(broken, pull, basis)
+    assert not found.is_complete and len(found.force) == frames - 1
+    kept = np.arange(frames) != lost
+    np.testing.assert_allclose(found.force, whole.force[kept])
+    slope = np.abs(whole.force_by_place).max()
+    np.testing.assert_allclose(found.force_by_place, whole.force_by_place[kept], atol=0.1 * slope)
+    none = reduced(solved._replace(balanced=jnp.zeros(frames, bool)), pull, basis)
+    assert len(none.force) == 0 and np.isfinite(none.force_by_place).all()
+
+
 TINY = Recipe(losses=QUICK.losses, warm_up=20, adam=20, lbfgs=10, redraw=10, width=6, layers=3)
 
 

@@ -270,6 +270,18 @@ def test_given_recordings_of_one_fabric_and_trial_go_together():
     assert len(matrix._together(every, ("lifting",))) == 3
 
 
+def test_each_fabric_has_draws_of_its_own(tmp_path):
+    """Else an unlucky draw would be the default of all, and no spread between fabrics show it."""
+    plan = matrix.with_changes(matrix.SMALL, ["diffcloud-cloth-lifting"], presets.FIVE)
+    stiffness = {
+        (cell.fabric, cell.draw, plan.seed): float(cell._fabric(tmp_path).membrane.c11)
+        for plan in (plan, matrix.with_changes(plan, seed=1))
+        for cell in matrix.synthetic(plan)
+        if cell.baseline == "default"
+    }
+    assert len(stiffness) == 2 * 5 * plan.draws == len(set(stiffness.values()))
+
+
 @pytest.mark.parametrize("name", ["diffcloud-cloth-lifting", "pinn-cloth-stretching"])
 def test_who_heeds_a_prior_is_told_of_fabrics_of_this_weight(name, tmp_path, monkeypatch):
     plan = matrix.with_changes(matrix.SMALL, [name], ["grey_interlock"])

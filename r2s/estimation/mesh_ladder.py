@@ -108,7 +108,12 @@ class _Rung(NamedTuple):
 
 
 def ladder(recordings: Recordings) -> list[list[Shape]]:
-    """The meshes to go by, from coarse to fine: on each rung that of every recording."""
+    """The meshes to go by, from coarse to fine: on each rung that of every recording.
+
+    The last rung has no finer mesh of a stretching than the one before: a taut sheet does not fold.
+    17 x 17 vertices leave 1 to 5 % of its force and 0.5 mm of its markers' places (grey interlock,
+    pulled at 0, 45 and 90 degrees to the warp), and the mesh bias of an estimate holds that.
+    """
     return [list(rung) for rung in zip(*map(_meshes, recordings), strict=True)]
 
 
@@ -128,7 +133,9 @@ def _motion(recording: Recording, shape: Shape):
 
 
 def _meshes(recording: Recording) -> list[Shape]:
-    return resolution.ladder(recording.info.sheet.size)
+    *coarse, finest = resolution.ladder(recording.info.sheet.size)
+    is_taut = recording.info.scenario in resolution.TAUT
+    return [*coarse, coarse[-1] if is_taut else finest]
 
 
 def _largest(recordings: Recordings) -> int:

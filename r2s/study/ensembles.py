@@ -30,9 +30,10 @@ from r2s.study.sources import SyntheticRecording, read, strain_dependent
 from r2s.study.starts import started
 
 ENSEMBLE = "ensemble.npz"
-STIFFNESS, PATH = 1e-3, 2e-4  # [-] and [m]: what no one can tell
+STIFFNESS, PATH = 1e-3, 2e-4  # [-] and [m], either way: what no one can tell
 FINER, COARSER = 3 / 2, 1 / 2  # cells a side: of the finer mesh, and of other fabrics' sheets
 APART = "apart "  # before the name of another fabric
+WAYS = (1, -1)
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,8 @@ class EnsembleCell(Cell):
     side; each comes to rest with its own fabric. No member has contact of layers, for the sake of
     time; a recording that has is compared with the truth without.
 
-    - `others`: presets whose truths move in the same way.
+    - `others`: presets whose truths move in the same way; on half the cells, all of them and the
+      truth's own fabric, so that what the mesh does is no difference between fabrics.
     """
 
     kind: ClassVar[str] = "ensembles"
@@ -80,15 +82,18 @@ class EnsembleCell(Cell):
         clouds = [cloud(recording, frame) for frame in range(len(recording.times))]
         found = {
             "recording": [to_surface(clouds, base.x, base.mesh.faces)],
-            "stiffness": [away(experiment, _scaled(fabric, 1 + STIFFNESS), shape)],
-            "path": [away(_shifted(experiment), fabric, shape)],
+            "stiffness": [
+                away(experiment, _scaled(fabric, 1 + way * STIFFNESS), shape) for way in WAYS
+            ],
+            "path": [away(_shifted(experiment, way * PATH), fabric, shape) for way in WAYS],
             "mesh": [away(experiment, fabric, _cells(shape, FINER))],
             "step": [away(experiment, fabric, shape, steps=2)],
         }
         coarse = _cells(shape, COARSER)
+        own = _points_of(_moved(experiment, fabric, coarse, start=start))
         for name in self.others:
-            other = strain_dependent(name, truth)
-            found[APART + name] = [away(experiment, other, coarse)]
+            moved = _moved(experiment, strain_dependent(name, truth), coarse, start=start)
+            found[APART + name] = [to_surface(own, moved.x, moved.mesh.faces)]
         arrays = {name: np.stack(rows) for name, rows in found.items()}
         stored: dict[str, Any] = {"times": np.asarray(experiment.times), **arrays}
         np.savez_compressed(out / ENSEMBLE, **stored)
@@ -170,11 +175,11 @@ def _scaled(fabric: Fabric, factor: float) -> Fabric:
     return eqx.tree_at(where, fabric, parts)
 
 
-def _shifted(experiment: Experiment) -> Experiment:
-    """With the first gripper aside by `PATH`, and the last one the other way."""
+def _shifted(experiment: Experiment, way: float) -> Experiment:
+    """With the first gripper aside by so much [m], and the last one the other way."""
     path = np.array(experiment.route.path, float)
-    path[:, 0, 0] += PATH
-    path[:, -1, 1] -= PATH
+    path[:, 0, 0] += way
+    path[:, -1, 1] -= way
     return experiment._replace(route=experiment.route._replace(path=path))
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
+from zlib import crc32
 
 import equinox as eqx
 import jax
@@ -51,8 +52,9 @@ class EvaluationCell(Cell):
     - `density`: areal, [kg/m^2].
     - `recordings`: what it is judged by, together, since they compile once.
     - `draw`: a number of `r2s.fabrics.prior.draws`, which know the density alone: together these
-      are the default. `MIDDLE`: the middle of that prior, the best guess. None: the truth of
-      synthetic recordings at small strain, so what a perfect estimate would reach.
+      are the default; each fabric has its own. `MIDDLE`: the middle of that prior, the best
+      guess. None: the truth of synthetic recordings at small strain, so what a perfect estimate
+      would reach.
     - `other`: whether `estimate` is that of another fabric, for comparison.
     - `every`: 1 compares all frames that count, 3 every third.
     """
@@ -147,8 +149,9 @@ class EvaluationCell(Cell):
                 return small_strain(self.fabric)
             if self.draw == MIDDLE:
                 return prior.middle(self.density)
-            drawn = prior.draws(self.density, self.draw + 1, jr.key(self.draw))
-            return jax.tree.map(lambda leaf: leaf[self.draw], drawn)
+            key = jr.fold_in(jr.key(getattr(self.recordings[0], "seed", 0)), self.draw)
+            drawn = prior.draws(self.density, 1, jr.fold_in(key, crc32(self.fabric.encode())))
+            return jax.tree.map(lambda leaf: leaf[0], drawn)
         found = read_estimate(self.estimate, folder)
         return None if found is None else found.fabric
 

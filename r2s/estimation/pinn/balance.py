@@ -89,12 +89,16 @@ class Solved(NamedTuple):
 
 class Reduced(NamedTuple):
     """Differences of markers [m] and force [N] from the measured ones, and derivatives in the place
-    in the parameter space."""
+    in the parameter space; of the frames that are in balance.
+
+    - `is_complete`: whether these are all frames.
+    """
 
     markers: np.ndarray
     markers_by_place: np.ndarray
     force: np.ndarray
     force_by_place: np.ndarray
+    is_complete: bool
 
 
 class Balanced(NamedTuple):
@@ -260,7 +264,11 @@ def solve(
 
 
 def reduced(solved: Solved, pull: Pull, basis: Basis) -> Reduced:
-    """Markers and force in balance, with their derivatives through all frames."""
+    """Markers and force in balance, with their derivatives through all frames.
+
+    A frame that is not in balance has no derivative, which may come out as anything: it does not
+    count, and to those after it its derivative is that of the frame before.
+    """
     parts = (np.asarray(part, np.float64) for part in solved[2:5])
     number, axes = len(pull.times), solved.markers.shape[2]
     interval = float(pull.times[-1] - pull.times[0]) / (number - 1)
@@ -268,7 +276,11 @@ def reduced(solved: Solved, pull: Pull, basis: Basis) -> Reduced:
     slopes = [np.zeros((solved.by_now.shape[2], dim))] * 2  # of the two frames before
     force_by_place = np.zeros((number, dim))
     formulas = _formulas(number) / interval
+    counts = np.asarray(solved.balanced)
     for frame, (by_now, by_rate, by_place) in enumerate(zip(*parts, strict=True)):
+        if not counts[frame]:
+            slopes.append(slopes[-1])
+            continue
         past = formulas[frame, 1] * slopes[-1] + formulas[frame, 2] * slopes[-2]
         matrix = by_now + formulas[frame, 0] * by_rate
         right = by_place + by_rate @ past
@@ -280,10 +292,11 @@ def reduced(solved: Solved, pull: Pull, basis: Basis) -> Reduced:
     markers = np.where(np.asarray(pull.seen)[..., None, None], markers, 0)
     measured = 0.0 if pull.force is None else np.asarray(pull.force, np.float64)
     return Reduced(
-        np.asarray(solved.markers, np.float64).ravel(),
-        markers.reshape(-1, dim),
-        np.asarray(solved.force, np.float64) - measured,
-        force_by_place / float(end_value(basis.virtual)),
+        np.asarray(solved.markers, np.float64)[counts].ravel(),
+        markers[counts].reshape(-1, dim),
+        (np.asarray(solved.force, np.float64) - measured)[counts],
+        (force_by_place / float(end_value(basis.virtual)))[counts],
+        bool(counts.all()),
     )
 
 
@@ -331,6 +344,8 @@ def balance(
                 raise RuntimeError(f"pull {i} has no motion in balance: it is not finite")
             starts[i] = solved.coefficients
             here.append(reduced(solved, pull, basis))
+        if not any(len(one.force) for one in here):
+            raise RuntimeError("no pull has a motion in balance")
         information, right = _normal_equations(here, pulls, marker, force)
         normal = information + FLAT_PRIOR * np.eye(len(place))
         change = _step(normal, right + FLAT_PRIOR * (0.5 - place), place)
@@ -343,10 +358,11 @@ def balance(
         force_left = _rms([one.force / _greatest(p) for one, p in zip(here, pulls, strict=True)])
         losses.append(marker_left**2)
         places.append(place)
-        if whole:  # what is left of a longer step is not noise
+        are_balanced = all(one.is_complete for one in here)
+        if whole and are_balanced:  # what is left of a longer step is not noise
             marker, force = max(marker_left, LEAST_NOISE[0]), max(force_left, LEAST_NOISE[1])
         standard_errors = np.sqrt(np.diag(np.linalg.inv(normal)))
-        if whole and np.all(np.abs(last) < SMALL * standard_errors):
+        if whole and are_balanced and np.all(np.abs(last) < SMALL * standard_errors):
             converged = True
             break
     history = np.array(places), np.array(losses)
