@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
 from r2s.study.matrix import PRESETS
+from r2s.study.mujoco_recording import FABRIC as FLEX
 from r2s.study.statistics.result_array import ResultArray, Trajectory
 
 TYPICAL = 0.02  # [m]
@@ -29,10 +30,15 @@ class Size(NamedTuple):
 
 
 def size_of(preset: str) -> Size:
-    """The size of a preset of the study."""
+    """The size of a preset of the study.
+
+    Without the sheet of MuJoCo, which has neither all configurations nor a floor, and so is in no
+    comparison.
+    """
     plan = PRESETS[preset]
     ours = tuple(c for c in PAPER_CONFIGURATIONS if c in plan.configurations)
-    return Size(ours, len(plan.fabrics), plan.repeats, plan.judged)
+    fabrics = sum(fabric != FLEX for fabric in plan.fabrics)
+    return Size(ours, fabrics, plan.repeats, plan.judged)
 
 
 class Spread(NamedTuple):

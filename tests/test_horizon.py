@@ -37,7 +37,8 @@ def test_skill_is_one_at_the_floor_and_is_not_told_where_the_default_is_no_worse
     assert skill(10e-3, 10e-3, 2e-3) == pytest.approx(0)
     assert skill(14e-3, 10e-3, 2e-3) == pytest.approx(-0.5)
     assert np.isnan(skill(2e-3, 2.9e-3, 2e-3)) and np.isnan(skill(2e-3, np.nan, 2e-3))
-    assert skill(np.nan, 10e-3, 2e-3) == -np.inf  # a run that diverged never helps
+    for default in (10e-3, 2e-3, np.nan):  # a run that diverged never helps
+        assert skill(np.nan, default, 2e-3) == -np.inf
 
 
 def test_points_of_a_sheet_are_at_no_distance_from_it_and_others_at_their_own():

@@ -95,6 +95,9 @@ def test_what_is_judged_before_a_horizon_does_not_hide_what_diverged_after_it():
     assert drop_undefined([early, lost]) == ([early, lost], {})
     whole = replace(early, horizon=math.inf)  # all of the motion
     assert drop_undefined([whole, lost]) == ([whole], {"chamfer": 1})
+    # what is looked at in every frame has no value because the run diverged in one that others skip
+    judged = replace(lost, metric="surface", floor=1e-3)
+    assert drop_undefined([whole, judged]) == ([whole, judged], {})
 
 
 def test_a_row_counts_for_its_configuration_or_the_default_fabric():

@@ -23,7 +23,7 @@ from r2s.study.report.skill_table import (
     skill_words,
 )
 from r2s.study.rows import Row
-from r2s.study.statistics.distances import means
+from r2s.study.statistics.distances import in_common, means
 from r2s.study.statistics.learned import learned
 from r2s.study.statistics.result_array import result_array
 from r2s.study.statistics.skills import draws, mean_floor, skills, with_floor
@@ -216,6 +216,17 @@ def test_nothing_is_learned_where_runs_diverged_or_nothing_is_told():
     assert learned_table(with_floor(untold, METRIC), METRIC) is None
     without = [row for row in rows if row.baseline != "middle"]
     assert learned_table(with_floor(without, METRIC), METRIC) is None
+
+
+def test_means_are_over_fabrics_that_every_configuration_has():
+    rows = made_up()
+    lacking = [r for r in rows if not (r.fabric == "satin" and r.approach == "pinn")]
+    shared, others = in_common(lacking)
+    assert {row.fabric for row in shared} == {"denim", "knit"} and set(others) == {"satin"}
+    assert len(shared) + len(others["satin"]) == len(lacking)
+    assert in_common(rows) == (rows, {})
+    apart = [r for r in lacking if r.fabric == "satin" or r.approach != "diffcloud"]
+    assert in_common(apart) == (apart, {})  # no fabric has both
 
 
 def test_what_is_not_told_is_said():

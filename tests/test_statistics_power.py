@@ -24,6 +24,13 @@ def measured(preset, words, ratio, studies, seed):
     return driver.measure(driver.size_of(preset), spread, ratio, studies, seed)
 
 
+def test_the_sizes_are_those_of_the_presets_with_the_fabrics_that_are_compared():
+    driver = importlib.import_module("statistics_power")
+    sizes = {name: driver.size_of(name) for name in ("small", "paper")}
+    assert (sizes["small"].fabrics, sizes["small"].repeats, sizes["small"].judged) == (2, 1, 2)
+    assert (sizes["paper"].fabrics, sizes["paper"].repeats, sizes["paper"].judged) == (5, 40, 40)
+
+
 def test_small_studies_find_no_more_than_chance_does():
     found = measured("small", "30 %", 1.0, 150, 1)
     assert found.any_false <= 0.06 and found.false <= 0.06, found

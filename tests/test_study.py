@@ -272,13 +272,14 @@ def test_given_recordings_of_one_fabric_and_trial_go_together():
 
 def test_each_fabric_has_draws_of_its_own(tmp_path):
     """Else an unlucky draw would be the default of all, and no spread between fabrics show it."""
-    plan = matrix.with_changes(matrix.SMALL, ["diffcloud-cloth-lifting"], presets.FIVE)
-    stiffness = {
-        (cell.fabric, cell.draw, plan.seed): float(cell._fabric(tmp_path).membrane.c11)
-        for plan in (plan, matrix.with_changes(plan, seed=1))
-        for cell in matrix.synthetic(plan)
-        if cell.baseline == "default"
-    }
+    plan = matrix.with_changes(matrix.SMALL, ["diffcloud-cloth-lifting"], list(presets.FIVE))
+    stiffness = {}
+    for each in (plan, matrix.with_changes(plan, seed=1)):
+        for cell in matrix.synthetic(each):
+            if cell.baseline == "default":
+                drawn = cell._fabric(tmp_path)
+                assert drawn is not None
+                stiffness[cell.fabric, cell.draw, each.seed] = float(drawn.membrane.c11)
     assert len(stiffness) == 2 * 5 * plan.draws == len(set(stiffness.values()))
 
 

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+import r2s
 from r2s.evaluation import phase_free
 from r2s.study import engine, results, verdicts
 from r2s.study.comparisons import motion_comparisons
@@ -32,6 +33,12 @@ def test_the_default_of_a_skill_is_the_mean_of_all_draws():
     )
     assert [each.skill for each in told[:3]] == [pytest.approx(0.5), pytest.approx(1), -np.inf]
     assert all(each.skill is None for each in told[3:])
+    # a draw that diverged raises no one's skill, and hides no run that diverged
+    lost = [*drawn, row(np.nan, "default", "2")]
+    again = verdicts._with_skills([row(7e-3), row(np.nan, repeat="1"), *lost])
+    assert [each.skill for each in again[:2]] == [pytest.approx(0.5), -np.inf]
+    none = verdicts._with_skills([row(7e-3), row(np.nan, repeat="1"), lost[-1]])
+    assert [each.skill for each in none[:2]] == [None, -np.inf]
     near = [dataclasses.replace(each, value=2.5e-3) for each in drawn]
     assert verdicts._with_skills([row(1e-3), *near])[0].skill is None  # not clearly above the floor
     assert verdicts._with_skills([row(1e-3, floor=None), *drawn])[0].skill is None
@@ -61,6 +68,24 @@ def test_a_run_that_is_lost_counts_against_its_configuration_in_the_table():
     assert (lost.mean, lost.diverged, lost.runs) == (-np.inf, 1, 2)
     line = skill_table(rows, SURFACE).rows[0]
     assert "1 of 2 diverged" in line[1] and "1 of 2 diverged" in line[3]
+
+
+@pytest.mark.parametrize("shape", [(9, 9), (33, 33)])
+def test_a_sheet_does_not_differ_from_itself_beyond_the_horizon_whatever_its_mesh(shape):
+    """Clouds of 10,000 points of a still, flat sheet, and the sheet."""
+    times, counts = np.arange(12) / 10, [10_000] * 12
+
+    def clouds(shape):
+        mesh = r2s.rectangle((0.45, 0.45), shape)
+        still = np.pad(np.asarray(mesh.rest), ((0, 0), (0, 1)))[None].repeat(12, axis=0)
+        return verdicts.as_recorded(still, mesh.faces, counts)
+
+    simulated = clouds(shape)
+    assert [len(cloud) for cloud in simulated] == counts
+    drawn_anew = [cloud[::-1] for cloud in clouds((17, 17))]
+    found = phase_free.differences(drawn_anew, simulated, times)
+    assert max(found[name] for name in ("width", "depth", "height", "sag")) < 1e-3, found
+    assert found["area"] < 1e-3 and found["speed"] < 5e-3, found
 
 
 @pytest.mark.slow(group="study")

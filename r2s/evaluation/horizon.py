@@ -66,11 +66,11 @@ def within(times: Float[np.ndarray, " frame"], horizon: float) -> np.ndarray:
 def skill(error: float, default: float, floor: float, clear: float = CLEAR) -> float:
     """(default - error) / (default - floor): 1 at the floor, 0 for the default, below it worse.
 
-    All are means over the same frames, [m]. NaN, so not told, where the default is not clearly
-    above the floor; minus infinity for an error that is not finite.
+    All are means over the same frames, [m]. Minus infinity for an error that is not finite; NaN, so
+    not told, where the default is not clearly above the floor.
     """
-    if not default > clear * floor:
-        return np.nan
     if not np.isfinite(error):
         return -np.inf
+    if not default > clear * floor:
+        return np.nan
     return float((default - error) / (default - floor))

@@ -131,8 +131,9 @@ def drop_undefined(rows: Iterable[Row]) -> tuple[list[Row], dict[str, int]]:
     """Leave out rows whose metric has no value though the run did not diverge.
 
     A run did not diverge where another of its metrics is finite; but what is judged within a
-    horizon says nothing of a run that diverged after it. Returns the other rows, and how many of
-    each metric are left out.
+    horizon says nothing of a run that diverged after it, and a distance beside a floor is looked at
+    in every frame, so where it has no value the run diverged, though others may not have seen it.
+    Returns the other rows, and how many of each metric are left out.
     """
     rows = list(rows)
     run = attrgetter(*HEADER[: HEADER.index("metric")])
@@ -140,7 +141,7 @@ def drop_undefined(rows: Iterable[Row]) -> tuple[list[Row], dict[str, int]]:
     finite = {run(row) for row in whole if np.isfinite(row.value)}
     kept, left_out = [], dict[str, int]()
     for row in rows:
-        if np.isfinite(row.value) or run(row) not in finite:
+        if np.isfinite(row.value) or run(row) not in finite or row.floor is not None:
             kept.append(row)
         else:
             left_out[row.metric] = left_out.get(row.metric, 0) + 1

@@ -3,18 +3,21 @@
 Beyond the horizon, what does not depend on the phase is compared (`r2s.evaluation.phase_free`).
 """
 
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from r2s.evaluation import phase_free
 from r2s.evaluation.horizon import floor_of, horizon_of, skill, within
+from r2s.geometry.surface import sample
 from r2s.recordings.recording import cloud
 from r2s.scenarios.scenario import from_recording
 from r2s.study.ensembles import EnsembleCell, ensemble_of, read_ensemble
@@ -111,7 +114,11 @@ def _within(row: Row, away: Float[np.ndarray, " frame"], judged: Judged) -> Row:
 
 
 def _with_skills(rows: list[Row]) -> list[Row]:
-    """With the skill of each beside the default's mean error in the same recording and solver."""
+    """With the skill of each beside the default's mean error in the same recording and solver.
+
+    The mean is over the draws that did not diverge: one that did would end the skill of all, of
+    what diverged itself too.
+    """
     defaults: dict[tuple[str, str, str], list[float]] = defaultdict(list)
     for row in rows:
         if row.baseline == "default":
@@ -122,9 +129,27 @@ def _with_skills(rows: list[Row]) -> list[Row]:
         if row.floor is None or row.baseline == "default" or default is None:
             found.append(row)
             continue
-        told = skill(row.value, float(np.mean(default)), row.floor)
+        finite = [value for value in default if np.isfinite(value)] or [np.nan]
+        told = skill(row.value, float(np.mean(finite)), row.floor)
         found.append(replace(row, skill=None if np.isnan(told) else told))
     return found
+
+
+def as_recorded(
+    x: Float[np.ndarray, "frame vertex 3"],
+    faces: Int[Array, "face 3"],
+    counts: Sequence[int],
+) -> list[Float[np.ndarray, "_ 3"]]:
+    """So many points [m] of a sheet's whole surface in each frame, drawn anew in each, as those of
+    a recording that is judged by are: so that extents, and what the centroid of points moves by
+    chance, are alike in both, whatever the mesh."""
+    generator = np.random.default_rng(0)
+    resolution = math.ceil(math.sqrt(2 * max(counts) / len(faces)))
+    every = np.asarray(jax.vmap(lambda at: sample(at, faces, resolution))(jnp.asarray(x)))
+    return [
+        points[generator.permutation(len(points))[:count]]
+        for points, count in zip(every, counts, strict=True)
+    ]
 
 
 def _beyond(row: Row, cell: EvaluationCell, judged: Judged, folder: Path) -> list[Row]:
@@ -135,10 +160,10 @@ def _beyond(row: Row, cell: EvaluationCell, judged: Judged, folder: Path) -> lis
     recording = read(source, folder)
     frames = [recording.info.frames_used[0] + int(place) for place in outside]
     x = read_motions(cell, folder)[row.recording][frames]
-    faces = np.asarray(from_recording(recording, cell.shape).scene.mesh.faces)
-    middles = np.asarray(jnp.asarray(x))[:, faces].mean(axis=2)  # as even as the clouds
+    faces = from_recording(recording, cell.shape).scene.mesh.faces
     real = [cloud(recording, frame) for frame in frames]
-    found = phase_free.differences(real, list(middles), judged.times[outside])
+    simulated = as_recorded(x, faces, [len(each) for each in real])
+    found = phase_free.differences(real, simulated, judged.times[outside])
     return [
         replace(row, metric=BEYOND + name, unit=phase_free.UNITS[name], value=value)
         for name, value in found.items()

@@ -17,6 +17,7 @@ from r2s.study.report.page import Section, write_report
 from r2s.study.report.player import viewer
 from r2s.study.report.sections import Keep
 from r2s.study.rows import Row, by_metric, drop_undefined
+from r2s.study.statistics.distances import in_common
 from r2s.study.statistics.paper import read_paper
 from r2s.study.statistics.parameters import Estimated, parameter_table
 from r2s.study.statistics.result_array import ResultArray, configurations_of, result_array
@@ -68,9 +69,10 @@ def publish(
     for folder in ("figures", "videos"):
         (out / folder).mkdir(parents=True, exist_ok=True)
     rows, undefined = drop_undefined(rows)
-    rows_of = by_metric(rows)
+    shared, others = in_common(rows)
+    rows_of = by_metric(shared)
     metrics = [metric for metric in JUDGED_BY if metric in rows_of]
-    results = result_array(rows, metrics[0] if metrics else JUDGED_BY[0])
+    results = result_array(shared, metrics[0] if metrics else JUDGED_BY[0])
     looks = looks_of(
         [
             *(configuration.label for configuration in configurations_of(rows)),
@@ -94,11 +96,12 @@ def publish(
             for heading, words, theirs in more
             if theirs
         ),
-        *parts.distance_sections(out, rows, results, paper, looks, keep),
+        *parts.distance_sections(out, shared, others, results, paper, looks, keep),
         *_missing(rows, missing, keep),
         _settings(settings or {}, keep),
     ]
-    write_report(out / "report.html", TITLE, _intro(results, missing, undefined), sections)
+    intro = _intro(result_array(rows, results.metric), missing, undefined)
+    write_report(out / "report.html", TITLE, intro, sections)
     return written
 
 

@@ -80,12 +80,16 @@ def _headlines(results: ResultArray) -> list[str]:
 def distance_sections(
     out: Path,
     rows: Sequence[Row],
+    others: Mapping[str, Sequence[Row]],
     results: ResultArray,
     paper: Paper,
     looks: Looks,
     keep: Keep,
 ) -> list[Section]:
-    """Distances in millimetres, and in the units of the paper beside its own."""
+    """Distances in millimetres, and in the units of the paper beside its own.
+
+    `others`: the rows of each fabric of which not every configuration has an estimate.
+    """
     sections = []
     ours = tuple(keep(name, table) for name, table in distance_tables(rows).items())
     if ours:
@@ -96,6 +100,14 @@ def distance_sections(
             caption = f"Mean {results.metric} of every configuration, with {LEVEL:.0%} intervals."
             figures = ((path, caption),)
         sections.append(Section("Distances in millimetres", (), ours, figures))
+    for fabric, theirs in others.items():
+        own = distance_tables(theirs)
+        words = (
+            f"Not every configuration has an estimate of {fabric.replace('_', ' ')}: it is in no "
+            "mean above.",
+        )
+        shown = tuple(keep(f"{name}_{fabric}", table) for name, table in own.items())
+        sections.append(Section(f"Distances of {fabric.replace('_', ' ')}", words, shown))
     beside = tuple(keep(name, table) for name, table in paper_tables(rows, paper).items())
     if beside:
         words = (

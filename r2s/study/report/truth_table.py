@@ -11,6 +11,7 @@ from r2s.study.tables import Table
 from r2s.study.verdicts import Judged, ensembles, judged_motions
 
 LEAST = 2e-3  # [m]: what mesh and step may leave, mean up to the horizon
+LAYERS = "not known: layers"
 HEADER = (
     *("recording", "horizon [s]", "floor [mm]"),
     *("stiffness [mm]", "path [mm]", "mesh [mm]", "step [mm]", "verdict"),
@@ -20,7 +21,8 @@ CAPTION = (
     "and the distances from it of the truth 0.1 % stiffer, with grippers 0.2 mm aside, on a finer "
     f"mesh and in half the step. It is converged where the last two are below {1e3 * LEAST:g} mm "
     "together, and chaotic where the first two are not; a prediction nearer than the floor is not "
-    "told from a better one."
+    "told from a better one. The ensemble of a fold has no layers, its truth has: whether that is "
+    "converged is not known."
 )
 
 
@@ -28,14 +30,19 @@ def truth_table(cells: Sequence[EvaluationCell], folder: Path) -> Table:
     """A line for each recording whose ensemble is made."""
     judged = judged_motions(cells, folder)
     lines = [
-        _line(cell.recording.name, judged[cell.recording], read_ensemble(cell, folder))
+        _line(
+            cell.recording.name,
+            judged[cell.recording],
+            read_ensemble(cell, folder),
+            cell.recording.truth.self_contact and cell.recording.scenario == "folding",
+        )
         for cell in ensembles(cells)
         if cell.recording in judged
     ]
     return Table(HEADER, tuple(lines), CAPTION)
 
 
-def _line(name: str, judged: Judged, ensemble: Ensemble) -> tuple[str, ...]:
+def _line(name: str, judged: Judged, ensemble: Ensemble, is_layered: bool) -> tuple[str, ...]:
     horizon = "never" if np.isinf(judged.horizon) else f"{judged.horizon:.2f}"
     if not judged.inside.any():
         return name, horizon, *["-"] * 5, "no frame is known"
@@ -43,7 +50,8 @@ def _line(name: str, judged: Judged, ensemble: Ensemble) -> tuple[str, ...]:
     left = {cause: float(each[:, inside].mean()) for cause, each in ensemble.causes.items()}
     means = [left[cause] for cause in ("stiffness", "path", "mesh", "step")]
     floor = float(judged.floor[judged.inside].mean())
-    return name, horizon, *(f"{1e3 * each:.2f}" for each in (floor, *means)), verdict(*means)
+    words = LAYERS if is_layered else verdict(*means)
+    return name, horizon, *(f"{1e3 * each:.2f}" for each in (floor, *means)), words
 
 
 def verdict(stiffness: float, path: float, mesh: float, step: float) -> str:

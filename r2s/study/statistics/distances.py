@@ -98,6 +98,27 @@ def _mean(
     return found.mean, float(np.exp(low)), float(np.exp(high))
 
 
+def in_common(rows: Iterable[Row]) -> tuple[list[Row], dict[str, list[Row]]]:
+    """The rows of fabrics of which every configuration has an estimate, and those of each other.
+
+    Means over other fabrics are not compared. Where no fabric has all, all count as the first.
+    """
+    rows = list(rows)
+    having: dict[str, set[Configuration]] = {}
+    for row in rows:
+        if row.approach and (configuration := row.configuration) is not None:
+            having.setdefault(row.fabric, set()).add(configuration)
+    every = set().union(*having.values())
+    whole = {fabric for fabric, own in having.items() if own == every}
+    if not whole:
+        return rows, {}
+    others: dict[str, list[Row]] = {}
+    for row in rows:
+        if row.fabric not in whole:
+            others.setdefault(row.fabric, []).append(row)
+    return [row for row in rows if row.fabric in whole], others
+
+
 def distance_tables(rows: Iterable[Row]) -> dict[str, Table]:
     """The tables of all metrics in metres that there are."""
     rows_of = by_metric(rows)
