@@ -84,8 +84,20 @@ def insert(document: Path, name: str, table: str) -> None:
 def resumed(
     path: Path, caption: str, jobs: Iterable[Line], make: Callable[..., Line]
 ) -> list[Line]:
-    """Make one line for each job, keep the table after each, and skip the jobs that it holds."""
-    lines = read(path)[0] if path.exists() else []
+    """Make one line for each job, keep the table after each, and skip the jobs that it holds.
+
+    Raises `ValueError` for a table that another version or processor began.
+    """
+    lines: list[Line] = []
+    if path.exists():
+        lines, facts = read(path)
+        made = facts.get("version", ""), facts.get("machine", "").partition(", ")[2]
+        own = f"r2s {importlib.metadata.version('r2s')}", processor()
+        if made != own:
+            raise ValueError(
+                f"{path}: begun by {' on '.join(made)}, not {' on '.join(own)}: move it away, or "
+                "give another --out"
+            )
     for job in jobs:
         if any(job.items() <= line.items() for line in lines):
             continue

@@ -192,15 +192,17 @@ def predict(
     fabric: Fabric,
     solver: str,
     starts: Sequence[Float[np.ndarray, "row column 3"] | None] = (),
+    shape: tuple[int, int] | None = None,
 ) -> list[Motion]:
     """The motions of a fabric in recordings of one scenario.
 
     `solver`: "cloth" in explicit steps, whose own error is that of their mesh alone (in implicit
     ones for fabrics that need more than `MOST`: what bends so stiffly moves smoothly), or "points"
     for material points in a grid that serves all recordings. `starts`: of each recording the shape
-    in its first frame [m], see `r2s.study.starts`; none: from flat sheets.
+    in its first frame [m], see `r2s.study.starts`; none: from flat sheets. `shape`: vertices along
+    warp and weft; None: those of `SHAPES`.
     """
-    scenarios = [from_recording(recording, SHAPES[solver]) for recording in recordings]
+    scenarios = [from_recording(each, shape or SHAPES[solver]) for each in recordings]
     if starts:
         scenarios = [started(each, shape) for each, shape in zip(scenarios, starts, strict=True)]
     most = max(scenario.substeps for scenario in scenarios)
