@@ -1,6 +1,6 @@
 """Which mesh do material points need to show what a fabric does?
 
-python experiments/points_mesh.py --out docs/results/points_mesh.csv      # half an hour
+python experiments/points_mesh.py --out docs/results/points_mesh.csv      # a quarter of an hour
 
 The true fabric at small strain, predicted by material points on meshes of several sizes, in
 motions of a study's truths: mean distance of the recorded points from the surface over the whole
