@@ -14,6 +14,10 @@ TABLES = (
         "Error up to the horizon, floor and skill by configuration: mean [90 % interval].",
     ),
     (
+        *("learned", "docs/results.md", "study_small_learned"),
+        "Error over that of the middle of the prior: geometric mean [90 % interval], p, fabrics.",
+    ),
+    (
         *("truths", "docs/results.md", "study_small_truths"),
         "Of every judged motion: horizon, and, mean up to there, its floor by cause.",
     ),

@@ -242,7 +242,7 @@ def test_the_middle_of_the_prior_stands_beside_every_estimate(tmp_path):
 
 def test_a_lift_and_the_pulls_of_the_network_are_estimated_from_together():
     names = ["diffcloud-cloth-lifting+stretching", "pinn-cloth-stretching"]
-    plan = matrix.with_changes(matrix.SMALL, names, ["grey_interlock", "mujoco_flex"])
+    plan = matrix.with_changes(matrix.SMALL, names, ["grey_interlock", "mujoco_flex"])  # of all
     every = {c.estimate for c in matrix.synthetic(plan) if c.estimate is not None}
     both, pulls = sorted(every, key=lambda each: each.approach)  # none of MuJoCo's sheet
     assert both.scenario == "lifting+stretching" and pulls.scenario == "stretching"

@@ -27,6 +27,7 @@ class EnergyBalance(eqx.Module):
 
     - `x`: positions, [m].
     - `forces`: with which the grippers hold each vertex, the mean since the frame before.
+    - `last`: the same at the frame itself, at the end of the last step.
     - `stored`: in membrane and bending; `kinetic`; `potential`: of gravity, above z = 0.
     - `grippers`, `air`: the work that they have done on the sheet since the first frame. That of
       still air is negative.
@@ -37,6 +38,7 @@ class EnergyBalance(eqx.Module):
 
     x: Float[Array, "frame vertex 3"]
     forces: Float[Array, "frame handle 3"]
+    last: Float[Array, "frame handle 3"]
     stored: Energies
     kinetic: Energies
     potential: Energies
@@ -77,10 +79,10 @@ def energy_balance(
     def frame(carried: Any, control: Control):
         (state, last), (forces, *work) = jax.lax.scan(step, carried, control)
         mean = jnp.mean(forces, axis=0)
-        return (state, last), (state.x, state.v, mean, *(jnp.sum(part) for part in work))
+        return (state, last), (state.x, state.v, mean, last, *(jnp.sum(part) for part in work))
 
     start = begin(solver, scenario), jnp.zeros((len(held), 3), float)
-    _, (x, v, forces, grippers, air) = jax.lax.scan(frame, start, scenario.controls(substeps))
+    _, (x, v, forces, last, grippers, air) = jax.lax.scan(frame, start, scenario.controls(substeps))
     first = scenario.lead_in - 1
 
     def since(work):
@@ -91,6 +93,7 @@ def energy_balance(
     return EnergyBalance(
         x=x,
         forces=forces[first:],
+        last=last[first:],
         stored=jax.vmap(lambda x: stored_energy(mesh, fabric, x))(x),
         kinetic=jnp.sum(mass[None] * jnp.sum(v**2, axis=2), axis=1) / 2,
         potential=GRAVITY * jnp.sum(mass[None] * x[..., 2], axis=1),
@@ -100,13 +103,14 @@ def energy_balance(
 
 
 def clamp_force(scenario: Scenario, found: EnergyBalance) -> Float[Array, "frame 3"]:
-    """The force [N] on the pulled clamp of a stretching at its frames: what a load cell measures.
+    """The force [N] on the pulled clamp of a stretching at its frames: what a load cell shows then.
 
-    The clamp is the held vertices at the end of the warp.
+    Not the mean since the frame before, which lags by half a frame: for that a damping of half a
+    frame more would make up. The clamp is the held vertices at the end of the warp.
     """
     mesh, held = scenario.scene.mesh, scenario.scene.held
     pulled = mesh.rest[held, 0] > jnp.max(mesh.rest[:, 0]) / 2
-    return jnp.sum(jnp.where(pulled[None, :, None], found.forces, 0), axis=1)
+    return jnp.sum(jnp.where(pulled[None, :, None], found.last, 0), axis=1)
 
 
 def stored_energy(mesh: Mesh, fabric: Fabric, x: Float[Array, "vertex 3"]) -> Float[Array, ""]:

@@ -88,7 +88,6 @@ SMALL = Plan(
         Configuration("physnet", "cloth", "lifting"),
         Configuration("pinn", "points", "stretching"),
         Configuration("pinn", "cloth", "stretching"),
-        *TOGETHER_CONFIGURATIONS,
     ),
     fabrics=("camel_ponte_roma", "grey_interlock", FLEX),
     repeats=1,
