@@ -30,7 +30,7 @@ _predict, _rollout = eqx.filter_jit(predict), eqx.filter_jit(rollout)
 
 def pull_of(degrees, key=0, **noise):
     """A short pull, recorded by markers and the clamp's force."""
-    options = {"shape": SHAPE, "frames": 7, "strain": 0.03, "moving": 0.15, "key": jr.key(key)}
+    options = {"shape": SHAPE, "frames": 13, "strain": 0.03, "moving": 0.35, "key": jr.key(key)}
     return pulled(FABRIC, "camel", math.radians(degrees), **options, **noise)
 
 
@@ -57,8 +57,8 @@ def test_the_true_fabric_predicts_a_pull_at_its_angle_and_no_other(bias):
         away = float(jnp.abs(at - markers.positions).max())
         missing = jnp.abs(seen.force - force.values).max() / jnp.abs(force.values).max()
         off[degrees] = away, float(missing)
-    # a force is recorded at the frames, and predicted as the mean since the frame before
-    assert off[30.0][0] < 2e-4 and off[30.0][1] < 0.1
+    # the force at the frames: a mean since the frame before lags by half a frame
+    assert off[30.0][0] < 2e-4 and off[30.0][1] < 0.03
     assert off[70.0][0] > 3 * off[30.0][0] and off[70.0][1] > 2.5 * off[30.0][1]
 
 

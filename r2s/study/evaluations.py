@@ -219,10 +219,11 @@ def predict(
 
 
 def _until_stable(scenario: Scenario, fabric: Fabric, solver: ExplicitCloth | Sheet) -> Motion:
-    """A motion; one of the cloth that is lost is made again in shorter substeps.
+    """A motion; one of the cloth that is lost is made again in shorter substeps, then in implicit
+    steps.
 
-    Their limit is that of a sheet whose cells keep their shape: some collapse where a soft sheet is
-    flung, and that is no property of the fabric.
+    The limit of substeps is that of a sheet whose cells keep their shape: some collapse where a
+    soft sheet is flung, and that is no property of the fabric.
     """
     motion = prediction_error.predict_motion(scenario, fabric, solver)
     for times in RETRIES:
@@ -230,7 +231,8 @@ def _until_stable(scenario: Scenario, fabric: Fabric, solver: ExplicitCloth | Sh
             break
         finer = dataclasses.replace(solver, substeps=times * solver.substeps)
         motion = prediction_error.predict_motion(scenario, fabric, finer)
-    return motion
+    is_lost = motion.failure and isinstance(solver, ExplicitCloth)
+    return _implicit(scenario, fabric) if is_lost else motion
 
 
 def _explicit(scenarios: list[Scenario], fabric: Fabric) -> ExplicitCloth | None:

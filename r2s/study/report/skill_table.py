@@ -140,7 +140,7 @@ def _lacking(verdict: Verdict) -> str:
 def _learned_words(verdict: Verdict) -> str:
     (comparison,), (p,) = verdict.claim.comparisons, verdict.corrected
     if comparison.lacking:
-        return comparison.lacking
+        return "not told" if comparison.lacking.startswith("no rows") else comparison.lacking
     low, high = (1 / end for end in reversed(comparison.ends))
     ends = f" [{low:.2f}, {high:.2f}], p {p:.2g}" if np.isfinite(low) else ""
     own, middles = comparison.diverged
