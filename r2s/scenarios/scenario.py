@@ -232,7 +232,7 @@ def from_recording(recording: Recording, shape: tuple[int, int] = (9, 9)) -> Sce
         clamps=CLAMPED.get(info.scenario, ()),
         wind=info.wind,
     )
-    if info.scenario != "stretching":
+    if not info.angle:
         return scenario
     return dataclasses.replace(scenario, turn=jnp.asarray(math.radians(info.angle), float))
 
