@@ -38,6 +38,15 @@ def test_every_version_that_made_cells_is_counted(tmp_path, monkeypatch):
     assert list(origins(made, tmp_path).values()) == [2, 1]
 
 
+def test_a_change_of_the_source_is_another_origin_of_the_same_version(tmp_path, monkeypatch):
+    made = [Nothing(i) for i in range(2)]
+    execute(made[0], tmp_path)
+    monkeypatch.setattr(cells, "source", lambda: "another")
+    execute(made[1], tmp_path)
+    first, second = origins(made, tmp_path)
+    assert first != second and "source another" in first + second
+
+
 def test_the_tables_of_a_study_of_mixed_origin_are_refused(tmp_path):
     (tmp_path / "tables").mkdir()
     lines = ["setting,value", "version of r2s,1", "cells made by a,2", "cells made by b,1"]

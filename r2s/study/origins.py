@@ -1,4 +1,4 @@
-"""By what the numbers of a study were made: versions and processors of its cells."""
+"""By what the numbers of a study were made: versions, source and processors of its cells."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -22,4 +22,5 @@ def origins(cells: Iterable[Cell], folder: Path) -> dict[str, int]:
 
 def _words(noted: dict) -> str:
     versions = ", ".join(f"{name} {number}" for name, number in noted["versions"].items())
-    return f"{versions}; {noted.get('processor', 'processor not noted')}"
+    source = f"source {noted['source']}" if "source" in noted else "source not noted"
+    return f"{versions}; {source}; {noted.get('processor', 'processor not noted')}"
