@@ -145,7 +145,7 @@ def as_recorded(
     chance, are alike in both, whatever the mesh."""
     generator = np.random.default_rng(0)
     resolution = math.ceil(math.sqrt(2 * max(counts) / len(faces)))
-    every = np.asarray(jax.vmap(lambda at: sample(at, faces, resolution))(jnp.asarray(x)))
+    every = np.asarray(jax.vmap(lambda at: sample(at, faces, resolution))(jnp.asarray(x, float)))
     return [
         points[generator.permutation(len(points))[:count]]
         for points, count in zip(every, counts, strict=True)
