@@ -2,6 +2,8 @@
 
 import contextlib
 import dataclasses
+import functools
+import hashlib
 import json
 import math
 import os
@@ -13,6 +15,20 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+
+
+def source_files() -> list[Path]:
+    """The files of the source of r2s."""
+    return sorted(Path(__file__).parent.rglob("*.py"))
+
+
+@functools.cache
+def source_hash() -> str:
+    """A hash of them, hexadecimal, as they were when it was asked for first."""
+    digest = hashlib.sha256()
+    for file in source_files():
+        digest.update(str(file.relative_to(Path(__file__).parent)).encode() + file.read_bytes())
+    return digest.hexdigest()
 
 
 def write_bytes(path: Path | str, data: bytes) -> None:

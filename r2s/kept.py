@@ -23,7 +23,6 @@ import time
 import weakref
 from collections.abc import Callable
 from importlib import metadata
-from pathlib import Path
 from types import FunctionType
 from typing import Any
 
@@ -34,6 +33,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from r2s import programs
+from r2s.files import source_files, source_hash
 from r2s.side_by_side import settings
 
 LIBRARIES = ("jax", "jaxlib", "equinox", "lineax", "numpy")
@@ -216,10 +216,8 @@ def _source() -> str | None:
     digest = hashlib.sha256(platform.python_version().encode())
     for name in LIBRARIES:
         digest.update(f"{name} {metadata.version(name)}".encode())
-    root = Path(__file__).parent
-    for file in sorted(root.rglob("*.py")):
-        found = file.stat()
-        if max(found.st_mtime, found.st_ctime) > BEGAN:
-            return None
-        digest.update(str(file.relative_to(root)).encode() + file.read_bytes())
+    stats = [file.stat() for file in source_files()]
+    if any(max(found.st_mtime, found.st_ctime) > BEGAN for found in stats):
+        return None
+    digest.update(source_hash().encode())
     return digest.hexdigest()

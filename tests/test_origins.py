@@ -41,7 +41,7 @@ def test_every_version_that_made_cells_is_counted(tmp_path, monkeypatch):
 def test_a_change_of_the_source_is_another_origin_of_the_same_version(tmp_path, monkeypatch):
     made = [Nothing(i) for i in range(2)]
     execute(made[0], tmp_path)
-    monkeypatch.setattr(cells, "source", lambda: "another")
+    monkeypatch.setattr(cells, "source_hash", lambda: "another")
     execute(made[1], tmp_path)
     first, second = origins(made, tmp_path)
     assert first != second and "source another" in first + second

@@ -14,29 +14,18 @@ from abc import abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
-from functools import cache
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar
 
-import r2s
-from r2s.files import write_bytes
+from r2s.files import source_hash, write_bytes
 from r2s.study.environment import processor
 
 FORMAT = "r2s-cell/1"
 KEY_LENGTH = 16  # of a key in the name of a file, hexadecimal digits
 METADATA = "about.json"  # among the files of a result
 VERSIONS = {name: version(name) for name in ("r2s", "jax", "jaxlib", "numpy")}
-
-
-@cache
-def source() -> str:
-    """A hash of the source of r2s as it is in its files: what versions do not tell apart."""
-    root, digest = Path(r2s.__file__).parent, sha256()
-    for file in sorted(root.rglob("*.py")):
-        digest.update(str(file.relative_to(root)).encode() + file.read_bytes())
-    return digest.hexdigest()[:KEY_LENGTH]
 
 
 @dataclass(frozen=True)
@@ -119,7 +108,7 @@ def execute(cell: Cell, folder: Path) -> None:
             "name": cell.name,
             "config": repr(cell),
             "versions": VERSIONS,
-            "source": source(),
+            "source": source_hash()[:KEY_LENGTH],
             "processor": processor(),
             "seconds": time.perf_counter() - began,
             "cpu_seconds": time.process_time() - cpu_began,

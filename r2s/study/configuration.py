@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 APPROACHES = {"diffcloud": "DIFFCLOUD", "diffcp": "DiffCP", "physnet": "PhysNet", "pinn": "PINN"}
-TOGETHER = "+"  # between scenarios that are estimated from together
+AND = "+"  # between scenarios that are estimated from together
 MOTIONS = ("folding", "fling", "shaking")  # that no estimate has seen
 # baselines that are configurations as well, and what stands for an approach in their labels
 REFERENCES = {"true": "true fabric on", "middle": "middle of the prior on"}
@@ -22,7 +22,7 @@ class Configuration(NamedTuple):
     @property
     def scenarios(self) -> tuple[str, ...]:
         """What it estimates from."""
-        return tuple(self.estimated_from.split(TOGETHER))
+        return tuple(self.estimated_from.split(AND))
 
     @property
     def label(self) -> str:
@@ -49,5 +49,5 @@ PAPER_CONFIGURATIONS = (
 )
 """The configurations in the tables of Ru et al. 2025, in their order."""
 
-TOGETHER_CONFIGURATIONS = (Configuration("diffcloud", "cloth", f"lifting{TOGETHER}stretching"),)
+TOGETHER_CONFIGURATIONS = (Configuration("diffcloud", "cloth", f"lifting{AND}stretching"),)
 """What the paper does not have: a lift, and pulls in three directions, of one fabric together."""

@@ -17,7 +17,7 @@ from r2s.estimation.registry import METHODS
 from r2s.fabrics import prior
 from r2s.files import write_json
 from r2s.study.cells import Cell, result_files
-from r2s.study.configuration import TOGETHER
+from r2s.study.configuration import AND
 from r2s.study.sources import Source, read
 
 ESTIMATE, NETWORK = "estimate.json", "network.eqx"
@@ -97,7 +97,7 @@ class EstimateCell(Cell):
     @property
     def scenario(self) -> str:
         """What it is estimated from, as in `Configuration.estimated_from`."""
-        return TOGETHER.join(dict.fromkeys(source.scenario for source in self.sources))
+        return AND.join(dict.fromkeys(source.scenario for source in self.sources))
 
     @property
     def name(self) -> str:

@@ -204,7 +204,7 @@ def predict(
     """
     scenarios = [from_recording(each, shape or SHAPES[solver]) for each in recordings]
     if starts:
-        scenarios = [started(each, shape) for each, shape in zip(scenarios, starts, strict=True)]
+        scenarios = [started(*each) for each in zip(scenarios, starts, strict=True)]
     most = max(scenario.substeps for scenario in scenarios)
     in_equal_steps = [dataclasses.replace(scenario, substeps=most) for scenario in scenarios]
     make = _points if solver == "points" else _explicit

@@ -136,8 +136,7 @@ class SyntheticRecording(Cell):
 
     def _recorded(self, fabric: Fabric, out: Path, key: PRNGKeyArray) -> Recording:
         """A motion of `r2s.scenarios`; of one to judge by also how a hanging sheet starts."""
-        truth = self.truth
-        layers = truth.self_contact and self.scenario == "folding"
+        truth, layers = self.truth, self.has_layers
         shape = min(truth.shape, LAYERED) if layers else truth.shape
         motion = None
         if not layers and self.scenario != "stretching":
@@ -156,6 +155,11 @@ class SyntheticRecording(Cell):
             motion=motion,
             key=key,
         )
+
+    @property
+    def has_layers(self) -> bool:
+        """Whether the sheet touches itself."""
+        return self.truth.self_contact and self.scenario == "folding"
 
     @property
     def experiment(self) -> Experiment:

@@ -68,12 +68,11 @@ def needed_table(rows: Sequence[Row]) -> Table:
 def learned_table(rows: Sequence[Row], metric: str) -> Table | None:
     """What estimates add to the middle of the prior; None where it does not stand beside them."""
     found = learned(rows, metric)
-    compared = {motion for of in found.values() for motion, v in of.items() if not _lacking(v)}
-    motions = [motion for motion in MOTIONS if motion in compared]
+    motions = [motion for motion in MOTIONS if any(motion in each for each in found.values())]
     if not motions:
         return None
     lines = [
-        (configuration.label, *(_learned_words(of_motion[motion]) for motion in motions))
+        (configuration.label, *(_learned_words(of_motion.get(motion)) for motion in motions))
         for configuration, of_motion in found.items()
     ]
     caption = (
@@ -132,15 +131,12 @@ def skill_words(found: Skill) -> str:
     return f"{_number(found.mean)}{ends}{part}"
 
 
-def _lacking(verdict: Verdict) -> str:
-    (comparison,) = verdict.claim.comparisons
-    return comparison.lacking
-
-
-def _learned_words(verdict: Verdict) -> str:
+def _learned_words(verdict: Verdict | None) -> str:
+    if verdict is None:
+        return "not told"
     (comparison,), (p,) = verdict.claim.comparisons, verdict.corrected
     if comparison.lacking:
-        return "not told" if comparison.lacking.startswith("no rows") else comparison.lacking
+        return comparison.lacking
     low, high = (1 / end for end in reversed(comparison.ends))
     ends = f" [{low:.2f}, {high:.2f}], p {p:.2g}" if np.isfinite(low) else ""
     own, middles = comparison.diverged

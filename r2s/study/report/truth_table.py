@@ -34,7 +34,7 @@ def truth_table(cells: Sequence[EvaluationCell], folder: Path) -> Table:
             cell.recording.name,
             judged[cell.recording],
             read_ensemble(cell, folder),
-            cell.recording.truth.self_contact and cell.recording.scenario == "folding",
+            cell.recording.has_layers,
         )
         for cell in ensembles(cells)
         if cell.recording in judged

@@ -7,10 +7,10 @@ has taught.
 
 from collections.abc import Sequence
 
-from r2s.study.configuration import MOTIONS, REFERENCES, Configuration
+from r2s.study.configuration import REFERENCES, Configuration
 from r2s.study.rows import Row
 from r2s.study.statistics.hypotheses import Claim, Verdict, compare, judge
-from r2s.study.statistics.result_array import on_motion, result_array
+from r2s.study.statistics.result_array import by_motion, result_array
 
 
 def learned(rows: Sequence[Row], metric: str) -> dict[Configuration, dict[str, Verdict]]:
@@ -18,27 +18,19 @@ def learned(rows: Sequence[Row], metric: str) -> dict[Configuration, dict[str, V
     same solver, in the recordings that tell a skill; corrected for all that is compared here.
 
     `rows`: what `r2s.study.statistics.skills.with_floor` returns. The true fabric is among the
-    configurations: it says what there is to learn. Empty where no middle stands beside them.
+    configurations: it says what there is to learn. What has no middle beside it is left out.
     """
-    results = result_array([row for row in rows if _tells(row)], metric)
-    pairs = [
-        (configuration, middle, motion)
+    told = result_array([row for row in rows if row.skill is not None], metric)
+    compared = [
+        (configuration, motion, compare(motion, results, [configuration], [middle]))
+        for motion, results in by_motion(told).items()
         for configuration in results.configurations
         if configuration.approach not in ("", REFERENCES["middle"])
         and (middle := Configuration(REFERENCES["middle"], configuration.solver, ""))
         in results.configurations
-        for motion in MOTIONS
     ]
-    claims = [
-        Claim("", (compare(motion, on_motion(results, motion), [configuration], [middle]),))
-        for configuration, middle, motion in pairs
-    ]
+    verdicts = judge([Claim("", (comparison,)) for *_, comparison in compared])
     found: dict[Configuration, dict[str, Verdict]] = {}
-    for (configuration, _, motion), verdict in zip(pairs, judge(claims), strict=True):
+    for (configuration, motion, _), verdict in zip(compared, verdicts, strict=True):
         found.setdefault(configuration, {})[motion] = verdict
     return found
-
-
-def _tells(row: Row) -> bool:
-    """Whether a row is of a recording in which fabrics differ clearly beyond the floor."""
-    return row.skill is not None
