@@ -33,4 +33,4 @@ def learned(rows: Sequence[Row], metric: str) -> dict[Configuration, dict[str, V
     found: dict[Configuration, dict[str, Verdict]] = {}
     for (configuration, motion, _), verdict in zip(compared, verdicts, strict=True):
         found.setdefault(configuration, {})[motion] = verdict
-    return found
+    return {each: found[each] for each in told.configurations if each in found}
