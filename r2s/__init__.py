@@ -32,6 +32,7 @@ from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.fold_length import fold_length
 from r2s.fabrics.informed_space import InformedSpace
 from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
+from r2s.fabrics.softening_space import SofteningSpace
 from r2s.fabrics.stiffening_space import StiffeningSpace
 from r2s.failures import Failure
 from r2s.geometry.mesh import Mesh, rectangle
@@ -128,6 +129,7 @@ __all__ = [
     "ParameterSpace",
     "OrthotropicSpace",
     "IsotropicSpace",
+    "SofteningSpace",
     "StiffeningSpace",
     "InformedSpace",
     "Range",

@@ -8,6 +8,7 @@ import pytest
 
 from r2s.estimation.default_spaces import on_cloth
 from r2s.fabrics import presets, prior
+from r2s.fabrics.softening_space import SofteningSpace
 from r2s.fabrics.stiffening_space import StiffeningSpace
 from r2s.laws.membrane import OrthotropicMembrane
 from r2s.laws.plate import PlateBending
@@ -77,15 +78,29 @@ def test_a_plate_loses_half_of_what_it_can_at_its_knee():
     assert np.all(np.linalg.eigvalsh(np.asarray(bent)) > 0)
 
 
-@pytest.mark.parametrize("stiffens", [False, True])
-def test_a_space_that_knows_of_the_prior_has_the_mean_and_the_spread_of_its_draws(stiffens):
+def test_a_space_of_sheets_that_soften_and_stiffen_gives_a_fabric_back():
+    space = StiffeningSpace.make(SofteningSpace.make(on_cloth(0.2)))
+    place = jr.uniform(jr.key(0), (space.dim,))
+    np.testing.assert_allclose(space.to_unit(space(place)), place, rtol=1e-4)
+    loss, knee = map(float, space.values(place)[7:9])
+    law = space(place).bending
+    moment = jax.grad(law.energy_density)(jnp.array([knee, 0.0, 0.0]))[0]
+    left = float(law.small.stiffness) * (1 - loss / 2)
+    assert float(moment) == pytest.approx(left * knee, rel=1e-4)
+    of_none = space.to_unit(presets.black_denim())
+    assert of_none[7] == 0 and jnp.allclose(space(of_none).bending.loss, 0)
+
+
+@pytest.mark.parametrize("laws", [(), (StiffeningSpace,), (SofteningSpace, StiffeningSpace)])
+def test_a_space_that_knows_of_the_prior_has_the_mean_and_the_spread_of_its_draws(laws):
     space = on_cloth(0.2)
-    space = StiffeningSpace.make(space) if stiffens else space
+    for law in laws:
+        space = law.make(space)
     mean, precision = prior.informed(space, 0.2).prior()
     drawn = prior.draws(0.2, 4000, jr.key(3))
     places = np.asarray(jax.vmap(space.to_unit)(drawn))[:, :7]
     spread = np.sqrt(np.diag(np.linalg.inv(precision)))
     np.testing.assert_allclose(mean[:7], np.clip(places.mean(axis=0), 0, 1), atol=0.03)
     np.testing.assert_allclose(spread[:7], places.std(axis=0), rtol=0.1)
-    if stiffens:  # of which no draw says anything
+    if laws:  # of which no draw says anything
         np.testing.assert_allclose(spread[7:], 0.29, rtol=1e-5)

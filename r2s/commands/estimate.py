@@ -79,9 +79,9 @@ class EstimateCard:
     solver: Literal["cloth", "points"] | None = None
     """What simulates: the cloth (orthotropic fabrics) or material points (isotropic ones); by
     default what the method supports."""
-    law: Literal["linear", "stiffening"] = "linear"
-    """Of the yarns: of constant stiffness, or one that grows with their stretch (three
-    numbers more)."""
+    law: Literal["linear", "stiffening", "softening", "stiffening+softening"] = "linear"
+    """Constant stiffness; stiffening: yarns whose stiffness grows with their stretch (three numbers
+    more); softening: bending whose stiffness falls with the curvature (two more)."""
     prior: Literal["flat", "fabrics"] | None = None
     """What is assumed beforehand: any place of the ranges alike, or what measured fabrics of this
     weight are like. Then diffcloud trusts that more, as far as its mesh errs. By default fabrics
@@ -209,6 +209,7 @@ class EstimateCard:
         that the solver's space lacks."""
         from r2s.estimation.method import default_space
         from r2s.fabrics import prior
+        from r2s.fabrics.softening_space import SofteningSpace
         from r2s.fabrics.stiffening_space import StiffeningSpace
 
         if self.density > 0 and not LIGHTEST <= self.density <= HEAVIEST:
@@ -220,7 +221,9 @@ class EstimateCard:
         asked = self.law != "linear" or told != "flat"
         if asked and method.chosen_solver != "cloth":
             raise ValueError("--law and --prior are of the cloth: material points have their own")
-        if self.law == "stiffening":
+        if "softening" in self.law:
+            space = SofteningSpace.make(space)
+        if "stiffening" in self.law:
             space = StiffeningSpace.make(space)
         return space if told == "flat" else prior.informed(space, self.density)
 

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from r2s.fabrics.fabric import Fabric, constant_laws
+from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace, Range
 from r2s.laws.stiffening import HALF, StiffeningMembrane
 
@@ -53,7 +53,6 @@ class StiffeningSpace(ParameterSpace):
         """The point where a fabric lies; one that does not stiffen lies at the least ratio."""
         law = fabric.membrane
         if not isinstance(law, StiffeningMembrane):
-            constant_laws(fabric)
             least = self.ranges[-3].to_unit(jnp.asarray(self.ranges[-3].low))
             return jnp.concatenate([self.space.to_unit(fabric), jnp.stack([least, 0.5, 0.5])])
         inner = self.space.to_unit(dataclasses.replace(fabric, membrane=law.small))
