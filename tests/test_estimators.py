@@ -146,7 +146,9 @@ def test_of_many_descents_the_better_half_go_on():
     zero, vector, matrix = (jnp.zeros((2,) * dims) for dims in range(3))
     stage = jnp.zeros((), int)
     losses = [float("nan"), *np.random.default_rng(0).permutation(63).astype(float)]
-    normals = [gauss_newton.Normal(jnp.array(x), zero, vector, matrix, matrix) for x in losses]
+    normals = [
+        gauss_newton.Normal(jnp.array(x), zero, zero, vector, matrix, matrix) for x in losses
+    ]
     row = [Descent(vector, normal, zero, zero, zero, stage) for normal in normals]
     order = [int(i) for i in np.argsort(losses)]  # NaN is last
     counts = []

@@ -1,5 +1,6 @@
 """Estimates by meshes: what one owes to its mesh, and when a finer one is taken."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -10,10 +11,10 @@ import pytest
 
 from r2s import scenarios
 from r2s.estimation import descent, mesh_ladder
-from r2s.estimation.compiled import derivatives_at
+from r2s.estimation.compiled import derivatives_at, normal_from
 from r2s.estimation.diffcloud import DiffCloud
 from r2s.estimation.estimate import Estimate
-from r2s.estimation.gauss_newton import theta_length
+from r2s.estimation.gauss_newton import Descent, Normal, theta_length
 from r2s.estimation.mesh_bias import OtherMesh, factor, mesh_bias
 from r2s.estimation.method import Budget
 from r2s.estimation.problem import NuisancePrior, Problem
@@ -125,6 +126,38 @@ def test_the_finest_mesh_is_reached_in_one_stride(monkeypatch):
     assert found.shape == (9, 9)
     with pytest.raises(ValueError, match="leave it out"):
         DiffCloud(finest=True, shape=(9, 9)).estimate([lift()], SPACE, key=jr.key(0))
+
+
+@pytest.mark.slow(group="estimates")
+def test_a_recording_of_twice_the_weight_counts_as_two():
+    stiff, soft = problem(1.5), problem(0.7)
+    theta = jnp.zeros(theta_length((stiff, soft))).at[:2].set(PLACE)
+    predicted = derivatives_at((stiff, soft), theta)
+    pairs = zip((stiff, soft), (6.0, 3.0), strict=True)
+    twice = tuple(dataclasses.replace(each, weight=jnp.array(count)) for each, count in pairs)
+    weighed = normal_from(twice, theta, predicted, jnp.zeros(()))
+    all_three = (stiff, stiff, soft)
+    longer = jnp.zeros(theta_length(all_three)).at[:2].set(PLACE)
+    counted = normal_from(all_three, longer, [predicted[0], *predicted], jnp.zeros(()))
+    alike = normal_from((stiff, soft), theta, predicted, jnp.zeros(()))
+    np.testing.assert_allclose(weighed.loss, counted.loss, rtol=1e-6)
+    np.testing.assert_allclose(weighed.gradient[:2], counted.gradient[:2], rtol=1e-5)
+    np.testing.assert_allclose(weighed.matrix[:2, :2], counted.matrix[:2, :2], rtol=1e-5)
+    assert weighed.spread == pytest.approx(float(counted.spread), rel=1e-6)
+    assert abs(float(alike.loss / weighed.loss) - 1) > 0.01
+    assert float(weighed.widest) == pytest.approx(float(alike.widest))
+    assert float(weighed.widest) > float(weighed.spread)
+
+
+def test_recordings_count_by_what_is_left_of_them_alone_and_none_is_exact():
+    def end(loss: float) -> Descent:
+        none, theta, square = jnp.zeros(()), jnp.zeros(2), jnp.zeros((2, 2))
+        normal = Normal(jnp.array(loss), none, none, theta, square, square)
+        return Descent(theta, normal, none, none, none, jnp.zeros((), int))
+
+    cloud, markers, exact = mesh_ladder.weights([end(4e-6), end(1e-8), end(0.0)])
+    assert markers / cloud == pytest.approx(400)
+    assert exact == pytest.approx(1e10)
 
 
 def estimate_of_nothing() -> Estimate:

@@ -157,7 +157,7 @@ def valley(lifted, size):
     def at(place, gradient: Any = 0.0, loss: Any = 0.0):
         found = matrix @ (place - end) + gradient
         one = jnp.ones(())
-        return Normal(loss * one, one, found, matrix, 1e-4 * matrix)
+        return Normal(loss * one, one, one, found, matrix, 1e-4 * matrix)
 
     one = jnp.ones(())
     return Descent(end, at(end), one, one, one, jnp.zeros((), int)), at

@@ -329,7 +329,7 @@ def _later(problems: Problems, budget: Budget, row: Row, derive: Derive) -> Row 
     loose = best
     if _share(budget, stage) != _share(budget, stage - 1):
         (loose,) = _fresh(problems, budget, [best.theta], 0.0, stage, derive)
-    scale = float(np.clip(STRICT * float(loose.normal.spread), *SCALES))
+    scale = float(np.clip(STRICT * float(loose.normal.widest), *SCALES))
     after = list(row)
     (after[which],) = _fresh(problems, budget, [best.theta], scale, stage, derive)
     return after
@@ -453,7 +453,7 @@ def _resumed(checkpoint: Path, run: dict[str, str], budget: Budget) -> list[Row]
     if arrays is None:
         return []
     none, vector, square = (jnp.zeros((0,) * dims) for dims in (2, 3, 4))
-    normal = Normal(none, none, vector, square, square)
+    normal = Normal(none, none, none, vector, square, square)
     like = Descent(vector, normal, none, none, none, jnp.zeros((0, 0), int))
     stored = checkpoints.tree_from(arrays, like)
     return [

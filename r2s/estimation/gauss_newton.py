@@ -5,9 +5,9 @@ does not pull on what it does not see), robust against outliers. The parameters 
 derivative of the whole motion with respect to all of them costs about as much as one gradient, and
 its normal equations give the step and the covariance at once.
 
-Several recordings of one fabric are weighed by their frames. Their joint parameter vector `theta`
-is the fabric's place in its space, the nuisances that all recordings share (`SHARED`), and those of
-each recording (`OWN`).
+Several recordings of one fabric are weighed by their frames, and by how well each can be followed
+(`Problem.weight`). Their joint parameter vector `theta` is the fabric's place in its space, the
+nuisances that all recordings share (`SHARED`), and those of each recording (`OWN`).
 
 This stays our own beside `optimistix.LevenbergMarquardt`, which on a lift (20 frames, 5 x 5
 vertices) came from three starts to the same loss, 6.789e-6 m^2, with 26 sensitivities each, its
@@ -40,13 +40,15 @@ class Normal(eqx.Module):
     """The loss at a theta, and its normal equations there, without the prior.
 
     - `loss`: robust mean, [m^2]; infinite when the run diverged.
-    - `spread`: robust standard deviation of the distances, [m].
+    - `spread`: robust standard deviation of the distances, [m], of recordings by their weights.
+    - `widest`: the same, of the recording where it is largest.
     - `gradient`, `matrix`: derivative of the loss in theta, and its Gauss-Newton matrix, [m^2].
     - `scatter`: covariance of the gradient, [m^4], see the function `scatter`.
     """
 
     loss: Float[Array, "*start"]
     spread: Float[Array, "*start"]
+    widest: Float[Array, "*start"]
     gradient: Float[Array, "*start theta"]
     matrix: Float[Array, "*start theta theta"]
     scatter: Float[Array, "*start theta theta"]
@@ -84,9 +86,12 @@ def theta_indices(problems: Problems, which: int) -> np.ndarray:
     return np.concatenate([np.arange(shared), np.arange(first, first + len(OWN))])
 
 
-def recording_weights(problems: Problems) -> list[float]:
-    """Weight of each recording: its share of all frames."""
-    frames = [len(problem.frames) for problem in problems]
+def recording_weights(problems: Problems) -> list[Float[Array, ""]]:
+    """Weight of each recording: its share of all frames, each by the weight of its recording."""
+    frames = [
+        len(problem.frames) * (jnp.ones((), float) if problem.weight is None else problem.weight)
+        for problem in problems
+    ]
     return [count / sum(frames) for count in frames]
 
 
@@ -156,19 +161,20 @@ def normal_from(
         index = theta_indices(problems, which)
         found = normal_equations.normal_equations_of(problem, seen, slope, scale)
         losses.append(share * jnp.where(seen.ok, found.loss, jnp.inf))
-        spreads.append(share * found.spread**2)
+        spreads.append(found.spread)
         zeros = jnp.zeros(
             (len(found.scores), theta_length(problems), theta_length(problems)), theta.dtype
         )
         scores.append(zeros[:, 0].at[:, index].set(share * found.scores))
         matrices.append(zeros.at[:, index[:, None], index].set(share * found.matrices))
         noise.append(share * found.noise)
-    spread = jnp.sqrt(jnp.sum(jnp.stack(spreads)))
+    spread = jnp.sqrt(jnp.stack(weights) @ jnp.stack(spreads) ** 2)
     score, matrix = jnp.concatenate(scores), jnp.concatenate(matrices)
     least = prior_terms(problems, theta)[1] * least_weight(problems, spread)
     return Normal(
         jnp.sum(jnp.stack(losses)),
         spread,
+        jnp.max(jnp.stack(spreads)),
         jnp.sum(score, axis=0),
         jnp.sum(matrix, axis=0),
         scatter(score, matrix, jnp.concatenate(noise), least),

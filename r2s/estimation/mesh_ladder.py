@@ -14,11 +14,13 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxtyping import PRNGKeyArray
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation.compiled import prepare, remembering
-from r2s.estimation.descent import Search, judged, search
+from r2s.estimation.descent import Search, each_alone, judged, search
 from r2s.estimation.estimate import Estimate
+from r2s.estimation.gauss_newton import FINEST, Descent
 from r2s.estimation.mesh_bias import OtherMesh, factor
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import Theta
@@ -51,6 +53,9 @@ def descend_by_meshes(
 ) -> Estimate:
     """The fabric that explains some recordings, on a mesh of `shape` or on one that resolves it.
 
+    Of several recordings each counts by how well it can be followed alone on the coarsest mesh
+    (`weights`), from the end of a search in which all frames count alike.
+
     `finest`: from the coarsest mesh straight to the finest of `r2s.scenarios.resolution.LADDER`,
     whichever fabric is found; not with a `shape`.
 
@@ -63,10 +68,13 @@ def descend_by_meshes(
     derive = remembering()
 
     known, lock = functools.cache(partial(_problems, recordings, space)), threading.Lock()
+    counts: list[Array] = []  # of each recording, once it is known
 
     def on(*shapes: Shape) -> tuple[Problem, ...]:
         with lock:  # else two threads make them twice, and `derive` knows one of these
-            return known(shapes)
+            found = known(shapes)
+        weighed = zip(found, counts, strict=True) if counts else ()
+        return tuple(dataclasses.replace(each, weight=count) for each, count in weighed) or found
 
     def climb(shapes: list[Shape], start: Theta | None, leads_on: bool) -> _Rung:
         more, path = budget, checkpoint
@@ -94,6 +102,10 @@ def descend_by_meshes(
 
     with meanwhile(needed() if kept() else ()):
         at = climb(rungs[0], None, len(rungs) > 1)
+        if len(recordings) > 1:
+            tell(progress, "each recording alone")
+            counts += weights(each_alone(at.found.problems, budget, at.found.theta, key, derive))
+            at = climb(rungs[0], at.found.theta, len(rungs) > 1)
         for shapes in rungs[1:]:
             if not finest and not is_too_coarse(recordings, at.found.fabric, at.shapes):
                 at = climb(at.shapes, at.found.theta, False)  # to its end
@@ -110,6 +122,18 @@ class _Rung(NamedTuple):
 
     shapes: list[Shape]
     found: Search
+
+
+def weights(alone: Sequence[Descent]) -> list[Float[Array, ""]]:
+    """Of each recording, from the end of a descent in it alone: one over the squared distances that
+    are left, [1/m^2], of noise or of what the model cannot follow.
+
+    Markers and a load cell err by tenths of a millimetre where points of a cloud err by
+    millimetres, and a lift that buckles elsewhere by more: weighed alike, a lift would outweigh
+    what pulls tell of the membrane. (A step of feasible generalized least squares.)
+    """
+    left = [max(float(end.normal.loss), FINEST**2) for end in alone]
+    return [jnp.asarray(1 / each, float) for each in left]
 
 
 def ladder(recordings: Recordings) -> list[list[Shape]]:

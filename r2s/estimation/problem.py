@@ -133,6 +133,8 @@ class Problem(eqx.Module):
     - `clouds`, `markers`, `force`: what was seen in them; None: it was not.
     - `expected`: what must have been seen of the sheet; None: nobody knows the cameras.
     - `wanted`: how many frames of the scenario have to be simulated; None: all.
+    - `weight`: of a frame beside those of other recordings of the fabric, [1/m^2] (only ratios
+      count): what the square of a distance scatters by, inverted; None: 1, as of all.
     - `solver`: what simulates; None: the cloth, in the scenario's steps.
     - `nuisance_prior`: how far the experiment may be off what was written down.
     """
@@ -147,6 +149,7 @@ class Problem(eqx.Module):
     nuisance_prior: NuisancePrior = eqx.field(static=True, default=USUAL)
     expected: Expected | None = None
     wanted: Int[Array, ""] | None = None
+    weight: Float[Array, ""] | None = None
 
     @classmethod
     def make(
@@ -257,12 +260,13 @@ def window(problem: Problem, first: int, last: int) -> Problem:
 
 
 def motion_alone(problem: Problem) -> Problem:
-    """The problem without clouds and markers, on which no prediction depends but for its end.
+    """The problem without what was seen, on which no prediction depends but for its end.
 
     Without a force it is not simulated beyond the last frame of which something was seen.
     """
     wanted = None if problem.force is not None else _wanted(problem)
-    return dataclasses.replace(problem, clouds=None, markers=None, expected=None, wanted=wanted)
+    seen = dict.fromkeys(("clouds", "markers", "expected", "weight"))
+    return dataclasses.replace(problem, wanted=wanted, **seen)
 
 
 def _wanted(problem: Problem) -> Int[Array, ""]:
