@@ -34,6 +34,7 @@ if __name__ == "__main__":
     facts = {
         "command": "make study; python experiments/summarise_study.py results",
         "version": f"r2s {version}",
+        "seed": settings["seed"],
         "date": time.strftime("%Y-%m-%d", made),
         "cost": f"{seconds / 60:.0f} CPU minutes",
     }

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,13 +13,17 @@ import pytest
 
 from r2s import scenarios
 from r2s.commands.estimate import EstimateCard
+from r2s.estimation.compiled import derivatives_at, normal_from, predictions_at
+from r2s.estimation.gauss_newton import least_weight, prior_terms, theta_length
 from r2s.estimation.method import default_space
+from r2s.estimation.normal_equations import loss_of
 from r2s.estimation.pinn.synthetic_pulls import pulled
-from r2s.estimation.prediction import predict, theta_length
+from r2s.estimation.prediction import predict
 from r2s.estimation.problem import Problem
 from r2s.estimation.registry import METHODS
 from r2s.fabrics import presets
 from r2s.recordings.recording import load, save
+from r2s.scenarios import synthetic
 from r2s.scenarios.scenario import as_cut, from_recording, rollout
 
 FABRIC = presets.camel_ponte_roma()
@@ -50,7 +55,7 @@ def test_the_true_fabric_predicts_a_pull_at_its_angle_and_no_other(bias):
     off = {}
     for degrees in (30.0, 70.0):
         problem = Problem.make(at_angle(bias, degrees), SPACE, shape=SHAPE)
-        theta = jnp.zeros(theta_length(problem)).at[: SPACE.dim].set(SPACE.to_unit(FABRIC))
+        theta = jnp.zeros(theta_length((problem,))).at[: SPACE.dim].set(SPACE.to_unit(FABRIC))
         seen, markers, force = _predict(problem, theta), problem.markers, problem.force
         assert markers is not None and force is not None and seen.force is not None
         at = jnp.einsum("mk,tmki->tmi", markers.weights, seen.x[:, markers.vertices])
@@ -107,3 +112,30 @@ def test_diffcloud_finds_the_membrane_from_pulls_in_three_directions():
     assert (off < [0.03, 0.03, 0.15]).all() and (off < 3 * found.standard_errors[own]).all()
     alone = METHODS["diffcloud"](shape=SHAPE).estimate(recordings[:1], SPACE, key=jax.random.key(0))
     assert (alone.standard_errors[own[1:]] > 3 * found.standard_errors[own[1:]]).all()
+
+
+@pytest.mark.slow(group="estimates")
+def test_a_lift_of_another_fabric_hardly_moves_what_a_pull_tells():
+    """Points of a cloud err by a centimetre here, markers and a load cell by far less."""
+    motion: dict[str, Any] = {"height": 0.2, "inward": 0.1, "moving": 0.8}
+    lift = scenarios.lifting(num_frames=13, interval=1 / 10, **motion)
+    args = {"seen": synthetic.WHOLE._replace(points=300, noise=0.01), "shape": SHAPE}
+    other = presets.pink_solid()
+    recordings = pull_of(0.0), synthetic.record(lift, other, "pink", key=jr.key(3), **args)
+    problems = tuple(Problem.make(each, SPACE, shape=SHAPE) for each in recordings)
+    theta = jnp.zeros(theta_length(problems)).at[: SPACE.dim]
+    here, there = (theta.set(SPACE.to_unit(each)) for each in (FABRIC, other))
+    predicted = derivatives_at(problems, here)
+    pull, _ = predicted
+    own = predictions_at(problems, there)
+    left = [float(loss_of(p, seen)) for p, seen in zip(problems, (pull[0], own[1]), strict=True)]
+    assert left[1] > 20 * left[0]  # of the noise of each
+
+    def step_of_warp(weights):
+        pairs = zip(problems, weights, strict=True)
+        counted = tuple(dataclasses.replace(each, weight=jnp.array(w)) for each, w in pairs)
+        found = normal_from(counted, here, predicted, jnp.zeros(()))
+        prior = least_weight(counted, found.spread) * prior_terms(counted, here)[1]
+        return abs(float(jnp.linalg.solve(found.matrix + prior, -found.gradient)[0]))
+
+    assert step_of_warp([1 / each for each in left]) < step_of_warp([1.0, 1.0]) / 3

@@ -372,5 +372,6 @@ def _contradiction(estimate: "Estimate", recordings: "Sequence[Recording]") -> l
     return [
         f"warning: {names[found.recording]} contradicts {against} (by chance {found.p:.1g}; "
         f"{found.parameter} {found.errors:.1f} standard errors apart): another fabric, or its "
-        "density, scale, path or markers are not as written down"
+        "density, scale, path or markers are not as written down, or a law that cannot follow all "
+        "of them (see --law)"
     ]

@@ -1,0 +1,70 @@
+"""What an estimate from a configuration's recordings of a fabric predicts, and what it found."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from _tables import Line
+
+from r2s.estimation.method import default_space
+from r2s.fabrics.parameters import ParameterSpace
+from r2s.study import engine, results, verdicts
+from r2s.study.cells import read_metadata
+from r2s.study.estimates import EstimateCell, read_estimate
+from r2s.study.matrix import SMALL, configuration_named, synthetic
+from r2s.study.rows import Row
+from r2s.study.sources import small_strain
+from r2s.study.verdicts import SURFACE
+
+NAMED = {"": "estimate", "true": "true fabric", "middle": "middle", "default": "default"}
+
+
+def predicted(folder: Path, configuration: str, fabric: str, motions: tuple[str, ...]) -> Line:
+    """The line of a table: errors [mm] and skill in the first of each of some motions, numbers of
+    the fabric over the truth's at small strain, and the seconds of a CPU that the estimate took."""
+    plan = dataclasses.replace(
+        SMALL,
+        configurations=(configuration_named(configuration),),
+        fabrics=(fabric,),
+        judged=1,
+        every=1,
+        draws=4,
+    )
+    cells = [cell for cell in synthetic(plan) if cell.scenario in motions]
+    failed = engine.run([*verdicts.ensembles(cells), *cells], folder, engine.Serial())
+    if failed:
+        raise RuntimeError(f"{configuration} of {fabric}: {next(iter(failed.values()))}")
+    rows = [row for row in results.rows(cells, folder) if row.metric == SURFACE]
+    line: Line = {}
+    for motion in motions:
+        line |= _of(motion, [row for row in rows if row.evaluated_on == motion])
+    (estimate,) = {cell.estimate for cell in cells if cell.estimate is not None}
+    took = read_metadata(estimate, folder)["cpu_seconds"]
+    return line | _over_truth(estimate, folder) | {"CPU s": f"{took:.0f}"}
+
+
+def _of(motion: str, rows: list[Row]) -> Line:
+    found: Line = {f"{motion}: floor": _millimetres(rows[0].floor)}
+    for baseline, name in NAMED.items():
+        values = [row.value for row in rows if row.baseline == baseline]
+        found[f"{motion}: {name}"] = _millimetres(float(np.mean(values)))
+    (skill,) = {row.skill for row in rows if row.baseline == ""}
+    return found | {f"{motion}: skill": "not told" if skill is None else f"{skill:.2f}"}
+
+
+def _over_truth(cell: EstimateCell, folder: Path) -> Line:
+    found = read_estimate(cell, folder)
+    if found is None:
+        return {"warp": "diverged"}
+    truth = small_strain(cell.fabric)
+    space: ParameterSpace = default_space(cell.solver, cell.density)
+    true = np.asarray(space.values(space.to_unit(truth)))
+    line: Line = {}
+    for bound, value, there in zip(found.ranges, found.values, true, strict=True):
+        apart = value / there if bound.log else value - there
+        line[bound.name] = f"{apart:.2f}" if bound.log else f"{apart:+.2f}"
+    return line
+
+
+def _millimetres(value: float | None) -> str:
+    return "-" if value is None else f"{1e3 * value:.1f}"
