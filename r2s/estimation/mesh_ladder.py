@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation.compiled import prepare, remembering
-from r2s.estimation.descent import Search, judged, search
+from r2s.estimation.descent import Search, each_alone, judged, search
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import FINEST, Descent
 from r2s.estimation.mesh_bias import OtherMesh, factor
@@ -54,7 +54,7 @@ def descend_by_meshes(
     """The fabric that explains some recordings, on a mesh of `shape` or on one that resolves it.
 
     Of several recordings each counts by how well it can be followed alone on the coarsest mesh
-    (`weights`).
+    (`weights`), from the end of a search in which all frames count alike.
 
     `finest`: from the coarsest mesh straight to the finest of `r2s.scenarios.resolution.LADDER`,
     whichever fabric is found; not with a `shape`.
@@ -88,13 +88,6 @@ def descend_by_meshes(
         found = search(on(*shapes), more, start=start, derive=derive, key=key, **saved)
         return _Rung(shapes, found)
 
-    def alone(which: int, shapes: list[Shape]) -> Descent:
-        tell(progress, f"recording {which + 1} of {len(recordings)} alone")
-        path = checkpoint.with_suffix(f".alone{which + 1}.npz") if checkpoint else None
-        early, own = budget._replace(leads_on=True), (on(*shapes)[which],)
-        saved = {"checkpoint": path, "progress": progress}
-        return search(own, early, derive=derive, key=key, **saved).best
-
     rungs = [[shape] * len(recordings)] if shape else ladder(recordings)
     if finest:
         rungs = [rungs[0], rungs[-1]]
@@ -108,9 +101,11 @@ def descend_by_meshes(
             yield lambda shapes=shapes: prepare(on(*shapes), derivatives=False)
 
     with meanwhile(needed() if kept() else ()):
-        if len(recordings) > 1:
-            counts += weights([alone(i, rungs[0]) for i in range(len(recordings))])
         at = climb(rungs[0], None, len(rungs) > 1)
+        if len(recordings) > 1:
+            tell(progress, "each recording alone")
+            counts += weights(each_alone(at.found.problems, budget, at.found.theta, key, derive))
+            at = climb(rungs[0], at.found.theta, len(rungs) > 1)
         for shapes in rungs[1:]:
             if not finest and not is_too_coarse(recordings, at.found.fabric, at.shapes):
                 at = climb(at.shapes, at.found.theta, False)  # to its end
