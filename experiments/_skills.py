@@ -7,7 +7,6 @@ import numpy as np
 from _tables import Line
 
 from r2s.estimation.method import default_space
-from r2s.fabrics.parameters import ParameterSpace
 from r2s.study import engine, results, verdicts
 from r2s.study.cells import read_metadata
 from r2s.study.estimates import EstimateCell, read_estimate
@@ -57,7 +56,7 @@ def _over_truth(cell: EstimateCell, folder: Path) -> Line:
     if found is None:
         return {"warp": "diverged"}
     truth = small_strain(cell.fabric)
-    space: ParameterSpace = default_space(cell.solver, cell.density)
+    space = default_space(cell.solver, cell.density)
     true = np.asarray(space.values(space.to_unit(truth)))
     line: Line = {}
     for bound, value, there in zip(found.ranges, found.values, true, strict=True):

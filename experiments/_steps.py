@@ -2,18 +2,16 @@
 
 import dataclasses
 
-import equinox as eqx
 import numpy as np
+from _motions import distance, run
 from _tables import Line
 
 from r2s.scenarios.in_explicit_steps import explicit_cloth
-from r2s.scenarios.scenario import Scenario, rollout
+from r2s.scenarios.scenario import Scenario
 from r2s.study.sources import SyntheticRecording, strain_dependent
 
 FINE, COARSER = 33, (9, 17)  # vertices a side
 SHARES = (1, 2, 4)  # steps for one of the scenario's
-
-_run = eqx.filter_jit(rollout)
 
 
 def apart_in_steps(scenario: str, fabric: str) -> Line:
@@ -23,14 +21,14 @@ def apart_in_steps(scenario: str, fabric: str) -> Line:
     fine = experiment.scenario((FINE, FINE))
 
     def moved(scenario: Scenario, count: int = FINE, solver=None) -> np.ndarray:
-        x = np.asarray(_run(scenario, law, solver=solver).x)[first : last + 1]
+        x = np.asarray(run(scenario, law, solver=solver).x)[first : last + 1]
         every = (count - 1) // (min(COARSER) - 1)
         return x.reshape(len(x), count, count, 3)[:, ::every, ::every]
 
     truth = moved(fine, solver=explicit_cloth(fine, law))
 
     def away(x: np.ndarray) -> str:
-        return f"{1e3 * np.sqrt(((x - truth) ** 2).sum(axis=-1).mean(axis=(1, 2))).mean():.1f}"
+        return f"{distance(scenario, x, truth).mean():.1f}"
 
     found: Line = {}
     for share in SHARES:

@@ -27,9 +27,7 @@ CAPTION = (
 if __name__ == "__main__":
     parser = command_line(__doc__, "docs/results/skill_by_fabric.csv")
     parser.add_argument("--fabrics", nargs="+", choices=presets.FIVE, default=list(presets.FIVE))
-    parser.add_argument(
-        "--configurations", nargs="+", default=["diffcloud-cloth-lifting+stretching"]
-    )
+    parser.add_argument("--configurations", nargs="+", default=[TOGETHER])
     parser.add_argument("--motions", nargs="+", choices=MOTIONS, default=["fling", "shaking"])
     parser.add_argument("--folder", type=Path, default=Path("results/skill_by_fabric"))
     a = parser.parse_args()
