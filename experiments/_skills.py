@@ -1,27 +1,34 @@
 """What an estimate from a configuration's recordings of a fabric predicts, and what it found."""
 
-import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from _tables import Line
 
+from r2s.estimation.default_spaces import law_of, with_law
 from r2s.estimation.method import default_space
 from r2s.study import engine, results, verdicts
 from r2s.study.cells import read_metadata
 from r2s.study.estimates import EstimateCell, read_estimate
+from r2s.study.evaluations import EvaluationCell
 from r2s.study.matrix import SMALL, configuration_named, synthetic
 from r2s.study.rows import Row
-from r2s.study.sources import small_strain
+from r2s.study.sources import of_law
 from r2s.study.verdicts import SURFACE
 
 NAMED = {"": "estimate", "true": "true fabric", "middle": "middle", "default": "default"}
 
 
-def predicted(folder: Path, configuration: str, fabric: str, motions: tuple[str, ...]) -> Line:
+def predicted(
+    folder: Path, configuration: str, fabric: str, law: str, motions: tuple[str, ...]
+) -> Line:
     """The line of a table: errors [mm] and skill in the first of each of some motions, numbers of
-    the fabric over the truth's at small strain, and the seconds of a CPU that the estimate took."""
-    plan = dataclasses.replace(
+    the fabric over the truth's at small strain, and the seconds of a CPU that the estimate took.
+
+    `law`: "told" by the recordings, as in a study, or one of `r2s.estimation.default_spaces`.
+    """
+    plan = replace(
         SMALL,
         configurations=(configuration_named(configuration),),
         fabrics=(fabric,),
@@ -29,7 +36,7 @@ def predicted(folder: Path, configuration: str, fabric: str, motions: tuple[str,
         every=1,
         draws=4,
     )
-    cells = [cell for cell in synthetic(plan) if cell.scenario in motions]
+    cells = [_of_law(cell, law) for cell in synthetic(plan) if cell.scenario in motions]
     failed = engine.run([*verdicts.ensembles(cells), *cells], folder, engine.Serial())
     if failed:
         raise RuntimeError(f"{configuration} of {fabric}: {next(iter(failed.values()))}")
@@ -40,6 +47,12 @@ def predicted(folder: Path, configuration: str, fabric: str, motions: tuple[str,
     (estimate,) = {cell.estimate for cell in cells if cell.estimate is not None}
     took = read_metadata(estimate, folder)["cpu_seconds"]
     return line | _over_truth(estimate, folder) | {"CPU s": f"{took:.0f}"}
+
+
+def _of_law(cell: EvaluationCell, law: str) -> EvaluationCell:
+    if cell.estimate is None or law == "told":
+        return cell
+    return replace(cell, estimate=replace(cell.estimate, law=law))
 
 
 def _of(motion: str, rows: list[Row]) -> Line:
@@ -55,9 +68,9 @@ def _over_truth(cell: EstimateCell, folder: Path) -> Line:
     found = read_estimate(cell, folder)
     if found is None:
         return {"warp": "diverged"}
-    truth = small_strain(cell.fabric)
-    space = default_space(cell.solver, cell.density)
-    true = np.asarray(space.values(space.to_unit(truth)))
+    law = law_of(found.ranges)
+    space = with_law(default_space(cell.solver, cell.density), law)
+    true = np.asarray(space.values(space.to_unit(of_law(cell.fabric, law))))
     line: Line = {}
     for bound, value, there in zip(found.ranges, found.values, true, strict=True):
         apart = value / there if bound.log else value - there

@@ -9,6 +9,7 @@ over the truth's at small strain (coupling: the difference). Truths stiffen as t
 up to 35 % of their bending stiffness, which estimates of constant stiffness cannot follow.
 """
 
+from functools import partial
 from pathlib import Path
 
 from _skills import predicted
@@ -28,6 +29,7 @@ if __name__ == "__main__":
     parser = command_line(__doc__, "docs/results/skill_by_fabric.csv")
     parser.add_argument("--fabrics", nargs="+", choices=presets.FIVE, default=list(presets.FIVE))
     parser.add_argument("--configurations", nargs="+", default=[TOGETHER])
+    parser.add_argument("--law", default="told", help="told by the recordings, or linear, ...")
     parser.add_argument("--motions", nargs="+", choices=MOTIONS, default=["fling", "shaking"])
     parser.add_argument("--folder", type=Path, default=Path("results/skill_by_fabric"))
     a = parser.parse_args()
@@ -37,4 +39,4 @@ if __name__ == "__main__":
         for fabric in a.fabrics
     ]
     motions = tuple(a.motions)
-    resumed(a.out, CAPTION, jobs, lambda **job: predicted(a.folder, motions=motions, **job))
+    resumed(a.out, CAPTION, jobs, partial(predicted, a.folder, law=a.law, motions=motions))

@@ -314,6 +314,6 @@ def test_fabrics_of_this_weight_are_known_to_whom_they_help(options, is_alone, k
     card = EstimateCard((Path("lift.npz"),), 0.2, Path("card.json"), **options)
     method = METHODS[card.method]()
     told = card._prior(method, is_alone)
-    assert isinstance(card._space(method, told), InformedSpace) == knows
+    assert isinstance(card._space(method, told, []), InformedSpace) == knows
     words = _approach("diffcloud", (), told)
     assert ("prior of measured fabrics" in words) == knows

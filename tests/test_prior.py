@@ -6,7 +6,7 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from r2s.estimation.default_spaces import on_cloth
+from r2s.estimation.default_spaces import on_cloth, with_law
 from r2s.fabrics import presets, prior
 from r2s.fabrics.softening_space import SofteningSpace
 from r2s.fabrics.stiffening_space import StiffeningSpace
@@ -79,7 +79,7 @@ def test_a_plate_loses_half_of_what_it_can_at_its_knee():
 
 
 def test_a_space_of_sheets_that_soften_and_stiffen_gives_a_fabric_back():
-    space = StiffeningSpace.make(SofteningSpace.make(on_cloth(0.2)))
+    space = with_law(on_cloth(0.2), "stiffening+softening")
     place = jr.uniform(jr.key(0), (space.dim,))
     np.testing.assert_allclose(space.to_unit(space(place)), place, rtol=1e-4)
     loss, knee = map(float, space.values(place)[7:9])

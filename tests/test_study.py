@@ -15,6 +15,7 @@ import pytest
 
 from r2s.estimation.diffcloud import DiffCloud
 from r2s.estimation.estimate import point_estimate
+from r2s.estimation.pinn.synthetic_pulls import pulled
 from r2s.evaluation import prediction_error
 from r2s.fabrics import presets, prior
 from r2s.fabrics.arcsim import write_material
@@ -248,6 +249,7 @@ def test_a_lift_and_the_pulls_of_the_network_are_estimated_from_together():
     assert both.scenario == "lifting+stretching" and pulls.scenario == "stretching"
     assert [each.scenario for each in both.sources[:1]] == ["lifting"]
     assert both.sources[1:] == pulls.sources
+    assert both.law == "told" and pulls.law == "linear"  # as the command has them
     assert [getattr(each, "angle", None) for each in pulls.sources] == [0.0, 45.0, 90.0]
     label = "DIFFCLOUD cloth lifting+stretching"
     assert label in {c.configuration.label for c in matrix.synthetic(plan)}
@@ -294,7 +296,9 @@ def test_who_heeds_a_prior_is_told_of_fabrics_of_this_weight(name, tmp_path, mon
         raise RuntimeError("enough")
 
     monkeypatch.setattr(EstimateCell, "_estimated", told)
-    monkeypatch.setattr(estimates, "read", lambda source, folder: None)
+    shape, motion = (3, 3), {"frames": 6, "moving": 0.1, "steps": 3}
+    recording = pulled(prior.middle(0.2), "any", shape=shape, **motion, key=jr.key(0))
+    monkeypatch.setattr(estimates, "read", lambda source, folder: recording)
     assert "enough" in cell.make(tmp_path, tmp_path)["diverged"]
     assert isinstance(seen[0], InformedSpace) == name.startswith("diffcloud")
     assert (estimates.method_of(cell).shape is None) == name.startswith("diffcloud")

@@ -14,6 +14,7 @@ import pytest
 from r2s import scenarios
 from r2s.commands.estimate import EstimateCard
 from r2s.estimation.compiled import derivatives_at, normal_from, predictions_at
+from r2s.estimation.default_spaces import law_of, law_told_by, with_law
 from r2s.estimation.gauss_newton import least_weight, prior_terms, theta_length
 from r2s.estimation.method import default_space
 from r2s.estimation.normal_equations import loss_of
@@ -139,3 +140,20 @@ def test_a_lift_of_another_fabric_hardly_moves_what_a_pull_tells():
         return abs(float(jnp.linalg.solve(found.matrix + prior, -found.gradient)[0]))
 
     assert step_of_warp([1 / each for each in left]) < step_of_warp([1.0, 1.0]) / 3
+
+
+def test_a_pull_and_another_motion_tell_how_a_fabric_stiffens_and_softens(bias):
+    """Neither alone does, nor a pull of which no force was recorded."""
+    info = dataclasses.replace(bias.info, scenario="lifting", angle=0.0)
+    motion = dataclasses.replace(bias, info=info)
+    without = dataclasses.replace(bias, force=None, force_times=None)
+    assert law_told_by([motion, bias]) == "stiffening+softening"
+    for others in ([], [bias], [bias, bias], [motion], [motion, without]):
+        assert law_told_by(others) == "linear"
+
+
+@pytest.mark.parametrize("law", ["linear", "stiffening", "softening", "stiffening+softening"])
+def test_the_parameters_of_a_space_say_its_law(law):
+    space = with_law(SPACE, law)
+    assert law_of(space.ranges) == law
+    assert [each.name for each in space.ranges[: SPACE.dim]] == [r.name for r in SPACE.ranges]

@@ -79,9 +79,10 @@ class EstimateCard:
     solver: Literal["cloth", "points"] | None = None
     """What simulates: the cloth (orthotropic fabrics) or material points (isotropic ones); by
     default what the method supports."""
-    law: Literal["linear", "stiffening", "softening", "stiffening+softening"] = "linear"
+    law: Literal["linear", "stiffening", "softening", "stiffening+softening"] | None = None
     """Constant stiffness; stiffening: yarns whose stiffness grows with their stretch (three numbers
-    more); softening: bending whose stiffness falls with the curvature (two more)."""
+    more); softening: bending whose stiffness falls with the curvature (two more). By default both
+    for diffcloud where the force of a pull was recorded and another motion; else constant."""
     prior: Literal["flat", "fabrics"] | None = None
     """What is assumed beforehand: any place of the ranges alike, or what measured fabrics of this
     weight are like. Then diffcloud trusts that more, as far as its mesh errs. By default fabrics
@@ -137,7 +138,7 @@ class EstimateCard:
         with Waiting("reading the recordings") as progress:
             method = self._method(progress)
             prior = self._prior(method, not known)
-            space = self._space(method, prior)
+            space = self._space(method, prior, [] if known else seen)
             tests = [test for each in known for test in each.tests]
             if seen:
                 method.check(seen)
@@ -204,13 +205,13 @@ class EstimateCard:
         usual = is_alone and method.takes_prior and method.chosen_solver == "cloth"
         return self.prior or ("fabrics" if usual else "flat")
 
-    def _space(self, method: "Method", told: str) -> "ParameterSpace":
-        """The fabrics to choose from, of which `told` is assumed beforehand; `ValueError` for a law
-        that the solver's space lacks."""
+    def _space(self, method: "Method", told: str, seen: "Sequence[Recording]") -> "ParameterSpace":
+        """The fabrics to choose from, of which `told` is assumed beforehand, with the law that was
+        asked for or that the recordings tell; `ValueError` for one that the solver's space
+        lacks."""
+        from r2s.estimation.default_spaces import law_told_by, with_law
         from r2s.estimation.method import default_space
         from r2s.fabrics import prior
-        from r2s.fabrics.softening_space import SofteningSpace
-        from r2s.fabrics.stiffening_space import StiffeningSpace
 
         if self.density > 0 and not LIGHTEST <= self.density <= HEAVIEST:
             raise ValueError(
@@ -218,13 +219,11 @@ class EstimateCard:
                 f"{HEAVIEST:g} (100 g/m^2 are 0.1 kg/m^2)"
             )
         space = default_space(method.chosen_solver, self.density)
-        asked = self.law != "linear" or told != "flat"
+        law = self.law or (law_told_by(seen) if method.name == "diffcloud" else "linear")
+        asked = law != "linear" or told != "flat"
         if asked and method.chosen_solver != "cloth":
             raise ValueError("--law and --prior are of the cloth: material points have their own")
-        if "softening" in self.law:
-            space = SofteningSpace.make(space)
-        if "stiffening" in self.law:
-            space = StiffeningSpace.make(space)
+        space = with_law(space, law)
         return space if told == "flat" else prior.informed(space, self.density)
 
     def _hold_out(self, seen: "list[Recording]") -> "list[Recording]":

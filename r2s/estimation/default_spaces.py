@@ -6,10 +6,16 @@ motion does not tell.
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 from r2s.fabrics import prior
 from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
+from r2s.fabrics.softening_space import SOFTENING, SofteningSpace
+from r2s.fabrics.stiffening_space import STIFFENING, StiffeningSpace
+from r2s.recordings.recording import Recording
+
+Law = Literal["linear", "stiffening", "softening", "stiffening+softening"]
 
 RANGES = (
     Range("warp", "N/m", 6.0, 20000.0),
@@ -32,6 +38,36 @@ FROM = {
     "nu": "isotropic solids, 0 to 0.5",
 }
 """Of each range: what it is around. The prior is `r2s.fabrics.prior`."""
+
+
+def with_law(space: ParameterSpace, law: Law) -> ParameterSpace:
+    """A space of constant stiffness, with yarns that stiffen and bending that softens as asked."""
+    if "softening" in law:
+        space = SofteningSpace.make(space)
+    return StiffeningSpace.make(space) if "stiffening" in law else space
+
+
+def law_told_by(recordings: Sequence[Recording]) -> Law:
+    """The laws that some recordings of one fabric tell enough of to estimate together.
+
+    Both where the force of a pull was recorded and another motion beside it: a pull tells how yarns
+    stiffen, and it alone nothing of bending; a motion that folds tells bending, and hardly how
+    yarns stiffen. Else constant stiffness.
+    """
+    pulled = [each.info.scenario == "stretching" for each in recordings]
+    has_force = any(
+        pull and each.force is not None for pull, each in zip(pulled, recordings, strict=True)
+    )
+    return "stiffening+softening" if has_force and not all(pulled) else "linear"
+
+
+def law_of(ranges: Sequence[Range]) -> Law:
+    """The law of a space's parameters, or of an estimate's, by their names."""
+    names = {each.name for each in ranges}
+    stiffens = STIFFENING[0].name in names
+    if SOFTENING[0].name in names:
+        return "stiffening+softening" if stiffens else "softening"
+    return "stiffening" if stiffens else "linear"
 
 
 class Fixed(NamedTuple):

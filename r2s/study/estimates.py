@@ -1,14 +1,16 @@
 """Cells that estimate: each approach from each scenario, on either solver."""
 
 import json
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.random as jr
 
+from r2s.estimation.default_spaces import Law, law_told_by, with_law
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.estimate_json import as_json, from_json
 from r2s.estimation.method import Budget, Method, default_space
@@ -16,6 +18,7 @@ from r2s.estimation.physnet.method import TrainingBudget, train_network
 from r2s.estimation.registry import METHODS
 from r2s.fabrics import prior
 from r2s.files import write_json
+from r2s.recordings.recording import Recording
 from r2s.study.cells import Cell, result_files
 from r2s.study.configuration import AND
 from r2s.study.sources import Source, read
@@ -72,6 +75,8 @@ class EstimateCell(Cell):
     - `prior`: "fabrics" where what fabrics of this weight are like is known (`r2s.fabrics.prior`),
       else "flat", as on the command line.
     - `resolves`: on meshes that resolve the fabric (`r2s.estimation.mesh_ladder`), not `SHAPES`.
+    - `law`: "told": the laws that the recordings tell (`law_told_by`), as on the command line; else
+      as in `with_law`.
     """
 
     kind: ClassVar[str] = "estimates"
@@ -87,6 +92,7 @@ class EstimateCell(Cell):
     repeat: int = 0
     prior: str = "flat"
     resolves: bool = False
+    law: Law | Literal["told"] = "linear"
 
     def __post_init__(self) -> None:
         if len(self.sources) > 1 and not METHODS[self.approach].several:
@@ -111,6 +117,7 @@ class EstimateCell(Cell):
         """An estimate; one whose every simulation diverged is a result too, and says so."""
         recordings = [read(source, folder) for source in self.sources]
         space = default_space(self.solver, self.density)
+        space = with_law(space, self.law_of(recordings))
         if self.prior != "flat":
             space = prior.informed(space, self.density)
         try:
@@ -121,6 +128,10 @@ class EstimateCell(Cell):
             return {"seed": self.repeat, "diverged": f"{error}"}
         write_json(out / ESTIMATE, as_json(found))
         return {"seed": self.repeat, "diverged": ""}
+
+    def law_of(self, recordings: Sequence[Recording]) -> Law:
+        """The law of the fabrics that it chooses from, told by its recordings where that is so."""
+        return law_told_by(recordings) if self.law == "told" else self.law
 
     def _estimated(self, recordings, space, folder: Path) -> Estimate:
         key, network = jr.key(self.repeat), self.network

@@ -84,6 +84,7 @@ SMALL = Plan(
     configurations=(
         Configuration("diffcloud", "cloth", "lifting"),
         Configuration("diffcloud", "cloth", "wind"),
+        *TOGETHER_CONFIGURATIONS,
         Configuration("diffcp", "points", "lifting"),
         Configuration("physnet", "cloth", "lifting"),
         Configuration("pinn", "points", "stretching"),
@@ -316,6 +317,7 @@ def _estimate(
         repeat,
         prior="fabrics" if as_commands_do else "flat",
         resolves=as_commands_do,
+        law="told" if as_commands_do else "linear",
     )
 
 

@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from r2s.estimation.default_spaces import law_of, with_law
 from r2s.estimation.method import default_space
 from r2s.evaluation import prediction_error
 from r2s.fabrics.fold_length import fold_length
+from r2s.fabrics.parameters import Range
 from r2s.files import write_text
 from r2s.scenarios.resolution import ENOUGH, mesh_error
 from r2s.study.cells import Cell, result_files, with_dependencies
@@ -25,7 +27,7 @@ from r2s.study.report.data_table import data_table
 from r2s.study.report.parameter_ranges import range_table, truth_settings
 from r2s.study.report.truth_table import truth_table
 from r2s.study.rows import Row, write_rows
-from r2s.study.sources import GivenRecording, SyntheticRecording, read, small_strain
+from r2s.study.sources import GivenRecording, SyntheticRecording, of_law, read
 from r2s.study.statistics.parameters import Estimated
 from r2s.study.statistics.recordings import recording_tables
 from r2s.study.tables import Table, significant
@@ -243,18 +245,22 @@ def parameters(cells: Iterable[EvaluationCell], folder: Path) -> dict[str, list[
                     estimate.values,
                     estimate.standard_errors,
                     estimate.identifiable,
-                    _true_values(cell, len(estimate.ranges)),
+                    _true_values(cell, estimate.ranges),
                 )
             )
     return found
 
 
-def _true_values(cell: EstimateCell, count: int) -> np.ndarray:
+def _true_values(cell: EstimateCell, ranges: Sequence[Range]) -> np.ndarray:
     """The parameters at small strain of a synthetic recording's fabric; NaN where unknown, as of
     given recordings and of another simulator's sheet."""
     source = cell.sources[0]
-    is_known = isinstance(source, SyntheticRecording) and not source.truth.materials
-    if cell.solver != "cloth" or not is_known:
-        return np.full(count, np.nan)
-    space = default_space("cloth", cell.density)
-    return np.asarray(space.values(space.to_unit(small_strain(cell.fabric))))
+    if (
+        cell.solver != "cloth"
+        or not isinstance(source, SyntheticRecording)
+        or source.truth.materials
+    ):
+        return np.full(len(ranges), np.nan)
+    law = law_of(ranges)
+    space = with_law(default_space("cloth", cell.density), law)
+    return np.asarray(space.values(space.to_unit(of_law(cell.fabric, law, source.truth))))

@@ -18,6 +18,7 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
+from r2s.estimation.default_spaces import Law
 from r2s.estimation.pinn.synthetic_pulls import pulled
 from r2s.fabrics import presets
 from r2s.fabrics.arcsim import read_material
@@ -294,3 +295,14 @@ def small_strain(name: str) -> Fabric:
     """
     damping, friction = (jnp.asarray(each[name], float) for each in (DAMPING, FRICTION))
     return dataclasses.replace(presets.FIVE[name](), damping=damping, friction=friction)
+
+
+def of_law(name: str, law: Law, truth: TruthSettings = TruthSettings()) -> Fabric:
+    """The fabric that a recording is made with, of those laws that an estimate has; where it has
+    constant ones the stiffness is that at small strain."""
+    small, changing = small_strain(name), strain_dependent(name, truth)
+    return dataclasses.replace(
+        changing,
+        membrane=changing.membrane if "stiffening" in law else small.membrane,
+        bending=changing.bending if "softening" in law else small.bending,
+    )

@@ -25,6 +25,7 @@ HEADER = (
     "markers",
     "force of grippers",
     "prior",
+    "laws",
 )
 CAPTION = (
     "Data of every approach, as its code reads them, and of the motions to judge by; all know the "
@@ -60,6 +61,7 @@ def _of_estimates(cells: list[EvaluationCell], folder: Path) -> list[tuple[str, 
             "; ".join(dict.fromkeys(map(seen_by, cell.sources, reads))),
             *_numbers(seen, reads),
             cell.prior,
+            cell.law_of(seen),
         )
     return list(found.values())
 
@@ -81,7 +83,7 @@ def _of_judged(cells: list[EvaluationCell], folder: Path) -> list[tuple[str, ...
         reads = Reads(tuple(range(first, last + 1, every[scenario])), points=None)
         by = seen_by(made[0], reads)
         lines[scenario] = ("judged by", scenario, str(len(sources)), by)
-        lines[scenario] += (*_numbers([recording], [reads]), MISSING)
+        lines[scenario] += (*_numbers([recording], [reads]), MISSING, MISSING)
     return list(lines.values())
 
 
