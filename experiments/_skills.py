@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from _tables import Line
+from scipy.stats import norm
 
 from r2s.estimation.default_spaces import law_of, with_law
 from r2s.estimation.method import default_space
@@ -24,7 +25,8 @@ def predicted(
     folder: Path, configuration: str, fabric: str, law: str, motions: tuple[str, ...]
 ) -> Line:
     """The line of a table: errors [mm] and skill in the first of each of some motions, numbers of
-    the fabric over the truth's at small strain, and the seconds of a CPU that the estimate took.
+    the fabric over the truth's at small strain, how many of these the intervals hold, by how many
+    standard errors what is called identifiable is off, and the seconds of a CPU that it took.
 
     `law`: "told" by the recordings, as in a study, or one of `r2s.estimation.default_spaces`.
     """
@@ -72,10 +74,17 @@ def _over_truth(cell: EstimateCell, folder: Path) -> Line:
     space = with_law(default_space(cell.solver, cell.density), law)
     true = np.asarray(space.values(space.to_unit(of_law(cell.fabric, law))))
     line: Line = {}
+    off = []
     for bound, value, there in zip(found.ranges, found.values, true, strict=True):
-        apart = value / there if bound.log else value - there
-        line[bound.name] = f"{apart:.2f}" if bound.log else f"{apart:+.2f}"
-    return line
+        off.append(np.log(value / there) if bound.log else value - there)
+        line[bound.name] = f"{value / there:.2f}" if bound.log else f"{off[-1]:+.2f}"
+    away = np.abs(off) / found.standard_errors
+    known = away[found.identifiable]
+    return line | {
+        "in 90 % intervals": f"{np.sum(away < norm.ppf(0.95))} of {len(away)}",
+        "identifiable": f"{len(known)}",
+        "errors off at most": f"{known.max():.1f}" if len(known) else "-",
+    }
 
 
 def _millimetres(value: float | None) -> str:

@@ -15,7 +15,7 @@ from r2s.estimation import compiled, descent, gauss_newton
 from r2s.estimation.descent import Budget, covariance_at, descend, nuisances
 from r2s.estimation.estimate import describe
 from r2s.estimation.gauss_newton import Descent, Normal
-from r2s.estimation.mesh_bias import weighed
+from r2s.estimation.mesh_bias import on_the_way, weighed
 from r2s.estimation.prediction import predict
 from r2s.estimation.problem import NuisancePrior, Problem, beginning
 from r2s.estimation.standard_errors import FARTHEST, covariance, disagreement, sample_around
@@ -145,6 +145,28 @@ def test_a_prior_counts_for_more_where_an_estimate_errs_by_more_than_noise(lifte
     np.testing.assert_allclose(found.bias, expected @ less @ seen, rtol=1e-5, atol=1e-8)
     nothing = weighed(problems, end, prior, 2 * np.linalg.inv(known), none)
     np.testing.assert_allclose(nothing.theta, mean, rtol=1e-5, atol=1e-8)
+
+
+def test_an_estimate_leaves_its_recordings_only_as_far_as_its_loss_rises_as_told(lifted):
+    """Half the way as often as needed where they are right at once and the step leads far off."""
+    problems, dim = (lifted,), lifted.space.dim
+    end, _ = valley(lifted, gauss_newton.theta_length(problems))
+    theta = jnp.zeros_like(end.theta).at[:dim].set(lifted.space.to_unit(FABRIC))
+    flat = dataclasses.replace(
+        end.normal, gradient=jnp.zeros_like(theta), matrix=0 * end.normal.matrix
+    )
+    end = dataclasses.replace(end, theta=theta, normal=flat)
+    place = np.asarray(jnp.where(jnp.arange(len(theta)) < dim, 0.05, theta))
+    before = compiled.loss_from(problems, compiled.predictions_at(problems, theta))
+    found, _, loss = on_the_way(problems, end, place, before)
+    share = float((found - theta)[0] / (place - theta)[0])
+    assert before < loss <= 2 * before and 0 < share < 1
+    assert np.log2(share) == pytest.approx(round(np.log2(share)), abs=1e-4)
+    steep = dataclasses.replace(flat, matrix=jnp.eye(len(theta)))  # tells of a far greater rise
+    told = dataclasses.replace(end, normal=steep)
+    whole, _, most = on_the_way(problems, told, place, before)
+    np.testing.assert_allclose(whole, place, atol=1e-6)
+    assert most > 2 * before
 
 
 def valley(lifted, size):

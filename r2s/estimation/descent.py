@@ -23,12 +23,11 @@ from r2s.estimation.compiled import (
     losses_at,
     normal_from,
     normals_at,
-    predictions_at,
     remembering,
 )
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
-from r2s.estimation.mesh_bias import OtherMesh, inside, mesh_bias, weighed
+from r2s.estimation.mesh_bias import OtherMesh, mesh_bias, on_the_way, weighed
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.misfits import left_out, misfits
 from r2s.estimation.nuisances import nuisances
@@ -192,8 +191,7 @@ def judged(
         covariance = covariance + np.outer(bias, bias)
         if isinstance(problems[0].space, InformedSpace) and other_mesh.is_finer:
             place, covariance, bias = weighed(problems, best, prior, covariance, bias)
-            seen = predictions_at(problems, theta := inside(problems, place))
-            loss = loss_from(problems, seen)
+            theta, seen, loss = on_the_way(problems, best, place, loss)
             normal = dataclasses.replace(best.normal, loss=jnp.asarray(loss, float))
             best = dataclasses.replace(best, theta=theta, normal=normal)
             rows = [*rows, [best if i == which else row for i, row in enumerate(rows[-1])]]

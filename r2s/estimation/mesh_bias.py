@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from r2s.estimation import compiled, normal_equations
+from r2s.estimation.compiled import loss_from, predictions_at
 from r2s.estimation.gauss_newton import (
     MARGIN,
     Descent,
@@ -29,6 +30,7 @@ from r2s.geometry.surface import nearest
 from r2s.kept import kept
 from r2s.scenarios.resolution import ORDER
 
+RISE, HALVINGS = 2.0, 6  # of a loss, and of the step that raises it by more
 RCOND = 1e-6  # of the recordings' information: less than that is none
 
 _equations = kept(normal_equations.normal_equations_of)
@@ -151,3 +153,26 @@ def inside(problems: Problems, theta: Float[np.ndarray, " theta"]) -> Theta:
     """Theta with the fabric's place within the unit cube."""
     is_fabric = np.arange(len(theta)) < problems[0].space.dim
     return jnp.asarray(np.where(is_fabric, np.clip(theta, MARGIN, 1 - MARGIN), theta), float)
+
+
+def on_the_way(
+    problems: Problems, end: Descent, place: Float[np.ndarray, " theta"], before: float
+) -> tuple[Theta, list[Prediction], float]:
+    """How far to go from the end of a descent to where `weighed` leads, what is predicted there,
+    and the loss; `before` is that at the end.
+
+    The step is linear. Where parameters trade against each other along a bent valley (how much a
+    yarn stiffens, and where) it leaves that, so it is halved until the loss is at most `RISE` times
+    what it was with what the Gauss-Newton matrix says that it rises; after `HALVINGS` it is none.
+    """
+    step = np.asarray(place, np.float64) - np.asarray(end.theta, np.float64)
+    slope = np.asarray(end.normal.gradient, np.float64)
+    matrix = np.asarray(end.normal.matrix, np.float64)
+    for share in (*(0.5**i for i in range(HALVINGS)), 0.0):
+        theta = inside(problems, np.asarray(end.theta, np.float64) + share * step)
+        seen = predictions_at(problems, theta)
+        loss = loss_from(problems, seen)
+        told = share * slope @ step + share**2 * step @ matrix @ step / 2
+        if loss <= RISE * (before + max(told, 0.0)):
+            break
+    return theta, seen, loss
