@@ -159,6 +159,27 @@ def test_recordings_count_by_what_is_left_of_them_alone_and_none_is_exact():
     assert exact == pytest.approx(1e10)
 
 
+def test_on_one_mesh_recordings_count_by_what_is_left_of_them_too(monkeypatch):
+    """Searched alike first, then once more by their weights from where that led; not one alone."""
+    asked: list[tuple[list[float | None], bool]] = []
+
+    def searched(problems, budget, *, start=None, **_):
+        weights = [None if each.weight is None else float(each.weight) for each in problems]
+        asked.append((weights, start is not None and budget.near))
+        return descent.Search(problems, [], 0.0, derivatives_at)
+
+    monkeypatch.setattr(descent.Search, "theta", jnp.zeros(3))
+    monkeypatch.setattr(mesh_ladder, "search", searched)
+    monkeypatch.setattr(mesh_ladder, "each_alone", lambda *_: [])
+    monkeypatch.setattr(mesh_ladder, "weights", lambda _: [jnp.array(4.0), jnp.array(1.0)])
+    monkeypatch.setattr(mesh_ladder, "judged", lambda *_, **__: estimate_of_nothing())
+    named = {"approach": "diffcp", "key": jr.key(0)}
+    mesh_ladder.descend_weighed((problem(1.5), problem(0.7)), SMALL, **named)
+    assert asked == [([None, None], False), ([4.0, 1.0], True)]
+    mesh_ladder.descend_weighed((problem(1.5),), SMALL, **named)
+    assert asked[2:] == [([None], False)]
+
+
 def estimate_of_nothing() -> Estimate:
     return Estimate(
         approach="none",

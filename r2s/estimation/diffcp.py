@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r2s.estimation import adam
-from r2s.estimation.descent import descend
 from r2s.estimation.estimate import Estimate
+from r2s.estimation.mesh_ladder import descend_weighed
 from r2s.estimation.method import ANY, Budget, Method, Progress, Reads, frames_that_count
 from r2s.estimation.prediction import Prediction
 from r2s.estimation.problem import POINTS, Problem, read_by_problem
@@ -48,7 +48,7 @@ class DiffCP(Method):
 
     def _estimate(self, recordings, space, budget, key):
         problems = problems_on_points(recordings, space, self.chosen_shape)
-        found = descend(
+        found = descend_weighed(
             problems,
             budget,
             approach=self.name,

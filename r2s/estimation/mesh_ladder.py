@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from r2s.estimation.compiled import prepare, remembering
 from r2s.estimation.descent import Search, each_alone, judged, search
 from r2s.estimation.estimate import Estimate
-from r2s.estimation.gauss_newton import FINEST, Descent
+from r2s.estimation.gauss_newton import FINEST, Descent, Problems
 from r2s.estimation.mesh_bias import OtherMesh, factor
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import Theta
@@ -115,6 +115,30 @@ def descend_by_meshes(
         other = OtherMesh(on(*_others(at.shapes)), factor(2.0 if _is_finest(at.shapes) else 0.5))
         estimate = judged(at.found, budget, other_mesh=other, key=key)
     return dataclasses.replace(estimate, shape=at.shapes[_largest(recordings)])
+
+
+def descend_weighed(
+    problems: Problems,
+    budget: Budget,
+    *,
+    approach: str,
+    checkpoint: Path | None = None,
+    progress: Progress | None = None,
+    key: PRNGKeyArray,
+) -> Estimate:
+    """`r2s.estimation.descent.descend` on the meshes that the problems have; of several recordings
+    each counts by how well it can be followed alone (`weights`)."""
+    derive = remembering()
+    saved = {"progress": progress, "derive": derive, "key": key}
+    found = search(problems, budget, checkpoint=checkpoint, **saved)
+    if len(problems) > 1:
+        tell(progress, "each recording alone")
+        counts = weights(each_alone(problems, budget, found.theta, key, derive))
+        pairs = zip(problems, counts, strict=True)
+        problems = tuple(dataclasses.replace(each, weight=count) for each, count in pairs)
+        path = checkpoint and checkpoint.with_suffix(".weighed.npz")
+        found = search(problems, near(budget), start=found.theta, checkpoint=path, **saved)
+    return judged(found, budget, approach=approach, key=key)
 
 
 class _Rung(NamedTuple):
