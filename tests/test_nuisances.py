@@ -158,13 +158,14 @@ def test_an_estimate_leaves_its_recordings_only_as_far_as_its_loss_rises_as_told
     end = dataclasses.replace(end, theta=theta, normal=flat)
     place = np.asarray(jnp.where(jnp.arange(len(theta)) < dim, 0.05, theta))
     before = compiled.loss_from(problems, compiled.predictions_at(problems, theta))
-    found, _, loss = on_the_way(problems, end, place, before)
+    found, _, loss, left = on_the_way(problems, end, place, before)
     share = float((found - theta)[0] / (place - theta)[0])
     assert before < loss <= 2 * before and 0 < share < 1
     assert np.log2(share) == pytest.approx(round(np.log2(share)), abs=1e-4)
     steep = dataclasses.replace(flat, matrix=jnp.eye(len(theta)))  # tells of a far greater rise
     told = dataclasses.replace(end, normal=steep)
-    whole, _, most = on_the_way(problems, told, place, before)
+    np.testing.assert_allclose(found + left, place, atol=1e-6)  # errors hold what is left
+    whole, _, most, _ = on_the_way(problems, told, place, before)
     np.testing.assert_allclose(whole, place, atol=1e-6)
     assert most > 2 * before
 

@@ -191,16 +191,26 @@ def test_a_changed_file_of_measured_tables_is_another_recording(tmp_path):
         return [cell.recordings[0] for cell in matrix.synthetic(plan)]
 
     truth, other = (presets.FIVE[name]() for name in ("grey_interlock", "pink_solid"))
-    write_material(tmp_path / "grey_interlock.json", truth)
+    for name in presets.FIVE:
+        write_material(tmp_path / f"{name}.json", truth)
     first, again = recordings(), recordings()
     write_material(tmp_path / "grey_interlock.json", other)
     changed = recordings()
     assert [cell.key for cell in first] == [cell.key for cell in again]
     assert not {cell.key for cell in first} & {cell.key for cell in changed}
     assert isinstance(changed[0], SyntheticRecording)
-    assert strain_dependent("grey_interlock", changed[0].truth).membrane.stiffness[
-        0, 0
-    ] == pytest.approx(float(other.membrane.c11))
+    made = strain_dependent("grey_interlock", changed[0].truth)
+    assert made.membrane.stiffness[0, 0] == pytest.approx(float(other.membrane.c11))
+    own = small_strain("grey_interlock")
+    assert (made.damping, made.friction) == (own.damping, own.friction)  # no file has these
+    for name in presets.FIVE:  # those that are compared with are inputs, too
+        write_material(tmp_path / f"{name}.json", truth if name == "pink_solid" else other)
+        assert {cell.key for cell in recordings()} != {cell.key for cell in changed}
+    plan = matrix.with_changes(
+        matrix.SMALL, fabrics=["grey_interlock"], materials=str(tmp_path)
+    )  # a table has no fabric of constant stiffness
+    assert "true" not in {cell.baseline for cell in matrix.synthetic(plan)}
+    (tmp_path / "camel_ponte_roma.json").unlink()
     with pytest.raises(FileNotFoundError, match="camel_ponte_roma.json"):
         matrix.with_changes(matrix.SMALL, fabrics=["camel_ponte_roma"], materials=str(tmp_path))
 

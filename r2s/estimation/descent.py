@@ -191,7 +191,8 @@ def judged(
         covariance = covariance + np.outer(bias, bias)
         if isinstance(problems[0].space, InformedSpace) and other_mesh.is_finer:
             place, covariance, bias = weighed(problems, best, prior, covariance, bias)
-            theta, seen, loss = on_the_way(problems, best, place, loss)
+            theta, seen, loss, left = on_the_way(problems, best, place, loss)
+            covariance = covariance + np.outer(left, left)
             normal = dataclasses.replace(best.normal, loss=jnp.asarray(loss, float))
             best = dataclasses.replace(best, theta=theta, normal=normal)
             rows = [*rows, [best if i == which else row for i, row in enumerate(rows[-1])]]

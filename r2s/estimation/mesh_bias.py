@@ -157,9 +157,9 @@ def inside(problems: Problems, theta: Float[np.ndarray, " theta"]) -> Theta:
 
 def on_the_way(
     problems: Problems, end: Descent, place: Float[np.ndarray, " theta"], before: float
-) -> tuple[Theta, list[Prediction], float]:
+) -> tuple[Theta, list[Prediction], float, Float[np.ndarray, " theta"]]:
     """How far to go from the end of a descent to where `weighed` leads, what is predicted there,
-    and the loss; `before` is that at the end.
+    the loss, and the way that is left; `before` is the loss at the end.
 
     The step is linear. Where parameters trade against each other along a bent valley (how much a
     yarn stiffens, and where) it leaves that, so it is halved until the loss is at most `RISE` times
@@ -175,4 +175,4 @@ def on_the_way(
         told = share * slope @ step + share**2 * step @ matrix @ step / 2
         if loss <= RISE * (before + max(told, 0.0)):
             break
-    return theta, seen, loss
+    return theta, seen, loss, (1 - share) * step

@@ -24,10 +24,14 @@ _sample = eqx.filter_jit(eqx.filter_vmap(sample, in_axes=(0, None, None)))
 
 
 class Motion(NamedTuple):
-    """Positions [m], NaN from where the run diverged, and why it did; "" where it did not."""
+    """Positions [m], NaN from where the run diverged, and why it did; "" where it did not.
+
+    `steps`: how it was simulated, in words; "" where that is not told.
+    """
 
     x: Float[np.ndarray, "frame vertex 3"]
     failure: str
+    steps: str = ""
 
 
 def predict(recording: Recording, fabric: Fabric) -> Float[np.ndarray, "frame vertex 3"]:

@@ -41,7 +41,9 @@ class EnsembleCell(Cell):
     """The ensemble of a synthetic recording that is judged by.
 
     A sheet that hangs starts in all members as the truth does, so that none buckles to another
-    side; each comes to rest with its own fabric. No member has contact of layers, for the sake of
+    side; each comes to rest with its own fabric. So do predictions, and what that start alone does
+    is a cause of its own (`start`): other members are compared with the truth started anew. No
+    member has contact of layers, for the sake of
     time; a recording that has is compared with the truth without.
 
     - `others`: presets whose truths move in the same way; on half the cells, all of them and the
@@ -63,16 +65,17 @@ class EnsembleCell(Cell):
         return f"ensembles {self.recording.scenario}"
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
-        """Distances [m] of every member from the truth, in each frame."""
+        """Distances [m] of every member from the truth, or from it started anew, in each frame."""
         source = self.recording
         truth, experiment, shape = source.truth, source.experiment, source.truth.shape
         fabric = strain_dependent(source.fabric, truth)
         base = _moved(experiment, fabric, shape)
         if not np.isfinite(base.x).all():
             raise RuntimeError(f"the truth of {self.name} diverged")
-        points = _points_of(base)
         hangs = experiment.sheet.weft[2] != 0
         start = base.x[0].reshape(*shape, 3) if hangs else None  # as predictions do
+        anew = _moved(experiment, fabric, shape, start=start) if hangs else base
+        points = _points_of(anew)
 
         def away(experiment: Experiment, fabric: Fabric, shape: Any, steps: int = 1) -> np.ndarray:
             moved = _moved(experiment, fabric, shape, steps, start)
@@ -89,6 +92,8 @@ class EnsembleCell(Cell):
             "mesh": [away(experiment, fabric, _cells(shape, FINER))],
             "step": [away(experiment, fabric, shape, steps=2)],
         }
+        if hangs:
+            found["start"] = [to_surface(_points_of(base), anew.x, anew.mesh.faces)]
         coarse = _cells(shape, COARSER)
         own = _points_of(_moved(experiment, fabric, coarse, start=start))
         for name in self.others:

@@ -53,8 +53,7 @@ class EvaluationCell(Cell):
     - `recordings`: what it is judged by, together, since they compile once.
     - `draw`: a number of `r2s.fabrics.prior.draws`, which know the density alone: together these
       are the default; each fabric has its own. `MIDDLE`: the middle of that prior, the best
-      guess. None: the truth of synthetic recordings at small strain, so what a perfect estimate
-      would reach.
+      guess. None: the truth of synthetic recordings at small strain.
     - `other`: whether `estimate` is that of another fabric, for comparison.
     - `every`: 1 compares all frames that count, 3 every third.
     """
@@ -141,7 +140,9 @@ class EvaluationCell(Cell):
                 diverged[source.name] = motion.failure
         write_json(out / MEASURED, measured)
         np.savez_compressed(out / MOTION, **arrays)
-        return {"diverged": diverged, "runs": len(recordings)}
+        pairs = zip(self.recordings, motions, strict=True)
+        steps = {source.name: motion.steps for source, motion in pairs if motion.steps}
+        return {"diverged": diverged, "runs": len(recordings), "steps": steps}
 
     def _fabric(self, folder: Path) -> Fabric | None:
         if self.estimate is None:
@@ -210,7 +211,8 @@ def predict(
     make = _points if solver == "points" else _explicit
     shared = make(in_equal_steps, fabric)
     if shared is None:
-        return [_implicit(scenario, fabric) for scenario in in_equal_steps]
+        words = "implicit steps, too stiff for explicit ones"
+        return [_implicit(each, fabric)._replace(steps=words) for each in in_equal_steps]
     motions = []
     for scenario in in_equal_steps:
         own = eqx.tree_at(lambda s: s.scene, shared, scenario.scene)
@@ -226,13 +228,17 @@ def _until_stable(scenario: Scenario, fabric: Fabric, solver: ExplicitCloth | Sh
     soft sheet is flung, and that is no property of the fabric.
     """
     motion = prediction_error.predict_motion(scenario, fabric, solver)
+    if not isinstance(solver, ExplicitCloth):
+        return motion._replace(steps="material points")
     for times in RETRIES:
-        if not motion.failure or not isinstance(solver, ExplicitCloth):
+        if not motion.failure:
             break
         finer = dataclasses.replace(solver, substeps=times * solver.substeps)
         motion = prediction_error.predict_motion(scenario, fabric, finer)
-    is_lost = motion.failure and isinstance(solver, ExplicitCloth)
-    return _implicit(scenario, fabric) if is_lost else motion
+        motion = motion._replace(steps=f"explicit steps, {times} times as many")
+    if motion.failure:
+        return _implicit(scenario, fabric)._replace(steps="implicit steps, lost in explicit ones")
+    return motion if motion.steps else motion._replace(steps="explicit steps")
 
 
 def _explicit(scenarios: list[Scenario], fabric: Fabric) -> ExplicitCloth | None:

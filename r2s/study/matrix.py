@@ -138,14 +138,13 @@ def with_changes(
         if number is not None and number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
     chosen, truth = tuple(fabrics or plan.fabrics), plan.truth
-    measured = [fabric for fabric in chosen if fabric != FLEX]
     return dataclasses.replace(
         plan,
         configurations=tuple(map(configuration_named, configurations or ())) or plan.configurations,
         fabrics=chosen,
         repeats=plan.repeats if repeats is None else repeats,
         judged=plan.judged if judged is None else judged,
-        truth=with_measured_tables(truth, Path(materials), measured) if materials else truth,
+        truth=with_measured_tables(truth, Path(materials)) if materials else truth,
         seed=seed,
     )
 
@@ -267,7 +266,11 @@ def _evaluations(
     """
     solvers = dict.fromkeys(estimate.solver for estimate in estimates)
     judged = list(judged)
-    is_known = all(isinstance(each, SyntheticRecording) for group in judged for each in group)
+    is_known = all(
+        isinstance(each, SyntheticRecording) and not each.truth.materials
+        for group in judged
+        for each in group
+    )
     whose: list[tuple[EstimateCell | None, str, int | None]] = []
     for solver in solvers:
         whose += [(None, solver, draw) for draw in (*range(plan.draws), MIDDLE)]

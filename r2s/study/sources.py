@@ -7,7 +7,6 @@ do. Those of a sheet of MuJoCo are of another simulator altogether (`r2s.study.m
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -68,8 +67,8 @@ class TruthSettings:
       strain; half way at an extension of 10 %. Bending softens, too (`r2s.laws.stiffening`).
       Assumed, not measured. 0: constant stiffness, of the membrane and in bending, as the
       estimators assume.
-    - `materials`: a folder of ARCSim material files, FABRIC.json, with measured tables to take
-      instead; "": none.
+    - `materials`: a folder of ARCSim material files, FABRIC.json of every preset, with measured
+      tables to take instead; "": none.
     - `materials_digest`: a hash of those files, from `with_measured_tables`.
     - `self_contact`: whether the sheet touches itself in a fold.
     """
@@ -232,16 +231,15 @@ def find_recordings(folder: Path) -> list[GivenRecording]:
     return found
 
 
-def with_measured_tables(
-    truth: TruthSettings, folder: Path, fabrics: Sequence[str]
-) -> TruthSettings:
-    """Settings with the measured tables in a folder, one file FABRIC.json for each fabric.
+def with_measured_tables(truth: TruthSettings, folder: Path) -> TruthSettings:
+    """Settings with the measured tables in a folder, one file FABRIC.json for each preset: those
+    that a study does not estimate are what others are compared with.
 
     Raises `FileNotFoundError` for one that is missing, and what `r2s.fabrics.arcsim.read_material`
     raises.
     """
     digest = sha256()
-    for fabric in fabrics:
+    for fabric in presets.FIVE:
         file = folder / f"{fabric}.json"
         read_material(file)
         digest.update(file.read_bytes())
@@ -274,9 +272,11 @@ def strain_dependent(name: str, truth: TruthSettings = TruthSettings()) -> Fabri
     """
     if name not in presets.FIVE:
         raise ValueError(f"no preset {name!r}; there are {', '.join(presets.FIVE)}")
-    if truth.materials:
-        return read_material(Path(truth.materials) / f"{name}.json")
     fabric = small_strain(name)
+    if truth.materials:
+        measured = read_material(Path(truth.materials) / f"{name}.json")
+        own = {"damping": fabric.damping, "friction": fabric.friction}  # such files have none
+        return dataclasses.replace(measured, **own)
     if not truth.stiffening:
         return fabric
     law, bending = constant_laws(fabric)

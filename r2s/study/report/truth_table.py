@@ -7,20 +7,21 @@ import numpy as np
 
 from r2s.study.ensembles import Ensemble, read_ensemble
 from r2s.study.evaluations import EvaluationCell
-from r2s.study.tables import Table
+from r2s.study.tables import MISSING, Table
 from r2s.study.verdicts import Judged, ensembles, judged_motions
 
 LEAST = 2e-3  # [m]: what mesh and step may leave, mean up to the horizon
 LAYERS = "not known: layers"
 HEADER = (
     *("recording", "horizon [s]", "floor [mm]"),
-    *("stiffness [mm]", "path [mm]", "mesh [mm]", "step [mm]", "verdict"),
+    *("stiffness [mm]", "path [mm]", "mesh [mm]", "step [mm]", "start [mm]", "verdict"),
 )
 CAPTION = (
     "Of every judged motion: until when it tells fabrics apart, and, mean up to there, its floor "
     "and the distances from it of the truth 0.1 % stiffer, with grippers 0.2 mm aside, on a finer "
-    f"mesh and in half the step. It is converged where the last two are below {1e3 * LEAST:g} mm "
-    "together, and chaotic where the first two are not; a prediction nearer than the floor is not "
+    "mesh and in half the step, and of a sheet that hangs as predictions start it. It is converged "
+    f"where mesh and step are below {1e3 * LEAST:g} mm together, and chaotic where stiffness and "
+    "path are not; a prediction nearer than the floor is not "
     "told from a better one. The ensemble of a fold has no layers, its truth has: whether that is "
     "converged is not known."
 )
@@ -45,13 +46,14 @@ def truth_table(cells: Sequence[EvaluationCell], folder: Path) -> Table:
 def _line(name: str, judged: Judged, ensemble: Ensemble, is_layered: bool) -> tuple[str, ...]:
     horizon = "never" if np.isinf(judged.horizon) else f"{judged.horizon:.2f}"
     if not judged.inside.any():
-        return name, horizon, *["-"] * 5, "no frame is known"
+        return name, horizon, *["-"] * 6, "no frame is known"
     inside = np.isin(ensemble.times, judged.times[judged.inside])
     left = {cause: float(each[:, inside].mean()) for cause, each in ensemble.causes.items()}
     means = [left[cause] for cause in ("stiffness", "path", "mesh", "step")]
+    start = f"{1e3 * left['start']:.2f}" if "start" in left else MISSING
     floor = float(judged.floor[judged.inside].mean())
     words = LAYERS if is_layered else verdict(*means)
-    return name, horizon, *(f"{1e3 * each:.2f}" for each in (floor, *means)), words
+    return name, horizon, *(f"{1e3 * each:.2f}" for each in (floor, *means)), start, words
 
 
 def verdict(stiffness: float, path: float, mesh: float, step: float) -> str:
