@@ -10,10 +10,11 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from r2s.files import write_text
+from r2s.files import source_hash, write_text
 from r2s.side_by_side import cores
 from r2s.study.environment import processor
 
+SOURCE = 16  # hexadecimal digits of a hash
 Line = dict[str, str]  # of a table, by column
 
 
@@ -32,13 +33,16 @@ def machine() -> str:
 def write(path: Path, lines: Sequence[Line], caption: str, facts: Line | None = None) -> None:
     """Write a table as CSV.
 
-    Its first lines, each after "#", say what it is, which command made it, with which version of
-    r2s, on which machine and when; `facts` replaces any of these, or adds to them.
+    Its first lines, each after "#", say what it is, which command made it, with which version and
+    source of r2s (`r2s.files.source_hash`), on which machine and when; `facts` replaces any of
+    these, or adds to them.
     """
     told = {
         "table": caption,
         "command": shlex.join(["python", *sys.argv]),
         "version": f"r2s {importlib.metadata.version('r2s')}",
+        "source": source_hash()[:SOURCE],
+        "seed": "that of the command, else as the driver has it",
         "machine": machine(),
         "date": time.strftime("%Y-%m-%d"),
     } | (facts or {})
@@ -86,13 +90,15 @@ def resumed(
 ) -> list[Line]:
     """Make one line for each job, keep the table after each, and skip the jobs that it holds.
 
-    Raises `ValueError` for a table that another version or processor began.
+    Raises `ValueError` for a table that another version, source or processor began.
     """
     lines: list[Line] = []
     if path.exists():
         lines, facts = read(path)
-        made = facts.get("version", ""), facts.get("machine", "").partition(", ")[2]
-        own = f"r2s {importlib.metadata.version('r2s')}", processor()
+        version, source = f"r2s {importlib.metadata.version('r2s')}", source_hash()[:SOURCE]
+        by = facts.get("machine", "").partition(", ")[2]
+        made = facts.get("version", ""), facts.get("source", "no known source"), by
+        own = version, source, processor()
         if made != own:
             raise ValueError(
                 f"{path}: begun by {' on '.join(made)}, not {' on '.join(own)}: move it away, or "

@@ -34,9 +34,9 @@ if __name__ == "__main__":
     parser.add_argument("--folder", type=Path, default=Path("results/skill_by_fabric"))
     a = parser.parse_args()
     jobs: list[Line] = [
-        {"configuration": configuration, "fabric": fabric}
+        {"configuration": configuration, "law": a.law, "fabric": fabric}
         for configuration in a.configurations
         for fabric in a.fabrics
     ]
     motions = tuple(a.motions)
-    resumed(a.out, CAPTION, jobs, partial(predicted, a.folder, law=a.law, motions=motions))
+    resumed(a.out, CAPTION, jobs, partial(predicted, a.folder, motions=motions))

@@ -21,6 +21,8 @@ from r2s.estimation.prediction import Prediction
 from r2s.estimation.problem import POINTS, Problem
 from r2s.estimation.registry import METHODS
 from r2s.fabrics import presets, prior
+from r2s.fabrics.softening_space import SOFTENING
+from r2s.fabrics.stiffening_space import STIFFENING
 from r2s.scenarios import synthetic
 from r2s.scenarios.paths import LIMITS
 from r2s.study import matrix
@@ -237,6 +239,10 @@ def test_every_range_and_fixed_value_stands_in_the_table():
         names = [bound.name for bound in space.ranges]
         names += [each.name for each in default_spaces.fixed(space)]
         assert {(solver, name) for name in names} <= told
+    laws = {each.name for each in (*STIFFENING, *SOFTENING)}  # of a lift and pulls together
+    assert {("cloth", name) for name in laws} <= told
+    alone = matrix.with_changes(matrix.SMALL, ["physnet-cloth-lifting"])
+    assert not laws & {line[1] for line in range_table(matrix.synthetic(alone)).rows}
     lines = {(line[0], line[1]): line for line in table.rows}
     assert all(line[-1] not in ("", "-") for line in table.rows)
     # as many densities as fabrics

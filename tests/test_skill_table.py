@@ -12,6 +12,7 @@ from scipy import stats
 
 from r2s.evaluation.horizon import CLEAR, skill
 from r2s.study.configuration import REFERENCES, Configuration
+from r2s.study.report import full
 from r2s.study.report.figures import looks_of
 from r2s.study.report.page import PNG
 from r2s.study.report.skill_chart import skill_chart
@@ -26,7 +27,7 @@ from r2s.study.rows import Row
 from r2s.study.statistics.distances import in_common, means
 from r2s.study.statistics.learned import learned
 from r2s.study.statistics.result_array import result_array
-from r2s.study.statistics.skills import draws, mean_floor, skills, with_floor
+from r2s.study.statistics.skills import deciding, draws, mean_floor, skills, with_floor
 
 LIFTING = Configuration("diffcloud", "cloth", "lifting")
 PINN = Configuration("pinn", "cloth", "stretching")
@@ -154,7 +155,9 @@ def test_a_run_that_diverged_improves_nothing(place):
     found = line(skill_table(after, METRIC), whose.label)
     assert "diverged" in found["fling: error [mm]"]
     if whose == DEFAULT:
-        assert draws(after, "fling", DEFAULT).errors[1] == math.inf
+        spread = draws(after, "fling", DEFAULT)
+        assert spread.errors[1] == math.inf and spread.skills[0] == -math.inf
+        assert math.isfinite(spread.skills[1])  # beside the mean of those that did not diverge
         return
     good, bad = (skills(rows, "fling")[whose] for rows in (before, after))
     assert bad.mean == -math.inf and bad.median <= good.median and math.isnan(bad.high)
@@ -165,6 +168,27 @@ def test_a_run_that_diverged_improves_nothing(place):
         assert skill_words(skills(after, "fling")[each]) == skill_words(
             skills(before, "fling")[each]
         )
+
+
+def test_recordings_that_tell_no_fabrics_apart_decide_nothing(tmp_path):
+    """Of one fabric the floor is as large as the default's error: less error is no better one."""
+    rows = made_up()
+    alike = {row.recording for row in rows if row.fabric == "satin"}
+    level = [
+        replace(row, floor=19e-3, skill=None, value=1e-3 * row.value) if row.recording in alike
+        else row for row in rows
+    ]  # fmt: skip
+    lost = level.index(next(row for row in level if row.recording in alike))
+    for changed in (level, diverged(level, lost)):
+        kept, untold = deciding(changed, METRIC)
+        assert set(untold) == alike and not alike & {row.recording for row in kept}
+        assert kept == [row for row in rows if row.recording not in alike]
+    assert deciding(rows, METRIC) == (rows, [])
+    without = [replace(row, floor=None, skill=None) for row in rows]  # of no ensemble
+    assert deciding(without, METRIC) == (without, [])
+    full.publish(tmp_path, level)
+    found = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert f"Not these 2, which tell no fabrics apart: {', '.join(sorted(alike))}." in found
 
 
 def test_what_is_learned_is_the_error_over_that_of_the_middle_of_the_prior():

@@ -330,6 +330,7 @@ def test_an_estimate_is_made_once_and_judged(tiny, tmp_path):
     assert np.isfinite(entry.truth).all()  # those of the preset
     meshes = results.mesh_table(cells, tmp_path)
     assert len(meshes.rows) == 1 and all(float(each) > 0 for each in meshes.rows[0][2:4])
+    assert sum(int(line[-1]) for line in results.steps_table(cells, tmp_path).rows) == len(cells)
     # what more of the same would cost
     plan = matrix.Plan((Configuration("diffcloud", "cloth", "lifting"),), ("grey_interlock",), 3, 4)
     table = forecast(costs(cells, tmp_path), plan)

@@ -9,6 +9,7 @@ import r2s
 from r2s.evaluation import phase_free
 from r2s.study import engine, results, verdicts
 from r2s.study.comparisons import motion_comparisons
+from r2s.study.ensembles import read_ensemble
 from r2s.study.evaluations import EvaluationCell
 from r2s.study.report.skill_table import skill_table
 from r2s.study.report.truth_table import truth_table, verdict
@@ -106,6 +107,9 @@ def test_a_truth_is_judged_beside_its_own_ensemble(tmp_path, monkeypatch):
     assert true.floor is not None and true.floor > 0
     assert drawn.value > 3e-3 and drawn.horizon == true.horizon
     (line,) = truth_table(cells, tmp_path).rows
+    (ensemble,) = (read_ensemble(each, tmp_path) for each in ensembles)
+    start = ensemble.causes["start"].mean()  # what settling again does, which predictions do
+    assert 0 < start < 1e-3 and ensemble.causes["step"].mean() < 1e-3
     assert line[0] == source.name and float(line[2]) == pytest.approx(1e3 * true.floor, abs=0.01)
     (shown,) = motion_comparisons(cells, tmp_path)
     assert list(shown.motions) == ["true fabric on cloth", "default cloth"]

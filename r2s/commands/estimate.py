@@ -138,15 +138,15 @@ class EstimateCard:
         with Waiting("reading the recordings") as progress:
             method = self._method(progress)
             prior = self._prior(method, not known)
+            unseen = self._hold_out(seen) if seen else []
             space = self._space(method, prior, [] if known else seen)
             tests = [test for each in known for test in each.tests]
             if seen:
-                method.check(seen)
+                method.check([*seen, *unseen])
                 if tests:
                     method.check_prior()
             else:
                 self._check_alone(method)
-            unseen = self._hold_out(seen) if seen else []
             told = estimate(tests, space, progress) if tests else None
             if seen:
                 space = informed(space, told) if told else space

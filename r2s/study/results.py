@@ -15,9 +15,8 @@ from r2s.fabrics.fold_length import fold_length
 from r2s.fabrics.parameters import Range
 from r2s.files import write_text
 from r2s.scenarios.resolution import ENOUGH, mesh_error
-from r2s.study.cells import Cell, result_files, with_dependencies
+from r2s.study.cells import Cell, read_metadata, result_files, with_dependencies
 from r2s.study.comparisons import motion_comparisons
-from r2s.study.configuration import MOTIONS
 from r2s.study.costs import cost_table, costs, forecast
 from r2s.study.estimates import ESTIMATE, EstimateCell, read_estimate
 from r2s.study.evaluations import EvaluationCell, read_measured
@@ -30,14 +29,14 @@ from r2s.study.rows import Row, write_rows
 from r2s.study.sources import GivenRecording, SyntheticRecording, of_law, read
 from r2s.study.statistics.parameters import Estimated
 from r2s.study.statistics.recordings import recording_tables
-from r2s.study.tables import Table, significant
+from r2s.study.tables import MISSING, Table, significant
 from r2s.study.verdicts import with_verdicts
 
 MESHES = (
-    "What the mesh of each estimate is expected to leave in the motion that it was made from, and "
-    "in those it is judged on, for the fabric that came out: the distance from a fine sheet of the "
-    "same fabric, over the sheet and the motion. Differences between configurations that are "
-    "smaller may be the mesh's."
+    "What the mesh of each estimate is expected to leave in the motion that it was made from, for "
+    "the fabric that came out: the distance from a fine sheet of the same fabric, over the sheet "
+    "and the motion. What meshes leave in the motions that are judged stands in the table of "
+    "truths. Predictions are simulated as their table says."
 )
 DATA = (
     "Approaches differ in what they are given; a difference between them, in ranks and findings "
@@ -119,7 +118,7 @@ def _publish(
             ("Data", DATA, _if_any(data=data_table(cells, out))),
             ("Ranges and fixed values", RANGES, _if_any(ranges=range_table(cells))),
             ("Costs", "", {"costs": cost_table(took)} if took else {}),
-            ("Meshes", MESHES, _if_any(meshes=meshes)),
+            ("Meshes and steps", MESHES, _if_any(meshes=meshes, steps=steps_table(cells, out))),
             ("Every recording", "Mean over the frames that count.", recording_tables(found)),
             ("What larger studies would take", "From the costs of this one.", forecasts),
         ],
@@ -220,16 +219,26 @@ def mesh_table(cells: Iterable[EvaluationCell], folder: Path) -> Table:
         if estimate is None or estimate.shape is None:
             continue
         size = read(cell.sources[0], folder).info.sheet.size
-        errors = [
-            mesh_error(estimate.fabric, size, estimate.shape, motion)
-            for motion in (cell.sources[0].scenario, *MOTIONS)
-        ]
+        error = mesh_error(estimate.fabric, size, estimate.shape, cell.sources[0].scenario)
         folds = significant(1e3 * float(fold_length(estimate.fabric)))
-        told = [significant(1e3 * error) if np.isfinite(error) else "-" for error in errors]
-        lines.append((cell.name, f"{estimate.shape[0]} x {estimate.shape[1]}", folds, *told))
-    motions = (f"{name} [mm]" for name in ("estimated from", *MOTIONS))
-    header = ("estimate", "mesh", "fold length [mm]", *motions)
+        told = significant(1e3 * error) if np.isfinite(error) else MISSING
+        lines.append((cell.name, f"{estimate.shape[0]} x {estimate.shape[1]}", folds, told))
+    header = ("estimate", "mesh", "fold length [mm]", "expected error [mm]")
     return Table(header, tuple(lines), f"Expected errors of meshes; {1e3 * ENOUGH:.0f} mm is fine")
+
+
+def steps_table(cells: Iterable[EvaluationCell], folder: Path) -> Table:
+    """How predictions were simulated: how many runs of each motion on each solver, by mesh and kind
+    of steps."""
+    counts: dict[tuple[str, ...], int] = defaultdict(int)
+    for cell in cells:
+        if cell.is_made(folder):
+            mesh = f"{cell.shape[0]} x {cell.shape[1]}"
+            for steps in read_metadata(cell, folder).get("steps", {}).values():
+                counts[cell.solver, cell.scenario, mesh, steps] += 1
+    lines = [(*which, str(count)) for which, count in sorted(counts.items())]
+    header = ("solver", "motion", "mesh", "steps", "runs")
+    return Table(header, tuple(lines), "How predictions were simulated")
 
 
 def parameters(cells: Iterable[EvaluationCell], folder: Path) -> dict[str, list[Estimated]]:

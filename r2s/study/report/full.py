@@ -21,6 +21,7 @@ from r2s.study.statistics.distances import in_common
 from r2s.study.statistics.paper import read_paper
 from r2s.study.statistics.parameters import Estimated, parameter_table
 from r2s.study.statistics.result_array import ResultArray, configurations_of, result_array
+from r2s.study.statistics.skills import deciding, with_floor
 from r2s.study.tables import Table
 from r2s.study.verdicts import SURFACE
 
@@ -70,21 +71,24 @@ def publish(
         (out / folder).mkdir(parents=True, exist_ok=True)
     rows, undefined = drop_undefined(rows)
     shared, others = in_common(rows)
-    rows_of = by_metric(shared)
+    told, untold = deciding(shared, SURFACE)
+    rows_of = by_metric(told)
     metrics = [metric for metric in JUDGED_BY if metric in rows_of]
-    results = result_array(shared, metrics[0] if metrics else JUDGED_BY[0])
+    metric = metrics[0] if metrics else JUDGED_BY[0]
+    results, decided = result_array(shared, metric), result_array(told, metric)
     looks = looks_of(
         [
             *(configuration.label for configuration in configurations_of(rows)),
             *(label for each in motions for label in each.motions),
+            *(each.label for each in configurations_of(with_floor(rows, SURFACE))),
         ]
     )
     sections = [
         *opening.picture_sections(out, motions, looks),
-        *opening.skill_sections(out, rows, looks, keep),
-        *parts.findings_section(rows_of, metrics, results, paper, keep),
-        *parts.rank_section(out, results, keep),
-        *parts.factor_section(out, results, keep),
+        *opening.skill_sections(out, shared, list(others), looks, keep),
+        *parts.findings_section(rows_of, metrics, decided, untold, paper, keep),
+        *parts.rank_section(out, decided, keep),
+        *parts.factor_section(out, decided, keep),
         *_moving(out, motions, looks),
         *_parameters(parameters or {}, keep),
         *(

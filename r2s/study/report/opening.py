@@ -73,8 +73,13 @@ def _horizon_words(comparison: MotionComparison) -> str:
     return f"the horizon is at {comparison.horizon:.2f} s"
 
 
-def skill_sections(out: Path, rows: Sequence[Row], looks: Looks, keep: Keep) -> list[Section]:
-    """Error, floor and skill by approach; and what is compared beyond the horizon."""
+def skill_sections(
+    out: Path, rows: Sequence[Row], others: Sequence[str], looks: Looks, keep: Keep
+) -> list[Section]:
+    """Error, floor and skill by approach; and what is compared beyond the horizon.
+
+    `others`: fabrics of which not every configuration has an estimate, and that are not in `rows`.
+    """
     known = with_floor(rows, SURFACE)
     judged = {row.recording for row in rows if row.metric == SURFACE}
     without = judged - {row.recording for row in known}
@@ -85,14 +90,20 @@ def skill_sections(out: Path, rows: Sequence[Row], looks: Looks, keep: Keep) -> 
     found = {motion: each for motion, each in found.items() if each}
     fabrics = list(dict.fromkeys(row.fabric for row in known))
     words = [
-        f"Fabrics that have floors: {_names(fabrics)}. Rows of the true fabric are what a perfect "
-        "estimate would reach on that solver; the default knows the fabric's weight alone, and its "
+        f"Fabrics that have floors: {_names(fabrics)}. Rows of the true fabric have the truth's "
+        "stiffness at small strain, constant, on that solver: an estimate of what stiffness is on "
+        "average, or of laws that change with the strain, may come nearer. The default knows the "
+        "fabric's weight alone, and its "
         "draws show by how much that varies; the middle of the prior is the best guess by it. "
         "Where an approach knows that prior (DIFFCLOUD on the cloth), it has learned what it has "
         "beyond that: the second table."
     ]
     if len(fabrics) < 2:
         words.append("There are no intervals: one fabric has no spread between fabrics.")
+    if others:
+        words.append(
+            f"Not every configuration has an estimate of {_names(others)}: not among these either."
+        )
     if without:
         words.append(
             f"Not among these are {len(without)} recordings that have no frame before a horizon, "
@@ -107,9 +118,12 @@ def skill_sections(out: Path, rows: Sequence[Row], looks: Looks, keep: Keep) -> 
     beyond = tuple(keep(name, table) for name, table in beyond_tables(rows, BEYOND).items())
     if beyond:
         text = (
-            "From the horizon on motions are out of phase whatever the fabric. What still can be "
-            "predicted are extents, sag, area covered seen from above, speed and mean frequency: "
-            "the differences between simulation and recording, means over those frames."
+            "From the horizon on motions are out of phase whatever the fabric. What is compared "
+            "there are extents, sag, area covered seen from above, speed and mean frequency: the "
+            "differences between simulation and recording, means over those frames. They have no "
+            "floor, so whether a difference says something of a fabric is told by the rows of the "
+            "true fabric and the default beside it. Folds begin here where their layers touch, "
+            "which predictions do not have."
         )
         sections.append(Section("Beyond the horizon", (text,), beyond))
     return sections

@@ -6,18 +6,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from r2s.cloth.self_contact.detection import CLOSEST, WATCHED
-from r2s.estimation.default_spaces import FROM, fixed
+from r2s.estimation.default_spaces import FROM, Law, fixed, with_law
 from r2s.estimation.method import default_space
 from r2s.fabrics.parameters import ParameterSpace
 from r2s.study.evaluations import EvaluationCell
-from r2s.study.sources import LAYERED, SyntheticRecording, TruthSettings, small_strain
+from r2s.study.sources import LAYERED, SyntheticRecording, TruthSettings, of_law, small_strain
 from r2s.study.tables import MISSING, Table, significant
 from r2s.world.contact import PRESSURE_STIFFNESS, SLIP_SPEED
 
 HEADER = ("solver", "parameter", "unit", "low", "high", "middle", "truths", "from")
 CAPTION = (
     "Ranges of what is estimated, and what estimates are told (one value, or one for each fabric); "
-    "truths: geometric mean of the study's fabrics at small strain, where it is known"
+    "truths: geometric mean of the study's fabrics at small strain, where it is known. Laws that "
+    "stiffen and soften are estimated where the recordings tell them: those of pulls and another "
+    "motion together"
 )
 
 
@@ -28,9 +30,18 @@ def range_table(cells: Iterable[EvaluationCell]) -> Table:
     for solver in dict.fromkeys(cell.solver for cell in cells):
         own = [cell for cell in cells if cell.solver == solver]
         densities = list(dict.fromkeys(cell.density for cell in own))
-        lines += _ranges(solver, default_space(solver, densities[0]), _known(own))
+        law = _law(own)
+        lines += _ranges(
+            solver, with_law(default_space(solver, densities[0]), law), law, _known(own)
+        )
         lines += _fixed(solver, [default_space(solver, density) for density in densities])
     return Table(HEADER, tuple(lines), CAPTION)
+
+
+def _law(cells: Sequence[EvaluationCell]) -> Law:
+    """All laws that an estimate may have: both, where any is but constant."""
+    laws = {cell.estimate.law for cell in cells if cell.estimate is not None}
+    return "linear" if laws <= {"linear"} else "stiffening+softening"
 
 
 def _known(cells: Sequence[EvaluationCell]) -> list[str]:
@@ -45,8 +56,10 @@ def _known(cells: Sequence[EvaluationCell]) -> list[str]:
     )
 
 
-def _ranges(solver: str, space: ParameterSpace, fabrics: list[str]) -> list[tuple[str, ...]]:
-    places = [np.asarray(space.to_unit(small_strain(fabric))) for fabric in fabrics]
+def _ranges(
+    solver: str, space: ParameterSpace, law: Law, fabrics: list[str]
+) -> list[tuple[str, ...]]:
+    places = [np.asarray(space.to_unit(of_law(fabric, law))) for fabric in fabrics]
     half = jnp.full(space.dim, 0.5, float)
     middle = np.asarray(space.values(half))
     truths = (

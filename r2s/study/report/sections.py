@@ -24,10 +24,14 @@ def findings_section(
     rows_of: Mapping[str, Sequence[Row]],
     metrics: Sequence[str],
     results: ResultArray,
+    untold: Sequence[str],
     paper: Paper,
     keep: Keep,
 ) -> list[Section]:
-    """The conclusions of the paper, by each of `metrics`; in words by the first of them."""
+    """The conclusions of the paper, by each of `metrics`; in words by the first of them.
+
+    `untold`: recordings that are not among the first metric's, since they tell no fabrics apart.
+    """
     if not metrics:
         return [Section("Findings", ("There are no results yet.",))]
     found = {metric: findings.find(rows_of[metric], paper, metric) for metric in metrics}
@@ -41,6 +45,13 @@ def findings_section(
         "correction.",
         *(findings.in_words(verdict) for verdict in first),
     ]
+    if untold:
+        words.insert(
+            0,
+            f"By the {NAMES.get(metrics[0], metrics[0])} recordings count here, and in ranks and "
+            "factors below, in which the default is clearly above the floor. Not these "
+            f"{len(untold)}, which tell no fabrics apart: {', '.join(untold)}.",
+        )
     if not paper:
         words.append("The tables of the paper were not given: its own numbers are not shown.")
     lines = tuple(

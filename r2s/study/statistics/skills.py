@@ -56,6 +56,20 @@ def with_floor(rows: Iterable[Row], metric: str) -> list[Row]:
     return [row for row in with_references(whose) if row.baseline not in REFERENCES]
 
 
+def deciding(rows: Iterable[Row], metric: str) -> tuple[list[Row], list[str]]:
+    """Rows without those of a metric in recordings that tell no fabrics apart, and their names.
+
+    These are recordings in which a skill is not told on some solver: the default is not clearly
+    above the floor there, so that what is nearer is not better, and a ratio of errors says nothing.
+    """
+    rows = list(rows)
+    own = [row for row in rows if row.metric == metric and row.floor is not None]
+    judged = [row for row in own if row.baseline != "default" and np.isfinite(row.value)]
+    untold = {row.recording for row in judged if row.skill is None}
+    kept = [row for row in rows if row.metric != metric or row.recording not in untold]
+    return kept, sorted(untold)
+
+
 def skills(rows: Iterable[Row], motion: str) -> dict[Configuration, Skill]:
     """The skill of every configuration in a motion, from what `with_floor` returns."""
     rows = [row for row in rows if row.evaluated_on == motion]
@@ -112,7 +126,8 @@ class Draws(NamedTuple):
 def draws(rows: Iterable[Row], motion: str, configuration: Configuration) -> Draws:
     """The spread of a default fabric's draws in a motion."""
     theirs = [row for row in rows if _is_of(row, motion, configuration)]
-    every = {row.recording: [r.value for r in theirs if r.recording == row.recording]
+    finite = [row for row in theirs if np.isfinite(row.value)]  # as skills are told
+    every = {row.recording: [r.value for r in finite if r.recording == row.recording] or [np.nan]
              for row in theirs}  # fmt: skip
     errors, told = [], []
     for draw in dict.fromkeys(row.repeat for row in theirs):
