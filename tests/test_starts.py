@@ -80,13 +80,18 @@ def test_a_prediction_of_the_cloth_that_is_lost_is_made_again_in_shorter_substep
     scenario, fabric, tried = FLING.scenario((5, 5)), presets.grey_interlock(), []
     solver = explicit_cloth(scenario, fabric)
 
-    def motion(_, __, solver):
-        tried.append(solver.substeps)
-        return Motion(np.zeros((1, 25, 3)), "" if len(tried) > 1 else "was unstable")
+    def motion(_, __, solver=None):
+        tried.append(solver.substeps if solver else None)
+        return Motion(np.zeros((1, 25, 3)), "" if len(tried) > lost else "was unstable")
 
     monkeypatch.setattr(prediction_error, "predict_motion", motion)
-    assert _until_stable(scenario, fabric, solver).failure == ""
-    assert tried == [solver.substeps, 2 * solver.substeps]
+    every = [solver.substeps, 2 * solver.substeps, 4 * solver.substeps, None]
+    words = "explicit steps", "explicit steps, 2 times as many", "explicit steps, 4 times as many"
+    for lost, told in enumerate((*words, "implicit steps, lost in explicit ones")):
+        found = _until_stable(scenario, fabric, solver)
+        assert (found.failure, found.steps) == ("", told)  # and says so
+        assert tried == every[: lost + 1]
+        tried.clear()
 
 
 def test_given_recordings_and_lying_sheets_have_no_start(tmp_path):

@@ -1,5 +1,8 @@
 """What two motions have in common although they are out of phase: sizes, sag, speeds.
 
+The features are the usual ones of extent and of spectra: bounding box, convex hull, and the mean
+frequency of a power spectrum (its first moment over its zeroth, as of waves: Longuet-Higgins,
+"On the statistical distribution of the heights of sea waves", Journal of Marine Research 11, 1952).
 Each is a number of a motion, from clouds of it or from the vertices of a sheet, over the frames
 that are compared. Beyond the horizon of a motion (`r2s.evaluation.horizon`) these can still be
 predicted.

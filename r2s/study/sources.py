@@ -2,7 +2,8 @@
 
 Synthetic recordings are not the estimators' own model: their mesh is finer, their steps are
 shorter, and their fabrics stiffen with the strain and soften with the curvature, as measured ones
-do. Those of a sheet of MuJoCo are of another simulator altogether (`r2s.study.mujoco_recording`).
+do (DIFFCLOUD from a lift and pulls together estimates such laws, all others constant stiffness).
+Those of a sheet of MuJoCo are of another simulator altogether (`r2s.study.mujoco_recording`).
 """
 
 import dataclasses
