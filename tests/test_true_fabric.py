@@ -1,7 +1,8 @@
 """The point of a study's verdicts: on truths that are known, the true fabric beats knowing nothing.
 
 Known to 5 mm in mesh and step, up to the horizon: a third of what fabrics differ by in most of
-these motions. To the 2 mm of a converged truth three of the ten are (docs/study.md).
+these motions. To the 2 mm of a converged truth four of the ten are, and in one the mesh passes half
+of what fabrics differ by after a quarter of a second: no skill is told of it (docs/study.md).
 """
 
 import numpy as np
@@ -16,7 +17,8 @@ from r2s.study.sources import SyntheticRecording, small_strain
 from r2s.study.verdicts import SURFACE
 
 KNOWN = 5e-3  # [m], of mesh and step, mean up to the horizon
-CHAOTIC = 0.5  # [s]: a horizon before this one tells nothing
+EARLY = 0.5  # [s]: a horizon before this one tells nothing
+UNTOLD = {("red_jet_set", "shaking")}
 
 
 @pytest.mark.slow(group="verdicts")
@@ -36,6 +38,8 @@ def test_the_true_fabric_beats_the_default_where_the_truth_is_known(tmp_path, fa
     assert true.horizon is not None and true.floor is not None
     inside = ensemble.times < true.horizon
     left = [ensemble.causes[cause][:, inside].mean() for cause in ("mesh", "step")]
-    assert true.horizon > CHAOTIC and np.hypot(*left) < KNOWN
-    assert true.value < np.mean(drawn)
-    assert true.skill is not None and true.skill > 0
+    assert np.hypot(*left) < KNOWN and true.value < np.mean(drawn)
+    if (fabric, motion) in UNTOLD:
+        assert true.horizon < EARLY and true.skill is None
+    else:
+        assert true.horizon > EARLY and true.skill is not None and true.skill > 0
