@@ -1,7 +1,7 @@
 """The point of a study's verdicts: on truths that are known, the true fabric beats knowing nothing.
 
 Known to 5 mm in mesh and step, up to the horizon: a third of what fabrics differ by in most of
-these motions. To the 2 mm of a converged truth four of the ten are, and in one the mesh passes half
+these motions. To the 2 mm of a converged truth five of the ten are, and in one the mesh passes half
 of what fabrics differ by after a quarter of a second: no skill is told of it (docs/study.md).
 """
 
