@@ -6,7 +6,8 @@ By default from a lift and three pulls together. Errors are mean distances up to
 the floor of the truth, the true fabric at small strain, the middle of the prior and the mean of
 draws of it (the default); skill is 1 at the floor and 0 at the default. Numbers of the fabrics are
 over the truth's at small strain (coupling: the difference). Truths stiffen as they stretch and lose
-up to 35 % of their bending stiffness, which estimates of constant stiffness cannot follow.
+up to 35 % of their bending stiffness, which estimates of constant stiffness (`--law linear`) cannot
+follow; by default an estimate has the laws that its recordings tell.
 """
 
 from functools import partial
