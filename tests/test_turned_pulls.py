@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -150,6 +151,13 @@ def test_a_pull_and_another_motion_tell_how_a_fabric_stiffens_and_softens(bias):
     assert law_told_by([motion, bias]) == "stiffening+softening"
     for others in ([], [bias], [bias, bias], [motion], [motion, without]):
         assert law_told_by(others) == "linear"
+
+    def law(seen, **options: Any):
+        card = EstimateCard((Path("lift.npz"),), 0.2, Path("card.json"), **options)
+        return law_of(card._space(METHODS[card.method](), "flat", seen).ranges)
+
+    assert law([motion, bias]) == "stiffening+softening" and law([bias]) == "linear"
+    assert law([motion, bias], law="linear") == law([motion, bias], method="diffcp") == "linear"
 
 
 @pytest.mark.parametrize("law", ["linear", "stiffening", "softening", "stiffening+softening"])
