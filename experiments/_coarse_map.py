@@ -23,13 +23,13 @@ RIDGE = 0.1  # of the variance: draws are few
 Table = Float[np.ndarray, "draw parameter"]
 
 
-def fitted(draw: str, shape: tuple[int, int]) -> Line:
+def fitted(draw: str, shape: str) -> Line:
     """Places in the unit cube of a draw of the prior, and of the fit of a coarse sheet to its lift
-    on `FINE`."""
+    on `FINE`; `shape`: its vertices a side."""
     fabric = jax.tree.map(lambda leaf: leaf[0], prior.draws(DENSITY, 1, jr.key(int(draw))))
     recording = _lift(fabric, jr.key(int(draw)))
     space = on_cloth(DENSITY)
-    method = DiffCloud(shape=shape)
+    method = DiffCloud(shape=(int(shape), int(shape)))
     budget = method.budget._replace(coarse=16, starts=2, iterations=20)
     found = method.estimate([recording], space, budget, key=jr.key(0))
     places = space.to_unit(fabric), space.to_unit(found.fabric)
@@ -83,6 +83,8 @@ def _left_out(seen: Table, wanted: Table) -> Table:
         middle, mean = x.mean(axis=0), y.mean(axis=0)
         x, y = x - middle, y - mean
         penalty = RIDGE * np.diag(np.sum(x**2, axis=0))
-        slope = np.linalg.solve(x.T @ x + penalty, x.T @ y) if x.shape[1] else np.zeros((0, 7))
+        slope = (
+            np.linalg.solve(x.T @ x + penalty, x.T @ y) if x.shape[1] else np.zeros((0, y.shape[1]))
+        )
         found.append(mean + (seen[i] - middle) @ slope)
     return np.stack(found)

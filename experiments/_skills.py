@@ -7,25 +7,21 @@ import numpy as np
 from _tables import Line
 from scipy.stats import norm
 
-from r2s.estimation.default_spaces import law_of, with_law
-from r2s.estimation.method import default_space
 from r2s.study import engine, results, verdicts
 from r2s.study.cells import read_metadata
 from r2s.study.estimates import EstimateCell, read_estimate
 from r2s.study.evaluations import EvaluationCell
 from r2s.study.matrix import SMALL, configuration_named, synthetic
 from r2s.study.rows import Row
-from r2s.study.sources import of_law
 from r2s.study.verdicts import SURFACE
 
+JUDGED = ("fling", "shaking")
 NAMED = {"": "estimate", "true": "true fabric", "middle": "middle", "default": "default"}
 
 
-def predicted(
-    folder: Path, configuration: str, fabric: str, law: str, motions: tuple[str, ...]
-) -> Line:
-    """The line of a table: errors [mm] and skill in the first of each of some motions, numbers of
-    the fabric over the truth's at small strain, how many of these the intervals hold, by how many
+def predicted(folder: Path, configuration: str, fabric: str, law: str) -> Line:
+    """The line of a table: errors [mm] and skill in the first fling and shaking, numbers of the
+    fabric over the truth's at small strain, how many of these the intervals hold, by how many
     standard errors what is called identifiable is off, and the seconds of a CPU that it took.
 
     `law`: "told" by the recordings, as in a study, or one of `r2s.estimation.default_spaces`.
@@ -38,17 +34,18 @@ def predicted(
         every=1,
         draws=4,
     )
-    cells = [_of_law(cell, law) for cell in synthetic(plan) if cell.scenario in motions]
+    cells = [_of_law(cell, law) for cell in synthetic(plan) if cell.scenario in JUDGED]
     failed = engine.run([*verdicts.ensembles(cells), *cells], folder, engine.Serial())
     if failed:
         raise RuntimeError(f"{configuration} of {fabric}: {next(iter(failed.values()))}")
     rows = [row for row in results.rows(cells, folder) if row.metric == SURFACE]
     line: Line = {}
-    for motion in motions:
+    for motion in JUDGED:
         line |= _of(motion, [row for row in rows if row.evaluated_on == motion])
     (estimate,) = {cell.estimate for cell in cells if cell.estimate is not None}
-    took = read_metadata(estimate, folder)["cpu_seconds"]
-    return line | _over_truth(estimate, folder) | {"CPU s": f"{took:.0f}"}
+    made = read_metadata(estimate, folder)
+    by = {"CPU s": f"{made['cpu_seconds']:.0f}", "estimated by source": made["source"]}
+    return line | _over_truth(estimate, folder) | by
 
 
 def _of_law(cell: EvaluationCell, law: str) -> EvaluationCell:
@@ -70,9 +67,7 @@ def _over_truth(cell: EstimateCell, folder: Path) -> Line:
     found = read_estimate(cell, folder)
     if found is None:
         return {"warp": "diverged"}
-    law = law_of(found.ranges)
-    space = with_law(default_space(cell.solver, cell.density), law)
-    true = np.asarray(space.values(space.to_unit(of_law(cell.fabric, law))))
+    true = results.true_values(cell, found.ranges)
     line: Line = {}
     off = []
     for bound, value, there in zip(found.ranges, found.values, true, strict=True):

@@ -8,7 +8,6 @@ place in the range (0 to 1) in draws that were left out one by one, by the mean 
 the fit as it is, and by linear maps of the fit.
 """
 
-from functools import partial
 from pathlib import Path
 
 from _coarse_map import fitted, judged
@@ -23,9 +22,9 @@ CAPTION = (
 if __name__ == "__main__":
     parser = command_line(__doc__, "docs/results/coarse_map.csv")
     parser.add_argument("--draws", type=int, default=40)
-    parser.add_argument("--shape", type=int, nargs=2, default=(9, 9))
+    parser.add_argument("--shape", default="9", help="vertices a side")
     parser.add_argument("--fits", type=Path, default=Path("results/coarse_map_fits.csv"))
     a = parser.parse_args()
-    jobs = [{"draw": str(draw)} for draw in range(a.draws)]
-    fits = resumed(a.fits, "Draws and fits.", jobs, partial(fitted, shape=tuple(a.shape)))
+    jobs = [{"draw": str(draw), "shape": a.shape} for draw in range(a.draws)]
+    fits = resumed(a.fits, "Draws and fits.", jobs, fitted)
     keep(a.out, judged(fits), CAPTION)

@@ -17,7 +17,6 @@ from _skills import predicted
 from _tables import Line, command_line, resumed
 
 from r2s.fabrics import presets
-from r2s.study.configuration import MOTIONS
 
 TOGETHER = "diffcloud-cloth-lifting+stretching"
 CAPTION = (
@@ -31,7 +30,6 @@ if __name__ == "__main__":
     parser.add_argument("--fabrics", nargs="+", choices=presets.FIVE, default=list(presets.FIVE))
     parser.add_argument("--configurations", nargs="+", default=[TOGETHER])
     parser.add_argument("--law", default="told", help="told by the recordings, or linear, ...")
-    parser.add_argument("--motions", nargs="+", choices=MOTIONS, default=["fling", "shaking"])
     parser.add_argument("--folder", type=Path, default=Path("results/skill_by_fabric"))
     a = parser.parse_args()
     jobs: list[Line] = [
@@ -39,5 +37,4 @@ if __name__ == "__main__":
         for configuration in a.configurations
         for fabric in a.fabrics
     ]
-    motions = tuple(a.motions)
-    resumed(a.out, CAPTION, jobs, partial(predicted, a.folder, motions=motions))
+    resumed(a.out, CAPTION, jobs, partial(predicted, a.folder))

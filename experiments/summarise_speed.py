@@ -33,6 +33,7 @@ if __name__ == "__main__":
     used = ("jax", "mujoco", "newton")
     libraries = ", ".join(f"{name} {found['machine'][name]}" for name in used)
     facts = {"libraries": libraries, "command": found["machine"]["command"]}
+    facts["source"] = "not noted by the benchmark"
     for name, (parts, table, caption) in TABLES.items():
         rows = [row for row in found["rows"] if row["part"] in parts]
         if not rows:

@@ -34,6 +34,7 @@ if __name__ == "__main__":
     facts = {
         "command": "make study; python experiments/summarise_study.py results",
         "version": f"r2s {version}",
+        "source": made_by[0].partition("source ")[2].partition(";")[0],
         "seed": settings["seed"],
         "date": time.strftime("%Y-%m-%d", made),
         "cost": f"{seconds / 60:.0f} CPU minutes",

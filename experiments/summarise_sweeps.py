@@ -54,5 +54,6 @@ if __name__ == "__main__":
         lines += [line(device, row) for row in found["rows"] if "step_us" in row]
     lines.sort(key=_place)
     facts = {"command": "; ".join(commands), "machine": "; ".join(sorted(libraries))}
+    facts["source"] = "not noted by the benchmark"
     keep(a.out / "sweeps.csv", lines, CAPTION, facts)
     insert(DOCUMENT, "sweeps", shown(a.out / "sweeps.csv"))

@@ -73,8 +73,7 @@ def descend_by_meshes(
     def on(*shapes: Shape) -> tuple[Problem, ...]:
         with lock:  # else two threads make them twice, and `derive` knows one of these
             found = known(shapes)
-        weighed = zip(found, counts, strict=True) if counts else ()
-        return tuple(dataclasses.replace(each, weight=count) for each, count in weighed) or found
+        return _weighed(found, counts) if counts else found
 
     def climb(shapes: list[Shape], start: Theta | None, leads_on: bool) -> _Rung:
         more, path = budget, checkpoint
@@ -134,8 +133,7 @@ def descend_weighed(
     if len(problems) > 1:
         tell(progress, "each recording alone")
         counts = weights(each_alone(problems, budget, found.theta, key, derive))
-        pairs = zip(problems, counts, strict=True)
-        problems = tuple(dataclasses.replace(each, weight=count) for each, count in pairs)
+        problems = _weighed(problems, counts)
         path = checkpoint and checkpoint.with_suffix(".weighed.npz")
         found = search(problems, near(budget), start=found.theta, checkpoint=path, **saved)
     return judged(found, budget, approach=approach, key=key)
@@ -158,6 +156,11 @@ def weights(alone: Sequence[Descent]) -> list[Float[Array, ""]]:
     """
     left = [max(float(end.normal.loss), FINEST**2) for end in alone]
     return [jnp.asarray(1 / each, float) for each in left]
+
+
+def _weighed(problems: Problems, counts: Sequence[Float[Array, ""]]) -> tuple[Problem, ...]:
+    pairs = zip(problems, counts, strict=True)
+    return tuple(dataclasses.replace(each, weight=count) for each, count in pairs)
 
 
 def ladder(recordings: Recordings) -> list[list[Shape]]:

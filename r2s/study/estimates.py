@@ -117,7 +117,7 @@ class EstimateCell(Cell):
         """An estimate; one whose every simulation diverged is a result too, and says so."""
         recordings = [read(source, folder) for source in self.sources]
         space = default_space(self.solver, self.density)
-        space = with_law(space, self.law_of(recordings))
+        space = with_law(space, self.law_from(recordings))
         if self.prior != "flat":
             space = prior.informed(space, self.density)
         try:
@@ -129,7 +129,7 @@ class EstimateCell(Cell):
         write_json(out / ESTIMATE, as_json(found))
         return {"seed": self.repeat, "diverged": ""}
 
-    def law_of(self, recordings: Sequence[Recording]) -> Law:
+    def law_from(self, recordings: Sequence[Recording]) -> Law:
         """The law of the fabrics that it chooses from, told by its recordings where that is so."""
         return law_told_by(recordings) if self.law == "told" else self.law
 

@@ -26,7 +26,7 @@ from r2s.study.report.data_table import data_table
 from r2s.study.report.parameter_ranges import range_table, truth_settings
 from r2s.study.report.truth_table import truth_table
 from r2s.study.rows import Row, write_rows
-from r2s.study.sources import GivenRecording, SyntheticRecording, of_law, read
+from r2s.study.sources import GivenRecording, SyntheticRecording, read, true_fabric
 from r2s.study.statistics.parameters import Estimated
 from r2s.study.statistics.recordings import recording_tables
 from r2s.study.tables import MISSING, Table, significant
@@ -254,15 +254,15 @@ def parameters(cells: Iterable[EvaluationCell], folder: Path) -> dict[str, list[
                     estimate.values,
                     estimate.standard_errors,
                     estimate.identifiable,
-                    _true_values(cell, estimate.ranges),
+                    true_values(cell, estimate.ranges),
                 )
             )
     return found
 
 
-def _true_values(cell: EstimateCell, ranges: Sequence[Range]) -> np.ndarray:
-    """The parameters at small strain of a synthetic recording's fabric; NaN where unknown, as of
-    given recordings and of another simulator's sheet."""
+def true_values(cell: EstimateCell, ranges: Sequence[Range]) -> np.ndarray:
+    """The parameters [unit of the range] of a synthetic recording's fabric, of constant ones those
+    at small strain; NaN where unknown, as of given recordings and of another simulator's sheet."""
     source = cell.sources[0]
     if (
         cell.solver != "cloth"
@@ -272,4 +272,4 @@ def _true_values(cell: EstimateCell, ranges: Sequence[Range]) -> np.ndarray:
         return np.full(len(ranges), np.nan)
     law = law_of(ranges)
     space = with_law(default_space("cloth", cell.density), law)
-    return np.asarray(space.values(space.to_unit(of_law(cell.fabric, law, source.truth))))
+    return np.asarray(space.values(space.to_unit(true_fabric(cell.fabric, law, source.truth))))

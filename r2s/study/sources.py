@@ -298,7 +298,7 @@ def small_strain(name: str) -> Fabric:
     return dataclasses.replace(presets.FIVE[name](), damping=damping, friction=friction)
 
 
-def of_law(name: str, law: Law, truth: TruthSettings = TruthSettings()) -> Fabric:
+def true_fabric(name: str, law: Law, truth: TruthSettings = TruthSettings()) -> Fabric:
     """The fabric that a recording is made with, of those laws that an estimate has; where it has
     constant ones the stiffness is that at small strain."""
     small, changing = small_strain(name), strain_dependent(name, truth)

@@ -61,7 +61,7 @@ def _of_estimates(cells: list[EvaluationCell], folder: Path) -> list[tuple[str, 
             "; ".join(dict.fromkeys(map(seen_by, cell.sources, reads))),
             *_numbers(seen, reads),
             cell.prior,
-            cell.law_of(seen),
+            cell.law_from(seen),
         )
     return list(found.values())
 

@@ -10,7 +10,7 @@ from r2s.estimation.default_spaces import FROM, Law, fixed, with_law
 from r2s.estimation.method import default_space
 from r2s.fabrics.parameters import ParameterSpace
 from r2s.study.evaluations import EvaluationCell
-from r2s.study.sources import LAYERED, SyntheticRecording, TruthSettings, of_law, small_strain
+from r2s.study.sources import LAYERED, SyntheticRecording, TruthSettings, small_strain, true_fabric
 from r2s.study.tables import MISSING, Table, significant
 from r2s.world.contact import PRESSURE_STIFFNESS, SLIP_SPEED
 
@@ -59,7 +59,7 @@ def _known(cells: Sequence[EvaluationCell]) -> list[str]:
 def _ranges(
     solver: str, space: ParameterSpace, law: Law, fabrics: list[str]
 ) -> list[tuple[str, ...]]:
-    places = [np.asarray(space.to_unit(of_law(fabric, law))) for fabric in fabrics]
+    places = [np.asarray(space.to_unit(true_fabric(fabric, law))) for fabric in fabrics]
     half = jnp.full(space.dim, 0.5, float)
     middle = np.asarray(space.values(half))
     truths = (
