@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from r2s import scenarios
@@ -38,9 +39,13 @@ def lifts():
     return lift(knit, 0), lift(knit, 1), lift(stiffer(knit, 3.0), 2), space.to_unit(knit)
 
 
+def _theta(problems, place):
+    return jnp.zeros(theta_length(problems), float).at[: len(place)].set(place)
+
+
 def judged(problems, place):
-    theta = jnp.zeros(theta_length(problems), float).at[: len(place)].set(place)
-    return contradiction(problems, each_alone(problems, DEFAULT, theta, jax.random.key(0)))
+    ends = each_alone(problems, DEFAULT, _theta(problems, place), jax.random.key(0))
+    return contradiction(problems, ends)
 
 
 @pytest.mark.slow(group="estimates")
@@ -58,3 +63,14 @@ def test_the_recording_of_another_fabric_is_named(lifts):
     assert found.parameter in ("warp", "weft", "shear") and found.errors > 3
     pair = judged((first, other), place)
     assert pair is not None and pair.p < 1e-6
+
+
+@pytest.mark.slow(group="estimates")
+def test_a_recording_is_excused_by_the_error_of_its_own_mesh_alone(lifts):
+    """As far as its mesh leads astray, and whatever the signs: those are not told."""
+    first, _, other, place = lifts
+    ends = each_alone((first, other), DEFAULT, _theta((first, other), place), jax.random.key(0))
+    none, far = np.zeros(len(place)), np.full(len(place), 0.5)
+    assert contradiction((first, other), ends, [none, far]) is None
+    assert contradiction((first, other), ends, [none, -far * (-1) ** np.arange(len(place))]) is None
+    assert contradiction((first, other), ends, [none, far / 100]) is not None

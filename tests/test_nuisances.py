@@ -12,7 +12,8 @@ import pytest
 
 from r2s import scenarios
 from r2s.estimation import compiled, descent, gauss_newton
-from r2s.estimation.descent import Budget, covariance_at, descend, nuisances
+from r2s.estimation.covariance import covariance_at
+from r2s.estimation.descent import Budget, descend, nuisances
 from r2s.estimation.estimate import describe
 from r2s.estimation.gauss_newton import Descent, Normal
 from r2s.estimation.mesh_bias import on_the_way, weighed

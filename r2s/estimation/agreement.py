@@ -28,12 +28,16 @@ class Led(NamedTuple):
 
 
 def contradiction(
-    problems: Problems, ends: Sequence[Descent], bias: Float[np.ndarray, " theta"] | None = None
+    problems: Problems,
+    ends: Sequence[Descent],
+    biases: Sequence[Float[np.ndarray, " theta"]] = (),
 ) -> Contradiction | None:
     """The recording that contradicts the others the most, where one does.
 
     - `ends`: of a descent in each recording alone.
-    - `bias`: of theta by the mesh, which excuses as much.
+    - `biases`: of each end by its mesh; none where that was not judged. A lift that buckles
+      elsewhere on a finer mesh leads far astray, pulls hardly. How far is told by one step, in
+      which direction is not: each parameter is excused by itself.
 
     Their weighted scatter around their mean, over the fabric's parameters with nuisances free, is
     compared with its chi-squared distribution. The one is named without which the others agree
@@ -42,9 +46,9 @@ def contradiction(
     if len(problems) < 2:
         return None
     dim = problems[0].space.dim
-    excused = np.zeros((dim, dim)) if bias is None else np.outer(bias[:dim], bias[:dim])
-    pairs = zip(problems, ends, strict=True)
-    led = [_led((problem,), end, excused) for problem, end in pairs]
+    excused = [bias[:dim] for bias in biases] or [np.zeros(dim)] * len(problems)
+    rows = zip(problems, ends, excused, strict=True)
+    led = [_led((problem,), end, by) for problem, end, by in rows]
     if not all(np.isfinite(part).all() for one in led for part in one):
         return None  # nothing is known
     p = float(stats.chi2.sf(_scatter(led), dim * (len(led) - 1)))
@@ -82,9 +86,9 @@ def _apart(one: Led, other: Led) -> Float[np.ndarray, " dim"]:
     return np.abs(one.place - other.place) / np.sqrt(variance)
 
 
-def _led(problems: Problems, end: Descent, excused: Float[np.ndarray, "dim dim"]) -> Led:
+def _led(problems: Problems, end: Descent, excused: Float[np.ndarray, " dim"]) -> Led:
     dim = problems[0].space.dim
     prior = prior_weight(problems, end.normal)
     covariance, _ = standard_errors.sandwich_of(problems, end, prior)
     own = np.asarray(covariance, float)[:dim, :dim]
-    return Led(np.asarray(end.theta, float)[:dim], own + excused)
+    return Led(np.asarray(end.theta, float)[:dim], own + np.diag(excused**2))

@@ -13,21 +13,19 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation import checkpoint as checkpoints
-from r2s.estimation import gauss_newton, standard_errors
+from r2s.estimation import gauss_newton, mesh_bias
 from r2s.estimation.agreement import contradiction
 from r2s.estimation.compiled import (
     Derive,
-    Predicted,
-    derivatives_at,
     loss_from,
     losses_at,
-    normal_from,
     normals_at,
     remembering,
 )
+from r2s.estimation.covariance import covariance_at
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
-from r2s.estimation.mesh_bias import OtherMesh, mesh_bias, on_the_way, weighed
+from r2s.estimation.mesh_bias import OtherMesh, on_the_way, weighed
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.misfits import left_out, misfits
 from r2s.estimation.nuisances import nuisances
@@ -39,8 +37,6 @@ from r2s.fabrics.informed_space import InformedSpace
 INITIAL_DAMPING = 1e-2
 STRICT, SCALES = 3.0, (3e-3, 0.015)  # of the spread, and between [m]: beyond lies an outlier
 HALVING, FEWEST = 3, 3  # iterations, after each of which half go on, but no fewer than this
-ROUGH = 3.0  # standard errors, by which places around an end lead apart
-FIRST, FAR_APART = 2, 2.0  # pairs of them, and times that, where no more are needed
 
 
 class Stop(NamedTuple):
@@ -65,10 +61,6 @@ _accept = eqx.filter_jit(gauss_newton.accept)
 _objective = eqx.filter_jit(gauss_newton.objective)
 _remaining = eqx.filter_jit(gauss_newton.remaining)
 _weight = eqx.filter_jit(gauss_newton.prior_weight)
-_covariance = eqx.filter_jit(standard_errors.covariance)
-_disagreement = eqx.filter_jit(standard_errors.disagreement)
-_tells = eqx.filter_jit(standard_errors.tells)
-_sample_around = eqx.filter_jit(standard_errors.sample_around)
 
 
 DEFAULT = Budget(shares=(0.25, 0.5))
@@ -187,7 +179,7 @@ def judged(
     seen = [each for each, _ in predicted]
     loss, rows = loss_from(problems, seen), found.rows
     if other_mesh is not None:
-        bias = mesh_bias(problems, other_mesh, best, prior, predicted)
+        bias = mesh_bias.mesh_bias(problems, other_mesh, best, prior, predicted)
         covariance = covariance + np.outer(bias, bias)
         if isinstance(problems[0].space, InformedSpace) and other_mesh.is_finer:
             place, covariance, bias = weighed(problems, best, prior, covariance, bias)
@@ -200,10 +192,12 @@ def judged(
     converged = _arrived(problems, stage, which, prior, _stop(budget, int(best.stage)))
     estimate = collect(problems, rows, covariance, approach, seconds, converged, loss, bias)
     alone = each_alone(problems, budget, best.theta, key, found.derive)
-    against = contradiction(problems, alone, bias)
+    biases = []
+    if other_mesh is not None and alone:
+        biases = mesh_bias.alone(problems, other_mesh, alone, found.derive, budget.width)
     return dataclasses.replace(
         estimate,
-        contradiction=against,
+        contradiction=contradiction(problems, alone, biases),
         misfits=misfits(problems, best.theta, seen),
         left_out=left_out(problems, seen, float(best.scale)),
     )
@@ -332,66 +326,6 @@ def _later(problems: Problems, budget: Budget, row: Row, derive: Derive) -> Row 
     after = list(row)
     (after[which],) = _fresh(problems, budget, [best.theta], scale, stage, derive)
     return after
-
-
-def covariance_at(
-    problems: Problems,
-    budget: Budget,
-    end: Descent,
-    key: PRNGKeyArray,
-    predicted: Predicted | None = None,
-    is_truth: bool = False,
-) -> Float[np.ndarray, "theta theta"]:
-    """Covariance of theta at the end of a descent, see `r2s.estimation.standard_errors`.
-
-    It comes from as many of the frames as agree. Where Gauss-Newton steps from places around the
-    end lead apart, the end of the motion depends on the fabric so steeply that its derivatives say
-    nothing; then the budget's shares of the frames are tried, the largest first. If these do not
-    agree either, the covariance is that of all frames. A beginning that says nothing of the fabric,
-    since nothing has moved yet, agrees with everything, and does not count.
-
-    `predicted`: `derivatives_at` the end, where they are known.
-    """
-    if predicted is None:
-        predicted = derivatives_at(problems, end.theta, budget.width)
-    found = []
-    for share in (1.0, *reversed(budget.shares)):
-        seen, here = problems, end
-        if share < 1:
-            seen = tuple(beginning(problem, share) for problem in problems)
-            normal = normal_from(seen, end.theta, predicted, end.scale)
-            here = dataclasses.replace(end, normal=normal)
-        prior = _weight(problems, here.normal)
-        neighbours, agrees = _around(seen, budget, here, prior, key)
-        found.append(np.asarray(_covariance(problems, here, prior, neighbours, is_truth)))
-        if agrees and (share == 1 or bool(_tells(problems, here, prior))):
-            return found[-1]
-    return found[0]
-
-
-def _around(
-    problems: Problems, budget: Budget, end: Descent, prior, key
-) -> tuple[standard_errors.Neighbours, bool]:
-    """The normal equations at places around the end of a descent, and whether they agree.
-
-    Where the first pairs of opposite places disagree by far, there are no others.
-    """
-    if not budget.around:
-        return [], True
-    places = _sample_around(problems, end, prior, budget.around, key)
-    pairs = list(places.reshape(2, -1, places.shape[-1]).swapaxes(0, 1))
-    neighbours: standard_errors.Neighbours = []
-    for some in (pairs[:FIRST], pairs[FIRST:]):
-        thetas = [theta for pair in some for theta in pair]
-        if not thetas:
-            continue
-        normals = normals_at(problems, thetas, [end.scale] * len(thetas), budget.width)
-        neighbours += zip(thetas, normals, strict=True)
-        is_last = len(neighbours) == budget.around
-        apart = float(_disagreement(problems, end, prior, neighbours))
-        if not apart < (ROUGH if is_last else FAR_APART * ROUGH):
-            return neighbours, False
-    return neighbours, True
 
 
 def _best(row: Row) -> tuple[int, Descent]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from r2s.estimation import compiled, descent, gauss_newton
+from r2s.estimation.covariance import covariance_at
 from r2s.estimation.descent import Budget
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import Descent, Problems
@@ -43,9 +44,7 @@ def sensitivity(problems: Problem | Problems, fabric: Fabric) -> Estimate:
     zero = jnp.zeros((), float)
     end = Descent(theta, normal, zero, zero, scale, jnp.zeros((), int))
     key = jax.random.key(0)
-    covariance = descent.covariance_at(
-        problems, descent.DEFAULT, end, key, predicted, is_truth=True
-    )
+    covariance = covariance_at(problems, descent.DEFAULT, end, key, predicted, is_truth=True)
     loss = compiled.loss_from(problems, [seen for seen, _ in predicted])
     return descent.collect(problems, [[end]], covariance, "sensitivity", 0.0, None, loss)
 

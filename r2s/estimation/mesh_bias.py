@@ -14,12 +14,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from r2s.estimation import compiled, normal_equations
-from r2s.estimation.compiled import loss_from, predictions_at
+from r2s.estimation.compiled import Derive, loss_from, predictions_at
 from r2s.estimation.gauss_newton import (
     MARGIN,
     Descent,
     Problems,
     prior_terms,
+    prior_weight,
     recording_weights,
     theta_indices,
     theta_length,
@@ -89,6 +90,25 @@ def mesh_bias(
     own, others = (_step(gradients[side], matrices[side], off, least) for side in (0, 1))
     bias = other.factor * (others - own)
     return np.clip(np.where(np.isfinite(bias), bias, 1.0), -1, 1)
+
+
+def alone(
+    problems: Problems,
+    other: OtherMesh,
+    ends: Sequence[Descent],
+    derive: Derive,
+    width: float | None = None,
+) -> list[Float[np.ndarray, " theta"]]:
+    """The `mesh_bias` of the end of a descent in each recording alone.
+
+    - `derive`, `width`: see `r2s.estimation.compiled`.
+    """
+    found = []
+    for problem, there, end in zip(problems, other.problems, ends, strict=True):
+        own, prior = (problem,), prior_weight((problem,), end.normal)
+        predicted = derive(own, end.theta, width)
+        found.append(mesh_bias(own, OtherMesh((there,), other.factor), end, prior, predicted))
+    return found
 
 
 def _step(gradient: np.ndarray, matrix: np.ndarray, off: np.ndarray, prior: np.ndarray):
