@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 from r2s import scenarios
-from r2s.estimation.agreement import contradiction
+from r2s.estimation.agreement import agreement, scattered, told_by
 from r2s.estimation.descent import DEFAULT, each_alone
 from r2s.estimation.gauss_newton import theta_length
 from r2s.estimation.problem import NuisancePrior, Problem
@@ -45,22 +46,26 @@ def _theta(problems, place):
 
 def judged(problems, place):
     ends = each_alone(problems, DEFAULT, _theta(problems, place), jax.random.key(0))
-    return contradiction(problems, ends)
+    return agreement(problems, ends)
 
 
 @pytest.mark.slow(group="estimates")
 def test_recordings_of_one_fabric_agree(lifts):
     first, second, _, place = lifts
     assert judged((first,), place) is None
-    assert judged((first, second), place) is None
+    found = judged((first, second), place)
+    assert found is not None and found.contradiction is None and min(found.told) > 2
 
 
 @pytest.mark.slow(group="estimates")
 def test_the_recording_of_another_fabric_is_named(lifts):
     first, second, other, place = lifts
     found = judged((first, other, second), place)
-    assert found is not None and found.recording == 1 and found.p < 1e-6
-    assert found.parameter in ("warp", "weft", "shear") and found.errors > 3
+    assert found is not None and found.p < 1e-6
+    odd = found.contradiction
+    assert odd is not None and odd.recording == 1
+    assert odd.parameter in ("warp", "weft", "shear") and odd.errors > 3
+    assert odd.values[0] == pytest.approx(3 * odd.values[1], rel=0.3)
     pair = judged((first, other), place)
     assert pair is not None and pair.p < 1e-6
 
@@ -69,8 +74,53 @@ def test_the_recording_of_another_fabric_is_named(lifts):
 def test_a_recording_is_excused_by_the_error_of_its_own_mesh_alone(lifts):
     """As far as its mesh leads astray, and whatever the signs: those are not told."""
     first, _, other, place = lifts
-    ends = each_alone((first, other), DEFAULT, _theta((first, other), place), jax.random.key(0))
+    pair = first, other
+    ends = each_alone(pair, DEFAULT, _theta(pair, place), jax.random.key(0))
     none, far = np.zeros(len(place)), np.full(len(place), 0.5)
-    assert contradiction((first, other), ends, [none, far]) is None
-    assert contradiction((first, other), ends, [none, -far * (-1) ** np.arange(len(place))]) is None
-    assert contradiction((first, other), ends, [none, far / 100]) is not None
+    for bias in (far, -far * (-1) ** np.arange(len(place))):
+        found = agreement(pair, ends, [none, bias])
+        assert found is None or found.contradiction is None
+    found = agreement(pair, ends, [none, far / 100])
+    assert found is not None and found.contradiction is not None
+
+
+def _linear(rng, seen, place, precision, shift=0.0):
+    """The estimate of a linear recording of some numbers, the first of which is off by a shift."""
+    looks = rng.normal(scale=30.0, size=(seen, len(place)))
+    saw = looks @ place + rng.normal(size=seen)
+    saw[0] += shift
+    covariance = np.linalg.inv(looks.T @ looks + precision)
+    return covariance @ (looks.T @ saw + precision @ np.full(len(place), 0.5)), covariance
+
+
+def _chances(shift, count=400, dim=12):
+    """Of four recordings that tell four directions each, how likely they lead so far apart."""
+    rng, precision, mean = np.random.default_rng(0), 12 * np.eye(dim), np.full(dim, 0.5)
+    found = []
+    for _ in range(count):
+        place = mean + 0.2 * rng.normal(size=dim)
+        ends = [_linear(rng, 4, place, precision, shift * (i == 1)) for i in range(4)]
+        found.append(stats.chi2.sf(*scattered([told_by(*end, mean, precision) for end in ends])))
+    return np.array(found)
+
+
+def test_recordings_of_one_fabric_scatter_as_the_test_says_whatever_they_do_not_tell():
+    chances = _chances(0.0)
+    for level in (0.1, 0.5):
+        assert np.mean(chances < level) == pytest.approx(level, abs=0.06)
+    assert np.mean(chances < 0.01) < 0.03
+
+
+def test_one_that_is_off_by_ten_standard_errors_is_mostly_found():
+    assert np.mean(_chances(10.0) < 1e-4) > 0.4
+    assert np.mean(_chances(20.0) < 1e-4) > 0.8
+
+
+def test_what_an_estimate_kept_of_its_prior_is_not_told_by_its_recording():
+    mean, precision = np.array([0.5, 0.5]), np.diag([12.0, 12.0])
+    covariance = np.linalg.inv(precision + np.diag([1e4, 1.0]))
+    place = mean + covariance @ np.array([1e4 * 0.1, 1.0 * 0.3])
+    told = told_by(place, covariance, mean, precision)
+    assert told.count == 1
+    np.testing.assert_allclose(told.information, np.diag([1e4, 0]), atol=1e-6)
+    np.testing.assert_allclose(told.place, [0.6, 0.5], atol=1e-9)

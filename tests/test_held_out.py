@@ -39,6 +39,13 @@ def test_the_last_motion_with_clouds_is_held_out_of_three_or_more(lift):
     assert held_out.choose([a, b], "a") == 0
 
 
+def test_it_is_said_why_none_is_held_out(lift):
+    a, b = called(lift, "a"), called(lift, "b")
+    assert "3 recordings or more" in held_out.why_none([a, b])
+    assert "two motions with clouds" in held_out.why_none([a, b, b])
+    assert "was to be" in held_out.why_none([a, b, b], held_out.NONE)
+
+
 def test_what_cannot_be_held_out_is_named(lift):
     a = called(lift, "a")
     with pytest.raises(ValueError, match="'x'; there are a"):

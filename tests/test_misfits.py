@@ -71,6 +71,21 @@ def test_a_marker_on_another_cloth_is_named(pulled):
     assert share == pytest.approx(1 / count, abs=0.02)
 
 
+def test_a_marker_that_stays_behind_or_is_lost_on_the_way_is_named(pulled):
+    """One that hardly moves in a pull of millimetres, and one that jumps near the end."""
+    seen_at = np.array(pulled.markers)
+    moved = np.linalg.norm(seen_at[-1] - seen_at[0], axis=1)
+    still = int(np.argmin(np.abs(moved - 5e-3)))
+    behind, lost = seen_at.copy(), seen_at.copy()
+    behind[:, still] = seen_at[:1, still]
+    lost[int(0.7 * len(lost)) :, 3] += [0.0, 0.05, 0.05]
+    for markers, which in ((behind, still), (lost, 3)):
+        problem = problem_of(dataclasses.replace(pulled, markers=jnp.asarray(markers)))
+        theta, seen = at_truth(problem)
+        (found,) = misfits((problem,), theta, seen)
+        assert found.what == f"marker {which}" and found.off > 2e-3
+
+
 def test_points_of_another_thing_are_counted(lifted):
     mask = np.asarray(lifted.mask)
     points = np.array(lifted.points)

@@ -181,9 +181,11 @@ class EstimateCard:
             path.unlink()
         lines = [
             *describe(found),
+            *_unread(method, seen),
+            *_by_weight(self.density, seen),
             *_warnings(found, seen),
             *_laboratory_lines(tests, told, found),
-            *judged,
+            *(judged or self._unjudged(seen)),
             f"{self.out}: {card.name}",
         ]
         print_result(self.json, cards.as_json(card), lines)
@@ -232,6 +234,15 @@ class EstimateCard:
 
         index = held_out.choose(seen, self.hold_out)
         return [] if index is None else [seen.pop(index)]
+
+    def _unjudged(self, seen: "list[Recording]") -> list[str]:
+        """Why none of several recordings tells whether the estimate is better than knowing
+        nothing."""
+        from r2s.estimation import held_out
+
+        if len(seen) < 2:
+            return []
+        return [f"not judged by another recording: {held_out.why_none(seen, self.hold_out)}"]
 
     def _turned(self, seen: "list[Recording]") -> "list[Recording]":
         """The recordings, of which the stretchings are at the angles that were asked for."""
@@ -287,11 +298,11 @@ class EstimateCard:
 
 
 def _warnings(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[str]:
-    """Recordings that contradict each other; where the mesh of the estimate is too coarse for the
-    fabric that came out."""
+    """How recordings count and whether they agree; what does not fit; where the mesh of the
+    estimate is too coarse for the fabric that came out."""
     from r2s.commands.common import mesh_warning
 
-    lines = [*_contradiction(estimate, recordings), *_misfits(estimate, recordings)]
+    lines = [*_agreement(estimate, recordings), *_misfits(estimate, recordings)]
     if estimate.shape is None:
         return lines
     motions = dict.fromkeys((each.info.sheet.size, each.info.scenario) for each in recordings)
@@ -361,16 +372,57 @@ def _misfits(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[st
     return lines
 
 
-def _contradiction(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[str]:
-    """Which recording contradicts the others, if one does."""
-    found = estimate.contradiction
-    if found is None:
+def _unread(method: "Method", recordings: "Sequence[Recording]") -> list[str]:
+    """What of the recordings the method has not read."""
+    lines = []
+    for each in recordings:
+        reads = method.reads(each)
+        kinds = {
+            "clouds": each.mask.any() and reads.points == 0,
+            "markers": each.markers is not None and not reads.markers,
+            "force": each.force is not None and not reads.force,
+        }
+        left = [kind for kind, is_left in kinds.items() if is_left]
+        if left:
+            lines.append(f"not read of {each.info.name}: {', '.join(left)}")
+    return lines
+
+
+def _by_weight(density: float, recordings: "Sequence[Recording]") -> list[str]:
+    """What no recording weighs: without a force, the wind's or a pull's, stiffness scales with the
+    density that was given."""
+    weighed = [each.force is not None or any(each.info.wind or ()) for each in recordings]
+    if any(weighed) or not recordings:
         return []
-    names = [each.info.name for each in recordings]
-    against = "the others" if len(names) > 2 else names[1 - found.recording]
     return [
-        f"warning: {names[found.recording]} contradicts {against} (by chance {found.p:.1g}; "
-        f"{found.parameter} {found.errors:.1f} standard errors apart): another fabric, or its "
-        "density, scale, path or markers are not as written down, or a law that cannot follow all "
-        "of them (see --law)"
+        f"stiffness is that of a sheet of {density:g} kg/m^2, in proportion: no force of a pull "
+        "and no wind tells whether that is right"
+    ]
+
+
+def _agreement(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[str]:
+    """How much each of several recordings counts, and which contradicts the others, if one does."""
+    names = [each.info.name for each in recordings]
+    if len(names) < 2:
+        return []
+    shares = [f"{n} {share:.2g}" for n, share in zip(names, estimate.shares, strict=False)]
+    lines = [f"shares in the loss: {', '.join(shares)}"] if shares else []
+    found = estimate.agreement
+    if found is None:
+        return [*lines, "not judged: whether the recordings agree"]
+    odd = found.contradiction
+    if odd is None:
+        alone = [name for name, told in zip(names, found.told, strict=True) if not told]
+        left = f"; not compared, by the error of the mesh: {', '.join(alone)}" if alone else ""
+        return [*lines, f"the recordings agree (by chance {found.p:.2g}){left}"]
+    unit = next(each.unit for each in estimate.ranges if each.name == odd.parameter)
+    own, others = (f"{value:.4g} {unit}".removesuffix(" -") for value in odd.values)
+    against = "the others" if len(names) > 2 else names[1 - odd.recording]
+    return [
+        *lines,
+        f"warning: {names[odd.recording]} contradicts {against} (by chance {found.p:.1g}; "
+        f"{odd.parameter} {own} by the first, {others} by {against}, {odd.errors:.1f} standard "
+        "errors apart): another fabric, or the density, scale, path or markers are not as written "
+        "down (a pull's force tells stiffness, other motions stiffness over density), or a law "
+        "that cannot follow all of them (see --law)",
     ]

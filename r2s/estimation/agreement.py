@@ -1,9 +1,11 @@
 """Do the recordings of an estimate tell of one fabric?
 
-From the estimate, each recording alone is descended to where it would lead. Where one leads many
-standard errors away from the others they contradict each other: another fabric in one of them, or
-an error in what was written down of it. (The covariance at the estimate itself would not show
-that: what a recording misfits there counts as its noise.)
+From the estimate, each recording alone is descended to where it would lead. What the prior says is
+taken out again, since all would share it, and so are the directions that a recording tells less of
+than the prior. Where the rest scatters by more than standard errors allow, the recordings
+contradict each other: another fabric in one of them, or an error in what was written down of it.
+(The covariance at the estimate itself would not show that: what a recording misfits there counts as
+its noise.)
 """
 
 from collections.abc import Sequence
@@ -14,81 +16,114 @@ from jaxtyping import Float
 from scipy import stats
 
 from r2s.estimation import standard_errors
-from r2s.estimation.estimate import Contradiction
+from r2s.estimation.estimate import Agreement, Contradiction
 from r2s.estimation.gauss_newton import Descent, Problems, prior_weight
 
-UNLIKELY = 1e-3  # that recordings of one fabric lead so far apart by chance
+UNLIKELY = 1e-4  # that recordings of one fabric lead so far apart by chance
+RCOND = 1e-9  # of the recordings' information together: less than that is none
 
 
-class Led(NamedTuple):
-    """Where a recording leads in the fabric's space, in the unit cube, and how well it is known."""
+class Told(NamedTuple):
+    """What a recording tells of the fabric's place in the unit cube, without the prior.
+
+    - `place`: where it leads. `information`: how well it is known, a precision; zero in directions
+      of which the prior knows more. `count`: of the others.
+    """
 
     place: Float[np.ndarray, " dim"]
-    covariance: Float[np.ndarray, "dim dim"]
+    information: Float[np.ndarray, "dim dim"]
+    count: int
 
 
-def contradiction(
+def agreement(
     problems: Problems,
     ends: Sequence[Descent],
     biases: Sequence[Float[np.ndarray, " theta"]] = (),
-) -> Contradiction | None:
-    """The recording that contradicts the others the most, where one does.
+) -> Agreement | None:
+    """Whether some recordings agree; None where there is one, or no two tell of the same.
 
     - `ends`: of a descent in each recording alone.
     - `biases`: of each end by its mesh; none where that was not judged. A lift that buckles
       elsewhere on a finer mesh leads far astray, pulls hardly. How far is told by one step, in
       which direction is not: each parameter is excused by itself.
 
-    Their weighted scatter around their mean, over the fabric's parameters with nuisances free, is
-    compared with its chi-squared distribution. The one is named without which the others agree
-    best; of two, the second. Of one recording there is nothing to say.
+    The weighted scatter around the mean is compared with its chi-squared distribution. The one is
+    named without which the others agree best; of two, the second.
     """
     if len(problems) < 2:
         return None
-    dim = problems[0].space.dim
+    space = problems[0].space
+    dim = space.dim
+    mean, precision = (np.asarray(part, np.float64) for part in space.prior())
     excused = [bias[:dim] for bias in biases] or [np.zeros(dim)] * len(problems)
-    rows = zip(problems, ends, excused, strict=True)
-    led = [_led((problem,), end, by) for problem, end, by in rows]
-    if not all(np.isfinite(part).all() for one in led for part in one):
-        return None  # nothing is known
-    p = float(stats.chi2.sf(_scatter(led), dim * (len(led) - 1)))
-    if not p < UNLIKELY:
+    places, told = [], []
+    for problem, end, by in zip(problems, ends, excused, strict=True):
+        place, covariance = _led((problem,), end, dim)
+        if not (np.isfinite(place).all() and np.isfinite(covariance).all()):
+            return None
+        places.append(place)
+        told.append(told_by(place, covariance + np.diag(by**2), mean, precision))
+    scatter, freedom = scattered(told)
+    if not freedom:
         return None
-    which = min(range(len(led)), key=lambda odd: _scatter(_without(led, odd)))
-    which = 1 if len(led) == 2 else which
-    errors = _apart(led[which], _mean(_without(led, which)))
+    p, counts = float(stats.chi2.sf(scatter, freedom)), tuple(each.count for each in told)
+    if not p < UNLIKELY:
+        return Agreement(p, counts, None)
+    odd = 1 if len(told) == 2 else min(range(len(told)), key=lambda i: _without(told, i))
+    rest = [each for i, each in enumerate(told) if i != odd]
+    (here, own), (there, others) = (_known(each, mean, precision) for each in ([told[odd]], rest))
+    errors = np.abs(here - there) / np.sqrt(np.diag(own) + np.diag(others))
     most = int(np.argmax(errors))
-    return Contradiction(which, p, problems[0].space.ranges[most].name, float(errors[most]))
+    of = space.ranges[most]
+    values = float(of.from_unit(here[most])), float(of.from_unit(there[most]))
+    return Agreement(p, counts, Contradiction(odd, of.name, float(errors[most]), values))
 
 
-def _without(led: list[Led], odd: int) -> list[Led]:
-    return [one for i, one in enumerate(led) if i != odd]
+def told_by(
+    place: Float[np.ndarray, " dim"],
+    covariance: Float[np.ndarray, "dim dim"],
+    mean: Float[np.ndarray, " dim"],
+    precision: Float[np.ndarray, "dim dim"],
+) -> Told:
+    """What an estimate tells without its prior of a `mean` and a `precision`."""
+    root = np.linalg.cholesky(precision)
+    inner = np.linalg.solve(root, np.linalg.inv(covariance))
+    sizes, axes = np.linalg.eigh(np.linalg.solve(root, inner.T))
+    kept = sizes > 2  # what is told beyond the prior weighs more than that
+    beyond = np.where(kept, sizes - 1, 1)
+    at, usual = (axes.T @ root.T @ each for each in (place, mean))
+    alone = np.where(kept, (sizes * at - usual) / beyond, usual)
+    forth = root @ axes
+    information = (forth * np.where(kept, beyond, 0)[None]) @ forth.T
+    return Told(np.linalg.solve(root.T, axes @ alone), information, int(kept.sum()))
 
 
-def _mean(led: list[Led]) -> Led:
-    """The mean, weighed by precisions."""
-    precisions = [np.linalg.inv(one.covariance) for one in led]
-    covariance = np.linalg.inv(np.sum(precisions, axis=0))
-    pairs = zip(precisions, led, strict=True)
-    return Led(covariance @ np.sum([p @ one.place for p, one in pairs], axis=0), covariance)
+def scattered(told: Sequence[Told]) -> tuple[float, int]:
+    """Squared distances from the weighted mean, in standard errors, and the degrees of freedom."""
+    total = np.sum([each.information for each in told], axis=0)
+    led = np.sum([each.information @ each.place for each in told], axis=0)
+    mean = np.linalg.pinv(total, rcond=RCOND, hermitian=True) @ led
+    off = [(each.place - mean, each.information) for each in told]
+    scatter = sum(float(away @ information @ away) for away, information in off)
+    shared = np.linalg.matrix_rank(total, tol=RCOND * np.linalg.norm(total, 2), hermitian=True)
+    return scatter, int(sum(each.count for each in told) - shared)
 
 
-def _scatter(led: list[Led]) -> float:
-    """Squared distances from the mean, in standard errors."""
-    mean = _mean(led).place
-    off = [(one.place - mean, one.covariance) for one in led]
-    return float(sum(away @ np.linalg.solve(covariance, away) for away, covariance in off))
+def _without(told: Sequence[Told], odd: int) -> float:
+    """The scatter of all but one, in standard deviations above its mean."""
+    scatter, freedom = scattered([each for i, each in enumerate(told) if i != odd])
+    return (scatter - freedom) / np.sqrt(2 * max(freedom, 1))
 
 
-def _apart(one: Led, other: Led) -> Float[np.ndarray, " dim"]:
-    """Of every parameter, by how many standard errors two differ."""
-    variance = np.diag(one.covariance) + np.diag(other.covariance)
-    return np.abs(one.place - other.place) / np.sqrt(variance)
+def _known(told: Sequence[Told], mean, precision) -> tuple[np.ndarray, np.ndarray]:
+    """Place and covariance by some recordings and the prior."""
+    covariance = np.linalg.inv(precision + np.sum([each.information for each in told], axis=0))
+    led = precision @ mean + np.sum([each.information @ each.place for each in told], axis=0)
+    return covariance @ led, covariance
 
 
-def _led(problems: Problems, end: Descent, excused: Float[np.ndarray, " dim"]) -> Led:
-    dim = problems[0].space.dim
+def _led(problems: Problems, end: Descent, dim: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where a recording leads with the prior, and its covariance there, nuisances free."""
     prior = prior_weight(problems, end.normal)
     covariance, _ = standard_errors.sandwich_of(problems, end, prior)
-    own = np.asarray(covariance, float)[:dim, :dim]
-    return Led(np.asarray(end.theta, float)[:dim], own + np.diag(excused**2))
+    return np.asarray(end.theta, np.float64)[:dim], np.asarray(covariance, np.float64)[:dim, :dim]

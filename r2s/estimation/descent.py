@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation import checkpoint as checkpoints
 from r2s.estimation import gauss_newton, mesh_bias
-from r2s.estimation.agreement import contradiction
+from r2s.estimation.agreement import agreement
 from r2s.estimation.compiled import (
     Derive,
     loss_from,
@@ -24,7 +24,13 @@ from r2s.estimation.compiled import (
 )
 from r2s.estimation.covariance import covariance_at
 from r2s.estimation.estimate import Estimate
-from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
+from r2s.estimation.gauss_newton import (
+    Descent,
+    Normal,
+    Problems,
+    recording_weights,
+    theta_indices,
+)
 from r2s.estimation.mesh_bias import OtherMesh, on_the_way, weighed
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.misfits import left_out, misfits
@@ -192,12 +198,14 @@ def judged(
     converged = _arrived(problems, stage, which, prior, _stop(budget, int(best.stage)))
     estimate = collect(problems, rows, covariance, approach, seconds, converged, loss, bias)
     alone = each_alone(problems, budget, best.theta, key, found.derive)
+    shares = tuple(float(each) for each in recording_weights(problems)) if alone else ()
     biases = []
     if other_mesh is not None and alone:
         biases = mesh_bias.alone(problems, other_mesh, alone, found.derive, budget.width)
     return dataclasses.replace(
         estimate,
-        contradiction=contradiction(problems, alone, biases),
+        agreement=agreement(problems, alone, biases),
+        shares=shares,
         misfits=misfits(problems, best.theta, seen),
         left_out=left_out(problems, seen, float(best.scale)),
     )

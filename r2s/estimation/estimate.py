@@ -30,14 +30,29 @@ class Nuisance(NamedTuple):
 class Contradiction(NamedTuple):
     """A recording that leads elsewhere than the others, see `r2s.estimation.agreement`.
 
-    - `recording`: its index. `p`: how likely that is by chance, [-].
+    - `recording`: its index; of two the second, which may be the right one.
     - `parameter`: in which they are the most standard errors apart, `errors`, [-].
+    - `values`: of that parameter, by this recording and by the others, in its unit.
     """
 
     recording: int
-    p: float
     parameter: str
     errors: float
+    values: tuple[float, float]
+
+
+class Agreement(NamedTuple):
+    """Whether the recordings of an estimate tell of one fabric, see `r2s.estimation.agreement`.
+
+    - `p`: how likely recordings of one fabric lead as far apart, [-].
+    - `told`: of each recording, how many directions of the fabric's space it tells by itself, its
+      mesh's error allowed for: one that tells none was not compared.
+    - `contradiction`: the one that leads elsewhere than the others; None where all agree.
+    """
+
+    p: float
+    told: tuple[int, ...]
+    contradiction: Contradiction | None
 
 
 class Misfit(NamedTuple):
@@ -91,8 +106,8 @@ class Estimate:
       does not say.
     - `misfits`: what of the recordings does not fit. `left_out`: of each the share that counts for
       little or nothing, [-]; none where that was not judged.
-    - `contradiction`: of the recordings the one that leads elsewhere than the others; None: none
-      does, or that was not judged.
+    - `shares`: of each recording in the loss, [-]; none of one, or where a method has no shares.
+    - `agreement`: of several recordings; None: that was not judged, or no two tell of the same.
     """
 
     approach: str
@@ -110,9 +125,10 @@ class Estimate:
     loss_unit: str = "m^2"
     mesh_bias: np.ndarray | None = None
     shape: tuple[int, int] | None = None
-    contradiction: Contradiction | None = None
+    agreement: Agreement | None = None
     misfits: tuple[Misfit, ...] = ()
     left_out: tuple[float, ...] = ()
+    shares: tuple[float, ...] = ()
 
     @property
     def at_bounds(self) -> dict[str, Literal["lower", "upper"]]:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from r2s.estimation.estimate import Contradiction, Estimate, Misfit, Nuisance
+from r2s.estimation.estimate import Agreement, Contradiction, Estimate, Misfit, Nuisance
 from r2s.fabrics.fabric_json import fabric_as_json, fabric_from_json
 from r2s.fabrics.parameters import Range
 
@@ -42,7 +42,8 @@ def as_json(estimate: Estimate) -> dict[str, Any]:
         "combinations": [each._asdict() for each in estimate.combinations],
         "shape": None if estimate.shape is None else list(estimate.shape),
         "mesh_bias": None if estimate.mesh_bias is None else _nested(estimate.mesh_bias),
-        "contradiction": estimate.contradiction and estimate.contradiction._asdict(),
+        "agreement": _stored(estimate.agreement),
+        "shares": list(estimate.shares),
         "misfits": [each._asdict() for each in estimate.misfits],
         "left_out": list(estimate.left_out),
         "nuisances": [
@@ -100,14 +101,28 @@ def from_json(stored: dict[str, Any]) -> Estimate:
         loss_unit=stored["loss_unit"],
         shape=None if stored.get("shape") is None else tuple(stored["shape"]),
         mesh_bias=None if stored.get("mesh_bias") is None else _numbers(stored["mesh_bias"]),
-        contradiction=_contradiction(stored.get("contradiction")),
+        agreement=_agreement(stored.get("agreement")),
+        shares=tuple(stored.get("shares", ())),
         misfits=tuple(Misfit(**each) for each in stored.get("misfits", ())),
         left_out=tuple(stored.get("left_out", ())),
     )
 
 
-def _contradiction(stored: dict[str, Any] | None) -> Contradiction | None:
-    return None if stored is None else Contradiction(**stored)
+def _stored(agreement: Agreement | None) -> dict[str, Any] | None:
+    if agreement is None:
+        return None
+    odd = agreement.contradiction
+    return agreement._asdict() | {"contradiction": odd and odd._asdict()}
+
+
+def _agreement(stored: dict[str, Any] | None) -> Agreement | None:
+    """None of a file that does not say, or says it as version 0.3.0 did before it was released."""
+    if stored is None:
+        return None
+    odd = stored["contradiction"]
+    if odd is not None:
+        odd = Contradiction(**odd | {"values": tuple(odd["values"])})
+    return Agreement(stored["p"], tuple(stored["told"]), odd)
 
 
 def upgraded(stored: dict[str, Any]) -> dict[str, Any]:

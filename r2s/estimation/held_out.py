@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax.random as jr
 import numpy as np
 
+from r2s.estimation.mesh_ladder import in_steps_worth
 from r2s.evaluation import prediction_error
 from r2s.fabrics import prior
 from r2s.fabrics.fabric import Fabric
@@ -80,6 +81,18 @@ def choose(recordings: Sequence[Recording], name: str | None = None) -> int | No
     return found[0]
 
 
+def why_none(recordings: Sequence[Recording], name: str | None = None) -> str:
+    """Why `choose` holds none of several recordings out."""
+    if name == NONE:
+        return "none was to be held out"
+    if len(recordings) < FEWEST:
+        return f"{FEWEST} recordings or more hold one out, these are {len(recordings)}"
+    return (
+        "two motions with clouds in all frames are needed to hold one out, beside stretchings, "
+        "which look alike of any fabric"
+    )
+
+
 def has_clouds(recording: Recording) -> bool:
     """Whether it has clouds, and not its markers in their place, in every frame that counts."""
     first, last = recording.info.frames_used
@@ -92,7 +105,8 @@ def judge(
 ) -> HeldOut:
     """The errors of a fabric and of `count` draws of its density in a recording.
 
-    All are simulated by the cloth on a mesh of `shape`, in the scenario's steps.
+    All are simulated by the cloth on a mesh of `shape`, in the steps that an estimate takes there
+    (`r2s.estimation.mesh_ladder.in_steps_worth`). Air, size and cameras are as written down.
     """
     each = prior.fabrics(float(fabric.density), count, jr.key(0))
     error, *others = (_error(recording, one, shape) for one in (fabric, *each))
@@ -102,6 +116,7 @@ def judge(
 
 def _error(recording: Recording, fabric: Fabric, shape: tuple[int, int]) -> float:
     scenario = from_recording(recording, shape)
+    scenario = in_steps_worth(scenario, recording.info.scenario, shape)
     x = prediction_error.predict_motion(scenario, fabric).x
     away = prediction_error.from_surface(recording, x, shape)
     return float(np.mean(away)) if np.isfinite(away).all() else float("inf")

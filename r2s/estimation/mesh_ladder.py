@@ -31,6 +31,7 @@ from r2s.programs import kept
 from r2s.recordings.recording import Recording
 from r2s.scenarios import resolution
 from r2s.scenarios.resolution import Shape
+from r2s.scenarios.scenario import Scenario
 from r2s.side_by_side import meanwhile
 
 Recordings = Sequence[Recording]
@@ -208,19 +209,22 @@ def _problems(
 
 
 def _problem(recording: Recording, space: ParameterSpace, shape: Shape) -> Problem:
-    """The problem of a recording on a mesh, on the finest one in steps that it is worth.
+    """The problem of a recording on a mesh, in the steps that it is worth."""
+    problem = Problem.make(recording, space, shape=shape)
+    scenario = in_steps_worth(problem.scenario, recording.info.scenario, shape)
+    return dataclasses.replace(problem, scenario=scenario)
+
+
+def in_steps_worth(scenario: Scenario, name: str, shape: Shape) -> Scenario:
+    """A scenario of some `name` in the steps that a mesh of `shape` is worth: those that it has,
+    or, on the finest mesh, of `FINEST_STEP` at most.
 
     A taut sheet moves alike in longer ones, and wind leaves more than they do.
     """
-    problem = Problem.make(recording, space, shape=shape)
-    is_windy = problem.scenario.wind is not None
-    if is_windy or recording.info.scenario in resolution.TAUT or not _is_finest([shape]):
-        return problem
-    steps = math.ceil(problem.scenario.interval / FINEST_STEP - 1e-9)
-    steps = max(problem.scenario.substeps, steps)
-    return dataclasses.replace(
-        problem, scenario=dataclasses.replace(problem.scenario, substeps=steps)
-    )
+    if scenario.wind is not None or name in resolution.TAUT or not _is_finest([shape]):
+        return scenario
+    steps = math.ceil(scenario.interval / FINEST_STEP - 1e-9)
+    return dataclasses.replace(scenario, substeps=max(scenario.substeps, steps))
 
 
 def _is_finest(shapes: Sequence[Shape]) -> bool:

@@ -19,7 +19,8 @@ from r2s.estimation.problem import Problem
 from r2s.evaluation.losses import robust_weight
 
 STRAY, FEWEST = 5.0, 4  # times the other markers' distance; markers that are needed to say so
-LEAST = 0.01  # [m], nearer than which no marker is on another cloth
+LEAST = 2e-3  # [m], nearer than which no marker is on another cloth: ten times what trackers err
+LATE = 1 / 3  # of the frames, the last ones, in which one that was lost on the way strays
 BENT = 3.0  # standard deviations of what was known
 LITTLE = 0.25  # weight below which something is left out: that of what lies beyond the scale
 
@@ -31,8 +32,9 @@ def misfits(
 
     - `predicted`: of each recording at `theta`, the end of an estimate.
 
-    A marker strays when the median of its distances is `STRAY` times that of the median marker and
-    at least `LEAST`; of fewer than `FEWEST` nothing is said. A nuisance is bent when it ended more
+    A marker strays when the median of its distances, over all frames or over the last third, is
+    `STRAY` times that of the median marker and at least `LEAST`; of fewer than `FEWEST` nothing is
+    said. A nuisance is bent when it ended more
     than `BENT` of its prior standard deviations away from what was written down.
     """
     pairs = enumerate(zip(problems, predicted, strict=True))
@@ -65,13 +67,15 @@ def _strays(which: int, problem: Problem, seen: Prediction) -> list[Misfit]:
     if pair is None:
         return []
     distance = np.where(np.asarray(pair[1]), np.asarray(pair[0], np.float64), np.nan)
-    known = np.flatnonzero(~np.isnan(distance).all(axis=0))
-    if len(known) < FEWEST:
-        return []
-    typical = np.nanmedian(distance[:, known], axis=0)
-    usual = float(np.median(typical))
-    return [
-        Misfit(which, f"marker {marker}", float(away), "m")
-        for marker, away in zip(known, typical, strict=True)
-        if away > max(STRAY * usual, LEAST)
-    ]
+    late = distance[round((1 - LATE) * len(distance)) :]
+    strays: dict[int, float] = {}
+    for frames in (distance, late):
+        known = np.flatnonzero(~np.isnan(frames).all(axis=0))
+        if len(known) < FEWEST:
+            continue
+        typical = np.nanmedian(frames[:, known], axis=0)
+        limit = max(STRAY * float(np.median(typical)), LEAST)
+        for marker, away in zip(known.tolist(), typical.tolist(), strict=True):
+            if away > limit:
+                strays[marker] = max(away, strays.get(marker, 0.0))
+    return [Misfit(which, f"marker {each}", away, "m") for each, away in sorted(strays.items())]

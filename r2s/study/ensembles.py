@@ -6,6 +6,7 @@ distances from it, over time, are its floor (`r2s.evaluation.horizon`).
 
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -64,6 +65,11 @@ class EnsembleCell(Cell):
     def compilation_group(self) -> str:
         return f"ensembles {self.recording.scenario}"
 
+    @property
+    def lacks_layers(self) -> bool:
+        """Whether its recording has contact of layers, which no member has."""
+        return self.recording.has_layers
+
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
         """Distances [m] of every member from the truth, or from it started anew, in each frame."""
         source = self.recording
@@ -75,7 +81,7 @@ class EnsembleCell(Cell):
         hangs = experiment.sheet.weft[2] != 0
         start = base.x[0].reshape(*shape, 3) if hangs else None  # as predictions do
         anew = _moved(experiment, fabric, shape, start=start) if hangs else base
-        points = _points_of(anew)
+        points = points_of(anew)
 
         def away(experiment: Experiment, fabric: Fabric, shape: Any, steps: int = 1) -> np.ndarray:
             moved = _moved(experiment, fabric, shape, steps, start)
@@ -88,21 +94,18 @@ class EnsembleCell(Cell):
             "stiffness": [
                 away(experiment, _scaled(fabric, 1 + way * STIFFNESS), shape) for way in WAYS
             ],
-            "path": [away(_shifted(experiment, way * PATH), fabric, shape) for way in WAYS],
-            "mesh": [away(experiment, fabric, _cells(shape, FINER))],
+            "path": [away(shifted(experiment, way * PATH), fabric, shape) for way in WAYS],
+            "mesh": [away(experiment, fabric, cells_a_side(shape, FINER))],
             "step": [away(experiment, fabric, shape, steps=2)],
         }
         if hangs:
-            found["start"] = [to_surface(_points_of(base), anew.x, anew.mesh.faces)]
-        coarse = _cells(shape, COARSER)
-        own = _points_of(_moved(experiment, fabric, coarse, start=start))
+            found["start"] = [to_surface(points_of(base), anew.x, anew.mesh.faces)]
+        coarse = cells_a_side(shape, COARSER)
+        own = points_of(_moved(experiment, fabric, coarse, start=start))
         for name in self.others:
             moved = _moved(experiment, strain_dependent(name, truth), coarse, start=start)
             found[APART + name] = [to_surface(own, moved.x, moved.mesh.faces)]
-        arrays = {name: np.stack(rows) for name, rows in found.items()}
-        stored: dict[str, Any] = {"times": np.asarray(experiment.times), **arrays}
-        np.savez_compressed(out / ENSEMBLE, **stored)
-        return {"diverged": [name for name, row in arrays.items() if not np.isfinite(row).all()]}
+        return save_ensemble(out, experiment, found)
 
 
 class Ensemble(NamedTuple):
@@ -113,8 +116,18 @@ class Ensemble(NamedTuple):
     apart: Float[np.ndarray, "other frame"]
 
 
-def read_ensemble(cell: EnsembleCell, folder: Path) -> Ensemble:
-    """The ensemble of a cell that is made."""
+def save_ensemble(
+    out: Path, experiment: Experiment, found: Mapping[str, Sequence[np.ndarray]]
+) -> dict[str, Any]:
+    """Write distances [m] by cause and member; returns which diverged."""
+    arrays = {name: np.stack(rows) for name, rows in found.items()}
+    stored: dict[str, Any] = {"times": np.asarray(experiment.times), **arrays}
+    np.savez_compressed(out / ENSEMBLE, **stored)
+    return {"diverged": [name for name, row in arrays.items() if not np.isfinite(row).all()]}
+
+
+def read_ensemble(cell: Cell, folder: Path) -> Ensemble:
+    """The ensemble of a cell of this kind that is made."""
     with result_files(cell, folder) as files, np.load(files / ENSEMBLE) as stored:
         arrays = dict(stored)
     times = arrays.pop("times")
@@ -129,7 +142,9 @@ def ensemble_of(recording: SyntheticRecording) -> EnsembleCell:
     return EnsembleCell(recording, others)
 
 
-class _Moved(NamedTuple):
+class Moved(NamedTuple):
+    """Positions [m] of the vertices of a mesh in the frames of a motion."""
+
     x: np.ndarray
     mesh: Mesh
 
@@ -143,7 +158,7 @@ def _moved(
     shape: tuple[int, int],
     steps: int = 1,
     start: Float[np.ndarray, "row column 3"] | None = None,
-) -> _Moved:
+) -> Moved:
     """A motion in explicit steps; NaN from where it diverged.
 
     `steps`: times as many. `start`: see `r2s.study.starts`.
@@ -153,10 +168,10 @@ def _moved(
     solver = dataclasses.replace(solver, substeps=steps * solver.substeps)
     moved = _rollout(scenario, fabric, solver=solver)
     ok = np.logical_and.accumulate(np.asarray(moved.ok))[:, None, None]
-    return _Moved(np.where(ok, np.asarray(moved.x), np.nan), scenario.scene.mesh)
+    return Moved(np.where(ok, np.asarray(moved.x), np.nan), scenario.scene.mesh)
 
 
-def _points_of(moved: _Moved) -> list[np.ndarray]:
+def points_of(moved: Moved) -> list[np.ndarray]:
     """Points of the sheet in each frame, the same places of the fabric in all."""
     faces = moved.mesh.faces
     resolution = max(math.ceil(math.sqrt(POINTS / len(faces))), 1)
@@ -180,7 +195,7 @@ def _scaled(fabric: Fabric, factor: float) -> Fabric:
     return eqx.tree_at(where, fabric, parts)
 
 
-def _shifted(experiment: Experiment, way: float) -> Experiment:
+def shifted(experiment: Experiment, way: float) -> Experiment:
     """With the first gripper aside by so much [m], and the last one the other way."""
     path = np.array(experiment.route.path, float)
     path[:, 0, 0] += way
@@ -188,6 +203,7 @@ def _shifted(experiment: Experiment, way: float) -> Experiment:
     return experiment._replace(route=experiment.route._replace(path=path))
 
 
-def _cells(shape: tuple[int, int], factor: float) -> tuple[int, int]:
+def cells_a_side(shape: tuple[int, int], factor: float) -> tuple[int, int]:
+    """Vertices of a mesh with `factor` times as many cells along either side."""
     rows, columns = (max(round(factor * (count - 1)), 1) + 1 for count in shape)
     return rows, columns

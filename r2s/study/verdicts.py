@@ -22,6 +22,8 @@ from r2s.recordings.recording import cloud
 from r2s.scenarios.scenario import from_recording
 from r2s.study.ensembles import EnsembleCell, ensemble_of, read_ensemble
 from r2s.study.evaluations import EvaluationCell, read_distances, read_motions
+from r2s.study.mujoco_ensemble import MujocoEnsemble
+from r2s.study.mujoco_recording import MujocoRecording
 from r2s.study.rows import Row
 from r2s.study.sources import Source, SyntheticRecording, read
 
@@ -46,10 +48,17 @@ class Judged(NamedTuple):
         return within(self.times, self.horizon)
 
 
-def ensembles(cells: Iterable[EvaluationCell]) -> list[EnsembleCell]:
-    """Of all synthetic recordings that cells judge by."""
+def ensembles(cells: Iterable[EvaluationCell]) -> list[EnsembleCell | MujocoEnsemble]:
+    """Of all recordings that cells judge by and that were simulated."""
     sources = dict.fromkeys(source for cell in cells for source in cell.recordings)
-    return [ensemble_of(each) for each in sources if isinstance(each, SyntheticRecording)]
+    found = [_ensemble(each) for each in sources]
+    return [each for each in found if each is not None]
+
+
+def _ensemble(source: Source) -> EnsembleCell | MujocoEnsemble | None:
+    if isinstance(source, SyntheticRecording):
+        return ensemble_of(source)
+    return MujocoEnsemble(source) if isinstance(source, MujocoRecording) else None
 
 
 def judged_motions(cells: Iterable[EvaluationCell], folder: Path) -> dict[Source, Judged]:
@@ -61,10 +70,8 @@ def judged_motions(cells: Iterable[EvaluationCell], folder: Path) -> dict[Source
 
 def judged_motion(source: Source, folder: Path) -> Judged | None:
     """What the ensemble of a recording says of it; None where there is none, or it is not made."""
-    if not isinstance(source, SyntheticRecording):
-        return None
-    cell = ensemble_of(source)
-    if not cell.is_made(folder):
+    cell = _ensemble(source)
+    if cell is None or not cell.is_made(folder):
         return None
     ensemble = read_ensemble(cell, folder)
     first, last = read(source, folder).info.frames_used
