@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 from scipy.linalg import solve
 
@@ -33,11 +34,11 @@ class Linear(NamedTuple):
     - `normal`: unit normals of the vertices.
     """
 
-    start: Float[Array, "state dim"]
-    state: Float[Array, "frame state state"]
-    fabric: Float[Array, "frame state dim"]
-    push: Float[Array, "frame state acceleration"]
-    normal: Float[Array, "frame vertex 3"]
+    start: Float[np.ndarray, "state dim"]
+    state: Float[np.ndarray, "frame state state"]
+    fabric: Float[np.ndarray, "frame state dim"]
+    push: Float[np.ndarray, "frame state acceleration"]
+    normal: Float[np.ndarray, "frame vertex 3"]
 
 
 def linear(
@@ -45,7 +46,7 @@ def linear(
 ) -> Linear:
     """The motion of the fabric at a place of a space, and its derivatives, frame by frame."""
     solver, substeps = stepped(scenario)
-    controls, lead_in = scenario.controls(substeps), scenario.lead_in - 1
+    controls, lead_in = scenario.controls(substeps), scenario.lead_in
     cloth = solver.solver if isinstance(solver, Braked) else solver
     before, after = (
         jax.tree.map(lambda leaf, part=part: leaf[part], controls)
@@ -75,7 +76,7 @@ def linear(
     @eqx.filter_jit
     def frame(packed, control):
         nothing = jnp.zeros(packed.shape[0] // 4, packed.dtype)
-        flat, unravel = jax.flatten_util.ravel_pytree((packed, place, nothing))
+        flat, unravel = ravel_pytree((packed, place, nothing))
 
         def along(tangent):
             move = partial(framed, control=control)
