@@ -3,19 +3,24 @@
 from dataclasses import replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 from _tables import Line
 from scipy.stats import norm
 
+from r2s.estimation.estimate import Estimate
+from r2s.fabrics.fabric import Fabric
 from r2s.study import engine, results, verdicts
 from r2s.study.cells import read_metadata
 from r2s.study.estimates import EstimateCell, read_estimate
 from r2s.study.evaluations import EvaluationCell
 from r2s.study.matrix import SMALL, configuration_named, synthetic
 from r2s.study.rows import Row
+from r2s.study.sources import strain_dependent
 from r2s.study.verdicts import SURFACE
 
 JUDGED = ("fling", "shaking")
+OUTSIDE = "*"  # behind a number whose 90 % interval does not hold the truth
 NAMED = {"": "estimate", "true": "true fabric", "middle": "middle", "default": "default"}
 
 
@@ -69,17 +74,44 @@ def _over_truth(cell: EstimateCell, folder: Path) -> Line:
         return {"warp": "diverged"}
     true = results.true_values(cell, found.ranges)
     line: Line = {}
-    off = []
-    for bound, value, there in zip(found.ranges, found.values, true, strict=True):
-        off.append(np.log(value / there) if bound.log else value - there)
-        line[bound.name] = f"{value / there:.2f}" if bound.log else f"{off[-1]:+.2f}"
-    away = np.abs(off) / found.standard_errors
+    away = []
+    rows = zip(found.ranges, found.values, true, found.standard_errors, strict=True)
+    for bound, value, there, error in rows:
+        off = np.log(value / there) if bound.log else value - there
+        away.append(abs(off) / error)
+        number = f"{value / there:.2f}" if bound.log else f"{off:+.2f}"
+        line[bound.name] = number + OUTSIDE * bool(away[-1] >= norm.ppf(0.95))
+    away = np.array(away)
     known = away[found.identifiable]
+    fabric = strain_dependent(cell.fabric)
+    for name, axis in (("warp", 0), ("weft", 1)):
+        grown = [f"{_growth(each, axis):.1%}" for each in (found.fabric, fabric)]
+        line[f"growth of {name} (truth)"] = f"{grown[0]} ({grown[1]})"
     return line | {
+        "converged": "yes" if found.converged else "no",
+        "left out": ", ".join(f"{share:.0%}" for share in found.left_out),
+        "recordings agree": _agreement(found, cell),
         "in 90 % intervals": f"{np.sum(away < norm.ppf(0.95))} of {len(away)}",
         "identifiable": f"{len(known)}",
         "errors off at most": f"{known.max():.1f}" if len(known) else "-",
     }
+
+
+def _growth(fabric: Fabric, axis: int) -> float:
+    """By how much the energy of a 5 % stretch exceeds that of constant stiffness, [-]."""
+    strain = jnp.zeros(3).at[axis].set((1.05**2 - 1) / 2)
+    small = getattr(fabric.membrane, "small", fabric.membrane)
+    return float(fabric.membrane.energy_density(strain) / small.energy_density(strain)) - 1
+
+
+def _agreement(found: Estimate, cell: EstimateCell) -> str:
+    """Whether the recordings do, by the likelihood by chance; else which does not."""
+    if found.agreement is None:
+        return "not judged"
+    odd = found.agreement.contradiction
+    if odd is None:
+        return f"yes, {found.agreement.p:.2g}"
+    return f"no, {found.agreement.p:.1g}: {cell.sources[odd.recording].name}, {odd.parameter}"
 
 
 def _millimetres(value: float | None) -> str:
