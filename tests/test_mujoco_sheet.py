@@ -14,13 +14,16 @@ from r2s.study import engine, matrix
 from r2s.study.cells import with_dependencies
 from r2s.study.configuration import MOTIONS
 from r2s.study.drawn import experiment_of
+from r2s.study.ensembles import read_ensemble
 from r2s.study.estimates import EstimateCell
 from r2s.study.evaluations import EvaluationCell, read_measured, read_motion
 from r2s.study.main import study
+from r2s.study.mujoco_ensemble import MujocoEnsemble
 from r2s.study.mujoco_error import difference, differences, places
 from r2s.study.mujoco_recording import FABRIC, MujocoRecording
 from r2s.study.mujoco_sheet import Material, Resolution, motion, moved
 from r2s.study.sources import SyntheticRecording, read
+from r2s.study.verdicts import judged_motion
 
 has_mujoco = importlib.util.find_spec("mujoco") is not None
 needs_mujoco = pytest.mark.skipif(not has_mujoco, reason="needs r2s[mujoco]")
@@ -161,3 +164,20 @@ def test_ours_predicts_the_sheet_of_mujoco_from_where_it_hangs(tmp_path):
     x = read_motion(judged, tmp_path)[0]
     start = motion(experiment_of("fling", 0, True, 0), resolution=cell.resolution)[0]
     assert start[:, 2].min() == pytest.approx(x[:, 2].min(), abs=0.02)
+
+
+@pytest.mark.slow(group="verdicts")
+@needs_mujoco
+def test_the_ensemble_of_a_recording_is_its_own_simulator_s(tmp_path):
+    """Trifles leave less than meshes, meshes less than fabrics; the floor has the larger ones."""
+    recording = MujocoRecording("fling", 0, unseen=True, resolution=Resolution((9, 9), 4e-3))
+    cell = MujocoEnsemble(recording, others=(0.5, 4.0))
+    assert not engine.run([cell], tmp_path, engine.Serial())
+    found, judged = read_ensemble(cell, tmp_path), judged_motion(recording, tmp_path)
+    assert set(found.causes) == {"recording", "stiffness", "path", "mesh", "step"}
+    assert found.causes["stiffness"].shape == found.causes["path"].shape == (2, len(found.times))
+    assert found.causes["recording"].mean() < 1e-4
+    left = {cause: float(each.mean()) for cause, each in found.causes.items()}
+    assert left["stiffness"] < left["mesh"] < found.apart.mean()
+    assert (found.apart.mean(axis=1) > left["path"]).all()
+    assert judged is not None and (judged.floor >= found.causes["mesh"][0]).all()
