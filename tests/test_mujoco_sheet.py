@@ -171,7 +171,7 @@ def test_ours_predicts_the_sheet_of_mujoco_from_where_it_hangs(tmp_path):
 def test_the_ensemble_of_a_recording_is_its_own_simulator_s(tmp_path):
     """Trifles leave less than meshes, meshes less than fabrics; the floor has the larger ones."""
     recording = MujocoRecording("fling", 0, unseen=True, resolution=Resolution((9, 9), 4e-3))
-    cell = MujocoEnsemble(recording, others=(0.5, 4.0))
+    cell = MujocoEnsemble(recording)
     assert not engine.run([cell], tmp_path, engine.Serial())
     found, judged = read_ensemble(cell, tmp_path), judged_motion(recording, tmp_path)
     assert set(found.causes) == {"recording", "stiffness", "path", "mesh", "step"}
