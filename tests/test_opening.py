@@ -125,6 +125,18 @@ def test_a_page_begins_with_pictures_then_skill_then_sentences(tmp_path):
     assert {"skill", "skill_needed", "surface"} <= written
 
 
+def test_a_fabric_that_a_configuration_lacks_has_a_table_of_its_own(tmp_path):
+    rows = made_up()
+    first = rows[0].fabric
+    lacking = next(row.configuration for row in rows if row.approach)
+    assert lacking is not None
+    rows = [row for row in rows if (row.fabric, row.configuration) != (first, lacking)]
+    full.publish(tmp_path, rows, [made_up_comparison(labels=LABELS)])
+    table = (tmp_path / "tables" / f"skill_{first}.md").read_text()
+    assert f"Of {first} alone" in table and lacking.label not in table
+    assert lacking.label in (tmp_path / "tables" / "skill.md").read_text()
+
+
 def test_given_recordings_say_in_one_line_that_they_have_no_horizon(tmp_path):
     rows = [replace(row, floor=None, horizon=None, skill=None) for row in made_up()]
     shown = replace(made_up_comparison(labels=LABELS), floor=None, horizon=None)

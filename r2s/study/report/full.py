@@ -85,7 +85,7 @@ def publish(
     )
     sections = [
         *opening.picture_sections(out, motions, looks),
-        *opening.skill_sections(out, shared, list(others), looks, keep),
+        *opening.skill_sections(out, shared, others, looks, keep),
         *parts.findings_section(rows_of, metrics, decided, untold, paper, keep),
         *parts.rank_section(out, decided, keep),
         *parts.factor_section(out, decided, keep),

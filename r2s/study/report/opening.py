@@ -1,6 +1,7 @@
 """What a report begins with: error over time, sheets at the frames that decide, skill."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from r2s.study.configuration import MOTIONS
@@ -19,6 +20,7 @@ from r2s.study.report.skill_table import (
 )
 from r2s.study.rows import Row
 from r2s.study.statistics.skills import skills, with_floor
+from r2s.study.tables import Table
 from r2s.study.verdicts import BEYOND, SURFACE
 
 NO_FLOOR = (
@@ -74,11 +76,12 @@ def _horizon_words(comparison: MotionComparison) -> str:
 
 
 def skill_sections(
-    out: Path, rows: Sequence[Row], others: Sequence[str], looks: Looks, keep: Keep
+    out: Path, rows: Sequence[Row], others: Mapping[str, Sequence[Row]], looks: Looks, keep: Keep
 ) -> list[Section]:
     """Error, floor and skill by approach; and what is compared beyond the horizon.
 
-    `others`: fabrics of which not every configuration has an estimate, and that are not in `rows`.
+    `others`: the rows of each fabric of which not every configuration has an estimate, and that is
+    not in `rows`: each has a table of its own.
     """
     known = with_floor(rows, SURFACE)
     judged = {row.recording for row in rows if row.metric == SURFACE}
@@ -100,9 +103,11 @@ def skill_sections(
     ]
     if len(fabrics) < 2:
         words.append("There are no intervals: one fabric has no spread between fabrics.")
+    apart = {fabric: with_floor(theirs, SURFACE) for fabric, theirs in others.items()}
     if others:
         words.append(
-            f"Not every configuration has an estimate of {_names(others)}: not among these either."
+            f"Not every configuration has an estimate of {_names(list(others))}: tables of their "
+            "own have what there is."
         )
     if without:
         words.append(
@@ -112,6 +117,8 @@ def skill_sections(
     path = skill_chart(out / "figures" / "skill.png", found, looks)
     tables = {"skill": skill_table(known, SURFACE), "learned": learned_table(known, SURFACE),
               "skill_needed": needed_table(known)}  # fmt: skip
+    for fabric, theirs in apart.items():
+        tables[f"skill_{fabric}"] = _of_fabric(fabric, theirs) if theirs else None
     shown = tuple(keep(name, table) for name, table in tables.items() if table)
     caption = "Skill of every configuration: 0 is the default, 1 the floor."
     sections = [Section("Skill", tuple(words), shown, ((path, caption),))]
@@ -127,6 +134,11 @@ def skill_sections(
         )
         sections.append(Section("Beyond the horizon", (text,), beyond))
     return sections
+
+
+def _of_fabric(fabric: str, rows: Sequence[Row]) -> Table:
+    table = skill_table(rows, SURFACE)
+    return replace(table, caption=f"Of {fabric} alone. {table.caption}")
 
 
 def _names(names: Sequence[str], most: int = 12) -> str:
