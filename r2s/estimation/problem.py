@@ -363,7 +363,8 @@ def _markers(recording: Recording, mesh: Mesh, frames: slice) -> Markers | None:
         worst = int(away.argmax())
         raise ValueError(
             f"{recording.info.name}, frame 0: marker {worst} lies {1e3 * away[worst]:.0f} mm off "
-            "the sheet: check the sheet's size and place [m] and the markers' plane"
+            "the sheet: check the sheet's size and place [m] and the markers' plane, or leave the "
+            "marker out if it is on another cloth"
         )
     return Markers(recording.markers[frames], jnp.asarray(seen[frames]), mesh.faces[face], weights)
 
