@@ -9,8 +9,9 @@ import pytest
 from scipy import stats
 
 from r2s import scenarios
-from r2s.estimation.agreement import agreement, scattered, told_by
+from r2s.estimation.agreement import MOST, agreement, density_told, scattered, told_by
 from r2s.estimation.descent import DEFAULT, each_alone
+from r2s.estimation.estimate import Agreement
 from r2s.estimation.gauss_newton import theta_length
 from r2s.estimation.problem import NuisancePrior, Problem
 from r2s.fabrics import presets
@@ -76,12 +77,20 @@ def test_a_recording_is_excused_by_the_error_of_its_own_mesh_alone(lifts):
     first, _, other, place = lifts
     pair = first, other
     ends = each_alone(pair, DEFAULT, _theta(pair, place), jax.random.key(0))
-    none, far = np.zeros(len(place)), np.full(len(place), 0.5)
-    for bias in (far, -far * (-1) ** np.arange(len(place))):
-        found = agreement(pair, ends, [none, bias])
-        assert found is None or found.contradiction is None
-    found = agreement(pair, ends, [none, far / 100])
-    assert found is not None and found.contradiction is not None
+    none, far = np.zeros(len(place)), np.full(len(place), MOST)
+    alone, _, excused, opposite, hardly = (
+        agreement(pair, ends, biases)
+        for biases in (
+            (),
+            [none, none],
+            [none, far],
+            [none, -far * (-1) ** np.arange(len(place))],
+            [none, far / 100],
+        )
+    )
+    assert alone is not None and excused is not None and opposite is not None
+    assert excused.p == opposite.p > alone.p
+    assert hardly is not None and hardly.contradiction is not None
 
 
 def _linear(rng, seen, place, precision, shift=0.0):
@@ -114,6 +123,24 @@ def test_recordings_of_one_fabric_scatter_as_the_test_says_whatever_they_do_not_
 def test_one_that_is_off_by_ten_standard_errors_is_mostly_found():
     assert np.mean(_chances(10.0) < 1e-4) > 0.4
     assert np.mean(_chances(20.0) < 1e-4) > 0.8
+
+
+@pytest.mark.parametrize("ratio", [0.1, 1.0, 10.0])
+def test_the_density_that_was_given_wrongly_is_found(ratio):
+    """A pull tells three stiffnesses, a lift the same over the density, and one number more."""
+    rng, precision, mean = np.random.default_rng(1), 12 * np.eye(4), np.full(4, 0.5)
+    scaled, place = np.array([0.12, 0.12, 0.15, 0.0]), np.array([0.4, 0.5, 0.6, 0.3])
+    pull, lift = np.diag([1e4, 1e4, 1e4, 0.0]), np.diag([1e3, 1e3, 1e3, 1e3])
+    told = []
+    for information, there in ((pull, place), (lift, place + np.log(ratio) * scaled)):
+        noise = np.sqrt(information) @ rng.normal(size=4)
+        covariance = np.linalg.inv(information + precision)
+        end = covariance @ (information @ there + noise + precision @ mean)
+        told.append(told_by(end, covariance, mean, precision))
+    density, error = density_told(told, [True, False], scaled, mean, precision)
+    assert np.log(density * ratio) == pytest.approx(0, abs=3 * error) and error < 0.3
+    found = Agreement(1.0, (3, 4), None, (density, error))
+    assert found.doubts_density == (ratio != 1)
 
 
 def test_what_an_estimate_kept_of_its_prior_is_not_told_by_its_recording():

@@ -402,6 +402,8 @@ def _by_weight(density: float, recordings: "Sequence[Recording]") -> list[str]:
 
 def _agreement(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[str]:
     """How much each of several recordings counts, and which contradicts the others, if one does."""
+    import numpy as np
+
     names = [each.info.name for each in recordings]
     if len(names) < 2:
         return []
@@ -410,6 +412,12 @@ def _agreement(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[
     found = estimate.agreement
     if found is None:
         return [*lines, "not judged: whether the recordings agree"]
+    if found.density is not None and found.doubts_density:
+        ratio, error = found.density
+        lines.append(
+            f"warning: the recordings would agree on {ratio:.2g} times the density that was given "
+            f"(a factor of {np.exp(error):.2g} either way): weigh the sheet again, in kg/m^2"
+        )
     odd = found.contradiction
     if odd is None:
         alone = [name for name, told in zip(names, found.told, strict=True) if not told]

@@ -20,6 +20,18 @@ from r2s.estimation.estimate import Agreement, Contradiction
 from r2s.estimation.gauss_newton import Descent, Problems, prior_weight
 
 UNLIKELY = 1e-4  # that recordings of one fabric lead so far apart by chance
+# of a range, by which a mesh excuses a parameter at most: what lifts on 17 x 17 vertices err in
+# stiffness, root mean square (docs/results/estimate_by_mesh.csv); one step may say far more
+MOST = 0.08
+SCALED = (
+    "warp",
+    "weft",
+    "shear",
+    "bending",
+    "E h",
+)  # with the density, where nothing weighs the sheet
+HARDLY = np.log(30.0)  # standard deviation of the logarithm of a density written down wrongly
+MORE, SOME = 2.0, 1 + 1e-6  # times a prior's precision: told weighs more, and at all
 RCOND = 1e-9  # of the recordings' information together: less than that is none
 
 
@@ -45,7 +57,7 @@ def agreement(
     - `ends`: of a descent in each recording alone.
     - `biases`: of each end by its mesh; none where that was not judged. A lift that buckles
       elsewhere on a finer mesh leads far astray, pulls hardly. How far is told by one step, in
-      which direction is not: each parameter is excused by itself.
+      which direction is not: each parameter is excused by itself, by `MOST` at most.
 
     The weighted scatter around the mean is compared with its chi-squared distribution. The one is
     named without which the others agree best; of two, the second.
@@ -56,19 +68,25 @@ def agreement(
     dim = space.dim
     mean, precision = (np.asarray(part, np.float64) for part in space.prior())
     excused = [bias[:dim] for bias in biases] or [np.zeros(dim)] * len(problems)
-    places, told = [], []
+    led: list[tuple[np.ndarray, np.ndarray]] = []
     for problem, end, by in zip(problems, ends, excused, strict=True):
         place, covariance = _led((problem,), end, dim)
         if not (np.isfinite(place).all() and np.isfinite(covariance).all()):
             return None
-        places.append(place)
-        told.append(told_by(place, covariance + np.diag(by**2), mean, precision))
+        led.append((place, covariance + np.diag(np.minimum(np.abs(by), MOST) ** 2)))
+    told = [told_by(*each, mean, precision) for each in led]
     scatter, freedom = scattered(told)
     if not freedom:
         return None
+    weigh = [each.force is not None or each.scenario.wind is not None for each in problems]
+    density = None
+    if any(weigh) and not all(weigh):
+        scaled = np.array([(r.name in SCALED) / r.width for r in space.ranges])
+        every = [told_by(*each, mean, precision, least=SOME) for each in led]
+        density = density_told(every, weigh, scaled, mean, precision)
     p, counts = float(stats.chi2.sf(scatter, freedom)), tuple(each.count for each in told)
     if not p < UNLIKELY:
-        return Agreement(p, counts, None)
+        return Agreement(p, counts, None, density)
     odd = 1 if len(told) == 2 else min(range(len(told)), key=lambda i: _without(told, i))
     rest = [each for i, each in enumerate(told) if i != odd]
     (here, own), (there, others) = (_known(each, mean, precision) for each in ([told[odd]], rest))
@@ -76,7 +94,7 @@ def agreement(
     most = int(np.argmax(errors))
     of = space.ranges[most]
     values = float(of.from_unit(here[most])), float(of.from_unit(there[most]))
-    return Agreement(p, counts, Contradiction(odd, of.name, float(errors[most]), values))
+    return Agreement(p, counts, Contradiction(odd, of.name, float(errors[most]), values), density)
 
 
 def told_by(
@@ -84,18 +102,47 @@ def told_by(
     covariance: Float[np.ndarray, "dim dim"],
     mean: Float[np.ndarray, " dim"],
     precision: Float[np.ndarray, "dim dim"],
+    least: float = MORE,
 ) -> Told:
-    """What an estimate tells without its prior of a `mean` and a `precision`."""
+    """What an estimate tells without its prior of a `mean` and a `precision`, in directions that it
+    knows `least` times as precisely."""
     root = np.linalg.cholesky(precision)
     inner = np.linalg.solve(root, np.linalg.inv(covariance))
     sizes, axes = np.linalg.eigh(np.linalg.solve(root, inner.T))
-    kept = sizes > 2  # what is told beyond the prior weighs more than that
+    kept = sizes > least
     beyond = np.where(kept, sizes - 1, 1)
     at, usual = (axes.T @ root.T @ each for each in (place, mean))
     alone = np.where(kept, (sizes * at - usual) / beyond, usual)
     forth = root @ axes
     information = (forth * np.where(kept, beyond, 0)[None]) @ forth.T
     return Told(np.linalg.solve(root.T, axes @ alone), information, int(kept.sum()))
+
+
+def density_told(
+    told: Sequence[Told],
+    weigh: Sequence[bool],
+    scaled: Float[np.ndarray, " dim"],
+    mean: Float[np.ndarray, " dim"],
+    precision: Float[np.ndarray, "dim dim"],
+) -> tuple[float, float]:
+    """The density with which recordings would agree best, over the one that was given, [-], and the
+    standard error of its logarithm: by least squares, the fabric free.
+
+    - `told`: by each, beside a prior of a `mean` and a `precision`.
+    - `weigh`: which of them tell the density. In the others ten times the density moves like ten
+      times all stiffness, whose places it moves along `scaled`, per unit of its logarithm.
+    """
+    dim = len(mean)
+    matrix, right = np.zeros((dim + 1, dim + 1)), np.zeros(dim + 1)
+    matrix[:dim, :dim], right[:dim] = precision, precision @ mean
+    matrix[dim, dim] = 1 / HARDLY**2
+    for each, weighs in zip(told, weigh, strict=True):
+        moves = np.column_stack([np.eye(dim), np.zeros(dim) if weighs else scaled])
+        matrix += moves.T @ each.information @ moves
+        right += moves.T @ each.information @ each.place
+    covariance = np.linalg.inv(matrix)
+    given_too_high = (covariance @ right)[dim]
+    return float(np.exp(-given_too_high)), float(np.sqrt(covariance[dim, dim]))
 
 
 def scattered(told: Sequence[Told]) -> tuple[float, int]:

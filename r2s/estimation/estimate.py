@@ -10,6 +10,7 @@ from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace, Range
 
 IDENTIFIABLE = 0.025  # greatest standard error, relative or absolute: two of them are 5 %
+DOUBT, FAR = 4.5, 3.0  # standard errors, and a factor, from which on a density is doubted
 AT_BOUND = 5e-3  # of a range's width: an estimate that is nearer to an end has reached the bound
 LEAST_EXPONENT = 0.05  # a parameter with a smaller share in a combination is not named
 
@@ -48,11 +49,23 @@ class Agreement(NamedTuple):
     - `told`: of each recording, how many directions of the fabric's space it tells by itself, its
       mesh's error allowed for: one that tells none was not compared.
     - `contradiction`: the one that leads elsewhere than the others; None where all agree.
+    - `density`: with which they would agree best, over the one that was given, [-], and the
+      standard error of its logarithm; None where not some weigh the sheet, by a force or a wind,
+      and others do not.
     """
 
     p: float
     told: tuple[int, ...]
     contradiction: Contradiction | None
+    density: tuple[float, float] | None = None
+
+    @property
+    def doubts_density(self) -> bool:
+        """Whether another density than the one given is far likelier."""
+        if self.density is None:
+            return False
+        off, error = abs(np.log(self.density[0])), self.density[1]
+        return bool(off > DOUBT * error and off > np.log(FAR))
 
 
 class Misfit(NamedTuple):

@@ -122,7 +122,9 @@ def _agreement(stored: dict[str, Any] | None) -> Agreement | None:
     odd = stored["contradiction"]
     if odd is not None:
         odd = Contradiction(**odd | {"values": tuple(odd["values"])})
-    return Agreement(stored["p"], tuple(stored["told"]), odd)
+    density = stored["density"]
+    told = tuple(stored["told"])
+    return Agreement(stored["p"], told, odd, None if density is None else tuple(density))
 
 
 def upgraded(stored: dict[str, Any]) -> dict[str, Any]:
