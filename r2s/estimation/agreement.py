@@ -11,6 +11,7 @@ its noise.)
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy import stats
@@ -93,8 +94,10 @@ def agreement(
     errors = np.abs(here - there) / np.sqrt(np.diag(own) + np.diag(others))
     most = int(np.argmax(errors))
     of = space.ranges[most]
-    values = float(of.from_unit(here[most])), float(of.from_unit(there[most]))
-    return Agreement(p, counts, Contradiction(odd, of.name, float(errors[most]), values), density)
+    first, second = (float(of.from_unit(jnp.asarray(at[most], float))) for at in (here, there))
+    return Agreement(
+        p, counts, Contradiction(odd, of.name, float(errors[most]), (first, second)), density
+    )
 
 
 def told_by(
