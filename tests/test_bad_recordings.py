@@ -55,7 +55,7 @@ def test_a_density_that_is_off_by_ten_is_told_by_the_force_of_a_pull(folder, cap
     text = said(folder[0], capsys, "lift", "pull", density=10 * DENSITY)
     (line,) = [line for line in text.splitlines() if "would agree on" in line]
     assert line.startswith("warning")
-    assert float(line.split("agree on ")[1].split()[0]) == pytest.approx(0.1, rel=0.6)
+    assert 0.05 <= float(line.split("agree on about ")[1].split()[0]) <= 0.3
 
 
 @pytest.mark.slow(group="estimates")

@@ -402,8 +402,6 @@ def _by_weight(density: float, recordings: "Sequence[Recording]") -> list[str]:
 
 def _agreement(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[str]:
     """How much each of several recordings counts, and which contradicts the others, if one does."""
-    import numpy as np
-
     names = [each.info.name for each in recordings]
     if len(names) < 2:
         return []
@@ -413,10 +411,9 @@ def _agreement(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[
     if found is None:
         return [*lines, "not judged: whether the recordings agree"]
     if found.density is not None and found.doubts_density:
-        ratio, error = found.density
         lines.append(
-            f"warning: the recordings would agree on {ratio:.2g} times the density that was given "
-            f"(a factor of {np.exp(error):.2g} either way): weigh the sheet again, in kg/m^2"
+            f"warning: the recordings would agree on about {found.density[0]:.1g} times the density "
+            "that was given: weigh the sheet again, in kg/m^2"
         )
     odd = found.contradiction
     if odd is None:
