@@ -412,8 +412,8 @@ def _agreement(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[
         return [*lines, "not judged: whether the recordings agree"]
     if found.density is not None and found.doubts_density:
         lines.append(
-            f"warning: the recordings would agree on about {found.density[0]:.1g} times the density "
-            "that was given: weigh the sheet again, in kg/m^2"
+            f"warning: the recordings would agree on about {found.density[0]:.1g} times the "
+            "density that was given: weigh the sheet again, in kg/m^2"
         )
     odd = found.contradiction
     if odd is None:
