@@ -11,7 +11,8 @@ It does not find the fabric. The map comes to lie within 2 mm of the points and 
 1 %, but with a stiffness far too low, also when it begins with the true one. Clouds do not say how
 the sheet lies within its surface, the part on the table is unseen, and a softer fabric makes less
 of the roughness of the map. The information is there, also beside a map in which forces balance but
-nearly (`experiments/unbalanced_maps.py`): the fit of one best map fails. For clouds there is `r2s.estimation.diffcloud`.
+nearly (`experiments/unbalanced_maps.py`): the fit of one best map fails. For clouds there is
+`r2s.estimation.diffcloud`.
 """
 
 import time
