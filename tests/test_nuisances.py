@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.estimation import compiled, descent, gauss_newton
+from r2s.estimation import compiled, gauss_newton
+from r2s.estimation import covariance as covariances
 from r2s.estimation.covariance import covariance_at
 from r2s.estimation.descent import Budget, descend, nuisances
 from r2s.estimation.estimate import describe
@@ -260,7 +261,7 @@ def test_deviations_are_from_the_frames_on_which_places_agree(monkeypatch):
 
     def found(agree, share=1.0, budget=budget):
         agree = iter(agree)
-        monkeypatch.setattr(descent, "_disagreement", lambda *_: 0.0 if next(agree) else np.inf)
+        monkeypatch.setattr(covariances, "_disagreement", lambda *_: 0.0 if next(agree) else np.inf)
         seen = problems if share == 1 else (beginning(lifted, share),)
         normal = compiled.normal_at(seen, theta, zero, None)
         end = Descent(theta, normal, zero, zero, zero, jnp.zeros((), int))
