@@ -36,10 +36,8 @@ def predicted(folder: Path, configuration: str, fabric: str, law: str) -> Line:
     """
     cells = [_of_law(each, law) for each in _cells(configuration, fabric, JUDGED)]
     line = _errors(cells, folder)
-    (estimate,) = {cell.estimate for cell in cells if cell.estimate is not None}
-    made = read_metadata(estimate, folder)
-    by = {"CPU s": f"{made['cpu_seconds']:.0f}", "estimated by source": made["source"]}
-    return line | _over_truth(estimate, folder) | by
+    estimate = _estimate(cells)
+    return line | _over_truth(estimate, folder) | _made(estimate, folder)
 
 
 def predicted_elsewhere(folder: Path, configuration: str) -> Line:
@@ -47,9 +45,18 @@ def predicted_elsewhere(folder: Path, configuration: str) -> Line:
     sheet of an estimate from its lift, and the seconds of a CPU that it took."""
     cells = _cells(configuration, FLEX, MOTIONS)
     line = _errors(cells, folder)
-    (estimate,) = {cell.estimate for cell in cells if cell.estimate is not None}
-    made = read_metadata(estimate, folder)
-    return line | {"CPU s": f"{made['cpu_seconds']:.0f}", "estimated by source": made["source"]}
+    return line | _made(_estimate(cells), folder)
+
+
+def _estimate(cells: list[EvaluationCell]) -> EstimateCell:
+    """The one that some cells evaluate."""
+    (found,) = {cell.estimate for cell in cells if cell.estimate is not None}
+    return found
+
+
+def _made(cell: EstimateCell, folder: Path) -> Line:
+    made = read_metadata(cell, folder)
+    return {"CPU s": f"{made['cpu_seconds']:.0f}", "estimated by source": made["source"]}
 
 
 def _cells(configuration: str, fabric: str, motions: Sequence[str]) -> list[EvaluationCell]:

@@ -416,6 +416,8 @@ def _agreement(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[
             "density that was given: weigh the sheet again, in kg/m^2"
         )
     odd = found.contradiction
+    if odd is None and found.doubts_density:
+        return lines
     if odd is None:
         alone = [name for name, told in zip(names, found.told, strict=True) if not told]
         left = f"; not compared, by the error of the mesh: {', '.join(alone)}" if alone else ""
@@ -426,7 +428,7 @@ def _agreement(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[
     return [
         *lines,
         f"warning: {names[odd.recording]} contradicts {against} (by chance {found.p:.1g}; "
-        f"{odd.parameter} {own} by the first, {others} by {against}, {odd.errors:.1f} standard "
+        f"{odd.parameter} {own} by it, {others} by {against}, {odd.errors:.1f} standard "
         "errors apart): another fabric, or the density, scale, path or markers are not as written "
         "down (a pull's force tells stiffness, other motions stiffness over density), or a law "
         "that cannot follow all of them (see --law)",

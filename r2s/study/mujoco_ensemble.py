@@ -38,7 +38,7 @@ class MujocoEnsemble(Cell):
     """
 
     kind: ClassVar[str] = "ensembles"
-    weight: ClassVar[float] = 120.0
+    weight: ClassVar[float] = 200.0
     lacks_layers: ClassVar[bool] = False
 
     recording: MujocoRecording
@@ -55,15 +55,15 @@ class MujocoEnsemble(Cell):
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
         """Distances [m] of every member from the truth in each frame.
 
-        Raises as `r2s.study.mujoco_sheet.moved`: a sheet of its that diverges says nothing.
+        Raises as `r2s.study.mujoco_sheet.moved`, also where a member diverges.
         """
         source = self.recording
         experiment, material, (shape, step) = source.experiment, source.material, source.resolution
         base = _moved(experiment, material, source.resolution)
-        points = points_of(base)
+        here, points = source.resolution, points_of(base)
 
-        def away(experiment: Experiment, material: Material, resolution: Resolution):
-            found = _moved(experiment, material, resolution)
+        def away(experiment: Experiment, material: Material, at: Resolution, points=points):
+            found = _moved(experiment, material, at)
             return to_surface(points, found.x, found.mesh.faces)
 
         def stiffer(factor: float) -> Material:
@@ -71,7 +71,6 @@ class MujocoEnsemble(Cell):
 
         recording = read(source, folder)
         clouds = [cloud(recording, frame) for frame in range(len(recording.times))]
-        here = source.resolution
         found = {
             "recording": [to_surface(clouds, base.x, base.mesh.faces)],
             "stiffness": [away(experiment, stiffer(1 + way * STIFFNESS), here) for way in WAYS],
@@ -80,9 +79,9 @@ class MujocoEnsemble(Cell):
             "step": [away(experiment, material, Resolution(shape, step / 2))],
         }
         coarse = Resolution(cells_a_side(shape, COARSER), step)
-        points = points_of(_moved(experiment, material, coarse))
+        own = points_of(_moved(experiment, material, coarse))
         for factor in self.others:
-            found[f"{APART}{factor:g}"] = [away(experiment, stiffer(factor), coarse)]
+            found[f"{APART}{factor:g}"] = [away(experiment, stiffer(factor), coarse, own)]
         return save_ensemble(out, experiment, found)
 
 

@@ -106,8 +106,8 @@ def skill_sections(
     apart = {fabric: with_floor(theirs, SURFACE) for fabric, theirs in others.items()}
     if others:
         words.append(
-            f"Not every configuration has an estimate of {_names(list(others))}: tables of their "
-            "own have what there is."
+            f"Not every configuration has an estimate of {_names(list(others))}: what has a floor "
+            "has a table of its own."
         )
     if without:
         words.append(
