@@ -13,6 +13,7 @@ from r2s.fabrics.stiffening_space import StiffeningSpace
 from r2s.laws.membrane import OrthotropicMembrane
 from r2s.laws.plate import PlateBending
 from r2s.laws.stiffening import SofteningPlate, StiffeningMembrane
+from r2s.scenarios.paths import draw
 
 
 def test_draws_are_fabrics_with_the_stated_spread_and_the_weight_that_is_known():
@@ -27,6 +28,16 @@ def test_draws_are_fabrics_with_the_stated_spread_and_the_weight_that_is_known()
     assert np.array_equal(again.membrane.c11, law.c11)
     with pytest.raises(ValueError, match="density"):
         prior.draws(0.0, 1, jr.key(0))
+
+
+def test_draws_of_a_key_are_the_same_in_either_precision():
+    """Else a study judged in float64 is of other motions than one in float32."""
+    double = prior.draws(0.2, 3, jr.key(0)), draw("fling", 2, key=jr.key(0))
+    with jax.enable_x64(False):
+        single = prior.draws(0.2, 3, jr.key(0)), draw("fling", 2, key=jr.key(0))
+    assert jax.tree.leaves(single)[0].dtype == jnp.float32
+    for one, other in zip(*map(jax.tree.leaves, (single, double)), strict=True):
+        np.testing.assert_allclose(np.asarray(one), np.asarray(other), rtol=1e-5)
 
 
 def test_the_fabrics_of_the_study_are_possible_and_not_in_the_middle():

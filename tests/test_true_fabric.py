@@ -5,6 +5,9 @@ these motions. To the 2 mm of a converged truth five of the ten are, and in one 
 of what fabrics differ by after a quarter of a second: no skill is told of it (docs/study.md).
 """
 
+from collections.abc import Iterator
+
+import jax
 import numpy as np
 import pytest
 
@@ -19,6 +22,13 @@ from r2s.study.verdicts import SURFACE
 KNOWN = 5e-3  # [m], of mesh and step, mean up to the horizon
 EARLY = 0.5  # [s]: a horizon before this one tells nothing
 UNTOLD = {("red_jet_set", "shaking")}
+
+
+@pytest.fixture(autouse=True)
+def single_precision() -> Iterator[None]:
+    """As studies are made, and twice as fast: floors are the same in float64 (docs/study.md)."""
+    with jax.enable_x64(False):
+        yield
 
 
 @pytest.mark.slow(group="verdicts")

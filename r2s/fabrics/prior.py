@@ -30,7 +30,8 @@ MANY, LEAST = 1024, 1e-3  # draws that tell a distribution; a range over which t
 
 
 def draws(density: float, count: int, key: PRNGKeyArray) -> Fabric:
-    """`count` fabrics of an areal density [kg/m^2], with a leading axis on every array.
+    """`count` fabrics of an areal density [kg/m^2], with a leading axis on every array; of one key
+    the same in float32 and float64.
 
     Raises `ValueError` for a density that is not positive.
     """
@@ -38,12 +39,12 @@ def draws(density: float, count: int, key: PRNGKeyArray) -> Fabric:
         raise ValueError(f"the areal density must be positive, got {density} kg/m^2")
     keys = jr.split(key, 6)
     mean, deviation = _membranes()
-    yarns = jnp.exp(mean[0] + deviation[0] * jr.normal(keys[0], (2, count), float))
-    c33 = jnp.exp(mean[1] + deviation[1] * jr.normal(keys[1], (count,), float))
+    yarns = jnp.exp(mean[0] + deviation[0] * _normal(keys[0], (2, count)))
+    c33 = jnp.exp(mean[1] + deviation[1] * _normal(keys[1], (count,)))
     coupling = _uniform(keys[2], count, COUPLING)
     c11, c22 = yarns / (1 - coupling**2)[None]
     middle = BENDING + EXPONENT * np.log(density)
-    bending = jnp.exp(middle + SPREAD * jr.normal(keys[3], (count,), float))
+    bending = jnp.exp(middle + SPREAD * _normal(keys[3], (count,)))
     low, high = np.log(DAMPING)
     return Fabric(
         jnp.full(count, density, float),
@@ -100,7 +101,13 @@ def middle(density: float) -> Fabric:
 
 
 def _uniform(key: PRNGKeyArray, count: int, ends: tuple[float, float]) -> jax.Array:
-    return jr.uniform(key, (count,), float, *ends)
+    low, high = ends
+    places = jr.uniform(key, (count,), jnp.float32).astype(float)
+    return jnp.maximum(low, places * (high - low) + low)
+
+
+def _normal(key: PRNGKeyArray, shape: tuple[int, ...]) -> jax.Array:
+    return jr.normal(key, shape, jnp.float32).astype(float)
 
 
 def _membranes() -> tuple[np.ndarray, np.ndarray]:

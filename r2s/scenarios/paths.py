@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
@@ -44,7 +45,8 @@ ESTIMATION, EVALUATION = 40, 120  # motions of each scenario in the study
 
 
 def draw(scenario: str, number: int, *, key: PRNGKeyArray) -> list[dict[str, float]]:
-    """`number` sets of a scenario's numbers, each uniform within its limits.
+    """`number` sets of a scenario's numbers, each uniform within its limits; of one key the same in
+    float32 and float64.
 
     Raises `ValueError` for an unknown scenario.
     """
@@ -52,7 +54,7 @@ def draw(scenario: str, number: int, *, key: PRNGKeyArray) -> list[dict[str, flo
         raise ValueError(f"a scenario is one of {list(LIMITS)}, got {scenario!r}")
     limits = LIMITS[scenario]
     low, high = np.array(list(limits.values())).T
-    places = np.asarray(jr.uniform(key, (number, len(limits)), float), np.float64)
+    places = np.asarray(jr.uniform(key, (number, len(limits)), jnp.float32), np.float64)
     return [dict(zip(limits, row, strict=True)) for row in (low + places * (high - low)).tolist()]
 
 
