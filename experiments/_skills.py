@@ -48,6 +48,11 @@ def predicted_elsewhere(folder: Path, configuration: str) -> Line:
     return line | _made(_estimate(cells), folder)
 
 
+def of_cells(folder: Path, configuration: str, motions: Sequence[str]) -> Line:
+    """Floor, errors [mm] and skill of MuJoCo's sheet by motion."""
+    return _errors(_cells(configuration, FLEX, motions), folder)
+
+
 def _estimate(cells: list[EvaluationCell]) -> EstimateCell:
     """The one that some cells evaluate."""
     (found,) = {cell.estimate for cell in cells if cell.estimate is not None}

@@ -32,7 +32,7 @@ from r2s.world.air import Air
 from r2s.world.contact import Table
 from r2s.world.scene import Control, Scene
 
-# Of the tests that take minutes: each group takes less than twenty on two cores.
+# Of the tests that take minutes: a group takes less than twenty on two cores, verdicts forty.
 SLOW_GROUPS = (
     "cloth",
     "points",

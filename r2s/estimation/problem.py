@@ -77,8 +77,8 @@ def default_nuisance_prior(scenario: Scenario, doubt: Doubt | None = None) -> Nu
     as exact, an error of 1 % in either could be explained by half the stiffness.
     """
     own = USUAL if doubt is None else NuisancePrior(doubt.shift, doubt.turn, doubt.time)
-    size = 0.0 if doubt is None else doubt.size
-    return own._replace(air=0.0 if scenario.wind is None else WIND, size=size)
+    size, air = (0.0, 0.0) if doubt is None else (doubt.size, doubt.air)
+    return own._replace(air=air or (0.0 if scenario.wind is None else WIND), size=size)
 
 
 class Clouds(eqx.Module):

@@ -68,6 +68,7 @@ class Doubt:
     - `turn`: of the same about the vertical, [rad].
     - `time`: of the cameras' clock against that of the grippers, [s].
     - `size`: of the sheet's side length, relative.
+    - `air`: of the force of still air at a speed of the sheet (its drag coefficient), relative.
 
     Raises ValueError for one that is negative or not finite.
     """
@@ -76,9 +77,10 @@ class Doubt:
     turn: float
     time: float = 0.0
     size: float = 0.0
+    air: float = 0.0
 
     def __post_init__(self) -> None:
-        for value in (*self.shift, self.turn, self.time, self.size):
+        for value in (*self.shift, self.turn, self.time, self.size, self.air):
             if not (np.isfinite(value) and value >= 0):
                 raise ValueError(f"doubt: standard deviations must not be negative, found {self}")
 

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from r2s.extras import require
+from r2s.fabrics.fabric import Fabric
 from r2s.scenarios.scenario import Scenario
 from r2s.scenarios.six import Experiment
 from r2s.units import AIR_DENSITY, GRAVITY
@@ -58,6 +59,25 @@ class Resolution(NamedTuple):
 
 
 SHEET, STUDIED = Material(), Resolution()
+
+
+def as_plate(material: Material = SHEET) -> Fabric:
+    """The fabric of r2s whose membrane and bending are those of a material at small strain.
+
+    A thin isotropic plate (Timoshenko and Woinowsky-Krieger, "Theory of plates and shells", 1959):
+    E h / (1 - nu^2) and E h^3 / (12 (1 - nu^2)). Hinges on triangles, air and contact are not the
+    fabric's, so it moves as the sheet does only in part.
+    """
+    young, poisson, thickness = material.young, material.poisson, material.thickness
+    stiff = young * thickness / (1 - poisson**2)
+    return Fabric.make(
+        material.density,
+        (stiff, poisson * stiff, stiff, (1 - poisson) / 2 * stiff),
+        stiff * thickness**2 / 12,
+        damping=material.damping,
+        friction=material.friction,
+        thickness=material.radius,
+    )
 
 
 def mujoco_module() -> Any:
