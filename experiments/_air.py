@@ -115,4 +115,5 @@ def _numbers(fabric: Fabric) -> list[float]:
 
 def _told(estimate: Estimate) -> Line:
     ratios = [each for each in estimate.nuisances if "air" in each.name]
-    return {"air ratio": f"{r.value:.2f} +- {r.standard_error:.2f}" for r in ratios}
+    (air,) = ratios or (None,)
+    return {} if air is None else {"air ratio": f"{air.value:.2f} +- {air.standard_error:.2f}"}

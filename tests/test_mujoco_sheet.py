@@ -21,7 +21,7 @@ from r2s.study.main import study
 from r2s.study.mujoco_ensemble import MujocoEnsemble
 from r2s.study.mujoco_error import difference, differences, places
 from r2s.study.mujoco_recording import FABRIC, MujocoRecording
-from r2s.study.mujoco_sheet import Material, Resolution, motion, moved
+from r2s.study.mujoco_sheet import Material, Resolution, as_plate, motion, moved
 from r2s.study.sources import SyntheticRecording, read
 from r2s.study.verdicts import judged_motion
 
@@ -181,3 +181,20 @@ def test_the_ensemble_of_a_recording_is_its_own_simulator_s(tmp_path):
     assert left["stiffness"] < left["mesh"] < found.apart.mean()
     assert (found.apart.mean(axis=1) > left["path"]).all()
     assert judged is not None and (judged.floor >= found.causes["mesh"][0]).all()
+
+
+def test_a_material_is_the_plate_that_stretches_shears_and_bends_as_it_does():
+    fabric = as_plate(Material(young=2e4, poisson=0.25, thickness=2e-3, density=0.3))
+    law = fabric.membrane
+    assert float(law.c11 - law.c12**2 / law.c22) == pytest.approx(2e4 * 2e-3, rel=1e-5)  # E h
+    assert float(law.c12 / law.c11) == pytest.approx(0.25, rel=1e-5)
+    assert float(law.c33) == pytest.approx(2e4 * 2e-3 / 2.5, rel=1e-5)  # E h / (2 (1 + nu))
+    stiffness = 2e4 * 2e-3**3 / 12 / (1 - 0.25**2)  # [N m]
+    assert float(fabric.bending.stiffness) == pytest.approx(stiffness, rel=1e-5)
+    assert float(fabric.density) == pytest.approx(0.3)
+
+
+def test_the_material_stands_beside_estimates_of_the_sheet():
+    plan = dataclasses.replace(matrix.SMALL, fabrics=(FABRIC,), judged=1)
+    true = [cell for cell in matrix.synthetic(plan) if cell.baseline == "true"]
+    assert {cell.scenario for cell in true if cell.solver == "cloth"} == set(MOTIONS)

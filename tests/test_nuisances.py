@@ -19,11 +19,17 @@ from r2s.estimation.estimate import describe
 from r2s.estimation.gauss_newton import Descent, Normal
 from r2s.estimation.mesh_bias import on_the_way, weighed
 from r2s.estimation.prediction import predict
-from r2s.estimation.problem import NuisancePrior, Problem, beginning
+from r2s.estimation.problem import (
+    NuisancePrior,
+    Problem,
+    beginning,
+    default_nuisance_prior,
+)
 from r2s.estimation.standard_errors import FARTHEST, covariance, disagreement, sample_around
 from r2s.fabrics import presets
 from r2s.fabrics.informed_space import InformedSpace
 from r2s.fabrics.parameters import UNIFORM_DEVIATION, OrthotropicSpace
+from r2s.recordings.recording import Doubt
 from r2s.scenarios import synthetic
 
 FABRIC = presets.grey_interlock()
@@ -307,3 +313,15 @@ def test_wind_gives_the_stiffness_of_a_sheet_that_was_weighed_wrongly():
     assert np.all(np.abs(np.log(ratio / wrong)) < 3 * found.standard_errors[stiff])
     air = found.nuisances[0]
     assert air.name == "air ratio" and air.value == pytest.approx(wrong, rel=5e-3)
+
+
+def test_the_air_of_a_recording_is_in_doubt_where_it_says_so(blown, lifted):
+    here, nowhere = (0.0, 0.0, 0.0), 0.0
+    still, windy = lifted.scenario, blown.scenario
+    assert default_nuisance_prior(still).air == 0
+    assert default_nuisance_prior(still, Doubt(here, nowhere, air=0.5)).air == 0.5
+    assert (
+        default_nuisance_prior(windy, Doubt(here, nowhere)).air == default_nuisance_prior(windy).air
+    )
+    with pytest.raises(ValueError, match="negative"):
+        Doubt(here, nowhere, air=-1.0)

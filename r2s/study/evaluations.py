@@ -30,6 +30,8 @@ from r2s.scenarios.scenario import Scenario, from_recording
 from r2s.study.cells import Cell, result_files
 from r2s.study.configuration import Configuration
 from r2s.study.estimates import EstimateCell, read_estimate
+from r2s.study.mujoco_recording import MujocoRecording
+from r2s.study.mujoco_sheet import as_plate
 from r2s.study.sources import GivenRecording, Source, read, read_start, small_strain
 from r2s.study.starts import started
 
@@ -53,7 +55,8 @@ class EvaluationCell(Cell):
     - `recordings`: what it is judged by, together, since they compile once.
     - `draw`: a number of `r2s.fabrics.prior.draws`, which know the density alone: together these
       are the default; each fabric has its own. `MIDDLE`: the middle of that prior, the best
-      guess. None: the truth of synthetic recordings at small strain.
+      guess. None: the truth of synthetic recordings at small strain; of MuJoCo's sheet its
+      material in the laws of r2s (`r2s.study.mujoco_sheet.as_plate`).
     - `other`: whether `estimate` is that of another fabric, for comparison.
     - `every`: 1 compares all frames that count, 3 every third.
     """
@@ -147,6 +150,9 @@ class EvaluationCell(Cell):
     def _fabric(self, folder: Path) -> Fabric | None:
         if self.estimate is None:
             if self.draw is None:
+                source = self.recordings[0]
+                if isinstance(source, MujocoRecording):
+                    return as_plate(source.material)
                 return small_strain(self.fabric)
             if self.draw == MIDDLE:
                 return prior.middle(self.density)

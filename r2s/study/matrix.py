@@ -267,7 +267,8 @@ def _evaluations(
     solvers = dict.fromkeys(estimate.solver for estimate in estimates)
     judged = list(judged)
     is_known = all(
-        isinstance(each, SyntheticRecording) and not each.truth.materials
+        isinstance(each, MujocoRecording)  # its material, in the laws of r2s
+        or (isinstance(each, SyntheticRecording) and not each.truth.materials)
         for group in judged
         for each in group
     )
