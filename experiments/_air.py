@@ -7,7 +7,7 @@ from pathlib import Path
 import equinox as eqx
 import jax.random as jr
 import numpy as np
-from _skills import of_cells
+from _skills import from_lift_in_mujoco
 from _tables import Line
 
 from r2s.estimation.default_spaces import on_cloth
@@ -37,12 +37,11 @@ PLACE, TURN = 0.015, 0.15  # [m] and [rad], as of all recordings that say nothin
 
 def moved_in_air(folder: Path, fabric: str, drag: str, **skin: str) -> Line:
     """The line of a table: air, errors [mm] and skill of a fabric in both motions."""
-    others = of_cells(folder, "diffcloud-cloth-lifting", JUDGED)
+    others, from_lift = from_lift_in_mujoco(folder, JUDGED)
     if fabric == "its material":
         found, made, air = as_plate(), {}, None
     else:
-        sources = ("lifting", "fling")[: 2 if "fling" in fabric else 1]
-        estimate = _estimated(folder, sources)
+        estimate = from_lift if drag != "found" else _estimated(folder, ("lifting", "fling"))
         found, made = estimate.fabric, _told(estimate)
         (ratio, *_) = [each.value for each in estimate.nuisances if "air" in each.name] or [1.0]
         air = Air.make(drag_coefficient=2.0 * ratio, friction_coefficient=0.02 * ratio)
@@ -76,12 +75,10 @@ def _error(folder: Path, motion: str, fabric: Fabric, air: Air) -> float:
 
 
 def _estimated(folder: Path, scenarios: tuple[str, ...]) -> Estimate:
-    """As a study estimates, but for the air, which is in doubt where there is a fling."""
+    """As a study estimates, but for the air, which is in doubt."""
     file = folder / f"air_{'_'.join(scenarios)}.json"
     if not file.exists():
-        recordings = [_recorded(folder, each) for each in scenarios]
-        if len(scenarios) > 1:
-            recordings = [_in_doubt(each) for each in recordings]
+        recordings = [_in_doubt(_recorded(folder, each)) for each in scenarios]
         space = prior.informed(on_cloth(SHEET.density), SHEET.density)
         method = METHODS["diffcloud"](solver="cloth")
         found = method.estimate(recordings, space, SMALL.budgets.diffcloud, key=jr.key(0))

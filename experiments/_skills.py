@@ -40,17 +40,21 @@ def predicted(folder: Path, configuration: str, fabric: str, law: str) -> Line:
     return line | _over_truth(estimate, folder) | _made(estimate, folder)
 
 
-def predicted_elsewhere(folder: Path, configuration: str) -> Line:
+def predicted_elsewhere(folder: Path, configuration: str, repeat: str) -> Line:
     """The line of a table: errors [mm] and skill in the first fold, fling and shaking of MuJoCo's
-    sheet of an estimate from its lift, and the seconds of a CPU that it took."""
-    cells = _cells(configuration, FLEX, MOTIONS)
+    sheet of an estimate from its lift of that number, and the seconds of a CPU that it took."""
+    cells = _cells(configuration, FLEX, MOTIONS, int(repeat))
     line = _errors(cells, folder)
     return line | _made(_estimate(cells), folder)
 
 
-def of_cells(folder: Path, configuration: str, motions: Sequence[str]) -> Line:
-    """Floor, errors [mm] and skill of MuJoCo's sheet by motion."""
-    return _errors(_cells(configuration, FLEX, motions), folder)
+def from_lift_in_mujoco(folder: Path, motions: Sequence[str]) -> tuple[Line, Estimate]:
+    """Floor, errors [mm] and skill of MuJoCo's sheet by motion, and the estimate from its first
+    lift by DIFFCLOUD."""
+    cells = _cells("diffcloud-cloth-lifting", FLEX, motions)
+    line, found = _errors(cells, folder), read_estimate(_estimate(cells), folder)
+    assert found is not None
+    return line, found
 
 
 def _estimate(cells: list[EvaluationCell]) -> EstimateCell:
@@ -64,16 +68,23 @@ def _made(cell: EstimateCell, folder: Path) -> Line:
     return {"CPU s": f"{made['cpu_seconds']:.0f}", "estimated by source": made["source"]}
 
 
-def _cells(configuration: str, fabric: str, motions: Sequence[str]) -> list[EvaluationCell]:
+def _cells(
+    configuration: str, fabric: str, motions: Sequence[str], repeat: int = 0
+) -> list[EvaluationCell]:
     plan = replace(
         SMALL,
         configurations=(configuration_named(configuration),),
         fabrics=(fabric,),
+        repeats=repeat + 1,
         judged=1,
         every=1,
         draws=4,
     )
-    return [cell for cell in synthetic(plan) if cell.scenario in motions]
+    return [
+        cell
+        for cell in synthetic(plan)
+        if cell.scenario in motions and (cell.estimate is None or cell.estimate.repeat == repeat)
+    ]
 
 
 def _errors(cells: list[EvaluationCell], folder: Path) -> Line:
