@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from _tables import Line
+from _tables import Line, made_by
 
 from r2s.study import engine, results, verdicts
 from r2s.study.ensembles import read_ensemble
@@ -38,7 +38,7 @@ def line(folder: Path, motion: str, fabric: str, number: str) -> Line:
         "true fabric": _millimetres(true.value),
         "default": f"{1e3 * drawn.mean():.1f} ({1e3 * drawn.min():.1f} to {1e3 * drawn.max():.1f})",
         "skill of the true fabric": _skill(true),
-    }
+    } | made_by(cells, folder)
 
 
 def _number(value: float | None) -> str:

@@ -32,8 +32,7 @@ class Size(NamedTuple):
 def size_of(preset: str) -> Size:
     """The size of a preset of the study.
 
-    Without the sheet of MuJoCo, which has neither all configurations nor a floor, and so is in no
-    comparison.
+    Without the sheet of MuJoCo, which has not all configurations, and so is in no comparison.
     """
     plan = PRESETS[preset]
     ours = tuple(c for c in PAPER_CONFIGURATIONS if c in plan.configurations)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from _tables import Line
+from _tables import Line, made_by
 from scipy.stats import norm
 
 from r2s.estimation.estimate import Estimate
@@ -64,8 +64,7 @@ def _estimate(cells: list[EvaluationCell]) -> EstimateCell:
 
 
 def _made(cell: EstimateCell, folder: Path) -> Line:
-    made = read_metadata(cell, folder)
-    return {"CPU s": f"{made['cpu_seconds']:.0f}", "estimated by source": made["source"]}
+    return {"CPU s": f"{read_metadata(cell, folder)['cpu_seconds']:.0f}"}
 
 
 def _cells(
@@ -96,7 +95,7 @@ def _errors(cells: list[EvaluationCell], folder: Path) -> Line:
     line: Line = {}
     for motion in dict.fromkeys(cell.scenario for cell in cells):
         line |= _of(motion, [row for row in rows if row.evaluated_on == motion])
-    return line
+    return line | made_by(cells, folder)
 
 
 def _of_law(cell: EvaluationCell, law: str) -> EvaluationCell:

@@ -12,10 +12,18 @@ from pathlib import Path
 
 from r2s.files import source_hash, write_text
 from r2s.side_by_side import cores
+from r2s.study.cells import Cell
 from r2s.study.environment import processor
+from r2s.study.origins import origins
 
 SOURCE = 16  # hexadecimal digits of a hash
 Line = dict[str, str]  # of a table, by column
+
+
+def made_by(cells: Iterable[Cell], folder: Path) -> Line:
+    """The sources that made the cells of a line, and all that these need: more than one is said."""
+    noted = (words.partition("source ")[2].partition(";")[0] for words in origins(cells, folder))
+    return {"made by source": ", ".join(sorted(each[:8] for each in noted))}
 
 
 def command_line(document: str | None, out: str) -> argparse.ArgumentParser:

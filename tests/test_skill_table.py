@@ -142,6 +142,21 @@ def test_the_default_has_skill_zero_and_shows_the_spread_of_its_draws():
     assert found["fling: skill"] == f"0; draws {min(worse):.2f} to {max(worse):.2f}"
 
 
+def test_draws_of_unlike_fabrics_do_not_average_away():
+    """Each fabric has draws of its own: which of them has which number says nothing."""
+    turned = [
+        replace(row, repeat=str(1 - int(row.repeat)))
+        if row.baseline == "default" and row.fabric == FABRICS[0]
+        else row
+        for row in made_up()
+    ]
+    before, after = (
+        draws(with_floor(rows, METRIC), "fling", DEFAULT) for rows in (made_up(), turned)
+    )
+    assert after.errors == pytest.approx(before.errors)
+    assert after.skills == pytest.approx(before.skills)
+
+
 @pytest.mark.parametrize("place", range(len(made_up())))
 def test_a_run_that_diverged_improves_nothing(place):
     whole, lost = made_up(), diverged(made_up(), place)

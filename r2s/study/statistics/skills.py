@@ -116,42 +116,43 @@ def mean_floor(rows: Iterable[Row], motion: str, configuration: Configuration) -
 
 
 class Draws(NamedTuple):
-    """The least and the largest of the means of the draws of a default: errors [unit], infinite
-    where one diverged, and skills [-] beside the mean over all; NaN where none is told."""
+    """The least and the largest of a fabric's draws of a default, mean over fabrics: errors [unit],
+    infinite where one diverged, and skills [-] beside the mean over all; NaN where none is told."""
 
     errors: tuple[float, float]
     skills: tuple[float, float]
 
 
 def draws(rows: Iterable[Row], motion: str, configuration: Configuration) -> Draws:
-    """The spread of a default fabric's draws in a motion."""
+    """The spread of a default fabric's draws in a motion: each fabric has draws of its own."""
     theirs = [row for row in rows if _is_of(row, motion, configuration)]
-    finite = [row for row in theirs if np.isfinite(row.value)]  # as skills are told
-    every = {row.recording: [r.value for r in finite if r.recording == row.recording] or [np.nan]
-             for row in theirs}  # fmt: skip
-    errors, told = [], []
-    for draw in dict.fromkeys(row.repeat for row in theirs):
-        own = [row for row in theirs if row.repeat == draw]
-        errors.append(_mean_of(own, [row.value for row in own], np.inf))
-        values = [
-            skill(row.value, float(np.mean(every[row.recording])), float(row.floor or 0))
-            for row in own
-        ]
-        kept = [(row, value) for row, value in zip(own, values, strict=True) if value == value]
-        if kept:
-            told.append(_mean_of([row for row, _ in kept], [value for _, value in kept], -np.inf))
-    span = (min(told), max(told)) if told else (np.nan, np.nan)
-    return Draws((min(errors), max(errors)), span)
+    drawn: dict[str, list[float]] = {}
+    for row in theirs:
+        if np.isfinite(row.value):  # as skills are told
+            drawn.setdefault(row.recording, []).append(row.value)
+    told = []
+    for row in theirs:
+        default = float(np.mean(drawn.get(row.recording, [np.nan])))
+        value = skill(row.value, default, float(row.floor or 0))
+        if not np.isnan(value):
+            told.append(replace(row, value=value))
+    return Draws(_span(theirs, np.inf), _span(told, -np.inf))
 
 
-def _mean_of(rows: list[Row], values: list[float], diverged: float) -> float:
-    """The mean over fabrics of the means over recordings; `diverged` where one is not finite."""
-    if not np.isfinite(values).all():
-        return diverged
-    of_fabric: dict[str, list[float]] = {}
-    for row, value in zip(rows, values, strict=True):
-        of_fabric.setdefault(row.fabric, []).append(value)
-    return float(np.mean([np.mean(each) for each in of_fabric.values()]))
+def _span(rows: list[Row], diverged: float) -> tuple[float, float]:
+    """Means over fabrics of the least and the largest draw of each, which is the mean over its
+    recordings; `diverged` where one is not finite."""
+    values: dict[str, dict[str, list[float]]] = {}
+    for row in rows:
+        values.setdefault(row.fabric, {}).setdefault(row.repeat, []).append(row.value)
+    of_fabric = [
+        [float(np.mean(each)) if np.isfinite(each).all() else diverged for each in own.values()]
+        for own in values.values()
+    ]
+    if not of_fabric:
+        return np.nan, np.nan
+    least, largest = (float(np.mean([pick(own) for own in of_fabric])) for pick in (min, max))
+    return least, largest
 
 
 def _is_of(row: Row, motion: str, configuration: Configuration) -> bool:
