@@ -10,10 +10,11 @@ from r2s.evaluation.crossed import interval
 from r2s.evaluation.statistics import SIGNIFICANCE
 from r2s.study.configuration import MOTIONS
 from r2s.study.statistics.conclusions import LIFTING, WIND
-from r2s.study.statistics.distances import means
+from r2s.study.statistics.distances import mean_over_fabrics, means
 from r2s.study.statistics.findings import find_in
 from r2s.study.statistics.result_array import ResultArray, by_motion
 
+FLOOR, ABOVE, DEFAULTS = 2e-3, 30e-3, 0.3  # [m], [m], and of its logarithm between fabrics
 ALONE = Spread(*(0.0,) * len(Spread._fields))
 
 
@@ -25,6 +26,7 @@ class Measured(NamedTuple):
     - `told`, `told_alone`: comparisons of what differs that are significant the right way, after
       Holm's correction, and alone; NaN where nothing differs.
     - `held`: intervals of ratios that hold the truth. `means_held`: those of mean distances.
+    - `skills_held`: those of skills, beside defaults that vary between fabrics.
     """
 
     any_false: float
@@ -34,6 +36,7 @@ class Measured(NamedTuple):
     told_alone: float
     held: float
     means_held: float
+    skills_held: float
 
 
 def effects_of(size: Size, ratio: float) -> Effects:
@@ -55,8 +58,11 @@ def measure(size: Size, spread: Spread, ratio: float, studies: int, seed: int = 
     found = []
     for i in range(studies):
         results = made_up(size, spread, effects, seed + i)
-        found.append((*_scores(results, truth), _means_held(results, spread, effects)))
-    p, corrected, held, right, means_held = (np.array(each) for each in zip(*found, strict=True))
+        own = results, spread, effects
+        found.append((*_scores(results, truth), _means_held(*own), _skills_held(*own, seed + i)))
+    p, corrected, held, right, means_held, skills_held = (
+        np.array(each) for each in zip(*found, strict=True)
+    )
     alike, differs = np.abs(truth) < 1e-9, np.abs(truth) > 1e-9
     known = np.isfinite(p)
     alone = known & (p < SIGNIFICANCE)
@@ -70,6 +76,7 @@ def measure(size: Size, spread: Spread, ratio: float, studies: int, seed: int = 
         told_alone=float((alone & right)[:, differs].mean()) if differs.any() else np.nan,
         held=float(held[known].mean()),
         means_held=float(means_held.mean()),
+        skills_held=float(skills_held.mean()),
     )
 
 
@@ -102,4 +109,25 @@ def _means_held(results: ResultArray, spread: Spread, effects: Effects) -> list[
         found = means(part)
         truth = [spread.mean * np.exp(effects.get((c, motion), 0.0)) for c in part.configurations]
         held += ((found.low <= truth) & (truth <= found.high)).tolist()
+    return held
+
+
+def _skills_held(results: ResultArray, spread: Spread, effects: Effects, seed: int) -> list[bool]:
+    """Whether the interval of each configuration's skill in each motion holds the truth.
+
+    A fabric's default is drawn without regard to its errors, so that the mean skill is that of the
+    mean distance beside the mean of one over what default and floor differ by.
+    """
+    names = list(dict.fromkeys(each.fabric for each in results.trajectories))
+    generator = np.random.default_rng([seed, 1])
+    above = ABOVE * np.exp(DEFAULTS * generator.normal(size=len(names)))
+    mean = float(np.exp(DEFAULTS**2 / 2)) / ABOVE  # of one over it
+    held = []
+    for motion, part in by_motion(results).items():
+        whose = np.array([above[names.index(each.fabric)] for each in part.trajectories])
+        told = 1 - (part.values - FLOOR) / whose[:, None]
+        for c, values in zip(part.configurations, told, strict=True):
+            distance = spread.mean * np.exp(effects.get((c, motion), 0.0))
+            low, high = interval(mean_over_fabrics(part, values))
+            held.append(bool(low <= 1 - (distance - FLOOR) * mean <= high))
     return held

@@ -29,7 +29,7 @@ def line(preset: str, words: str, ratio: float, found: Measured) -> Line:
     """The line of a table."""
     columns = (
         *("false in a study", "false alone", "the worst", "told", "told alone"),
-        *("ratios held", "means held"),
+        *("ratios held", "means held", "skills held"),
     )
     shares = [f"{100 * share:.1f} %" if np.isfinite(share) else "-" for share in found]
     told = dict(zip(columns, shares, strict=True))
