@@ -1,13 +1,11 @@
 """How much of what MuJoCo's sheet does in a fling is its air's?
 
-python experiments/air_in_mujoco.py --out docs/results/air_in_mujoco.csv    # half an hour
+python experiments/air_in_mujoco.py --out docs/results/air_in_mujoco.csv    # after skill_in_mujoco.py: a few minutes
 
-MuJoCo's own material in the laws of r2s, and estimates of it from its lift and from its lift and a
-fling, predict the first fling and shaking that they have not seen, in the air that r2s has
-(`r2s.world.air`: a drag coefficient of 2 normal to the sheet, 0.02 along it) and in others. The
-estimate from lift and fling finds the force of the air, too, which it holds in doubt by half, and
-predicts with what it found. Errors are mean distances up to the horizon, beside floor and default.
-Needs r2s[mujoco].
+MuJoCo's own material in the laws of r2s, and the estimate of it from its lift, predict its first
+fling and shaking in the air that r2s has (`r2s.world.air`: a drag coefficient of 2 normal to the
+sheet, 0.02 along it) and in others. Errors are mean distances up to the horizon, beside floor and
+default. Needs r2s[mujoco].
 """
 
 from functools import partial
@@ -16,7 +14,7 @@ from pathlib import Path
 from _air import moved_in_air
 from _tables import Line, command_line, resumed
 
-MATERIAL, LIFT, BOTH = "its material", "estimate from lift", "estimate from lift and fling"
+MATERIAL, LIFT = "its material", "estimate from lift"
 AIRS = ((2.0, 0.02), (1.0, 0.02), (1.0, 1.0), (0.0, 0.0))  # across and along the sheet
 CAPTION = (
     "Of MuJoCo's sheet: mean distances [mm] up to the horizon, and skill, by coefficients of the "
@@ -33,5 +31,4 @@ if __name__ == "__main__":
         for fabric in (MATERIAL, LIFT)
         for drag, skin in AIRS
     ]
-    jobs.append({"fabric": BOTH, "drag": "found", "skin friction": "found"})
     resumed(a.out, CAPTION, jobs, partial(moved_in_air, a.folder))
