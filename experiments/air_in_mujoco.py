@@ -2,10 +2,10 @@
 
 python experiments/air_in_mujoco.py --out docs/results/air_in_mujoco.csv    # minutes
 
-After `skill_in_mujoco.py`, whose cells it needs: MuJoCo's own material in the laws of r2s, and the estimate of it from its lift, predict its first
-fling and shaking in the air that r2s has (`r2s.world.air`: a drag coefficient of 2 normal to the
-sheet, 0.02 along it) and in others. Errors are mean distances up to the horizon, beside floor and
-default. Needs r2s[mujoco].
+After `skill_in_mujoco.py`, whose cells it needs. MuJoCo's own material in the laws of r2s, and the
+estimate of it from its lift, predict its first fling and shaking in the air that r2s has
+(`r2s.world.air`: a drag coefficient of 2 normal to the sheet, 0.02 along it) and in others. Errors
+are mean distances up to the horizon, beside floor and default. Needs r2s[mujoco].
 """
 
 from functools import partial
