@@ -1,7 +1,7 @@
 """Does a study find the same by another kind of processor's instructions?
 
 make study; cp -r results other; rm -r other/cells/networks other/cells/estimates
-make study OUT=other ARGS="--no-cache" with XLA_FLAGS=--xla_cpu_max_isa=AVX2 in the environment
+make study OUT=other ARGS="--no-cache" with XLA_FLAGS=--xla_cpu_max_isa=SSE4_2 in the environment
 python experiments/other_processor.py results other --out docs/results/other_processor.csv
 
 Errors up to the horizon, their intervals over fabrics and skill by configuration, of two studies
@@ -28,7 +28,7 @@ def lines(folder: Path) -> dict[str, Line]:
 if __name__ == "__main__":
     parser = command_line(__doc__, "docs/results/other_processor.csv")
     parser.add_argument("studies", type=Path, nargs=2, help="folders of results")
-    parser.add_argument("--names", nargs=2, default=("AVX-512", "AVX2"), help="of the two")
+    parser.add_argument("--names", nargs=2, default=("AVX-512", "SSE4.2"), help="of the two")
     a = parser.parse_args()
     first, second = (lines(folder) for folder in a.studies)
     found: list[Line] = [
