@@ -71,7 +71,7 @@ UNITS = {"shift x": "m", "shift y": "m", "shift z": "m", "turn": "rad", "time": 
 def default_nuisance_prior(scenario: Scenario, doubt: Doubt | None = None) -> NuisancePrior:
     """What is in doubt of a recording: the cameras' place, and the force of a wind that blows.
 
-    `doubt`: what the recording says of its own; None: the usual.
+    `doubt`: what the recording says of its own, of the air too; None: the usual.
 
     A sheet in wind weighs the air against its density to a part in five thousand. Were both taken
     as exact, an error of 1 % in either could be explained by half the stiffness.

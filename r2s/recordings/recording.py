@@ -68,7 +68,8 @@ class Doubt:
     - `turn`: of the same about the vertical, [rad].
     - `time`: of the cameras' clock against that of the grippers, [s].
     - `size`: of the sheet's side length, relative.
-    - `air`: of the force of still air at a speed of the sheet (its drag coefficient), relative.
+    - `air`: of the force of the air at its speed (its drag coefficient), relative; 0: exact, but
+      for a wind that blows, whose force an estimate always doubts.
 
     Raises ValueError for one that is negative or not finite.
     """

@@ -65,8 +65,9 @@ def as_plate(material: Material = SHEET) -> Fabric:
     """The fabric of r2s whose membrane and bending are those of a material at small strain.
 
     A thin isotropic plate (Timoshenko and Woinowsky-Krieger, "Theory of plates and shells", 1959):
-    E h / (1 - nu^2) and E h^3 / (12 (1 - nu^2)). Hinges on triangles, air and contact are not the
-    fabric's, so it moves as the sheet does only in part.
+    E h / (1 - nu^2) [N/m], and E h^3 / (12 (1 - nu^2)) [N m] with a Poisson's ratio of bending of
+    zero, as other fabrics of r2s: alike where a sheet bends one way. Hinges on triangles, air and
+    contact are not the fabric's, so it moves as the sheet does only in part.
     """
     young, poisson, thickness = material.young, material.poisson, material.thickness
     stiff = young * thickness / (1 - poisson**2)
