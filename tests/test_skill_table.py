@@ -120,6 +120,15 @@ def test_numbers_are_those_of_the_definition():
     assert line(table, MIDDLE.label)["fling: skill"].startswith(f"{middle:.2f}")
 
 
+def test_what_is_estimated_on_points_has_a_line_of_its_own_on_the_cloth():
+    rows = made_up()
+    moved = [replace(row, approach="diffcp") for row in rows if row.approach == "pinn"]
+    on_cloth = [replace(row, baseline="on_cloth") for row in moved]
+    table = skill_table(with_floor([*rows, *on_cloth], METRIC), METRIC)
+    found = line(table, "DiffCP (found on points) cloth stretching")
+    assert list(found.values())[1:] == list(line(table, PINN.label).values())[1:]
+
+
 def test_the_interval_of_one_recording_and_repeat_is_students_over_fabrics():
     every = with_floor(made_up(), METRIC)
     rows = [row for row in every if row.recording.endswith("_0") and row.repeat in ("0", "")]

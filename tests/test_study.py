@@ -28,6 +28,7 @@ from r2s.scenarios.six import SIX
 from r2s.solver import Trajectory
 from r2s.study import engine, estimates, matrix, results
 from r2s.study.cells import dependencies, read_metadata, with_dependencies
+from r2s.study.comparisons import label_of
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
 from r2s.study.costs import costs, forecast
 from r2s.study.drawn import numbers_of
@@ -251,6 +252,19 @@ def test_the_middle_of_the_prior_stands_beside_every_estimate(tmp_path):
         assert one == other
 
 
+def test_what_is_estimated_on_points_is_judged_on_the_cloth_too():
+    """There alone are all fabrics simulated alike, in a way whose own error is below the floor."""
+    names = ["diffcp-points-lifting"]
+    cells = matrix.synthetic(matrix.with_changes(matrix.SMALL, names, ["grey_interlock"]))
+    both = {c.solver: c for c in cells if c.estimate is not None and c.scenario == "fling"}
+    assert (both["points"].baseline, both["cloth"].baseline) == ("", "on_cloth")
+    assert both["points"].estimate == both["cloth"].estimate
+    assert len({cell.name for cell in cells}) == len(cells)
+    assert {c.solver for c in cells if c.baseline == "default"} == {"cloth", "points"}
+    assert label_of(both["cloth"]) == "DiffCP (found on points) cloth lifting"
+    assert label_of(both["points"]) == "DiffCP points lifting"
+
+
 def test_a_lift_and_the_pulls_of_the_network_are_estimated_from_together():
     names = ["diffcloud-cloth-lifting+stretching", "pinn-cloth-stretching"]
     plan = matrix.with_changes(matrix.SMALL, names, ["grey_interlock", "mujoco_flex"])  # of all
@@ -437,3 +451,7 @@ def test_given_recordings_are_shown_one_by_one():
     )
     assert found.caption == "DIFFCLOUD cloth lifting: chamfer_real_to_sim [mm] on folding"
     assert recording_tables(rows[:2]) == {}  # as those of synthetic recordings
+    on_points = [dataclasses.replace(each, solver="points") for each in rows[:3]]
+    on_cloth = dataclasses.replace(rows[0], baseline="on_cloth", value=0.015)
+    (found,) = recording_tables([*on_points, on_cloth]).values()
+    assert dict(zip(found.header, found.rows[0], strict=True))["on cloth [mm]"] == "15.0"

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from r2s.geometry.mesh import rectangle
 from r2s.recordings.recording import cloud
-from r2s.study.configuration import REFERENCES, Configuration
+from r2s.study.configuration import ON_CLOTH, as_configuration
 from r2s.study.evaluations import EvaluationCell, read_distances, read_motions
 from r2s.study.report.motions import MotionComparison
 from r2s.study.sources import Source, read
@@ -40,16 +40,14 @@ def motion_comparisons(cells: Iterable[EvaluationCell], folder: Path) -> list[Mo
 
 def label_of(cell: EvaluationCell) -> str:
     """What pictures and tables call the fabric that a cell judges."""
-    if cell.baseline in REFERENCES:
-        return Configuration(REFERENCES[cell.baseline], cell.solver, "").label
-    return cell.configuration.label
+    return as_configuration(cell.configuration, cell.baseline).label
 
 
 def _compared(source: Source, group: Group, folder: Path) -> MotionComparison:
     recording = read(source, folder)
     first, last = recording.info.frames_used
     judged = judged_motion(source, folder)
-    rank = {"": 0, "true": 1, "middle": 2, "default": 3}
+    rank = {"": 0, ON_CLOTH: 0, "true": 1, "middle": 2, "default": 3}
     ordered = sorted(group.items(), key=lambda each: rank[each[1][0].baseline])
     errors, motions, faces = {}, {}, {}
     for label, cells in ordered:

@@ -7,6 +7,8 @@ AND = "+"  # between scenarios that are estimated from together
 MOTIONS = ("folding", "fling", "shaking")  # that no estimate has seen
 # baselines that are configurations as well, and what stands for an approach in their labels
 REFERENCES = {"true": "true fabric on", "middle": "middle of the prior on"}
+# the baseline of what an estimate on material points predicts on the cloth, as all others do
+ON_CLOTH = "on_cloth"
 
 
 class Configuration(NamedTuple):
@@ -30,6 +32,17 @@ class Configuration(NamedTuple):
             return f"default {self.solver}"
         named = APPROACHES.get(self.approach, self.approach)
         return f"{named} {self.solver} {self.estimated_from}".strip()
+
+
+def as_configuration(configuration: Configuration, baseline: str) -> Configuration:
+    """What a table calls a baseline that is a line of its own; any other as it is."""
+    if baseline in REFERENCES:
+        return Configuration(REFERENCES[baseline], configuration.solver, "")
+    words = {"other_fabric": "of another fabric", ON_CLOTH: "found on points"}.get(baseline)
+    if words is None:
+        return configuration
+    named = APPROACHES.get(configuration.approach, configuration.approach)
+    return configuration._replace(approach=f"{named} ({words})")
 
 
 def is_reference(label: str) -> bool:

@@ -28,7 +28,7 @@ from r2s.scenarios.in_explicit_steps import explicit_cloth
 from r2s.scenarios.on_points import EDGE, MEMBRANE_DAMPING, grid_around
 from r2s.scenarios.scenario import Scenario, from_recording
 from r2s.study.cells import Cell, result_files
-from r2s.study.configuration import Configuration
+from r2s.study.configuration import ON_CLOTH, Configuration
 from r2s.study.estimates import EstimateCell, read_estimate
 from r2s.study.mujoco_recording import MujocoRecording
 from r2s.study.mujoco_sheet import as_plate
@@ -37,8 +37,8 @@ from r2s.study.starts import started
 
 MIDDLE = -1  # instead of the number of a draw
 MEASURED, MOTION = "measured.json", "motion.npz"
-# vertices of the simulated sheet: with 25 x 25 a fling of grey interlock is 7 mm off
-SHAPES = {"cloth": (33, 33), "points": (9, 9)}
+# vertices of the simulated sheet: with 25 x 25 of the cloth a fling of grey interlock is 7 mm off
+SHAPES = {"cloth": (33, 33), "points": (17, 17)}
 # substeps a second, above which implicit steps, of so many seconds, are three times as fast
 MOST, IMPLICIT = 150_000, 1 / 240
 RETRIES = (2, 4)  # times the substeps, of a prediction that was lost
@@ -50,7 +50,8 @@ class EvaluationCell(Cell):
     """How near simulations of a fabric come to recordings of one scenario.
 
     - `estimate`: whose fabric is judged; None: that of a draw, or the true one.
-    - `solver`: "cloth", in explicit steps on `SHAPE`, or "points", on `ON_POINTS`.
+    - `solver`: "cloth", in explicit steps, or "points", on `SHAPES`. What was estimated on points
+      is judged on both: whose fabric is nearer is told where all are simulated alike.
     - `density`: areal, [kg/m^2].
     - `recordings`: what it is judged by, together, since they compile once.
     - `draw`: a number of `r2s.fabrics.prior.draws`, which know the density alone: together these
@@ -77,7 +78,9 @@ class EvaluationCell(Cell):
     def baseline(self) -> str:
         """As in `r2s.study.rows.Row`."""
         if self.estimate is not None:
-            return "other_fabric" if self.other else ""
+            if self.other:
+                return "other_fabric"
+            return "" if self.solver == self.estimate.solver else ON_CLOTH
         if self.draw is None:
             return "true"
         return "middle" if self.draw == MIDDLE else "default"
@@ -107,6 +110,7 @@ class EvaluationCell(Cell):
         if self.estimate is not None:
             whose = self.estimate.name
         on = f"{self.fabric}_" if self.other else ""
+        on += "cloth_" if self.baseline == ON_CLOTH else ""
         return f"{whose}_on_{on}{self.scenario}_{self.recordings[0].name.split('_')[-1]}"
 
     @property

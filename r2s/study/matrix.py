@@ -264,7 +264,10 @@ def _evaluations(
 
     `judged`: the recordings of each scenario.
     """
-    solvers = dict.fromkeys(estimate.solver for estimate in estimates)
+    if not estimates:
+        return []
+    # the cloth always: what is estimated on points is judged on it, too
+    solvers = dict.fromkeys(("cloth", *(estimate.solver for estimate in estimates)))
     judged = list(judged)
     is_known = all(
         isinstance(each, MujocoRecording)  # its material, in the laws of r2s
@@ -277,6 +280,7 @@ def _evaluations(
         whose += [(None, solver, draw) for draw in (*range(plan.draws), MIDDLE)]
         whose += [(None, solver, None)] if is_known else []
     whose += [(each, each.solver, None) for each in estimates]
+    whose += [(each, "cloth", None) for each in estimates if each.solver != "cloth"]
     return [
         EvaluationCell(
             estimate,

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from r2s.files import write_text
-from r2s.study.configuration import Configuration
+from r2s.study.configuration import ON_CLOTH, Configuration
 
 # The values of Row.baseline, and what a table calls them.
 BASELINES = {"": "estimate"} | {
     name: name.replace("_", " ")
-    for name in ("default", "middle", "true", "other_fabric", "repeatability")
+    for name in ("default", "middle", "true", ON_CLOTH, "other_fabric", "repeatability")
 }
 
 
@@ -23,7 +23,8 @@ class Row:
     """One number of an estimate on a recording.
 
     - `repeat`: tells apart estimates of one configuration: from other recordings, or other seeds.
-    - `baseline`: "" for the estimate itself, else what it is compared with, see `BASELINES`.
+    - `baseline`: "" for the estimate itself, else what it is compared with, see `BASELINES`;
+      "on_cloth" for what an estimate on material points predicts on the cloth.
     - `unit`: SI, or "-" for a number without one. `value` is in that unit.
     - `floor`: what the recording itself is known to, in that unit. `horizon`: until when it tells
       fabrics apart, [s]. `skill`: see `r2s.evaluation.horizon`. None: not known, or not told.

@@ -9,7 +9,7 @@ from jaxtyping import Float, Integer
 
 from r2s.evaluation.crossed import CrossedMean, crossed_mean, interval
 from r2s.evaluation.statistics import LEVEL
-from r2s.study.configuration import APPROACHES, REFERENCES, Configuration
+from r2s.study.configuration import Configuration, as_configuration
 from r2s.study.rows import Row, by_metric
 from r2s.study.statistics.result_array import (
     ResultArray,
@@ -131,7 +131,7 @@ def distance_table(rows: Sequence[Row], metric: str) -> Table:
     """The table of one metric: a line a configuration, a cell a motion with mean and interval.
 
     The last column, "own", is what each was estimated from. The last lines are what to compare
-    with: default fabrics, `REFERENCES`, estimates of another fabric, another trial. Metres are
+    with: default fabrics, and what `with_references` adds. Metres are
     shown in millimetres.
     """
     rows = with_references(rows)
@@ -153,18 +153,17 @@ def distance_table(rows: Sequence[Row], metric: str) -> Table:
 
 
 def with_references(rows: Iterable[Row]) -> list[Row]:
-    """Rows in which `REFERENCES`, estimates of another fabric, and another trial are configurations
-    as well."""
+    """Rows in which `REFERENCES`, estimates of another fabric, those on material points as the
+    cloth predicts them, and another trial are configurations as well."""
     rows = list(rows)
     found = []
     for row in rows:
-        name = APPROACHES.get(row.approach, row.approach)
-        if row.baseline == "other_fabric":
-            found.append(replace(row, baseline="", approach=f"{name} (of another fabric)"))
-        elif row.baseline in REFERENCES:
-            found.append(replace(row, baseline="", approach=REFERENCES[row.baseline]))
-        elif row.baseline == "repeatability":
+        if row.baseline == "repeatability":
             found.append(replace(row, baseline="", approach="another trial"))
+        elif row.baseline not in ("", "default"):
+            own = Configuration(row.approach, row.solver, row.estimated_from)
+            named = as_configuration(own, row.baseline)._asdict()
+            found.append(replace(row, baseline="", **named))
     return rows + found
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from r2s.study.configuration import Configuration
+from r2s.study.configuration import ON_CLOTH, Configuration
 from r2s.study.rows import BASELINES, Row
 from r2s.study.tables import MISSING, Table
 
@@ -36,6 +36,8 @@ def _belongs(row: Row, configuration: Configuration) -> bool:
     """Whether a row is of a configuration, or of what it is compared with."""
     approach, solver, scenario = configuration
     source = row.approach, row.estimated_from
+    if row.baseline == ON_CLOTH:
+        return solver == "points" and source == (approach, scenario)
     return source in ((approach, scenario), ("", "")) and row.solver in (solver, "")
 
 
@@ -46,27 +48,28 @@ def _table(configuration: Configuration, rows: Sequence[Row]) -> Table:
         places.setdefault(row.baseline, []).append(row.value)
     # of estimates the first, of the default all draws
     errors = {
-        names: {
+        which: {
             baseline: float(np.mean(values if baseline == "default" else values[:1]))
             for baseline, values in found.items()
         }
-        for names, found in every.items()
+        for which, found in every.items()
     }
     lines = list(errors.values())
-    of_all = {name: _mean([each[name] for each in lines if name in each]) for name in BASELINES}
+    names = [each for each in BASELINES if each != ON_CLOTH or configuration.solver == "points"]
+    of_all = [_mean([each[name] for each in lines if name in each]) for name in names]
     return Table(
-        header=("fabric", "recording", *(f"{words} [mm]" for words in BASELINES.values())),
+        header=("fabric", "recording", *(f"{BASELINES[name]} [mm]" for name in names)),
         rows=(
-            *((*names, *_cells(line)) for names, line in errors.items()),
-            ("mean", "", *of_all.values()),
+            *((*which, *_cells(line, names)) for which, line in errors.items()),
+            ("mean", "", *of_all),
         ),
         caption=f"{configuration.label}: {METRIC} [mm] on {rows[0].evaluated_on}",
         foot=1,
     )
 
 
-def _cells(line: dict[str, float]) -> list[str]:
-    return [_shown(line[name]) if name in line else MISSING for name in BASELINES]
+def _cells(line: dict[str, float], names: Sequence[str]) -> list[str]:
+    return [_shown(line[name]) if name in line else MISSING for name in names]
 
 
 def _mean(values: Sequence[float]) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from r2s.evaluation.crossed import CrossedMean, interval, units_needed
 from r2s.evaluation.horizon import skill
 from r2s.evaluation.statistics import SIGNIFICANCE
-from r2s.study.configuration import REFERENCES, Configuration
+from r2s.study.configuration import ON_CLOTH, REFERENCES, Configuration
 from r2s.study.rows import Row
 from r2s.study.statistics.distances import mean_over_fabrics, with_references
 from r2s.study.statistics.result_array import ResultArray, result_array, select
@@ -49,11 +49,11 @@ class Skill(NamedTuple):
 
 
 def with_floor(rows: Iterable[Row], metric: str) -> list[Row]:
-    """The rows of a metric that stand beside a floor, of estimates, `REFERENCES` and defaults; the
-    second are configurations in them."""
+    """The rows of a metric that stand beside a floor, of estimates (those of
+    material points on the cloth, too), `REFERENCES` and defaults."""
     known = [row for row in rows if row.metric == metric and row.floor is not None]
-    whose = [row for row in known if row.baseline in ("", "default", *REFERENCES)]
-    return [row for row in with_references(whose) if row.baseline not in REFERENCES]
+    whose = [row for row in known if row.baseline in ("", "default", *REFERENCES, ON_CLOTH)]
+    return [row for row in with_references(whose) if row.baseline in ("", "default")]
 
 
 def deciding(rows: Iterable[Row], metric: str) -> tuple[list[Row], list[str]]:
