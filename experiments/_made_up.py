@@ -27,17 +27,18 @@ class Size(NamedTuple):
     fabrics: int
     repeats: int
     judged: int
+    motions: tuple[str, ...] = MOTIONS
 
 
-def size_of(preset: str) -> Size:
-    """The size of a preset of the study.
+def size_of(preset: str, motions: tuple[str, ...] = MOTIONS) -> Size:
+    """The size of a preset of the study, with the motions that tell fabrics apart.
 
     Without the sheet of MuJoCo, which has not all configurations, and so is in no comparison.
     """
     plan = PRESETS[preset]
     ours = tuple(c for c in PAPER_CONFIGURATIONS if c in plan.configurations)
     fabrics = sum(fabric != FLEX for fabric in plan.fabrics)
-    return Size(ours, fabrics, plan.repeats, plan.judged)
+    return Size(ours, fabrics, plan.repeats, plan.judged, motions)
 
 
 class Spread(NamedTuple):
@@ -75,7 +76,7 @@ def made_up(size: Size, spread: Spread, effects: Effects, seed: int) -> ResultAr
     """The results of one study, [m]."""
     generator = np.random.default_rng(seed)
     names = size.configurations
-    shape = len(names), len(MOTIONS), size.fabrics, size.judged, size.repeats
+    shape = len(names), len(size.motions), size.fabrics, size.judged, size.repeats
 
     def drawn(deviation: float, axes: str) -> Float[np.ndarray, "..."]:
         own = [n if axis in axes.split() else 1 for n, axis in zip(shape, AXES, strict=True)]
@@ -85,10 +86,10 @@ def made_up(size: Size, spread: Spread, effects: Effects, seed: int) -> ResultAr
     for deviation, axes in zip(spread, VARY, strict=True):
         logs += drawn(deviation, axes)
     for (configuration, motion), effect in effects.items():
-        logs[names.index(configuration), MOTIONS.index(motion)] += effect
+        logs[names.index(configuration), size.motions.index(motion)] += effect
     trajectories = tuple(
         Trajectory(f"fabric{fabric}", motion, f"{motion}_fabric{fabric}_u{number}")
-        for motion in MOTIONS
+        for motion in size.motions
         for fabric in range(size.fabrics)
         for number in range(size.judged)
     )

@@ -8,7 +8,6 @@ from jaxtyping import Float
 
 from r2s.evaluation.crossed import interval
 from r2s.evaluation.statistics import SIGNIFICANCE
-from r2s.study.configuration import MOTIONS
 from r2s.study.statistics.conclusions import LIFTING, WIND
 from r2s.study.statistics.distances import mean_over_fabrics, means
 from r2s.study.statistics.findings import find_in
@@ -44,9 +43,9 @@ def effects_of(size: Size, ratio: float) -> Effects:
     found = {
         (c, motion): np.log(ratio) * (motion != "folding")
         for c in size.configurations
-        for motion in MOTIONS
+        for motion in size.motions
     }
-    for motion in MOTIONS:
+    for motion in size.motions:
         found[LIFTING if motion == "folding" else WIND, motion] += np.log(ratio)
     return found
 

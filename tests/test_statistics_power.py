@@ -21,7 +21,7 @@ def experiments(monkeypatch: pytest.MonkeyPatch):
 def measured(preset, words, ratio, studies, seed):
     driver = importlib.import_module("statistics_power")
     spread = driver.SPREADS[words]
-    return driver.measure(driver.size_of(preset), spread, ratio, studies, seed)
+    return driver.measure(driver.SIZES[preset], spread, ratio, studies, seed)
 
 
 def test_the_sizes_are_those_of_the_presets_with_the_fabrics_that_are_compared():
@@ -45,7 +45,9 @@ def test_the_paper_s_size_tells_what_is_three_times_as_far():
 
 @pytest.mark.slow(group="study")
 @pytest.mark.parametrize("words", ["15 %", "30 %", "15 %, between motions as much"])
-@pytest.mark.parametrize(("preset", "studies"), [("small", 2000), ("paper", 1000)])
+@pytest.mark.parametrize(
+    ("preset", "studies"), [("small", 2000), ("paper", 1000), ("paper, without folds", 1000)]
+)
 def test_studies_with_nothing_to_find(preset, studies, words):
     found = measured(preset, words, 1.0, studies, 10_000)
     assert found.any_false <= 0.06 and found.false <= 0.06, found
