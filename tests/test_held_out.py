@@ -11,6 +11,7 @@ from r2s.estimation import held_out
 from r2s.estimation.held_out import HeldOut
 from r2s.fabrics import presets
 from r2s.scenarios import synthetic
+from r2s.scenarios.scenario import in_denser_air, rollout
 
 SHAPE = (5, 5)
 
@@ -67,6 +68,20 @@ def test_the_true_fabric_is_better_than_draws_and_a_wrong_one_is_not(lift):
     board = dataclasses.replace(board, bending=jax.tree.map(lambda b: 1e4 * b, true.bending))
     wrong = held_out.judge(lift, board, SHAPE, count=3)
     assert not wrong.is_better and wrong.defaults == found.defaults
+
+
+def test_a_motion_is_judged_in_the_air_that_was_found():
+    fabric, thick = presets.grey_interlock(), 5.0
+    experiment = scenarios.fling(num_frames=24)
+    motion = rollout(in_denser_air(experiment.scenario(SHAPE), thick), fabric)
+    fling = synthetic.record(
+        experiment, fabric, "interlock", shape=SHAPE, motion=motion, key=jax.random.key(0)
+    )
+    found, written = (
+        held_out.judge(fling, fabric, SHAPE, count=2, air=air) for air in (thick, 1.0)
+    )
+    assert found.error < 0.5 * written.error
+    assert found.defaults != written.defaults
 
 
 def test_a_run_that_diverged_is_no_better_than_anything():

@@ -160,7 +160,9 @@ class EstimateCard:
             for each in unseen:
                 tell(progress, f"judging by {each.info.name}")
                 shape = found.shape or COARSEST
-                judged.append(held_out.judge(each, found.fabric, shape).describe())
+                air = held_out.air_found(found)
+                told_by = held_out.judge(each, found.fabric, shape, air=air)
+                judged.append(told_by.describe())
         sources = [each.info.source for each in seen] + [each.source for each in known]
         provenance = cards.Provenance(
             method="; ".join(

@@ -10,16 +10,18 @@ from typing import NamedTuple
 import jax.random as jr
 import numpy as np
 
+from r2s.estimation.estimate import Estimate
 from r2s.estimation.mesh_ladder import in_steps_worth
 from r2s.evaluation import prediction_error
 from r2s.fabrics import prior
 from r2s.fabrics.fabric import Fabric
 from r2s.recordings.recording import Recording, clouds_are_markers
-from r2s.scenarios.scenario import from_recording
+from r2s.scenarios.scenario import from_recording, in_denser_air
 
 FEWEST = 3  # recordings, of which one is held out without being asked for
 NONE = "none"  # the name by which no recording is held out
 DRAWS = 8
+AIR = "air ratio"  # the nuisance, of `r2s.estimation.prediction`
 
 
 class HeldOut(NamedTuple):
@@ -101,21 +103,33 @@ def has_clouds(recording: Recording) -> bool:
 
 
 def judge(
-    recording: Recording, fabric: Fabric, shape: tuple[int, int], count: int = DRAWS
+    recording: Recording,
+    fabric: Fabric,
+    shape: tuple[int, int],
+    count: int = DRAWS,
+    air: float = 1.0,
 ) -> HeldOut:
     """The errors of a fabric and of `count` draws of its density in a recording.
 
     All are simulated by the cloth on a mesh of `shape`, in the steps that an estimate takes there
-    (`r2s.estimation.mesh_ladder.in_steps_worth`). Air, size and cameras are as written down.
+    (`r2s.estimation.mesh_ladder.in_steps_worth`). `air`: times the density of the air as written
+    down, for all alike: what an estimate found along with the fabric (`air_found`), where that was
+    in doubt. Size and cameras are as written down.
     """
     each = prior.fabrics(float(fabric.density), count, jr.key(0))
-    error, *others = (_error(recording, one, shape) for one in (fabric, *each))
+    error, *others = (_error(recording, one, shape, air) for one in (fabric, *each))
     finite = tuple(other for other in others if np.isfinite(other))
     return HeldOut(recording.info.name, error, finite, count - len(finite))
 
 
-def _error(recording: Recording, fabric: Fabric, shape: tuple[int, int]) -> float:
-    scenario = from_recording(recording, shape)
+def air_found(estimate: Estimate) -> float:
+    """The density of the air over that written down; 1 where it was not in doubt."""
+    found = [each.value for each in estimate.nuisances if each.name == AIR]
+    return found[0] if found else 1.0
+
+
+def _error(recording: Recording, fabric: Fabric, shape: tuple[int, int], air: float) -> float:
+    scenario = in_denser_air(from_recording(recording, shape), air)
     scenario = in_steps_worth(scenario, recording.info.scenario, shape)
     x = prediction_error.predict_motion(scenario, fabric).x
     away = prediction_error.from_surface(recording, x, shape)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from r2s.estimation.problem import OWN, SHARED, Problem
 from r2s.fabrics.fabric import Fabric
 from r2s.scenarios.energy import clamp_force, energy_balance
-from r2s.scenarios.scenario import resized, rollout
+from r2s.scenarios.scenario import in_denser_air, resized, rollout
 
 Theta = Float[Array, " theta"]
 
@@ -142,19 +142,13 @@ def explain(problem: Problem, theta: Theta) -> str:
 def _conditions(problem: Problem, theta: Theta):
     """Scenario, fabric and solver (None: the cloth) at a theta."""
     ratio = jnp.exp(problem.nuisance_prior.air * theta[problem.space.dim + 1])
-
-    def thicken(part):
-        return eqx.tree_at(
-            lambda part: part.scene.air.density, part, replace_fn=lambda density: density * ratio
-        )
-
     size = problem.nuisance_prior.size
     if size and problem.solver is not None:
         raise ValueError("the size of the sheet is estimated on the cloth alone")
-    scenario = thicken(problem.scenario)
+    scenario = in_denser_air(problem.scenario, ratio)
     if size:
         scenario = resized(scenario, jnp.exp(size * theta[problem.space.dim + 2]))
-    solver = None if problem.solver is None else thicken(problem.solver)
+    solver = None if problem.solver is None else in_denser_air(problem.solver, ratio)
     return scenario, fabric_at(problem, theta), solver
 
 

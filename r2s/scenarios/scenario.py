@@ -263,6 +263,13 @@ def resized(scenario: Scenario, ratio: Float[Array, ""]) -> Scenario:
     return dataclasses.replace(scenario, scene=scene, start=grown(scenario.start), path=path)
 
 
+def in_denser_air(part: Any, ratio: Float[Array, ""] | float) -> Any:
+    """A scenario, or a solver of one, whose air has `ratio` times the density, and force."""
+    return eqx.tree_at(
+        lambda part: part.scene.air.density, part, replace_fn=lambda density: density * ratio
+    )
+
+
 def rollout(
     scenario: Scenario,
     fabric: Fabric,
