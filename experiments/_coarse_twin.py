@@ -1,0 +1,77 @@
+"""What a coarse sheet fits to a fabric's motions, and how it then moves."""
+
+from pathlib import Path
+
+import jax
+import jax.random as jr
+import numpy as np
+from _tables import Line
+
+from r2s.estimation.registry import METHODS
+from r2s.evaluation.prediction_error import from_surface
+from r2s.fabrics import prior
+from r2s.fabrics.fabric import Fabric
+from r2s.study import engine, verdicts
+from r2s.study.ensembles import ensemble_of
+from r2s.study.estimates import SHAPES, EstimateCell, read_estimate
+from r2s.study.evaluations import SHAPES as PREDICTED_ON
+from r2s.study.evaluations import predict
+from r2s.study.sources import SyntheticRecording, read, read_start, small_strain
+
+COARSE, FINE = SHAPES["cloth"], PREDICTED_ON["cloth"]
+FITTED_TO = {"lift": ("lifting",), "lift and fling": ("lifting", "fling")}
+BUDGET = METHODS["diffcloud"].budget._replace(coarse=16, starts=2, iterations=15)
+DRAWS = 4
+Shape = tuple[int, int]
+
+
+def line(folder: Path, motion: str, fabric: str) -> Line:
+    """The line of a table."""
+    source, truth = SyntheticRecording(fabric, motion, 0, True), small_strain(fabric)
+    fits = {name: _cell(fabric, float(truth.density), each) for name, each in FITTED_TO.items()}
+    _make([*fits.values(), ensemble_of(source)], folder)
+    judged = verdicts.judged_motion(source, folder)
+    assert judged is not None
+    recording, start = read(source, folder), read_start(source, folder)
+
+    def error(which: Fabric, shape: Shape) -> float:
+        (moved,) = predict([recording], which, "cloth", [start], shape)
+        return 1e3 * float(np.mean(from_surface(recording, moved.x, shape)[judged.inside]))
+
+    draws = prior.draws(float(truth.density), DRAWS, jr.key(0))
+    each = [jax.tree.map(lambda leaf, i=i: leaf[i], draws) for i in range(DRAWS)]
+    found: Line = {
+        "floor": f"{1e3 * float(np.mean(judged.floor[judged.inside])):.2f}",
+        "default": f"{np.mean([error(one, COARSE) for one in each]):.1f}",
+        "true fabric, fine": f"{error(truth, FINE):.2f}",
+        "true fabric": f"{error(truth, COARSE):.2f}",
+    }
+    for name, cell in fits.items():
+        estimate = read_estimate(cell, folder)
+        assert estimate is not None
+        found[f"fit to {name}"] = f"{error(estimate.fabric, COARSE):.2f}"
+        found[f"fit to {name}, fine"] = f"{error(estimate.fabric, FINE):.2f}"
+        found[f"fit to {name} over truth"] = _over(estimate.fabric, truth)
+    return found
+
+
+def _cell(fabric: str, density: float, scenarios: tuple[str, ...]) -> EstimateCell:
+    """A sheet of `COARSE` vertices that knows nothing beforehand."""
+    sources = tuple(SyntheticRecording(fabric, each, 0, False) for each in scenarios)
+    return EstimateCell("diffcloud", "cloth", fabric, sources, density, BUDGET)
+
+
+def _make(cells: list, folder: Path) -> None:
+    if failed := engine.run(cells, folder, engine.Serial()):
+        raise RuntimeError(f"{next(iter(failed.values()))}")
+
+
+def _over(one: Fabric, truth: Fabric) -> str:
+    return ", ".join(f"{a / b:.2f}" for a, b in zip(_numbers(one), _numbers(truth), strict=True))
+
+
+def _numbers(fabric: Fabric) -> list[float]:
+    """Warp, weft, shear, bending and damping."""
+    membrane = fabric.membrane
+    stiff = [membrane.c11, membrane.c22, membrane.c33]
+    return [float(each) for each in (*stiff, fabric.bending.stiffness, fabric.damping)]
