@@ -5,7 +5,8 @@ python experiments/coarse_twin.py --out docs/results/coarse_twin.csv      # half
 A sheet of 9 x 9 vertices is fitted to a lift of each fabric, and to a lift and a fling, with
 nothing known beforehand; what it fits is judged in a fling and a shaking that it has not seen, on
 its own mesh and on a fine one, beside the true fabric at small strain on both, and draws of the
-prior on its own. A simulator that can afford no finer mesh is best given the fabric whose error is least.
+prior on its own. A simulator that can afford no finer mesh is best given the fabric whose error
+is least.
 """
 
 from pathlib import Path
