@@ -1,6 +1,7 @@
 """What a coarse sheet fits to a fabric's motions, and how it then moves."""
 
 from pathlib import Path
+from zlib import crc32
 
 import jax
 import jax.random as jr
@@ -38,7 +39,8 @@ def line(folder: Path, motion: str, fabric: str) -> Line:
         (moved,) = predict([recording], which, "cloth", [start], shape)
         return 1e3 * float(np.mean(from_surface(recording, moved.x, shape)[judged.inside]))
 
-    draws = prior.draws(float(truth.density), DRAWS, jr.key(0))
+    key = jr.fold_in(jr.key(0), crc32(fabric.encode()))  # each fabric has draws of its own
+    draws = prior.draws(float(truth.density), DRAWS, key)
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], draws) for i in range(DRAWS)]
     found: Line = {
         "floor": f"{1e3 * float(np.mean(judged.floor[judged.inside])):.2f}",

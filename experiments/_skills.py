@@ -1,4 +1,7 @@
-"""What an estimate from a configuration's recordings of a fabric predicts, and what it found."""
+"""What an estimate from a configuration's recordings of a fabric predicts, and what it found.
+
+All is predicted on the cloth, what was estimated on material points, too.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,7 +16,7 @@ from r2s.estimation.estimate import Estimate
 from r2s.fabrics.fabric import Fabric
 from r2s.study import engine, results, verdicts
 from r2s.study.cells import read_metadata
-from r2s.study.configuration import MOTIONS
+from r2s.study.configuration import MOTIONS, ON_CLOTH
 from r2s.study.estimates import EstimateCell, read_estimate
 from r2s.study.evaluations import EvaluationCell
 from r2s.study.matrix import SMALL, configuration_named, synthetic
@@ -24,7 +27,12 @@ from r2s.study.verdicts import SURFACE
 
 JUDGED = ("fling", "shaking")
 OUTSIDE = "*"  # behind a number whose 90 % interval does not hold the truth
-NAMED = {"": "estimate", "true": "true fabric", "middle": "middle", "default": "default"}
+ESTIMATES = ("", ON_CLOTH)
+NAMED = {name: "estimate" for name in ESTIMATES} | {
+    "true": "true fabric",
+    "middle": "middle",
+    "default": "default",
+}
 
 
 def predicted(folder: Path, configuration: str, fabric: str, law: str) -> Line:
@@ -82,7 +90,9 @@ def _cells(
     return [
         cell
         for cell in synthetic(plan)
-        if cell.scenario in motions and (cell.estimate is None or cell.estimate.repeat == repeat)
+        if cell.scenario in motions
+        and cell.solver == "cloth"
+        and (cell.estimate is None or cell.estimate.repeat == repeat)
     ]
 
 
@@ -110,7 +120,7 @@ def _of(motion: str, rows: list[Row]) -> Line:
         values = [row.value for row in rows if row.baseline == baseline]
         if values:  # another simulator's sheet has no true fabric
             found[f"{motion}: {name}"] = _millimetres(float(np.mean(values)))
-    (skill,) = {row.skill for row in rows if row.baseline == ""}
+    (skill,) = {row.skill for row in rows if row.baseline in ESTIMATES}
     return found | {f"{motion}: skill": "not told" if skill is None else f"{skill:.2f}"}
 
 

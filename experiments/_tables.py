@@ -21,9 +21,16 @@ Line = dict[str, str]  # of a table, by column
 
 
 def made_by(cells: Iterable[Cell], folder: Path) -> Line:
-    """The sources that made the cells of a line, and all that these need: more than one is said."""
-    noted = (words.partition("source ")[2].partition(";")[0] for words in origins(cells, folder))
-    return {"made by source": ", ".join(sorted(each[:8] for each in noted))}
+    """The source that made the cells of a line, and all that these need.
+
+    Raises `ValueError` for more than one: figures of two sources are no table.
+    """
+    noted = {words.partition("source ")[2].partition(";")[0] for words in origins(cells, folder)}
+    if len(noted) > 1:
+        raise ValueError(
+            f"{folder}: made by several sources ({', '.join(sorted(noted))}); empty it"
+        )
+    return {"made by source": ", ".join(each[:8] for each in noted)}
 
 
 def command_line(document: str | None, out: str) -> argparse.ArgumentParser:

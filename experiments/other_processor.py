@@ -15,7 +15,8 @@ from _tables import Line, command_line, keep
 
 MOTIONS = ("fling", "shaking")
 CAPTION = (
-    "Error [mm] and skill by configuration, mean [90 % interval over fabrics], of two studies."
+    "Error [mm] and skill by configuration, mean [90 % interval over fabrics], of two studies. "
+    "Recordings, floors and references are the first's in both."
 )
 
 

@@ -16,7 +16,10 @@ from hypothesis import strategies as st
 
 from r2s.study import cells, engine
 from r2s.study.cells import Cell
+from r2s.study.ensembles import EnsembleCell
 from r2s.study.environment import environment, one_core
+from r2s.study.evaluations import SHAPES, EvaluationCell
+from r2s.study.starts import SETTLING
 from r2s.study.subprocesses import OneProcess
 
 
@@ -106,6 +109,13 @@ def test_the_key_depends_on_the_configuration_of_what_is_needed():
     assert Sum((Number(1),)).key != Sum((Number(2),)).key
     assert Sum((Sum((Number(1),)),)).key != Sum((Sum((Number(1, 0.5),)),)).key
     assert Number(1).key != Sum((Number(1),)).key
+
+
+def test_the_key_depends_on_the_settings_that_results_do(monkeypatch):
+    before, sum_before = Number(1).key, Sum((Number(1),)).key
+    monkeypatch.setattr(Number, "settings", ((33, 33),))
+    assert Number(1).key != before and Sum((Number(1),)).key != sum_before
+    assert SHAPES in EvaluationCell.settings and SETTLING in EnsembleCell.settings
 
 
 def test_a_damaged_result_is_made_again(tmp_path):

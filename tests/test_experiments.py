@@ -114,3 +114,14 @@ def test_an_exported_fabric_hangs_in_mujoco_as_ours_does(module) -> None:
     distance = np.sqrt(np.mean(np.sum((ours[-1] - theirs[-1]) ** 2, axis=-1))) / peer.SIDE
     moved = np.sqrt(np.mean(np.sum((ours[-1] - ours[0]) ** 2, axis=-1))) / peer.SIDE
     assert distance < 0.05 < moved
+
+
+@pytest.mark.parametrize("name", ["diffcp-points-lifting", "pinn-cloth-stretching"])
+def test_what_a_table_of_skills_compares_is_all_predicted_on_the_cloth(module, name: str) -> None:
+    pytest.importorskip("psutil", reason="needs r2s[study]")
+    cells = module("_skills")._cells(name, "grey_interlock", ("fling",))
+    assert {cell.solver for cell in cells} == {"cloth"}
+    whose = [cell.baseline for cell in cells]
+    assert len(whose) == 7 and whose.count("default") == 4  # draws, middle, truth, estimate
+    (estimate,) = (cell for cell in cells if cell.estimate is not None)
+    assert "-".join(estimate.estimate.name.split("_")[:3]) == name

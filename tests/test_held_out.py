@@ -4,12 +4,18 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from r2s import scenarios
 from r2s.estimation import held_out
+from r2s.estimation.descent import nuisances
+from r2s.estimation.estimate import point_estimate
 from r2s.estimation.held_out import HeldOut
+from r2s.estimation.problem import Problem
 from r2s.fabrics import presets
+from r2s.fabrics.parameters import OrthotropicSpace
+from r2s.recordings.recording import Doubt
 from r2s.scenarios import synthetic
 from r2s.scenarios.scenario import in_denser_air, rollout
 
@@ -82,6 +88,22 @@ def test_a_motion_is_judged_in_the_air_that_was_found():
     )
     assert found.error < 0.5 * written.error
     assert found.defaults != written.defaults
+
+
+def test_the_air_is_the_one_that_an_estimate_names_where_a_recording_doubts_it(lift):
+    doubt = Doubt((0.0, 0.0, 0.0), 0.0, air=0.5)
+    doubted = dataclasses.replace(lift, info=dataclasses.replace(lift.info, doubt=doubt))
+    space = OrthotropicSpace.make(float(presets.grey_interlock().density))
+    problem = Problem.make(doubted, space, shape=SHAPE)
+    theta = np.zeros(20)
+    theta[space.dim + 1] = -1.0  # a standard deviation less
+    found = nuisances((problem,), theta, theta)
+    middle, nothing = jnp.full(space.dim, 0.5), np.zeros((1, 1))
+    estimate = point_estimate("fake", space, middle, 0.0, nothing, nothing[None], 1.0)
+    estimate = dataclasses.replace(estimate, nuisances=found)
+    assert held_out.air_found(estimate, [lift, doubted]) == pytest.approx(np.exp(-0.5))
+    assert held_out.air_found(estimate, [lift]) == 1.0  # as of a wind, whose speed was in doubt
+    assert "in air 0.61 times" in HeldOut("fling", 4e-3, (8e-3,), 0, np.exp(-0.5)).describe()
 
 
 def test_a_run_that_diverged_is_no_better_than_anything():

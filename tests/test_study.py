@@ -253,7 +253,7 @@ def test_the_middle_of_the_prior_stands_beside_every_estimate(tmp_path):
 
 
 def test_what_is_estimated_on_points_is_judged_on_the_cloth_too():
-    """There alone are all fabrics simulated alike, in a way whose own error is below the floor."""
+    """There alone are all fabrics simulated alike, on the mesh of the truths."""
     names = ["diffcp-points-lifting"]
     cells = matrix.synthetic(matrix.with_changes(matrix.SMALL, names, ["grey_interlock"]))
     both = {c.solver: c for c in cells if c.estimate is not None and c.scenario == "fling"}
@@ -453,5 +453,5 @@ def test_given_recordings_are_shown_one_by_one():
     assert recording_tables(rows[:2]) == {}  # as those of synthetic recordings
     on_points = [dataclasses.replace(each, solver="points") for each in rows[:3]]
     on_cloth = dataclasses.replace(rows[0], baseline="on_cloth", value=0.015)
-    (found,) = recording_tables([*on_points, on_cloth]).values()
-    assert dict(zip(found.header, found.rows[0], strict=True))["on cloth [mm]"] == "15.0"
+    # beside references on points nothing stands that the cloth predicted
+    assert recording_tables([*on_points, on_cloth]) == recording_tables(on_points) != {}

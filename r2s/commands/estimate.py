@@ -160,7 +160,7 @@ class EstimateCard:
             for each in unseen:
                 tell(progress, f"judging by {each.info.name}")
                 shape = found.shape or COARSEST
-                air = held_out.air_found(found)
+                air = held_out.air_found(found, seen)
                 told_by = held_out.judge(each, found.fabric, shape, air=air)
                 judged.append(told_by.describe())
         sources = [each.info.source for each in seen] + [each.source for each in known]

@@ -31,12 +31,14 @@ class HeldOut(NamedTuple):
       over the frames that count, [m]; infinite where the simulation diverged.
     - `defaults`: the same of draws of the prior, without those that diverged, [m]. `diverged`: how
       many did.
+    - `air`: density of the air that all of them moved in, over that written down.
     """
 
     recording: str
     error: float
     defaults: tuple[float, ...]
     diverged: int
+    air: float = 1.0
 
     @property
     def is_better(self) -> bool:
@@ -50,7 +52,8 @@ class HeldOut(NamedTuple):
         least, most, mean = (_mm(each) for each in (errors.min(), errors.max(), errors.mean()))
         known = f"knowing nothing {mean} mm ({least} to {most}, {len(self.defaults)} draws{lost})"
         error = f"{_mm(self.error)} mm" if np.isfinite(self.error) else "the simulation diverged"
-        words = f"held out, {self.recording}: {error}; {known}"
+        air = "" if self.air == 1 else f" (all in air {self.air:.2f} times as dense, as found)"
+        words = f"held out, {self.recording}: {error}; {known}{air}"
         if self.is_better:
             best = self.error < min(self.defaults)
             return f"{words}: better than {'every draw' if best else 'the draws on average'}"
@@ -119,13 +122,17 @@ def judge(
     each = prior.fabrics(float(fabric.density), count, jr.key(0))
     error, *others = (_error(recording, one, shape, air) for one in (fabric, *each))
     finite = tuple(other for other in others if np.isfinite(other))
-    return HeldOut(recording.info.name, error, finite, count - len(finite))
+    return HeldOut(recording.info.name, error, finite, count - len(finite), air)
 
 
-def air_found(estimate: Estimate) -> float:
-    """The density of the air over that written down; 1 where it was not in doubt."""
-    found = [each.value for each in estimate.nuisances if each.name == AIR]
-    return found[0] if found else 1.0
+def air_found(estimate: Estimate, recordings: Sequence[Recording]) -> float:
+    """The density of the air over that written down, where one of the estimate's recordings held it
+    in doubt; else 1: what is estimated of a wind alone is how fast it was, which no other motion
+    has."""
+    if not any(each.info.doubt is not None and each.info.doubt.air for each in recordings):
+        return 1.0
+    (found,) = (each.value for each in estimate.nuisances if each.name == AIR)
+    return found
 
 
 def _error(recording: Recording, fabric: Fabric, shape: tuple[int, int], air: float) -> float:

@@ -34,10 +34,13 @@ class Cell:
 
     - `kind`: a folder for cells of this class.
     - `weight`: how long one takes, roughly, in CPU seconds: for the estimate of the time left.
+    - `settings`: the constants of its module that a result depends on, which are part of its key:
+      else a result of other meshes would be taken for one of these.
     """
 
     kind: ClassVar[str] = ""
     weight: ClassVar[float] = 1.0
+    settings: ClassVar[tuple[Any, ...]] = ()
 
     @property
     @abstractmethod
@@ -59,8 +62,11 @@ class Cell:
 
     @property
     def key(self) -> str:
-        """A hash of the configuration and of the inputs, whose configurations are part of it."""
-        return sha256(f"{FORMAT} {VERSIONS['r2s']} {self!r}".encode()).hexdigest()[:KEY_LENGTH]
+        """A hash of the configuration and of the inputs, whose configurations are part of it, and
+        of the settings of all these."""
+        settings = [each.settings for each in with_dependencies([self])]
+        text = f"{FORMAT} {VERSIONS['r2s']} {self!r} {settings!r}"
+        return sha256(text.encode()).hexdigest()[:KEY_LENGTH]
 
     def path(self, folder: Path) -> Path:
         """Where its result is, or will be."""

@@ -28,7 +28,7 @@ from r2s.scenarios.scenario import rollout
 from r2s.scenarios.six import Experiment
 from r2s.study.cells import Cell, result_files
 from r2s.study.sources import SyntheticRecording, read, strain_dependent
-from r2s.study.starts import started
+from r2s.study.starts import SETTLING, started
 
 ENSEMBLE = "ensemble.npz"
 STIFFNESS, PATH = 1e-3, 2e-4  # [-] and [m], either way: what no one can tell
@@ -53,6 +53,7 @@ class EnsembleCell(Cell):
 
     kind: ClassVar[str] = "ensembles"
     weight: ClassVar[float] = 60.0
+    settings: ClassVar[tuple[Any, ...]] = (STIFFNESS, PATH, FINER, COARSER, POINTS, SETTLING)
 
     recording: SyntheticRecording
     others: tuple[str, ...]

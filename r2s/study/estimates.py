@@ -81,6 +81,7 @@ class EstimateCell(Cell):
 
     kind: ClassVar[str] = "estimates"
     weight: ClassVar[float] = 40.0
+    settings: ClassVar[tuple[Any, ...]] = (SHAPES,)
 
     approach: str
     solver: str

@@ -33,12 +33,12 @@ from r2s.study.estimates import EstimateCell, read_estimate
 from r2s.study.mujoco_recording import MujocoRecording
 from r2s.study.mujoco_sheet import as_plate
 from r2s.study.sources import GivenRecording, Source, read, read_start, small_strain
-from r2s.study.starts import started
+from r2s.study.starts import SETTLING, started
 
 MIDDLE = -1  # instead of the number of a draw
 MEASURED, MOTION = "measured.json", "motion.npz"
 # vertices of the simulated sheet: with 25 x 25 of the cloth a fling of grey interlock is 7 mm off
-SHAPES = {"cloth": (33, 33), "points": (17, 17)}
+SHAPES = {"cloth": (33, 33), "points": (9, 9)}
 # substeps a second, above which implicit steps, of so many seconds, are three times as fast
 MOST, IMPLICIT = 150_000, 1 / 240
 RETRIES = (2, 4)  # times the substeps, of a prediction that was lost
@@ -64,6 +64,7 @@ class EvaluationCell(Cell):
 
     kind: ClassVar[str] = "evaluations"
     weight: ClassVar[float] = 8.0
+    settings: ClassVar[tuple[Any, ...]] = (SHAPES, MOST, IMPLICIT, RETRIES, LADDER, SETTLING)
 
     estimate: EstimateCell | None
     solver: str

@@ -259,8 +259,9 @@ def _evaluations(
     judged: Iterable[tuple[Source, ...]],
     plan: Plan,
 ) -> list[EvaluationCell]:
-    """Cells for estimates of a fabric, and first, on each of their solvers, for the draws that are
-    the default, the middle of their prior, and the true fabric where it is known.
+    """Cells for estimates of a fabric on their solver and on the cloth, and first, on all of these,
+    for the draws that are the default, the middle of their prior, and the true fabric where it is
+    known.
 
     `judged`: the recordings of each scenario.
     """

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from r2s.evaluation.surface_distance import to_surface
+from r2s.evaluation.surface_distance import POINTS, to_surface
 from r2s.recordings.recording import cloud
 from r2s.scenarios.six import Experiment
 from r2s.study.cells import Cell
@@ -39,6 +39,7 @@ class MujocoEnsemble(Cell):
 
     kind: ClassVar[str] = "ensembles"
     weight: ClassVar[float] = 200.0
+    settings: ClassVar[tuple[Any, ...]] = (STIFFNESS, PATH, FINER, COARSER, POINTS)
     lacks_layers: ClassVar[bool] = False
 
     recording: MujocoRecording

@@ -14,7 +14,7 @@ from r2s.scenarios import synthetic
 from r2s.scenarios.six import Experiment
 from r2s.study.cells import Cell
 from r2s.study.drawn import RECORDING, START, experiment_of, number_of
-from r2s.study.mujoco_sheet import Material, Resolution, moved
+from r2s.study.mujoco_sheet import GRIP, Material, Resolution, moved
 
 FABRIC = "mujoco_flex"
 SCENARIOS = ("lifting", "folding", "fling", "shaking")  # without fans and clamps
@@ -29,6 +29,7 @@ class MujocoRecording(Cell):
 
     kind: ClassVar[str] = "recordings"
     weight: ClassVar[float] = 60.0
+    settings: ClassVar[tuple[Any, ...]] = (GRIP,)
 
     scenario: str
     number: int = 0

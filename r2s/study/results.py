@@ -25,7 +25,7 @@ from r2s.study.origins import origins
 from r2s.study.report.data_table import data_table
 from r2s.study.report.parameter_ranges import range_table, truth_settings
 from r2s.study.report.truth_table import truth_table
-from r2s.study.rows import Row, write_rows
+from r2s.study.rows import Row, place_of, write_rows
 from r2s.study.sources import GivenRecording, SyntheticRecording, read, true_fabric
 from r2s.study.statistics.parameters import Estimated
 from r2s.study.statistics.recordings import recording_tables
@@ -150,7 +150,9 @@ def rows(cells: Iterable[EvaluationCell], folder: Path) -> list[Row]:
     """The rows of all cells that are made, in their order, then what two trials differ by."""
     cells = list(cells)
     found = [row for cell in cells if cell.is_made(folder) for row in _rows(cell, folder)]
-    return with_verdicts(found, cells, folder) + _repeatability(cells, folder)
+    # given trials may share some of what they are judged by, whose references are alike
+    once = list({place_of(row): row for row in reversed(found)}.values())[::-1]
+    return with_verdicts(once, cells, folder) + _repeatability(cells, folder)
 
 
 def _rows(cell: EvaluationCell, folder: Path) -> list[Row]:

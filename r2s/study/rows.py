@@ -64,6 +64,7 @@ class Row:
 
 HEADER = tuple(field.name for field in fields(Row))
 TEXTS = HEADER.index("value")  # columns before it are text
+place_of = attrgetter(*HEADER[: HEADER.index("unit")])  # what one number alone may have
 
 
 def write_rows(path: Path | str, rows: Iterable[Row]) -> None:

@@ -1,8 +1,10 @@
 """What a study estimates from and judges by: recordings, synthetic or given.
 
-Synthetic recordings are not the estimators' own model: their mesh is finer, their steps are
-shorter, and their fabrics stiffen with the strain and soften with the curvature, as measured ones
-do (DIFFCLOUD from a lift and pulls together estimates such laws, all others constant stiffness).
+Synthetic recordings are not the estimators' own model: but for folds, whose layers touch, their
+mesh is finer than the one that estimates begin on, their steps are shorter, and their fabrics
+stiffen with the strain and soften with the curvature, as measured ones do (DIFFCLOUD from a lift
+and pulls together estimates such laws, all others constant stiffness). Predictions have their mesh:
+what that does is in the floor, and in no error.
 Those of a sheet of MuJoCo are of another simulator altogether (`r2s.study.mujoco_recording`).
 """
 
@@ -96,6 +98,9 @@ class SyntheticRecording(Cell):
 
     kind: ClassVar[str] = "recordings"
     weight: ClassVar[float] = 15.0
+    settings: ClassVar[tuple[Any, ...]] = (
+        *(STRETCH, SOFTENING, KNEE, DAMPING, FRICTION, PULL_FRAMES, LAYERED),
+    )
 
     fabric: str
     scenario: str

@@ -86,7 +86,7 @@ def publish(
     sections = [
         *opening.picture_sections(out, motions, looks),
         *opening.skill_sections(out, shared, others, looks, keep),
-        *parts.findings_section(rows_of, metrics, decided, untold, paper, keep),
+        *parts.findings_section(rows_of.get(metric, []), metric, decided, untold, paper, keep),
         *parts.rank_section(out, decided, keep),
         *parts.factor_section(out, decided, keep),
         *_moving(out, motions, looks),
@@ -117,7 +117,8 @@ def _intro(
         f"Fabrics are estimated from one motion and judged on others that the estimate never saw: "
         f"{len(estimates)} configurations (approach, solver, and what it was estimated from), "
         f"{len(results.fabrics)} fabrics, {len(results.trajectories)} judged recordings, "
-        f"{results.present.sum()} simulations, of which {results.diverged.sum()} diverged; "
+        f"{results.present.sum()} simulations of these and the default, of which "
+        f"{results.diverged.sum()} diverged; "
         f"{len(missing)} cells are missing."
     )
     what = METRIC_WORDS.get(results.metric, results.metric)

@@ -25,7 +25,8 @@ CAPTION = (
 
 def range_table(cells: Iterable[EvaluationCell]) -> Table:
     """A line for each parameter of each solver, then for each number that stays as it is."""
-    cells = [cell for cell in cells if cell.estimate is not None]
+    # what is estimated on points is predicted on the cloth, too
+    cells = [c for c in cells if c.estimate is not None and c.solver == c.estimate.solver]
     lines: list[tuple[str, ...]] = []
     for solver in dict.fromkeys(cell.solver for cell in cells):
         own = [cell for cell in cells if cell.solver == solver]

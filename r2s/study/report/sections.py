@@ -17,25 +17,31 @@ from r2s.study.statistics.result_array import ResultArray, by_motion
 from r2s.study.tables import Table, significant
 
 NAMES = {METRICS[0]: "distance to the surface"}  # of metrics in a sentence
+BETWEEN_SOLVERS = (
+    "What is found between solvers is about the meshes that they predict on as much as about the "
+    'approaches, whose estimates are simulated alike in the lines "(found on points)" of the table '
+    "of skill. The true fabric itself is off by, on average,"
+)
 Keep = Callable[[str, Table], Table]  # writes a table under a name, and returns it
 
 
 def findings_section(
-    rows_of: Mapping[str, Sequence[Row]],
-    metrics: Sequence[str],
+    rows: Sequence[Row],
+    metric: str,
     results: ResultArray,
     untold: Sequence[str],
     paper: Paper,
     keep: Keep,
 ) -> list[Section]:
-    """The conclusions of the paper, by each of `metrics`; in words by the first of them.
+    """The conclusions of the paper by one metric: answers by several would be several chances to
+    find what is not there.
 
-    `untold`: recordings that are not among the first metric's, since they tell no fabrics apart.
+    `rows`: of the metric. `untold`: recordings that are not among these, since they tell no fabrics
+    apart.
     """
-    if not metrics:
+    if not rows:
         return [Section("Findings", ("There are no results yet.",))]
-    found = {metric: findings.find(rows_of[metric], paper, metric) for metric in metrics}
-    first = found[metrics[0]]
+    found = findings.find(rows, paper, metric)
     words = [
         *_headlines(results),
         "Each conclusion of the paper is a test on these numbers, meant for fabrics like these: "
@@ -43,27 +49,41 @@ def findings_section(
         "estimates it rests on. Ratios are of distances, or of what is named, with their interval; "
         "they are above 1 where the conclusion is right. All p are Student's t test with Holm's "
         "correction.",
-        *(findings.in_words(verdict) for verdict in first),
+        *(findings.in_words(verdict) for verdict in found),
+        *_solver_words(rows),
     ]
     if untold:
         words.insert(
             0,
-            f"By the {NAMES.get(metrics[0], metrics[0])} recordings count here, and in ranks and "
+            f"By the {NAMES.get(metric, metric)} recordings count here, and in ranks and "
             "factors below, in which the default is clearly above the floor. Not these "
             f"{len(untold)}, which tell no fabrics apart: {', '.join(untold)}.",
         )
     if not paper:
         words.append("The tables of the paper were not given: its own numbers are not shown.")
-    lines = tuple(
-        (first[i].claim.words, *(found[metric][i].answer for metric in metrics))
-        for i in range(len(first))
-    )
-    caption = f"Which conclusions of the paper ({CITED}) hold here, by metric"
+    lines = tuple((verdict.claim.words, verdict.answer) for verdict in found)
+    caption = f"Which conclusions of the paper ({CITED}) hold here"
     shown = (
-        keep("findings", Table(("conclusion", *metrics), lines, caption)),
-        keep(f"findings_{metrics[0]}", findings.finding_table(first, metrics[0])),
+        keep("findings", Table(("conclusion", f"by {metric}"), lines, caption)),
+        keep(f"findings_{metric}", findings.finding_table(found, metric)),
     )
     return [Section("Findings", tuple(words), shown)]
+
+
+def _solver_words(rows: Sequence[Row]) -> list[str]:
+    """What the true fabric itself is off by on either solver, where both predict: a comparison
+    between them is one of their meshes where that differs."""
+    errors: dict[str, dict[str, list[float]]] = {}
+    for row in rows:
+        if row.baseline == "true" and np.isfinite(row.value):
+            errors.setdefault(row.evaluated_on, {}).setdefault(row.solver, []).append(row.value)
+    off = [
+        f"{motion}: "
+        + ", ".join(f"{significant(1e3 * np.mean(own))} mm on {name}" for name, own in each.items())
+        for motion, each in errors.items()
+        if len(each) > 1
+    ]
+    return [f"{BETWEEN_SOLVERS} {'; '.join(off)}."] if off else []
 
 
 def _headlines(results: ResultArray) -> list[str]:

@@ -19,10 +19,12 @@ HEADER = (
 CAPTION = (
     "Of every judged motion: until when it tells fabrics apart, and, mean up to there, its floor "
     "and the distances from it of the truth 0.1 % stiffer, with grippers 0.2 mm aside, on a finer "
-    "mesh and in half the step, and of a sheet that hangs as predictions start it. It is converged "
-    f"where mesh and step are below {1e3 * LEAST:g} mm together, and chaotic where stiffness and "
-    "path are not; a prediction nearer than the floor is not "
-    "told from a better one. The ensemble of a fold has no layers, its truth has: whether that is "
+    "mesh and in half the step, and of a sheet that hangs as predictions start it. It is called "
+    f"converged where mesh and step move it by less than {1e3 * LEAST:g} mm together (the error "
+    "itself is 1.8 times what 3/2 as many cells a side move, where it falls with their square, and "
+    "3 times where it falls with their length), and chaotic where stiffness and path do not; a "
+    "prediction nearer than the floor is not told from a better one. The ensemble of a fold has no "
+    "layers, its truth has: whether that is "
     "converged is not known. Members of MuJoCo's sheet are MuJoCo's, with layers, its sheets of a "
     "quarter to four times the modulus are the other fabrics."
 )

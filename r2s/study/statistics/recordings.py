@@ -36,9 +36,11 @@ def _belongs(row: Row, configuration: Configuration) -> bool:
     """Whether a row is of a configuration, or of what it is compared with."""
     approach, solver, scenario = configuration
     source = row.approach, row.estimated_from
-    if row.baseline == ON_CLOTH:
-        return solver == "points" and source == (approach, scenario)
-    return source in ((approach, scenario), ("", "")) and row.solver in (solver, "")
+    return (
+        row.baseline != ON_CLOTH
+        and source in ((approach, scenario), ("", ""))
+        and row.solver in (solver, "")
+    )
 
 
 def _table(configuration: Configuration, rows: Sequence[Row]) -> Table:
@@ -55,7 +57,7 @@ def _table(configuration: Configuration, rows: Sequence[Row]) -> Table:
         for which, found in every.items()
     }
     lines = list(errors.values())
-    names = [each for each in BASELINES if each != ON_CLOTH or configuration.solver == "points"]
+    names = [each for each in BASELINES if each != ON_CLOTH]  # all are on one solver
     of_all = [_mean([each[name] for each in lines if name in each]) for name in names]
     return Table(
         header=("fabric", "recording", *(f"{BASELINES[name]} [mm]" for name in names)),
