@@ -27,9 +27,7 @@ def made_by(cells: Iterable[Cell], folder: Path) -> Line:
     """
     noted = {words.partition("source ")[2].partition(";")[0] for words in origins(cells, folder)}
     if len(noted) > 1:
-        raise ValueError(
-            f"{folder}: made by several sources ({', '.join(sorted(noted))}); empty it"
-        )
+        raise ValueError(f"{folder} is of several sources, empty it: {', '.join(sorted(noted))}")
     return {"made by source": ", ".join(each[:8] for each in noted)}
 
 

@@ -79,7 +79,9 @@ def _solver_words(rows: Sequence[Row]) -> list[str]:
             errors.setdefault(row.evaluated_on, {}).setdefault(row.solver, []).append(row.value)
     off = [
         f"{motion}: "
-        + ", ".join(f"{significant(1e3 * np.mean(own))} mm on {name}" for name, own in each.items())
+        + ", ".join(
+            f"{significant(1e3 * float(np.mean(own)))} mm on {name}" for name, own in each.items()
+        )
         for motion, each in errors.items()
         if len(each) > 1
     ]
