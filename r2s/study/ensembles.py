@@ -76,16 +76,16 @@ class EnsembleCell(Cell):
         source = self.recording
         truth, experiment, shape = source.truth, source.experiment, source.truth.shape
         fabric = strain_dependent(source.fabric, truth)
-        base = _moved(experiment, fabric, shape)
+        base = simulated(experiment, fabric, shape)
         if not np.isfinite(base.x).all():
             raise RuntimeError(f"the truth of {self.name} diverged")
         hangs = experiment.sheet.weft[2] != 0
         start = base.x[0].reshape(*shape, 3) if hangs else None  # as predictions do
-        anew = _moved(experiment, fabric, shape, start=start) if hangs else base
+        anew = simulated(experiment, fabric, shape, start=start) if hangs else base
         points = points_of(anew)
 
         def away(experiment: Experiment, fabric: Fabric, shape: Any, steps: int = 1) -> np.ndarray:
-            moved = _moved(experiment, fabric, shape, steps, start)
+            moved = simulated(experiment, fabric, shape, steps, start)
             return to_surface(points, moved.x, moved.mesh.faces)
 
         recording = read(source, folder)
@@ -102,9 +102,9 @@ class EnsembleCell(Cell):
         if hangs:
             found["start"] = [to_surface(points_of(base), anew.x, anew.mesh.faces)]
         coarse = cells_a_side(shape, COARSER)
-        own = points_of(_moved(experiment, fabric, coarse, start=start))
+        own = points_of(simulated(experiment, fabric, coarse, start=start))
         for name in self.others:
-            moved = _moved(experiment, strain_dependent(name, truth), coarse, start=start)
+            moved = simulated(experiment, strain_dependent(name, truth), coarse, start=start)
             found[APART + name] = [to_surface(own, moved.x, moved.mesh.faces)]
         return save_ensemble(out, experiment, found)
 
@@ -153,7 +153,7 @@ class Moved(NamedTuple):
 _rollout = eqx.filter_jit(rollout)
 
 
-def _moved(
+def simulated(
     experiment: Experiment,
     fabric: Fabric,
     shape: tuple[int, int],
