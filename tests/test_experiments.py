@@ -125,3 +125,13 @@ def test_what_a_table_of_skills_compares_is_all_predicted_on_the_cloth(module, n
     assert len(whose) == 7 and whose.count("default") == 4  # draws, middle, truth, estimate
     (estimate,) = (cell for cell in cells if cell.estimate is not None)
     assert "-".join(estimate.estimate.name.split("_")[:3]) == name
+
+
+def test_a_line_of_several_sources_is_refused(tables, tmp_path: Path, monkeypatch) -> None:
+    words = "r2s 0.3.0; source {}; a processor"
+    found = dict.fromkeys([words.format("a" * 16)], 3)
+    monkeypatch.setattr(tables, "origins", lambda cells, folder: found)
+    assert tables.made_by([], tmp_path) == {"made by source": "a" * 8}
+    found[words.format("b" * 16)] = 1
+    with pytest.raises(ValueError, match="several sources"):
+        tables.made_by([], tmp_path)

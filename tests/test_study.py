@@ -33,6 +33,7 @@ from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
 from r2s.study.costs import costs, forecast
 from r2s.study.drawn import numbers_of
 from r2s.study.estimates import EstimateCell, TrainedNetwork
+from r2s.study.evaluations import EvaluationCell
 from r2s.study.mujoco_recording import MujocoRecording
 from r2s.study.rows import Row, read_rows, write_rows
 from r2s.study.sources import (
@@ -420,6 +421,31 @@ def test_results_are_written_again_when_one_is_gone_or_a_cell_is_newer(tmp_path)
     os.utime(cell, ns=(0, 0))
     (tmp_path / "results.csv").unlink()
     assert not results._is_published(tmp_path, mark, "these cells")
+
+
+def test_what_trials_share_counts_once(tmp_path, monkeypatch):
+    """A fold that two lifts are judged by has one default, whichever lift brought it."""
+
+    def given(name, scenario, trial):
+        return GivenRecording("", name, "knit", scenario, trial, "")
+
+    every = [given(f"lift{i}", "lifting", f"{i}") for i in (1, 2, 3)]
+    every += [given(f"fold{i}", "folding", f"{i}") for i in (1, 2)]
+    monkeypatch.setattr(matrix, "find_recordings", lambda folder: every)
+    plan = dataclasses.replace(matrix.SMALL, draws=1)
+    cells = [
+        cell
+        for cell in matrix.recorded(tmp_path, 0.2, plan)
+        if cell.baseline == "default" and cell.solver == "cloth"
+    ]
+    # of trials 1 and 2 their own fold, of trial 3, which has none, both together
+    assert [len(cell.recordings) for cell in cells] == [1, 1, 2]
+    measured = {cell: {each.name: {"chamfer": 1.0} for each in cell.recordings} for cell in cells}
+    monkeypatch.setattr(results, "read_measured", lambda cell, folder: measured[cell])
+    monkeypatch.setattr(EvaluationCell, "is_made", lambda cell, folder: True)
+    monkeypatch.setattr(results, "with_verdicts", lambda rows, cells, folder: rows)
+    found = results.rows(cells, tmp_path)
+    assert sorted(row.recording for row in found) == ["fold1", "fold2"]
 
 
 def test_given_recordings_are_shown_one_by_one():
