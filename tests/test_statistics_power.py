@@ -52,6 +52,7 @@ def test_studies_with_nothing_to_find(preset, studies, words):
     found = measured(preset, words, 1.0, studies, 10_000)
     assert found.any_false <= 0.06 and found.false <= 0.06, found
     assert 0.85 <= found.held <= 0.95 and 0.85 <= found.means_held <= 0.95, found
+    assert 0.85 <= found.skills_held <= 0.95, found
 
 
 @pytest.mark.slow(group="study")
