@@ -55,11 +55,13 @@ def test_the_true_fabric_beats_the_default_where_the_truth_is_known(tmp_path, fa
     (ensemble,) = (read_ensemble(each, tmp_path) for each in ensembles)
     assert true.horizon is not None and true.floor is not None
     inside = ensemble.times < true.horizon
-    causes = ("stiffness", "path", "mesh", "step")
-    *trifles, mesh, step = (ensemble.causes[cause][:, inside].mean() for cause in causes)
+    stiffness, path, mesh, step = (
+        float(ensemble.causes[cause][:, inside].mean())
+        for cause in ("stiffness", "path", "mesh", "step")
+    )
     between = np.mean(np.sqrt(np.mean(ensemble.apart**2, axis=1)))
     assert true.value < np.mean(drawn)
-    words = verdict(*trifles, mesh, step)
+    words = verdict(stiffness, path, mesh, step)
     assert words != "chaotic" and (words == "converged") == ((fabric, motion) in CONVERGED), words
     if (fabric, motion) in UNTOLD:
         assert true.horizon < EARLY and true.skill is None
