@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from r2s import scenarios
-from r2s.estimation.agreement import MOST, agreement, density_told, scattered, told_by
+from r2s.estimation.agreement import MOST, UNLIKELY, agreement, density_told, scattered, told_by
 from r2s.estimation.descent import DEFAULT, each_alone
 from r2s.estimation.estimate import Agreement
 from r2s.estimation.gauss_newton import theta_length
@@ -89,7 +89,11 @@ def test_a_recording_is_excused_by_the_error_of_its_own_mesh_alone(lifts):
         )
     )
     assert alone is not None and excused is not None and opposite is not None
-    assert excused.p == opposite.p > alone.p
+    assert excused.p == opposite.p > alone.p == excused.exact and alone.exact is None
+    # three times as stiff is no more than two meshes of the worst may do, and that is said
+    both = agreement(pair, ends, [far, far])
+    assert both is not None and both.contradiction is None
+    assert both.exact == alone.p < UNLIKELY < both.p
     assert hardly is not None and hardly.contradiction is not None
 
 

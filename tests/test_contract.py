@@ -218,6 +218,9 @@ def test_bounds_are_named_at_both_ends_and_nowhere_else():
     found = point_estimate("test", SPACE, place, 0.0, nothing, nothing, 0.0)
     expected = {"warp": "lower", "weft": "upper", "coupling": "lower", "friction": "upper"}
     assert found.at_bounds == expected
+    sure = dataclasses.replace(found, standard_errors=np.full(7, 1e-3), correlation=np.eye(7))
+    inside = [name not in expected for name in (each.name for each in found.ranges)]
+    assert sure.identifiable.tolist() == inside  # beyond a bound no error says how far it is
     stored = json.loads(json.dumps(as_json(found), allow_nan=False))
     assert stored["at_bounds"] == expected and stored["converged"] is False
     assert from_json(stored).at_bounds == expected

@@ -103,6 +103,8 @@ def test_the_air_is_the_one_that_an_estimate_names_where_a_recording_doubts_it(l
     estimate = dataclasses.replace(estimate, nuisances=found)
     assert held_out.air_found(estimate, [lift, doubted]) == pytest.approx(np.exp(-0.5))
     assert held_out.air_found(estimate, [lift]) == 1.0  # as of a wind, whose speed was in doubt
+    silent = dataclasses.replace(estimate, nuisances=())  # as of cma-es, which reports none
+    assert held_out.air_found(silent, [doubted]) == 1.0
     assert "in air 0.61 times" in HeldOut("fling", 4e-3, (8e-3,), 0, np.exp(-0.5)).describe()
 
 

@@ -13,6 +13,7 @@ import pytest
 from r2s import scenarios
 from r2s.estimation import compiled, gauss_newton
 from r2s.estimation import covariance as covariances
+from r2s.estimation.agreement import weighing
 from r2s.estimation.covariance import covariance_at
 from r2s.estimation.descent import Budget, descend, nuisances
 from r2s.estimation.estimate import describe
@@ -20,6 +21,7 @@ from r2s.estimation.gauss_newton import Descent, Normal
 from r2s.estimation.mesh_bias import on_the_way, weighed
 from r2s.estimation.prediction import predict
 from r2s.estimation.problem import (
+    Force,
     NuisancePrior,
     Problem,
     beginning,
@@ -325,3 +327,9 @@ def test_the_air_of_a_recording_is_in_doubt_where_it_says_so(blown, lifted):
     )
     with pytest.raises(ValueError, match="negative"):
         Doubt(here, nowhere, air=-1.0)
+
+
+def test_a_wind_whose_force_is_in_doubt_weighs_nothing(blown, lifted):
+    force = Force(jnp.zeros((1, 3)), jnp.ones(1, bool), jnp.eye(3))
+    pulled = dataclasses.replace(lifted, force=force)
+    assert weighing((blown, lifted, pulled)) == [False, False, True]

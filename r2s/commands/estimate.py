@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 POOR = 0.5  # of a recording that is left out, above which it is hardly explained at all
 LIGHTEST, HEAVIEST = 0.005, 5.0  # [kg/m^2]: finer than any gauze, heavier than any carpet
+UNLIKELY = 1e-4  # as `r2s.estimation.agreement` has it
 CONTRADICTION = 0.01  # likelihood by chance, below which it is told
 
 # what is wrong where a nuisance is far from what was written down
@@ -51,8 +52,9 @@ class EstimateCard:
 
     RECORDING is an NPZ of r2s, a folder of them, a folder of frames with its manifest, or a JSON
     file of laboratory tests (pulls, cantilevers, drapes: docs/laboratory.md); several are taken for
-    the same fabric. Of three or more the last motion with clouds is held out: the
-    estimate is judged on it, beside fabrics of which only the weight is known. Says whether the
+    the same fabric. Of three or more, two of them no stretchings, the last motion with clouds is
+    held out: the estimate is judged on it, beside fabrics of which only the weight is known. Says
+    whether the
     method converged, and which numbers ended at a bound of their range. A killed run of diffcloud,
     diffcp, physnet, or pinn from pulls goes on where it was, from FILE.progress.npz.
 
@@ -184,7 +186,7 @@ class EstimateCard:
         lines = [
             *describe(found),
             *_unread(method, seen),
-            *_by_weight(self.density, seen),
+            *_by_weight(method, self.density, seen),
             *_warnings(found, seen),
             *_laboratory_lines(tests, told, found),
             *(judged or self._unjudged(seen)),
@@ -352,6 +354,8 @@ def _misfits(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[st
     """What of the recordings does not fit the fabric, and how much of them is left out."""
     names = [each.info.name for each in recordings]
     lines = []
+    if not estimate.left_out:
+        lines.append("not judged: what of the recordings does not fit")
     for misfit in estimate.misfits:
         name = names[misfit.recording]
         if misfit.unit == "m":
@@ -385,15 +389,18 @@ def _unread(method: "Method", recordings: "Sequence[Recording]") -> list[str]:
             "force": each.force is not None and not reads.force,
         }
         left = [kind for kind, is_left in kinds.items() if is_left]
+        first, last = each.info.frames_used
+        if len(reads.frames) < last - first + 1:
+            left.append(f"{last - first + 1 - len(reads.frames)} of {last - first + 1} frames")
         if left:
             lines.append(f"not read of {each.info.name}: {', '.join(left)}")
     return lines
 
 
-def _by_weight(density: float, recordings: "Sequence[Recording]") -> list[str]:
-    """What no recording weighs: without a force, the wind's or a pull's, stiffness scales with the
-    density that was given."""
-    weighed = [each.force is not None or any(each.info.wind or ()) for each in recordings]
+def _by_weight(method: "Method", density: float, recordings: "Sequence[Recording]") -> list[str]:
+    """What no recording weighs: without a force that is read, the wind's or a pull's, stiffness
+    scales with the density that was given."""
+    weighed = [method.reads(each).force or any(each.info.wind or ()) for each in recordings]
     if any(weighed) or not recordings:
         return []
     return [
@@ -423,7 +430,14 @@ def _agreement(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[
     if odd is None:
         alone = [name for name, told in zip(names, found.told, strict=True) if not told]
         left = f"; not compared, by the error of the mesh: {', '.join(alone)}" if alone else ""
-        return [*lines, f"the recordings agree (by chance {found.p:.2g}){left}"]
+        words = f"the recordings agree (by chance {found.p:.2g}){left}"
+        if found.exact is not None and found.exact < UNLIKELY:
+            words = (
+                "the recordings agree only as far as their meshes may err (by chance "
+                f"{found.p:.2g}, without that {found.exact:.1g}), so a fabric a few times as stiff "
+                f"in one of them would not be told{left}"
+            )
+        return [*lines, words]
     unit = next(each.unit for each in estimate.ranges if each.name == odd.parameter)
     own, others = (f"{value:.4g} {unit}".removesuffix(" -") for value in odd.values)
     against = "the others" if len(names) > 2 else names[1 - odd.recording]

@@ -65,17 +65,22 @@ def agreement(
     dim = space.dim
     mean, precision = (np.asarray(part, np.float64) for part in space.prior())
     excused = [bias[:dim] for bias in biases] or [np.zeros(dim)] * len(problems)
-    led: list[tuple[np.ndarray, np.ndarray]] = []
-    for problem, end, by in zip(problems, ends, excused, strict=True):
+    exact: list[tuple[np.ndarray, np.ndarray]] = []
+    for problem, end in zip(problems, ends, strict=True):
         place, covariance = _led((problem,), end, dim)
         if not (np.isfinite(place).all() and np.isfinite(covariance).all()):
             return None
-        led.append((place, covariance + np.diag(np.minimum(np.abs(by), MOST) ** 2)))
+        exact.append((place, covariance))
+    led = [
+        (place, covariance + np.diag(np.minimum(np.abs(by), MOST) ** 2))
+        for (place, covariance), by in zip(exact, excused, strict=True)
+    ]
     told = [told_by(*each, mean, precision) for each in led]
     scatter, freedom = scattered(told)
     if not freedom:
         return None
-    weigh = [each.force is not None or each.scenario.wind is not None for each in problems]
+    without = chance([told_by(*each, mean, precision) for each in exact]) if biases else None
+    weigh = weighing(problems)
     density = None
     if any(weigh) and not all(weigh):
         scaled = np.array([(r.name in SCALED) / r.width for r in space.ranges])
@@ -83,7 +88,7 @@ def agreement(
         density = density_told(every, weigh, scaled, mean, precision)
     p, counts = float(stats.chi2.sf(scatter, freedom)), tuple(each.count for each in told)
     if not p < UNLIKELY:
-        return Agreement(p, counts, None, density)
+        return Agreement(p, counts, None, density, without)
     odd = 1 if len(told) == 2 else min(range(len(told)), key=lambda i: _without(told, i))
     rest = [each for i, each in enumerate(told) if i != odd]
     (here, own), (there, others) = (_known(each, mean, precision) for each in ([told[odd]], rest))
@@ -91,9 +96,14 @@ def agreement(
     most = int(np.argmax(errors))
     of = space.ranges[most]
     first, second = (float(of.from_unit(jnp.asarray(at[most], float))) for at in (here, there))
-    return Agreement(
-        p, counts, Contradiction(odd, of.name, float(errors[most]), (first, second)), density
-    )
+    found = Contradiction(odd, of.name, float(errors[most]), (first, second))
+    return Agreement(p, counts, found, density, without)
+
+
+def weighing(problems: Problems) -> list[bool]:
+    """Which recordings weigh the sheet: those of a force. No wind, whose own is in doubt: with ten
+    times the density it is found ten times as strong, and stiffness with it."""
+    return [problem.force is not None for problem in problems]
 
 
 def told_by(
@@ -153,6 +163,12 @@ def scattered(told: Sequence[Told]) -> tuple[float, int]:
     scatter = sum(float(away @ information @ away) for away, information in off)
     shared = np.linalg.matrix_rank(total, tol=RCOND * np.linalg.norm(total, 2), hermitian=True)
     return scatter, int(sum(each.count for each in told) - shared)
+
+
+def chance(told: Sequence[Told]) -> float:
+    """How likely recordings of one fabric scatter as much, [-]; 1 where no two tell of the same."""
+    scatter, freedom = scattered(told)
+    return float(stats.chi2.sf(scatter, freedom)) if freedom else 1.0
 
 
 def _without(told: Sequence[Told], odd: int) -> float:

@@ -50,14 +50,16 @@ class Agreement(NamedTuple):
       mesh's error allowed for: one that tells none was not compared.
     - `contradiction`: the one that leads elsewhere than the others; None where all agree.
     - `density`: with which they would agree best, over the one that was given, [-], and the
-      standard error of its logarithm; None where not some weigh the sheet, by a force or a wind,
-      and others do not.
+      standard error of its logarithm; None where not some weigh the sheet, by a force, and others
+      do not.
+    - `exact`: as `p`, were their meshes without error; None where nothing was excused.
     """
 
     p: float
     told: tuple[int, ...]
     contradiction: Contradiction | None
     density: tuple[float, float] | None = None
+    exact: float | None = None
 
     @property
     def doubts_density(self) -> bool:
@@ -157,8 +159,17 @@ class Estimate:
 
     @property
     def identifiable(self) -> np.ndarray:
-        """Which parameters the recording determines: to 5 % (or 0.05) with 95 % confidence."""
-        return self.standard_errors < IDENTIFIABLE
+        """Which parameters the recording determines: to 5 % (or 0.05) with 95 % confidence.
+
+        None that ended at a bound: the truth may lie beyond, and no error here says how far.
+        """
+        return (self.standard_errors < IDENTIFIABLE) & self._inside
+
+    @property
+    def _inside(self) -> np.ndarray:
+        """Which parameters did not end at a bound."""
+        at_bounds = self.at_bounds
+        return np.array([each.name not in at_bounds for each in self.ranges], bool)
 
     @property
     def combinations(self) -> list[Combination]:
@@ -167,7 +178,8 @@ class Estimate:
         Eigenvectors of the parameters' covariance, on the scales of their ranges, whose standard
         error is at most `IDENTIFIABLE`; the best known first.
         """
-        index = np.flatnonzero(~self.identifiable & np.isfinite(self.standard_errors))
+        known = np.isfinite(self.standard_errors) & self._inside
+        index = np.flatnonzero(known & ~self.identifiable)
         if len(index) < 2:
             return []
         scale = self.standard_errors[index]

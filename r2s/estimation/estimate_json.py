@@ -124,7 +124,8 @@ def _agreement(stored: dict[str, Any] | None) -> Agreement | None:
         odd = Contradiction(**odd | {"values": tuple(odd["values"])})
     density = stored["density"]
     told = tuple(stored["told"])
-    return Agreement(stored["p"], told, odd, None if density is None else tuple(density))
+    density = None if density is None else tuple(density)
+    return Agreement(stored["p"], told, odd, density, stored.get("exact"))
 
 
 def upgraded(stored: dict[str, Any]) -> dict[str, Any]:

@@ -131,8 +131,8 @@ def air_found(estimate: Estimate, recordings: Sequence[Recording]) -> float:
     has."""
     if not any(each.info.doubt is not None and each.info.doubt.air for each in recordings):
         return 1.0
-    (found,) = (each.value for each in estimate.nuisances if each.name == AIR)
-    return found
+    # a method that reports no nuisances has left the air as it was written down
+    return next((each.value for each in estimate.nuisances if each.name == AIR), 1.0)
 
 
 def _error(recording: Recording, fabric: Fabric, shape: tuple[int, int], air: float) -> float:
