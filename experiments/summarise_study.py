@@ -1,7 +1,7 @@
 """Copy the tables of a study that the documents show, and put them into the documents.
 
 python experiments/summarise_study.py results     # the folder that `make study` left
-python experiments/summarise_study.py other --alone study_points --args "--fabrics grey_interlock"
+python experiments/summarise_study.py other --alone study_points --args "..."
 
 The second: of a study of these ARGS the table of skill alone, for docs/study.md. Each table becomes
 a file of OUT, which says what made it, and replaces what stands between the two marks of its name
