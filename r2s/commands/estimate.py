@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 POOR = 0.5  # of a recording that is left out, above which it is hardly explained at all
 LIGHTEST, HEAVIEST = 0.005, 5.0  # [kg/m^2]: finer than any gauze, heavier than any carpet
-UNLIKELY = 1e-4  # as `r2s.estimation.agreement` has it
 CONTRADICTION = 0.01  # likelihood by chance, below which it is told
 
 # what is wrong where a nuisance is far from what was written down
@@ -54,9 +53,8 @@ class EstimateCard:
     file of laboratory tests (pulls, cantilevers, drapes: docs/laboratory.md); several are taken for
     the same fabric. Of three or more, two of them no stretchings, the last motion with clouds is
     held out: the estimate is judged on it, beside fabrics of which only the weight is known. Says
-    whether the
-    method converged, and which numbers ended at a bound of their range. A killed run of diffcloud,
-    diffcp, physnet, or pinn from pulls goes on where it was, from FILE.progress.npz.
+    whether the method converged, and which numbers ended at a bound of their range. A killed run of
+    diffcloud, diffcp, physnet, or pinn from pulls goes on where it was, from FILE.progress.npz.
 
     diffcloud differentiates through the cloth, diffcp through material points, cma-es tries fabrics
     on either. pinn fits a network to the markers and force of stretchings, or to the clouds of
@@ -431,7 +429,7 @@ def _agreement(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[
         alone = [name for name, told in zip(names, found.told, strict=True) if not told]
         left = f"; not compared, by the error of the mesh: {', '.join(alone)}" if alone else ""
         words = f"the recordings agree (by chance {found.p:.2g}){left}"
-        if found.exact is not None and found.exact < UNLIKELY:
+        if found.is_excused:
             words = (
                 "the recordings agree only as far as their meshes may err (by chance "
                 f"{found.p:.2g}, without that {found.exact:.1g}), so a fabric a few times as stiff "

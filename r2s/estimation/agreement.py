@@ -17,10 +17,9 @@ from jaxtyping import Float
 from scipy import stats
 
 from r2s.estimation import standard_errors
-from r2s.estimation.estimate import Agreement, Contradiction
+from r2s.estimation.estimate import UNLIKELY, Agreement, Contradiction
 from r2s.estimation.gauss_newton import Descent, Problems, prior_weight
 
-UNLIKELY = 1e-4  # that recordings of one fabric lead so far apart by chance
 # Of a range, by which a mesh excuses a parameter at most, since one step may say far more. Lifts on
 # 17 x 17 vertices err in warp, weft and shear by 0.10, root mean square
 # (docs/results/estimate_by_mesh.csv); with that, a density ten times off is doubted less often.
@@ -76,8 +75,7 @@ def agreement(
         for (place, covariance), by in zip(exact, excused, strict=True)
     ]
     told = [told_by(*each, mean, precision) for each in led]
-    scatter, freedom = scattered(told)
-    if not freedom:
+    if not scattered(told)[1]:
         return None
     without = chance([told_by(*each, mean, precision) for each in exact]) if biases else None
     weigh = weighing(problems)
@@ -86,7 +84,7 @@ def agreement(
         scaled = np.array([(r.name in SCALED) / r.width for r in space.ranges])
         every = [told_by(*each, mean, precision, least=SOME) for each in led]
         density = density_told(every, weigh, scaled, mean, precision)
-    p, counts = float(stats.chi2.sf(scatter, freedom)), tuple(each.count for each in told)
+    p, counts = chance(told), tuple(each.count for each in told)
     if not p < UNLIKELY:
         return Agreement(p, counts, None, density, without)
     odd = 1 if len(told) == 2 else min(range(len(told)), key=lambda i: _without(told, i))

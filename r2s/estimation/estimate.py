@@ -42,6 +42,9 @@ class Contradiction(NamedTuple):
     values: tuple[float, float]
 
 
+UNLIKELY = 1e-4  # that recordings of one fabric lead so far apart by chance
+
+
 class Agreement(NamedTuple):
     """Whether the recordings of an estimate tell of one fabric, see `r2s.estimation.agreement`.
 
@@ -60,6 +63,11 @@ class Agreement(NamedTuple):
     contradiction: Contradiction | None
     density: tuple[float, float] | None = None
     exact: float | None = None
+
+    @property
+    def is_excused(self) -> bool:
+        """Whether the recordings agree only as far as their meshes may err."""
+        return self.exact is not None and self.exact < UNLIKELY <= self.p
 
     @property
     def doubts_density(self) -> bool:
