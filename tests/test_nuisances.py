@@ -133,7 +133,7 @@ def test_a_prior_counts_for_more_where_an_estimate_errs_by_more_than_noise(lifte
         lifted.space, jnp.asarray(mean[:dim]), jnp.asarray(known[:dim, :dim])
     )
     problems = (dataclasses.replace(lifted, space=space),)
-    told, seen = root @ root.T + 50 * np.eye(size), 0.1 * random.normal(size=size)
+    told, seen = root @ root.T + 50 * np.eye(size), 0.4 + 0.1 * random.normal(size=size)
     both = np.linalg.inv(told + known)
     end, _ = valley(lifted, size)
     normal = dataclasses.replace(end.normal, matrix=jnp.asarray(0.01 * told))
@@ -153,6 +153,7 @@ def test_a_prior_counts_for_more_where_an_estimate_errs_by_more_than_noise(lifte
         found.theta, expected @ (less @ seen + known @ mean), rtol=1e-5, atol=1e-8
     )
     np.testing.assert_allclose(found.bias, expected @ less @ seen, rtol=1e-5, atol=1e-8)
+    assert np.all((found.theta[:dim] > gauss_newton.MARGIN) & (found.theta[:dim] < 1))
     nothing = weighed(problems, end, prior, 2 * np.linalg.inv(known), none)
     np.testing.assert_allclose(nothing.theta, mean, rtol=1e-5, atol=1e-8)
 

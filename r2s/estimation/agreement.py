@@ -17,6 +17,7 @@ from jaxtyping import Float
 from scipy import stats
 
 from r2s.estimation import standard_errors
+from r2s.estimation.bounded import held_back
 from r2s.estimation.estimate import UNLIKELY, Agreement, Contradiction
 from r2s.estimation.gauss_newton import Descent, Problems, prior_weight
 
@@ -183,7 +184,12 @@ def _known(told: Sequence[Told], mean, precision) -> tuple[np.ndarray, np.ndarra
 
 
 def _led(problems: Problems, end: Descent, dim: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where a recording leads with the prior, and its covariance there, nuisances free."""
+    """Where a recording leads with the prior, and its covariance there, nuisances free.
+
+    How far it would go without bounds is an error of its place: no bound speaks for a recording.
+    """
     prior = prior_weight(problems, end.normal)
     covariance, _ = standard_errors.sandwich_of(problems, end, prior)
-    return np.asarray(end.theta, np.float64)[:dim], np.asarray(covariance, np.float64)[:dim, :dim]
+    back = held_back(problems, end, float(prior))[:dim]
+    known = np.asarray(covariance, np.float64)[:dim, :dim] + np.outer(back, back)
+    return np.asarray(end.theta, np.float64)[:dim], known

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from r2s.estimation import compiled, normal_equations
+from r2s.estimation.bounded import bounded_step, only_held, room
 from r2s.estimation.compiled import Derive, loss_from, predictions_at
 from r2s.estimation.gauss_newton import (
     MARGIN,
@@ -67,7 +68,7 @@ def mesh_bias(
 
     The Gauss-Newton step on the own mesh is subtracted, since a descent seldom ends at the very
     minimum. Where a motion fails, or the step is longer than the range, it is the whole range: the
-    mesh tells nothing then.
+    mesh tells nothing then. What a bound holds is held in both steps.
 
     - `prior`: its weight, see `r2s.estimation.gauss_newton.prior_weight`.
     - `predicted`: at the end, with its derivative (`r2s.estimation.compiled.derivatives_at`).
@@ -87,7 +88,11 @@ def mesh_bias(
             matrices[side][np.ix_(index, index)] += matrix
     off, precision = (np.asarray(part) for part in prior_terms(problems, end.theta))
     least = float(prior) * precision
-    own, others = (_step(gradients[side], matrices[side], off, least) for side in (0, 1))
+    limits = only_held(room(problems, end.theta))
+    own, others = (
+        bounded_step(gradients[side] + least @ off, matrices[side] + least, limits)
+        for side in (0, 1)
+    )
     bias = other.factor * (others - own)
     return np.clip(np.where(np.isfinite(bias), bias, 1.0), -1, 1)
 
@@ -109,10 +114,6 @@ def alone(
         predicted = derive(own, end.theta, width)
         found.append(mesh_bias(own, OtherMesh((there,), other.factor), end, prior, predicted))
     return found
-
-
-def _step(gradient: np.ndarray, matrix: np.ndarray, off: np.ndarray, prior: np.ndarray):
-    return np.linalg.solve(matrix + prior, -gradient - prior @ off)
 
 
 def _laid_onto(here: Problem, there: Problem, slope: Sensitivity) -> Sensitivity:
@@ -164,7 +165,8 @@ def weighed(
     axes = root @ axes
     left = (axes * np.maximum(sizes - 1, 0)[None]) @ axes.T
     errors = np.linalg.inv(left + known)
-    theta = np.asarray(end.theta, np.float64) + errors @ (left @ alone - known @ off)
+    way = bounded_step(known @ off - left @ alone, left + known, room(problems, end.theta))
+    theta = np.asarray(end.theta, np.float64) + way
     led = np.linalg.lstsq(told, (told + known) @ bias, rcond=RCOND)[0]
     return Weighed(theta, errors, errors @ left @ led)
 
