@@ -8,7 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import MASS_DAMPING, OrthotropicSpace, Range
+from r2s.fabrics.parameters import (
+    LOSSES,
+    MASS_DAMPING,
+    IsotropicSpace,
+    OrthotropicSpace,
+    Range,
+)
 from r2s.fabrics.presets import FIVE
 
 few = settings(max_examples=25, deadline=None)
@@ -104,3 +110,16 @@ def test_a_fabric_out_of_its_physical_range_is_refused(name):
     arguments, reason = BAD[name]
     with pytest.raises(ValueError, match=reason):
         Fabric.make(*arguments)
+
+
+def test_an_isotropic_sheet_has_damping_and_friction_where_asked():
+    given, free = (IsotropicSpace.make(0.17, losses=losses) for losses in ((), LOSSES))
+    assert [each.name for each in free.ranges] == ["E h", "nu", "damping", "friction"]
+    place = jnp.array([0.3, 0.6, 0.2, 0.9])
+    found = free(place)
+    assert found.damping == pytest.approx(float(LOSSES[0].from_unit(place[2])))
+    assert found.friction == pytest.approx(float(LOSSES[1].from_unit(place[3])))
+    np.testing.assert_allclose(free.to_unit(found), place, rtol=1e-5)
+    same = given(place[:2])
+    assert (float(same.damping), float(same.friction)) == pytest.approx((0.01, 0.5))
+    np.testing.assert_allclose(found.membrane.c11, same.membrane.c11)

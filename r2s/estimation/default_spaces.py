@@ -90,11 +90,12 @@ def on_cloth(density: float) -> OrthotropicSpace:
     return OrthotropicSpace(density=space.density, thickness=space.thickness, ranges=RANGES)
 
 
-def on_points(density: float) -> IsotropicSpace:
+def on_points(density: float, losses: tuple[Range, ...] = ()) -> IsotropicSpace:
     """Isotropic sheets of an areal density, [kg/m^2]; raises as `IsotropicSpace.make`.
 
-    Damping and friction are those in the middle of the prior. The sheet in the middle of the range
-    bends as the middle of the prior does, and others as plates of the same thickness.
+    Damping and friction are those in the middle of the prior, or parameters: see `losses` there.
+    The sheet in the middle of the range bends as the middle of the prior does, and others as plates
+    of the same thickness.
     """
     usual = IsotropicSpace.make(density)
     assumed, middle = prior.middle(density), usual.middle()
@@ -105,6 +106,7 @@ def on_points(density: float) -> IsotropicSpace:
         damping=float(assumed.damping),
         friction=float(assumed.friction),
         thickness=prior.THICKNESS,
+        losses=losses,
     )
 
 
@@ -125,7 +127,15 @@ def fixed(space: ParameterSpace) -> tuple[Fixed, ...]:
     return (
         *found,
         Fixed("plate thickness", "m", float(space.plate), plate),
-        Fixed("damping", "s", float(space.damping), "the prior's median"),
-        Fixed("friction", "-", float(space.friction), "the prior's median"),
+        *_losses(space),
         Fixed("anisotropy", "-", 0.0, "the space has none"),
     )
+
+
+def _losses(space: IsotropicSpace) -> tuple[Fixed, ...]:
+    given = (
+        Fixed("damping", "s", float(space.damping), "the prior's median"),
+        Fixed("friction", "-", float(space.friction), "the prior's median"),
+    )
+    estimated = {each.name for each in space.ranges}
+    return tuple(each for each in given if each.name not in estimated)

@@ -58,6 +58,7 @@ class Range:
 
 
 MASS_DAMPING = Range("mass damping", "1/s", 1e-2, 10.0)
+LOSSES = (Range("damping", "s", 3e-4, 1e-1), Range("friction", "-", 0.1, 1.0))
 UNIFORM_DEVIATION = 0.29  # of a uniform distribution from 0 to 1
 
 Prior = tuple[Float[Array, " dim"], Float[Array, "dim dim"]]
@@ -180,7 +181,8 @@ class IsotropicSpace(ParameterSpace):
     """Isotropic sheets, as DiffCP has them: Young's modulus times thickness [N/m], Poisson's ratio.
 
     The bending stiffness is that of a solid plate of the same modulus and some `plate` thickness
-    [m]. Areal density [kg/m^2], damping [s], friction and contact thickness [m] are given.
+    [m]. Areal density [kg/m^2] and contact thickness [m] are given, and damping [s] and friction
+    where they are not the last of the ranges.
     """
 
     density: Float[Array, ""]
@@ -201,25 +203,31 @@ class IsotropicSpace(ParameterSpace):
         damping: float = 0.01,
         friction: float = 0.5,
         thickness: float = 1e-3,
+        losses: tuple[Range, ...] = (),
     ) -> "IsotropicSpace":
-        """The space of these numbers, of which all but damping and friction must be positive."""
+        """The space of these numbers, of which all but damping and friction must be positive.
+
+        `losses`: `LOSSES` makes damping and friction parameters.
+        """
         if not min(density, plate, thickness) > 0 or min(damping, friction) < 0:
             raise ValueError(
                 "areal density [kg/m^2], plate and contact thickness [m] must be positive, damping "
                 f"[s] and friction not negative, got {density}, {plate}, {thickness}, {damping} "
                 f"and {friction}"
             )
-        return cls(
+        space = cls(
             density=jnp.asarray(density, float),
             plate=jnp.asarray(plate, float),
             damping=jnp.asarray(damping, float),
             friction=jnp.asarray(friction, float),
             thickness=jnp.asarray(thickness, float),
         )
+        return dataclasses.replace(space, ranges=(*space.ranges, *losses))
 
     def __call__(self, u: Float[Array, " dim"]) -> Fabric:
         """The fabric at a point of the unit cube."""
-        modulus, ratio = self.values(u)
+        modulus, ratio, *losses = self.values(u)
+        damping, friction = losses or (self.damping, self.friction)
         c11 = modulus / (1 - ratio**2)
         membrane = OrthotropicMembrane(c11, ratio * c11, c11, modulus / (2 * (1 + ratio)))
         bending = PlateBending(c11 * self.plate**2 / 12, ratio)
@@ -227,8 +235,8 @@ class IsotropicSpace(ParameterSpace):
             self.density,
             membrane,
             bending,
-            self.damping,
-            self.friction,
+            damping,
+            friction,
             self.thickness,
             jnp.zeros((), float),
         )
@@ -239,5 +247,6 @@ class IsotropicSpace(ParameterSpace):
         stiffness = (law.c11 + law.c22) / 2
         ratio = law.c12 / stiffness
         values = ((1 - ratio**2) * stiffness, ratio)
+        values += (fabric.damping, fabric.friction)[: self.dim - 2]
         places = [bound.to_unit(value) for bound, value in zip(self.ranges, values, strict=True)]
         return jnp.stack(places)
