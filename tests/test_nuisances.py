@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.estimation import compiled, gauss_newton
+from r2s.estimation import cma_es, compiled, gauss_newton
 from r2s.estimation import covariance as covariances
 from r2s.estimation.agreement import weighing
 from r2s.estimation.covariance import covariance_at
@@ -19,6 +19,7 @@ from r2s.estimation.descent import Budget, descend, nuisances
 from r2s.estimation.estimate import describe
 from r2s.estimation.gauss_newton import Descent, Normal
 from r2s.estimation.mesh_bias import on_the_way, weighed
+from r2s.estimation.nuisances import free as nuisances_that_vary
 from r2s.estimation.prediction import predict
 from r2s.estimation.problem import (
     Force,
@@ -334,3 +335,19 @@ def test_a_wind_whose_force_is_in_doubt_weighs_nothing(blown, lifted):
     force = Force(jnp.zeros((1, 3)), jnp.ones(1, bool), jnp.eye(3))
     pulled = dataclasses.replace(lifted, force=force)
     assert weighing((blown, lifted, pulled)) == [False, False, True]
+
+
+@pytest.mark.slow(group="estimates")
+def test_cma_es_tells_the_nuisances_with_which_it_has_its_loss(lifted):
+    pytest.importorskip("cma")
+    found = cma_es.search(lifted, evaluations=40, key=jr.key(0))
+    free = list(nuisances_that_vary((lifted,)))
+    assert [each.name for each in found.nuisances] == [each.name for each in free] != []
+    theta = np.zeros(gauss_newton.theta_length((lifted,)))
+    theta[: lifted.space.dim] = lifted.space.to_unit(found.fabric)
+    for each, told in zip(free, found.nuisances, strict=True):
+        assert np.isnan(told.standard_error)
+        theta[each.place] = told.value / each.scale
+    loss = float(gauss_newton.loss_at((lifted,), jnp.asarray(theta, float)))
+    assert found.loss == pytest.approx(loss, rel=1e-3)
+    assert np.abs(theta[lifted.space.dim :]).max() > 0.1

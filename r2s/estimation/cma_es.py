@@ -17,6 +17,7 @@ from r2s.estimation.estimate import Estimate, point_estimate
 from r2s.estimation.gauss_newton import Problems, loss_at, theta_indices, theta_length
 from r2s.estimation.method import ANY, Budget, Method, Progress
 from r2s.estimation.normal_equations import Loss
+from r2s.estimation.nuisances import nuisances
 from r2s.estimation.problem import Problem, read_by_problem
 from r2s.extras import require
 
@@ -64,8 +65,8 @@ def search(
 ) -> Estimate:
     """The best of some `evaluations` of the loss that CMA-ES (Hansen 2016) proposes from `start`.
 
-    It moves the nuisances of the prior along with the fabric, as the default methods do. It ends
-    earlier, and has converged, when its tolerances in place or loss say so. Gives no standard
+    It moves the nuisances of the prior along with the fabric, as the default methods do, and tells
+    them. It ends earlier, and has converged, when its tolerances in place or loss say so. Gives no standard
     errors.
     """
     began = time.perf_counter()
@@ -84,7 +85,7 @@ def search(
         "CMA_stds": [1.0] * space.dim + [2.0] * len(moved),
     }
     strategy = require("cma", "cma", "CMA-ES").CMAEvolutionStrategy(first, WIDTH, options)
-    losses, history, best = [], [], (np.inf, first)
+    losses, history, best = [], [], (np.inf, first, np.inf)
     while not strategy.stop():
         asked = np.array(strategy.ask())
         thetas = np.zeros((len(asked), theta_length(problems)))
@@ -95,21 +96,24 @@ def search(
         strategy.tell(list(asked), told.tolist())
         lead = int(np.argmin(told))
         if told[lead] < best[0]:
-            best = float(told[lead]), asked[lead]
+            best = float(told[lead]), asked[lead], float(found[lead])
         losses.append(float(found[lead]))
         history.append(np.asarray(space.values(_unit(space.dim, best[1]))))
         if progress is not None:
             progress(len(losses), best[0])
-    return point_estimate(
+    theta, unknown = np.zeros(theta_length(problems)), np.full(theta_length(problems), np.nan)
+    theta[moved] = best[1][space.dim :]
+    found = point_estimate(
         "cma-es",
         space,
         _unit(space.dim, best[1]),
-        min(losses),
+        best[2],
         np.array(losses)[:, None],
         np.stack(history)[:, None],
         time.perf_counter() - began,
         converged=any(name in strategy.stop() for name in ARRIVED),
     )
+    return replace(found, nuisances=nuisances(problems, theta, unknown))
 
 
 def _unit(dim: int, proposal: np.ndarray) -> Array:
