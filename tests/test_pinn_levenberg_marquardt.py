@@ -17,7 +17,6 @@ from r2s.estimation.pinn.from_clouds import clipped, parameters_of, prior, with_
 from r2s.estimation.pinn.levenberg_marquardt import (
     Term,
     least_squares,
-    marginal,
     normal_equations,
 )
 from r2s.estimation.pinn.losses import (
@@ -63,14 +62,6 @@ def test_a_line_is_found_in_a_step():
     assert found.converged and len(found.squares) <= 4
     design = np.stack([np.ones_like(x), x], 1)
     np.testing.assert_allclose(found.information, 1.25 * design.T @ design, rtol=1e-9)
-
-
-def test_what_is_left_over_of_the_information():
-    """Of the last unknowns when the others are unknown: the inverse of their covariance."""
-    random = np.random.default_rng(1).normal(size=(9, 6))
-    information = random.T @ random
-    covariance = np.linalg.inv(information)[-2:, -2:]
-    np.testing.assert_allclose(marginal(information, 2), np.linalg.inv(covariance), rtol=1e-5)
 
 
 def test_steps_go_down_and_keep_to_bounds():

@@ -66,8 +66,8 @@ def search(
     """The best of some `evaluations` of the loss that CMA-ES (Hansen 2016) proposes from `start`.
 
     It moves the nuisances of the prior along with the fabric, as the default methods do, and tells
-    them. It ends earlier, and has converged, when its tolerances in place or loss say so. Gives no standard
-    errors.
+    them. It ends earlier, and has converged, when its tolerances in place or loss say so. Gives no
+    standard errors.
     """
     began = time.perf_counter()
     problems = (problems,) if isinstance(problems, Problem) else problems

@@ -3,9 +3,7 @@
 A network from (X, Y, t) to places is fitted, with the fabric, to the clouds (each point to the
 nearest place of the network's own map, matched again and again), to the grippers' path, and to the
 balance of forces in the weak form. Gravity gives the scale, since the areal density is known. The
-fit begins with the motion of a middling fabric in the cloth solver. Levenberg-Marquardt steps give
-the information on the fabric with the whole map unknown beside it: what the clouds do not determine
-keeps the standard error of its range.
+fit begins with the motion of a middling fabric in the cloth solver.
 
 It does not find the fabric. The map comes to lie within 2 mm of the points and forces balance to
 1 %, but with a stiffness far too low, also when it begins with the true one. Clouds do not say how
@@ -15,6 +13,7 @@ nearly (`experiments/unbalanced_maps.py`): the fit of one best map fails. For cl
 `r2s.estimation.diffcloud`.
 """
 
+import dataclasses
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,7 +26,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from r2s.estimation.estimate import Estimate, Nuisance
+from r2s.estimation.estimate import Estimate, Nuisance, point_estimate
 from r2s.estimation.pinn.hanging_sheet import (
     Hanging,
     Splines,
@@ -36,7 +35,7 @@ from r2s.estimation.pinn.hanging_sheet import (
     virtual_work,
     work_scale,
 )
-from r2s.estimation.pinn.levenberg_marquardt import FIRST, Term, least_squares, marginal
+from r2s.estimation.pinn.levenberg_marquardt import FIRST, Term, least_squares
 from r2s.estimation.pinn.matching import (
     Rows,
     Sight,
@@ -62,7 +61,6 @@ BEGIN = 5e-3  # that of the cloth solver's motion, which the network follows at 
 LOW = 0.01  # height above the table below which the sheet may touch it, [m]
 STRAIN = 0.02  # standard deviation of the strain on the table, where nothing else gives it, [-]
 GUST_OVER = GUST + 1.0  # time after the first frame when the wind blows evenly, [s]
-ALIKE = 8  # frames of a lift over which model errors are alike; in a wind they are in all
 SHARPER = 0.7  # of the noise of the points: what a round leaves of it
 SETTLED = 2e-3  # of the ranges: a round that moves the fabric less is the last
 INSIDE = 1e-3  # least distance from the ends of the ranges
@@ -170,7 +168,8 @@ def estimate(
 ) -> Estimate:
     """The fabric of a recording of a sheet that is lifted or hangs, from its clouds.
 
-    An estimate that still moved in its last round has not converged, and has no standard errors.
+    It has no standard errors: what it finds is far from the truth, and no linear model says how
+    far. One that still moved in its last round has not converged.
 
     - `begin`: place in the space of the fabric to begin with, by default the middle.
     - `report`: called after each round with its number, the spread of the distances [m] and the
@@ -191,22 +190,19 @@ def estimate(
     terms = [_rows(shared, held), _rows(shared, solver), prior(place)]
     theta = least_squares(terms, theta, settings.begin, inside=clipped(space.dim)).parameters
     found = _rounds(shared, sight, held, theta, recording.info.sheet.held, settings, report)
-    in_wind = recording.info.wind is not None
-    alike = float(len(frames)) if in_wind else max(1.0, ALIKE * len(frames) / _counted(recording))
     words = f"clouds of {recording.info.scenario}"
-    return _estimate(words, space, found, alike, time.perf_counter() - began)
+    return _estimate(words, space, found, time.perf_counter() - began)
 
 
 class Found(NamedTuple):
     """Where the rounds arrived.
 
-    - `place`: in the parameter space. `information`: on it.
+    - `place`: in the parameter space.
     - `settled`: whether the fabric hardly moved in the last round.
     - `history`: square of the spread of the distances [m^2] and parameters, of every round.
     """
 
     place: np.ndarray
-    information: np.ndarray
     settled: bool
     history: list[tuple[float, np.ndarray]]
 
@@ -226,7 +222,7 @@ def _rounds(
     """
     size, dim = (float(sight.size[0]), float(sight.size[1])), shared.space.dim
     fine, coarse = rectangle(size, FINE), rectangle(size, COARSE)
-    damping, history, settled, information = FIRST, [], False, np.zeros((dim, dim))
+    damping, history, settled = FIRST, [], False
     noise = np.inf
     firm, free = prior(theta[-dim:], FIRM), prior(np.full(dim, 0.5))
     for number in range(settings.rounds):
@@ -246,7 +242,6 @@ def _rounds(
         found = least_squares(terms, theta, settings.steps, inside=clipped(dim), damping=damping)
         moved = np.abs(found.parameters - theta)[-dim:].max()
         theta, damping = found.parameters, min(found.damping, FIRST)
-        information = found.information
         values = np.asarray(shared.space.values(jnp.asarray(theta[-dim:], float)))
         history.append((float(spread) ** 2, values))
         if report is not None:
@@ -255,12 +250,7 @@ def _rounds(
         settled = sharp and bool(moved < SETTLED)
         if settled:
             break
-    return Found(theta[-dim:], marginal(information, dim), settled, history)
-
-
-def _counted(recording: Recording) -> int:
-    first, last = recording.info.frames_used
-    return last - first + 1
+    return Found(theta[-dim:], settled, history)
 
 
 def frames_of(recording: Recording, number: int = Settings.frames) -> tuple[int, ...]:
@@ -364,31 +354,18 @@ def _of_work(theta: Theta, shared: Shared, row) -> Array:
     return jnp.where(free[:, None], work / scale[:, None], 0).ravel()
 
 
-def _estimate(
-    words: str, space: ParameterSpace, found: Found, alike: float, seconds: float
-) -> Estimate:
-    """The estimate of the last round. What errs alike in `alike` frames counts once.
-
-    While the fabric moves there are no standard errors: what a linear model says of a place far
-    from the best one is wrong.
-    """
-    own = found.information - PRIOR**2 * np.eye(space.dim)
-    covariance = np.linalg.inv(own / alike + PRIOR**2 * np.eye(space.dim))
-    lengths = np.array([np.log(r.high / r.low) if r.log else r.high - r.low for r in space.ranges])
-    errors = np.sqrt(np.diag(covariance)) * (1.0 if found.settled else np.nan)
-    place = jnp.asarray(found.place, float)
+def _estimate(words: str, space: ParameterSpace, found: Found, seconds: float) -> Estimate:
+    """The estimate of the last round."""
     squares = np.array([square for square, _ in found.history])[:, None]
-    return Estimate(
-        approach=f"pinn (weak form, {words})",
-        fabric=space(place),
-        ranges=space.ranges,
-        values=np.asarray(space.values(place)),
-        standard_errors=lengths * errors,
-        correlation=covariance / np.outer(errors, errors),
-        nuisances=(Nuisance("spread of distances", "m", float(squares[-1, 0] ** 0.5), np.nan),),
-        loss=float(squares[-1, 0]),
-        losses=squares,
-        history=np.stack([values for _, values in found.history])[:, None],
-        seconds=seconds,
+    estimate = point_estimate(
+        f"pinn (weak form, {words})",
+        space,
+        jnp.asarray(found.place, float),
+        float(squares[-1, 0]),
+        squares,
+        np.stack([values for _, values in found.history])[:, None],
+        seconds,
         converged=found.settled,
     )
+    spread = Nuisance("spread of distances", "m", float(squares[-1, 0] ** 0.5), np.nan)
+    return dataclasses.replace(estimate, nuisances=(spread,))

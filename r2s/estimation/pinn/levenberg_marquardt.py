@@ -160,13 +160,3 @@ def _stepped(matrix: np.ndarray, right: np.ndarray, parameters: np.ndarray, insi
     rest = right[free] + matrix[np.ix_(free, ~free)] @ held
     after[free] = parameters[free] - cho_solve(cho_factor(matrix[np.ix_(free, free)]), rest)
     return inside(after)
-
-
-def marginal(
-    information: Float[np.ndarray, "parameter parameter"], number: int
-) -> Float[np.ndarray, "last last"]:
-    """The information on the last `number` parameters when all others are unknown too."""
-    of_others, mixed = information[:-number, :-number], information[:-number, -number:]
-    mean = np.trace(of_others) / len(of_others)
-    held = of_others + RIDGE * mean * np.eye(len(of_others))
-    return information[-number:, -number:] - mixed.T @ cho_solve(cho_factor(held), mixed)
