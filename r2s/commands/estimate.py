@@ -82,7 +82,8 @@ class EstimateCard:
     law: Literal["linear", "stiffening", "softening", "stiffening+softening"] | None = None
     """Constant stiffness; stiffening: yarns whose stiffness grows with their stretch (three numbers
     more); softening: bending whose stiffness falls with the curvature (two more). By default both
-    for diffcloud where the force of a pull was recorded and another motion; else constant."""
+    for diffcloud where the force of a pull was recorded and another motion, and no laboratory test
+    is given; else constant."""
     prior: Literal["flat", "fabrics"] | None = None
     """What is assumed beforehand: any place of the ranges alike, or what measured fabrics of this
     weight are like. Then diffcloud trusts that more, as far as its mesh errs. By default fabrics
@@ -126,7 +127,9 @@ class EstimateCard:
         from r2s.files import check_folders
         from r2s.laboratory.estimate import estimate, informed
         from r2s.laboratory.files import read_tests
+        from r2s.laboratory.pull import Pull
         from r2s.recordings.open import open_recordings
+        from r2s.scenarios.resolution import alike
 
         check_folders(self.out)
         files = [path for path in self.recordings if path.suffix == ".json"]
@@ -142,7 +145,7 @@ class EstimateCard:
             space = self._space(method, prior, [] if known else seen)
             tests = [test for each in known for test in each.tests]
             if seen:
-                method.check([*seen, *unseen])
+                method.check(seen)
                 if tests:
                     method.check_prior()
             else:
@@ -159,7 +162,7 @@ class EstimateCard:
             judged = []
             for each in unseen:
                 tell(progress, f"judging by {each.info.name}")
-                shape = found.shape or COARSEST
+                shape = alike(found.shape or COARSEST, each.info.sheet.size)
                 air = held_out.air_found(found, seen)
                 told_by = held_out.judge(each, found.fabric, shape, air=air)
                 judged.append(told_by.describe())
@@ -174,17 +177,18 @@ class EstimateCard:
                 *((each.name, each.fingerprint) for each in known),
             ),
             date=self.date,
-            assumed=("density", "thickness", "mass_damping"),
+            assumed=_assumed([each.name for each in found.ranges]),
         )
         name = self.name or (seen[0].info.fabric if seen else known[0].name)
         card = cards.Card.make(name, found, provenance)
         cards.write(self.out, card)
         for path in self.out.parent.glob(f"{escape(self._progress_file.stem)}*.npz"):
             path.unlink()
+        weighing = _by_weight(method, self.density, seen)
         lines = [
             *describe(found),
             *_unread(method, seen),
-            *_by_weight(method, self.density, seen),
+            *([] if any(isinstance(test, Pull) for test in tests) else weighing),
             *_warnings(found, seen),
             *_laboratory_lines(tests, told, found),
             *(judged or self._unjudged(seen)),
@@ -227,6 +231,10 @@ class EstimateCard:
         asked = law != "linear" or told != "flat"
         if asked and method.chosen_solver != "cloth":
             raise ValueError("--law and --prior are of the cloth: material points have their own")
+        if law != "linear" and method.name == "diffcloud-published":
+            raise ValueError(
+                "--law: the two multipliers of diffcloud-published are of constant ones"
+            )
         space = with_law(space, law)
         return space if told == "flat" else prior.informed(space, self.density)
 
@@ -303,13 +311,30 @@ def _warnings(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[s
     """How recordings count and whether they agree; what does not fit; where the mesh of the
     estimate is too coarse for the fabric that came out."""
     from r2s.commands.common import mesh_warning
+    from r2s.scenarios.resolution import alike
 
     lines = [*_agreement(estimate, recordings), *_misfits(estimate, recordings)]
     if estimate.shape is None:
         return lines
     motions = dict.fromkeys((each.info.sheet.size, each.info.scenario) for each in recordings)
-    shape, fabric = estimate.shape, estimate.fabric
-    return [*lines, *(line for each in motions for line in mesh_warning(shape, fabric, *each))]
+    fabric = estimate.fabric
+    for size, scenario in motions:
+        lines += mesh_warning(alike(estimate.shape, size), fabric, size, scenario)
+    return lines
+
+
+def _assumed(estimated: "Sequence[str]") -> tuple[str, ...]:
+    """The numbers and laws of a fabric that were neither weighed nor estimated, by the names of
+    those that were."""
+    parts = {
+        "membrane": {"warp", "E h"},
+        "bending": {"bending"},
+        "damping": {"damping"},
+        "friction": {"friction"},
+        "thickness": {"thickness"},
+        "mass_damping": {"mass damping"},
+    }
+    return tuple(name for name, told in parts.items() if not told & {*estimated})
 
 
 def _approach(approach: str, known: "Sequence[LaboratoryTests]", prior: str) -> str:

@@ -57,7 +57,7 @@ def agreement(
       which direction is not: each parameter is excused by itself, by `MOST` at most.
 
     The weighted scatter around the mean is compared with its chi-squared distribution. The one is
-    named without which the others agree best; of two, the second.
+    named that adds to it what is least likely, see `odd_one`.
     """
     if len(problems) < 2:
         return None
@@ -88,7 +88,7 @@ def agreement(
     p, counts = chance(told), tuple(each.count for each in told)
     if not p < UNLIKELY:
         return Agreement(p, counts, None, density, without)
-    odd = 1 if len(told) == 2 else min(range(len(told)), key=lambda i: _without(told, i))
+    odd = odd_one(told)
     rest = [each for i, each in enumerate(told) if i != odd]
     (here, own), (there, others) = (_known(each, mean, precision) for each in ([told[odd]], rest))
     errors = np.abs(here - there) / np.sqrt(np.diag(own) + np.diag(others))
@@ -170,10 +170,19 @@ def chance(told: Sequence[Told]) -> float:
     return float(stats.chi2.sf(scatter, freedom)) if freedom else 1.0
 
 
-def _without(told: Sequence[Told], odd: int) -> float:
-    """The scatter of all but one, in standard deviations above its mean."""
-    scatter, freedom = scattered([each for i, each in enumerate(told) if i != odd])
-    return (scatter - freedom) / np.sqrt(2 * max(freedom, 1))
+def odd_one(told: Sequence[Told]) -> int:
+    """The index of the recording that adds to the scatter what is least likely by chance for the
+    degrees of freedom that it adds. Of several alike, the last: of two, the second."""
+    scatter, freedom = scattered(told)
+
+    def likely(which: int) -> tuple[float, int]:
+        others = [each for i, each in enumerate(told) if i != which]
+        less, left = scattered(others)
+        if left == freedom:  # it tells nothing that others tell
+            return 0.0, -which
+        return round(float(stats.chi2.logsf(scatter - less, freedom - left)), 6), -which
+
+    return min(range(len(told)), key=likely)
 
 
 def _known(told: Sequence[Told], mean, precision) -> tuple[np.ndarray, np.ndarray]:

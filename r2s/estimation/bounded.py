@@ -12,6 +12,7 @@ from r2s.estimation.gauss_newton import MARGIN, Descent, Problems, prior_terms, 
 from r2s.estimation.prediction import Theta
 
 ROUNDING = 1e-12  # of the largest curvature: less is none
+AT_BOUND = 1e-6  # of a range: nearer than that, in single precision, is at it
 
 Vector = Float[np.ndarray, " theta"]
 Matrix = Float[np.ndarray, "theta theta"]
@@ -22,7 +23,8 @@ def room(problems: Problems, theta: Theta) -> tuple[Vector, Vector]:
     without end."""
     is_fabric = np.arange(theta_length(problems)) < problems[0].space.dim
     at = np.asarray(theta, np.float64)
-    down, up = np.minimum(MARGIN - at, 0.0), np.maximum(1 - MARGIN - at, 0.0)
+    down, up = MARGIN - at, 1 - MARGIN - at
+    down, up = np.where(down < -AT_BOUND, down, 0.0), np.where(up > AT_BOUND, up, 0.0)
     return np.where(is_fabric, down, -np.inf), np.where(is_fabric, up, np.inf)
 
 

@@ -18,7 +18,7 @@ from r2s.estimation.gauss_newton import Problems, loss_at, theta_indices, theta_
 from r2s.estimation.method import ANY, Budget, Method, Progress
 from r2s.estimation.normal_equations import Loss
 from r2s.estimation.nuisances import nuisances
-from r2s.estimation.problem import Problem, read_by_problem
+from r2s.estimation.problem import Problem, check_shared, read_by_problem
 from r2s.extras import require
 
 DIVERGED = 1.0  # [m^2]: the loss of a run that diverged, above that of any that did not
@@ -68,9 +68,13 @@ def search(
     It moves the nuisances of the prior along with the fabric, as the default methods do, and tells
     them. It ends earlier, and has converged, when its tolerances in place or loss say so. Gives no
     standard errors.
+
+    Raises `ValueError` for recordings whose shared nuisances are in doubt by different amounts,
+    `RuntimeError` where all runs diverged.
     """
     began = time.perf_counter()
     problems = (problems,) if isinstance(problems, Problem) else problems
+    check_shared(problems)
     space, moved = problems[0].space, _nuisance_indices(problems)
     place = np.full(space.dim, 0.5) if start is None else np.asarray(start, float)
     first = np.concatenate([np.clip(place, 0, 1), np.zeros(len(moved))])
@@ -101,6 +105,11 @@ def search(
         history.append(np.asarray(space.values(_unit(space.dim, best[1]))))
         if progress is not None:
             progress(len(losses), best[0])
+    if not np.isfinite(best[2]):
+        raise RuntimeError(
+            f"all {strategy.countevals} simulations of CMA-ES diverged: check the recording's "
+            "units and gripper path, or narrow the space's ranges"
+        )
     theta, unknown = np.zeros(theta_length(problems)), np.full(theta_length(problems), np.nan)
     theta[moved] = best[1][space.dim :]
     found = point_estimate(

@@ -239,15 +239,28 @@ def _begin(problems: Problems, budget: Budget, start, derive: Derive, progress, 
     if budget.coarse:
         losses = losses_at(_seen(problems, budget, 0), thetas, progress)
         if not np.any(np.isfinite(losses)):
-            theta = thetas[0, theta_indices(problems, 0)]
-            raise RuntimeError(
-                f"all {count} simulations of the coarse search diverged, the first "
-                f"{explain(problems[0], theta)} Check the recording's units and gripper path, or "
-                "narrow the space's ranges."
-            )
+            raise _diverged(f"all {count} simulations of the coarse search", problems, thetas[0])
         thetas = thetas[np.argsort(losses)]
     tell(progress, "compiling the derivatives")
-    return _fresh(problems, budget, list(thetas[: budget.starts]), 0.0, 0, derive)
+    row = _fresh(problems, budget, list(thetas[: budget.starts]), 0.0, 0, derive)
+    if not any(_is_finite(each) for each in row):
+        raise _diverged("all starts of the descents", problems, thetas[0])
+    return row
+
+
+def _is_finite(descent: Descent) -> bool:
+    return bool(np.isfinite(float(descent.normal.loss)))
+
+
+def _diverged(what: str, problems: Problems, theta: Theta) -> RuntimeError:
+    reasons = (
+        explain(problem, theta[theta_indices(problems, which)])
+        for which, problem in enumerate(problems)
+    )
+    return RuntimeError(
+        f"{what} diverged, the first {next(filter(None, reasons), '')} Check the recording's units "
+        "and gripper path, or narrow the space's ranges."
+    )
 
 
 def _share(budget: Budget, stage: int) -> float:
@@ -317,19 +330,26 @@ def _kept(row: Row, iteration: int) -> list[int]:
 
 
 def _later(problems: Problems, budget: Budget, row: Row, derive: Derive) -> Row | None:
-    """The next stage, to which only the best descent goes on; None after the last.
+    """The next stage, to which only the best descent goes on; None after the last. Where that
+    diverges in the frames that count then, the next best does; `RuntimeError` where all do.
 
     From the second stage on outliers are left out, beyond a scale that follows from the distances
     left: outliers lie to one side of a sheet, so that even a small weight of theirs biases the
     estimate.
     """
-    which, best = _best(row)
-    stage = int(best.stage) + 1
+    now = int(_best(row)[1].stage)
+    stage = now + 1
     if stage > _last_stage(budget):
         return None
-    loose = best
-    if _share(budget, stage) != _share(budget, stage - 1):
-        (loose,) = _fresh(problems, budget, [best.theta], 0.0, stage, derive)
+    there = [i for i, each in enumerate(row) if int(each.stage) == now and _is_finite(each)]
+    for which in sorted(there, key=lambda i: float(row[i].normal.loss)):
+        loose = best = row[which]
+        if _share(budget, stage) != _share(budget, stage - 1):
+            (loose,) = _fresh(problems, budget, [best.theta], 0.0, stage, derive)
+        if _is_finite(loose):
+            break
+    else:
+        raise _diverged("all descents", problems, _best(row)[1].theta)
     scale = float(np.clip(STRICT * float(loose.normal.widest), *SCALES))
     after = list(row)
     (after[which],) = _fresh(problems, budget, [best.theta], scale, stage, derive)

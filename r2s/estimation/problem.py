@@ -380,7 +380,11 @@ def _on_sheet(
 
 
 def _force(recording: Recording, frames: slice) -> Force | None:
-    """The force at the frames; a log of numbers is along the warp, along which the clamp pulls."""
+    """The force at the frames; a log of numbers is along the warp, along which the clamp pulls.
+
+    Raises `ValueError` for a log that does not cover the frames, and for one number that falls in a
+    stretching.
+    """
     if recording.force is None or recording.force_times is None:
         return None
     log = np.asarray(recording.force, float)
@@ -388,7 +392,18 @@ def _force(recording: Recording, frames: slice) -> Force | None:
     times = np.asarray(recording.times)[frames]
     columns = log[:, None] if scalar else log
     clock = np.asarray(recording.force_times)
+    slack = float(np.diff(times).mean()) if len(times) > 1 else 0.0
+    if clock[0] > times[0] + slack or clock[-1] < times[-1] - slack:
+        raise ValueError(
+            f"{recording.info.name}: the force is known from {clock[0]:g} to {clock[-1]:g} s, the "
+            f"frames that count go from {times[0]:g} to {times[-1]:g} s: is it on the same clock?"
+        )
     values = np.stack([np.interp(times, clock, column) for column in columns.T], axis=1)
+    if scalar and recording.info.scenario == "stretching" and -values.min() > values.max():
+        raise ValueError(
+            f"{recording.info.name}: the force on the pulled clamp falls to {values.min():.3g} N: "
+            "it must be positive along the pull"
+        )
     directions = np.array([recording.info.sheet.warp]) if scalar else np.eye(3)
     seen = jnp.ones(len(values), bool)
     return Force(jnp.asarray(values, float), seen, jnp.asarray(directions, float))

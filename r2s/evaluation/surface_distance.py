@@ -18,7 +18,8 @@ def to_surface(
     """Mean distance [m] from each frame's points to the nearest place on the sheet.
 
     It is to the surface itself, where `r2s.evaluation.metrics` measures to samples of it. Of more
-    than `POINTS` points the first count: clouds are in random order. NaN where `x` is not finite.
+    than `POINTS` points so many are drawn, always the same: the order of a recording's points may
+    be that of their places. NaN where `x` is not finite.
     Raises `ValueError` for another number of clouds than frames, and for an empty one.
     """
     if len(clouds) != len(x):
@@ -26,11 +27,18 @@ def to_surface(
     if not all(len(cloud) for cloud in clouds):
         raise ValueError(f"frame {[len(c) for c in clouds].index(0)} has no points")
     most = min(POINTS, max(map(len, clouds)))
-    rows = [np.resize(cloud[:most], (most, 3)) for cloud in clouds]  # repeated where too few
+    drawn = [_drawn(cloud, most, frame) for frame, cloud in enumerate(clouds)]
+    rows = [np.resize(cloud, (most, 3)) for cloud in drawn]  # repeated where too few
     weights = [_weights(min(len(cloud), most), most) for cloud in clouds]
     found = _distances(jnp.asarray(rows, float), jnp.asarray(weights, float), jnp.asarray(x), faces)
     finite = np.isfinite(x).all(axis=(1, 2))
     return np.where(finite, np.asarray(found, float), np.nan)
+
+
+def _drawn(cloud: np.ndarray, most: int, frame: int) -> np.ndarray:
+    if len(cloud) <= most:
+        return cloud
+    return cloud[np.random.default_rng([0, frame]).choice(len(cloud), most, replace=False)]
 
 
 def _weights(count: int, most: int) -> np.ndarray:

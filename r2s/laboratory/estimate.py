@@ -111,7 +111,9 @@ def apart(told: Estimate, found: Estimate) -> float:
     """How likely it is by chance that an estimate lies as far from what tests alone told, [-].
 
     `found` has the tests as its prior, so that the difference has the covariance of `told` less its
-    own (Hausman, Econometrica 46, 1978). Counted are the parameters that the tests tell.
+    own (Hausman, Econometrica 46, 1978); and the error of its mesh, where that was judged. In
+    directions that it knows no better than the tests do, its own errors are others, of its mesh or
+    its law: there the covariances add. Counted are the parameters that the tests tell.
     """
     ranges = told.ranges
     widths = np.array([bound.width for bound in ranges])
@@ -127,7 +129,10 @@ def apart(told: Estimate, found: Estimate) -> float:
     off = (places[1] - places[0])[told_by]
     before, after = (_covariance(each, widths)[np.ix_(told_by, told_by)] for each in (told, found))
     sizes, axes = np.linalg.eigh(before - after)
-    sizes = np.maximum(sizes, SLACK * np.max(np.linalg.eigvalsh(before)))
+    both = np.einsum("ij,ik,kj->j", axes, before + after, axes)
+    sizes = np.where(sizes > SLACK * np.max(np.linalg.eigvalsh(before)), sizes, both)
+    if found.mesh_bias is not None:
+        sizes = sizes + (axes**2).T @ (found.mesh_bias / widths)[told_by] ** 2
     return float(chi2.sf(np.sum((axes.T @ off) ** 2 / sizes), len(off)))
 
 

@@ -97,6 +97,12 @@ def ladder(size: tuple[float, float]) -> list[Shape]:
     return [(cells(n, size[0]) + 1, cells(n, size[1]) + 1) for n in LADDER]
 
 
+def alike(shape: Shape, size: tuple[float, float]) -> Shape:
+    """The mesh of a sheet of another `size` [m] that is of the same step of the `ladder` as a
+    `shape`: as many vertices along its longer side; where no step has so many, the shape itself."""
+    return next((each for each in ladder(size) if max(each) == max(shape)), shape)
+
+
 def warning(fabric: Fabric, size: tuple[float, float], shape: Shape, motion: str) -> str:
     """A line for people, with the figure, when a mesh is too coarse for a fabric; else empty."""
     error = mesh_error(fabric, size, shape, motion)

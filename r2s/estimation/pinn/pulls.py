@@ -74,8 +74,8 @@ def pull_from(
 
     - `angle`: from the pull to the warp [rad]: pi / 2 in a pull along the weft, pi / 4 on the bias;
       None: what the recording says.
-    - `places`: of the markers on the sheet at rest [m]; by default a grid with as many rows as
-      columns, each marker in the middle of its cell.
+    - `places`: of the markers on the sheet at rest [m]; None: what the recording says, and where it
+      does not, a grid with as many rows as columns, each marker in the middle of its cell.
     - `without_force`: leave the force out.
 
     Raises `ValueError` for fewer than 3 frames, times that do not increase evenly, markers that are
@@ -84,6 +84,8 @@ def pull_from(
     """
     if angle is None:
         angle = math.radians(recording.info.angle)
+    if places is None and recording.marker_places is not None:
+        places = np.asarray(recording.marker_places, np.float64)
     try:
         return _pull(recording, angle, places, without_force)
     except ValueError as error:
