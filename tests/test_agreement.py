@@ -9,7 +9,16 @@ import pytest
 from scipy import stats
 
 from r2s import scenarios
-from r2s.estimation.agreement import MOST, UNLIKELY, agreement, density_told, scattered, told_by
+from r2s.estimation.agreement import (
+    MOST,
+    UNLIKELY,
+    Told,
+    agreement,
+    density_told,
+    odd_one,
+    scattered,
+    told_by,
+)
 from r2s.estimation.descent import DEFAULT, each_alone
 from r2s.estimation.estimate import Agreement
 from r2s.estimation.gauss_newton import theta_length
@@ -155,3 +164,23 @@ def test_what_an_estimate_kept_of_its_prior_is_not_told_by_its_recording():
     assert told.count == 1
     np.testing.assert_allclose(told.information, np.diag([1e4, 0]), atol=1e-6)
     np.testing.assert_allclose(told.place, [0.6, 0.5], atol=1e-9)
+
+
+def _told(*known):
+    """What a recording tells of a warp and a weft: where to, and how precisely."""
+    place = np.array([each[0] if each else 0.0 for each in known])
+    information = np.diag([1 / each[1] ** 2 if each else 0.0 for each in known])
+    return Told(place, information, sum(bool(each) for each in known))
+
+
+def test_the_odd_recording_is_the_one_that_adds_what_is_least_likely():
+    """Not the one without which there is nothing left to compare."""
+    lift, weft = _told((0.5, 0.01), (0.5, 0.01)), _told((), (0.514, 0.01))
+    wrong = _told((0.6, 0.01), ())
+    assert odd_one([lift, wrong, weft]) == 1
+    assert odd_one([wrong, weft, lift]) == 0
+    tells_nothing = _told((), ())
+    assert odd_one([tells_nothing, lift, wrong]) == 2  # of two that contradict, the second
+    assert odd_one([lift, wrong]) == 1
+    both_against_it = _told((0.7, 0.01), (0.7, 0.01))
+    assert odd_one([both_against_it, _told((0.5, 0.01), ()), weft]) == 0

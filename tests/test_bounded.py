@@ -111,3 +111,14 @@ def test_room_is_to_the_bounds_and_nuisances_have_no_end(problems):
     assert np.all(np.isinf(down[DIM:])) and np.all(np.isinf(up[DIM:]))
     held = only_held((down, up))
     assert held[1][1] == 0 and np.isinf(held[0]).all() and np.isinf(np.delete(held[1], 1)).all()
+
+
+def test_a_bound_is_held_in_single_precision_too(problems):
+    """Where the least place, 1e-3, is a little more than itself, and the largest a little less."""
+    ends = np.array([MARGIN, 1 - MARGIN])
+    theta = np.zeros(theta_length(problems), np.float32)
+    theta[:DIM] = ends
+    assert np.any(theta[:DIM].astype(float) != ends)
+    low, high = only_held(room(problems, jnp.asarray(theta, jnp.float32)))
+    assert low[0] == 0 and high[1] == 0
+    assert np.isinf(high[0]) and np.isinf(low[1])

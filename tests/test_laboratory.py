@@ -492,3 +492,22 @@ def test_tests_alone_make_a_card(tmp_path: Path, capsys: pytest.CaptureFixture):
     assert main([*command, "--law", "stiffening"]) == 0
     law = cards.read(tmp_path / "card.json").fabric.membrane
     assert isinstance(law, StiffeningMembrane)
+
+
+def test_an_estimate_that_errs_by_its_mesh_does_not_contradict_tests_that_it_lies_near():
+    """It knows no better than the tests do, and half a standard error is no contradiction."""
+    space = on_cloth(0.32)
+    told = estimate([pulled(presets.black_denim(), each) for each in ANGLES], space)
+    widths = np.array([bound.width for bound in space.ranges])
+    shift = np.zeros(space.dim)
+    shift[:3] = 0.5 * told.standard_errors[:3] / widths[:3]
+    places = np.asarray(space.to_unit(told.fabric)) + shift
+    values = np.asarray(space.values(jnp.asarray(places, float)))
+    for wider in (1.0, 1.2):
+        near = dataclasses.replace(
+            told, values=values, standard_errors=wider * told.standard_errors
+        )
+        assert apart(told, near) > 0.3
+    finer = dataclasses.replace(told, values=values, standard_errors=0.99 * told.standard_errors)
+    blamed = dataclasses.replace(finer, mesh_bias=0.5 * told.standard_errors)
+    assert apart(told, finer) < 0.01 < apart(told, blamed)

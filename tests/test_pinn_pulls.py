@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from r2s.estimation.pinn.pulls import pull_from, stacked
+from r2s.estimation.problem import Problem
+from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.recordings.recording import RecordingInfo, make_recording
 from r2s.scenarios import stretching
 
@@ -148,3 +150,30 @@ def test_pulls_that_do_not_go_together():
         stacked([one, short])
     with pytest.raises(ValueError, match="one stretching"):
         stacked([])
+
+
+def test_markers_are_where_the_recording_says_that_they_were_put():
+    """No square grid, and none of them in the middle of a cell."""
+    markers = np.asarray(recording().markers)[:, :8] + np.array([0.004, 0, 0])
+    places = markers[0, :, :2]
+    found = pull_from(recording(markers=markers, marker_places=places))
+    np.testing.assert_allclose(found.places, places, atol=1e-9)
+    assert np.abs(np.asarray(found.displacement[0])).max() < 1e-9
+
+
+@pytest.mark.parametrize("says", ["on the same clock", "positive along the pull"])
+def test_methods_that_simulate_refuse_such_forces_too(says):
+    number = np.asarray(recording().force)[:, 0]
+    good, bad = (
+        {"force": number},
+        {
+            "on the same clock": {"force": number, "force_times": 100 + np.arange(FRAMES)},
+            "positive along the pull": {"force": -number},
+        }[says],
+    )
+    space = OrthotropicSpace.make(0.2)
+    force = Problem.make(recording(**good), space, shape=(3, 3)).force
+    assert force is not None
+    np.testing.assert_allclose(np.asarray(force.values)[:, 0], number, rtol=1e-5)
+    with pytest.raises(ValueError, match=says):
+        Problem.make(recording(**bad), space, shape=(3, 3))

@@ -11,7 +11,15 @@ from scipy.stats import gmean
 from r2s.fabrics import presets
 from r2s.fabrics.fold_length import fold_length
 from r2s.scenarios import resolution
-from r2s.scenarios.resolution import ENOUGH, LADDER, TABLE, mesh_error, shape_for
+from r2s.scenarios.resolution import (
+    ENOUGH,
+    LADDER,
+    TABLE,
+    alike,
+    ladder,
+    mesh_error,
+    shape_for,
+)
 from r2s.scenarios.six import SIDE
 
 SIZE = (SIDE, SIDE)
@@ -106,3 +114,11 @@ def test_a_motion_that_was_not_measured_has_the_largest_error():
     knit = presets.grey_interlock()
     largest = max(mesh_error(knit, SIZE, (9, 9), motion) for motion in TABLE)
     assert mesh_error(knit, SIZE, (9, 9), "wringing") == largest
+
+
+def test_another_sheet_has_the_mesh_of_the_same_step():
+    strip, square = (0.5, 0.1), (0.45, 0.45)
+    shape = ladder(strip)[1]
+    assert alike(shape, square) == (17, 17)
+    assert alike((17, 17), strip) == shape
+    assert alike((12, 12), square) == (12, 12)  # asked for: of no step

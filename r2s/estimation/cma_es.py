@@ -132,7 +132,7 @@ def _unit(dim: int, proposal: np.ndarray) -> Array:
 
 def _with_prior(problems: Problems, losses: np.ndarray, nuisances: np.ndarray) -> np.ndarray:
     """Losses [m^2] with the prior of the nuisances, so that these do not run away."""
-    least = np.nanmin(np.where(np.isfinite(losses), losses, np.nan))
+    least = np.min(losses, where=np.isfinite(losses), initial=DIVERGED)
     frames = sum(len(problem.frames) for problem in problems)
     penalty = 2 * least / frames * np.sum(nuisances**2, axis=1) / 2
     return np.where(np.isfinite(losses), losses + penalty, DIVERGED)

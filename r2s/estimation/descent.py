@@ -331,7 +331,8 @@ def _kept(row: Row, iteration: int) -> list[int]:
 
 def _later(problems: Problems, budget: Budget, row: Row, derive: Derive) -> Row | None:
     """The next stage, to which only the best descent goes on; None after the last. Where that
-    diverges in the frames that count then, the next best does; `RuntimeError` where all do.
+    diverges in the frames that count then, the next best does, of those that earlier stages left
+    too; `RuntimeError` where all diverge.
 
     From the second stage on outliers are left out, beyond a scale that follows from the distances
     left: outliers lie to one side of a sheet, so that even a small weight of theirs biases the
@@ -341,8 +342,8 @@ def _later(problems: Problems, budget: Budget, row: Row, derive: Derive) -> Row 
     stage = now + 1
     if stage > _last_stage(budget):
         return None
-    there = [i for i, each in enumerate(row) if int(each.stage) == now and _is_finite(each)]
-    for which in sorted(there, key=lambda i: float(row[i].normal.loss)):
+    there = [i for i, each in enumerate(row) if _is_finite(each)]
+    for which in sorted(there, key=lambda i: (-int(row[i].stage), float(row[i].normal.loss))):
         loose = best = row[which]
         if _share(budget, stage) != _share(budget, stage - 1):
             (loose,) = _fresh(problems, budget, [best.theta], 0.0, stage, derive)

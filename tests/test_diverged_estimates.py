@@ -1,0 +1,99 @@
+"""Runs that diverge end no estimate as if it had arrived: another descent goes on, or none does."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+from r2s import scenarios
+from r2s.estimation import cma_es, descent
+from r2s.estimation.compiled import derivatives_at
+from r2s.estimation.descent import Descent
+from r2s.estimation.gauss_newton import Normal, theta_length
+from r2s.estimation.method import Budget
+from r2s.estimation.problem import NuisancePrior, Problem
+from r2s.fabrics import presets
+from r2s.fabrics.parameters import IsotropicSpace
+from r2s.scenarios import synthetic
+
+BUDGET = Budget(shares=(0.25, 0.5), starts=2)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    fabric = presets.grey_interlock()
+    experiment = scenarios.lifting(num_frames=4, interval=1 / 10, height=0.2, moving=0.3)
+    seen = synthetic.record(experiment, fabric, "lift", shape=(3, 3), key=jr.key(0))
+    return Problem.make(seen, IsotropicSpace.make(float(fabric.density)), shape=(3, 3))
+
+
+def row_of(problem, losses):
+    """Descents of the first stage with such losses, each in a place of its own."""
+    size, none, stage = theta_length((problem,)), jnp.zeros(()), jnp.zeros((), int)
+    theta, matrix = jnp.zeros(size), jnp.eye(size)
+    return [
+        Descent(
+            theta + i, Normal(jnp.array(x), none, none, theta, matrix, matrix), *[none] * 3, stage
+        )
+        for i, x in enumerate(losses)
+    ]
+
+
+def fresh(losses):
+    """Instead of new descents: whose losses, once all frames count, are those of their places."""
+
+    def made(problems, budget, thetas, scale, stage, derive):
+        shared = budget.shares and stage <= len(budget.shares)
+        found = [1e-6 if shared else losses[int(theta[0])] for theta in thetas]
+        row = [row_of(problems[0], [loss])[0] for loss in found]
+        changes = {"scale": jnp.asarray(scale), "stage": jnp.asarray(stage)}
+        return [
+            dataclasses.replace(each, theta=theta, **changes)
+            for each, theta in zip(row, thetas, strict=True)
+        ]
+
+    return made
+
+
+def test_the_next_best_descent_goes_on_where_the_best_diverges_later(problem, monkeypatch):
+    row = row_of(problem, [1e-6, 2e-6])
+    monkeypatch.setattr(descent, "_fresh", fresh([np.inf, 3e-6]))
+    stages = []
+    while row is not None:
+        stages.append(descent._best(row))
+        row = descent._later((problem,), BUDGET, row, derivatives_at)
+    assert [which for which, _ in stages] == [0, 0, 0, 1]
+    assert float(stages[-1][1].normal.loss) == pytest.approx(3e-6)
+
+
+def test_where_all_diverge_it_is_said_and_why(problem, monkeypatch):
+    monkeypatch.setattr(descent, "_fresh", fresh([np.inf, np.inf]))
+    monkeypatch.setattr(descent, "explain", lambda *_: "frame 3: speed.")
+    row = descent._later((problem,), BUDGET, row_of(problem, [1e-6, 2e-6]), derivatives_at)
+    with pytest.raises(
+        RuntimeError, match="all descents diverged, the first frame 3: speed. Check"
+    ):
+        while row is not None:
+            row = descent._later((problem,), BUDGET, row, derivatives_at)
+    with pytest.raises(RuntimeError, match="all starts of the descents diverged"):
+        descent.search((problem,), Budget(shares=(), coarse=0, starts=1), key=jr.key(0))
+
+
+def test_cma_es_gives_no_fabric_of_runs_that_all_diverged(problem, monkeypatch):
+    pytest.importorskip("cma")
+    monkeypatch.setattr(
+        cma_es, "_losses", lambda problems, thetas, loss: jnp.full(len(thetas), jnp.inf)
+    )
+    with pytest.raises(RuntimeError, match="all .* simulations of CMA-ES diverged"):
+        cma_es.search(problem, evaluations=30, key=jr.key(0))
+
+
+def test_cma_es_refuses_a_shared_doubt_of_two_sizes(problem):
+    pytest.importorskip("cma")
+    problems = tuple(
+        dataclasses.replace(problem, nuisance_prior=NuisancePrior(air=air)) for air in (0.1, 0.2)
+    )
+    with pytest.raises(ValueError, match="air"):
+        cma_es.search(problems, evaluations=30, key=jr.key(0))
