@@ -19,9 +19,11 @@ from test_show import recorded  # noqa: E402
 from r2s.cli import main  # noqa: E402
 from r2s.commands.common import choose_shape, make_experiment, print_result  # noqa: E402
 from r2s.commands.doctor import EXCLUDED, EXTRAS, implausible  # noqa: E402
-from r2s.commands.estimate import EstimateCard, _approach  # noqa: E402
+from r2s.commands.estimate import EstimateCard, _approach, _assumed  # noqa: E402
 from r2s.estimation import cards
 from r2s.estimation.cards import Card, Provenance  # noqa: E402
+from r2s.estimation.diffcloud import MASS, STRETCH  # noqa: E402
+from r2s.estimation.method import default_space  # noqa: E402
 from r2s.estimation.registry import METHODS  # noqa: E402
 from r2s.fabrics import presets  # noqa: E402
 from r2s.fabrics.arcsim import read_material  # noqa: E402
@@ -317,3 +319,19 @@ def test_fabrics_of_this_weight_are_known_to_whom_they_help(options, is_alone, k
     assert isinstance(card._space(method, told, []), InformedSpace) == knows
     words = _approach("diffcloud", (), told)
     assert ("prior of measured fabrics" in words) == knows
+
+
+def test_a_card_says_what_was_neither_weighed_nor_estimated():
+    on_cloth, on_points = (
+        [each.name for each in default_space(solver, 0.2).ranges] for solver in ("cloth", "points")
+    )
+    assert _assumed(on_cloth) == ("thickness", "mass_damping")
+    assert _assumed(on_points) == ("bending", "damping", "friction", "thickness", "mass_damping")
+    whole = ("membrane", "bending", "damping", "friction", "thickness", "mass_damping")
+    assert _assumed([each.name for each in (STRETCH, MASS)]) == whole
+
+
+def test_multipliers_have_no_law_that_stiffens():
+    card = EstimateCard((Path("lift.npz"),), 0.2, Path("card.json"), law="stiffening")
+    with pytest.raises(ValueError, match="multipliers of diffcloud-published"):
+        card._space(METHODS["diffcloud-published"](), "flat", [])
