@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -213,3 +214,17 @@ def test_the_command_says_what_it_found_and_how_it_went(rendered, tmp_path: Path
     assert cli.main(["check", str(tmp_path / "late.npz"), "--json"]) == 1
     told = json.loads(capsys.readouterr().out)
     assert told["suspicious"] >= 1 and told["findings"][0]["check"] == "clock"
+
+
+def test_a_sheet_of_which_no_point_lies_on_the_table_is_not_shown_and_no_warning():
+    away = positions(0.0) + np.array([0, 0, 0.5])
+    path = np.broadcast_to(away[:1], (len(TIMES), 1, 3))
+    info = RecordingInfo(
+        "made_up", "lift", "none", "1", "made up", (5, len(TIMES) - 1), PLACE, 0.0, None
+    )
+    seen = make_recording([away] * len(TIMES), TIMES, path, TIMES, info)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = {each.check: each for each in check(seen)}
+    assert all(np.isnan(found[f"scale, {side}"].figure) for side in ("warp", "weft"))
+    assert np.isnan(found["gravity"].figure) and np.isnan(found["table"].figure)

@@ -45,9 +45,8 @@ def _lying(recording: Recording, first: Points) -> list[Finding]:
         found.append(
             Finding(f"scale, {side}", ratio, "-", 1 - SCALE, 1 + SCALE, words, CALIBRATION)
         )
-    spread = first - first.mean(axis=0)
     is_flat = len(first) > 50 and whole
-    normal = np.linalg.svd(spread, full_matrices=False)[2][2] if is_flat else np.full(3, np.nan)
+    normal = _normal(first) if is_flat else np.full(3, np.nan)
     tilt = float(np.degrees(np.arccos(np.clip(abs(normal[2]), -1, 1))))
     words = "tilt of the sheet that lies on the table" if is_flat else words
     advice = "the world's z must point up: check the cameras' pose against a level"
@@ -56,6 +55,11 @@ def _lying(recording: Recording, first: Points) -> list[Finding]:
     words = "height of the sheet at rest above the table" if is_flat else words
     advice = "check table_height and the cameras' pose"
     return [*found, Finding("table", height, "m", -HEIGHT, HEIGHT, words, advice)]
+
+
+def _normal(points: Points) -> Float[np.ndarray, " 3"]:
+    """Normal of the plane that lies nearest to some points."""
+    return np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][2]
 
 
 def _seen_share(flat: Float[np.ndarray, "point 2"], size: tuple[float, float]) -> float:
