@@ -33,12 +33,8 @@ def row_of(problem, losses):
     """Descents of the first stage with such losses, each in a place of its own."""
     size, none, stage = theta_length((problem,)), jnp.zeros(()), jnp.zeros((), int)
     theta, matrix = jnp.zeros(size), jnp.eye(size)
-    return [
-        Descent(
-            theta + i, Normal(jnp.array(x), none, none, theta, matrix, matrix), *[none] * 3, stage
-        )
-        for i, x in enumerate(losses)
-    ]
+    normals = [Normal(jnp.array(x), none, none, theta, matrix, matrix) for x in losses]
+    return [Descent(theta + i, normal, none, none, none, stage) for i, normal in enumerate(normals)]
 
 
 def fresh(losses):
