@@ -10,7 +10,13 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 from r2s.fabrics import prior
-from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
+from r2s.fabrics.parameters import (
+    LOSSES,
+    IsotropicSpace,
+    OrthotropicSpace,
+    ParameterSpace,
+    Range,
+)
 from r2s.fabrics.softening_space import SOFTENING, SofteningSpace
 from r2s.fabrics.stiffening_space import STIFFENING, StiffeningSpace
 from r2s.recordings.recording import Recording
@@ -23,8 +29,7 @@ RANGES = (
     Range("shear", "N/m", 1.0, 800.0),
     Range("coupling", "-", -0.9, 0.9, log=False),
     Range("bending", "N m", 1.4e-7, 1.4e-3),
-    Range("damping", "s", 3e-4, 1e-1),
-    Range("friction", "-", 0.1, 1.0),
+    *LOSSES,
 )
 FROM = {
     "warp": "around the prior's median",

@@ -17,7 +17,7 @@ from r2s.fabrics.parameters import ParameterSpace
 from r2s.geometry.mesh import Mesh
 from r2s.geometry.surface import nearest
 from r2s.recordings.cameras.views import Views
-from r2s.recordings.recording import Doubt, Recording, gripper_positions, subsample
+from r2s.recordings.recording import Doubt, Recording, check_covered, gripper_positions, subsample
 from r2s.scenarios.scenario import Scenario, from_recording
 
 POINTS = 300  # at most, of a cloud
@@ -392,12 +392,10 @@ def _force(recording: Recording, frames: slice) -> Force | None:
     times = np.asarray(recording.times)[frames]
     columns = log[:, None] if scalar else log
     clock = np.asarray(recording.force_times)
-    slack = float(np.diff(times).mean()) if len(times) > 1 else 0.0
-    if clock[0] > times[0] + slack or clock[-1] < times[-1] - slack:
-        raise ValueError(
-            f"{recording.info.name}: the force is known from {clock[0]:g} to {clock[-1]:g} s, the "
-            f"frames that count go from {times[0]:g} to {times[-1]:g} s: is it on the same clock?"
-        )
+    try:
+        check_covered(clock, times)
+    except ValueError as error:
+        raise ValueError(f"{recording.info.name}: {error}") from error
     values = np.stack([np.interp(times, clock, column) for column in columns.T], axis=1)
     if scalar and recording.info.scenario == "stretching" and -values.min() > values.max():
         raise ValueError(

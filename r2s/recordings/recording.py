@@ -263,6 +263,17 @@ def gripper_positions(recording: Recording) -> Float[np.ndarray, "frame gripper 
     return at.reshape(-1, *path.shape[1:])
 
 
+def check_covered(clock: Float[np.ndarray, " sample"], times: Float[np.ndarray, " frame"]) -> None:
+    """Raise `ValueError` where a log of a force at the times `clock` [s] begins later, or ends
+    earlier, than frames at `times` [s], by more than a frame."""
+    slack = float(np.diff(times).mean()) if len(times) > 1 else 0.0
+    if clock[0] > times[0] + slack or clock[-1] < times[-1] - slack:
+        raise ValueError(
+            f"the force is known from {clock[0]:g} to {clock[-1]:g} s, the frames that count go "
+            f"from {times[0]:g} to {times[-1]:g} s: is it on the same clock?"
+        )
+
+
 def subsample(recording: Recording, num_points: int, voxel: float | None, seed: int) -> Recording:
     """Thin every frame to at most `num_points`, padded to exactly that many.
 

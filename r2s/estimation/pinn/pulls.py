@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.interpolate import CubicSpline
 
-from r2s.recordings.recording import Recording
+from r2s.recordings.recording import Recording, check_covered
 from r2s.units import GRAVITY
 
 FEWEST_FRAMES = 3
@@ -261,12 +261,7 @@ def _force(recording: Recording, times: np.ndarray, along: np.ndarray) -> np.nda
     force = np.asarray(recording.force, np.float64)
     force = force @ along if force.ndim == 2 else force
     clock = np.asarray(recording.force_times, np.float64)
-    slack = np.diff(times).mean()
-    if clock[0] > times[0] + slack or clock[-1] < times[-1] - slack:
-        raise ValueError(
-            f"the force is known from {clock[0]:g} to {clock[-1]:g} s, the frames go from "
-            f"{times[0]:g} to {times[-1]:g} s: is it on the same clock?"
-        )
+    check_covered(clock, times)
     return np.interp(times, clock, force)
 
 
