@@ -5,19 +5,16 @@ import time
 from pathlib import Path
 
 import jax.random as jr
-import numpy as np
+from _judged import error_of, floor_of, judged, make
 from _tables import Line
 
 from r2s.estimation import default_spaces
 from r2s.estimation.diffcp import DEFAULT, DiffCP
-from r2s.evaluation.prediction_error import from_surface
 from r2s.fabrics import prior
 from r2s.fabrics.parameters import LOSSES, OrthotropicSpace, ParameterSpace
-from r2s.study import engine, verdicts
-from r2s.study.ensembles import ensemble_of
 from r2s.study.estimates import SHAPES as ESTIMATED_ON
-from r2s.study.evaluations import SHAPES, predict
-from r2s.study.sources import SyntheticRecording, read, read_start, small_strain
+from r2s.study.evaluations import SHAPES
+from r2s.study.sources import SyntheticRecording, read, small_strain
 
 SPACES = ("isotropic", "with damping and friction", "orthotropic, too")
 JUDGED = ("fling", "shaking")
@@ -27,25 +24,19 @@ BUDGET = DEFAULT._replace(coarse=6, starts=1, iterations=10)  # the same for all
 def line(folder: Path, fabric: str, space: str) -> Line:
     """The line of a table."""
     lift = SyntheticRecording(fabric, "lifting", 0, False)
-    judged = {each: SyntheticRecording(fabric, each, 0, True) for each in JUDGED}
-    cells = [lift, *(ensemble_of(each) for each in judged.values())]
-    if failed := engine.run(cells, folder, engine.Serial()):
-        raise RuntimeError(f"{next(iter(failed.values()))}")
+    make([lift], folder)
+    motions = judged([SyntheticRecording(fabric, each, 0, True) for each in JUDGED], folder)
     density = float(small_strain(fabric).density)
     chosen = prior.informed(_space(space, density), density)
     began, method = time.process_time(), DiffCP(shape=ESTIMATED_ON["points"])
     found = method.estimate([read(lift, folder)], chosen, BUDGET, key=jr.key(0))
     numbers: Line = {"CPU s": f"{time.process_time() - began:.0f}"}
-    for motion, source in judged.items():
-        known = verdicts.judged_motion(source, folder)
-        assert known is not None
-        recording, start = read(source, folder), read_start(source, folder)
-        numbers[f"{motion}: floor"] = f"{1e3 * float(np.mean(known.floor[known.inside])):.1f}"
+    for name, motion in zip(JUDGED, motions, strict=True):
+        numbers[f"{name}: floor"] = f"{floor_of(motion):.1f}"
         for solver, shape in SHAPES.items():
-            for which, name in ((found.fabric, ""), (small_strain(fabric), ", true fabric")):
-                (moved,) = predict([recording], which, solver, [start], shape)
-                off = 1e3 * float(np.mean(from_surface(recording, moved.x, shape)[known.inside]))
-                numbers[f"{motion}: {solver}{name}"] = f"{off:.1f}"
+            for which, whose in ((found.fabric, ""), (small_strain(fabric), ", true fabric")):
+                off = error_of(motion, which, solver, shape)
+                numbers[f"{name}: {solver}{whose}"] = f"{off:.1f}"
     told = zip(found.ranges, found.values, strict=True)
     numbers["found"] = ", ".join(f"{each.name} {value:.3g}" for each, value in told)
     return numbers
