@@ -9,8 +9,9 @@ import pytest
 from scipy import ndimage
 
 from r2s import scenarios
-from r2s.estimation.physnet import preprocess, views
+from r2s.estimation.physnet import dataset, preprocess, views
 from r2s.estimation.physnet.views import View
+from r2s.fabrics import presets
 from r2s.geometry.mesh import rectangle
 from r2s.recordings.cameras.calibration import (
     DepthCamera,
@@ -21,6 +22,7 @@ from r2s.recordings.cameras.calibration import (
 from r2s.recordings.cameras.camera import Camera
 from r2s.recordings.cameras.render import render
 from r2s.scenarios import synthetic
+from r2s.scenarios.scenario import rollout
 
 VIEW = View((0.1, -0.4, 0.6), (0.1, 0.1, 0.1), 40.0, 32, 0.4, 1.0, -1.0)
 MESH = rectangle((0.3, 0.3), (4, 4))
@@ -236,6 +238,16 @@ def test_what_no_camera_has_in_its_frame_is_left_out_of_an_image():
     assert 0.2 < kept.sum() / (whole > 0).sum() < 0.8
     np.testing.assert_allclose(cut[kept], whole[kept], atol=0.02)
     np.testing.assert_array_equal(again, whole)
+
+
+@pytest.mark.parametrize("name", ["lifting", "wind"])
+def test_the_study_s_cameras_have_all_of_a_sheet_in_their_images(name):
+    experiment = scenarios.SIX[name]()
+    images = dataset.kept_frames(experiment.frames_used, dataset.Settings.num_frames)
+    fabric = presets.grey_interlock()
+    x = jax.jit(rollout)(experiment.scenario((5, 5)), fabric).x[jnp.array(images)]
+    frames = frames_of(*synthetic.sensing(experiment).cameras)
+    assert bool(jax.vmap(lambda each: views.in_frame(each, frames))(x).all())
 
 
 def frames_of(*cameras):
