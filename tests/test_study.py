@@ -448,6 +448,22 @@ def test_what_trials_share_counts_once(tmp_path, monkeypatch):
     assert sorted(row.recording for row in found) == ["fold1", "fold2"]
 
 
+def test_a_fling_that_an_estimate_has_seen_does_not_judge_it(tmp_path, monkeypatch):
+    scenarios = ["lifting", "wind", "stretching", "fling", "shaking"]
+    every = [GivenRecording("", name, "knit", name, "1", "") for name in scenarios]
+    monkeypatch.setattr(matrix, "find_recordings", lambda folder: every)
+    names = ["diffcloud-cloth-lifting", "diffcloud-cloth-lifting+wind+stretching+fling"]
+    cells = matrix.recorded(tmp_path, 0.2, matrix.with_changes(matrix.SMALL, names))
+    judged_by = {
+        (cell.estimate.scenario, source.name)
+        for cell in cells
+        if cell.estimate is not None
+        for source in cell.recordings
+    }
+    alone, together = "lifting", "lifting+wind+stretching+fling"
+    assert judged_by == {(alone, "fling"), (alone, "shaking"), (together, "shaking")}
+
+
 def test_given_recordings_are_shown_one_by_one():
     def row(baseline, value, recording="fold_silk", repeat="0"):
         is_estimate = baseline in ("", "other_fabric")

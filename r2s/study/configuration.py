@@ -62,5 +62,9 @@ PAPER_CONFIGURATIONS = (
 )
 """The configurations in the tables of Ru et al. 2025, in their order."""
 
-TOGETHER_CONFIGURATIONS = (Configuration("diffcloud", "cloth", f"lifting{AND}stretching"),)
-"""What the paper does not have: a lift, and pulls in three directions, of one fabric together."""
+TOGETHER_CONFIGURATIONS = tuple(
+    Configuration("diffcloud", "cloth", AND.join(each))
+    for each in (("lifting", "stretching"), ("lifting", "wind", "stretching", "fling"))
+)
+"""What the paper does not have: a lift and pulls in three directions, or these with a wind and a
+fling, of one fabric together."""

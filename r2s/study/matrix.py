@@ -84,7 +84,7 @@ SMALL = Plan(
     configurations=(
         Configuration("diffcloud", "cloth", "lifting"),
         Configuration("diffcloud", "cloth", "wind"),
-        *TOGETHER_CONFIGURATIONS,
+        TOGETHER_CONFIGURATIONS[0],
         Configuration("diffcp", "points", "lifting"),
         Configuration("physnet", "cloth", "lifting"),
         Configuration("pinn", "points", "stretching"),
@@ -206,10 +206,10 @@ def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationCell]:
     - `plan`: gives configurations, of which those count that have recordings to estimate from, and
       budgets.
 
-    A repeat is a recording. An estimate is judged by `MOTIONS` of the same fabric and trial (of all
-    trials where that trial has none), and beside the estimate of another fabric. Raises what
-    `find_recordings` raises, and `ValueError` for a density that is none, when no configuration
-    has a recording to estimate from, or none is there to judge by.
+    A repeat is a recording. An estimate is judged by those `MOTIONS` of the same fabric and trial
+    (of all trials where that trial has none) that it has not seen, and beside the estimate of
+    another fabric. Raises what `find_recordings` raises, and `ValueError` for a density that is
+    none, when no configuration has a recording to estimate from, or none is there to judge by.
     """
     default_space("cloth", density)  # refuses a density that is none
     # clouds of real cameras need all of the search, and there are few frames to judge by
@@ -233,7 +233,8 @@ def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationCell]:
         ]
         own = [each[0] for each in sources]
         for index, (recording, estimate) in enumerate(zip(own, estimates, strict=True)):
-            judged = _by_scenario(_of_trial(unseen, recording))
+            others = [r for r in _of_trial(unseen, recording) if r not in estimate.sources]
+            judged = _by_scenario(others)
             found += _evaluations([estimate], recording.fabric, density, judged, plan)
             other = _other_fabric(own, index)
             if other is not None:
