@@ -25,6 +25,7 @@ from r2s.estimation.pinn.synthetic_pulls import pulled
 from r2s.estimation.pinn.training import Recipe, train, trainable
 from r2s.fabrics import presets
 from r2s.fabrics.parameters import OrthotropicSpace
+from r2s.laws.stiffening import StiffeningMembrane
 from r2s.scenarios import fling, folding, shaking
 from r2s.scenarios.scenario import rollout
 
@@ -33,8 +34,11 @@ WARP, PULLED = 80.0, 0.02  # [N/m], [m]
 NOISE = (2e-4, 0.01)
 
 
-def even_pull(force: bool = True, seed: int = 0, frames: int = FRAMES) -> Pull:
-    """A sheet without coupling that stretches evenly: its exact motion, whatever the clamps."""
+def even_pull(force: bool = True, seed: int = 0, frames: int = FRAMES, growth: float = 0.0) -> Pull:
+    """A sheet without coupling that stretches evenly: its exact motion, whatever the clamps.
+
+    `growth`: of its stiffness with the stretch, up to the end, [-].
+    """
     times = jnp.linspace(0.0, 1.0, frames)
     along = (jnp.arange(4.0) + 0.5) / 4 * SIZE[0]
     places = jnp.stack(jnp.meshgrid(along, along, indexing="ij"), -1).reshape(-1, 2)
@@ -44,6 +48,7 @@ def even_pull(force: bool = True, seed: int = 0, frames: int = FRAMES) -> Pull:
     moved = places[None, :, :1] / SIZE[0] * far[:, None]
     noise = 1e-6 * jr.normal(jr.key(seed), moved.shape)
     e = PULLED * times / SIZE[0]
+    stiffness = WARP * (1 + growth * times)
     return Pull(
         size=jnp.array(SIZE),
         angle=jnp.zeros(()),
@@ -53,7 +58,7 @@ def even_pull(force: bool = True, seed: int = 0, frames: int = FRAMES) -> Pull:
         times=times,
         near=Clamp(zero, zero, zero),
         far=Clamp(far, rate, zero),
-        force=(1 + e) * WARP * ((1 + e) ** 2 - 1) / 2 * SIZE[1] if force else None,
+        force=stiffness * (1 + e) * ((1 + e) ** 2 - 1) / 2 * SIZE[1] if force else None,
         gravity=jnp.zeros(2),
         normal=jnp.zeros(()),
     )
@@ -85,6 +90,21 @@ def test_an_even_stretch_gives_the_warp_of_the_closed_form():
     np.testing.assert_allclose(values[3], 0.0, atol=2e-3)
     deviations = np.sqrt(np.diag(found.covariance)) * math.sqrt(12)  # of a flat range's
     assert deviations[0] < 1e-2 and deviations[2] > 0.5 and deviations[4] > 0.99
+
+
+@pytest.mark.parametrize("growth", [0.0, 0.05, 0.2])
+def test_what_stiffness_grows_by_is_an_error_of_the_small_strain_s(growth):
+    """A constant stiffness is a mean over the pull; half of the stretch tells how far it is off."""
+    pull = even_pull(frames=21, growth=growth)
+    found = balance(FAMILY, [small_network(pull)], [pull], np.full(7, 0.5), *NOISE)
+    assert found.converged
+    value = float(FAMILY.values(jnp.asarray(found.place))[0])
+    length = math.log(FAMILY.ranges[0].high / FAMILY.ranges[0].low)
+    off = math.log(value / WARP) / length
+    errors = np.sqrt(np.diag(found.law))
+    assert off >= 0.7 * growth / length - 3e-4  # the mean weighs what is far stretched
+    assert 0.8 * off <= errors[0] <= 1.5 * abs(off) + 2e-3
+    assert errors[4] < 1e-3  # of bending a flat sheet says nothing, and nothing changes
 
 
 def test_without_force_the_scale_is_not_identifiable():
@@ -311,6 +331,27 @@ def test_pulls_and_families_that_do_not_go_together():
 
 
 ANGLES = (0.0, math.pi / 2, math.pi / 4)
+
+
+@pytest.mark.slow(group="pinn")
+def test_yarns_that_stiffen_are_within_three_standard_errors(monkeypatch):
+    """Of their stiffness at small strain, which is not what they have on average."""
+    monkeypatch.undo()
+    truth = presets.FIVE["grey_interlock"]()
+    membrane = StiffeningMembrane.make(truth.membrane, 2.0, 1.1)
+    fabric = dataclasses.replace(truth, membrane=membrane)
+    space = OrthotropicSpace.make(float(fabric.density))
+    keys = jr.split(jr.key(0), 3)
+    with jax.numpy_dtype_promotion("standard"):
+        some = [
+            pull_from(pulled(fabric, "knit", angle, shape=(17, 17), key=key))
+            for angle, key in zip(ANGLES, keys, strict=True)
+        ]
+        found = estimate(some, space, key=jr.key(1)).estimate
+    values = np.asarray(space.values(space.to_unit(truth)))
+    off = np.append(np.log(found.values[:3] / values[:3]), found.values[3] - values[3])
+    assert off[:2].min() > 0.02
+    assert (np.abs(off) < 3 * found.standard_errors[:4]).all()
 
 
 @pytest.mark.slow(group="pinn")

@@ -44,6 +44,7 @@ def test_the_paper_s_size_tells_what_is_three_times_as_far():
 
 
 @pytest.mark.slow(group="study")
+@pytest.mark.usefixtures("unchecked")  # checks of shapes take four fifths of the time
 @pytest.mark.parametrize("words", ["15 %", "30 %", "15 %, between motions as much"])
 @pytest.mark.parametrize(
     ("preset", "studies"), [("small", 2000), ("paper", 1000), ("paper, without folds", 1000)]
@@ -56,6 +57,7 @@ def test_studies_with_nothing_to_find(preset, studies, words):
 
 
 @pytest.mark.slow(group="study")
+@pytest.mark.usefixtures("unchecked")
 def test_power_at_the_size_of_the_paper():
     told, alone = zip(
         *(measured("paper", "15 %", ratio, 150, 20_000)[3:5] for ratio in (1.2, 1.5, 3.0)),

@@ -50,6 +50,9 @@ FLAT_PRIOR = 12.0  # one over the variance of a uniform distribution on 0..1
 STEPS = 60  # most Gauss-Newton steps
 SMALL = 0.05  # of the standard errors: the Gauss-Newton step after which it has converged
 LEAST_NOISE = (1e-7, 1e-5)  # of markers [m], and of the force over its greatest [-]
+# from what stiffness changes between half a pull and all of it, to what it has from small strain:
+# twice that where it grows with the stretch
+TO_SMALL_STRAIN = 2.0
 
 Coefficients = Float[Array, "function axis"]  # of virtual displacements, [m]
 
@@ -91,14 +94,26 @@ class Reduced(NamedTuple):
     """Differences of markers [m] and force [N] from the measured ones, and derivatives in the place
     in the parameter space; of the frames that are in balance.
 
-    - `is_complete`: whether these are all frames.
+    - `counts`: whether each frame is.
     """
 
     markers: np.ndarray
     markers_by_place: np.ndarray
     force: np.ndarray
     force_by_place: np.ndarray
-    is_complete: bool
+    counts: Bool[np.ndarray, " frame"]
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all frames are in balance."""
+        return bool(self.counts.all())
+
+    def where(self, chosen: Bool[np.ndarray, " frame"]) -> "Reduced":
+        """Of some of the frames alone."""
+        kept = chosen[self.counts]
+        rows = np.repeat(kept, len(self.markers) // max(len(kept), 1))
+        each = self.markers[rows], self.markers_by_place[rows]
+        return Reduced(*each, self.force[kept], self.force_by_place[kept], self.counts & chosen)
 
 
 class Balanced(NamedTuple):
@@ -109,6 +124,7 @@ class Balanced(NamedTuple):
     - `marker`, `force`: rms differences that are left, of markers [m] and force [-].
     - `places`, `losses`: of every step; the losses are mean squares of the markers' rest [m^2].
     - `converged`: whether the last step was small.
+    - `law`: what the covariance lacks where stiffness is not constant, see `_law_error`.
     """
 
     place: Float[np.ndarray, " dim"]
@@ -118,6 +134,7 @@ class Balanced(NamedTuple):
     places: Float[np.ndarray, "step dim"]
     losses: Float[np.ndarray, " step"]
     converged: bool
+    law: Float[np.ndarray, "dim dim"]
 
 
 def basis_of(pull: Pull, degrees: tuple[int, int] = DEGREES) -> Basis:
@@ -296,7 +313,7 @@ def reduced(solved: Solved, pull: Pull, basis: Basis) -> Reduced:
         markers[counts].reshape(-1, dim),
         (np.asarray(solved.force, np.float64) - measured)[counts],
         (force_by_place / float(end_value(basis.virtual)))[counts],
-        bool(counts.all()),
+        counts,
     )
 
 
@@ -334,7 +351,7 @@ def balance(
     starts = [start for *_, start in prepared_pulls]
     place = np.clip(np.asarray(place, np.float64), INSIDE, 1 - INSIDE)
     places, losses, last, longest, converged = [], [], np.zeros_like(place), LONGEST, False
-    normal = np.eye(len(place))
+    normal, here = np.eye(len(place)), []
     for _ in range(steps):
         at, here = jnp.asarray(place, float), []
         for i, (pull, basis) in enumerate(zip(pulls, bases, strict=True)):
@@ -365,8 +382,38 @@ def balance(
         if whole and are_balanced and np.all(np.abs(last) < SMALL * standard_errors):
             converged = True
             break
-    history = np.array(places), np.array(losses)
-    return Balanced(place, np.linalg.inv(normal), marker, force, *history, converged)
+    history, law = (np.array(places), np.array(losses)), _law_error(here, pulls, marker, force)
+    return Balanced(place, np.linalg.inv(normal), marker, force, *history, converged, law)
+
+
+def _law_error(
+    here: list[Reduced], pulls: list[Pull], marker: float, force: float
+) -> Float[np.ndarray, "dim dim"]:
+    """Covariance of the place at small strain, for what stiffness changes up to the greatest.
+
+    A constant stiffness comes out as a mean over the pull. Frames up to half the stretch alone lead
+    elsewhere (one Gauss-Newton step from where all of them lead) by noise, whose variance there is
+    the difference of both (Hausman 1978), and by what changes with the strain, which is the rest.
+    """
+    early = [one.where(_half_way(pull)) for one, pull in zip(here, pulls, strict=True)]
+    if not any(len(one.force) for one in early):
+        return np.zeros((here[0].force_by_place.shape[1],) * 2)
+    sides = []
+    for some in (early, here):
+        information, right = _normal_equations(some, pulls, marker, force)
+        inverse = np.linalg.inv(information + FLAT_PRIOR * np.eye(len(right)))
+        sides.append((inverse @ right, np.diag(inverse)))
+    (half, half_variance), (whole, variance) = sides
+    squares = (half - whole) ** 2 - np.maximum(half_variance - variance, 0)
+    off = TO_SMALL_STRAIN * np.sign(half - whole) * np.sqrt(np.maximum(squares, 0))
+    return np.outer(off, off)
+
+
+def _half_way(pull: Pull) -> Bool[np.ndarray, " frame"]:
+    """The frames up to half of the greatest stretch."""
+    apart = np.asarray(pull.far.value, np.float64) - np.asarray(pull.near.value, np.float64)
+    stretch = np.linalg.norm(apart - apart[0], axis=-1)
+    return stretch <= stretch.max() / 2
 
 
 def _normal_equations(here: list[Reduced], pulls: list[Pull], marker: float, force: float):

@@ -67,9 +67,10 @@ def estimate_all(
     """The fabrics of as many pulls each, their networks trained together.
 
     The standard errors come from the noise, from the change of the estimate with the number of
-    virtual displacements, and from what the model leaves out. A parameter that the pulls do not
-    determine keeps the standard error of its range. Without a force the nuisance "stiffness scale"
-    says that the scale is not identifiable; ratios of stiffness may be.
+    virtual displacements, from what the model leaves out, and from what stiffness changes between
+    half the stretch and all of it (they are those of stiffness at small strain). A parameter that
+    the pulls do not determine keeps the standard error of its range. Without a force the nuisance
+    "stiffness scale" says that the scale is not identifiable; ratios of stiffness may be.
 
     - `pulls`, `spaces`: of each fabric; as many pulls of each, and spaces of the same ranges.
     - `recipe`: of the training.
@@ -151,14 +152,15 @@ def _balanced(
     recipe: Recipe,
 ) -> Balanced:
     """The estimate from the weak form. Its covariance counts the number of virtual displacements,
-    by the change with one degree less each way, and what the model leaves out."""
+    by the change with one degree less each way, what the model leaves out, and what stiffness
+    changes with the stretch."""
     found = balance(space, networks, pulls, place, *noise, recipe.strain, DEGREES)
     degrees = DEGREES[0] - 1, DEGREES[1] - 1
     fewer = balance(
         space, networks, pulls, found.place, found.marker, found.force, recipe.strain, degrees
     )
     difference = fewer.place - found.place
-    more = np.outer(difference, difference) + np.diag(_unmodelled(space) ** 2)
+    more = np.outer(difference, difference) + np.diag(_unmodelled(space) ** 2) + found.law
     return found._replace(covariance=found.covariance + more)
 
 
