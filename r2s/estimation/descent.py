@@ -31,6 +31,7 @@ from r2s.estimation.gauss_newton import (
     recording_weights,
     theta_indices,
 )
+from r2s.estimation.law_error import law_error
 from r2s.estimation.mesh_bias import OtherMesh, on_the_way, weighed
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.misfits import left_out, misfits
@@ -171,7 +172,8 @@ def judged(
     other_mesh: OtherMesh | None = None,
     key: PRNGKeyArray,
 ) -> Estimate:
-    """The estimate at the end of a search, with its standard errors.
+    """The estimate at the end of a search, with its standard errors, which hold what a constant
+    stiffness is off that at small strain (`r2s.estimation.law_error`).
 
     `other_mesh`: by which its bias by its mesh is judged, which the standard errors then hold. If
     it is finer, and something is known of the fabric beforehand, the estimate goes towards that as
@@ -182,6 +184,8 @@ def judged(
     stage, prior = _rows_of_stage(found.rows, int(best.stage)), _weight(problems, best.normal)
     predicted, bias = found.derive(problems, best.theta, budget.width), None
     covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1), predicted)
+    of_law = law_error(problems, best, prior, predicted)
+    covariance = covariance + np.outer(of_law, of_law)
     seen = [each for each, _ in predicted]
     loss, rows = loss_from(problems, seen), found.rows
     if other_mesh is not None:

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from r2s.estimation.law_error import to_small_strain
 from r2s.estimation.pinn.losses import load, marker_residual
 from r2s.estimation.pinn.network import Network
 from r2s.estimation.pinn.pulls import Pull
@@ -50,9 +51,6 @@ FLAT_PRIOR = 12.0  # one over the variance of a uniform distribution on 0..1
 STEPS = 60  # most Gauss-Newton steps
 SMALL = 0.05  # of the standard errors: the Gauss-Newton step after which it has converged
 LEAST_NOISE = (1e-7, 1e-5)  # of markers [m], and of the force over its greatest [-]
-# from what stiffness changes between half a pull and all of it, to what it has from small strain:
-# twice that where it grows with the stretch
-TO_SMALL_STRAIN = 2.0
 
 Coefficients = Float[Array, "function axis"]  # of virtual displacements, [m]
 
@@ -389,12 +387,8 @@ def balance(
 def _law_error(
     here: list[Reduced], pulls: list[Pull], marker: float, force: float
 ) -> Float[np.ndarray, "dim dim"]:
-    """Covariance of the place at small strain, for what stiffness changes up to the greatest.
-
-    A constant stiffness comes out as a mean over the pull. Frames up to half the stretch alone lead
-    elsewhere (one Gauss-Newton step from where all of them lead) by noise, whose variance there is
-    the difference of both (Hausman 1978), and by what changes with the strain, which is the rest.
-    """
+    """Covariance of the place at small strain, for what stiffness changes with the stretch: by the
+    frames up to half of the greatest, see `r2s.estimation.law_error`."""
     early = [one.where(_half_way(pull)) for one, pull in zip(here, pulls, strict=True)]
     if not any(len(one.force) for one in early):
         return np.zeros((here[0].force_by_place.shape[1],) * 2)
@@ -404,8 +398,7 @@ def _law_error(
         inverse = np.linalg.inv(information + FLAT_PRIOR * np.eye(len(right)))
         sides.append((inverse @ right, np.diag(inverse)))
     (half, half_variance), (whole, variance) = sides
-    squares = (half - whole) ** 2 - np.maximum(half_variance - variance, 0)
-    off = TO_SMALL_STRAIN * np.sign(half - whole) * np.sqrt(np.maximum(squares, 0))
+    off = to_small_strain(half - whole, half_variance - variance)
     return np.outer(off, off)
 
 
