@@ -344,13 +344,13 @@ def test_yarns_that_stiffen_are_within_three_standard_errors(monkeypatch):
     keys = jr.split(jr.key(0), 3)
     with jax.numpy_dtype_promotion("standard"):
         some = [
-            pull_from(pulled(fabric, "knit", angle, shape=(17, 17), key=key))
+            pull_from(pulled(fabric, "knit", angle, shape=(17, 17), key=key, strain=0.08))
             for angle, key in zip(ANGLES, keys, strict=True)
         ]
         found = estimate(some, space, key=jr.key(1)).estimate
     values = np.asarray(space.values(space.to_unit(truth)))
     off = np.append(np.log(found.values[:3] / values[:3]), found.values[3] - values[3])
-    assert off[:2].min() > 0.02
+    assert off[:2].min() > 0.03
     assert (np.abs(off) < 3 * found.standard_errors[:4]).all()
 
 
