@@ -67,12 +67,16 @@ def law_error(
 
 
 def half_pulled(problem: Problem) -> Problem:
-    """The problem of a pull with nothing seen where its force is more than half of the greatest;
-    any other as it is."""
+    """The problem of a pull with nothing seen where its force is beyond the middle between least
+    and greatest; any other as it is."""
     if problem.force is None:
         return problem
     force = jnp.linalg.norm(problem.force.values, axis=1)
-    early = force <= jnp.max(jnp.where(problem.force.seen, force, 0)) / 2
+    seen = problem.force.seen
+    middle = (
+        jnp.min(force, where=seen, initial=jnp.inf) + jnp.max(force, where=seen, initial=0)
+    ) / 2
+    early = force <= middle
     parts = {"force": "seen", "markers": "seen", "clouds": "mask"}
     kept_frames = {}
     for name, mask in parts.items():
