@@ -10,7 +10,7 @@ from r2s.estimation.gauss_newton import Descent, Normal, theta_length
 from r2s.estimation.law_error import half_pulled, law_error, to_small_strain
 from r2s.estimation.prediction import Prediction, Sensitivity
 from r2s.estimation.problem import Force, Problem
-from r2s.fabrics.parameters import OrthotropicSpace
+from r2s.fabrics.parameters import OrthotropicSpace, ParameterSpace
 from r2s.fabrics.stiffening_space import StiffeningSpace
 from r2s.scenarios import stretching
 
@@ -20,7 +20,7 @@ SPACE = OrthotropicSpace.make(0.2)
 WIDTH = SPACE.ranges[0].width  # of the logarithm of the warp's stiffness
 
 
-def fitted(growth, seed=0, space=SPACE):
+def fitted(growth, seed=0, space: ParameterSpace = SPACE):
     """A pull whose stiffness grows, and what a constant one of the warp predicts of its force where
     it fits best: the problem, its end, the prediction, and the place of the stiffness at rest less
     that of the fit."""
@@ -45,7 +45,7 @@ def fitted(growth, seed=0, space=SPACE):
     return problem, end, (seen, sensitivity), np.log(SCALE / best) / WIDTH
 
 
-def error_of(growth, seed=0, space=SPACE):
+def error_of(growth, seed=0, space: ParameterSpace = SPACE):
     problem, end, predicted, off = fitted(growth, seed, space)
     return law_error((problem,), end, jnp.asarray(1e-9), [predicted])[: space.dim], off
 

@@ -73,10 +73,9 @@ def half_pulled(problem: Problem) -> Problem:
         return problem
     force = jnp.linalg.norm(problem.force.values, axis=1)
     seen = problem.force.seen
-    middle = (
-        jnp.min(force, where=seen, initial=jnp.inf) + jnp.max(force, where=seen, initial=0)
-    ) / 2
-    early = force <= middle
+    least = jnp.min(force, where=seen, initial=jnp.inf)
+    greatest = jnp.max(force, where=seen, initial=0)
+    early = force <= (least + greatest) / 2
     parts = {"force": "seen", "markers": "seen", "clouds": "mask"}
     kept_frames = {}
     for name, mask in parts.items():
