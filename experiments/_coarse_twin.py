@@ -1,5 +1,6 @@
 """What a coarse sheet fits to a fabric's motions, and how it then moves."""
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from zlib import crc32
@@ -23,10 +24,10 @@ BUDGET = METHODS["diffcloud"].budget._replace(coarse=16, starts=2, iterations=15
 DRAWS = 4
 
 
-def line(folder: Path, motion: str, fabric: str) -> Line:
-    """The line of a table."""
+def line(folder: Path, fitted_to: Sequence[str], motion: str, fabric: str) -> Line:
+    """The line of a table; `fitted_to`: of `FITTED_TO`."""
     source, truth = SyntheticRecording(fabric, motion, 0, True), small_strain(fabric)
-    fits = {name: _cell(fabric, float(truth.density), each) for name, each in FITTED_TO.items()}
+    fits = {name: _cell(fabric, float(truth.density), FITTED_TO[name]) for name in fitted_to}
     make([*fits.values()], folder)
     (seen,) = judged([source], folder)
     error = partial(error_of, seen, solver="cloth")
