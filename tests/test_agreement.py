@@ -184,3 +184,6 @@ def test_the_odd_recording_is_the_one_that_adds_what_is_least_likely():
     assert odd_one([lift, wrong]) == 1
     both_against_it = _told((0.7, 0.01), (0.7, 0.01))
     assert odd_one([both_against_it, _told((0.5, 0.01), ()), weft]) == 0
+    # however far it is: two chances may both be less than the least number
+    far = _told((1.5, 0.01), (0.5, 0.01))
+    assert odd_one([lift, far, _told((0.51, 0.01), (0.5, 0.01))]) == 1

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
+from scipy import special, stats
 
 from r2s.estimation import standard_errors
 from r2s.estimation.bounded import held_back
@@ -180,9 +180,19 @@ def odd_one(told: Sequence[Told]) -> int:
         less, left = scattered(others)
         if left == freedom:  # it tells nothing that others tell
             return 0.0, -which
-        return round(float(stats.chi2.logsf(scatter - less, freedom - left)), 6), -which
+        return round(_log_chance(scatter - less, freedom - left), 6), -which
 
     return min(range(len(told)), key=likely)
+
+
+def _log_chance(scatter: float, freedom: int) -> float:
+    """The logarithm of the tail of chi squared, also where that is less than the least number: by
+    the first term of its series, with which two such are still told apart."""
+    found = float(stats.chi2.logsf(scatter, freedom))
+    if np.isfinite(found):
+        return found
+    half = freedom / 2
+    return float((half - 1) * np.log(scatter / 2) - scatter / 2 - special.gammaln(half))
 
 
 def _known(told: Sequence[Told], mean, precision) -> tuple[np.ndarray, np.ndarray]:
