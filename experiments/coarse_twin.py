@@ -1,6 +1,6 @@
 """Is there a fabric with which a coarse sheet moves as a fine one does with the true fabric?
 
-python experiments/coarse_twin.py --out docs/results/coarse_twin.csv      # an hour
+python experiments/coarse_twin.py --out docs/results/coarse_twin.csv      # two hours
 
 A sheet of 9 x 9 vertices is fitted to a lift of each fabric (or, in hours, to a lift and a fling),
 with nothing known beforehand; what it fits is judged in a fling and a shaking that it has not seen,

@@ -369,8 +369,10 @@ def test_the_cloths_fabric_is_found(name, monkeypatch):
         ]
         found = estimate(some, space, key=jr.key(1)).estimate
     truth = np.asarray(space.values(space.to_unit(fabric)))
-    # half of a pull tells to a few per cent whether stiffness is constant, and not always to 5 %
-    assert found.identifiable[3] and (found.standard_errors[:3] < 0.1).all()
+    # that stiffness is constant half of a pull tells to a few per cent: of pink solid not to 5 %
+    told = found.identifiable[:4]
+    assert told.all() or (name == "pink_solid" and told[3])
+    assert (found.standard_errors[:3] < 0.1).all()
     np.testing.assert_allclose(found.values[:3], truth[:3], rtol=0.05)
     np.testing.assert_allclose(found.values[3], truth[3], atol=0.05)
     for experiment in (folding(num_frames=40), fling(num_frames=25), shaking(num_frames=25)):

@@ -4,7 +4,6 @@ Yarns stiffen as they stretch. A stiffness that is taken as constant comes out a
 pull, and no noise says so; but the first half of the pull alone leads elsewhere.
 """
 
-import dataclasses
 from collections.abc import Sequence
 
 import jax.numpy as jnp
@@ -21,7 +20,7 @@ from r2s.estimation.gauss_newton import (
     theta_length,
 )
 from r2s.estimation.prediction import Prediction, Sensitivity
-from r2s.estimation.problem import Problem
+from r2s.estimation.problem import Problem, seen_where
 from r2s.fabrics.stiffening_space import STIFFENING
 from r2s.kept import kept
 
@@ -76,14 +75,7 @@ def half_pulled(problem: Problem) -> Problem:
     least = jnp.min(force, where=seen, initial=jnp.inf)
     greatest = jnp.max(force, where=seen, initial=0)
     early = force <= (least + greatest) / 2
-    parts = {"force": "seen", "markers": "seen", "clouds": "mask"}
-    kept_frames = {}
-    for name, mask in parts.items():
-        if (part := getattr(problem, name)) is not None:
-            there = getattr(part, mask)
-            there = there & early.reshape(-1, *(1,) * (there.ndim - 1))
-            kept_frames[name] = dataclasses.replace(part, **{mask: there})
-    return dataclasses.replace(problem, **kept_frames)
+    return seen_where(problem, lambda _: early)
 
 
 def _place(

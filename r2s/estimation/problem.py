@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -25,6 +25,8 @@ TARGETS = 1200  # at most, of a cloud that the sheet must lie near
 SPACING = 0.012  # [m], of the samples of such a sheet
 BETWEEN = 3  # frames after the last that is seen, of which the interpolation in time may have one
 CLOCK = 4.0  # standard deviations of a clock, by which it may be early
+# of each kind of what was seen: the field that says where
+MASKS = {"clouds": "mask", "markers": "seen", "force": "seen", "expected": "mask"}
 FORCE_SCALE = 0.02  # [m/N]: a load cell is good to 10 mN where a marker is to 0.2 mm
 
 
@@ -291,23 +293,28 @@ def beginning(problem: Problem, share: float) -> Problem:
     problem serves this one.
     """
 
-    def hide(part: Any, name: str) -> Any:
-        if part is None:
-            return None
-        seen = getattr(part, name)
-        number = jnp.cumsum(jnp.any(seen.reshape(len(seen), -1), axis=1)).astype(float)
-        early = number <= jnp.maximum(jnp.round(share * number[-1]), 1)
-        return dataclasses.replace(
-            part, **{name: seen & early.reshape(-1, *(1,) * (seen.ndim - 1))}
-        )
+    def first_ones(seen: Bool[Array, " frame"]) -> Bool[Array, " frame"]:
+        number = jnp.cumsum(seen).astype(float)
+        return number <= jnp.maximum(jnp.round(share * number[-1]), 1)
 
-    return dataclasses.replace(
-        problem,
-        clouds=hide(problem.clouds, "mask"),
-        markers=hide(problem.markers, "seen"),
-        force=hide(problem.force, "seen"),
-        expected=hide(problem.expected, "mask"),
-    )
+    return seen_where(problem, first_ones)
+
+
+def seen_where(
+    problem: Problem, chosen: Callable[[Bool[Array, " frame"]], Bool[Array, " frame"]]
+) -> Problem:
+    """The problem with nothing seen but in some frames, in arrays of the same shapes.
+
+    `chosen`: which these are, from those in which something of a kind was seen.
+    """
+    kept = {}
+    for name, mask in MASKS.items():
+        if (part := getattr(problem, name)) is not None:
+            seen = getattr(part, mask)
+            frames = chosen(jnp.any(seen.reshape(len(seen), -1), axis=1))
+            frames = frames.reshape(-1, *(1,) * (seen.ndim - 1))
+            kept[name] = dataclasses.replace(part, **{mask: seen & frames})
+    return dataclasses.replace(problem, **kept)
 
 
 def _expected(
