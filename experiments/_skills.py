@@ -124,20 +124,48 @@ def _of(motion: str, rows: list[Row]) -> Line:
     return found | {f"{motion}: skill": "not told" if skill is None else f"{skill:.2f}"}
 
 
+def repeated(folder: Path, configuration: str, fabric: str, repeat: str) -> Line:
+    """The line of a table: how an estimate from the recordings of that number stands to the truth,
+    by parameter in its standard errors, in brackets what is not called identifiable, and by how
+    much the rest is off at most."""
+    cells = _cells(configuration, fabric, JUDGED, int(repeat))
+    cell = _estimate([_of_law(each, "told") for each in cells])
+    if failed := engine.run([cell], folder, engine.Serial()):
+        raise RuntimeError(next(iter(failed.values())))
+    found = read_estimate(cell, folder)
+    if found is None:
+        return {"converged": "diverged"}
+    off, away = _off(cell, found)
+    line: Line = {}
+    for bound, errors, is_known in zip(found.ranges, away, found.identifiable, strict=True):
+        line[bound.name] = f"{errors:+.2f}" if is_known else f"({errors:+.2f})"
+    known = np.abs(off[found.identifiable])
+    return line | {
+        "identifiable off at most": f"{known.max():.3f}" if len(known) else "-",
+        "converged": "yes" if found.converged else "no",
+        "recordings agree": _agreement(found, cell),
+    }
+
+
+def _off(cell: EstimateCell, found: Estimate) -> tuple[np.ndarray, np.ndarray]:
+    """How far an estimate is from the truth, by parameter: in shares of it (the coupling as it is),
+    and in standard errors, both as in the range."""
+    true = results.true_values(cell, found.ranges)
+    rows = zip(found.ranges, found.values, true, strict=True)
+    off = np.array([np.log(v / there) if bound.log else v - there for bound, v, there in rows])
+    return off, off / found.standard_errors
+
+
 def _over_truth(cell: EstimateCell, folder: Path) -> Line:
     found = read_estimate(cell, folder)
     if found is None:
         return {"warp": "diverged"}
-    true = results.true_values(cell, found.ranges)
+    off, away = _off(cell, found)
+    away = np.abs(away)
     line: Line = {}
-    away = []
-    rows = zip(found.ranges, found.values, true, found.standard_errors, strict=True)
-    for bound, value, there, error in rows:
-        off = np.log(value / there) if bound.log else value - there
-        away.append(abs(off) / error)
-        number = f"{value / there:.2f}" if bound.log else f"{off:+.2f}"
-        line[bound.name] = number + OUTSIDE * bool(away[-1] >= norm.ppf(0.95))
-    away = np.array(away)
+    for bound, apart, errors in zip(found.ranges, off, away, strict=True):
+        number = f"{np.exp(apart):.2f}" if bound.log else f"{apart:+.2f}"
+        line[bound.name] = number + OUTSIDE * bool(errors >= norm.ppf(0.95))
     known = away[found.identifiable]
     fabric = strain_dependent(cell.fabric)
     for name, axis in (("warp", 0), ("weft", 1)):

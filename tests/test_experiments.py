@@ -135,3 +135,12 @@ def test_a_line_of_several_sources_is_refused(tables, tmp_path: Path, monkeypatc
     found[words.format("b" * 16)] = 1
     with pytest.raises(ValueError, match="several sources"):
         tables.made_by([], tmp_path)
+
+
+def test_what_is_not_identifiable_or_diverged_is_no_interval_that_holds(module) -> None:
+    line = {"fabric": "knit", "repeat": "1", "warp": "+0.50", "damping": "(-2.00)"}
+    lines = [line | {"identifiable off at most": "0.1"}, {"repeat": "2", "converged": "diverged"}]
+    warp, damping, every = module("_repeats").by_parameter(lines)
+    assert (warp["held"], warp["identifiable"], warp["held of these"]) == ("1 of 2", "1", "1")
+    assert (damping["held"], damping["errors off at most"]) == ("0 of 2", "-")
+    assert every["held"] == "1 of 4" and every["errors off at most"] == "0.5"
