@@ -128,6 +128,28 @@ def test_the_finest_mesh_is_reached_in_one_stride(monkeypatch):
         DiffCloud(finest=True, shape=(9, 9)).estimate([lift()], SPACE, key=jr.key(0))
 
 
+@pytest.mark.parametrize(("folds", "meshes"), [("never", [9, 9]), ("at the end", [9, 9, 25])])
+def test_a_fabric_that_folds_at_the_end_of_a_coarse_mesh_goes_on(folds, meshes, monkeypatch):
+    """On the way it was stiff enough for that mesh, and the end is softer."""
+    climbed: list[tuple[int, bool]] = []
+
+    def searched(problems, budget, **_):
+        climbed.append((len(problems[0].scenario.scene.mesh.rest), budget.leads_on))
+        return descent.Search(problems, [], 0.0, derivatives_at)
+
+    def is_too_coarse(*_):
+        return folds == "at the end" and not climbed[-1][1]
+
+    monkeypatch.setattr(descent.Search, "theta", jnp.zeros(3))
+    monkeypatch.setattr(mesh_ladder, "search", searched)
+    monkeypatch.setattr(mesh_ladder, "is_too_coarse", is_too_coarse)
+    monkeypatch.setattr(mesh_ladder, "judged", lambda *_, **__: estimate_of_nothing())
+    monkeypatch.setattr(resolution, "LADDER", (3, 5))
+    mesh_ladder.descend_by_meshes([lift()], SPACE, SMALL, key=jr.key(0))
+    assert [count for count, _ in climbed] == meshes
+    assert [leads_on for _, leads_on in climbed] == [True, *[False] * (len(meshes) - 1)]
+
+
 @pytest.mark.slow(group="estimates")
 def test_a_recording_of_twice_the_weight_counts_as_two():
     stiff, soft = problem(1.5), problem(0.7)

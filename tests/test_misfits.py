@@ -11,11 +11,12 @@ import pytest
 
 from r2s import scenarios
 from r2s.commands.estimate import _misfits
-from r2s.estimation.estimate import Estimate, Misfit
+from r2s.estimation.density_doubt import freed, is_asked
+from r2s.estimation.estimate import Agreement, Contradiction, Estimate, Misfit
 from r2s.estimation.gauss_newton import theta_length
 from r2s.estimation.misfits import left_out, misfits
-from r2s.estimation.prediction import predict
-from r2s.estimation.problem import Problem
+from r2s.estimation.prediction import fabric_at, predict
+from r2s.estimation.problem import NuisancePrior, Problem
 from r2s.fabrics import presets
 from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.scenarios import synthetic
@@ -86,6 +87,38 @@ def test_a_marker_that_stays_behind_or_is_lost_on_the_way_is_named(pulled):
         assert found.what == f"marker {which}" and found.off > 2e-3
 
 
+def test_a_force_of_another_sheet_is_named(pulled):
+    """In other units, say; one that is off by a tenth is not."""
+    for factor, expected in ((1.1, 0.1), (2.0, 0.5), (0.1, 9.0)):
+        problem = problem_of(dataclasses.replace(pulled, force=factor * jnp.asarray(pulled.force)))
+        theta, seen = at_truth(problem)
+        found = misfits((problem,), theta, seen)
+        assert bool(found) == (expected > 1 / 3)
+        if found:
+            assert (found[0].what, found[0].unit) == ("force", "of its size")
+            assert found[0].off == pytest.approx(expected, rel=0.15)
+
+
+def test_a_density_is_asked_for_where_a_force_is_missed_or_recordings_are_apart(pulled, lifted):
+    both = problem_of(lifted), problem_of(pulled)
+    missed, bent = Misfit(1, "force", 2.0, "of its size"), Misfit(1, "shift x", 4.0, "")
+    odd = Agreement(1e-9, (3, 3), Contradiction(1, "warp", 9.0, (1.0, 2.0)))
+    assert is_asked(both, None, [missed]) and is_asked(both, odd, [])
+    assert not is_asked(both, None, [bent]) and not is_asked(both, Agreement(0.3, (3, 3), None), [])
+    assert not is_asked(both[1:], None, [missed])  # a pull alone has no other weight to go by
+    assert not is_asked(both[:1] * 2, odd, [])  # nothing weighs the sheet
+
+
+def test_a_density_that_is_freed_is_the_one_that_was_found(pulled):
+    """A theta in which it is half a standard deviation of 10 % heavier stays as heavy."""
+    prior = NuisancePrior(density=0.1)
+    problem = Problem.make(pulled, SPACE, shape=SHAPE, nuisance_prior=prior)
+    theta, _ = at_truth(problem)
+    (loose,), there = freed((problem,), theta.at[SPACE.dim].set(0.5))
+    density = float(fabric_at(loose, there).density)
+    assert density == pytest.approx(float(KNIT.density) * np.exp(0.05), rel=1e-5)
+
+
 def test_points_of_another_thing_are_counted(lifted):
     mask = np.asarray(lifted.mask)
     points = np.array(lifted.points)
@@ -111,11 +144,14 @@ def test_the_command_says_so(lifted, pulled):
         misfits=(
             Misfit(0, "marker 2", 0.036, "m"),
             Misfit(1, "air", 5.0, "standard deviations"),
+            Misfit(0, "force", 2.5, "of its size"),
         ),
         left_out=(0.02, 0.76),
     )
     lines = _misfits(cast(Estimate, found), [pulled, lifted])
     assert "pull" in lines[0] and "marker 2 is 36 mm" in lines[0]
     assert "lift" in lines[1] and "the density" in lines[1]
+    assert "pull" in lines[2] and "off by 250 %" in lines[2] and "density" in lines[2]
+    lines = lines[:2] + lines[3:]
     assert lines[2] == f"left out of {pulled.info.name}: 2.0 % as outliers"
     assert lines[3].startswith("warning") and "76.0 %" in lines[3] and "density" in lines[3]

@@ -375,6 +375,8 @@ def _laboratory_lines(
 
 def _misfits(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[str]:
     """What of the recordings does not fit the fabric, and how much of them is left out."""
+    from r2s.estimation.misfits import FORCE
+
     names = [each.info.name for each in recordings]
     lines = []
     if not estimate.left_out:
@@ -385,6 +387,11 @@ def _misfits(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[st
             lines.append(
                 f"warning: {name}: {misfit.what} is {1e3 * misfit.off:.0f} mm from its place on "
                 "the sheet, far more than the others: on another cloth, or its place is wrong"
+            )
+        elif misfit.what == FORCE:
+            lines.append(
+                f"warning: {name}: the force of this sheet is off by {100 * misfit.off:.0f} % of "
+                "what was recorded: its density [kg/m^2], or the unit of the force [N], may be off"
             )
         else:
             lines.append(

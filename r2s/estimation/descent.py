@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation import checkpoint as checkpoints
-from r2s.estimation import gauss_newton, mesh_bias
+from r2s.estimation import density_doubt, gauss_newton, mesh_bias
 from r2s.estimation.agreement import agreement
 from r2s.estimation.compiled import (
     Derive,
@@ -206,11 +206,14 @@ def judged(
     biases = []
     if other_mesh is not None and alone:
         biases = mesh_bias.alone(problems, other_mesh, alone, found.derive, budget.width)
+    agreed, missed = agreement(problems, alone, biases), misfits(problems, best.theta, seen)
+    if density_doubt.is_asked(problems, agreed, missed):
+        agreed = _with_density(agreed, problems, budget, best.theta, key)
     return dataclasses.replace(
         estimate,
-        agreement=agreement(problems, alone, biases),
+        agreement=agreed,
         shares=shares,
-        misfits=misfits(problems, best.theta, seen),
+        misfits=missed,
         left_out=left_out(problems, seen, float(best.scale)),
     )
 
@@ -231,6 +234,17 @@ def each_alone(
         start = theta[theta_indices(problems, which)]
         ends.append(search((problem,), alone, start=start, derive=derive, key=key).best)
     return ends
+
+
+def _with_density(agreed, problems: Problems, budget: Budget, theta: Theta, key: PRNGKeyArray):
+    """The agreement with the density that all recordings lead to; as it is where they diverge."""
+    loose, start = density_doubt.freed(problems, theta)
+    free = budget._replace(coarse=0, starts=1, shares=(), near=True, leads_on=False)
+    try:
+        end = search(loose, free, start=start, key=key).best
+    except RuntimeError:
+        return agreed
+    return density_doubt.with_density(agreed, loose, end)
 
 
 def _begin(problems: Problems, budget: Budget, start, derive: Derive, progress, key) -> Row:

@@ -53,8 +53,8 @@ class Agreement(NamedTuple):
       mesh's error allowed for: one that tells none was not compared.
     - `contradiction`: the one that leads elsewhere than the others; None where all agree.
     - `density`: with which they would agree best, over the one that was given, [-], and the
-      standard error of its logarithm; None where not some weigh the sheet, by a force, and others
-      do not.
+      standard error of its logarithm, see `r2s.estimation.density_doubt`; None where not some
+      weigh the sheet, by a force, and others do not.
     - `exact`: as `p`, were their meshes without error; None where nothing was excused.
     """
 
@@ -82,9 +82,9 @@ class Misfit(NamedTuple):
     """Something of a recording that does not fit the fabric that was found, see
     `r2s.estimation.misfits`.
 
-    - `recording`: its index. `what`: a marker or a nuisance.
-    - `off`: how far, in `unit`: of a marker [m], of a nuisance the standard deviations of what was
-      known of it.
+    - `recording`: its index. `what`: a marker, "force" or a nuisance.
+    - `off`: how far, in `unit`: of a marker [m], of a force its share, of a nuisance the standard
+      deviations of what was known of it.
     """
 
     recording: int

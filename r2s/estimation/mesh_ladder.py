@@ -108,8 +108,9 @@ def descend_by_meshes(
             at = climb(rungs[0], at.found.theta, len(rungs) > 1)
         for shapes in rungs[1:]:
             if not finest and not is_too_coarse(recordings, at.found.fabric, at.shapes):
-                at = climb(at.shapes, at.found.theta, False)  # to its end
-                break
+                at = climb(at.shapes, at.found.theta, False)  # to its end, where it may be softer
+                if not is_too_coarse(recordings, at.found.fabric, at.shapes):
+                    break
             at = climb(shapes, at.found.theta, shapes is not rungs[-1])
         tell(progress, "standard errors")
         other = OtherMesh(on(*_others(at.shapes)), factor(2.0 if _is_finest(at.shapes) else 0.5))

@@ -201,7 +201,7 @@ class Problem(eqx.Module):
             tuple(range(first, last + 1)),
             clouds,
             markers,
-            _force(recording, frames) if recording.info.scenario == "stretching" else None,
+            force_at(recording, frames) if recording.info.scenario == "stretching" else None,
             solver,
             nuisance_prior or default_nuisance_prior(scenario, recording.info.doubt),
             expected,
@@ -386,8 +386,9 @@ def _on_sheet(
     return face, weights, np.linalg.norm(there - places, axis=1)
 
 
-def _force(recording: Recording, frames: slice) -> Force | None:
-    """The force at the frames; a log of numbers is along the warp, along which the clamp pulls.
+def force_at(recording: Recording, frames: slice | list[int]) -> Force | None:
+    """The force at some frames, None where none was measured; a log of numbers is along the warp,
+    along which the clamp pulls.
 
     Raises `ValueError` for a log that does not cover the frames, and for one number that falls in a
     stretching.

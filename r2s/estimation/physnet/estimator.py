@@ -2,7 +2,8 @@
 
 After Duan et al. 2022. The loss is the distance, frame by frame, between the points that a trained
 network gives the recorded and the simulated images. Both pass the same preprocessing, and the
-simulation follows the recorded gripper.
+simulation follows the recorded gripper. Of a stretching the force on the clamp counts, too
+(`r2s.estimation.physnet.pull_force`), which the papers have not.
 """
 
 import time
@@ -20,8 +21,10 @@ from r2s.estimation.estimate import Estimate, point_estimate
 from r2s.estimation.physnet import bayes, emulator
 from r2s.estimation.physnet.network import PhysNet
 from r2s.estimation.physnet.preprocess import grey
+from r2s.estimation.physnet.pull_force import PullForce, moved_with_forces
 from r2s.estimation.physnet.training import Training
 from r2s.estimation.physnet.views import View, depths_of_sheet, per_face
+from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace
 from r2s.recordings.cameras.calibration import DepthCamera, frustum
 from r2s.scenarios.scenario import Scenario, rollout
@@ -41,6 +44,7 @@ class Sighting(eqx.Module):
     - `frames`: frames of the scenario at which the images were recorded.
     - `view`, `per_face`: see `views.depths_of_sheet`.
     - `cameras`: planes of the cameras' frames (`frustum`); None: all of the sheet was in them.
+    - `pull`: the force of a pull, whose coordinates `points` have, too; None: of images alone.
     """
 
     scenario: Scenario
@@ -52,6 +56,7 @@ class Sighting(eqx.Module):
     view: View = eqx.field(static=True)
     per_face: int = eqx.field(static=True)
     cameras: Float[Array, "camera 4 4"] | None = None
+    pull: PullForce | None = None
 
     @classmethod
     def make(
@@ -63,12 +68,14 @@ class Sighting(eqx.Module):
         training: Training,
         solver: Solver | None = None,
         cameras: Sequence[DepthCamera] = (),
+        pull: PullForce | None = None,
     ) -> "Sighting":
         """A sighting from recorded images.
 
         - `images`: of `r2s.estimation.physnet.preprocess`, one for each of the `frames`.
         - `training`: the trained network with its view.
         - `cameras`: what is out of the frame of all of them is left out of simulated images too.
+        - `pull`: the force at the same frames, see `r2s.estimation.physnet.pull_force`.
 
         Raises `ValueError` when images and frames differ in number, or a frame is not simulated.
         """
@@ -78,6 +85,8 @@ class Sighting(eqx.Module):
                 "expected one image for each frame"
             )
         points = embedded(training.network, jnp.asarray(images, float))
+        if pull is not None:
+            points = jnp.concatenate([points, pull.recorded], axis=1)
         rest = np.asarray(scenario.scene.mesh.rest)
         along = tuple(len(np.unique(rest[:, axis].round(6))) for axis in (0, 1))
         width, height = (float(side) for side in np.ptp(rest, axis=0))
@@ -93,6 +102,7 @@ class Sighting(eqx.Module):
             view=training.view,
             per_face=fine,
             cameras=jnp.asarray(np.stack(planes), float) if planes else None,
+            pull=pull,
         )
 
 
@@ -113,16 +123,27 @@ def answers(sighting: Sighting, places: Float[Array, "place dim"]) -> Float[Arra
 
     def of_place(place):
         fabric = sighting.space(place)
-        found = rollout(sighting.scenario, fabric, solver=sighting.solver)
+        found, ok = _moved(sighting, fabric)
         x = found.x[jnp.array(sighting.frames)]
         faces = sighting.scenario.scene.mesh.faces
         depth = depths_of_sheet(sighting.view, x, faces, sighting.per_face, sighting.cameras)
         images = jax.vmap(partial(grey, sighting.view))(depth)
         points = jax.vmap(sighting.network)(images)
-        whole = jnp.all(found.ok) & jnp.all(jnp.isfinite(x))
+        if sighting.pull is not None:
+            force = sighting.pull.simulated(sighting.scenario, found, sighting.frames)
+            points = jnp.concatenate([points, force], axis=1)
+        whole = ok & jnp.all(jnp.isfinite(x))
         return jnp.where(whole, _flat(points), jnp.nan)
 
     return jax.vmap(of_place)(places)
+
+
+def _moved(sighting: Sighting, fabric: Fabric):
+    """The motion of a fabric, with its forces where one was recorded, and whether it is finite."""
+    if sighting.pull is not None:
+        return moved_with_forces(sighting.scenario, fabric, sighting.solver)
+    found = rollout(sighting.scenario, fabric, solver=sighting.solver)
+    return found, jnp.all(found.ok)
 
 
 def _flat(points: Float[Array, "frame dim"]) -> Float[Array, " part"]:
