@@ -1,9 +1,11 @@
 """Cells that estimate: each approach from each scenario, on either solver."""
 
 import json
+import shutil
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -17,10 +19,11 @@ from r2s.estimation.method import Budget, Method, default_space
 from r2s.estimation.physnet.method import TrainingBudget, train_network
 from r2s.estimation.registry import METHODS
 from r2s.fabrics import prior
-from r2s.files import write_json
+from r2s.files import source_hash, write_json
 from r2s.recordings.recording import Recording
-from r2s.study.cells import Cell, result_files
+from r2s.study.cells import KEY_LENGTH, VERSIONS, Cell, result_files
 from r2s.study.configuration import AND
+from r2s.study.environment import processor
 from r2s.study.sources import Source, read
 
 ESTIMATE, NETWORK = "estimate.json", "network.eqx"
@@ -134,10 +137,19 @@ class EstimateCell(Cell):
         """The law of the fabrics that it chooses from, told by its recordings where that is so."""
         return law_told_by(recordings) if self.law == "told" else self.law
 
+    def begun(self, folder: Path) -> Path:
+        """Where the state of an estimate lies until it is made, so that a killed one goes on: by
+        the same source, versions and processor, since another would not come by there."""
+        made_by = sha256(f"{source_hash()} {VERSIONS} {processor()}".encode()).hexdigest()
+        return folder / "begun" / f"{self.name}-{self.key}-{made_by[:KEY_LENGTH]}"
+
     def _estimated(self, recordings, space, folder: Path) -> Estimate:
-        key, network = jr.key(self.repeat), self.network
+        key, network, begun = jr.key(self.repeat), self.network, self.begun(folder)
         with nullcontext() if network is None else result_files(network, folder) as files:
-            return method_of(self, files).estimate(recordings, space, self.budget, key=key)
+            method = replace(method_of(self, files), checkpoint=begun / "state.npz")
+            found = method.estimate(recordings, space, self.budget, key=key)
+        shutil.rmtree(begun, ignore_errors=True)
+        return found
 
 
 def method_of(cell: EstimateCell, network: Path | None = None) -> Method:
