@@ -8,6 +8,7 @@ contradict each other: another fabric in one of them, or an error in what was wr
 its noise.)
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -27,7 +28,7 @@ from r2s.estimation.gauss_newton import Descent, Problems, prior_weight
 MOST = 0.08
 # what moves with the density, where nothing weighs the sheet
 SCALED = ("warp", "weft", "shear", "bending", "E h")
-HARDLY = np.log(30.0)  # standard deviation of the logarithm of a density written down wrongly
+HARDLY = math.log(30.0)  # standard deviation of the logarithm of a density written down wrongly
 MORE, SOME = 2.0, 1 + 1e-6  # times a prior's precision: told weighs more, and at all
 RCOND = 1e-9  # of the recordings' information together: less than that is none
 
