@@ -53,8 +53,9 @@ class Agreement(NamedTuple):
       mesh's error allowed for: one that tells none was not compared.
     - `contradiction`: the one that leads elsewhere than the others; None where all agree.
     - `density`: with which they would agree best, over the one that was given, [-], and the
-      standard error of its logarithm, see `r2s.estimation.density_doubt`; None where not some
-      weigh the sheet, by a force, and others do not.
+      standard error of its logarithm: a first guess where some weigh the sheet, by a force, and
+      others do not; where a force or another recording does not fit, of a descent
+      (`r2s.estimation.density_doubt`). Else None.
     - `exact`: as `p`, were their meshes without error; None where nothing was excused.
     """
 

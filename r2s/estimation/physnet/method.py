@@ -17,7 +17,8 @@ from r2s.estimation.default_spaces import RANGES
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.method import ANY, Budget, Method, Reads, seed_of
 from r2s.estimation.physnet import bayes, dataset, emulator, estimator, preprocess, training
-from r2s.estimation.physnet.pull_force import PullForce, pull_force
+from r2s.estimation.physnet.pull_force import pull_force
+from r2s.estimation.problem import read_by_problem
 from r2s.recordings.recording import Recording
 from r2s.scenarios.on_points import material_points
 from r2s.scenarios.scenario import from_recording
@@ -101,9 +102,8 @@ class PhysNetMethod(Method):
     training_budget: TrainingBudget = TrainingBudget()
 
     def reads(self, recording):
-        return Reads(
-            _images_of(recording), points=None, force=self._force_of(recording) is not None
-        )
+        force = self.heeds_force and read_by_problem(recording).force
+        return Reads(_images_of(recording), points=None, force=force)
 
     def _estimate(self, recordings, space, budget, key):
         if importlib.util.find_spec(self.library) is None:
@@ -115,14 +115,11 @@ class PhysNetMethod(Method):
         images = preprocess.of_clouds(trained.view, recording, frames)
         stiffest = space(jnp.ones(space.dim, float))
         simulator = None if solver == "cloth" else material_points(scenario, stiffest)
-        pull = self._force_of(recording)
+        pull = pull_force(recording, frames) if self.heeds_force else None
         seen = estimator.Sighting.make(
             scenario, images, frames, space, trained, simulator, pull=pull
         )
         return self._search(seen, budget.evaluations, seed_of(key))
-
-    def _force_of(self, recording: Recording) -> PullForce | None:
-        return pull_force(recording, _images_of(recording)) if self.heeds_force else None
 
     def _trained(self, recording: Recording, seed: int) -> training.Training:
         if self.network is None:
