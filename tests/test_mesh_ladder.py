@@ -150,6 +150,27 @@ def test_a_fabric_that_folds_at_the_end_of_a_coarse_mesh_goes_on(folds, meshes, 
     assert [leads_on for _, leads_on in climbed] == [True, *[False] * (len(meshes) - 1)]
 
 
+def test_each_rung_keeps_its_state_in_a_file_of_its_own(monkeypatch, tmp_path):
+    """Also after a pull, whose mesh is the same on the last two."""
+    kept: list[str] = []
+
+    def searched(problems, budget, *, checkpoint, **_):
+        kept.append(checkpoint.name)
+        return descent.Search(problems, [], 0.0, derivatives_at)
+
+    rungs = [[(3, 3), (3, 3)], [(5, 5), (5, 5)], [(5, 5), (9, 9)]]
+    monkeypatch.setattr(descent.Search, "theta", jnp.zeros(3))
+    monkeypatch.setattr(mesh_ladder, "search", searched)
+    monkeypatch.setattr(mesh_ladder, "ladder", lambda _: rungs)
+    monkeypatch.setattr(mesh_ladder, "each_alone", lambda *_: [])
+    monkeypatch.setattr(mesh_ladder, "weights", lambda _: [])
+    monkeypatch.setattr(mesh_ladder, "is_too_coarse", lambda *_: True)
+    monkeypatch.setattr(mesh_ladder, "judged", lambda *_, **__: estimate_of_nothing())
+    files = {"checkpoint": tmp_path / "card.progress.npz", "key": jr.key(0)}
+    mesh_ladder.descend_by_meshes([lift(), lift()], SPACE, SMALL, **files)
+    assert len(kept) == len(set(kept)) == 4
+
+
 @pytest.mark.slow(group="estimates")
 def test_a_recording_of_twice_the_weight_counts_as_two():
     stiff, soft = problem(1.5), problem(0.7)

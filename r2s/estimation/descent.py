@@ -125,7 +125,8 @@ def descend(
     """
     problems = (problems,) if isinstance(problems, Problem) else problems
     found = search(problems, budget, start=start, checkpoint=checkpoint, progress=progress, key=key)
-    return judged(found, budget, approach=approach, key=key)
+    saved = {"checkpoint": checkpoint, "progress": progress, "key": key}
+    return judged(found, budget, approach=approach, **saved)
 
 
 def search(
@@ -136,11 +137,13 @@ def search(
     checkpoint: Path | None = None,
     progress: Progress | None = None,
     derive: Derive | None = None,
+    words: str = "descents",
     key: PRNGKeyArray,
 ) -> Search:
     """The descents of `descend`, whose arguments these are; a `start` may be a whole theta.
 
     `derive`: of an earlier search in the same recordings, whose end need not be derived again.
+    `words`: what the progress says.
     """
     if budget.starts < 1:
         raise ValueError(f"an estimate needs a start or more, got {budget.starts}")
@@ -154,7 +157,7 @@ def search(
     rows = _resumed(checkpoint, run, budget) if checkpoint else []
     if not rows:
         rows = [_begin(problems, budget, start, derive, progress, key)]
-    tell(progress, "descents")
+    tell(progress, words)
     while (row := _next(problems, budget, rows, derive)) is not None:
         rows.append(row)
         if checkpoint is not None:
@@ -170,10 +173,15 @@ def judged(
     *,
     approach: str = "diffcloud",
     other_mesh: OtherMesh | None = None,
+    checkpoint: Path | None = None,
+    progress: Progress | None = None,
     key: PRNGKeyArray,
 ) -> Estimate:
     """The estimate at the end of a search, with its standard errors, which hold what a constant
     stiffness is off that at small strain (`r2s.estimation.law_error`).
+
+    `checkpoint`: of the search; a descent for the density (`r2s.estimation.density_doubt`) is kept
+    beside it. `progress`: as in `descend`.
 
     `other_mesh`: by which its bias by its mesh is judged, which the standard errors then hold. If
     it is finer, and something is known of the fabric beforehand, the estimate goes towards that as
@@ -201,14 +209,16 @@ def judged(
     seconds = found.seconds + time.perf_counter() - began
     converged = _arrived(problems, stage, which, prior, _stop(budget, int(best.stage)))
     estimate = collect(problems, rows, covariance, approach, seconds, converged, loss, bias)
-    alone = each_alone(problems, budget, best.theta, key, found.derive)
+    alone = each_alone(problems, budget, best.theta, key, found.derive, progress)
     shares = tuple(float(each) for each in recording_weights(problems)) if alone else ()
     biases = []
     if other_mesh is not None and alone:
         biases = mesh_bias.alone(problems, other_mesh, alone, found.derive, budget.width)
     agreed, missed = agreement(problems, alone, biases), misfits(problems, best.theta, seen)
     if density_doubt.is_asked(problems, agreed, missed):
-        agreed = _with_density(agreed, problems, budget, best.theta, key)
+        path = checkpoint and checkpoint.with_suffix(".density.npz")
+        saved = {"checkpoint": path, "progress": progress, "key": key}
+        agreed = _with_density(agreed, problems, budget, best.theta, **saved)
     return dataclasses.replace(
         estimate,
         agreement=agreed,
@@ -224,24 +234,27 @@ def each_alone(
     theta: Theta,
     key: PRNGKeyArray,
     derive: Derive | None = None,
+    progress: Progress | None = None,
 ) -> list[Descent]:
     """The ends of descents in each of several recordings alone, from a theta of all of them."""
     if len(problems) < 2:
         return []
+    saved = {"derive": derive, "progress": progress, "key": key}
     alone = budget._replace(coarse=0, starts=1, shares=(), near=True, leads_on=True)
     ends = []
     for which, problem in enumerate(problems):
         start = theta[theta_indices(problems, which)]
-        ends.append(search((problem,), alone, start=start, derive=derive, key=key).best)
+        words = f"recording {which + 1} of {len(problems)} alone"
+        ends.append(search((problem,), alone, start=start, words=words, **saved).best)
     return ends
 
 
-def _with_density(agreed, problems: Problems, budget: Budget, theta: Theta, key: PRNGKeyArray):
+def _with_density(agreed, problems: Problems, budget: Budget, theta: Theta, **saved):
     """The agreement with the density that all recordings lead to; as it is where they diverge."""
     loose, start = density_doubt.freed(problems, theta)
     free = budget._replace(coarse=0, starts=1, shares=(), near=True, leads_on=False)
     try:
-        end = search(loose, free, start=start, key=key).best
+        end = search(loose, free, start=start, words="which density would fit", **saved).best
     except RuntimeError:
         return agreed
     return density_doubt.with_density(agreed, loose, end)

@@ -78,14 +78,15 @@ def descend_by_meshes(
 
     def climb(shapes: list[Shape], start: Theta | None, leads_on: bool) -> _Rung:
         more, path = budget, checkpoint
+        rows, columns = max(shapes)  # a pull's is that of the rung before on the last one
         if start is not None:
             more = near(budget)
             if path:
-                rows, columns = shapes[0]
                 path = path.with_suffix(f".{rows}x{columns}{'' if leads_on else '.end'}.npz")
         more = more._replace(leads_on=leads_on)
-        saved = {"checkpoint": path, "progress": progress}
-        found = search(on(*shapes), more, start=start, derive=derive, key=key, **saved)
+        saved = {"checkpoint": path, "progress": progress, "derive": derive, "key": key}
+        words = f"descents on {rows} x {columns} vertices"
+        found = search(on(*shapes), more, start=start, words=words, **saved)
         return _Rung(shapes, found)
 
     rungs = [[shape] * len(recordings)] if shape else ladder(recordings)
@@ -103,8 +104,8 @@ def descend_by_meshes(
     with meanwhile(needed() if kept() else ()):
         at = climb(rungs[0], None, len(rungs) > 1)
         if len(recordings) > 1:
-            tell(progress, "each recording alone")
-            counts += weights(each_alone(at.found.problems, budget, at.found.theta, key, derive))
+            alone = each_alone(at.found.problems, budget, at.found.theta, key, derive, progress)
+            counts += weights(alone)
             at = climb(rungs[0], at.found.theta, len(rungs) > 1)
         for shapes in rungs[1:]:
             if not finest and not is_too_coarse(recordings, at.found.fabric, at.shapes):
@@ -114,7 +115,8 @@ def descend_by_meshes(
             at = climb(shapes, at.found.theta, shapes is not rungs[-1])
         tell(progress, "standard errors")
         other = OtherMesh(on(*_others(at.shapes)), factor(2.0 if _is_finest(at.shapes) else 0.5))
-        estimate = judged(at.found, budget, other_mesh=other, key=key)
+        saved = {"checkpoint": checkpoint, "progress": progress, "key": key}
+        estimate = judged(at.found, budget, other_mesh=other, **saved)
     return dataclasses.replace(estimate, shape=at.shapes[_largest(recordings)])
 
 
@@ -133,12 +135,13 @@ def descend_weighed(
     saved = {"progress": progress, "derive": derive, "key": key}
     found = search(problems, budget, checkpoint=checkpoint, **saved)
     if len(problems) > 1:
-        tell(progress, "each recording alone")
-        counts = weights(each_alone(problems, budget, found.theta, key, derive))
+        counts = weights(each_alone(problems, budget, found.theta, key, derive, progress))
         problems = _weighed(problems, counts)
         path = checkpoint and checkpoint.with_suffix(".weighed.npz")
         found = search(problems, near(budget), start=found.theta, checkpoint=path, **saved)
-    return judged(found, budget, approach=approach, key=key)
+    return judged(
+        found, budget, approach=approach, checkpoint=checkpoint, progress=progress, key=key
+    )
 
 
 class _Rung(NamedTuple):
