@@ -14,6 +14,7 @@ import numpy as np
 from _physnet_accuracy import errors
 from _tables import Line, command_line, keep
 
+from r2s.estimation.default_spaces import RANGES
 from r2s.estimation.physnet import dataset, training, triplets
 from r2s.estimation.physnet.dataset import Settings
 
@@ -28,8 +29,9 @@ if __name__ == "__main__":
     parser.add_argument("--calls", type=int, default=80, help="simulations of a search")
     parser.add_argument("--estimates", type=int, default=8)
     a = parser.parse_args()
-    settings = Settings(a.scenario, a.fabrics)
-    judged = Settings(a.scenario, a.unseen, num_levels=3, per_shard=a.unseen, seed=1)
+    settings = Settings(a.scenario, a.fabrics, ranges=RANGES)
+    of_judged = {"num_levels": 3, "per_shard": a.unseen, "seed": 1}
+    judged = Settings(a.scenario, a.unseen, ranges=RANGES, **of_judged)
     view = dataset.make(a.out / "data", settings).view
     dataset.make(a.out / "unseen", judged, view=view)
     taught, unseen = dataset.load(a.out / "data"), dataset.load(a.out / "unseen")

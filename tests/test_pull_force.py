@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,7 @@ from r2s.estimation.physnet import estimator, training
 from r2s.estimation.physnet.estimator import Sighting
 from r2s.estimation.physnet.method import PhysNetMethod, PublishedPhysNet
 from r2s.estimation.physnet.network import Architecture
-from r2s.estimation.physnet.pull_force import SCALE, PullForce, pull_force
+from r2s.estimation.physnet.pull_force import FLAW, NOISE, SCALE, PullForce, pull_force
 from r2s.estimation.physnet.views import eye_of, floor_of, view_around
 from r2s.fabrics import presets
 from r2s.fabrics.parameters import OrthotropicSpace
@@ -51,17 +52,31 @@ def test_the_true_force_is_where_it_was_recorded_and_twice_the_stiffness_apart(s
     answers = np.asarray(estimator.answers(sighting, jnp.stack([true, slippery, twice])))
     width = sighting.points.shape[1]
     parts = [each.reshape(len(FRAMES), width) / np.sqrt(width) for each in answers]
-    along = -3  # the pull is along x, the first of the three directions that end a point
-    recorded = np.asarray(sighting.points[:, along])
-    assert parts[0][-1, along] == pytest.approx(recorded[-1], abs=SCALE * 0.03)  # the cell's noise
-    further = parts[2][-1, along] - parts[1][-1, along]
-    assert further == pytest.approx(SCALE * np.log(2), rel=0.05)
+    recorded = np.asarray(sighting.points[:, -1])  # the last coordinate of a point
+    assert parts[0][-1, -1] == pytest.approx(recorded[-1], abs=3 * FLAW)  # the cell's noise
+    of_slippery, of_twice = (np.sinh(part[-1, -1] / SCALE) for part in parts[1:])
+    assert of_twice == pytest.approx(2 * of_slippery, rel=0.05)
+
+
+def test_a_force_counts_by_its_ratio():
+    one, two = (PullForce(jnp.array([n]), jnp.eye(3)[0], jnp.array(0.05)) for n in (5.0, 10.0))
+    further = float((two.recorded - one.recorded)[0, 0])
+    assert further == pytest.approx(SCALE * np.log(2), rel=1e-3)
 
 
 def test_a_force_that_is_small_counts_by_its_difference():
-    pull = PullForce(jnp.array([[1.0]]), jnp.eye(3)[:1], jnp.array(0.05))
-    small = dataclasses.replace(pull, values=jnp.array([[1e-4]]))
-    assert float(small.recorded[0, 0]) == pytest.approx(SCALE * 1e-4 / 0.05, rel=1e-3)
+    pull = PullForce(jnp.array([1e-4]), jnp.eye(3)[0], jnp.array(0.05))
+    assert float(pull.recorded[0, 0]) == pytest.approx(SCALE * 1e-4 / 0.05, rel=1e-3)
+
+
+def test_noise_of_a_load_cell_counts_like_a_flawed_image_at_most(recording):
+    """Of a fabric that is so soft that a pull needs little more than that noise, too."""
+    _, seen = recording
+    largest = float(jnp.max(jnp.abs(seen.force[:, 0])))
+    soft = dataclasses.replace(seen, force=seen.force * (0.05 / largest))
+    noisy = dataclasses.replace(soft, force=soft.force.at[:, 0].add(NOISE))
+    away = pull_force(noisy, FRAMES).recorded - pull_force(soft, FRAMES).recorded
+    assert 0.7 * FLAW < float(jnp.max(jnp.abs(away))) <= 1.01 * FLAW
 
 
 def test_only_a_stretching_has_one_and_the_published_method_reads_none(recording):
@@ -75,3 +90,20 @@ def test_only_a_stretching_has_one_and_the_published_method_reads_none(recording
     still = dataclasses.replace(seen, force=jnp.zeros_like(seen.force))
     with pytest.raises(ValueError, match="zero throughout"):
         pull_force(still, FRAMES)
+
+
+def test_a_state_file_of_another_sighting_is_refused(sighting, tmp_path):
+    """Its answers would be those of another density, and its target another recording's."""
+    path, calls = tmp_path / "search.npz", SPACE.dim + 2
+    whole = estimator.estimate(sighting, num_calls=calls, path=path)
+    again = estimator.estimate(sighting, num_calls=calls, path=path)
+    assert np.array_equal(whole.losses, again.losses)
+    heavier = eqx.tree_at(lambda each: each.space, sighting, OrthotropicSpace.make(0.3))
+    further = eqx.tree_at(lambda each: each.points, sighting, sighting.points + 1.0)
+    for other in (heavier, further):
+        with pytest.raises(ValueError, match="another run"):
+            estimator.estimate(other, num_calls=calls, path=path)
+
+
+def test_what_tells_a_sighting_is_the_same_in_another_process(sighting):
+    assert "0x" not in repr(jax.tree.structure(sighting))

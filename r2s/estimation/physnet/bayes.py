@@ -131,6 +131,7 @@ def minimise(
     num_first: int = 16,
     seed: int = 0,
     path: Path | str | None = None,
+    run: str = "",
     progress: Callable[[History], None] | None = None,
 ) -> History:
     """The history of a search of `num_calls` calls.
@@ -138,21 +139,22 @@ def minimise(
     - `objective`: gives a non-negative loss for each of up to `batch` places.
     - `num_first`: calls that fill the cube evenly before the Gaussian process is used.
     - `path`: file that keeps the history after every batch, and from which the search continues.
+    - `run`: what tells this search from others (`r2s.estimation.checkpoint.fingerprint`).
     - `progress`: called with the history after every batch.
 
     Raises `ValueError` when the file is of another search.
     """
-    run = {"kind": "Bayesian optimisation", "dim": dim, "batch": batch}
-    run |= {"num_first": num_first, "seed": seed}
+    told = {"kind": "Bayesian optimisation", "run": run, "dim": dim, "batch": batch}
+    told |= {"num_first": num_first, "seed": seed}
     history = begin(dim)
-    if path is not None and (stored := checkpoint.load(path, run)) is not None:
+    if path is not None and (stored := checkpoint.load(path, told)) is not None:
         history = History(**stored)
     while len(history.losses) < num_calls:
         number = min(batch, num_calls - len(history.losses))
         places = ask(history, number, num_first=num_first, seed=seed)
         history = tell(history, places, objective(places))
         if path is not None:
-            checkpoint.save(path, vars(history), run)
+            checkpoint.save(path, vars(history), told)
         if progress is not None:
             progress(history)
     return history

@@ -43,6 +43,7 @@ def minimise(
     shared: int = 1,
     seed: int = 0,
     path: Path | str | None = None,
+    run: str = "",
     progress: Callable[[Trials], None] | None = None,
 ) -> Trials:
     """Trials, of which the last is where the target most likely lies.
@@ -50,6 +51,7 @@ def minimise(
     - `respond`: gives the answers of up to `batch` places.
     - `shared`: number of parts of an answer, such as frames, that share one error of the target.
     - `path`: file that keeps the trials after every batch, and from which the search continues.
+    - `run`: what tells this search from others (`r2s.estimation.checkpoint.fingerprint`).
     - `progress`: called with the trials after every batch.
 
     The share `FIRST` of the calls fills the cube. Then each batch is drawn by the likelihood of the
@@ -59,9 +61,10 @@ def minimise(
     """
     if num_calls < dim + 2:
         raise ValueError(f"expected at least {dim + 2} calls in {dim} dimensions, got {num_calls}")
-    run = {"kind": "emulated search", "dim": dim, "calls": num_calls, "batch": batch, "seed": seed}
+    told = {"kind": "emulated search", "run": run, "dim": dim}
+    told |= {"calls": num_calls, "batch": batch, "seed": seed}
     trials = Trials(np.zeros((0, dim)), np.zeros((0, len(target))))
-    if path is not None and (stored := checkpoint.load(path, run)) is not None:
+    if path is not None and (stored := checkpoint.load(path, told)) is not None:
         trials = Trials(**stored)
     first = even(dim, max(int(FIRST * num_calls), dim + 1), seed)
     while (done := len(trials.places)) < num_calls:
@@ -72,10 +75,10 @@ def minimise(
             generator = np.random.default_rng([seed, done])
             places = _ask(trials, target, shared, number, generator)
         answers = respond(places)
-        told = np.concatenate([trials.answers, answers])
-        trials = Trials(np.concatenate([trials.places, places]), told)
+        known = np.concatenate([trials.answers, answers])
+        trials = Trials(np.concatenate([trials.places, places]), known)
         if path is not None:
-            checkpoint.save(path, trials._asdict(), run)
+            checkpoint.save(path, trials._asdict(), told)
         if progress is not None:
             progress(trials)
     return trials

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from r2s.estimation.checkpoint import fingerprint
 from r2s.estimation.estimate import Estimate, point_estimate
 from r2s.estimation.physnet import bayes, emulator
 from r2s.estimation.physnet.network import PhysNet
@@ -195,7 +196,7 @@ def estimate(
     """The fabric most likely to look as recorded, by `num_calls` simulations.
 
     - `batch`: simulations that run together.
-    - `path`: file of the search, from which it continues.
+    - `path`: file of the search, from which it continues; one of another sighting is refused.
     - `progress`: called with the trials after every batch.
 
     An emulator (`r2s.estimation.physnet.emulator`) predicts the points of simulated images; the
@@ -213,6 +214,7 @@ def estimate(
         shared=len(sighting.frames),  # the error of the images counts as the same in all of them
         seed=seed,
         path=path,
+        run=fingerprint(sighting) if path else "",
         progress=progress,
     )
     losses = trials.losses(target_of(sighting))
@@ -246,6 +248,7 @@ def published_recipe(
         batch=batch,
         seed=seed,
         path=path,
+        run=fingerprint(sighting) if path else "",
         progress=progress,
     )
     name = f"physnet (Bayesian optimisation, {num_calls} simulations)"
