@@ -44,6 +44,9 @@ def test_the_last_motion_with_clouds_is_held_out_of_three_or_more(lift):
     assert held_out.choose([a, b, called(lift, "c")]) == 2
     assert held_out.choose([a, b, pull], held_out.NONE) is None
     assert held_out.choose([a, b], "a") == 0
+    fold = called(lift, "fold", "folding")  # tells no fabrics apart
+    assert held_out.choose([a, b, fold]) == 1
+    assert held_out.choose([a, fold, fold]) == 0
 
 
 def test_it_is_said_why_none_is_held_out(lift):
@@ -105,20 +108,40 @@ def test_the_air_is_the_one_that_an_estimate_names_where_a_recording_doubts_it(l
     assert held_out.air_found(estimate, [lift]) == 1.0  # as of a wind, whose speed was in doubt
     silent = dataclasses.replace(estimate, nuisances=())  # as of cma-es, which reports none
     assert held_out.air_found(silent, [doubted]) == 1.0
-    assert "in air 0.61 times" in HeldOut("fling", 4e-3, (8e-3,), 0, np.exp(-0.5)).describe()
+    assert "in air 0.61 times" in HeldOut("fling", 4e-3, (8e-3,), 0, 8e-3, np.exp(-0.5)).describe()
 
 
 def test_a_run_that_diverged_is_no_better_than_anything():
-    assert not HeldOut("fling", float("inf"), (1e-2,), 0).is_better
-    assert not HeldOut("fling", 1e-3, (), 8).is_better
-    assert "diverged" in HeldOut("fling", float("inf"), (1e-2,), 0).describe()
+    assert not HeldOut("fling", float("inf"), (1e-2,), 0, 1e-2).is_better
+    assert not HeldOut("fling", 1e-3, (), 8, 1e-2).is_better
+    for lost in (HeldOut("fling", float("inf"), (1e-2,), 0, 1e-2), HeldOut("f", 1e-3, (), 8, 1e-2)):
+        assert lost.describe().startswith("warning")
+    assert "diverged" in HeldOut("fling", float("inf"), (1e-2,), 0, 1e-2).describe()
+    nothing_else = HeldOut("fling", 4e-3, (8e-3, 12e-3), 0, float("inf"))
+    assert nothing_else.is_better and "the middle of the prior -" in nothing_else.describe()
 
 
 def test_the_line_says_better_or_warns():
-    good = HeldOut("fling", 4e-3, (8e-3, 12e-3), 1).describe()
+    good = HeldOut("fling", 4e-3, (8e-3, 12e-3), 1, 9e-3).describe()
     assert good == (
-        "held out, fling: 4.0 mm; knowing nothing 10.0 mm (8.0 to 12.0, 2 draws, 1 more diverged): "
-        "better than every draw"
+        "held out, fling: 4.0 mm; knowing nothing 10.0 mm (8.0 to 12.0, 2 draws, 1 more diverged; "
+        "the middle of the prior 9.0): better than every draw"
     )
-    assert HeldOut("fling", 9e-3, (8e-3, 12e-3), 0).describe().endswith("draws on average")
-    assert HeldOut("fling", 11e-3, (8e-3, 12e-3), 0).describe().startswith("warning: held out")
+    apart = (8e-3, 12e-3)
+    assert HeldOut("fling", 9e-3, apart, 0, 1e-2).describe().endswith("draws on average")
+    assert HeldOut("fling", 11e-3, apart, 0, 2e-2).describe().startswith("warning: held out")
+
+
+def test_an_estimate_that_is_worse_than_the_best_guess_by_the_weight_has_learnt_nothing():
+    """The draws scatter about the middle of the prior, which is nearer than most of them."""
+    found = HeldOut("fling", 16e-3, (10e-3, 48e-3), 0, 8.5e-3)
+    assert not found.is_better and found.describe().startswith("warning")
+
+
+def test_a_motion_in_which_all_fabrics_are_alike_tells_nothing():
+    """But that an estimate which is far from all of them is wrong."""
+    fold = (2.4e-3, 2.6e-3)
+    for error in (2.0e-3, 3.1e-3):
+        words = HeldOut("fold", error, fold, 0, 2.5e-3).describe()
+        assert not words.startswith("warning") and "not told" in words
+    assert HeldOut("fold", 9e-3, fold, 0, 2.5e-3).describe().startswith("warning")

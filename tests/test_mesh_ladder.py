@@ -101,6 +101,15 @@ def test_a_finer_mesh_is_taken_where_the_coarse_one_is_not_enough(enough, shape,
 
 
 @pytest.mark.slow(group="estimates")
+def test_an_estimate_is_named_by_the_mesh_of_what_moves_freely():
+    """Whichever recording comes first: a pull has a coarser one on the last rung."""
+    free = lift()
+    taut = dataclasses.replace(free, info=dataclasses.replace(free.info, scenario="stretching"))
+    assert mesh_ladder._told([free, taut], [(33, 33), (17, 17)]) == (33, 33)
+    assert mesh_ladder._told([taut, free], [(17, 17), (33, 33)]) == (33, 33)
+    assert mesh_ladder._told([taut], [(17, 5)]) == (17, 5)
+
+
 def test_a_shape_that_is_asked_for_is_kept(monkeypatch):
     monkeypatch.setattr(resolution, "LADDER", (3, 5))
     monkeypatch.setattr(resolution, "ENOUGH", 1e-9)

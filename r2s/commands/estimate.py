@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from glob import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -122,6 +121,7 @@ class EstimateCard:
         from r2s.commands.common import print_result
         from r2s.commands.waiting import Waiting
         from r2s.estimation import cards, held_out
+        from r2s.estimation.checkpoint import forget
         from r2s.estimation.estimate import describe
         from r2s.estimation.method import COARSEST, tell
         from r2s.files import check_folders
@@ -165,7 +165,8 @@ class EstimateCard:
                 shape = alike(found.shape or COARSEST, each.info.sheet.size)
                 air = held_out.air_found(found, seen)
                 told_by = held_out.judge(each, found.fabric, shape, air=air)
-                judged.append(told_by.describe())
+                line = told_by.describe()
+                judged.append(line if method.chosen_solver == "cloth" else f"{line} (by the cloth)")
         sources = [each.info.source for each in seen] + [each.source for each in known]
         provenance = cards.Provenance(
             method="; ".join(
@@ -182,8 +183,7 @@ class EstimateCard:
         name = self.name or (seen[0].info.fabric if seen else known[0].name)
         card = cards.Card.make(name, found, provenance)
         cards.write(self.out, card)
-        for path in self.out.parent.glob(f"{escape(self._progress_file.stem)}*.npz"):
-            path.unlink()
+        forget(self._progress_file)
         weighing = _by_weight(method, self.density, seen)
         lines = [
             *describe(found),
@@ -410,15 +410,21 @@ def _misfits(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[st
 
 def _unread(method: "Method", recordings: "Sequence[Recording]") -> list[str]:
     """What of the recordings the method has not read."""
+    from r2s.recordings.recording import clouds_are_markers
+
     lines = []
     for each in recordings:
         reads = method.reads(each)
+        has_clouds = each.mask.any() and not clouds_are_markers(each)
         kinds = {
-            "clouds": each.mask.any() and reads.points == 0,
+            "clouds": has_clouds and reads.points == 0,
             "markers": each.markers is not None and not reads.markers,
             "force": each.force is not None and not reads.force,
         }
         left = [kind for kind, is_left in kinds.items() if is_left]
+        most = int(each.mask.sum(axis=1).max())
+        if has_clouds and reads.points and reads.points < most:
+            left.append(f"all but {reads.points} points a frame, drawn at random, of up to {most}")
         first, last = each.info.frames_used
         if len(reads.frames) < last - first + 1:
             left.append(f"{last - first + 1 - len(reads.frames)} of {last - first + 1} frames")
@@ -459,7 +465,8 @@ def _agreement(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[
         return lines
     if odd is None:
         alone = [name for name, told in zip(names, found.told, strict=True) if not told]
-        left = f"; not compared, by the error of the mesh: {', '.join(alone)}" if alone else ""
+        little = "; too little beyond the prior and the mesh's error is told to compare"
+        left = f"{little} {', '.join(alone)}" if alone else ""
         words = f"the recordings agree (by chance {found.p:.2g}){left}"
         if found.is_excused:
             words = (

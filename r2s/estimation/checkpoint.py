@@ -8,6 +8,7 @@ arrays = load(path, run)  # None: there is no such file
 import io
 import json
 from collections.abc import Mapping
+from glob import escape
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar
@@ -74,6 +75,12 @@ def load(path: Path | str, run: Mapping[str, Any]) -> dict[str, np.ndarray] | No
         told = ", ".join(f"{key} {found.get(key)} there, {asked.get(key)} asked" for key in names)
         raise ValueError(f"{path} is of another run ({told}): remove it, or choose another file")
     return arrays
+
+
+def forget(path: Path) -> None:
+    """Remove a state file, and those of what was built on it, PATH's stem and more words."""
+    for each in (path, *path.parent.glob(f"{escape(path.stem)}.*{path.suffix}")):
+        each.unlink(missing_ok=True)
 
 
 def fingerprint(*parts: Any) -> str:

@@ -441,7 +441,10 @@ def _run_of(problems: Problems, budget: Budget, start, key) -> dict[str, str]:
 
 
 def _resumed(checkpoint: Path, run: dict[str, str], budget: Budget) -> list[Row]:
-    """The iterations in a checkpoint; none when there is no file."""
+    """The iterations in a checkpoint; none when there is no file (then what was built on another
+    run's is of no use, and removed)."""
+    if not checkpoint.exists():
+        checkpoints.forget(checkpoint)
     arrays = checkpoints.load(checkpoint, run)
     if arrays is None:
         return []

@@ -21,6 +21,7 @@ from r2s.scenarios.scenario import from_recording, in_denser_air
 FEWEST = 3  # recordings, of which one is held out without being asked for
 NONE = "none"  # the name by which no recording is held out
 DRAWS = 8
+ALIKE = 1.25  # of the farthest draw's error over the nearest's: less, and all fabrics look alike
 AIR = "air ratio"  # the nuisance, of `r2s.estimation.prediction`
 
 
@@ -30,7 +31,7 @@ class HeldOut(NamedTuple):
     - `recording`: its name. `error`: the mean distance of its points from the estimate's surface,
       over the frames that count, [m]; infinite where the simulation diverged.
     - `defaults`: the same of draws of the prior, without those that diverged, [m]. `diverged`: how
-      many did.
+      many did. `middle`: of the fabric in the middle of the prior, the best guess by the weight.
     - `air`: density of the air that all of them moved in, over that written down.
     """
 
@@ -38,43 +39,59 @@ class HeldOut(NamedTuple):
     error: float
     defaults: tuple[float, ...]
     diverged: int
+    middle: float
     air: float = 1.0
 
     @property
     def is_better(self) -> bool:
-        """Whether the estimate is nearer than the draws are on average; False where none ran."""
-        return bool(self.defaults) and self.error < float(np.mean(self.defaults))
+        """Whether the estimate is nearer than the middle of the prior is, and than the draws are on
+        average; False where none of these ran."""
+        return bool(self.defaults) and self.error < min(float(np.mean(self.defaults)), self.middle)
+
+    @property
+    def is_told(self) -> bool:
+        """Whether the motion tells so: not where the draws, and the estimate with them, are alike
+        in it, as in a fold that lies on the table (`ALIKE`)."""
+        least, most = min(self.defaults, default=0.0), max(self.defaults, default=0.0)
+        return most > ALIKE * least or not self.error < ALIKE * most
 
     def describe(self) -> str:
         """One line; a warning where the estimate is no better than knowing nothing."""
         lost = f", {self.diverged} more diverged" if self.diverged else ""
         errors = np.array(self.defaults or (np.nan,))
         least, most, mean = (_mm(each) for each in (errors.min(), errors.max(), errors.mean()))
-        known = f"knowing nothing {mean} mm ({least} to {most}, {len(self.defaults)} draws{lost})"
+        known = f"knowing nothing {mean} mm ({least} to {most}, {len(self.defaults)} draws{lost}; "
+        known += f"the middle of the prior {_mm(self.middle)})"
         error = f"{_mm(self.error)} mm" if np.isfinite(self.error) else "the simulation diverged"
         air = "" if self.air == 1 else f" (all in air {self.air:.2f} times as dense, as found)"
         words = f"held out, {self.recording}: {error}; {known}{air}"
+        if not self.is_told:
+            return f"{words}: fabrics hardly differ in it, so not told whether it is better"
         if self.is_better:
             best = self.error < min(self.defaults)
             return f"{words}: better than {'every draw' if best else 'the draws on average'}"
-        return f"warning: {words}: not better than knowing nothing"
+        return (
+            f"warning: {words}: not better than knowing nothing, or it is a motion of another "
+            "fabric (it is not among the recordings that are compared with each other)"
+        )
 
 
 def choose(recordings: Sequence[Recording], name: str | None = None) -> int | None:
     """Which recording to hold out; None: none of them.
 
     `name`: of the recording, or `NONE`; None: the last one with clouds that is no stretching (a
-    clamped sheet looks alike of any fabric), where there are `FEWEST` or more, and another such one
-    is left: pulls tell nothing of bending and damping. Raises `ValueError`
-    for an unknown name, for two recordings of that name, for one without clouds, and where none
-    would be left.
+    clamped sheet looks alike of any fabric), and no fold (so does one on a table) but for want of
+    another, where there are `FEWEST` or more, and another such one is left: pulls tell nothing of
+    bending and damping. Raises `ValueError` for an unknown name, for two recordings of that name,
+    for one without clouds, and where none would be left.
     """
     if name == NONE:
         return None
     with_clouds = [i for i, each in enumerate(recordings) if has_clouds(each)]
     if name is None:
         moving = [i for i in with_clouds if recordings[i].info.scenario != "stretching"]
-        return moving[-1] if len(recordings) >= FEWEST and len(moving) > 1 else None
+        telling = [i for i in moving if recordings[i].info.scenario != "folding"] or moving
+        return telling[-1] if len(recordings) >= FEWEST and len(moving) > 1 else None
     found = [i for i, each in enumerate(recordings) if each.info.name == name]
     if len(found) != 1:
         known = ", ".join(each.info.name for each in recordings)
@@ -112,17 +129,19 @@ def judge(
     count: int = DRAWS,
     air: float = 1.0,
 ) -> HeldOut:
-    """The errors of a fabric and of `count` draws of its density in a recording.
+    """The errors of a fabric, and of the middle of the prior and `count` draws of it for its
+    density, in a recording.
 
     All are simulated by the cloth on a mesh of `shape`, in the steps that an estimate takes there
     (`r2s.estimation.mesh_ladder.in_steps_worth`). `air`: times the density of the air as written
     down, for all alike: what an estimate found along with the fabric (`air_found`), where that was
     in doubt. Size and cameras are as written down.
     """
-    each = prior.fabrics(float(fabric.density), count, jr.key(0))
-    error, *others = (_error(recording, one, shape, air) for one in (fabric, *each))
+    density = float(fabric.density)
+    each = (fabric, prior.middle(density), *prior.fabrics(density, count, jr.key(0)))
+    error, middle, *others = (_error(recording, one, shape, air) for one in each)
     finite = tuple(other for other in others if np.isfinite(other))
-    return HeldOut(recording.info.name, error, finite, count - len(finite), air)
+    return HeldOut(recording.info.name, error, finite, count - len(finite), middle, air)
 
 
 def air_found(estimate: Estimate, recordings: Sequence[Recording]) -> float:
@@ -144,4 +163,4 @@ def _error(recording: Recording, fabric: Fabric, shape: tuple[int, int], air: fl
 
 
 def _mm(value: float | np.floating) -> str:
-    return f"{1e3 * float(value):.1f}"
+    return f"{1e3 * float(value):.1f}" if np.isfinite(value) else "-"

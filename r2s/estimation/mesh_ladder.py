@@ -61,7 +61,7 @@ def descend_by_meshes(
     whichever fabric is found; not with a `shape`.
 
     The other arguments are those of `r2s.estimation.descent.descend`; each mesh has a checkpoint.
-    The `shape` of the estimate is that of the largest sheet.
+    The `shape` of the estimate is the finest, of a sheet that is not taut where there is one.
     Its `mesh_bias` is judged by a mesh whose cells are half as long, or twice as long where that
     would be finer than all of `r2s.scenarios.resolution.LADDER`.
     """
@@ -117,7 +117,7 @@ def descend_by_meshes(
         other = OtherMesh(on(*_others(at.shapes)), factor(2.0 if _is_finest(at.shapes) else 0.5))
         saved = {"checkpoint": checkpoint, "progress": progress, "key": key}
         estimate = judged(at.found, budget, other_mesh=other, **saved)
-    return dataclasses.replace(estimate, shape=at.shapes[_largest(recordings)])
+    return dataclasses.replace(estimate, shape=_told(recordings, at.shapes))
 
 
 def descend_weighed(
@@ -199,9 +199,14 @@ def _meshes(recording: Recording) -> list[Shape]:
     return [*coarse, coarse[-1] if is_taut else finest]
 
 
-def _largest(recordings: Recordings) -> int:
-    """Which recording has the largest sheet."""
-    return max(range(len(recordings)), key=lambda i: max(recordings[i].info.sheet.size))
+def _told(recordings: Recordings, shapes: Sequence[Shape]) -> Shape:
+    """The mesh by which an estimate is named: a taut sheet's says little of how the others fold."""
+    loose = [
+        shape
+        for each, shape in zip(recordings, shapes, strict=True)
+        if each.info.scenario not in resolution.TAUT
+    ]
+    return max(loose or shapes, key=max)
 
 
 def _problems(
