@@ -5,14 +5,17 @@ from _tables import Line
 from scipy.stats import norm
 
 BEFORE, BEHIND = "repeat", "identifiable off at most"  # the columns around those of parameters
+BEYOND = (BEHIND, "converged", "recordings agree")
 DIVERGED = "(inf)"  # what is no estimate holds no truth
 
 
 def by_parameter(lines: list[Line]) -> list[Line]:
-    """One line for each parameter, and one for all."""
-    columns = list(dict.fromkeys(name for line in lines for name in line))
-    names = columns[columns.index(BEFORE) + 1 : columns.index(BEHIND)]
-    told = np.array([[line.get(name, DIVERGED) for name in names] for line in lines])
+    """One line for each parameter, and one for all; none where all estimates diverged."""
+    columns = next((list(line) for line in lines if line.get(BEHIND)), [BEFORE, BEHIND])
+    names = [name for name in columns[columns.index(BEFORE) + 1 :] if name not in BEYOND]
+    if not names:
+        return []
+    told = np.array([[line.get(name) or DIVERGED for name in names] for line in lines])
     known = ~np.char.startswith(told, "(")
     away = np.abs(np.char.strip(told, "()").astype(float))
     every = zip([*names, "all"], [*away.T, away.ravel()], [*known.T, known.ravel()], strict=True)

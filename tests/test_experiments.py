@@ -144,3 +144,11 @@ def test_what_is_not_identifiable_or_diverged_is_no_interval_that_holds(module) 
     assert (warp["held"], warp["identifiable"], warp["held of these"]) == ("1 of 2", "1", "1")
     assert (damping["held"], damping["errors off at most"]) == ("0 of 2", "-")
     assert every["held"] == "1 of 4" and every["errors off at most"] == "0.5"
+    # as a table that begins with the one that diverged is read back
+    lost = {"converged": "diverged", "warp": "", "damping": "", "identifiable off at most": ""}
+    again = {"converged": "yes"} | lines[0]
+    read_back = [
+        {"fabric": "knit", "repeat": n} | each for n, each in zip("21", (lost, again), strict=True)
+    ]
+    assert module("_repeats").by_parameter(read_back) == [warp, damping, every]
+    assert module("_repeats").by_parameter(lines[1:]) == []

@@ -25,6 +25,7 @@ from r2s.estimation.pinn.synthetic_pulls import pulled
 from r2s.estimation.pinn.training import Recipe, train, trainable
 from r2s.fabrics import presets
 from r2s.fabrics.parameters import OrthotropicSpace
+from r2s.fabrics.stiffening_space import StiffeningSpace
 from r2s.laws.stiffening import StiffeningMembrane
 from r2s.scenarios import fling, folding, shaking
 from r2s.scenarios.scenario import rollout
@@ -105,6 +106,13 @@ def test_what_stiffness_grows_by_is_an_error_of_the_small_strain_s(growth):
     assert off >= 0.7 * growth / length - 3e-4  # the mean weighs what is far stretched
     assert 0.8 * off <= errors[0] <= 1.5 * abs(off) + 2e-3
     assert errors[4] < 1e-3  # of bending a flat sheet says nothing, and nothing changes
+
+
+def test_yarns_that_may_stiffen_have_no_error_for_not_doing_so():
+    pull = even_pull(frames=21, growth=0.2)
+    space = StiffeningSpace.make(FAMILY)
+    found = balance(space, [small_network(pull)], [pull], np.full(10, 0.5), *NOISE, steps=1)
+    assert found.law.shape == (10, 10) and not found.law.any()
 
 
 def test_without_force_the_scale_is_not_identifiable():

@@ -39,6 +39,7 @@ from r2s.estimation.pinn.weak_form import (
     virtual_work,
 )
 from r2s.fabrics.parameters import ParameterSpace
+from r2s.fabrics.stiffening_space import STIFFENING
 
 # weights of this frame and the two before in a rate, over the time between frames: at rest at first
 FORMULAS = ((0.0, 0.0, 0.0), (1.0, -1.0, 0.0), (1.5, -2.0, 0.5))
@@ -122,7 +123,8 @@ class Balanced(NamedTuple):
     - `marker`, `force`: rms differences that are left, of markers [m] and force [-].
     - `places`, `losses`: of every step; the losses are mean squares of the markers' rest [m^2].
     - `converged`: whether the last step was small.
-    - `law`: what the covariance lacks where stiffness is not constant, see `_law_error`.
+    - `law`: what the covariance lacks where stiffness is not constant, see `_law_error`; zero for
+      spaces of yarns that stiffen.
     """
 
     place: Float[np.ndarray, " dim"]
@@ -380,7 +382,9 @@ def balance(
         if whole and are_balanced and np.all(np.abs(last) < SMALL * standard_errors):
             converged = True
             break
-    history, law = (np.array(places), np.array(losses)), _law_error(here, pulls, marker, force)
+    stiffens = STIFFENING[0].name in {each.name for each in space.ranges}
+    law = np.zeros_like(normal) if stiffens else _law_error(here, pulls, marker, force)
+    history = np.array(places), np.array(losses)
     return Balanced(place, np.linalg.inv(normal), marker, force, *history, converged, law)
 
 

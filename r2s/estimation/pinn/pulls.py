@@ -255,8 +255,8 @@ def _force(recording: Recording, times: np.ndarray, along: np.ndarray) -> np.nda
     if recording.force is None or recording.force_times is None:
         raise ValueError(
             "no force: without it only ratios of stiffness are identifiable, not their scale; add "
-            "the load cell's log (r2s.recordings.readers.force_log), or "
-            "ask for that with without_force=True"
+            "the load cell's log (r2s.recordings.readers.force_log), or take the pull with "
+            "r2s.estimation.pinn.pulls.pull_from(recording, without_force=True)"
         )
     force = np.asarray(recording.force, np.float64)
     force = force @ along if force.ndim == 2 else force
