@@ -26,7 +26,7 @@ from r2s.cloth.linear.pattern import Pattern
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.elements import strains, vertex_masses
 from r2s.geometry.mesh import Mesh, rectangle
-from r2s.study.memory import let_go
+from r2s.program_memory import let_go
 from r2s.units import GRAVITY
 from r2s.world.air import Air
 from r2s.world.contact import Table

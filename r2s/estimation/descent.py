@@ -40,6 +40,7 @@ from r2s.estimation.prediction import Theta, explain, fabric_at
 from r2s.estimation.problem import Problem, beginning, check_shared
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.informed_space import InformedSpace
+from r2s.program_memory import let_go_in_time
 
 INITIAL_DAMPING = 1e-2
 STRICT, SCALES = 3.0, (3e-3, 0.015)  # of the spread, and between [m]: beyond lies an outlier
@@ -152,6 +153,7 @@ def search(
     if budget.around < 0 or budget.around % 2:
         raise ValueError(f"places around the end are in pairs: an even number, got {budget.around}")
     check_shared(problems)
+    let_go_in_time()
     began, derive = time.perf_counter(), derive or remembering()
     run = _run_of(problems, budget, start, key) if checkpoint else {}
     rows = _resumed(checkpoint, run, budget) if checkpoint else []

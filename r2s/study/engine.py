@@ -13,8 +13,8 @@ from typing import Protocol, runtime_checkable
 
 from tqdm import tqdm
 
+from r2s.program_memory import let_go_beyond
 from r2s.study.cells import Cell, dependencies, execute, with_dependencies
-from r2s.study.memory import let_go_beyond
 
 MOST_MEMORY = 0.9e9  # [byte]: a process that holds more after a cell lets its programs go
 
