@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.commands.estimate import _misfits
+from r2s.commands.estimate import _agreement, _misfits, _unread
 from r2s.estimation.density_doubt import freed, is_asked
+from r2s.estimation.diffcloud import DiffCloud
 from r2s.estimation.estimate import Agreement, Contradiction, Estimate, Misfit
 from r2s.estimation.gauss_newton import theta_length
 from r2s.estimation.misfits import left_out, misfits
@@ -19,6 +20,7 @@ from r2s.estimation.prediction import fabric_at, predict
 from r2s.estimation.problem import NuisancePrior, Problem
 from r2s.fabrics import presets
 from r2s.fabrics.parameters import OrthotropicSpace
+from r2s.recordings.recording import make_recording
 from r2s.scenarios import synthetic
 
 SHAPE = (5, 5)
@@ -154,3 +156,35 @@ def test_the_command_says_so(lifted, pulled):
     assert "pull" in lines[2] and "off by 250 %" in lines[2] and "density" in lines[2]
     assert lines[3] == f"left out of {pulled.info.name}: 2.0 % as outliers"
     assert lines[4].startswith("warning") and "76.0 %" in lines[4] and "density" in lines[4]
+
+
+@pytest.mark.parametrize("is_coarse", [False, True])
+def test_a_mesh_that_is_too_coarse_is_named_where_recordings_are_apart(is_coarse, pulled, lifted):
+    """In wind a coarse sheet leads far from what it leads to elsewhere."""
+    odd = Agreement(1e-9, (3, 3), Contradiction(1, "warp", 9.0, (1.0, 2.0)))
+    found = cast(Estimate, SimpleNamespace(agreement=odd, shares=(), ranges=SPACE.ranges))
+    (line,) = _agreement(found, [pulled, lifted], is_coarse)
+    assert line.startswith(f"warning: {lifted.info.name} contradicts")
+    assert ("or the mesh" in line) is is_coarse
+
+
+def test_points_that_are_not_read_are_counted(lifted):
+    most = int(lifted.mask.sum(axis=1).max())
+    (line,) = _unread(DiffCloud(), [lifted])
+    assert most > 300 and f"all but 300 points a frame, drawn at random, of up to {most}" in line
+    few = dataclasses.replace(lifted, points=lifted.points[:, :200], mask=lifted.mask[:, :200])
+    assert _unread(DiffCloud(), [few]) == []
+
+
+def test_clouds_that_nobody_recorded_are_not_left_unread(pulled):
+    """Markers stand in their place."""
+    bare = make_recording(
+        None,
+        pulled.times,
+        pulled.handle_path,
+        pulled.handle_times,
+        pulled.info,
+        markers=pulled.markers,
+        marker_places=pulled.marker_places,
+    )
+    assert _unread(DiffCloud(), [bare]) == []

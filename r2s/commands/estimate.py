@@ -314,14 +314,12 @@ def _warnings(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[s
     from r2s.commands.common import mesh_warning
     from r2s.scenarios.resolution import alike
 
-    lines = [*_agreement(estimate, recordings), *_misfits(estimate, recordings)]
-    if estimate.shape is None:
-        return lines
     motions = dict.fromkeys((each.info.sheet.size, each.info.scenario) for each in recordings)
-    fabric = estimate.fabric
+    fabric, shape, coarse = estimate.fabric, estimate.shape, []
     for size, scenario in motions:
-        lines += mesh_warning(alike(estimate.shape, size), fabric, size, scenario)
-    return lines
+        coarse += mesh_warning(alike(shape, size), fabric, size, scenario) if shape else []
+    agreed = _agreement(estimate, recordings, bool(coarse))
+    return [*agreed, *_misfits(estimate, recordings), *coarse]
 
 
 def _assumed(estimated: "Sequence[str]") -> tuple[str, ...]:
@@ -446,8 +444,11 @@ def _by_weight(method: "Method", density: float, recordings: "Sequence[Recording
     ]
 
 
-def _agreement(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[str]:
-    """How much each of several recordings counts, and which contradicts the others, if one does."""
+def _agreement(
+    estimate: "Estimate", recordings: "Sequence[Recording]", is_coarse: bool = False
+) -> list[str]:
+    """How much each of several recordings counts, and which contradicts the others, if one does;
+    `is_coarse`: on a mesh that is too coarse for the fabric."""
     names = [each.info.name for each in recordings]
     if len(names) < 2:
         return []
@@ -485,5 +486,5 @@ def _agreement(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[
         f"{odd.parameter} {own} by it, {others} by {against}, {odd.errors:.1f} standard "
         "errors apart): another fabric, or the density, scale, path or markers are not as written "
         "down (a pull's force tells stiffness, other motions stiffness over density), or a law "
-        "that cannot follow all of them (see --law)",
+        f"that cannot follow all of them (see --law){', or the mesh, see below' * is_coarse}",
     ]
