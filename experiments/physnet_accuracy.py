@@ -1,7 +1,7 @@
 """Train PhysNet's network, and measure it on fabrics and a motion that it has never seen.
 
 python experiments/physnet_accuracy.py --out results/physnet                 # 20 minutes, one core
-python experiments/physnet_accuracy.py --scenario stretching --out results/physnet_stretching
+python experiments/physnet_accuracy.py --scenario stretching --out results/stretching  # an hour
 python experiments/physnet_accuracy.py --fabrics 32 --unseen 16 --epochs 2 --calls 20   # a trial
 
 Printed: the share of triplets of images that the network orders rightly (chance: one half), and for

@@ -139,9 +139,12 @@ def test_an_estimate_that_is_worse_than_the_best_guess_by_the_weight_has_learnt_
 
 
 def test_a_motion_in_which_all_fabrics_are_alike_tells_nothing():
-    """But that an estimate which is far from all of them is wrong."""
+    """But that an estimate which is far from all of them is wrong, or far better."""
     fold = (2.4e-3, 2.6e-3)
     for error in (2.0e-3, 3.1e-3):
         words = HeldOut("fold", error, fold, 0, 2.5e-3).describe()
         assert not words.startswith("warning") and "not told" in words
     assert HeldOut("fold", 9e-3, fold, 0, 2.5e-3).describe().startswith("warning")
+    assert HeldOut("fold", 1e-3, fold, 0, 2.5e-3).describe().endswith("better than every draw")
+    apart = HeldOut("fold", 2.4e-3, fold, 0, 9e-3)  # the middle is another fabric, too
+    assert apart.is_told and apart.is_better

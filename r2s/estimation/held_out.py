@@ -51,10 +51,11 @@ class HeldOut(NamedTuple):
 
     @property
     def is_told(self) -> bool:
-        """Whether the motion tells so: not where the draws, and the estimate with them, are alike
-        in it, as in a fold that lies on the table (`ALIKE`)."""
-        least, most = min(self.defaults, default=0.0), max(self.defaults, default=0.0)
-        return most > ALIKE * least or not self.error < ALIKE * most
+        """Whether the motion tells so: not where draws and middle of the prior, and the estimate
+        with them, are alike in it, as in a fold that lies on the table (`ALIKE`)."""
+        others = [each for each in (*self.defaults, self.middle) if np.isfinite(each)]
+        least, most = min(others, default=0.0), max(others, default=0.0)
+        return most > ALIKE * least or not least / ALIKE <= self.error < ALIKE * most
 
     def describe(self) -> str:
         """One line; a warning where the estimate is no better than knowing nothing."""
