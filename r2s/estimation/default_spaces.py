@@ -18,7 +18,7 @@ from r2s.fabrics.parameters import (
     Range,
 )
 from r2s.fabrics.softening_space import SOFTENING, SofteningSpace
-from r2s.fabrics.stiffening_space import STIFFENING, StiffeningSpace
+from r2s.fabrics.stiffening_space import StiffeningSpace, stiffens
 from r2s.recordings.recording import Recording
 
 Law = Literal["linear", "stiffening", "softening", "stiffening+softening"]
@@ -73,11 +73,9 @@ def law_told_by(recordings: Sequence[Recording]) -> Law:
 
 def law_of(ranges: Sequence[Range]) -> Law:
     """The law of a space's parameters, or of an estimate's, by their names."""
-    names = {each.name for each in ranges}
-    stiffens = STIFFENING[0].name in names
-    if SOFTENING[0].name in names:
-        return "stiffening+softening" if stiffens else "softening"
-    return "stiffening" if stiffens else "linear"
+    if SOFTENING[0].name in {each.name for each in ranges}:
+        return "stiffening+softening" if stiffens(ranges) else "softening"
+    return "stiffening" if stiffens(ranges) else "linear"
 
 
 class Fixed(NamedTuple):

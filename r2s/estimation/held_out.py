@@ -22,7 +22,7 @@ from r2s.scenarios.scenario import from_recording, in_denser_air
 FEWEST = 3  # recordings, of which one is held out without being asked for
 NONE = "none"  # the name by which no recording is held out
 DRAWS = 8
-ALIKE = 1.25  # of the farthest draw's error over the nearest's: less, and all fabrics look alike
+ALIKE = 1.25  # of the largest error over the least: less, and all fabrics look alike
 AIR = "air ratio"  # the nuisance, of `r2s.estimation.prediction`
 
 

@@ -21,8 +21,7 @@ from r2s.estimation.gauss_newton import (
 )
 from r2s.estimation.prediction import Prediction, Sensitivity
 from r2s.estimation.problem import Problem, seen_where
-from r2s.fabrics.parameters import ParameterSpace
-from r2s.fabrics.stiffening_space import STIFFENING
+from r2s.fabrics.stiffening_space import stiffens
 from r2s.kept import kept
 
 # from what stiffness changes between half a pull and all of it, to what it has from small strain:
@@ -44,11 +43,6 @@ def to_small_strain(
     return TO_SMALL_STRAIN * np.sign(change) * np.sqrt(np.maximum(squares, 0))
 
 
-def stiffens(space: ParameterSpace) -> bool:
-    """Whether the space has yarns that may stiffen, so that nothing is taken as constant."""
-    return STIFFENING[0].name in {each.name for each in space.ranges}
-
-
 def law_error(
     problems: Problems,
     end: Descent,
@@ -61,7 +55,7 @@ def law_error(
     - `prior`: its weight, see `r2s.estimation.gauss_newton.prior_weight`.
     - `predicted`: at the end, with its derivative (`r2s.estimation.compiled.derivatives_at`).
     """
-    if stiffens(problems[0].space) or all(problem.force is None for problem in problems):
+    if stiffens(problems[0].space.ranges) or all(problem.force is None for problem in problems):
         return np.zeros(theta_length(problems))
     halves = tuple(half_pulled(problem) for problem in problems)
     half, half_variance = _place(halves, problems, end, prior, predicted)

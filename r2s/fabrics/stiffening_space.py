@@ -1,6 +1,7 @@
 """Fabrics that stiffen as they stretch: a space of constant stiffness, and three numbers more."""
 
 import dataclasses
+from collections.abc import Iterable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,6 +16,11 @@ STIFFENING = (
     Range("knee warp", "-", 3e-3, 10.0),
     Range("knee weft", "-", 3e-3, 10.0),
 )
+
+
+def stiffens(ranges: Iterable[Range]) -> bool:
+    """Whether parameters of a space, or of an estimate, are of yarns that may stiffen."""
+    return STIFFENING[0].name in {each.name for each in ranges}
 
 
 class StiffeningSpace(ParameterSpace):

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from r2s.estimation.law_error import stiffens, to_small_strain
+from r2s.estimation.law_error import to_small_strain
 from r2s.estimation.pinn.losses import load, marker_residual
 from r2s.estimation.pinn.network import Network
 from r2s.estimation.pinn.pulls import Pull
@@ -39,6 +39,7 @@ from r2s.estimation.pinn.weak_form import (
     virtual_work,
 )
 from r2s.fabrics.parameters import ParameterSpace
+from r2s.fabrics.stiffening_space import stiffens
 
 # weights of this frame and the two before in a rate, over the time between frames: at rest at first
 FORMULAS = ((0.0, 0.0, 0.0), (1.0, -1.0, 0.0), (1.5, -2.0, 0.5))
@@ -382,7 +383,7 @@ def balance(
             converged = True
             break
     law = np.zeros_like(normal)
-    if not stiffens(space):
+    if not stiffens(space.ranges):
         law = _law_error(here, pulls, marker, force)
     history = np.array(places), np.array(losses)
     return Balanced(place, np.linalg.inv(normal), marker, force, *history, converged, law)
