@@ -28,7 +28,13 @@ from r2s.estimation.problem import (
     beginning,
     default_nuisance_prior,
 )
-from r2s.estimation.standard_errors import FARTHEST, covariance, disagreement, sample_around
+from r2s.estimation.standard_errors import (
+    FARTHEST,
+    covariance,
+    disagreement,
+    sample_around,
+    steps_apart,
+)
 from r2s.fabrics import presets
 from r2s.fabrics.informed_space import InformedSpace
 from r2s.fabrics.parameters import UNIFORM_DEVIATION, OrthotropicSpace
@@ -247,6 +253,24 @@ def test_of_the_true_fabric_where_its_end_leads_is_noise(lifted):
     assert np.all(np.diag(found(noisy, noise, False)) > np.diag(found(noisy, noise, True)))
 
 
+def test_steps_that_lead_apart_elsewhere_count_as_if_they_did_here(lifted):
+    problems, prior = (lifted,), 1e-9
+    end, at = valley(lifted, gauss_newton.theta_length(problems))
+    unarrived = dataclasses.replace(end, normal=at(end.theta, jnp.arange(1.0, len(end.theta) + 1)))
+    places = sample_around(problems, end, prior, 4, jr.key(0))
+    led = [(p, at(p, 1.0 * i)) for i, p in enumerate(places)]
+    here = covariance(problems, unarrived, prior, led)
+    elsewhere = steps_apart(problems, unarrived, prior, led)
+    there = covariance(problems, unarrived, prior, [], elsewhere=elsewhere)
+    np.testing.assert_allclose(there, here, rtol=1e-5, atol=1e-9)
+    # on a mesh whose own end leads elsewhere alike, they tell the same
+    biased = [(p, at(p, 1.0 * i + 3.0)) for i, p in enumerate(places)]
+    other = dataclasses.replace(end, normal=at(end.theta, jnp.arange(1.0, len(end.theta) + 1) + 3))
+    np.testing.assert_allclose(
+        steps_apart(problems, other, prior, biased), elsewhere, rtol=1e-5, atol=1e-9
+    )
+
+
 def test_where_derivatives_overflow_nothing_is_known(lifted):
     problems, prior = (lifted,), 1e-9
     size = gauss_newton.theta_length(problems)
@@ -269,19 +293,22 @@ def test_deviations_are_from_the_frames_on_which_places_agree(monkeypatch):
     theta = jnp.concatenate([FAMILY.to_unit(FABRIC), nuisances])
     zero = jnp.zeros(())
 
-    def found(agree, share=1.0, budget=budget):
+    def found(agree, share=1.0, budget=budget, tried_on=None):
         agree = iter(agree)
         monkeypatch.setattr(covariances, "_disagreement", lambda *_: 0.0 if next(agree) else np.inf)
         seen = problems if share == 1 else (beginning(lifted, share),)
         normal = compiled.normal_at(seen, theta, zero, None)
         end = Descent(theta, normal, zero, zero, zero, jnp.zeros((), int))
-        return covariance_at(seen, budget, end, jr.key(0))
+        return covariance_at(seen, budget, end, jr.key(0), tried_on=tried_on)
 
     alone = budget._replace(shares=())
     whole, half = (found([True], share, alone) for share in (1.0, 0.5))
     np.testing.assert_allclose(found([True]), whole)
     np.testing.assert_allclose(found([False, True]), half)
     np.testing.assert_allclose(found([False, False]), whole)
+    copied = (*problems,)  # places are tried on another mesh that moves alike
+    np.testing.assert_allclose(found([True], tried_on=copied), whole, rtol=1e-3)
+    np.testing.assert_allclose(found([False, True], tried_on=copied), half, rtol=1e-3)
     assert np.max(np.abs(np.diag(half) / np.diag(whole) - 1)) > 0.1
 
 

@@ -1,10 +1,11 @@
 """The covariance of an estimate, from as many frames of its recordings as agree."""
 
 import dataclasses
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation import gauss_newton, standard_errors
 from r2s.estimation.compiled import Predicted, derivatives_at, normal_from, normals_at
@@ -19,6 +20,7 @@ _weight = eqx.filter_jit(gauss_newton.prior_weight)
 _covariance = eqx.filter_jit(standard_errors.covariance)
 _disagreement = eqx.filter_jit(standard_errors.disagreement)
 _tells = eqx.filter_jit(standard_errors.tells)
+_steps_apart = eqx.filter_jit(standard_errors.steps_apart)
 _sample_around = eqx.filter_jit(standard_errors.sample_around)
 
 
@@ -29,6 +31,7 @@ def covariance_at(
     key: PRNGKeyArray,
     predicted: Predicted | None = None,
     is_truth: bool = False,
+    tried_on: Problems | None = None,
 ) -> Float[np.ndarray, "theta theta"]:
     """Covariance of theta at the end of a descent, see `r2s.estimation.standard_errors`.
 
@@ -38,23 +41,63 @@ def covariance_at(
     agree either, the covariance is that of all frames. A beginning that says nothing of the fabric,
     since nothing has moved yet, agrees with everything, and does not count.
 
-    `predicted`: `derivatives_at` the end, where they are known.
+    - `predicted`: `derivatives_at` the end, where they are known.
+    - `tried_on`: the same recordings on a mesh on which the places around the end are tried.
     """
     if predicted is None:
         predicted = derivatives_at(problems, end.theta, budget.width)
+    other = None
+    if tried_on is not None and tried_on is not problems:
+        there = derivatives_at(tried_on, end.theta, budget.width)
+        other = _Elsewhere(tried_on, _end_in(tried_on, end, there), there)
     found = []
     for share in (1.0, *reversed(budget.shares)):
-        seen, here = problems, end
-        if share < 1:
-            seen = tuple(beginning(problem, share) for problem in problems)
-            normal = normal_from(seen, end.theta, predicted, end.scale)
-            here = dataclasses.replace(end, normal=normal)
+        seen, here = _beginning(problems, end, share, predicted)
         prior = _weight(problems, here.normal)
-        neighbours, agrees = _around(seen, budget, here, prior, key)
-        found.append(np.asarray(_covariance(problems, here, prior, neighbours, is_truth)))
+        if other is None:
+            neighbours, agrees = _around(seen, budget, here, prior, key)
+            errors = _covariance(problems, here, prior, neighbours, is_truth)
+        else:
+            elsewhere, agrees = _elsewhere(other, budget, share, key)
+            errors = _covariance(problems, here, prior, [], is_truth, elsewhere)
+        found.append(np.asarray(errors))
         if agrees and (share == 1 or bool(_tells(problems, here, prior))):
             return found[-1]
     return found[0]
+
+
+def _beginning(
+    problems: Problems, end: Descent, share: float, predicted: Predicted
+) -> tuple[Problems, Descent]:
+    """The problems up to a share of their frames, and a descent's end in these."""
+    if share == 1:
+        return problems, end
+    seen = tuple(beginning(problem, share) for problem in problems)
+    return seen, _end_in(seen, end, predicted)
+
+
+def _end_in(problems: Problems, end: Descent, predicted: Predicted) -> Descent:
+    """The end of a descent with its normal equations in other problems."""
+    normal = normal_from(problems, end.theta, predicted, end.scale)
+    return dataclasses.replace(end, normal=normal)
+
+
+class _Elsewhere(NamedTuple):
+    """The end of a descent on another mesh, with `derivatives_at` it."""
+
+    problems: Problems
+    end: Descent
+    predicted: Predicted
+
+
+def _elsewhere(
+    other: _Elsewhere, budget: Budget, share: float, key: PRNGKeyArray
+) -> tuple[Float[Array, "place theta"], bool]:
+    """How far steps from around the end lead apart on another mesh, and whether they agree."""
+    seen, here = _beginning(other.problems, other.end, share, other.predicted)
+    prior = _weight(other.problems, here.normal)
+    neighbours, agrees = _around(seen, budget, here, prior, key)
+    return _steps_apart(other.problems, here, prior, neighbours), agrees
 
 
 def _around(

@@ -32,7 +32,7 @@ from r2s.estimation.gauss_newton import (
     theta_indices,
 )
 from r2s.estimation.law_error import law_error
-from r2s.estimation.mesh_bias import OtherMesh, on_the_way, weighed
+from r2s.estimation.mesh_bias import OtherMesh, coarser_of, on_the_way, weighed
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.misfits import left_out, misfits
 from r2s.estimation.nuisances import nuisances
@@ -187,13 +187,16 @@ def judged(
 
     `other_mesh`: by which its bias by its mesh is judged, which the standard errors then hold. If
     it is finer, and something is known of the fabric beforehand, the estimate goes towards that as
-    far as its mesh errs (`r2s.estimation.mesh_bias.weighed`).
+    far as its mesh errs (`mesh_bias.weighed`). If it is coarser, places around the end and each
+    recording alone are tried on it, in a small part of the time.
     """
     began, problems = time.perf_counter(), found.problems
     which, best = _best(found.rows[-1])
     stage, prior = _rows_of_stage(found.rows, int(best.stage)), _weight(problems, best.normal)
     predicted, bias = found.derive(problems, best.theta, budget.width), None
-    covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1), predicted)
+    coarse, finer = coarser_of(problems, other_mesh)
+    around = {"predicted": predicted, "tried_on": coarse}
+    covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1), **around)
     of_law = law_error(problems, best, prior, predicted)
     covariance = covariance + np.outer(of_law, of_law)
     seen = [each for each, _ in predicted]
@@ -211,12 +214,10 @@ def judged(
     seconds = found.seconds + time.perf_counter() - began
     converged = _arrived(problems, stage, which, prior, _stop(budget, int(best.stage)))
     estimate = collect(problems, rows, covariance, approach, seconds, converged, loss, bias)
-    alone = each_alone(problems, budget, best.theta, key, found.derive, progress)
+    alone = each_alone(coarse, budget, best.theta, key, found.derive, progress)
     shares = tuple(float(each) for each in recording_weights(problems)) if alone else ()
-    biases = []
-    if other_mesh is not None and alone:
-        biases = mesh_bias.alone(problems, other_mesh, alone, found.derive, budget.width)
-    agreed, missed = agreement(problems, alone, biases), misfits(problems, best.theta, seen)
+    biases = mesh_bias.alone(coarse, finer, alone, found.derive, budget.width)
+    agreed, missed = agreement(coarse, alone, biases), misfits(problems, best.theta, seen)
     if density_doubt.is_asked(problems, agreed, missed):
         path = checkpoint and checkpoint.with_suffix(".density.npz")
         saved = {"checkpoint": path, "progress": progress, "key": key}

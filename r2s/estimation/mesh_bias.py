@@ -57,6 +57,14 @@ def factor(ratio: float) -> float:
     return 1 / (1 - ratio**ORDER)
 
 
+def coarser_of(problems: Problems, other: OtherMesh | None) -> tuple[Problems, OtherMesh | None]:
+    """The recordings on the coarser of two meshes, and the other beside it, for what takes many
+    motions: on the finest, in its short steps, a lift's takes some thirty times as long."""
+    if other is None or other.is_finer:
+        return problems, other
+    return other.problems, OtherMesh(problems, factor(0.5))
+
+
 def mesh_bias(
     problems: Problems,
     other: OtherMesh,
@@ -99,16 +107,19 @@ def mesh_bias(
 
 def alone(
     problems: Problems,
-    other: OtherMesh,
+    other: OtherMesh | None,
     ends: Sequence[Descent],
     derive: Derive,
     width: float | None = None,
 ) -> list[Float[np.ndarray, " theta"]]:
-    """The `mesh_bias` of the end of a descent in each recording alone.
+    """The `mesh_bias` of the end of a descent in each recording alone; of none where there is no
+    other mesh, or no such end.
 
     - `derive`, `width`: see `r2s.estimation.compiled`.
     """
-    found = []
+    found: list[Float[np.ndarray, " theta"]] = []
+    if other is None or not ends:
+        return found
     for problem, there, end in zip(problems, other.problems, ends, strict=True):
         own, prior = (problem,), prior_weight((problem,), end.normal)
         predicted = derive(own, end.theta, width)

@@ -17,7 +17,12 @@ Neighbours = list[tuple[Theta, Normal]]  # places around the end, with their nor
 
 
 def covariance(
-    problems: Problems, end: Descent, prior, neighbours: Neighbours, is_truth: bool = False
+    problems: Problems,
+    end: Descent,
+    prior,
+    neighbours: Neighbours,
+    is_truth: bool = False,
+    elsewhere: Float[Array, "place theta"] | None = None,
 ) -> Float[Array, "theta theta"]:
     """Covariance of theta at the end of one descent.
 
@@ -29,10 +34,13 @@ def covariance(
     - `prior`: its weight, see `gauss_newton.prior_weight`.
     - `is_truth`: the end is the true theta. Then its own step is noise, and the distances of the
       others count from where it leads.
+    - `elsewhere`: the `steps_apart` of neighbours on another mesh, which count as if on this one.
 
     Where derivatives are not finite only the prior is known.
     """
     off = step_ends(problems, end, prior, neighbours) - end.theta[None]
+    if elsewhere is not None:
+        off = jnp.concatenate([off, off[:1] + elsewhere])
     off = jnp.where(is_truth, off - off[:1], off)
     sandwich, root = sandwich_of(problems, end, prior)
     far = jnp.linalg.norm(jnp.linalg.solve(root, off.T), axis=0)
@@ -50,10 +58,18 @@ def disagreement(
 
     Next to zero where the loss is smooth; infinite where derivatives are not finite.
     """
-    led = step_ends(problems, end, prior, neighbours)
+    apart = steps_apart(problems, end, prior, neighbours)
     _, root = sandwich_of(problems, end, prior)
-    far = jnp.linalg.norm(jnp.linalg.solve(root, (led - led[:1]).T), axis=0)[1:]
+    far = jnp.linalg.norm(jnp.linalg.solve(root, apart.T), axis=0)
     return jnp.median(jnp.where(jnp.isfinite(far), far, jnp.inf))
+
+
+def steps_apart(
+    problems: Problems, end: Descent, prior, neighbours: Neighbours
+) -> Float[Array, "place theta"]:
+    """How far Gauss-Newton steps from neighbours lead from where that of the end does."""
+    led = step_ends(problems, end, prior, neighbours)
+    return led[1:] - led[:1]
 
 
 def tells(problems: Problems, end: Descent, prior) -> Bool[Array, ""]:
