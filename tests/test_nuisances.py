@@ -18,7 +18,7 @@ from r2s.estimation.covariance import covariance_at
 from r2s.estimation.descent import Budget, descend, nuisances
 from r2s.estimation.estimate import describe
 from r2s.estimation.gauss_newton import Descent, Normal
-from r2s.estimation.mesh_bias import on_the_way, weighed
+from r2s.estimation.mesh_bias import OtherMesh, coarser_of, factor, on_the_way, weighed
 from r2s.estimation.nuisances import free as nuisances_that_vary
 from r2s.estimation.prediction import predict
 from r2s.estimation.problem import (
@@ -269,6 +269,17 @@ def test_steps_that_lead_apart_elsewhere_count_as_if_they_did_here(lifted):
     np.testing.assert_allclose(
         steps_apart(problems, other, prior, biased), elsewhere, rtol=1e-5, atol=1e-9
     )
+
+
+def test_the_coarser_of_two_meshes_is_the_same_from_either(lifted):
+    coarse, fine = (lifted,), (lifted,) * 2
+    to_finer, to_coarser = OtherMesh(fine, factor(0.5)), OtherMesh(coarse, factor(2.0))
+    assert to_finer.is_finer and not to_coarser.is_finer
+    for problems, other in ((coarse, to_finer), (fine, to_coarser)):
+        found, beside = coarser_of(problems, other)
+        assert found is coarse and beside is not None
+        assert beside.problems is fine and beside.factor == to_finer.factor
+    assert coarser_of(coarse, None)[0] is coarse
 
 
 def test_where_derivatives_overflow_nothing_is_known(lifted):

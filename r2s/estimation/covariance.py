@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation import gauss_newton, standard_errors
-from r2s.estimation.compiled import Predicted, derivatives_at, normal_from, normals_at
+from r2s.estimation.compiled import Derive, Predicted, derivatives_at, normal_from, normals_at
 from r2s.estimation.gauss_newton import Descent, Problems
 from r2s.estimation.method import Budget
 from r2s.estimation.problem import beginning
@@ -32,6 +32,7 @@ def covariance_at(
     predicted: Predicted | None = None,
     is_truth: bool = False,
     tried_on: Problems | None = None,
+    derive: Derive = derivatives_at,
 ) -> Float[np.ndarray, "theta theta"]:
     """Covariance of theta at the end of a descent, see `r2s.estimation.standard_errors`.
 
@@ -43,12 +44,13 @@ def covariance_at(
 
     - `predicted`: `derivatives_at` the end, where they are known.
     - `tried_on`: the same recordings on a mesh on which the places around the end are tried.
+    - `derive`: what gives derivatives at the end, of which it may know some.
     """
     if predicted is None:
-        predicted = derivatives_at(problems, end.theta, budget.width)
+        predicted = derive(problems, end.theta, budget.width)
     other = None
     if tried_on is not None and tried_on is not problems:
-        there = derivatives_at(tried_on, end.theta, budget.width)
+        there = derive(tried_on, end.theta, budget.width)
         other = _Elsewhere(tried_on, _end_in(tried_on, end, there), there)
     found = []
     for share in (1.0, *reversed(budget.shares)):

@@ -187,15 +187,15 @@ def judged(
 
     `other_mesh`: by which its bias by its mesh is judged, which the standard errors then hold. If
     it is finer, and something is known of the fabric beforehand, the estimate goes towards that as
-    far as its mesh errs (`mesh_bias.weighed`). If it is coarser, places around the end and each
-    recording alone are tried on it, in a small part of the time.
+    far as its mesh errs (`mesh_bias.weighed`). If it is coarser, places around the end, each
+    recording alone and a doubted density are tried on it, in a small part of the time.
     """
     began, problems = time.perf_counter(), found.problems
     which, best = _best(found.rows[-1])
     stage, prior = _rows_of_stage(found.rows, int(best.stage)), _weight(problems, best.normal)
     predicted, bias = found.derive(problems, best.theta, budget.width), None
     coarse, finer = coarser_of(problems, other_mesh)
-    around = {"predicted": predicted, "tried_on": coarse}
+    around = {"predicted": predicted, "tried_on": coarse, "derive": found.derive}
     covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1), **around)
     of_law = law_error(problems, best, prior, predicted)
     covariance = covariance + np.outer(of_law, of_law)
@@ -221,7 +221,7 @@ def judged(
     if density_doubt.is_asked(problems, agreed, missed):
         path = checkpoint and checkpoint.with_suffix(".density.npz")
         saved = {"checkpoint": path, "progress": progress, "key": key}
-        agreed = _with_density(agreed, problems, budget, best.theta, **saved)
+        agreed = _with_density(agreed, coarse, budget, best.theta, **saved)
     return dataclasses.replace(
         estimate,
         agreement=agreed,

@@ -59,7 +59,7 @@ def factor(ratio: float) -> float:
 
 def coarser_of(problems: Problems, other: OtherMesh | None) -> tuple[Problems, OtherMesh | None]:
     """The recordings on the coarser of two meshes, and the other beside it, for what takes many
-    motions: on the finest, in its short steps, a lift's takes some sixteen times as long."""
+    motions: on the finest, in its short steps, those of a lift take many times as long."""
     if other is None or other.is_finer:
         return problems, other
     return other.problems, OtherMesh(problems, factor(0.5))
