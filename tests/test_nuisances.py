@@ -18,7 +18,7 @@ from r2s.estimation.covariance import covariance_at
 from r2s.estimation.descent import Budget, descend, nuisances
 from r2s.estimation.estimate import describe
 from r2s.estimation.gauss_newton import Descent, Normal
-from r2s.estimation.mesh_bias import OtherMesh, coarser_of, factor, on_the_way, weighed
+from r2s.estimation.mesh_bias import OtherMesh, coarser_of, factor, on_the_way, settled, weighed
 from r2s.estimation.nuisances import free as nuisances_that_vary
 from r2s.estimation.prediction import predict
 from r2s.estimation.problem import (
@@ -123,7 +123,7 @@ def test_the_prior_of_theta_holds_what_is_known_of_the_fabric(lifted):
         end.normal, matrix=0 * end.normal.matrix, scatter=0 * end.normal.scatter
     )
     nothing = dataclasses.replace(end, theta=theta - off, normal=alone)
-    told = covariance(problems, nothing, 1.0, [])[:dim, :dim]
+    told = errors_by(problems, nothing, 1.0, [])[:dim, :dim]
     np.testing.assert_allclose(np.linalg.inv(told), precision, rtol=1e-6, atol=1e-9)
 
 
@@ -188,6 +188,41 @@ def test_an_estimate_leaves_its_recordings_only_as_far_as_its_loss_rises_as_told
     assert most > 2 * before
 
 
+def test_an_estimate_that_stays_where_its_prior_leads_elsewhere_errs_by_that_way(lifted):
+    """Where its errors are wider than what is known they become as narrow, but for the way."""
+    dim, size = lifted.space.dim, gauss_newton.theta_length((lifted,))
+    known = np.eye(size)
+    known[:dim, :dim] *= 16
+    space = InformedSpace.make(
+        lifted.space, jnp.full(dim, 0.45), jnp.asarray(known[:dim, :dim], float)
+    )
+    problems = (dataclasses.replace(lifted, space=space),)
+    end, _ = valley(lifted, size)
+    off, prior, none = np.r_[np.full(dim, 0.05), np.zeros(size - dim)], jnp.ones(()), np.zeros(size)
+    told = dataclasses.replace(
+        end.normal, matrix=1e4 * jnp.eye(size), gradient=jnp.asarray(-known @ off)
+    )
+    end = dataclasses.replace(end, normal=told)  # arrived: recordings and prior pull alike
+    wide = np.diag(np.r_[4.0, np.full(dim - 1, 1e-4), np.full(size - dim, 1e-4)])
+    seen = compiled.predictions_at(problems, end.theta)
+    stays = settled(problems, end, prior, wide, none, seen, moves=False)
+    assert stays.theta is end.theta and stays.seen is seen and not np.any(stays.bias)
+    np.testing.assert_allclose(stays.covariance[0, 0], 1 / 16 + 0.05**2, rtol=1e-3)
+    np.testing.assert_allclose(np.diag(stays.covariance)[1:], 1e-4, rtol=1e-3)
+    flat = (dataclasses.replace(lifted, space=lifted.space),)  # with nothing known beforehand
+    same = settled(flat, end, prior, wide, none, seen, moves=False)
+    np.testing.assert_allclose(same.covariance, wide)
+
+
+def errors_by(problems, end, prior, led, is_truth=False):
+    """`covariance` where steps lead from places and their normal equations."""
+    return covariance(problems, end, prior, steps_apart(problems, end, prior, led), is_truth)
+
+
+def apart_by(problems, end, prior, led):
+    return float(disagreement(problems, end, prior, steps_apart(problems, end, prior, led)))
+
+
 def valley(lifted, size):
     """The end of a descent in a quadratic loss, and what the loss is at any place."""
     random = np.random.default_rng(0)
@@ -208,7 +243,7 @@ def test_deviations_are_those_of_a_smooth_loss_or_of_how_far_descents_lie_apart(
     problems, prior = (lifted,), 1e-9
     size = gauss_newton.theta_length(problems)
     end, at = valley(lifted, size)
-    alone = covariance(problems, end, prior, [])
+    alone = errors_by(problems, end, prior, [])
     np.testing.assert_allclose(alone, 1e-4 * jnp.linalg.inv(end.normal.matrix), rtol=1e-5)
     places = sample_around(problems, end, prior, 64, jr.key(0))
     off = places - end.theta[None]
@@ -216,8 +251,8 @@ def test_deviations_are_those_of_a_smooth_loss_or_of_how_far_descents_lie_apart(
     far = jnp.einsum("pu,uv,pv->p", off, jnp.linalg.inv(alone), off)
     np.testing.assert_allclose(far, size, rtol=1e-4)  # a deviation along each axis
     back = [(place, at(place)) for place in places]
-    np.testing.assert_allclose(covariance(problems, end, prior, back), alone, rtol=1e-6)
-    assert float(disagreement(problems, end, prior, back)) < 1e-6
+    np.testing.assert_allclose(errors_by(problems, end, prior, back), alone, rtol=1e-6)
+    assert apart_by(problems, end, prior, back) < 1e-6
     # descents that would all end one way, but for one that would end anywhere
     away = jnp.linalg.cholesky(alone)[:, 0] * 5
 
@@ -226,15 +261,15 @@ def test_deviations_are_those_of_a_smooth_loss_or_of_how_far_descents_lie_apart(
 
     pushes = [1e6, *(1.0 if i % 2 else -1.0 for i in range(63))]
     led = [(place, at(place, push(t))) for place, t in zip(places, pushes, strict=True)]
-    rough = covariance(problems, end, prior, led)
+    rough = errors_by(problems, end, prior, led)
     expected = alone + jnp.outer(away, away) * (63 + FARTHEST**2) / 65
     np.testing.assert_allclose(rough, expected, rtol=1e-3, atol=1e-12)
-    assert float(disagreement(problems, end, prior, led)) == pytest.approx(5, rel=1e-4)
+    assert apart_by(problems, end, prior, led) == pytest.approx(5, rel=1e-4)
     # a run that diverged, or whose derivatives did, says that its place is no better known
     for loss, gradient in ((jnp.inf, away * jnp.nan), (1.0, away * jnp.nan), (1.0, away / 0)):
         pair = jnp.asarray(loss), gradient
         broken = eqx.tree_at(lambda n: (n.loss, n.gradient), at(end.theta), pair)
-        lost = covariance(problems, end, prior, [(place, broken) for place in places[:2]])
+        lost = errors_by(problems, end, prior, [(place, broken) for place in places[:2]])
         assert np.all(np.isfinite(lost)) and np.all(np.diag(lost) > np.diag(alone))
 
 
@@ -245,7 +280,7 @@ def test_of_the_true_fabric_where_its_end_leads_is_noise(lifted):
     noisy = dataclasses.replace(end, normal=at(end.theta, noise))
 
     def found(end, noise, true):
-        return covariance(
+        return errors_by(
             problems, end, prior, [(p, at(p, noise)) for p in (end.theta + 0.01, end.theta)], true
         )
 
@@ -253,22 +288,20 @@ def test_of_the_true_fabric_where_its_end_leads_is_noise(lifted):
     assert np.all(np.diag(found(noisy, noise, False)) > np.diag(found(noisy, noise, True)))
 
 
-def test_steps_that_lead_apart_elsewhere_count_as_if_they_did_here(lifted):
+def test_steps_lead_apart_alike_on_a_mesh_whose_own_end_leads_elsewhere(lifted):
     problems, prior = (lifted,), 1e-9
     end, at = valley(lifted, gauss_newton.theta_length(problems))
-    unarrived = dataclasses.replace(end, normal=at(end.theta, jnp.arange(1.0, len(end.theta) + 1)))
     places = sample_around(problems, end, prior, 4, jr.key(0))
-    led = [(p, at(p, 1.0 * i)) for i, p in enumerate(places)]
-    here = covariance(problems, unarrived, prior, led)
-    elsewhere = steps_apart(problems, unarrived, prior, led)
-    there = covariance(problems, unarrived, prior, [], elsewhere=elsewhere)
-    np.testing.assert_allclose(there, here, rtol=1e-5, atol=1e-9)
-    # on a mesh whose own end leads elsewhere alike, they tell the same
-    biased = [(p, at(p, 1.0 * i + 3.0)) for i, p in enumerate(places)]
-    other = dataclasses.replace(end, normal=at(end.theta, jnp.arange(1.0, len(end.theta) + 1) + 3))
-    np.testing.assert_allclose(
-        steps_apart(problems, other, prior, biased), elsewhere, rtol=1e-5, atol=1e-9
-    )
+
+    def apart(bias):
+        led = [(p, at(p, 1.0 * i + bias)) for i, p in enumerate(places)]
+        own = jnp.arange(1.0, len(end.theta) + 1) + bias
+        return steps_apart(
+            problems, dataclasses.replace(end, normal=at(end.theta, own)), prior, led
+        )
+
+    assert np.max(np.abs(apart(0.0))) > 1e-2
+    np.testing.assert_allclose(apart(3.0), apart(0.0), rtol=1e-5, atol=1e-9)
 
 
 def test_the_coarser_of_two_meshes_is_the_same_from_either(lifted):
@@ -288,11 +321,11 @@ def test_where_derivatives_overflow_nothing_is_known(lifted):
     end, at = valley(lifted, size)
     broken = eqx.tree_at(lambda e: e.normal.scatter, end, jnp.full((size, size), jnp.inf))
     near = [(end.theta, at(end.theta))] * 2
-    known = np.diag(covariance(problems, broken, prior, near))
+    known = np.diag(errors_by(problems, broken, prior, near))
     dim = lifted.space.dim
     np.testing.assert_allclose(known[:dim], UNIFORM_DEVIATION**2)
     np.testing.assert_allclose(known[dim:], 1)
-    assert disagreement(problems, broken, prior, near) == np.inf
+    assert apart_by(problems, broken, prior, near) == np.inf
 
 
 @pytest.mark.slow(group="estimates")

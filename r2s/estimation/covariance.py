@@ -4,6 +4,7 @@ import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -48,21 +49,16 @@ def covariance_at(
     """
     if predicted is None:
         predicted = derive(problems, end.theta, budget.width)
-    other = None
+    tried = _Place(problems, end, predicted)
     if tried_on is not None and tried_on is not problems:
         there = derive(tried_on, end.theta, budget.width)
-        other = _Elsewhere(tried_on, _end_in(tried_on, end, there), there)
+        tried = _Place(tried_on, _end_in(tried_on, end, there), there)
     found = []
     for share in (1.0, *reversed(budget.shares)):
         seen, here = _beginning(problems, end, share, predicted)
         prior = _weight(problems, here.normal)
-        if other is None:
-            neighbours, agrees = _around(seen, budget, here, prior, key)
-            errors = _covariance(problems, here, prior, neighbours, is_truth)
-        else:
-            elsewhere, agrees = _elsewhere(other, budget, share, key)
-            errors = _covariance(problems, here, prior, [], is_truth, elsewhere)
-        found.append(np.asarray(errors))
+        apart, agrees = _around(*_beginning(*tried[:2], share, tried.predicted), budget, key)
+        found.append(np.asarray(_covariance(seen, here, prior, apart, is_truth)))
         if agrees and (share == 1 or bool(_tells(problems, here, prior))):
             return found[-1]
     return found[0]
@@ -84,33 +80,25 @@ def _end_in(problems: Problems, end: Descent, predicted: Predicted) -> Descent:
     return dataclasses.replace(end, normal=normal)
 
 
-class _Elsewhere(NamedTuple):
-    """The end of a descent on another mesh, with `derivatives_at` it."""
+class _Place(NamedTuple):
+    """The end of a descent on some mesh, with `derivatives_at` it."""
 
     problems: Problems
     end: Descent
     predicted: Predicted
 
 
-def _elsewhere(
-    other: _Elsewhere, budget: Budget, share: float, key: PRNGKeyArray
-) -> tuple[Float[Array, "place theta"], bool]:
-    """How far steps from around the end lead apart on another mesh, and whether they agree."""
-    seen, here = _beginning(other.problems, other.end, share, other.predicted)
-    prior = _weight(other.problems, here.normal)
-    neighbours, agrees = _around(seen, budget, here, prior, key)
-    return _steps_apart(other.problems, here, prior, neighbours), agrees
-
-
 def _around(
-    problems: Problems, budget: Budget, end: Descent, prior, key
-) -> tuple[standard_errors.Neighbours, bool]:
-    """The normal equations at places around the end of a descent, and whether they agree.
+    problems: Problems, end: Descent, budget: Budget, key: PRNGKeyArray
+) -> tuple[Float[Array, "place theta"], bool]:
+    """How far steps from places around the end of a descent lead apart, and whether they agree.
 
     Where the first pairs of opposite places disagree by far, there are no others.
     """
+    apart = jnp.zeros((0, len(end.theta)), float)
     if not budget.around:
-        return [], True
+        return apart, True
+    prior = _weight(problems, end.normal)
     places = _sample_around(problems, end, prior, budget.around, key)
     pairs = list(places.reshape(2, -1, places.shape[-1]).swapaxes(0, 1))
     neighbours: standard_errors.Neighbours = []
@@ -121,7 +109,8 @@ def _around(
         normals = normals_at(problems, thetas, [end.scale] * len(thetas), budget.width)
         neighbours += zip(thetas, normals, strict=True)
         is_last = len(neighbours) == budget.around
-        apart = float(_disagreement(problems, end, prior, neighbours))
-        if not apart < (ROUGH if is_last else FAR_APART * ROUGH):
-            return neighbours, False
-    return neighbours, True
+        apart = _steps_apart(problems, end, prior, neighbours)
+        far = float(_disagreement(problems, end, prior, apart))
+        if not far < (ROUGH if is_last else FAR_APART * ROUGH):
+            return apart, False
+    return apart, True

@@ -32,14 +32,13 @@ from r2s.estimation.gauss_newton import (
     theta_indices,
 )
 from r2s.estimation.law_error import law_error
-from r2s.estimation.mesh_bias import OtherMesh, coarser_of, on_the_way, weighed
+from r2s.estimation.mesh_bias import OtherMesh, coarser_of
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.misfits import left_out, misfits
 from r2s.estimation.nuisances import nuisances
 from r2s.estimation.prediction import Theta, explain, fabric_at
 from r2s.estimation.problem import Problem, beginning, check_shared
 from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.informed_space import InformedSpace
 from r2s.program_memory import let_go_in_time
 
 INITIAL_DAMPING = 1e-2
@@ -185,10 +184,9 @@ def judged(
     `checkpoint`: of the search; a descent for the density (`r2s.estimation.density_doubt`) is kept
     beside it. `progress`: as in `descend`.
 
-    `other_mesh`: by which its bias by its mesh is judged, which the standard errors then hold. If
-    it is finer, and something is known of the fabric beforehand, the estimate goes towards that as
-    far as its mesh errs (`mesh_bias.weighed`). If it is coarser, places around the end, each
-    recording alone and a doubted density are tried on it, in a small part of the time.
+    `other_mesh`: by which its bias by its mesh is judged, which the standard errors then hold
+    (`mesh_bias.settled`). If it is coarser, places around the end, each recording alone and a
+    doubted density are tried on it, in a small part of the time.
     """
     began, problems = time.perf_counter(), found.problems
     which, best = _best(found.rows[-1])
@@ -199,17 +197,16 @@ def judged(
     covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1), **around)
     of_law = law_error(problems, best, prior, predicted)
     covariance = covariance + np.outer(of_law, of_law)
-    seen = [each for each, _ in predicted]
-    loss, rows = loss_from(problems, seen), found.rows
+    seen, rows = [each for each, _ in predicted], found.rows
+    loss = loss_from(problems, seen)
     if other_mesh is not None:
         bias = mesh_bias.mesh_bias(problems, other_mesh, best, prior, predicted)
-        covariance = covariance + np.outer(bias, bias)
-        if isinstance(problems[0].space, InformedSpace) and other_mesh.is_finer:
-            place, covariance, bias = weighed(problems, best, prior, covariance, bias)
-            theta, seen, loss, left = on_the_way(problems, best, place, loss)
-            covariance = covariance + np.outer(left, left)
+        errors, moves = (covariance, bias), other_mesh.is_finer
+        at = mesh_bias.settled(problems, best, prior, *errors, seen, moves)
+        seen, loss, covariance, bias = at[1:]
+        if at.theta is not best.theta:
             normal = dataclasses.replace(best.normal, loss=jnp.asarray(loss, float))
-            best = dataclasses.replace(best, theta=theta, normal=normal)
+            best = dataclasses.replace(best, theta=at.theta, normal=normal)
             rows = [*rows, [best if i == which else row for i, row in enumerate(rows[-1])]]
     seconds = found.seconds + time.perf_counter() - began
     converged = _arrived(problems, stage, which, prior, _stop(budget, int(best.stage)))

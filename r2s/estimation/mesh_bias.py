@@ -28,6 +28,7 @@ from r2s.estimation.gauss_newton import (
 )
 from r2s.estimation.prediction import Prediction, Sensitivity, Theta
 from r2s.estimation.problem import Problem, motion_alone
+from r2s.fabrics.informed_space import InformedSpace
 from r2s.geometry.surface import nearest
 from r2s.kept import kept
 from r2s.scenarios.resolution import ORDER
@@ -180,6 +181,50 @@ def weighed(
     theta = np.asarray(end.theta, np.float64) + way
     led = np.linalg.lstsq(told, (told + known) @ bias, rcond=RCOND)[0]
     return Weighed(theta, errors, errors @ left @ led)
+
+
+class Settled(NamedTuple):
+    """An estimate at its end.
+
+    - `theta`: there. `seen`: what is predicted there. `loss`: [m^2].
+    - `covariance`: of it, with all errors. `bias`: of its mesh that is left.
+    """
+
+    theta: Theta
+    seen: list[Prediction]
+    loss: float
+    covariance: Float[np.ndarray, "theta theta"]
+    bias: Float[np.ndarray, " theta"]
+
+
+def settled(
+    problems: Problems,
+    end: Descent,
+    prior: Array,
+    covariance: Float[np.ndarray, "theta theta"],
+    bias: Float[np.ndarray, " theta"],
+    seen: list[Prediction],
+    moves: bool,
+) -> Settled:
+    """An estimate at the end of its descents, with what its mesh errs.
+
+    Where something is known of the fabric beforehand, the estimate goes where `weighed` leads; not
+    if it does not move, as beside a coarser mesh, which says how far the own one errs, but hardly
+    where to. What is left of the way counts as an error.
+
+    - `prior`, `bias`: as in `weighed`. `covariance`: of the end, without its mesh's error.
+    - `seen`: what is predicted at the end.
+    """
+    covariance = covariance + np.outer(bias, bias)
+    at = Settled(end.theta, seen, loss_from(problems, seen), covariance, bias)
+    if not isinstance(problems[0].space, InformedSpace):
+        return at
+    to = weighed(problems, end, prior, covariance, bias)
+    if moves:
+        theta, seen, loss, left = on_the_way(problems, end, to.theta, at.loss)
+        return Settled(theta, seen, loss, to.covariance + np.outer(left, left), to.bias)
+    left = to.theta - np.asarray(end.theta, np.float64)
+    return at._replace(covariance=to.covariance + np.outer(left, left))
 
 
 def inside(problems: Problems, theta: Float[np.ndarray, " theta"]) -> Theta:

@@ -20,9 +20,8 @@ def covariance(
     problems: Problems,
     end: Descent,
     prior,
-    neighbours: Neighbours,
+    apart: Float[Array, "place theta"],
     is_truth: bool = False,
-    elsewhere: Float[Array, "place theta"] | None = None,
 ) -> Float[Array, "theta theta"]:
     """Covariance of theta at the end of one descent.
 
@@ -32,16 +31,15 @@ def covariance(
     times the median, in standard errors, is shortened to that.
 
     - `prior`: its weight, see `gauss_newton.prior_weight`.
+    - `apart`: the `steps_apart` of the neighbours, on this mesh or another.
     - `is_truth`: the end is the true theta. Then its own step is noise, and the distances of the
       others count from where it leads.
-    - `elsewhere`: the `steps_apart` of neighbours on another mesh, which count as if on this one.
 
     Where derivatives are not finite only the prior is known.
     """
-    off = step_ends(problems, end, prior, neighbours) - end.theta[None]
-    if elsewhere is not None:
-        off = jnp.concatenate([off, off[:1] + elsewhere])
-    off = jnp.where(is_truth, off - off[:1], off)
+    own = step_end(problems, end.theta, end.normal, prior) - end.theta
+    own = jnp.where(is_truth, 0, own)
+    off = own[None] + jnp.concatenate([jnp.zeros_like(apart, shape=(1, len(own))), apart])
     sandwich, root = sandwich_of(problems, end, prior)
     far = jnp.linalg.norm(jnp.linalg.solve(root, off.T), axis=0)
     limit = FARTHEST * jnp.median(far)
@@ -52,13 +50,12 @@ def covariance(
 
 
 def disagreement(
-    problems: Problems, end: Descent, prior, neighbours: Neighbours
+    problems: Problems, end: Descent, prior, apart: Float[Array, "place theta"]
 ) -> Float[Array, ""]:
-    """Median distance, in standard errors, between where steps from neighbours and the end lead.
+    """Median distance, in standard errors, of `steps_apart`.
 
     Next to zero where the loss is smooth; infinite where derivatives are not finite.
     """
-    apart = steps_apart(problems, end, prior, neighbours)
     _, root = sandwich_of(problems, end, prior)
     far = jnp.linalg.norm(jnp.linalg.solve(root, apart.T), axis=0)
     return jnp.median(jnp.where(jnp.isfinite(far), far, jnp.inf))
@@ -68,8 +65,8 @@ def steps_apart(
     problems: Problems, end: Descent, prior, neighbours: Neighbours
 ) -> Float[Array, "place theta"]:
     """How far Gauss-Newton steps from neighbours lead from where that of the end does."""
-    led = step_ends(problems, end, prior, neighbours)
-    return led[1:] - led[:1]
+    led = [step_end(problems, *place, prior) for place in [(end.theta, end.normal), *neighbours]]
+    return jnp.stack(led)[1:] - led[0][None]
 
 
 def tells(problems: Problems, end: Descent, prior) -> Bool[Array, ""]:
@@ -105,19 +102,13 @@ def sandwich_of(problems: Problems, end: Descent, prior):
     return sandwich, deviation[:, None] * axes * jnp.sqrt(jnp.maximum(squares, least))[None]
 
 
-def step_ends(
-    problems: Problems, end: Descent, prior, neighbours: Neighbours
-) -> Float[Array, "place theta"]:
-    """Where the Gauss-Newton steps of the end and of its neighbours lead, regardless of bounds.
+def step_end(problems: Problems, theta: Theta, normal: Normal, prior) -> Theta:
+    """Where the Gauss-Newton step from a place leads, regardless of bounds.
 
     A run that diverged, or whose derivatives did, takes no step.
     """
-
-    def step_end(theta: Theta, normal: Normal) -> Theta:
-        off, precision = prior_terms(problems, theta)
-        matrix = normal.matrix + prior * precision
-        step = jnp.linalg.solve(matrix, normal.gradient + prior * precision @ off)
-        finite = jnp.isfinite(normal.loss) & jnp.all(jnp.isfinite(step))
-        return theta - jnp.where(finite, step, 0)
-
-    return jnp.stack([step_end(*place) for place in [(end.theta, end.normal), *neighbours]])
+    off, precision = prior_terms(problems, theta)
+    matrix = normal.matrix + prior * precision
+    step = jnp.linalg.solve(matrix, normal.gradient + prior * precision @ off)
+    finite = jnp.isfinite(normal.loss) & jnp.all(jnp.isfinite(step))
+    return theta - jnp.where(finite, step, 0)
