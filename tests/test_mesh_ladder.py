@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.estimation import descent, mesh_ladder
+from r2s.estimation import covariance, descent, mesh_ladder
 from r2s.estimation.compiled import derivatives_at, normal_from
 from r2s.estimation.diffcloud import DiffCloud
 from r2s.estimation.estimate import Estimate
@@ -19,6 +19,7 @@ from r2s.estimation.mesh_bias import OtherMesh, factor, mesh_bias
 from r2s.estimation.method import Budget
 from r2s.estimation.problem import NuisancePrior, Problem
 from r2s.fabrics import presets
+from r2s.fabrics.informed_space import InformedSpace
 from r2s.fabrics.parameters import IsotropicSpace
 from r2s.scenarios import resolution, synthetic
 
@@ -98,6 +99,65 @@ def test_a_finer_mesh_is_taken_where_the_coarse_one_is_not_enough(enough, shape,
     else:
         assert not np.any(found.identifiable)
     assert abs(np.log(found.values[0] / truth)) < 2 * found.standard_errors[0]
+
+
+@pytest.mark.slow(group="estimates")
+def test_an_estimate_on_the_finest_mesh_stays_at_its_end_within_what_is_known(monkeypatch):
+    """Of two recordings, to its end: places around it and each alone are on the mesh before."""
+    monkeypatch.setattr(resolution, "LADDER", (3, 5))
+    monkeypatch.setattr(resolution, "ENOUGH", 1e-9)
+    known, off = 0.1, 0.02
+    prior = InformedSpace.make(SPACE, PLACE + off, jnp.eye(2) / known**2)
+    both, budget = [lift(), lift()], SMALL._replace(around=2)
+    tried: list[tuple[str, int]] = []
+
+    def note(module, name, stands_in=None):
+        does = stands_in or getattr(module, name)
+
+        def noting(*given, **words):
+            seen = next(each for each in given if isinstance(each, tuple) and each)
+            tried.append((name, len(seen[0].scenario.scene.mesh.rest)))
+            return does(*given, **words)
+
+        monkeypatch.setattr(module, name, noting)
+
+    note(covariance, "normals_at")
+    note(descent, "each_alone")
+    note(descent.mesh_bias, "alone")
+    note(descent, "_with_density", lambda *_, **__: None)
+    monkeypatch.setattr(descent, "agreement", lambda *_: None)
+    monkeypatch.setattr(descent.density_doubt, "is_asked", lambda *_: True)
+    monkeypatch.setattr(descent.mesh_bias, "on_the_way", None)  # it does not go
+    found = mesh_ladder.descend_by_meshes(both, prior, budget, key=jr.key(0))
+    assert found.shape == (5, 5)
+    assert tried == [(name, 9) for name in ("normals_at", "each_alone", "alone", "_with_density")]
+    errors = found.standard_errors / [bound.width for bound in SPACE.ranges]
+    assert np.all(errors < np.hypot(known, 2 * off))
+    assert found.values[0] == pytest.approx(float(SPACE.values(PLACE)[0]), rel=0.1)
+    np.testing.assert_allclose(found.shares, 0.5, rtol=1e-6)  # of recordings that are the same
+
+
+@pytest.mark.slow(group="estimates")
+def test_recordings_that_diverge_alone_on_a_coarser_mesh_are_not_compared(monkeypatch):
+    class Progress:
+        said: list[str] = []
+        say = said.append
+
+        def __call__(self, iteration, loss):
+            pass
+
+    def diverges(*_):
+        raise RuntimeError("all starts of the descents diverged")
+
+    problems = (problem(1.0), problem(1.0))
+    theta = jnp.zeros(theta_length(problems)).at[:2].set(PLACE)
+    row = descent._fresh(problems, SMALL, [theta], 0.0, len(SMALL.shares) + 1, derivatives_at)
+    found = descent.Search(problems, [row], 0.0, derivatives_at)
+    monkeypatch.setattr(descent, "each_alone", diverges)
+    estimate = descent.judged(found, SMALL, progress=Progress(), key=jr.key(0))
+    assert estimate.agreement is None and estimate.shares == ()
+    assert np.all(np.isfinite(estimate.standard_errors))
+    assert Progress.said == ["a recording alone diverged: not compared"]
 
 
 @pytest.mark.slow(group="estimates")

@@ -18,7 +18,15 @@ from r2s.estimation.covariance import covariance_at
 from r2s.estimation.descent import Budget, descend, nuisances
 from r2s.estimation.estimate import describe
 from r2s.estimation.gauss_newton import Descent, Normal
-from r2s.estimation.mesh_bias import OtherMesh, coarser_of, factor, on_the_way, settled, weighed
+from r2s.estimation.mesh_bias import (
+    OtherMesh,
+    Settled,
+    coarser_of,
+    factor,
+    on_the_way,
+    settled,
+    weighed,
+)
 from r2s.estimation.nuisances import free as nuisances_that_vary
 from r2s.estimation.prediction import predict
 from r2s.estimation.problem import (
@@ -188,30 +196,43 @@ def test_an_estimate_leaves_its_recordings_only_as_far_as_its_loss_rises_as_told
     assert most > 2 * before
 
 
-def test_an_estimate_that_stays_where_its_prior_leads_elsewhere_errs_by_that_way(lifted):
-    """Where its errors are wider than what is known they become as narrow, but for the way."""
+def staying(lifted, raw, off, bias):
+    """What is `settled` at an end that does not move: the variances are those of a prior of 1/16
+    for each number of a fabric, `off` its mean by so much; `raw` is without the prior."""
     dim, size = lifted.space.dim, gauss_newton.theta_length((lifted,))
     known = np.eye(size)
     known[:dim, :dim] *= 16
-    space = InformedSpace.make(
-        lifted.space, jnp.full(dim, 0.45), jnp.asarray(known[:dim, :dim], float)
-    )
-    problems = (dataclasses.replace(lifted, space=space),)
     end, _ = valley(lifted, size)
-    off, prior, none = np.r_[np.full(dim, 0.05), np.zeros(size - dim)], jnp.ones(()), np.zeros(size)
-    told = dataclasses.replace(
-        end.normal, matrix=1e4 * jnp.eye(size), gradient=jnp.asarray(-known @ off)
+    mean = end.theta[:dim] - off
+    space = InformedSpace.make(lifted.space, mean, jnp.asarray(known[:dim, :dim], float))
+    problems = (dataclasses.replace(lifted, space=space),)
+    away = np.r_[np.full(dim, off), np.zeros(size - dim)]
+    told = dataclasses.replace(  # arrived: recordings and prior pull alike
+        end.normal, matrix=1e4 * jnp.eye(size), gradient=jnp.asarray(-known @ away)
     )
-    end = dataclasses.replace(end, normal=told)  # arrived: recordings and prior pull alike
-    wide = np.diag(np.r_[4.0, np.full(dim - 1, 1e-4), np.full(size - dim, 1e-4)])
-    seen = compiled.predictions_at(problems, end.theta)
-    stays = settled(problems, end, prior, wide, none, seen, moves=False)
-    assert stays.theta is end.theta and stays.seen is seen and not np.any(stays.bias)
-    np.testing.assert_allclose(stays.covariance[0, 0], 1 / 16 + 0.05**2, rtol=1e-3)
-    np.testing.assert_allclose(np.diag(stays.covariance)[1:], 1e-4, rtol=1e-3)
-    flat = (dataclasses.replace(lifted, space=lifted.space),)  # with nothing known beforehand
-    same = settled(flat, end, prior, wide, none, seen, moves=False)
-    np.testing.assert_allclose(same.covariance, wide)
+    end = dataclasses.replace(end, normal=told)
+    at = Settled(end.theta, [], 1.0, np.diag(np.r_[raw, np.full(size - 1, 1e-4)]))
+    theirs = np.r_[bias, np.zeros(size - 1)]
+    flat = settled((lifted,), end, jnp.ones(()), at, theirs, False)
+    found = settled(problems, end, jnp.ones(()), at, theirs, False)
+    for each in (flat, found):
+        assert each.theta is end.theta and each.loss == 1.0
+        assert each.bias is not None and each.bias[0] <= np.sqrt(each.covariance[0, 0])
+    np.testing.assert_allclose(flat.covariance, at.covariance + np.outer(theirs, theirs))
+    left = flat.covariance - found.covariance
+    assert np.linalg.eigvalsh(left)[0] > -1e-9  # never wider for what is known
+    np.testing.assert_allclose(np.diag(found.covariance)[1:], 1e-4, rtol=2e-2)
+    return found
+
+
+def test_what_is_known_limits_the_errors_of_an_estimate_that_stays_but_for_the_way(lifted):
+    close = staying(lifted, 4.0, 0.05, 0.0)
+    np.testing.assert_allclose(close.covariance[0, 0], 1 / 16 + 0.05**2, rtol=1e-3)
+    by_mesh = staying(lifted, 1e-4, 0.05, 0.9)
+    np.testing.assert_allclose(by_mesh.covariance[0, 0], 1 / 16 + 0.05**2, rtol=2e-2)
+    assert by_mesh.bias is not None and by_mesh.bias[0] == pytest.approx(0.255, abs=0.01)
+    far = staying(lifted, 0.04, 2.5, 0.0)  # eight standard deviations of the prior
+    np.testing.assert_allclose(far.covariance[0, 0], 0.04, rtol=1e-3)
 
 
 def errors_by(problems, end, prior, led, is_truth=False):
@@ -304,15 +325,20 @@ def test_steps_lead_apart_alike_on_a_mesh_whose_own_end_leads_elsewhere(lifted):
     np.testing.assert_allclose(apart(3.0), apart(0.0), rtol=1e-5, atol=1e-9)
 
 
-def test_the_coarser_of_two_meshes_is_the_same_from_either(lifted):
-    coarse, fine = (lifted,), (lifted,) * 2
+def test_the_coarser_of_two_meshes_is_the_same_from_either_but_for_what_stays(lifted):
+    coarse, fine = [tuple(dataclasses.replace(lifted) for _ in range(2)) for _ in range(2)]
     to_finer, to_coarser = OtherMesh(fine, factor(0.5)), OtherMesh(coarse, factor(2.0))
     assert to_finer.is_finer and not to_coarser.is_finer
     for problems, other in ((coarse, to_finer), (fine, to_coarser)):
         found, beside = coarser_of(problems, other)
-        assert found is coarse and beside is not None
-        assert beside.problems is fine and beside.factor == to_finer.factor
-    assert coarser_of(coarse, None)[0] is coarse
+        for which in (0, 1):
+            assert found[which] is coarse[which] and beside[which].problems[0] is fine[which]
+            assert beside[which].factor == to_finer.factor
+    found, beside = coarser_of(fine, to_coarser._replace(stay=(True, False)))
+    assert found[0] is fine[0] and found[1] is coarse[1]
+    assert beside[0].problems[0] is coarse[0] and beside[0].factor == to_coarser.factor
+    assert beside[1].problems[0] is fine[1] and beside[1].factor == to_finer.factor
+    assert coarser_of(coarse, None) == (coarse, ())
 
 
 def test_where_derivatives_overflow_nothing_is_known(lifted):
@@ -337,13 +363,19 @@ def test_deviations_are_from_the_frames_on_which_places_agree(monkeypatch):
     theta = jnp.concatenate([FAMILY.to_unit(FABRIC), nuisances])
     zero = jnp.zeros(())
 
+    asked = []
+
+    def noting(problems, *rest):
+        asked.append(problems)
+        return compiled.derivatives_at(problems, *rest)
+
     def found(agree, share=1.0, budget=budget, tried_on=None):
         agree = iter(agree)
         monkeypatch.setattr(covariances, "_disagreement", lambda *_: 0.0 if next(agree) else np.inf)
         seen = problems if share == 1 else (beginning(lifted, share),)
         normal = compiled.normal_at(seen, theta, zero, None)
         end = Descent(theta, normal, zero, zero, zero, jnp.zeros((), int))
-        return covariance_at(seen, budget, end, jr.key(0), tried_on=tried_on)
+        return covariance_at(seen, budget, end, jr.key(0), tried_on=tried_on, derive=noting)
 
     alone = budget._replace(shares=())
     whole, half = (found([True], share, alone) for share in (1.0, 0.5))
@@ -352,6 +384,7 @@ def test_deviations_are_from_the_frames_on_which_places_agree(monkeypatch):
     np.testing.assert_allclose(found([False, False]), whole)
     copied = (*problems,)  # places are tried on another mesh that moves alike
     np.testing.assert_allclose(found([True], tried_on=copied), whole, rtol=1e-3)
+    assert asked[-1] is copied
     np.testing.assert_allclose(found([False, True], tried_on=copied), half, rtol=1e-3)
     assert np.max(np.abs(np.diag(half) / np.diag(whole) - 1)) > 0.1
 

@@ -44,7 +44,8 @@ def covariance_at(
     since nothing has moved yet, agrees with everything, and does not count.
 
     - `predicted`: `derivatives_at` the end, where they are known.
-    - `tried_on`: the same recordings on a mesh on which the places around the end are tried.
+    - `tried_on`: the same recordings on a mesh on which the places around the end are tried: one
+      standard error of that mesh away, in which their agreement is told, too.
     - `derive`: what gives derivatives at the end, of which it may know some.
     """
     if predicted is None:

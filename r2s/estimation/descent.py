@@ -32,7 +32,7 @@ from r2s.estimation.gauss_newton import (
     theta_indices,
 )
 from r2s.estimation.law_error import law_error
-from r2s.estimation.mesh_bias import OtherMesh, coarser_of
+from r2s.estimation.mesh_bias import OtherMesh, Settled, coarser_of
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.misfits import left_out, misfits
 from r2s.estimation.nuisances import nuisances
@@ -191,30 +191,33 @@ def judged(
     began, problems = time.perf_counter(), found.problems
     which, best = _best(found.rows[-1])
     stage, prior = _rows_of_stage(found.rows, int(best.stage)), _weight(problems, best.normal)
-    predicted, bias = found.derive(problems, best.theta, budget.width), None
-    coarse, finer = coarser_of(problems, other_mesh)
+    predicted = found.derive(problems, best.theta, budget.width)
+    coarse, beside = coarser_of(problems, other_mesh)
     around = {"predicted": predicted, "tried_on": coarse, "derive": found.derive}
     covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1), **around)
-    of_law = law_error(problems, best, prior, predicted)
-    covariance = covariance + np.outer(of_law, of_law)
-    seen, rows = [each for each, _ in predicted], found.rows
-    loss = loss_from(problems, seen)
+    of_law, seen = law_error(problems, best, prior, predicted), [each for each, _ in predicted]
+    errors = covariance + np.outer(of_law, of_law)
+    at, rows = Settled(best.theta, seen, loss_from(problems, seen), errors), found.rows
     if other_mesh is not None:
         bias = mesh_bias.mesh_bias(problems, other_mesh, best, prior, predicted)
-        errors, moves = (covariance, bias), other_mesh.is_finer
-        at = mesh_bias.settled(problems, best, prior, *errors, seen, moves)
-        seen, loss, covariance, bias = at[1:]
-        if at.theta is not best.theta:
-            normal = dataclasses.replace(best.normal, loss=jnp.asarray(loss, float))
-            best = dataclasses.replace(best, theta=at.theta, normal=normal)
-            rows = [*rows, [best if i == which else row for i, row in enumerate(rows[-1])]]
+        at = mesh_bias.settled(problems, best, prior, at, bias, other_mesh.is_finer)
+    if at.theta is not best.theta:
+        normal = dataclasses.replace(best.normal, loss=jnp.asarray(at.loss, float))
+        best = dataclasses.replace(best, theta=at.theta, normal=normal)
+        rows = [*rows, [best if i == which else row for i, row in enumerate(rows[-1])]]
     seconds = found.seconds + time.perf_counter() - began
     converged = _arrived(problems, stage, which, prior, _stop(budget, int(best.stage)))
-    estimate = collect(problems, rows, covariance, approach, seconds, converged, loss, bias)
-    alone = each_alone(coarse, budget, best.theta, key, found.derive, progress)
+    told = at.covariance, approach, seconds, converged, at.loss, at.bias
+    estimate = collect(problems, rows, *told)
+    try:
+        alone = each_alone(coarse, budget, best.theta, key, found.derive, progress)
+    except RuntimeError:  # on the coarser mesh, of a fabric of the finer one
+        tell(progress, "a recording alone diverged: not compared")
+        alone = []
     shares = tuple(float(each) for each in recording_weights(problems)) if alone else ()
-    biases = mesh_bias.alone(coarse, finer, alone, found.derive, budget.width)
-    agreed, missed = agreement(coarse, alone, biases), misfits(problems, best.theta, seen)
+    biases = mesh_bias.alone(coarse, beside, alone, found.derive, budget.width)
+    agreed = agreement(coarse, alone, biases) if alone else None
+    missed = misfits(problems, best.theta, at.seen)
     if density_doubt.is_asked(problems, agreed, missed):
         path = checkpoint and checkpoint.with_suffix(".density.npz")
         saved = {"checkpoint": path, "progress": progress, "key": key}
@@ -224,7 +227,7 @@ def judged(
         agreement=agreed,
         shares=shares,
         misfits=missed,
-        left_out=left_out(problems, seen, float(best.scale)),
+        left_out=left_out(problems, at.seen, float(best.scale)),
     )
 
 

@@ -42,10 +42,13 @@ _equations = kept(normal_equations.normal_equations_of)
 class OtherMesh(NamedTuple):
     """- `problems`: the same recordings on another mesh.
     - `factor`: from a step to that mesh to one to a mesh without end, see `factor`.
+    - `stay`: of a coarser one, which recordings are worth their own mesh wherever many motions are
+      tried, as of a taut sheet, whose motions are short; none where it is not said.
     """
 
     problems: Problems
     factor: float
+    stay: tuple[bool, ...] = ()
 
     @property
     def is_finer(self) -> bool:
@@ -58,12 +61,21 @@ def factor(ratio: float) -> float:
     return 1 / (1 - ratio**ORDER)
 
 
-def coarser_of(problems: Problems, other: OtherMesh | None) -> tuple[Problems, OtherMesh | None]:
-    """The recordings on the coarser of two meshes, and the other beside it, for what takes many
-    motions: on the finest, in its short steps, those of a lift take many times as long."""
-    if other is None or other.is_finer:
-        return problems, other
-    return other.problems, OtherMesh(problems, factor(0.5))
+def coarser_of(
+    problems: Problems, other: OtherMesh | None
+) -> tuple[Problems, tuple[OtherMesh, ...]]:
+    """The recordings on the coarser of two meshes, and each on another beside it, for what takes
+    many motions: on the finest, in its short steps, those of a lift take many times as long. What
+    stays is on its own mesh."""
+    if other is None:
+        return problems, ()
+    stay = other.stay or (other.is_finer,) * len(problems)
+    coarse, beside = [], []
+    for own, there, stays in zip(problems, other.problems, stay, strict=True):
+        coarse.append(own if stays else there)
+        to = there if stays else own
+        beside.append(OtherMesh((to,), other.factor if stays else factor(0.5)))
+    return tuple(coarse), tuple(beside)
 
 
 def mesh_bias(
@@ -108,7 +120,7 @@ def mesh_bias(
 
 def alone(
     problems: Problems,
-    other: OtherMesh | None,
+    others: Sequence[OtherMesh],
     ends: Sequence[Descent],
     derive: Derive,
     width: float | None = None,
@@ -116,15 +128,14 @@ def alone(
     """The `mesh_bias` of the end of a descent in each recording alone; of none where there is no
     other mesh, or no such end.
 
-    - `derive`, `width`: see `r2s.estimation.compiled`.
+    - `others`: of each recording alone. `derive`, `width`: see `r2s.estimation.compiled`.
     """
     found: list[Float[np.ndarray, " theta"]] = []
-    if other is None or not ends:
+    if not others or not ends:
         return found
-    for problem, there, end in zip(problems, other.problems, ends, strict=True):
+    for problem, other, end in zip(problems, others, ends, strict=True):
         own, prior = (problem,), prior_weight((problem,), end.normal)
-        predicted = derive(own, end.theta, width)
-        found.append(mesh_bias(own, OtherMesh((there,), other.factor), end, prior, predicted))
+        found.append(mesh_bias(own, other, end, prior, derive(own, end.theta, width)))
     return found
 
 
@@ -184,47 +195,57 @@ def weighed(
 
 
 class Settled(NamedTuple):
-    """An estimate at its end.
+    """An estimate at the end of its descents.
 
     - `theta`: there. `seen`: what is predicted there. `loss`: [m^2].
-    - `covariance`: of it, with all errors. `bias`: of its mesh that is left.
+    - `covariance`: of it. `bias`: of its mesh, which it holds; None: that was not judged.
     """
 
     theta: Theta
     seen: list[Prediction]
     loss: float
     covariance: Float[np.ndarray, "theta theta"]
-    bias: Float[np.ndarray, " theta"]
+    bias: Float[np.ndarray, " theta"] | None = None
 
 
 def settled(
     problems: Problems,
     end: Descent,
     prior: Array,
-    covariance: Float[np.ndarray, "theta theta"],
+    at: Settled,
     bias: Float[np.ndarray, " theta"],
-    seen: list[Prediction],
     moves: bool,
 ) -> Settled:
     """An estimate at the end of its descents, with what its mesh errs.
 
-    Where something is known of the fabric beforehand, the estimate goes where `weighed` leads; not
-    if it does not move, as beside a coarser mesh, which says how far the own one errs, but hardly
-    where to. What is left of the way counts as an error.
+    Where something is known of the fabric beforehand, it goes where `weighed` leads, and what is
+    left of that way counts as an error. Beside a coarser mesh, which says how far the own one errs,
+    but hardly where to, it does not move. Its errors are then those without the prior or those
+    where `weighed` leads with the whole way, in each direction the smaller.
 
-    - `prior`, `bias`: as in `weighed`. `covariance`: of the end, without its mesh's error.
-    - `seen`: what is predicted at the end.
+    - `prior`, `bias`: as in `weighed`. `at`: the end, without its mesh's error.
     """
-    covariance = covariance + np.outer(bias, bias)
-    at = Settled(end.theta, seen, loss_from(problems, seen), covariance, bias)
+    covariance = at.covariance + np.outer(bias, bias)
     if not isinstance(problems[0].space, InformedSpace):
-        return at
+        return at._replace(covariance=covariance, bias=bias)
     to = weighed(problems, end, prior, covariance, bias)
     if moves:
         theta, seen, loss, left = on_the_way(problems, end, to.theta, at.loss)
         return Settled(theta, seen, loss, to.covariance + np.outer(left, left), to.bias)
-    left = to.theta - np.asarray(end.theta, np.float64)
-    return at._replace(covariance=to.covariance + np.outer(left, left))
+    way = to.theta - np.asarray(end.theta, np.float64)
+    errors = _smaller(covariance, to.covariance + np.outer(way, way))
+    most = np.sqrt(np.diag(errors))
+    return at._replace(covariance=errors, bias=np.clip(bias, -most, most))
+
+
+def _smaller(
+    one: Float[np.ndarray, "theta theta"], other: Float[np.ndarray, "theta theta"]
+) -> Float[np.ndarray, "theta theta"]:
+    """The smaller of two covariances in each direction in which both have no correlation."""
+    root = np.linalg.cholesky(one)
+    sizes, axes = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, other).T))
+    axes = root @ axes
+    return (axes * np.minimum(sizes, 1)[None]) @ axes.T
 
 
 def inside(problems: Problems, theta: Float[np.ndarray, " theta"]) -> Theta:

@@ -100,6 +100,8 @@ def descend_by_meshes(
         last = rungs[:2][-1]
         for shapes in (_others(last), last):
             yield lambda shapes=shapes: prepare(on(*shapes), derivatives=False)
+        if finest:  # else that of the rung before
+            yield lambda: prepare(on(*_others(last)), budget.width)
 
     with meanwhile(needed() if kept() else ()):
         at = climb(rungs[0], None, len(rungs) > 1)
@@ -114,7 +116,9 @@ def descend_by_meshes(
                     break
             at = climb(shapes, at.found.theta, shapes is not rungs[-1])
         tell(progress, "standard errors")
-        other = OtherMesh(on(*_others(at.shapes)), factor(2.0 if _is_finest(at.shapes) else 0.5))
+        other = OtherMesh(on(*_others(at.shapes)), factor(0.5))
+        if _is_finest(at.shapes):
+            other = other._replace(factor=factor(2.0), stay=tuple(map(_is_taut, recordings)))
         saved = {"checkpoint": checkpoint, "progress": progress, "key": key}
         estimate = judged(at.found, budget, other_mesh=other, **saved)
     return dataclasses.replace(estimate, shape=_told(recordings, at.shapes))
@@ -195,17 +199,17 @@ def _motion(recording: Recording, shape: Shape):
 
 def _meshes(recording: Recording) -> list[Shape]:
     *coarse, finest = resolution.ladder(recording.info.sheet.size)
-    is_taut = recording.info.scenario in resolution.TAUT
-    return [*coarse, coarse[-1] if is_taut else finest]
+    return [*coarse, coarse[-1] if _is_taut(recording) else finest]
+
+
+def _is_taut(recording: Recording) -> bool:
+    return recording.info.scenario in resolution.TAUT
 
 
 def _told(recordings: Recordings, shapes: Sequence[Shape]) -> Shape:
     """The mesh by which an estimate is named: a taut sheet's says little of how the others fold."""
-    loose = [
-        shape
-        for each, shape in zip(recordings, shapes, strict=True)
-        if each.info.scenario not in resolution.TAUT
-    ]
+    pairs = zip(recordings, shapes, strict=True)
+    loose = [shape for each, shape in pairs if not _is_taut(each)]
     return max(loose or shapes, key=max)
 
 
