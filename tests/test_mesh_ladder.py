@@ -150,13 +150,13 @@ def test_recordings_that_diverge_alone_on_a_coarser_mesh_are_not_compared(monkey
         raise RuntimeError("all starts of the descents diverged")
 
     problems = (problem(1.0), problem(1.0))
-    theta = jnp.zeros(theta_length(problems)).at[:2].set(PLACE)
+    theta = jnp.zeros(theta_length(problems)).at[:2].set(PLACE + 0.01)
     row = descent._fresh(problems, SMALL, [theta], 0.0, len(SMALL.shares) + 1, derivatives_at)
     found = descent.Search(problems, [row], 0.0, derivatives_at)
     monkeypatch.setattr(descent, "each_alone", diverges)
     estimate = descent.judged(found, SMALL, progress=Progress(), key=jr.key(0))
     assert estimate.agreement is None and estimate.shares == ()
-    assert np.all(np.isfinite(estimate.standard_errors))
+    assert np.all(estimate.standard_errors > 0)
     assert Progress.said == ["a recording alone diverged: not compared"]
 
 
