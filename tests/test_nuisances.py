@@ -334,11 +334,31 @@ def test_the_coarser_of_two_meshes_is_the_same_from_either_but_for_what_stays(li
         for which in (0, 1):
             assert found[which] is coarse[which] and beside[which].problems[0] is fine[which]
             assert beside[which].factor == to_finer.factor
-    found, beside = coarser_of(fine, to_coarser._replace(stay=(True, False)))
-    assert found[0] is fine[0] and found[1] is coarse[1]
+    pulled = (pull(fine[0]), fine[1])
+    found, beside = coarser_of(pulled, to_coarser)
+    assert found[0] is pulled[0] and found[1] is coarse[1]
     assert beside[0].problems[0] is coarse[0] and beside[0].factor == to_coarser.factor
     assert beside[1].problems[0] is fine[1] and beside[1].factor == to_finer.factor
     assert coarser_of(coarse, None) == (coarse, ())
+
+
+def pull(problem: Problem) -> Problem:
+    """The problem with a force, as that of a pull."""
+    count = len(problem.frames)
+    force = Force(jnp.zeros((count, 1)), jnp.ones(count, bool), jnp.eye(3)[:1])
+    return dataclasses.replace(problem, force=force)
+
+
+def test_pulls_keep_their_frames_where_other_motions_are_cut(lifted):
+    pulled = pull(lifted)
+
+    def frames(problem):
+        return int(jnp.sum(jnp.any(problem.clouds.mask, axis=1)))
+
+    whole = frames(lifted)
+    assert [frames(each) for each in covariances.cut((lifted, pulled), 0.5)] == [whole // 2, whole]
+    assert [frames(each) for each in covariances.cut((pulled, pulled), 0.5)] == [whole // 2] * 2
+    assert [frames(each) for each in covariances.cut((lifted, lifted), 0.5)] == [whole // 2] * 2
 
 
 def test_where_derivatives_overflow_nothing_is_known(lifted):

@@ -41,7 +41,8 @@ def covariance_at(
     end lead apart, the end of the motion depends on the fabric so steeply that its derivatives say
     nothing; then the budget's shares of the frames are tried, the largest first. If these do not
     agree either, the covariance is that of all frames. A beginning that says nothing of the fabric,
-    since nothing has moved yet, agrees with everything, and does not count.
+    since nothing has moved yet, agrees with everything, and does not count. Beside other motions
+    pulls keep all their frames: their sheets are taut.
 
     - `predicted`: `derivatives_at` the end, where they are known.
     - `tried_on`: the same recordings on a mesh on which the places around the end are tried: one
@@ -71,8 +72,16 @@ def _beginning(
     """The problems up to a share of their frames, and a descent's end in these."""
     if share == 1:
         return problems, end
-    seen = tuple(beginning(problem, share) for problem in problems)
+    seen = cut(problems, share)
     return seen, _end_in(seen, end, predicted)
+
+
+def cut(problems: Problems, share: float) -> Problems:
+    """The beginnings of those that may move too steeply: of all, or of all but the pulls."""
+    are_pulls = all(problem.is_pulled for problem in problems)
+    return tuple(
+        beginning(each, share) if are_pulls or not each.is_pulled else each for each in problems
+    )
 
 
 def _end_in(problems: Problems, end: Descent, predicted: Predicted) -> Descent:

@@ -42,13 +42,10 @@ _equations = kept(normal_equations.normal_equations_of)
 class OtherMesh(NamedTuple):
     """- `problems`: the same recordings on another mesh.
     - `factor`: from a step to that mesh to one to a mesh without end, see `factor`.
-    - `stay`: of a coarser one, which recordings are worth their own mesh wherever many motions are
-      tried, as of a taut sheet, whose motions are short; none where it is not said.
     """
 
     problems: Problems
     factor: float
-    stay: tuple[bool, ...] = ()
 
     @property
     def is_finer(self) -> bool:
@@ -65,13 +62,13 @@ def coarser_of(
     problems: Problems, other: OtherMesh | None
 ) -> tuple[Problems, tuple[OtherMesh, ...]]:
     """The recordings on the coarser of two meshes, and each on another beside it, for what takes
-    many motions: on the finest, in its short steps, those of a lift take many times as long. What
-    stays is on its own mesh."""
+    many motions: on the finest, in its short steps, those of a lift take many times as long. Pulls
+    stay on their own mesh."""
     if other is None:
         return problems, ()
-    stay = other.stay or (other.is_finer,) * len(problems)
     coarse, beside = [], []
-    for own, there, stays in zip(problems, other.problems, stay, strict=True):
+    for own, there in zip(problems, other.problems, strict=True):
+        stays = other.is_finer or own.is_pulled
         coarse.append(own if stays else there)
         to = there if stays else own
         beside.append(OtherMesh((to,), other.factor if stays else factor(0.5)))

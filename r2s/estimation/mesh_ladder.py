@@ -116,9 +116,7 @@ def descend_by_meshes(
                     break
             at = climb(shapes, at.found.theta, shapes is not rungs[-1])
         tell(progress, "standard errors")
-        other = OtherMesh(on(*_others(at.shapes)), factor(0.5))
-        if _is_finest(at.shapes):
-            other = other._replace(factor=factor(2.0), stay=tuple(map(_is_taut, recordings)))
+        other = OtherMesh(on(*_others(at.shapes)), factor(2.0 if _is_finest(at.shapes) else 0.5))
         saved = {"checkpoint": checkpoint, "progress": progress, "key": key}
         estimate = judged(at.found, budget, other_mesh=other, **saved)
     return dataclasses.replace(estimate, shape=_told(recordings, at.shapes))

@@ -153,6 +153,11 @@ class Problem(eqx.Module):
     wanted: Int[Array, ""] | None = None
     weight: Float[Array, ""] | None = None
 
+    @property
+    def is_pulled(self) -> bool:
+        """Whether it is a pull whose force was recorded: a taut sheet, which moves smoothly."""
+        return self.force is not None
+
     @classmethod
     def make(
         cls,
