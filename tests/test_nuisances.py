@@ -357,6 +357,8 @@ def test_pulls_keep_their_frames_where_other_motions_are_cut(lifted):
 
     whole = frames(lifted)
     assert [frames(each) for each in covariances.cut((lifted, pulled), 0.5)] == [whole // 2, whole]
+    shares = gauss_newton.recording_weights(covariances.cut((lifted, pulled), 0.5))
+    np.testing.assert_allclose(shares, [1 / 3, 2 / 3], rtol=1e-6)
     assert [frames(each) for each in covariances.cut((pulled, pulled), 0.5)] == [whole // 2] * 2
     assert [frames(each) for each in covariances.cut((lifted, lifted), 0.5)] == [whole // 2] * 2
 

@@ -12,7 +12,7 @@ from r2s.estimation import gauss_newton, standard_errors
 from r2s.estimation.compiled import Derive, Predicted, derivatives_at, normal_from, normals_at
 from r2s.estimation.gauss_newton import Descent, Problems
 from r2s.estimation.method import Budget
-from r2s.estimation.problem import beginning
+from r2s.estimation.problem import Problem, beginning
 
 ROUGH = 3.0  # standard errors, by which places around an end lead apart
 FIRST, FAR_APART = 2, 2.0  # pairs of them, and times that, where no more are needed
@@ -77,11 +77,16 @@ def _beginning(
 
 
 def cut(problems: Problems, share: float) -> Problems:
-    """The beginnings of those that may move too steeply: of all, or of all but the pulls."""
-    are_pulls = all(problem.is_pulled for problem in problems)
-    return tuple(
-        beginning(each, share) if are_pulls or not each.is_pulled else each for each in problems
-    )
+    """The beginnings of those that may move too steeply: of all, or of all but the pulls, and these
+    then count by the frames that are left, too."""
+    if len({problem.is_pulled for problem in problems}) == 1:
+        return tuple(beginning(each, share) for each in problems)
+    return tuple(each if each.is_pulled else _lighter(each, share) for each in problems)
+
+
+def _lighter(problem: Problem, share: float) -> Problem:
+    weight = jnp.ones((), float) if problem.weight is None else problem.weight
+    return dataclasses.replace(beginning(problem, share), weight=share * weight)
 
 
 def _end_in(problems: Problems, end: Descent, predicted: Predicted) -> Descent:
