@@ -339,6 +339,7 @@ def test_the_coarser_of_two_meshes_is_the_same_from_either_but_for_what_stays(li
     assert found[0] is pulled[0] and found[1] is coarse[1]
     assert beside[0].problems[0] is coarse[0] and beside[0].factor == to_coarser.factor
     assert beside[1].problems[0] is fine[1] and beside[1].factor == to_finer.factor
+    assert coarser_of(coarse, to_finer)[0] is coarse  # so that places are not derived again
     assert coarser_of(coarse, None) == (coarse, ())
 
 

@@ -103,7 +103,7 @@ def agreement(
 def weighing(problems: Problems) -> list[bool]:
     """Which recordings weigh the sheet: those of a force. No wind, whose own is in doubt: with ten
     times the density it is found ten times as strong, and stiffness with it."""
-    return [problem.force is not None for problem in problems]
+    return [problem.is_pulled for problem in problems]
 
 
 def told_by(

@@ -184,9 +184,8 @@ def judged(
     `checkpoint`: of the search; a descent for the density (`r2s.estimation.density_doubt`) is kept
     beside it. `progress`: as in `descend`.
 
-    `other_mesh`: by which its bias by its mesh is judged, which the standard errors then hold
-    (`mesh_bias.settled`). If it is coarser, places around the end, each recording alone and a
-    doubted density are tried on it, in a small part of the time.
+    `other_mesh`: by which its bias is judged, which the standard errors hold (`mesh_bias.settled`).
+    If it is coarser, places around the end, each recording alone and a density are tried on it.
     """
     began, problems = time.perf_counter(), found.problems
     which, best = _best(found.rows[-1])
@@ -196,8 +195,8 @@ def judged(
     around = {"predicted": predicted, "tried_on": coarse, "derive": found.derive}
     covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1), **around)
     of_law, seen = law_error(problems, best, prior, predicted), [each for each, _ in predicted]
-    errors = covariance + np.outer(of_law, of_law)
-    at, rows = Settled(best.theta, seen, loss_from(problems, seen), errors), found.rows
+    covariance, rows = covariance + np.outer(of_law, of_law), found.rows
+    at = Settled(best.theta, seen, loss_from(problems, seen), covariance)
     if other_mesh is not None:
         bias = mesh_bias.mesh_bias(problems, other_mesh, best, prior, predicted)
         at = mesh_bias.settled(problems, best, prior, at, bias, other_mesh.is_finer)
@@ -211,7 +210,9 @@ def judged(
     estimate = collect(problems, rows, *told)
     try:
         alone = each_alone(coarse, budget, best.theta, key, found.derive, progress)
-    except RuntimeError:  # on the coarser mesh, of a fabric of the finer one
+    except RuntimeError as error:  # on the coarser mesh, of a fabric of the finer one
+        if isinstance(error, jax.errors.JaxRuntimeError):  # out of memory, say
+            raise
         tell(progress, "a recording alone diverged: not compared")
         alone = []
     shares = tuple(float(each) for each in recording_weights(problems)) if alone else ()

@@ -66,12 +66,13 @@ def coarser_of(
     stay on their own mesh."""
     if other is None:
         return problems, ()
+    if other.is_finer:
+        return problems, tuple(OtherMesh((there,), other.factor) for there in other.problems)
     coarse, beside = [], []
     for own, there in zip(problems, other.problems, strict=True):
-        stays = other.is_finer or own.is_pulled
-        coarse.append(own if stays else there)
-        to = there if stays else own
-        beside.append(OtherMesh((to,), other.factor if stays else factor(0.5)))
+        coarse.append(own if own.is_pulled else there)
+        pair = (there, other.factor) if own.is_pulled else (own, factor(0.5))
+        beside.append(OtherMesh((pair[0],), pair[1]))
     return tuple(coarse), tuple(beside)
 
 
