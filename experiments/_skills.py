@@ -51,7 +51,16 @@ def predicted(folder: Path, configuration: str, fabric: str, law: str) -> Line:
 def predicted_elsewhere(folder: Path, configuration: str, repeat: str) -> Line:
     """The line of a table: errors [mm] and skill in the first fold, fling and shaking of MuJoCo's
     sheet of an estimate from its lift of that number, and the seconds of a CPU that it took."""
-    cells = _cells(configuration, FLEX, MOTIONS, int(repeat))
+    return _judged(_cells(configuration, FLEX, MOTIONS, int(repeat)), folder)
+
+
+def predicted_alone(folder: Path, configuration: str, fabric: str) -> Line:
+    """The line of a table: errors [mm] and skill of an estimate in the first fling and shaking of a
+    fabric, and the seconds of a CPU that it took."""
+    return _judged(_cells(configuration, fabric, JUDGED), folder)
+
+
+def _judged(cells: list[EvaluationCell], folder: Path) -> Line:
     line = _errors(cells, folder)
     return line | _made(_estimate(cells), folder)
 

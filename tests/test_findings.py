@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from made_up_study import FABRICS, made_up_rows
 
 from r2s.evaluation.statistics import holm
-from r2s.study.configuration import PAPER_CONFIGURATIONS
+from r2s.study.configuration import PAPER_CONFIGURATIONS, PUBLISHED_CONFIGURATIONS
 from r2s.study.statistics.conclusions import CONCLUSIONS
 from r2s.study.statistics.findings import find, finding_table, in_words
 from r2s.study.statistics.hypotheses import Claim, compare, judge
@@ -55,6 +55,15 @@ MANY = tuple(f"fabric{i}" for i in range(10))  # that is what it takes to tell s
 @pytest.fixture(scope="module")
 def right():
     return find(made_up_rows(as_concluded, fabrics=MANY, trials=6, repeats=4), {})
+
+
+def test_findings_are_not_of_published_recipes(right):
+    worse = made_up_rows(
+        lambda *_: 0.5, configurations=PUBLISHED_CONFIGURATIONS, fabrics=MANY, trials=6, repeats=4
+    )
+    rows = made_up_rows(as_concluded, fabrics=MANY, trials=6, repeats=4)
+    found = find([*rows, *(row for row in worse if row.approach)], {})
+    assert list(map(in_words, found)) == list(map(in_words, right))
 
 
 def answers(verdicts):

@@ -13,9 +13,12 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from r2s.estimation.diffcloud import DiffCloud
+from r2s.estimation.diffcloud import MASS, DiffCloud
+from r2s.estimation.diffcloud import STRETCH as MULTIPLIER
 from r2s.estimation.estimate import point_estimate
+from r2s.estimation.method import default_space
 from r2s.estimation.pinn.synthetic_pulls import pulled
+from r2s.estimation.registry import METHODS
 from r2s.evaluation import prediction_error
 from r2s.fabrics import presets, prior
 from r2s.fabrics.arcsim import write_material
@@ -29,7 +32,13 @@ from r2s.solver import Trajectory
 from r2s.study import engine, estimates, matrix, results
 from r2s.study.cells import dependencies, read_metadata, with_dependencies
 from r2s.study.comparisons import label_of
-from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
+from r2s.study.configuration import (
+    APPROACHES,
+    MOTIONS,
+    PAPER_CONFIGURATIONS,
+    PUBLISHED_CONFIGURATIONS,
+    Configuration,
+)
 from r2s.study.costs import costs, forecast
 from r2s.study.drawn import numbers_of
 from r2s.study.estimates import EstimateCell, TrainedNetwork
@@ -280,6 +289,33 @@ def test_a_lift_and_the_pulls_of_the_network_are_estimated_from_together():
     assert label in {c.configuration.label for c in matrix.synthetic(plan)}
     with pytest.raises(ValueError, match="from one recording, got 4"):
         dataclasses.replace(both, approach="physnet")
+
+
+def test_published_recipes_are_configurations_of_their_own_whatever_a_plan_cuts():
+    names = ["-".join(each) for each in PUBLISHED_CONFIGURATIONS]
+    names.append("physnet-cloth-lifting")
+    plan = matrix.with_changes(matrix.SMALL, names, ["grey_interlock"])
+    every = {c.estimate for c in matrix.synthetic(plan) if c.estimate is not None}
+    published = {each for each in every if each.approach != "physnet"}
+    assert {each.approach for each in published} == {f"{name}-published" for name in APPROACHES}
+    for each in published:
+        assert each.budget == METHODS[each.approach].budget and len(each.sources) == 1
+        assert (each.prior, each.law, each.resolves) == ("flat", "linear", False)
+    (own,) = every - published
+    (theirs,) = (each for each in published if each.name.startswith("physnet-published_cloth_l"))
+    assert own.network == theirs.network and own.budget != theirs.budget
+    labels = [each.label for each in PUBLISHED_CONFIGURATIONS]
+    assert labels[0] == "DIFFCLOUD as published cloth lifting" and len(set(labels)) == 8
+
+
+def test_multipliers_of_an_assumed_fabric_have_no_truth():
+    plan = matrix.with_changes(
+        matrix.SMALL, ["diffcloud-published-cloth-lifting"], ["grey_interlock"]
+    )
+    cell = next(c.estimate for c in matrix.synthetic(plan) if c.estimate is not None)
+    ranges = (*default_space("cloth", cell.density).ranges[:2], MULTIPLIER, MASS)
+    true = results.true_values(cell, ranges)
+    assert np.isfinite(true).tolist() == [True, True, False, False]
 
 
 def test_given_recordings_of_one_fabric_and_trial_go_together():

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 APPROACHES = {"diffcloud": "DIFFCLOUD", "diffcp": "DiffCP", "physnet": "PhysNet", "pinn": "PINN"}
+PUBLISHED = "-published"  # behind an approach: by the recipe of its paper, as it is
 AND = "+"  # between scenarios that are estimated from together
 MOTIONS = ("folding", "fling", "shaking")  # that no estimate has seen
 # baselines that are configurations as well, and what stands for an approach in their labels
@@ -30,8 +31,12 @@ class Configuration(NamedTuple):
     def label(self) -> str:
         if not self.approach:
             return f"default {self.solver}"
-        named = APPROACHES.get(self.approach, self.approach)
-        return f"{named} {self.solver} {self.estimated_from}".strip()
+        return f"{_named(self.approach)} {self.solver} {self.estimated_from}".strip()
+
+    @property
+    def is_published(self) -> bool:
+        """Whether it is by the recipe of the approach's paper."""
+        return self.approach.endswith(PUBLISHED)
 
 
 def as_configuration(configuration: Configuration, baseline: str) -> Configuration:
@@ -41,8 +46,13 @@ def as_configuration(configuration: Configuration, baseline: str) -> Configurati
     words = {"other_fabric": "of another fabric", ON_CLOTH: "found on points"}.get(baseline)
     if words is None:
         return configuration
-    named = APPROACHES.get(configuration.approach, configuration.approach)
-    return configuration._replace(approach=f"{named} ({words})")
+    return configuration._replace(approach=f"{_named(configuration.approach)} ({words})")
+
+
+def _named(approach: str) -> str:
+    """An approach in words; what is none, as it is."""
+    own = approach.removesuffix(PUBLISHED)
+    return APPROACHES.get(own, own) + (" as published" if own != approach else "")
 
 
 def is_reference(label: str) -> bool:
@@ -61,6 +71,11 @@ PAPER_CONFIGURATIONS = (
     Configuration("pinn", "cloth", "stretching"),
 )
 """The configurations in the tables of Ru et al. 2025, in their order."""
+
+PUBLISHED_CONFIGURATIONS = tuple(
+    each._replace(approach=each.approach + PUBLISHED) for each in PAPER_CONFIGURATIONS
+)
+"""The same by the recipes of the approaches' papers, to compare with."""
 
 TOGETHER_CONFIGURATIONS = tuple(
     Configuration("diffcloud", "cloth", AND.join(each))

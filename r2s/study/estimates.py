@@ -69,12 +69,12 @@ class TrainedNetwork(Cell):
 class EstimateCell(Cell):
     """An estimate of a fabric.
 
-    - `approach`: "diffcloud", "diffcp", "physnet" or "pinn".
+    - `approach`: "diffcloud", "diffcp", "physnet" or "pinn", or "-published" behind one of these.
     - `solver`: "cloth" or "points".
     - `sources`: the recordings; several for the pulls of "pinn", and for approaches that estimate
       from several scenarios together.
     - `density`: areal density as weighed, [kg/m^2].
-    - `network`: of "physnet".
+    - `network`: of "physnet" and "physnet-published".
     - `prior`: "fabrics" where what fabrics of this weight are like is known (`r2s.fabrics.prior`),
       else "flat", as on the command line.
     - `resolves`: on meshes that resolve the fabric (`r2s.estimation.mesh_ladder`), not `SHAPES`.
@@ -101,8 +101,9 @@ class EstimateCell(Cell):
     def __post_init__(self) -> None:
         if len(self.sources) > 1 and not METHODS[self.approach].several:
             raise ValueError(f"{self.approach} is from one recording, got {len(self.sources)}")
-        if self.solver not in SOLVERS[self.approach]:
-            raise ValueError(f"{self.approach} is not on {self.solver}: {SOLVERS[self.approach]}")
+        solvers = tuple(METHODS[self.approach].supports)
+        if self.solver not in solvers:
+            raise ValueError(f"{self.approach} is not on {self.solver}: {solvers}")
 
     @property
     def scenario(self) -> str:

@@ -14,6 +14,7 @@ from r2s.scenarios.paths import ESTIMATION, EVALUATION
 from r2s.study.configuration import (
     MOTIONS,
     PAPER_CONFIGURATIONS,
+    PUBLISHED_CONFIGURATIONS,
     TOGETHER_CONFIGURATIONS,
     Configuration,
 )
@@ -47,7 +48,9 @@ FULL = (*PAPER_CONFIGURATIONS, *TOGETHER_CONFIGURATIONS) + tuple(
     if (approach, solver, scenario) not in PAPER_CONFIGURATIONS
     and not METHODS[approach].refusal(solver, scenario)
 )
-"""The configurations of the paper, those that it calls unsupported, and those that it lacks."""
+FULL += PUBLISHED_CONFIGURATIONS
+"""The configurations of the paper, those that it calls unsupported, those that it lacks, and its
+own by published recipes."""
 
 
 @dataclass(frozen=True)
@@ -307,7 +310,10 @@ def _estimate(
     repeat: int,
 ) -> EstimateCell:
     approach, solver, scenario = configuration
-    budget, network = getattr(plan.budgets, approach), None
+    # published recipes are what they are, whatever a plan cuts
+    kept = configuration.is_published
+    budget = METHODS[approach].budget if kept else getattr(plan.budgets, approach)
+    network = None
     if "network" in METHODS[approach].options():
         training = plan.budgets.training
         if solver == "points":

@@ -264,7 +264,8 @@ def parameters(cells: Iterable[EvaluationCell], folder: Path) -> dict[str, list[
 
 def true_values(cell: EstimateCell, ranges: Sequence[Range]) -> np.ndarray:
     """The parameters [unit of the range] of a synthetic recording's fabric, of constant ones those
-    at small strain; NaN where unknown, as of given recordings and of another simulator's sheet."""
+    at small strain; NaN where unknown, as of given recordings, of another simulator's sheet, and of
+    multipliers of an assumed fabric."""
     source = cell.sources[0]
     if (
         cell.solver != "cloth"
@@ -274,4 +275,6 @@ def true_values(cell: EstimateCell, ranges: Sequence[Range]) -> np.ndarray:
         return np.full(len(ranges), np.nan)
     law = law_of(ranges)
     space = with_law(default_space("cloth", cell.density), law)
-    return np.asarray(space.values(space.to_unit(true_fabric(cell.fabric, law, source.truth))))
+    values = space.values(space.to_unit(true_fabric(cell.fabric, law, source.truth)))
+    known = {bound.name: float(v) for bound, v in zip(space.ranges, values, strict=True)}
+    return np.array([known.get(bound.name, np.nan) for bound in ranges])

@@ -10,7 +10,7 @@ from r2s.study.rows import Row
 from r2s.study.statistics.conclusions import CONCLUSIONS
 from r2s.study.statistics.hypotheses import Comparison, Verdict, judge
 from r2s.study.statistics.paper import Paper
-from r2s.study.statistics.result_array import ResultArray, result_array
+from r2s.study.statistics.result_array import ResultArray, result_array, select
 from r2s.study.tables import MISSING, Table, significant
 
 MOST_IN_WORDS = 3
@@ -22,8 +22,9 @@ def find(rows: Sequence[Row], paper: Paper, metric: str = "chamfer") -> list[Ver
 
 
 def find_in(results: ResultArray, paper: Paper) -> list[Verdict]:
-    """The answers to all conclusions."""
-    return judge([conclusion(results, paper) for conclusion in CONCLUSIONS])
+    """The answers to all conclusions, by all configurations but those of published recipes."""
+    own = select(results, lambda configuration: not configuration.is_published)
+    return judge([conclusion(own, paper) for conclusion in CONCLUSIONS])
 
 
 def finding_table(verdicts: Sequence[Verdict], metric: str) -> Table:
