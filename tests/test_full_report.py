@@ -8,7 +8,7 @@ from made_up_study import made_up_comparison, made_up_rows
 from test_report import Page
 
 from r2s.fabrics.parameters import Range
-from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS
+from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, PUBLISHED_CONFIGURATIONS
 from r2s.study.costs import Cost, cost_table
 from r2s.study.report import full, overlays
 from r2s.study.report.figures import looks_of
@@ -23,6 +23,7 @@ ESTIMATED = Estimated(
     np.array([True]),
     np.array([np.nan]),
 )
+CONFIGURATIONS = (*PAPER_CONFIGURATIONS, PUBLISHED_CONFIGURATIONS[0])
 COSTS = cost_table([Cost("estimates", count=3, seconds=12.345, each=4.1, peak_memory=512.0)])
 
 
@@ -40,7 +41,7 @@ def published(tmp_path_factory):
         patch.setattr(full, "MOST_IN_VIEWER", 2)
         tables = full.publish(
             out,
-            made_up_rows(some_diverged, trials=3),
+            made_up_rows(some_diverged, CONFIGURATIONS, trials=3),
             motions,
             {"cloth": [ESTIMATED], "points": []},
             [("estimates pinn_denim", "RuntimeError: <diverged>")],
@@ -58,7 +59,8 @@ def test_all_parts_are_there(published):
         "Viewer", "123 ± 12 N/m",
         "RuntimeError: <diverged>", "12.3",
         "peak memory [MB]", "recordings", "made up", "version of jax", "diverged)",
-        "1 more recordings are not in it", "videos/fling_black_denim1.",
+        "1 more recordings are not in it", "DIFFCLOUD as published cloth lifting",
+        "videos/fling_black_denim1.",
     ):  # fmt: skip
         assert text in page.text, text
     written = {path.stem for path in (out / "tables").iterdir()}
