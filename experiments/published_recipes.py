@@ -1,10 +1,10 @@
 """What do the recipes of the approaches' papers predict, beside knowing nothing and the truth?
 
-python experiments/published_recipes.py --out docs/results/published_recipes.csv    # an hour
+python experiments/published_recipes.py --out docs/results/published_recipes.csv    # two hours
 
 Each as it is (`r2s.study.configuration.PUBLISHED_CONFIGURATIONS`), from one recording; PhysNet's
-network is trained as in the preset "small". On the cloth; references and skill are those of
-`experiments/skill_by_fabric.py`.
+network is trained as in the preset "small"; of DIFFCLOUD's mass see `MultiplierSpace`. On the
+cloth; references and skill are those of `experiments/skill_by_fabric.py`.
 """
 
 from functools import partial
