@@ -14,6 +14,7 @@ from r2s.estimation import covariance, descent, mesh_ladder
 from r2s.estimation.compiled import derivatives_at, normal_from
 from r2s.estimation.diffcloud import DiffCloud
 from r2s.estimation.estimate import Estimate
+from r2s.estimation.estimate_json import as_json, from_json
 from r2s.estimation.gauss_newton import Descent, Normal, theta_length
 from r2s.estimation.mesh_bias import OtherMesh, factor, mesh_bias
 from r2s.estimation.method import Budget
@@ -238,6 +239,32 @@ def test_each_rung_keeps_its_state_in_a_file_of_its_own(monkeypatch, tmp_path):
     files = {"checkpoint": tmp_path / "card.progress.npz", "key": jr.key(0)}
     mesh_ladder.descend_by_meshes([lift(), lift()], SPACE, SMALL, **files)
     assert len(kept) == len(set(kept)) == 4
+
+
+def test_where_all_diverges_on_a_finer_mesh_the_estimate_is_of_the_coarser_and_says_so(monkeypatch):
+    climbed: list[tuple[int, bool]] = []
+
+    def searched(problems, budget, **_):
+        climbed.append((len(problems[0].scenario.scene.mesh.rest), budget.leads_on))
+        if climbed[-1][0] == 25:
+            raise RuntimeError("all starts of the descents diverged")
+        return descent.Search(problems, [], 0.0, derivatives_at)
+
+    monkeypatch.setattr(descent.Search, "theta", jnp.zeros(3))
+    monkeypatch.setattr(mesh_ladder, "search", searched)
+    monkeypatch.setattr(mesh_ladder, "is_too_coarse", lambda *_: True)
+    monkeypatch.setattr(mesh_ladder, "judged", lambda *_, **__: estimate_of_nothing())
+    monkeypatch.setattr(resolution, "LADDER", (3, 5))
+    told: list[str] = []
+    monkeypatch.setattr(mesh_ladder, "tell", lambda _, words: told.append(words))
+    found = mesh_ladder.descend_by_meshes([lift()], SPACE, SMALL, key=jr.key(0))
+    assert climbed == [(9, True), (25, False), (9, False)]
+    assert found.shape == (3, 3)
+    assert found.refused.startswith("5 x 5 vertices") and "diverged" in found.refused
+    assert any("back to 3 x 3" in words for words in told)
+    assert from_json(as_json(found)).refused == found.refused
+    with pytest.raises(RuntimeError, match="diverged"):  # the finest was asked for
+        mesh_ladder.descend_by_meshes([lift()], SPACE, SMALL, finest=True, key=jr.key(0))
 
 
 @pytest.mark.slow(group="estimates")

@@ -319,6 +319,8 @@ def _warnings(estimate: "Estimate", recordings: "Sequence[Recording]") -> list[s
     for size, scenario in motions:
         coarse += mesh_warning(alike(shape, size), fabric, size, scenario) if shape else []
     agreed = _agreement(estimate, recordings, bool(coarse))
+    if estimate.refused:
+        coarse.append(f"warning: estimated on a coarser mesh than {estimate.refused}")
     return [*agreed, *_misfits(estimate, recordings), *coarse]
 
 

@@ -128,6 +128,7 @@ class Estimate:
       errors, which hold it (`r2s.estimation.mesh_bias`). None: that was not judged.
     - `shape`: vertices of the simulated sheet along warp and weft; None: it has none, or a file
       does not say.
+    - `refused`: a finer mesh that the fabric needs, and why it was not taken; "": there is none.
     - `misfits`: what of the recordings does not fit. `left_out`: of each the share that counts for
       little or nothing, [-]; none where that was not judged.
     - `shares`: of each recording in the loss, [-]; none of one, or where a method has no shares.
@@ -153,6 +154,7 @@ class Estimate:
     misfits: tuple[Misfit, ...] = ()
     left_out: tuple[float, ...] = ()
     shares: tuple[float, ...] = ()
+    refused: str = ""
 
     @property
     def at_bounds(self) -> dict[str, Literal["lower", "upper"]]:

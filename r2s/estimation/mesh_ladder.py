@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -61,15 +62,19 @@ def descend_by_meshes(
     whichever fabric is found; not with a `shape`.
 
     The other arguments are those of `r2s.estimation.descent.descend`; each mesh has a checkpoint.
+    Where a mesh is too coarse, but on the finer one all diverges, the estimate is that of the end
+    on the coarser mesh, and `refused` says why (with `finest` it is an error).
+
     The `shape` of the estimate is the finest, of a sheet that is not taut where there is one.
     Its `mesh_bias` is judged by a mesh whose cells are half as long, or twice as long where that
-    would be finer than all of `r2s.scenarios.resolution.LADDER`.
+    would be finer than all of `r2s.scenarios.resolution.LADDER`, or diverged.
     """
 
     derive = remembering()
 
     known, lock = functools.cache(partial(_problems, recordings, space)), threading.Lock()
     counts: list[Array] = []  # of each recording, once it is known
+    refused = ""
 
     def on(*shapes: Shape) -> tuple[Problem, ...]:
         with lock:  # else two threads make them twice, and `derive` knows one of these
@@ -78,14 +83,15 @@ def descend_by_meshes(
 
     def climb(shapes: list[Shape], start: Theta | None, leads_on: bool) -> _Rung:
         more, path = budget, checkpoint
-        rows, columns = max(shapes)  # a pull's is that of the rung before on the last one
+        name = _named(max(shapes))  # a pull's is that of the rung before on the last one
         if start is not None:
             more = near(budget)
             if path:
-                path = path.with_suffix(f".{rows}x{columns}{'' if leads_on else '.end'}.npz")
+                short = name.replace(" ", "")
+                path = path.with_suffix(f".{short}{'' if leads_on else '.end'}.npz")
         more = more._replace(leads_on=leads_on)
         saved = {"checkpoint": path, "progress": progress, "derive": derive, "key": key}
-        words = f"descents on {rows} x {columns} vertices"
+        words = f"descents on {name} vertices"
         found = search(on(*shapes), more, start=start, words=words, **saved)
         return _Rung(shapes, found)
 
@@ -98,10 +104,11 @@ def descend_by_meshes(
         for shapes in rungs[:2]:
             yield lambda shapes=shapes: prepare(on(*shapes), budget.width)
         last = rungs[:2][-1]
-        for shapes in (_others(last), last):
+        others = _others(last, 2.0 if _is_finest(last) else 0.5)
+        for shapes in (others, last):
             yield lambda shapes=shapes: prepare(on(*shapes), derivatives=False)
         if finest:  # else that of the rung before
-            yield lambda: prepare(on(*_others(last)), budget.width)
+            yield lambda: prepare(on(*others), budget.width)
 
     with meanwhile(needed() if kept() else ()):
         at = climb(rungs[0], None, len(rungs) > 1)
@@ -114,12 +121,23 @@ def descend_by_meshes(
                 at = climb(at.shapes, at.found.theta, False)  # to its end, where it may be softer
                 if not is_too_coarse(recordings, at.found.fabric, at.shapes):
                     break
-            at = climb(shapes, at.found.theta, shapes is not rungs[-1])
+            try:
+                at = climb(shapes, at.found.theta, shapes is not rungs[-1])
+            except RuntimeError as error:
+                if finest or isinstance(error, jax.errors.JaxRuntimeError):  # out of memory, say
+                    raise
+                refused = f"{_named(max(shapes))} vertices, which it needs: {error}"
+                tell(
+                    progress, f"the finer mesh diverged: back to {_named(max(at.shapes))} vertices"
+                )
+                at = climb(at.shapes, at.found.theta, False)
+                break
         tell(progress, "standard errors")
-        other = OtherMesh(on(*_others(at.shapes)), factor(2.0 if _is_finest(at.shapes) else 0.5))
+        ratio = 2.0 if refused or _is_finest(at.shapes) else 0.5
+        other = OtherMesh(on(*_others(at.shapes, ratio)), factor(ratio))
         saved = {"checkpoint": checkpoint, "progress": progress, "key": key}
         estimate = judged(at.found, budget, other_mesh=other, **saved)
-    return dataclasses.replace(estimate, shape=_told(recordings, at.shapes))
+    return dataclasses.replace(estimate, shape=_told(recordings, at.shapes), refused=refused)
 
 
 def descend_weighed(
@@ -238,15 +256,18 @@ def in_steps_worth(scenario: Scenario, name: str, shape: Shape) -> Scenario:
     return dataclasses.replace(scenario, substeps=max(scenario.substeps, steps))
 
 
+def _named(shape: Shape) -> str:
+    return f"{shape[0]} x {shape[1]}"
+
+
 def _is_finest(shapes: Sequence[Shape]) -> bool:
     return max(map(max, shapes)) >= max(resolution.LADDER)
 
 
-def _others(shapes: Sequence[Shape]) -> list[Shape]:
-    """The meshes by which those of `shapes` are judged."""
+def _others(shapes: Sequence[Shape], ratio: float) -> list[Shape]:
+    """Meshes whose cells are `ratio` times as long."""
 
     def other(count: int) -> int:
-        cells = (count - 1) // 2 if _is_finest(shapes) else 2 * (count - 1)
-        return max(cells, 1) + 1
+        return max(int((count - 1) / ratio), 1) + 1
 
     return [(other(rows), other(columns)) for rows, columns in shapes]
