@@ -104,7 +104,7 @@ def descend_by_meshes(
         for shapes in rungs[:2]:
             yield lambda shapes=shapes: prepare(on(*shapes), budget.width)
         last = rungs[:2][-1]
-        others = _others(last, 2.0 if _is_finest(last) else 0.5)
+        others = _others(last, _ratio(last))
         for shapes in (others, last):
             yield lambda shapes=shapes: prepare(on(*shapes), derivatives=False)
         if finest:  # else that of the rung before
@@ -127,13 +127,11 @@ def descend_by_meshes(
                 if finest or isinstance(error, jax.errors.JaxRuntimeError):  # out of memory, say
                     raise
                 refused = f"{_named(max(shapes))} vertices, which it needs: {error}"
-                tell(
-                    progress, f"the finer mesh diverged: back to {_named(max(at.shapes))} vertices"
-                )
+                tell(progress, f"the finer mesh diverged: back to {_named(max(at.shapes))}")
                 at = climb(at.shapes, at.found.theta, False)
                 break
         tell(progress, "standard errors")
-        ratio = 2.0 if refused or _is_finest(at.shapes) else 0.5
+        ratio = 2.0 if refused else _ratio(at.shapes)
         other = OtherMesh(on(*_others(at.shapes, ratio)), factor(ratio))
         saved = {"checkpoint": checkpoint, "progress": progress, "key": key}
         estimate = judged(at.found, budget, other_mesh=other, **saved)
@@ -262,6 +260,11 @@ def _named(shape: Shape) -> str:
 
 def _is_finest(shapes: Sequence[Shape]) -> bool:
     return max(map(max, shapes)) >= max(resolution.LADDER)
+
+
+def _ratio(shapes: Sequence[Shape]) -> float:
+    """How long the cells are of the meshes by which those of `shapes` are judged, over theirs."""
+    return 2.0 if _is_finest(shapes) else 0.5
 
 
 def _others(shapes: Sequence[Shape], ratio: float) -> list[Shape]:

@@ -29,7 +29,7 @@ SETTLING = 3.0  # [s], in which a sheet that hangs comes to rest before the firs
 BRAKE = 8.0  # [1/s], mass damping meanwhile: a sheet of 0.45 m swings at 5.6/s, and has lost its
 # energy by 4e-11
 ITERATIONS = 1000  # of Newton's method, of a sheet that hangs: laid onto a cloud it starts far from
-# rest, and on 33 x 33 vertices its first step may take more than 500
+# rest, and on 33 x 33 vertices its first step may take more than 500 (by its time)
 BOW = 0.01  # [m], by which a hanging sheet starts out of its plane, so that it buckles to one side
 GUST = 0.5  # [s], in which a wind rises from nothing
 JET = (1 / 3, 1 / 4)  # radius and edge of a fan's jet, of the sheet's shorter side
