@@ -57,7 +57,6 @@ def test_the_command_line_offers_every_method_and_no_other():
         ("diffcloud", "points", 1, "on material points take diffcp"),
         ("pinn", "points", 1, "estimates from stretching, not from lifting: without markers"),
         ("pinn-published", "cloth", 1, "estimates from stretching, not from lifting"),
-        ("pinn", "cloth", 2, "several stretchings, or one recording of another motion"),
         ("physnet", "cloth", 2, "takes one recording, got 2"),
         ("diffcloud", "cloth", 0, "needs a recording"),
         ("cma-es", "felt", 1, "a solver is one of cloth, points, got 'felt'"),
@@ -67,6 +66,14 @@ def test_what_is_not_supported_is_refused_with_a_reason(recording, name, solver,
     method = METHODS[name](solver=solver)
     with pytest.raises(ValueError, match=words):
         method.estimate([recording] * number, SPACE, key=jr.key(0))
+
+
+def test_pulls_and_clouds_are_not_for_one_network(recording):
+    pull = dataclasses.replace(
+        recording, info=dataclasses.replace(recording.info, scenario="stretching")
+    )
+    with pytest.raises(ValueError, match="stretchings, or recordings of other motions, not both"):
+        METHODS["pinn"]().estimate([recording, pull], SPACE, key=jr.key(0))
 
 
 def test_every_method_supports_a_solver_and_says_why_not_the_other():

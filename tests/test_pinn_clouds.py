@@ -283,7 +283,7 @@ def test_the_map_comes_to_lie_where_the_points_are():
     with jax.numpy_dtype_promotion("standard"):
         seen = synthetic.record(wind(), fabric, "grey_interlock", shape=(17, 17), key=jr.key(11))
         few = from_clouds.Settings(rounds=10)
-        found = from_clouds.estimate(seen, space, few, key=jr.key(0))
+        found = from_clouds.estimate([seen], space, few, key=jr.key(0))
     spreads = np.sqrt(found.losses[:, 0])  # [m]
     assert spreads[-1] < 0.5 * spreads[0]
     assert found.values[0] < 0.5 * space.values(jnp.full(space.dim, 0.5))[0]  # softer
@@ -294,4 +294,4 @@ def test_a_wind_that_is_still_rising_does_not_count():
     seen = recorded(wind())
     windy = dataclasses.replace(seen.info, wind=(0.0, 2.0, 0.0))
     with pytest.raises(ValueError, match="after the wind rises"):
-        from_clouds.estimate(dataclasses.replace(seen, info=windy), FAMILY, key=jr.key(0))
+        from_clouds.estimate([dataclasses.replace(seen, info=windy)], FAMILY, key=jr.key(0))

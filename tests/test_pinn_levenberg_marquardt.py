@@ -64,6 +64,22 @@ def test_a_line_is_found_in_a_step():
     np.testing.assert_allclose(found.information, 1.25 * design.T @ design, rtol=1e-9)
 
 
+def test_terms_share_some_parameters_and_have_others_of_their_own():
+    """Two lines of one slope: theta has both offsets, then the slope."""
+    x, rise = np.linspace(0, 1, 20), np.random.default_rng(1).normal(size=(2, 20))
+    rows = [(jnp.asarray(x), jnp.asarray(y)) for y in rise]
+    own = jnp.array([0, 2]), jnp.array([1, 2])
+    terms = [
+        Term(of_line, jnp.asarray(1.0), row, 7, each) for row, each in zip(rows, own, strict=True)
+    ]
+    found = least_squares(terms, np.zeros(3), 20, damping=1e-12)
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    design = np.concatenate([np.stack([one, zero, x], 1), np.stack([zero, one, x], 1)])
+    expected = np.linalg.lstsq(design, rise.ravel(), rcond=None)[0]
+    np.testing.assert_allclose(found.parameters, expected, rtol=1e-6)
+    np.testing.assert_allclose(found.information, 2 * design.T @ design, rtol=1e-9, atol=1e-12)
+
+
 def test_steps_go_down_and_keep_to_bounds():
     x = jnp.linspace(0.0, 2.0, 12)
     term = Term(of_curve, jnp.asarray(1.0), (x, jnp.exp(1.3 * x) + 0.7))

@@ -1,9 +1,9 @@
 """The physics-informed network from clouds without markers: a sheet that is lifted, or in the wind.
 
-A network from (X, Y, t) to places is fitted, with the fabric, to the clouds (each point to the
-nearest place of the network's own map, matched again and again), to the grippers' path, and to the
-balance of forces in the weak form. Gravity gives the scale, since the areal density is known. The
-fit begins with the motion of a middling fabric in the cloth solver.
+For each recording a network from (X, Y, t) to places is fitted, with one fabric for all, to the
+clouds (each point to the nearest place of the network's own map, matched again and again), to the
+grippers' path, and to the balance of forces in the weak form. Gravity gives the scale, since the
+areal density is known. The fit begins with the motion of a middling fabric in the cloth solver.
 
 It does not find the fabric. The map comes to lie within 2 mm of the points and forces balance to
 1 %, but with a stiffness far too low, also when it begins with the true one. Clouds do not say how
@@ -15,7 +15,7 @@ nearly (`experiments/unbalanced_maps.py`): the fit of one best map fails. For cl
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from r2s.estimation.estimate import Estimate, Nuisance, point_estimate
 from r2s.estimation.pinn.hanging_sheet import (
@@ -98,8 +98,26 @@ class Settings:
     layers: int = 4
 
 
-Theta = Float[Array, " theta"]  # parameters of the network, then the place in the parameter space
-Report = Callable[[int, float, np.ndarray], None]
+# parameters of a network (of all of them, one after the other), then the place in the space
+Theta = Float[Array, " theta"]
+
+
+class Round(NamedTuple):
+    """What a round of matching and steps led to.
+
+    - `number`: from 0.
+    - `spread`: of the distances of points from the maps, root mean square of the recordings, [m].
+    - `squares`: sum of all squares of residuals, [-].
+    - `values`: of the parameters.
+    """
+
+    number: int
+    spread: float
+    squares: float
+    values: Float[np.ndarray, " dim"]
+
+
+Report = Callable[[Round], None]
 
 
 class Shared(eqx.Module):
@@ -157,8 +175,35 @@ def clipped(dim: int) -> Callable[[np.ndarray], np.ndarray]:
     return inside
 
 
+class Motion(eqx.Module):
+    """A recording and its network.
+
+    - `shared`, `sight`: what its rows share, and what was seen.
+    - `grips`: names of the corners that are held. `held`: rows of their path.
+    - `own`: which numbers of theta are of its network; then those of the place in the space.
+    """
+
+    shared: Shared
+    sight: Sight
+    grips: tuple[str, ...] = eqx.field(static=True)
+    held: Rows
+    own: Int[Array, " own"]
+
+    def of(self, theta: Float[np.ndarray, " theta"]) -> Network:
+        """Its network."""
+        return self.shared.network(jnp.asarray(theta, float)[self.own])
+
+    def term(self, function: Callable[..., Array], rows, together: int = 256) -> Term:
+        """Residuals of its network and the fabric."""
+        return Term(function, self.shared, rows, together, self.own)
+
+    def mesh(self, shape: tuple[int, int]) -> Mesh:
+        """A mesh of its sheet."""
+        return rectangle((float(self.sight.size[0]), float(self.sight.size[1])), shape)
+
+
 def estimate(
-    recording: Recording,
+    recordings: Sequence[Recording],
     space: ParameterSpace,
     settings: Settings = Settings(),
     *,
@@ -166,31 +211,36 @@ def estimate(
     report: Report | None = None,
     key: PRNGKeyArray,
 ) -> Estimate:
-    """The fabric of a recording of a sheet that is lifted or hangs, from its clouds.
+    """The fabric of recordings of a sheet that is lifted or hangs, from their clouds.
 
     It has no standard errors: what it finds is far from the truth, and no linear model says how
     far. One that still moved in its last round has not converged.
 
     - `begin`: place in the space of the fabric to begin with, by default the middle.
-    - `report`: called after each round with its number, the spread of the distances [m] and the
-      parameters of the fabric.
+    - `report`: called after each round.
 
     Raises `ValueError` for too few frames, `RuntimeError` when the solver or the network diverges.
     """
     if settings.rounds < 1:
         raise ValueError(f"at least one round is needed, got {settings.rounds}")
     began = time.perf_counter()
-    frames = np.array(frames_of(recording, settings.frames))
-    sight = sight_of(recording, frames, settings.points)
-    shared = _shared(recording, space, sight, settings, key)
-    held = fixed(sight.corners, sight.times, sight.grips, GRIP)
     place = np.full(space.dim, 0.5) if begin is None else np.asarray(begin, np.float64)
-    solver = _of_solver(recording, space(jnp.asarray(place, float)), sight, frames)
-    theta = np.concatenate([parameters_of(shared.likeness), place])
-    terms = [_rows(shared, held), _rows(shared, solver), prior(place)]
-    theta = least_squares(terms, theta, settings.begin, inside=clipped(space.dim)).parameters
-    found = _rounds(shared, sight, held, theta, recording.info.sheet.held, settings, report)
-    words = f"clouds of {recording.info.scenario}"
+    fabric = space(jnp.asarray(place, float))
+    motions: list[Motion] = []
+    drawn = [prior(place)]
+    for number, recording in enumerate(recordings):
+        frames = np.array(frames_of(recording, settings.frames))
+        sight = sight_of(recording, frames, settings.points)
+        one = jax.random.fold_in(key, number)
+        motion = _motion(recording, space, sight, settings, number, len(recordings), one)
+        solver = _of_solver(recording, fabric, sight, frames)
+        drawn += [motion.term(_of_row, motion.held), motion.term(_of_row, solver)]
+        motions.append(motion)
+    networks = [parameters_of(motion.shared.likeness) for motion in motions]
+    theta = np.concatenate([*networks, place])
+    theta = least_squares(drawn, theta, settings.begin, inside=clipped(space.dim)).parameters
+    found = _rounds(motions, theta, settings, report)
+    words = f"clouds of {', '.join(each.info.scenario for each in recordings)}"
     return _estimate(words, space, found, time.perf_counter() - began)
 
 
@@ -199,54 +249,50 @@ class Found(NamedTuple):
 
     - `place`: in the parameter space.
     - `settled`: whether the fabric hardly moved in the last round.
-    - `history`: square of the spread of the distances [m^2] and parameters, of every round.
+    - `history`: every round.
     """
 
     place: np.ndarray
     settled: bool
-    history: list[tuple[float, np.ndarray]]
+    history: list[Round]
 
 
 def _rounds(
-    shared: Shared,
-    sight: Sight,
-    held: Rows,
-    theta: np.ndarray,
-    names: tuple[str, ...],
-    settings: Settings,
-    report: Report | None,
+    motions: Sequence[Motion], theta: np.ndarray, settings: Settings, report: Report | None
 ) -> Found:
     """Match points and make a few steps, again and again.
 
-    The fabric follows when the map is in balance.
+    The fabric follows when the maps are in balance.
     """
-    size, dim = (float(sight.size[0]), float(sight.size[1])), shared.space.dim
-    fine, coarse = rectangle(size, FINE), rectangle(size, COARSE)
-    damping, history, settled = FIRST, [], False
-    noise = np.inf
+    space = motions[0].shared.space
+    dim, history, settled = space.dim, [], False
+    damping, noises = FIRST, [np.inf] * len(motions)
     firm, free = prior(theta[-dim:], FIRM), prior(np.full(dim, 0.5))
     for number in range(settings.rounds):
-        network = shared.network(jnp.asarray(theta, float))
-        near, spread = matched(network, sight, fine)
-        # not the spread itself: what is far off would never be worth coming nearer
-        noise = max(settings.noise, min(float(spread), SHARPER * noise))
-        near = near._replace(weight=near.weight * (float(spread) / noise))
-        terms = [
-            _rows(shared, held),
-            _rows(shared, near),
-            _rows(shared, bordered(network, sight)),
-            *_of_table(network, shared, sight, coarse),
-            firm if number < settings.held else free,
-            _of_balance(network, shared, sight, names, settings.balanced),
-        ]
+        terms, spreads = [firm if number < settings.held else free], []
+        for i, motion in enumerate(motions):
+            network = motion.of(theta)
+            near, spread = matched(network, motion.sight, motion.mesh(FINE))
+            spreads.append(float(spread))
+            # not the spread itself: what is far off would never be worth coming nearer
+            noises[i] = max(settings.noise, min(spreads[i], SHARPER * noises[i]))
+            near = near._replace(weight=near.weight * (spreads[i] / noises[i]))
+            terms += [
+                motion.term(_of_row, motion.held),
+                motion.term(_of_row, near),
+                motion.term(_of_row, bordered(network, motion.sight)),
+                *_of_table(network, motion),
+                _of_balance(network, motion, settings.balanced),
+            ]
         found = least_squares(terms, theta, settings.steps, inside=clipped(dim), damping=damping)
         moved = np.abs(found.parameters - theta)[-dim:].max()
         theta, damping = found.parameters, min(found.damping, FIRST)
-        values = np.asarray(shared.space.values(jnp.asarray(theta[-dim:], float)))
-        history.append((float(spread) ** 2, values))
+        values = np.asarray(space.values(jnp.asarray(theta[-dim:], float)))
+        spread = float(np.mean(np.square(spreads)) ** 0.5)
+        history.append(Round(number, spread, float(found.squares[-1]), values))
         if report is not None:
-            report(number, float(spread), values)
-        sharp = number > settings.held and noise == settings.noise
+            report(history[-1])
+        sharp = number > settings.held and max(noises) == settings.noise
         settled = sharp and bool(moved < SETTLED)
         if settled:
             break
@@ -266,6 +312,25 @@ def frames_of(recording: Recording, number: int = Settings.frames) -> tuple[int,
             "least" + (f", {GUST_OVER:g} s after the wind rises" if recording.info.wind else "")
         )
     return tuple(np.unique(np.linspace(first, last, number).round().astype(int)).tolist())
+
+
+def _motion(
+    recording: Recording,
+    space: ParameterSpace,
+    sight: Sight,
+    settings: Settings,
+    number: int,
+    of: int,
+    key: PRNGKeyArray,
+) -> Motion:
+    """The `number`-th `of` some recordings, counted from 0."""
+    shared = _shared(recording, space, sight, settings, key)
+    size = len(parameters_of(shared.likeness))
+    own = jnp.concatenate(
+        [number * size + jnp.arange(size), of * size + jnp.arange(space.dim)],
+    )
+    held = fixed(sight.corners, sight.times, sight.grips, GRIP)
+    return Motion(shared, sight, recording.info.sheet.held, held, own)
 
 
 def _shared(
@@ -306,21 +371,18 @@ def _of_solver(recording: Recording, fabric: Fabric, sight: Sight, frames: np.nd
     return fixed(scenario.scene.mesh.rest, sight.times, jnp.asarray(local, float), BEGIN)
 
 
-def _rows(shared: Shared, rows: Rows) -> Term:
-    return Term(_of_row, shared, rows)
-
-
 def _of_row(theta: Theta, shared: Shared, row: Rows) -> Array:
     at = placed(shared.network(theta), row.place[None])[0]
     return (row.weight * (row.direction @ (at - row.target)))[None]
 
 
-def _of_table(network: Network, shared: Shared, sight: Sight, mesh: Mesh) -> list[Term]:
+def _of_table(network: Network, motion: Motion) -> list[Term]:
     """Terms that keep the map above the table, and unstretched where it lies on it."""
-    lifted = above(network, sight, mesh)
+    sight = motion.sight
+    lifted = above(network, sight, motion.mesh(COARSE))
     height = placed(network, lifted.place) @ sight.up - sight.table
     weight = jnp.where(height < LOW, 1 / STRAIN, 0.0)
-    return [_rows(shared, lifted), Term(_of_strain, shared, (lifted.place, weight))]
+    return [motion.term(_of_row, lifted), motion.term(_of_strain, (lifted.place, weight))]
 
 
 def _of_strain(theta: Theta, shared: Shared, row) -> Array:
@@ -329,13 +391,12 @@ def _of_strain(theta: Theta, shared: Shared, row) -> Array:
     return weight * green(jnp.stack([jet.first[X, 0], jet.first[Y, 0]], axis=1))
 
 
-def _of_balance(
-    network: Network, shared: Shared, sight: Sight, grips: tuple[str, ...], every: int
-) -> Term:
+def _of_balance(network: Network, motion: Motion, every: int) -> Term:
     """The work of all forces in every so many-th frame, where the sheet is neither held nor on the
     table."""
     names = ("origin", "warp", "weft", "opposite")  # in the order of `loose`
-    held = jnp.array([name in grips for name in names])
+    shared, sight = motion.shared, motion.sight
+    held = jnp.array([name in motion.grips for name in names])
     places = shared.parts.nodes * sight.size[None]
 
     def free(time: Float[Array, ""]) -> Bool[Array, " function"]:
@@ -343,7 +404,7 @@ def _of_balance(
         return loose(shared.parts, held, low)
 
     times = sight.times[every // 2 :: every]
-    return Term(_of_work, shared, (times, jax.vmap(free)(times)), 1)
+    return motion.term(_of_work, (times, jax.vmap(free)(times)), 1)
 
 
 def _of_work(theta: Theta, shared: Shared, row) -> Array:
@@ -356,14 +417,14 @@ def _of_work(theta: Theta, shared: Shared, row) -> Array:
 
 def _estimate(words: str, space: ParameterSpace, found: Found, seconds: float) -> Estimate:
     """The estimate of the last round."""
-    squares = np.array([square for square, _ in found.history])[:, None]
+    squares = np.array([each.spread**2 for each in found.history])[:, None]
     estimate = point_estimate(
         f"pinn (weak form, {words})",
         space,
         jnp.asarray(found.place, float),
         float(squares[-1, 0]),
         squares,
-        np.stack([values for _, values in found.history])[:, None],
+        np.stack([each.values for each in found.history])[:, None],
         seconds,
         converged=found.settled,
     )

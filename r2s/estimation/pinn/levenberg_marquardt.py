@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from scipy.linalg import cho_factor, cho_solve
 
 DAMPINGS, GROWTH = (1e-9, 1e9), 2.0  # of Levenberg's, times the mean of the matrix's diagonal
@@ -36,12 +36,18 @@ class Term(eqx.Module):
     - `shared`: by all rows.
     - `rows`: arrays with a leading axis of rows.
     - `together`: number of rows whose derivatives are taken at once.
+    - `own`: numbers of the parameters that the function is given; None: all of them.
     """
 
     function: Callable[..., Array] = eqx.field(static=True)
     shared: Any
     rows: Any
     together: int = eqx.field(static=True, default=256)
+    own: Int[Array, " own"] | None = None
+
+    def of_own(self, parameters: Parameters) -> Float[Array, " own"]:
+        """Those of the parameters that it is given."""
+        return parameters if self.own is None else parameters[self.own]
 
 
 class Fit(NamedTuple):
@@ -66,8 +72,9 @@ def residuals(terms: Sequence[Term], parameters: Parameters) -> Array:
     """All residuals [-], one term after the other."""
 
     def of(term: Term):
+        own = term.of_own(parameters)
         return jax.lax.map(
-            lambda row: term.function(parameters, term.shared, row),
+            lambda row: term.function(own, term.shared, row),
             term.rows,
             batch_size=term.together,
         ).ravel()
@@ -76,30 +83,38 @@ def residuals(terms: Sequence[Term], parameters: Parameters) -> Array:
 
 
 @eqx.filter_jit
-def linearised(terms: Sequence[Term], parameters: Parameters) -> tuple[Array, Array]:
-    """Residuals and their Jacobian (residual, parameter)."""
+def linearised(terms: Sequence[Term], parameters: Parameters) -> list[tuple[Array, Array]]:
+    """The residuals of each term and their Jacobian (residual, parameter of its own)."""
 
     def of(term: Term):
+        own = term.of_own(parameters)
+
         def each(row):
             def value(parameters):
                 found = term.function(parameters, term.shared, row)
                 return found, found
 
-            slope, residual = jax.jacrev(value, has_aux=True)(parameters)
+            slope, residual = jax.jacrev(value, has_aux=True)(own)
             return residual, slope
 
         residual, slope = jax.lax.map(each, term.rows, batch_size=term.together)
-        return residual.ravel(), slope.reshape(-1, len(parameters))
+        return residual.ravel(), slope.reshape(-1, len(own))
 
-    residual, slope = zip(*(of(term) for term in terms), strict=True)
-    return jnp.concatenate(residual), jnp.concatenate(slope)
+    return [of(term) for term in terms]
 
 
 def normal_equations(terms: Sequence[Term], parameters: Float[np.ndarray, " parameter"]):
     """Residuals, J^T J and J^T r, in double precision. Raises `RuntimeError` if not finite."""
-    residual, jacobian = linearised(tuple(terms), jnp.asarray(parameters, float))
-    residual, jacobian = (np.asarray(part, np.float64) for part in (residual, jacobian))
-    matrix, right = jacobian.T @ jacobian, jacobian.T @ residual
+    number = len(parameters)
+    matrix, right, rest = np.zeros((number, number)), np.zeros(number), []
+    found = linearised(tuple(terms), jnp.asarray(parameters, float))
+    for term, parts in zip(terms, found, strict=True):
+        residual, jacobian = (np.asarray(part, np.float64) for part in parts)
+        own = np.arange(number) if term.own is None else np.asarray(term.own)
+        matrix[np.ix_(own, own)] += jacobian.T @ jacobian
+        right[own] += jacobian.T @ residual
+        rest.append(residual)
+    residual = np.concatenate(rest)
     if not (np.isfinite(residual).all() and np.isfinite(matrix).all()):
         raise RuntimeError("the residuals of the network or their derivatives are not finite")
     return residual, matrix, right

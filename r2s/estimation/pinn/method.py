@@ -56,17 +56,16 @@ class PINN(Method):
                 checkpoint=self.checkpoint,
                 key=key,
             ).estimate
-        if len(recordings) > 1:
-            raise ValueError("pinn takes several stretchings, or one recording of another motion")
+        if any(each.info.scenario == "stretching" for each in recordings):
+            raise ValueError("pinn takes stretchings, or recordings of other motions, not both")
         settings = from_clouds.Settings()
         rounds = min(settings.rounds, budget.iterations)
         settings = dataclasses.replace(settings, rounds=rounds)
-        return from_clouds.estimate(recordings[0], space, settings, report=self._report, key=key)
+        return from_clouds.estimate(recordings, space, settings, report=self._report, key=key)
 
-    def _report(self, number: int, spread: float, values: np.ndarray) -> None:
-        del values
+    def _report(self, end) -> None:
         if self.progress is not None:
-            self.progress(number, spread**2)
+            self.progress(end.number, end.spread**2)
 
 
 @dataclass(frozen=True, kw_only=True)
