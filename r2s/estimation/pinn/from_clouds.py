@@ -6,11 +6,11 @@ grippers' path, and to the balance of forces in the weak form. Gravity gives the
 areal density is known. The fit begins with the motion of a middling fabric in the cloth solver.
 
 It does not find the fabric. The map comes to lie within 2 mm of the points and forces balance to
-1 %, but with a stiffness far too low, also when it begins with the true one. Clouds do not say how
-the sheet lies within its surface, the part on the table is unseen, and a softer fabric makes less
-of the roughness of the map. The information is there, also beside a map in which forces balance but
-nearly (`experiments/unbalanced_maps.py`): the fit of one best map fails. For clouds there is
-`r2s.estimation.diffcloud`.
+1 %, but with a stiffness far too low, also when it begins with the true one, and from several
+motions. Clouds do not say how the sheet lies within its surface, the part on the table is unseen,
+and a softer fabric makes less of the roughness of the map. The information is there, also beside a
+map in which forces balance but nearly (`experiments/unbalanced_maps.py`): the fit of one best map
+fails. For clouds there is `r2s.estimation.diffcloud`.
 """
 
 import dataclasses
