@@ -58,7 +58,7 @@ class EstimateCard:
 
     diffcloud differentiates through the cloth, diffcp through material points, cma-es tries fabrics
     on either. pinn fits a network to the markers and force of stretchings, or to the clouds of
-    another motion. physnet compares depth images on the map of a network that was trained for the
+    other motions. physnet compares depth images on the map of a network that was trained for the
     motion: that in the file --network, or one that is trained now (an hour) and written there.
     Names with -published follow the recipes of the papers.
 
