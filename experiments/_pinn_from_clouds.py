@@ -14,7 +14,7 @@ from r2s.scenarios import lifting, synthetic, wind
 
 MOTIONS = {"lifting": lifting, "wind": wind}
 SHAPE = (17, 17)  # vertices of the sheet that is recorded
-TOLD = ("warp", "weft", "shear", "coupling", "bending")  # no friction acts, damping is left out
+TOLD = ("warp", "weft", "shear", "coupling", "bending")  # the fit has neither friction nor damping
 
 
 def found(fabric: str, motions: str, begin: str) -> Line:
@@ -27,8 +27,8 @@ def found(fabric: str, motions: str, begin: str) -> Line:
         synthetic.record(MOTIONS[name](), truth, fabric, shape=SHAPE, key=key)
         for name, key in zip(names, keys, strict=True)
     ]
-    settings, rounds = Settings(), list[Round]()
-    if begin == "truth, held":
+    settings, rounds, is_held = Settings(), list[Round](), begin == "truth, held"
+    if is_held:
         settings = dataclasses.replace(settings, held=settings.rounds)
     place = None if begin == "middle" else np.asarray(space.to_unit(truth))
     began = time.process_time()
@@ -45,6 +45,6 @@ def found(fabric: str, motions: str, begin: str) -> Line:
         "spread [mm]": f"{1e3 * rounds[-1].spread:.2f}",
         "sum of squares": f"{rounds[-1].squares:.0f}",
         "rounds": str(len(rounds)),
-        "converged": "yes" if made.converged else "no",
+        "converged": "-" if is_held else "yes" if made.converged else "no",
         "CPU s": f"{seconds:.0f}",
     }

@@ -270,6 +270,48 @@ def test_a_recording_is_seen_in_the_axes_of_its_sheet(experiment):
     assert np.abs(first).max() < 0.05  # wind: the grippers are a little closer than the corners
 
 
+def test_motions_have_networks_of_their_own_and_one_fabric():
+    seen, few = [recorded(lifting()), recorded(wind())], from_clouds.Settings(width=4, layers=2)
+    keys = jr.split(jr.key(0))
+    first, second = (
+        from_clouds._motion(
+            each, FAMILY, sight_of(each, np.array([0, 3, 7]), 20), few, i, 2, keys[i]
+        )
+        for i, each in enumerate(seen)
+    )
+    networks = [from_clouds.parameters_of(each.shared.likeness) for each in (first, second)]
+    theta = np.concatenate([*networks, np.full(FAMILY.dim, 0.5)])
+    shared = set(first.own.tolist()) & set(second.own.tolist())
+    assert shared == set(range(len(theta) - FAMILY.dim, len(theta)))
+    assert {*first.own.tolist(), *second.own.tolist()} == set(range(len(theta)))
+    for motion, network in zip((first, second), networks, strict=True):
+        found = from_clouds.parameters_of(motion.of(theta))
+        np.testing.assert_allclose(found, network, rtol=1e-6)
+
+
+@pytest.mark.slow(group="pinn")
+def test_two_motions_lead_to_one_fabric_to_which_both_count():
+    few = from_clouds.Settings(
+        frames=3, points=40, begin=1, held=0, rounds=1, steps=2, width=4, layers=2
+    )
+    fabric = presets.grey_interlock()
+    space = OrthotropicSpace.make(float(fabric.density))
+    with jax.numpy_dtype_promotion("standard"):
+        lift, gust = (
+            synthetic.record(motion, fabric, "grey_interlock", shape=(9, 9), key=jr.key(i))
+            for i, motion in enumerate((lifting(), wind()))
+        )
+        alone = from_clouds.estimate([lift], space, few, key=jr.key(0))
+        both = from_clouds.estimate([lift, gust], space, few, key=jr.key(0))
+    assert np.isfinite(both.values).all() and "lifting, wind" in both.approach
+    assert not np.allclose(both.values, alone.values, rtol=1e-4)
+
+
+def test_no_recording_is_refused():
+    with pytest.raises(ValueError, match="a recording is needed"):
+        from_clouds.estimate([], FAMILY, key=jr.key(0))
+
+
 def test_frames_that_are_not_there_are_refused():
     with pytest.raises(ValueError, match=r"three frames or more of 0\.\.7"):
         sight_of(recorded(lifting()), np.array([0, 3, 8]), 50)

@@ -95,7 +95,8 @@ class EstimateCard:
     starts: int | None = None
     """Descents from the best of them (diffcloud 3, diffcp 2)."""
     iterations: int | None = None
-    """Gauss-Newton steps of each stage (25); of pinn and the recipes the epochs."""
+    """Gauss-Newton steps of each stage (25); of pinn and the recipes the epochs; of pinn
+    from clouds the rounds, at most 30."""
     evaluations: int | None = None
     """Simulations of a search (cma-es 600, physnet 80)."""
     angles: Annotated[tuple[float, ...], arg(metavar="DEGREES")] = ()

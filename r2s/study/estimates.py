@@ -71,8 +71,7 @@ class EstimateCell(Cell):
 
     - `approach`: "diffcloud", "diffcp", "physnet" or "pinn", or "-published" behind one of these.
     - `solver`: "cloth" or "points".
-    - `sources`: the recordings; several for the pulls of "pinn", and for approaches that estimate
-      from several scenarios together.
+    - `sources`: the recordings; several of them for approaches that take several.
     - `density`: areal density as weighed, [kg/m^2].
     - `network`: of "physnet" and "physnet-published".
     - `prior`: "fabrics" where what fabrics of this weight are like is known (`r2s.fabrics.prior`),

@@ -5,12 +5,12 @@ clouds (each point to the nearest place of the network's own map, matched again 
 grippers' path, and to the balance of forces in the weak form. Gravity gives the scale, since the
 areal density is known. The fit begins with the motion of a middling fabric in the cloth solver.
 
-It does not find the fabric. The map comes to lie within 2 mm of the points and forces balance to
-1 %, but with a stiffness far too low, also when it begins with the true one, and from several
-motions. Clouds do not say how the sheet lies within its surface, the part on the table is unseen,
-and a softer fabric makes less of the roughness of the map. The information is there, also beside a
-map in which forces balance but nearly (`experiments/unbalanced_maps.py`): the fit of one best map
-fails. For clouds there is `r2s.estimation.diffcloud`.
+It does not find the fabric. The maps come to lie near the points (a spread of 1 to 2 mm) and forces
+balance to 1 %, but with a membrane far too soft, also when it begins with the true one, and from
+two motions. Clouds do not say how the sheet lies within its surface, and the part on the table is
+unseen. Why it fails was not measured; perhaps because a softer fabric makes less of the roughness
+of the map. The information is there, also beside a map in which forces balance but nearly
+(`experiments/unbalanced_maps.py`). For clouds there is `r2s.estimation.diffcloud`.
 """
 
 import dataclasses
@@ -106,9 +106,10 @@ class Round(NamedTuple):
     """What a round of matching and steps led to.
 
     - `number`: from 0.
-    - `spread`: of the distances of points from the maps, root mean square of the recordings, [m].
-    - `squares`: sum of all squares of residuals, [-].
-    - `values`: of the parameters.
+    - `spread`: of the distances of points from the maps (1.48 times the median) before the steps,
+      root mean square of the recordings, [m].
+    - `squares`: sum of all squares of residuals after them, [-].
+    - `values`: of the parameters after them.
     """
 
     number: int
@@ -181,6 +182,7 @@ class Motion(eqx.Module):
     - `shared`, `sight`: what its rows share, and what was seen.
     - `grips`: names of the corners that are held. `held`: rows of their path.
     - `own`: which numbers of theta are of its network; then those of the place in the space.
+    - `fine`, `coarse`: meshes of the sheet, of the matching and of what is tested on the table.
     """
 
     shared: Shared
@@ -188,6 +190,8 @@ class Motion(eqx.Module):
     grips: tuple[str, ...] = eqx.field(static=True)
     held: Rows
     own: Int[Array, " own"]
+    fine: Mesh
+    coarse: Mesh
 
     def of(self, theta: Float[np.ndarray, " theta"]) -> Network:
         """Its network."""
@@ -196,10 +200,6 @@ class Motion(eqx.Module):
     def term(self, function: Callable[..., Array], rows, together: int = 256) -> Term:
         """Residuals of its network and the fabric."""
         return Term(function, self.shared, rows, together, self.own)
-
-    def mesh(self, shape: tuple[int, int]) -> Mesh:
-        """A mesh of its sheet."""
-        return rectangle((float(self.sight.size[0]), float(self.sight.size[1])), shape)
 
 
 def estimate(
@@ -211,16 +211,20 @@ def estimate(
     report: Report | None = None,
     key: PRNGKeyArray,
 ) -> Estimate:
-    """The fabric of recordings of a sheet that is lifted or hangs, from their clouds.
+    """The fabric of one or more recordings of a sheet that is lifted or hangs, from their clouds.
 
     It has no standard errors: what it finds is far from the truth, and no linear model says how
-    far. One that still moved in its last round has not converged.
+    far. One that still moved in its last round has not converged. A step solves for the parameters
+    of all networks at once: its cost grows with the cube of the number of recordings.
 
     - `begin`: place in the space of the fabric to begin with, by default the middle.
     - `report`: called after each round.
 
-    Raises `ValueError` for too few frames, `RuntimeError` when the solver or the network diverges.
+    Raises `ValueError` for no recording or too few frames, `RuntimeError` when the solver or the
+    network diverges.
     """
+    if not recordings:
+        raise ValueError("a recording is needed at least")
     if settings.rounds < 1:
         raise ValueError(f"at least one round is needed, got {settings.rounds}")
     began = time.perf_counter()
@@ -272,7 +276,7 @@ def _rounds(
         terms, spreads = [firm if number < settings.held else free], []
         for i, motion in enumerate(motions):
             network = motion.of(theta)
-            near, spread = matched(network, motion.sight, motion.mesh(FINE))
+            near, spread = matched(network, motion.sight, motion.fine)
             spreads.append(float(spread))
             # not the spread itself: what is far off would never be worth coming nearer
             noises[i] = max(settings.noise, min(spreads[i], SHARPER * noises[i]))
@@ -320,17 +324,23 @@ def _motion(
     sight: Sight,
     settings: Settings,
     number: int,
-    of: int,
+    count: int,
     key: PRNGKeyArray,
 ) -> Motion:
-    """The `number`-th `of` some recordings, counted from 0."""
+    """The `number`-th of `count` recordings, from 0; the networks of all are of one size."""
     shared = _shared(recording, space, sight, settings, key)
     size = len(parameters_of(shared.likeness))
-    own = jnp.concatenate(
-        [number * size + jnp.arange(size), of * size + jnp.arange(space.dim)],
+    network, place = number * size + jnp.arange(size), count * size + jnp.arange(space.dim)
+    sides = float(sight.size[0]), float(sight.size[1])
+    return Motion(
+        shared,
+        sight,
+        recording.info.sheet.held,
+        fixed(sight.corners, sight.times, sight.grips, GRIP),
+        jnp.concatenate([network, place]),
+        rectangle(sides, FINE),
+        rectangle(sides, COARSE),
     )
-    held = fixed(sight.corners, sight.times, sight.grips, GRIP)
-    return Motion(shared, sight, recording.info.sheet.held, held, own)
 
 
 def _shared(
@@ -379,7 +389,7 @@ def _of_row(theta: Theta, shared: Shared, row: Rows) -> Array:
 def _of_table(network: Network, motion: Motion) -> list[Term]:
     """Terms that keep the map above the table, and unstretched where it lies on it."""
     sight = motion.sight
-    lifted = above(network, sight, motion.mesh(COARSE))
+    lifted = above(network, sight, motion.coarse)
     height = placed(network, lifted.place) @ sight.up - sight.table
     weight = jnp.where(height < LOW, 1 / STRAIN, 0.0)
     return [motion.term(_of_row, lifted), motion.term(_of_strain, (lifted.place, weight))]

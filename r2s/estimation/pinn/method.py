@@ -3,6 +3,7 @@
 import dataclasses
 import time
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +12,9 @@ from r2s.estimation.estimate import point_estimate
 from r2s.estimation.method import ANY, Budget, Method, Reads, frames_that_count
 from r2s.estimation.pinn.pulls import Pull, pull_from, stacked
 from r2s.recordings.recording import Recording
+
+if TYPE_CHECKING:
+    from r2s.estimation.pinn.from_clouds import Round
 
 REFUSALS = {
     "points": "without markers and force it balances the map of an orthotropic sheet, and the "
@@ -35,6 +39,14 @@ class PINN(Method):
     several = True
     takes_shape = False
 
+    def check(self, recordings):
+        super().check(recordings)
+        if len({each.info.scenario == "stretching" for each in recordings}) > 1:
+            raise ValueError(
+                "pinn takes stretchings, or recordings of other motions, not both: estimate from "
+                "each kind alone, or from all by diffcloud"
+            )
+
     def reads(self, recording):
         if recording.info.scenario == "stretching":
             return Reads(frames_that_count(recording), markers=True, force=True)
@@ -46,7 +58,7 @@ class PINN(Method):
     def _estimate(self, recordings, space, budget, key):
         from r2s.estimation.pinn import from_clouds, from_pulls  # need flax
 
-        if all(each.info.scenario == "stretching" for each in recordings):
+        if recordings[0].info.scenario == "stretching":
             recipe = dataclasses.replace(from_pulls.QUICK, adam=budget.iterations)
             return from_pulls.estimate(
                 pulls_of(recordings),
@@ -56,14 +68,12 @@ class PINN(Method):
                 checkpoint=self.checkpoint,
                 key=key,
             ).estimate
-        if any(each.info.scenario == "stretching" for each in recordings):
-            raise ValueError("pinn takes stretchings, or recordings of other motions, not both")
         settings = from_clouds.Settings()
         rounds = min(settings.rounds, budget.iterations)
         settings = dataclasses.replace(settings, rounds=rounds)
         return from_clouds.estimate(recordings, space, settings, report=self._report, key=key)
 
-    def _report(self, end) -> None:
+    def _report(self, end: "Round") -> None:
         if self.progress is not None:
             self.progress(end.number, end.spread**2)
 
