@@ -102,9 +102,10 @@ def predictions_at(problems: Problems, theta: Theta) -> list[Prediction]:
     return side_by_side(lambda pair: predicted(*pair), _places(problems, theta))
 
 
-def loss_from(problems: Problems, seen: Sequence[Prediction]) -> float:
-    """The robust loss [m^2] of what is predicted of each recording."""
-    return float(_loss_from(problems, list(seen)))
+def loss_from(problems: Problems, seen: Sequence[Prediction], scale: Array | float = 0.0) -> float:
+    """The robust loss [m^2] of what is predicted of each recording; for `scale` [m] see
+    `r2s.evaluation.losses.robust`."""
+    return float(_loss_from(problems, list(seen), None, jnp.asarray(scale, float)))
 
 
 def normal_at(

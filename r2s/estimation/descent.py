@@ -32,7 +32,7 @@ from r2s.estimation.gauss_newton import (
     theta_indices,
 )
 from r2s.estimation.law_error import law_error
-from r2s.estimation.mesh_bias import OtherMesh, Settled, coarser_of
+from r2s.estimation.mesh_bias import OtherMesh, coarser_of
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.misfits import left_out, misfits
 from r2s.estimation.nuisances import nuisances
@@ -42,7 +42,9 @@ from r2s.fabrics.fabric import Fabric
 from r2s.program_memory import let_go_in_time
 
 INITIAL_DAMPING = 1e-2
-STRICT, SCALES = 3.0, (3e-3, 0.015)  # of the spread, and between [m]: beyond lies an outlier
+# of the spread, and between [m]: beyond lies an outlier. At half of it a part of the sheet that the
+# start cannot follow counts for nothing, and never draws the sheet there.
+STRICT, SCALES = 6.0, (6e-3, 0.015)
 HALVING, FEWEST = 3, 3  # iterations, after each of which half go on, but no fewer than this
 
 
@@ -76,12 +78,14 @@ DEFAULT = Budget(shares=(0.25, 0.5))
 class Search(NamedTuple):
     """- `problems`: what was searched for. - `rows`: all descents in every iteration.
     - `seconds`: how long it took. - `derive`: `remembering` where it was last.
+    - `reached`: see `r2s.estimation.estimate.Estimate`.
     """
 
     problems: Problems
     rows: list[Row]
     seconds: float
     derive: Derive
+    reached: tuple[int, int] | None = None
 
     @property
     def best(self) -> Descent:
@@ -192,22 +196,18 @@ def judged(
     stage, prior = _rows_of_stage(found.rows, int(best.stage)), _weight(problems, best.normal)
     predicted = found.derive(problems, best.theta, budget.width)
     coarse, beside = coarser_of(problems, other_mesh)
-    around = {"predicted": predicted, "tried_on": coarse, "derive": found.derive}
+    around = {"tried_on": coarse, "derive": found.derive}
     covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1), **around)
     of_law, seen = law_error(problems, best, prior, predicted), [each for each, _ in predicted]
-    covariance, rows = covariance + np.outer(of_law, of_law), found.rows
-    at = Settled(best.theta, seen, loss_from(problems, seen), covariance)
+    covariance, bias = covariance + np.outer(of_law, of_law), None
     if other_mesh is not None:
         bias = mesh_bias.mesh_bias(problems, other_mesh, best, prior, predicted)
-        at = mesh_bias.settled(problems, best, prior, at, bias, other_mesh.is_finer)
-    if at.theta is not best.theta:
-        normal = dataclasses.replace(best.normal, loss=jnp.asarray(at.loss, float))
-        best = dataclasses.replace(best, theta=at.theta, normal=normal)
-        rows = [*rows, [best if i == which else row for i, row in enumerate(rows[-1])]]
+        covariance, bias = mesh_bias.settled(problems, best, prior, covariance, bias)
     seconds = found.seconds + time.perf_counter() - began
     converged = _arrived(problems, stage, which, prior, _stop(budget, int(best.stage)))
-    told = at.covariance, approach, seconds, converged, at.loss, at.bias
-    estimate = collect(problems, rows, *told)
+    converged = converged and (found.reached is None or found.reached[0] > 1)
+    told = covariance, approach, seconds, converged, loss_from(problems, seen), bias
+    estimate = collect(problems, found.rows, *told)
     try:
         alone = each_alone(coarse, budget, best.theta, key, found.derive, progress)
     except RuntimeError as error:  # on the coarser mesh, of a fabric of the finer one
@@ -218,7 +218,7 @@ def judged(
     shares = tuple(float(each) for each in recording_weights(problems)) if alone else ()
     biases = mesh_bias.alone(coarse, beside, alone, found.derive, budget.width)
     agreed = agreement(coarse, alone, biases) if alone else None
-    missed = misfits(problems, best.theta, at.seen)
+    missed = misfits(problems, best.theta, seen)
     if density_doubt.is_asked(problems, agreed, missed):
         path = checkpoint and checkpoint.with_suffix(".density.npz")
         saved = {"checkpoint": path, "progress": progress, "key": key}
@@ -228,7 +228,8 @@ def judged(
         agreement=agreed,
         shares=shares,
         misfits=missed,
-        left_out=left_out(problems, at.seen, float(best.scale)),
+        left_out=left_out(problems, seen, float(best.scale)),
+        reached=found.reached,
     )
 
 

@@ -122,8 +122,11 @@ class Estimate:
     - `losses`, `history`: loss and parameters of every iteration and start. The losses of two
       stages of a descent do not compare: each counts other frames, or leaves outliers out.
     - `seconds`: how long it took, compilation included.
-    - `converged`: whether the method stopped by its own criterion; False when its budget ended it.
-      None: nothing was fitted, or a file of version 0.2.0 does not say.
+    - `converged`: whether the method stopped by its own criterion; False when its budget ended it,
+      or no other search ended there. None: nothing was fitted, or a file of version 0.2.0 does not
+      say.
+    - `reached`: how many searches from different starts ended at this fabric, and how many were
+      made; None: there was one.
     - `mesh_bias`: how far each parameter is expected to be off for its mesh alone, as the standard
       errors, which hold it (`r2s.estimation.mesh_bias`). None: that was not judged.
     - `shape`: vertices of the simulated sheet along warp and weft; None: it has none, or a file
@@ -155,6 +158,7 @@ class Estimate:
     left_out: tuple[float, ...] = ()
     shares: tuple[float, ...] = ()
     refused: str = ""
+    reached: tuple[int, int] | None = None
 
     @property
     def at_bounds(self) -> dict[str, Literal["lower", "upper"]]:
@@ -286,6 +290,11 @@ def describe(estimate: Estimate) -> list[str]:
         lines.append(f"{name:14s}{value:10.4g}{unit:6s}{spread}")
     if estimate.converged is not None:
         words = "yes" if estimate.converged else "no, the budget ended the search"
+        if estimate.reached is not None:
+            ended, searches = estimate.reached
+            told = f"{ended} of {searches} searches from different starts ended here"
+            lost = f"no, not sure: {told}, the others elsewhere with a larger loss"
+            words = f"{words}, {told}" if ended > 1 else lost
         lines.append(f"converged: {words}")
         named = ", ".join(f"{name} ({side})" for name, side in estimate.at_bounds.items())
         warned = f"warning: at a bound, beyond which the truth may lie: {named}"

@@ -25,9 +25,9 @@ NOISE = 3e-3  # [m]: beyond which a distance counts as an outlier's
 def sensitivity(problems: Problem | Problems, fabric: Fabric) -> Estimate:
     """Standard errors and combinations that recordings would give, were a fabric the true one.
 
-    Nothing is fitted: it takes nine simulations with their derivatives, up to 27 where the motion
-    is rough. Make the recordings with `r2s.scenarios.synthetic.record` from the motion in question
-    and the cameras that there are. Raises `RuntimeError` when the simulation diverges.
+    Nothing is fitted: it takes nine simulations with their derivatives. Make the recordings with
+    `r2s.scenarios.synthetic.record` from the motion in question and the cameras that there are.
+    Raises `RuntimeError` when the simulation diverges.
     """
     problems = (problems,) if isinstance(problems, Problem) else problems
     space = problems[0].space
@@ -44,7 +44,7 @@ def sensitivity(problems: Problem | Problems, fabric: Fabric) -> Estimate:
     zero = jnp.zeros((), float)
     end = Descent(theta, normal, zero, zero, scale, jnp.zeros((), int))
     key = jax.random.key(0)
-    covariance = covariance_at(problems, descent.DEFAULT, end, key, predicted, is_truth=True)
+    covariance = covariance_at(problems, descent.DEFAULT, end, key, is_truth=True)
     loss = compiled.loss_from(problems, [seen for seen, _ in predicted])
     return descent.collect(problems, [[end]], covariance, "sensitivity", 0.0, None, loss)
 

@@ -15,9 +15,8 @@ from jaxtyping import Array, Float
 
 from r2s.estimation import compiled, normal_equations
 from r2s.estimation.bounded import bounded_step, only_held, room
-from r2s.estimation.compiled import Derive, loss_from, predictions_at
+from r2s.estimation.compiled import Derive
 from r2s.estimation.gauss_newton import (
-    MARGIN,
     Descent,
     Problems,
     prior_terms,
@@ -26,14 +25,13 @@ from r2s.estimation.gauss_newton import (
     theta_indices,
     theta_length,
 )
-from r2s.estimation.prediction import Prediction, Sensitivity, Theta
+from r2s.estimation.prediction import Prediction, Sensitivity
 from r2s.estimation.problem import Problem, motion_alone
 from r2s.fabrics.informed_space import InformedSpace
 from r2s.geometry.surface import nearest
 from r2s.kept import kept
 from r2s.scenarios.resolution import ORDER
 
-RISE, HALVINGS = 2.0, 6  # of a loss, and of the step that raises it by more
 RCOND = 1e-6  # of the recordings' information: less than that is none
 
 _equations = kept(normal_equations.normal_equations_of)
@@ -147,34 +145,40 @@ def _laid_onto(here: Problem, there: Problem, slope: Sensitivity) -> Sensitivity
     return Sensitivity(laid, slope.force)
 
 
-class Weighed(NamedTuple):
-    """Where an estimate lies once its mesh's error counts as an error of the recordings.
-
-    - `theta`: there. `covariance`: of it. `bias`: of its mesh that is left.
-    """
-
-    theta: Float[np.ndarray, " theta"]
-    covariance: Float[np.ndarray, "theta theta"]
-    bias: Float[np.ndarray, " theta"]
-
-
-def weighed(
+def settled(
     problems: Problems,
     end: Descent,
     prior: Array,
     covariance: Float[np.ndarray, "theta theta"],
     bias: Float[np.ndarray, " theta"],
-) -> Weighed:
-    """An estimate that trusts its prior more where it errs, from one that took its recordings as
-    exact but for their noise.
+) -> tuple[Float[np.ndarray, "theta theta"], Float[np.ndarray, " theta"]]:
+    """The covariance of the end of a descent with its mesh's error, and that error where it is no
+    larger than the standard errors.
 
-    A descent weighs recordings and prior by the noise. The standard errors know more: how far the
-    mesh leads astray, and how rough the loss is. What is left of the recordings' information with
-    these is what `covariance` has beyond the prior, and the prior is added to that anew (the model
-    discrepancy of Kennedy and O'Hagan 2001, linear about the end).
+    The end stays where the loss is least: no error of the mesh says where the fabric is instead.
+    Where something is known of the fabric beforehand, the truth is at most as far off as what is
+    known allows: the errors are in each direction the smaller of those by the recordings and those
+    of the posterior in which the recordings count by all of these errors (the model discrepancy of
+    Kennedy and O'Hagan 2001, linear about the end), with the way to its mean.
 
     - `prior`: its weight, see `r2s.estimation.gauss_newton.prior_weight`.
-    - `covariance`: of the end with all errors. `bias`: of its mesh, as `mesh_bias` gives it.
+    - `covariance`: of the end, without its mesh's error. `bias`: as `mesh_bias` gives it.
+    """
+    raw = covariance + np.outer(bias, bias)
+    if not isinstance(problems[0].space, InformedSpace):
+        return raw, bias
+    way, errors = _posterior(problems, end, prior, raw)
+    errors = _smaller(raw, errors + np.outer(way, way))
+    most = np.sqrt(np.diag(errors))
+    return errors, np.clip(bias, -most, most)
+
+
+def _posterior(
+    problems: Problems, end: Descent, prior: Array, covariance: Float[np.ndarray, "theta theta"]
+) -> tuple[Float[np.ndarray, " theta"], Float[np.ndarray, "theta theta"]]:
+    """From an end of a given `covariance` to the mean of its posterior, and the covariance there.
+
+    What the recordings tell is what the covariance knows beyond the prior.
     """
     off, known = (np.asarray(part, np.float64) for part in prior_terms(problems, end.theta))
     told = np.asarray(end.normal.matrix, np.float64) / float(prior)
@@ -185,55 +189,8 @@ def weighed(
     sizes, axes = np.linalg.eigh(np.linalg.solve(root, inner.T))
     axes = root @ axes
     left = (axes * np.maximum(sizes - 1, 0)[None]) @ axes.T
-    errors = np.linalg.inv(left + known)
     way = bounded_step(known @ off - left @ alone, left + known, room(problems, end.theta))
-    theta = np.asarray(end.theta, np.float64) + way
-    led = np.linalg.lstsq(told, (told + known) @ bias, rcond=RCOND)[0]
-    return Weighed(theta, errors, errors @ left @ led)
-
-
-class Settled(NamedTuple):
-    """An estimate at the end of its descents.
-
-    - `theta`: there. `seen`: what is predicted there. `loss`: [m^2].
-    - `covariance`: of it. `bias`: of its mesh, which it holds; None: that was not judged.
-    """
-
-    theta: Theta
-    seen: list[Prediction]
-    loss: float
-    covariance: Float[np.ndarray, "theta theta"]
-    bias: Float[np.ndarray, " theta"] | None = None
-
-
-def settled(
-    problems: Problems,
-    end: Descent,
-    prior: Array,
-    at: Settled,
-    bias: Float[np.ndarray, " theta"],
-    moves: bool,
-) -> Settled:
-    """An estimate at the end of its descents, with what its mesh errs.
-
-    Where something is known of the fabric beforehand, it goes where `weighed` leads, and what is
-    left of that way counts as an error. Beside a coarser mesh, which says how far the own one errs,
-    but hardly where to, it does not move. Its errors are then those without the prior or those
-    where `weighed` leads with the whole way, in each direction the smaller.
-
-    - `prior`, `bias`: as in `weighed`. `at`: the end, without its mesh's error.
-    """
-    covariance = at.covariance + np.outer(bias, bias)
-    if not isinstance(problems[0].space, InformedSpace):
-        return at._replace(covariance=covariance, bias=bias)
-    to = weighed(problems, end, prior, covariance, bias)
-    if moves:
-        theta, seen, loss, left = on_the_way(problems, end, to.theta, at.loss)
-        return Settled(theta, seen, loss, to.covariance + np.outer(left, left), to.bias)
-    way = to.theta - np.asarray(end.theta, np.float64)
-    errors = _smaller(covariance, to.covariance + np.outer(way, way))
-    most = np.sqrt(np.diag(errors))
-    return at._replace(covariance=errors, bias=np.clip(bias, -most, most))
+    return way, np.linalg.inv(left + known)
 
 
 def _smaller(
@@ -244,32 +201,3 @@ def _smaller(
     sizes, axes = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, other).T))
     axes = root @ axes
     return (axes * np.minimum(sizes, 1)[None]) @ axes.T
-
-
-def inside(problems: Problems, theta: Float[np.ndarray, " theta"]) -> Theta:
-    """Theta with the fabric's place within the unit cube."""
-    is_fabric = np.arange(len(theta)) < problems[0].space.dim
-    return jnp.asarray(np.where(is_fabric, np.clip(theta, MARGIN, 1 - MARGIN), theta), float)
-
-
-def on_the_way(
-    problems: Problems, end: Descent, place: Float[np.ndarray, " theta"], before: float
-) -> tuple[Theta, list[Prediction], float, Float[np.ndarray, " theta"]]:
-    """How far to go from the end of a descent to where `weighed` leads, what is predicted there,
-    the loss, and the way that is left; `before` is the loss at the end.
-
-    The step is linear. Where parameters trade against each other along a bent valley (how much a
-    yarn stiffens, and where) it leaves that, so it is halved until the loss is at most `RISE` times
-    what it was with what the Gauss-Newton matrix says that it rises; after `HALVINGS` it is none.
-    """
-    step = np.asarray(place, np.float64) - np.asarray(end.theta, np.float64)
-    slope = np.asarray(end.normal.gradient, np.float64)
-    matrix = np.asarray(end.normal.matrix, np.float64)
-    for share in (*(0.5**i for i in range(HALVINGS)), 0.0):
-        theta = inside(problems, np.asarray(end.theta, np.float64) + share * step)
-        seen = predictions_at(problems, theta)
-        loss = loss_from(problems, seen)
-        told = share * slope @ step + share**2 * step @ matrix @ step / 2
-        if loss <= RISE * (before + max(told, 0.0)):
-            break
-    return theta, seen, loss, (1 - share) * step

@@ -26,6 +26,7 @@ from r2s.estimation.mesh_bias import OtherMesh, factor
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import Theta
 from r2s.estimation.problem import Problem
+from r2s.estimation.second_look import look_again
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace
 from r2s.programs import kept
@@ -95,6 +96,11 @@ def descend_by_meshes(
         found = search(on(*shapes), more, start=start, words=words, **saved)
         return _Rung(shapes, found)
 
+    def settle(at: _Rung) -> _Rung:
+        """A rung at its end, where it may be softer, and after another look from elsewhere."""
+        end = climb(at.shapes, at.found.theta, False)
+        return end._replace(found=look_again(end.found, budget, progress=progress, key=key))
+
     rungs = [[shape] * len(recordings)] if shape else ladder(recordings)
     if finest:
         rungs = [rungs[0], rungs[-1]]
@@ -117,19 +123,21 @@ def descend_by_meshes(
             counts += weights(alone)
             at = climb(rungs[0], at.found.theta, len(rungs) > 1)
         for shapes in rungs[1:]:
-            if not finest and not is_too_coarse(recordings, at.found.fabric, at.shapes):
-                at = climb(at.shapes, at.found.theta, False)  # to its end, where it may be softer
-                if not is_too_coarse(recordings, at.found.fabric, at.shapes):
+            if not finest and (shapes is rungs[-1] or not is_too_coarse(recordings, *at.fabric)):
+                at = settle(at)
+                if not is_too_coarse(recordings, *at.fabric):
                     break
             try:
-                at = climb(shapes, at.found.theta, shapes is not rungs[-1])
+                finer = climb(shapes, at.found.theta, shapes is not rungs[-1])
+                at = finer._replace(found=finer.found._replace(reached=at.found.reached))
             except RuntimeError as error:
                 if finest or isinstance(error, jax.errors.JaxRuntimeError):  # out of memory, say
                     raise
                 refused = f"{_named(max(shapes))} vertices, which it needs: {error}"
                 tell(progress, f"the finer mesh diverged: back to {_named(max(at.shapes))}")
-                at = climb(at.shapes, at.found.theta, False)
                 break
+        if len(rungs) == 1:
+            at = at._replace(found=look_again(at.found, budget, progress=progress, key=key))
         tell(progress, "standard errors")
         ratio = 2.0 if refused else _ratio(at.shapes)
         other = OtherMesh(on(*_others(at.shapes, ratio)), factor(ratio))
@@ -167,6 +175,11 @@ class _Rung(NamedTuple):
 
     shapes: list[Shape]
     found: Search
+
+    @property
+    def fabric(self) -> tuple[Fabric, list[Shape]]:
+        """The fabric that was found, and on which meshes."""
+        return self.found.fabric, self.shapes
 
 
 def weights(alone: Sequence[Descent]) -> list[Float[Array, ""]]:

@@ -6,7 +6,7 @@ nearby places, so that a rough or unconverged fit reports larger errors.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation.gauss_newton import MARGIN, Descent, Normal, Problems, prior_terms
 from r2s.estimation.prediction import Theta
@@ -49,34 +49,12 @@ def covariance(
     return jnp.where(jnp.all(jnp.isfinite(found)), found, jnp.linalg.inv(precision))
 
 
-def disagreement(
-    problems: Problems, end: Descent, prior, apart: Float[Array, "place theta"]
-) -> Float[Array, ""]:
-    """Median distance, in standard errors, of `steps_apart`.
-
-    Next to zero where the loss is smooth; infinite where derivatives are not finite.
-    """
-    _, root = sandwich_of(problems, end, prior)
-    far = jnp.linalg.norm(jnp.linalg.solve(root, apart.T), axis=0)
-    return jnp.median(jnp.where(jnp.isfinite(far), far, jnp.inf))
-
-
 def steps_apart(
     problems: Problems, end: Descent, prior, neighbours: Neighbours
 ) -> Float[Array, "place theta"]:
     """How far Gauss-Newton steps from neighbours lead from where that of the end does."""
     led = [step_end(problems, *place, prior) for place in [(end.theta, end.normal), *neighbours]]
     return jnp.stack(led)[1:] - led[0][None]
-
-
-def tells(problems: Problems, end: Descent, prior) -> Bool[Array, ""]:
-    """Whether the data weigh more than the prior in some direction of the fabric's space."""
-    fabric = slice(problems[0].space.dim)
-    _, precision = prior_terms(problems, end.theta)
-    root = jnp.linalg.cholesky(prior * precision[fabric, fabric])
-    inner = jax.scipy.linalg.solve_triangular(root, end.normal.matrix[fabric, fabric], lower=True)
-    weights = jax.scipy.linalg.solve_triangular(root, inner.T, lower=True)
-    return jnp.linalg.eigvalsh(weights)[-1] > 1  # NaN does not
 
 
 def sample_around(
@@ -92,14 +70,16 @@ def sample_around(
 
 
 def sandwich_of(problems: Problems, end: Descent, prior):
-    """The covariance of an estimate, had it arrived and were the loss smooth, and its root."""
+    """The covariance of an estimate, had it arrived and were the loss smooth, and its symmetric
+    root, which rounding changes no more than it changes the covariance."""
     _, precision = prior_terms(problems, end.theta)
     inverse = jnp.linalg.inv(end.normal.matrix + prior * precision)
     sandwich = inverse @ (end.normal.scatter + prior**2 * precision) @ inverse
     deviation = jnp.sqrt(jnp.diag(sandwich))
     squares, axes = jnp.linalg.eigh(sandwich / jnp.outer(deviation, deviation))
     least = len(squares) * jnp.finfo(squares.dtype).eps
-    return sandwich, deviation[:, None] * axes * jnp.sqrt(jnp.maximum(squares, least))[None]
+    root = (axes * jnp.sqrt(jnp.maximum(squares, least))[None]) @ axes.T
+    return sandwich, deviation[:, None] * root
 
 
 def step_end(problems: Problems, theta: Theta, normal: Normal, prior) -> Theta:
