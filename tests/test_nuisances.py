@@ -173,8 +173,10 @@ def staying(lifted, raw, off, bias):
     end = dataclasses.replace(end, normal=told)
     covariance = np.diag(np.r_[raw, np.full(size - 1, 1e-4)])
     theirs = np.r_[bias, np.zeros(size - 1)]
-    flat, _ = settled((lifted,), end, jnp.ones(()), covariance, theirs)
-    found, left = settled(problems, end, jnp.ones(()), covariance, theirs)
+    other, one = OtherMesh((lifted,), factor(0.5)), jnp.ones(())
+    at, flat, _ = settled((lifted,), other, end, one, covariance, theirs)
+    there, found, left = settled(problems, other, end, one, covariance, theirs)
+    assert at is end.theta and there is end.theta
     assert left[0] <= np.sqrt(found[0, 0])
     np.testing.assert_allclose(flat, covariance + np.outer(theirs, theirs))
     assert np.linalg.eigvalsh(flat - found)[0] > -1e-9  # never wider for what is known
@@ -190,6 +192,41 @@ def test_what_is_known_limits_the_errors_of_an_estimate_that_stays_but_for_the_w
     assert left == pytest.approx(0.255, abs=0.01)
     far, _ = staying(lifted, 0.04, 2.5, 0.0)  # eight standard deviations of the prior
     np.testing.assert_allclose(far, 0.04, rtol=1e-3)
+
+
+def test_what_tests_measured_draws_an_estimate_only_as_far_as_the_finer_mesh_allows(
+    lifted, monkeypatch
+):
+    """All the way where that fits as well there, half of it where only that does, else not."""
+    dim, size = lifted.space.dim, gauss_newton.theta_length((lifted,))
+    end, _ = valley(lifted, size)
+    mean, known = end.theta[:dim] - 0.1, 1e4 * jnp.eye(dim)
+    space = InformedSpace.make(lifted.space, mean, known, measured=True)
+    problems = (dataclasses.replace(lifted, space=space),)
+    normal = dataclasses.replace(
+        end.normal, matrix=1e4 * jnp.eye(size), gradient=jnp.zeros(size).at[:dim].set(-1e3)
+    )
+    end, one = dataclasses.replace(end, normal=normal), jnp.ones(())
+    bias = np.r_[np.full(dim, 0.5), np.zeros(size - dim)]
+    covariance = np.diag(np.r_[np.full(dim, 0.25), np.full(size - dim, 1e-4)])
+
+    def went(limit, ratio=0.5):
+        def loss(_, theta, scale):
+            assert scale is end.scale
+            return 1.0 if float(end.theta[0] - theta[0]) <= limit else 2.0
+
+        monkeypatch.setattr("r2s.estimation.mesh_bias.predictions_at", lambda _, theta: theta)
+        monkeypatch.setattr("r2s.estimation.mesh_bias.loss_from", loss)
+        other = OtherMesh(problems, factor(ratio))
+        theta, errors, _ = settled(problems, other, end, one, covariance, bias)
+        return float(end.theta[0] - theta[0]), np.sqrt(errors[0, 0])
+
+    whole, error = went(1.0)
+    assert whole == pytest.approx(0.1, rel=0.01) and error == pytest.approx(0.01, rel=0.01)
+    half, error = went(0.6 * whole)
+    assert half == pytest.approx(whole / 2, rel=1e-5)
+    assert error == pytest.approx(np.hypot(0.01, whole / 2), rel=0.01)  # which hold what is left
+    assert went(1e-4)[0] == 0 and went(1.0, ratio=2.0)[0] == 0  # a coarser mesh allows nothing
 
 
 def errors_by(problems, end, prior, led, is_truth=False):

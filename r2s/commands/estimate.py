@@ -86,8 +86,8 @@ class EstimateCard:
     is given; else constant."""
     prior: Literal["flat", "fabrics"] | None = None
     """What is assumed beforehand: any place of the ranges alike, or what measured fabrics of this
-    weight are like. Then diffcloud trusts that more, as far as its mesh errs. By default fabrics
-    for diffcloud, unless laboratory tests say what is known; flat for what takes no prior."""
+    weight are like. By default fabrics for diffcloud, unless laboratory tests say what is known;
+    flat for what takes no prior."""
     name: str = ""
     """Name of the fabric; by default that of the recording."""
     coarse: int | None = None

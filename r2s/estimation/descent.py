@@ -20,6 +20,7 @@ from r2s.estimation.compiled import (
     loss_from,
     losses_at,
     normals_at,
+    predictions_at,
     remembering,
 )
 from r2s.estimation.covariance import covariance_at
@@ -201,13 +202,18 @@ def judged(
     of_law, seen = law_error(problems, best, prior, predicted), [each for each, _ in predicted]
     covariance, bias = covariance + np.outer(of_law, of_law), None
     if other_mesh is not None:
-        bias = mesh_bias.mesh_bias(problems, other_mesh, best, prior, predicted)
-        covariance, bias = mesh_bias.settled(problems, best, prior, covariance, bias)
+        led = mesh_bias.mesh_bias(problems, other_mesh, best, prior, predicted)
+        theta, covariance, bias = mesh_bias.settled(
+            problems, other_mesh, best, prior, covariance, led
+        )
+        if theta is not best.theta:
+            best, seen = dataclasses.replace(best, theta=theta), predictions_at(problems, theta)
+    rows = [*found.rows[:-1], [best if i == which else row for i, row in enumerate(found.rows[-1])]]
     seconds = found.seconds + time.perf_counter() - began
     converged = _arrived(problems, stage, which, prior, _stop(budget, int(best.stage)))
     converged = converged and (found.reached is None or found.reached[0] > 1)
     told = covariance, approach, seconds, converged, loss_from(problems, seen), bias
-    estimate = collect(problems, found.rows, *told)
+    estimate = collect(problems, rows, *told)
     try:
         alone = each_alone(coarse, budget, best.theta, key, found.derive, progress)
     except RuntimeError as error:  # on the coarser mesh, of a fabric of the finer one

@@ -15,8 +15,9 @@ from jaxtyping import Array, Float
 
 from r2s.estimation import compiled, normal_equations
 from r2s.estimation.bounded import bounded_step, only_held, room
-from r2s.estimation.compiled import Derive
+from r2s.estimation.compiled import Derive, loss_from, predictions_at
 from r2s.estimation.gauss_newton import (
+    MARGIN,
     Descent,
     Problems,
     prior_terms,
@@ -25,13 +26,14 @@ from r2s.estimation.gauss_newton import (
     theta_indices,
     theta_length,
 )
-from r2s.estimation.prediction import Prediction, Sensitivity
+from r2s.estimation.prediction import Prediction, Sensitivity, Theta
 from r2s.estimation.problem import Problem, motion_alone
 from r2s.fabrics.informed_space import InformedSpace
 from r2s.geometry.surface import nearest
 from r2s.kept import kept
 from r2s.scenarios.resolution import ORDER
 
+RISE, HALVINGS = 1.5, 6  # of a loss, and of the step that raises it by more
 RCOND = 1e-6  # of the recordings' information: less than that is none
 
 _equations = kept(normal_equations.normal_equations_of)
@@ -145,32 +147,75 @@ def _laid_onto(here: Problem, there: Problem, slope: Sensitivity) -> Sensitivity
     return Sensitivity(laid, slope.force)
 
 
+class Settled(NamedTuple):
+    """An estimate at the end of its search, with its mesh's error.
+
+    - `theta`: where it is. `covariance`: of it, with all errors. `bias`: of its mesh that is left,
+      no larger than the standard errors.
+    """
+
+    theta: Theta
+    covariance: Float[np.ndarray, "theta theta"]
+    bias: Float[np.ndarray, " theta"]
+
+
 def settled(
     problems: Problems,
+    other: OtherMesh,
     end: Descent,
     prior: Array,
     covariance: Float[np.ndarray, "theta theta"],
     bias: Float[np.ndarray, " theta"],
-) -> tuple[Float[np.ndarray, "theta theta"], Float[np.ndarray, " theta"]]:
-    """The covariance of the end of a descent with its mesh's error, and that error where it is no
-    larger than the standard errors.
+) -> Settled:
+    """An estimate at the end of a descent, with what its mesh errs.
 
-    The end stays where the loss is least: no error of the mesh says where the fabric is instead.
-    Where something is known of the fabric beforehand, the truth is at most as far off as what is
-    known allows: the errors are in each direction the smaller of those by the recordings and those
-    of the posterior in which the recordings count by all of these errors (the model discrepancy of
-    Kennedy and O'Hagan 2001, linear about the end), with the way to its mean.
+    It stays where the loss is least: that a mesh errs does not say where the fabric is instead.
+    Where something is known of the fabric beforehand, the truth is at most as far off as that
+    allows: the errors are in each direction the smaller of those by the recordings and those of the
+    posterior in which the recordings count by all of these errors (the model discrepancy of Kennedy
+    and O'Hagan 2001, linear about the end), with the way to its mean. Only where tests measured
+    this very fabric does it go there, as far as the finer mesh allows (`_allowed`).
 
     - `prior`: its weight, see `r2s.estimation.gauss_newton.prior_weight`.
     - `covariance`: of the end, without its mesh's error. `bias`: as `mesh_bias` gives it.
     """
-    raw = covariance + np.outer(bias, bias)
-    if not isinstance(problems[0].space, InformedSpace):
-        return raw, bias
+    raw, space = covariance + np.outer(bias, bias), problems[0].space
+    if not isinstance(space, InformedSpace):
+        return Settled(end.theta, raw, bias)
     way, errors = _posterior(problems, end, prior, raw)
-    errors = _smaller(raw, errors + np.outer(way, way))
+    share = _allowed(other, end, way) if space.measured and other.is_finer else 0.0
+    left = (1 - share) * way
+    errors = errors + np.outer(left, left)
+    if not share:
+        errors = _smaller(raw, errors)
     most = np.sqrt(np.diag(errors))
-    return errors, np.clip(bias, -most, most)
+    return Settled(_at(other, end, share * way), errors, np.clip(bias, -most, most))
+
+
+def _allowed(other: OtherMesh, end: Descent, way: Float[np.ndarray, " theta"]) -> float:
+    """The share of a way from the end, halved as often as needed, on which the finer mesh fits
+    `RISE` times as badly as at the end at most; 0 after `HALVINGS`.
+
+    What a mesh errs is by how much it moves unlike the finer one. So a step for it that makes the
+    finer mesh fit worse is none.
+    """
+
+    def loss(share: float) -> float:
+        theta = _at(other, end, share * way)
+        return loss_from(other.problems, predictions_at(other.problems, theta), end.scale)
+
+    most = RISE * loss(0.0)
+    shares = (0.5**i for i in range(HALVINGS))
+    return next((share for share in shares if loss(share) <= most), 0.0)
+
+
+def _at(other: OtherMesh, end: Descent, way: Float[np.ndarray, " theta"]) -> Theta:
+    """Theta at some way from an end, with the fabric's place within the unit cube."""
+    if not way.any():
+        return end.theta
+    theta = np.asarray(end.theta, np.float64) + way
+    is_fabric = np.arange(len(theta)) < other.problems[0].space.dim
+    return jnp.asarray(np.where(is_fabric, np.clip(theta, MARGIN, 1 - MARGIN), theta), float)
 
 
 def _posterior(

@@ -13,16 +13,22 @@ class InformedSpace(ParameterSpace):
 
     - `space`: the space itself.
     - `mean`, `precision`: of the place; the precision is the inverse of its covariance.
+    - `measured`: whether tests of this very fabric told them, and not what fabrics alike are.
     """
 
     space: ParameterSpace
     mean: Float[Array, " dim"]
     precision: Float[Array, "dim dim"]
     ranges: tuple[Range, ...] = eqx.field(static=True)
+    measured: bool = eqx.field(static=True, default=False)
 
     @classmethod
     def make(
-        cls, space: ParameterSpace, mean: Float[Array, " dim"], precision: Float[Array, "dim dim"]
+        cls,
+        space: ParameterSpace,
+        mean: Float[Array, " dim"],
+        precision: Float[Array, "dim dim"],
+        measured: bool = False,
     ) -> "InformedSpace":
         """Raises `ValueError` for a mean or a precision of another size than the space's."""
         if mean.shape != (space.dim,) or precision.shape != (space.dim, space.dim):
@@ -31,7 +37,7 @@ class InformedSpace(ParameterSpace):
                 f"{space.dim} x {space.dim}, got {mean.shape} and {precision.shape}"
             )
         means, known = jnp.asarray(mean, float), jnp.asarray(precision, float)
-        return cls(space=space, mean=means, precision=known, ranges=space.ranges)
+        return cls(space=space, mean=means, precision=known, ranges=space.ranges, measured=measured)
 
     def __call__(self, u: Float[Array, " dim"]) -> Fabric:
         """The fabric at a point of the unit cube."""

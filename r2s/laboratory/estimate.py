@@ -104,7 +104,8 @@ def informed(space: ParameterSpace, found: Estimate) -> InformedSpace:
     widths = np.array([bound.width for bound in space.ranges])
     covariance = _covariance(found, widths)
     place = space.to_unit(found.fabric)
-    return InformedSpace.make(space, place, jnp.asarray(np.linalg.inv(covariance), float))
+    precision = jnp.asarray(np.linalg.inv(covariance), float)
+    return InformedSpace.make(space, place, precision, measured=True)
 
 
 def apart(told: Estimate, found: Estimate) -> float:
