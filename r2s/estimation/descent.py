@@ -46,6 +46,7 @@ INITIAL_DAMPING = 1e-2
 # of the spread, and between [m]: beyond lies an outlier. At half of it a part of the sheet that the
 # start cannot follow counts for nothing, and never draws the sheet there.
 STRICT, SCALES = 6.0, (6e-3, 0.015)
+STUCK = 10.0  # damping: a step as short as that, which gains nothing, ends a descent
 HALVING, FEWEST = 3, 3  # iterations, after each of which half go on, but no fewer than this
 
 
@@ -54,7 +55,7 @@ class Stop(NamedTuple):
 
     - `close`: when its next step promises to gain less, over the prior's weight, which is about
       twice what a change by one standard error costs.
-    - `patience`: when so many iterations gained less.
+    - `patience`: when so many steps gained less.
     """
 
     close: float
@@ -419,8 +420,9 @@ def _stop(budget: Budget, stage: int) -> Stop:
 def _arrived(problems: Problems, stage: list[Row], start: int, prior, stop: Stop) -> bool:
     """Whether a descent is at its end.
 
-    It is when its next step promises to gain next to nothing, when its latest iterations have
-    gained next to nothing, or when it diverged.
+    It is when its next step promises to gain next to nothing, when its latest steps have gained
+    next to nothing, when not even a short step gains anything, or when it diverged. A step that was
+    refused is none: the next is shorter, and may gain.
     """
     now = stage[-1][start]
     if not np.isfinite(float(now.normal.loss)):
@@ -428,13 +430,20 @@ def _arrived(problems: Problems, stage: list[Row], start: int, prior, stop: Stop
     least = stop.close * float(prior)
     if len(stage) > 1 and float(_remaining(problems, now, prior)) < least:
         return True
-    if len(stage) <= stop.patience:
-        return False
-    values = [
-        float(_objective(problems, d.theta, d.normal.loss, prior))
-        for d in (stage[-1 - stop.patience][start], now)
+    if float(now.damping) >= STUCK:
+        return True
+    before = [
+        row[start]
+        for row, after in itertools.pairwise(stage)
+        if not np.array_equal(row[start].theta, after[start].theta)
     ]
-    return not values[1] < values[0] - least
+    if len(before) < stop.patience:
+        return False
+    then, value = (
+        float(_objective(problems, d.theta, d.normal.loss, prior))
+        for d in (before[-stop.patience], now)
+    )
+    return not value < then - least
 
 
 def _stacked(rows: list[Row]) -> Descent:

@@ -16,7 +16,9 @@ from r2s.estimation.descent import Search, search
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.fabrics.parameters import ParameterSpace
 
-ALIKE = 0.5  # standard errors, by which ends of one minimum differ at most
+# standard errors, by which ends of one minimum differ at most: a search that is to confirm another
+# stops within half of one
+ALIKE = 1.0
 MOST = 3  # searches, where the first two differ
 
 _weight = eqx.filter_jit(gauss_newton.prior_weight)
@@ -34,14 +36,14 @@ def look_again(
     `r2s.estimation.descent.search`; a killed run looks again from the beginning.
     """
     problems, ends, looks = found.problems, [found], 1
-    once = budget._replace(coarse=0, starts=1, near=False, leads_on=False)
+    once = budget._replace(coarse=0, starts=1, near=False, leads_on=True)
+    more = {"derive": found.derive, "progress": progress, "key": key}
     while looks < MOST:
         start = _start(problems[0].space, looks, key)
         looks += 1
         try:
             words = f"search {looks}, from another start"
-            more = {"start": start, "derive": found.derive, "progress": progress, "words": words}
-            ends.append(search(problems, once, key=key, **more))
+            ends.append(search(problems, once, start=start, words=words, **more))
         except RuntimeError as error:
             if isinstance(error, jax.errors.JaxRuntimeError):  # out of memory, say
                 raise
@@ -51,6 +53,10 @@ def look_again(
         alike = sum(_is_alike(best, each) for each in ends)
         if alike > 1:
             break
+    if best is not found:
+        to_the_end = once._replace(shares=(), near=True, leads_on=False)
+        best = search(problems, to_the_end, start=best.theta, words="its end", **more)
+        ends.append(best)
     seconds = sum(each.seconds for each in ends)
     return best._replace(seconds=seconds, reached=(alike, looks))
 
