@@ -10,7 +10,7 @@ ARGS ?=
 PRESET ?= small
 WORKERS ?= 2
 # What takes minutes: `make test-slow GROUP=cloth` runs one group, `make test-slow` all of them.
-GROUPS := cloth points motions estimates pinn physnet study verdicts documents
+GROUPS := cloth points motions estimates arrival pinn physnet study verdicts documents
 GROUP :=
 
 # Most of the fast tests' time is compilation: they do without XLA's optimisation. Two processes of

@@ -38,6 +38,7 @@ SLOW_GROUPS = (
     "points",
     "motions",
     "estimates",
+    "arrival",
     "pinn",
     "physnet",
     "study",
