@@ -55,7 +55,8 @@ def test_the_command_line_offers_every_method_and_no_other():
     [
         ("diffcp", "cloth", 1, "differentiates through material points; on the cloth take diffcl"),
         ("diffcloud", "points", 1, "on material points take diffcp"),
-        ("pinn", "points", 1, "estimates from stretching, not from lifting: without markers"),
+        ("pinn", "cloth", 1, "not from lifting: the network from clouds .* does not find the fab"),
+        ("pinn", "points", 1, "not from lifting: the network from clouds .* does not find the fab"),
         ("pinn-published", "cloth", 1, "estimates from stretching, not from lifting"),
         ("physnet", "cloth", 2, "takes one recording, got 2"),
         ("diffcloud", "cloth", 0, "needs a recording"),
@@ -68,12 +69,12 @@ def test_what_is_not_supported_is_refused_with_a_reason(recording, name, solver,
         method.estimate([recording] * number, SPACE, key=jr.key(0))
 
 
-def test_pulls_and_clouds_are_not_for_one_network(recording):
+def test_the_network_takes_no_lift_beside_a_pull(recording):
     pull = dataclasses.replace(
         recording, info=dataclasses.replace(recording.info, scenario="stretching")
     )
-    with pytest.raises(ValueError, match="stretchings, or recordings of other motions, not both"):
-        METHODS["pinn"]().estimate([recording, pull], SPACE, key=jr.key(0))
+    with pytest.raises(ValueError, match="pinn: .* so the PINN estimates from stretchings alone"):
+        METHODS["pinn"]().estimate([pull, recording], SPACE, key=jr.key(0))
 
 
 def test_every_method_supports_a_solver_and_says_why_not_the_other():

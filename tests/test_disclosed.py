@@ -145,18 +145,6 @@ def test_the_network_reads_markers_and_force_and_no_clouds(pull):
     assert alike(*given)
 
 
-def test_the_network_looks_at_some_frames_of_clouds(lift):
-    from r2s.estimation.pinn.from_clouds import Settings
-    from r2s.estimation.pinn.matching import sight_of
-
-    reads = METHODS["pinn"]().reads(lift)
-    assert reads.points is None and len(reads.frames) <= Settings.frames
-    args = np.array(reads.frames), Settings.points
-    sight = sight_of(lift, *args)
-    assert alike(sight, sight_of(poisoned(lift, others(lift, reads.frames)), *args))
-    assert not alike(sight, sight_of(poisoned(lift, reads.frames[-1:]), *args))
-
-
 def test_images_are_made_of_some_frames(lift):
     from r2s.estimation.physnet import preprocess
     from r2s.estimation.physnet.views import view_around

@@ -4,16 +4,18 @@ import dataclasses
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from test_pinn_losses import DENSITY, FABRIC, SIZE, waves
 from test_pinn_losses import exact as in_closed_form
 from test_pinn_network import PlaneStrainSpace
 
-from r2s.estimation.pinn.from_clouds import clipped, parameters_of, prior, with_parameters
+from r2s.estimation.pinn.balance import FLAT_PRIOR, INSIDE
 from r2s.estimation.pinn.levenberg_marquardt import (
     Term,
     least_squares,
@@ -64,22 +66,6 @@ def test_a_line_is_found_in_a_step():
     np.testing.assert_allclose(found.information, 1.25 * design.T @ design, rtol=1e-9)
 
 
-def test_terms_share_some_parameters_and_have_others_of_their_own():
-    """Two lines of one slope: theta has both offsets, then the slope."""
-    x, rise = np.linspace(0, 1, 20), np.random.default_rng(1).normal(size=(2, 20))
-    rows = [(jnp.asarray(x), jnp.asarray(y)) for y in rise]
-    own = jnp.array([0, 2]), jnp.array([1, 2])
-    terms = [
-        Term(of_line, jnp.asarray(1.0), row, 7, each) for row, each in zip(rows, own, strict=True)
-    ]
-    found = least_squares(terms, np.zeros(3), 20, damping=1e-12)
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    design = np.concatenate([np.stack([one, zero, x], 1), np.stack([zero, one, x], 1)])
-    expected = np.linalg.lstsq(design, rise.ravel(), rcond=None)[0]
-    np.testing.assert_allclose(found.parameters, expected, rtol=1e-6)
-    np.testing.assert_allclose(found.information, 2 * design.T @ design, rtol=1e-9, atol=1e-12)
-
-
 def test_steps_go_down_and_keep_to_bounds():
     x = jnp.linspace(0.0, 2.0, 12)
     term = Term(of_curve, jnp.asarray(1.0), (x, jnp.exp(1.3 * x) + 0.7))
@@ -96,16 +82,6 @@ def test_what_is_not_finite_is_said():
     x = jnp.array([0.0, jnp.inf])
     with pytest.raises(RuntimeError, match="not finite"):
         normal_equations([Term(of_curve, jnp.asarray(1.0), (x, x))], np.ones(2))
-
-
-def test_parameters_of_a_network_go_there_and_back():
-    low, high = jnp.zeros(3), jnp.ones(3)
-    one, other = (
-        Network.make(low, high, jnp.ones(()), width=4, layers=3, key=jr.key(i)) for i in range(2)
-    )
-    moved = with_parameters(other, jnp.append(jnp.asarray(parameters_of(one)), 5.0))
-    points = jr.uniform(jr.key(3), (5, 3))
-    np.testing.assert_allclose(moved(points), one(points), rtol=1e-12)
 
 
 def wave_pull(fabric) -> Pull:
@@ -158,16 +134,28 @@ class Problem(NamedTuple):
     force: Any
 
 
+def network_of(theta, problem) -> Network:
+    """The network whose parameters are the first numbers of theta."""
+    own, unravel = ravel_pytree(problem.likeness.params)
+    return eqx.tree_at(lambda n: n.params, problem.likeness, unravel(theta[: len(own)]))
+
+
+def of_prior(theta, problem, row):
+    """The ranges as a flat prior: theta ends with a place in the space."""
+    del problem
+    return FLAT_PRIOR**0.5 * (theta[row] - 0.5)[None]
+
+
 def of_marker(theta, problem, row):
     place, frame, measured = row
-    network = with_parameters(problem.likeness, theta)
+    network = network_of(theta, problem)
     moved = displacement(network, problem.pull, place[None], frame[None])[0]
     return (moved - measured) / problem.marker
 
 
 def of_motion(theta, problem, row):
     place, frame = row
-    network = with_parameters(problem.likeness, theta)
+    network = network_of(theta, problem)
     fabric = problem.space(theta[-problem.space.dim :])
     off = motion_residual(network, problem.pull, fabric, place[None], frame[None], small)
     return off[0] / problem.motion
@@ -179,7 +167,7 @@ def of_force(theta, problem, row):
     pull, fabric = problem.pull, problem.space(theta[-problem.space.dim :])
     nodes, weights = gauss(EDGE_NODES)
     places = jnp.stack([jnp.broadcast_to(pull.size[0], nodes.shape), nodes * pull.size[1]], axis=1)
-    network = with_parameters(problem.likeness, theta)
+    network = network_of(theta, problem)
     slopes = gradients(field(network, pull, places, jnp.broadcast_to(frame, nodes.shape)))
     stress = jax.vmap(partial(nominal_stress, fabric, pull.angle, strain=small))(slopes)
     return (pull.size[1] * weights @ stress[:, 0, :1] - measured) / problem.force
@@ -196,17 +184,21 @@ def fabric_of(space, pull, tolerance=1e-3, steps=60):
     problem = Problem(likeness, space, pull, jnp.asarray(1e-6, float), motion, force)
     frames, markers = (jnp.asarray(grid.ravel()) for grid in np.indices(pull.seen.shape))
     seen = pull.places[markers], frames, pull.displacement.reshape(len(frames), -1)
-    drawn, middle = draw_points(pull, 600, key=key_points), np.full(space.dim, 0.5)
-    data, flat = Term(of_marker, problem, seen), prior(middle)
+    drawn, dim = draw_points(pull, 600, key=key_points), space.dim
+    data, flat = Term(of_marker, problem, seen), Term(of_prior, problem, jnp.arange(-dim, 0))
     physics = [
         Term(of_motion, problem, (drawn.inner, drawn.inner_frame)),
         Term(of_force, problem, (jnp.arange(len(pull.times)), pull.force)),
     ]
-    theta, inside = np.concatenate([parameters_of(likeness), middle]), clipped(space.dim)
+    theta = np.append(ravel_pytree(likeness.params)[0], np.full(dim, 0.5))
+
+    def inside(theta):
+        return np.append(theta[:-dim], np.clip(theta[-dim:], INSIDE, 1 - INSIDE))
+
     # the motion first, or the fabric runs to an end of its ranges meanwhile
     theta = least_squares([data, flat], theta, steps // 3, inside=inside).parameters
     found = least_squares([data, flat, *physics], theta, steps, inside=inside)
-    return found.parameters[-space.dim :]
+    return found.parameters[-dim:]
 
 
 @pytest.mark.slow(group="pinn")

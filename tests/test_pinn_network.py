@@ -27,10 +27,9 @@ FABRIC = Fabric.make(0.3, (200.0, 40.0, 120.0, 30.0), 1e-5, damping=0.02)
 ANGLE = jnp.asarray(0.4)
 
 
-def some_network(axes: int = 2) -> Network:
+def some_network() -> Network:
     low, high = jnp.zeros(3), jnp.array([0.45, 0.3, 1.2])
-    scale = jnp.asarray(0.02)
-    return Network.make(low, high, scale, axes=axes, width=9, layers=4, key=jr.key(0))
+    return Network.make(low, high, jnp.asarray(0.02), width=9, layers=4, key=jr.key(0))
 
 
 class PlaneStrainSpace(IsotropicSpace):
@@ -72,10 +71,9 @@ def test_a_network_survives_the_file_of_flax():
     np.testing.assert_array_equal(again(points), network(points))
 
 
-@pytest.mark.parametrize("axes", [2, 3])
 @pytest.mark.parametrize("pairs", [STRONG, WEAK])
-def test_jets_are_the_derivatives(pairs, axes):
-    network = some_network(axes)
+def test_jets_are_the_derivatives(pairs):
+    network = some_network()
     points = jr.uniform(jr.key(1), (5, 3)) * jnp.array([[0.45, 0.3, 1.2]])
     jet = network.jet(points, pairs)
 

@@ -289,6 +289,8 @@ def test_a_lift_and_the_pulls_of_the_network_are_estimated_from_together():
     assert label in {c.configuration.label for c in matrix.synthetic(plan)}
     with pytest.raises(ValueError, match="from one recording, got 4"):
         dataclasses.replace(both, approach="physnet")
+    with pytest.raises(ValueError, match="pinn: on cloth it estimates from stretching, not from l"):
+        dataclasses.replace(both, approach="pinn")
 
 
 def test_published_recipes_are_configurations_of_their_own_whatever_a_plan_cuts():
@@ -415,8 +417,9 @@ def test_an_estimate_that_diverges_is_a_result(tiny, tmp_path, monkeypatch):
         (("--data", "r2s"), "no recording"),
         (("--data", "r2s", "--density", "-1"), "must be positive"),
         (("--fabrics", "silk"), "no preset 'silk'"),
-        (("--configurations", "diffcp-cloth-wind"), "no configuration 'diffcp-cloth-wind'; there"),
-        (("--columns", "diffcp-cloth-wind"), "no configuration 'diffcp-cloth-wind'; there"),
+        (("--configurations", "diffcp-felt"), "no configuration 'diffcp-felt'; there"),
+        (("--columns", "diffcp-cloth-wind"), "no configuration 'diffcp-cloth-wind': it diff"),
+        (("--configurations", "pinn-cloth-wind"), "the network from clouds .* does not find the"),
         (("--judged", "0"), "judged must be at least 1"),
     ],
 )

@@ -53,14 +53,14 @@ class EstimateCard:
     the same fabric. Of three or more, two of them no stretchings, the last motion with clouds (a
     fold only where there is no other) is held out: the estimate is judged on it, beside fabrics of
     which only the weight is known. Says whether the method converged, and which numbers ended at a
-    bound of their range. A killed run of diffcloud, diffcp, physnet, or pinn from pulls goes on
-    where it was, from FILE.progress.npz.
+    bound of their range. A killed run of diffcloud, diffcp, physnet or pinn goes on where it was,
+    from FILE.progress.npz.
 
     diffcloud differentiates through the cloth, diffcp through material points, cma-es tries fabrics
-    on either. pinn fits a network to the markers and force of stretchings, or to the clouds of
-    other motions. physnet compares depth images on the map of a network that was trained for the
-    motion: that in the file --network, or one that is trained now (an hour) and written there.
-    Names with -published follow the recipes of the papers.
+    on either. pinn fits a network to the markers and force of stretchings, and takes no other
+    motion. physnet compares depth images on the map of a network that was trained for the motion:
+    that in the file --network, or one that is trained now (an hour) and written there. Names with
+    -published follow the recipes of the papers.
 
         r2s estimate lift.npz --density 0.32 --out denim.json
         r2s estimate lift.npz wind.npz fling.npz --density 0.32 --out denim.json
@@ -95,8 +95,7 @@ class EstimateCard:
     starts: int | None = None
     """Descents from the best of them (diffcloud 3, diffcp 2)."""
     iterations: int | None = None
-    """Gauss-Newton steps of each stage (25); of pinn and the recipes the epochs; of pinn
-    from clouds the rounds, at most 30."""
+    """Gauss-Newton steps of each stage (25); of pinn and the recipes the epochs."""
     evaluations: int | None = None
     """Simulations of a search (cma-es 600, physnet 80)."""
     angles: Annotated[tuple[float, ...], arg(metavar="DEGREES")] = ()

@@ -100,9 +100,9 @@ class EstimateCell(Cell):
     def __post_init__(self) -> None:
         if len(self.sources) > 1 and not METHODS[self.approach].several:
             raise ValueError(f"{self.approach} is from one recording, got {len(self.sources)}")
-        solvers = tuple(METHODS[self.approach].supports)
-        if self.solver not in solvers:
-            raise ValueError(f"{self.approach} is not on {self.solver}: {solvers}")
+        for source in self.sources:
+            if reason := METHODS[self.approach].refusal(self.solver, source.scenario):
+                raise ValueError(f"{self.approach}: {reason}")
 
     @property
     def scenario(self) -> str:

@@ -50,7 +50,7 @@ FULL = (*PAPER_CONFIGURATIONS, *TOGETHER_CONFIGURATIONS) + tuple(
 )
 FULL += PUBLISHED_CONFIGURATIONS
 """The configurations of the paper, those that it calls unsupported, those that it lacks, and its
-own by published recipes."""
+own by published recipes; none that an approach refuses."""
 
 
 @dataclass(frozen=True)
@@ -113,9 +113,17 @@ PRESETS = {
 
 
 def configuration_named(text: str) -> Configuration:
-    """The configuration written as "diffcloud-cloth-lifting"; ValueError names all there are."""
+    """The configuration written as "diffcloud-cloth-lifting".
+
+    Raises `ValueError` that says why for one that its approach refuses, and names all there are for
+    any other.
+    """
     names = {"-".join(each): each for each in FULL}
     if text not in names:
+        approach, *others = text.rsplit("-", 2)
+        if approach in METHODS and len(others) == 2:
+            if reason := METHODS[approach].refusal(*others):
+                raise ValueError(f"no configuration {text!r}: {reason}")
         raise ValueError(f"no configuration {text!r}; there are {', '.join(names)}")
     return names[text]
 

@@ -1,15 +1,12 @@
 """A physics-informed network: the stiffness of a fabric from stretchings, their markers and force.
 
-From clouds of a sheet that is lifted or in the wind there is an estimate too, which does not find
-the fabric. Needs flax: `pip install 'r2s[pinn]'`.
+Needs flax: `pip install 'r2s[pinn]'`.
 
 - `from_pulls`: the estimate from stretchings. `pulls`: what it is given of a recording.
-- `from_clouds`: the estimate from clouds.
 - `network`: (X, Y, t) to displacement, with derivatives in forward mode.
 - `stress`: strain, stress and its divergence, from the laws of `r2s.laws.membrane`.
 - `losses`: markers, equation of motion, traction, free edges, clamps. `weak_form`: virtual work.
 - `training`: Adam, then L-BFGS. `balance`: motions in balance, the estimate and its covariance.
-- `matching`: points of clouds and the network's map. `hanging_sheet`: its balance of forces.
 - `levenberg_marquardt`: least squares for all parameters of a network at once.
 - `synthetic_pulls`: recordings of a known fabric. `published_recipe`: of Ru et al. (2025).
 """

@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 from scipy.linalg import cho_factor, cho_solve
 
 DAMPINGS, GROWTH = (1e-9, 1e9), 2.0  # of Levenberg's, times the mean of the matrix's diagonal
@@ -36,18 +36,12 @@ class Term(eqx.Module):
     - `shared`: by all rows.
     - `rows`: arrays with a leading axis of rows.
     - `together`: number of rows whose derivatives are taken at once.
-    - `own`: numbers of the parameters that the function is given; None: all of them.
     """
 
     function: Callable[..., Array] = eqx.field(static=True)
     shared: Any
     rows: Any
     together: int = eqx.field(static=True, default=256)
-    own: Int[Array, " own"] | None = None
-
-    def of_own(self, parameters: Parameters) -> Float[Array, " own"]:
-        """Those of the parameters that it is given."""
-        return parameters if self.own is None else parameters[self.own]
 
 
 class Fit(NamedTuple):
@@ -56,14 +50,12 @@ class Fit(NamedTuple):
     - `parameters`: the best ones.
     - `squares`: sum of squares before each step, and after the last.
     - `information`: J^T J there.
-    - `damping`: Levenberg's, as it was at the end.
     - `converged`: whether the last step hardly gained.
     """
 
     parameters: Float[np.ndarray, " parameter"]
     squares: Float[np.ndarray, " step"]
     information: Float[np.ndarray, "parameter parameter"]
-    damping: float
     converged: bool
 
 
@@ -72,9 +64,8 @@ def residuals(terms: Sequence[Term], parameters: Parameters) -> Array:
     """All residuals [-], one term after the other."""
 
     def of(term: Term):
-        own = term.of_own(parameters)
         return jax.lax.map(
-            lambda row: term.function(own, term.shared, row),
+            lambda row: term.function(parameters, term.shared, row),
             term.rows,
             batch_size=term.together,
         ).ravel()
@@ -84,21 +75,19 @@ def residuals(terms: Sequence[Term], parameters: Parameters) -> Array:
 
 @eqx.filter_jit
 def linearised(terms: Sequence[Term], parameters: Parameters) -> list[tuple[Array, Array]]:
-    """The residuals of each term and their Jacobian (residual, parameter of its own)."""
+    """The residuals of each term and their Jacobian."""
 
     def of(term: Term):
-        own = term.of_own(parameters)
-
         def each(row):
             def value(parameters):
                 found = term.function(parameters, term.shared, row)
                 return found, found
 
-            slope, residual = jax.jacrev(value, has_aux=True)(own)
+            slope, residual = jax.jacrev(value, has_aux=True)(parameters)
             return residual, slope
 
         residual, slope = jax.lax.map(each, term.rows, batch_size=term.together)
-        return residual.ravel(), slope.reshape(-1, len(own))
+        return residual.ravel(), slope.reshape(-1, len(parameters))
 
     return [of(term) for term in terms]
 
@@ -108,11 +97,10 @@ def normal_equations(terms: Sequence[Term], parameters: Float[np.ndarray, " para
     number = len(parameters)
     matrix, right, rest = np.zeros((number, number)), np.zeros(number), []
     found = linearised(tuple(terms), jnp.asarray(parameters, float))
-    for term, parts in zip(terms, found, strict=True):
+    for parts in found:
         residual, jacobian = (np.asarray(part, np.float64) for part in parts)
-        own = np.arange(number) if term.own is None else np.asarray(term.own)
-        matrix[np.ix_(own, own)] += jacobian.T @ jacobian
-        right[own] += jacobian.T @ residual
+        matrix += jacobian.T @ jacobian
+        right += jacobian.T @ residual
         rest.append(residual)
     residual = np.concatenate(rest)
     if not (np.isfinite(residual).all() and np.isfinite(matrix).all()):
@@ -133,7 +121,7 @@ def least_squares(
     - `parameters`: to begin with.
     - `steps`: at most.
     - `inside`: brings parameters back within their bounds.
-    - `damping`: Levenberg's to begin with, for instance the last one of an earlier fit.
+    - `damping`: Levenberg's to begin with.
 
     Raises `RuntimeError` when the residuals are not finite.
     """
@@ -161,7 +149,7 @@ def least_squares(
             converged = gain < SMALL * squares[-1]
         if converged:
             break
-    return Fit(parameters, np.array(squares), matrix, damping, converged)
+    return Fit(parameters, np.array(squares), matrix, converged)
 
 
 def _stepped(matrix: np.ndarray, right: np.ndarray, parameters: np.ndarray, inside) -> np.ndarray:

@@ -18,6 +18,7 @@ except ImportError as error:
     raise ImportError("the physics-informed network needs flax: pip install 'r2s[pinn]'") from error
 
 WIDTH, LAYERS = 50, 7  # of the published network: six hidden layers and the last one
+AXES = 2  # outputs: displacements along X and Y
 X, Y, T = range(3)  # the inputs
 STRONG = ((X, X), (X, Y), (Y, Y), (T, T))  # second derivatives in the equation of motion
 WEAK = ((X, T), (Y, T), (T, T))  # second derivatives in the virtual work: none in space alone
@@ -52,21 +53,19 @@ class DisplacementField(Protocol):
 
 
 class Perceptron(nn.Module):
-    """Layers of tanh, the last one linear, from three inputs in -1..1 to `axes` outputs.
+    """Layers of tanh, the last one linear, from three inputs in -1..1 to two outputs.
 
-    - `axes`: number of outputs.
     - `width`: of the hidden layers.
     - `layers`: how many there are, with the last one.
     """
 
-    axes: int
     width: int
     layers: int
 
     @property
     def sizes(self) -> tuple[int, ...]:
         """Widths from the inputs to the outputs."""
-        return (3, *(self.layers - 1) * (self.width,), self.axes)
+        return (3, *(self.layers - 1) * (self.width,), AXES)
 
     def setup(self) -> None:
         shapes = list(zip(self.sizes, self.sizes[1:], strict=False))
@@ -130,7 +129,6 @@ class Network(eqx.Module):
         high: Float[Array, " 3"],
         scale: Float[Array, ""],
         *,
-        axes: int = 2,
         width: int = WIDTH,
         layers: int = LAYERS,
         shrink: float = 1.0,
@@ -140,10 +138,10 @@ class Network(eqx.Module):
 
         - `low`, `high`: ends of the inputs [m, m, s].
         - `scale`: displacement [m] that an output of 1 stands for.
-        - `axes`, `width`, `layers`: see `Perceptron`.
+        - `width`, `layers`: see `Perceptron`.
         - `shrink`: what the last kernel is divided by, for a motion that begins small.
         """
-        module = Perceptron(axes, width, layers)
+        module = Perceptron(width, layers)
         draw, dtype = jax.nn.initializers.glorot_normal(), jnp.zeros((), float).dtype
         shapes, params = zip(module.sizes, module.sizes[1:], strict=False), {}
         for i, (shape, key_layer) in enumerate(zip(shapes, jr.split(key, layers), strict=True)):
@@ -164,8 +162,3 @@ class Network(eqx.Module):
     def _apply(self, points: Float[Array, "point 3"], *rest, method=None) -> Any:
         inputs = (points - self.centre[None]) / self.radius[None]
         return self.module.apply({"params": self.params}, inputs, *rest, method=method)
-
-
-def at_time(places: Float[Array, "place 2"], time: Float[Array, ""]) -> Float[Array, "place 3"]:
-    """Inputs (X [m], Y [m], t [s]) of a network, from places and one time."""
-    return jnp.concatenate([places, jnp.broadcast_to(time, (len(places), 1))], axis=1)

@@ -20,8 +20,8 @@ Strain = Callable[[Gradient], Voigt]
 
 
 def green(gradient: Gradient) -> Voigt:
-    """Green strain [-] of a gradient of displacement, exact for any rotation and out of plane."""
-    f = gradient + jnp.eye(gradient.shape[0], 2, dtype=gradient.dtype)
+    """Green strain [-] of a gradient of displacement, exact for any rotation."""
+    f = gradient + jnp.eye(2, dtype=gradient.dtype)
     return jnp.stack([(f[:, 0] @ f[:, 0] - 1) / 2, (f[:, 1] @ f[:, 1] - 1) / 2, f[:, 0] @ f[:, 1]])
 
 

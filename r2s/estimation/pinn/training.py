@@ -112,7 +112,6 @@ def init(space: ParameterSpace, pulls: Pull, recipe: Recipe, *, key: PRNGKeyArra
             jnp.zeros_like(high),
             high,
             jnp.max(jnp.abs(pull.displacement)) / 2,
-            axes=pull.displacement.shape[-1],
             width=recipe.width,
             layers=recipe.layers,
             shrink=SHRINK,
