@@ -5,11 +5,11 @@ python experiments/prior_and_mesh.py --meshes finest --priors fabrics   # half a
 
 A lift of each of the five fabrics on 33 x 33 vertices, seen by two depth cameras, is estimated from
 on 9 x 9 vertices, or on the finest mesh: with no prior ("flat"), and with that of measured fabrics.
-Predicted are three motions that the estimate never saw, all of them on 17 x 17 vertices. Written is the mean
-distance of vertices from the true fabric's on the same mesh [mm] (which is then zero), beside those
-of the prior's middle and of its draws, which know the weight alone; and each parameter over the
-truth (of the coupling the difference) with its standard error, in brackets where it is not called
-identifiable.
+Predicted are three motions that the estimate never saw, all of them on 17 x 17 vertices. Written is
+the mean distance of vertices from the true fabric's on the same mesh [mm] (which is then zero),
+beside those of the prior's middle and of its draws, which know the weight alone; and each parameter
+over the truth (of the coupling the difference) with its standard error, in brackets where it is not
+called identifiable.
 """
 
 import itertools
