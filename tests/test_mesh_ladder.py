@@ -89,7 +89,7 @@ def test_steps_to_finer_and_coarser_meshes_lead_to_the_same_limit():
 @pytest.mark.slow(group="estimates")
 @pytest.mark.parametrize(("enough", "shape"), [(1e9, (3, 3)), (1e-9, (5, 5))])
 def test_a_finer_mesh_is_taken_where_the_coarse_one_is_not_enough(enough, shape, monkeypatch):
-    monkeypatch.setattr(resolution, "LADDER", (3, 5))
+    monkeypatch.setattr(resolution, "LADDER", (2, 3, 5))
     monkeypatch.setattr(resolution, "ENOUGH", enough)
     found = mesh_ladder.descend_by_meshes([lift()], SPACE, SMALL, key=jr.key(0))
     assert found.shape == shape
@@ -105,7 +105,7 @@ def test_a_finer_mesh_is_taken_where_the_coarse_one_is_not_enough(enough, shape,
 @pytest.mark.slow(group="estimates")
 def test_an_estimate_on_the_finest_mesh_stays_at_its_end_within_what_is_known(monkeypatch):
     """Of two recordings, to its end: places around it and each alone are on the mesh before."""
-    monkeypatch.setattr(resolution, "LADDER", (3, 5))
+    monkeypatch.setattr(resolution, "LADDER", (2, 3, 5))
     monkeypatch.setattr(resolution, "ENOUGH", 1e-9)
     known, off = 0.1, 0.02
     prior = InformedSpace.make(SPACE, PLACE + off, jnp.eye(2) / known**2)
@@ -172,14 +172,14 @@ def test_an_estimate_is_named_by_the_mesh_of_what_moves_freely():
 
 
 def test_a_shape_that_is_asked_for_is_kept(monkeypatch):
-    monkeypatch.setattr(resolution, "LADDER", (3, 5))
+    monkeypatch.setattr(resolution, "LADDER", (2, 3, 5))
     monkeypatch.setattr(resolution, "ENOUGH", 1e-9)
     found = mesh_ladder.descend_by_meshes([lift()], SPACE, SMALL, shape=(3, 3), key=jr.key(0))
     assert found.shape == (3, 3)
 
 
 def test_the_finest_mesh_is_reached_in_one_stride(monkeypatch):
-    """From the coarsest, whose fabric would do; and it is no shape that was asked for."""
+    """From the mesh before, whose fabric would do; and it is no shape that was asked for."""
     climbed, here = [], jnp.zeros(3)
 
     def searched(problems, budget, *, start=None, **_):
@@ -192,7 +192,7 @@ def test_the_finest_mesh_is_reached_in_one_stride(monkeypatch):
     monkeypatch.setattr(mesh_ladder, "judged", lambda *_, **__: estimate_of_nothing())
     monkeypatch.setattr(resolution, "LADDER", (3, 5, 9))
     found = mesh_ladder.descend_by_meshes([lift()], SPACE, SMALL, finest=True, key=jr.key(0))
-    assert climbed == [(9, True, True), (81, False, False)]
+    assert climbed == [(25, True, True), (81, False, False)]
     assert found.shape == (9, 9)
     with pytest.raises(ValueError, match="leave it out"):
         DiffCloud(finest=True, shape=(9, 9)).estimate([lift()], SPACE, key=jr.key(0))
@@ -215,7 +215,7 @@ def test_a_fabric_that_folds_at_the_end_of_a_coarse_mesh_goes_on(folds, meshes, 
     monkeypatch.setattr(mesh_ladder, "is_too_coarse", is_too_coarse)
     monkeypatch.setattr(mesh_ladder, "look_again", lambda found, *_, **__: found)
     monkeypatch.setattr(mesh_ladder, "judged", lambda *_, **__: estimate_of_nothing())
-    monkeypatch.setattr(resolution, "LADDER", (3, 5))
+    monkeypatch.setattr(resolution, "LADDER", (2, 3, 5))
     mesh_ladder.descend_by_meshes([lift()], SPACE, SMALL, key=jr.key(0))
     assert [count for count, _ in climbed] == meshes
     assert [leads_on for _, leads_on in climbed] == [True, *[False] * (len(meshes) - 1)]
@@ -257,7 +257,7 @@ def test_where_all_diverges_on_a_finer_mesh_the_estimate_is_of_the_coarser_and_s
     monkeypatch.setattr(mesh_ladder, "is_too_coarse", lambda *_: True)
     monkeypatch.setattr(mesh_ladder, "look_again", lambda found, *_, **__: found)
     monkeypatch.setattr(mesh_ladder, "judged", lambda *_, **__: estimate_of_nothing())
-    monkeypatch.setattr(resolution, "LADDER", (3, 5))
+    monkeypatch.setattr(resolution, "LADDER", (2, 3, 5))
     told: list[str] = []
     monkeypatch.setattr(mesh_ladder, "tell", lambda _, words: told.append(words))
     found = mesh_ladder.descend_by_meshes([lift()], SPACE, SMALL, key=jr.key(0))

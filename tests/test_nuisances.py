@@ -178,7 +178,7 @@ def staying(lifted, raw, off, bias):
     there, found, left = settled(problems, other, end, one, covariance, theirs)
     assert at is end.theta and there is end.theta
     assert left[0] <= np.sqrt(found[0, 0])
-    np.testing.assert_allclose(flat, covariance + np.outer(theirs, theirs))
+    np.testing.assert_allclose(flat, covariance + np.diag(theirs**2))
     assert np.linalg.eigvalsh(flat - found)[0] > -1e-9  # never wider for what is known
     np.testing.assert_allclose(np.diag(found)[1:], 1e-4, rtol=2e-2)
     return found[0, 0], left[0]

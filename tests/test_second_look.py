@@ -16,7 +16,6 @@ from r2s.estimation.second_look import ALIKE, look_again
 from r2s.fabrics.parameters import IsotropicSpace
 
 SPACE = IsotropicSpace.make(0.2)
-ERROR = 0.01  # of a range
 
 
 class Problem:
@@ -50,20 +49,18 @@ def looked(monkeypatch, first: Search, *others: Search | None, losses):
         scales.append(float(scale))
         return losses(float(predicted[0][0]))
 
-    covariance = ERROR**2 * jnp.eye(SPACE.dim)
     monkeypatch.setattr(second_look, "search", search)
     monkeypatch.setattr(second_look, "loss_from", loss)
-    monkeypatch.setattr(second_look, "_weight", lambda *_: jnp.ones(()))
-    monkeypatch.setattr(second_look, "_sandwich", lambda *_: (covariance, covariance))
     return look_again(first, DEFAULT, key=jr.key(0)), starts, scales
 
 
 def test_two_searches_that_end_alike_are_enough(monkeypatch):
-    near = 0.6 + 0.9 * ALIKE * ERROR
+    near = 0.6 * (1 + 0.9 * (ALIKE - 1))
     found, starts, _ = looked(monkeypatch, ended(0.6), ended(near), losses=lambda at: at)
     assert found.reached == (2, 2) and found.seconds == 2.0
     assert float(found.theta[0]) == pytest.approx(0.6)
-    np.testing.assert_allclose(starts, [SPACE.prior()[0]])
+    assert [float(each[0]) for each in found.others] == pytest.approx([near])  # in its errors
+    assert np.max(np.abs(starts[0] - SPACE.prior()[0])) > 0.01  # a draw of the prior
 
 
 def test_where_two_differ_the_best_of_three_is_taken_and_counted(monkeypatch):
@@ -78,6 +75,7 @@ def test_a_search_that_no_other_confirms_is_not_sure(monkeypatch):
     ends = ended(0.3), ended(0.6), None
     found, _, _ = looked(monkeypatch, *ends, losses=lambda at: at)
     assert found.reached == (1, 3) and float(found.theta[0]) == pytest.approx(0.3)
+    assert found.others == ()
 
 
 def test_ends_are_compared_by_the_scale_of_the_best_fit(monkeypatch):

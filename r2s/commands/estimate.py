@@ -91,9 +91,9 @@ class EstimateCard:
     name: str = ""
     """Name of the fabric; by default that of the recording."""
     coarse: int | None = None
-    """Places of the range that are tried first (diffcloud 24, diffcp 12)."""
+    """Places of the range that are tried first (diffcloud none, diffcp 12)."""
     starts: int | None = None
-    """Descents from the best of them (diffcloud 3, diffcp 2)."""
+    """Descents from the best of them, or from the prior mean (diffcloud 1, diffcp 2)."""
     iterations: int | None = None
     """Gauss-Newton steps of each stage (25); of pinn and the recipes the epochs."""
     evaluations: int | None = None
@@ -103,8 +103,8 @@ class EstimateCard:
     network: Annotated[Path | None, arg(metavar="FILE")] = None
     """physnet: its trained network; by default that of --out with .network."""
     shape: tuple[int, int] | None = None
-    """Vertices of the simulated sheet; by default diffcloud goes to finer meshes until one resolves
-    the fabric, others take 9 9."""
+    """Vertices of the simulated sheet; by default diffcloud takes 17 along the longer side, or 33
+    where the fabric needs them, others take 9 9."""
     finest: bool = False
     """diffcloud: go on to 33 vertices along the longer side, whichever fabric is found: minutes."""
     hold_out: Annotated[str | None, arg(metavar="NAME|none")] = None

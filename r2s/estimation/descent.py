@@ -46,7 +46,6 @@ INITIAL_DAMPING = 1e-2
 # of the spread, and between [m]: beyond lies an outlier. At half of it a part of the sheet that the
 # start cannot follow counts for nothing, and never draws the sheet there.
 STRICT, SCALES = 6.0, (6e-3, 0.015)
-STUCK = 10.0  # damping: a step as short as that, which gains nothing, ends a descent
 HALVING, FEWEST = 3, 3  # iterations, after each of which half go on, but no fewer than this
 
 
@@ -55,16 +54,21 @@ class Stop(NamedTuple):
 
     - `close`: when its next step promises to gain less, over the prior's weight, which is about
       twice what a change by one standard error costs.
-    - `patience`: when so many steps gained less.
+    - `patience`, `gain`: when so many steps gained less than that, or than this share of the loss.
+    - `stuck`: at this damping, when not even a step that is as short gains anything.
     """
 
     close: float
     patience: int
+    gain: float
+    stuck: float
 
 
-# At a tenth of a standard error, or, where another descent goes on from there, at a quarter (a half
-# is too early: outliers that are left out from there on may hold it there).
-AT_THE_END, ON_THE_WAY = Stop(5e-3, 4), Stop(0.03, 2)
+# At a tenth of a standard error; or, where another descent goes on from there, at a quarter (a half
+# is too early: outliers that are left out from there on may hold it there); or, where more frames
+# follow, roughly.
+AT_THE_END, ON_THE_WAY = Stop(5e-3, 4, 5e-4, 10.0), Stop(0.03, 2, 3e-3, 10.0)
+MORE_FRAMES = Stop(0.03, 2, 0.02, 1.0)
 Row = list[Descent]  # one iteration: the descents of all starts
 
 _propose = eqx.filter_jit(gauss_newton.propose)
@@ -80,7 +84,7 @@ DEFAULT = Budget(shares=(0.25, 0.5))
 class Search(NamedTuple):
     """- `problems`: what was searched for. - `rows`: all descents in every iteration.
     - `seconds`: how long it took. - `derive`: `remembering` where it was last.
-    - `reached`: see `r2s.estimation.estimate.Estimate`.
+    - `reached`: see `r2s.estimation.estimate.Estimate`. `others`: where else it fits as well.
     """
 
     problems: Problems
@@ -88,6 +92,7 @@ class Search(NamedTuple):
     seconds: float
     derive: Derive
     reached: tuple[int, int] | None = None
+    others: tuple[Theta, ...] = ()
 
     @property
     def best(self) -> Descent:
@@ -200,6 +205,9 @@ def judged(
     coarse, beside = coarser_of(problems, other_mesh)
     around = {"tried_on": coarse, "derive": found.derive}
     covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1), **around)
+    if found.others:  # of one valley, or of several fabrics that nothing tells apart
+        off = np.asarray(jnp.stack(found.others) - best.theta[None], np.float64)
+        covariance = covariance + off.T @ off / len(off)
     of_law, seen = law_error(problems, best, prior, predicted), [each for each, _ in predicted]
     covariance, bias = covariance + np.outer(of_law, of_law), None
     if other_mesh is not None:
@@ -413,8 +421,9 @@ def _last_stage(budget: Budget) -> int:
 
 
 def _stop(budget: Budget, stage: int) -> Stop:
-    is_last = stage == _last_stage(budget)
-    return AT_THE_END if is_last and not budget.leads_on else ON_THE_WAY
+    if stage < _last_stage(budget):
+        return MORE_FRAMES
+    return ON_THE_WAY if budget.leads_on else AT_THE_END
 
 
 def _arrived(problems: Problems, stage: list[Row], start: int, prior, stop: Stop) -> bool:
@@ -430,7 +439,7 @@ def _arrived(problems: Problems, stage: list[Row], start: int, prior, stop: Stop
     least = stop.close * float(prior)
     if len(stage) > 1 and float(_remaining(problems, now, prior)) < least:
         return True
-    if float(now.damping) >= STUCK:
+    if float(now.damping) >= stop.stuck:
         return True
     before = [
         row[start]
@@ -443,7 +452,7 @@ def _arrived(problems: Problems, stage: list[Row], start: int, prior, stop: Stop
         float(_objective(problems, d.theta, d.normal.loss, prior))
         for d in (before[-stop.patience], now)
     )
-    return not value < then - least
+    return not value < then - max(least, stop.gain * float(now.normal.loss))
 
 
 def _stacked(rows: list[Row]) -> Descent:

@@ -41,7 +41,7 @@ class DiffCloud(Method):
     """
 
     name = "diffcloud"
-    budget = DEFAULT
+    budget = DEFAULT._replace(coarse=0, starts=1)
     heeds = ("coarse", "starts", "iterations")
     supports = {"cloth": ANY}
     refusals = REFUSALS

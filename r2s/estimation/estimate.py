@@ -125,7 +125,7 @@ class Estimate:
     - `converged`: whether the method stopped by its own criterion; False when its budget ended it,
       or no other search ended there. None: nothing was fitted, or a file of version 0.2.0 does not
       say.
-    - `reached`: how many searches from different starts ended at this fabric, and how many were
+    - `reached`: how many searches from different starts fit as well as this one, and how many were
       made; None: there was one.
     - `mesh_bias`: how far each parameter is expected to be off for its mesh alone, as the standard
       errors, which hold it (`r2s.estimation.mesh_bias`). None: that was not judged.
@@ -292,8 +292,8 @@ def describe(estimate: Estimate) -> list[str]:
         words = "yes" if estimate.converged else "no, the budget ended the search"
         if estimate.reached is not None:
             ended, searches = estimate.reached
-            told = f"{ended} of {searches} searches from different starts ended here"
-            lost = f"no, not sure: {told}, the others elsewhere with a larger loss"
+            told = f"{ended} of {searches} searches from different starts fit as well"
+            lost = f"no, not sure: none of {searches - 1} searches from other starts fits as well"
             words = f"{words}, {told}" if ended > 1 else lost
         lines.append(f"converged: {words}")
         named = ", ".join(f"{name} ({side})" for name, side in estimate.at_bounds.items())

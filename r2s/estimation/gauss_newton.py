@@ -229,13 +229,16 @@ def prior_weight(problems: Problems, normal: Normal) -> Float[Array, ""]:
     """Weight [m^2] of the prior beside the loss: how much the loss scatters by chance.
 
     The likelihood is exp(-loss / weight) when the gradient scatters like weight times the matrix
-    (magnitude adjustment of a composite likelihood, Pauli, Racugno and Ventura 2011).
+    (magnitude adjustment of a composite likelihood, Pauli, Racugno and Ventura 2011). At most, as
+    if all points of a cluster were one: few clusters of a rough loss may scatter by far more, and
+    the prior would draw a fit to where its loss is several times as large.
     """
     _, precision = prior_terms(problems, jnp.zeros(theta_length(problems), float))
     least = least_weight(problems, normal.spread)
     inverse = jnp.linalg.inv(normal.matrix + least * precision)
     ratio = jnp.trace(inverse @ normal.scatter) / jnp.trace(inverse @ normal.matrix)
-    return jnp.maximum(ratio, jnp.finfo(ratio.dtype).tiny)
+    most = normal_equations.MEMORY * least_weight(problems, jnp.sqrt(2 * normal.loss))
+    return jnp.clip(ratio, jnp.finfo(ratio.dtype).tiny, jnp.maximum(most, least))
 
 
 def least_weight(problems: Problems, spread: Float[Array, ""]) -> Float[Array, ""]:

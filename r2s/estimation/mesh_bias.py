@@ -169,7 +169,8 @@ def settled(
 ) -> Settled:
     """An estimate at the end of a descent, with what its mesh errs.
 
-    It stays where the loss is least: that a mesh errs does not say where the fabric is instead.
+    It stays where the loss is least: that a mesh errs does not say where the fabric is instead. How
+    far is told by one step, in which direction hardly, so each parameter errs by itself.
     Where something is known of the fabric beforehand, the truth is at most as far off as that
     allows: the errors are in each direction the smaller of those by the recordings and those of the
     posterior in which the recordings count by all of these errors (the model discrepancy of Kennedy
@@ -179,7 +180,7 @@ def settled(
     - `prior`: its weight, see `r2s.estimation.gauss_newton.prior_weight`.
     - `covariance`: of the end, without its mesh's error. `bias`: as `mesh_bias` gives it.
     """
-    raw, space = covariance + np.outer(bias, bias), problems[0].space
+    raw, space = covariance + np.diag(bias**2), problems[0].space
     if not isinstance(space, InformedSpace):
         return Settled(end.theta, raw, bias)
     way, errors = _posterior(problems, end, prior, raw)

@@ -97,7 +97,7 @@ SMALL = Plan(
     repeats=1,
     judged=2,
     budgets=Budgets(
-        diffcloud=METHODS["diffcloud"].budget._replace(coarse=16, starts=2, iterations=15),
+        diffcloud=METHODS["diffcloud"].budget._replace(iterations=15),
         diffcp=METHODS["diffcp"].budget._replace(coarse=4, starts=1, iterations=2),
         physnet=METHODS["physnet"].budget._replace(evaluations=40),
         training=TrainingBudget(fabrics=32, epochs=2, steps=40),
