@@ -12,7 +12,7 @@ from r2s.estimation.descent import DEFAULT, Search
 from r2s.estimation.estimate import describe
 from r2s.estimation.estimate_json import as_json, from_json
 from r2s.estimation.gauss_newton import Descent, Normal
-from r2s.estimation.second_look import ALIKE, look_again
+from r2s.estimation.second_look import ALIKE, LIKELY, look_again
 from r2s.fabrics.parameters import IsotropicSpace
 
 SPACE = IsotropicSpace.make(0.2)
@@ -76,6 +76,13 @@ def test_a_search_that_no_other_confirms_is_not_sure(monkeypatch):
     found, _, _ = looked(monkeypatch, *ends, losses=lambda at: at)
     assert found.reached == (1, 3) and float(found.theta[0]) == pytest.approx(0.3)
     assert found.others == ()
+
+
+def test_an_end_that_fits_nearly_as_well_is_in_the_errors_though_it_confirms_nothing(monkeypatch):
+    ends = ended(0.3), ended(0.3 * 0.99 * LIKELY), ended(0.3 * 1.01 * LIKELY)
+    found, *_ = looked(monkeypatch, *ends, losses=lambda at: at)
+    assert found.reached == (1, 3)
+    assert [float(each[0]) for each in found.others] == pytest.approx([0.297 * LIKELY])
 
 
 def test_ends_are_compared_by_the_scale_of_the_best_fit(monkeypatch):

@@ -84,7 +84,8 @@ DEFAULT = Budget(shares=(0.25, 0.5))
 class Search(NamedTuple):
     """- `problems`: what was searched for. - `rows`: all descents in every iteration.
     - `seconds`: how long it took. - `derive`: `remembering` where it was last.
-    - `reached`: see `r2s.estimation.estimate.Estimate`. `others`: where else it fits as well.
+    - `reached`: see `r2s.estimation.estimate.Estimate`. `others`: where else it fits nearly as
+      well.
     """
 
     problems: Problems
@@ -205,7 +206,7 @@ def judged(
     coarse, beside = coarser_of(problems, other_mesh)
     around = {"tried_on": coarse, "derive": found.derive}
     covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1), **around)
-    if found.others:  # of one valley, or of several fabrics that nothing tells apart
+    if found.others:  # of one valley, or of several fabrics that little tells apart
         off = np.asarray(jnp.stack(found.others) - best.theta[None], np.float64)
         covariance = covariance + off.T @ off / len(off)
     of_law, seen = law_error(problems, best, prior, predicted), [each for each, _ in predicted]

@@ -16,6 +16,7 @@ from r2s.estimation.method import Budget, Progress, tell
 from r2s.fabrics.parameters import ParameterSpace
 
 ALIKE = 1.02  # times the least loss, within which two ends fit alike
+LIKELY = 1.25  # times that, within which an end shows how far apart minima of a rough loss lie
 MOST = 3  # searches, where the first two differ
 
 
@@ -25,9 +26,9 @@ def look_again(
     """The best of a search and of others from elsewhere, with how many of them fit as well.
 
     These start at draws of the prior; there is a third where the first two differ. All count the
-    same points, with the scale of the outliers of the best fit. Where they end apart but fit alike,
-    nothing tells these fabrics apart, and the standard errors hold that. A search that diverges
-    counts as one that ended elsewhere. The other arguments are those of
+    same points, with the scale of the outliers of the best fit. Where they end apart but fit nearly
+    alike, little tells these fabrics apart, and the standard errors hold that. A search that
+    diverges counts as one that ended elsewhere. The other arguments are those of
     `r2s.estimation.descent.search`; a killed run looks again from the beginning.
     """
     problems, ends, looks = found.problems, [found], 1
@@ -45,16 +46,17 @@ def look_again(
             tell(progress, f"search {looks} diverged")
         losses = _losses(ends, budget)
         best = ends[int(np.argmin(losses))]
-        alike = [e for e, loss in zip(ends, losses, strict=True) if loss <= ALIKE * min(losses)]
-        if len(alike) > 1:
+        alike = sum(loss <= ALIKE * min(losses) for loss in losses)
+        if alike > 1:
             break
-    others = tuple(each.theta for each in alike if each is not best)
+    likely = [e for e, loss in zip(ends, losses, strict=True) if loss <= LIKELY * min(losses)]
+    others = tuple(each.theta for each in likely if each is not best)
     if best is not found:
         to_the_end = once._replace(shares=(), near=True, leads_on=False)
         best = search(problems, to_the_end, start=best.theta, words="its end", **more)
         ends.append(best)
     seconds = sum(each.seconds for each in ends)
-    return best._replace(seconds=seconds, reached=(len(alike), looks), others=others)
+    return best._replace(seconds=seconds, reached=(alike, looks), others=others)
 
 
 def _draw(space: ParameterSpace, key: PRNGKeyArray) -> Float[Array, " dim"]:
