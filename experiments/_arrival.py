@@ -146,10 +146,8 @@ CASES: dict[str, Case] = {
     # pulls
     "pull same pink": Case("stretching", PINK, (17, 17)),
     "pull finer denim": Case("stretching", DENIM, (33, 33), motion=(("strain", 0.03),)),
-    "pull falling linen": Case("stretching", LINEN, (25, 25), "falling"),
-    "pull stiffening trousers": Case(
-        "stretching", TROUSERS, (25, 25), simulator="stiffening", motion=(("strain", 0.03),)
-    ),
+    "pull finer linen": Case("stretching", LINEN, (25, 25)),
+    "pull finer canvas": Case("stretching", CANVAS, (25, 25), motion=(("strain", 0.02),)),
 }
 
 
