@@ -17,7 +17,7 @@ from r2s.estimation.covariance import covariance_at
 from r2s.estimation.descent import Budget, descend, nuisances
 from r2s.estimation.estimate import describe
 from r2s.estimation.gauss_newton import Descent, Normal
-from r2s.estimation.mesh_bias import OtherMesh, _posterior, coarser_of, factor, settled
+from r2s.estimation.mesh_bias import OtherMesh, _positive, _posterior, coarser_of, factor, settled
 from r2s.estimation.nuisances import free as nuisances_that_vary
 from r2s.estimation.prediction import predict
 from r2s.estimation.problem import (
@@ -192,6 +192,17 @@ def test_what_is_known_limits_the_errors_of_an_estimate_that_stays_but_for_the_w
     assert left == pytest.approx(0.255, abs=0.01)
     far, _ = staying(lifted, 0.04, 2.5, 0.0)  # eight standard deviations of the prior
     np.testing.assert_allclose(far, 0.04, rtol=1e-3)
+
+
+def test_a_covariance_that_rounding_left_singular_has_errors_too(lifted):
+    """Two numbers of which single precision tells only a combination."""
+    size = gauss_newton.theta_length((lifted,))
+    broken = 1e-4 * np.eye(size)
+    broken[0, 1] = broken[1, 0] = 1e-4 * (1 + 1e-6)
+    assert np.linalg.eigvalsh(broken)[0] < 0
+    mended = _positive(broken)
+    assert np.linalg.eigvalsh(mended)[0] > 0
+    np.testing.assert_allclose(mended, broken, atol=1e-9)
 
 
 def test_what_tests_measured_draws_an_estimate_only_as_far_as_the_finer_mesh_allows(

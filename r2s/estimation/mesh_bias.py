@@ -180,7 +180,7 @@ def settled(
     - `prior`: its weight, see `r2s.estimation.gauss_newton.prior_weight`.
     - `covariance`: of the end, without its mesh's error. `bias`: as `mesh_bias` gives it.
     """
-    raw, space = covariance + np.diag(bias**2), problems[0].space
+    raw, space = _positive(covariance) + np.diag(bias**2), problems[0].space
     if not isinstance(space, InformedSpace):
         return Settled(end.theta, raw, bias)
     way, errors = _posterior(problems, end, prior, raw)
@@ -237,6 +237,14 @@ def _posterior(
     left = (axes * np.maximum(sizes - 1, 0)[None]) @ axes.T
     way = bounded_step(known @ off - left @ alone, left + known, room(problems, end.theta))
     return way, np.linalg.inv(left + known)
+
+
+def _positive(covariance: Float[np.ndarray, "theta theta"]) -> Float[np.ndarray, "theta theta"]:
+    """A covariance without the negative variances that rounding leaves in single precision."""
+    deviation = np.sqrt(np.diag(covariance))
+    sizes, axes = np.linalg.eigh(covariance / np.outer(deviation, deviation))
+    sizes = np.maximum(sizes, len(sizes) * np.finfo(np.float32).eps)
+    return (axes * sizes[None]) @ axes.T * np.outer(deviation, deviation)
 
 
 def _smaller(
