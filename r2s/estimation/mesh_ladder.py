@@ -110,12 +110,11 @@ def descend_by_meshes(
 
     def needed() -> Iterator[Callable[[], None]]:
         """What will be compiled, in the order in which it will most likely be run."""
-        for shapes in rungs[:2]:
+        likely = rungs if finest else rungs[: 2 if several else 1]
+        for shapes in likely:
             yield lambda shapes=shapes: prepare(on(*shapes), budget.width)
-        last = rungs[:2][-1]
-        others = _others(last, _ratio(last))
-        for shapes in (others, last):
-            yield lambda shapes=shapes: prepare(on(*shapes), derivatives=False)
+        others = _others(likely[-1], _ratio(likely[-1]))
+        yield lambda: prepare(on(*others), derivatives=False)
         if finest:  # else that of the rung before
             yield lambda: prepare(on(*others), budget.width)
 
@@ -138,6 +137,7 @@ def descend_by_meshes(
                     raise
                 refused = f"{_named(max(shapes))} vertices, which it needs: {error}"
                 tell(progress, f"the finer mesh diverged: back to {_named(max(at.shapes))}")
+                at = at if shapes is rungs[-1] else settle(at)  # which it is already on the last
                 break
         if len(rungs) == 1:
             at = at._replace(found=look_again(at.found, budget, progress=progress, key=key))
