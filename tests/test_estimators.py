@@ -217,7 +217,7 @@ def test_the_scatter_of_a_gradient_is_that_of_the_jackknife():
     clusters = jnp.asarray(scores), jnp.asarray(matrices)
 
     def covariance(noise):
-        found = gauss_newton.scatter(*clusters, jnp.full(6, noise), jnp.zeros((2, 2)))
+        found = gauss_newton.scatter(*clusters, jnp.full(6, noise), jnp.zeros((2, 2)), 1.0)
         return inverse @ np.asarray(found) @ inverse
 
     np.testing.assert_allclose(covariance(0.0), left.T @ left, rtol=1e-9)
@@ -225,6 +225,19 @@ def test_the_scatter_of_a_gradient_is_that_of_the_jackknife():
     np.testing.assert_allclose(covariance(100.0), 100 * inverse, rtol=1e-9)
     least = np.linalg.eigvalsh(covariance(0.1) - 0.1 * inverse)
     assert least[0] > -1e-12
+
+
+def test_without_the_cluster_that_alone_tells_a_number_that_is_what_the_prior_allows():
+    """The slope of a line whose points but for the last cluster's all lie in one place."""
+    rows = np.ones((3, 4, 2))
+    rows[:, :, 1] = np.array([0.0, 0.0, 1.0])[:, None]
+    matrices, precision, weight = np.einsum("cpu,cpv->cuv", rows, rows), np.diag([4.0, 25.0]), 1e-9
+    scores = np.array([[0.1, 0.0], [-0.3, 0.0], [0.2, 0.2]])  # not at the minimum of the slope
+    parts = jnp.asarray(scores), jnp.asarray(matrices), jnp.zeros(3)
+    found = gauss_newton.scatter(*parts, jnp.asarray(precision), weight)
+    inverse = np.linalg.inv(matrices.sum(axis=0) + weight * precision)
+    error = np.sqrt((inverse @ np.asarray(found) @ inverse)[1, 1])
+    assert 1 / 5 < error < 1 / 4  # the others tell a little of it by the mean
 
 
 @pytest.mark.slow(group="estimates")

@@ -170,14 +170,15 @@ def normal_from(
         noise.append(share * found.noise)
     spread = jnp.sqrt(jnp.stack(weights) @ jnp.stack(spreads) ** 2)
     score, matrix = jnp.concatenate(scores), jnp.concatenate(matrices)
-    least = prior_terms(problems, theta)[1] * least_weight(problems, spread)
+    least = least_weight(problems, spread)
+    _, precision = prior_terms(problems, theta)
     return Normal(
         jnp.sum(jnp.stack(losses)),
         spread,
         jnp.max(jnp.stack(spreads)),
         jnp.sum(score, axis=0),
         jnp.sum(matrix, axis=0),
-        scatter(score, matrix, jnp.concatenate(noise), least),
+        scatter(score, matrix, jnp.concatenate(noise), precision, least),
     )
 
 
@@ -185,22 +186,31 @@ def scatter(
     scores: Float[Array, "cluster theta"],
     matrices: Float[Array, "cluster theta theta"],
     noise: Float[Array, " cluster"],
-    prior: Float[Array, "theta theta"],
+    precision: Float[Array, "theta theta"],
+    weight: Float[Array, ""] | float,
 ) -> Float[Array, "theta theta"]:
     """Covariance of a gradient that is a sum over clusters which err independently.
 
     Each score is corrected to what it would be had its cluster not been fitted. With that the
     sandwich estimator is the jackknife, which does not take few clusters for much evidence (CR3 of
-    Bell and McCaffrey 2002). In no direction is the covariance less than if all residuals erred
-    independently, with a variance of `noise` times the cluster's matrix: less would be the chance
-    of few clusters.
+    Bell and McCaffrey 2002). Without a cluster the fit is one standard deviation of the prior away
+    at most: where a cluster alone tells a direction, and its loss is rough, it would be farther by
+    what rounding leaves of the others. In no direction is the covariance less than if all residuals
+    erred independently, with a variance of `noise` times the cluster's matrix: less would be the
+    chance of few clusters.
+
+    - `precision`, `weight` [m^2]: of the prior.
     """
-    whole = jnp.sum(matrices, axis=0) + prior
+    whole = jnp.sum(matrices, axis=0) + weight * precision
     # a cluster that alone tells something would leave nothing behind, but for rounding
     share = 1 - 16 * jnp.finfo(scores.dtype).eps
-    left = jnp.eye(len(prior), dtype=scores.dtype)[None] - share * matrices @ jnp.linalg.inv(whole)
+    inverse = jnp.linalg.inv(whole)
+    left = jnp.eye(len(whole), dtype=scores.dtype)[None] - share * matrices @ inverse
     # one by one: batches of LAPACK in two programs at once wait for each other for ever
     alone = jax.lax.map(lambda each: jnp.linalg.solve(*each), (left, scores))
+    away = alone @ inverse
+    squares = jnp.einsum("cu,uv,cv->c", away, precision, away)
+    alone = alone / jnp.sqrt(jnp.maximum(squares, 1))[:, None]
     return _larger(alone.T @ alone, jnp.einsum("c,cuv->uv", noise, matrices), whole)
 
 
