@@ -16,7 +16,9 @@ import measure
 
 from r2s import scenarios
 from r2s.estimation import gauss_newton
-from r2s.estimation.descent import DEFAULT, Budget, descend
+from r2s.estimation.descent import DEFAULT
+from r2s.estimation.judgement import descend
+from r2s.estimation.method import Budget
 from r2s.estimation.prediction import predict
 from r2s.estimation.problem import Problem
 from r2s.fabrics import presets

@@ -113,7 +113,7 @@ CASES: dict[str, Case] = {
     "lift same denim": Case("lifting", DENIM, (17, 17)),
     "lift same linen": Case("lifting", LINEN, (17, 17), motion=FAST, outliers=0.01),
     "lift same trousers": Case("lifting", TROUSERS, (17, 17), motion=FAR),
-    "lift same canvas": Case("lifting", CANVAS, (9, 9), motion=LOW),
+    "lift same canvas": Case("lifting", CANVAS, (17, 17), motion=LOW),
     # on finer ones
     "lift finer denim": Case("lifting", DENIM, (33, 33), motion=LOW),
     "lift finer linen": Case("lifting", LINEN, (33, 33), motion=FAR),
@@ -139,7 +139,7 @@ CASES: dict[str, Case] = {
     "lift mujoco 6": _of_mujoco(150.0, 1.2e-4, 0.35, 0.45, (25, 33), (0.45, 0.6)),
     # winds
     "wind same canvas": Case("wind", CANVAS, (17, 17)),
-    "wind same tarpaulin": Case("wind", TARPAULIN, (9, 9), motion=(("speed", 3.2),)),
+    "wind same tarpaulin": Case("wind", TARPAULIN, (17, 17), motion=(("speed", 3.2),)),
     "wind finer canvas": Case("wind", CANVAS, (25, 25), motion=(("aside", 15.0),)),
     "wind finer tarpaulin": Case("wind", TARPAULIN, (25, 25), outliers=0.01),
     "wind quadrilaterals canvas": Case("wind", CANVAS, (25, 25), "quadrilaterals"),

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from r2s.estimation import default_spaces
-from r2s.estimation.descent import descend
 from r2s.estimation.estimate import Estimate
+from r2s.estimation.judgement import descend
 from r2s.estimation.problem import NuisancePrior, Problem
 from r2s.evaluation.horizon import floor_of, horizon_of, skill, within
 from r2s.evaluation.surface_distance import POINTS, to_surface

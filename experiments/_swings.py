@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from r2s.estimation.descent import Budget, descend
 from r2s.estimation.estimate import Estimate
+from r2s.estimation.judgement import descend
+from r2s.estimation.method import Budget
 from r2s.estimation.problem import NuisancePrior, Problem, default_nuisance_prior
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace

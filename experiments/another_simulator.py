@@ -16,7 +16,7 @@ from _mujoco import FRAMES, MOTIONS, SIDE, in_mujoco, scenario_of
 from _tables import Line, command_line, keep
 
 import r2s
-from r2s.estimation.descent import descend
+from r2s.estimation.judgement import descend
 from r2s.estimation.problem import Clouds, NuisancePrior, Problem
 from r2s.fabrics.parameters import MASS_DAMPING, OrthotropicSpace
 from r2s.geometry.surface import sample

@@ -12,7 +12,8 @@ import numpy as np
 from _common import relative_errors, synthetic_problem
 from _tables import Line, command_line, keep, resumed
 
-from r2s.estimation.descent import DEFAULT, descend
+from r2s.estimation.descent import DEFAULT
+from r2s.estimation.judgement import descend
 from r2s.fabrics import presets
 
 NINETY = 1.645  # standard errors to either side

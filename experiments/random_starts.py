@@ -17,8 +17,9 @@ from _common import relative_errors, synthetic_problem
 from _tables import Line, command_line, resumed
 
 from r2s.estimation import cma_es
-from r2s.estimation.descent import DEFAULT, descend
+from r2s.estimation.descent import DEFAULT
 from r2s.estimation.diffcloud import published_recipe
+from r2s.estimation.judgement import descend
 from r2s.fabrics import presets
 
 METHODS = {

@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from r2s.estimation.descent import Budget, descend
 from r2s.estimation.estimate import Estimate
+from r2s.estimation.judgement import descend
+from r2s.estimation.method import Budget
 from r2s.estimation.problem import NuisancePrior, Problem
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import OrthotropicSpace

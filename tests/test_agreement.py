@@ -19,9 +19,10 @@ from r2s.estimation.agreement import (
     scattered,
     told_by,
 )
-from r2s.estimation.descent import DEFAULT, each_alone
+from r2s.estimation.descent import DEFAULT
 from r2s.estimation.estimate import Agreement
 from r2s.estimation.gauss_newton import theta_length
+from r2s.estimation.judgement import each_alone
 from r2s.estimation.problem import NuisancePrior, Problem
 from r2s.fabrics import presets
 from r2s.fabrics.parameters import OrthotropicSpace

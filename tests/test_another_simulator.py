@@ -13,7 +13,7 @@ import pytest
 
 from r2s.cloth.cloth import Cloth
 from r2s.cloth.linear.elimination import Elimination
-from r2s.estimation.descent import Budget
+from r2s.estimation.method import Budget
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.geometry.mesh import rectangle

@@ -7,8 +7,7 @@ import pytest
 
 from r2s import scenarios
 from r2s.estimation.bounded import bounded_step, held_back, only_held, room
-from r2s.estimation.descent import Descent
-from r2s.estimation.gauss_newton import MARGIN, Normal, theta_length
+from r2s.estimation.gauss_newton import MARGIN, Descent, Normal, theta_length
 from r2s.estimation.mesh_bias import _posterior
 from r2s.estimation.problem import Problem
 from r2s.fabrics import presets

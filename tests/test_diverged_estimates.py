@@ -10,8 +10,7 @@ import pytest
 from r2s import scenarios
 from r2s.estimation import cma_es, descent
 from r2s.estimation.compiled import derivatives_at
-from r2s.estimation.descent import Descent
-from r2s.estimation.gauss_newton import Normal, theta_length
+from r2s.estimation.gauss_newton import Descent, Normal, theta_length
 from r2s.estimation.method import Budget
 from r2s.estimation.problem import NuisancePrior, Problem
 from r2s.fabrics import presets

@@ -19,10 +19,11 @@ from r2s.estimation import (
     gauss_newton,
     identifiability,
 )
-from r2s.estimation.descent import Budget, descend
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.estimate_json import as_json, from_json
 from r2s.estimation.gauss_newton import Descent
+from r2s.estimation.judgement import descend
+from r2s.estimation.method import Budget
 from r2s.estimation.normal_equations import loss_of, normal_equations_of
 from r2s.estimation.prediction import Prediction, Sensitivity, _delayed, predict, sensitivities
 from r2s.estimation.problem import OWN, NuisancePrior, Problem, beginning, window
@@ -190,7 +191,8 @@ def test_a_marker_that_is_off_in_every_frame_is_one_error(pulled):
         prior = 1e-6 * jnp.diag(jnp.diag(jnp.sum(found.matrices, axis=0)) + 1e-9)
         inverse = jnp.linalg.inv(jnp.sum(found.matrices, axis=0) + prior)
         noise = jnp.zeros_like(found.noise)
-        return inverse @ gauss_newton.scatter(found.scores, found.matrices, noise, prior) @ inverse
+        parts = found.scores, found.matrices, noise, prior, 1.0
+        return inverse @ gauss_newton.scatter(*parts) @ inverse
 
     corners = pulled.markers.vertices
     once, again = (np.asarray(covariance(*each)) for each in ((1, lambda x: x), (2, twice)))

@@ -9,9 +9,9 @@ import pytest
 
 from r2s import scenarios
 from r2s.estimation import held_out
-from r2s.estimation.descent import nuisances
 from r2s.estimation.estimate import point_estimate
 from r2s.estimation.held_out import HeldOut
+from r2s.estimation.nuisances import nuisances
 from r2s.estimation.problem import Problem
 from r2s.fabrics import presets
 from r2s.fabrics.parameters import OrthotropicSpace

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.estimation import covariance, descent, mesh_ladder
+from r2s.estimation import covariance, descent, judgement, mesh_ladder
 from r2s.estimation.compiled import derivatives_at, normal_from
 from r2s.estimation.diffcloud import DiffCloud
 from r2s.estimation.estimate import Estimate
@@ -123,11 +123,11 @@ def test_an_estimate_on_the_finest_mesh_stays_at_its_end_within_what_is_known(mo
         monkeypatch.setattr(module, name, noting)
 
     note(covariance, "normals_at")
-    note(descent, "each_alone")
-    note(descent.mesh_bias, "alone")
-    note(descent, "_with_density", lambda *_, **__: None)
-    monkeypatch.setattr(descent, "agreement", lambda *_: None)
-    monkeypatch.setattr(descent.density_doubt, "is_asked", lambda *_: True)
+    note(judgement, "each_alone")
+    note(judgement.mesh_bias, "alone")
+    note(judgement, "_with_density", lambda *_, **__: None)
+    monkeypatch.setattr(judgement, "agreement", lambda *_: None)
+    monkeypatch.setattr(judgement.density_doubt, "is_asked", lambda *_: True)
     found = mesh_ladder.descend_by_meshes(both, prior, budget, key=jr.key(0))
     assert found.shape == (5, 5)
     assert tried == [(name, 9) for name in ("normals_at", "each_alone", "alone", "_with_density")]
@@ -154,8 +154,8 @@ def test_recordings_that_diverge_alone_on_a_coarser_mesh_are_not_compared(monkey
     theta = jnp.zeros(theta_length(problems)).at[:2].set(PLACE + 0.01)
     row = descent._fresh(problems, SMALL, [theta], 0.0, len(SMALL.shares) + 1, derivatives_at)
     found = descent.Search(problems, [row], 0.0, derivatives_at)
-    monkeypatch.setattr(descent, "each_alone", diverges)
-    estimate = descent.judged(found, SMALL, progress=Progress(), key=jr.key(0))
+    monkeypatch.setattr(judgement, "each_alone", diverges)
+    estimate = judgement.judged(found, SMALL, progress=Progress(), key=jr.key(0))
     assert estimate.agreement is None and estimate.shares == ()
     assert np.all(estimate.standard_errors > 0)
     assert Progress.said == ["a recording alone diverged: not compared"]

@@ -14,11 +14,13 @@ from r2s import scenarios
 from r2s.estimation import cma_es, compiled, gauss_newton
 from r2s.estimation.agreement import weighing
 from r2s.estimation.covariance import covariance_at
-from r2s.estimation.descent import Budget, descend, nuisances
 from r2s.estimation.estimate import describe
 from r2s.estimation.gauss_newton import Descent, Normal
+from r2s.estimation.judgement import descend
 from r2s.estimation.mesh_bias import OtherMesh, _positive, _posterior, coarser_of, factor, settled
+from r2s.estimation.method import Budget
 from r2s.estimation.nuisances import free as nuisances_that_vary
+from r2s.estimation.nuisances import nuisances
 from r2s.estimation.prediction import predict
 from r2s.estimation.problem import (
     Force,

@@ -12,7 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from r2s import scenarios
-from r2s.estimation.descent import Budget, descend
+from r2s.estimation.judgement import descend
+from r2s.estimation.method import Budget
 from r2s.estimation.problem import NuisancePrior, Problem
 from r2s.fabrics import presets
 from r2s.fabrics.parameters import OrthotropicSpace

@@ -1,6 +1,5 @@
 """From anywhere in the range to the best fabric: a coarse search, then Gauss-Newton descents."""
 
-import dataclasses
 import itertools
 import time
 from pathlib import Path
@@ -13,32 +12,22 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation import checkpoint as checkpoints
-from r2s.estimation import density_doubt, gauss_newton, mesh_bias
-from r2s.estimation.agreement import agreement
+from r2s.estimation import gauss_newton
 from r2s.estimation.compiled import (
     Derive,
-    loss_from,
     losses_at,
     normals_at,
-    predictions_at,
     remembering,
 )
-from r2s.estimation.covariance import covariance_at
-from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import (
     Descent,
     Normal,
     Problems,
-    recording_weights,
     theta_indices,
 )
-from r2s.estimation.law_error import law_error
-from r2s.estimation.mesh_bias import OtherMesh, coarser_of
 from r2s.estimation.method import Budget, Progress, tell
-from r2s.estimation.misfits import left_out, misfits
-from r2s.estimation.nuisances import nuisances
 from r2s.estimation.prediction import Theta, explain, fabric_at
-from r2s.estimation.problem import Problem, beginning, check_shared
+from r2s.estimation.problem import beginning, check_shared
 from r2s.fabrics.fabric import Fabric
 from r2s.program_memory import let_go_in_time
 
@@ -98,7 +87,12 @@ class Search(NamedTuple):
     @property
     def best(self) -> Descent:
         """The best descent, at its end."""
-        return _best(self.rows[-1])[1]
+        return self.rows[-1][self.which]
+
+    @property
+    def which(self) -> int:
+        """Its index among the starts."""
+        return _best(self.rows[-1])[0]
 
     @property
     def theta(self) -> Theta:
@@ -109,36 +103,6 @@ class Search(NamedTuple):
     def fabric(self) -> Fabric:
         """The fabric there."""
         return fabric_at(self.problems[0], self.theta[theta_indices(self.problems, 0)])
-
-
-def descend(
-    problems: Problem | Problems,
-    budget: Budget = DEFAULT,
-    *,
-    approach: str = "diffcloud",
-    start: Float[Array, " dim"] | None = None,
-    checkpoint: Path | None = None,
-    progress: Progress | None = None,
-    key: PRNGKeyArray,
-) -> Estimate:
-    """The fabric that explains one recording, or several of one fabric.
-
-    - `approach`: how the estimate names its method.
-    - `start`: in the unit cube, among the coarse places; None: the mean of the space's prior.
-    - `checkpoint`: a file that holds the state after every iteration. A run of the same problem
-      that finds it goes on from there.
-    - `progress`: called with the iteration and the best loss [m^2].
-    - `key`: draws the other coarse places.
-
-    The estimate has converged when the best descent arrived in the last stage, see `_arrived`. A
-    simulation that diverges counts as infinitely bad; when all do, raises `RuntimeError`. Raises
-    `ValueError` for no starts, for an odd number of places around the end, and for shares that do
-    not rise between 0 and 1.
-    """
-    problems = (problems,) if isinstance(problems, Problem) else problems
-    found = search(problems, budget, start=start, checkpoint=checkpoint, progress=progress, key=key)
-    saved = {"checkpoint": checkpoint, "progress": progress, "key": key}
-    return judged(found, budget, approach=approach, **saved)
 
 
 def search(
@@ -174,111 +138,10 @@ def search(
     while (row := _next(problems, budget, rows, derive)) is not None:
         rows.append(row)
         if checkpoint is not None:
-            checkpoints.save(checkpoint, checkpoints.arrays_of(_stacked(rows)), run)
+            checkpoints.save(checkpoint, checkpoints.arrays_of(stacked(rows)), run)
         if progress is not None:
             progress(len(rows) - 2, float(_best(row)[1].normal.loss))
     return Search(problems, rows, time.perf_counter() - began, derive)
-
-
-def judged(
-    found: Search,
-    budget: Budget,
-    *,
-    approach: str = "diffcloud",
-    other_mesh: OtherMesh | None = None,
-    checkpoint: Path | None = None,
-    progress: Progress | None = None,
-    key: PRNGKeyArray,
-) -> Estimate:
-    """The estimate at the end of a search, with its standard errors, which hold what a constant
-    stiffness is off that at small strain (`r2s.estimation.law_error`).
-
-    `checkpoint`: of the search; a descent for the density (`r2s.estimation.density_doubt`) is kept
-    beside it. `progress`: as in `descend`.
-
-    `other_mesh`: by which its bias is judged, which the standard errors hold (`mesh_bias.settled`).
-    If it is coarser, places around the end, each recording alone and a density are tried on it.
-    """
-    began, problems = time.perf_counter(), found.problems
-    which, best = _best(found.rows[-1])
-    stage, prior = _rows_of_stage(found.rows, int(best.stage)), _weight(problems, best.normal)
-    predicted = found.derive(problems, best.theta, budget.width)
-    coarse, beside = coarser_of(problems, other_mesh)
-    around = {"tried_on": coarse, "derive": found.derive}
-    covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1), **around)
-    if found.others:  # of one valley, or of several fabrics that little tells apart
-        off = np.asarray(jnp.stack(found.others) - best.theta[None], np.float64)
-        covariance = covariance + off.T @ off / len(off)
-    of_law, seen = law_error(problems, best, prior, predicted), [each for each, _ in predicted]
-    covariance, bias = covariance + np.outer(of_law, of_law), None
-    if other_mesh is not None:
-        led = mesh_bias.mesh_bias(problems, other_mesh, best, prior, predicted)
-        theta, covariance, bias = mesh_bias.settled(
-            problems, other_mesh, best, prior, covariance, led
-        )
-        if theta is not best.theta:
-            best, seen = dataclasses.replace(best, theta=theta), predictions_at(problems, theta)
-    rows = [*found.rows[:-1], [best if i == which else row for i, row in enumerate(found.rows[-1])]]
-    seconds = found.seconds + time.perf_counter() - began
-    converged = _arrived(problems, stage, which, prior, _stop(budget, int(best.stage)))
-    converged = converged and (found.reached is None or found.reached[0] > 1)
-    told = covariance, approach, seconds, converged, loss_from(problems, seen), bias
-    estimate = collect(problems, rows, *told)
-    try:
-        alone = each_alone(coarse, budget, best.theta, key, found.derive, progress)
-    except RuntimeError as error:  # on the coarser mesh, of a fabric of the finer one
-        if isinstance(error, jax.errors.JaxRuntimeError):  # out of memory, say
-            raise
-        tell(progress, "a recording alone diverged: not compared")
-        alone = []
-    shares = tuple(float(each) for each in recording_weights(problems)) if alone else ()
-    biases = mesh_bias.alone(coarse, beside, alone, found.derive, budget.width)
-    agreed = agreement(coarse, alone, biases) if alone else None
-    missed = misfits(problems, best.theta, seen)
-    if density_doubt.is_asked(problems, agreed, missed):
-        path = checkpoint and checkpoint.with_suffix(".density.npz")
-        saved = {"checkpoint": path, "progress": progress, "key": key}
-        agreed = _with_density(agreed, coarse, budget, best.theta, **saved)
-    return dataclasses.replace(
-        estimate,
-        agreement=agreed,
-        shares=shares,
-        misfits=missed,
-        left_out=left_out(problems, seen, float(best.scale)),
-        reached=found.reached,
-    )
-
-
-def each_alone(
-    problems: Problems,
-    budget: Budget,
-    theta: Theta,
-    key: PRNGKeyArray,
-    derive: Derive | None = None,
-    progress: Progress | None = None,
-) -> list[Descent]:
-    """The ends of descents in each of several recordings alone, from a theta of all of them."""
-    if len(problems) < 2:
-        return []
-    saved = {"derive": derive, "progress": progress, "key": key}
-    alone = budget._replace(coarse=0, starts=1, shares=(), near=True, leads_on=True)
-    ends = []
-    for which, problem in enumerate(problems):
-        start = theta[theta_indices(problems, which)]
-        words = f"recording {which + 1} of {len(problems)} alone"
-        ends.append(search((problem,), alone, start=start, words=words, **saved).best)
-    return ends
-
-
-def _with_density(agreed, problems: Problems, budget: Budget, theta: Theta, **saved):
-    """The agreement with the density that all recordings lead to; as it is where they diverge."""
-    loose, start = density_doubt.freed(problems, theta)
-    free = budget._replace(coarse=0, starts=1, shares=(), near=True, leads_on=False)
-    try:
-        end = search(loose, free, start=start, words="which density would fit", **saved).best
-    except RuntimeError:
-        return agreed
-    return density_doubt.with_density(agreed, loose, end)
 
 
 def _begin(problems: Problems, budget: Budget, start, derive: Derive, progress, key) -> Row:
@@ -427,6 +290,13 @@ def _stop(budget: Budget, stage: int) -> Stop:
     return ON_THE_WAY if budget.leads_on else AT_THE_END
 
 
+def has_arrived(found: Search, budget: Budget) -> bool:
+    """Whether the best descent of a search is at its end, see `_arrived`."""
+    now, prior = int(found.best.stage), _weight(found.problems, found.best.normal)
+    stage = _rows_of_stage(found.rows, now)
+    return _arrived(found.problems, stage, found.which, prior, _stop(budget, now))
+
+
 def _arrived(problems: Problems, stage: list[Row], start: int, prior, stop: Stop) -> bool:
     """Whether a descent is at its end.
 
@@ -456,7 +326,7 @@ def _arrived(problems: Problems, stage: list[Row], start: int, prior, stop: Stop
     return not value < then - max(least, stop.gain * float(now.normal.loss))
 
 
-def _stacked(rows: list[Row]) -> Descent:
+def stacked(rows: list[Row]) -> Descent:
     """All descents of some iterations, with the leading axes (iteration, start)."""
     flat = [descent for row in rows for descent in row]
     shape = (len(rows), len(rows[0]))
@@ -486,41 +356,3 @@ def _resumed(checkpoint: Path, run: dict[str, str], budget: Budget) -> list[Row]
         [jax.tree.map(lambda leaf, i=i, j=j: leaf[i, j], stored) for j in range(budget.starts)]
         for i in range(len(stored.stage))
     ]
-
-
-def collect(
-    problems: Problems,
-    rows: list[Row],
-    covariance: Float[np.ndarray, "theta theta"],
-    approach: str,
-    seconds: float,
-    converged: bool | None,
-    loss: float,
-    bias: Float[np.ndarray, " theta"] | None = None,
-) -> Estimate:
-    """The estimate of the best descent in the last of some iterations, from its covariance.
-
-    `bias` is that of its mesh, which the covariance holds already.
-    """
-    space = problems[0].space
-    _, best = _best(rows[-1])
-    of_fabric = covariance[: space.dim, : space.dim]
-    deviation = np.sqrt(np.diag(of_fabric))
-    descents = _stacked(rows)
-    values_of = jax.vmap(jax.vmap(space.values))
-    widths = np.array([bound.width for bound in space.ranges])
-    return Estimate(
-        approach=approach,
-        fabric=fabric_at(problems[0], best.theta[theta_indices(problems, 0)]),
-        ranges=space.ranges,
-        values=np.asarray(space.values(best.theta[: space.dim])),
-        standard_errors=deviation * widths,
-        mesh_bias=None if bias is None else np.abs(bias[: space.dim]) * widths,
-        correlation=of_fabric / np.outer(deviation, deviation),
-        nuisances=nuisances(problems, np.asarray(best.theta), np.sqrt(np.diag(covariance))),
-        loss=loss,
-        losses=np.asarray(descents.normal.loss),
-        history=np.asarray(values_of(jnp.asarray(descents.theta[..., : space.dim]))),
-        seconds=seconds,
-        converged=converged,
-    )

@@ -9,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r2s.estimation import compiled, descent, gauss_newton
+from r2s.estimation import compiled, gauss_newton
 from r2s.estimation.covariance import covariance_at
-from r2s.estimation.descent import Budget
+from r2s.estimation.descent import DEFAULT
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import Descent, Problems
+from r2s.estimation.judgement import collect, descend
+from r2s.estimation.method import Budget
 from r2s.estimation.prediction import explain
 from r2s.estimation.problem import Problem
 from r2s.fabrics.fabric import Fabric
@@ -44,9 +46,9 @@ def sensitivity(problems: Problem | Problems, fabric: Fabric) -> Estimate:
     zero = jnp.zeros((), float)
     end = Descent(theta, normal, zero, zero, scale, jnp.zeros((), int))
     key = jax.random.key(0)
-    covariance = covariance_at(problems, descent.DEFAULT, end, key, is_truth=True)
+    covariance = covariance_at(problems, DEFAULT, end, key, is_truth=True)
     loss = compiled.loss_from(problems, [seen for seen, _ in predicted])
-    return descent.collect(problems, [[end]], covariance, "sensitivity", 0.0, None, loss)
+    return collect(problems, end, [[end]], covariance, "sensitivity", 0.0, None, loss)
 
 
 class FixedParameter(ParameterSpace):
@@ -118,7 +120,7 @@ def profile(
         side = 1 if places[i] >= centre else -1
         held = FixedParameter.make(space, which, places[i])
         fixed = tuple(dataclasses.replace(problem, space=held) for problem in problems)
-        found = descent.descend(
+        found = descend(
             fixed,
             budget,
             approach="profile",

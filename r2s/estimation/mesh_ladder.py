@@ -19,9 +19,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation.compiled import prepare, remembering
-from r2s.estimation.descent import Search, each_alone, judged, search
+from r2s.estimation.descent import Search, search
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import FINEST, Descent, Problems
+from r2s.estimation.judgement import each_alone, judged
 from r2s.estimation.mesh_bias import OtherMesh, factor
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import Theta
@@ -62,7 +63,7 @@ def descend_by_meshes(
     `finest`: from the first mesh straight to the finest of `r2s.scenarios.resolution.LADDER`,
     whichever fabric is found; not with a `shape`.
 
-    The other arguments are those of `r2s.estimation.descent.descend`; each mesh has a checkpoint.
+    The other arguments are those of `r2s.estimation.judgement.descend`; each mesh has a checkpoint.
     Where a mesh is too coarse, but on the finer one all diverges, the estimate is that of the end
     on the coarser mesh, and `refused` says why (with `finest` it is an error).
 
@@ -158,8 +159,8 @@ def descend_weighed(
     progress: Progress | None = None,
     key: PRNGKeyArray,
 ) -> Estimate:
-    """`r2s.estimation.descent.descend` on the meshes that the problems have; of several recordings
-    each counts by how well it can be followed alone (`weights`)."""
+    """`r2s.estimation.judgement.descend` on the meshes that the problems have; of several
+    recordings each counts by how well it can be followed alone (`weights`)."""
     derive = remembering()
     saved = {"progress": progress, "derive": derive, "key": key}
     found = search(problems, budget, checkpoint=checkpoint, **saved)
