@@ -1,10 +1,13 @@
 """Thirty recordings of known sheets, and what an estimate from each of them comes to.
 
-The true numbers of each fit on a mesh that estimates go to: most sheets are stiff in bending.
+The true numbers of each fit on a mesh that estimates go to: most sheets are stiff in bending. None
+is more than two and a half standard deviations off what is known of fabrics of its weight, beyond
+which intervals of what a recording does not tell would miss whatever the search does.
 """
 
 import dataclasses
 import math
+import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -82,8 +85,8 @@ def _with_losses(name: str, damping: float, friction: float) -> Fabric:
 DENIM, PINK = _with_losses("black_denim", 6e-3, 0.45), _with_losses("pink_solid", 4e-3, 0.55)
 TROUSERS = _with_losses("royal_target", 8e-3, 0.35)
 LINEN = _stiff(0.2, (400.0, 300.0), 40.0, 1.5e-5, 0.4)
-CANVAS = _stiff(0.3, (900.0, 700.0), 90.0, 3e-4, 0.6)
-TARPAULIN = _stiff(0.4, (500.0, 800.0), 150.0, 8e-4, 0.3)
+CANVAS = _stiff(0.3, (900.0, 700.0), 60.0, 1.2e-4, 0.6)
+TARPAULIN = _stiff(0.4, (500.0, 800.0), 80.0, 2e-4, 0.3)
 FAST, LOW, FAR = (("moving", 1.6),), (("height", 0.2),), (("height", 0.4), ("inward", 0.05))
 
 
@@ -133,9 +136,9 @@ CASES: dict[str, Case] = {
     # of MuJoCo
     "lift mujoco 1": _of_mujoco(300.0, 6.2e-5, 0.3, 0.5, (19, 25), (0.45, 0.6), FAST),
     "lift mujoco 2": _of_mujoco(300.0, 6.2e-5, 0.3, 0.5, (25, 33), (0.45, 0.6), FAR),
-    "lift mujoco 3": _of_mujoco(200.0, 1e-4, 0.2, 0.4, (25, 25), (0.45, 0.45)),
-    "lift mujoco 4": _of_mujoco(500.0, 2e-4, 0.25, 0.6, (33, 33), (0.45, 0.45), LOW),
-    "lift mujoco 5": _of_mujoco(400.0, 8e-5, 0.2, 0.3, (33, 33), (0.45, 0.45), FAST),
+    "lift mujoco 3": _of_mujoco(200.0, 7e-5, 0.2, 0.4, (25, 25), (0.45, 0.45)),
+    "lift mujoco 4": _of_mujoco(400.0, 1.2e-4, 0.25, 0.6, (33, 33), (0.45, 0.45), LOW),
+    "lift mujoco 5": _of_mujoco(300.0, 7e-5, 0.2, 0.3, (33, 33), (0.45, 0.45), FAST),
     "lift mujoco 6": _of_mujoco(150.0, 1.2e-4, 0.35, 0.45, (25, 33), (0.45, 0.6)),
     # winds
     "wind same canvas": Case("wind", CANVAS, (17, 17)),
@@ -205,7 +208,9 @@ def arrived(folder: Path, case: str, seed: str) -> Line:
     recording, truth = recorded(case, folder), CASES[case].fabric
     density = float(truth.density)
     space = prior.informed(with_law(on_cloth(density), law_told_by([recording])), density)
+    began = time.process_time()
     found = DiffCloud().estimate([recording], space, key=jr.key(int(seed)))
+    seconds = time.process_time() - began
     assert found.shape is not None
     problem = problem_of(recording, space, found.shape)
     ends = {
@@ -219,7 +224,8 @@ def arrived(folder: Path, case: str, seed: str) -> Line:
         line[f"loss of {name}"] = f"{1e6 * loss_from((problem,), seen):.3f}"
         line[f"mm of {name}"] = f"{1e3 * away(problem, seen[0]):.2f}"
         line[f"% beyond 3 mm of {name}"] = f"{100 * left_out((problem,), seen, STRICT)[0]:.1f}"
-    return line | in_errors(space, truth, found) | told(found)
+    line |= in_errors(space, truth, found) | told(found)
+    return line | {"CPU s": f"{seconds:.0f}"}
 
 
 def problem_of(recording: Recording, space: ParameterSpace, shape: tuple[int, int]) -> Problem:
@@ -271,5 +277,4 @@ def told(found: Estimate) -> Line:
     return {
         "left out": f"{100 * max(found.left_out, default=0.0):.1f} %",
         "converged": "yes" if found.converged else "no",
-        "s": f"{found.seconds:.0f}",
     }

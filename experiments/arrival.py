@@ -1,6 +1,6 @@
 """Do searches arrive? Estimates from thirty recordings of known sheets, beside the true numbers.
 
-python experiments/arrival.py --out docs/results/arrival.csv     # an hour on one core
+python experiments/arrival.py --out docs/results/arrival.csv     # three hours on one core
 python experiments/arrival.py --cases "lift same denim" --seeds 1 2
 
 Each line has, on the mesh of the estimate, the loss [mm^2], the mean distance [mm] of the recorded

@@ -16,7 +16,7 @@ from r2s.estimation.diffcloud import DiffCloud
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.estimate_json import as_json, from_json
 from r2s.estimation.gauss_newton import Descent, Normal, theta_length
-from r2s.estimation.mesh_bias import OtherMesh, factor, mesh_bias
+from r2s.estimation.mesh_bias import OtherMesh, factor, mesh_error
 from r2s.estimation.method import Budget
 from r2s.estimation.problem import NuisancePrior, Problem
 from r2s.fabrics import presets
@@ -56,8 +56,9 @@ def end():
 def test_the_same_mesh_has_no_bias(end):
     problems, found = end
     seen = derivatives_at(problems, found.theta)
-    bias = mesh_bias(problems, OtherMesh(problems, 1.0), found, jnp.asarray(1e-12), seen)
-    np.testing.assert_allclose(bias, 0, atol=1e-9)
+    by = mesh_error(problems, OtherMesh(problems, 1.0), found, seen)
+    np.testing.assert_allclose(by.bias, 0, atol=1e-9)
+    np.testing.assert_allclose(by.covariance, 0, atol=1e-9)
 
 
 @pytest.mark.slow(group="estimates")
@@ -65,8 +66,9 @@ def test_a_mesh_that_moves_like_a_stiffer_fabric_has_the_bias_of_that_stiffness(
     problems, found = end
     seen = derivatives_at(problems, found.theta)
     other = OtherMesh((problem(1.05),), 2.0)
-    bias = mesh_bias(problems, other, found, jnp.asarray(1e-12), seen)
-    assert bias[0] * SPACE.ranges[0].width == pytest.approx(2 * np.log(1.05), rel=0.2)
+    by = mesh_error(problems, other, found, seen)
+    assert by.bias[0] * SPACE.ranges[0].width == pytest.approx(2 * np.log(1.05), rel=0.2)
+    assert np.linalg.eigvalsh(by.covariance - np.outer(by.bias, by.bias))[0] > -1e-12
 
 
 @pytest.mark.slow(group="estimates")
@@ -74,8 +76,9 @@ def test_a_motion_that_fails_leaves_the_whole_range_in_doubt(end):
     problems, found = end
     seen = derivatives_at(problems, found.theta)
     broken = eqx.tree_at(lambda p: p.scenario.path, problems[0], replace_fn=lambda p: p * jnp.nan)
-    bias = mesh_bias(problems, OtherMesh((broken,), 1.0), found, jnp.asarray(1e-12), seen)
-    np.testing.assert_allclose(np.abs(bias[:2]), 1)
+    by = mesh_error(problems, OtherMesh((broken,), 1.0), found, seen)
+    np.testing.assert_allclose(by.bias, 1)
+    np.testing.assert_allclose(by.covariance, np.eye(len(by.bias)))
 
 
 def test_steps_to_finer_and_coarser_meshes_lead_to_the_same_limit():

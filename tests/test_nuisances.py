@@ -17,7 +17,15 @@ from r2s.estimation.covariance import covariance_at
 from r2s.estimation.estimate import describe
 from r2s.estimation.gauss_newton import Descent, Normal
 from r2s.estimation.judgement import descend
-from r2s.estimation.mesh_bias import OtherMesh, _positive, _posterior, coarser_of, factor, settled
+from r2s.estimation.mesh_bias import (
+    MeshError,
+    OtherMesh,
+    _positive,
+    _posterior,
+    coarser_of,
+    factor,
+    settled,
+)
 from r2s.estimation.method import Budget
 from r2s.estimation.nuisances import free as nuisances_that_vary
 from r2s.estimation.nuisances import nuisances
@@ -176,8 +184,9 @@ def staying(lifted, raw, off, bias):
     covariance = np.diag(np.r_[raw, np.full(size - 1, 1e-4)])
     theirs = np.r_[bias, np.zeros(size - 1)]
     other, one = OtherMesh((lifted,), factor(0.5)), jnp.ones(())
-    at, flat, _ = settled((lifted,), other, end, one, covariance, theirs)
-    there, found, left = settled(problems, other, end, one, covariance, theirs)
+    by = MeshError(theirs, np.outer(theirs, theirs))
+    at, flat, _ = settled((lifted,), other, end, one, covariance, by)
+    there, found, left = settled(problems, other, end, one, covariance, by)
     assert at is end.theta and there is end.theta
     assert left[0] <= np.sqrt(found[0, 0])
     np.testing.assert_allclose(flat, covariance + np.diag(theirs**2))
@@ -231,7 +240,8 @@ def test_what_tests_measured_draws_an_estimate_only_as_far_as_the_finer_mesh_all
         monkeypatch.setattr("r2s.estimation.mesh_bias.predictions_at", lambda _, theta: theta)
         monkeypatch.setattr("r2s.estimation.mesh_bias.loss_from", loss)
         other = OtherMesh(problems, factor(ratio))
-        theta, errors, _ = settled(problems, other, end, one, covariance, bias)
+        by = MeshError(bias, np.diag(bias**2))
+        theta, errors, _ = settled(problems, other, end, one, covariance, by)
         return float(end.theta[0] - theta[0]), np.sqrt(errors[0, 0])
 
     whole, error = went(1.0)

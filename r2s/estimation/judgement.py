@@ -89,9 +89,9 @@ def judged(
     of_law, seen = law_error(problems, best, prior, predicted), [each for each, _ in predicted]
     covariance, bias = covariance + np.outer(of_law, of_law), None
     if other_mesh is not None:
-        led = mesh_bias.mesh_bias(problems, other_mesh, best, prior, predicted)
+        by = mesh_bias.mesh_error(problems, other_mesh, best, predicted)
         theta, covariance, bias = mesh_bias.settled(
-            problems, other_mesh, best, prior, covariance, led
+            problems, other_mesh, best, prior, covariance, by
         )
         if theta is not best.theta:
             best, seen = dataclasses.replace(best, theta=theta), predictions_at(problems, theta)

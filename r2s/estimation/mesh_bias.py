@@ -20,8 +20,8 @@ from r2s.estimation.gauss_newton import (
     MARGIN,
     Descent,
     Problems,
+    least_weight,
     prior_terms,
-    prior_weight,
     recording_weights,
     theta_indices,
     theta_length,
@@ -76,44 +76,58 @@ def coarser_of(
     return tuple(coarse), tuple(beside)
 
 
-def mesh_bias(
+class MeshError(NamedTuple):
+    """By how much theta errs for its mesh.
+
+    - `bias`: from where meshes without end would lead.
+    - `covariance`: the square of that, and how far patches and blocks of frames differ in it.
+    """
+
+    bias: Float[np.ndarray, " theta"]
+    covariance: Float[np.ndarray, "theta theta"]
+
+
+def mesh_error(
     problems: Problems,
     other: OtherMesh,
     end: Descent,
-    prior: Array,
     predicted: Sequence[tuple[Prediction, Sensitivity]],
-) -> Float[np.ndarray, " theta"]:
-    """How far theta is from where meshes without end would lead, as far as one step says.
+) -> MeshError:
+    """By how much theta errs for its mesh, as far as one step says.
 
-    The Gauss-Newton step on the own mesh is subtracted, since a descent seldom ends at the very
-    minimum. Where a motion fails, or the step is longer than the range, it is the whole range: the
-    mesh tells nothing then. What a bound holds is held in both steps.
+    It is the Gauss-Newton step by what the gradient on the other mesh differs. The other mesh fits
+    the recordings worse than by their noise, so the step is held by the prior as strongly as by a
+    fit of that spread: a number that hardly matters isn't taken for the cause. What each cluster of
+    residuals adds to it is the evidence for its direction, so their scatter is in the covariance.
 
-    - `prior`: its weight, see `r2s.estimation.gauss_newton.prior_weight`.
+    Where a motion fails, or the step is longer than the range, it is the whole range: the mesh
+    tells nothing then. What a bound holds is held.
+
     - `predicted`: at the end, with its derivative (`r2s.estimation.compiled.derivatives_at`).
     """
     size = theta_length(problems)
-    gradients, matrices = np.zeros((2, size)), np.zeros((2, size, size))
+    changes, matrix, square = [], np.zeros((size, size)), 0.0
     for which, share in enumerate(recording_weights(problems)):
         index = theta_indices(problems, which)
         here, there, theta = problems[which], other.problems[which], end.theta[index]
         seen, slope = predicted[which]
-        laid = _laid_onto(here, there, slope)
         finer = compiled.predicted(motion_alone(there), theta)
-        for side, each in enumerate([(here, seen, slope), (there, finer, laid)]):
-            found = _equations(*each, end.scale)
-            gradients[side, index] += share * np.asarray(found.scores).sum(axis=0)
-            matrix = share * np.asarray(found.matrices).sum(axis=0)
-            matrices[side][np.ix_(index, index)] += matrix
-    off, precision = (np.asarray(part) for part in prior_terms(problems, end.theta))
-    least = float(prior) * precision
-    limits = only_held(room(problems, end.theta))
-    own, others = (
-        bounded_step(gradients[side] + least @ off, matrices[side] + least, limits)
-        for side in (0, 1)
-    )
-    bias = other.factor * (others - own)
-    return np.clip(np.where(np.isfinite(bias), bias, 1.0), -1, 1)
+        own = _equations(here, seen, slope, end.scale)
+        found = _equations(there, finer, _laid_onto(here, there, slope), end.scale)
+        change = np.zeros((len(own.scores), size))
+        change[:, index] = share * (np.asarray(found.scores) - np.asarray(own.scores))
+        changes.append(change)
+        matrix[np.ix_(index, index)] += share * np.asarray(found.matrices).sum(axis=0)
+        square += float(share) * float(found.spread) ** 2
+    least = least_weight(problems, jnp.sqrt(jnp.asarray(square, float)))
+    matrix += float(least) * np.asarray(prior_terms(problems, end.theta)[1])
+    change, limits = np.concatenate(changes), only_held(room(problems, end.theta))
+    bias = other.factor * bounded_step(change.sum(axis=0), matrix, limits)
+    if not np.isfinite(bias).all():
+        return MeshError(np.ones(size), np.eye(size))
+    bias = np.clip(bias, -1, 1)
+    apart = other.factor * change @ np.linalg.inv(matrix)
+    return MeshError(bias, np.outer(bias, bias) + apart.T @ apart)
 
 
 def alone(
@@ -123,8 +137,8 @@ def alone(
     derive: Derive,
     width: float | None = None,
 ) -> list[Float[np.ndarray, " theta"]]:
-    """The `mesh_bias` of the end of a descent in each recording alone; of none where there is no
-    other mesh, or no such end.
+    """The bias by its mesh of the end of a descent in each recording alone; of none where there is
+    no other mesh, or no such end.
 
     - `others`: of each recording alone. `derive`, `width`: see `r2s.estimation.compiled`.
     """
@@ -132,8 +146,8 @@ def alone(
     if not others or not ends:
         return found
     for problem, other, end in zip(problems, others, ends, strict=True):
-        own, prior = (problem,), prior_weight((problem,), end.normal)
-        found.append(mesh_bias(own, other, end, prior, derive(own, end.theta, width)))
+        own = (problem,)
+        found.append(mesh_error(own, other, end, derive(own, end.theta, width)).bias)
     return found
 
 
@@ -165,12 +179,11 @@ def settled(
     end: Descent,
     prior: Array,
     covariance: Float[np.ndarray, "theta theta"],
-    bias: Float[np.ndarray, " theta"],
+    by: MeshError,
 ) -> Settled:
     """An estimate at the end of a descent, with what its mesh errs.
 
-    It stays where the loss is least: that a mesh errs does not say where the fabric is instead. How
-    far is told by one step, in which direction hardly, so each parameter errs by itself.
+    It stays where the loss is least: that a mesh errs does not say where the fabric is instead.
     Where something is known of the fabric beforehand, the truth is at most as far off as that
     allows: the errors are in each direction the smaller of those by the recordings and those of the
     posterior in which the recordings count by all of these errors (the model discrepancy of Kennedy
@@ -178,11 +191,11 @@ def settled(
     this very fabric does it go there, as far as the finer mesh allows (`_allowed`).
 
     - `prior`: its weight, see `r2s.estimation.gauss_newton.prior_weight`.
-    - `covariance`: of the end, without its mesh's error. `bias`: as `mesh_bias` gives it.
+    - `covariance`: of the end, without its mesh's error. `by`: that, see `mesh_error`.
     """
-    raw, space = _positive(covariance) + np.diag(bias**2), problems[0].space
+    raw, space = _positive(covariance) + by.covariance, problems[0].space
     if not isinstance(space, InformedSpace):
-        return Settled(end.theta, raw, bias)
+        return Settled(end.theta, raw, by.bias)
     way, errors = _posterior(problems, end, prior, raw)
     share = _allowed(other, end, way) if space.measured and other.is_finer else 0.0
     left = (1 - share) * way
@@ -190,7 +203,7 @@ def settled(
     if not share:
         errors = _smaller(raw, errors)
     most = np.sqrt(np.diag(errors))
-    return Settled(_at(other, end, share * way), errors, np.clip(bias, -most, most))
+    return Settled(_at(other, end, share * way), errors, np.clip(by.bias, -most, most))
 
 
 def _allowed(other: OtherMesh, end: Descent, way: Float[np.ndarray, " theta"]) -> float:
