@@ -43,6 +43,16 @@ def problem(stiffer: float, shape=(5, 5)) -> Problem:
     return Problem.make(lift(stiffer), SPACE, shape=shape, nuisance_prior=EXACT)
 
 
+def of_loss(loss):
+    """The end of a descent whose loss alone matters."""
+    none = jnp.zeros(())
+    nowhere = Normal(jnp.asarray(loss), none, none, jnp.zeros(3), *jnp.zeros((2, 3, 3)))
+    return Descent(jnp.zeros(3), nowhere, none, none, none, jnp.zeros((), int))
+
+
+NOWHERE = of_loss(1.0)
+
+
 @pytest.fixture(scope="module")
 def end():
     """A descent that stands at the true fabric."""
@@ -191,6 +201,7 @@ def test_the_finest_mesh_is_reached_in_one_stride(monkeypatch):
         return descent.Search(problems, [], 0.0, derivatives_at)
 
     monkeypatch.setattr(descent.Search, "theta", here)
+    monkeypatch.setattr(descent.Search, "best", NOWHERE)
     monkeypatch.setattr(mesh_ladder, "search", searched)
     monkeypatch.setattr(mesh_ladder, "judged", lambda *_, **__: estimate_of_nothing())
     monkeypatch.setattr(resolution, "LADDER", (3, 5, 9))
@@ -214,6 +225,7 @@ def test_a_fabric_that_folds_at_the_end_of_a_coarse_mesh_goes_on(folds, meshes, 
         return folds == "at the end" and not climbed[-1][1]
 
     monkeypatch.setattr(descent.Search, "theta", jnp.zeros(3))
+    monkeypatch.setattr(descent.Search, "best", NOWHERE)
     monkeypatch.setattr(mesh_ladder, "search", searched)
     monkeypatch.setattr(mesh_ladder, "is_too_coarse", is_too_coarse)
     monkeypatch.setattr(mesh_ladder, "look_again", lambda found, *_, **__: found)
@@ -234,6 +246,7 @@ def test_each_rung_keeps_its_state_in_a_file_of_its_own(monkeypatch, tmp_path):
 
     rungs = [[(3, 3), (3, 3)], [(5, 5), (5, 5)], [(5, 5), (9, 9)]]
     monkeypatch.setattr(descent.Search, "theta", jnp.zeros(3))
+    monkeypatch.setattr(descent.Search, "best", NOWHERE)
     monkeypatch.setattr(mesh_ladder, "search", searched)
     monkeypatch.setattr(mesh_ladder, "ladder", lambda _: rungs)
     monkeypatch.setattr(mesh_ladder, "each_alone", lambda *_: [])
@@ -256,6 +269,7 @@ def test_where_all_diverges_on_a_finer_mesh_the_estimate_is_of_the_coarser_and_s
         return descent.Search(problems, [], 0.0, derivatives_at)
 
     monkeypatch.setattr(descent.Search, "theta", jnp.zeros(3))
+    monkeypatch.setattr(descent.Search, "best", NOWHERE)
     monkeypatch.setattr(mesh_ladder, "search", searched)
     monkeypatch.setattr(mesh_ladder, "is_too_coarse", lambda *_: True)
     monkeypatch.setattr(mesh_ladder, "look_again", lambda found, *_, **__: found)
@@ -314,6 +328,7 @@ def test_on_one_mesh_recordings_count_by_what_is_left_of_them_too(monkeypatch):
         return descent.Search(problems, [], 0.0, derivatives_at)
 
     monkeypatch.setattr(descent.Search, "theta", jnp.zeros(3))
+    monkeypatch.setattr(descent.Search, "best", NOWHERE)
     monkeypatch.setattr(mesh_ladder, "search", searched)
     monkeypatch.setattr(mesh_ladder, "each_alone", lambda *_: [])
     monkeypatch.setattr(mesh_ladder, "weights", lambda _: [jnp.array(4.0), jnp.array(1.0)])
@@ -323,6 +338,17 @@ def test_on_one_mesh_recordings_count_by_what_is_left_of_them_too(monkeypatch):
     assert asked == [([None, None], False), ([4.0, 1.0], True)]
     mesh_ladder.descend_weighed((problem(1.5),), SMALL, **named)
     assert asked[2:] == [([None], False)]
+
+
+@pytest.mark.parametrize(("loss", "words"), [(1.2, "as it was"), (1.3, "5 x 5 vertices fit worse")])
+def test_a_finer_mesh_that_fits_worse_is_another_minimum(loss, words):
+    def rung(shape, loss):
+        found = descent.Search((), [[of_loss(loss)]], 0.0, derivatives_at, (2, 3), "as it was")
+        return mesh_ladder._Rung([shape], found)
+
+    at = mesh_ladder._gone_on(rung((3, 3), 1.0), rung((5, 5), loss))
+    assert at.found.reached == (2, 3) and at.found.unsure.startswith(words)
+    assert at.shapes == [(5, 5)]
 
 
 def estimate_of_nothing() -> Estimate:

@@ -66,7 +66,7 @@ def test_two_searches_that_end_alike_are_enough(monkeypatch):
 def test_where_two_differ_the_best_of_three_is_taken_and_counted(monkeypatch):
     ends = ended(0.6), ended(0.3), ended(0.3), ended(0.301)  # the last goes on to the end
     found, starts, _ = looked(monkeypatch, *ends, losses=lambda at: at)
-    assert found.reached == (2, 3)
+    assert found.reached == (2, 3) and not found.unsure
     assert float(found.theta[0]) == pytest.approx(0.301)
     assert np.max(np.abs(starts[1] - starts[0])) > 0.01  # not from the same place again
 
@@ -75,6 +75,7 @@ def test_a_search_that_no_other_confirms_is_not_sure(monkeypatch):
     ends = ended(0.3), ended(0.6), None
     found, _, _ = looked(monkeypatch, *ends, losses=lambda at: at)
     assert found.reached == (1, 3) and float(found.theta[0]) == pytest.approx(0.3)
+    assert found.unsure == "none of 2 searches from other starts fits as well"
     assert found.others == ()
 
 
@@ -91,11 +92,17 @@ def test_ends_are_compared_by_the_scale_of_the_best_fit(monkeypatch):
     np.testing.assert_allclose(scales, 7e-3)
 
 
-@pytest.mark.parametrize(("reached", "words"), [((2, 2), "yes, 2 of 2"), ((1, 3), "not sure")])
-def test_an_estimate_says_how_many_searches_ended_there(reached, words, estimate_of_nothing):
-    found = dataclasses.replace(estimate_of_nothing, reached=reached, converged=reached[0] > 1)
-    assert any(line.startswith("converged: ") and words in line for line in describe(found))
-    assert from_json(as_json(found)).reached == reached
+@pytest.mark.parametrize(
+    ("unsure", "words"),
+    [("", "yes, 2 of 2 searches from different starts fit as well"), ("why", "no, not sure: why")],
+)
+def test_an_estimate_says_how_many_searches_ended_there(unsure, words, estimate_of_nothing):
+    found = dataclasses.replace(
+        estimate_of_nothing, reached=(2, 2), converged=not unsure, unsure=unsure
+    )
+    assert f"converged: {words}" in describe(found)
+    again = from_json(as_json(found))
+    assert again.reached == (2, 2) and again.unsure == unsure
 
 
 @pytest.fixture

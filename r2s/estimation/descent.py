@@ -73,8 +73,8 @@ DEFAULT = Budget(shares=(0.25, 0.5))
 class Search(NamedTuple):
     """- `problems`: what was searched for. - `rows`: all descents in every iteration.
     - `seconds`: how long it took. - `derive`: `remembering` where it was last.
-    - `reached`: see `r2s.estimation.estimate.Estimate`. `others`: where else it fits nearly as
-      well.
+    - `reached`, `unsure`: see `r2s.estimation.estimate.Estimate`. `others`: where else it fits
+      nearly as well.
     """
 
     problems: Problems
@@ -82,6 +82,7 @@ class Search(NamedTuple):
     seconds: float
     derive: Derive
     reached: tuple[int, int] | None = None
+    unsure: str = ""
     others: tuple[Theta, ...] = ()
 
     @property

@@ -126,7 +126,8 @@ class Estimate:
       or no other search ended there. None: nothing was fitted, or a file of version 0.2.0 does not
       say.
     - `reached`: how many searches from different starts fit as well as this one, and how many were
-      made; None: there was one.
+      made; None: there was one. `unsure`: why the search may have ended in another minimum; "": no
+      search says so.
     - `mesh_bias`: how far each parameter is expected to be off for its mesh alone, as the standard
       errors, which hold it (`r2s.estimation.mesh_bias`). None: that was not judged.
     - `shape`: vertices of the simulated sheet along warp and weft; None: it has none, or a file
@@ -159,6 +160,7 @@ class Estimate:
     shares: tuple[float, ...] = ()
     refused: str = ""
     reached: tuple[int, int] | None = None
+    unsure: str = ""
 
     @property
     def at_bounds(self) -> dict[str, Literal["lower", "upper"]]:
@@ -290,11 +292,11 @@ def describe(estimate: Estimate) -> list[str]:
         lines.append(f"{name:14s}{value:10.4g}{unit:6s}{spread}")
     if estimate.converged is not None:
         words = "yes" if estimate.converged else "no, the budget ended the search"
-        if estimate.reached is not None:
+        if estimate.unsure:
+            words = f"no, not sure: {estimate.unsure}"
+        elif estimate.reached is not None:
             ended, searches = estimate.reached
-            told = f"{ended} of {searches} searches from different starts fit as well"
-            lost = f"no, not sure: none of {searches - 1} searches from other starts fits as well"
-            words = f"{words}, {told}" if ended > 1 else lost
+            words += f", {ended} of {searches} searches from different starts fit as well"
         lines.append(f"converged: {words}")
         named = ", ".join(f"{name} ({side})" for name, side in estimate.at_bounds.items())
         warned = f"warning: at a bound, beyond which the truth may lie: {named}"

@@ -96,7 +96,7 @@ def judged(
         if theta is not best.theta:
             best, seen = dataclasses.replace(best, theta=theta), predictions_at(problems, theta)
     seconds = found.seconds + time.perf_counter() - began
-    converged = has_arrived(found, budget) and (found.reached is None or found.reached[0] > 1)
+    converged = has_arrived(found, budget) and not found.unsure
     told = covariance, approach, seconds, converged, loss_from(problems, seen), bias
     estimate = collect(problems, best, found.rows, *told)
     try:
@@ -121,6 +121,7 @@ def judged(
         misfits=missed,
         left_out=left_out(problems, seen, float(best.scale)),
         reached=found.reached,
+        unsure=found.unsure,
     )
 
 

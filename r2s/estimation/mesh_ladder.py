@@ -27,7 +27,7 @@ from r2s.estimation.mesh_bias import OtherMesh, factor
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import Theta
 from r2s.estimation.problem import Problem
-from r2s.estimation.second_look import look_again
+from r2s.estimation.second_look import LIKELY, look_again
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace
 from r2s.programs import kept
@@ -131,8 +131,7 @@ def descend_by_meshes(
                 if not is_too_coarse(recordings, *at.fabric):
                     break
             try:
-                finer = climb(shapes, at.found.theta, shapes is not rungs[-1])
-                at = finer._replace(found=finer.found._replace(reached=at.found.reached))
+                at = _gone_on(at, climb(shapes, at.found.theta, shapes is not rungs[-1]))
             except RuntimeError as error:
                 if finest or isinstance(error, jax.errors.JaxRuntimeError):  # out of memory, say
                     raise
@@ -184,6 +183,16 @@ class _Rung(NamedTuple):
     def fabric(self) -> tuple[Fabric, list[Shape]]:
         """The fabric that was found, and on which meshes."""
         return self.found.fabric, self.shapes
+
+
+def _gone_on(at: _Rung, finer: _Rung) -> _Rung:
+    """A finer rung with what was said of the one before, and whether it fits worse than that: then
+    the search ended in another minimum there."""
+    found, before = finer.found, at.found
+    less = float(found.best.normal.loss) <= LIKELY * float(before.best.normal.loss)
+    worse = f"{_named(max(finer.shapes))} vertices fit worse than {_named(max(at.shapes))} did"
+    unsure = before.unsure if less else worse
+    return finer._replace(found=found._replace(reached=before.reached, unsure=unsure))
 
 
 def weights(alone: Sequence[Descent]) -> list[Float[Array, ""]]:

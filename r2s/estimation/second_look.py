@@ -55,8 +55,9 @@ def look_again(
         to_the_end = once._replace(shares=(), near=True, leads_on=False)
         best = search(problems, to_the_end, start=best.theta, words="its end", **more)
         ends.append(best)
-    seconds = sum(each.seconds for each in ends)
-    return best._replace(seconds=seconds, reached=(alike, looks), others=others)
+    lost = f"none of {looks - 1} searches from other starts fits as well"
+    told = {"reached": (alike, looks), "unsure": "" if alike > 1 else lost}
+    return best._replace(seconds=sum(each.seconds for each in ends), others=others, **told)
 
 
 def _draw(space: ParameterSpace, key: PRNGKeyArray) -> Float[Array, " dim"]:
