@@ -184,6 +184,17 @@ def test_an_estimate_is_named_by_the_mesh_of_what_moves_freely():
     assert mesh_ladder._told([taut], [(17, 5)]) == (17, 5)
 
 
+def test_one_recording_of_a_taut_sheet_is_searched_on_the_coarsest_mesh_and_others_are_not():
+    free = lift()
+    taut = dataclasses.replace(free, info=dataclasses.replace(free.info, scenario="stretching"))
+
+    def longest(*recordings):
+        return [max(map(max, rung)) for rung in mesh_ladder._rungs(recordings)]
+
+    assert longest(free) == [17, 33] and longest(taut) == [9, 17]
+    assert longest(free, taut) == [9, 17, 33] and longest(taut, taut) == [9, 17, 17]
+
+
 def test_a_shape_that_is_asked_for_is_kept(monkeypatch):
     monkeypatch.setattr(resolution, "LADDER", (2, 3, 5))
     monkeypatch.setattr(resolution, "ENOUGH", 1e-9)

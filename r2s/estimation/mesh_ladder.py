@@ -102,10 +102,8 @@ def descend_by_meshes(
         end = climb(at.shapes, at.found.theta, False)
         return end._replace(found=look_again(end.found, budget, progress=progress, key=key))
 
-    # the coarsest is for the weights of several: what it finds of one is far off (25 x 33 vertices
-    # of MuJoCo's sheet, found on 7 x 9: shear 0.15 times, damping 16 times the truth)
     several = len(recordings) > 1
-    rungs = [[shape] * len(recordings)] if shape else ladder(recordings)[0 if several else 1 :]
+    rungs = [[shape] * len(recordings)] if shape else _rungs(recordings)
     if finest:
         rungs = [rungs[0], rungs[-1]]
 
@@ -220,6 +218,19 @@ def ladder(recordings: Recordings) -> list[list[Shape]]:
     pulled at 0, 45 and 90 degrees to the warp), and the mesh bias of an estimate holds that.
     """
     return [list(rung) for rung in zip(*map(_meshes, recordings), strict=True)]
+
+
+def _rungs(recordings: Recordings) -> list[list[Shape]]:
+    """The part of the ladder that is climbed.
+
+    The coarsest is for the weights of several recordings, and for one of a taut sheet. What it
+    finds of another is far off (25 x 33 vertices of MuJoCo's sheet, found on 7 x 9: shear 0.15
+    times, damping 16 times the truth).
+    """
+    first, *rest = ladder(recordings)
+    if len(recordings) > 1:
+        return [first, *rest]
+    return [first, rest[0]] if _is_taut(recordings[0]) else rest
 
 
 def is_too_coarse(recordings: Recordings, fabric: Fabric, shapes: Sequence[Shape]) -> bool:
