@@ -25,13 +25,13 @@ from r2s.estimation.gauss_newton import (
     Problems,
     theta_indices,
 )
+from r2s.estimation.least_squares import Damping
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import Theta, explain, fabric_at
 from r2s.estimation.problem import beginning, check_shared
 from r2s.fabrics.fabric import Fabric
 from r2s.program_memory import let_go_in_time
 
-INITIAL_DAMPING = 1e-2
 # of the spread, and between [m]: beyond lies an outlier. At half of it a part of the sheet that the
 # start cannot follow counts for nothing, and never draws the sheet there.
 STRICT, SCALES = 6.0, (6e-3, 0.015)
@@ -195,13 +195,11 @@ def _fresh(
     problems: Problems, budget: Budget, thetas: list, scale: float, stage: int, derive: Derive
 ) -> Row:
     """Descents that begin at some thetas, in a stage."""
-    damping, growth, limit = (
-        jnp.asarray(number, float) for number in (INITIAL_DAMPING, gauss_newton.GROWTH, scale)
-    )
+    damping, limit = Damping.initial(), jnp.asarray(scale, float)
     seen = _seen(problems, budget, stage)
     normals = normals_at(seen, thetas, [limit] * len(thetas), budget.width, derive)
     return [
-        Descent(theta, normal, damping, growth, limit, jnp.asarray(stage))
+        Descent(theta, normal, damping.value, damping.growth, limit, jnp.asarray(stage))
         for theta, normal in zip(thetas, normals, strict=True)
     ]
 

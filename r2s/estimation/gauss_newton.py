@@ -9,10 +9,10 @@ Several recordings of one fabric are weighed by their frames, and by how well ea
 (`Problem.weight`). Their joint parameter vector `theta` is the fabric's place in its space, the
 nuisances that all recordings share (`SHARED`), and those of each recording (`OWN`).
 
-This stays our own beside `optimistix.LevenbergMarquardt`, which on a lift (20 frames, 5 x 5
-vertices) came from three starts to the same loss, 6.789e-6 m^2, with 26 sensitivities each, its
-limit, where ours arrived after 21, 22 and 16, and which gives no normal equations by clusters for
-the standard errors.
+The steps are those of `r2s.estimation.least_squares`; the normal equations are made here, by
+clusters of residuals, which the standard errors need. (`optimistix.LevenbergMarquardt`, without
+bounds and prior, came on a lift of 20 frames and 5 x 5 vertices from three starts to the same loss,
+6.789e-6 m^2, with 26 sensitivities each, its limit, where this arrived after 21, 22 and 16.)
 """
 
 from collections.abc import Sequence
@@ -25,13 +25,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from r2s.estimation import normal_equations
+from r2s.estimation.least_squares import Damping, at_bound, damped, newton_step, proposed
 from r2s.estimation.prediction import Prediction, Sensitivity, Theta, predict, sensitivities
 from r2s.estimation.problem import OWN, SHARED, Problem
 
 Problems = tuple[Problem, ...]
 
 MARGIN = 1e-3  # of the unit cube, so that a start at its edge can move
-DAMPINGS, GROWTH = (1e-3, 1e6), 3.0
 LONGEST_STEP = 0.2  # of a parameter's range
 FINEST = 1e-5  # [m]: no recording is better
 
@@ -265,39 +265,27 @@ def objective(problems: Problems, theta, loss, prior) -> Float[Array, ""]:
 
 def remaining(problems: Problems, descent: Descent, prior) -> Float[Array, ""]:
     """Gain [m^2] that the next Gauss-Newton step promises, by the parameters not at a bound."""
-    gradient, matrix, stuck = _equations(problems, descent, prior)
-    pinned = jnp.where(stuck[:, None] | stuck[None], jnp.diag(jnp.diag(matrix)), matrix)
-    gradient = jnp.where(stuck, 0, gradient)
-    return gradient @ jnp.linalg.solve(pinned, gradient) / 2
+    gradient, matrix, low, high = _equations(problems, descent, prior)
+    fixed = at_bound(descent.theta, gradient, low, high)
+    return -jnp.where(fixed, 0, gradient) @ newton_step(gradient, matrix, fixed) / 2
 
 
 def _equations(problems: Problems, descent: Descent, prior):
-    """Gradient and matrix with the prior, and which parameters would leave the unit cube."""
-    theta = descent.theta
-    off, precision = prior_terms(problems, theta)
+    """Gradient and matrix with the prior, and the bounds of theta."""
+    off, precision = prior_terms(problems, descent.theta)
     gradient = descent.normal.gradient + prior * precision @ off
     matrix = descent.normal.matrix + prior * precision
-    bounded = jnp.arange(theta.shape[0]) < problems[0].space.dim
-    stuck = bounded & (theta <= MARGIN) & (gradient > 0)
-    stuck |= bounded & (theta >= 1 - MARGIN) & (gradient < 0)
-    return gradient, matrix, stuck
+    bounded = jnp.arange(len(descent.theta)) < problems[0].space.dim
+    low, high = jnp.where(bounded, MARGIN, -jnp.inf), jnp.where(bounded, 1 - MARGIN, jnp.inf)
+    return gradient, matrix, low, high
 
 
 def propose(problems: Problems, descent: Descent, prior) -> Theta:
-    """The next theta to try: a damped Gauss-Newton step, within the unit cube.
-
-    A parameter that would leave the cube stays at its bound, and the others take the step alone.
-    """
-    theta = descent.theta
-    bounded = jnp.arange(theta.shape[0]) < problems[0].space.dim
-    gradient, matrix, stuck = _equations(problems, descent, prior)
-    damped = matrix + descent.damping * jnp.diag(jnp.diag(matrix))
-    pinned = jnp.where(stuck[:, None] | stuck[None], jnp.diag(jnp.diag(damped)), damped)
-    change = -jnp.linalg.solve(pinned, jnp.where(stuck, 0, gradient))
-    longest = jnp.max(jnp.where(bounded, jnp.abs(change), 0))
-    change = change / jnp.maximum(1, longest / LONGEST_STEP)
-    inside = jnp.clip(theta + change, MARGIN, 1 - MARGIN)
-    return jnp.where(bounded, inside, theta + change)
+    """The next theta to try: a damped Gauss-Newton step, within the unit cube."""
+    gradient, matrix, low, high = _equations(problems, descent, prior)
+    longest = jnp.where(jnp.isfinite(low), LONGEST_STEP, jnp.inf)
+    damping = Damping(descent.damping, descent.growth)
+    return proposed(descent.theta, gradient, matrix, damping, low, high, longest)
 
 
 def accept(problems: Problems, descent: Descent, trial: Theta, tried: Normal, prior) -> Descent:
@@ -305,12 +293,12 @@ def accept(problems: Problems, descent: Descent, trial: Theta, tried: Normal, pr
     new = objective(problems, trial, tried.loss, prior)
     old = objective(problems, descent.theta, descent.normal.loss, prior)
     better = new < old
-    damping = jnp.where(better, descent.damping / 4, descent.damping * descent.growth)
+    damping = damped(Damping(descent.damping, descent.growth), better)
     return Descent(
         jnp.where(better, trial, descent.theta),
         jax.tree.map(partial(jnp.where, better), tried, descent.normal),
-        jnp.clip(damping, *DAMPINGS),
-        jnp.where(better, GROWTH, 2 * descent.growth),
+        damping.value,
+        damping.growth,
         descent.scale,
         descent.stage,
     )

@@ -16,10 +16,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 from jaxtyping import Array, Float
-from scipy.optimize import least_squares
 from scipy.stats import chi2
 
+from r2s.estimation.bounded_gauss_newton import BoundedGaussNewton
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import MARGIN
 from r2s.estimation.method import Progress, tell
@@ -35,7 +36,7 @@ Test = Pull | Cantilever | Drape
 APPROACH = "laboratory tests"
 STARTS = 8
 ENOUGH = 1e-4  # relative, of the sum of squares or of a step: there a descent ends
-FAILED = 1e6  # of every residual, where a specimen of a drape does not come to rest
+MOST = 60  # steps
 SLACK = 0.02  # of a variance: less than that a motion does not add to what tests tell
 TOLD = 0.5  # of the prior's standard error: tests tell what they know better than that
 POOR_FIT = 3.0  # standard deviations (root mean square), beyond which a test does not fit
@@ -59,7 +60,7 @@ def estimate(
     """The fabric of a space that explains some tests of it.
 
     Where tests have no part in a parameter it stays at the prior of the space. `progress` is told
-    the number of evaluations and the loss, a mean square of residuals, [-].
+    the number of steps and the loss, half a sum of squares, [-].
 
     Raises `ValueError` without a test, and `RuntimeError` where no specimen of a drape comes to
     rest.
@@ -72,15 +73,17 @@ def estimate(
     if quick:
         others = np.random.default_rng(0).random((STARTS - 1, space.dim))
         ends = [_descend(quick, space, each, progress) for each in (start, *others)]
-        start = min(ends, key=lambda end: end.cost).x
+        start = min(ends, key=lambda end: end.loss).place
     tell(progress, "simulating drapes" if len(quick) < len(tests) else "fitting")
     found = _descend(tuple(tests), space, start, progress)
-    if np.any(found.fun == FAILED):
+    if not np.isfinite(found.loss):
         raise RuntimeError("no specimen of the drape test comes to rest: are its radii right?")
-    covariance = np.linalg.inv(_precision(tests, space, found.fun, found.jac))
+    place = jnp.asarray(found.place, float)
+    value, slope = (np.asarray(x, np.float64) for x in _linearised(tuple(tests), space, place))
+    covariance = np.linalg.inv(_precision(tests, space, value, slope))
     deviation = np.sqrt(np.diag(covariance))
     widths = np.array([bound.width for bound in space.ranges])
-    place, loss = jnp.asarray(found.x, float), 2 * found.cost / max(len(found.fun), 1)
+    loss = 2 * found.loss / (len(value) + space.dim)
     values = np.asarray(space.values(place))
     return Estimate(
         approach=APPROACH,
@@ -94,7 +97,7 @@ def estimate(
         losses=np.array([[loss]]),
         history=values[None, None],
         seconds=time.perf_counter() - begun,
-        converged=bool(found.status > 0),
+        converged=found.converged,
         loss_unit="-",
     )
 
@@ -169,58 +172,55 @@ def _residuals_of(test: Test, fabric: Fabric) -> Float[Array, " residual"]:
     return test.residuals(fabric)
 
 
-def _descend(tests: tuple[Test, ...], space: ParameterSpace, start, progress: Progress | None):
-    """The result of scipy's trust region reflective method within the cube."""
-    told: list[float] = []
+class _End(NamedTuple):
+    place: np.ndarray
+    loss: float  # half the sum of squares, of the prior's too
+    converged: bool
 
-    def at(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        value, slope = _linearised(tests, space, jnp.asarray(u, float))
-        told.append(float(value @ value) / len(value))
-        if progress is not None:
-            progress(len(told), min(told))
-        bad = not np.isfinite(value).all() or not np.isfinite(slope).all()  # a drape that failed
-        value, slope = np.asarray(value, np.float64), np.asarray(slope, np.float64)
-        return (np.full_like(value, FAILED), np.zeros_like(slope)) if bad else (value, slope)
 
-    kept: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
-
-    def once(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if u.tobytes() not in kept:
-            kept[u.tobytes()] = at(u)
-        return kept[u.tobytes()]
-
-    inside = np.clip(np.asarray(start, np.float64), 2 * MARGIN, 1 - 2 * MARGIN)
-    return least_squares(
-        lambda u: once(u)[0],
-        inside,
-        jac=lambda u: once(u)[1],  # pyright: ignore[reportArgumentType]  # its stubs know text only
-        bounds=(MARGIN, 1 - MARGIN),
-        ftol=ENOUGH,
-        xtol=ENOUGH,
-        max_nfev=60,
+def _descend(
+    tests: tuple[Test, ...], space: ParameterSpace, start, progress: Progress | None
+) -> _End:
+    """Where a descent of `BoundedGaussNewton` within the cube ends."""
+    mean, precision = space.prior()
+    solver = BoundedGaussNewton(
+        rtol=ENOUGH, atol=ENOUGH, low=MARGIN, high=1 - MARGIN, mean=mean, precision=precision
     )
+    place, given = jnp.clip(jnp.asarray(start, float), MARGIN, 1 - MARGIN), (tests, space)
+    state = solver.init(_residuals, place, given, {}, None, None, frozenset())
+    for count in range(1, MOST + 1):
+        place, state, is_done, result = _step(solver, place, given, state)
+        if progress is not None:
+            progress(count, float(state.loss))
+        if is_done:
+            break
+    is_good = bool(is_done) and bool(result == optimistix.RESULTS.successful)
+    return _End(np.asarray(place), float(state.loss), is_good)
+
+
+@eqx.filter_jit
+def _step(solver: BoundedGaussNewton, place: Float[Array, " dim"], given, state):
+    place, state, _ = solver.step(_residuals, place, given, {}, state, frozenset())
+    return place, state, *solver.terminate(_residuals, place, given, {}, state, frozenset())
+
+
+def _residuals(u: Float[Array, " dim"], given: tuple[tuple[Test, ...], ParameterSpace]):
+    tests, space = given
+    return jnp.concatenate([test.residuals(space(u)) for test in tests]), None
 
 
 @eqx.filter_jit
 def _linearised(tests: tuple[Test, ...], space: ParameterSpace, u: Float[Array, " dim"]):
-    """Residuals of tests and prior, and their derivative in a place."""
-
-    def residuals(u):
-        mean, precision = space.prior()
-        beyond = jnp.linalg.cholesky(precision).T @ (u - mean)
-        value = jnp.concatenate([*(test.residuals(space(u)) for test in tests), beyond])
-        return value, value
-
-    slope, value = jax.jacfwd(residuals, has_aux=True)(u)
-    return value, slope
+    """Residuals of tests, and their derivative in a place."""
+    value, slope = jax.linearize(lambda u: _residuals(u, (tests, space))[0], u)
+    return value, jax.vmap(slope, out_axes=1)(jnp.eye(len(u), dtype=u.dtype))
 
 
 def _precision(
     tests: Sequence[Test], space: ParameterSpace, value: np.ndarray, slope: np.ndarray
 ) -> np.ndarray:
     """Of a place: what the tests say, less where they scatter by more than they should, and the
-    prior of the space. From the residuals of both, and their derivative."""
-    value, slope = value[: -space.dim], slope[: -space.dim]
+    prior of the space. From the residuals, and their derivative."""
     left = sum(test.count for test in tests) - np.linalg.matrix_rank(slope)
     scatter = max(1.0, float(value @ value) / max(int(left), 1))
     return slope.T @ slope / scatter + np.asarray(space.prior()[1], np.float64)

@@ -7,6 +7,5 @@ Needs flax: `pip install 'r2s[pinn]'`.
 - `stress`: strain, stress and its divergence, from the laws of `r2s.laws.membrane`.
 - `losses`: markers, equation of motion, traction, free edges, clamps. `weak_form`: virtual work.
 - `training`: Adam, then L-BFGS. `balance`: motions in balance, the estimate and its covariance.
-- `levenberg_marquardt`: least squares for all parameters of a network at once.
 - `synthetic_pulls`: recordings of a known fabric. `published_recipe`: of Ru et al. (2025).
 """

@@ -1,0 +1,125 @@
+"""Damped Gauss-Newton steps within bounds: facts of least squares, and scipy's answers."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+import pytest
+from scipy import optimize
+
+from r2s.estimation.bounded_gauss_newton import BoundedGaussNewton
+
+TIGHT: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-10}
+
+
+def solved(residual, start, max_steps=200, **settings):
+    solver = BoundedGaussNewton(**TIGHT | settings)
+    return optimistix.least_squares(residual, solver, start, throw=False, max_steps=max_steps)
+
+
+def line(matrix, right):
+    return lambda y, _: matrix @ y - right
+
+
+@pytest.fixture
+def problem():
+    random = np.random.default_rng(0)
+    return jnp.asarray(random.normal(size=(9, 4))), jnp.asarray(random.normal(size=9))
+
+
+def test_a_bound_that_holds_one_number_leaves_the_others_at_their_least_squares(problem):
+    matrix, right = problem
+    free = np.linalg.lstsq(matrix, right, None)[0]
+    low, high = np.full(4, -10.0), np.full(4, 10.0)
+    high[0], low[2] = free[0] - 0.3, free[2] + 0.2
+    found = solved(line(matrix, right), jnp.zeros(4).at[0].set(-1.0), low=low, high=high)
+    expected = optimize.lsq_linear(np.asarray(matrix), np.asarray(right), (low, high)).x
+    assert found.result == optimistix.RESULTS.successful
+    np.testing.assert_allclose(found.value, expected, atol=1e-8)
+
+
+def test_curved_residuals_within_bounds_end_where_those_of_scipy_do():
+    def residual(y, _):
+        return jnp.stack([10 * (y[1] - y[0] ** 2), 1 - y[0], jnp.exp(-y[1]) - 0.2])
+
+    low, high = np.array([-2.0, -1.0]), np.array([0.8, 3.0])
+    found = solved(residual, jnp.array([-1.2, 1.0]), low=low, high=high)
+    expected = optimize.least_squares(
+        lambda y: np.asarray(residual(y, None)), [-1.2, 1.0], bounds=(low, high), xtol=1e-12
+    )
+    np.testing.assert_allclose(found.value, expected.x, atol=1e-6)
+    assert found.stats["loss"] == pytest.approx(expected.cost, rel=1e-8)
+
+
+def test_a_number_that_nothing_tells_stays_where_it_is():
+    matrix = jnp.array([[1.0, 1.0, 0.0], [2.0, 2.0, 0.0]])
+    found = solved(line(matrix, jnp.array([2.0, 4.0])), jnp.array([0.0, 0.5, 0.7]))
+    assert found.value[2] == pytest.approx(0.7, abs=1e-12)
+    np.testing.assert_allclose(matrix @ found.value, [2.0, 4.0], atol=1e-8)
+
+
+def test_with_a_prior_it_ends_at_the_mean_of_the_posterior(problem):
+    matrix, right = problem
+    root = jnp.asarray(np.random.default_rng(1).normal(size=(4, 4)))
+    precision, mean = root @ root.T + jnp.eye(4), jnp.arange(4.0)
+    found = solved(line(matrix, right), jnp.zeros(4), mean=mean, precision=precision)
+    whole = matrix.T @ matrix + precision
+    expected = np.linalg.solve(whole, matrix.T @ right + precision @ mean)
+    np.testing.assert_allclose(found.value, expected, atol=1e-8)
+    np.testing.assert_allclose(found.stats["matrix"], whole, rtol=1e-9)
+
+
+def test_where_an_evaluation_fails_the_next_step_is_shorter():
+    def residual(y, _):
+        return jnp.where(y < 2.0, (y - 1.5) * (1 + 20 * (y - 1.5)), jnp.nan)
+
+    found = solved(residual, jnp.array([1.476]))  # whose first step leads beyond 2
+    assert found.result == optimistix.RESULTS.successful
+    assert abs(residual(found.value, None)[0]) < 1e-6
+    nowhere = solved(residual, jnp.array([3.0]))
+    assert nowhere.result != optimistix.RESULTS.successful
+    np.testing.assert_allclose(nowhere.value, 3.0)
+
+
+def test_a_step_is_no_longer_than_allowed(problem):
+    matrix, right = problem
+    once = solved(line(matrix, right), jnp.full(4, 5.0), longest=0.2, max_steps=2)
+    assert np.max(np.abs(np.asarray(once.value) - 5.0)) == pytest.approx(0.2)
+
+
+def test_many_at_once_are_each_alone(problem):
+    matrix, right = problem
+    starts = jnp.asarray(np.random.default_rng(2).normal(size=(3, 4)))
+    together = jax.vmap(lambda start: solved(line(matrix, right), start, high=0.1).value)(starts)
+    alone = [solved(line(matrix, right), start, high=0.1).value for start in starts]
+    np.testing.assert_allclose(together, jnp.stack(alone), atol=1e-9)
+
+
+def test_numbers_may_be_a_tree_and_of_single_precision(problem):
+    matrix, right = (part.astype(jnp.float32) for part in problem)
+    start = {"a": jnp.zeros(1, jnp.float32), "b": jnp.zeros((3,), jnp.float32)}
+
+    def residual(y, _):
+        return matrix @ jnp.concatenate([y["a"], y["b"]]) - right
+
+    found = solved(residual, start, low={"a": 0.3, "b": -jnp.inf}, rtol=1e-5, atol=1e-5)
+    low = np.array([0.3, -np.inf, -np.inf, -np.inf])
+    a, b = (np.asarray(part, np.float64) for part in (matrix, right))
+    expected = optimize.lsq_linear(a, b, (low, np.inf)).x
+    both = jnp.concatenate([found.value["a"], found.value["b"]])
+    assert both.dtype == jnp.float32
+    np.testing.assert_allclose(both, expected, atol=1e-4)
+
+
+def test_what_it_ends_at_changes_with_the_data_as_least_squares_do(problem):
+    """Through the solver, by the implicit function theorem."""
+    matrix, right = problem
+
+    def end(right):
+        solver = BoundedGaussNewton(**TIGHT)
+        found = optimistix.least_squares(lambda y, r: matrix @ y - r, solver, jnp.zeros(4), right)
+        return found.value
+
+    np.testing.assert_allclose(jax.jacobian(end)(right), np.linalg.pinv(matrix), atol=1e-8)
