@@ -1,8 +1,7 @@
-"""Data sets: manifests, downloads from a server on loopback, what is corrupt; RGBench captures."""
+"""Data sets: manifests, downloads from a server on loopback, what is corrupt."""
 
 import hashlib
 import json
-import shutil
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -19,8 +18,6 @@ from r2s.recordings.manifest import (
     hash_values,
     read_manifest,
 )
-from r2s.recordings.readers.rgbench import read_capture
-from r2s.recordings.recording import SheetPlacement, cloud
 
 MANIFESTS = default_manifest().parent
 CONTENT = np.random.default_rng(0).bytes(300_000)
@@ -229,109 +226,3 @@ def test_recordings_are_compared_with_the_published_values(tmp_path: Path) -> No
     (data / "lift_tan" / "002.npy").write_bytes(b"cut")
     with pytest.raises(ValueError, match="corrupt, not the published.*001.npy, lift_tan/002.npy$"):
         list(fetch("diffcloud", data, manifests))
-
-
-# RGBench
-
-X, Y = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
-SHEET = SheetPlacement((0.5, 0.6), (0.1, 0.0, 0.0), X, Y, ("weft", "opposite"))
-START = 1752924898.0  # [s], the arms' first sample
-TURN = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # from world to camera
-SHIFT = np.array([0.1, 0.2, 0.3])
-POINTS = np.array([[0.3, 0.1, 0.02], [0.5, -0.2, 0.1]])  # [m], in the world
-
-
-@pytest.fixture
-def capture(tmp_path: Path) -> Path:
-    """A capture of five clouds, 0.06 s apart, with two arms that rise by 1 m/s."""
-    from_pcd = pytest.importorskip("pypcd4").PointCloud
-    folder = tmp_path / "green_tshirt" / "green_tshirt_grasp_2025-07-19-19-14-58"
-    for name in ("segment_pcds", "calibration", "joints"):
-        (folder / name).mkdir(parents=True)
-    for i in range(5):
-        seen = (POINTS + [0, 0, 0.06 * i]) @ TURN.T + SHIFT
-        file = folder / "segment_pcds" / f"pointcloud_{START + 0.06 * i:.6f}_segmented.pcd"
-        from_pcd.from_xyz_points(seen.astype(np.float32)).save(file)
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = TURN, SHIFT
-    extrinsics = folder / "calibration" / "world_to_camera_transform.json"
-    extrinsics.write_text(json.dumps(matrix.tolist()))
-    for arm, late in (("left", 0.0), ("right", 0.003)):
-        lines = ["time,pos_1,pos_x,pos_y,pos_z,orn_w"]
-        for i in range(40):
-            lines.append(f"{START + late + 0.01 * i},0.5,0.3,0.0,{late + 0.01 * i},1")
-        file = folder / "joints" / f"{arm}_arm_joint_states_and_end_pose.csv"
-        file.write_text("\n".join(lines))
-    return folder
-
-
-def test_a_capture_is_in_the_world_and_on_the_arms_clock(capture: Path) -> None:
-    recording = read_capture(capture, SHEET, camera_delay=0.05)
-    np.testing.assert_allclose(recording.times, 0.05 + 0.06 * np.arange(5), atol=1e-6)
-    for i in range(5):
-        np.testing.assert_allclose(cloud(recording, i), POINTS + [0, 0, 0.06 * i], atol=1e-6)
-    np.testing.assert_allclose(recording.handle_path[10, :, 1], [0.25, -0.25])
-    np.testing.assert_allclose(recording.handle_path[10, :, 2], [0.1, 0.1], atol=1e-6)
-    info = recording.info
-    assert (info.fabric, info.scenario, info.trial) == (
-        "green_tshirt",
-        "grasp",
-        "2025-07-19-19-14-58",
-    )
-    assert float(read_capture(capture, SHEET).times[0]) == pytest.approx(0.06, abs=1e-5)
-
-
-def broken(capture: Path, what: str) -> None:
-    joints, calibration = capture / "joints", capture / "calibration"
-    left = joints / "left_arm_joint_states_and_end_pose.csv"
-    extrinsics = calibration / "world_to_camera_transform.json"
-    lines = left.read_text().splitlines()
-    if what == "no clouds":
-        shutil.rmtree(capture / "segment_pcds")
-    elif what == "one cloud":
-        for file in sorted((capture / "segment_pcds").iterdir())[1:]:
-            file.unlink()
-    elif what == "no extrinsics":
-        extrinsics.unlink()
-    elif what == "short extrinsics":
-        extrinsics.write_text(json.dumps(np.eye(3).tolist()))
-    elif what == "mirrored":
-        extrinsics.write_text(json.dumps(np.diag([1.0, 1, -1, 1]).tolist()))
-    elif what == "columns":
-        left.write_text("\n".join([lines[0].replace("pos_x", "x"), *lines[1:]]))
-    elif what == "word":
-        left.write_text("\n".join([*lines[:3], lines[3].replace("0.3", "high"), *lines[4:]]))
-    elif what == "unsorted":
-        left.write_text("\n".join([*lines[:3], lines[4], lines[3], *lines[5:]]))
-    else:  # of another day
-        for file in sorted(capture.glob("segment_pcds/*")):
-            file.rename(file.with_name(file.name.replace("pointcloud_17", "pointcloud_16")))
-
-
-@pytest.mark.parametrize(
-    "what, words",
-    [
-        ("no clouds", "segment_pcds: no such folder of clouds"),
-        ("one cloud", "segment_pcds: expected clouds such as pointcloud_.*found 1"),
-        ("no extrinsics", "world_to_camera_transform.json"),
-        ("short extrinsics", "world_to_camera_transform.json: expected a 4 x 4 matrix"),
-        ("mirrored", "world_to_camera_transform.json: its rotation is none"),
-        ("columns", "left_arm.*lacks the columns pos_x"),
-        ("word", "left_arm.*csv: line 4: could not convert"),
-        ("unsorted", "left_arm.*csv: line 5: times must increase"),
-        ("another day", "no cloud is from the time of the arms' paths.*of one capture"),
-    ],
-)
-def test_a_broken_capture_names_the_file(capture: Path, what: str, words: str) -> None:
-    broken(capture, what)
-    with pytest.raises((ValueError, FileNotFoundError), match=words):
-        read_capture(capture, SHEET)
-
-
-def test_a_capture_needs_two_held_corners_and_its_name(capture: Path) -> None:
-    one = SheetPlacement((0.5, 0.6), (0.1, 0.0, 0.0), X, Y, ("weft",))
-    with pytest.raises(ValueError, match="two arms hold the sheet, found 1"):
-        read_capture(capture, one)
-    other = capture.rename(capture.with_name("capture"))
-    with pytest.raises(ValueError, match="expected a name such as (green_t|white_)shirt_grasp"):
-        read_capture(other, SHEET)

@@ -3,7 +3,7 @@
 RGBench steps whatever has `step_to_time` and `get_sim_vertices`. In `rgbench/envs/__init__.py` add
 
     if "r2s" in env_name:
-        from r2s.export.rgbench import Environment
+        from rgbench_simulator import Environment
         return Environment(cfg=env_cfg, **kwargs)
 
 and a file `configs/env/r2s.yaml`, whose `card` is a fabric card of r2s or the name of a preset:
@@ -28,6 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from rgbench_captures import BASES, read_arm
 from scipy.ndimage import binary_closing, binary_fill_holes, label
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -38,7 +39,6 @@ from r2s.extras import require
 from r2s.fabrics import presets
 from r2s.fabrics.fabric import Fabric, constant_laws
 from r2s.geometry.mesh import Mesh, rectangle
-from r2s.recordings.readers.rgbench import BASES, read_arm
 from r2s.world.air import Air
 from r2s.world.contact import Table
 from r2s.world.scene import Control, Scene

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from phystwin import read_case
+from rgbench_simulator import Environment, garment, layered
 
-from r2s.export.rgbench import Environment, garment, layered
 from r2s.fabrics import presets
 from r2s.laws.stiffening import StiffeningMembrane
-from r2s.recordings.readers.phystwin import read_case
 from r2s.recordings.recording import SheetPlacement
 
 # RGBench
