@@ -5,7 +5,7 @@ python benchmarks/side_by_side.py --out results/side_by_side.json     # five min
 A lift of 60 frames of grey interlock, at places of the range that are drawn once, and its
 derivatives in seven parameters. Wall and CPU seconds of one of them, without compilation; with as
 many threads of OpenBLAS as there are cores, which is its own choice, and with one. Side by side is
-`r2s.side_by_side`. Every line is of a process of its own, since OpenBLAS asks once.
+`r2s.threads`. Every line is of a process of its own, since OpenBLAS asks once.
 """
 
 import argparse
@@ -28,7 +28,7 @@ from r2s.estimation.default_spaces import on_cloth
 from r2s.estimation.problem import Problem
 from r2s.fabrics import presets
 from r2s.scenarios import synthetic
-from r2s.side_by_side import cores, side_by_side
+from r2s.threads import cores, thread_map
 
 PLACES = 12
 
@@ -51,7 +51,7 @@ def measured(side: int) -> list[Row]:
             return jax.block_until_ready(at(problems, theta))
 
         one(thetas[0])
-        for how, run in (("one by one", map), ("side by side", side_by_side)):
+        for how, run in (("one by one", map), ("side by side", thread_map)):
             wall, cpu = time.perf_counter(), time.process_time()
             list(run(one, thetas))
             spent = time.perf_counter() - wall, time.process_time() - cpu

@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from r2s.files import source_hash, write_text
-from r2s.side_by_side import cores
 from r2s.study.cells import Cell
 from r2s.study.environment import processor
 from r2s.study.origins import origins
+from r2s.threads import cores
 
 SOURCE = 16  # hexadecimal digits of a hash
 Line = dict[str, str]  # of a table, by column

@@ -11,7 +11,7 @@ from pathlib import Path
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # before JAX: see `r2s_command`
 
-from r2s import programs  # noqa: E402
+from r2s import compilation  # noqa: E402
 from r2s.study.main import study  # noqa: E402
 
 if __name__ == "__main__":
@@ -36,7 +36,7 @@ if __name__ == "__main__":
     add("--no-cache", action="store_true", help="keep no compiled programs, and read none")
     settings = vars(parser.parse_args())
     if settings.pop("no_cache"):
-        programs.forget()
+        compilation.forget()
     try:
         missing = study(**settings)
         sys.exit(f"{missing} cells are missing: see the report" if missing else 0)

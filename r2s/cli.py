@@ -17,7 +17,7 @@ try:
 except ImportError:
     sys.exit("r2s: error: the command line needs tyro: pip install 'r2s[cli]'")
 
-from r2s import programs
+from r2s import compilation
 from r2s.commands.check import Check
 from r2s.commands.check_grad import CheckGrad
 from r2s.commands.data import Data
@@ -30,8 +30,8 @@ from r2s.commands.show import Show
 from r2s.commands.simulate import Simulate
 from r2s.commands.study import Study
 from r2s.commands.view import View
-from r2s.side_by_side import leave
 from r2s.study.environment import one_thread
+from r2s.threads import leave
 
 NO_CACHE = "--no-cache"
 Command = (
@@ -90,11 +90,11 @@ def command() -> int:
     gc.set_threshold(100_000, 50, 100)  # to trace makes many objects that stay
     os.environ["XLA_FLAGS"] = one_thread(os.environ.get("XLA_FLAGS", ""))  # JAX has not begun yet
     if NO_CACHE in sys.argv:
-        programs.forget()
+        compilation.forget()
     else:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
-            programs.keep()
+            compilation.keep()
     return leave(main())
 
 

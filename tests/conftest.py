@@ -23,10 +23,10 @@ import pytest
 
 from r2s.cloth.cloth import Cloth, ClothState
 from r2s.cloth.linear.pattern import Pattern
+from r2s.compilation import clear
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.elements import strains, vertex_masses
 from r2s.geometry.mesh import Mesh, rectangle
-from r2s.program_memory import let_go
 from r2s.units import GRAVITY
 from r2s.world.air import Air
 from r2s.world.contact import Table
@@ -98,7 +98,7 @@ def little_memory_within_a_module() -> Iterator[None]:
 def let_go_beyond(memory_in_use: float) -> None:
     """Let compiled programs go if the process holds more memory [MB]."""
     if memory() > memory_in_use:
-        let_go()
+        clear()
 
 
 def memory() -> float:

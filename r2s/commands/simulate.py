@@ -46,8 +46,8 @@ class Simulate:
         from r2s import scenarios
         from r2s.commands.common import choose_shape, load_card, make_experiment, print_result
         from r2s.commands.waiting import Waiting
+        from r2s.compilation import compile_once
         from r2s.files import check_folders
-        from r2s.kept import kept
         from r2s.recordings.open import save_trajectory
         from r2s.recordings.recording import save
         from r2s.scenarios import synthetic
@@ -70,7 +70,7 @@ class Simulate:
         }[self.solver]
         solver = None if make_solver is None else make_solver(scenario, fabric)
         with Waiting("compiling the motion") as line:
-            moved = kept(rollout)
+            moved = compile_once(rollout)
             moved.prepare(scenario, fabric, solver=solver)
             line.say(f"simulating {scenario.num_frames} frames")
             motion = moved(scenario, fabric, solver=solver)

@@ -15,23 +15,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from r2s.compilation import compile_once
 from r2s.estimation import gauss_newton
 from r2s.estimation.gauss_newton import Normal, Problems, theta_indices
 from r2s.estimation.method import Progress, tell
 from r2s.estimation.prediction import Prediction, Sensitivity, Theta, predict, sensitivities
 from r2s.estimation.problem import Problem, motion_alone
-from r2s.kept import kept
-from r2s.side_by_side import side_by_side
+from r2s.threads import thread_map
 
 Predicted = list[tuple[Prediction, Sensitivity]]  # of each recording
 Derive = Callable[[Problems, Theta, float | None], Predicted]  # as `derivatives_at`
 REMEMBERED = 128_000_000  # bytes of derivatives: a lift on 33 x 33 vertices takes 9 MB
 
 # compiled once in a process for all recordings of as many frames and knots, on a mesh
-predicted = kept(predict)
-_sensitivities = kept(sensitivities)
-_loss_from = kept(gauss_newton.loss_from)
-_normal_from = kept(gauss_newton.normal_from)
+predicted = compile_once(predict)
+_sensitivities = compile_once(sensitivities)
+_loss_from = compile_once(gauss_newton.loss_from)
+_normal_from = compile_once(gauss_newton.normal_from)
 _losses = eqx.filter_jit(eqx.filter_vmap(gauss_newton.loss_at, in_axes=(None, 0)))
 _normals = eqx.filter_jit(eqx.filter_vmap(gauss_newton.normal_at, in_axes=(None, 0, 0, None)))
 
@@ -41,14 +41,11 @@ def derivatives_at(problems: Problems, theta: Theta, width: float | None = None)
 
     `width`: as in `r2s.estimation.prediction.sensitivities`.
     """
-    return side_by_side(lambda pair: _sensitivities(*pair, width), _places(problems, theta))
+    return thread_map(lambda pair: _sensitivities(*pair, width), _places(problems, theta))
 
 
 def prepare(problems: Problems, width: float | None = None, *, derivatives: bool = True) -> None:
-    """Compile what `derivatives_at`, or else `predictions_at`, will run; from any thread.
-
-    Of use where programs are kept (`r2s.programs.keep`).
-    """
+    """Compile what `derivatives_at`, or else `predictions_at`, will run; from any thread."""
     theta = jnp.zeros(gauss_newton.theta_length(problems), float)
     for pair in _places(problems, theta):
         if derivatives:
@@ -67,7 +64,7 @@ def remembering() -> Derive:
     lock = threading.Lock()
 
     def derive(problems: Problems, theta: Theta, width: float | None = None) -> Predicted:
-        return side_by_side(lambda pair: one(*pair, width), _places(problems, theta))
+        return thread_map(lambda pair: one(*pair, width), _places(problems, theta))
 
     def one(problem: Problem, theta: Array, width: float | None):
         frames = problem.scenario.num_frames if problem.wanted is None else int(problem.wanted)
@@ -99,7 +96,7 @@ class _Known(NamedTuple):
 
 def predictions_at(problems: Problems, theta: Theta) -> list[Prediction]:
     """What each recording would show at a theta."""
-    return side_by_side(lambda pair: predicted(*pair), _places(problems, theta))
+    return thread_map(lambda pair: predicted(*pair), _places(problems, theta))
 
 
 def loss_from(problems: Problems, seen: Sequence[Prediction], scale: Array | float = 0.0) -> float:
@@ -144,7 +141,7 @@ def losses_at(
         tell(progress, f"coarse search {number} of {len(thetas)}")
 
     tell(progress, "compiling the motion")
-    return np.array(side_by_side(loss, thetas, done))
+    return np.array(thread_map(loss, thetas, done))
 
 
 def normals_at(
@@ -160,7 +157,7 @@ def normals_at(
     """
     if jax.default_backend() == "cpu" or len(thetas) == 1:
         pairs = zip(thetas, scales, strict=True)
-        return side_by_side(lambda pair: normal_at(problems, *pair, width, derive), pairs)
+        return thread_map(lambda pair: normal_at(problems, *pair, width, derive), pairs)
     more = 2 ** math.ceil(math.log2(len(thetas))) - len(thetas)
     filled = (jnp.stack([*parts, *[parts[-1]] * more]) for parts in (thetas, scales))
     found = _normals(problems, *filled, width)

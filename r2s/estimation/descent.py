@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from r2s.compilation import clear_in_time
 from r2s.estimation import checkpoint as checkpoints
 from r2s.estimation import gauss_newton
 from r2s.estimation.compiled import (
@@ -30,7 +31,6 @@ from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import Theta, explain, fabric_at
 from r2s.estimation.problem import beginning, check_shared
 from r2s.fabrics.fabric import Fabric
-from r2s.program_memory import let_go_in_time
 
 # of the spread, and between [m]: beyond lies an outlier. At half of it a part of the sheet that the
 # start cannot follow counts for nothing, and never draws the sheet there.
@@ -129,7 +129,7 @@ def search(
     if budget.around < 0 or budget.around % 2:
         raise ValueError(f"places around the end are in pairs: an even number, got {budget.around}")
     check_shared(problems)
-    let_go_in_time()
+    clear_in_time()
     began, derive = time.perf_counter(), derive or remembering()
     run = _run_of(problems, budget, start, key) if checkpoint else {}
     rows = _resumed(checkpoint, run, budget) if checkpoint else []

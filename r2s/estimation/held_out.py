@@ -10,12 +10,12 @@ from typing import NamedTuple
 import jax.random as jr
 import numpy as np
 
+from r2s.compilation import clear_in_time
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.mesh_ladder import in_steps_worth
 from r2s.evaluation import prediction_error
 from r2s.fabrics import prior
 from r2s.fabrics.fabric import Fabric
-from r2s.program_memory import let_go_in_time
 from r2s.recordings.recording import Recording, clouds_are_markers
 from r2s.scenarios.scenario import from_recording, in_denser_air
 
@@ -139,7 +139,7 @@ def judge(
     down, for all alike: what an estimate found along with the fabric (`air_found`), where that was
     in doubt. Size and cameras are as written down.
     """
-    let_go_in_time()
+    clear_in_time()
     density = float(fabric.density)
     each = (fabric, prior.middle(density), *prior.fabrics(density, count, jr.key(0)))
     error, middle, *others = (_error(recording, one, shape, air) for one in each)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from r2s.compilation import compile_once
 from r2s.estimation import normal_equations
 from r2s.estimation.gauss_newton import (
     Descent,
@@ -22,13 +23,12 @@ from r2s.estimation.gauss_newton import (
 from r2s.estimation.prediction import Prediction, Sensitivity
 from r2s.estimation.problem import Problem, seen_where
 from r2s.fabrics.stiffening_space import stiffens
-from r2s.kept import kept
 
 # from what stiffness changes between half a pull and all of it, to what it has from small strain:
 # twice that where it grows with the stretch
 TO_SMALL_STRAIN = 2.0
 
-_equations = kept(normal_equations.normal_equations_of)
+_equations = compile_once(normal_equations.normal_equations_of)
 
 
 def to_small_strain(

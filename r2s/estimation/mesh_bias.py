@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from r2s.compilation import compile_once
 from r2s.estimation import compiled, normal_equations
 from r2s.estimation.bounded import bounded_step, only_held, room
 from r2s.estimation.compiled import Derive, loss_from, predictions_at
@@ -30,13 +31,12 @@ from r2s.estimation.prediction import Prediction, Sensitivity, Theta
 from r2s.estimation.problem import Problem, motion_alone
 from r2s.fabrics.informed_space import InformedSpace
 from r2s.geometry.surface import nearest
-from r2s.kept import kept
 from r2s.scenarios.resolution import ORDER
 
 RISE, HALVINGS = 1.5, 6  # of a loss, and of the step that raises it by more
 RCOND = 1e-6  # of the recordings' information: less than that is none
 
-_equations = kept(normal_equations.normal_equations_of)
+_equations = compile_once(normal_equations.normal_equations_of)
 
 
 class OtherMesh(NamedTuple):

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from r2s.compilation import is_kept
 from r2s.estimation.compiled import prepare, remembering
 from r2s.estimation.descent import Search, search
 from r2s.estimation.estimate import Estimate
@@ -30,12 +31,11 @@ from r2s.estimation.problem import Problem
 from r2s.estimation.second_look import LIKELY, look_again
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace
-from r2s.programs import kept
 from r2s.recordings.recording import Recording
 from r2s.scenarios import resolution
 from r2s.scenarios.resolution import Shape
 from r2s.scenarios.scenario import Scenario
-from r2s.side_by_side import meanwhile
+from r2s.threads import background
 
 Recordings = Sequence[Recording]
 
@@ -117,7 +117,7 @@ def descend_by_meshes(
         if finest:  # else that of the rung before
             yield lambda: prepare(on(*others), budget.width)
 
-    with meanwhile(needed() if kept() else ()):
+    with background(needed() if is_kept() else ()):
         at = climb(rungs[0], None, len(rungs) > 1)
         if several:
             alone = each_alone(at.found.problems, budget, at.found.theta, key, derive, progress)

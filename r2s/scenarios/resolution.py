@@ -11,9 +11,9 @@ import math
 
 import numpy as np
 
+from r2s.compilation import compile_once
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.fold_length import fold_length
-from r2s.kept import kept
 from r2s.scenarios.six import SIDE
 
 Shape = tuple[int, int]
@@ -33,7 +33,7 @@ ORDER = 1.0  # of the error in the cells' length, where it is not measured
 ENOUGH = 6e-3  # [m], error of a mesh that is fine enough, of sheets of the study's size: a choice
 LADDER = (9, 17, 33)  # vertices along the longer side
 
-_fold_length = kept(fold_length)  # the derivatives in it take seconds one by one
+_fold_length = compile_once(fold_length)  # the derivatives in it take seconds one by one
 
 
 def mesh_error(fabric: Fabric, size: tuple[float, float], shape: Shape, motion: str) -> float:

@@ -16,9 +16,9 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from r2s.compilation import compile_once
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.surface import nearest, sample
-from r2s.kept import kept
 from r2s.mpm.sheet import longest_edge
 from r2s.recordings.cameras.camera import Camera
 from r2s.recordings.recording import (
@@ -250,8 +250,8 @@ def _extended(route: Route, end: float) -> Route:
     return Route(times, np.concatenate([route.path, route.path[-1:]]))
 
 
-_rollout = kept(rollout)
-_energy_balance = kept(energy_balance)
+_rollout = compile_once(rollout)
+_energy_balance = compile_once(energy_balance)
 
 
 def _markers(x, scenario: Scenario, key) -> np.ndarray:

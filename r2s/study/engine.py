@@ -13,7 +13,7 @@ from typing import Protocol, runtime_checkable
 
 from tqdm import tqdm
 
-from r2s.program_memory import let_go_beyond
+from r2s.compilation import clear_beyond
 from r2s.study.cells import Cell, dependencies, execute, with_dependencies
 
 MOST_MEMORY = 0.9e9  # [byte]: a process that holds more after a cell lets its programs go
@@ -78,7 +78,7 @@ def attempt(cell: Cell, folder: Path, key: str | None = None) -> str:
     except Exception as error:  # whatever it is, the other cells go on
         return f"{type(error).__name__}: {error}"
     finally:
-        let_go_beyond(MOST_MEMORY)
+        clear_beyond(MOST_MEMORY)
     return ""
 
 

@@ -5,9 +5,9 @@ import platform
 from importlib.metadata import version
 from pathlib import Path
 
-from r2s import programs
+from r2s import compilation
 from r2s.extras import require
-from r2s.side_by_side import LIMIT
+from r2s.threads import LIMIT
 
 ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 # Compiles a step in 60 to 70 % of the time, and it runs as fast. XLA ends a process whose flags it
@@ -50,7 +50,7 @@ def one_core(number: int | None = None) -> None:
 def begin_worker(number: int | None = None) -> None:
     """What a process that makes cells does first: it binds itself and keeps its programs."""
     one_core(number)
-    programs.keep()
+    compilation.keep()
 
 
 def environment(workers: int, compilation_cache: Path | None = None) -> dict[str, str]:
@@ -59,7 +59,7 @@ def environment(workers: int, compilation_cache: Path | None = None) -> dict[str
     One thread each: sums in another order would give other numbers, and a study is to have the same
     on any runner. All of them share the memory of its GPUs, if there are any; a fabric that goes
     wrong in a batch does not stop the others. Compiled programs are kept in `compilation_cache`,
-    by default where `r2s.programs.keep` has them.
+    by default where `r2s.compilation.keep` has them.
     """
     level = os.environ.get("TF_CPP_MIN_LOG_LEVEL", JAX_LEVEL)
     one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")

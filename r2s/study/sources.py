@@ -20,12 +20,12 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
+from r2s.compilation import compile_once
 from r2s.estimation.default_spaces import Law
 from r2s.estimation.pinn.synthetic_pulls import pulled
 from r2s.fabrics import presets
 from r2s.fabrics.arcsim import read_material
 from r2s.fabrics.fabric import Fabric, constant_laws
-from r2s.kept import kept
 from r2s.laws.stiffening import SofteningPlate, StiffeningMembrane
 from r2s.recordings import manifest
 from r2s.recordings.recording import Recording, load, save
@@ -205,7 +205,7 @@ class GivenRecording(Cell):
         return {"frames": len(read.times), "verified": read.info.verified}
 
 
-_rollout = kept(rollout)
+_rollout = compile_once(rollout)
 
 Source = SyntheticRecording | MujocoRecording | GivenRecording
 

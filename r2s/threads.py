@@ -23,21 +23,9 @@ import jax
 Item = TypeVar("Item")
 Found = TypeVar("Found")
 LIMIT = "R2S_THREADS"
-MEANWHILE = "r2s meanwhile"  # name of a thread
+BACKGROUND = "r2s background"  # name of a thread
 # of JAX, that a thread may have of its own
-SETTINGS = (
-    "jax_enable_x64",
-    "jax_default_matmul_precision",
-    "jax_numpy_dtype_promotion",
-    "jax_numpy_rank_promotion",
-    "jax_debug_nans",
-    "jax_debug_infs",
-    "jax_disable_jit",
-    "jax_default_prng_impl",
-    "jax_threefry_partitionable",
-    "jax_random_seed_offset",
-    "jax_platforms",
-)
+SETTINGS = ("jax_enable_x64", "jax_debug_nans", "jax_disable_jit", "jax_numpy_dtype_promotion")
 
 
 class _Inside(threading.local):
@@ -47,7 +35,7 @@ class _Inside(threading.local):
 _inside = _Inside()
 
 
-def side_by_side(
+def thread_map(
     function: Callable[[Item], Found],
     items: Iterable[Item],
     done: Callable[[int], None] | None = None,
@@ -60,7 +48,7 @@ def side_by_side(
 
     `done`: told in the calling thread how many of the first results are there.
 
-    >>> side_by_side(abs, [-1, 2, -3])
+    >>> thread_map(abs, [-1, 2, -3])
     [1, 2, 3]
     """
     items, found = list(items), []
@@ -90,7 +78,7 @@ def _told(result: Found, number: int, done: Callable[[int], None] | None) -> Fou
 
 
 @contextmanager
-def meanwhile(calls: Iterable[Callable[[], Any]]) -> Iterator[None]:
+def background(calls: Iterable[Callable[[], Any]]) -> Iterator[None]:
     """Calls on a thread of their own, one after the other, while the body of a `with` runs.
 
     For what the body will wait for otherwise, such as a program to compile. Those that have not
@@ -112,7 +100,7 @@ def meanwhile(calls: Iterable[Callable[[], Any]]) -> Iterator[None]:
             except Exception:  # the body meets it itself
                 return
 
-    threading.Thread(target=work, name=MEANWHILE, daemon=True).start()
+    threading.Thread(target=work, name=BACKGROUND, daemon=True).start()
     try:
         yield
     finally:
@@ -120,11 +108,11 @@ def meanwhile(calls: Iterable[Callable[[], Any]]) -> Iterator[None]:
 
 
 def leave(code: int) -> int:
-    """An exit code; or, where a thread of `meanwhile` still works, the end of the process with it.
+    """An exit code; or, where a thread of `background` still works, the end of the process with it.
 
     For the end of a command, which need not wait until what it has no use for is compiled.
     """
-    if any(thread.name == MEANWHILE for thread in threading.enumerate()):
+    if any(thread.name == BACKGROUND for thread in threading.enumerate()):
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
