@@ -35,45 +35,49 @@ SHARE = 0.5  # of the mappings that Linux allows, beyond which programs go
 
 class Compiled:
     """A function of pytrees, compiled as by `equinox.filter_jit`, but once where two threads call
-    it for the first time."""
+    it for the first time, and apart for numbers that are equal and of another type."""
 
     def __init__(self, function: Callable) -> None:
         functools.update_wrapper(self, function)
-        self._jitted = eqx.filter_jit(function)
+        self._function = function
+        self._jitted: dict[Any, Any] = {}  # by the types of static parts, which it does not look at
         self._ready: set[Any] = set()
         self._locks: dict[Any, threading.RLock] = {}  # of each program
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        program = _program(args, kwargs)
+        program, jitted = self._of(args, kwargs)
         if program in self._ready or is_traced(args, kwargs):
-            return self._jitted(*args, **kwargs)
+            return jitted(*args, **kwargs)
         with self._locks.setdefault(program, threading.RLock()):
-            found = self._jitted(*args, **kwargs)
+            found = jitted(*args, **kwargs)
             self._ready.add(program)
             return found
 
     def prepare(self, *args: Any, **kwargs: Any) -> None:
         """Compile for these arguments, and run nothing; from any thread."""
-        program = _program(args, kwargs)
+        program, jitted = self._of(args, kwargs)
         with self._locks.setdefault(program, threading.RLock()):
             if program not in self._ready:
-                self._jitted.lower(*args, **kwargs).compile()
+                jitted.lower(*args, **kwargs).compile()
                 self._ready.add(program)
+
+    def _of(self, args: tuple, kwargs: dict) -> tuple[Any, Any]:
+        """What tells one program from another, and what compiles it."""
+        dynamic, static = eqx.partition((args, kwargs), eqx.is_array)
+        leaves, tree = jax.tree.flatten(dynamic)
+        shapes = tuple((leaf.shape, str(leaf.dtype), leaf.weak_type) for leaf in leaves)
+        parts, static_tree = jax.tree.flatten(static)
+        types = tuple(map(type, parts))
+        x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore
+        if types not in self._jitted:  # of one function all have the same programs
+            self._jitted[types] = eqx.filter_jit(functools.partial(self._function))
+        jitted = self._jitted[types]
+        return (tree, shapes, types, tuple(parts), static_tree, x64), jitted
 
 
 def compile_once(function: Callable) -> Compiled:
     """`Compiled`, as a decorator."""
     return Compiled(function)
-
-
-def _program(args: tuple, kwargs: dict) -> tuple:
-    """What tells one program of a function from another."""
-    dynamic, static = eqx.partition((args, kwargs), eqx.is_array)
-    leaves, tree = jax.tree.flatten(dynamic)
-    shapes = tuple((leaf.shape, str(leaf.dtype), leaf.weak_type) for leaf in leaves)
-    parts, static_tree = jax.tree.flatten(static)
-    x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore
-    return tree, shapes, tuple(parts), static_tree, x64
 
 
 def keep(folder: Path | None = None) -> Path | None:

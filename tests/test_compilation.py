@@ -50,6 +50,12 @@ def test_what_was_prepared_is_neither_traced_nor_run_again() -> None:
     assert traced == [2, 3, 2]
 
 
+def test_equal_numbers_of_other_types_are_other_programs() -> None:
+    """Which `equinox.filter_jit` takes for one (0.13.8, findings/filter_jit_equal_numbers.sh)."""
+    full = compile_once(lambda value: jnp.full((2,), value))
+    assert [full(value).dtype.kind for value in (1, 1.0, True)] == ["i", "f", "b"]
+
+
 def test_a_compiled_function_is_differentiated_like_any_other() -> None:
     assert float(jax.grad(compile_once(lambda x: x**3))(2.0)) == pytest.approx(12.0)
 
