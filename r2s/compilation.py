@@ -15,6 +15,7 @@ import sys
 import tempfile
 import threading
 import warnings
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ import equinox as eqx
 import jax
 
 from r2s.extras import require
-from r2s.threads import cores
+from r2s.threads import cores, settings
 from r2s.traced import is_traced
 
 MOST = 1_000_000_000  # [byte] of all programs in a folder: some hundred motions with gradients
@@ -43,6 +44,7 @@ class Compiled:
         self._jitted: dict[Any, Any] = {}  # by the types of static parts, which it does not look at
         self._ready: set[Any] = set()
         self._locks: dict[Any, threading.RLock] = {}  # of each program
+        _all.add(self)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         program, jitted = self._of(args, kwargs)
@@ -68,11 +70,13 @@ class Compiled:
         shapes = tuple((leaf.shape, str(leaf.dtype), leaf.weak_type) for leaf in leaves)
         parts, static_tree = jax.tree.flatten(static)
         types = tuple(map(type, parts))
-        x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore
         if types not in self._jitted:  # of one function all have the same programs
             self._jitted[types] = eqx.filter_jit(functools.partial(self._function))
         jitted = self._jitted[types]
-        return (tree, shapes, types, tuple(parts), static_tree, x64), jitted
+        return (tree, shapes, types, tuple(parts), static_tree, settings()), jitted
+
+
+_all: weakref.WeakSet[Compiled] = weakref.WeakSet()
 
 
 def compile_once(function: Callable) -> Compiled:
@@ -118,8 +122,9 @@ def keep(folder: Path | None = None) -> Path | None:
 
 
 def is_kept() -> bool:
-    """Whether this process keeps its programs."""
-    return bool(getattr(jax.config, ENABLED) and getattr(jax.config, FOLDER))
+    """Whether this process keeps its programs by `keep`, in a folder of this machine."""
+    folder = getattr(jax.config, FOLDER)
+    return bool(getattr(jax.config, ENABLED) and folder) and Path(folder).name == machine()
 
 
 def forget() -> None:
@@ -147,6 +152,9 @@ def machine() -> str:
 
 def clear() -> None:
     """Let all compiled programs of this process go, and give their memory back."""
+    for each in _all:
+        each._jitted.clear()
+        each._ready.clear()
     eqx.clear_caches()
     jax.clear_caches()
     gc.collect()

@@ -25,7 +25,19 @@ Found = TypeVar("Found")
 LIMIT = "R2S_THREADS"
 BACKGROUND = "r2s background"  # name of a thread
 # of JAX, that a thread may have of its own
-SETTINGS = ("jax_enable_x64", "jax_debug_nans", "jax_disable_jit", "jax_numpy_dtype_promotion")
+SETTINGS = (
+    "jax_enable_x64",
+    "jax_default_matmul_precision",
+    "jax_numpy_dtype_promotion",
+    "jax_numpy_rank_promotion",
+    "jax_debug_nans",
+    "jax_debug_infs",
+    "jax_disable_jit",
+    "jax_default_prng_impl",
+    "jax_threefry_partitionable",
+    "jax_random_seed_offset",
+    "jax_platforms",
+)
 
 
 class _Inside(threading.local):

@@ -10,6 +10,7 @@ import pytest
 from scipy import optimize
 
 from r2s.estimation.bounded_gauss_newton import BoundedGaussNewton
+from r2s.estimation.least_squares import Damping, proposed
 
 TIGHT: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-10}
 
@@ -81,12 +82,18 @@ def test_where_an_evaluation_fails_the_next_step_is_shorter():
     nowhere = solved(residual, jnp.array([3.0]))
     assert nowhere.result != optimistix.RESULTS.successful
     np.testing.assert_allclose(nowhere.value, 3.0)
+    assert nowhere.stats["num_steps"] == 1  # the same place would fail again
 
 
 def test_a_step_is_no_longer_than_allowed(problem):
     matrix, right = problem
-    once = solved(line(matrix, right), jnp.full(4, 5.0), longest=0.2, max_steps=2)
-    assert np.max(np.abs(np.asarray(once.value) - 5.0)) == pytest.approx(0.2)
+    start, square = jnp.full(4, 5.0), matrix.T @ matrix
+    limits = jnp.full(4, -jnp.inf), jnp.full(4, jnp.inf)
+    gradient = matrix.T @ (matrix @ start - right)
+    free = proposed(start, gradient, square, Damping.initial(), *limits) - start
+    held = proposed(start, gradient, square, Damping.initial(), *limits, 0.2) - start
+    assert np.max(np.abs(held)) == pytest.approx(0.2)
+    np.testing.assert_allclose(held / 0.2, free / np.max(np.abs(free)), rtol=1e-9)  # as a whole
 
 
 def test_many_at_once_are_each_alone(problem):

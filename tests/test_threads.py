@@ -59,6 +59,7 @@ def test_an_error_is_raised_and_what_has_not_begun_is_left_out(two_cores):
     [
         lambda: jax.enable_x64(not jax.config.jax_enable_x64),  # pyright: ignore
         lambda: jax.debug_nans(True),
+        lambda: jax.default_matmul_precision("highest"),
     ],
 )
 def test_settings_of_the_calling_thread_alone_hold(two_cores, setting):

@@ -17,7 +17,7 @@ import optimistix
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
-from r2s.estimation.least_squares import DAMPINGS, Damping, damped, proposed
+from r2s.estimation.least_squares import DAMPINGS, GROWTH, Damping, damped, proposed
 
 
 class _State(eqx.Module):
@@ -36,7 +36,7 @@ class BoundedGaussNewton(optimistix.AbstractLeastSquaresSolver):
     bounds.
 
     - `rtol`, `atol`: it ends when a step changes y and the objective by no more than these.
-    - `low`, `high`: bounds of y, numbers or as y is. `longest`: of a step, in the same form.
+    - `low`, `high`: bounds of y, numbers or as y is.
     - `mean`, `precision`: of the prior of y as one vector (`jax.flatten_util.ravel_pytree`); None:
       there is none.
 
@@ -49,7 +49,6 @@ class BoundedGaussNewton(optimistix.AbstractLeastSquaresSolver):
     atol: float
     low: PyTree = -jnp.inf
     high: PyTree = jnp.inf
-    longest: PyTree = jnp.inf
     mean: Float[Array, " y"] | None = None
     precision: Float[Array, "y y"] | None = None
     norm: Callable[[PyTree], Array] = optimistix.max_norm
@@ -71,9 +70,9 @@ class BoundedGaussNewton(optimistix.AbstractLeastSquaresSolver):
 
     def step(self, fn, y, args, options, state: _State, tags):
         flat, unravel = ravel_pytree(y)
-        low, high, longest = (_like(bound, y, flat) for bound in self._limits)
+        low, high = (_like(bound, y, flat) for bound in (self.low, self.high))
         # without a gradient yet, the first is where it begins
-        trial = proposed(flat, state.gradient, state.matrix, state.damping, low, high, longest)
+        trial = proposed(flat, state.gradient, state.matrix, state.damping, low, high)
 
         def residual(at):
             value, aux = fn(unravel(at), args)
@@ -113,7 +112,9 @@ class BoundedGaussNewton(optimistix.AbstractLeastSquaresSolver):
         has_begun = jnp.isfinite(state.loss)
         # a step so short that rounding decides whether it gains is an end, too
         is_done = has_begun & small & (little | ~state.is_better)
-        is_stuck = ~state.is_better & (state.damping.value >= DAMPINGS[1]) & ~is_done
+        has_failed = ~has_begun & (state.damping.growth > GROWTH)  # where it begins
+        has_no_step = (state.damping.value >= DAMPINGS[1]) | has_failed
+        is_stuck = ~state.is_better & has_no_step & ~is_done
         result = optimistix.RESULTS.where(
             is_stuck, optimistix.RESULTS.nonlinear_divergence, optimistix.RESULTS.successful
         )
@@ -121,10 +122,6 @@ class BoundedGaussNewton(optimistix.AbstractLeastSquaresSolver):
 
     def postprocess(self, fn, y, aux, args, options, state: _State, tags, result):
         return y, aux, {"loss": state.loss, "matrix": state.matrix}
-
-    @property
-    def _limits(self) -> tuple[PyTree, PyTree, PyTree]:
-        return self.low, self.high, self.longest
 
 
 def _like(bound: PyTree, y: PyTree, flat: Float[Array, " y"]) -> Float[Array, " y"]:

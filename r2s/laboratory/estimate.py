@@ -60,7 +60,7 @@ def estimate(
     """The fabric of a space that explains some tests of it.
 
     Where tests have no part in a parameter it stays at the prior of the space. `progress` is told
-    the number of steps and the loss, half a sum of squares, [-].
+    the number of steps and the loss, a mean square of residuals, [-].
 
     Raises `ValueError` without a test, and `RuntimeError` where no specimen of a drape comes to
     rest.
@@ -83,7 +83,6 @@ def estimate(
     covariance = np.linalg.inv(_precision(tests, space, value, slope))
     deviation = np.sqrt(np.diag(covariance))
     widths = np.array([bound.width for bound in space.ranges])
-    loss = 2 * found.loss / (len(value) + space.dim)
     values = np.asarray(space.values(place))
     return Estimate(
         approach=APPROACH,
@@ -93,8 +92,8 @@ def estimate(
         standard_errors=deviation * widths,
         correlation=covariance / np.outer(deviation, deviation),
         nuisances=(),
-        loss=loss,
-        losses=np.array([[loss]]),
+        loss=found.loss,
+        losses=np.array([[found.loss]]),
         history=values[None, None],
         seconds=time.perf_counter() - begun,
         converged=found.converged,
@@ -174,7 +173,7 @@ def _residuals_of(test: Test, fabric: Fabric) -> Float[Array, " residual"]:
 
 class _End(NamedTuple):
     place: np.ndarray
-    loss: float  # half the sum of squares, of the prior's too
+    loss: float  # mean square of the residuals, of the prior's too, [-]
     converged: bool
 
 
@@ -188,14 +187,15 @@ def _descend(
     )
     place, given = jnp.clip(jnp.asarray(start, float), MARGIN, 1 - MARGIN), (tests, space)
     state = solver.init(_residuals, place, given, {}, None, None, frozenset())
+    size = len(jax.eval_shape(_residuals, place, given)[0]) + space.dim
     for count in range(1, MOST + 1):
         place, state, is_done, result = _step(solver, place, given, state)
         if progress is not None:
-            progress(count, float(state.loss))
+            progress(count, 2 * float(state.loss) / size)
         if is_done:
             break
     is_good = bool(is_done) and bool(result == optimistix.RESULTS.successful)
-    return _End(np.asarray(place), float(state.loss), is_good)
+    return _End(np.asarray(place), 2 * float(state.loss) / size, is_good)
 
 
 @eqx.filter_jit
