@@ -49,8 +49,8 @@ def descend(
 
     The estimate has converged when the best descent arrived in the last stage
     (`r2s.estimation.descent.has_arrived`). A simulation that diverges counts as infinitely bad;
-    when all do, raises `RuntimeError`. Raises `ValueError` for no starts, for an odd number of places
-    around the end, and for shares that do not rise between 0 and 1.
+    when all do, raises `RuntimeError`. Raises `ValueError` for no starts, for an odd number of
+    places around the end, and for shares that do not rise between 0 and 1.
     """
     problems = (problems,) if isinstance(problems, Problem) else problems
     found = search(problems, budget, start=start, checkpoint=checkpoint, progress=progress, key=key)
