@@ -9,7 +9,6 @@ from r2s.study import engine, results, verdicts
 from r2s.study.ensembles import read_ensemble
 from r2s.study.evaluations import EvaluationCell
 from r2s.study.matrix import DRAWS
-from r2s.study.rows import Row
 from r2s.study.sources import SyntheticRecording, small_strain
 from r2s.study.verdicts import SURFACE
 
@@ -24,9 +23,10 @@ def line(folder: Path, motion: str, fabric: str, number: str) -> Line:
     failed = engine.run([*ensembles, *cells], folder, engine.Serial())
     if failed:
         raise RuntimeError(f"{motion} of {fabric}: {next(iter(failed.values()))}")
-    found = [row for row in results.rows(cells, folder) if row.metric == SURFACE]
-    (true,) = (row for row in found if row.baseline == "true")
-    drawn = np.array([row.value for row in found if row.baseline == "default"])
+    found = results.collect(cells, folder)
+    found = found[found.metric == SURFACE]
+    (true,) = found[found.baseline == "true"].itertuples()
+    drawn = found[found.baseline == "default"].value.to_numpy()
     ensemble = read_ensemble(ensembles[0], folder)
     means = {cause: 1e3 * each.mean() for cause, each in ensemble.causes.items()}
     between = 1e3 * np.mean(np.sqrt(np.mean(ensemble.apart**2, axis=1)))
@@ -37,17 +37,13 @@ def line(folder: Path, motion: str, fabric: str, number: str) -> Line:
         "floor": _millimetres(true.floor),
         "true fabric": _millimetres(true.value),
         "default": f"{1e3 * drawn.mean():.1f} ({1e3 * drawn.min():.1f} to {1e3 * drawn.max():.1f})",
-        "skill of the true fabric": _skill(true),
+        "skill of the true fabric": "not told" if np.isnan(true.skill) else f"{true.skill:.2f}",
     } | made_by(cells, folder)
 
 
-def _number(value: float | None) -> str:
-    return "-" if value is None else "never" if np.isinf(value) else f"{value:.2f}"
+def _number(value: float) -> str:
+    return "-" if np.isnan(value) else "never" if np.isinf(value) else f"{value:.2f}"
 
 
-def _millimetres(value: float | None) -> str:
-    return "-" if value is None else f"{1e3 * value:.2f}"
-
-
-def _skill(row: Row) -> str:
-    return "not told" if row.skill is None else f"{row.skill:.2f}"
+def _millimetres(value: float) -> str:
+    return "-" if np.isnan(value) else f"{1e3 * value:.2f}"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 from _tables import Line, made_by
 from scipy.stats import norm
 
@@ -21,7 +22,6 @@ from r2s.study.estimates import EstimateCell, read_estimate
 from r2s.study.evaluations import EvaluationCell
 from r2s.study.matrix import SMALL, configuration_named, synthetic
 from r2s.study.mujoco_recording import FABRIC as FLEX
-from r2s.study.rows import Row
 from r2s.study.sources import strain_dependent
 from r2s.study.verdicts import SURFACE
 
@@ -110,10 +110,11 @@ def _errors(cells: list[EvaluationCell], folder: Path) -> Line:
     failed = engine.run([*verdicts.ensembles(cells), *cells], folder, engine.Serial())
     if failed:
         raise RuntimeError(next(iter(failed.values())))
-    rows = [row for row in results.rows(cells, folder) if row.metric == SURFACE]
+    found = results.collect(cells, folder)
+    found = found[found.metric == SURFACE]
     line: Line = {}
     for motion in dict.fromkeys(cell.scenario for cell in cells):
-        line |= _of(motion, [row for row in rows if row.evaluated_on == motion])
+        line |= _of(motion, found[found.evaluated_on == motion])
     return line | made_by(cells, folder)
 
 
@@ -123,14 +124,14 @@ def _of_law(cell: EvaluationCell, law: str) -> EvaluationCell:
     return replace(cell, estimate=replace(cell.estimate, law=law))
 
 
-def _of(motion: str, rows: list[Row]) -> Line:
-    found: Line = {f"{motion}: floor": _millimetres(rows[0].floor)}
+def _of(motion: str, rows: pd.DataFrame) -> Line:
+    found: Line = {f"{motion}: floor": _millimetres(rows.floor.iloc[0])}
     for baseline, name in NAMED.items():
-        values = [row.value for row in rows if row.baseline == baseline]
-        if values:  # another simulator's sheet has no true fabric
-            found[f"{motion}: {name}"] = _millimetres(float(np.mean(values)))
-    (skill,) = {row.skill for row in rows if row.baseline in ESTIMATES}
-    return found | {f"{motion}: skill": "not told" if skill is None else f"{skill:.2f}"}
+        values = rows[rows.baseline == baseline].value
+        if len(values):  # another simulator's sheet has no true fabric
+            found[f"{motion}: {name}"] = _millimetres(values.mean(skipna=False))
+    (skill,) = set(rows[rows.baseline.isin(ESTIMATES)].skill)
+    return found | {f"{motion}: skill": "not told" if np.isnan(skill) else f"{skill:.2f}"}
 
 
 def repeated(folder: Path, configuration: str, fabric: str, repeat: str) -> Line:
@@ -207,5 +208,5 @@ def _agreement(found: Estimate, cell: EstimateCell) -> str:
     return f"no, {found.agreement.p:.1g}: {cell.sources[odd.recording].name}, {odd.parameter}"
 
 
-def _millimetres(value: float | None) -> str:
-    return "-" if value is None else f"{1e3 * value:.1f}"
+def _millimetres(value: float) -> str:
+    return "-" if np.isnan(value) else f"{1e3 * value:.1f}"

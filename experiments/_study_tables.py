@@ -31,13 +31,13 @@ TABLES = (
         "Distance from the true surface to samples of the simulated one, whole motions.",
     ),
     (
-        *("findings_surface", "docs/results.md", "study_small_findings"),
+        *("findings", "docs/results.md", "study_small_findings"),
         "Conclusions of the paper, tested here by the surface, and how many fabrics would tell.",
-        *("conclusion", "comparison", "answer to it", "ratio", "90% interval"),
+        *("conclusion", "comparison", "answer", "ratio", "90% interval"),
         *("p (Holm)", "fabrics needed"),
     ),
     (
         *("parameters_cloth", "docs/results.md", "study_small_parameters"),
-        *("Stiffness along warp and weft.", "recording", "warp", "weft"),
+        *("Stiffness along warp and weft.", "recording", "warp [N/m]", "weft [N/m]"),
     ),
 )

@@ -1,14 +1,15 @@
-"""Made-up rows and motions of a study, whose effects are known."""
+"""Made-up results and motions of a study, whose effects are known."""
 
 import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
+import pandas as pd
 
 from r2s.geometry.mesh import rectangle
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
-from r2s.study.report.motions import MotionComparison
-from r2s.study.rows import Row
+from r2s.study.motions import Motion
+from r2s.study.statistics.frame import as_frame, labelled
 
 FABRICS = ("black_denim", "grey_interlock", "pink_solid")
 METRICS = {"chamfer": ("m", 1.0), "paper_chamfer": ("-", 20.0), "hausdorff": ("m", 3.0)}
@@ -21,7 +22,7 @@ def flat_distance(
     return 0.02
 
 
-def made_up_rows(
+def made_up_results(
     distance: Callable[[Configuration, str, str, int, int], float] = flat_distance,
     configurations: Sequence[Configuration] = PAPER_CONFIGURATIONS,
     fabrics: Sequence[str] = FABRICS,
@@ -31,8 +32,8 @@ def made_up_rows(
     noise: float = 0.1,
     seed: int = 0,
     metrics: Sequence[str] = tuple(METRICS),
-) -> list[Row]:
-    """Rows of `distance` [m], times log-normal noise; that of the default fabric is 40 mm."""
+) -> pd.DataFrame:
+    """Labelled results of `distance` [m], times log-normal noise; 40 mm of the default fabric."""
     generator = np.random.default_rng(seed)
     rows = []
     for configuration in (*configurations, Configuration("", "cloth", "")):
@@ -45,26 +46,24 @@ def made_up_rows(
                         if not is_default:
                             value = distance(configuration, fabric, motion, trial, repeat)
                         value *= math.exp(noise * generator.normal())
-                        rows += [
-                            Row(
-                                *configuration,
-                                fabric,
-                                str(repeat),
-                                f"{motion}_{fabric}{trial}",
-                                motion,
-                                "default" if is_default else "",
-                                metric,
-                                METRICS[metric][0],
-                                METRICS[metric][1] * value,
+                        place = configuration._asdict() | {
+                            "fabric": fabric,
+                            "repeat": str(repeat),
+                            "recording": f"{motion}_{fabric}{trial}",
+                            "evaluated_on": motion,
+                            "baseline": "default" if is_default else "",
+                        }
+                        for metric in metrics:
+                            unit, scale = METRICS[metric]
+                            rows.append(
+                                place | {"metric": metric, "unit": unit, "value": scale * value}
                             )
-                            for metric in metrics
-                        ]
-    return rows
+    return labelled(as_frame(rows))
 
 
-def made_up_comparison(
+def made_up_motion(
     motion: str = "fling", fabric: str = "black_denim", labels: Sequence[str] = ("a", "b")
-) -> MotionComparison:
+) -> Motion:
     """A sheet that swings for 1 s in six frames, seen as its own vertices; the configurations lag
     behind it, each more than the one before. The floor is 1 mm, the horizon at 0.7 s."""
     mesh = rectangle((0.4, 0.4), (4, 4))
@@ -78,7 +77,7 @@ def made_up_comparison(
     motions = {label: swung(0.1 * i) for i, label in enumerate(labels)}
     clouds = tuple(swung(0.0)[i, : len(rest) - i] for i in range(len(times)))
     away = [np.linalg.norm(x - swung(0.0), axis=2).mean(axis=1) for x in motions.values()]
-    return MotionComparison(
+    return Motion(
         fabric,
         motion,
         f"{motion}_{fabric}1",

@@ -29,8 +29,8 @@ from r2s.study import matrix
 from r2s.study.cells import with_dependencies
 from r2s.study.drawn import pull_of
 from r2s.study.estimates import EstimateCell
-from r2s.study.report.data_table import data_table
-from r2s.study.report.parameter_ranges import range_table, truth_settings
+from r2s.study.report import disclosures
+from r2s.study.report.disclosures import range_table
 from r2s.study.sources import SyntheticRecording, TruthSettings, small_strain
 
 FABRIC = presets.grey_interlock()
@@ -221,7 +221,7 @@ def test_the_middle_of_the_prior_is_the_median_of_its_draws():
 
 def test_every_range_and_fixed_value_stands_in_the_table():
     table = range_table(matrix.synthetic(matrix.SMALL))
-    told = {(line[0], line[1]) for line in table.rows}
+    told = set(zip(table.solver, table.parameter, strict=True))
     for solver in ("cloth", "points"):
         space = default_space(solver, 0.2)
         names = [bound.name for bound in space.ranges]
@@ -230,43 +230,29 @@ def test_every_range_and_fixed_value_stands_in_the_table():
     laws = {each.name for each in (*STIFFENING, *SOFTENING)}  # of a lift and pulls together
     assert {("cloth", name) for name in laws} <= told
     alone = matrix.with_changes(matrix.SMALL, ["physnet-cloth-lifting"])
-    assert not laws & {line[1] for line in range_table(matrix.synthetic(alone)).rows}
-    lines = {(line[0], line[1]): line for line in table.rows}
-    assert all(line[-1] not in ("", "-") for line in table.rows)
+    assert not laws & set(range_table(matrix.synthetic(alone)).parameter)
+    assert not set(table["from"]) & {"", "-"}
     # as many densities as fabrics
-    assert len(lines["points", "density"][3].split(",")) == len(matrix.SMALL.fabrics)
-
-
-def test_numbers_of_self_contact_are_told():
-    words = truth_settings(TruthSettings(), presets.FIVE)["truths' contact with themselves"]
-    for number in ("1.00 mm", "4e+08 Pa/m^2", "0.280", "0.620", "0.1 thicknesses", "17 x 17"):
-        assert number in words
-    without = truth_settings(TruthSettings(self_contact=False), presets.FIVE)
-    assert without["truths' contact with themselves"].startswith("none")
+    points = table[table.solver == "points"].set_index("parameter")
+    assert len(points.low["density"].split(",")) == len(matrix.SMALL.fabrics)
 
 
 def test_the_data_of_every_approach_stand_in_the_table(monkeypatch, lift, pull):
-    from r2s.study.report import data_table as module
-
     monkeypatch.setattr(SyntheticRecording, "is_made", lambda self, folder: True)
     monkeypatch.setattr(
-        module, "read", lambda source, folder: pull if source.angle is not None else lift
+        disclosures, "read", lambda source, folder: pull if source.angle is not None else lift
     )
     plan = dataclasses.replace(matrix.SMALL, fabrics=("grey_interlock",))
-    cells = matrix.synthetic(plan)
-    table = data_table(cells, Path())
-    lines = {line[:2]: line[2:] for line in table.rows}
-    made = [cell for cell in with_dependencies(cells) if isinstance(cell, EstimateCell)]
-    assert {(f"{c.approach} on {c.solver}", c.scenario) for c in made} <= set(lines)
-    count, by, frames, points, markers, force, *assumed = lines["pinn on cloth", "stretching"]
-    assert (count, frames, points, markers, force) == ("3", "6", "-", "81", "yes")
-    assert assumed == ["flat", "linear"]
-    assert "markers" in by
-    count, by, frames, points, markers, force, *_ = lines["physnet on cloth", "lifting"]
-    assert (count, frames, markers, force) == ("1", "8", "-", "-") and "2 depth cameras" in by
-    assert int(lines["diffcloud on cloth", "lifting"][3]) <= POINTS
-    assert lines["diffcloud on cloth", "lifting"][-2:] == ("fabrics", "linear")
-    together = lines["diffcloud on cloth", "lifting+stretching"]
-    assert together[-2:] == ("fabrics", "stiffening+softening")
-    for scenario in ("folding", "fling", "shaking"):
-        assert lines["judged by", scenario][:2] == (str(plan.judged), "whole surface")
+    cells = with_dependencies(matrix.synthetic(plan))
+    made = [cell for cell in cells if isinstance(cell, EstimateCell)]
+    table = disclosures.data_table(made, Path()).set_index(["approach", "motion"])
+    assert {(f"{c.approach} on {c.solver}", c.scenario) for c in made} == set(table.index)
+    pinn = table.loc[("pinn on cloth", "stretching")]
+    assert list(pinn)[-6:] == ["6", "-", "81", "yes", "flat", "linear"]
+    assert pinn["recordings of a fabric"] == 3
+    physnet = table.loc[("physnet on cloth", "lifting")]
+    assert (physnet["frames read"], physnet.markers) == ("8", "-")
+    together = table.loc[("diffcloud on cloth", "lifting+stretching")]
+    assert (together.prior, together.laws) == ("fabrics", "stiffening+softening")
+    alone = table.loc[("diffcloud on cloth", "lifting")]
+    assert int(alone["points of a frame"]) <= POINTS and alone.laws == "linear"

@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import os
 import runpy
 import sys
 from pathlib import Path
@@ -31,7 +30,6 @@ from r2s.scenarios.six import SIX
 from r2s.solver import Trajectory
 from r2s.study import engine, estimates, matrix, results
 from r2s.study.cells import dependencies, read_metadata, with_dependencies
-from r2s.study.comparisons import label_of
 from r2s.study.configuration import (
     APPROACHES,
     MOTIONS,
@@ -39,12 +37,12 @@ from r2s.study.configuration import (
     PUBLISHED_CONFIGURATIONS,
     Configuration,
 )
-from r2s.study.costs import costs, forecast
 from r2s.study.drawn import numbers_of
 from r2s.study.estimates import EstimateCell, TrainedNetwork
 from r2s.study.evaluations import EvaluationCell
 from r2s.study.mujoco_recording import MujocoRecording
-from r2s.study.rows import Row, read_rows, write_rows
+from r2s.study.report import disclosures
+from r2s.study.report.tables import recording_table
 from r2s.study.sources import (
     STRETCH,
     GivenRecording,
@@ -53,7 +51,7 @@ from r2s.study.sources import (
     small_strain,
     strain_dependent,
 )
-from r2s.study.statistics.recordings import recording_tables
+from r2s.study.statistics.frame import as_frame
 
 ROOT = Path(__file__).parents[1]
 
@@ -271,8 +269,6 @@ def test_what_is_estimated_on_points_is_judged_on_the_cloth_too():
     assert both["points"].estimate == both["cloth"].estimate
     assert len({cell.name for cell in cells}) == len(cells)
     assert {c.solver for c in cells if c.baseline == "default"} == {"cloth", "points"}
-    assert label_of(both["cloth"]) == "DiffCP (found on points) cloth lifting"
-    assert label_of(both["points"]) == "DiffCP points lifting"
 
 
 def test_a_lift_and_the_pulls_of_the_network_are_estimated_from_together():
@@ -371,28 +367,19 @@ def test_who_heeds_a_prior_is_told_of_fabrics_of_this_weight(name, tmp_path, mon
 def test_an_estimate_is_made_once_and_judged(tiny, tmp_path):
     cells, made = tiny
     assert engine.run(cells, tmp_path, engine.Serial()) == {}
-    rows = results.rows(cells, tmp_path)
-    assert {row.approach for row in rows} == {"diffcloud"} and {row.repeat for row in rows} == {"0"}
-    assert all(np.isfinite(row.value) and row.value > 0 for row in rows)
-    write_rows(tmp_path / "results.csv", rows)
-    assert read_rows(tmp_path / "results.csv") == rows
+    found = results.collect(cells, tmp_path)
+    assert set(found.approach) == {"diffcloud"} and set(found.repeat) == {"0"}
+    assert np.isfinite(found.value).all() and (found.value > 0).all()
     engine.run(cells, tmp_path, engine.Serial())
     assert len(made) == 1
-    (entry,) = results.parameters(cells, tmp_path)["cloth"]
-    assert entry.ranges[0].unit == "N/m" and not np.isfinite(entry.standard_errors).any()
-    assert np.isfinite(entry.truth).all()  # those of the preset
-    meshes = results.mesh_table(cells, tmp_path)
-    assert len(meshes.rows) == 1 and all(float(each) > 0 for each in meshes.rows[0][2:4])
-    assert sum(int(line[-1]) for line in results.steps_table(cells, tmp_path).rows) == len(cells)
-    # what more of the same would cost
-    plan = matrix.Plan((Configuration("diffcloud", "cloth", "lifting"),), ("grey_interlock",), 3, 4)
-    table = forecast(costs(cells, tmp_path), plan)
-    lines = {line[0]: line[1:] for line in table.rows}
-    assert lines["estimates diffcloud cloth lifting"][0] == "3"
-    # 3 estimates, the true fabric, the middle of the prior and the draws, in 4 motions
-    assert lines["evaluations cloth shaking"][0] == str((3 + 2 + plan.draws) * 4)
-    assert float(lines["evaluations cloth shaking"][2]) > 0
-    assert lines["evaluations cloth fling"][1:] == ("not measured", "-")
+    parameters = results.parameters(cells, tmp_path)
+    assert parameters.unit[0] == "N/m" and not np.isfinite(parameters.standard_error).any()
+    assert np.isfinite(parameters.truth).all()  # those of the preset
+    meshes = disclosures.mesh_table(results.estimates_made(cells, tmp_path), tmp_path)
+    assert len(meshes) == 1 and meshes.iloc[0, 2:].astype(float).gt(0).all()
+    costs = disclosures.cost_table(cells, tmp_path).set_index("kind")
+    assert costs["count"]["estimates diffcloud cloth lifting"] == 1
+    assert float(costs["CPU seconds in all"]["evaluations cloth shaking"]) > 0
 
 
 @pytest.mark.slow(group="study")
@@ -404,10 +391,10 @@ def test_an_estimate_that_diverges_is_a_result(tiny, tmp_path, monkeypatch):
 
     monkeypatch.setattr(DiffCloud, "_estimate", explode)
     assert engine.run(cells, tmp_path, engine.Serial()) == {}
-    assert all(np.isnan(row.value) for row in results.rows(cells, tmp_path))
+    assert results.collect(cells, tmp_path).value.isna().all()
     reasons = read_metadata(cells[0], tmp_path)["diverged"]
     assert reasons == {source.name: "the estimate diverged" for source in cells[0].recordings}
-    assert results.parameters(cells, tmp_path) == {}
+    assert results.parameters(cells, tmp_path).empty
 
 
 @pytest.mark.parametrize(
@@ -446,22 +433,6 @@ def test_an_estimate_without_memory_is_missing_and_no_divergence(tiny, tmp_path,
     assert "out of memory" in failed[estimated] and not estimated.is_made(tmp_path)
 
 
-def test_results_are_written_again_when_one_is_gone_or_a_cell_is_newer(tmp_path):
-    mark, cell = tmp_path / ".published", tmp_path / "cells/estimates/one.zip"
-    cell.parent.mkdir(parents=True)
-    for path in (cell, tmp_path / "results.csv", tmp_path / "report.html"):
-        path.write_text("made")
-    mark.write_text("these cells")
-    os.utime(cell, ns=(0, 0))
-    assert results._is_published(tmp_path, mark, "these cells")
-    assert not results._is_published(tmp_path, mark, "others")
-    os.utime(cell, (mark.stat().st_mtime + 10,) * 2)
-    assert not results._is_published(tmp_path, mark, "these cells")
-    os.utime(cell, ns=(0, 0))
-    (tmp_path / "results.csv").unlink()
-    assert not results._is_published(tmp_path, mark, "these cells")
-
-
 def test_what_trials_share_counts_once(tmp_path, monkeypatch):
     """A fold that two lifts are judged by has one default, whichever lift brought it."""
 
@@ -482,9 +453,8 @@ def test_what_trials_share_counts_once(tmp_path, monkeypatch):
     measured = {cell: {each.name: {"chamfer": 1.0} for each in cell.recordings} for cell in cells}
     monkeypatch.setattr(results, "read_measured", lambda cell, folder: measured[cell])
     monkeypatch.setattr(EvaluationCell, "is_made", lambda cell, folder: True)
-    monkeypatch.setattr(results, "with_verdicts", lambda rows, cells, folder: rows)
-    found = results.rows(cells, tmp_path)
-    assert sorted(row.recording for row in found) == ["fold1", "fold2"]
+    found = results.collect(cells, tmp_path)
+    assert sorted(found.recording) == ["fold1", "fold2"]
 
 
 def test_a_fling_that_an_estimate_has_seen_does_not_judge_it(tmp_path, monkeypatch):
@@ -504,35 +474,30 @@ def test_a_fling_that_an_estimate_has_seen_does_not_judge_it(tmp_path, monkeypat
 
 
 def test_given_recordings_are_shown_one_by_one():
-    def row(baseline, value, recording="fold_silk", repeat="0"):
-        is_estimate = baseline in ("", "other_fabric")
-        return Row(
-            approach="diffcloud" if is_estimate else "",
-            solver="" if baseline == "repeatability" else "cloth",
-            estimated_from="lifting" if is_estimate else "",
-            fabric="silk",
-            repeat=repeat,
-            recording=recording,
-            evaluated_on="folding",
-            baseline=baseline,
-            metric="chamfer_real_to_sim",
-            unit="m",
-            value=value,
-        )
+    def row(baseline, value, recording="fold_silk", repeat="0", solver="cloth"):
+        is_estimate = baseline in ("", "other_fabric", "on_cloth")
+        return {
+            "approach": "diffcloud" if is_estimate else "",
+            "solver": "" if baseline == "repeatability" else solver,
+            "estimated_from": "lifting" if is_estimate else "",
+            "fabric": "silk",
+            "repeat": repeat,
+            "recording": recording,
+            "evaluated_on": "folding",
+            "baseline": baseline,
+            "metric": "chamfer_real_to_sim",
+            "unit": "m",
+            "value": value,
+        }
 
     rows = [row("", 0.02), row("default", 0.03), row("other_fabric", 0.025)]
-    rows += [row("repeatability", 0.01), row("", 0.09, repeat="1")]
-    rows += [row("true", 0.018), row("middle", 0.028)]
-    draws = [row("default", 0.04, "fold_silk2"), row("default", 0.05, "fold_silk2", repeat="1")]
-    (found,) = recording_tables([*rows, *draws]).values()
-    assert found.rows == (
-        ("silk", "fold_silk", "20.0", "30.0", "28.0", "18.0", "25.0", "10.0"),
-        ("silk", "fold_silk2", "-", "45.0", "-", "-", "-", "-"),
-        ("mean", "", "20.0", "37.5", "28.0", "18.0", "25.0", "10.0"),
-    )
-    assert found.caption == "DIFFCLOUD cloth lifting: chamfer_real_to_sim [mm] on folding"
-    assert recording_tables(rows[:2]) == {}  # as those of synthetic recordings
-    on_points = [dataclasses.replace(each, solver="points") for each in rows[:3]]
-    on_cloth = dataclasses.replace(rows[0], baseline="on_cloth", value=0.015)
-    # beside references on points nothing stands that the cloth predicted
-    assert recording_tables([*on_points, on_cloth]) == recording_tables(on_points) != {}
+    rows += [row("repeatability", 0.01), row("", 0.09, repeat="1"), row("on_cloth", 0.5)]
+    rows += [row("default", 0.04, "fold_silk2"), row("default", 0.05, "fold_silk2", repeat="1")]
+    rows += [row("default", 0.7, solver="points")]
+    table = recording_table(as_frame(rows), "chamfer_real_to_sim").set_index("recording")
+    first, second = table.loc["fold_silk"], table.loc["fold_silk2"]
+    assert dict(first[["estimate", "default", "other_fabric", "repeatability"]]) == {
+        "estimate": 20.0, "default": 30.0, "other_fabric": 25.0, "repeatability": 10.0
+    }  # fmt: skip
+    assert second.default == 45.0 and np.isnan(second.estimate)
+    assert recording_table(as_frame(rows[:2]), "chamfer_real_to_sim").empty  # as synthetic ones

@@ -1,6 +1,4 @@
-"""Verdicts of a study: errors within the horizon, beside the floor, as skill; ensembles."""
-
-import dataclasses
+"""Verdicts of a study: errors within the horizon, beside the floor; ensembles."""
 
 import numpy as np
 import pytest
@@ -8,67 +6,25 @@ import pytest
 import r2s
 from r2s.evaluation import phase_free
 from r2s.study import engine, results, verdicts
-from r2s.study.comparisons import motion_comparisons
 from r2s.study.ensembles import read_ensemble
 from r2s.study.evaluations import EvaluationCell
-from r2s.study.report.skill_table import skill_table
-from r2s.study.report.truth_table import truth_table, verdict
-from r2s.study.rows import Row
+from r2s.study.motions import judged_recordings
+from r2s.study.report.disclosures import truth_table, verdict
 from r2s.study.sources import SyntheticRecording, TruthSettings, small_strain
-from r2s.study.statistics.skills import skills, with_floor
 from r2s.study.verdicts import BEYOND, SURFACE, Judged
 
 FABRIC = "grey_interlock"
 
 
-def row(value, baseline="", repeat="0", floor: float | None = 2e-3, metric=SURFACE):
-    approach = "" if baseline else "diffcloud"
-    whose = (approach, "cloth", "lifting" if approach else "", FABRIC, repeat)
-    return Row(*whose, "fling_0", "fling", baseline, metric, "m", value, floor, 4.0)
-
-
-def test_the_default_of_a_skill_is_the_mean_of_all_draws():
-    drawn = [row(value, "default", str(i)) for i, value in enumerate((10e-3, 14e-3))]
-    told = verdicts._with_skills(
-        [row(7e-3), row(2e-3, "true", ""), row(np.nan, repeat="1"), *drawn]
-    )
-    assert [each.skill for each in told[:3]] == [pytest.approx(0.5), pytest.approx(1), -np.inf]
-    assert all(each.skill is None for each in told[3:])
-    # a draw that diverged raises no one's skill, and hides no run that diverged
-    lost = [*drawn, row(np.nan, "default", "2")]
-    again = verdicts._with_skills([row(7e-3), row(np.nan, repeat="1"), *lost])
-    assert [each.skill for each in again[:2]] == [pytest.approx(0.5), -np.inf]
-    none = verdicts._with_skills([row(7e-3), row(np.nan, repeat="1"), lost[-1]])
-    assert [each.skill for each in none[:2]] == [None, -np.inf]
-    near = [dataclasses.replace(each, value=2.5e-3) for each in drawn]
-    assert verdicts._with_skills([row(1e-3), *near])[0].skill is None  # not clearly above the floor
-    assert verdicts._with_skills([row(1e-3, floor=None), *drawn])[0].skill is None
-
-
 def test_only_what_is_within_the_horizon_counts():
     times = np.arange(4.0)
     judged = Judged(times, np.array([1.0, 2.0, 3.0, 90.0]) * 1e-3, 2.0)
-    found = verdicts._within(row(0.5), np.array([4.0, 6.0, 99.0, 99.0]) * 1e-3, judged)
-    assert (found.value, found.floor, found.horizon) == (5e-3, 1.5e-3, 2.0)
-    lost = verdicts._within(row(0.5), np.array([4e-3, np.nan, np.nan, np.nan]), judged)
-    assert np.isnan(lost.value) and lost.floor == 1.5e-3  # diverged within it
-    assert np.isnan(verdicts._within(row(0.5), times, judged._replace(horizon=0.0)).value)
-
-
-def test_a_run_that_is_lost_counts_against_its_configuration_in_the_table():
-    times = np.arange(4.0)
-    judged = Judged(times, np.full(4, 1e-3), np.inf)
-    runs = [
-        verdicts._within(row(0.5, repeat=repeat), np.full(4, error), judged)
-        for repeat, error in (("0", 3e-3), ("1", np.nan))
-    ]
-    drawn = verdicts._within(row(0.5, "default"), np.full(4, 9e-3), judged)
-    rows = with_floor(verdicts._with_skills([*runs, drawn]), SURFACE)
-    assert len(rows) == 3
-    (lost,) = (each for c, each in skills(rows, "fling").items() if c.approach)
-    assert (lost.mean, lost.diverged, lost.runs) == (-np.inf, 1, 2)
-    line = skill_table(rows, SURFACE).rows[0]
-    assert "1 of 2 diverged" in line[1] and "1 of 2 diverged" in line[3]
+    found = verdicts.within_horizon(np.array([4.0, 6.0, 99.0, 99.0]) * 1e-3, judged)
+    assert found == {"value": 5e-3, "floor": 1.5e-3, "horizon": 2.0}
+    lost = verdicts.within_horizon(np.array([4e-3, 6e-3, np.nan, np.nan]), judged)
+    assert np.isnan(lost["value"]) and lost["floor"] == 1.5e-3  # diverged, if later
+    none = verdicts.within_horizon(times, judged._replace(horizon=0.0))
+    assert np.isnan(none["value"]) and "floor" not in none
 
 
 @pytest.mark.parametrize("shape", [(9, 9), (33, 33)])
@@ -100,24 +56,26 @@ def test_a_truth_is_judged_beside_its_own_ensemble(tmp_path, monkeypatch):
     assert engine.run([*ensembles, *cells], tmp_path, engine.Serial()) == {}
     judged = verdicts.judged_motions(cells, tmp_path)[source]
     assert np.all(judged.floor > 0) and judged.floor.max() < 0.1
-    rows = results.rows(cells, tmp_path)
-    (true,) = (each for each in rows if each.baseline == "true" and each.metric == SURFACE)
-    (drawn,) = (each for each in rows if each.baseline == "default" and each.metric == SURFACE)
+    rows = results.collect(cells, tmp_path)
+    surface = rows[rows.metric == SURFACE]
+    (true,) = surface[surface.baseline == "true"].itertuples()
+    (drawn,) = surface[surface.baseline == "default"].itertuples()
     assert true.value < 1e-5  # it is the truth itself
-    assert true.floor is not None and true.floor > 0
+    assert true.floor > 0
     assert drawn.value > 3e-3 and drawn.horizon == true.horizon
-    (line,) = truth_table(cells, tmp_path).rows
+    (line,) = truth_table(cells, tmp_path).to_dict("records")
     (ensemble,) = (read_ensemble(each, tmp_path) for each in ensembles)
     start = ensemble.causes["start"].mean()  # what settling again does, which predictions do
     assert 0 < start < 1e-3 and ensemble.causes["step"].mean() < 1e-3
-    assert line[0] == source.name and float(line[2]) == pytest.approx(1e3 * true.floor, abs=0.01)
-    (shown,) = motion_comparisons(cells, tmp_path)
-    assert list(shown.motions) == ["true fabric on cloth", "default cloth"]
+    assert line["recording"] == source.name
+    assert float(line["floor [mm]"]) == pytest.approx(1e3 * true.floor, abs=0.01)
+    (shown,) = judged_recordings(cells, tmp_path)
+    assert list(shown.vertices) == ["true fabric on cloth", "default cloth"]
     assert shown.horizon == judged.horizon and np.all(shown.floor == judged.floor)
     inside = shown.mean_errors["default cloth"][shown.inside]
     assert inside.mean() == pytest.approx(drawn.value)
     if np.isfinite(judged.horizon):
-        beyond = {each.metric for each in rows if each.baseline == "true"}
+        beyond = set(rows[rows.baseline == "true"].metric)
         assert {BEYOND + name for name in phase_free.UNITS} <= beyond
 
 

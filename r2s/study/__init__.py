@@ -4,8 +4,8 @@ The path of data, each step a module:
 
 - `sources`: recordings, synthetic or given, to estimate from and to judge by.
 - `estimates`: what each approach makes of them. `evaluations`: how near its fabric comes.
-- `rows`: one number each, of all evaluations (`results.csv`).
-- `statistics`: what the rows say, as `tables`. `report`: tables, pictures, videos, one page.
+- `statistics`: the results as one table (`results.csv`), and what they say.
+- `report`: tables, figures and motions on one page.
 
 Sources, estimates and evaluations are `cells`, which `matrix` lays out by `configuration`, `engine`
 (with `cluster`) makes, and `results` collects. `main.study` does all of it.

@@ -77,7 +77,7 @@ class EvaluationCell(Cell):
 
     @property
     def baseline(self) -> str:
-        """As in `r2s.study.rows.Row`."""
+        """As in `r2s.study.statistics.frame`."""
         if self.estimate is not None:
             if self.other:
                 return "other_fabric"

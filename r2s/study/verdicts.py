@@ -1,14 +1,13 @@
-"""What the distances to a surface say of a fabric: within the horizon, beside the floor, as skill.
+"""What the distances to a surface say of a fabric: up to the horizon, beside the floor, as skill.
 
-Beyond the horizon, what does not depend on the phase is compared (`r2s.evaluation.phase_free`).
+Beyond the horizon features that do not depend on the phase are compared
+(`r2s.evaluation.phase_free`).
 """
 
 import math
-from collections import defaultdict
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,15 +15,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s.evaluation import phase_free
-from r2s.evaluation.horizon import floor_of, horizon_of, skill, within
+from r2s.evaluation.horizon import floor_of, horizon_of, within
 from r2s.geometry.surface import sample
-from r2s.recordings.recording import cloud
+from r2s.recordings.recording import Recording, cloud
 from r2s.scenarios.scenario import from_recording
 from r2s.study.ensembles import EnsembleCell, ensemble_of, read_ensemble
 from r2s.study.evaluations import EvaluationCell, read_distances, read_motions
 from r2s.study.mujoco_ensemble import MujocoEnsemble
 from r2s.study.mujoco_recording import MujocoRecording
-from r2s.study.rows import Row
 from r2s.study.sources import Source, SyntheticRecording, read
 
 SURFACE = "surface"  # the metric that is judged within the horizon
@@ -80,66 +78,36 @@ def judged_motion(source: Source, folder: Path) -> Judged | None:
     return Judged(times, floor, horizon_of(times, floor, ensemble.apart[:, used]))
 
 
-def with_verdicts(rows: Sequence[Row], cells: Sequence[EvaluationCell], folder: Path) -> list[Row]:
-    """Rows in which those of `SURFACE` are judged within their horizon, beside floor and skill, and
-    more rows of what is compared beyond it."""
-    known = {source.name: each for source, each in judged_motions(cells, folder).items()}
-    errors = {_place(row): row for row in rows if row.metric == SURFACE}
-    more: list[Row] = []
-    for cell in cells:
-        if not cell.is_made(folder):
-            continue
-        for name, away in read_distances(cell, folder).items():
-            place = (*cell.configuration, cell.fabric, cell.repeat, name, cell.baseline)
-            if name in known and (row := errors.get(place)) is not None:
-                errors[place] = _within(row, away, known[name])
-                more += _beyond(row, cell, known[name], folder)
-    told = _with_skills(list(errors.values()))
-    replaced = {_place(row): row for row in told}
-    return [replaced.get(_place(row), row) if row.metric == SURFACE else row for row in rows] + more
+def verdicts(
+    cell: EvaluationCell, known: Mapping[Source, Judged], folder: Path
+) -> dict[str, list[dict[str, Any]]]:
+    """What a cell that is made says of its recordings whose motion is judged, by their names.
+
+    Each has the metric, unit and value of an error: first that of `SURFACE` with floor and horizon,
+    then those of what is compared beyond the horizon. `known`: from `judged_motions`.
+    """
+    sources = [source for source in cell.recordings if source in known]
+    if not sources:
+        return {}
+    distances, x = read_distances(cell, folder), read_motions(cell, folder)
+    found = {}
+    for source in sources:
+        judged = known[source]
+        surface = {"metric": SURFACE, "unit": "m", **within_horizon(distances[source.name], judged)}
+        recording = read(source, folder)
+        found[source.name] = [surface, *_beyond(recording, x[source.name], cell.shape, judged)]
+    return found
 
 
-def _place(row: Row) -> tuple[str, ...]:
-    return (
-        row.approach,
-        row.solver,
-        row.estimated_from,
-        row.fabric,
-        row.repeat,
-        row.recording,
-        row.baseline,
-    )
-
-
-def _within(row: Row, away: Float[np.ndarray, " frame"], judged: Judged) -> Row:
+def within_horizon(away: Float[np.ndarray, " frame"], judged: Judged) -> dict[str, Any]:
+    """The mean of distances [m] before the horizon, beside the floor's; NaN for a run that
+    diverged, whenever it did, and where no frame is before the horizon."""
     inside = judged.inside
     if not inside.any():
-        return replace(row, value=np.nan, horizon=judged.horizon)
-    is_lost = not np.isfinite(away).all()  # what diverges later is lost, too
-    value, floor = np.nan if is_lost else np.mean(away[inside]), np.mean(judged.floor[inside])
-    return replace(row, value=float(value), floor=float(floor), horizon=judged.horizon)
-
-
-def _with_skills(rows: list[Row]) -> list[Row]:
-    """With the skill of each beside the default's mean error in the same recording and solver.
-
-    The mean is over the draws that did not diverge: one that did would end the skill of all, of
-    what diverged itself too.
-    """
-    defaults: dict[tuple[str, str, str], list[float]] = defaultdict(list)
-    for row in rows:
-        if row.baseline == "default":
-            defaults[row.solver, row.fabric, row.recording].append(row.value)
-    found = []
-    for row in rows:
-        default = defaults.get((row.solver, row.fabric, row.recording))
-        if row.floor is None or row.baseline == "default" or default is None:
-            found.append(row)
-            continue
-        finite = [value for value in default if np.isfinite(value)] or [np.nan]
-        told = skill(row.value, float(np.mean(finite)), row.floor)
-        found.append(replace(row, skill=None if np.isnan(told) else told))
-    return found
+        return {"value": np.nan, "horizon": judged.horizon}
+    value = np.mean(away[inside]) if np.isfinite(away).all() else np.nan
+    floor = float(np.mean(judged.floor[inside]))
+    return {"value": float(value), "floor": floor, "horizon": judged.horizon}
 
 
 def as_recorded(
@@ -159,19 +127,21 @@ def as_recorded(
     ]
 
 
-def _beyond(row: Row, cell: EvaluationCell, judged: Judged, folder: Path) -> list[Row]:
+def _beyond(
+    recording: Recording,
+    x: Float[np.ndarray, "frame vertex 3"],
+    shape: tuple[int, int],
+    judged: Judged,
+) -> list[dict[str, Any]]:
     outside = np.flatnonzero(~judged.inside)
     if len(outside) < FEWEST:
         return []
-    (source,) = (each for each in cell.recordings if each.name == row.recording)
-    recording = read(source, folder)
     frames = [recording.info.frames_used[0] + int(place) for place in outside]
-    x = read_motions(cell, folder)[row.recording][frames]
-    faces = from_recording(recording, cell.shape).scene.mesh.faces
+    faces = from_recording(recording, shape).scene.mesh.faces
     real = [cloud(recording, frame) for frame in frames]
-    simulated = as_recorded(x, faces, [len(each) for each in real])
+    simulated = as_recorded(x[frames], faces, [len(each) for each in real])
     found = phase_free.differences(real, simulated, judged.times[outside])
     return [
-        replace(row, metric=BEYOND + name, unit=phase_free.UNITS[name], value=value)
+        {"metric": BEYOND + name, "unit": phase_free.UNITS[name], "value": value}
         for name, value in found.items()
     ]

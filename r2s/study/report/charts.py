@@ -1,114 +1,119 @@
-"""Charts of a study, each one PNG: mean ranks, shares of the variance, distances.
+"""Plotly charts of a report: skill, mean distances, error over time."""
 
-Needs matplotlib: pip install 'r2s[study]'. Each function returns `path`, and raises OSError that
-names it when it cannot be written.
-"""
-
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable, Mapping
 
 import numpy as np
+import pandas as pd
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
 
-from r2s.evaluation.statistics import LEVEL, SIGNIFICANCE
-from r2s.study.report.figures import (
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    SKY,
-    VERMILION,
-    Figure,
-    Looks,
-    save,
-)
-from r2s.study.statistics.distances import means
-from r2s.study.statistics.factors import REST, Shares
-from r2s.study.statistics.ranks import Ranks
-from r2s.study.statistics.result_array import ResultArray
+from r2s.study.configuration import REFERENCES, is_reference
+from r2s.study.motions import Motion
 
-SHARE_COLOURS = (BLUE, ORANGE, GREEN, GREY, SKY, VERMILION)
+# Okabe and Ito's colours, which the colour-blind can tell apart, and then darker ones.
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7", "#B8A800", "#5D3A9B",
+           "#994F00", "#006CD1", "#40B0A6", "#7D7D00")  # fmt: skip
+INK, BROWN, GREY, SAND, RED = "#202020", "#8a6d5a", "#8c8c8c", "#ecdcb0", "#c4004f"
+OF_REFERENCES = {REFERENCES["true"]: INK, REFERENCES["middle"]: BROWN}
+ABOVE = 1.1  # of the largest error that is shown, the upper end of a chart
+RUNAWAY = 2.0  # times the largest error of a reference: what is farther off is out of the chart
 
 
-def rank_chart(path: Path | str, ranks: Mapping[str, Ranks]) -> Path:
-    """Mean ranks with intervals, a results each, the best at the top.
+def colours_of(labels: Iterable[str]) -> dict[str, str]:
+    """The colour of each label, one for a whole page; references are dark, brown and grey."""
+    found: dict[str, str] = {}
+    for label in dict.fromkeys(labels):
+        if is_reference(label):
+            own = [colour for name, colour in OF_REFERENCES.items() if label.startswith(name)]
+            found[label] = own[0] if own else GREY
+        else:
+            count = sum(not is_reference(each) for each in found)
+            found[label] = COLOURS[count % len(COLOURS)]
+    return found
 
-    The bar below is as long as two mean ranks must be apart to be told from each other.
+
+def interval_chart(
+    means: pd.DataFrame, colours: Mapping[str, str], title: str, marks: Mapping[float, str]
+) -> go.Figure:
+    """Means with their intervals, a panel a motion, a line a configuration.
+
+    `means`: from `r2s.study.statistics.means.means`. `marks`: values with a vertical line.
     """
-    count = max(len(each.configurations) for each in ranks.values())
-    across = min(2, len(ranks))
-    down = -(-len(ranks) // across)
-    size = (5.6 * across, 0.4 + (1.5 + 0.3 * count) * down)
-    figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(down, across, squeeze=False).ravel()
-    for axes in panels[len(ranks) :]:
-        axes.remove()
-    for axes, (title, each) in zip(panels, ranks.items(), strict=False):
-        order = np.argsort(each.mean, kind="stable")
-        places = np.arange(len(order))
-        axes.hlines(places, each.low[order], each.high[order], color=BLUE, linewidth=5, alpha=0.35)
-        axes.plot(each.mean[order], places, "o", color=BLUE, markersize=6)
-        axes.set_yticks(places, [each.configurations[i].label for i in order], fontsize=8.5)
-        axes.set(xlabel="mean rank (1 is best)", xlim=(0.7, len(order) + 0.3))
-        axes.set_title(f"{title}: {each.fabrics} fabrics", fontsize=11)
-        start, below = 1.0, len(order) - 0.1
-        axes.plot([start, start + each.difference], [below, below], "|-", color=VERMILION)
-        text = f"critical difference {each.difference:.2f} ({100 * SIGNIFICANCE:.0f} %, Nemenyi)"
-        axes.text(start, below + 0.2, text, fontsize=7.5, color=VERMILION, va="top")
-        axes.set_ylim(len(order) + 0.6, -0.6)
-        axes.grid(axis="x", alpha=0.3)
-    figure.suptitle(f"Ranks of the configurations, with {LEVEL:.0%} intervals", fontsize=12)
-    return save(figure, path)
+    motions = list(dict.fromkeys(means.index.get_level_values("evaluated_on")))
+    labels = list(dict.fromkeys(map(str, means.index.get_level_values("configuration"))))
+    figure = make_subplots(1, len(motions), shared_yaxes=True, subplot_titles=motions)
+    finite = means["mean"][np.isfinite(means["mean"])]
+    low = min([*marks, *finite, 0.0])
+    for column, motion in enumerate(motions, 1):
+        for label, row in means.xs(motion, level="evaluated_on").iterrows():
+            label = str(label)
+            if row.diverged or not np.isfinite(row["mean"]):
+                words = f"{row.diverged:.0f} of {row.runs:.0f} runs diverged"
+                style = {"mode": "text", "text": [words], "textposition": "middle right"}
+                shown = go.Scatter(x=[low], y=[label], textfont_color=RED, **style)
+            else:
+                ends = {"array": [row.high - row["mean"]], "arrayminus": [row["mean"] - row.low]}
+                known = {"error_x": {"type": "data", **ends}} if np.isfinite(row.low) else {}
+                marker = {"color": colours[label], "size": 10}
+                shown = go.Scatter(x=[row["mean"]], y=[label], mode="markers", marker=marker, **known)
+            figure.add_trace(shown.update(showlegend=False, name=label), 1, column)
+        for value, words in marks.items():
+            figure.add_vline(value, line_dash="dot", annotation_text=words, row=1, col=column)  # type: ignore
+    reach = max([*marks, *finite, 0.0]) - low or 1.0
+    figure.update_xaxes(title=title, range=[low - 0.15 * reach, low + 1.15 * reach])
+    figure.update_yaxes(categoryorder="array", categoryarray=labels[::-1])
+    return figure.update_layout(height=140 + 32 * len(labels), margin_l=260)
 
 
-def share_chart(path: Path | str, shares: Mapping[str, Shares]) -> Path:
-    """Draw shares of the variance of the log distance, grouped by factor."""
-    factors = list(dict.fromkeys(name for each in shares.values() for name in each.factors))
-    factors.sort(key=lambda name: name == REST)  # last
-    figure = Figure(figsize=(max(6.5, 1.3 * len(factors) + 1.5), 4.2), layout="constrained")
-    axes = figure.add_subplot()
-    width = 0.84 / max(1, len(shares))
-    for i, (title, each) in enumerate(shares.items()):
-        where = np.array([factors.index(name) for name in each.factors], float)
-        where += (i - (len(shares) - 1) / 2) * width
-        axes.bar(where, 100 * each.share, 0.92 * width, label=title, color=SHARE_COLOURS[i % 6])
-    axes.set_xticks(range(len(factors)), factors)
-    axes.set_ylabel("share of the variance [%]")
-    axes.set_title("What the logarithm of the distance depends on")
-    axes.axhline(0, color="black", linewidth=0.8)
-    axes.grid(axis="y", alpha=0.3)
-    axes.set_axisbelow(True)
-    options: dict[str, Any] = {"loc": "outside lower center", "ncols": max(1, len(shares))}
-    figure.legend(frameon=False, fontsize=9, **options)
-    return save(figure, path)
+def error_chart(motion: Motion, colours: Mapping[str, str]) -> go.Figure:
+    """The mean error [mm] of each configuration's runs against time, with their range.
+
+    The floor is shaded; beyond the horizon the chart is pale. A line ends with a cross where one of
+    its runs diverged.
+    """
+    times, top = motion.times, _top(motion)
+    figure = go.Figure()
+    if motion.floor is not None:
+        floor = np.minimum(1e3 * motion.floor, 2 * top)  # an infinite one fills the chart
+        shade = {"mode": "none", "fill": "tozeroy", "fillcolor": SAND, "name": "floor"}
+        figure.add_scatter(x=times, y=floor, **shade)
+    for label, mean in motion.mean_errors.items():
+        runs, dash = motion.errors[label], "dash" if "points" in label.split() else "solid"
+        line, group = {"color": colours[label], "dash": dash}, {"legendgroup": label}
+        if len(runs) > 1:
+            ends = np.where(np.isfinite(runs), 1e3 * runs, np.inf)
+            low, high = (np.minimum(end(ends, axis=0), 2 * top) for end in (np.min, np.max))
+            band = {"x": [*times, *times[::-1]], "y": [*high, *low[::-1]], "fill": "toself"}
+            figure.add_scatter(**band, mode="none", fillcolor=colours[label], opacity=0.18,
+                               showlegend=False, hoverinfo="skip", **group)  # fmt: skip
+        lost = int((~np.isfinite(runs).all(axis=1)).sum())
+        words = f"{label} ({lost} of {len(runs)} diverged)" if lost else label
+        known = np.isfinite(mean)
+        y = np.where(known, 1e3 * mean, np.nan)
+        figure.add_scatter(x=times, y=y, mode="lines", line=line, name=words, **group)
+        if lost and known.any():
+            last = np.flatnonzero(known)[-1:]
+            cross = {"symbol": "x", "size": 10, "color": colours[label]}
+            figure.add_scatter(x=times[last], y=np.minimum(y[last], top), mode="markers",
+                               marker=cross, showlegend=False, **group)  # fmt: skip
+    if motion.horizon is not None and np.isfinite(motion.horizon):
+        end = max(times[-1], motion.horizon)
+        figure.add_vrect(motion.horizon, end, fillcolor="white", opacity=0.65, line_width=0)
+        words = f"horizon {motion.horizon:.2f} s"
+        figure.add_vline(motion.horizon, line_color=RED, annotation_text=words)
+    figure.update_xaxes(title="time [s]", range=[times[0], max(times[-1], times[0] + 1e-3)])
+    figure.update_yaxes(title="distance to the simulated surface [mm]", range=[0, top])
+    title = f"{motion.evaluated_on}, {motion.fabric.replace('_', ' ')} ({motion.recording})"
+    return figure.update_layout(title=title, height=460)
 
 
-def distance_chart(
-    path: Path | str, parts: Mapping[str, ResultArray], title: str, looks: Looks
-) -> Path:
-    """Draw the mean distances of all configurations, a panel for each motion, on one scale."""
-    found = {motion: means(part) for motion, part in parts.items()}
-    order = list(dict.fromkeys(c for part in parts.values() for c in part.configurations))
-    size = (2.6 + 2.9 * len(found), 1.6 + 0.34 * len(order))
-    figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
-    # Intervals of few fabrics are wide: the scale is that of the means.
-    finite = [2e3 * each.mean[np.isfinite(each.mean)] for each in found.values()]
-    right = 1.12 * max((float(values.max()) for values in finite if len(values)), default=1.0)
-    for axes, (motion, each) in zip(panels, found.items(), strict=True):
-        for i, configuration in enumerate(parts[motion].configurations):
-            place = order.index(configuration)
-            if not np.isfinite(each.mean[i]):
-                text = f"{each.diverged[i]}/{each.runs[i]} diverged"
-                axes.text(0.02 * right, place, text, fontsize=8, va="center", color=VERMILION)
-                continue
-            low, mean, high = 1e3 * each.low[i], 1e3 * each.mean[i], 1e3 * each.high[i]
-            colour = looks[configuration.label].colour
-            axes.hlines(place, low, high, color=colour, linewidth=5, alpha=0.4)
-            axes.plot(mean, place, "o", color=colour, markersize=6)
-        axes.set(xlabel="distance [mm]", xlim=(0, right), ylim=(len(order) - 0.4, -0.6))
-        axes.set_title(motion, fontsize=11)
-        axes.grid(axis="x", alpha=0.3)
-    panels[0].set_yticks(range(len(order)), [c.label for c in order], fontsize=8.5)
-    figure.suptitle(title, fontsize=12)
-    return save(figure, path)
+def _top(motion: Motion) -> float:
+    """The upper end of the chart, [mm]: what runs away does not widen it."""
+
+    def largest(labels: Iterable[str]) -> float:
+        runs = np.concatenate([np.zeros(1), *(motion.errors[label].ravel() for label in labels)])
+        return float(runs[np.isfinite(runs)].max())
+
+    references = largest(label for label in motion.errors if is_reference(label))
+    every = largest(motion.errors)
+    return 1e3 * ABOVE * (min(every, RUNAWAY * references) if references else every) or 1.0

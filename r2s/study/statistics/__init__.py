@@ -1,6 +1,15 @@
-"""What the rows of a study say.
+"""The analysis of a study: pure functions from tables of results to tables.
 
-- `result_array`: the rows of a metric as an array, and its bootstrap.
-- `distances`, `ranks`, `factors`, `recordings`, `parameters`, `paper`: tables of them.
-- `hypotheses`, `conclusions`, `findings`: which conclusions of the paper hold.
+- `frame`: the results as one long table, `results.csv`.
+- `means`: means over fabrics with their intervals; skill.
+- `comparisons`: which of two sides is better, and what is known of it.
+- `conclusions`: the conclusions of the paper as such comparisons; `paper`: its tables.
+- `ranks`, `factors`: who is best more often, and what the distance depends on.
+
+Needs pandas and statsmodels: pip install 'r2s[study]'.
 """
+
+from r2s.extras import require
+
+require("pandas", "study", "the analysis of a study")
+require("statsmodels", "study", "the analysis of a study")

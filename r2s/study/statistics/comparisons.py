@@ -1,0 +1,184 @@
+"""Comparisons: which of two sides has the smaller distances, tested over fabrics.
+
+A comparison is one number a fabric, the mean logarithm of the ratio of two distances, above zero
+where the hypothesis is right; intervals and tests are Student's t over fabrics (`means.crossed`).
+A run that diverged has no distance: a comparison leaves it out, and nothing is concluded in favour
+of a side of which a run diverged.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from statsmodels.stats.multitest import multipletests
+
+from r2s.evaluation.crossed import CrossedMean, crossed_mean, interval, p_value, units_needed
+from r2s.evaluation.statistics import SIGNIFICANCE
+from r2s.study.configuration import ON_CLOTH
+from r2s.study.statistics.frame import motions
+
+MARGIN = 0.05  # an interval of the ratio within 1 +- this says that there is no difference
+HOLDS, HOLDS_NOT, UNKNOWN = "holds", "does not hold", "cannot be told"
+NOTHING = CrossedMean(np.nan, 0, np.nan, 0.0, np.nan)
+
+
+class Comparison(NamedTuple):
+    """One test; `lacking` says why there is none.
+
+    - `found`: the mean over fabrics of the logarithm of the ratio (of what `words` say, where it
+      is no ratio), above zero where the hypothesis is right.
+    - `agreeing`: in how many of the fabrics it is above zero.
+    - `diverged`: runs that did, of the side that should be smaller, and of the larger.
+    - `paper`: the two averages that the paper's tables have for it, [-].
+    """
+
+    words: str
+    found: CrossedMean = NOTHING
+    agreeing: int = 0
+    diverged: tuple[int, int] = (0, 0)
+    is_ratio: bool = True
+    paper: tuple[float, float] | None = None
+    lacking: str = ""
+
+
+def compare(
+    words: str,
+    results: pd.DataFrame,
+    smaller: Sequence[str],
+    larger: Sequence[str],
+    paper: tuple[float, float] | None = None,
+) -> Comparison:
+    """Compare configurations over the recordings that they share; of several on a side the
+    geometric mean counts.
+
+    `results`: of one metric, from `frame.labelled`. `smaller`, `larger`: labels of configurations
+    that are expected to have the smaller and the larger distances.
+    """
+    there = set(results.configuration)
+    if missing := [each for each in (*smaller, *larger) if each not in there]:
+        return Comparison(words, lacking=f"no rows of {', '.join(missing)}", paper=paper)
+    sides = [*dict.fromkeys((*smaller, *larger))]
+    part = results[results.configuration.isin(sides)]
+    part = part.assign(configuration=part.configuration.astype(str))
+    counts = part.groupby("recording").configuration.transform("nunique")
+    part = part[counts == len(sides)]
+    if part.empty:
+        return Comparison(words, paper=paper, lacking="nothing that both were judged on")
+    lost = [int(part[part.configuration.isin(side)].diverged.sum()) for side in (smaller, larger)]
+    place = ["fabric", "movement"]
+    part = part.assign(alone=part.groupby(["configuration", *place]).log.transform("size") == 1)
+    wide = part.pivot(index=[*place, "repeat"], columns="configuration", values=["log", "alone"])
+    logs, alone = wide["log"].astype(float), wide["alone"].fillna(False).astype(bool)
+    of_recording = logs.groupby(place).mean()
+    # what was run once stands beside every repeat of the other side
+    once = alone.groupby(place).transform("any")
+    logs = logs.where(~once, logs.groupby(place).transform("mean"))
+
+    def apart(table: pd.DataFrame) -> pd.Series:
+        means = [table[list(side)].mean(axis=1, skipna=False) for side in (larger, smaller)]
+        return means[0] - means[1]
+
+    by_movement = apart(of_recording).unstack()
+    by_repeat = apart(logs).groupby(["fabric", "repeat"]).mean().unstack()
+    tables = [by_movement, by_repeat]
+    return compared(words, by_movement.mean(axis=1), tables, (lost[0], lost[1]), paper)
+
+
+def compared(
+    words: str,
+    numbers: pd.Series,
+    tables: Iterable[pd.DataFrame] = (),
+    diverged: tuple[int, int] = (0, 0),
+    paper: tuple[float, float] | None = None,
+    is_ratio: bool = True,
+) -> Comparison:
+    """The comparison of numbers by fabric; `tables`: these by fabric and a factor that all share.
+
+    Fabrics without a number (NaN) do not count.
+    """
+    numbers = numbers[np.isfinite(numbers)]
+    if numbers.empty:
+        why = "all of it diverged" if sum(diverged) else "nothing that both were judged on"
+        return Comparison(words, diverged=diverged, paper=paper, lacking=why)
+    arrays = [table.reindex(numbers.index).to_numpy(float) for table in tables]
+    found = crossed_mean(numbers.to_numpy(float), arrays)
+    return Comparison(words, found, int((numbers > 0).sum()), diverged, is_ratio, paper)
+
+
+def judge(comparisons: Iterable[tuple[str, Comparison]]) -> pd.DataFrame:
+    """The answer to each comparison of each conclusion, after Holm's correction for all of them.
+
+    A comparison holds where p is below `SIGNIFICANCE` and speaks for it. It does not hold where p
+    speaks against it, or where the interval of the ratio says that there is no difference to speak
+    of (`MARGIN`). Columns: `conclusion`, `comparison`, `answer`, `lacking`, `ratio` with `low` and
+    `high`, `p`, `p_holm`, `agreeing` of `fabrics`, `diverged_smaller` and `diverged_larger`,
+    `needed`, `fewest`, `most`: fabrics that would tell a ratio like this, at least one as far from
+    1 as `MARGIN`; `paper_smaller`, `paper_larger`.
+    """
+    pairs = list(comparisons)
+    p = np.array([p_value(each.found) for _, each in pairs])
+    corrected, known = np.full(len(p), np.nan), np.isfinite(p)
+    if known.any():
+        corrected[known] = multipletests(p[known], method="holm")[1]
+    level = SIGNIFICANCE / max(1, int(known.sum()))
+    rows = []
+    for (conclusion, each), own, holm in zip(pairs, p, corrected, strict=True):
+        low, high = np.exp(interval(each.found)) if each.is_ratio else (np.nan, np.nan)
+        effect = max(abs(each.found.mean), np.log1p(MARGIN))
+        needed = dict(
+            zip(("needed", "fewest", "most"), units_needed(each.found, effect, level), strict=True)
+        )
+        rows.append({
+            "conclusion": conclusion, "comparison": each.words,
+            "answer": _answer(each, low, high, holm), "lacking": each.lacking,
+            "ratio": np.exp(each.found.mean) if each.is_ratio else np.nan, "low": low, "high": high,
+            "p": own, "p_holm": holm, "agreeing": each.agreeing, "fabrics": each.found.units,
+            "diverged_smaller": each.diverged[0], "diverged_larger": each.diverged[1], **needed,
+            "paper_smaller": each.paper[0] if each.paper else np.nan,
+            "paper_larger": each.paper[1] if each.paper else np.nan,
+        })  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def learned(results: pd.DataFrame, metric: str) -> pd.DataFrame:
+    """Whether the errors of each configuration (`conclusion`) on each motion (`comparison`) are
+    below those of the prior's middle on the same solver, in the recordings that have a skill.
+
+    An approach that knows the prior of fabrics does as well as its middle by learning nothing, so
+    this, and not the skill against random draws of it, says what a recording has taught. `results`:
+    from `frame.labelled`; the true fabric is among the configurations: it bounds what can be learned.
+    """
+    known = results[(results.metric == metric) & results.skill.notna()]
+    pairs = []
+    for motion in motions(known):
+        part = known[known.evaluated_on == motion]
+        whose = part[["configuration", "solver", "baseline"]].drop_duplicates()
+        middles = whose[whose.baseline == "middle"].set_index("solver").configuration.to_dict()
+        for label, solver, baseline in whose.sort_values("configuration").itertuples(index=False):
+            if baseline in ("", "true", ON_CLOTH) and solver in middles:
+                pairs.append((str(label), compare(motion, part, [label], [middles[solver]])))
+    return judge(pairs)
+
+
+def _answer(comparison: Comparison, low: float, high: float, p: float) -> str:
+    if comparison.lacking:
+        return UNKNOWN
+    if 1 / (1 + MARGIN) < low and high < 1 + MARGIN and not any(comparison.diverged):
+        return HOLDS_NOT
+    is_favoured = comparison.found.mean > 0
+    if p < SIGNIFICANCE and not comparison.diverged[0 if is_favoured else 1]:
+        return HOLDS if is_favoured else HOLDS_NOT
+    return UNKNOWN
+
+
+def answers(judged: pd.DataFrame) -> dict[str, str]:
+    """The answer to each conclusion: it holds where all its comparisons hold, and does not as soon
+    as one of them does not."""
+    found = {}
+    for conclusion, own in judged.groupby("conclusion", sort=False).answer:
+        if (own == HOLDS_NOT).any():
+            found[conclusion] = HOLDS_NOT
+        else:
+            found[conclusion] = HOLDS if (own == HOLDS).all() else UNKNOWN
+    return found

@@ -1,0 +1,112 @@
+"""The table of results: read back as written, damage is named, what counts for what."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from made_up_study import made_up_results
+
+from r2s.study.configuration import PAPER_CONFIGURATIONS, Configuration
+from r2s.study.statistics import frame
+from r2s.study.statistics.frame import COLUMNS, as_frame, labelled, read_results, write_results
+
+
+def row(value, recording="towel_1", baseline="", metric="chamfer", repeat="1", **more):
+    whose = {"approach": "new", "solver": "cloth", "estimated_from": "lifting"}
+    place = {"fabric": recording.split("_")[0], "repeat": repeat, "recording": recording}
+    judged = {"evaluated_on": "folding", "baseline": baseline, "metric": metric, "unit": "m"}
+    return whose | place | judged | {"value": value} | more
+
+
+def test_results_are_read_back_as_written(tmp_path):
+    path = tmp_path / "results.csv"
+    values = (0.1 + 0.2, 1e-300, math.nan, math.inf)
+    rows = [row(value, f'a, "{i}"\nb', skill=-math.inf) for i, value in enumerate(values)]
+    written = as_frame([*rows, row(1 / 3, floor=2e-3, horizon=math.inf)])
+    write_results(path, written)
+    pd.testing.assert_frame_equal(read_results(path), written, check_exact=True)
+    assert path.read_text().splitlines()[0] == (
+        "approach,solver,estimated_from,fabric,repeat,recording,evaluated_on,baseline,metric,unit,"
+        "value,floor,horizon,skill"
+    )
+    assert [entry.name for entry in tmp_path.iterdir()] == ["results.csv"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "No columns"),
+        ("approach,value\n", "expected the header"),
+        (",".join(COLUMNS) + "\na,b,c,d,e,f,g,,h,m,many,,,\n", "many"),
+        (",".join(COLUMNS) + "\na,b,c,d,e,f,g,best,h,m,1.0,,,\n", "unknown baseline 'best'"),
+        (",".join(COLUMNS) + 2 * "\na,b,c,d,e,f,g,,h,m,1.0,,,", "two rows for one value: a, b, c"),
+    ],
+)
+def test_damaged_results_are_refused(tmp_path, text, message):
+    path = tmp_path / "damaged.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_results(path)
+    assert str(path) in str(caught.value)
+    with pytest.raises(FileNotFoundError, match="nowhere.csv"):
+        read_results(tmp_path / "nowhere.csv")
+
+
+def test_a_metric_without_a_value_is_not_a_run_that_diverged():
+    rows = [
+        row(value, name, metric=metric)
+        for name, values in {"well": (0.1, math.nan), "lost": (math.nan, math.nan)}.items()
+        for metric, value in zip(("chamfer", "chamfer_cropped"), values, strict=True)
+    ]
+    kept = frame.without_undefined(as_frame(rows))
+    assert list(zip(kept.recording, kept.metric, strict=True)) == [
+        ("well", "chamfer"), ("lost", "chamfer"), ("lost", "chamfer_cropped")
+    ]  # fmt: skip
+
+
+def test_what_is_judged_before_a_horizon_does_not_hide_what_diverged_after_it():
+    def kept(*rows):
+        return list(frame.without_undefined(as_frame(rows)).metric)
+
+    lost, early = row(math.nan), row(0.1, metric="surface", horizon=0.5)
+    assert kept(early, lost) == ["surface", "chamfer"]
+    whole = early | {"horizon": math.inf}
+    assert kept(whole, lost) == ["surface"]
+    # a distance beside a floor is looked at in every frame: without a value the run diverged
+    assert kept(row(0.1), row(math.nan, metric="surface", floor=1e-3)) == ["chamfer", "surface"]
+
+
+def test_configurations_are_in_the_order_of_the_paper_and_defaults_last():
+    new = Configuration("new", "cloth", "wind")
+    results = made_up_results(configurations=[new, *reversed(PAPER_CONFIGURATIONS)])
+    assert frame.configurations(results) == [*PAPER_CONFIGURATIONS, new]
+    labels = list(results.configuration.cat.categories)
+    assert labels[:2] == ["DIFFCLOUD cloth lifting", "DIFFCLOUD cloth wind"]
+    assert labels[-2:] == ["new cloth wind", "default cloth"]
+
+
+def test_references_count_for_themselves():
+    baselines = "true", "middle", "default", "on_cloth", "other_fabric", "repeatability"
+    found = labelled(as_frame([row(0.1, baseline=each) for each in baselines]))
+    assert list(found.configuration) == [
+        "true fabric on cloth", "middle of the prior on cloth", "default cloth",
+        "new (found on points) cloth lifting", "new (of another fabric) cloth lifting",
+        "another trial cloth lifting",
+    ]  # fmt: skip
+
+
+def test_means_are_over_fabrics_that_every_configuration_has():
+    results = made_up_results(configurations=PAPER_CONFIGURATIONS[:2])
+    lacking = results[(results.fabric != "pink_solid") | (results.estimated_from != "wind")]
+    assert frame.fabrics_in_common(lacking) == ["black_denim", "grey_interlock"]
+    assert len(frame.fabrics_in_common(results)) == 3
+    apart = lacking[(lacking.fabric == "pink_solid") | (lacking.estimated_from != "lifting")]
+    assert len(frame.fabrics_in_common(apart)) == 3  # no fabric has both: all count
+
+
+def test_what_diverged_has_no_logarithm_and_movements_are_common_to_fabrics():
+    results = labelled(as_frame([row(math.nan), row(math.inf, "rag_1"), row(1.0, "bag_1")]))
+    assert list(results.diverged) == [True, True, False]
+    assert np.isnan(results.log).tolist() == [True, True, False]
+    assert set(results.movement) == {"_1"}
