@@ -17,7 +17,7 @@ from r2s.study.main import study  # noqa: E402
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Estimate, and judge on motions never seen.")
     add = parser.add_argument
-    add("--preset", default="small", help="small, paper or full")
+    add("--preset", default="one_fabric", help="one_fabric, three_fabrics, paper or full")
     add("--data", type=Path, help="folder of recordings; synthetic ones without")
     add("--out", type=Path, default=Path("results"), help="folder of the results")
     add("--paper", type=Path, help="folder of the tables of Ru et al. 2025, to set beside ours")

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.study import cells, engine
+from r2s.study import cells, engine, progress
 from r2s.study.cells import Cell
 from r2s.study.ensembles import EnsembleCell
 from r2s.study.environment import environment, one_core
@@ -273,3 +273,11 @@ def test_jobs_of_slurm_make_the_same_with_a_stand_in_for_sbatch(tmp_path, monkey
     assert [value_of(cell, tmp_path / "out") for cell in sums] == [1, 3, 5, 7]
     assert settings and set(settings.values()) == {"1"}
     assert len(list(tmp_path.glob("sbatch.*.log"))) >= 1
+
+
+def test_a_file_gets_a_line_in_time_while_a_cell_is_running(tmp_path, capfd, monkeypatch):
+    """Half a minute as delivered; a tenth of a second here."""
+    monkeypatch.setattr(progress, "LINES", 0.1)
+    engine.run([Number(1, pause=0.55)], tmp_path, engine.Serial())
+    lines = capfd.readouterr().err.splitlines()
+    assert len([line for line in lines if line.startswith("study of 1 cells:   0 %")]) >= 3

@@ -130,7 +130,7 @@ def test_the_cropped_distance_leaves_out_what_the_recording_cannot_show(fold, pr
 def test_the_configurations_of_the_paper_are_part_of_all():
     assert set(PAPER_CONFIGURATIONS) <= set(matrix.FULL)
     assert len(set(matrix.FULL)) == len(matrix.FULL)
-    for cell in matrix.synthetic(matrix.PRESETS["small"]):
+    for cell in matrix.synthetic(matrix.PRESETS["three_fabrics"]):
         assert cell.scenario in MOTIONS
         assert all(
             isinstance(source, SyntheticRecording | MujocoRecording) and source.unseen

@@ -21,7 +21,7 @@ class Study:
 
     out: Annotated[Path, arg(metavar="FOLDER")]
     """Where report, tables, pictures and cells go."""
-    preset: Literal["small", "paper", "full"] = "small"
+    preset: Literal["one_fabric", "three_fabrics", "paper", "full"] = "one_fabric"
     """Which configurations and fabrics, and how many motions."""
     data: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Recordings with their manifest; synthetic ones without."""

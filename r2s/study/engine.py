@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from r2s.compilation import clear_beyond
 from r2s.study.cells import Cell, dependencies, execute, with_dependencies
+from r2s.study.progress import progress
 
 MOST_MEMORY = 0.9e9  # [byte]: a process that holds more after a cell lets its programs go
 
@@ -91,9 +92,8 @@ def run(cells: Iterable[Cell], folder: Path, runner: Runner) -> dict[Cell, str]:
     order = TopologicalSorter({cell: _waiting_for(cell, waiting) for cell in waiting})
     order.prepare()
     failed: dict[Cell, str] = {}
-    shape = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}, about {remaining} left{postfix}"
     total = sum(cell.weight for cell in waiting)
-    with tqdm(total=total, desc="study", bar_format=shape, disable=None, smoothing=0.1) as bar:
+    with progress(total, len(waiting)) as bar:
         for cell in order.get_ready():
             runner.submit(cell, folder)
         for cell, reason in runner.finished() if waiting else ():

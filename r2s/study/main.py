@@ -10,7 +10,7 @@ from r2s.study.subprocesses import OneProcess
 
 
 def study(
-    preset: str = "small",
+    preset: str = "one_fabric",
     data: Path | None = None,
     out: Path = Path("results"),
     *,

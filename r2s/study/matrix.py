@@ -83,6 +83,19 @@ ALL = Plan(
     judged=EVALUATION // len(MOTIONS),
     truth=TruthSettings(self_contact=True),
 )
+ONE_FABRIC = Plan(
+    configurations=PAPER_CONFIGURATIONS,
+    fabrics=("camel_ponte_roma",),
+    repeats=1,
+    judged=1,
+    budgets=Budgets(
+        diffcp=METHODS["diffcp"].budget._replace(coarse=4, starts=1),
+        physnet=METHODS["physnet"].budget._replace(evaluations=40),
+        training=TrainingBudget(fabrics=32, epochs=2, steps=40),
+    ),
+    every=3,
+    draws=2,
+)
 SMALL = Plan(
     configurations=(
         Configuration("diffcloud", "cloth", "lifting"),
@@ -106,7 +119,8 @@ SMALL = Plan(
     draws=2,
 )
 PRESETS = {
-    "small": SMALL,
+    "one_fabric": ONE_FABRIC,
+    "three_fabrics": SMALL,
     "paper": dataclasses.replace(ALL, configurations=PAPER_CONFIGURATIONS),
     "full": ALL,
 }
