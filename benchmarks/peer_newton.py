@@ -1,83 +1,48 @@
-"""Newton's cloths in the scene "hang", on the same mesh, recorded as graphs (also on the CPU).
+"""Newton's semi-implicit Euler solver in the scene "hang", recorded as graphs (also on the CPU).
 
-Their membrane is a stable neo-Hookean one, with the same stiffness as r2s's at small strains; their
-bending is scaled edge by edge to that of r2s. "Explicit" is `SolverSemiImplicit`, a semi-implicit
-Euler, whose damping also acts on rigid rotations; that of VBD does not.
+The sheet is that of `r2s.export.newton`: a neo-Hookean membrane with the same stiffness as r2s's at
+small strains, and hinges. Its damping also acts on rigid rotations.
 """
 
-from functools import partial
-
+import _hang
 import newton  # pyright: ignore[reportMissingImports]
 import numpy as np
-import scenes
 import warp as wp  # pyright: ignore[reportMissingImports]
 
+from r2s.export import newton as export
 from r2s.units import GRAVITY
 
 wp.config.quiet = True
-MU = scenes.MEMBRANE[3]  # [N/m]
-LAMBDA = {"explicit": scenes.MEMBRANE[1] + MU, "VBD": scenes.MEMBRANE[1]}  # [N/m]
-ITERATIONS = 10  # of VBD, Newton's default
+KIND = "semi_implicit"
 
 
-def _model(kind: str, size: int, damping: float, differentiable: bool):
-    mesh = scenes.sheet(size)
+def _model(size: int, damping: float, differentiable: bool):
+    """The model and its solver; `damping` [s], of the membrane."""
+    mesh, fabric = _hang.sheet(size), _hang.fabric(0.0)
+    arguments = export.cloth(fabric, mesh, KIND, yarns=False)[0].arguments
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
-    # both damp (part of) the shear as r2s does; VBD's acts on the rate of F^T F, twice that of E
-    share = 1.0 if kind == "explicit" else 0.5
     builder.add_cloth_mesh(
         pos=wp.vec3(0.0, 0.0, 0.0),
         rot=wp.quat_identity(),
         vel=wp.vec3(0.0, 0.0, 0.0),
         scale=1.0,
-        vertices=[wp.vec3(*x) for x in np.asarray(scenes.flat(mesh)).tolist()],
+        vertices=[wp.vec3(*x) for x in np.asarray(_hang.flat(mesh)).tolist()],
         indices=np.asarray(mesh.faces).ravel().tolist(),
-        density=scenes.DENSITY,
-        tri_ke=MU,
-        tri_ka=LAMBDA[kind],
-        tri_kd=share * damping * MU,
-        tri_drag=0.0,
-        tri_lift=0.0,
-        edge_ke=1.0,
-        edge_kd=0.0,
-        particle_radius=1e-4,
+        **(arguments | {"tri_kd": damping * arguments["tri_ke"]}),
     )
     for corner in (0, size - 1):
         builder.particle_mass[corner] = 0.0
         builder.particle_flags[corner] &= ~newton.ParticleFlags.ACTIVE
-    if kind == "VBD":
-        builder.color()
     model = builder.finalize(requires_grad=differentiable)
     model.particle_grid = None  # no contact between particles
-    _set_bending(model, kind, scenes.SIDE / (size - 1))
-    return model
+    export.set_edges(model, fabric, mesh, KIND)
+    return model, newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False)
 
 
-def _set_bending(model, kind: str, cell: float) -> None:
-    """Hinges with r2s's stiffness k l^2 / A, where A is a cell's area.
-
-    Newton multiplies by the edge's length l, and `SolverSemiImplicit` by A too.
-    """
-    area = cell**2
-    properties = model.edge_bending_properties.numpy()
-    length = model.edge_rest_length.numpy()
-    properties[:, 0] = scenes.BENDING * length / area
-    if kind == "explicit":
-        properties[:, 0] /= area
-    model.edge_bending_properties.assign(properties)
-
-
-def _solver(kind: str, model):
-    if kind == "VBD":
-        return newton.solvers.SolverVBD(model, iterations=ITERATIONS)
-    return newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False)
-
-
-def _forward(kind: str, size: int, substeps: int, damping: float):
-    if substeps % 2:
-        raise ValueError(f"two states take turns: substeps must be even, got {substeps}")
-    model = _model(kind, size, damping, False)
-    solver, control = _solver(kind, model), model.control()
+def forward(size: int, substeps: int, damping: float):
+    """As `_hang.forward`; `substeps` is even, since two states take turns."""
+    model, solver = _model(size, damping, False)
+    control = model.control()
     state, other, start = model.state(), model.state(), model.state()
 
     def frame():
@@ -87,21 +52,15 @@ def _forward(kind: str, size: int, substeps: int, damping: float):
             solver.step(a, b, control, None, 1 / (60 * substeps))
             a, b = b, a
 
-    materials = model.tri_materials.numpy().copy()  # on the CPU it is a view
-
-    def reset(stiffness):
-        model.tri_materials.assign(materials * np.array([stiffness, stiffness, 1, 1, 1]))
-        wp.copy(state.particle_q, start.particle_q)
-        wp.copy(state.particle_qd, start.particle_qd)
-
     frame()  # loads the kernels
     with wp.ScopedCapture() as capture:
         frame()
 
-    def call(stiffness=1.0):
-        reset(stiffness)
+    def call():
+        wp.copy(state.particle_q, start.particle_q)
+        wp.copy(state.particle_qd, start.particle_qd)
         frames = []
-        for _ in range(scenes.FRAMES):
+        for _ in range(_hang.FRAMES):
             wp.capture_launch(capture.graph)
             frames.append(state.particle_q.numpy().copy())
         return np.stack(frames)
@@ -121,14 +80,14 @@ def _add_squares(
 
 
 def gradient(size: int, substeps: int, damping: float):
-    """As `ours.gradient`, with all materials and masses, of the explicit solver by `wp.Tape`."""
-    model = _model("explicit", size, damping, True)
-    solver, control = _solver("explicit", model), model.control()
-    states = [model.state() for _ in range(scenes.FRAMES * substeps + 1)]
+    """As `_hang.gradient`, in all materials and masses, by `wp.Tape`."""
+    model, solver = _model(size, damping, True)
+    control = model.control()
+    states = [model.state() for _ in range(_hang.FRAMES * substeps + 1)]
     loss = wp.zeros(1, dtype=float, requires_grad=True)
-    start, weight = wp.clone(states[0].particle_q), 1 / (scenes.FRAMES * size**2)
+    start, weight = wp.clone(states[0].particle_q), 1 / (_hang.FRAMES * size**2)
 
-    def forward():
+    def run():
         for before, after in zip(states, states[1:], strict=False):
             before.clear_forces()
             solver.step(before, after, control, None, 1 / (60 * substeps))
@@ -139,17 +98,12 @@ def gradient(size: int, substeps: int, damping: float):
     with wp.ScopedCapture() as capture:
         loss.zero_()
         with tape:
-            forward()
+            run()
         tape.backward(loss)
 
     def call():
         tape.zero()  # a graph on the CPU leaves it out
         wp.capture_launch(capture.graph)
-        slope = model.tri_materials.grad.numpy().astype(float).sum(axis=0)
-        return float(loss.numpy()[0]), slope[0] * MU + slope[1] * LAMBDA["explicit"]
+        return float(loss.numpy()[0]), model.tri_materials.grad.numpy().sum(axis=0)
 
     return call
-
-
-forward_explicit = partial(_forward, "explicit")
-forward_vbd = partial(_forward, "VBD")

@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _common import frames_of
+from _recordings import frames_of
 from _tables import Line
 from scipy import stats
 
@@ -24,7 +24,7 @@ from r2s.recordings.recording import Recording, RecordingInfo, gripper_positions
 from r2s.scenarios.scenario import from_recording, resized
 
 SIZE = "size ratio"  # the nuisance that belongs to the fabric
-ORDER = ("own lift", "other trial's lift", "other fabrics' lifts")
+GROUPS = ("own lift", "other trial's lift", "other fabrics' lifts", "fold itself")
 Clouds = list[np.ndarray]
 
 
@@ -42,20 +42,13 @@ def estimated(
     return found
 
 
-def candidates(
-    fold: RecordingInfo, made: Iterable[tuple[RecordingInfo, Estimate]]
-) -> dict[str, list[Estimate]]:
-    """Estimates by what they were made from, as seen from a fold."""
-    found: dict[str, list[Estimate]] = {}
-    for info, estimate in made:
-        name = "other fabrics' lifts"
-        if info.scenario == fold.scenario:
-            name = "fold itself" if info == fold else ""
-        elif info.fabric == fold.fabric:
-            name = "own lift" if info.trial == fold.trial else "other trial's lift"
-        found.setdefault(name, []).append(estimate)
-    found.pop("", None)
-    return {name: found[name] for name in (*ORDER, "fold itself") if name in found}
+def group_of(fold: RecordingInfo, source: RecordingInfo) -> str:
+    """What the recording of an estimate is to a fold; "": another fold, from which none is used."""
+    if source.scenario == fold.scenario:
+        return "fold itself" if source == fold else ""
+    if source.fabric != fold.fabric:
+        return "other fabrics' lifts"
+    return "own lift" if source.trial == fold.trial else "other trial's lift"
 
 
 def size_of(estimate: Estimate) -> float:
@@ -88,16 +81,15 @@ def seen(
 def beside(
     fold: Recording,
     made: Iterable[tuple[RecordingInfo, Estimate]],
-    draws: list[Fabric],
+    samples: list[Fabric],
     shape: tuple[int, int],
 ) -> dict[str, list[Clouds | None]]:
-    """What a fold's cameras would have seen of the estimated fabrics and of the prior's `draws`."""
-    groups = candidates(fold.info, made)
-    found = {
-        name: [seen(fold, each.fabric, shape, size_of(each)) for each in group]
-        for name, group in groups.items()
-    }
-    return found | {"prior": [seen(fold, fabric, shape) for fabric in draws]}
+    """What a fold's cameras would have seen of the estimates and of samples of the prior."""
+    found: dict[str, list[Clouds | None]] = {name: [] for name in GROUPS}
+    for info, estimate in made:
+        if group := group_of(fold.info, info):
+            found[group].append(seen(fold, estimate.fabric, shape, size_of(estimate)))
+    return found | {"prior": [seen(fold, fabric, shape) for fabric in samples]}
 
 
 def errors(real: Clouds, others: list[Clouds | None]) -> tuple[float, float]:

@@ -4,20 +4,18 @@ import numpy as np
 from _tables import Line
 from scipy.stats import norm
 
-BEFORE, BEHIND = "repeat", "identifiable off at most"  # the columns around those of parameters
-BEYOND = (BEHIND, "converged", "recordings agree")
+OTHERS = ("fabric", "repeat", "identifiable off at most", "converged", "recordings agree")
 DIVERGED = "(inf)"  # what is no estimate holds no truth
 
 
 def by_parameter(lines: list[Line]) -> list[Line]:
     """One line for each parameter, and one for all; none where all estimates diverged."""
-    columns = next((list(line) for line in lines if line.get(BEHIND)), [BEFORE, BEHIND])
-    names = [name for name in columns[columns.index(BEFORE) + 1 :] if name not in BEYOND]
-    if not names:
+    names = list(dict.fromkeys(name for line in lines for name in line if name not in OTHERS))
+    if not any(line.get(name) for line in lines for name in names):
         return []
-    told = np.array([[line.get(name) or DIVERGED for name in names] for line in lines])
-    known = ~np.char.startswith(told, "(")
-    away = np.abs(np.char.strip(told, "()").astype(float))
+    cells = np.array([[line.get(name) or DIVERGED for name in names] for line in lines])
+    known = ~np.char.startswith(cells, "(")
+    away = np.abs(np.char.strip(cells, "()").astype(float))
     every = zip([*names, "all"], [*away.T, away.ravel()], [*known.T, known.ravel()], strict=True)
     return [{"parameter": name} | _held(errors, which) for name, errors, which in every]
 

@@ -48,30 +48,20 @@ def predicted(folder: Path, configuration: str, fabric: str, law: str) -> Line:
     return line | _over_truth(estimate, folder) | _made(estimate, folder)
 
 
-def predicted_elsewhere(folder: Path, configuration: str, repeat: str) -> Line:
-    """The line of a table: errors [mm] and skill in the first fold, fling and shaking of MuJoCo's
-    sheet of an estimate from its lift of that number, and the seconds of a CPU that it took."""
-    return _judged(_cells(configuration, FLEX, MOTIONS, int(repeat)), folder)
-
-
 def predicted_alone(folder: Path, configuration: str, fabric: str) -> Line:
     """The line of a table: errors [mm] and skill of an estimate in the first fling and shaking of a
     fabric, and the seconds of a CPU that it took."""
-    return _judged(_cells(configuration, fabric, JUDGED), folder)
+    return _judged(folder, _cells(configuration, fabric, JUDGED))
 
 
-def _judged(cells: list[EvaluationCell], folder: Path) -> Line:
-    line = _errors(cells, folder)
-    return line | _made(_estimate(cells), folder)
+def predicted_elsewhere(folder: Path, configuration: str, repeat: str) -> Line:
+    """As `predicted_alone`, in the first fold, fling and shaking of MuJoCo's sheet, of an estimate
+    from its lift of that number."""
+    return _judged(folder, _cells(configuration, FLEX, MOTIONS, int(repeat)))
 
 
-def from_lift_in_mujoco(folder: Path, motions: Sequence[str]) -> tuple[Line, Estimate]:
-    """Floor, errors [mm] and skill of MuJoCo's sheet by motion, and the estimate from its first
-    lift by DIFFCLOUD."""
-    cells = _cells("diffcloud-cloth-lifting", FLEX, motions)
-    line, found = _errors(cells, folder), read_estimate(_estimate(cells), folder)
-    assert found is not None
-    return line, found
+def _judged(folder: Path, cells: list[EvaluationCell]) -> Line:
+    return _errors(cells, folder) | _made(_estimate(cells), folder)
 
 
 def _estimate(cells: list[EvaluationCell]) -> EstimateCell:

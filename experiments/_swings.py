@@ -1,4 +1,9 @@
-"""What swings say of a fabric, and how far predictions of other swings are from their trackers."""
+"""Estimates of density and stiffness from a few measured swings, and predictions of the others.
+
+Errors [mm] are mean distances from the tracked points to where they are predicted. The tracker's
+own error is that of the row that the bar holds, whose place is known. "Placed": the predictions are
+moved by the offset of the tracker's frame, which the swings of the estimate determine.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,12 +12,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _tables import Line, keep
 from jaxtyping import Float
 
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.judgement import descend
 from r2s.estimation.method import Budget
-from r2s.estimation.problem import NuisancePrior, Problem, default_nuisance_prior
+from r2s.estimation.problem import Problem, default_nuisance_prior
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace
 from r2s.recordings.datasets import known_bar
@@ -20,28 +26,38 @@ from r2s.recordings.readers.swings import read_swing
 from r2s.recordings.recording import Recording
 from r2s.scenarios.scenario import from_recording, rollout
 
+LEARNT = ("range030_rep01", "range060_rep04", "range090_rep02", "range120_rep01")
 SHAPE = (8, 8)  # vertices, as many as are tracked
 KNOT = 0.02  # [s], between knots of the path; the arm logs poses every 0.01 to 0.1 s
 DENSITY = 1.0  # relative deviation of a density that nobody measured
 BUDGET = Budget(coarse=24, starts=3, iterations=25, around=0, shares=(0.3,))
+CAPTION = "Swings predicted from four others: mean distances [mm]."
 
 _rollout = eqx.filter_jit(rollout)
 
 
-def swings(folder: Path, names: Sequence[str], duration: float) -> list[Recording]:
-    """Some recordings of a folder, or all where no names are given."""
-    bar = known_bar()
-    files = sorted(folder.glob("*.npz"))
-    chosen = [file for file in files if file.stem in names] if names else files
-    if not chosen:
-        raise ValueError(f"{folder}: no recording of {', '.join(names) or 'any name'}")
-    return [_alike(read_swing(file, bar, duration)) for file in chosen]
+def predict_swings(
+    folder: Path, seconds: float, space: ParameterSpace, samples: Sequence[Fabric], out: Path
+) -> None:
+    """Estimate from four swings, and write the table of the others."""
+    swings = {file.stem: _read(file, seconds) for file in sorted(folder.glob("*.npz"))}
+    if not set(LEARNT) <= set(swings):
+        raise ValueError(f"{folder}: expected the swings {', '.join(LEARNT)}")
+    problems = tuple(_problem(swings.pop(name), space) for name in LEARNT)
+    estimate = descend(problems, BUDGET, key=jax.random.key(0))
+    offset, rows = _offset(estimate), {}
+    for name, swing in swings.items():
+        rows[name] = _row(swing, estimate.fabric, samples, offset)
+        means = {key: np.mean([row[key] for row in rows.values()]) for key in rows[name]}
+        table = [*rows.items(), ("mean", means)]
+        lines = [{"swing": n} | {k: f"{v:.2f}" for k, v in row.items()} for n, row in table]
+        keep(out, lines, CAPTION, _facts(estimate))
 
 
-def _alike(recording: Recording) -> Recording:
-    """With as many knots as any of its duration, so that one program serves all of them."""
-    end = float(recording.times[-1]) + KNOT
-    times = np.arange(0, end, KNOT)
+def _read(file: Path, seconds: float) -> Recording:
+    """A swing with as many knots as any of its duration, so that one program serves all."""
+    recording = read_swing(file, known_bar(), seconds)
+    times = np.arange(0, float(recording.times[-1]) + KNOT, KNOT)
     path = np.asarray(recording.handle_path).reshape(len(recording.handle_times), -1)
     at = [np.interp(times, np.asarray(recording.handle_times), column) for column in path.T]
     ends = np.stack(at, axis=1).reshape(-1, *recording.handle_path.shape[1:])
@@ -49,51 +65,57 @@ def _alike(recording: Recording) -> Recording:
     return eqx.tree_at(lambda r: (r.handle_path, r.handle_times), recording, knots)
 
 
-def estimated(recordings: Sequence[Recording], space: ParameterSpace) -> Estimate:
-    """The fabric of some swings, its density in doubt by `DENSITY`; the air is taken as known."""
-    problems = tuple(_problem(each, space) for each in recordings)
-    return descend(problems, BUDGET, key=jax.random.key(0))
-
-
 def _problem(recording: Recording, space: ParameterSpace) -> Problem:
-    scenario = from_recording(recording, SHAPE)
-    prior: NuisancePrior = default_nuisance_prior(scenario, recording.info.doubt)
-    return Problem.make(
-        recording, space, shape=SHAPE, nuisance_prior=prior._replace(density=DENSITY)
-    )
+    nuisances = default_nuisance_prior(from_recording(recording, SHAPE), recording.info.doubt)
+    nuisances = nuisances._replace(density=DENSITY)
+    return Problem.make(recording, space, shape=SHAPE, nuisance_prior=nuisances)
 
 
-def learnt_offset(found: Estimate) -> Float[np.ndarray, " 3"]:
-    """Where the tracker's frame lies against the arm's, [m]: the mean over the swings learnt."""
-    told = {
-        axis: [n.value for n in found.nuisances if n.name.startswith(f"shift {axis}")]
-        for axis in "xyz"
+def _shifts(estimate: Estimate, axis: str) -> list[float]:
+    """Offsets [m] of the tracker's frame against the arm's, of each swing."""
+    return [n.value for n in estimate.nuisances if n.name.startswith(f"shift {axis}")]
+
+
+def _offset(estimate: Estimate) -> Float[np.ndarray, " 3"]:
+    return np.array([np.mean(_shifts(estimate, axis)) for axis in "xyz"])
+
+
+def _facts(estimate: Estimate) -> Line:
+    """Density and the tracker's height above the bar, for the head of the table."""
+    ratio = next(n for n in estimate.nuisances if n.name == "density ratio")
+    error = ratio.standard_error / ratio.value
+    return {
+        "density": f"{float(estimate.fabric.density):.3g} kg/m^2, {error:.0%}",
+        "tracker above the bar [mm]": ", ".join(f"{1e3 * z:.1f}" for z in _shifts(estimate, "z")),
     }
-    return np.array([np.mean(values) for values in told.values()])
 
 
-def facts(found: Estimate) -> dict[str, str]:
-    """What the swings learnt tell, for the head of a table."""
-    shifts = ", ".join(f"{1e3 * n.value:.1f}" for n in found.nuisances if "shift z" in n.name)
-    ratio = next(n for n in found.nuisances if n.name == "density ratio")
-    density = f"{float(found.fabric.density):.3g} kg/m^2, {ratio.standard_error / ratio.value:.0%}"
-    return {"density": density, "tracker above the bar [mm]": shifts}
+def _row(
+    swing: Recording, fabric: Fabric, samples: Sequence[Fabric], offset: Float[np.ndarray, " 3"]
+) -> dict[str, float]:
+    """Errors [mm] of the tracker, of the estimate and of the samples, as read and placed."""
+    found, others = _gap(swing, fabric), [_gap(swing, sample) for sample in samples]
+    row: dict[str, float] = {}
+    for how, shift in {"": np.zeros(3), " placed": offset}.items():
+        of_rows = _of_rows(found + shift)
+        row["tracker" + how], row["estimate" + how] = of_rows[0], of_rows.mean()
+        row["prior" + how] = np.nanmean([_of_rows(gap + shift) for gap in others])
+        row["estimate / tracker" + how] = row["estimate" + how] / row["tracker" + how]
+    return row
 
 
-def errors(
-    recording: Recording, fabric: Fabric, offset: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "2 row"]:
-    """Mean distance [m] from the tracked points to where a fabric predicts them, row by row from
-    the bar down, in the arm's frame and in one that is shifted by an offset [m]; the first row is
-    the bar's own. NaN: the simulation diverged."""
-    moved = _rollout(from_recording(recording, SHAPE), fabric)
-    if not np.isfinite(moved.x).all():
-        return np.full((2, SHAPE[1]), np.nan)
-    assert recording.markers is not None and recording.markers_seen is not None
-    gap = np.asarray(moved.x) - np.asarray(recording.markers)
-    seen = np.asarray(recording.markers_seen)
-    found = []
-    for shift in (np.zeros(3), offset):
-        away = np.where(seen, np.linalg.norm(gap + shift, axis=-1), np.nan)
-        found.append(np.nanmean(away.reshape(-1, *SHAPE), axis=(0, 1)))
-    return np.stack(found)
+def _gap(swing: Recording, fabric: Fabric) -> Float[np.ndarray, "frame column row 3"]:
+    """From the tracked points to the predicted ones [m], rows from the bar down.
+
+    NaN where a point was not seen, and everywhere if the simulation diverged.
+    """
+    moved = _rollout(from_recording(swing, SHAPE), fabric)
+    assert swing.markers is not None and swing.markers_seen is not None
+    seen = np.asarray(swing.markers_seen) & np.isfinite(moved.x).all()
+    gap = np.where(seen[..., None], np.asarray(moved.x) - np.asarray(swing.markers), np.nan)
+    return gap.reshape(len(gap), *SHAPE, 3)
+
+
+def _of_rows(gap: Float[np.ndarray, "frame column row 3"]) -> Float[np.ndarray, " row"]:
+    """Mean distance of each row, [mm]."""
+    return 1e3 * np.nanmean(np.linalg.norm(gap, axis=-1), axis=(0, 1))

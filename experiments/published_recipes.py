@@ -28,12 +28,9 @@ if __name__ == "__main__":
     parser = command_line(__doc__, "docs/results/published_recipes.csv")
     fabrics = ["grey_interlock", "camel_ponte_roma"]
     parser.add_argument("--fabrics", nargs="+", choices=presets.FIVE, default=fabrics)
-    parser.add_argument("--configurations", nargs="+", default=CONFIGURATIONS)
     parser.add_argument("--folder", type=Path, default=Path("results/published_recipes"))
     a = parser.parse_args()
     jobs: list[Line] = [
-        {"fabric": fabric, "configuration": each}
-        for fabric in a.fabrics
-        for each in a.configurations
+        {"fabric": fabric, "configuration": each} for fabric in a.fabrics for each in CONFIGURATIONS
     ]
     resumed(a.out, CAPTION, jobs, partial(predicted_alone, a.folder))

@@ -1,48 +1,45 @@
-"""Estimate from each real lift, and judge on the unseen fold: what is learnt, what is left?
+"""What estimates from real recordings predict of other recordings of the same fabric.
 
 python experiments/real_recordings.py recordings --density 0.15      # two hours on one core
 python experiments/real_recordings.py recordings --prior fabrics --lifts-alone    # one hour
+python experiments/real_recordings.py swings --swings --density 0.2 --out results/swings.csv
 
-Errors [mm] are mean distances both ways between a recording and what its cameras would have seen of
-a simulation: as read, and "placed" where the recording lies nearest (at most 30 mm and 0.3 rad
-off), which leaves the cameras out. The prior's draws know the weight alone. Estimates are kept in
-the folder --kept, and not made again. With --prior fabrics an estimate knows beforehand what
-measured fabrics of the weight are like; --lifts-alone leaves out estimates from the folds.
+An estimate from each lift predicts the fold that it has not seen. Errors [mm] are mean distances
+both ways between a recording and what its cameras would have seen of a simulation: as read, and
+"placed" where the recording lies nearest (at most 30 mm and 0.3 rad off), which leaves the cameras
+out. Samples of the prior know the weight alone. Estimates are stored in the folder --kept, and not
+made again. With --prior fabrics the prior is that of measured fabrics of the weight; --lifts-alone
+leaves out estimates from the folds.
+
+With --swings density and stiffness are estimated from four measured swings, which predict the
+others: see `_swings.py` (15 minutes).
 """
 
 from pathlib import Path
 
 import jax
 import numpy as np
-from _common import frames_of, recorded_points, recordings_in
 from _real import beside, compared, errors, estimated
+from _recordings import frames_of, recorded_points, recordings_in
+from _swings import predict_swings
 from _tables import command_line, keep
 
 import r2s
 from r2s.fabrics import prior
 
-DRAWS = 8
+SAMPLES = 8  # of the prior
 
-if __name__ == "__main__":
-    parser = command_line(__doc__, "results/real_recordings.csv")
-    parser.add_argument("recordings", type=Path)
-    parser.add_argument("--density", type=float, default=0.15, help="areal density [kg/m^2]")
-    parser.add_argument("--kept", type=Path, default=Path("results/real_estimates"))
-    parser.add_argument("--shape", type=int, nargs=2, default=(9, 9), help="vertices")
-    parser.add_argument("--prior", choices=("flat", "fabrics"), default="flat")
-    parser.add_argument("--lifts-alone", action="store_true")
-    a = parser.parse_args()
-    shape, space = tuple(a.shape), r2s.OrthotropicSpace.make(a.density)
-    if a.prior == "fabrics":
-        space = prior.informed(space, a.density)
-    draws = prior.fabrics(a.density, DRAWS, jax.random.key(0))
-    lifts, folds = (recordings_in(a.recordings, name) for name in ("lift", "fold"))
-    learnt = lifts if a.lifts_alone else [*lifts, *folds]
-    made = {r.info.name: (r.info, estimated(r, space, shape, a.kept)) for r in learnt}
+
+def predict_folds(options, space: r2s.ParameterSpace, samples: list[r2s.Fabric]) -> None:
+    """Write the table of folds, and the tests of its columns against each other."""
+    shape = tuple(options.shape)
+    lifts, folds = (recordings_in(options.recordings, name) for name in ("lift", "fold"))
+    learnt = lifts if options.lifts_alone else [*lifts, *folds]
+    made = {r.info.name: (r.info, estimated(r, space, shape, options.kept)) for r in learnt}
     table: dict[str, dict[str, float]] = {}
     for fold in folds:
         info, real = fold.info, recorded_points(fold, frames_of(fold))
-        moved = beside(fold, made.values(), draws, shape)
+        moved = beside(fold, made.values(), samples, shape)
         again = [r for r in folds if r.info.fabric == info.fabric and r is not fold]
         moved["other trial"] = [recorded_points(r, frames_of(fold)) for r in again]
         row = {}
@@ -52,9 +49,31 @@ if __name__ == "__main__":
         means = {n: np.mean([row[n] for row in table.values()]) for n in row}
         rows = [*table.items(), ("mean", means)]
         lines = [{"recording": n} | {k: f"{v:.1f}" for k, v in r.items()} for n, r in rows]
-        keep(a.out, lines, "Real folds, predicted from lifts: mean distance both ways [mm].")
+        keep(options.out, lines, "Real folds, predicted from lifts: mean distance both ways [mm].")
     fabrics, tests = [fold.info.fabric for fold in folds], []
     for end in ("", ", placed"):
         for other in ("prior", "other fabrics' lifts", "other trial"):
             tests.append(compared(table, fabrics, f"own lift{end}", f"{other}{end}"))
-    keep(a.out.with_stem(f"{a.out.stem}_tests"), tests, "Own lift against others [mm].")
+    path = options.out.with_stem(f"{options.out.stem}_tests")
+    keep(path, tests, "Own lift against others [mm].")
+
+
+if __name__ == "__main__":
+    parser = command_line(__doc__, "results/real_recordings.csv")
+    parser.add_argument("recordings", type=Path)
+    parser.add_argument("--swings", action="store_true", help="the folder has swings")
+    parser.add_argument("--density", type=float, default=0.15, help="areal density [kg/m^2]")
+    parser.add_argument("--kept", type=Path, default=Path("results/real_estimates"))
+    parser.add_argument("--shape", type=int, nargs=2, default=(9, 9), help="vertices")
+    parser.add_argument("--prior", choices=("flat", "fabrics"), default="flat")
+    parser.add_argument("--lifts-alone", action="store_true")
+    parser.add_argument("--seconds", type=float, default=5.0, help="of each swing")
+    a = parser.parse_args()
+    space = r2s.OrthotropicSpace.make(a.density)
+    samples = prior.fabrics(a.density, SAMPLES, jax.random.key(0))
+    if a.swings:
+        predict_swings(a.recordings, a.seconds, space, samples, a.out)
+    else:
+        if a.prior == "fabrics":
+            space = prior.informed(space, a.density)
+        predict_folds(a, space, samples)
