@@ -86,9 +86,9 @@ def motion_loss(fabric: r2s.Fabric, solver, start, controls) -> Float[Array, ""]
     return jnp.mean(jnp.sum(moved**2, axis=-1))
 
 
-def forward(size: int, substeps: int, damping: float, frames: int = FRAMES, **how):
+def forward(size: int, substeps: int, damping: float, **how):
     """A compiled function without arguments that gives the motion; `how`: see `hang`."""
-    arguments = fabric(damping), *hang(size, substeps, frames, **how)
+    arguments = fabric(damping), *hang(size, substeps, **how)
     run = eqx.filter_jit(motion).lower(*arguments).compile()
     return lambda: np.asarray(run(*arguments))
 

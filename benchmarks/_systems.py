@@ -85,13 +85,13 @@ def _runs(system: System, module: ModuleType, size: int, repeats: int) -> list[d
     rows = []
     for factor in system.factors:
         substeps = _substeps(system, size, factor)
-        times, x = _measure.timed(forward(size, substeps, damping), repeats)
+        seconds, x = _measure.timed(forward(size, substeps, damping), repeats)
         squared = np.sum((x[:HALF].astype(float) - finest[:HALF]) ** 2, axis=-1)
-        row = {"steps": _hang.FRAMES * substeps, "forward_s": times.median}
+        row = {"steps": _hang.FRAMES * substeps, "forward_s": seconds}
         row["error_mm"] = 1e3 * float(np.sqrt(squared.mean()))
         if system.gradient and np.isfinite(row["error_mm"]):
             backward = getattr(module, system.gradient)(size, substeps, damping)
-            row["gradient_s"] = _measure.timed(backward, repeats)[0].median
+            row["gradient_s"] = _measure.timed(backward, repeats)[0]
         rows.append(row)
     return rows
 

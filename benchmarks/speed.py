@@ -3,43 +3,22 @@
 taskset -c 0 python benchmarks/speed.py                                # all tables, an hour or more
 taskset -c 0 python benchmarks/speed.py --only hang --sizes 9          # a part, one mesh
 
-"hang": the cloth of r2s beside Newton and MuJoCo, at equal error. "scaling": a step of larger
-meshes. "points": material points beside Taichi. Peers that are not installed are left out:
-pip install 'r2s[bench]'. Times are without compilation. Measure on one core: JAX's threads hinder
-each other in steps as small as these, and the peers use one. --out is the folder of the tables.
+"hang": the cloth of r2s beside Newton and MuJoCo, at equal error. "points": material points beside
+Taichi. Peers that are not installed are left out: pip install 'r2s[bench]'. Times are without
+compilation. Measure on one core: JAX's threads hinder each other in steps as small as these, and
+the peers use one. --out is the folder of the tables.
 """
 
-import math
-
-import _hang
 import _measure
 import _points
 import _systems
 import jax
 from _measure import Line, command_line, keep
 
-SCALING_FRAMES = 20  # of hang, a step each
-
 
 def hang(options) -> list[Line]:
     """The cloths at equal error."""
     return _systems.at_equal_error(_systems.measured(options.sizes, options.repeats))
-
-
-def scaling(options) -> list[Line]:
-    """A forward step by the size of the mesh, and the exponent from one size to the next."""
-    lines, before = [], None
-    for size in options.sizes:
-        call = _hang.forward(size, 1, _systems.DAMPING, SCALING_FRAMES)
-        times, _ = _measure.timed(call, options.repeats)
-        line = {"side": str(size), "a step [ms]": f"{1e3 * times.median / SCALING_FRAMES:.3g}"}
-        line |= {"run [s]": str(times), "exponent": "-"}
-        if before is not None:
-            power = math.log(times.median / before[1]) / math.log((size / before[0]) ** 2)
-            line["exponent"] = f"{power:.2f}"
-        lines.append(line)
-        before = size, times.median
-    return lines
 
 
 def points(options) -> list[Line]:
@@ -56,7 +35,7 @@ def points(options) -> list[Line]:
         print(f"skipped: taichi (pip install 'r2s[bench]': no {error.name})")
     lines = []
     for name, calls in systems.items():
-        seconds = [_measure.timed(call, options.repeats)[0].median for call, _ in calls]
+        seconds = [_measure.timed(call, options.repeats)[0] for call, _ in calls]
         rates = [f"{_points.COUNT * options.steps / each / 1e6:.3g}" for each in seconds]
         line = {"system": name, "particles": str(_points.COUNT), "forward [M/s]": rates[0]}
         line |= {"value and gradient [M/s]": rates[1]}
@@ -68,11 +47,6 @@ PARTS = {
     "hang": (
         *(hang, "hang_at_equal_error"),
         "The cheapest run of each system within 2 mm over 0.5 s, and its time over that of r2s.",
-    ),
-    "scaling": (
-        *(scaling, "scaling"),
-        "The first 20 steps of 1/60 s of the scene hang, forward, median (least to most); "
-        "exponent: of the number of vertices, from the size before.",
     ),
     "points": (
         *(points, "points"),

@@ -10,8 +10,6 @@ explicit steps, material points. A step that takes as long for one fabric as for
 the launch of its kernels.
 """
 
-import dataclasses
-
 import _hang
 import _measure
 import equinox as eqx
@@ -21,7 +19,6 @@ import numpy as np
 from _measure import Line, command_line, keep
 
 import r2s
-from r2s.cloth.linear.elimination import ORDERS, Elimination
 from r2s.mpm import Grid, Sheet
 from r2s.mpm.sheet import stable_step
 
@@ -48,8 +45,8 @@ def fabrics(count: int) -> r2s.Fabric:
     return jax.tree.map(lambda leaf: leaf * factors(), _hang.fabric(damping=0.01))
 
 
-def setting(kind: str, side: int, order: str | None) -> tuple[tuple, int]:
-    """Solver, start and controls, and how many steps they are; `order`: of the elimination."""
+def setting(kind: str, side: int) -> tuple[tuple, int]:
+    """Solver, start and controls, and how many steps they are."""
     frames, batch = FRAMES[kind], fabrics(MOST)
     stiffest = jax.tree.map(jnp.max, batch)
     stiffest = eqx.tree_at(lambda f: f.density, stiffest, jnp.min(batch.density))
@@ -66,32 +63,29 @@ def setting(kind: str, side: int, order: str | None) -> tuple[tuple, int]:
         handles = jnp.broadcast_to(start.x[solver.scene.held], (frames, steps, 2, 3))
         controls = r2s.Control(handles, jnp.zeros((frames, steps, 3)))
         return (points, points.init(start.x), controls), steps * frames
-    elimination = Elimination.make(solver.scene.mesh, order=order)
-    solver = dataclasses.replace(solver, elimination=elimination)
     return (solver, start, controls), IMPLICIT_STEPS * frames
 
 
-def line(kind: str, side: int, members: int, order: str | None, repeats: int) -> Line:
+def line(kind: str, side: int, members: int, repeats: int) -> Line:
     """The line of a table: how long a batch takes, how much memory, and how many are finite."""
-    named = f"{kind}, {order}" if order else kind
-    head = {"device": jax.devices()[0].device_kind, "solver": named}
+    head = {"device": jax.devices()[0].device_kind, "solver": kind}
     head |= {"side": str(side), "fabrics": str(members)}
-    batch, (arguments, steps) = fabrics(members), setting(kind, side, order)
+    batch, (arguments, steps) = fabrics(members), setting(kind, side)
     function = _hang.motion
     if kind == "gradient":
         function = eqx.filter_value_and_grad(_hang.motion_loss)
     batched = eqx.filter_vmap(function, in_axes=(eqx.if_array(0), None, None, None))
     run = eqx.filter_jit(batched).lower(batch, *arguments).compile()
-    times, found = _measure.timed(
+    seconds, found = _measure.timed(
         lambda: jax.block_until_ready(run(batch, *arguments)), repeats, wall=True
     )
     leaves = [np.asarray(leaf).reshape(members, -1) for leaf in jax.tree.leaves(found)]
     finite = np.all([np.isfinite(leaf).all(axis=1) for leaf in leaves], axis=0)
-    step = times.median / steps
+    step = seconds / steps
     return head | {
         "a step [us]": f"{1e6 * step:.3g}",
         "a fabric and step [us]": f"{1e6 * step / members:.3g}",
-        "seconds of motion a second": f"{FRAMES[kind] / 60 * members / times.median:.3g}",
+        "seconds of motion a second": f"{FRAMES[kind] / 60 * members / seconds:.3g}",
         "finite": str(finite.sum()),
         "memory [MB]": f"{_measure.memory(run.compiled):.0f}",
     }
@@ -101,7 +95,6 @@ if __name__ == "__main__":
     parser = command_line(__doc__, "results/sweeps.csv")
     parser.add_argument("--only", nargs="+", choices=list(SIDES), default=list(SIDES))
     parser.add_argument("--sizes", nargs="+", type=int, help="vertices a side")
-    parser.add_argument("--order", choices=ORDERS, help="of implicit steps' elimination")
     parser.add_argument("--members", nargs="+", type=int, default=[1, 64, 1024, MOST])
     parser.add_argument("--repeats", type=int, default=3)
     a = parser.parse_args()
@@ -109,5 +102,5 @@ if __name__ == "__main__":
     for kind in a.only:
         for side in a.sizes or SIDES[kind]:
             for members in a.members:
-                lines.append(line(kind, side, min(members, MOST), a.order, a.repeats))
+                lines.append(line(kind, side, min(members, MOST), a.repeats))
                 keep(a.out, lines, CAPTION)

@@ -2,7 +2,6 @@
 
 python experiments/_documents.py                      # all tables that a document shows
 python experiments/_documents.py --study results      # first the table of skill of a study
-python experiments/_documents.py --study results --args "--preset small"    # ARGS of `make study`
 """
 
 import argparse
@@ -31,7 +30,7 @@ def study_table(results: Path, name: str) -> list[Line]:
         return list(csv.DictReader(file))
 
 
-def copy_skill(results: Path, arguments: str) -> None:
+def copy_skill(results: Path) -> None:
     """Copy the table of skill of a study to docs/results, with what made it."""
     settings = {x["setting"]: x["value"] for x in study_table(results, "settings")}
     made_by = [name for name in settings if name.startswith("cells made by ")]
@@ -39,9 +38,8 @@ def copy_skill(results: Path, arguments: str) -> None:
         sys.exit(f"error: {results} is mixed, make it anew: {'; '.join(made_by) or 'of none'}")
     seconds = sum(float(x["CPU seconds in all"]) for x in study_table(results, "costs"))
     made = time.gmtime((results / "results.csv").stat().st_mtime)
-    study = f'make study ARGS="{arguments}"' if arguments else "make study"
     facts = {
-        "command": f"{study}; python experiments/_documents.py --study results",
+        "command": "make study; python experiments/_documents.py --study results",
         "version": f"r2s {settings['version of r2s']}",
         "source": made_by[0].partition("source ")[2].partition(";")[0],
         "seed": settings["seed"],
@@ -55,10 +53,9 @@ def copy_skill(results: Path, arguments: str) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--study", type=Path, help="folder that `make study` left")
-    parser.add_argument("--args", default="", help="what `make study` had as ARGS")
     a = parser.parse_args()
     if a.study:
-        copy_skill(a.study, a.args)
+        copy_skill(a.study)
     for document in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
         for name in MARK.findall(document.read_text(encoding="utf-8")):
             insert(document, name, shown(RESULTS / f"{name}.csv"))

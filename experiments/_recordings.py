@@ -1,11 +1,9 @@
-"""Recordings of a folder, and their points."""
+"""Recordings of a folder."""
 
 from pathlib import Path
 
-import numpy as np
-
 from r2s.recordings import manifest
-from r2s.recordings.recording import Recording, cloud, load
+from r2s.recordings.recording import Recording, load
 
 
 def recordings_in(folder: Path, *scenarios: str) -> list[Recording]:
@@ -29,8 +27,3 @@ def recordings_in(folder: Path, *scenarios: str) -> list[Recording]:
 def frames_of(recording: Recording) -> range:
     """The numbers of the frames that count."""
     return range(recording.info.frames_used[0], recording.info.frames_used[1] + 1)
-
-
-def recorded_points(recording: Recording, frames: range) -> list[np.ndarray]:
-    """The clouds [m] of some frames."""
-    return [cloud(recording, frame) for frame in frames]

@@ -45,7 +45,7 @@ def predicted(folder: Path, configuration: str, fabric: str, law: str) -> Line:
     cells = [_of_law(each, law) for each in _cells(configuration, fabric, JUDGED)]
     line = _errors(cells, folder)
     estimate = _estimate(cells)
-    return line | _over_truth(estimate, folder) | _made(estimate, folder)
+    return line | _over_truth(estimate, folder) | _cost(estimate, folder)
 
 
 def predicted_alone(folder: Path, configuration: str, fabric: str) -> Line:
@@ -61,7 +61,7 @@ def predicted_elsewhere(folder: Path, configuration: str, repeat: str) -> Line:
 
 
 def _judged(folder: Path, cells: list[EvaluationCell]) -> Line:
-    return _errors(cells, folder) | _made(_estimate(cells), folder)
+    return _errors(cells, folder) | _cost(_estimate(cells), folder)
 
 
 def _estimate(cells: list[EvaluationCell]) -> EstimateCell:
@@ -70,7 +70,7 @@ def _estimate(cells: list[EvaluationCell]) -> EstimateCell:
     return found
 
 
-def _made(cell: EstimateCell, folder: Path) -> Line:
+def _cost(cell: EstimateCell, folder: Path) -> Line:
     return {"CPU s": f"{read_metadata(cell, folder)['cpu_seconds']:.0f}"}
 
 

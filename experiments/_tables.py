@@ -38,11 +38,6 @@ def command_line(document: str | None, out: str) -> argparse.ArgumentParser:
     return parser
 
 
-def machine() -> str:
-    """Describe this machine: the number of cores that may be used, and the processor."""
-    return f"{cores()} cores, {processor()}"
-
-
 def write(path: Path, lines: Sequence[Line], caption: str, facts: Line | None = None) -> None:
     """Write a table as CSV.
 
@@ -56,7 +51,7 @@ def write(path: Path, lines: Sequence[Line], caption: str, facts: Line | None = 
         "version": f"r2s {importlib.metadata.version('r2s')}",
         "source": source_hash()[:SOURCE],
         "seed": "that of the command, else as the driver has it",
-        "machine": machine(),
+        "machine": f"{cores()} cores, {processor()}",
         "date": time.strftime("%Y-%m-%d"),
     } | (facts or {})
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -20,12 +20,13 @@ from pathlib import Path
 import jax
 import numpy as np
 from _real import beside, compared, errors, estimated
-from _recordings import frames_of, recorded_points, recordings_in
+from _recordings import frames_of, recordings_in
 from _swings import predict_swings
 from _tables import command_line, keep
 
 import r2s
 from r2s.fabrics import prior
+from r2s.recordings.recording import cloud
 
 SAMPLES = 8  # of the prior
 
@@ -38,10 +39,11 @@ def predict_folds(options, space: r2s.ParameterSpace, samples: list[r2s.Fabric])
     made = {r.info.name: (r.info, estimated(r, space, shape, options.kept)) for r in learnt}
     table: dict[str, dict[str, float]] = {}
     for fold in folds:
-        info, real = fold.info, recorded_points(fold, frames_of(fold))
+        info, frames = fold.info, frames_of(fold)
+        real = [cloud(fold, frame) for frame in frames]
         moved = beside(fold, made.values(), samples, shape)
         again = [r for r in folds if r.info.fabric == info.fabric and r is not fold]
-        moved["other trial"] = [recorded_points(r, frames_of(fold)) for r in again]
+        moved["other trial"] = [[cloud(r, frame) for frame in frames] for r in again]
         row = {}
         for name in filter(moved.get, moved):
             row[name], row[f"{name}, placed"] = errors(real, moved[name])
