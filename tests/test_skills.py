@@ -80,7 +80,7 @@ def test_numbers_are_those_of_the_definition():
     assert found.loc[(TRUE, "fling"), "mean"] == pytest.approx(true)
     middle = np.mean([(default - MIDDLES) / (default - f) for f in FLOOR.values()])
     assert found.loc[(MIDDLE, "fling"), "mean"] == pytest.approx(middle)
-    assert set(found.floor) == {pytest.approx(2e-3)}
+    assert found.floor.to_numpy() == pytest.approx(2e-3)
     errors = [errors_of(LIFTING, f, i, j) for f in FABRICS for i in range(2) for j in range(2)]
     table = means(known(made_up()))
     assert table.loc[(LIFTING.label, "fling"), "mean"] == pytest.approx(np.mean(errors))
@@ -163,8 +163,6 @@ def test_what_is_learned_is_the_error_over_that_of_the_middle_of_the_prior():
         assert found.agreeing[whose.label] == (logs > 0).sum()
     assert found.answer[LIFTING.label] == "holds"  # 7 to 10 mm in each, for 15
     assert found.answer[PINN.label] == "cannot be told"  # 13 to 16
-    text = tables.learned_table(found.reset_index()).set_index("configuration").fling[LIFTING.label]
-    assert text.startswith(f"{1 / found.ratio[LIFTING.label]:.2f} [") and text.endswith("3 of 3")
 
 
 def test_nothing_is_learned_where_runs_diverged_or_no_skill_is_known():

@@ -14,7 +14,16 @@ if TYPE_CHECKING:
 
 EXCLUDED = {"0.10.2": "wrong numbers from a jitted vmap on the CPU", "0.11.1": "no flax"}
 EXTRAS = {
-    "study": ("jinja2", "matplotlib", "pandas", "plotly", "psutil", "statsmodels", "tqdm", "trimesh"),
+    "study": (
+        "jinja2",
+        "matplotlib",
+        "pandas",
+        "plotly",
+        "psutil",
+        "statsmodels",
+        "tqdm",
+        "trimesh",
+    ),
     "pcd": ("pypcd4",),
     "camera": ("cv2",),
     "data": ("pooch",),

@@ -63,7 +63,7 @@ def publish(
         [(f"{cell.kind} {cell.name}", reason) for cell, reason in failed.items()],
         settings,
         paper,
-        disclosures.sections(cells, estimates_made(cells, out), out),
+        [disclosures.section(cells, estimates_made(cells, out), out)],
     )
     for name in PRINTED:
         if name in tables:

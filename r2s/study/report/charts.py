@@ -55,7 +55,9 @@ def interval_chart(
                 ends = {"array": [row.high - row["mean"]], "arrayminus": [row["mean"] - row.low]}
                 known = {"error_x": {"type": "data", **ends}} if np.isfinite(row.low) else {}
                 marker = {"color": colours[label], "size": 10}
-                shown = go.Scatter(x=[row["mean"]], y=[label], mode="markers", marker=marker, **known)
+                shown = go.Scatter(
+                    x=[row["mean"]], y=[label], mode="markers", marker=marker, **known
+                )
             figure.add_trace(shown.update(showlegend=False, name=label), 1, column)
         for value, words in marks.items():
             figure.add_vline(value, line_dash="dot", annotation_text=words, row=1, col=column)  # type: ignore

@@ -1,8 +1,9 @@
-"""What a study was made with: truths, data, ranges, meshes and costs, as sections."""
+"""What a study was made with: truths, data, ranges, meshes and costs, as a section."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,27 +18,25 @@ from r2s.study.cells import read_metadata, with_dependencies
 from r2s.study.ensembles import Ensemble, read_ensemble
 from r2s.study.estimates import EstimateCell, method_of, read_estimate
 from r2s.study.evaluations import EvaluationCell
-from r2s.study.report.publish import Section
-from r2s.study.report.tables import MISSING, significant
+from r2s.study.report.page import Section
 from r2s.study.sources import SyntheticRecording, read, true_fabric
 from r2s.study.verdicts import Judged, ensembles, judged_motions
 
 LEAST = 2e-3  # [m]: what mesh and step may leave, mean up to the horizon
-CAUSES = ("stiffness", "path", "mesh", "step", "start")
 TRUTHS = (
-    "Of every judged motion: until when it tells fabrics apart and, mean up to there, its floor "
-    "and the distances from it of the truth 0.1 % stiffer, with grippers 0.2 mm aside, on a finer "
-    "mesh, in half the step, and of a sheet that hangs as predictions start it. It is converged "
-    f"where mesh and step move it by less than {1e3 * LEAST:g} mm together, chaotic where stiffness "
-    "and path do not; the ensemble of a fold has no layers, its truth has"
+    "Of every judged motion: until when it discriminates between fabrics and, mean up to there, "
+    "its floor and the distances from it of the truth 0.1 % stiffer, with grippers 0.2 mm aside, "
+    "on a finer mesh, in half the step, and of a sheet that hangs as predictions start it. It is "
+    f"converged where mesh and step move it by less than {1e3 * LEAST:g} mm together, chaotic "
+    "where stiffness and path do not; the ensemble of a fold has no layers, its truth has"
 )
 DATA = (
     "What every approach reads of its recordings; a difference between approaches may be that of "
     "their data, or of the prior"
 )
 RANGES = (
-    "Ranges of what is estimated, and fixed values (one, or one for each fabric). Truths: geometric "
-    "mean of the study's fabrics at small strain"
+    "Ranges of what is estimated, and fixed values. Truths: geometric mean of the study's fabrics "
+    "at small strain"
 )
 MESHES = (
     "The error that the mesh of each estimate leaves in the motion that it was made from, by its "
@@ -45,9 +44,9 @@ MESHES = (
 )
 
 
-def sections(
+def section(
     cells: Sequence[EvaluationCell], estimates: Sequence[EstimateCell], folder: Path
-) -> list[Section]:
+) -> Section:
     """What a study was made with; `estimates`: those that are made."""
     found = {
         "truths": (TRUTHS, truth_table(cells, folder)),
@@ -56,14 +55,14 @@ def sections(
         "meshes": (MESHES, mesh_table(estimates, folder)),
         "costs": ("What it took, compilation included", cost_table(cells, folder)),
     }
-    return [Section("How it was made", (), {k: v for k, v in found.items() if len(v[1])})]
+    return Section("How it was made", (), {k: v for k, v in found.items() if len(v[1])})
 
 
 def truth_table(cells: Sequence[EvaluationCell], folder: Path) -> pd.DataFrame:
     """How well each judged motion is known: horizon, floor by cause [mm] and a verdict."""
     known = judged_motions(cells, folder)
     rows = [
-        {"recording": cell.recording.name}
+        {"recording": cell.recording.name, "horizon [s]": known[cell.recording].horizon}
         | _truth(known[cell.recording], read_ensemble(cell, folder), cell.lacks_layers)
         for cell in ensembles(cells)
         if cell.recording in known
@@ -71,17 +70,15 @@ def truth_table(cells: Sequence[EvaluationCell], folder: Path) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _truth(judged: Judged, ensemble: Ensemble, is_layered: bool) -> dict[str, str]:
-    horizon = "never" if np.isinf(judged.horizon) else f"{judged.horizon:.2f}"
+def _truth(judged: Judged, ensemble: Ensemble, is_layered: bool) -> dict[str, Any]:
     if not judged.inside.any():
-        return {"horizon [s]": horizon, "verdict": "no frame is known"}
+        return {"verdict": "no frame is known"}
     inside = np.isin(ensemble.times, judged.times[judged.inside])
     left = {cause: float(each[:, inside].mean()) for cause, each in ensemble.causes.items()}
+    words = verdict(*(left[cause] for cause in ("stiffness", "path", "mesh", "step")))
     floor = float(judged.floor[judged.inside].mean())
-    lengths = {"floor": floor} | {cause: left[cause] for cause in CAUSES if cause in left}
-    shown = {f"{name} [mm]": f"{1e3 * length:.2f}" for name, length in lengths.items()}
-    words = verdict(*(left[cause] for cause in CAUSES[:4]))
-    return {"horizon [s]": horizon, **shown, "verdict": "not known: layers" if is_layered else words}
+    shown = {f"{name} [mm]": 1e3 * length for name, length in ({"floor": floor} | left).items()}
+    return {**shown, "verdict": "not known: layers" if is_layered else words}
 
 
 def verdict(stiffness: float, path: float, mesh: float, step: float) -> str:
@@ -109,7 +106,7 @@ def data_table(estimates: Iterable[EstimateCell], folder: Path) -> pd.DataFrame:
             "frames read": _span(len(each.frames) for each in reads),
             "points of a frame": _span(_points(*pair) for pair in pairs),
             "markers": _span(_markers(*pair) for pair in pairs),
-            "force of grippers": "yes" if any(each.force for each in reads) else MISSING,
+            "force of grippers": "yes" if any(each.force for each in reads) else "no",
             "prior": cell.prior,
             "laws": cell.law_from(recordings),
         }
@@ -128,9 +125,9 @@ def _markers(recording: Recording, reads: Reads) -> int:
 
 
 def _span(numbers: Iterable[int]) -> str:
-    """One number if all are equal, else the least and the greatest; nothing for 0."""
+    """One number if all are equal, else the least and the greatest."""
     every = sorted(set(numbers))
-    return " to ".join(map(str, dict.fromkeys((every[0], every[-1])))) if every[-1] else MISSING
+    return " to ".join(map(str, dict.fromkeys((every[0], every[-1]))))
 
 
 def range_table(cells: Iterable[EvaluationCell]) -> pd.DataFrame:
@@ -142,23 +139,21 @@ def range_table(cells: Iterable[EvaluationCell]) -> pd.DataFrame:
         own = [cell for cell in cells if cell.solver == solver]
         laws = {cell.estimate.law for cell in own if cell.estimate is not None}
         law = "linear" if laws <= {"linear"} else "stiffening+softening"
-        densities = dict.fromkeys(cell.density for cell in own)
         space = with_law(default_space(solver, own[0].density), law)
-        middle = np.asarray(space.values(jnp.full(space.dim, 0.5, float)))
         sources = [source for cell in own for source in cell.recordings]
-        names = dict.fromkeys(s.fabric for s in sources
-                              if isinstance(s, SyntheticRecording) and not s.truth.materials)  # fmt: skip
-        units = [np.asarray(space.to_unit(true_fabric(name, law))) for name in names]
-        truths = np.full(space.dim, np.nan)
-        if units:
-            truths = np.asarray(space.values(jnp.asarray(np.mean(units, axis=0), float)))
-        for bound, *numbers in zip(space.ranges, middle.tolist(), truths.tolist(), strict=True):
-            values = [significant(x) for x in (bound.low, bound.high, *numbers)]
-            rows.append((solver, bound.name, bound.unit, *values, FROM.get(bound.name, MISSING)))
-        for same in zip(*(fixed(default_space(solver, each)) for each in densities), strict=True):
-            value = ", ".join(dict.fromkeys(significant(each.value) for each in same))
-            name, unit, origin = same[0].name, same[0].unit, same[0].origin
-            rows.append((solver, name, unit, *[value] * 3, MISSING, origin))
+        synthetic = [each for each in sources if isinstance(each, SyntheticRecording)]
+        names = dict.fromkeys(each.fabric for each in synthetic if not each.truth.materials)
+        units = [space.to_unit(true_fabric(name, law)) for name in names]
+        mean = np.mean(units, axis=0) if units else np.full(space.dim, np.nan)
+        middle = space.values(jnp.full(space.dim, 0.5, float))
+        truths = space.values(jnp.asarray(mean, float))
+        for bound, half, truth in zip(space.ranges, middle.tolist(), truths.tolist(), strict=True):
+            numbers = (bound.low, bound.high, half, truth)
+            rows.append((solver, bound.name, bound.unit, *numbers, FROM.get(bound.name)))
+        for density in dict.fromkeys(cell.density for cell in own):
+            for each in fixed(default_space(solver, density)):
+                row = (solver, each.name, each.unit, *(each.value,) * 3, np.nan, each.origin)
+                rows += [row] if row not in rows else []
     header = ["solver", "parameter", "unit", "low", "high", "middle", "truths", "from"]
     return pd.DataFrame(rows, columns=header)
 
@@ -172,8 +167,8 @@ def mesh_table(estimates: Iterable[EstimateCell], folder: Path) -> pd.DataFrame:
             continue
         size = read(cell.sources[0], folder).info.sheet.size
         error = mesh_error(estimate.fabric, size, estimate.shape, cell.sources[0].scenario)
-        lengths = 1e3 * float(fold_length(estimate.fabric)), 1e3 * error
-        rows.append((cell.name, " x ".join(map(str, estimate.shape)), *map(significant, lengths)))
+        bending_length = 1e3 * float(fold_length(estimate.fabric))
+        rows.append((cell.name, " x ".join(map(str, estimate.shape)), bending_length, 1e3 * error))
     header = ["estimate", "mesh", "bending length [mm]", "expected error [mm]"]
     return pd.DataFrame(rows, columns=header)
 
@@ -188,7 +183,6 @@ def cost_table(cells: Iterable[EvaluationCell], folder: Path) -> pd.DataFrame:
     for group, noted in groups.items():
         seconds = [each["cpu_seconds"] for each in noted]
         memory = max(each["peak_memory_MB"] for each in noted)
-        rows.append((group, len(noted), *map(significant, (sum(seconds), np.median(seconds), memory))))
-    header = ["kind", "count", "CPU seconds in all", "CPU seconds of one (median)",
-              "peak memory [MB]"]  # fmt: skip
-    return pd.DataFrame(rows, columns=header)
+        rows.append((group, len(noted), sum(seconds), float(np.median(seconds)), memory))
+    times = ["CPU seconds in all", "CPU seconds of one (median)"]
+    return pd.DataFrame(rows, columns=["kind", "count", *times, "peak memory [MB]"])

@@ -19,8 +19,8 @@ QUESTION = (
 
 def picture(
     with_skill: pd.DataFrame, decided: pd.DataFrame, metric: str, colours: Mapping[str, str]
-) -> tuple[go.Figure | None, str]:
-    """A chart of skills, or where none is known of mean distances, and its title.
+) -> dict[str, go.Figure]:
+    """A chart of skills, or where none is known of mean distances, by its title.
 
     `with_skill`: rows that have a floor. `decided`: those of the metric that compares.
     """
@@ -28,11 +28,11 @@ def picture(
     if len(known):
         title = f"Skill in motions that no estimate has seen, with {LEVEL:.0%} intervals"
         marks = {0.0: "weight alone", 1.0: "floor"}
-        return interval_chart(means.means(known, "skill"), colours, "skill [-]", marks), title
+        return {title: interval_chart(means.means(known, "skill"), colours, "skill [-]", marks)}
     if len(decided):
         title = f"Mean {metric} in motions that no estimate has seen, with {LEVEL:.0%} intervals"
-        return interval_chart(means.means(decided), colours, f"{metric} [m]", {}), title
-    return None, ""
+        return {title: interval_chart(means.means(decided), colours, f"{metric} [m]", {})}
+    return {}
 
 
 def sentences(
@@ -49,8 +49,8 @@ def sentences(
     done = (
         f"{count} configurations (approach, solver, source) estimated {_number(fabrics, 'fabric')} "
         f"and were judged on {decided.recording.nunique()} recordings of "
-        f"{', '.join(frame.motions(decided)) or 'no motion'}, which no estimate has seen: of {runs} "
-        f"predictions {lost} diverged, and {_number(missing, 'cell')} of the study "
+        f"{', '.join(frame.motions(decided)) or 'no motion'}, which no estimate has seen: of "
+        f"{runs} predictions {lost} diverged, and {_number(missing, 'cell')} of the study "
         f"{'is' if missing == 1 else 'are'} missing."
     )
     return [done, _best(own, with_skill[with_skill.baseline == ""]), _decides(judged, fabrics)]

@@ -1,22 +1,20 @@
-"""The report of a whole study and its tables: what is analysed, in which order, with which words."""
+"""The report of a whole study: what is analysed, in which order and words, and its tables."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import NamedTuple
 
-import jinja2
 import pandas as pd
-import plotly.graph_objects as go
-from plotly.offline import get_plotlyjs
 
 from r2s.evaluation.statistics import LEVEL
 from r2s.files import write_text
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS
 from r2s.study.motions import Motion
-from r2s.study.report import opening, tables
-from r2s.study.report.charts import colours_of, error_chart, interval_chart
+from r2s.study.report import opening
+from r2s.study.report.charts import colours_of, error_chart
 from r2s.study.report.motion_figure import motion_figures
+from r2s.study.report.page import Section, render
+from r2s.study.report.tables import mean_table, recording_table, skill_table
 from r2s.study.statistics import comparisons, conclusions, factors, frame, means, paper, ranks
 from r2s.study.verdicts import BEYOND, SURFACE
 
@@ -26,19 +24,7 @@ JUDGED_BY = (SURFACE, "chamfer_real_to_sim", "chamfer", "chamfer_cropped", paper
 DISTANCES = (*JUDGED_BY[:-1], "chamfer_sim_to_real", "hausdorff")
 MOST_MOTIONS = 15  # that are drawn
 VERSIONS = ("r2s", "jax", "jaxlib", "equinox", "numpy", "scipy", "pandas", "statsmodels", "plotly")
-
-
-class Section(NamedTuple):
-    """A part of the report: paragraphs, tables by name with a caption, figures by title.
-
-    `folded`: the figures are drawn when a reader opens them, for a browser has few 3-D contexts.
-    """
-
-    heading: str
-    words: Sequence[str] = ()
-    tables: Mapping[str, tuple[str, pd.DataFrame]] = {}
-    figures: Mapping[str, go.Figure] = {}
-    folded: bool = False
+INTERVAL = f"means over fabrics, with {LEVEL:.0%} intervals for fabrics like these"
 
 
 def publish(
@@ -65,68 +51,47 @@ def publish(
     every = frame.labelled(frame.without_undefined(results))
     fabrics = frame.fabrics_in_common(every)
     shared = every[every.fabric.isin(fabrics)]
-    there = set(shared.metric)
-    metric = next((each for each in JUDGED_BY if each in there), SURFACE)
+    metric = next((each for each in JUDGED_BY if each in set(shared.metric)), SURFACE)
     skip = frame.undecided(shared, SURFACE) if metric == SURFACE else []
     decided = shared[(shared.metric == metric) & ~shared.recording.isin(skip)]
     judged = conclusions.findings(decided, papers)
-    colours = colours_of(
-        [*every.configuration.cat.categories, *(label for each in motions for label in each.vertices)]
-    )
+    drawn = [label for each in motions for label in each.vertices]
+    colours = colours_of([*every.configuration.cat.categories, *drawn])
     known = means.with_floor(shared, SURFACE)
-    with_skill = known[known.baseline != "default"]
-    picture, caption = opening.picture(with_skill, decided, metric, colours)
+    with_skill = known[known.baseline != frame.DEFAULT]
+    sentences = opening.sentences(decided, with_skill, judged, len(fabrics), len(missing))
     sections = [
-        *_skill(shared, every, known),
+        Section(
+            opening.QUESTION,
+            sentences,
+            figures=opening.picture(with_skill, decided, metric, colours),
+        ),
+        _skill(shared, every, known),
         _findings(judged, metric, skip),
-        *_errors_over_time(motions[:MOST_MOTIONS], colours),
         *_motions(motions, colours),
-        *_ranks_and_factors(decided, metric),
-        *_parameters(parameters),
+        _ranks_and_factors(decided, metric),
+        _parameters(parameters),
         *more,
-        *_distances(shared, papers),
-        *_missing(every, missing),
+        _distances(shared, papers),
+        _missing(every, missing),
         _settings(settings or {}),
     ]
-    sentences = opening.sentences(decided, with_skill, judged, len(fabrics), len(missing))
-    first = Section(opening.QUESTION, sentences, figures={caption: picture} if picture else {})
-    write_text(out / "report.html", render([first, *sections]))
-    return _write_tables(out / "tables", sections)
-
-
-def render(sections: Sequence[Section]) -> str:
-    """The page as HTML."""
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
-    environment.filters |= {"table": _html_table, "figure": _json_figure}
-    template = environment.get_template("report.html.j2")
-    return template.render(sections=sections, plotly=get_plotlyjs())
-
-
-def _html_table(table: pd.DataFrame) -> str:
-    return table.to_html(index=False, border=0, na_rep=tables.MISSING, classes="sortable")
-
-
-def _json_figure(figure: go.Figure) -> str:
-    text = figure.update_layout(template="plotly_white").to_json() or ""
-    return text.replace("<", "\\u003c")  # "<" would end the element that holds it
-
-
-def _write_tables(folder: Path, sections: Iterable[Section]) -> dict[str, pd.DataFrame]:
-    folder.mkdir(parents=True, exist_ok=True)
-    for old in folder.glob("*.csv"):
+    sections = [each for each in sections if each.words or each.tables]
+    tables = {name: table for each in sections for name, (_, table) in each.tables.items()}
+    (out / "tables").mkdir(parents=True, exist_ok=True)
+    for old in (out / "tables").glob("*.csv"):
         old.unlink()
-    found = {name: table for each in sections for name, (_, table) in each.tables.items()}
-    for name, table in found.items():
-        write_text(folder / f"{name}.csv", table.to_csv(index=False, lineterminator="\n"))
-    return found
+    for name, table in tables.items():
+        text = table.to_csv(index=False, lineterminator="\n")
+        write_text(out / "tables" / f"{name}.csv", text)
+    write_text(out / "report.html", render(sections))
+    return tables
 
 
-def _skill(shared: pd.DataFrame, every: pd.DataFrame, known: pd.DataFrame) -> list[Section]:
+def _skill(shared: pd.DataFrame, every: pd.DataFrame, known: pd.DataFrame) -> Section:
     """Error, floor and skill by configuration; and what is compared beyond the horizon."""
     if known.empty:
-        words = "No recording has a floor and a horizon, so no skill is known."
-        return [Section("Skill", (words,))]
+        return Section("Skill", ("No recording has a floor and a horizon: no skill is known.",))
     words = [
         "Skill is (default - error) / (default - floor): 1 where the prediction is as near as the "
         "truth itself is known, 0 for the mean of random fabrics of the same weight (the default). "
@@ -140,29 +105,31 @@ def _skill(shared: pd.DataFrame, every: pd.DataFrame, known: pd.DataFrame) -> li
             f"Not every configuration has an estimate of {', '.join(left_out)}, which no mean "
             "counts; the table by fabric has all."
         )
-    interval = f"means over fabrics, with {LEVEL:.0%} intervals for fabrics like these"
     found = {
         "skill": (
-            f"Error up to the horizon, floor and skill: {interval}",
-            tables.skill_table(means.means(known), means.skills(known)),
-        )
+            f"Error up to the horizon, floor and skill: {INTERVAL}",
+            skill_table(means.means(known), means.skills(known)),
+        ),
+        "learned": (
+            "How much nearer than the middle of the prior (ratio of its error to theirs)",
+            comparisons.learned(known, SURFACE),
+        ),
+        "skill_by_fabric": ("The same by fabric", _by_fabric(means.with_floor(every, SURFACE))),
     }
-    learned = comparisons.learned(known, SURFACE)
-    if len(learned):
-        text = (
-            "Error over that of the middle of the prior (below 1: better), with p (Student's t "
-            "over fabrics, Holm's correction over this table) and in how many fabrics"
-        )
-        found["learned"] = text, tables.learned_table(learned)
-    found["skill_by_fabric"] = "The same by fabric", tables.by_fabric(
-        means.with_floor(every, SURFACE)
-    )
     beyond = shared[shared.metric.str.startswith(BEYOND)]
     for motion in frame.motions(beyond):
-        part = beyond[beyond.evaluated_on == motion]
-        text = f"{motion}, differences to the recording from the horizon on: {interval}"
-        found[f"beyond_{motion}"] = text, tables.mean_table(part, "metric")
-    return [Section("Skill", words, found)]
+        table = mean_table(beyond[beyond.evaluated_on == motion], "metric")
+        text = f"{motion}, differences to the recording from the horizon on: {INTERVAL}"
+        found[f"beyond_{motion}"] = text, table
+    return Section("Skill", words, {name: each for name, each in found.items() if len(each[1])})
+
+
+def _by_fabric(known: pd.DataFrame) -> pd.DataFrame:
+    keys = ["fabric", "evaluated_on", "configuration"]
+    found = known.groupby(keys, observed=True)[["value", "floor", "skill"]].mean()
+    found["diverged"] = known.groupby(keys, observed=True).diverged.sum()
+    millimetres = {"error [mm]": 1e3 * found.value, "floor [mm]": 1e3 * found.floor}
+    return found.assign(**millimetres).drop(columns=["value", "floor"]).reset_index()
 
 
 def _findings(judged: pd.DataFrame, metric: str, skip: Sequence[str]) -> Section:
@@ -178,80 +145,70 @@ def _findings(judged: pd.DataFrame, metric: str, skip: Sequence[str]) -> Section
             f"{len(skip)} recordings do not discriminate between fabrics and count neither here "
             f"nor in ranks and factors: {', '.join(skip)}."
         )
-    table = tables.finding_table(judged)
-    return Section("The paper's conclusions", words, {"findings": ("Comparisons", table)})
-
-
-def _errors_over_time(motions: Sequence[Motion], colours: Mapping[str, str]) -> list[Section]:
-    if not motions:
-        return []
-    words = (
-        "The mean distance of the recorded points from each simulated surface. Within the shaded "
-        "floor no approach is nearer than another; beyond the horizon an error says nothing about "
-        "a fabric. Lines are dashed for material points; bands are the range of estimates or draws."
-    )
-    charts = {f"{m.evaluated_on}, {m.fabric}": error_chart(m, colours) for m in motions}
-    return [Section("Error over time", (words,), figures=charts)]
+    return Section("The paper's conclusions", words, {"findings": ("Comparisons", judged)})
 
 
 def _motions(motions: Sequence[Motion], colours: Mapping[str, str]) -> list[Section]:
     shown = motions[:MOST_MOTIONS]
     if not shown:
         return []
-    words = ["Recorded points and simulated sheets: open a motion, move the slider, turn the view; "
-             "a click in the legend shows or hides a sheet."]  # fmt: skip
-    if len(motions) > len(shown):
-        words.append(f"{len(motions) - len(shown)} more recordings are not shown.")
     names = [f"{each.evaluated_on}, {each.fabric} ({each.recording})" for each in shown]
+    errors = [error_chart(each, colours) for each in shown]
+    words = (
+        "The mean distance of the recorded points from each simulated surface. Within the shaded "
+        "floor no approach is nearer than another; beyond the horizon an error says nothing about "
+        "a fabric. Lines are dashed for material points; bands are the range of estimates or draws."
+    )
+    turn = (
+        "Recorded points and simulated sheets: open a motion, move the slider, turn the view; a "
+        "click in the legend shows or hides a sheet."
+    )
+    if len(motions) > len(shown):
+        turn += f" {len(motions) - len(shown)} more recordings are not shown."
     figures = dict(zip(names, motion_figures(shown, colours), strict=True))
-    return [Section("Motions", words, figures=figures, folded=True)]
+    return [
+        Section("Error over time", (words,), figures=dict(zip(names, errors, strict=True))),
+        Section("Motions", (turn,), figures=figures, folded=True),
+    ]
 
 
-def _ranks_and_factors(decided: pd.DataFrame, metric: str) -> list[Section]:
+def _ranks_and_factors(decided: pd.DataFrame, metric: str) -> Section:
     parts = {m: decided[decided.evaluated_on == m] for m in frame.motions(decided)}
     parts |= {"all motions": decided} if len(parts) > 1 else {}
-    found = {}
     ranked = {name: r for name, part in parts.items() if (r := ranks.rank(part)) is not None}
+    found = {}
     if ranked:
-        tests = "; ".join(
-            f"{name}: {len(r.table)} configurations, {r.recordings} recordings, {r.fabrics} fabrics"
-            + (f", Friedman's p {r.p:.2g}" if r.p == r.p else "")
-            + f", critical difference {r.difference:.2f}"
-            + (f", left out {', '.join(r.left_out)}" if r.left_out else "")
-            for name, r in ranked.items()
-        )
-        text = f"Mean rank by {metric} with {LEVEL:.0%} interval, how often the best. {tests}"
-        found["ranks"] = text, tables.rank_table(ranked)
+        tests = "; ".join(f"{name}: {ranks.in_words(each)}" for name, each in ranked.items())
+        table = pd.concat({name: each.table for name, each in ranked.items()}, names=["motion"])
+        text = f"Mean ranks by {metric} with {LEVEL:.0%} intervals, and how often first. {tests}"
+        found["ranks"] = text, table.reset_index()
     shares = factors.variance_shares(decided)
     if shares is not None:
         text = (
             f"Shares of the variance of log {metric} that each factor explains alone, and adds to "
             "the others (adjusted for degrees of freedom)"
         )
-        found["factors"] = text, shares.round(3)
-    return [Section("Ranks and factors", (), found)] if found else []
+        found["factors"] = text, shares
+    return Section("Ranks and factors", (), found)
 
 
-def _parameters(parameters: pd.DataFrame | None) -> list[Section]:
-    if parameters is None or parameters.empty:
-        return []
+def _parameters(parameters: pd.DataFrame | None) -> Section:
+    groups = () if parameters is None else parameters.groupby("solver")
+    text = f"with {LEVEL:.0%} intervals, and the truth where it is known"
     found = {
-        f"parameters_{solver}": (
-            f"Estimates on {solver}, with {LEVEL:.0%} intervals, and the truth where it is known",
-            tables.parameter_table(part),
-        )
-        for solver, part in parameters.groupby("solver")
+        f"parameters_{solver}": (f"Estimates on {solver}, {text}", means.parameter_intervals(part))
+        for solver, part in groups
     }
-    return [Section("Parameters", (), found)]
+    return Section("Parameters", (), found)
 
 
-def _distances(shared: pd.DataFrame, papers: pd.DataFrame) -> list[Section]:
+def _distances(shared: pd.DataFrame, papers: pd.DataFrame) -> Section:
     found = {}
     for metric in DISTANCES:
         own = shared[(shared.metric == metric) & shared.evaluated_on.isin(MOTIONS)]
         if len(own):
-            found[metric] = f"{metric}: means over fabrics", tables.mean_table(own, "evaluated_on")
-    one_by_one = tables.recording_table(shared, "chamfer_real_to_sim")
+            found[metric] = f"{metric}: {INTERVAL}", mean_table(own, "evaluated_on")
+    one_by_one = recording_table(shared, "chamfer_real_to_sim")
     if len(one_by_one):
         found["recordings"] = "chamfer_real_to_sim [mm] of every recording", one_by_one
     for motion in MOTIONS:
@@ -259,19 +216,17 @@ def _distances(shared: pd.DataFrame, papers: pd.DataFrame) -> list[Section]:
         if len(table.columns) > 1:
             cited = f"; paper: {paper.CITED}" if len(papers) else ""
             text = f"Chamfer distance on {motion} in the units of the paper [-]{cited}"
-            found[f"{motion}_{paper.CHAMFER}"] = text, table.round(3)
-    return [Section("All distances", (), found)] if found else []
+            found[f"{motion}_{paper.CHAMFER}"] = text, table
+    return Section("All distances", (), found)
 
 
-def _missing(every: pd.DataFrame, missing: Sequence[tuple[str, str]]) -> list[Section]:
+def _missing(every: pd.DataFrame, missing: Sequence[tuple[str, str]]) -> Section:
     there = frame.configurations(every)
     absent = [each.label for each in PAPER_CONFIGURATIONS if each not in there]
     words = f"Configurations of the paper that have no result here: {', '.join(absent)}."
     table = pd.DataFrame(list(missing), columns=["cell", "reason"])
     found = {"missing": ("Cells without a result, and why", table)} if missing else {}
-    if not (absent or missing):
-        return []
-    return [Section("What is missing", (words,) if absent else (), found)]
+    return Section("What is missing", (words,) if absent else (), found)
 
 
 def _settings(settings: Mapping[str, str]) -> Section:

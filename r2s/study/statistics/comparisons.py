@@ -47,7 +47,6 @@ def compare(
     results: pd.DataFrame,
     smaller: Sequence[str],
     larger: Sequence[str],
-    paper: tuple[float, float] | None = None,
 ) -> Comparison:
     """Compare configurations over the recordings that they share; of several on a side the
     geometric mean counts.
@@ -57,14 +56,14 @@ def compare(
     """
     there = set(results.configuration)
     if missing := [each for each in (*smaller, *larger) if each not in there]:
-        return Comparison(words, lacking=f"no rows of {', '.join(missing)}", paper=paper)
+        return Comparison(words, lacking=f"no rows of {', '.join(missing)}")
     sides = [*dict.fromkeys((*smaller, *larger))]
     part = results[results.configuration.isin(sides)]
     part = part.assign(configuration=part.configuration.astype(str))
     counts = part.groupby("recording").configuration.transform("nunique")
     part = part[counts == len(sides)]
     if part.empty:
-        return Comparison(words, paper=paper, lacking="nothing that both were judged on")
+        return Comparison(words, lacking="nothing that both were judged on")
     lost = [int(part[part.configuration.isin(side)].diverged.sum()) for side in (smaller, larger)]
     place = ["fabric", "movement"]
     part = part.assign(alone=part.groupby(["configuration", *place]).log.transform("size") == 1)
@@ -82,7 +81,7 @@ def compare(
     by_movement = apart(of_recording).unstack()
     by_repeat = apart(logs).groupby(["fabric", "repeat"]).mean().unstack()
     tables = [by_movement, by_repeat]
-    return compared(words, by_movement.mean(axis=1), tables, (lost[0], lost[1]), paper)
+    return compared(words, by_movement.mean(axis=1), tables, (lost[0], lost[1]))
 
 
 def compared(
@@ -90,7 +89,6 @@ def compared(
     numbers: pd.Series,
     tables: Iterable[pd.DataFrame] = (),
     diverged: tuple[int, int] = (0, 0),
-    paper: tuple[float, float] | None = None,
     is_ratio: bool = True,
 ) -> Comparison:
     """The comparison of numbers by fabric; `tables`: these by fabric and a factor that all share.
@@ -100,10 +98,10 @@ def compared(
     numbers = numbers[np.isfinite(numbers)]
     if numbers.empty:
         why = "all of it diverged" if sum(diverged) else "nothing that both were judged on"
-        return Comparison(words, diverged=diverged, paper=paper, lacking=why)
+        return Comparison(words, diverged=diverged, lacking=why)
     arrays = [table.reindex(numbers.index).to_numpy(float) for table in tables]
     found = crossed_mean(numbers.to_numpy(float), arrays)
-    return Comparison(words, found, int((numbers > 0).sum()), diverged, is_ratio, paper)
+    return Comparison(words, found, int((numbers > 0).sum()), diverged, is_ratio)
 
 
 def judge(comparisons: Iterable[tuple[str, Comparison]]) -> pd.DataFrame:
@@ -113,8 +111,8 @@ def judge(comparisons: Iterable[tuple[str, Comparison]]) -> pd.DataFrame:
     speaks against it, or where the interval of the ratio says that there is no difference to speak
     of (`MARGIN`). Columns: `conclusion`, `comparison`, `answer`, `lacking`, `ratio` with `low` and
     `high`, `p`, `p_holm`, `agreeing` of `fabrics`, `diverged_smaller` and `diverged_larger`,
-    `needed`, `fewest`, `most`: fabrics that would tell a ratio like this, at least one as far from
-    1 as `MARGIN`; `paper_smaller`, `paper_larger`.
+    `needed`, `fewest`, `most`: where it cannot be told, fabrics that would tell a ratio like this,
+    at least one as far from 1 as `MARGIN`; `paper_smaller`, `paper_larger`.
     """
     pairs = list(comparisons)
     p = np.array([p_value(each.found) for _, each in pairs])
@@ -125,16 +123,17 @@ def judge(comparisons: Iterable[tuple[str, Comparison]]) -> pd.DataFrame:
     rows = []
     for (conclusion, each), own, holm in zip(pairs, p, corrected, strict=True):
         low, high = np.exp(interval(each.found)) if each.is_ratio else (np.nan, np.nan)
-        effect = max(abs(each.found.mean), np.log1p(MARGIN))
-        needed = dict(
-            zip(("needed", "fewest", "most"), units_needed(each.found, effect, level), strict=True)
-        )
+        answer, needed = _answer(each, low, high, holm), (np.nan,) * 3
+        if answer == UNKNOWN and not each.lacking:
+            effect = max(abs(each.found.mean), np.log1p(MARGIN))
+            needed = units_needed(each.found, effect, level)
         rows.append({
-            "conclusion": conclusion, "comparison": each.words,
-            "answer": _answer(each, low, high, holm), "lacking": each.lacking,
+            "conclusion": conclusion, "comparison": each.words, "answer": answer,
+            "lacking": each.lacking,
             "ratio": np.exp(each.found.mean) if each.is_ratio else np.nan, "low": low, "high": high,
             "p": own, "p_holm": holm, "agreeing": each.agreeing, "fabrics": each.found.units,
-            "diverged_smaller": each.diverged[0], "diverged_larger": each.diverged[1], **needed,
+            "diverged_smaller": each.diverged[0], "diverged_larger": each.diverged[1],
+            "needed": needed[0], "fewest": needed[1], "most": needed[2],
             "paper_smaller": each.paper[0] if each.paper else np.nan,
             "paper_larger": each.paper[1] if each.paper else np.nan,
         })  # fmt: skip
@@ -146,8 +145,8 @@ def learned(results: pd.DataFrame, metric: str) -> pd.DataFrame:
     below those of the prior's middle on the same solver, in the recordings that have a skill.
 
     An approach that knows the prior of fabrics does as well as its middle by learning nothing, so
-    this, and not the skill against random draws of it, says what a recording has taught. `results`:
-    from `frame.labelled`; the true fabric is among the configurations: it bounds what can be learned.
+    this, and not the skill against random draws of it, says what a recording has taught. The true
+    fabric is among the configurations: it bounds what can be learned.
     """
     known = results[(results.metric == metric) & results.skill.notna()]
     pairs = []

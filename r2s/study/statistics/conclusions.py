@@ -12,11 +12,10 @@ import pandas as pd
 from r2s.study.configuration import APPROACHES, MOTIONS, PAPER_CONFIGURATIONS, Configuration
 from r2s.study.statistics.comparisons import Comparison, compare, compared, judge
 from r2s.study.statistics.frame import configurations
-from r2s.study.statistics.paper import CHAMFER, average
+from r2s.study.statistics.paper import average
 
 LIFTING, WIND, DIFFCP = PAPER_CONFIGURATIONS[:3]
 PINN_POINTS, PINN_CLOTH = PAPER_CONFIGURATIONS[6:]
-NOTHING_SHARED = "nothing that both were judged on"
 
 
 def findings(results: pd.DataFrame, paper: pd.DataFrame) -> pd.DataFrame:
@@ -30,6 +29,11 @@ def findings(results: pd.DataFrame, paper: pd.DataFrame) -> pd.DataFrame:
 def _conclusions(
     results: pd.DataFrame, paper: pd.DataFrame
 ) -> Iterator[tuple[str, list[Comparison]]]:
+    def sides(motion: str, smaller: Sequence[Configuration], *larger: Configuration) -> Comparison:
+        return _sides(results, paper, motion, smaller, larger)
+
+    there = configurations(results)
+    cloth = [each for each in PAPER_CONFIGURATIONS if each.solver == "cloth"]
     yield (
         "Folding is reproduced far better than fling and shaking.",
         [_easier(results, paper, "folding", motion) for motion in ("fling", "shaking")],
@@ -38,35 +42,26 @@ def _conclusions(
         "In shaking the cloth solver is better than material points.",
         [_solvers(results, paper, "shaking", "cloth", "points")],
     )
-    cloth = [each for each in PAPER_CONFIGURATIONS if each.solver == "cloth"]
-    there = [each for each in cloth if each in configurations(results)]
     yield (
         "In fling material points are better than the cloth solver.",
         [
             _solvers(results, paper, "fling", "points", "cloth"),
-            _sides(results, paper, "fling", [PINN_POINTS, DIFFCP], there or cloth,
-                   "PINN and DiffCP on points, against all on cloth"),
+            sides("fling", (PINN_POINTS, DIFFCP), *([c for c in cloth if c in there] or cloth)),
         ],
-    )  # fmt: skip
+    )
     yield (
         "For DIFFCLOUD, lifting is a better source than wind in fling and shaking, but wind in "
         "folding.",
         [
-            _sides(results, paper, "fling", [LIFTING], [WIND], "lifting better than wind in fling"),
-            _sides(results, paper, "shaking", [LIFTING], [WIND],
-                   "lifting better than wind in shaking"),
-            _sides(results, paper, "folding", [WIND], [LIFTING],
-                   "wind better than lifting in folding"),
+            sides("fling", [LIFTING], WIND),
+            sides("shaking", [LIFTING], WIND),
+            sides("folding", [WIND], LIFTING),
         ],
-    )  # fmt: skip
+    )
     for best, motion in ((PINN_CLOTH, "folding"), (PINN_POINTS, "fling")):
-        others = [each for each in PAPER_CONFIGURATIONS if each != best]
         yield (
             f"In {motion} {best.label} is the best configuration.",
-            [
-                _sides(results, paper, motion, [best], [each], f"better than {each.label}")
-                for each in others
-            ],
+            [sides(motion, [best], each) for each in PAPER_CONFIGURATIONS if each != best],
         )
     yield (
         "The gradients of DiffCP explode: more of its estimates diverge than of others.",
@@ -86,12 +81,13 @@ def _sides(
     motion: str,
     smaller: Sequence[Configuration],
     larger: Sequence[Configuration],
-    words: str,
 ) -> Comparison:
     """Some configurations against others on one motion, beside the averages of the paper."""
+    first, second = ([each.label for each in side] for side in (smaller, larger))
+    words = f"in {motion} {' and '.join(first)} better than {' and '.join(second)}"
     quoted = _quoted(average(paper, motion, smaller), average(paper, motion, larger))
     part = results[results.evaluated_on == motion]
-    return compare(words, part, [c.label for c in smaller], [c.label for c in larger], quoted)
+    return compare(words, part, first, second)._replace(paper=quoted)
 
 
 def _quoted(ours: float, theirs: float) -> tuple[float, float] | None:
@@ -104,16 +100,11 @@ def _solvers(
     """One solver against the other, of the approaches and scenarios that have both."""
     there = configurations(results)
     first = [c for c in there if c.solver == better and c._replace(solver=worse) in there]
-    second = [each._replace(solver=worse) for each in first]
-    both = ", ".join(c.label.replace(f" {better}", "") for c in first) or "none"
-    words = f"{better} better than {worse} in {motion}, where there are both ({both})"
     if not first:
+        words = f"in {motion} {better} better than {worse}"
         return Comparison(words, lacking="no approach with rows of both solvers")
-    found = _sides(results, paper, motion, first, second, words)
-    in_paper = [c for c in first if {c, c._replace(solver=worse)} <= {*PAPER_CONFIGURATIONS}]
-    theirs = [each._replace(solver=worse) for each in in_paper]
-    quoted = _quoted(average(paper, motion, in_paper), average(paper, motion, theirs))
-    return found._replace(paper=quoted)
+    second = [each._replace(solver=worse) for each in first]
+    return _sides(results, paper, motion, first, second)
 
 
 def _easier(results: pd.DataFrame, paper: pd.DataFrame, easy: str, hard: str) -> Comparison:
@@ -123,7 +114,7 @@ def _easier(results: pd.DataFrame, paper: pd.DataFrame, easy: str, hard: str) ->
     quoted = _quoted(average(paper, easy, there), average(paper, hard, there))
     part = results[results.evaluated_on.isin([easy, hard])]
     if part.empty:
-        return Comparison(words, lacking=NOTHING_SHARED, paper=quoted)
+        return Comparison(words, lacking="nothing that both were judged on", paper=quoted)
     own = ["configuration", "fabric"]
     part = part.assign(configuration=part.configuration.astype(str))
     logs = part.set_index([*own, "evaluated_on", "movement", "repeat"]).log
@@ -141,7 +132,8 @@ def _easier(results: pd.DataFrame, paper: pd.DataFrame, easy: str, hard: str) ->
     tables.append(apart(logs, "repeat").groupby(["fabric", "repeat"]).mean().unstack())
     lost = part.groupby("evaluated_on").diverged.sum()
     diverged = int(lost.get(easy, 0)), int(lost.get(hard, 0))
-    return compared(words, numbers.groupby("fabric").mean(), tables, diverged, quoted)
+    found = compared(words, numbers.groupby("fabric").mean(), tables, diverged)
+    return found._replace(paper=quoted)
 
 
 def _diverges_more(results: pd.DataFrame, approach: str) -> Comparison:

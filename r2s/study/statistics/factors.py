@@ -31,7 +31,8 @@ def variance_shares(results: pd.DataFrame) -> pd.DataFrame | None:
         formula = f"log ~ {' + '.join(f'C({name})' for name in names) or '1'}"
         with warnings.catch_warnings():  # confounded factors make the design singular
             warnings.simplefilter("ignore", SingularMatrixWarning)
-            return float(ols(formula, data).fit().rsquared_adj)
+            fitted = ols(formula, data).fit()
+        return float(fitted.rsquared_adj) if fitted.df_resid > 0 else 1.0
 
     whole = explained(factors)
     rows = [

@@ -33,6 +33,7 @@ NUMBERS = ("value", "floor", "horizon", "skill")
 COLUMNS = (*TEXTS, *NUMBERS)
 PLACE = list(TEXTS[:-1])  # no two rows share these
 RUN = PLACE[:-1]
+CONFIGURATION = list(TEXTS[:3])
 ESTIMATE, DEFAULT = "", "default"
 BASELINES = (ESTIMATE, DEFAULT, "middle", "true", ON_CLOTH, "other_fabric", "repeatability")
 
@@ -114,8 +115,8 @@ def _place(configuration: Configuration) -> tuple:
 def configurations(results: pd.DataFrame) -> list[Configuration]:
     """The configurations that have an estimate, in the order of `labelled`."""
     own = results[(results.baseline == ESTIMATE) & (results.approach != "")]
-    columns = own[["approach", "solver", "estimated_from"]].drop_duplicates()
-    return sorted((Configuration(*each) for each in columns.itertuples(index=False)), key=_place)
+    found = own[CONFIGURATION].drop_duplicates().itertuples(index=False)
+    return sorted((Configuration(*each) for each in found), key=_place)
 
 
 def motions(results: pd.DataFrame) -> list[str]:
@@ -142,9 +143,8 @@ def fabrics_in_common(results: pd.DataFrame) -> list[str]:
     Means over other fabrics cannot be compared.
     """
     own = results[(results.baseline == ESTIMATE) & (results.approach != "")]
-    keys = ["approach", "solver", "estimated_from"]
-    every = len(own[keys].drop_duplicates())
-    counts = own[[*keys, "fabric"]].drop_duplicates().groupby("fabric").size()
+    every = len(own[CONFIGURATION].drop_duplicates())
+    counts = own[[*CONFIGURATION, "fabric"]].drop_duplicates().groupby("fabric").size()
     return list(counts.index[counts == every]) or list(dict.fromkeys(results.fabric))
 
 

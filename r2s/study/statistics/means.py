@@ -7,9 +7,11 @@ motion, or the number of an estimate, contributes is common to all of them.
 
 import numpy as np
 import pandas as pd
+from scipy.stats import norm
 
 from r2s.evaluation.crossed import CrossedMean, crossed_mean, interval
 from r2s.evaluation.horizon import skill
+from r2s.evaluation.statistics import LEVEL
 from r2s.study.configuration import ON_CLOTH
 
 PLACES = ["fabric", "movement", "repeat"]
@@ -58,8 +60,8 @@ def means(results: pd.DataFrame, column: str = "value") -> pd.DataFrame:
 
 
 def with_skill(results: pd.DataFrame, metric: str) -> pd.DataFrame:
-    """Results in which the rows of a metric that have a floor have their skill beside the mean error
-    of the default on the same solver in the same recording (`r2s.evaluation.horizon.skill`).
+    """Results with the skill of the rows of a metric that have a floor, beside the mean error of
+    the default on the same solver in the same recording (`r2s.evaluation.horizon.skill`).
 
     The mean is over the draws that did not diverge: one that did would end the skill of all.
     """
@@ -100,3 +102,17 @@ def skills(results: pd.DataFrame) -> pd.DataFrame:
     })  # fmt: skip
     found["known"] = found.known.fillna(0).astype(int)
     return found.join(means(known, "skill"))
+
+
+def parameter_intervals(parameters: pd.DataFrame) -> pd.DataFrame:
+    """Estimates [unit] with the ends of their intervals, from `r2s.study.results.parameters`.
+
+    Standard errors are those of the logarithm for a logarithmic range.
+    """
+    reach = norm.ppf((1 + LEVEL) / 2) * parameters.standard_error
+    value, is_log = parameters.value, parameters.is_log
+    factor = np.exp(reach.where(is_log))
+    low = (value / factor).where(is_log, value - reach)
+    high = (value * factor).where(is_log, value + reach)
+    columns = ["recording", "parameter", "unit", "value", "low", "high", "is_identifiable", "truth"]
+    return parameters.assign(low=low, high=high)[columns]

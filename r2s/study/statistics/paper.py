@@ -28,8 +28,10 @@ def read_paper(folder: Path | str | None) -> pd.DataFrame:
     cell that is missing or no positive number.
     """
     tables = [] if folder is None else [_read(Path(folder), motion) for motion in MOTIONS]
-    return pd.concat([pd.DataFrame(columns=COLUMNS), *tables]) if tables else pd.DataFrame(
-        columns=COLUMNS
+    return (
+        pd.concat([pd.DataFrame(columns=COLUMNS), *tables])
+        if tables
+        else pd.DataFrame(columns=COLUMNS)
     )
 
 

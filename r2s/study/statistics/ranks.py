@@ -38,7 +38,7 @@ def rank(results: pd.DataFrame) -> Ranks | None:
     than two share a recording.
 
     Ranks are of means over repeats. A mean with a repeat that diverged is last. Configurations that
-    lack more than half of the recordings are left out, then recordings that one of the others lacks.
+    lack more than half of the recordings are left out, then recordings that another one lacks.
     """
     own = results[results.baseline.isin(("", "default"))]
     own = own.assign(value=own.value.where(~own.diverged, np.inf))
@@ -70,6 +70,14 @@ def rank(results: pd.DataFrame) -> Ranks | None:
         p=float(stats.friedmanchisquare(*tested).pvalue) if can_test else np.nan,
         difference=critical_difference(len(ranks.columns), len(of_fabric)),
     )
+
+
+def in_words(ranks: Ranks) -> str:
+    """What ranks are of, and their tests."""
+    count = f"{len(ranks.table)} configurations, {ranks.recordings} recordings, "
+    words = count + f"{ranks.fabrics} fabrics, critical difference {ranks.difference:.2f}"
+    words += f", Friedman's p {ranks.p:.2g}" if np.isfinite(ranks.p) else ""
+    return words + (f", left out {', '.join(ranks.left_out)}" if ranks.left_out else "")
 
 
 def critical_difference(treatments: int, blocks: int) -> float:
