@@ -10,7 +10,7 @@ from r2s.study import cells
 from r2s.study.cells import Cell, execute
 from r2s.study.origins import origins
 
-DRIVER = Path(__file__).parents[1] / "experiments" / "summarise_study.py"
+DRIVER = Path(__file__).parents[1] / "experiments" / "_documents.py"
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def test_the_tables_of_a_study_of_mixed_origin_are_refused(tmp_path):
     lines = ["setting,value", "version of r2s,1", "cells made by a,2", "cells made by b,1"]
     (tmp_path / "tables" / "settings.csv").write_text("\n".join(lines))
     done = subprocess.run(
-        [sys.executable, DRIVER, tmp_path], cwd=tmp_path, capture_output=True, text=True
+        [sys.executable, DRIVER, "--study", tmp_path], cwd=tmp_path, capture_output=True, text=True
     )
     assert done.returncode == 1 and "mixed" in done.stderr
     assert "cells made by a; cells made by b" in done.stderr
