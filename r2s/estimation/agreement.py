@@ -24,7 +24,7 @@ from r2s.estimation.gauss_newton import Descent, Problems, prior_weight
 
 # Of a range, by which a mesh excuses a parameter at most, since one step may say far more. Lifts on
 # 17 x 17 vertices err in warp, weft and shear by 0.10, root mean square
-# (docs/results/estimate_by_mesh.csv); with that, a density ten times off is doubted less often.
+# (version 0.3.0); with that, a density ten times off is doubted less often.
 MOST = 0.08
 # what moves with the density, where nothing weighs the sheet
 SCALED = ("warp", "weft", "shear", "bending", "E h")

@@ -40,7 +40,7 @@ from r2s.threads import background
 Recordings = Sequence[Recording]
 
 # [s], on the finest mesh: in the scenario's own, of 25 ms at most, a lift of grey interlock is
-# 7.3 mm off one in explicit steps, in these 0.7 (`experiments/step_error.py`)
+# 7.3 mm off one in explicit steps, in these 0.7
 FINEST_STEP = 1 / 180
 
 

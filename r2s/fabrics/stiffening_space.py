@@ -32,7 +32,7 @@ class StiffeningSpace(ParameterSpace):
     - knee warp, knee weft: the stretch less 1 at which half of the growth is reached, [-].
 
     Warp and weft have each their own knee: pulls of knits along wales and courses cannot be
-    followed with one (`experiments/knits.py`).
+    followed with one.
 
     Fields: `space`, of constant stiffness.
     """

@@ -3,7 +3,7 @@
 The drape coefficient is the share of the ring around the support that the hanging specimen still
 covers, seen from above: 1 for a rigid one. The specimen is simulated as a ring that the support
 clamps, from nearly flat until it rests. Its folds are one of several sets that it may fall into,
-and the coefficient depends on which (`experiments/drapes.py` says by how much).
+and the coefficient depends on which.
 """
 
 from functools import cache

@@ -13,7 +13,7 @@ from r2s.cloth.linear.pattern import Pattern
 from r2s.geometry.mesh import Mesh
 
 ORDERS = "band", "wide band", "dissection"
-WIDEST = 160  # vertices: of wider bands nested dissection is faster (`benchmarks/factors.py`)
+WIDEST = 160  # vertices: of wider bands nested dissection is faster
 
 
 class Elimination(eqx.Module):

@@ -79,7 +79,7 @@ def ask(
 
     The search is our own: scikit-optimize's `Optimizer` (expected improvement) had median losses
     50, 11 and 15 % higher after 60 calls on three losses in seven dimensions, at 13 times the CPU
-    time, with 21 to 27 % of its places on faces of the cube (`benchmarks/bayes.py`).
+    time, with 21 to 27 % of its places on faces of the cube.
     """
     done, dim = history.places.shape
     if done < num_first:
