@@ -15,13 +15,22 @@ import _systems
 import jax
 from _measure import Line, command_line, keep
 
+AT_EQUAL_ERROR = (
+    "The cheapest run of each system within 2 mm over 0.5 s, and its time over that of r2s."
+)
+MATERIAL_POINTS = (
+    "Material points, CPU seconds of one core without compilation: million particle-steps a "
+    "second, and memory of the gradient."
+)
 
-def hang(options) -> list[Line]:
+
+def hang(options) -> None:
     """The cloths at equal error."""
-    return _systems.at_equal_error(_systems.measured(options.sizes, options.repeats))
+    lines = _systems.at_equal_error(_systems.measured(options.sizes, options.repeats))
+    keep(options.out / "hang_at_equal_error.csv", lines, AT_EQUAL_ERROR)
 
 
-def points(options) -> list[Line]:
+def points(options) -> None:
     """The block of material points in r2s and in Taichi."""
     loss, mu = _points.block_loss(options.steps)
     functions = loss, jax.value_and_grad(loss)
@@ -33,27 +42,17 @@ def points(options) -> list[Line]:
         systems["taichi"] = [(block.run, block.memory), (block.run_back, block.memory)]
     except ModuleNotFoundError as error:
         print(f"skipped: taichi (pip install 'r2s[bench]': no {error.name})")
-    lines = []
+    lines: list[Line] = []
     for name, calls in systems.items():
         seconds = [_measure.timed(call, options.repeats)[0] for call, _ in calls]
         rates = [f"{_points.COUNT * options.steps / each / 1e6:.3g}" for each in seconds]
         line = {"system": name, "particles": str(_points.COUNT), "forward [M/s]": rates[0]}
         line |= {"value and gradient [M/s]": rates[1]}
         lines.append(line | {"memory of the gradient [MB]": f"{calls[1][1]:.0f}"})
-    return lines
+    keep(options.out / "points.csv", lines, MATERIAL_POINTS)
 
 
-PARTS = {
-    "hang": (
-        *(hang, "hang_at_equal_error"),
-        "The cheapest run of each system within 2 mm over 0.5 s, and its time over that of r2s.",
-    ),
-    "points": (
-        *(points, "points"),
-        "Material points, CPU seconds of one core without compilation: million particle-steps a "
-        "second, and memory of the gradient.",
-    ),
-}
+PARTS = {"hang": hang, "points": points}
 
 if __name__ == "__main__":
     parser = command_line(__doc__, "results/speed")
@@ -63,5 +62,4 @@ if __name__ == "__main__":
     parser.add_argument("--repeats", type=int, default=3)
     a = parser.parse_args()
     for part in a.only:
-        table, name, caption = PARTS[part]
-        keep(a.out / f"{name}.csv", table(a), caption)
+        PARTS[part](a)

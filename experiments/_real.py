@@ -7,7 +7,6 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _recordings import frames_of
 from _tables import Line
 from scipy import stats
 
@@ -49,6 +48,11 @@ def group_of(fold: RecordingInfo, source: RecordingInfo) -> str:
     if source.fabric != fold.fabric:
         return "other fabrics' lifts"
     return "own lift" if source.trial == fold.trial else "other trial's lift"
+
+
+def frames_of(recording: Recording) -> range:
+    """The numbers of the frames that count."""
+    return range(recording.info.frames_used[0], recording.info.frames_used[1] + 1)
 
 
 def size_of(estimate: Estimate) -> float:

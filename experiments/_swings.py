@@ -28,6 +28,7 @@ from r2s.scenarios.scenario import from_recording, rollout
 
 LEARNT = ("range030_rep01", "range060_rep04", "range090_rep02", "range120_rep01")
 SHAPE = (8, 8)  # vertices, as many as are tracked
+SECONDS = 5.0  # of each swing
 KNOT = 0.02  # [s], between knots of the path; the arm logs poses every 0.01 to 0.1 s
 DENSITY = 1.0  # relative deviation of a density that nobody measured
 BUDGET = Budget(coarse=24, starts=3, iterations=25, around=0, shares=(0.3,))
@@ -37,15 +38,16 @@ _rollout = eqx.filter_jit(rollout)
 
 
 def predict_swings(
-    folder: Path, seconds: float, space: ParameterSpace, samples: Sequence[Fabric], out: Path
+    folder: Path, space: ParameterSpace, samples: Sequence[Fabric], out: Path
 ) -> None:
     """Estimate from four swings, and write the table of the others."""
-    swings = {file.stem: _read(file, seconds) for file in sorted(folder.glob("*.npz"))}
+    swings = {file.stem: _read(file) for file in sorted(folder.glob("*.npz"))}
     if not set(LEARNT) <= set(swings):
         raise ValueError(f"{folder}: expected the swings {', '.join(LEARNT)}")
     problems = tuple(_problem(swings.pop(name), space) for name in LEARNT)
     estimate = descend(problems, BUDGET, key=jax.random.key(0))
-    offset, rows = _offset(estimate), {}
+    offset = np.array([np.mean(_shifts(estimate, axis)) for axis in "xyz"])
+    rows: dict[str, dict[str, float]] = {}
     for name, swing in swings.items():
         rows[name] = _row(swing, estimate.fabric, samples, offset)
         means = {key: np.mean([row[key] for row in rows.values()]) for key in rows[name]}
@@ -54,9 +56,9 @@ def predict_swings(
         keep(out, lines, CAPTION, _facts(estimate))
 
 
-def _read(file: Path, seconds: float) -> Recording:
+def _read(file: Path) -> Recording:
     """A swing with as many knots as any of its duration, so that one program serves all."""
-    recording = read_swing(file, known_bar(), seconds)
+    recording = read_swing(file, known_bar(), SECONDS)
     times = np.arange(0, float(recording.times[-1]) + KNOT, KNOT)
     path = np.asarray(recording.handle_path).reshape(len(recording.handle_times), -1)
     at = [np.interp(times, np.asarray(recording.handle_times), column) for column in path.T]
@@ -74,10 +76,6 @@ def _problem(recording: Recording, space: ParameterSpace) -> Problem:
 def _shifts(estimate: Estimate, axis: str) -> list[float]:
     """Offsets [m] of the tracker's frame against the arm's, of each swing."""
     return [n.value for n in estimate.nuisances if n.name.startswith(f"shift {axis}")]
-
-
-def _offset(estimate: Estimate) -> Float[np.ndarray, " 3"]:
-    return np.array([np.mean(_shifts(estimate, axis)) for axis in "xyz"])
 
 
 def _facts(estimate: Estimate) -> Line:
@@ -99,7 +97,7 @@ def _row(
     for how, shift in {"": np.zeros(3), " placed": offset}.items():
         of_rows = _of_rows(found + shift)
         row["tracker" + how], row["estimate" + how] = of_rows[0], of_rows.mean()
-        row["prior" + how] = np.nanmean([_of_rows(gap + shift) for gap in others])
+        row["prior" + how] = float(np.nanmean([_of_rows(gap + shift) for gap in others]))
         row["estimate / tracker" + how] = row["estimate" + how] / row["tracker" + how]
     return row
 

@@ -103,15 +103,12 @@ def resumed(
     lines: list[Line] = []
     if path.exists():
         lines, facts = read(path)
-        version, source = f"r2s {importlib.metadata.version('r2s')}", source_hash()[:SOURCE]
         by = facts.get("machine", "").partition(", ")[2]
         made = facts.get("version", ""), facts.get("source", "no known source"), by
-        own = version, source, processor()
+        own = f"r2s {importlib.metadata.version('r2s')}", source_hash()[:SOURCE], processor()
         if made != own:
-            raise ValueError(
-                f"{path}: begun by {' on '.join(made)}, not {' on '.join(own)}: move it away, or "
-                "give another --out"
-            )
+            begun = f"begun by {' on '.join(made)}, not {' on '.join(own)}"
+            raise ValueError(f"{path}: {begun}: move it away, or give another --out")
     for job in jobs:
         if any(job.items() <= line.items() for line in lines):
             continue

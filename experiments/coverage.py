@@ -33,7 +33,6 @@ CAPTION = (
     "called identifiable, and by how much the rest is off at most (a share of the truth; of the "
     "coupling the difference)."
 )
-SAME_MODEL = "Errors over standard errors of estimates by the recordings' own model."
 SUMMARY = (
     "Of these estimates: how many 90 % intervals hold the truth, how often a parameter is called "
     "identifiable, how many of these intervals hold it, and the largest error then, in standard "
@@ -90,6 +89,7 @@ if __name__ == "__main__":
     jobs: list[Line] = [{"fabric": f, "repeat": r} for r in a.repeats for f in a.fabrics]
     caption, make = CAPTION, partial(repeated, a.folder, TOGETHER)
     if a.same_model:
-        caption, make = SAME_MODEL, partial(by_same_model, a.same_model)
+        caption = "Errors over standard errors, by the recordings' own model."
+        make = partial(by_same_model, a.same_model)
     lines = resumed(a.out, caption, jobs, make)
     keep(a.out.with_name(f"{a.out.stem}_by_parameter.csv"), by_parameter(lines), SUMMARY)

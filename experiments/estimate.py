@@ -11,6 +11,7 @@ interrupted estimate of DIFFCLOUD or DiffCP continues. `r2s estimate` writes a c
 """
 
 from pathlib import Path
+from typing import Any
 
 import jax
 from _recordings import recordings_in
@@ -28,7 +29,7 @@ DIFFCP_SHAPE = (7, 7)  # vertices of the sheet of material points
 
 def method_named(name: str, group: str, scenario: str, folder: Path) -> Method:
     """The approach, with its files in a folder."""
-    settings: dict[str, object] = {"shape": DIFFCP_SHAPE} if name == "diffcp" else {}
+    settings: dict[str, Any] = {"shape": DIFFCP_SHAPE} if name == "diffcp" else {}
     if name == "physnet":
         settings["network"] = folder / f"{scenario}.network"
     if name in ("diffcloud", "diffcp"):

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from _real import beside, compared, errors, estimated
-from _recordings import frames_of, recordings_in
+from _real import beside, compared, errors, estimated, frames_of
+from _recordings import recordings_in
 from _swings import predict_swings
 from _tables import command_line, keep
 
@@ -69,12 +69,11 @@ if __name__ == "__main__":
     parser.add_argument("--shape", type=int, nargs=2, default=(9, 9), help="vertices")
     parser.add_argument("--prior", choices=("flat", "fabrics"), default="flat")
     parser.add_argument("--lifts-alone", action="store_true")
-    parser.add_argument("--seconds", type=float, default=5.0, help="of each swing")
     a = parser.parse_args()
     space = r2s.OrthotropicSpace.make(a.density)
     samples = prior.fabrics(a.density, SAMPLES, jax.random.key(0))
     if a.swings:
-        predict_swings(a.recordings, a.seconds, space, samples, a.out)
+        predict_swings(a.recordings, space, samples, a.out)
     else:
         if a.prior == "fabrics":
             space = prior.informed(space, a.density)

@@ -5,14 +5,12 @@ python experiments/skill_by_fabric.py --published --out docs/results/published_r
 
 By default from a lift and three pulls together. Errors are mean distances up to the horizon, beside
 the floor of the truth, the true fabric at small strain, the middle of the prior and the mean of
-samples of it (the default); skill is 1 at the floor and 0 at the default. Parameters are over the
-truth's at small strain (coupling: the difference). Truths stiffen as they stretch and lose up to
-35 % of their bending stiffness, which estimates of constant stiffness (`--law linear`) cannot
-follow; by default an estimate has the laws that its recordings determine.
+samples of it (the default); skill is 1 at the floor and 0 at the default. Truths stiffen as they
+stretch and lose up to 35 % of their bending stiffness, which estimates of constant stiffness
+(`--law linear`) cannot follow; by default an estimate has the laws that its recordings determine.
 
-With --published the recipes of the approaches' papers are compared (two hours, two fabrics; see
-`r2s.study.configuration.PUBLISHED_CONFIGURATIONS`), each from one recording; PhysNet's network is
-trained as in the study's small preset; of DIFFCLOUD's mass see `MultiplierSpace`.
+With --published the recipes of the approaches' papers are compared (two hours, two fabrics), each
+from one recording; PhysNet's network is trained as in the study's small preset.
 """
 
 import itertools
