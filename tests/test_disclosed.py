@@ -247,12 +247,10 @@ def test_the_data_of_every_approach_stand_in_the_table(monkeypatch, lift, pull):
     made = [cell for cell in cells if isinstance(cell, EstimateCell)]
     table = disclosures.data_table(made, Path()).set_index(["approach", "motion"])
     assert {(f"{c.approach} on {c.solver}", c.scenario) for c in made} == set(table.index)
-    pinn = table.loc[("pinn on cloth", "stretching")]
-    assert list(pinn)[-6:] == ["6", "0", "81", "yes", "flat", "linear"]
-    assert pinn["recordings of a fabric"] == 3
-    physnet = table.loc[("physnet on cloth", "lifting")]
-    assert (physnet["frames read"], physnet.markers) == ("8", "0")
+    assert list(table.loc[("pinn on cloth", "stretching")]) == [
+        3, "6", False, True, True, "flat", "linear"
+    ]  # fmt: skip
+    assert list(table.loc[("physnet on cloth", "lifting")])[:4] == [1, "8", True, False]
     together = table.loc[("diffcloud on cloth", "lifting+stretching")]
     assert (together.prior, together.laws) == ("fabrics", "stiffening+softening")
-    alone = table.loc[("diffcloud on cloth", "lifting")]
-    assert int(alone["points of a frame"]) <= POINTS and alone.laws == "linear"
+    assert table.loc[("diffcloud on cloth", "lifting")].laws == "linear"

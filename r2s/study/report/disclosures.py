@@ -10,9 +10,8 @@ import numpy as np
 import pandas as pd
 
 from r2s.estimation.default_spaces import FROM, fixed, with_law
-from r2s.estimation.method import Reads, default_space
+from r2s.estimation.method import default_space
 from r2s.fabrics.fold_length import fold_length
-from r2s.recordings.recording import Recording
 from r2s.scenarios.resolution import ENOUGH, mesh_error
 from r2s.study.cells import read_metadata, with_dependencies
 from r2s.study.ensembles import Ensemble, read_ensemble
@@ -98,36 +97,18 @@ def data_table(estimates: Iterable[EstimateCell], folder: Path) -> pd.DataFrame:
             continue
         recordings = [read(source, folder) for source in cell.sources]
         reads = [method_of(cell).reads(recording) for recording in recordings]
-        pairs = list(zip(recordings, reads, strict=True))
         rows[place] = {
             "approach": place[0],
             "motion": place[1],
-            "recordings of a fabric": len(recordings),
-            "frames read": _span(len(each.frames) for each in reads),
-            "points of a frame": _span(_points(*pair) for pair in pairs),
-            "markers": _span(_markers(*pair) for pair in pairs),
-            "force of grippers": "yes" if any(each.force for each in reads) else "no",
+            "recordings": len(recordings),
+            "frames": ", ".join(dict.fromkeys(str(len(each.frames)) for each in reads)),
+            "clouds": any(each.points != 0 for each in reads),
+            "markers": any(each.markers for each in reads),
+            "force of grippers": any(each.force for each in reads),
             "prior": cell.prior,
             "laws": cell.law_from(recordings),
         }
     return pd.DataFrame(list(rows.values()))
-
-
-def _points(recording: Recording, reads: Reads) -> int:
-    """The mean over the frames that are read of how many points are."""
-    there = np.asarray(recording.mask)[list(reads.frames)].sum(axis=1)
-    most = there.max() if reads.points is None else reads.points
-    return round(float(np.minimum(there, most).mean()))
-
-
-def _markers(recording: Recording, reads: Reads) -> int:
-    return recording.markers.shape[1] if reads.markers and recording.markers is not None else 0
-
-
-def _span(numbers: Iterable[int]) -> str:
-    """One number if all are equal, else the least and the greatest."""
-    every = sorted(set(numbers))
-    return " to ".join(map(str, dict.fromkeys((every[0], every[-1]))))
 
 
 def range_table(cells: Iterable[EvaluationCell]) -> pd.DataFrame:

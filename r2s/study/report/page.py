@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jinja2
+import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
 from plotly.offline import get_plotlyjs
@@ -36,6 +37,7 @@ def render(sections: Sequence[Section]) -> str:
 
 def _html_table(table: pd.DataFrame) -> str:
     form = {"float_format": significant, "na_rep": MISSING}
+    table = table.replace("", np.nan).dropna(axis=1, how="all")
     return table.to_html(index=False, border=0, classes="sortable", **form)
 
 

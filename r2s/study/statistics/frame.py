@@ -5,7 +5,9 @@ Columns:
 - `approach`, `solver`, `estimated_from`: the configuration; `fabric`; `repeat`: tells apart
   estimates of one configuration, from other recordings or other seeds.
 - `recording`, `evaluated_on`: the recording that the prediction is compared with, and its motion.
-- `baseline`: "" for an estimate, else what it is compared with, see `BASELINES`.
+- `baseline`: "" for an estimate, else what it is compared with: "default" (draws of the prior),
+  "middle" (of the prior), "true" (fabric), "on_cloth" (what was estimated on points, predicted on
+  the cloth), "other_fabric" (the estimate of one), "repeatability" (another trial).
 - `metric`, `unit`, `value`: SI, or "-" for a number without a unit; NaN where a run diverged.
 - `floor`: the accuracy of the recording itself, in that unit. `horizon`: until when it tells
   fabrics apart, [s]. `skill`: see `r2s.evaluation.horizon`. NaN: not known.
@@ -21,7 +23,6 @@ import pandas as pd
 from r2s.files import write_text
 from r2s.study.configuration import (
     MOTIONS,
-    ON_CLOTH,
     PAPER_CONFIGURATIONS,
     Configuration,
     as_configuration,
@@ -35,44 +36,17 @@ PLACE = list(TEXTS[:-1])  # no two rows share these
 RUN = PLACE[:-1]
 CONFIGURATION = list(TEXTS[:3])
 ESTIMATE, DEFAULT = "", "default"
-BASELINES = (ESTIMATE, DEFAULT, "middle", "true", ON_CLOTH, "other_fabric", "repeatability")
 
 
 def as_frame(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
-    """A table of results from rows with the keys of `COLUMNS`; numbers may be missing.
-
-    Raises `ValueError` for an unknown baseline and for two rows of one place.
-    """
+    """A table of results from rows with the keys of `COLUMNS`; numbers may be missing."""
     frame = pd.DataFrame(list(rows), columns=list(COLUMNS))
-    frame = frame.astype({**dict.fromkeys(TEXTS, object), **dict.fromkeys(NUMBERS, float)})
-    if unknown := set(frame.baseline) - set(BASELINES):
-        known = ", ".join(map(repr, BASELINES))
-        raise ValueError(f"unknown baseline {min(unknown)!r}, expected one of {known}")
-    if frame.duplicated(PLACE).any():
-        twice = frame[frame.duplicated(PLACE)].iloc[0]
-        raise ValueError(f"two rows for one value: {', '.join(twice[PLACE])}")
-    return frame
+    return frame.astype({**dict.fromkeys(TEXTS, object), **dict.fromkeys(NUMBERS, float)})
 
 
 def write_results(path: Path | str, results: pd.DataFrame) -> None:
     """Write a table of results as CSV, whole or not at all; an OSError names `path`."""
     write_text(path, results[list(COLUMNS)].to_csv(index=False, lineterminator="\n"))
-
-
-def read_results(path: Path | str) -> pd.DataFrame:
-    """Read what `write_results` wrote: the same numbers to the last bit.
-
-    Raises FileNotFoundError, or a ValueError that names the file: another header, a value that is
-    no number, an unknown baseline, two rows of one place.
-    """
-    try:
-        frame = pd.read_csv(path, dtype=str, keep_default_na=False)
-        if tuple(frame.columns) != COLUMNS:
-            raise ValueError(f"expected the header {','.join(COLUMNS)}")
-        numbers = {name: frame[name].replace("", "nan").astype(float) for name in NUMBERS}
-        return as_frame(frame.assign(**numbers).to_dict("records"))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
 
 
 def labelled(results: pd.DataFrame) -> pd.DataFrame:
