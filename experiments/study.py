@@ -1,6 +1,7 @@
 """Which approach, which simulator, which scenario? Every cell of the study, and its report.
 
-python experiments/study.py --preset small           # an hour; "paper" and "full" are for a cluster
+python experiments/study.py --workers 2              # one fabric, about 20 minutes
+python experiments/study.py --preset paper --slurm 16 --out paper    # days, for a cluster
 python experiments/study.py --data FOLDER            # recordings (see README, "Your recordings")
 """
 
