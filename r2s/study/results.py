@@ -144,10 +144,10 @@ def parameters(cells: Iterable[EvaluationCell], folder: Path) -> pd.DataFrame:
         estimate = read_estimate(cell, folder)
         if estimate is None:
             continue
-        numbers = (estimate.values, estimate.standard_errors, estimate.identifiable,
-                   true_values(cell, estimate.ranges))  # fmt: skip
-        for bound, *own in zip(estimate.ranges, *(np.asarray(x).tolist() for x in numbers),
-                               strict=True):  # fmt: skip
+        truth = true_values(cell, estimate.ranges)
+        numbers = estimate.values, estimate.standard_errors, estimate.identifiable, truth
+        columns = [np.asarray(each).tolist() for each in numbers]
+        for bound, *own in zip(estimate.ranges, *columns, strict=True):
             rows.append((cell.solver, cell.name, bound.name, bound.unit, bound.log, *own))
     return pd.DataFrame(rows, columns=list(PARAMETERS))
 

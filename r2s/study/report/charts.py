@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
+from plotly.colors import hex_to_rgb
 from plotly.subplots import make_subplots
 
 from r2s.study.configuration import REFERENCES, is_reference
@@ -60,7 +61,7 @@ def interval_chart(
                 )
             figure.add_trace(shown.update(showlegend=False, name=label), 1, column)
         for value, words in marks.items():
-            figure.add_vline(value, line_dash="dot", annotation_text=words, row=1, col=column)  # type: ignore
+            figure.add_vline(value, line_dash="dot", annotation_text=words, row=1, col=column)
     reach = max([*marks, *finite, 0.0]) - low or 1.0
     figure.update_xaxes(title=title, range=[low - 0.15 * reach, low + 1.15 * reach])
     figure.update_yaxes(categoryorder="array", categoryarray=labels[::-1])
@@ -86,8 +87,9 @@ def error_chart(motion: Motion, colours: Mapping[str, str]) -> go.Figure:
             ends = np.where(np.isfinite(runs), 1e3 * runs, np.inf)
             low, high = (np.minimum(end(ends, axis=0), 2 * top) for end in (np.min, np.max))
             band = {"x": [*times, *times[::-1]], "y": [*high, *low[::-1]], "fill": "toself"}
-            figure.add_scatter(**band, mode="none", fillcolor=colours[label], opacity=0.18,
-                               showlegend=False, hoverinfo="skip", **group)  # fmt: skip
+            pale = f"rgba{(*hex_to_rgb(colours[label]), 0.18)}"
+            hidden = {"showlegend": False, "hoverinfo": "skip"}
+            figure.add_scatter(**band, mode="none", fillcolor=pale, **hidden, **group)
         lost = int((~np.isfinite(runs).all(axis=1)).sum())
         words = f"{label} ({lost} of {len(runs)} diverged)" if lost else label
         known = np.isfinite(mean)
@@ -96,8 +98,8 @@ def error_chart(motion: Motion, colours: Mapping[str, str]) -> go.Figure:
         if lost and known.any():
             last = np.flatnonzero(known)[-1:]
             cross = {"symbol": "x", "size": 10, "color": colours[label]}
-            figure.add_scatter(x=times[last], y=np.minimum(y[last], top), mode="markers",
-                               marker=cross, showlegend=False, **group)  # fmt: skip
+            place = {"x": times[last], "y": np.minimum(y[last], top)}
+            figure.add_scatter(**place, mode="markers", marker=cross, showlegend=False, **group)
     if motion.horizon is not None and np.isfinite(motion.horizon):
         end = max(times[-1], motion.horizon)
         figure.add_vrect(motion.horizon, end, fillcolor="white", opacity=0.65, line_width=0)

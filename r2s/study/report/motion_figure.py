@@ -28,37 +28,36 @@ def _figure(motion: Motion, colours: Mapping[str, str], budget: int) -> go.Figur
     frames, count = _kept(motion, budget)
     generator = np.random.default_rng(0)
     clouds = [generator.permutation(_finite(motion.clouds[i]))[:count] for i in frames]
-    start = int(np.argmin(np.abs(frames - deciding_frame(motion))))
-    traces = [
-        go.Scatter3d(mode="markers", marker={"size": 1.5, "color": RED}, name="recorded points"),
-        *(_sheet(motion, label, colours[label], i == 0) for i, label in enumerate(motion.vertices)),
-    ]
     data = [
-        [_positions(cloud), *(_vertices(x[: i + 1]) for x in motion.vertices.values())]
+        [
+            {"type": "scatter3d", **_positions(cloud)},
+            *({"type": "mesh3d", **_vertices(x[: i + 1])} for x in motion.vertices.values()),
+        ]
         for i, cloud in zip(frames, clouds, strict=True)
     ]
+    start = int(np.argmin(np.abs(frames - deciding_frame(motion))))
+    points = {"mode": "markers", "marker": {"size": 1.5, "color": RED}, "name": "recorded points"}
+    looks = [points, *(_look(motion, label, colours[label]) for label in motion.vertices)]
     names = [f"{motion.times[i]:.2f} s" for i in frames]
-    steps = [{"method": "animate", "label": name, "args": [[name], NOW]} for name in names]
     figure = go.Figure(
-        [trace.update(own) for trace, own in zip(traces, data[start], strict=True)],
-        frames=[
-            go.Frame(
-                name=name, data=[{"type": t.type, **x} for t, x in zip(traces, own, strict=True)]
-            )
-            for name, own in zip(names, data, strict=True)
-        ],
+        [look | own for look, own in zip(looks, data[start], strict=True)],
+        frames=[go.Frame(name=name, data=own) for name, own in zip(names, data, strict=True)],
     )
-    play = {"method": "animate", "label": "Play", "args": [None, {**NOW, "fromcurrent": True,
-            "frame": {"duration": 80, "redraw": True}}]}  # fmt: skip
-    pause = {"method": "animate", "label": "Pause", "args": [[None], NOW]}
+    steps = [{"method": "animate", "label": name, "args": [[name], NOW]} for name in names]
+    moving = NOW | {"fromcurrent": True, "frame": {"duration": 80, "redraw": True}}
+    buttons = [
+        {"method": "animate", "label": "Play", "args": [None, moving]},
+        {"method": "animate", "label": "Pause", "args": [[None], NOW]},
+    ]
     return figure.update_layout(
         height=620,
         title=f"{motion.evaluated_on}, {motion.fabric.replace('_', ' ')} ({motion.recording})",
         scene=_scene(clouds, [x[frames] for x in motion.vertices.values()]),
         sliders=[{"active": start, "steps": steps, "currentvalue": {"prefix": "time: "}}],
-        updatemenus=[{"type": "buttons", "direction": "left", "x": 0, "y": 1.08,
-                      "buttons": [play, pause]}],
-    )  # fmt: skip
+        updatemenus=[
+            {"type": "buttons", "direction": "left", "x": 0, "y": 1.1, "buttons": buttons}
+        ],
+    )
 
 
 def _kept(motion: Motion, budget: int) -> tuple[np.ndarray, int]:
@@ -73,12 +72,13 @@ def _kept(motion: Motion, budget: int) -> tuple[np.ndarray, int]:
     return np.arange(1), FEWEST_POINTS
 
 
-def _sheet(motion: Motion, label: str, colour: str, is_first: bool) -> go.Mesh3d:
-    """An empty sheet; the first configuration and the true fabric are shown, others on a click."""
-    i, j, k = (np.asarray(corner, np.uint16) for corner in motion.faces[label].T)
-    shown = True if is_first or label.startswith(REFERENCES["true"]) else "legendonly"
-    return go.Mesh3d(i=i, j=j, k=k, name=label, color=colour, showlegend=True, visible=shown,
-                     hoverinfo="name", flatshading=True)  # fmt: skip
+def _look(motion: Motion, label: str, colour: str) -> dict:
+    """Of a sheet; the first configuration and the true fabric are shown, others on a click."""
+    corners = zip("ijk", np.asarray(motion.faces[label], np.uint16).T, strict=True)
+    is_first = label == next(iter(motion.vertices))
+    is_shown = is_first or label.startswith(REFERENCES["true"])
+    legend = {"name": label, "showlegend": True, "visible": True if is_shown else "legendonly"}
+    return dict(corners) | legend | {"color": colour, "flatshading": True, "hoverinfo": "name"}
 
 
 def _vertices(x: np.ndarray) -> dict:
@@ -103,7 +103,8 @@ def _scene(clouds: Sequence[np.ndarray], sheets: Sequence[np.ndarray]) -> dict:
     low, high = np.percentile(dots, [1, 99], axis=0)
     reach = max(float((high - low).max()) / 2, 0.05)
     for sheet in sheets:
-        near = sheet[((sheet > low - reach) & (sheet < high + reach)).all(axis=-1)]
+        is_near = np.all((sheet > low - reach) & (sheet < high + reach), axis=-1)
+        near = sheet[is_near]
         low, high = np.min([low, *near], axis=0), np.max([high, *near], axis=0)
     low, high = 1e3 * (low - 0.02 * reach), 1e3 * (high + 0.02 * reach)
     size = high - low

@@ -30,7 +30,7 @@ class Comparison(NamedTuple):
       is no ratio), above zero where the hypothesis is right.
     - `agreeing`: in how many of the fabrics it is above zero.
     - `diverged`: runs that did, of the side that should be smaller, and of the larger.
-    - `paper`: the two averages that the paper's tables have for it, [-].
+    - `paper`: the two averages that the paper's tables have for it, [-]; NaN: none.
     """
 
     words: str
@@ -38,7 +38,7 @@ class Comparison(NamedTuple):
     agreeing: int = 0
     diverged: tuple[int, int] = (0, 0)
     is_ratio: bool = True
-    paper: tuple[float, float] | None = None
+    paper: tuple[float, float] = (np.nan, np.nan)
     lacking: str = ""
 
 
@@ -127,16 +127,28 @@ def judge(comparisons: Iterable[tuple[str, Comparison]]) -> pd.DataFrame:
         if answer == UNKNOWN and not each.lacking:
             effect = max(abs(each.found.mean), np.log1p(MARGIN))
             needed = units_needed(each.found, effect, level)
-        rows.append({
-            "conclusion": conclusion, "comparison": each.words, "answer": answer,
-            "lacking": each.lacking,
-            "ratio": np.exp(each.found.mean) if each.is_ratio else np.nan, "low": low, "high": high,
-            "p": own, "p_holm": holm, "agreeing": each.agreeing, "fabrics": each.found.units,
-            "diverged_smaller": each.diverged[0], "diverged_larger": each.diverged[1],
-            "needed": needed[0], "fewest": needed[1], "most": needed[2],
-            "paper_smaller": each.paper[0] if each.paper else np.nan,
-            "paper_larger": each.paper[1] if each.paper else np.nan,
-        })  # fmt: skip
+        rows.append(
+            {
+                "conclusion": conclusion,
+                "comparison": each.words,
+                "answer": answer,
+                "lacking": each.lacking,
+                "ratio": np.exp(each.found.mean) if each.is_ratio else np.nan,
+                "low": low,
+                "high": high,
+                "p": own,
+                "p_holm": holm,
+                "agreeing": each.agreeing,
+                "fabrics": each.found.units,
+                "needed": needed[0],
+                "fewest": needed[1],
+                "most": needed[2],
+                "diverged_smaller": each.diverged[0],
+                "diverged_larger": each.diverged[1],
+                "paper_smaller": each.paper[0],
+                "paper_larger": each.paper[1],
+            }
+        )
     return pd.DataFrame(rows)
 
 

@@ -85,13 +85,9 @@ def _sides(
     """Some configurations against others on one motion, beside the averages of the paper."""
     first, second = ([each.label for each in side] for side in (smaller, larger))
     words = f"in {motion} {' and '.join(first)} better than {' and '.join(second)}"
-    quoted = _quoted(average(paper, motion, smaller), average(paper, motion, larger))
+    quoted = average(paper, motion, smaller), average(paper, motion, larger)
     part = results[results.evaluated_on == motion]
     return compare(words, part, first, second)._replace(paper=quoted)
-
-
-def _quoted(ours: float, theirs: float) -> tuple[float, float] | None:
-    return (ours, theirs) if np.isfinite([ours, theirs]).all() else None
 
 
 def _solvers(
@@ -111,7 +107,7 @@ def _easier(results: pd.DataFrame, paper: pd.DataFrame, easy: str, hard: str) ->
     """Distances on one motion against those on another, by the same configuration and fabric."""
     words = f"{hard} over {easy}, for the same configuration and fabric"
     there = [each for each in PAPER_CONFIGURATIONS if each in configurations(results)]
-    quoted = _quoted(average(paper, easy, there), average(paper, hard, there))
+    quoted = average(paper, easy, there), average(paper, hard, there)
     part = results[results.evaluated_on.isin([easy, hard])]
     if part.empty:
         return Comparison(words, lacking="nothing that both were judged on", paper=quoted)

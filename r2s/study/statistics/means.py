@@ -95,11 +95,12 @@ def skills(results: pd.DataFrame) -> pd.DataFrame:
     known = results[results.skill.notna()]
     of_fabric = results.groupby([*keys, "fabric", "movement"], observed=True).floor.mean()
     floor = of_fabric.groupby([*keys, "fabric"], observed=True).mean()
-    found = pd.DataFrame({
+    columns = {
         "judged": groups.recording.nunique(),
         "floor": floor.groupby(keys, observed=True).mean(),
         "known": known.groupby(keys, observed=True).recording.nunique(),
-    })  # fmt: skip
+    }
+    found = pd.DataFrame(columns)
     found["known"] = found.known.fillna(0).astype(int)
     return found.join(means(known, "skill"))
 
