@@ -377,6 +377,10 @@ def test_an_estimate_is_made_once_and_judged(tiny, tmp_path):
     assert np.isfinite(parameters.truth).all()  # those of the preset
     meshes = disclosures.mesh_table(results.estimates_made(cells, tmp_path), tmp_path)
     assert len(meshes) == 1 and meshes.iloc[0, 2:].astype(float).gt(0).all()
+    results.publish(cells, {}, tmp_path, matrix.SMALL, "synthetic")
+    assert "diffcloud" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    written = {path.stem for path in (tmp_path / "tables").iterdir()}
+    assert {"ranges", "meshes", "costs", "parameters_cloth", "settings"} <= written
     costs = disclosures.cost_table(cells, tmp_path).set_index("kind")
     assert costs["count"]["estimates diffcloud cloth lifting"] == 1
     assert float(costs["CPU seconds in all"]["evaluations cloth shaking"]) > 0

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from made_up_study import made_up_motion, made_up_results
+from plotly.offline import get_plotlyjs
 from test_skills import FABRICS, made_up
 from test_skills import METRIC as SURFACE
 
@@ -19,7 +20,7 @@ from r2s.geometry.mesh import rectangle
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, PUBLISHED_CONFIGURATIONS
 from r2s.study.report import motion_figure, publish
 from r2s.study.report.charts import GREY, INK, colours_of, error_chart, interval_chart
-from r2s.study.report.page import Section, get_plotlyjs
+from r2s.study.report.page import Section
 from r2s.study.report.tables import significant
 from r2s.study.results import PARAMETERS
 from r2s.study.statistics.frame import as_frame, labelled

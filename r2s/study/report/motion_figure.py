@@ -83,7 +83,7 @@ def _look(motion: Motion, label: str, colour: str) -> dict:
 
 def _vertices(x: np.ndarray) -> dict:
     """The last vertices of a motion; where it diverged, those before it, not visible."""
-    is_known = np.isfinite(x).all(axis=(1, 2))
+    is_known = np.all(np.isfinite(x), axis=(1, 2))
     last = x[is_known][-1] if is_known.any() else np.zeros_like(x[0])
     return {**_positions(last), "opacity": 0.75 if is_known[-1] else 0.0}
 
