@@ -10,7 +10,7 @@ import os
 import sys
 from pathlib import Path
 
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # before JAX: see `r2s_command`
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # before JAX: see `r2s.__main__`
 
 from r2s import compilation  # noqa: E402
 from r2s.study.main import study  # noqa: E402

@@ -13,136 +13,37 @@ Rooms, in the order in which they build on each other:
 - `sweep`, `gradient_check`: thousands of fabrics at once; derivatives against differences.
 - `export`, `viewer`, `study`, `commands`: other simulators, pictures, the study, the command line.
 
-The names below are the public surface; what changes here is in the changelog.
+The public names are those of `__init__.pyi`. Each is imported at its first use (PEP 562), so that
+`import r2s` takes no time and settings of the environment can still come before JAX. What changes
+there is in the changelog.
 """
 
-from r2s.cloth.cloth import Cloth, ClothState
-from r2s.cloth.explicit import ExplicitCloth
-from r2s.estimation.cards import Card, Provenance
-from r2s.estimation.cards import read as read_card
-from r2s.estimation.cards import write as write_card
-from r2s.estimation.estimate import Estimate, Nuisance
-from r2s.estimation.identifiability import sensitivity
-from r2s.estimation.method import Budget, Method
-from r2s.estimation.problem import NuisancePrior, Problem
-from r2s.estimation.registry import METHODS
-from r2s.evaluation.metrics import distances
-from r2s.fabrics import presets
-from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.fold_length import fold_length
-from r2s.fabrics.informed_space import InformedSpace
-from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
-from r2s.fabrics.softening_space import SofteningSpace
-from r2s.fabrics.stiffening_space import StiffeningSpace
-from r2s.failures import Failure
-from r2s.geometry.mesh import Mesh, rectangle
-from r2s.laboratory.cantilever import Cantilever
-from r2s.laboratory.drape import Drape
-from r2s.laboratory.files import read_tests
-from r2s.laboratory.pull import Pull
-from r2s.laws.bending import BendingLaw, HingeBending, HingeLaw
-from r2s.laws.membrane import MembraneLaw, OrthotropicMembrane, SpringMembrane
-from r2s.laws.plate import OrthotropicPlate, PlateBending, PlateLaw
-from r2s.laws.stiffening import StiffeningMembrane
-from r2s.laws.tables import TableBending, TableMembrane
-from r2s.recordings.manifest import read_recordings
-from r2s.recordings.recording import Recording, RecordingInfo, SheetPlacement, make_recording
-from r2s.recordings.recording import load as load_recording
-from r2s.recordings.recording import save as save_recording
-from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
-from r2s.scenarios.in_explicit_steps import explicit_cloth
-from r2s.scenarios.on_points import material_points
-from r2s.scenarios.scenario import Scenario, from_recording, rollout
-from r2s.scenarios.six import Experiment, fling, folding, lifting, shaking, stretching, wind
-from r2s.scenarios.synthetic import record
-from r2s.solver import Solver, Trajectory, predicted_memory, simulate
-from r2s.world.air import Air, Fan
-from r2s.world.contact import Table
-from r2s.world.scene import Control, Scene
+import ast
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
 
-__all__ = [
-    # what a fabric is
-    "Fabric",
-    "fold_length",
-    "presets",
-    "MembraneLaw",
-    "OrthotropicMembrane",
-    "StiffeningMembrane",
-    "SpringMembrane",
-    "TableMembrane",
-    "BendingLaw",
-    "HingeLaw",
-    "HingeBending",
-    "TableBending",
-    "PlateLaw",
-    "PlateBending",
-    "OrthotropicPlate",
-    # the sheet, and what it meets
-    "Mesh",
-    "rectangle",
-    "Scene",
-    "Control",
-    "Air",
-    "Fan",
-    "Table",
-    # solvers and motions
-    "Solver",
-    "Cloth",
-    "ClothState",
-    "ExplicitCloth",
-    "simulate",
-    "Trajectory",
-    "Failure",
-    "predicted_memory",
-    # experiments
-    "Scenario",
-    "Experiment",
-    "lifting",
-    "wind",
-    "stretching",
-    "folding",
-    "fling",
-    "shaking",
-    "rollout",
-    "explicit_cloth",
-    "material_points",
-    "energy_balance",
-    "EnergyBalance",
-    "clamp_force",
-    # recordings
-    "Recording",
-    "RecordingInfo",
-    "SheetPlacement",
-    "make_recording",
-    "load_recording",
-    "save_recording",
-    "read_recordings",
-    "from_recording",
-    "record",
-    "distances",
-    # laboratory tests
-    "Pull",
-    "Cantilever",
-    "Drape",
-    "read_tests",
-    # estimates
-    "ParameterSpace",
-    "OrthotropicSpace",
-    "IsotropicSpace",
-    "SofteningSpace",
-    "StiffeningSpace",
-    "InformedSpace",
-    "Range",
-    "METHODS",
-    "Method",
-    "Problem",
-    "NuisancePrior",
-    "Budget",
-    "Estimate",
-    "Nuisance",
-    "sensitivity",
-    "Card",
-    "Provenance",
-    "read_card",
-    "write_card",
-]
+_STUB = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+_HOMES = {
+    alias.asname or alias.name: (str(node.module), alias.name)
+    for node in _STUB.body
+    if isinstance(node, ast.ImportFrom)
+    for alias in node.names
+}
+__all__ = list(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name, or a module of r2s, at its first use."""
+    package, attribute = _HOMES.get(name, (__name__, name))
+    module = import_module(package)
+    if attribute not in vars(module):
+        if find_spec(f"{package}.{attribute}") is None:
+            raise AttributeError(f"module {package!r} has no attribute {attribute!r}")
+        import_module(f"{package}.{attribute}")
+    return globals().setdefault(name, getattr(module, attribute))
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,8 +1,10 @@
 """The command line: what it does, its help, and its exit codes."""
 
 import json
+import os
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -103,9 +105,29 @@ def test_recordings_are_converted_once(tmp_path: Path, capsys: pytest.CaptureFix
     assert "3 frames" in capsys.readouterr().out
 
 
-def test_the_console_script_is_installed() -> None:
-    script = Path(sys.executable).with_name("r2s")
-    if not script.exists():
-        pytest.skip("the package is not installed with its scripts")
-    run = subprocess.run([script, "--help"], capture_output=True, text=True, timeout=60)
-    assert run.returncode == 0 and "usage: r2s" in run.stdout
+WATCHED = """
+import os, sys
+
+class Watch:
+    def find_spec(self, name, path=None, target=None):
+        if name in ("numpy", "jax"):
+            print(name, os.environ["TF_CPP_MIN_LOG_LEVEL"], os.environ["OPENBLAS_NUM_THREADS"])
+
+sys.meta_path.insert(0, Watch())
+import r2s.__main__
+print("imported")
+sys.argv = ["r2s", "--help"]
+r2s.__main__.command()
+"""
+
+
+def test_the_console_script_sets_the_environment_before_numpy_and_jax_load() -> None:
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    assert project["scripts"] == {"r2s": "r2s.__main__:command"}
+    names = ("TF_CPP_MIN_LOG_LEVEL", "OPENBLAS_NUM_THREADS")
+    unset = {name: value for name, value in os.environ.items() if name not in names}
+    run = subprocess.run([sys.executable, "-c", WATCHED], capture_output=True, text=True, env=unset)
+    assert run.returncode == 0, run.stderr
+    first, *loaded = run.stdout.splitlines()
+    assert first == "imported" and {"numpy 3 1", "jax 3 1"} == set(loaded[:2])
+    assert "usage: r2s" in run.stdout

@@ -22,15 +22,15 @@ MANIFESTS = ROOT / "data_manifests"
 PACKAGE = Path(r2s.__file__).parent
 
 
-def test_every_manifest_is_package_data() -> None:
+def test_every_manifest_and_the_public_names_are_package_data() -> None:
     """A link in the package leads to the folder, and what is listed covers its files."""
     assert (PACKAGE / "data_manifests").resolve() == MANIFESTS
     assert default_manifest().parent == PACKAGE / "data_manifests"
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     patterns = settings["package-data"]["r2s"]
     listed = {path.resolve() for pattern in patterns for path in PACKAGE.glob(pattern)}
-    template = PACKAGE / "study" / "report" / "report.html.j2"
-    assert listed - {template} == set(MANIFESTS.rglob("*.json")) != set() and template in listed
+    others = {PACKAGE / "__init__.pyi", PACKAGE / "study" / "report" / "report.html.j2"}
+    assert listed == {*others, *MANIFESTS.rglob("*.json")}
 
 
 # where a library is imported by another name than it is installed by

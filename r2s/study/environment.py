@@ -68,7 +68,7 @@ def environment(workers: int, compilation_cache: Path | None = None) -> dict[str
         "XLA_FLAGS": one_thread(os.environ.get("XLA_FLAGS", "")),
         "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.9 / workers:.3f}",
         "EQX_ON_ERROR": "nan",
-        "TF_CPP_MIN_LOG_LEVEL": "3" if level == JAX_LEVEL else level,  # see `r2s_command`
+        "TF_CPP_MIN_LOG_LEVEL": "3" if level == JAX_LEVEL else level,  # see `r2s.__main__`
     }
     if compilation_cache is not None:
         found |= {"JAX_COMPILATION_CACHE_DIR": str(compilation_cache)}

@@ -1,0 +1,132 @@
+"""The public names, and where each is; `r2s/__init__.py` imports them at first use."""
+
+from r2s.cloth.cloth import Cloth, ClothState
+from r2s.cloth.explicit import ExplicitCloth
+from r2s.estimation.cards import Card, Provenance
+from r2s.estimation.cards import read as read_card
+from r2s.estimation.cards import write as write_card
+from r2s.estimation.estimate import Estimate, Nuisance
+from r2s.estimation.identifiability import sensitivity
+from r2s.estimation.method import Budget, Method
+from r2s.estimation.problem import NuisancePrior, Problem
+from r2s.estimation.registry import METHODS
+from r2s.evaluation.metrics import distances
+from r2s.fabrics import presets
+from r2s.fabrics.fabric import Fabric
+from r2s.fabrics.fold_length import fold_length
+from r2s.fabrics.informed_space import InformedSpace
+from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
+from r2s.fabrics.softening_space import SofteningSpace
+from r2s.fabrics.stiffening_space import StiffeningSpace
+from r2s.failures import Failure
+from r2s.geometry.mesh import Mesh, rectangle
+from r2s.laboratory.cantilever import Cantilever
+from r2s.laboratory.drape import Drape
+from r2s.laboratory.files import read_tests
+from r2s.laboratory.pull import Pull
+from r2s.laws.bending import BendingLaw, HingeBending, HingeLaw
+from r2s.laws.membrane import MembraneLaw, OrthotropicMembrane, SpringMembrane
+from r2s.laws.plate import OrthotropicPlate, PlateBending, PlateLaw
+from r2s.laws.stiffening import StiffeningMembrane
+from r2s.laws.tables import TableBending, TableMembrane
+from r2s.recordings.manifest import read_recordings
+from r2s.recordings.recording import Recording, RecordingInfo, SheetPlacement, make_recording
+from r2s.recordings.recording import load as load_recording
+from r2s.recordings.recording import save as save_recording
+from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
+from r2s.scenarios.in_explicit_steps import explicit_cloth
+from r2s.scenarios.on_points import material_points
+from r2s.scenarios.scenario import Scenario, from_recording, rollout
+from r2s.scenarios.six import Experiment, fling, folding, lifting, shaking, stretching, wind
+from r2s.scenarios.synthetic import record
+from r2s.solver import Solver, Trajectory, predicted_memory, simulate
+from r2s.world.air import Air, Fan
+from r2s.world.contact import Table
+from r2s.world.scene import Control, Scene
+
+__all__ = [
+    # what a fabric is
+    "Fabric",
+    "fold_length",
+    "presets",
+    "MembraneLaw",
+    "OrthotropicMembrane",
+    "StiffeningMembrane",
+    "SpringMembrane",
+    "TableMembrane",
+    "BendingLaw",
+    "HingeLaw",
+    "HingeBending",
+    "TableBending",
+    "PlateLaw",
+    "PlateBending",
+    "OrthotropicPlate",
+    # the sheet, and what it meets
+    "Mesh",
+    "rectangle",
+    "Scene",
+    "Control",
+    "Air",
+    "Fan",
+    "Table",
+    # solvers and motions
+    "Solver",
+    "Cloth",
+    "ClothState",
+    "ExplicitCloth",
+    "simulate",
+    "Trajectory",
+    "Failure",
+    "predicted_memory",
+    # experiments
+    "Scenario",
+    "Experiment",
+    "lifting",
+    "wind",
+    "stretching",
+    "folding",
+    "fling",
+    "shaking",
+    "rollout",
+    "explicit_cloth",
+    "material_points",
+    "energy_balance",
+    "EnergyBalance",
+    "clamp_force",
+    # recordings
+    "Recording",
+    "RecordingInfo",
+    "SheetPlacement",
+    "make_recording",
+    "load_recording",
+    "save_recording",
+    "read_recordings",
+    "from_recording",
+    "record",
+    "distances",
+    # laboratory tests
+    "Pull",
+    "Cantilever",
+    "Drape",
+    "read_tests",
+    # estimates
+    "ParameterSpace",
+    "OrthotropicSpace",
+    "IsotropicSpace",
+    "SofteningSpace",
+    "StiffeningSpace",
+    "InformedSpace",
+    "Range",
+    "METHODS",
+    "Method",
+    "Problem",
+    "NuisancePrior",
+    "Budget",
+    "Estimate",
+    "Nuisance",
+    "sensitivity",
+    "Card",
+    "Provenance",
+    "read_card",
+    "write_card",
+]
