@@ -19,10 +19,12 @@ from test_show import recorded  # noqa: E402
 from r2s.cli import main  # noqa: E402
 from r2s.commands.common import choose_shape, make_experiment, print_result  # noqa: E402
 from r2s.commands.doctor import EXCLUDED, EXTRAS, implausible  # noqa: E402
-from r2s.commands.estimate import EstimateCard, _approach, _assumed  # noqa: E402
+from r2s.commands.estimate import EstimateCard  # noqa: E402
+from r2s.commands.estimate_report import Outcome, approach, assumed  # noqa: E402
 from r2s.estimation import cards
 from r2s.estimation.cards import Card, Provenance  # noqa: E402
 from r2s.estimation.diffcloud import MASS, STRETCH  # noqa: E402
+from r2s.estimation.estimate import point_estimate  # noqa: E402
 from r2s.estimation.method import default_space  # noqa: E402
 from r2s.estimation.registry import METHODS  # noqa: E402
 from r2s.fabrics import presets  # noqa: E402
@@ -315,20 +317,23 @@ def test_fabrics_of_this_weight_are_known_to_whom_they_help(options, is_alone, k
     """What they are like beforehand, unless something better is known, or nothing is asked for."""
     card = EstimateCard((Path("lift.npz"),), 0.2, Path("card.json"), **options)
     method = METHODS[card.method]()
-    told = card._prior(method, is_alone)
-    assert isinstance(card._space(method, told, []), InformedSpace) == knows
-    words = _approach("diffcloud", (), told)
+    prior = card._prior(method, not is_alone)
+    space = card._space(method, prior, [])
+    assert isinstance(space, InformedSpace) == knows
+    place = jnp.full(space.dim, 0.5)
+    found = point_estimate("diffcloud", space, place, 0.0, np.zeros(1), np.zeros((1, 1, 1)), 0.0)
+    words = approach(Outcome(method, 0.2, prior, (), (), found, None))
     assert ("prior of measured fabrics" in words) == knows
 
 
 def test_a_card_says_what_was_neither_weighed_nor_estimated():
     on_cloth, on_points = (
-        [each.name for each in default_space(solver, 0.2).ranges] for solver in ("cloth", "points")
+        {each.name for each in default_space(solver, 0.2).ranges} for solver in ("cloth", "points")
     )
-    assert _assumed(on_cloth) == ("thickness", "mass_damping")
-    assert _assumed(on_points) == ("bending", "damping", "friction", "thickness", "mass_damping")
+    assert assumed(on_cloth) == ("thickness", "mass_damping")
+    assert assumed(on_points) == ("bending", "damping", "friction", "thickness", "mass_damping")
     whole = ("membrane", "bending", "damping", "friction", "thickness", "mass_damping")
-    assert _assumed([each.name for each in (STRETCH, MASS)]) == whole
+    assert assumed({each.name for each in (STRETCH, MASS)}) == whole
 
 
 def test_multipliers_have_no_law_that_stiffens():

@@ -1,8 +1,6 @@
 """What of a recording does not fit a fabric is found and named, and nothing else is."""
 
 import dataclasses
-from types import SimpleNamespace
-from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +8,10 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.commands.estimate import _agreement, _misfits, _unread
+from r2s.commands import estimate_report
 from r2s.estimation.density_doubt import freed, is_asked
 from r2s.estimation.diffcloud import DiffCloud
-from r2s.estimation.estimate import Agreement, Contradiction, Estimate, Misfit
+from r2s.estimation.estimate import Agreement, Contradiction, Estimate, Misfit, point_estimate
 from r2s.estimation.gauss_newton import theta_length
 from r2s.estimation.misfits import left_out, misfits
 from r2s.estimation.prediction import fabric_at, predict
@@ -31,6 +29,13 @@ STRICT = 0.01  # [m], beyond which points do not count
 
 def problem_of(recording) -> Problem:
     return Problem.make(recording, SPACE, shape=SHAPE)
+
+
+def estimate_with(**fields) -> Estimate:
+    """An estimate in the middle of the space."""
+    none = np.zeros(0)
+    made = point_estimate("diffcloud", SPACE, jnp.full(SPACE.dim, 0.5), 0.0, none, none, 0.0)
+    return dataclasses.replace(made, **fields)
 
 
 def at_truth(problem):
@@ -142,7 +147,7 @@ def test_what_was_written_down_and_does_not_fit_is_named(lifted):
 
 
 def test_the_command_says_so(lifted, pulled):
-    found = SimpleNamespace(
+    found = estimate_with(
         misfits=(
             Misfit(0, "marker 2", 0.036, "m"),
             Misfit(1, "air", 5.0, "standard deviations"),
@@ -150,7 +155,7 @@ def test_the_command_says_so(lifted, pulled):
         ),
         left_out=(0.02, 0.76),
     )
-    lines = _misfits(cast(Estimate, found), [pulled, lifted])
+    lines = [*estimate_report.misfits(found, [pulled, lifted])]
     assert "pull" in lines[0] and "marker 2 is 36 mm" in lines[0]
     assert "lift" in lines[1] and "the density" in lines[1]
     assert "pull" in lines[2] and "off by 250 %" in lines[2] and "density" in lines[2]
@@ -162,18 +167,18 @@ def test_the_command_says_so(lifted, pulled):
 def test_a_mesh_that_is_too_coarse_is_named_where_recordings_are_apart(is_coarse, pulled, lifted):
     """In wind a coarse sheet leads far from what it leads to elsewhere."""
     odd = Agreement(1e-9, (3, 3), Contradiction(1, "warp", 9.0, (1.0, 2.0)))
-    found = cast(Estimate, SimpleNamespace(agreement=odd, shares=(), ranges=SPACE.ranges))
-    (line,) = _agreement(found, [pulled, lifted], is_coarse)
+    found = estimate_with(agreement=odd)
+    (line,) = estimate_report.agreement(found, [pulled, lifted], is_coarse)
     assert line.startswith(f"warning: {lifted.info.name} contradicts")
     assert ("or the mesh" in line) is is_coarse
 
 
 def test_points_that_are_not_read_are_counted(lifted):
     most = int(lifted.mask.sum(axis=1).max())
-    (line,) = _unread(DiffCloud(), [lifted])
+    (line,) = estimate_report.unread(DiffCloud(), [lifted])
     assert most > 300 and f"all but 300 points a frame, drawn at random, of up to {most}" in line
     few = dataclasses.replace(lifted, points=lifted.points[:, :200], mask=lifted.mask[:, :200])
-    assert _unread(DiffCloud(), [few]) == []
+    assert not list(estimate_report.unread(DiffCloud(), [few]))
 
 
 def test_clouds_that_nobody_recorded_are_not_left_unread(pulled):
@@ -187,4 +192,4 @@ def test_clouds_that_nobody_recorded_are_not_left_unread(pulled):
         markers=pulled.markers,
         marker_places=pulled.marker_places,
     )
-    assert _unread(DiffCloud(), [bare]) == []
+    assert not list(estimate_report.unread(DiffCloud(), [bare]))

@@ -96,10 +96,10 @@ def test_angles_of_the_command_line_are_those_of_the_stretchings_in_their_order(
     info = dataclasses.replace(bias.info, scenario="wind", angle=0.0)
     other = dataclasses.replace(bias, info=info)
     command = EstimateCard((), 0.2, tmp_path / "out.json", angles=(45.0, 90.0))
-    found = command._turned([bias, other, bias])
+    found = command._set_angles([bias, other, bias])
     assert [each.info.angle for each in found] == [45.0, 0.0, 90.0]
     with pytest.raises(ValueError, match="got 2 for 1 stretching"):
-        command._turned([bias])
+        command._set_angles([bias])
 
 
 @pytest.mark.slow(group="estimates")
