@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import io
 import json
 import math
 import os
@@ -14,20 +15,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 T = TypeVar("T")
-
-
-def source_files() -> list[Path]:
-    """The files of the source of r2s."""
-    return sorted(Path(__file__).parent.rglob("*.py"))
 
 
 @functools.cache
 def source_hash() -> str:
-    """A hash of them, hexadecimal, as they were when it was asked for first."""
+    """A hash of the source files of r2s, hexadecimal, as they were at the first call."""
+    root = Path(__file__).parent
     digest = hashlib.sha256()
-    for file in source_files():
-        digest.update(str(file.relative_to(Path(__file__).parent)).encode() + file.read_bytes())
+    for file in sorted(root.rglob("*.py")):
+        digest.update(str(file.relative_to(root)).encode() + file.read_bytes())
     return digest.hexdigest()
 
 
@@ -73,6 +72,31 @@ def write_json(path: Path | str, value: Any) -> None:
     hold, and OSError as `write_bytes`.
     """
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def write_npz(path: Path | str, **arrays: Any) -> None:
+    """Write named arrays as one NPZ, whole or not at all; raises as `write_bytes`."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **{name: np.asarray(values) for name, values in arrays.items()})
+    write_bytes(path, buffer.getvalue())
+
+
+def read_npz(path: Path | str, *needed: str) -> dict[str, np.ndarray]:
+    """The arrays of an NPZ, by name.
+
+    Raises FileNotFoundError, or a ValueError (which does not name the file) when it is damaged or
+    one of the arrays `needed` is missing.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # a damaged archive raises anything, from EOFError to zlib.error
+        raise ValueError(f"{error}: copy the file again, or make it anew") from error
+    if lacking := [name for name in needed if name not in arrays]:
+        raise ValueError(f"lacks the arrays {', '.join(lacking)}; has {', '.join(arrays)}")
+    return arrays
 
 
 def read_json(path: Path | str, kind: type[T]) -> T:

@@ -27,8 +27,7 @@ from r2s.recordings.cameras.rgbd import (
 )
 from r2s.recordings.cameras.timing import pair, read_times
 from r2s.recordings.manifest import manifest_for, read_recording
-from r2s.recordings.recording import cloud, load, make_recording, save
-from r2s.recordings.summary import summarise, table
+from r2s.recordings.recording import cloud, load, save
 
 
 @pytest.fixture(scope="module")
@@ -169,21 +168,6 @@ def test_a_png_cut_anywhere_is_refused(
     path.write_bytes(whole[: cut % len(whole)])
     with pytest.raises(ValueError, match="000.png: (truncated|no) PNG"):
         read_depth(path, 1e-3, (16, 12))
-
-
-def test_a_summary_counts_points_parts_and_gaps() -> None:
-    plane = np.stack(np.meshgrid(np.arange(20), np.arange(20), [0.0]), axis=-1).reshape(-1, 3)
-    whole, torn = 0.008 * plane, 0.008 * plane + np.where(plane[:, :1] > 14, [0.1, 0, 0], 0)
-    times = [0.0, 0.1, 0.2, 0.5]
-    clouds = [whole, torn, torn, whole[:3]]
-    found = summarise(make_recording(clouds, times, PATH, times, INFO))
-    assert found.points == (3, 400, 400) and found.thin == (3,)
-    np.testing.assert_allclose(found.longest, (0.3, 0.1), rtol=1e-5)
-    assert found.parts == 1.5 and found.apart == pytest.approx(0.125, abs=0.03)
-    assert found.spacing == pytest.approx(0.008)
-    np.testing.assert_allclose(found.high, [0.252, 0.152, 0], atol=1e-3)
-    text = table([make_recording(clouds, times, PATH, times, INFO)])
-    assert text.count("\n") == 2 and "| wave | 4 | 3, 400, 400 | 0.00 to 0.25" in text
 
 
 @given(gaps=CLOCKS, shift=st.floats(-0.004, 0.004), lost=st.integers(0, 5))

@@ -156,7 +156,7 @@ def test_a_trajectory_is_read_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "arrays, words",
     [
-        ({"x": cloth().x}, "no trajectory .*lacks the array 'faces', has x"),
+        ({"x": cloth().x}, "no trajectory .*lacks the arrays faces; has x"),
         ({"x": cloth().x[0], "faces": cloth().faces}, r"expected x .frame, vertex, 3.*\(4, 3\)"),
         ({"x": cloth().x, "faces": cloth().faces + 1}, "faces must be numbers of the 4 vertices"),
         ({"x": cloth().x, "faces": cloth().faces * 1.0}, "faces must be numbers"),

@@ -21,10 +21,9 @@ Manifests = Annotated[
 class Fetch:
     """Bring a public data set into a folder, and verify it.
 
-    Files that are there and are what was published are left alone; a download that broke off goes
-    on where it ended. A corrupt file is named and never replaced unasked. What cannot be downloaded
-    automatically is said, with its licence, how to get it, and where to put it. Run it again then:
-    it checks what is there.
+    Files that are there and are what was published are left alone. A corrupt file is named and
+    never replaced unasked. What cannot be downloaded automatically is said, with its licence, how
+    to get it, and where to put it. Run it again then: it checks what is there.
 
         r2s data fetch diffcloud --to recordings
     """

@@ -3,6 +3,6 @@
 - `recording`: the canonical form: clouds, markers, force, the path of the grippers.
 - `manifest`: what a folder of recordings is. `convert`: folders to NPZ files.
 - `open`: a recording, or a simulated motion, from a path.
-- `datasets`: public data. `summary`: what is in a recording.
+- `datasets`: public data.
 - `readers`: one file format each. `cameras`: depth cameras, real and rendered.
 """

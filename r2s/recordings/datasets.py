@@ -6,12 +6,10 @@ pooch: pip install 'r2s[data]'.
 """
 
 import json
-import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 from r2s.extras import require
 from r2s.files import read_json
@@ -26,7 +24,7 @@ from r2s.recordings.readers.clouds import read_values
 from r2s.recordings.readers.swings import Bar
 
 TIMEOUT = 30  # [s], without a byte from the server
-CHUNK = 1 << 14  # [byte], of which a broken download loses at most one
+SHOWN = 6  # folders that an error names
 
 
 @dataclass(frozen=True)
@@ -117,11 +115,10 @@ def known_bar() -> Bar:
 def fetch(name: str, folder: Path | str, manifests: Path | str | None = None) -> Iterator[str]:
     """Bring a data set into a folder, as far as that can be done; says what it does, line by line.
 
-    Files that are there and are what was published are left alone. A download that broke off is
-    taken up where it ended. What is corrupt is never replaced unasked: the error says which file to
-    delete. Raises ValueError or OSError, after all that could be done was done: an unknown name,
-    files that are corrupt, that the server does not have, or that must be fetched by hand; the
-    error then says how, and where to put them.
+    Files that are there and are what was published are left alone. What is corrupt is never
+    replaced unasked: the error says which file to delete. Raises ValueError or OSError, after all
+    that could be done was done: an unknown name, files that are corrupt, that the server does not
+    have, or that must be fetched by hand; the error then says how, and where to put them.
     """
     known = known_datasets(manifests)
     if name not in known:
@@ -149,7 +146,8 @@ def _download_all(data: Dataset, folder: Path) -> Iterator[str]:
 
 def _fetch_file(folder: Path, path: str, download: Download) -> str:
     """Have a file, complete and verified; what was done."""
-    pooch = _pooch()
+    pooch = require("pooch", "data", "downloads")
+    pooch.get_logger().setLevel("ERROR")  # what is done is said here
     file = folder / path
     if file.exists():
         found = pooch.file_hash(str(file), alg="sha256")
@@ -160,59 +158,23 @@ def _fetch_file(folder: Path, path: str, download: Download) -> str:
                 "delete it and run the command again"
             )
         return f"{path}: there, verified"
-    part = file.with_name(file.name + ".part")
-    resumed = part.stat().st_size if part.exists() else 0
-    source = pooch.create(folder, "", registry={path: f"sha256:{download.sha256}"})
-    source.urls = {path: download.url}
     try:
-        source.fetch(path, downloader=lambda url, output, _: _resume(url, part, output))
+        pooch.retrieve(
+            download.url,
+            f"sha256:{download.sha256}",
+            fname=file.name,
+            path=file.parent,
+            downloader=pooch.HTTPDownloader(timeout=TIMEOUT),
+        )
     except ValueError as error:
         raise ValueError(
             f"{file}: corrupt: what {download.url} sent is not the published file (sha256 "
             f"{download.sha256[:12]}...): it was discarded; run the command again, or tell whoever "
             "keeps the data"
         ) from error
-    return f"{path}: downloaded{f' from byte {resumed} on' if resumed else ''}, verified"
-
-
-def _resume(url: str, part: Path, output: Any) -> None:
-    """Download `url` into `part`, from where that ends, and move it to `output` when it is whole.
-
-    Raises OSError that names the URL: it is not there, or the connection broke; then `part` stays.
-    """
-    import requests  # comes with pooch
-
-    start = part.stat().st_size if part.exists() else 0
-    part.parent.mkdir(parents=True, exist_ok=True)
-    headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={start}-"} if start else {})
-    try:
-        with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT) as answer:
-            if answer.status_code == 416 and _total_size(answer) == start:
-                os.replace(part, output)  # it broke off between the last byte and the move
-                return
-            if answer.status_code == 416:
-                part.unlink()  # longer than the file: of something else
-                raise OSError(f"{url}: {part} did not fit: run the command again")
-            if answer.status_code >= 400:
-                raise OSError(f"{url}: the server says {answer.status_code} {answer.reason}")
-            # A server that knows no ranges sends it all, with 200 for 206.
-            resumes = answer.status_code == 206
-            with open(part, "ab" if resumes else "wb") as file:
-                for chunk in answer.iter_content(CHUNK):
-                    file.write(chunk)
-    except requests.RequestException as error:
-        have = part.stat().st_size if part.exists() else 0
-        raise OSError(
-            f"{url}: the connection broke after {have} bytes ({type(error).__name__}): run the "
-            "command again, it goes on from there"
-        ) from error
-    os.replace(part, output)
-
-
-def _total_size(answer: Any) -> int | None:
-    """The size of a file [byte] that a server names when it has no such range."""
-    match = re.fullmatch(r"bytes \*/(\d+)", answer.headers.get("Content-Range", ""))
-    return int(match[1]) if match else None
+    except OSError as error:  # those of requests are such
+        raise OSError(f"{download.url}: {error}: check the address and run it again") from error
+    return f"{path}: downloaded, verified"
 
 
 def _check_layout(data: Dataset, folder: Path) -> Iterator[str]:
@@ -233,19 +195,13 @@ def _check_layout(data: Dataset, folder: Path) -> Iterator[str]:
 def _check_recordings(data: Manifest, folder: Path) -> Iterator[str]:
     """Compare the recordings in a folder with the values that were published."""
     names = read_recordings(folder, data) if folder.is_dir() else []
-    missing, corrupt, good = [], [], 0
-    for path, expected in data.files.items():
-        file = folder / path
-        if not file.is_file():
-            missing.append(path)
-            continue
-        try:
-            same = hash_values(read_values(file)) == expected
-        except ValueError:
-            same = False
-        good += same
-        if not same:
-            corrupt.append(path)
+    missing = [path for path in data.files if not (folder / path).is_file()]
+    corrupt = [
+        path
+        for path, expected in data.files.items()
+        if path not in missing and _hash(folder / path) != expected
+    ]
+    good = len(data.files) - len(missing) - len(corrupt)
     yield f"{len(names)} recordings in {folder}; {good} of {len(data.files)} files verified"
     problems = []
     if corrupt:
@@ -253,26 +209,23 @@ def _check_recordings(data: Manifest, folder: Path) -> Iterator[str]:
     if missing or not names:
         source = f"{data.source.repository}, commit {data.source.commit}, {data.source.path}"
         folders = sorted({path.partition("/")[0] for path in missing})
+        more = f" and {len(folders) - SHOWN} more" if len(folders) > SHOWN else ""
+        shown = ", ".join(folders[:SHOWN]) + more
         problems.append(
             f"{data.name}: cannot be downloaded automatically ({data.licence}). Get it from "
-            f"{source} and put into {folder}: "
-            f"{_shortened(folders) or 'the folders of the recordings'}"
+            f"{source} and put into {folder}: {shown or 'the folders of the recordings'}"
         )
     _raise_all(problems)
 
 
-def _shortened(names: Iterable[str], most: int = 6) -> str:
-    names = list(names)
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+def _hash(file: Path) -> str:
+    """The hash of a file's values; empty where it cannot be read."""
+    try:
+        return hash_values(read_values(file))
+    except ValueError:
+        return ""
 
 
 def _raise_all(problems: list[str]) -> None:
     if problems:
         raise ValueError("; ".join(problems))
-
-
-def _pooch() -> Any:
-    pooch = require("pooch", "data", "downloads")
-    pooch.get_logger().setLevel("ERROR")  # what is done is said here
-    return pooch

@@ -1,6 +1,5 @@
 """Recordings and simulated motions from paths: NPZ files, or folders of frames."""
 
-import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Integer
 
-from r2s.files import write_bytes
+from r2s.files import read_npz, write_npz
 from r2s.recordings.datasets import known_bar
 from r2s.recordings.manifest import manifest_for, read_recording, read_recordings
 from r2s.recordings.readers.swings import is_swing, read_swing
@@ -67,9 +66,7 @@ def open_recordings(paths: Sequence[Path]) -> Iterator[Recording]:
 
 def save_trajectory(path: Path | str, x: Any, faces: Any) -> None:
     """Write a motion for `load_trajectory`: `x` (frame, vertex, 3) [m], `faces` (face, 3)."""
-    buffer = io.BytesIO()
-    np.savez(buffer, x=np.asarray(x), faces=np.asarray(faces))
-    write_bytes(path, buffer.getvalue())
+    write_npz(path, x=x, faces=faces)
 
 
 def load_trajectory(path: Path | str) -> SimulatedCloth:
@@ -80,14 +77,10 @@ def load_trajectory(path: Path | str) -> SimulatedCloth:
     missing or of another shape, or a face has a vertex that does not exist.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            if lacking := [name for name in ("x", "faces") if name not in file]:
-                raise ValueError(f"lacks the array {lacking[0]!r}, has {', '.join(file)}")
-            x, faces = np.asarray(file["x"], float), np.asarray(file["faces"])
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # a damaged archive raises anything
+        arrays = read_npz(path, "x", "faces")
+    except ValueError as error:
         raise ValueError(f"{path}: no trajectory (NPZ with x and faces): {error}") from error
+    x, faces = np.asarray(arrays["x"], float), arrays["faces"]
     if x.ndim != 3 or x.shape[2] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise ValueError(
             f"{path}: expected x (frame, vertex, 3) [m] and faces (face, 3), found {x.shape} and "

@@ -1,6 +1,5 @@
 """The canonical observation of a fabric: point clouds and the path of what holds the cloth."""
 
-import io
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -12,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from r2s.files import parse, write_bytes
+from r2s.files import parse, read_npz, write_npz
 from r2s.recordings.cameras.views import Views
-from r2s.recordings.readers.clouds import voxel_means
+from r2s.recordings.readers.clouds import draw_points, voxel_means
 
 FORMAT = "r2s-recording/3"
 # the first knew neither force nor markers nor wind, the second neither doubt nor views
@@ -291,10 +290,7 @@ def subsample(recording: Recording, num_points: int, voxel: float | None, seed: 
     for frame in range(len(recording.times)):
         points = cloud(recording, frame)
         points = points if voxel is None else voxel_means(points, voxel)
-        if len(points) > num_points:
-            generator = np.random.default_rng([seed, frame])
-            points = points[np.sort(generator.choice(len(points), num_points, replace=False))]
-        thinned.append(points)
+        thinned.append(draw_points(points, num_points, (seed, frame)))
     points, mask = _pad(thinned, num_points)
     return replace(recording, points=jnp.asarray(points, float), mask=jnp.asarray(mask))
 
@@ -307,17 +303,15 @@ def save(recording: Recording, path: Path | str) -> None:
     `force`, `force_times`, `markers`, `markers_seen`; `meta`: JSON of format and `info`.
     """
     mask = np.asarray(recording.mask)
-    arrays: dict[str, Any] = {
-        "meta": np.array(json.dumps({"format": FORMAT, "info": asdict(recording.info)})),
-        "points": np.asarray(recording.points)[mask],
-        "offsets": np.cumsum([0, *mask.sum(axis=1)]),
-    }
-    for name in ("times", "handle_path", "handle_times", *OPTIONAL):
-        if (values := getattr(recording, name)) is not None:
-            arrays[name] = np.asarray(values)
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    write_bytes(path, buffer.getvalue())
+    names = ("times", "handle_path", "handle_times", *OPTIONAL)
+    arrays = {name: getattr(recording, name) for name in names}
+    write_npz(
+        path,
+        meta=json.dumps({"format": FORMAT, "info": asdict(recording.info)}),
+        points=np.asarray(recording.points)[mask],
+        offsets=np.cumsum([0, *mask.sum(axis=1)]),
+        **{name: values for name, values in arrays.items() if values is not None},
+    )
 
 
 def load(path: Path | str) -> Recording:
@@ -327,36 +321,24 @@ def load(path: Path | str) -> Recording:
     recording, or of another version of the format.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            meta = json.loads(str(file["meta"]))
-            if meta["format"] not in READABLE:
-                raise ValueError(
-                    f"format {meta['format']!r}, expected one of {READABLE}: update r2s, or "
-                    "convert the recording again"
-                )
-            info = _info_from(meta["info"])
-            clouds = _split(file["points"], file["offsets"])
-            handles = file["handle_path"], file["handle_times"]
-            optional = {name: file[name] for name in OPTIONAL if name in file}
-            return make_recording(clouds, file["times"], *handles, info, **optional)
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # a damaged archive raises anything, from EOFError to zlib.error
+        arrays = read_npz(path, "meta", "points", "offsets", "times", "handle_path", "handle_times")
+        meta = json.loads(str(arrays["meta"]))
+        if meta["format"] not in READABLE:
+            raise ValueError(
+                f"format {meta['format']!r}, expected one of {READABLE}: update r2s, or convert "
+                "the recording again"
+            )
+        return make_recording(
+            _split(arrays["points"], arrays["offsets"]),
+            arrays["times"],
+            arrays["handle_path"],
+            arrays["handle_times"],
+            parse(RecordingInfo, meta["info"], "info"),
+            **{name: arrays[name] for name in OPTIONAL if name in arrays},
+        )
+    except (KeyError, ValueError) as error:
         reason = f"it lacks {error}" if isinstance(error, KeyError) else f"{error}"
-        if not isinstance(error, ValueError):
-            reason += ": copy the file again, or make it anew"
         raise ValueError(f"{path}: not a readable recording ({FORMAT}): {reason}") from error
-
-
-def _info_from(values: dict[str, Any]) -> RecordingInfo:
-    sheet = SheetPlacement(**{key: tuple(value) for key, value in values["sheet"].items()})
-    changed = {"sheet": sheet, "frames_used": tuple(values["frames_used"])}
-    if values.get("wind") is not None:
-        changed["wind"] = tuple(values["wind"])
-    for name, kind in (("doubt", Doubt), ("views", Views)):
-        if values.get(name) is not None:
-            changed[name] = parse(kind, values[name], name)
-    return RecordingInfo(**{**values, **changed})
 
 
 def _split(points: np.ndarray, offsets: np.ndarray) -> list[np.ndarray]:

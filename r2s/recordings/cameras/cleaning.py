@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
 
-from r2s.recordings.readers.clouds import voxel_means
+from r2s.recordings.readers.clouds import draw_points, voxel_means
 
 Corner = tuple[float, float, float]
 
@@ -56,10 +57,7 @@ def clean(
     if how.voxel > 0 and len(points):
         points = voxel_means(points, how.voxel)
     points = points[~outliers(points, how.neighbours, how.deviations)]
-    if 0 < how.max_points < len(points):
-        generator = np.random.default_rng([how.seed, frame])
-        points = points[np.sort(generator.choice(len(points), how.max_points, replace=False))]
-    return points
+    return draw_points(points, how.max_points or len(points), (how.seed, frame))
 
 
 def inside(points: Float[np.ndarray, "point 3"], how: Cleaning) -> Bool[np.ndarray, " point"]:
@@ -76,8 +74,6 @@ def outliers(
     None is where there are no more points than `neighbours`. Points that lie where others do
     count as neighbours; thin the cloud first.
     """
-    from scipy.spatial import KDTree
-
     if neighbours == 0 or len(points) <= neighbours:
         return np.zeros(len(points), bool)
     apart = KDTree(points).query(points, neighbours + 1)[0][:, 1:].mean(axis=1)

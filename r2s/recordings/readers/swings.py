@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from r2s.files import read_npz
 from r2s.recordings.recording import (
     Doubt,
     Recording,
@@ -89,11 +90,8 @@ def read_swing(path: Path | str, bar: Bar, duration: float | None = None) -> Rec
     """
     path = Path(path)
     try:
-        arrays = _read(path)
-        return _recording(path.stem, arrays, bar, duration)
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # a damaged archive raises anything
+        return _recording(path.stem, _read(path), bar, duration)
+    except ValueError as error:
         raise ValueError(f"{path}: no readable swing: {error}") from error
 
 
@@ -106,10 +104,8 @@ def bar_path(
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    with np.load(path, allow_pickle=False) as file:
-        if lacking := [name for name in ARRAYS if name not in file]:
-            raise ValueError(f"lacks the arrays {', '.join(lacking)}; has {', '.join(file)}")
-        arrays = {name: np.asarray(file[name], np.float64) for name in ARRAYS}
+    found = read_npz(path, *ARRAYS)
+    arrays = {name: np.asarray(found[name], np.float64) for name in ARRAYS}
     points, frames = arrays["points"], len(arrays["times"])
     if points.ndim != 4 or points.shape[0] != frames or points.shape[3] != 3:
         raise ValueError(
