@@ -21,7 +21,7 @@ from r2s.recordings.cameras.flaws import (
     flawed_depth,
     flawed_mask,
 )
-from r2s.recordings.cameras.images import encode_depth, read_depth, write_depth
+from r2s.recordings.cameras.images import read_depth, write_depth
 from r2s.recordings.cameras.render import render
 
 SMALL = (32, 24)
@@ -111,7 +111,7 @@ def test_depth_survives_its_file_but_for_rounding(tmp_path) -> None:
         read = read_depth(tmp_path / name, scale, SMALL)
         np.testing.assert_allclose(read, depth, atol=1.01 * close)
     with pytest.raises(ValueError, match="does not fit into 16 bits"):
-        encode_depth(100 * depth, 1e-3)
+        write_depth(tmp_path / "far.png", 100 * depth, 1e-3)
 
 
 def rendered():

@@ -1,6 +1,5 @@
 """Depth images, masks and colour in files."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +23,7 @@ def read_depth(
     FileNotFoundError or ValueError that names the file: truncated, of another kind or size,
     negative depths, no depth at all, depths that are no metres.
     """
-    units = _read_npy(path) if path.suffix.lower() == ".npy" else _read_png(path)
+    units = _read_npy(path) if path.suffix.lower() == ".npy" else read_png(path)
     if units.ndim != 2 or units.dtype == np.uint8 or units.dtype.kind not in "uif":
         kind = f"{8 * units.dtype.itemsize} bits in {units.shape[2] if units.ndim > 2 else 1}"
         raise ValueError(
@@ -50,17 +49,9 @@ def read_mask(path: Path, resolution: tuple[int, int]) -> Bool[np.ndarray, "down
 
     Raises FileNotFoundError or ValueError that names the file: truncated, of another size.
     """
-    image = _read_png(path)
+    image = read_png(path)
     _check_size(path, image, resolution, "make the masks in the pixels of the depth images")
     return image != 0 if image.ndim == 2 else (image[..., :3] != 0).any(axis=2)
-
-
-def encode_depth(depth: Float[np.ndarray, "down across"], scale: float) -> bytes:
-    """A depth image [m] as a 16-bit PNG of `scale` metres per unit; ValueError if it overflows."""
-    units = np.rint(depth / scale)
-    if units.max() > DEEPEST:
-        raise ValueError(f"{depth.max():g} m does not fit into 16 bits of {scale:g} m")
-    return encode_png(units.astype(np.uint16))
 
 
 def encode_png(image: Num[np.ndarray, "down across *channel"]) -> bytes:
@@ -70,12 +61,17 @@ def encode_png(image: Num[np.ndarray, "down across *channel"]) -> bytes:
 
 
 def write_depth(path: Path, depth: Float[np.ndarray, "down across"], scale: float) -> None:
-    """Write a depth image [m]: PNG as `encode_depth`, NPY in units of `scale` [m]."""
+    """Write a depth image [m] in units of `scale` [m]: NPY, or 16-bit PNG.
+
+    Raises ValueError for a depth that does not fit into 16 bits.
+    """
     if path.suffix == ".npy":
-        with open(path, "wb") as file:
-            np.save(file, (depth / scale).astype(np.float32))
-    else:
-        write_bytes(path, encode_depth(depth, scale))
+        np.save(path, (depth / scale).astype(np.float32))
+        return
+    units = np.rint(depth / scale)
+    if units.max() > DEEPEST:
+        raise ValueError(f"{depth.max():g} m does not fit into 16 bits of {scale:g} m")
+    write_bytes(path, encode_png(units.astype(np.uint16)))
 
 
 def _check_size(path: Path, image: np.ndarray, resolution: tuple[int, int], remedy: str) -> None:
@@ -100,30 +96,31 @@ def _check_unit(path: Path, depth: np.ndarray, scale: float) -> None:
         )
 
 
-def _read_png(path: Path) -> np.ndarray:
-    cv2 = require("cv2", "camera", "depth images")
+def read_png(path: Path) -> np.ndarray:
+    """The pixels of a PNG, as they are; ValueError that names a file that is none or damaged."""
+    cv2 = require("cv2", "camera", "images")
     data = path.read_bytes()
     if not data.startswith(PNG_START):
         raise ValueError(
             f"{path}: no PNG: found the bytes {data[:8]!r}: export it as PNG, depth also as NPY"
         )
     # by hand, since the decoder says nothing, or takes a part for the whole
-    if PNG_END not in data[-64:]:
-        raise ValueError(f"{path}: truncated PNG of {len(data)} bytes: copy or export it again")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    is_whole = PNG_END in data[-64:]
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if is_whole else None
     if image is None:
-        raise ValueError(f"{path}: damaged PNG of {len(data)} bytes: copy or export it again")
+        what = "damaged" if is_whole else "truncated"
+        raise ValueError(f"{path}: {what} PNG of {len(data)} bytes: copy or export it again")
     return image
 
 
 def _read_npy(path: Path) -> np.ndarray:
     try:
         values = np.load(path, allow_pickle=False)
+        if not isinstance(values, np.ndarray):
+            raise ValueError("an archive of arrays, expected one depth image")
     except FileNotFoundError:
         raise
     except Exception as error:  # a damaged file raises anything
-        size = os.path.getsize(path)
+        size = path.stat().st_size
         raise ValueError(f"{path}: damaged NPY of {size} bytes ({error}): copy it again") from error
-    if not isinstance(values, np.ndarray):
-        raise ValueError(f"{path}: an archive of arrays, expected one depth image as NPY")
     return values

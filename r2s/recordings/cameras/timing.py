@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from r2s.recordings.readers.columns import number_in, read_lines
+
 LONGEST = 5.0  # [s] between frames: above, times are taken for milliseconds or nanoseconds
 
 
@@ -16,15 +18,12 @@ def read_times(path: Path) -> Float[np.ndarray, " frame"]:
     Raises FileNotFoundError, or ValueError that names the file and the line: no number, times that
     do not increase, or intervals that seconds cannot have.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: no text in UTF-8 ({error.reason}): export it again") from error
-    lines = [line.strip() for line in text.splitlines()]
-    rows = [(number, line) for number, line in enumerate(lines, 1) if line]
-    if rows and re.match(r"[A-Za-z]", rows[0][1].split(",")[-1].strip()):
+    rows = read_lines(path)
+    if rows and re.match("[A-Za-z]", rows[0][1][-1]):
         rows = rows[1:]
-    times = np.array([_number(path, number, line) for number, line in rows])
+    times = np.array(
+        [number_in(path, number, cells[-1], "a time [s] last") for number, cells in rows]
+    )
     if len(times) == 0:
         raise ValueError(f"{path}: no times: expected one line a frame, its time [s] last")
     steps = np.diff(times)
@@ -74,15 +73,3 @@ def pair(
             )
         pairs[name] = nearest
     return pairs
-
-
-def _number(path: Path, number: int, line: str) -> float:
-    try:
-        value = float(line.split(",")[-1])
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise ValueError(
-            f"{path}: line {number}: expected a time [s] last, found {line!r}: write a number"
-        )
-    return value

@@ -39,7 +39,7 @@ def read_columns(path: Path | str, columns: Mapping[str, Mapping[str, float]]) -
     no unit, values that are no finite numbers, fewer than two samples.
     """
     path = Path(path)
-    lines = _lines(path)
+    lines = read_lines(path)
     if not lines:
         raise ValueError(f"{path}: the log is empty")
     header = lines[0][1]
@@ -51,7 +51,7 @@ def read_columns(path: Path | str, columns: Mapping[str, Mapping[str, float]]) -
                 f"{path}: line {number} has {len(cells)} columns, the header {len(header)}: it is "
                 "cut short, or decimal commas part the columns (write decimal points)"
             )
-        rows.append([_number(path, number, cells[index]) * unit for index, unit in places])
+        rows.append([number_in(path, number, cells[index]) * unit for index, unit in places])
     if len(rows) < 2:
         raise ValueError(f"{path}: expected two samples or more, found {len(rows)}")
     return Columns(np.array(rows), tuple(number for number, _ in lines[1:]))
@@ -59,16 +59,20 @@ def read_columns(path: Path | str, columns: Mapping[str, Mapping[str, float]]) -
 
 def header_of(path: Path | str) -> list[str]:
     """The cells of a CSV's header; none of an empty file."""
-    lines = _lines(Path(path))
+    lines = read_lines(Path(path))
     return lines[0][1] if lines else []
 
 
-def _lines(path: Path) -> list[tuple[int, list[str]]]:
-    """The lines that hold something, with their numbers, as cells."""
+def read_lines(path: Path) -> list[tuple[int, list[str]]]:
+    """The lines of a CSV that hold something, with their numbers, as cells.
+
+    Cells are parted by commas, semicolons or tabs; lines that begin with # are passed over. Raises
+    FileNotFoundError, or a ValueError that names the file.
+    """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: no text in UTF-8: {error}") from error
+        raise ValueError(f"{path}: no text in UTF-8 ({error.reason}): export it again") from error
     kept = [
         (number, line)
         for number, line in enumerate(text.splitlines(), 1)
@@ -115,11 +119,12 @@ def _column(
     return index, units[unit]
 
 
-def _number(path: Path, line: int, cell: str) -> float:
+def number_in(path: Path, line: int, cell: str, what: str = "a finite number") -> float:
+    """The number in a cell; ValueError that names the file and the line when there is none."""
     try:
         value = float(cell)
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        raise ValueError(f"{path}: line {line}: expected a finite number, found {cell!r}")
+        raise ValueError(f"{path}: line {line}: expected {what}, found {cell!r}: write a number")
     return value

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from r2s.extras import require
+from r2s.recordings.cameras.images import read_png
 from r2s.recordings.readers.numbered import find_numbered
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -37,13 +38,11 @@ def read_grey(path: Path | str) -> Iterator[UInt8[np.ndarray, "height width"]]:
 def _images(folder: Path) -> Iterator[tuple[Path, np.ndarray]]:
     cv2 = require("cv2", "camera", "videos and images")
     for file in find_numbered(folder, IMAGES).values():
-        data = file.read_bytes()
-        # libpng hands out the rows that it has: a cut file must be told by its missing end
-        cut = file.suffix.lower() == ".png" and b"IEND" not in data[-16:]
-        buffer = np.frombuffer(data, np.uint8)
-        image = cv2.imdecode(buffer, cv2.IMREAD_GRAYSCALE) if len(buffer) and not cut else None
+        if file.suffix.lower() == ".png":
+            read_png(file)  # of a cut one OpenCV takes the rows that are there
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
         if image is None:
-            raise ValueError(f"{file}: damaged or cut short: copy it again from the camera")
+            raise ValueError(f"{file}: damaged: copy it again from the camera")
         yield file, np.asarray(image, np.uint8)
 
 
@@ -56,12 +55,9 @@ def _video(path: Path) -> Iterator[tuple[Path, np.ndarray]]:
         if not capture.isOpened():
             raise ValueError(f"{path}: no video that OpenCV can read: convert it to MP4 (H.264)")
         promised, number = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0
-        while True:
-            there, image = capture.read()
-            if not there:
-                break
+        while (found := capture.read())[0]:
             number += 1
-            image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+            image = found[1] if found[1].ndim == 2 else cv2.cvtColor(found[1], cv2.COLOR_BGR2GRAY)
             yield path, np.asarray(image, np.uint8)
     finally:
         capture.release()
