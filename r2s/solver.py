@@ -21,12 +21,22 @@ State = TypeVar("State")
 class Solver(Protocol[State]):
     """What `simulate` and the estimators ask of a solver.
 
-    Its fabric is an `r2s.Fabric`, or what else its bodies are made of.
+    Its fabric is an `r2s.Fabric`, or what else its bodies are made of. A state has positions `x`
+    [m] and a `failure` (`r2s.Failure`).
     """
 
-    dt: float
+    dt: float  # [s]
 
-    def step(self, fabric: Any, state: State, control: Control) -> State: ...
+    def step(self, fabric: Any, state: State, control: Control) -> State:
+        """The state `dt` later."""
+        ...
+
+    def check(self, fabric: Any) -> None:
+        """Raise `ValueError` where steps of `dt` are unstable for a fabric that is not traced."""
+
+    def fits(self, fabric: Any) -> Bool[Array, ""]:
+        """Whether steps of `dt` are stable for a fabric that may be traced, as far as is known."""
+        ...
 
 
 def predicted_memory(function: Callable, *args) -> int:
@@ -89,9 +99,8 @@ def simulate(
 ) -> Trajectory:
     """The motion under `controls`, whose leading axes are (frame, substep).
 
-    A solver whose steps have a limit (its `check`) refuses a fabric that is too stiff for them by
-    `ValueError`. Where the fabric is traced the run of one that says so (its `fits`, as explicit
-    steps of a cloth have it) fails in its first step (`Failure.TIME_STEP`).
+    Raises `ValueError` for a fabric that is too stiff for the solver's steps (`Solver.check`). A
+    run with a traced one fails in its first step (`Solver.fits`, `Failure.TIME_STEP`).
 
     `frames`: how many are wanted, which may be traced: what comes after them is not simulated, and
     repeats the last. None: all.
@@ -101,8 +110,8 @@ def simulate(
     states of the frames, and those of the steps of one frame at a time, which it solves again: the
     time of one more forward run, for the memory of about frames + substeps states.
     """
-    if hasattr(solver, "check") and not is_traced(solver, fabric):
-        solver.check(fabric)  # pyright: ignore[reportAttributeAccessIssue]
+    if not is_traced(solver, fabric):
+        solver.check(fabric)
     names = (SAVED,) if keep_solutions else ()
     policy = jax.checkpoint_policies.save_only_these_names(*names)
 
@@ -131,9 +140,8 @@ def simulate(
         numbers = jnp.arange(jax.tree.leaves(controls)[0].shape[0])
         wanted = jax.checkpoint(wanted, policy=policy)
         _, (x, failures) = jax.lax.scan(wanted, start, (numbers, controls))
-    if hasattr(solver, "fits"):  # once, and not in every step
-        fits = solver.fits(fabric)  # pyright: ignore[reportAttributeAccessIssue]
-        failures = jnp.where(fits, failures, Failure.TIME_STEP.value)
+    # once, and not in every step
+    failures = jnp.where(solver.fits(fabric), failures, Failure.TIME_STEP.value)
     unfailed = jnp.all(failures == Failure.NONE.value, axis=1)
     ok = jnp.all(jnp.isfinite(x), axis=(1, 2)) & jnp.cumprod(unfailed).astype(bool)
     return Trajectory(x, ok, *_first_failure(failures))
@@ -143,7 +151,7 @@ def _failure(state: Any) -> Int[Array, ""]:
     """The failure that a state carries, or that its positions are not finite."""
     finite = jnp.all(jnp.isfinite(jax.lax.stop_gradient(state.x)))
     seen = jnp.where(finite, Failure.NONE.value, Failure.NON_FINITE.value)
-    return first_failure(getattr(state, "failure", no_failure()), seen)
+    return first_failure(state.failure, seen)
 
 
 def _first_failure(failures: Int[Array, "frame step"]) -> tuple[Array, Array, Array]:

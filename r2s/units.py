@@ -1,9 +1,11 @@
-"""Constants and conversions. Everything in r2s is SI: metres, kilograms, seconds; z is up.
+"""Constants, conversions, checks of quantities. All is SI: metres, kilograms, seconds; z is up.
 
 Membrane stiffness is a force per width, [N/m]; bending stiffness a moment per curvature and width,
 [N m]; areal density [kg/m^2]. Shear strain is the engineering one, so that C33 of an isotropic
 sheet is its shear modulus times its thickness.
 """
+
+import math
 
 from jaxtyping import Array, Float
 
@@ -11,6 +13,20 @@ GRAVITY = 9.81  # [m/s^2], downwards
 AIR_DENSITY = 1.2  # [kg/m^3], at 20 degrees Celsius and 101 kPa
 
 Scalar = Float[Array, ""] | float
+
+
+def positive(unit: str, **numbers: float) -> None:
+    """Raise a `ValueError` that names a number and its unit unless it is positive and finite."""
+    for name, value in numbers.items():
+        if not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{name} must be positive [{unit}], found {value}")
+
+
+def not_negative(unit: str, **numbers: float) -> None:
+    """As `positive`, but zero is allowed."""
+    for name, value in numbers.items():
+        if not (math.isfinite(value) and value >= 0):
+            raise ValueError(f"{name} must not be negative [{unit}], found {value}")
 
 
 def isotropic_membrane(

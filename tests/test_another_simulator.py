@@ -70,21 +70,12 @@ def test_a_sheet_that_is_let_go_falls_freely_from_the_first_step_on(fabric):
     assert np.diff(lag)[1:] == pytest.approx(GRAVITY * INTERVAL / 4 * INTERVAL, rel=0.05)
 
 
-def test_the_first_acceleration_reaches_a_braked_solver_and_no_other_than_the_cloth():
+def test_the_first_acceleration_reaches_a_braked_solver():
     scenario = dropped(brake=5.0)
     solver, _ = stepped(scenario)
     state = begin(solver, scenario)
     assert jnp.all(state.inner.v_before[1:, 2] == GRAVITY * solver.dt)
 
-    class Explicit:
-        """A solver that does not look back."""
-
-        dt = 0.01
-
-        def init(self, x):
-            return x
-
-    assert begin(Explicit(), dataclasses.replace(scenario, brake=None)) is scenario.start
     free = Cloth.make(scenario.scene, 0.01)
     assert jnp.all(begin(free, dataclasses.replace(scenario, acceleration=None)).v_before == 0)
 

@@ -18,7 +18,7 @@ from test_show import recorded  # noqa: E402
 
 from r2s.cli import main  # noqa: E402
 from r2s.commands.common import choose_shape, make_experiment, print_result  # noqa: E402
-from r2s.commands.doctor import EXCLUDED, EXTRAS, implausible  # noqa: E402
+from r2s.commands.doctor import EXCLUDED, implausible  # noqa: E402
 from r2s.commands.estimate import EstimateCard  # noqa: E402
 from r2s.commands.estimate_report import Outcome, approach, assumed  # noqa: E402
 from r2s.estimation import cards
@@ -164,11 +164,10 @@ def test_the_doctor_knows_the_installation(capsys: pytest.CaptureFixture) -> Non
     assert main(["doctor", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["x64"] and told["versions"]["jax"] not in EXCLUDED and told["wrong"] == []
-    assert told["missing"].keys() == EXTRAS.keys() and not told["missing"]["cli"]
+    assert not told["missing"]["cli"] and told["missing"]["bench"]
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
     (jax,) = (text for text in project["dependencies"] if text.startswith("jax>"))
     assert all(f"!={version}" in jax for version in EXCLUDED)
-    assert {*EXTRAS, "dev"} == project["optional-dependencies"].keys()
 
 
 def test_the_doctor_finds_wrong_units(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

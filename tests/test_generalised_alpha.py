@@ -24,7 +24,6 @@ from r2s.cloth.cloth import Cloth
 from r2s.cloth.generalised_alpha import coefficients
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.elements import vertex_masses
-from r2s.scenarios.gripper_forces import step_with_forces
 from r2s.solver import simulate
 from r2s.units import AIR_DENSITY, GRAVITY
 from r2s.world import contact
@@ -128,7 +127,7 @@ def test_grippers_carry_the_weight(sheet, fabric):
     states = roll(solver, damped, solver.init(hanging(sheet)), 400)
     last = jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), states)
     control = Control(last.x[:5], jnp.zeros(3))
-    _, forces = eqx.filter_jit(step_with_forces)(solver, damped, last, control)
+    _, forces = eqx.filter_jit(solver.step_with_forces)(damped, last, control)
     weight = float(jnp.sum(vertex_masses(sheet, damped.density))) * GRAVITY
     assert np.asarray(forces.sum(axis=0)) == pytest.approx([0, 0, weight], abs=1e-5 * weight)
 

@@ -14,7 +14,6 @@ from rgbd_scene import INFO, PATH, TIMES, camera, distances, rig, surface, write
 
 from r2s.recordings.cameras.calibration import DepthCamera, look_at
 from r2s.recordings.cameras.cleaning import Cleaning, clean, inside, outliers
-from r2s.recordings.cameras.flaws import NONE
 from r2s.recordings.cameras.images import encode_png, read_depth, read_mask
 from r2s.recordings.cameras.rgbd import (
     Rig,
@@ -25,6 +24,7 @@ from r2s.recordings.cameras.rgbd import (
     stream,
     write_rig,
 )
+from r2s.recordings.cameras.synthetic_rgbd import NONE
 from r2s.recordings.cameras.timing import pair, read_times
 from r2s.recordings.manifest import manifest_for, read_recording
 from r2s.recordings.recording import cloud, load, save

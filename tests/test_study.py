@@ -12,6 +12,7 @@ import jax.random as jr
 import numpy as np
 import pytest
 
+from r2s import scenarios
 from r2s.estimation.diffcloud import MASS, DiffCloud
 from r2s.estimation.diffcloud import STRETCH as MULTIPLIER
 from r2s.estimation.estimate import point_estimate
@@ -58,7 +59,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def fold():
-    return synthetic.fold(presets.grey_interlock(), "grey", 1, key=jr.key(1))
+    return synthetic.record(scenarios.folding(), presets.grey_interlock(), "grey", key=jr.key(1))
 
 
 @pytest.fixture(scope="module")

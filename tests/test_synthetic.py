@@ -33,14 +33,18 @@ def test_a_point_projects_where_similar_triangles_say():
     np.testing.assert_allclose(pixel[0], [80 + 200 * 0.05, 60 - 200 * 0.025], atol=1e-9)
 
 
+def recorded_lift():
+    return synthetic.record(scenarios.lifting(), presets.grey_interlock(), "grey", key=jr.key(0))
+
+
 @pytest.fixture(scope="module")
 def recording():
-    return synthetic.lift(presets.grey_interlock(), "grey", 1, key=jr.key(0))
+    return recorded_lift()
 
 
 @pytest.mark.slow(group="motions")
 def test_the_same_key_gives_the_same_recording(recording):
-    again = synthetic.lift(presets.grey_interlock(), "grey", 1, key=jr.key(0))
+    again = recorded_lift()
     np.testing.assert_array_equal(recording.points, again.points)
 
 

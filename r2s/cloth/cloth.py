@@ -10,12 +10,12 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from r2s.cloth.generalised_alpha import by_generalised_alpha, rates_after
 from r2s.cloth.linear.elimination import Elimination
 from r2s.cloth.newton import minimise
-from r2s.cloth.potential import IncrementalPotential
+from r2s.cloth.potential import IncrementalPotential, residual
 from r2s.cloth.self_contact.detection import SMALL, SelfContact, colliding, touching
 from r2s.fabrics.fabric import Fabric
 from r2s.failures import Failure, first_failure, no_failure
@@ -125,6 +125,25 @@ class Cloth(eqx.Module):
         before = x - self.dt * v + self.dt**2 / 2 * a, v - self.dt * a
         forces = (None, None) if self.spectral_radius is None else (a, a)
         return ClothState(x, v, *before, no_failure(), *forces)
+
+    def check(self, fabric: Fabric) -> None:
+        """Implicit steps are stable for any fabric."""
+
+    def fits(self, fabric: Fabric) -> Bool[Array, ""]:
+        """Implicit steps are stable for any fabric."""
+        return jnp.ones((), bool)
+
+    def step_with_forces(
+        self, fabric: Fabric, state: ClothState, control: Control
+    ) -> tuple[ClothState, Float[Array, "handle 3"]]:
+        """The state `dt` later, and the grippers' forces [N] on the held vertices.
+
+        The derivative of the step's potential in their place, which vanishes for free vertices;
+        self-contact is left out.
+        """
+        after = self.step(fabric, state, control)
+        forces = residual(self.potential(fabric, state, control), after.x)
+        return after, forces[self.scene.held]
 
     def step(self, fabric: Fabric, state: ClothState, control: Control) -> ClothState:
         """The state `dt` later, with the held vertices at `control.handles`."""

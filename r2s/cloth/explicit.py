@@ -151,8 +151,13 @@ class ExplicitCloth(eqx.Module):
         material = f"the fabric and the mesh (dt = {self.dt:g} s in {self.substeps} substeps)"
         check_step(self.dt / self.substeps, jnp.asarray(longest), material)
 
-    def init(self, x: Positions, v: Positions | None = None) -> ExplicitState:
-        """A state from positions [m] and velocities [m/s] (default: zero)."""
+    def init(
+        self, x: Positions, v: Positions | None = None, acceleration: Positions | None = None
+    ) -> ExplicitState:
+        """A state from positions [m] and velocities [m/s] (default: zero).
+
+        The `acceleration` is of no use: a step needs nothing of the step before.
+        """
         v = jnp.zeros_like(x) if v is None else v
         return ExplicitState(x, v, *no_memory(self.scene.mesh, self.grid, x.dtype), no_failure())
 

@@ -1,7 +1,10 @@
 """`r2s doctor`: is what is installed, and what a card and a scenario say, sound?"""
 
+import platform
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,30 +16,6 @@ if TYPE_CHECKING:
     from r2s.fabrics.fabric import Fabric
 
 EXCLUDED = {"0.10.2": "wrong numbers from a jitted vmap on the CPU", "0.11.1": "no flax"}
-EXTRAS = {
-    "study": (
-        "jinja2",
-        "matplotlib",
-        "pandas",
-        "plotly",
-        "psutil",
-        "statsmodels",
-        "tqdm",
-        "trimesh",
-    ),
-    "pcd": ("pypcd4",),
-    "camera": ("cv2",),
-    "data": ("pooch",),
-    "cli": ("tyro", "psutil"),
-    "physnet": ("skopt", "sklearn"),
-    "pinn": ("flax",),
-    "laboratory": ("h5py",),
-    "cma": ("cma",),
-    "cluster": ("dask", "distributed", "dask_jobqueue"),
-    "viz": ("viser",),
-    "mujoco": ("mujoco",),
-    "bench": ("mujoco", "newton", "warp", "taichi"),
-}
 PACKAGES = ("r2s", "jax", "jaxlib", "equinox", "optax", "lineax", "numpy")
 PLAUSIBLE = {  # of fabrics for clothes and the household
     "density": (0.05, 1.0, "kg/m^2", "an areal density: a T-shirt has 0.15, denim 0.4"),
@@ -73,27 +52,13 @@ class Doctor:
 
     def run(self) -> int:
         from r2s.commands.common import load_card, print_result
-        from r2s.fabrics.fold_length import fold_length
-        from r2s.scenarios.six import SIDE
 
         result, lines, wrong = installation()
         if self.fabric:
             card = load_card(self.fabric)
-            found = list(implausible(card.fabric))
-            wrong += [f"{card.name}: {text}" for text in found]
-            lines.append(f"fabric {card.name}: {'see below' if found else 'plausible'}")
-            length = float(fold_length(card.fabric))
-            lines.append(f"    it folds at {1e3 * length:.1f} mm: longer cells cannot follow")
-            errors = mesh_errors(card.fabric, self.shape)
-            mesh = f"{self.shape[0]} x {self.shape[1]} vertices"
-            lines.append(f"    expected errors of a sheet of {SIDE} m with {mesh}:")
-            lines += [f"        {name}: {text}" for name, (_, text) in errors.items()]
-            result["fabric"] = {
-                "name": card.name,
-                "implausible": found,
-                "fold_length_m": length,
-                "mesh_error_m": {name: error for name, (error, _) in errors.items()},
-            }
+            result["fabric"], more = _fabric(card.name, card.fabric, self.shape)
+            lines += more
+            wrong += [f"{card.name}: {text}" for text in result["fabric"]["implausible"]]
         if self.mesh is not None:
             result["mesh"], text = _mesh(self.mesh)
             lines.append(text)
@@ -143,40 +108,47 @@ class Doctor:
         ]
 
 
-def mesh_errors(fabric: "Fabric", shape: tuple[int, int]) -> dict[str, tuple[float, str]]:
-    """The error [m] that a mesh leaves in each motion of a fabric, and in words."""
+def _fabric(
+    name: str, fabric: "Fabric", shape: tuple[int, int]
+) -> tuple[dict[str, Any], list[str]]:
+    """Whether its numbers are plausible, and the error that a mesh leaves in each motion."""
+    from r2s.fabrics.fold_length import fold_length
     from r2s.scenarios import resolution
     from r2s.scenarios.six import SIDE
 
-    found = {}
-    for motion in resolution.TABLE:
-        error = resolution.mesh_error(fabric, (SIDE, SIDE), shape, motion)
+    found, length, sheet = list(implausible(fabric)), float(fold_length(fabric)), (SIDE, SIDE)
+    errors = {m: resolution.mesh_error(fabric, sheet, shape, m) for m in resolution.TABLE}
+    lines = [
+        f"fabric {name}: {'see below' if found else 'plausible'}",
+        f"    it folds at {1e3 * length:.1f} mm: longer cells cannot follow",
+        f"    expected errors of a sheet of {SIDE} m with {shape[0]} x {shape[1]} vertices:",
+    ]
+    for motion, error in errors.items():
         words = "enough"
         if error > resolution.ENOUGH:
-            instead = resolution.advice(fabric, (SIDE, SIDE), shape, motion)
-            words = f"too coarse, {instead}"
-        found[motion] = error, f"{1e3 * error:.1f} mm, {words}"
-    return found
+            words = f"too coarse, {resolution.advice(fabric, sheet, shape, motion)}"
+        lines.append(f"        {motion}: {1e3 * error:.1f} mm, {words}")
+    result = {
+        "name": name,
+        "implausible": found,
+        "fold_length_m": length,
+        "mesh_error_m": errors,
+    }
+    return result, lines
 
 
 def installation() -> tuple[dict[str, Any], list[str], list[str]]:
     """What is installed: as data, in lines, and what is wrong with it."""
-    import importlib.util
-    import platform
-    from importlib import metadata
-
     import jax
 
     versions = {"python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    missing = {
-        extra: [name for name in modules if importlib.util.find_spec(name) is None]
-        for extra, modules in EXTRAS.items()
-    }
+    versions |= {name: _version(name) or "not installed" for name in PACKAGES}
+    missing: dict[str, list[str]] = {}
+    for requirement in metadata.requires("r2s") or ():
+        found = re.match(r"([\w.-]+).*extra == ['\"]([\w-]+)['\"]", requirement)
+        if found and found[2] != "dev":
+            lacking = missing.setdefault(found[2], [])
+            lacking += [] if _version(found[1]) else [found[1]]
     devices = [f"{each.platform} {each.device_kind}" for each in jax.devices()]
     x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
     lines = [", ".join(f"{name} {version}" for name, version in versions.items())]
@@ -189,6 +161,14 @@ def installation() -> tuple[dict[str, Any], list[str], list[str]]:
         wrong.append(f"jax {jax.__version__} ({EXCLUDED[jax.__version__]}): install another one")
     result = {"versions": versions, "devices": devices, "x64": x64, "missing": missing}
     return result, lines, wrong
+
+
+def _version(package: str) -> str:
+    """The version of an installed package; empty where it is not."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return ""
 
 
 def implausible(fabric: "Fabric") -> Iterator[str]:
@@ -229,8 +209,7 @@ def _mesh(path: Path) -> tuple[dict[str, Any], str]:
         mesh = Mesh.make(np.delete(places, flat, axis=1), faces)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    corners = np.asarray(mesh.rest)[np.asarray(mesh.faces)]
-    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
+    edges = loaded.edges_unique_length
     result = {
         "vertices": len(places),
         "faces": len(faces),

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from r2s.failures import first_failure, no_failure
 from r2s.forces.stability import check_step, longest_step
@@ -129,6 +129,10 @@ class Block(eqx.Module):
         with jax.ensure_compile_time_eval():
             longest = stable_step(self.background, solid)
         check_step(self.dt, longest, "the solid and the grid")
+
+    def fits(self, solid: Solid) -> Bool[Array, ""]:
+        """Not judged where a solid is traced."""
+        return jnp.ones((), bool)
 
     def init(self, x: Points, v: Points | None = None) -> BlockState:
         """A state of no strain from positions [m] and velocities [m/s] (default: zero).

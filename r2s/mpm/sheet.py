@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from r2s.fabrics.fabric import Fabric
 from r2s.failures import first_failure, no_failure
@@ -135,8 +135,16 @@ class Sheet(eqx.Module):
             longest = stable_step(mesh, spacing, fabric, *times, self.transverse)
         check_step(self.dt, longest, "the fabric, the mesh and the grid")
 
-    def init(self, x: Vertices, v: Vertices | None = None) -> SheetState:
+    def fits(self, fabric: Fabric) -> Bool[Array, ""]:
+        """Not judged where a fabric is traced."""
+        return jnp.ones((), bool)
+
+    def init(
+        self, x: Vertices, v: Vertices | None = None, acceleration: Vertices | None = None
+    ) -> SheetState:
         """A state from positions [m] and velocities [m/s] (default: zero), with free layers.
+
+        The `acceleration` is of no use: a step needs nothing of the step before.
 
         Raises `ValueError` when a vertex is outside the grid, unless positions are traced.
         """

@@ -22,6 +22,7 @@ from r2s.recordings.recording import (
     SheetPlacement,
     make_recording,
 )
+from r2s.units import positive
 
 Vector = tuple[float, float, float]
 Watch = Callable[[Iterable[Any]], Iterable[Any]]
@@ -36,7 +37,7 @@ class Transform:
     translation: Vector  # [m]
 
     def __post_init__(self) -> None:
-        _positive("scale", self.scale, "m per unit")
+        positive("m per unit", scale=self.scale)
         rotation = np.array(self.rotation)
         square = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-6)
         if not square or np.linalg.det(rotation) < 0:
@@ -58,7 +59,7 @@ class Gripper:
     note: str
 
     def __post_init__(self) -> None:
-        _positive("rate", self.rate, "Hz")
+        positive("Hz", rate=self.rate)
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ class Scenario:
     views: Views | None = None
 
     def __post_init__(self) -> None:
-        _positive("frame_rate", self.frame_rate, "Hz")
+        positive("Hz", frame_rate=self.frame_rate)
         if not 0 <= self.frames_used[0] <= self.frames_used[1]:
             raise ValueError(f"frames_used must be [first, last], found {self.frames_used}")
         try:
@@ -338,8 +339,3 @@ def _verify(listed: Mapping[str, str], name: str, found: Mapping[str, np.ndarray
 def _distinct(points: np.ndarray) -> np.ndarray:
     _, first = np.unique(points, axis=0, return_index=True)
     return points[np.sort(first)]
-
-
-def _positive(what: str, value: float, unit: str) -> None:
-    if not value > 0:
-        raise ValueError(f"{what} must be positive [{unit}], found {value}")

@@ -1,11 +1,10 @@
 """The six scenarios of the study, for any fabric and solver.
 
 - `scenario`: a sheet at rest, what holds it, how that moves, which frames count; `rollout`.
-- `six`: lifting, wind, stretching, folding, fling, shaking; and varied at random.
-- `swing`: a sheet on a moving bar.
+- `six`: lifting, wind, stretching, folding, fling, shaking; varied at random; a swing on a bar.
 - `paths`: how grippers move in them.
 - `on_points`, `in_explicit_steps`: the same on material points, and by explicit steps of the cloth.
-- `gripper_forces`, `energy`: what grippers feel, and where the energy goes.
+- `energy`: where the energy goes.
 - `synthetic`: recordings of a known fabric, seen by cameras.
 """
 
@@ -20,10 +19,10 @@ from r2s.scenarios.six import (
     lifting,
     shaking,
     stretching,
+    swing,
     varied,
     wind,
 )
-from r2s.scenarios.swing import swing
 
 __all__ = [
     "SIX",

@@ -12,9 +12,7 @@ from r2s.geometry.elements import strains, vertex_masses
 from r2s.geometry.mesh import Mesh
 from r2s.geometry.strain_samples import on_samples
 from r2s.laws.wrinkling import membrane_on_samples
-from r2s.scenarios.gripper_forces import step_with_forces
-from r2s.scenarios.scenario import Scenario, as_cut, begin, stepped
-from r2s.solver import Solver
+from r2s.scenarios.scenario import Scenario, SheetSolver, as_cut, begin, stepped
 from r2s.units import GRAVITY
 from r2s.world.drag import drag_on_vertices
 from r2s.world.scene import Control
@@ -55,7 +53,7 @@ def energy_balance(
     scenario: Scenario,
     fabric: Fabric,
     max_step: float | None = None,
-    solver: Solver | None = None,
+    solver: SheetSolver | None = None,
 ) -> EnergyBalance:
     """The motion of a fabric with forces and energies, from the first frame on.
 
@@ -70,7 +68,7 @@ def energy_balance(
 
     def step(carried: Any, control: Control):
         state, before = carried
-        after, forces = step_with_forces(solver, fabric, state, control)
+        after, forces = solver.step_with_forces(fabric, state, control)
         moved = after.x - state.x
         drag = _drag(scenario, state, after, control)
         work = jnp.sum((before + forces) / 2 * moved[held]), jnp.sum(drag * moved)

@@ -6,7 +6,6 @@ or with which a path would not be at rest when its `duration` ends, raise a `Val
 them.
 """
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -14,8 +13,10 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
+from scipy.spatial.transform import Rotation
 
 from r2s.recordings.recording import SheetPlacement, corner
+from r2s.units import not_negative, positive
 
 KNOT_RATE = 120.0  # [1/s]: in a fling of 20 m/s^2 the speed jumps by 0.17 m/s from knot to knot
 UP = np.array([0.0, 0.0, 1.0])
@@ -183,9 +184,7 @@ def shake(
     of `duration` [s].
     """
     not_negative("m", amplitude=amplitude)
-    positive("1/s", frequency=frequency)
-    if frequency > FASTEST:
-        raise ValueError(f"frequency must be at most {FASTEST:g} 1/s, found {frequency}")
+    _check_frequency(frequency)
     positive("s", fade=fade)
     not_negative("s", still=still)
     _ends(duration, "2 fade + still", 2 * fade + still)
@@ -200,18 +199,38 @@ def shake(
     return _route(duration, at)
 
 
-def positive(unit: str, **numbers: float) -> None:
-    """Raise a `ValueError` that names a number and its unit unless it is positive and finite."""
-    for name, value in numbers.items():
-        if not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{name} must be positive [{unit}], found {value}")
+def swing(
+    sheet: SheetPlacement,
+    duration: float,
+    sway: float = 0.1,
+    turn: float = 30.0,
+    frequency: float = 0.8,
+) -> Route:
+    """Both ends of a bar, which goes to and fro and turns about the vertical through its middle.
+
+    It goes out of the sheet's plane by `sway` [m] to either side, turns by `turn` [degrees] to
+    either side, both at a `frequency` [1/s].
+    """
+    not_negative("m", sway=sway)
+    not_negative("degrees", turn=turn)
+    _check_frequency(frequency)
+    ends = np.array([corner(sheet, name) for name in sheet.held])
+    middle = ends.mean(axis=0)
+
+    def at(t):
+        swell, phase = np.sin(np.pi * t / duration) ** 2, 2 * np.pi * frequency * t
+        angle = np.radians(turn) * swell * np.cos(phase)
+        turned = Rotation.from_rotvec(np.outer(angle, UP)).as_matrix()
+        aside = (sway * swell * np.sin(phase))[:, None, None] * np.array([0.0, 1.0, 0.0])
+        return middle + np.einsum("kij,ej->kei", turned, ends - middle) + aside
+
+    return _route(duration, at)
 
 
-def not_negative(unit: str, **numbers: float) -> None:
-    """As `positive`, but zero is allowed."""
-    for name, value in numbers.items():
-        if not (math.isfinite(value) and value >= 0):
-            raise ValueError(f"{name} must not be negative [{unit}], found {value}")
+def _check_frequency(frequency: float) -> None:
+    positive("1/s", frequency=frequency)
+    if frequency > FASTEST:
+        raise ValueError(f"frequency must be at most {FASTEST:g} 1/s, found {frequency}")
 
 
 def _share(name: str, value: float) -> None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -36,6 +36,21 @@ JET = (1 / 3, 1 / 4)  # radius and edge of a fan's jet, of the sheet's shorter s
 CLAMPS = (("origin", "weft"), ("warp", "opposite"))  # sides that a stretching holds
 BAR = (("origin", "warp"),)  # the side that a swing holds
 CLAMPED = {"stretching": CLAMPS, "swing": BAR}  # sides that are held in a scenario
+
+
+@runtime_checkable
+class SheetSolver(Solver, Protocol):
+    """A solver of a held sheet: Cloth, ExplicitCloth and Sheet."""
+
+    def init(self, x: Array, v: Array | None = None, acceleration: Array | None = None) -> Any:
+        """The state at positions [m], velocities [m/s] and accelerations [m/s^2]; None: zero."""
+
+    def step_with_forces(self, fabric: Fabric, state: Any, control: Control) -> tuple[Any, Array]:
+        """The state `dt` later, and the mean forces [N] of the grippers on the held vertices.
+
+        They have the weight and the inertia of these vertices in them.
+        """
+        ...
 
 
 class Scenario(eqx.Module):
@@ -276,7 +291,7 @@ def rollout(
     scenario: Scenario,
     fabric: Fabric,
     max_step: float | None = None,
-    solver: Solver | None = None,
+    solver: SheetSolver | None = None,
     frames: Int[Array, ""] | int | None = None,
 ) -> Trajectory:
     """How a fabric moves in a scenario: positions [m] at its frames, or at the first of them.
@@ -295,8 +310,8 @@ def rollout(
 
 
 def stepped(
-    scenario: Scenario, max_step: float | None = None, solver: Solver | None = None
-) -> tuple[Solver, int]:
+    scenario: Scenario, max_step: float | None = None, solver: SheetSolver | None = None
+) -> tuple[SheetSolver, int]:
     """The solver of a motion, which brakes the sheet before its first frame, and its steps a frame.
 
     The arguments are those of `rollout`. Raises `ValueError` when a solver's step does not fit, or
@@ -323,11 +338,8 @@ def stepped(
     return Braked(solver, scenario.brake, scenario.lead_in * substeps, solver.dt), substeps
 
 
-def begin(solver: Any, scenario: Scenario) -> Any:
+def begin(solver: SheetSolver, scenario: Scenario) -> Any:
     """The state of a solver from `stepped` at the start of a scenario, without velocity."""
-    bare = solver.solver if isinstance(solver, Braked) else solver
-    if scenario.acceleration is None or not isinstance(bare, Cloth):  # only BDF2 looks back
-        return solver.init(scenario.start)
     return solver.init(scenario.start, None, scenario.acceleration)
 
 
@@ -356,25 +368,24 @@ class BrakedState(eqx.Module):
 class Braked(eqx.Module):
     """A solver whose first steps have more mass damping, so that a sheet comes to rest.
 
-    - `solver`: any, of a `Fabric`.
+    - `solver`: any, of a sheet.
     - `brake`: that damping, beside the fabric's, [1/s].
     - `steps`: how many are braked.
     - `dt`: step of the solver, [s].
     """
 
-    solver: Any
+    solver: SheetSolver
     brake: Float[Array, ""]
     steps: int = eqx.field(static=True)
     dt: float = eqx.field(static=True)
 
     def check(self, fabric: Fabric) -> None:
         """Raises `ValueError` where the steps of the solver are too long for a fabric."""
-        if hasattr(self.solver, "check"):
-            self.solver.check(fabric)
+        self.solver.check(fabric)
 
     def fits(self, fabric: Fabric) -> Bool[Array, ""]:
-        """Whether the steps of the solver are short enough for a fabric, as far as it says."""
-        return self.solver.fits(fabric) if hasattr(self.solver, "fits") else jnp.ones((), bool)
+        """Whether the steps of the solver are short enough for a fabric, as far as is known."""
+        return self.solver.fits(fabric)
 
     def init(self, x: Float[Array, "vertex 3"], *rates: Array | None) -> BrakedState:
         """At positions [m]; `rates` go to the solver; by default it is at rest."""
@@ -382,10 +393,18 @@ class Braked(eqx.Module):
 
     def step(self, fabric: Fabric, state: BrakedState, control: Control) -> BrakedState:
         """The state `dt` later."""
-        inner = self.solver.step(self.braked(fabric, state), state.inner, control)
+        inner = self.solver.step(self._braked(fabric, state), state.inner, control)
         return BrakedState(inner, state.count + 1)
 
-    def braked(self, fabric: Fabric, state: BrakedState) -> Fabric:
+    def step_with_forces(
+        self, fabric: Fabric, state: BrakedState, control: Control
+    ) -> tuple[BrakedState, Float[Array, "handle 3"]]:
+        """The state `dt` later, and the grippers' forces [N] on the held vertices."""
+        braked = self._braked(fabric, state)
+        inner, forces = self.solver.step_with_forces(braked, state.inner, control)
+        return BrakedState(inner, state.count + 1), forces
+
+    def _braked(self, fabric: Fabric, state: BrakedState) -> Fabric:
         """The fabric with the mass damping [1/s] of this step."""
         brake = jnp.where(state.count < self.steps, self.brake, 0)
         return eqx.tree_at(lambda f: f.mass_damping, fabric, fabric.mass_damping + brake)

@@ -15,11 +15,13 @@ from jaxtyping import Float, PRNGKeyArray
 from r2s.recordings.recording import SheetPlacement
 from r2s.scenarios import paths
 from r2s.scenarios.paths import Route
-from r2s.scenarios.scenario import CLAMPS, CLEARANCE, Scenario, from_placement
+from r2s.scenarios.scenario import BAR, CLAMPS, CLEARANCE, Scenario, from_placement
+from r2s.units import not_negative, positive
 
 SIDE = 0.45  # [m], the study's sheets
 NUM_FRAMES = 60
 INTERVAL, STRETCHING_INTERVAL = 1 / 15, 1 / 30  # [s]
+SWING_SIDE, SWING_FRAMES, SWING_INTERVAL = 0.3, 50, 0.1  # [m], -, [s]: those of public swings
 GRIP_HEIGHT = 0.7  # [m] above the table, of a hanging sheet's grippers
 ALL_CORNERS = ("origin", "weft", "warp", "opposite")
 Size = tuple[float, float]
@@ -80,7 +82,7 @@ def lifting(
 ) -> Experiment:
     """A sheet lies flat on the table; a corner is lifted. The second half of the frames counts.
 
-    `path`: see `trajectories.lift`. The left corner is the "origin" or the "weft".
+    `path`: see `paths.lift`. The left corner is the "origin" or the "weft".
 
     >>> scenario = lifting((0.3, 0.3), height=0.2).scenario((5, 5))
     >>> scenario.start.shape, scenario.num_frames
@@ -101,7 +103,7 @@ def folding(
 ) -> Experiment:
     """A sheet lies flat on the table; a corner is brought onto the opposite one.
 
-    `path`: see `trajectories.fold`.
+    `path`: see `paths.fold`.
     """
     return _moved("folding", on_table(size, (held,)), route, num_frames, interval, path)
 
@@ -119,7 +121,7 @@ def stretching(
 
     Its force is `r2s.scenarios.clamp_force`. At a `height` [m] above the table the sheet sags in
     the air instead, until it is pulled taut. A `route` is that of the corners (origin, weft, warp,
-    opposite). `path`: see `trajectories.pull`.
+    opposite). `path`: see `paths.pull`.
     """
     sheet = on_table(size, ALL_CORNERS, height)
     return _moved("stretching", sheet, route, num_frames, interval, path)._replace(clamps=CLAMPS)
@@ -138,9 +140,9 @@ def wind(
 ) -> Experiment:
     """A sheet hangs from its top corners; a fan blows on its middle, `speed` [m/s] on its axis.
 
-    `aside` [degrees] is how far the wind turns from straight on. `path`: see `trajectories.hold`.
+    `aside` [degrees] is how far the wind turns from straight on. `path`: see `paths.hold`.
     """
-    paths.not_negative("m/s", speed=speed)
+    not_negative("m/s", speed=speed)
     if not abs(aside) <= 90:
         raise ValueError(f"aside must be from -90 to 90 [degrees], found {aside}")
     angle = np.radians(aside)
@@ -160,7 +162,7 @@ def fling(
 ) -> Experiment:
     """A sheet hangs from its top corners, which rapidly go forward and back.
 
-    `path`: see `trajectories.fling`.
+    `path`: see `paths.fling`.
     """
     return _moved("fling", hanging(size, height), route, num_frames, interval, path)
 
@@ -176,9 +178,29 @@ def shaking(
 ) -> Experiment:
     """A sheet hangs from its top corners, of which one goes up and down.
 
-    `path`: see `trajectories.shake`.
+    `path`: see `paths.shake`.
     """
     return _moved("shaking", hanging(size, height), route, num_frames, interval, path)
+
+
+def swing(
+    size: Size = (SWING_SIDE, SWING_SIDE),
+    *,
+    route: Route | None = None,
+    height: float = GRIP_HEIGHT,
+    num_frames: int = SWING_FRAMES,
+    interval: float = SWING_INTERVAL,
+    **path: float,
+) -> Experiment:
+    """A sheet hangs from a bar along its warp, which goes to and fro and turns; not of the study.
+
+    A `route` is that of both ends of the bar. `path`: see `paths.swing`.
+
+    >>> swing((0.3, 0.3)).scenario((4, 4)).path.shape[1]  # vertices along the bar
+    4
+    """
+    sheet = hanging(size, height)
+    return _moved("swing", sheet, route, num_frames, interval, path)._replace(clamps=BAR)
 
 
 SIX: dict[str, Callable[..., Experiment]] = {
@@ -194,9 +216,9 @@ SIX: dict[str, Callable[..., Experiment]] = {
 def varied(
     name: str, number: int, size: Size = (SIDE, SIDE), *, key: PRNGKeyArray
 ) -> list[Experiment]:
-    """`number` experiments of a scenario, their numbers drawn within `trajectories.LIMITS`.
+    """`number` experiments of a scenario, their numbers drawn within `paths.LIMITS`.
 
-    The study has `trajectories.ESTIMATION` of each to estimate from and `EVALUATION` to judge by:
+    The study has `paths.ESTIMATION` of each to estimate from and `EVALUATION` to judge by:
     split a key, so that they differ.
     """
     return [SIX[name](size, **numbers) for numbers in paths.draw(name, number, key=key)]
@@ -204,13 +226,13 @@ def varied(
 
 def on_table(size: Size, held: tuple[str, ...], height: float = CLEARANCE) -> SheetPlacement:
     """A sheet of `size` [m], horizontal at a `height` [m], warp along x and weft along y."""
-    paths.not_negative("m", height=height)
+    not_negative("m", height=height)
     return SheetPlacement(size, (0.0, 0.0, height), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), held)
 
 
 def hanging(size: Size, height: float) -> SheetPlacement:
     """A sheet of `size` [m], vertical, held by the ends of its warp at a `height` [m], along x."""
-    paths.positive("m", height=height)
+    positive("m", height=height)
     held = ("origin", "warp")
     return SheetPlacement(size, (0.0, 0.0, height), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), held)
 
@@ -222,6 +244,7 @@ _PATHS: dict[str, Callable[..., Route]] = {
     "folding": paths.fold,
     "fling": paths.fling,
     "shaking": paths.shake,
+    "swing": paths.swing,
 }
 
 
@@ -236,7 +259,7 @@ def _moved(
     """An experiment all of whose frames count: on a `route`, or on the path of these numbers."""
     if num_frames < 2:
         raise ValueError(f"num_frames must be at least 2, found {num_frames}")
-    paths.positive("s", interval=interval)
+    positive("s", interval=interval)
     if route is not None and path:
         raise ValueError(f"{name}: a route is given, which {', '.join(path)} would not change")
     times = np.arange(num_frames) * interval

@@ -1,8 +1,7 @@
 """Synthetic recordings: a known fabric, moved by a solver and seen by cameras.
 
-`lift` and `fold` come from the same solver, mesh and step as the estimates made from them. So they
-test the estimators, not the solver: the error on a real fabric is larger. `record` makes those of
-any scenario, by either solver, on any mesh and with any step.
+An estimate from one of its own solver, mesh and step tests the estimator, not the solver: the error
+on a real fabric is larger. `record` takes any scenario, solver, mesh and step.
 """
 
 import math
@@ -24,17 +23,15 @@ from r2s.recordings.cameras.camera import Camera
 from r2s.recordings.recording import (
     Recording,
     RecordingInfo,
-    SheetPlacement,
     corner,
     make_recording,
 )
 from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
 from r2s.scenarios.paths import Route
-from r2s.scenarios.scenario import Scenario, rollout
+from r2s.scenarios.scenario import Scenario, SheetSolver, rollout
 from r2s.scenarios.six import SIDE, Experiment
-from r2s.solver import Solver, Trajectory
+from r2s.solver import Trajectory
 
-NUM_FRAMES, FRAME_RATE = 60, 15.0  # the study's
 SPACING = SIDE * math.sqrt(2) / 80  # [m], between samples of the surface
 POINTS = 2000  # a frame
 NOISE = 1e-3  # [m], standard deviation
@@ -101,7 +98,7 @@ def record(
     shape: tuple[int, int] = (9, 9),
     max_step: float | None = None,
     self_contact: bool = False,
-    solver: Callable[[Scenario, Fabric], Solver] | None = None,
+    solver: Callable[[Scenario, Fabric], SheetSolver] | None = None,
     motion: Trajectory | None = None,
     key: PRNGKeyArray,
 ) -> Recording:
@@ -121,28 +118,24 @@ def record(
     `RuntimeError` that says why when the simulation diverges, and `ValueError` for a motion of
     another shape.
     """
-    seen = sensing(experiment) if seen is None else seen
     scenario = experiment.scenario(shape, self_contact)
-    balance = None
+    made = None if solver is None else solver(scenario, fabric)
+    measured: dict[str, Any] = {}
     if experiment.name == "stretching":
-        made = None if solver is None else solver(scenario, fabric)
-        balance = _energy_balance(scenario, fabric, max_step, made)
-    if motion is None and (balance is None or not np.isfinite(balance.x).all()):
-        made = None if solver is None else solver(scenario, fabric)
-        motion = _rollout(scenario, fabric, max_step, made)
-    found = motion if balance is None else balance
-    assert found is not None
-    x = found.x
-    if x.shape != (scenario.num_frames, *scenario.start.shape):
+        found = _energy_balance(scenario, fabric, max_step, made)
+        measured = _measured(experiment, scenario, found, key)
+    else:
+        found = motion or _rollout(scenario, fabric, max_step, made)
+    if found.x.shape != (scenario.num_frames, *scenario.start.shape):
         raise ValueError(
             f"expected a motion of {scenario.num_frames} frames and {len(scenario.start)} "
-            f"vertices, got {x.shape}"
+            f"vertices, got {found.x.shape}"
         )
-    if not np.isfinite(x).all():
-        failure = "" if motion is None else motion.explain()
-        raise RuntimeError(f"the simulation of {name} {failure}")
-    measured = {} if balance is None else _measured(experiment, scenario, balance, key)
-    return seen_of(x, experiment, scenario, name, trial, seen, measured, key=key)
+    if not np.isfinite(found.x).all():
+        motion = motion or _rollout(scenario, fabric, max_step, made)
+        raise RuntimeError(f"the simulation of {name} {motion.explain()}")
+    seen = sensing(experiment) if seen is None else seen
+    return seen_of(found.x, experiment, scenario, name, trial, seen, measured, key=key)
 
 
 def seen_of(
@@ -196,50 +189,11 @@ def _measured(
     }
 
 
-def lift(fabric: Fabric, name: str, trial: int, *, key: PRNGKeyArray) -> Recording:
-    """Record one corner that is lifted from the table by 0.35 m and drawn inward.
-
-    `trial` names the repetition, `key` its noise and the 2 mm by which its path differs. Raises
-    as `record`.
-    """
-    inward = 0.15 / np.sqrt(2)
-    knots = [(0.0, 0.0, 0.002), (0.5 * inward, 0.5 * inward, 0.2), (inward, inward, 0.35)]
-    return _record(fabric, name, "lift", trial, "origin", knots, (30, 59), key)
-
-
-def fold(fabric: Fabric, name: str, trial: int, *, key: PRNGKeyArray) -> Recording:
-    """Record one corner that is brought over to the opposite one; otherwise as `lift`."""
-    angles = np.linspace(0, np.pi, 9)
-    reach, height = 0.46 * SIDE, 0.5 * SIDE
-    knots = [(reach * (1 - np.cos(a)), reach * (1 - np.cos(a)), height * np.sin(a)) for a in angles]
-    knots = [(x, y, max(z, 0.01)) for x, y, z in knots]
-    return _record(fabric, name, "fold", trial, "origin", knots, (15, 59), key)
-
-
-def placement(held: str) -> SheetPlacement:
-    """The study's square sheet, flat on a table at z = 0, held at a named corner."""
-    return SheetPlacement((SIDE, SIDE), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (held,))
-
-
 def cameras() -> tuple[Camera, Camera]:
     """Two depth cameras in front of the sheet, one from the left and one from above."""
     target = jnp.array([0.25, 0.25, 0.1], float)
     positions = [(-0.5, -0.1, 0.5), (0.1, -0.4, 0.9)]
     return tuple(Camera(jnp.array(p, float), target) for p in positions)  # pyright: ignore
-
-
-def _record(fabric, name, scenario, trial, held, knots, frames_used, key) -> Recording:
-    key_path, key_view = jr.split(key)
-    sheet = placement(held)
-    # a smooth start and stop, at rest for the last second
-    times = np.arange(NUM_FRAMES) / FRAME_RATE
-    progress = np.clip(times / (times[-1] - 1), 0, 1)
-    progress = progress**2 * (3 - 2 * progress)
-    along = np.linspace(0, 1, len(knots))
-    path = np.stack([np.interp(progress, along, axis) for axis in np.array(knots).T], axis=1)
-    path = path + corner(sheet, held) + 2e-3 * np.asarray(jr.normal(key_path, (3,))) * [1, 1, 0]
-    experiment = Experiment(scenario, sheet, Route(times, path[:, None]), times, frames_used)
-    return record(experiment, fabric, name, trial, key=key_view)
 
 
 def _extended(route: Route, end: float) -> Route:
@@ -289,10 +243,9 @@ def _observe_frame(x: Float[Array, "vertex 3"], faces, resolution: int, lowest, 
     visible = surface[:, 2] > lowest
     if seen.cameras:
         by_camera = [camera.sees(surface) for camera in seen.cameras]
-        visible = visible & jnp.any(jnp.stack(by_camera), axis=0)
+        visible &= jnp.any(jnp.stack(by_camera), axis=0)
     if seen.dropped:
-        kept = jr.uniform(jr.fold_in(key, 1), visible.shape, float) >= seen.dropped
-        visible = visible & kept
+        visible &= jr.uniform(jr.fold_in(key, 1), visible.shape, float) >= seen.dropped
     # a random order with what is seen in front: its first points are a random choice of the seen
     order = jnp.argsort(jr.uniform(key_pick, visible.shape, float) + (~visible).astype(float))
     count = min(seen.points, len(surface))

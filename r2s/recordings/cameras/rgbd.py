@@ -18,6 +18,7 @@ The fields are those of `Rig`, `Cleaning` and `DepthCamera`.
 """
 
 import dataclasses
+import hashlib
 import itertools
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -27,6 +28,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from r2s.files import read_json, write_json
 from r2s.recordings.cameras import images
@@ -106,8 +108,8 @@ def rgbd_recording(
     (force, markers) are as in `make_recording`. Raises as `stream` and `make_recording` do.
     """
     times, clouds = read_clouds(folder, rig or read_rig(folder))
-    times = times + info.time_offset
-    return make_recording(clouds, times, handle_path, handle_times, info, **measured)
+    clock = times + info.time_offset
+    return make_recording(clouds, clock, handle_path, handle_times, info, **measured)
 
 
 def read_clouds(
@@ -286,8 +288,6 @@ def _check_swapped(folder: Path, rig: Rig, parts: Mapping[str, np.ndarray]) -> N
 
 def _apart(one: np.ndarray, other: np.ndarray) -> float:
     """Median distance [m] from the points of a cloud to the nearest of the other, both ways."""
-    from scipy.spatial import KDTree
-
     one, other = (points[:: len(points) // COMPARED + 1] for points in (one, other))
     both = KDTree(one).query(other)[0], KDTree(other).query(one)[0]
     return float(np.median(np.concatenate(both)))
@@ -295,8 +295,6 @@ def _apart(one: np.ndarray, other: np.ndarray) -> float:
 
 def _warn_of_repeats(name: str, path: Path, depth: np.ndarray, last: dict[str, bytes]) -> None:
     """Warn when a camera gives the same image twice: it hung, noise alone would change it."""
-    import hashlib
-
     digest = hashlib.blake2b(depth.data, digest_size=16).digest()
     if last.get(name) == digest:
         warnings.warn(f"{path}: the same image as in the frame before: did it hang?", stacklevel=3)

@@ -1,19 +1,48 @@
-"""Synthetic RGB-D recordings: a moving mesh as folders of images."""
+"""Synthetic RGB-D recordings: a moving mesh as folders of images, with the flaws of real ones."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import distance_transform_edt, gaussian_filter, zoom
 
 from r2s.files import write_bytes, write_text
-from r2s.recordings.cameras.flaws import TYPICAL, Flaws, flawed_depth, flawed_mask
+from r2s.geometry.mesh import rectangle
+from r2s.recordings.cameras.calibration import DepthCamera, rays
+from r2s.recordings.cameras.depth import depth_jumps, from_world
 from r2s.recordings.cameras.images import encode_png, write_depth
 from r2s.recordings.cameras.render import render
 from r2s.recordings.cameras.rgbd import Rig, write_rig
 
 TABLE_CELLS = 8  # along each side, so that few of them reach behind a camera
 FABRIC_COLOUR, TABLE_COLOUR = (60, 60, 200), (120, 140, 150)  # blue, green, red
+STEP = 0.02  # [m]: a jump in depth that counts as an edge
+
+
+@dataclass(frozen=True)
+class Flaws:
+    """How wrong images are; all zero (and `grazing` 90) for perfect ones.
+
+    - `noise`: standard deviation of depth at 1 m, growing with its square, [m].
+    - `grazing`: surfaces turned away by more than this give no depth, [degree].
+    - `edge_holes`, `edge_mixed`: shares of pixels at edges that have no depth, or a depth between
+      that of the two sides.
+    - `holes`: share of all pixels that have no depth.
+    - `mask_error`: standard deviation of the mask's border, [pixel].
+    """
+
+    noise: float = 1.5e-3
+    grazing: float = 82.0
+    edge_holes: float = 0.3
+    edge_mixed: float = 0.3
+    holes: float = 0.003
+    mask_error: float = 1.0
+
+
+TYPICAL = Flaws()
+NONE = Flaws(0.0, 90.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def write_rgbd(
@@ -69,15 +98,9 @@ def _with_table(
     if table is None:
         return x, faces
     height, side = table
-    line = np.linspace(-side / 2, side / 2, TABLE_CELLS + 1)
-    plane = np.stack([*np.meshgrid(line, line), np.full((len(line),) * 2, height)], axis=-1)
-    number = np.arange(len(line) ** 2).reshape(len(line), -1)
-    a, b, c, d = (
-        part.ravel()
-        for part in (number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:])
-    )
-    cells = np.concatenate([np.stack([a, b, d], axis=1), np.stack([a, d, c], axis=1)])
-    return np.concatenate([x, plane.reshape(-1, 3)]), np.concatenate([faces, len(x) + cells])
+    plane = rectangle((side, side), (TABLE_CELLS + 1,) * 2)
+    corners = np.pad(np.asarray(plane.rest) - side / 2, ((0, 0), (0, 1)), constant_values=height)
+    return np.concatenate([x, corners]), np.concatenate([faces, len(x) + np.asarray(plane.faces)])
 
 
 def _picture(depth: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -86,3 +109,67 @@ def _picture(depth: np.ndarray, mask: np.ndarray) -> np.ndarray:
     shade = 1 / (1 + 200 * np.hypot(down, across))
     colours = np.where(mask[..., None], FABRIC_COLOUR, TABLE_COLOUR) * (depth > 0)[..., None]
     return (colours * (0.4 + 0.6 * shade[..., None])).astype(np.uint8)
+
+
+def flawed_depth(
+    camera: DepthCamera,
+    depth: Float[np.ndarray, "down across"],
+    which: Int[np.ndarray, "down across"],
+    x: Float[np.ndarray, "vertex 3"],
+    faces: Int[np.ndarray, "face 3"],
+    flaws: Flaws,
+    generator: np.random.Generator,
+) -> Float[np.ndarray, "down across"]:
+    """A rendered depth image [m] (with the faces that it shows) as a real camera gives it."""
+    found = depth > 0
+    flawed = depth.copy()
+    edges = np.flatnonzero(depth_jumps(depth, STEP))
+    chance = generator.random(len(edges))
+    mixed = edges[chance < flaws.edge_mixed]
+    flawed.flat[mixed] = _mix(depth, mixed, generator)
+    flawed.flat[edges[chance > 1 - flaws.edge_holes]] = 0
+    if flaws.noise > 0:
+        flawed += flaws.noise * flawed**2 * generator.standard_normal(depth.shape, np.float32)
+    if flaws.holes > 0:
+        flawed[generator.random(depth.shape, np.float32) < flaws.holes] = 0
+    if flaws.grazing < 90:
+        flawed[_turned_away(camera, which, x, faces, flaws.grazing)] = 0
+    return np.where(found, np.maximum(flawed, 0), 0)
+
+
+def flawed_mask(
+    mask: Bool[np.ndarray, "down across"], error: float, generator: np.random.Generator
+) -> Bool[np.ndarray, "down across"]:
+    """A mask whose border wanders by `error` pixels (standard deviation), smoothly along it."""
+    if error == 0 or not mask.any() or mask.all():
+        return mask
+    signed = np.asarray(distance_transform_edt(mask)) - distance_transform_edt(~mask)
+    coarse = [size // 8 + 2 for size in mask.shape]  # it changes over about 16 pixels
+    field = gaussian_filter(generator.standard_normal(coarse), 1)
+    wander = zoom(field / field.std(), 8, order=1)[: mask.shape[0], : mask.shape[1]]
+    return signed + error * wander > 0
+
+
+def _mix(depth: np.ndarray, places: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Depths between those of pixels and of a neighbour on the other side of the edge."""
+    rows, columns = np.unravel_index(places, depth.shape)
+    here = depth[rows, columns]
+    there = here
+    for down, across in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+        row = np.clip(rows + down, 0, depth.shape[0] - 1)
+        column = np.clip(columns + across, 0, depth.shape[1] - 1)
+        other = depth[row, column]
+        farther = (other > 0) & (np.abs(other - here) > np.abs(there - here))
+        there = np.where(farther, other, there)
+    return here + generator.random(len(places)) * (there - here)
+
+
+def _turned_away(camera, which, x, faces, limit: float) -> Bool[np.ndarray, "down across"]:
+    corners = from_world(camera, np.asarray(x, np.float64))[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    directions = rays(camera)
+    normal = normals[which]  # where there is no face, any: nothing is seen there
+    along = np.abs(normal[..., 2] + np.einsum("rci,rci->rc", normal[..., :2], directions))
+    length = np.sqrt(1 + (directions**2).sum(axis=-1))
+    return along < np.cos(np.deg2rad(limit)) * length

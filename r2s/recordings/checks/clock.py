@@ -7,10 +7,6 @@ from r2s.recordings.checks.finding import Finding
 from r2s.recordings.checks.seen import FEWEST, Points, Seen, lies
 from r2s.recordings.recording import Recording
 
-UNEVEN = 0.05  # of the interval between frames
-RATE = (1.0, 240.0)  # [Hz]
-FASTEST = 5.0  # [m/s], of a gripper
-LATE = 0.1  # [s]: clean synthetic recordings show up to 0.08
 LAGS = np.arange(-50, 51) / 100  # [s], that are tried
 RATES = np.array([0.5, 0.67, 0.8, 1.0, 1.25, 1.5, 2.0])  # of the clock, that are tried
 CLEARLY = 0.25  # of what is left as written: then another lag or rate is better
@@ -20,46 +16,28 @@ FRAMES = 5  # at least, that show the sheet held up
 NEAR = 6e-3  # [m], within which the tops follow the grippers where nothing is wrong
 MOVES = 0.05  # [m], at least, along an axis that is compared
 UP = 0.1  # [m] above the table: a sheet that is held up
-WAITS = "check the frame rate and time_offset: does a clap or a jerk come at one time in both?"
 
 
 def check_clock(seen: Seen) -> list[Finding]:
     """Intervals, rate, the grippers' speed, and how late the top of the cloud follows them."""
-    recording = seen.recording
-    gaps = np.diff(np.asarray(recording.times, np.float64))
+    gaps = np.diff(np.asarray(seen.recording.times, np.float64))
     middle = float(np.median(gaps)) if len(gaps) else np.nan
     uneven = float(np.abs(gaps / middle - 1).max()) if len(gaps) else np.nan
-    speeds = _speeds(recording)
     lag, rate = _lag(seen)
-    moves = "when the top of the cloud moves, after the grippers do,"
-    moves = moves if np.isfinite(lag) else "the tops of the clouds do not show it"
+    why = "" if np.isfinite(lag) else "the tops of the clouds do not show it"
     return [
-        Finding(
-            "frames", uneven, "-", -np.inf, UNEVEN, "largest deviation from an even interval",
-            "frames were dropped, or their times are not their own: resample them",
-        ),
-        Finding(
-            "rate", 1 / middle, "Hz", *RATE, "frames a second",
-            "are times in seconds?",
-        ),
-        Finding(
-            "grippers", speeds, "m/s", -np.inf, FASTEST, "greatest speed of a gripper",
-            "are the path in metres and its times in seconds?",
-        ),
-        Finding("clock", lag, "s", -LATE, LATE, moves, WAITS),
-        Finding(
-            "clock rate", rate, "-", 0.95, 1.05, "how fast the cameras' clock runs" if
-            np.isfinite(rate) else moves, WAITS,
-        ),
-    ]  # fmt: skip
+        Finding.make("frames", uneven),
+        Finding.make("rate", 1 / middle),
+        Finding.make("grippers", _speed(seen.recording)),
+        Finding.make("clock", lag, why),
+        Finding.make("clock rate", rate, why),
+    ]
 
 
-def _speeds(recording: Recording) -> float:
+def _speed(recording: Recording) -> float:
     path, knots = np.asarray(recording.handle_path), np.asarray(recording.handle_times)
-    if len(knots) < 2:
-        return 0.0
     moved = np.linalg.norm(np.diff(path, axis=0), axis=-1).max(axis=1)
-    return float((moved / np.diff(knots)).max())
+    return float((moved / np.diff(knots)).max(initial=0.0))
 
 
 def _lag(seen: Seen) -> tuple[float, float]:
@@ -74,18 +52,14 @@ def _lag(seen: Seen) -> tuple[float, float]:
     if len(up) < FRAMES:
         return np.nan, np.nan
     times, tops = np.asarray(recording.times, np.float64)[up], np.array([tops[f] for f in up])
-    axes = [axis for axis in (2, 0, 1) if _range(recording, axis) > MOVES]
-    if len(recording.info.sheet.held) == 1:
-        axes = [axis for axis in axes if axis == 2]  # a single corner leans aside
+    path = np.asarray(recording.handle_path)
+    compared = (2,) if len(recording.info.sheet.held) == 1 else (2, 0, 1)  # one corner leans aside
+    axes = [axis for axis in compared if np.ptp(_leader(path, axis)) > MOVES]
     if not axes:
         return np.nan, np.nan
     start = float(recording.times[0])  # where clocks of any rate agree
-    left = np.array(
-        [
-            [_left(recording, start + rate * (times - start) - lag, tops, axes) for lag in LAGS]
-            for rate in RATES
-        ]
-    )
+    at = [start + rate * (times - start) for rate in RATES]
+    left = np.array([[_left(recording, each - lag, tops, axes) for lag in LAGS] for each in at])
     usual = int(np.argmin(np.abs(RATES - 1)))
     best = np.unravel_index(left.argmin(), left.shape)
     if left[best] > CLEARLY * left[usual].min():
@@ -96,10 +70,6 @@ def _lag(seen: Seen) -> tuple[float, float]:
     if best[1] in (0, len(LAGS) - 1):
         return np.nan, np.nan
     return float(LAGS[best[1]]), float(1 / RATES[best[0]])
-
-
-def _range(recording: Recording, axis: int) -> float:
-    return float(np.ptp(_leader(np.asarray(recording.handle_path), axis)))
 
 
 def _leader(path: Float[np.ndarray, "time gripper 3"], axis: int) -> np.ndarray:

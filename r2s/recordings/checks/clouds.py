@@ -2,6 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from r2s.recordings.cameras.cleaning import outliers
 from r2s.recordings.checks.finding import Finding
@@ -9,16 +10,12 @@ from r2s.recordings.checks.seen import VOXEL, Seen
 from r2s.recordings.checks.sheet import reach
 from r2s.recordings.recording import Recording, clouds_are_markers
 
-FEWEST = 150  # points of a frame, thinned to 5 mm
-STRAY = 0.03  # share of a frame
 NEIGHBOURS, DEVIATIONS = 8, 6.0  # beyond which a point is alone
 BEYOND = 1.15  # of how far the sheet reaches: no point of it is there
 FACE = 0.003  # [m], as thick as the layer along a face of a box that cut the cloud
 CROWDED = 30  # points in that layer, so that a face is one
 SAME = 0.0015  # [m], within which the ends of clouds agree where a box cut them
-OFTEN = 0.3  # of the frames that count
 ABOVE = 0.025  # [m] above the table, below which clouds are often cut on purpose
-APART = 0.08  # [m], from a gripper to the nearest point
 
 
 def check_clouds(seen: Seen) -> list[Finding]:
@@ -28,35 +25,14 @@ def check_clouds(seen: Seen) -> list[Finding]:
         return []
     first, last = recording.info.frames_used
     clouds, held = seen.thinned[first : last + 1], seen.grippers[first : last + 1]
-    counts = np.array([len(points) for points in clouds])
-    found = [
-        Finding(
-            "points",
-            float(np.median(counts)),
-            "-",
-            FEWEST,
-            np.inf,
-            "points of a frame, thinned to 5 mm,",
-            "move the cameras nearer, or widen masks and workspace",
-        ),
-        Finding(
-            "outliers",
-            float(np.median([_stray(recording, *pair) for pair in zip(clouds, held, strict=True)])),
-            "-",
-            -np.inf,
-            STRAY,
-            "share of points that are off the sheet",
-            "clean masks, or narrow the workspace",
-        ),
+    pairs = list(zip(clouds, held, strict=True))
+    near = [np.max(KDTree(points).query(at)[0]) for points, at in pairs]
+    return [
+        Finding.make("points", float(np.median([len(points) for points in clouds]))),
+        Finding.make("outliers", float(np.median([_stray(recording, *pair) for pair in pairs]))),
+        Finding.make("grip", float(np.median(near))),
+        *_faces(recording, clouds),
     ]
-    near = [
-        np.linalg.norm(points[:, None] - at[None], axis=-1).min(axis=0).max()
-        for points, at in zip(clouds, held, strict=True)
-    ]
-    words = "distance from a gripper to the nearest point (median over frames)"
-    advice = "the frames of cameras and grippers differ, or the clock does"
-    found.append(Finding("grip", float(np.median(near)), "m", -np.inf, APART, words, advice))
-    return [*found, *_faces(recording, clouds)]
 
 
 def _stray(
@@ -81,8 +57,7 @@ def _faces(recording: Recording, clouds: list[np.ndarray]) -> list[Finding]:
             if axis == 2 and side < 0 and place < recording.info.table_height + ABOVE:
                 continue  # the table, or a cut just above it
             words = f"share of frames whose clouds are cut {name} {letter} = {place:.3f} m"
-            advice = "widen the workspace or the crop, or move the camera"
-            found.append(Finding(f"crop {letter}", share, "-", -np.inf, OFTEN, words, advice))
+            found.append(Finding.make("crop", share, words, f"crop {letter}"))
     return found
 
 
