@@ -3,19 +3,15 @@
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from rgbd_scene import INFO, PATH, TIMES, write
+from rgbd_scene import TIMES, write
 
 from r2s.recordings.cameras.images import encode_png
-from r2s.recordings.cameras.rgbd import read_clouds, read_rig, rgbd_recording
-from r2s.recordings.readers.clouds import read_cloud
-from r2s.recordings.readers.force_log import read_force_log
-from r2s.recordings.recording import load, make_recording, save
+from r2s.recordings.cameras.rgbd import read_clouds, read_rig
 
 Break = Callable[[Path], Any]
 LEFT = ("cameras", "left")
@@ -104,27 +100,15 @@ BROKEN: dict[str, tuple[Break, str]] = {
     # files and frames
     "missing camera": (removed("right"), "wave/right: no folder of the camera 'right'.*restore it"),
     "missing masks": (removed("left/masks"), "left/masks: no such folder: segment.*SAM 2"),
-    "missing depth frame": (removed("left/depth/001.png"), "left/depth: frame 1 is missing"),
-    "missing last depth": (
-        removed("left/depth/003.png"),
-        "left/depth: frame 3 is missing, .*masks/003.png is there: export it again",
-    ),
-    "missing mask": (
-        removed("right/masks/003.png"),
-        "right/masks: frame 3 is missing, .*depth/003.png is there: export it again, or drop",
-    ),
+    "missing depth": (removed("left/depth/001.png"), "left/depth: frame 1 is missing.*restore"),
+    "missing last depth": (removed("left/depth/003.png"), "left/depth: frame 3 .*export it again"),
+    "missing mask": (removed("right/masks/003.png"), "right/masks: frame 3 .*export it again"),
     "missing colour": (removed("right/colour/000.png"), "right/colour: frame 0 is missing"),
-    "duplicate frame": (duplicate, "left/depth: frame 1 is there twice: 001.png and left_0001.png"),
+    "duplicate frame": (duplicate, "left/depth: frame 1 is there twice: .*remove one"),
     # images
-    "truncated PNG": (
-        cut("left/depth/002.png"),
-        r"left/depth/002.png: truncated PNG of \d+ bytes: copy or export it again",
-    ),
+    "truncated PNG": (cut("left/depth/002.png"), "left/depth/002.png: truncated PNG.*again"),
     "truncated mask": (cut("left/masks/002.png"), "left/masks/002.png: truncated PNG"),
-    "no PNG": (
-        lambda folder: (folder / "left/depth/002.png").write_bytes(b"\xff\xd8\xff\xe0 JFIF"),
-        "left/depth/002.png: no PNG: found the bytes .*: export it as PNG",
-    ),
+    "no PNG": (text("left/depth/002.png", "JFIF"), "left/depth/002.png: no PNG.*: export it as"),
     "damaged NPY": (
         lambda folder: (depths(lambda d: d)(folder), cut("left/depth/001.npy")(folder)),
         "left/depth/001.npy: damaged NPY.*copy it again",
@@ -149,10 +133,7 @@ BROKEN: dict[str, tuple[Break, str]] = {
         depths(lambda depth: depth - 0.5),
         r"left/depth/000.npy: \d+ depths are negative, the least is -0.*0 where unknown",
     ),
-    "no depth": (
-        depths(lambda depth: depth * np.nan),
-        "left/depth/000.npy: no pixel has a depth: drop the frame",
-    ),
+    "no depth": (depths(lambda depth: depth * np.nan), "left/depth/000.npy: no pixel.*drop the fr"),
     "millimetres for metres": (
         edited(*LEFT, "depth_scale", value=1.0),
         r"left/depth/000.png: the median depth is \d+ m with depth_scale 1: .*0.001 for millimet",
@@ -178,21 +159,13 @@ BROKEN: dict[str, tuple[Break, str]] = {
     ),
     # calibration
     "no JSON": (cut("cameras.json"), "cameras.json: no JSON: "),
-    "no cameras.json": (
-        removed("cameras.json"),
-        "wave: no cameras.json there or in the folder above: write one",
-    ),
+    "no cameras.json": (removed("cameras.json"), "wave: no cameras.json.*: write one"),
     "unknown key": (edited(*LEFT, "fx", value=900), "cameras.json: cameras: left: unknown: fx"),
     "unknown scale": (
-        lambda folder: edited(
-            "cameras", value=lambda c: {"left": dict(c["left"], depth_scale=None)}
-        )(folder),
+        edited("cameras", value=lambda c: {"left": dict(c["left"], depth_scale=None)}),
         "cameras.json: cameras: left: depth_scale is unknown: give metres per unit",
     ),
-    "zero scale": (
-        edited(*LEFT, "depth_scale", value=0),
-        "cameras.json: cameras: left: depth_scale must be positive, found 0.0: give metres",
-    ),
+    "zero scale": (edited(*LEFT, "depth_scale", value=0), "left: depth_scale must be.*give metres"),
     "other resolution": (
         edited(*LEFT, "centre", value=[319.5, 239.5]),
         "cameras.json: cameras: left: centre .* far from the middle of 160 x 120 pixels.*Scale",
@@ -221,10 +194,7 @@ BROKEN: dict[str, tuple[Break, str]] = {
         edited(*LEFT, "to_world", value=lambda p: (np.array(p) @ np.diag([1, -1, -1, 1])).tolist()),
         "left/depth/000.png: 0% of .*OpenGL",
     ),
-    "swapped extrinsics": (
-        swap_poses,
-        r"wave: the first frames of 'left' and 'right' are \d+ mm apart, .* exchanged \d+ mm: are",
-    ),
+    "swapped": (swap_poses, r"wave: the first frames of 'left' and 'right' .*are the two swapped"),
     "no overlap with the workspace": (
         edited("clean", "workspace", value=[[5, 5, 5], [6, 6, 6]]),
         "left/depth/000.png: 0% of .* lie around .* m: check to_world, depth_scale and workspace",
@@ -242,15 +212,12 @@ BROKEN: dict[str, tuple[Break, str]] = {
         text("left/times.csv", "0\n0.1\n0.1\n0.3\n"),
         "left/times.csv: line 3: 0.1 s is there twice.*drop those that are repeated",
     ),
-    "times in milliseconds": (
-        text("left/times.csv", "0\n66\n133\n200\n"),
-        "left/times.csv: frames are 67 s apart: give times in seconds",
-    ),
-    "times that are no numbers": (
+    "milliseconds": (text("left/times.csv", "0\n66\n133\n200\n"), "67 s apart: .*in seconds"),
+    "no numbers": (
         text("left/times.csv", "0\n0.1\n12:00:01\n0.3\n"),
         "left/times.csv: line 3: expected a time .s. last, found '12:00:01': write a number",
     ),
-    "times in another encoding": (
+    "another encoding": (
         lambda folder: (folder / "left/times.csv").write_bytes(b"Zeit in s, f\xfcr alle\n0\n"),
         "left/times.csv: no text in UTF-8 .*: export it again",
     ),
@@ -258,7 +225,7 @@ BROKEN: dict[str, tuple[Break, str]] = {
     "no times": (removed("left/times.csv"), "left/times.csv: no such file, and no frame_rate"),
     "no common time": (
         text("right/times.csv", "".join(f"{9 + t}\n" for t in TIMES)),
-        "wave: the cameras never ran at once: left 0 to 0.2 s, right 9 to 9.2 s: check that they",
+        "wave: the cameras never ran at once: .*check that they share a clock",
     ),
     "frame without partner": (
         text("right/times.csv", "0\n0.12\n0.133\n0.2\n"),
@@ -286,51 +253,3 @@ def test_a_camera_that_hangs_is_warned_of(folder: Path) -> None:
     shutil.copy(folder / "left/depth/001.png", folder / "left/depth/002.png")
     with pytest.warns(UserWarning, match="left/depth/002.png: the same image as in the frame bef"):
         read_clouds(folder, read_rig(folder))
-
-
-def pcd_with_nan(folder: Path) -> None:
-    header = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 3\nHEIGHT 1\n"
-    rows = "VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\nDATA ascii\n0 0 0\n1 nan 1\n2 2 2\n"
-    (folder / "012.pcd").write_text(header + rows)
-    read_cloud(folder / "012.pcd")
-
-
-def force_log(folder: Path) -> None:
-    (folder / "pull.csv").write_text("time_s,force_N\n0,0\n0.1,1\n0.05,2\n")
-    read_force_log(folder / "pull.csv")
-
-
-def short_npz(folder: Path) -> None:
-    clouds = [np.ones((50, 3))] * 4
-    save(make_recording(clouds, TIMES, PATH, TIMES, INFO), folder / "a.npz")
-    cut("a.npz")(folder)
-    load(folder / "a.npz")
-
-
-def path_too_short(folder: Path) -> None:
-    rgbd_recording(folder, INFO, PATH[:2], TIMES[:2])
-
-
-def frames_not_there(folder: Path) -> None:
-    rgbd_recording(folder, replace(INFO, frames_used=(0, 9)), PATH, TIMES)
-
-
-@pytest.mark.parametrize(
-    "read_it, words",
-    [
-        (
-            pcd_with_nan,
-            "012.pcd: 1 of 3 points are not finite, the first is point 1.*: export the cloud",
-        ),
-        (force_log, r"pull.csv: .*line 4"),
-        (short_npz, "a.npz: not a readable recording .r2s-recording/3.*: copy the file again"),
-        (
-            path_too_short,
-            "recording wave: the handle path ends at .* before the last frame.*: log it longer",
-        ),
-        (frames_not_there, r"recording wave: frames_used is 0\.\.9, but there are 4 frames"),
-    ],
-)
-def test_other_broken_files_are_named(folder: Path, read_it: Break, words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        read_it(folder)

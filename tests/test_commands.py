@@ -164,7 +164,7 @@ def test_the_doctor_knows_the_installation(capsys: pytest.CaptureFixture) -> Non
     assert main(["doctor", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["x64"] and told["versions"]["jax"] not in EXCLUDED and told["wrong"] == []
-    assert not told["missing"]["cli"] and told["missing"]["bench"]
+    assert not told["missing"]["cli"] and "bench" in told["missing"]
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
     (jax,) = (text for text in project["dependencies"] if text.startswith("jax>"))
     assert all(f"!={version}" in jax for version in EXCLUDED)

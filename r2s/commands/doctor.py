@@ -144,7 +144,7 @@ def installation() -> tuple[dict[str, Any], list[str], list[str]]:
     versions = {"python": platform.python_version()}
     versions |= {name: _version(name) or "not installed" for name in PACKAGES}
     missing: dict[str, list[str]] = {}
-    for requirement in metadata.requires("r2s") or ():
+    for requirement in (_version("r2s") and metadata.requires("r2s")) or ():
         found = re.match(r"([\w.-]+).*extra == ['\"]([\w-]+)['\"]", requirement)
         if found and found[2] != "dev":
             lacking = missing.setdefault(found[2], [])
