@@ -26,36 +26,40 @@ def stopped(*arguments: str) -> int | str | None:
 
 
 @pytest.mark.parametrize(
-    "arguments, words",
+    "command, words",
     [
-        ((), ["data", "show", "real-to-sim for fabrics"]),
-        (("data",), ["fetch", "list", "convert"]),
-        (("data", "convert"), ["FOLDER", "--to OUT", "--only REGEX", "--force", "cameras.json"]),
-        (("data", "fetch"), ["NAME", "--to FOLDER", "r2s data fetch diffcloud --to recordings"]),
-        (("data", "list"), ["--manifests FOLDER"]),
-        (("show",), ["RECORDING", "--trajectory FILE", "--out FOLDER", "gif", "frame, vertex, 3"]),
+        ("", ["data", "show", "estimate"]),
+        ("data", ["fetch", "list", "convert"]),
+        ("data convert", ["FOLDER", "--to OUT", "--only REGEX", "--force"]),
+        ("data fetch", ["NAME", "--to FOLDER"]),
+        ("data list", ["--manifests FOLDER"]),
+        ("show", ["RECORDING", "--trajectory FILE", "--out FOLDER", "gif"]),
+        ("estimate", ["RECORDING", "--density KG/M^2", "--out FILE", "--method", "--json"]),
     ],
 )
-def test_help_teaches(capsys: pytest.CaptureFixture, arguments: tuple, words: list[str]) -> None:
-    assert stopped(*arguments, "--help") == 0
+def test_help_names_commands_and_options(capsys: pytest.CaptureFixture, command, words) -> None:
+    assert stopped(*command.split(), "--help") == 0
     text = capsys.readouterr().out
-    for word in words:
-        assert word in text
+    assert all(word in text for word in words)
 
 
 @pytest.mark.parametrize(
-    "arguments, word",
+    "command, word",
     [
-        ((), "command"),
-        (("shov",), "shov"),
-        (("data", "fetch", "rgbench"), "--to"),
-        (("data", "convert", "recordings"), "--to"),
-        (("show", "a.npz", "--out", "b", "--video", "avi"), "avi"),
-        (("show", "a.npz", "--out", "b", "--colour", "red"), "--colour"),
+        ("", "command"),
+        ("shov", "shov"),
+        ("data fetch rgbench", "--to"),
+        ("data convert recordings", "--to"),
+        ("show a.npz --out b --video avi", "avi"),
+        ("show a.npz --out b --colour red", "--colour"),
+        ("simulate lifting", "--out"),
+        ("simulate hovering --out x.npz", "hovering"),
+        ("estimate a.npz --out x.json", "--density"),
+        ("export black_denim --to felt --out x", "felt"),
     ],
 )
-def test_wrong_usage_is_2(capsys: pytest.CaptureFixture, arguments: tuple, word: str) -> None:
-    assert stopped(*arguments) == 2
+def test_wrong_usage_is_2(capsys: pytest.CaptureFixture, command: str, word: str) -> None:
+    assert stopped(*command.split()) == 2
     assert word in capsys.readouterr().err.lower()
 
 
@@ -67,16 +71,43 @@ def test_the_data_sets_are_listed(capsys: pytest.CaptureFixture) -> None:
     assert json.loads(capsys.readouterr().out)["rgbench"]["licence"] == "CC-BY-4.0"
 
 
-def test_an_error_is_one_line_and_1(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    for arguments, words in (
-        (["data", "fetch", "blanco_mulero", "--to", str(tmp_path)], "10.5281/zenodo.13823986"),
-        (["data", "fetch", "none", "--to", str(tmp_path)], "no data set 'none'; there are"),
-        (["data", "convert", str(tmp_path), "--to", str(tmp_path / "out")], "no recording whose"),
-        (["show", str(tmp_path / "no.npz"), "--out", str(tmp_path)], "no.npz: no such recording"),
-    ):
-        assert main(arguments) == 1
-        lines = capsys.readouterr().err.splitlines()
-        assert len(lines) == 1 and lines[0].startswith("r2s: error: ") and words in lines[0]
+@pytest.mark.parametrize(
+    "command, words",
+    [
+        ("data fetch blanco_mulero --to HERE", "10.5281/zenodo.13823986"),
+        ("data fetch none --to HERE", "no data set 'none'; there are"),
+        ("data convert HERE --to HERE/out", "no recording whose"),
+        ("show HERE/no.npz --out HERE", "no.npz: no such recording"),
+        ("simulate lifting --fabric felt --out HERE/out", "felt: no such card, and no preset"),
+        (
+            "simulate lifting --fabric HERE/broken.json --out HERE/out",
+            "broken.json: no fabric",
+        ),
+        ("simulate lifting --out HERE/no/x.npz", "there is no folder"),
+        ("estimate x.npz --density 1 --out HERE/no/x.json", "there is no folder"),
+        ("simulate lifting --motion heigt=1 --out HERE/out", "lifting has no heigt; it takes he"),
+        ("simulate lifting --motion height --out HERE/out", "expects NAME=NUMBER"),
+        (
+            "simulate wind --self-contact --solver points --out HERE/out",
+            "--self-contact is of the implicit cloth",
+        ),
+        ("estimate HERE/no.npz --density 0.2 --out HERE/out", "no.npz: no such"),
+        ("evaluate black_denim HERE/no.npz", "no.npz: no such recording"),
+        ("check-grad wind --solver points --forward", "are of the cloth"),
+        ("doctor --mesh HERE/no.obj", "no.obj: no such mesh"),
+        ("view felt", "felt: no such card, and no preset"),
+        ("view --recording HERE/no.npz", "no.npz: no such recording"),
+        ("view --recording x.npz --motion height=1", "--motion is of a scenario"),
+    ],
+)
+def test_an_error_is_one_line_and_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture, command: str, words: str
+) -> None:
+    (tmp_path / "broken.json").write_text('{"format": "r2s-card/9"}')
+    assert main(command.replace("HERE", str(tmp_path)).split()) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("r2s: error: ") and words in lines[0]
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_recording_is_shown_with_its_simulation(

@@ -13,7 +13,6 @@ import pytest
 
 pytest.importorskip("tyro")
 
-from test_cli import stopped  # noqa: E402
 from test_show import recorded  # noqa: E402
 
 from r2s.cli import main  # noqa: E402
@@ -33,61 +32,7 @@ from r2s.fabrics.informed_space import InformedSpace  # noqa: E402
 from r2s.recordings.open import load_trajectory  # noqa: E402
 from r2s.recordings.recording import load, save  # noqa: E402
 
-COMMANDS = ["simulate", "estimate", "evaluate", "export", "check-grad", "doctor"]
 SHORT = ["--motion", "num_frames=4", "moving=0.15", "--shape", "3", "3"]
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_has_two_examples_or_more(capsys: pytest.CaptureFixture, command: str) -> None:
-    assert stopped(command, "--help") == 0
-    text = capsys.readouterr().out
-    assert text.count(f"    r2s {command}") >= 2 and "--json" in text
-
-
-@pytest.mark.parametrize(
-    "arguments, word",
-    [
-        (("simulate", "lifting"), "--out"),
-        (("simulate", "hovering", "--out", "x.npz"), "hovering"),
-        (("estimate", "a.npz", "--out", "x.json"), "--density"),
-        (("export", "black_denim", "--to", "felt", "--out", "x"), "felt"),
-    ],
-)
-def test_wrong_usage_is_2(capsys: pytest.CaptureFixture, arguments: tuple, word: str) -> None:
-    assert stopped(*arguments) == 2
-    assert word in capsys.readouterr().err.lower()
-
-
-def test_an_error_is_one_line_and_1(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    out = ["--out", str(tmp_path / "out")]
-    broken = tmp_path / "broken.json"
-    broken.write_text('{"format": "r2s-card/9"}')
-    for arguments, words in (
-        (["simulate", "lifting", "--fabric", "felt", *out], "felt: no such card, and no preset"),
-        (["simulate", "lifting", "--fabric", str(broken), *out], "broken.json: no fabric card"),
-        (["simulate", "lifting", "--out", str(tmp_path / "no" / "x.npz")], "there is no folder"),
-        (
-            ["estimate", "x.npz", "--density", "1", "--out", str(tmp_path / "no" / "x.json")],
-            "there is no folder",
-        ),
-        (["simulate", "lifting", "--motion", "heigt=1", *out], "lifting has no heigt; it takes he"),
-        (["simulate", "lifting", "--motion", "height", *out], "expects NAME=NUMBER"),
-        (
-            ["simulate", "wind", "--self-contact", "--solver", "points", *out],
-            "--self-contact is of the implicit cloth",
-        ),
-        (["estimate", str(tmp_path / "no.npz"), "--density", "0.2", *out], "no.npz: no such"),
-        (["evaluate", "black_denim", str(tmp_path / "no.npz")], "no.npz: no such recording"),
-        (["check-grad", "wind", "--solver", "points", "--forward"], "are of the cloth"),
-        (["doctor", "--mesh", str(tmp_path / "no.obj")], "no.obj: no such mesh"),
-        (["view", "felt"], "felt: no such card, and no preset"),
-        (["view", "--recording", str(tmp_path / "no.npz")], "no.npz: no such recording"),
-        (["view", "--recording", "x.npz", "--motion", "height=1"], "--motion is of a scenario"),
-    ):
-        assert main(arguments) == 1, arguments
-        lines = capsys.readouterr().err.splitlines()
-        assert len(lines) == 1 and lines[0].startswith("r2s: error: ") and words in lines[0]
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow(group="documents")

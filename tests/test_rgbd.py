@@ -1,5 +1,6 @@
 """RGB-D folders to clouds: there and back, cameras that are merged, paired and cleaned."""
 
+import copy
 import json
 import sys
 from dataclasses import replace
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from rgbd_scene import INFO, PATH, TIMES, camera, distances, rig, surface, write
+from test_manifest import MANIFEST
 
 from r2s.recordings.cameras.calibration import DepthCamera, look_at
 from r2s.recordings.cameras.cleaning import Cleaning, clean, inside, outliers
@@ -205,24 +207,10 @@ def test_cameras_of_a_set_lie_above_its_recordings(tmp_path: Path) -> None:
 def test_a_manifest_takes_images_for_clouds(tmp_path: Path) -> None:
     write(tmp_path / "pull_tan2", colour=False)
     np.save(tmp_path / "gripper.npy", PATH)
-    unit = {"scale": 1, "rotation": np.eye(3).tolist(), "translation": [0, 0, 0.5]}
-    gripper = {"file": "gripper.npy", "rate": 10, "transform": unit, "offset": [0, 0, 0]}
-    sheet = {"size": [0.3, 0.3], "origin": [0, 0, 0], "warp": [1, 0, 0], "weft": [0, 1, 0]}
-    scenario = {
-        "folder": r"pull_(?P<fabric>[a-z]+)(?P<trial>\d*)",
-        "frame_rate": 15,
-        "time_offset": -0.01,
-        "cloud": unit,
-        "gripper": gripper | {"note": ""},
-        "sheet": sheet | {"held": ["origin"]},
-        "table_height": 0.5,
-        "frames_used": [0, 3],
-        "drop_repeats": True,
-    }
-    text = dict.fromkeys(("name", "title", "citation", "licence", "hash", "note"), "none")
-    source = {"repository": "none", "commit": "0", "path": "."}
-    manifest = {**text, "source": source, "files": {}, "scenarios": {"pull": scenario}}
-    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    made = copy.deepcopy(MANIFEST)
+    up = {"scale": 1, "rotation": np.eye(3).tolist(), "translation": [0, 0, 0.5]}
+    made["scenarios"]["pull"] |= {"cloud": up, "frame_rate": 15, "frames_used": [0, 3]}
+    (tmp_path / "manifest.json").write_text(json.dumps(made))
     recording = read_recording(tmp_path, manifest_for(tmp_path), "pull_tan2")
     info = recording.info
     assert (info.fabric, info.trial, info.verified, info.time_offset) == ("tan", "2", None, -0.01)
