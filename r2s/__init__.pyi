@@ -34,10 +34,9 @@ from r2s.recordings.recording import Recording, RecordingInfo, SheetPlacement, m
 from r2s.recordings.recording import load as load_recording
 from r2s.recordings.recording import save as save_recording
 from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
-from r2s.scenarios.in_explicit_steps import explicit_cloth
-from r2s.scenarios.on_points import material_points
 from r2s.scenarios.scenario import Scenario, from_recording, rollout
-from r2s.scenarios.six import Experiment, fling, folding, lifting, shaking, stretching, wind
+from r2s.scenarios.solvers import explicit_cloth, material_points
+from r2s.scenarios.standard import Experiment, fling, folding, lifting, shaking, stretching, wind
 from r2s.scenarios.synthetic import record
 from r2s.solver import Solver, Trajectory, predicted_memory, simulate
 from r2s.world.air import Air, Fan

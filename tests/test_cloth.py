@@ -30,7 +30,7 @@ from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.geometry.elements import vertex_masses
 from r2s.geometry.mesh import rectangle
 from r2s.scenarios.scenario import rollout
-from r2s.scenarios.six import lifting
+from r2s.scenarios.standard import lifting
 from r2s.units import AIR_DENSITY, GRAVITY
 from r2s.world.scene import Control, along_path
 

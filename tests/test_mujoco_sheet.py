@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from r2s.geometry.surface import nearest
-from r2s.scenarios.six import SIX
+from r2s.scenarios.standard import SIX
 from r2s.study import engine, matrix
 from r2s.study.cells import with_dependencies
 from r2s.study.configuration import MOTIONS

@@ -17,7 +17,7 @@ from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import ELEMENTS, Mesh, rectangle
 from r2s.laws.plate import OrthotropicPlate, PlateBending
 from r2s.scenarios.scenario import rollout
-from r2s.scenarios.six import lifting
+from r2s.scenarios.standard import lifting
 from r2s.world.scene import Control
 
 SLIGHT = 1e-4  # so that angles are slopes

@@ -20,7 +20,7 @@ from r2s.scenarios.resolution import (
     mesh_error,
     shape_for,
 )
-from r2s.scenarios.six import SIDE
+from r2s.scenarios.standard import SIDE
 
 SIZE = (SIDE, SIDE)
 

@@ -261,7 +261,7 @@ def test_a_simulated_fabric_comes_back_within_2_mm(motion_of: str, tmp_path: Pat
     from r2s.recordings.cameras.synthetic_rgbd import write_rgbd
     from r2s.scenarios import synthetic
     from r2s.scenarios.scenario import from_recording, rollout
-    from r2s.scenarios.six import SIX
+    from r2s.scenarios.standard import SIX
 
     fabric = presets.grey_interlock()
     recorded = synthetic.record(SIX[motion_of](), fabric, "grey", key=jr.key(0))

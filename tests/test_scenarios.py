@@ -16,10 +16,10 @@ from r2s.laws.bending import HingeBending
 from r2s.laws.tables import HINGE_FACTOR, TableBending
 from r2s.recordings.recording import RecordingInfo, make_recording
 from r2s.scenarios.energy import stored_energy, stretch
-from r2s.scenarios.on_points import material_points
 from r2s.scenarios.paths import Route
 from r2s.scenarios.scenario import from_recording, rollout
-from r2s.scenarios.six import CLEARANCE, SIX
+from r2s.scenarios.solvers import material_points
+from r2s.scenarios.standard import CLEARANCE, SIX
 from r2s.units import GRAVITY
 
 SHAPE = (5, 5)

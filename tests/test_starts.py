@@ -13,8 +13,8 @@ from r2s.evaluation.prediction_error import Motion
 from r2s.evaluation.surface_distance import to_surface
 from r2s.fabrics import presets
 from r2s.recordings.recording import cloud
-from r2s.scenarios.in_explicit_steps import explicit_cloth
-from r2s.scenarios.six import SIX
+from r2s.scenarios.solvers import explicit_cloth
+from r2s.scenarios.standard import SIX
 from r2s.study.cells import execute
 from r2s.study.evaluations import _explicit, _until_stable, predict
 from r2s.study.sources import SyntheticRecording, TruthSettings, read, read_start, small_strain

@@ -27,7 +27,7 @@ from r2s.failures import Failure
 from r2s.recordings.recording import cloud
 from r2s.scenarios import synthetic
 from r2s.scenarios.paths import LIMITS
-from r2s.scenarios.six import SIX
+from r2s.scenarios.standard import SIX
 from r2s.solver import Trajectory
 from r2s.study import engine, estimates, matrix, results
 from r2s.study.cells import dependencies, read_metadata, with_dependencies

@@ -21,7 +21,7 @@ from r2s.recordings.open import open_recording
 from r2s.recordings.readers.swings import Bar, bar_path, read_swing
 from r2s.recordings.recording import load, make_recording, save
 from r2s.scenarios.scenario import from_recording, rollout
-from r2s.scenarios.six import swing
+from r2s.scenarios.standard import swing
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("R2S_SWINGS") or ROOT.parent / "shared" / "data" / "swings_real")

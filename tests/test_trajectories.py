@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from r2s.recordings.recording import corner
 from r2s.scenarios import paths
-from r2s.scenarios.six import ALL_CORNERS, SIX, hanging, on_table, varied, wind
+from r2s.scenarios.standard import ALL_CORNERS, SIX, hanging, on_table, varied, wind
 
 DURATION = 59 / 15  # [s]
 SIZE = (0.3, 0.2)  # [m]

@@ -114,7 +114,7 @@ def _fabric(
     """Whether its numbers are plausible, and the error that a mesh leaves in each motion."""
     from r2s.fabrics.fold_length import fold_length
     from r2s.scenarios import resolution
-    from r2s.scenarios.six import SIDE
+    from r2s.scenarios.standard import SIDE
 
     found, length, sheet = list(implausible(fabric)), float(fold_length(fabric)), (SIDE, SIDE)
     errors = {m: resolution.mesh_error(fabric, sheet, shape, m) for m in resolution.TABLE}

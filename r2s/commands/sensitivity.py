@@ -37,7 +37,7 @@ class Sensitivity:
         from r2s.estimation.estimate_json import as_json
         from r2s.estimation.experiment_design import evaluate_design
         from r2s.estimation.method import COARSEST
-        from r2s.scenarios.six import SIDE
+        from r2s.scenarios.standard import SIDE
 
         numbers = parse_numbers(self.motion)
         found = evaluate_design(self.scenario, self.fabric, numbers, self.noise, self.seed)

@@ -22,7 +22,7 @@ from r2s.evaluation.losses import surface_residuals
 from r2s.fabrics.parameters import ParameterSpace
 from r2s.mpm.sheet import Sheet
 from r2s.recordings.recording import Recording
-from r2s.scenarios.on_points import MEMBRANE_DAMPING, material_points
+from r2s.scenarios.solvers import MEMBRANE_DAMPING, material_points
 
 WIDTH = 0.02  # of the range: the slope of the exact motion is rough below that
 PUBLISHED_START = {"E h": 100.0, "nu": 0.1}  # where the public code starts

@@ -76,7 +76,7 @@ def lift(
 
     Inward is towards the opposite corner.
 
-    >>> from r2s.scenarios.six import on_table
+    >>> from r2s.scenarios.standard import on_table
     >>> path = lift(on_table((0.3, 0.3), ("origin",)), 4.0, height=0.2, inward=0.0).path
     >>> np.asarray(path[-1, 0]).round(3).tolist()
     [0.0, 0.0, 0.201]

@@ -14,7 +14,7 @@ import numpy as np
 from r2s.compilation import compile_once
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.fold_length import fold_length
-from r2s.scenarios.six import SIDE
+from r2s.scenarios.standard import SIDE
 
 Shape = tuple[int, int]
 

@@ -29,7 +29,7 @@ from r2s.recordings.recording import (
 from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
 from r2s.scenarios.paths import Route
 from r2s.scenarios.scenario import Scenario, SheetSolver, rollout
-from r2s.scenarios.six import SIDE, Experiment
+from r2s.scenarios.standard import SIDE, Experiment
 from r2s.solver import Trajectory
 
 SPACING = SIDE * math.sqrt(2) / 80  # [m], between samples of the surface

@@ -6,7 +6,7 @@ from typing import Any
 import jax.random as jr
 
 from r2s.scenarios.paths import draw
-from r2s.scenarios.six import SIX, Experiment
+from r2s.scenarios.standard import SIX, Experiment
 
 RECORDING = "recording.npz"
 START = "start.npy"  # beside it: the shape of a hanging sheet in its first frame

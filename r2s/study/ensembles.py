@@ -23,9 +23,9 @@ from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh
 from r2s.geometry.surface import sample
 from r2s.recordings.recording import cloud
-from r2s.scenarios.in_explicit_steps import explicit_cloth
 from r2s.scenarios.scenario import rollout
-from r2s.scenarios.six import Experiment
+from r2s.scenarios.solvers import explicit_cloth
+from r2s.scenarios.standard import Experiment
 from r2s.study.cells import Cell, result_files
 from r2s.study.sources import SyntheticRecording, read, strain_dependent
 from r2s.study.starts import SETTLING, started

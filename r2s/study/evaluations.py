@@ -24,9 +24,8 @@ from r2s.fabrics.fabric import Fabric
 from r2s.files import write_json
 from r2s.mpm.sheet import Sheet, longest_edge, stable_step
 from r2s.recordings.recording import Recording
-from r2s.scenarios.in_explicit_steps import explicit_cloth
-from r2s.scenarios.on_points import EDGE, MEMBRANE_DAMPING, grid_around
 from r2s.scenarios.scenario import Scenario, from_recording
+from r2s.scenarios.solvers import EDGE, MEMBRANE_DAMPING, explicit_cloth, grid_around
 from r2s.study.cells import Cell, result_files
 from r2s.study.configuration import ON_CLOTH, Configuration
 from r2s.study.estimates import EstimateCell, read_estimate

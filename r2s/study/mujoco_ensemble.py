@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from r2s.evaluation.surface_distance import POINTS, to_surface
 from r2s.recordings.recording import cloud
-from r2s.scenarios.six import Experiment
+from r2s.scenarios.standard import Experiment
 from r2s.study.cells import Cell
 from r2s.study.ensembles import (
     APART,

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from r2s.scenarios.six import Experiment
+from r2s.scenarios.standard import Experiment
 from r2s.study.mujoco_sheet import SHEET, STUDIED, Material, Resolution, motion
 
 SOFTER = 1e-3  # [-], by which Young's modulus is changed to see how much that grows

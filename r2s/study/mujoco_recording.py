@@ -11,7 +11,7 @@ import numpy as np
 
 from r2s.recordings.recording import save
 from r2s.scenarios import synthetic
-from r2s.scenarios.six import Experiment
+from r2s.scenarios.standard import Experiment
 from r2s.study.cells import Cell
 from r2s.study.drawn import RECORDING, START, experiment_of, number_of
 from r2s.study.mujoco_sheet import GRIP, Material, Resolution, moved

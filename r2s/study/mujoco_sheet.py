@@ -19,7 +19,7 @@ from jaxtyping import Float
 from r2s.extras import require
 from r2s.fabrics.fabric import Fabric
 from r2s.scenarios.scenario import Scenario
-from r2s.scenarios.six import Experiment
+from r2s.scenarios.standard import Experiment
 from r2s.units import AIR_DENSITY, GRAVITY
 
 GRIP = 10.0  # [kg], of a held vertex: the sheet's pull moves it by less than 1e-7 m in a step

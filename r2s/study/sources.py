@@ -30,9 +30,9 @@ from r2s.laws.stiffening import SofteningPlate, StiffeningMembrane
 from r2s.recordings import manifest
 from r2s.recordings.recording import Recording, load, save
 from r2s.scenarios import synthetic
-from r2s.scenarios.in_explicit_steps import explicit_cloth
 from r2s.scenarios.scenario import rollout
-from r2s.scenarios.six import STRETCHING_INTERVAL, Experiment
+from r2s.scenarios.solvers import explicit_cloth
+from r2s.scenarios.standard import STRETCHING_INTERVAL, Experiment
 from r2s.study.cells import Cell, result_files
 from r2s.study.drawn import RECORDING, START, experiment_of, number_of, pull_of
 from r2s.study.mujoco_recording import MujocoRecording

@@ -27,9 +27,9 @@ from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
 from r2s.files import read_json, write_bytes, write_json
 from r2s.mpm.sheet import Sheet
-from r2s.scenarios.on_points import material_points
 from r2s.scenarios.scenario import Scenario, rollout
-from r2s.scenarios.six import SIX, Experiment, varied
+from r2s.scenarios.solvers import material_points
+from r2s.scenarios.standard import SIX, Experiment, varied
 
 FORMAT = "r2s-physnet-data/2"
 DEPTH_UNIT = 1e-4  # [m], of the depths in the files

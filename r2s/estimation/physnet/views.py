@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from r2s.geometry.surface import sample
 from r2s.recordings.cameras.camera import Camera
-from r2s.scenarios.six import Experiment
+from r2s.scenarios.standard import Experiment
 from r2s.scenarios.synthetic import sensing
 
 Triple = tuple[float, float, float]

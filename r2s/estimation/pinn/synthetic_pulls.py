@@ -13,7 +13,7 @@ from r2s.geometry.mesh import Mesh
 from r2s.geometry.surface import nearest
 from r2s.recordings.recording import Recording, RecordingInfo, make_recording
 from r2s.scenarios import clamp_force, energy_balance, stretching
-from r2s.scenarios.six import STRETCHING_INTERVAL
+from r2s.scenarios.standard import STRETCHING_INTERVAL
 from r2s.scenarios.synthetic import MARKER_NOISE, MARKERS
 
 FRAMES = 39  # of 1/30 s
