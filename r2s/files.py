@@ -77,7 +77,8 @@ def write_json(path: Path | str, value: Any) -> None:
 def write_npz(path: Path | str, **arrays: Any) -> None:
     """Write named arrays as one NPZ, whole or not at all; raises as `write_bytes`."""
     buffer = io.BytesIO()
-    np.savez(buffer, **{name: np.asarray(values) for name, values in arrays.items()})
+    made: dict[str, Any] = {name: np.asarray(values) for name, values in arrays.items()}
+    np.savez(buffer, **made)
     write_bytes(path, buffer.getvalue())
 
 

@@ -27,14 +27,14 @@ class Solver(Protocol[State]):
 
     dt: float  # [s]
 
-    def step(self, fabric: Any, state: State, control: Control) -> State:
+    def step(self, fabric: Any, state: State, control: Control, /) -> State:
         """The state `dt` later."""
         ...
 
-    def check(self, fabric: Any) -> None:
+    def check(self, fabric: Any, /) -> None:
         """Raise `ValueError` where steps of `dt` are unstable for a fabric that is not traced."""
 
-    def fits(self, fabric: Any) -> Bool[Array, ""]:
+    def fits(self, fabric: Any, /) -> Bool[Array, ""]:
         """Whether steps of `dt` are stable for a fabric that may be traced, as far as is known."""
         ...
 

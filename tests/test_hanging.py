@@ -83,4 +83,5 @@ def test_a_sheet_that_hangs_may_take_as_many_iterations_as_its_first_step_needs(
     braked, _ = stepped(scenarios.wind().scenario((3, 3)))
     lying, _ = stepped(scenarios.lifting().scenario((3, 3)))
     assert isinstance(braked, Braked) and isinstance(lying, Cloth)
+    assert isinstance(braked.solver, Cloth)
     assert braked.solver.max_iterations > 560 > lying.max_iterations

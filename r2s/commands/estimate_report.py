@@ -231,9 +231,10 @@ def _coarse(estimate: Estimate, recordings: Sequence[Recording]) -> list[str]:
     """Where the mesh is too coarse for the estimated fabric."""
     if estimate.shape is None:
         return []
-    motions = dict.fromkeys((each.info.sheet.size, each.info.scenario) for each in recordings)
-    shapes = [(alike(estimate.shape, size), size, scenario) for size, scenario in motions]
-    return [line for shape, *at in shapes for line in mesh_warning(shape, estimate.fabric, *at)]
+    fabric, lines = estimate.fabric, []
+    for size, scenario in dict.fromkeys((r.info.sheet.size, r.info.scenario) for r in recordings):
+        lines += mesh_warning(alike(estimate.shape, size), fabric, size, scenario)
+    return lines
 
 
 def _weighed(outcome: Outcome) -> Iterator[str]:

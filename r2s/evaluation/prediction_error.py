@@ -12,8 +12,7 @@ from r2s.evaluation.surface_distance import to_surface
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.surface import sample
 from r2s.recordings.recording import Recording, cloud
-from r2s.scenarios.scenario import Scenario, from_recording, rollout
-from r2s.solver import Solver
+from r2s.scenarios.scenario import Scenario, SheetSolver, from_recording, rollout
 
 SAMPLES = 9  # squared, on each face: 10,368 points on 128 faces, the study's 10,000
 ALL_SAMPLES = SAMPLES**2 * 128  # about as many on any mesh
@@ -39,7 +38,7 @@ def predict(recording: Recording, fabric: Fabric) -> Float[np.ndarray, "frame ve
     return predict_motion(from_recording(recording), fabric).x
 
 
-def predict_motion(scenario: Scenario, fabric: Fabric, solver: Solver | None = None) -> Motion:
+def predict_motion(scenario: Scenario, fabric: Fabric, solver: SheetSolver | None = None) -> Motion:
     """The motion of a fabric in a scenario; by the cloth unless another solver is given."""
     moved = _rollout(scenario, fabric, solver=solver)
     ok = np.logical_and.accumulate(np.asarray(moved.ok))[:, None, None]

@@ -387,9 +387,11 @@ class Braked(eqx.Module):
         """Whether the steps of the solver are short enough for a fabric, as far as is known."""
         return self.solver.fits(fabric)
 
-    def init(self, x: Float[Array, "vertex 3"], *rates: Array | None) -> BrakedState:
-        """At positions [m]; `rates` go to the solver; by default it is at rest."""
-        return BrakedState(self.solver.init(x, *rates), jnp.zeros((), int))
+    def init(
+        self, x: Array, v: Array | None = None, acceleration: Array | None = None
+    ) -> BrakedState:
+        """At positions [m], velocities [m/s] and accelerations [m/s^2]; None: zero."""
+        return BrakedState(self.solver.init(x, v, acceleration), jnp.zeros((), int))
 
     def step(self, fabric: Fabric, state: BrakedState, control: Control) -> BrakedState:
         """The state `dt` later."""

@@ -132,8 +132,8 @@ def record(
             f"vertices, got {found.x.shape}"
         )
     if not np.isfinite(found.x).all():
-        motion = motion or _rollout(scenario, fabric, max_step, made)
-        raise RuntimeError(f"the simulation of {name} {motion.explain()}")
+        why = (motion or _rollout(scenario, fabric, max_step, made)).explain()
+        raise RuntimeError(f"the simulation of {name} {why}")
     seen = sensing(experiment) if seen is None else seen
     return seen_of(found.x, experiment, scenario, name, trial, seen, measured, key=key)
 

@@ -28,8 +28,7 @@ from r2s.estimation.physnet.views import View, depths_of_sheet, per_face
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace
 from r2s.recordings.cameras.calibration import DepthCamera, frustum
-from r2s.scenarios.scenario import Scenario, rollout
-from r2s.solver import Solver
+from r2s.scenarios.scenario import Scenario, SheetSolver, rollout
 
 Images = Float[np.ndarray, "frame down across"]
 
@@ -52,7 +51,7 @@ class Sighting(eqx.Module):
     points: Float[Array, "frame dim"]
     space: ParameterSpace
     network: PhysNet
-    solver: Solver | None
+    solver: SheetSolver | None
     frames: tuple[int, ...] = eqx.field(static=True)
     view: View = eqx.field(static=True)
     per_face: int = eqx.field(static=True)
@@ -67,7 +66,7 @@ class Sighting(eqx.Module):
         frames: tuple[int, ...],
         space: ParameterSpace,
         training: Training,
-        solver: Solver | None = None,
+        solver: SheetSolver | None = None,
         cameras: Sequence[DepthCamera] = (),
         pull: PullForce | None = None,
     ) -> "Sighting":

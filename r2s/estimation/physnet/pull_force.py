@@ -13,8 +13,7 @@ from jaxtyping import Array, Float
 from r2s.estimation.problem import force_at
 from r2s.recordings.recording import Recording
 from r2s.scenarios.energy import clamp_force, energy_balance
-from r2s.scenarios.scenario import Scenario
-from r2s.solver import Solver
+from r2s.scenarios.scenario import Scenario, SheetSolver
 
 # A flawed image lies 0.45 from a flawless one on the map (docs/physnet.md), and a sheet of 9 x 9
 # vertices errs by some 5 % in the force of a pull: that is to count alike.
@@ -70,7 +69,7 @@ def pull_force(recording: Recording, frames: Sequence[int]) -> PullForce | None:
     return PullForce(along, direction, jnp.maximum(SHARE * largest, NOISE / SHARE))
 
 
-def moved_with_forces(scenario: Scenario, fabric, solver: Solver | None):
+def moved_with_forces(scenario: Scenario, fabric, solver: SheetSolver | None):
     """A motion with its forces, and whether all of it is finite."""
     found = energy_balance(scenario, fabric, solver=solver)
     return found, jnp.all(jnp.isfinite(found.x)) & jnp.all(jnp.isfinite(found.last))

@@ -98,7 +98,7 @@ def _with_table(
     if table is None:
         return x, faces
     height, side = table
-    plane = rectangle((side, side), (TABLE_CELLS + 1,) * 2)
+    plane = rectangle((side, side), (TABLE_CELLS + 1, TABLE_CELLS + 1))
     corners = np.pad(np.asarray(plane.rest) - side / 2, ((0, 0), (0, 1)), constant_values=height)
     return np.concatenate([x, corners]), np.concatenate([faces, len(x) + np.asarray(plane.faces)])
 

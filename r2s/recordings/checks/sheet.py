@@ -102,7 +102,7 @@ def _markers_apart(recording: Recording) -> Finding:
     markers, seen = np.asarray(markers), np.asarray(seen)
     places = recording.marker_places
     places = markers[0] if places is None else np.asarray(places)
-    gaps, nearest = (each[:, 1] for each in KDTree(places).query(places, 2))
+    gaps, nearest = (np.asarray(each)[:, 1] for each in KDTree(places).query(places, 2))
     apart = np.linalg.norm(markers - markers[:, nearest], axis=-1) / gaps
     both = seen & seen[:, nearest]
     return Finding.make("markers", float(np.quantile(apart[both], 0.95)) if both.any() else np.nan)
