@@ -1,12 +1,8 @@
 """`r2s check`: what is suspicious in a recording, before anything is estimated from it."""
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
-from tyro.conf import Positional, arg
-
-from r2s.commands.common import Json
+from r2s.commands.common import Json, RecordingPath
 
 
 @dataclass(frozen=True)
@@ -22,8 +18,7 @@ class Check:
         r2s check lift.npz --json
     """
 
-    recording: Annotated[Positional[Path], arg(metavar="RECORDING")]
-    """NPZ, or folder of numbered clouds or of RGB-D images."""
+    recording: RecordingPath
     json: Json = False
 
     def run(self) -> int:

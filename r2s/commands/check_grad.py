@@ -1,11 +1,8 @@
 """`r2s check-grad`: are the derivatives of one's own scene right?"""
 
 from dataclasses import dataclass
-from typing import Annotated
 
-from tyro.conf import Positional, arg
-
-from r2s.commands.common import FabricName, Json, Motion, ScenarioName, Shape, SolverName
+from r2s.commands.common import FabricName, Json, Motion, Scenario, Shape, SolverName
 
 
 @dataclass(frozen=True)
@@ -21,8 +18,7 @@ class CheckGrad:
         r2s check-grad folding --fabric mine.json --self-contact --forward
     """
 
-    scenario: Annotated[Positional[ScenarioName], arg(metavar="SCENARIO")]
-    """A scenario of the study."""
+    scenario: Scenario
     fabric: FabricName = "grey_interlock"
     motion: Motion = ()
     solver: SolverName = "cloth"

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
 if TYPE_CHECKING:
     from r2s.estimation.cards import Card
@@ -18,6 +18,13 @@ if TYPE_CHECKING:
 A_VERTEX = 2.5e4  # [byte] of a mesh and its elimination, at least (100 x 100 vertices)
 NOT_NUMBERS = {"path", "route", "size", "held"}  # parameters of an experiment that are no numbers
 ScenarioName = Literal["lifting", "wind", "stretching", "folding", "fling", "shaking"]
+Scenario = Annotated[
+    Positional[ScenarioName], arg(metavar="SCENARIO", help="A scenario of the study.")
+]
+RecordingPath = Annotated[
+    Positional[Path],
+    arg(metavar="RECORDING", help="NPZ, or folder of numbered clouds or of RGB-D images."),
+]
 FabricName = Annotated[
     str,
     arg(

@@ -1,11 +1,8 @@
 """`r2s sensitivity`: what a planned motion would reveal of a fabric."""
 
 from dataclasses import dataclass
-from typing import Annotated
 
-from tyro.conf import Positional, arg
-
-from r2s.commands.common import Json, Motion, ScenarioName
+from r2s.commands.common import Json, Motion, Scenario
 
 
 @dataclass(frozen=True)
@@ -20,8 +17,7 @@ class Sensitivity:
         r2s sensitivity wind --fabric grey_interlock --motion speed=3 --noise 0.002
     """
 
-    scenario: Annotated[Positional[ScenarioName], arg(metavar="SCENARIO")]
-    """A scenario of the study."""
+    scenario: Scenario
     fabric: str = "grey_interlock"
     """A preset of `r2s.fabrics.presets`."""
     motion: Motion = ()

@@ -4,7 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
+
+from r2s.commands.common import RecordingPath
 
 
 @dataclass(frozen=True)
@@ -18,8 +20,7 @@ class Show:
         r2s show lift.npz --trajectory simulated.npz --out pictures --video gif
     """
 
-    recording: Annotated[Positional[Path], arg(metavar="RECORDING")]
-    """NPZ, or folder of numbered clouds or of RGB-D images."""
+    recording: RecordingPath
     out: Annotated[Path, arg(metavar="FOLDER")]
     """Where the pictures go; it is made when it is not there."""
     trajectory: Annotated[Path | None, arg(metavar="FILE")] = None

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
-from r2s.commands.common import ChosenShape, FabricName, Json, Motion, ScenarioName
+from r2s.commands.common import ChosenShape, FabricName, Json, Motion, Scenario
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,7 @@ class Simulate:
         r2s simulate fling --fabric mine.json --shape 33 33 --out x.npz --recording fling.npz
     """
 
-    scenario: Annotated[Positional[ScenarioName], arg(metavar="SCENARIO")]
-    """A scenario of the study."""
+    scenario: Scenario
     out: Annotated[Path, arg(metavar="FILE")]
     """NPZ of the motion."""
     fabric: FabricName = "grey_interlock"

@@ -355,15 +355,20 @@ def _check_places(
         return None
     if marks is None:
         raise ValueError("marker_places without markers")
-    places, count = np.asarray(places, np.float64), marks[0].shape[1]
-    if places.shape != (count, 2):
-        raise ValueError(f"marker_places must have the shape ({count}, 2), found {places.shape}")
+    places = _of_shape(places, (marks[0].shape[1], 2), "marker_places")
     if not ((places >= -CLOCK_TOLERANCE) & (places <= np.array(size) + CLOCK_TOLERANCE)).all():
         raise ValueError(
             f"marker_places must lie on the sheet of {size} m, found {places.min(axis=0)} to "
             f"{places.max(axis=0)}: in metres from its origin, along warp and weft"
         )
     return places
+
+
+def _of_shape(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
+    values = np.asarray(values, np.float64)
+    if values.shape != shape:
+        raise ValueError(f"{what} must have the shape {shape}, found {values.shape}")
+    return values
 
 
 def _check_cloud(points: Any, frame: int) -> np.ndarray:
@@ -381,16 +386,12 @@ def _check_cloud(points: Any, frame: int) -> np.ndarray:
 
 
 def _check_times(times: Any, what: str, count: int) -> np.ndarray:
-    times = np.asarray(times, np.float64)
-    if times.shape != (count,):
-        raise ValueError(f"{what} must have the shape ({count},), found {times.shape}")
+    times = _of_shape(times, (count,), what)
     if not np.isfinite(times).all():
         raise ValueError(f"{what} must be finite [s]")
-    # As they will be kept: in single precision, the frames of a clock that counts from 1970
-    # would fall together.
+    # as they will be kept: in single precision, times of a clock that counts from 1970 are equal
     kept = np.asarray(jnp.asarray(times, float))
-    if (np.diff(kept) <= 0).any():
-        at = int((np.diff(kept) <= 0).argmax())
+    for at in np.flatnonzero(np.diff(kept) <= 0)[:1]:
         raise ValueError(
             f"{what} must increase: {times[at]} s at {at}, then {times[at + 1]} s, "
             f"as {kept.dtype} {kept[at]} and {kept[at + 1]}; sort them, drop repeated ones, and "

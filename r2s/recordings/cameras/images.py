@@ -7,9 +7,9 @@ from jaxtyping import Bool, Float, Num
 
 from r2s.extras import require
 from r2s.files import write_bytes
+from r2s.recordings.readers.video import read_png
 
 DEPTHS, MASKS, COLOURS = (".png", ".npy"), (".png",), (".png", ".jpg", ".jpeg")
-PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 FARTHEST, NEAREST = 20.0, 0.02  # [m], of median depths; no camera of a fabric measures others
 DEEPEST = 65535  # units of depth that 16 bits hold
 
@@ -94,23 +94,6 @@ def _check_unit(path: Path, depth: np.ndarray, scale: float) -> None:
             f"{path}: the median depth is {middle:g} m with depth_scale {scale:g}: depth_scale is "
             "metres per unit of the file, 0.001 for millimetres, 1 for metres"
         )
-
-
-def read_png(path: Path) -> np.ndarray:
-    """The pixels of a PNG, as they are; ValueError that names a file that is none or damaged."""
-    cv2 = require("cv2", "camera", "images")
-    data = path.read_bytes()
-    if not data.startswith(PNG_START):
-        raise ValueError(
-            f"{path}: no PNG: found the bytes {data[:8]!r}: export it as PNG, depth also as NPY"
-        )
-    # by hand, since the decoder says nothing, or takes a part for the whole
-    is_whole = PNG_END in data[-64:]
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if is_whole else None
-    if image is None:
-        what = "damaged" if is_whole else "truncated"
-        raise ValueError(f"{path}: {what} PNG of {len(data)} bytes: copy or export it again")
-    return image
 
 
 def _read_npy(path: Path) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Grey frames of a video file or of a folder of images. Needs OpenCV: pip install 'r2s[camera]'."""
+"""Frames of a video file or of a folder of images. Needs OpenCV: pip install 'r2s[camera]'."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import UInt8
 
 from r2s.extras import require
-from r2s.recordings.cameras.images import read_png
 from r2s.recordings.readers.numbered import find_numbered
 
+PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
@@ -68,3 +68,20 @@ def _video(path: Path) -> Iterator[tuple[Path, np.ndarray]]:
         )
     if number == 0:
         raise ValueError(f"{path}: the video has no frames")
+
+
+def read_png(path: Path) -> np.ndarray:
+    """The pixels of a PNG, as they are; ValueError that names a file that is none or damaged."""
+    cv2 = require("cv2", "camera", "images")
+    data = path.read_bytes()
+    if not data.startswith(PNG_START):
+        raise ValueError(
+            f"{path}: no PNG: found the bytes {data[:8]!r}: export it as PNG, depth also as NPY"
+        )
+    # by hand, since the decoder says nothing, or takes a part for the whole
+    is_whole = PNG_END in data[-64:]
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if is_whole else None
+    if image is None:
+        what = "damaged" if is_whole else "truncated"
+        raise ValueError(f"{path}: {what} PNG of {len(data)} bytes: copy or export it again")
+    return image
