@@ -17,7 +17,7 @@ from r2s.estimation.checkpoint import arrays_of, load, read, save, tree_from
 from r2s.estimation.estimate import describe, point_estimate
 from r2s.estimation.estimate_json import as_json, from_json
 from r2s.estimation.method import Budget, default_space, seed_of
-from r2s.estimation.pinn import from_pulls, published_recipe
+from r2s.estimation.pinn import published_recipe, training
 from r2s.estimation.registry import METHODS
 from r2s.fabrics import presets
 from r2s.fabrics.fabric_json import fabric_as_json, fabric_from_json
@@ -314,5 +314,5 @@ def test_a_checkpoint_is_of_one_run(tmp_path):
 
 
 def test_the_usual_budgets_of_the_network_are_those_of_its_recipes():
-    assert METHODS["pinn"].budget.iterations == from_pulls.QUICK.adam
+    assert METHODS["pinn"].budget.iterations == training.QUICK.adam
     assert METHODS["pinn-published"].budget.iterations == published_recipe.EPOCHS

@@ -14,7 +14,6 @@ from r2s import scenarios
 from r2s.estimation import default_spaces
 from r2s.estimation.diffcloud import last_frame
 from r2s.estimation.method import default_space
-from r2s.estimation.pinn.method import pulls_of
 from r2s.estimation.pinn.pulls import pull_from
 from r2s.estimation.pinn.synthetic_pulls import pulled
 from r2s.estimation.prediction import Prediction
@@ -141,7 +140,7 @@ def test_the_network_reads_markers_and_force_and_no_clouds(pull):
         pull_from(dataclasses.replace(pull, markers=None, markers_seen=None))
     published = METHODS["pinn-published"]().reads(pull)
     assert published.markers and not published.force
-    given = [pulls_of([each], without_force=True) for each in (pull, without)]
+    given = [pull_from(each, without_force=True) for each in (pull, without)]
     assert alike(*given)
 
 

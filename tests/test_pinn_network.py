@@ -7,15 +7,9 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
-from flax import serialization
 
-from r2s.estimation.pinn.network import STRONG, WEAK, Network
-from r2s.estimation.pinn.stress import (
-    divergence,
-    green,
-    nominal_stress,
-    small,
-)
+from r2s.estimation.pinn.network import Network, T, X, Y
+from r2s.estimation.pinn.stress import green, nominal_stress, small
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import IsotropicSpace
 from r2s.geometry.mesh import rectangle
@@ -42,36 +36,7 @@ class PlaneStrainSpace(IsotropicSpace):
         return dataclasses.replace(super().__call__(u), membrane=law)
 
 
-# what version 0.2.0 drew with this key: first and last number of each kernel
-DRAWN = """0x1.8397f993153f8p-1 -0x1.0b827e4db7be7p-2 -0x1.f1f2e5e986053p-2 0x1.d8466c682e508p-3
-0x1.209cff70d60b5p-3 -0x1.12cea8aa28c21p-1 0x1.3e13846b3bd1ap-2 -0x1.d76558da1d9b2p-2"""
-
-
-def test_the_first_parameters_are_those_of_version_0_2_0():
-    """Up to rounding, whatever flax draws: estimates with a key are to stay what they were."""
-    params = some_network().params
-    ends = [float(params[f"kernel_{i}"].ravel()[at]) for i in range(4) for at in (0, -1)]
-    drawn = [float.fromhex(number) for number in DRAWN.split()]
-    assert ends == pytest.approx(drawn, rel=1e-14)
-    assert all(not np.any(params[f"bias_{i}"]) for i in range(4))
-
-
-def test_parameters_have_the_form_that_flax_gives_them():
-    network = some_network()
-    own = jax.eval_shape(network.module.init, jr.key(0), jnp.zeros((1, 3)))["params"]
-    shapes = jax.tree.map(jnp.shape, network.params)
-    assert shapes == jax.tree.map(lambda leaf: leaf.shape, own)
-
-
-def test_a_network_survives_the_file_of_flax():
-    network, points = some_network(), jr.uniform(jr.key(1), (5, 3))
-    stored = serialization.to_bytes(network.params)
-    params = serialization.from_bytes(jax.tree.map(jnp.zeros_like, network.params), stored)
-    again = dataclasses.replace(network, params=jax.tree.map(jnp.asarray, params))
-    np.testing.assert_array_equal(again(points), network(points))
-
-
-@pytest.mark.parametrize("pairs", [STRONG, WEAK])
+@pytest.mark.parametrize("pairs", [((X, X), (X, Y), (Y, Y), (T, T)), ((X, T), (Y, T), (T, T))])
 def test_jets_are_the_derivatives(pairs):
     network = some_network()
     points = jr.uniform(jr.key(1), (5, 3)) * jnp.array([[0.45, 0.3, 1.2]])
@@ -118,24 +83,6 @@ def test_damping_adds_the_stress_of_the_rate():
     viscous = 0.02 * jax.grad(law.energy_density)(fast)  # the law is linear
     expected = jax.vjp(green, at)[1](viscous)[0]
     np.testing.assert_allclose(found, expected, rtol=1e-9)
-
-
-@pytest.mark.parametrize("strain", [green, small])
-def test_divergence_against_differences(strain):
-    network = some_network()
-
-    def fields(x):
-        return jax.jacfwd(lambda p: network(p[None])[0])(jnp.append(x, 0.5))[:, :2]
-
-    def stress(x):
-        return nominal_stress(FABRIC, ANGLE, fields(x), strain=strain)
-
-    at, h = jnp.array([0.2, 0.1]), 1e-5
-    differences = [(stress(at + step) - stress(at - step)) / (2 * h) for step in h * jnp.eye(2)]
-    expected = differences[0][:, 0] + differences[1][:, 1]
-    changes = jnp.moveaxis(jax.jacfwd(fields)(at), 2, 0)
-    found = divergence(FABRIC, ANGLE, fields(at), changes, strain)
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_turning_a_strain_turns_its_tensor():

@@ -18,12 +18,14 @@ import hashlib
 import json
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from r2s.files import parse
 from r2s.laboratory.cantilever import Cantilever
 from r2s.laboratory.drape import DEVIATION, RADII, Drape
 from r2s.laboratory.estimate import Test
@@ -32,7 +34,6 @@ from r2s.laboratory.pull import SPECIMEN, Pull
 from r2s.recordings.readers.columns import METRES, NEWTONS, SHARES, header_of, read_columns
 
 FORMAT = "r2s-laboratory/1"
-LARGEST = 1e12  # that is still a number of a test
 DIRECTIONS = {"warp": 0.0, "bias": math.pi / 4, "weft": math.pi / 2}
 
 
@@ -77,103 +78,96 @@ def read_tests(path: Path | str) -> LaboratoryTests:
         raise ValueError(f"{path}: source: expected text, found {source!r}")
     tests: list[Test] = []
     for kind, make in KINDS.items():
-        each = stored.get(kind, [])
-        if not isinstance(each, list):
-            raise ValueError(f"{path}: {kind}: expected a list, found {type(each).__name__}")
-        for number, one in enumerate(each, 1):
-            where = f"{path}: {kind[:-1]} {number}"
-            if not isinstance(one, dict):
-                raise ValueError(f"{where}: expected an object, found {one!r}")
-            tests += make(path.parent, where, dict(one))
+        entries = stored.get(kind, [])
+        if not isinstance(entries, list):
+            raise ValueError(f"{path}: {kind}: expected a list, found {type(entries).__name__}")
+        for number, entry in enumerate(entries, 1):
+            tests += make(path.parent, f"{path}: {kind[:-1]} {number}", entry)
     if not tests:
         raise ValueError(f"{path}: no test: it has neither {', '.join(KINDS)}")
     return LaboratoryTests(tuple(tests), source, path.stem)
 
 
-def _pulls(folder: Path, where: str, one: dict[str, Any]) -> list[Test]:
-    direction = _direction(where, one)
-    file = folder / str(_taken(where, one, "file"))
+@dataclass(frozen=True)
+class _Knit:
+    file: str
+    direction: float
+    specimen: float = SPECIMEN
+
+
+@dataclass(frozen=True)
+class _Pull:
+    file: str
+    direction: float
+    length: float
+    width: float
+    specimen: float = SPECIMEN
+
+
+@dataclass(frozen=True)
+class _Cantilever:
+    direction: float
+    overhangs: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Drape:
+    coefficient: float
+    specimen_radius: float = RADII[0]
+    support_radius: float = RADII[1]
+    deviation: float = DEVIATION
+
+
+def _entry(kind: type, where: str, entry: Any) -> Any:
+    """The dataclass `kind` from an entry of a file, its direction as an angle [rad]."""
+    if isinstance(entry, dict) and "direction" in entry:
+        direction = DIRECTIONS.get(str(entry["direction"]), entry["direction"])
+        is_number = isinstance(direction, int | float) and not isinstance(direction, bool)
+        if not is_number or not 0 <= direction <= math.pi:
+            raise ValueError(
+                f"{where}: direction: expected {', '.join(DIRECTIONS)}, or an angle from the warp, "
+                f"0 to pi rad, found {direction!r}"
+            )
+        entry = entry | {"direction": direction}
+    try:
+        return parse(kind, entry, where)
+    except OverflowError as error:
+        raise ValueError(f"{where}: a number is too large: {error}") from error
+
+
+def _pulls(folder: Path, where: str, entry: Any) -> list[Test]:
+    is_knit = isinstance(entry, dict) and str(entry.get("file")).endswith(".h5")
+    one = _entry(_Knit if is_knit else _Pull, where, entry)
+    file = folder / one.file
     if not file.is_file():
         raise FileNotFoundError(f"{where}: no such file: {file}")
-    specimen = _number(where, one, "specimen", SPECIMEN)
-    if file.suffix == ".h5":
-        _nothing_left(where, one)
-        return list(read_knit(file, direction, specimen))
-    length, wide = (_number(where, one, name) for name in ("length", "width"))
-    _nothing_left(where, one)
+    if is_knit:
+        return list(read_knit(file, one.direction, one.specimen))
     header = " ".join(header_of(file)).lower()
-    along = {"extension": METRES} if "extension" in header else {"strain": SHARES}
-    names = along | {"force": NEWTONS} | ({"width": METRES} if "width" in header else {})
-    columns = read_columns(file, names).values.T
-    extension = columns[0] * (1 if "extension" in names else length)
-    middle = columns[2] if len(columns) > 2 else None
-    name = f"{where} ({file.name})"
-    return [
-        Pull.make(extension, columns[1], (length, wide), direction, middle, specimen, name),
-    ]
+    names = {"extension": METRES} if "extension" in header else {"strain": SHARES}
+    names |= {"force": NEWTONS} | ({"width": METRES} if "width" in header else {})
+    along, force, *width = read_columns(file, names).values.T
+    extension = along if "extension" in names else along * one.length
+    middle, name = width[0] if width else None, f"{where} ({file.name})"
+    size = one.length, one.width
+    return [Pull.make(extension, force, size, one.direction, middle, one.specimen, name)]
 
 
-def _cantilevers(folder: Path, where: str, one: dict[str, Any]) -> list[Test]:
+def _cantilevers(folder: Path, where: str, entry: Any) -> list[Test]:
     del folder
-    direction = _direction(where, one)
-    overhangs = _taken(where, one, "overhangs")
-    _nothing_left(where, one)
-    if not isinstance(overhangs, list) or not all(_is_number(value) for value in overhangs):
-        raise ValueError(f"{where}: overhangs: expected a list of numbers [m], found {overhangs!r}")
-    return [Cantilever.make(overhangs, direction, name=where)]
+    one = _entry(_Cantilever, where, entry)
+    return [Cantilever.make(one.overhangs, one.direction, name=where)]
 
 
-def _drapes(folder: Path, where: str, one: dict[str, Any]) -> list[Test]:
+def _drapes(folder: Path, where: str, entry: Any) -> list[Test]:
     del folder
-    value = _number(where, one, "coefficient")
-    radii = (
-        _number(where, one, "specimen_radius", RADII[0]),
-        _number(where, one, "support_radius", RADII[1]),
-    )
-    deviation = _number(where, one, "deviation", DEVIATION)
-    _nothing_left(where, one)
-    return [Drape.make(value, radii, deviation, name=where)]
+    one = _entry(_Drape, where, entry)
+    radii = one.specimen_radius, one.support_radius
+    return [Drape.make(one.coefficient, radii, one.deviation, name=where)]
 
 
-KINDS: dict[str, Callable[[Path, str, dict[str, Any]], list[Test]]] = {
+KINDS: dict[str, Callable[[Path, str, Any], list[Test]]] = {
     "pulls": _pulls,
     "cantilevers": _cantilevers,
     "drapes": _drapes,
 }
-
-
-def _taken(where: str, one: dict[str, Any], key: str) -> Any:
-    if key not in one:
-        raise ValueError(f"{where}: missing: {key}")
-    return one.pop(key)
-
-
-def _nothing_left(where: str, one: dict[str, Any]) -> None:
-    if one:
-        raise ValueError(f"{where}: unknown: {', '.join(sorted(one))}")
-
-
-def _number(where: str, one: dict[str, Any], key: str, default: float | None = None) -> float:
-    value = _taken(where, one, key) if default is None else one.pop(key, default)
-    if not _is_number(value):
-        raise ValueError(f"{where}: {key}: expected a number, found {value!r}")
-    return float(value)
-
-
-def _is_number(value: Any) -> bool:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return abs(value) < LARGEST  # no infinity, nor an integer that no float holds
-
-
-def _direction(where: str, one: dict[str, Any]) -> float:
-    value = _taken(where, one, "direction")
-    if isinstance(value, str) and value in DIRECTIONS:
-        return DIRECTIONS[value]
-    if isinstance(value, int | float) and _is_number(value) and 0 <= value <= math.pi:
-        return float(value)
-    known = ", ".join(DIRECTIONS)
-    raise ValueError(
-        f"{where}: direction: expected {known}, or an angle from the warp, 0 to pi rad, found "
-        f"{value!r}"
-    )

@@ -40,39 +40,30 @@ def read_knit(path: Path | str, direction: float, specimen: float = SPECIMEN) ->
                 name: tuple(np.asarray(file[name][key], float) for key in ("traj", "forces"))
                 for name in PULLS
             }
-            sizes = {key: float(file[key][0]) for key in ("clampSize", "fabricSize")}
-        if not min(sizes.values()) > 0:
-            raise ValueError(f"sizes must be positive, found {sizes}")
+            clamp, fabric = (float(file[key][0]) for key in ("clampSize", "fabricSize"))
+        if not min(clamp, fabric) > 0:
+            raise ValueError(f"sizes must be positive, found {clamp} and {fabric}")
     except Exception as error:  # a file of another layout raises anything
         raise ValueError(f"{path}: no pulls of stitch-by-stitch: {error}") from error
-    scale = CLAMP / sizes["clampSize"]  # [m] a pixel
-    spans = {name: _spans(path, name, *each) for name, each in arrays.items()}
-    length, wide = (span[0] for span in spans[REFERENCE])
-    size = float(length * scale), sizes["fabricSize"] * scale
-    pulls = []
-    for name, (_, force) in arrays.items():
-        along, across = spans[name]
-        pulls.append(
-            Pull.make(
-                (along - length) * scale,
-                force,
-                size,
-                direction,
-                across / wide * size[1],
-                specimen,
-                f"{path.name}: {name}",
+    scale, spans = CLAMP / clamp, {}  # [m] a pixel
+    for name, (pins, force) in arrays.items():
+        if pins.ndim != 3 or pins.shape[0] < 4 or pins.shape[1:] != (2, len(force)):
+            raise ValueError(
+                f"{path}: {name}: expected pins (four or more, 2, {len(force)}), found {pins.shape}"
             )
+        along, across = pins[UPPER] - pins[LOWER], pins[RIGHT] - pins[LEFT]
+        spans[name] = np.linalg.norm([along, across], axis=1)  # between clamps, between the sides
+    length, wide = spans[REFERENCE][:, 0]
+    size = float(length * scale), fabric * scale
+    return [
+        Pull.make(
+            (spans[name][0] - length) * scale,
+            force,
+            size,
+            direction,
+            spans[name][1] / wide * size[1],
+            specimen,
+            f"{path.name}: {name}",
         )
-    return pulls
-
-
-def _spans(
-    path: Path, name: str, pins: np.ndarray, force: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Distances [pixel] between the clamps and between the pins at the sides, over time."""
-    if pins.ndim != 3 or pins.shape[0] < 4 or pins.shape[1:] != (2, len(force)):
-        raise ValueError(
-            f"{path}: {name}: expected pins (four or more, 2, {len(force)}), found {pins.shape}"
-        )
-    along = np.linalg.norm(pins[UPPER] - pins[LOWER], axis=0)
-    return along, np.linalg.norm(pins[RIGHT] - pins[LEFT], axis=0)
+        for name, (_, force) in arrays.items()
+    ]

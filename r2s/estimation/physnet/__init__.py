@@ -10,6 +10,6 @@ garments with a physics similarity neural network").
 - `triplets`: batches, triplets and their loss.
 - `training`: epochs, checkpoints, validation.
 - `estimator`: the estimate of a fabric from images.
-- `emulator`, `bayes`: the searches of the estimate and of the published recipe.
-- `search_file`: the file of a search, from which it continues.
+- `search`: a search that continues from its file; `emulator`, `bayes`: what asks for its places, of
+  the estimate and of the published recipe.
 """

@@ -1,12 +1,10 @@
 """Training data: depth images of simulated motions of many fabrics, in reproducible shards."""
 
 import dataclasses
-import hashlib
 import io
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -31,8 +29,9 @@ from r2s.scenarios.scenario import Scenario, rollout
 from r2s.scenarios.solvers import material_points
 from r2s.scenarios.standard import SIX, Experiment, varied
 
-FORMAT = "r2s-physnet-data/2"
+FORMAT = "r2s-physnet-data/3"
 DEPTH_UNIT = 1e-4  # [m], of the depths in the files
+DENSITY = 0.2  # [kg/m^2], of all fabrics
 
 
 @dataclass(frozen=True)
@@ -45,10 +44,9 @@ class Settings:
     - `num_frames`: frames of each motion, evenly spread over those that count.
     - `size`: side of the images, [pixel].
     - `shape`: vertices of the sheet along warp and weft.
-    - `density` [kg/m^2], `thickness` [m], `ranges`: of the space; without ranges its defaults.
-    - `material_points`: whether material points simulate the motions, and not the cloth.
+    - `ranges`: of the space; without ranges its defaults.
+    - `solver`: "cloth" of orthotropic fabrics, or "points" (material points) of isotropic ones.
     - `per_shard`: fabrics in a file.
-    - `isotropic`: whether fabrics are isotropic (E h and Poisson's ratio), and not orthotropic.
     """
 
     scenario: str = "lifting"
@@ -57,19 +55,16 @@ class Settings:
     num_frames: int = 8
     size: int = 64
     shape: tuple[int, int] = (9, 9)
-    density: float = 0.2
-    thickness: float = 1e-3
     ranges: tuple[Range, ...] = ()
-    material_points: bool = False
+    solver: str = "cloth"
     per_shard: int = 16
     seed: int = 0
-    isotropic: bool = False
 
     def __post_init__(self) -> None:
-        plain = self._plain().ranges
+        default = self._default_space().ranges
         if not self.ranges:  # stored with the data, so that later defaults do not change them
-            object.__setattr__(self, "ranges", plain)
-        names, expected = ([bound.name for bound in ranges] for ranges in (self.ranges, plain))
+            object.__setattr__(self, "ranges", default)
+        names, expected = ([bound.name for bound in ranges] for ranges in (self.ranges, default))
         if names[: len(expected)] != expected:
             raise ValueError(f"the space has the ranges {expected}, found {names}")
         if self.scenario not in SIX:
@@ -81,22 +76,24 @@ class Settings:
     @property
     def space(self) -> ParameterSpace:
         """The fabrics from which those of the data are drawn."""
-        return dataclasses.replace(self._plain(), ranges=self.ranges)
+        return dataclasses.replace(self._default_space(), ranges=self.ranges)
 
-    def _plain(self) -> OrthotropicSpace | IsotropicSpace:
-        if self.isotropic:
-            return IsotropicSpace.make(self.density, thickness=self.thickness)
-        return OrthotropicSpace.make(self.density, self.thickness)
+    @property
+    def num_shards(self) -> int:
+        """Number of files."""
+        return -(-self.num_fabrics // self.per_shard)
+
+    def _default_space(self) -> OrthotropicSpace | IsotropicSpace:
+        return (IsotropicSpace if self.solver == "points" else OrthotropicSpace).make(DENSITY)
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """The file `manifest.json`: settings and view of the data, and the SHA-256 of every shard."""
+    """The file `manifest.json`: settings and view of the data."""
 
     format: str
     settings: Settings
     view: View
-    shards: Mapping[str, str]
 
 
 class Data(NamedTuple):
@@ -129,7 +126,7 @@ _depths = eqx.filter_jit(eqx.filter_vmap(depths_of_sheet, in_axes=(None, 0, None
 def make(
     folder: Path | str, settings: Settings, progress: bool = True, view: View | None = None
 ) -> Manifest:
-    """Write the missing shards of a data set, and its manifest after each.
+    """Write a manifest and the missing shards of a data set.
 
     A shard depends on the settings and on its own number alone, so that an interrupted call can be
     repeated. Without a `view`, such as that of the data of an existing network, the motions of the
@@ -140,29 +137,26 @@ def make(
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    known = load_manifest(folder) if (folder / "manifest.json").exists() else None
-    if known is not None and known.settings != settings:
-        raise ValueError(
-            f"{folder} has data of other settings: {_differences(known.settings, settings)}; "
-            "choose another folder"
-        )
-    if known is not None and view not in (None, known.view):
-        raise ValueError(f"{folder} has data of {known.view}, asked for {view}")
-    shards = dict(known.shards) if known else {}
-    view = known.view if known else view
-    starts = range(0, settings.num_fabrics, settings.per_shard)
-    shared = None  # until a shard is missing
-    for number, _ in enumerate(tqdm(starts, "shards", disable=None if progress else True)):
-        name = f"{number:04d}.npz"
-        if view is not None and _is_whole(folder / name, shards.get(name)):
-            continue
-        shared = _shared(settings) if shared is None else shared
+    if (folder / "manifest.json").exists():
+        known = load_manifest(folder)
+        if known.settings != settings:
+            raise ValueError(
+                f"{folder} has data of other settings: {_differences(known.settings, settings)}; "
+                "choose another folder"
+            )
+        if view not in (None, known.view):
+            raise ValueError(f"{folder} has data of {known.view}, asked for {view}")
+        view = known.view
+    missing = [n for n in range(settings.num_shards) if not _shard(folder, n).exists()]
+    shared = _shared(settings) if missing else None
+    for number in tqdm(missing, "shards", disable=None if progress else True):
         experiments, places, x, ok = _simulate(settings, number, shared)
         if view is None:
-            view = _fitted_view(settings, experiments[0], x[ok])
-        shards[name] = _write(folder / name, settings, view, places, x, ok)
-        manifest = Manifest(FORMAT, settings, view, dict(sorted(shards.items())))
-        write_json(folder / "manifest.json", asdict(manifest))
+            points = x[ok].reshape(-1, 3)
+            eye, floor = eye_of(experiments[0]), floor_of(experiments[0])
+            view = view_around(eye, points, settings.size, floor)
+        write_json(folder / "manifest.json", asdict(Manifest(FORMAT, settings, view)))
+        _write(_shard(folder, number), settings, view, places, x, ok)
     return load_manifest(folder)
 
 
@@ -178,24 +172,23 @@ def load_manifest(folder: Path | str) -> Manifest:
 def load(folder: Path | str) -> Data:
     """All shards of a data set. Raises `ValueError` that names what is missing or damaged."""
     folder = Path(folder)
-    manifest = load_manifest(folder)
-    settings, shards = manifest.settings, manifest.shards
-    expected = -(-settings.num_fabrics // settings.per_shard)
-    if len(shards) != expected:
-        raise ValueError(
-            f"{folder} has {len(shards)} of {expected} shards: call `make` again, it goes on"
-        )
-    parts: list[Any] = []
-    for name, digest in shards.items():
-        if not _is_whole(folder / name, digest):
-            raise ValueError(f"{folder / name} is missing or damaged: make the data set again")
-        with np.load(folder / name, allow_pickle=False) as file:
-            parts.append({key: file[key] for key in file.files})
-    ok = np.concatenate([part["ok"] for part in parts])
-    depth = np.concatenate([part["depth"] for part in parts])
-    places = np.concatenate([part["places"] for part in parts])
+    settings, parts = load_manifest(folder).settings, []
+    for number in range(settings.num_shards):
+        path = _shard(folder, number)
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                parts.append([file[name] for name in ("ok", "depth", "places")])
+        except Exception as error:  # a damaged file raises anything
+            raise ValueError(
+                f"{path} is missing or damaged: remove it and call `make` again, it goes on"
+            ) from error
+    ok, depth, places = (np.concatenate(part) for part in zip(*parts, strict=True))
     fabric = np.repeat(np.arange(len(places)), settings.num_levels)
     return Data(depth[ok], fabric[ok], places)
+
+
+def _shard(folder: Path, number: int) -> Path:
+    return folder / f"{number:04d}.npz"
 
 
 def levels(settings: Settings, number: int = 0) -> list[Experiment]:
@@ -209,7 +202,7 @@ def levels(settings: Settings, number: int = 0) -> list[Experiment]:
 
 def solver_of(settings: Settings, scenarios: list[Scenario]) -> Sheet | None:
     """None for the cloth, or material points whose step and grid serve all these motions."""
-    if not settings.material_points:
+    if settings.solver == "cloth":
         return None
     paths, times = (
         jnp.concatenate([getattr(scenario, name) for scenario in scenarios])
@@ -228,8 +221,8 @@ def kept_frames(used: tuple[int, int], number: int) -> tuple[int, ...]:
 
 def _shared(settings: Settings) -> tuple[int, Sheet | None]:
     """The steps between frames and the solver of all shards, so that they compile once."""
-    shards = -(-settings.num_fabrics // settings.per_shard)
-    experiments = [experiment for i in range(shards) for experiment in levels(settings, i)[i > 0 :]]
+    shards = range(settings.num_shards)
+    experiments = [experiment for i in shards for experiment in levels(settings, i)[i > 0 :]]
     scenarios = [experiment.scenario(settings.shape) for experiment in experiments]
     return max(s.substeps for s in scenarios), solver_of(settings, scenarios)
 
@@ -261,13 +254,8 @@ def _simulate(settings: Settings, number: int, shared: tuple[int, Sheet | None])
     )
 
 
-def _fitted_view(settings: Settings, experiment: Experiment, x: np.ndarray) -> View:
-    points = x.reshape(-1, 3)
-    return view_around(eye_of(experiment), points, settings.size, floor_of(experiment))
-
-
-def _write(path: Path, settings: Settings, view: View, places, x, ok) -> str:
-    """Write a shard with depths in units of `DEPTH_UNIT`, and return its SHA-256."""
+def _write(path: Path, settings: Settings, view: View, places, x, ok) -> None:
+    """Write a shard with depths in units of `DEPTH_UNIT`."""
     experiment = SIX[settings.scenario]()
     faces = experiment.scenario(settings.shape).scene.mesh.faces
     fine = per_face(view, settings.shape, experiment.sheet.size)
@@ -276,13 +264,6 @@ def _write(path: Path, settings: Settings, view: View, places, x, ok) -> str:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, depth=depth, places=places, ok=ok)
     write_bytes(path, buffer.getvalue())
-    return hashlib.sha256(buffer.getvalue()).hexdigest()
-
-
-def _is_whole(path: Path, digest: str | None) -> bool:
-    if digest is None or not path.exists():
-        return False
-    return hashlib.sha256(path.read_bytes()).hexdigest() == digest
 
 
 def _differences(known: Settings, asked: Settings) -> str:

@@ -7,7 +7,7 @@ simulation follows the recorded gripper. Of a stretching the force on the clamp 
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -19,16 +19,15 @@ from jaxtyping import Array, Float
 
 from r2s.estimation.checkpoint import fingerprint
 from r2s.estimation.estimate import Estimate, point_estimate
-from r2s.estimation.physnet import bayes, emulator
+from r2s.estimation.physnet import bayes, emulator, search
 from r2s.estimation.physnet.network import PhysNet
 from r2s.estimation.physnet.preprocess import grey
 from r2s.estimation.physnet.pull_force import PullForce, moved_with_forces
 from r2s.estimation.physnet.training import Training
 from r2s.estimation.physnet.views import View, depths_of_sheet, per_face
-from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace
-from r2s.recordings.cameras.calibration import DepthCamera, frustum
-from r2s.scenarios.scenario import Scenario, SheetSolver, rollout
+from r2s.scenarios.scenario import Scenario, rollout
+from r2s.solver import Solver
 
 Images = Float[np.ndarray, "frame down across"]
 
@@ -43,7 +42,6 @@ class Sighting(eqx.Module):
     - `solver`: None for the cloth.
     - `frames`: frames of the scenario at which the images were recorded.
     - `view`, `per_face`: see `views.depths_of_sheet`.
-    - `cameras`: planes of the cameras' frames (`frustum`); None: all of the sheet was in them.
     - `pull`: the force of a pull, whose coordinates `points` have, too; None: of images alone.
     """
 
@@ -51,11 +49,10 @@ class Sighting(eqx.Module):
     points: Float[Array, "frame dim"]
     space: ParameterSpace
     network: PhysNet
-    solver: SheetSolver | None
+    solver: Solver | None
     frames: tuple[int, ...] = eqx.field(static=True)
     view: View = eqx.field(static=True)
     per_face: int = eqx.field(static=True)
-    cameras: Float[Array, "camera 4 4"] | None = None
     pull: PullForce | None = None
 
     @classmethod
@@ -66,15 +63,13 @@ class Sighting(eqx.Module):
         frames: tuple[int, ...],
         space: ParameterSpace,
         training: Training,
-        solver: SheetSolver | None = None,
-        cameras: Sequence[DepthCamera] = (),
+        solver: Solver | None = None,
         pull: PullForce | None = None,
     ) -> "Sighting":
         """A sighting from recorded images.
 
         - `images`: of `r2s.estimation.physnet.preprocess`, one for each of the `frames`.
         - `training`: the trained network with its view.
-        - `cameras`: what is out of the frame of all of them is left out of simulated images too.
         - `pull`: the force at the same frames, see `r2s.estimation.physnet.pull_force`.
 
         Raises `ValueError` when images and frames differ in number, or a frame is not simulated.
@@ -84,14 +79,13 @@ class Sighting(eqx.Module):
                 f"{len(images)} images at frames {frames}, of {scenario.num_frames} simulated: "
                 "expected one image for each frame"
             )
-        points = embedded(training.network, jnp.asarray(images, float))
+        points = eqx.filter_jit(jax.vmap(training.network))(jnp.asarray(images, float))
         if pull is not None:
             points = jnp.concatenate([points, pull.recorded], axis=1)
         rest = np.asarray(scenario.scene.mesh.rest)
         along = tuple(len(np.unique(rest[:, axis].round(6))) for axis in (0, 1))
         width, height = (float(side) for side in np.ptp(rest, axis=0))
         fine = per_face(training.view, (along[0], along[1]), (width, height))
-        planes = [frustum(camera) for camera in cameras]
         return cls(
             scenario=scenario,
             points=points,
@@ -101,17 +95,8 @@ class Sighting(eqx.Module):
             frames=frames,
             view=training.view,
             per_face=fine,
-            cameras=jnp.asarray(np.stack(planes), float) if planes else None,
             pull=pull,
         )
-
-
-@eqx.filter_jit
-def embedded(
-    network: PhysNet, images: Float[Array, "image down across"]
-) -> Float[Array, "image dim"]:
-    """The points of images on the map."""
-    return jax.vmap(network)(images)
 
 
 @eqx.filter_jit
@@ -123,10 +108,14 @@ def answers(sighting: Sighting, places: Float[Array, "place dim"]) -> Float[Arra
 
     def of_place(place):
         fabric = sighting.space(place)
-        found, ok = _moved(sighting, fabric)
+        if sighting.pull is None:
+            found = rollout(sighting.scenario, fabric, solver=sighting.solver)
+            ok = jnp.all(found.ok)
+        else:
+            found, ok = moved_with_forces(sighting.scenario, fabric, sighting.solver)
         x = found.x[jnp.array(sighting.frames)]
         faces = sighting.scenario.scene.mesh.faces
-        depth = depths_of_sheet(sighting.view, x, faces, sighting.per_face, sighting.cameras)
+        depth = depths_of_sheet(sighting.view, x, faces, sighting.per_face)
         images = jax.vmap(partial(grey, sighting.view))(depth)
         points = jax.vmap(sighting.network)(images)
         if sighting.pull is not None:
@@ -136,14 +125,6 @@ def answers(sighting: Sighting, places: Float[Array, "place dim"]) -> Float[Arra
         return jnp.where(whole, _flat(points), jnp.nan)
 
     return jax.vmap(of_place)(places)
-
-
-def _moved(sighting: Sighting, fabric: Fabric):
-    """The motion of a fabric, with its forces where one was recorded, and whether it is finite."""
-    if sighting.pull is not None:
-        return moved_with_forces(sighting.scenario, fabric, sighting.solver)
-    found = rollout(sighting.scenario, fabric, solver=sighting.solver)
-    return found, jnp.all(found.ok)
 
 
 def _flat(points: Float[Array, "frame dim"]) -> Float[Array, " part"]:
@@ -157,12 +138,10 @@ def target_of(sighting: Sighting) -> Float[np.ndarray, " part"]:
     return np.asarray(_flat(sighting.points))
 
 
-def responses(
-    sighting: Sighting, batch: int
-) -> Callable[[Float[np.ndarray, "place dim"]], Float[np.ndarray, "place part"]]:
+def responses(sighting: Sighting, batch: int) -> search.Respond:
     """The function from up to `batch` places to their answers, simulated together."""
 
-    def respond(places):
+    def respond(places: search.Places) -> Float[np.ndarray, "place part"]:
         padded = np.full((batch, places.shape[1]), 0.5)  # so that it compiles once
         padded[: len(places)] = places
         return np.asarray(answers(sighting, jnp.asarray(padded, float)))[: len(places)]
@@ -170,17 +149,15 @@ def responses(
     return respond
 
 
-def objective(sighting: Sighting, batch: int) -> bayes.Objective:
+def objective(
+    sighting: Sighting, batch: int
+) -> Callable[[search.Places], Float[np.ndarray, " place"]]:
     """The function from up to `batch` places to the rms distances of their frames on the map.
 
     A distance is NaN where the simulation diverges.
     """
     respond, recorded = responses(sighting, batch), target_of(sighting)
-
-    def distances(places: Float[np.ndarray, "place dim"]) -> Float[np.ndarray, " place"]:
-        return np.sqrt(((respond(places) - recorded) ** 2).mean(axis=1))
-
-    return distances
+    return lambda places: np.sqrt(((respond(places) - recorded) ** 2).mean(axis=1))
 
 
 def estimate(
@@ -190,39 +167,23 @@ def estimate(
     batch: int = 4,
     seed: int = 0,
     path: Path | str | None = None,
-    progress: Callable[[emulator.Trials], None] | None = None,
+    progress: Callable[[int, float], None] | None = None,
 ) -> Estimate:
     """The fabric most likely to look as recorded, by `num_calls` simulations.
 
     - `batch`: simulations that run together.
     - `path`: file of the search, from which it continues; one of another sighting is refused.
-    - `progress`: called with the trials after every batch.
+    - `progress`: called with the number of simulations and the least loss, after every batch.
 
     An emulator (`r2s.estimation.physnet.emulator`) predicts the points of simulated images; the
     last simulation is that of the estimate. Losses are distances on the map, without unit. There
     are no standard errors: repeat with other seeds. Raises `RuntimeError` when all simulations
     diverge, or the last one.
     """
-    began = time.perf_counter()
-    trials = emulator.minimise(
-        responses(sighting, batch),
-        target_of(sighting),
-        sighting.space.dim,
-        num_calls=num_calls,
-        batch=batch,
-        shared=len(sighting.frames),  # the error of the images counts as the same in all of them
-        seed=seed,
-        path=path,
-        run=fingerprint(sighting) if path else "",
-        progress=progress,
-    )
-    losses = trials.losses(target_of(sighting))
-    if not np.isfinite(losses[-1]):
-        fabric = sighting.space(jnp.asarray(trials.places[-1], float))
-        moved = eqx.filter_jit(rollout)(sighting.scenario, fabric, solver=sighting.solver)
-        raise RuntimeError(f"the simulation of the estimate {moved.explain()} Narrow the ranges.")
+    # the error of the images counts as the same in all frames
+    how = partial(emulator.search, num_calls=num_calls, shared=len(sighting.frames))
     name = f"physnet (emulated answers, {num_calls} simulations)"
-    return _estimate(sighting, name, trials.places, losses, -1, began)
+    return _searched(sighting, name, how, False, batch, seed, path, progress)
 
 
 def published_recipe(
@@ -232,38 +193,54 @@ def published_recipe(
     batch: int = 4,
     seed: int = 0,
     path: Path | str | None = None,
-    progress: Callable[[bayes.History], None] | None = None,
+    progress: Callable[[int, float], None] | None = None,
 ) -> Estimate:
     """The fabric of the least distance on the map among `num_calls` simulations.
 
     Bayesian optimisation of that distance (`r2s.estimation.physnet.bayes`) chooses them, as in the
     study of Duan et al. The arguments are those of `estimate`.
     """
-    began = time.perf_counter()
-    history = bayes.minimise(
-        objective(sighting, batch),
-        sighting.space.dim,
-        num_calls=num_calls,
+    how = partial(search.minimise, ask=bayes.ask, num_calls=num_calls)
+    name = f"physnet (Bayesian optimisation, {num_calls} simulations)"
+    return _searched(sighting, name, how, True, batch, seed, path, progress)
+
+
+def _searched(
+    sighting: Sighting,
+    name: str,
+    how: Callable[..., search.Trials],
+    takes_best: bool,
+    batch: int,
+    seed: int,
+    path: Path | str | None,
+    progress: Callable[[int, float], None] | None,
+) -> Estimate:
+    """The estimate by a search: of its best trial, or of its last one."""
+    began, space = time.perf_counter(), sighting.space
+    trials = how(
+        responses(sighting, batch),
+        target_of(sighting),
+        dim=space.dim,
         batch=batch,
         seed=seed,
         path=path,
         run=fingerprint(sighting) if path else "",
         progress=progress,
     )
-    name = f"physnet (Bayesian optimisation, {num_calls} simulations)"
-    return _estimate(sighting, name, history.places, history.losses, history.best, began)
-
-
-def _estimate(sighting: Sighting, name: str, places, losses, best: int, began: float) -> Estimate:
-    space = sighting.space
-    values = np.asarray(jax.vmap(space.values)(jnp.asarray(places, float)))
+    losses, places = trials.losses, jnp.asarray(trials.places, float)
+    chosen = int(np.nanargmin(losses)) if takes_best else len(losses) - 1
+    if not np.isfinite(losses[chosen]):
+        moved = eqx.filter_jit(rollout)(
+            sighting.scenario, space(places[chosen]), solver=sighting.solver
+        )
+        raise RuntimeError(f"the simulation of the estimate {moved.explain()} Narrow the ranges.")
     return point_estimate(
         name,
         space,
-        jnp.asarray(places[best], float),
-        float(losses[best]),
+        places[chosen],
+        float(losses[chosen]),
         losses[:, None],
-        values[:, None],
+        np.asarray(jax.vmap(space.values)(places))[:, None],
         time.perf_counter() - began,
         loss_unit="-",
     )

@@ -8,15 +8,13 @@ import shutil
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
-import numpy as np
 
 from r2s.estimation.default_spaces import RANGES
-from r2s.estimation.estimate import Estimate
 from r2s.estimation.method import ANY, Budget, Method, Reads, seed_of
-from r2s.estimation.physnet import bayes, dataset, emulator, estimator, preprocess, training
+from r2s.estimation.physnet import dataset, estimator, preprocess, training
 from r2s.estimation.physnet.pull_force import pull_force
 from r2s.estimation.problem import read_by_problem
 from r2s.recordings.recording import Recording
@@ -48,26 +46,20 @@ def train_network(
     The simulated images lie in a folder beside `path` until it is trained, so that a killed run
     goes on. `progress` shows a bar of the simulations, and prints a line an epoch, on stderr.
     """
-    settings = dataset.Settings(scenario, budget.fabrics, ranges=RANGES, seed=seed)
+    options: dict[str, Any] = {"ranges": RANGES}
     if solver == "points":
-        settings = dataset.Settings(
-            scenario,
-            budget.fabrics,
-            num_levels=3,
-            shape=NETWORK_SHAPE["points"],
-            per_shard=4,
-            material_points=True,
-            isotropic=True,
-            seed=seed,
-        )
+        options = {"solver": solver, "num_levels": 3, "shape": NETWORK_SHAPE[solver]}
+        options |= {"per_shard": 4}
+    settings = dataset.Settings(scenario, budget.fabrics, seed=seed, **options)
     images = path.with_name(f"{path.name}.images")
     view = dataset.make(images, settings, progress=progress).view
     schedule = training.Schedule(epochs=budget.epochs, steps=budget.steps, seed=seed)
-    begun = training.begin(view, schedule=schedule)._replace(data=f"{scenario} on {solver}")
-    begun = training.load(path) if path.exists() else begun
-    trained = training.train(
-        begun, dataset.load(images), path, progress=_print_epoch if progress else None
-    )
+    if path.exists():
+        begun = training.load(path)
+    else:
+        begun = training.begin(view, schedule=schedule)._replace(data=f"{scenario} on {solver}")
+    report = _print_epoch if progress else None
+    trained = training.train(begun, dataset.load(images), path, report)
     shutil.rmtree(images)
     return trained
 
@@ -98,6 +90,8 @@ class PhysNetMethod(Method):
     takes_shape = False
     heeds_force: ClassVar[bool] = True  # of a stretching, beside its images
 
+    _search = staticmethod(estimator.estimate)
+
     network: Path | None = None
     training_budget: TrainingBudget = TrainingBudget()
 
@@ -119,7 +113,13 @@ class PhysNetMethod(Method):
         seen = estimator.Sighting.make(
             scenario, images, frames, space, trained, simulator, pull=pull
         )
-        return self._search(seen, budget.evaluations, seed_of(key))
+        return self._search(
+            seen,
+            num_calls=budget.evaluations,
+            seed=seed_of(key),
+            path=self.checkpoint,
+            progress=self.progress,
+        )
 
     def _trained(self, recording: Recording, seed: int) -> training.Training:
         if self.network is None:
@@ -143,17 +143,6 @@ class PhysNetMethod(Method):
             progress=self.progress is not None,
         )
 
-    def _search(self, seen: estimator.Sighting, evaluations: int, seed: int) -> Estimate:
-        target = estimator.target_of(seen)
-
-        def report(trials: emulator.Trials) -> None:
-            if self.progress is not None:
-                self.progress(len(trials.places), float(np.nanmin(trials.losses(target))))
-
-        return estimator.estimate(
-            seen, num_calls=evaluations, seed=seed, path=self.checkpoint, progress=report
-        )
-
 
 @dataclass(frozen=True, kw_only=True)
 class PublishedPhysNet(PhysNetMethod):
@@ -163,11 +152,4 @@ class PublishedPhysNet(PhysNetMethod):
     library: ClassVar[str] = "skopt"
     heeds_force: ClassVar[bool] = False
 
-    def _search(self, seen: estimator.Sighting, evaluations: int, seed: int) -> Estimate:
-        def report(history: bayes.History) -> None:
-            if self.progress is not None:
-                self.progress(len(history.losses), float(np.nanmin(history.losses)))
-
-        return estimator.published_recipe(
-            seen, num_calls=evaluations, seed=seed, path=self.checkpoint, progress=report
-        )
+    _search = staticmethod(estimator.published_recipe)

@@ -9,8 +9,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from r2s.estimation.physnet.views import LAYER, View, depth_of
-from r2s.recordings.cameras.calibration import DepthCamera
-from r2s.recordings.cameras.depth import back_project, moved
 from r2s.recordings.recording import Recording
 
 ALIKE = 2  # least number of 8 neighbours within `views.LAYER` of a pixel that is no stray
@@ -57,25 +55,31 @@ def grey(view: View, depth: Float[Array, "down across"]) -> Float[Array, "down a
 
 def without_strays(depth: Float[Array, "down across"]) -> Float[Array, "down across"]:
     """Depth [m] without the pixels that have fewer than `ALIKE` neighbours near their depth."""
-    near = [(other > 0) & (jnp.abs(other - depth) < LAYER) for other in _around(depth)]
-    return jnp.where(sum(each.astype(int) for each in near) >= ALIKE, depth, 0)
+    around = _around(depth)
+    near = (around > 0) & (jnp.abs(around - depth[None]) < LAYER)
+    return jnp.where(jnp.sum(near, axis=0) >= ALIKE, depth, 0)
 
 
 def filled(depth: Float[Array, "down across"]) -> Float[Array, "down across"]:
     """Depth [m] where pixels without depth get the mean of at least `AROUND` neighbours."""
     for _ in range(PASSES):
-        there = depth > 0
-        number = sum((other > 0).astype(depth.dtype) for other in _around(depth))
-        mean = sum(_around(depth)) / jnp.maximum(number, 1)
-        depth = jnp.where(there | (number < AROUND), depth, mean)
+        number, mean = _mean_around(_around(depth))
+        depth = jnp.where((depth > 0) | (number < AROUND), depth, mean)
     return depth
 
 
-def _around(values: Float[Array, "down across"]) -> list[Float[Array, "down across"]]:
-    """The 8 neighbours of every pixel; 0 outside of the image."""
-    padded, (rows, columns) = jnp.pad(values, 1), values.shape
-    shifts = [(i, j) for i in range(3) for j in range(3) if (i, j) != (1, 1)]
-    return [padded[i : i + rows, j : j + columns] for i, j in shifts]
+def _around(values: Float[Array, "down across"], reach: int = 1) -> Float[Array, "n down across"]:
+    """The neighbours of every pixel, 8 for a `reach` of 1; 0 outside of the image."""
+    padded, (rows, columns) = jnp.pad(values, reach), values.shape
+    shifts = [(i, j) for i in range(2 * reach + 1) for j in range(2 * reach + 1)]
+    shifts.remove((reach, reach))
+    return jnp.stack([padded[i : i + rows, j : j + columns] for i, j in shifts])
+
+
+def _mean_around(around: Float[Array, "n down across"]):
+    """How many neighbours of every pixel have a depth, and the mean of those [m]."""
+    number = jnp.sum(around > 0, axis=0, dtype=around.dtype)
+    return number, jnp.sum(around, axis=0) / jnp.maximum(number, 1)
 
 
 def flawed(
@@ -95,14 +99,11 @@ def flawed(
 def _ragged(depth: Float[Array, "down across"], flaws: Flaws, share: Float[Array, "3"], key: Array):
     """Depth [m] with lost, gained and wrong pixels at its borders."""
     key_lost, key_error = jax.random.split(key)
-    around = _around(depth)
-    there = depth > 0
-    number = sum((other > 0).astype(depth.dtype) for other in around)
-    steps = [(other == 0) | (jnp.abs(other - depth) > LAYER) for other in around]
-    border = there & jnp.any(jnp.stack(steps), axis=0)
+    around, there = _around(depth), depth > 0
+    number, beside = _mean_around(around)
+    border = there & jnp.any((around == 0) | (jnp.abs(around - depth[None]) > LAYER), axis=0)
     outside = ~there & (number > 0)
     chance = jax.random.uniform(key_lost, depth.shape, depth.dtype)
-    beside = sum(around) / jnp.maximum(number, 1)
     gained = outside & (chance < flaws.gained * share[0])
     lost = border & (chance < flaws.lost * share[1])
     error = flaws.flying * share[2] * jax.random.laplace(key_error, depth.shape, depth.dtype)
@@ -124,10 +125,8 @@ def of_points(
 
 def without_specks(depth: Float[Array, "down across"]) -> Float[Array, "down across"]:
     """Depth [m] without the pixels that have fewer than `SPECK` around them near their depth."""
-    padded, (rows, columns) = jnp.pad(depth, 2), depth.shape
-    others = [padded[i : i + rows, j : j + columns] for i in range(5) for j in range(5)]
-    near = [((depth > 0) & (jnp.abs(other - depth) < 2 * LAYER)).astype(int) for other in others]
-    return jnp.where(sum(near) >= SPECK, depth, 0)
+    near = jnp.abs(_around(depth, 2) - depth[None]) < 2 * LAYER
+    return jnp.where((depth > 0) & (1 + jnp.sum(near, axis=0) >= SPECK), depth, 0)
 
 
 def of_clouds(view: View, recording: Recording, frames: tuple[int, ...]) -> np.ndarray:
@@ -139,36 +138,6 @@ def of_clouds(view: View, recording: Recording, frames: tuple[int, ...]) -> np.n
     chosen = np.array(frames)
     depth = see(recording.points[chosen], recording.mask[chosen])
     return of_depths(view, np.asarray(depth), recording.info.name, frames)
-
-
-def of_camera(
-    view: View,
-    camera: DepthCamera,
-    depths: Float[np.ndarray, "frame down across"],
-    masks: Bool[np.ndarray, "frame down across"],
-    name: str = "depth images",
-) -> np.ndarray:
-    """The images in a view of the depths [m] that a calibrated camera measured inside of masks.
-
-    The camera may have another resolution, lens and pose than the view: its pixels become points.
-    Raises `ValueError` for images of another resolution or unit, and as `of_depths` does.
-    """
-    across, down = camera.resolution
-    if depths.shape[1:] != (down, across) or masks.shape != depths.shape:
-        raise ValueError(
-            f"{name}: expected depths and masks of {down} x {across} pixels (down, across), found "
-            f"{depths.shape[1:]} and {masks.shape[1:]}: use the resolution of the calibration"
-        )
-    see = jax.jit(partial(of_points, view))
-    images = []
-    for depth, mask in zip(depths, masks, strict=True):
-        everywhere = np.ones(depth.shape, bool)  # all pixels, so that it compiles once
-        points = moved(np.array(camera.to_world), back_project(camera, depth, everywhere))
-        found = np.isfinite(depth) & (depth > 0) & mask
-        points = np.where(found.reshape(-1, 1), points, 0)
-        images.append(np.asarray(see(jnp.asarray(points, float), jnp.asarray(found.ravel()))))
-    _check_unit(depths, masks, name)
-    return of_depths(view, np.stack(images), name, tuple(range(len(images))))
 
 
 def of_depths(
@@ -204,9 +173,3 @@ def of_depths(
                 f"{view.far:g} m: give depths in metres, from the view's camera"
             )
     return np.asarray(jax.jit(jax.vmap(partial(grey, view)))(jnp.asarray(depths, float)))
-
-
-def _check_unit(depths: np.ndarray, masks: np.ndarray, name: str) -> None:
-    seen = depths[masks & (depths > 0)]
-    if len(seen) and np.median(seen) > 20:
-        raise ValueError(f"{name}: the median depth is {np.median(seen):g} m: give metres")

@@ -23,20 +23,11 @@ from jaxtyping import Array, Float
 from r2s.estimation.physnet.dataset import DEPTH_UNIT, Data
 from r2s.estimation.physnet.network import DEEPER, Architecture, PhysNet
 from r2s.estimation.physnet.preprocess import Flaws, flawed, grey
-from r2s.estimation.physnet.triplets import (
-    Images,
-    Split,
-    all_triplets,
-    draw,
-    hardest_triplets,
-    split,
-    triplets,
-)
+from r2s.estimation.physnet.triplets import Split, draw, split, triplet_loss, triplets
 from r2s.estimation.physnet.views import View
 from r2s.files import write_bytes
 
 FORMAT = "r2s-physnet/2"
-EARLIER = "r2s-physnet/1"  # of version 0.2.0
 CHUNK = 256  # images that are embedded at once
 
 
@@ -48,7 +39,6 @@ class Schedule:
     - `fabrics`, `images`: fabrics in a batch, and images of each, from different motions.
     - `rate`, `decay`, `decay_every`: Adam's learning rate, times `decay` every so many epochs.
     - `margin`: squared distance by which another fabric is to be farther away.
-    - `hard`: whether only the hardest triplet of each image counts.
     - `validation`: share of the fabrics for validation.
     - `triplets`: number of triplets for validation.
     - `flaws`: errors of the images, in training and validation.
@@ -62,7 +52,6 @@ class Schedule:
     decay: float = 0.1
     decay_every: int = 5
     margin: float = 1.0
-    hard: bool = False
     validation: float = 0.15
     triplets: int = 4000
     flaws: Flaws = Flaws()
@@ -113,8 +102,9 @@ def train(
 
     Raises `FloatingPointError` when the loss is not finite.
     """
-    taught, validation = divide(data, training.schedule)
-    while len(training.curve) < training.schedule.epochs:
+    schedule = training.schedule
+    taught, validation = split(data, schedule.validation, schedule.fabrics, schedule.seed)
+    while len(training.curve) < schedule.epochs:
         training = epoch(training, taught, validation)
         if path is not None:
             save(training, path)
@@ -144,28 +134,17 @@ def epoch(training: Training, taught: Split, validation: Split) -> Training:
     return training._replace(network=network, optimiser=optimiser, curve=(*training.curve, row))
 
 
-def divide(data: Data, schedule: Schedule) -> tuple[Split, Split]:
-    """Images of the fabrics for training and for validation; see `triplets.split`."""
-    return split(data, schedule.validation, schedule.fabrics, schedule.seed)
-
-
-def embed(network: PhysNet, view: View, depth: Images, flaws: Flaws | None, seed: int = 0):
-    """Points on the map of images in units of `dataset.DEPTH_UNIT`, with flaws where given."""
-    parts = []
-    for start in range(0, len(depth), CHUNK):
-        some = depth[start : start + CHUNK]
-        padded = np.zeros((CHUNK, *depth.shape[1:]), depth.dtype)
-        padded[: len(some)] = some
-        key = jr.fold_in(jr.key(seed), start)
-        parts.append(
-            np.asarray(_embedded(network, view, jnp.asarray(padded), flaws, key))[: len(some)]
-        )
-    return np.concatenate(parts)
-
-
 def judge(network: PhysNet, view: View, images: Split, schedule: Schedule) -> tuple[float, float]:
     """The mean loss of triplets, and the share of them in which the positive is nearer."""
-    points = embed(network, view, images.depth, schedule.flaws, schedule.seed)
+    parts = []
+    for start in range(0, len(images.depth), CHUNK):
+        some = images.depth[start : start + CHUNK]
+        padded = np.zeros((CHUNK, *some.shape[1:]), some.dtype)  # so that it compiles once
+        padded[: len(some)] = some
+        key = jr.fold_in(jr.key(schedule.seed), start)
+        embedded = _embedded(network, view, jnp.asarray(padded), schedule.flaws, key)
+        parts.append(np.asarray(embedded)[: len(some)])
+    points = np.concatenate(parts)
     anchor, positive, negative = points[triplets(images, schedule.triplets, schedule.seed).T]
     near, far = (((anchor - other) ** 2).sum(axis=1) for other in (positive, negative))
     loss = np.maximum(near - far + schedule.margin, 0).mean()
@@ -178,19 +157,15 @@ def _adam(schedule: Schedule) -> optax.GradientTransformation:
     return optax.adam(rate)
 
 
-def _shown(depth, view: View, flaws: Flaws | None, key) -> Float[Array, "image down across"]:
-    depth = depth.astype(float) * DEPTH_UNIT
-
+def _shown(depth, view: View, flaws: Flaws, key) -> Float[Array, "image down across"]:
     def one(depth, key):
-        if flaws is not None:
-            depth = flawed(depth, view, flaws, key)
-        return grey(view, depth)
+        return grey(view, flawed(depth, view, flaws, key))
 
-    return jax.vmap(one)(depth, jr.split(key, len(depth)))
+    return jax.vmap(one)(depth.astype(float) * DEPTH_UNIT, jr.split(key, len(depth)))
 
 
 @eqx.filter_jit
-def _embedded(network: PhysNet, view: View, depth, flaws: Flaws | None, key):
+def _embedded(network: PhysNet, view: View, depth, flaws: Flaws, key):
     return jax.vmap(network)(_shown(depth, view, flaws, key))
 
 
@@ -201,8 +176,7 @@ def _step(network: PhysNet, optimiser, depth, schedule: Schedule, view: View, ke
 
     def loss_of(network):
         points = jax.vmap(network)(images).reshape(fabrics, count, -1)
-        loss = hardest_triplets if schedule.hard else all_triplets
-        return loss(points, schedule.margin)
+        return triplet_loss(points, schedule.margin)
 
     loss, slope = eqx.filter_value_and_grad(loss_of)(network)
     update, optimiser = _adam(schedule).update(slope, optimiser)
@@ -225,11 +199,11 @@ def save(training: Training, path: Path | str) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def load(path: Path | str, expected: Architecture | None = None) -> Training:
+def load(path: Path | str) -> Training:
     """Read a training that `save` wrote.
 
-    Raises `FileNotFoundError`, or `ValueError` that names the file when it is damaged, of another
-    format, or not of the `expected` architecture.
+    Raises `FileNotFoundError`, or `ValueError` that names the file when it is damaged or of another
+    format.
     """
     with open(path, "rb") as file:
         try:
@@ -237,16 +211,13 @@ def load(path: Path | str, expected: Architecture | None = None) -> Training:
             found = header["format"]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: no training of PhysNet: {error}") from error
-        if found not in (FORMAT, EARLIER):
+        if found != FORMAT:
             raise ValueError(f"{path}: expected format {FORMAT}, found {found}")
+        header["schedule"].pop("hard", None)  # of version 0.3.0
+        flaws = Flaws(*header["schedule"].pop("flaws"))
+        schedule = Schedule(**header["schedule"], flaws=flaws)
         architecture = Architecture(**_tuples(header["architecture"]))
-        if expected is not None and architecture != expected:
-            raise ValueError(f"{path}: expected {expected}, found {architecture}")
-        view = View(**_tuples(header["view"]))
-        schedule = {**header["schedule"], "flaws": Flaws(*header["schedule"]["flaws"])}
-        if found == EARLIER:
-            schedule["validation"] = schedule.pop("held_back")
-        empty = begin(view, architecture, Schedule(**schedule))
+        empty = begin(View(**_tuples(header["view"])), architecture, schedule)
         try:
             network, optimiser = eqx.tree_deserialise_leaves(file, (empty.network, empty.optimiser))
         except Exception as error:  # a damaged file raises anything
@@ -258,6 +229,4 @@ def load(path: Path | str, expected: Architecture | None = None) -> Training:
 
 def _tuples(values: dict[str, Any]) -> dict[str, Any]:
     """The values with tuples in place of JSON's lists."""
-    return {
-        key: tuple(value) if isinstance(value, list) else value for key, value in values.items()
-    }
+    return {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}

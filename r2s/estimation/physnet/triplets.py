@@ -62,32 +62,16 @@ def triplets(images: Split, number: int, seed: int) -> Int[np.ndarray, "triplet 
     return np.stack([anchor, positive, negative], axis=1)
 
 
-def all_triplets(points: Float[Array, "fabric image dim"], margin: float) -> Float[Array, ""]:
+def triplet_loss(points: Float[Array, "fabric image dim"], margin: float) -> Float[Array, ""]:
     """The mean loss of all triplets of a batch."""
-    squares, alike, same = _pairs(points)
-    loss = jax.nn.relu(squares[:, :, None] - squares[:, None, :] + margin)
-    counts = (alike & ~same)[:, :, None] & ~alike[:, None, :]
-    return jnp.sum(jnp.where(counts, loss, 0)) / jnp.sum(counts)
-
-
-def hardest_triplets(points: Float[Array, "fabric image dim"], margin: float) -> Float[Array, ""]:
-    """The mean loss of every image with its farthest positive and its nearest negative.
-
-    See Hermans, Beyer and Leibe 2017, "In defense of the triplet loss".
-    """
-    squares, alike, _ = _pairs(points)
-    farthest = jnp.max(jnp.where(alike, squares, 0), axis=1)
-    nearest = jnp.min(jnp.where(alike, jnp.inf, squares), axis=1)
-    return jnp.mean(jax.nn.relu(farthest - nearest + margin))
-
-
-def _pairs(points):
-    """Squared distances of all pairs of images; which are of one fabric; which are of one image."""
     fabrics, images, dim = points.shape
     flat = points.reshape(-1, dim)
     squares = jnp.sum((flat[:, None] - flat[None]) ** 2, axis=2)
     fabric = jnp.repeat(jnp.arange(fabrics), images)
-    return squares, fabric[:, None] == fabric[None], jnp.eye(len(flat), dtype=bool)
+    alike = fabric[:, None] == fabric[None]
+    loss = jax.nn.relu(squares[:, :, None] - squares[:, None, :] + margin)
+    counts = (alike & ~jnp.eye(len(flat), dtype=bool))[:, :, None] & ~alike[:, None, :]
+    return jnp.sum(jnp.where(counts, loss, 0)) / jnp.sum(counts)
 
 
 def draw(

@@ -124,32 +124,15 @@ def depth_of(
 
 
 def depths_of_sheet(
-    view: View,
-    x: Float[Array, "frame vertex 3"],
-    faces: Int[Array, "face 3"],
-    per_face: int,
-    frames: Float[Array, "camera 4 4"] | None = None,
+    view: View, x: Float[Array, "frame vertex 3"], faces: Int[Array, "face 3"], per_face: int
 ) -> Float[Array, "frame down across"]:
-    """Depth images [m] of a moving mesh [m], from `per_face`^2 points on every face.
-
-    `frames` are the planes of `r2s.recordings.cameras.calibration.frustum` of some cameras: points
-    that are in the frame of none of them are left out. None keeps all points.
-    """
+    """Depth images [m] of a moving mesh [m], from `per_face`^2 points on every face."""
 
     def of_frame(x):
         points = sample(x, faces, per_face)
-        mask = jnp.ones(len(points), bool) if frames is None else in_frame(points, frames)
-        return depth_of(view, points, mask)
+        return depth_of(view, points, jnp.ones(len(points), bool))
 
     return jax.lax.map(of_frame, x)
-
-
-def in_frame(
-    points: Float[Array, "point 3"], frames: Float[Array, "camera 4 4"]
-) -> Bool[Array, " point"]:
-    """Which points [m] are in the frame of at least one camera; see `depths_of_sheet`."""
-    sides = jnp.einsum("cki,pi->pck", frames[..., :3], points) + frames[None, :, :, 3]
-    return jnp.any(jnp.all(sides >= 0, axis=-1), axis=-1)
 
 
 def per_face(view: View, shape: tuple[int, int], size: tuple[float, float]) -> int:

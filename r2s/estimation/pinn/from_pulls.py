@@ -1,41 +1,30 @@
 """The physics-informed network as an estimator: stiffness from markers and force of stretchings.
 
-A network is trained on each pull (`r2s.estimation.pinn.training`). From it the motion in balance
-and the stiffness that fits best are found, with their covariance (`r2s.estimation.pinn.balance`).
+A network is trained on each pull (`r2s.estimation.pinn.training`). From it the motion in
+equilibrium and the stiffness that fits best are found (`r2s.estimation.pinn.balance`).
 """
 
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
-from r2s.estimation.estimate import Estimate, Nuisance, point_estimate
-from r2s.estimation.pinn.balance import Balanced, balance
-from r2s.estimation.pinn.losses import Losses
-from r2s.estimation.pinn.network import Network
+from r2s.estimation.estimate import Estimate, Nuisance
+from r2s.estimation.pinn.balance import Fit, balance
 from r2s.estimation.pinn.pulls import Pull, stacked
-from r2s.estimation.pinn.training import NOISE, Recipe, Trained, train
-from r2s.estimation.pinn.weak_form import DEGREES, weak_losses
+from r2s.estimation.pinn.training import NOISE, QUICK, Recipe, Trained, train
+from r2s.estimation.pinn.weak_form import DEGREES
 from r2s.fabrics.parameters import ParameterSpace
 
-# the balance needs no more of a network than a motion to begin with, and its accelerations
-QUICK = Recipe(losses=weak_losses, warm_up=200, adam=200, lbfgs=0)
 # near the clamps the tension carries some of the weight, which the model gives to the table
 FRICTION_ERROR = 0.1  # [-]
 # between a mesh of 33 x 33 vertices and the continuum, over four noise seeds of five fabrics
 STIFFNESS_ERROR, COUPLING_ERROR = 0.006, 0.004  # relative; [-]
-
-
-class Found(NamedTuple):
-    """An estimate, and the fabric that the networks alone arrived at, without standard errors."""
-
-    estimate: Estimate
-    network: Estimate
+MODEL_ERRORS = {"friction": FRICTION_ERROR, "coupling": COUPLING_ERROR, "nu": COUPLING_ERROR}
 
 
 def estimate(
@@ -47,24 +36,8 @@ def estimate(
     progress: Callable[[int, float], None] | None = None,
     checkpoint: Path | None = None,
     key: PRNGKeyArray,
-) -> Found:
-    """The fabric of one or several pulls of one fabric; see `estimate_all` for the arguments."""
-    return estimate_all(
-        [pulls], [space], recipe, noise=noise, progress=progress, checkpoint=checkpoint, key=key
-    )[0]
-
-
-def estimate_all(
-    pulls: Sequence[Sequence[Pull]],
-    spaces: Sequence[ParameterSpace],
-    recipe: Recipe = QUICK,
-    *,
-    noise: tuple[float, float] = NOISE,
-    progress: Callable[[int, float], None] | None = None,
-    checkpoint: Path | None = None,
-    key: PRNGKeyArray,
-) -> list[Found]:
-    """The fabrics of as many pulls each, their networks trained together.
+) -> Estimate:
+    """The fabric of one or several pulls.
 
     The standard errors come from the noise, from the change of the estimate with the number of
     virtual displacements, from what the model leaves out, and from what stiffness changes between
@@ -72,140 +45,74 @@ def estimate_all(
     the pulls do not determine keeps the standard error of its range. Without a force the nuisance
     "stiffness scale" says that the scale is not identifiable; ratios of stiffness may be.
 
-    - `pulls`, `spaces`: of each fabric; as many pulls of each, and spaces of the same ranges.
     - `recipe`: of the training.
     - `noise`: of the markers [m], and of the force over its greatest [-], to begin with. It is
-      estimated along.
+      estimated with the fabric.
     - `progress`: called with the number of each chunk of training and its loss [m^2].
     - `checkpoint`: a file from which a killed training goes on.
 
-    Raises `ValueError` for pulls that do not go together, `RuntimeError` when the training or the
-    balance diverges.
+    Raises `ValueError` for pulls that do not go together, `RuntimeError` when the training diverges
+    or no motion is in equilibrium.
     """
-    if not pulls or len(pulls) != len(spaces):
-        raise ValueError(f"{len(pulls)} fabrics were pulled, but {len(spaces)} spaces given")
-    if len({len(some) for some in pulls}) > 1:
-        raise ValueError(f"as many pulls of each fabric are needed, got {[len(p) for p in pulls]}")
-    if len({space.ranges for space in spaces}) > 1:
-        raise ValueError("the spaces must have the same ranges")
     began = time.perf_counter()
-
-    def report(chunk: int, losses: Losses) -> None:
-        if progress is not None:
-            progress(chunk, float(losses.data.mean()) * noise[0] ** 2)
-
     trained = train(
-        jax.tree.map(lambda *leaves: jnp.stack(leaves), *spaces),
-        jax.tree.map(lambda *leaves: jnp.stack(leaves), *(stacked(list(some)) for some in pulls)),
+        space,
+        stacked(list(pulls)),
         recipe,
         noise=noise,
-        report=report,
+        report=progress,
         checkpoint=checkpoint,
         key=key,
     )
-    shared = (time.perf_counter() - began) / len(pulls)
-    return [
-        _found(trained, i, list(some), space, recipe, noise, shared)
-        for i, (some, space) in enumerate(zip(pulls, spaces, strict=True))
+    networks = [
+        jax.tree.map(lambda leaf, i=i: leaf[i], trained.model.networks) for i in range(len(pulls))
     ]
-
-
-def _found(
-    trained: Trained,
-    which: int,
-    pulls: list[Pull],
-    space: ParameterSpace,
-    recipe: Recipe,
-    noise: tuple[float, float],
-    seconds: float,
-) -> Found:
-    """The estimate of one of the fabrics that were trained in `seconds`."""
-    began = time.perf_counter()
-    model = jax.tree.map(lambda leaf: leaf[which], trained.model)
+    fit = balance(space, networks, pulls, trained.places[-1], noise, DEGREES)
+    fewer = DEGREES[0] - 1, DEGREES[1] - 1
+    change = balance(space, networks, pulls, fit.place, fit.noise, fewer).place - fit.place
+    errors = [
+        STIFFNESS_ERROR if r.unit == "N/m" else MODEL_ERRORS.get(r.name, 0.0) for r in space.ranges
+    ]
+    model = np.diag((np.array(errors) / _lengths(space)) ** 2)
+    fit = fit._replace(covariance=fit.covariance + np.outer(change, change) + model + fit.law)
     words = f"{len(pulls)} pull{'s' if len(pulls) > 1 else ''}"
     if pulls[0].force is None:
         words += ", no force: the scale of stiffness is not identifiable"
-    form = "weak form" if recipe.losses is weak_losses else "strong form"
-    squares = np.asarray(trained.losses.data)[which] * noise[0] ** 2
-    network = point_estimate(
-        f"pinn ({form}, {words})",
-        space,
-        model.place,
-        float(squares[-1]),
-        squares[:, None],
-        np.stack([_values(space, place) for place in trained.places[which]])[:, None],
-        seconds,
-    )
-    networks = [jax.tree.map(lambda leaf, j=j: leaf[j], model.networks) for j in range(len(pulls))]
-    balanced = _balanced(space, networks, pulls, np.asarray(model.place), noise, recipe)
-    seconds += time.perf_counter() - began
-    words += "" if balanced.converged else ", not converged"
-    return Found(_estimate(balanced, space, network, f"pinn ({words})", pulls, seconds), network)
+    words += "" if fit.converged else ", not converged"
+    return _estimate(f"pinn ({words})", fit, space, trained, noise, pulls, began)
 
 
-def _balanced(
-    space: ParameterSpace,
-    networks: list[Network],
-    pulls: list[Pull],
-    place: np.ndarray,
-    noise: tuple[float, float],
-    recipe: Recipe,
-) -> Balanced:
-    """The estimate from the weak form. Its covariance counts the number of virtual displacements,
-    by the change with one degree less each way, what the model leaves out, and what stiffness
-    changes with the stretch."""
-    found = balance(space, networks, pulls, place, *noise, recipe.strain, DEGREES)
-    degrees = DEGREES[0] - 1, DEGREES[1] - 1
-    fewer = balance(
-        space, networks, pulls, found.place, found.marker, found.force, recipe.strain, degrees
-    )
-    difference = fewer.place - found.place
-    more = np.outer(difference, difference) + np.diag(_unmodelled(space) ** 2) + found.law
-    return found._replace(covariance=found.covariance + more)
-
-
-def _values(space: ParameterSpace, place: np.ndarray) -> np.ndarray:
-    return np.asarray(space.values(jnp.asarray(place, float)))
-
-
-def _lengths(space: ParameterSpace) -> np.ndarray:
+def _lengths(space: ParameterSpace) -> Float[np.ndarray, " dim"]:
     """Lengths of the ranges, on the scale of each."""
-    return np.array([np.log(r.high / r.low) if r.log else r.high - r.low for r in space.ranges])
-
-
-def _unmodelled(space: ParameterSpace) -> np.ndarray:
-    """Standard errors of places in the space, for what the model leaves out."""
-    errors = {"friction": FRICTION_ERROR, "coupling": COUPLING_ERROR, "nu": COUPLING_ERROR}
-    error = [STIFFNESS_ERROR if r.unit == "N/m" else errors.get(r.name, 0.0) for r in space.ranges]
-    return np.array(error) / _lengths(space)
+    return np.array([bound.width for bound in space.ranges])
 
 
 def _estimate(
-    found: Balanced, space: ParameterSpace, network: Estimate, approach: str, pulls, seconds: float
+    approach: str, fit: Fit, space: ParameterSpace, trained: Trained, noise, pulls, began: float
 ) -> Estimate:
-    lengths, errors = _lengths(space), np.sqrt(np.diag(found.covariance))
-    values = _values(space, found.place)
-    steps = np.stack([_values(space, place) for place in found.places])[:, None]
-    nuisances = [Nuisance("marker noise", "m", found.marker, np.nan)]
+    lengths, errors = _lengths(space), np.sqrt(np.diag(fit.covariance))
+    places = np.concatenate([trained.places, fit.places, fit.place[None]])
+    history = np.asarray(jax.vmap(space.values)(jnp.asarray(places, float)))
+    nuisances = [Nuisance("marker noise", "m", fit.noise[0], np.nan)]
     if pulls[0].force is not None:
-        nuisances.append(Nuisance("force noise", "-", found.force, np.nan))
+        nuisances.append(Nuisance("force noise", "-", fit.noise[1], np.nan))
     scale = np.array([r.unit == "N/m" for r in space.ranges]) * lengths
     if scale.any():
         weights = scale / np.count_nonzero(scale)
-        mean = float(np.exp(np.log(values[scale > 0]).mean()))
-        spread = float(np.sqrt(weights @ found.covariance @ weights))  # relative, since log
+        mean = float(np.exp(np.log(history[-1][scale > 0]).mean()))
+        spread = float(np.sqrt(weights @ fit.covariance @ weights))  # relative, since log
         nuisances.append(Nuisance("stiffness scale", "N/m", mean, spread * mean))
     return Estimate(
         approach=approach,
-        fabric=space(jnp.asarray(found.place, float)),
+        fabric=space(jnp.asarray(fit.place, float)),
         ranges=space.ranges,
-        values=values,
+        values=history[-1],
         standard_errors=lengths * errors,
-        correlation=found.covariance / np.outer(errors, errors),
+        correlation=fit.covariance / np.outer(errors, errors),
         nuisances=tuple(nuisances),
-        loss=float(found.losses[-1]),
-        losses=np.concatenate([network.losses, found.losses[:, None]]),
-        history=np.concatenate([network.history, steps]),
-        seconds=seconds,
-        converged=found.converged,
+        loss=float(fit.losses[-1]),
+        losses=np.concatenate([trained.losses * noise[0] ** 2, fit.losses])[:, None],
+        history=history[:-1, None],
+        seconds=time.perf_counter() - began,
+        converged=fit.converged,
     )

@@ -1,16 +1,15 @@
 """The physics-informed network by the contract of `r2s.estimation.method`."""
 
-import dataclasses
 import time
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from r2s.estimation.estimate import point_estimate
 from r2s.estimation.method import Budget, Method, Reads, frames_that_count
-from r2s.estimation.pinn.pulls import Pull, pull_from, stacked
-from r2s.recordings.recording import Recording
+from r2s.estimation.pinn.pulls import pull_from, stacked
 
 ALONE = (
     "the network from clouds was tried and does not find the fabric, so the PINN estimates from "
@@ -39,17 +38,18 @@ class PINN(Method):
         return Reads(frames_that_count(recording), markers=True, force=True)
 
     def _estimate(self, recordings, space, budget, key):
-        from r2s.estimation.pinn import from_pulls  # needs flax
+        from r2s.estimation.pinn.from_pulls import estimate  # needs flax
+        from r2s.estimation.pinn.training import Recipe
 
-        recipe = dataclasses.replace(from_pulls.QUICK, adam=budget.iterations)
-        return from_pulls.estimate(
-            pulls_of(recordings),
+        pulls = [pull_from(recording) for recording in recordings]
+        return estimate(
+            pulls,
             space,
-            recipe,
+            Recipe(adam=budget.iterations),
             progress=self.progress,
             checkpoint=self.checkpoint,
             key=key,
-        ).estimate
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,15 +72,12 @@ class PublishedPINN(Method):
     def _estimate(self, recordings, space, budget, key):
         from r2s.estimation.pinn import published_recipe  # needs flax
 
-        began = time.perf_counter()
-        pulls = pulls_of(recordings, without_force=True)
-        middle, epochs = jnp.full(space.dim, 0.5, float), budget.iterations
-        course = published_recipe.train(
-            space, stacked(pulls), middle, epochs, min(CHUNK, epochs), key=key
-        )
+        began, epochs = time.perf_counter(), budget.iterations
+        pulls = [pull_from(recording, without_force=True) for recording in recordings]
+        course = published_recipe.train(space, stacked(pulls), epochs, min(CHUNK, epochs), key=key)
         if not np.isfinite(course.data[-1]):
             raise RuntimeError("the training of the published recipe diverged")
-        history = np.stack([np.asarray(space.values(jnp.asarray(p))) for p in course.places])
+        history = np.asarray(jax.vmap(space.values)(jnp.asarray(course.places, float)))
         return point_estimate(
             f"pinn-published ({epochs} epochs, no force)",
             space,
@@ -90,8 +87,3 @@ class PublishedPINN(Method):
             history[:, None],
             time.perf_counter() - began,
         )
-
-
-def pulls_of(recordings: list[Recording], without_force: bool = False) -> list[Pull]:
-    """The pulls of stretchings, each at its own angle to the warp."""
-    return [pull_from(recording, without_force=without_force) for recording in recordings]

@@ -1,7 +1,7 @@
 """A multilayer perceptron from (X, Y, t) to a displacement, with its derivatives.
 
-The network is a module of flax. Its derivatives are carried forward through the layers beside the
-value, all in one matrix product for each layer: no backward pass is nested in another.
+The network is a module of flax. Derivatives are carried forward through the layers with the value,
+in one matrix product per layer, so that no reverse pass is nested in another.
 """
 
 from typing import Any, Protocol, runtime_checkable
@@ -9,19 +9,15 @@ from typing import Any, Protocol, runtime_checkable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
-try:
-    import flax.linen as nn
-except ImportError as error:
-    raise ImportError("the physics-informed network needs flax: pip install 'r2s[pinn]'") from error
+from r2s.extras import require
 
-WIDTH, LAYERS = 50, 7  # of the published network: six hidden layers and the last one
+require("flax", "pinn", "the physics-informed network")
+import flax.linen as nn  # noqa: E402
+
 AXES = 2  # outputs: displacements along X and Y
 X, Y, T = range(3)  # the inputs
-STRONG = ((X, X), (X, Y), (Y, Y), (T, T))  # second derivatives in the equation of motion
-WEAK = ((X, T), (Y, T), (T, T))  # second derivatives in the virtual work: none in space alone
 
 Pairs = tuple[tuple[int, int], ...]  # inputs in which a second derivative is taken
 
@@ -31,7 +27,7 @@ class Jet(eqx.Module):
 
     - `value`: displacements [m].
     - `first`: derivatives in X [-], Y [-] and t [m/s].
-    - `second`: derivatives in the pairs of inputs that were asked for, in their units.
+    - `second`: derivatives in some pairs of inputs, in their units.
     """
 
     value: Float[Array, "*point axis"]
@@ -41,37 +37,33 @@ class Jet(eqx.Module):
 
 @runtime_checkable
 class DisplacementField(Protocol):
-    """What the losses ask of a network. An exact solution in closed form has it too."""
+    """Displacements [m] at points (X [m], Y [m], t [s]): a network, or an exact solution."""
 
-    def __call__(self, points: Float[Array, "point 3"]) -> Float[Array, "point axis"]:
-        """Displacements [m] at points (X [m], Y [m], t [s])."""
-        ...
+    def __call__(self, points: Float[Array, "point 3"]) -> Float[Array, "point axis"]: ...
 
-    def jet(self, points: Float[Array, "point 3"], pairs: Pairs) -> Jet:
-        """Displacements with first derivatives, and second ones in `pairs` of inputs."""
-        ...
+    def jet(self, points: Float[Array, "point 3"], pairs: Pairs) -> Jet: ...
 
 
 class Perceptron(nn.Module):
     """Layers of tanh, the last one linear, from three inputs in -1..1 to two outputs.
 
-    - `width`: of the hidden layers.
-    - `layers`: how many there are, with the last one.
+    - `width`: of the hidden layers. - `layers`: their number, the last one included.
     """
 
     width: int
     layers: int
 
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Widths from the inputs to the outputs."""
-        return (3, *(self.layers - 1) * (self.width,), AXES)
-
     def setup(self) -> None:
-        shapes = list(zip(self.sizes, self.sizes[1:], strict=False))
-        draw, zeros = nn.initializers.glorot_normal(), nn.initializers.zeros
-        self.kernels = [self.param(f"kernel_{i}", draw, shape) for i, shape in enumerate(shapes)]
-        self.biases = [self.param(f"bias_{i}", zeros, shape[1:]) for i, shape in enumerate(shapes)]
+        sizes = (3, *(self.layers - 1) * (self.width,), AXES)
+        draw, dtype = nn.initializers.glorot_normal(), jnp.zeros((), float).dtype
+        shapes = list(zip(sizes, sizes[1:], strict=False))
+        self.kernels = [
+            self.param(f"kernel_{i}", draw, shape, dtype) for i, shape in enumerate(shapes)
+        ]
+        self.biases = [
+            self.param(f"bias_{i}", nn.initializers.zeros, shape[1:], dtype)
+            for i, shape in enumerate(shapes)
+        ]
 
     def __call__(self, inputs: Float[Array, "point 3"]) -> Float[Array, "point axis"]:
         """Outputs at inputs."""
@@ -103,17 +95,16 @@ class Perceptron(nn.Module):
             product = jnp.concatenate([z, *slopes, *curves]) @ kernel
             value, *parts = jnp.split(product, 4 + len(pairs))
             value, slopes, curves = value + bias[None], parts[:3], parts[3:]
-        none = jnp.zeros((0, *value.shape), value.dtype)
-        return Jet(value, jnp.stack(slopes), jnp.stack(curves) if pairs else none)
+        second = jnp.stack(curves) if pairs else jnp.zeros((0, *value.shape), value.dtype)
+        return Jet(value, jnp.stack(slopes), second)
 
 
 class Network(eqx.Module):
     """Displacement [m] at material points and times: a perceptron with parameters and scales.
 
-    - `module`: the perceptron.
-    - `params`: its kernels and biases by name, as flax has them.
-    - `centre`, `radius`: of the inputs X [m], Y [m], t [s], which become -1..1.
-    - `scale`: displacement [m] that an output of 1 stands for.
+    - `params`: kernels and biases of the `module` by name, as flax has them.
+    - `centre`, `radius`: of the inputs X [m], Y [m], t [s], which become -1..1; not trained.
+    - `scale`: displacement [m] for an output of 1; not trained.
     """
 
     module: Perceptron = eqx.field(static=True)
@@ -129,36 +120,34 @@ class Network(eqx.Module):
         high: Float[Array, " 3"],
         scale: Float[Array, ""],
         *,
-        width: int = WIDTH,
-        layers: int = LAYERS,
+        width: int,
+        layers: int,
         shrink: float = 1.0,
         key: PRNGKeyArray,
     ) -> "Network":
         """A network with random kernels (Glorot) and no biases.
 
         - `low`, `high`: ends of the inputs [m, m, s].
-        - `scale`: displacement [m] that an output of 1 stands for.
+        - `scale`: displacement [m] for an output of 1.
         - `width`, `layers`: see `Perceptron`.
-        - `shrink`: what the last kernel is divided by, for a motion that begins small.
+        - `shrink`: divisor of the last kernel, for a motion that is small at first.
         """
         module = Perceptron(width, layers)
-        draw, dtype = jax.nn.initializers.glorot_normal(), jnp.zeros((), float).dtype
-        shapes, params = zip(module.sizes, module.sizes[1:], strict=False), {}
-        for i, (shape, key_layer) in enumerate(zip(shapes, jr.split(key, layers), strict=True)):
-            params[f"kernel_{i}"] = draw(key_layer, shape, dtype)
-            params[f"bias_{i}"] = jnp.zeros(shape[1], dtype)
+        params = module.init(key, jnp.zeros((1, 3), float))["params"]
         params[f"kernel_{layers - 1}"] /= shrink
         return cls(module, params, (low + high) / 2, (high - low) / 2, scale)
 
     def __call__(self, points: Float[Array, "point 3"]) -> Float[Array, "point axis"]:
         """Displacements [m] at points (X [m], Y [m], t [s])."""
-        return self.scale * self._apply(points)
+        return jax.lax.stop_gradient(self.scale) * self._apply(points)
 
     def jet(self, points: Float[Array, "point 3"], pairs: Pairs) -> Jet:
         """Displacements [m] with first derivatives, and second ones in `pairs` of inputs."""
-        found = self._apply(points, self.radius, pairs, method=Perceptron.jet)
-        return jax.tree.map(lambda part: self.scale * part, found)
+        radius, scale = jax.lax.stop_gradient((self.radius, self.scale))
+        jet = self._apply(points, radius, pairs, method=Perceptron.jet)
+        return jax.tree.map(lambda part: scale * part, jet)
 
     def _apply(self, points: Float[Array, "point 3"], *rest, method=None) -> Any:
-        inputs = (points - self.centre[None]) / self.radius[None]
+        centre, radius = jax.lax.stop_gradient((self.centre, self.radius))
+        inputs = (points - centre[None]) / radius[None]
         return self.module.apply({"params": self.params}, inputs, *rest, method=method)

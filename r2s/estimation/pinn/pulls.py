@@ -4,6 +4,7 @@
 """
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,7 +14,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.interpolate import CubicSpline
 
-from r2s.recordings.recording import Recording, check_covered
+from r2s.estimation.problem import force_at
+from r2s.recordings.recording import Recording
 from r2s.units import GRAVITY
 
 FEWEST_FRAMES = 3
@@ -59,35 +61,22 @@ class Pull(eqx.Module):
     normal: Float[Array, "*pull"]
 
 
-def pull_from(
-    recording: Recording,
-    angle: float | None = None,
-    *,
-    places: Float[np.ndarray, "marker 2"] | None = None,
-    without_force: bool = False,
-) -> Pull:
+def pull_from(recording: Recording, *, without_force: bool = False) -> Pull:
     """A stretching, in the plane of the sheet, from its recording.
 
     The pull is along the first side of the recording's sheet. The force is that on the clamp at the
     end of that side; a force of one number is taken along the pull. The model is that of a sheet in
-    its plane: inertia, and on the table friction, while the table carries the weight.
+    its plane: inertia, and on the table friction, while the table carries the weight. Where the
+    recording does not say the places of its markers, they are a grid with as many rows as columns,
+    each marker in the middle of its cell.
 
-    - `angle`: from the pull to the warp [rad]: pi / 2 in a pull along the weft, pi / 4 on the bias;
-      None: what the recording says.
-    - `places`: of the markers on the sheet at rest [m]; None: what the recording says, and where it
-      does not, a grid with as many rows as columns, each marker in the middle of its cell.
-    - `without_force`: leave the force out.
-
-    Raises `ValueError` for fewer than 3 frames, times that do not increase evenly, markers that are
+    Raises `ValueError` for fewer than 3 frames, frames that are not evenly spaced, markers that are
     missing, lost, off the sheet or out of its plane, another way of holding, and a force that is
-    missing, does not cover the frames, points the other way or is not in newtons.
+    missing (unless `without_force`), does not cover the frames, points the other way or is not in
+    newtons.
     """
-    if angle is None:
-        angle = math.radians(recording.info.angle)
-    if places is None and recording.marker_places is not None:
-        places = np.asarray(recording.marker_places, np.float64)
     try:
-        return _pull(recording, angle, places, without_force)
+        return _pull(recording, without_force)
     except ValueError as error:
         raise ValueError(f"recording {recording.info.name}: {error}") from error
 
@@ -110,49 +99,44 @@ def stacked(pulls: list[Pull]) -> Pull:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *pulls)
 
 
-def _pull(recording, angle, places, without_force) -> Pull:
-    sheet = recording.info.sheet
+def _pull(recording: Recording, without_force: bool) -> Pull:
+    sheet, (first, last) = recording.info.sheet, recording.info.frames_used
     size = np.asarray(sheet.size)
     axes = np.array([sheet.warp, sheet.weft, np.cross(sheet.warp, sheet.weft)])
-    first, last = recording.info.frames_used
-    times = np.asarray(recording.times, np.float64)[first : last + 1]
+    used = slice(first, last + 1)
+    times = np.asarray(recording.times, np.float64)[used]
     _check_times(times)
     if recording.markers is None or recording.markers_seen is None:
         raise ValueError(
             "no markers: a stretching needs them in each frame "
             "(r2s.recordings.readers.markers.track)"
         )
-    seen = np.asarray(recording.markers_seen)[first : last + 1]
+    seen = np.asarray(recording.markers_seen)[used]
     _check_seen(seen, first)
-    world = np.asarray(recording.markers, np.float64)[first : last + 1]
+    world = np.asarray(recording.markers, np.float64)[used]
     local = (world - np.asarray(sheet.origin)) @ axes.T
-    places = _grid(size, seen.shape[1]) if places is None else np.asarray(places, np.float64)
-    _check_places(places, size, seen.shape[1])
+    places = _places(recording, size, seen.shape[1])
     displacement = local[..., :2] - places
     _check_on_sheet(displacement, local[..., 2], seen, places, min(size))
     near, far = _clamps(recording, times, axes, size)
-    force = None
-    if not without_force:
-        force = _force(recording, times, axes[0])
+    force = None if without_force else _force(recording, used, axes[0])
+    if force is not None:
         _check_unit(force, far[0][:, 0] - near[0][:, 0], size)
     down = axes @ np.array([0.0, 0.0, -GRAVITY])
+    array = partial(jnp.asarray, dtype=float)
     return Pull(
-        size=_array(size),
-        angle=_array(angle),
-        places=_array(places),
-        displacement=_array(np.where(seen[..., None], displacement, 0)),
+        size=array(size),
+        angle=array(math.radians(recording.info.angle)),
+        places=array(places),
+        displacement=array(np.where(seen[..., None], displacement, 0)),
         seen=jnp.asarray(seen),
-        times=_array(times - times[0]),
-        near=Clamp(*map(_array, near)),
-        far=Clamp(*map(_array, far)),
-        force=None if force is None else _array(force),
-        gravity=_array(down[:2]),
-        normal=_array(abs(down[2])),
+        times=array(times - times[0]),
+        near=Clamp(*map(array, near)),
+        far=Clamp(*map(array, far)),
+        force=None if force is None else array(force),
+        gravity=array(down[:2]),
+        normal=array(abs(down[2])),
     )
-
-
-def _array(value) -> Array:
-    return jnp.asarray(value, float)
 
 
 def _check_times(times: np.ndarray) -> None:
@@ -161,13 +145,7 @@ def _check_times(times: np.ndarray) -> None:
             f"{len(times)} frames: at least {FEWEST_FRAMES} are needed for an acceleration"
         )
     steps = np.diff(times)
-    if not (steps > 0).all():
-        at = int((~(steps > 0)).argmax())
-        raise ValueError(
-            f"times must increase, found {times[at]:g} s in frame {at}, then {times[at + 1]:g} s: "
-            "sort the frames"
-        )
-    if steps.max() - steps.min() > 0.01 * steps.mean():
+    if np.ptp(steps) > 0.01 * steps.mean():
         raise ValueError(
             f"frames must be evenly spaced, found {steps.min():g} to {steps.max():g} s: resample"
         )
@@ -186,32 +164,21 @@ def _check_seen(seen: np.ndarray, first: int) -> None:
         )
 
 
-def _grid(size: np.ndarray, count: int) -> np.ndarray:
-    """Places [m] of markers in a square grid, each in the middle of its cell."""
-    side = round(count**0.5)
-    if side * side != count:
-        raise ValueError(
-            f"{count} markers are no square grid: give `places` [m], where they are on the sheet"
-        )
-    along = (np.arange(side) + 0.5) / side
-    return np.stack(np.meshgrid(along, along, indexing="ij"), -1).reshape(-1, 2) * size
-
-
-def _check_places(places: np.ndarray, size: np.ndarray, count: int) -> None:
-    if places.shape != (count, 2):
-        raise ValueError(f"places must be ({count}, 2) [m], one a marker, found {places.shape}")
-    outside = np.flatnonzero(((places < 0) | (places > size)).any(axis=1))
-    if len(outside):
-        raise ValueError(
-            f"marker {outside[0]} has its place at {places[outside[0]]} m, not on the sheet of "
-            f"{size[0]:g} x {size[1]:g} m ({len(outside)} such): are the places in metres?"
-        )
+def _places(recording: Recording, size: np.ndarray, count: int) -> np.ndarray:
+    """Places [m] of the markers on the sheet at rest."""
+    if recording.marker_places is None:
+        side = math.isqrt(count)
+        if side * side != count:
+            raise ValueError(f"{count} markers are no square grid: give their places on the sheet")
+        along = (np.arange(side) + 0.5) / side
+        return np.stack(np.meshgrid(along, along, indexing="ij"), -1).reshape(-1, 2) * size
+    return np.asarray(recording.marker_places, np.float64)
 
 
 def _check_on_sheet(displacement, height, seen, places, side: float) -> None:
-    marker = int(np.argmax(np.where(seen[0], np.linalg.norm(displacement[0], axis=-1), 0)))
-    off = np.linalg.norm(displacement[0, marker])
-    if off > OFF_PLACE * side:
+    off = np.where(seen[0], np.linalg.norm(displacement[0], axis=-1), 0)
+    marker = int(np.argmax(off))
+    if off[marker] > OFF_PLACE * side:
         found = 1e3 * (places[marker] + displacement[0, marker])
         raise ValueError(
             f"frame 0: marker {marker} is at {found.round(1)} mm on the sheet, its place is "
@@ -230,39 +197,34 @@ def _check_on_sheet(displacement, height, seen, places, side: float) -> None:
 def _clamps(recording: Recording, times: np.ndarray, axes: np.ndarray, size: np.ndarray):
     """Displacement, velocity and acceleration of both clamps, by cubic splines of their path."""
     held = recording.info.sheet.held
-    if set(held) != {"origin", "weft", "warp", "opposite"}:
-        raise ValueError(f"a stretching is clamped at four corners, this sheet is held at {held}")
-    path = np.asarray(recording.handle_path, np.float64) @ axes[:2].T
-    start = np.asarray(recording.info.sheet.origin) @ axes[:2].T
     corners = {"origin": (0, 0), "weft": (0, 1), "warp": (1, 0), "opposite": (1, 1)}
-    knots = np.asarray(recording.handle_times, np.float64)
-    moved = {}
-    for i, name in enumerate(held):
-        at = path[:, i] - start - np.array(corners[name]) * size
-        at = np.stack([np.interp(times, knots, axis) for axis in at.T], axis=1)
-        moved[name] = CubicSpline(times, at, bc_type="not-a-knot")
+    if set(held) != set(corners):
+        raise ValueError(f"a stretching is clamped at four corners, this sheet is held at {held}")
+    world = np.asarray(recording.handle_path, np.float64) - np.asarray(recording.info.sheet.origin)
+    path = world @ axes[:2].T - np.array([corners[name] for name in held]) * size
+    knots, columns = np.asarray(recording.handle_times, np.float64), path.reshape(len(path), -1).T
+    moved = np.stack([np.interp(times, knots, column) for column in columns], axis=1)
+    spline = CubicSpline(times, moved.reshape(len(times), *path.shape[1:]))
+    derivatives = np.stack([spline(times, order) for order in range(3)])
     ends = []
     for pair in (("origin", "weft"), ("warp", "opposite")):
-        derivatives = [[moved[name](times, order) for name in pair] for order in range(3)]
-        if np.max(np.abs(np.subtract(*derivatives[0]))) > 1e-3 * min(size):
+        first, second = (derivatives[:, :, held.index(name)] for name in pair)
+        if np.max(np.abs(first[0] - second[0])) > 1e-3 * min(size):
             raise ValueError(f"the clamp from {pair[0]} to {pair[1]} turns: it must go straight")
-        ends.append([np.mean(both, axis=0) for both in derivatives])
+        ends.append((first + second) / 2)
     return ends
 
 
-def _force(recording: Recording, times: np.ndarray, along: np.ndarray) -> np.ndarray:
+def _force(recording: Recording, used: slice, along: np.ndarray) -> np.ndarray:
     """The force [N] along the pull at the times of the frames."""
-    if recording.force is None or recording.force_times is None:
+    force = force_at(recording, used)
+    if force is None:
         raise ValueError(
             "no force: without it only ratios of stiffness are identifiable, not their scale; add "
             "the load cell's log (r2s.recordings.readers.force_log), or take the pull with "
             "r2s.estimation.pinn.pulls.pull_from(recording, without_force=True)"
         )
-    force = np.asarray(recording.force, np.float64)
-    force = force @ along if force.ndim == 2 else force
-    clock = np.asarray(recording.force_times, np.float64)
-    check_covered(clock, times)
-    return np.interp(times, clock, force)
+    return np.asarray(force.values, np.float64) @ (np.asarray(force.directions) @ along)
 
 
 def _check_unit(force: np.ndarray, pulled: np.ndarray, size: np.ndarray) -> None:

@@ -1,11 +1,10 @@
-"""Strain, stress and its divergence in a sheet, from the laws of `r2s.laws.membrane`.
+"""Strain and stress in a sheet, from the laws of `r2s.laws.membrane`.
 
 The sheet has sides X (the pull) and Y. The law is in the axes of warp and weft, which are turned
 by an `angle` from X. Stress is force per width [N/m]: no thickness enters.
 """
 
 from collections.abc import Callable
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +13,8 @@ from jaxtyping import Array, Float
 from r2s.fabrics.fabric import Fabric
 from r2s.laws.turned import TurnedMembrane
 
-Gradient = Float[Array, "axis 2"]  # of displacement or position in X and Y, [-]
-Voigt = Float[Array, " 3"]  # strain (E11, E22, 2 E12) [-], or stress (S11, S22, S12) [N/m]
+Gradient = Float[Array, "axis 2"]  # of displacement in X and Y, [-]
+Voigt = Float[Array, " 3"]  # strain (E11, E22, 2 E12) [-]
 Strain = Callable[[Gradient], Voigt]
 
 
@@ -53,19 +52,3 @@ def nominal_stress(
     if rate is not None:
         at = at + fabric.damping * jax.jvp(strain, (gradient,), (rate,))[1]
     return pull_back(jax.grad(energy)(at))[0]
-
-
-def divergence(
-    fabric: Fabric,
-    angle: Float[Array, ""],
-    gradient: Gradient,
-    changes: Float[Array, "2 axis 2"],
-    strain: Strain = green,
-) -> Float[Array, " axis"]:
-    """Divergence [N/m^2] of the nominal stress, from derivatives `changes` [1/m] of the gradient.
-
-    It leaves damping out, whose divergence would need third derivatives.
-    """
-    stress = partial(nominal_stress, fabric, angle, strain=strain)
-    along_x, along_y = (jax.jvp(stress, (gradient,), (change,))[1] for change in changes)
-    return along_x[:, 0] + along_y[:, 1]

@@ -1,11 +1,11 @@
-"""Training of networks: Adam, then L-BFGS, on all losses at once, with the stiffness among them.
+"""Training of networks by Adam on all losses at once, with the stiffness among the parameters.
 
-Both optimisers are optax's. The training goes in chunks of epochs; points are drawn anew for each,
-and after each one a checkpoint may be written.
+Each loss is the mean square of a residual over its known magnitude. It is about 1 when the fit is
+as good as markers and load cell are, so that no weights need tuning. The frames in which the weak
+form is tested are drawn anew for each chunk of epochs, after which a checkpoint may be written.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,24 +15,42 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import optax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from r2s.estimation import checkpoint as checkpoints
-from r2s.estimation.pinn.losses import (
-    Losses,
-    Points,
-    draw_points,
-    motion_residual,
-    scales_of,
-    strong_losses,
-)
-from r2s.estimation.pinn.network import LAYERS, Network
+from r2s.estimation.pinn.losses import clamp_residual, marker_residual
+from r2s.estimation.pinn.network import DisplacementField, Network
 from r2s.estimation.pinn.pulls import Pull
-from r2s.estimation.pinn.stress import Strain, green
+from r2s.estimation.pinn.weak_form import end_value, kinematics, virtual_fields, virtual_work
+from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace
 
 NOISE = (2e-4, 0.01)  # of markers [m], and of the force over its greatest [-]
+TOLERANCE = 0.01  # of the virtual work, over that of the stress in the sheet
+CLAMP = 0.2  # error of the displacement at the clamps, over the noise of the markers
 SHRINK = 10.0  # the last kernel is small at first, since the even stretch is given
+RATE, LAST_RATE = 3e-3, 0.01  # of Adam; where its cosine ends, as a multiple
+FABRIC_RATE = 3.0  # that of the fabric's parameters, as a multiple
+FRAMES = 25  # in which the weak form is tested
+DEGREES, NODES = (3, 4), 8  # of its virtual displacements and their quadrature
+
+
+class Recipe(NamedTuple):
+    """How to train.
+
+    - `warm_up`, `adam`: epochs without and with physics.
+    - `chunk`: epochs for which frames are drawn.
+    - `width`, `layers`: of the network.
+    """
+
+    warm_up: int = 200
+    adam: int = 200
+    chunk: int = 100
+    width: int = 32
+    layers: int = 7
+
+
+QUICK = Recipe()  # `balance` needs a motion to begin with, and its accelerations, no more
 
 
 class Model(eqx.Module):
@@ -44,259 +62,142 @@ class Model(eqx.Module):
     """
 
     networks: Network
-    free: Float[Array, "*batch dim"]
+    free: Float[Array, " dim"]
 
     @property
-    def place(self) -> Float[Array, "*batch dim"]:
+    def place(self) -> Float[Array, " dim"]:
         """Where the fabric lies in its space's unit cube."""
         return jax.nn.sigmoid(self.free)
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """How to train.
-
-    - `losses`: `strong_losses` or `r2s.estimation.pinn.weak_form.weak_losses`.
-    - `weights`: of the terms, in the order of `Losses`; 0 leaves one out.
-    - `strain`: `green` or `small`.
-    - `warm_up`, `adam`: epochs of Adam without and with physics.
-    - `lbfgs`: iterations of L-BFGS after them.
-    - `rate`: of Adam, which falls to a hundredth by a cosine.
-    - `fabric_rate`: that of the fabric's parameters, as a multiple.
-    - `points`: number of points in each sheet where equations are tested.
-    - `redraw`: epochs in a chunk.
-    - `width`, `layers`: of the network.
-    """
-
-    losses: Callable[..., Losses] = strong_losses
-    weights: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0, 1.0)
-    strain: Strain = green
-    warm_up: int = 500
-    adam: int = 1500
-    lbfgs: int = 200
-    rate: float = 3e-3
-    fabric_rate: float = 3.0
-    points: int = 200
-    redraw: int = 100
-    width: int = 32
-    layers: int = LAYERS
-
-    @property
-    def adam_chunks(self) -> int:
-        """Number of chunks that Adam makes."""
-        return -(-(self.warm_up + self.adam) // self.redraw)
-
-    @property
-    def chunks(self) -> int:
-        """Number of chunks of the whole training."""
-        return self.adam_chunks + -(-self.lbfgs // self.redraw)
-
-
 class Trained(NamedTuple):
-    """Trained models, and their course after each chunk; all with a leading axis of fabrics.
-
-    - `losses`: [-]. - `places`: of the fabrics in the space's unit cube.
-    """
+    """A trained model, and after each chunk the loss of the markers [-] and the fabric's place."""
 
     model: Model
-    losses: Losses
-    places: Float[np.ndarray, "fabric chunk dim"]
+    losses: Float[np.ndarray, " chunk"]
+    places: Float[np.ndarray, "chunk dim"]
 
 
-def init(space: ParameterSpace, pulls: Pull, recipe: Recipe, *, key: PRNGKeyArray) -> Model:
+class Losses(NamedTuple):
+    """Terms of a loss, each [-].
+
+    - `data`: distance of the markers.
+    - `clamps`: displacement at the clamps.
+    - `work`: virtual work in displacements that vanish at the clamps.
+    - `force`: on the far clamp, beside the measured one; 0 without one.
+    """
+
+    data: Float[Array, "*pull"]
+    clamps: Float[Array, "*pull"]
+    work: Float[Array, "*pull"]
+    force: Float[Array, "*pull"]
+
+
+class Progress(NamedTuple):
+    """State of a training: model, state of Adam, and number of epochs that are done."""
+
+    model: Model
+    state: Any
+    epoch: Int[Array, ""]
+
+
+def init(
+    space: ParameterSpace, pulls: Pull, width: int, layers: int, *, key: PRNGKeyArray
+) -> Model:
     """An untrained model of stacked pulls, its fabric in the middle of the space."""
 
     def network(pull: Pull, key: PRNGKeyArray) -> Network:
         high = jnp.concatenate([pull.size, pull.times[-1:]])
-        return Network.make(
-            jnp.zeros_like(high),
-            high,
-            jnp.max(jnp.abs(pull.displacement)) / 2,
-            width=recipe.width,
-            layers=recipe.layers,
-            shrink=SHRINK,
-            key=key,
-        )
+        scale = jnp.max(jnp.abs(pull.displacement)) / 2
+        size: dict[str, Any] = {"width": width, "layers": layers, "shrink": SHRINK}
+        return Network.make(jnp.zeros_like(high), high, scale, **size, key=key)
 
     keys = jr.split(key, pulls.angle.shape[0])
     return Model(jax.vmap(network)(pulls, keys), jnp.zeros(space.dim, float))
 
 
-def trainable(model: Model) -> Any:
-    """A tree like the model, true for what is trained: the networks' parameters and the fabric."""
-    none = jax.tree.map(lambda _: False, model)
-    parts = (none.networks.params, none.free)
-    return eqx.tree_at(
-        lambda m: (m.networks.params, m.free), none, jax.tree.map(lambda _: True, parts)
-    )
+def losses_of(
+    network: DisplacementField, pull: Pull, fabric: Fabric, frames: Int[Array, " frame"], noise
+) -> Losses:
+    """The losses of one pull, with the weak form in some frames.
+
+    `noise`: of the markers [m], and of the force over its greatest [-]. The work counts beside that
+    of the measured force over the width; without a force, of the stress of the `fabric` as it is
+    now, held constant, so that a soft one is not preferred.
+    """
+    marker, force_noise = noise
+    residual = marker_residual(network, pull) / marker
+    data = jnp.mean(residual**2) / jnp.mean(pull.seen, dtype=residual.dtype)
+    clamps = jnp.mean((clamp_residual(network, pull) / (CLAMP * marker)) ** 2)
+    virtual = virtual_fields(DEGREES, NODES)
+    work = virtual_work(fabric, pull, virtual, kinematics(network, pull, virtual, frames))
+    stretch = jnp.max(jnp.abs(pull.displacement)) / pull.size[0]
+    stress = jax.lax.stop_gradient(fabric.membrane.c11) * stretch
+    force_loss = jnp.zeros((), data.dtype)
+    if pull.force is not None:
+        greatest = jnp.max(jnp.abs(pull.force))
+        stress = greatest / pull.size[1]
+        difference = work[:, -1, 0] / end_value(virtual) - pull.force[frames]
+        force_loss = jnp.mean((difference / (force_noise * greatest)) ** 2)
+    balance = work[:, :-1] / (TOLERANCE * stress * jnp.max(pull.size))
+    return Losses(data, clamps, jnp.mean(balance**2), force_loss)
 
 
 def total(
-    model: Model,
-    space: ParameterSpace,
-    pulls: Pull,
-    points: Points,
-    noise: Array,
-    weight,
-    recipe: Recipe,
+    model: Model, space: ParameterSpace, pulls: Pull, frames, noise: Array, weight: Array
 ) -> tuple[Array, Losses]:
     """The sum of all losses, those of physics times `weight` [-], and the losses themselves."""
     fabric = space(model.place)
-
-    def of_pull(network: Network, pull: Pull, points: Points) -> Losses:
-        greatest = jnp.ones((), float) if pull.force is None else jnp.max(jnp.abs(pull.force))
-        scales = scales_of(pull, fabric, noise[0], noise[1] * greatest)
-        return recipe.losses(network, pull, fabric, points, scales, recipe.strain)
-
-    each = jax.vmap(of_pull)(model.networks, pulls, points)
-    losses = jax.tree.map(jnp.mean, each)
-    terms = [w * value for w, value in zip(recipe.weights, losses, strict=True)]
-    data, motion, traction, free, clamps = terms
-    return data + clamps + weight * (motion + traction + free), losses
-
-
-def redrawn(
-    model: Model, space: ParameterSpace, pulls: Pull, recipe: Recipe, key: PRNGKeyArray
-) -> Points:
-    """New points for every pull.
-
-    In the strong form half of them are drawn from four times as many, with chances that grow with
-    the residual of the equation of motion there.
-    """
-    fabric = space(model.place)
-
-    def of_pull(network: Network, pull: Pull, key: PRNGKeyArray) -> Points:
-        key_pool, key_even, key_pick = jr.split(key, 3)
-        even = draw_points(pull, recipe.points, key=key_even)
-        if recipe.losses is not strong_losses:
-            return even
-        pool = draw_points(pull, 4 * recipe.points, key=key_pool)
-        off = motion_residual(network, pull, fabric, pool.inner, pool.inner_frame, recipe.strain)
-        size = jnp.sqrt(jnp.sum(off**2, axis=1))
-        chance = size / jnp.maximum(jnp.sum(size), jnp.finfo(size.dtype).tiny)
-        half = recipe.points // 2
-        picked = jr.choice(key_pick, len(size), (half,), p=chance)
-        return even._replace(
-            inner=even.inner.at[:half].set(pool.inner[picked]),
-            inner_frame=even.inner_frame.at[:half].set(pool.inner_frame[picked]),
-        )
-
-    number = pulls.angle.shape[0]
-    return jax.vmap(of_pull)(model.networks, pulls, jr.split(key, number))
-
-
-class Progress(NamedTuple):
-    """State of a training: models, state of Adam, and number of epochs of Adam that are done."""
-
-    model: Model
-    state: Any
-    epoch: Array
+    of_pulls = jax.vmap(lambda *given: losses_of(*given[:2], fabric, given[2], noise))
+    losses = jax.tree.map(jnp.mean, of_pulls(model.networks, pulls, frames))
+    return losses.data + losses.clamps + weight * (losses.work + losses.force), losses
 
 
 def adam(recipe: Recipe) -> optax.GradientTransformation:
-    """Adam with the recipe's rates."""
-    epochs = recipe.warm_up + recipe.adam
-    return optax.adam(optax.cosine_decay_schedule(recipe.rate, max(epochs, 1), 0.01))
+    """Adam, whose rate falls by a cosine."""
+    epochs = max(recipe.warm_up + recipe.adam, 1)
+    return optax.adam(optax.cosine_decay_schedule(RATE, epochs, LAST_RATE))
 
 
 @eqx.filter_jit
-def adam_chunk(
+def train_chunk(
     progress: Progress,
-    spaces: ParameterSpace,
+    space: ParameterSpace,
     pulls: Pull,
     noise: Array,
     recipe: Recipe,
     key: PRNGKeyArray,
 ) -> tuple[Progress, Losses]:
-    """A chunk of epochs of Adam for every fabric, and the losses of the last epoch."""
-    which, optimiser = trainable(progress.model), adam(recipe)
+    """A chunk of epochs, and the losses of the last one."""
+    number, count = pulls.times.shape
+    frames = jr.randint(key, (number, FRAMES), 0, count, int)
 
-    def run(progress: Progress, space: ParameterSpace, pulls: Pull, key: PRNGKeyArray):
-        points = redrawn(progress.model, space, pulls, recipe, key)
+    def epoch(progress: Progress, _):
+        model, state, done = progress
+        weight = (done >= recipe.warm_up).astype(float)
+        gradient, losses = jax.grad(total, has_aux=True)(model, space, pulls, frames, noise, weight)
+        change, state = adam(recipe).update(gradient, state)
+        change = eqx.tree_at(lambda m: m.free, change, replace_fn=lambda free: FABRIC_RATE * free)
+        return Progress(eqx.apply_updates(model, change), state, done + 1), losses
 
-        def epoch(progress: Progress, _):
-            weight = (progress.epoch >= recipe.warm_up).astype(float)
-            params, fixed = eqx.partition(progress.model, which)
-
-            def loss(params):
-                model = eqx.combine(params, fixed)
-                return total(model, space, pulls, points, noise, weight, recipe)
-
-            gradient, losses = jax.grad(loss, has_aux=True)(params)
-            change, state = optimiser.update(gradient, progress.state)
-            change = eqx.tree_at(
-                lambda m: m.free, change, replace_fn=lambda free: recipe.fabric_rate * free
-            )
-            model = eqx.apply_updates(progress.model, change)
-            return Progress(model, state, progress.epoch + 1), losses
-
-        return jax.lax.scan(epoch, progress, None, recipe.redraw)
-
-    keys = jr.split(key, progress.epoch.shape[0])
-    progress, losses = jax.vmap(run)(progress, spaces, pulls, keys)
-    return progress, jax.tree.map(lambda values: values[:, -1], losses)
-
-
-@eqx.filter_jit
-def lbfgs_chunk(
-    progress: Progress,
-    spaces: ParameterSpace,
-    pulls: Pull,
-    noise: Array,
-    recipe: Recipe,
-    key: PRNGKeyArray,
-) -> tuple[Progress, Losses]:
-    """A chunk of iterations of L-BFGS with a line search for every fabric, and the last losses.
-
-    It begins without memory: the curvature that it remembered would be of other points.
-    """
-    which, optimiser = trainable(progress.model), optax.lbfgs()
-
-    def run(model: Model, space: ParameterSpace, pulls: Pull, key: PRNGKeyArray):
-        points = redrawn(model, space, pulls, recipe, key)
-        params, fixed = eqx.partition(model, which)
-
-        def losses(params):
-            model = eqx.combine(params, fixed)
-            return total(model, space, pulls, points, noise, 1.0, recipe)
-
-        def loss(params):
-            return losses(params)[0]
-
-        value_and_grad = optax.value_and_grad_from_state(loss)
-
-        def iterate(carried, _):
-            params, state = carried
-            value, gradient = value_and_grad(params, state=state)
-            change, state = optimiser.update(
-                gradient, state, params, value=value, grad=gradient, value_fn=loss
-            )
-            return (eqx.apply_updates(params, change), state), None
-
-        begin = params, optimiser.init(params)
-        (params, _), _ = jax.lax.scan(iterate, begin, None, recipe.redraw)
-        return eqx.combine(params, fixed), losses(params)[1]
-
-    keys = jr.split(key, progress.epoch.shape[0])
-    model, losses = jax.vmap(run)(progress.model, spaces, pulls, keys)
-    return progress._replace(model=model), losses
+    progress, losses = jax.lax.scan(epoch, progress, None, recipe.chunk)
+    return progress, jax.tree.map(lambda values: values[-1], losses)
 
 
 def train(
-    spaces: ParameterSpace,
+    space: ParameterSpace,
     pulls: Pull,
-    recipe: Recipe = Recipe(),
+    recipe: Recipe = QUICK,
     *,
     noise: tuple[float, float] = NOISE,
-    report: Callable[[int, Losses], None] | None = None,
+    report: Callable[[int, float], None] | None = None,
     checkpoint: Path | None = None,
     key: PRNGKeyArray,
 ) -> Trained:
-    """Train a network for each pull of each fabric, and the fabrics, all together.
+    """Train a network for each of some stacked pulls, and their fabric, together.
 
-    - `spaces`, `pulls`: with a leading axis of fabrics; `pulls` have one of pulls after it.
     - `noise`: of the markers [m], and of the force over its greatest [-].
-    - `report`: called after every chunk with its number and the losses.
+    - `report`: called after every chunk with its number and the loss of the markers [m^2].
     - `checkpoint`: a file that is written after every chunk, and from which a killed training of
       the same problem goes on.
 
@@ -304,53 +205,23 @@ def train(
     problem.
     """
     key_init, key_chunks = jr.split(key)
-    number, weights = pulls.angle.shape[0], jnp.asarray(noise, float)
-
-    def begin(space: ParameterSpace, pulls: Pull, key: PRNGKeyArray) -> Progress:
-        model = init(space, pulls, recipe, key=key)
-        state = adam(recipe).init(eqx.filter(model, trainable(model)))
-        return Progress(model, state, jnp.zeros((), int))
-
-    progress = jax.vmap(begin)(spaces, pulls, jr.split(key_init, number))
-    history: list[tuple[Losses, Array]] = []
+    model = init(space, pulls, recipe.width, recipe.layers, key=key_init)
+    progress = Progress(model, adam(recipe).init(model), jnp.zeros((), int))
+    losses, places, weights = np.zeros(0), np.zeros((0, space.dim)), jnp.asarray(noise, float)
     run = {"kind": "training of networks"}
     if checkpoint is not None:
-        run["run"] = checkpoints.fingerprint(spaces, pulls, weights, _settings(recipe), key)
-        progress, history = _resumed(checkpoint, run, progress)
-    for chunk in range(len(history), recipe.chunks):
-        make = adam_chunk if chunk < recipe.adam_chunks else lbfgs_chunk
+        run["run"] = checkpoints.fingerprint(space, pulls, weights, recipe, key)
+        if (stored := checkpoints.load(checkpoint, run)) is not None:
+            progress, losses, places = checkpoints.tree_from(stored, (progress, losses, places))
+    for chunk in range(len(losses), -(-(recipe.warm_up + recipe.adam) // recipe.chunk)):
         key_chunk = jr.fold_in(key_chunks, chunk)
-        progress, losses = make(progress, spaces, pulls, weights, recipe, key_chunk)
-        if not all(bool(jnp.isfinite(values).all()) for values in losses):
-            raise RuntimeError(f"training diverged in chunk {chunk + 1}: {losses}")
-        history.append((losses, progress.model.place))
+        progress, now = train_chunk(progress, space, pulls, weights, recipe, key_chunk)
+        if not np.isfinite(now).all():
+            raise RuntimeError(f"training diverged in chunk {chunk + 1}: {now}")
+        losses = np.append(losses, now.data)
+        places = np.concatenate([places, np.asarray(progress.model.place)[None]])
         if checkpoint is not None:
-            arrays = checkpoints.arrays_of((progress, _stacked(history)))
-            checkpoints.save(checkpoint, arrays, run)
+            checkpoints.save(checkpoint, checkpoints.arrays_of((progress, losses, places)), run)
         if report is not None:
-            report(chunk, losses)
-    losses, places = jax.tree.map(np.asarray, _stacked(history))
-    return Trained(progress.model, losses, places)
-
-
-def _stacked(history: list[tuple[Losses, Array]]) -> tuple[Losses, Array]:
-    """Losses and places with an axis of chunks after that of fabrics."""
-    return jax.tree.map(lambda *values: jnp.stack(values, 1), *history)
-
-
-def _resumed(path: Path, run: dict[str, str], progress: Progress):
-    """The state of a training and its history, from a checkpoint if there is one."""
-    place = progress.model.place
-    likeness = progress, (Losses(place, place, place, place, place), place)
-    stored = checkpoints.load(path, run)
-    if stored is None:
-        return progress, []
-    progress, course = checkpoints.tree_from(stored, likeness)
-    chunks = range(course[1].shape[1])
-    return progress, [jax.tree.map(lambda values, at=at: values[:, at], course) for at in chunks]
-
-
-def _settings(recipe: Recipe) -> dict[str, Any]:
-    """The fields of a recipe, functions by name."""
-    values = {field.name: getattr(recipe, field.name) for field in fields(recipe)}
-    return {name: getattr(value, "__name__", value) for name, value in values.items()}
+            report(chunk, float(now.data) * noise[0] ** 2)
+    return Trained(progress.model, np.asarray(losses), np.asarray(places))

@@ -12,24 +12,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from numpy.polynomial import Legendre, Polynomial
 
-from r2s.estimation.pinn.losses import (
-    Losses,
-    Points,
-    Scales,
-    common_losses,
-    field,
-    gradients,
-    load,
-)
-from r2s.estimation.pinn.network import WEAK, DisplacementField, T
+from r2s.estimation.pinn.losses import field, gradients, load
+from r2s.estimation.pinn.network import DisplacementField, T, X, Y
 from r2s.estimation.pinn.pulls import Pull
-from r2s.estimation.pinn.stress import Strain, green, nominal_stress
+from r2s.estimation.pinn.stress import nominal_stress
 from r2s.fabrics.fabric import Fabric
 
 NODES = 12  # of the quadrature along each side
 DEGREES = (7, 8)  # number of polynomials along and across the pull
-FEW_NODES, FEW_DEGREES = 8, (3, 4)  # the same in the loss of the network
 
 
 class Virtual(NamedTuple):
@@ -39,44 +31,50 @@ class Virtual(NamedTuple):
 
     - `nodes`, `weights`: of the quadrature.
     - `value`, `slope`: of the functions, and in both sides, [-].
+    - `at_markers`: value of all but the last function at the markers, [-].
     """
 
     nodes: Float[Array, "node 2"]
     weights: Float[Array, " node"]
     value: Float[Array, "function node"]
     slope: Float[Array, "function node 2"]
+    at_markers: Float[Array, "marker function"]
 
 
-def virtual_fields(degrees: tuple[int, int] = DEGREES, nodes: int = NODES) -> Virtual:
-    """Products x (1 - x) P_i(x) P_j(y) of Legendre polynomials, scaled to a mean slope of 1."""
+def virtual_fields(
+    degrees: tuple[int, int] = DEGREES,
+    nodes: int = NODES,
+    markers: Float[np.ndarray, "marker 2"] | None = None,
+) -> Virtual:
+    """Products x (1 - x) P_i(x) P_j(y) of Legendre polynomials, scaled to a mean slope of 1.
+
+    - `degrees`: number of polynomials along and across the pull.
+    - `nodes`: of the quadrature along each side.
+    - `markers`: their places on the unit square.
+    """
     at, weight = np.polynomial.legendre.leggauss(nodes)
-    x, y = (grid.ravel() for grid in np.meshgrid((at + 1) / 2, (at + 1) / 2, indexing="ij"))
+    places = np.stack(np.meshgrid((at + 1) / 2, (at + 1) / 2, indexing="ij"), -1).reshape(-1, 2)
     weights = np.outer(weight, weight).ravel() / 4
-    value, slope = virtual_at(np.stack([x, y], 1), degrees)
-    size = np.sqrt(np.einsum("fqi,q->f", slope**2, weights))
-    value, slope = value / size[:, None], slope / size[:, None, None]
-    parts = np.stack([x, y], 1), weights, value, slope
-    return Virtual(*(jnp.asarray(part, float) for part in parts))
+    along, across = ([_legendre(i) for i in range(count)] for count in degrees)
+    pairs = [(f * Polynomial([0, 1, -1]), g) for f in along for g in across]
+    pairs.append((Polynomial([0, 1]), Polynomial([1])))
+
+    def values(functions, places) -> np.ndarray:
+        x, y = places.T
+        return np.array([f(x) * g(y) for f, g in functions])
+
+    slopes = [values([(f.deriv(), g) for f, g in pairs], places)]
+    slopes.append(values([(f, g.deriv()) for f, g in pairs], places))
+    slope = np.stack(slopes, axis=2)
+    size = np.sqrt(np.einsum("fqi,q->f", slope**2, weights))[:, None]
+    at_markers = values(pairs, np.zeros((0, 2)) if markers is None else markers) / size
+    parts = places, weights, values(pairs, places) / size, slope / size[..., None]
+    return Virtual(*(jnp.asarray(part, float) for part in (*parts, at_markers[:-1].T)))
 
 
-def virtual_at(
-    places: np.ndarray, degrees: tuple[int, int]
-) -> tuple[Float[np.ndarray, "function point"], Float[np.ndarray, "function point 2"]]:
-    """Values and slopes of the functions of `virtual_fields`, not scaled, at any places."""
-    x, y = places.T
-    along = [_legendre(i) * np.polynomial.Polynomial([0, 1, -1]) for i in range(degrees[0])]
-    across = [_legendre(j) for j in range(degrees[1])]
-    pairs = [(f, g) for f in along for g in across]
-    pairs.append((np.polynomial.Polynomial([0, 1]), np.polynomial.Polynomial([1])))
-    value = np.array([f(x) * g(y) for f, g in pairs])
-    slope = np.array([[f.deriv()(x) * g(y), f(x) * g.deriv()(y)] for f, g in pairs])
-    return value, np.moveaxis(slope, 1, 2)
-
-
-def _legendre(degree: int) -> np.polynomial.Polynomial:
+def _legendre(degree: int) -> Polynomial:
     """Legendre polynomial on 0..1."""
-    basis = np.polynomial.legendre.Legendre.basis(degree, [0, 1])
-    return basis.convert(kind=np.polynomial.Polynomial)
+    return Legendre.basis(degree, [0, 1]).convert(kind=Polynomial)
 
 
 class Kinematics(NamedTuple):
@@ -98,14 +96,14 @@ def kinematics(
     """The motion of a network at the nodes in some frames."""
     number, nodes = len(frames), len(virtual.nodes)
     places = jnp.tile(virtual.nodes * pull.size[None], (number, 1))
-    jet = field(network, pull, places, jnp.repeat(frames, nodes), WEAK)
+    jet = field(network, pull, places, jnp.repeat(frames, nodes), ((X, T), (Y, T), (T, T)))
     rate = jnp.moveaxis(jet.second[:2], 0, -1)
     parts = gradients(jet), rate, jet.first[T], jet.second[2]
     return Kinematics(*(part.reshape(number, nodes, *part.shape[1:]) for part in parts))
 
 
 def virtual_work(
-    fabric: Fabric, pull: Pull, virtual: Virtual, motion: Kinematics, strain: Strain = green
+    fabric: Fabric, pull: Pull, virtual: Virtual, motion: Kinematics
 ) -> Float[Array, "frame function axis"]:
     """Work [N m / m] of stress and load in every virtual displacement and frame.
 
@@ -114,7 +112,7 @@ def virtual_work(
     """
 
     def stresses(gradient, rate, velocity, acceleration):
-        stress = nominal_stress(fabric, pull.angle, gradient, rate, strain)
+        stress = nominal_stress(fabric, pull.angle, gradient, rate)
         return stress, load(fabric, pull, velocity, acceleration)
 
     stress, loads = jax.vmap(jax.vmap(stresses))(*motion)
@@ -127,27 +125,3 @@ def virtual_work(
 def end_value(virtual: Virtual) -> Float[Array, ""]:
     """Value [-] of the last virtual displacement at the far clamp."""
     return virtual.slope[-1, 0, 0]
-
-
-def weak_losses(
-    network: DisplacementField,
-    pull: Pull,
-    fabric: Fabric,
-    points: Points,
-    scales: Scales,
-    strain: Strain = green,
-) -> Losses:
-    """The losses with the virtual work in place of the equation of motion and of free edges.
-
-    It is tested in the frames `points.edge_frame`; the other points are not used.
-    """
-    data, clamps = common_losses(network, pull, scales)
-    virtual = virtual_fields(FEW_DEGREES, FEW_NODES)
-    motion = kinematics(network, pull, virtual, points.edge_frame)
-    work = virtual_work(fabric, pull, virtual, motion, strain)
-    off = work[:, :-1] / (scales.stress * jnp.max(pull.size))
-    traction = jnp.zeros((), data.dtype)
-    if pull.force is not None:
-        force = work[:, -1, 0] / end_value(virtual)
-        traction = jnp.mean(((force - pull.force[points.edge_frame]) / scales.force) ** 2)
-    return Losses(data, jnp.mean(off**2), traction, jnp.zeros((), data.dtype), clamps)
