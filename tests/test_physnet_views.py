@@ -9,20 +9,16 @@ import pytest
 from scipy import ndimage
 
 from r2s import scenarios
-from r2s.estimation.physnet import dataset, preprocess, views
+from r2s.estimation.physnet import preprocess, views
 from r2s.estimation.physnet.views import View
-from r2s.fabrics import presets
 from r2s.geometry.mesh import rectangle
 from r2s.recordings.cameras.calibration import (
     DepthCamera,
     calibrated,
-    frustum,
-    look_at,
 )
 from r2s.recordings.cameras.camera import Camera
 from r2s.recordings.cameras.render import render
 from r2s.scenarios import synthetic
-from r2s.scenarios.scenario import rollout
 
 VIEW = View((0.1, -0.4, 0.6), (0.1, 0.1, 0.1), 40.0, 32, 0.4, 1.0, -1.0)
 MESH = rectangle((0.3, 0.3), (4, 4))
@@ -78,17 +74,6 @@ def test_a_view_around_points_holds_them_all():
     assert float(alone(jnp.asarray(points[seen])).min()) > 0
     with pytest.raises(ValueError, match="no point is higher than 1 m"):
         views.view_around((-0.5, -0.1, 0.5), points, 64, 1.0)
-
-
-def test_a_real_camera_of_another_resolution_gives_the_same_image():
-    pose = look_at((0.12, -0.42, 0.58), (0.1, 0.1, 0.1))
-    camera = DepthCamera((160, 120), (140.0, 140.0), (79.5, 59.5), pose, 1e-3)
-    depth, which = render(camera, TILTED, np.asarray(MESH.faces))
-    image = preprocess.of_camera(VIEW, camera, depth[None], (which >= 0)[None])[0]
-    expected = np.asarray(shown(VIEW, jnp.asarray(drawn())))
-    both = (image > 0) & (expected > 0)
-    assert both.sum() > 0.9 * (expected > 0).sum()
-    assert np.abs(image - expected)[both].mean() < 0.01
 
 
 def test_measured_points_cover_as_much_as_the_surface_does():
@@ -171,15 +156,6 @@ def test_broken_depth_is_refused(depths, message):
         preprocess.of_depths(VIEW, depths, "cup", (5, 9))
 
 
-def test_a_cameras_wrong_size_and_unit_are_refused():
-    camera = camera_of(VIEW)
-    there = np.ones((1, 32, 32), bool)
-    with pytest.raises(ValueError, match="the median depth is 700 m: give metres"):
-        preprocess.of_camera(VIEW, camera, np.full((1, 32, 32), 700.0), there)
-    with pytest.raises(ValueError, match=r"of 32 x 32 pixels .*found \(30, 32\)"):
-        preprocess.of_camera(VIEW, camera, np.ones((1, 30, 32)), there[:, :30])
-
-
 def test_clouds_become_depth(fabric):
     experiment = scenarios.lifting()
     view = views.view_around(
@@ -211,44 +187,3 @@ def test_a_stray_point_that_was_spread_is_dropped():
     alone = (plain > 0) & (clean == 0)
     assert alone.any() and (stray[alone] == 0).all()
     assert ((clean > 0) == (stray > 0))[plain == 0].mean() > 0.99
-
-
-def test_in_the_frame_is_what_falls_onto_a_pixel():
-    camera = Camera(jnp.array([-0.5, -0.1, 0.5]), jnp.array([0.25, 0.25, 0.1]), 200.0, (160, 120))
-    points = jnp.asarray(np.random.default_rng(0).uniform(-0.3, 0.8, (2000, 3)), float)
-    pixel, depth = (np.asarray(part) for part in camera.project(points))
-    found = np.asarray(views.in_frame(points, frames_of(camera)))
-    spare = np.minimum(pixel, np.array(camera.resolution) - pixel).min(axis=1)
-    assert found[(depth > 0) & (spare > 1)].all()
-    assert not found[(depth <= 0) | (spare < 0)].any()
-    assert 100 < found.sum() < 1900
-
-
-def test_what_no_camera_has_in_its_frame_is_left_out_of_an_image():
-    aside = jnp.array([0.3, 0.1, 0.1])
-    narrow = Camera(jnp.array(VIEW.position), aside, 40.0, (12, 32))
-    wide = Camera(jnp.array(VIEW.position), aside, 40.0, (200, 200))
-    x = jnp.asarray(TILTED, float)[None]
-    images = [
-        np.asarray(views.depths_of_sheet(VIEW, x, MESH.faces, 40, frames)[0])
-        for frames in (None, frames_of(narrow), frames_of(narrow, wide))
-    ]
-    whole, cut, again = images
-    kept = cut > 0
-    assert 0.2 < kept.sum() / (whole > 0).sum() < 0.8
-    np.testing.assert_allclose(cut[kept], whole[kept], atol=0.02)
-    np.testing.assert_array_equal(again, whole)
-
-
-@pytest.mark.parametrize("name", ["lifting", "wind"])
-def test_the_study_s_cameras_have_all_of_a_sheet_in_their_images(name):
-    experiment = scenarios.SIX[name]()
-    images = dataset.kept_frames(experiment.frames_used, dataset.Settings.num_frames)
-    fabric = presets.grey_interlock()
-    x = jax.jit(rollout)(experiment.scenario((5, 5)), fabric).x[jnp.array(images)]
-    frames = frames_of(*synthetic.sensing(experiment).cameras)
-    assert bool(jax.vmap(lambda each: views.in_frame(each, frames))(x).all())
-
-
-def frames_of(*cameras):
-    return jnp.asarray(np.stack([frustum(calibrated(camera)) for camera in cameras]), float)

@@ -75,7 +75,7 @@ def small_network(pull: Pull) -> Network:
 def coarse(monkeypatch):
     """Few virtual displacements, so that it compiles fast; the slow tests undo it."""
     monkeypatch.setattr("r2s.estimation.pinn.from_pulls.DEGREES", (3, 3))
-    monkeypatch.setattr(balancing, "prepare", lambda *given: prepare(*given[:2], (3, 3)))
+    monkeypatch.setattr(balancing, "prepare", lambda n, p, _: prepare(n, p, (3, 3)))
 
 
 FAMILY = OrthotropicSpace.make(DENSITY)

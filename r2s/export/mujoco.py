@@ -7,9 +7,8 @@ no Poisson's ratio, and are too stiff across diagonals. Both stiffnesses togethe
 (`r2s.laws.solid.plate_solid`): h is not the fabric's thickness, which is the `radius` of its
 contacts. `damping` is a Kelvin-Voigt time [s], as in r2s.
 
-`flexcomp` is the short form: isotropic, all vertices of one mass. `mjcf` is a whole model with a
-body for each vertex: masses of their areas, held vertices tied to mocap bodies, and springs along
-the yarns (spatial tendons) that make it orthotropic.
+The model has a body for each vertex: masses of their areas, held vertices tied to mocap bodies, and
+springs along the yarns (spatial tendons) that make it orthotropic.
 """
 
 from typing import Any, NamedTuple
@@ -17,15 +16,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from r2s.export import stiffness
-from r2s.export.stiffness import Loss, Stiffness
-from r2s.export.yarns import split, springs, together
+from r2s.export.stiffness import Loss
+from r2s.export.yarns import Springs, sheet_of
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh
 from r2s.laws.solid import plate_solid
 from r2s.units import GRAVITY
 
 POISSON = (0.0, 0.499)
-MASSES = "all vertices get the same mass"
 RIGID = "mass damping: `r2s.export.mujoco.brake` sets it in the finished model"
 AXES = ("1 0 0", "0 1 0", "0 0 1")
 LARGE = "at large strains the springs along the yarns are linear in length, not in Green strain"
@@ -53,30 +51,6 @@ def elasticity(fabric: Fabric, mesh: Mesh, modulus: float, poisson: float) -> El
     return Elasticity(float(young), poisson, float(thickness), damping, "both")
 
 
-def flexcomp(
-    fabric: Fabric, mesh: Mesh, *, name: str = "cloth", held: tuple[int, ...] = ()
-) -> tuple[str, Loss]:
-    """The `<flexcomp>` of a sheet, flat at z = 0 in its parent body, and what is lost.
-
-    It is the nearest isotropic sheet, on r2s's mesh; `held` vertices belong to the parent. Raises
-    `ValueError` for a batch, and for a membrane without positive stiffness.
-    """
-    stiffness.one(fabric)
-    own = stiffness.membrane_stiffness(fabric)
-    sheet = stiffness.nearest_isotropic(own, POISSON)
-    mass = float(fabric.density) * float(np.sum(np.asarray(mesh.area, np.float64)))
-    pin = f'\n  <pin id="{_numbers(np.array(held))}"/>' if held else ""
-    text = f"""<flexcomp name="{name}" type="direct" dim="2" dof="full" mass="{mass!r}"
-    radius="{float(fabric.thickness)!r}"
-    point="{_numbers(_flat(mesh))}"
-    element="{_numbers(np.asarray(mesh.faces))}">
-  {_contact(fabric)}
-  {_elasticity(elasticity(fabric, mesh, *sheet))}{pin}
-</flexcomp>"""
-    lost = (MASSES, RIGID) if float(fabric.mass_damping) else (MASSES,)
-    return text, _loss(fabric, mesh, own, stiffness.isotropic(*sheet), lost)
-
-
 def mjcf(
     fabric: Fabric,
     mesh: Mesh,
@@ -96,44 +70,35 @@ def mjcf(
       isotropic sheet.
     - `timestep` [s]; `integrator`: of MuJoCo.
 
-    Vertex i is the body "v<i>" and number i of the flex "cloth". Raises as `flexcomp`, and
-    `ValueError` for a mesh that has no yarns.
+    Vertex i is the body "v<i>" and number i of the flex "cloth". Raises `ValueError` for a batch,
+    for a membrane without positive stiffness, and with yarns for a mesh that has none.
     """
-    stiffness.one(fabric)
-    own = stiffness.membrane_stiffness(fabric)
-    tendons, lost = "", ()
-    if yarns:
-        parts = split(own, POISSON, negative=False)
-        near, sheet, lost = together(parts), parts[:2], (LARGE,)
-        tendons = _tendons(mesh, parts.warp, parts.weft, float(fabric.damping))
-    else:
-        sheet = stiffness.nearest_isotropic(own, POISSON)
-        near = stiffness.isotropic(*sheet)
+    sheet = sheet_of(fabric, mesh, yarns, POISSON, negative=False)
+    solid = elasticity(fabric, mesh, sheet.modulus, sheet.poisson)
+    tendons = _tendons(sheet.springs, float(fabric.damping)) if sheet.springs else ""
+    lost = (LARGE,) if yarns else ()
     lost += (RIGID,) if float(fabric.mass_damping) else ()
-    friction = f"{float(fabric.friction)!r} 0.005 0.0001"
-    plane = (
-        f'<geom type="plane" size="0 0 1" pos="0 0 {table!r}" friction="{friction}"/>'
-        if table is not None
-        else ""
-    )
+    friction = f'friction="{float(fabric.friction)!r} 0.005 0.0001"'
+    plane = f'<geom type="plane" size="0 0 1" pos="0 0 {table!r}" {friction}/>'
     names = " ".join(f"v{i}" for i in range(len(mesh.rest)))
+    attributes = " ".join(f'{name}="{value}"' for name, value in solid._asdict().items())
     text = f"""<mujoco>
   <option timestep="{timestep!r}" gravity="0 0 {-GRAVITY}" integrator="{integrator}"/>
   <size memory="1G"/>
   <worldbody>
-    {plane}
+    {plane if table is not None else ""}
 {_bodies(fabric, mesh, held, height)}
   </worldbody>
   <deformable>
     <flex name="cloth" dim="2" radius="{float(fabric.thickness)!r}" body="{names}"
         element="{_numbers(np.asarray(mesh.faces))}">
-      {_contact(fabric)}
-      {_elasticity(elasticity(fabric, mesh, *sheet))}
+      <contact selfcollide="none" {friction}/>
+      <elasticity {attributes}/>
     </flex>
   </deformable>
 {tendons}{_grips(held, timestep)}</mujoco>
 """
-    return text, _loss(fabric, mesh, own, near, lost)
+    return text, stiffness.loss_of(fabric, sheet.stiffness, mesh, lost)
 
 
 def brake(model: Any, fabric: Fabric) -> None:
@@ -168,35 +133,14 @@ def _grips(held: tuple[int, ...], timestep: float) -> str:
     return "  <equality>\n" + "\n".join(lines) + "\n  </equality>\n" if held else ""
 
 
-def _tendons(mesh: Mesh, warp: float, weft: float, damping: float) -> str:
-    found = springs(mesh, warp, weft)
+def _tendons(springs: Springs, damping: float) -> str:
     lines = [
         f'    <spatial stiffness="{k!r}" damping="{damping * k!r}" springlength="{length!r}">'
         f'<site site="v{a}"/><site site="v{b}"/></spatial>'
-        for (a, b), k, length in zip(*(part.tolist() for part in found), strict=True)
+        for (a, b), k, length in zip(*(part.tolist() for part in springs), strict=True)
         if k > 0
     ]
     return "  <tendon>\n" + "\n".join(lines) + "\n  </tendon>\n" if lines else ""
-
-
-def _loss(fabric: Fabric, mesh: Mesh, own: Stiffness, near: Stiffness, lost) -> Loss:
-    bending = stiffness.hinge_stiffness(fabric, mesh)
-    hinges = stiffness.hinged(mesh, bending) if bending else {}
-    return Loss(
-        stiffness.errors(stiffness.probes(near), stiffness.probes(own)),
-        stiffness.errors(hinges, stiffness.bending_stiffness(fabric)) if bending else {},
-        (*stiffness.softening(fabric), *lost),
-    )
-
-
-def _contact(fabric: Fabric) -> str:
-    friction = f"{float(fabric.friction)!r} 0.005 0.0001"
-    return f'<contact selfcollide="none" friction="{friction}"/>'
-
-
-def _elasticity(values: Elasticity) -> str:
-    fields = " ".join(f'{name}="{value}"' for name, value in values._asdict().items())
-    return f"<elasticity {fields}/>"
 
 
 def _flat(mesh: Mesh) -> np.ndarray:

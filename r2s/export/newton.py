@@ -8,8 +8,8 @@ is L - mu = C12.
 A hinge of r2s has the moment B l / A per angle and length l of its edge, A the area of its two
 triangles. VBD multiplies `edge_ke` by l: it is B l / A [N] there, another number for every edge.
 `SolverSemiImplicit` multiplies by twice a triangle's area, too, which is A where both are alike:
-B l / A^2 [N/m^2]. So the argument, which is one for all edges, is the mean; `set_edges` puts the
-right ones into the finished model. Hinges are too stiff across diagonals.
+B l / A^2 [N/m^2]. The argument is one for all edges: the mean. Hinges are too stiff across
+diagonals.
 
 Damping is Kelvin-Voigt. In VBD, of shear alone: `tri_kd`, on the rate of F^T F, is half of mu times
 the damping time. In `SolverSemiImplicit` it acts on the rate of F, also in a rigid rotation, as a
@@ -24,13 +24,13 @@ import numpy as np
 
 from r2s.export import stiffness
 from r2s.export.stiffness import Loss
-from r2s.export.yarns import Springs, split, springs, together
+from r2s.export.yarns import Springs, sheet_of
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh
 
 Kind = Literal["semi_implicit", "vbd"]
 LARGE = "at large strains the law is neo-Hookean, not of Green strain"
-EDGES = "one bending stiffness for all edges; `r2s.export.newton.set_edges` sets each"
+EDGES = "one bending stiffness for all edges: the mean of what each should have"
 DAMPING = {
     "vbd": "damping of the sheet acts on shear and bending, not on stretching",
     "semi_implicit": "damping of the sheet acts on bending alone: that of stretching and shear "
@@ -59,28 +59,16 @@ def cloth(
     - `yarns`: springs along warp and weft, for a mesh such as `r2s.rectangle`; without, the nearest
       isotropic sheet.
 
-    Raises `ValueError` for a batch, for a membrane without
-    positive stiffness, and for a mesh that has no yarns.
+    Raises `ValueError` for a batch, for a membrane without positive stiffness, and with yarns for a
+    mesh that has none.
     """
-    stiffness.one(fabric)
-    own = stiffness.membrane_stiffness(fabric)
-    lost = (*stiffness.softening(fabric), LARGE, EDGES, DAMPING[kind])
-    if yarns:
-        parts = split(own)
-        along = springs(mesh, parts.warp, parts.weft)
-        sheet, near = stiffness.isotropic(*parts[:2]), together(parts)
-    else:
-        along = None
-        sheet = near = stiffness.isotropic(*stiffness.nearest_isotropic(own))
+    sheet = sheet_of(fabric, mesh, yarns)
+    lost = (LARGE, EDGES, DAMPING[kind])
     lost += (RIGID,) if float(fabric.mass_damping) else ()
-    hinges = stiffness.hinged(mesh, stiffness.hinge_stiffness(fabric, mesh))
-    loss = Loss(
-        stiffness.errors(stiffness.probes(near), stiffness.probes(own)),
-        stiffness.errors(hinges, stiffness.bending_stiffness(fabric)),
-        lost,
-    )
+    near = stiffness.isotropic(sheet.modulus, sheet.poisson)
     contact = {"soft_contact_mu": float(fabric.friction)}
-    return Cloth(_arguments(fabric, mesh, kind, sheet), along, contact), loss
+    made = Cloth(_arguments(fabric, mesh, kind, near), sheet.springs, contact)
+    return made, stiffness.loss_of(fabric, sheet.stiffness, mesh, lost)
 
 
 def _arguments(fabric: Fabric, mesh: Mesh, kind: Kind, sheet: np.ndarray) -> dict[str, float]:
@@ -123,25 +111,3 @@ def edge_factors(
     if kind == "vbd":
         return moment, damping * moment
     return moment / area, damping * moment / area**2
-
-
-def set_edges(model: Any, fabric: Fabric, mesh: Mesh, kind: Kind) -> None:
-    """Give every edge of a finished model, of this cloth alone, its own bending stiffness.
-
-    For `fabric`, `mesh` and `kind` see `cloth`.
-    """
-    indices = model.edge_indices.numpy()  # opposite, opposite, start, end
-    places = model.particle_q.numpy().astype(np.float64)
-    inner = (indices[:, :2] >= 0).all(axis=1)
-    first, second, start, end = (places[indices[:, i]] for i in range(4))
-    area = _area(first, start, end) + _area(second, start, end)
-    length = model.edge_rest_length.numpy().astype(np.float64)
-    bending, damping = stiffness.hinge_stiffness(fabric, mesh), float(fabric.damping)
-    properties = model.edge_bending_properties.numpy().copy()
-    factors = edge_factors(length[inner], area[inner], kind, bending, damping)
-    properties[inner] = np.stack(factors, axis=1)
-    model.edge_bending_properties.assign(properties)
-
-
-def _area(corner: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(np.cross(start - corner, end - corner), axis=1) / 2

@@ -12,6 +12,7 @@ import numpy as np
 
 from r2s.export import stiffness
 from r2s.export.stiffness import Loss, Stiffness
+from r2s.export.yarns import edges_of
 from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh
 
@@ -32,7 +33,7 @@ def soft_body(fabric: Fabric, mesh: Mesh) -> tuple[dict[str, float | int], Loss]
         raise ValueError(f"the membrane has no positive stiffness in every probe: {own}")
     unit = stiffness.probes(spring_stiffness(mesh))
     spring = float(np.exp(np.mean([np.log(own[name] / unit[name]) for name in own])))
-    lost = (*stiffness.softening(fabric), CAUCHY, NO_BENDING, MASSES)
+    lost = (CAUCHY, NO_BENDING, MASSES)
     lost += (RIGID,) if float(fabric.mass_damping) else ()
     arguments = {
         "mass": float(fabric.density) * float(np.sum(np.asarray(mesh.area, np.float64))),
@@ -45,14 +46,12 @@ def soft_body(fabric: Fabric, mesh: Mesh) -> tuple[dict[str, float | int], Loss]
         "frictionCoeff": float(fabric.friction),
         "collisionMargin": float(fabric.thickness),
     }
-    exported = {name: spring * value for name, value in unit.items()}
-    return arguments, Loss(stiffness.errors(exported, own), {}, lost)
+    return arguments, stiffness.loss_of(fabric, spring * spring_stiffness(mesh), None, lost)
 
 
 def spring_stiffness(mesh: Mesh) -> Stiffness:
     """The membrane stiffness [-] of a mesh whose edges are springs of 1 N/m."""
-    rest, faces = np.asarray(mesh.rest, np.float64), np.asarray(mesh.faces)
-    pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    rest, pairs = np.asarray(mesh.rest, np.float64), edges_of(mesh).reshape(-1, 2)
     edges = np.unique(pairs, axis=0)
     along = rest[edges[:, 1]] - rest[edges[:, 0]]
     squared = np.sum(along**2, axis=1)

@@ -163,13 +163,29 @@ def one(fabric: Fabric) -> None:
         raise ValueError(f"one fabric is exported at a time, got a batch of shape {shape}")
 
 
+def loss_of(fabric: Fabric, near: Stiffness, mesh: Mesh | None, lost: tuple[str, ...]) -> Loss:
+    """What is lost of a fabric where its membrane becomes one of constant stiffness.
+
+    - `near`: that stiffness, [N/m].
+    - `mesh`: on which it bends by hinges of `hinge_stiffness`; None: it does not bend.
+    - `lost`: what else is.
+    """
+    bending = hinge_stiffness(fabric, mesh) if mesh is not None else 0.0
+    errors_of_bending = {}
+    if mesh is not None and bending:
+        errors_of_bending = errors(hinged(mesh, bending), bending_stiffness(fabric))
+    membrane = errors(probes(near), probes(membrane_stiffness(fabric)))
+    return Loss(membrane, errors_of_bending, (*softening(fabric), *lost))
+
+
 def softening(fabric: Fabric) -> tuple[str, ...]:
     """What a law of constant stiffness loses of the fabric's laws."""
-    names = [type(law).__name__ for law in (fabric.membrane, fabric.bending)]
-    parts = ("the strain", "the curvature")
-    follow = [f"{n}: stiffness follows {part}" for n, part in zip(names, parts, strict=True)]
+    laws = ((fabric.membrane, "strain"), (fabric.bending, "curvature"))
     return tuple(
-        f"{text}; that of the flat sheet at rest is exported"
-        for text, name in zip(follow, names, strict=True)
-        if any(word in name for word in ("Table", "Spring", "Stiffening", "Softening"))
+        f"{type(law).__name__}: stiffness follows the {what}; that of the flat sheet at rest is "
+        "exported"
+        for law, what in laws
+        if any(
+            word in type(law).__name__ for word in ("Table", "Spring", "Stiffening", "Softening")
+        )
     )

@@ -12,7 +12,16 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import least_squares
 
-from r2s.export.stiffness import BOUNDS, Stiffness, isotropic, nearest_isotropic, probes
+from r2s.export.stiffness import (
+    BOUNDS,
+    Stiffness,
+    isotropic,
+    membrane_stiffness,
+    nearest_isotropic,
+    one,
+    probes,
+)
+from r2s.fabrics.fabric import Fabric
 from r2s.geometry.mesh import Mesh
 
 PARALLEL = 1e-6  # [rad]
@@ -30,12 +39,46 @@ class Split(NamedTuple):
     weft: float
 
 
+class Sheet(NamedTuple):
+    """- `modulus`, `poisson`: E h [N/m] and Poisson's ratio [-] of an isotropic sheet.
+    - `springs`: beside it; None: there are none.
+    - `stiffness`: of both together at small strains, [N/m].
+    """
+
+    modulus: float
+    poisson: float
+    springs: "Springs | None"
+    stiffness: Stiffness
+
+
 class Springs(NamedTuple):
     """- `ends`: the two vertices of each. - `constants`: [N/m]. - `lengths`: at rest, [m]."""
 
     ends: Int[np.ndarray, "spring 2"]
     constants: Float[np.ndarray, " spring"]
     lengths: Float[np.ndarray, " spring"]
+
+
+def sheet_of(
+    fabric: Fabric,
+    mesh: Mesh,
+    yarns: bool,
+    poisson: tuple[float, float] = BOUNDS,
+    negative: bool = True,
+) -> Sheet:
+    """A fabric as an isotropic sheet, with springs along its `yarns` or the nearest one without.
+
+    See `split` for the other arguments. Raises `ValueError` for a batch, for a membrane without
+    positive stiffness, and with yarns for a mesh that has none.
+    """
+    one(fabric)
+    own = membrane_stiffness(fabric)
+    if not yarns:
+        nearest = nearest_isotropic(own, poisson)
+        return Sheet(*nearest, None, isotropic(*nearest))
+    parts = split(own, poisson, negative)
+    along = springs(mesh, parts.warp, parts.weft)
+    return Sheet(parts.modulus, parts.poisson, along, together(parts))
 
 
 def split(
@@ -91,8 +134,7 @@ def springs(mesh: Mesh, warp: float, weft: float) -> Springs:
     for a strip as wide as its triangles, so that those of the border are half as stiff. Raises
     `ValueError` for another mesh.
     """
-    rest, faces = np.asarray(mesh.rest, np.float64), np.asarray(mesh.faces)
-    pairs = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    rest, pairs = np.asarray(mesh.rest, np.float64), edges_of(mesh).reshape(-1, 2)
     along = np.abs(rest[pairs[:, 1]] - rest[pairs[:, 0]])
     of_warp = along[:, 1] < PARALLEL * along[:, 0]
     of_weft = along[:, 0] < PARALLEL * along[:, 1]
@@ -108,3 +150,8 @@ def springs(mesh: Mesh, warp: float, weft: float) -> Springs:
     lengths = np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
     is_warp = np.abs(rest[edges[:, 1]] - rest[edges[:, 0]])[:, 0] > lengths / 2
     return Springs(edges, np.where(is_warp, warp, weft) * area / lengths**2, lengths)
+
+
+def edges_of(mesh: Mesh) -> Int[np.ndarray, "face 3 2"]:
+    """The vertices of every face's edges, the lower number first."""
+    return np.sort(np.asarray(mesh.faces)[:, [[0, 1], [1, 2], [2, 0]]], axis=2)

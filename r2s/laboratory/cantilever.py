@@ -22,7 +22,6 @@ from r2s.units import GRAVITY
 
 SLOPE = np.radians(41.5)  # of the standard's plane [rad]
 DEVIATION = 0.03  # relative, of an overhang
-STEEPEST = np.radians(80.0)
 
 
 class Cantilever(eqx.Module):
@@ -31,30 +30,24 @@ class Cantilever(eqx.Module):
     - `overhang`: mean over strips, sides and ends, [m].
     - `deviation`: standard error of the logarithm of that mean, [-].
     - `direction`: of the strip, from the warp, [rad]: 0, pi/2, or pi/4 for the bias.
-    - `slope`: of the line from the edge to the tip, below the horizontal, [rad].
     - `name`: for messages.
     """
 
     overhang: Float[Array, ""]
     deviation: Float[Array, ""]
     direction: float = eqx.field(static=True, default=0.0)
-    slope: float = eqx.field(static=True, default=float(SLOPE))
     name: str = eqx.field(static=True, default="cantilever")
 
     @classmethod
     def make(
-        cls,
-        overhangs: Sequence[float],
-        direction: float = 0.0,
-        slope: float = float(SLOPE),
-        name: str = "cantilever",
+        cls, overhangs: Sequence[float], direction: float = 0.0, name: str = "cantilever"
     ) -> "Cantilever":
         """From the readings [m] of one direction; see the fields.
 
         Their mean errs by `DEVIATION`, or by what the readings say where that is more.
 
         Raises `ValueError` that names the test: no reading, one that is none in metres, readings
-        that differ by more than a factor of two, a slope that is none.
+        that differ by more than a factor of two.
         """
         read = np.asarray(overhangs, float)
         if read.ndim != 1 or not read.size or not np.isfinite(read).all() or not (read > 0).all():
@@ -69,12 +62,10 @@ class Cantilever(eqx.Module):
                 f"{name}: the readings differ by more than twice, {read.tolist()} m: are they of "
                 "one direction?"
             )
-        if not 0 < slope <= STEEPEST:
-            raise ValueError(f"{name}: the slope must be from 0 to 80 degrees [rad], got {slope}")
         scatter = np.std(np.log(read), ddof=1) / np.sqrt(len(read)) if len(read) > 1 else 0.0
         spread = max(float(scatter), DEVIATION)
         mean = float(np.exp(np.mean(np.log(read))))
-        return cls(jnp.asarray(mean, float), jnp.asarray(spread, float), direction, slope, name)
+        return cls(jnp.asarray(mean, float), jnp.asarray(spread, float), direction, name)
 
     @property
     def count(self) -> int:
@@ -83,7 +74,7 @@ class Cantilever(eqx.Module):
 
     def residuals(self, fabric: Fabric) -> Float[Array, " 1"]:
         """How far a fabric's overhang is from the measured one, in standard deviations."""
-        expected = overhang(fabric, self.direction, self.slope)
+        expected = overhang(fabric, self.direction)
         return jnp.log(expected / self.overhang)[None] / self.deviation
 
 

@@ -157,7 +157,7 @@ def _fit(test: Test, fabric: Fabric) -> Fit:
         share = float(test.misfit(fabric))
         words = f"up to {force:.3g} N/m at {most:.1%}: off by {share:.1%} of that (rms)"
     elif isinstance(test, Cantilever):
-        seen, told = float(test.overhang), float(overhang(fabric, test.direction, test.slope))
+        seen, told = float(test.overhang), float(overhang(fabric, test.direction))
         words = f"overhang {1e3 * seen:.1f} mm measured, {1e3 * told:.1f} mm expected"
     else:
         seen = float(test.coefficient)

@@ -121,7 +121,7 @@ class _Drape:
 def _entry(kind: type, where: str, entry: Any) -> Any:
     """The dataclass `kind` from an entry of a file, its direction as an angle [rad]."""
     if isinstance(entry, dict) and "direction" in entry:
-        direction = DIRECTIONS.get(str(entry["direction"]), entry["direction"])
+        direction: Any = DIRECTIONS.get(str(entry["direction"]), entry["direction"])
         is_number = isinstance(direction, int | float) and not isinstance(direction, bool)
         if not is_number or not 0 <= direction <= math.pi:
             raise ValueError(

@@ -185,7 +185,7 @@ def _measured(
     return {
         "force": force + FORCE_NOISE * np.asarray(jr.normal(key_force, force.shape, float)),
         "force_times": experiment.times,
-        "markers": _markers(balance.x, scenario, key_markers),
+        "markers": markers_of(balance.x, scenario, key_markers),
     }
 
 
@@ -208,8 +208,9 @@ _rollout = compile_once(rollout)
 _energy_balance = compile_once(energy_balance)
 
 
-def _markers(x, scenario: Scenario, key) -> np.ndarray:
-    """Places [m] of a printed grid of markers in each frame, each in the middle of its cell."""
+def markers_of(x, scenario: Scenario, key, noise: float = MARKER_NOISE) -> np.ndarray:
+    """Places [m] of a printed grid of markers in each frame, each in the middle of its cell, with
+    `noise` [m]."""
     mesh = scenario.scene.mesh
     along = (np.arange(MARKERS) + 0.5) / MARKERS
     places = np.stack(np.meshgrid(along, along, indexing="ij"), -1).reshape(-1, 2)
@@ -217,7 +218,7 @@ def _markers(x, scenario: Scenario, key) -> np.ndarray:
     in_plane = (0, 0), (0, 1)  # z = 0
     faces, weights = nearest(jnp.pad(places, in_plane), jnp.pad(mesh.rest, in_plane), mesh.faces)
     markers = jnp.einsum("mk,tmki->tmi", weights, x[:, mesh.faces[faces]])
-    return np.asarray(markers + MARKER_NOISE * jr.normal(key, markers.shape, float))
+    return np.asarray(markers + noise * jr.normal(key, markers.shape, float))
 
 
 def _clouds(x, scenario: Scenario, seen: Sensing, key) -> list[np.ndarray]:

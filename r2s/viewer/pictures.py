@@ -61,11 +61,10 @@ def show(
     folder.mkdir(parents=True, exist_ok=True)
     stem = recording.info.name.replace("/", "_")
     written = [contact_sheet(folder / f"{stem}.png", recording, cloth)]
-    if video == "auto":
-        video = "mp4" if video_writer.has_opencv() else "gif"
     if video != "none":
-        write = write_mp4 if video == "mp4" else write_gif
-        written.append(write(folder / f"{stem}.{video}", recording, cloth))
+        times, frames = np.asarray(recording.times, float), pictures(recording, cloth)
+        interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+        written.append(video_writer.write_video(folder, stem, frames, interval, video))
     return written
 
 
@@ -97,16 +96,6 @@ def contact_sheet(path: Path, recording: Recording, cloth: SimulatedCloth | None
     return path
 
 
-def write_gif(path: Path, recording: Recording, cloth: SimulatedCloth | None = None) -> Path:
-    """Write all frames as a GIF, in real time up to 50 frames a second."""
-    return video_writer.write_gif(path, _pictures(recording, cloth), _interval(recording))
-
-
-def write_mp4(path: Path, recording: Recording, cloth: SimulatedCloth | None = None) -> Path:
-    """Write all frames as an MP4, in real time. Needs OpenCV: pip install 'r2s[camera]'."""
-    return video_writer.write_mp4(path, _pictures(recording, cloth), _interval(recording))
-
-
 class _Content(NamedTuple):
     """What the panels show.
 
@@ -128,11 +117,11 @@ class _Content(NamedTuple):
         return cls(recording, cloth, clouds, *_limits(recording, cloth, np.concatenate(clouds)))
 
     def visible(self, points: np.ndarray) -> np.ndarray:
-        """Which points [m] are in the box; False where one is not finite."""
+        """Which points [m] are in the box."""
         return _inside(points, self.low, self.high)
 
 
-def _pictures(recording: Recording, cloth: SimulatedCloth | None) -> Iterator[np.ndarray]:
+def pictures(recording: Recording, cloth: SimulatedCloth | None = None) -> Iterator[np.ndarray]:
     """Each frame as a picture, (height, width, 3) in 0..255, of even sides."""
     content = _Content.make(recording, cloth)
     strip = 0.0 if recording.force is None else STRIP - 0.1  # [inch]: sides of even pixels
@@ -238,16 +227,16 @@ def _grippers(recording: Recording, frame: int) -> list[np.ndarray]:
     """The path [m] of each gripper up to a frame, which ends where it is then."""
     times, path = np.asarray(recording.handle_times), np.asarray(recording.handle_path)
     now = float(recording.times[frame])
-    before = path[times < now]
-    here = np.stack(
-        [[np.interp(now, times, axis) for axis in handle.T] for handle in path.transpose(1, 0, 2)]
-    )
-    return [np.concatenate([before[:, i], here[i : i + 1]]) for i in range(path.shape[1])]
+    knots = np.append(times[times < now], now)
+    return [
+        np.stack([np.interp(knots, times, axis) for axis in handle.T], axis=1)
+        for handle in path.transpose(1, 0, 2)
+    ]
 
 
 def _inside(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    within = (points >= low) & (points <= high)  # False where a point is not finite
-    return np.asarray(within.all(axis=1))
+    """Which points are in a box; False where one is not finite."""
+    return np.asarray(((points >= low) & (points <= high)).all(axis=1))
 
 
 def _limits(
@@ -282,12 +271,6 @@ def _outline(sheet: SheetPlacement) -> np.ndarray:
     """The corners [m] of the sheet at rest, around and back to the first."""
     names = ("origin", "warp", "opposite", "weft", "origin")
     return np.stack([corner(sheet, name) for name in names])
-
-
-def _interval(recording: Recording) -> float:
-    """Between two frames, [s]."""
-    times = np.asarray(recording.times, float)
-    return float(np.median(np.diff(times))) if len(times) > 1 else 1.0
 
 
 def _title(recording: Recording) -> str:

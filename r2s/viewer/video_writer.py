@@ -1,9 +1,11 @@
 """Pictures, one after the other, as a video file: an MP4 where OpenCV is installed, else a GIF."""
 
+import importlib.util
 import io
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import UInt8
@@ -11,15 +13,20 @@ from jaxtyping import UInt8
 from r2s.extras import require
 from r2s.files import write_bytes
 
+Ending = Literal["auto", "gif", "mp4"]
 Pictures = Iterable[UInt8[np.ndarray, "height width 3"]]
 
 
-def write_video(folder: Path, stem: str, pictures: Pictures, interval: float) -> Path:
-    """Write `stem`.mp4, or `stem`.gif without OpenCV, into a folder; its path.
+def write_video(
+    folder: Path, stem: str, pictures: Pictures, interval: float, ending: Ending = "auto"
+) -> Path:
+    """Write `stem`.mp4 or `stem`.gif into a folder; its path. "auto" is MP4 with OpenCV, else GIF.
 
     `interval`: between two pictures, [s].
     """
-    write, ending = (write_mp4, "mp4") if has_opencv() else (write_gif, "gif")
+    if ending == "auto":
+        ending = "gif" if importlib.util.find_spec("cv2") is None else "mp4"
+    write = write_mp4 if ending == "mp4" else write_gif
     return write(folder / f"{stem}.{ending}", pictures, interval)
 
 
@@ -61,12 +68,3 @@ def write_mp4(path: Path, pictures: Pictures, interval: float) -> Path:
             writer.release()
         write_bytes(path, part.read_bytes())
     return path
-
-
-def has_opencv() -> bool:
-    """Whether OpenCV is installed."""
-    try:
-        require("cv2", "camera", "videos as MP4")
-    except ImportError:
-        return False
-    return True

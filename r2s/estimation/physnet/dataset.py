@@ -148,7 +148,9 @@ def make(
             raise ValueError(f"{folder} has data of {known.view}, asked for {view}")
         view = known.view
     missing = [n for n in range(settings.num_shards) if not _shard(folder, n).exists()]
-    shared = _shared(settings) if missing else None
+    if not missing:
+        return load_manifest(folder)
+    shared = _shared(settings)
     for number in tqdm(missing, "shards", disable=None if progress else True):
         experiments, places, x, ok = _simulate(settings, number, shared)
         if view is None:

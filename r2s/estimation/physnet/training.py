@@ -5,8 +5,6 @@ The loss is that of Schroff, Kalenichenko and Philbin 2015: squared distances wi
 Training and validation have different fabrics.
 """
 
-import io
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,14 +18,14 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
+from r2s.estimation import checkpoint
 from r2s.estimation.physnet.dataset import DEPTH_UNIT, Data
 from r2s.estimation.physnet.network import DEEPER, Architecture, PhysNet
 from r2s.estimation.physnet.preprocess import Flaws, flawed, grey
 from r2s.estimation.physnet.triplets import Split, draw, split, triplet_loss, triplets
 from r2s.estimation.physnet.views import View
-from r2s.files import write_bytes
 
-FORMAT = "r2s-physnet/2"
+FORMAT = "r2s-physnet/3"
 CHUNK = 256  # images that are embedded at once
 
 
@@ -184,19 +182,16 @@ def _step(network: PhysNet, optimiser, depth, schedule: Schedule, view: View, ke
 
 
 def save(training: Training, path: Path | str) -> None:
-    """Write a training: one line of JSON with its settings, then the arrays."""
+    """Write a training to a checkpoint, with its settings."""
     header = {
         "format": FORMAT,
         "architecture": asdict(training.network.architecture),
-        "schedule": asdict(training.schedule),
+        "schedule": asdict(training.schedule) | {"flaws": training.schedule.flaws._asdict()},
         "view": asdict(training.view),
         "curve": training.curve,
         "data": training.data,
     }
-    buffer = io.BytesIO()
-    buffer.write(json.dumps(header).encode() + b"\n")
-    eqx.tree_serialise_leaves(buffer, (training.network, training.optimiser))
-    write_bytes(path, buffer.getvalue())
+    checkpoint.save(path, checkpoint.arrays_of(_state(training)), header)
 
 
 def load(path: Path | str) -> Training:
@@ -205,28 +200,21 @@ def load(path: Path | str) -> Training:
     Raises `FileNotFoundError`, or `ValueError` that names the file when it is damaged or of another
     format.
     """
-    with open(path, "rb") as file:
-        try:
-            header = json.loads(file.readline())
-            found = header["format"]
-        except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path}: no training of PhysNet: {error}") from error
-        if found != FORMAT:
-            raise ValueError(f"{path}: expected format {FORMAT}, found {found}")
-        header["schedule"].pop("hard", None)  # of version 0.3.0
-        flaws = Flaws(*header["schedule"].pop("flaws"))
-        schedule = Schedule(**header["schedule"], flaws=flaws)
-        architecture = Architecture(**_tuples(header["architecture"]))
-        empty = begin(View(**_tuples(header["view"])), architecture, schedule)
-        try:
-            network, optimiser = eqx.tree_deserialise_leaves(file, (empty.network, empty.optimiser))
-        except Exception as error:  # a damaged file raises anything
-            raise ValueError(f"{path}: damaged: {error}") from error
+    arrays, header = checkpoint.read(path)
+    if header.get("format") != FORMAT:
+        raise ValueError(f"{path}: expected format {FORMAT}, found {header.get('format')}")
+    schedule = header["schedule"] | {"flaws": Flaws(**header["schedule"]["flaws"])}
+    architecture, view = (
+        {name: tuple(v) if isinstance(v, list) else v for name, v in header[part].items()}
+        for part in ("architecture", "view")
+    )
+    empty = begin(View(**view), Architecture(**architecture), Schedule(**schedule))
+    network, optimiser = checkpoint.tree_from(arrays, _state(empty))
+    network = eqx.combine(network, empty.network)
     curve = tuple(Row(*row) for row in header["curve"])
-    data = header.get("data", "")
-    return empty._replace(network=network, optimiser=optimiser, curve=curve, data=data)
+    return empty._replace(network=network, optimiser=optimiser, curve=curve, data=header["data"])
 
 
-def _tuples(values: dict[str, Any]) -> dict[str, Any]:
-    """The values with tuples in place of JSON's lists."""
-    return {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
+def _state(training: Training) -> tuple[Any, Any]:
+    """All arrays of a training."""
+    return eqx.filter(training.network, eqx.is_array), training.optimiser

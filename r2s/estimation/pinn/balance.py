@@ -16,7 +16,6 @@ from jaxtyping import Array, Float
 
 from r2s.estimation.law_error import to_small_strain
 from r2s.estimation.least_squares import (
-    DAMPINGS,
     Damping,
     at_bound,
     damped,
@@ -34,7 +33,6 @@ LONGEST = 0.1  # Gauss-Newton step, of a range
 BOUNDS = 1e-3, 1 - 1e-3  # of places in the ranges
 FLAT_PRIOR = 12.0  # one over the variance of a uniform distribution on 0..1
 STEPS = 60  # most Gauss-Newton steps
-SLACK = 0.1  # of half a sum of squares: what the motions' tolerance may change it by
 SMALL = 0.05  # of the standard errors: the Gauss-Newton step at which it has converged
 LEAST_NOISE = (1e-7, 1e-5)  # of markers [m], and of the force over its greatest [-]
 
@@ -45,7 +43,7 @@ class Fit(NamedTuple):
     - `place`: in the space's unit cube. - `covariance`: of that place.
     - `noise`: rms differences that are left, of markers [m] and of the force over its greatest [-].
     - `places`, `losses`: of every step; the losses are mean squares of the markers' rest [m^2].
-    - `converged`: whether the last Gauss-Newton step was small.
+    - `converged`: whether the next Gauss-Newton step is small, or no place near by fits better.
     - `law`: covariance by stiffness that changes with the stretch, see `_law_error`; zero for
       spaces of yarns that stiffen.
     """
@@ -102,32 +100,37 @@ def balance(
     motions, damping = motions_at(at, starts), Damping.initial(at.dtype)
     if not any(motion.is_balanced.any() for motion in motions):
         raise RuntimeError("no pull has a motion in equilibrium")
-    places, losses, is_near, converged = [], [], False, False
+    places, losses, converged = [], [], False
 
     def equations(motions: Sequence[Motion], at: Array) -> _Equations:
         return _equations(motions, pulls, noise, np.asarray(at, np.float64) - 0.5)
 
     for _ in range(steps):
-        left = _left(motions, pulls)
-        if is_near:  # what is left of a longer step is not noise
-            noise = max(left[0], LEAST_NOISE[0]), max(left[1], LEAST_NOISE[1])
         places.append(np.asarray(at, np.float64))
-        losses.append(left[0] ** 2)
+        losses.append(_left(motions, pulls)[0] ** 2)
         here = equations(motions, at)
         gradient, matrix = (jnp.asarray(part, float) for part in here[1:])
-        step = newton_step(gradient, matrix, at_bound(at, gradient, low, high))
-        errors = np.sqrt(np.diag(np.linalg.inv(here.matrix)))
-        converged = is_near and bool(np.all(np.abs(step) < SMALL * errors))
-        if converged or damping.value >= DAMPINGS[1]:
+        step = np.abs(newton_step(gradient, matrix, at_bound(at, gradient, low, high)))
+        small = SMALL * np.sqrt(np.diag(np.linalg.inv(here.matrix)))
+        is_near = not _unbalanced(motions) and bool(np.all(step <= LONGEST))
+        converged = is_near and bool(np.all(step < small))
+        if converged:
             break
         trial = proposed(at, gradient, matrix, damping, low, high, LONGEST)
         there = motions_at(trial, [motion.coefficients for motion in motions])
         loss = equations(there, trial).loss
-        is_better = (_unbalanced(there), loss) < (_unbalanced(motions), here.loss + SLACK)
+        is_better = (_unbalanced(there), loss) < (_unbalanced(motions), here.loss)
         damping = damped(damping, jnp.asarray(is_better))
         if is_better:
-            is_near = not _unbalanced(there) and bool(jnp.max(jnp.abs(trial - at)) < 0.99 * LONGEST)
             at, motions = trial, there
+        elif np.all(
+            np.abs(trial - at) < small
+        ):  # the tolerance of the motions decides what is better
+            converged = is_near
+            break
+        if is_near:  # what is left of a longer step is not noise
+            left = _left(motions, pulls)
+            noise = max(left[0], LEAST_NOISE[0]), max(left[1], LEAST_NOISE[1])
     covariance = np.linalg.inv(equations(motions, at).matrix)
     law = np.zeros_like(covariance)
     if not stiffens(space.ranges):

@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.estimation.pinn.balance import Fit, balance
@@ -32,7 +32,6 @@ def estimate(
     space: ParameterSpace,
     recipe: Recipe = QUICK,
     *,
-    noise: tuple[float, float] = NOISE,
     progress: Callable[[int, float], None] | None = None,
     checkpoint: Path | None = None,
     key: PRNGKeyArray,
@@ -46,8 +45,6 @@ def estimate(
     "stiffness scale" says that the scale is not identifiable; ratios of stiffness may be.
 
     - `recipe`: of the training.
-    - `noise`: of the markers [m], and of the force over its greatest [-], to begin with. It is
-      estimated with the fabric.
     - `progress`: called with the number of each chunk of training and its loss [m^2].
     - `checkpoint`: a file from which a killed training goes on.
 
@@ -56,41 +53,31 @@ def estimate(
     """
     began = time.perf_counter()
     trained = train(
-        space,
-        stacked(list(pulls)),
-        recipe,
-        noise=noise,
-        report=progress,
-        checkpoint=checkpoint,
-        key=key,
+        space, stacked(list(pulls)), recipe, report=progress, checkpoint=checkpoint, key=key
     )
     networks = [
         jax.tree.map(lambda leaf, i=i: leaf[i], trained.model.networks) for i in range(len(pulls))
     ]
-    fit = balance(space, networks, pulls, trained.places[-1], noise, DEGREES)
+    fit = balance(space, networks, pulls, trained.places[-1], NOISE, DEGREES)
     fewer = DEGREES[0] - 1, DEGREES[1] - 1
     change = balance(space, networks, pulls, fit.place, fit.noise, fewer).place - fit.place
     errors = [
         STIFFNESS_ERROR if r.unit == "N/m" else MODEL_ERRORS.get(r.name, 0.0) for r in space.ranges
     ]
-    model = np.diag((np.array(errors) / _lengths(space)) ** 2)
+    model = np.diag([(error / r.width) ** 2 for error, r in zip(errors, space.ranges, strict=True)])
     fit = fit._replace(covariance=fit.covariance + np.outer(change, change) + model + fit.law)
     words = f"{len(pulls)} pull{'s' if len(pulls) > 1 else ''}"
     if pulls[0].force is None:
         words += ", no force: the scale of stiffness is not identifiable"
     words += "" if fit.converged else ", not converged"
-    return _estimate(f"pinn ({words})", fit, space, trained, noise, pulls, began)
-
-
-def _lengths(space: ParameterSpace) -> Float[np.ndarray, " dim"]:
-    """Lengths of the ranges, on the scale of each."""
-    return np.array([bound.width for bound in space.ranges])
+    return _estimate(f"pinn ({words})", fit, space, trained, pulls, began)
 
 
 def _estimate(
-    approach: str, fit: Fit, space: ParameterSpace, trained: Trained, noise, pulls, began: float
+    approach: str, fit: Fit, space: ParameterSpace, trained: Trained, pulls, began: float
 ) -> Estimate:
-    lengths, errors = _lengths(space), np.sqrt(np.diag(fit.covariance))
+    lengths = np.array([bound.width for bound in space.ranges])
+    errors = np.sqrt(np.diag(fit.covariance))
     places = np.concatenate([trained.places, fit.places, fit.place[None]])
     history = np.asarray(jax.vmap(space.values)(jnp.asarray(places, float)))
     nuisances = [Nuisance("marker noise", "m", fit.noise[0], np.nan)]
@@ -111,7 +98,7 @@ def _estimate(
         correlation=fit.covariance / np.outer(errors, errors),
         nuisances=tuple(nuisances),
         loss=float(fit.losses[-1]),
-        losses=np.concatenate([trained.losses * noise[0] ** 2, fit.losses])[:, None],
+        losses=np.concatenate([trained.losses * NOISE[0] ** 2, fit.losses])[:, None],
         history=history[:-1, None],
         seconds=time.perf_counter() - began,
         converged=fit.converged,

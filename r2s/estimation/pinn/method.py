@@ -53,7 +53,7 @@ class PINN(Method):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PublishedPINN(Method):
+class PublishedPINN(PINN):
     """The recipe of the paper, `r2s.estimation.pinn.published_recipe`, from stretchings.
 
     It starts in the middle of the space. Without force nothing fixes the scale of the stiffness.
@@ -61,10 +61,7 @@ class PublishedPINN(Method):
 
     name = "pinn-published"
     budget = Budget(iterations=10_000)
-    heeds = ("iterations",)
-    supports = {"cloth": ("stretching",), "points": ("stretching",)}
-    several = True
-    takes_shape = False
+    refusals = {}
 
     def reads(self, recording):
         return Reads(frames_that_count(recording), markers=True)

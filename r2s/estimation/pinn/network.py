@@ -133,7 +133,7 @@ class Network(eqx.Module):
         - `shrink`: divisor of the last kernel, for a motion that is small at first.
         """
         module = Perceptron(width, layers)
-        params = module.init(key, jnp.zeros((1, 3), float))["params"]
+        params: Any = module.init(key, jnp.zeros((1, 3), float))["params"]
         params[f"kernel_{layers - 1}"] /= shrink
         return cls(module, params, (low + high) / 2, (high - low) / 2, scale)
 

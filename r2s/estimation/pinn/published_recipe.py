@@ -50,8 +50,8 @@ class State(NamedTuple):
     - `before`: sum of the losses before that step.
     """
 
-    model: Model
-    ahead: Model
+    model: Any
+    ahead: Any
     adam: Any
     lbfgs: Any
     before: Float[Array, ""]
@@ -71,7 +71,7 @@ def plain(pull: Pull) -> Pull:
 
 def begin(space: ParameterSpace, pulls: Pull, *, key: PRNGKeyArray) -> State:
     """The state before the first epoch, in the middle of the space; `pulls` are stacked."""
-    model = init(space, pulls, WIDTH, LAYERS, key=key)
+    model: Any = init(space, pulls, WIDTH, LAYERS, key=key)
     none = jnp.asarray(jnp.inf, model.free.dtype)
     return State(model, model, ADAM.init(model), LBFGS.init(model), none)
 

@@ -6,15 +6,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from r2s.fabrics.fabric import Fabric
-from r2s.geometry.mesh import Mesh
-from r2s.geometry.surface import nearest
 from r2s.recordings.recording import Recording, RecordingInfo, make_recording
 from r2s.scenarios import clamp_force, energy_balance, stretching
 from r2s.scenarios.standard import STRETCHING_INTERVAL
-from r2s.scenarios.synthetic import MARKER_NOISE, MARKERS
+from r2s.scenarios.synthetic import MARKER_NOISE, markers_of
 
 FRAMES = 39  # of 1/30 s
 FORCE_NOISE = 0.01  # over the largest force
@@ -62,7 +60,6 @@ def pulled(
     if not np.isfinite(np.asarray(found.x)).all():
         raise RuntimeError(f"the simulation of {name} diverged")
     key_markers, key_force = jr.split(key)
-    markers = _markers(scenario.scene.mesh, found.x[::steps])
     force = np.asarray(clamp_force(scenario, found))[::steps]
     spread = force_noise * np.abs(force).max()
     info = RecordingInfo(
@@ -83,17 +80,7 @@ def pulled(
         experiment.route.path,
         experiment.route.times,
         info,
-        markers=markers + marker_noise * np.asarray(jr.normal(key_markers, markers.shape, float)),
+        markers=markers_of(found.x[::steps], scenario, key_markers, marker_noise),
         force=force + spread * np.asarray(jr.normal(key_force, force.shape, float)),
         force_times=experiment.times,
     )
-
-
-def _markers(mesh: Mesh, x: Float[Array, "frame vertex 3"]) -> np.ndarray:
-    """Positions [m] of 9 x 9 markers in each frame, each in the middle of its cell of the sheet."""
-    along = (np.arange(MARKERS) + 0.5) / MARKERS
-    places = np.stack(np.meshgrid(along, along, indexing="ij"), -1).reshape(-1, 2)
-    places = jnp.asarray(places * np.asarray(mesh.rest).max(axis=0), float)
-    flat_places, flat_rest = (jnp.pad(p, ((0, 0), (0, 1))) for p in (places, mesh.rest))
-    faces, weights = nearest(flat_places, flat_rest, mesh.faces)
-    return np.asarray(jnp.einsum("mk,tmki->tmi", weights, x[:, mesh.faces[faces]]))

@@ -117,15 +117,14 @@ def init(
 
 
 def losses_of(
-    network: DisplacementField, pull: Pull, fabric: Fabric, frames: Int[Array, " frame"], noise
+    network: DisplacementField, pull: Pull, fabric: Fabric, frames: Int[Array, " frame"]
 ) -> Losses:
     """The losses of one pull, with the weak form in some frames.
 
-    `noise`: of the markers [m], and of the force over its greatest [-]. The work counts beside that
-    of the measured force over the width; without a force, of the stress of the `fabric` as it is
-    now, held constant, so that a soft one is not preferred.
+    The work counts beside that of the measured force over the width; without a force, of the stress
+    of the `fabric` as it is now, held constant, so that a soft one is not preferred.
     """
-    marker, force_noise = noise
+    marker, force_noise = NOISE
     residual = marker_residual(network, pull) / marker
     data = jnp.mean(residual**2) / jnp.mean(pull.seen, dtype=residual.dtype)
     clamps = jnp.mean((clamp_residual(network, pull) / (CLAMP * marker)) ** 2)
@@ -144,11 +143,11 @@ def losses_of(
 
 
 def total(
-    model: Model, space: ParameterSpace, pulls: Pull, frames, noise: Array, weight: Array
+    model: Model, space: ParameterSpace, pulls: Pull, frames, weight: Array
 ) -> tuple[Array, Losses]:
     """The sum of all losses, those of physics times `weight` [-], and the losses themselves."""
     fabric = space(model.place)
-    of_pulls = jax.vmap(lambda *given: losses_of(*given[:2], fabric, given[2], noise))
+    of_pulls = jax.vmap(lambda network, pull, at: losses_of(network, pull, fabric, at))
     losses = jax.tree.map(jnp.mean, of_pulls(model.networks, pulls, frames))
     return losses.data + losses.clamps + weight * (losses.work + losses.force), losses
 
@@ -164,7 +163,6 @@ def train_chunk(
     progress: Progress,
     space: ParameterSpace,
     pulls: Pull,
-    noise: Array,
     recipe: Recipe,
     key: PRNGKeyArray,
 ) -> tuple[Progress, Losses]:
@@ -175,7 +173,7 @@ def train_chunk(
     def epoch(progress: Progress, _):
         model, state, done = progress
         weight = (done >= recipe.warm_up).astype(float)
-        gradient, losses = jax.grad(total, has_aux=True)(model, space, pulls, frames, noise, weight)
+        gradient, losses = jax.grad(total, has_aux=True)(model, space, pulls, frames, weight)
         change, state = adam(recipe).update(gradient, state)
         change = eqx.tree_at(lambda m: m.free, change, replace_fn=lambda free: FABRIC_RATE * free)
         return Progress(eqx.apply_updates(model, change), state, done + 1), losses
@@ -189,14 +187,12 @@ def train(
     pulls: Pull,
     recipe: Recipe = QUICK,
     *,
-    noise: tuple[float, float] = NOISE,
     report: Callable[[int, float], None] | None = None,
     checkpoint: Path | None = None,
     key: PRNGKeyArray,
 ) -> Trained:
     """Train a network for each of some stacked pulls, and their fabric, together.
 
-    - `noise`: of the markers [m], and of the force over its greatest [-].
     - `report`: called after every chunk with its number and the loss of the markers [m^2].
     - `checkpoint`: a file that is written after every chunk, and from which a killed training of
       the same problem goes on.
@@ -205,17 +201,17 @@ def train(
     problem.
     """
     key_init, key_chunks = jr.split(key)
-    model = init(space, pulls, recipe.width, recipe.layers, key=key_init)
+    model: Any = init(space, pulls, recipe.width, recipe.layers, key=key_init)
     progress = Progress(model, adam(recipe).init(model), jnp.zeros((), int))
-    losses, places, weights = np.zeros(0), np.zeros((0, space.dim)), jnp.asarray(noise, float)
+    losses, places = np.zeros(0), np.zeros((0, space.dim))
     run = {"kind": "training of networks"}
     if checkpoint is not None:
-        run["run"] = checkpoints.fingerprint(space, pulls, weights, recipe, key)
+        run["run"] = checkpoints.fingerprint(space, pulls, recipe, key)
         if (stored := checkpoints.load(checkpoint, run)) is not None:
             progress, losses, places = checkpoints.tree_from(stored, (progress, losses, places))
     for chunk in range(len(losses), -(-(recipe.warm_up + recipe.adam) // recipe.chunk)):
         key_chunk = jr.fold_in(key_chunks, chunk)
-        progress, now = train_chunk(progress, space, pulls, weights, recipe, key_chunk)
+        progress, now = train_chunk(progress, space, pulls, recipe, key_chunk)
         if not np.isfinite(now).all():
             raise RuntimeError(f"training diverged in chunk {chunk + 1}: {now}")
         losses = np.append(losses, now.data)
@@ -223,5 +219,5 @@ def train(
         if checkpoint is not None:
             checkpoints.save(checkpoint, checkpoints.arrays_of((progress, losses, places)), run)
         if report is not None:
-            report(chunk, float(now.data) * noise[0] ** 2)
+            report(chunk, float(now.data) * NOISE[0] ** 2)
     return Trained(progress.model, np.asarray(losses), np.asarray(places))
