@@ -204,15 +204,17 @@ def load(path: Path | str) -> Training:
     if header.get("format") != FORMAT:
         raise ValueError(f"{path}: expected format {FORMAT}, found {header.get('format')}")
     schedule = header["schedule"] | {"flaws": Flaws(**header["schedule"]["flaws"])}
-    architecture, view = (
-        {name: tuple(v) if isinstance(v, list) else v for name, v in header[part].items()}
-        for part in ("architecture", "view")
-    )
-    empty = begin(View(**view), Architecture(**architecture), Schedule(**schedule))
+    architecture = Architecture(**_tuples(header["architecture"]))
+    empty = begin(View(**_tuples(header["view"])), architecture, Schedule(**schedule))
     network, optimiser = checkpoint.tree_from(arrays, _state(empty))
     network = eqx.combine(network, empty.network)
     curve = tuple(Row(*row) for row in header["curve"])
     return empty._replace(network=network, optimiser=optimiser, curve=curve, data=header["data"])
+
+
+def _tuples(values: dict[str, Any]) -> dict[str, Any]:
+    """The values with tuples in place of JSON's lists."""
+    return {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
 
 
 def _state(training: Training) -> tuple[Any, Any]:

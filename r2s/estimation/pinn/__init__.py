@@ -4,8 +4,9 @@ Needs flax: `pip install 'r2s[pinn]'`.
 
 - `from_pulls`: the estimate from stretchings. `pulls`: what it is given of a recording.
 - `network`: (X, Y, t) to displacement, with derivatives in forward mode.
-- `stress`: strain, stress and its divergence, from the laws of `r2s.laws.membrane`.
-- `losses`: markers, equation of motion, traction, free edges, clamps. `weak_form`: virtual work.
-- `training`: Adam, then L-BFGS. `balance`: motions in balance, the estimate and its covariance.
+- `stress`: strain and stress, from the laws of `r2s.laws.membrane`.
+- `losses`: displacements beside markers and clamps, the load. `weak_form`: virtual work.
+- `training`: of the networks, by Adam. `equilibrium`: motions in equilibrium, by Galerkin's method.
+- `balance`: the stiffness whose motions fit best, and its covariance.
 - `synthetic_pulls`: recordings of a known fabric. `published_recipe`: of Ru et al. (2025).
 """

@@ -4,7 +4,7 @@ Damped Gauss-Newton steps within the ranges, by the derivatives of `equilibrium`
 markers and force is estimated with the stiffness. The loop is our own, since solvers of optimistix
 begin each motion anew and cannot estimate the noise: from three pulls
 `optimistix.LevenbergMarquardt` arrives at the same place, to 0.05 standard errors, in 34 steps and
-71 CPU seconds, where this takes 7 steps and 12 CPU seconds.
+71 CPU seconds, where such a loop took 7 steps and 12 CPU seconds.
 """
 
 from collections.abc import Sequence
