@@ -1,7 +1,7 @@
 """Put the tables of docs/results into the documents, between the marks of their names.
 
 python experiments/_documents.py                      # all tables that a document shows
-python experiments/_documents.py --study results      # first the table of skill of a study
+python experiments/_documents.py --study results      # first the skill of preset three_fabrics
 """
 
 import argparse
@@ -16,6 +16,7 @@ from _tables import Line, insert, shown, write
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
 MARK = re.compile(r"<!-- (?!end of )(\w+) -->")
+STUDY = "make study PRESET=three_fabrics"
 SKILL = (
     "Error up to the horizon, floor, and skill (1 at the floor, 0 of the default): mean "
     "[90 % interval over fabrics]."
@@ -39,7 +40,7 @@ def copy_skill(results: Path) -> None:
     seconds = sum(float(x["CPU seconds in all"]) for x in study_table(results, "costs"))
     made = time.gmtime((results / "results.csv").stat().st_mtime)
     facts = {
-        "command": "make study; python experiments/_documents.py --study results",
+        "command": f"{STUDY}; python experiments/_documents.py --study results",
         "version": f"r2s {settings['version of r2s']}",
         "source": made_by[0].partition("source ")[2].partition(";")[0],
         "seed": settings["seed"],

@@ -10,7 +10,7 @@ stretch and lose up to 35 % of their bending stiffness, which estimates of const
 (`--law linear`) cannot follow; by default an estimate has the laws that its recordings determine.
 
 With --published the recipes of the approaches' papers are compared (two hours, two fabrics), each
-from one recording; PhysNet's network is trained as in the study's small preset.
+from one recording; PhysNet's network is trained as in the study's preset three_fabrics.
 """
 
 import itertools

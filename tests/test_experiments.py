@@ -1,6 +1,7 @@
 """The drivers of experiments and benchmarks start, and keep what made their tables."""
 
 import importlib
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -30,7 +31,8 @@ def tables(module) -> ModuleType:
 @pytest.mark.parametrize("driver", sorted(DRIVERS), ids=lambda path: path.stem)
 def test_a_driver_starts(driver: Path) -> None:
     pytest.importorskip("psutil", reason="needs r2s[study]")
-    done = subprocess.run([sys.executable, driver, "--help"], capture_output=True, text=True)
+    command, here = [sys.executable, driver, "--help"], os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, env=here)
     assert done.returncode == 0, done.stderr[-2000:]
 
 
