@@ -26,8 +26,7 @@ from r2s.estimation.physnet.pull_force import PullForce, moved_with_forces
 from r2s.estimation.physnet.training import Training
 from r2s.estimation.physnet.views import View, depths_of_sheet, per_face
 from r2s.fabrics.parameters import ParameterSpace
-from r2s.scenarios.scenario import Scenario, rollout
-from r2s.solver import Solver
+from r2s.scenarios.scenario import Scenario, SheetSolver, rollout
 
 Images = Float[np.ndarray, "frame down across"]
 
@@ -49,7 +48,7 @@ class Sighting(eqx.Module):
     points: Float[Array, "frame dim"]
     space: ParameterSpace
     network: PhysNet
-    solver: Solver | None
+    solver: SheetSolver | None
     frames: tuple[int, ...] = eqx.field(static=True)
     view: View = eqx.field(static=True)
     per_face: int = eqx.field(static=True)
@@ -63,7 +62,7 @@ class Sighting(eqx.Module):
         frames: tuple[int, ...],
         space: ParameterSpace,
         training: Training,
-        solver: Solver | None = None,
+        solver: SheetSolver | None = None,
         pull: PullForce | None = None,
     ) -> "Sighting":
         """A sighting from recorded images.
