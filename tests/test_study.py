@@ -58,25 +58,25 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
-def fold():
-    return synthetic.record(scenarios.folding(), presets.grey_interlock(), "grey", key=jr.key(1))
+def lift():
+    return synthetic.record(scenarios.lifting(), presets.grey_interlock(), "grey", key=jr.key(1))
 
 
 @pytest.fixture(scope="module")
-def predicted(fold):
-    """The motion of the fold with its true fabric."""
-    return prediction_error.predict(fold, presets.grey_interlock())
+def predicted(lift):
+    """The motion of the lift with its true fabric."""
+    return prediction_error.predict(lift, presets.grey_interlock())
 
 
-def test_a_recording_is_at_no_distance_from_itself(fold):
-    found = prediction_error.against_recording(fold, fold)
+def test_a_recording_is_at_no_distance_from_itself(lift):
+    found = prediction_error.against_recording(lift, lift)
     assert all(value == 0 for value in found.values())
 
 
-def test_the_true_fabric_is_nearer_than_another_and_than_noise_allows(fold, predicted):
-    truth = prediction_error.against_motion(fold, predicted)
+def test_the_true_fabric_is_nearer_than_another_and_than_noise_allows(lift, predicted):
+    truth = prediction_error.against_motion(lift, predicted)
     other = prediction_error.against_motion(
-        fold, prediction_error.predict(fold, presets.pink_solid())
+        lift, prediction_error.predict(lift, presets.pink_solid())
     )
     # 1 mm of noise, sampling of the surface every 5 mm, one point in a hundred 0.2 m away
     assert truth["chamfer_real_to_sim"] < 0.007
@@ -99,10 +99,10 @@ def test_a_whole_surface_tells_the_true_fabric_by_every_metric():
     assert truth["hausdorff"] < 0.01  # samples of the surface, 8 mm apart
 
 
-def test_a_diverged_motion_is_a_result(fold):
-    shape = (len(fold.times), 81, 3)
-    found = prediction_error.against_motion(fold, np.full(shape, np.nan))
-    whole = prediction_error.against_recording(fold, fold)
+def test_a_diverged_motion_is_a_result(lift):
+    shape = (len(lift.times), 81, 3)
+    found = prediction_error.against_motion(lift, np.full(shape, np.nan))
+    whole = prediction_error.against_recording(lift, lift)
     assert found.keys() == whole.keys()
     assert all(np.isnan(value) for value in found.values())
 
@@ -122,10 +122,10 @@ def test_a_run_that_fails_is_lost_from_there_on_and_says_why(monkeypatch):
     assert "frame 1, step 2" in moved.failure
 
 
-def test_the_cropped_distance_leaves_out_what_the_recording_cannot_show(fold, predicted):
-    found = prediction_error.against_motion(fold, predicted)
+def test_the_cropped_distance_leaves_out_what_the_recording_cannot_show(lift, predicted):
+    found = prediction_error.against_motion(lift, predicted)
     assert found["chamfer_sim_to_real_cropped"] < found["chamfer_sim_to_real"]
-    assert cloud(fold, 20)[:, 2].min() > 0
+    assert cloud(lift, 20)[:, 2].min() > 0
 
 
 def test_the_configurations_of_the_paper_are_part_of_all():
