@@ -14,13 +14,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.study import cells, engine, progress
+from r2s.study import cells, durations, engine, progress
 from r2s.study.cells import Cell
 from r2s.study.ensembles import EnsembleCell
 from r2s.study.environment import environment, one_core
 from r2s.study.evaluations import SHAPES, EvaluationCell
 from r2s.study.starts import SETTLING
-from r2s.study.subprocesses import OneProcess
 
 
 @dataclass(frozen=True)
@@ -185,7 +184,7 @@ class Dying(Cell):
 def test_a_process_apart_has_a_workers_environment_and_may_die(tmp_path, monkeypatch):
     for name in environment(1):
         monkeypatch.setenv(name, os.environ.get(name, ""))  # put back at the end
-    runner = OneProcess()
+    runner = engine.OneProcess()
     try:
         failed = engine.run([Dying(), tree()], tmp_path, runner)
     finally:
@@ -281,3 +280,12 @@ def test_a_file_gets_a_line_in_time_while_a_cell_is_running(tmp_path, capfd, mon
     engine.run([Number(1, pause=0.55)], tmp_path, engine.Serial())
     lines = capfd.readouterr().err.splitlines()
     assert len([line for line in lines if line.startswith("study of 1 cells:   0 %")]) >= 3
+
+
+def test_a_study_says_beforehand_how_long_it_takes(tmp_path, capfd, monkeypatch):
+    monkeypatch.setitem(durations.SECONDS, "numbers", (150.0, 30.0))
+    engine.run([Number(1), Number(2)], tmp_path, engine.Serial())
+    forecast = "study: 2 cells, about 3 min on 1 process"
+    assert capfd.readouterr().err.splitlines()[0] == forecast
+    engine.run([Number(1), Number(2)], tmp_path, engine.Serial())
+    assert "study:" not in capfd.readouterr().err

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from r2s.commands.study import Study
 from r2s.geometry.surface import nearest
 from r2s.scenarios.standard import SIX
 from r2s.study import engine, matrix
@@ -17,7 +18,6 @@ from r2s.study.drawn import experiment_of
 from r2s.study.ensembles import read_ensemble
 from r2s.study.estimates import EstimateCell
 from r2s.study.evaluations import EvaluationCell, read_measured, read_motion
-from r2s.study.main import study
 from r2s.study.mujoco_ensemble import MujocoEnsemble
 from r2s.study.mujoco_error import difference, differences, places
 from r2s.study.mujoco_recording import FABRIC, MujocoRecording
@@ -149,7 +149,7 @@ def test_a_study_without_the_wheel_says_so_before_it_makes_anything(tmp_path, mo
     monkeypatch.setitem(sys.modules, "mujoco", None)
     out = tmp_path / "results"
     with pytest.raises(ImportError, match=r"r2s\[mujoco\].*leave mujoco_flex out of --fabrics"):
-        study(out=out)
+        Study(out=out, preset="three_fabrics").run()
     assert not out.exists()
 
 

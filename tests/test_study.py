@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import re
 import runpy
 import sys
 from pathlib import Path
@@ -13,6 +14,8 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
+from r2s.cli import main
+from r2s.commands.study import Study
 from r2s.estimation.diffcloud import MASS, DiffCloud
 from r2s.estimation.diffcloud import STRETCH as MULTIPLIER
 from r2s.estimation.estimate import point_estimate
@@ -415,15 +418,27 @@ def test_an_estimate_that_diverges_is_a_result(tiny, tmp_path, monkeypatch):
         (("--judged", "0"), "judged must be at least 1"),
     ],
 )
-def test_a_wrong_call_says_what_is_wrong_and_writes_nothing(
-    arguments, message, tmp_path, monkeypatch
-):
-    driver, out = str(ROOT / "experiments" / "study.py"), tmp_path / "results"
-    monkeypatch.setattr(sys, "argv", [driver, *arguments, "--out", str(out)])
-    monkeypatch.chdir(ROOT)
-    with pytest.raises(SystemExit, match=message):  # a text, so that the exit status is 1
-        runpy.run_path(driver, run_name="__main__")
+def test_a_wrong_call_says_what_is_wrong_and_writes_nothing(arguments, message, tmp_path, capsys):
+    out = tmp_path / "results"
+    given = [str(ROOT / each) if each == "r2s" else each for each in arguments]
+    assert main(["study", *given, "--out", str(out)]) == 1
+    assert re.search(message, capsys.readouterr().err)
     assert not out.exists()
+
+
+def test_the_driver_is_the_command(monkeypatch):
+    options = ["--configurations", "diffcloud-cloth-lifting", "diffcloud-cloth-wind"]
+    options += ["--fabrics", "grey_interlock", "black_denim", "--out", "here", "--workers", "2"]
+    monkeypatch.setattr(sys, "argv", ["study.py", *options])
+    monkeypatch.setattr("r2s.__main__.command", lambda: main(sys.argv[1:]))
+    found = []
+    monkeypatch.setattr(Study, "run", lambda self: found.append(self))
+    with pytest.raises(SystemExit, match="0"):
+        runpy.run_path(str(ROOT / "experiments" / "study.py"), run_name="__main__")
+    (settings,) = found
+    assert settings.configurations == (("diffcloud-cloth-lifting", "diffcloud-cloth-wind"),)
+    assert settings.fabrics == (("grey_interlock", "black_denim"),)
+    assert settings.out == Path("here") and settings.workers == 2
 
 
 @pytest.mark.slow(group="study")

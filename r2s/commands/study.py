@@ -1,6 +1,8 @@
 """`r2s study`: every approach from every scenario, judged on motions never seen."""
 
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -32,13 +34,21 @@ class Study:
     materials: Annotated[str, arg(metavar="FOLDER")] = ""
     """Measured tables to make recordings with, FABRIC.json (ARCSim)."""
     configurations: Annotated[
-        tuple[str, ...],
-        arg(name="configuration", aliases=("--column",), metavar="CONFIGURATION"),
+        tuple[tuple[str, ...], ...],
+        arg(
+            name="configuration",
+            aliases=("--configurations", "--column", "--columns"),
+            metavar="CONFIGURATION ...",
+        ),
         UseAppendAction,
     ] = ()
-    """Such as diffcloud-cloth-lifting, instead of the preset's; may be given several times."""
-    fabrics: Annotated[tuple[str, ...], arg(name="fabric", metavar="PRESET"), UseAppendAction] = ()
-    """Instead of the preset's; may be given several times."""
+    """Such as diffcloud-cloth-lifting, instead of the preset's; one or several."""
+    fabrics: Annotated[
+        tuple[tuple[str, ...], ...],
+        arg(name="fabric", aliases=("--fabrics",), metavar="PRESET ..."),
+        UseAppendAction,
+    ] = ()
+    """Instead of the preset's; one or several."""
     repeats: int | None = None
     """Estimates of each fabric."""
     judged: int | None = None
@@ -55,9 +65,47 @@ class Study:
     """Where workers keep compiled programs; by default the user's cache folder."""
 
     def run(self) -> int:
-        from r2s.study.main import study
+        """Make all cells that are missing, and write results and report.
 
-        missing = study(**vars(self))
-        if missing:
-            raise ValueError(f"{missing} cells are missing: {self.out / 'report.html'} says why")
+        Raises `ValueError` for settings that make no sense and when cells are missing at the end,
+        `OSError`, and `ImportError` that names the extra for workers.
+        """
+        from r2s.study import engine, matrix, results, verdicts
+
+        plan = matrix.with_changes(
+            matrix.PRESETS[self.preset],
+            list(chain(*self.configurations)),
+            list(chain(*self.fabrics)),
+            self.repeats,
+            self.judged,
+            self.materials,
+            self.seed,
+        )
+        if self.data is None:
+            cells = matrix.synthetic(plan)
+        else:
+            cells = matrix.recorded(self.data, self.density, plan)
+        matrix.check_simulators(cells)
+        with self._runner() as runner:
+            failed = engine.run([*verdicts.ensembles(cells), *cells], self.out, runner)
+        source = str(self.data or "synthetic")
+        results.publish(cells, failed, self.out, plan, source, self.paper)
+        if failed:
+            raise ValueError(
+                f"{len(failed)} cells are missing: {self.out / 'report.html'} says why"
+            )
         return 0
+
+    def _runner(self) -> AbstractContextManager:
+        """One process, or workers of this machine, of Slurm or of a scheduler."""
+        from r2s.study import engine
+
+        if not (self.workers > 1 or self.scheduler or self.slurm):
+            return closing(engine.OneProcess())
+        from r2s.study import cluster
+
+        if self.scheduler:
+            return closing(cluster.at(self.scheduler))
+        if self.slurm:
+            return closing(cluster.slurm(self.slurm))
+        return closing(cluster.local(self.workers, self.compilation_cache))

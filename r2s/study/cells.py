@@ -33,13 +33,11 @@ class Cell:
     """A part of a study. Its fields are numbers, strings, tuples of them and frozen dataclasses.
 
     - `kind`: a folder for cells of this class.
-    - `weight`: how long one takes, roughly, in CPU seconds: for the estimate of the time left.
     - `settings`: the constants of its module that a result depends on, which are part of its key:
       else a result of other meshes would be taken for one of these.
     """
 
     kind: ClassVar[str] = ""
-    weight: ClassVar[float] = 1.0
     settings: ClassVar[tuple[Any, ...]] = ()
 
     @property
@@ -51,6 +49,11 @@ class Cell:
     def compilation_group(self) -> str:
         """The group of the cell. Those of one group compile once, and run one after the other."""
         return self.kind
+
+    @property
+    def runs(self) -> int:
+        """How many recordings it is about, which its time grows with (`r2s.study.durations`)."""
+        return 1
 
     @abstractmethod
     def make(self, folder: Path, out: Path) -> dict[str, Any]:

@@ -30,12 +30,13 @@ def local(workers: int, compilation_cache: Path | None = None) -> "Workers":
     cluster = LocalCluster(
         n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0"
     )
-    return Workers(_bound(cluster), cluster)
+    return Workers(_bound(cluster), cluster, workers)
 
 
 def at(address: str) -> "Workers":
     """The workers of a scheduler that runs already, such as "tcp://node:8786"."""
-    return Workers(Client(address), None)
+    client = Client(address)
+    return Workers(client, None, max(len(client.nthreads()), 1))
 
 
 def slurm(
@@ -66,7 +67,7 @@ def slurm(
         job_script_prologue=exports,
     )
     cluster.scale(jobs=jobs)
-    return Workers(_bound(cluster), cluster)
+    return Workers(_bound(cluster), cluster, jobs * cores)
 
 
 class OneCore(WorkerPlugin):
@@ -88,8 +89,8 @@ class Workers:
     Cells that compile alike go to the same worker, as long as it is not busy.
     """
 
-    def __init__(self, client: Any, cluster: Any) -> None:
-        self._client, self._cluster = client, cluster
+    def __init__(self, client: Any, cluster: Any, processes: int) -> None:
+        self._client, self._cluster, self.processes = client, cluster, processes
         self._cells: dict[str, Cell] = {}
         self._homes: dict[str, int] = {}
         self._done = as_completed()

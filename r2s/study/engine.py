@@ -4,10 +4,13 @@ Nothing that is finished is lost: a result is there whole or not at all, a cell 
 stop the others, and a run that was killed goes on where it was.
 """
 
+import os
 import sys
-from collections import deque
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from graphlib import TopologicalSorter
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -15,14 +18,22 @@ from tqdm import tqdm
 
 from r2s.compilation import clear_beyond
 from r2s.study.cells import Cell, dependencies, execute, with_dependencies
+from r2s.study.durations import expected_seconds, in_words
+from r2s.study.environment import begin_worker, environment
 from r2s.study.progress import progress
 
 MOST_MEMORY = 0.9e9  # [byte]: a process that holds more after a cell lets its programs go
+TRIES = 2  # of a cell whose process died
 
 
 @runtime_checkable
 class Runner(Protocol):
     """What makes cells: here one after the other, or elsewhere many at once."""
+
+    @property
+    def processes(self) -> int:
+        """How many cells are made at once."""
+        ...
 
     def submit(self, cell: Cell, folder: Path) -> None:
         """Take a cell whose dependencies are made."""
@@ -43,20 +54,20 @@ class Runner(Protocol):
 class Serial:
     """One cell after the other in this process, those that compile alike together."""
 
+    processes = 1
+
     def __init__(self) -> None:
-        self._waiting: deque[tuple[Cell, Path]] = deque()
-        self._last = ""
+        self._waiting: list[tuple[Cell, Path]] = []
 
     def submit(self, cell: Cell, folder: Path) -> None:
         self._waiting.append((cell, folder))
 
     def finished(self) -> Iterator[tuple[Cell, str]]:
+        last = ""
         while self._waiting:
             groups = [cell.compilation_group for cell, _ in self._waiting]
-            index = groups.index(self._last) if self._last in groups else 0
-            cell, folder = self._waiting[index]
-            del self._waiting[index]
-            self._last = cell.compilation_group
+            cell, folder = self._waiting.pop(groups.index(last) if last in groups else 0)
+            last = cell.compilation_group
             yield cell, self.make(cell, folder)
 
     def make(self, cell: Cell, folder: Path) -> str:
@@ -65,6 +76,36 @@ class Serial:
 
     def close(self) -> None:
         pass
+
+
+class OneProcess(Serial):
+    """Make cells as `Serial` does, in a process of its own, with the same numbers as workers.
+
+    Linear algebra is threaded as the environment said when it was loaded, and sums in another
+    order are other numbers.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        os.environ.update(environment(1))  # the process inherits it
+        self._pool = self._start()
+
+    def make(self, cell: Cell, folder: Path) -> str:
+        reason = ""
+        for _ in range(TRIES):
+            try:
+                return self._pool.submit(attempt, cell, folder, cell.key).result()
+            except BrokenProcessPool as error:
+                reason = f"{type(error).__name__}: {error}"
+                self._pool = self._start()
+        return reason
+
+    def close(self) -> None:
+        self._pool.shutdown(cancel_futures=True)
+
+    @staticmethod
+    def _start() -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=begin_worker)
 
 
 def attempt(cell: Cell, folder: Path, key: str | None = None) -> str:
@@ -88,16 +129,26 @@ def run(cells: Iterable[Cell], folder: Path, runner: Runner) -> dict[Cell, str]:
 
     Cells that are made already are left alone, those that failed before are tried again.
     """
-    waiting = {cell: None for cell in with_dependencies(cells) if not cell.is_made(folder)}
-    order = TopologicalSorter({cell: _waiting_for(cell, waiting) for cell in waiting})
-    order.prepare()
+    waiting = [cell for cell in with_dependencies(cells) if not cell.is_made(folder)]
+    seconds = expected_seconds(waiting)
+    needs = {cell: [need for need in dependencies(cell) if need in seconds] for cell in waiting}
     failed: dict[Cell, str] = {}
-    total = sum(cell.weight for cell in waiting)
+    if not waiting:
+        return failed
+    order = TopologicalSorter(needs)
+    order.prepare()
+    total, processes = sum(seconds.values()), runner.processes
+    print(
+        f"study: {len(waiting)} cells, about {in_words(total / processes)} on {processes} "
+        f"{'process' if processes == 1 else 'processes'}",
+        file=sys.stderr,
+        flush=True,
+    )
     with progress(total, len(waiting)) as bar:
         for cell in order.get_ready():
             runner.submit(cell, folder)
-        for cell, reason in runner.finished() if waiting else ():
-            bar.update(cell.weight)
+        for cell, reason in runner.finished():
+            bar.update(seconds[cell])
             bar.set_postfix_str(f"{cell.kind} {cell.name}")
             if reason:
                 tqdm.write(f"missing: {cell.kind} {cell.name}: {reason}", file=sys.stderr)
@@ -107,11 +158,7 @@ def run(cells: Iterable[Cell], folder: Path, runner: Runner) -> dict[Cell, str]:
             for other in order.get_ready():
                 runner.submit(other, folder)
     for cell in waiting:  # what is needed comes first
-        lost = [need for need in _waiting_for(cell, waiting) if need in failed]
+        lost = [need for need in needs[cell] if need in failed]
         if lost:
             failed[cell] = f"needs {lost[0].kind} {lost[0].name}, which is missing"
     return failed
-
-
-def _waiting_for(cell: Cell, waiting: Container[Cell]) -> list[Cell]:
-    return [need for need in dependencies(cell) if need in waiting]

@@ -52,7 +52,6 @@ class EnsembleCell(Cell):
     """
 
     kind: ClassVar[str] = "ensembles"
-    weight: ClassVar[float] = 60.0
     settings: ClassVar[tuple[Any, ...]] = (STIFFNESS, PATH, FINER, COARSER, POINTS, SETTLING)
 
     recording: SyntheticRecording

@@ -48,7 +48,6 @@ class TrainedNetwork(Cell):
     """PhysNet's network for a scenario on a solver."""
 
     kind: ClassVar[str] = "networks"
-    weight: ClassVar[float] = 150.0
 
     solver: str
     scenario: str
@@ -58,6 +57,10 @@ class TrainedNetwork(Cell):
     @property
     def name(self) -> str:
         return f"physnet_{self.solver}_{self.scenario}"
+
+    @property
+    def compilation_group(self) -> str:
+        return f"networks {self.solver} {self.scenario}"
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
         """A trained network; the simulated images are not kept."""
@@ -82,7 +85,6 @@ class EstimateCell(Cell):
     """
 
     kind: ClassVar[str] = "estimates"
-    weight: ClassVar[float] = 40.0
     settings: ClassVar[tuple[Any, ...]] = (SHAPES,)
 
     approach: str

@@ -62,7 +62,6 @@ class EvaluationCell(Cell):
     """
 
     kind: ClassVar[str] = "evaluations"
-    weight: ClassVar[float] = 8.0
     settings: ClassVar[tuple[Any, ...]] = (SHAPES, MOST, IMPLICIT, RETRIES, LADDER, SETTLING)
 
     estimate: EstimateCell | None
@@ -121,6 +120,10 @@ class EvaluationCell(Cell):
     @property
     def compilation_group(self) -> str:
         return f"evaluations {self.solver} {self.scenario}"
+
+    @property
+    def runs(self) -> int:
+        return len(self.recordings)
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
         """Simulate every recording's motion: metrics of each, its motion, its distances from the

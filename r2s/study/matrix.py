@@ -23,7 +23,7 @@ from r2s.study.evaluations import MIDDLE, EvaluationCell
 from r2s.study.mujoco_recording import FABRIC as FLEX
 from r2s.study.mujoco_recording import SCENARIOS as IN_MUJOCO
 from r2s.study.mujoco_recording import MujocoRecording
-from r2s.study.mujoco_sheet import Material
+from r2s.study.mujoco_sheet import Material, mujoco_module
 from r2s.study.sources import (
     GivenRecording,
     Source,
@@ -208,6 +208,15 @@ def synthetic(plan: Plan) -> list[EvaluationCell]:
                 estimates.append(_estimate(configuration, sources, density, plan, repeat))
         found += _evaluations(estimates, fabric, density, unseen, plan)
     return found
+
+
+def check_simulators(cells: Iterable[EvaluationCell]) -> None:
+    """Raise `ImportError`, before anything is made, where cells need MuJoCo and it is missing."""
+    if any(isinstance(source, MujocoRecording) for cell in cells for source in cell.recordings):
+        try:
+            mujoco_module()
+        except ImportError as error:
+            raise ImportError(f"{error}, or leave {FLEX} out of --fabrics") from error
 
 
 def _angles(configuration: Configuration, scenario: str) -> tuple[float | None, ...]:

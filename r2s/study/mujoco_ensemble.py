@@ -38,7 +38,6 @@ class MujocoEnsemble(Cell):
     """
 
     kind: ClassVar[str] = "ensembles"
-    weight: ClassVar[float] = 200.0
     settings: ClassVar[tuple[Any, ...]] = (STIFFNESS, PATH, FINER, COARSER, POINTS)
     lacks_layers: ClassVar[bool] = False
 

@@ -28,7 +28,6 @@ class MujocoRecording(Cell):
     """
 
     kind: ClassVar[str] = "recordings"
-    weight: ClassVar[float] = 60.0
     settings: ClassVar[tuple[Any, ...]] = (GRIP,)
 
     scenario: str

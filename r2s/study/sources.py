@@ -97,7 +97,6 @@ class SyntheticRecording(Cell):
     """
 
     kind: ClassVar[str] = "recordings"
-    weight: ClassVar[float] = 15.0
     settings: ClassVar[tuple[Any, ...]] = (
         *(STRETCH, SOFTENING, KNEE, DAMPING, FRICTION, PULL_FRAMES, LAYERED),
     )
