@@ -17,7 +17,6 @@ from r2s.fabrics.parameters import OrthotropicSpace
 from r2s.geometry.mesh import rectangle
 from r2s.geometry.surface import nearest
 from r2s.scenarios.scenario import Scenario, begin, rollout, stepped
-from r2s.study import diffsim_runs
 from r2s.units import GRAVITY
 from r2s.world.air import Air
 from r2s.world.contact import Table
@@ -84,7 +83,7 @@ def test_clouds_lie_on_the_sheet_evenly_and_off_it_by_the_noise():
     mesh = rectangle((0.4, 0.2), (3, 3))
     x = np.stack([np.pad(np.asarray(mesh.rest), ((0, 0), (0, 1)))] * 2)
     x[1, :, 2] += 0.3
-    clouds = diffsim_runs.sampled(x, mesh, 4000, jax.random.key(0), noise=2e-3)
+    clouds = runs.sampled(x, mesh, 4000, jax.random.key(0), noise=2e-3)
     assert clouds.mask.all()
     points = np.asarray(clouds.points)
     assert points[:, :, 2].mean(axis=1) == pytest.approx([0.0, 0.3], abs=2e-4)
@@ -97,13 +96,13 @@ def test_clouds_lie_on_the_sheet_evenly_and_off_it_by_the_noise():
 
 def test_trajectories_that_are_not_there_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="lift1_x.npz"):
-        diffsim_runs.read(tmp_path, "lift1_x")
+        runs.read(tmp_path, "lift1_x")
 
 
 @needs_data
 def test_the_first_acceleration_is_what_the_other_simulator_does_first():
-    made = diffsim_runs.read(runs.DATA, runs.WIND.format("camel"))
-    acceleration = diffsim_runs.first_acceleration(made)
+    made = runs.read(runs.DATA, runs.WIND.format("camel"))
+    acceleration = runs.first_acceleration(made)
     # its frame at 0.04 s, after four steps that each look at the air before them
     gained = made.x[1] - made.start
     free = np.arange(27)  # the lowest three rows, which do not feel the handles yet
@@ -115,18 +114,18 @@ def test_the_first_acceleration_is_what_the_other_simulator_does_first():
 
 @needs_data
 def test_the_errors_of_a_motion_with_itself_are_none_and_a_shift_is_found():
-    made = diffsim_runs.read(runs.DATA, runs.LIFT.format("denim"))
-    x = diffsim_runs.truth(made)
+    made = runs.read(runs.DATA, runs.LIFT.format("denim"))
+    x = runs.truth(made)
     np.testing.assert_array_equal(runs.errors(x, x), np.zeros(10))
     assert runs.errors(x + np.array([3e-3, 4e-3, 0]), x) == pytest.approx(5e-3)
 
 
 @needs_data
 def test_a_run_with_too_few_frames_is_named():
-    made = diffsim_runs.read(runs.DATA, runs.LIFT.format("denim"))
-    assert len(diffsim_runs.truth(made, count=60)) == 60
+    made = runs.read(runs.DATA, runs.LIFT.format("denim"))
+    assert len(runs.truth(made, count=60)) == 60
     with pytest.raises(ValueError, match="expected 61 frames"):
-        diffsim_runs.truth(made, count=61)
+        runs.truth(made, count=61)
 
 
 @pytest.mark.slow(group="estimates")
@@ -137,7 +136,7 @@ def test_a_run_with_too_few_frames_is_named():
 )
 def test_an_estimate_predicts_another_support_and_the_wind(name, bound, budget):
     edge, wind = runs.EDGE.format(name), runs.WIND.format(name)
-    density = diffsim_runs.read(runs.DATA, wind).told["material_json"]["density"]
+    density = runs.read(runs.DATA, wind).told["material_json"]["density"]
     found = runs.estimated(name, 2000, budget).fabric
     assert runs.worst_error(edge, found, at_rest=True) < 1
     error = runs.worst_error(wind, found)
