@@ -21,7 +21,7 @@ from r2s.study.configuration import MOTIONS, ON_CLOTH
 from r2s.study.estimates import EstimateCell, read_estimate
 from r2s.study.evaluations import EvaluationCell
 from r2s.study.matrix import SMALL, configuration_named, synthetic
-from r2s.study.mujoco_recording import FABRIC as FLEX
+from r2s.study.mujoco_cells import FABRIC as FLEX
 from r2s.study.sources import strain_dependent
 from r2s.study.verdicts import SURFACE
 

@@ -18,8 +18,7 @@ from r2s.study.drawn import experiment_of
 from r2s.study.ensembles import read_ensemble
 from r2s.study.estimates import EstimateCell
 from r2s.study.evaluations import EvaluationCell, read_measured, read_motion
-from r2s.study.mujoco_ensemble import MujocoEnsemble
-from r2s.study.mujoco_recording import FABRIC, MujocoRecording
+from r2s.study.mujoco_cells import FABRIC, MujocoEnsemble, MujocoRecording
 from r2s.study.mujoco_sheet import Material, Resolution, as_plate, motion, moved
 from r2s.study.sources import SyntheticRecording, read
 from r2s.study.verdicts import judged_motion
@@ -106,8 +105,9 @@ def test_a_recording_has_the_experiment_s_times_and_clouds_on_the_sheet(tmp_path
     assert np.abs(points - on_sheet).max() < 1e-5
 
 
-def test_every_preset_has_the_sheet_with_the_configurations_that_can_be():
-    for name, plan in matrix.PRESETS.items():
+def test_presets_have_the_sheet_with_the_configurations_that_can_be():
+    plans = {name: plan for name, plan in matrix.PRESETS.items() if FABRIC in plan.fabrics}
+    for name, plan in plans.items():
         small = matrix.with_changes(plan, repeats=1, judged=1)
         cells = [cell for cell in matrix.synthetic(small) if cell.fabric == FABRIC]
         assert {cell.scenario for cell in cells} == set(MOTIONS), name

@@ -44,7 +44,7 @@ from r2s.study.configuration import (
 from r2s.study.drawn import numbers_of
 from r2s.study.estimates import EstimateCell, TrainedNetwork
 from r2s.study.evaluations import EvaluationCell
-from r2s.study.mujoco_recording import MujocoRecording
+from r2s.study.mujoco_cells import MujocoRecording
 from r2s.study.report import disclosures
 from r2s.study.report.tables import recording_table
 from r2s.study.sources import (

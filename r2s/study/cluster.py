@@ -36,7 +36,7 @@ def local(workers: int, compilation_cache: Path | None = None) -> "Workers":
 def at(address: str) -> "Workers":
     """The workers of a scheduler that runs already, such as "tcp://node:8786"."""
     client = Client(address)
-    return Workers(client, None, max(len(client.nthreads()), 1))
+    return Workers(client, None, max(len(client.scheduler_info()["workers"]), 1))
 
 
 def slurm(

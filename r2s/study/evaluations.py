@@ -29,9 +29,7 @@ from r2s.scenarios.solvers import EDGE, MEMBRANE_DAMPING, explicit_cloth, grid_a
 from r2s.study.cells import Cell, result_files
 from r2s.study.configuration import ON_CLOTH, Configuration
 from r2s.study.estimates import EstimateCell, read_estimate
-from r2s.study.mujoco_recording import MujocoRecording
-from r2s.study.mujoco_sheet import as_plate
-from r2s.study.sources import GivenRecording, Source, read, read_start, small_strain
+from r2s.study.sources import Source, read, read_start
 from r2s.study.starts import SETTLING, started
 
 MIDDLE = -1  # instead of the number of a draw
@@ -139,8 +137,7 @@ class EvaluationCell(Cell):
             motions = predict(recordings, fabric, self.solver, starts)
         measured, diverged, arrays = {}, {}, {}
         for source, recording, motion in zip(self.recordings, recordings, motions, strict=True):
-            is_cropped = isinstance(source, GivenRecording)
-            args = self.every, is_cropped, self.shape
+            args = self.every, source.is_given, self.shape  # what cameras see is cropped
             found = prediction_error.against_motion(recording, motion.x, *args)
             away = prediction_error.from_surface(recording, motion.x, self.shape)
             found["surface"] = float(np.mean(away))
@@ -157,10 +154,7 @@ class EvaluationCell(Cell):
     def _fabric(self, folder: Path) -> Fabric | None:
         if self.estimate is None:
             if self.draw is None:
-                source = self.recordings[0]
-                if isinstance(source, MujocoRecording):
-                    return as_plate(source.material)
-                return small_strain(self.fabric)
+                return self.recordings[0].small_strain_fabric
             if self.draw == MIDDLE:
                 return prior.middle(self.density)
             key = jr.fold_in(jr.key(getattr(self.recordings[0], "seed", 0)), self.draw)

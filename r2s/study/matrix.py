@@ -20,9 +20,9 @@ from r2s.study.configuration import (
 )
 from r2s.study.estimates import SOLVERS, Budgets, EstimateCell, TrainedNetwork
 from r2s.study.evaluations import MIDDLE, EvaluationCell
-from r2s.study.mujoco_recording import FABRIC as FLEX
-from r2s.study.mujoco_recording import SCENARIOS as IN_MUJOCO
-from r2s.study.mujoco_recording import MujocoRecording
+from r2s.study.mujoco_cells import FABRIC as FLEX
+from r2s.study.mujoco_cells import SCENARIOS as IN_MUJOCO
+from r2s.study.mujoco_cells import MujocoRecording
 from r2s.study.mujoco_sheet import Material, mujoco_module
 from r2s.study.sources import (
     GivenRecording,
@@ -305,12 +305,7 @@ def _evaluations(
     # the cloth always: what is estimated on points is judged on it, too
     solvers = dict.fromkeys(("cloth", *(estimate.solver for estimate in estimates)))
     judged = list(judged)
-    is_known = all(
-        isinstance(each, MujocoRecording)  # its material, in the laws of r2s
-        or (isinstance(each, SyntheticRecording) and not each.truth.materials)
-        for group in judged
-        for each in group
-    )
+    is_known = all(each.small_strain_fabric is not None for group in judged for each in group)
     whose: list[tuple[EstimateCell | None, str, int | None]] = []
     for solver in solvers:
         whose += [(None, solver, draw) for draw in (*range(plan.draws), MIDDLE)]

@@ -22,7 +22,7 @@ from r2s.study.motions import judged_recordings
 from r2s.study.origins import origins
 from r2s.study.report import disclosures
 from r2s.study.report.publish import publish as publish_report
-from r2s.study.sources import GivenRecording, SyntheticRecording, read, true_fabric
+from r2s.study.sources import SyntheticRecording, read, true_fabric
 from r2s.study.statistics.frame import PLACE, as_frame, write_results
 from r2s.study.statistics.means import with_skill
 from r2s.study.verdicts import SURFACE, judged_motions, verdicts
@@ -109,7 +109,7 @@ def _repeatability(cells: Sequence[EvaluationCell], folder: Path) -> list[dict[s
     """How far two trials of a fabric in a motion are from each other, for given recordings."""
     trials = defaultdict(list)
     for source in dict.fromkeys(source for cell in cells for source in cell.recordings):
-        if isinstance(source, GivenRecording) and source.is_made(folder):
+        if source.is_given and source.is_made(folder):
             trials[source.fabric, source.scenario].append(source)
     found = []
     for (fabric, scenario), sources in trials.items():

@@ -5,7 +5,7 @@ mesh is finer than the one that estimates begin on, their steps are shorter, and
 stiffen with the strain and soften with the curvature, as measured ones do (DIFFCLOUD from a lift
 and pulls together estimates such laws, all others constant stiffness). Predictions have their mesh:
 what that does is in the floor, and in no error.
-Those of a sheet of MuJoCo are of another simulator altogether (`r2s.study.mujoco_recording`).
+Those of a sheet of MuJoCo are of another simulator altogether (`r2s.study.mujoco_cells`).
 """
 
 import dataclasses
@@ -35,7 +35,6 @@ from r2s.scenarios.solvers import explicit_cloth
 from r2s.scenarios.standard import STRETCHING_INTERVAL, Experiment
 from r2s.study.cells import Cell, result_files
 from r2s.study.drawn import RECORDING, START, experiment_of, number_of, pull_of
-from r2s.study.mujoco_recording import MujocoRecording
 
 STRETCH = 1.1  # where half of `TruthSettings.stiffening` is reached; Wang et al. 2011: up to 1.167
 SOFTENING, KNEE = 0.35, 20.0  # [-] and [1/m], of a `SofteningPlate`
@@ -84,19 +83,62 @@ class TruthSettings:
     self_contact: bool = True
 
 
-@dataclass(frozen=True)
-class SyntheticRecording(Cell):
-    """A synthetic recording of a preset's fabric.
+class Source(Cell):
+    """A recording, of a `fabric` in a `scenario`, that is estimated from or judged by."""
+
+    kind: ClassVar[str] = "recordings"
+    is_given: ClassVar[bool] = False  # whether it was read, not simulated
+
+    fabric: str  # a field of each class, in an order of its own, as keys have it
+    scenario: str
+
+    @property
+    def has_start(self) -> bool:
+        """Whether the shape of the sheet in the first frame of a judged motion is known."""
+        return False
+
+    @property
+    def small_strain_fabric(self) -> Fabric | None:
+        """The true fabric at small strain, in the laws of r2s; None where it is not known."""
+        return None
+
+
+class SimulatedRecording(Source):
+    """A recording of a motion of `r2s.scenarios`, by whichever simulator.
 
     - `number`: 0 is the motion of the scenario without any numbers; others are drawn within
       `r2s.scenarios.paths.LIMITS`, the same for all fabrics.
     - `unseen`: whether its motion is drawn to be judged by; none of these is one to estimate from.
       Its clouds are all of the surface, without any error.
+    """
+
+    number: int
+    unseen: bool
+    seed: int
+
+    @property
+    def has_start(self) -> bool:
+        return self.experiment.sheet.weft[2] != 0  # else it lies on the table
+
+    @property
+    def experiment(self) -> Experiment:
+        """What is done to the sheet."""
+        return experiment_of(self.scenario, self.number, self.unseen, self.seed)
+
+    @property
+    def sensing(self) -> synthetic.Sensing:
+        """How cameras see it."""
+        return synthetic.WHOLE if self.unseen else synthetic.sensing(self.experiment)
+
+
+@dataclass(frozen=True)
+class SyntheticRecording(SimulatedRecording):
+    """A synthetic recording of a preset's fabric.
+
     - `angle`: from the pull of a stretching to the warp [degrees], for `r2s.estimation.pinn`; each
       angle and number has a stretch and a rate of its own. None: a motion of `r2s.scenarios`.
     """
 
-    kind: ClassVar[str] = "recordings"
     settings: ClassVar[tuple[Any, ...]] = (
         *(STRETCH, SOFTENING, KNEE, DAMPING, FRICTION, PULL_FRAMES, LAYERED),
     )
@@ -167,23 +209,15 @@ class SyntheticRecording(Cell):
         return self.truth.self_contact and self.scenario == "folding"
 
     @property
-    def experiment(self) -> Experiment:
-        """What is done to the sheet."""
-        return experiment_of(self.scenario, self.number, self.unseen, self.seed)
-
-    @property
-    def sensing(self) -> synthetic.Sensing | None:
-        """How cameras see it; None: a pull, of which there are markers alone."""
-        if self.angle is not None:
-            return None
-        return synthetic.WHOLE if self.unseen else synthetic.sensing(self.experiment)
+    def small_strain_fabric(self) -> Fabric | None:
+        return None if self.truth.materials else small_strain(self.fabric)
 
 
 @dataclass(frozen=True)
-class GivenRecording(Cell):
+class GivenRecording(Source):
     """A recording in a folder with its manifest; `digest`: a hash of its files."""
 
-    kind: ClassVar[str] = "recordings"
+    is_given: ClassVar[bool] = True
 
     folder: str
     recording: str
@@ -205,8 +239,6 @@ class GivenRecording(Cell):
 
 
 _rollout = compile_once(rollout)
-
-Source = SyntheticRecording | MujocoRecording | GivenRecording
 
 
 def find_recordings(folder: Path) -> list[GivenRecording]:
@@ -264,7 +296,7 @@ def read_start(source: Source, folder: Path) -> Float[np.ndarray, "row column 3"
 
     None for a sheet that lies on the table, and for given recordings: no one knows theirs.
     """
-    if isinstance(source, GivenRecording) or source.experiment.sheet.weft[2] == 0:
+    if not source.has_start:
         return None
     with result_files(source, folder) as files:
         return np.load(files / START)

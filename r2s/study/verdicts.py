@@ -21,13 +21,14 @@ from r2s.recordings.recording import Recording, cloud
 from r2s.scenarios.scenario import from_recording
 from r2s.study.ensembles import EnsembleCell, ensemble_of, read_ensemble
 from r2s.study.evaluations import EvaluationCell, read_distances, read_motions
-from r2s.study.mujoco_ensemble import MujocoEnsemble
-from r2s.study.mujoco_recording import MujocoRecording
+from r2s.study.mujoco_cells import MujocoEnsemble, MujocoRecording
 from r2s.study.sources import Source, SyntheticRecording, read
 
 SURFACE = "surface"  # the metric that is judged within the horizon
 BEYOND = "beyond "  # before the name of a feature that is compared from the horizon on
 FEWEST = 4  # frames that are compared beyond it
+# of recordings that were simulated
+ENSEMBLES = {SyntheticRecording: ensemble_of, MujocoRecording: MujocoEnsemble}
 
 
 class Judged(NamedTuple):
@@ -54,9 +55,8 @@ def ensembles(cells: Iterable[EvaluationCell]) -> list[EnsembleCell | MujocoEnse
 
 
 def _ensemble(source: Source) -> EnsembleCell | MujocoEnsemble | None:
-    if isinstance(source, SyntheticRecording):
-        return ensemble_of(source)
-    return MujocoEnsemble(source) if isinstance(source, MujocoRecording) else None
+    make = ENSEMBLES.get(type(source))
+    return None if make is None else make(source)
 
 
 def judged_motions(cells: Iterable[EvaluationCell], folder: Path) -> dict[Source, Judged]:

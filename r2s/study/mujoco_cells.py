@@ -1,13 +1,21 @@
-"""Cells of ensembles of MuJoCo's sheet: how well a motion of it is known that is judged by."""
+"""Cells of another simulator, MuJoCo: recordings of a sheet of its flex, and their ensembles."""
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+
 from r2s.evaluation.surface_distance import POINTS, to_surface
-from r2s.recordings.recording import cloud
+from r2s.fabrics.fabric import Fabric
+from r2s.recordings.recording import cloud, save
+from r2s.scenarios import synthetic
 from r2s.scenarios.standard import Experiment
 from r2s.study.cells import Cell
+from r2s.study.drawn import RECORDING, START, number_of
 from r2s.study.ensembles import (
     APART,
     COARSER,
@@ -21,11 +29,71 @@ from r2s.study.ensembles import (
     save_ensemble,
     shifted,
 )
-from r2s.study.mujoco_recording import MujocoRecording
-from r2s.study.mujoco_sheet import Material, Resolution, moved
-from r2s.study.sources import read
+from r2s.study.mujoco_sheet import GRIP, Material, Resolution, as_plate, moved
+from r2s.study.sources import SimulatedRecording, read
 
+FABRIC = "mujoco_flex"
+SCENARIOS = ("lifting", "folding", "fling", "shaking")  # without fans and clamps
 OTHERS = (0.25, 0.5, 2.0, 4.0)  # times as stiff: as the membranes of the presets differ
+
+
+@dataclass(frozen=True)
+class MujocoRecording(SimulatedRecording):
+    """A recording of a sheet of MuJoCo; what it shares with `SyntheticRecording` means the same.
+
+    Its truth has no numbers in r2s's terms: it is there to be predicted.
+    """
+
+    settings: ClassVar[tuple[Any, ...]] = (GRIP,)
+
+    scenario: str
+    number: int = 0
+    unseen: bool = False
+    seed: int = 0
+    material: Material = Material()
+    resolution: Resolution = Resolution()
+    fabric: str = FABRIC
+
+    def __post_init__(self) -> None:
+        if self.scenario not in SCENARIOS:
+            raise ValueError(f"{FABRIC} has {', '.join(SCENARIOS)}, not {self.scenario}")
+
+    @property
+    def name(self) -> str:
+        return f"{self.scenario}_{self.fabric}_{'u' * self.unseen}{self.number}"
+
+    @property
+    def compilation_group(self) -> str:
+        return f"recordings of MuJoCo {self.scenario}"
+
+    @property
+    def small_strain_fabric(self) -> Fabric | None:
+        return as_plate(self.material)
+
+    def make(self, folder: Path, out: Path) -> dict[str, Any]:
+        """Simulate the recording; raises as `r2s.study.mujoco_sheet.moved`."""
+        experiment = self.experiment
+        scenario = experiment.scenario(self.resolution.shape)
+        key = jr.fold_in(
+            jr.key(self.seed), number_of(self.fabric, self.scenario, self.number, self.unseen)
+        )
+        x = moved(scenario, self.material, self.resolution.step)
+        if self.unseen and scenario.brake is not None:
+            np.save(out / START, x[0].reshape(*self.resolution.shape, 3))
+        made = synthetic.seen_of(
+            jnp.asarray(x, float),
+            experiment,
+            scenario,
+            self.fabric,
+            self.number,
+            self.sensing,
+            key=key,
+        )
+        info = dataclasses.replace(
+            made.info, name=self.name, source=f"MuJoCo's flex: {made.info.source}"
+        )
+        save(dataclasses.replace(made, info=info), out / RECORDING)
+        return {"seed": self.seed, "frames": len(made.times)}
 
 
 @dataclass(frozen=True)
