@@ -8,6 +8,7 @@ degrees of freedom are those of Satterthwaite 1946, An approximate distribution 
 variance components.
 """
 
+from bisect import bisect_left
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -125,16 +126,11 @@ def units_needed(
 
 def _needed(variance: float, shared: float, effect: float, significance: float) -> float:
     """The least number of units whose power is enough, by bisection."""
-    fewest, most = 1, MOST_UNITS
-    if _power(most, variance, shared, effect, significance) < POWER:
-        return np.inf
-    while most - fewest > 1:
-        middle = (fewest + most) // 2
-        if _power(middle, variance, shared, effect, significance) < POWER:
-            fewest = middle
-        else:
-            most = middle
-    return float(most)
+    counts = range(2, MOST_UNITS + 1)
+    which = bisect_left(
+        counts, POWER, key=lambda units: _power(units, variance, shared, effect, significance)
+    )
+    return float(counts[which]) if which < len(counts) else np.inf
 
 
 def _power(units: int, variance: float, shared: float, effect: float, significance: float) -> float:

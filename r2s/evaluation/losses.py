@@ -73,9 +73,7 @@ def robust(
     Cauchy's, logarithmic beyond `OUTLIER_SCALE`, which draws from afar. Or, with a `scale` [m] > 0,
     that of Geman and McClure (1987), bounded: what is much farther off does not count at all.
     """
-    strict = jnp.asarray(scale, float) > 0
-    limit = jnp.where(strict, jnp.maximum(scale, TOUCHING), OUTLIER_SCALE)
-    square = (distance / limit) ** 2
+    strict, limit, square = _scaled(distance, scale)
     return limit**2 / 2 * jnp.where(strict, square / (1 + square), jnp.log1p(square))
 
 
@@ -83,9 +81,8 @@ def robust_weight(
     distance: Float[Array, "*point"], scale: Float[Array, ""] | float = 0.0
 ) -> Float[Array, "*point"]:
     """The derivative of `robust`, divided by the distance [-]."""
-    strict = jnp.asarray(scale, float) > 0
-    limit = jnp.where(strict, jnp.maximum(scale, TOUCHING), OUTLIER_SCALE)
-    weight = 1 / (1 + (distance / limit) ** 2)
+    strict, _, square = _scaled(distance, scale)
+    weight = 1 / (1 + square)
     return jnp.where(strict, weight**2, weight)
 
 
@@ -93,10 +90,15 @@ def robust_curvature(
     distance: Float[Array, "*point"], scale: Float[Array, ""] | float = 0.0
 ) -> Float[Array, "*point"]:
     """The second derivative of `robust` [-]: below 0 for an outlier."""
+    strict, _, square = _scaled(distance, scale)
+    return jnp.where(strict, (1 - 3 * square) / (1 + square) ** 3, (1 - square) / (1 + square) ** 2)
+
+
+def _scaled(distance, scale) -> tuple[Array, Array, Array]:
+    """Whether the loss is the bounded one, its scale [m], and squared distances over that [-]."""
     strict = jnp.asarray(scale, float) > 0
     limit = jnp.where(strict, jnp.maximum(scale, TOUCHING), OUTLIER_SCALE)
-    square = (distance / limit) ** 2
-    return jnp.where(strict, (1 - 3 * square) / (1 + square) ** 3, (1 - square) / (1 + square) ** 2)
+    return strict, limit, (distance / limit) ** 2
 
 
 def masked_mean(values: Float[Array, "*point"], mask: Bool[Array, "*point"]) -> Float[Array, ""]:
