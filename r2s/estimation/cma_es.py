@@ -14,10 +14,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation.diffcp import problems_on_points
 from r2s.estimation.estimate import Estimate, point_estimate
-from r2s.estimation.gauss_newton import Problems, loss_at, theta_indices, theta_length
+from r2s.estimation.gauss_newton import Problems, loss_at, theta_length
 from r2s.estimation.method import ANY, Budget, Method, Progress
 from r2s.estimation.normal_equations import Loss
-from r2s.estimation.nuisances import nuisances
+from r2s.estimation.nuisances import free, nuisances
 from r2s.estimation.problem import Problem, check_shared, read_by_problem
 from r2s.extras import require
 
@@ -75,7 +75,8 @@ def search(
     began = time.perf_counter()
     problems = (problems,) if isinstance(problems, Problem) else problems
     check_shared(problems)
-    space, moved = problems[0].space, _nuisance_indices(problems)
+    space = problems[0].space
+    moved = np.array(sorted(each.place for each in free(problems)), int)
     place = np.full(space.dim, 0.5) if start is None else np.asarray(start, float)
     first = np.concatenate([np.clip(place, 0, 1), np.zeros(len(moved))])
     options = {
@@ -136,13 +137,3 @@ def _with_prior(problems: Problems, losses: np.ndarray, nuisances: np.ndarray) -
     frames = sum(len(problem.frames) for problem in problems)
     penalty = 2 * least / frames * np.sum(nuisances**2, axis=1) / 2
     return np.where(np.isfinite(losses), losses + penalty, DIVERGED)
-
-
-def _nuisance_indices(problems: Problems) -> np.ndarray:
-    """Indices in theta of the nuisances that the prior lets vary."""
-    dim, found = problems[0].space.dim, []
-    for which, problem in enumerate(problems):
-        places = theta_indices(problems, which)[dim:]
-        scales = problem.nuisance_prior.scales
-        found += [place for place, scale in zip(places, scales, strict=True) if scale]
-    return np.unique(np.array(found, int))

@@ -15,18 +15,12 @@ FORMAT_0_2 = "r2s-estimate/2"
 def as_json(estimate: Estimate) -> dict[str, Any]:
     """An estimate with units, for a file; a number that is not finite is None (null)."""
     parameters = {}
-    rows = zip(
-        estimate.ranges,
-        estimate.values,
-        estimate.standard_errors,
-        estimate.identifiable,
-        strict=True,
-    )
-    for bound, value, standard_error, identifiable in rows:
+    numbers = zip(estimate.values, estimate.standard_errors, estimate.identifiable, strict=True)
+    for bound, (value, error, identifiable) in zip(estimate.ranges, numbers, strict=True):
         parameters[bound.name] = {
             "value": _finite_or_none(value),
             "unit": bound.unit,
-            "standard_error": _finite_or_none(standard_error),
+            "standard_error": _finite_or_none(error),
             "standard_error_is": "relative" if bound.log else "absolute",
             "identifiable": bool(identifiable),
             "bounds": [bound.low, bound.high],
@@ -50,12 +44,13 @@ def as_json(estimate: Estimate) -> dict[str, Any]:
         "misfits": [each._asdict() for each in estimate.misfits],
         "left_out": list(estimate.left_out),
         "nuisances": [
-            each._asdict()
-            | {
-                "value": _finite_or_none(each.value),
-                "standard_error": _finite_or_none(each.standard_error),
+            {
+                "name": name,
+                "unit": unit,
+                "value": _finite_or_none(value),
+                "standard_error": _finite_or_none(error),
             }
-            for each in estimate.nuisances
+            for name, unit, value, error in estimate.nuisances
         ],
         "loss": _finite_or_none(estimate.loss),
         "loss_unit": estimate.loss_unit,
@@ -88,13 +83,8 @@ def from_json(stored: dict[str, Any]) -> Estimate:
         standard_errors=_numbers([p["standard_error"] for p in parameters.values()]),
         correlation=_numbers(stored["correlation"]),
         nuisances=tuple(
-            Nuisance(
-                each["name"],
-                each["unit"],
-                _number(each["value"]),
-                _number(each["standard_error"]),
-            )
-            for each in stored["nuisances"]
+            Nuisance(n["name"], n["unit"], _number(n["value"]), _number(n["standard_error"]))
+            for n in stored["nuisances"]
         ),
         loss=_number(stored["loss"]),
         losses=_numbers(stored.get("losses", [])),
