@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.estimation import covariance, descent, judgement, mesh_ladder
+from r2s.estimation import descent, judgement, mesh_ladder, standard_errors
 from r2s.estimation.compiled import derivatives_at, normal_from
 from r2s.estimation.diffcloud import DiffCloud
 from r2s.estimation.estimate import Estimate
@@ -135,12 +135,12 @@ def test_an_estimate_on_the_finest_mesh_stays_at_its_end_within_what_is_known(mo
 
         monkeypatch.setattr(module, name, noting)
 
-    note(covariance, "normals_at")
+    note(standard_errors, "normals_at")
     note(judgement, "each_alone")
     note(judgement.mesh_bias, "alone")
     note(judgement, "_with_density", lambda *_, **__: None)
     monkeypatch.setattr(judgement, "agreement", lambda *_: None)
-    monkeypatch.setattr(judgement.density_doubt, "is_asked", lambda *_: True)
+    monkeypatch.setattr(judgement, "asks_for_density", lambda *_: True)
     found = mesh_ladder.descend_by_meshes(both, prior, budget, key=jr.key(0))
     assert found.shape == (5, 5)
     assert tried == [(name, 9) for name in ("normals_at", "each_alone", "alone", "_with_density")]

@@ -9,7 +9,7 @@ import pytest
 
 from r2s import scenarios
 from r2s.commands import estimate_report
-from r2s.estimation.density_doubt import freed, is_asked
+from r2s.estimation.agreement import asks_for_density, with_free_density
 from r2s.estimation.diffcloud import DiffCloud
 from r2s.estimation.estimate import Agreement, Contradiction, Estimate, Misfit, point_estimate
 from r2s.estimation.gauss_newton import theta_length
@@ -110,10 +110,14 @@ def test_a_density_is_asked_for_where_a_force_is_missed_or_recordings_are_apart(
     both = problem_of(lifted), problem_of(pulled)
     missed, bent = Misfit(1, "force", 2.0, "of its size"), Misfit(1, "shift x", 4.0, "")
     odd = Agreement(1e-9, (3, 3), Contradiction(1, "warp", 9.0, (1.0, 2.0)))
-    assert is_asked(both, None, [missed]) and is_asked(both, odd, [])
-    assert not is_asked(both, None, [bent]) and not is_asked(both, Agreement(0.3, (3, 3), None), [])
-    assert not is_asked(both[1:], None, [missed])  # a pull alone has no other weight to go by
-    assert not is_asked(both[:1] * 2, odd, [])  # nothing weighs the sheet
+    assert asks_for_density(both, None, [missed]) and asks_for_density(both, odd, [])
+    assert not asks_for_density(both, None, [bent]) and not asks_for_density(
+        both, Agreement(0.3, (3, 3), None), []
+    )
+    assert not asks_for_density(
+        both[1:], None, [missed]
+    )  # a pull alone has no other weight to go by
+    assert not asks_for_density(both[:1] * 2, odd, [])  # nothing weighs the sheet
 
 
 def test_a_density_that_is_freed_is_the_one_that_was_found(pulled):
@@ -121,7 +125,7 @@ def test_a_density_that_is_freed_is_the_one_that_was_found(pulled):
     prior = NuisancePrior(density=0.1)
     problem = Problem.make(pulled, SPACE, shape=SHAPE, nuisance_prior=prior)
     theta, _ = at_truth(problem)
-    (loose,), there = freed((problem,), theta.at[SPACE.dim].set(0.5))
+    (loose,), there = with_free_density((problem,), theta.at[SPACE.dim].set(0.5))
     density = float(fabric_at(loose, there).density)
     assert density == pytest.approx(float(KNIT.density) * np.exp(0.05), rel=1e-5)
 

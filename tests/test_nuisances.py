@@ -13,7 +13,6 @@ import pytest
 from r2s import scenarios
 from r2s.estimation import cma_es, compiled, gauss_newton
 from r2s.estimation.agreement import weighing
-from r2s.estimation.covariance import covariance_at
 from r2s.estimation.estimate import describe
 from r2s.estimation.gauss_newton import Descent, Normal
 from r2s.estimation.judgement import descend
@@ -36,7 +35,13 @@ from r2s.estimation.problem import (
     Problem,
     default_nuisance_prior,
 )
-from r2s.estimation.standard_errors import FARTHEST, covariance, sample_around, steps_apart
+from r2s.estimation.standard_errors import (
+    FARTHEST,
+    covariance,
+    covariance_at,
+    sample_around,
+    steps_apart,
+)
 from r2s.fabrics import presets
 from r2s.fabrics.informed_space import InformedSpace
 from r2s.fabrics.parameters import UNIFORM_DEVIATION, OrthotropicSpace

@@ -6,8 +6,13 @@ than the prior. Where the rest scatters by more than standard errors allow, the 
 contradict each other: another fabric in one of them, or an error in what was written down of it.
 (The covariance at the estimate itself would not show that: what a recording misfits there counts as
 its noise.)
+
+A sheet that is taken to be ten times as heavy needs ten times the stiffness to hang as it was
+recorded, and then pulls far harder than its load cell showed. Where `asks_for_density` says so, a
+descent in all recordings `with_free_density` tells which density would fit.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -19,8 +24,10 @@ from scipy import special, stats
 
 from r2s.estimation import standard_errors
 from r2s.estimation.bounded import held_back
-from r2s.estimation.estimate import UNLIKELY, Agreement, Contradiction
+from r2s.estimation.estimate import UNLIKELY, Agreement, Contradiction, Misfit
 from r2s.estimation.gauss_newton import Descent, Problems, prior_weight
+from r2s.estimation.misfits import FORCE
+from r2s.estimation.prediction import Theta
 
 # Of a range, by which a mesh excuses a parameter at most, since one step may say far more. Lifts on
 # 17 x 17 vertices err in warp, weft and shear by 0.10, root mean square
@@ -152,6 +159,38 @@ def density_told(
     covariance = np.linalg.inv(matrix)
     given_too_high = (covariance @ right)[dim]
     return float(np.exp(-given_too_high)), float(np.sqrt(covariance[dim, dim]))
+
+
+def asks_for_density(
+    problems: Problems, found: Agreement | None, misfits: Sequence[Misfit]
+) -> bool:
+    """Whether some of several recordings weigh the sheet, and they or a force do not fit."""
+    if len(problems) < 2 or not any(weighing(problems)):
+        return False
+    is_apart = found is not None and (found.contradiction is not None or found.doubts_density)
+    return is_apart or any(each.what == FORCE for each in misfits)
+
+
+def with_free_density(problems: Problems, theta: Theta) -> tuple[Problems, Theta]:
+    """The problems with a density of which only the order is known, and a theta in its units."""
+    place, given = problems[0].space.dim, problems[0].nuisance_prior.density
+    loose = tuple(
+        dataclasses.replace(p, nuisance_prior=p.nuisance_prior._replace(density=HARDLY))
+        for p in problems
+    )
+    return loose, theta.at[place].multiply(given / HARDLY)
+
+
+def with_density(found: Agreement | None, loose: Problems, end: Descent) -> Agreement | None:
+    """An agreement with the density at the end of a descent in problems of `with_free_density`,
+    over the one that was given, and the standard error of its logarithm. None stays None where that
+    density is not doubted."""
+    place = loose[0].space.dim
+    covariance, _ = standard_errors.sandwich_of(loose, end, prior_weight(loose, end.normal))
+    error = HARDLY * float(np.sqrt(covariance[place, place]))
+    density = float(np.exp(HARDLY * float(end.theta[place]))), error
+    judged = (found or Agreement(1.0, (0,) * len(loose), None))._replace(density=density)
+    return judged if found or judged.doubts_density else None
 
 
 def scattered(told: Sequence[Told]) -> tuple[float, int]:

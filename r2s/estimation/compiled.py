@@ -7,7 +7,7 @@ serves recordings of any number of points, all stages of a descent, and its end.
 import math
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,6 +21,7 @@ from r2s.estimation.gauss_newton import Normal, Problems, theta_indices
 from r2s.estimation.method import Progress, tell
 from r2s.estimation.prediction import Prediction, Sensitivity, Theta, predict, sensitivities
 from r2s.estimation.problem import Problem, motion_alone
+from r2s.scenarios.scenario import Scenario
 from r2s.threads import thread_map
 
 Predicted = list[tuple[Prediction, Sensitivity]]  # of each recording
@@ -60,7 +61,7 @@ def remembering() -> Derive:
     A descent comes back to where it was whenever a stage, a search, or the standard errors begin.
     What was found there of more frames serves fewer, too.
     """
-    known: dict[Any, _Known] = {}
+    known: list[_Known] = []  # the latest place last
     lock = threading.Lock()
 
     def derive(problems: Problems, theta: Theta, width: float | None = None) -> Predicted:
@@ -68,26 +69,35 @@ def remembering() -> Derive:
 
     def one(problem: Problem, theta: Array, width: float | None):
         frames = problem.scenario.num_frames if problem.wanted is None else int(problem.wanted)
-        place = id(problem.scenario), np.asarray(theta).tobytes(), width
+        place = np.asarray(theta)
         with lock:
-            found = known.pop(place, None)
+            found = next((k for k in known if k.is_of(problem.scenario, place, width)), None)
         if found is None or found.frames < frames:
-            found = _Known(problem.scenario, frames, _sensitivities(problem, theta, width))
+            derivatives = _sensitivities(problem, theta, width)
+            found = _Known(problem.scenario, place, width, frames, derivatives)
         with lock:
-            known[place] = found
-            while len(known) > 1 and sum(each.bytes for each in known.values()) > REMEMBERED:
-                del known[next(iter(known))]
+            known[:] = [k for k in known if not k.is_of(problem.scenario, place, width)]
+            known.append(found)
+            while len(known) > 1 and sum(each.bytes for each in known) > REMEMBERED:
+                del known[0]
         return found.derivatives
 
     return derive
 
 
 class _Known(NamedTuple):
-    """Derivatives over some frames; `scenario`: held, so that its id stays its own."""
+    """Derivatives of a scenario over some frames, at a place theta."""
 
-    scenario: Any
+    scenario: Scenario
+    theta: np.ndarray
+    width: float | None
     frames: int
     derivatives: tuple[Prediction, Sensitivity]
+
+    def is_of(self, scenario: Scenario, theta: np.ndarray, width: float | None) -> bool:
+        """Whether they are of this very scenario, at this place by this width."""
+        is_alike = self.scenario is scenario and self.width == width
+        return is_alike and np.array_equal(self.theta, theta)
 
     @property
     def bytes(self) -> int:

@@ -14,18 +14,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from r2s.compilation import clear_in_time
 from r2s.estimation import checkpoint as checkpoints
 from r2s.estimation import gauss_newton
-from r2s.estimation.compiled import (
-    Derive,
-    losses_at,
-    normals_at,
-    remembering,
-)
-from r2s.estimation.gauss_newton import (
-    Descent,
-    Normal,
-    Problems,
-    theta_indices,
-)
+from r2s.estimation.compiled import Derive, losses_at, normals_at, remembering
+from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
 from r2s.estimation.least_squares import Damping
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import Theta, explain, fabric_at

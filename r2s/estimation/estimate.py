@@ -55,7 +55,7 @@ class Agreement(NamedTuple):
     - `density`: with which they would agree best, over the one that was given, [-], and the
       standard error of its logarithm: a first guess where some weigh the sheet, by a force, and
       others do not; where a force or another recording does not fit, of a descent
-      (`r2s.estimation.density_doubt`). Else None.
+      (`r2s.estimation.agreement.with_density`). Else None.
     - `exact`: as `p`, were their meshes without error; None where nothing was excused.
     """
 

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from r2s.estimation import compiled, gauss_newton
-from r2s.estimation.covariance import covariance_at
 from r2s.estimation.descent import DEFAULT
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import Descent, Problems
@@ -18,6 +17,7 @@ from r2s.estimation.judgement import collect, descend
 from r2s.estimation.method import Budget
 from r2s.estimation.prediction import explain
 from r2s.estimation.problem import Problem
+from r2s.estimation.standard_errors import covariance_at
 from r2s.fabrics.fabric import Fabric
 from r2s.fabrics.parameters import ParameterSpace, Prior, Range
 

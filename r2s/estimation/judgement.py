@@ -10,12 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimation import density_doubt, gauss_newton, mesh_bias
-from r2s.estimation.agreement import agreement
+from r2s.estimation import gauss_newton, mesh_bias
+from r2s.estimation.agreement import (
+    agreement,
+    asks_for_density,
+    with_density,
+    with_free_density,
+)
 from r2s.estimation.compiled import Derive, loss_from, predictions_at
-from r2s.estimation.covariance import covariance_at
 from r2s.estimation.descent import DEFAULT, Row, Search, has_arrived, search, stacked
-from r2s.estimation.estimate import Estimate
+from r2s.estimation.estimate import Agreement, Estimate
 from r2s.estimation.gauss_newton import Descent, Problems, recording_weights, theta_indices
 from r2s.estimation.law_error import law_error
 from r2s.estimation.mesh_bias import OtherMesh, coarser_of
@@ -24,6 +28,7 @@ from r2s.estimation.misfits import left_out, misfits
 from r2s.estimation.nuisances import nuisances
 from r2s.estimation.prediction import Theta, fabric_at
 from r2s.estimation.problem import Problem
+from r2s.estimation.standard_errors import covariance_at
 
 _weight = eqx.filter_jit(gauss_newton.prior_weight)
 
@@ -54,8 +59,9 @@ def descend(
     """
     problems = (problems,) if isinstance(problems, Problem) else problems
     found = search(problems, budget, start=start, checkpoint=checkpoint, progress=progress, key=key)
-    saved = {"checkpoint": checkpoint, "progress": progress, "key": key}
-    return judged(found, budget, approach=approach, **saved)
+    return judged(
+        found, budget, approach=approach, checkpoint=checkpoint, progress=progress, key=key
+    )
 
 
 def judged(
@@ -71,7 +77,7 @@ def judged(
     """The estimate at the end of a search, with its standard errors, which hold what a constant
     stiffness is off that at small strain (`r2s.estimation.law_error`).
 
-    `checkpoint`: of the search; a descent for the density (`r2s.estimation.density_doubt`) is kept
+    `checkpoint`: of the search; a descent for the density (`r2s.estimation.agreement`) is kept
     beside it. `progress`: as in `descend`.
 
     `other_mesh`: by which its bias is judged, which the standard errors hold (`mesh_bias.settled`).
@@ -81,8 +87,8 @@ def judged(
     best, prior = found.best, _weight(problems, found.best.normal)
     predicted = found.derive(problems, best.theta, budget.width)
     coarse, beside = coarser_of(problems, other_mesh)
-    around = {"tried_on": coarse, "derive": found.derive}
-    covariance = covariance_at(problems, budget, best, jax.random.fold_in(key, 1), **around)
+    around = jax.random.fold_in(key, 1)
+    covariance = covariance_at(problems, budget, best, around, tried_on=coarse, derive=found.derive)
     if found.others:  # of one valley, or of several fabrics that little tells apart
         off = np.asarray(jnp.stack(found.others) - best.theta[None], np.float64)
         covariance = covariance + off.T @ off / len(off)
@@ -97,8 +103,10 @@ def judged(
             best, seen = dataclasses.replace(best, theta=theta), predictions_at(problems, theta)
     seconds = found.seconds + time.perf_counter() - began
     converged = has_arrived(found, budget) and not found.unsure
-    told = covariance, approach, seconds, converged, loss_from(problems, seen), bias
-    estimate = collect(problems, best, found.rows, *told)
+    loss = loss_from(problems, seen)
+    estimate = collect(
+        problems, best, found.rows, covariance, approach, seconds, converged, loss, bias
+    )
     try:
         alone = each_alone(coarse, budget, best.theta, key, found.derive, progress)
     except RuntimeError as error:  # on the coarser mesh, of a fabric of the finer one
@@ -110,10 +118,9 @@ def judged(
     biases = mesh_bias.alone(coarse, beside, alone, found.derive, budget.width)
     agreed = agreement(coarse, alone, biases) if alone else None
     missed = misfits(problems, best.theta, seen)
-    if density_doubt.is_asked(problems, agreed, missed):
+    if asks_for_density(problems, agreed, missed):
         path = checkpoint and checkpoint.with_suffix(".density.npz")
-        saved = {"checkpoint": path, "progress": progress, "key": key}
-        agreed = _with_density(agreed, coarse, budget, best.theta, **saved)
+        agreed = _with_density(agreed, coarse, budget, best.theta, path, progress, key)
     return dataclasses.replace(
         estimate,
         agreement=agreed,
@@ -136,25 +143,45 @@ def each_alone(
     """The ends of descents in each of several recordings alone, from a theta of all of them."""
     if len(problems) < 2:
         return []
-    saved = {"derive": derive, "progress": progress, "key": key}
     alone = budget._replace(coarse=0, starts=1, shares=(), near=True, leads_on=True)
-    ends = []
-    for which, problem in enumerate(problems):
-        start = theta[theta_indices(problems, which)]
-        words = f"recording {which + 1} of {len(problems)} alone"
-        ends.append(search((problem,), alone, start=start, words=words, **saved).best)
-    return ends
+    return [
+        search(
+            (problem,),
+            alone,
+            start=theta[theta_indices(problems, which)],
+            progress=progress,
+            derive=derive,
+            words=f"recording {which + 1} of {len(problems)} alone",
+            key=key,
+        ).best
+        for which, problem in enumerate(problems)
+    ]
 
 
-def _with_density(agreed, problems: Problems, budget: Budget, theta: Theta, **saved):
+def _with_density(
+    agreed: Agreement | None,
+    problems: Problems,
+    budget: Budget,
+    theta: Theta,
+    checkpoint: Path | None,
+    progress: Progress | None,
+    key: PRNGKeyArray,
+) -> Agreement | None:
     """The agreement with the density that all recordings lead to; as it is where they diverge."""
-    loose, start = density_doubt.freed(problems, theta)
-    free = budget._replace(coarse=0, starts=1, shares=(), near=True, leads_on=False)
+    loose, start = with_free_density(problems, theta)
     try:
-        end = search(loose, free, start=start, words="which density would fit", **saved).best
+        end = search(
+            loose,
+            budget._replace(coarse=0, starts=1, shares=(), near=True, leads_on=False),
+            start=start,
+            checkpoint=checkpoint,
+            progress=progress,
+            words="which density would fit",
+            key=key,
+        ).best
     except RuntimeError:
         return agreed
-    return density_doubt.with_density(agreed, loose, end)
+    return with_density(agreed, loose, end)
 
 
 def collect(

@@ -8,7 +8,6 @@ goes on from it there, with the nuisances that were found.
 import dataclasses
 import functools
 import math
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -19,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.compilation import is_kept
-from r2s.estimation.compiled import prepare, remembering
+from r2s.estimation.compiled import Derive, prepare, remembering
 from r2s.estimation.descent import Search, search
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import FINEST, Descent, Problems
@@ -71,80 +70,133 @@ def descend_by_meshes(
     Its `mesh_bias` is judged by a mesh whose cells are half as long, or twice as long where that
     would be finer than all of `r2s.scenarios.resolution.LADDER`, or diverged.
     """
-
-    derive = remembering()
-
-    known, lock = functools.cache(partial(_problems, recordings, space)), threading.Lock()
-    counts: list[Array] = []  # of each recording, once it is known
-    refused = ""
-
-    def on(*shapes: Shape) -> tuple[Problem, ...]:
-        with lock:  # else two threads make them twice, and `derive` knows one of these
-            found = known(shapes)
-        return _weighed(found, counts) if counts else found
-
-    def climb(shapes: list[Shape], start: Theta | None, leads_on: bool) -> _Rung:
-        more, path = budget, checkpoint
-        name = _named(max(shapes))  # a pull's is that of the rung before on the last one
-        if start is not None:
-            more = near(budget)
-            if path:
-                short = name.replace(" ", "")
-                path = path.with_suffix(f".{short}{'' if leads_on else '.end'}.npz")
-        more = more._replace(leads_on=leads_on)
-        saved = {"checkpoint": path, "progress": progress, "derive": derive, "key": key}
-        words = f"descents on {name} vertices"
-        found = search(on(*shapes), more, start=start, words=words, **saved)
-        return _Rung(shapes, found)
-
-    def settle(at: _Rung) -> _Rung:
-        """A rung at its end, where it may be softer, and after another look from elsewhere."""
-        end = climb(at.shapes, at.found.theta, False)
-        return end._replace(found=look_again(end.found, budget, progress=progress, key=key))
-
-    several = len(recordings) > 1
     rungs = [[shape] * len(recordings)] if shape else _rungs(recordings)
     if finest:
         rungs = [rungs[0], rungs[-1]]
-
-    def needed() -> Iterator[Callable[[], None]]:
-        """What will be compiled, in the order in which it will most likely be run."""
-        likely = rungs if finest else rungs[: 2 if several else 1]
-        for shapes in likely:
-            yield lambda shapes=shapes: prepare(on(*shapes), budget.width)
-        others = _others(likely[-1], _ratio(likely[-1]))
-        yield lambda: prepare(on(*others), derivatives=False)
-        if finest:  # else that of the rung before
-            yield lambda: prepare(on(*others), budget.width)
-
-    with background(needed() if is_kept() else ()):
-        at = climb(rungs[0], None, len(rungs) > 1)
-        if several:
-            alone = each_alone(at.found.problems, budget, at.found.theta, key, derive, progress)
-            counts += weights(alone)
-            at = climb(rungs[0], at.found.theta, len(rungs) > 1)
-        for shapes in rungs[1:]:
-            if shapes is rungs[-1] and not finest:
-                at = settle(at)
-                if not is_too_coarse(recordings, *at.fabric):
-                    break
-            try:
-                at = _gone_on(at, climb(shapes, at.found.theta, shapes is not rungs[-1]))
-            except RuntimeError as error:
-                if finest or isinstance(error, jax.errors.JaxRuntimeError):  # out of memory, say
-                    raise
-                refused = f"{_named(max(shapes))} vertices, which it needs: {error}"
-                tell(progress, f"the finer mesh diverged: back to {_named(max(at.shapes))}")
-                at = at if shapes is rungs[-1] else settle(at)  # which it is already on the last
-                break
-        if len(rungs) == 1:
-            at = at._replace(found=look_again(at.found, budget, progress=progress, key=key))
+    on = functools.cache(partial(_problems, recordings, space))
+    on(tuple(rungs[0]))  # which both threads would make, else
+    run = _Run(recordings, on, budget, remembering(), checkpoint, progress, key)
+    with background(_programs(run, rungs, finest) if is_kept() else ()):
+        run, at = _first(run, rungs[0], leads_on=len(rungs) > 1)
+        at, refused = _refined(run, at, rungs[1:], finest)
         tell(progress, "standard errors")
         ratio = 2.0 if refused else _ratio(at.shapes)
-        other = OtherMesh(on(*_others(at.shapes, ratio)), factor(ratio))
-        saved = {"checkpoint": checkpoint, "progress": progress, "key": key}
-        estimate = judged(at.found, budget, other_mesh=other, **saved)
+        estimate = judged(
+            at.found,
+            budget,
+            other_mesh=OtherMesh(run.problems(_others(at.shapes, ratio)), factor(ratio)),
+            checkpoint=checkpoint,
+            progress=progress,
+            key=key,
+        )
     return dataclasses.replace(estimate, shape=_told(recordings, at.shapes), refused=refused)
+
+
+class _Rung(NamedTuple):
+    """What was found on the meshes of some shapes, one for each recording."""
+
+    shapes: list[Shape]
+    found: Search
+
+    @property
+    def fabric(self) -> tuple[Fabric, list[Shape]]:
+        """The fabric that was found, and on which meshes."""
+        return self.found.fabric, self.shapes
+
+
+class _Run(NamedTuple):
+    """What all searches of an estimate by meshes share.
+
+    - `problems_on`: the problems of the recordings on meshes of given shapes.
+    - `weights`: of the recordings, [1/m^2]; none: all frames count alike.
+    """
+
+    recordings: Recordings
+    problems_on: Callable[[tuple[Shape, ...]], tuple[Problem, ...]]
+    budget: Budget
+    derive: Derive
+    checkpoint: Path | None
+    progress: Progress | None
+    key: PRNGKeyArray
+    weights: Sequence[Array] = ()
+
+    def problems(self, shapes: Sequence[Shape]) -> tuple[Problem, ...]:
+        found = self.problems_on(tuple(shapes))
+        return _weighed(found, self.weights) if self.weights else found
+
+
+def _programs(run: _Run, rungs: list[list[Shape]], finest: bool) -> Iterator[Callable[[], None]]:
+    """Compilations in the order in which the estimate will most likely need them."""
+    likely = rungs if finest else rungs[: 2 if len(run.recordings) > 1 else 1]
+    others, width = _others(likely[-1], _ratio(likely[-1])), run.budget.width
+    for shapes in likely:
+        yield lambda shapes=shapes: prepare(run.problems(shapes), width)
+    yield lambda: prepare(run.problems(others), derivatives=False)
+    if finest:  # else that of the rung before
+        yield lambda: prepare(run.problems(others), width)
+
+
+def _first(run: _Run, shapes: list[Shape], leads_on: bool) -> tuple[_Run, _Rung]:
+    """The search on the first meshes; of several recordings a second one, by their weights."""
+    at = _searched(run, shapes, None, leads_on)
+    if len(run.recordings) == 1:
+        return run, at
+    theta = at.found.theta
+    alone = each_alone(at.found.problems, run.budget, theta, run.key, run.derive, run.progress)
+    run = run._replace(weights=weights(alone))
+    return run, _searched(run, shapes, theta, leads_on)
+
+
+def _refined(run: _Run, at: _Rung, finer: list[list[Shape]], finest: bool) -> tuple[_Rung, str]:
+    """The end on the meshes that resolve the fabric, and why finer ones were refused, or ""."""
+    if not finer:
+        return _looked_again(run, at), ""
+    for shapes in finer:
+        is_last = shapes is finer[-1]
+        if is_last and not finest:
+            at = _at_its_end(run, at)
+            if not is_too_coarse(run.recordings, *at.fabric):
+                break
+        try:
+            at = _gone_on(at, _searched(run, shapes, at.found.theta, leads_on=not is_last))
+        except RuntimeError as error:
+            if finest or isinstance(error, jax.errors.JaxRuntimeError):  # out of memory, say
+                raise
+            tell(run.progress, f"the finer mesh diverged: back to {_named(max(at.shapes))}")
+            refused = f"{_named(max(shapes))} vertices, which it needs: {error}"
+            return at if is_last else _at_its_end(run, at), refused
+    return at, ""
+
+
+def _searched(run: _Run, shapes: list[Shape], start: Theta | None, leads_on: bool) -> _Rung:
+    """A search on some meshes, near a `start` where there is one."""
+    budget, path = run.budget, run.checkpoint
+    name = _named(max(shapes))  # a pull's is that of the rung before on the last one
+    if start is not None:
+        budget = near(budget)
+        short = name.replace(" ", "")
+        path = path and path.with_suffix(f".{short}{'' if leads_on else '.end'}.npz")
+    found = search(
+        run.problems(shapes),
+        budget._replace(leads_on=leads_on),
+        start=start,
+        checkpoint=path,
+        progress=run.progress,
+        derive=run.derive,
+        words=f"descents on {name} vertices",
+        key=run.key,
+    )
+    return _Rung(shapes, found)
+
+
+def _at_its_end(run: _Run, at: _Rung) -> _Rung:
+    """A rung at its end, where it may be softer, and after another look from elsewhere."""
+    return _looked_again(run, _searched(run, at.shapes, at.found.theta, leads_on=False))
+
+
+def _looked_again(run: _Run, at: _Rung) -> _Rung:
+    found = look_again(at.found, run.budget, progress=run.progress, key=run.key)
+    return at._replace(found=found)
 
 
 def descend_weighed(
@@ -158,29 +210,21 @@ def descend_weighed(
 ) -> Estimate:
     """`r2s.estimation.judgement.descend` on the meshes that the problems have; of several
     recordings each counts by how well it can be followed alone (`weights`)."""
-    derive = remembering()
-    saved = {"progress": progress, "derive": derive, "key": key}
-    found = search(problems, budget, checkpoint=checkpoint, **saved)
+    found = search(problems, budget, checkpoint=checkpoint, progress=progress, key=key)
     if len(problems) > 1:
-        counts = weights(each_alone(problems, budget, found.theta, key, derive, progress))
-        problems = _weighed(problems, counts)
-        path = checkpoint and checkpoint.with_suffix(".weighed.npz")
-        found = search(problems, near(budget), start=found.theta, checkpoint=path, **saved)
+        alone = each_alone(problems, budget, found.theta, key, found.derive, progress)
+        found = search(
+            _weighed(problems, weights(alone)),
+            near(budget),
+            start=found.theta,
+            checkpoint=checkpoint and checkpoint.with_suffix(".weighed.npz"),
+            progress=progress,
+            derive=found.derive,
+            key=key,
+        )
     return judged(
         found, budget, approach=approach, checkpoint=checkpoint, progress=progress, key=key
     )
-
-
-class _Rung(NamedTuple):
-    """What was found on the meshes of some shapes, one for each recording."""
-
-    shapes: list[Shape]
-    found: Search
-
-    @property
-    def fabric(self) -> tuple[Fabric, list[Shape]]:
-        """The fabric that was found, and on which meshes."""
-        return self.found.fabric, self.shapes
 
 
 def _gone_on(at: _Rung, finer: _Rung) -> _Rung:

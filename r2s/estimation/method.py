@@ -54,7 +54,7 @@ class Budget(NamedTuple):
       frames. The end of a long motion can depend on the fabric so steeply that a loss over all of
       it is low nowhere but near the truth; the loss of its beginning leads there.
     - `around`: an even number of places around the end, from which Gauss-Newton steps are taken;
-      the standard errors grow by how far these steps end from it, see `covariance.covariance_at`.
+      the standard errors grow by how far these steps end from it, see `standard_errors`.
     - `evaluations`: simulations of a search without derivatives.
     - `leads_on`: whether other descents go on from the end of these, on a finer mesh. Such a one
       ends within about half a standard error, as all do that are not in the last stage.

@@ -3,6 +3,8 @@
 A loss over a motion has several minima, and a descent says nothing of those that it did not see.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -33,13 +35,13 @@ def look_again(
     """
     problems, ends, looks = found.problems, [found], 1
     once = budget._replace(coarse=0, starts=1, near=False, leads_on=True)
-    more = {"derive": found.derive, "progress": progress, "key": key}
+    again = partial(search, problems, derive=found.derive, progress=progress, key=key)
     while looks < MOST:
         start = _draw(problems[0].space, jr.fold_in(key, looks))
         looks += 1
         try:
             words = f"search {looks}, from another start"
-            ends.append(search(problems, once, start=start, words=words, **more))
+            ends.append(again(once, start=start, words=words))
         except RuntimeError as error:
             if isinstance(error, jax.errors.JaxRuntimeError):  # out of memory, say
                 raise
@@ -53,11 +55,15 @@ def look_again(
     others = tuple(each.theta for each in likely if each is not best)
     if best is not found:
         to_the_end = once._replace(shares=(), near=True, leads_on=False)
-        best = search(problems, to_the_end, start=best.theta, words="its end", **more)
+        best = again(to_the_end, start=best.theta, words="its end")
         ends.append(best)
     lost = f"none of {looks - 1} searches from other starts fits as well"
-    told = {"reached": (alike, looks), "unsure": "" if alike > 1 else lost}
-    return best._replace(seconds=sum(each.seconds for each in ends), others=others, **told)
+    return best._replace(
+        seconds=sum(each.seconds for each in ends),
+        others=others,
+        reached=(alike, looks),
+        unsure="" if alike > 1 else lost,
+    )
 
 
 def _draw(space: ParameterSpace, key: PRNGKeyArray) -> Float[Array, " dim"]:
