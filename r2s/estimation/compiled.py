@@ -33,6 +33,7 @@ predicted = compile_once(predict)
 _sensitivities = compile_once(sensitivities)
 _loss_from = compile_once(gauss_newton.loss_from)
 _normal_from = compile_once(gauss_newton.normal_from)
+prior_weight = eqx.filter_jit(gauss_newton.prior_weight)
 _losses = eqx.filter_jit(eqx.filter_vmap(gauss_newton.loss_at, in_axes=(None, 0)))
 _normals = eqx.filter_jit(eqx.filter_vmap(gauss_newton.normal_at, in_axes=(None, 0, 0, None)))
 

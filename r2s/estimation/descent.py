@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from r2s.compilation import clear_in_time
 from r2s.estimation import checkpoint as checkpoints
 from r2s.estimation import gauss_newton
-from r2s.estimation.compiled import Derive, losses_at, normals_at, remembering
+from r2s.estimation.compiled import Derive, losses_at, normals_at, prior_weight, remembering
 from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
 from r2s.estimation.least_squares import Damping
 from r2s.estimation.method import Budget, Progress, tell
@@ -54,7 +54,6 @@ _propose = eqx.filter_jit(gauss_newton.propose)
 _accept = eqx.filter_jit(gauss_newton.accept)
 _objective = eqx.filter_jit(gauss_newton.objective)
 _remaining = eqx.filter_jit(gauss_newton.remaining)
-_weight = eqx.filter_jit(gauss_newton.prior_weight)
 
 
 DEFAULT = Budget(shares=(0.25, 0.5))
@@ -200,7 +199,7 @@ def _next(problems: Problems, budget: Budget, rows: list[Row], derive: Derive) -
     _, best = _best(row)
     now = int(best.stage)
     stage = _rows_of_stage(rows, now)
-    prior = _weight(problems, best.normal)
+    prior = prior_weight(problems, best.normal)
     stop = _stop(budget, now)
     kept_on = _kept(row, len(stage))
     moving = [i for i in kept_on if not _arrived(problems, stage, i, prior, stop)]
@@ -281,7 +280,7 @@ def _stop(budget: Budget, stage: int) -> Stop:
 
 def has_arrived(found: Search, budget: Budget) -> bool:
     """Whether the best descent of a search is at its end, see `_arrived`."""
-    now, prior = int(found.best.stage), _weight(found.problems, found.best.normal)
+    now, prior = int(found.best.stage), prior_weight(found.problems, found.best.normal)
     stage = _rows_of_stage(found.rows, now)
     return _arrived(found.problems, stage, found.which, prior, _stop(budget, now))
 

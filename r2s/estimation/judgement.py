@@ -4,20 +4,19 @@ import dataclasses
 import time
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimation import gauss_newton, mesh_bias
+from r2s.estimation import mesh_bias
 from r2s.estimation.agreement import (
     agreement,
     asks_for_density,
     with_density,
     with_free_density,
 )
-from r2s.estimation.compiled import Derive, loss_from, predictions_at
+from r2s.estimation.compiled import Derive, loss_from, predictions_at, prior_weight
 from r2s.estimation.descent import DEFAULT, Row, Search, has_arrived, search, stacked
 from r2s.estimation.estimate import Agreement, Estimate
 from r2s.estimation.gauss_newton import Descent, Problems, recording_weights, theta_indices
@@ -29,8 +28,6 @@ from r2s.estimation.nuisances import nuisances
 from r2s.estimation.prediction import Theta, fabric_at
 from r2s.estimation.problem import Problem
 from r2s.estimation.standard_errors import covariance_at
-
-_weight = eqx.filter_jit(gauss_newton.prior_weight)
 
 
 def descend(
@@ -84,7 +81,7 @@ def judged(
     If it is coarser, places around the end, each recording alone and a density are tried on it.
     """
     began, problems = time.perf_counter(), found.problems
-    best, prior = found.best, _weight(problems, found.best.normal)
+    best, prior = found.best, prior_weight(problems, found.best.normal)
     predicted = found.derive(problems, best.theta, budget.width)
     coarse, beside = coarser_of(problems, other_mesh)
     around = jax.random.fold_in(key, 1)

@@ -12,15 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimation.compiled import Derive, derivatives_at, normal_from, normals_at
-from r2s.estimation.gauss_newton import (
-    MARGIN,
-    Descent,
-    Normal,
-    Problems,
-    prior_terms,
-    prior_weight,
-)
+from r2s.estimation.compiled import Derive, derivatives_at, normal_from, normals_at, prior_weight
+from r2s.estimation.gauss_newton import MARGIN, Descent, Normal, Problems, prior_terms
 from r2s.estimation.method import Budget
 from r2s.estimation.prediction import Theta
 
@@ -107,7 +100,6 @@ def step_end(problems: Problems, theta: Theta, normal: Normal, prior) -> Theta:
     return theta - jnp.where(finite, step, 0)
 
 
-_weight = eqx.filter_jit(prior_weight)
 _covariance = eqx.filter_jit(covariance)
 _steps_apart = eqx.filter_jit(steps_apart)
 _sample_around = eqx.filter_jit(sample_around)
@@ -137,7 +129,7 @@ def covariance_at(
         normal = normal_from(there, end.theta, derive(there, end.theta, budget.width), end.scale)
         here = dataclasses.replace(end, normal=normal)
     apart = _apart(there, here, budget, key)
-    prior = _weight(problems, end.normal)
+    prior = prior_weight(problems, end.normal)
     return np.asarray(_covariance(problems, end, prior, apart, is_truth))
 
 
@@ -147,7 +139,7 @@ def _apart(
     """How far steps from places around the end of a descent lead from where its own leads."""
     if not budget.around:
         return jnp.zeros((0, len(end.theta)), float)
-    prior = _weight(problems, end.normal)
+    prior = prior_weight(problems, end.normal)
     places = list(_sample_around(problems, end, prior, budget.around, key))
     normals = normals_at(problems, places, [end.scale] * len(places), budget.width)
     return _steps_apart(problems, end, prior, list(zip(places, normals, strict=True)))
