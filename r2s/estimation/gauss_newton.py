@@ -22,7 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from r2s.estimation import normal_equations
 from r2s.estimation.least_squares import Damping, at_bound, damped, newton_step, proposed
@@ -202,13 +202,19 @@ def scatter(
     - `precision`, `weight` [m^2]: of the prior.
     """
     whole = jnp.sum(matrices, axis=0) + weight * precision
+    root, inverse = _roots(whole)
     # a cluster that alone tells something would leave nothing behind, but for rounding
     share = 1 - 16 * jnp.finfo(scores.dtype).eps
-    inverse = jnp.linalg.inv(whole)
-    left = jnp.eye(len(whole), dtype=scores.dtype)[None] - share * matrices @ inverse
+
+    def without(cluster):
+        matrix, score = cluster
+        parts, directions = jnp.linalg.eigh(inverse.T @ matrix @ inverse)
+        left = 1 - share * jnp.clip(parts, 0, 1)
+        return inverse @ (directions @ (directions.T @ (inverse.T @ score) / left))
+
     # one by one: batches of LAPACK in two programs at once wait for each other for ever
-    alone = jax.lax.map(lambda each: jnp.linalg.solve(*each), (left, scores))
-    away = alone @ inverse
+    away = jax.lax.map(without, (matrices, scores))
+    alone = away @ root @ root.T
     squares = jnp.einsum("cu,uv,cv->c", away, precision, away)
     alone = alone / jnp.sqrt(jnp.maximum(squares, 1))[:, None]
     return _larger(alone.T @ alone, jnp.einsum("c,cuv->uv", noise, matrices), whole)
@@ -216,12 +222,17 @@ def scatter(
 
 def _larger(one: Array, other: Array, metric: Array) -> Float[Array, "theta theta"]:
     """The larger of two positive matrices in each direction in which a metric tells them apart."""
-    sizes, axes = jnp.linalg.eigh(metric)
-    lengths = jnp.sqrt(jnp.maximum(sizes, jnp.finfo(sizes.dtype).eps * sizes[-1]))
-    root, inverse = axes * lengths[None], axes / lengths[None]
+    root, inverse = _roots(metric)
     apart, directions = jnp.linalg.eigh(inverse.T @ (one - other) @ inverse)
     absolute = (directions * jnp.abs(apart)[None]) @ directions.T
     return (one + other + root @ absolute @ root.T) / 2
+
+
+def _roots(matrix: Float[Array, "theta theta"]) -> tuple[Array, Array]:
+    """R and the inverse of its transpose, of a positive matrix R R^T, but for rounding."""
+    sizes, axes = jnp.linalg.eigh(matrix)
+    lengths = jnp.sqrt(jnp.maximum(sizes, jnp.finfo(sizes.dtype).eps * sizes[-1]))
+    return axes * lengths[None], axes / lengths[None]
 
 
 def prior_terms(problems: Problems, theta: Theta) -> tuple[Theta, Float[Array, "theta theta"]]:
@@ -288,11 +299,20 @@ def propose(problems: Problems, descent: Descent, prior) -> Theta:
     return proposed(descent.theta, gradient, matrix, damping, low, high, longest)
 
 
+def is_finite(normal: Normal) -> Bool[Array, ""]:
+    """Whether the loss and all its derivatives are finite."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(normal)]))
+
+
 def accept(problems: Problems, descent: Descent, trial: Theta, tried: Normal, prior) -> Descent:
-    """The descent after a trial: moved if that lowers the objective, else damped more."""
+    """The descent after a trial: moved if that lowers the objective, else damped more.
+
+    Where a derivative is not finite it does not move: it could neither go on from there, nor say
+    how well its place is known.
+    """
     new = objective(problems, trial, tried.loss, prior)
     old = objective(problems, descent.theta, descent.normal.loss, prior)
-    better = new < old
+    better = (new < old) & is_finite(tried)
     damping = damped(Damping(descent.damping, descent.growth), better)
     return Descent(
         jnp.where(better, trial, descent.theta),

@@ -19,7 +19,13 @@ from r2s.estimation.agreement import (
 from r2s.estimation.compiled import Derive, loss_from, predictions_at, prior_weight
 from r2s.estimation.descent import DEFAULT, Row, Search, has_arrived, search, stacked
 from r2s.estimation.estimate import Agreement, Estimate
-from r2s.estimation.gauss_newton import Descent, Problems, recording_weights, theta_indices
+from r2s.estimation.gauss_newton import (
+    Descent,
+    Problems,
+    is_finite,
+    recording_weights,
+    theta_indices,
+)
 from r2s.estimation.law_error import law_error
 from r2s.estimation.mesh_bias import OtherMesh, coarser_of
 from r2s.estimation.method import Budget, Progress, tell
@@ -28,6 +34,8 @@ from r2s.estimation.nuisances import nuisances
 from r2s.estimation.prediction import Theta, fabric_at
 from r2s.estimation.problem import Problem
 from r2s.estimation.standard_errors import covariance_at
+
+NO_DERIVATIVE = "the derivative is not finite at the end of the search"
 
 
 def descend(
@@ -99,7 +107,8 @@ def judged(
         if theta is not best.theta:
             best, seen = dataclasses.replace(best, theta=theta), predictions_at(problems, theta)
     seconds = found.seconds + time.perf_counter() - began
-    converged = has_arrived(found, budget) and not found.unsure
+    unsure = found.unsure if is_finite(found.best.normal) else NO_DERIVATIVE
+    converged = has_arrived(found, budget) and not unsure
     loss = loss_from(problems, seen)
     estimate = collect(
         problems, best, found.rows, covariance, approach, seconds, converged, loss, bias
@@ -125,7 +134,7 @@ def judged(
         misfits=missed,
         left_out=left_out(problems, seen, float(best.scale)),
         reached=found.reached,
-        unsure=found.unsure,
+        unsure=unsure,
     )
 
 

@@ -21,6 +21,7 @@ from r2s.estimation.gauss_newton import (
     MARGIN,
     Descent,
     Problems,
+    is_finite,
     least_weight,
     prior_terms,
     recording_weights,
@@ -194,7 +195,7 @@ def settled(
     - `covariance`: of the end, without its mesh's error. `by`: that, see `mesh_error`.
     """
     raw, space = _positive(covariance) + by.covariance, problems[0].space
-    if not isinstance(space, InformedSpace):
+    if not (isinstance(space, InformedSpace) and is_finite(end.normal)):
         return Settled(end.theta, raw, by.bias)
     way, errors = _posterior(problems, end, prior, raw)
     share = _allowed(other, end, way) if space.measured and other.is_finer else 0.0
