@@ -144,12 +144,11 @@ def run(cells: Iterable[Cell], folder: Path, runner: Runner) -> dict[Cell, str]:
         file=sys.stderr,
         flush=True,
     )
-    with progress(total, len(waiting)) as bar:
+    with progress(total, len(waiting), runner.processes) as bar:
         for cell in order.get_ready():
             runner.submit(cell, folder)
         for cell, reason in runner.finished():
             bar.update(seconds[cell])
-            bar.set_postfix_str(f"{cell.kind} {cell.name}")
             if reason:
                 tqdm.write(f"missing: {cell.kind} {cell.name}: {reason}", file=sys.stderr)
                 failed[cell] = reason

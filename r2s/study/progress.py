@@ -8,13 +8,16 @@ from contextlib import contextmanager
 
 from tqdm import tqdm
 
+from r2s.study.durations import in_words
+
 REFRESH, LINES = 1.0, 30.0  # [s] between updates of the bar, and between lines
-SHAPE = "{desc}: {percentage:3.0f} %, {elapsed} elapsed, about {remaining} left{postfix}"
+SHAPE = "{desc}: {percentage:3.0f} %, {elapsed} elapsed{postfix}"
+TRUST = 300.0  # [s] that count as done as fast as expected, until cells that are made say more
 
 
 @contextmanager
-def progress(seconds: float, cells: int) -> Iterator[tqdm]:
-    """A bar to update by the expected seconds of each cell that is done, of `seconds` in all.
+def progress(seconds: float, cells: int, processes: int) -> Iterator[tqdm]:
+    """A bar to update by the expected CPU seconds of each cell that is done, of `seconds` in all.
 
     It moves while cells are running: the main thread waits for them.
     """
@@ -25,6 +28,9 @@ def progress(seconds: float, cells: int) -> Iterator[tqdm]:
 
         def show() -> None:
             while not stop.wait(REFRESH if is_terminal else LINES):
+                pace = (TRUST + bar.format_dict["elapsed"]) / (TRUST + bar.n / processes)
+                left = pace * (seconds - bar.n) / processes
+                bar.set_postfix_str(f"about {in_words(left)} left", refresh=False)
                 if is_terminal:
                     bar.refresh()
                 else:
