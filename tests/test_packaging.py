@@ -15,7 +15,9 @@ from pathlib import Path
 import pytest
 
 import r2s
+from r2s.commands.study import Study
 from r2s.recordings.manifest import default_manifest
+from r2s.study import matrix
 
 ROOT = Path(__file__).parents[1]
 MANIFESTS = ROOT / "data_manifests"
@@ -145,3 +147,9 @@ def test_a_wheel_knows_the_data_sets(tmp_path: Path) -> None:
     assert Path(where) == tmp_path / "site" / "r2s" / "__init__.py"
     named = {line.partition(":")[0] for line in lines if not line.startswith(" ")}
     assert named == {"blanco_mulero", "diffcloud", "rgbench", "study"}
+
+
+def test_make_study_runs_a_preset_that_there_is():
+    text = (ROOT / "Makefile").read_text(encoding="utf-8")
+    (default,) = re.findall(r"^PRESET \?= (\w+)$", text, re.MULTILINE)
+    assert default in matrix.PRESETS and Study(out=ROOT).preset == default
