@@ -4,7 +4,7 @@ A Gaussian process emulates each principal component of the answers, because 80 
 numbers say more of where the target lies than 80 losses (composite Bayesian optimisation, Astudillo
 and Frazier 2019). It is our own beside scikit-optimize, which models a scalar loss alone: its
 estimates of shear, friction and coupling are 0.05, 0.05 and 0.30 of the range off (80 simulations),
-where Bayesian optimisation of the loss had 0.25, 0.10 and 0.60 (44 simulations; docs/physnet.md).
+where Bayesian optimisation of the loss had 0.25, 0.10 and 0.60 (44 simulations; version 0.2.0).
 """
 
 import warnings
