@@ -2,19 +2,22 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.estimation import cma_es, descent
+from r2s.estimation import cma_es, descent, gauss_newton, mesh_bias
 from r2s.estimation.compiled import derivatives_at
 from r2s.estimation.gauss_newton import Descent, Normal, theta_length
+from r2s.estimation.judgement import NO_DERIVATIVE, judged
+from r2s.estimation.mesh_bias import MeshError, OtherMesh
 from r2s.estimation.method import Budget
 from r2s.estimation.problem import NuisancePrior, Problem
-from r2s.fabrics import presets
-from r2s.fabrics.parameters import IsotropicSpace
+from r2s.fabrics import presets, prior
+from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace
 from r2s.scenarios import synthetic
 
 BUDGET = Budget(shares=(0.25, 0.5), starts=2)
@@ -92,3 +95,44 @@ def test_cma_es_refuses_a_shared_doubt_of_two_sizes(problem):
     )
     with pytest.raises(ValueError, match="air"):
         cma_es.search(problems, evaluations=30, key=jr.key(0))
+
+
+def test_a_descent_does_not_go_where_its_derivative_is_not_finite(problem):
+    """However low the loss is there: it could neither go on, nor say how well that is known."""
+    (start,) = row_of(problem, [1e-6])
+    start = dataclasses.replace(start, damping=jnp.asarray(0.1), growth=jnp.asarray(2.0))
+    lower = dataclasses.replace(start.normal, loss=jnp.asarray(5e-7))
+    lost = dataclasses.replace(lower, scatter=lower.scatter.at[0, 0].set(jnp.nan))
+    for tried, is_taken in ((lower, True), (lost, False)):
+        after = gauss_newton.accept((problem,), start, start.theta + 0.1, tried, 0.0)
+        assert (after.theta[0] > start.theta[0]) == is_taken
+        assert (after.damping < start.damping) == is_taken
+
+
+def test_without_a_derivative_an_estimate_is_not_sure_and_knows_what_was_known(problem):
+    def without(problems, theta, width=None):
+        found = derivatives_at(problems, theta, width)
+        return [(seen, jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), s)) for seen, s in found]
+
+    budget = Budget(coarse=0, starts=1, around=0, iterations=3)
+    found = descent.search((problem,), budget, derive=without, key=jr.key(0))
+    estimate = judged(found, budget, key=jr.key(1))
+    assert not estimate.converged and estimate.unsure == NO_DERIVATIVE
+    _, precision = problem.space.prior()
+    widths = np.array([each.width for each in problem.space.ranges])
+    known = np.sqrt(np.diag(np.linalg.inv(np.asarray(precision)))) * widths
+    np.testing.assert_allclose(estimate.standard_errors, known, rtol=1e-5)
+
+
+def test_without_a_derivative_the_error_of_a_mesh_is_added_and_nothing_is_solved(problem):
+    space = OrthotropicSpace.make(0.2)
+    known = dataclasses.replace(problem, space=prior.informed(space, 0.2))
+    size = theta_length((known,))
+    (end,) = row_of(known, [1e-6])
+    lost = dataclasses.replace(end.normal, matrix=jnp.full((size, size), jnp.nan))
+    end = dataclasses.replace(end, normal=lost)
+    by = MeshError(np.full(size, 0.1), np.eye(size))
+    other = OtherMesh((known,), 4 / 3)
+    settled = mesh_bias.settled((known,), other, end, jnp.asarray(jnp.nan), np.eye(size), by)
+    np.testing.assert_allclose(settled.covariance, 2 * np.eye(size), rtol=1e-6)
+    np.testing.assert_array_equal(settled.theta, end.theta)

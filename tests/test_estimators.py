@@ -202,22 +202,6 @@ def test_a_marker_that_is_off_in_every_frame_is_one_error(pulled):
     )
 
 
-def test_a_descent_does_not_go_where_its_derivative_is_not_finite(small):
-    """However low the loss is there: it could neither go on, nor say how well that is known."""
-    theta = jnp.full(gauss_newton.theta_length((small,)), 0.5)
-    size = len(theta)
-    part = jnp.asarray(1e-6, float)
-    before = gauss_newton.Normal(part, part, part, jnp.ones(size), jnp.eye(size), jnp.eye(size))
-    damping, growth = jnp.asarray(0.1, float), jnp.asarray(2.0, float)
-    start = Descent(theta, before, damping, growth, part, jnp.asarray(0))
-    lower = dataclasses.replace(before, loss=part / 2)
-    lost = dataclasses.replace(lower, scatter=lower.scatter.at[0, 0].set(jnp.nan))
-    for tried, is_taken in ((lower, True), (lost, False)):
-        after = gauss_newton.accept((small,), start, theta + 0.1, tried, 0.0)
-        assert (after.theta[0] > theta[0]) == is_taken
-        assert (after.damping < start.damping) == is_taken
-
-
 def test_the_scatter_of_a_gradient_is_that_of_the_jackknife():
     """Of a straight line through points: as if each cluster in turn had been left out."""
     random = np.random.default_rng(0)
