@@ -17,7 +17,7 @@ from r2s.study.configuration import MOTIONS
 from r2s.study.drawn import experiment_of
 from r2s.study.ensembles import read_ensemble
 from r2s.study.estimates import EstimateCell
-from r2s.study.evaluations import EvaluationCell, read_measured, read_motion
+from r2s.study.evaluations import EvaluationCell, read_measured, read_motions
 from r2s.study.mujoco_cells import FABRIC, MujocoEnsemble, MujocoRecording
 from r2s.study.mujoco_sheet import Material, Resolution, as_plate, motion, moved
 from r2s.study.sources import SyntheticRecording, read
@@ -151,7 +151,7 @@ def test_ours_predicts_the_sheet_of_mujoco_from_where_it_hangs(tmp_path):
     assert engine.run([judged], tmp_path, engine.Serial()) == {}
     (found,) = read_measured(judged, tmp_path).values()
     assert found["chamfer_real_to_sim"] < 0.03
-    x = read_motion(judged, tmp_path)[0]
+    x = read_motions(judged, tmp_path)[judged.recordings[0].name][0]
     start = motion(experiment_of("fling", 0, True, 0), resolution=cell.resolution)[0]
     assert start[:, 2].min() == pytest.approx(x[:, 2].min(), abs=0.02)
 

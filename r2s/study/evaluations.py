@@ -174,12 +174,6 @@ def read_measured(cell: EvaluationCell, folder: Path) -> dict[str, dict[str, flo
     }
 
 
-def read_motion(cell: EvaluationCell, folder: Path) -> Float[np.ndarray, "frame vertex 3"]:
-    """Positions [m] of the motion beside the first recording."""
-    with result_files(cell, folder) as files, np.load(files / MOTION) as stored:
-        return stored[f"x {cell.recordings[0].name}"]
-
-
 def read_motions(
     cell: EvaluationCell, folder: Path
 ) -> dict[str, Float[np.ndarray, "frame vertex 3"]]:

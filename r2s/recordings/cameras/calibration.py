@@ -147,16 +147,3 @@ def rays(camera: DepthCamera) -> Float[np.ndarray, "down across 2"]:
         directions = (pixels - camera.centre) / camera.focal_length
     directions.setflags(write=False)
     return directions
-
-
-def frustum(camera: DepthCamera) -> Float[np.ndarray, "4 4"]:
-    """The planes around what a camera has in its frame: points (x, y, z, 1) [m] of the world with
-    no product below zero. They go through the corners of its image; between those a lens may bend
-    the border by some pixels."""
-    around = rays(camera)[[0, 0, -1, -1], [0, -1, -1, 0]]
-    corners = np.concatenate([around, np.ones((4, 1))], axis=1)
-    inward = np.cross(corners, np.roll(corners, -1, axis=0))
-    inward /= np.linalg.norm(inward, axis=1, keepdims=True)
-    pose = np.array(camera.to_world)
-    normal = inward @ pose[:3, :3].T
-    return np.concatenate([normal, -normal @ pose[:3, 3:]], axis=1)
