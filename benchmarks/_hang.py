@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import r2s
-from r2s.units import GRAVITY
-from r2s.world.air import Air
-from r2s.world.contact import Table
+from r2s._util.units import GRAVITY
+from r2s.environment.air import Air
+from r2s.environment.contact import Table
 
 SIDE = 1.0  # of the sheet, [m]
 DENSITY = 0.2  # [kg/m^2]

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import r2s
-from r2s.laws.solid import NeoHookean, Solid
-from r2s.mpm import Background, Block, Grid
+from r2s.materials.solid import NeoHookean, Solid
+from r2s.solvers.mpm import Background, Block, Grid
 
 MU, LAMBDA, MASS, VOLUME, GRAVITY, WALLS = 100.0, 100.0, 1.0, 1.0, 9.8, 3  # units of DiffTaichi
 COUNT, NODES, DT = 8192, 128, 1e-4

@@ -10,8 +10,8 @@ import _hang
 import mujoco  # pyright: ignore[reportMissingImports]
 import numpy as np
 
+from r2s._util.units import GRAVITY
 from r2s.export.mujoco import flexcomp
-from r2s.units import GRAVITY
 
 mujoco.set_mju_user_warning(lambda message: None)  # or it writes a log file where it is run
 MODEL = """

@@ -9,8 +9,8 @@ import newton  # pyright: ignore[reportMissingImports]
 import numpy as np
 import warp as wp  # pyright: ignore[reportMissingImports]
 
+from r2s._util.units import GRAVITY
 from r2s.export import newton as export
-from r2s.units import GRAVITY
 
 wp.config.quiet = True
 KIND = "semi_implicit"

@@ -19,8 +19,8 @@ import numpy as np
 from _measure import Line, command_line, keep
 
 import r2s
-from r2s.mpm import Grid, Sheet
-from r2s.mpm.sheet import stable_step
+from r2s.solvers.mpm import Grid, Sheet
+from r2s.solvers.mpm.sheet import stable_step
 
 MOST = 4096  # fabrics, the stiffest of which all batches have the substeps of
 SPREAD = 1.5

@@ -13,7 +13,7 @@ import jax.random as jr
 import optax
 
 import r2s
-from r2s.fabrics import presets
+from r2s.materials import presets
 
 STEPS, FASTEST = 20, 0.5  # [m/s]
 sheet = r2s.rectangle((0.2, 0.2), (4, 4))  # [m]

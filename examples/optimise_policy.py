@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 
 import r2s
-from r2s.fabrics import presets
+from r2s.materials import presets
 
 STEPS, KNOTS, ITERATIONS = 24, 4, 40
 TARGET = jnp.array([0.12, 0.15, 0.001])  # [m]

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 import r2s
-from r2s.fabrics import presets
-from r2s.laws.membrane import OrthotropicMembrane
+from r2s.materials import presets
+from r2s.materials.membrane import OrthotropicMembrane
 
 
 class Stiffening(eqx.Module):

@@ -13,7 +13,7 @@ import numpy as np
 
 import r2s
 from r2s import scenarios
-from r2s.fabrics import presets
+from r2s.materials import presets
 from r2s.recordings.cameras.calibration import DepthCamera, look_at
 from r2s.recordings.cameras.cleaning import Cleaning
 from r2s.recordings.cameras.rgbd import Rig, read_rig, rgbd_recording

@@ -30,10 +30,10 @@ from r2s.estimation.normal_equations import marker_distances, point_distances
 from r2s.estimation.nuisances import free
 from r2s.estimation.prediction import Prediction
 from r2s.estimation.problem import Problem
-from r2s.fabrics import presets, prior
-from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import ParameterSpace
-from r2s.laws.stiffening import SofteningPlate, StiffeningMembrane
+from r2s.materials import presets, prior
+from r2s.materials.fabric import Fabric
+from r2s.materials.parameters import ParameterSpace
+from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
 from r2s.recordings.recording import Recording, load, save
 from r2s.scenarios import synthetic
 from r2s.scenarios.scenario import Scenario, rollout

@@ -10,14 +10,15 @@ import numpy as np
 from _tables import Line
 from scipy import stats
 
+from r2s._util.files import write_json
 from r2s.estimation.diffcloud import DiffCloud
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.estimate_json import as_json, from_json
-from r2s.evaluation import metrics, placement, prediction_error
-from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.informed_space import InformedSpace
-from r2s.fabrics.parameters import ParameterSpace
-from r2s.files import write_json
+from r2s.materials.fabric import Fabric
+from r2s.materials.informed_space import InformedSpace
+from r2s.materials.parameters import ParameterSpace
+from r2s.metrics import placement, prediction_error
+from r2s.metrics.distances import distances
 from r2s.recordings.cameras.views import observed
 from r2s.recordings.recording import Recording, RecordingInfo, gripper_positions
 from r2s.scenarios.scenario import from_recording, resized
@@ -112,7 +113,7 @@ def errors(real: Clouds, others: list[Clouds | None]) -> tuple[float, float]:
 
 def _both_ways(real: Clouds, other: Clouds) -> float:
     pairs = zip(real, other, strict=True)
-    return 1e3 * float(np.mean([metrics.distances(a, b)["chamfer"] for a, b in pairs]))
+    return 1e3 * float(np.mean([distances(a, b)["chamfer"] for a, b in pairs]))
 
 
 def compared(table: dict[str, dict[str, float]], fabrics: list[str], one: str, other: str) -> Line:

@@ -14,7 +14,7 @@ from _tables import Line, made_by
 from scipy.stats import norm
 
 from r2s.estimation.estimate import Estimate
-from r2s.fabrics.fabric import Fabric
+from r2s.materials.fabric import Fabric
 from r2s.study import engine, results, verdicts
 from r2s.study.cells import read_metadata
 from r2s.study.configuration import MOTIONS, ON_CLOTH

@@ -19,8 +19,8 @@ from r2s.estimation.estimate import Estimate
 from r2s.estimation.judgement import descend
 from r2s.estimation.method import Budget
 from r2s.estimation.problem import Problem, default_nuisance_prior
-from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import ParameterSpace
+from r2s.materials.fabric import Fabric
+from r2s.materials.parameters import ParameterSpace
 from r2s.recordings.datasets import known_bar
 from r2s.recordings.readers.swings import read_swing
 from r2s.recordings.recording import Recording

@@ -10,11 +10,11 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from r2s.files import source_hash, write_text
+from r2s._util.files import source_hash, write_text
+from r2s._util.threads import cores
 from r2s.study.cells import Cell
 from r2s.study.environment import processor
 from r2s.study.origins import origins
-from r2s.threads import cores
 
 SOURCE = 16  # hexadecimal digits of a hash
 Line = dict[str, str]  # of a table, by column
@@ -42,8 +42,8 @@ def write(path: Path, lines: Sequence[Line], caption: str, facts: Line | None = 
     """Write a table as CSV.
 
     Its first lines, each after "#", say what it is, which command made it, with which version and
-    source of r2s (`r2s.files.source_hash`), on which machine and when; `facts` replaces any of
-    these, or adds to them.
+    source of r2s (`r2s._util.files.source_hash`), on which machine and when; `facts`
+    replaces any of these, or adds to them.
     """
     told = {
         "table": caption,

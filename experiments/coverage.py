@@ -23,8 +23,8 @@ from r2s import scenarios
 from r2s.estimation.descent import DEFAULT
 from r2s.estimation.judgement import descend
 from r2s.estimation.problem import Problem
-from r2s.fabrics import presets
-from r2s.fabrics.parameters import OrthotropicSpace
+from r2s.materials import presets
+from r2s.materials.parameters import OrthotropicSpace
 from r2s.scenarios import synthetic
 
 TOGETHER = "diffcloud-cloth-lifting+stretching"

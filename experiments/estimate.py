@@ -18,10 +18,10 @@ from _recordings import recordings_in
 from _tables import command_line
 
 import r2s
+from r2s._util.files import write_json
 from r2s.estimation.estimate import describe
 from r2s.estimation.estimate_json import as_json
 from r2s.estimation.method import Method
-from r2s.files import write_json
 
 METHODS = ("diffcloud", "diffcp", "physnet", "pinn")
 DIFFCP_SHAPE = (7, 7)  # vertices of the sheet of material points

@@ -16,8 +16,8 @@ import numpy as np
 from _tables import Line, command_line, keep
 
 from r2s import scenarios
-from r2s.fabrics import presets
-from r2s.geometry.mesh import ELEMENTS
+from r2s.materials import presets
+from r2s.mesh.mesh import ELEMENTS
 from r2s.recordings.recording import corner
 from r2s.scenarios.paths import Route, ease
 from r2s.scenarios.scenario import rollout

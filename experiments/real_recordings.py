@@ -25,7 +25,7 @@ from _swings import predict_swings
 from _tables import command_line, keep
 
 import r2s
-from r2s.fabrics import prior
+from r2s.materials import prior
 from r2s.recordings.recording import cloud
 
 SAMPLES = 8  # of the prior

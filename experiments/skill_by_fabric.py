@@ -20,7 +20,7 @@ from pathlib import Path
 from _skills import predicted, predicted_alone
 from _tables import Line, command_line, resumed
 
-from r2s.fabrics import presets
+from r2s.materials import presets
 
 TOGETHER = "diffcloud-cloth-lifting+stretching"
 CAPTION = (

@@ -33,15 +33,15 @@ from scipy.ndimage import binary_closing, binary_fill_holes, label
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from r2s.cloth.cloth import Cloth
+from r2s._util.extras import require
+from r2s.environment.air import Air
+from r2s.environment.contact import Table
+from r2s.environment.scene import Control, Scene
 from r2s.estimation import cards
-from r2s.extras import require
-from r2s.fabrics import presets
-from r2s.fabrics.fabric import Fabric, constant_laws
-from r2s.geometry.mesh import Mesh, rectangle
-from r2s.world.air import Air
-from r2s.world.contact import Table
-from r2s.world.scene import Control, Scene
+from r2s.materials import presets
+from r2s.materials.fabric import Fabric, constant_laws
+from r2s.mesh.mesh import Mesh, rectangle
+from r2s.solvers.implicit.cloth import Cloth
 
 SPACING, TIMESTEP = 0.02, 0.01  # [m], [s]
 MOVES = ("grasp", "fold", "fling")

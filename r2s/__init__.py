@@ -1,17 +1,13 @@
 """r2s: real-to-sim for fabrics.
 
-Rooms, in the order in which they build on each other:
+Packages, each of which imports only those before it:
 
-- `units`, `failures`: constants and conversions; why a run failed.
-- `geometry`: the sheet at rest, and what a moved one shows. `laws`: energies of one element.
-- `fabrics`: what is estimated. `world`: what a fabric meets: air, table, grippers.
-- `forces`: those of elements, for explicit steps.
-- `cloth`, `mpm`: the two solvers. `solver`: from steps to motions.
+- `mesh`: the sheet at rest, and its strains. `environment`: air, table, grippers.
+- `materials`: fabrics and their laws. `solvers`: motions of a fabric.
 - `recordings`: observations, from files to one form. `scenarios`: the six experiments.
-- `evaluation`: how near a simulation comes. `estimation`: fabrics from recordings.
-- `laboratory`: pulls, cantilevers and drapes, and the fabrics that they tell.
-- `sweep`, `gradient_check`: thousands of fabrics at once; derivatives against differences.
-- `export`, `viewer`, `study`, `commands`: other simulators, pictures, the study, the command line.
+- `metrics`: distances between a simulation and a recording.
+- `estimation`: fabrics from recordings. `laboratory`: fabrics from pulls, cantilevers and drapes.
+- `export`, `viewer`, `study`, `cli`: other simulators, pictures, the study, the command line.
 
 The public names are those of `__init__.pyi`. Each is imported at its first use (PEP 562), so that
 `import r2s` takes no time and settings of the environment can still come before JAX. What changes

@@ -1,7 +1,8 @@
 """The public names, and where each is; `r2s/__init__.py` imports them at first use."""
 
-from r2s.cloth.cloth import Cloth, ClothState
-from r2s.cloth.explicit import ExplicitCloth
+from r2s.environment.air import Air, Fan
+from r2s.environment.contact import Table
+from r2s.environment.scene import Control, Scene
 from r2s.estimation.cards import Card, Provenance
 from r2s.estimation.cards import read as read_card
 from r2s.estimation.cards import write as write_card
@@ -10,25 +11,24 @@ from r2s.estimation.identifiability import sensitivity
 from r2s.estimation.method import Budget, Method
 from r2s.estimation.problem import NuisancePrior, Problem
 from r2s.estimation.registry import METHODS
-from r2s.evaluation.metrics import distances
-from r2s.fabrics import presets
-from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.fold_length import fold_length
-from r2s.fabrics.informed_space import InformedSpace
-from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
-from r2s.fabrics.softening_space import SofteningSpace
-from r2s.fabrics.stiffening_space import StiffeningSpace
-from r2s.failures import Failure
-from r2s.geometry.mesh import Mesh, rectangle
 from r2s.laboratory.cantilever import Cantilever
 from r2s.laboratory.drape import Drape
 from r2s.laboratory.files import read_tests
 from r2s.laboratory.pull import Pull
-from r2s.laws.bending import BendingLaw, HingeBending, HingeLaw
-from r2s.laws.membrane import MembraneLaw, OrthotropicMembrane, SpringMembrane
-from r2s.laws.plate import OrthotropicPlate, PlateBending, PlateLaw
-from r2s.laws.stiffening import StiffeningMembrane
-from r2s.laws.tables import TableBending, TableMembrane
+from r2s.materials import presets
+from r2s.materials.bending import BendingLaw, HingeBending, HingeLaw
+from r2s.materials.fabric import Fabric
+from r2s.materials.fold_length import fold_length
+from r2s.materials.informed_space import InformedSpace
+from r2s.materials.membrane import MembraneLaw, OrthotropicMembrane, SpringMembrane
+from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
+from r2s.materials.plate import OrthotropicPlate, PlateBending, PlateLaw
+from r2s.materials.softening_space import SofteningSpace
+from r2s.materials.stiffening import StiffeningMembrane
+from r2s.materials.stiffening_space import StiffeningSpace
+from r2s.materials.tables import TableBending, TableMembrane
+from r2s.mesh.mesh import Mesh, rectangle
+from r2s.metrics.distances import distances
 from r2s.recordings.manifest import read_recordings
 from r2s.recordings.recording import Recording, RecordingInfo, SheetPlacement, make_recording
 from r2s.recordings.recording import load as load_recording
@@ -38,10 +38,10 @@ from r2s.scenarios.scenario import Scenario, from_recording, rollout
 from r2s.scenarios.solvers import explicit_cloth, material_points
 from r2s.scenarios.standard import Experiment, fling, folding, lifting, shaking, stretching, wind
 from r2s.scenarios.synthetic import record
-from r2s.solver import Solver, Trajectory, predicted_memory, simulate
-from r2s.world.air import Air, Fan
-from r2s.world.contact import Table
-from r2s.world.scene import Control, Scene
+from r2s.solvers.explicit.cloth import ExplicitCloth
+from r2s.solvers.failures import Failure
+from r2s.solvers.implicit.cloth import Cloth, ClothState
+from r2s.solvers.simulate import Solver, Trajectory, predicted_memory, simulate
 
 __all__ = [
     # what a fabric is

@@ -12,7 +12,7 @@ def command() -> int:
     # the threads of OpenBLAS wait for each other over small matrices: a motion on 17 x 17 vertices
     # takes 1.6 times as long on two of them as on one
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from r2s.cli import command
+    from r2s.cli.main import command
 
     return command()
 

@@ -21,16 +21,16 @@ import numpy as np
 import psutil
 import pytest
 
-from r2s.cloth.cloth import Cloth, ClothState
-from r2s.cloth.linear.pattern import Pattern
+from r2s._util.units import GRAVITY
 from r2s.compilation import clear
-from r2s.fabrics.fabric import Fabric
-from r2s.geometry.elements import strains, vertex_masses
-from r2s.geometry.mesh import Mesh, rectangle
-from r2s.units import GRAVITY
-from r2s.world.air import Air
-from r2s.world.contact import Table
-from r2s.world.scene import Control, Scene
+from r2s.environment.air import Air
+from r2s.environment.contact import Table
+from r2s.environment.scene import Control, Scene
+from r2s.materials.fabric import Fabric
+from r2s.mesh.elements import strains, vertex_masses
+from r2s.mesh.mesh import Mesh, rectangle
+from r2s.solvers.implicit.cloth import Cloth, ClothState
+from r2s.solvers.implicit.linear.pattern import Pattern
 
 # Of the tests that take minutes: a group takes less than twenty on two cores, verdicts forty.
 SLOW_GROUPS = (

@@ -14,23 +14,24 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from folders import SHARED
 from jaxtyping import Float, Int, PRNGKeyArray
 
-from r2s.cloth.linear.elimination import Elimination
+from r2s._util.units import GRAVITY
+from r2s.environment.air import Air
+from r2s.environment.contact import Table
+from r2s.environment.scene import Scene
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.judgement import descend
 from r2s.estimation.method import Budget
 from r2s.estimation.problem import Clouds, NuisancePrior, Problem
-from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import OrthotropicSpace
-from r2s.geometry.mesh import Mesh
+from r2s.materials.fabric import Fabric
+from r2s.materials.parameters import OrthotropicSpace
+from r2s.mesh.mesh import Mesh
 from r2s.scenarios.scenario import BRAKE, Scenario, rollout
-from r2s.units import GRAVITY
-from r2s.world.air import Air
-from r2s.world.contact import Table
-from r2s.world.scene import Scene
+from r2s.solvers.implicit.linear.elimination import Elimination
 
-DATA = Path(__file__).parents[2] / "shared" / "data" / "diffsim_reference"
+DATA = SHARED / "data" / "diffsim_reference"
 LIFT, REST, EDGE = "lift1_{}_9_dt10", "rest_{}_9_dt40", "edge_{}_9_dt40"
 WIND = "hang2wind_{}_9_dt10"
 EXACT = NuisancePrior(0.0, 0.0)

@@ -12,14 +12,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from folders import SHARED
 from jaxtyping import Array, Float, Int
 
-from r2s.geometry.bends import hinge_angle
-from r2s.geometry.mesh import Mesh
-from r2s.geometry.strain_samples import green_strain
-from r2s.laws.tables import DiffSimTableBending, DiffSimTableMembrane
+from r2s.materials.tables import DiffSimTableBending, DiffSimTableMembrane
+from r2s.mesh.bends import hinge_angle
+from r2s.mesh.mesh import Mesh
+from r2s.mesh.strain_samples import green_strain
 
-FOLDER = Path(__file__).parents[2] / "shared" / "data" / "diffsim_reference"
+FOLDER = SHARED / "data" / "diffsim_reference"
 FRAMES = 61  # as many as the longest of the recordings, so that all share one compilation
 Positions = Float[Array, "vertex 3"]
 

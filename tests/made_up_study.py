@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pandas as pd
 
-from r2s.geometry.mesh import rectangle
+from r2s.mesh.mesh import rectangle
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
 from r2s.study.motions import Motion
 from r2s.study.statistics.frame import as_frame, labelled

@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from r2s.laws.solid import FixedCorotated, Solid
-from r2s.mpm import Background, Block, Grid
-from r2s.world.scene import Control
+from r2s.environment.scene import Control
+from r2s.materials.solid import FixedCorotated, Solid
+from r2s.solvers.mpm import Background, Block, Grid
 
 
 def lattice(lower, upper, spacing):

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from r2s.geometry import surface as surfaces
-from r2s.geometry.mesh import rectangle
+from r2s.mesh import surface as surfaces
+from r2s.mesh.mesh import rectangle
 from r2s.recordings.cameras.calibration import DepthCamera, look_at
 from r2s.recordings.cameras.cleaning import Cleaning
 from r2s.recordings.cameras.rgbd import Rig

@@ -1,6 +1,6 @@
 """Fabric cards: a fabric or an estimate as a JSON file, to keep, to share, and to simulate again.
 
-A card has the fabric as it is simulated (see `r2s.fabrics.fabric_json`), where the numbers come
+A card has the fabric as it is simulated (see `r2s.materials.fabric_json`), where the numbers come
 from, and, of an estimate, everything that `r2s.estimation.estimate_json.as_json` says except its
 history. A card keeps the numbers of its file, double precision and all, so that writing a card
 that was read gives the same file; its `fabric` is in JAX's default precision. Cards of version
@@ -19,11 +19,12 @@ from typing import Any
 import jax
 import numpy as np
 
+from r2s._util.files import write_json
 from r2s.estimation import estimate_json
 from r2s.estimation.estimate import Estimate
-from r2s.fabrics import presets
-from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.fabric_json import (
+from r2s.materials import presets
+from r2s.materials.fabric import Fabric
+from r2s.materials.fabric_json import (
     LAWS,
     NUMBERS,
     check_keys,
@@ -33,7 +34,6 @@ from r2s.fabrics.fabric_json import (
     fabric_from_json,
     nan_to_null,
 )
-from r2s.files import write_json
 from r2s.recordings.recording import Recording
 
 FORMAT = "r2s-card/2"
@@ -109,7 +109,7 @@ class Card:
 
 
 def preset(name: str) -> Card:
-    """The card of a preset of `r2s.fabrics.presets`; `ValueError` names the presets there are.
+    """The card of a preset of `r2s.materials.presets`; `ValueError` names the presets there are.
 
     >>> preset("black_denim").numbers["density"]
     {'value': 0.32, 'unit': 'kg/m^2'}
@@ -148,7 +148,7 @@ def version() -> str:
 
 
 def write(path: Path | str, card: Card) -> None:
-    """Write a card, whole or not at all; raises as `r2s.files.write_json`."""
+    """Write a card, whole or not at all; raises as `r2s._util.files.write_json`."""
     write_json(path, as_json(card))
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from jax import random
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from r2s._util.extras import require
 from r2s.estimation.diffcp import problems_on_points
 from r2s.estimation.estimate import Estimate, point_estimate
 from r2s.estimation.gauss_newton import Problems, loss_at, theta_length
@@ -19,7 +20,6 @@ from r2s.estimation.method import ANY, Budget, Method, Progress
 from r2s.estimation.normal_equations import Loss
 from r2s.estimation.nuisances import free, nuisances
 from r2s.estimation.problem import Problem, check_shared, read_by_problem
-from r2s.extras import require
 
 DIVERGED = 1.0  # [m^2]: the loss of a run that diverged, above that of any that did not
 WIDTH = 0.25  # of the unit cube: the first standard deviation

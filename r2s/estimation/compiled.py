@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from r2s._util.threads import thread_map
 from r2s.compilation import compile_once
 from r2s.estimation import gauss_newton
 from r2s.estimation.gauss_newton import Normal, Problems, theta_indices
@@ -22,7 +23,6 @@ from r2s.estimation.method import Progress, tell
 from r2s.estimation.prediction import Prediction, Sensitivity, Theta, predict, sensitivities
 from r2s.estimation.problem import Problem, motion_alone
 from r2s.scenarios.scenario import Scenario
-from r2s.threads import thread_map
 
 Predicted = list[tuple[Prediction, Sensitivity]]  # of each recording
 Derive = Callable[[Problems, Theta, float | None], Predicted]  # as `derivatives_at`
@@ -112,7 +112,7 @@ def predictions_at(problems: Problems, theta: Theta) -> list[Prediction]:
 
 def loss_from(problems: Problems, seen: Sequence[Prediction], scale: Array | float = 0.0) -> float:
     """The robust loss [m^2] of what is predicted of each recording; for `scale` [m] see
-    `r2s.evaluation.losses.robust`."""
+    `r2s.metrics.losses.robust`."""
     return float(_loss_from(problems, list(seen), None, jnp.asarray(scale, float)))
 
 

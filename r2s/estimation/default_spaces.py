@@ -9,16 +9,16 @@ import math
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
-from r2s.fabrics import prior
-from r2s.fabrics.parameters import (
+from r2s.materials import prior
+from r2s.materials.parameters import (
     LOSSES,
     IsotropicSpace,
     OrthotropicSpace,
     ParameterSpace,
     Range,
 )
-from r2s.fabrics.softening_space import SOFTENING, SofteningSpace
-from r2s.fabrics.stiffening_space import StiffeningSpace, stiffens
+from r2s.materials.softening_space import SOFTENING, SofteningSpace
+from r2s.materials.stiffening_space import StiffeningSpace, stiffens
 from r2s.recordings.recording import Recording
 
 Law = Literal["linear", "stiffening", "softening", "stiffening+softening"]
@@ -47,7 +47,7 @@ FROM = {
     "E h": "around 100 N/m, where the public code of DiffCP starts; longer would be shorter steps",
     "nu": "isotropic solids, 0 to 0.5",
 }
-"""Of each range: what it is around. The prior is `r2s.fabrics.prior`."""
+"""Of each range: what it is around. The prior is `r2s.materials.prior`."""
 
 
 def with_law(space: ParameterSpace, law: Law) -> ParameterSpace:

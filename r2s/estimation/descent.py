@@ -20,7 +20,7 @@ from r2s.estimation.least_squares import Damping
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import Theta, explain, fabric_at
 from r2s.estimation.problem import beginning, check_shared
-from r2s.fabrics.fabric import Fabric
+from r2s.materials.fabric import Fabric
 
 # of the spread, and between [m]: beyond lies an outlier. At half of it a part of the sheet that the
 # start cannot follow counts for nothing, and never draws the sheet there.

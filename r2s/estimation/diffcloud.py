@@ -18,10 +18,10 @@ from r2s.estimation.mesh_ladder import descend_by_meshes
 from r2s.estimation.method import ANY, Budget, Method, Progress, Reads, frames_that_count
 from r2s.estimation.prediction import Prediction
 from r2s.estimation.problem import POINTS, Problem, read_by_problem
-from r2s.evaluation.losses import one_sided_chamfer
-from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import ParameterSpace, Range
-from r2s.geometry.surface import sample
+from r2s.materials.fabric import Fabric
+from r2s.materials.parameters import ParameterSpace, Range
+from r2s.mesh.surface import sample
+from r2s.metrics.losses import one_sided_chamfer
 from r2s.scenarios.scenario import from_recording
 
 STRETCH = Range("stretch multiplier", "-", 0.05, 10.0, log=False)

@@ -18,11 +18,11 @@ from r2s.estimation.mesh_ladder import descend_weighed
 from r2s.estimation.method import ANY, Budget, Method, Progress, Reads, frames_that_count
 from r2s.estimation.prediction import Prediction
 from r2s.estimation.problem import POINTS, Problem, read_by_problem
-from r2s.evaluation.losses import surface_residuals
-from r2s.fabrics.parameters import ParameterSpace
-from r2s.mpm.sheet import Sheet
+from r2s.materials.parameters import ParameterSpace
+from r2s.metrics.losses import surface_residuals
 from r2s.recordings.recording import Recording
 from r2s.scenarios.solvers import MEMBRANE_DAMPING, material_points
+from r2s.solvers.mpm.sheet import Sheet
 
 WIDTH = 0.02  # of the range: the slope of the exact motion is rough below that
 PUBLISHED_START = {"E h": 100.0, "nu": 0.1}  # where the public code starts

@@ -6,8 +6,8 @@ from typing import Any, Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import ParameterSpace, Range
+from r2s.materials.fabric import Fabric
+from r2s.materials.parameters import ParameterSpace, Range
 
 IDENTIFIABLE = 0.025  # greatest standard error, relative or absolute: two of them are 5 %
 DOUBT, FAR = 4.5, 3.0  # standard errors, and a factor, from which on a density is doubted

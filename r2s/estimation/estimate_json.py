@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from r2s.estimation.estimate import Agreement, Contradiction, Estimate, Misfit, Nuisance
-from r2s.fabrics.fabric_json import fabric_as_json, fabric_from_json
-from r2s.fabrics.parameters import Range
+from r2s.materials.fabric_json import fabric_as_json, fabric_from_json
+from r2s.materials.parameters import Range
 
 FORMAT = "r2s-estimate/3"
 FORMAT_0_2 = "r2s-estimate/2"
@@ -152,7 +152,7 @@ def upgraded(stored: dict[str, Any]) -> dict[str, Any]:
 
 
 def _fabric_0_2(stored: dict[str, Any]) -> dict[str, Any]:
-    """The flat form of a fabric of constant stiffness, as `r2s.fabrics.fabric_json` has it."""
+    """The flat form of a fabric of constant stiffness, as `r2s.materials.fabric_json` has it."""
     membrane = {name.lower(): stored[name] for name in ("C11", "C12", "C22", "C33")}
     bending = {"stiffness": stored["bending"], "poissons_ratio": stored["bending_poissons_ratio"]}
     others = ("density", "damping", "friction", "thickness", "mass_damping")

@@ -8,8 +8,8 @@ from r2s import scenarios
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.identifiability import sensitivity
 from r2s.estimation.problem import Problem
-from r2s.fabrics import presets
-from r2s.fabrics.parameters import OrthotropicSpace
+from r2s.materials import presets
+from r2s.materials.parameters import OrthotropicSpace
 from r2s.scenarios import synthetic
 
 

@@ -62,7 +62,7 @@ class Descent(eqx.Module):
     - `damping`: Levenberg's, [-].
     - `growth`: factor of the damping should the next step fail (Nielsen 1999).
     - `scale`: beyond which distances do not count, [m]; 0: all do, see
-      `r2s.evaluation.losses.robust`.
+      `r2s.metrics.losses.robust`.
     - `stage`: its stage in an estimate, see `iterations` of `r2s.estimation.method.Budget`.
     """
 
@@ -104,7 +104,7 @@ def loss_at(
     """The loss [m^2] at a theta; infinite when a run diverged.
 
     - `loss`: of one recording; None: the robust one.
-    - `scale`: of the robust loss [m], see `r2s.evaluation.losses.robust`.
+    - `scale`: of the robust loss [m], see `r2s.metrics.losses.robust`.
     """
     seen = [predict(each, theta[theta_indices(problems, i)]) for i, each in enumerate(problems)]
     return loss_from(problems, seen, loss, scale)
@@ -136,7 +136,7 @@ def normal_at(
 ) -> Normal:
     """Loss, gradient and Gauss-Newton matrix at a theta.
 
-    - `scale`: of the robust loss [m], see `r2s.evaluation.losses.robust`.
+    - `scale`: of the robust loss [m], see `r2s.metrics.losses.robust`.
     - `width`: over which slopes are taken, see `r2s.estimation.prediction.sensitivities`.
     """
     found = [

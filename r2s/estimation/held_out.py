@@ -1,7 +1,7 @@
 """Is an estimate better than knowing nothing? Told by a recording that it was not made from.
 
 Of three recordings or more one is held out; the estimate is judged on it beside fabrics of which
-nothing but the weight is known (`r2s.fabrics.prior`).
+nothing but the weight is known (`r2s.materials.prior`).
 """
 
 from collections.abc import Sequence
@@ -13,9 +13,9 @@ import numpy as np
 from r2s.compilation import clear_in_time
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.mesh_ladder import in_steps_worth
-from r2s.evaluation import prediction_error
-from r2s.fabrics import prior
-from r2s.fabrics.fabric import Fabric
+from r2s.materials import prior
+from r2s.materials.fabric import Fabric
+from r2s.metrics import prediction_error
 from r2s.recordings.recording import Recording, clouds_are_markers
 from r2s.scenarios.scenario import from_recording, in_denser_air
 

@@ -18,8 +18,8 @@ from r2s.estimation.method import Budget
 from r2s.estimation.prediction import explain
 from r2s.estimation.problem import Problem
 from r2s.estimation.standard_errors import covariance_at
-from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import ParameterSpace, Prior, Range
+from r2s.materials.fabric import Fabric
+from r2s.materials.parameters import ParameterSpace, Prior, Range
 
 NOISE = 3e-3  # [m]: beyond which a distance counts as an outlier's
 

@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from r2s.evaluation.losses import TOUCHING, length, robust_weight, surface_residuals
-from r2s.fabrics.fabric import Fabric
-from r2s.geometry.mesh import Mesh
+from r2s.materials.fabric import Fabric
+from r2s.mesh.mesh import Mesh
+from r2s.metrics.losses import TOUCHING, length, robust_weight, surface_residuals
 from r2s.scenarios.scenario import Scenario, rollout
 
 _motion = eqx.filter_jit(rollout)

@@ -22,7 +22,7 @@ from r2s.estimation.gauss_newton import (
 )
 from r2s.estimation.prediction import Prediction, Sensitivity
 from r2s.estimation.problem import Problem, seen_where
-from r2s.fabrics.stiffening_space import stiffens
+from r2s.materials.stiffening_space import stiffens
 
 # from what stiffness changes between half a pull and all of it, to what it has from small strain:
 # twice that where it grows with the stretch

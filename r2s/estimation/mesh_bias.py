@@ -30,8 +30,8 @@ from r2s.estimation.gauss_newton import (
 )
 from r2s.estimation.prediction import Prediction, Sensitivity, Theta
 from r2s.estimation.problem import Problem, motion_alone
-from r2s.fabrics.informed_space import InformedSpace
-from r2s.geometry.surface import nearest
+from r2s.materials.informed_space import InformedSpace
+from r2s.mesh.surface import nearest
 from r2s.scenarios.resolution import ORDER
 
 RISE, HALVINGS = 1.5, 6  # of a loss, and of the step that raises it by more

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from r2s._util.threads import background
 from r2s.compilation import is_kept
 from r2s.estimation.compiled import Derive, prepare, remembering
 from r2s.estimation.descent import Search, search
@@ -28,13 +29,12 @@ from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import Theta
 from r2s.estimation.problem import Problem
 from r2s.estimation.second_look import LIKELY, look_again
-from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import ParameterSpace
+from r2s.materials.fabric import Fabric
+from r2s.materials.parameters import ParameterSpace
 from r2s.recordings.recording import Recording
 from r2s.scenarios import resolution
 from r2s.scenarios.resolution import Shape
 from r2s.scenarios.scenario import Scenario
-from r2s.threads import background
 
 Recordings = Sequence[Recording]
 

@@ -17,7 +17,7 @@ from r2s.estimation.normal_equations import marker_distances, point_distances
 from r2s.estimation.nuisances import free
 from r2s.estimation.prediction import Prediction
 from r2s.estimation.problem import Problem
-from r2s.evaluation.losses import robust_weight
+from r2s.metrics.losses import robust_weight
 
 STRAY, FEWEST = 5.0, 4  # times the other markers' distance; markers that are needed to say so
 LEAST = 2e-3  # [m], nearer than which no marker is on another cloth: ten times what trackers err
@@ -55,7 +55,7 @@ def left_out(
 ) -> tuple[float, ...]:
     """Of each recording the share [-] of points or markers that lies beyond the scale of the loss.
 
-    - `scale`: [m], see `r2s.evaluation.losses.robust`: what lies there counts for a quarter of what
+    - `scale`: [m], see `r2s.metrics.losses.robust`: what lies there counts for a quarter of what
       lies near.
     """
     shares = []

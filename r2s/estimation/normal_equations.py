@@ -9,7 +9,8 @@ from jaxtyping import Array, Bool, Float
 
 from r2s.estimation.prediction import Prediction, Sensitivity
 from r2s.estimation.problem import FORCE_SCALE, Clouds, Expected, Force, Markers, Problem
-from r2s.evaluation.losses import (
+from r2s.mesh.mesh import Mesh, borders
+from r2s.metrics.losses import (
     TOUCHING,
     length,
     masked_mean,
@@ -18,7 +19,6 @@ from r2s.evaluation.losses import (
     robust_weight,
     surface_residuals,
 )
-from r2s.geometry.mesh import Mesh, borders
 from r2s.recordings.cameras.views import in_view
 
 Scale = Float[Array, ""] | float
@@ -53,7 +53,7 @@ class NormalEquations(eqx.Module):
 def loss_of(problem: Problem, seen: Prediction, scale: Scale = 0.0) -> Float[Array, ""]:
     """The robust mean [m^2] of all that was seen.
 
-    For `scale` [m] see `r2s.evaluation.losses.robust`.
+    For `scale` [m] see `r2s.metrics.losses.robust`.
     """
     mesh, total = problem.scenario.scene.mesh, jnp.zeros((), seen.x.dtype)
     if problem.clouds is not None:
@@ -104,7 +104,7 @@ def marker_distances(problem: Problem, seen: Prediction) -> tuple[Array, Array] 
 
 def point_distances(problem: Problem, seen: Prediction, scale: Scale = 0.0) -> tuple[Array, Array]:
     """How far [m] each point is from the sheet, and which are no padding, by frame and point;
-    empty without clouds. For `scale` [m] see `r2s.evaluation.losses.robust`."""
+    empty without clouds. For `scale` [m] see `r2s.metrics.losses.robust`."""
     if problem.clouds is None:
         return jnp.zeros((0, 0), seen.x.dtype), jnp.zeros((0, 0), bool)
     mesh = problem.scenario.scene.mesh

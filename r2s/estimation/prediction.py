@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from r2s.estimation.problem import OWN, SHARED, Problem
-from r2s.fabrics.fabric import Fabric
+from r2s.materials.fabric import Fabric
 from r2s.scenarios.energy import clamp_force, energy_balance
 from r2s.scenarios.scenario import in_denser_air, resized, rollout
 

@@ -13,9 +13,9 @@ from scipy.spatial import KDTree
 
 from r2s.estimation import initial_shape
 from r2s.estimation.method import Reads, frames_that_count
-from r2s.fabrics.parameters import ParameterSpace
-from r2s.geometry.mesh import Mesh
-from r2s.geometry.surface import nearest
+from r2s.materials.parameters import ParameterSpace
+from r2s.mesh.mesh import Mesh
+from r2s.mesh.surface import nearest
 from r2s.recordings.cameras.views import Views
 from r2s.recordings.recording import Doubt, Recording, check_covered, gripper_positions, subsample
 from r2s.scenarios.scenario import Scenario, from_recording

@@ -15,7 +15,7 @@ from r2s.estimation import gauss_newton
 from r2s.estimation.compiled import loss_from
 from r2s.estimation.descent import Search, search
 from r2s.estimation.method import Budget, Progress, tell
-from r2s.fabrics.parameters import ParameterSpace
+from r2s.materials.parameters import ParameterSpace
 
 ALIKE = 1.02  # times the least loss, within which two ends fit alike
 LIKELY = 1.25  # times that, within which an end shows how far apart minima of a rough loss lie

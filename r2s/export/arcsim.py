@@ -4,8 +4,8 @@ from pathlib import Path
 
 from r2s.export import stiffness
 from r2s.export.stiffness import Loss
-from r2s.fabrics.arcsim import write_material
-from r2s.fabrics.fabric import Fabric
+from r2s.materials.arcsim import write_material
+from r2s.materials.fabric import Fabric
 
 ELSEWHERE = "damping, friction and thickness: ARCSim and DiffSim keep them in their scene files"
 TWICE = "DiffSim uses the numbers twice as stiff: the file has half of them"
@@ -13,7 +13,7 @@ HINGES = "bending by hinges: without a plate's Poisson's ratio, and too stiff ac
 
 
 def write(path: Path | str, fabric: Fabric, name: str = "", *, diffsim: bool = False) -> Loss:
-    """Write a fabric with `r2s.fabrics.arcsim.write_material`, whose errors it raises; what is
+    """Write a fabric with `r2s.materials.arcsim.write_material`, whose errors it raises; what is
     lost.
 
     Membrane and bending stiffness along the yarns are exact.

@@ -4,7 +4,7 @@ MuJoCo's 2-D flex is a solid plate of Young's modulus E [Pa], Poisson's ratio nu
 thickness h [m]: a St. Venant-Kirchhoff membrane in plane stress, of stiffness E h, on the same mesh
 that of r2s to rounding; and hinges with the bending stiffness E h^3 / (12 (1 - nu^2)), which know
 no Poisson's ratio, and are too stiff across diagonals. Both stiffnesses together fix E and h
-(`r2s.laws.solid.plate_solid`): h is not the fabric's thickness, which is the `radius` of its
+(`r2s.materials.solid.plate_solid`): h is not the fabric's thickness, which is the `radius` of its
 contacts. `damping` is a Kelvin-Voigt time [s], as in r2s.
 
 The model has a body for each vertex: masses of their areas, held vertices tied to mocap bodies, and
@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from r2s._util.units import GRAVITY
 from r2s.export import stiffness
 from r2s.export.stiffness import Loss
 from r2s.export.yarns import Springs, sheet_of
-from r2s.fabrics.fabric import Fabric
-from r2s.geometry.mesh import Mesh
-from r2s.laws.solid import plate_solid
-from r2s.units import GRAVITY
+from r2s.materials.fabric import Fabric
+from r2s.materials.solid import plate_solid
+from r2s.mesh.mesh import Mesh
 
 POISSON = (0.0, 0.499)
 RIGID = "mass damping: `r2s.export.mujoco.brake` sets it in the finished model"

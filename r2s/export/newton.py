@@ -25,8 +25,8 @@ import numpy as np
 from r2s.export import stiffness
 from r2s.export.stiffness import Loss
 from r2s.export.yarns import Springs, sheet_of
-from r2s.fabrics.fabric import Fabric
-from r2s.geometry.mesh import Mesh
+from r2s.materials.fabric import Fabric
+from r2s.mesh.mesh import Mesh
 
 Kind = Literal["semi_implicit", "vbd"]
 LARGE = "at large strains the law is neo-Hookean, not of Green strain"

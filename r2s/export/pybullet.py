@@ -13,8 +13,8 @@ import numpy as np
 from r2s.export import stiffness
 from r2s.export.stiffness import Loss, Stiffness
 from r2s.export.yarns import edges_of
-from r2s.fabrics.fabric import Fabric
-from r2s.geometry.mesh import Mesh
+from r2s.materials.fabric import Fabric
+from r2s.mesh.mesh import Mesh
 
 NO_BENDING = "bending: a flat sheet of springs has none"
 CAUCHY = "shear and coupling are what the mesh's diagonals make them"

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
-from r2s.fabrics.fabric import Fabric
-from r2s.geometry.mesh import Mesh
-from r2s.laws.bending import HingeBending
-from r2s.laws.plate import PlateBending
+from r2s.materials.bending import HingeBending
+from r2s.materials.fabric import Fabric
+from r2s.materials.plate import PlateBending
+from r2s.mesh.mesh import Mesh
 
 Stiffness = Float[np.ndarray, "3 3"]
 DIRECTIONS = {"warp": 0.0, "bias": np.pi / 4, "weft": np.pi / 2, "other bias": 3 * np.pi / 4}
@@ -136,7 +136,7 @@ def hinged(mesh: Mesh, stiffness: float) -> dict[str, float]:
     `stiffness`: of the hinges, [N m].
 
     Along the lines of a grid that is `stiffness`; across its diagonals it is more (see
-    `r2s.laws.bending`), and in part three times as much where all diagonals are parallel.
+    `r2s.materials.bending`), and in part three times as much where all diagonals are parallel.
     """
     hinges, plate = HingeBending(jnp.ones((), float)), PlateBending.make(1.0)
     mesh = Mesh.make(np.asarray(mesh.rest), np.asarray(mesh.faces))

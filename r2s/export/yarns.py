@@ -21,8 +21,8 @@ from r2s.export.stiffness import (
     one,
     probes,
 )
-from r2s.fabrics.fabric import Fabric
-from r2s.geometry.mesh import Mesh
+from r2s.materials.fabric import Fabric
+from r2s.mesh.mesh import Mesh
 
 PARALLEL = 1e-6  # [rad]
 NEGLIGIBLE = 1e-6  # of the sheet's stiffness: springs that are at their bound, and cost much

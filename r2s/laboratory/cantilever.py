@@ -17,8 +17,8 @@ from jaxtyping import Array, Float
 from scipy.integrate import solve_ivp
 from scipy.optimize import root_scalar
 
-from r2s.fabrics.fabric import Fabric
-from r2s.units import GRAVITY
+from r2s._util.units import GRAVITY
+from r2s.materials.fabric import Fabric
 
 SLOPE = np.radians(41.5)  # of the standard's plane [rad]
 DEVIATION = 0.03  # relative, of an overhang
@@ -84,7 +84,7 @@ def overhang(fabric: Fabric, direction: float = 0.0, slope: float = SLOPE) -> Fl
     `direction`: of the strip from the warp, [rad]. Of a law whose stiffness follows the curvature
     it takes that of the flat sheet.
 
-    >>> from r2s.fabrics import presets
+    >>> from r2s.materials import presets
     >>> round(float(100 * overhang(presets.black_denim())), 1)  # [cm]
     3.6
     """

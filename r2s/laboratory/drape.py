@@ -15,12 +15,12 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from r2s.cloth.cloth import Cloth
-from r2s.fabrics.fabric import Fabric
-from r2s.geometry.mesh import Mesh
-from r2s.world.air import Air
-from r2s.world.contact import Table
-from r2s.world.scene import Control, Scene
+from r2s.environment.air import Air
+from r2s.environment.contact import Table
+from r2s.environment.scene import Control, Scene
+from r2s.materials.fabric import Fabric
+from r2s.mesh.mesh import Mesh
+from r2s.solvers.implicit.cloth import Cloth
 
 RADII = 0.15, 0.09  # of specimen and support [m]: the 30 cm templates of the standard
 DEVIATION = 0.03  # of a coefficient

@@ -24,12 +24,12 @@ from r2s.estimation.bounded_gauss_newton import BoundedGaussNewton
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import MARGIN
 from r2s.estimation.method import Progress, tell
-from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.informed_space import InformedSpace
-from r2s.fabrics.parameters import UNIFORM_DEVIATION, ParameterSpace
 from r2s.laboratory.cantilever import Cantilever, overhang
 from r2s.laboratory.drape import Drape
 from r2s.laboratory.pull import Pull
+from r2s.materials.fabric import Fabric
+from r2s.materials.informed_space import InformedSpace
+from r2s.materials.parameters import UNIFORM_DEVIATION, ParameterSpace
 
 Test = Pull | Cantilever | Drape
 

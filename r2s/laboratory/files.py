@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from r2s.files import parse
+from r2s._util.files import parse
 from r2s.laboratory.cantilever import Cantilever
 from r2s.laboratory.drape import DEVIATION, RADII, Drape
 from r2s.laboratory.estimate import Test

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from r2s.extras import require
+from r2s._util.extras import require
 from r2s.laboratory.pull import SPECIMEN, Pull
 
 CLAMP = 0.0355  # [m]

@@ -2,7 +2,7 @@
 
 The model is a strip in uniform strain with free sides: it stretches as it is told, and contracts
 and shears as costs it least. Clamps hold the width: a strip four times as long as wide pulls within
-3 % of it, a square one of an isotropic sheet within 15 % (`tests/test_laboratory.py`).
+3 % of it, a square one of an isotropic sheet within 15 % (`tests/laboratory/test_laboratory.py`).
 """
 
 from collections.abc import Sequence
@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r2s.fabrics.fabric import Fabric
-from r2s.laws.membrane import MembraneLaw
+from r2s.materials.fabric import Fabric
+from r2s.materials.membrane import MembraneLaw
 
 SAMPLES = 24  # of a curve, evenly over its stretch
 SPECIMEN = 0.05  # relative, by which specimens of a fabric differ (standard deviation)

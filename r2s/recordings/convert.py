@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 
-from r2s.extras import require
-from r2s.files import write_text
+from r2s._util.extras import require
+from r2s._util.files import write_text
 from r2s.recordings.manifest import (
     Manifest,
     manifest_for,

@@ -11,8 +11,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from r2s.extras import require
-from r2s.files import read_json
+from r2s._util.extras import require
+from r2s._util.files import read_json
 from r2s.recordings.manifest import (
     Manifest,
     default_manifest,

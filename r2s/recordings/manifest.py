@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from r2s.files import read_json
+from r2s._util.files import read_json
+from r2s._util.units import positive
 from r2s.recordings.cameras.rgbd import find_rig, read_clouds, read_rig
 from r2s.recordings.cameras.views import Views, shifted
 from r2s.recordings.readers.clouds import find_frames, read_cloud, read_values
@@ -22,7 +23,6 @@ from r2s.recordings.recording import (
     SheetPlacement,
     make_recording,
 )
-from r2s.units import positive
 
 Vector = tuple[float, float, float]
 Watch = Callable[[Iterable[Any]], Iterable[Any]]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Integer
 
-from r2s.files import read_npz, write_npz
+from r2s._util.files import read_npz, write_npz
 from r2s.recordings.datasets import known_bar
 from r2s.recordings.manifest import manifest_for, read_recording, read_recordings
 from r2s.recordings.readers.swings import is_swing, read_swing

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from r2s.files import parse, read_npz, write_npz
+from r2s._util.files import parse, read_npz, write_npz
 from r2s.recordings.cameras.views import Views
 from r2s.recordings.readers.clouds import draw_points, voxel_means
 

@@ -7,15 +7,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from r2s.fabrics.fabric import Fabric
-from r2s.geometry.elements import strains, vertex_masses
-from r2s.geometry.mesh import Mesh
-from r2s.geometry.strain_samples import on_samples
-from r2s.laws.wrinkling import membrane_on_samples
+from r2s._util.units import GRAVITY
+from r2s.environment.drag import drag_on_vertices
+from r2s.environment.scene import Control
+from r2s.materials.fabric import Fabric
+from r2s.materials.wrinkling import membrane_on_samples
+from r2s.mesh.elements import strains, vertex_masses
+from r2s.mesh.mesh import Mesh
+from r2s.mesh.strain_samples import on_samples
 from r2s.scenarios.scenario import Scenario, SheetSolver, as_cut, begin, stepped
-from r2s.units import GRAVITY
-from r2s.world.drag import drag_on_vertices
-from r2s.world.scene import Control
 
 Energies = Float[Array, " frame"]
 

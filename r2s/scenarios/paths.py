@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from scipy.spatial.transform import Rotation
 
+from r2s._util.units import not_negative, positive
 from r2s.recordings.recording import SheetPlacement, corner
-from r2s.units import not_negative, positive
 
 KNOT_RATE = 120.0  # [1/s]: in a fling of 20 m/s^2 the speed jumps by 0.17 m/s from knot to knot
 UP = np.array([0.0, 0.0, 1.0])

@@ -12,8 +12,8 @@ import math
 import numpy as np
 
 from r2s.compilation import compile_once
-from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.fold_length import fold_length
+from r2s.materials.fabric import Fabric
+from r2s.materials.fold_length import fold_length
 from r2s.scenarios.standard import SIDE
 
 Shape = tuple[int, int]
@@ -76,7 +76,7 @@ def shape_for(
 ) -> Shape:
     """The coarsest of some meshes (`ladder`) whose error is `enough` [m]; else the finest.
 
-    >>> from r2s.fabrics import presets
+    >>> from r2s.materials import presets
     >>> shape_for(presets.black_denim(), (0.45, 0.45), "lifting")
     (17, 17)
     """

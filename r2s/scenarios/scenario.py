@@ -9,18 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from r2s.cloth.cloth import Cloth, prepare_mesh
-from r2s.cloth.linear.elimination import Elimination
-from r2s.cloth.self_contact.detection import SelfContact
-from r2s.fabrics.fabric import Fabric
-from r2s.geometry.mesh import Mesh, corner, rectangle
-from r2s.geometry.mesh import resized as resized_mesh
-from r2s.laws.turned import TurnedMembrane
+from r2s.environment.air import Air, Fan
+from r2s.environment.contact import Table
+from r2s.environment.scene import Control, Scene, along_path
+from r2s.materials.fabric import Fabric
+from r2s.materials.turned import TurnedMembrane
+from r2s.mesh.mesh import Mesh, corner, rectangle
+from r2s.mesh.mesh import resized as resized_mesh
 from r2s.recordings.recording import Recording, SheetPlacement
-from r2s.solver import Solver, Trajectory, simulate
-from r2s.world.air import Air, Fan
-from r2s.world.contact import Table
-from r2s.world.scene import Control, Scene, along_path
+from r2s.solvers.contact.detection import SelfContact
+from r2s.solvers.implicit.cloth import Cloth, prepare_mesh
+from r2s.solvers.implicit.linear.elimination import Elimination
+from r2s.solvers.simulate import Solver, Trajectory, simulate
 
 CLEARANCE = 1e-3  # [m], between the table and a sheet that lies on it
 LEAD_IN = 0.5  # [s], in which the grippers go from the sheet at rest to where their path begins
@@ -58,7 +58,7 @@ class Scenario(eqx.Module):
     of as many frames and knots.
 
     - `scene`: sheet, table, air, fan, held vertices.
-    - `elimination`, `self_contact`: of the cloth solver, see `r2s.cloth.cloth.Cloth`.
+    - `elimination`, `self_contact`: of the cloth solver, see `r2s.solvers.implicit.cloth.Cloth`.
     - `start`: positions at rest, [m].
     - `path`, `path_times`: of the held vertices, [m] and [s].
     - `first_time`: of the first frame, [s].
@@ -119,7 +119,7 @@ def from_placement(
     """A scenario for a rectangular sheet, held at named corners, over a table.
 
     - `path` [m], `path_times` [s]: of the grippers. `times`: of the frames, [s].
-    - `shape`, `elements`: of the mesh (`r2s.geometry.mesh.rectangle`).
+    - `shape`, `elements`: of the mesh (`r2s.mesh.mesh.rectangle`).
     - `clamps`: pairs of held corners: all of the side between them is held, straight and evenly
       spread.
     - `wind`: of a fan in front of the sheet's middle, which starts with the first frame, [m/s].
@@ -361,7 +361,7 @@ class BrakedState(eqx.Module):
 
     @property
     def failure(self) -> Int[Array, ""]:
-        """The first `r2s.failures.Failure` so far."""
+        """The first `r2s.solvers.failures.Failure` so far."""
         return self.inner.failure
 
 

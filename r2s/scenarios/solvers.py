@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 
-from r2s.cloth.explicit import ExplicitCloth
-from r2s.fabrics.fabric import Fabric
-from r2s.forces.viscosity import RELAXATION
-from r2s.mpm.grid import Grid
-from r2s.mpm.sheet import Sheet, longest_edge, stable_step
+from r2s.materials.fabric import Fabric
 from r2s.scenarios.scenario import Scenario
+from r2s.solvers.explicit.cloth import ExplicitCloth
+from r2s.solvers.explicit.viscosity import RELAXATION
+from r2s.solvers.mpm.grid import Grid
+from r2s.solvers.mpm.sheet import Sheet, longest_edge, stable_step
 
 # [s]: a held vertex goes straight in a step. At 10 m/s^2 its path is off by 0.09 mm in the middle.
 MAX_EXPLICIT_STEP = 1 / 120
@@ -52,7 +52,7 @@ def material_points(
 
     `fabric` is the stiffest that it will be used for. The grid's `spacing` [m] is by default the
     mesh's longest edge over `EDGE`; folds that lie on each other are about a spacing apart. The
-    membrane's damping time [s] is as in `r2s.mpm.Sheet`. The steps fill the time between frames.
+    membrane's damping time [s] is as in `r2s.solvers.mpm.Sheet`. Steps fill a frame.
     Raises `ValueError` when the mesh is too coarse for the grid, or the scenario has
     self-contact of the cloth.
     """

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
+from r2s._util.units import not_negative, positive
 from r2s.recordings.recording import SheetPlacement
 from r2s.scenarios import paths
 from r2s.scenarios.paths import Route
 from r2s.scenarios.scenario import BAR, CLAMPS, CLEARANCE, Scenario, from_placement
-from r2s.units import not_negative, positive
 
 SIDE = 0.45  # [m], the study's sheets
 NUM_FRAMES = 60
@@ -56,7 +56,7 @@ class Experiment(NamedTuple):
         elements: str = "wrinkling",
     ) -> Scenario:
         """On a mesh of `shape` vertices along warp and weft, made of `elements`
-        (`r2s.geometry.mesh.rectangle`); with `self_contact` it does not pass through itself."""
+        (`r2s.mesh.mesh.rectangle`); with `self_contact` it does not pass through itself."""
         return from_placement(
             self.sheet,
             self.table_height,

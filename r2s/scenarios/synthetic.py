@@ -16,9 +16,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.compilation import compile_once
-from r2s.fabrics.fabric import Fabric
-from r2s.geometry.surface import nearest, sample
-from r2s.mpm.sheet import longest_edge
+from r2s.materials.fabric import Fabric
+from r2s.mesh.surface import nearest, sample
 from r2s.recordings.cameras.camera import Camera
 from r2s.recordings.recording import (
     Recording,
@@ -30,7 +29,8 @@ from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
 from r2s.scenarios.paths import Route
 from r2s.scenarios.scenario import Scenario, SheetSolver, rollout
 from r2s.scenarios.standard import SIDE, Experiment
-from r2s.solver import Trajectory
+from r2s.solvers.mpm.sheet import longest_edge
+from r2s.solvers.simulate import Trajectory
 
 SPACING = SIDE * math.sqrt(2) / 80  # [m], between samples of the surface
 POINTS = 2000  # a frame

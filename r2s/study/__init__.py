@@ -8,5 +8,5 @@ The path of data, each step a module:
 - `report`: tables, figures and motions on one page.
 
 Sources, estimates and evaluations are `cells`, which `matrix` lays out by `configuration`, `engine`
-(with `cluster`) makes, and `results` collects. `r2s.commands.study` does all of it.
+(with `cluster`) makes, and `results` collects. `r2s.cli.study` does all of it.
 """

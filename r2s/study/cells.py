@@ -19,7 +19,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar
 
-from r2s.files import source_hash, write_bytes
+from r2s._util.files import source_hash, write_bytes
 from r2s.study.environment import processor
 
 FORMAT = "r2s-cell/1"

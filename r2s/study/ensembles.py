@@ -1,7 +1,7 @@
 """Cells of ensembles: how well a judged motion is known, and what other fabrics do in it.
 
 Members differ from the truth by what no one can see, or by what its mesh and steps leave. Their
-distances from it, over time, are its floor (`r2s.evaluation.horizon`).
+distances from it, over time, are its floor (`r2s.metrics.horizon`).
 """
 
 import dataclasses
@@ -17,11 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from r2s.evaluation.surface_distance import POINTS, to_surface
-from r2s.fabrics import presets
-from r2s.fabrics.fabric import Fabric
-from r2s.geometry.mesh import Mesh
-from r2s.geometry.surface import sample
+from r2s.materials import presets
+from r2s.materials.fabric import Fabric
+from r2s.mesh.mesh import Mesh
+from r2s.mesh.surface import sample
+from r2s.metrics.surface_distance import POINTS, to_surface
 from r2s.recordings.recording import cloud
 from r2s.scenarios.scenario import rollout
 from r2s.scenarios.solvers import explicit_cloth

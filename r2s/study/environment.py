@@ -6,8 +6,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 from r2s import compilation
-from r2s.extras import require
-from r2s.threads import LIMIT
+from r2s._util.extras import require
+from r2s._util.threads import LIMIT
 
 ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 # Compiles a step in 60 to 70 % of the time, and it runs as fast. XLA ends a process whose flags it

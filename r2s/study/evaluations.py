@@ -16,16 +16,16 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Float
 
-from r2s.cloth.explicit import ExplicitCloth
-from r2s.evaluation import prediction_error
-from r2s.evaluation.prediction_error import Motion
-from r2s.fabrics import prior
-from r2s.fabrics.fabric import Fabric
-from r2s.files import write_json
-from r2s.mpm.sheet import Sheet, longest_edge, stable_step
+from r2s._util.files import write_json
+from r2s.materials import prior
+from r2s.materials.fabric import Fabric
+from r2s.metrics import prediction_error
+from r2s.metrics.prediction_error import Motion
 from r2s.recordings.recording import Recording
 from r2s.scenarios.scenario import Scenario, from_recording
 from r2s.scenarios.solvers import EDGE, MEMBRANE_DAMPING, explicit_cloth, grid_around
+from r2s.solvers.explicit.cloth import ExplicitCloth
+from r2s.solvers.mpm.sheet import Sheet, longest_edge, stable_step
 from r2s.study.cells import Cell, result_files
 from r2s.study.configuration import ON_CLOTH, Configuration
 from r2s.study.estimates import EstimateCell, read_estimate
@@ -51,7 +51,7 @@ class EvaluationCell(Cell):
       is judged on both: whose fabric is nearer is told where all are simulated alike.
     - `density`: areal, [kg/m^2].
     - `recordings`: what it is judged by, together, since they compile once.
-    - `draw`: a number of `r2s.fabrics.prior.draws`, which know the density alone: together these
+    - `draw`: a number of `r2s.materials.prior.draws`, which know the density alone: together these
       are the default; each fabric has its own. `MIDDLE`: the middle of that prior, the best
       guess. None: the truth of synthetic recordings at small strain; of MuJoCo's sheet its
       material in the laws of r2s (`r2s.study.mujoco_sheet.as_plate`).

@@ -9,7 +9,7 @@ from pathlib import Path
 from r2s.estimation.method import default_space
 from r2s.estimation.physnet.method import TrainingBudget
 from r2s.estimation.registry import METHODS
-from r2s.fabrics import presets
+from r2s.materials import presets
 from r2s.scenarios.paths import ESTIMATION, EVALUATION
 from r2s.study.configuration import (
     MOTIONS,

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 
-from r2s.evaluation.horizon import within
-from r2s.geometry.mesh import rectangle
+from r2s.mesh.mesh import rectangle
+from r2s.metrics.horizon import within
 from r2s.recordings.recording import cloud
 from r2s.study.configuration import MOTIONS, ON_CLOTH, as_configuration, is_reference
 from r2s.study.evaluations import EvaluationCell, read_distances, read_motions

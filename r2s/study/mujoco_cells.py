@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
-from r2s.evaluation.surface_distance import POINTS, to_surface
-from r2s.fabrics.fabric import Fabric
+from r2s.materials.fabric import Fabric
+from r2s.metrics.surface_distance import POINTS, to_surface
 from r2s.recordings.recording import cloud, save
 from r2s.scenarios import synthetic
 from r2s.scenarios.standard import Experiment

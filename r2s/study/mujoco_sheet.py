@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from r2s.extras import require
-from r2s.fabrics.fabric import Fabric
+from r2s._util.extras import require
+from r2s._util.units import AIR_DENSITY, GRAVITY
+from r2s.materials.fabric import Fabric
 from r2s.scenarios.scenario import Scenario
 from r2s.scenarios.standard import Experiment
-from r2s.units import AIR_DENSITY, GRAVITY
 
 GRIP = 10.0  # [kg], of a held vertex: the sheet's pull moves it by less than 1e-7 m in a step
 ELASTICITY = ("young", "poisson", "thickness", "damping")

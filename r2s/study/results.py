@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from r2s._util.files import write_text
 from r2s.estimation.default_spaces import law_of, with_law
 from r2s.estimation.method import default_space
-from r2s.evaluation import prediction_error
-from r2s.fabrics.parameters import Range
-from r2s.files import write_text
+from r2s.materials.parameters import Range
+from r2s.metrics import prediction_error
 from r2s.study.cells import Cell, result_files, with_dependencies
 from r2s.study.estimates import ESTIMATE, EstimateCell, read_estimate
 from r2s.study.evaluations import EvaluationCell, read_measured

@@ -23,10 +23,10 @@ from jaxtyping import Float, PRNGKeyArray
 from r2s.compilation import compile_once
 from r2s.estimation.default_spaces import Law
 from r2s.estimation.pinn.synthetic_pulls import pulled
-from r2s.fabrics import presets
-from r2s.fabrics.arcsim import read_material
-from r2s.fabrics.fabric import Fabric, constant_laws
-from r2s.laws.stiffening import SofteningPlate, StiffeningMembrane
+from r2s.materials import presets
+from r2s.materials.arcsim import read_material
+from r2s.materials.fabric import Fabric, constant_laws
+from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
 from r2s.recordings import manifest
 from r2s.recordings.recording import Recording, load, save
 from r2s.scenarios import synthetic
@@ -66,7 +66,7 @@ class TruthSettings:
     - `max_step`: longest implicit time step, [s], of a sheet that touches itself or is stretched.
       All others go in explicit steps, which leave no error of their own.
     - `stiffening`: stiffness along a yarn far stretched over that of the preset, which is at zero
-      strain; half way at an extension of 10 %. Bending softens, too (`r2s.laws.stiffening`).
+      strain; half way at an extension of 10 %. Bending softens, too (`r2s.materials.stiffening`).
       Assumed, not measured. 0: constant stiffness, of the membrane and in bending, as the
       estimators assume.
     - `materials`: a folder of ARCSim material files, FABRIC.json of every preset, with measured
@@ -272,7 +272,7 @@ def with_measured_tables(truth: TruthSettings, folder: Path) -> TruthSettings:
     """Settings with the measured tables in a folder, one file FABRIC.json for each preset: those
     that a study does not estimate are what others are compared with.
 
-    Raises `FileNotFoundError` for one that is missing, and what `r2s.fabrics.arcsim.read_material`
+    Raises `FileNotFoundError` for one that is missing, and what `arcsim.read_material`
     raises.
     """
     digest = sha256()

@@ -1,7 +1,7 @@
 """What the distances to a surface say of a fabric: up to the horizon, beside the floor, as skill.
 
 Beyond the horizon features that do not depend on the phase are compared
-(`r2s.evaluation.phase_free`).
+(`r2s.metrics.phase_free`).
 """
 
 import math
@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from r2s.evaluation import phase_free
-from r2s.evaluation.horizon import floor_of, horizon_of, within
-from r2s.geometry.surface import sample
+from r2s.mesh.surface import sample
+from r2s.metrics import phase_free
+from r2s.metrics.horizon import floor_of, horizon_of, within
 from r2s.recordings.recording import Recording, cloud
 from r2s.scenarios.scenario import from_recording
 from r2s.study.ensembles import EnsembleCell, ensemble_of, read_ensemble

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r2s.extras import require
-from r2s.fabrics.fabric import Fabric
+from r2s._util.extras import require
+from r2s.materials.fabric import Fabric
 from r2s.viewer.subject import Moved, Subject, error_used, move
 
 CLOTH, CLOUD, GRIPPER = (0, 114, 178), (213, 94, 0), (30, 30, 30)  # Okabe and Ito's

@@ -15,8 +15,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from r2s.extras import require
-from r2s.files import write_bytes
+from r2s._util.extras import require
+from r2s._util.files import write_bytes
 from r2s.recordings.open import SimulatedCloth
 from r2s.recordings.recording import Recording, SheetPlacement, cloud, corner
 from r2s.viewer import video_writer

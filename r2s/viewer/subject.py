@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from r2s.estimation.problem import Clouds
-from r2s.evaluation.losses import masked_mean, surface_residuals
-from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import ParameterSpace
+from r2s.materials.fabric import Fabric
+from r2s.materials.parameters import ParameterSpace
+from r2s.metrics.losses import masked_mean, surface_residuals
 from r2s.recordings.recording import Recording, subsample
 from r2s.scenarios import Experiment
 from r2s.scenarios.scenario import Scenario, from_recording, rollout
-from r2s.solver import Trajectory
+from r2s.solvers.simulate import Trajectory
 
 MOST_POINTS = 1500  # of a cloud: more change neither the picture nor the distance
 

@@ -10,8 +10,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import UInt8
 
-from r2s.extras import require
-from r2s.files import write_bytes
+from r2s._util.extras import require
+from r2s._util.files import write_bytes
 
 Ending = Literal["auto", "gif", "mp4"]
 Pictures = Iterable[UInt8[np.ndarray, "height width 3"]]

@@ -4,8 +4,8 @@ import warnings
 
 import numpy as np
 
+from r2s._util.extras import require
 from r2s.estimation.physnet.search import Places, Trials
-from r2s.extras import require
 
 
 def ask(trials: Trials, batch: int, left: int, generator: np.random.Generator) -> Places:

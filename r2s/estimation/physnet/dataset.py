@@ -13,6 +13,7 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Float, Int, UInt
 
+from r2s._util.files import read_json, write_bytes, write_json
 from r2s.estimation.physnet.views import (
     View,
     depths_of_sheet,
@@ -21,13 +22,12 @@ from r2s.estimation.physnet.views import (
     per_face,
     view_around,
 )
-from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
-from r2s.files import read_json, write_bytes, write_json
-from r2s.mpm.sheet import Sheet
+from r2s.materials.fabric import Fabric
+from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
 from r2s.scenarios.scenario import Scenario, rollout
 from r2s.scenarios.solvers import material_points
 from r2s.scenarios.standard import SIX, Experiment, varied
+from r2s.solvers.mpm.sheet import Sheet
 
 FORMAT = "r2s-physnet-data/3"
 DEPTH_UNIT = 1e-4  # [m], of the depths in the files

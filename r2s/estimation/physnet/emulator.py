@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from r2s._util.extras import require
 from r2s.estimation.physnet.search import Places, Respond, Trials, minimise
-from r2s.extras import require
 
 COMPONENTS = 10  # principal components of the answers, at most
 FIRST = 0.4  # share of the calls that fill the cube evenly

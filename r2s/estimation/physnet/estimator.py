@@ -25,7 +25,7 @@ from r2s.estimation.physnet.preprocess import grey
 from r2s.estimation.physnet.pull_force import PullForce, moved_with_forces
 from r2s.estimation.physnet.training import Training
 from r2s.estimation.physnet.views import View, depths_of_sheet, per_face
-from r2s.fabrics.parameters import ParameterSpace
+from r2s.materials.parameters import ParameterSpace
 from r2s.scenarios.scenario import Scenario, SheetSolver, rollout
 
 Images = Float[np.ndarray, "frame down across"]

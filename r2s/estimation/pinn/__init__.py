@@ -4,7 +4,7 @@ Needs flax: `pip install 'r2s[pinn]'`.
 
 - `from_pulls`: the estimate from stretchings. `pulls`: what it is given of a recording.
 - `network`: (X, Y, t) to displacement, with derivatives in forward mode.
-- `stress`: strain and stress, from the laws of `r2s.laws.membrane`.
+- `stress`: strain and stress, from the laws of `r2s.materials.membrane`.
 - `losses`: displacements beside markers and clamps, the load. `weak_form`: virtual work.
 - `training`: of the networks, by Adam. `equilibrium`: motions in equilibrium, by Galerkin's method.
 - `balance`: the stiffness whose motions fit best, and its covariance.

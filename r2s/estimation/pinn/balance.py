@@ -26,8 +26,8 @@ from r2s.estimation.pinn.equilibrium import Motion, equilibrium, prepare
 from r2s.estimation.pinn.network import Network
 from r2s.estimation.pinn.pulls import Pull
 from r2s.estimation.pinn.weak_form import DEGREES
-from r2s.fabrics.parameters import ParameterSpace
-from r2s.fabrics.stiffening_space import stiffens
+from r2s.materials.parameters import ParameterSpace
+from r2s.materials.stiffening_space import stiffens
 
 LONGEST = 0.1  # Gauss-Newton step, of a range
 BOUNDS = 1e-3, 1 - 1e-3  # of places in the ranges

@@ -30,7 +30,7 @@ from r2s.estimation.pinn.weak_form import (
     virtual_fields,
     virtual_work,
 )
-from r2s.fabrics.parameters import ParameterSpace
+from r2s.materials.parameters import ParameterSpace
 
 # weights of this frame and the two before in a rate, over the time between frames: at rest at first
 FORMULAS = ((0.0, 0.0, 0.0), (1.0, -1.0, 0.0), (1.5, -2.0, 0.5))

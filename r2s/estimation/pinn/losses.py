@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from r2s.environment.contact import friction_dissipation
 from r2s.estimation.pinn.network import DisplacementField, Jet, Pairs, T
 from r2s.estimation.pinn.pulls import Pull
-from r2s.fabrics.fabric import Fabric
-from r2s.world.contact import friction_dissipation
+from r2s.materials.fabric import Fabric
 
 EDGE_NODES = 6  # of Gauss's quadrature along a clamp
 
@@ -68,7 +68,7 @@ def load(
 ) -> Float[Array, " axis"]:
     """Load [N/m^2] that the stress must balance: inertia, damping and friction, less the weight.
 
-    The friction is that of the cloth solver on a table (`r2s.world.contact`).
+    The friction is that of the cloth solver on a table (`r2s.environment.contact`).
     """
     limit = fabric.friction * fabric.density * pull.normal
     friction = jax.grad(friction_dissipation, argnums=1)(limit, velocity)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.extras import require
+from r2s._util.extras import require
 
 require("flax", "pinn", "the physics-informed network")
 import flax.linen as nn  # noqa: E402

@@ -24,8 +24,8 @@ from r2s.estimation.pinn.network import DisplacementField, T, X, Y
 from r2s.estimation.pinn.pulls import Pull
 from r2s.estimation.pinn.stress import nominal_stress, small
 from r2s.estimation.pinn.training import Model, init
-from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import ParameterSpace
+from r2s.materials.fabric import Fabric
+from r2s.materials.parameters import ParameterSpace
 
 EPOCHS = 10_000
 WIDTH, LAYERS = 50, 7  # six hidden layers and the last one

@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.interpolate import CubicSpline
 
+from r2s._util.units import GRAVITY
 from r2s.estimation.problem import force_at
 from r2s.recordings.recording import Recording
-from r2s.units import GRAVITY
 
 FEWEST_FRAMES = 3
 FEWEST_SEEN = 0.5  # share of the markers that must be seen in every frame

@@ -1,4 +1,4 @@
-"""Strain and stress in a sheet, from the laws of `r2s.laws.membrane`.
+"""Strain and stress in a sheet, from the laws of `r2s.materials.membrane`.
 
 The sheet has sides X (the pull) and Y. The law is in the axes of warp and weft, which are turned
 by an `angle` from X. Stress is force per width [N/m]: no thickness enters.
@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from r2s.fabrics.fabric import Fabric
-from r2s.laws.turned import TurnedMembrane
+from r2s.materials.fabric import Fabric
+from r2s.materials.turned import TurnedMembrane
 
 Gradient = Float[Array, "axis 2"]  # of displacement in X and Y, [-]
 Voigt = Float[Array, " 3"]  # strain (E11, E22, 2 E12) [-]

@@ -8,7 +8,7 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from r2s.fabrics.fabric import Fabric
+from r2s.materials.fabric import Fabric
 from r2s.recordings.recording import Recording, RecordingInfo, make_recording
 from r2s.scenarios import clamp_force, energy_balance, stretching
 from r2s.scenarios.standard import STRETCHING_INTERVAL

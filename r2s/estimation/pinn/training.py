@@ -22,8 +22,8 @@ from r2s.estimation.pinn.losses import clamp_residual, marker_residual
 from r2s.estimation.pinn.network import DisplacementField, Network
 from r2s.estimation.pinn.pulls import Pull
 from r2s.estimation.pinn.weak_form import end_value, kinematics, virtual_fields, virtual_work
-from r2s.fabrics.fabric import Fabric
-from r2s.fabrics.parameters import ParameterSpace
+from r2s.materials.fabric import Fabric
+from r2s.materials.parameters import ParameterSpace
 
 NOISE = (2e-4, 0.01)  # of markers [m], and of the force over its greatest [-]
 TOLERANCE = 0.01  # of the virtual work, over that of the stress in the sheet

@@ -18,7 +18,7 @@ from r2s.estimation.pinn.losses import field, gradients, load
 from r2s.estimation.pinn.network import DisplacementField, T, X, Y
 from r2s.estimation.pinn.pulls import Pull
 from r2s.estimation.pinn.stress import nominal_stress
-from r2s.fabrics.fabric import Fabric
+from r2s.materials.fabric import Fabric
 
 NODES = 12  # of the quadrature along each side
 DEGREES = (7, 8)  # number of polynomials along and across the pull

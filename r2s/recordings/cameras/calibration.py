@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
-from r2s.extras import require
+from r2s._util.extras import require
 from r2s.recordings.cameras.camera import Camera
 
 Row = tuple[float, float, float, float]

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-from r2s.extras import require
-from r2s.files import write_bytes
+from r2s._util.extras import require
+from r2s._util.files import write_bytes
 from r2s.recordings.readers.video import read_png
 
 DEPTHS, MASKS, COLOURS = (".png", ".npy"), (".png",), (".png", ".jpg", ".jpeg")

@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from r2s.files import read_json, write_json
+from r2s._util.files import read_json, write_json
 from r2s.recordings.cameras import images
 from r2s.recordings.cameras.calibration import DepthCamera
 from r2s.recordings.cameras.cleaning import Cleaning, clean, inside

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, gaussian_filter, zoom
 
-from r2s.files import write_bytes, write_text
-from r2s.geometry.mesh import rectangle
+from r2s._util.files import write_bytes, write_text
+from r2s.mesh.mesh import rectangle
 from r2s.recordings.cameras.calibration import DepthCamera, rays
 from r2s.recordings.cameras.depth import depth_jumps, from_world
 from r2s.recordings.cameras.images import encode_png, write_depth

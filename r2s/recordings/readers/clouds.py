@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from r2s.extras import require
+from r2s._util.extras import require
 from r2s.recordings.readers.numbered import find_numbered
 
 

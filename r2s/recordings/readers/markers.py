@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer
 from scipy.spatial import KDTree
 
-from r2s.extras import require
+from r2s._util.extras import require
 
 Places = Float[np.ndarray, "dot 2"]
 

@@ -7,7 +7,7 @@ Places in an image are (x, y), x to the right and y down, [px]. Needs OpenCV: pi
 import numpy as np
 from jaxtyping import Float
 
-from r2s.extras import require
+from r2s._util.extras import require
 
 
 def plane_homography(

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from r2s.files import read_npz
+from r2s._util.files import read_npz
 from r2s.recordings.recording import (
     Doubt,
     Recording,

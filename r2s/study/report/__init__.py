@@ -7,7 +7,7 @@
 Needs plotly and Jinja2: pip install 'r2s[study]'.
 """
 
-from r2s.extras import require
+from r2s._util.extras import require
 
 require("plotly", "study", "the report of a study")
 require("jinja2", "study", "the report of a study")

@@ -11,7 +11,7 @@ import pandas as pd
 
 from r2s.estimation.default_spaces import FROM, fixed, with_law
 from r2s.estimation.method import default_space
-from r2s.fabrics.fold_length import fold_length
+from r2s.materials.fold_length import fold_length
 from r2s.scenarios.resolution import ENOUGH, mesh_error
 from r2s.study.cells import read_metadata, with_dependencies
 from r2s.study.ensembles import Ensemble, read_ensemble

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
 
-from r2s.evaluation.statistics import LEVEL
+from r2s.metrics.statistics import LEVEL
 from r2s.study.report.charts import interval_chart
 from r2s.study.report.tables import mean_text
 from r2s.study.statistics import comparisons, frame, means

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from r2s.evaluation.statistics import LEVEL
-from r2s.files import write_text
+from r2s._util.files import write_text
+from r2s.metrics.statistics import LEVEL
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS
 from r2s.study.motions import Motion
 from r2s.study.report import opening

@@ -9,7 +9,7 @@
 Needs pandas and statsmodels: pip install 'r2s[study]'.
 """
 
-from r2s.extras import require
+from r2s._util.extras import require
 
 require("pandas", "study", "the analysis of a study")
 require("statsmodels", "study", "the analysis of a study")

@@ -10,7 +10,7 @@ Columns:
   the cloth), "other_fabric" (the estimate of one), "repeatability" (another trial).
 - `metric`, `unit`, `value`: SI, or "-" for a number without a unit; NaN where a run diverged.
 - `floor`: the accuracy of the recording itself, in that unit. `horizon`: until when it tells
-  fabrics apart, [s]. `skill`: see `r2s.evaluation.horizon`. NaN: not known.
+  fabrics apart, [s]. `skill`: see `r2s.metrics.horizon`. NaN: not known.
 """
 
 from collections.abc import Iterable, Mapping
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from r2s.files import write_text
+from r2s._util.files import write_text
 from r2s.study.configuration import (
     MOTIONS,
     PAPER_CONFIGURATIONS,

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from r2s.evaluation.crossed import crossed_mean, interval
-from r2s.evaluation.statistics import SIGNIFICANCE
+from r2s.metrics.crossed import crossed_mean, interval
+from r2s.metrics.statistics import SIGNIFICANCE
 
 
 class Ranks(NamedTuple):

@@ -1,0 +1,1 @@
+"""Files, units, threads and optional libraries: what every package uses."""

@@ -1,0 +1,178 @@
+"""Files that are written whole or not at all, and JSON that is read strictly."""
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import io
+import json
+import math
+import os
+import shutil
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+T = TypeVar("T")
+
+
+@functools.cache
+def source_hash() -> str:
+    """A hash of the source files of r2s, hexadecimal, as they were at the first call."""
+    root = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for file in sorted(root.rglob("*.py")):
+        digest.update(str(file.relative_to(root)).encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
+def write_bytes(path: Path | str, data: bytes) -> None:
+    """Write `data` to `path`: a reader finds the old file or the new one, never a part.
+
+    Raises OSError (of the kind that the system gave) that names `path`, the size of the data and
+    the free space; no temporary file is left behind.
+    """
+    path = Path(path)
+    # In the same folder, since os.replace cannot cross file systems.
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(data)
+        os.replace(temporary, path)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        message = f"cannot write {path} ({len(data)} bytes; {_free(path.parent)}): {reason}"
+        raise OSError(error.errno, message) from error
+    finally:
+        with contextlib.suppress(OSError):  # it is gone already when all went well
+            temporary.unlink()
+
+
+def check_folders(*paths: Path | None) -> None:
+    """Raise `FileNotFoundError` where the folder of a file that will be written is missing: before
+    the work of making what is in it."""
+    for path in paths:
+        if path is not None and not path.absolute().parent.is_dir():
+            raise FileNotFoundError(f"{path}: there is no folder {path.parent} to write it to")
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Write `text` as UTF-8 to `path`, whole or not at all; raises as `write_bytes`."""
+    write_bytes(path, text.encode())
+
+
+def write_json(path: Path | str, value: Any) -> None:
+    """Write `value` as JSON to `path`, whole or not at all.
+
+    Raises ValueError for NaN and infinities (which JSON lacks), TypeError for what JSON cannot
+    hold, and OSError as `write_bytes`.
+    """
+    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def write_npz(path: Path | str, **arrays: Any) -> None:
+    """Write named arrays as one NPZ, whole or not at all; raises as `write_bytes`."""
+    buffer = io.BytesIO()
+    made: dict[str, Any] = {name: np.asarray(values) for name, values in arrays.items()}
+    np.savez(buffer, **made)
+    write_bytes(path, buffer.getvalue())
+
+
+def read_npz(path: Path | str, *needed: str) -> dict[str, np.ndarray]:
+    """The arrays of an NPZ, by name.
+
+    Raises FileNotFoundError, or a ValueError (which does not name the file) when it is damaged or
+    one of the arrays `needed` is missing.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # a damaged archive raises anything, from EOFError to zlib.error
+        raise ValueError(f"{error}: copy the file again, or make it anew") from error
+    if lacking := [name for name in needed if name not in arrays]:
+        raise ValueError(f"lacks the arrays {', '.join(lacking)}; has {', '.join(arrays)}")
+    return arrays
+
+
+def read_json(path: Path | str, kind: type[T]) -> T:
+    """Read the dataclass `kind` from JSON: its fields, no more and (but for defaults) no less.
+
+    Fields are numbers (finite), strings, booleans, tuples (JSON lists), mappings and dataclasses,
+    or one of these or null.
+    The metadata "unknown" of a field is the hint in the error when it is missing or null. Raises
+    OSError, or a ValueError that names the file and the field: no JSON, fields missing or unknown,
+    values of another type, or what `kind` itself refuses.
+    """
+    try:
+        value = json.loads(Path(path).read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: no JSON: {error}") from error
+    return parse(kind, value, f"{path}")
+
+
+def parse(kind: type[T], value: Any, where: str) -> T:
+    """The dataclass `kind` from what JSON gave, as `read_json`; errors begin with `where`."""
+    return _read(kind, value, where)
+
+
+def _free(folder: Path) -> str:
+    try:
+        return f"{shutil.disk_usage(folder).free} bytes free in {folder}"
+    except OSError:
+        return f"folder {folder} is missing or cannot be read"
+
+
+def _read(kind: Any, value: Any, where: str) -> Any:
+    """`value` (from JSON) as `kind`: a dataclass, tuple, mapping or plain type, or one or None."""
+    if isinstance(kind, types.UnionType):
+        if value is None:
+            return None
+        (kind,) = (each for each in typing.get_args(kind) if each is not types.NoneType)
+    if dataclasses.is_dataclass(kind):
+        return _read_fields(kind, value, where)
+    arguments = typing.get_args(kind)
+    if typing.get_origin(kind) is tuple:
+        _expect(isinstance(value, list), "a list", value, where)
+        if arguments[1:] == (...,):
+            arguments = (arguments[0],) * len(value)
+        _expect(len(value) == len(arguments), f"{len(arguments)} entries", value, where)
+        entries = enumerate(zip(arguments, value, strict=True))
+        return tuple(_read(kind, entry, f"{where}[{i}]") for i, (kind, entry) in entries)
+    if typing.get_origin(kind) is Mapping:
+        _expect(isinstance(value, dict), "an object", value, where)
+        return {key: _read(arguments[1], v, f"{where}: {key}") for key, v in value.items()}
+    if kind is float:
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        _expect(number and math.isfinite(value), "a finite number", value, where)
+        return float(value)
+    _expect(type(value) is kind, f"{kind.__name__}", value, where)
+    return value
+
+
+def _read_fields(kind: Any, value: Any, where: str) -> Any:
+    _expect(isinstance(value, dict), "an object", value, where)
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    for name, field in fields.items():
+        if "unknown" in field.metadata and value.get(name) is None:
+            raise ValueError(f"{where}: {name} is unknown: {field.metadata['unknown']}")
+    needed = {name for name, field in fields.items() if field.default is dataclasses.MISSING}
+    if missing := sorted(needed - value.keys()):
+        raise ValueError(f"{where}: missing: {', '.join(missing)}")
+    if unknown := sorted(value.keys() - fields.keys()):
+        raise ValueError(f"{where}: unknown: {', '.join(unknown)}; known: {', '.join(fields)}")
+    read = {name: _read(fields[name].type, v, f"{where}: {name}") for name, v in value.items()}
+    try:
+        return kind(**read)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+
+
+def _expect(holds: bool, expected: str, value: Any, where: str) -> None:
+    if not holds:
+        raise ValueError(f"{where}: expected {expected}, found {value!r}")

@@ -1,0 +1,105 @@
+"""`r2s data`: recordings, public ones and one's own."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg, subcommand
+
+from r2s.cli.common import Json
+
+Manifests = Annotated[
+    Path | None,
+    arg(
+        metavar="FOLDER",
+        help="Descriptions of other data sets, one JSON each, instead of the project's.",
+    ),
+]
+
+
+@dataclass(frozen=True)
+class Fetch:
+    """Bring a public data set into a folder, and verify it.
+
+    Files that are there and are what was published are left alone. A corrupt file is named and
+    never replaced unasked. What cannot be downloaded automatically is said, with its licence, how
+    to get it, and where to put it. Run it again then: it checks what is there.
+
+        r2s data fetch diffcloud --to recordings
+    """
+
+    name: Annotated[Positional[str], arg(metavar="NAME")]
+    """Name of the data set; `r2s data list` shows them."""
+    to: Annotated[Path, arg(metavar="FOLDER")]
+    """Where it is, or shall be."""
+    manifests: Manifests = None
+
+    def run(self) -> None:
+        from r2s.recordings.datasets import fetch
+
+        for line in fetch(self.name, self.to, self.manifests):
+            print(line)
+
+
+@dataclass(frozen=True)
+class List:
+    """List the public data sets that r2s knows: name, title, licence, and how each is got."""
+
+    manifests: Manifests = None
+    json: Json = False
+
+    def run(self) -> None:
+        from r2s.cli.common import print_result
+        from r2s.recordings.datasets import Dataset, known_datasets
+
+        result, lines = {}, []
+        for name, data in known_datasets(self.manifests).items():
+            automatic = isinstance(data, Dataset) and bool(data.downloads) and not data.layout
+            result[name] = {"title": data.title, "licence": data.licence, "automatic": automatic}
+            lines += [f"{name}: {data.title}", f"    licence: {data.licence}"]
+            lines.append(f"    {'downloaded automatically' if automatic else 'fetched by hand'}")
+        print_result(self.json, result, lines)
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Read recordings, of RGB-D images or of point clouds, and write each as one NPZ of r2s.
+
+    FOLDER has a manifest.json and a folder for each recording, or is the folder of one. Where there
+    is a cameras.json, in a recording's folder or above, that holds images, else numbered clouds.
+    What was converted already is skipped, unless the files that it was made from have changed.
+    Recordings that cannot be read are named, with file and frame, after the others were converted.
+
+        r2s data convert recordings --to canonical
+        r2s data convert recordings --only '^lift_' --to canonical
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """A folder of recordings, or of one."""
+    to: Annotated[Path, arg(metavar="OUT")]
+    """Where NAME.npz goes, and NAME.sha256 of what it was made from; made when it is not there."""
+    only: Annotated[str, arg(metavar="REGEX")] = ""
+    """Convert those whose name matches this regular expression."""
+    force: bool = False
+    """Convert again what is up to date, as after an update of r2s."""
+
+    def run(self) -> None:
+        from r2s.recordings.convert import convert
+
+        for line in convert(self.folder, self.to, self.only, self.force):
+            print(line)
+
+
+@dataclass(frozen=True)
+class Data:
+    """Recordings: which are public and how to get them, and how yours become those of r2s."""
+
+    command: Annotated[
+        Annotated[Fetch, subcommand("fetch")]
+        | Annotated[List, subcommand("list")]
+        | Annotated[Convert, subcommand("convert")],
+        arg(name=""),
+    ]
+
+    def run(self) -> None:
+        self.command.run()

@@ -1,0 +1,222 @@
+"""`r2s doctor`: is what is installed, and what a card and a scenario say, sound?"""
+
+import platform
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import arg
+
+from r2s.cli.common import FabricName, Json, Motion, ScenarioName, Shape
+
+if TYPE_CHECKING:
+    from r2s.materials.fabric import Fabric
+
+EXCLUDED = {"0.10.2": "wrong numbers from a jitted vmap on the CPU", "0.11.1": "no flax"}
+PACKAGES = ("r2s", "jax", "jaxlib", "equinox", "optax", "lineax", "numpy")
+PLAUSIBLE = {  # of fabrics for clothes and the household
+    "density": (0.05, 1.0, "kg/m^2", "an areal density: a T-shirt has 0.15, denim 0.4"),
+    "damping": (0.0, 0.1, "s", "a time"),
+    "friction": (0.05, 1.5, "-", "Coulomb's coefficient"),
+    "thickness": (1e-4, 5e-3, "m", "of the sheet"),
+    "mass_damping": (0.0, 20.0, "1/s", "a rate"),
+}
+STIFF = (1.0, 1e5, "N/m", "a force per width: a modulus in Pa times the thickness in m")
+BENDS = (1e-8, 1e-2, "N m", "a moment per curvature and width: 1 mN mm is 1e-6 N m")
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Look at the installation; with a card, a mesh or a scenario, also at those.
+
+    Says versions, devices, precision and which extras there are; whether the numbers of a fabric
+    are plausible in their units; whether a mesh is sound; whether the fabric can be simulated in a
+    scenario, and which time step and how much memory that takes. Exit code 1 when something is
+    wrong.
+
+        r2s doctor
+        r2s doctor --fabric mine.json --scenario folding --shape 17 17
+    """
+
+    fabric: FabricName = ""
+    mesh: Annotated[Path | None, arg(metavar="FILE")] = None
+    """A flat triangle mesh in metres, as OBJ, PLY or STL."""
+    scenario: Annotated[ScenarioName | None, arg(metavar="SCENARIO")] = None
+    """A scenario of the study, whose motion is checked, too."""
+    motion: Motion = ()
+    shape: Shape = (9, 9)
+    json: Json = False
+
+    def run(self) -> int:
+        from r2s.cli.common import load_card, print_result
+
+        result, lines, wrong = installation()
+        if self.fabric:
+            card = load_card(self.fabric)
+            result["fabric"], more = _fabric(card.name, card.fabric, self.shape)
+            lines += more
+            wrong += [f"{card.name}: {text}" for text in result["fabric"]["implausible"]]
+        if self.mesh is not None:
+            result["mesh"], text = _mesh(self.mesh)
+            lines.append(text)
+        if self.scenario is not None:
+            result["scenario"], more = self._scenario(self.scenario)
+            lines += more
+            if failure := result["scenario"]["failure"]:
+                wrong.append(f"scenario {self.scenario}: the simulation {failure}")
+        result["wrong"] = wrong
+        print_result(self.json, result, [*lines, *(f"WRONG: {text}" for text in wrong)])
+        return 1 if wrong else 0
+
+    def _scenario(self, name: str) -> tuple[dict[str, Any], list[str]]:
+        import equinox as eqx
+        import jax
+        import jax.numpy as jnp
+
+        from r2s.cli.common import load_card, make_experiment
+        from r2s.scenarios import material_points
+        from r2s.scenarios.scenario import rollout
+        from r2s.solvers.simulate import predicted_memory
+
+        fabric = load_card(self.fabric or "grey_interlock").fabric
+        scenario = make_experiment(name, self.motion).scenario(self.shape)
+        points = material_points(scenario, fabric)
+
+        def loss(fabric):
+            return jnp.mean(rollout(scenario, fabric).x ** 2)
+
+        memory = predicted_memory(loss, fabric)
+        gradient_memory = predicted_memory(jax.value_and_grad(loss), fabric)
+        step = scenario.interval / scenario.substeps
+        frames = scenario.num_frames + scenario.lead_in
+        result = {
+            "frames": frames,
+            "step_s": step,
+            "steps": (frames - 1) * scenario.substeps,
+            "points_step_s": points.dt,
+            "memory_bytes": memory,
+            "gradient_memory_bytes": gradient_memory,
+            "failure": eqx.filter_jit(rollout)(scenario, fabric).explain() or None,
+        }
+        return result, [
+            f"scenario {name}: {result['steps']} steps of {1e3 * step:.1f} ms, "
+            f"{memory / 1e6:.1f} MB, with its gradient {gradient_memory / 1e6:.1f} MB",
+            f"    on material points: steps of {1e3 * points.dt:.3f} ms",
+        ]
+
+
+def _fabric(
+    name: str, fabric: "Fabric", shape: tuple[int, int]
+) -> tuple[dict[str, Any], list[str]]:
+    """Whether its numbers are plausible, and the error that a mesh leaves in each motion."""
+    from r2s.materials.fold_length import fold_length
+    from r2s.scenarios import resolution
+    from r2s.scenarios.standard import SIDE
+
+    found, length, sheet = list(implausible(fabric)), float(fold_length(fabric)), (SIDE, SIDE)
+    errors = {m: resolution.mesh_error(fabric, sheet, shape, m) for m in resolution.TABLE}
+    lines = [
+        f"fabric {name}: {'see below' if found else 'plausible'}",
+        f"    it folds at {1e3 * length:.1f} mm: longer cells cannot follow",
+        f"    expected errors of a sheet of {SIDE} m with {shape[0]} x {shape[1]} vertices:",
+    ]
+    for motion, error in errors.items():
+        words = "enough"
+        if error > resolution.ENOUGH:
+            words = f"too coarse, {resolution.advice(fabric, sheet, shape, motion)}"
+        lines.append(f"        {motion}: {1e3 * error:.1f} mm, {words}")
+    result = {
+        "name": name,
+        "implausible": found,
+        "fold_length_m": length,
+        "mesh_error_m": errors,
+    }
+    return result, lines
+
+
+def installation() -> tuple[dict[str, Any], list[str], list[str]]:
+    """What is installed: as data, in lines, and what is wrong with it."""
+    import jax
+
+    versions = {"python": platform.python_version()}
+    versions |= {name: _version(name) or "not installed" for name in PACKAGES}
+    missing: dict[str, list[str]] = {}
+    for requirement in (_version("r2s") and metadata.requires("r2s")) or ():
+        found = re.match(r"([\w.-]+).*extra == ['\"]([\w-]+)['\"]", requirement)
+        if found and found[2] != "dev":
+            lacking = missing.setdefault(found[2], [])
+            lacking += [] if _version(found[1]) else [found[1]]
+    devices = [f"{each.platform} {each.device_kind}" for each in jax.devices()]
+    x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
+    lines = [", ".join(f"{name} {version}" for name, version in versions.items())]
+    lines.append(f"devices: {', '.join(devices)}; {'double' if x64 else 'single'} precision")
+    for extra, lacking in missing.items():
+        state = f"lacks {', '.join(lacking)}: pip install 'r2s[{extra}]'" if lacking else "there"
+        lines.append(f"extra {extra}: {state}")
+    wrong = []
+    if jax.__version__ in EXCLUDED:
+        wrong.append(f"jax {jax.__version__} ({EXCLUDED[jax.__version__]}): install another one")
+    result = {"versions": versions, "devices": devices, "x64": x64, "missing": missing}
+    return result, lines, wrong
+
+
+def _version(package: str) -> str:
+    """The version of an installed package; empty where it is not."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return ""
+
+
+def implausible(fabric: "Fabric") -> Iterator[str]:
+    """Say which numbers of a fabric are hardly in their units, one line each."""
+    import numpy as np
+
+    from r2s.export.stiffness import bending_stiffness, membrane_stiffness
+
+    matrix = membrane_stiffness(fabric)
+    numbers = [(name, float(getattr(fabric, name)), limits) for name, limits in PLAUSIBLE.items()]
+    for name, value in zip(("C11", "C22", "C33"), np.diag(matrix).tolist(), strict=True):
+        numbers.append((name, value, STIFF))
+    bending = bending_stiffness(fabric).items()
+    numbers += [(f"bending ({name})", value, BENDS) for name, value in bending if value]
+    for name, value, (low, high, unit, what) in numbers:
+        if not low <= value <= high:
+            yield f"{name} is {value:g} {unit}, expected {low:g} to {high:g} ({what})"
+    if not np.all(np.linalg.eigvalsh(matrix) > 0):
+        yield "the membrane has a negative stiffness: C12^2 must be less than C11 C22"
+
+
+def _mesh(path: Path) -> tuple[dict[str, Any], str]:
+    import numpy as np
+
+    from r2s._util.extras import require
+    from r2s.mesh.mesh import Mesh
+
+    trimesh = require("trimesh", "study", "mesh files")
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such mesh")
+    loaded: Any = trimesh.load(path, process=False, force="mesh")
+    places, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
+    extent = np.ptp(places, axis=0)
+    flat = int(np.argmin(extent))
+    if extent[flat] > 1e-6 * extent.max():
+        raise ValueError(f"{path}: a rest shape must lie in a plane, it extends over {extent} m")
+    try:
+        mesh = Mesh.make(np.delete(places, flat, axis=1), faces)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    edges = loaded.edges_unique_length
+    result = {
+        "vertices": len(places),
+        "faces": len(faces),
+        "area_m2": float(np.sum(np.asarray(mesh.area))),
+        "shortest_edge_m": float(edges.min()),
+        "longest_edge_m": float(edges.max()),
+    }
+    size = f"{result['vertices']} vertices, {result['faces']} faces, {result['area_m2']:.4g} m^2"
+    edge = f"edges {1e3 * edges.min():.2f} to {1e3 * edges.max():.2f} mm"
+    return result, f"mesh {path.name}: sound; {size}, {edge}"

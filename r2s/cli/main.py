@@ -1,0 +1,106 @@
+"""The command line `r2s`: data, pictures, plans, simulations, estimates. `r2s --help` begins.
+
+Exit codes: 0; 1 for an error, in one line on stderr; 2 for wrong usage. The commands are in
+`r2s.cli`.
+"""
+
+import gc
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from typing import Annotated
+
+try:
+    import tyro
+    from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
+except ImportError:
+    sys.exit("r2s: error: the command line needs tyro: pip install 'r2s[cli]'")
+
+from r2s import compilation
+from r2s._util.threads import leave
+from r2s.cli.check import Check
+from r2s.cli.check_grad import CheckGrad
+from r2s.cli.data import Data
+from r2s.cli.doctor import Doctor
+from r2s.cli.estimate import EstimateCard
+from r2s.cli.evaluate import Evaluate
+from r2s.cli.export import Export
+from r2s.cli.sensitivity import Sensitivity
+from r2s.cli.show import Show
+from r2s.cli.simulate import Simulate
+from r2s.cli.study import Study
+from r2s.cli.view import View
+from r2s.study.environment import one_thread
+
+NO_CACHE = "--no-cache"
+Command = (
+    Annotated[Data, subcommand("data")]
+    | Annotated[Check, subcommand("check")]
+    | Annotated[Show, subcommand("show")]
+    | Annotated[Sensitivity, subcommand("sensitivity")]
+    | Annotated[Simulate, subcommand("simulate")]
+    | Annotated[EstimateCard, subcommand("estimate")]
+    | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[Export, subcommand("export")]
+    | Annotated[CheckGrad, subcommand("check-grad")]
+    | Annotated[Doctor, subcommand("doctor")]
+    | Annotated[Study, subcommand("study")]
+    | Annotated[View, subcommand("view")]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command line (None: that of the process); the exit code.
+
+    Raises SystemExit, with 0 after --help and 2 after a wrong usage, whose message is on stderr.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        command = tyro.cli(
+            Command,  # pyright: ignore[reportArgumentType]
+            prog="r2s",
+            description=(
+                "r2s: real-to-sim for fabrics. Each command tells more with --help. Compiled "
+                "programs are kept in the cache folder of the user, or in that of "
+                f"JAX_COMPILATION_CACHE_DIR; {NO_CACHE}, with any command, keeps and reads none."
+            ),
+            args=[each for each in arguments if each != NO_CACHE],
+            config=(OmitArgPrefixes, OmitSubcommandPrefixes, FlagCreatePairsOff),
+        )
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            return command.run() or 0
+    except BrokenPipeError:  # whoever read the output had enough
+        sys.stdout = None
+    except (ValueError, OSError, ImportError, RuntimeError, MemoryError) as error:
+        told = " ".join(str(error).split())
+        if "RESOURCE_EXHAUSTED" in told:
+            told += " Take fewer frames, shorter motions or a coarser mesh."
+        print(f"r2s: error: {told}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("r2s: error: interrupted", file=sys.stderr)
+        return 1
+    return 0
+
+
+def command() -> int:
+    """`main` in a process of its own, which keeps what it compiles."""
+    gc.set_threshold(100_000, 50, 100)  # to trace makes many objects that stay
+    os.environ["XLA_FLAGS"] = one_thread(os.environ.get("XLA_FLAGS", ""))  # JAX has not begun yet
+    if NO_CACHE in sys.argv:
+        compilation.forget()
+    else:
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            compilation.keep()
+    return leave(main())
+
+
+def _warn(message, *_, **__) -> None:
+    print(f"r2s: warning: {message}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(command())

@@ -1,7 +1,0 @@
-"""The cloth solver: a sheet of triangles, implicit in time, differentiable.
-
-- `cloth`: the solver, `init` and `step`.
-- `potential`: the energy that one step minimises. `newton`: its minimiser.
-- `linear`: sparse matrices over a mesh, and their factor.
-- `self_contact`: which places of the sheet touch, and what keeps them apart.
-"""

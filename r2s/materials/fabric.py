@@ -1,0 +1,89 @@
+"""Fabric: what an estimator estimates. Presets with provenance are in `r2s.materials.presets`."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from r2s.materials.membrane import OrthotropicMembrane
+from r2s.materials.plate import PlateBending
+
+
+class Fabric(eqx.Module):
+    """A fabric. A leading batch axis on every field makes it a sweep, for `jax.vmap`.
+
+    - `density`: areal density, [kg/m^2].
+    - `membrane`, `bending`: the laws of its energies: any `MembraneLaw` [N/m], and
+      any `PlateLaw` or `BendingLaw` [N m].
+    - `damping`: stiffness-proportional (Kelvin-Voigt) damping time, [s]: the viscous stress is
+      `damping` times the stiffness times the rate of strain.
+    - `friction`: Coulomb coefficient against the table, [-].
+    - `thickness`: distance from the table at which contact begins, [m].
+    - `mass_damping`: mass-proportional damping rate, [1/s]: the force on a mass is minus
+      `mass_damping` times its momentum. It also brakes rigid motion, as still air would.
+    """
+
+    density: Float[Array, "*batch"]
+    membrane: Any
+    bending: Any
+    damping: Float[Array, "*batch"]
+    friction: Float[Array, "*batch"]
+    thickness: Float[Array, "*batch"]
+    mass_damping: Float[Array, "*batch"]
+
+    @classmethod
+    def make(
+        cls,
+        density: float,
+        membrane: tuple[float, float, float, float],
+        bending: float,
+        damping: float = 0.01,
+        friction: float = 0.5,
+        thickness: float = 1e-3,
+        mass_damping: float = 0.0,
+    ) -> "Fabric":
+        """A fabric from numbers: areal density [kg/m^2], (C11, C12, C22, C33) [N/m], bending
+        stiffness [N m], damping time [s], friction [-], thickness [m], mass damping [1/s].
+
+        Raises `ValueError` when one is out of its physical range.
+
+        >>> fabric = Fabric.make(0.2, (300.0, 60.0, 200.0, 80.0), 2e-5)
+        >>> float(fabric.membrane.c12)
+        60.0
+        """
+        c11, c12, c22, c33 = membrane
+        if not min(density, c11, c22, c33, thickness) > 0:
+            raise ValueError(
+                "density [kg/m^2], C11, C22, C33 [N/m] and thickness [m] must be positive, got "
+                f"{density}, {c11}, {c22}, {c33} and {thickness}"
+            )
+        if not c12**2 < c11 * c22:
+            raise ValueError(
+                f"C12^2 must be less than C11 C22, or the sheet has a negative stiffness: "
+                f"C12 = {c12} N/m, C11 C22 = {c11 * c22} (N/m)^2"
+            )
+        if not min(bending, damping, friction, mass_damping) >= 0:
+            raise ValueError(
+                "bending stiffness [N m], damping [s], friction [-] and mass damping [1/s] must "
+                f"not be negative, got {bending}, {damping}, {friction} and {mass_damping}"
+            )
+        stiffnesses = (jnp.asarray(number, float) for number in membrane)
+        others = (damping, friction, thickness, mass_damping)
+        return cls(
+            jnp.asarray(density, float),
+            OrthotropicMembrane(*stiffnesses),
+            PlateBending.make(bending),
+            *(jnp.asarray(number, float) for number in others),
+        )
+
+
+def constant_laws(fabric: Fabric) -> tuple[OrthotropicMembrane, PlateBending]:
+    """The laws of a fabric whose stiffness is constant; raises `TypeError` for another one."""
+    membrane, bending = fabric.membrane, fabric.bending
+    if not isinstance(membrane, OrthotropicMembrane) or not isinstance(bending, PlateBending):
+        raise TypeError(
+            "this needs a fabric of constant stiffness (OrthotropicMembrane, PlateBending), got "
+            f"{type(membrane).__name__} and {type(bending).__name__}"
+        )
+    return membrane, bending

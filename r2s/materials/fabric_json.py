@@ -1,0 +1,178 @@
+"""A fabric as JSON: areal density, the two laws with every number, damping, friction, thickness.
+
+Every number stands beside its unit. NaN, a number that nobody knows, is null.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from r2s.materials.bending import HingeBending, OrthotropicBending, SpringBending
+from r2s.materials.fabric import Fabric
+from r2s.materials.membrane import OrthotropicMembrane, SpringMembrane
+from r2s.materials.plate import OrthotropicPlate, PlateBending
+from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
+from r2s.materials.tables import (
+    DiffSimTableBending,
+    DiffSimTableMembrane,
+    TableBending,
+    TableMembrane,
+)
+
+NUMBERS = {"density": "kg/m^2", "damping": "s", "friction": "-", "thickness": "m"}
+NUMBERS |= {"mass_damping": "1/s"}
+TABLES = (TableMembrane, DiffSimTableMembrane)
+MEMBRANES = (OrthotropicMembrane, StiffeningMembrane, SpringMembrane, *TABLES)
+PLATES = (PlateBending, OrthotropicPlate, SofteningPlate)
+BENDINGS = (*PLATES, HingeBending, OrthotropicBending, SpringBending)
+LAWS = {
+    "membrane": (MEMBRANES, "N/m"),
+    "bending": ((*BENDINGS, TableBending, DiffSimTableBending), "N m"),
+}
+TABLE_SHAPES = {
+    TableMembrane: (6, 4),
+    DiffSimTableMembrane: (6, 4),
+    TableBending: (3, 5),
+    DiffSimTableBending: (3, 5),
+}
+OTHER_UNITS = {"poissons_ratio": "-", "spacing": "m", "SpringBending.stiffness": "N/m"}
+OTHER_UNITS |= {"ratio": "-", "loss": "-"}
+OTHER_UNITS |= {"StiffeningMembrane.knee": "-", "knee_weft": "-", "SofteningPlate.knee": "1/m"}
+WITHIN = {(StiffeningMembrane, "small"), (SofteningPlate, "small")}  # laws that hold another one
+
+
+def fabric_as_json(fabric: Fabric) -> dict[str, Any]:
+    """The JSON object of one fabric.
+
+    Raises `TypeError` for a law that r2s does not have, since its code cannot go into a file;
+    `ValueError` for a batch of fabrics and for infinite numbers.
+    """
+    if jnp.ndim(fabric.density):
+        raise ValueError(f"expected one fabric, got a batch of shape {jnp.shape(fabric.density)}")
+    stored: dict[str, Any] = {}
+    for name, unit in NUMBERS.items():
+        stored[name] = _entry(getattr(fabric, name), unit)
+    for part, (laws, _) in LAWS.items():
+        law = getattr(fabric, part)
+        if type(law) not in laws:
+            raise TypeError(
+                f"a file holds a {part} law of r2s ({', '.join(k.__name__ for k in laws)}), got "
+                f"{type(law).__name__}"
+            )
+        stored[part] = _law_as_json(law, part)
+    return nan_to_null(stored, "fabric")
+
+
+def fabric_from_json(stored: Any) -> Fabric:
+    """The fabric that `fabric_as_json` wrote, in JAX's default precision.
+
+    Raises `ValueError` that names the key: missing or unknown keys, another unit, values of
+    another type, numbers that no fabric has.
+    """
+    check_keys(stored, (*NUMBERS, *LAWS), "fabric")
+    numbers = {n: _value(stored[n], unit, f"fabric: {n}", ()) for n, unit in NUMBERS.items()}
+    laws = {part: _law_from(stored[part], part) for part in LAWS}
+    fabric = Fabric(**numbers, **laws)
+    check_numbers(fabric)
+    return fabric
+
+
+def check_numbers(fabric: Fabric) -> None:
+    """Raise `ValueError` for numbers that no fabric has; NaN passes as not known."""
+    for name, unit in NUMBERS.items():
+        value = float(getattr(fabric, name))
+        positive = name in ("density", "thickness")
+        if value < 0 or (positive and value == 0):
+            word = "positive" if positive else "not negative"
+            raise ValueError(f"fabric: {name} must be {word} [{unit}], found {value}")
+
+
+def nan_to_null(value: Any, where: str) -> Any:
+    """Nested JSON values with None for NaN; `ValueError` that says where a number is infinite."""
+    if isinstance(value, Mapping):
+        return {key: nan_to_null(each, f"{where}: {key}") for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [nan_to_null(each, f"{where}[{i}]") for i, each in enumerate(value)]
+    if isinstance(value, float) and not math.isfinite(value):
+        if math.isnan(value):
+            return None
+        raise ValueError(f"{where}: a file holds finite numbers, found {value}")
+    return value
+
+
+def null_to_nan(value: Any) -> Any:
+    """Nested lists of numbers with NaN for None."""
+    if isinstance(value, list):
+        return [null_to_nan(each) for each in value]
+    return math.nan if value is None else value
+
+
+def check_keys(stored: Any, expected: Iterable[str], where: str) -> None:
+    """Raise `ValueError` unless an object has exactly the `expected` keys."""
+    prefix = f"{where}: " if where else ""
+    expect(isinstance(stored, Mapping), where or "the card", "an object", stored)
+    if missing := [key for key in expected if key not in stored]:
+        raise ValueError(f"{prefix}missing: {', '.join(missing)}")
+    if unknown := sorted(set(stored) - set(expected)):
+        raise ValueError(f"{prefix}unknown: {', '.join(unknown)}; known: {', '.join(expected)}")
+
+
+def expect(holds: bool, where: str, expected: str, found: Any) -> None:
+    """Raise `ValueError` that says what was expected where, unless the condition holds."""
+    if not holds:
+        raise ValueError(f"{where}: expected {expected}, found {found!r}")
+
+
+def _law_as_json(law: Any, part: str) -> dict[str, Any]:
+    fields: dict[str, Any] = {}
+    for name in _field_names(law):
+        value, is_law = getattr(law, name), (type(law), name) in WITHIN
+        unit = _unit(part, type(law), name)
+        fields[name] = _law_as_json(value, part) if is_law else _entry(value, unit)
+    return {"law": type(law).__name__, **fields}
+
+
+def _entry(value: Any, unit: str) -> dict[str, Any]:
+    return {"value": np.asarray(value).tolist(), "unit": unit}
+
+
+def _field_names(law: Any) -> list[str]:
+    return [field.name for field in dataclasses.fields(law)]
+
+
+def _unit(part: str, law: type, name: str) -> str:
+    own = OTHER_UNITS.get(f"{law.__name__}.{name}")
+    return own or OTHER_UNITS.get(name) or LAWS[part][1]
+
+
+def _law_from(stored: Any, part: str, within: str = "") -> Any:
+    kinds = {kind.__name__: kind for kind in LAWS[part][0]}
+    where = f"fabric: {part}{within}"
+    name = stored.get("law") if isinstance(stored, dict) else None
+    expect(name in kinds, f"{where}: law", f"one of {', '.join(kinds)}", name)
+    kind = kinds[name]  # pyright: ignore[reportArgumentType]
+    check_keys(stored, ("law", *_field_names(kind)), where)
+    shape = TABLE_SHAPES.get(kind, ())
+    fields = {}
+    for n in _field_names(kind):
+        if (kind, n) in WITHIN:
+            fields[n] = _law_from(stored[n], part, f"{within}: {n}")
+        else:
+            fields[n] = _value(stored[n], _unit(part, kind, n), f"{where}: {n}", shape)
+    return kind(**fields)
+
+
+def _value(stored: Any, unit: str, where: str, shape: tuple[int, ...]) -> jax.Array:
+    check_keys(stored, ("value", "unit"), where)
+    expect(stored["unit"] == unit, f"{where}: unit", repr(unit), stored["unit"])
+    values = np.array(null_to_nan(stored["value"]), object)
+    numbers = [isinstance(v, int | float) and not isinstance(v, bool) for v in values.flat]
+    expected = f"numbers of shape {shape}" if shape else "a number, or null"
+    fits = values.shape == shape and all(numbers)
+    expect(fits, f"{where}: value", expected, stored["value"])
+    return jnp.asarray(values.astype(float), float)

@@ -1,0 +1,136 @@
+"""Bending of a sheet as a thin plate: the energy in its curvature tensor.
+
+A plate law sees the curvature (k11, k22, 2 k12) of an element, by warp and weft
+(`r2s.mesh.plate_elements`), as a membrane law sees a strain. It bends alike in all directions
+of a rectangle, and twists as a plate does, which hinges (`r2s.materials.bending`) do not.
+"""
+
+import math
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from r2s._util.units import Scalar, isotropic_bending
+from r2s.materials.bending import BendingLaw
+from r2s.mesh.bends import Bends
+from r2s.mesh.mesh import Mesh
+
+
+class PlateLaw(BendingLaw):
+    """A bending law of faces or vertices: of their curvature tensor.
+
+    The weft must be an axis of symmetry, so that small twists do not bend the sheet: curvature and
+    twist of a grid are not seen at one place.
+    """
+
+    element: ClassVar[str] = "plate"
+    bend: ClassVar[str] = "plate_bends"
+
+    @abstractmethod
+    def at(self, curvature: Float[Array, " 3"]) -> "PlateLaw":
+        """The law of a time step for an element which starts near this curvature [1/m]."""
+
+    @abstractmethod
+    def energy_density(self, curvature: Float[Array, " 3"]) -> Float[Array, ""]:
+        """Energy per rest area [J/m^2] at a curvature (k11, k22, 2 k12) [1/m]."""
+
+    def bends(self, mesh: Mesh) -> Bends:
+        """Those of the mesh's plate elements."""
+        return mesh.plate.bends
+
+    def vertices(self, mesh: Mesh) -> Int[Array, "element place"]:
+        """The vertices that each element's curvature depends on."""
+        return mesh.plate.vertices
+
+    def areas(self, mesh: Mesh) -> Float[Array, " element"]:
+        """The rest areas [m^2] of the elements."""
+        return mesh.plate.areas
+
+    def curvatures(self, mesh: Mesh, bends: Float[Array, " bend"]) -> Float[Array, "element 3"]:
+        """The curvatures (k11, k22, 2 k12) [1/m] of the elements, from those of the bends."""
+        return mesh.plate.curvatures(bends)
+
+    def gradients(
+        self, mesh: Mesh, bends: Float[Array, "bend corner 3"]
+    ) -> Float[Array, "element 3 place 3"]:
+        """Derivatives [1/m^2] of the elements' curvatures in their vertices, from the bends'."""
+        return mesh.plate.gradients(bends)
+
+    def on_elements(self, mesh: Mesh, bends: Float[Array, " bend"]) -> Any:
+        """The law of every element, by its curvature."""
+        return jax.vmap(self.at)(self.curvatures(mesh, bends))
+
+    def stiffness_along(self, angle: float) -> Float[Array, ""]:
+        """Stiffness [N m] of the flat plate against a cylinder at an angle [rad] to the warp."""
+        flat = jnp.zeros(3, float)
+        matrix = jax.hessian(self.at(flat).energy_density)(flat)
+        cylinder = jnp.asarray(
+            [math.cos(angle) ** 2, math.sin(angle) ** 2, math.sin(2 * angle)], float
+        )
+        return cylinder @ matrix @ cylinder
+
+
+class PlateBending(PlateLaw):
+    """The Kirchhoff plate, alike in all directions, of constant stiffness.
+
+    - `stiffness`: moment per curvature and width of a plate that may not curve across, [N m].
+    - `poissons_ratio`: how much it curves across when it may, [-]; -1 < nu < 1.
+    """
+
+    stiffness: Float[Array, "*batch"]
+    poissons_ratio: Float[Array, "*batch"]
+
+    @classmethod
+    def make(cls, stiffness: Scalar, poissons_ratio: Scalar = 0.0) -> "PlateBending":
+        """From a bending stiffness [N m] and Poisson's ratio [-]."""
+        stiffness = jnp.asarray(stiffness, float)
+        return cls(stiffness, jnp.broadcast_to(jnp.asarray(poissons_ratio, float), stiffness.shape))
+
+    @classmethod
+    def isotropic(
+        cls, youngs_modulus: Scalar, poissons_ratio: Scalar, thickness: Scalar
+    ) -> "PlateBending":
+        """Of a solid plate, from Young's modulus [Pa], Poisson's ratio [-] and thickness [m]."""
+        return cls.make(
+            isotropic_bending(youngs_modulus, poissons_ratio, thickness), poissons_ratio
+        )
+
+    def at(self, curvature: Float[Array, " 3"]) -> "PlateBending":
+        """Itself: its stiffness is constant."""
+        return self
+
+    def energy_density(self, curvature: Float[Array, " 3"]) -> Float[Array, ""]:
+        """Energy per rest area [J/m^2] at a curvature [1/m]: Timoshenko and Woinowsky-Krieger 1959,
+        section 21.
+        """
+        warp, weft, twist = curvature
+        nu = self.poissons_ratio
+        pure = warp**2 + weft**2 + 2 * nu * warp * weft + (1 - nu) / 2 * twist**2
+        return self.stiffness / 2 * pure
+
+
+class OrthotropicPlate(PlateLaw):
+    """A plate without Poisson effect, of constant stiffness along its yarns and across them.
+
+    - `warp`, `bias`, `weft`: moment per curvature and width [N m] of a sheet that bends along 0, 45
+      and 90 degrees from the warp. The bias must be above (warp + weft) / 4; (warp + weft) / 2
+      makes the stiffness linear in the square of the direction's cosine.
+    """
+
+    warp: Float[Array, "*batch"]
+    bias: Float[Array, "*batch"]
+    weft: Float[Array, "*batch"]
+
+    def at(self, curvature: Float[Array, " 3"]) -> "OrthotropicPlate":
+        """Itself: its stiffness is constant."""
+        return self
+
+    def energy_density(self, curvature: Float[Array, " 3"]) -> Float[Array, ""]:
+        """Energy per rest area [J/m^2] at a curvature [1/m]."""
+        warp, weft, twist = curvature
+        # at 45 degrees k11 = k22 = 2 k12 / 2
+        of_twist = self.bias - (self.warp + self.weft) / 4
+        return (self.warp * warp**2 + self.weft * weft**2 + of_twist * twist**2) / 2

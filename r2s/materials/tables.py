@@ -1,0 +1,201 @@
+"""Laws from tables of measured stiffness, which follows the strain or the curvature.
+
+Wang, O'Brien and Ramamoorthi ("Data-driven elastic models for cloth: modeling and measurement", ACM
+Transactions on Graphics 30(4), 2011) measured fabrics as such tables; ARCSim and DiffSim use them,
+and `r2s.materials.arcsim` reads their files.
+
+What was measured is a secant stiffness: stress = C(E) E, bending moment = B(kappa) kappa. Such a
+stress derives from no energy. So a law here has no energy of its own: a time step takes from `at`
+the law whose stiffness is held at what it is near the start of the step, which has one.
+
+`TableMembrane` and `TableBending` interpolate what was published. `DiffSimTableMembrane` and
+`DiffSimTableBending` are DiffSim's own look-ups (Qiao, Liang, Koltun and Lin, "Scalable
+differentiable physics for learning and control", ICML 2020), for comparisons with it.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from r2s.materials.bending import HingeBending, HingeLaw
+from r2s.materials.membrane import OrthotropicMembrane
+
+LARGE_STRETCH = 1 / 6  # [-]: the extension at which the large-strain rows were measured
+CURVATURE_STEP = 10.0  # [1/m]: between the columns of a bending table
+BLUR = 1e-3  # [-]: principal strains that differ by less hardly have a direction
+HINGE_FACTOR = 4.0  # published bending stiffness over bending stiffness of the hinge
+
+BAKED = 30  # samples along each axis of DiffSim's baked grid
+BAKED_FROM = (-0.25, -0.25, 0.0)  # [-]: E11, E22 and |E12| of its first sample
+
+
+class TableMembrane(eqx.Module):
+    """Membrane whose stiffness depends on the principal stretch and its direction.
+
+    - `stiffness`: as published, C11, C12, C22, C33 [N/m] in each row. Row 0 is at zero strain, rows
+      1 to 5 at a principal extension of 16.7 % along 0, 22.5, 45, 67.5 and 90 degrees from the
+      warp. The published C33 acts on the shear strain E12: it is twice the `c33` of
+      `OrthotropicMembrane`.
+    """
+
+    stiffness: Float[Array, "*batch 6 4"]
+
+    def at(self, strain: Float[Array, " 3"]) -> OrthotropicMembrane:
+        """The constant stiffness that the law has at a strain (E11, E22, 2 E12) [-].
+
+        Linear in the largest principal stretch, from row 0 to the large-strain rows, and between
+        those in its direction; constant in compression and beyond the table. A sheet that stretches
+        alike in all directions gets the row of 45 degrees. Some measured numbers are negative where
+        a stiffness cannot be: C33 is raised to zero, and C12 limited to what C11 and C22 allow.
+        """
+        stretch, angle = _principal(strain)
+        weight = jnp.clip((stretch - 1) / LARGE_STRETCH, 0, 1)
+        return _stable(_stretched(self.stiffness, weight, 8 * angle / jnp.pi))
+
+    def energy_density(self, strain: Float[Array, " 3"]) -> Float[Array, ""]:
+        """Energy per rest area [J/m^2] at a Green strain (E11, E22, 2 E12) [-] of a sheet that has
+        had the stiffness it has there all along.
+
+        Its gradient is not the stress, since the stiffness changes with the strain: the stress is
+        the gradient of the energy of `at(strain)`.
+        """
+        return self.at(strain).energy_density(strain)
+
+
+class DiffSimTableMembrane(eqx.Module):
+    """A `TableMembrane` looked up as DiffSim does.
+
+    It doubles the numbers, raises negative ones to zero, and shifts them by half a sample: an
+    extension of 4.2 % still has the stiffness of zero strain, one of 12.5 % that of 16.7 %. The
+    result is baked on a coarse grid of E11, E22 and |E12| (steps of 1/30), which is shifted by half
+    a cell once more and interpolated linearly. C12 is not limited: a table with C12^2 > C11 C22 has
+    a negative stiffness.
+
+    - `stiffness`: of a `TableMembrane`, as published [N/m]; half of what DiffSim then uses.
+    """
+
+    stiffness: Float[Array, "*batch 6 4"]
+
+    def at(self, strain: Float[Array, " 3"]) -> OrthotropicMembrane:
+        """The constant stiffness that DiffSim uses at a strain (E11, E22, 2 E12) [-]."""
+        first = jnp.asarray(BAKED_FROM, strain.dtype)
+        green = jnp.stack([strain[0], strain[1], jnp.abs(strain[2]) / 2])
+        index = jnp.clip((green - first) * (BAKED**2 / (BAKED - 1)) - 0.5, 0, BAKED - 1)
+        # no derivative, so that that of a sample, NaN at equal principal strains, is never formed
+        below = jax.lax.stop_gradient(jnp.clip(jnp.floor(index), 0, BAKED - 2))
+        above = index - below
+
+        def weighed(corner: Float[Array, " 3"]) -> Float[Array, " 4"]:
+            sample = _diffsim_sample(self.stiffness, first + (below + corner) / BAKED)
+            return jnp.prod(jnp.where(corner > 0, above, 1 - above)) * sample
+
+        corners = jnp.indices((2, 2, 2)).reshape(3, 8).T.astype(strain.dtype)  # of the cell
+        return _engineering(jnp.sum(jax.vmap(weighed)(corners), axis=0))
+
+    def energy_density(self, strain: Float[Array, " 3"]) -> Float[Array, ""]:
+        """Energy per rest area [J/m^2] at a strain, as of a `TableMembrane`."""
+        return self.at(strain).energy_density(strain)
+
+
+class TableBending(HingeLaw):
+    """Bending whose stiffness depends on the direction and the curvature.
+
+    - `stiffness`: as published [N m]. Rows are the directions 0, 45 and 90 degrees of an edge from
+      the warp; columns the curvatures theta l / A of 0, 10, 20, 30 and 40 1/m at the edge.
+
+    The published stiffness k is the one of the force k l^2 / (4 A) theta dtheta/dx of an edge with
+    angle theta and length l, A the areas of its two triangles. The hinge of r2s has the energy
+    A B (theta l / A)^2 / 2, so the force B l^2 / A theta dtheta/dx: its B is k / 4.
+    """
+
+    stiffness: Float[Array, "*batch 3 5"]
+
+    def at(self, direction: Float[Array, ""], curvature: Float[Array, ""]) -> HingeBending:
+        """The constant stiffness of a hinge at a curvature [1/m], linear between the entries.
+
+        `direction` is that of the line which the hinge bends [rad], at right angles to its edge.
+        """
+        row, column = _edge_row(direction), jnp.abs(curvature) / CURVATURE_STEP
+        return HingeBending(_between(_between(self.stiffness, row), column) / HINGE_FACTOR)
+
+
+class DiffSimTableBending(HingeLaw):
+    """A `TableBending` looked up as DiffSim does.
+
+    It shifts the table by half an entry in both directions, and takes the curvature with its sign:
+    hinges that bend to one side (of positive `hinge_angle`) all have the stiffness of a flat one.
+
+    - `stiffness`: as of a `TableBending`, [N m].
+    """
+
+    stiffness: Float[Array, "*batch 3 5"]
+
+    def at(self, direction: Float[Array, ""], curvature: Float[Array, ""]) -> HingeBending:
+        """The constant stiffness that DiffSim uses at a curvature [1/m], as of a `TableBending`."""
+        row = 1.5 * _edge_row(direction) - 0.5
+        column = 1.25 * (-curvature / CURVATURE_STEP) - 0.5
+        return HingeBending(_between(_between(self.stiffness, row), column) / HINGE_FACTOR)
+
+
+def _between(table: Float[Array, "row ..."], index: Float[Array, ""]) -> Float[Array, "..."]:
+    """Rows of a table, interpolated linearly at an index [-] and constant beyond its ends."""
+    last = table.shape[0] - 1
+    index = jnp.clip(index, 0, last)
+    below = jnp.clip(jnp.floor(index), 0, last - 1)
+    low = below.astype(int)
+    # this form, so that equal rows give exactly what they hold
+    return table[low] + (index - below) * (table[low + 1] - table[low])
+
+
+def _edge_row(direction: Float[Array, ""]) -> Float[Array, ""]:
+    """The row [-] of a bending table for the edge of a hinge, from the line that it bends [rad]."""
+    return 2 - 4 * direction / jnp.pi
+
+
+def _stretched(
+    stiffness: Float[Array, "6 4"], weight: Float[Array, ""], angle: Float[Array, ""]
+) -> Float[Array, " 4"]:
+    """From row 0 at weight 0 to the large-strain row at weight 1; `angle` in steps of a row."""
+    return stiffness[0] + weight * (_between(stiffness[1:], angle) - stiffness[0])
+
+
+def _principal(strain: Float[Array, " 3"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The largest principal stretch [-], at least 1, and its angle to the warp, 0 to pi/2 [rad].
+
+    Where the principal strains are equal the angle is undefined and the stretch has a kink: both
+    are blurred over a difference of `BLUR`, and the angle becomes pi/4 there.
+    """
+    e11, e22, shear = strain
+    difference = e11 - e22
+    squared = difference**2 + shear**2  # of the difference between the principal strains
+    stretch = jnp.sqrt(jnp.maximum(1 + e11 + e22 + squared / jnp.sqrt(squared + BLUR**2), 1))
+    # far below the blur, where the derivative of the arctangent would overflow, any angle does
+    has_angle = squared > 1e-12 * BLUR**2
+    angle = jnp.arctan2(jnp.abs(shear), jnp.where(has_angle, difference, 1)) / 2
+    return stretch, jnp.pi / 4 + squared / (squared + BLUR**2) * (angle - jnp.pi / 4)
+
+
+def _stable(published: Float[Array, " 4"]) -> OrthotropicMembrane:
+    """A law from published numbers [N/m], without negative stiffness."""
+    c11, c12, c22, c33 = jnp.maximum(published, jnp.array([0, -jnp.inf, 0, 0], published.dtype))
+    bound = jnp.sqrt(jnp.maximum(c11 * c22, jnp.finfo(published.dtype).tiny))
+    return _engineering(jnp.stack([c11, jnp.clip(c12, -bound, bound), c22, c33]))
+
+
+def _engineering(published: Float[Array, " 4"]) -> OrthotropicMembrane:
+    c11, c12, c22, c33 = published
+    return OrthotropicMembrane(c11, c12, c22, c33 / 2)
+
+
+def _diffsim_sample(
+    stiffness: Float[Array, "6 4"], green: Float[Array, " 3"]
+) -> Float[Array, " 4"]:
+    """One sample [N/m] of DiffSim's baked grid, at (E11, E22, E12) [-]."""
+    e11, e22, e12 = green
+    difference, shear = e11 - e22, 2 * e12
+    largest = 1 + e11 + e22 + jnp.sqrt(difference**2 + shear**2)
+    weight = (jnp.sqrt(largest) - 1) / LARGE_STRETCH
+    angle = 8 * (jnp.arctan2(shear, difference) / 2) / jnp.pi  # 0 at equal principal strains
+    shifted = jnp.clip(2 * weight - 0.5, 0, 1)
+    return jnp.maximum(2 * _stretched(stiffness, shifted, 1.25 * angle - 0.5), 0)

@@ -1,0 +1,367 @@
+"""The cloth in explicit steps: as many symplectic substeps in a step as its waves need.
+
+The physics are those of `r2s.Cloth`, but for the fastest waves of the membrane
+(`viscosity`). A substep needs no solve, and all its arrays are worked on side by side:
+of a batch, its members. For derivatives the implicit cloth is better: these would go through every
+substep.
+"""
+
+import math
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from r2s._util.traced import is_traced
+from r2s.environment.air import Air
+from r2s.environment.scene import Control, Scene
+from r2s.materials.fabric import Fabric
+from r2s.materials.plate import PlateLaw
+from r2s.mesh.mesh import Mesh
+from r2s.solvers.explicit import elements
+from r2s.solvers.explicit.batch_last import batch_last
+from r2s.solvers.explicit.grid import grid_force, laws_on_grid
+from r2s.solvers.explicit.grid_membrane import Samples
+from r2s.solvers.explicit.layout import Layout
+from r2s.solvers.explicit.sheet import (
+    Cells,
+    ForceInputs,
+    Memory,
+    cells_of,
+    force_by_gathers,
+    no_memory,
+)
+from r2s.solvers.explicit.stability import check_step, longest_relaxing_step
+from r2s.solvers.explicit.viscosity import RELAXATION, Viscosity
+from r2s.solvers.failures import Failure, first_failure, no_failure
+from r2s.solvers.implicit.substep import moved_velocity
+
+Positions = Float[Array, "vertex 3"]
+OfSamples = Float[Array, "element sample 3"]
+
+ROUNDING = 1e-3  # of a limit in float32
+TRACED = (
+    "the fabric that gives the substeps must not be traced: make the solver outside of jit, grad "
+    "and vmap, of the stiffest fabric, and trace its steps"
+)
+REFUSED = (
+    "explicit steps do not know contact of the sheet with itself: take the implicit cloth, "
+    "r2s.Cloth.make(..., self_contact=True), or material points, r2s.material_points"
+)
+
+
+class ExplicitState(eqx.Module):
+    """- `x`, `v`: positions [m] and velocities [m/s], world frame, z up.
+    - `relaxed`: stress of every sample that its viscosity remembers, [N/m].
+    - `hidden`: scaled wrinkles of every sample, from where the next substep goes on; None: the mesh
+      has none, or is no grid.
+    - `begun`: whether there was a step.
+    - `failure`: the first `r2s.solvers.failures.Failure` of the run so far.
+    """
+
+    x: Positions
+    v: Positions
+    relaxed: OfSamples
+    hidden: OfSamples | None
+    begun: Bool[Array, ""]
+    failure: Int[Array, ""]
+
+
+class ExplicitCloth(eqx.Module):
+    """A sheet in a scene, stepped by symplectic Euler in substeps.
+
+    `make` makes one. `jax.vmap` of `step` runs a batch with its members side by side.
+
+    - `scene`: sheet, held vertices, table, air.
+    - `membrane_damping`: damping time of the membrane, [s]; None: the fabric's.
+    - `relaxation`: of the membrane's viscosity, [s].
+    - `dt`: step, [s]. `substeps`: in a step.
+    - `grid`: vertices along warp and weft of a rectangle of quadrilaterals, and the spacing
+      between them [m]; None: any other mesh, whose forces take several times as long.
+    """
+
+    scene: Scene
+    membrane_damping: Float[Array, ""] | None
+    relaxation: Float[Array, ""]
+    dt: float = eqx.field(static=True)
+    substeps: int = eqx.field(static=True)
+    grid: Cells | None = eqx.field(static=True)
+
+    @classmethod
+    def make(
+        cls,
+        scene: Scene,
+        dt: float,
+        fabric: Fabric,
+        membrane_damping: float | None = None,
+        relaxation: float = RELAXATION,
+        *,
+        substeps: int | None = None,
+        self_contact: bool = False,
+    ) -> "ExplicitCloth":
+        """A solver for a scene, whose mesh must not be traced.
+
+        - `fabric`: the stiffest that it will be used for; of a batch, with a leading axis on every
+          array, that is the member which needs the shortest substeps.
+        - `membrane_damping`: as in `ExplicitCloth`. `relaxation`: of its viscosity, [s]
+          (`viscosity`); 0: plain Kelvin-Voigt damping, in far shorter substeps.
+        - `substeps`: in a step; None: the fewest below `stable_step`.
+
+        Raises `ValueError` for a step that is not positive, for substeps that are too long, with
+        their limit, for a fabric that is traced or has no limit, and for self-contact.
+        """
+        if self_contact:
+            raise ValueError(REFUSED)
+        if is_traced(fabric):
+            raise ValueError(TRACED)
+        if substeps is not None and (substeps != int(substeps) or substeps < 1):
+            raise ValueError(f"substeps must be a whole number from 1 on, got {substeps}")
+        if not (math.inf > dt > 0 and relaxation >= 0 and (membrane_damping or 0) >= 0):
+            raise ValueError(
+                "dt must be positive, damping time and relaxation not negative, got "
+                f"{dt} s, {membrane_damping} s and {relaxation} s"
+            )
+        damping = None if membrane_damping is None else jnp.asarray(membrane_damping, float)
+        relaxing = jnp.asarray(relaxation, float)
+        with jax.ensure_compile_time_eval():
+            longest = shortest(scene.mesh, fabric, damping, relaxing)
+            grid = cells_of(scene.mesh)
+        if not 0 < longest < math.inf:
+            raise ValueError(
+                f"the fabric has no longest substep (found {longest} s): its density and its "
+                "stiffness must be positive, its numbers finite"
+            )
+        if substeps is None:
+            substeps = max(1, math.ceil(dt / longest * (1 + 1e-6)))
+        solver = cls(scene, damping, relaxing, float(dt), int(substeps), grid)
+        solver._check_substep(longest)
+        return solver
+
+    def check(self, fabric: Fabric) -> None:
+        """Raises `ValueError` when the substeps are too long for a fabric, unless it is traced."""
+        if is_traced(fabric):
+            return
+        with jax.ensure_compile_time_eval():
+            times = self.membrane_damping, self.relaxation
+            self._check_substep(shortest(self.scene.mesh, fabric, *times))
+
+    def fits(self, fabric: Fabric) -> Bool[Array, ""]:
+        """Whether the substeps are short enough for a fabric, which may be traced."""
+        longest = stable_step(self.scene.mesh, fabric, self.membrane_damping, self.relaxation)
+        return self.dt / self.substeps <= (1 + ROUNDING) * longest
+
+    def _check_substep(self, longest: float) -> None:
+        material = f"the fabric and the mesh (dt = {self.dt:g} s in {self.substeps} substeps)"
+        check_step(self.dt / self.substeps, jnp.asarray(longest), material)
+
+    def init(
+        self, x: Positions, v: Positions | None = None, acceleration: Positions | None = None
+    ) -> ExplicitState:
+        """A state from positions [m] and velocities [m/s] (default: zero).
+
+        The `acceleration` is of no use: a step needs nothing of the step before.
+        """
+        v = jnp.zeros_like(x) if v is None else v
+        return ExplicitState(x, v, *no_memory(self.scene.mesh, self.grid, x.dtype), no_failure())
+
+    def step(self, fabric: Fabric, state: ExplicitState, control: Control) -> ExplicitState:
+        """The state `dt` later, with the held vertices at `control.handles`."""
+        return self._step(fabric, state, control, False)[0]
+
+    def step_with_forces(
+        self, fabric: Fabric, state: ExplicitState, control: Control
+    ) -> tuple[ExplicitState, Float[Array, "handle 3"]]:
+        """The state `dt` later, and the grippers' mean forces [N] on the held vertices."""
+        after, impulse = self._step(fabric, state, control, True)
+        return after, impulse[self.scene.held] / self.dt
+
+    def _step(self, fabric: Fabric, state: ExplicitState, control: Control, with_impulse: bool):
+        scene, dtype = self.scene, state.x.dtype
+        carried = jnp.zeros_like(state.x)
+        carried = carried.at[scene.held].set((control.handles - state.x[scene.held]) / self.dt)
+        damping = fabric.damping if self.membrane_damping is None else self.membrane_damping
+        substep = jnp.asarray(self.dt / self.substeps, dtype)
+        inputs = _Inputs(
+            fabric,
+            _Moving(
+                state.x,
+                state.v,
+                state.relaxed,
+                state.hidden,
+                state.begun,
+                jnp.zeros_like(state.x) if with_impulse else None,
+            ),
+            carried,
+            scene.is_free.astype(dtype),
+            control.wind,
+            scene.table.height,
+            scene.air,
+            scene.fan,
+            Viscosity.make(damping, self.relaxation, substep),
+        )
+        if self.grid is not None and isinstance(fabric.bending, PlateLaw):
+            moved = self._on_grid(inputs)
+        else:
+            moved = self._by_gathers(inputs)
+        x = scene.place(moved.x, control.handles)
+        asked = state.x, state.v, fabric, control
+        failure = first_failure(state.failure, _failure(asked, (x, moved.v)))
+        after = ExplicitState(x, moved.v, moved.relaxed, moved.hidden, moved.begun, failure)
+        return after, moved.impulse
+
+    def _on_grid(self, inputs: "_Inputs") -> "_Moving":
+        assert self.grid is not None
+        arrays, static = eqx.partition(inputs, eqx.is_array)
+        advance = partial(_advance_grid, *self.grid, self.dt, self.substeps)
+        return batch_last(lambda batched, arrays: advance(batched, eqx.combine(arrays, static)))(
+            arrays
+        )
+
+    def _by_gathers(self, inputs: "_Inputs") -> "_Moving":
+        mesh, fabric, start = self.scene.mesh, inputs.fabric, inputs.start
+        dt = jnp.asarray(self.dt / self.substeps, start.x.dtype)
+        mass = fabric.density * mesh.vertex_area
+        free, carried = inputs.is_free > 0, tuple(inputs.carried.T)
+        around = inputs.viscosity, inputs.air, inputs.fan
+
+        def substep(moving: _Moving, _):
+            x, v, impulse = moving.x, moving.v, moving.impulse
+            memory = Memory(moving.relaxed, moving.hidden, moving.begun)
+            asked = ForceInputs(fabric, *around, x, v, inputs.wind, memory)
+            force, memory = force_by_gathers(mesh, asked)
+            height = x[:, 2] - inputs.table_height - fabric.thickness
+            others = fabric.density, fabric.friction, fabric.mass_damping
+            moved = moved_velocity(dt, tuple(force.T), mass, tuple(v.T), height, *others)
+            v = jnp.stack([jnp.where(free, m, c) for m, c in zip(moved, carried, strict=True)], 1)
+            if impulse is not None:
+                impulse += mass[:, None] * (v - jnp.stack(moved, axis=1))
+            return _Moving(x + dt * v, v, *memory, impulse), None
+
+        return jax.lax.scan(substep, start, length=self.substeps)[0]
+
+
+class _Moving(NamedTuple):
+    """What a substep changes, as in `ExplicitState`."""
+
+    x: Any
+    v: Any
+    relaxed: Any
+    hidden: Any
+    begun: Array
+    impulse: Any  # [N s], of the grippers, added up; None: it is not asked for
+
+
+class _Inputs(NamedTuple):
+    """All that a step depends on; with a batch as last axis in `_advance_grid`."""
+
+    fabric: Fabric
+    start: _Moving
+    carried: Array  # velocities of held vertices
+    is_free: Array
+    wind: Array
+    table_height: Array
+    air: Air
+    fan: Any
+    viscosity: Viscosity
+
+
+def _advance_grid(shape, spacing, dt, substeps: int, batched: bool, inputs: _Inputs) -> _Moving:
+    """What the substeps of a step change."""
+    layout = Layout(shape, spacing, batched)
+    fabric, start, count, room = inputs.fabric, inputs.start, layout.count, layout.room
+    dt = jnp.asarray(dt / substeps, start.x.dtype)
+    viscosity = jax.tree.map(layout.row, inputs.viscosity)
+    laws = laws_on_grid(layout, fabric, viscosity, start.hidden is not None)
+    names = ("density", "friction", "mass_damping", "thickness")
+    row = {name: layout.row(getattr(fabric, name)) for name in names}
+    mass = row["density"] * layout.constant(layout.vertex_areas, 0, start.x)
+    contact = layout.row(inputs.table_height) + row["thickness"]
+    air = jax.tree.map(layout.row, inputs.air)
+    free = inputs.is_free > 0
+    carried = tuple(inputs.carried[:, i] for i in range(3))
+
+    def inner(arrays):
+        return tuple(each[room : room + count] for each in arrays)
+
+    def put(wide, arrays):
+        return tuple(w.at[room : room + count].set(a) for w, a in zip(wide, arrays, strict=True))
+
+    def substep(_, moving: _Moving) -> _Moving:
+        x, v, impulse = moving.x, moving.v, moving.impulse
+        flow = layout.flow(x, v, inputs.wind, inputs.fan)
+        samples = Samples(moving.relaxed, moving.hidden)
+        force, samples = grid_force(layout, laws, air, x, v, flow, samples, moving.begun)
+        here, before = inner(x), inner(v)
+        height = here[2] - contact
+        others = row["density"], row["friction"], row["mass_damping"]
+        unheld = moved_velocity(dt, force, mass, before, height, *others)
+        moved = tuple(jnp.where(free, m, c) for m, c in zip(unheld, carried, strict=True))
+        if impulse is not None:
+            given = zip(impulse, moved, unheld, strict=True)
+            impulse = tuple(i + mass * (m - u) for i, m, u in given)
+        placed = tuple(a + dt * b for a, b in zip(here, moved, strict=True))
+        begun = jnp.ones_like(moving.begun)
+        return _Moving(put(x, placed), put(v, moved), *samples, begun, impulse)
+
+    def columns(array: Array | None):
+        return None if array is None else tuple(array[:, i] for i in range(3))
+
+    def stacked(arrays):
+        return None if arrays is None else jnp.stack(arrays, axis=1)
+
+    of_samples = (start.relaxed, start.hidden)
+    relaxed, hidden = (None if s is None else layout.to_cells(s) for s in of_samples)
+    moving = _Moving(
+        layout.wide(start.x),
+        layout.wide(start.v),
+        relaxed,
+        hidden,
+        layout.row(start.begun),
+        columns(start.impulse),
+    )
+    end = jax.lax.fori_loop(0, substeps, substep, moving)
+    of_samples = (end.relaxed, end.hidden)
+    relaxed, hidden = (None if s is None else layout.from_cells(s) for s in of_samples)
+    begun = end.begun[0] if batched else end.begun
+    impulse = stacked(end.impulse)
+    return _Moving(stacked(inner(end.x)), stacked(inner(end.v)), relaxed, hidden, begun, impulse)
+
+
+def _failure(inputs: Any, results: Any) -> Int[Array, ""]:
+    """Inputs that are not finite give `NON_FINITE`, results that are not `TIME_STEP`."""
+    code = jnp.where(_all_finite(results), Failure.NONE.value, Failure.TIME_STEP.value)
+    return jnp.where(_all_finite(inputs), code, Failure.NON_FINITE.value)
+
+
+def _all_finite(tree: Any) -> Array:
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
+
+
+@eqx.filter_jit
+def stable_step(
+    mesh: Mesh,
+    fabric: Fabric,
+    membrane_damping: Float[Array, ""] | float | None = None,
+    relaxation: Float[Array, ""] | float = RELAXATION,
+) -> Float[Array, ""]:
+    """The longest substep [s] that is stable for a fabric near its rest shape.
+
+    `membrane_damping`, `relaxation`: as in `ExplicitCloth`, [s]. The squares of the highest
+    frequencies of membrane and bending have bounds that add. Table and friction do not limit it.
+    """
+    damping = fabric.damping if membrane_damping is None else jnp.asarray(membrane_damping, float)
+    bending = elements.bending_frequency(mesh, fabric), fabric.damping
+    stretching = elements.membrane_frequency(mesh, fabric)
+    return longest_relaxing_step(stretching, damping, jnp.asarray(relaxation, float), [bending])
+
+
+def shortest(mesh: Mesh, fabric: Fabric, damping: Array | None, relaxation: Array) -> float:
+    """The least `stable_step` [s] of a fabric, or of all members of a batch."""
+    limit = stable_step
+    for _ in range(jnp.ndim(fabric.density)):
+        limit = eqx.filter_vmap(limit, in_axes=(None, 0, None, None))
+    return float(np.min(np.asarray(limit(mesh, fabric, damping, relaxation))))

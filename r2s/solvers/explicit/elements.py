@@ -1,0 +1,146 @@
+"""Membrane and bending of a sheet as forces on its vertices, and bounds on their frequencies.
+
+Strains, curvatures and laws are those of `r2s.Cloth`; here they give forces, for explicit steps.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from r2s.materials.fabric import Fabric
+from r2s.materials.wrinkling import membrane_on_samples, stress_on_samples
+from r2s.mesh.elements import strains, vertex_masses
+from r2s.mesh.mesh import Mesh
+from r2s.mesh.strain_samples import green_strain_gradient
+
+Vertices = Float[Array, "vertex 3"]
+
+
+def elastic_force(
+    mesh: Mesh, fabric: Fabric, membrane_damping: Float[Array, ""], x: Vertices, v: Vertices
+) -> Vertices:
+    """Forces [N] of membrane and bending with Kelvin-Voigt viscosity on the vertices.
+
+    - `membrane_damping`: damping time of the membrane, [s]; the fabric's holds for bending alone.
+    - `x`, `v`: positions [m] and velocities [m/s].
+    """
+    strain = mesh.samples.strains(x)
+    laws = membrane_on_samples(mesh.samples, fabric.membrane, fabric.bending, strain)
+    row = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), laws)
+    areas = mesh.samples.areas.reshape(-1)
+    membrane = _resistance(row, partial(strains, mesh), areas, membrane_damping, x, v)
+    return membrane + bending_force(mesh, fabric, x, v)
+
+
+def membrane_stress(mesh: Mesh, fabric: Fabric, x: Vertices) -> Float[Array, "sample 3"]:
+    """Of all strain samples at positions [m], [N/m]."""
+    strain = mesh.samples.strains(x)
+    laws = membrane_on_samples(mesh.samples, fabric.membrane, fabric.bending, strain)
+    return stress_on_samples(laws, strain).reshape(-1, 3)
+
+
+def membrane_force(mesh: Mesh, x: Vertices, stress: Float[Array, "sample 3"]) -> Vertices:
+    """Forces [N] of stresses [N/m] on the vertices."""
+    _, to_forces = jax.vjp(partial(strains, mesh), x)
+    return -to_forces(mesh.samples.areas.reshape(-1)[:, None] * stress)[0]
+
+
+def bending_force(mesh: Mesh, fabric: Fabric, x: Vertices, v: Vertices) -> Vertices:
+    """Forces [N] of bending with Kelvin-Voigt viscosity on the vertices."""
+    bends = fabric.bending.bends(mesh)
+
+    def bend(x: Vertices) -> Array:
+        return fabric.bending.curvatures(mesh, bends.curvatures_at(x))
+
+    bent = fabric.bending.on_elements(mesh, bends.curvatures_at(x))
+    return _resistance(bent, bend, fabric.bending.areas(mesh), fabric.damping, x, v)
+
+
+def _resistance(
+    laws: Any,
+    measure: Callable[[Vertices], Array],
+    areas: Array,
+    damping: Array,
+    x: Array,
+    v: Array,
+) -> Vertices:
+    """Minus the derivative in x of the energy of a strain measure, with its viscosity [N]."""
+
+    def stresses(strain: Array) -> Array:
+        return jax.vmap(lambda law, s: jax.grad(law.energy_density)(s))(laws, strain)
+
+    strain, rate = jax.jvp(measure, (x,), (v,))
+    stress, viscous = jax.jvp(stresses, (strain,), (rate,))
+    _, to_forces = jax.vjp(measure, x)
+    areas = areas if strain.ndim == 1 else areas[:, None]
+    return -to_forces(areas * (stress + damping * viscous))[0]
+
+
+def membrane_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
+    """A bound on the square of the membrane's highest frequency [1/s^2], flat and unstrained.
+
+    The bound is that of the worst element, with its mass in equal parts at its corners (Fried
+    1972). A law that stiffens counts as its property `stiffest`, if it has one.
+    """
+    law = getattr(fabric.membrane, "stiffest", fabric.membrane)
+    tangent = _tangent(law.at, law)
+    samples = mesh.samples
+    count = samples.corners.shape[1]
+
+    def square(corners, gradients, areas):
+        rates = jax.vmap(green_strain_gradient, in_axes=(None, 0))(corners, gradients)
+        rates = rates.reshape(*rates.shape[:2], -1)
+        share = areas / jnp.sum(areas)
+        stiffness = jnp.einsum("q,qsi,st,qtj->ij", share, rates, tangent, rates)
+        return count * jnp.linalg.eigvalsh(stiffness)[-1] / fabric.density
+
+    corners = _flat(mesh)[samples.corners]
+    return jnp.max(jax.vmap(square)(corners, samples.gradients, samples.areas))
+
+
+def bending_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
+    """A bound on the square of the highest frequency of bending [1/s^2], flat and at rest.
+
+    The bound is that of the worst face or hinge, with the vertices' masses in equal parts among
+    the elements that share them.
+    """
+    mass = vertex_masses(mesh, fabric.density)
+    law = fabric.bending
+    bends = law.bends(mesh)
+    if not bends.vertices.shape[0]:
+        return jnp.zeros((), float)
+    vertices, areas = law.vertices(mesh), law.areas(mesh)
+    rates = law.gradients(mesh, bends.gradients(_flat(mesh)))
+    count, size = rates.shape[:2]
+    unbent = jnp.zeros(bends.vertices.shape[0], mesh.rest.dtype)
+    laws, flat = law.on_elements(mesh, unbent), law.curvatures(mesh, unbent)
+    tangents = jax.vmap(lambda law, k: jax.hessian(law.energy_density)(k))(laws, flat)
+    tangents = tangents.reshape(count, size, size)  # of a hinge it is a number
+    sharing = jnp.zeros(mass.shape, float).at[vertices].add(1)
+    weight = jnp.sqrt(areas[:, None] * sharing[vertices] / mass[vertices])
+    rates = (rates * weight[:, None, :, None]).reshape(*rates.shape[:2], -1)
+    return jnp.max(jax.vmap(_largest)(tangents, rates))
+
+
+def _tangent(at: Callable[[Array], Any], law: Any) -> Float[Array, "3 3"]:
+    """The stiffness of a law at zero strain or curvature."""
+    zero = jnp.zeros(3, jax.tree.leaves(law)[0].dtype)
+    return jax.hessian(at(zero).energy_density)(zero)
+
+
+def _largest(
+    tangent: Float[Array, "strain strain"], rates: Float[Array, "strain coordinate"]
+) -> Float[Array, ""]:
+    """The largest eigenvalue of rates^T tangent rates."""
+    size = jnp.trace(tangent) + jnp.finfo(tangent.dtype).tiny
+    root = jnp.linalg.cholesky(tangent + 1e-6 * size * jnp.eye(len(tangent), dtype=tangent.dtype))
+    scaled = root.T @ rates
+    return jnp.linalg.eigvalsh(scaled @ scaled.T)[-1]
+
+
+def _flat(mesh: Mesh) -> Vertices:
+    return jnp.pad(mesh.rest, ((0, 0), (0, 1)))

@@ -1,0 +1,121 @@
+"""Forces on a sheet from substep to substep, with what the viscosity of its membrane remembers.
+
+By slices where the mesh is a grid, by gathers elsewhere.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from r2s._util.once import once
+from r2s.environment.air import Air, Fan
+from r2s.environment.drag import drag_on_vertices
+from r2s.materials.fabric import Fabric
+from r2s.materials.plate import PlateLaw
+from r2s.mesh.mesh import Mesh
+from r2s.solvers.explicit.batch_last import batch_last
+from r2s.solvers.explicit.elements import bending_force, membrane_force, membrane_stress
+from r2s.solvers.explicit.grid import grid_force, laws_on_grid
+from r2s.solvers.explicit.grid_membrane import Samples
+from r2s.solvers.explicit.layout import Layout
+from r2s.solvers.explicit.viscosity import Viscosity
+
+Vertices = Float[Array, "vertex 3"]
+Cells = tuple[tuple[int, int], tuple[float, float]]
+
+
+class Memory(NamedTuple):
+    """What the samples of a membrane remember of the substep before.
+
+    - `relaxed`: stress (`r2s.solvers.explicit.viscosity`), [N/m].
+    - `hidden`: scaled wrinkles; None: the mesh has none, or is no grid.
+    - `begun`: whether there was a substep.
+    """
+
+    relaxed: Float[Array, "element sample 3"]
+    hidden: Float[Array, "element sample 3"] | None
+    begun: Array
+
+
+class ForceInputs(NamedTuple):
+    """All that the forces depend on, beside the mesh."""
+
+    fabric: Fabric
+    viscosity: Viscosity
+    air: Air
+    fan: Fan | None
+    x: Vertices
+    v: Vertices
+    wind: Array
+    memory: Memory
+
+
+def cells_of(mesh: Mesh) -> Cells | None:
+    """Vertices along warp and weft of a `rectangle` of quadrilaterals, and their spacing [m]."""
+    corners = np.asarray(mesh.samples.corners)
+    if corners.shape[1] != 4:
+        return None
+    rest = np.asarray(mesh.rest, float)
+    columns = int(corners[0, 1] - corners[0, 0])
+    shape = len(rest) // columns, columns
+    size = rest[-1] - rest[0]
+    return shape, (float(size[0]) / (shape[0] - 1), float(size[1]) / (columns - 1))
+
+
+def no_memory(mesh: Mesh, cells: Cells | None, dtype: Any) -> Memory:
+    """Before the first substep."""
+    none = jnp.zeros((*mesh.samples.areas.shape, 3), dtype)
+    wrinkles = cells is not None and mesh.samples.hidden_waves is not None
+    return Memory(none, none if wrinkles else None, jnp.asarray(False))
+
+
+def sheet_force(mesh: Mesh, cells: Cells | None, inputs: ForceInputs) -> tuple[Vertices, Memory]:
+    """Forces [N] of membrane, bending and air on the vertices, and what the samples remember.
+
+    `cells`: vertices along warp and weft of a rectangle of quadrilaterals, and the spacing between
+    them [m]; None: any mesh.
+    """
+    if cells is None or not isinstance(inputs.fabric.bending, PlateLaw):
+        return force_by_gathers(mesh, inputs)
+    arrays, static = eqx.partition(inputs, eqx.is_array)
+    by_slices = partial(_force_by_slices, *cells)
+    return batch_last(lambda batched, arrays: by_slices(batched, eqx.combine(arrays, static)))(
+        arrays
+    )
+
+
+def force_by_gathers(mesh: Mesh, inputs: ForceInputs) -> tuple[Vertices, Memory]:
+    """`sheet_force` on any mesh."""
+    fabric, viscosity, air, fan, x, v, wind, memory = inputs
+    past = memory.relaxed.reshape(-1, 3)
+    stress = membrane_stress(mesh, fabric, x)
+    stress, relaxed = viscosity.resist(stress, past, memory.begun)
+    force = membrane_force(mesh, x, stress) + bending_force(mesh, fabric, x, v)
+    force += drag_on_vertices(mesh, air, fan, x, v, wind)
+    relaxed = relaxed.reshape(memory.relaxed.shape)
+    return force, Memory(relaxed, memory.hidden, jnp.ones_like(memory.begun))
+
+
+def _force_by_slices(shape, spacing, batched: bool, inputs: ForceInputs) -> tuple[Array, Memory]:
+    """With a batch as last axis."""
+    layout = Layout(shape, spacing, batched)
+    fabric, viscosity, air, fan, x, v, wind, memory = inputs
+    viscosity, air = jax.tree.map(layout.row, (viscosity, air))
+    laws = laws_on_grid(layout, fabric, viscosity, memory.hidden is not None)
+    known = None if memory.hidden is None else layout.to_cells(memory.hidden)
+    samples = Samples(layout.to_cells(memory.relaxed), known)
+    x, v = layout.wide(x), layout.wide(v)
+    flow = layout.flow(x, v, wind, fan)
+    force, samples = grid_force(layout, laws, air, x, v, flow, samples, layout.row(memory.begun))
+    hidden = None if samples.hidden is None else layout.from_cells(samples.hidden)
+    force = once(
+        lambda *force: force, *force
+    )  # XLA would sum it up within the stack, element by element
+    return jnp.stack(force, axis=1), Memory(
+        layout.from_cells(samples.relaxed), hidden, jnp.ones_like(memory.begun)
+    )

@@ -1,0 +1,25 @@
+"""The material point method: the second simulator, in 2-D and 3-D from one code.
+
+- `grid`: the nodes.
+- `transfer`: from particles to the grid (`p2g`) and back (`g2p`).
+- `background`: gravity, table, walls and grippers at the nodes.
+- `block`: a solid body of particles (`r2s.materials.solid`).
+- `transverse`, `elements`, `sheet`: a sheet of the same fabrics as `r2s.Cloth`.
+- `stability`: how long a step may be, and why a motion failed.
+"""
+
+from r2s.solvers.mpm.background import Background
+from r2s.solvers.mpm.block import Block, BlockState, Surface, layered
+from r2s.solvers.mpm.grid import Grid
+from r2s.solvers.mpm.sheet import Sheet, SheetState
+
+__all__ = [
+    "Background",
+    "Block",
+    "BlockState",
+    "Grid",
+    "Sheet",
+    "SheetState",
+    "Surface",
+    "layered",
+]

@@ -1,0 +1,220 @@
+"""A solid body of particles, in 2-D or 3-D, by the material point method.
+
+MLS-MPM (Hu et al. 2018) with APIC, explicit in time (symplectic Euler), as in DiffTaichi and
+DiffCP. A thin sheet of particles stretches, shears and bends as an isotropic solid of its
+thickness does.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from r2s.environment.air import Air, Fan
+from r2s.environment.drag import drag_on_vertices
+from r2s.environment.scene import Control
+from r2s.materials.solid import Solid, product
+from r2s.mesh.mesh import Mesh
+from r2s.solvers.explicit.stability import check_step, longest_step
+from r2s.solvers.failures import first_failure, no_failure
+from r2s.solvers.mpm.background import Background, Held
+from r2s.solvers.mpm.stability import failure_of_step
+from r2s.solvers.mpm.transfer import affine_factor
+
+Points = Float[Array, "particle axis"]
+
+
+class BlockState(eqx.Module):
+    """The particles of a block at one time.
+
+    - `x`, `v`: positions [m] and velocities [m/s].
+    - `C`: affine velocity matrices, [1/s].
+    - `F`: deformation gradients, [-].
+    - `failure`: the first `r2s.solvers.failures.Failure` of the run so far.
+    """
+
+    x: Float[Array, "particle axis"]
+    v: Float[Array, "particle axis"]
+    C: Float[Array, "particle axis axis"]
+    F: Float[Array, "particle axis axis"]
+    failure: Int[Array, ""]
+
+
+class Surface(eqx.Module):
+    """The triangles on which air acts. Their vertices are the first particles of the body.
+
+    - `mesh`: the triangles.
+    - `air`, `fan`: as in a `Scene`.
+    """
+
+    mesh: Mesh
+    air: Air
+    fan: Fan | None = None
+
+
+class Block(eqx.Module):
+    """A body in its surroundings, stepped explicitly.
+
+    It is differentiable in solid, state, control and background; in forward mode when the
+    background allows it.
+
+    - `background`: grid, table, walls, gravity.
+    - `volume`: volumes of the particles at rest, [m^3]; in 2-D of a body of 1 m depth.
+    - `held`, `handle_of`: the particles that grippers carry, and the handle that carries each.
+    - `offset`: positions of the held particles relative to their handles, [m].
+    - `surface`: the triangles on which wind acts; None: no wind.
+    - `dt`: step, [s].
+    """
+
+    background: Background
+    volume: Float[Array, " particle"]
+    held: Int[Array, " held"]
+    handle_of: Int[Array, " held"]
+    offset: Float[Array, "held axis"]
+    surface: Surface | None
+    dt: float = eqx.field(static=True)
+
+    @classmethod
+    def make(
+        cls,
+        background: Background,
+        volume: Float[Array, " particle"],
+        solid: Solid,
+        dt: float,
+        surface: Surface | None = None,
+    ) -> "Block":
+        """A solver for particles that no gripper holds.
+
+        - `volume`: volumes of the particles at rest, [m^3].
+        - `solid`: the stiffest material that the solver will be used for.
+        - `dt`: step, [s].
+        - `surface`: the triangles on which wind acts; None: no wind.
+
+        Raises `ValueError` when the step is too long for the solid; the text gives the limit.
+        """
+        if not dt > 0:
+            raise ValueError(f"dt must be positive, got {dt} s")
+        dimension = len(background.grid.shape)
+        if surface is not None and dimension != 3:
+            raise ValueError(f"wind on a surface needs a grid of 3 axes, got {dimension}")
+        none = jnp.zeros(0, int)
+        offset = jnp.zeros((0, dimension), float)
+        solver = cls(background, jnp.asarray(volume, float), none, none, offset, surface, float(dt))
+        solver.check(solid)
+        return solver
+
+    def gripped(self, x: Points, handles: Float[Array, "handle axis"], radius: float) -> "Block":
+        """The solver with grippers that carry the particles within `radius` [m] of the handles.
+
+        `x` and `handles` are the positions [m] of particles and grippers when the grippers close.
+        Raises `ValueError` when a gripper finds no particle.
+        """
+        distance = np.linalg.norm(np.asarray(x)[:, None] - np.asarray(handles)[None], axis=2)
+        nearest = np.argmin(distance, axis=1)
+        held = np.flatnonzero(np.min(distance, axis=1) <= radius)
+        empty = np.setdiff1d(np.arange(len(handles)), nearest[held])
+        if len(empty):
+            raise ValueError(
+                f"gripper {empty[0]} finds no particle within {radius} m: the nearest is "
+                f"{distance[:, empty[0]].min():.4g} m away"
+            )
+        handle_of = nearest[held]
+        offset = jnp.asarray(x)[held] - jnp.asarray(handles)[handle_of]
+        parts = (jnp.asarray(held), jnp.asarray(handle_of), offset)
+        return eqx.tree_at(lambda s: (s.held, s.handle_of, s.offset), self, parts)
+
+    def check(self, solid: Solid) -> None:
+        """Raises `ValueError` when the step is too long for a solid, unless that is traced."""
+        with jax.ensure_compile_time_eval():
+            longest = stable_step(self.background, solid)
+        check_step(self.dt, longest, "the solid and the grid")
+
+    def fits(self, solid: Solid) -> Bool[Array, ""]:
+        """Not judged where a solid is traced."""
+        return jnp.ones((), bool)
+
+    def init(self, x: Points, v: Points | None = None) -> BlockState:
+        """A state of no strain from positions [m] and velocities [m/s] (default: zero).
+
+        Raises `ValueError` when a particle is outside the grid, unless positions are traced.
+        """
+        self.background.grid.check(x)
+        v = jnp.zeros_like(x) if v is None else v
+        identity = jnp.broadcast_to(jnp.eye(x.shape[1], dtype=x.dtype), (*x.shape, x.shape[1]))
+        return BlockState(x, v, jnp.zeros_like(identity), identity, no_failure())
+
+    def step(self, fabric: Solid, state: BlockState, control: Control) -> BlockState:
+        """The state `dt` later, with the held particles at `control.handles` plus their offsets."""
+        dt, held = self.dt, self.held
+        deformation = state.F + dt * jax.vmap(product)(state.C, state.F)
+        mass = fabric.density * self.volume
+        goal = control.handles[self.handle_of] + self.offset
+        carried = Held(state.x[held], (goal - state.x[held]) / dt, mass[held])
+        v = _put(state.v, held, carried.v)
+        momentum = mass[:, None] * (1 - dt * fabric.mass_damping) * v
+        if self.surface is not None:
+            count = self.surface.mesh.rest.shape[0]
+            momentum = momentum.at[:count].add(dt * self._drag(state, control.wind))
+        stress = jax.vmap(fabric.law.kirchhoff)(deformation)
+        stress += fabric.damping * jax.vmap(fabric.law.viscous)(state.C)
+        factor = -dt * affine_factor(self.background.grid) * self.volume
+        affine = factor[:, None, None] * stress + mass[:, None, None] * state.C
+        v, C = self.background.advance(
+            dt, fabric.friction, state.x, mass, momentum, affine, carried
+        )
+        v, C = _put(v, held, carried.v), _put(C, held, jnp.zeros_like(C[held]))
+        x = _put(state.x + dt * v, held, goal)
+        failure = failure_of_step(self.background.grid, state.x, x, (fabric, control))
+        failure = first_failure(state.failure, failure)
+        return BlockState(self.background.project(x), v, C, deformation, failure)
+
+    def _drag(self, state: BlockState, wind: Array) -> Array:
+        surface = self.surface
+        assert surface is not None
+        count = surface.mesh.rest.shape[0]
+        x, v = state.x[:count], state.v[:count]
+        return drag_on_vertices(surface.mesh, surface.air, surface.fan, x, v, wind)
+
+
+def _put(values: Array, where: Array, held: Array) -> Array:
+    """Values with those of the held particles replaced."""
+    return values.at[where].set(held) if where.shape[0] else values
+
+
+def stable_step(background: Background, solid: Solid) -> Float[Array, ""]:
+    """The longest step [s] that is stable for a solid of small strain on a grid.
+
+    On quadratic B-splines sum w d^2 = spacing^2 / 4, so that the stiffness of a particle over its
+    share of the nodes' masses is at most 4 modulus / (density spacing^2). That bounds the square of
+    every frequency of the grid, as for finite elements (Fried 1972).
+    """
+    grid = background.grid
+    square = 4 * solid.law.modulus(len(grid.shape)) / (solid.density * grid.spacing**2)
+    return longest_step([(square, solid.damping)])
+
+
+def layered(
+    mesh: Mesh, x: Float[Array, "vertex 3"], thickness: float, layers: int = 3
+) -> tuple[Points, Float[Array, " particle"]]:
+    """Positions [m] and volumes [m^3] of particles that fill a sheet in layers.
+
+    - `x`: positions of the mesh's vertices, [m]; they are the middle layer, which comes first.
+    - `thickness`: thickness of the solid, [m].
+    - `layers`: number of layers across the thickness.
+
+    Raises `ValueError` when the thickness is not positive or the number of layers is not odd.
+    """
+    if not thickness > 0 or layers < 1 or layers % 2 == 0:
+        raise ValueError(
+            "a sheet needs a thickness > 0 m and an odd number of layers, got "
+            f"{thickness} and {layers}"
+        )
+    corners = x[mesh.faces]
+    faces = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = jnp.zeros_like(x).at[mesh.faces].add(faces[:, None])
+    normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
+    places = (np.arange(layers) - layers // 2) / layers * thickness
+    places = places[np.argsort(np.abs(places), kind="stable")]
+    particles = jnp.concatenate([x + float(place) * normals for place in places])
+    return particles, jnp.tile(mesh.vertex_area * (thickness / layers), layers)

@@ -1,0 +1,158 @@
+"""A function of one fabric (or trajectory, or seed) for thousands, on all devices of all hosts.
+
+    for first, found in stream(lowest, fabrics, chunk=256, folder=Path("sweep")):
+        ...
+
+`lowest` is a pure function of one member; `fabrics` has a leading axis on every array. A chunk is
+spread over the devices, and on each of them run by `vmap`. On several hosts every process makes the
+same call after `jax.distributed.initialize`, and has all results.
+"""
+
+import io
+from collections.abc import Callable, Iterator
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+from r2s._util.files import write_bytes
+from r2s._util.memory import check, planned
+
+AXIS = "member"
+
+
+def sweep(
+    function: Callable[[Any], Any],
+    members: Any,
+    chunk: int = 256,
+    *,
+    folder: Path | None = None,
+    devices: Mesh | None = None,
+) -> Any:
+    """The results of all members, in NumPy arrays with a leading axis; for arguments see `stream`.
+
+    >>> members = {"a": np.ones(3), "b": np.arange(3.0)}
+    >>> sweep(lambda member: member["a"] + member["b"], members, chunk=2).tolist()
+    [1.0, 2.0, 3.0]
+    """
+    parts = [found for _, found in stream(function, members, chunk, folder=folder, devices=devices)]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+def stream(
+    function: Callable[[Any], Any],
+    members: Any,
+    chunk: int = 256,
+    *,
+    folder: Path | None = None,
+    devices: Mesh | None = None,
+) -> Iterator[tuple[int, Any]]:
+    """The number of the first member of each chunk, and the results of the chunk, as they come.
+
+    - `members`: a pytree of arrays with a leading axis, all of the same length.
+    - `chunk`: members at once, rounded up to a multiple of the devices; the last is filled up with
+      copies, whose results are left out. It must fit in memory; the whole need not.
+    - `folder`: where each chunk's result is kept, whole or not at all. One that is there for the
+      same members is read, not made again: an interrupted sweep goes on. What the function itself
+      depends on is not looked at: take another folder for another function.
+    - `devices`: a mesh with the axis "member"; by default all devices of all processes.
+
+    What diverges is in the results, and stops nothing: NaN, and of a `r2s.Trajectory`, if the
+    function returns it, `ok` and the reason. Raises `ValueError` for arrays of different lengths,
+    or none, and before it runs `MemoryError` for a chunk that does not fit the memory of a device.
+    """
+    devices = all_devices() if devices is None else devices
+    count = _length(members)
+    size = -(-min(chunk, count) // devices.size) * devices.size
+    run = _sharded(function, devices)
+    like = compiled = None
+    for first in range(0, count, size):
+        part = _part(members, slice(first, first + size))
+        kept = min(size, count - first)
+        path = None if folder is None else folder / f"{first:08d}-{_digest(part)}.eqx"
+        if path is not None and path.exists():
+            like = _structure(function, part) if like is None else like
+            yield first, _read(path, like, kept)
+            continue
+        whole = jax.tree.map(lambda leaf: _padded(leaf, size), part)
+        shards = _shard(whole, devices)
+        if compiled is None:
+            compiled = run.lower(shards).compile()
+            check(planned(compiled), f"a chunk of {size} members", f"take a chunk below {size}")
+        found = _on_host(compiled(shards), kept)
+        if path is not None and jax.process_index() == 0:
+            _write(path, found)
+        yield first, found
+
+
+def all_devices() -> Mesh:
+    """A mesh of all devices of all processes, along the members."""
+    return jax.make_mesh((jax.device_count(),), (AXIS,), axis_types=(AxisType.Auto,))
+
+
+def _sharded(function: Callable[[Any], Any], devices: Mesh) -> Callable[[Any], Any]:
+    spec = PartitionSpec(AXIS)
+    # without the check, which would refuse loops that begin with constants
+    return jax.jit(
+        jax.shard_map(
+            jax.vmap(function), mesh=devices, in_specs=spec, out_specs=spec, check_vma=False
+        )
+    )
+
+
+def _length(members: Any) -> int:
+    lengths = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(members)}
+    if len(lengths) != 1 or lengths == {()} or lengths == {(0,)}:
+        raise ValueError(f"members need one leading axis on all arrays, found {sorted(lengths)}")
+    return lengths.pop()[0]
+
+
+def _part(members: Any, chosen: slice) -> Any:
+    return jax.tree.map(lambda leaf: np.asarray(leaf[chosen]), members)
+
+
+def _padded(leaf: np.ndarray, size: int) -> np.ndarray:
+    return np.concatenate([leaf, np.repeat(leaf[-1:], size - len(leaf), axis=0)])
+
+
+def _shard(part: Any, devices: Mesh) -> Any:
+    """On the devices, of which a process sees its own alone."""
+    sharding = NamedSharding(devices, PartitionSpec(AXIS))
+    return jax.tree.map(
+        lambda leaf: jax.make_array_from_callback(leaf.shape, sharding, lambda at: leaf[at]), part
+    )
+
+
+def _on_host(found: Any, kept: int) -> Any:
+    if jax.process_count() > 1:
+        found = multihost_utils.process_allgather(found, tiled=True)
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[:kept], found)
+
+
+def _digest(part: Any) -> str:
+    digest = sha256()
+    for leaf in jax.tree.leaves(part):
+        digest.update(f"{leaf.dtype}{leaf.shape}".encode() + np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _structure(function: Callable[[Any], Any], part: Any) -> Any:
+    one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), part)
+    return jax.eval_shape(function, one)
+
+
+def _write(path: Path, found: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    buffer = io.BytesIO()
+    eqx.tree_serialise_leaves(buffer, found)
+    write_bytes(path, buffer.getvalue())
+
+
+def _read(path: Path, like: Any, kept: int) -> Any:
+    shaped = jax.tree.map(lambda s: np.empty((kept, *s.shape), s.dtype), like)
+    return eqx.tree_deserialise_leaves(path, shaped)

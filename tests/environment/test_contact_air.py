@@ -1,0 +1,136 @@
+"""Table and air: rest, Coulomb friction and its smoothing, terminal velocity, wind."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import DT, cloth, directional_difference, everywhere, flat, roll, rotation
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from r2s._util.units import AIR_DENSITY, GRAVITY
+from r2s.environment.air import Air
+from r2s.environment.contact import (
+    PRESSURE_STIFFNESS,
+    SLIP_SPEED,
+    Table,
+    friction_dissipation,
+    normal_potential,
+    pressure,
+)
+
+few = settings(max_examples=25, deadline=None)
+REST_DEPTH = (0.2 * GRAVITY / PRESSURE_STIFFNESS) ** 0.5  # [m], where pressure carries 0.2 kg/m^2
+
+
+@pytest.fixture(scope="module")
+def lying(sheet, fabric):
+    """A solver with a table, and where a sheet lies on it."""
+    return cloth(sheet, table=0.0), flat(sheet, float(fabric.thickness) - REST_DEPTH)
+
+
+def test_a_dropped_sheet_rests_on_the_table(sheet, fabric):
+    solver = cloth(sheet, table=0.0)
+    states = roll(solver, fabric, solver.init(flat(sheet, 4e-3)), 150)
+    depth = float(fabric.thickness) - states.x[100:, :, 2]
+    assert np.max(depth) < 2e-4
+    assert depth == pytest.approx(REST_DEPTH, rel=1e-3)  # and it does not sink
+    assert np.max(np.abs(states.v[-1])) < 1e-6
+
+
+def test_a_sliding_sheet_decelerates_by_friction(sheet, fabric, lying):
+    solver, start = lying
+    states = roll(solver, fabric, solver.init(start, everywhere([0.8, 0.6, 0.0], sheet)), 8)
+    speed = np.mean(np.linalg.norm(states.v[:, :, :2], axis=2), axis=1)
+    deceleration = (speed[4] - speed[8]) / (4 * DT)
+    assert deceleration == pytest.approx(0.5 * GRAVITY, rel=0.02)  # 3^-4 of the start-up is left
+    assert states.v[8, :, 0] / states.v[8, :, 1] == pytest.approx(0.8 / 0.6, rel=1e-6)
+
+
+def pulled(lying, fabric, acceleration, count):
+    """Speeds of a sheet at rest on the table that a uniform force pulls along."""
+    solver, start = lying
+    state = solver.init(start)
+    speeds = []
+    for _ in range(count):
+        # the step's inertia starts from (4 v - v_before) / 3, so this adds dt times 2/3 of it
+        push = everywhere([2 * acceleration * DT, 0.0, 0.0], solver.scene.mesh)
+        state = eqx.tree_at(lambda state: state.v_before, state, state.v_before - push)
+        last = roll(solver, fabric, state, 1)
+        state = jax.tree.map(lambda leaf: jnp.asarray(leaf[1]), last)
+        speeds.append(float(jnp.mean(state.v[:, 0])))
+    return speeds
+
+
+def test_a_pull_below_the_limit_only_creeps(fabric, lying):
+    share = 0.6  # of the limit
+    speed = pulled(lying, fabric, share * 0.5 * GRAVITY, 15)[-1]
+    assert speed < SLIP_SPEED
+    assert speed == pytest.approx(SLIP_SPEED * share / (1 - share**2) ** 0.5, rel=1e-3)
+
+
+def test_a_pull_above_the_limit_accelerates_by_the_rest(fabric, lying):
+    speeds = pulled(lying, fabric, 1.5 * 0.5 * GRAVITY, 9)
+    acceleration = (speeds[-1] - speeds[4]) / (4 * DT)
+    assert acceleration == pytest.approx(0.5 * 0.5 * GRAVITY, rel=0.01)  # start-up's 3^-4
+
+
+@given(st.floats(-1e-3, 2e-3), st.floats(1e-4, 5e-3))
+@few
+def test_pressure_begins_at_the_thickness(height, thickness):
+    table = Table.make(0.0)
+    position = jnp.array([0.0, 0.0, height])
+    force = -jax.grad(lambda x: normal_potential(table.depth(x, jnp.array(thickness))))(position)
+    expected = PRESSURE_STIFFNESS * max(thickness - height, 0) ** 2
+    assert force[2] == pytest.approx(expected, rel=1e-9)
+    assert force[2] == pytest.approx(float(pressure(table.depth(position, jnp.array(thickness)))))
+    assert force[0] == force[1] == 0
+
+
+@given(st.tuples(*[st.floats(-1, 1)] * 2), st.floats(0, 1))
+@few
+def test_friction_is_within_its_cone_and_against_the_slip(velocity, limit):
+    velocity = jnp.array(velocity)
+    force = -jax.grad(friction_dissipation, argnums=1)(jnp.array(limit), velocity)
+    assert jnp.linalg.norm(force) <= limit * (1 + 1e-12)
+    assert force @ velocity <= 0
+
+
+def test_a_falling_sheet_reaches_its_terminal_velocity(sheet, fabric):
+    solver = cloth(sheet, air=AIR_DENSITY)
+    states = roll(solver, fabric, solver.init(flat(sheet)), 120)
+    expected = -((2 * 0.2 * GRAVITY / (AIR_DENSITY * 2)) ** 0.5)
+    assert states.v[-1, :, 2] == pytest.approx(expected, rel=0.01)
+
+
+def test_wind_as_fast_as_the_sheet_exerts_no_drag(sheet, fabric):
+    solver = cloth(sheet, air=AIR_DENSITY)
+    upright = flat(sheet) @ rotation(np.pi / 2, 0).T
+    start = solver.init(upright, everywhere([0.0, 1.0, 0.0], sheet))
+    along, still = (roll(solver, fabric, start, 10, wind=(0, w, 0)).v[-1, :, 1] for w in (1, 0))
+    assert along == pytest.approx(1, abs=1e-9)  # the tolerance of the solve, 1e-11 m in a step
+    assert np.max(still) < 0.7
+
+
+@given(st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(0.1, 1)] * 3))
+@few
+def test_drag_is_the_pressure_of_the_normal_flow(velocity, normal):
+    velocity, normal = jnp.array(velocity), jnp.array(normal)
+    air = Air.make(1.3, 1.7, 0.0)
+    area = float(jnp.linalg.norm(normal))
+    flow = float(velocity @ normal) / area
+    expected = -1.3 * 1.7 / 2 * abs(flow) * flow * np.asarray(normal)
+    found = -jax.grad(air.dissipation)(velocity, normal)
+    assert found == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+    def potential(velocity):
+        return air.dissipation(velocity, normal)
+
+    change = directional_difference(potential, velocity, jnp.ones(3), 1e-5)
+    assert -change == pytest.approx(float(np.sum(expected)), rel=1e-6, abs=1e-8)
+
+
+def test_negative_air_is_refused():
+    with pytest.raises(ValueError, match="density >= 0"):
+        Air.make(density=-1.0)

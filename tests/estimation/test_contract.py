@@ -1,0 +1,318 @@
+"""The contract of all methods: refusals with reasons, convergence, bounds; files of 0.2.0."""
+
+import dataclasses
+import json
+from typing import Any, get_args
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+from folders import TESTS
+
+from r2s import scenarios
+from r2s.estimation import cards
+from r2s.estimation.checkpoint import arrays_of, load, read, save, tree_from
+from r2s.estimation.estimate import describe, point_estimate
+from r2s.estimation.estimate_json import as_json, from_json
+from r2s.estimation.method import Budget, default_space, seed_of
+from r2s.estimation.pinn import published_recipe, training
+from r2s.estimation.registry import METHODS
+from r2s.materials import presets
+from r2s.materials.fabric_json import fabric_as_json, fabric_from_json
+from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace
+from r2s.scenarios import synthetic
+
+FABRIC = presets.grey_interlock()
+SPACE = OrthotropicSpace.make(float(FABRIC.density))
+DATA = TESTS / "data"
+TINY = {
+    "diffcloud": Budget(coarse=0, starts=1, iterations=2, around=0),
+    "diffcp": Budget(coarse=0, starts=1, iterations=1, width=0.02, around=0),
+    "cma-es": Budget(evaluations=14),
+    "diffcloud-published": Budget(iterations=2),
+    "diffcp-published": Budget(iterations=2),
+}
+
+
+@pytest.fixture(scope="module")
+def recording():
+    motion: dict[str, Any] = {"height": 0.2, "inward": 0.1, "moving": 0.3}
+    experiment = scenarios.lifting(num_frames=4, interval=1 / 10, **motion)
+    return synthetic.record(experiment, FABRIC, "grey", shape=(4, 4), key=jr.key(1))
+
+
+def test_the_command_line_offers_every_method_and_no_other():
+    commands = pytest.importorskip("r2s.cli.estimate")
+    assert set(get_args(commands.MethodName)) == set(METHODS)
+    assert all(method.name == name for name, method in METHODS.items())
+    assert all(set(method.heeds) <= set(Budget._fields) for method in METHODS.values())
+
+
+@pytest.mark.parametrize(
+    "name, solver, number, words",
+    [
+        ("diffcp", "cloth", 1, "differentiates through material points; on the cloth take diffcl"),
+        ("diffcloud", "points", 1, "on material points take diffcp"),
+        ("pinn", "cloth", 1, "not from lifting: the network from clouds .* does not find the fab"),
+        ("pinn", "points", 1, "not from lifting: the network from clouds .* does not find the fab"),
+        ("pinn-published", "cloth", 1, "estimates from stretching, not from lifting"),
+        ("physnet", "cloth", 2, "takes one recording, got 2"),
+        ("diffcloud", "cloth", 0, "needs a recording"),
+        ("cma-es", "felt", 1, "a solver is one of cloth, points, got 'felt'"),
+    ],
+)
+def test_what_is_not_supported_is_refused_with_a_reason(recording, name, solver, number, words):
+    method = METHODS[name](solver=solver)
+    with pytest.raises(ValueError, match=words):
+        method.estimate([recording] * number, SPACE, key=jr.key(0))
+
+
+def test_the_network_takes_no_lift_beside_a_pull(recording):
+    pull = dataclasses.replace(
+        recording, info=dataclasses.replace(recording.info, scenario="stretching")
+    )
+    with pytest.raises(ValueError, match="pinn: .* so the PINN estimates from stretchings alone"):
+        METHODS["pinn"]().estimate([pull, recording], SPACE, key=jr.key(0))
+
+
+def test_every_method_supports_a_solver_and_says_why_not_the_other():
+    for method in METHODS.values():
+        assert method.supports
+        for solver in ("cloth", "points"):
+            assert method.refusal(solver, "stretching") == "" or method.refusals[solver]
+
+
+def test_the_space_is_that_of_the_solver_and_a_key_has_a_seed():
+    assert isinstance(default_space("cloth", 0.2), OrthotropicSpace)
+    assert isinstance(default_space("points", 0.2), IsotropicSpace)
+    assert seed_of(jax.random.key(7)) == 7
+
+
+def test_physnet_needs_a_file_for_its_network(recording):
+    pytest.importorskip("sklearn")
+    with pytest.raises(ValueError, match="needs a file for its trained network"):
+        METHODS["physnet"]().estimate([recording], SPACE, key=jr.key(0))
+
+
+def ran(name: str, recording, space, solver=None, **others):
+    """An estimate of a tiny budget."""
+    method = METHODS[name](solver=solver, shape=(4, 4), **others)
+    with jax.numpy_dtype_promotion("standard"):  # optax counts its steps in integers
+        return method.estimate([recording], space, TINY[name], key=jr.key(0))
+
+
+DIFFCLOUD = pytest.param("diffcloud", marks=pytest.mark.slow(group="estimates"))
+CMA_ES = pytest.param("cma-es", marks=pytest.mark.slow(group="estimates"))
+
+
+@pytest.mark.parametrize("name", [DIFFCLOUD, CMA_ES])
+def test_a_method_keeps_the_contract_on_the_cloth(recording, name):
+    if name == "cma-es":
+        pytest.importorskip("cma")
+    seen = []
+    found = ran(name, recording, SPACE, progress=lambda step, loss: seen.append(loss))
+    assert found.approach.startswith(name) and np.isfinite(found.loss) and seen
+    assert found.converged is False  # the budget is much too small
+    assert from_json(as_json(found)).converged is False
+    assert "converged: no, the budget ended the search" in describe(found)
+
+
+@pytest.mark.slow(group="estimates")
+@pytest.mark.parametrize(
+    "name, solver",
+    [
+        ("diffcloud-published", "cloth"),
+        ("diffcp", "points"),
+        ("diffcp-published", "points"),
+        ("cma-es", "points"),
+    ],
+)
+def test_other_methods_keep_the_contract(recording, name, solver):
+    space = default_space(solver, float(FABRIC.density))
+    found = ran(name, recording, space, solver)
+    assert found.approach.startswith(name) and np.isfinite(found.loss) and not found.converged
+
+
+@pytest.mark.slow(group="estimates")
+def test_physnet_trains_its_network_once(recording, tmp_path, monkeypatch):
+    pytest.importorskip("skopt")
+    from r2s.estimation.physnet import dataset
+    from r2s.estimation.physnet.method import TrainingBudget
+
+    make = dataset.make
+
+    def coarse(folder, settings, **others):
+        return make(folder, dataclasses.replace(settings, shape=(4, 4), num_levels=4), **others)
+
+    monkeypatch.setattr(dataset, "make", coarse)
+    network = tmp_path / "lifting.network"
+    others: dict[str, Any] = {"training_budget": TrainingBudget(32, 1, 2), "network": network}
+    found = {}
+    with jax.numpy_dtype_promotion("standard"):
+        for name in ("physnet", "physnet-published"):
+            method = METHODS[name](**others)
+            found[name] = method.estimate([recording], SPACE, Budget(evaluations=9), key=jr.key(0))
+            others["training_budget"] = TrainingBudget(0)  # what is there is not trained again
+    assert not list(tmp_path.glob("*.images"))
+    blown = dataclasses.replace(
+        recording, info=dataclasses.replace(recording.info, scenario="wind")
+    )
+    with pytest.raises(ValueError, match="trained for lifting on cloth, .* one for wind on cloth"):
+        METHODS["physnet"](**others).estimate([blown], SPACE, key=jr.key(0))
+    for name, each in found.items():
+        assert each.approach.startswith("physnet") and each.losses.shape == (9, 1), name
+        assert each.loss_unit == "-"
+        assert np.isfinite(each.loss) and each.converged is False
+
+
+@pytest.mark.slow(group="estimates")
+@pytest.mark.parametrize("name", ["pinn", "pinn-published"])
+def test_the_network_takes_a_stretching(name):
+    from r2s.estimation.pinn.synthetic_pulls import pulled
+
+    pull = pulled(FABRIC, "grey", 0.0, key=jr.key(0))
+    method = METHODS[name]()
+    with jax.numpy_dtype_promotion("standard"):
+        found = method.estimate([pull], SPACE, Budget(iterations=10), key=jr.key(0))
+    assert found.approach.startswith(name) and np.isfinite(found.values).all()
+    assert isinstance(found.converged, bool)
+    if name == "pinn-published":
+        assert not found.converged and found.approach == "pinn-published (10 epochs, no force)"
+
+
+@pytest.mark.slow(group="estimates")
+@pytest.mark.parametrize(
+    ("low", "high", "bound"),
+    [
+        (1 / 30, 1 / 3, "upper"),
+        (3.0, 30.0, "lower"),
+        (1 / 10, 10.0, None),
+        pytest.param(
+            1 / 30,
+            1 / 10,
+            "upper",
+            marks=pytest.mark.xfail(
+                reason="so far away the misfit counts as noise, and the prior holds it inside",
+                strict=True,
+            ),
+        ),
+    ],
+)
+def test_a_descent_that_arrives_has_converged_and_a_truth_beyond_a_bound_is_named(low, high, bound):
+    """The range of its stiffness goes from `low` to `high` times the truth."""
+    space = IsotropicSpace.make(float(FABRIC.density))
+    place = jnp.array([0.5, 0.5])
+    truth = float(space.values(place)[0])
+    motion: dict[str, Any] = {"height": 0.2, "inward": 0.1, "moving": 0.4}
+    experiment = scenarios.lifting(num_frames=6, interval=1 / 10, **motion)
+    seen = synthetic.WHOLE._replace(points=300)
+    lifted = synthetic.record(
+        experiment, space(place), "knit", seen=seen, shape=(5, 5), key=jr.key(0)
+    )
+    stiffness = dataclasses.replace(space.ranges[0], low=low * truth, high=high * truth)
+    space = dataclasses.replace(space, ranges=(stiffness, *space.ranges[1:]))
+    budget = Budget(coarse=0, starts=1, iterations=40, around=0)
+    found = METHODS["diffcloud"](shape=(5, 5)).estimate([lifted], space, budget, key=jr.key(0))
+    assert found.converged and found.at_bounds.get(stiffness.name) == bound
+    told = [line for line in describe(found) if line.startswith(stiffness.name)]
+    assert any(f"at its {bound} bound" in line for line in told) == (bound is not None)
+
+
+def test_bounds_are_named_at_both_ends_and_nowhere_else():
+    place = jnp.array([0.0, 1.0, 0.5, 0.001, 0.994, 0.006, 0.999])
+    nothing = np.zeros((1, 1))
+    found = point_estimate("test", SPACE, place, 0.0, nothing, nothing, 0.0)
+    expected = {"warp": "lower", "weft": "upper", "coupling": "lower", "friction": "upper"}
+    assert found.at_bounds == expected
+    sure = dataclasses.replace(found, standard_errors=np.full(7, 1e-3), correlation=np.eye(7))
+    inside = [name not in expected for name in (each.name for each in found.ranges)]
+    assert sure.identifiable.tolist() == inside  # beyond a bound no error says how far it is
+    stored = json.loads(json.dumps(as_json(found), allow_nan=False))
+    assert stored["at_bounds"] == expected and stored["converged"] is False
+    assert from_json(stored).at_bounds == expected
+    (last,) = [line for line in describe(found) if "at a bound" in line]
+    named = "warp (lower), weft (upper), coupling (lower), friction (upper)"
+    assert last == f"warning: at a bound, beyond which the truth may lie: {named}"
+
+
+def test_an_estimate_of_version_0_2_0_is_read():
+    stored = json.loads((DATA / "estimate_0.2.0.json").read_text())
+    found = from_json(stored)
+    assert stored["format"] == "r2s-estimate/2" and found.converged is None
+    assert found.at_bounds == {"damping": "upper"}
+    np.testing.assert_array_equal(found.standard_errors[[0, 3, 5]], [0.2, 0.012, 1.0])
+    assert np.isnan(found.standard_errors[4]) and found.ranges == SPACE.ranges
+    assert [each.name for each in found.nuisances] == ["shift x", "marker noise"]
+    assert found.nuisances[0].standard_error == 0.0005 and found.history.shape == (2, 2, 7)
+    assert found.values[0] == stored["parameters"]["warp"]["value"]
+    assert float(found.fabric.membrane.c33) == stored["fabric"]["C33"]["value"]
+    (known,) = found.combinations
+    assert known._asdict() == {
+        **{key: stored["combinations"][0][key] for key in ("exponents", "value")},
+        "standard_error": stored["combinations"][0]["deviation"],
+    }
+    again = from_json(as_json(found))
+    np.testing.assert_array_equal(again.values, found.values)
+    assert as_json(again)["format"] == "r2s-estimate/3"
+
+
+@pytest.mark.parametrize(
+    "approach, converged",
+    [("pinn (1 pull, not converged)", False), ("pinn (1 pull)", True), ("diffcp", None)],
+)
+def test_version_0_2_0_said_in_words_whether_it_had_converged(approach, converged):
+    stored = json.loads((DATA / "estimate_0.2.0.json").read_text())
+    assert from_json({**stored, "approach": approach}).converged is converged
+
+
+def test_a_card_of_version_0_2_0_is_read(tmp_path):
+    stored = json.loads((DATA / "card_0.2.0.json").read_text())
+    card = cards.read(DATA / "card_0.2.0.json")
+    assert stored["format"] == "r2s-card/1" and card.provenance.recordings[0][0] == "lift"
+    assert float(card.fabric.density) == stored["fabric"]["density"]["value"]
+    assert card.estimate is not None and card.estimate.at_bounds == {"damping": "upper"}
+    cards.write(tmp_path / "new.json", card)
+    assert cards.read(tmp_path / "new.json") == card
+    assert json.loads((tmp_path / "new.json").read_text())["format"] == "r2s-card/2"
+    del stored["estimate"]["conditions"]
+    with pytest.raises(ValueError, match="estimate: missing: conditions"):
+        cards.from_json(stored)
+
+
+def test_an_estimate_and_a_card_have_one_form_of_a_fabric():
+    found = point_estimate("test", SPACE, jnp.full(7, 0.4), 0.0, np.zeros(1), np.zeros(1), 0.0)
+    form = fabric_as_json(found.fabric)
+    assert as_json(found)["fabric"] == form
+    card = cards.as_json(cards.Card.make("any", found, cards.Provenance("made up")))
+    assert card["fabric"] == form == card["estimate"]["fabric"]
+    assert form["membrane"]["c12"].keys() == {"value", "unit"}
+    assert float(fabric_from_json(form).membrane.c12) == float(found.fabric.membrane.c12)
+
+
+def test_a_checkpoint_is_of_one_run(tmp_path):
+    path, tree = tmp_path / "deep" / "run.npz", {"a": jnp.arange(3.0), "b": (jnp.ones(2, int),)}
+    run = {"kind": "test", "seed": 3, "shape": (2, 2)}
+    assert load(path, run) is None
+    save(path, arrays_of(tree), run)
+    stored = load(path, run)
+    assert stored is not None
+    back = tree_from(stored, tree)
+    assert jax.tree.all(jax.tree.map(lambda x, y: bool(jnp.all(x == y)), tree, back))
+    assert read(path)[1] == {"kind": "test", "seed": 3, "shape": [2, 2]}
+    with pytest.raises(ValueError, match=r"run\.npz is of another run \(seed 3 there, 4 asked\)"):
+        load(path, {**run, "seed": 4})
+    with pytest.raises(ValueError, match=r"lacks \['c'\]"):
+        tree_from(stored, {**tree, "c": jnp.zeros(1)})
+    path.write_bytes(b"torn")
+    with pytest.raises(ValueError, match=r"run\.npz is no checkpoint"):
+        load(path, run)
+    np.savez(path, places=np.zeros(2))
+    with pytest.raises(ValueError, match=r"run\.npz is no checkpoint"):
+        read(path)
+
+
+def test_the_usual_budgets_of_the_network_are_those_of_its_recipes():
+    assert METHODS["pinn"].budget.iterations == training.QUICK.adam
+    assert METHODS["pinn-published"].budget.iterations == published_recipe.EPOCHS

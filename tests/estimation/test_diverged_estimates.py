@@ -1,0 +1,138 @@
+"""Runs that diverge end no estimate as if it had arrived: another descent goes on, or none does."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+from r2s import scenarios
+from r2s.estimation import cma_es, descent, gauss_newton, mesh_bias
+from r2s.estimation.compiled import derivatives_at
+from r2s.estimation.gauss_newton import Descent, Normal, theta_length
+from r2s.estimation.judgement import NO_DERIVATIVE, judged
+from r2s.estimation.mesh_bias import MeshError, OtherMesh
+from r2s.estimation.method import Budget
+from r2s.estimation.problem import NuisancePrior, Problem
+from r2s.materials import presets, prior
+from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace
+from r2s.scenarios import synthetic
+
+BUDGET = Budget(shares=(0.25, 0.5), starts=2)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    fabric = presets.grey_interlock()
+    experiment = scenarios.lifting(num_frames=4, interval=1 / 10, height=0.2, moving=0.3)
+    seen = synthetic.record(experiment, fabric, "lift", shape=(3, 3), key=jr.key(0))
+    return Problem.make(seen, IsotropicSpace.make(float(fabric.density)), shape=(3, 3))
+
+
+def row_of(problem, losses):
+    """Descents of the first stage with such losses, each in a place of its own."""
+    size, none, stage = theta_length((problem,)), jnp.zeros(()), jnp.zeros((), int)
+    theta, matrix = jnp.zeros(size), jnp.eye(size)
+    normals = [Normal(jnp.array(x), none, none, theta, matrix, matrix) for x in losses]
+    return [Descent(theta + i, normal, none, none, none, stage) for i, normal in enumerate(normals)]
+
+
+def fresh(losses):
+    """Instead of new descents: whose losses, once all frames count, are those of their places."""
+
+    def made(problems, budget, thetas, scale, stage, derive):
+        shared = budget.shares and stage <= len(budget.shares)
+        found = [1e-6 if shared else losses[int(theta[0])] for theta in thetas]
+        row = [row_of(problems[0], [loss])[0] for loss in found]
+        changes = {"scale": jnp.asarray(scale), "stage": jnp.asarray(stage)}
+        return [
+            dataclasses.replace(each, theta=theta, **changes)
+            for each, theta in zip(row, thetas, strict=True)
+        ]
+
+    return made
+
+
+def test_the_next_best_descent_goes_on_where_the_best_diverges_later(problem, monkeypatch):
+    row = row_of(problem, [1e-6, 2e-6])
+    monkeypatch.setattr(descent, "_fresh", fresh([np.inf, 3e-6]))
+    stages = []
+    while row is not None:
+        stages.append(descent._best(row))
+        row = descent._later((problem,), BUDGET, row, derivatives_at)
+    assert [which for which, _ in stages] == [0, 0, 0, 1]
+    assert float(stages[-1][1].normal.loss) == pytest.approx(3e-6)
+
+
+def test_where_all_diverge_it_is_said_and_why(problem, monkeypatch):
+    monkeypatch.setattr(descent, "_fresh", fresh([np.inf, np.inf]))
+    monkeypatch.setattr(descent, "explain", lambda *_: "frame 3: speed.")
+    row = descent._later((problem,), BUDGET, row_of(problem, [1e-6, 2e-6]), derivatives_at)
+    with pytest.raises(
+        RuntimeError, match="all descents diverged, the first frame 3: speed. Check"
+    ):
+        while row is not None:
+            row = descent._later((problem,), BUDGET, row, derivatives_at)
+    with pytest.raises(RuntimeError, match="all starts of the descents diverged"):
+        descent.search((problem,), Budget(shares=(), coarse=0, starts=1), key=jr.key(0))
+
+
+def test_cma_es_gives_no_fabric_of_runs_that_all_diverged(problem, monkeypatch):
+    pytest.importorskip("cma")
+    monkeypatch.setattr(
+        cma_es, "_losses", lambda problems, thetas, loss: jnp.full(len(thetas), jnp.inf)
+    )
+    with pytest.raises(RuntimeError, match="all .* simulations of CMA-ES diverged"):
+        cma_es.search(problem, evaluations=30, key=jr.key(0))
+
+
+def test_cma_es_refuses_a_shared_doubt_of_two_sizes(problem):
+    pytest.importorskip("cma")
+    problems = tuple(
+        dataclasses.replace(problem, nuisance_prior=NuisancePrior(air=air)) for air in (0.1, 0.2)
+    )
+    with pytest.raises(ValueError, match="air"):
+        cma_es.search(problems, evaluations=30, key=jr.key(0))
+
+
+def test_a_descent_does_not_go_where_its_derivative_is_not_finite(problem):
+    """However low the loss is there: it could neither go on, nor say how well that is known."""
+    (start,) = row_of(problem, [1e-6])
+    start = dataclasses.replace(start, damping=jnp.asarray(0.1), growth=jnp.asarray(2.0))
+    lower = dataclasses.replace(start.normal, loss=jnp.asarray(5e-7))
+    lost = dataclasses.replace(lower, scatter=lower.scatter.at[0, 0].set(jnp.nan))
+    for tried, is_taken in ((lower, True), (lost, False)):
+        after = gauss_newton.accept((problem,), start, start.theta + 0.1, tried, 0.0)
+        assert (after.theta[0] > start.theta[0]) == is_taken
+        assert (after.damping < start.damping) == is_taken
+
+
+def test_without_a_derivative_an_estimate_is_not_sure_and_knows_what_was_known(problem):
+    def without(problems, theta, width=None):
+        found = derivatives_at(problems, theta, width)
+        return [(seen, jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), s)) for seen, s in found]
+
+    budget = Budget(coarse=0, starts=1, around=0, iterations=3)
+    found = descent.search((problem,), budget, derive=without, key=jr.key(0))
+    estimate = judged(found, budget, key=jr.key(1))
+    assert not estimate.converged and estimate.unsure == NO_DERIVATIVE
+    _, precision = problem.space.prior()
+    widths = np.array([each.width for each in problem.space.ranges])
+    known = np.sqrt(np.diag(np.linalg.inv(np.asarray(precision)))) * widths
+    np.testing.assert_allclose(estimate.standard_errors, known, rtol=1e-5)
+
+
+def test_without_a_derivative_the_error_of_a_mesh_is_added_and_nothing_is_solved(problem):
+    space = OrthotropicSpace.make(0.2)
+    known = dataclasses.replace(problem, space=prior.informed(space, 0.2))
+    size = theta_length((known,))
+    (end,) = row_of(known, [1e-6])
+    lost = dataclasses.replace(end.normal, matrix=jnp.full((size, size), jnp.nan))
+    end = dataclasses.replace(end, normal=lost)
+    by = MeshError(np.full(size, 0.1), np.eye(size))
+    other = OtherMesh((known,), 4 / 3)
+    settled = mesh_bias.settled((known,), other, end, jnp.asarray(jnp.nan), np.eye(size), by)
+    np.testing.assert_allclose(settled.covariance, 2 * np.eye(size), rtol=1e-6)
+    np.testing.assert_array_equal(settled.theta, end.theta)

@@ -1,0 +1,558 @@
+"""Estimators: their derivatives, what they say of the recordings, files, and resumed runs."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+from r2s import scenarios
+from r2s.estimation import (
+    adam,
+    cma_es,
+    compiled,
+    descent,
+    diffcloud,
+    gauss_newton,
+    identifiability,
+)
+from r2s.estimation.estimate import Estimate
+from r2s.estimation.estimate_json import as_json, from_json
+from r2s.estimation.gauss_newton import Descent
+from r2s.estimation.judgement import descend
+from r2s.estimation.method import Budget
+from r2s.estimation.normal_equations import loss_of, normal_equations_of
+from r2s.estimation.prediction import Prediction, Sensitivity, _delayed, predict, sensitivities
+from r2s.estimation.problem import OWN, NuisancePrior, Problem, beginning, window
+from r2s.materials import presets
+from r2s.materials.parameters import OrthotropicSpace, Range
+from r2s.recordings.recording import set_time_offset
+from r2s.scenarios import synthetic
+
+ALL = NuisancePrior(time=0.05, density=0.2, air=0.3, size=0.05)
+SMALL = Budget(coarse=2, starts=1, iterations=4, shares=(0.5,), around=2)
+FABRIC = presets.grey_interlock()
+FAMILY = OrthotropicSpace.make(float(FABRIC.density))
+
+
+@pytest.fixture(scope="module")
+def recording():
+    motion: dict[str, Any] = {"height": 0.2, "inward": 0.1, "moving": 0.6}
+    experiment = scenarios.lifting(num_frames=8, interval=1 / 10, **motion)
+    return synthetic.record(experiment, FABRIC, "grey", shape=(5, 5), key=jr.key(1))
+
+
+@pytest.fixture(scope="module")
+def small(recording):
+    """A problem of four frames on a coarse sheet, of which nothing is known for sure."""
+    return Problem.make(recording, FAMILY, num_points=60, shape=(5, 5), nuisance_prior=ALL)
+
+
+@pytest.fixture(scope="module")
+def pull():
+    """A recorded stretching of few frames, with markers and force."""
+    experiment = scenarios.stretching(num_frames=6, interval=1 / 10, strain=0.03, moving=0.4)
+    return synthetic.record(experiment, FABRIC, "grey", shape=(5, 5), key=jr.key(3))
+
+
+@pytest.fixture(scope="module")
+def pulled(pull):
+    return Problem.make(pull, FAMILY, shape=(5, 5))
+
+
+@pytest.fixture(scope="module")
+def estimated(small):
+    return descend(small, SMALL, key=jr.key(0))
+
+
+def normal_at(problems, theta, scale=0.0):
+    """By the program that a descent runs, which is compiled once for both."""
+    return compiled.normal_at(problems, theta, jnp.asarray(scale, float))
+
+
+AWAY = jnp.array([0.1, -0.2, 0.5, 0.1, 0.3, 0.2, -0.1, 0.4])
+
+
+PULLED = pytest.param("pulled", marks=pytest.mark.slow(group="estimates"))
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.01])
+@pytest.mark.parametrize("kind", ["small", PULLED])
+def test_the_objective_has_the_gradient_that_differences_have(kind, scale, request):
+    """Gauss-Newton's gradient is that of the whole rollout: contact, nearest points, force."""
+    problems = (request.getfixturevalue(kind),)
+    theta = jnp.concatenate([jnp.full(7, 0.45), AWAY])
+    normal = normal_at(problems, theta, scale)
+    found = normal.gradient
+    width = 1e-4 if kind == "small" else 1e-3  # forces of a stiff sheet are rounded more
+    least = 1e-6 * float(jnp.max(jnp.abs(found)))
+    assert normal.loss == pytest.approx(float(jax.jit(_loss)(problems, theta, scale)))
+    for index in range(1 if scale else 0, 15, 2):  # at each scale the other half of them
+        steps = [normal_at(problems, theta.at[index].add(s * width), scale).loss for s in (1, -1)]
+        difference = float(steps[0] - steps[1]) / (2 * width)
+        assert float(found[index]) == pytest.approx(difference, rel=2e-3, abs=least)
+    moved = 15 if kind == "small" else 11  # what is not in doubt does not move it
+    assert np.count_nonzero(np.asarray(found)) == moved
+
+
+def _loss(problems, theta, scale):
+    return gauss_newton.loss_at(problems, theta, scale=scale)
+
+
+@pytest.mark.slow(group="estimates")
+def test_a_narrow_secant_is_the_derivative(small):
+    theta = jnp.concatenate([jnp.full(7, 0.45), AWAY])
+    _, exact = jax.jit(sensitivities)(small, theta)
+    _, secant = jax.jit(lambda p, u: sensitivities(p, u, 1e-4))(small, theta)
+    largest = float(jnp.max(jnp.abs(exact.x)))
+    assert np.asarray(secant.x) == pytest.approx(np.asarray(exact.x), abs=1e-4 * largest)
+
+
+def test_a_delay_by_frames_shifts_and_one_between_them_is_third_order():
+    times = jnp.arange(12.0)
+    x = jnp.stack([times**2, times, 3 - times], axis=1)[:, None]
+    shifted = _delayed(x, jnp.array(2.0))
+    np.testing.assert_allclose(shifted[4:], x[2:-2], atol=1e-12)
+    between = _delayed(x, jnp.array(0.3))  # exact for a quadratic, but at the ends
+    np.testing.assert_allclose(between[3:-2, 0, 0], (times[3:-2] - 0.3) ** 2, atol=1e-12)
+
+
+def test_an_early_camera_is_predicted_as_an_early_recording(recording):
+    """Clouds on a clock that is a frame early are explained, by that delay, as on the right one."""
+    late = set_time_offset(recording, -0.1)
+    nuisance_prior = NuisancePrior(time=0.1)
+    place = FAMILY.to_unit(FABRIC)
+
+    def theta(delay):
+        return jnp.concatenate([place, jnp.zeros(7), jnp.array([delay])])
+
+    loss = jax.jit(lambda p, u: loss_of(p, predict(p, u)))
+
+    def whole(r):
+        return Problem.make(r, FAMILY, num_points=60, shape=(5, 5), nuisance_prior=nuisance_prior)
+
+    def make(r):
+        return window(whole(r), 4, 6)  # the simulation ends where the recording does
+
+    same, shifted = float(loss(make(recording), theta(0.0))), make(late)
+    assert float(loss(shifted, theta(-1.0))) == pytest.approx(same, rel=0.02)
+    assert float(loss(shifted, theta(0.0))) > 2 * same
+
+
+def test_of_many_descents_the_better_half_go_on():
+    """After every third iteration, until three are left; a diverged one goes first."""
+    zero, vector, matrix = (jnp.zeros((2,) * dims) for dims in range(3))
+    stage = jnp.zeros((), int)
+    losses = [float("nan"), *np.random.default_rng(0).permutation(63).astype(float)]
+    normals = [
+        gauss_newton.Normal(jnp.array(x), zero, zero, vector, matrix, matrix) for x in losses
+    ]
+    row = [Descent(vector, normal, zero, zero, zero, stage) for normal in normals]
+    order = [int(i) for i in np.argsort(losses)]  # NaN is last
+    counts = []
+    for iteration in range(1, 25):
+        kept = descent._kept(row, iteration)
+        counts.append(len(kept))
+        assert kept == sorted(order[: len(kept)])
+    assert counts == [64] * 3 + [32] * 3 + [16] * 3 + [8] * 3 + [4] * 3 + [3] * 9
+    later = dataclasses.replace(row[5], stage=stage + 1)
+    assert descent._kept([*row[:5], later, *row[6:]], 1) == [5]
+
+
+@pytest.mark.slow(group="estimates")
+def test_a_marker_that_is_off_in_every_frame_is_one_error(pulled):
+    """As the first frame's noise makes it: to see it twice as often tells no more."""
+    pulled = dataclasses.replace(pulled, force=None)
+    rest = jnp.pad(pulled.scenario.scene.mesh.rest, ((0, 0), (0, 1)))
+    x = jnp.broadcast_to(rest, (len(pulled.frames), *rest.shape))
+    seen = Prediction(x, None, jnp.array(True))
+    slope = Sensitivity(0.1 * jr.normal(jr.key(1), (*x.shape, 3)), None)  # of a made-up motion
+    off = 1e-3 * jr.normal(jr.key(0), pulled.markers.positions.shape[1:])
+
+    def twice(part):
+        return jnp.concatenate([part, part])
+
+    def covariance(number, repeat):
+        expected = jnp.einsum("mk,fmki->fmi", pulled.markers.weights, seen.x[:, corners])
+        markers = dataclasses.replace(
+            pulled.markers,
+            positions=repeat(expected + off[None]),
+            seen=repeat(pulled.markers.seen),
+        )
+        frames = pulled.frames * number
+        found = jax.jit(normal_equations_of)(
+            dataclasses.replace(pulled, markers=markers, frames=frames),
+            Prediction(repeat(seen.x), None, seen.ok),
+            Sensitivity(repeat(slope.x), None),
+        )
+        prior = 1e-6 * jnp.diag(jnp.diag(jnp.sum(found.matrices, axis=0)) + 1e-9)
+        inverse = jnp.linalg.inv(jnp.sum(found.matrices, axis=0) + prior)
+        noise = jnp.zeros_like(found.noise)
+        parts = found.scores, found.matrices, noise, prior, 1.0
+        return inverse @ gauss_newton.scatter(*parts) @ inverse
+
+    corners = pulled.markers.vertices
+    once, again = (np.asarray(covariance(*each)) for each in ((1, lambda x: x), (2, twice)))
+    sizes = np.sqrt(np.diag(once))
+    np.testing.assert_allclose(
+        again / np.outer(sizes, sizes), once / np.outer(sizes, sizes), atol=1e-4
+    )
+
+
+def test_the_scatter_of_a_gradient_is_that_of_the_jackknife():
+    """Of a straight line through points: as if each cluster in turn had been left out."""
+    random = np.random.default_rng(0)
+    rows, values = random.normal(size=(6, 4, 2)), random.normal(size=(6, 4))
+    whole = np.einsum("cpu,cpv->uv", rows, rows)
+
+    def fit(kept):
+        return np.linalg.lstsq(rows[kept].reshape(-1, 2), values[kept].ravel(), None)[0]
+
+    best = fit(np.arange(6))
+    scores = np.einsum("cpu,cp->cu", rows, rows @ best - values)
+    left = np.stack([fit(np.arange(6) != i) - best for i in range(6)])
+    matrices = np.einsum("cpu,cpv->cuv", rows, rows)
+    inverse = np.linalg.inv(whole)
+    clusters = jnp.asarray(scores), jnp.asarray(matrices)
+
+    def covariance(noise):
+        found = gauss_newton.scatter(*clusters, jnp.full(6, noise), jnp.zeros((2, 2)), 1.0)
+        return inverse @ np.asarray(found) @ inverse
+
+    np.testing.assert_allclose(covariance(0.0), left.T @ left, rtol=1e-9)
+    # nor is it less than by independent errors, of a variance of 100 here
+    np.testing.assert_allclose(covariance(100.0), 100 * inverse, rtol=1e-9)
+    least = np.linalg.eigvalsh(covariance(0.1) - 0.1 * inverse)
+    assert least[0] > -1e-12
+
+
+def test_without_the_cluster_that_alone_tells_a_number_that_is_what_the_prior_allows():
+    """The slope of a line whose points but for the last cluster's all lie in one place."""
+    rows = np.ones((3, 4, 2))
+    rows[:, :, 1] = np.array([0.0, 0.0, 1.0])[:, None]
+    matrices, precision, weight = np.einsum("cpu,cpv->cuv", rows, rows), np.diag([4.0, 25.0]), 1e-9
+    scores = np.array([[0.1, 0.0], [-0.3, 0.0], [0.2, 0.2]])  # not at the minimum of the slope
+    parts = jnp.asarray(scores), jnp.asarray(matrices), jnp.zeros(3)
+    found = gauss_newton.scatter(*parts, jnp.asarray(precision), weight)
+    inverse = np.linalg.inv(matrices.sum(axis=0) + weight * precision)
+    error = np.sqrt((inverse @ np.asarray(found) @ inverse)[1, 1])
+    assert 1 / 5 < error < 1 / 4  # the others tell a little of it by the mean
+
+
+@pytest.mark.slow(group="estimates")
+def test_recordings_of_one_fabric_add_up(small):
+    theta = jnp.concatenate([jnp.full(7, 0.45), AWAY])
+    both = jnp.concatenate([theta, theta[-5:]])
+    one, two = normal_at((small,), theta), normal_at((small, small), both)
+    assert two.loss == pytest.approx(float(one.loss), rel=1e-12)
+
+    def same(a, b):
+        return np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6 * np.max(np.abs(b)))
+
+    same(two.gradient[:9], one.gradient[:9])
+    same(two.matrix[:9, :9], one.matrix[:9, :9])
+    same(two.gradient[10:15], one.gradient[10:] / 2)
+    # half as uncertain, and less so: of more clusters none has as much of a say
+    sizes = [float(jnp.trace(n.scatter[:9, :9])) for n in (two, one)]
+    assert 0 < sizes[0] <= sizes[1] / 2
+    assert np.all(np.asarray(two.matrix[10:15, 15:]) == 0)
+
+
+def test_an_estimate_lowers_the_loss_and_survives_its_file(estimated):
+    found = estimated
+    assert np.nanmin(found.losses[-1]) < np.nanmin(found.losses[0])
+    again = from_json(as_json(found))
+    np.testing.assert_allclose(again.values, found.values)
+    np.testing.assert_allclose(again.history, found.history)
+    assert float(again.fabric.membrane.c12) == pytest.approx(float(found.fabric.membrane.c12))
+    names = ["density ratio", "air ratio", "size ratio", *OWN]
+    assert [c.name for c in again.nuisances] == names
+    assert again.nuisances == found.nuisances and again.combinations == found.combinations
+
+
+@pytest.mark.slow(group="estimates")
+def test_a_profile_rises_from_the_estimate(small):
+    """To both sides of it, although all other parameters follow."""
+    budget = Budget(coarse=0, starts=1, iterations=12, around=0)
+    place = FAMILY.to_unit(FABRIC)
+    found = descend(small, budget, start=place, key=jr.key(0))
+    value = float(found.values[0])
+    values = value * np.array([0.1, 1.0, 10.0])
+    losses = identifiability.profile(small, found, "warp", values)
+    assert losses[1] == pytest.approx(found.loss, rel=0.02)
+    assert losses[0] > 1.02 * losses[1] and losses[2] > 1.02 * losses[1]
+    with pytest.raises(ValueError, match="no parameter 'C99': the estimate has warp"):
+        identifiability.profile(small, found, "C99", values)
+
+
+def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(small, estimated, tmp_path):
+    path, whole = tmp_path / "descent.npz", estimated
+
+    class Stop(Exception):
+        pass
+
+    def stop(iteration, loss):
+        if iteration == 1:
+            raise Stop
+
+    with pytest.raises(Stop):
+        descend(small, SMALL, checkpoint=path, progress=stop, key=jr.key(0))
+    seen = []
+
+    def count(iteration, loss):
+        return seen.append(iteration)
+
+    found = descend(small, SMALL, checkpoint=path, progress=count, key=jr.key(0))
+    np.testing.assert_array_equal(found.values, whole.values)
+    np.testing.assert_array_equal(found.losses, whole.losses)
+    assert seen[0] == 2  # and did not begin again
+    with pytest.raises(ValueError, match="is of another run .run .* there, .* asked"):
+        descend(small, SMALL, checkpoint=path, key=jr.key(1))
+    path.write_bytes(b"nothing")
+    with pytest.raises(ValueError, match="is no checkpoint"):
+        descend(small, SMALL, checkpoint=path, key=jr.key(0))
+
+
+def test_what_is_known_of_a_product_is_said():
+    """Two parameters of which only the ratio is known, and a third that is."""
+    ranges = (
+        Range("a", "N/m", 1.0, 100.0),
+        Range("b", "N/m", 1.0, 100.0),
+        Range("c", "-", 0.1, 10.0),
+    )
+    spread, ratio = 0.5, 0.01
+    covariance = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 0]]) * spread**2
+    covariance += np.diag([ratio**2 / 2, ratio**2 / 2, 1e-4])
+    deviation = np.sqrt(np.diag(covariance))
+    found = Estimate(
+        "test", FABRIC, ranges, np.array([8.0, 2.0, 1.0]), deviation,
+        covariance / np.outer(deviation, deviation), (), 0.0, np.zeros((1, 1)),
+        np.zeros((1, 1, 3)), 0.0, None,
+    )  # fmt: skip
+    assert found.identifiable.tolist() == [False, False, True]
+    (known,) = found.combinations
+    assert sorted(known.exponents.values()) == [-1.0, 1.0] and set(known.exponents) == {"a", "b"}
+    assert known.value == pytest.approx(4 if known.exponents["a"] > 0 else 0.25)
+    assert known.standard_error == pytest.approx(ratio, rel=1e-6)
+
+
+def test_a_window_leaves_the_other_frames_out(small, pulled):
+    part = window(small, 5, 6)
+    assert part.frames == (5, 6) and part.clouds is not None and small.clouds is not None
+    np.testing.assert_array_equal(part.clouds.points, small.clouds.points[1:3])
+    force, whole = window(pulled, 0, 1).force, pulled.force
+    assert force is not None and whole is not None and len(force.values) == 2
+    with pytest.raises(ValueError, match="no frame from 40 to 50 counts"):
+        window(small, 40, 50)
+
+
+def test_what_a_beginning_is(small):
+    """A share of the frames that show something, and one at least; shares must rise."""
+    assert small.clouds is not None
+    mask = small.clouds.mask.at[0].set(False)
+    late = dataclasses.replace(small, clouds=dataclasses.replace(small.clouds, mask=mask))
+
+    def frames(problem: Problem, share: float) -> list[bool]:
+        clouds = beginning(problem, share).clouds
+        assert clouds is not None
+        return np.any(clouds.mask, axis=1).tolist()
+
+    assert frames(small, 0.5) == [True, True, False, False]
+    assert frames(late, 0.67) == [False, True, True, False]
+    assert frames(late, 0.01) == [False, True, False, False]
+    with pytest.raises(ValueError, match="needs a start or more, got 0"):
+        descend(small, SMALL._replace(starts=0), key=jr.key(0))
+    for count in (3, -2):
+        with pytest.raises(ValueError, match=f"an even number, got {count}"):
+            descend(small, SMALL._replace(around=count), key=jr.key(0))
+    for shares in ((0.5, 0.25), (0.5, 1.0), (0.0,), (0.5, 0.5)):
+        with pytest.raises(ValueError, match="shares of the frames must rise between 0 and 1"):
+            descend(small, SMALL._replace(shares=shares), key=jr.key(0))
+
+
+@pytest.mark.parametrize("kind", ["small", "pulled"])
+def test_a_beginning_counts_as_a_window_of_the_first_frames_does(kind, request):
+    """In the loss and in the normal equations of any motion; later frames have no say."""
+    problem = request.getfixturevalue(kind)
+    rest, count, size = problem.scenario.scene.mesh.rest, len(problem.frames), 3
+    half = count // 2
+
+    def draw(number, *shape):
+        return jr.normal(jr.key(number), (count, *shape), float)
+
+    x = jnp.pad(rest, ((0, 0), (0, 1)))[None] + 0.02 * draw(1, len(rest), 3)
+    forces = None if problem.force is None else (draw(2, 3), draw(3, 3, size))
+    slope = draw(4, len(rest), 3, size)
+
+    def evidence(problem, frames):
+        def pick(which):
+            return None if forces is None else forces[which][:frames]
+
+        seen = Prediction(x[:frames], pick(0), jnp.array(True))
+
+        def both(p, *about):
+            return (loss_of(p, about[0]), normal_equations_of(p, *about))
+
+        return jax.jit(both)(problem, seen, Sensitivity(slope[:frames], pick(1)))
+
+    loss, early = evidence(beginning(problem, half / count), count)
+    same, part = evidence(window(problem, problem.frames[0], problem.frames[half - 1]), half)
+    assert half >= 2 and float(loss) == pytest.approx(float(same), rel=1e-12)
+    assert float(early.loss) == pytest.approx(float(loss), rel=1e-12)
+    assert float(early.spread) == pytest.approx(float(part.spread), rel=1e-12)
+    for name in ("scores", "matrices"):
+        one, other = (jnp.sum(getattr(each, name), axis=0) for each in (early, part))
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(early.noise[0], part.noise[0], rtol=1e-12)
+
+
+def test_where_a_descent_was_it_does_not_derive_again(small, monkeypatch):
+    """A place of all frames serves their beginning, but not the other way round; another place,
+    another width or another recording does not serve."""
+    derived = []
+
+    def derive_one(problem, theta, width):
+        derived.append((problem.scenario, float(theta[0]), width))
+        one = jnp.zeros((1, 1, 3))
+        return Prediction(one, None, jnp.array(True)), Sensitivity(one[..., None], None)
+
+    monkeypatch.setattr(compiled, "_sensitivities", derive_one)
+    derive = compiled.remembering()
+    small = dataclasses.replace(small, nuisance_prior=ALL._replace(time=0.0))
+    whole, early = (small,), (beginning(small, 0.01),)
+    other = (dataclasses.replace(small, scenario=dataclasses.replace(small.scenario)),)
+    there, elsewhere = jnp.full(15, 0.4), jnp.full(15, 0.6)
+    (first,) = derive(early, there, None)
+    (second,) = derive(whole, there, None)
+    assert first is not second and len(derived) == 2  # more frames are needed
+    for known in (whole, early, whole):
+        assert derive(known, there, None)[0] is second
+    assert len(derived) == 2
+    derive(whole, elsewhere, None)
+    derive(whole, there, 0.1)
+    derive(other, there, None)
+    assert len(derived) == 5
+    assert derive(whole, there, None)[0] is second
+    monkeypatch.setattr(compiled, "REMEMBERED", 0)  # no room: only the latest place is known
+    derive(whole, jnp.full(15, 0.7), None)
+    derive(whole, there, None)
+    assert len(derived) == 7
+
+
+def test_markers_must_lie_on_the_sheet(pull):
+    record = pull
+    assert record.markers is not None and record.markers_seen is not None
+    moved = dataclasses.replace(record, markers=record.markers + jnp.array([[[0.0, 0.3, 0.0]]]))
+    with pytest.raises(ValueError, match="marker .* mm off the sheet"):
+        Problem.make(moved, FAMILY, shape=(5, 5))
+    lost = dataclasses.replace(record, markers_seen=record.markers_seen.at[0, 7].set(False))
+    with pytest.raises(ValueError, match=r"markers \[7\] are not seen at rest"):
+        Problem.make(lost, FAMILY, shape=(5, 5))
+
+
+@pytest.mark.slow(group="estimates")
+def test_the_recipe_and_cma_lower_their_losses(small):
+    with jax.numpy_dtype_promotion("standard"):  # optax counts its steps in integers
+        found = diffcloud.published_recipe(small, small.space.middle(), epochs=4)
+        recipe = diffcloud.published_recipe(small, None, start=jnp.full(7, 0.4), epochs=4)
+    assert found.loss < found.losses[0, 0] and recipe.loss < recipe.losses[0, 0]
+    evolved = cma_es.search(small, evaluations=80, start=jnp.full(7, 0.9), key=jr.key(0))
+    again = cma_es.search(small, evaluations=80, start=jnp.full(7, 0.9), key=jr.key(0))
+    assert evolved.losses.min() < evolved.losses[0, 0]
+    np.testing.assert_array_equal(evolved.values, again.values)
+
+
+@pytest.mark.slow(group="estimates")
+def test_a_loss_that_is_not_finite_at_the_start_is_an_error(small):
+    def broken(problem, seen):
+        return jnp.nan * jnp.sum(seen.x)
+
+    with jax.numpy_dtype_promotion("standard"), pytest.raises(RuntimeError, match="not finite"):
+        adam.descend(small, broken, approach="test", epochs=2, rate=0.1)
+
+
+@pytest.mark.slow(group="estimates")
+@pytest.mark.parametrize("name", ["camel_ponte_roma", "grey_interlock"])
+def test_a_known_fabric_and_a_late_clock_are_found(name):
+    """What the lift determines is within three deviations of the truth, and so is the delay."""
+    fabric = presets.FIVE[name]()
+    experiment = scenarios.lifting()
+    seen = synthetic.sensing(experiment)._replace(time_offset=0.08)
+    record = synthetic.record(experiment, fabric, name, seen=seen, key=jr.key(0))
+    space = OrthotropicSpace.make(float(fabric.density))
+    problem = Problem.make(record, space, nuisance_prior=NuisancePrior(time=0.1))
+    found = descend(problem, approach="test", key=jr.key(0))
+    truth = np.asarray(space.values(space.to_unit(fabric)))
+    assert found.identifiable.sum() >= 3
+    error = np.abs(np.where(truth > 0, found.values / truth - 1, found.values - truth))
+    assert np.all(error[found.identifiable] < 0.1)
+    delay = found.nuisances[-1]
+    assert delay.name == "time" and abs(delay.value - 0.08) < 0.01
+
+
+@pytest.mark.slow(group="estimates")
+def test_wind_finds_a_light_fabric_from_a_random_start():
+    fabric = presets.red_jet_set()
+    record = synthetic.record(scenarios.wind(), fabric, "red", key=jr.key(0))
+    space = OrthotropicSpace.make(float(fabric.density))
+    problem = Problem.make(record, space)
+    key = jr.key(101)
+    start = jr.uniform(key, (space.dim,), float)
+    found = descend(problem, start=start, key=key)
+    truth = np.asarray(space.values(space.to_unit(fabric)))
+    error = np.abs(np.where(truth > 0, found.values / truth - 1, found.values - truth))
+    assert np.all(error[:-1] < 0.05)  # of all but friction
+
+
+@pytest.mark.slow(group="estimates")
+def test_a_planned_motion_reveals_more_with_better_cameras():
+    """And one that does not move reveals less than one that does."""
+    from r2s.estimation.identifiability import sensitivity
+
+    def deviations(height, noise):
+        experiment = scenarios.lifting(num_frames=8, interval=1 / 10, height=height, moving=0.6)
+        seen = synthetic.sensing(experiment)
+        seen = seen._replace(noise=noise, outliers=1e-3)
+        record = synthetic.record(
+            experiment, FABRIC, "grey", seen=seen, shape=(5, 5), key=jr.key(1)
+        )
+        problem = Problem.make(record, FAMILY, num_points=60, shape=(5, 5), voxel=1e-3)
+        return sensitivity(problem, FABRIC).standard_errors
+
+    good, bad, low = deviations(0.2, 3e-4), deviations(0.2, 3e-3), deviations(0.05, 3e-4)
+    assert np.all(np.isfinite(good)) and np.all(good > 0)
+    assert np.median(good / bad) < 0.5
+    assert np.median(good / low) < 0.8
+
+
+@pytest.mark.slow(group="estimates")
+def test_material_points_find_a_known_modulus():
+    """Of an isotropic sheet, by DiffCP; the same sheet of cloth is refused."""
+    from r2s.estimation import diffcp
+    from r2s.materials.parameters import IsotropicSpace
+    from r2s.scenarios import material_points
+
+    space = IsotropicSpace.make(0.2, plate=5e-4)
+    place = jnp.array([0.3, 0.6])
+    experiment = scenarios.lifting(num_frames=6, interval=1 / 10, height=0.15, moving=0.4)
+    record = synthetic.record(
+        experiment,
+        space(place),
+        "sheet",
+        shape=(4, 4),
+        solver=lambda scenario, fabric: material_points(scenario, space(jnp.ones(2))),
+        key=jr.key(0),
+    )
+    problem = Problem.make(record, space, num_points=100, shape=(4, 4))
+    with pytest.raises(ValueError, match="material points"):
+        diffcp.published_recipe(problem)
+    budget = Budget(coarse=0, starts=1, iterations=6, width=0.02, around=2)
+    start = jnp.array([0.25, 0.5])
+    found = descend(diffcp.on_points(problem), budget, start=start, key=jr.key(0))
+    truth = np.asarray(space.values(place))
+    spread = found.standard_errors * np.where([b.log for b in space.ranges], truth, 1)
+    assert np.all(np.abs(found.values - truth) < 4 * spread)
+    assert found.standard_errors[0] < 0.3  # of the modulus

@@ -1,0 +1,306 @@
+"""Laws against what they stand for: springs, orthotropic and isotropic sheets, damping, air."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import DT, SHAPE, SIZE, cloth, everywhere, flat, roll, rotation, stored_energy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from r2s._util.units import AIR_DENSITY, GRAVITY
+from r2s.environment.air import STILL, Air, Fan
+from r2s.environment.scene import Control
+from r2s.materials.bending import HingeBending, OrthotropicBending, SpringBending
+from r2s.materials.fabric import Fabric
+from r2s.materials.membrane import OrthotropicMembrane, SpringMembrane
+from r2s.mesh.elements import strains
+from r2s.mesh.mesh import Mesh, rectangle
+
+CELL = SIZE / (SHAPE[0] - 1)  # side of the sheet's squares, [m]
+few = settings(max_examples=25, deadline=None)
+
+
+def law(kind, *parameters):
+    return kind(*(jnp.asarray(parameter, float) for parameter in parameters))
+
+
+@eqx.filter_jit
+def membrane_energy(mesh, membrane, x):
+    """Energy [J] in the strains alone."""
+    return jnp.sum(mesh.samples.areas.ravel() * jax.vmap(membrane.energy_density)(strains(mesh, x)))
+
+
+@eqx.filter_jit
+def bending_energy(mesh, bending, x):
+    """Energy [J] in the curvatures alone."""
+    curvature = mesh.hinge_bends.curvatures_at(x)
+    laws = jax.vmap(bending.at)(mesh.hinge_direction, curvature)
+    density = jax.vmap(lambda law, curvature: law.energy_density(curvature))(laws, curvature)
+    return jnp.sum(mesh.hinge_area * density)
+
+
+# Springs in the plane
+
+
+def spring_energy(x, first, second, constant, length):
+    """Energy [J] of springs [N/m] between vertices, of a rest length [m]."""
+    stretched = np.linalg.norm(x[second] - x[first], axis=-1)
+    return np.sum(constant / 2 * (stretched - length) ** 2)
+
+
+def structural_springs(x, warp, weft):
+    """Energy [J] of springs on the edges along warp and weft, those of the boundary by half."""
+    index = np.arange(25).reshape(SHAPE)
+    half = np.array([0.5, 1, 1, 1, 0.5])
+    return spring_energy(x, index[:-1], index[1:], warp * half, CELL) + spring_energy(
+        x, index[:, :-1], index[:, 1:], weft * half[:, None], CELL
+    )
+
+
+def diagonal_springs(x, constant):
+    """Energy [J] of springs on both diagonals of every cell."""
+    index = np.arange(25).reshape(SHAPE)
+    pairs = (index[:-1, :-1], index[1:, 1:]), (index[1:, :-1], index[:-1, 1:])
+    return sum(spring_energy(x, *pair, constant, 2**0.5 * CELL) for pair in pairs)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_structural_energy_is_that_of_springs_on_the_edges(seed):
+    sheet = rectangle((SIZE, SIZE), SHAPE, "falling")
+    noise = np.random.default_rng(seed).normal(size=(25, 3))
+    x = np.asarray(flat(sheet)) + 0.3 * CELL * noise  # in any position, bent too
+    found = membrane_energy(sheet, law(SpringMembrane, 30.0, 20.0, 0.0), jnp.asarray(x))
+    assert found == pytest.approx(structural_springs(x, 30.0, 20.0), rel=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_energy_of_a_uniform_strain_is_that_of_all_springs(seed, sheet):
+    gradient = np.eye(2, 3) + 0.4 * np.random.default_rng(seed).normal(size=(2, 3))
+    x = np.asarray(sheet.rest) @ gradient
+    membrane = SpringMembrane.from_spring_constants(25.0, 9.0)
+    found = membrane_energy(sheet, membrane, jnp.asarray(x))
+    springs = structural_springs(x, 25.0, 25.0) + diagonal_springs(x, 9.0)
+    assert found == pytest.approx(springs, rel=1e-12)
+
+
+def test_small_strains_of_springs_see_an_orthotropic_membrane():
+    membrane = law(SpringMembrane, 30.0, 20.0, 8.0)
+    stiffness = jax.hessian(membrane.energy_density)(jnp.zeros(3))
+    c11, c22, c12, c33 = 30 + 4, 20 + 4, 4, 4  # C12 = C33: Cauchy's relation
+    expected = np.array([[c11, c12, 0], [c12, c22, 0], [0, 0, c33]])
+    assert np.asarray(stiffness) == pytest.approx(expected, abs=1e-12)
+
+
+COLLAPSED = {  # (E11, E22, 2 E12)
+    "warp": (-0.5, 0.0, 0.0),
+    "all": (-0.5, -0.5, 0.0),
+    "bias": (-0.25, -0.25, -0.5),
+    "inverted": (-2.0, -2.0, 1.0),  # what no triangle has
+}
+
+
+@pytest.mark.parametrize("name", COLLAPSED)
+def test_collapsed_springs_have_finite_energy_and_force(name):
+    membrane = law(SpringMembrane, 30.0, 20.0, 8.0)
+    strain = jnp.array(COLLAPSED[name])
+    value, force = jax.value_and_grad(membrane.energy_density)(strain)
+    assert 0 < value <= (30 + 20 + 2 * 8) / 2
+    assert jnp.all(jnp.isfinite(force))
+    assert jnp.all(jnp.isfinite(jax.hessian(membrane.energy_density)(strain)))
+
+
+# Bending
+
+
+def folded(mesh, angle, axis):
+    """Positions of a sheet whose rows turn by the same angle [rad] from cell to cell."""
+    headings = angle * np.arange(SHAPE[0] - 1)
+    cells = CELL * np.stack([np.cos(headings), np.sin(headings)], axis=1)
+    profile = np.concatenate([np.zeros((1, 2)), np.cumsum(cells, axis=0)])
+    row = np.rint(np.asarray(mesh.rest[:, axis]) / CELL).astype(int)
+    across = np.asarray(mesh.rest[:, 1 - axis])
+    round_, up = profile[row].T
+    return jnp.stack([round_, across, up] if axis == 0 else [across, round_, up], axis=1)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("angle", [1e-3, 0.3, 1.2])
+def test_spring_bending_has_the_energy_of_springs_over_two_cells(angle, axis, sheet):
+    constant = 7.0  # [N/m]; two springs overlap, each twice as long as wide
+    x = folded(sheet, angle, axis)
+    found = bending_energy(sheet, law(SpringBending, 4 * constant, CELL), x)
+    index = np.arange(25).reshape(SHAPE) if axis == 0 else np.arange(25).reshape(SHAPE).T
+    half = np.array([0.5, 1, 1, 1, 0.5])
+    springs = spring_energy(np.asarray(x), index[:-2], index[2:], constant * half, 2 * CELL)
+    assert found == pytest.approx(springs, rel=1e-6)  # a spring's stretch of 1e-7 is rounded
+
+
+def test_bending_springs_are_of_fourth_order():
+    bending = law(SpringBending, 28.0, 0.05)
+    energy = bending.energy_density(jnp.array(0.2))
+    assert energy == pytest.approx(28 * (0.05 * 0.2) ** 4 / 128, rel=1e-4)
+    stiffness = jax.grad(jax.grad(bending.energy_density))
+    assert stiffness(jnp.array(0.0)) == 0
+    assert stiffness(jnp.array(0.2)) == pytest.approx(3 * 28 * 0.05**4 * 0.2**2 / 32, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "expected"),
+    [(0, 4.0), (22.5, 2.5), (45, 1.0), (60, 1 + 5 / 3), (67.5, 3.5), (90, 6.0)],
+)
+def test_bending_stiffness_is_linear_in_the_angle_to_the_warp(degrees, expected):
+    bending = law(OrthotropicBending, 4.0, 1.0, 6.0)
+    found = bending.at(jnp.deg2rad(jnp.asarray(degrees, float)), jnp.array(0.0))
+    assert found.stiffness == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("axis", "stiffness"), [(0, 4e-5), (1, 6e-5)])
+def test_a_cylinder_has_the_stiffness_of_the_yarns_that_it_bends(axis, stiffness, sheet):
+    radius = 0.1
+    along, across = sheet.rest[:, axis], sheet.rest[:, 1 - axis]
+    round_, up = radius * jnp.sin(along / radius), radius * (1 - jnp.cos(along / radius))
+    x = jnp.stack([round_, across, up] if axis == 0 else [across, round_, up], axis=1)
+    found = bending_energy(sheet, law(OrthotropicBending, 4e-5, 1e-5, 6e-5), x)
+    area = SIZE**2 * (1 - 1 / (SHAPE[0] - 1))  # the outer half cells have no hinge
+    assert found == pytest.approx(stiffness / radius**2 / 2 * area, rel=1e-9)
+
+
+def turned(mesh, angle):
+    """A mesh whose warp is at minus an angle [rad] to the axes of the rectangle `mesh`."""
+    rest = mesh.rest @ rotation(angle, 2)[:2, :2].T
+    return Mesh.make(np.asarray(rest), np.asarray(mesh.faces))
+
+
+def test_bias_stiffness_is_for_bending_at_45_degrees(sheet):
+    # the squares' sides at 45 degrees to the warp, so that their hinges bend along the bias
+    x = folded(sheet, 0.2, 0)
+    found = bending_energy(turned(sheet, np.pi / 4), law(OrthotropicBending, 4e-5, 1e-5, 6e-5), x)
+    expected = 1e-5 / 2 * (0.2 / CELL) ** 2 * SIZE**2 * 3 / 4
+    assert found == pytest.approx(expected, rel=1e-9)
+
+
+# Orthotropic and isotropic sheets
+
+
+def test_isotropic_laws_are_those_of_a_plate():
+    modulus, ratio, thickness = 2e6, 0.3, 5e-4
+    membrane = OrthotropicMembrane.isotropic(modulus, ratio, thickness)
+    tension = jnp.array([1e-3, -ratio * 1e-3, 0.0])  # a strip with free sides
+    stress = jax.grad(membrane.energy_density)(tension)
+    assert stress == pytest.approx(np.array([modulus * thickness * 1e-3, 0, 0]), abs=1e-12)
+    sheared = jax.grad(membrane.energy_density)(jnp.array([0.0, 0.0, 1e-3]))
+    shear_modulus = modulus / (2 * (1 + ratio))
+    assert sheared[2] == pytest.approx(shear_modulus * thickness * 1e-3)
+    bending = HingeBending.isotropic(modulus, ratio, thickness)
+    assert bending.stiffness == pytest.approx(float(membrane.c11) * thickness**2 / 12)
+
+
+INNER = np.arange(25).reshape(SHAPE)[1:-1, 1:-1].ravel()
+forces = jax.jit(jax.grad(stored_energy, argnums=2))
+
+
+@pytest.mark.parametrize("degrees", [30, 45, -70])
+def test_uniaxial_stretch_across_the_yarns_is_exact(degrees, sheet, fabric):
+    angle, stretch = np.deg2rad(degrees), 1.1
+    mesh = turned(sheet, -angle)  # the warp at this angle to the stretch
+    x = (flat(sheet) * jnp.array([[stretch, 1.0, 1.0]])) @ rotation(0.7, 0).T
+    green, c, s = (stretch**2 - 1) / 2, np.cos(angle), np.sin(angle)
+    e11, e22, shear = green * c**2, green * s**2, -2 * green * c * s
+    density = (300 * e11**2 + 2 * 60 * e11 * e22 + 200 * e22**2 + 80 * shear**2) / 2
+    found = np.asarray(strains(mesh, x))
+    assert found == pytest.approx(np.tile([e11, e22, shear], (32, 1)), abs=1e-13)
+    assert stored_energy(mesh, fabric, x) == pytest.approx(SIZE**2 * density, rel=1e-12)
+    force = forces(mesh, fabric, x)
+    assert jnp.max(jnp.abs(force[INNER])) < 1e-12 * jnp.max(jnp.abs(force))
+
+
+# Mass damping
+
+
+def test_mass_damping_brakes_a_fall(sheet):
+    rate = 3.0  # [1/s]
+    fabric = Fabric.make(0.2, (300.0, 60.0, 200.0, 80.0), 2e-5, mass_damping=rate)
+    solver = cloth(sheet)
+    start = solver.init(flat(sheet), acceleration=everywhere([0.0, 0.0, -GRAVITY], sheet))
+    velocity = roll(solver, fabric, start, 120).v[1:, :, 2]
+    time = DT * np.arange(1, 121)
+    expected = -GRAVITY / rate * (1 - np.exp(-rate * time))
+    assert velocity == pytest.approx(np.tile(expected[:, None], 25), rel=0.01)
+    assert velocity[-1] == pytest.approx(-GRAVITY / rate, rel=0.03)  # exp(-3.6)
+
+
+# Air
+
+
+@given(st.tuples(*[st.floats(-3, 3)] * 2), st.floats(-3, 3))
+@few
+def test_flow_along_a_face_pulls_it_along(flow, normal_flow):
+    air = Air.make(1.3, 0.0, 0.4)
+    area_normal = jnp.array([0.0, 0.0, 0.02])
+    force = -jax.grad(air.dissipation)(-jnp.array([*flow, normal_flow]), area_normal)
+    expected = 1.3 * 0.4 / 2 * 0.02 * np.hypot(*flow) * np.array([*flow, 0.0])
+    # where the flow is slow its friction fades to linear
+    assert force == pytest.approx(expected, rel=1e-9, abs=1.3 * 0.4 / 2 * 0.02 * STILL**2)
+
+
+@pytest.mark.parametrize("flow", [(0.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
+def test_friction_of_the_air_has_derivatives_at_no_flow_along(flow):
+    air, area_normal = Air.make(), jnp.array([0.0, 0.0, 0.02])
+    force = jax.grad(air.dissipation)(jnp.array(flow), area_normal)
+    assert force[:2] == pytest.approx(0)
+    assert jnp.all(jnp.isfinite(jax.hessian(air.dissipation)(jnp.array(flow), area_normal)))
+
+
+@pytest.mark.parametrize("degrees", [35, 90])
+def test_a_tilted_sheet_glides_at_its_terminal_velocity(degrees, sheet, fabric):
+    # the flows along and across the sheet do not know of each other, nor does it turn
+    air = Air.make(AIR_DENSITY, 2.0, 1.2)
+    solver = eqx.tree_at(lambda solver: solver.scene.air, cloth(sheet), air)
+    tilt = np.deg2rad(degrees)
+    states = roll(solver, fabric, solver.init(flat(sheet) @ rotation(tilt, 1).T), 150)
+    uphill, normal = (np.asarray(rotation(tilt, 1))[:, axis] for axis in (0, 2))
+    weight = 2 * 0.2 * GRAVITY / AIR_DENSITY  # [m^2/s^2], over the pressure of a flow of 1 m/s
+    along, across = (weight * np.sin(tilt) / 1.2) ** 0.5, (weight * np.cos(tilt) / 2.0) ** 0.5
+    expected = -along * uphill - across * normal
+    assert states.v[-1] == pytest.approx(np.tile(expected, (25, 1)), rel=0.01, abs=1e-3)
+
+
+def fan(radius, edge):
+    point, axis = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.0, 2.0, 0.0])
+    return Fan(point, axis, jnp.array(radius), jnp.array(edge))
+
+
+def strength(jet, distance, along=0.7):
+    """Of a fan's wind at a distance [m] from the axis, and somewhere along it."""
+    return float(jet(jnp.array([[1.0, 2.0 + along, 3.0 + distance]]))[0])
+
+
+def test_the_wind_of_a_fan_falls_across_its_edge():
+    jet = fan(0.3, 0.02)
+    assert strength(jet, 0.0) == pytest.approx(1, abs=1e-12)
+    rounding = 0.02 / 0.3 / 32  # of the distance, on the axis
+    assert strength(jet, 0.3) == pytest.approx(0.5, abs=1.1 * rounding)
+    assert strength(jet, 0.29) == pytest.approx(0.88, abs=0.005)
+    assert strength(jet, 0.31) == pytest.approx(0.12, abs=0.005)
+    assert strength(jet, 0.6) < 1e-12
+    assert strength(jet, 0.31, along=-5.0) == pytest.approx(strength(jet, 0.31))
+
+
+def test_the_wind_of_a_fan_has_a_gradient_on_its_axis():
+    slope = jax.grad(lambda point: fan(0.05, 0.1)(point[None])[0])(jnp.array([1.0, 2.5, 3.0]))
+    assert slope == pytest.approx(0)  # and not NaN
+
+
+def test_the_same_wind_at_every_vertex_is_a_uniform_one(sheet, fabric):
+    solver = cloth(sheet, air=AIR_DENSITY)
+    start = solver.init(flat(sheet) @ rotation(0.4, 0).T)
+    wind, none = jnp.array([1.0, -2.0, 3.0]), start.x[:0]
+    uniform, each = (
+        # what a step is made of; for each kind of wind it would compile anew
+        solver.potential(fabric, start, Control(none, wind))
+        for wind in (wind, everywhere(wind, sheet))
+    )
+    assert np.asarray(uniform.wind) == pytest.approx(np.tile(wind, (16, 1)), abs=1e-12)
+    assert jax.tree.all(jax.tree.map(lambda a, b: jnp.allclose(a, b, 1e-12), uniform, each))

@@ -1,0 +1,177 @@
+"""Plates: the curvature of faces is exact, and its energy that of Kirchhoff's plate."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import cloth, directional_difference, flat, step, stored_energy
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial import Delaunay
+
+from r2s.environment.scene import Control
+from r2s.materials.fabric import Fabric
+from r2s.materials.plate import OrthotropicPlate, PlateBending
+from r2s.mesh.mesh import ELEMENTS, Mesh, rectangle
+from r2s.scenarios.scenario import rollout
+from r2s.scenarios.standard import lifting
+from r2s.solvers.implicit.potential import hessian, residual
+
+SLIGHT = 1e-4  # so that angles are slopes
+numbers = st.floats(-1.0, 1.0)
+
+
+def irregular(seed: int = 0, count: int = 40) -> Mesh:
+    """A square of Delaunay triangles."""
+    rng = np.random.default_rng(seed)
+    side = np.linspace(0, 0.2, 6)
+    border = np.concatenate(
+        [[[a, 0.0], [a, 0.2]] for a in side] + [[[0.0, a], [0.2, a]] for a in side]
+    )
+    places = np.unique(np.concatenate([border, rng.uniform(0.02, 0.18, (count, 2))]), axis=0)
+    faces = Delaunay(places).simplices
+    edges = places[faces[:, 1:]] - places[faces[:, :1]]
+    area = np.linalg.det(edges)
+    faces = np.where(area[:, None] < 0, faces[:, ::-1], faces)[np.abs(area) > 1e-6]
+    return Mesh.make(places, faces)
+
+
+MESHES = {
+    **{name: rectangle((0.2, 0.3), (5, 6), name) for name in ELEMENTS},
+    "irregular": irregular(),
+}
+
+
+def bent(mesh: Mesh, k11, k22, k12):
+    """A sheet with a constant curvature [1/m], if slight."""
+    x, y = mesh.rest.T
+    return jnp.stack([x, y, (k11 * x**2 + k22 * y**2) / 2 + k12 * x * y], axis=1)
+
+
+def seen(mesh: Mesh, x):
+    return mesh.plate.curvatures(mesh.plate.bends.curvatures_at(x))
+
+
+def inner_elements(mesh: Mesh):
+    """The faces with a hinge on each edge, the vertices with a cell of their own area."""
+    if len(mesh.plate.areas) == len(mesh.rest):
+        areas, twists = np.asarray(mesh.plate.areas), np.asarray(mesh.plate.to_curvature[:, 2, 2])
+        return (areas > 0.9 * areas.max()) & (twists > 0)
+    corners = np.asarray(mesh.faces)
+    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]))
+    _, index, count = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+    return np.all(count[index.reshape(3, -1)] == 2, axis=0)
+
+
+@pytest.mark.parametrize("name", MESHES)
+@given(k11=numbers, k22=numbers, k12=numbers)
+def test_a_constant_curvature_is_seen_exactly(name, k11, k22, k12):
+    mesh = MESHES[name]
+    found = seen(mesh, bent(mesh, *(SLIGHT * jnp.asarray(k, float) for k in (k11, k22, k12))))
+    # downwards is positive
+    expected = -SLIGHT * np.array([k11, k22, 2 * k12])
+    inner = inner_elements(mesh)
+    assert inner.sum() > 10
+    np.testing.assert_allclose(
+        np.asarray(found)[inner], expected[None] + 0 * found[inner], atol=1e-9
+    )
+
+
+def test_a_face_at_the_border_takes_the_least_curvature_that_its_hinges_allow():
+    mesh = MESHES["falling"]
+    exact = np.linalg.norm(SLIGHT * np.array([0.4, -0.7, 0.2, 0.2]))
+    k11, k22, twice = np.asarray(seen(mesh, bent(mesh, *(SLIGHT * jnp.array([0.4, -0.7, 0.2]))))).T
+    found = np.sqrt(k11**2 + k22**2 + twice**2 / 2)
+    border = ~inner_elements(mesh)
+    assert border.sum() > 10 and np.all(found[border] <= exact * (1 + 1e-6))
+    # faces at the sides along the warp see bending along it; those at its two ends do not
+    cylinder = np.asarray(seen(mesh, bent(mesh, SLIGHT, 0.0, 0.0)))
+    has_warp = np.abs(cylinder[:, 0]) > 0.9 * SLIGHT
+    assert has_warp.mean() == 1 - 2 * 5 / len(mesh.faces)
+
+
+def test_a_single_triangle_has_no_curvature():
+    mesh = Mesh.make(np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]]), np.array([[0, 1, 2]]))
+    assert np.all(np.asarray(seen(mesh, bent(mesh, 1.0, 1.0, 0.0))) == 0)
+
+
+@pytest.mark.parametrize("name", ["quadrilaterals", "falling", "rising", "irregular"])
+@pytest.mark.parametrize("angle", [0.0, 22.5, 45.0, 90.0, 135.0])
+def test_a_plate_bends_alike_in_all_directions(name, angle):
+    mesh, (c, s) = MESHES[name], (np.cos(np.radians(angle)), np.sin(np.radians(angle)))
+    curvature = np.asarray(seen(mesh, bent(mesh, *(SLIGHT * jnp.array([c * c, s * s, c * s])))))
+    law = PlateBending.make(2e-5, 0.3)
+    densities = jax.vmap(law.energy_density)(jnp.asarray(curvature))[inner_elements(mesh)]
+    assert densities == pytest.approx(2e-5 * SLIGHT**2 / 2, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("angle", "stiffness"), [(0, 3e-5), (45, 2.5e-5), (90, 1e-5), (135, 2.5e-5)]
+)
+def test_an_orthotropic_plate_has_the_stiffness_of_the_direction(angle, stiffness):
+    law = OrthotropicPlate(*(jnp.asarray(b, float) for b in (3e-5, 2.5e-5, 1e-5)))
+    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    density = law.energy_density(jnp.asarray([c * c, s * s, 2 * c * s]))
+    assert density == pytest.approx(stiffness / 2, rel=1e-12)
+
+
+def test_an_orthotropic_plate_of_one_stiffness_is_isotropic():
+    one = jnp.asarray(2e-5, float)
+    curvature = jnp.asarray([0.3, -0.8, 0.5])
+    expected = PlateBending.make(2e-5).energy_density(curvature)
+    assert OrthotropicPlate(one, one, one).energy_density(curvature) == pytest.approx(
+        float(expected)
+    )
+
+
+def test_a_solid_plate_has_the_textbook_stiffness():
+    law = PlateBending.isotropic(2e9, 0.3, 1e-3)
+    assert law.stiffness == pytest.approx(2e9 * 1e-9 / (12 * (1 - 0.09)))
+    # free to curve across, it is a beam of E h^3 / 12
+    beam = law.energy_density(jnp.asarray([1.0, -0.3, 0.0]))
+    assert beam == pytest.approx(2e9 * 1e-9 / 24)
+
+
+@pytest.mark.parametrize(
+    "law", [PlateBending.make(0.3, 0.2), OrthotropicPlate(*jnp.array([0.3, 0.4, 0.2]))]
+)
+def test_the_hessian_is_the_derivative_of_the_force(law, sheet, fabric):
+    x = flat(sheet) + 0.02 * jax.random.normal(jax.random.key(1), (25, 3))
+    fabric = Fabric(fabric.density, fabric.membrane, law, *list(fabric.__dict__.values())[3:])
+    solver = cloth(sheet)
+    state, control = solver.init(flat(sheet)), Control(jnp.zeros((0, 3)), jnp.zeros(3))
+    increment = solver.potential(fabric, state, control)
+    direction = jax.random.normal(jax.random.key(2), x.shape)
+    expected = directional_difference(jax.jit(partial(residual, increment)), x, direction, 1e-7)
+    pattern, blocks = increment.elimination.pattern, jax.jit(hessian)(increment, x)
+    product = np.zeros((25, 3))
+    np.add.at(
+        product,
+        np.asarray(pattern.rows),
+        np.einsum("bij,bj->bi", blocks, direction[pattern.columns]),
+    )
+    np.testing.assert_allclose(product, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
+
+
+def test_a_stiff_plate_keeps_its_energy_account(sheet, fabric):
+    # let go from a cylinder, it straightens: what was stored goes into motion and damping
+    law = PlateBending.make(1e-3)
+    fabric = Fabric(fabric.density, fabric.membrane, law, *list(fabric.__dict__.values())[3:])
+    warp, weft = sheet.rest.T
+    x = jnp.stack([0.2 * jnp.sin(warp / 0.2), weft, 0.2 * (1 - jnp.cos(warp / 0.2))], axis=1)
+    solver = cloth(sheet)
+    after = step(solver, fabric, solver.init(x), Control(jnp.zeros((0, 3)), jnp.zeros(3)))
+    stored = stored_energy(sheet, fabric, x)
+    assert stored > 1e-6 and stored_energy(sheet, fabric, after.x) < stored
+
+
+def test_quadrilaterals_favour_neither_warp_nor_weft_nor_a_diagonal():
+    fabric = Fabric.make(0.2, (60.0, 20.0, 60.0, 20.0), 2e-5)
+    lift = lifting(num_frames=40).scenario((9, 9))
+    x = np.asarray(eqx.filter_jit(rollout)(lift, fabric).x).reshape(-1, 9, 9, 3)
+    mirrored = x.transpose(0, 2, 1, 3)[..., [1, 0, 2]]  # about the diagonal through the grip
+    assert np.ptp(x[-1, ..., 2]) > 0.2
+    np.testing.assert_allclose(x, mirrored, atol=1e-9)

@@ -1,0 +1,327 @@
+"""Tables of measured stiffness: what is published where, smoothness, what a step makes of it."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import FIRST_ROW, SIZE, cloth, flat, roll, step
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+
+from r2s._util.units import GRAVITY
+from r2s.environment.scene import Control
+from r2s.materials.bending import BendingLaw, HingeBending, OrthotropicBending
+from r2s.materials.fabric import Fabric
+from r2s.materials.membrane import MembraneLaw, OrthotropicMembrane
+from r2s.materials.tables import (
+    BLUR,
+    HINGE_FACTOR,
+    DiffSimTableBending,
+    DiffSimTableMembrane,
+    TableBending,
+    TableMembrane,
+)
+
+few = settings(max_examples=25, deadline=None)
+STRETCHING = jnp.array(  # [N/m]; numbers of no fabric, which tell the rows apart
+    [
+        [100.0, 20.0, 50.0, 30.0],
+        [210.0, 31.0, 71.0, 41.0],
+        [230.0, 33.0, 74.0, 44.0],
+        [260.0, 36.0, 78.0, 48.0],
+        [300.0, 40.0, 83.0, 53.0],
+        [350.0, 45.0, 89.0, 59.0],
+    ]
+)
+BENDING = 1e-5 * jnp.array(  # [N m]
+    [[1.0, 1.1, 1.3, 1.6, 2.0], [3.0, 3.2, 3.5, 3.9, 4.4], [6.0, 6.3, 6.7, 7.2, 7.8]]
+)
+LARGE = 7 / 6  # the stretch of rows 1 to 5
+ROW_DIRECTIONS = jnp.deg2rad(jnp.array([0.0, 22.5, 45.0, 67.5, 90.0]))
+MEMBRANES = {"plain": TableMembrane(STRETCHING), "diffsim": DiffSimTableMembrane(STRETCHING)}
+
+
+def strain_of(stretch, direction, other=1.0):
+    """Green strain (E11, E22, 2 E12) with a principal stretch along a direction [rad]."""
+    high, low = (stretch**2 - 1) / 2, (other**2 - 1) / 2
+    c, s = jnp.cos(direction), jnp.sin(direction)
+    return jnp.stack([c**2 * high + s**2 * low, s**2 * high + c**2 * low, 2 * s * c * (high - low)])
+
+
+def numbers(law):
+    """C11, C12, C22, C33 [N/m] of a law, with C33 as published."""
+    return jnp.stack([law.c11, law.c12, law.c22, 2 * law.c33])
+
+
+def _look(law, strain):
+    return numbers(law.at(strain))
+
+
+look = jax.jit(_look)
+slope = jax.jit(jax.jacfwd(_look, argnums=1))
+bend = jax.jit(lambda law, direction, curvature: law.at(direction, curvature).stiffness)
+
+
+@pytest.mark.parametrize("row", range(6))
+def test_the_rows_are_the_published_ones(row):
+    strain = jnp.zeros(3) if row == 0 else strain_of(LARGE, ROW_DIRECTIONS[row - 1])
+    # the blur of the direction, which falls with the square of the strain
+    assert look(MEMBRANES["plain"], strain) == pytest.approx(np.asarray(STRETCHING[row]), rel=1e-4)
+
+
+def test_stiffness_is_linear_in_the_stretch_and_constant_beyond_the_table():
+    for extension, weight in ((-0.1, 0), (1 / 24, 1 / 4), (1 / 8, 3 / 4), (1 / 6, 1), (0.5, 1)):
+        narrow = min(1.0, 1 + extension)  # the smaller stretch does not count
+        found = look(MEMBRANES["plain"], strain_of(1 + extension, 0.0, 0.8 * narrow))
+        expected = STRETCHING[0] + weight * (STRETCHING[1] - STRETCHING[0])
+        assert found == pytest.approx(np.asarray(expected), rel=1e-3)
+
+
+def test_stiffness_is_linear_in_the_direction_between_rows():
+    found = look(MEMBRANES["plain"], strain_of(LARGE, jnp.deg2rad(22.5 * 2.25)))
+    expected = 0.75 * STRETCHING[3] + 0.25 * STRETCHING[4]
+    assert found == pytest.approx(np.asarray(expected), rel=1e-4)
+
+
+@given(st.floats(0.7, 1.3), st.floats(0.7, 1.3), st.floats(0, 1.57))
+@few
+def test_both_biases_are_alike(high, low, direction):
+    for law in MEMBRANES.values():
+        left, right = (look(law, strain_of(high, sign * direction, low)) for sign in (1, -1))
+        assert left == pytest.approx(np.asarray(right), rel=1e-12)
+
+
+@pytest.mark.parametrize("lookup", MEMBRANES)
+@pytest.mark.parametrize("size", [0.0, 1e-300, 1e-160, 1e-30, 1e-12, 1e-8, 1e-3, 0.3, -0.2, -0.5])
+def test_stiffness_and_its_derivatives_are_finite(lookup, size):
+    law = MEMBRANES[lookup]
+    for direction in ([1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 1, 1e-9], [1, -1, 0]):
+        strain = size * jnp.array(direction, float)
+        assert jnp.all(jnp.isfinite(look(law, strain)))
+        assert jnp.all(jnp.isfinite(slope(law, strain)))
+
+
+@pytest.mark.parametrize("kind", [TableMembrane, DiffSimTableMembrane])
+def test_single_precision_stays_single_and_finite(kind):
+    with jax.enable_x64(False):
+        law = kind(jnp.asarray(np.asarray(STRETCHING), jnp.float32))
+        for size in (0.0, 1e-30, 1e-12, 1e-4, 0.1):
+            strain = size * jnp.array([1.0, 0.999, -1e-3], jnp.float32)
+            assert look(law, strain).dtype == jnp.float32
+            assert jnp.all(jnp.isfinite(slope(law, strain)))
+
+
+@pytest.mark.parametrize("biaxial", [0.0, 0.05, 0.15])
+def test_stiffness_is_smooth_where_the_principal_stretches_are_equal(biaxial):
+    # a step of a thousandth of the blur across the place changes no more than the blur allows
+    def at(offset):
+        return look(MEMBRANES["plain"], strain_of(1 + biaxial, 0.0, 1 + biaxial) + offset)
+
+    span = float(jnp.max(jnp.ptp(STRETCHING, axis=0)))
+    for direction in ([1.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 1.0, 1.0]):
+        offset = 1e-3 * BLUR * jnp.array(direction)
+        change = at(offset) - at(-offset)
+        assert jnp.max(jnp.abs(change)) < 0.02 * span
+
+
+@pytest.mark.parametrize("strain", [[0.03, -0.01, 0.02], [0.01, 0.012, -0.003], [1e-4, 2e-4, 3e-4]])
+def test_derivatives_agree_with_differences(strain):
+    at, size = jnp.array(strain), 1e-7
+    sides = [
+        (look(law, at + size * axis) - look(law, at - size * axis)) / (2 * size)
+        for law in MEMBRANES.values()
+        for axis in jnp.eye(3)
+    ]
+    found = jnp.concatenate([slope(law, at).T for law in MEMBRANES.values()])
+    assert found == pytest.approx(np.stack(sides), rel=1e-5, abs=1e-3)
+
+
+def test_a_table_of_equal_rows_is_a_constant_law():
+    constant = OrthotropicMembrane(*(jnp.asarray(c) for c in (300.0, -40.0, 200.0, 80.0)))
+    law = TableMembrane(jnp.tile(numbers(constant), (6, 1)))
+    assert isinstance(law, MembraneLaw)
+    for strain in ([0.0, 0.0, 0.0], [0.1, -0.02, 0.03], [0.2, 0.2, 0.0]):
+        assert jnp.all(look(law, jnp.array(strain)) == numbers(constant))
+        energy = law.energy_density(jnp.array(strain))
+        assert energy == constant.energy_density(jnp.array(strain))
+
+
+def test_the_stress_is_the_secant_stiffness_times_the_strain():
+    law, strain = MEMBRANES["plain"], strain_of(1.1, 0.3, 0.98)
+    stress = jax.grad(law.at(strain).energy_density)(strain)
+    c11, c12, c22, c33 = look(law, strain)
+    e11, e22, shear = strain
+    expected = [c11 * e11 + c12 * e22, c12 * e11 + c22 * e22, c33 * shear / 2]
+    assert stress == pytest.approx(np.array(expected), rel=1e-12)
+    # no energy has this stress: work around a closed loop of strains is not zero
+    tangent = jax.jacfwd(lambda strain: jax.grad(law.at(strain).energy_density)(strain))
+    total = jax.jacfwd(lambda e: _stress(law, e))(strain)
+    assert tangent(strain).shape == total.shape
+    assert jnp.max(jnp.abs(total - total.T)) > 1.0  # [N/m]
+
+
+def _stress(law, strain):
+    held = law.at(strain)
+    return jax.grad(lambda e: held.energy_density(e))(strain)
+
+
+@given(st.lists(st.floats(-100, 400), min_size=24, max_size=24), *[st.floats(-0.4, 0.4)] * 3)
+@few
+def test_no_measured_number_makes_a_negative_stiffness(entries, e11, e22, shear):
+    law = TableMembrane(jnp.array(entries).reshape(6, 4))
+    c11, c12, c22, c33 = look(law, jnp.array([e11, e22, shear]))
+    assert min(c11, c22, c33) >= 0
+    assert c12**2 <= c11 * c22 * (1 + 1e-9) + 1e-12
+
+
+def test_diffsim_doubles_the_stiffness_of_zero_strain():
+    # its samples next to zero strain are stretched by less than the 4.2 % up to which row 0 holds
+    assert look(MEMBRANES["diffsim"], jnp.zeros(3)) == pytest.approx(2 * np.asarray(STRETCHING[0]))
+
+
+@pytest.mark.parametrize("axis, row", [(0, 1), (1, 5)])
+def test_diffsim_has_twice_the_large_strain_rows_along_the_yarns(axis, row):
+    strain = jnp.array([0.25, 0.0, 0.0]) if axis == 0 else jnp.array([0.0, 0.25, 0.0])
+    found = look(MEMBRANES["diffsim"], strain)
+    assert found == pytest.approx(2 * np.asarray(STRETCHING[row]), rel=1e-12)
+
+
+def test_diffsim_raises_negative_stiffness_to_zero():
+    law = DiffSimTableMembrane(STRETCHING.at[0, 1].set(-20.0))
+    expected = [200.0, 0.0, 100.0, 60.0]
+    assert look(law, jnp.zeros(3)) == pytest.approx(np.array(expected))
+
+
+def baked(index):
+    """A sample of DiffSim's grid, from its definition, at an index along E11, E22, E12."""
+    e11, e22, e12 = index[0] / 30 - 0.25, index[1] / 30 - 0.25, index[2] / 30
+    values, vectors = np.linalg.eigh([[1 + 2 * e11, 2 * e12], [2 * e12, 1 + 2 * e22]])
+    row = np.clip(12 * (np.sqrt(values[1]) - 1) - 0.5, 0, 1)
+    angle = np.abs(np.arctan(vectors[1, 1] / vectors[0, 1])) * 8 / np.pi
+    column = np.clip(1.25 * angle - 0.5, 0, 4)
+    rows = np.asarray(STRETCHING)
+    large = [np.interp(column, range(5), rows[1:, entry]) for entry in range(4)]
+    return 2 * ((1 - row) * rows[0] + row * np.array(large))
+
+
+@pytest.mark.parametrize("index", [(8, 7, 0), (9, 4, 3), (12, 11, 1), (5, 14, 6), (20, 3, 10)])
+def test_diffsim_bakes_its_table_on_a_grid(index):
+    # where the shifted index is whole, only one sample counts
+    shifted = 29 * (np.array(index) + 0.5) / 900
+    strain = jnp.array([shifted[0] - 0.25, shifted[1] - 0.25, 2 * shifted[2]])
+    assert look(MEMBRANES["diffsim"], strain) == pytest.approx(baked(index), rel=1e-9)
+    halfway = strain.at[0].add(29 / 1800)
+    expected = (baked(index) + baked((index[0] + 1, *index[1:]))) / 2
+    assert look(MEMBRANES["diffsim"], halfway) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("row, direction", [(0, np.pi / 2), (1, np.pi / 4), (2, 0.0)])
+@pytest.mark.parametrize("column", range(5))
+def test_bending_entries_are_the_published_ones(row, direction, column):
+    # row 0 is of edges along the warp, which bend the weft
+    for sign in (1.0, -1.0):
+        found = bend(TableBending(BENDING), jnp.array(direction), jnp.array(sign * 10.0 * column))
+        assert HINGE_FACTOR * found == pytest.approx(float(BENDING[row, column]), rel=1e-12)
+
+
+def test_bending_is_linear_between_its_entries_and_constant_beyond():
+    law = TableBending(BENDING)
+    found = bend(law, jnp.array(3 * np.pi / 8), jnp.array(-25.0))
+    expected = (BENDING[0, 2] + BENDING[0, 3] + BENDING[1, 2] + BENDING[1, 3]) / 4
+    assert HINGE_FACTOR * found == pytest.approx(float(expected), rel=1e-12)
+    assert bend(law, jnp.array(0.0), jnp.array(1e3)) == bend(law, jnp.array(0.0), jnp.array(40.0))
+    derivative = jax.jacfwd(bend, argnums=(1, 2))(law, jnp.array(0.0), jnp.array(0.0))
+    assert np.all(np.isfinite(derivative))
+
+
+def test_the_hinge_has_the_force_of_the_published_stiffness():
+    # k l^2 / (4 A) theta, of the energy A B (theta l / A)^2 / 2
+    stiffness, length, area, angle = 3e-5, 0.12, 0.015, 0.4
+    law = TableBending(jnp.full((3, 5), stiffness)).at(jnp.array(0.3), jnp.array(0.0))
+
+    def energy(angle):
+        return area * law.energy_density(angle * length / area)
+
+    force = jax.grad(energy)(jnp.array(angle))
+    assert force == pytest.approx(stiffness * length**2 / (4 * area) * angle, rel=1e-12)
+
+
+def test_a_bending_table_of_equal_columns_is_orthotropic_bending():
+    table = TableBending(jnp.tile(BENDING[:, :1], (1, 5)))
+    weft, bias, warp = BENDING[:, 0] / HINGE_FACTOR
+    law = OrthotropicBending(warp, bias, weft)
+    for direction in (0.0, 0.3, np.pi / 4, 1.2, np.pi / 2):
+        found = bend(table, jnp.array(direction), jnp.array(17.0))
+        expected = float(bend(law, jnp.array(direction), jnp.array(17.0)))
+        assert found == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("curvature, column", [(40.0, 0.0), (0.0, 0.0), (-4.0, 0.0), (-20.0, 2.0)])
+def test_diffsim_shifts_bending_and_knows_one_side_only(curvature, column):
+    found = bend(DiffSimTableBending(BENDING), jnp.array(0.0), jnp.array(curvature))
+    expected = np.interp(column, range(5), np.asarray(BENDING[2]))
+    assert HINGE_FACTOR * found == pytest.approx(expected, rel=1e-12)
+
+
+def tabled(membrane, bending):
+    fabric = Fabric.make(0.2, (300.0, 60.0, 200.0, 80.0), 2e-5, damping=0.05)
+    return dataclasses.replace(fabric, membrane=membrane, bending=bending)
+
+
+def test_a_sheet_hangs_by_the_stiffness_of_its_strain(sheet):
+    # by the first row, so stretched along the warp; without C12 its width does not matter
+    membrane = TableMembrane(0.1 * STRETCHING.at[:, 1].set(0.0))
+    solver = cloth(sheet, FIRST_ROW)
+    start = flat(sheet)[:, jnp.array([2, 1, 0])] * jnp.array([[1.0, 1.0, -1.0]])
+    x = roll(solver, tabled(membrane, TableBending(BENDING)), solver.init(start), 400).x[-1]
+    height = x[:, 2].reshape(5, 5).mean(axis=1)
+
+    def surplus(stretch, tension, is_table):
+        law = membrane.at(strain_of(jnp.array(stretch if is_table else 1.0), 0.0))
+        return float(law.c11) * stretch * (stretch**2 - 1) / 2 - tension  # [N/m]
+
+    def extension(is_table):
+        cell = SIZE / 4
+        tensions = 0.2 * GRAVITY * (SIZE - cell * (np.arange(4) + 0.5))
+        stretches = np.array([brentq(surplus, 1, 1.5, (t, is_table)) for t in tensions])
+        return cell * np.sum(stretches - 1)
+
+    assert height[0] - height[-1] - SIZE == pytest.approx(extension(True), rel=0.01)
+    assert extension(False) > 1.1 * extension(True)  # so the table makes a difference
+
+
+def test_derivatives_of_a_step_agree_with_differences(sheet):
+    solver = cloth(sheet, FIRST_ROW)
+
+    def end(scales):
+        tables = TableMembrane(STRETCHING * scales[0]), TableBending(BENDING * scales[1])
+        state = solver.init(flat(sheet) * scales[2])
+        after = step(solver, tabled(*tables), state, Control(state.x[:5], jnp.zeros(3)))
+        return jnp.sum(after.x[5:] ** 2)
+
+    scales, size = jnp.array([1.0, 1.0, 1.05]), 1e-5
+    found = jax.grad(end)(scales)
+    expected = [(end(scales + e) - end(scales - e)) / (2 * size) for e in size * jnp.eye(3)]
+    assert found == pytest.approx(np.array(expected), rel=1e-4, abs=1e-7)
+
+
+@pytest.mark.slow(group="cloth")
+def test_a_sheet_of_equal_rows_moves_like_one_of_constant_stiffness(sheet):
+    solver = cloth(sheet, FIRST_ROW)
+    state = solver.init(1.02 * flat(sheet))
+    control = Control(state.x[:5], jnp.zeros(3))
+    constant = Fabric.make(0.2, (300.0, 60.0, 200.0, 80.0), 0.0, damping=0.05)
+    constant = dataclasses.replace(constant, bending=HingeBending(jnp.asarray(2e-5, float)))
+    rows = jnp.tile(numbers(constant.membrane), (6, 1))
+    bending = TableBending(jnp.full((3, 5), HINGE_FACTOR * 2e-5))
+    found = step(solver, tabled(TableMembrane(rows), bending), state, control)
+    expected = step(solver, constant, state, control)
+    assert found.x == pytest.approx(np.asarray(expected.x), abs=1e-11)
+
+
+def test_hinges_of_a_table_are_bending_laws():
+    law = TableBending(BENDING).at(jnp.array(0.3), jnp.array(2.0))
+    assert isinstance(law, BendingLaw) and isinstance(law, HingeBending)

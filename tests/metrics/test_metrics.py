@@ -1,0 +1,95 @@
+"""Metrics: clouds whose distances are known by hand, and what does not change them."""
+
+import numpy as np
+import pytest
+from conftest import rotation
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from r2s.metrics.distances import distances, paper_units
+
+few = settings(max_examples=25, deadline=None)
+SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+UNIT = 0.5**0.5 / 2  # of the paper for `SQUARE`: half of the largest radius, [m]
+scales = st.floats(1e-2, 1e2)
+seeds = st.integers(0, 1000)
+
+
+def clouds(seed):
+    random = np.random.default_rng(seed)
+    return random.normal(size=(20, 3)), random.normal(size=(15, 3))
+
+
+def test_distances_by_hand():
+    far = np.concatenate([SQUARE + [0, 0, 0.1], [[0.0, 0, 2.1]]])
+    found = distances(SQUARE, far)
+    assert found["chamfer_real_to_sim"] == pytest.approx(0.1)
+    assert found["chamfer_sim_to_real"] == pytest.approx((4 * 0.1 + 2.1) / 5)
+    assert found["chamfer"] == pytest.approx((0.1 + 0.5) / 2)
+    assert found["hausdorff"] == pytest.approx(2.1)
+
+
+def test_a_cloud_is_at_no_distance_from_itself():
+    assert set(distances(SQUARE, SQUARE[::-1]).values()) == {0.0}
+
+
+@given(seeds)
+@few
+def test_distances_are_symmetric(seed):
+    one, other = clouds(seed)
+    there, back = distances(one, other), distances(other, one)
+    assert there["chamfer"] == pytest.approx(back["chamfer"])
+    assert there["hausdorff"] == back["hausdorff"]
+    assert there["chamfer_real_to_sim"] == back["chamfer_sim_to_real"]
+
+
+@given(seeds, st.floats(-3, 3), st.integers(0, 2), scales)
+@few
+def test_distances_move_and_scale_with_the_clouds(seed, angle, axis, scale):
+    one, other = clouds(seed)
+
+    def move(cloud):
+        return scale * (cloud @ np.asarray(rotation(angle, axis)).T + [3.0, -1.0, 2.0])
+
+    expected = {name: scale * value for name, value in distances(one, other).items()}
+    assert distances(move(one), move(other)) == pytest.approx(expected, rel=1e-9)
+
+
+@given(scales, seeds)
+@few
+def test_paper_units_of_a_square_are_half_its_radius(scale, seed):
+    place = np.random.default_rng(seed).normal(size=3)
+    real, first = scale * SQUARE + place, scale * SQUARE
+    # off its own first frame by 0.1 of the unit more than the real one, so by 0.1
+    simulated = real + scale * UNIT * np.array([0, 0, 0.1])
+    found = paper_units(real, simulated, first, first)
+    assert found["paper_chamfer"] == pytest.approx(2 * 0.1**2, rel=1e-9)
+    assert found["paper_hausdorff"] == pytest.approx(0.1, rel=1e-9)
+
+
+def test_paper_units_centre_each_cloud_on_its_own_first_frame():
+    shifted = SQUARE + [5.0, 0, 1]
+    first = paper_units(SQUARE, shifted, SQUARE, shifted)
+    assert first == pytest.approx({"paper_chamfer": 0, "paper_hausdorff": 0}, abs=1e-12)
+    moved = paper_units(SQUARE, shifted + [0, 0, UNIT], SQUARE, shifted)
+    assert moved == pytest.approx({"paper_chamfer": 2, "paper_hausdorff": 1})
+
+
+BAD = {
+    "empty": (np.zeros((0, 3)), "not empty"),
+    "flat": (np.zeros((4, 2)), r"must be \(point, 3\)"),
+    "not finite": (SQUARE + np.inf, "not finite"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_is_no_cloud_is_refused(name, unchecked):
+    cloud, reason = BAD[name]
+    with pytest.raises(ValueError, match=reason):
+        distances(SQUARE, cloud)
+
+
+def test_paper_units_need_a_first_frame_with_a_size():
+    point = np.zeros((3, 3))
+    with pytest.raises(ValueError, match="more than one place"):
+        paper_units(SQUARE, SQUARE, point, SQUARE)

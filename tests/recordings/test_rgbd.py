@@ -1,0 +1,278 @@
+"""RGB-D folders to clouds: there and back, cameras that are merged, paired and cleaned."""
+
+import copy
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from rgbd_scene import INFO, PATH, TIMES, camera, distances, rig, surface, write
+from test_manifest import MANIFEST
+
+from r2s.recordings.cameras.calibration import DepthCamera, look_at
+from r2s.recordings.cameras.cleaning import Cleaning, clean, inside, outliers
+from r2s.recordings.cameras.images import encode_png, read_depth, read_mask
+from r2s.recordings.cameras.rgbd import (
+    Rig,
+    find_rig,
+    read_clouds,
+    read_rig,
+    rgbd_recording,
+    stream,
+    write_rig,
+)
+from r2s.recordings.cameras.synthetic_rgbd import NONE
+from r2s.recordings.cameras.timing import pair, read_times
+from r2s.recordings.manifest import manifest_for, read_recording
+from r2s.recordings.recording import cloud, load, save
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("rgbd")
+    write(folder)
+    return folder
+
+
+def test_a_flawed_recording_lies_on_its_surface(folder: Path) -> None:
+    times, clouds = read_clouds(folder, read_rig(folder))
+    np.testing.assert_allclose(times, TIMES, atol=1e-6)
+    for frame, points in enumerate(clouds):
+        error = distances(points, surface(frame))
+        assert len(points) > 2000
+        assert error.mean() < 2e-3
+        assert np.median(error) < 1e-3
+
+
+@pytest.mark.parametrize("suffix, scale", [(".png", 1e-4), (".npy", 1.0)])
+def test_a_perfect_recording_is_exact_but_for_rounding(
+    tmp_path: Path, suffix: str, scale: float
+) -> None:
+    scene = rig(voxel=0.0, neighbours=0, edge=0.0)
+    cameras = {name: replace(view, depth_scale=scale) for name, view in scene.cameras.items()}
+    write(tmp_path, replace(scene, cameras=cameras), flaws=NONE, suffix=suffix, colour=False)
+    _, clouds = read_clouds(tmp_path, read_rig(tmp_path))
+    for frame, points in enumerate(clouds):
+        assert distances(points, surface(frame)).max() < (1e-4 if suffix == ".png" else 1e-6)
+
+
+def test_two_cameras_see_more_than_one(folder: Path) -> None:
+    scene = read_rig(folder)
+    both = next(stream(folder, scene))[1]
+    for name, view in scene.cameras.items():
+        one = next(stream(folder, replace(scene, cameras={name: view})))[1]
+        assert len(one) < len(both)
+
+
+def test_frames_are_read_one_at_a_time(tmp_path: Path) -> None:
+    scene = write(tmp_path, colour=False)
+    frames = stream(tmp_path, scene)
+    next(frames)
+    (tmp_path / "right" / "depth" / "002.png").write_bytes(b"")
+    next(frames)
+    with pytest.raises(ValueError, match="right/depth/002.png"):
+        next(frames)
+
+
+def test_a_recording_from_images_is_saved_and_loaded(folder: Path, tmp_path: Path) -> None:
+    knots = np.arange(4) / 10
+    recording = rgbd_recording(folder, replace(INFO, time_offset=-0.02), PATH, knots)
+    np.testing.assert_allclose(recording.times, TIMES - 0.02, atol=1e-6)
+    save(recording, tmp_path / "a.npz")
+    np.testing.assert_array_equal(load(tmp_path / "a.npz").points, recording.points)
+
+
+def test_the_points_are_thinned_by_a_seed(folder: Path) -> None:
+    scene = read_rig(folder)
+    some = [replace(scene, clean=replace(scene.clean, max_points=300, seed=s)) for s in (1, 1, 2)]
+    first, again, other = (next(stream(folder, r))[1] for r in some)
+    assert first.shape == (300, 3)
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+
+
+def test_without_masks_the_table_is_cut_off(tmp_path: Path) -> None:
+    scene = rig(table=(0.0, 0.02))
+    cameras = {name: replace(view, masks=False) for name, view in scene.cameras.items()}
+    scene = replace(scene, cameras=cameras)
+    write(tmp_path, scene, flaws=replace(NONE, noise=1e-3), colour=False)
+    for frame, (_, points) in enumerate(stream(tmp_path, scene)):
+        assert np.median(distances(points, surface(frame))) < 1e-3
+        assert np.mean(distances(points, surface(frame)) > 0.01) < 0.02
+
+
+def test_cameras_are_paired_by_time(tmp_path: Path) -> None:
+    """A camera that started a frame later has its pictures under other numbers."""
+    scene = write(tmp_path, colour=False)
+    for kind in ("depth", "masks"):
+        (tmp_path / "right" / kind / "000.png").unlink()
+    (tmp_path / "right" / "times.csv").write_text("".join(f"{t + 0.004}\n" for t in TIMES[1:]))
+    times, clouds = read_clouds(tmp_path, scene)
+    np.testing.assert_allclose(times, TIMES[1:], atol=1e-6)
+    for frame, points in enumerate(clouds, 1):
+        assert distances(points, surface(frame)).mean() < 2e-3
+
+
+CLOCKS = st.lists(st.floats(0.01, 0.2), min_size=2, max_size=20)
+
+
+@given(
+    across=st.integers(8, 4000),
+    down=st.integers(8, 4000),
+    angles=st.tuples(*[st.floats(-2, 2)] * 2),
+    scale=st.floats(1e-5, 1.0),
+    distortion=st.lists(st.floats(-1, 1), min_size=5, max_size=5) | st.just([]),
+    voxel=st.floats(0, 0.1),
+)
+def test_a_rig_is_read_as_it_was_written(
+    tmp_path_factory: pytest.TempPathFactory, across, down, angles, scale, distortion, voxel
+) -> None:
+    view = DepthCamera(
+        resolution=(across, down),
+        focal_length=(0.9 * across, 0.8 * down),
+        centre=(across / 2, down / 2),
+        to_world=look_at((1.0, *angles), (0.0, 0.0, 0.0)),
+        depth_scale=scale,
+        distortion=tuple(distortion),
+    )
+    written = Rig({"a": view, "b": view}, replace(rig().clean, voxel=voxel), frame_rate=30.0)
+    folder = tmp_path_factory.mktemp("rig")
+    write_rig(folder, written)
+    assert read_rig(folder) == written
+
+
+def test_a_mask_may_have_a_palette(folder: Path, tmp_path: Path) -> None:
+    """As SAM 2 writes it: the colours mean nothing, black is the background."""
+    from PIL import Image
+
+    mask = np.zeros((12, 16), np.uint8)
+    mask[3:6, 4:9] = 2
+    picture = Image.fromarray(mask, "P")
+    picture.putpalette([0, 0, 0, 128, 0, 0, 0, 0, 128])
+    picture.save(tmp_path / "000.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "000.png", (16, 12)), mask > 0)
+
+
+@given(cut=st.integers(0, 10_000), seed=st.integers(0, 9))
+@settings(max_examples=40)
+def test_a_png_cut_anywhere_is_refused(
+    tmp_path_factory: pytest.TempPathFactory, cut: int, seed: int
+) -> None:
+    path = tmp_path_factory.mktemp("cut") / "000.png"
+    whole = encode_png(np.random.default_rng(seed).integers(1, 999, (12, 16)).astype(np.uint16))
+    path.write_bytes(whole)
+    assert read_depth(path, 1e-3, (16, 12)).shape == (12, 16)
+    path.write_bytes(whole[: cut % len(whole)])
+    with pytest.raises(ValueError, match="000.png: (truncated|no) PNG"):
+        read_depth(path, 1e-3, (16, 12))
+
+
+@given(gaps=CLOCKS, shift=st.floats(-0.004, 0.004), lost=st.integers(0, 5))
+def test_pairs_are_within_the_tolerance(gaps: list[float], shift: float, lost: int) -> None:
+    clock = np.cumsum(gaps)
+    other = np.delete(clock, [0] if lost == 0 else []) + shift
+    pairs = pair({"a": clock, "b": other}, 0.005)
+    apart = np.abs(clock[pairs["a"]] - other[pairs["b"]])
+    assert (apart <= 0.005).all()
+    assert len(pairs["a"]) == len(pairs["b"]) >= len(other) - 1
+
+
+def test_times_may_have_titles_and_frame_numbers(tmp_path: Path) -> None:
+    for text in (
+        "frame,time\n0,0.1\n1,0.2\n",
+        "0.1\n0.2\n",
+        "\ufeffTime [s]\r\n0.1\r\n\r\n0.2\r\n",
+    ):
+        (tmp_path / "times.csv").write_text(text, encoding="utf-8")
+        np.testing.assert_allclose(read_times(tmp_path / "times.csv"), [0.1, 0.2])
+
+
+def test_cameras_of_a_set_lie_above_its_recordings(tmp_path: Path) -> None:
+    assert find_rig(tmp_path / "lift_a") is None
+    with pytest.raises(FileNotFoundError, match="no cameras.json there or in the folder above"):
+        read_rig(tmp_path / "lift_a")
+    write_rig(tmp_path, rig())
+    (tmp_path / "lift_a").mkdir()
+    assert read_rig(tmp_path / "lift_a") == rig()
+    own = Rig({"one": camera((0.5, 0.5, 0.5))}, rig().clean, frame_rate=30.0)
+    write_rig(tmp_path / "lift_a", own)
+    assert read_rig(tmp_path / "lift_a") == own
+
+
+def test_a_manifest_takes_images_for_clouds(tmp_path: Path) -> None:
+    write(tmp_path / "pull_tan2", colour=False)
+    np.save(tmp_path / "gripper.npy", PATH)
+    made = copy.deepcopy(MANIFEST)
+    up = {"scale": 1, "rotation": np.eye(3).tolist(), "translation": [0, 0, 0.5]}
+    made["scenarios"]["pull"] |= {"cloud": up, "frame_rate": 15, "frames_used": [0, 3]}
+    (tmp_path / "manifest.json").write_text(json.dumps(made))
+    recording = read_recording(tmp_path, manifest_for(tmp_path), "pull_tan2")
+    info = recording.info
+    assert (info.fabric, info.trial, info.verified, info.time_offset) == ("tan", "2", None, -0.01)
+    np.testing.assert_allclose(recording.times, TIMES - 0.01, atol=1e-6)
+    error = distances(cloud(recording, 2) - [0, 0, 0.5], surface(2))
+    assert error.mean() < 2e-3
+
+
+def test_without_opencv_the_extra_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(ImportError, match=r"pip install 'r2s\[camera\]'"):
+        read_clouds(folder, read_rig(folder))
+
+
+POINTS = arrays(float, st.tuples(st.integers(0, 40), st.just(3)), elements=st.floats(-2, 2))
+
+
+@given(points=POINTS, voxel=st.sampled_from([0.0, 0.1]), most=st.integers(0, 20))
+@settings(max_examples=60)
+def test_what_is_cleaned_is_in_the_box_and_not_too_much(
+    points: np.ndarray, voxel: float, most: int
+) -> None:
+    how = Cleaning(
+        ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), table=(0.0, 0.2), voxel=voxel, max_points=most
+    )
+    kept = clean(points, how, frame=0)
+    assert inside(kept, how).all()
+    assert (np.abs(kept[:, 2]) > 0.2 - 1e-9).all()
+    assert len(kept) <= (most or len(points))
+    np.testing.assert_array_equal(kept, clean(points, how, frame=0))
+
+
+def test_lone_points_are_outliers() -> None:
+    sheet = np.stack(np.meshgrid(np.arange(30), np.arange(30), [0.0]), axis=-1).reshape(-1, 3)
+    lone = np.array([[10.0, 10, 8], [-9, 0, 0]])
+    found = outliers(np.concatenate([sheet, lone]), 8, 3.0)
+    assert found[-2:].all() and not found[:-2].any()
+    assert not outliers(sheet[:5], 8, 3.0).any()
+
+
+@pytest.mark.slow(group="motions")
+@pytest.mark.parametrize("motion_of", ["lifting", "folding"])
+def test_a_simulated_fabric_comes_back_within_2_mm(motion_of: str, tmp_path: Path) -> None:
+    """Two 720p cameras with the flaws of real ones, a soft sheet that is lifted or folded."""
+    import jax.random as jr
+
+    from r2s.materials import presets
+    from r2s.recordings.cameras.synthetic_rgbd import write_rgbd
+    from r2s.scenarios import synthetic
+    from r2s.scenarios.scenario import from_recording, rollout
+    from r2s.scenarios.standard import SIX
+
+    fabric = presets.grey_interlock()
+    recorded = synthetic.record(SIX[motion_of](), fabric, "grey", key=jr.key(0))
+    scenario = from_recording(recorded, (17, 17))
+    moved = np.asarray(rollout(scenario, fabric).x)[::10]
+    faces, times = np.asarray(scenario.scene.mesh.faces), np.asarray(recorded.times)[::10]
+    positions = {"left": (-0.5, -0.1, 0.5), "right": (0.1, -0.4, 0.9)}
+    views = {n: camera(p, resolution=(1280, 720)) for n, p in positions.items()}
+    box = Cleaning(((-0.2, -0.2, -0.05), (0.7, 0.7, 0.7)))
+    write_rgbd(tmp_path, Rig(views, box), moved, faces, times, colour=False)
+    means = []
+    for (_, points), x in zip(stream(tmp_path, read_rig(tmp_path)), moved, strict=True):
+        means.append(distances(points, x, faces).mean())
+    assert max(means) < 2e-3

@@ -1,0 +1,133 @@
+"""Synthetic recordings: what the cameras see."""
+
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from r2s import scenarios
+from r2s.materials import presets
+from r2s.mesh.surface import sample
+from r2s.recordings.cameras.camera import Camera
+from r2s.recordings.recording import cloud
+from r2s.scenarios import synthetic
+from r2s.scenarios.scenario import from_recording, rollout
+
+
+def test_a_camera_sees_the_nearer_of_two_sheets():
+    plane = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 40), np.linspace(-0.1, 0.1, 40)), -1)
+    near = np.concatenate([plane.reshape(-1, 2), np.full((1600, 1), 0.5)], axis=1)
+    far = near - [0, 0, 0.2]
+    camera = Camera(jnp.array([0.0, -0.01, 1.5]), jnp.array([0.0, 0.0, 0.0]))
+    seen = np.asarray(camera.sees(jnp.asarray(np.concatenate([near, far]))))
+    assert seen[:1600].mean() > 0.99
+    assert seen[1600:].mean() < 0.1  # but for the far sheet's edge
+
+
+def test_a_point_projects_where_similar_triangles_say():
+    camera = Camera(jnp.array([0.0, -2.0, 0.0]), jnp.zeros(3))
+    pixel, depth = camera.project(jnp.array([[0.1, 0.0, 0.05]]))
+    assert depth[0] == pytest.approx(2.0)
+    # 200 pixels of focal length; right is +x, down is -z
+    np.testing.assert_allclose(pixel[0], [80 + 200 * 0.05, 60 - 200 * 0.025], atol=1e-9)
+
+
+def recorded_lift():
+    return synthetic.record(scenarios.lifting(), presets.grey_interlock(), "grey", key=jr.key(0))
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return recorded_lift()
+
+
+@pytest.mark.slow(group="motions")
+def test_the_same_key_gives_the_same_recording(recording):
+    again = recorded_lift()
+    np.testing.assert_array_equal(recording.points, again.points)
+
+
+def test_the_cloud_lies_on_the_sheet_but_for_noise_and_outliers(recording):
+    moved = rollout(from_recording(recording), presets.grey_interlock())
+    assert bool(jnp.all(moved.ok))
+    faces = from_recording(recording).scene.mesh.faces
+    surface = np.asarray(sample(moved.x[45], faces, 12))
+    distance = KDTree(surface).query(cloud(recording, 45))[0]
+    stray = np.mean(distance > 0.01)
+    assert 0.002 < stray < 0.02  # one point in a hundred is an outlier
+    # 3-D noise of 1 mm, of which the surface takes up what lies along it
+    assert 0.5e-3 < np.median(distance) < 2.5e-3
+
+
+def test_the_view_is_partial(recording):
+    moved = rollout(from_recording(recording), presets.grey_interlock())
+    faces = from_recording(recording).scene.mesh.faces
+    surface = np.asarray(sample(moved.x[40], faces, 8))
+    hidden = KDTree(cloud(recording, 40)).query(surface)[0] > 0.02
+    assert 0.05 < hidden.mean() < 0.95
+
+
+SHAPE = (5, 5)
+
+
+@pytest.fixture(scope="module")
+def blown():
+    """An experiment of a few frames, and its recording with a late clock and dropped points."""
+    experiment = scenarios.wind(num_frames=6, interval=1 / 10, speed=3.0)
+    seen = synthetic.sensing(experiment)._replace(time_offset=0.07, dropped=0.6, points=20000)
+
+    def make(seen):
+        return synthetic.record(
+            experiment, presets.grey_interlock(), "grey", seen=seen, shape=SHAPE, key=jr.key(2)
+        )
+
+    return experiment, make(seen), make(seen._replace(dropped=0.0, time_offset=0.0))
+
+
+def test_what_is_known_of_an_experiment_is_in_its_recording(blown):
+    experiment, record, whole = blown
+    assert record.info.scenario == "wind" and record.info.wind == (0.0, 3.0, 0.0)
+    np.testing.assert_allclose(record.times, np.asarray(whole.times) + 0.07, atol=1e-9)
+    np.testing.assert_allclose(whole.times, experiment.times, atol=1e-9)
+    assert record.handle_times[-1] >= record.times[-1]
+    assert from_recording(whole, SHAPE).brake is not None
+
+
+def test_dropped_points_are_missing(blown):
+    _, record, whole = blown
+    fewer, all_of_them = (np.asarray(r.mask).sum(axis=1) for r in (record, whole))
+    assert fewer / all_of_them == pytest.approx(0.4, abs=0.05)
+
+
+def test_a_hanging_sheet_is_in_view(blown):
+    experiment, _, whole = blown
+    moved = synthetic._rollout(experiment.scenario(SHAPE), presets.grey_interlock(), None, None)
+    faces = experiment.scenario(SHAPE).scene.mesh.faces
+    surface = np.asarray(sample(moved.x[-1], faces, 16))
+    assert np.mean(KDTree(cloud(whole, 5)).query(surface)[0] < 0.02) > 0.8
+
+
+@pytest.mark.slow(group="motions")
+@pytest.mark.parametrize("kind", ["cloth", "points"])
+@pytest.mark.parametrize("name", scenarios.SIX)
+def test_every_scenario_is_recorded_by_either_solver(name, kind):
+    """On another mesh and with smaller steps than the estimators' own."""
+    solver = scenarios.material_points if kind == "points" else None
+    finer = {"shape": (13, 13), "max_step": 1 / 90, "solver": solver}
+    record = synthetic.record(
+        scenarios.SIX[name](), presets.black_denim(), "denim", **finer, key=jr.key(0)
+    )
+    assert len(record.times) == 60
+    x = np.asarray(rollout(from_recording(record), presets.black_denim()).x)
+    faces = from_recording(record).scene.mesh.faces
+    distance = KDTree(np.asarray(sample(jnp.asarray(x[-1]), faces, 12))).query(cloud(record, 59))[0]
+    # two models of one fabric; where it is laid on itself, one of them lets it pass through
+    assert np.median(distance) < (0.05 if name in ("folding", "fling") else 0.02)
+    if name == "stretching":
+        assert record.force is not None and record.markers is not None
+        assert record.markers.shape == (60, 81, 3)
+        strain = np.ptp(np.asarray(record.markers)[..., 0], axis=1) / (0.45 * 8 / 9) - 1
+        assert strain[-1] == pytest.approx(0.04, abs=0.003) and abs(strain[0]) < 0.003
+        # between that of a free and of a wholly prevented contraction
+        assert 0.9 * 0.04 * 210 * 0.45 < record.force[-1, 0] < 1.2 * 0.04 * 210 * 0.45

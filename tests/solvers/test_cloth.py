@@ -1,0 +1,314 @@
+"""The cloth in time: conservation laws, statics, order of convergence, and the step's algebra."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import (
+    DT,
+    FIRST_ROW,
+    SHAPE,
+    SIZE,
+    cloth,
+    dense,
+    directional_difference,
+    energy,
+    everywhere,
+    flat,
+    roll,
+    rotation,
+    step,
+)
+
+from r2s._util.units import AIR_DENSITY, GRAVITY
+from r2s.environment.scene import Control, along_path
+from r2s.materials.fabric import Fabric
+from r2s.materials.parameters import OrthotropicSpace
+from r2s.mesh.elements import vertex_masses
+from r2s.mesh.mesh import rectangle
+from r2s.scenarios.scenario import rollout
+from r2s.scenarios.standard import lifting
+from r2s.solvers.implicit.cloth import ClothState
+from r2s.solvers.implicit.potential import hessian, potential, residual
+
+LAW = (300.0, 60.0, 200.0, 80.0)  # [N/m]
+STEPS = np.arange(21)
+
+
+def hanging(mesh, angle=0.0):
+    """Positions of a flat sheet that hangs from its first row, swung out by an angle."""
+    return flat(mesh) @ rotation(angle - np.pi / 2, 1).T
+
+
+def settled(solver, mesh):
+    """Where a strongly damped sheet comes to rest that hangs from its first row."""
+    damped = Fabric.make(0.2, LAW, 1e-3, damping=0.05)
+    return jnp.asarray(roll(solver, damped, solver.init(hanging(mesh)), 400).x[-1])
+
+
+def test_free_fall_is_exact(sheet, fabric):
+    # BDF2 differentiates parabolas exactly, given a point of the parabola before the start
+    x, v, g = flat(sheet) @ rotation(0.5, 0).T, [0.3, 0.0, 1.0], [0.0, 0.0, -GRAVITY]
+    v, g = everywhere(v, sheet), everywhere(g, sheet)
+    states = roll(
+        cloth(sheet),
+        fabric,
+        ClothState(x, v, x - DT * v + DT**2 / 2 * g, v - DT * g),
+        20,
+    )
+    x, v, g = (np.asarray(array) for array in (x, v, g))
+    exact = np.stack([x + t * v + t**2 / 2 * g for t in STEPS * DT])
+    assert states.x == pytest.approx(exact, abs=1e-10)  # tolerance of the solve, 1e-11 m a step
+
+
+def test_free_fall_from_init_is_half_a_step_late(sheet, fabric):
+    # `init` continues the velocity backwards, without gravity
+    solver = cloth(sheet)
+    states = roll(solver, fabric, solver.init(flat(sheet)), 20)
+    exact = -GRAVITY * DT * (STEPS - (1 - 3.0**-STEPS) / 2)
+    assert states.v[:, :, 2] == pytest.approx(np.tile(exact[:, None], 25), abs=1e-9)
+
+
+def test_momentum_changes_by_gravity_alone(sheet, fabric):
+    random = np.random.default_rng(0)
+    x = flat(sheet) + jnp.asarray(random.normal(size=(25, 3)) * 5e-3)
+    v = jnp.asarray(random.normal(size=(25, 3)) * 0.3)
+    solver = cloth(sheet)
+    states = roll(solver, fabric, solver.init(x, v), 20)
+    mass = np.asarray(vertex_masses(sheet, fabric.density))
+    momentum = np.einsum("v,tvi->ti", mass, states.v)
+    assert momentum[:, :2] == pytest.approx(np.tile(momentum[0, :2], (21, 1)), abs=1e-12)
+    weight = 0.2 * SIZE**2 * GRAVITY
+    assert (momentum[20, 2] - momentum[19, 2]) / DT == pytest.approx(-weight, rel=1e-8)  # 3^-19
+
+
+def test_damping_does_not_brake_a_rotation(sheet):
+    rate = 3.0  # [rad/s], about the vertical
+    x = flat(sheet) - jnp.array([[SIZE / 2, SIZE / 2, 0.0]])
+    v = jnp.cross(everywhere([0.0, 0.0, rate], sheet), x)
+    back = rotation(-rate * DT, 2).T
+    solver, spin = cloth(sheet), []
+    for damping in (0.0, 10.0):
+        fabric = Fabric.make(0.2, (3e3, 6e2, 2e3, 8e2), 2e-5, damping=damping)
+        states = roll(solver, fabric, ClothState(x, v, x @ back, v @ back), 50)
+        place = states.x - states.x.mean(axis=1, keepdims=True)
+        mass = np.asarray(vertex_masses(sheet, fabric.density))[:, None]
+        moment = np.sum(mass * np.cross(place, states.v), axis=1)[:, 2]
+        assert moment[-1] == pytest.approx(moment[0], rel=1e-4)  # BDF2's own damping is 2e-5
+        spin.append(moment[-1])
+    assert spin[1] == pytest.approx(spin[0], rel=1e-7)
+
+
+def test_damping_is_proportional_to_stiffness():
+    sheet = rectangle((SIZE, SIZE), SHAPE, "quadrilaterals")  # without bending others give way
+    # the first standing wave of a free sheet, x = s + a cos(pi s / L), on a grid of 4 cells
+    solver, along, peaks = cloth(sheet), sheet.rest[:, 0], []
+    wave = jnp.cos(jnp.pi / SIZE * along)
+    rate = 8 / SIZE * (0.3 / 0.2) ** 0.5 * np.sin(np.pi / 8)  # [rad/s]
+    for damping in (0.0, 0.005):
+        fabric = Fabric.make(0.2, (0.3, 0.0, 0.3, 0.1), 0.0, damping=damping)
+        start = solver.init(flat(sheet).at[:, 0].add(1e-3 * wave))
+        moved = roll(solver, fabric, start, 40).x[:, :, 0] - np.asarray(along)
+        peaks.append(np.max((moved * np.asarray(wave)).sum(axis=1)[25:]))
+    period = 2 * np.pi / rate
+    # 3 %: triangles and vertices share the mass unevenly
+    assert peaks[1] / peaks[0] == pytest.approx(np.exp(-(rate**2) * 0.005 / 2 * period), rel=0.03)
+
+
+@pytest.mark.parametrize("stiffness", [20.0, 1000.0])
+def test_a_hanging_sheet_stretches_under_its_weight(sheet, stiffness):
+    fabric = Fabric.make(0.2, (stiffness, 0.0, stiffness, stiffness / 2), 1e-5, damping=0.1)
+    solver = cloth(sheet, FIRST_ROW)
+    x = roll(solver, fabric, solver.init(hanging(sheet)), 400).x[-1]
+    height = x[:, 2].reshape(SHAPE).mean(axis=1)
+    # nominal tension T = C s (s^2 - 1) / 2 at a stretch s, and T = weight below
+    cell = SIZE / (SHAPE[0] - 1)
+    tensions = 0.2 * GRAVITY * (SIZE - cell * (np.arange(4) + 0.5))
+    stretches = [np.roots([stiffness / 2, 0, -stiffness / 2, -t]).real.max() for t in tensions]
+    expected = cell * np.sum(np.array(stretches) - 1)
+    assert height[0] - height[-1] - SIZE == pytest.approx(expected, rel=0.01)
+
+
+def test_handles_are_where_they_are_put(sheet, fabric):
+    solver = cloth(sheet, FIRST_ROW)
+    start = flat(sheet)
+
+    def path(t):
+        return start[:5] + jnp.array([[0.3 * t, -0.2 * t, t**2]])
+
+    states = roll(solver, fabric, solver.init(start), 20, path)
+    expected = np.stack([np.asarray(path(t)) for t in STEPS * DT])
+    assert states.x[:, :5] == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_path_is_linear_between_knots_and_rests_beyond():
+    path = jnp.array([[[0.0, 1.0, 2.0]], [[4.0, 1.0, 0.0]]])
+    times = jnp.array([-1.0, 0.5, 1.0, 2.0, 9.0])
+    found = along_path(times, jnp.array([0.0, 2.0]), path)
+    expected = [[0, 1, 2], [1, 1, 1.5], [2, 1, 1], [4, 1, 0], [4, 1, 0]]
+    assert np.asarray(found[:, 0]) == pytest.approx(np.array(expected))
+
+
+def test_a_swinging_sheet_gains_no_energy(sheet, fabric):
+    solver = cloth(sheet, FIRST_ROW)
+    states = roll(solver, fabric, solver.init(hanging(sheet, np.deg2rad(20))), 100)
+    energies = jax.vmap(lambda x, v: energy(sheet, fabric, x, v))(states.x, states.v)
+    scale = 0.2 * SIZE**3 * GRAVITY / 2  # weight times half the length
+    assert jnp.max(jnp.diff(energies)) < 3e-5 * scale  # BDF2 bounds another energy, of two steps
+    assert energies[-1] < energies[0]
+
+
+def test_air_takes_energy_from_a_swing(sheet, fabric):
+    ends = []
+    for air in (0.0, AIR_DENSITY):
+        solver = cloth(sheet, FIRST_ROW, air=air)
+        states = roll(solver, fabric, solver.init(hanging(sheet, np.deg2rad(20))), 100)
+        ends.append(energy(sheet, fabric, states.x[-1], states.v[-1]))
+    hung = energy(sheet, fabric, hanging(sheet), jnp.zeros((25, 3)))
+    assert ends[1] - hung < 0.5 * (ends[0] - hung)
+
+
+def test_a_smooth_swing_converges_to_second_order(sheet):
+    fabric = Fabric.make(0.2, LAW, 1e-3)
+    start = settled(cloth(sheet, FIRST_ROW), sheet)  # `init` is exact for a sheet at rest
+    ends = []
+    for refinement in (1, 2, 4):
+        solver = cloth(sheet, FIRST_ROW, dt=DT / refinement)
+
+        def path(t):
+            return start[:5] + jnp.array([[0.03 * np.sin(np.pi * t / 0.4) ** 4, 0.0, 0.0]])
+
+        ends.append(roll(solver, fabric, solver.init(start), 30 * refinement, path).x[-1])
+    ratio = np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(ends[1] - ends[2])
+    assert 2**1.7 < ratio < 2**2.3
+
+
+@pytest.fixture(scope="module")
+def disturbed():
+    """Increments and positions with strain, contact, slip and wind at random, and functions.
+
+    Of cells that do not wrinkle, so that compression makes the exact Hessian indefinite.
+    """
+    sheet = rectangle((SIZE, SIZE), SHAPE, "quadrilaterals")
+    solver = cloth(sheet, FIRST_ROW, table=0.0, air=AIR_DENSITY)
+    fabric = Fabric.make(0.2, LAW, 1e-4)
+
+    # both Hessians and the force, in one compilation
+    def matrix(at, x, exactness):
+        return dense(at.elimination.pattern, hessian(at, x, exactness))
+
+    both = eqx.filter_jit(lambda at, x: (matrix(at, x, 1.0), matrix(at, x, 0.0), residual(at, x)))
+
+    def state(seed):
+        noise = jnp.asarray(np.random.default_rng(seed).normal(size=(4, 25, 3))) * 8e-3
+        x = flat(sheet, 2e-3) + noise[0]
+        start = ClothState(x, 20 * noise[1], x + noise[2], 20 * noise[1])
+        control = Control(x[:5], jnp.array([2.0, 1.0, -1.0]))
+        return solver.potential(fabric, start, control), x + noise[3]
+
+    return state, both
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_forces_are_minus_the_gradient_of_the_energy(disturbed, seed):
+    state, both = disturbed
+    increment, x = state(seed)
+    direction = jax.random.normal(jax.random.key(seed), x.shape)
+    value = eqx.filter_jit(potential)
+    expected = directional_difference(lambda x: value(increment, x), x, direction, 1e-7)
+    assert jnp.sum(both(increment, x)[2] * direction) == pytest.approx(float(expected), rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_hessian_is_the_derivative_of_the_forces(disturbed, seed):
+    state, both = disturbed
+    increment, x = state(seed)
+    direction = jax.random.normal(jax.random.key(seed), x.shape)
+    matrix = both(increment, x)[0]
+    difference = directional_difference(lambda x: both(increment, x)[2], x, direction, 1e-7)
+    error = jnp.linalg.norm(matrix @ direction.ravel() - difference.ravel())
+    assert error < 1e-6 * jnp.linalg.norm(difference)
+    assert np.asarray(matrix) == pytest.approx(np.asarray(matrix.T), rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_convex_hessian_is_positive_definite(disturbed, seed):
+    state, both = disturbed
+    increment, x = state(seed)
+    exact, convex, _ = both(increment, x)
+    mass = vertex_masses(increment.mesh, increment.fabric.density)
+    inertia = float(jnp.min(mass)) * float(increment.rate) ** 2
+    assert jnp.linalg.eigvalsh(convex)[0] >= inertia * (1 - 1e-6)
+    assert jnp.linalg.eigvalsh(exact)[0] < 0  # so these states are a test
+
+
+def test_the_convex_hessian_is_exact_on_a_flat_sheet_under_tension(sheet, disturbed):
+    _, both = disturbed
+    solver = cloth(sheet, FIRST_ROW, table=0.0, air=AIR_DENSITY)
+    x = 1.1 * flat(sheet, 1.0)
+    still = solver.init(x)
+    fabric = Fabric.make(0.2, LAW, 1e-4)
+    increment = solver.potential(fabric, still, Control(x[:5], jnp.zeros(3)))
+    exact, convex, _ = both(increment, x)
+    assert np.asarray(convex) == pytest.approx(np.asarray(exact), rel=1e-9, abs=1e-9)
+
+
+def test_the_step_ends_in_balance(sheet, fabric):
+    solver = cloth(sheet, FIRST_ROW)
+    state = solver.init(hanging(sheet, 0.5))
+    control = Control(state.x[:5], jnp.zeros(3))
+    after = step(solver, fabric, state, control)
+    force = eqx.filter_jit(residual)(solver.potential(fabric, state, control), after.x)
+    assert jnp.max(jnp.abs(force[5:])) < 1e-9 * 0.2 * SIZE**2 * GRAVITY
+
+
+EXTREME = [  # density, C11, C22, C33, bending
+    (0.05, 1e4, 1e4, 1e4, 1e-4),
+    (0.05, 10.0, 10.0, 10.0, 1e-7),
+    (0.5, 10.0, 10.0, 10.0, 1e-7),
+    (0.5, 1e4, 10.0, 10.0, 1e-7),
+    (0.05, 1e4, 10.0, 1e4, 1e-4),
+    (0.5, 1e4, 1e4, 10.0, 1e-4),
+]
+
+
+@pytest.mark.parametrize("is_double", [False, True])
+def test_extreme_fabrics_stay_finite(is_double):
+    with jax.enable_x64(is_double):
+        mesh = rectangle((SIZE, SIZE), SHAPE)
+        solver = cloth(mesh, FIRST_ROW, table=0.0, air=AIR_DENSITY)
+        start = flat(mesh, 1e-3)
+
+        def path(t):
+            return start[:5] + jnp.array([[0.0, 0.0, 0.5 * t]])
+
+        for density, c11, c22, c33, bending in EXTREME:
+            fabric = Fabric.make(density, (c11, 0.0, c22, c33), bending)
+            states = roll(solver, fabric, solver.init(start), 10, path)
+            assert states.x.dtype == (np.float64 if is_double else np.float32)
+            assert np.all(np.isfinite(states.x))
+
+
+def test_a_step_that_does_not_converge_is_nan(sheet, fabric):
+    solver = dataclasses.replace(cloth(sheet, FIRST_ROW), max_iterations=1)
+    state = solver.init(hanging(sheet, 0.5))
+    after = step(solver, fabric, state, Control(state.x[:5], jnp.zeros(3)))
+    assert jnp.all(jnp.isnan(after.x))
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.01, float("nan")])
+def test_the_step_must_be_positive(sheet, dt):
+    with pytest.raises(ValueError, match="dt must be positive"):
+        cloth(sheet, dt=dt)
+
+
+def test_the_noise_of_the_energy_does_not_stop_newtons_method():
+    """The last steps of a soft sheet gain less than the sum of its energies is exact to."""
+    space = OrthotropicSpace.make(0.19)
+    soft = np.random.default_rng(0).uniform(0, 1, (40, space.dim)) * [1, 1, 1, 1, 0.3, 1, 1]
+    lift = lifting().scenario((3, 3))
+    fail = eqx.filter_jit(lambda each: jax.lax.map(lambda u: rollout(lift, space(u)).failure, each))
+    assert not np.any(fail(jnp.asarray(soft)))

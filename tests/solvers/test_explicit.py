@@ -1,0 +1,338 @@
+"""Explicit steps of the cloth: forces on the grid, falls, batches, and what is refused."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import cloth, flat, step
+
+import r2s
+from r2s._util.units import GRAVITY
+from r2s.environment.air import Air, Fan
+from r2s.environment.contact import Table
+from r2s.environment.drag import drag_on_vertices
+from r2s.environment.scene import Control, Scene
+from r2s.materials.plate import PlateBending
+from r2s.scenarios.energy import stored_energy
+from r2s.solvers.explicit.cloth import ExplicitCloth, stable_step
+from r2s.solvers.explicit.elements import bending_force, membrane_force, membrane_stress
+from r2s.solvers.explicit.grid import grid_force, laws_on_grid
+from r2s.solvers.explicit.grid_membrane import Samples
+from r2s.solvers.explicit.layout import Layout
+from r2s.solvers.explicit.stability import SAFETY, longest_relaxing_step
+from r2s.solvers.explicit.viscosity import Viscosity
+from r2s.solvers.failures import Failure
+
+
+def explicit(mesh, fabric, held=(), dt=0.01, table=-jnp.inf, **options):
+    scene = Scene(mesh, jnp.asarray(tuple(held), int), Table.make(table), Air.make(density=0.0))
+    return ExplicitCloth.make(scene, dt, fabric, **options)
+
+
+@pytest.mark.parametrize("elements", ["quadrilaterals", "wrinkling"])
+@pytest.mark.parametrize("shape", [(6, 5), (2, 5)])
+def test_forces_on_the_grid_are_those_by_gathers(shape, elements, fabric):
+    mesh = r2s.rectangle((0.3, 0.2), shape, elements)
+    fabric = eqx.tree_at(lambda f: f.bending, fabric, PlateBending.make(1e-3, 0.3))
+    x = flat(mesh) + 0.01 * jax.random.normal(jax.random.key(0), (mesh.rest.shape[0], 3))
+    v = jax.random.normal(jax.random.key(1), x.shape)
+    layout = Layout(shape, (0.3 / (shape[0] - 1), 0.2 / (shape[1] - 1)))
+    viscosity = Viscosity(jnp.asarray(3.0), jnp.asarray(0.2))
+    laws = laws_on_grid(layout, fabric, viscosity, elements == "wrinkling")
+    count = mesh.samples.areas.size
+    past = jax.random.normal(jax.random.key(2), (count, 3))
+    none = jnp.zeros(4 * layout.length(layout.first_cell))
+    relaxed = layout.to_cells(past.reshape(-1, 4, 3))
+    samples = Samples(relaxed, (none, none, none) if elements == "wrinkling" else None)
+    wide, rates = layout.wide(x), layout.wide(v)
+    begun = jnp.asarray(True)
+
+    def on_grid(samples):
+        return grid_force(layout, laws, Air.make(), wide, rates, rates, samples, begun)
+
+    run = jax.jit(on_grid)
+    for _ in range(12):  # of Newton's method for the wrinkles
+        found, after = run(samples)
+        samples = after._replace(relaxed=relaxed)
+
+    def by_gathers(x, v):
+        stress, remembered = viscosity.resist(membrane_stress(mesh, fabric, x), past, begun)
+        force = membrane_force(mesh, x, stress) + bending_force(mesh, fabric, x, v)
+        drag = drag_on_vertices(mesh, Air.make(), None, x, v, jnp.zeros(3))
+        return force + drag, remembered
+
+    expected, remembered = jax.jit(by_gathers)(x, v)
+    assert jnp.stack(found, axis=1) == pytest.approx(np.asarray(expected), rel=1e-9, abs=1e-11)
+    kept = layout.from_cells(after.relaxed).reshape(-1, 3)
+    assert kept == pytest.approx(np.asarray(remembered), rel=1e-9, abs=1e-9)
+
+
+def test_a_free_sheet_falls_as_a_stone(sheet, fabric):
+    solver = explicit(sheet, fabric)
+    moved = eqx.filter_jit(solver.step)(
+        fabric, solver.init(flat(sheet)), Control(jnp.zeros((0, 3)), jnp.zeros(3))
+    )
+    count, small = solver.substeps, solver.dt / solver.substeps
+    fallen = -GRAVITY * small**2 * count * (count + 1) / 2
+    assert moved.x == pytest.approx(np.asarray(flat(sheet, fallen)), abs=1e-12)
+    assert int(moved.failure) == Failure.NONE
+
+
+def test_a_batch_is_its_members(sheet, fabric):
+    solver = explicit(sheet, fabric, held=(0, 4))
+    start = solver.init(flat(sheet))
+    control = Control(flat(sheet)[jnp.array([0, 4])] + 0.002, jnp.array([0.5, 0.0, 0.0]))
+    membrane = fabric.membrane
+    scales = jnp.array([0.5, 0.8, 1.0, 0.9])
+
+    def moved(softer, lighter):
+        of = eqx.tree_at(lambda f: f.membrane, fabric, jax.tree.map(lambda c: c * softer, membrane))
+        of = eqx.tree_at(lambda f: f.density, of, fabric.density / lighter)
+        return solver.step(of, start, control).x
+
+    alone = jnp.stack([eqx.filter_jit(moved)(s, jnp.ones(())) for s in scales])
+    batch = eqx.filter_jit(jax.vmap(moved))(scales, jnp.ones(4))
+    assert batch == pytest.approx(np.asarray(alone), abs=1e-10)
+    nested = eqx.filter_jit(jax.vmap(jax.vmap(moved, (0, None)), (None, 0)))(scales, jnp.ones(2))
+    assert nested[1] == pytest.approx(np.asarray(alone), abs=1e-10)
+    held = np.asarray(alone)[:, [0, 4]]
+    assert held == pytest.approx(np.broadcast_to(control.handles, held.shape), abs=0)
+
+
+def test_too_few_substeps_and_self_contact_are_refused(sheet, fabric):
+    limit = float(stable_step(sheet, fabric))
+    with pytest.raises(ValueError, match=f"limited by .* to {limit:.4g} s"):
+        explicit(sheet, fabric, dt=2 * limit, substeps=1)
+    with pytest.raises(ValueError, match="contact of the sheet with itself"):
+        explicit(sheet, fabric, self_contact=True)
+
+
+def test_a_step_that_explodes_is_a_recorded_failure(sheet, fabric):
+    solver = explicit(sheet, fabric)
+    start = solver.init(flat(sheet).at[0, 0].set(jnp.nan))
+    control = Control(jnp.zeros((0, 3)), jnp.zeros(3))
+    assert int(eqx.filter_jit(solver.step)(fabric, start, control).failure) == Failure.NON_FINITE
+
+
+def moved(solver, fabric, wind=(0.0, 0.0, 0.0), height=0.0, v=None, steps=1):
+    """After some steps whose grippers stay."""
+    x = flat(solver.scene.mesh, height)
+    state = solver.init(x, v)
+    control = Control(x[solver.scene.held], jnp.array(wind))
+    run = eqx.filter_jit(solver.step)
+    for _ in range(steps):
+        state = run(fabric, state, control)
+    return state
+
+
+def test_the_grid_moves_as_any_mesh_does_in_the_wind_of_a_fan(fabric):
+    mesh = r2s.rectangle((0.3, 0.2), (4, 5), "quadrilaterals")
+    fan = Fan(*(jnp.asarray(v) for v in ((0.1, 0.1, -0.2), (0.0, 0.3, 1.0), 0.1, 0.05)))
+    scene = Scene(mesh, jnp.array([0]), Table.make(-jnp.inf), Air.make(), fan)
+    grid = ExplicitCloth.make(scene, 0.01, fabric)
+    gathers = dataclasses.replace(grid, grid=None)
+    assert grid.grid is not None
+    one, other = (moved(each, fabric, (0.0, 2.0, 5.0), steps=3) for each in (grid, gathers))
+    still = moved(grid, fabric, steps=3)
+    assert jnp.max(jnp.abs(one.x - still.x)) > 1e-4  # the wind is felt
+    np.testing.assert_allclose(one.x, other.x, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(one.v, other.v, rtol=0, atol=1e-9)
+
+
+def test_laws_that_are_not_constant_move_the_grid_as_any_mesh(fabric):
+    springs = r2s.SpringMembrane(*(jnp.asarray(c) for c in (300.0, 200.0, 80.0)))
+    fabric = eqx.tree_at(lambda f: f.membrane, fabric, springs)
+    mesh = r2s.rectangle((0.3, 0.2), (4, 5), "quadrilaterals")
+    scene = Scene(mesh, jnp.array([0]), Table.make(-jnp.inf), Air.make())
+    grid = ExplicitCloth.make(scene, 0.005, fabric)
+    gathers = dataclasses.replace(grid, grid=None)
+    v = jax.random.normal(jax.random.key(0), (len(mesh.rest), 3))
+    one, other = (moved(each, fabric, v=v, steps=2) for each in (grid, gathers))
+    np.testing.assert_allclose(one.x, other.x, rtol=0, atol=1e-10)
+
+
+def test_friction_stops_a_sliding_sheet_after_the_way_of_coulomb(fabric):
+    """Speed falls by friction times gravity a second."""
+    mesh = r2s.rectangle((0.3, 0.2), (3, 3), "quadrilaterals")
+    rest = fabric.thickness - 1e-4
+    solver = explicit(mesh, fabric, table=0.0, dt=0.01)
+    v = jnp.zeros((9, 3)).at[:, 0].set(0.3)
+    slid = moved(solver, fabric, height=rest, v=v, steps=3)
+    lost = 0.3 - jnp.mean(slid.v[:, 0])
+    assert float(lost) == pytest.approx(float(fabric.friction) * GRAVITY * 0.03, rel=0.05)
+    assert float(jnp.mean(moved(solver, fabric, height=rest, v=v, steps=30).v[:, 0])) < 1e-3
+
+
+def test_substeps_that_are_too_long_for_a_traced_fabric_are_a_recorded_failure(sheet, fabric):
+    solver = explicit(sheet, fabric)
+    stiff = eqx.tree_at(
+        lambda f: f.membrane, fabric, jax.tree.map(lambda c: 1e4 * c, fabric.membrane)
+    )
+    v = jax.random.normal(jax.random.key(0), (len(sheet.rest), 3))
+    exploded = moved(solver, stiff, v=v, steps=4)
+    assert int(exploded.failure) == Failure.TIME_STEP
+
+
+def test_a_motion_in_explicit_steps_has_its_derivative(fabric):
+    sheet = r2s.rectangle((0.2, 0.2), (3, 3), "quadrilaterals")
+    solver = explicit(sheet, fabric, held=(0,), dt=0.005)
+    start = solver.init(flat(sheet))
+    control = Control(flat(sheet)[:1], jnp.zeros(3))
+
+    def sagged(factor):
+        of = eqx.tree_at(
+            lambda f: f.bending, fabric, PlateBending.make(1e-4 * factor, jnp.zeros(()))
+        )
+        return jnp.sum(solver.step(of, start, control).x[:, 2] ** 2)
+
+    sagged = jax.jit(sagged)
+    step = 1e-4
+    difference = (sagged(1 + step) - sagged(1 - step)) / (2 * step)
+    forward = jax.jit(jax.jacfwd(sagged))(1.0)
+    assert float(forward) == pytest.approx(float(difference), rel=1e-6)
+
+
+def test_a_short_hang_is_that_of_small_implicit_steps(sheet, fabric):
+    fabric = eqx.tree_at(lambda f: f.damping, fabric, jnp.asarray(1e-3))
+    held = jnp.array([0, 20])
+    solver = explicit(sheet, fabric, held=(0, 20), membrane_damping=1e-3)
+    implicit = cloth(sheet, held=(0, 20), dt=1 / 800)
+    control = Control(flat(sheet)[held], jnp.zeros(3))
+    state, other = solver.init(flat(sheet)), implicit.init(flat(sheet))
+    run = eqx.filter_jit(solver.step)
+    for _ in range(10):
+        state = run(fabric, state, control)
+    for _ in range(80):
+        other = step(implicit, fabric, other, control)
+    moved = jnp.max(jnp.abs(state.x - flat(sheet)))
+    assert moved > 0.02
+    assert jnp.max(jnp.abs(state.x - other.x)) < 0.05 * moved
+
+
+def test_a_fabric_that_is_too_stiff_for_the_substeps_is_refused_or_fails(sheet, fabric):
+    solver = explicit(sheet, fabric, held=(0,))
+    stiff = eqx.tree_at(
+        lambda f: f.membrane, fabric, jax.tree.map(lambda c: 3 * c, fabric.membrane)
+    )
+    controls = Control(jnp.zeros((2, 1, 1, 3)), jnp.zeros((2, 1, 3)))
+
+    def move(fabric):
+        return r2s.simulate(solver, fabric, solver.init(flat(sheet)), controls)
+
+    with pytest.raises(ValueError, match="limited by the fabric"):
+        move(stiff)
+    moved = eqx.filter_jit(move)  # in which it is traced
+    assert bool(moved(fabric).ok.all())
+    failed = moved(stiff)  # though nothing has exploded yet
+    assert int(failed.failure) == Failure.TIME_STEP and bool(jnp.isfinite(failed.x).all())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"substeps": -5}, "whole number"),
+        ({"dt": jnp.inf}, "dt must be positive"),
+    ],
+)
+def test_wrong_numbers_of_an_explicit_cloth_are_refused(sheet, fabric, options, message):
+    with pytest.raises(ValueError, match=message):
+        explicit(sheet, fabric, **options)
+
+
+def test_a_fabric_without_a_longest_substep_is_refused(sheet, fabric):
+    def make(fabric):
+        return explicit(sheet, fabric).substeps
+
+    for density in (0.0, -1.0, jnp.nan):
+        with pytest.raises(ValueError, match="density and its stiffness must be positive"):
+            make(eqx.tree_at(lambda f: f.density, fabric, jnp.asarray(density)))
+    with pytest.raises(ValueError, match="must not be traced"):
+        jax.jit(make)(fabric)
+
+
+@pytest.mark.parametrize("relaxation", [0.0, 1e-3, 1e-2])
+def test_the_longest_step_is_where_a_relaxing_spring_begins_to_explode(relaxation):
+    square, damping = 4e6, 5e-3  # [1/s^2], [s]
+    times = jnp.asarray(damping), jnp.asarray(relaxation)
+    none = [(jnp.zeros(()), jnp.zeros(()))]
+    limit = float(longest_relaxing_step(jnp.asarray(square), *times, none)) / SAFETY
+
+    def growth(dt):
+        """Of the fastest mode of position, dt times velocity and relaxed position."""
+        share, rate = (float(part) for part in Viscosity.make(*times, jnp.asarray(dt)))
+        k = dt**2 * square
+        v = np.array([-k * (1 + share), 1, k * share])
+        matrix = np.array([v + [1, 0, 0], v, [rate, 0, 1 - rate]])
+        return np.abs(np.linalg.eigvals(matrix)).max()
+
+    assert growth(0.999 * limit) < 1 + 1e-9
+    assert growth(1.001 * limit) > 1
+
+
+def test_slow_changes_are_damped_as_by_kelvin_and_voigt_and_sudden_ones_stiffened():
+    damping, relaxation, dt, rate = 0.01, 2e-3, 5e-4, 30.0  # [s], [s], [s], [N/(m s)]
+    times = (jnp.asarray(time) for time in (damping, relaxation, dt))
+    viscosity, relaxed = Viscosity.make(*times), jnp.zeros(())
+    begun = jnp.asarray(True)
+    stress = total = jnp.zeros(())
+    for count in range(1, 101):
+        stress = jnp.asarray(rate * dt * count)
+        total, relaxed = viscosity.resist(stress, relaxed, begun)
+    assert float(total - stress) == pytest.approx(damping * rate, rel=1e-6)
+    sudden, _ = viscosity.resist(jnp.ones(()), jnp.zeros(()), begun)
+    assert float(sudden) == pytest.approx(1 + damping / (relaxation + dt))
+    first, caught_up = viscosity.resist(jnp.ones(()), jnp.zeros(()), ~begun)
+    assert float(first) == float(caught_up) == 1.0
+
+
+def test_a_free_sheet_keeps_its_momentum_and_loses_energy(sheet, fabric):
+    solver = explicit(sheet, fabric, dt=0.01)
+    v = jax.random.normal(jax.random.key(3), (len(sheet.rest), 3))
+    state, run = solver.init(flat(sheet), v), eqx.filter_jit(solver.step)
+    stored_of = jax.jit(lambda x: stored_energy(sheet, fabric, x))
+    mass = fabric.density * sheet.vertex_area[:, None]
+    control = Control(jnp.zeros((0, 3)), jnp.zeros(3))
+    momentum, energies = jnp.sum(mass * v, axis=0), []
+    for count in range(1, 6):
+        state = run(fabric, state, control)
+        fallen = jnp.sum(mass) * jnp.array([0.0, 0.0, -GRAVITY]) * count * solver.dt
+        now = jnp.sum(mass * state.v, axis=0)
+        assert now == pytest.approx(np.asarray(momentum + fallen), abs=1e-12)
+        relative = state.v - now[None] / jnp.sum(mass)
+        stored = stored_of(state.x)
+        energies.append(float(stored + jnp.sum(mass * relative**2) / 2))
+    assert np.all(np.diff(energies) < 0)
+
+
+def test_grippers_carry_the_weight_of_a_sheet_at_rest(fabric):
+    """On any mesh and on the grid, and through the account of energy."""
+    scenario = r2s.wind((0.2, 0.2), speed=0.0, num_frames=3).scenario((4, 4))
+    solver = r2s.explicit_cloth(scenario, fabric)
+    weight = float(fabric.density) * 0.04 * GRAVITY
+    for each in (solver, dataclasses.replace(solver, grid=None)):
+        found = eqx.filter_jit(r2s.energy_balance)(scenario, fabric, None, each)
+        assert float(jnp.sum(found.forces[-1], axis=0)[2]) == pytest.approx(weight, rel=1e-3)
+        assert float(found.dissipated[-1]) > -1e-6
+
+
+def test_explicit_steps_of_a_lift_go_where_small_implicit_ones_go(fabric):
+    scenario = r2s.lifting((0.3, 0.3), num_frames=12, moving=0.6).scenario((5, 5))
+    run = eqx.filter_jit(r2s.rollout)
+    fine = run(scenario, fabric, 1 / 480).x
+    explicit = run(scenario, fabric, None, r2s.explicit_cloth(scenario, fabric)).x
+    light = r2s.explicit_cloth(scenario, fabric, membrane_damping=1e-4)
+    apart, lightly = (
+        float(jnp.sqrt(jnp.mean(jnp.sum((x - fine) ** 2, axis=2))))
+        for x in (explicit, run(scenario, fabric, None, light).x)
+    )
+    assert apart < 1e-3
+    assert lightly > 3 * apart  # the membrane's damping is felt
+
+
+def test_explicit_steps_refuse_self_contact_and_say_what_has_it(fabric):
+    scenario = r2s.folding((0.2, 0.2)).scenario((4, 4), self_contact=True)
+    with pytest.raises(ValueError, match="material_points"):
+        r2s.explicit_cloth(scenario, fabric)

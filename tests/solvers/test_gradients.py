@@ -1,0 +1,204 @@
+"""Derivatives of a whole motion: a corner lifted off a table, with friction, air and wind."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import DT, cloth, directional_difference, everywhere, flat
+from jaxtyping import Array, Float
+
+from r2s._util.units import AIR_DENSITY
+from r2s.environment.contact import Table
+from r2s.environment.scene import Control, along_path
+from r2s.materials.fabric import Fabric
+from r2s.solvers.implicit.cloth import Cloth
+from r2s.solvers.simulate import simulate
+
+FRAMES, SUBSTEPS = 6, 5
+KNOTS = jnp.linspace(0, FRAMES * SUBSTEPS * DT, 4)
+REST = 0.93e-3  # where the pressure of the table carries the sheet, [m]
+
+
+class Inputs(eqx.Module):
+    """Everything that a motion depends on."""
+
+    fabric: Fabric
+    x: Float[Array, "vertex 3"]
+    v: Float[Array, "vertex 3"]
+    path: Float[Array, "knot handle 3"]
+    height: Float[Array, ""]
+    wind: Float[Array, " 3"]
+
+
+@pytest.fixture(scope="module")
+def inputs(sheet, fabric):
+    x = flat(sheet, REST)
+    # up, and to the side, so that the rest slides on the table
+    shift = jnp.array([[[0.0, 0.0, 0.0]], [[0.03, 0.01, 0.03]], [[0.06, 0.02, 0.06]]])
+    path = x[:1][None] + jnp.concatenate([shift, shift[-1:] + jnp.array([[[0.02, 0.0, 0.01]]])])
+    v = everywhere([0.05, 0.02, 0.0], sheet)
+    return Inputs(fabric, x, v, path, jnp.asarray(0.0, float), jnp.array([0.5, -0.3, 0.8]))
+
+
+@pytest.fixture(scope="module")
+def run(sheet):
+    """The motion of inputs, as a function of them."""
+    fixed = cloth(sheet, held=(0,), table=0.0, air=AIR_DENSITY)
+
+    def run(inputs):
+        scene = eqx.tree_at(lambda scene: scene.table, fixed.scene, Table(inputs.height))
+        solver = Cloth.make(scene, DT, tolerance=1e-13)  # so that differences have little noise
+        times = jnp.arange(1, FRAMES * SUBSTEPS + 1).astype(float) * DT
+        handles = along_path(times, KNOTS, inputs.path).reshape(FRAMES, SUBSTEPS, 1, 3)
+        controls = Control(handles, jnp.broadcast_to(inputs.wind, (FRAMES, SUBSTEPS, 3)))
+        return simulate(solver, inputs.fabric, solver.init(inputs.x, inputs.v), controls).x
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def loss(run):
+    """A scalar of all positions in all frames [m]."""
+    weights = jax.random.normal(jax.random.key(1), (FRAMES, 25, 3))
+    return lambda inputs: (lambda x: (jnp.sum(weights * x), x))(run(inputs))
+
+
+@pytest.fixture(scope="module")
+def value_and_grad(loss):
+    """Compiled; once more at most, since programs are freed between tests."""
+    function = jax.value_and_grad(loss, has_aux=True)
+    return jax.jit(eqx.debug.assert_max_traces(function, max_traces=2))
+
+
+@pytest.fixture(scope="module")
+def gradient(value_and_grad, inputs):
+    return value_and_grad(inputs)[1]
+
+
+def test_the_motion_touches_the_table_and_slides_on_it(value_and_grad, inputs):
+    (_, x), _ = value_and_grad(inputs)
+    x = np.asarray(x)
+    touching = x[-1, :, 2] < float(inputs.fabric.thickness)
+    assert 5 < touching.sum() < 20
+    assert np.max(np.abs(x[-1] - x[0])[touching, :2]) > 3e-3
+
+
+WHERE = {  # what to differ, and by how much [in its unit]
+    "density": (lambda i: i.fabric.density, 1e-6),
+    "c11": (lambda i: i.fabric.membrane.c11, 1e-1),
+    "c12": (lambda i: i.fabric.membrane.c12, 1e-1),
+    "c22": (lambda i: i.fabric.membrane.c22, 1e-1),
+    "c33": (lambda i: i.fabric.membrane.c33, 1e-1),
+    "bending": (lambda i: i.fabric.bending.stiffness, 1e-8),
+    "damping": (lambda i: i.fabric.damping, 1e-5),
+    "friction": (lambda i: i.fabric.friction, 1e-6),
+    "thickness": (lambda i: i.fabric.thickness, 1e-8),
+    "mass damping": (lambda i: i.fabric.mass_damping, 1e-5),
+    "positions": (lambda i: i.x, 1e-9),
+    "velocities": (lambda i: i.v, 1e-6),
+    "path": (lambda i: i.path, 1e-8),
+    "table height": (lambda i: i.height, 1e-8),
+    "wind": (lambda i: i.wind, 1e-5),
+}
+
+
+@pytest.mark.parametrize("name", WHERE)
+def test_the_gradient_agrees_with_differences(name, value_and_grad, gradient, inputs):
+    where, size = WHERE[name]
+
+    def value(part):
+        return value_and_grad(eqx.tree_at(where, inputs, part))[0][0]
+
+    direction = jax.random.normal(jax.random.key(2), where(inputs).shape)
+    expected = directional_difference(value, where(inputs), direction, size)
+    found = jnp.sum(where(gradient) * direction)
+    assert found == pytest.approx(float(expected), rel=1e-4)
+    assert abs(found) > 1e-12  # so the motion does depend on it
+
+
+@pytest.fixture(scope="module")
+def hung(sheet, fabric):
+    """A sheet that hangs from its first row, taut, in wind: value and gradient, and its inputs."""
+    fixed = cloth(sheet, held=range(5), air=AIR_DENSITY)
+    solver = Cloth.make(fixed.scene, DT, tolerance=1e-13)
+    x = jnp.stack([0 * sheet.rest[:, 0], sheet.rest[:, 1], -1.01 * sheet.rest[:, 0]], axis=1)
+    path = x[:5][None] + jnp.array([0.0, 0.3, 1.0])[:, None, None] * jnp.array(
+        [[[0.02, 0.01, 0.0]]]
+    )
+    still = jnp.asarray(-jnp.inf, float)
+    wind = jnp.array([1.5, 0.4, 0.2])
+    inputs = Inputs(fabric, x, everywhere([0.05, 0.02, 0.0], sheet), path, still, wind)
+    weights = jax.random.normal(jax.random.key(1), (FRAMES, 25, 3))
+
+    def loss(inputs):
+        times = jnp.arange(1, FRAMES * SUBSTEPS + 1).astype(float) * DT
+        handles = along_path(times, jnp.array([0.0, 0.1, 0.3]), inputs.path)
+        wind = jnp.broadcast_to(inputs.wind, (FRAMES, SUBSTEPS, 3))
+        controls = Control(handles.reshape(FRAMES, SUBSTEPS, 5, 3), wind)
+        start = solver.init(inputs.x, inputs.v)
+        return jnp.sum(weights * simulate(solver, inputs.fabric, start, controls).x)
+
+    return jax.jit(jax.value_and_grad(loss)), inputs
+
+
+@pytest.mark.slow(group="cloth")
+@pytest.mark.parametrize("name", sorted(WHERE.keys() - {"friction", "thickness", "table height"}))
+def test_without_contact_the_gradient_agrees_more_closely(name, hung):
+    value_and_grad, inputs = hung
+    where, size = WHERE[name]
+
+    def value(part):
+        return value_and_grad(eqx.tree_at(where, inputs, part))[0]
+
+    direction = jax.random.normal(jax.random.key(2), where(inputs).shape)
+    expected = directional_difference(value, where(inputs), direction, size)
+    found = jnp.sum(where(value_and_grad(inputs)[1]) * direction)
+    assert found == pytest.approx(float(expected), rel=1e-5)
+    assert abs(found) > 1e-12
+
+
+@pytest.mark.slow(group="cloth")
+def test_forward_mode_equals_reverse_mode(loss, gradient, inputs):
+    keys = iter(jax.random.split(jax.random.key(3), 20))
+    # relative, so that all parameters count
+    tangent = jax.tree.map(lambda a: a * jax.random.normal(next(keys), a.shape), inputs)
+    _, forward, _ = jax.jit(lambda i, d: jax.jvp(loss, (i,), (d,), has_aux=True))(inputs, tangent)
+    products = jax.tree.map(lambda g, d: jnp.sum(g * d), gradient, tangent)
+    assert forward == pytest.approx(float(sum(jax.tree.leaves(products))), rel=1e-8)
+
+
+@pytest.fixture(scope="module")
+def several(inputs):
+    """Inputs with three fabrics."""
+    fabrics = (
+        inputs.fabric,
+        Fabric.make(0.1, (50.0, -10.0, 80.0, 20.0), 1e-6, damping=0.02),
+        Fabric.make(0.4, (2e3, 5e2, 1e3, 3e2), 1e-4, damping=1e-3, friction=1.2),
+    )
+    return [eqx.tree_at(lambda inputs: inputs.fabric, inputs, fabric) for fabric in fabrics]
+
+
+def test_one_compilation_serves_all_fabrics(value_and_grad, several):
+    values = [value_and_grad(inputs)[0][0] for inputs in several]
+    assert value_and_grad._cache_size() == 1
+    assert len({float(value) for value in values}) == 3
+
+
+@pytest.mark.slow(group="cloth")
+def test_a_batch_of_fabrics_equals_the_loop(loss, value_and_grad, several):
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)
+    (value, x), slope = jax.jit(jax.vmap(jax.value_and_grad(loss, has_aux=True)))(batch)
+    for i, single in enumerate(several):
+        (expected, expected_x), expected_slope = value_and_grad(single)
+        assert value[i] == pytest.approx(float(expected), rel=1e-9)
+        assert np.asarray(x[i]) == pytest.approx(np.asarray(expected_x), abs=1e-10)
+        for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(expected_slope), strict=True):
+            error = np.max(np.abs(np.asarray(a[i]) - np.asarray(b)))
+            assert error <= 1e-7 * np.max(np.abs(np.asarray(b)))  # conditioning of the solves
+
+
+def test_the_same_input_gives_the_same_bits(value_and_grad, several):
+    first, second = value_and_grad(several[0]), value_and_grad(several[0])
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        assert np.array_equal(np.asarray(a), np.asarray(b))

@@ -1,0 +1,290 @@
+"""A sheet of fabric on the grid: conservation, statics, layers, air, and what is refused."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import SIZE, everywhere, flat, rotation
+from mpm_bodies import momenta, states, still
+
+import r2s
+from r2s._util.units import GRAVITY
+from r2s.environment.air import Air
+from r2s.environment.contact import Table
+from r2s.environment.scene import Control, Scene
+from r2s.materials.bending import HingeBending
+from r2s.materials.fabric import Fabric
+from r2s.mesh.elements import vertex_masses
+from r2s.scenarios.energy import stored_energy
+from r2s.solvers.explicit.elements import bending_frequency, elastic_force, membrane_frequency
+from r2s.solvers.failures import Failure
+from r2s.solvers.mpm import Grid, Sheet
+from r2s.solvers.mpm.sheet import stable_step
+from r2s.solvers.mpm.transverse import Transverse, unit_normal
+
+SPACING = 0.05
+
+
+def solver_of(mesh, fabric, held=(), table=-jnp.inf, air=0.0, dt=5e-4, room=0.25, **options):
+    """A solver for a sheet with room [m] around it."""
+    high = float(jnp.max(mesh.rest)) + room
+    grid = Grid.covering((-room, -room, -room), (high, high, room), SPACING)
+    if np.isfinite(table):
+        grid = Grid.covering((-room, -room, table), (high, high, table + room), SPACING)
+    scene = Scene(mesh, jnp.asarray(tuple(held), int), Table.make(table), Air.make(density=air))
+    return Sheet.make(scene, grid, fabric, dt, **options)
+
+
+@pytest.fixture(scope="module")
+def elastic(fabric):
+    """The fabric without damping."""
+    return eqx.tree_at(lambda f: f.damping, fabric, jnp.zeros((), float))
+
+
+def test_momenta_are_kept_to_rounding(sheet, elastic):
+    solver = solver_of(sheet, elastic)
+    solver = eqx.tree_at(lambda s: s.background.gravity, solver, jnp.zeros((), float))
+    x = flat(sheet)
+    noise = 0.05 * jax.random.normal(jax.random.key(0), x.shape)
+    start = solver.init(x, noise + 3 * (x - SIZE / 2)[:, jnp.array([2, 0, 1])])
+    # pressed and tilted, so that what is between the layers acts too
+    pressed = start.d * 0.8 + 0.1 * jax.random.normal(jax.random.key(1), start.d.shape)
+    start = dataclasses.replace(start, d=pressed)
+    moved = states(solver, elastic, start, still(1, 60))
+    linear, angular = momenta(moved, vertex_masses(sheet, elastic.density), SPACING)
+    assert linear == pytest.approx(np.broadcast_to(linear[0], linear.shape), abs=1e-14)
+    assert angular == pytest.approx(np.broadcast_to(angular[0], angular.shape), abs=1e-14)
+    assert np.max(np.abs(angular[0])) > 1e-5
+
+
+def test_free_fall_is_exact(sheet, elastic):
+    solver = solver_of(sheet, elastic)
+    moved = states(solver, elastic, solver.init(flat(sheet)), still(1, 60))
+    count = np.arange(1, 61)
+    fallen = -GRAVITY * solver.dt**2 * count * (count + 1) / 2
+    expected = np.asarray(flat(sheet))[None] + fallen[:, None, None] * np.array([0, 0, 1.0])
+    assert np.asarray(moved.x) == pytest.approx(expected, abs=1e-12)
+
+
+def test_the_forces_are_those_of_the_energy(sheet, fabric):
+    x = flat(sheet) + 0.01 * jax.random.normal(jax.random.key(0), (25, 3))
+    for bending in (fabric.bending, HingeBending(jnp.asarray(2e-5))):
+        of = eqx.tree_at(lambda f: f.bending, fabric, bending)
+        force = eqx.filter_jit(lambda v, of=of: elastic_force(sheet, of, of.damping, x, v))
+        found = force(jnp.zeros_like(x))
+        expected = -jax.grad(stored_energy, argnums=2)(sheet, of, x)
+        assert found == pytest.approx(np.asarray(expected), rel=1e-9, abs=1e-12)
+        braking = force(x) - found
+        assert jnp.sum(braking * x) < 0
+        turned = everywhere([0.1, 0.2, 0.3], sheet) + jnp.cross(jnp.array([[1.0, 2.0, 3.0]]), x)
+        rigid = force(turned)
+        assert rigid == pytest.approx(np.asarray(found), rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.slow(group="points")
+def test_the_frequencies_are_bounds_of_those_of_the_matrices(sheet, fabric):
+    mass = jnp.repeat(vertex_masses(sheet, fabric.density), 3)
+    none = eqx.tree_at(lambda f: f.bending, fabric, HingeBending(jnp.zeros((), float)))
+    soft = jax.tree.map(lambda c: 1e-9 * c, fabric.membrane)
+    bent = eqx.tree_at(lambda f: f.membrane, fabric, soft)
+    for of, bound in ((none, membrane_frequency), (bent, bending_frequency)):
+        stiffness = jax.hessian(stored_energy, argnums=2)(sheet, of, flat(sheet))
+        matrix = stiffness.reshape(75, 75) / jnp.sqrt(mass[:, None] * mass[None])
+        largest = float(jnp.linalg.eigvalsh(matrix)[-1])
+        assert largest < float(eqx.filter_jit(bound)(sheet, of)) < 6 * largest
+
+
+@pytest.mark.slow(group="points")
+def test_a_hanging_sheet_stretches_as_it_should():
+    """Force per width P = C11 (s^2 - 1) s / 2 at a stretch s carries what hangs below."""
+    shape, length = (9, 5), 0.4
+    mesh = r2s.rectangle((length, 0.2), shape)
+    fabric = Fabric.make(0.3, (12.0, 0.0, 12.0, 6.0), 1e-5, damping=2e-3, mass_damping=6.0)
+    grid = Grid.covering((-0.1, -0.1, -0.7), (0.1, 0.3, 0.1), SPACING)
+    scene = Scene(mesh, jnp.arange(5), Table.make(-jnp.inf), Air.make(density=0.0))
+    solver = Sheet.make(scene, grid, fabric, 1.2e-3)
+    x = jnp.stack([0 * mesh.rest[:, 0], mesh.rest[:, 1], -mesh.rest[:, 0]], axis=1)
+    controls = Control(jnp.broadcast_to(x[:5], (1, 1800, 5, 3)), jnp.zeros((1, 1800, 3)))
+    found = eqx.filter_jit(r2s.simulate)(solver, fabric, solver.init(x), controls).x[-1]
+    where = np.linspace(0, length, 2001)
+    stretch = np.ones_like(where)
+    for _ in range(50):  # Newton
+        pull = 12.0 * (stretch**2 - 1) * stretch / 2 - 0.3 * GRAVITY * (length - where)
+        stretch -= pull / (12.0 * (3 * stretch**2 - 1) / 2)
+    hung = np.concatenate([[0], np.cumsum((stretch[1:] + stretch[:-1]) / 2 * np.diff(where))])
+    expected = np.interp(np.asarray(mesh.rest[:, 0]), where, hung)
+    extension = hung[-1] - length
+    assert extension > 0.015
+    rows = -np.asarray(found)[:, 2].reshape(shape)
+    assert rows.mean(axis=1) == pytest.approx(expected.reshape(shape)[:, 0], abs=0.01 * extension)
+    assert rows.reshape(-1) == pytest.approx(expected, abs=0.025 * extension)
+
+
+def _layers():
+    return Transverse(*(jnp.asarray(value) for value in (20.0, 10.0, 0.9)))
+
+
+def test_layers_press_and_do_not_pull():
+    corners = jnp.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.2], [0.0, 1.0, 0.1]])
+    normal = unit_normal(corners)
+    law, friction = _layers(), jnp.asarray(0.5)
+    apart = law.return_mapping(corners, 1.3 * normal + jnp.array([0.1, 0.0, 0.0]), friction)
+    assert apart == pytest.approx(np.asarray(normal), abs=1e-6)  # it forgets
+    force, stress = law.stress(corners, apart)
+    assert force == pytest.approx(0, abs=1e-4) and stress == pytest.approx(0, abs=1e-4)
+    pressed = law.return_mapping(corners, 0.8 * normal, friction)
+    assert pressed == pytest.approx(np.asarray(0.8 * normal), abs=1e-12)
+    pressure = normal @ law.stress(corners, pressed)[1] @ normal
+    assert pressure == pytest.approx(-20.0 * 0.1**2 * 0.8)
+
+
+def test_pressed_layers_slide_when_coulomb_lets_them():
+    corners = jnp.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    law, friction = _layers(), jnp.asarray(0.5)
+    limit = 0.5 * 20.0 * 0.1**2 / 10.0  # friction x pressure / shear stiffness
+    for tilt in (0.5 * limit, 3 * limit):
+        found = law.return_mapping(corners, jnp.array([tilt, 0.0, 0.8]), friction)
+        assert found == pytest.approx([min(tilt, limit), 0, 0.8], abs=1e-9)
+
+
+def test_stresses_between_layers_exert_no_torque():
+    corners = jax.random.normal(jax.random.key(0), (3, 3))
+    direction = 0.7 * unit_normal(corners) + jnp.array([0.1, -0.2, 0.1])
+    law = _layers()
+    force, stress = law.stress(corners, direction)
+    torque = jnp.sum(jnp.cross(corners, force), axis=0)
+    # what the stress does at the nodes: sum d x (stress d), minus its axial vector
+    axial = jnp.stack([stress[2, 1] - stress[1, 2], stress[0, 2] - stress[2, 0]])
+    axial = jnp.append(axial, stress[1, 0] - stress[0, 1])
+    assert torque - axial == pytest.approx(0, abs=1e-12)
+    assert jnp.sum(force, axis=0) == pytest.approx(0, abs=1e-13)
+    turn = rotation(0.7, 0) @ rotation(0.4, 2)
+    assert law.energy(corners @ turn.T, turn @ direction) == pytest.approx(
+        float(law.energy(corners, direction)), rel=1e-12
+    )
+
+
+def _two(mesh):
+    """A mesh of two separate copies of a sheet."""
+    rest, faces = np.asarray(mesh.rest), np.asarray(mesh.faces)
+    aside = rest + np.array([1.0, 0.0])
+    count = len(rest)
+    return r2s.Mesh.make(np.concatenate([rest, aside]), np.concatenate([faces, faces + count]))
+
+
+@pytest.fixture(scope="module")
+def pair(sheet, fabric):
+    """Two sheets, and a solver for them over a table."""
+    mesh, fabric = _two(sheet), eqx.tree_at(lambda f: f.damping, fabric, jnp.asarray(2e-4, float))
+    grid = Grid.covering((-0.15, -0.15, 0.0), (0.35, 0.35, 0.3), SPACING)
+    scene = Scene(mesh, jnp.zeros(0, int), Table.make(0.0), Air.make(density=0.0))
+    return Sheet.make(scene, grid, fabric, 5e-4), fabric
+
+
+@pytest.mark.slow(group="points")
+def test_a_sheet_that_falls_on_another_stays_on_it(pair, sheet):
+    solver, fabric = pair
+    x = jnp.concatenate([flat(sheet, 2e-3), flat(sheet, 0.12)])
+    moved = states(solver, fabric, solver.init(x), still(1, 1500))
+    low, high = np.asarray(moved.x)[:, :25, 2], np.asarray(moved.x)[:, 25:, 2]
+    assert np.min(low) >= 0
+    assert np.min(high - low) > 0.2 * SPACING
+    assert np.max(np.abs(np.asarray(moved.v)[-1])) < 0.05  # at rest
+    assert 0.7 * SPACING < np.mean(high[-1] - low[-1]) < 1.3 * SPACING
+
+
+@pytest.mark.slow(group="points")
+def test_sheets_that_part_do_not_hold_each_other(pair, sheet):
+    solver, fabric = pair
+    solver = eqx.tree_at(lambda s: s.background.gravity, solver, jnp.zeros((), float))
+    x = jnp.concatenate([flat(sheet, 0.1), flat(sheet, 0.1 + SPACING)])
+    apart = jnp.repeat(jnp.array([[0.0, 0.0, -0.2], [0.0, 0.0, 0.2]]), 25, axis=0)
+    moved = states(solver, fabric, solver.init(x, apart), still(1, 1500))
+    low, high = np.asarray(moved.v)[-1, :25, 2], np.asarray(moved.v)[-1, 25:, 2]
+    gap = np.asarray(moved.x)[-1, 25:, 2] - np.asarray(moved.x)[-1, :25, 2]
+    assert np.min(gap) > 1.5 * SPACING
+    assert np.mean(high - low) > 0
+
+
+def test_wind_gives_the_momentum_of_its_drag(sheet, elastic):
+    solver = solver_of(sheet, elastic, air=1.2)
+    solver = eqx.tree_at(lambda s: s.background.gravity, solver, jnp.zeros((), float))
+    wind = jnp.broadcast_to(jnp.array([0.0, 0.0, 3.0]), (1, 60, 3))
+    controls = dataclasses.replace(still(1, 60), wind=wind)
+    moved = states(solver, elastic, solver.init(flat(sheet)), controls)
+    gained = np.sum(np.asarray(vertex_masses(sheet, elastic.density))[:, None] * moved.v[0], axis=0)
+    expected = solver.dt * 1.2 * 2 / 2 * SIZE**2 * 3.0**2
+    assert gained == pytest.approx([0, 0, expected], abs=1e-14)
+
+
+@pytest.mark.slow(group="points")
+def test_held_vertices_follow_their_path_exactly(sheet, elastic):
+    solver = solver_of(sheet, elastic, held=(0, 4))
+    x = flat(sheet)
+    time = jnp.linspace(0, 1, 60)[None, :, None, None]
+    path = x[jnp.array([0, 4])][None, None] + time * jnp.array([[[[0.01, 0.0, 0.02]]]])
+    moved = states(solver, elastic, solver.init(x), Control(path, jnp.zeros((1, 60, 3))))
+    assert np.array_equal(np.asarray(moved.x)[:, [0, 4]], np.asarray(path[0]))
+
+
+def test_a_grid_of_cells_moves_as_the_same_mesh_by_gathers():
+    """Wrinkles, drag and viscosity included; wrinkles that are followed lag a little behind."""
+    mesh = r2s.rectangle((0.2, 0.15), (5, 4))
+    fabric = Fabric.make(0.3, (40.0, 2.0, 30.0, 8.0), 1e-5, damping=2e-3, friction=0.4)
+    solver = solver_of(mesh, fabric, held=(0,), table=0.0, air=1.2, dt=2e-4)
+    assert solver.cells is not None
+    x = flat(mesh, 1e-3)
+    rise = jnp.linspace(0, 0.05, 100)[None, :, None, None]
+    path = x[:1][None, None] + rise * jnp.ones((1, 1, 1, 3))
+    controls = Control(path, jnp.broadcast_to(jnp.array([0.5, 0.0, 1.0]), (1, 100, 3)))
+    found = states(solver, fabric, solver.init(x), controls)
+    gathers = dataclasses.replace(solver, cells=None)
+    expected = states(gathers, fabric, gathers.init(x), controls)
+    moved = np.max(np.abs(np.asarray(expected.x[-1] - x)))
+    assert moved > 0.01
+    assert np.asarray(found.x) == pytest.approx(np.asarray(expected.x), abs=1e-4 * moved)
+
+
+def test_a_membrane_that_damps_for_longer_than_it_relaxes_needs_no_shorter_steps(sheet, elastic):
+    limits = [
+        float(
+            stable_step(
+                sheet, SPACING, eqx.tree_at(lambda f: f.membrane.c11, elastic, jnp.asarray(1e3)), t
+            )
+        )
+        for t in (0.0, 0.01, 0.1)
+    ]
+    assert limits[0] > limits[1] > limits[2] > limits[0] / np.sqrt(1 + 0.1 / 2e-3) * 0.99
+
+
+def test_what_cannot_work_is_refused(sheet, elastic):
+    limit = float(stable_step(sheet, SPACING, elastic))
+    with pytest.raises(ValueError, match=f"limited by .* to {limit:.4g} s, got dt = 0.1 s"):
+        solver_of(sheet, elastic, dt=0.1)
+    damped = eqx.tree_at(lambda f: f.damping, elastic, jnp.asarray(0.01, float))
+    with pytest.raises(ValueError, match="less damping"):
+        solver_of(sheet, damped)
+    solver_of(sheet, damped, membrane_damping=1e-4)
+    with pytest.raises(ValueError, match="edges may be"):
+        solver_of(r2s.rectangle((0.4, 0.4), (3, 3)), elastic)
+    with pytest.raises(ValueError, match="outside the grid"):
+        solver_of(sheet, elastic).init(flat(sheet, 1.0))
+
+
+def test_a_sheet_that_is_carried_out_of_the_grid_ends_the_run(sheet, elastic):
+    """Also where every vertex is held, and its place known all the time."""
+    solver = solver_of(sheet, elastic, held=tuple(range(25)))
+    x, height = flat(sheet), jnp.linspace(0, 0.5, 60)[None, :, None, None]
+    path = x[None, None] + height * jnp.array([[[[0.0, 0.0, 1.0]]]])
+    moved = r2s.simulate(solver, elastic, solver.init(x), Control(path, jnp.zeros((1, 60, 3))))
+    assert moved.failure == Failure.GRID and not moved.ok[0]
+    assert int(moved.failed_step) == int(jnp.argmax(path[0, :, 0, 2] > solver_top(solver)))
+
+
+def solver_top(solver):
+    """The greatest height [m] of a particle in the grid."""
+    grid = solver.background.grid
+    return float(grid.lower[2]) + (grid.shape[2] - 1.5) * grid.spacing

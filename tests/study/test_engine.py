@@ -1,0 +1,292 @@
+"""The engine: nothing finished is lost, what fails stops nothing else, keys say all."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+from folders import TESTS
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from r2s.study import cells, durations, engine, progress
+from r2s.study.cells import Cell
+from r2s.study.ensembles import EnsembleCell
+from r2s.study.environment import environment, one_core
+from r2s.study.evaluations import SHAPES, EvaluationCell
+from r2s.study.starts import SETTLING
+
+
+@dataclass(frozen=True)
+class Number(Cell):
+    """Writes a number; a negative one fails."""
+
+    kind: ClassVar[str] = "numbers"
+
+    value: int
+    pause: float = 0.0
+
+    @property
+    def name(self) -> str:
+        return f"n{self.value}"
+
+    def make(self, folder: Path, out: Path) -> dict[str, Any]:
+        time.sleep(self.pause)
+        if self.value < 0:
+            raise ValueError("is below zero")
+        (out / "value.txt").write_text(str(self.value))
+        return {"seed": self.value}
+
+
+@dataclass(frozen=True)
+class Sum(Cell):
+    """The sum of others."""
+
+    kind: ClassVar[str] = "sums"
+
+    parts: tuple[Cell, ...]
+    label: str = "sum"
+
+    @property
+    def name(self) -> str:
+        return self.label
+
+    def make(self, folder: Path, out: Path) -> dict[str, Any]:
+        total = sum(value_of(part, folder) for part in self.parts)
+        (out / "value.txt").write_text(str(total))
+        return {}
+
+
+def value_of(cell: Cell, folder: Path) -> int:
+    with cells.result_files(cell, folder) as files:
+        return int((files / "value.txt").read_text())
+
+
+def tree() -> Sum:
+    return Sum((Sum((Number(1), Number(2)), "a"), Sum((Number(2), Number(3)), "b")), "whole")
+
+
+def test_needs_come_first_and_once(tmp_path):
+    order = [cell.name for cell in cells.with_dependencies([tree()])]
+    assert order == ["n1", "n2", "a", "n3", "b", "whole"]
+    assert engine.run([tree()], tmp_path, engine.Serial()) == {}
+    assert value_of(tree(), tmp_path) == 8
+
+
+@settings(max_examples=25, deadline=None)
+@given(values=st.lists(st.integers(-2, 3), min_size=1, max_size=6))
+def test_what_fails_stops_only_what_needs_it(tmp_path_factory, values):
+    folder = tmp_path_factory.mktemp("study")
+    sums = [Sum((Number(value), Number(5)), f"s{i}") for i, value in enumerate(values)]
+    failed = engine.run(sums, folder, engine.Serial())
+    for cell, value in zip(sums, values, strict=True):
+        assert cell.is_made(folder) == (value >= 0)
+        assert (cell in failed) == (value < 0)
+        if value < 0:
+            assert failed[cell] == f"needs numbers n{value}, which is missing"
+            assert failed[Number(value)] == "ValueError: is below zero"
+
+
+def test_what_is_made_is_not_made_again_and_says_how_it_was_made(tmp_path):
+    engine.run([tree()], tmp_path, engine.Serial())
+    times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.zip")}
+    engine.run([tree()], tmp_path, engine.Serial())
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.zip")} == times
+    noted = cells.read_metadata(Number(3), tmp_path)
+    assert noted["config"] == "Number(value=3, pause=0.0)" and noted["seed"] == 3
+    assert {"r2s", "jax"} <= noted["versions"].keys()
+    assert noted["seconds"] >= 0 and noted["peak_memory_MB"] > 10
+
+
+def test_the_key_depends_on_the_configuration_of_what_is_needed():
+    assert Sum((Number(1),)).key == Sum((Number(1),)).key
+    assert Sum((Number(1),)).key != Sum((Number(2),)).key
+    assert Sum((Sum((Number(1),)),)).key != Sum((Sum((Number(1, 0.5),)),)).key
+    assert Number(1).key != Sum((Number(1),)).key
+
+
+def test_the_key_depends_on_the_settings_that_results_do(monkeypatch):
+    before, sum_before = Number(1).key, Sum((Number(1),)).key
+    monkeypatch.setattr(Number, "settings", ((33, 33),))
+    assert Number(1).key != before and Sum((Number(1),)).key != sum_before
+    assert SHAPES in EvaluationCell.settings and SETTLING in EnsembleCell.settings
+
+
+def test_a_damaged_result_is_made_again(tmp_path):
+    engine.run([Number(4)], tmp_path, engine.Serial())
+    path = Number(4).path(tmp_path)
+    path.write_bytes(path.read_bytes()[:20])
+    engine.run([Number(4)], tmp_path, engine.Serial())
+    assert zipfile.is_zipfile(path) and value_of(Number(4), tmp_path) == 4
+
+
+def test_a_full_disk_is_a_reason_and_leaves_nothing_behind(tmp_path, monkeypatch):
+    def full(path, data):
+        raise OSError(28, f"cannot write {path}: no space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(cells, "write_bytes", full)
+        failed = engine.run([Number(1)], tmp_path, engine.Serial())
+    assert "no space left" in failed[Number(1)]
+    assert not list(tmp_path.rglob("*.zip"))
+    assert engine.run([Number(1)], tmp_path, engine.Serial()) == {}
+
+
+STUDY = """
+import sys
+sys.path.insert(0, {tests!r})
+from pathlib import Path
+from test_engine import Number, Sum
+from r2s.study import engine
+cells = [Sum((Number(i, 0.05), Number(i + 1, 0.05)), f"s{{i}}") for i in range(8)]
+engine.run(cells, Path({folder!r}), engine.Serial())
+"""
+
+
+@pytest.mark.parametrize("after", [pytest.param(0.1, marks=pytest.mark.slow(group="study")), 0.25])
+def test_a_run_that_was_killed_goes_on(tmp_path, after):
+    code = STUDY.format(tests=str(TESTS), folder=str(tmp_path))
+    killed = subprocess.Popen([sys.executable, "-c", code])
+    deadline = time.time() + 60
+    while time.time() < deadline and not list(tmp_path.rglob("*.zip")):
+        time.sleep(0.01)
+    time.sleep(after)
+    os.kill(killed.pid, signal.SIGKILL)
+    killed.wait()
+    made = set(tmp_path.rglob("*.zip"))
+    assert 0 < len(made) < 17
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert made <= set(tmp_path.rglob("*.zip"))
+    sums = [Sum((Number(i, 0.05), Number(i + 1, 0.05)), f"s{i}") for i in range(8)]
+    assert [value_of(cell, tmp_path) for cell in sums] == [2 * i + 1 for i in range(8)]
+
+
+@dataclass(frozen=True)
+class Dying(Cell):
+    """Ends its process."""
+
+    kind: ClassVar[str] = "deaths"
+
+    @property
+    def name(self) -> str:
+        return "dying"
+
+    def make(self, folder: Path, out: Path) -> dict[str, Any]:
+        os.kill(os.getpid(), signal.SIGKILL)
+        return {}
+
+
+def test_a_process_apart_has_a_workers_environment_and_may_die(tmp_path, monkeypatch):
+    for name in environment(1):
+        monkeypatch.setenv(name, os.environ.get(name, ""))  # put back at the end
+    runner = engine.OneProcess()
+    try:
+        failed = engine.run([Dying(), tree()], tmp_path, runner)
+    finally:
+        runner.close()
+    assert list(failed) == [Dying()] and "Broken" in failed[Dying()]
+    assert value_of(tree(), tmp_path) == 8
+    assert os.environ["OPENBLAS_NUM_THREADS"] == "1"
+
+
+@pytest.mark.parametrize("set_to, expected", [(None, "3"), ("1", "3"), ("0", "0")])
+def test_workers_do_not_print_what_xla_says_of_kept_programs(monkeypatch, set_to, expected):
+    if set_to is None:
+        monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL", raising=False)
+    else:
+        monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", set_to)  # JAX sets 1 where nothing is set
+    assert environment(1)["TF_CPP_MIN_LOG_LEVEL"] == expected
+
+
+@pytest.mark.slow(group="study")
+def test_workers_of_dask_make_the_same_and_survive_a_kill(tmp_path):
+    cluster = pytest.importorskip("r2s.study.cluster", reason="needs the extra cluster")
+    sums = [Sum((Number(i, 0.2), Number(i + 1, 0.2)), f"s{i}") for i in range(6)]
+    sums.append(Sum((Number(-1), Number(0, 0.2)), "bad"))
+    runner = cluster.local(2)
+    try:
+        client = runner._client
+        cores = list(client.run(_cores).values())
+        # a process that dies in the middle of a cell
+        client.run_on_scheduler(lambda: None)
+        pid = next(iter(client.run(os.getpid).values()))
+        import threading
+
+        threading.Timer(0.5, os.kill, (pid, signal.SIGKILL)).start()
+        failed = engine.run(sums, tmp_path, runner)
+    finally:
+        runner.close()
+    assert {cell.name for cell in failed} == {"n-1", "bad"}
+    assert [value_of(cell, tmp_path) for cell in sums[:6]] == [2 * i + 1 for i in range(6)]
+    if _cores():  # else not Linux
+        assert sorted(map(len, cores)) == [1, 1]
+        assert len(set.union(*cores)) == min(2, len(_cores()))
+
+
+def _cores() -> set[int]:
+    return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
+
+
+def test_a_process_takes_the_core_that_has_least_to_do(monkeypatch):
+    psutil, taken = pytest.importorskip("psutil"), []
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {1, 3, 4}, raising=False)
+    monkeypatch.setattr(os, "sched_setaffinity", lambda *given: taken.append(given), raising=False)
+    monkeypatch.setattr(psutil, "cpu_percent", lambda **_: [0.0, 90.0, 0.0, 20.0, 40.0])
+    one_core()
+    one_core(5)
+    assert taken == [(0, {3}), (0, {4})]
+
+
+SBATCH = """#!/bin/sh
+for script; do :; done
+cp "$script" "$0.$$"
+setsid sh "$0.$$" > "$0.$$.log" 2>&1 &
+echo "Submitted batch job $!"
+"""
+
+
+@pytest.mark.slow(group="study")
+def test_jobs_of_slurm_make_the_same_with_a_stand_in_for_sbatch(tmp_path, monkeypatch):
+    """The stand-in runs a job's script at once, as Slurm would on a node that is free."""
+    cluster = pytest.importorskip("r2s.study.cluster", reason="needs the extra cluster")
+    monkeypatch.setenv("PATH", "/usr/bin:/bin")
+    with pytest.raises(OSError, match="sbatch"):
+        cluster.slurm(1)
+    for name, script in (("sbatch", SBATCH), ("scancel", '#!/bin/sh\nkill -- "-$1"\n')):
+        (tmp_path / name).write_text(script)
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    monkeypatch.setenv("PYTHONPATH", str(TESTS))
+    sums = [Sum((Number(i, 0.1), Number(i + 1, 0.1)), f"s{i}") for i in range(4)]
+    runner = cluster.slurm(2)
+    try:
+        assert not engine.run(sums, tmp_path / "out", runner)
+        settings = runner._client.run(os.getenv, "OPENBLAS_NUM_THREADS")
+    finally:
+        runner.close()
+    assert [value_of(cell, tmp_path / "out") for cell in sums] == [1, 3, 5, 7]
+    assert settings and set(settings.values()) == {"1"}
+    assert len(list(tmp_path.glob("sbatch.*.log"))) >= 1
+
+
+def test_a_file_gets_a_line_in_time_while_a_cell_is_running(tmp_path, capfd, monkeypatch):
+    """Half a minute as delivered; a tenth of a second here."""
+    monkeypatch.setattr(progress, "LINES", 0.1)
+    engine.run([Number(1, pause=0.55)], tmp_path, engine.Serial())
+    lines = capfd.readouterr().err.splitlines()
+    assert len([line for line in lines if line.startswith("study of 1 cells:   0 %")]) >= 3
+
+
+def test_a_study_says_beforehand_how_long_it_takes(tmp_path, capfd, monkeypatch):
+    monkeypatch.setitem(durations.SECONDS, "numbers", (150.0, 30.0))
+    engine.run([Number(1), Number(2)], tmp_path, engine.Serial())
+    forecast = "study: 2 cells, about 3 min on 1 process"
+    assert capfd.readouterr().err.splitlines()[0] == forecast
+    engine.run([Number(1), Number(2)], tmp_path, engine.Serial())
+    assert "study:" not in capfd.readouterr().err

@@ -1,0 +1,190 @@
+"""A sheet of MuJoCo's flex follows its grippers, lies on its table, and is a part of a study."""
+
+import dataclasses
+import importlib.util
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from r2s.cli.study import Study
+from r2s.mesh.surface import nearest
+from r2s.scenarios.standard import SIX
+from r2s.study import engine, matrix
+from r2s.study.cells import with_dependencies
+from r2s.study.configuration import MOTIONS
+from r2s.study.drawn import experiment_of
+from r2s.study.ensembles import read_ensemble
+from r2s.study.estimates import EstimateCell
+from r2s.study.evaluations import EvaluationCell, read_measured, read_motions
+from r2s.study.mujoco_cells import FABRIC, MujocoEnsemble, MujocoRecording
+from r2s.study.mujoco_sheet import Material, Resolution, as_plate, motion, moved
+from r2s.study.sources import SyntheticRecording, read
+from r2s.study.verdicts import judged_motion
+
+has_mujoco = importlib.util.find_spec("mujoco") is not None
+needs_mujoco = pytest.mark.skipif(not has_mujoco, reason="needs r2s[mujoco]")
+COARSE = Resolution((5, 5), 1 / 300)
+
+
+@pytest.fixture(scope="module")
+def moves():
+    """A sheet in the four scenarios that MuJoCo takes."""
+    if not has_mujoco:
+        pytest.skip("needs r2s[mujoco]")
+    names = ("lifting", "folding", "fling", "shaking")
+    return {name: motion(SIX[name](), resolution=COARSE) for name in names}
+
+
+def test_held_vertices_follow_the_path(moves):
+    for name, x in moves.items():
+        experiment = SIX[name]()
+        route, held = experiment.route, np.asarray(experiment.scenario((5, 5)).scene.held)
+        path = route.path.reshape(len(route.times), -1).T
+        wanted = np.stack([np.interp(experiment.times, route.times, along) for along in path], 1)
+        np.testing.assert_allclose(x[:, held].reshape(len(x), -1), wanted, atol=1e-5)
+
+
+def test_a_sheet_lies_on_the_table_and_not_below_it(moves):
+    lying, radius = moves["lifting"][0], Material().radius
+    np.testing.assert_allclose(lying[:, 2], radius, atol=2e-4)
+    for x in moves.values():
+        assert x[..., 2].min() > -1e-3
+
+
+def test_a_hanging_sheet_is_at_rest_below_its_grippers_and_stretches_by_its_weight(moves):
+    x, material = moves["fling"], Material()
+    side, stiffness = 0.45, material.young * material.thickness
+    assert np.abs(x[1] - x[0]).max() < 1e-3  # the grippers wait
+    fallen = x[0, 0, 2] - x[0, 4::5, 2].mean()
+    # at most what a sheet that is pulled evenly gives: it hangs by two corners, and sags between
+    stretched = material.density * 9.81 * side / (2 * stiffness)
+    assert 0.9 * side < fallen < (1 + 3 * stretched) * side
+
+
+def test_the_same_sheet_moves_alike_and_another_does_not(moves):
+    again = motion(SIX["fling"](), resolution=COARSE)
+    np.testing.assert_array_equal(again, moves["fling"])
+    other = motion(SIX["fling"](), Material(young=8e3), COARSE)
+    assert np.abs(other - again).max() > 5e-3
+
+
+@needs_mujoco
+def test_a_sheet_that_is_lost_is_an_error_that_says_when():
+    scenario = SIX["lifting"]().scenario(COARSE.shape)
+    torn = dataclasses.replace(scenario, path=scenario.path.at[-1].set(jnp.nan))
+    with pytest.raises(RuntimeError, match=r"diverged after 3\.\d+ s"):
+        moved(torn, step=COARSE.step)
+
+
+@needs_mujoco
+def test_half_the_step_changes_less_than_a_step_that_is_twice_as_long():
+    experiment = SIX["lifting"](num_frames=8, moving=0.4)
+
+    def change(step):
+        """Of the positions, when the step is halved, rms [m]."""
+        found = [motion(experiment, resolution=Resolution((13, 13), at)) for at in (step, step / 2)]
+        return np.sqrt(np.square(found[0] - found[1]).sum(axis=-1).mean())
+
+    assert change(1 / 600) < change(1 / 150) / 2
+
+
+@needs_mujoco
+def test_a_recording_has_the_experiment_s_times_and_clouds_on_the_sheet(tmp_path):
+    cell = MujocoRecording("lifting", 1, unseen=True, resolution=COARSE)
+    assert engine.run([cell], tmp_path, engine.Serial()) == {}
+    made, experiment = read(cell, tmp_path), experiment_of("lifting", 1, True, 0)
+    np.testing.assert_allclose(made.times, experiment.times, atol=1e-6)
+    assert (made.info.fabric, made.info.scenario) == (FABRIC, "lifting")
+    x = motion(experiment, resolution=COARSE)[-1]
+    points = np.asarray(made.points)[-1][np.asarray(made.mask)[-1]]
+    faces = experiment.scenario((5, 5)).scene.mesh.faces
+    found, weights = nearest(jnp.asarray(points, float), jnp.asarray(x, float), faces)
+    on_sheet = np.einsum("pk,pki->pi", weights, x[np.asarray(faces)[found]])
+    assert np.abs(points - on_sheet).max() < 1e-5
+
+
+def test_presets_have_the_sheet_with_the_configurations_that_can_be():
+    plans = {name: plan for name, plan in matrix.PRESETS.items() if FABRIC in plan.fabrics}
+    for name, plan in plans.items():
+        small = matrix.with_changes(plan, repeats=1, judged=1)
+        cells = [cell for cell in matrix.synthetic(small) if cell.fabric == FABRIC]
+        assert {cell.scenario for cell in cells} == set(MOTIONS), name
+        needed = with_dependencies(cells)
+        estimates = [cell for cell in needed if isinstance(cell, EstimateCell)]
+        lifts = {c for c in plan.configurations if c.estimated_from == "lifting"}
+        assert len(estimates) == len(lifts) > 0
+        assert {cell.scenario for cell in estimates} == {"lifting"}
+        assert {cell.density for cell in estimates} == {Material().density}
+        assert not any(isinstance(cell, SyntheticRecording) for cell in needed)
+
+
+def test_the_sheet_is_moved_as_the_other_fabrics_are():
+    made = with_dependencies(matrix.synthetic(matrix.with_changes(matrix.SMALL, judged=1)))
+    paths = {}
+    for cell in made:
+        if isinstance(cell, SyntheticRecording | MujocoRecording) and cell.unseen:
+            path = experiment_of(cell.scenario, cell.number, cell.unseen, cell.seed).route.path
+            paths.setdefault(cell.scenario, set()).add(path.tobytes())
+    assert {scenario: len(found) for scenario, found in paths.items()} == dict.fromkeys(MOTIONS, 1)
+
+
+def test_a_scenario_that_mujoco_s_sheet_does_not_have_is_refused():
+    with pytest.raises(ValueError, match="not wind"):
+        MujocoRecording("wind")
+
+
+def test_a_study_without_the_wheel_says_so_before_it_makes_anything(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    out = tmp_path / "results"
+    with pytest.raises(ImportError, match=r"r2s\[mujoco\].*leave mujoco_flex out of --fabrics"):
+        Study(out=out, preset="three_fabrics").run()
+    assert not out.exists()
+
+
+@pytest.mark.slow(group="study")
+@needs_mujoco
+def test_ours_predicts_the_sheet_of_mujoco_from_where_it_hangs(tmp_path):
+    cell = MujocoRecording("fling", 0, unseen=True, resolution=Resolution((13, 13), 2e-3))
+    judged = EvaluationCell(None, "cloth", Material().density, FABRIC, (cell,), draw=0, every=3)
+    assert engine.run([judged], tmp_path, engine.Serial()) == {}
+    (found,) = read_measured(judged, tmp_path).values()
+    assert found["chamfer_real_to_sim"] < 0.03
+    x = read_motions(judged, tmp_path)[judged.recordings[0].name][0]
+    start = motion(experiment_of("fling", 0, True, 0), resolution=cell.resolution)[0]
+    assert start[:, 2].min() == pytest.approx(x[:, 2].min(), abs=0.02)
+
+
+@pytest.mark.slow(group="verdicts")
+@needs_mujoco
+def test_the_ensemble_of_a_recording_is_its_own_simulator_s(tmp_path):
+    """Trifles leave less than meshes, meshes less than fabrics; the floor has the larger ones."""
+    recording = MujocoRecording("fling", 0, unseen=True, resolution=Resolution((9, 9), 4e-3))
+    cell = MujocoEnsemble(recording)
+    assert not engine.run([cell], tmp_path, engine.Serial())
+    found, judged = read_ensemble(cell, tmp_path), judged_motion(recording, tmp_path)
+    assert set(found.causes) == {"recording", "stiffness", "path", "mesh", "step"}
+    assert found.causes["stiffness"].shape == found.causes["path"].shape == (2, len(found.times))
+    assert found.causes["recording"].mean() < 1e-4
+    left = {cause: float(each.mean()) for cause, each in found.causes.items()}
+    assert left["stiffness"] < left["mesh"] < found.apart.mean()
+    assert (found.apart.mean(axis=1) > left["path"]).all()
+    assert judged is not None and (judged.floor >= found.causes["mesh"][0]).all()
+
+
+def test_a_material_is_the_plate_that_stretches_shears_and_bends_as_it_does():
+    fabric = as_plate(Material(young=2e4, poisson=0.25, thickness=2e-3, density=0.3))
+    law = fabric.membrane
+    assert float(law.c11 - law.c12**2 / law.c22) == pytest.approx(2e4 * 2e-3, rel=1e-5)  # E h
+    assert float(law.c12 / law.c11) == pytest.approx(0.25, rel=1e-5)
+    assert float(law.c33) == pytest.approx(2e4 * 2e-3 / 2.5, rel=1e-5)  # E h / (2 (1 + nu))
+    stiffness = 2e4 * 2e-3**3 / 12 / (1 - 0.25**2)  # [N m]
+    assert float(fabric.bending.stiffness) == pytest.approx(stiffness, rel=1e-5)
+    assert float(fabric.density) == pytest.approx(0.3)
+
+
+def test_the_material_stands_beside_estimates_of_the_sheet():
+    plan = dataclasses.replace(matrix.SMALL, fabrics=(FABRIC,), judged=1)
+    true = [cell for cell in matrix.synthetic(plan) if cell.baseline == "true"]
+    assert {cell.scenario for cell in true if cell.solver == "cloth"} == set(MOTIONS)

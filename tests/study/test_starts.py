@@ -1,0 +1,98 @@
+"""From what shape a prediction of a hanging sheet starts."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from r2s.materials import presets
+from r2s.metrics import prediction_error
+from r2s.metrics.prediction_error import Motion
+from r2s.metrics.surface_distance import to_surface
+from r2s.recordings.recording import cloud
+from r2s.scenarios.solvers import explicit_cloth
+from r2s.scenarios.standard import SIX
+from r2s.solvers.explicit.cloth import ExplicitCloth
+from r2s.study.cells import execute
+from r2s.study.evaluations import _explicit, _until_stable, predict
+from r2s.study.sources import SyntheticRecording, TruthSettings, read, read_start, small_strain
+from r2s.study.starts import SETTLING, started
+
+FLING = SIX["fling"](num_frames=30)
+
+
+def test_a_hanging_sheet_starts_in_the_shape_that_is_given_held_where_the_path_begins():
+    truth, other = FLING.scenario((9, 9)), FLING.scenario((5, 5))
+    shape = np.asarray(truth.start).reshape(9, 9, 3) + np.array([0.0, 0.02, 0.0])
+    moved = started(other, shape)
+    free = np.asarray(other.scene.is_free)
+    expected = shape[::2, ::2].reshape(-1, 3)  # vertices that both meshes have
+    np.testing.assert_allclose(np.asarray(moved.start)[free], expected[free], atol=1e-6)
+    held = np.asarray(moved.scene.held)
+    np.testing.assert_allclose(np.asarray(moved.start)[held], np.asarray(other.path)[1], atol=1e-6)
+    assert bool(jnp.all(moved.path[0] == moved.path[1]))
+    assert (moved.lead_in - 1) * moved.interval < SETTLING <= moved.lead_in * moved.interval + 1e-9
+    assert bool(jnp.all(moved.path_times == other.path_times))
+
+
+def test_a_sheet_on_the_table_starts_flat():
+    lying = SIX["folding"]().scenario((5, 5))
+    assert started(lying, None) is lying
+    with pytest.raises(ValueError, match="lies on the table"):
+        started(lying, np.zeros((5, 5, 3)))
+
+
+@pytest.mark.slow(group="study")
+def test_the_true_fabric_begins_where_its_recording_does(tmp_path, monkeypatch):
+    """Flat sheets of two meshes come to rest in two shapes, a centimetre apart."""
+    shape = (25, 25)
+    monkeypatch.setattr("r2s.study.evaluations.SHAPES", {"cloth": shape})
+    source = SyntheticRecording("camel_ponte_roma", "fling", 0, True, TruthSettings())
+    execute(source, tmp_path)
+    recording, start = read(source, tmp_path), read_start(source, tmp_path)
+    assert start is not None and start.shape == (*source.truth.shape, 3)
+    faces = FLING.scenario(shape).scene.mesh.faces
+
+    def away(starts):
+        (moved,) = predict([recording], small_strain(source.fabric), "cloth", starts)
+        clouds = [cloud(recording, frame) for frame in (0, 3)]
+        return to_surface(clouds, np.asarray(moved.x)[[0, 3]], faces)
+
+    assert np.all(away([start]) < 3e-3)
+    assert np.all(away(()) > 5e-3)
+
+
+def test_only_what_bends_and_damps_very_stiffly_is_predicted_in_implicit_steps():
+    scenarios = [FLING.scenario((33, 33))]
+    usual = presets.black_denim()
+    assert isinstance(_explicit(scenarios, usual), ExplicitCloth)
+    board = dataclasses.replace(
+        usual,
+        bending=jax.tree.map(lambda b: 0 * b + 1e-3, usual.bending),
+        damping=jnp.asarray(0.07),
+    )
+    assert _explicit(scenarios, board) is None
+
+
+def test_a_prediction_of_the_cloth_that_is_lost_is_made_again_in_shorter_substeps(monkeypatch):
+    scenario, fabric, tried = FLING.scenario((5, 5)), presets.grey_interlock(), []
+    solver = explicit_cloth(scenario, fabric)
+
+    def motion(_, __, solver=None):
+        tried.append(solver.substeps if solver else None)
+        return Motion(np.zeros((1, 25, 3)), "" if len(tried) > lost else "was unstable")
+
+    monkeypatch.setattr(prediction_error, "predict_motion", motion)
+    every = [solver.substeps, 2 * solver.substeps, 4 * solver.substeps, None]
+    words = "explicit steps", "explicit steps, 2 times as many", "explicit steps, 4 times as many"
+    for lost, told in enumerate((*words, "implicit steps, lost in explicit ones")):
+        found = _until_stable(scenario, fabric, solver)
+        assert (found.failure, found.steps) == ("", told)  # and says so
+        assert tried == every[: lost + 1]
+        tried.clear()
+
+
+def test_given_recordings_and_lying_sheets_have_no_start(tmp_path):
+    assert read_start(SyntheticRecording("pink_solid", "folding", 0, True), tmp_path) is None

@@ -1,0 +1,174 @@
+"""Calls on threads give what calls one after the other give."""
+
+import re
+import subprocess
+import sys
+import threading
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from r2s._util import threads
+from r2s.compilation import compile_once
+from r2s.estimation import gauss_newton
+
+
+@pytest.fixture
+def two_cores(monkeypatch):
+    monkeypatch.setattr(threads, "threads", lambda: 2)
+
+
+def test_calls_run_at_the_same_time_and_come_in_order(two_cores):
+    both = threading.Barrier(2)
+
+    def waits_for_the_other(number):
+        both.wait(timeout=10)
+        return 2 * number
+
+    assert threads.thread_map(waits_for_the_other, range(6)) == [0, 2, 4, 6, 8, 10]
+
+
+def test_within_a_call_others_come_one_after_the_other(two_cores):
+    def inner(_):
+        return threads.thread_map(lambda _: threading.get_ident(), range(3))
+
+    found = threads.thread_map(inner, range(4))
+    assert all(len(set(each)) == 1 for each in found)
+    assert threading.get_ident() not in found[0]
+
+
+def test_an_error_is_raised_and_what_has_not_begun_is_left_out(two_cores):
+    begun = []
+
+    def fails_at_first(number):
+        begun.append(number)
+        if number == 0:
+            raise ValueError("number 0")
+        time.sleep(0.2)
+
+    with pytest.raises(ValueError, match="number 0"):
+        threads.thread_map(fails_at_first, range(50))
+    assert len(begun) < 50
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        lambda: jax.enable_x64(not jax.config.jax_enable_x64),  # pyright: ignore
+        lambda: jax.debug_nans(True),
+        lambda: jax.default_matmul_precision("highest"),
+    ],
+)
+def test_settings_of_the_calling_thread_alone_hold(two_cores, setting):
+    """Threads would not have them: the caller works itself, and nothing goes in the background."""
+    made = []
+    with setting():
+        here = threads.settings()
+        found = threads.thread_map(lambda _: threads.settings(), [1, 2])
+        with threads.background([lambda: made.append(1)]):
+            time.sleep(0.05)
+    assert found == [here] * 2 and made == []
+
+
+def test_numpys_settings_hold_on_threads(two_cores):
+    with np.errstate(divide="raise"):
+        found = threads.thread_map(lambda _: np.geterr()["divide"], [1, 2])
+    assert found == ["raise"] * 2
+
+
+def test_how_many_are_done_is_told_by_the_caller(two_cores):
+    told = []
+
+    def done(number):
+        told.append((number, threading.get_ident()))
+
+    threads.thread_map(abs, range(4), done)
+    assert told == [(number, threading.get_ident()) for number in (1, 2, 3, 4)]
+
+
+@pytest.mark.parametrize(("limit", "count"), [("1", 1), ("", 4), (" 1000 ", 4), ("3", 3)])
+def test_the_environment_limits_the_threads(monkeypatch, limit, count):
+    monkeypatch.setattr(threads, "cores", lambda: 4)
+    monkeypatch.setenv(threads.LIMIT, limit)
+    assert threads.threads() == count
+
+
+@pytest.mark.parametrize("limit", ["0", "many", "-1"])
+def test_a_limit_that_is_none_is_refused(monkeypatch, limit):
+    monkeypatch.setenv(threads.LIMIT, limit)
+    with pytest.raises(ValueError, match="whole number from 1 on"):
+        threads.threads()
+
+
+def test_on_one_core_the_caller_works_alone(monkeypatch):
+    monkeypatch.setattr(threads, "threads", lambda: 1)
+    found = threads.thread_map(lambda _: threading.get_ident(), range(3))
+    assert set(found) == {threading.get_ident()}
+    made = []
+    with threads.background([lambda: made.append(1)]):
+        pass
+    assert made == []
+
+
+def test_in_the_background_another_thread_works_until_the_body_ends(two_cores):
+    began, end, made = threading.Event(), threading.Event(), []
+
+    def first():
+        began.set()
+        end.wait(timeout=10)
+        raise ValueError("which the body would meet itself")
+
+    with threads.background([first, lambda: made.append(1)]):
+        assert began.wait(timeout=10)  # while the body is here
+    end.set()
+    time.sleep(0.1)
+    assert made == []  # it had not begun
+
+
+def test_two_threads_that_call_a_function_first_trace_it_once(two_cores):
+    traced = []
+
+    @compile_once
+    def doubled(x):
+        traced.append(x)
+        time.sleep(0.1)
+        return 2 * x
+
+    found = threads.thread_map(doubled, [jnp.ones(3), 2 * jnp.ones(3)])
+    assert [each.tolist() for each in found] == [[2.0] * 3, [4.0] * 3]
+    assert len(traced) == 1
+
+
+def test_the_end_of_a_command_does_not_wait_for_the_background():
+    """Nor does what is written go lost."""
+    code = """
+import time
+from r2s._util import threads
+threads.threads = lambda: 2
+with threads.background([lambda: time.sleep(60)]):
+    print("the body")
+raise SystemExit(threads.leave(3))
+"""
+    began = time.monotonic()
+    ended = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, timeout=55)
+    assert (ended.returncode, ended.stdout) == (3, b"the body\n") and time.monotonic() - began < 50
+    assert threads.leave(3) == 3
+
+
+def batches(function, *args):
+    """Calls of LAPACK in a program that take a batch of matrices."""
+    text = jax.jit(function).lower(*args).as_text()
+    calls = [line for line in text.splitlines() if "custom_call @lapack" in line]
+    assert calls
+    return [line for line in calls if re.search(r"tensor<(?!1x)\d+x\d+x\d+xf", line)]
+
+
+def test_what_runs_side_by_side_factors_no_batch_of_matrices():
+    """Two programs that do wait for each other for ever, each in a thread of jaxlib's only pool."""
+    scores, prior = jnp.ones((12, 5)), jnp.eye(5)
+    matrices = jnp.broadcast_to(prior, (12, 5, 5))
+    assert batches(jax.vmap(jnp.linalg.solve), matrices, scores)
+    assert not batches(gauss_newton.scatter, scores, matrices, jnp.ones(12), prior, 1.0)

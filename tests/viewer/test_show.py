@@ -1,0 +1,153 @@
+"""Pictures of recordings: written, of the right frames, and errors that name the file."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recorded_lift import FRAMES, cloth, lab, recorded
+
+pytest.importorskip("matplotlib")
+from matplotlib.figure import Figure  # noqa: E402
+from PIL import Image  # noqa: E402
+
+from r2s.recordings.open import (
+    SimulatedCloth,
+    load_trajectory,
+    open_recording,
+    save_trajectory,
+)
+from r2s.recordings.recording import (
+    save,
+)
+from r2s.viewer.pictures import (
+    _force_curve,
+    _mark_frames,
+    contact_sheet,
+    pictures,
+    show,
+)
+
+
+def colours(path: Path) -> set[tuple[int, int, int]]:
+    image = Image.open(path).convert("RGB")
+    found = image.getcolors(image.width * image.height)
+    assert found is not None
+    return {colour for _, colour in found}  # type: ignore[misc]
+
+
+def test_a_sheet_and_a_gif_are_written(tmp_path: Path) -> None:
+    written = show(recorded(), tmp_path / "new" / "folder", video="gif")
+    assert [path.name for path in written] == ["lift_made.png", "lift_made.gif"]
+    assert sorted(written) == sorted((tmp_path / "new" / "folder").iterdir())
+    with Image.open(written[1]) as video:
+        lasts = []
+        for frame in range(getattr(video, "n_frames", 1)):
+            video.seek(frame)
+            lasts.append(video.info["duration"])
+    assert lasts == [70, 60, 70, 70, 60]  # [ms]: 5/15 s in all
+    assert (0xD5, 0x5E, 0x00) in colours(written[0])  # the cloud
+
+
+def test_the_cloth_is_drawn_over_it_and_markers_too(tmp_path: Path) -> None:
+    without = show(recorded(), tmp_path / "without", video="none")
+    assert len(without) == 1
+    with_cloth = contact_sheet(tmp_path / "with.png", recorded(), cloth())
+
+    def blue(path):
+        return sum(b > r + 60 for r, _, b in colours(path))
+
+    assert blue(with_cloth) > 5 + blue(without[0])
+    markers = np.full((FRAMES, 4, 3), 0.1)
+    seen = np.array([True, True, False, True])[None].repeat(FRAMES, axis=0)
+    marked = recorded(markers=markers, markers_seen=seen)
+    drawn = contact_sheet(tmp_path / "marked.png", marked)
+    assert drawn.read_bytes() != without[0].read_bytes()
+
+
+@pytest.mark.parametrize("vector", [False, True])
+def test_the_force_is_drawn_below(tmp_path: Path, vector: bool) -> None:
+    """Its curve as the log has it; dots only at frames that the log reaches."""
+    times = np.linspace(0.1, 1.0, 50)
+    force = 3 * times
+    log = np.outer(force, [0.6, 0.0, -0.8]) if vector else force
+    pulled = recorded(force=log, force_times=times)
+    curve = _force_curve(Figure(), pulled, 0.1, 0.2)
+    np.testing.assert_allclose(curve.lines[0].get_ydata(), force, rtol=1e-12)
+    (marked,) = _mark_frames(curve, pulled, np.arange(FRAMES))
+    expected = np.where(np.arange(FRAMES) / 15 < 0.1, np.nan, np.arange(FRAMES) / 5)
+    np.testing.assert_allclose(marked.get_ydata(), expected, rtol=1e-12)
+    assert curve.get_xlim()[1] < 0.3  # the frames end long before the log
+
+    def size(recording, name):
+        return Image.open(contact_sheet(tmp_path / name, recording)).height
+
+    assert size(pulled, "with.png") > size(recorded(), "without.png") + 100
+
+
+def test_a_video_with_a_force() -> None:
+    pulled = recorded(3, force=np.arange(4.0), force_times=np.arange(4.0) / 20)
+    frames = list(pictures(pulled))
+    assert len(frames) == 3 and all(side % 2 == 0 for side in frames[0].shape[:2])
+    below = [frame[-160:] for frame in frames]
+    assert (below[0] != below[1]).any() and (below[1] != below[2]).any()  # the dot moves
+
+
+def test_a_video_of_opencv(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    written = show(recorded(3), tmp_path, video="mp4")
+    capture = cv2.VideoCapture(str(written[1]))
+    assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == 3
+    assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(15, abs=0.01)
+
+
+def test_a_cloth_that_flew_off_does_not_spoil_the_picture(tmp_path: Path) -> None:
+    lost = cloth()
+    lost.x[2:] = 1e6
+    lost.x[3:] = np.nan
+    contact_sheet(tmp_path / "lost.png", recorded(), lost)
+    assert len(list(pictures(recorded(3), SimulatedCloth(lost.x[:3], lost.faces)))) == 3
+    with pytest.raises(ValueError, match="trajectory has 4 frames, the recording lift_made 5"):
+        show(recorded(), tmp_path, cloth(4))
+
+
+def test_a_trajectory_is_read_back(tmp_path: Path) -> None:
+    file = tmp_path / "trajectory.npz"
+    save_trajectory(file, cloth().x, cloth().faces)
+    np.testing.assert_array_equal(load_trajectory(file).x, cloth().x)
+    np.testing.assert_array_equal(load_trajectory(file).faces, cloth().faces)
+
+
+@pytest.mark.parametrize(
+    "arrays, words",
+    [
+        ({"x": cloth().x}, "no trajectory .*lacks the arrays faces; has x"),
+        ({"x": cloth().x[0], "faces": cloth().faces}, r"expected x .frame, vertex, 3.*\(4, 3\)"),
+        ({"x": cloth().x, "faces": cloth().faces + 1}, "faces must be numbers of the 4 vertices"),
+        ({"x": cloth().x, "faces": cloth().faces * 1.0}, "faces must be numbers"),
+    ],
+)
+def test_a_trajectory_that_is_none_names_the_file(tmp_path: Path, arrays, words: str) -> None:
+    np.savez(tmp_path / "t.npz", **arrays)
+    with pytest.raises(ValueError, match=f"t.npz: {words}"):
+        load_trajectory(tmp_path / "t.npz")
+
+
+def test_a_damaged_trajectory_and_none(tmp_path: Path) -> None:
+    (tmp_path / "t.npz").write_bytes(b"PK cut")
+    with pytest.raises(ValueError, match="t.npz: no trajectory"):
+        load_trajectory(tmp_path / "t.npz")
+    with pytest.raises(FileNotFoundError, match="none.npz"):
+        load_trajectory(tmp_path / "none.npz")
+
+
+def test_recordings_are_opened_by_what_they_are(tmp_path: Path) -> None:
+    save(recorded(), tmp_path / "made.npz")
+    assert open_recording(tmp_path / "made.npz").info.name == "lift_made"
+    folder = lab(tmp_path, "lift_camel_1")
+    assert open_recording(folder / "lift_camel_1").info.fabric == "camel"
+    assert open_recording(folder).info.trial == "1"
+    (folder / "lift_denim_1").mkdir()
+    with pytest.raises(ValueError, match="name one of its recordings.*lift_camel_1, lift_denim_1"):
+        open_recording(folder)
+    with pytest.raises(FileNotFoundError, match="nowhere: no such recording"):
+        open_recording(tmp_path / "nowhere")
