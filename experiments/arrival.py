@@ -7,7 +7,8 @@ Each line has, on the mesh of the estimate, the loss [mm^2], the mean distance [
 points and the share of them beyond 3 mm, at the end of the estimate, at the true numbers and at the
 prior mean; how far each number is from the truth, in standard errors (in brackets: the standard
 error, a share of the value, of the coupling the number itself); and how many 90 % intervals hold.
-Beside it, OUT_by_kind.csv has a line for each kind of recording. Recordings are made where the folder does not have them. Needs r2s[mujoco].
+Beside it, OUT_by_kind.csv has a line for each kind of recording. Recordings are made where the
+folder does not have them. Needs r2s[mujoco].
 """
 
 from functools import partial
@@ -22,8 +23,8 @@ CAPTION = (
 )
 
 BY_KIND = (
-    "Searches by kind of recording: largest loss of the end over that of the true numbers, how many "
-    "are at most 1.02, 90 % intervals that hold, estimates that say they are not sure."
+    "Searches by kind of recording: largest loss of the end over that of the true numbers, how "
+    "many are at most 1.02, 90 % intervals that hold, estimates that say they are not sure."
 )
 
 
