@@ -15,14 +15,78 @@ import numpy as np
 from folders import SHARED
 from jaxtyping import Array, Float, Int
 
-from r2s.materials.tables import DiffSimTableBending, DiffSimTableMembrane
+from r2s.materials.bending import HingeBending, HingeLaw
+from r2s.materials.membrane import OrthotropicMembrane
+from r2s.materials.tables import (
+    HINGE_FACTOR,
+    LARGE_STRETCH,
+    _between,
+    _edge_row,
+    _engineering,
+    _stretched,
+)
 from r2s.mesh.bends import hinge_angle
 from r2s.mesh.mesh import Mesh
 from r2s.mesh.strain_samples import green_strain
 
 FOLDER = SHARED / "data" / "diffsim_reference"
 FRAMES = 61  # as many as the longest of the recordings, so that all share one compilation
+BAKED = 30  # samples along each axis of DiffSim's grid of membrane stiffness
+BAKED_FROM = (-0.25, -0.25, 0.0)  # [-]: E11, E22 and |E12| of its first sample
 Positions = Float[Array, "vertex 3"]
+
+
+class DiffSimTableMembrane(eqx.Module):
+    """A `TableMembrane` looked up as DiffSim does.
+
+    It doubles the numbers, raises negative ones to zero, and shifts them by half a sample. The
+    result is baked on a coarse grid of E11, E22 and |E12| (steps of 1/30), which is shifted by half
+    a cell once more and interpolated linearly.
+    """
+
+    stiffness: Float[Array, "6 4"]
+
+    def at(self, strain: Float[Array, " 3"]) -> OrthotropicMembrane:
+        """The constant stiffness that DiffSim uses at a strain (E11, E22, 2 E12) [-]."""
+        first = jnp.asarray(BAKED_FROM, strain.dtype)
+        green = jnp.stack([strain[0], strain[1], jnp.abs(strain[2]) / 2])
+        index = jnp.clip((green - first) * (BAKED**2 / (BAKED - 1)) - 0.5, 0, BAKED - 1)
+        below = jnp.clip(jnp.floor(index), 0, BAKED - 2)
+        above = index - below
+
+        def weighed(corner: Float[Array, " 3"]) -> Float[Array, " 4"]:
+            sample = self._sample(first + (below + corner) / BAKED)
+            return jnp.prod(jnp.where(corner > 0, above, 1 - above)) * sample
+
+        corners = jnp.indices((2, 2, 2)).reshape(3, 8).T.astype(strain.dtype)  # of the cell
+        return _engineering(jnp.sum(jax.vmap(weighed)(corners), axis=0))
+
+    def energy_density(self, strain: Float[Array, " 3"]) -> Float[Array, ""]:
+        return self.at(strain).energy_density(strain)
+
+    def _sample(self, green: Float[Array, " 3"]) -> Float[Array, " 4"]:
+        """One sample [N/m] of the baked grid, at (E11, E22, E12) [-]."""
+        e11, e22, e12 = green
+        difference, shear = e11 - e22, 2 * e12
+        largest = 1 + e11 + e22 + jnp.sqrt(difference**2 + shear**2)
+        weight = (jnp.sqrt(largest) - 1) / LARGE_STRETCH
+        angle = 8 * (jnp.arctan2(shear, difference) / 2) / jnp.pi
+        shifted = jnp.clip(2 * weight - 0.5, 0, 1)
+        return jnp.maximum(2 * _stretched(self.stiffness, shifted, 1.25 * angle - 0.5), 0)
+
+
+class DiffSimTableBending(HingeLaw):
+    """A `TableBending` looked up as DiffSim does: shifted by half an entry in both directions, with
+    hinges that bend to one side as stiff as flat ones.
+    """
+
+    stiffness: Float[Array, "3 5"]
+
+    def at(self, direction: Float[Array, ""], curvature: Float[Array, ""]) -> HingeBending:
+        """The constant stiffness that DiffSim uses at a curvature [1/m], as of a `TableBending`."""
+        row = 1.5 * _edge_row(direction) - 0.5
+        column = 1.25 * (-curvature / 10.0) - 0.5
+        return HingeBending(_between(_between(self.stiffness, row), column) / HINGE_FACTOR)
 
 
 class Setting(eqx.Module):

@@ -12,17 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from r2s._util.files import read_json, write_json
-from r2s.materials.bending import HingeBending, OrthotropicBending
+from r2s.materials.bending import HingeBending
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import OrthotropicMembrane
 from r2s.materials.plate import OrthotropicPlate, PlateBending
-from r2s.materials.tables import (
-    HINGE_FACTOR,
-    DiffSimTableBending,
-    DiffSimTableMembrane,
-    TableBending,
-    TableMembrane,
-)
+from r2s.materials.tables import HINGE_FACTOR, TableBending, TableMembrane
 
 Four = tuple[float, float, float, float]
 Five = tuple[float, float, float, float, float]
@@ -61,7 +55,6 @@ class Material:
 def read_material(
     path: Path | str,
     *,
-    diffsim: bool = False,
     damping: float = 0.01,
     friction: float = 0.5,
     thickness: float = 1e-3,
@@ -69,12 +62,9 @@ def read_material(
 ) -> Fabric:
     """The fabric of a material file, whose stiffness follows the strain and the curvature.
 
-    `diffsim` looks the tables up as DiffSim does (twice as stiff, and shifted), instead of as they
-    were published. What the file does not know is given: damping time [s], friction [-], thickness
-    [m], mass damping [1/s].
-
-    Raises `OSError`; `ValueError` that names the file, the key and what was expected there, or one
-    of the given numbers.
+    What the file does not hold is given: damping time [s], friction [-], thickness [m], mass
+    damping [1/s]. Raises `OSError`; `ValueError` that names the file, the key and what was expected
+    there, or one of the given numbers.
     """
     if not (min(damping, friction, mass_damping) >= 0 and thickness > 0):
         raise ValueError(
@@ -82,13 +72,11 @@ def read_material(
             f"[m] positive, got {damping}, {friction}, {mass_damping} and {thickness}"
         )
     material = read_json(path, Material)
-    membrane = DiffSimTableMembrane if diffsim else TableMembrane
-    bending = DiffSimTableBending if diffsim else TableBending
     others = (damping, friction, thickness, mass_damping)
     return Fabric(
         jnp.asarray(material.density, float),
-        membrane(jnp.asarray(material.stretching, float)),
-        bending(jnp.asarray(material.bending, float)),
+        TableMembrane(jnp.asarray(material.stretching, float)),
+        TableBending(jnp.asarray(material.bending, float)),
         *(jnp.asarray(number, float) for number in others),
     )
 
@@ -98,10 +86,9 @@ def write_material(
 ) -> None:
     """Write a fabric as a material file, whole or not at all; `name` is a label in it.
 
-    Tables are written as they are. A constant stiffness is written as a table of equal rows, which
-    `read_material` with the same `diffsim` reads back as the same stiffness: for DiffSim, which
-    doubles it, as half of it; that of a plate as that of hinges, without its Poisson's ratio.
-    Damping, friction and thickness are not written.
+    Tables are written as they are, a constant stiffness as a table of equal rows; for `diffsim`,
+    which doubles membrane stiffnesses, as half of it. A plate is written as hinges, without its
+    Poisson's ratio. Damping, friction and thickness are not written.
 
     Raises `TypeError` for a law that is neither; `ValueError` for a batch of fabrics, for what
     `read_material` would refuse, and for a constant C12 < 0 with `diffsim`, which takes it for 0.
@@ -129,12 +116,12 @@ def _rows(table: np.ndarray, shape: tuple[int, int]) -> Any:
 
 
 def _stretching(law: Any, diffsim: bool) -> np.ndarray:
-    if isinstance(law, TableMembrane | DiffSimTableMembrane):
+    if isinstance(law, TableMembrane):
         return np.asarray(law.stiffness)
     if not isinstance(law, OrthotropicMembrane):
         raise TypeError(
-            "a material file holds a TableMembrane, a DiffSimTableMembrane or an "
-            f"OrthotropicMembrane, got {type(law).__name__}"
+            "a material file holds a TableMembrane or an OrthotropicMembrane, got "
+            f"{type(law).__name__}"
         )
     published = np.array([law.c11, law.c12, law.c22, 2 * law.c33])  # C33 acts on E12 there
     if diffsim and published[1] < 0:
@@ -143,14 +130,14 @@ def _stretching(law: Any, diffsim: bool) -> np.ndarray:
 
 
 def _bending(law: Any) -> np.ndarray:
-    if isinstance(law, TableBending | DiffSimTableBending):
+    if isinstance(law, TableBending):
         return np.asarray(law.stiffness)
     if isinstance(law, HingeBending | PlateBending):
         return np.full((3, 5), HINGE_FACTOR * np.asarray(law.stiffness))
-    if not isinstance(law, OrthotropicBending | OrthotropicPlate):
+    if not isinstance(law, OrthotropicPlate):
         raise TypeError(
-            "a material file holds a TableBending, a DiffSimTableBending, or the constant "
-            f"stiffness of hinges or of a plate, got {type(law).__name__}"
+            "a material file holds a TableBending, or the constant stiffness of hinges or of a "
+            f"plate, got {type(law).__name__}"
         )
     # an edge along the warp bends the weft
     by_edge = HINGE_FACTOR * np.array([law.weft, law.bias, law.warp])

@@ -21,7 +21,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from r2s._util.units import Scalar, isotropic_bending
 from r2s.mesh.bends import Bends
 from r2s.mesh.mesh import Mesh
 
@@ -128,14 +127,6 @@ class HingeBending(HingeLaw):
 
     stiffness: Float[Array, "*batch"]
 
-    @classmethod
-    def isotropic(
-        cls, youngs_modulus: Scalar, poissons_ratio: Scalar, thickness: Scalar
-    ) -> "HingeBending":
-        """Of a solid plate, from Young's modulus [Pa], Poisson's ratio [-] and thickness [m]."""
-        stiffness = isotropic_bending(youngs_modulus, poissons_ratio, thickness)
-        return cls(jnp.asarray(stiffness, float))
-
     def at(self, direction: Float[Array, ""], curvature: Float[Array, ""]) -> "HingeBending":
         """Itself: its stiffness is constant."""
         return self
@@ -143,45 +134,3 @@ class HingeBending(HingeLaw):
     def energy_density(self, curvature: Float[Array, ""]) -> Float[Array, ""]:
         """Energy per rest area [J/m^2] at a curvature [1/m]."""
         return self.stiffness * curvature**2 / 2
-
-
-class OrthotropicBending(HingeLaw):
-    """Bending whose constant stiffness depends on the direction, as warp and weft yarns do.
-
-    - `warp`, `bias`, `weft`: moment per curvature and width [N m] for bending along 0, 45 and 90
-      degrees from the warp; linear in the angle between them.
-    """
-
-    warp: Float[Array, "*batch"]
-    bias: Float[Array, "*batch"]
-    weft: Float[Array, "*batch"]
-
-    def at(self, direction: Float[Array, ""], curvature: Float[Array, ""]) -> HingeBending:
-        """The stiffness along a direction [rad]."""
-        quarter = 4 * direction / jnp.pi  # 0 warp, 1 bias, 2 weft
-        to_bias, to_weft = jnp.clip(quarter, 0, 1), jnp.clip(quarter - 1, 0, 1)
-        across = self.warp + to_bias * (self.bias - self.warp)
-        return HingeBending(across + to_weft * (self.weft - self.bias))
-
-
-class SpringBending(HingeLaw):
-    """The bending springs of a mass-spring cloth, between vertices two apart.
-
-    A spring over two cells of length h shortens to cos(theta / 2) of its length when the cells
-    turn by theta = curvature h. Its energy is of fourth order in the curvature: a flat sheet of
-    springs has no bending stiffness at all, one of curvature k has 3 stiffness h^4 k^2 / 32.
-
-    - `stiffness`: force per width and stretch, [N/m].
-    - `spacing`: h, [m].
-    """
-
-    stiffness: Float[Array, "*batch"]
-    spacing: Float[Array, "*batch"]
-
-    def at(self, direction: Float[Array, ""], curvature: Float[Array, ""]) -> "SpringBending":
-        """Itself."""
-        return self
-
-    def energy_density(self, curvature: Float[Array, ""]) -> Float[Array, ""]:
-        """Energy per rest area [J/m^2] at a curvature [1/m]."""
-        return self.stiffness / 2 * (1 - jnp.cos(curvature * self.spacing / 2)) ** 2

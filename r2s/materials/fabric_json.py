@@ -12,37 +12,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from r2s.materials.bending import HingeBending, OrthotropicBending, SpringBending
+from r2s.materials.bending import HingeBending
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import OrthotropicMembrane, SpringMembrane
 from r2s.materials.plate import OrthotropicPlate, PlateBending
 from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
-from r2s.materials.tables import (
-    DiffSimTableBending,
-    DiffSimTableMembrane,
-    TableBending,
-    TableMembrane,
-)
+from r2s.materials.tables import TableBending, TableMembrane
 
-NUMBERS = {"density": "kg/m^2", "damping": "s", "friction": "-", "thickness": "m"}
-NUMBERS |= {"mass_damping": "1/s"}
-TABLES = (TableMembrane, DiffSimTableMembrane)
-MEMBRANES = (OrthotropicMembrane, StiffeningMembrane, SpringMembrane, *TABLES)
-PLATES = (PlateBending, OrthotropicPlate, SofteningPlate)
-BENDINGS = (*PLATES, HingeBending, OrthotropicBending, SpringBending)
-LAWS = {
-    "membrane": (MEMBRANES, "N/m"),
-    "bending": ((*BENDINGS, TableBending, DiffSimTableBending), "N m"),
+NUMBERS = {
+    "density": "kg/m^2",
+    "damping": "s",
+    "friction": "-",
+    "thickness": "m",
+    "mass_damping": "1/s",
 }
-TABLE_SHAPES = {
-    TableMembrane: (6, 4),
-    DiffSimTableMembrane: (6, 4),
-    TableBending: (3, 5),
-    DiffSimTableBending: (3, 5),
-}
-OTHER_UNITS = {"poissons_ratio": "-", "spacing": "m", "SpringBending.stiffness": "N/m"}
-OTHER_UNITS |= {"ratio": "-", "loss": "-"}
-OTHER_UNITS |= {"StiffeningMembrane.knee": "-", "knee_weft": "-", "SofteningPlate.knee": "1/m"}
+MEMBRANES = OrthotropicMembrane, StiffeningMembrane, SpringMembrane, TableMembrane
+BENDINGS = PlateBending, OrthotropicPlate, SofteningPlate, HingeBending, TableBending
+LAWS = {"membrane": (MEMBRANES, "N/m"), "bending": (BENDINGS, "N m")}
+TABLE_SHAPES = {TableMembrane: (6, 4), TableBending: (3, 5)}
+DIMENSIONLESS = "poissons_ratio", "ratio", "loss", "knee_weft"
 WITHIN = {(StiffeningMembrane, "small"), (SofteningPlate, "small")}  # laws that hold another one
 
 
@@ -146,8 +134,9 @@ def _field_names(law: Any) -> list[str]:
 
 
 def _unit(part: str, law: type, name: str) -> str:
-    own = OTHER_UNITS.get(f"{law.__name__}.{name}")
-    return own or OTHER_UNITS.get(name) or LAWS[part][1]
+    if name == "knee":
+        return "-" if law is StiffeningMembrane else "1/m"
+    return "-" if name in DIMENSIONLESS else LAWS[part][1]
 
 
 def _law_from(stored: Any, part: str, within: str = "") -> Any:

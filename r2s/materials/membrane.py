@@ -80,16 +80,6 @@ class SpringMembrane(eqx.Module):
     weft: Float[Array, "*batch"]
     shear: Float[Array, "*batch"]
 
-    @classmethod
-    def from_spring_constants(cls, structural: Scalar, shear: Scalar) -> "SpringMembrane":
-        """From the constants [N/m] of the springs themselves, on a grid of squares of any size.
-
-        A structural spring of constant k stands for a strip as wide as it is long, so for k as
-        force per width. A diagonal is longer than its share of the width: 2 k.
-        """
-        along = jnp.asarray(structural, float)
-        return cls(along, along, 2 * jnp.asarray(shear, float))
-
     def at(self, strain: Float[Array, " 3"]) -> "SpringMembrane":
         """Itself: its stiffness is constant."""
         return self

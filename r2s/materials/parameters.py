@@ -8,6 +8,7 @@ import abc
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -57,7 +58,6 @@ class Range:
         return (scale(value) - low) / (high - low)
 
 
-MASS_DAMPING = Range("mass damping", "1/s", 1e-2, 10.0)
 LOSSES = (Range("damping", "s", 3e-4, 1e-1), Range("friction", "-", 0.1, 1.0))
 UNIFORM_DEVIATION = 0.29  # of a uniform distribution from 0 to 1
 
@@ -86,6 +86,11 @@ class ParameterSpace(eqx.Module):
         """The parameters, in the order and the units of `ranges`, at a point of the unit cube."""
         return jnp.stack([bound.from_unit(u[i]) for i, bound in enumerate(self.ranges)])
 
+    def places(self, *values: Float[Array, ""]) -> Float[Array, " dim"]:
+        """Where the last parameters are between their bounds, 0 to 1; the inverse of `values`."""
+        ranges = self.ranges[self.dim - len(values) :]
+        return jnp.stack([r.to_unit(value) for r, value in zip(ranges, values, strict=True)])
+
     def prior(self) -> Prior:
         """What is known of a place before any recording: its mean, and its precision, the inverse
         of its covariance. By default those of a uniform distribution over the cube.
@@ -95,6 +100,41 @@ class ParameterSpace(eqx.Module):
     def middle(self) -> Fabric:
         """The fabric in the middle of all ranges: what one assumes knowing nothing."""
         return self(jnp.full(self.dim, 0.5, float))
+
+
+class ExtendedSpace(ParameterSpace):
+    """The fabrics of another space, whose laws have some numbers more.
+
+    - `space`: the other one, of constant stiffness.
+    - `extra`: ranges of the numbers that this one adds.
+    """
+
+    space: ParameterSpace
+    ranges: tuple[Range, ...] = eqx.field(static=True)
+    extra: ClassVar[tuple[Range, ...]]
+
+    @classmethod
+    def make(cls, space: ParameterSpace) -> Self:
+        """From a space of constant stiffness."""
+        return cls(space=space, ranges=(*space.ranges, *cls.extra))
+
+    @abc.abstractmethod
+    def extended(self, fabric: Fabric, values: Float[Array, " extra"]) -> Fabric:
+        """The fabric of the other space, with the laws that have these values."""
+
+    @abc.abstractmethod
+    def reduced(self, fabric: Fabric) -> tuple[Fabric, Float[Array, " extra"]]:
+        """The fabric of the other space, and where the values are between their bounds."""
+
+    def __call__(self, u: Float[Array, " dim"]) -> Fabric:
+        """The fabric at a point of the unit cube."""
+        count = len(self.extra)
+        return self.extended(self.space(u[:-count]), self.values(u)[-count:])
+
+    def to_unit(self, fabric: Fabric) -> Float[Array, " dim"]:
+        """The point of the unit cube where a fabric lies."""
+        inner, places = self.reduced(fabric)
+        return jnp.concatenate([self.space.to_unit(inner), places])
 
 
 class OrthotropicSpace(ParameterSpace):
@@ -108,7 +148,6 @@ class OrthotropicSpace(ParameterSpace):
     - coupling: C12 / sqrt(C11 C22) [-], within -1..1, so that C stays positive definite while C12
       may be negative.
     - bending [N m], damping [s], friction [-].
-    - mass damping [1/s], when it is the last of the ranges; else there is none.
 
     Fields:
 
@@ -133,27 +172,18 @@ class OrthotropicSpace(ParameterSpace):
     )
 
     @classmethod
-    def make(
-        cls, density: float, thickness: float = 1e-3, mass_damping: Range | None = None
-    ) -> "OrthotropicSpace":
-        """The space of an areal density [kg/m^2] and a thickness [m], which must be positive.
-
-        `mass_damping`, for example `MASS_DAMPING`, makes that one of its parameters. What brakes
-        rigid motion is hard to tell from the air's drag, so by default it is not.
-        """
+    def make(cls, density: float, thickness: float = 1e-3) -> "OrthotropicSpace":
+        """The space of an areal density [kg/m^2] and a thickness [m], which must be positive."""
         if not (density > 0 and thickness > 0):
             raise ValueError(
                 f"areal density and thickness must be positive, got {density} kg/m^2 and "
                 f"{thickness} m"
             )
-        space = cls(density=jnp.asarray(density, float), thickness=jnp.asarray(thickness, float))
-        if mass_damping is None:
-            return space
-        return dataclasses.replace(space, ranges=(*space.ranges, mass_damping))
+        return cls(density=jnp.asarray(density, float), thickness=jnp.asarray(thickness, float))
 
     def __call__(self, u: Float[Array, " dim"]) -> Fabric:
         """The fabric at a point of the unit cube."""
-        warp, weft, c33, coupling, bending, damping, friction, *others = self.values(u)
+        warp, weft, c33, coupling, bending, damping, friction = self.values(u)
         c11, c22 = warp / (1 - coupling**2), weft / (1 - coupling**2)
         c12 = coupling * jnp.sqrt(c11 * c22)
         return Fabric(
@@ -163,7 +193,7 @@ class OrthotropicSpace(ParameterSpace):
             damping,
             friction,
             self.thickness,
-            others[0] if others else jnp.zeros((), float),
+            jnp.zeros((), float),
         )
 
     def to_unit(self, fabric: Fabric) -> Float[Array, " dim"]:
@@ -172,9 +202,7 @@ class OrthotropicSpace(ParameterSpace):
         coupling = law.c12 / jnp.sqrt(law.c11 * law.c22)
         held = 1 - coupling**2
         values = (held * law.c11, held * law.c22, law.c33, coupling, bending.stiffness)
-        values += (fabric.damping, fabric.friction, fabric.mass_damping)[: self.dim - 5]
-        places = [bound.to_unit(value) for bound, value in zip(self.ranges, values, strict=True)]
-        return jnp.stack(places)
+        return self.places(*values, fabric.damping, fabric.friction)
 
 
 class IsotropicSpace(ParameterSpace):
@@ -248,5 +276,4 @@ class IsotropicSpace(ParameterSpace):
         ratio = law.c12 / stiffness
         values = ((1 - ratio**2) * stiffness, ratio)
         values += (fabric.damping, fabric.friction)[: self.dim - 2]
-        places = [bound.to_unit(value) for bound, value in zip(self.ranges, values, strict=True)]
-        return jnp.stack(places)
+        return self.places(*values)

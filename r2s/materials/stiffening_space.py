@@ -2,13 +2,13 @@
 
 import dataclasses
 from collections.abc import Iterable
+from typing import ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r2s.materials.fabric import Fabric
-from r2s.materials.parameters import ParameterSpace, Range
+from r2s.materials.parameters import ExtendedSpace, Range
 from r2s.materials.stiffening import HALF, StiffeningMembrane
 
 STIFFENING = (
@@ -23,45 +23,32 @@ def stiffens(ranges: Iterable[Range]) -> bool:
     return STIFFENING[0].name in {each.name for each in ranges}
 
 
-class StiffeningSpace(ParameterSpace):
-    """The fabrics of another space, with yarns that stiffen (`r2s.materials.stiffening`).
+class StiffeningSpace(ExtendedSpace):
+    """The fabrics of a space of constant stiffness, with yarns that stiffen
+    (`r2s.materials.stiffening`).
 
     Parameters: those of the other space, at small strain, and
 
     - stiffening: of the tangent far stretched to that at rest, [-].
-    - knee warp, knee weft: the stretch less 1 at which half of the growth is reached, [-].
-
-    Warp and weft have each their own knee: pulls of knits along wales and courses cannot be
-    followed with one.
-
-    Fields: `space`, of constant stiffness.
+    - knee warp, knee weft: the stretch less 1 at which half of the growth is reached, [-]. Pulls of
+      knits along wales and courses cannot be followed with one knee for both.
     """
 
-    space: ParameterSpace
-    ranges: tuple[Range, ...] = eqx.field(static=True)
+    extra: ClassVar[tuple[Range, ...]] = STIFFENING
 
-    @classmethod
-    def make(
-        cls, space: ParameterSpace, stiffening: tuple[Range, Range, Range] = STIFFENING
-    ) -> "StiffeningSpace":
-        """From a space of constant stiffness and the ranges of the three numbers more."""
-        return cls(space=space, ranges=(*space.ranges, *stiffening))
-
-    def __call__(self, u: Float[Array, " dim"]) -> Fabric:
-        """The fabric at a point of the unit cube."""
-        fabric = self.space(u[:-3])
-        ratio, *knees = self.values(u)[-3:]
+    def extended(self, fabric: Fabric, values: Float[Array, " extra"]) -> Fabric:
+        """The fabric, stiffening."""
+        ratio, *knees = values
         strains = [((1 + knee) ** 2 - 1) / 2 / HALF for knee in knees]
         membrane = StiffeningMembrane(fabric.membrane, ratio, *strains)
         return dataclasses.replace(fabric, membrane=membrane)
 
-    def to_unit(self, fabric: Fabric) -> Float[Array, " dim"]:
-        """The point where a fabric lies; one that does not stiffen lies at the least ratio."""
+    def reduced(self, fabric: Fabric) -> tuple[Fabric, Float[Array, " extra"]]:
+        """The fabric at small strain; one that does not stiffen has the least ratio."""
         law = fabric.membrane
         if not isinstance(law, StiffeningMembrane):
             least = self.ranges[-3].to_unit(jnp.asarray(self.ranges[-3].low))
-            return jnp.concatenate([self.space.to_unit(fabric), jnp.stack([least, 0.5, 0.5])])
-        inner = self.space.to_unit(dataclasses.replace(fabric, membrane=law.small))
+            return fabric, jnp.stack([least, 0.5, 0.5])
         knees = (jnp.sqrt(1 + 2 * HALF * strain) - 1 for strain in (law.knee, law.knee_weft))
-        numbers = zip(self.ranges[-3:], (law.ratio, *knees), strict=True)
-        return jnp.concatenate([inner, jnp.stack([r.to_unit(n) for r, n in numbers])])
+        small = dataclasses.replace(fabric, membrane=law.small)
+        return small, self.places(law.ratio, *knees)

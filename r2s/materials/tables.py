@@ -7,14 +7,9 @@ and `r2s.materials.arcsim` reads their files.
 What was measured is a secant stiffness: stress = C(E) E, bending moment = B(kappa) kappa. Such a
 stress derives from no energy. So a law here has no energy of its own: a time step takes from `at`
 the law whose stiffness is held at what it is near the start of the step, which has one.
-
-`TableMembrane` and `TableBending` interpolate what was published. `DiffSimTableMembrane` and
-`DiffSimTableBending` are DiffSim's own look-ups (Qiao, Liang, Koltun and Lin, "Scalable
-differentiable physics for learning and control", ICML 2020), for comparisons with it.
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -25,9 +20,6 @@ LARGE_STRETCH = 1 / 6  # [-]: the extension at which the large-strain rows were 
 CURVATURE_STEP = 10.0  # [1/m]: between the columns of a bending table
 BLUR = 1e-3  # [-]: principal strains that differ by less hardly have a direction
 HINGE_FACTOR = 4.0  # published bending stiffness over bending stiffness of the hinge
-
-BAKED = 30  # samples along each axis of DiffSim's baked grid
-BAKED_FROM = (-0.25, -0.25, 0.0)  # [-]: E11, E22 and |E12| of its first sample
 
 
 class TableMembrane(eqx.Module):
@@ -63,41 +55,6 @@ class TableMembrane(eqx.Module):
         return self.at(strain).energy_density(strain)
 
 
-class DiffSimTableMembrane(eqx.Module):
-    """A `TableMembrane` looked up as DiffSim does.
-
-    It doubles the numbers, raises negative ones to zero, and shifts them by half a sample: an
-    extension of 4.2 % still has the stiffness of zero strain, one of 12.5 % that of 16.7 %. The
-    result is baked on a coarse grid of E11, E22 and |E12| (steps of 1/30), which is shifted by half
-    a cell once more and interpolated linearly. C12 is not limited: a table with C12^2 > C11 C22 has
-    a negative stiffness.
-
-    - `stiffness`: of a `TableMembrane`, as published [N/m]; half of what DiffSim then uses.
-    """
-
-    stiffness: Float[Array, "*batch 6 4"]
-
-    def at(self, strain: Float[Array, " 3"]) -> OrthotropicMembrane:
-        """The constant stiffness that DiffSim uses at a strain (E11, E22, 2 E12) [-]."""
-        first = jnp.asarray(BAKED_FROM, strain.dtype)
-        green = jnp.stack([strain[0], strain[1], jnp.abs(strain[2]) / 2])
-        index = jnp.clip((green - first) * (BAKED**2 / (BAKED - 1)) - 0.5, 0, BAKED - 1)
-        # no derivative, so that that of a sample, NaN at equal principal strains, is never formed
-        below = jax.lax.stop_gradient(jnp.clip(jnp.floor(index), 0, BAKED - 2))
-        above = index - below
-
-        def weighed(corner: Float[Array, " 3"]) -> Float[Array, " 4"]:
-            sample = _diffsim_sample(self.stiffness, first + (below + corner) / BAKED)
-            return jnp.prod(jnp.where(corner > 0, above, 1 - above)) * sample
-
-        corners = jnp.indices((2, 2, 2)).reshape(3, 8).T.astype(strain.dtype)  # of the cell
-        return _engineering(jnp.sum(jax.vmap(weighed)(corners), axis=0))
-
-    def energy_density(self, strain: Float[Array, " 3"]) -> Float[Array, ""]:
-        """Energy per rest area [J/m^2] at a strain, as of a `TableMembrane`."""
-        return self.at(strain).energy_density(strain)
-
-
 class TableBending(HingeLaw):
     """Bending whose stiffness depends on the direction and the curvature.
 
@@ -117,24 +74,6 @@ class TableBending(HingeLaw):
         `direction` is that of the line which the hinge bends [rad], at right angles to its edge.
         """
         row, column = _edge_row(direction), jnp.abs(curvature) / CURVATURE_STEP
-        return HingeBending(_between(_between(self.stiffness, row), column) / HINGE_FACTOR)
-
-
-class DiffSimTableBending(HingeLaw):
-    """A `TableBending` looked up as DiffSim does.
-
-    It shifts the table by half an entry in both directions, and takes the curvature with its sign:
-    hinges that bend to one side (of positive `hinge_angle`) all have the stiffness of a flat one.
-
-    - `stiffness`: as of a `TableBending`, [N m].
-    """
-
-    stiffness: Float[Array, "*batch 3 5"]
-
-    def at(self, direction: Float[Array, ""], curvature: Float[Array, ""]) -> HingeBending:
-        """The constant stiffness that DiffSim uses at a curvature [1/m], as of a `TableBending`."""
-        row = 1.5 * _edge_row(direction) - 0.5
-        column = 1.25 * (-curvature / CURVATURE_STEP) - 0.5
         return HingeBending(_between(_between(self.stiffness, row), column) / HINGE_FACTOR)
 
 
@@ -186,16 +125,3 @@ def _stable(published: Float[Array, " 4"]) -> OrthotropicMembrane:
 def _engineering(published: Float[Array, " 4"]) -> OrthotropicMembrane:
     c11, c12, c22, c33 = published
     return OrthotropicMembrane(c11, c12, c22, c33 / 2)
-
-
-def _diffsim_sample(
-    stiffness: Float[Array, "6 4"], green: Float[Array, " 3"]
-) -> Float[Array, " 4"]:
-    """One sample [N/m] of DiffSim's baked grid, at (E11, E22, E12) [-]."""
-    e11, e22, e12 = green
-    difference, shear = e11 - e22, 2 * e12
-    largest = 1 + e11 + e22 + jnp.sqrt(difference**2 + shear**2)
-    weight = (jnp.sqrt(largest) - 1) / LARGE_STRETCH
-    angle = 8 * (jnp.arctan2(shear, difference) / 2) / jnp.pi  # 0 at equal principal strains
-    shifted = jnp.clip(2 * weight - 0.5, 0, 1)
-    return jnp.maximum(2 * _stretched(stiffness, shifted, 1.25 * angle - 0.5), 0)

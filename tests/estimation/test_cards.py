@@ -17,7 +17,7 @@ from r2s.estimation import cards
 from r2s.estimation.cards import Card, Provenance
 from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.materials import presets
-from r2s.materials.bending import HingeBending, OrthotropicBending
+from r2s.materials.bending import HingeBending
 from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import OrthotropicSpace
 from r2s.materials.plate import OrthotropicPlate
@@ -95,7 +95,6 @@ def test_double_precision_survives_where_jax_has_single(tmp_path):
 
 LAWS = {
     "hinges": {"bending": HingeBending(jnp.asarray(1e-5))},
-    "orthotropic hinges": {"bending": OrthotropicBending(*map(jnp.asarray, (1e-5, 2e-5, 3e-5)))},
     "orthotropic plate": {"bending": OrthotropicPlate(*map(jnp.asarray, (1e-5, 2e-5, 3e-5)))},
     "tables": {
         "membrane": TableMembrane(jnp.arange(24.0).reshape(6, 4) + 1),

@@ -15,7 +15,7 @@ from r2s._util.units import isotropic_membrane
 from r2s.export import Loss, arcsim, mujoco, newton, pybullet, stiffness, yarns
 from r2s.materials import presets
 from r2s.materials.arcsim import read_material
-from r2s.materials.bending import HingeBending, OrthotropicBending
+from r2s.materials.bending import HingeBending
 from r2s.materials.fabric import Fabric
 from r2s.materials.plate import OrthotropicPlate, PlateBending
 from r2s.materials.tables import TableMembrane
@@ -55,11 +55,10 @@ def test_the_probes_are_what_a_pulled_strip_shows():
 
 def test_bending_is_that_of_a_cylinder_in_each_direction():
     numbers = (1e-5, 2e-5, 4e-5)
-    laws = (OrthotropicPlate, OrthotropicBending)
-    for law in (kind(*map(jnp.asarray, numbers)) for kind in laws):
-        found = stiffness.bending_stiffness(dataclasses.replace(DENIM, bending=law))
-        expected = dict(zip(("warp", "bias", "weft"), numbers, strict=True))
-        assert close(found, {**expected, "other bias": 2e-5})
+    law = OrthotropicPlate(*map(jnp.asarray, numbers))
+    found = stiffness.bending_stiffness(dataclasses.replace(DENIM, bending=law))
+    expected = dict(zip(("warp", "bias", "weft"), numbers, strict=True))
+    assert close(found, {**expected, "other bias": 2e-5})
     plate = dataclasses.replace(DENIM, bending=PlateBending.make(3e-5, 0.4))
     assert close(stiffness.bending_stiffness(plate), dict.fromkeys(stiffness.DIRECTIONS, 3e-5))
 

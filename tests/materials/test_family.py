@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import (
     LOSSES,
-    MASS_DAMPING,
     IsotropicSpace,
     OrthotropicSpace,
     Range,
@@ -56,15 +55,6 @@ def test_every_fabric_of_the_cube_is_stable(place):
 def test_every_fabric_has_the_density_and_thickness_of_the_family():
     fabric = OrthotropicSpace.make(0.17, 2e-3)(jnp.linspace(0.0, 1.0, 7))
     assert (float(fabric.density), float(fabric.thickness)) == (0.17, 2e-3)
-
-
-def test_mass_damping_is_a_parameter_when_asked_for():
-    space = OrthotropicSpace.make(0.17, mass_damping=MASS_DAMPING)
-    place = jnp.linspace(0.1, 0.8, 8)
-    assert space.dim == FAMILY.dim + 1
-    assert space(place).mass_damping == pytest.approx(float(MASS_DAMPING.from_unit(place[-1])))
-    assert np.asarray(space.to_unit(space(place))) == pytest.approx(np.asarray(place), abs=1e-9)
-    assert FAMILY(place[:-1]).mass_damping == 0
 
 
 def test_the_middle_is_the_geometric_one():

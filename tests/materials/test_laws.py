@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from r2s._util.units import AIR_DENSITY, GRAVITY
 from r2s.environment.air import STILL, Air, Fan
 from r2s.environment.scene import Control
-from r2s.materials.bending import HingeBending, OrthotropicBending, SpringBending
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import OrthotropicMembrane, SpringMembrane
+from r2s.materials.plate import PlateBending
 from r2s.mesh.elements import strains
 from r2s.mesh.mesh import Mesh, rectangle
 
@@ -30,15 +30,6 @@ def law(kind, *parameters):
 def membrane_energy(mesh, membrane, x):
     """Energy [J] in the strains alone."""
     return jnp.sum(mesh.samples.areas.ravel() * jax.vmap(membrane.energy_density)(strains(mesh, x)))
-
-
-@eqx.filter_jit
-def bending_energy(mesh, bending, x):
-    """Energy [J] in the curvatures alone."""
-    curvature = mesh.hinge_bends.curvatures_at(x)
-    laws = jax.vmap(bending.at)(mesh.hinge_direction, curvature)
-    density = jax.vmap(lambda law, curvature: law.energy_density(curvature))(laws, curvature)
-    return jnp.sum(mesh.hinge_area * density)
 
 
 # Springs in the plane
@@ -79,7 +70,7 @@ def test_structural_energy_is_that_of_springs_on_the_edges(seed):
 def test_energy_of_a_uniform_strain_is_that_of_all_springs(seed, sheet):
     gradient = np.eye(2, 3) + 0.4 * np.random.default_rng(seed).normal(size=(2, 3))
     x = np.asarray(sheet.rest) @ gradient
-    membrane = SpringMembrane.from_spring_constants(25.0, 9.0)
+    membrane = law(SpringMembrane, 25.0, 25.0, 18.0)  # a diagonal is longer than its share
     found = membrane_energy(sheet, membrane, jnp.asarray(x))
     springs = structural_springs(x, 25.0, 25.0) + diagonal_springs(x, 9.0)
     assert found == pytest.approx(springs, rel=1e-12)
@@ -111,74 +102,10 @@ def test_collapsed_springs_have_finite_energy_and_force(name):
     assert jnp.all(jnp.isfinite(jax.hessian(membrane.energy_density)(strain)))
 
 
-# Bending
-
-
-def folded(mesh, angle, axis):
-    """Positions of a sheet whose rows turn by the same angle [rad] from cell to cell."""
-    headings = angle * np.arange(SHAPE[0] - 1)
-    cells = CELL * np.stack([np.cos(headings), np.sin(headings)], axis=1)
-    profile = np.concatenate([np.zeros((1, 2)), np.cumsum(cells, axis=0)])
-    row = np.rint(np.asarray(mesh.rest[:, axis]) / CELL).astype(int)
-    across = np.asarray(mesh.rest[:, 1 - axis])
-    round_, up = profile[row].T
-    return jnp.stack([round_, across, up] if axis == 0 else [across, round_, up], axis=1)
-
-
-@pytest.mark.parametrize("axis", [0, 1])
-@pytest.mark.parametrize("angle", [1e-3, 0.3, 1.2])
-def test_spring_bending_has_the_energy_of_springs_over_two_cells(angle, axis, sheet):
-    constant = 7.0  # [N/m]; two springs overlap, each twice as long as wide
-    x = folded(sheet, angle, axis)
-    found = bending_energy(sheet, law(SpringBending, 4 * constant, CELL), x)
-    index = np.arange(25).reshape(SHAPE) if axis == 0 else np.arange(25).reshape(SHAPE).T
-    half = np.array([0.5, 1, 1, 1, 0.5])
-    springs = spring_energy(np.asarray(x), index[:-2], index[2:], constant * half, 2 * CELL)
-    assert found == pytest.approx(springs, rel=1e-6)  # a spring's stretch of 1e-7 is rounded
-
-
-def test_bending_springs_are_of_fourth_order():
-    bending = law(SpringBending, 28.0, 0.05)
-    energy = bending.energy_density(jnp.array(0.2))
-    assert energy == pytest.approx(28 * (0.05 * 0.2) ** 4 / 128, rel=1e-4)
-    stiffness = jax.grad(jax.grad(bending.energy_density))
-    assert stiffness(jnp.array(0.0)) == 0
-    assert stiffness(jnp.array(0.2)) == pytest.approx(3 * 28 * 0.05**4 * 0.2**2 / 32, rel=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("degrees", "expected"),
-    [(0, 4.0), (22.5, 2.5), (45, 1.0), (60, 1 + 5 / 3), (67.5, 3.5), (90, 6.0)],
-)
-def test_bending_stiffness_is_linear_in_the_angle_to_the_warp(degrees, expected):
-    bending = law(OrthotropicBending, 4.0, 1.0, 6.0)
-    found = bending.at(jnp.deg2rad(jnp.asarray(degrees, float)), jnp.array(0.0))
-    assert found.stiffness == pytest.approx(expected)
-
-
-@pytest.mark.parametrize(("axis", "stiffness"), [(0, 4e-5), (1, 6e-5)])
-def test_a_cylinder_has_the_stiffness_of_the_yarns_that_it_bends(axis, stiffness, sheet):
-    radius = 0.1
-    along, across = sheet.rest[:, axis], sheet.rest[:, 1 - axis]
-    round_, up = radius * jnp.sin(along / radius), radius * (1 - jnp.cos(along / radius))
-    x = jnp.stack([round_, across, up] if axis == 0 else [across, round_, up], axis=1)
-    found = bending_energy(sheet, law(OrthotropicBending, 4e-5, 1e-5, 6e-5), x)
-    area = SIZE**2 * (1 - 1 / (SHAPE[0] - 1))  # the outer half cells have no hinge
-    assert found == pytest.approx(stiffness / radius**2 / 2 * area, rel=1e-9)
-
-
 def turned(mesh, angle):
     """A mesh whose warp is at minus an angle [rad] to the axes of the rectangle `mesh`."""
     rest = mesh.rest @ rotation(angle, 2)[:2, :2].T
     return Mesh.make(np.asarray(rest), np.asarray(mesh.faces))
-
-
-def test_bias_stiffness_is_for_bending_at_45_degrees(sheet):
-    # the squares' sides at 45 degrees to the warp, so that their hinges bend along the bias
-    x = folded(sheet, 0.2, 0)
-    found = bending_energy(turned(sheet, np.pi / 4), law(OrthotropicBending, 4e-5, 1e-5, 6e-5), x)
-    expected = 1e-5 / 2 * (0.2 / CELL) ** 2 * SIZE**2 * 3 / 4
-    assert found == pytest.approx(expected, rel=1e-9)
 
 
 # Orthotropic and isotropic sheets
@@ -193,7 +120,7 @@ def test_isotropic_laws_are_those_of_a_plate():
     sheared = jax.grad(membrane.energy_density)(jnp.array([0.0, 0.0, 1e-3]))
     shear_modulus = modulus / (2 * (1 + ratio))
     assert sheared[2] == pytest.approx(shear_modulus * thickness * 1e-3)
-    bending = HingeBending.isotropic(modulus, ratio, thickness)
+    bending = PlateBending.isotropic(modulus, ratio, thickness)
     assert bending.stiffness == pytest.approx(float(membrane.c11) * thickness**2 / 12)
 
 
