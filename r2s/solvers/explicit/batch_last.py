@@ -4,23 +4,29 @@
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 
-def batch_last(function: Callable[[bool, Any], Any]) -> Callable[[Any], Any]:
-    """`function(False, arrays)`, which under `jax.vmap` is `function(True, arrays)`.
+def batch_last(function: Callable[[bool, Any], Any], inputs: Any) -> Any:
+    """`function(False, inputs)`, which under `jax.vmap` is `function(True, inputs)`.
 
     The latter has a batch as last axis of every array, and of every result. `jax.vmap` of
-    `jax.vmap` makes one batch of both. Derivatives are those of `function(False, arrays)`, and
+    `jax.vmap` makes one batch of both. Derivatives are those of `function(False, inputs)`, and
     with them a batch is JAX's own.
     """
+    arrays, static = eqx.partition(inputs, eqx.is_array)
+
+    def of_arrays(batched, arrays):
+        return function(batched, eqx.combine(arrays, static))
 
     @jax.custom_batching.custom_vmap
     def of_members(arrays):
-        return function(True, arrays)
+        return of_arrays(True, arrays)
 
     @of_members.def_vmap
     def _(size, in_batched, arrays):
@@ -40,7 +46,7 @@ def batch_last(function: Callable[[bool, Any], Any]) -> Callable[[Any], Any]:
 
     @jax.custom_batching.custom_vmap
     def of_one(arrays):
-        return function(False, arrays)
+        return of_arrays(False, arrays)
 
     @of_one.def_vmap
     def _(size, in_batched, arrays):
@@ -59,6 +65,6 @@ def batch_last(function: Callable[[bool, Any], Any]) -> Callable[[Any], Any]:
 
     @called.defjvp
     def _(primals, tangents):
-        return jax.jvp(lambda arrays: function(False, arrays), primals, tangents)
+        return jax.jvp(partial(of_arrays, False), primals, tangents)
 
-    return called
+    return called(arrays)

@@ -17,15 +17,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s._util.traced import is_traced
-from r2s.environment.air import Air
 from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric
 from r2s.materials.plate import PlateLaw
 from r2s.mesh.mesh import Mesh
 from r2s.solvers.explicit import elements
 from r2s.solvers.explicit.batch_last import batch_last
-from r2s.solvers.explicit.grid import grid_force, laws_on_grid
-from r2s.solvers.explicit.grid_membrane import Samples
 from r2s.solvers.explicit.layout import Layout
 from r2s.solvers.explicit.sheet import (
     Cells,
@@ -34,6 +31,8 @@ from r2s.solvers.explicit.sheet import (
     cells_of,
     force_by_gathers,
     no_memory,
+    remembered,
+    slices,
 )
 from r2s.solvers.explicit.stability import check_step, longest_relaxing_step
 from r2s.solvers.explicit.viscosity import RELAXATION, Viscosity
@@ -185,104 +184,80 @@ class ExplicitCloth(eqx.Module):
         carried = carried.at[scene.held].set((control.handles - state.x[scene.held]) / self.dt)
         damping = fabric.damping if self.membrane_damping is None else self.membrane_damping
         substep = jnp.asarray(self.dt / self.substeps, dtype)
+        memory = Memory(state.relaxed, state.hidden, state.begun)
+        viscosity = Viscosity.make(damping, self.relaxation, substep)
+        around = viscosity, scene.air, scene.fan
         inputs = _Inputs(
-            fabric,
-            _Moving(
-                state.x,
-                state.v,
-                state.relaxed,
-                state.hidden,
-                state.begun,
-                jnp.zeros_like(state.x) if with_impulse else None,
-            ),
+            ForceInputs(fabric, *around, state.x, state.v, control.wind, memory),
             carried,
             scene.is_free.astype(dtype),
-            control.wind,
             scene.table.height,
-            scene.air,
-            scene.fan,
-            Viscosity.make(damping, self.relaxation, substep),
+            jnp.zeros_like(state.x) if with_impulse else None,
         )
         if self.grid is not None and isinstance(fabric.bending, PlateLaw):
-            moved = self._on_grid(inputs)
+            advance = partial(_advance_grid, *self.grid, self.dt, self.substeps)
+            moved = batch_last(advance, inputs)
         else:
-            moved = self._by_gathers(inputs)
+            moved = _advance(scene.mesh, self.dt, self.substeps, inputs)
         x = scene.place(moved.x, control.handles)
         asked = state.x, state.v, fabric, control
         failure = first_failure(state.failure, _failure(asked, (x, moved.v)))
-        after = ExplicitState(x, moved.v, moved.relaxed, moved.hidden, moved.begun, failure)
-        return after, moved.impulse
-
-    def _on_grid(self, inputs: "_Inputs") -> "_Moving":
-        assert self.grid is not None
-        arrays, static = eqx.partition(inputs, eqx.is_array)
-        advance = partial(_advance_grid, *self.grid, self.dt, self.substeps)
-        return batch_last(lambda batched, arrays: advance(batched, eqx.combine(arrays, static)))(
-            arrays
-        )
-
-    def _by_gathers(self, inputs: "_Inputs") -> "_Moving":
-        mesh, fabric, start = self.scene.mesh, inputs.fabric, inputs.start
-        dt = jnp.asarray(self.dt / self.substeps, start.x.dtype)
-        mass = fabric.density * mesh.vertex_area
-        free, carried = inputs.is_free > 0, tuple(inputs.carried.T)
-        around = inputs.viscosity, inputs.air, inputs.fan
-
-        def substep(moving: _Moving, _):
-            x, v, impulse = moving.x, moving.v, moving.impulse
-            memory = Memory(moving.relaxed, moving.hidden, moving.begun)
-            asked = ForceInputs(fabric, *around, x, v, inputs.wind, memory)
-            force, memory = force_by_gathers(mesh, asked)
-            height = x[:, 2] - inputs.table_height - fabric.thickness
-            others = fabric.density, fabric.friction, fabric.mass_damping
-            moved = moved_velocity(dt, tuple(force.T), mass, tuple(v.T), height, *others)
-            v = jnp.stack([jnp.where(free, m, c) for m, c in zip(moved, carried, strict=True)], 1)
-            if impulse is not None:
-                impulse += mass[:, None] * (v - jnp.stack(moved, axis=1))
-            return _Moving(x + dt * v, v, *memory, impulse), None
-
-        return jax.lax.scan(substep, start, length=self.substeps)[0]
+        relaxed, hidden, begun = moved.memory
+        return ExplicitState(x, moved.v, relaxed, hidden, begun, failure), moved.impulse
 
 
 class _Moving(NamedTuple):
-    """What a substep changes, as in `ExplicitState`."""
+    """What a substep changes; on a grid with room on either side (`Layout`)."""
 
     x: Any
     v: Any
-    relaxed: Any
-    hidden: Any
-    begun: Array
+    memory: Any
     impulse: Any  # [N s], of the grippers, added up; None: it is not asked for
 
 
 class _Inputs(NamedTuple):
     """All that a step depends on; with a batch as last axis in `_advance_grid`."""
 
-    fabric: Fabric
-    start: _Moving
+    forces: ForceInputs
     carried: Array  # velocities of held vertices
     is_free: Array
-    wind: Array
     table_height: Array
-    air: Air
-    fan: Any
-    viscosity: Viscosity
+    impulse: Array | None
+
+
+def _advance(mesh: Mesh, dt: float, substeps: int, inputs: _Inputs) -> _Moving:
+    """What the substeps of a step change, of any mesh."""
+    start, fabric = inputs.forces, inputs.forces.fabric
+    small = jnp.asarray(dt / substeps, start.x.dtype)
+    mass = fabric.density * mesh.vertex_area
+    free, carried = inputs.is_free > 0, tuple(inputs.carried.T)
+
+    def substep(moving: _Moving, _):
+        x, v, memory, impulse = moving
+        force, memory = force_by_gathers(mesh, start._replace(x=x, v=v, memory=memory))
+        height = x[:, 2] - inputs.table_height - fabric.thickness
+        others = fabric.density, fabric.friction, fabric.mass_damping
+        moved = moved_velocity(small, tuple(force.T), mass, tuple(v.T), height, *others)
+        v = jnp.stack([jnp.where(free, m, c) for m, c in zip(moved, carried, strict=True)], 1)
+        if impulse is not None:
+            impulse += mass[:, None] * (v - jnp.stack(moved, axis=1))
+        return _Moving(x + small * v, v, memory, impulse), None
+
+    moving = _Moving(start.x, start.v, start.memory, inputs.impulse)
+    return jax.lax.scan(substep, moving, length=substeps)[0]
 
 
 def _advance_grid(shape, spacing, dt, substeps: int, batched: bool, inputs: _Inputs) -> _Moving:
-    """What the substeps of a step change."""
-    layout = Layout(shape, spacing, batched)
-    fabric, start, count, room = inputs.fabric, inputs.start, layout.count, layout.room
+    """What the substeps of a step change, on a grid."""
+    layout, start = Layout(shape, spacing, batched), inputs.forces
+    force_of, samples = slices(layout, start)
+    count, room = layout.count, layout.room
     dt = jnp.asarray(dt / substeps, start.x.dtype)
-    viscosity = jax.tree.map(layout.row, inputs.viscosity)
-    laws = laws_on_grid(layout, fabric, viscosity, start.hidden is not None)
     names = ("density", "friction", "mass_damping", "thickness")
-    row = {name: layout.row(getattr(fabric, name)) for name in names}
-    mass = row["density"] * layout.constant(layout.vertex_areas, 0, start.x)
-    contact = layout.row(inputs.table_height) + row["thickness"]
-    air = jax.tree.map(layout.row, inputs.air)
-    free = inputs.is_free > 0
-    carried = tuple(inputs.carried[:, i] for i in range(3))
+    *others, thickness = (layout.row(getattr(start.fabric, name)) for name in names)
+    mass = others[0] * layout.constant(layout.vertex_areas, 0, start.x)
+    contact = layout.row(inputs.table_height) + thickness
+    free, carried = inputs.is_free > 0, _columns(inputs.carried)
 
     def inner(arrays):
         return tuple(each[room : room + count] for each in arrays)
@@ -291,44 +266,28 @@ def _advance_grid(shape, spacing, dt, substeps: int, batched: bool, inputs: _Inp
         return tuple(w.at[room : room + count].set(a) for w, a in zip(wide, arrays, strict=True))
 
     def substep(_, moving: _Moving) -> _Moving:
-        x, v, impulse = moving.x, moving.v, moving.impulse
-        flow = layout.flow(x, v, inputs.wind, inputs.fan)
-        samples = Samples(moving.relaxed, moving.hidden)
-        force, samples = grid_force(layout, laws, air, x, v, flow, samples, moving.begun)
-        here, before = inner(x), inner(v)
-        height = here[2] - contact
-        others = row["density"], row["friction"], row["mass_damping"]
-        unheld = moved_velocity(dt, force, mass, before, height, *others)
+        x, v, (samples, begun), impulse = moving
+        force, samples = force_of(x, v, samples, begun)
+        here = inner(x)
+        unheld = moved_velocity(dt, force, mass, inner(v), here[2] - contact, *others)
         moved = tuple(jnp.where(free, m, c) for m, c in zip(unheld, carried, strict=True))
         if impulse is not None:
             given = zip(impulse, moved, unheld, strict=True)
             impulse = tuple(i + mass * (m - u) for i, m, u in given)
         placed = tuple(a + dt * b for a, b in zip(here, moved, strict=True))
-        begun = jnp.ones_like(moving.begun)
-        return _Moving(put(x, placed), put(v, moved), *samples, begun, impulse)
+        return _Moving(put(x, placed), put(v, moved), (samples, jnp.ones_like(begun)), impulse)
 
-    def columns(array: Array | None):
-        return None if array is None else tuple(array[:, i] for i in range(3))
+    impulse = None if inputs.impulse is None else _columns(inputs.impulse)
+    memory = samples, layout.row(start.memory.begun)
+    moving = _Moving(layout.wide(start.x), layout.wide(start.v), memory, impulse)
+    x, v, (samples, begun), impulse = jax.lax.fori_loop(0, substeps, substep, moving)
+    memory = remembered(layout, samples, begun[0] if batched else begun)
+    impulse = None if impulse is None else jnp.stack(impulse, axis=1)
+    return _Moving(jnp.stack(inner(x), axis=1), jnp.stack(inner(v), axis=1), memory, impulse)
 
-    def stacked(arrays):
-        return None if arrays is None else jnp.stack(arrays, axis=1)
 
-    of_samples = (start.relaxed, start.hidden)
-    relaxed, hidden = (None if s is None else layout.to_cells(s) for s in of_samples)
-    moving = _Moving(
-        layout.wide(start.x),
-        layout.wide(start.v),
-        relaxed,
-        hidden,
-        layout.row(start.begun),
-        columns(start.impulse),
-    )
-    end = jax.lax.fori_loop(0, substeps, substep, moving)
-    of_samples = (end.relaxed, end.hidden)
-    relaxed, hidden = (None if s is None else layout.from_cells(s) for s in of_samples)
-    begun = end.begun[0] if batched else end.begun
-    impulse = stacked(end.impulse)
-    return _Moving(stacked(inner(end.x)), stacked(inner(end.v)), relaxed, hidden, begun, impulse)
+def _columns(vectors: Array) -> tuple[Array, Array, Array]:
+    return vectors[:, 0], vectors[:, 1], vectors[:, 2]
 
 
 def _failure(inputs: Any, results: Any) -> Int[Array, ""]:

@@ -20,22 +20,6 @@ from r2s.mesh.strain_samples import green_strain_gradient
 Vertices = Float[Array, "vertex 3"]
 
 
-def elastic_force(
-    mesh: Mesh, fabric: Fabric, membrane_damping: Float[Array, ""], x: Vertices, v: Vertices
-) -> Vertices:
-    """Forces [N] of membrane and bending with Kelvin-Voigt viscosity on the vertices.
-
-    - `membrane_damping`: damping time of the membrane, [s]; the fabric's holds for bending alone.
-    - `x`, `v`: positions [m] and velocities [m/s].
-    """
-    strain = mesh.samples.strains(x)
-    laws = membrane_on_samples(mesh.samples, fabric.membrane, fabric.bending, strain)
-    row = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), laws)
-    areas = mesh.samples.areas.reshape(-1)
-    membrane = _resistance(row, partial(strains, mesh), areas, membrane_damping, x, v)
-    return membrane + bending_force(mesh, fabric, x, v)
-
-
 def membrane_stress(mesh: Mesh, fabric: Fabric, x: Vertices) -> Float[Array, "sample 3"]:
     """Of all strain samples at positions [m], [N/m]."""
     strain = mesh.samples.strains(x)
@@ -51,33 +35,22 @@ def membrane_force(mesh: Mesh, x: Vertices, stress: Float[Array, "sample 3"]) ->
 
 def bending_force(mesh: Mesh, fabric: Fabric, x: Vertices, v: Vertices) -> Vertices:
     """Forces [N] of bending with Kelvin-Voigt viscosity on the vertices."""
-    bends = fabric.bending.bends(mesh)
+    law, areas = fabric.bending, fabric.bending.areas(mesh)
+    bends = law.bends(mesh)
 
     def bend(x: Vertices) -> Array:
-        return fabric.bending.curvatures(mesh, bends.curvatures_at(x))
+        return law.curvatures(mesh, bends.curvatures_at(x))
 
-    bent = fabric.bending.on_elements(mesh, bends.curvatures_at(x))
-    return _resistance(bent, bend, fabric.bending.areas(mesh), fabric.damping, x, v)
+    bent = law.on_elements(mesh, bends.curvatures_at(x))
 
+    def moments(curvature: Array) -> Array:
+        return jax.vmap(lambda law, k: jax.grad(law.energy_density)(k))(bent, curvature)
 
-def _resistance(
-    laws: Any,
-    measure: Callable[[Vertices], Array],
-    areas: Array,
-    damping: Array,
-    x: Array,
-    v: Array,
-) -> Vertices:
-    """Minus the derivative in x of the energy of a strain measure, with its viscosity [N]."""
-
-    def stresses(strain: Array) -> Array:
-        return jax.vmap(lambda law, s: jax.grad(law.energy_density)(s))(laws, strain)
-
-    strain, rate = jax.jvp(measure, (x,), (v,))
-    stress, viscous = jax.jvp(stresses, (strain,), (rate,))
-    _, to_forces = jax.vjp(measure, x)
-    areas = areas if strain.ndim == 1 else areas[:, None]
-    return -to_forces(areas * (stress + damping * viscous))[0]
+    curvature, rate = jax.jvp(bend, (x,), (v,))
+    moment, viscous = jax.jvp(moments, (curvature,), (rate,))
+    _, to_forces = jax.vjp(bend, x)
+    areas = areas if curvature.ndim == 1 else areas[:, None]
+    return -to_forces(areas * (moment + fabric.damping * viscous))[0]
 
 
 def membrane_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:

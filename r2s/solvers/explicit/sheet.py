@@ -3,10 +3,10 @@
 By slices where the mesh is a grid, by gathers elsewhere.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +18,7 @@ from r2s.environment.drag import drag_on_vertices
 from r2s.materials.fabric import Fabric
 from r2s.materials.plate import PlateLaw
 from r2s.mesh.mesh import Mesh
+from r2s.mesh.vectors import Vector
 from r2s.solvers.explicit.batch_last import batch_last
 from r2s.solvers.explicit.elements import bending_force, membrane_force, membrane_stress
 from r2s.solvers.explicit.grid import grid_force, laws_on_grid
@@ -82,11 +83,7 @@ def sheet_force(mesh: Mesh, cells: Cells | None, inputs: ForceInputs) -> tuple[V
     """
     if cells is None or not isinstance(inputs.fabric.bending, PlateLaw):
         return force_by_gathers(mesh, inputs)
-    arrays, static = eqx.partition(inputs, eqx.is_array)
-    by_slices = partial(_force_by_slices, *cells)
-    return batch_last(lambda batched, arrays: by_slices(batched, eqx.combine(arrays, static)))(
-        arrays
-    )
+    return batch_last(partial(_force_by_slices, *cells), inputs)
 
 
 def force_by_gathers(mesh: Mesh, inputs: ForceInputs) -> tuple[Vertices, Memory]:
@@ -101,21 +98,34 @@ def force_by_gathers(mesh: Mesh, inputs: ForceInputs) -> tuple[Vertices, Memory]
     return force, Memory(relaxed, memory.hidden, jnp.ones_like(memory.begun))
 
 
-def _force_by_slices(shape, spacing, batched: bool, inputs: ForceInputs) -> tuple[Array, Memory]:
-    """With a batch as last axis."""
-    layout = Layout(shape, spacing, batched)
-    fabric, viscosity, air, fan, x, v, wind, memory = inputs
-    viscosity, air = jax.tree.map(layout.row, (viscosity, air))
-    laws = laws_on_grid(layout, fabric, viscosity, memory.hidden is not None)
-    known = None if memory.hidden is None else layout.to_cells(memory.hidden)
-    samples = Samples(layout.to_cells(memory.relaxed), known)
-    x, v = layout.wide(x), layout.wide(v)
-    flow = layout.flow(x, v, wind, fan)
-    force, samples = grid_force(layout, laws, air, x, v, flow, samples, layout.row(memory.begun))
+def slices(layout: Layout, inputs: ForceInputs) -> tuple[Callable, Samples]:
+    """The forces on a grid as a function of positions and velocities with room (`Layout`), samples
+    and whether there was a substep; and the samples at first. With a batch as last axis.
+    """
+    viscosity, air = jax.tree.map(layout.row, (inputs.viscosity, inputs.air))
+    relaxed, hidden, _ = inputs.memory
+    laws = laws_on_grid(layout, inputs.fabric, viscosity, hidden is not None)
+
+    def force(x: Vector, v: Vector, samples: Samples, begun: Array) -> tuple[Vector, Samples]:
+        flow = layout.flow(x, v, inputs.wind, inputs.fan)
+        return grid_force(layout, laws, air, x, v, flow, samples, begun)
+
+    known = None if hidden is None else layout.to_cells(hidden)
+    return force, Samples(layout.to_cells(relaxed), known)
+
+
+def remembered(layout: Layout, samples: Samples, begun: Array) -> Memory:
+    """The samples of a grid as the memory of its cells."""
     hidden = None if samples.hidden is None else layout.from_cells(samples.hidden)
-    force = once(
-        lambda *force: force, *force
-    )  # XLA would sum it up within the stack, element by element
-    return jnp.stack(force, axis=1), Memory(
-        layout.from_cells(samples.relaxed), hidden, jnp.ones_like(memory.begun)
-    )
+    return Memory(layout.from_cells(samples.relaxed), hidden, begun)
+
+
+def _force_by_slices(shape, spacing, batched: bool, inputs: ForceInputs) -> tuple[Array, Memory]:
+    layout = Layout(shape, spacing, batched)
+    force_of, samples = slices(layout, inputs)
+    begun = inputs.memory.begun
+    x, v = layout.wide(inputs.x), layout.wide(inputs.v)
+    force, samples = force_of(x, v, samples, layout.row(begun))
+    # XLA would sum it up within the stack, element by element
+    force = once(lambda *force: force, *force)
+    return jnp.stack(force, axis=1), remembered(layout, samples, jnp.ones_like(begun))
