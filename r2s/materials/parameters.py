@@ -8,7 +8,7 @@ import abc
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -114,7 +114,7 @@ class ExtendedSpace(ParameterSpace):
     extra: ClassVar[tuple[Range, ...]]
 
     @classmethod
-    def make(cls, space: ParameterSpace) -> Self:
+    def make(cls, space: ParameterSpace) -> "ExtendedSpace":
         """From a space of constant stiffness."""
         return cls(space=space, ranges=(*space.ranges, *cls.extra))
 
