@@ -6,7 +6,6 @@ units of the wrinkles' onset, in which the edges are rounded.
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 
 from r2s.mesh.vectors import Matrix, Number, Vector
@@ -41,9 +40,9 @@ def limits(value: Number, most: Number) -> Number:
     return _edge(value) + jnp.where(left < 1, _edge(left) + 1 / 6, 0)
 
 
-def held_back(before: Vector, most: Number) -> Number:
+def held_back(principal: Principal, most: Number) -> Number:
     """By how much the principal values of `limited` fall short of those before, near the most."""
-    mean, radius, _, _ = principal_of(before)
+    mean, radius, _, _ = principal
     parts = (
         jnp.where(v > most - 1, v - _between(v, most), 0) for v in (mean + radius, mean - radius)
     )
@@ -64,22 +63,13 @@ def of_principal(function: Callable[[Number], Number], principal: Principal) -> 
     return middle + half * cosine, middle - half * cosine, ROOT * half * sine
 
 
-@jax.jit
-def limited(matrix: Vector, most: Number) -> Vector:
-    return limited_at(principal_of(matrix), most)
-
-
-def limited_at(principal: Principal, most: Number) -> Vector:
+def limited(principal: Principal, most: Number) -> Vector:
+    """The nearest matrix whose principal values are between none and most, its edges rounded."""
     return of_principal(lambda value: _between(value, most), principal)
 
 
-@jax.jit
-def limited_slope(matrix: Vector, most: Number) -> Matrix:
-    """The derivative of `limited`."""
-    return slope_at(principal_of(matrix), most)
-
-
-def slope_at(principal: Principal, most: Number) -> Matrix:
+def limited_slope(principal: Principal, most: Number) -> Matrix:
+    """The derivative of `limited` in the matrix."""
     mean, radius, cosine, sine = principal
     high, low = mean + radius, mean - radius
     along, across = (_between_slope(value, most) for value in (high, low))

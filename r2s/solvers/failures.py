@@ -1,10 +1,11 @@
 """Why a run of a solver failed: one code for cloth and material points alike."""
 
 import enum
-from typing import SupportsInt
+from typing import Any, SupportsInt
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 
 class Failure(enum.IntEnum):
@@ -49,6 +50,11 @@ def describe(code: SupportsInt) -> str:
     number that is no code.
     """
     return _SENTENCES[Failure(int(code))]
+
+
+def all_finite(tree: Any) -> Bool[Array, ""]:
+    """Whether all numbers of a tree of arrays are finite."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
 
 
 def no_failure() -> Int[Array, ""]:

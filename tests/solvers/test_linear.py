@@ -15,7 +15,6 @@ from r2s.solvers.implicit.linear.dissection import levels
 from r2s.solvers.implicit.linear.elimination import Elimination
 from r2s.solvers.implicit.linear.factor import factor, solve
 from r2s.solvers.implicit.linear.pattern import Pattern, assemble, pinned, product
-from r2s.solvers.implicit.linear.system import Far, apply_inverse, prepare
 
 # compiled once for each mesh, for all tests
 factored = jax.jit(factor, static_argnames="is_definite")
@@ -145,25 +144,11 @@ def test_a_wide_mesh_is_dissected_and_a_narrow_one_is_a_band():
     assert isinstance(narrow, Band) and narrow.width == 2 * 20 + 2
 
 
-def test_a_wide_band_has_groups_as_large_as_its_width():
-    mesh = rectangle((1.0, 1.0), (9, 9))
-    thin, wide = (Elimination.make(mesh, order=order).order for order in ("band", "wide band"))
-    assert isinstance(thin, Band) and isinstance(wide, Band)
-    assert wide.size == wide.width == thin.width
-    assert len(wide.order) == -(-81 // wide.width) < len(thin.order)
-
-
 def test_a_pattern_holds_more_vertices_than_squares_fit_in_32_bits():
     last = np.array([[59_998, 59_999]], np.int32)
     pattern = Pattern.make(60_000, {"edge": last})
     assert np.asarray(pattern.rows)[-3:].tolist() == [59_998, 59_999, 59_999]
     assert np.asarray(pattern.columns)[-3:].tolist() == [59_999, 59_998, 59_999]
-
-
-def test_where_all_are_coupled_there_is_no_order_to_choose():
-    mesh = rectangle((1.0, 1.0), (3, 3))
-    with pytest.raises(ValueError, match="all are coupled"):
-        Elimination.make(mesh, couples_all=True, order="band")
 
 
 def test_held_vertices_do_not_move(problem):
@@ -188,34 +173,3 @@ def test_a_solution_is_transposed_by_itself(problem):
 
     (back,) = jax.linear_transpose(run, right)(other)
     assert np.asarray(back) == pytest.approx(np.asarray(run(other)), rel=1e-8, abs=1e-10)
-
-
-@pytest.mark.parametrize("is_definite", [True, False])
-def test_couplings_outside_of_the_pattern_are_solved_and_transposed(is_definite):
-    """Springs between far places, a hundred times as stiff as the sheet; two vertices are held."""
-    mesh = rectangle((1.0, 1.0), (5, 5))
-    equations = Elimination.make(mesh)
-    random = np.random.default_rng(0)
-    roots = random.normal(size=(len(mesh.hinges), 12, 12))
-    hinges = jnp.asarray((roots @ roots.transpose(0, 2, 1)).reshape(-1, 4, 3, 4, 3))
-    blocks = assemble(equations.pattern, jnp.tile(jnp.eye(3), (25, 1, 1)), hinges=hinges)
-    spring = 30 * random.normal(size=(2, 12))
-    matrices = jnp.asarray(np.einsum("pi,pj->pij", spring, spring).reshape(-1, 4, 3, 4, 3))
-    far = Far(jnp.array([[0, 1, 23, 24], [2, 3, 20, 21]]), matrices)
-    free = jnp.ones(25, bool).at[jnp.array([0, 12])].set(False)
-    system = prepare(equations, blocks, far, free, is_definite)
-
-    def run(b):
-        return apply_inverse(equations, system, b, is_definite)
-
-    right, other = jnp.asarray(random.normal(size=(2, 25, 3)))
-    both = free[equations.pattern.rows] & free[equations.pattern.columns]
-    x = jnp.where(free[:, None], jax.jit(run)(right), 0)
-    force = product(equations.pattern, jnp.where(both[:, None, None], blocks, 0), x) + far.times(x)
-    left = np.asarray(jnp.where(free[:, None], force - right, 0))
-    assert np.linalg.norm(left) < 1e-7 * np.linalg.norm(right)
-    (back,) = jax.linear_transpose(run, right)(other)
-    assert float(jnp.vdot(back, right)) == pytest.approx(
-        float(jnp.vdot(other, run(right))), rel=1e-6
-    )
-    assert np.all(np.asarray(run(jnp.zeros_like(right))) == 0)

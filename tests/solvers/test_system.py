@@ -70,6 +70,7 @@ def test_the_solution_solves(least, is_definite, stiffness):
 
 def test_the_transpose_of_the_solution_is_the_solution():
     apply = inverse(blocks(1.0), far(10.0), False)
+    assert np.all(np.asarray(apply(jnp.zeros((COUNT, 3)))) == 0)
     right, left = jax.random.normal(jax.random.key(0), (2, COUNT, 3))
     _, transposed = jax.vjp(apply, right)
     assert jnp.sum(transposed(left)[0] * right) == pytest.approx(

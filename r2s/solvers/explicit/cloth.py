@@ -36,7 +36,7 @@ from r2s.solvers.explicit.sheet import (
 )
 from r2s.solvers.explicit.stability import check_step, longest_relaxing_step
 from r2s.solvers.explicit.viscosity import RELAXATION, Viscosity
-from r2s.solvers.failures import Failure, first_failure, no_failure
+from r2s.solvers.failures import Failure, all_finite, first_failure, no_failure
 from r2s.solvers.implicit.substep import moved_velocity
 
 Positions = Float[Array, "vertex 3"]
@@ -292,12 +292,8 @@ def _columns(vectors: Array) -> tuple[Array, Array, Array]:
 
 def _failure(inputs: Any, results: Any) -> Int[Array, ""]:
     """Inputs that are not finite give `NON_FINITE`, results that are not `TIME_STEP`."""
-    code = jnp.where(_all_finite(results), Failure.NONE.value, Failure.TIME_STEP.value)
-    return jnp.where(_all_finite(inputs), code, Failure.NON_FINITE.value)
-
-
-def _all_finite(tree: Any) -> Array:
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
+    code = jnp.where(all_finite(results), Failure.NONE.value, Failure.TIME_STEP.value)
+    return jnp.where(all_finite(inputs), code, Failure.NON_FINITE.value)
 
 
 @eqx.filter_jit

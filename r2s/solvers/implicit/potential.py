@@ -30,9 +30,9 @@ from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import MembraneLaw, stress_and_tangent
 from r2s.materials.wrinkling import (
     Columns,
-    Wrinkled,
     given_way,
     search,
+    split,
     stress_on_samples,
     with_wrinkles,
 )
@@ -294,11 +294,11 @@ def _membrane_hessians(
     """
     samples = step.mesh.samples
     law, tangent_before, strain, anchor = _samples(step, x, wrinkles)
-    base = law.law if isinstance(law, Wrinkled) else law
-    parts = on_samples(partial(_stress_and_tangent, step), base, tangent_before, strain, anchor)
+    taut, wrinkled = split(law)
+    parts = on_samples(partial(_stress_and_tangent, step), taut, tangent_before, strain, anchor)
     stress, tangent = jnp.moveaxis(parts[0], -1, 0), jnp.moveaxis(parts[1], (-2, -1), (0, 1))
-    if isinstance(law, Wrinkled):
-        relief, softening = given_way(law, strain)
+    if wrinkled is not None:
+        relief, softening = given_way(wrinkled, strain)
         stress, tangent = stress + relief, tangent + softening
     stress, tangent = samples.areas[None] * stress, samples.areas[None, None] * tangent
     carried = blend * stress + (1 - blend) * _tension(stress)

@@ -4,12 +4,12 @@
 - `transfer`: from particles to the grid (`p2g`) and back (`g2p`).
 - `background`: gravity, table, walls and grippers at the nodes.
 - `block`: a solid body of particles (`r2s.materials.solid`).
-- `transverse`, `elements`, `sheet`: a sheet of the same fabrics as `r2s.Cloth`.
-- `stability`: how long a step may be, and why a motion failed.
+- `transverse`, `sheet`: a sheet of the same fabrics as `r2s.Cloth`.
+- `stability`: why a motion failed.
 """
 
 from r2s.solvers.mpm.background import Background
-from r2s.solvers.mpm.block import Block, BlockState, Surface, layered
+from r2s.solvers.mpm.block import Block, BlockState, layered
 from r2s.solvers.mpm.grid import Grid
 from r2s.solvers.mpm.sheet import Sheet, SheetState
 
@@ -20,6 +20,5 @@ __all__ = [
     "Grid",
     "Sheet",
     "SheetState",
-    "Surface",
     "layered",
 ]

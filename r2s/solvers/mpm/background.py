@@ -10,15 +10,7 @@ from jaxtyping import Array, Float
 from r2s._util.units import GRAVITY
 from r2s.environment.contact import SLIP_SPEED, Table
 from r2s.solvers.mpm.grid import Grid
-from r2s.solvers.mpm.transfer import (
-    affine_factor,
-    g2p,
-    g2p_plain,
-    g2p_through,
-    p2g,
-    p2g_few,
-    p2g_plain,
-)
+from r2s.solvers.mpm.transfer import affine_factor, g2p, g2p_plain, g2p_through, p2g, p2g_plain
 
 Vectors = Float[Array, "particle axis"]
 Matrices = Float[Array, "particle axis axis"]
@@ -99,7 +91,7 @@ class Background(eqx.Module):
             still = jnp.zeros_like(affine[:, :1])
             values = jnp.concatenate([momentum, mass[:, None]], axis=1)
             slopes = jnp.concatenate([affine, still], axis=1)
-            nodes = (p2g_plain if self.forward_mode else p2g)(self.grid, x, values, slopes)
+            nodes = self._to_nodes(x, values, slopes)
         floor = self.mass_floor * jnp.mean(mass)
         gripped = held is not None and held.x.shape[0]
         if not gripped and 3 ** x.shape[1] * x.shape[0] < nodes.shape[0]:
@@ -133,6 +125,9 @@ class Background(eqx.Module):
             v = self._gripped(v, mass, floor, held)
         return self._walled(self._on_table(v, friction, index[-1]), index)
 
+    def _to_nodes(self, x: Vectors, values: Array, slopes: Array) -> Array:
+        return (p2g_plain if self.forward_mode else p2g)(self.grid, x, values, slopes)
+
     def _index(self) -> list[Array]:
         """Of each axis, the indices of all nodes, each (node, 1)."""
         shape = self.grid.shape
@@ -148,7 +143,8 @@ class Background(eqx.Module):
         let the body creep out of the grip.
         """
         values = jnp.concatenate([held.mass[:, None] * held.v, held.mass[:, None]], axis=1)
-        nodes = p2g_few(self.grid, held.x, values)
+        flat = jnp.zeros((*values.shape, held.x.shape[1]), values.dtype)
+        nodes = self._to_nodes(held.x, values, flat)
         *carried, weight = jnp.split(nodes, nodes.shape[1], axis=1)
         share = jnp.minimum(quotient(weight, mass + floor) / GRIPPED, 1)
         grip = [quotient(each, weight + floor) for each in carried]

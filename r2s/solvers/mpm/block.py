@@ -11,8 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from r2s.environment.air import Air, Fan
-from r2s.environment.drag import drag_on_vertices
 from r2s.environment.scene import Control
 from r2s.materials.solid import Solid, product
 from r2s.mesh.mesh import Mesh
@@ -41,18 +39,6 @@ class BlockState(eqx.Module):
     failure: Int[Array, ""]
 
 
-class Surface(eqx.Module):
-    """The triangles on which air acts. Their vertices are the first particles of the body.
-
-    - `mesh`: the triangles.
-    - `air`, `fan`: as in a `Scene`.
-    """
-
-    mesh: Mesh
-    air: Air
-    fan: Fan | None = None
-
-
 class Block(eqx.Module):
     """A body in its surroundings, stepped explicitly.
 
@@ -63,7 +49,6 @@ class Block(eqx.Module):
     - `volume`: volumes of the particles at rest, [m^3]; in 2-D of a body of 1 m depth.
     - `held`, `handle_of`: the particles that grippers carry, and the handle that carries each.
     - `offset`: positions of the held particles relative to their handles, [m].
-    - `surface`: the triangles on which wind acts; None: no wind.
     - `dt`: step, [s].
     """
 
@@ -72,35 +57,21 @@ class Block(eqx.Module):
     held: Int[Array, " held"]
     handle_of: Int[Array, " held"]
     offset: Float[Array, "held axis"]
-    surface: Surface | None
     dt: float = eqx.field(static=True)
 
     @classmethod
     def make(
-        cls,
-        background: Background,
-        volume: Float[Array, " particle"],
-        solid: Solid,
-        dt: float,
-        surface: Surface | None = None,
+        cls, background: Background, volume: Float[Array, " particle"], solid: Solid, dt: float
     ) -> "Block":
-        """A solver for particles that no gripper holds.
+        """A solver in steps `dt` [s] for particles of `volume` [m^3] at rest that no gripper holds.
 
-        - `volume`: volumes of the particles at rest, [m^3].
-        - `solid`: the stiffest material that the solver will be used for.
-        - `dt`: step, [s].
-        - `surface`: the triangles on which wind acts; None: no wind.
-
-        Raises `ValueError` when the step is too long for the solid; the text gives the limit.
+        `solid`: the stiffest material that the solver will be used for. Raises `ValueError` when
+        the step is too long for it; the text gives the limit.
         """
         if not dt > 0:
             raise ValueError(f"dt must be positive, got {dt} s")
-        dimension = len(background.grid.shape)
-        if surface is not None and dimension != 3:
-            raise ValueError(f"wind on a surface needs a grid of 3 axes, got {dimension}")
-        none = jnp.zeros(0, int)
-        offset = jnp.zeros((0, dimension), float)
-        solver = cls(background, jnp.asarray(volume, float), none, none, offset, surface, float(dt))
+        none, offset = jnp.zeros(0, int), jnp.zeros((0, len(background.grid.shape)), float)
+        solver = cls(background, jnp.asarray(volume, float), none, none, offset, float(dt))
         solver.check(solid)
         return solver
 
@@ -153,9 +124,6 @@ class Block(eqx.Module):
         carried = Held(state.x[held], (goal - state.x[held]) / dt, mass[held])
         v = _put(state.v, held, carried.v)
         momentum = mass[:, None] * (1 - dt * fabric.mass_damping) * v
-        if self.surface is not None:
-            count = self.surface.mesh.rest.shape[0]
-            momentum = momentum.at[:count].add(dt * self._drag(state, control.wind))
         stress = jax.vmap(fabric.law.kirchhoff)(deformation)
         stress += fabric.damping * jax.vmap(fabric.law.viscous)(state.C)
         factor = -dt * affine_factor(self.background.grid) * self.volume
@@ -168,13 +136,6 @@ class Block(eqx.Module):
         failure = failure_of_step(self.background.grid, state.x, x, (fabric, control))
         failure = first_failure(state.failure, failure)
         return BlockState(self.background.project(x), v, C, deformation, failure)
-
-    def _drag(self, state: BlockState, wind: Array) -> Array:
-        surface = self.surface
-        assert surface is not None
-        count = surface.mesh.rest.shape[0]
-        x, v = state.x[:count], state.v[:count]
-        return drag_on_vertices(surface.mesh, surface.air, surface.fan, x, v, wind)
 
 
 def _put(values: Array, where: Array, held: Array) -> Array:

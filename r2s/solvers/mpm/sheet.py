@@ -84,41 +84,29 @@ class Sheet(eqx.Module):
         dt: float,
         membrane_damping: float | None = None,
         relaxation: float = RELAXATION,
-        compression: float = CONTACT,
-        shear: float = CONTACT,
-        walls: int = 0,
-        sticky: bool = False,
         forward_mode: bool = False,
     ) -> "Sheet":
-        """A solver for a scene on a grid.
+        """A solver for a scene on a grid, in steps `dt` [s].
 
-        - `fabric`: the stiffest fabric that the solver will be used for.
-        - `dt`: step, [s].
+        - `fabric`: the stiffest that the solver will be used for.
         - `membrane_damping`, `relaxation`: as in `ExplicitCloth.make`, [s].
-        - `compression`, `shear`: stiffnesses between layers, [N/m].
-        - `walls`, `sticky`, `forward_mode`: as in `Background`.
+        - `forward_mode`: as in `Background`.
 
         Raises `ValueError` when the step is too long for the fabric (the text gives the limit) or
         the mesh is too coarse for the grid.
         """
-        if not dt > 0 or not min(compression, shear) > 0:
-            raise ValueError(
-                f"dt [s], compression and shear [N/m] must be positive, got {dt}, {compression} "
-                f"and {shear}"
-            )
+        if not dt > 0:
+            raise ValueError(f"dt must be positive, got {dt} s")
         edge = longest_edge(scene.mesh)
         if edge > COARSEST * grid.spacing:
             raise ValueError(
                 f"the mesh has an edge of {edge:.4g} m, the grid a spacing of {grid.spacing:.4g} "
                 f"m: edges may be {COARSEST} spacings long, or layers slip through between vertices"
             )
-        background = Background.make(
-            grid, scene.table, walls=walls, sticky=sticky, forward_mode=forward_mode
-        )
         solver = cls(
             scene,
-            background,
-            between_layers(compression, shear),
+            Background.make(grid, scene.table, forward_mode=forward_mode),
+            between_layers(),
             None if membrane_damping is None else jnp.asarray(membrane_damping, float),
             jnp.asarray(relaxation, float),
             float(dt),
@@ -132,7 +120,7 @@ class Sheet(eqx.Module):
         mesh, spacing = self.scene.mesh, self.background.grid.spacing
         with jax.ensure_compile_time_eval():
             times = self.membrane_damping, self.relaxation
-            longest = stable_step(mesh, spacing, fabric, *times, self.transverse)
+            longest = stable_step(mesh, spacing, fabric, *times)
         check_step(self.dt, longest, "the fabric, the mesh and the grid")
 
     def fits(self, fabric: Fabric) -> Bool[Array, ""]:
@@ -229,34 +217,25 @@ def stable_step(
     fabric: Fabric,
     membrane_damping: Float[Array, ""] | float | None = None,
     relaxation: Float[Array, ""] | float = RELAXATION,
-    transverse: Transverse | None = None,
 ) -> Float[Array, ""]:
     """The longest step [s] that is stable for a fabric near its rest shape.
 
-    - `spacing`: spacing of the grid, [m].
+    - `spacing`: of the grid, [m].
     - `membrane_damping`, `relaxation`: as in `Sheet`, [s].
-    - `transverse`: compression and shear between layers; None: the default stiffnesses.
 
     The squares of the highest frequencies of membrane, bending and layers have bounds that add.
     The grid only lowers the frequencies of the mesh.
     """
-    if transverse is None:
-        transverse = between_layers()
     damping = fabric.damping if membrane_damping is None else jnp.asarray(membrane_damping, float)
-    return longest_relaxing_step(
-        membrane_frequency(mesh, fabric),
-        damping,
-        jnp.asarray(relaxation, float),
-        [
-            (bending_frequency(mesh, fabric), fabric.damping),
-            (transverse.frequency(fabric.density, spacing), jnp.zeros((), float)),
-        ],
-    )
+    layers = between_layers().frequency(fabric.density, spacing)
+    others = [(bending_frequency(mesh, fabric), fabric.damping), (layers, jnp.zeros((), float))]
+    membrane, relaxing = membrane_frequency(mesh, fabric), jnp.asarray(relaxation, float)
+    return longest_relaxing_step(membrane, damping, relaxing, others)
 
 
-def between_layers(compression: float = CONTACT, shear: float = CONTACT) -> Transverse:
-    """Compression and shear [N/m] between layers that start to press at `ONSET`."""
-    return Transverse(*(jnp.asarray(value, float) for value in (compression, shear, ONSET)))
+def between_layers() -> Transverse:
+    """Compression and shear between layers."""
+    return Transverse(*(jnp.asarray(value, float) for value in (CONTACT, CONTACT, ONSET)))
 
 
 def longest_edge(mesh: Mesh) -> float:

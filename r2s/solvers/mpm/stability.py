@@ -2,11 +2,10 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from r2s.solvers.failures import Failure
+from r2s.solvers.failures import Failure, all_finite
 from r2s.solvers.mpm.grid import Grid
 
 Points = Float[Array, "particle axis"]
@@ -25,11 +24,7 @@ def failure_of_step(grid: Grid, before: Points, after: Points, inputs: Any) -> I
     """
     outside = ~jnp.all(grid.inside(after))
     thrown = jnp.any(jnp.abs(after - before) > grid.spacing)
-    unstable = ~_all_finite(after) | (outside & thrown)
+    unstable = ~all_finite(after) | (outside & thrown)
     code = jnp.where(outside, Failure.GRID.value, Failure.NONE.value)
     code = jnp.where(unstable, Failure.TIME_STEP.value, code)
-    return jnp.where(_all_finite((before, inputs)), code, Failure.NON_FINITE.value)
-
-
-def _all_finite(tree: Any) -> Array:
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
+    return jnp.where(all_finite((before, inputs)), code, Failure.NON_FINITE.value)

@@ -106,18 +106,6 @@ def _around_reverse(saved, columns):
     return _no_slope(grid), np.zeros(first.shape, jax.dtypes.float0), nodes
 
 
-def p2g_few(grid: Grid, x: Points, values: Values) -> Nodes:
-    """`p2g` without slopes in one addition, which compiles fast, for a few particles."""
-    stencil = _Stencil(grid, x)
-    weights = jnp.ones((x.shape[0], 1), x.dtype)
-    for axis in stencil.weights:
-        products = weights[:, :, None] * jnp.concatenate(axis, axis=1)[:, None]
-        weights = products.reshape(x.shape[0], 3 * weights.shape[1])
-    nodes = jnp.zeros((math.prod(grid.shape), values.shape[1]), values.dtype)
-    where = stencil.first[:, None] + jnp.asarray(_offsets(grid), int)[None]
-    return nodes.at[where].add(weights[:, :, None] * values[:, None], mode="promise_in_bounds")
-
-
 def _pairing_slope(grid: Grid, x: Points, values: Values, slopes: Slopes, nodes: Nodes) -> Points:
     """The derivative in x of sum_ip w_ip (value_p + slope_p d_ip) . node_i.
 

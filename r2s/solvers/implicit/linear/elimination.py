@@ -12,7 +12,6 @@ from r2s.solvers.implicit.linear.dissection import levels
 from r2s.solvers.implicit.linear.factor import Order
 from r2s.solvers.implicit.linear.pattern import Pattern
 
-ORDERS = "band", "wide band", "dissection"
 WIDEST = 160  # vertices: of wider bands nested dissection is faster
 
 
@@ -33,17 +32,14 @@ class Elimination(eqx.Module):
         cls,
         mesh: Mesh,
         couples_all: bool = False,
-        order: Literal["band", "wide band", "dissection"] | None = None,
+        order: Literal["band", "dissection"] | None = None,
     ) -> "Elimination":
         """The elimination of a mesh that is not traced, since its sizes follow from the mesh.
 
-        With `couples_all` any two vertices may be coupled, as self-contact does in small meshes.
-        `order`: a wide band has groups as large as its width, so fewer of them; None: on a CPU a
-        band where it is narrow, elsewhere dissection, which launches the fewest kernels. Where all
-        are coupled there is none to choose. Raises `ValueError` for another order.
+        With `couples_all` any two vertices may be coupled, as self-contact does in small meshes:
+        then there is no `order` to choose. None: on a CPU a band where it is narrow, elsewhere
+        dissection, which launches the fewest kernels.
         """
-        if order is not None and (couples_all or order not in ORDERS):
-            raise ValueError(f"order is one of {ORDERS}; None where all are coupled; got {order!r}")
         rest = np.asarray(mesh.rest)
         elements = {
             "samples": mesh.samples.corners,
@@ -56,9 +52,9 @@ class Elimination(eqx.Module):
         blocks = np.asarray(pattern.rows), np.asarray(pattern.columns)
         if couples_all:
             return cls(pattern, levels(rest, *blocks, leaf=len(rest)), couples_all)
-        narrow = Band.make(rest, *blocks)
-        is_short = narrow.width <= WIDEST and jax.default_backend() == "cpu"
-        chosen = order or ("band" if is_short else "dissection")
-        if chosen == "dissection":
+        if order == "dissection":
             return cls(pattern, levels(rest, *blocks))
-        return cls(pattern, narrow if chosen == "band" else Band.make(rest, *blocks, narrow.width))
+        band = Band.make(rest, *blocks)
+        if order == "band" or (band.width <= WIDEST and jax.default_backend() == "cpu"):
+            return cls(pattern, band)
+        return cls(pattern, levels(rest, *blocks))
