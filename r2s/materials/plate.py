@@ -11,12 +11,12 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from r2s._util.units import Scalar, isotropic_bending
 from r2s.materials.bending import BendingLaw
-from r2s.mesh.bends import Bends
 from r2s.mesh.mesh import Mesh
+from r2s.mesh.plate_elements import PlateElements
 
 
 class PlateLaw(BendingLaw):
@@ -29,35 +29,17 @@ class PlateLaw(BendingLaw):
     element: ClassVar[str] = "plate"
     bend: ClassVar[str] = "plate_bends"
 
-    @abstractmethod
     def at(self, curvature: Float[Array, " 3"]) -> "PlateLaw":
-        """The law of a time step for an element which starts near this curvature [1/m]."""
+        """The law of a time step near a curvature [1/m]: itself, as its energy says it all."""
+        return self
 
     @abstractmethod
     def energy_density(self, curvature: Float[Array, " 3"]) -> Float[Array, ""]:
         """Energy per rest area [J/m^2] at a curvature (k11, k22, 2 k12) [1/m]."""
 
-    def bends(self, mesh: Mesh) -> Bends:
-        """Those of the mesh's plate elements."""
-        return mesh.plate.bends
-
-    def vertices(self, mesh: Mesh) -> Int[Array, "element place"]:
-        """The vertices that each element's curvature depends on."""
-        return mesh.plate.vertices
-
-    def areas(self, mesh: Mesh) -> Float[Array, " element"]:
-        """The rest areas [m^2] of the elements."""
-        return mesh.plate.areas
-
-    def curvatures(self, mesh: Mesh, bends: Float[Array, " bend"]) -> Float[Array, "element 3"]:
-        """The curvatures (k11, k22, 2 k12) [1/m] of the elements, from those of the bends."""
-        return mesh.plate.curvatures(bends)
-
-    def gradients(
-        self, mesh: Mesh, bends: Float[Array, "bend corner 3"]
-    ) -> Float[Array, "element 3 place 3"]:
-        """Derivatives [1/m^2] of the elements' curvatures in their vertices, from the bends'."""
-        return mesh.plate.gradients(bends)
+    def elements(self, mesh: Mesh) -> PlateElements:
+        """The plate elements of the mesh."""
+        return mesh.plate
 
     def on_elements(self, mesh: Mesh, bends: Float[Array, " bend"]) -> Any:
         """The law of every element, by its curvature."""
@@ -98,10 +80,6 @@ class PlateBending(PlateLaw):
             isotropic_bending(youngs_modulus, poissons_ratio, thickness), poissons_ratio
         )
 
-    def at(self, curvature: Float[Array, " 3"]) -> "PlateBending":
-        """Itself: its stiffness is constant."""
-        return self
-
     def energy_density(self, curvature: Float[Array, " 3"]) -> Float[Array, ""]:
         """Energy per rest area [J/m^2] at a curvature [1/m]: Timoshenko and Woinowsky-Krieger 1959,
         section 21.
@@ -123,10 +101,6 @@ class OrthotropicPlate(PlateLaw):
     warp: Float[Array, "*batch"]
     bias: Float[Array, "*batch"]
     weft: Float[Array, "*batch"]
-
-    def at(self, curvature: Float[Array, " 3"]) -> "OrthotropicPlate":
-        """Itself: its stiffness is constant."""
-        return self
 
     def energy_density(self, curvature: Float[Array, " 3"]) -> Float[Array, ""]:
         """Energy per rest area [J/m^2] at a curvature [1/m]."""

@@ -173,9 +173,8 @@ def plate_stiffness(
 def plate_solid(c11: Scalar, c12: Scalar, bending: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     """Young's modulus [Pa], Poisson's ratio [-] and thickness [m] of a plate of given stiffness.
 
-    The inverse of `plate_stiffness`, from C11 and C12 [N/m] and the bending stiffness [N m] of an
-    isotropic sheet: nu = C12 / C11, h^2 = 12 B / C11. A fabric is as a rule thicker than the solid
-    plate that bends like it.
+    The inverse of `plate_stiffness`: nu = C12 / C11, h^2 = 12 B / C11, from C11 and C12 [N/m] and
+    the bending stiffness B [N m] of an isotropic sheet.
 
     >>> membrane, bending = plate_stiffness(1e5, 0.3, 1e-3)
     >>> [round(x, 6) for x in plate_solid(membrane[0], membrane[1], bending)]

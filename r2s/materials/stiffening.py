@@ -89,10 +89,6 @@ class SofteningPlate(PlateLaw):
     loss: Float[Array, "*batch"]
     knee: Float[Array, "*batch"]
 
-    def at(self, curvature: Float[Array, " 3"]) -> "SofteningPlate":
-        """Itself: its energy says it all."""
-        return self
-
     def energy_density(self, curvature: Float[Array, " 3"]) -> Float[Array, ""]:
         """Energy per rest area [J/m^2] at a curvature (k11, k22, 2 k12) [1/m]."""
         full = self.small.energy_density(curvature)

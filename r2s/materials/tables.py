@@ -5,8 +5,8 @@ Transactions on Graphics 30(4), 2011) measured fabrics as such tables; ARCSim an
 and `r2s.materials.arcsim` reads their files.
 
 What was measured is a secant stiffness: stress = C(E) E, bending moment = B(kappa) kappa. Such a
-stress derives from no energy. So a law here has no energy of its own: a time step takes from `at`
-the law whose stiffness is held at what it is near the start of the step, which has one.
+stress derives from no energy: a time step takes from `at` the law of constant stiffness at its
+start.
 """
 
 import equinox as eqx
@@ -36,21 +36,17 @@ class TableMembrane(eqx.Module):
     def at(self, strain: Float[Array, " 3"]) -> OrthotropicMembrane:
         """The constant stiffness that the law has at a strain (E11, E22, 2 E12) [-].
 
-        Linear in the largest principal stretch, from row 0 to the large-strain rows, and between
-        those in its direction; constant in compression and beyond the table. A sheet that stretches
-        alike in all directions gets the row of 45 degrees. Some measured numbers are negative where
-        a stiffness cannot be: C33 is raised to zero, and C12 limited to what C11 and C22 allow.
+        Linear in the largest principal stretch and, between the large-strain rows, in its
+        direction; constant in compression and beyond the table; of an isotropic stretch the row of
+        45 degrees. A negative C33 is raised to zero, C12 limited to what C11 and C22 allow.
         """
         stretch, angle = _principal(strain)
         weight = jnp.clip((stretch - 1) / LARGE_STRETCH, 0, 1)
         return _stable(_stretched(self.stiffness, weight, 8 * angle / jnp.pi))
 
     def energy_density(self, strain: Float[Array, " 3"]) -> Float[Array, ""]:
-        """Energy per rest area [J/m^2] at a Green strain (E11, E22, 2 E12) [-] of a sheet that has
-        had the stiffness it has there all along.
-
-        Its gradient is not the stress, since the stiffness changes with the strain: the stress is
-        the gradient of the energy of `at(strain)`.
+        """Energy per rest area [J/m^2] at a Green strain (E11, E22, 2 E12) [-], of the stiffness
+        there. Its gradient is not the stress, which is that of the energy of `at(strain)`.
         """
         return self.at(strain).energy_density(strain)
 
@@ -61,9 +57,8 @@ class TableBending(HingeLaw):
     - `stiffness`: as published [N m]. Rows are the directions 0, 45 and 90 degrees of an edge from
       the warp; columns the curvatures theta l / A of 0, 10, 20, 30 and 40 1/m at the edge.
 
-    The published stiffness k is the one of the force k l^2 / (4 A) theta dtheta/dx of an edge with
-    angle theta and length l, A the areas of its two triangles. The hinge of r2s has the energy
-    A B (theta l / A)^2 / 2, so the force B l^2 / A theta dtheta/dx: its B is k / 4.
+    The published stiffness k is that of the force k l^2 / (4 A) theta dtheta/dx of an edge of
+    length l, A the areas of its two triangles; here it is B l^2 / A theta dtheta/dx: B is k / 4.
     """
 
     stiffness: Float[Array, "*batch 3 5"]

@@ -94,6 +94,30 @@ class Bends(eqx.Module):
         return jnp.moveaxis(total, -1, 0)
 
 
+class HingeElements(eqx.Module):
+    """The hinges of a mesh as elements of one curvature each.
+
+    - `bends`: the hinges themselves.
+    - `areas`: rest areas of their two faces together, [m^2].
+    """
+
+    bends: Bends
+    areas: Float[Array, " hinge"]
+
+    @property
+    def vertices(self) -> Int[Array, "hinge 4"]:
+        """The ends of each hinge's edge, then the vertices opposite to it."""
+        return self.bends.vertices
+
+    def curvatures(self, bends: Float[Array, " hinge"]) -> Float[Array, " hinge"]:
+        """The curvatures [1/m] of the hinges, from those of the bends."""
+        return bends
+
+    def gradients(self, bends: Float[Array, "hinge 4 3"]) -> Float[Array, "hinge 1 4 3"]:
+        """The gradients [1/m^2] of the hinges, from those of the bends."""
+        return bends[:, None]
+
+
 _PARTS = ((0, 1, 2), (0, 1), (0, 2))  # the two wings are not coupled
 
 

@@ -40,13 +40,12 @@ class Solver(Protocol[State]):
 
 
 def predicted_memory(function: Callable, *args) -> int:
-    """The memory [byte] that a jitted call of `function` on `args` will need, before it runs.
+    """The memory [byte] that a jitted call of `function` on `args` will need, as compiled.
 
-    That of arguments, results and all that is held between, as the compiler lays it out:
+    That of arguments, results and all that is held between. Nothing runs. What a device's libraries
+    take for themselves comes on top.
 
         predicted_memory(jax.value_and_grad(loss), fabric)
-
-    It compiles, and runs nothing. What a device's libraries take for themselves comes on top.
     """
     arrays, static = eqx.partition(args, eqx.is_array)
     run = jax.jit(lambda arrays: eqx.filter(function(*eqx.combine(arrays, static)), eqx.is_array))
@@ -99,15 +98,12 @@ def simulate(
 ) -> Trajectory:
     """The motion under `controls`, whose leading axes are (frame, substep).
 
-    Raises `ValueError` for a fabric that is too stiff for the solver's steps (`Solver.check`). A
-    run with a traced one fails in its first step (`Solver.fits`, `Failure.TIME_STEP`).
+    `frames`: how many are simulated, which may be traced; the others repeat the last. None: all.
+    Raises `ValueError` for a fabric that is too stiff for the solver's steps (`Solver.check`); a
+    run with a traced one fails in its first step (`Failure.TIME_STEP`).
 
-    `frames`: how many are wanted, which may be traced: what comes after them is not simulated, and
-    repeats the last. None: all.
-
-    A `lax.scan` over frames and steps. Reverse mode keeps one state a frame, and of every step its
-    solution, so that it solves nothing again. Without `keep_solutions` it keeps no more than the
-    states of the frames, and those of the steps of one frame at a time, which it solves again: the
+    Reverse mode keeps one state a frame, and of every step its solution. Without `keep_solutions`
+    it keeps the states of the frames alone and solves the steps of one frame at a time again: the
     time of one more forward run, for the memory of about frames + substeps states.
     """
     if not is_traced(solver, fabric):

@@ -55,16 +55,13 @@ def stream(
     """The number of the first member of each chunk, and the results of the chunk, as they come.
 
     - `members`: a pytree of arrays with a leading axis, all of the same length.
-    - `chunk`: members at once, rounded up to a multiple of the devices; the last is filled up with
-      copies, whose results are left out. It must fit in memory; the whole need not.
-    - `folder`: where each chunk's result is kept, whole or not at all. One that is there for the
-      same members is read, not made again: an interrupted sweep goes on. What the function itself
-      depends on is not looked at: take another folder for another function.
+    - `chunk`: members at once, rounded up to a multiple of the devices.
+    - `folder`: where each chunk's result is kept. One that is there for the same members is read,
+      so that an interrupted sweep goes on. Take another folder for another function.
     - `devices`: a mesh with the axis "member"; by default all devices of all processes.
 
-    What diverges is in the results, and stops nothing: NaN, and of a `r2s.Trajectory`, if the
-    function returns it, `ok` and the reason. Raises `ValueError` for arrays of different lengths,
-    or none, and before it runs `MemoryError` for a chunk that does not fit the memory of a device.
+    A member that diverges stops nothing. Raises `ValueError` for arrays of different lengths, or
+    none, and before it runs `MemoryError` for a chunk that does not fit the memory of a device.
     """
     devices = all_devices() if devices is None else devices
     count = _length(members)

@@ -1,7 +1,5 @@
 """The cloth in time: conservation laws, statics, order of convergence, and the step's algebra."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -116,20 +114,6 @@ def test_damping_is_proportional_to_stiffness():
     period = 2 * np.pi / rate
     # 3 %: triangles and vertices share the mass unevenly
     assert peaks[1] / peaks[0] == pytest.approx(np.exp(-(rate**2) * 0.005 / 2 * period), rel=0.03)
-
-
-@pytest.mark.parametrize("stiffness", [20.0, 1000.0])
-def test_a_hanging_sheet_stretches_under_its_weight(sheet, stiffness):
-    fabric = Fabric.make(0.2, (stiffness, 0.0, stiffness, stiffness / 2), 1e-5, damping=0.1)
-    solver = cloth(sheet, FIRST_ROW)
-    x = roll(solver, fabric, solver.init(hanging(sheet)), 400).x[-1]
-    height = x[:, 2].reshape(SHAPE).mean(axis=1)
-    # nominal tension T = C s (s^2 - 1) / 2 at a stretch s, and T = weight below
-    cell = SIZE / (SHAPE[0] - 1)
-    tensions = 0.2 * GRAVITY * (SIZE - cell * (np.arange(4) + 0.5))
-    stretches = [np.roots([stiffness / 2, 0, -stiffness / 2, -t]).real.max() for t in tensions]
-    expected = cell * np.sum(np.array(stretches) - 1)
-    assert height[0] - height[-1] - SIZE == pytest.approx(expected, rel=0.01)
 
 
 def test_handles_are_where_they_are_put(sheet, fabric):
@@ -290,13 +274,6 @@ def test_extreme_fabrics_stay_finite(is_double):
             states = roll(solver, fabric, solver.init(start), 10, path)
             assert states.x.dtype == (np.float64 if is_double else np.float32)
             assert np.all(np.isfinite(states.x))
-
-
-def test_a_step_that_does_not_converge_is_nan(sheet, fabric):
-    solver = dataclasses.replace(cloth(sheet, FIRST_ROW), max_iterations=1)
-    state = solver.init(hanging(sheet, 0.5))
-    after = step(solver, fabric, state, Control(state.x[:5], jnp.zeros(3)))
-    assert jnp.all(jnp.isnan(after.x))
 
 
 @pytest.mark.parametrize("dt", [0.0, -0.01, float("nan")])

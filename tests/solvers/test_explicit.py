@@ -106,7 +106,7 @@ def test_too_few_substeps_and_self_contact_are_refused(sheet, fabric):
     limit = float(stable_step(sheet, fabric))
     with pytest.raises(ValueError, match=f"limited by .* to {limit:.4g} s"):
         explicit(sheet, fabric, dt=2 * limit, substeps=1)
-    with pytest.raises(ValueError, match="contact of the sheet with itself"):
+    with pytest.raises(ValueError, match="contact of the sheet with itself.*material_points"):
         explicit(sheet, fabric, self_contact=True)
 
 
@@ -164,16 +164,6 @@ def test_friction_stops_a_sliding_sheet_after_the_way_of_coulomb(fabric):
     lost = 0.3 - jnp.mean(slid.v[:, 0])
     assert float(lost) == pytest.approx(float(fabric.friction) * GRAVITY * 0.03, rel=0.05)
     assert float(jnp.mean(moved(solver, fabric, height=rest, v=v, steps=30).v[:, 0])) < 1e-3
-
-
-def test_substeps_that_are_too_long_for_a_traced_fabric_are_a_recorded_failure(sheet, fabric):
-    solver = explicit(sheet, fabric)
-    stiff = eqx.tree_at(
-        lambda f: f.membrane, fabric, jax.tree.map(lambda c: 1e4 * c, fabric.membrane)
-    )
-    v = jax.random.normal(jax.random.key(0), (len(sheet.rest), 3))
-    exploded = moved(solver, stiff, v=v, steps=4)
-    assert int(exploded.failure) == Failure.TIME_STEP
 
 
 def test_a_motion_in_explicit_steps_has_its_derivative(fabric):
@@ -330,9 +320,3 @@ def test_explicit_steps_of_a_lift_go_where_small_implicit_ones_go(fabric):
     )
     assert apart < 1e-3
     assert lightly > 3 * apart  # the membrane's damping is felt
-
-
-def test_explicit_steps_refuse_self_contact_and_say_what_has_it(fabric):
-    scenario = r2s.folding((0.2, 0.2)).scenario((4, 4), self_contact=True)
-    with pytest.raises(ValueError, match="material_points"):
-        r2s.explicit_cloth(scenario, fabric)

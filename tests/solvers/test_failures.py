@@ -43,6 +43,7 @@ def test_newton_that_is_cut_short_is_named_with_frame_and_step(sheet, fabric):
     assert moved.failure == Failure.NEWTON.value and not bool(jnp.any(moved.ok))
     assert (int(moved.failed_frame), int(moved.failed_step)) == (0, 0)
     assert "frame 0, step 0" in moved.explain() and "Newton" in moved.explain()
+    assert bool(jnp.all(jnp.isnan(moved.x)))
 
 
 def test_the_frame_and_step_are_those_in_which_it_failed(sheet, fabric):

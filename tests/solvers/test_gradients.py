@@ -117,47 +117,6 @@ def test_the_gradient_agrees_with_differences(name, value_and_grad, gradient, in
     assert abs(found) > 1e-12  # so the motion does depend on it
 
 
-@pytest.fixture(scope="module")
-def hung(sheet, fabric):
-    """A sheet that hangs from its first row, taut, in wind: value and gradient, and its inputs."""
-    fixed = cloth(sheet, held=range(5), air=AIR_DENSITY)
-    solver = Cloth.make(fixed.scene, DT, tolerance=1e-13)
-    x = jnp.stack([0 * sheet.rest[:, 0], sheet.rest[:, 1], -1.01 * sheet.rest[:, 0]], axis=1)
-    path = x[:5][None] + jnp.array([0.0, 0.3, 1.0])[:, None, None] * jnp.array(
-        [[[0.02, 0.01, 0.0]]]
-    )
-    still = jnp.asarray(-jnp.inf, float)
-    wind = jnp.array([1.5, 0.4, 0.2])
-    inputs = Inputs(fabric, x, everywhere([0.05, 0.02, 0.0], sheet), path, still, wind)
-    weights = jax.random.normal(jax.random.key(1), (FRAMES, 25, 3))
-
-    def loss(inputs):
-        times = jnp.arange(1, FRAMES * SUBSTEPS + 1).astype(float) * DT
-        handles = along_path(times, jnp.array([0.0, 0.1, 0.3]), inputs.path)
-        wind = jnp.broadcast_to(inputs.wind, (FRAMES, SUBSTEPS, 3))
-        controls = Control(handles.reshape(FRAMES, SUBSTEPS, 5, 3), wind)
-        start = solver.init(inputs.x, inputs.v)
-        return jnp.sum(weights * simulate(solver, inputs.fabric, start, controls).x)
-
-    return jax.jit(jax.value_and_grad(loss)), inputs
-
-
-@pytest.mark.slow(group="cloth")
-@pytest.mark.parametrize("name", sorted(WHERE.keys() - {"friction", "thickness", "table height"}))
-def test_without_contact_the_gradient_agrees_more_closely(name, hung):
-    value_and_grad, inputs = hung
-    where, size = WHERE[name]
-
-    def value(part):
-        return value_and_grad(eqx.tree_at(where, inputs, part))[0]
-
-    direction = jax.random.normal(jax.random.key(2), where(inputs).shape)
-    expected = directional_difference(value, where(inputs), direction, size)
-    found = jnp.sum(where(value_and_grad(inputs)[1]) * direction)
-    assert found == pytest.approx(float(expected), rel=1e-5)
-    assert abs(found) > 1e-12
-
-
 @pytest.mark.slow(group="cloth")
 def test_forward_mode_equals_reverse_mode(loss, gradient, inputs):
     keys = iter(jax.random.split(jax.random.key(3), 20))

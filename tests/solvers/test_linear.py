@@ -108,15 +108,6 @@ def test_every_depth_of_dissection_and_every_group_gives_the_same(problem):
         assert np.asarray(found) == pytest.approx(np.asarray(expected), rel=1e-8, abs=1e-10)
 
 
-def test_every_vertex_is_eliminated_once(problem):
-    mesh, equations = problem[:2]
-    count = len(mesh.rest)
-    order = equations.order
-    parts = [order.order] if isinstance(order, Band) else [level.pivots for level in order]
-    pivots = np.concatenate([np.asarray(part).ravel() for part in parts])
-    assert np.array_equal(np.sort(pivots[pivots < count]), np.arange(count))
-
-
 def test_an_indefinite_matrix_has_no_factor(problem):
     mesh, equations, _, blocks = problem
     vertex = len(mesh.rest) // 2

@@ -69,19 +69,6 @@ def test_all_pairs_of_a_small_mesh_are_all_of_its_pairs():
     assert as_set(all_pairs(faces)) == met | crossed
 
 
-@pytest.mark.parametrize("shape", [(9, 9), (17, 17)])
-def test_all_pairs_are_as_many_as_there_are(shape):
-    faces, rest = sheet(shape)
-    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 0, 2]].reshape(-1, 2)), axis=0)
-    degrees = np.bincount(edges.ravel())
-    met = len(faces) * (len(rest) - 3)
-    crossed = len(edges) * (len(edges) - 1) // 2 - np.sum(degrees * (degrees - 1) // 2)
-    pairs = all_pairs(faces)
-    assert int(np.sum(pairs.is_edges)) == crossed
-    assert pairs.stencils.shape == (met + crossed, 4)
-    assert np.all(pairs.is_real)
-
-
 def test_a_mesh_without_pairs_is_an_error():
     with pytest.raises(ValueError, match="no pairs"):
         all_pairs(np.array([[0, 1, 2]]))
@@ -142,16 +129,6 @@ def test_too_many_pairs_are_reported_and_the_first_are_kept():
         assert bool(is_over) == expected
         assert np.all(found.is_real)
         assert np.array_equal(found.stencils, whole.stencils[:size])
-
-
-def test_what_fills_up_is_no_pair():
-    faces, rest = sheet((5, 5))
-    pairs, (start, end) = all_pairs(faces), crumpled(rest, 0)
-    size = len(pairs.is_real)
-    found, _ = found_near(pairs, start, end, jnp.asarray(5e-3), size)
-    assert not np.any(np.asarray(found.stencils)[~np.asarray(found.is_real)])
-    again, _ = found_near(found, start, end, jnp.asarray(5e-3), size)
-    assert eqx.tree_equal(again, found)
 
 
 def test_sheets_can_be_searched_at_once():

@@ -92,14 +92,6 @@ def test_single_precision_finds_the_same_distance(kind):
     assert np.max(np.abs(found - expected)) < 1e-6
 
 
-@pytest.mark.parametrize(("is_edges", "regions"), [(False, 7), (True, 9)])
-def test_every_region_occurs(is_edges, regions):
-    # inside, on the edges, at the corners; for two edges: inside or at an end of each
-    corners, of_edges = pairs("anywhere")
-    weights = np.asarray(weights_of(corners, of_edges))[of_edges == is_edges]
-    assert len(np.unique(weights != 0, axis=0)) == regions
-
-
 def grid(is_edges: bool, count: int = 15):
     """Weights of points all over a pair's bodies."""
     s, t = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(0, 1, count)]))
@@ -344,20 +336,6 @@ def test_an_impact_is_never_late_and_hardly_early(kind, dtype):
     within = history[0] < GAP - rounding
     stays = (history.min(axis=0) < 0.97 * history[0]) | (history[-1] < GAP - rounding)
     assert np.all(found[within & stays] == 0)
-
-
-def test_all_motions_of_lattice_points_have_a_time():
-    start, end = pairs("lattice", 6)[0], pairs("lattice", 7)[0]
-    found = np.asarray(impacts(start, end, np.arange(COUNT) % 2 == 0, 0.1))
-    assert np.all((found >= 0) & ((found <= 1) | np.isinf(found)))
-    assert np.isfinite(found).any() and np.isinf(found).any()
-
-
-def test_one_pair_and_many_have_the_same_times():
-    start, end, is_edges = motions("fast", np.float64, 5)
-    found = impacts(start, end, is_edges, GAP)[:50]
-    alone = [one_impact(start[i], end[i], is_edges[i], GAP) for i in range(50)]
-    assert np.asarray(found) == pytest.approx(np.array(alone), rel=1e-9)
 
 
 def test_an_impact_that_takes_too_many_advances_is_early(monkeypatch):

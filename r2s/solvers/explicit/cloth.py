@@ -104,10 +104,9 @@ class ExplicitCloth(eqx.Module):
     ) -> "ExplicitCloth":
         """A solver for a scene, whose mesh must not be traced.
 
-        - `fabric`: the stiffest that it will be used for; of a batch, with a leading axis on every
-          array, that is the member which needs the shortest substeps.
-        - `membrane_damping`: as in `ExplicitCloth`. `relaxation`: of its viscosity, [s]
-          (`viscosity`); 0: plain Kelvin-Voigt damping, in far shorter substeps.
+        - `fabric`: the stiffest that it will be used for, or a batch of all.
+        - `membrane_damping`, `relaxation`: as in `ExplicitCloth`. A relaxation of 0 is plain
+          Kelvin-Voigt damping, in far shorter substeps.
         - `substeps`: in a step; None: the fewest below `stable_step`.
 
         Raises `ValueError` for a step that is not positive, for substeps that are too long, with
@@ -162,7 +161,7 @@ class ExplicitCloth(eqx.Module):
     ) -> ExplicitState:
         """A state from positions [m] and velocities [m/s] (default: zero).
 
-        The `acceleration` is of no use: a step needs nothing of the step before.
+        The `acceleration` is not used.
         """
         v = jnp.zeros_like(x) if v is None else v
         return ExplicitState(x, v, *no_memory(self.scene.mesh, self.grid, x.dtype), no_failure())

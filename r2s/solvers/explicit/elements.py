@@ -86,8 +86,8 @@ def bending_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
     bends = law.bends(mesh)
     if not bends.vertices.shape[0]:
         return jnp.zeros((), float)
-    vertices, areas = law.vertices(mesh), law.areas(mesh)
-    rates = law.gradients(mesh, bends.gradients(_flat(mesh)))
+    vertices, areas = law.elements(mesh).vertices, law.areas(mesh)
+    rates = law.elements(mesh).gradients(bends.gradients(_flat(mesh)))
     count, size = rates.shape[:2]
     unbent = jnp.zeros(bends.vertices.shape[0], mesh.rest.dtype)
     laws, flat = law.on_elements(mesh, unbent), law.curvatures(mesh, unbent)

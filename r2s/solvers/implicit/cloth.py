@@ -85,9 +85,6 @@ class Cloth(eqx.Module):
     ) -> "Cloth":
         """A cloth solver for a scene, whose table and air may be traced, but not its mesh.
 
-        At equal steps a `spectral_radius` of 0.6 makes 0.2 to 0.6 of BDF2's error in free motion,
-        until the sheet buckles another way; on a table it gains less.
-
         Raises `ValueError` for a step that is not positive, or too long for self-contact, for a
         spectral radius beyond its limits, and for one with self-contact.
         """
@@ -116,8 +113,7 @@ class Cloth(eqx.Module):
     ) -> ClothState:
         """A state from positions [m], velocities [m/s], accelerations [m/s^2] (default: zero).
 
-        The acceleration makes up the step before. The motion is second order in `dt` when it is
-        right: zero for a sheet that starts in equilibrium. Otherwise the velocity lags by half a
+        The acceleration extrapolates the step before; with a wrong one the velocity lags by half a
         step's change, once and for all.
         """
         v = jnp.zeros_like(x) if v is None else v
@@ -136,10 +132,8 @@ class Cloth(eqx.Module):
     def step_with_forces(
         self, fabric: Fabric, state: ClothState, control: Control
     ) -> tuple[ClothState, Float[Array, "handle 3"]]:
-        """The state `dt` later, and the grippers' forces [N] on the held vertices.
-
-        The derivative of the step's potential in their place, which vanishes for free vertices;
-        self-contact is left out.
+        """The state `dt` later, and the grippers' forces [N] on the held vertices, without those
+        of self-contact.
         """
         after = self.step(fabric, state, control)
         forces = residual(self.potential(fabric, state, control), after.x)
@@ -255,11 +249,8 @@ def prepare_mesh(scene: Scene, self_contact: bool) -> tuple[Elimination, SelfCon
 def loss_tolerance(dt: float) -> float:
     """The tolerance [m] of a step [s] whose errors are lost in those of mesh and time step.
 
-    It is 1e-5 m at 1/60 s and above, and shrinks with the square of the step, as what the formula
-    leaves in it, down to 1e-6 m, near the rounding. Lifts of three fabrics in steps of 1/45 s move
-    by 0.007 to 0.017 mm from 1e-6 m at 9 x 9 vertices, and by 0.014 to 0.31 mm at 17 x 17 (rms over
-    the motion), where a vertex that is about to buckle goes up to 7 mm another way. There 1e-6 m
-    itself differs by 0.18 mm from half of it.
+    1e-5 m at 1/60 s and above, shrinking with the square of the step as the formula's error does,
+    down to 1e-6 m, near the rounding.
     """
     return min(max(1e-5 * (60 * dt) ** 2, 1e-6), 1e-5)
 

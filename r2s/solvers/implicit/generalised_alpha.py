@@ -6,10 +6,9 @@ and v' = v + dt ((1 - gamma) a + gamma a'), the forces per mass p balance at a t
     (1 - alpha_m) a' + alpha_m a = (1 - alpha_f) p' + alpha_f p + contact'
 
 All numbers follow from the spectral radius at infinity: what a step leaves of the fastest
-vibrations. Contact and friction of the table are not shared between the ends of the step but count
-in full at its end (as in Bruels, Acary and Cardona 2014): shared, the force of a contact that has
-opened goes on for a step, and the sheet chatters. Divided by 1 - alpha_f it is the derivative of an
-incremental potential as BDF2's, which has another inertia and another weight of contact.
+vibrations. Contact and friction of the table count in full at the end of the step (as in Bruels,
+Acary and Cardona 2014), lest the sheet chatter. Divided by 1 - alpha_f it is the derivative of an
+incremental potential as BDF2's, with another inertia and another weight of contact.
 """
 
 import dataclasses

@@ -193,12 +193,15 @@ def _moved(state: _Search, line: _Line, goes_on: Bool[Array, ""]) -> _Search:
     moved = jnp.where(usable, moved, jnp.where(is_lost, line.full, state.moved))
     is_slow = (moved > SLOW * state.moved) & (state.count >= CONVEX_ITERATIONS)
     blend = jnp.where(is_slow, (state.blend + state.limit) / 2, state.blend)
+    # where the Hessian is indefinite: half of the exact one, or none; the stand-in is only rounded
+    less = jnp.where(state.blend > LEAST_BLEND, state.blend / 2, 0)
+    limit = jnp.where(state.blend > 0, state.blend, state.limit)
     arrived = state._replace(
         at=line.best,
         moved=moved,
         is_stale=is_first | ~usable | (line.length != 1) | (moved > STALE * state.moved),
-        blend=jnp.where(usable, jnp.minimum(blend, 1), _less(state.blend)),
-        limit=jnp.where(usable, jnp.minimum(1.2 * state.limit, 2), _limit(state)),
+        blend=jnp.where(usable, jnp.minimum(blend, 1), less),
+        limit=jnp.where(usable, jnp.minimum(1.2 * state.limit, 2), limit),
         shift=_next_shift(state, usable),
         count=state.count + 1,
     )
@@ -215,16 +218,6 @@ def _failure(found: _Search, tolerance: float) -> Int[Array, ""]:
     reason = jnp.where(is_finite, reason, Failure.NON_FINITE.value)
     converged = (found.moved <= tolerance) & is_finite
     return jnp.where(converged, Failure.NONE.value, reason)
-
-
-def _less(blend: Array) -> Array:
-    """Half of the exact Hessian's share; none where little is left."""
-    return jnp.where(blend > LEAST_BLEND, blend / 2, 0)
-
-
-def _limit(state: _Search) -> Array:
-    """The blend at which the Hessian was found indefinite; the convex stand-in is only rounded."""
-    return jnp.where(state.blend > 0, state.blend, state.limit)
 
 
 def _next_shift(state: _Search, usable: Array) -> Array:

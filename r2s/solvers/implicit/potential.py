@@ -265,7 +265,7 @@ def _bending_energy(step: IncrementalPotential, bends: Float[Array, " bend"]):
 def _bending_hessians(step: IncrementalPotential, x: Positions):
     """Second derivatives [N/m] of the bending energy of each element, but for `_angle_hessians`."""
     mesh, law = step.mesh, step.bending
-    gradients = law.gradients(mesh, law.bends(mesh).gradients(x))
+    gradients = law.elements(mesh).gradients(law.bends(mesh).gradients(x))
     elements = _bending_elements(step, _curvatures(step, x))
     stiffness = _map(jax.hessian(_element_bending_energy, argnums=3), step, *elements)
     if stiffness.ndim == 1:  # of a scalar curvature

@@ -132,9 +132,8 @@ class Sheet(eqx.Module):
     ) -> SheetState:
         """A state from positions [m] and velocities [m/s] (default: zero), with free layers.
 
-        The `acceleration` is of no use: a step needs nothing of the step before.
-
-        Raises `ValueError` when a vertex is outside the grid, unless positions are traced.
+        The `acceleration` is not used. Raises `ValueError` when a vertex is outside the grid,
+        unless positions are traced.
         """
         self.background.grid.check(x)
         v = jnp.zeros_like(x) if v is None else v
