@@ -19,16 +19,14 @@ from _tables import Line
 from scipy.stats import norm
 
 from r2s import scenarios
-from r2s.estimation.compiled import loss_from, predictions_at
+from r2s.estimation.consistency import outlier_fractions
 from r2s.estimation.default_spaces import law_told_by, on_cloth, with_law
-from r2s.estimation.diffcloud import DiffCloud
 from r2s.estimation.estimate import Estimate
-from r2s.estimation.gauss_newton import theta_length
-from r2s.estimation.mesh_ladder import in_steps_worth
-from r2s.estimation.misfits import left_out
+from r2s.estimation.gauss_newton import loss_from
+from r2s.estimation.mesh_refinement import in_mesh_steps
+from r2s.estimation.methods import DiffCloud
 from r2s.estimation.normal_equations import marker_distances, point_distances
-from r2s.estimation.nuisances import free
-from r2s.estimation.prediction import Prediction
+from r2s.estimation.prediction import Prediction, free_nuisances, predictions_at, theta_length
 from r2s.estimation.problem import Problem
 from r2s.materials import presets, prior
 from r2s.materials.fabric import Fabric
@@ -223,7 +221,9 @@ def arrived(folder: Path, case: str, seed: str) -> Line:
         seen = predictions_at((problem,), theta)
         line[f"loss of {name}"] = f"{1e6 * loss_from((problem,), seen):.3f}"
         line[f"mm of {name}"] = f"{1e3 * away(problem, seen[0]):.2f}"
-        line[f"% beyond 3 mm of {name}"] = f"{100 * left_out((problem,), seen, STRICT)[0]:.1f}"
+        line[f"% beyond 3 mm of {name}"] = (
+            f"{100 * outlier_fractions((problem,), seen, STRICT)[0]:.1f}"
+        )
     line |= in_errors(space, truth, found) | told(found)
     return line | {"CPU s": f"{seconds:.0f}"}
 
@@ -231,7 +231,7 @@ def arrived(folder: Path, case: str, seed: str) -> Line:
 def problem_of(recording: Recording, space: ParameterSpace, shape: tuple[int, int]) -> Problem:
     """The problem of a recording on a mesh, in the steps of an estimate."""
     problem = Problem.make(recording, space, shape=shape)
-    scenario = in_steps_worth(problem.scenario, recording.info.scenario, shape)
+    scenario = in_mesh_steps(problem.scenario, recording.info.scenario, shape)
     return dataclasses.replace(problem, scenario=scenario)
 
 
@@ -248,7 +248,7 @@ def end_of(problem: Problem, found: Estimate) -> jax.Array:
         for bound, value in zip(found.ranges, found.values, strict=True)
     ]
     theta = place_of(problem, jnp.stack(units))
-    for each, nuisance in zip(free((problem,)), found.nuisances, strict=True):
+    for each, nuisance in zip(free_nuisances((problem,)), found.nuisances, strict=True):
         value = np.log(nuisance.value) if nuisance.name.endswith(" ratio") else nuisance.value
         theta = theta.at[each.place].set(value / each.scale)
     return theta

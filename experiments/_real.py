@@ -11,9 +11,8 @@ from _tables import Line
 from scipy import stats
 
 from r2s._util.files import write_json
-from r2s.estimation.diffcloud import DiffCloud
-from r2s.estimation.estimate import Estimate
-from r2s.estimation.estimate_json import as_json, from_json
+from r2s.estimation.estimate import Estimate, as_json, from_json
+from r2s.estimation.methods import DiffCloud
 from r2s.materials.fabric import Fabric
 from r2s.materials.informed_space import InformedSpace
 from r2s.materials.parameters import ParameterSpace

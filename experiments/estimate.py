@@ -19,8 +19,7 @@ from _tables import command_line
 
 import r2s
 from r2s._util.files import write_json
-from r2s.estimation.estimate import describe
-from r2s.estimation.estimate_json import as_json
+from r2s.estimation.estimate import as_json, describe
 from r2s.estimation.method import Method
 
 METHODS = ("diffcloud", "diffcp", "physnet", "pinn")

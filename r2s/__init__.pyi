@@ -7,10 +7,10 @@ from r2s.estimation.cards import Card, Provenance
 from r2s.estimation.cards import read as read_card
 from r2s.estimation.cards import write as write_card
 from r2s.estimation.estimate import Estimate, Nuisance
-from r2s.estimation.identifiability import sensitivity
+from r2s.estimation.judgement import sensitivity
 from r2s.estimation.method import Budget, Method
+from r2s.estimation.methods import METHODS
 from r2s.estimation.problem import NuisancePrior, Problem
-from r2s.estimation.registry import METHODS
 from r2s.laboratory.cantilever import Cantilever
 from r2s.laboratory.drape import Drape
 from r2s.laboratory.files import read_tests

@@ -224,7 +224,7 @@ class EstimateCard:
 
     def _method(self, progress: "Progress | None") -> "Method":
         """The method with the options asked for; `ValueError` for one that it lacks."""
-        from r2s.estimation.registry import METHODS
+        from r2s.estimation.methods import METHODS
 
         kind = METHODS[self.method]
         known = kind.options()

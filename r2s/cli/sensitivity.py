@@ -29,9 +29,8 @@ class Sensitivity:
 
     def run(self) -> None:
         from r2s.cli.common import mesh_warning, parse_numbers, print_result
-        from r2s.estimation.estimate import describe
-        from r2s.estimation.estimate_json import as_json
-        from r2s.estimation.experiment_design import evaluate_design
+        from r2s.estimation.estimate import as_json, describe
+        from r2s.estimation.judgement import evaluate_design
         from r2s.estimation.method import COARSEST
         from r2s.scenarios.standard import SIDE
 

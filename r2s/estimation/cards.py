@@ -1,10 +1,8 @@
 """Fabric cards: a fabric or an estimate as a JSON file, to keep, to share, and to simulate again.
 
-A card has the fabric as it is simulated (see `r2s.materials.fabric_json`), where the numbers come
-from, and, of an estimate, everything that `r2s.estimation.estimate_json.as_json` says except its
-history. A card keeps the numbers of its file, double precision and all, so that writing a card
-that was read gives the same file; its `fabric` is in JAX's default precision. Cards of version
-0.2.0 are read too.
+A card has the fabric (see `r2s.materials.fabric_json`), where its numbers come from, and the
+estimate without its history. It keeps the numbers of its file in double precision, so that a card
+that was read is written as it was; its `fabric` is in JAX's default precision.
 """
 
 import dataclasses
@@ -20,7 +18,7 @@ import jax
 import numpy as np
 
 from r2s._util.files import write_json
-from r2s.estimation import estimate_json
+from r2s.estimation import estimate as estimates
 from r2s.estimation.estimate import Estimate
 from r2s.materials import presets
 from r2s.materials.fabric import Fabric
@@ -92,7 +90,7 @@ class Card:
         numbers, found = fabric_as_json(fabric), None
         check_numbers(fabric)
         if isinstance(what, Estimate):
-            full = estimate_json.as_json(what)
+            full = estimates.as_json(what)
             kept = {key: value for key, value in full.items() if key not in LEFT_OUT}
             found = nan_to_null(kept, "estimate")
         return cls(name, str(np.asarray(fabric.density).dtype), numbers, provenance, found)
@@ -105,7 +103,7 @@ class Card:
     @property
     def estimate(self) -> Estimate | None:
         """The estimate without its history, or None."""
-        return None if self.found is None else estimate_json.from_json(dict(self.found))
+        return None if self.found is None else estimates.from_json(dict(self.found))
 
 
 def preset(name: str) -> Card:
@@ -187,7 +185,7 @@ def from_json(stored: Any) -> Card:
     fabric = fabric_from_json(stored["fabric"])
     try:
         if found is not None and form == FORMAT_0_2:
-            found = estimate_json.upgraded(found)
+            found = estimates.upgraded(found)
         card = Card(stored["name"], stored["precision"], stored["fabric"], provenance, found)
         estimate = card.estimate
     except KeyError as error:

@@ -5,7 +5,6 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,28 +12,45 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.compilation import clear_in_time
 from r2s.estimation import checkpoint as checkpoints
-from r2s.estimation import gauss_newton
-from r2s.estimation.compiled import Derive, losses_at, normals_at, prior_weight, remembering
-from r2s.estimation.gauss_newton import Descent, Normal, Problems, theta_indices
+from r2s.estimation.gauss_newton import (
+    MARGIN,
+    Descent,
+    Normal,
+    accept,
+    losses_at,
+    normals_at,
+    objective,
+    prior_weight,
+    propose,
+    remaining,
+)
 from r2s.estimation.least_squares import Damping
 from r2s.estimation.method import Budget, Progress, tell
-from r2s.estimation.prediction import Theta, explain, fabric_at
-from r2s.estimation.problem import beginning, check_shared
+from r2s.estimation.prediction import (
+    Derive,
+    Theta,
+    explain,
+    fabric_at,
+    remembering,
+    theta_indices,
+    theta_length,
+)
+from r2s.estimation.problem import Problems, beginning, check_shared
 from r2s.materials.fabric import Fabric
 
-# of the spread, and between [m]: beyond lies an outlier. At half of it a part of the sheet that the
-# start cannot follow counts for nothing, and never draws the sheet there.
+# an outlier lies beyond so many spreads, within these limits [m]. At half of it a part of the sheet
+# that the start cannot follow counts for nothing, and never attracts the sheet.
 STRICT, SCALES = 6.0, (6e-3, 0.015)
 HALVING, FEWEST = 3, 3  # iterations, after each of which half go on, but no fewer than this
 
 
 class Stop(NamedTuple):
-    """When a descent has arrived.
+    """When a descent ends.
 
     - `close`: when its next step promises to gain less, over the prior's weight, which is about
-      twice what a change by one standard error costs.
+      twice the cost of a change by one standard error.
     - `patience`, `gain`: when so many steps gained less than that, or than this share of the loss.
-    - `stuck`: at this damping, when not even a step that is as short gains anything.
+    - `stuck`: at this damping: not even so short a step gains anything.
     """
 
     close: float
@@ -49,20 +65,15 @@ class Stop(NamedTuple):
 AT_THE_END, ON_THE_WAY = Stop(5e-3, 4, 5e-4, 10.0), Stop(0.03, 2, 3e-3, 10.0)
 MORE_FRAMES = Stop(0.03, 2, 0.02, 1.0)
 Row = list[Descent]  # one iteration: the descents of all starts
-
-_propose = eqx.filter_jit(gauss_newton.propose)
-_accept = eqx.filter_jit(gauss_newton.accept)
-_objective = eqx.filter_jit(gauss_newton.objective)
-_remaining = eqx.filter_jit(gauss_newton.remaining)
-
-
 DEFAULT = Budget(shares=(0.25, 0.5))
 
 
 class Search(NamedTuple):
-    """- `problems`: what was searched for. - `rows`: all descents in every iteration.
-    - `seconds`: how long it took. - `derive`: `remembering` where it was last.
-    - `reached`, `unsure`: see `r2s.estimation.estimate.Estimate`. `others`: where else it fits
+    """A finished search.
+
+    - `rows`: all descents in every iteration. `seconds`: how long it took.
+    - `derive`: with a cache of its latest places.
+    - `reached`, `unsure`: see `r2s.estimation.estimate.Estimate`. `others`: other ends that fit
       nearly as well.
     """
 
@@ -86,12 +97,12 @@ class Search(NamedTuple):
 
     @property
     def theta(self) -> Theta:
-        """That end, see `r2s.estimation.prediction`."""
+        """Its end."""
         return self.best.theta
 
     @property
     def fabric(self) -> Fabric:
-        """The fabric there."""
+        """The fabric at its end."""
         return fabric_at(self.problems[0], self.theta[theta_indices(self.problems, 0)])
 
 
@@ -106,10 +117,9 @@ def search(
     words: str = "descents",
     key: PRNGKeyArray,
 ) -> Search:
-    """The descents of `descend`, whose arguments these are; a `start` may be a whole theta.
+    """The descents of `r2s.estimation.judgement.descend`; a `start` may be a whole theta.
 
-    `derive`: of an earlier search in the same recordings, whose end need not be derived again.
-    `words`: what the progress says.
+    `derive`: of an earlier search in the same recordings. `words`: for the progress.
     """
     if budget.starts < 1:
         raise ValueError(f"an estimate needs a start or more, got {budget.starts}")
@@ -136,10 +146,10 @@ def search(
 
 def _begin(problems: Problems, budget: Budget, start, derive: Derive, progress, key) -> Row:
     dim, count = problems[0].space.dim, max(budget.coarse, budget.starts)
-    usual = jnp.clip(problems[0].space.prior()[0], gauss_newton.MARGIN, 1 - gauss_newton.MARGIN)
-    start = usual if start is None else start
+    if start is None:
+        start = jnp.clip(problems[0].space.prior()[0], MARGIN, 1 - MARGIN)
     places = jax.random.uniform(key, (count, dim), float)
-    nothing = jnp.zeros((count, gauss_newton.theta_length(problems) - dim), float)
+    nothing = jnp.zeros((count, theta_length(problems) - dim), float)
     thetas = jnp.concatenate([places, nothing], axis=1).at[0, : len(start)].set(start)
     if budget.coarse:
         losses = losses_at(_seen(problems, budget, 0), thetas, progress)
@@ -207,11 +217,11 @@ def _next(problems: Problems, budget: Budget, rows: list[Row], derive: Derive) -
     if is_passed or not moving or len(stage) > budget.iterations:
         return _later(problems, budget, row, derive)
     seen = _seen(problems, budget, now)
-    trials = [_propose(problems, row[i], prior) for i in moving]
+    trials = [propose(problems, row[i], prior) for i in moving]
     tried = normals_at(seen, trials, [row[i].scale for i in moving], budget.width, derive)
     after = list(row)
     for i, trial, normal in zip(moving, trials, tried, strict=True):
-        after[i] = _accept(problems, row[i], trial, normal, prior)
+        after[i] = accept(problems, row[i], trial, normal, prior)
     return after
 
 
@@ -220,11 +230,8 @@ def _rows_of_stage(rows: list[Row], stage: int) -> list[Row]:
 
 
 def _kept(row: Row, iteration: int) -> list[int]:
-    """Indices of the descents of the latest stage that go on.
-
-    Of many, the better half goes on every few iterations (successive halving, Jamieson and
-    Talwalkar 2016). A descent that diverged is the worst.
-    """
+    """Indices of the descents of the latest stage that go on: of many, the better half every few
+    iterations (successive halving, Jamieson and Talwalkar 2016)."""
     now = max(int(descent.stage) for descent in row)
     there = [i for i, descent in enumerate(row) if int(descent.stage) == now]
     count = max(FEWEST, len(there) >> (iteration - 1) // HALVING)
@@ -233,13 +240,11 @@ def _kept(row: Row, iteration: int) -> list[int]:
 
 
 def _later(problems: Problems, budget: Budget, row: Row, derive: Derive) -> Row | None:
-    """The next stage, to which only the best descent goes on; None after the last. Where that
-    diverges in the frames that count then, the next best does, of those that earlier stages left
-    too; `RuntimeError` where all diverge.
+    """The next stage, of the best descent alone, or the next best where that diverges in the frames
+    that count then; None after the last. Raises `RuntimeError` where all diverge.
 
-    From the second stage on outliers are left out, beyond a scale that follows from the distances
-    left: outliers lie to one side of a sheet, so that even a small weight of theirs biases the
-    estimate.
+    From the second stage on outliers are left out, beyond a scale that follows from the distances:
+    outliers lie to one side of a sheet, so that even a small weight of theirs biases the estimate.
     """
     now = int(_best(row)[1].stage)
     stage = now + 1
@@ -286,17 +291,13 @@ def has_arrived(found: Search, budget: Budget) -> bool:
 
 
 def _arrived(problems: Problems, stage: list[Row], start: int, prior, stop: Stop) -> bool:
-    """Whether a descent is at its end.
-
-    It is when its next step promises to gain next to nothing, when its latest steps have gained
-    next to nothing, when not even a short step gains anything, or when it diverged. A step that was
-    refused is none: the next is shorter, and may gain.
-    """
+    """Whether a descent is at its end by a criterion of `stop`, or diverged. Rejected steps do not
+    count: the next is shorter, and may gain."""
     now = stage[-1][start]
     if not np.isfinite(float(now.normal.loss)):
         return True
     least = stop.close * float(prior)
-    if len(stage) > 1 and float(_remaining(problems, now, prior)) < least:
+    if len(stage) > 1 and float(remaining(problems, now, prior)) < least:
         return True
     if float(now.damping) >= stop.stuck:
         return True
@@ -308,7 +309,7 @@ def _arrived(problems: Problems, stage: list[Row], start: int, prior, stop: Stop
     if len(before) < stop.patience:
         return False
     then, value = (
-        float(_objective(problems, d.theta, d.normal.loss, prior))
+        float(objective(problems, d.theta, d.normal.loss, prior))
         for d in (before[-stop.patience], now)
     )
     return not value < then - max(least, stop.gain * float(now.normal.loss))
@@ -329,8 +330,8 @@ def _run_of(problems: Problems, budget: Budget, start, key) -> dict[str, str]:
 
 
 def _resumed(checkpoint: Path, run: dict[str, str], budget: Budget) -> list[Row]:
-    """The iterations in a checkpoint; none when there is no file (then what was built on another
-    run's is of no use, and removed)."""
+    """The iterations in a checkpoint. Without a file none, and files built on an older one are
+    removed."""
     if not checkpoint.exists():
         checkpoints.forget(checkpoint)
     arrays = checkpoints.load(checkpoint, run)

@@ -1,4 +1,7 @@
-"""What an estimator gives back: a fabric, how well each number is known, and how it was found."""
+"""The result of an estimator: a fabric, its standard errors, how it was found; and its JSON object.
+
+Estimates of version 0.2.0 are read, too.
+"""
 
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -7,8 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from r2s.materials.fabric import Fabric
+from r2s.materials.fabric_json import fabric_as_json, fabric_from_json
 from r2s.materials.parameters import ParameterSpace, Range
 
+FORMAT = "r2s-estimate/3"
+FORMAT_0_2 = "r2s-estimate/2"
 IDENTIFIABLE = 0.025  # greatest standard error, relative or absolute: two of them are 5 %
 DOUBT, FAR = 4.5, 3.0  # standard errors, and a factor, from which on a density is doubted
 AT_BOUND = 5e-3  # of a range's width: an estimate that is nearer to an end has reached the bound
@@ -16,11 +22,8 @@ LEAST_EXPONENT = 0.05  # a parameter with a smaller share in a combination is no
 
 
 class Nuisance(NamedTuple):
-    """A quantity of a recording that was estimated along with the fabric.
-
-    - `name`, `unit`, `value`.
-    - `standard_error`: in the same unit; NaN when there is none.
-    """
+    """A quantity of a recording that was estimated along with the fabric; its `standard_error` is
+    NaN when there is none."""
 
     name: str
     unit: str
@@ -29,7 +32,7 @@ class Nuisance(NamedTuple):
 
 
 class Contradiction(NamedTuple):
-    """A recording that leads elsewhere than the others, see `r2s.estimation.agreement`.
+    """A recording that contradicts the others, see `r2s.estimation.consistency`.
 
     - `recording`: its index; of two the second, which may be the right one.
     - `parameter`: in which they are the most standard errors apart, `errors`, [-].
@@ -46,17 +49,15 @@ UNLIKELY = 1e-4  # that recordings of one fabric lead so far apart by chance
 
 
 class Agreement(NamedTuple):
-    """Whether the recordings of an estimate tell of one fabric, see `r2s.estimation.agreement`.
+    """Whether the recordings of an estimate are of one fabric, see `r2s.estimation.consistency`.
 
-    - `p`: how likely recordings of one fabric lead as far apart, [-].
-    - `told`: of each recording, how many directions of the fabric's space it tells by itself, its
-      mesh's error allowed for: one that tells none was not compared.
-    - `contradiction`: the one that leads elsewhere than the others; None where all agree.
-    - `density`: with which they would agree best, over the one that was given, [-], and the
-      standard error of its logarithm: a first guess where some weigh the sheet, by a force, and
-      others do not; where a force or another recording does not fit, of a descent
-      (`r2s.estimation.agreement.with_density`). Else None.
-    - `exact`: as `p`, were their meshes without error; None where nothing was excused.
+    - `p`: p-value of their scatter, were they of one fabric, [-].
+    - `told`: of each recording, how many directions of the fabric's space it determines beyond the
+      prior and the error of its mesh: with none it was not compared.
+    - `contradiction`: the one that contradicts the others; None where all agree.
+    - `density`: with which they would agree best, relative to the given one, [-], and the standard
+      error of its logarithm; None: that was not estimated.
+    - `exact`: as `p`, were their meshes without error; None where there was no such error.
     """
 
     p: float
@@ -80,12 +81,11 @@ class Agreement(NamedTuple):
 
 
 class Misfit(NamedTuple):
-    """Something of a recording that does not fit the fabric that was found, see
-    `r2s.estimation.misfits`.
+    """Something of a recording that does not fit the estimate, see `r2s.estimation.consistency`.
 
-    - `recording`: its index. `what`: a marker, "force" or a nuisance.
-    - `off`: how far, in `unit`: of a marker [m], of a force its share, of a nuisance the standard
-      deviations of what was known of it.
+    - `recording`: its index. `what`: a marker, "force" or a nuisance parameter.
+    - `off`: how far, in `unit`: of a marker [m], of a force its share, of a nuisance parameter its
+      prior standard deviations.
     """
 
     recording: int
@@ -109,34 +109,30 @@ class Combination(NamedTuple):
 
 @dataclass(frozen=True)
 class Estimate:
-    """What an estimator found.
+    """The result of an estimator.
 
     - `approach`: which method, with its settings in words.
-    - `fabric`: the estimate.
-    - `ranges`, `values`: its parameters, in the units of the ranges.
+    - `fabric`; `ranges`, `values`: its parameters, in the units of the ranges.
     - `standard_errors`: relative where the range is logarithmic, else absolute; NaN from a method
       that gives none. The ranges count as a flat prior.
     - `correlation`: of the parameters, [-].
     - `nuisances`: quantities of the recordings that were not known exactly.
     - `loss`: at the estimate, in its `loss_unit`: of PhysNet a distance on its map, [-].
-    - `losses`, `history`: loss and parameters of every iteration and start. The losses of two
-      stages of a descent do not compare: each counts other frames, or leaves outliers out.
+    - `losses`, `history`: loss and parameters of every iteration and start. Losses of two stages of
+      a descent do not compare: each counts other frames, or leaves outliers out.
     - `seconds`: how long it took, compilation included.
-    - `converged`: whether the method stopped by its own criterion; False when its budget ended it,
-      or no other search ended there. None: nothing was fitted, or a file of version 0.2.0 does not
-      say.
+    - `converged`: whether the method stopped by its own criterion, and not by its budget. None:
+      nothing was fitted, or a file of version 0.2.0 does not say.
     - `reached`: how many searches from different starts fit as well as this one, and how many were
-      made; None: there was one. `unsure`: why the search may have ended in another minimum; "": no
-      search says so.
-    - `mesh_bias`: how far each parameter is expected to be off for its mesh alone, as the standard
-      errors, which hold it (`r2s.estimation.mesh_bias`). None: that was not judged.
-    - `shape`: vertices of the simulated sheet along warp and weft; None: it has none, or a file
-      does not say.
-    - `refused`: a finer mesh that the fabric needs, and why it was not taken; "": there is none.
-    - `misfits`: what of the recordings does not fit. `left_out`: of each the share that counts for
-      little or nothing, [-]; none where that was not judged.
-    - `shares`: of each recording in the loss, [-]; none of one, or where a method has no shares.
-    - `agreement`: of several recordings; None: that was not judged, or no two tell of the same.
+      made; None: there was one. `unsure`: why the search may have ended in another minimum; or "".
+    - `mesh_bias`: expected discretization error of each parameter, in the units of the standard
+      errors, which include it; None: not estimated.
+    - `shape`: vertices of the simulated sheet along warp and weft; None: unknown.
+    - `refused`: a finer mesh that the fabric needs, and why it was not used; or "".
+    - `misfits`: what of the recordings does not fit. `left_out`: of each recording the share of
+      outliers, [-]; empty where that was not judged.
+    - `shares`: of each recording in the loss, [-]; empty of one, or of a method without.
+    - `agreement`: of several recordings; None: not judged, or no two determine the same.
     """
 
     approach: str
@@ -178,7 +174,7 @@ class Estimate:
     def identifiable(self) -> np.ndarray:
         """Which parameters the recording determines: to 5 % (or 0.05) with 95 % confidence.
 
-        None that ended at a bound: the truth may lie beyond, and no error here says how far.
+        None that ended at a bound: the truth may lie beyond.
         """
         return (self.standard_errors < IDENTIFIABLE) & self._inside
 
@@ -302,3 +298,161 @@ def describe(estimate: Estimate) -> list[str]:
         warned = f"warning: at a bound, beyond which the truth may lie: {named}"
         lines.append(warned if named else "at a bound: none")
     return lines
+
+
+def as_json(estimate: Estimate) -> dict[str, Any]:
+    """An estimate with units, for a file; numbers that are not finite are None (null)."""
+    parameters, agreement = {}, None
+    if estimate.agreement is not None:
+        odd = estimate.agreement.contradiction
+        agreement = estimate.agreement._asdict() | {"contradiction": odd and odd._asdict()}
+    numbers = zip(estimate.values, estimate.standard_errors, estimate.identifiable, strict=True)
+    for bound, (value, error, identifiable) in zip(estimate.ranges, numbers, strict=True):
+        parameters[bound.name] = {
+            "value": _finite_or_none(value),
+            "unit": bound.unit,
+            "standard_error": _finite_or_none(error),
+            "standard_error_is": "relative" if bound.log else "absolute",
+            "identifiable": bool(identifiable),
+            "bounds": [bound.low, bound.high],
+        }
+    return {
+        "format": FORMAT,
+        "approach": estimate.approach,
+        "converged": estimate.converged,
+        "at_bounds": estimate.at_bounds,
+        "parameters": parameters,
+        "correlation": _nested(estimate.correlation),
+        "fabric": fabric_as_json(estimate.fabric),
+        "combinations": [each._asdict() for each in estimate.combinations],
+        "shape": None if estimate.shape is None else list(estimate.shape),
+        "refused": estimate.refused,
+        "reached": None if estimate.reached is None else list(estimate.reached),
+        "unsure": estimate.unsure,
+        "mesh_bias": None if estimate.mesh_bias is None else _nested(estimate.mesh_bias),
+        "agreement": agreement,
+        "shares": list(estimate.shares),
+        "misfits": [each._asdict() for each in estimate.misfits],
+        "left_out": list(estimate.left_out),
+        "nuisances": [
+            each._asdict()
+            | {name: _finite_or_none(getattr(each, name)) for name in ("value", "standard_error")}
+            for each in estimate.nuisances
+        ],
+        "loss": _finite_or_none(estimate.loss),
+        "loss_unit": estimate.loss_unit,
+        "seconds": estimate.seconds,
+        "losses": _nested(estimate.losses),
+        "history": _nested(estimate.history),
+    }
+
+
+def from_json(stored: dict[str, Any]) -> Estimate:
+    """The estimate that `as_json` made, or that version 0.2.0 wrote.
+
+    What was left out of `losses` and `history` is empty. Raises `ValueError` when the object is of
+    another format or its fabric is none, `KeyError` when a key is missing.
+    """
+    if stored.get("format") == FORMAT_0_2:
+        stored = upgraded(stored)
+    if stored.get("format") != FORMAT:
+        raise ValueError(f"expected an estimate of format {FORMAT}, got {stored.get('format')}")
+    parameters = stored["parameters"]
+    ranges = tuple(
+        Range(name, p["unit"], *p["bounds"], log=p["standard_error_is"] == "relative")
+        for name, p in parameters.items()
+    )
+    return Estimate(
+        approach=stored["approach"],
+        fabric=fabric_from_json(stored["fabric"]),
+        ranges=ranges,
+        values=_numbers([p["value"] for p in parameters.values()]),
+        standard_errors=_numbers([p["standard_error"] for p in parameters.values()]),
+        correlation=_numbers(stored["correlation"]),
+        nuisances=tuple(
+            Nuisance(n["name"], n["unit"], _number(n["value"]), _number(n["standard_error"]))
+            for n in stored["nuisances"]
+        ),
+        loss=_number(stored["loss"]),
+        losses=_numbers(stored.get("losses", [])),
+        history=_numbers(stored.get("history", [])),
+        seconds=stored["seconds"],
+        converged=stored["converged"],
+        loss_unit=stored["loss_unit"],
+        shape=None if stored.get("shape") is None else tuple(stored["shape"]),
+        refused=stored.get("refused", ""),
+        reached=None if stored.get("reached") is None else tuple(stored["reached"]),
+        unsure=stored.get("unsure", ""),
+        mesh_bias=None if stored.get("mesh_bias") is None else _numbers(stored["mesh_bias"]),
+        agreement=_agreement(stored.get("agreement")),
+        shares=tuple(stored.get("shares", ())),
+        misfits=tuple(Misfit(**each) for each in stored.get("misfits", ())),
+        left_out=tuple(stored.get("left_out", ())),
+    )
+
+
+def _agreement(stored: dict[str, Any] | None) -> Agreement | None:
+    if stored is None:
+        return None
+    odd, density = stored["contradiction"], stored["density"]
+    if odd is not None:
+        odd = Contradiction(**odd | {"values": tuple(odd["values"])})
+    density = None if density is None else tuple(density)
+    return Agreement(stored["p"], tuple(stored["told"]), odd, density, stored.get("exact"))
+
+
+def upgraded(stored: dict[str, Any]) -> dict[str, Any]:
+    """An estimate's JSON object of version 0.2.0 in the keys of this version.
+
+    Of convergence version 0.2.0 knew only that of the physics-informed network, in words.
+    """
+    renamed = {"deviation": "standard_error", "deviation_is": "standard_error_is"}
+    renamed |= {"determined": "identifiable"}
+
+    def rename(entry: dict[str, Any]) -> dict[str, Any]:
+        return {renamed.get(key, key): value for key, value in entry.items()}
+
+    approach = stored["approach"]
+    known = "not converged" not in approach if approach.startswith("pinn") else None
+    fabric = stored["fabric"]
+    new = {
+        "format": FORMAT,
+        "converged": known,
+        "parameters": {name: rename(entry) for name, entry in stored["parameters"].items()},
+        "combinations": [rename(entry) for entry in stored["combinations"]],
+        "nuisances": [rename(entry) for entry in stored["conditions"]],
+        "fabric": _fabric_0_2(fabric) if "C11" in fabric else fabric,
+    }
+    upgraded = {key: value for key, value in stored.items() if key != "conditions"} | new
+    return upgraded | {"at_bounds": from_json({**upgraded, "at_bounds": {}}).at_bounds}
+
+
+def _fabric_0_2(stored: dict[str, Any]) -> dict[str, Any]:
+    """The flat form of a fabric of constant stiffness, as `r2s.materials.fabric_json` has it."""
+    membrane = {name.lower(): stored[name] for name in ("C11", "C12", "C22", "C33")}
+    bending = {"stiffness": stored["bending"], "poissons_ratio": stored["bending_poissons_ratio"]}
+    others = ("density", "damping", "friction", "thickness", "mass_damping")
+    return {
+        **{name: stored[name] for name in others},
+        "membrane": {"law": "OrthotropicMembrane", **membrane},
+        "bending": {"law": "PlateBending", **bending},
+    }
+
+
+def _finite_or_none(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _nested(values: np.ndarray) -> Any:
+    """Nested lists, with None for numbers that are not finite: JSON has no word for them."""
+    plain = values.astype(object)
+    plain[~np.isfinite(values)] = None
+    return plain.tolist()
+
+
+def _number(value: float | None) -> float:
+    return np.nan if value is None else value
+
+
+def _numbers(values: Any) -> np.ndarray:
+    return np.array(values, dtype=float)  # None becomes NaN

@@ -1,20 +1,14 @@
 """Gauss-Newton on nearest-point distances, with forward sensitivities: the default of r2s.
 
 The loss is that of DIFFCLOUD turned round (recording to simulated surface, so that a partial view
-does not pull on what it does not see), robust against outliers. The parameters are few, so the
-derivative of the whole motion with respect to all of them costs about as much as one gradient, and
-its normal equations give the step and the covariance at once.
+does not attract hidden parts), robust against outliers. The parameters are few, so forward mode
+gives the normal equations, and with them step and covariance, for about the cost of one gradient.
 
-Several recordings of one fabric are weighed by their frames, and by how well each can be followed
-(`Problem.weight`). Their joint parameter vector `theta` is the fabric's place in its space, the
-nuisances that all recordings share (`SHARED`), and those of each recording (`OWN`).
-
-The steps are those of `r2s.estimation.least_squares`; the normal equations are made here, by
-clusters of residuals, which the standard errors need. (`optimistix.LevenbergMarquardt`, without
-bounds and prior, came on a lift of 20 frames and 5 x 5 vertices from three starts to the same loss,
-6.789e-6 m^2, with 26 sensitivities each, its limit, where this arrived after 21, 22 and 16.)
+Recordings of one fabric are weighted by their frames and by how well each can be followed
+(`Problem.weight`). For `theta` see `r2s.estimation.prediction`.
 """
 
+import math
 from collections.abc import Sequence
 from functools import partial
 
@@ -24,16 +18,43 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from r2s.estimation import normal_equations
-from r2s.estimation.least_squares import Damping, at_bound, damped, newton_step, proposed
-from r2s.estimation.prediction import Prediction, Sensitivity, Theta, predict, sensitivities
-from r2s.estimation.problem import OWN, SHARED, Problem
-
-Problems = tuple[Problem, ...]
+from r2s._util.threads import thread_map
+from r2s.compilation import compile_once
+from r2s.estimation.least_squares import (
+    Damping,
+    at_bound,
+    bounded_step,
+    damped,
+    newton_step,
+    proposed,
+)
+from r2s.estimation.method import Progress, tell
+from r2s.estimation.normal_equations import (
+    MEMORY,
+    PATCHES,
+    Loss,
+    Scale,
+    loss_of,
+    normal_equations_of,
+)
+from r2s.estimation.prediction import (
+    Derive,
+    Prediction,
+    Sensitivity,
+    Theta,
+    derivatives_at,
+    predict,
+    predictions_at,
+    sensitivities,
+    theta_indices,
+    theta_length,
+)
+from r2s.estimation.problem import Problems
 
 MARGIN = 1e-3  # of the unit cube, so that a start at its edge can move
 LONGEST_STEP = 0.2  # of a parameter's range
 FINEST = 1e-5  # [m]: no recording is better
+AT_BOUND = 1e-6  # of a range: nearer than that, in single precision, is at the bound
 
 
 class Normal(eqx.Module):
@@ -55,14 +76,11 @@ class Normal(eqx.Module):
 
 
 class Descent(eqx.Module):
-    """A Levenberg-Marquardt descent.
+    """The state of a Levenberg-Marquardt descent.
 
-    - `theta`: where it is, see `r2s.estimation.prediction`.
-    - `normal`: the normal equations there.
-    - `damping`: Levenberg's, [-].
-    - `growth`: factor of the damping should the next step fail (Nielsen 1999).
-    - `scale`: beyond which distances do not count, [m]; 0: all do, see
-      `r2s.metrics.losses.robust`.
+    - `theta`, and the normal equations there, `normal`.
+    - `damping`, `growth`: see `r2s.estimation.least_squares.Damping`.
+    - `scale`: of the robust loss, [m], see `r2s.metrics.losses.robust`; 0: no outliers.
     - `stage`: its stage in an estimate, see `iterations` of `r2s.estimation.method.Budget`.
     """
 
@@ -74,20 +92,8 @@ class Descent(eqx.Module):
     stage: Int[Array, "*start"]
 
 
-def theta_length(problems: Problems) -> int:
-    """Length of theta: fabric, nuisances shared by all recordings, nuisances of each."""
-    return problems[0].space.dim + len(SHARED) + len(OWN) * len(problems)
-
-
-def theta_indices(problems: Problems, which: int) -> np.ndarray:
-    """Indices in theta of the parameters of one recording."""
-    shared = problems[0].space.dim + len(SHARED)
-    first = shared + len(OWN) * which
-    return np.concatenate([np.arange(shared), np.arange(first, first + len(OWN))])
-
-
 def recording_weights(problems: Problems) -> list[Float[Array, ""]]:
-    """Weight of each recording: its share of all frames, each by the weight of its recording."""
+    """Weight of each recording in the loss: its share of all frames, times its `weight`."""
     frames = [
         len(problem.frames) * (jnp.ones((), float) if problem.weight is None else problem.weight)
         for problem in problems
@@ -96,75 +102,56 @@ def recording_weights(problems: Problems) -> list[Float[Array, ""]]:
 
 
 def loss_at(
-    problems: Problems,
-    theta: Theta,
-    loss: normal_equations.Loss | None = None,
-    scale: normal_equations.Scale = 0.0,
+    problems: Problems, theta: Theta, loss: Loss | None = None, scale: Scale = 0.0
 ) -> Float[Array, ""]:
     """The loss [m^2] at a theta; infinite when a run diverged.
 
-    - `loss`: of one recording; None: the robust one.
-    - `scale`: of the robust loss [m], see `r2s.metrics.losses.robust`.
+    - `loss`: of one recording; None: the robust one, of a `scale` [m].
     """
     seen = [predict(each, theta[theta_indices(problems, i)]) for i, each in enumerate(problems)]
-    return loss_from(problems, seen, loss, scale)
+    return _loss_from(problems, seen, loss, scale)
 
 
-def loss_from(
-    problems: Problems,
-    seen: Sequence[Prediction],
-    loss: normal_equations.Loss | None = None,
-    scale: normal_equations.Scale = 0.0,
+def _loss_from(
+    problems: Problems, seen: Sequence[Prediction], loss: Loss | None, scale: Scale
 ) -> Float[Array, ""]:
-    """`loss_at` a theta from what it predicts of each recording."""
     total = jnp.zeros((), float)
     for problem, share, found in zip(problems, recording_weights(problems), seen, strict=True):
-        value = (
-            normal_equations.loss_of(problem, found, scale)
-            if loss is None
-            else loss(problem, found)
-        )
+        value = loss_of(problem, found, scale) if loss is None else loss(problem, found)
         total += share * jnp.where(found.ok, value, jnp.inf)
     return total
 
 
 def normal_at(
-    problems: Problems,
-    theta: Theta,
-    scale: normal_equations.Scale = 0.0,
-    width: float | None = None,
+    problems: Problems, theta: Theta, scale: Scale = 0.0, width: float | None = None
 ) -> Normal:
     """Loss, gradient and Gauss-Newton matrix at a theta.
 
-    - `scale`: of the robust loss [m], see `r2s.metrics.losses.robust`.
-    - `width`: over which slopes are taken, see `r2s.estimation.prediction.sensitivities`.
+    - `scale`: of the robust loss [m]. `width`: see `r2s.estimation.prediction.sensitivities`.
     """
-    found = [
+    predicted = [
         sensitivities(each, theta[theta_indices(problems, i)], width)
         for i, each in enumerate(problems)
     ]
-    return normal_from(problems, theta, found, scale)
+    return _normal_from(problems, theta, predicted, scale)
 
 
-def normal_from(
+def _normal_from(
     problems: Problems,
     theta: Theta,
     predicted: Sequence[tuple[Prediction, Sensitivity]],
-    scale: normal_equations.Scale = 0.0,
+    scale: Scale,
 ) -> Normal:
-    """`normal_at` a theta from what it predicts of each recording, and its derivative."""
     losses, spreads, scores, matrices, noise = [], [], [], [], []
-    weights = recording_weights(problems)
+    weights, size = recording_weights(problems), theta_length(problems)
     for which, (problem, share, (seen, slope)) in enumerate(
         zip(problems, weights, predicted, strict=True)
     ):
         index = theta_indices(problems, which)
-        found = normal_equations.normal_equations_of(problem, seen, slope, scale)
+        found = normal_equations_of(problem, seen, slope, scale)
         losses.append(share * jnp.where(seen.ok, found.loss, jnp.inf))
         spreads.append(found.spread)
-        zeros = jnp.zeros(
-            (len(found.scores), theta_length(problems), theta_length(problems)), theta.dtype
-        )
+        zeros = jnp.zeros((len(found.scores), size, size), theta.dtype)
         scores.append(zeros[:, 0].at[:, index].set(share * found.scores))
         matrices.append(zeros.at[:, index[:, None], index].set(share * found.matrices))
         noise.append(share * found.noise)
@@ -189,21 +176,20 @@ def scatter(
     precision: Float[Array, "theta theta"],
     weight: Float[Array, ""] | float,
 ) -> Float[Array, "theta theta"]:
-    """Covariance of a gradient that is a sum over clusters which err independently.
+    """Covariance of a gradient that is a sum over clusters with independent errors.
 
-    Each score is corrected to what it would be had its cluster not been fitted. With that the
-    sandwich estimator is the jackknife, which does not take few clusters for much evidence (CR3 of
-    Bell and McCaffrey 2002). Without a cluster the fit is one standard deviation of the prior away
-    at most: where a cluster alone tells a direction, and its loss is rough, it would be farther by
-    what rounding leaves of the others. In no direction is the covariance less than if all residuals
-    erred independently, with a variance of `noise` times the cluster's matrix: less would be the
+    Each score is corrected to what it would be had its cluster not been fitted: the sandwich
+    estimator is the jackknife then (CR3 of Bell and McCaffrey 2002). Without a cluster the fit is
+    one standard deviation of the prior away at most: where one cluster alone determines a
+    direction, rounding would decide. In no direction is the covariance less than for residuals with
+    independent errors, of a variance of `noise` times the cluster's matrix: less would be the
     chance of few clusters.
 
     - `precision`, `weight` [m^2]: of the prior.
     """
     whole = jnp.sum(matrices, axis=0) + weight * precision
     root, inverse = _roots(whole)
-    # a cluster that alone tells something would leave nothing behind, but for rounding
+    # a cluster that alone determines a direction would leave nothing but rounding
     share = 1 - 16 * jnp.finfo(scores.dtype).eps
 
     def without(cluster):
@@ -221,7 +207,7 @@ def scatter(
 
 
 def _larger(one: Array, other: Array, metric: Array) -> Float[Array, "theta theta"]:
-    """The larger of two positive matrices in each direction in which a metric tells them apart."""
+    """The larger of two positive matrices in each direction in which a metric separates them."""
     root, inverse = _roots(metric)
     apart, directions = jnp.linalg.eigh(inverse.T @ (one - other) @ inverse)
     absolute = (directions * jnp.abs(apart)[None]) @ directions.T
@@ -229,16 +215,15 @@ def _larger(one: Array, other: Array, metric: Array) -> Float[Array, "theta thet
 
 
 def _roots(matrix: Float[Array, "theta theta"]) -> tuple[Array, Array]:
-    """R and the inverse of its transpose, of a positive matrix R R^T, but for rounding."""
+    """R and the inverse of its transpose, of a positive matrix R R^T, up to rounding."""
     sizes, axes = jnp.linalg.eigh(matrix)
     lengths = jnp.sqrt(jnp.maximum(sizes, jnp.finfo(sizes.dtype).eps * sizes[-1]))
     return axes * lengths[None], axes / lengths[None]
 
 
 def prior_terms(problems: Problems, theta: Theta) -> tuple[Theta, Float[Array, "theta theta"]]:
-    """Difference of theta from the mean of its prior, and the precision of the prior: that of the
-    fabric's space, and of nuisances in their standard deviations.
-    """
+    """Difference of theta from its prior mean, and the precision of the prior: that of the fabric's
+    space, and 1 for nuisance parameters."""
     dim, rest = problems[0].space.dim, theta_length(problems) - problems[0].space.dim
     mean, of_fabric = problems[0].space.prior()
     expected = jnp.concatenate([mean, jnp.zeros(rest, float)])
@@ -246,6 +231,7 @@ def prior_terms(problems: Problems, theta: Theta) -> tuple[Theta, Float[Array, "
     return theta - expected, precision
 
 
+@eqx.filter_jit
 def prior_weight(problems: Problems, normal: Normal) -> Float[Array, ""]:
     """Weight [m^2] of the prior beside the loss: how much the loss scatters by chance.
 
@@ -258,27 +244,21 @@ def prior_weight(problems: Problems, normal: Normal) -> Float[Array, ""]:
     least = least_weight(problems, normal.spread)
     inverse = jnp.linalg.inv(normal.matrix + least * precision)
     ratio = jnp.trace(inverse @ normal.scatter) / jnp.trace(inverse @ normal.matrix)
-    most = normal_equations.MEMORY * least_weight(problems, jnp.sqrt(2 * normal.loss))
+    most = MEMORY * least_weight(problems, jnp.sqrt(2 * normal.loss))
     return jnp.clip(ratio, jnp.finfo(ratio.dtype).tiny, jnp.maximum(most, least))
 
 
 def least_weight(problems: Problems, spread: Float[Array, ""]) -> Float[Array, ""]:
     """Least weight [m^2] of the prior: as if all points of a patch and frame were one."""
     frames = sum(len(problem.frames) for problem in problems)
-    return jnp.maximum(spread, FINEST) ** 2 / (frames * normal_equations.PATCHES**2)
+    return jnp.maximum(spread, FINEST) ** 2 / (frames * PATCHES**2)
 
 
-def objective(problems: Problems, theta, loss, prior) -> Float[Array, ""]:
+@eqx.filter_jit
+def objective(problems: Problems, theta: Theta, loss, prior) -> Float[Array, ""]:
     """Loss and prior [m^2] at a theta."""
     off, precision = prior_terms(problems, theta)
     return loss + prior * (off @ precision @ off) / 2
-
-
-def remaining(problems: Problems, descent: Descent, prior) -> Float[Array, ""]:
-    """Gain [m^2] that the next Gauss-Newton step promises, by the parameters not at a bound."""
-    gradient, matrix, low, high = _equations(problems, descent, prior)
-    fixed = at_bound(descent.theta, gradient, low, high)
-    return -jnp.where(fixed, 0, gradient) @ newton_step(gradient, matrix, fixed) / 2
 
 
 def _equations(problems: Problems, descent: Descent, prior):
@@ -291,8 +271,17 @@ def _equations(problems: Problems, descent: Descent, prior):
     return gradient, matrix, low, high
 
 
+@eqx.filter_jit
+def remaining(problems: Problems, descent: Descent, prior) -> Float[Array, ""]:
+    """Gain [m^2] predicted for the next Gauss-Newton step of the parameters not at a bound."""
+    gradient, matrix, low, high = _equations(problems, descent, prior)
+    fixed = at_bound(descent.theta, gradient, low, high)
+    return -jnp.where(fixed, 0, gradient) @ newton_step(gradient, matrix, fixed) / 2
+
+
+@eqx.filter_jit
 def propose(problems: Problems, descent: Descent, prior) -> Theta:
-    """The next theta to try: a damped Gauss-Newton step, within the unit cube."""
+    """The next trial: a damped Gauss-Newton step, within the unit cube."""
     gradient, matrix, low, high = _equations(problems, descent, prior)
     longest = jnp.where(jnp.isfinite(low), LONGEST_STEP, jnp.inf)
     damping = Damping(descent.damping, descent.growth)
@@ -304,11 +293,12 @@ def is_finite(normal: Normal) -> Bool[Array, ""]:
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(normal)]))
 
 
+@eqx.filter_jit
 def accept(problems: Problems, descent: Descent, trial: Theta, tried: Normal, prior) -> Descent:
     """The descent after a trial: moved if that lowers the objective, else damped more.
 
-    Where a derivative is not finite it does not move: it could neither go on from there, nor say
-    how well its place is known.
+    It does not move to where a derivative is not finite: from there it could neither go on nor give
+    standard errors.
     """
     new = objective(problems, trial, tried.loss, prior)
     old = objective(problems, descent.theta, descent.normal.loss, prior)
@@ -322,3 +312,97 @@ def accept(problems: Problems, descent: Descent, trial: Theta, tried: Normal, pr
         descent.scale,
         descent.stage,
     )
+
+
+Limits = tuple[Float[np.ndarray, " theta"], Float[np.ndarray, " theta"]]
+
+
+def room(problems: Problems, theta: Theta) -> Limits:
+    """How far each parameter may go down, at most 0, and up: a fabric's to its bounds, nuisance
+    parameters without limit."""
+    is_fabric = np.arange(theta_length(problems)) < problems[0].space.dim
+    at = np.asarray(theta, np.float64)
+    down, up = MARGIN - at, 1 - MARGIN - at
+    down, up = np.where(down < -AT_BOUND, down, 0.0), np.where(up > AT_BOUND, up, 0.0)
+    return np.where(is_fabric, down, -np.inf), np.where(is_fabric, up, np.inf)
+
+
+def only_held(limits: Limits) -> Limits:
+    """`room` in which only parameters at a bound are limited: for a step that is an error, not a
+    move."""
+    down, up = limits
+    return np.where(down < 0, -np.inf, 0.0), np.where(up > 0, np.inf, 0.0)
+
+
+def held_back(problems: Problems, end: Descent, prior: float) -> Float[np.ndarray, " theta"]:
+    """How much farther the end of a descent would go without bounds; zero if it is at none.
+
+    - `prior`: its weight, see `prior_weight`.
+    """
+    off, precision = (np.asarray(part, np.float64) for part in prior_terms(problems, end.theta))
+    gradient = np.asarray(end.normal.gradient, np.float64) + prior * precision @ off
+    matrix = np.asarray(end.normal.matrix, np.float64) + prior * precision
+    within = bounded_step(gradient, matrix, only_held(room(problems, end.theta)))
+    free = np.full(len(gradient), np.inf)
+    return bounded_step(gradient, matrix, (-free, free)) - within
+
+
+_compiled_loss = compile_once(_loss_from)
+_compiled_normal = compile_once(_normal_from)
+_losses = eqx.filter_jit(eqx.filter_vmap(loss_at, in_axes=(None, 0)))
+_normals = eqx.filter_jit(eqx.filter_vmap(normal_at, in_axes=(None, 0, 0, None)))
+
+
+def loss_from(problems: Problems, seen: Sequence[Prediction], scale: Array | float = 0.0) -> float:
+    """The robust loss [m^2] of a prediction of each recording, see `loss_at`."""
+    return float(_compiled_loss(problems, list(seen), None, jnp.asarray(scale, float)))
+
+
+def normal_from(
+    problems: Problems,
+    theta: Theta,
+    predicted: Sequence[tuple[Prediction, Sensitivity]],
+    scale: Array,
+) -> Normal:
+    """`normal_at` a theta from the prediction of each recording and its derivative."""
+    return _compiled_normal(problems, theta, list(predicted), scale)
+
+
+def losses_at(
+    problems: Problems, thetas: Float[Array, "start theta"], progress: Progress | None = None
+) -> np.ndarray:
+    """The losses [m^2] at many thetas: in one batch, or, on a CPU, on its threads."""
+    if jax.default_backend() != "cpu":
+        return np.asarray(_losses(problems, thetas))
+
+    def done(number: int) -> None:
+        tell(progress, f"coarse search {number} of {len(thetas)}")
+
+    tell(progress, "compiling the motion")
+    return np.array(
+        thread_map(lambda at: loss_from(problems, predictions_at(problems, at)), thetas, done)
+    )
+
+
+def normals_at(
+    problems: Problems,
+    thetas: list,
+    scales: list,
+    width: float | None = None,
+    derive: Derive = derivatives_at,
+) -> list[Normal]:
+    """The normal equations at many thetas: in batches, or, on a CPU, on its threads.
+
+    The sizes of batches are powers of two, so that few are compiled.
+    """
+
+    def one(pair) -> Normal:
+        theta, scale = pair
+        return normal_from(problems, theta, derive(problems, theta, width), scale)
+
+    if jax.default_backend() == "cpu" or len(thetas) == 1:
+        return thread_map(one, zip(thetas, scales, strict=True))
+    more = 2 ** math.ceil(math.log2(len(thetas))) - len(thetas)
+    filled = (jnp.stack([*parts, *[parts[-1]] * more]) for parts in (thetas, scales))
+    found = _normals(problems, *filled, width)
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(len(thetas))]

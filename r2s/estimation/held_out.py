@@ -12,7 +12,7 @@ import numpy as np
 
 from r2s.compilation import clear_in_time
 from r2s.estimation.estimate import Estimate
-from r2s.estimation.mesh_ladder import in_steps_worth
+from r2s.estimation.mesh_refinement import in_mesh_steps
 from r2s.materials import prior
 from r2s.materials.fabric import Fabric
 from r2s.metrics import prediction_error
@@ -50,7 +50,7 @@ class HeldOut(NamedTuple):
         return bool(self.defaults) and self.error < min(float(np.mean(self.defaults)), self.middle)
 
     @property
-    def is_told(self) -> bool:
+    def is_discriminating(self) -> bool:
         """Whether the motion tells so: not where draws and middle of the prior, and the estimate
         with them, are alike in it, as in a fold that lies on the table (`ALIKE`)."""
         others = [each for each in (*self.defaults, self.middle) if np.isfinite(each)]
@@ -67,7 +67,7 @@ class HeldOut(NamedTuple):
         error = f"{_mm(self.error)} mm" if np.isfinite(self.error) else "the simulation diverged"
         air = "" if self.air == 1 else f" (all in air {self.air:.2f} times as dense, as found)"
         words = f"held out, {self.recording}: {error}; {known}{air}"
-        if not self.is_told:
+        if not self.is_discriminating:
             return f"{words}: fabrics hardly differ in it, so not told whether it is better"
         if self.is_better:
             best = self.error < min(self.defaults)
@@ -135,7 +135,7 @@ def judge(
     density, in a recording.
 
     All are simulated by the cloth on a mesh of `shape`, in the steps that an estimate takes there
-    (`r2s.estimation.mesh_ladder.in_steps_worth`). `air`: times the density of the air as written
+    (`r2s.estimation.mesh_refinement.in_mesh_steps`). `air`: times the density of the air as written
     down, for all alike: what an estimate found along with the fabric (`air_found`), where that was
     in doubt. Size and cameras are as written down.
     """
@@ -159,7 +159,7 @@ def air_found(estimate: Estimate, recordings: Sequence[Recording]) -> float:
 
 def _error(recording: Recording, fabric: Fabric, shape: tuple[int, int], air: float) -> float:
     scenario = in_denser_air(from_recording(recording, shape), air)
-    scenario = in_steps_worth(scenario, recording.info.scenario, shape)
+    scenario = in_mesh_steps(scenario, recording.info.scenario, shape)
     x = prediction_error.predict_motion(scenario, fabric).x
     away = prediction_error.from_surface(recording, x, shape)
     return float(np.mean(away)) if np.isfinite(away).all() else float("inf")

@@ -1,6 +1,10 @@
-"""The estimate at the end of a search: its standard errors, and what recordings say against it."""
+"""The estimate at the end of a search: its standard errors, and what contradicts it.
+
+`sensitivity` and `evaluate_design` give the standard errors of a motion before it is recorded.
+"""
 
 import dataclasses
+import inspect
 import time
 from pathlib import Path
 
@@ -9,32 +13,48 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from r2s import scenarios
 from r2s.estimation import mesh_bias
-from r2s.estimation.agreement import (
+from r2s.estimation.consistency import (
     agreement,
     asks_for_density,
+    misfits,
+    outlier_fractions,
     with_density,
     with_free_density,
 )
-from r2s.estimation.compiled import Derive, loss_from, predictions_at, prior_weight
 from r2s.estimation.descent import DEFAULT, Row, Search, has_arrived, search, stacked
 from r2s.estimation.estimate import Agreement, Estimate
 from r2s.estimation.gauss_newton import (
+    MARGIN,
     Descent,
-    Problems,
     is_finite,
+    loss_from,
+    normal_from,
+    prior_weight,
     recording_weights,
-    theta_indices,
 )
-from r2s.estimation.law_error import law_error
 from r2s.estimation.mesh_bias import OtherMesh, coarser_of
 from r2s.estimation.method import Budget, Progress, tell
-from r2s.estimation.misfits import left_out, misfits
-from r2s.estimation.nuisances import nuisances
-from r2s.estimation.prediction import Theta, fabric_at
-from r2s.estimation.problem import Problem
-from r2s.estimation.standard_errors import covariance_at
+from r2s.estimation.prediction import (
+    Derive,
+    Theta,
+    derivatives_at,
+    explain,
+    fabric_at,
+    nuisances,
+    predictions_at,
+    theta_indices,
+    theta_length,
+)
+from r2s.estimation.problem import Problem, Problems
+from r2s.estimation.standard_errors import covariance_at, model_error
+from r2s.materials import presets
+from r2s.materials.fabric import Fabric
+from r2s.materials.parameters import OrthotropicSpace
+from r2s.scenarios import synthetic
 
+NOISE = 3e-3  # [m], of a sensitivity: beyond which a distance is an outlier
 NO_DERIVATIVE = "the derivative is not finite at the end of the search"
 
 
@@ -52,15 +72,14 @@ def descend(
 
     - `approach`: how the estimate names its method.
     - `start`: in the unit cube, among the coarse places; None: the mean of the space's prior.
-    - `checkpoint`: a file that holds the state after every iteration. A run of the same problem
-      that finds it goes on from there.
+    - `checkpoint`: a file of the state after every iteration, from which the same run resumes.
     - `progress`: called with the iteration and the best loss [m^2].
-    - `key`: draws the other coarse places.
+    - `key`: of the other coarse places.
 
     The estimate has converged when the best descent arrived in the last stage
-    (`r2s.estimation.descent.has_arrived`). A simulation that diverges counts as infinitely bad;
-    when all do, raises `RuntimeError`. Raises `ValueError` for no starts, for an odd number of
-    places around the end, and for shares that do not rise between 0 and 1.
+    (`r2s.estimation.descent.has_arrived`). Raises `RuntimeError` when all simulations diverge,
+    `ValueError` for no starts, for an odd number of places around the end, and for shares that do
+    not rise between 0 and 1.
     """
     problems = (problems,) if isinstance(problems, Problem) else problems
     found = search(problems, budget, start=start, checkpoint=checkpoint, progress=progress, key=key)
@@ -79,14 +98,12 @@ def judged(
     progress: Progress | None = None,
     key: PRNGKeyArray,
 ) -> Estimate:
-    """The estimate at the end of a search, with its standard errors, which hold what a constant
-    stiffness is off that at small strain (`r2s.estimation.law_error`).
+    """The estimate at the end of a search, with its standard errors and checks.
 
-    `checkpoint`: of the search; a descent for the density (`r2s.estimation.agreement`) is kept
-    beside it. `progress`: as in `descend`.
-
-    `other_mesh`: by which its bias is judged, which the standard errors hold (`mesh_bias.settled`).
-    If it is coarser, places around the end, each recording alone and a density are tried on it.
+    - `other_mesh`: by which its discretization error is estimated, a part of the standard errors
+      (`mesh_bias.correct`). If it is coarser, places around the end, each recording alone and a
+      density are tried on it.
+    - `checkpoint`: of the search; that of a descent for the density is beside it.
     """
     began, problems = time.perf_counter(), found.problems
     best, prior = found.best, prior_weight(problems, found.best.normal)
@@ -94,14 +111,14 @@ def judged(
     coarse, beside = coarser_of(problems, other_mesh)
     around = jax.random.fold_in(key, 1)
     covariance = covariance_at(problems, budget, best, around, tried_on=coarse, derive=found.derive)
-    if found.others:  # of one valley, or of several fabrics that little tells apart
+    if found.others:  # that fit nearly as well
         off = np.asarray(jnp.stack(found.others) - best.theta[None], np.float64)
         covariance = covariance + off.T @ off / len(off)
-    of_law, seen = law_error(problems, best, prior, predicted), [each for each, _ in predicted]
+    of_law, seen = model_error(problems, best, prior, predicted), [each for each, _ in predicted]
     covariance, bias = covariance + np.outer(of_law, of_law), None
     if other_mesh is not None:
         by = mesh_bias.mesh_error(problems, other_mesh, best, predicted)
-        theta, covariance, bias = mesh_bias.settled(
+        theta, covariance, bias = mesh_bias.correct(
             problems, other_mesh, best, prior, covariance, by
         )
         if theta is not best.theta:
@@ -132,7 +149,7 @@ def judged(
         agreement=agreed,
         shares=shares,
         misfits=missed,
-        left_out=left_out(problems, seen, float(best.scale)),
+        left_out=outlier_fractions(problems, seen, float(best.scale)),
         reached=found.reached,
         unsure=unsure,
     )
@@ -226,3 +243,58 @@ def collect(
         seconds=seconds,
         converged=converged,
     )
+
+
+def sensitivity(problems: Problem | Problems, fabric: Fabric) -> Estimate:
+    """Standard errors and combinations that recordings would give, were a fabric the true one.
+
+    Nothing is fitted: it takes nine simulations with their derivatives. Make the recordings with
+    `r2s.scenarios.synthetic.record` from the motion in question and the cameras that there are.
+    Raises `RuntimeError` when the simulation diverges.
+    """
+    problems = (problems,) if isinstance(problems, Problem) else problems
+    space = problems[0].space
+    place = jnp.clip(space.to_unit(fabric), MARGIN, 1 - MARGIN)
+    theta = jnp.concatenate([place, jnp.zeros(theta_length(problems) - space.dim, float)])
+    scale = jnp.asarray(NOISE, float)
+    predicted = derivatives_at(problems, theta)
+    normal = normal_from(problems, theta, predicted, scale)
+    if not np.isfinite(float(normal.loss)):
+        why = explain(problems[0], theta[theta_indices(problems, 0)])
+        raise RuntimeError(f"the simulation of the motion {why or 'has a loss that is not finite'}")
+    zero = jnp.zeros((), float)
+    end = Descent(theta, normal, zero, zero, scale, jnp.zeros((), int))
+    covariance = covariance_at(problems, DEFAULT, end, jax.random.key(0), is_truth=True)
+    loss = loss_from(problems, [seen for seen, _ in predicted])
+    return collect(problems, end, [[end]], covariance, "sensitivity", 0.0, None, loss)
+
+
+def evaluate_design(
+    scenario: str, fabric: str, numbers: dict[str, float], noise: float = 1e-3, seed: int = 0
+) -> Estimate:
+    """The `sensitivity` of a motion that nobody has made yet.
+
+    - `scenario`, `numbers`: the motion, one of `r2s.scenarios.SIX` and its arguments.
+    - `fabric`: a preset, which counts as the true fabric.
+    - `noise`: of the clouds, [m]; `seed`: of the noise.
+
+    Raises `ValueError` for a scenario, preset or number that does not exist, and for numbers out of
+    range.
+    """
+    if scenario not in scenarios.SIX:
+        raise ValueError(f"a scenario is one of {', '.join(scenarios.SIX)}, got {scenario!r}")
+    if fabric not in presets.FIVE:
+        raise ValueError(f"a preset is one of {', '.join(presets.FIVE)}, got {fabric!r}")
+    if not noise >= 0:
+        raise ValueError(f"noise must not be negative [m], got {noise:g}")
+    try:
+        experiment = scenarios.SIX[scenario](**numbers)
+    except TypeError as error:
+        known = inspect.signature(getattr(scenarios, scenario)).parameters
+        raise ValueError(f"{scenario}: {error}; it takes {', '.join(known)}") from None
+    chosen = presets.FIVE[fabric]()
+    seen = synthetic.sensing(experiment)._replace(noise=noise)
+    key = jax.random.key(seed)
+    recording = synthetic.record(experiment, chosen, fabric, seen=seen, key=key)
+    space = OrthotropicSpace.make(float(chosen.density))
+    return sensitivity(Problem.make(recording, space), chosen)

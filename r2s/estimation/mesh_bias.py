@@ -1,9 +1,8 @@
-"""How far an estimate would go on a finer mesh: one step of Gauss-Newton with that mesh's motion.
+"""How far an estimate would go on a finer mesh: one Gauss-Newton step with that mesh's motion.
 
-The prediction is made on another mesh, its derivative is that of the mesh of the estimate, laid
-onto the other's vertices. Where the meshes agree on the fabric the step is next to nothing. From
-that mesh it is extrapolated to one without end (Richardson), by the order of the error in
-`r2s.scenarios.resolution`.
+The prediction is made on another mesh; its derivative is that of the estimate's mesh, interpolated
+to the other's vertices. From that mesh the step is extrapolated to one of cell size 0 (Richardson),
+by the order of the error in `r2s.scenarios.resolution`.
 """
 
 from collections.abc import Sequence
@@ -13,23 +12,30 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r2s.compilation import compile_once
-from r2s.estimation import compiled, normal_equations
-from r2s.estimation.bounded import bounded_step, only_held, room
-from r2s.estimation.compiled import Derive, loss_from, predictions_at
 from r2s.estimation.gauss_newton import (
     MARGIN,
     Descent,
-    Problems,
     is_finite,
     least_weight,
+    loss_from,
+    only_held,
     prior_terms,
     recording_weights,
+    room,
+)
+from r2s.estimation.least_squares import bounded_step
+from r2s.estimation.prediction import (
+    Derive,
+    Prediction,
+    Sensitivity,
+    Theta,
+    predict_compiled,
+    predictions_at,
     theta_indices,
     theta_length,
 )
-from r2s.estimation.prediction import Prediction, Sensitivity, Theta
-from r2s.estimation.problem import Problem, motion_alone
+from r2s.estimation.problem import Problem, Problems, motion_alone
+from r2s.estimation.standard_errors import equations
 from r2s.materials.informed_space import InformedSpace
 from r2s.mesh.surface import nearest
 from r2s.scenarios.resolution import ORDER
@@ -37,34 +43,29 @@ from r2s.scenarios.resolution import ORDER
 RISE, HALVINGS = 1.5, 6  # of a loss, and of the step that raises it by more
 RCOND = 1e-6  # of the recordings' information: less than that is none
 
-_equations = compile_once(normal_equations.normal_equations_of)
-
 
 class OtherMesh(NamedTuple):
-    """- `problems`: the same recordings on another mesh.
-    - `factor`: from a step to that mesh to one to a mesh without end, see `factor`.
-    """
+    """The same recordings on another mesh, and the extrapolation `factor` from a step to it."""
 
     problems: Problems
     factor: float
 
     @property
     def is_finer(self) -> bool:
-        """Whether its cells are shorter: a coarser mesh says how far, but hardly where to."""
+        """Whether its cells are shorter."""
         return self.factor > 0
 
 
 def factor(ratio: float) -> float:
-    """From a step to a mesh whose cells are `ratio` times as long, to one to a mesh without end."""
+    """Richardson extrapolation factor to cell size 0, of a step to cells `ratio` times as long."""
     return 1 / (1 - ratio**ORDER)
 
 
 def coarser_of(
     problems: Problems, other: OtherMesh | None
 ) -> tuple[Problems, tuple[OtherMesh, ...]]:
-    """The recordings on the coarser of two meshes, and each on another beside it, for what takes
-    many motions: on the finest, in its short steps, those of a lift take many times as long. Pulls
-    stay on their own mesh."""
+    """The recordings on the coarser of two meshes, for what takes many motions, and each of them on
+    another mesh beside it. Pulls stay on their own mesh."""
     if other is None:
         return problems, ()
     if other.is_finer:
@@ -78,10 +79,10 @@ def coarser_of(
 
 
 class MeshError(NamedTuple):
-    """By how much theta errs for its mesh.
+    """The discretization error of theta.
 
-    - `bias`: from where meshes without end would lead.
-    - `covariance`: the square of that, and how far patches and blocks of frames differ in it.
+    - `bias`: from the limit of fine meshes. `covariance`: its square, and its scatter between
+      patches and blocks of frames.
     """
 
     bias: Float[np.ndarray, " theta"]
@@ -94,17 +95,16 @@ def mesh_error(
     end: Descent,
     predicted: Sequence[tuple[Prediction, Sensitivity]],
 ) -> MeshError:
-    """By how much theta errs for its mesh, as far as one step says.
+    """The discretization error of theta, by one Gauss-Newton step.
 
-    It is the Gauss-Newton step by what the gradient on the other mesh differs. The other mesh fits
-    the recordings worse than by their noise, so the step is held by the prior as strongly as by a
-    fit of that spread: a number that hardly matters isn't taken for the cause. What each cluster of
-    residuals adds to it is the evidence for its direction, so their scatter is in the covariance.
+    Its gradient is by how much that on the other mesh differs. The other mesh fits the recordings
+    worse than by their noise, so the step has a prior as strong as that of a fit of this spread: a
+    parameter of little influence is not taken for the cause. The scatter of the contributions of
+    clusters of residuals is in the covariance. Parameters at a bound stay there.
 
-    Where a motion fails, or the step is longer than the range, it is the whole range: the mesh
-    tells nothing then. What a bound holds is held.
+    Where a motion fails, or the step is longer than the range, it is the whole range.
 
-    - `predicted`: at the end, with its derivative (`r2s.estimation.compiled.derivatives_at`).
+    - `predicted`: at the end, with its derivative.
     """
     size = theta_length(problems)
     changes, matrix, square = [], np.zeros((size, size)), 0.0
@@ -112,9 +112,9 @@ def mesh_error(
         index = theta_indices(problems, which)
         here, there, theta = problems[which], other.problems[which], end.theta[index]
         seen, slope = predicted[which]
-        finer = compiled.predicted(motion_alone(there), theta)
-        own = _equations(here, seen, slope, end.scale)
-        found = _equations(there, finer, _laid_onto(here, there, slope), end.scale)
+        finer = predict_compiled(motion_alone(there), theta)
+        own = equations(here, seen, slope, end.scale)
+        found = equations(there, finer, _laid_onto(here, there, slope), end.scale)
         change = np.zeros((len(own.scores), size))
         change[:, index] = share * (np.asarray(found.scores) - np.asarray(own.scores))
         changes.append(change)
@@ -138,18 +138,13 @@ def alone(
     derive: Derive,
     width: float | None = None,
 ) -> list[Float[np.ndarray, " theta"]]:
-    """The bias by its mesh of the end of a descent in each recording alone; of none where there is
-    no other mesh, or no such end.
-
-    - `others`: of each recording alone. `derive`, `width`: see `r2s.estimation.compiled`.
-    """
-    found: list[Float[np.ndarray, " theta"]] = []
+    """The bias of the end of a descent in each recording alone; empty without other meshes."""
     if not others or not ends:
-        return found
-    for problem, other, end in zip(problems, others, ends, strict=True):
-        own = (problem,)
-        found.append(mesh_error(own, other, end, derive(own, end.theta, width)).bias)
-    return found
+        return []
+    return [
+        mesh_error((problem,), other, end, derive((problem,), end.theta, width)).bias
+        for problem, other, end in zip(problems, others, ends, strict=True)
+    ]
 
 
 def _laid_onto(here: Problem, there: Problem, slope: Sensitivity) -> Sensitivity:
@@ -162,11 +157,11 @@ def _laid_onto(here: Problem, there: Problem, slope: Sensitivity) -> Sensitivity
     return Sensitivity(laid, slope.force)
 
 
-class Settled(NamedTuple):
-    """An estimate at the end of its search, with its mesh's error.
+class Result(NamedTuple):
+    """An estimate with its discretization error.
 
-    - `theta`: where it is. `covariance`: of it, with all errors. `bias`: of its mesh that is left,
-      no larger than the standard errors.
+    - `theta`; `covariance`: with all errors; `bias`: of its mesh, no larger than the standard
+      errors.
     """
 
     theta: Theta
@@ -174,29 +169,27 @@ class Settled(NamedTuple):
     bias: Float[np.ndarray, " theta"]
 
 
-def settled(
+def correct(
     problems: Problems,
     other: OtherMesh,
     end: Descent,
     prior: Array,
     covariance: Float[np.ndarray, "theta theta"],
     by: MeshError,
-) -> Settled:
-    """An estimate at the end of a descent, with what its mesh errs.
+) -> Result:
+    """An estimate at the end of a descent, with its discretization error.
 
-    It stays where the loss is least: that a mesh errs does not say where the fabric is instead.
-    Where something is known of the fabric beforehand, the truth is at most as far off as that
-    allows: the errors are in each direction the smaller of those by the recordings and those of the
-    posterior in which the recordings count by all of these errors (the model discrepancy of Kennedy
-    and O'Hagan 2001, linear about the end), with the way to its mean. Only where tests measured
-    this very fabric does it go there, as far as the finer mesh allows (`_allowed`).
+    It stays where the loss is least: a mesh's error does not say where the fabric is instead. A
+    prior limits the error: in each direction it is the smaller of that by the recordings and that
+    of the posterior in which the recordings have all of these errors (the model discrepancy of
+    Kennedy and O'Hagan 2001, linear about the end), with the way to its mean. Only where tests
+    measured this very fabric does it go there, as far as the finer mesh allows (`_allowed`).
 
-    - `prior`: its weight, see `r2s.estimation.gauss_newton.prior_weight`.
-    - `covariance`: of the end, without its mesh's error. `by`: that, see `mesh_error`.
+    - `prior`: its weight. `covariance`: of the end, without its mesh's error. `by`: that.
     """
     raw, space = _positive(covariance) + by.covariance, problems[0].space
     if not (isinstance(space, InformedSpace) and is_finite(end.normal)):
-        return Settled(end.theta, raw, by.bias)
+        return Result(end.theta, raw, by.bias)
     way, errors = _posterior(problems, end, prior, raw)
     share = _allowed(other, end, way) if space.measured and other.is_finer else 0.0
     left = (1 - share) * way
@@ -204,16 +197,12 @@ def settled(
     if not share:
         errors = _smaller(raw, errors)
     most = np.sqrt(np.diag(errors))
-    return Settled(_at(other, end, share * way), errors, np.clip(by.bias, -most, most))
+    return Result(_at(other, end, share * way), errors, np.clip(by.bias, -most, most))
 
 
 def _allowed(other: OtherMesh, end: Descent, way: Float[np.ndarray, " theta"]) -> float:
-    """The share of a way from the end, halved as often as needed, on which the finer mesh fits
-    `RISE` times as badly as at the end at most; 0 after `HALVINGS`.
-
-    What a mesh errs is by how much it moves unlike the finer one. So a step for it that makes the
-    finer mesh fit worse is none.
-    """
+    """The share of a way from the end, halved as often as needed, at which the loss of the finer
+    mesh is `RISE` times that at the end at most; 0 after `HALVINGS`."""
 
     def loss(share: float) -> float:
         theta = _at(other, end, share * way)
@@ -236,14 +225,12 @@ def _at(other: OtherMesh, end: Descent, way: Float[np.ndarray, " theta"]) -> The
 def _posterior(
     problems: Problems, end: Descent, prior: Array, covariance: Float[np.ndarray, "theta theta"]
 ) -> tuple[Float[np.ndarray, " theta"], Float[np.ndarray, "theta theta"]]:
-    """From an end of a given `covariance` to the mean of its posterior, and the covariance there.
-
-    What the recordings tell is what the covariance knows beyond the prior.
-    """
+    """The way from an end of a given `covariance` to the mean of its posterior, and the covariance
+    there. The information of the recordings is that of the covariance beyond the prior."""
     off, known = (np.asarray(part, np.float64) for part in prior_terms(problems, end.theta))
     told = np.asarray(end.normal.matrix, np.float64) / float(prior)
     slope = np.asarray(end.normal.gradient, np.float64) / float(prior)
-    alone = np.linalg.lstsq(told, -slope, rcond=RCOND)[0]  # to where recordings alone lead
+    alone = np.linalg.lstsq(told, -slope, rcond=RCOND)[0]  # the step without the prior
     root = np.linalg.cholesky(known)
     inner = np.linalg.solve(root, np.linalg.inv(covariance))
     sizes, axes = np.linalg.eigh(np.linalg.solve(root, inner.T))

@@ -2,8 +2,8 @@
 
     found = METHODS["diffcloud"]().estimate(recordings, space, key=jax.random.key(0))
 
-A method is a frozen dataclass. What it needs beyond recordings, space, budget and key (a mesh, a
-checkpoint, a trained network) are its fields. `r2s.estimation.registry.METHODS` has all methods.
+A method is a frozen dataclass, whose fields are what it needs beyond recordings, space, budget and
+key. `r2s.estimation.methods.METHODS` has all methods.
 """
 
 import abc
@@ -24,41 +24,36 @@ from r2s.materials.parameters import ParameterSpace
 from r2s.recordings.recording import Recording
 
 SOLVERS = ("cloth", "points")
-Progress = Callable[[int, float], None]  # told the iteration and the best loss
+COARSEST = (9, 9)  # vertices of a simulated sheet
 ANY = None  # every scenario
+Progress = Callable[[int, float], None]  # called with the iteration and the best loss
 
 
 def tell(progress: Progress | None, words: str) -> None:
-    """Say what is done now to a progress that has a method `say`."""
+    """Report what is being done to a progress that has a method `say`."""
     say = getattr(progress, "say", None)
     if say is not None:
         say(words)
 
 
-COARSEST = (9, 9)  # vertices of a simulated sheet
-
-
 class Budget(NamedTuple):
-    """How much an estimate may cost. A method heeds some of the numbers, see `Method.heeds`.
+    """How much an estimate may cost. Each method has its own numbers, see `Method.heeds`.
 
     - `coarse`: places of the range that are tried first; 0: descend from the start alone.
-    - `starts`: how many of the best places are descended from, side by side. Of more than three
-      descents the better half go on every three iterations, until three are left.
-    - `iterations`: at most, of each stage of a descent. First all starts descend until each has
-      arrived; then the best one descends with outliers left out, until its next step promises to
-      change no parameter by more than about a tenth of its standard error. Of a method
-      that trains: its epochs.
+    - `starts`: how many of the best places are descended from. Of more than three descents the
+      better half go on every three iterations, until three are left.
+    - `iterations`: at most, of each stage of a descent. First all starts descend; then the best one
+      descends with outliers left out, until its next step would change no parameter by more than
+      about a tenth of its standard error. Of a method that trains: its epochs.
     - `width`: over which slopes are taken, see `r2s.estimation.prediction.sensitivities`.
-    - `shares`: of the frames, from the first, that count before all of them do. All starts descend
-      on the first share; then the best one, outliers left out, descends on each share and on all
-      frames. The end of a long motion can depend on the fabric so steeply that a loss over all of
-      it is low nowhere but near the truth; the loss of its beginning leads there.
+    - `shares`: of the frames, from the first, that count in earlier stages. The end of a long
+      motion can depend so steeply on the fabric that a loss over all of it is low only near the
+      truth; the loss of its beginning leads there.
     - `around`: an even number of places around the end, from which Gauss-Newton steps are taken;
-      the standard errors grow by how far these steps end from it, see `standard_errors`.
+      the standard errors grow by how far apart these steps end.
     - `evaluations`: simulations of a search without derivatives.
-    - `leads_on`: whether other descents go on from the end of these, on a finer mesh. Such a one
-      ends within about half a standard error, as all do that are not in the last stage.
-    - `near`: whether the start is near the end already: then outliers are left out from there on.
+    - `leads_on`: whether a descent on a finer mesh goes on from the end, which may be less exact.
+    - `near`: whether the start is near the end: outliers are left out from there on.
     """
 
     coarse: int = 24
@@ -72,10 +67,10 @@ class Budget(NamedTuple):
     near: bool = False
 
 
-class Reads(NamedTuple):
+class DataRequirements(NamedTuple):
     """What a method reads of a recording, beside its sheet, table, wind and the grippers' path.
 
-    - `frames`: of which it reads clouds, markers or force; the others could be missing.
+    - `frames`: of which it reads clouds, markers or force.
     - `points`: at most, of each cloud; 0: no clouds; None: all points.
     - `markers`: whether it reads them. `force`: of the pulled clamp, on them.
     """
@@ -98,20 +93,19 @@ class Method(abc.ABC):
 
     Of every method:
 
-    - `name`: in the registry. `budget`: its usual one.
-    - `heeds`: the numbers of a `Budget` that it goes by.
-    - `supports`: solver by solver the scenarios that it estimates from; None: all of them.
-    - `refusals`: solver by solver why it does not support it.
+    - `name`: in the registry. `budget`: its default. `heeds`: the numbers of it that it uses.
+    - `supports`: by solver the scenarios that it estimates from; None: all of them.
+    - `refusals`: by solver why it does not support it.
     - `several`: whether it takes more than one recording of a fabric.
-    - `takes_prior`: whether it heeds what is known of a space beforehand (`InformedSpace`).
+    - `takes_prior`: whether it uses the prior of an `InformedSpace`.
     - `takes_shape`: whether the `shape` of its simulated sheet can be chosen.
 
     Of one instance:
 
     - `solver`: "cloth", or "points" (material points); None: the first that the method supports.
     - `shape`: vertices of the simulated sheet along warp and weft; None: those of the method
-      (`diffcloud`: by meshes that resolve the fabric, see `r2s.estimation.mesh_ladder`).
-    - `checkpoint`: a file that a killed run goes on from; None: it begins again.
+      (`diffcloud`: by meshes that resolve the fabric, see `r2s.estimation.mesh_refinement`).
+    - `checkpoint`: a file that a killed run resumes from; None: it begins again.
     - `progress`: called with the iteration and the best loss so far, see also `tell`.
     """
 
@@ -139,10 +133,9 @@ class Method(abc.ABC):
     ) -> Estimate:
         """The fabric of `space` that explains the recordings, all of one fabric.
 
-        `budget` is by default the method's usual one. Raises `ValueError` that says why for what
-        the method does not support (`check` says so beforehand) or a recording that it cannot use,
-        `RuntimeError` when every simulation diverges, and `ImportError` that names the extra to
-        install.
+        Raises `ValueError` that says why for what the method does not support (see `check`) or a
+        recording that it cannot use, `RuntimeError` when every simulation diverges, and
+        `ImportError` that names the extra to install.
         """
         self.check(recordings)
         if isinstance(space, InformedSpace):
@@ -160,9 +153,9 @@ class Method(abc.ABC):
                 raise ValueError(f"{self.name}: {reason}")
 
     def check_prior(self) -> None:
-        """Raise `ValueError` if the method does not heed what is known of a space beforehand."""
+        """Raise `ValueError` if the method does not support priors."""
         if not self.takes_prior:
-            raise ValueError(f"{self.name} takes no account of what is known of a space beforehand")
+            raise ValueError(f"{self.name} does not support priors (InformedSpace)")
 
     @property
     def chosen_solver(self) -> str:
@@ -175,7 +168,7 @@ class Method(abc.ABC):
         return self.shape or COARSEST
 
     @abc.abstractmethod
-    def reads(self, recording: Recording) -> Reads:
+    def reads(self, recording: Recording) -> DataRequirements:
         """What an estimate from a recording depends on."""
 
     @classmethod
@@ -194,9 +187,8 @@ class Method(abc.ABC):
         scenarios = cls.supports[solver]
         if scenarios is None or scenario in scenarios:
             return ""
-        why = cls.refusals.get(solver)
-        told = f"on {solver} it estimates from {', '.join(scenarios)}, not from {scenario}"
-        return f"{told}: {why}" if why else told
+        reason = f"on {solver} it estimates from {', '.join(scenarios)}, not from {scenario}"
+        return f"{reason}: {cls.refusals[solver]}" if solver in cls.refusals else reason
 
     @abc.abstractmethod
     def _estimate(
@@ -210,10 +202,8 @@ class Method(abc.ABC):
 
 
 def default_space(solver: str, density: float) -> ParameterSpace:
-    """The fabrics to choose from: orthotropic on the cloth, isotropic on material points.
-
-    See `r2s.estimation.default_spaces`. `density`: areal, [kg/m^2], else `ValueError`.
-    """
+    """The default space of a solver (`r2s.estimation.default_spaces`): orthotropic on the cloth,
+    isotropic on material points. `density`: areal, [kg/m^2], else `ValueError`."""
     return on_cloth(density) if solver == "cloth" else on_points(density)
 
 

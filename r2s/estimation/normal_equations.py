@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from r2s.estimation.prediction import Prediction, Sensitivity
-from r2s.estimation.problem import FORCE_SCALE, Clouds, Expected, Force, Markers, Problem
+from r2s.estimation.problem import FORCE_SCALE, Clouds, Force, ImageObservation, Markers, Problem
 from r2s.mesh.mesh import Mesh, borders
 from r2s.metrics.losses import (
     TOUCHING,
@@ -141,7 +141,7 @@ def _of_markers(markers: Markers, seen: Prediction, slope: Sensitivity, scale) -
 
 
 def _of_expected(
-    expected: Expected, mesh: Mesh, seen: Prediction, slope: Sensitivity, scale
+    expected: ImageObservation, mesh: Mesh, seen: Prediction, slope: Sensitivity, scale
 ) -> NormalEquations:
     gap, counts = _to_clouds(expected, seen.x)
     distance = length(gap)
@@ -243,7 +243,7 @@ def _residuals(clouds: Clouds, mesh: Mesh, seen: Prediction, scale: Scale):
 
 
 def _to_clouds(
-    expected: Expected, x: Float[Array, "frame vertex 3"]
+    expected: ImageObservation, x: Float[Array, "frame vertex 3"]
 ) -> tuple[Float[Array, "frame sample 3"], Bool[Array, "frame sample"]]:
     """From the nearest point of its cloud to each sample of the sheet [m], and which count.
 

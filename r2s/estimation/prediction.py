@@ -1,29 +1,95 @@
-"""What a recording would show if the sheet were of a given fabric, and how that changes with it.
+"""What recordings would show if the sheet were of a given fabric, and the derivative of that.
 
-`theta` is a flat vector: the fabric's place in its space; then the density of the sheet and of the
-air and the sheet's size, which all recordings of a fabric share; then of every recording the
-cameras' shift, turn and clock. All but the place are nuisances, in units of the standard deviation
-that `r2s.estimation.problem.NuisancePrior` gives them.
+`theta` is a flat vector: the fabric's place in its space; then the density of the sheet, that of
+the air and the sheet's size, which all recordings of a fabric share; then the cameras' shift, turn
+and clock of each recording. All but the place are nuisance parameters, in units of the standard
+deviation that `r2s.estimation.problem.NuisancePrior` gives them.
+
+The motion is compiled apart from the loss: it is most of the work, and one program serves
+recordings of any number of points and all stages of a descent.
 """
 
 import dataclasses
+import threading
+from collections.abc import Callable, Iterator
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from r2s.estimation.problem import OWN, SHARED, Problem
+from r2s._util.threads import thread_map
+from r2s.compilation import compile_once
+from r2s.estimation.estimate import Nuisance
+from r2s.estimation.problem import OWN, SHARED, UNITS, Problem, Problems, motion_alone
 from r2s.materials.fabric import Fabric
 from r2s.scenarios.energy import clamp_force, energy_balance
-from r2s.scenarios.scenario import in_denser_air, resized, rollout
+from r2s.scenarios.scenario import Scenario, in_denser_air, resized, rollout
+
+REMEMBERED = 128_000_000  # bytes of derivatives: a lift on 33 x 33 vertices takes 9 MB
 
 Theta = Float[Array, " theta"]
 
 
+def theta_length(problems: Problems) -> int:
+    """Length of theta: fabric, nuisances shared by all recordings, nuisances of each."""
+    return problems[0].space.dim + len(SHARED) + len(OWN) * len(problems)
+
+
+def theta_indices(problems: Problems, which: int) -> np.ndarray:
+    """Indices in theta of the parameters of one recording."""
+    shared = problems[0].space.dim + len(SHARED)
+    first = shared + len(OWN) * which
+    return np.concatenate([np.arange(shared), np.arange(first, first + len(OWN))])
+
+
+class FreeNuisance(NamedTuple):
+    """A nuisance parameter that the prior lets vary.
+
+    - `recording`: its index, that of the first for what recordings share.
+    - `name`: one of `SHARED` or `OWN`. `scale`: its prior standard deviation, in its unit.
+    - `place`: its index in theta.
+    """
+
+    recording: int
+    name: str
+    scale: float
+    place: int
+
+
+def free_nuisances(problems: Problems) -> Iterator[FreeNuisance]:
+    """All nuisance parameters that vary, shared ones once."""
+    known = set()
+    for which, problem in enumerate(problems):
+        places = theta_indices(problems, which)[problem.space.dim :]
+        rows = zip((*SHARED, *OWN), problem.nuisance_prior.scales, places, strict=True)
+        for name, scale, place in rows:
+            if scale and place not in known:
+                known.add(place)
+                yield FreeNuisance(which, name, float(scale), int(place))
+
+
+def nuisances(problems: Problems, theta: np.ndarray, deviation: np.ndarray) -> tuple[Nuisance, ...]:
+    """The nuisance parameters that vary, from theta and its standard errors."""
+    found = []
+    for each in free_nuisances(problems):
+        number = f" {each.recording + 1}" if len(problems) > 1 else ""
+        at, spread = (each.scale * float(part[each.place]) for part in (theta, deviation))
+        if each.name in SHARED:  # the logarithm of a ratio
+            ratio = float(np.exp(at))
+            found.append(Nuisance(f"{each.name} ratio", "-", ratio, ratio * spread))
+        else:
+            found.append(Nuisance(each.name + number, UNITS[each.name], at, spread))
+    return tuple(found)
+
+
 class Prediction(eqx.Module):
-    """- `x`: vertices in the frame and on the clock of the cameras, at the frames that count, [m].
+    """What a recording would show.
+
+    - `x`: vertices in the frame and on the clock of the cameras, at the frames that count, [m].
     - `force`: on the pulled clamp then, [N]; None: it was not measured.
     - `ok`: whether the whole run is finite.
     """
@@ -40,9 +106,8 @@ class Sensitivity(eqx.Module):
     force: Float[Array, "frame direction theta"] | None
 
 
-def theta_length(problem: Problem) -> int:
-    """Length of theta of one recording."""
-    return problem.space.dim + len(SHARED) + len(OWN)
+Predicted = list[tuple[Prediction, Sensitivity]]  # of each recording
+Derive = Callable[[Problems, Theta, float | None], Predicted]  # as `derivatives_at`
 
 
 def fabric_at(problem: Problem, theta: Theta) -> Fabric:
@@ -87,7 +152,7 @@ def sensitivities(
         slope, ((x, force), ok) = jax.jacfwd(moved_twice, has_aux=True)(none)
     else:
         slope, ((x, force), ok) = _secants(moved, theta[index], width, problem.space.dim)
-    slope_x, slope_force = jax.tree.map(partial(_scattered, theta_length(problem), index), slope)
+    slope_x, slope_force = jax.tree.map(partial(_scattered, len(theta), index), slope)
     slope_x = jax.vmap(turned, in_axes=-1, out_axes=-1)(slope_x[..., :shared])
     own = jax.jacfwd(lambda theta: _seen_from(problem, x, theta))(theta)[..., shared:]
     return (
@@ -128,6 +193,84 @@ def _secants(moved, place, width: float, dim: int):
 
     first = jax.tree.map(lambda part: part[0], outs)
     return jax.tree.map(slope, outs), (first, jnp.all(ok))
+
+
+predict_compiled = compile_once(predict)
+_sensitivities = compile_once(sensitivities)
+
+
+def predictions_at(problems: Problems, theta: Theta) -> list[Prediction]:
+    """`predict` of each recording."""
+    return thread_map(lambda pair: predict_compiled(*pair), _motions(problems, theta))
+
+
+def derivatives_at(problems: Problems, theta: Theta, width: float | None = None) -> Predicted:
+    """`sensitivities` of each recording."""
+    return thread_map(lambda pair: _sensitivities(*pair, width), _motions(problems, theta))
+
+
+def prepare(problems: Problems, width: float | None = None, *, derivatives: bool = True) -> None:
+    """Compile what `derivatives_at`, or else `predictions_at`, will run; from any thread."""
+    for pair in _motions(problems, jnp.zeros(theta_length(problems), float)):
+        if derivatives:
+            _sensitivities.prepare(*pair, width)
+        else:
+            predict_compiled.prepare(*pair)
+
+
+def _motions(problems: Problems, theta: Theta) -> list[tuple[Problem, Array]]:
+    """What moves in each recording, and its own part of theta."""
+    indices = (jnp.asarray(theta_indices(problems, i)) for i in range(len(problems)))
+    pairs = zip(problems, indices, strict=True)
+    return [(motion_alone(problem), theta[index]) for problem, index in pairs]
+
+
+class _Known(NamedTuple):
+    """Derivatives of a scenario over some frames, at a theta, by slopes over a width."""
+
+    scenario: Scenario
+    theta: np.ndarray
+    width: float | None
+    frames: int
+    derivatives: tuple[Prediction, Sensitivity]
+
+    def is_of(self, scenario: Scenario, theta: np.ndarray, width: float | None) -> bool:
+        is_alike = self.scenario is scenario and self.width == width
+        return is_alike and np.array_equal(self.theta, theta)
+
+    @property
+    def bytes(self) -> int:
+        return sum(leaf.nbytes for leaf in jax.tree.leaves(self.derivatives))
+
+
+def remembering() -> Derive:
+    """`derivatives_at` with a cache of the latest places.
+
+    Every stage of a descent, every search and the standard errors begin where another ended.
+    Derivatives of more frames serve fewer, too.
+    """
+    cache: list[_Known] = []  # the latest place last
+    lock = threading.Lock()
+
+    def derive(problems: Problems, theta: Theta, width: float | None = None) -> Predicted:
+        return thread_map(lambda pair: one(*pair, width), _motions(problems, theta))
+
+    def one(problem: Problem, theta: Array, width: float | None):
+        frames = problem.scenario.num_frames if problem.wanted is None else int(problem.wanted)
+        place = np.asarray(theta)
+        with lock:
+            found = next((k for k in cache if k.is_of(problem.scenario, place, width)), None)
+        if found is None or found.frames < frames:
+            derivatives = _sensitivities(problem, theta, width)
+            found = _Known(problem.scenario, place, width, frames, derivatives)
+        with lock:
+            cache[:] = [k for k in cache if not k.is_of(problem.scenario, place, width)]
+            cache.append(found)
+            while len(cache) > 1 and sum(each.bytes for each in cache) > REMEMBERED:
+                del cache[0]
+        return found.derivatives
+
+    return derive
 
 
 def explain(problem: Problem, theta: Theta) -> str:

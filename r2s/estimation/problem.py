@@ -1,4 +1,4 @@
-"""What an estimator is given: a recording to be explained by a fabric of a parameter space."""
+"""The inverse problem: a recording to be explained by a fabric of a parameter space."""
 
 import dataclasses
 import math
@@ -6,35 +6,40 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
-from r2s.estimation import initial_shape
-from r2s.estimation.method import Reads, frames_that_count
+from r2s.estimation.method import DataRequirements, frames_that_count
+from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import ParameterSpace
 from r2s.mesh.mesh import Mesh
 from r2s.mesh.surface import nearest
+from r2s.metrics.losses import TOUCHING, length, robust_weight, surface_residuals
 from r2s.recordings.cameras.views import Views
 from r2s.recordings.recording import Doubt, Recording, check_covered, gripper_positions, subsample
-from r2s.scenarios.scenario import Scenario, from_recording
+from r2s.scenarios.scenario import Scenario, from_recording, rollout
 
 POINTS = 300  # at most, of a cloud
 TARGETS = 1200  # at most, of a cloud that the sheet must lie near
 SPACING = 0.012  # [m], of the samples of such a sheet
-BETWEEN = 3  # frames after the last that is seen, of which the interpolation in time may have one
-CLOCK = 4.0  # standard deviations of a clock, by which it may be early
-# of each kind of what was seen: the field that says where
+ON_SHEET = 0.01  # [m], within which a marker must lie in the first frame
+BETWEEN = 3  # frames after the last that is seen, for the interpolation in time
+CLOCK = 4.0  # standard deviations, by which a clock may be early
+# of each kind of observation: its field that says where
 MASKS = {"clouds": "mask", "markers": "seen", "force": "seen", "expected": "mask"}
 FORCE_SCALE = 0.02  # [m/N]: a load cell is good to 10 mN where a marker is to 0.2 mm
+ROUNDS = 60  # of the registration of a hanging sheet
+SMOOTH, STRETCHED = 0.02, 0.1  # weights of neighbours moving apart, and of edges growing longer
 
 
 class NuisancePrior(NamedTuple):
     """Standard deviations of what was written down of an experiment; 0: it is exact.
 
-    These nuisances are estimated along with the fabric, so that an error of calibration is not
-    taken for a property of the fabric.
+    They are estimated along with the fabric, so that an error of calibration is not taken for a
+    property of the fabric.
 
     - `shift`: of the cameras' frame against the grippers', [m]; of each axis, or of all alike.
     - `turn`: of the same, about the vertical through the first gripper, [rad].
@@ -99,7 +104,7 @@ class Markers(eqx.Module):
     weights: Float[Array, "marker 3"]
 
 
-class Expected(eqx.Module):
+class ImageObservation(eqx.Module):
     """Where the sheet itself must lie near the clouds: in its parts that cameras had in view.
 
     - `views`: the cameras, and what became of their points.
@@ -137,7 +142,7 @@ class Problem(eqx.Module):
     - `wanted`: how many frames of the scenario have to be simulated; None: all.
     - `weight`: of a frame beside those of other recordings of the fabric, [1/m^2] (only ratios
       count): what the square of a distance scatters by, inverted; None: 1, as of all.
-    - `solver`: what simulates; None: the cloth, in the scenario's steps.
+    - `solver`: what simulates; None: the cloth.
     - `nuisance_prior`: how far the experiment may be off what was written down.
     """
 
@@ -149,7 +154,7 @@ class Problem(eqx.Module):
     force: Force | None = None
     solver: Any = None
     nuisance_prior: NuisancePrior = eqx.field(static=True, default=USUAL)
-    expected: Expected | None = None
+    expected: ImageObservation | None = None
     wanted: Int[Array, ""] | None = None
     weight: Float[Array, ""] | None = None
 
@@ -165,25 +170,20 @@ class Problem(eqx.Module):
         space: ParameterSpace,
         *,
         num_points: int = POINTS,
-        voxel: float | None = None,
         shape: tuple[int, int] = (9, 9),
         seed: int = 0,
         nuisance_prior: NuisancePrior | None = None,
-        solver: Any = None,
         as_seen: bool = True,
     ) -> "Problem":
         """The problem of a recording.
 
-        Where markers were tracked they count instead of the clouds, and the force on the pulled
-        clamp counts where it was measured.
+        Tracked markers replace the clouds, and the force on the pulled clamp counts where it was
+        measured.
 
-        - `num_points`, `voxel` [m], `seed`: how the clouds are thinned, see
-          `r2s.recordings.recording.subsample`.
+        - `num_points`, `seed`: how clouds are thinned (`r2s.recordings.recording.subsample`).
         - `shape`: vertices of the simulated sheet along warp and weft.
         - `nuisance_prior`: by default `default_nuisance_prior`.
-        - `solver`: what simulates; None: the cloth.
-        - `as_seen`: a sheet that hangs starts in the shape that the first cloud shows, see
-          `r2s.estimation.initial_shape`; else flat.
+        - `as_seen`: a sheet that hangs starts in the shape of its first cloud; else flat.
 
         Raises `ValueError` when a marker is not seen in the first frame, or lies off the sheet
         there.
@@ -195,11 +195,11 @@ class Problem(eqx.Module):
         clouds, expected = None, None
         if markers is None:
             expected = _expected(recording, scenario, frames, seed)
-            thinned = subsample(recording, num_points, voxel, seed)
+            thinned = subsample(recording, num_points, None, seed)
             clouds = Clouds(thinned.points[frames], thinned.mask[frames])
             if as_seen and scenario.brake is not None and first == 0:
                 middle = space(jnp.full(space.dim, 0.5, float))
-                scenario = initial_shape.as_seen(scenario, middle, clouds.points[0], clouds.mask[0])
+                scenario = start_as_seen(scenario, middle, clouds.points[0], clouds.mask[0])
         return cls(
             scenario,
             space,
@@ -207,17 +207,19 @@ class Problem(eqx.Module):
             clouds,
             markers,
             force_at(recording, frames) if recording.info.scenario == "stretching" else None,
-            solver,
-            nuisance_prior or default_nuisance_prior(scenario, recording.info.doubt),
-            expected,
+            nuisance_prior=nuisance_prior or default_nuisance_prior(scenario, recording.info.doubt),
+            expected=expected,
         )
 
 
-def read_by_problem(recording: Recording) -> Reads:
+Problems = tuple[Problem, ...]
+
+
+def read_by_problem(recording: Recording) -> DataRequirements:
     """What `Problem.make` reads of a recording."""
     has_markers = recording.markers is not None
     is_pulled = recording.info.scenario == "stretching"
-    return Reads(
+    return DataRequirements(
         frames_that_count(recording),
         points=0 if has_markers else POINTS if recording.info.views is None else TARGETS,
         markers=has_markers,
@@ -324,7 +326,7 @@ def seen_where(
 
 def _expected(
     recording: Recording, scenario: Scenario, frames: slice, seed: int
-) -> Expected | None:
+) -> ImageObservation | None:
     """What must be seen of the sheet of a recording whose cameras are known."""
     views, mesh = recording.info.views, scenario.scene.mesh
     if views is None:
@@ -343,7 +345,7 @@ def _expected(
     targets, mask = dense.points[frames], dense.mask[frames]
     clouds = [cloud[kept] for cloud, kept in zip(*map(np.asarray, (targets, mask)), strict=True)]
     apart = jnp.asarray([_apart(cloud) for cloud in clouds], float)
-    return Expected(views, mesh.faces[face], weights, grippers, targets, mask, apart)
+    return ImageObservation(views, mesh.faces[face], weights, grippers, targets, mask, apart)
 
 
 def _apart(cloud: Float[np.ndarray, "point 3"]) -> float:
@@ -371,7 +373,7 @@ def _markers(recording: Recording, mesh: Mesh, frames: slice) -> Markers | None:
     offset = np.asarray(recording.markers[0]) - np.asarray(sheet.origin)
     material = offset @ np.array([sheet.warp, sheet.weft]).T
     face, weights, away = _on_sheet(material, mesh)
-    if away.max() > 0.01:
+    if away.max() > ON_SHEET:
         worst = int(away.argmax())
         raise ValueError(
             f"{recording.info.name}, frame 0: marker {worst} lies {1e3 * away[worst]:.0f} mm off "
@@ -418,3 +420,81 @@ def force_at(recording: Recording, frames: slice | list[int]) -> Force | None:
     directions = np.array([recording.info.sheet.warp]) if scalar else np.eye(3)
     seen = jnp.ones(len(values), bool)
     return Force(jnp.asarray(values, float), seen, jnp.asarray(directions, float))
+
+
+_rollout = eqx.filter_jit(rollout)
+
+
+def start_as_seen(
+    scenario: Scenario,
+    fabric: Fabric,
+    points: Float[Array, "point 3"],
+    mask: Bool[Array, " point"],
+) -> Scenario:
+    """A scenario of a hanging sheet that starts in the shape of its first cloud.
+
+    A sheet whose corners are nearer to each other than they were cut buckles in one of several
+    shapes, each at rest. Which one a simulation falls into depends on the fabric, and no descent
+    crosses such a jump; near the observed shape, more fabrics come to rest in it (not all: for a
+    stiff denim it fails on some recordings).
+
+    - `fabric`: any of those to be estimated, for what the cloud does not show.
+    - `points`, `mask`: the first cloud, [m].
+    """
+    scene = scenario.scene
+    first = _rollout(dataclasses.replace(scenario, num_frames=1), fabric).x[0]
+    start = registered(points, mask, first, scene.mesh, scene.is_free)
+    path = scenario.path.at[0].set(scenario.path[1])
+    return dataclasses.replace(scenario, start=start, path=path)
+
+
+@eqx.filter_jit
+def registered(
+    points: Float[Array, "point 3"],
+    mask: Bool[Array, " point"],
+    x: Float[Array, "vertex 3"],
+    mesh: Mesh,
+    free: Bool[Array, " vertex"],
+) -> Float[Array, "vertex 3"]:
+    """The vertices of a sheet laid smoothly onto points, with edges as long as they were.
+
+    - `points`, `mask`: where to, [m].
+    - `x`: vertices at first, [m].
+    - `free`: which vertices move.
+
+    Nonrigid iterative closest points (Amberg, Romdhani and Vetter 2007), with distances to the
+    surface, and outliers down-weighted.
+    """
+    edges = _edges(mesh, len(x))
+    lengths = length(edges @ x)
+    smooth = jnp.kron(SMOOTH * edges.T @ edges, jnp.eye(3, dtype=x.dtype))
+    moving = jnp.repeat(free, 3)
+    share = len(x) / jnp.maximum(jnp.sum(mask, dtype=x.dtype), 1)
+
+    def closer(x: Array, _: None) -> tuple[Array, None]:
+        distance, direction, vertices, weights = surface_residuals(points, mask, x, mesh.faces)
+        shares = jnp.einsum("pk,pkv->pv", weights, jax.nn.one_hot(vertices, len(x), dtype=x.dtype))
+        weight = share * jnp.where(mask, robust_weight(distance), 0)
+        seen = _along(shares, direction)
+        now = length(edges @ x)
+        stretch = _along(edges, edges @ x / jnp.maximum(now, TOUCHING)[:, None])
+        matrix = seen.T @ (weight[:, None] * seen) + smooth + STRETCHED * stretch.T @ stretch
+        force = seen.T @ (weight * distance) - STRETCHED * stretch.T @ (now - lengths)
+        matrix = jnp.where(moving[:, None] & moving[None], matrix, jnp.eye(len(matrix)))
+        change = jnp.linalg.solve(matrix, jnp.where(moving, force, 0))
+        return x + change.reshape(x.shape), None
+
+    return jax.lax.scan(closer, x, length=ROUNDS)[0]
+
+
+def _edges(mesh: Mesh, count: int) -> Float[Array, "edge vertex"]:
+    """The matrix from vertices to the edges of the faces; inner edges are there twice."""
+    corner = jax.nn.one_hot(mesh.faces, count, dtype=float)
+    return (corner - jnp.roll(corner, 1, axis=1)).reshape(-1, count)
+
+
+def _along(
+    shares: Float[Array, "row vertex"], direction: Float[Array, "row 3"]
+) -> Float[Array, "row coordinate"]:
+    """The derivative of shares of vertices along directions."""
+    return jnp.einsum("rv,ri->rvi", shares, direction).reshape(len(shares), -1)

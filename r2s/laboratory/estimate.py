@@ -20,9 +20,9 @@ import optimistix
 from jaxtyping import Array, Float
 from scipy.stats import chi2
 
-from r2s.estimation.bounded_gauss_newton import BoundedGaussNewton
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import MARGIN
+from r2s.estimation.least_squares import BoundedGaussNewton
 from r2s.estimation.method import Progress, tell
 from r2s.laboratory.cantilever import Cantilever, overhang
 from r2s.laboratory.drape import Drape

@@ -14,11 +14,10 @@ import jax.random as jr
 
 from r2s._util.files import source_hash, write_json
 from r2s.estimation.default_spaces import Law, law_told_by, with_law
-from r2s.estimation.estimate import Estimate
-from r2s.estimation.estimate_json import as_json, from_json
+from r2s.estimation.estimate import Estimate, as_json, from_json
 from r2s.estimation.method import Budget, Method, default_space
+from r2s.estimation.methods import METHODS
 from r2s.estimation.physnet.method import TrainingBudget, train_network
-from r2s.estimation.registry import METHODS
 from r2s.materials import prior
 from r2s.recordings.recording import Recording
 from r2s.study.cells import KEY_LENGTH, VERSIONS, Cell, result_files
@@ -79,7 +78,7 @@ class EstimateCell(Cell):
     - `network`: of "physnet" and "physnet-published".
     - `prior`: "fabrics" where what fabrics of this weight are like is known (`prior`),
       else "flat", as on the command line.
-    - `resolves`: on meshes that resolve the fabric (`r2s.estimation.mesh_ladder`), not `SHAPES`.
+    - `resolves`: on meshes that resolve the fabric (`descend_by_meshes`), not `SHAPES`.
     - `law`: "told": the laws that the recordings tell (`law_told_by`), as on the command line; else
       as in `with_law`.
     """

@@ -9,15 +9,15 @@ import pytest
 from scipy import stats
 
 from r2s import scenarios
-from r2s.estimation.agreement import (
+from r2s.estimation.consistency import (
     MOST,
     UNLIKELY,
-    Told,
+    Information,
     agreement,
-    density_told,
-    odd_one,
-    scattered,
-    told_by,
+    density_of,
+    information_of,
+    outlier,
+    scatter_of,
 )
 from r2s.estimation.descent import DEFAULT
 from r2s.estimation.estimate import Agreement
@@ -123,7 +123,9 @@ def _chances(shift, count=400, dim=12):
     for _ in range(count):
         place = mean + 0.2 * rng.normal(size=dim)
         ends = [_linear(rng, 4, place, precision, shift * (i == 1)) for i in range(4)]
-        found.append(stats.chi2.sf(*scattered([told_by(*end, mean, precision) for end in ends])))
+        found.append(
+            stats.chi2.sf(*scatter_of([information_of(*end, mean, precision) for end in ends]))
+        )
     return np.array(found)
 
 
@@ -150,8 +152,8 @@ def test_the_density_that_was_given_wrongly_is_found(ratio):
         noise = np.sqrt(information) @ rng.normal(size=4)
         covariance = np.linalg.inv(information + precision)
         end = covariance @ (information @ there + noise + precision @ mean)
-        told.append(told_by(end, covariance, mean, precision))
-    density, error = density_told(told, [True, False], scaled, mean, precision)
+        told.append(information_of(end, covariance, mean, precision))
+    density, error = density_of(told, [True, False], scaled, mean, precision)
     assert np.log(density * ratio) == pytest.approx(0, abs=3 * error) and error < 0.3
     found = Agreement(1.0, (3, 4), None, (density, error))
     assert found.doubts_density == (ratio != 1)
@@ -161,7 +163,7 @@ def test_what_an_estimate_kept_of_its_prior_is_not_told_by_its_recording():
     mean, precision = np.array([0.5, 0.5]), np.diag([12.0, 12.0])
     covariance = np.linalg.inv(precision + np.diag([1e4, 1.0]))
     place = mean + covariance @ np.array([1e4 * 0.1, 1.0 * 0.3])
-    told = told_by(place, covariance, mean, precision)
+    told = information_of(place, covariance, mean, precision)
     assert told.count == 1
     np.testing.assert_allclose(told.information, np.diag([1e4, 0]), atol=1e-6)
     np.testing.assert_allclose(told.place, [0.6, 0.5], atol=1e-9)
@@ -171,20 +173,20 @@ def _told(*known):
     """What a recording tells of a warp and a weft: where to, and how precisely."""
     place = np.array([each[0] if each else 0.0 for each in known])
     information = np.diag([1 / each[1] ** 2 if each else 0.0 for each in known])
-    return Told(place, information, sum(bool(each) for each in known))
+    return Information(place, information, sum(bool(each) for each in known))
 
 
 def test_the_odd_recording_is_the_one_that_adds_what_is_least_likely():
     """Not the one without which there is nothing left to compare."""
     lift, weft = _told((0.5, 0.01), (0.5, 0.01)), _told((), (0.514, 0.01))
     wrong = _told((0.6, 0.01), ())
-    assert odd_one([lift, wrong, weft]) == 1
-    assert odd_one([wrong, weft, lift]) == 0
+    assert outlier([lift, wrong, weft]) == 1
+    assert outlier([wrong, weft, lift]) == 0
     tells_nothing = _told((), ())
-    assert odd_one([tells_nothing, lift, wrong]) == 2  # of two that contradict, the second
-    assert odd_one([lift, wrong]) == 1
+    assert outlier([tells_nothing, lift, wrong]) == 2  # of two that contradict, the second
+    assert outlier([lift, wrong]) == 1
     both_against_it = _told((0.7, 0.01), (0.7, 0.01))
-    assert odd_one([both_against_it, _told((0.5, 0.01), ()), weft]) == 0
+    assert outlier([both_against_it, _told((0.5, 0.01), ()), weft]) == 0
     # however far it is: two chances may both be less than the least number
     far = _told((1.5, 0.01), (0.5, 0.01))
-    assert odd_one([lift, far, _told((0.51, 0.01), (0.5, 0.01))]) == 1
+    assert outlier([lift, far, _told((0.51, 0.01), (0.5, 0.01))]) == 1

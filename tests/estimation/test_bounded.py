@@ -4,11 +4,12 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+from r2s.estimation.bounded import bounded_step, held_back, only_held, room
 
 from r2s import scenarios
-from r2s.estimation.bounded import bounded_step, held_back, only_held, room
 from r2s.estimation.gauss_newton import MARGIN, Descent, Normal, theta_length
 from r2s.estimation.mesh_bias import _posterior
+from r2s.estimation.prediction import theta_length
 from r2s.estimation.problem import Problem
 from r2s.materials import presets
 from r2s.materials.informed_space import InformedSpace

@@ -14,11 +14,10 @@ from folders import TESTS
 from r2s import scenarios
 from r2s.estimation import cards
 from r2s.estimation.checkpoint import arrays_of, load, read, save, tree_from
-from r2s.estimation.estimate import describe, point_estimate
-from r2s.estimation.estimate_json import as_json, from_json
+from r2s.estimation.estimate import as_json, describe, from_json, point_estimate
 from r2s.estimation.method import Budget, default_space, seed_of
+from r2s.estimation.methods import METHODS
 from r2s.estimation.pinn import published_recipe, training
-from r2s.estimation.registry import METHODS
 from r2s.materials import presets
 from r2s.materials.fabric_json import fabric_as_json, fabric_from_json
 from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace

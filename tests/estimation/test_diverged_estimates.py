@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.estimation import cma_es, descent, gauss_newton, mesh_bias
-from r2s.estimation.compiled import derivatives_at
-from r2s.estimation.gauss_newton import Descent, Normal, theta_length
+from r2s.estimation import baselines, descent, gauss_newton, mesh_bias
+from r2s.estimation.gauss_newton import Descent, Normal
 from r2s.estimation.judgement import NO_DERIVATIVE, judged
 from r2s.estimation.mesh_bias import MeshError, OtherMesh
 from r2s.estimation.method import Budget
+from r2s.estimation.prediction import derivatives_at, theta_length
 from r2s.estimation.problem import NuisancePrior, Problem
 from r2s.materials import presets, prior
 from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace
@@ -82,10 +82,10 @@ def test_where_all_diverge_it_is_said_and_why(problem, monkeypatch):
 def test_cma_es_gives_no_fabric_of_runs_that_all_diverged(problem, monkeypatch):
     pytest.importorskip("cma")
     monkeypatch.setattr(
-        cma_es, "_losses", lambda problems, thetas, loss: jnp.full(len(thetas), jnp.inf)
+        baselines, "_losses", lambda problems, thetas: jnp.full(len(thetas), jnp.inf)
     )
     with pytest.raises(RuntimeError, match="all .* simulations of CMA-ES diverged"):
-        cma_es.search(problem, evaluations=30, key=jr.key(0))
+        baselines.cma_es((problem,), 30, key=jr.key(0))
 
 
 def test_cma_es_refuses_a_shared_doubt_of_two_sizes(problem):
@@ -94,7 +94,7 @@ def test_cma_es_refuses_a_shared_doubt_of_two_sizes(problem):
         dataclasses.replace(problem, nuisance_prior=NuisancePrior(air=air)) for air in (0.1, 0.2)
     )
     with pytest.raises(ValueError, match="air"):
-        cma_es.search(problems, evaluations=30, key=jr.key(0))
+        baselines.cma_es(problems, 30, key=jr.key(0))
 
 
 def test_a_descent_does_not_go_where_its_derivative_is_not_finite(problem):
@@ -133,6 +133,6 @@ def test_without_a_derivative_the_error_of_a_mesh_is_added_and_nothing_is_solved
     end = dataclasses.replace(end, normal=lost)
     by = MeshError(np.full(size, 0.1), np.eye(size))
     other = OtherMesh((known,), 4 / 3)
-    settled = mesh_bias.settled((known,), other, end, jnp.asarray(jnp.nan), np.eye(size), by)
-    np.testing.assert_allclose(settled.covariance, 2 * np.eye(size), rtol=1e-6)
-    np.testing.assert_array_equal(settled.theta, end.theta)
+    found = mesh_bias.correct((known,), other, end, jnp.asarray(jnp.nan), np.eye(size), by)
+    np.testing.assert_allclose(found.covariance, 2 * np.eye(size), rtol=1e-6)
+    np.testing.assert_array_equal(found.theta, end.theta)

@@ -19,8 +19,7 @@ from r2s.estimation import (
     gauss_newton,
     identifiability,
 )
-from r2s.estimation.estimate import Estimate
-from r2s.estimation.estimate_json import as_json, from_json
+from r2s.estimation.estimate import Estimate, as_json, from_json
 from r2s.estimation.gauss_newton import Descent
 from r2s.estimation.judgement import descend
 from r2s.estimation.method import Budget
@@ -510,7 +509,7 @@ def test_wind_finds_a_light_fabric_from_a_random_start():
 @pytest.mark.slow(group="estimates")
 def test_a_planned_motion_reveals_more_with_better_cameras():
     """And one that does not move reveals less than one that does."""
-    from r2s.estimation.identifiability import sensitivity
+    from r2s.estimation.judgement import sensitivity
 
     def deviations(height, noise):
         experiment = scenarios.lifting(num_frames=8, interval=1 / 10, height=height, moving=0.6)

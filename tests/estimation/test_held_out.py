@@ -11,7 +11,7 @@ from r2s import scenarios
 from r2s.estimation import held_out
 from r2s.estimation.estimate import point_estimate
 from r2s.estimation.held_out import HeldOut
-from r2s.estimation.nuisances import nuisances
+from r2s.estimation.prediction import nuisances
 from r2s.estimation.problem import Problem
 from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
@@ -147,4 +147,4 @@ def test_a_motion_in_which_all_fabrics_are_alike_tells_nothing():
     assert HeldOut("fold", 9e-3, fold, 0, 2.5e-3).describe().startswith("warning")
     assert HeldOut("fold", 1e-3, fold, 0, 2.5e-3).describe().endswith("better than every draw")
     apart = HeldOut("fold", 2.4e-3, fold, 0, 9e-3)  # the middle is another fabric, too
-    assert apart.is_told and apart.is_better
+    assert apart.is_discriminating and apart.is_better

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s.estimation.gauss_newton import Descent, Normal, theta_length
-from r2s.estimation.law_error import half_pulled, law_error, to_small_strain
-from r2s.estimation.prediction import Prediction, Sensitivity
+from r2s.estimation.gauss_newton import Descent, Normal
+from r2s.estimation.prediction import Prediction, Sensitivity, theta_length
 from r2s.estimation.problem import Force, Problem
+from r2s.estimation.standard_errors import half_pulled, model_error, to_small_strain
 from r2s.materials.parameters import OrthotropicSpace, ParameterSpace
 from r2s.materials.stiffening_space import StiffeningSpace
 from r2s.scenarios import stretching
@@ -47,7 +47,7 @@ def fitted(growth, seed=0, space: ParameterSpace = SPACE):
 
 def error_of(growth, seed=0, space: ParameterSpace = SPACE):
     problem, end, predicted, off = fitted(growth, seed, space)
-    return law_error((problem,), end, jnp.asarray(1e-9), [predicted])[: space.dim], off
+    return model_error((problem,), end, jnp.asarray(1e-9), [predicted])[: space.dim], off
 
 
 @pytest.mark.parametrize("growth", [0.1, 0.5])
@@ -73,7 +73,7 @@ def test_yarns_that_may_stiffen_and_pulls_without_force_have_no_such_error():
     problem, end, predicted, _ = fitted(0.5)
     without = Problem(problem.scenario, SPACE, problem.frames)
     assert half_pulled(without) is without
-    assert not np.any(law_error((without,), end, jnp.asarray(1e-9), [predicted]))
+    assert not np.any(model_error((without,), end, jnp.asarray(1e-9), [predicted]))
 
 
 def test_half_of_a_pull_ends_in_the_middle_of_its_force():

@@ -9,8 +9,7 @@ import optimistix
 import pytest
 from scipy import optimize
 
-from r2s.estimation.bounded_gauss_newton import BoundedGaussNewton
-from r2s.estimation.least_squares import Damping, proposed
+from r2s.estimation.least_squares import BoundedGaussNewton, Damping, proposed
 
 TIGHT: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-10}
 

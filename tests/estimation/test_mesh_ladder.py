@@ -8,16 +8,15 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+from r2s.estimation.compiled import derivatives_at, normal_from
 
 from r2s import scenarios
 from r2s.estimation import descent, judgement, mesh_ladder, standard_errors
-from r2s.estimation.compiled import derivatives_at, normal_from
-from r2s.estimation.diffcloud import DiffCloud
-from r2s.estimation.estimate import Estimate
-from r2s.estimation.estimate_json import as_json, from_json
+from r2s.estimation.estimate import Estimate, as_json, from_json
 from r2s.estimation.gauss_newton import Descent, Normal, theta_length
 from r2s.estimation.mesh_bias import OtherMesh, factor, mesh_error
 from r2s.estimation.method import Budget
+from r2s.estimation.methods import DiffCloud
 from r2s.estimation.problem import NuisancePrior, Problem
 from r2s.materials import presets
 from r2s.materials.informed_space import InformedSpace

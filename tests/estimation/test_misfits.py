@@ -9,12 +9,10 @@ import pytest
 
 from r2s import scenarios
 from r2s.cli import estimate_report
-from r2s.estimation.agreement import asks_for_density, with_free_density
-from r2s.estimation.diffcloud import DiffCloud
+from r2s.estimation.consistency import asks_for_density, misfits, with_free_density
 from r2s.estimation.estimate import Agreement, Contradiction, Estimate, Misfit, point_estimate
-from r2s.estimation.gauss_newton import theta_length
-from r2s.estimation.misfits import left_out, misfits
-from r2s.estimation.prediction import fabric_at, predict
+from r2s.estimation.methods import DiffCloud
+from r2s.estimation.prediction import fabric_at, predict, theta_length
 from r2s.estimation.problem import NuisancePrior, Problem
 from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
@@ -63,7 +61,7 @@ def test_what_fits_is_not_named(pulled, lifted):
         problem = problem_of(recording)
         theta, seen = at_truth(problem)
         assert misfits((problem,), theta, seen) == ()
-        (share,) = left_out((problem,), seen, STRICT)
+        (share,) = outlier_fractions((problem,), seen, STRICT)
         assert share < 0.01
 
 
@@ -75,7 +73,7 @@ def test_a_marker_on_another_cloth_is_named(pulled):
     assert (found.recording, found.what, found.unit) == (0, "marker 2", "m")
     assert found.off == pytest.approx(np.hypot(0.03, 0.02), abs=2e-3)
     count = pulled.markers.shape[1]
-    (share,) = left_out((problem,), seen, STRICT)
+    (share,) = outlier_fractions((problem,), seen, STRICT)
     assert share == pytest.approx(1 / count, abs=0.02)
 
 
@@ -136,7 +134,7 @@ def test_points_of_another_thing_are_counted(lifted):
     points[:, ::5, 2] += 0.3
     problem = problem_of(dataclasses.replace(lifted, points=jnp.asarray(points)))
     _, seen = at_truth(problem)
-    (share,) = left_out((problem,), seen, STRICT)
+    (share,) = outlier_fractions((problem,), seen, STRICT)
     assert share == pytest.approx(mask[:, ::5].sum() / mask.sum(), abs=0.05)
 
 

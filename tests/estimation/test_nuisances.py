@@ -12,7 +12,7 @@ import pytest
 
 from r2s import scenarios
 from r2s.estimation import cma_es, compiled, gauss_newton
-from r2s.estimation.agreement import weighing
+from r2s.estimation.consistency import weighing
 from r2s.estimation.estimate import describe
 from r2s.estimation.gauss_newton import Descent, Normal
 from r2s.estimation.judgement import descend
@@ -26,9 +26,8 @@ from r2s.estimation.mesh_bias import (
     settled,
 )
 from r2s.estimation.method import Budget
-from r2s.estimation.nuisances import free as nuisances_that_vary
-from r2s.estimation.nuisances import nuisances
-from r2s.estimation.prediction import predict
+from r2s.estimation.prediction import free as nuisances_that_vary
+from r2s.estimation.prediction import nuisances, predict
 from r2s.estimation.problem import (
     Force,
     NuisancePrior,

@@ -9,10 +9,9 @@ import pytest
 
 from r2s.estimation import second_look
 from r2s.estimation.descent import DEFAULT, Search
-from r2s.estimation.estimate import describe
-from r2s.estimation.estimate_json import as_json, from_json
+from r2s.estimation.estimate import as_json, describe, from_json
 from r2s.estimation.gauss_newton import Descent, Normal
-from r2s.estimation.second_look import ALIKE, LIKELY, look_again
+from r2s.estimation.mesh_refinement import ALIKE, LIKELY, look_again
 from r2s.materials.parameters import IsotropicSpace
 
 SPACE = IsotropicSpace.make(0.2)

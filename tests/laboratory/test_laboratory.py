@@ -16,7 +16,6 @@ from r2s.environment.air import Air
 from r2s.environment.contact import Table
 from r2s.environment.scene import Control, Scene
 from r2s.estimation.default_spaces import on_cloth
-from r2s.estimation.identifiability import FixedParameter
 from r2s.laboratory.cantilever import Cantilever, overhang
 from r2s.laboratory.drape import Drape, coefficient, drape, ring
 from r2s.laboratory.estimate import apart, estimate, fits, informed
@@ -26,7 +25,6 @@ from r2s.laboratory.pull import SPECIMEN, Pull, uniaxial
 from r2s.materials import presets
 from r2s.materials.fabric import Fabric
 from r2s.materials.fabric_json import fabric_as_json, fabric_from_json
-from r2s.materials.informed_space import InformedSpace
 from r2s.materials.membrane import OrthotropicMembrane
 from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
 from r2s.materials.stiffening_space import StiffeningSpace
@@ -277,22 +275,8 @@ def test_a_motion_after_tests_tells_more_than_either():
         assert both.standard_errors[which] < alone.standard_errors[which], name
         assert both.standard_errors[which] < told.standard_errors[which], name
     assert apart(told, both) > 0.01
-    with pytest.raises(ValueError, match="cma-es takes no account"):
+    with pytest.raises(ValueError, match="cma-es does not support priors"):
         r2s.METHODS["cma-es"]().estimate([lift], informed(space, told), key=jax.random.key(0))
-
-
-def test_what_is_known_of_the_others_follows_from_the_one_that_is_fixed():
-    space = on_cloth(0.2)
-    root = np.random.default_rng(0).normal(size=(space.dim, space.dim))
-    covariance = 1e-3 * (root @ root.T + np.eye(space.dim))
-    mean = np.full(space.dim, 0.4)
-    known = InformedSpace.make(space, jnp.asarray(mean), jnp.asarray(np.linalg.inv(covariance)))
-    others = [0, 1, 3, 4, 5, 6]
-    found, precision = FixedParameter.make(known, 2, 0.5).prior()
-    gain = covariance[others, 2] / covariance[2, 2]
-    np.testing.assert_allclose(found, mean[others] + gain * 0.1, rtol=1e-6)
-    left = covariance[np.ix_(others, others)] - np.outer(gain, covariance[2, others])
-    np.testing.assert_allclose(np.linalg.inv(precision), left, rtol=1e-5, atol=1e-9)
 
 
 def test_a_motion_that_leads_elsewhere_than_the_tests_contradicts_them():

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.estimation import compiled, normal_equations
+from r2s.estimation import normal_equations
 from r2s.estimation.default_spaces import on_points
-from r2s.estimation.diffcp import problems_on_points
+from r2s.estimation.gauss_newton import normals_at
+from r2s.estimation.methods import problems_on_points
 from r2s.estimation.prediction import predict
 from r2s.estimation.problem import NuisancePrior, Problem, beginning, check_shared, window
 from r2s.materials import presets
@@ -186,11 +187,11 @@ def test_what_should_have_been_seen_has_the_gradient_that_differences_have(probl
     place = FAMILY.to_unit(FABRIC) + 0.1
     alone = dataclasses.replace(problem, clouds=None)  # the nearest points of both may change
     theta = theta_of(alone, place).at[7:].set(jnp.array([0, 0, 0.5, 1.2, -1.1, 0.9, 0.4, -0.3]))
-    found, loss = compiled.normal_at((alone,), theta, jnp.zeros(())), []
+    (found,), loss = normals_at((alone,), [theta], [jnp.zeros(())]), []
     for index in (0, 2, 9, 10, 13, 14):  # fabric, size, shift, turn, clock
         width = 1e-5
         steps = [theta.at[index].add(s * width) for s in (1, -1)]
-        loss = [compiled.normal_at((alone,), step, jnp.zeros(())).loss for step in steps]
+        loss = [n.loss for n in normals_at((alone,), steps, [jnp.zeros(())] * 2)]
         difference = float(loss[0] - loss[1]) / (2 * width)
         most = float(jnp.max(jnp.abs(found.gradient)))
         assert float(found.gradient[index]) == pytest.approx(difference, rel=1e-2, abs=1e-3 * most)

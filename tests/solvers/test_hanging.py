@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.estimation.initial_shape import as_seen, registered
+from r2s.estimation.problem import registered, start_as_seen
 from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
 from r2s.mesh.mesh import borders, rectangle
@@ -72,7 +72,7 @@ def test_fabrics_come_to_rest_in_the_buckled_shape_that_was_seen():
     assert apart(rest(scenario, changed), true) > 4e-3
     points = sample(true, scenario.scene.mesh.faces, 3)
     middle = space(jnp.full(space.dim, 0.5))
-    seen = as_seen(scenario, middle, points, jnp.ones(len(points), bool))
+    seen = start_as_seen(scenario, middle, points, jnp.ones(len(points), bool))
     assert apart(rest(seen, changed), true) < 2e-3
     assert apart(rest(seen, place), true) < 1e-3
 

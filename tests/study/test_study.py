@@ -17,12 +17,12 @@ from folders import ROOT
 from r2s import scenarios
 from r2s.cli.main import main
 from r2s.cli.study import Study
-from r2s.estimation.diffcloud import MASS, DiffCloud
-from r2s.estimation.diffcloud import STRETCH as MULTIPLIER
+from r2s.estimation.baselines import MASS
+from r2s.estimation.baselines import STRETCH as MULTIPLIER
 from r2s.estimation.estimate import point_estimate
 from r2s.estimation.method import default_space
+from r2s.estimation.methods import METHODS
 from r2s.estimation.pinn.synthetic_pulls import pulled
-from r2s.estimation.registry import METHODS
 from r2s.materials import presets, prior
 from r2s.materials.arcsim import write_material
 from r2s.materials.informed_space import InformedSpace
@@ -240,7 +240,7 @@ def tiny(monkeypatch):
         found = point_estimate("fake", space, middle, 1e-4, losses, values[None, None], 0.1)
         return dataclasses.replace(found, shape=method.chosen_shape)
 
-    monkeypatch.setattr(DiffCloud, "_estimate", fake)
+    monkeypatch.setattr(METHODS["diffcloud"], "_estimate", fake)
     plan = matrix.Plan(
         (Configuration("diffcloud", "cloth", "lifting"),),
         ("grey_interlock",),
@@ -396,7 +396,7 @@ def test_an_estimate_that_diverges_is_a_result(tiny, tmp_path, monkeypatch):
     def explode(method, recordings, space, budget, key):
         raise RuntimeError("every simulation diverged")
 
-    monkeypatch.setattr(DiffCloud, "_estimate", explode)
+    monkeypatch.setattr(METHODS["diffcloud"], "_estimate", explode)
     assert engine.run(cells, tmp_path, engine.Serial()) == {}
     assert results.collect(cells, tmp_path).value.isna().all()
     reasons = read_metadata(cells[0], tmp_path)["diverged"]
@@ -447,7 +447,7 @@ def test_an_estimate_without_memory_is_missing_and_no_divergence(tiny, tmp_path,
     def exhaust(method, recordings, space, budget, key):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory")
 
-    monkeypatch.setattr(DiffCloud, "_estimate", exhaust)
+    monkeypatch.setattr(METHODS["diffcloud"], "_estimate", exhaust)
     failed = engine.run([estimated], tmp_path, engine.Serial())
     assert "out of memory" in failed[estimated] and not estimated.is_made(tmp_path)
 

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 
 from r2s.estimation.default_spaces import RANGES
-from r2s.estimation.method import ANY, Budget, Method, Reads, seed_of
+from r2s.estimation.method import ANY, Budget, DataRequirements, Method, seed_of
 from r2s.estimation.physnet import dataset, estimator, preprocess, training
 from r2s.estimation.physnet.pull_force import pull_force
 from r2s.estimation.problem import read_by_problem
@@ -97,7 +97,7 @@ class PhysNetMethod(Method):
 
     def reads(self, recording):
         force = self.heeds_force and read_by_problem(recording).force
-        return Reads(_images_of(recording), points=None, force=force)
+        return DataRequirements(_images_of(recording), points=None, force=force)
 
     def _estimate(self, recordings, space, budget, key):
         if importlib.util.find_spec(self.library) is None:

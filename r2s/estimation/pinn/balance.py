@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r2s.estimation.law_error import to_small_strain
 from r2s.estimation.least_squares import (
     Damping,
     at_bound,
@@ -26,6 +25,7 @@ from r2s.estimation.pinn.equilibrium import Motion, equilibrium, prepare
 from r2s.estimation.pinn.network import Network
 from r2s.estimation.pinn.pulls import Pull
 from r2s.estimation.pinn.weak_form import DEGREES
+from r2s.estimation.standard_errors import to_small_strain
 from r2s.materials.parameters import ParameterSpace
 from r2s.materials.stiffening_space import stiffens
 
@@ -203,7 +203,7 @@ def _law_error(
     motions: Sequence[Motion], pulls: Sequence[Pull], noise: tuple[float, float], dim: int
 ) -> Float[np.ndarray, "dim dim"]:
     """Covariance of the place at small strain, for what stiffness changes with the stretch: by the
-    frames up to half of the greatest, see `r2s.estimation.law_error`."""
+    frames up to half of the greatest, see `r2s.estimation.standard_errors`."""
     steps, variances = [], []
     for until in (0.5, 1.0):
         found = _equations(motions, pulls, noise, np.zeros(dim), until)

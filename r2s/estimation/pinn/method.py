@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from r2s.estimation.estimate import point_estimate
-from r2s.estimation.method import Budget, Method, Reads, frames_that_count
+from r2s.estimation.method import Budget, DataRequirements, Method, frames_that_count
 from r2s.estimation.pinn.pulls import pull_from, stacked
 
 ALONE = (
@@ -35,7 +35,7 @@ class PINN(Method):
     takes_shape = False
 
     def reads(self, recording):
-        return Reads(frames_that_count(recording), markers=True, force=True)
+        return DataRequirements(frames_that_count(recording), markers=True, force=True)
 
     def _estimate(self, recordings, space, budget, key):
         from r2s.estimation.pinn.from_pulls import estimate  # needs flax
@@ -64,7 +64,7 @@ class PublishedPINN(PINN):
     refusals = {}
 
     def reads(self, recording):
-        return Reads(frames_that_count(recording), markers=True)
+        return DataRequirements(frames_that_count(recording), markers=True)
 
     def _estimate(self, recordings, space, budget, key):
         from r2s.estimation.pinn import published_recipe  # needs flax
