@@ -2,14 +2,12 @@
 
 In reading order:
 
-- `method`, `registry`: the contract `Method.estimate`, and all `METHODS` by name.
-- `estimate`, `estimate_json`, `cards`: what comes out, and its files.
-- `problem`, `initial_shape`: a recording to be explained, and how its sheet hangs at first.
-- `prediction`, `normal_equations`, `gauss_newton`: predictions, losses, steps.
-- `compiled`: the same for many thetas, in compiled programs.
-- `descent`, `standard_errors`, `checkpoint`: whole descents, and how well the end is known.
-- `mesh_ladder`, `mesh_bias`: from a coarse mesh to one that resolves; what the mesh makes wrong.
-- `diffcloud`, `diffcp`, `cma_es`, `physnet`, `pinn`: the methods.
-- `adam`: how the published recipes descend.
-- `identifiability`, `experiment_design`: what a recording or a motion reveals of a fabric.
+- `method`, `methods`, `baselines`: the contract `Method.estimate`, and all `METHODS`.
+- `estimate`, `cards`, `checkpoint`: results and their files.
+- `problem`, `prediction`: a recording to be explained; what it would show of a fabric.
+- `normal_equations`, `least_squares`, `gauss_newton`, `descent`: the loss, steps, whole descents.
+- `standard_errors`, `mesh_bias`, `consistency`, `judgement`: how well the end is known.
+- `mesh_refinement`: from a coarse mesh to one that resolves the fabric.
+- `held_out`: a test on a recording that was not used.
+- `physnet`, `pinn`: the methods that train networks.
 """

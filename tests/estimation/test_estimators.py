@@ -10,24 +10,17 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.estimation import (
-    adam,
-    cma_es,
-    compiled,
-    descent,
-    diffcloud,
-    gauss_newton,
-    identifiability,
-)
+from r2s.estimation import baselines, descent, gauss_newton, prediction
 from r2s.estimation.estimate import Estimate, as_json, from_json
-from r2s.estimation.gauss_newton import Descent
-from r2s.estimation.judgement import descend
+from r2s.estimation.gauss_newton import Descent, normals_at
+from r2s.estimation.judgement import descend, sensitivity
 from r2s.estimation.method import Budget
+from r2s.estimation.methods import problems_on_points
 from r2s.estimation.normal_equations import loss_of, normal_equations_of
 from r2s.estimation.prediction import Prediction, Sensitivity, _delayed, predict, sensitivities
 from r2s.estimation.problem import OWN, NuisancePrior, Problem, beginning, window
 from r2s.materials import presets
-from r2s.materials.parameters import OrthotropicSpace, Range
+from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace, Range
 from r2s.recordings.recording import set_time_offset
 from r2s.scenarios import synthetic
 
@@ -69,7 +62,7 @@ def estimated(small):
 
 def normal_at(problems, theta, scale=0.0):
     """By the program that a descent runs, which is compiled once for both."""
-    return compiled.normal_at(problems, theta, jnp.asarray(scale, float))
+    return normals_at(problems, [theta], [jnp.asarray(scale, float)])[0]
 
 
 AWAY = jnp.array([0.1, -0.2, 0.5, 0.1, 0.3, 0.2, -0.1, 0.4])
@@ -272,21 +265,6 @@ def test_an_estimate_lowers_the_loss_and_survives_its_file(estimated):
     assert again.nuisances == found.nuisances and again.combinations == found.combinations
 
 
-@pytest.mark.slow(group="estimates")
-def test_a_profile_rises_from_the_estimate(small):
-    """To both sides of it, although all other parameters follow."""
-    budget = Budget(coarse=0, starts=1, iterations=12, around=0)
-    place = FAMILY.to_unit(FABRIC)
-    found = descend(small, budget, start=place, key=jr.key(0))
-    value = float(found.values[0])
-    values = value * np.array([0.1, 1.0, 10.0])
-    losses = identifiability.profile(small, found, "warp", values)
-    assert losses[1] == pytest.approx(found.loss, rel=0.02)
-    assert losses[0] > 1.02 * losses[1] and losses[2] > 1.02 * losses[1]
-    with pytest.raises(ValueError, match="no parameter 'C99': the estimate has warp"):
-        identifiability.profile(small, found, "C99", values)
-
-
 def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(small, estimated, tmp_path):
     path, whole = tmp_path / "descent.npz", estimated
 
@@ -418,8 +396,8 @@ def test_where_a_descent_was_it_does_not_derive_again(small, monkeypatch):
         one = jnp.zeros((1, 1, 3))
         return Prediction(one, None, jnp.array(True)), Sensitivity(one[..., None], None)
 
-    monkeypatch.setattr(compiled, "_sensitivities", derive_one)
-    derive = compiled.remembering()
+    monkeypatch.setattr(prediction, "_sensitivities", derive_one)
+    derive = prediction.remembering()
     small = dataclasses.replace(small, nuisance_prior=ALL._replace(time=0.0))
     whole, early = (small,), (beginning(small, 0.01),)
     other = (dataclasses.replace(small, scenario=dataclasses.replace(small.scenario)),)
@@ -435,7 +413,7 @@ def test_where_a_descent_was_it_does_not_derive_again(small, monkeypatch):
     derive(other, there, None)
     assert len(derived) == 5
     assert derive(whole, there, None)[0] is second
-    monkeypatch.setattr(compiled, "REMEMBERED", 0)  # no room: only the latest place is known
+    monkeypatch.setattr(prediction, "REMEMBERED", 0)  # no room: only the latest place is known
     derive(whole, jnp.full(15, 0.7), None)
     derive(whole, there, None)
     assert len(derived) == 7
@@ -455,11 +433,10 @@ def test_markers_must_lie_on_the_sheet(pull):
 @pytest.mark.slow(group="estimates")
 def test_the_recipe_and_cma_lower_their_losses(small):
     with jax.numpy_dtype_promotion("standard"):  # optax counts its steps in integers
-        found = diffcloud.published_recipe(small, small.space.middle(), epochs=4)
-        recipe = diffcloud.published_recipe(small, None, start=jnp.full(7, 0.4), epochs=4)
-    assert found.loss < found.losses[0, 0] and recipe.loss < recipe.losses[0, 0]
-    evolved = cma_es.search(small, evaluations=80, start=jnp.full(7, 0.9), key=jr.key(0))
-    again = cma_es.search(small, evaluations=80, start=jnp.full(7, 0.9), key=jr.key(0))
+        found = baselines.diffcloud_recipe(small, small.space.middle(), epochs=4)
+    assert found.loss < found.losses[0, 0]
+    evolved = baselines.cma_es((small,), 80, start=jnp.full(7, 0.9), key=jr.key(0))
+    again = baselines.cma_es((small,), 80, start=jnp.full(7, 0.9), key=jr.key(0))
     assert evolved.losses.min() < evolved.losses[0, 0]
     np.testing.assert_array_equal(evolved.values, again.values)
 
@@ -470,7 +447,7 @@ def test_a_loss_that_is_not_finite_at_the_start_is_an_error(small):
         return jnp.nan * jnp.sum(seen.x)
 
     with jax.numpy_dtype_promotion("standard"), pytest.raises(RuntimeError, match="not finite"):
-        adam.descend(small, broken, approach="test", epochs=2, rate=0.1)
+        baselines.adam(small, broken, approach="test", epochs=2, rate=0.1)
 
 
 @pytest.mark.slow(group="estimates")
@@ -509,7 +486,6 @@ def test_wind_finds_a_light_fabric_from_a_random_start():
 @pytest.mark.slow(group="estimates")
 def test_a_planned_motion_reveals_more_with_better_cameras():
     """And one that does not move reveals less than one that does."""
-    from r2s.estimation.judgement import sensitivity
 
     def deviations(height, noise):
         experiment = scenarios.lifting(num_frames=8, interval=1 / 10, height=height, moving=0.6)
@@ -518,7 +494,7 @@ def test_a_planned_motion_reveals_more_with_better_cameras():
         record = synthetic.record(
             experiment, FABRIC, "grey", seen=seen, shape=(5, 5), key=jr.key(1)
         )
-        problem = Problem.make(record, FAMILY, num_points=60, shape=(5, 5), voxel=1e-3)
+        problem = Problem.make(record, FAMILY, num_points=60, shape=(5, 5))
         return sensitivity(problem, FABRIC).standard_errors
 
     good, bad, low = deviations(0.2, 3e-4), deviations(0.2, 3e-3), deviations(0.05, 3e-4)
@@ -530,8 +506,6 @@ def test_a_planned_motion_reveals_more_with_better_cameras():
 @pytest.mark.slow(group="estimates")
 def test_material_points_find_a_known_modulus():
     """Of an isotropic sheet, by DiffCP; the same sheet of cloth is refused."""
-    from r2s.estimation import diffcp
-    from r2s.materials.parameters import IsotropicSpace
     from r2s.scenarios import material_points
 
     space = IsotropicSpace.make(0.2, plate=5e-4)
@@ -547,10 +521,10 @@ def test_material_points_find_a_known_modulus():
     )
     problem = Problem.make(record, space, num_points=100, shape=(4, 4))
     with pytest.raises(ValueError, match="material points"):
-        diffcp.published_recipe(problem)
+        baselines.diffcp_recipe(problem)
     budget = Budget(coarse=0, starts=1, iterations=6, width=0.02, around=2)
     start = jnp.array([0.25, 0.5])
-    found = descend(diffcp.on_points(problem), budget, start=start, key=jr.key(0))
+    found = descend(problems_on_points([record], space, (4, 4)), budget, start=start, key=jr.key(0))
     truth = np.asarray(space.values(place))
     spread = found.standard_errors * np.where([b.log for b in space.ranges], truth, 1)
     assert np.all(np.abs(found.values - truth) < 4 * spread)

@@ -1,0 +1,254 @@
+"""Standard errors: of a smooth loss, of a rough one, and of a law that is not constant."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+from r2s import scenarios
+from r2s.estimation import gauss_newton
+from r2s.estimation.gauss_newton import Descent, Normal, normals_at
+from r2s.estimation.method import Budget
+from r2s.estimation.prediction import Prediction, Sensitivity, theta_length
+from r2s.estimation.problem import Force, Problem
+from r2s.estimation.standard_errors import (
+    FARTHEST,
+    covariance,
+    covariance_at,
+    half_pulled,
+    model_error,
+    sample_around,
+    steps_apart,
+    to_small_strain,
+)
+from r2s.materials import presets
+from r2s.materials.informed_space import InformedSpace
+from r2s.materials.parameters import UNIFORM_DEVIATION, OrthotropicSpace, ParameterSpace
+from r2s.materials.stiffening_space import StiffeningSpace
+from r2s.scenarios import stretching, synthetic
+
+FABRIC = presets.grey_interlock()
+FAMILY = OrthotropicSpace.make(float(FABRIC.density))
+FRAMES, NOISE, SCALE = 40, 2e-3, 1.0  # -, [N], of the force at the end of the pull [N]
+STRETCH = np.linspace(0, 1, FRAMES)  # of that at the end
+SPACE = OrthotropicSpace.make(0.2)
+WIDTH = SPACE.ranges[0].width  # of the logarithm of the warp's stiffness
+
+
+def lift(num_frames: int) -> Problem:
+    """Of a sheet of few vertices; the second half of the frames counts."""
+    experiment = scenarios.lifting(num_frames=num_frames, interval=1 / 10, height=0.2, moving=0.3)
+    record = synthetic.record(experiment, FABRIC, "grey", shape=(4, 4), key=jr.key(1))
+    return Problem.make(record, FAMILY, num_points=60, shape=(4, 4))
+
+
+@pytest.fixture(scope="module")
+def lifted():
+    return lift(4)
+
+
+def errors_by(problems, end, prior, led, is_truth=False):
+    """`covariance` where steps lead from places and their normal equations."""
+    return covariance(problems, end, prior, steps_apart(problems, end, prior, led), is_truth)
+
+
+def valley(lifted, size):
+    """The end of a descent in a quadratic loss, and what the loss is at any place."""
+    random = np.random.default_rng(0)
+    root = random.normal(size=(size, 2 * size))
+    matrix = jnp.asarray(root @ root.T)
+    end = jnp.full(size, 0.5).at[lifted.space.dim :].set(0.0)
+
+    def at(place, gradient: Any = 0.0, loss: Any = 0.0):
+        found = matrix @ (place - end) + gradient
+        one = jnp.ones(())
+        return Normal(loss * one, one, one, found, matrix, 1e-4 * matrix)
+
+    one = jnp.ones(())
+    return Descent(end, at(end), one, one, one, jnp.zeros((), int)), at
+
+
+def test_the_prior_of_theta_holds_what_is_known_of_the_fabric(lifted):
+    dim = lifted.space.dim
+    precision = np.diag(np.arange(1.0, dim + 1)) + 0.1
+    known = InformedSpace.make(lifted.space, jnp.full(dim, 0.3), jnp.asarray(precision))
+    problems = (dataclasses.replace(lifted, space=known),)
+    theta = jnp.zeros(theta_length(problems))
+    off, found = gauss_newton.prior_terms(problems, theta)
+    np.testing.assert_allclose(off[:dim], -0.3, rtol=1e-6)
+    np.testing.assert_allclose(found[:dim, :dim], precision, rtol=1e-6)
+    np.testing.assert_allclose(found[dim:, dim:], np.eye(len(theta) - dim))
+    end, _ = valley(lifted, len(theta))
+    alone = dataclasses.replace(
+        end.normal, matrix=0 * end.normal.matrix, scatter=0 * end.normal.scatter
+    )
+    nothing = dataclasses.replace(end, theta=theta - off, normal=alone)
+    told = errors_by(problems, nothing, 1.0, [])[:dim, :dim]
+    np.testing.assert_allclose(np.linalg.inv(told), precision, rtol=1e-6, atol=1e-9)
+
+
+def test_deviations_are_those_of_a_smooth_loss_or_of_how_far_descents_lie_apart(lifted):
+    problems, prior = (lifted,), 1e-9
+    size = theta_length(problems)
+    end, at = valley(lifted, size)
+    alone = errors_by(problems, end, prior, [])
+    np.testing.assert_allclose(alone, 1e-4 * jnp.linalg.inv(end.normal.matrix), rtol=1e-5)
+    places = sample_around(problems, end, prior, 64, jr.key(0))
+    off = places - end.theta[None]
+    np.testing.assert_allclose(jnp.mean(off, axis=0), 0, atol=1e-12)  # in opposite pairs
+    far = jnp.einsum("pu,uv,pv->p", off, jnp.linalg.inv(alone), off)
+    np.testing.assert_allclose(far, size, rtol=1e-4)  # a deviation along each axis
+    back = [(place, at(place)) for place in places]
+    np.testing.assert_allclose(errors_by(problems, end, prior, back), alone, rtol=1e-6)
+    # descents that would all end one way, but for one that would end anywhere
+    away = jnp.linalg.cholesky(alone)[:, 0] * 5
+
+    def push(times):
+        return -end.normal.matrix @ away * times
+
+    pushes = [1e6, *(1.0 if i % 2 else -1.0 for i in range(63))]
+    led = [(place, at(place, push(t))) for place, t in zip(places, pushes, strict=True)]
+    rough = errors_by(problems, end, prior, led)
+    expected = alone + jnp.outer(away, away) * (63 + FARTHEST**2) / 65
+    np.testing.assert_allclose(rough, expected, rtol=1e-3, atol=1e-12)
+    # a run that diverged, or whose derivatives did, says that its place is no better known
+    for loss, gradient in ((jnp.inf, away * jnp.nan), (1.0, away * jnp.nan), (1.0, away / 0)):
+        pair = jnp.asarray(loss), gradient
+        broken = eqx.tree_at(lambda n: (n.loss, n.gradient), at(end.theta), pair)
+        lost = errors_by(problems, end, prior, [(place, broken) for place in places[:2]])
+        assert np.all(np.isfinite(lost)) and np.all(np.diag(lost) > np.diag(alone))
+
+
+def test_of_the_true_fabric_where_its_end_leads_is_noise(lifted):
+    problems, prior = (lifted,), 1e-9
+    end, at = valley(lifted, theta_length(problems))
+    noise = jnp.arange(1.0, len(end.theta) + 1)
+    noisy = dataclasses.replace(end, normal=at(end.theta, noise))
+
+    def found(end, noise, true):
+        return errors_by(
+            problems, end, prior, [(p, at(p, noise)) for p in (end.theta + 0.01, end.theta)], true
+        )
+
+    np.testing.assert_allclose(found(noisy, noise, True), found(end, 0.0, False), rtol=1e-6)
+    assert np.all(np.diag(found(noisy, noise, False)) > np.diag(found(noisy, noise, True)))
+
+
+def test_steps_lead_apart_alike_on_a_mesh_whose_own_end_leads_elsewhere(lifted):
+    problems, prior = (lifted,), 1e-9
+    end, at = valley(lifted, theta_length(problems))
+    places = sample_around(problems, end, prior, 4, jr.key(0))
+
+    def apart(bias):
+        led = [(p, at(p, 1.0 * i + bias)) for i, p in enumerate(places)]
+        own = jnp.arange(1.0, len(end.theta) + 1) + bias
+        return steps_apart(
+            problems, dataclasses.replace(end, normal=at(end.theta, own)), prior, led
+        )
+
+    assert np.max(np.abs(apart(0.0))) > 1e-2
+    np.testing.assert_allclose(apart(3.0), apart(0.0), rtol=1e-5, atol=1e-9)
+
+
+def test_where_derivatives_overflow_nothing_is_known(lifted):
+    problems, prior = (lifted,), 1e-9
+    size = theta_length(problems)
+    end, at = valley(lifted, size)
+    broken = eqx.tree_at(lambda e: e.normal.scatter, end, jnp.full((size, size), jnp.inf))
+    near = [(end.theta, at(end.theta))] * 2
+    known = np.diag(errors_by(problems, broken, prior, near))
+    dim = lifted.space.dim
+    np.testing.assert_allclose(known[:dim], UNIFORM_DEVIATION**2)
+    np.testing.assert_allclose(known[dim:], 1)
+
+
+@pytest.mark.slow(group="estimates")
+def test_deviations_hang_on_no_limit_and_hardly_on_rounding():
+    """Of an end that is moved by less than single precision resolves, and of a mesh that moves
+    alike: two answers would differ by far."""
+    problems, budget = (lift(8),), Budget(around=4)
+    nuisances = jnp.zeros(theta_length(problems) - FAMILY.dim)
+    theta, zero = jnp.concatenate([FAMILY.to_unit(FABRIC), nuisances]), jnp.zeros(())
+
+    def found(theta, tried_on=None):
+        normal = normals_at(problems, [theta], [zero])[0]
+        end = Descent(theta, normal, zero, zero, zero, jnp.zeros((), int))
+        return np.sqrt(np.diag(covariance_at(problems, budget, end, jr.key(0), tried_on=tried_on)))
+
+    whole = found(theta)
+    np.testing.assert_allclose(found(theta * (1 + 3e-7)), whole, rtol=0.05)
+    np.testing.assert_allclose(found(theta, tried_on=(*problems,)), whole, rtol=1e-3)
+
+
+def fitted(growth, seed=0, space: ParameterSpace = SPACE):
+    """A pull whose stiffness grows, and what a constant one of the warp predicts of its force where
+    it fits best: the problem, its end, the prediction, and the place of the stiffness at rest less
+    that of the fit."""
+    scenario = stretching(num_frames=FRAMES).scenario((3, 3))
+    measured = SCALE * STRETCH * (1 + growth * STRETCH)
+    measured = measured + NOISE * np.random.default_rng(seed).normal(size=FRAMES)
+    force = Force(
+        jnp.asarray(measured[:, None], float), jnp.ones(FRAMES, bool), jnp.array([[1.0, 0, 0]])
+    )
+    problem = Problem(scenario, space, tuple(range(FRAMES)), force=force)
+    best = measured @ STRETCH / (STRETCH @ STRETCH)
+    x = jnp.zeros((FRAMES, len(scenario.start), 3))
+    size = theta_length((problem,))
+    slope = np.zeros((FRAMES, 1, size))
+    slope[:, 0, 0] = best * STRETCH * WIDTH
+    seen = Prediction(x, jnp.asarray(best * STRETCH[:, None], float), jnp.asarray(True))
+    sensitivity = Sensitivity(jnp.zeros((*x.shape, size)), jnp.asarray(slope, float))
+    number, none, square = jnp.zeros(()), jnp.zeros(size), jnp.zeros((size, size))
+    normal = Normal(number, number, number, none, square, square)
+    theta = none.at[: space.dim].set(0.5)
+    end = Descent(theta, normal, number, number, number, jnp.zeros((), int))
+    return problem, end, (seen, sensitivity), np.log(SCALE / best) / WIDTH
+
+
+def error_of(growth, seed=0, space: ParameterSpace = SPACE):
+    problem, end, predicted, off = fitted(growth, seed, space)
+    return model_error((problem,), end, jnp.asarray(1e-9), [predicted])[: space.dim], off
+
+
+@pytest.mark.parametrize("growth", [0.1, 0.5])
+def test_the_stiffness_at_rest_is_as_far_as_half_of_the_pull_says(growth):
+    found, off = error_of(growth)
+    assert abs(off) > 0.5 * growth / (1 + growth) / WIDTH
+    np.testing.assert_allclose(found[0], off, rtol=0.35)
+    np.testing.assert_allclose(found[1:], 0, atol=1e-6)  # of which the force says nothing
+
+
+def test_a_stiffness_that_is_constant_errs_by_its_noise():
+    """The error of half a pull is noise then, and what is counted beyond it is as large at most."""
+    found = [error_of(0.0, seed)[0][0] * WIDTH for seed in range(40)]
+    half = STRETCH <= 0.5
+    noise = NOISE / SCALE / np.sqrt(np.sum(STRETCH[half] ** 2))
+    assert np.median(np.abs(found)) < 2 * noise
+    assert np.sqrt(np.mean(np.square(found))) < 3 * noise
+    assert np.mean(np.equal(found, 0)) > 0.4
+
+
+def test_yarns_that_may_stiffen_and_pulls_without_force_have_no_such_error():
+    assert not np.any(error_of(0.5, space=StiffeningSpace.make(SPACE))[0])
+    problem, end, predicted, _ = fitted(0.5)
+    without = Problem(problem.scenario, SPACE, problem.frames)
+    assert half_pulled(without) is without
+    assert not np.any(model_error((without,), end, jnp.asarray(1e-9), [predicted]))
+
+
+def test_half_of_a_pull_ends_in_the_middle_of_its_force():
+    problem, *_ = fitted(0.0)
+    assert problem.force is not None
+    taut = dataclasses.replace(problem.force, values=problem.force.values + 3)  # from the start
+    half = half_pulled(dataclasses.replace(problem, force=taut))
+    assert half.force is not None
+    np.testing.assert_array_equal(np.asarray(half.force.seen), STRETCH < 0.5)
+
+
+def test_a_change_within_its_noise_is_none():
+    change, variance = np.array([0.1, -0.1, 0.1]), np.array([0.02, 0.0, -1.0])
+    np.testing.assert_allclose(to_small_strain(change, variance), [0, -0.2, 0.2])
