@@ -44,11 +44,9 @@ LEFT_OUT = ("losses", "history")  # of an estimate: as long as its search, and n
 class Provenance:
     """Where the numbers of a card come from. All fields but `method` may be empty.
 
-    - `method`: measured or estimated, and how.
-    - `source`: a citation, or whose data.
+    - `method`: measured or estimated, and how. `source`: a citation, or whose data.
     - `recordings`: name and sha256 (see `fingerprint`) of what an estimate was made from.
-    - `version`: the version of r2s.
-    - `date`: the date that the caller gives; r2s looks at no clock.
+    - `version`: of r2s. `date`: as the caller gives it.
     - `assumed`: numbers of the fabric that nobody measured.
     """
 
@@ -64,11 +62,9 @@ class Provenance:
 class Card:
     """A fabric card. `make` makes one; `read` and `write` are its file.
 
-    - `name`: what the fabric is called.
+    - `name`: of the fabric. `provenance`: where its numbers come from.
     - `precision`: in which its numbers were computed, "float32" or "float64".
-    - `numbers`: the fabric as the file has it.
-    - `provenance`: where these numbers come from.
-    - `found`: the estimate as the file has it; None: there is none.
+    - `numbers`, `found`: the fabric, and the estimate if there is one, as the file has them.
     """
 
     name: str

@@ -25,13 +25,8 @@ T = TypeVar("T")
 
 
 def save(path: Path | str, arrays: Mapping[str, Any], run: Mapping[str, Any]) -> None:
-    """Write arrays and the JSON description of their run, whole or not at all.
-
-    - `arrays`: by name; anything that numpy makes an array of.
-    - `run`: whatever JSON holds: settings to read back, a `fingerprint` of the rest.
-
-    Makes the folder when it is not there. Raises `ValueError` for an array named `HEADER`.
-    """
+    """Write arrays and the JSON description of their `run` (settings to read back, a `fingerprint`
+    of the rest), whole or not at all. Raises `ValueError` for an array named `HEADER`."""
     if HEADER in arrays:
         raise ValueError(f"no array of a checkpoint can be named {HEADER!r}")
     header = json.dumps({"format": FORMAT, "run": dict(run)})
@@ -78,7 +73,7 @@ def load(path: Path | str, run: Mapping[str, Any]) -> dict[str, np.ndarray] | No
 
 
 def forget(path: Path) -> None:
-    """Remove a state file, and those of what was built on it, PATH's stem and more words."""
+    """Remove a state file, and those of later stages, which have a longer name."""
     for each in (path, *path.parent.glob(f"{escape(path.stem)}.*{path.suffix}")):
         each.unlink(missing_ok=True)
 

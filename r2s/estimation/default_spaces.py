@@ -1,8 +1,6 @@
-"""The fabrics that an estimate chooses from when no other space is given, and where each number of
-them is from: ranges and fixed values are not laid around any fabric that is to be estimated.
-
-The middle of a range is where a search begins, and what an estimate keeps of a parameter that a
-motion does not tell.
+"""The default parameter spaces, and the origin of their ranges and fixed values: none is laid around a
+fabric that is to be estimated. The middle of a range is the start of a search, and the value of a
+parameter that a motion does not determine.
 """
 
 import math
@@ -58,12 +56,9 @@ def with_law(space: ParameterSpace, law: Law) -> ParameterSpace:
 
 
 def law_told_by(recordings: Sequence[Recording]) -> Law:
-    """The laws that some recordings of one fabric tell enough of to estimate together.
-
-    Both where the force of a pull was recorded and another motion beside it: a pull tells how yarns
-    stiffen, and it alone nothing of bending; a motion that folds tells bending, and hardly how
-    yarns stiffen. Else constant stiffness.
-    """
+    """The law that some recordings of one fabric identify: stiffening and softening where the force
+    of a pull was recorded and another motion, since a pull determines how yarns stiffen and a fold
+    bending. Else constant stiffness."""
     pulled = [each.info.scenario == "stretching" for each in recordings]
     has_force = any(
         pull and each.force is not None for pull, each in zip(pulled, recordings, strict=True)
@@ -96,9 +91,8 @@ def on_cloth(density: float) -> OrthotropicSpace:
 def on_points(density: float, losses: tuple[Range, ...] = ()) -> IsotropicSpace:
     """Isotropic sheets of an areal density, [kg/m^2]; raises as `IsotropicSpace.make`.
 
-    Damping and friction are those in the middle of the prior, or parameters: see `losses` there.
-    The sheet in the middle of the range bends as the middle of the prior does, and others as plates
-    of the same thickness.
+    Damping and friction are the prior's median, or parameters (`losses`). The sheet in the middle
+    of the range bends as that of the prior, others as plates of the same thickness.
     """
     usual = IsotropicSpace.make(density)
     assumed, middle = prior.middle(density), usual.middle()

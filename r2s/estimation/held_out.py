@@ -1,7 +1,7 @@
-"""Is an estimate better than knowing nothing? Told by a recording that it was not made from.
+"""Cross-validation: is an estimate better than the prior on a recording that it was not made from?
 
-Of three recordings or more one is held out; the estimate is judged on it beside fabrics of which
-nothing but the weight is known (`r2s.materials.prior`).
+Of three recordings or more one is held out; the prior is that of fabrics of which only the weight
+is known (`r2s.materials.prior`).
 """
 
 from collections.abc import Sequence
@@ -27,13 +27,13 @@ AIR = "air ratio"  # the nuisance, of `r2s.estimation.prediction`
 
 
 class HeldOut(NamedTuple):
-    """What a recording that was held out says of an estimate.
+    """The errors of an estimate and of the prior on a recording that was held out.
 
     - `recording`: its name. `error`: the mean distance of its points from the estimate's surface,
       over the frames that count, [m]; infinite where the simulation diverged.
-    - `defaults`: the same of draws of the prior, without those that diverged, [m]. `diverged`: how
-      many did. `middle`: of the fabric in the middle of the prior, the best guess by the weight.
-    - `air`: density of the air that all of them moved in, over that written down.
+    - `defaults`: the same of samples of the prior, without the `diverged` ones, [m]. `middle`: of
+      the fabric in the middle of the prior, the best guess by the weight.
+    - `air`: density of the air that all of them moved in, relative to that written down.
     """
 
     recording: str
@@ -45,14 +45,14 @@ class HeldOut(NamedTuple):
 
     @property
     def is_better(self) -> bool:
-        """Whether the estimate is nearer than the middle of the prior is, and than the draws are on
-        average; False where none of these ran."""
+        """Whether the error is less than that of the middle of the prior, and than the mean of the
+        samples; False where none of these ran."""
         return bool(self.defaults) and self.error < min(float(np.mean(self.defaults)), self.middle)
 
     @property
     def is_discriminating(self) -> bool:
-        """Whether the motion tells so: not where draws and middle of the prior, and the estimate
-        with them, are alike in it, as in a fold that lies on the table (`ALIKE`)."""
+        """Whether the motion discriminates: not where samples, middle and estimate are alike in it
+        (`ALIKE`), as in a fold that lies on the table."""
         others = [each for each in (*self.defaults, self.middle) if np.isfinite(each)]
         least, most = min(others, default=0.0), max(others, default=0.0)
         return most > ALIKE * least or not least / ALIKE <= self.error < ALIKE * most
@@ -79,13 +79,12 @@ class HeldOut(NamedTuple):
 
 
 def choose(recordings: Sequence[Recording], name: str | None = None) -> int | None:
-    """Which recording to hold out; None: none of them.
+    """The index of the recording to hold out, or None.
 
-    `name`: of the recording, or `NONE`; None: the last one with clouds that is no stretching (a
-    clamped sheet looks alike of any fabric), and no fold (so does one on a table) but for want of
-    another, where there are `FEWEST` or more, and another such one is left: pulls tell nothing of
-    bending and damping. Raises `ValueError` for an unknown name, for two recordings of that name,
-    for one without clouds, and where none would be left.
+    `name`: of the recording, or `NONE`; None: of `FEWEST` recordings or more the last motion with
+    clouds, if another is left: no stretching, in which all fabrics look alike, and no fold unless
+    there is no other. Raises `ValueError` for an unknown name, for two recordings of that name, for
+    one without clouds, and where none would be left.
     """
     if name == NONE:
         return None
@@ -131,13 +130,12 @@ def judge(
     count: int = DRAWS,
     air: float = 1.0,
 ) -> HeldOut:
-    """The errors of a fabric, and of the middle of the prior and `count` draws of it for its
-    density, in a recording.
+    """The errors of a fabric, of the middle of the prior of its density and of `count` samples of
+    it, in a recording.
 
-    All are simulated by the cloth on a mesh of `shape`, in the steps that an estimate takes there
-    (`r2s.estimation.mesh_refinement.in_mesh_steps`). `air`: times the density of the air as written
-    down, for all alike: what an estimate found along with the fabric (`air_found`), where that was
-    in doubt. Size and cameras are as written down.
+    All are simulated by the cloth on a mesh of `shape`, in the steps of an estimate
+    (`r2s.estimation.mesh_refinement.in_mesh_steps`), with `air` times the density of the air. Size
+    and cameras are as written down.
     """
     clear_in_time()
     density = float(fabric.density)
@@ -148,9 +146,8 @@ def judge(
 
 
 def air_found(estimate: Estimate, recordings: Sequence[Recording]) -> float:
-    """The density of the air over that written down, where one of the estimate's recordings held it
-    in doubt; else 1: what is estimated of a wind alone is how fast it was, which no other motion
-    has."""
+    """The estimated density of the air, relative to that written down, where one of the estimate's
+    recordings doubts it; else 1: a wind alone determines only its own speed."""
     if not any(each.info.doubt is not None and each.info.doubt.air for each in recordings):
         return 1.0
     # a method that reports no nuisances has left the air as it was written down

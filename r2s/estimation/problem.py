@@ -240,34 +240,6 @@ def check_shared(problems: Sequence[Problem]) -> None:
             )
 
 
-def window(problem: Problem, first: int, last: int) -> Problem:
-    """The problem in which only the frames from `first` to `last` count.
-
-    Raises `ValueError` when none does.
-    """
-    kept = [i for i, frame in enumerate(problem.frames) if first <= frame <= last]
-    if not kept:
-        raise ValueError(
-            f"no frame from {first} to {last} counts: the problem has {problem.frames[0]} to "
-            f"{problem.frames[-1]}"
-        )
-    index = jnp.array(kept)
-
-    def pick(part: Any, names: tuple[str, ...]) -> Any:
-        if part is None:
-            return None
-        return dataclasses.replace(part, **{name: getattr(part, name)[index] for name in names})
-
-    return dataclasses.replace(
-        problem,
-        frames=tuple(problem.frames[i] for i in kept),
-        clouds=pick(problem.clouds, ("points", "mask")),
-        markers=pick(problem.markers, ("positions", "seen")),
-        force=pick(problem.force, ("values", "seen")),
-        expected=pick(problem.expected, ("grippers", "targets", "mask", "apart")),
-    )
-
-
 def motion_alone(problem: Problem) -> Problem:
     """The problem without what was seen, on which no prediction depends but for its end.
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+from windows import window
 
 from r2s import scenarios
 from r2s.estimation import baselines, descent, gauss_newton, prediction
@@ -18,7 +19,7 @@ from r2s.estimation.method import Budget
 from r2s.estimation.methods import problems_on_points
 from r2s.estimation.normal_equations import loss_of, normal_equations_of
 from r2s.estimation.prediction import Prediction, Sensitivity, _delayed, predict, sensitivities
-from r2s.estimation.problem import OWN, NuisancePrior, Problem, beginning, window
+from r2s.estimation.problem import OWN, NuisancePrior, Problem, beginning
 from r2s.materials import presets
 from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace, Range
 from r2s.recordings.recording import set_time_offset
@@ -314,16 +315,6 @@ def test_what_is_known_of_a_product_is_said():
     assert sorted(known.exponents.values()) == [-1.0, 1.0] and set(known.exponents) == {"a", "b"}
     assert known.value == pytest.approx(4 if known.exponents["a"] > 0 else 0.25)
     assert known.standard_error == pytest.approx(ratio, rel=1e-6)
-
-
-def test_a_window_leaves_the_other_frames_out(small, pulled):
-    part = window(small, 5, 6)
-    assert part.frames == (5, 6) and part.clouds is not None and small.clouds is not None
-    np.testing.assert_array_equal(part.clouds.points, small.clouds.points[1:3])
-    force, whole = window(pulled, 0, 1).force, pulled.force
-    assert force is not None and whole is not None and len(force.values) == 2
-    with pytest.raises(ValueError, match="no frame from 40 to 50 counts"):
-        window(small, 40, 50)
 
 
 def test_what_a_beginning_is(small):

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+from windows import window
 
 from r2s import scenarios
 from r2s.estimation import normal_equations
@@ -15,7 +16,7 @@ from r2s.estimation.default_spaces import on_points
 from r2s.estimation.gauss_newton import normals_at
 from r2s.estimation.methods import problems_on_points
 from r2s.estimation.prediction import predict
-from r2s.estimation.problem import NuisancePrior, Problem, beginning, check_shared, window
+from r2s.estimation.problem import NuisancePrior, Problem, beginning, check_shared
 from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
 from r2s.mesh.mesh import rectangle
