@@ -1,6 +1,7 @@
-"""The default parameter spaces, and the origin of their ranges and fixed values: none is laid around a
-fabric that is to be estimated. The middle of a range is the start of a search, and the value of a
-parameter that a motion does not determine.
+"""The default parameter spaces, and the origin of their ranges and fixed values.
+
+None is laid around a fabric that is to be estimated. The middle of a range is the start of a search
+and the value of a parameter that a motion does not determine.
 """
 
 import math
