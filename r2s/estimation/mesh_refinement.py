@@ -9,7 +9,7 @@ there. A loss over a motion has several minima, so the search is repeated from o
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -20,15 +20,13 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s._util.threads import background
-from r2s.compilation import is_kept
 from r2s.estimation.descent import Search, search
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import FINEST, MARGIN, Descent, loss_from
 from r2s.estimation.judgement import each_alone, judged
 from r2s.estimation.mesh_bias import OtherMesh, factor
 from r2s.estimation.method import Budget, Progress, tell
-from r2s.estimation.prediction import Derive, Theta, prepare, remembering
+from r2s.estimation.prediction import Derive, Theta, remembering
 from r2s.estimation.problem import Problem, Problems
 from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import ParameterSpace
@@ -73,21 +71,19 @@ def descend_by_meshes(
     if finest:
         levels = [levels[0], levels[-1]]
     problems_on = functools.cache(partial(_problems, recordings, space))
-    problems_on(tuple(levels[0]))  # before both threads ask for them
     run = _Run(recordings, problems_on, budget, remembering(), checkpoint, progress, key)
-    with background(_programs(run, levels, finest) if is_kept() else ()):
-        run, at = _first(run, levels[0], leads_on=len(levels) > 1)
-        at, refused = _refined(run, at, levels[1:], finest)
-        tell(progress, "standard errors")
-        ratio = 2.0 if refused else _ratio(at.shapes)
-        estimate = judged(
-            at.found,
-            budget,
-            other_mesh=OtherMesh(run.problems(_others(at.shapes, ratio)), factor(ratio)),
-            checkpoint=checkpoint,
-            progress=progress,
-            key=key,
-        )
+    run, at = _first(run, levels[0], leads_on=len(levels) > 1)
+    at, refused = _refined(run, at, levels[1:], finest)
+    tell(progress, "standard errors")
+    ratio = 2.0 if refused else _ratio(at.shapes)
+    estimate = judged(
+        at.found,
+        budget,
+        other_mesh=OtherMesh(run.problems(_others(at.shapes, ratio)), factor(ratio)),
+        checkpoint=checkpoint,
+        progress=progress,
+        key=key,
+    )
     return dataclasses.replace(estimate, shape=_named(recordings, at.shapes), refused=refused)
 
 
@@ -141,17 +137,6 @@ class _Run(NamedTuple):
     def look_again(self, at: Level) -> Level:
         found = look_again(at.found, self.budget, progress=self.progress, key=self.key)
         return at._replace(found=found)
-
-
-def _programs(run: _Run, levels: list[list[Shape]], finest: bool) -> Iterator[Callable[[], None]]:
-    """Compilations in the order in which the estimate will most likely need them."""
-    likely = levels if finest else levels[: 2 if len(run.recordings) > 1 else 1]
-    others, width = _others(likely[-1], _ratio(likely[-1])), run.budget.width
-    for shapes in likely:
-        yield lambda shapes=shapes: prepare(run.problems(shapes), width)
-    yield lambda: prepare(run.problems(others), derivatives=False)
-    if finest:  # else that of the level before
-        yield lambda: prepare(run.problems(others), width)
 
 
 def _first(run: _Run, shapes: list[Shape], leads_on: bool) -> tuple[_Run, Level]:

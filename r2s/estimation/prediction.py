@@ -209,15 +209,6 @@ def derivatives_at(problems: Problems, theta: Theta, width: float | None = None)
     return thread_map(lambda pair: _sensitivities(*pair, width), _motions(problems, theta))
 
 
-def prepare(problems: Problems, width: float | None = None, *, derivatives: bool = True) -> None:
-    """Compile what `derivatives_at`, or else `predictions_at`, will run; from any thread."""
-    for pair in _motions(problems, jnp.zeros(theta_length(problems), float)):
-        if derivatives:
-            _sensitivities.prepare(*pair, width)
-        else:
-            predict_compiled.prepare(*pair)
-
-
 def _motions(problems: Problems, theta: Theta) -> list[tuple[Problem, Array]]:
     """What moves in each recording, and its own part of theta."""
     indices = (jnp.asarray(theta_indices(problems, i)) for i in range(len(problems)))
