@@ -22,6 +22,7 @@ from scipy import special, stats
 
 from r2s.estimation.estimate import UNLIKELY, Agreement, Contradiction, Misfit
 from r2s.estimation.gauss_newton import Descent, held_back, prior_weight
+from r2s.estimation.least_squares import common_axes
 from r2s.estimation.normal_equations import marker_distances, point_distances
 from r2s.estimation.prediction import Prediction, Theta, free_nuisances
 from r2s.estimation.problem import Problem, Problems
@@ -120,16 +121,13 @@ def information_of(
 ) -> Information:
     """The information of an estimate without its prior of a `mean` and a `precision`, in directions
     that it knows `least` times as precisely."""
-    root = np.linalg.cholesky(precision)
-    inner = np.linalg.solve(root, np.linalg.inv(covariance))
-    sizes, axes = np.linalg.eigh(np.linalg.solve(root, inner.T))
+    sizes, axes = common_axes(precision, np.linalg.inv(covariance))
     kept = sizes > least
     beyond = np.where(kept, sizes - 1, 1)
-    at, usual = (axes.T @ root.T @ each for each in (place, mean))
+    at, usual = axes.T @ place, axes.T @ mean
     alone = np.where(kept, (sizes * at - usual) / beyond, usual)
-    forth = root @ axes
-    information = (forth * np.where(kept, beyond, 0)[None]) @ forth.T
-    return Information(np.linalg.solve(root.T, axes @ alone), information, int(kept.sum()))
+    information = (axes * np.where(kept, beyond, 0)[None]) @ axes.T
+    return Information(np.linalg.solve(axes.T, alone), information, int(kept.sum()))
 
 
 def density_of(

@@ -3,6 +3,7 @@
 Estimates of version 0.2.0 are read, too.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -357,6 +358,10 @@ def from_json(stored: dict[str, Any]) -> Estimate:
         stored = upgraded(stored)
     if stored.get("format") != FORMAT:
         raise ValueError(f"expected an estimate of format {FORMAT}, got {stored.get('format')}")
+
+    def optional(name: str, read: Callable[[Any], Any]) -> Any:
+        return None if stored.get(name) is None else read(stored[name])
+
     parameters = stored["parameters"]
     ranges = tuple(
         Range(name, p["unit"], *p["bounds"], log=p["standard_error_is"] == "relative")
@@ -379,21 +384,19 @@ def from_json(stored: dict[str, Any]) -> Estimate:
         seconds=stored["seconds"],
         converged=stored["converged"],
         loss_unit=stored["loss_unit"],
-        shape=None if stored.get("shape") is None else tuple(stored["shape"]),
+        shape=optional("shape", tuple),
         refused=stored.get("refused", ""),
-        reached=None if stored.get("reached") is None else tuple(stored["reached"]),
+        reached=optional("reached", tuple),
         unsure=stored.get("unsure", ""),
-        mesh_bias=None if stored.get("mesh_bias") is None else _numbers(stored["mesh_bias"]),
-        agreement=_agreement(stored.get("agreement")),
+        mesh_bias=optional("mesh_bias", _numbers),
+        agreement=optional("agreement", _agreement),
         shares=tuple(stored.get("shares", ())),
         misfits=tuple(Misfit(**each) for each in stored.get("misfits", ())),
         left_out=tuple(stored.get("left_out", ())),
     )
 
 
-def _agreement(stored: dict[str, Any] | None) -> Agreement | None:
-    if stored is None:
-        return None
+def _agreement(stored: dict[str, Any]) -> Agreement:
     odd, density = stored["contradiction"], stored["density"]
     if odd is not None:
         odd = Contradiction(**odd | {"values": tuple(odd["values"])})

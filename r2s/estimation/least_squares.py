@@ -105,6 +105,16 @@ def bounded_step(
     return optimize.lsq_linear(roots[:, None] * axes.T, right, limits, method="bvls").x
 
 
+def common_axes(
+    one: Float[np.ndarray, "y y"], other: Float[np.ndarray, "y y"]
+) -> tuple[Float[np.ndarray, " y"], Float[np.ndarray, "y y"]]:
+    """Sizes s and axes A in which two positive matrices have no correlation: one = A A^T,
+    other = A diag(s) A^T."""
+    root = np.linalg.cholesky(one)
+    sizes, axes = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, other).T))
+    return sizes, root @ axes
+
+
 class _State(eqx.Module):
     loss: Float[Array, ""]
     gradient: Float[Array, " y"]

@@ -23,7 +23,7 @@ from r2s.estimation.gauss_newton import (
     recording_weights,
     room,
 )
-from r2s.estimation.least_squares import bounded_step
+from r2s.estimation.least_squares import bounded_step, common_axes
 from r2s.estimation.prediction import (
     Derive,
     Prediction,
@@ -231,10 +231,7 @@ def _posterior(
     told = np.asarray(end.normal.matrix, np.float64) / float(prior)
     slope = np.asarray(end.normal.gradient, np.float64) / float(prior)
     alone = np.linalg.lstsq(told, -slope, rcond=RCOND)[0]  # the step without the prior
-    root = np.linalg.cholesky(known)
-    inner = np.linalg.solve(root, np.linalg.inv(covariance))
-    sizes, axes = np.linalg.eigh(np.linalg.solve(root, inner.T))
-    axes = root @ axes
+    sizes, axes = common_axes(known, np.linalg.inv(covariance))
     left = (axes * np.maximum(sizes - 1, 0)[None]) @ axes.T
     way = bounded_step(known @ off - left @ alone, left + known, room(problems, end.theta))
     return way, np.linalg.inv(left + known)
@@ -252,7 +249,5 @@ def _smaller(
     one: Float[np.ndarray, "theta theta"], other: Float[np.ndarray, "theta theta"]
 ) -> Float[np.ndarray, "theta theta"]:
     """The smaller of two covariances in each direction in which both have no correlation."""
-    root = np.linalg.cholesky(one)
-    sizes, axes = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, other).T))
-    axes = root @ axes
+    sizes, axes = common_axes(one, other)
     return (axes * np.minimum(sizes, 1)[None]) @ axes.T

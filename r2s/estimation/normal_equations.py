@@ -115,17 +115,36 @@ def _of_clouds(
     clouds: Clouds, mesh: Mesh, seen: Prediction, slope: Sensitivity, scale
 ) -> NormalEquations:
     distance, direction, vertices, weights = _residuals(clouds, mesh, seen, scale)
-    weight = _weights(distance, clouds.mask, scale)
+    return _of_surface(mesh, slope, scale, distance, clouds.mask, -direction, vertices, weights)
+
+
+def _of_expected(
+    expected: ImageObservation, mesh: Mesh, seen: Prediction, slope: Sensitivity, scale
+) -> NormalEquations:
+    gap, counts = _to_clouds(expected, seen.x)
+    distance = length(gap)
+    direction = gap / jnp.maximum(distance, TOUCHING)[..., None]
+    shape = len(gap), *expected.vertices.shape
+    samples = (jnp.broadcast_to(part, shape) for part in (expected.vertices, expected.weights))
+    return _of_surface(mesh, slope, scale, distance, counts, direction, *samples)
+
+
+def _of_surface(
+    mesh: Mesh, slope: Sensitivity, scale, distance, mask, direction, vertices, weights
+) -> NormalEquations:
+    """Of distances that grow as places of the sheet, by vertices and weights, move along
+    directions; all with leading axes (frame, point)."""
+    weight = _weights(distance, mask, scale)
 
     def frame(args):  # one at a time: its derivatives fit the cache
         slope, vertices, weights, direction, distance, weight = args
         moved = jnp.einsum("pk,pkiu->piu", weights, slope[vertices])
-        jacobian = -jnp.einsum("pi,piu->pu", direction, moved)
+        jacobian = jnp.einsum("pi,piu->pu", direction, moved)
         place = jnp.einsum("pk,pki->pi", weights, mesh.rest[vertices])
         return _by_patch(mesh, place, jacobian, distance, weight)
 
     shares = jax.lax.map(frame, (slope.x, vertices, weights, direction, distance, weight))
-    return _of_robust(distance, clouds.mask, scale, *(_by_time(share) for share in shares))
+    return _of_robust(distance, mask, scale, *(_by_time(share) for share in shares))
 
 
 def _of_markers(markers: Markers, seen: Prediction, slope: Sensitivity, scale) -> NormalEquations:
@@ -138,24 +157,6 @@ def _of_markers(markers: Markers, seen: Prediction, slope: Sensitivity, scale) -
     scores = jnp.einsum("fm,fmi,fmiu->mu", weight, gap, jacobian)
     matrices = jnp.einsum("fm,fmiu,fmiv->muv", weight, jacobian, jacobian)
     return _of_robust(distance, markers.seen, scale, scores, matrices)
-
-
-def _of_expected(
-    expected: ImageObservation, mesh: Mesh, seen: Prediction, slope: Sensitivity, scale
-) -> NormalEquations:
-    gap, counts = _to_clouds(expected, seen.x)
-    distance = length(gap)
-    direction = gap / jnp.maximum(distance, TOUCHING)[..., None]
-    weight = _weights(distance, counts, scale)
-    place = jnp.einsum("sk,ski->si", expected.weights, mesh.rest[expected.vertices])
-
-    def frame(args):
-        slope, direction, distance, weight = args
-        moved = jnp.einsum("sk,skiu->siu", expected.weights, slope[expected.vertices])
-        return _by_patch(mesh, place, jnp.einsum("si,siu->su", direction, moved), distance, weight)
-
-    shares = jax.lax.map(frame, (slope.x, direction, distance, weight))
-    return _of_robust(distance, counts, scale, *(_by_time(share) for share in shares))
 
 
 def _of_force(force: Force, pulled: Array, slope: Array) -> NormalEquations:
