@@ -16,10 +16,10 @@ from r2s.estimation.methods import DiffCloud
 from r2s.materials.fabric import Fabric
 from r2s.materials.informed_space import InformedSpace
 from r2s.materials.parameters import ParameterSpace
-from r2s.metrics import placement, prediction_error
-from r2s.metrics.distances import distances
-from r2s.recordings.cameras.views import observed
+from r2s.metrics import prediction_error
+from r2s.metrics.prediction_error import distances
 from r2s.recordings.recording import Recording, RecordingInfo, gripper_positions
+from r2s.recordings.views import observed
 from r2s.scenarios.scenario import from_recording, resized
 
 SIZE = "size ratio"  # the nuisance that belongs to the fabric
@@ -103,8 +103,8 @@ def errors(real: Clouds, others: list[Clouds | None]) -> tuple[float, float]:
         if other is None or not all(len(points) for points in other):
             found.append((np.inf, np.inf))
             continue
-        place = placement.nearest(real, other)
-        there = [placement.moved(place, points) for points in real]
+        place = prediction_error.best_placement(real, other)
+        there = [prediction_error.placed(place, points) for points in real]
         found.append((_both_ways(real, other), _both_ways(there, other)))
     as_read, placed = np.mean(found, axis=0)
     return float(as_read), float(placed)

@@ -28,7 +28,7 @@ from r2s.materials.stiffening import StiffeningMembrane
 from r2s.materials.stiffening_space import StiffeningSpace
 from r2s.materials.tables import TableBending, TableMembrane
 from r2s.mesh.mesh import Mesh, rectangle
-from r2s.metrics.distances import distances
+from r2s.metrics.prediction_error import distances
 from r2s.recordings.manifest import read_recordings
 from r2s.recordings.recording import Recording, RecordingInfo, SheetPlacement, make_recording
 from r2s.recordings.recording import load as load_recording

@@ -21,7 +21,7 @@ from r2s.materials import presets
 from r2s.materials.fabric import Fabric
 from r2s.mesh.mesh import Mesh
 from r2s.mesh.surface import sample
-from r2s.metrics.surface_distance import POINTS, to_surface
+from r2s.metrics.losses import POINTS, to_surface
 from r2s.recordings.recording import cloud
 from r2s.scenarios.scenario import rollout
 from r2s.scenarios.solvers import explicit_cloth

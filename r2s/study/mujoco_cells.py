@@ -10,7 +10,7 @@ import jax.random as jr
 import numpy as np
 
 from r2s.materials.fabric import Fabric
-from r2s.metrics.surface_distance import POINTS, to_surface
+from r2s.metrics.losses import POINTS, to_surface
 from r2s.recordings.recording import cloud, save
 from r2s.scenarios import synthetic
 from r2s.scenarios.standard import Experiment

@@ -1,7 +1,7 @@
 """What the distances to a surface say of a fabric: up to the horizon, beside the floor, as skill.
 
 Beyond the horizon features that do not depend on the phase are compared
-(`r2s.metrics.phase_free`).
+(`r2s.metrics.horizon`).
 """
 
 import math
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s.mesh.surface import sample
-from r2s.metrics import phase_free
+from r2s.metrics import horizon
 from r2s.metrics.horizon import floor_of, horizon_of, within
 from r2s.recordings.recording import Recording, cloud
 from r2s.scenarios.scenario import from_recording
@@ -140,8 +140,8 @@ def _beyond(
     faces = from_recording(recording, shape).scene.mesh.faces
     real = [cloud(recording, frame) for frame in frames]
     simulated = as_recorded(x[frames], faces, [len(each) for each in real])
-    found = phase_free.differences(real, simulated, judged.times[outside])
+    found = horizon.differences(real, simulated, judged.times[outside])
     return [
-        {"metric": BEYOND + name, "unit": phase_free.UNITS[name], "value": value}
+        {"metric": BEYOND + name, "unit": horizon.UNITS[name], "value": value}
         for name, value in found.items()
     ]

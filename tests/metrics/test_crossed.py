@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from r2s.metrics.crossed import POWER, crossed_mean, interval, p_value, units_needed
+from r2s.metrics.statistics import POWER, crossed_mean, interval, p_value, units_needed
 
 
 def test_without_other_factors_it_is_students_t():

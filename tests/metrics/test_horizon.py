@@ -8,9 +8,9 @@ import pytest
 import r2s
 from r2s.mesh.mesh import rectangle
 from r2s.mesh.surface import sample
-from r2s.metrics import phase_free
+from r2s.metrics import horizon
 from r2s.metrics.horizon import floor_of, horizon_of, skill, within
-from r2s.metrics.surface_distance import POINTS, to_surface
+from r2s.metrics.losses import POINTS, to_surface
 
 TIMES = np.arange(20) / 10
 
@@ -78,17 +78,17 @@ def swing(phase: float) -> list[np.ndarray]:
 
 def test_the_phase_of_a_swing_does_not_count_but_its_size_and_speed_do():
     times = np.arange(80) / 20
-    found = phase_free.features(swing(0.0), times)
+    found = horizon.features(swing(0.0), times)
     assert found["width"] == pytest.approx(0.2) and found["height"] == 0
     assert found["area"] == pytest.approx(0.02)
     assert found["speed"] == pytest.approx(0.05 * 2 * np.pi / np.sqrt(2), rel=0.02)
     assert found["frequency"] == pytest.approx(1, rel=0.03)
-    apart = phase_free.differences(swing(0.0), swing(1.0), times)
+    apart = horizon.differences(swing(0.0), swing(1.0), times)
     assert apart["speed"] < 0.02 * found["speed"] and apart["frequency"] < 0.05
     larger = [2 * cloud for cloud in swing(0.0)]
-    twice = phase_free.differences(swing(0.0), larger, times)
+    twice = horizon.differences(swing(0.0), larger, times)
     assert twice["width"] == pytest.approx(0.2) and twice["area"] == pytest.approx(0.06)
     assert twice["speed"] == pytest.approx(found["speed"])
-    assert np.isnan(phase_free.differences(swing(0.0), [np.nan * c for c in larger], times)["sag"])
+    assert np.isnan(horizon.differences(swing(0.0), [np.nan * c for c in larger], times)["sag"])
     with pytest.raises(ValueError, match="evenly"):
-        phase_free.features(swing(0.0), times**2)
+        horizon.features(swing(0.0), times**2)

@@ -6,7 +6,7 @@ from conftest import rotation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.metrics.distances import distances, paper_units
+from r2s.metrics.prediction_error import distances, paper_units
 
 few = settings(max_examples=25, deadline=None)
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from r2s.metrics.placement import FARTHEST, TURN, Placement, moved, nearest
+from r2s.metrics.prediction_error import FARTHEST, TURN, Placement, best_placement, placed
 
 
 def surface(count: int, seed: int) -> list[np.ndarray]:
@@ -19,9 +19,9 @@ def surface(count: int, seed: int) -> list[np.ndarray]:
 def test_a_recording_that_was_moved_goes_back(shift, turn) -> None:
     true, motion = surface(500, 0), surface(20000, 1)
     away = Placement(np.array(shift), turn, np.mean(np.concatenate(true), axis=0))
-    real = [moved(away, cloud) for cloud in true]
-    place = nearest(real, motion)
-    back = [moved(place, cloud) for cloud in real]
+    real = [placed(away, cloud) for cloud in true]
+    place = best_placement(real, motion)
+    back = [placed(place, cloud) for cloud in real]
     # what slides along the sheet moves it least
     np.testing.assert_allclose(np.concatenate(back)[:, 2], np.concatenate(true)[:, 2], atol=3e-3)
     assert np.abs(np.concatenate(back) - np.concatenate(true)).mean() < 3e-3
@@ -30,19 +30,19 @@ def test_a_recording_that_was_moved_goes_back(shift, turn) -> None:
 def test_a_turn_keeps_heights_and_distances() -> None:
     place = Placement(np.array([0.1, 0.2, 0.3]), 0.5, np.array([1.0, 2.0, 3.0]))
     cloud = np.random.default_rng(0).normal(size=(20, 3))
-    there = moved(place, cloud)
+    there = placed(place, cloud)
     np.testing.assert_allclose(there[:, 2], cloud[:, 2] + 0.3)
 
     def lengths(points):
         return np.linalg.norm(points[:, None] - points[None], axis=2)
 
     np.testing.assert_allclose(lengths(there), lengths(cloud), atol=1e-12)
-    np.testing.assert_allclose(moved(place, place.pivot[None])[0], place.pivot + place.shift)
+    np.testing.assert_allclose(placed(place, place.pivot[None])[0], place.pivot + place.shift)
 
 
 def test_a_recording_is_not_placed_beyond_what_may_be_in_doubt() -> None:
     motion = surface(5000, 1)
-    place = nearest([cloud + np.array([0.0, 0.0, 0.2]) for cloud in surface(500, 0)], motion)
+    place = best_placement([cloud + np.array([0.0, 0.0, 0.2]) for cloud in surface(500, 0)], motion)
     assert np.max(np.abs(place.shift)) <= FARTHEST and abs(place.turn) <= TURN
     assert place.shift[2] == pytest.approx(-FARTHEST, rel=1e-3)
 
@@ -50,8 +50,8 @@ def test_a_recording_is_not_placed_beyond_what_may_be_in_doubt() -> None:
 def test_frames_that_cannot_be_compared_are_named() -> None:
     real, motion = surface(50, 0), surface(50, 1)
     with pytest.raises(ValueError, match="1 recorded frames, 2 simulated"):
-        nearest(real[:1], motion)
+        best_placement(real[:1], motion)
     with pytest.raises(ValueError, match="simulated frame 1"):
-        nearest(real, [motion[0], motion[1] * np.nan])
+        best_placement(real, [motion[0], motion[1] * np.nan])
     with pytest.raises(ValueError, match="recorded frame 0"):
-        nearest([real[0][:0], real[1]], motion)
+        best_placement([real[0][:0], real[1]], motion)

@@ -9,8 +9,8 @@ import pytest
 
 from r2s.materials import presets
 from r2s.metrics import prediction_error
+from r2s.metrics.losses import to_surface
 from r2s.metrics.prediction_error import Motion
-from r2s.metrics.surface_distance import to_surface
 from r2s.recordings.recording import cloud
 from r2s.scenarios.solvers import explicit_cloth
 from r2s.scenarios.standard import SIX

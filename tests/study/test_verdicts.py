@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import r2s
-from r2s.metrics import phase_free
+from r2s.metrics import horizon
 from r2s.study import engine, results, verdicts
 from r2s.study.ensembles import read_ensemble
 from r2s.study.evaluations import EvaluationCell
@@ -40,7 +40,7 @@ def test_a_sheet_does_not_differ_from_itself_beyond_the_horizon_whatever_its_mes
     simulated = clouds(shape)
     assert [len(cloud) for cloud in simulated] == counts
     drawn_anew = [cloud[::-1] for cloud in clouds((17, 17))]
-    found = phase_free.differences(drawn_anew, simulated, times)
+    found = horizon.differences(drawn_anew, simulated, times)
     assert max(found[name] for name in ("width", "depth", "height", "sag")) < 1e-3, found
     assert found["area"] < 1e-3 and found["speed"] < 5e-3, found
 
@@ -76,7 +76,7 @@ def test_a_truth_is_judged_beside_its_own_ensemble(tmp_path, monkeypatch):
     assert inside.mean() == pytest.approx(drawn.value)
     if np.isfinite(judged.horizon):
         beyond = set(rows[rows.baseline == "true"].metric)
-        assert {BEYOND + name for name in phase_free.UNITS} <= beyond
+        assert {BEYOND + name for name in horizon.UNITS} <= beyond
 
 
 def test_a_truth_is_converged_where_mesh_and_step_leave_little_and_chaotic_where_trifles_grow():

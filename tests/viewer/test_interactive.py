@@ -21,7 +21,7 @@ from matplotlib.image import imread
 from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
 from r2s.mesh.surface import sample
-from r2s.metrics.distances import distances
+from r2s.metrics.prediction_error import distances
 from r2s.recordings.recording import cloud
 from r2s.scenarios import lifting, synthetic
 from r2s.viewer import page

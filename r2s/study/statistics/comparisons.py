@@ -13,8 +13,14 @@ import numpy as np
 import pandas as pd
 from statsmodels.stats.multitest import multipletests
 
-from r2s.metrics.crossed import CrossedMean, crossed_mean, interval, p_value, units_needed
-from r2s.metrics.statistics import SIGNIFICANCE
+from r2s.metrics.statistics import (
+    SIGNIFICANCE,
+    CrossedMean,
+    crossed_mean,
+    interval,
+    p_value,
+    units_needed,
+)
 from r2s.study.configuration import ON_CLOTH
 from r2s.study.statistics.frame import motions
 

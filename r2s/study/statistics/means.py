@@ -9,9 +9,8 @@ import numpy as np
 import pandas as pd
 from scipy.stats import norm
 
-from r2s.metrics.crossed import CrossedMean, crossed_mean, interval
 from r2s.metrics.horizon import skill
-from r2s.metrics.statistics import LEVEL
+from r2s.metrics.statistics import LEVEL, CrossedMean, crossed_mean, interval
 from r2s.study.configuration import ON_CLOTH
 
 PLACES = ["fabric", "movement", "repeat"]
@@ -21,7 +20,7 @@ def crossed(values: pd.Series) -> CrossedMean:
     """The mean over fabrics of the means over recordings and repeats.
 
     `values`: indexed by `PLACES`; what is not finite does not count. The analysis of variance in
-    `r2s.metrics.crossed` stands beside statsmodels' `MixedLM` because its tests at a level of
+    `r2s.metrics.statistics` stands beside statsmodels' `MixedLM` because its tests at a level of
     5 % find 0 % in studies of two fabrics without an effect, where those of `MixedLM` find 18 %
     (four motions; deviations 0.2 between fabrics, 0.1 between motions and in the rest).
     """

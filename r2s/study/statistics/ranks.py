@@ -10,8 +10,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from r2s.metrics.crossed import crossed_mean, interval
-from r2s.metrics.statistics import SIGNIFICANCE
+from r2s.metrics.statistics import SIGNIFICANCE, crossed_mean, interval
 
 
 class Ranks(NamedTuple):
