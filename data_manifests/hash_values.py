@@ -10,8 +10,8 @@ import argparse
 import json
 from pathlib import Path
 
+from r2s.recordings.clouds import READERS, read_values
 from r2s.recordings.manifest import hash_values
-from r2s.recordings.readers.clouds import READERS, read_values
 
 
 def hash_folder(folder: Path) -> dict[str, str]:

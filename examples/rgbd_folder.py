@@ -14,11 +14,11 @@ import numpy as np
 import r2s
 from r2s import scenarios
 from r2s.materials import presets
-from r2s.recordings.cameras.calibration import DepthCamera, look_at
-from r2s.recordings.cameras.cleaning import Cleaning
-from r2s.recordings.cameras.rgbd import Rig, read_rig, rgbd_recording
-from r2s.recordings.cameras.synthetic_rgbd import write_rgbd
+from r2s.recordings.cameras import DepthCamera, look_at
+from r2s.recordings.clouds import Cleaning
 from r2s.recordings.recording import RecordingInfo, cloud, save
+from r2s.recordings.rgbd import Rig, read_rig, rgbd_recording
+from r2s.recordings.synthetic_rgbd import write_rgbd
 
 
 def camera(place: tuple[float, float, float]) -> DepthCamera:

@@ -22,8 +22,8 @@ from r2s.estimation.problem import Problem, default_nuisance_prior
 from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import ParameterSpace
 from r2s.recordings.datasets import known_bar
-from r2s.recordings.readers.swings import read_swing
 from r2s.recordings.recording import Recording
+from r2s.recordings.swings import read_swing
 from r2s.scenarios.scenario import from_recording, rollout
 
 LEARNT = ("range030_rep01", "range060_rep04", "range090_rep02", "range120_rep01")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from r2s.recordings.readers.clouds import read_cloud
+from r2s.recordings.clouds import read_cloud
 from r2s.recordings.recording import (
     Recording,
     RecordingInfo,

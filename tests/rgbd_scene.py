@@ -10,11 +10,11 @@ import numpy as np
 
 from r2s.mesh import surface as surfaces
 from r2s.mesh.mesh import rectangle
-from r2s.recordings.cameras.calibration import DepthCamera, look_at
-from r2s.recordings.cameras.cleaning import Cleaning
-from r2s.recordings.cameras.rgbd import Rig
-from r2s.recordings.cameras.synthetic_rgbd import write_rgbd
+from r2s.recordings.cameras import Camera, DepthCamera, look_at
+from r2s.recordings.clouds import Cleaning
 from r2s.recordings.recording import RecordingInfo, SheetPlacement
+from r2s.recordings.rgbd import Rig
+from r2s.recordings.synthetic_rgbd import write_rgbd
 
 nearest = jax.jit(surfaces.nearest)
 SAMPLE = 1000
@@ -50,6 +50,15 @@ def camera(position: tuple[float, float, float], **changes: Any) -> DepthCamera:
         "depth_scale": 1e-3,
     }
     return DepthCamera(**(fields | changes))
+
+
+def calibrated(pinhole: Camera) -> DepthCamera:
+    """A pinhole camera as a calibrated one: its pixels begin, those have their middle, at 0."""
+    across, down = pinhole.resolution
+    focal = float(pinhole.focal_length)
+    position, target = (tuple(map(float, p)) for p in (pinhole.position, pinhole.target))
+    centre = (across / 2 - 0.5, down / 2 - 0.5)
+    return DepthCamera((across, down), (focal, focal), centre, look_at(position, target), 1e-3)
 
 
 def rig(**changes: Any) -> Rig:

@@ -84,7 +84,7 @@ class Convert:
     """Convert again what is up to date, as after an update of r2s."""
 
     def run(self) -> None:
-        from r2s.recordings.convert import convert
+        from r2s.recordings.open import convert
 
         for line in convert(self.folder, self.to, self.only, self.force):
             print(line)

@@ -19,7 +19,7 @@ from r2s.metrics.losses import (
     robust_weight,
     surface_residuals,
 )
-from r2s.recordings.cameras.views import in_view
+from r2s.recordings.views import in_view
 
 Scale = Float[Array, ""] | float
 Loss = Callable[[Problem, Prediction], Float[Array, ""]]  # [m^2]

@@ -31,7 +31,7 @@ from r2s.laboratory.drape import DEVIATION, RADII, Drape
 from r2s.laboratory.estimate import Test
 from r2s.laboratory.knits import read_knit
 from r2s.laboratory.pull import SPECIMEN, Pull
-from r2s.recordings.readers.columns import METRES, NEWTONS, SHARES, header_of, read_columns
+from r2s.recordings.force_log import METRES, NEWTONS, SHARES, header_of, read_columns
 
 FORMAT = "r2s-laboratory/1"
 DIRECTIONS = {"warp": 0.0, "bias": math.pi / 4, "weft": math.pi / 2}

@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 
 from r2s._util.extras import require
 from r2s._util.files import read_json
+from r2s.recordings.clouds import read_values
 from r2s.recordings.manifest import (
     Manifest,
     default_manifest,
@@ -20,8 +21,7 @@ from r2s.recordings.manifest import (
     read_manifest,
     read_recordings,
 )
-from r2s.recordings.readers.clouds import read_values
-from r2s.recordings.readers.swings import Bar
+from r2s.recordings.swings import Bar
 
 TIMEOUT = 30  # [s], without a byte from the server
 SHOWN = 6  # folders that an error names
@@ -68,7 +68,7 @@ class Dataset:
 
 @dataclass(frozen=True, kw_only=True)
 class Swings(Dataset):
-    """A data set of swings, and how their sheet is held: `r2s.recordings.readers.swings`."""
+    """A data set of swings, and how their sheet is held: `r2s.recordings.swings`."""
 
     bar: Bar
 

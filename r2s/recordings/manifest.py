@@ -13,9 +13,7 @@ from jaxtyping import Float
 
 from r2s._util.files import read_json
 from r2s._util.units import positive
-from r2s.recordings.cameras.rgbd import find_rig, read_clouds, read_rig
-from r2s.recordings.cameras.views import Views, shifted
-from r2s.recordings.readers.clouds import find_frames, read_cloud, read_values
+from r2s.recordings.clouds import find_frames, read_cloud, read_values
 from r2s.recordings.recording import (
     Doubt,
     Recording,
@@ -23,6 +21,8 @@ from r2s.recordings.recording import (
     SheetPlacement,
     make_recording,
 )
+from r2s.recordings.rgbd import find_rig, read_clouds, read_rig
+from r2s.recordings.views import Views, shifted
 
 Vector = tuple[float, float, float]
 Watch = Callable[[Iterable[Any]], Iterable[Any]]
@@ -86,7 +86,7 @@ class Scenario:
     (the first is numbered `first_frame`) is taken at i / frame_rate + time_offset on the
     gripper's clock: a negative offset says that the clouds lag behind the gripper.
 
-    A folder for which there is a cameras.json holds RGB-D images (`r2s.recordings.cameras.rgbd`)
+    A folder for which there is a cameras.json holds RGB-D images (`r2s.recordings.rgbd`)
     instead of clouds: the cameras' own times or rate come before `frame_rate`, and `cloud`
     transforms what cameras.json calls the world. No hashes are kept of images.
 

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from r2s._util.files import parse, read_npz, write_npz
-from r2s.recordings.cameras.views import Views
-from r2s.recordings.readers.clouds import draw_points, voxel_means
+from r2s.recordings.clouds import draw_points, voxel_means
+from r2s.recordings.views import Views
 
 FORMAT = "r2s-recording/3"
 # the first knew neither force nor markers nor wind, the second neither doubt nor views

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from r2s.compilation import compile_once
 from r2s.materials.fabric import Fabric
 from r2s.mesh.surface import nearest, sample
-from r2s.recordings.cameras.camera import Camera
+from r2s.recordings.cameras import Camera
 from r2s.recordings.recording import (
     Recording,
     RecordingInfo,

@@ -6,18 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rgbd_scene import calibrated
 from scipy import ndimage
 
 from r2s import scenarios
 from r2s.estimation.physnet import preprocess, views
 from r2s.estimation.physnet.views import View
 from r2s.mesh.mesh import rectangle
-from r2s.recordings.cameras.calibration import (
-    DepthCamera,
-    calibrated,
-)
-from r2s.recordings.cameras.camera import Camera
-from r2s.recordings.cameras.render import render
+from r2s.recordings.cameras import Camera, DepthCamera
+from r2s.recordings.views import render
 from r2s.scenarios import synthetic
 
 VIEW = View((0.1, -0.4, 0.6), (0.1, 0.1, 0.1), 40.0, 32, 0.4, 1.0, -1.0)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from rgbd_scene import TIMES, write
 
-from r2s.recordings.cameras.images import encode_png
-from r2s.recordings.cameras.rgbd import read_clouds, read_rig
+from r2s.recordings.images import encode_png
+from r2s.recordings.rgbd import read_clouds, read_rig
 
 Break = Callable[[Path], Any]
 LEFT = ("cameras", "left")
@@ -65,7 +65,7 @@ def depths(change: Callable[[np.ndarray], np.ndarray]) -> Break:
     """The depth of the left camera as NPY of metres, changed."""
 
     def rewrite(folder: Path) -> None:
-        from r2s.recordings.cameras.images import read_depth
+        from r2s.recordings.images import read_depth
 
         edited(*LEFT, "depth_scale", value=1.0)(folder)
         for path in sorted((folder / "left" / "depth").iterdir()):

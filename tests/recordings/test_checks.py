@@ -15,12 +15,12 @@ from r2s import scenarios
 from r2s.cli.main import main as cli
 from r2s.materials import presets
 from r2s.mesh.mesh import rectangle
-from r2s.recordings.cameras.calibration import DepthCamera, look_at
-from r2s.recordings.cameras.cleaning import Cleaning
-from r2s.recordings.cameras.rgbd import Rig, read_clouds
-from r2s.recordings.cameras.synthetic_rgbd import write_rgbd
+from r2s.recordings.cameras import DepthCamera, look_at
 from r2s.recordings.checks import Finding, check
+from r2s.recordings.clouds import Cleaning
 from r2s.recordings.recording import Recording, RecordingInfo, SheetPlacement, make_recording, save
+from r2s.recordings.rgbd import Rig, read_clouds
+from r2s.recordings.synthetic_rgbd import write_rgbd
 from r2s.scenarios import synthetic
 
 SIDE, RATE = 0.4, 10.0

@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from r2s.recordings.readers.clouds import find_frames, read_cloud, voxel_means
+from r2s.recordings.clouds import find_frames, read_cloud, voxel_means
 
 POINTS = arrays(
     np.float32,

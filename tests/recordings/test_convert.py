@@ -10,8 +10,8 @@ from recorded_lift import lab
 from rgbd_scene import PATH, TIMES, distances, surface
 from rgbd_scene import write as write_images
 
-from r2s.recordings.convert import convert
 from r2s.recordings.manifest import default_manifest, manifest_for, read_recording
+from r2s.recordings.open import convert
 from r2s.recordings.recording import cloud, load
 
 NAMES = ("lift_camel_1", "lift_denim_1", "lift_denim_2")

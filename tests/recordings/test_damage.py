@@ -14,11 +14,11 @@ from hypothesis import HealthCheck, given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 from rgbd_scene import INFO, PATH, TIMES, write  # noqa: E402
 
-from r2s.recordings.cameras.rgbd import read_clouds, read_rig  # noqa: E402
+from r2s.recordings.clouds import read_cloud  # noqa: E402
+from r2s.recordings.force_log import read_force_log  # noqa: E402
 from r2s.recordings.manifest import default_manifest, read_manifest  # noqa: E402
-from r2s.recordings.readers.clouds import read_cloud  # noqa: E402
-from r2s.recordings.readers.force_log import read_force_log  # noqa: E402
 from r2s.recordings.recording import load, make_recording, save  # noqa: E402
+from r2s.recordings.rgbd import read_clouds, read_rig  # noqa: E402
 
 IMAGES = ("cameras.json", "left/times.csv", "left/depth/001.png", "right/masks/002.png")
 Damage = Callable[[bytes], bytes]

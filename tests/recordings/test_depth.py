@@ -9,20 +9,27 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from rgbd_scene import FACES, LENS, camera, surface
+from rgbd_scene import FACES, LENS, calibrated, camera, surface
 
-from r2s.recordings.cameras.calibration import calibrated, look_at, project, rays
-from r2s.recordings.cameras.camera import Camera
-from r2s.recordings.cameras.depth import back_project, depth_jumps, from_world, moved
-from r2s.recordings.cameras.images import read_depth, write_depth
-from r2s.recordings.cameras.render import render
-from r2s.recordings.cameras.synthetic_rgbd import (
+from r2s.recordings.cameras import (
+    Camera,
+    back_project,
+    depth_jumps,
+    from_world,
+    look_at,
+    moved,
+    project,
+    rays,
+)
+from r2s.recordings.images import read_depth, write_depth
+from r2s.recordings.synthetic_rgbd import (
     NONE,
     TYPICAL,
     Flaws,
     flawed_depth,
     flawed_mask,
 )
+from r2s.recordings.views import render
 
 SMALL = (32, 24)
 LENSES = [(), LENS]

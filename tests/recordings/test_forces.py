@@ -8,13 +8,13 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from r2s.recordings.readers.force_log import (
+from r2s.recordings.force_log import (
     ForceLog,
     at_frames,
     estimate_offset,
     read_force_log,
 )
-from r2s.recordings.readers.plane import on_table
+from r2s.recordings.markers import on_table
 from r2s.recordings.recording import RecordingInfo, SheetPlacement, make_recording
 
 TIMES = np.arange(60) / 30.0  # [s], of the frames

@@ -10,15 +10,18 @@ import pytest
 
 cv2 = pytest.importorskip("cv2")
 
-from r2s.recordings.readers.markers import Tracks, detect, find_grid, track  # noqa: E402
-from r2s.recordings.readers.plane import (  # noqa: E402
+from r2s.recordings.images import read_grey  # noqa: E402
+from r2s.recordings.markers import (  # noqa: E402  # noqa: E402
+    Tracks,
     checkerboard,
+    detect,
+    find_grid,
     on_table,
     plane_homography,
     to_metres,
+    track,
     undistort,
 )
-from r2s.recordings.readers.video import read_grey  # noqa: E402
 
 SIZE = (1280, 720)  # [px]
 PITCH, RADIUS = 0.045, 0.006  # [m], of a sheet of 0.45 m

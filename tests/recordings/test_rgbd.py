@@ -14,22 +14,23 @@ from hypothesis.extra.numpy import arrays
 from rgbd_scene import INFO, PATH, TIMES, camera, distances, rig, surface, write
 from test_manifest import MANIFEST
 
-from r2s.recordings.cameras.calibration import DepthCamera, look_at
-from r2s.recordings.cameras.cleaning import Cleaning, clean, inside, outliers
-from r2s.recordings.cameras.images import encode_png, read_depth, read_mask
-from r2s.recordings.cameras.rgbd import (
+from r2s.recordings.cameras import DepthCamera, look_at
+from r2s.recordings.clouds import Cleaning, clean, inside, outliers
+from r2s.recordings.images import encode_png, read_depth, read_mask
+from r2s.recordings.manifest import manifest_for, read_recording
+from r2s.recordings.recording import cloud, load, save
+from r2s.recordings.rgbd import (
     Rig,
     find_rig,
+    pair,
     read_clouds,
     read_rig,
+    read_times,
     rgbd_recording,
     stream,
     write_rig,
 )
-from r2s.recordings.cameras.synthetic_rgbd import NONE
-from r2s.recordings.cameras.timing import pair, read_times
-from r2s.recordings.manifest import manifest_for, read_recording
-from r2s.recordings.recording import cloud, load, save
+from r2s.recordings.synthetic_rgbd import NONE
 
 
 @pytest.fixture(scope="module")
@@ -258,7 +259,7 @@ def test_a_simulated_fabric_comes_back_within_2_mm(motion_of: str, tmp_path: Pat
     import jax.random as jr
 
     from r2s.materials import presets
-    from r2s.recordings.cameras.synthetic_rgbd import write_rgbd
+    from r2s.recordings.synthetic_rgbd import write_rgbd
     from r2s.scenarios import synthetic
     from r2s.scenarios.scenario import from_recording, rollout
     from r2s.scenarios.standard import SIX

@@ -19,8 +19,8 @@ from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
 from r2s.recordings.datasets import Swings, known_bar, known_datasets
 from r2s.recordings.open import open_recording
-from r2s.recordings.readers.swings import Bar, bar_path, read_swing
 from r2s.recordings.recording import load, make_recording, save
+from r2s.recordings.swings import Bar, bar_path, read_swing
 from r2s.scenarios.scenario import from_recording, rollout
 from r2s.scenarios.standard import swing
 

@@ -21,11 +21,11 @@ from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
 from r2s.mesh.mesh import rectangle
 from r2s.mesh.surface import sample
-from r2s.metrics.surface_distance import to_surface
-from r2s.recordings.cameras.calibration import DepthCamera, look_at
-from r2s.recordings.cameras.cleaning import Cleaning
-from r2s.recordings.cameras.views import Views, in_view, observed, shifted
+from r2s.metrics.losses import to_surface
+from r2s.recordings.cameras import DepthCamera, look_at
+from r2s.recordings.clouds import Cleaning
 from r2s.recordings.recording import Doubt, Recording, load, save
+from r2s.recordings.views import Views, in_view, observed, shifted
 from r2s.scenarios import synthetic
 
 BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))

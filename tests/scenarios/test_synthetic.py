@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 from r2s import scenarios
 from r2s.materials import presets
 from r2s.mesh.surface import sample
-from r2s.recordings.cameras.camera import Camera
+from r2s.recordings.cameras import Camera
 from r2s.recordings.recording import cloud
 from r2s.scenarios import synthetic
 from r2s.scenarios.scenario import from_recording, rollout

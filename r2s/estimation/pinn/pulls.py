@@ -108,8 +108,7 @@ def _pull(recording: Recording, without_force: bool) -> Pull:
     _check_times(times)
     if recording.markers is None or recording.markers_seen is None:
         raise ValueError(
-            "no markers: a stretching needs them in each frame "
-            "(r2s.recordings.readers.markers.track)"
+            "no markers: a stretching needs them in each frame (r2s.recordings.markers.track)"
         )
     seen = np.asarray(recording.markers_seen)[used]
     _check_seen(seen, first)
@@ -221,7 +220,7 @@ def _force(recording: Recording, used: slice, along: np.ndarray) -> np.ndarray:
     if force is None:
         raise ValueError(
             "no force: without it only ratios of stiffness are identifiable, not their scale; add "
-            "the load cell's log (r2s.recordings.readers.force_log), or take the pull with "
+            "the load cell's log (r2s.recordings.force_log), or take the pull with "
             "r2s.estimation.pinn.pulls.pull_from(recording, without_force=True)"
         )
     return np.asarray(force.values, np.float64) @ (np.asarray(force.directions) @ along)

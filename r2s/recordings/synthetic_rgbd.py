@@ -10,11 +10,10 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, zoom
 
 from r2s._util.files import write_bytes, write_text
 from r2s.mesh.mesh import rectangle
-from r2s.recordings.cameras.calibration import DepthCamera, rays
-from r2s.recordings.cameras.depth import depth_jumps, from_world
-from r2s.recordings.cameras.images import encode_png, write_depth
-from r2s.recordings.cameras.render import render
-from r2s.recordings.cameras.rgbd import Rig, write_rig
+from r2s.recordings.cameras import DepthCamera, depth_jumps, from_world, rays
+from r2s.recordings.images import encode_png, write_depth
+from r2s.recordings.rgbd import Rig, write_rig
+from r2s.recordings.views import render
 
 TABLE_CELLS = 8  # along each side, so that few of them reach behind a camera
 FABRIC_COLOUR, TABLE_COLOUR = (60, 60, 200), (120, 140, 150)  # blue, green, red

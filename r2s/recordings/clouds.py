@@ -1,14 +1,67 @@
-"""Point clouds in files: one reader per format."""
+"""Point clouds: files, frames in folders, thinning and cleaning."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
 
 from r2s._util.extras import require
-from r2s.recordings.readers.numbered import find_numbered
+
+
+def find_numbered(
+    folder: Path | str, suffixes: Collection[str], first: int | None = None
+) -> dict[int, Path]:
+    """The files of a folder with a number in their names (`000.npy`, `frame_12.npy`), in order.
+
+    Other files and hidden files are passed over.
+
+    - `suffixes`: the formats that are looked for, such as ".npy"; all files must have one of them.
+    - `first`: the number that the first file must have; None: any.
+
+    The number is the last group of digits in the name. Raises FileNotFoundError (no such folder,
+    no such file) or ValueError (mixed formats, two files of one number, a number is missing).
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder")
+    found = [(_number(path, suffixes), path) for path in sorted(folder.iterdir())]
+    numbered = [(number, path) for number, path in found if number is not None]
+    if not numbered:
+        formats = f"formats: {', '.join(suffixes)}"
+        raise FileNotFoundError(
+            f"{folder}: no numbered frames such as 000{next(iter(suffixes))} ({formats})"
+        )
+    formats = sorted({path.suffix.lower() for _, path in numbered})
+    if len(formats) > 1:
+        raise ValueError(f"{folder}: frames of mixed formats: {', '.join(formats)}")
+    frames: dict[int, Path] = {}
+    for number, path in numbered:
+        if number in frames:
+            names = f"{frames[number].name} and {path.name}"
+            raise ValueError(f"{folder}: frame {number} is there twice: {names}: remove one")
+        frames[number] = path
+    start = min(frames) if first is None else first
+    for number in range(start, max(frames)):
+        if number not in frames:
+            found = f"found {len(frames)} frames from {min(frames)} to {max(frames)}"
+            raise ValueError(
+                f"{folder}: frame {number} is missing ({found}): restore it, or number the frames "
+                "without gaps"
+            )
+    if min(frames) < start:
+        raise ValueError(f"{folder}: frame {min(frames)} comes before the first frame, {start}")
+    return dict(sorted(frames.items()))
+
+
+def _number(path: Path, suffixes: Collection[str]) -> int | None:
+    if path.name.startswith(".") or path.suffix.lower() not in suffixes or not path.is_file():
+        return None
+    digits = re.findall(r"[0-9]+", path.stem)
+    return int(digits[-1]) if digits else None
 
 
 def read_cloud(path: Path | str) -> Float[np.ndarray, "point 3"]:
@@ -154,3 +207,75 @@ READERS: dict[str, Callable[[Path], np.ndarray]] = {
     ".xyz": _read_xyz,
     ".pcd": _read_pcd,
 }
+
+
+Corner = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Cleaning:
+    """How a cloud is cleaned, in this order.
+
+    - `workspace`: the box [m] outside of which points are dropped: least and greatest corner.
+    - `edge`: pixels are dropped where depth jumps by more than this to a neighbour, [m]; 0: none.
+    - `table`: height of the table and the distance from it within which points are dropped, [m];
+      empty: none.
+    - `voxel`: the points of each cube of this side become their mean, [m]; 0: all points are kept.
+    - `neighbours`, `deviations`: a point is an outlier where its mean distance from this many
+      neighbours is above the mean of all by this many standard deviations; 0 neighbours: none is.
+    - `max_points`, `seed`: at most so many points a frame are drawn at random; 0: all.
+
+    Raises ValueError for a box without inside and for numbers that are negative.
+    """
+
+    workspace: tuple[Corner, Corner]
+    edge: float = 0.02
+    table: tuple[float, ...] = ()
+    voxel: float = 0.005
+    neighbours: int = 8
+    deviations: float = 3.0
+    max_points: int = 0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        low, high = np.array(self.workspace)
+        if not (low < high).all():
+            raise ValueError(f"workspace must be [least, greatest] corner [m], found {low}, {high}")
+        if len(self.table) not in (0, 2):
+            raise ValueError(f"table must be [height, margin] in metres, found {self.table}")
+        for name in ("edge", "voxel", "neighbours", "deviations", "max_points"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, found {getattr(self, name)}")
+
+
+def clean(
+    points: Float[np.ndarray, "point 3"], how: Cleaning, frame: int
+) -> Float[np.ndarray, "kept 3"]:
+    """The points [m] of the fabric among those of a frame; `frame` seeds the choice."""
+    points = points[inside(points, how)]
+    if how.table:
+        points = points[np.abs(points[:, 2] - how.table[0]) > how.table[1]]
+    if how.voxel > 0 and len(points):
+        points = voxel_means(points, how.voxel)
+    points = points[~outliers(points, how.neighbours, how.deviations)]
+    return draw_points(points, how.max_points or len(points), (how.seed, frame))
+
+
+def inside(points: Float[np.ndarray, "point 3"], how: Cleaning) -> Bool[np.ndarray, " point"]:
+    """Which points [m] are in the workspace."""
+    low, high = np.array(how.workspace)
+    return ((points >= low) & (points <= high)).all(axis=1)
+
+
+def outliers(
+    points: Float[np.ndarray, "point 3"], neighbours: int, deviations: float
+) -> Bool[np.ndarray, " point"]:
+    """Which points are much farther from their nearest neighbours than points are on average.
+
+    None is where there are no more points than `neighbours`. Points that lie where others do
+    count as neighbours; thin the cloud first.
+    """
+    if neighbours == 0 or len(points) <= neighbours:
+        return np.zeros(len(points), bool)
+    apart = KDTree(points).query(points, neighbours + 1)[0][:, 1:].mean(axis=1)
+    return apart > apart.mean() + deviations * apart.std()

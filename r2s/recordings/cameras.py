@@ -1,13 +1,15 @@
-"""Calibrated depth cameras: lenses, poses, and the rays of their pixels."""
+"""Depth cameras: lenses, poses, rays, from depth images to points."""
 
 from dataclasses import dataclass, field
 from functools import lru_cache
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float, Int
 
 from r2s._util.extras import require
-from r2s.recordings.cameras.camera import Camera
 
 Row = tuple[float, float, float, float]
 
@@ -98,17 +100,6 @@ def look_at(position: tuple[float, ...], target: tuple[float, ...]) -> tuple[Row
     return rows[0], rows[1], rows[2], rows[3]  # pyright: ignore[reportReturnType]
 
 
-def calibrated(camera: Camera, depth_scale: float = 1e-3) -> DepthCamera:
-    """A pinhole camera of the simulation as a calibrated one."""
-    across, down = camera.resolution
-    focal = float(camera.focal_length)
-    position, target = (tuple(map(float, p)) for p in (camera.position, camera.target))
-    # its pixels begin, ours have their middle, at whole numbers
-    centre = (across / 2 - 0.5, down / 2 - 0.5)
-    pose = look_at(position, target)
-    return DepthCamera((across, down), (focal, focal), centre, pose, depth_scale)
-
-
 def matrix(camera: DepthCamera) -> Float[np.ndarray, "3 3"]:
     """The 3 x 3 matrix of the intrinsics [pixel]."""
     (fx, fy), (cx, cy) = camera.focal_length, camera.centre
@@ -147,3 +138,87 @@ def rays(camera: DepthCamera) -> Float[np.ndarray, "down across 2"]:
         directions = (pixels - camera.centre) / camera.focal_length
     directions.setflags(write=False)
     return directions
+
+
+def depth_jumps(
+    depth: Float[np.ndarray, "down across"], limit: float
+) -> Bool[np.ndarray, "down across"]:
+    """Pixels at which the depth [m] jumps by more than `limit` [m] to a neighbour that has one.
+
+    There a pixel sees two surfaces at once, and cameras report a depth in between.
+    """
+    jumps = np.zeros(depth.shape, bool)
+    for lines, marked in ((depth, jumps), (depth.T, jumps.T)):  # of two rows, of two columns
+        jump = (np.abs(np.diff(lines, axis=0)) > limit) & (lines[1:] > 0) & (lines[:-1] > 0)
+        marked[1:] |= jump
+        marked[:-1] |= jump
+    return jumps
+
+
+def back_project(
+    camera: DepthCamera,
+    depth: Float[np.ndarray, "down across"],
+    where: Bool[np.ndarray, "down across"],
+) -> Float[np.ndarray, "point 3"]:
+    """What the pixels `where` see, in the camera's axes [m], row by row."""
+    along = depth[where].astype(np.float64)
+    return np.concatenate([rays(camera)[where] * along[:, None], along[:, None]], axis=1)
+
+
+def moved(pose: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*_ 3"]) -> np.ndarray:
+    """Points [m] after a rotation and shift given as a 4 x 4 matrix."""
+    return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def from_world(camera: DepthCamera, points: Float[np.ndarray, "*_ 3"]) -> np.ndarray:
+    """World points [m] in the camera's axes."""
+    pose = np.array(camera.to_world)
+    return (points - pose[:3, 3]) @ pose[:3, :3]
+
+
+DEPTH_TOLERANCE = 0.006  # [m]: samples of one surface in one pixel differ in depth by less
+
+
+class Camera(eqx.Module):
+    """A pinhole camera without distortion.
+
+    - `position`, `target`: where it is and what it looks at, [m]; up in its image is up.
+    - `focal_length`: in pixels.
+    - `resolution`: pixels (across, down).
+    """
+
+    position: Float[Array, " 3"]
+    target: Float[Array, " 3"]
+    focal_length: float = eqx.field(static=True, default=200.0)
+    resolution: tuple[int, int] = eqx.field(static=True, default=(160, 120))
+
+    def project(
+        self, points: Float[Array, "point 3"]
+    ) -> tuple[Float[Array, "point 2"], Float[Array, " point"]]:
+        """Pixel coordinates (across, down) and depth [m] of points [m]."""
+        forward = self.target - self.position
+        forward = forward / jnp.sqrt(forward @ forward)
+        right = jnp.cross(forward, jnp.array([0.0, 0.0, 1.0], points.dtype))
+        right = right / jnp.sqrt(right @ right)
+        down = jnp.cross(forward, right)
+        offset = points - self.position[None]
+        depth = offset @ forward
+        plane = jnp.stack([offset @ right, offset @ down], axis=1)
+        centre = jnp.array(self.resolution, points.dtype) / 2
+        return centre[None] + self.focal_length * plane / depth[:, None], depth
+
+    def sees(self, points: Float[Array, "point 3"]) -> Bool[Array, " point"]:
+        """Which points [m] of a densely sampled surface are in view and not behind others.
+
+        A z-buffer: of the points in a pixel, those within `DEPTH_TOLERANCE` of the nearest.
+        """
+        pixel, depth = self.project(points)
+        index, inside = self._pixels(pixel, depth)
+        nearest = jax.ops.segment_min(depth, index, self.resolution[0] * self.resolution[1] + 1)
+        return inside & (depth <= nearest[index] + DEPTH_TOLERANCE)
+
+    def _pixels(self, pixel, depth) -> tuple[Int[Array, " point"], Bool[Array, " point"]]:
+        across, down = jnp.floor(pixel[:, 0]).astype(int), jnp.floor(pixel[:, 1]).astype(int)
+        width, height = self.resolution
+        inside = (depth > 0) & (across >= 0) & (across < width) & (down >= 0) & (down < height)
+        return jnp.where(inside, down * width + across, width * height), inside
