@@ -29,7 +29,6 @@ from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import OrthotropicSpace
 from r2s.mesh.mesh import Mesh
 from r2s.scenarios.scenario import BRAKE, Scenario, rollout
-from r2s.solvers.implicit.linear.elimination import Elimination
 
 DATA = SHARED / "data" / "diffsim_reference"
 LIFT, REST, EDGE = "lift1_{}_9_dt10", "rest_{}_9_dt40", "edge_{}_9_dt40"
@@ -118,7 +117,6 @@ def scenario_of(
     air = Air.make(made.told["wind"]["density"], drag_coefficient=2.0, friction_coefficient=0.0)
     return Scenario(
         scene=Scene(made.mesh, jnp.asarray(made.held), Table.make(-jnp.inf), air),
-        elimination=Elimination.make(made.mesh),
         start=array(made.start),
         path=array(handles),
         path_times=array(times),

@@ -1,10 +1,12 @@
 """Scenarios: a sheet at rest, what holds it, how that moves, and which frames count."""
 
 import dataclasses
+import functools
 import math
 from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -17,9 +19,7 @@ from r2s.materials.turned import TurnedMembrane
 from r2s.mesh.mesh import Mesh, corner, rectangle
 from r2s.mesh.mesh import resized as resized_mesh
 from r2s.recordings.recording import Recording, SheetPlacement
-from r2s.solvers.contact.detection import SelfContact
 from r2s.solvers.implicit.cloth import Cloth, prepare_mesh
-from r2s.solvers.implicit.linear.elimination import Elimination
 from r2s.solvers.simulate import Solver, Trajectory, simulate
 
 CLEARANCE = 1e-3  # [m], between the table and a sheet that lies on it
@@ -53,12 +53,38 @@ class SheetSolver(Solver, Protocol):
         ...
 
 
+class Layout:
+    """How the vertices and elements of a mesh are joined, whatever its size: hashable.
+
+    Orders of elimination and searches for contacts follow from it alone, so that a solver can be
+    made for a scenario that is traced. `mesh` has this layout, and must not be traced.
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
+        rest = np.asarray(mesh.rest)
+        extent = np.ptp(rest, axis=0)
+        ranks = [np.unique(np.round(axis, 6), return_inverse=True)[1] for axis in (rest / extent).T]
+        parts = [*ranks, *filter(_is_index, jax.tree.leaves(mesh))]
+        arrays = [np.asarray(part, np.int32) for part in parts]
+        self._key = int(np.argmax(extent)), *((part.shape, part.tobytes()) for part in arrays)
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Layout) and self._key == other._key
+
+
+def _is_index(part: Any) -> bool:
+    return eqx.is_array(part) and np.issubdtype(part.dtype, np.integer)
+
+
 class Scenario(eqx.Module):
     """An experiment, for any fabric. Its arrays are traced: one compilation serves all recordings
     of as many frames and knots.
 
     - `scene`: sheet, table, air, fan, held vertices.
-    - `elimination`, `self_contact`: of the cloth solver, see `r2s.solvers.implicit.cloth.Cloth`.
     - `start`: positions at rest, [m].
     - `path`, `path_times`: of the held vertices, [m] and [s].
     - `first_time`: of the first frame, [s].
@@ -69,10 +95,11 @@ class Scenario(eqx.Module):
     - `brake`: mass damping [1/s] before the first frame, beside the fabric's; None: none.
     - `acceleration`: at the start, [m/s^2], of a sheet that is let go there; None: it is at rest.
     - `turn`: from the sheet's first side to the warp, [rad]; None: it lies along it.
+    - `self_contact`: whether the sheet does not pass through itself.
+    - `layout`: of the mesh; by default it follows from that, which must then not be traced.
     """
 
     scene: Scene
-    elimination: Elimination
     start: Float[Array, "vertex 3"]
     path: Float[Array, "knot handle 3"]
     path_times: Float[Array, " knot"]
@@ -85,8 +112,13 @@ class Scenario(eqx.Module):
     wind_times: Float[Array, " gust"] | None = None
     brake: Float[Array, ""] | None = None
     acceleration: Float[Array, "vertex 3"] | None = None
-    self_contact: SelfContact | None = None
     turn: Float[Array, ""] | None = None
+    self_contact: bool = eqx.field(static=True, default=False)
+    layout: Layout | None = eqx.field(static=True, default=None)
+
+    def __post_init__(self) -> None:
+        if self.layout is None:
+            self.layout = Layout(self.scene.mesh)
 
     def controls(self, substeps: int) -> Control:
         """What grippers and air do at the end of every substep, axes (frame, substep)."""
@@ -150,10 +182,8 @@ def from_placement(
     rising, rising_times = (None, None) if wind is None else _gust(wind, float(times[0]))
     fan = None if wind is None else _fan(sheet, wind)
     scene = Scene(mesh, jnp.asarray(held), Table.make(table_height), Air.make(), fan)
-    elimination, search = prepare_mesh(scene, self_contact)
     return Scenario(
         scene=scene,
-        elimination=elimination,
         start=jnp.asarray(start, float),
         path=jnp.concatenate([at_rest[None], path[:1], path]),
         path_times=jnp.concatenate([knots, path_times]),
@@ -165,7 +195,7 @@ def from_placement(
         wind=rising,
         wind_times=rising_times,
         brake=jnp.asarray(BRAKE, float) if hangs else None,
-        self_contact=search,
+        self_contact=self_contact,
     )
 
 
@@ -324,7 +354,9 @@ def stepped(
                 raise ValueError(f"max_step [s] must be positive, got {max_step}")
             substeps = math.ceil(scenario.interval / max_step - 1e-9)
         dt = scenario.interval / substeps
-        solver = Cloth(scenario.scene, scenario.elimination, dt, scenario.self_contact)
+        x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+        elimination, search = _prepared(scenario.layout, scenario.self_contact, x64)
+        solver = Cloth(scenario.scene, elimination, dt, search)
         if scenario.brake is not None:
             solver = dataclasses.replace(solver, max_iterations=ITERATIONS)
     else:
@@ -336,6 +368,13 @@ def stepped(
     if scenario.brake is None:
         return solver, substeps
     return Braked(solver, scenario.brake, scenario.lead_in * substeps, solver.dt), substeps
+
+
+@functools.lru_cache(maxsize=16)
+def _prepared(layout: Layout, self_contact: bool, x64: bool) -> Any:
+    """How the cloth solves its equations and finds contacts, in integers of 64 bits or of 32."""
+    del x64
+    return prepare_mesh(layout.mesh, self_contact)
 
 
 def begin(solver: SheetSolver, scenario: Scenario) -> Any:

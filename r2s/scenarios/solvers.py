@@ -38,7 +38,7 @@ def explicit_cloth(
         fabric,
         membrane_damping,
         relaxation,
-        self_contact=scenario.self_contact is not None,
+        self_contact=scenario.self_contact,
     )
 
 
@@ -56,7 +56,7 @@ def material_points(
     Raises `ValueError` when the mesh is too coarse for the grid, or the scenario has
     self-contact of the cloth.
     """
-    if scenario.self_contact is not None:
+    if scenario.self_contact:
         raise ValueError(
             "self-contact of material points comes from the grid: make the scenario without it"
         )

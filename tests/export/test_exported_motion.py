@@ -9,7 +9,6 @@ import pytest
 import r2s
 from r2s._util.units import GRAVITY
 from r2s.export.mujoco import brake, mjcf
-from r2s.solvers.implicit.linear.elimination import Elimination
 
 FABRIC = r2s.Fabric.make(0.2, (100.0, 30.0, 100.0, 35.0), 1e-5, damping=2e-4, mass_damping=3.0)
 SIDE, SIZE, HEIGHT = 0.3, 9, 0.5  # [m], vertices a side, of the sheet that starts flat [m]
@@ -29,7 +28,6 @@ def drape() -> r2s.Scenario:
     falling = jnp.array([0.0, 0.0, -GRAVITY])
     return r2s.Scenario(
         scene=scene,
-        elimination=Elimination.make(mesh),
         start=jnp.asarray(start, float),
         path=jnp.asarray(corners + eased[:, None, None] * way, float),
         path_times=jnp.asarray(times, float),

@@ -20,7 +20,6 @@ from r2s.mesh.mesh import rectangle
 from r2s.mesh.surface import nearest
 from r2s.scenarios.scenario import Scenario, begin, rollout, stepped
 from r2s.solvers.implicit.cloth import Cloth
-from r2s.solvers.implicit.linear.elimination import Elimination
 
 needs_data = pytest.mark.skipif(not runs.DATA.is_dir(), reason=f"no data in {runs.DATA}")
 INTERVAL = 0.02  # [s]
@@ -40,7 +39,6 @@ def dropped(air: float = 0.0, brake: float | None = None) -> Scenario:
     falling = jnp.zeros_like(start).at[1:, 2].set(-GRAVITY)
     return Scenario(
         scene=Scene(mesh, jnp.array([0]), Table.make(-jnp.inf), Air.make(air)),
-        elimination=Elimination.make(mesh),
         start=start,
         path=jnp.zeros((2, 1, 3)),
         path_times=jnp.array([0.0, 1.0]),

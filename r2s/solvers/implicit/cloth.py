@@ -18,6 +18,7 @@ from r2s.materials.fabric import Fabric
 from r2s.materials.wrinkling import membrane_on_samples, tangents_on_samples
 from r2s.mesh.bends import unwrapped
 from r2s.mesh.elements import area_normals
+from r2s.mesh.mesh import Mesh
 from r2s.solvers.contact.detection import SMALL, SelfContact, colliding, touching
 from r2s.solvers.failures import Failure, first_failure, no_failure
 from r2s.solvers.implicit.generalised_alpha import by_generalised_alpha, rates_after
@@ -88,7 +89,7 @@ class Cloth(eqx.Module):
         Raises `ValueError` for a step that is not positive, or too long for self-contact, for a
         spectral radius beyond its limits, and for one with self-contact.
         """
-        elimination, search = prepare_mesh(scene, self_contact)
+        elimination, search = prepare_mesh(scene.mesh, self_contact)
         return cls(scene, elimination, dt, search, tolerance, max_iterations, spectral_radius)
 
     def __check_init__(self):
@@ -238,12 +239,12 @@ class Cloth(eqx.Module):
         return jnp.where(failure == Failure.NONE.value, x, jnp.nan), failure
 
 
-def prepare_mesh(scene: Scene, self_contact: bool) -> tuple[Elimination, SelfContact | None]:
-    """What a cloth solver makes of the mesh of its scene, once; the mesh must not be traced."""
-    couples_all = self_contact and scene.mesh.rest.shape[0] <= SMALL
+def prepare_mesh(mesh: Mesh, self_contact: bool) -> tuple[Elimination, SelfContact | None]:
+    """What a cloth solver makes of a mesh, once; it must not be traced."""
+    couples_all = self_contact and mesh.rest.shape[0] <= SMALL
     with jax.ensure_compile_time_eval():  # sizes follow from the mesh, also under `jax.jit`
-        search = SelfContact.make(scene.mesh) if self_contact else None
-        return Elimination.make(scene.mesh, couples_all), search
+        search = SelfContact.make(mesh) if self_contact else None
+        return Elimination.make(mesh, couples_all), search
 
 
 def loss_tolerance(dt: float) -> float:
