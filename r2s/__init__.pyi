@@ -34,8 +34,8 @@ from r2s.recordings.recording import Recording, RecordingInfo, SheetPlacement, m
 from r2s.recordings.recording import load as load_recording
 from r2s.recordings.recording import save as save_recording
 from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
+from r2s.scenarios.resolution import explicit_cloth, material_points
 from r2s.scenarios.scenario import Scenario, from_recording, rollout
-from r2s.scenarios.solvers import explicit_cloth, material_points
 from r2s.scenarios.standard import Experiment, fling, folding, lifting, shaking, stretching, wind
 from r2s.scenarios.synthetic import record
 from r2s.solvers.explicit.cloth import ExplicitCloth

@@ -84,10 +84,10 @@ def parse_numbers(motion: Iterable[str]) -> dict[str, float]:
 def make_experiment(scenario: str, motion: Iterable[str]) -> "Experiment":
     """Make an experiment of `r2s.scenarios`; `ValueError` names the numbers that it takes."""
     from r2s import scenarios
-    from r2s.scenarios import paths
+    from r2s.scenarios.standard import LIMITS
 
     make = scenarios.SIX[scenario]
-    known = {*paths.LIMITS[scenario], *inspect.signature(make).parameters} - NOT_NUMBERS
+    known = {*LIMITS[scenario], *inspect.signature(make).parameters} - NOT_NUMBERS
     numbers: dict[str, Any] = {**parse_numbers(motion)}
     if unknown := sorted(set(numbers) - known):
         raise ValueError(

@@ -11,7 +11,7 @@ class Sensitivity:
 
     Simulates the motion with a preset that is like the fabric, as seen by two depth cameras, and
     prints how well each parameter would be known, and which combinations where one is not.
-    Numbers of the motion are those of `r2s.scenarios.paths`, in SI units.
+    Numbers of the motion are those of `r2s.scenarios.standard`, in SI units.
 
         r2s sensitivity lifting --fabric black_denim --motion height=0.3 moving=2
         r2s sensitivity wind --fabric grey_interlock --motion speed=3 --noise 0.002

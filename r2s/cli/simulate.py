@@ -15,7 +15,7 @@ class Simulate:
 
     The NPZ has x (frame, vertex, 3) [m] and faces (face, 3), as `r2s show --trajectory` reads it.
     With --recording it is also seen by two depth cameras, with noise and outliers: a synthetic
-    recording to estimate from. Numbers of the motion are those of `r2s.scenarios.paths`, in SI
+    recording to estimate from. Numbers of the motion are those of `r2s.scenarios.standard`, in SI
     units.
 
         r2s simulate lifting --fabric black_denim --motion height=0.3 --out lift.npz

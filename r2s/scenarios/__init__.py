@@ -2,14 +2,13 @@
 
 - `scenario`: a sheet at rest, what holds it, how that moves, which frames count; `rollout`.
 - `standard`: lifting, wind, stretching, folding, fling, shaking; a swing; varied at random.
-- `paths`: how grippers move in them.
-- `solvers`: explicit steps of the cloth, and material points, for a scenario.
+- `resolution`: which mesh, step and grid are fine enough.
 - `energy`: where the energy goes.
 - `synthetic`: recordings of a known fabric, seen by cameras.
 """
 
 from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
-from r2s.scenarios.solvers import explicit_cloth, material_points
+from r2s.scenarios.resolution import explicit_cloth, material_points
 from r2s.scenarios.standard import (
     SIX,
     Experiment,

@@ -328,7 +328,7 @@ def rollout(
 
     By the cloth, in steps of equal size that fill the time between frames: the scenario's, or as
     many as it takes that none is above `max_step` [s]. Or by another `solver` of the same scene,
-    whose own step divides that time, see `r2s.scenarios.solvers.material_points`. For `frames`
+    whose own step divides that time, see `r2s.scenarios.resolution.material_points`. For `frames`
     see `r2s.simulate`.
     """
     solver, substeps = stepped(scenario, max_step, solver)

@@ -26,9 +26,8 @@ from r2s.recordings.recording import (
     make_recording,
 )
 from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
-from r2s.scenarios.paths import Route
 from r2s.scenarios.scenario import Scenario, SheetSolver, rollout
-from r2s.scenarios.standard import SIDE, Experiment
+from r2s.scenarios.standard import SIDE, Experiment, Route
 from r2s.solvers.mpm.sheet import longest_edge
 from r2s.solvers.simulate import Trajectory
 

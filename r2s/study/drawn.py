@@ -5,8 +5,7 @@ from typing import Any
 
 import jax.random as jr
 
-from r2s.scenarios.paths import draw
-from r2s.scenarios.standard import SIX, Experiment
+from r2s.scenarios.standard import SIX, Experiment, draw
 
 RECORDING = "recording.npz"
 START = "start.npy"  # beside it: the shape of a hanging sheet in its first frame
@@ -15,7 +14,7 @@ START = "start.npy"  # beside it: the shape of a hanging sheet in its first fram
 def experiment_of(scenario: str, number: int, unseen: bool, seed: int) -> Experiment:
     """Motion `number` of a scenario, the same for all fabrics.
 
-    0 is that without any numbers; others are drawn within `r2s.scenarios.paths.LIMITS`. None that
+    0 is that without any numbers; others are drawn within `r2s.scenarios.standard.LIMITS`. None that
     is `unseen`, to be judged by, is one to estimate from.
     """
     if number == 0 and not unseen:
@@ -33,7 +32,7 @@ def numbers_of(scenario: str, number: int, unseen: bool, seed: int) -> dict[str,
 def pull_of(number: int, angle: float, seed: int) -> dict[str, float]:
     """Stretch and time of a pull at an `angle` [degrees] to the warp, the same for all fabrics.
 
-    Each angle and each number has its own, drawn within `r2s.scenarios.paths.LIMITS`.
+    Each angle and each number has its own, drawn within `r2s.scenarios.standard.LIMITS`.
     """
     key = jr.fold_in(jr.key(seed), number_of("pull", number, float(angle)))
     return draw("stretching", 1, key=key)[0]

@@ -23,8 +23,8 @@ from r2s.mesh.mesh import Mesh
 from r2s.mesh.surface import sample
 from r2s.metrics.losses import POINTS, to_surface
 from r2s.recordings.recording import cloud
+from r2s.scenarios.resolution import explicit_cloth
 from r2s.scenarios.scenario import rollout
-from r2s.scenarios.solvers import explicit_cloth
 from r2s.scenarios.standard import Experiment
 from r2s.study.cells import Cell, result_files
 from r2s.study.sources import SyntheticRecording, read, strain_dependent

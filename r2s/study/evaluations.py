@@ -22,8 +22,8 @@ from r2s.materials.fabric import Fabric
 from r2s.metrics import prediction_error
 from r2s.metrics.prediction_error import Motion
 from r2s.recordings.recording import Recording
+from r2s.scenarios.resolution import EDGE, MEMBRANE_DAMPING, explicit_cloth, grid_around
 from r2s.scenarios.scenario import Scenario, from_recording
-from r2s.scenarios.solvers import EDGE, MEMBRANE_DAMPING, explicit_cloth, grid_around
 from r2s.solvers.explicit.cloth import ExplicitCloth
 from r2s.solvers.mpm.sheet import Sheet, longest_edge, stable_step
 from r2s.study.cells import Cell, result_files

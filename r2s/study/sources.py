@@ -30,8 +30,8 @@ from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
 from r2s.recordings import manifest
 from r2s.recordings.recording import Recording, load, save
 from r2s.scenarios import synthetic
+from r2s.scenarios.resolution import explicit_cloth
 from r2s.scenarios.scenario import rollout
-from r2s.scenarios.solvers import explicit_cloth
 from r2s.scenarios.standard import STRETCHING_INTERVAL, Experiment
 from r2s.study.cells import Cell, result_files
 from r2s.study.drawn import RECORDING, START, experiment_of, number_of, pull_of
@@ -107,7 +107,7 @@ class SimulatedRecording(Source):
     """A recording of a motion of `r2s.scenarios`, by whichever simulator.
 
     - `number`: 0 is the motion of the scenario without any numbers; others are drawn within
-      `r2s.scenarios.paths.LIMITS`, the same for all fabrics.
+      `r2s.scenarios.standard.LIMITS`, the same for all fabrics.
     - `unseen`: whether its motion is drawn to be judged by; none of these is one to estimate from.
       Its clouds are all of the surface, without any error.
     """

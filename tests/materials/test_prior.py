@@ -13,7 +13,7 @@ from r2s.materials.plate import PlateBending
 from r2s.materials.softening_space import SofteningSpace
 from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
 from r2s.materials.stiffening_space import StiffeningSpace
-from r2s.scenarios.paths import draw
+from r2s.scenarios.standard import draw
 
 
 def test_draws_are_fabrics_with_the_stated_spread_and_the_weight_that_is_known():

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r2s.recordings.recording import corner
-from r2s.scenarios import paths
+from r2s.scenarios import standard
 from r2s.scenarios.standard import ALL_CORNERS, SIX, hanging, on_table, varied, wind
 
 DURATION = 59 / 15  # [s]
@@ -33,16 +33,16 @@ def test_every_path_is_smooth_and_at_rest_at_both_ends(name):
 @pytest.mark.parametrize("held", ["origin", "warp", "weft", "opposite"])
 def test_any_corner_can_be_folded_onto_the_opposite_one(held):
     sheet = on_table(SIZE, (held,))
-    path = paths.fold(sheet, DURATION, reach=1.0).path[:, 0]
+    path = standard.fold_path(sheet, DURATION, reach=1.0).path[:, 0]
     np.testing.assert_allclose(path[0], corner(sheet, held), atol=1e-12)
-    there = corner(sheet, paths.OPPOSITE[held])
+    there = corner(sheet, standard.OPPOSITE[held])
     np.testing.assert_allclose(path[-1, :2], there[:2], atol=1e-12)
     assert path[:, 2].min() >= sheet.origin[2] - 1e-12
-    assert path[-1, 2] == pytest.approx(sheet.origin[2] + paths.TABLE_GAP)
+    assert path[-1, 2] == pytest.approx(sheet.origin[2] + standard.TABLE_GAP)
 
 
 def test_a_lift_goes_up_and_inward():
-    path = paths.lift(on_table(SIZE, ("weft",)), DURATION, height=0.3, inward=0.1).path
+    path = standard.lift_path(on_table(SIZE, ("weft",)), DURATION, height=0.3, inward=0.1).path
     moved = path[-1, 0] - path[0, 0]
     assert moved[2] == pytest.approx(0.3)
     assert np.linalg.norm(moved[:2]) == pytest.approx(0.1)
@@ -50,7 +50,7 @@ def test_a_lift_goes_up_and_inward():
 
 
 def test_a_pull_moves_one_clamp_by_its_strain():
-    path = paths.pull(on_table(SIZE, ALL_CORNERS), DURATION, strain=0.05).path
+    path = standard.pull_path(on_table(SIZE, ALL_CORNERS), DURATION, strain=0.05).path
     moved = path[-1] - path[0]
     np.testing.assert_allclose(moved[:, 0], [0, 0, 0.05 * SIZE[0], 0.05 * SIZE[0]], atol=1e-12)
     np.testing.assert_array_equal(moved[:, 1:], 0)
@@ -58,11 +58,11 @@ def test_a_pull_moves_one_clamp_by_its_strain():
 
 def test_a_fling_comes_back_and_a_shake_moves_one_gripper():
     sheet = hanging(SIZE, 0.5)
-    flung = paths.fling(sheet, DURATION, forward=0.3).path
+    flung = standard.fling_path(sheet, DURATION, forward=0.3).path
     away = flung - flung[:1]
     assert away[..., 1].max() == pytest.approx(0.3, rel=1e-3)
     np.testing.assert_allclose(away[-1], 0, atol=1e-12)
-    shaken = paths.shake(sheet, DURATION, amplitude=0.05, frequency=1.5).path
+    shaken = standard.shake_path(sheet, DURATION, amplitude=0.05, frequency=1.5).path
     away = shaken - shaken[:1]
     np.testing.assert_array_equal(away[:, 0], 0)
     assert np.abs(away[:, 1, 2]).max() == pytest.approx(0.05, rel=0.02)
@@ -73,11 +73,11 @@ def test_a_fling_comes_back_and_a_shake_moves_one_gripper():
 @pytest.mark.parametrize("name", SIX)
 def test_drawn_numbers_keep_their_limits_and_their_seed(name):
     first, second = jr.split(jr.key(1))
-    estimation = paths.draw(name, paths.ESTIMATION, key=first)
-    evaluation = paths.draw(name, paths.EVALUATION, key=second)
+    estimation = standard.draw(name, standard.ESTIMATION, key=first)
+    evaluation = standard.draw(name, standard.EVALUATION, key=second)
     assert (len(estimation), len(evaluation)) == (40, 120)
-    assert estimation == paths.draw(name, paths.ESTIMATION, key=first)
-    limits = paths.LIMITS[name]
+    assert estimation == standard.draw(name, standard.ESTIMATION, key=first)
+    limits = standard.LIMITS[name]
     for numbers in estimation + evaluation:
         assert all(low <= numbers[number] <= high for number, (low, high) in limits.items())
     assert len({tuple(numbers.values()) for numbers in estimation + evaluation}) == 160
@@ -85,11 +85,11 @@ def test_drawn_numbers_keep_their_limits_and_their_seed(name):
 
 def test_what_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="a scenario is one of"):
-        paths.draw("dancing", 1, key=jr.key(0))
+        standard.draw("dancing", 1, key=jr.key(0))
     with pytest.raises(ValueError, match="one gripper"):
-        paths.lift(hanging(SIZE, 0.5), DURATION)
+        standard.lift_path(hanging(SIZE, 0.5), DURATION)
     with pytest.raises(ValueError, match="two grippers"):
-        paths.fling(on_table(SIZE, ("origin",)), DURATION)
+        standard.fling_path(on_table(SIZE, ("origin",)), DURATION)
 
 
 NOT_POSITIVE = st.floats(max_value=0.0)
@@ -124,12 +124,12 @@ WRONG: dict[str, dict[str, tuple[st.SearchStrategy[float], str]]] = {
     },
 }
 PATHS = {
-    "lifting": paths.lift,
-    "wind": paths.hold,
-    "stretching": paths.pull,
-    "folding": paths.fold,
-    "fling": paths.fling,
-    "shaking": paths.shake,
+    "lifting": standard.lift_path,
+    "wind": standard.hold_path,
+    "stretching": standard.pull_path,
+    "folding": standard.fold_path,
+    "fling": standard.fling_path,
+    "shaking": standard.shake_path,
 }
 
 
@@ -156,7 +156,7 @@ def test_numbers_that_make_no_sense_are_refused(name, number, data):
 @pytest.mark.parametrize("name", SIX)
 @given(data=st.data())
 def test_any_numbers_within_the_limits_give_a_path_at_rest_at_both_ends(name, data):
-    limits = paths.LIMITS[name]
+    limits = standard.LIMITS[name]
     numbers = {key: data.draw(st.floats(*ends)) for key, ends in limits.items()}
     times, path = SIX[name](**numbers).route
     assert np.isfinite(path).all() and (np.diff(times) > 0).all()

@@ -23,7 +23,7 @@ from r2s.materials import presets, prior
 from r2s.materials.softening_space import SOFTENING
 from r2s.materials.stiffening_space import STIFFENING
 from r2s.scenarios import synthetic
-from r2s.scenarios.paths import LIMITS
+from r2s.scenarios.standard import LIMITS
 from r2s.study import matrix
 from r2s.study.cells import with_dependencies
 from r2s.study.drawn import pull_of

@@ -12,7 +12,7 @@ from r2s.metrics import prediction_error
 from r2s.metrics.losses import to_surface
 from r2s.metrics.prediction_error import Motion
 from r2s.recordings.recording import cloud
-from r2s.scenarios.solvers import explicit_cloth
+from r2s.scenarios.resolution import explicit_cloth
 from r2s.scenarios.standard import SIX
 from r2s.solvers.explicit.cloth import ExplicitCloth
 from r2s.study.cells import execute

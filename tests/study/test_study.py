@@ -29,8 +29,7 @@ from r2s.materials.informed_space import InformedSpace
 from r2s.metrics import prediction_error
 from r2s.recordings.recording import cloud
 from r2s.scenarios import synthetic
-from r2s.scenarios.paths import LIMITS
-from r2s.scenarios.standard import SIX
+from r2s.scenarios.standard import LIMITS, SIX
 from r2s.solvers.failures import Failure
 from r2s.solvers.simulate import Trajectory
 from r2s.study import engine, estimates, matrix, results

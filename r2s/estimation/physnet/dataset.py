@@ -24,8 +24,8 @@ from r2s.estimation.physnet.views import (
 )
 from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
+from r2s.scenarios.resolution import material_points
 from r2s.scenarios.scenario import Scenario, rollout
-from r2s.scenarios.solvers import material_points
 from r2s.scenarios.standard import SIX, Experiment, varied
 from r2s.solvers.mpm.sheet import Sheet
 

@@ -18,8 +18,8 @@ from r2s.estimation.physnet import dataset, estimator, preprocess, training
 from r2s.estimation.physnet.pull_force import pull_force
 from r2s.estimation.problem import read_by_problem
 from r2s.recordings.recording import Recording
+from r2s.scenarios.resolution import material_points
 from r2s.scenarios.scenario import from_recording
-from r2s.scenarios.solvers import material_points
 
 NETWORK_SHAPE = {"cloth": (9, 9), "points": (7, 7)}
 
