@@ -106,20 +106,6 @@ def matrix(camera: DepthCamera) -> Float[np.ndarray, "3 3"]:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
-def project(
-    camera: DepthCamera, points: Float[np.ndarray, "point 3"]
-) -> Float[np.ndarray, "point 2"]:
-    """Pixels (across, down), lens included, of points in the camera's axes [m] in front of it."""
-    if not any(camera.distortion):
-        return points[:, :2] / points[:, 2:] * camera.focal_length + camera.centre
-    still, lens = np.zeros(3), np.array(camera.distortion)
-    return (
-        require("cv2", "camera", "lens distortion")
-        .projectPoints(points, still, still, matrix(camera), lens)[0]
-        .reshape(-1, 2)
-    )
-
-
 @lru_cache(maxsize=8)  # the same for every frame; 15 MB at 720p
 def rays(camera: DepthCamera) -> Float[np.ndarray, "down across 2"]:
     """x / z and y / z of what each pixel sees, in the camera's axes: undistorted.

@@ -111,9 +111,8 @@ class Finding(NamedTuple):
             return f"not shown   {self.check}: {self.words}"
         unit = "" if self.unit == "-" else f" {self.unit}"
         ends = f"{self.low:g} to {self.high:g}{unit}"
-        if not np.isfinite(self.high):
-            ends = f"at least {self.low:g}{unit}"
-        if not np.isfinite(self.low):
-            ends = f"at most {self.high:g}{unit}"
+        if not np.isfinite([self.low, self.high]).all():
+            bound = f"at least {self.low:g}" if np.isfinite(self.low) else f"at most {self.high:g}"
+            ends = bound + unit
         line = f"{self.check}: {self.words} {self.figure:.3g}{unit}, expected {ends}"
         return f"suspicious  {line}: {self.advice}" if self.is_suspicious else f"good        {line}"

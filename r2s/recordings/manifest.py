@@ -86,13 +86,9 @@ class Scenario:
     (the first is numbered `first_frame`) is taken at i / frame_rate + time_offset on the
     gripper's clock: a negative offset says that the clouds lag behind the gripper.
 
-    A folder for which there is a cameras.json holds RGB-D images (`r2s.recordings.rgbd`)
-    instead of clouds: the cameras' own times or rate come before `frame_rate`, and `cloud`
-    transforms what cameras.json calls the world. No hashes are kept of images.
-
-    - `sessions`: what moves the points of some recordings, after `cloud`, and with them the
-      `views`; a recording belongs to one of them, where there are any.
-    - `doubt`, `views`: see `r2s.recordings.recording.RecordingInfo`.
+    A folder with a cameras.json holds RGB-D images (`r2s.recordings.rgbd`) instead of clouds: the
+    cameras' own times or rate come before `frame_rate`, `cloud` transforms from their world, and
+    no hashes are kept. If there are `sessions`, a recording belongs to one of them.
     """
 
     folder: str
@@ -154,8 +150,7 @@ def to_world(transform: Transform, points: Float[np.ndarray, "*_ 3"]) -> np.ndar
 def hash_values(values: np.ndarray) -> str:
     """The sha256 of the values as little-endian float32 in C order.
 
-    Of the values, not of the file: copies in double and in single precision, or in another file
-    format, have one hash.
+    Copies in double and in single precision, or in another file format, have one hash.
     """
     return hashlib.sha256(np.asarray(values, "<f4").tobytes()).hexdigest()
 
@@ -182,9 +177,7 @@ def manifest_of(folder: Path | str) -> Path:
 def read_manifest(path: Path | str) -> Manifest:
     """Read a manifest from JSON: the fields of `Manifest`, no more and (but for defaults) no less.
 
-    Raises FileNotFoundError, or a ValueError that names the file and the field: no JSON, unknown
-    or missing fields, wrong types, numbers that are not finite, an unknown scale, a rotation that
-    is none, rates or sides that are not positive.
+    Raises FileNotFoundError, or a ValueError that names the file and the field.
     """
     return read_json(path, Manifest)
 
@@ -227,12 +220,11 @@ def read_recording(
 
     Frames are read through `watch`, such as a bar that shows progress.
 
-    `info.verified`: True if all its files are listed in the manifest and have the listed values,
-    None if some are not listed; False, with a warning, if a listed one differs or is missing.
+    `info.verified`: True if all its files have the values listed in the manifest, None if some are
+    not listed; False, with a warning, if a listed one differs or is missing.
 
     Raises FileNotFoundError or a ValueError that names the file or folder: a name that fits no
-    scenario or several, a frame that is missing, a cloud or path that is damaged, empty or not
-    finite, a path that ends before the last frame.
+    scenario or several, files that are missing, damaged, empty or not finite.
     """
     folder = Path(folder)
     scenario_name, fabric, trial = _scenario_of(manifest, name)
@@ -288,7 +280,6 @@ def _numbered_clouds(
 
 
 def _session(scenario: Scenario, name: str) -> Session:
-    """The session that a recording belongs to; one that moves nothing where there are none."""
     if not scenario.sessions:
         return Session(".*", (0.0, 0.0, 0.0), "")
     fits = [each for each in scenario.sessions if re.fullmatch(each.recordings, name)]

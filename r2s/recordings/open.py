@@ -58,7 +58,6 @@ def open_recording(path: Path | str) -> Recording:
 
 
 def _load(path: Path) -> Recording:
-    """Of this format, or of the public swings."""
     return read_swing(path, known_bar()) if is_swing(path) else load(path)
 
 

@@ -27,9 +27,9 @@ CLOCK_TOLERANCE = 1e-6  # [s], rounding when a time is a frame number over a rat
 class SheetPlacement:
     """Where the rectangular sheet lies at rest, in metres, z up.
 
-    `held` names the corners grasped by the handles, one per handle: "origin", "warp" (at the end
-    of the warp side), "weft" (at the end of the weft side) or "opposite". Raises ValueError for
-    sides that are not positive, directions that are not orthonormal, and unknown corners.
+    `held` names the corner of each handle: "origin", "warp" (at the end of the warp side), "weft"
+    or "opposite". Raises ValueError for sides that are not positive, directions that are not
+    orthonormal, and unknown corners.
     """
 
     size: tuple[float, float]  # [m], lengths of the warp and the weft side
@@ -89,14 +89,11 @@ class Doubt:
 class RecordingInfo:
     """What a recording is of.
 
-    - `frames_used`: the first and the last frame that count.
-    - `wind`: of the air around the sheet, None where nobody measured it.
-    - `time_offset`: what was added to the cameras' clock to give `Recording.times`; a negative one
-      says that the cameras lag behind the grippers. `set_time_offset` changes it.
-    - `doubt`: how far all this may be off; None: nobody said.
-    - `views`: the cameras and what became of their points; None: nobody wrote them down.
-    - `angle`: from the pull of a stretching to the warp: 0 where the sheet was cut along the warp,
-      45 on the bias, 90 along the weft.
+    - `wind`: of the air around the sheet; None: not measured.
+    - `time_offset`: added to the cameras' clock to give `Recording.times`; negative where the
+      cameras lag behind the grippers. `set_time_offset` changes it.
+    - `doubt`: standard deviations of all this; `views`: the cameras; None: unknown.
+    - `angle`: from the pull of a stretching to the warp: 45 on the bias, 90 along the weft.
 
     Raises ValueError for a wind, an offset or an angle that is not finite, and for an angle of
     another motion.
@@ -137,9 +134,9 @@ class Recording(eqx.Module):
     `info` is static: a jitted function that takes a whole Recording compiles once per `info`; one
     that takes its arrays compiles once per shape (see `subsample`).
 
-    `force` is what pulls at the sheet: for each sample of its log a number, or a vector in the
-    world. `markers` are places printed on the sheet, in each frame; `marker_places` says where they
-    are on it, None: where the first frame shows them on the sheet at rest. None where not recorded.
+    `force` is what pulls at the sheet: numbers, or vectors in the world. `markers` are places
+    printed on it; `marker_places` says where on it, None: where the first frame shows them on the
+    sheet at rest. None where not recorded.
     """
 
     points: Float[Array, "frame point 3"]  # [m], padded with zeros; only where mask
@@ -168,24 +165,18 @@ def make_recording(
     markers_seen: Any = None,
     marker_places: Any = None,
 ) -> Recording:
-    """Pad ragged clouds into a Recording.
+    """Pad ragged clouds into a Recording, in JAX's default precision.
 
     - `clouds`: one (points, 3) array per frame, [m]; None: the markers that are seen.
     - `times`: (frame,), `info.time_offset` included, [s].
-    - `handle_path`: (knot, handle, 3), or (knot, 3) for one handle, [m].
-    - `handle_times`: (knot,), [s].
+    - `handle_path`: (knot, handle, 3), or (knot, 3) for one handle, [m]. `handle_times`: [s].
     - `force`, `force_times`: (sample,) or (sample, 3) [N], and (sample,) [s].
-    - `markers`: (frame, marker, 3), [m].
-    - `markers_seen`: (frame, marker); None: wherever the markers are finite.
+    - `markers`: (frame, marker, 3), [m]. `markers_seen`: (frame, marker); None: where finite.
     - `marker_places`: (marker, 2), where they are on the sheet along warp and weft, [m].
 
-    Floats take JAX's default precision.
-
-    Raises ValueError that names the recording, and the frame where there is one: no frames, a
-    cloud that is empty or not finite or not (points, 3), times that do not increase, a path of
-    another shape or of more handles than `info.sheet.held` names, a path that ends before the
-    last frame, `frames_used` outside of the frames, a force without times or the reverse, markers
-    of other frames, or seen but not finite, and places of other markers, or off the sheet.
+    Raises ValueError that names the recording, and the frame where there is one: clouds that are
+    empty or not finite, times that do not increase, a path of other handles than `info.sheet.held`
+    or that ends before the last frame, and arrays that do not belong together.
     """
     try:
         marks = _check_markers(markers, markers_seen)
@@ -276,10 +267,9 @@ def check_covered(clock: Float[np.ndarray, " sample"], times: Float[np.ndarray, 
 def subsample(recording: Recording, num_points: int, voxel: float | None, seed: int) -> Recording:
     """Thin every frame to at most `num_points`, padded to exactly that many.
 
-    They are drawn without repetition, by a generator seeded with (`seed`, frame). With a `voxel`
-    the points of each cube of that side [m] become their mean first, which evens out their density,
-    but moves them: a point that noise throws into an empty cube counts as much as the many of the
-    next. Recordings of as many frames and knots then have the same shapes. Raises ValueError if
+    Drawn by a generator seeded with (`seed`, frame). With a `voxel` the points of each cube of that
+    side [m] become their mean first, which evens out their density, but moves them.
+    Recordings of as many frames and knots then have the same shapes. Raises ValueError if
     `num_points` < 1 or `voxel` is not positive.
     """
     if num_points < 1:
@@ -348,6 +338,13 @@ def _split(points: np.ndarray, offsets: np.ndarray) -> list[np.ndarray]:
     return np.split(points, offsets[1:-1])
 
 
+def _of_shape(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
+    values = np.asarray(values, np.float64)
+    if values.shape != shape:
+        raise ValueError(f"{what} must have the shape {shape}, found {values.shape}")
+    return values
+
+
 def _check_places(
     places: Any, marks: tuple[np.ndarray, np.ndarray] | None, size: tuple[float, float]
 ) -> np.ndarray | None:
@@ -362,13 +359,6 @@ def _check_places(
             f"{places.max(axis=0)}: in metres from its origin, along warp and weft"
         )
     return places
-
-
-def _of_shape(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
-    values = np.asarray(values, np.float64)
-    if values.shape != shape:
-        raise ValueError(f"{what} must have the shape {shape}, found {values.shape}")
-    return values
 
 
 def _check_cloud(points: Any, frame: int) -> np.ndarray:
@@ -412,8 +402,7 @@ def _check_force(force: Any, times: Any) -> tuple[np.ndarray, np.ndarray] | None
     if force is None and times is None:
         return None
     if force is None or times is None:
-        there, lacks = ("force_times", "force") if force is None else ("force", "force_times")
-        raise ValueError(f"{there} without {lacks}: give both or neither")
+        raise ValueError("force and force_times: one is missing, give both or neither")
     force = np.asarray(force, np.float64)
     if len(force.shape) not in (1, 2) or force.shape[1:] not in ((), (3,)) or len(force) == 0:
         raise ValueError(f"force must be (sample,) or (sample, 3) [N], found {force.shape}")

@@ -1,4 +1,10 @@
-"""The six scenarios of the study, for any fabric and solver: sheets, grippers' paths, frames."""
+"""The six scenarios of the study, each a function of the sheet's size and the grippers' path.
+
+An experiment does not know how it will be simulated: `Experiment.scenario` puts it on a mesh. The
+grippers follow a `route` that was recorded, or a smooth path made from a few numbers, whose limits
+are in `LIMITS`. The speed of a path is continuous, and zero at both ends; numbers that make no
+sense, or with which it would not be at rest after its `duration`, raise a `ValueError`.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -41,8 +47,7 @@ ESTIMATION, EVALUATION = 40, 120  # motions of each scenario in the study
 
 
 def draw(scenario: str, number: int, *, key: PRNGKeyArray) -> list[dict[str, float]]:
-    """`number` sets of a scenario's numbers, each uniform within its limits; of one key the same in
-    float32 and float64.
+    """`number` sets of a scenario's numbers, uniform in their limits, the same in any precision.
 
     Raises `ValueError` for an unknown scenario.
     """
@@ -67,9 +72,9 @@ def lift_path(
     inward: float = 0.15,
     moving: float = 2.5,
 ) -> Route:
-    """The held corner goes up by `height` and inward by `inward` [m] in `moving` of `duration` [s].
+    """The held corner goes up by `height` and towards the opposite one by `inward` [m].
 
-    Inward is towards the opposite corner.
+    It moves for `moving` of `duration` [s].
 
     >>> from r2s.scenarios.standard import on_table
     >>> path = lift(on_table((0.3, 0.3), ("origin",)), 4.0, height=0.2, inward=0.0).path
@@ -115,10 +120,9 @@ def fold_path(
 def pull_path(
     sheet: SheetPlacement, duration: float, strain: float = 0.04, moving: float = 1.0
 ) -> Route:
-    """Two clamps, each from corner to corner: the one at the warp's end is pulled in `moving` [s].
+    """Two clamps from corner to corner: that at the warp's end is pulled in `moving` [s].
 
-    It goes along the warp by `strain` [-] times the sheet's length, and stays. The grippers are
-    the corners, in the order in which they are held.
+    By `strain` [-] times the sheet's length. The grippers are the held corners.
     """
     not_negative("-", strain=strain)
     positive("s", moving=moving)
@@ -146,9 +150,8 @@ def fling_path(
 ) -> Route:
     """Two grippers go `forward` [m] in `there` [s] and come back in `back` [s], after `wait` [s].
 
-    Forward is the horizontal direction at right angles to the sheet, 90 degrees to the left of
-    the one from the first to the second gripper. The greatest acceleration is
-    6 forward / there^2.
+    Forward is horizontal, 90 degrees to the left of the direction from the first to the second
+    gripper. The greatest acceleration is 6 forward / there^2.
     """
     not_negative("m", forward=forward)
     positive("s", there=there, back=back)
@@ -175,8 +178,7 @@ def shake_path(
 ) -> Route:
     """Two grippers, of which the second goes up and down by `amplitude` [m], `frequency` [1/s].
 
-    It takes `fade` [s] to come to that amplitude and to lose it, and is still for the last `still`
-    of `duration` [s].
+    The amplitude rises and falls in `fade` [s]; the last `still` of `duration` [s] is at rest.
     """
     not_negative("m", amplitude=amplitude)
     _check_frequency(frequency)
@@ -201,11 +203,8 @@ def swing_path(
     turn: float = 30.0,
     frequency: float = 0.8,
 ) -> Route:
-    """Both ends of a bar, which goes to and fro and turns about the vertical through its middle.
-
-    It goes out of the sheet's plane by `sway` [m] to either side, turns by `turn` [degrees] to
-    either side, both at a `frequency` [1/s].
-    """
+    """Both ends of a bar, which goes out of the sheet's plane by `sway` [m] to either side, and
+    turns about the vertical through its middle by `turn` [degrees], both at `frequency` [1/s]."""
     not_negative("m", sway=sway)
     not_negative("degrees", turn=turn)
     _check_frequency(frequency)
@@ -281,11 +280,8 @@ Size = tuple[float, float]
 class Experiment(NamedTuple):
     """What is done to a sheet, for any fabric and any solver.
 
-    - `name`: of the scenario.
-    - `sheet`: where it is at rest, and which corners the grippers hold.
-    - `route`: the grippers' path.
-    - `times`: of the frames, [s].
-    - `frames_used`: the first and the last frame that count.
+    - `sheet`: where it is at rest, and which corners the grippers hold; `route`: their path.
+    - `times`: of the frames, [s]. `frames_used`: the first and the last frame that count.
     - `wind`: of a fan in front of the sheet's middle, from the first frame on, [m/s]; None: none.
     - `clamps`: pairs of held corners between which the whole side is held.
     - `table_height`: [m].
@@ -352,10 +348,7 @@ def folding(
     interval: float = INTERVAL,
     **path: float,
 ) -> Experiment:
-    """A sheet lies flat on the table; a corner is brought onto the opposite one.
-
-    `path`: see `fold_path`.
-    """
+    """A sheet lies flat on the table; a corner is brought onto the opposite one: `fold_path`."""
     return _moved("folding", on_table(size, (held,)), route, num_frames, interval, path)
 
 
@@ -411,10 +404,7 @@ def fling(
     interval: float = INTERVAL,
     **path: float,
 ) -> Experiment:
-    """A sheet hangs from its top corners, which rapidly go forward and back.
-
-    `path`: see `fling_path`.
-    """
+    """A sheet hangs from its top corners, which rapidly go forward and back: `fling_path`."""
     return _moved("fling", hanging(size, height), route, num_frames, interval, path)
 
 
@@ -427,10 +417,7 @@ def shaking(
     interval: float = INTERVAL,
     **path: float,
 ) -> Experiment:
-    """A sheet hangs from its top corners, of which one goes up and down.
-
-    `path`: see `shake_path`.
-    """
+    """A sheet hangs from its top corners, of which one goes up and down: `shake_path`."""
     return _moved("shaking", hanging(size, height), route, num_frames, interval, path)
 
 

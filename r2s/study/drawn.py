@@ -14,8 +14,8 @@ START = "start.npy"  # beside it: the shape of a hanging sheet in its first fram
 def experiment_of(scenario: str, number: int, unseen: bool, seed: int) -> Experiment:
     """Motion `number` of a scenario, the same for all fabrics.
 
-    0 is that without any numbers; others are drawn within `r2s.scenarios.standard.LIMITS`. None that
-    is `unseen`, to be judged by, is one to estimate from.
+    0 is that without any numbers; others are drawn within `r2s.scenarios.standard.LIMITS`. None
+    that is `unseen`, to be judged by, is one to estimate from.
     """
     if number == 0 and not unseen:
         return SIX[scenario]()

@@ -210,9 +210,9 @@ def test_a_figure_that_nothing_shows_is_not_suspicious():
 def test_the_command_says_what_it_found_and_how_it_went(rendered, tmp_path: Path, capsys):
     save(read(rendered(1.0)), tmp_path / "good.npz")
     save(read(rendered(1.0), late=0.2), tmp_path / "late.npz")
-    assert cli.main(["check", str(tmp_path / "good.npz")]) == 0
+    assert cli(["check", str(tmp_path / "good.npz")]) == 0
     assert capsys.readouterr().out.endswith("nothing suspicious\n")
-    assert cli.main(["check", str(tmp_path / "late.npz"), "--json"]) == 1
+    assert cli(["check", str(tmp_path / "late.npz"), "--json"]) == 1
     told = json.loads(capsys.readouterr().out)
     assert told["suspicious"] >= 1 and told["findings"][0]["check"] == "clock"
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -17,8 +18,8 @@ from r2s.recordings.cameras import (
     depth_jumps,
     from_world,
     look_at,
+    matrix,
     moved,
-    project,
     rays,
 )
 from r2s.recordings.images import read_depth, write_depth
@@ -33,6 +34,13 @@ from r2s.recordings.views import render
 
 SMALL = (32, 24)
 LENSES = [(), LENS]
+
+
+def project(view, points):
+    """Pixels (across, down), lens included, of points in the camera's axes [m], by OpenCV."""
+    still, lens = np.zeros(3), np.array(view.distortion or (0.0,) * 4)
+    found = cv2.projectPoints(points, still, still, matrix(view), lens)[0]
+    return found.reshape(-1, 2)
 
 
 def seen(lens: tuple[float, ...] = (), **changes: Any):

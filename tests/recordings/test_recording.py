@@ -323,8 +323,8 @@ def test_markers_alone_make_the_clouds() -> None:
 @pytest.mark.parametrize(
     "changes, words",
     [
-        ({"force": [1.0, 2.0]}, "force without force_times"),
-        ({"force_times": [1.0, 2.0]}, "force_times without force"),
+        ({"force": [1.0, 2.0]}, "give both or neither"),
+        ({"force_times": [1.0, 2.0]}, "give both or neither"),
         ({"force": [[1.0, 2.0]], "force_times": [0.0]}, r"or \(sample, 3\) .N., found \(1, 2\)"),
         ({"force": [], "force_times": []}, r"found \(0,\)"),
         ({"force": [1.0, np.nan], "force_times": [0.0, 1.0]}, "found nan in sample 1"),
