@@ -16,14 +16,8 @@ from jaxtyping import Float
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import ConvexHull
 
-from r2s.recordings.recording import (
-    CORNERS,
-    Recording,
-    RecordingInfo,
-    SheetPlacement,
-    corner,
-    make_recording,
-)
+from r2s.recordings import recording as recordings
+from r2s.recordings.recording import Recording, RecordingInfo, SheetPlacement, corner
 
 FILE = "final_data.pkl"
 RATE = 30.0  # frames a second
@@ -93,7 +87,7 @@ def read_case(
         table_height=float(np.quantile(clouds[0][:, 2], 0.01)),
         verified=None,
     )
-    return make_recording(clouds, times, corners + (paths - paths[:1]), times, info)
+    return recordings.make_recording(clouds, times, corners + (paths - paths[:1]), times, info)
 
 
 class _Arrays(pickle.Unpickler):
@@ -164,6 +158,6 @@ def _around(
         weft=(float(weft[0]), float(weft[1]), 0.0),
         held=(),
     )
-    places = {name: corner(bare, name) for name in CORNERS}
+    places = {name: corner(bare, name) for name in recordings.CORNERS}
     held = [min(places, key=lambda name: float(np.linalg.norm(places[name] - h))) for h in hands]
     return SheetPlacement(bare.size, bare.origin, bare.warp, bare.weft, tuple(held))

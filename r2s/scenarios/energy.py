@@ -12,7 +12,7 @@ from r2s.environment.drag import drag_on_vertices
 from r2s.environment.scene import Control
 from r2s.materials.fabric import Fabric
 from r2s.materials.wrinkling import membrane_on_samples
-from r2s.mesh.elements import strains, vertex_masses
+from r2s.mesh.elements import vertex_masses
 from r2s.mesh.mesh import Mesh
 from r2s.mesh.strain_samples import on_samples
 from r2s.scenarios.scenario import Scenario, SheetSolver, as_cut, begin, stepped
@@ -24,14 +24,12 @@ class EnergyBalance(eqx.Module):
     """A motion with its forces [N], and its energies at every frame, [J].
 
     - `x`: positions, [m].
-    - `forces`: with which the grippers hold each vertex, the mean since the frame before.
-    - `last`: the same at the frame itself, at the end of the last step.
+    - `forces`: of the grippers on each held vertex, mean since the frame before. `last`: the same
+      at the frame itself, at the end of the last step.
     - `stored`: in membrane and bending; `kinetic`; `potential`: of gravity, above z = 0.
-    - `grippers`, `air`: the work that they have done on the sheet since the first frame. That of
-      still air is negative.
-    - `dissipated`: what has gone since then, by internal and mass damping, friction, and the
-      formula of the time steps: the work less what the sheet holds more. Energy of self-contact
-      and in the table's contact counts as gone until it comes back.
+    - `grippers`, `air`: their work on the sheet since the first frame.
+    - `dissipated`: that work less what the sheet holds more: damping, friction, and the error of
+      the time steps. Energy of contacts counts as dissipated until it comes back.
     """
 
     x: Float[Array, "frame vertex 3"]
@@ -57,10 +55,8 @@ def energy_balance(
 ) -> EnergyBalance:
     """The motion of a fabric with forces and energies, from the first frame on.
 
-    The arguments are those of `rollout`.
-
-    The grippers' work is the mean of their forces in two steps, times the displacement (the cloth
-    has forces at the ends of its steps); the air's is that in the middle of the step.
+    The arguments are those of `rollout`. The grippers' work is the mean of their forces at both
+    ends of a step times the displacement; the air's is that in the middle of the step.
     """
     solver, substeps = stepped(scenario, max_step, solver)
     fabric = as_cut(scenario, fabric)
@@ -101,10 +97,10 @@ def energy_balance(
 
 
 def clamp_force(scenario: Scenario, found: EnergyBalance) -> Float[Array, "frame 3"]:
-    """The force [N] on the pulled clamp of a stretching at its frames: what a load cell shows then.
+    """The force [N] on the pulled clamp of a stretching at its frames, as a load cell shows it.
 
-    Not the mean since the frame before, which lags by half a frame: for that a damping of half a
-    frame more would make up. The clamp is the held vertices at the end of the warp.
+    Not the mean since the frame before, which lags by half a frame. The clamp is the held vertices
+    at the end of the warp.
     """
     mesh, held = scenario.scene.mesh, scenario.scene.held
     pulled = mesh.rest[held, 0] > jnp.max(mesh.rest[:, 0]) / 2
@@ -114,7 +110,7 @@ def clamp_force(scenario: Scenario, found: EnergyBalance) -> Float[Array, "frame
 def stored_energy(mesh: Mesh, fabric: Fabric, x: Float[Array, "vertex 3"]) -> Float[Array, ""]:
     """The energy [J] in the strains and curvatures of a sheet at positions [m].
 
-    Of laws by table: that of a sheet which has had the stiffness it has there all along.
+    Of laws by table: that of the stiffness it has there.
     """
     strain = mesh.samples.strains(x)
     stretched = membrane_on_samples(mesh.samples, fabric.membrane, fabric.bending, strain)
@@ -132,14 +128,3 @@ def _drag(scenario: Scenario, state: Any, after: Any, control: Control):
     scene = scenario.scene
     x, v = (state.x + after.x) / 2, (state.v + after.v) / 2
     return drag_on_vertices(scene.mesh, scene.air, scene.fan, x, v, control.wind)
-
-
-def stretch(mesh: Mesh, x: Float[Array, "frame vertex 3"]) -> Float[Array, "frame sample"]:
-    """The greatest principal stretch less one [-] of every strain sample at positions [m]."""
-
-    def of_frame(x):
-        e11, e22, shear = jnp.moveaxis(strains(mesh, x), -1, 0)
-        mean, half = (e11 + e22) / 2, (e11 - e22) / 2
-        return jnp.sqrt(1 + 2 * (mean + jnp.sqrt(half**2 + shear**2 / 4))) - 1
-
-    return jax.vmap(of_frame)(x)

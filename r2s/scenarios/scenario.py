@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import equinox as eqx
 import jax
@@ -38,7 +38,6 @@ BAR = (("origin", "warp"),)  # the side that a swing holds
 CLAMPED = {"stretching": CLAMPS, "swing": BAR}  # sides that are held in a scenario
 
 
-@runtime_checkable
 class SheetSolver(Solver, Protocol):
     """A solver of a held sheet: Cloth, ExplicitCloth and Sheet."""
 
@@ -46,10 +45,7 @@ class SheetSolver(Solver, Protocol):
         """The state at positions [m], velocities [m/s] and accelerations [m/s^2]; None: zero."""
 
     def step_with_forces(self, fabric: Fabric, state: Any, control: Control) -> tuple[Any, Array]:
-        """The state `dt` later, and the mean forces [N] of the grippers on the held vertices.
-
-        They have the weight and the inertia of these vertices in them.
-        """
+        """The state `dt` later, and the mean forces [N] on the held vertices, weight included."""
         ...
 
 
@@ -158,8 +154,8 @@ def from_placement(
     - `self_contact`: the sheet does not pass through itself.
 
     Before the first frame the grippers go from the sheet's corners to where the path begins; a
-    sheet that hangs, its plane not horizontal, also comes to rest, braked by `BRAKE` for
-    `SETTLING`. Raises `ValueError` when the frames are not evenly spaced.
+    sheet that hangs also comes to rest, braked by `BRAKE` for `SETTLING`. Raises `ValueError` when
+    the frames are not evenly spaced.
     """
     times = np.asarray(times)
     interval = _interval(times)
@@ -248,11 +244,7 @@ def steps_between(
     path_times: Float[np.ndarray, " knot"],
 ) -> int:
     """How many steps to make in an interval [s]: the least such that none is above `MAX_STEP`, and
-    that no gripper goes farther in one than the shortest edge of the mesh is long.
-
-    The fabric does not limit the step: the formula is stable for any stiffness, and what is faster
-    than the step is damped.
-    """
+    no gripper goes farther in one than the shortest edge. The formula is stable for any fabric."""
     corners = np.asarray(mesh.rest)[np.asarray(mesh.faces)]
     edge = np.min(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1))
     moved = np.linalg.norm(np.diff(path, axis=0), axis=-1)
@@ -265,8 +257,7 @@ def steps_between(
 def from_recording(recording: Recording, shape: tuple[int, int] = (9, 9)) -> Scenario:
     """The scenario of a recording: its sheet, table, gripper path, wind and frame times.
 
-    In a recording of "stretching" the sides between the held corners are clamped, in one of a
-    "swing" the side along the bar. A stretching may be of a sheet that is cut at an angle.
+    A "stretching" has the sides between the held corners clamped, a "swing" the one along the bar.
     """
     info = recording.info
     scenario = from_placement(
@@ -326,10 +317,9 @@ def rollout(
 ) -> Trajectory:
     """How a fabric moves in a scenario: positions [m] at its frames, or at the first of them.
 
-    By the cloth, in steps of equal size that fill the time between frames: the scenario's, or as
-    many as it takes that none is above `max_step` [s]. Or by another `solver` of the same scene,
-    whose own step divides that time, see `r2s.scenarios.resolution.material_points`. For `frames`
-    see `r2s.simulate`.
+    By the cloth, in the scenario's steps, or in so many that none is above `max_step` [s]. Or by
+    another `solver` of the same scene, whose step divides the time between frames, such as
+    `r2s.scenarios.material_points`. For `frames` see `r2s.simulate`.
     """
     solver, substeps = stepped(scenario, max_step, solver)
     skipped = scenario.lead_in - 1
@@ -383,7 +373,7 @@ def begin(solver: SheetSolver, scenario: Scenario) -> Any:
 
 
 class BrakedState(eqx.Module):
-    """- `inner`: of the solver. - `count`: of the steps made."""
+    """The state of a solver (`inner`) after `count` steps."""
 
     inner: Any
     count: Array
@@ -405,13 +395,7 @@ class BrakedState(eqx.Module):
 
 
 class Braked(eqx.Module):
-    """A solver whose first steps have more mass damping, so that a sheet comes to rest.
-
-    - `solver`: any, of a sheet.
-    - `brake`: that damping, beside the fabric's, [1/s].
-    - `steps`: how many are braked.
-    - `dt`: step of the solver, [s].
-    """
+    """A solver of a sheet whose first `steps` have more mass damping, `brake` [1/s]."""
 
     solver: SheetSolver
     brake: Float[Array, ""]
@@ -419,7 +403,7 @@ class Braked(eqx.Module):
     dt: float = eqx.field(static=True)
 
     def check(self, fabric: Fabric) -> None:
-        """Raises `ValueError` where the steps of the solver are too long for a fabric."""
+        """Raises `ValueError` where the steps are too long for a fabric."""
         self.solver.check(fabric)
 
     def fits(self, fabric: Fabric) -> Bool[Array, ""]:

@@ -19,12 +19,7 @@ from r2s.compilation import compile_once
 from r2s.materials.fabric import Fabric
 from r2s.mesh.surface import nearest, sample
 from r2s.recordings.cameras import Camera
-from r2s.recordings.recording import (
-    Recording,
-    RecordingInfo,
-    corner,
-    make_recording,
-)
+from r2s.recordings.recording import Recording, RecordingInfo, corner, make_recording
 from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
 from r2s.scenarios.scenario import Scenario, SheetSolver, rollout
 from r2s.scenarios.standard import SIDE, Experiment, Route
@@ -101,21 +96,18 @@ def record(
     motion: Trajectory | None = None,
     key: PRNGKeyArray,
 ) -> Recording:
-    """Record a simulated experiment with a fabric.
+    """Record a simulated experiment with a fabric; the same `key` gives the same recording.
 
     - `name`, `trial`: of the fabric and of the repetition.
     - `seen`: cameras and their errors; None: those of `sensing`.
-    - `shape`: vertices along warp and weft. `max_step`: longest time step, [s]. A finer mesh and
-      shorter steps than the estimators' make a recording that is not their own model's.
+    - `shape`: vertices along warp and weft. `max_step`: longest time step, [s].
     - `self_contact`: whether the sheet touches itself.
     - `solver`: makes another solver than the cloth, such as `r2s.scenarios.material_points`.
-    - `motion`: that of these arguments, where it is known already; None: it is simulated here. A
-      stretching is simulated in any case, with its forces.
-    - `key`: the same one gives the same recording.
+    - `motion`: that of these arguments, if known; a stretching, which also has markers and the
+      force on the pulled clamp, is simulated in any case.
 
-    The recording of a stretching has markers and the force on the pulled clamp. Raises
-    `RuntimeError` that says why when the simulation diverges, and `ValueError` for a motion of
-    another shape.
+    Raises `RuntimeError` that says why when the simulation diverges, and `ValueError` for a motion
+    of another shape.
     """
     scenario = experiment.scenario(shape, self_contact)
     made = None if solver is None else solver(scenario, fabric)
@@ -148,12 +140,10 @@ def seen_of(
     *,
     key: PRNGKeyArray,
 ) -> Recording:
-    """What cameras record of a motion that is known, whoever made it.
+    """What cameras record of a known motion; arguments as in `record`.
 
     - `x`: positions of the vertices of `scenario`, which is `experiment` on a mesh, [m].
     - `measured`: what else there is, see `r2s.recordings.recording.make_recording`.
-
-    The others are those of `record`.
     """
     errors = f"camera noise {1e3 * seen.noise:g} mm, {seen.outliers:.0%} outliers"
     errors += f", {seen.dropped:.0%} dropped" if seen.dropped else ""
@@ -231,9 +221,7 @@ def _clouds(x, scenario: Scenario, seen: Sensing, key) -> list[np.ndarray]:
 
 @eqx.filter_jit
 def _observe(x, faces, resolution: int, lowest, seen: Sensing, keys):
-    return jax.vmap(
-        lambda x, key: _observe_frame(x, faces, resolution, lowest, seen, key),
-    )(x, keys)
+    return jax.vmap(lambda x, key: _observe_frame(x, faces, resolution, lowest, seen, key))(x, keys)
 
 
 def _observe_frame(x: Float[Array, "vertex 3"], faces, resolution: int, lowest, seen: Sensing, key):
