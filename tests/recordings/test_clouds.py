@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from r2s.recordings.clouds import find_frames, read_cloud, voxel_means
+from r2s.recordings.clouds import find_frames, read_cloud
 
 POINTS = arrays(
     np.float32,
@@ -91,12 +91,6 @@ def test_trimesh_and_pypcd4_write_what_we_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd"), points)
 
 
-def test_an_upper_case_suffix_and_integers_are_fine(tmp_path: Path) -> None:
-    with open(tmp_path / "A.NPY", "wb") as file:
-        np.save(file, np.arange(6).reshape(2, 3))
-    np.testing.assert_array_equal(read_cloud(tmp_path / "A.NPY"), [[0, 1, 2], [3, 4, 5]])
-
-
 @pytest.mark.parametrize("kind", FORMATS)
 def test_nan_is_counted_and_located(tmp_path: Path, kind: str) -> None:
     points = np.ones((5, 3), np.float32)
@@ -143,12 +137,6 @@ def test_junk_is_refused(tmp_path: Path, suffix: str, junk: bytes) -> None:
     path.write_bytes(junk)
     with pytest.raises(ValueError, match=f"cloud.{suffix}: cannot be read as {suffix}"):
         read_cloud(path)
-
-
-def test_junk_as_obj_has_no_vertices(tmp_path: Path) -> None:
-    (tmp_path / "cloud.obj").write_text("garbage\n")
-    with pytest.raises(ValueError, match="cloud.obj: the cloud is empty"):
-        read_cloud(tmp_path / "cloud.obj")
 
 
 @pytest.mark.parametrize("shape", [(6,), (3, 2), (2, 3, 3), (3, 4)])
@@ -209,18 +197,6 @@ def test_frames_are_sorted_by_number(tmp_path: Path) -> None:
     assert names == ["t1_frame_8.ply", "t1_frame_9.ply", "t1_frame_10.ply"]
 
 
-@given(start=st.integers(0, 5), count=st.integers(3, 30), data=st.data())
-@some_example
-def test_any_gap_is_named(
-    tmp_path_factory: pytest.TempPathFactory, start: int, count: int, data: st.DataObject
-) -> None:
-    folder = tmp_path_factory.mktemp("frames")
-    lost = data.draw(st.integers(start + 1, start + count - 2))
-    touch(folder, *(f"{i:03d}.npy" for i in range(start, start + count) if i != lost))
-    with pytest.raises(ValueError, match=f"frame {lost} is missing"):
-        find_frames(folder)
-
-
 def test_the_first_frame_may_be_required(tmp_path: Path) -> None:
     touch(tmp_path, "001.npy", "002.npy")
     assert len(find_frames(tmp_path)) == len(find_frames(tmp_path, first=1)) == 2
@@ -241,9 +217,3 @@ def test_bad_folders_are_refused(tmp_path: Path) -> None:
     touch(tmp_path, "001.ply")
     with pytest.raises(ValueError, match=r"mixed formats: \.npy, \.ply"):
         find_frames(tmp_path)
-
-
-def test_voxel_means_average_per_cell() -> None:
-    points = np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [-0.1, 0.1, 0.1], [1.2, 0.0, 0.0]])
-    means = voxel_means(points, 1.0)
-    np.testing.assert_allclose(means, [[-0.1, 0.1, 0.1], [0.2, 0.1, 0.1], [1.2, 0.0, 0.0]])

@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ pytest.importorskip("cv2")
 from hypothesis import HealthCheck, given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 from rgbd_scene import INFO, PATH, TIMES, write  # noqa: E402
+from test_clouds import FORMATS, write_cloud  # noqa: E402
 
 from r2s.recordings.clouds import read_cloud  # noqa: E402
 from r2s.recordings.force_log import read_force_log  # noqa: E402
@@ -71,32 +73,7 @@ def test_a_damaged_folder_of_images(whole: Path, name: str, damage: Damage) -> N
         file.write_bytes(before)
 
 
-CLOUD = np.random.default_rng(0).uniform(-1, 1, (20, 3))
-
-
-def ply(path: Path) -> None:
-    lines = "".join(f"{x:.4f} {y:.4f} {z:.4f}\n" for x, y, z in CLOUD)
-    axes = "".join(f"property float {axis}\n" for axis in "xyz")
-    path.write_text(f"ply\nformat ascii 1.0\nelement vertex 20\n{axes}end_header\n{lines}")
-
-
-def pcd(path: Path) -> None:
-    pytest.importorskip("pypcd4")
-    fields = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 20\nHEIGHT 1\n"
-    head = f"VERSION 0.7\n{fields}VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 20\nDATA binary\n"
-    path.write_bytes(head.encode() + CLOUD.astype("<f4").tobytes())
-
-
-def npy(path: Path) -> None:
-    np.save(path, CLOUD)
-
-
-def xyz(path: Path) -> None:
-    np.savetxt(path, CLOUD)
-
-
-def obj(path: Path) -> None:
-    path.write_text("".join(f"v {x:.4f} {y:.4f} {z:.4f}\n" for x, y, z in CLOUD))
+CLOUD = np.random.default_rng(0).uniform(-1, 1, (20, 3)).astype(np.float32)
 
 
 def recording(path: Path) -> None:
@@ -113,16 +90,11 @@ def manifest(path: Path) -> None:
     path.write_text(json.dumps(value))
 
 
-FILES = {
-    "cloud.ply": (ply, read_cloud),
-    "cloud.pcd": (pcd, read_cloud),
-    "cloud.npy": (npy, read_cloud),
-    "cloud.xyz": (xyz, read_cloud),
-    "cloud.obj": (obj, read_cloud),
+FILES: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "recording.npz": (recording, load),
     "log.csv": (log, read_force_log),
     "manifest.json": (manifest, read_manifest),
-}
+} | {kind: (partial(write_cloud, points=CLOUD), read_cloud) for kind in FORMATS}
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -131,10 +103,10 @@ FILES = {
 @pytest.mark.filterwarnings("ignore")
 def test_a_damaged_file(tmp_path: Path, name: str, damage: Damage) -> None:
     write_it, read_it = FILES[name]
-    write_it(tmp_path / name)
-    read_it(tmp_path / name)
-    (tmp_path / name).write_bytes(damage((tmp_path / name).read_bytes()))
-    read_or_named(lambda: read_it(tmp_path / name), tmp_path / name)
+    file = write_it(tmp_path / name) or tmp_path / name
+    read_it(file)
+    file.write_bytes(damage(file.read_bytes()))
+    read_or_named(lambda: read_it(file), file)
 
 
 def test_a_file_that_is_a_folder(whole: Path, tmp_path: Path) -> None:

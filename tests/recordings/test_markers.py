@@ -1,6 +1,5 @@
 """Markers on rendered videos of a stretch: kept, exact, lost and found; planes; broken input."""
 
-import time
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -99,13 +98,9 @@ TRUTH = np.stack([in_image(stretched(strain)) for strain in strains()])
 
 
 def test_all_markers_are_kept_to_a_fifth_of_a_pixel(pull: list[np.ndarray]) -> None:
-    started = time.process_time()
     tracks = track(pull)
-    spent = time.process_time() - started
     assert tracks.seen.all() and tracks.pixels.shape == (60, 81, 2)
     assert error(tracks, TRUTH) < 0.2
-    assert spent < 20  # 60 frames of 1280 x 720
-    print(f"\n81 of 81, rms {error(tracks, TRUTH):.3f} px, {spent:.1f} s")
 
 
 def test_the_strain_comes_back_in_metres(pull: list[np.ndarray]) -> None:

@@ -1,6 +1,5 @@
 """Gripper paths: smooth, at rest at both ends, within their limits."""
 
-import inspect
 import math
 
 import jax.random as jr
@@ -72,15 +71,12 @@ def test_a_fling_comes_back_and_a_shake_moves_one_gripper():
 
 @pytest.mark.parametrize("name", SIX)
 def test_drawn_numbers_keep_their_limits_and_their_seed(name):
-    first, second = jr.split(jr.key(1))
-    estimation = standard.draw(name, standard.ESTIMATION, key=first)
-    evaluation = standard.draw(name, standard.EVALUATION, key=second)
-    assert (len(estimation), len(evaluation)) == (40, 120)
-    assert estimation == standard.draw(name, standard.ESTIMATION, key=first)
-    limits = standard.LIMITS[name]
-    for numbers in estimation + evaluation:
-        assert all(low <= numbers[number] <= high for number, (low, high) in limits.items())
-    assert len({tuple(numbers.values()) for numbers in estimation + evaluation}) == 160
+    drawn = standard.draw(name, standard.EVALUATION, key=jr.key(1))
+    assert drawn == standard.draw(name, standard.EVALUATION, key=jr.key(1))
+    for numbers in drawn:
+        limits = standard.LIMITS[name].items()
+        assert all(low <= numbers[number] <= high for number, (low, high) in limits)
+    assert len({tuple(numbers.values()) for numbers in drawn}) == standard.EVALUATION
 
 
 def test_what_does_not_fit_is_refused():
@@ -123,20 +119,6 @@ WRONG: dict[str, dict[str, tuple[st.SearchStrategy[float], str]]] = {
         "still": (NEGATIVE, "s"),
     },
 }
-PATHS = {
-    "lifting": standard.lift_path,
-    "wind": standard.hold_path,
-    "stretching": standard.pull_path,
-    "folding": standard.fold_path,
-    "fling": standard.fling_path,
-    "shaking": standard.shake_path,
-}
-
-
-@pytest.mark.parametrize("name", SIX)
-def test_every_number_of_a_path_is_checked(name):
-    numbers = set(list(inspect.signature(PATHS[name]).parameters)[2:])
-    assert numbers <= WRONG[name].keys()
 
 
 @pytest.mark.parametrize(
@@ -151,17 +133,6 @@ def test_numbers_that_make_no_sense_are_refused(name, number, data):
         SIX[name](**{number: value})
     text = str(error.value)
     assert text.startswith(f"{number} must") and f"[{unit}], found {value}" in text
-
-
-@pytest.mark.parametrize("name", SIX)
-@given(data=st.data())
-def test_any_numbers_within_the_limits_give_a_path_at_rest_at_both_ends(name, data):
-    limits = standard.LIMITS[name]
-    numbers = {key: data.draw(st.floats(*ends)) for key, ends in limits.items()}
-    times, path = SIX[name](**numbers).route
-    assert np.isfinite(path).all() and (np.diff(times) > 0).all()
-    velocity = np.diff(path, axis=0) / np.diff(times)[:, None, None]
-    assert np.abs(velocity[[0, -1]]).max() < 20 / 120
 
 
 @pytest.mark.parametrize(

@@ -97,12 +97,6 @@ def test_the_table_is_that_of_the_experiment():
         np.testing.assert_allclose([ratio for ratio, _ in table], cells, rtol=0.01)
 
 
-def test_a_recording_of_a_lift_or_a_fold_is_one():
-    knit = presets.grey_interlock()
-    for name, motion in (("lift", "lifting"), ("fold", "folding")):
-        assert mesh_error(knit, SIZE, (9, 9), name) == mesh_error(knit, SIZE, (9, 9), motion)
-
-
 def test_a_taut_sheet_needs_no_finer_mesh_and_has_no_figure():
     knit = presets.grey_interlock()
     assert np.isnan(mesh_error(knit, SIZE, (9, 9), "stretching"))
