@@ -140,13 +140,10 @@ def encode_png(image: Num[np.ndarray, "down across *channel"]) -> bytes:
 
 
 def write_depth(path: Path, depth: Float[np.ndarray, "down across"], scale: float) -> None:
-    """Write a depth image [m] in units of `scale` [m]: NPY, or 16-bit PNG.
+    """Write a depth image [m] as a 16-bit PNG in units of `scale` [m].
 
     Raises ValueError for a depth that does not fit into 16 bits.
     """
-    if path.suffix == ".npy":
-        np.save(path, (depth / scale).astype(np.float32))
-        return
     units = np.rint(depth / scale)
     if units.max() > DEEPEST:
         raise ValueError(f"{depth.max():g} m does not fit into 16 bits of {scale:g} m")

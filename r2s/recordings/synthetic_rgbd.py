@@ -1,6 +1,5 @@
 """Synthetic RGB-D recordings: a moving mesh as folders of images, with the flaws of real ones."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +14,7 @@ from r2s.recordings.images import encode_png, write_depth
 from r2s.recordings.rgbd import Rig, write_rig
 from r2s.recordings.views import render
 
-TABLE_CELLS = 8  # along each side, so that few of them reach behind a camera
-FABRIC_COLOUR, TABLE_COLOUR = (60, 60, 200), (120, 140, 150)  # blue, green, red
+TABLE, TABLE_CELLS = 2.0, 8  # [m] and cells along each side of the table
 STEP = 0.02  # [m]: a jump in depth that counts as an edge
 
 
@@ -51,63 +49,38 @@ def write_rgbd(
     faces: Int[np.ndarray, "face 3"],
     times: Float[np.ndarray, " frame"],
     *,
-    table: tuple[float, float] | None = (0.0, 2.0),
     flaws: Flaws = TYPICAL,
     seed: int = 0,
-    delays: Mapping[str, float] | None = None,
-    colour: bool = True,
-    suffix: str = ".png",
 ) -> None:
-    """Write what the cameras of a rig see of a moving mesh [m], with cameras.json.
+    """Write what the cameras of a rig see of a moving mesh [m] on a table at z = 0, at `times` [s].
 
-    `table`: its height and its side [m], around the origin; None: there is none. `times` [s];
-    `delays` [s] are added to those of the cameras that they name, whose pictures stay the same.
-    `suffix` of the depth images: .png or .npy. Raises ValueError when a camera never sees the
-    mesh, OSError naming the file that cannot be written.
+    With cameras.json, without colour. Raises ValueError when a camera does not see the mesh,
+    OSError naming the file that cannot be written.
     """
-    folder = Path(folder)
+    folder, faces = Path(folder), np.asarray(faces)
     folder.mkdir(parents=True, exist_ok=True)
     write_rig(folder, rig)
+    # in cells, so that few of them reach behind a camera
+    table = rectangle((TABLE, TABLE), (TABLE_CELLS + 1, TABLE_CELLS + 1))
+    plane = np.pad(np.asarray(table.rest) - TABLE / 2, ((0, 0), (0, 1)))
+    both = np.concatenate([faces, x.shape[1] + np.asarray(table.faces)])
     for order, (name, camera) in enumerate(rig.cameras.items()):
-        for kind in ("depth", "masks", "colour")[: 3 if colour else 2]:
+        for kind in ("depth", "masks"):
             (folder / name / kind).mkdir(parents=True, exist_ok=True)
-        late = np.asarray(times) + (delays or {}).get(name, 0.0)
-        rows = [f"{frame},{time:.6f}\n" for frame, time in enumerate(late)]
+        rows = [f"{frame},{time:.6f}\n" for frame, time in enumerate(times)]
         write_text(folder / name / "times.csv", "frame,time\n" + "".join(rows))
         for frame, positions in enumerate(x):
             generator = np.random.default_rng([seed, order, frame])
-            mesh = _with_table(np.asarray(positions), np.asarray(faces), table)
+            mesh = np.concatenate([np.asarray(positions), plane]), both
             depth, which = render(camera, *mesh)
             mask = (which >= 0) & (which < len(faces))
             if not mask.any() and not camera.may_miss:
                 raise ValueError(f"camera {name!r} does not see the mesh in frame {frame}")
-            seen = flawed_depth(camera, depth, which, *mesh, flaws, generator)
             file = f"{frame:03d}.png"
-            write_depth(folder / name / "depth" / f"{frame:03d}{suffix}", seen, camera.depth_scale)
+            seen = flawed_depth(camera, depth, which, *mesh, flaws, generator)
+            write_depth(folder / name / "depth" / file, seen, camera.depth_scale)
             marked = flawed_mask(mask, flaws.mask_error, generator)
             write_bytes(folder / name / "masks" / file, encode_png(marked.astype(np.uint8) * 255))
-            if colour:
-                picture = _picture(depth, mask)
-                write_bytes(folder / name / "colour" / file, encode_png(picture))
-
-
-def _with_table(
-    x: np.ndarray, faces: np.ndarray, table: tuple[float, float] | None
-) -> tuple[np.ndarray, np.ndarray]:
-    if table is None:
-        return x, faces
-    height, side = table
-    plane = rectangle((side, side), (TABLE_CELLS + 1, TABLE_CELLS + 1))
-    corners = np.pad(np.asarray(plane.rest) - side / 2, ((0, 0), (0, 1)), constant_values=height)
-    return np.concatenate([x, corners]), np.concatenate([faces, len(x) + np.asarray(plane.faces)])
-
-
-def _picture(depth: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """A picture shaded by how steeply depth changes."""
-    down, across = np.gradient(depth)
-    shade = 1 / (1 + 200 * np.hypot(down, across))
-    colours = np.where(mask[..., None], FABRIC_COLOUR, TABLE_COLOUR) * (depth > 0)[..., None]
-    return (colours * (0.4 + 0.6 * shade[..., None])).astype(np.uint8)
 
 
 def flawed_depth(

@@ -17,7 +17,6 @@ from r2s.materials.fold_length import fold_length
 from r2s.scenarios.scenario import Scenario
 from r2s.scenarios.standard import SIDE
 from r2s.solvers.explicit.cloth import ExplicitCloth
-from r2s.solvers.explicit.viscosity import RELAXATION
 from r2s.solvers.mpm.grid import Grid
 from r2s.solvers.mpm.sheet import Sheet, longest_edge, stable_step
 
@@ -139,14 +138,12 @@ def explicit_cloth(
     scenario: Scenario,
     fabric: Fabric,
     membrane_damping: float | None = None,
-    relaxation: float = RELAXATION,
 ) -> ExplicitCloth:
     """A solver in explicit steps for a scenario: `rollout(scenario, fabric, solver=...)`.
 
-    `fabric` is the stiffest that it will be used for, or a batch of all of them. The membrane's
-    damping time and relaxation [s] are as in `r2s.ExplicitCloth.make`. The steps, of at most
-    `MAX_EXPLICIT_STEP`, fill the time between frames. Raises `ValueError` for a scenario with
-    self-contact.
+    `fabric` is the stiffest that it will be used for, or a batch of all of them; `membrane_damping`
+    [s] as in `r2s.ExplicitCloth.make`. Steps of at most `MAX_EXPLICIT_STEP` fill the time between
+    frames. Raises `ValueError` for a scenario with self-contact.
     """
     steps = max(scenario.substeps, math.ceil(scenario.interval / MAX_EXPLICIT_STEP - 1e-9))
     return ExplicitCloth.make(
@@ -154,7 +151,6 @@ def explicit_cloth(
         scenario.interval / steps,
         fabric,
         membrane_damping,
-        relaxation,
         self_contact=scenario.self_contact,
     )
 

@@ -103,7 +103,10 @@ BROKEN: dict[str, tuple[Break, str]] = {
     "missing depth": (removed("left/depth/001.png"), "left/depth: frame 1 is missing.*restore"),
     "missing last depth": (removed("left/depth/003.png"), "left/depth: frame 3 .*export it again"),
     "missing mask": (removed("right/masks/003.png"), "right/masks: frame 3 .*export it again"),
-    "missing colour": (removed("right/colour/000.png"), "right/colour: frame 0 is missing"),
+    "missing colour": (
+        lambda folder: ((folder / "right/colour").mkdir(), text("right/colour/1.png", "")(folder)),
+        "right/colour: frame 0 is missing",
+    ),
     "duplicate frame": (duplicate, "left/depth: frame 1 is there twice: .*remove one"),
     # images
     "truncated PNG": (cut("left/depth/002.png"), "left/depth/002.png: truncated PNG.*again"),

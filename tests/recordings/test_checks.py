@@ -70,7 +70,7 @@ def rendered(tmp_path_factory) -> Callable[[float], Path]:
             factors = 1 + (longer - 1) * np.arange(len(TIMES)) / len(TIMES)
             pairs = zip(height(TIMES), factors, strict=True)
             x = np.stack([positions(*pair) for pair in pairs])
-            write_rgbd(made[longer], RIG, x, np.asarray(SHEET.faces), TIMES, colour=False)
+            write_rgbd(made[longer], RIG, x, np.asarray(SHEET.faces), TIMES)
         return made[longer]
 
     return folder

@@ -56,7 +56,7 @@ def read_or_named(read: Callable[[], Any], *names: Path) -> None:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("whole") / "wave"
-    write(folder, colour=False)
+    write(folder)
     return folder
 
 
@@ -90,7 +90,7 @@ def manifest(path: Path) -> None:
     path.write_text(json.dumps(value))
 
 
-FILES: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
+FILES: dict[str, Any] = {
     "recording.npz": (recording, load),
     "log.csv": (log, read_force_log),
     "manifest.json": (manifest, read_manifest),
