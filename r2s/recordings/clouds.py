@@ -15,15 +15,11 @@ from r2s._util.extras import require
 def find_numbered(
     folder: Path | str, suffixes: Collection[str], first: int | None = None
 ) -> dict[int, Path]:
-    """The files of a folder with a number in their names (`000.npy`, `frame_12.npy`), in order.
+    """The files of a folder by the last number in their names (`000.npy`, `frame_12.npy`).
 
-    Other files and hidden files are passed over.
-
-    - `suffixes`: the formats that are looked for, such as ".npy"; all files must have one of them.
-    - `first`: the number that the first file must have; None: any.
-
-    The number is the last group of digits in the name. Raises FileNotFoundError (no such folder,
-    no such file) or ValueError (mixed formats, two files of one number, a number is missing).
+    All must have one of the `suffixes`; others are skipped. `first`: the number that the first file
+    must have. Raises FileNotFoundError (no such folder, no such file) or ValueError (mixed formats,
+    two files of one number, a number is missing).
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -272,8 +268,7 @@ def outliers(
 ) -> Bool[np.ndarray, " point"]:
     """Which points are much farther from their nearest neighbours than points are on average.
 
-    None is where there are no more points than `neighbours`. Points that lie where others do
-    count as neighbours; thin the cloud first.
+    None where there are no more points than `neighbours`; thin the cloud first.
     """
     if neighbours == 0 or len(points) <= neighbours:
         return np.zeros(len(points), bool)

@@ -45,9 +45,8 @@ class Download:
 class Dataset:
     """A data set that somebody published.
 
-    - `how`: how to get what `downloads` lacks, and how it comes into the form of `layout`.
+    - `how`: to get what `downloads` (path in the folder -> file) lacks.
     - `layout`: pattern of paths in the folder -> what is there, of what is fetched by hand.
-    - `downloads`: path in the folder -> the file.
     - `note`: what was checked about it, and what was not.
     """
 
@@ -113,12 +112,11 @@ def known_bar() -> Bar:
 
 
 def fetch(name: str, folder: Path | str, manifests: Path | str | None = None) -> Iterator[str]:
-    """Bring a data set into a folder, as far as that can be done; says what it does, line by line.
+    """Bring a data set into a folder, as far as possible; says what it does, line by line.
 
-    Files that are there and are what was published are left alone. What is corrupt is never
-    replaced unasked: the error says which file to delete. Raises ValueError or OSError, after all
-    that could be done was done: an unknown name, files that are corrupt, that the server does not
-    have, or that must be fetched by hand; the error then says how, and where to put them.
+    Corrupt files are never replaced: the error says which to delete. Raises ValueError or OSError,
+    after all else was done: an unknown name, files that are corrupt, missing on the server, or that
+    must be fetched by hand; the error then says how, and where to put them.
     """
     known = known_datasets(manifests)
     if name not in known:
@@ -141,7 +139,8 @@ def _download_all(data: Dataset, folder: Path) -> Iterator[str]:
             yield _fetch_file(folder, path, download)
         except (ValueError, OSError) as error:
             problems.append(str(error))
-    _raise_all(problems)
+    if problems:
+        raise ValueError("; ".join(problems))
 
 
 def _fetch_file(folder: Path, path: str, download: Download) -> str:
@@ -215,7 +214,8 @@ def _check_recordings(data: Manifest, folder: Path) -> Iterator[str]:
             f"{data.name}: cannot be downloaded automatically ({data.licence}). Get it from "
             f"{source} and put into {folder}: {shown or 'the folders of the recordings'}"
         )
-    _raise_all(problems)
+    if problems:
+        raise ValueError("; ".join(problems))
 
 
 def _hash(file: Path) -> str:
@@ -224,8 +224,3 @@ def _hash(file: Path) -> str:
         return hash_values(read_values(file))
     except ValueError:
         return ""
-
-
-def _raise_all(problems: list[str]) -> None:
-    if problems:
-        raise ValueError("; ".join(problems))

@@ -28,14 +28,12 @@ class Columns(NamedTuple):
 
 
 def read_columns(path: Path | str, columns: Mapping[str, Mapping[str, float]]) -> Columns:
-    """Read some columns of a CSV with a header, its cells parted by commas, semicolons or tabs.
+    """Read some columns of a CSV with a header, separated by commas, semicolons or tabs.
 
-    `columns` has of each its name and the units that it may be in. The header says which, as in
-    "time_s", "Force [N]" or "force (mN)". Other columns are passed over, and so are blank lines and
-    lines that start with #.
+    `columns`: their names and possible units. The header says which, as in "time_s", "Force [N]" or
+    "force (mN)". Other columns, blank lines and lines that start with # are skipped.
 
-    Raises FileNotFoundError, or a ValueError that names the file and the line: no such column or
-    no unit, values that are no finite numbers, fewer than two samples.
+    Raises FileNotFoundError, or a ValueError that names the file and the line.
     """
     path = Path(path)
     lines = read_lines(path)
@@ -63,10 +61,9 @@ def header_of(path: Path | str) -> list[str]:
 
 
 def read_lines(path: Path) -> list[tuple[int, list[str]]]:
-    """The lines of a CSV that hold something, with their numbers, as cells.
+    """The cells of a CSV's lines with their numbers, but for blank ones and comments (#).
 
-    Cells are parted by commas, semicolons or tabs; lines that begin with # are passed over. Raises
-    FileNotFoundError, or a ValueError that names the file.
+    Raises FileNotFoundError, or a ValueError that names the file.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -143,14 +140,10 @@ class ForceLog:
 
 
 def read_force_log(path: Path | str, time: str = "time", force: str = "force") -> ForceLog:
-    """Read a CSV with a header, its columns parted by commas, semicolons or tabs.
+    """Read the columns `time` and `force` of a CSV, as `read_columns`.
 
-    `time` and `force` name the columns; the header says their units too, as in "time_s",
-    "Force [N]" or "force (mN)": seconds (s, ms, us), newtons (N, mN, cN, kN, gf, kgf). Other
-    columns are passed over, and so are blank lines and lines that start with #.
-
-    Raises FileNotFoundError, or a ValueError that names the file and the line: no such column or
-    no unit, values that are no finite numbers, times that do not increase, fewer than two samples.
+    Their units: seconds (s, ms, us), newtons (N, mN, cN, kN, gf, kgf). Raises also ValueError for
+    times that do not increase.
     """
     path = Path(path)
     values, lines = read_columns(path, {time: SECONDS, force: NEWTONS})
@@ -205,12 +198,11 @@ def estimate_offset(
     """The offset [s] for `at_frames`, from the motion: that at which displacement explains force.
 
     `displacement` [m] is how far the pulled side went, for example the mean over its markers. The
-    force is correlated with a cubic in the displacement, since fabrics stiffen, at offsets up to
-    `longest` [s] either way from where both records begin together. What tells the time is where
-    the pull begins and ends: it must do both, or go back, within the video.
+    force is fitted by a cubic in the displacement, since fabrics stiffen, at offsets up to
+    `longest` [s] from where both records begin together. The pull must begin and end in the video.
 
     Raises ValueError when nothing moves, when no offset explains 90 % of the force's variance, or
-    when the best is at the end of the range: then measure the offset otherwise.
+    when the best is at the end of the range.
     """
     if displacement.shape != times.shape or not np.isfinite(displacement).all():
         raise ValueError("give one finite displacement [m] for each frame's time")

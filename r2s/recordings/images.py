@@ -15,13 +15,10 @@ IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
 def read_grey(path: Path | str) -> Iterator[UInt8[np.ndarray, "height width"]]:
-    """The frames of a video, one after the other, as grey images.
-
-    `path`: a video file, or a folder of images of one format, numbered as for `find_numbered`.
+    """The frames of a video, or of a folder of numbered images (`find_numbered`), as grey images.
 
     Raises FileNotFoundError, ImportError (names the extra), or a ValueError that names the file
-    and the frame: no video, no images, one that is damaged or of another size than the first, a
-    video that ends early; and as `find_numbered`.
+    and the frame: no video, no images, a damaged one or one of another size than the first.
     """
     path = Path(path)
     frames = _images(path) if path.is_dir() else _video(path)

@@ -4,10 +4,8 @@
     homography = plane_homography(corners_in_pixels, corners_in_metres)  # plane
     markers = to_metres(homography, tracks.pixels)
 
-OpenCV detects the dots and finds their grid in the first frame; the rest is ours, since OpenCV has
-no tracker for dots that are covered for a while and come back. The centre of a dot is that of its
-area in the image, which a tilted camera moves off the middle of the dot: by 0.01 px for dots of
-16 px at a moderate tilt, and by the square of their size.
+OpenCV detects the dots and finds their grid in the first frame; it has no tracker for dots that are
+covered for a while and come back.
 
 Images are grey, 8 bits, (height, width); places in them are (x, y), x to the right and y down,
 [px], whole numbers at the centres of pixels. Needs OpenCV: pip install 'r2s[camera]'.
@@ -143,10 +141,9 @@ def track(
 ) -> Tracks:
     """Follow the dots of a grid of `shape` (rows, columns) through the frames of a video.
 
-    All must be seen in the first frame, which says which is which. From frame to frame a dot is
-    expected to keep its velocity, and must be found within 0.4 of the grid's spacing of that place.
-    A dot that is covered, even in part, is not seen; it is found again where a smooth motion of the
-    others says that it should be.
+    All must be seen in the first frame. From frame to frame a dot must be found within 0.4 of the
+    grid's spacing of where its velocity takes it. A dot that is covered, even in part, is not seen;
+    it is found again where a smooth motion of the others takes it.
 
     - `frames`: grey images, such as those of `r2s.recordings.images.read_grey`.
     - `dark`: whether the dots are darker than the cloth.
@@ -213,13 +210,12 @@ def _blobs(image: np.ndarray, dark: bool, blur: float, diameters: tuple[float, f
 def find_grid(
     places: Places, shape: tuple[int, int], origin: tuple[float, float] | None = None
 ) -> Integer[np.ndarray, " marker"]:
-    """Which of the dots is which of a grid of `shape` (rows, columns): an index for each, by rows.
+    """The index of the dot of each marker of a grid of `shape` (rows, columns), by rows.
 
-    The grid may be turned and seen at an angle; dots that are off it are left out. Seen from above
-    it is never mirrored, but dots alone do not say where it begins: its first marker is the corner
-    nearest to `origin` [px], or else the one from which the columns run most to the right and the
-    rows most downward. Raises ValueError when the grid is not there as a whole, when the dots go on
-    beside it, or when `origin` is at a corner from which rows and columns have the other's length.
+    The grid may be turned and seen at an angle, but not mirrored. Its first marker is the corner
+    nearest to `origin` [px], or else the one from which columns run most to the right and rows most
+    downward. Raises ValueError when the grid is not there as a whole, when the dots go on beside
+    it, or when rows and columns from `origin` have the other's length.
     """
     rows, columns = shape
     grid = _unmirrored(places, _circles_grid(places, shape))
@@ -320,7 +316,6 @@ def _begin(image: np.ndarray, shape: tuple[int, int], dark: bool, origin: Any) -
 
 
 def _spacing(places: Places) -> float:
-    """The median distance [px] of a marker from the next."""
     return float(np.median(KDTree(places).query(places, 2)[0][:, 1]))
 
 

@@ -33,16 +33,13 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Bar:
-    """How the sheet is held, and how it was seen.
+    """How the sheet is held, and how it was tracked.
 
-    - `ends`: of the bar, in the frame of the tool, [m]. The sheet's warp lies along it, from the
-      first end to the second.
+    - `ends`: of the bar, in the frame of the tool, [m]; the warp runs from the first to the second.
     - `drop`: length of the sheet below it, [m].
     - `lag`: of the tracker's clock behind the arm's, [s]. `lag_deviation`: between recordings, [s].
     - `place_deviation`: of the bar in the frame of the tool, [m].
-    - `tracker_error`: of each row of points, from the bar down: the deviation of a coordinate [m]
-      while the sheet rests.
-    - `note`: how these were found.
+    - `tracker_error`: deviation of a coordinate [m] at rest, of each row from the bar down.
 
     Raises ValueError for ends that are one, and lengths or deviations that are not positive.
     """
@@ -84,9 +81,8 @@ def read_swing(path: Path | str, bar: Bar, duration: float | None = None) -> Rec
     whole sheet for longer than `LONGEST_GAP` the recording ends, with a warning. `duration` [s]
     from the first frame on; None: all.
 
-    Raises FileNotFoundError, or a ValueError that names the file: it is damaged, an array is
-    missing, of another shape or not finite, a clock does not increase, the tool's quaternions are
-    not of length 1, the bar is vertical, or the duration shorter than two frames.
+    Raises FileNotFoundError, or a ValueError that names the file and what is wrong with its arrays,
+    the bar, or the duration.
     """
     path = Path(path)
     try:
@@ -132,7 +128,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 def _recording(
     name: str, arrays: dict[str, np.ndarray], bar: Bar, duration: float | None
 ) -> Recording:
-    tool = _knots(arrays)
+    # some poses are logged twice at one time
+    tool = np.flatnonzero(np.diff(arrays["tool_times"], prepend=-np.inf) > 1e-4)
     path = bar_path(arrays["tool_position"][tool], arrays["tool_quaternion_xyzw"][tool], bar)
     clock = arrays["tool_times"][tool]
     seen_at = arrays["times"] - bar.lag
@@ -145,14 +142,8 @@ def _recording(
     markers, seen = _resampled(times, seen_at, arrays["points"])
     times = times - seen_at[0]  # single precision is finest near 0
     across = arrays["points"].shape[1:3]
-    places = np.stack(
-        np.meshgrid(
-            np.linspace(0, bar.length, across[0]),
-            np.linspace(0, bar.drop, across[1]),
-            indexing="ij",
-        ),
-        axis=-1,
-    ).reshape(-1, 2)
+    sides = (np.linspace(0, *side) for side in zip((bar.length, bar.drop), across, strict=True))
+    places = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
     place = bar.place_deviation
     info = RecordingInfo(
         name=name,
@@ -177,12 +168,6 @@ def _recording(
         markers_seen=seen,
         marker_places=places,
     )
-
-
-def _knots(arrays: dict[str, np.ndarray]) -> np.ndarray:
-    """Which poses of the tool count: some are logged twice at one time."""
-    times = arrays["tool_times"]
-    return np.flatnonzero(np.concatenate([[True], np.diff(times) > 1e-4]))
 
 
 def _first_gap(name: str, seen_at: np.ndarray, points: np.ndarray) -> float:
