@@ -44,11 +44,10 @@ def mesh_error(fabric: Fabric, size: tuple[float, float], shape: Shape, motion: 
     """Expected error [m] of a motion on a mesh, rms over the sheet and mean over the motion.
 
     - `size`: of the sheet, [m]. `shape`: of the mesh, vertices along warp and weft.
-    - `motion`: one of `TABLE`, or its name in recordings (`SAME`); of another, the largest of all.
-      NaN for what is `TAUT`: it has no folds, and was not measured.
+    - `motion`: one of `TABLE`, or its name in recordings (`SAME`); for others the largest of all,
+      NaN for what is `TAUT`.
 
-    Infinite for a fabric without bending. Fabrics scatter about it by a factor of 1.7 (3.5 at
-    most: grey interlock in wind), and the end of a lift is off by three times the mean.
+    Infinite for a fabric without bending. Fabrics scatter about it by a factor of 1.7.
     """
     motion = SAME.get(motion, motion)
     if motion in TAUT:
@@ -75,16 +74,14 @@ def longest_cell(size: tuple[float, float], shape: Shape) -> float:
     return max(side / (count - 1) for side, count in zip(size, shape, strict=True))
 
 
-def shape_for(
-    fabric: Fabric, size: tuple[float, float], motion: str, enough: float = ENOUGH
-) -> Shape:
-    """The coarsest of some meshes (`ladder`) whose error is `enough` [m]; else the finest.
+def shape_for(fabric: Fabric, size: tuple[float, float], motion: str) -> Shape:
+    """The coarsest of some meshes (`ladder`) whose error is at most `ENOUGH`; else the finest.
 
     >>> from r2s.materials import presets
     >>> shape_for(presets.black_denim(), (0.45, 0.45), "lifting")
     (17, 17)
     """
-    enough = enough * max(size) / SIDE
+    enough = ENOUGH * max(size) / SIDE
     for shape in ladder(size):
         if not mesh_error(fabric, size, shape, motion) > enough:  # NaN: no folds to resolve
             return shape
@@ -164,10 +161,8 @@ def material_points(
     """A solver of material points for a scenario: `rollout(scenario, fabric, solver=...)`.
 
     `fabric` is the stiffest that it will be used for. The grid's `spacing` [m] is by default the
-    mesh's longest edge over `EDGE`; folds that lie on each other are about a spacing apart. The
-    membrane's damping time [s] is as in `r2s.solvers.mpm.Sheet`. Steps fill a frame.
-    Raises `ValueError` when the mesh is too coarse for the grid, or the scenario has
-    self-contact of the cloth.
+    mesh's longest edge over `EDGE`; `membrane_damping` [s] as in `r2s.solvers.mpm.Sheet`. Raises
+    `ValueError` when the mesh is too coarse for the grid, or the scenario has self-contact.
     """
     if scenario.self_contact:
         raise ValueError(

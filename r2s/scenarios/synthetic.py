@@ -22,7 +22,7 @@ from r2s.recordings.cameras import Camera
 from r2s.recordings.recording import Recording, RecordingInfo, corner, make_recording
 from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
 from r2s.scenarios.scenario import Scenario, SheetSolver, rollout
-from r2s.scenarios.standard import SIDE, Experiment, Route
+from r2s.scenarios.standard import SIDE, Experiment
 from r2s.solvers.mpm.sheet import longest_edge
 from r2s.solvers.simulate import Trajectory
 
@@ -43,8 +43,7 @@ class Sensing(NamedTuple):
     - `region`: two corners of the box in which outliers lie, [m].
     - `points`: at most, in a frame.
     - `noise`: standard deviation of each coordinate, [m].
-    - `outliers`, `dropped`: fractions of the points, [-]; three outliers at least, unless 0.
-    - `time_offset`: how much later than the grippers' clock the cameras' is, [s].
+    - `outliers`: fraction of the points, [-]; three at least, unless 0.
     - `margin`: above the table, below which no point is recorded, [m].
     """
 
@@ -53,8 +52,6 @@ class Sensing(NamedTuple):
     points: int = POINTS
     noise: float = NOISE
     outliers: float = OUTLIERS
-    dropped: float = 0.0
-    time_offset: float = 0.0
     margin: float = MARGIN
 
 
@@ -146,7 +143,6 @@ def seen_of(
     - `measured`: what else there is, see `r2s.recordings.recording.make_recording`.
     """
     errors = f"camera noise {1e3 * seen.noise:g} mm, {seen.outliers:.0%} outliers"
-    errors += f", {seen.dropped:.0%} dropped" if seen.dropped else ""
     info = RecordingInfo(
         name=f"{experiment.name}_{name}{trial if trial > 1 else ''}",
         scenario=experiment.name,
@@ -160,9 +156,10 @@ def seen_of(
         wind=experiment.wind,
     )
     clouds = _clouds(x, scenario, seen, key)
-    times = np.asarray(experiment.times) + seen.time_offset
-    route = _extended(experiment.route, times[-1])
-    return make_recording(clouds, times, route.path, route.times, info, **(measured or {}))
+    route = experiment.route
+    return make_recording(
+        clouds, experiment.times, route.path, route.times, info, **(measured or {})
+    )
 
 
 def _measured(
@@ -183,14 +180,6 @@ def cameras() -> tuple[Camera, Camera]:
     target = jnp.array([0.25, 0.25, 0.1], float)
     positions = [(-0.5, -0.1, 0.5), (0.1, -0.4, 0.9)]
     return tuple(Camera(jnp.array(p, float), target) for p in positions)  # pyright: ignore
-
-
-def _extended(route: Route, end: float) -> Route:
-    """The route, at rest after its end until `end` [s]."""
-    if route.times[-1] >= end:
-        return route
-    times = np.append(route.times, end)
-    return Route(times, np.concatenate([route.path, route.path[-1:]]))
 
 
 _rollout = compile_once(rollout)
@@ -232,8 +221,6 @@ def _observe_frame(x: Float[Array, "vertex 3"], faces, resolution: int, lowest, 
     if seen.cameras:
         by_camera = [camera.sees(surface) for camera in seen.cameras]
         visible &= jnp.any(jnp.stack(by_camera), axis=0)
-    if seen.dropped:
-        visible &= jr.uniform(jr.fold_in(key, 1), visible.shape, float) >= seen.dropped
     # a random order with what is seen in front: its first points are a random choice of the seen
     order = jnp.argsort(jr.uniform(key_pick, visible.shape, float) + (~visible).astype(float))
     count = min(seen.points, len(surface))
