@@ -17,7 +17,13 @@ from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import ParameterSpace
 from r2s.mesh.mesh import Mesh
 from r2s.mesh.surface import nearest
-from r2s.recordings.recording import Doubt, Recording, check_covered, gripper_positions, subsample
+from r2s.recordings.recording import (
+    MeasurementUncertainty,
+    Recording,
+    check_covered,
+    gripper_positions,
+    subsample,
+)
 from r2s.recordings.views import Views
 from r2s.scenarios.scenario import Scenario, from_recording
 
@@ -74,7 +80,9 @@ OWN: tuple[str, ...] = ("shift x", "shift y", "shift z", "turn", "time")  # nuis
 UNITS = {"shift x": "m", "shift y": "m", "shift z": "m", "turn": "rad", "time": "s"}
 
 
-def default_nuisance_prior(scenario: Scenario, doubt: Doubt | None = None) -> NuisancePrior:
+def default_nuisance_prior(
+    scenario: Scenario, doubt: MeasurementUncertainty | None = None
+) -> NuisancePrior:
     """What is in doubt of a recording: the cameras' place, and the force of a wind that blows.
 
     `doubt`: what the recording says of its own, of the air too; None: the usual.

@@ -15,7 +15,7 @@ from r2s._util.files import read_json
 from r2s._util.units import positive
 from r2s.recordings.clouds import find_frames, read_cloud, read_values
 from r2s.recordings.recording import (
-    Doubt,
+    MeasurementUncertainty,
     Recording,
     RecordingInfo,
     SheetPlacement,
@@ -102,7 +102,7 @@ class Scenario:
     drop_repeats: bool  # keep one of points that are equal
     first_frame: int = 0
     sessions: tuple[Session, ...] = ()
-    doubt: Doubt | None = None
+    doubt: MeasurementUncertainty | None = None
     views: Views | None = None
 
     def __post_init__(self) -> None:

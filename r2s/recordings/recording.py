@@ -60,7 +60,7 @@ def corner(sheet: SheetPlacement, name: str) -> Float[np.ndarray, "3"]:
 
 
 @dataclass(frozen=True)
-class Doubt:
+class MeasurementUncertainty:
     """Standard deviations of what was written down of a recording; 0: it is exact.
 
     - `shift`: of the cameras' frame against that of the grippers along x, y and z, [m].
@@ -110,7 +110,7 @@ class RecordingInfo:
     verified: bool | None  # do the files match published hashes (None: there are none)
     wind: tuple[float, float, float] | None = None  # [m/s]
     time_offset: float = 0.0  # [s]
-    doubt: Doubt | None = None
+    doubt: MeasurementUncertainty | None = None
     views: Views | None = None
     angle: float = 0.0  # [degrees]
 

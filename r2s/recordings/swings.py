@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from r2s._util.files import read_npz
 from r2s.recordings.recording import (
-    Doubt,
+    MeasurementUncertainty,
     Recording,
     RecordingInfo,
     SheetPlacement,
@@ -156,7 +156,7 @@ def _recording(
         table_height=float(np.nanmin(arrays["points"][..., 2]) - FLOOR),
         verified=None,
         time_offset=-bar.lag,
-        doubt=Doubt((place, place, place), TURN_DEVIATION, bar.lag_deviation),
+        doubt=MeasurementUncertainty((place, place, place), TURN_DEVIATION, bar.lag_deviation),
     )
     return make_recording(
         None,

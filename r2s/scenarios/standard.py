@@ -76,8 +76,7 @@ def lift_path(
 
     It moves for `moving` of `duration` [s].
 
-    >>> from r2s.scenarios.standard import on_table
-    >>> path = lift(on_table((0.3, 0.3), ("origin",)), 4.0, height=0.2, inward=0.0).path
+    >>> path = lift_path(on_table((0.3, 0.3), ("origin",)), 4.0, height=0.2, inward=0.0).path
     >>> np.asarray(path[-1, 0]).round(3).tolist()
     [0.0, 0.0, 0.201]
     """

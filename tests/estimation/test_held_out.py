@@ -15,7 +15,7 @@ from r2s.estimation.prediction import nuisances
 from r2s.estimation.problem import Problem
 from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
-from r2s.recordings.recording import Doubt
+from r2s.recordings.recording import MeasurementUncertainty
 from r2s.scenarios import synthetic
 from r2s.scenarios.scenario import in_denser_air, rollout
 
@@ -94,7 +94,7 @@ def test_a_motion_is_judged_in_the_air_that_was_found():
 
 
 def test_the_air_is_the_one_that_an_estimate_names_where_a_recording_doubts_it(lift):
-    doubt = Doubt((0.0, 0.0, 0.0), 0.0, air=0.5)
+    doubt = MeasurementUncertainty((0.0, 0.0, 0.0), 0.0, air=0.5)
     doubted = dataclasses.replace(lift, info=dataclasses.replace(lift.info, doubt=doubt))
     space = OrthotropicSpace.make(float(presets.grey_interlock().density))
     problem = Problem.make(doubted, space, shape=SHAPE)

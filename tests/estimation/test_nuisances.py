@@ -16,8 +16,9 @@ from r2s.estimation.method import Budget
 from r2s.estimation.prediction import free_nuisances, nuisances, predict, theta_length
 from r2s.estimation.problem import NuisancePrior, Problem, default_nuisance_prior
 from r2s.materials import presets
-from r2s.materials.parameters import OrthotropicSpace
-from r2s.recordings.recording import Doubt
+from r2s.materials.informed_space import InformedSpace
+from r2s.materials.parameters import UNIFORM_DEVIATION, OrthotropicSpace
+from r2s.recordings.recording import MeasurementUncertainty
 from r2s.scenarios import synthetic
 
 FABRIC = presets.grey_interlock()
@@ -125,12 +126,13 @@ def test_the_air_of_a_recording_is_in_doubt_where_it_says_so(blown, lifted):
     here, nowhere = (0.0, 0.0, 0.0), 0.0
     still, windy = lifted.scenario, blown.scenario
     assert default_nuisance_prior(still).air == 0
-    assert default_nuisance_prior(still, Doubt(here, nowhere, air=0.5)).air == 0.5
+    assert default_nuisance_prior(still, MeasurementUncertainty(here, nowhere, air=0.5)).air == 0.5
     assert (
-        default_nuisance_prior(windy, Doubt(here, nowhere)).air == default_nuisance_prior(windy).air
+        default_nuisance_prior(windy, MeasurementUncertainty(here, nowhere)).air
+        == default_nuisance_prior(windy).air
     )
     with pytest.raises(ValueError, match="negative"):
-        Doubt(here, nowhere, air=-1.0)
+        MeasurementUncertainty(here, nowhere, air=-1.0)
 
 
 @pytest.mark.slow(group="estimates")

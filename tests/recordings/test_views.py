@@ -24,7 +24,7 @@ from r2s.mesh.surface import sample
 from r2s.metrics.losses import to_surface
 from r2s.recordings.cameras import DepthCamera, look_at
 from r2s.recordings.clouds import Cleaning
-from r2s.recordings.recording import Doubt, Recording, load, save
+from r2s.recordings.recording import MeasurementUncertainty, Recording, load, save
 from r2s.recordings.views import Views, in_view, observed, shifted
 from r2s.scenarios import synthetic
 
@@ -136,7 +136,7 @@ def lifted() -> Recording:
     lowest = float(jnp.min(jnp.where(made.mask, made.points[..., 2], jnp.inf)))  # cropped there
     box = ((-1.0, -1.0, lowest), BOX[1])
     views = Views(eyes, dataclasses.replace(WHOLE, workspace=box), border=0.01, hidden=0.02)
-    doubt = Doubt((0.01, 0.02, 0.03), 0.1, 0.05, 0.02)
+    doubt = MeasurementUncertainty((0.01, 0.02, 0.03), 0.1, 0.05, 0.02)
     return dataclasses.replace(made, info=dataclasses.replace(made.info, views=views, doubt=doubt))
 
 
@@ -146,7 +146,7 @@ def test_a_recording_keeps_its_cameras_and_doubt(lifted: Recording, tmp_path: Pa
     problem = Problem.make(lifted, FAMILY, shape=(5, 5))
     assert problem.nuisance_prior.scales == (0, 0, 0.02, 0.01, 0.02, 0.03, 0.1, 0.05)
     with pytest.raises(ValueError, match="must not be negative"):
-        Doubt((0.01, -0.02, 0.03), 0.1)
+        MeasurementUncertainty((0.01, -0.02, 0.03), 0.1)
 
 
 @pytest.fixture(scope="module")
