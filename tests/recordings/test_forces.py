@@ -4,9 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from r2s.recordings.force_log import (
     ForceLog,
@@ -65,22 +64,6 @@ def test_units_come_from_the_header(tmp_path: Path, header, row, expected) -> No
 def test_a_broken_log_names_the_line(tmp_path: Path, text: str, words: str) -> None:
     with pytest.raises(ValueError, match=f"pull.csv: .*{words}|pull.csv.*{words}"):
         read_force_log(written(tmp_path, text))
-
-
-@given(
-    steps=arrays(float, st.integers(2, 20), elements=st.floats(1e-6, 1e3)),
-    seed=st.integers(0, 99),
-)
-def test_what_is_written_is_read(tmp_path_factory, steps: np.ndarray, seed: int) -> None:
-    times, force = np.cumsum(steps), np.random.default_rng(seed).normal(0, 1e3, len(steps))
-    assume((np.diff(times) > 0).all())
-    rows = [
-        f"{time!r};{value!r}" for time, value in zip(times.tolist(), force.tolist(), strict=True)
-    ]
-    file = written(tmp_path_factory.getbasetemp(), "\n".join(["time_s;force_N", *rows]))
-    log = read_force_log(file)
-    np.testing.assert_array_equal(log.times, times)
-    np.testing.assert_array_equal(log.force, force)
 
 
 def test_a_stretch_becomes_a_recording() -> None:

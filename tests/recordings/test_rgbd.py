@@ -14,7 +14,6 @@ from hypothesis.extra.numpy import arrays
 from rgbd_scene import INFO, PATH, TIMES, camera, distances, rig, surface, write
 from test_manifest import MANIFEST
 
-from r2s.recordings.cameras import DepthCamera, look_at
 from r2s.recordings.clouds import Cleaning, clean, inside, outliers
 from r2s.recordings.images import read_mask
 from r2s.recordings.manifest import manifest_for, read_recording
@@ -109,31 +108,6 @@ def test_cameras_are_paired_by_time(tmp_path: Path) -> None:
 
 
 CLOCKS = st.lists(st.floats(0.01, 0.2), min_size=2, max_size=20)
-
-
-@given(
-    across=st.integers(8, 4000),
-    down=st.integers(8, 4000),
-    angles=st.tuples(*[st.floats(-2, 2)] * 2),
-    scale=st.floats(1e-5, 1.0),
-    distortion=st.lists(st.floats(-1, 1), min_size=5, max_size=5) | st.just([]),
-    voxel=st.floats(0, 0.1),
-)
-def test_a_rig_is_read_as_it_was_written(
-    tmp_path_factory: pytest.TempPathFactory, across, down, angles, scale, distortion, voxel
-) -> None:
-    view = DepthCamera(
-        resolution=(across, down),
-        focal_length=(0.9 * across, 0.8 * down),
-        centre=(across / 2, down / 2),
-        to_world=look_at((1.0, *angles), (0.0, 0.0, 0.0)),
-        depth_scale=scale,
-        distortion=tuple(distortion),
-    )
-    written = Rig({"a": view, "b": view}, replace(rig().clean, voxel=voxel), frame_rate=30.0)
-    folder = tmp_path_factory.mktemp("rig")
-    write_rig(folder, written)
-    assert read_rig(folder) == written
 
 
 def test_a_mask_may_have_a_palette(folder: Path, tmp_path: Path) -> None:
