@@ -11,8 +11,8 @@ from r2s.estimation.judgement import sensitivity
 from r2s.estimation.method import Budget, Method
 from r2s.estimation.methods import METHODS
 from r2s.estimation.problem import NuisancePrior, Problem
-from r2s.laboratory.cantilever import Cantilever
-from r2s.laboratory.drape import Drape
+from r2s.estimation.registry import METHODS
+from r2s.laboratory.bending import Cantilever, Drape
 from r2s.laboratory.files import read_tests
 from r2s.laboratory.pull import Pull
 from r2s.materials import presets

@@ -9,7 +9,8 @@ from r2s.estimation.cards import Card, Provenance, fingerprint
 from r2s.estimation.consistency import FORCE
 from r2s.estimation.estimate import Agreement, Estimate, Misfit, describe
 from r2s.estimation.method import COARSEST, Method, Progress, tell
-from r2s.laboratory.estimate import APPROACH, POOR_FIT, apart, fits
+from r2s.estimation.misfits import FORCE
+from r2s.laboratory.estimate import APPROACH, POOR_FIT, consistency, fits
 from r2s.laboratory.files import LaboratoryTests
 from r2s.laboratory.pull import Pull
 from r2s.recordings.recording import Recording, clouds_are_markers
@@ -261,7 +262,7 @@ def _laboratory(outcome: Outcome) -> Iterator[str]:
                 f"warning: {name}: {errors:.1f} standard deviations off: another fabric, other "
                 "units, or a law that cannot follow it (try --law stiffening)"
             )
-    p = apart(outcome.by_tests, outcome.estimate)
+    p = consistency(outcome.by_tests, outcome.estimate)
     if p < CONTRADICTION:
         yield (
             f"warning: the recordings contradict the laboratory tests (p = {p:.1g}): another "

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from r2s.estimation.cards import Card
     from r2s.materials.fabric import Fabric
     from r2s.materials.parameters import ParameterSpace
-    from r2s.viewer.subject import Subject
+    from r2s.viewer.page import Subject
 
 Size = tuple[float, float]
 
@@ -49,12 +49,11 @@ class View:
         from r2s.cli.common import load_card, mesh_warning
         from r2s.materials.parameters import OrthotropicSpace
         from r2s.viewer.page import Page
-        from r2s.viewer.subject import place
 
         card = load_card(self.fabric)
         subject, motion = self._subject(OrthotropicSpace.make(float(card.fabric.density)))
         save = None if self.save is None else lambda fabric: self._save_card(card, fabric)
-        start = place(subject, card.fabric)
+        start = subject.place(card.fabric)
         page = Page(subject, start, save=save, host=self.host, port=self.port)
         for line in mesh_warning(self.shape, card.fabric, *motion):
             print(line)
@@ -69,15 +68,18 @@ class View:
         """What is shown; the sheet's size [m] and the name of the motion."""
         from r2s.cli.common import make_experiment
         from r2s.recordings.open import open_recording
-        from r2s.viewer.subject import of_experiment, of_recording
+        from r2s.viewer.page import Subject
 
         if self.recording is None:
             made = make_experiment(self.scenario, self.motion)
-            return of_experiment(made, space, self.shape), (made.sheet.size, made.name)
+            return Subject.of_experiment(made, space, self.shape), (made.sheet.size, made.name)
         if self.motion:
             raise ValueError("--motion is of a scenario: a recording has its own motion")
         seen = open_recording(self.recording)
-        return of_recording(seen, space, self.shape), (seen.info.sheet.size, seen.info.scenario)
+        return Subject.of_recording(seen, space, self.shape), (
+            seen.info.sheet.size,
+            seen.info.scenario,
+        )
 
     def _save_card(self, card: "Card", fabric: "Fabric") -> str:
         from r2s.estimation import cards

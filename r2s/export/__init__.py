@@ -1,6 +1,6 @@
 """A fabric for other simulators: their parameters, and what is lost on the way.
 
-- `stiffness`: a fabric's stiffness in probes, the nearest isotropic sheet, and the `Loss`.
+- `stiffness`: a fabric's stiffness in probes, the nearest sheet and springs, and the `Loss`.
 - `mujoco`: a flex, as MJCF.
 - `newton`: a cloth of Newton (Warp), as arguments and stiffness of every edge.
 - `arcsim`: a material file of ARCSim and DiffSim.

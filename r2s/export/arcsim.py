@@ -24,4 +24,6 @@ def write(path: Path | str, fabric: Fabric, name: str = "", *, diffsim: bool = F
     lost += (TWICE,) if diffsim else ()
     own = stiffness.probes(stiffness.membrane_stiffness(fabric))
     bending = stiffness.bending_stiffness(fabric)
-    return Loss(stiffness.errors(own, own), stiffness.errors(bending, bending), lost)
+    return Loss(
+        stiffness.relative_errors(own, own), stiffness.relative_errors(bending, bending), lost
+    )

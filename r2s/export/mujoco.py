@@ -1,24 +1,22 @@
 """A fabric as a flex of MuJoCo (4.0), in MJCF.
 
 MuJoCo's 2-D flex is a solid plate of Young's modulus E [Pa], Poisson's ratio nu in [0, 0.5) and
-thickness h [m]: a St. Venant-Kirchhoff membrane in plane stress, of stiffness E h, on the same mesh
-that of r2s to rounding; and hinges with the bending stiffness E h^3 / (12 (1 - nu^2)), which know
-no Poisson's ratio, and are too stiff across diagonals. Both stiffnesses together fix E and h
-(`r2s.materials.solid.plate_solid`): h is not the fabric's thickness, which is the `radius` of its
-contacts. `damping` is a Kelvin-Voigt time [s], as in r2s.
+thickness h [m]: a St. Venant-Kirchhoff membrane in plane stress of stiffness E h, that of r2s on
+the same mesh; and hinges of bending stiffness E h^3 / (12 (1 - nu^2)), too stiff across diagonals.
+Both stiffnesses fix E and h (`r2s.materials.solid.plate_solid`): h is not the fabric's thickness,
+which is the `radius` of its contacts. `damping` is a Kelvin-Voigt time [s], as in r2s.
 
-The model has a body for each vertex: masses of their areas, held vertices tied to mocap bodies, and
-springs along the yarns (spatial tendons) that make it orthotropic.
+The model has a body for each vertex, held vertices tied to mocap bodies, and springs along the
+yarns (spatial tendons) that make it orthotropic.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from r2s._util.units import GRAVITY
 from r2s.export import stiffness
-from r2s.export.stiffness import Loss
-from r2s.export.yarns import Springs, sheet_of
+from r2s.export.stiffness import Loss, Springs
 from r2s.materials.fabric import Fabric
 from r2s.materials.solid import plate_solid
 from r2s.mesh.mesh import Mesh
@@ -27,28 +25,6 @@ POISSON = (0.0, 0.499)
 RIGID = "mass damping: `r2s.export.mujoco.brake` sets it in the finished model"
 AXES = ("1 0 0", "0 1 0", "0 0 1")
 LARGE = "at large strains the springs along the yarns are linear in length, not in Green strain"
-
-
-class Elasticity(NamedTuple):
-    """The attributes of `<elasticity>`: E [Pa], nu [-], h [m], time [s], which parts there are."""
-
-    young: float
-    poisson: float
-    thickness: float
-    damping: float
-    elastic2d: str
-
-
-def elasticity(fabric: Fabric, mesh: Mesh, modulus: float, poisson: float) -> Elasticity:
-    """Elasticity of a sheet with E h `modulus` [N/m], Poisson's ratio, and a fabric's bending and
-    damping."""
-    near, bending = stiffness.isotropic(modulus, poisson), stiffness.hinge_stiffness(fabric, mesh)
-    damping = float(fabric.damping)
-    if not bending:
-        thickness = float(fabric.thickness)
-        return Elasticity(modulus / thickness, poisson, thickness, damping, "stretch")
-    young, _, thickness = plate_solid(near[0, 0], near[0, 1], bending)
-    return Elasticity(float(young), poisson, float(thickness), damping, "both")
 
 
 def mjcf(
@@ -73,15 +49,16 @@ def mjcf(
     Vertex i is the body "v<i>" and number i of the flex "cloth". Raises `ValueError` for a batch,
     for a membrane without positive stiffness, and with yarns for a mesh that has none.
     """
-    sheet = sheet_of(fabric, mesh, yarns, POISSON, negative=False)
-    solid = elasticity(fabric, mesh, sheet.modulus, sheet.poisson)
-    tendons = _tendons(sheet.springs, float(fabric.damping)) if sheet.springs else ""
+    sheet = stiffness.nearest_sheet(fabric, yarns, POISSON, negative=False)
+    tendons = ""
+    if yarns:
+        springs = stiffness.yarn_springs(mesh, sheet.warp, sheet.weft)
+        tendons = _tendons(springs, float(fabric.damping))
     lost = (LARGE,) if yarns else ()
     lost += (RIGID,) if float(fabric.mass_damping) else ()
     friction = f'friction="{float(fabric.friction)!r} 0.005 0.0001"'
     plane = f'<geom type="plane" size="0 0 1" pos="0 0 {table!r}" {friction}/>'
     names = " ".join(f"v{i}" for i in range(len(mesh.rest)))
-    attributes = " ".join(f'{name}="{value}"' for name, value in solid._asdict().items())
     text = f"""<mujoco>
   <option timestep="{timestep!r}" gravity="0 0 {-GRAVITY}" integrator="{integrator}"/>
   <size memory="1G"/>
@@ -93,7 +70,7 @@ def mjcf(
     <flex name="cloth" dim="2" radius="{float(fabric.thickness)!r}" body="{names}"
         element="{_numbers(np.asarray(mesh.faces))}">
       <contact selfcollide="none" {friction}/>
-      <elasticity {attributes}/>
+      <elasticity {_elasticity(fabric, mesh, sheet)}/>
     </flex>
   </deformable>
 {tendons}{_grips(held, timestep)}</mujoco>
@@ -110,10 +87,26 @@ def brake(model: Any, fabric: Fabric) -> None:
     model.dof_damping[:] = float(fabric.mass_damping) * mass
 
 
+def _elasticity(fabric: Fabric, mesh: Mesh, sheet: stiffness.Sheet) -> str:
+    """The attributes of `<elasticity>`: membrane, bending and damping."""
+    near = stiffness.isotropic(sheet.modulus, sheet.poisson)
+    bending, parts = stiffness.hinge_stiffness(fabric, mesh), "both"
+    if bending:
+        young, _, thickness = map(float, plate_solid(near[0, 0], near[0, 1], bending))
+    else:
+        thickness, parts = float(fabric.thickness), "stretch"
+        young = sheet.modulus / thickness
+    return (
+        f'young="{young}" poisson="{sheet.poisson}" thickness="{thickness}" '
+        f'damping="{float(fabric.damping)}" elastic2d="{parts}"'
+    )
+
+
 def _bodies(fabric: Fabric, mesh: Mesh, held: tuple[int, ...], height: float) -> str:
     """A mocap body for each held vertex, in their order, and a body for each vertex."""
     mass = float(fabric.density) * np.asarray(mesh.vertex_area, np.float64)
-    places = _flat(mesh) + [0.0, 0.0, height]
+    flat = np.pad(np.asarray(mesh.rest, np.float64), ((0, 0), (0, 1)))
+    places = flat + [0.0, 0.0, height]
     lines = [f'    <body name="h{i}" pos="{_numbers(places[i])}" mocap="true"/>' for i in held]
     for i in range(len(places)):
         joints = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in AXES)
@@ -141,10 +134,6 @@ def _tendons(springs: Springs, damping: float) -> str:
         if k > 0
     ]
     return "  <tendon>\n" + "\n".join(lines) + "\n  </tendon>\n" if lines else ""
-
-
-def _flat(mesh: Mesh) -> np.ndarray:
-    return np.pad(np.asarray(mesh.rest, np.float64), ((0, 0), (0, 1)))
 
 
 def _numbers(values: np.ndarray) -> str:

@@ -6,16 +6,13 @@ area, whose stiffness at small strains is C11 = mu + L, C12 = L - mu, C33 = mu. 
 is L - mu = C12.
 
 A hinge of r2s has the moment B l / A per angle and length l of its edge, A the area of its two
-triangles. VBD multiplies `edge_ke` by l: it is B l / A [N] there, another number for every edge.
-`SolverSemiImplicit` multiplies by twice a triangle's area, too, which is A where both are alike:
-B l / A^2 [N/m^2]. The argument is one for all edges: the mean. Hinges are too stiff across
-diagonals.
+triangles. VBD multiplies `edge_ke` by l: it is B l / A [N] there. `SolverSemiImplicit` multiplies
+by twice a triangle's area, too, which is A where both are equal: B l / A^2 [N/m^2]. Exported is the
+mean over all edges. Hinges are too stiff across diagonals.
 
 Damping is Kelvin-Voigt. In VBD, of shear alone: `tri_kd`, on the rate of F^T F, is half of mu times
-the damping time. In `SolverSemiImplicit` it acts on the rate of F, also in a rigid rotation, as a
-swinging sheet's: it is 0. `edge_kd` is `edge_ke` times the time, over A for `SolverSemiImplicit`.
-
-With `yarns`, springs along warp and weft (`ModelBuilder.add_spring`) make it orthotropic.
+the damping time. In `SolverSemiImplicit` it would act on rigid rotation, too: it is 0. `edge_kd` is
+`edge_ke` times the time, over A for `SolverSemiImplicit`. Springs are `ModelBuilder.add_spring`.
 """
 
 from typing import Any, Literal, NamedTuple
@@ -23,8 +20,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from r2s.export import stiffness
-from r2s.export.stiffness import Loss
-from r2s.export.yarns import Springs, sheet_of
+from r2s.export.stiffness import Loss, Springs
 from r2s.materials.fabric import Fabric
 from r2s.mesh.mesh import Mesh
 
@@ -62,12 +58,13 @@ def cloth(
     Raises `ValueError` for a batch, for a membrane without positive stiffness, and with yarns for a
     mesh that has none.
     """
-    sheet = sheet_of(fabric, mesh, yarns)
+    sheet = stiffness.nearest_sheet(fabric, yarns)
+    springs = stiffness.yarn_springs(mesh, sheet.warp, sheet.weft) if yarns else None
     lost = (LARGE, EDGES, DAMPING[kind])
     lost += (RIGID,) if float(fabric.mass_damping) else ()
     near = stiffness.isotropic(sheet.modulus, sheet.poisson)
     contact = {"soft_contact_mu": float(fabric.friction)}
-    made = Cloth(_arguments(fabric, mesh, kind, near), sheet.springs, contact)
+    made = Cloth(_arguments(fabric, mesh, kind, near), springs, contact)
     return made, stiffness.loss_of(fabric, sheet.stiffness, mesh, lost)
 
 
@@ -99,13 +96,9 @@ def spring_arguments(found: Springs, damping: float) -> list[dict[str, Any]]:
 def edge_factors(
     length: np.ndarray, area: np.ndarray, kind: Kind, bending: float, damping: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`edge_ke` and `edge_kd` of hinges.
+    """`edge_ke` and `edge_kd` of hinges with a `bending` stiffness [N m] and a `damping` time [s].
 
-    - `length`: of their edges, [m].
-    - `area`: of the two triangles of each, [m^2].
-    - `kind`: the solver.
-    - `bending`: stiffness, [N m].
-    - `damping`: time, [s].
+    `length` [m] of their edges, and `area` [m^2] of the two triangles of each.
     """
     moment = bending * length / area
     if kind == "vbd":

@@ -12,7 +12,6 @@ import numpy as np
 
 from r2s.export import stiffness
 from r2s.export.stiffness import Loss, Stiffness
-from r2s.export.yarns import edges_of
 from r2s.materials.fabric import Fabric
 from r2s.mesh.mesh import Mesh
 
@@ -27,10 +26,8 @@ def soft_body(fabric: Fabric, mesh: Mesh) -> tuple[dict[str, float | int], Loss]
 
     Raises `ValueError` for a batch, and for a membrane without positive stiffness.
     """
-    stiffness.one(fabric)
-    own = stiffness.probes(stiffness.membrane_stiffness(fabric))
-    if not min(own.values()) > 0:
-        raise ValueError(f"the membrane has no positive stiffness in every probe: {own}")
+    stiffness.check_single(fabric)
+    own = stiffness.positive_probes(stiffness.membrane_stiffness(fabric))
     unit = stiffness.probes(spring_stiffness(mesh))
     spring = float(np.exp(np.mean([np.log(own[name] / unit[name]) for name in own])))
     lost = (CAUCHY, NO_BENDING, MASSES)
@@ -51,7 +48,7 @@ def soft_body(fabric: Fabric, mesh: Mesh) -> tuple[dict[str, float | int], Loss]
 
 def spring_stiffness(mesh: Mesh) -> Stiffness:
     """The membrane stiffness [-] of a mesh whose edges are springs of 1 N/m."""
-    rest, pairs = np.asarray(mesh.rest, np.float64), edges_of(mesh).reshape(-1, 2)
+    rest, pairs = np.asarray(mesh.rest, np.float64), stiffness.face_edges(mesh).reshape(-1, 2)
     edges = np.unique(pairs, axis=0)
     along = rest[edges[:, 1]] - rest[edges[:, 0]]
     squared = np.sum(along**2, axis=1)

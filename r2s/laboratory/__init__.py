@@ -1,7 +1,6 @@
-"""Tests of a textile laboratory, and the fabrics that they tell.
+"""Tests of a textile laboratory, and the fabrics that explain them.
 
-- `pull`: force and extension of strips. `cantilever`: overhangs (ASTM D1388). `drape`: drape
-  coefficients (Cusick, BS EN ISO 9073-9), from a simulated specimen.
-- `estimate`: the fabric that tests tell, and the space that knows of it.
-- `files`: tests in a JSON file. `knits`: published pulls of knits.
+- `pull`: force and extension of strips. `bending`: cantilevers (ASTM D1388) and drapes (Cusick).
+- `estimate`: the fabric that tests give, and the space with that as its prior.
+- `files`: tests in a JSON file, and published pulls of knits.
 """

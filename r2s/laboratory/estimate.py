@@ -1,4 +1,4 @@
-"""The fabric that laboratory tests tell, and what they add to what motions tell.
+"""The fabric that best explains laboratory tests, and the prior that it gives to motions.
 
     found = estimate((pull_along_warp, pull_along_weft, cantilever), on_cloth(density))
     space = informed(on_cloth(density), found)      # for an estimate from motions beside them
@@ -17,15 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from jaxtyping import Array, Float
+from jaxtyping import Array
 from scipy.stats import chi2
 
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import MARGIN
 from r2s.estimation.least_squares import BoundedGaussNewton
 from r2s.estimation.method import Progress, tell
-from r2s.laboratory.cantilever import Cantilever, overhang
-from r2s.laboratory.drape import Drape
+from r2s.laboratory.bending import Cantilever, Drape, overhang
 from r2s.laboratory.pull import Pull
 from r2s.materials.fabric import Fabric
 from r2s.materials.informed_space import InformedSpace
@@ -35,10 +34,10 @@ Test = Pull | Cantilever | Drape
 
 APPROACH = "laboratory tests"
 STARTS = 8
-ENOUGH = 1e-4  # relative, of the sum of squares or of a step: there a descent ends
-MOST = 60  # steps
-SLACK = 0.02  # of a variance: less than that a motion does not add to what tests tell
-TOLD = 0.5  # of the prior's standard error: tests tell what they know better than that
+TOLERANCE = 1e-4  # relative, of the sum of squares or of a step
+MAX_STEPS = 60
+SLACK = 0.02  # of a variance: information that a motion is not taken to add
+IDENTIFIED = 0.5  # of the prior's standard error: below, tests identify a parameter
 POOR_FIT = 3.0  # standard deviations (root mean square), beyond which a test does not fit
 
 
@@ -59,8 +58,8 @@ def estimate(
 ) -> Estimate:
     """The fabric of a space that explains some tests of it.
 
-    Where tests have no part in a parameter it stays at the prior of the space. `progress` is told
-    the number of steps and the loss, a mean square of residuals, [-].
+    Parameters on which no test depends stay at the prior mean. `progress` is called with the number
+    of steps and the loss, a mean square of residuals, [-].
 
     Raises `ValueError` without a test, and `RuntimeError` where no specimen of a drape comes to
     rest.
@@ -68,6 +67,7 @@ def estimate(
     if not tests:
         raise ValueError("no laboratory test")
     begun = time.perf_counter()
+    tests = tuple(tests)
     quick = tuple(test for test in tests if not isinstance(test, Drape))
     start = np.asarray(space.prior()[0])
     if quick:
@@ -75,21 +75,19 @@ def estimate(
         ends = [_descend(quick, space, each, progress) for each in (start, *others)]
         start = min(ends, key=lambda end: end.loss).place
     tell(progress, "simulating drapes" if len(quick) < len(tests) else "fitting")
-    found = _descend(tuple(tests), space, start, progress)
+    found = _descend(tests, space, start, progress)
     if not np.isfinite(found.loss):
         raise RuntimeError("no specimen of the drape test comes to rest: are its radii right?")
     place = jnp.asarray(found.place, float)
-    value, slope = (np.asarray(x, np.float64) for x in _linearised(tuple(tests), space, place))
-    covariance = np.linalg.inv(_precision(tests, space, value, slope))
+    covariance = _place_covariance(tests, space, place)
     deviation = np.sqrt(np.diag(covariance))
-    widths = np.array([bound.width for bound in space.ranges])
     values = np.asarray(space.values(place))
     return Estimate(
         approach=APPROACH,
         fabric=space(place),
         ranges=space.ranges,
         values=values,
-        standard_errors=deviation * widths,
+        standard_errors=deviation * np.array([bound.width for bound in space.ranges]),
         correlation=covariance / np.outer(deviation, deviation),
         nuisances=(),
         loss=found.loss,
@@ -102,45 +100,42 @@ def estimate(
 
 
 def informed(space: ParameterSpace, found: Estimate) -> InformedSpace:
-    """The space with what an estimate from laboratory tests knows of its places as their prior."""
-    widths = np.array([bound.width for bound in space.ranges])
-    covariance = _covariance(found, widths)
-    place = space.to_unit(found.fabric)
-    precision = jnp.asarray(np.linalg.inv(covariance), float)
-    return InformedSpace.make(space, place, precision, measured=True)
+    """The space with an estimate from laboratory tests as its prior."""
+    precision = jnp.asarray(np.linalg.inv(_covariance(found)), float)
+    return InformedSpace.make(space, space.to_unit(found.fabric), precision, measured=True)
 
 
-def apart(told: Estimate, found: Estimate) -> float:
-    """How likely it is by chance that an estimate lies as far from what tests alone told, [-].
+def consistency(by_tests: Estimate, found: Estimate) -> float:
+    """The p-value of an estimate from motions, given that of the tests that are its prior, [-].
 
-    `found` has the tests as its prior, so that the difference has the covariance of `told` less its
-    own (Hausman, Econometrica 46, 1978); and the error of its mesh, where that was judged. In
-    directions that it knows no better than the tests do, its own errors are others, of its mesh or
-    its law: there the covariances add. Counted are the parameters that the tests tell.
+    The difference has the covariance of `by_tests` less that of `found` (Hausman, Econometrica 46,
+    1978), and the error of its mesh, where that was estimated. In directions that the motions did
+    not improve, the errors of mesh and law are independent: there the covariances add. Counted are
+    the parameters that the tests identify.
     """
-    ranges = told.ranges
+    ranges = by_tests.ranges
     widths = np.array([bound.width for bound in ranges])
-    told_by = np.flatnonzero(told.standard_errors < TOLD * UNIFORM_DEVIATION * widths)
-    if not len(told_by):
+    which = np.flatnonzero(by_tests.standard_errors < IDENTIFIED * UNIFORM_DEVIATION * widths)
+    if not len(which):
         return 1.0
-    places = [
-        np.array(
-            [float(r.to_unit(jnp.asarray(v, float))) for r, v in zip(ranges, e.values, strict=True)]
-        )
-        for e in (told, found)
-    ]
-    off = (places[1] - places[0])[told_by]
-    before, after = (_covariance(each, widths)[np.ix_(told_by, told_by)] for each in (told, found))
-    sizes, axes = np.linalg.eigh(before - after)
-    both = np.einsum("ij,ik,kj->j", axes, before + after, axes)
-    sizes = np.where(sizes > SLACK * np.max(np.linalg.eigvalsh(before)), sizes, both)
+
+    def place(estimate: Estimate) -> np.ndarray:
+        pairs = zip(ranges, estimate.values, strict=True)
+        return np.array([float(bound.to_unit(jnp.asarray(v, float))) for bound, v in pairs])
+
+    off = (place(found) - place(by_tests))[which]
+    before, after = (_covariance(each)[np.ix_(which, which)] for each in (by_tests, found))
+    variances, axes = np.linalg.eigh(before - after)
+    sums = np.einsum("ij,ik,kj->j", axes, before + after, axes)
+    variances = np.where(variances > SLACK * np.max(np.linalg.eigvalsh(before)), variances, sums)
     if found.mesh_bias is not None:
-        sizes = sizes + (axes**2).T @ (found.mesh_bias / widths)[told_by] ** 2
-    return float(chi2.sf(np.sum((axes.T @ off) ** 2 / sizes), len(off)))
+        variances = variances + (axes**2).T @ (found.mesh_bias / widths)[which] ** 2
+    return float(chi2.sf(np.sum((axes.T @ off) ** 2 / variances), len(off)))
 
 
-def _covariance(estimate: Estimate, widths: np.ndarray) -> np.ndarray:
-    deviation = estimate.standard_errors / widths
+def _covariance(estimate: Estimate) -> np.ndarray:
+    """Of the place in the unit cube."""
+    deviation = estimate.standard_errors / np.array([bound.width for bound in estimate.ranges])
     return estimate.correlation * np.outer(deviation, deviation)
 
 
@@ -157,17 +152,17 @@ def _fit(test: Test, fabric: Fabric) -> Fit:
         share = float(test.misfit(fabric))
         words = f"up to {force:.3g} N/m at {most:.1%}: off by {share:.1%} of that (rms)"
     elif isinstance(test, Cantilever):
-        seen, told = float(test.overhang), float(overhang(fabric, test.direction))
-        words = f"overhang {1e3 * seen:.1f} mm measured, {1e3 * told:.1f} mm expected"
+        measured, expected = float(test.overhang), float(overhang(fabric, test.direction))
+        words = f"overhang {1e3 * measured:.1f} mm measured, {1e3 * expected:.1f} mm expected"
     else:
-        seen = float(test.coefficient)
-        told = seen + float(residuals[0] * test.deviation)  # not to simulate it again
-        words = f"coefficient {seen:.3f} measured, {told:.3f} expected"
+        measured = float(test.coefficient)
+        expected = measured + float(residuals[0] * test.deviation)  # not to simulate it again
+        words = f"coefficient {measured:.3f} measured, {expected:.3f} expected"
     return Fit(test.name, errors, words)
 
 
 @eqx.filter_jit
-def _residuals_of(test: Test, fabric: Fabric) -> Float[Array, " residual"]:
+def _residuals_of(test: Test, fabric: Fabric) -> Array:
     return test.residuals(fabric)
 
 
@@ -182,45 +177,44 @@ def _descend(
 ) -> _End:
     """Where a descent of `BoundedGaussNewton` within the cube ends."""
     mean, precision = space.prior()
+    low, high = MARGIN, 1 - MARGIN
     solver = BoundedGaussNewton(
-        rtol=ENOUGH, atol=ENOUGH, low=MARGIN, high=1 - MARGIN, mean=mean, precision=precision
+        rtol=TOLERANCE, atol=TOLERANCE, low=low, high=high, mean=mean, precision=precision
     )
-    place, given = jnp.clip(jnp.asarray(start, float), MARGIN, 1 - MARGIN), (tests, space)
+    place, given = jnp.clip(jnp.asarray(start, float), low, high), (tests, space)
     state = solver.init(_residuals, place, given, {}, None, None, frozenset())
     size = len(jax.eval_shape(_residuals, place, given)[0]) + space.dim
-    for count in range(1, MOST + 1):
+    for count in range(1, MAX_STEPS + 1):
         place, state, is_done, result = _step(solver, place, given, state)
         if progress is not None:
             progress(count, 2 * float(state.loss) / size)
         if is_done:
             break
-    is_good = bool(is_done) and bool(result == optimistix.RESULTS.successful)
-    return _End(np.asarray(place), 2 * float(state.loss) / size, is_good)
+    converged = bool(is_done) and bool(result == optimistix.RESULTS.successful)
+    return _End(np.asarray(place), 2 * float(state.loss) / size, converged)
 
 
 @eqx.filter_jit
-def _step(solver: BoundedGaussNewton, place: Float[Array, " dim"], given, state):
+def _step(solver: BoundedGaussNewton, place: Array, given, state):
     place, state, _ = solver.step(_residuals, place, given, {}, state, frozenset())
     return place, state, *solver.terminate(_residuals, place, given, {}, state, frozenset())
 
 
-def _residuals(u: Float[Array, " dim"], given: tuple[tuple[Test, ...], ParameterSpace]):
+def _residuals(u: Array, given: tuple[tuple[Test, ...], ParameterSpace]):
     tests, space = given
     return jnp.concatenate([test.residuals(space(u)) for test in tests]), None
 
 
 @eqx.filter_jit
-def _linearised(tests: tuple[Test, ...], space: ParameterSpace, u: Float[Array, " dim"]):
+def _linearised(tests: tuple[Test, ...], space: ParameterSpace, u: Array):
     """Residuals of tests, and their derivative in a place."""
     value, slope = jax.linearize(lambda u: _residuals(u, (tests, space))[0], u)
     return value, jax.vmap(slope, out_axes=1)(jnp.eye(len(u), dtype=u.dtype))
 
 
-def _precision(
-    tests: Sequence[Test], space: ParameterSpace, value: np.ndarray, slope: np.ndarray
-) -> np.ndarray:
-    """Of a place: what the tests say, less where they scatter by more than they should, and the
-    prior of the space. From the residuals, and their derivative."""
-    left = sum(test.count for test in tests) - np.linalg.matrix_rank(slope)
-    scatter = max(1.0, float(value @ value) / max(int(left), 1))
-    return slope.T @ slope / scatter + np.asarray(space.prior()[1], np.float64)
+def _place_covariance(tests: tuple[Test, ...], space: ParameterSpace, place: Array) -> np.ndarray:
+    """From tests, which count less where they scatter by more than they should, and the prior."""
+    value, slope = (np.asarray(x, np.float64) for x in _linearised(tests, space, place))
+    free = sum(test.count for test in tests) - np.linalg.matrix_rank(slope)
+    scatter = max(1.0, float(value @ value) / max(int(free), 1))
+    return np.linalg.inv(slope.T @ slope / scatter + np.asarray(space.prior()[1], np.float64))

@@ -11,7 +11,7 @@
 Lengths are in metres, a direction is "warp", "weft", "bias" or an angle from the warp [rad]. The
 columns of a curve are `extension` (m, mm, cm) or `strain` (-, %), `force` (N, mN, cN, kN, gf, kgf)
 and, where the width in the middle was measured, `width`; the header says their units. A pull of
-stitch-by-stitch is one with a `file` that ends in .h5, see `r2s.laboratory.knits`.
+stitch-by-stitch is one with a `file` that ends in .h5, see `read_knit`.
 """
 
 import hashlib
@@ -25,16 +25,19 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from r2s._util.extras import require
 from r2s._util.files import parse
-from r2s.laboratory.cantilever import Cantilever
-from r2s.laboratory.drape import DEVIATION, RADII, Drape
+from r2s.laboratory.bending import DRAPE_DEVIATION, RADII, Cantilever, Drape
 from r2s.laboratory.estimate import Test
-from r2s.laboratory.knits import read_knit
 from r2s.laboratory.pull import SPECIMEN, Pull
 from r2s.recordings.force_log import METRES, NEWTONS, SHARES, header_of, read_columns
 
 FORMAT = "r2s-laboratory/1"
 DIRECTIONS = {"warp": 0.0, "bias": math.pi / 4, "weft": math.pi / 2}
+# of stitch-by-stitch, see `read_knit`
+CLAMP_WIDTH = 0.0355  # [m]
+KNIT_PULLS = ("video2", "video3", "video4", "video5")  # the first frame of the first one is at rest
+RIGHT, LEFT, LOWER, UPPER = 0, 1, -2, -1  # of the tracked pins; the last two are the clamps'
 
 
 class LaboratoryTests(NamedTuple):
@@ -69,22 +72,22 @@ def read_tests(path: Path | str) -> LaboratoryTests:
     if not isinstance(stored, dict) or stored.get("format") != FORMAT:
         found = stored.get("format") if isinstance(stored, dict) else type(stored).__name__
         raise ValueError(f"{path}: laboratory tests have the format {FORMAT!r}, found {found!r}")
-    if unknown := sorted(set(stored) - {"format", "source", *KINDS}):
+    if unknown := sorted(set(stored) - {"format", "source", *READERS}):
         raise ValueError(
-            f"{path}: unknown: {', '.join(unknown)}; known: source, {', '.join(KINDS)}"
+            f"{path}: unknown: {', '.join(unknown)}; known: source, {', '.join(READERS)}"
         )
     source = stored.get("source", "")
     if not isinstance(source, str):
         raise ValueError(f"{path}: source: expected text, found {source!r}")
     tests: list[Test] = []
-    for kind, make in KINDS.items():
+    for kind, read in READERS.items():
         entries = stored.get(kind, [])
         if not isinstance(entries, list):
             raise ValueError(f"{path}: {kind}: expected a list, found {type(entries).__name__}")
         for number, entry in enumerate(entries, 1):
-            tests += make(path.parent, f"{path}: {kind[:-1]} {number}", entry)
+            tests += read(path.parent, f"{path}: {kind[:-1]} {number}", entry)
     if not tests:
-        raise ValueError(f"{path}: no test: it has neither {', '.join(KINDS)}")
+        raise ValueError(f"{path}: no test: it has neither {', '.join(READERS)}")
     return LaboratoryTests(tuple(tests), source, path.stem)
 
 
@@ -115,7 +118,7 @@ class _Drape:
     coefficient: float
     specimen_radius: float = RADII[0]
     support_radius: float = RADII[1]
-    deviation: float = DEVIATION
+    deviation: float = DRAPE_DEVIATION
 
 
 def _entry(kind: type, where: str, entry: Any) -> Any:
@@ -137,37 +140,89 @@ def _entry(kind: type, where: str, entry: Any) -> Any:
 
 def _pulls(folder: Path, where: str, entry: Any) -> list[Test]:
     is_knit = isinstance(entry, dict) and str(entry.get("file")).endswith(".h5")
-    one = _entry(_Knit if is_knit else _Pull, where, entry)
-    file = folder / one.file
+    given = _entry(_Knit if is_knit else _Pull, where, entry)
+    file = folder / given.file
     if not file.is_file():
         raise FileNotFoundError(f"{where}: no such file: {file}")
     if is_knit:
-        return list(read_knit(file, one.direction, one.specimen))
+        return list(read_knit(file, given.direction, given.specimen))
     header = " ".join(header_of(file)).lower()
-    names = {"extension": METRES} if "extension" in header else {"strain": SHARES}
-    names |= {"force": NEWTONS} | ({"width": METRES} if "width" in header else {})
-    along, force, *width = read_columns(file, names).values.T
-    extension = along if "extension" in names else along * one.length
+    units = {"extension": METRES} if "extension" in header else {"strain": SHARES}
+    units |= {"force": NEWTONS} | ({"width": METRES} if "width" in header else {})
+    along, force, *width = read_columns(file, units).values.T
+    extension = along if "extension" in units else along * given.length
     middle, name = width[0] if width else None, f"{where} ({file.name})"
-    size = one.length, one.width
-    return [Pull.make(extension, force, size, one.direction, middle, one.specimen, name)]
+    size = given.length, given.width
+    return [Pull.make(extension, force, size, given.direction, middle, given.specimen, name)]
 
 
 def _cantilevers(folder: Path, where: str, entry: Any) -> list[Test]:
     del folder
-    one = _entry(_Cantilever, where, entry)
-    return [Cantilever.make(one.overhangs, one.direction, name=where)]
+    given = _entry(_Cantilever, where, entry)
+    return [Cantilever.make(given.overhangs, given.direction, name=where)]
 
 
 def _drapes(folder: Path, where: str, entry: Any) -> list[Test]:
     del folder
-    one = _entry(_Drape, where, entry)
-    radii = one.specimen_radius, one.support_radius
-    return [Drape.make(one.coefficient, radii, one.deviation, name=where)]
+    given = _entry(_Drape, where, entry)
+    radii = given.specimen_radius, given.support_radius
+    return [Drape.make(given.coefficient, radii, given.deviation, name=where)]
 
 
-KINDS: dict[str, Callable[[Path, str, Any], list[Test]]] = {
+READERS: dict[str, Callable[[Path, str, Any], list[Test]]] = {
     "pulls": _pulls,
     "cantilevers": _cantilevers,
     "drapes": _drapes,
 }
+
+
+def read_knit(path: Path | str, direction: float, specimen: float = SPECIMEN) -> list[Pull]:
+    """The uniaxial pulls in one file of stitch-by-stitch, but for the first.
+
+    Singal et al., Nature Communications 15, 2622 (2024); repository sabetta/stitch-by-stitch (MIT
+    licence), commit 0ed27f35, `data/uniaxial_experiments/experimentData/outputData_{yarn} {stitch}
+    {X,Y}.h5`: force [N] and tracked pins [pixel] of five pulls of a swatch. X is along the courses
+    (rows), Y along the wales. Its notebook has what the files lack: the width of the clamp, which
+    gives the scale, that strain counts from the first frame of the second pull, and that the first
+    pull, of a swatch never stretched before, is left out. The fabrics' weight is not given.
+
+    - `direction`: of the pull from the warp, [rad]: 0 for Y and pi/2 for X.
+    - `specimen`: see `Pull`.
+
+    Needs h5py: pip install 'r2s[laboratory]'. Raises FileNotFoundError; ValueError that names the
+    file and the pull: no such file of HDF5, arrays that are missing or of other shapes; ImportError
+    that names the extra.
+    """
+    path = Path(path)
+    h5py = require("h5py", "laboratory", "the pulls of stitch-by-stitch")
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        with h5py.File(path, "r") as file:
+            arrays = {
+                name: tuple(np.asarray(file[name][key], float) for key in ("traj", "forces"))
+                for name in KNIT_PULLS
+            }
+            clamp, fabric = (float(file[key][0]) for key in ("clampSize", "fabricSize"))
+        if not min(clamp, fabric) > 0:
+            raise ValueError(f"sizes must be positive, found {clamp} and {fabric}")
+    except Exception as error:  # a file of another layout raises anything
+        raise ValueError(f"{path}: no pulls of stitch-by-stitch: {error}") from error
+    spans = {}  # between the clamps, and between the sides, [pixel]
+    for name, (pins, force) in arrays.items():
+        if pins.ndim != 3 or pins.shape[0] < 4 or pins.shape[1:] != (2, len(force)):
+            raise ValueError(
+                f"{path}: {name}: expected pins (four or more, 2, {len(force)}), found {pins.shape}"
+            )
+        along, across = pins[UPPER] - pins[LOWER], pins[RIGHT] - pins[LEFT]
+        spans[name] = np.linalg.norm([along, across], axis=1)
+    length, width = spans[KNIT_PULLS[0]][:, 0]
+    scale = CLAMP_WIDTH / clamp  # [m] a pixel
+    size = float(length * scale), fabric * scale
+    pulls = []
+    for name, (_, force) in arrays.items():
+        extension = (spans[name][0] - length) * scale
+        middle = spans[name][1] / width * size[1]
+        title = f"{path.name}: {name}"
+        pulls.append(Pull.make(extension, force, size, direction, middle, specimen, title))
+    return pulls

@@ -1,8 +1,8 @@
 """Uniaxial pulls of strips: a curve of tension over stretch, as tensile testers give it.
 
-The model is a strip in uniform strain with free sides: it stretches as it is told, and contracts
-and shears as costs it least. Clamps hold the width: a strip four times as long as wide pulls within
-3 % of it, a square one of an isotropic sheet within 15 % (`tests/laboratory/test_laboratory.py`).
+The model is a strip in uniform strain with free sides: at a given stretch it contracts and shears
+so that its energy is least. Clamps hold the width: a strip four times as long as wide pulls within
+3 % of the model, a square one of an isotropic sheet within 15 %.
 """
 
 from collections.abc import Sequence
@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import MembraneLaw
+from r2s.materials.turned import turned
 
 SAMPLES = 24  # of a curve, evenly over its stretch
 SPECIMEN = 0.05  # relative, by which specimens of a fabric differ (standard deviation)
@@ -136,8 +137,9 @@ def uniaxial(
     direction = jnp.asarray(direction, float)
     along = (stretch**2 - 1) / 2
 
-    def energy(along, free):
-        return membrane.energy_density(_in_yarns(along, free, direction))
+    def energy(along, free):  # `free`: strain across, and shear
+        strain = jnp.stack([along, *free])
+        return membrane.energy_density(turned(strain, -direction))
 
     slope = jax.grad(energy, argnums=1)
 
@@ -151,19 +153,6 @@ def uniaxial(
     free = step(found)  # from its minimum a step has the derivatives of the minimum
     tension = stretch * jax.grad(energy)(along, free)
     return tension, jnp.sqrt(jnp.maximum(1 + 2 * free[0], 1e-6))
-
-
-def _in_yarns(along: Array, free: Float[Array, " 2"], direction: Array) -> Float[Array, " 3"]:
-    """Green strain (E11, E22, 2 E12) from that along, across and in shear of a strip."""
-    across, shear = free
-    c, s = jnp.cos(direction), jnp.sin(direction)
-    return jnp.stack(
-        [
-            c**2 * along + s**2 * across - c * s * shear,
-            s**2 * along + c**2 * across + c * s * shear,
-            2 * c * s * (along - across) + (c**2 - s**2) * shear,
-        ]
-    )
 
 
 def _check(name: str, stretch: np.ndarray, tension: np.ndarray, across: np.ndarray) -> None:

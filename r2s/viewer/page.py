@@ -1,21 +1,103 @@
-"""A page with sliders: the cloth follows them, with the recording and its distance beside it."""
+"""A page with sliders: the cloth follows them, with the recording and its distance beside it.
+
+subject = Subject.of_recording(recording, space)
+Page(subject, subject.place(fabric), port=8080)     # http://127.0.0.1:8080, until `close`
+"""
 
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from r2s._util.extras import require
+from r2s.estimation.problem import Clouds
 from r2s.materials.fabric import Fabric
-from r2s.viewer.subject import Moved, Subject, error_used, move
+from r2s.materials.parameters import ParameterSpace
+from r2s.metrics.losses import masked_mean, surface_residuals
+from r2s.recordings.recording import Recording, subsample
+from r2s.scenarios import Experiment
+from r2s.scenarios.scenario import Scenario, from_recording, rollout
+from r2s.solvers.simulate import Trajectory
 
-CLOTH, CLOUD, GRIPPER = (0, 114, 178), (213, 94, 0), (30, 30, 30)  # Okabe and Ito's
+MAX_POINTS = 1500  # of a cloud: more change neither the picture nor the distance
+CLOTH, EDGES, CLOUD, GRIPPER = (0, 114, 178), (0, 60, 100), (213, 94, 0), (30, 30, 30)
 POINT = 0.003  # [m], of a cloud
 PAUSE = 0.02  # [s], between looks at what has changed
+
+
+class Subject(eqx.Module):
+    """A motion that any fabric of a space can make.
+
+    - `scenario`: the motion.
+    - `space`: the fabrics that the sliders reach.
+    - `clouds`: points of a recording, in all its frames; None: there is none.
+    - `frames_used`: the first and the last frame that count.
+    """
+
+    scenario: Scenario
+    space: ParameterSpace
+    clouds: Clouds | None = None
+    frames_used: tuple[int, int] = eqx.field(static=True, default=(0, 0))
+
+    @classmethod
+    def of_recording(
+        cls, recording: Recording, space: ParameterSpace, shape: tuple[int, int] = (9, 9)
+    ) -> "Subject":
+        """The motion of a recording, on a mesh of `shape` vertices; raises as `from_recording`."""
+        sampled = subsample(recording, MAX_POINTS, None, 0)
+        clouds = Clouds(sampled.points, sampled.mask)
+        return cls(from_recording(recording, shape), space, clouds, recording.info.frames_used)
+
+    @classmethod
+    def of_experiment(
+        cls, experiment: Experiment, space: ParameterSpace, shape: tuple[int, int] = (9, 9)
+    ) -> "Subject":
+        """A motion that nobody recorded."""
+        return cls(experiment.scenario(shape), space, None, experiment.frames_used)
+
+    def place(self, fabric: Fabric) -> Float[Array, " dim"]:
+        """The point of a fabric in the unit cube of the space, at its bounds when beyond them."""
+        return jnp.clip(self.space.to_unit(fabric), 0, 1)
+
+
+class Moved(NamedTuple):
+    """A motion of a subject, and its distance from the recording.
+
+    - `error`: mean distance [m] from the recorded points to the sheet in each frame; NaN where
+      there are none, or the simulation diverged.
+    - `mean_error`: over the frames that count [m]; NaN when one of them has none.
+    """
+
+    motion: Trajectory
+    error: Float[Array, " frame"]
+    mean_error: Float[Array, ""]
+
+
+@eqx.filter_jit
+def move(subject: Subject, u: Float[Array, " dim"]) -> Moved:
+    """The motion of the fabric at `u`, and how far the recording is from it.
+
+    A cloud's distance is that of `chamfer_real_to_sim`, but to the surface itself.
+    """
+    motion = rollout(subject.scenario, subject.space(u))
+    error = jnp.full(motion.ok.shape, jnp.nan)
+    if subject.clouds is not None:
+        faces = subject.scenario.scene.mesh.faces
+
+        def distance(frame):
+            points, mask, x = frame
+            return masked_mean(surface_residuals(points, mask, x, faces)[0], mask)
+
+        error = jax.lax.map(distance, (subject.clouds.points, subject.clouds.mask, motion.x))
+        error = jnp.where(motion.ok, error, jnp.nan)
+    first, last = subject.frames_used
+    return Moved(motion, error, jnp.mean(error[first : last + 1]))
 
 
 class Page:
@@ -23,7 +105,7 @@ class Page:
 
     Only the last of the places that a slider was dragged through is simulated. `moved` is the
     motion that the page shows, `u` the place of its fabric in the space, and `failure` the reason
-    when there is no motion of it; `latest` waits for the motion that the sliders ask for.
+    when there is no motion of it.
 
     - `subject`: the motion, the space of fabrics and the recording.
     - `u`: where the sliders begin, in the unit cube of the subject's space.
@@ -31,7 +113,7 @@ class Page:
       of the notification. None: no button.
     - `host`, `port`: 127.0.0.1 lets nobody in from other machines.
 
-    Raises `OSError` when the port is taken.
+    Raises `OSError` when the port is taken, `ImportError` that names the extra.
     """
 
     def __init__(
@@ -50,12 +132,11 @@ class Page:
         self._changed, self._stop = threading.Event(), threading.Event()
         self._drawing = threading.Lock()
         self.server = viser.ViserServer(host=host, port=port, label="r2s", verbose=False)
-        if self.server.get_port() != port:
-            taken = self.server.get_port()
+        if (free := self.server.get_port()) != port:
             self.server.stop()
-            raise OSError(f"port {port} of {host} is taken; {taken} is free")
+            raise OSError(f"port {port} of {host} is taken; {free} is free")
         self._sliders: list[Any] = []
-        self._fill(save)
+        self._add_controls(save)
         self._draw()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -65,31 +146,28 @@ class Page:
         """What to open in a browser."""
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
-    def latest(self, timeout: float = 60.0) -> Moved:
-        """What the sliders ask for now, simulated; `TimeoutError` after `timeout` [s]."""
-        end = time.monotonic() + timeout
-        while time.monotonic() < end:
-            if not self._changed.is_set() and np.array_equal(self.u, self._wanted()):
-                return self.moved
-            time.sleep(PAUSE)
-        raise TimeoutError(f"no motion within {timeout:g} s of the sliders' last move")
-
     def close(self) -> None:
         """End the server and its thread."""
         self._stop.set()
         self._thread.join()
         self.server.stop()
 
-    def _fill(self, save: Callable[[Fabric], str] | None) -> None:
-        """Everything on the page, once."""
+    def _add_controls(self, save: Callable[[Fabric], str] | None) -> None:
+        """The camera, the table, sliders and buttons."""
         gui, scene, subject = self.server.gui, self.server.scene, self.subject
         scene.set_up_direction("+z")
-        middle = np.asarray(self.moved.x).reshape(-1, 3)
-        self._look_at(np.nanmean(middle, axis=0), np.ptp(middle, axis=0).max())
+        points = np.asarray(self.moved.motion.x).reshape(-1, 3)
+        middle, extent = np.nanmean(points, axis=0), np.ptp(points, axis=0).max()
+        eye = middle + extent * np.array([0.7, -1.3, 0.7])
+
+        @self.server.on_client_connect
+        def _(client: Any) -> None:
+            client.camera.position, client.camera.look_at = eye, middle
+
         height = float(subject.scenario.scene.table.height)
         grid = {"cell_size": 0.05, "section_size": 0.25, "position": (0.0, 0.0, height)}
         scene.add_grid("/table", 2.0, 2.0, **grid)
-        last = len(self.moved.ok) - 1
+        last = len(self.moved.motion.ok) - 1
         self._frame = gui.add_slider("frame", 0, last, 1, subject.frames_used[1] or last)
         self._play = gui.add_checkbox("play", False)
         self._frame.on_update(lambda _: self._draw())
@@ -99,16 +177,9 @@ class Page:
             slider = gui.add_slider(bound.name, 0.0, 1.0, 0.01, float(place), hint=hint)
             slider.on_update(lambda _: self._changed.set())
             self._sliders.append(slider)
-        self._text = gui.add_markdown("")  # what they stand for
+        self._text = gui.add_markdown("")
         if save is not None:
             gui.add_button("save card").on_click(lambda event: self._save(save, event))
-
-    def _look_at(self, middle: np.ndarray, extent: float) -> None:
-        eye = middle + extent * np.array([0.7, -1.3, 0.7])
-
-        @self.server.on_client_connect
-        def _(client: Any) -> None:
-            client.camera.position, client.camera.look_at = eye, middle
 
     def _save(self, save: Callable[[Fabric], str], event: Any) -> None:
         try:
@@ -118,16 +189,13 @@ class Page:
         if event.client is not None:
             event.client.add_notification(title, text)
 
-    def _wanted(self) -> np.ndarray:
-        return np.array([slider.value for slider in self._sliders], self.u.dtype)
-
     def _run(self) -> None:
         interval = self.subject.scenario.interval
         due = time.monotonic()
         while not self._stop.is_set():
             if self._changed.is_set():
                 self._changed.clear()
-                wanted = self._wanted()
+                wanted = np.array([slider.value for slider in self._sliders], self.u.dtype)
                 try:
                     self.moved, self.failure = move(self.subject, jnp.asarray(wanted)), ""
                 except RuntimeError as error:  # such as of memory: the page goes on
@@ -136,28 +204,27 @@ class Page:
                 self._draw()
             if self._play.value and time.monotonic() >= due:
                 due = time.monotonic() + interval
-                self._frame.value = (self._frame.value + 1) % len(self.moved.ok)  # draws it
+                frames = len(self.moved.motion.ok)
+                self._frame.value = (self._frame.value + 1) % frames  # draws it
             time.sleep(min(PAUSE, interval))
 
     def _draw(self) -> None:
-        """The frame of the slider."""
-        with self._drawing:
-            frame, moved, scene = int(self._frame.value), self.moved, self.server.scene
-            faces = np.asarray(self.subject.scenario.scene.mesh.faces)
-            x = np.asarray(moved.x[frame], np.float32)
-            is_whole = bool(moved.ok[frame])
-            with self.server.atomic():
-                look = {"color": CLOTH, "side": "double", "flat_shading": True}
-                scene.add_mesh_simple("/cloth", x, faces, visible=is_whole, **look)
-                edges = {"color": (0, 60, 100), "wireframe": True, "visible": is_whole}
-                scene.add_mesh_simple("/mesh", x, faces, **edges)
-                held = x[np.asarray(self.subject.scenario.scene.held)]
-                self._points("/grippers", held, GRIPPER, 4 * POINT)
-                if self.subject.clouds is not None:
-                    mask = np.asarray(self.subject.clouds.mask[frame])
-                    seen = np.asarray(self.subject.clouds.points[frame])[mask]
-                    self._points("/recording", seen, CLOUD, POINT)
-                self._text.content = self._describe(frame)
+        """Draw the frame of the slider."""
+        with self._drawing, self.server.atomic():
+            frame, scene = int(self._frame.value), self.server.scene
+            of_sheet, clouds = self.subject.scenario.scene, self.subject.clouds
+            faces = np.asarray(of_sheet.mesh.faces)
+            x = np.asarray(self.moved.motion.x[frame], np.float32)
+            is_finite = bool(self.moved.motion.ok[frame])
+            look = {"color": CLOTH, "side": "double", "flat_shading": True}
+            scene.add_mesh_simple("/cloth", x, faces, visible=is_finite, **look)
+            edges = {"color": EDGES, "wireframe": True}
+            scene.add_mesh_simple("/mesh", x, faces, visible=is_finite, **edges)
+            self._points("/grippers", x[np.asarray(of_sheet.held)], GRIPPER, 4 * POINT)
+            if clouds is not None:
+                cloud = np.asarray(clouds.points[frame])[np.asarray(clouds.mask[frame])]
+                self._points("/recording", cloud, CLOUD, POINT)
+            self._text.content = self._describe(frame)
 
     def _points(self, name: str, points: np.ndarray, color: tuple, size: float) -> None:
         look = {"point_size": size, "point_shape": "circle", "precision": "float32"}
@@ -177,10 +244,9 @@ class Page:
         elif failure := moved.motion.explain():
             lines.append(f"The simulation {failure}")
         elif self.subject.clouds is not None:
-            error = 1e3 * float(moved.error[frame]), 1e3 * float(error_used(self.subject, moved))
             first, last = self.subject.frames_used
             lines.append(
-                f"Recording to sheet, mean: **{error[0]:.1f} mm** in frame {frame}, "
-                f"**{error[1]:.1f} mm** in frames {first} to {last}."
+                f"Recording to sheet, mean: **{1e3 * float(moved.error[frame]):.1f} mm** in frame "
+                f"{frame}, **{1e3 * float(moved.mean_error):.1f} mm** in frames {first} to {last}."
             )
         return "\n".join(lines)

@@ -1,25 +1,26 @@
 """Pictures of a recording: a contact sheet and a video of clouds, grippers, and simulated cloth.
 
-Where a force was recorded, its curve is drawn below, with a dot for each frame of the picture.
-
     show(open_recording("recording.npz"), "out", load_trajectory("trajectory.npz"))
 
 Needs matplotlib: pip install 'r2s[study]'; the video is an MP4 where OpenCV is installed
 ('r2s[camera]'), else a GIF.
 """
 
+import importlib.util
 import io
-from collections.abc import Iterator
+import itertools
+import tempfile
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from jaxtyping import UInt8
 
 from r2s._util.extras import require
 from r2s._util.files import write_bytes
 from r2s.recordings.open import SimulatedCloth
 from r2s.recordings.recording import Recording, SheetPlacement, cloud, corner
-from r2s.viewer import video_writer
 
 # The object API alone: pyplot would keep every figure, and choose a backend for the caller.
 require("matplotlib", "study", "pictures")
@@ -31,12 +32,13 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # noqa: E402
 
 # Okabe and Ito's colours, which the colour-blind can tell apart.
 CLOTH, CLOUD, GRIPPER, MARKER, GREY = "#0072B2", "#D55E00", "#000000", "#009E73", "#8c8c8c"
-MOST_DOTS = 1500  # a panel; more would hide the cloth
-PANELS = 12  # of the contact sheet, at most
-ABOVE, FROM_ABOVE, AZIMUTH = 18, 50, -60  # [degrees], of the eye; the second for flat scenes
+MAX_DOTS = 1500  # a panel; more would hide the cloth
+MAX_PANELS = 12  # of the contact sheet
+ELEVATION, FLAT_ELEVATION, AZIMUTH = 18, 50, -60  # [degrees], of the eye; the second: flat scenes
 FLAT = 0.3  # least height of the box over its longest side, so that a flat scene can be seen in
 STRIP = 1.7  # [inch], height of the force's curve
 Video = Literal["auto", "gif", "mp4", "none"]
+Pictures = Iterable[UInt8[np.ndarray, "height width 3"]]
 
 
 def show(
@@ -61,10 +63,14 @@ def show(
     folder.mkdir(parents=True, exist_ok=True)
     stem = recording.info.name.replace("/", "_")
     written = [contact_sheet(folder / f"{stem}.png", recording, cloth)]
+    if video == "auto":
+        video = "gif" if importlib.util.find_spec("cv2") is None else "mp4"
     if video != "none":
-        times, frames = np.asarray(recording.times, float), pictures(recording, cloth)
+        times, path = np.asarray(recording.times, float), folder / f"{stem}.{video}"
         interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
-        written.append(video_writer.write_video(folder, stem, frames, interval, video))
+        write = write_mp4 if video == "mp4" else write_gif
+        write(path, pictures(recording, cloth), interval)
+        written.append(path)
     return written
 
 
@@ -72,7 +78,7 @@ def contact_sheet(path: Path, recording: Recording, cloth: SimulatedCloth | None
     """Write up to twelve frames, spread over the recording, as one PNG."""
     content = _Content.make(recording, cloth)
     count = len(recording.times)
-    frames = np.unique(np.linspace(0, count - 1, min(PANELS, count)).round().astype(int))
+    frames = np.unique(np.linspace(0, count - 1, min(MAX_PANELS, count)).round().astype(int))
     columns = min(4, len(frames))
     rows = -(-len(frames) // columns)
     strip = 0.0 if recording.force is None else STRIP
@@ -82,18 +88,41 @@ def contact_sheet(path: Path, recording: Recording, cloth: SimulatedCloth | None
     figure.subplots_adjust(0.0, bottom, 0.96, top - 0.02, wspace=0.06, hspace=0.1)
     for i, frame in enumerate(frames):
         axes: Any = figure.add_subplot(rows, columns, i + 1, projection="3d")
-        _set_up(axes, content)
-        _draw(axes, content, int(frame))
+        _draw_surroundings(axes, content)
+        _draw_frame(axes, content, int(frame))
         axes.set_title(_caption(recording, int(frame)), fontsize=9, y=0.98)
     if strip:
-        curve = _force_curve(figure, recording, 0.75 / height, (strip - 0.45) / height)
+        curve = _draw_force(figure, recording, 0.75 / height, (strip - 0.45) / height)
         _mark_frames(curve, recording, frames)
-    figure.suptitle(_title(recording), fontsize=12)
-    _legend(figure, content)
+    _draw_title_and_legend(figure, content, 12)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=100)
     write_bytes(path, buffer.getvalue())
     return path
+
+
+def pictures(recording: Recording, cloth: SimulatedCloth | None = None) -> Iterator[np.ndarray]:
+    """Each frame as a picture, (height, width, 3) in 0..255, of even sides."""
+    content = _Content.make(recording, cloth)
+    strip = 0.0 if recording.force is None else STRIP - 0.1  # [inch]: sides of even pixels
+    height = 5.6 + strip
+    figure = Figure(figsize=(6.4, height), dpi=100)
+    canvas = FigureCanvasAgg(figure)
+    figure.subplots_adjust(0.0, (0.34 + strip) / height, 0.96, 1 - 0.39 / height)
+    axes: Any = figure.add_subplot(projection="3d")
+    _draw_surroundings(axes, content)
+    _draw_title_and_legend(figure, content, 11)
+    caption = figure.text(0.02, 1 - 0.56 / height, "", fontsize=10)
+    curve = strip and _draw_force(figure, recording, 0.7 / height, (strip - 0.45) / height)
+    for frame in range(len(recording.times)):
+        artists = _draw_frame(axes, content, frame)
+        if strip:
+            artists += _mark_frames(curve, recording, np.array([frame]))
+        caption.set_text(_caption(recording, frame))
+        canvas.draw()
+        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+        for artist in artists:
+            artist.remove()
 
 
 class _Content(NamedTuple):
@@ -113,7 +142,7 @@ class _Content(NamedTuple):
     def make(cls, recording: Recording, cloth: SimulatedCloth | None) -> "_Content":
         generator = np.random.default_rng(0)
         frames = (cloud(recording, frame) for frame in range(len(recording.times)))
-        clouds = [generator.permutation(points)[:MOST_DOTS] for points in frames]
+        clouds = [generator.permutation(points)[:MAX_DOTS] for points in frames]
         return cls(recording, cloth, clouds, *_limits(recording, cloth, np.concatenate(clouds)))
 
     def visible(self, points: np.ndarray) -> np.ndarray:
@@ -121,32 +150,7 @@ class _Content(NamedTuple):
         return _inside(points, self.low, self.high)
 
 
-def pictures(recording: Recording, cloth: SimulatedCloth | None = None) -> Iterator[np.ndarray]:
-    """Each frame as a picture, (height, width, 3) in 0..255, of even sides."""
-    content = _Content.make(recording, cloth)
-    strip = 0.0 if recording.force is None else STRIP - 0.1  # [inch]: sides of even pixels
-    height = 5.6 + strip
-    figure = Figure(figsize=(6.4, height), dpi=100)
-    canvas = FigureCanvasAgg(figure)
-    figure.subplots_adjust(0.0, (0.34 + strip) / height, 0.96, 1 - 0.39 / height)
-    axes: Any = figure.add_subplot(projection="3d")
-    _set_up(axes, content)
-    figure.suptitle(_title(recording), fontsize=11)
-    _legend(figure, content)
-    caption = figure.text(0.02, 1 - 0.56 / height, "", fontsize=10)
-    curve = strip and _force_curve(figure, recording, 0.7 / height, (strip - 0.45) / height)
-    for frame in range(len(recording.times)):
-        drawn = _draw(axes, content, frame)
-        if strip:
-            drawn += _mark_frames(curve, recording, np.array([frame]))
-        caption.set_text(_caption(recording, frame))
-        canvas.draw()
-        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
-        for artist in drawn:
-            artist.remove()
-
-
-def _set_up(axes: Any, content: _Content) -> None:
+def _draw_surroundings(axes: Any, content: _Content) -> None:
     """Limits, one scale for all axes, labels, and what does not move: table and sheet at rest."""
     low, high, info = content.low, content.high, content.recording.info
     axes.patch.set_alpha(0)  # it would cover the labels of the panel to the left
@@ -154,7 +158,7 @@ def _set_up(axes: Any, content: _Content) -> None:
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set_box_aspect(high - low, zoom=0.98)
     is_flat = high[2] - low[2] < 1.01 * FLAT * (high - low).max()
-    axes.view_init(elev=FROM_ABOVE if is_flat else ABOVE, azim=AZIMUTH)
+    axes.view_init(elev=FLAT_ELEVATION if is_flat else ELEVATION, azim=AZIMUTH)
     for axis, name in ((axes.xaxis, "x"), (axes.yaxis, "y"), (axes.zaxis, "z")):
         axis.set_major_locator(MaxNLocator(3))
         axis.set_label_text(f"{name} [m]", fontsize=8)
@@ -168,38 +172,40 @@ def _set_up(axes: Any, content: _Content) -> None:
         axes.plot(*edge.T, np.full(5, info.table_height), color=GREY, linewidth=0.6, zorder=1)
 
 
-def _draw(axes: Any, content: _Content, frame: int) -> list[Any]:
-    """Draw what moves, as it is in a frame."""
-    drawn, recording, cloth = [], content.recording, content.cloth
+def _draw_frame(axes: Any, content: _Content, frame: int) -> list[Any]:
+    """Draw what moves, as it is in a frame; the artists."""
+    artists, recording, cloth = [], content.recording, content.cloth
     if cloth is not None:
         x = cloth.x[frame]
         faces = cloth.faces[content.visible(x)[cloth.faces].all(axis=1)]
         style: dict[str, Any] = {"facecolor": (CLOTH, 0.25), "edgecolor": (CLOTH, 0.7)}
         sheet = Poly3DCollection(x[faces], linewidth=0.35, zorder=3, **style)
-        drawn.append(axes.add_collection3d(sheet))
+        artists.append(axes.add_collection3d(sheet))
         if len(faces) < len(cloth.faces):
             text = "part of the cloth is out of the picture"
             place = {"ha": "center", "transform": axes.transAxes}
-            drawn.append(axes.text2D(0.5, 0.02, text, fontsize=8, **place))
+            artists.append(axes.text2D(0.5, 0.02, text, fontsize=8, **place))
     points = content.clouds[frame]
     points = points[content.visible(points)]
     dots: dict[str, Any] = {"linewidths": 0, "depthshade": False}
-    drawn.append(axes.scatter(*points.T, s=2.2, color=CLOUD, zorder=5, **dots))
+    artists.append(axes.scatter(*points.T, s=2.2, color=CLOUD, zorder=5, **dots))
     if recording.markers is not None and recording.markers_seen is not None:
         seen = np.asarray(recording.markers)[frame][np.asarray(recording.markers_seen)[frame]]
         crosses: dict[str, Any] = {"marker": "x", "depthshade": False}
-        drawn.append(axes.scatter(*seen.T, s=14, color=MARKER, zorder=6, **crosses))
-    for path in _grippers(recording, frame):
-        drawn += axes.plot(*path.T, color=GRIPPER, linewidth=0.9, zorder=7)
-        drawn += axes.plot(*path[-1:].T, "o", color=GRIPPER, markersize=5, zorder=8)
-    return drawn
+        artists.append(axes.scatter(*seen.T, s=14, color=MARKER, zorder=6, **crosses))
+    times, now = np.asarray(recording.handle_times), float(recording.times[frame])
+    knots = np.append(times[times < now], now)
+    for gripper in np.asarray(recording.handle_path).transpose(1, 2, 0):  # its path so far
+        path = np.stack([np.interp(knots, times, axis) for axis in gripper])
+        artists += axes.plot(*path, color=GRIPPER, linewidth=0.9, zorder=7)
+        artists += axes.plot(*path[:, -1:], "o", color=GRIPPER, markersize=5, zorder=8)
+    return artists
 
 
-def _force_curve(figure: Any, recording: Recording, bottom: float, height: float) -> Any:
+def _draw_force(figure: Any, recording: Recording, bottom: float, height: float) -> Any:
     """The force [N] while the frames were taken, in a strip of the figure; of a vector its size."""
     axes = figure.add_axes((0.08, bottom, 0.86, height))
-    force = _force(recording)
-    axes.plot(np.asarray(recording.force_times), force, color=GRIPPER, linewidth=1.1)
+    axes.plot(np.asarray(recording.force_times), _force(recording), color=GRIPPER, linewidth=1.1)
     times = np.asarray(recording.times)
     margin = 0.02 * float(np.ptp(times)) or 1.0
     axes.set_xlim(times[0] - margin, times[-1] + margin)
@@ -221,17 +227,6 @@ def _mark_frames(axes: Any, recording: Recording, frames: np.ndarray) -> list[An
 def _force(recording: Recording) -> np.ndarray:
     force = np.asarray(recording.force)
     return force if force.ndim == 1 else np.linalg.norm(force, axis=1)
-
-
-def _grippers(recording: Recording, frame: int) -> list[np.ndarray]:
-    """The path [m] of each gripper up to a frame, which ends where it is then."""
-    times, path = np.asarray(recording.handle_times), np.asarray(recording.handle_path)
-    now = float(recording.times[frame])
-    knots = np.append(times[times < now], now)
-    return [
-        np.stack([np.interp(knots, times, axis) for axis in handle.T], axis=1)
-        for handle in path.transpose(1, 0, 2)
-    ]
 
 
 def _inside(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -273,18 +268,16 @@ def _outline(sheet: SheetPlacement) -> np.ndarray:
     return np.stack([corner(sheet, name) for name in names])
 
 
-def _title(recording: Recording) -> str:
-    info = recording.info
-    return f"{info.name}: {info.scenario}, {info.fabric}, trial {info.trial}"
-
-
 def _caption(recording: Recording, frame: int) -> str:
     first, last = recording.info.frames_used
     counts = "" if first <= frame <= last else " (not used)"
     return f"frame {frame}, {float(recording.times[frame]):.2f} s{counts}"
 
 
-def _legend(figure: Any, content: _Content) -> None:
+def _draw_title_and_legend(figure: Any, content: _Content, fontsize: int) -> None:
+    info = content.recording.info
+    title = f"{info.name}: {info.scenario}, {info.fabric}, trial {info.trial}"
+    figure.suptitle(title, fontsize=fontsize)
     outside = 1 - float(content.visible(np.concatenate(content.clouds)).mean())
     left_out = f" ({outside:.1%} out of the picture)" if outside >= 5e-4 else ""
     dot: dict[str, Any] = {"linestyle": "", "marker": "o"}
@@ -301,3 +294,40 @@ def _legend(figure: Any, content: _Content) -> None:
     spacing: dict[str, Any] = {"columnspacing": 0.9, "handletextpad": 0.3} if narrow else {}
     spacing |= {"loc": "lower center", "ncols": len(handles), "frameon": False}
     figure.legend(handles=handles, fontsize=7.5 if narrow else 9, **spacing)
+
+
+def write_gif(path: Path, frames: Pictures, interval: float) -> None:
+    """Write pictures, one each `interval` [s], as a GIF, of up to 50 a second."""
+    from PIL import Image  # comes with matplotlib
+
+    images = [Image.fromarray(pixels) for pixels in frames]
+    # One palette for all, from the fullest picture: else colours flicker, and files are larger.
+    palette = images[len(images) // 2].quantize(64)
+    small = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    buffer = io.BytesIO()
+    # GIFs count in hundredths of a second: round the times, not the intervals, which would add up.
+    times = np.round(100 * interval * np.arange(len(small) + 1))
+    duration = [max(20, 10 * int(step)) for step in np.diff(times)]  # [ms]
+    options = {"save_all": True, "append_images": small[1:], "loop": 0, "optimize": False}
+    small[0].save(buffer, format="GIF", duration=duration, **options)
+    write_bytes(path, buffer.getvalue())
+
+
+def write_mp4(path: Path, frames: Pictures, interval: float) -> None:
+    """Write pictures of even sides, one each `interval` [s], as an MP4.
+
+    Needs OpenCV: pip install 'r2s[camera]'. Raises OSError where it cannot write MP4.
+    """
+    cv2 = require("cv2", "camera", "videos as MP4 (a GIF needs no extra)")
+    frames = iter(frames)
+    first = next(frames)
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        part = Path(folder) / "video.mp4"
+        size, code = first.shape[1::-1], cv2.VideoWriter.fourcc(*"mp4v")
+        writer = cv2.VideoWriter(str(part), code, 1 / interval, size)
+        if not writer.isOpened():
+            raise OSError(f"{path}: OpenCV cannot write MP4 here: ask for a GIF")
+        for pixels in itertools.chain([first], frames):
+            writer.write(np.ascontiguousarray(pixels[..., ::-1]))
+        writer.release()
+        write_bytes(path, part.read_bytes())

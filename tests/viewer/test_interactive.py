@@ -25,7 +25,7 @@ from r2s.metrics.prediction_error import distances
 from r2s.recordings.recording import cloud
 from r2s.scenarios import lifting, synthetic
 from r2s.viewer import page
-from r2s.viewer import subject as subjects
+from r2s.viewer.page import Subject, move
 
 pytest.importorskip("viser")
 
@@ -49,12 +49,12 @@ def recording():
 @pytest.fixture(scope="module")
 def subject(recording):
     space = OrthotropicSpace.make(float(presets.grey_interlock().density))
-    return subjects.of_recording(recording, space, SHAPE)
+    return Subject.of_recording(recording, space, SHAPE)
 
 
 @pytest.fixture
 def shown(subject):
-    start = subjects.place(subject, presets.grey_interlock())
+    start = subject.place(presets.grey_interlock())
     made = page.Page(subject, start, port=free_port())
     yield made
     made.close()
@@ -68,36 +68,37 @@ def free_port():
 
 @pytest.mark.slow(group="documents")
 def test_the_error_is_the_distance_to_dense_samples_of_the_sheet(recording, subject):
-    moved = subjects.move(subject, subjects.place(subject, presets.black_denim()))
+    moved = move(subject, subject.place(presets.black_denim()))
     first, last = subject.frames_used
     faces = subject.scenario.scene.mesh.faces
     found = [
-        distances(cloud(recording, frame), np.asarray(sample(moved.x[frame], faces, 30)))
+        distances(cloud(recording, frame), np.asarray(sample(moved.motion.x[frame], faces, 30)))
         for frame in range(first, last + 1)
     ]
     expected = np.mean([each["chamfer_real_to_sim"] for each in found])
     # samples 4 mm apart, and not all of the points
-    assert float(subjects.error_used(subject, moved)) == pytest.approx(expected, abs=1e-3)
+    assert float(moved.mean_error) == pytest.approx(expected, abs=1e-3)
 
 
 @pytest.mark.slow(group="documents")
 def test_the_true_fabric_is_nearest_and_a_softer_one_hangs_lower(subject):
-    truth = subjects.place(subject, presets.grey_interlock())
+    truth = subject.place(presets.grey_interlock())
 
     def at(u):
-        return subjects.move(subject, u)
+        return move(subject, u)
 
     softer = at(truth.at[0].set(0.0))
-    assert subjects.error_used(subject, at(truth)) < subjects.error_used(subject, softer)
-    assert softer.x[-1, :, 2].min() <= at(truth).x[-1, :, 2].min() + 1e-4
+    assert at(truth).mean_error < softer.mean_error
+    lowest = [each.motion.x[-1, :, 2].min() for each in (softer, at(truth))]
+    assert lowest[0] <= lowest[1] + 1e-4
 
 
 @pytest.mark.slow(group="documents")
 def test_without_a_recording_there_is_no_error():
     experiment = lifting(num_frames=3, moving=0.1)
-    subject = subjects.of_experiment(experiment, OrthotropicSpace.make(0.2), (3, 3))
-    moved = subjects.move(subject, jnp.full(subject.space.dim, 0.5))
-    assert bool(moved.ok.all()) and np.isnan(np.asarray(moved.error)).all()
+    subject = Subject.of_experiment(experiment, OrthotropicSpace.make(0.2), (3, 3))
+    moved = move(subject, jnp.full(subject.space.dim, 0.5))
+    assert bool(moved.motion.ok.all()) and np.isnan(np.asarray(moved.error)).all()
 
 
 def test_without_viser_the_extra_is_named(monkeypatch, subject):
@@ -115,10 +116,10 @@ def test_only_the_last_place_of_a_slider_is_shown(subject, shown):
     before = shown.moved
     for value in np.linspace(0.1, 0.9, 9):
         shown._sliders[2].value = float(value)
-    after = shown.latest()
-    assert shown.u[2] == pytest.approx(0.9)
-    assert np.allclose(after.x, subjects.move(subject, jnp.asarray(shown.u)).x)
-    assert not np.allclose(after.x, before.x, atol=1e-3)
+    wait_for(lambda: shown.u[2] == pytest.approx(0.9))
+    after = shown.moved.motion.x
+    assert np.allclose(after, move(subject, jnp.asarray(shown.u)).motion.x)
+    assert not np.allclose(after, before.motion.x, atol=1e-3)
 
 
 def test_a_motion_that_fails_is_said_and_the_page_goes_on(shown, monkeypatch):
@@ -128,10 +129,12 @@ def test_a_motion_that_fails_is_said_and_the_page_goes_on(shown, monkeypatch):
     before, whole = shown.moved, page.move
     monkeypatch.setattr(page, "move", fail)
     shown._sliders[2].value = 0.2
-    assert shown.latest() is before and "out of memory" in shown._describe(0)
+    wait_for(lambda: shown.u[2] == pytest.approx(0.2))
+    assert shown.moved is before and "out of memory" in shown._describe(0)
     monkeypatch.setattr(page, "move", whole)
     shown._sliders[2].value = 0.3
-    assert shown.latest() is not before and not shown.failure
+    wait_for(lambda: shown.moved is not before)
+    assert not shown.failure
 
 
 def test_what_cannot_be_saved_is_said(shown):
@@ -221,12 +224,12 @@ def test_a_slider_moved_in_a_browser_moves_the_cloth(shown, tmp_path):
         browser.evaluate(f"{SLIDER}.focus()")
         browser.press("Home")
         wait_for(lambda: shown.u[0] == 0)
-        after = shown.latest()
+        after = shown.moved
         time.sleep(2)
         changed = browser.picture()
         (tmp_path / "before.png").write_bytes(picture)
         (tmp_path / "after.png").write_bytes(changed)
-        assert not np.allclose(after.x, before.x, atol=1e-3)
+        assert not np.allclose(after.motion.x, before.motion.x, atol=1e-3)
         sheets = is_blue(picture), is_blue(changed)
         assert min(sheet.sum() for sheet in sheets) > 1000
         assert (sheets[0] ^ sheets[1]).sum() > 0.05 * sheets[0].sum()

@@ -16,11 +16,9 @@ from r2s.recordings.open import (
     open_recording,
     save_trajectory,
 )
-from r2s.recordings.recording import (
-    save,
-)
+from r2s.recordings.recording import save
 from r2s.viewer.pictures import (
-    _force_curve,
+    _draw_force,
     _mark_frames,
     contact_sheet,
     pictures,
@@ -71,7 +69,7 @@ def test_the_force_is_drawn_below(tmp_path: Path, vector: bool) -> None:
     force = 3 * times
     log = np.outer(force, [0.6, 0.0, -0.8]) if vector else force
     pulled = recorded(force=log, force_times=times)
-    curve = _force_curve(Figure(), pulled, 0.1, 0.2)
+    curve = _draw_force(Figure(), pulled, 0.1, 0.2)
     np.testing.assert_allclose(curve.lines[0].get_ydata(), force, rtol=1e-12)
     (marked,) = _mark_frames(curve, pulled, np.arange(FRAMES))
     expected = np.where(np.arange(FRAMES) / 15 < 0.1, np.nan, np.arange(FRAMES) / 5)
