@@ -79,25 +79,27 @@ class Moved(NamedTuple):
     mean_error: Float[Array, ""]
 
 
-@eqx.filter_jit
 def move(subject: Subject, u: Float[Array, " dim"]) -> Moved:
-    """The motion of the fabric at `u`, and how far the recording is from it.
-
-    A cloud's distance is that of `chamfer_real_to_sim`, but to the surface itself.
-    """
-    motion = rollout(subject.scenario, subject.space(u))
-    error = jnp.full(motion.ok.shape, jnp.nan)
-    if subject.clouds is not None:
-        faces = subject.scenario.scene.mesh.faces
-
-        def distance(frame):
-            points, mask, x = frame
-            return masked_mean(surface_residuals(points, mask, x, faces)[0], mask)
-
-        error = jax.lax.map(distance, (subject.clouds.points, subject.clouds.mask, motion.x))
-        error = jnp.where(motion.ok, error, jnp.nan)
+    """The motion of the fabric at `u`, and how far the recording is from it."""
+    motion, error = _simulated(subject, u)
     first, last = subject.frames_used
     return Moved(motion, error, jnp.mean(error[first : last + 1]))
+
+
+@eqx.filter_jit
+def _simulated(subject: Subject, u: Float[Array, " dim"]) -> tuple[Trajectory, Array]:
+    """The motion, and its `error`: that of `chamfer_real_to_sim`, but to the surface itself."""
+    motion = rollout(subject.scenario, subject.space(u))
+    if subject.clouds is None:
+        return motion, jnp.full(motion.ok.shape, jnp.nan)
+    faces = subject.scenario.scene.mesh.faces
+
+    def distance(frame):
+        points, mask, x = frame
+        return masked_mean(surface_residuals(points, mask, x, faces)[0], mask)
+
+    error = jax.lax.map(distance, (subject.clouds.points, subject.clouds.mask, motion.x))
+    return motion, jnp.where(motion.ok, error, jnp.nan)
 
 
 class Page:

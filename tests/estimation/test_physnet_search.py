@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("skopt")
 pytest.importorskip("sklearn")
 
-from r2s.estimation.physnet import bayes, emulator, search  # noqa: E402
+from r2s.estimation.physnet.search import bayesian, emulated  # noqa: E402
 
 TRUTH = np.array([0.3, 0.7, 0.55])
 
@@ -21,25 +21,25 @@ def respond(places):
 
 
 TARGET = respond(TRUTH[None])[0]
-optimised = partial(search.minimise, ask=bayes.ask, num_first=8)
+optimised = partial(bayesian, num_first=8)
 
 
 def test_answers_find_what_losses_alone_do_not_and_losses_what_chance_does_not():
-    emulated = emulator.search(respond, TARGET, 3, num_calls=24, seed=1)
+    found = emulated(respond, TARGET, 3, num_calls=24, seed=1)
     by_losses = optimised(respond, TARGET, dim=3, num_calls=24, seed=1)
     random = respond(np.random.default_rng(1).random((24, 3))) - TARGET
-    assert np.abs(emulated.places[-1] - TRUTH).max() < 0.02
-    assert emulated.losses[-1] < by_losses.losses.min() / 2
+    assert np.abs(found.places[-1] - TRUTH).max() < 0.02
+    assert found.losses[-1] < by_losses.losses.min() / 2
     assert by_losses.losses.min() < np.sqrt((random**2).mean(axis=1)).min()
 
 
 def test_a_flawed_target_is_not_followed_beyond_its_flaws():
     flawed = TARGET + 0.1 * np.random.default_rng(0).standard_normal(12)
-    found = emulator.search(respond, flawed, 3, num_calls=24, seed=1)
+    found = emulated(respond, flawed, 3, num_calls=24, seed=1)
     assert np.abs(found.places[-1] - TRUTH).max() < 0.15
 
 
-@pytest.mark.parametrize("run", [partial(emulator.search, dim=3), partial(optimised, dim=3)])
+@pytest.mark.parametrize("run", [partial(emulated, dim=3), partial(optimised, dim=3)])
 def test_a_search_continues_from_its_file_as_if_uninterrupted(run, tmp_path):
     path = tmp_path / "trials.npz"
     whole = run(respond, TARGET, num_calls=15, seed=2)
@@ -63,12 +63,12 @@ def test_calls_that_fail_are_left_out_and_avoided():
     def fails(places):
         return np.where(places[:, [0]] > 0.5, np.nan, respond(places))
 
-    found = emulator.search(fails, TARGET, 3, num_calls=24, seed=0)
+    found = emulated(fails, TARGET, 3, num_calls=24, seed=0)
     assert np.isnan(found.losses[:9]).sum() >= 3
     assert np.abs(found.places[-1] - TRUTH).max() < 0.05
     optimum = optimised(fails, TARGET, dim=3, num_calls=16, seed=0)
     assert np.isnan(optimum.losses[8:]).mean() < 0.4
     with pytest.raises(RuntimeError, match="all 9 calls failed"):
-        emulator.search(lambda places: respond(places) * np.nan, TARGET, 3, num_calls=24)
+        emulated(lambda places: respond(places) * np.nan, TARGET, 3, num_calls=24)
     with pytest.raises(ValueError, match="at least 5 calls in 3 dimensions, got 4"):
-        emulator.search(respond, TARGET, 3, num_calls=4)
+        emulated(respond, TARGET, 3, num_calls=4)

@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 
 from r2s.estimation import checkpoint
-from r2s.estimation.physnet import training, triplets
+from r2s.estimation.physnet import training
 from r2s.estimation.physnet.dataset import DEPTH_UNIT, Data
-from r2s.estimation.physnet.network import DEEPER, PAPER, Architecture, PhysNet
-from r2s.estimation.physnet.preprocess import Flaws
-from r2s.estimation.physnet.training import Schedule
-from r2s.estimation.physnet.views import View
+from r2s.estimation.physnet.images import Flaws, View
+from r2s.estimation.physnet.training import DEEPER, PAPER, Architecture, PhysNet, Schedule
 
 VIEW = View((0.0, -1.0, 0.0), (0.0, 0.0, 0.0), 16.0, 16, 0.5, 1.5, -1.0)
 SMALL = Architecture(size=16, channels=(4, 4), hidden=(16,))
@@ -47,7 +45,7 @@ def data() -> Data:
 
 
 def divided(data, needed=SHORT.fabrics):
-    return triplets.split(data, SHORT.validation, needed, SHORT.seed)
+    return training.split(data, SHORT.validation, needed, SHORT.seed)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +58,7 @@ def trained(data):
 def test_learns_to_tell_unseen_classes_apart(data, trained):
     _, validation = divided(data)
     untrained = training.begin(VIEW, SMALL, SHORT).network
-    before = training.judge(untrained, VIEW, validation, SHORT)[1]
+    before = training.validate(untrained, VIEW, validation, SHORT)[1]
     assert trained.curve[-1].accuracy > 0.85 > before
     assert trained.curve[-1].loss < 0.7 * trained.curve[0].loss
 
@@ -124,7 +122,7 @@ def test_a_fabric_is_for_training_or_for_validation(data):
 
 def test_triplets_are_of_two_motions_of_a_fabric_and_another(data):
     _, images = divided(data)
-    anchor, positive, negative = triplets.triplets(images, 200, 0).T
+    anchor, positive, negative = training.triplets(images, 200, 0).T
     assert (images.fabric[anchor] == images.fabric[positive]).all()
     assert (images.motion[anchor] != images.motion[positive]).all()
     assert (images.fabric[anchor] != images.fabric[negative]).all()
@@ -139,7 +137,7 @@ def test_losses_of_three_points_on_a_line():
         for anchor in pair:
             others = [v for k, v in squares.items() if anchor in k]
             losses += [max(own - other + 5, 0) for other in others]
-    np.testing.assert_allclose(triplets.triplet_loss(points, 5.0), np.mean(losses))
+    np.testing.assert_allclose(training.triplet_loss(points, 5.0), np.mean(losses))
 
 
 def test_the_paper_s_network_has_its_layers():

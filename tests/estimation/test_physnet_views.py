@@ -10,18 +10,19 @@ from rgbd_scene import calibrated
 from scipy import ndimage
 
 from r2s import scenarios
-from r2s.estimation.physnet import preprocess, views
-from r2s.estimation.physnet.views import View
+from r2s.estimation.physnet import images
+from r2s.estimation.physnet.images import View, depths_of_sheet, view_around
 from r2s.mesh.mesh import rectangle
-from r2s.recordings.cameras import Camera, DepthCamera
-from r2s.recordings.views import render
+from r2s.recordings.cameras.calibration import DepthCamera, calibrated
+from r2s.recordings.cameras.camera import Camera
+from r2s.recordings.cameras.render import render
 from r2s.scenarios import synthetic
 
 VIEW = View((0.1, -0.4, 0.6), (0.1, 0.1, 0.1), 40.0, 32, 0.4, 1.0, -1.0)
 MESH = rectangle((0.3, 0.3), (4, 4))
-seen_by = jax.jit(views.depth_of, static_argnums=0)
-shown = jax.jit(preprocess.grey, static_argnums=0)
-CLEAN = preprocess.Flaws(noise=0.0, holes=0.0, strays=0.0, lost=0.0, gained=0.0, flying=0.0)
+seen_by = jax.jit(images.depth_of, static_argnums=0)
+shown = jax.jit(images.grey, static_argnums=0)
+CLEAN = images.Flaws(noise=0.0, holes=0.0, strays=0.0, lost=0.0, gained=0.0, flying=0.0)
 TILTED = np.c_[np.asarray(MESH.rest), 0.1 + 0.4 * np.asarray(MESH.rest[:, 1])]
 
 
@@ -32,7 +33,7 @@ def camera_of(view: View) -> DepthCamera:
 
 
 def drawn(view: View = VIEW):
-    depth = views.depths_of_sheet(view, jnp.asarray(TILTED)[None], MESH.faces, 24)
+    depth = depths_of_sheet(view, jnp.asarray(TILTED)[None], MESH.faces, 24)
     return np.asarray(depth[0])
 
 
@@ -62,7 +63,7 @@ def test_nearer_layers_hide_others_and_the_floor_is_left_out():
 
 def test_a_view_around_points_holds_them_all():
     points = np.random.default_rng(0).uniform([0, 0, 0], [0.4, 0.3, 0.2], (200, 3))
-    view = views.view_around((-0.5, -0.1, 0.5), points, 64, 0.01)
+    view = view_around((-0.5, -0.1, 0.5), points, 64, 0.01)
     seen = points[:, 2] > 0.01
     depth = seen_by(view, jnp.asarray(points), jnp.ones(200, bool))
     found = np.asarray(depth)[np.asarray(depth) > 0]
@@ -70,7 +71,7 @@ def test_a_view_around_points_holds_them_all():
     alone = jax.jit(jax.vmap(lambda p: seen_by(view, p[None], jnp.array([True])).max()))
     assert float(alone(jnp.asarray(points[seen])).min()) > 0
     with pytest.raises(ValueError, match="no point is higher than 1 m"):
-        views.view_around((-0.5, -0.1, 0.5), points, 64, 1.0)
+        view_around((-0.5, -0.1, 0.5), points, 64, 1.0)
 
 
 def test_measured_points_cover_as_much_as_the_surface_does():
@@ -85,7 +86,7 @@ def test_measured_points_cover_as_much_as_the_surface_does():
     whole = covered(jnp.asarray(drawn()))
     points = jnp.asarray(places)
     assert covered(seen_by(VIEW, points, there)) < 0.97 * whole
-    measured = jax.jit(preprocess.of_points, static_argnums=0)(VIEW, points, there)
+    measured = jax.jit(images.depth_of_cloud, static_argnums=0)(VIEW, points, there)
     assert 0.97 < covered(measured) / whole < 1.03
 
 
@@ -107,12 +108,11 @@ def test_holes_are_filled_and_strays_dropped():
 def test_flaws_are_those_asked_for():
     depth = jnp.full((32, 32), 0.8)
     flaws = CLEAN._replace(noise=1e-3)
-    noisy = preprocess.flawed(depth, VIEW, flaws, jax.random.key(0))
+    noisy = images.flawed(depth, VIEW, flaws, jax.random.key(0))
     np.testing.assert_allclose(np.std(noisy), 0.64e-3, rtol=0.1)
     flaws = CLEAN._replace(holes=0.4)
     shares = [
-        float((preprocess.flawed(depth, VIEW, flaws, jax.random.key(i)) == 0).mean())
-        for i in range(20)
+        float((images.flawed(depth, VIEW, flaws, jax.random.key(i)) == 0).mean()) for i in range(20)
     ]
     assert max(shares) < 0.5 and min(shares) < 0.1 < np.mean(shares) < 0.3
 
@@ -122,19 +122,19 @@ def test_borders_lose_gain_and_err_and_nothing_else_does():
     there = whole > 0
     inner = np.asarray(ndimage.binary_erosion(there, np.ones((3, 3))), bool)
     outer = np.asarray(ndimage.binary_dilation(there, np.ones((3, 3))), bool)
-    flaw = jax.jit(jax.vmap(preprocess.flawed, in_axes=(None, None, None, 0)), static_argnums=1)
+    flaw = jax.jit(jax.vmap(images.flawed, in_axes=(None, None, None, 0)), static_argnums=1)
     keys = jax.random.split(jax.random.key(0), 50)
     flaws = CLEAN._replace(lost=0.5, gained=0.2, flying=1e-2)
-    images = np.asarray(flaw(jnp.asarray(whole), VIEW, flaws, keys))
+    broken = np.asarray(flaw(jnp.asarray(whole), VIEW, flaws, keys))
     np.testing.assert_array_equal(
-        images[:, inner], np.broadcast_to(whole[inner], (50, inner.sum()))
+        broken[:, inner], np.broadcast_to(whole[inner], (50, inner.sum()))
     )
-    assert (images[:, ~outer] == 0).all()
-    lost = (images[:, there & ~inner] == 0).mean(axis=1)  # from 0 to `lost`, by image
+    assert (broken[:, ~outer] == 0).all()
+    lost = (broken[:, there & ~inner] == 0).mean(axis=1)  # from 0 to `lost`, by image
     assert lost.min() < 0.1 and 0.4 < lost.max() < 0.65 and 0.2 < lost.mean() < 0.3
-    gained = (images[:, outer & ~there] > 0).mean(axis=1)
+    gained = (broken[:, outer & ~there] > 0).mean(axis=1)
     assert gained.max() < 0.35 and 0.06 < gained.mean() < 0.14
-    edge = images[:, there & ~inner]
+    edge = broken[:, there & ~inner]
     error = np.abs(edge - whole[there & ~inner])[edge > 0]
     assert 2e-3 < error.mean() < 8e-3  # of Laplace's, the mean is the scale: 0 to 1e-2
 
@@ -150,13 +150,13 @@ def test_borders_lose_gain_and_err_and_nothing_else_does():
 )
 def test_broken_depth_is_refused(depths, message):
     with pytest.raises(ValueError, match=message):
-        preprocess.of_depths(VIEW, depths, "cup", (5, 9))
+        images.of_depths(VIEW, depths, "cup", (5, 9))
 
 
 def test_clouds_become_depth(fabric):
     experiment = scenarios.lifting()
-    view = views.view_around(
-        views.eye_of(experiment), np.array([[0, 0, 0.01], [0.45, 0.45, 0.4]]), 32, 0.004
+    view = view_around(
+        images.eye_of(experiment), np.array([[0, 0, 0.01], [0.45, 0.45, 0.4]]), 32, 0.004
     )
     cloud = np.random.default_rng(0).uniform([0.1, 0.1, 0.1], [0.3, 0.3, 0.3], (2000, 3))
     info = synthetic.RecordingInfo(
@@ -164,12 +164,12 @@ def test_clouds_become_depth(fabric):
     )
     path = np.zeros((2, 1, 3))
     recording = synthetic.make_recording([cloud, cloud[:1999]], [0, 1], path, [0, 1], info)
-    images = preprocess.of_clouds(view, recording, (0, 1))
-    assert images.shape == (2, 32, 32)
-    assert np.abs(images[0] - images[1]).max() < 0.3
+    seen = images.of_clouds(view, recording, (0, 1))
+    assert seen.shape == (2, 32, 32)
+    assert np.abs(seen[0] - seen[1]).max() < 0.3
     far = dataclasses.replace(recording, points=recording.points * 1000)
     with pytest.raises(ValueError, match="r, frame 0: 0 pixels have a depth.*units are not metres"):
-        preprocess.of_clouds(view, far, (0, 1))
+        images.of_clouds(view, far, (0, 1))
 
 
 def test_a_stray_point_that_was_spread_is_dropped():
@@ -177,9 +177,9 @@ def test_a_stray_point_that_was_spread_is_dropped():
     plane = np.random.default_rng(0).uniform([0, 0], inside, (1500, 2))
     points = np.c_[plane, 0.1 + 0.4 * plane[:, 1]]
     far = np.array([[-0.1, 0.1, 0.1], [-0.12, 0.2, 0.15]])  # beside the sheet
-    see = jax.jit(lambda points: preprocess.of_points(VIEW, points, jnp.ones(len(points), bool)))
+    see = jax.jit(lambda points: images.depth_of_cloud(VIEW, points, jnp.ones(len(points), bool)))
     clean, stray = (np.asarray(see(jnp.asarray(p))) for p in (points, np.r_[points, far]))
-    plain = np.asarray(views.depth_of(VIEW, jnp.asarray(far), jnp.ones(2, bool), jnp.asarray(0.5)))
+    plain = np.asarray(images.depth_of(VIEW, jnp.asarray(far), jnp.ones(2, bool), jnp.asarray(0.5)))
     assert (plain > 0).sum() >= 4  # more than a pixel for each
     alone = (plain > 0) & (clean == 0)
     assert alone.any() and (stray[alone] == 0).all()

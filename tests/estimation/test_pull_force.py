@@ -9,11 +9,17 @@ import numpy as np
 import pytest
 
 from r2s.estimation.physnet import estimator, training
-from r2s.estimation.physnet.estimator import Sighting
+from r2s.estimation.physnet.estimator import (
+    FLAW,
+    NOISE,
+    SCALE,
+    ImageObservation,
+    PullForce,
+    pull_force,
+)
+from r2s.estimation.physnet.images import eye_of, floor_of, view_around
 from r2s.estimation.physnet.method import PhysNetMethod, PublishedPhysNet
-from r2s.estimation.physnet.network import Architecture
-from r2s.estimation.physnet.pull_force import FLAW, NOISE, SCALE, PullForce, pull_force
-from r2s.estimation.physnet.views import eye_of, floor_of, view_around
+from r2s.estimation.physnet.training import Architecture
 from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
 from r2s.scenarios import lifting, stretching, synthetic
@@ -32,7 +38,7 @@ def recording():
 
 
 @pytest.fixture(scope="module")
-def sighting(recording):
+def observation(recording):
     """With an untrained network and empty images: only the force tells."""
     experiment, seen = recording
     scenario = experiment.scenario(SHAPE)
@@ -41,18 +47,18 @@ def sighting(recording):
     view = view_around(eye_of(experiment), points, 16, floor_of(experiment))
     untrained = training.begin(view, Architecture(16, (4,), (8,)))
     images, pull = np.zeros((len(FRAMES), 16, 16)), pull_force(seen, FRAMES)
-    return Sighting.make(scenario, images, FRAMES, SPACE, untrained, pull=pull)
+    return ImageObservation.make(scenario, images, FRAMES, SPACE, untrained, pull=pull)
 
 
-def test_the_true_force_is_where_it_was_recorded_and_twice_the_stiffness_apart(sighting):
+def test_the_true_force_is_where_it_was_recorded_and_twice_the_stiffness_apart(observation):
     true = SPACE.to_unit(KNIT)
     warp, weft = (SPACE.ranges[i] for i in (0, 1))
     slippery = true.at[-1].set(0.0)  # so that the yarns take the pull alone, not the table
     twice = slippery.at[0].add(np.log(2) / warp.width).at[1].add(np.log(2) / weft.width)
-    answers = np.asarray(estimator.answers(sighting, jnp.stack([true, slippery, twice])))
-    width = sighting.points.shape[1]
+    answers = np.asarray(estimator.answers(observation, jnp.stack([true, slippery, twice])))
+    width = observation.points.shape[1]
     parts = [each.reshape(len(FRAMES), width) / np.sqrt(width) for each in answers]
-    recorded = np.asarray(sighting.points[:, -1])  # the last coordinate of a point
+    recorded = np.asarray(observation.points[:, -1])  # the last coordinate of a point
     assert parts[0][-1, -1] == pytest.approx(recorded[-1], abs=3 * FLAW)  # the cell's noise
     of_slippery, of_twice = (np.sinh(part[-1, -1] / SCALE) for part in parts[1:])
     assert of_twice == pytest.approx(2 * of_slippery, rel=0.05)
@@ -93,18 +99,18 @@ def test_only_a_stretching_has_one_and_the_published_method_reads_none(recording
         pull_force(still, FRAMES)
 
 
-def test_a_state_file_of_another_sighting_is_refused(sighting, tmp_path):
+def test_a_state_file_of_another_observation_is_refused(observation, tmp_path):
     """Its answers would be those of another density, and its target another recording's."""
     path, calls = tmp_path / "search.npz", SPACE.dim + 2
-    whole = estimator.estimate(sighting, num_calls=calls, path=path)
-    again = estimator.estimate(sighting, num_calls=calls, path=path)
+    whole = estimator.estimate(observation, num_calls=calls, path=path)
+    again = estimator.estimate(observation, num_calls=calls, path=path)
     assert np.array_equal(whole.losses, again.losses)
-    heavier = eqx.tree_at(lambda each: each.space, sighting, OrthotropicSpace.make(0.3))
-    further = eqx.tree_at(lambda each: each.points, sighting, sighting.points + 1.0)
+    heavier = eqx.tree_at(lambda each: each.space, observation, OrthotropicSpace.make(0.3))
+    further = eqx.tree_at(lambda each: each.points, observation, observation.points + 1.0)
     for other in (heavier, further):
         with pytest.raises(ValueError, match="another run"):
             estimator.estimate(other, num_calls=calls, path=path)
 
 
-def test_what_tells_a_sighting_is_the_same_in_another_process(sighting):
-    assert "0x" not in repr(jax.tree.structure(sighting))
+def test_what_tells_a_observation_is_the_same_in_another_process(observation):
+    assert "0x" not in repr(jax.tree.structure(observation))

@@ -145,17 +145,16 @@ def test_the_network_reads_markers_and_force_and_no_clouds(pull):
 
 
 def test_images_are_made_of_some_frames(lift):
-    from r2s.estimation.physnet import preprocess
-    from r2s.estimation.physnet.views import view_around
+    from r2s.estimation.physnet.images import of_clouds, view_around
 
     reads = METHODS["physnet"]().reads(lift)
     assert reads.points is None and len(reads.frames) == 8
     x = np.asarray(lift.points)[np.asarray(lift.mask)]
     view = view_around((0.2, -0.6, 0.6), x, 32, 0.0)
-    seen = preprocess.of_clouds(view, lift, reads.frames)
+    seen = of_clouds(view, lift, reads.frames)
     hidden = poisoned(lift, others(lift, reads.frames))
-    assert np.array_equal(seen, preprocess.of_clouds(view, hidden, reads.frames))
-    changed = preprocess.of_clouds(view, poisoned(lift, reads.frames[-1:]), reads.frames)
+    assert np.array_equal(seen, of_clouds(view, hidden, reads.frames))
+    changed = of_clouds(view, poisoned(lift, reads.frames[-1:]), reads.frames)
     assert not np.array_equal(seen, changed)
 
 

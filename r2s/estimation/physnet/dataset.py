@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt
 
 from r2s._util.files import read_json, write_bytes, write_json
-from r2s.estimation.physnet.views import (
+from r2s.estimation.physnet.images import (
     View,
     depths_of_sheet,
     eye_of,
@@ -109,20 +109,6 @@ class Data(NamedTuple):
     places: Float[np.ndarray, "fabric dim"]
 
 
-@eqx.filter_jit
-def _rollouts(scenarios: Scenario, fabrics: Fabric, solver: Sheet | None):
-    def one(scenario: Scenario, fabric: Fabric):
-        # the grid serves all scenarios, but each has a fan of its own
-        own = solver and eqx.tree_at(lambda s: s.scene, solver, scenario.scene)
-        found = rollout(scenario, fabric, solver=own)
-        return found.x, jnp.all(found.ok) & jnp.all(jnp.isfinite(found.x))
-
-    return eqx.filter_vmap(one)(scenarios, fabrics)
-
-
-_depths = eqx.filter_jit(eqx.filter_vmap(depths_of_sheet, in_axes=(None, 0, None, None)))
-
-
 def make(
     folder: Path | str, settings: Settings, progress: bool = True, view: View | None = None
 ) -> Manifest:
@@ -138,24 +124,24 @@ def make(
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     if (folder / "manifest.json").exists():
-        known = load_manifest(folder)
-        if known.settings != settings:
+        stored = load_manifest(folder)
+        old, new = asdict(stored.settings), asdict(settings)
+        if changed := [f"{k} {old[k]} there, {new[k]} asked" for k in old if old[k] != new[k]]:
             raise ValueError(
-                f"{folder} has data of other settings: {_differences(known.settings, settings)}; "
-                "choose another folder"
+                f"{folder} has data of other settings: {', '.join(changed)}; choose another folder"
             )
-        if view not in (None, known.view):
-            raise ValueError(f"{folder} has data of {known.view}, asked for {view}")
-        view = known.view
+        if view not in (None, stored.view):
+            raise ValueError(f"{folder} has data of {stored.view}, asked for {view}")
+        view = stored.view
     missing = [n for n in range(settings.num_shards) if not _shard(folder, n).exists()]
     if not missing:
         return load_manifest(folder)
-    shared = _shared(settings)
+    substeps, solver = _shared(settings)
     for number in tqdm(missing, "shards", disable=None if progress else True):
-        experiments, places, x, ok = _simulate(settings, number, shared)
+        places, x, ok = _simulate(settings, number, substeps, solver)
         if view is None:
-            points = x[ok].reshape(-1, 3)
-            eye, floor = eye_of(experiments[0]), floor_of(experiments[0])
+            experiment, points = SIX[settings.scenario](), x[ok].reshape(-1, 3)
+            eye, floor = eye_of(experiment), floor_of(experiment)
             view = view_around(eye, points, settings.size, floor)
         write_json(folder / "manifest.json", asdict(Manifest(FORMAT, settings, view)))
         _write(_shard(folder, number), settings, view, places, x, ok)
@@ -189,10 +175,6 @@ def load(folder: Path | str) -> Data:
     return Data(depth[ok], fabric[ok], places)
 
 
-def _shard(folder: Path, number: int) -> Path:
-    return folder / f"{number:04d}.npz"
-
-
 def levels(settings: Settings, number: int = 0) -> list[Experiment]:
     """The motions of every fabric of a shard: the scenario's own, and random variations of it.
 
@@ -202,36 +184,47 @@ def levels(settings: Settings, number: int = 0) -> list[Experiment]:
     return [SIX[settings.scenario](), *varied(settings.scenario, settings.num_levels - 1, key=key)]
 
 
-def solver_of(settings: Settings, scenarios: list[Scenario]) -> Sheet | None:
-    """None for the cloth, or material points whose step and grid serve all these motions."""
-    if settings.solver == "cloth":
-        return None
-    paths, times = (
-        jnp.concatenate([getattr(scenario, name) for scenario in scenarios])
-        for name in ("path", "path_times")
-    )
-    stiffest = settings.space(jnp.ones(len(settings.ranges), float))
-    everywhere = dataclasses.replace(scenarios[0], path=paths, path_times=times)
-    return material_points(everywhere, stiffest)
-
-
-def kept_frames(used: tuple[int, int], number: int) -> tuple[int, ...]:
+def frame_indices(used: tuple[int, int], number: int) -> tuple[int, ...]:
     """The indices of `number` frames, evenly spread from the first to the last that counts."""
     first, last = used
     return tuple(int(frame) for frame in np.linspace(first, last, number).round())
 
 
+def _shard(folder: Path, number: int) -> Path:
+    return folder / f"{number:04d}.npz"
+
+
 def _shared(settings: Settings) -> tuple[int, Sheet | None]:
-    """The steps between frames and the solver of all shards, so that they compile once."""
+    """The steps between frames and the solver of all shards, so that they compile once.
+
+    The solver is None for the cloth, or material points whose step and grid serve all motions.
+    """
     shards = range(settings.num_shards)
     experiments = [experiment for i in shards for experiment in levels(settings, i)[i > 0 :]]
     scenarios = [experiment.scenario(settings.shape) for experiment in experiments]
-    return max(s.substeps for s in scenarios), solver_of(settings, scenarios)
+    substeps = max(scenario.substeps for scenario in scenarios)
+    if settings.solver == "cloth":
+        return substeps, None
+    path = jnp.concatenate([scenario.path for scenario in scenarios])
+    times = jnp.concatenate([scenario.path_times for scenario in scenarios])
+    stiffest = settings.space(jnp.ones(len(settings.ranges), float))
+    everywhere = dataclasses.replace(scenarios[0], path=path, path_times=times)
+    return substeps, material_points(everywhere, stiffest)
 
 
-def _simulate(settings: Settings, number: int, shared: tuple[int, Sheet | None]):
-    """Experiments, places of the fabrics, motions [m] and which of them are ok, of a shard."""
-    substeps, solver = shared
+@eqx.filter_jit
+def _rollouts(scenarios: Scenario, fabrics: Fabric, solver: Sheet | None):
+    def one(scenario: Scenario, fabric: Fabric):
+        # the grid serves all scenarios, but each has a fan of its own
+        own = solver and eqx.tree_at(lambda s: s.scene, solver, scenario.scene)
+        found = rollout(scenario, fabric, solver=own)
+        return found.x, jnp.all(found.ok) & jnp.all(jnp.isfinite(found.x))
+
+    return eqx.filter_vmap(one)(scenarios, fabrics)
+
+
+def _simulate(settings: Settings, number: int, substeps: int, solver: Sheet | None):
+    """Places of the fabrics, motions [m] and which of them are ok, of a shard."""
     first = number * settings.per_shard
     count = min(settings.per_shard, settings.num_fabrics - first)
     # always a whole shard, so that it compiles once and does not depend on the number of fabrics
@@ -243,17 +236,14 @@ def _simulate(settings: Settings, number: int, shared: tuple[int, Sheet | None])
         for experiment in experiments
     ]
     fabrics = jax.vmap(settings.space)(jnp.repeat(places, settings.num_levels, axis=0))
-    repeated = scenarios * settings.per_shard
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *repeated)
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenarios * settings.per_shard)
     x, ok = _rollouts(stacked, fabrics, solver)
     motions = count * settings.num_levels
-    frames = np.array(kept_frames(experiments[0].frames_used, settings.num_frames))
-    return (
-        experiments,
-        np.asarray(places)[:count],
-        np.asarray(x)[:motions, frames],
-        np.asarray(ok)[:motions],
-    )
+    frames = np.array(frame_indices(experiments[0].frames_used, settings.num_frames))
+    return np.asarray(places)[:count], np.asarray(x)[:motions, frames], np.asarray(ok)[:motions]
+
+
+_depths = eqx.filter_jit(eqx.filter_vmap(depths_of_sheet, in_axes=(None, 0, None, None)))
 
 
 def _write(path: Path, settings: Settings, view: View, places, x, ok) -> None:
@@ -266,10 +256,3 @@ def _write(path: Path, settings: Settings, view: View, places, x, ok) -> None:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, depth=depth, places=places, ok=ok)
     write_bytes(path, buffer.getvalue())
-
-
-def _differences(known: Settings, asked: Settings) -> str:
-    old, new = asdict(known), asdict(asked)
-    return ", ".join(
-        f"{key} {old[key]} there, {new[key]} asked" for key in old if old[key] != new[key]
-    )

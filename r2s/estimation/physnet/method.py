@@ -13,9 +13,8 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 
 from r2s.estimation.default_spaces import RANGES
-from r2s.estimation.method import ANY, Budget, DataRequirements, Method, seed_of
-from r2s.estimation.physnet import dataset, estimator, preprocess, training
-from r2s.estimation.physnet.pull_force import pull_force
+from r2s.estimation.method import ANY, Budget, Method, Reads, seed_of
+from r2s.estimation.physnet import dataset, estimator, images, training
 from r2s.estimation.problem import read_by_problem
 from r2s.recordings.recording import Recording
 from r2s.scenarios.resolution import material_points
@@ -51,22 +50,22 @@ def train_network(
         options = {"solver": solver, "num_levels": 3, "shape": NETWORK_SHAPE[solver]}
         options |= {"per_shard": 4}
     settings = dataset.Settings(scenario, budget.fabrics, seed=seed, **options)
-    images = path.with_name(f"{path.name}.images")
-    view = dataset.make(images, settings, progress=progress).view
+    folder = path.with_name(f"{path.name}.images")
+    view = dataset.make(folder, settings, progress=progress).view
     schedule = training.Schedule(epochs=budget.epochs, steps=budget.steps, seed=seed)
     if path.exists():
         begun = training.load(path)
     else:
         begun = training.begin(view, schedule=schedule)._replace(data=f"{scenario} on {solver}")
     report = _print_epoch if progress else None
-    trained = training.train(begun, dataset.load(images), path, report)
-    shutil.rmtree(images)
+    trained = training.train(begun, dataset.load(folder), path, report)
+    shutil.rmtree(folder)
     return trained
 
 
 def _images_of(recording: Recording) -> tuple[int, ...]:
     """The frames of which the network has images."""
-    return dataset.kept_frames(recording.info.frames_used, dataset.Settings.num_frames)
+    return dataset.frame_indices(recording.info.frames_used, dataset.Settings.num_frames)
 
 
 def _print_epoch(epoch: int, row: training.Row) -> None:
@@ -86,18 +85,16 @@ class PhysNetMethod(Method):
     budget = Budget(evaluations=80)
     heeds = ("evaluations",)
     supports = {"cloth": ANY, "points": ANY}
-    library: ClassVar[str] = "sklearn"
     takes_shape = False
-    heeds_force: ClassVar[bool] = True  # of a stretching, beside its images
-
-    _search = staticmethod(estimator.estimate)
+    library: ClassVar[str] = "sklearn"
+    published: ClassVar[bool] = False  # without the force of a stretching, too
 
     network: Path | None = None
     training_budget: TrainingBudget = TrainingBudget()
 
     def reads(self, recording):
-        force = self.heeds_force and read_by_problem(recording).force
-        return DataRequirements(_images_of(recording), points=None, force=force)
+        force = not self.published and read_by_problem(recording).force
+        return Reads(_images_of(recording), points=None, force=force)
 
     def _estimate(self, recordings, space, budget, key):
         if importlib.util.find_spec(self.library) is None:
@@ -106,15 +103,16 @@ class PhysNetMethod(Method):
         trained = self._trained(recording, seed_of(key))
         scenario = from_recording(recording, NETWORK_SHAPE[solver])
         frames = _images_of(recording)
-        images = preprocess.of_clouds(trained.view, recording, frames)
+        seen = images.of_clouds(trained.view, recording, frames)
         stiffest = space(jnp.ones(space.dim, float))
-        simulator = None if solver == "cloth" else material_points(scenario, stiffest)
-        pull = pull_force(recording, frames) if self.heeds_force else None
-        seen = estimator.Sighting.make(
-            scenario, images, frames, space, trained, simulator, pull=pull
+        points = None if solver == "cloth" else material_points(scenario, stiffest)
+        pull = None if self.published else estimator.pull_force(recording, frames)
+        observation = estimator.ImageObservation.make(
+            scenario, seen, frames, space, trained, points, pull
         )
-        return self._search(
-            seen,
+        return estimator.estimate(
+            observation,
+            published=self.published,
             num_calls=budget.evaluations,
             seed=seed_of(key),
             path=self.checkpoint,
@@ -150,6 +148,4 @@ class PublishedPhysNet(PhysNetMethod):
 
     name = "physnet-published"
     library: ClassVar[str] = "skopt"
-    heeds_force: ClassVar[bool] = False
-
-    _search = staticmethod(estimator.published_recipe)
+    published: ClassVar[bool] = True

@@ -1,12 +1,17 @@
-"""Training of the embedding with triplets: two images of one fabric in different motions, and one
-of another fabric.
+"""The embedding of depth images as points of a physics similarity map, and its training.
 
-The loss is that of Schroff, Kalenichenko and Philbin 2015: squared distances with a margin of 1.
+The branches of a Siamese network share their weights, so that one function serves for all of them:
+5 x 5 convolutions with PReLU and 2 x 2 max-pooling, then fully connected layers.
+
+It is trained with triplets, two images of one fabric in different motions and one of another
+fabric, by the loss of Schroff, Kalenichenko and Philbin 2015: squared distances with a margin of 1.
 Training and validation have different fabrics.
 """
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,17 +21,188 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt
 
 from r2s.estimation import checkpoint
 from r2s.estimation.physnet.dataset import DEPTH_UNIT, Data
-from r2s.estimation.physnet.network import DEEPER, Architecture, PhysNet
-from r2s.estimation.physnet.preprocess import Flaws, flawed, grey
-from r2s.estimation.physnet.triplets import Split, draw, split, triplet_loss, triplets
-from r2s.estimation.physnet.views import View
+from r2s.estimation.physnet.images import Flaws, View, flawed, grey
 
 FORMAT = "r2s-physnet/3"
 CHUNK = 256  # images that are embedded at once
+KERNEL = 5
+SLOPE = 0.25  # initial slope of PReLU
+
+
+# The network
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """The sizes of a network.
+
+    - `size`: side of the image, [pixel].
+    - `channels`: output channels of the convolutions.
+    - `hidden`: widths of the hidden fully connected layers.
+    - `dim`: dimensions of the map.
+
+    Raises `ValueError` when the image cannot be halved as often as there are convolutions.
+    """
+
+    size: int = 64
+    channels: tuple[int, ...] = (32, 64)
+    hidden: tuple[int, ...] = (256, 256)
+    dim: int = 2
+
+    def __post_init__(self) -> None:
+        if self.size < 1 or self.size % 2 ** len(self.channels):
+            raise ValueError(
+                f"size must be a multiple of {2 ** len(self.channels)} for {len(self.channels)} "
+                f"convolutions, found {self.size}"
+            )
+
+
+PAPER = Architecture(size=256)  # of Duan et al. 2022
+DEEPER = Architecture(channels=(16, 32, 64, 128), dim=8)  # five times as fast at the same size
+
+
+class PhysNet(eqx.Module):
+    """The embedding of one image. `slopes` are those of the PReLU after each layer but the last."""
+
+    convolutions: list[eqx.nn.Conv2d]
+    layers: list[eqx.nn.Linear]
+    slopes: Float[Array, " activation"]
+    architecture: Architecture = eqx.field(static=True)
+
+    @classmethod
+    def make(cls, architecture: Architecture, *, key: PRNGKeyArray) -> "PhysNet":
+        """An untrained network."""
+        channels = (1, *architecture.channels)
+        side = architecture.size // 2 ** len(architecture.channels)
+        widths = (channels[-1] * side**2, *architecture.hidden, architecture.dim)
+        keys = iter(jr.split(key, len(channels) + len(widths)))
+        convolution = partial(eqx.nn.Conv2d, kernel_size=KERNEL, padding=KERNEL // 2)
+        slopes = jnp.full(len(architecture.channels) + len(architecture.hidden), SLOPE, float)
+        return cls(
+            [_he_layer(convolution, a, b, next(keys)) for a, b in pairwise(channels)],
+            [_he_layer(eqx.nn.Linear, a, b, next(keys)) for a, b in pairwise(widths)],
+            slopes,
+            architecture,
+        )
+
+    def __call__(self, image: Float[Array, "down across"]) -> Float[Array, " dim"]:
+        """The point of an image on the map. Raises `ValueError` for an image of another size."""
+        size = self.architecture.size
+        if image.shape != (size, size):
+            raise ValueError(f"expected an image of {size} x {size} pixels, found {image.shape}")
+        slopes = iter(self.slopes)
+        values = image[None]
+        for convolution in self.convolutions:
+            values = _halved(_prelu(convolution(values), next(slopes)))
+        values = values.reshape(-1)
+        for layer in self.layers[:-1]:
+            values = _prelu(layer(values), next(slopes))
+        return self.layers[-1](values)
+
+
+def _he_layer(make, inputs: int, outputs: int, key: PRNGKeyArray):
+    """A layer with the normal initial weights of He et al. 2015 and biases of zero."""
+    layer = make(inputs, outputs, key=key)
+    weight = layer.weight
+    scale = jnp.sqrt(2 / (weight.size // outputs)).astype(weight.dtype)
+    weight = scale * jr.normal(key, weight.shape, weight.dtype)
+    return eqx.tree_at(lambda at: (at.weight, at.bias), layer, (weight, 0 * layer.bias))
+
+
+def _prelu(values: Array, slope: Float[Array, ""]) -> Array:
+    return jnp.where(values > 0, values, slope * values)
+
+
+def _halved(values: Float[Array, "channel down across"]) -> Array:
+    """The maximum of each 2 x 2 pixels."""
+    channel, down, across = values.shape
+    return jnp.max(values.reshape(channel, down // 2, 2, across // 2, 2), axis=(2, 4))
+
+
+# Batches and triplets
+
+
+class Split(NamedTuple):
+    """Images in units of `DEPTH_UNIT`, with the fabric and the motion of each."""
+
+    depth: UInt[np.ndarray, "image down across"]
+    fabric: Int[np.ndarray, " image"]
+    motion: Int[np.ndarray, " image"]
+
+
+def split(data: Data, validation: float, needed: int, seed: int) -> tuple[Split, Split]:
+    """Images of the fabrics for training, and of the share `validation` of the fabrics.
+
+    Raises `ValueError` for fewer than two validation fabrics or `needed` training fabrics.
+    """
+    count = len(data.places)
+    order = np.random.default_rng([seed, 0, 1]).permutation(count)
+    number = round(validation * count)
+    if number < 2 or count - number < needed:
+        raise ValueError(
+            f"{count} fabrics, of which {number} are for validation: expected at least 2 of these, "
+            f"and {needed} more for a batch"
+        )
+    is_validation = np.isin(data.fabric, order[:number])
+    return _images_of(data, ~is_validation), _images_of(data, is_validation)
+
+
+def _images_of(data: Data, motions: Bool[np.ndarray, " motion"]) -> Split:
+    """All images of some motions that are not empty."""
+    depth = data.depth[motions]
+    frames = depth.shape[1]
+    fabric = np.repeat(data.fabric[motions], frames)
+    motion = np.repeat(np.flatnonzero(motions), frames)
+    depth = depth.reshape(-1, *depth.shape[2:])
+    is_full = (depth > 0).any(axis=(1, 2))
+    return Split(depth[is_full], fabric[is_full], motion[is_full])
+
+
+def batch(
+    images: Split, fabrics: int, count: int, generator: np.random.Generator
+) -> Int[np.ndarray, "fabric image"]:
+    """Indices of `count` images of each of some fabrics, of different motions if possible."""
+    chosen = generator.choice(np.unique(images.fabric), fabrics, replace=False)
+    rows = []
+    for fabric in chosen:
+        own = np.flatnonzero(images.fabric == fabric)
+        motions = np.unique(images.motion[own])
+        taken = generator.choice(motions, count, replace=len(motions) < count)
+        rows.append([generator.choice(own[images.motion[own] == motion]) for motion in taken])
+    return np.array(rows)
+
+
+def triplets(images: Split, number: int, seed: int) -> Int[np.ndarray, "triplet 3"]:
+    """Anchors, positives and negatives: two motions of one fabric, and another; any frames."""
+    generator = np.random.default_rng([seed, 2])
+    anchor = generator.integers(len(images.fabric), size=number)
+    positive, negative = np.empty_like(anchor), np.empty_like(anchor)
+    for row, first in enumerate(anchor):
+        alike = images.fabric == images.fabric[first]
+        other = np.flatnonzero(alike & (images.motion != images.motion[first]))
+        alone = len(other) == 0  # only one motion of this fabric did not diverge
+        positive[row] = first if alone else generator.choice(other)
+        negative[row] = generator.choice(np.flatnonzero(~alike))
+    return np.stack([anchor, positive, negative], axis=1)
+
+
+def triplet_loss(points: Float[Array, "fabric image dim"], margin: float) -> Float[Array, ""]:
+    """The mean loss of all triplets of a batch."""
+    fabrics, images, dim = points.shape
+    flat = points.reshape(-1, dim)
+    squares = jnp.sum((flat[:, None] - flat[None]) ** 2, axis=2)
+    fabric = jnp.repeat(jnp.arange(fabrics), images)
+    alike = fabric[:, None] == fabric[None]
+    loss = jax.nn.relu(squares[:, :, None] - squares[:, None, :] + margin)
+    counts = (alike & ~jnp.eye(len(flat), dtype=bool))[:, :, None] & ~alike[:, None, :]
+    return jnp.sum(jnp.where(counts, loss, 0)) / jnp.sum(counts)
+
+
+# Training
 
 
 @dataclass(frozen=True)
@@ -78,9 +254,10 @@ class Training(NamedTuple):
     data: str = ""
 
 
-def begin(view: View, architecture: Architecture = DEEPER, schedule: Schedule | None = None):
+def begin(
+    view: View, architecture: Architecture = DEEPER, schedule: Schedule = Schedule()
+) -> Training:
     """A training without epochs. Raises `ValueError` when network and view differ in size."""
-    schedule = Schedule() if schedule is None else schedule
     if architecture.size != view.size:
         raise ValueError(
             f"the network takes images of {architecture.size} pixels, the data have {view.size}"
@@ -101,9 +278,9 @@ def train(
     Raises `FloatingPointError` when the loss is not finite.
     """
     schedule = training.schedule
-    taught, validation = split(data, schedule.validation, schedule.fabrics, schedule.seed)
+    parts = split(data, schedule.validation, schedule.fabrics, schedule.seed)
     while len(training.curve) < schedule.epochs:
-        training = epoch(training, taught, validation)
+        training = epoch(training, *parts)
         if path is not None:
             save(training, path)
         if progress is not None:
@@ -111,16 +288,16 @@ def train(
     return training
 
 
-def epoch(training: Training, taught: Split, validation: Split) -> Training:
+def epoch(training: Training, images: Split, validation: Split) -> Training:
     """The training after one more epoch."""
     schedule, number = training.schedule, len(training.curve)
     generator = np.random.default_rng([schedule.seed, number])
     network, optimiser = training.network, training.optimiser
     losses = []
     for step in range(schedule.steps):
-        chosen = draw(taught, schedule.fabrics, schedule.images, generator)
+        chosen = batch(images, schedule.fabrics, schedule.images, generator)
         key = jr.fold_in(jr.key(schedule.seed), number * schedule.steps + step)
-        depth = jnp.asarray(taught.depth[chosen])
+        depth = jnp.asarray(images.depth[chosen])
         network, optimiser, loss = _step(network, optimiser, depth, schedule, training.view, key)
         losses.append(loss)
     loss = float(np.mean([float(value) for value in losses]))
@@ -128,11 +305,13 @@ def epoch(training: Training, taught: Split, validation: Split) -> Training:
         raise FloatingPointError(
             f"the loss is {loss} in epoch {number}: lower the learning rate {schedule.rate:g}"
         )
-    row = Row(loss, *judge(network, training.view, validation, schedule))
+    row = Row(loss, *validate(network, training.view, validation, schedule))
     return training._replace(network=network, optimiser=optimiser, curve=(*training.curve, row))
 
 
-def judge(network: PhysNet, view: View, images: Split, schedule: Schedule) -> tuple[float, float]:
+def validate(
+    network: PhysNet, view: View, images: Split, schedule: Schedule
+) -> tuple[float, float]:
     """The mean loss of triplets, and the share of them in which the positive is nearer."""
     parts = []
     for start in range(0, len(images.depth), CHUNK):
@@ -155,7 +334,7 @@ def _adam(schedule: Schedule) -> optax.GradientTransformation:
     return optax.adam(rate)
 
 
-def _shown(depth, view: View, flaws: Flaws, key) -> Float[Array, "image down across"]:
+def _flawed_images(depth, view: View, flaws: Flaws, key) -> Float[Array, "image down across"]:
     def one(depth, key):
         return grey(view, flawed(depth, view, flaws, key))
 
@@ -164,13 +343,13 @@ def _shown(depth, view: View, flaws: Flaws, key) -> Float[Array, "image down acr
 
 @eqx.filter_jit
 def _embedded(network: PhysNet, view: View, depth, flaws: Flaws, key):
-    return jax.vmap(network)(_shown(depth, view, flaws, key))
+    return jax.vmap(network)(_flawed_images(depth, view, flaws, key))
 
 
 @eqx.filter_jit
 def _step(network: PhysNet, optimiser, depth, schedule: Schedule, view: View, key):
     fabrics, count = depth.shape[:2]
-    images = _shown(depth.reshape(-1, *depth.shape[2:]), view, schedule.flaws, key)
+    images = _flawed_images(depth.reshape(-1, *depth.shape[2:]), view, schedule.flaws, key)
 
     def loss_of(network):
         points = jax.vmap(network)(images).reshape(fabrics, count, -1)
@@ -179,6 +358,9 @@ def _step(network: PhysNet, optimiser, depth, schedule: Schedule, view: View, ke
     loss, slope = eqx.filter_value_and_grad(loss_of)(network)
     update, optimiser = _adam(schedule).update(slope, optimiser)
     return eqx.apply_updates(network, update), optimiser, loss
+
+
+# Checkpoints
 
 
 def save(training: Training, path: Path | str) -> None:
