@@ -22,7 +22,7 @@ from jaxtyping import Float, PRNGKeyArray
 
 from r2s.compilation import compile_once
 from r2s.estimation.default_spaces import Law
-from r2s.estimation.pinn.synthetic_pulls import pulled
+from r2s.estimation.pinn.pulls import pulled
 from r2s.materials import presets
 from r2s.materials.arcsim import read_material
 from r2s.materials.fabric import Fabric, constant_laws

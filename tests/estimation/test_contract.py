@@ -169,7 +169,7 @@ def test_physnet_trains_its_network_once(recording, tmp_path, monkeypatch):
 @pytest.mark.slow(group="estimates")
 @pytest.mark.parametrize("name", ["pinn", "pinn-published"])
 def test_the_network_takes_a_stretching(name):
-    from r2s.estimation.pinn.synthetic_pulls import pulled
+    from r2s.estimation.pinn.pulls import pulled
 
     pull = pulled(FABRIC, "grey", 0.0, key=jr.key(0))
     method = METHODS[name]()

@@ -12,16 +12,13 @@ import numpy as np
 import pytest
 
 import r2s
-from r2s.estimation.estimate import as_json, from_json
-from r2s.estimation.pinn import balance as balancing
-from r2s.estimation.pinn import published_recipe
-from r2s.estimation.pinn.balance import balance
+from r2s.estimation.estimate_json import as_json, from_json
+from r2s.estimation.pinn import estimator, published_recipe
 from r2s.estimation.pinn.equilibrium import equilibrium, prepare
-from r2s.estimation.pinn.from_pulls import estimate
+from r2s.estimation.pinn.estimator import estimate, fit
 from r2s.estimation.pinn.network import Network
 from r2s.estimation.pinn.published_recipe import motion_residual
-from r2s.estimation.pinn.pulls import Clamp, Pull, pull_from, stacked
-from r2s.estimation.pinn.synthetic_pulls import pulled
+from r2s.estimation.pinn.pulls import Clamp, Pull, pull_from, pulled, stacked
 from r2s.estimation.pinn.training import Recipe, train
 from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
@@ -74,8 +71,8 @@ def small_network(pull: Pull) -> Network:
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
     """Few virtual displacements, so that it compiles fast; the slow tests undo it."""
-    monkeypatch.setattr("r2s.estimation.pinn.from_pulls.DEGREES", (3, 3))
-    monkeypatch.setattr(balancing, "prepare", lambda n, p, _: prepare(n, p, (3, 3)))
+    monkeypatch.setattr(estimator, "DEGREES", (3, 3))
+    monkeypatch.setattr(estimator, "prepare", lambda n, p, _: prepare(n, p, (3, 3)))
 
 
 FAMILY = OrthotropicSpace.make(DENSITY)
@@ -84,7 +81,7 @@ FAMILY = OrthotropicSpace.make(DENSITY)
 def test_an_even_stretch_gives_the_warp_of_the_closed_form():
     """And not what it does not depend on: weft and shear keep the deviation of their range."""
     pull = even_pull()
-    found = balance(FAMILY, [small_network(pull)], [pull], np.full(7, 0.5), NOISE)
+    found = fit(FAMILY, [small_network(pull)], [pull], np.full(7, 0.5), NOISE)
     assert found.converged
     values = np.asarray(FAMILY.values(jnp.asarray(found.place)))
     np.testing.assert_allclose(values[0], WARP, rtol=2e-3)
@@ -97,7 +94,7 @@ def test_an_even_stretch_gives_the_warp_of_the_closed_form():
 def test_what_stiffness_grows_by_is_an_error_of_the_small_strain_s(growth):
     """A constant stiffness is a mean over the pull; half of the stretch tells how far it is off."""
     pull = even_pull(frames=21, growth=growth)
-    found = balance(FAMILY, [small_network(pull)], [pull], np.full(7, 0.5), NOISE)
+    found = fit(FAMILY, [small_network(pull)], [pull], np.full(7, 0.5), NOISE)
     assert found.converged
     value = float(FAMILY.values(jnp.asarray(found.place))[0])
     length = math.log(FAMILY.ranges[0].high / FAMILY.ranges[0].low)
@@ -111,7 +108,7 @@ def test_what_stiffness_grows_by_is_an_error_of_the_small_strain_s(growth):
 def test_yarns_that_may_stiffen_have_no_error_for_not_doing_so():
     pull = even_pull(frames=21, growth=0.2)
     space = StiffeningSpace.make(FAMILY)
-    found = balance(space, [small_network(pull)], [pull], np.full(10, 0.5), NOISE, steps=1)
+    found = fit(space, [small_network(pull)], [pull], np.full(10, 0.5), NOISE, steps=1)
     assert found.law.shape == (10, 10) and not found.law.any()
 
 
@@ -166,9 +163,9 @@ def test_a_frame_that_is_not_in_equilibrium_does_not_count(monkeypatch):
         found.force_by_place[others], whole.force_by_place[others], atol=0.1 * slope
     )
     nowhere = eqx.tree_at(lambda g: g.even.acceleration, given, jnp.nan * given.even.acceleration)
-    monkeypatch.setattr(balancing, "prepare", lambda *_: (nowhere, start))
+    monkeypatch.setattr(estimator, "prepare", lambda *_: (nowhere, start))
     with pytest.raises(RuntimeError, match="no pull has a motion in equilibrium"):
-        balance(FAMILY, [small_network(pull)], [pull], PLACE, NOISE)
+        fit(FAMILY, [small_network(pull)], [pull], PLACE, NOISE)
 
 
 TINY = Recipe(warm_up=20, adam=20, chunk=10, width=6, layers=3)
@@ -239,7 +236,7 @@ def test_a_step_that_went_astray_is_taken_back(monkeypatch):
     """To the model before it and without memory, when the losses are greater than they were."""
     monkeypatch.setattr(published_recipe, "LAYERS", 3)
     monkeypatch.setattr(published_recipe, "WIDTH", 5)
-    pulls = published_recipe.plain(stacked([even_pull(frames=4)]))
+    pulls = published_recipe.without_force(stacked([even_pull(frames=4)]))
     assert pulls.force is None
     with jax.numpy_dtype_promotion("standard"):
         fresh, first = published_recipe.begin(FAMILY, pulls, key=jr.key(0)), jnp.asarray(0)
@@ -255,7 +252,7 @@ def test_a_step_that_went_astray_is_taken_back(monkeypatch):
 @pytest.mark.slow(group="pinn")
 def test_the_gradient_made_along_with_the_sum_is_that_of_the_sum():
     """Of the recipe's loss of the motion, in the networks and the fabric of two pulls."""
-    pulls = published_recipe.plain(stacked([even_pull(frames=4), even_pull(frames=4)]))
+    pulls = published_recipe.without_force(stacked([even_pull(frames=4), even_pull(frames=4)]))
     with jax.numpy_dtype_promotion("standard"):
         model = published_recipe.begin(FAMILY, pulls, key=jr.key(0)).model
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array
 
-from r2s.estimation.pinn import losses, published_recipe, weak_form
+from r2s.estimation.pinn import published_recipe, weak_form
 from r2s.estimation.pinn.network import Jet, Network
 from r2s.estimation.pinn.pulls import Clamp, Pull
 from r2s.estimation.pinn.training import NOISE, losses_of
@@ -21,7 +21,7 @@ from r2s.materials.membrane import OrthotropicMembrane
 
 # compiled as a whole, which is faster than one operation after the other
 compiled: Any = eqx.filter_jit
-marker_residual = compiled(losses.marker_residual)
+marker_residual = compiled(weak_form.marker_residual)
 motion_residual = compiled(published_recipe.motion_residual)
 kinematics, virtual_work = compiled(weak_form.kinematics), compiled(weak_form.virtual_work)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from r2s.estimation.pinn.network import Network, T, X, Y
-from r2s.estimation.pinn.stress import green, nominal_stress, small
+from r2s.estimation.pinn.weak_form import green_strain, nominal_stress, small_strain
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import OrthotropicMembrane
 from r2s.materials.parameters import IsotropicSpace
@@ -60,17 +60,17 @@ def gradient(key: int, size: float):
 def test_green_strain_does_not_see_a_rotation():
     c, s = jnp.cos(0.7), jnp.sin(0.7)
     rotation = jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
-    np.testing.assert_allclose(green(rotation - jnp.eye(2)), 0, atol=1e-15)
+    np.testing.assert_allclose(green_strain(rotation - jnp.eye(2)), 0, atol=1e-15)
 
 
 def test_strains_agree_when_small():
     change = gradient(2, 1e-7)
-    np.testing.assert_allclose(green(change), small(change), atol=1e-12)
+    np.testing.assert_allclose(green_strain(change), small_strain(change), atol=1e-12)
 
 
 def test_stress_is_the_derivative_of_the_energy():
     at, law = gradient(3, 0.05), TurnedMembrane(FABRIC.membrane, ANGLE)
-    expected = jax.grad(lambda g: law.energy_density(green(g)))(at)
+    expected = jax.grad(lambda g: law.energy_density(green_strain(g)))(at)
     np.testing.assert_allclose(nominal_stress(FABRIC, ANGLE, at), expected, rtol=1e-10)
 
 
@@ -78,10 +78,10 @@ def test_damping_adds_the_stress_of_the_rate():
     """Kelvin-Voigt: as if the strain were that of `damping` later, to first order."""
     at, rate = gradient(3, 0.05), gradient(4, 1e-4)
     found = nominal_stress(FABRIC, ANGLE, at, rate) - nominal_stress(FABRIC, ANGLE, at)
-    fast = jax.jvp(green, (at,), (rate,))[1]
+    fast = jax.jvp(green_strain, (at,), (rate,))[1]
     law = TurnedMembrane(FABRIC.membrane, ANGLE)
     viscous = 0.02 * jax.grad(law.energy_density)(fast)  # the law is linear
-    expected = jax.vjp(green, at)[1](viscous)[0]
+    expected = jax.vjp(green_strain, at)[1](viscous)[0]
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
@@ -111,7 +111,7 @@ def test_plane_strain_is_that_of_the_solid():
     solid = LinearSolid.make(modulus, ratio)
     change = gradient(5, 0.01)
     expected = solid.energy_density(jnp.eye(2) + change)
-    found = space(place).membrane.energy_density(small(change))
+    found = space(place).membrane.energy_density(small_strain(change))
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 

@@ -14,9 +14,7 @@ from r2s import scenarios
 from r2s.estimation import default_spaces
 from r2s.estimation.baselines import last_frame
 from r2s.estimation.method import default_space
-from r2s.estimation.methods import METHODS
-from r2s.estimation.pinn.pulls import pull_from
-from r2s.estimation.pinn.synthetic_pulls import pulled
+from r2s.estimation.pinn.pulls import pull_from, pulled
 from r2s.estimation.prediction import Prediction
 from r2s.estimation.problem import POINTS, Problem
 from r2s.materials import presets, prior

@@ -21,8 +21,8 @@ from r2s.estimation.baselines import MASS
 from r2s.estimation.baselines import STRETCH as MULTIPLIER
 from r2s.estimation.estimate import point_estimate
 from r2s.estimation.method import default_space
-from r2s.estimation.methods import METHODS
-from r2s.estimation.pinn.synthetic_pulls import pulled
+from r2s.estimation.pinn.pulls import pulled
+from r2s.estimation.registry import METHODS
 from r2s.materials import presets, prior
 from r2s.materials.arcsim import write_material
 from r2s.materials.informed_space import InformedSpace

@@ -6,8 +6,7 @@ until it is (rates by BDF2 from rest, the inertia that of the network). So noise
 not taken for stress.
 
 Newton's method in a frame is our own, with its tangent by hand and a line search:
-`optimistix.Newton` takes 2.7 times the CPU seconds (1.59 against 0.59 for 39 frames, in 144 steps
-against 124), `Dogleg` 4.2 times.
+`optimistix.Newton` takes 2.7 times the CPU seconds, `Dogleg` 4.2 times.
 """
 
 from typing import NamedTuple
@@ -18,15 +17,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from r2s.estimation.pinn.losses import load, marker_residual
 from r2s.estimation.pinn.network import Network
 from r2s.estimation.pinn.pulls import Pull
-from r2s.estimation.pinn.stress import nominal_stress
 from r2s.estimation.pinn.weak_form import (
     Kinematics,
     Virtual,
     end_value,
     kinematics,
+    load,
+    marker_residual,
+    nominal_stress,
     virtual_fields,
     virtual_work,
 )
@@ -37,8 +37,6 @@ FORMULAS = ((0.0, 0.0, 0.0), (1.0, -1.0, 0.0), (1.5, -2.0, 0.5))
 NEWTON = 25  # most Newton steps in a frame
 CUTS = 6  # lengths of a Newton step that are tried, each half of the one before
 BALANCED = 1e-5  # work that may be left, over that of the stress
-
-Coefficients = Float[Array, "function axis"]  # of virtual displacements, [m]
 
 
 class Given(NamedTuple):
@@ -98,45 +96,6 @@ def _prepared(network: Network, pull: Pull, virtual: Virtual):
     return Given(virtual, motion, marker_residual(even, pull)), start
 
 
-def _moved(
-    even: Kinematics, pull: Pull, virtual: Virtual, now: Coefficients, rate: Coefficients
-) -> Kinematics:
-    """The motion in one frame, from coefficients and their rates [m/s]; its axis of frames is 1."""
-    slope = virtual.slope[:-1] / pull.size[None, None]
-    change, change_rate = (jnp.einsum("fi,fqj->qij", c, slope)[None] for c in (now, rate))
-    velocity = jnp.einsum("fi,fq->qi", rate, virtual.value[:-1])[None]
-    return Kinematics(
-        even.gradient + change,
-        even.rate + change_rate,
-        even.velocity + velocity,
-        even.acceleration,
-    )
-
-
-def _tangents(fabric, pull: Pull, virtual: Virtual, motion: Kinematics):
-    """Derivatives of the work in one frame, in the coefficients and in their rates."""
-
-    def stress(gradient, rate):
-        return nominal_stress(fabric, pull.angle, gradient, rate)
-
-    def load_at(velocity, acceleration):
-        return load(fabric, pull, velocity, acceleration)
-
-    by_gradient, by_rate = jax.vmap(jax.jacfwd(stress, (0, 1)))(motion.gradient[0], motion.rate[0])
-    by_velocity = jax.vmap(jax.jacfwd(load_at))(motion.velocity[0], motion.acceleration[0])
-    weights = virtual.weights * pull.size[0] * pull.size[1]
-    slope, value = virtual.slope / pull.size[None, None], virtual.value
-
-    def strains(tangent):  # in two steps, or it would be many times the work
-        inner = jnp.einsum("q,qikjl,gql->qikgj", weights, tangent, slope[:-1])
-        return jnp.einsum("fqk,qikgj->figj", slope, inner)
-
-    moves = jnp.einsum("q,fq,qij,gq->figj", weights, value, by_velocity, value[:-1])
-    size = slope.shape[0] * motion.velocity.shape[2]
-    by_now, by_rate = strains(by_gradient), strains(by_rate) + moves
-    return by_now.reshape(size, -1), by_rate.reshape(size, -1)
-
-
 @eqx.filter_jit
 def equilibrium(
     space: ParameterSpace,
@@ -184,14 +143,40 @@ def equilibrium(
     markers = given.markers + jnp.einsum("mf,tfi->tmi", virtual.at_markers, now)
     by_place = jnp.einsum("mf,tfid->tmid", virtual.at_markers, slope.reshape(*now.shape, -1))
     seen, at_end = pull.seen[..., None], end_value(virtual)
-    return Motion(
-        now,
-        is_balanced,
-        jnp.where(seen, markers, 0),
-        jnp.where(seen[..., None], by_place, 0),
-        force / at_end,
-        force_by_place / at_end,
-    )
+    markers, by_place = jnp.where(seen, markers, 0), jnp.where(seen[..., None], by_place, 0)
+    return Motion(now, is_balanced, markers, by_place, force / at_end, force_by_place / at_end)
+
+
+def _moved(even: Kinematics, pull: Pull, virtual: Virtual, now: Array, rate: Array) -> Kinematics:
+    """The motion in one frame, from coefficients [m] and rates [m/s]; its axis of frames is 1."""
+    slope = virtual.slope[:-1] / pull.size[None, None]
+    change, change_rate = (jnp.einsum("fi,fqj->qij", c, slope)[None] for c in (now, rate))
+    velocity = even.velocity + jnp.einsum("fi,fq->qi", rate, virtual.value[:-1])[None]
+    return Kinematics(even.gradient + change, even.rate + change_rate, velocity, even.acceleration)
+
+
+def _tangents(fabric, pull: Pull, virtual: Virtual, motion: Kinematics):
+    """Derivatives of the work in one frame, in the coefficients and in their rates."""
+
+    def stress(gradient, rate):
+        return nominal_stress(fabric, pull.angle, gradient, rate)
+
+    def load_at(velocity, acceleration):
+        return load(fabric, pull, velocity, acceleration)
+
+    by_gradient, by_rate = jax.vmap(jax.jacfwd(stress, (0, 1)))(motion.gradient[0], motion.rate[0])
+    by_velocity = jax.vmap(jax.jacfwd(load_at))(motion.velocity[0], motion.acceleration[0])
+    weights = virtual.weights * pull.size[0] * pull.size[1]
+    slope, value = virtual.slope / pull.size[None, None], virtual.value
+
+    def strains(tangent):  # in two steps, or it would be many times the work
+        inner = jnp.einsum("q,qikjl,gql->qikgj", weights, tangent, slope[:-1])
+        return jnp.einsum("fqk,qikgj->figj", slope, inner)
+
+    moves = jnp.einsum("q,fq,qij,gq->figj", weights, value, by_velocity, value[:-1])
+    size = slope.shape[0] * motion.velocity.shape[2]
+    by_now, by_rate = strains(by_gradient), strains(by_rate) + moves
+    return by_now.reshape(size, -1), by_rate.reshape(size, -1)
 
 
 def _newton(works, fabric, pull: Pull, virtual: Virtual, rate, before, guess):

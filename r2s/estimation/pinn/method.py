@@ -38,7 +38,7 @@ class PINN(Method):
         return DataRequirements(frames_that_count(recording), markers=True, force=True)
 
     def _estimate(self, recordings, space, budget, key):
-        from r2s.estimation.pinn.from_pulls import estimate  # needs flax
+        from r2s.estimation.pinn.estimator import estimate  # needs flax
         from r2s.estimation.pinn.training import Recipe
 
         pulls = [pull_from(recording) for recording in recordings]
@@ -71,16 +71,18 @@ class PublishedPINN(PINN):
 
         began, epochs = time.perf_counter(), budget.iterations
         pulls = [pull_from(recording, without_force=True) for recording in recordings]
-        course = published_recipe.train(space, stacked(pulls), epochs, min(CHUNK, epochs), key=key)
-        if not np.isfinite(course.data[-1]):
+        train = published_recipe.train
+        trained = train(space, stacked(pulls), epochs, min(CHUNK, epochs), key=key)
+        losses = trained.losses
+        if not np.isfinite(losses[-1]):
             raise RuntimeError("the training of the published recipe diverged")
-        history = np.asarray(jax.vmap(space.values)(jnp.asarray(course.places, float)))
+        history = np.asarray(jax.vmap(space.values)(jnp.asarray(trained.places, float)))
         return point_estimate(
             f"pinn-published ({epochs} epochs, no force)",
             space,
-            course.model.place,
-            float(course.data[-1]),
-            course.data[:, None],
+            trained.model.place,
+            float(losses[-1]),
+            losses[:, None],
             history[:, None],
             time.perf_counter() - began,
         )

@@ -19,11 +19,17 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimation.pinn.losses import field, gradients, load, marker_residual
 from r2s.estimation.pinn.network import DisplacementField, T, X, Y
 from r2s.estimation.pinn.pulls import Pull
-from r2s.estimation.pinn.stress import nominal_stress, small
-from r2s.estimation.pinn.training import Model, init
+from r2s.estimation.pinn.training import Model, Trained, init
+from r2s.estimation.pinn.weak_form import (
+    field,
+    gradients,
+    load,
+    marker_residual,
+    nominal_stress,
+    small_strain,
+)
 from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import ParameterSpace
 
@@ -33,17 +39,8 @@ ADAM, LBFGS = optax.adam(1e-4), optax.lbfgs(0.1, memory_size=10, linesearch=None
 WEIGHT, EVERY = 0.1, 500  # of the equation of motion: at first and as a step; epochs between steps
 
 
-class Course(NamedTuple):
-    """A trained model; and after every chunk the loss of the markers [m^2] and the fabric's place
-    in its space."""
-
-    model: Model
-    data: Float[np.ndarray, " chunk"]
-    places: Float[np.ndarray, "chunk dim"]
-
-
 class State(NamedTuple):
-    """What a training carries from epoch to epoch.
+    """State of a training.
 
     - `model`: without the last step of L-BFGS. - `ahead`: with it.
     - `adam`, `lbfgs`: states of the optimisers.
@@ -57,12 +54,29 @@ class State(NamedTuple):
     before: Float[Array, ""]
 
 
-def weight(epoch: Array) -> Array:
-    """Weight of the equation of motion in an epoch."""
-    return jnp.minimum(WEIGHT * (1 + (epoch // EVERY).astype(float)), 1.0)
+def train(
+    space: ParameterSpace,
+    pulls: Pull,
+    epochs: int = EPOCHS,
+    chunk: int = 100,
+    *,
+    key: PRNGKeyArray,
+) -> Trained:
+    """Train on stacked pulls, with the fabric from the middle of its space on; losses are [m^2].
+
+    A training that diverges does not raise: its losses show it.
+    """
+    pulls = without_force(pulls)
+    state, losses, places = begin(space, pulls, key=key), [], []
+    for first in range(0, epochs, chunk):
+        number = min(chunk, epochs - first)
+        state, loss = run(state, space, pulls, jnp.asarray(first), number)
+        losses.append(float(loss))
+        places.append(np.asarray(state.model.place))
+    return Trained(state.model, np.array(losses), np.array(places))
 
 
-def plain(pull: Pull) -> Pull:
+def without_force(pull: Pull) -> Pull:
     """A pull without what the paper does not use: clamps, force and friction."""
     nothing = jax.tree.map(jnp.zeros_like, (pull.near, pull.far, pull.normal))
     pull = eqx.tree_at(lambda p: (p.near, p.far, p.normal), pull, nothing)
@@ -76,23 +90,35 @@ def begin(space: ParameterSpace, pulls: Pull, *, key: PRNGKeyArray) -> State:
     return State(model, model, ADAM.init(model), LBFGS.init(model), none)
 
 
-def motion_residual(
-    network: DisplacementField, pull: Pull, fabric: Fabric, places, frames
-) -> Float[Array, "point axis"]:
-    """Residual [N/m^2] of the equation of motion in small strain: divergence of the stress less
-    the load. Damping of the stress is left out, as it would need third derivatives."""
-    jet = field(network, pull, places, frames, ((X, X), (X, Y), (Y, Y), (T, T)))
-    xx, xy, yy, tt = jet.second
-    changes = jnp.stack([jnp.stack([xx, xy], -1), jnp.stack([xy, yy], -1)], axis=1)
+@eqx.filter_jit
+def run(
+    state: State, space: ParameterSpace, pulls: Pull, first: Array, epochs: int
+) -> tuple[State, Float[Array, ""]]:
+    """Some epochs from number `first` on, and the loss of the markers [m^2] in the last epoch after
+    which no step was taken back, or in the first."""
 
-    def stress(gradient):
-        return nominal_stress(fabric, pull.angle, gradient, strain=small)
+    def epoch(state: State, number: Array):
+        model, ahead, of_adam, of_lbfgs, before = state
+        data, slope = jax.value_and_grad(marker_loss)(ahead, pulls)
+        change, of_adam_next = ADAM.update(slope, of_adam)
+        stepped = eqx.apply_updates(ahead, change)
+        both = motion_loss(stepped, space, pulls)
+        motion, slope = jax.tree.map(lambda x: weight(number) * x, both)
+        change, of_lbfgs_next = LBFGS.update(slope, of_lbfgs, stepped)
+        moved = eqx.apply_updates(stepped, change)
+        is_good = data + motion <= before
+        on = State(stepped, moved, of_adam_next, of_lbfgs_next, data + motion)
+        back = State(model, model, of_adam, LBFGS.init(model), jnp.full_like(before, jnp.inf))
+        state = jax.tree.map(lambda new, old: jnp.where(is_good, new, old), on, back)
+        return state, (is_good, data)
 
-    def residual(gradient, changes, velocity, acceleration):
-        by_x, by_y = (jax.jvp(stress, (gradient,), (change,))[1] for change in changes)
-        return by_x[:, 0] + by_y[:, 1] - load(fabric, pull, velocity, acceleration)
+    state, (is_good, data) = jax.lax.scan(epoch, state, first + jnp.arange(epochs))
+    return state, data[jnp.max(jnp.where(is_good, jnp.arange(epochs), 0))]
 
-    return jax.vmap(residual)(gradients(jet), changes, jet.first[T], tt)
+
+def weight(epoch: Array) -> Array:
+    """Weight of the equation of motion in an epoch."""
+    return jnp.minimum(WEIGHT * (1 + (epoch // EVERY).astype(float)), 1.0)
 
 
 def marker_loss(model: Model, pulls: Pull) -> Float[Array, ""]:
@@ -124,52 +150,20 @@ def motion_loss(model: Model, space: ParameterSpace, pulls: Pull) -> tuple[Float
     return jax.lax.scan(add, nothing, jnp.arange(number))[0]
 
 
-@eqx.filter_jit
-def run(
-    state: State, space: ParameterSpace, pulls: Pull, first: Array, epochs: int
-) -> tuple[State, Float[Array, ""]]:
-    """Some epochs from number `first` on, and the loss of the markers [m^2] in the last epoch after
-    which no step was taken back, or in the first."""
+def motion_residual(
+    network: DisplacementField, pull: Pull, fabric: Fabric, places, frames
+) -> Float[Array, "point axis"]:
+    """Residual [N/m^2] of the equation of motion in small strain: divergence of the stress less
+    the load. Damping of the stress is left out, as it would need third derivatives."""
+    jet = field(network, pull, places, frames, ((X, X), (X, Y), (Y, Y), (T, T)))
+    xx, xy, yy, tt = jet.second
+    changes = jnp.stack([jnp.stack([xx, xy], -1), jnp.stack([xy, yy], -1)], axis=1)
 
-    def epoch(state: State, number: Array):
-        model, ahead, of_adam, of_lbfgs, before = state
-        data, slope = jax.value_and_grad(marker_loss)(ahead, pulls)
-        change, of_adam_next = ADAM.update(slope, of_adam)
-        stepped = eqx.apply_updates(ahead, change)
-        motion, slope = jax.tree.map(
-            lambda x: weight(number) * x, motion_loss(stepped, space, pulls)
-        )
-        change, of_lbfgs_next = LBFGS.update(slope, of_lbfgs, stepped)
-        moved = eqx.apply_updates(stepped, change)
-        is_good = data + motion <= before
-        on = State(stepped, moved, of_adam_next, of_lbfgs_next, data + motion)
-        back = State(model, model, of_adam, LBFGS.init(model), jnp.full_like(before, jnp.inf))
-        return jax.tree.map(lambda new, old: jnp.where(is_good, new, old), on, back), (
-            is_good,
-            data,
-        )
+    def stress(gradient):
+        return nominal_stress(fabric, pull.angle, gradient, strain=small_strain)
 
-    state, (is_good, data) = jax.lax.scan(epoch, state, first + jnp.arange(epochs))
-    return state, data[jnp.max(jnp.where(is_good, jnp.arange(epochs), 0))]
+    def residual(gradient, changes, velocity, acceleration):
+        by_x, by_y = (jax.jvp(stress, (gradient,), (change,))[1] for change in changes)
+        return by_x[:, 0] + by_y[:, 1] - load(fabric, pull, velocity, acceleration)
 
-
-def train(
-    space: ParameterSpace,
-    pulls: Pull,
-    epochs: int = EPOCHS,
-    chunk: int = 100,
-    *,
-    key: PRNGKeyArray,
-) -> Course:
-    """Train on stacked pulls, with the fabric from the middle of its space on.
-
-    A training that diverges does not raise: its course shows it.
-    """
-    pulls = plain(pulls)
-    state, data, places = begin(space, pulls, key=key), [], []
-    for first in range(0, epochs, chunk):
-        number = min(chunk, epochs - first)
-        state, loss = run(state, space, pulls, jnp.asarray(first), number)
-        data.append(float(loss))
-        places.append(np.asarray(state.model.place))
-    return Course(state.model, np.array(data), np.array(places))
+    return jax.vmap(residual)(gradients(jet), changes, jet.first[T], tt)

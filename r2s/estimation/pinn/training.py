@@ -18,10 +18,16 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from r2s.estimation import checkpoint as checkpoints
-from r2s.estimation.pinn.losses import clamp_residual, marker_residual
 from r2s.estimation.pinn.network import DisplacementField, Network
 from r2s.estimation.pinn.pulls import Pull
-from r2s.estimation.pinn.weak_form import end_value, kinematics, virtual_fields, virtual_work
+from r2s.estimation.pinn.weak_form import (
+    clamp_residual,
+    end_value,
+    kinematics,
+    marker_residual,
+    virtual_fields,
+    virtual_work,
+)
 from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import ParameterSpace
 
@@ -50,7 +56,7 @@ class Recipe(NamedTuple):
     layers: int = 7
 
 
-QUICK = Recipe()  # `balance` needs a motion to begin with, and its accelerations, no more
+QUICK = Recipe()  # the fit needs a motion to begin with, and its accelerations, no more
 
 
 class Model(eqx.Module):
@@ -142,16 +148,6 @@ def losses_of(
     return Losses(data, clamps, jnp.mean(balance**2), force_loss)
 
 
-def total(
-    model: Model, space: ParameterSpace, pulls: Pull, frames, weight: Array
-) -> tuple[Array, Losses]:
-    """The sum of all losses, those of physics times `weight` [-], and the losses themselves."""
-    fabric = space(model.place)
-    of_pulls = jax.vmap(lambda network, pull, at: losses_of(network, pull, fabric, at))
-    losses = jax.tree.map(jnp.mean, of_pulls(model.networks, pulls, frames))
-    return losses.data + losses.clamps + weight * (losses.work + losses.force), losses
-
-
 def adam(recipe: Recipe) -> optax.GradientTransformation:
     """Adam, whose rate falls by a cosine."""
     epochs = max(recipe.warm_up + recipe.adam, 1)
@@ -160,20 +156,22 @@ def adam(recipe: Recipe) -> optax.GradientTransformation:
 
 @eqx.filter_jit
 def train_chunk(
-    progress: Progress,
-    space: ParameterSpace,
-    pulls: Pull,
-    recipe: Recipe,
-    key: PRNGKeyArray,
+    progress: Progress, space: ParameterSpace, pulls: Pull, recipe: Recipe, key: PRNGKeyArray
 ) -> tuple[Progress, Losses]:
     """A chunk of epochs, and the losses of the last one."""
     number, count = pulls.times.shape
     frames = jr.randint(key, (number, FRAMES), 0, count, int)
 
+    def total(model: Model, weight: Array) -> tuple[Array, Losses]:
+        fabric = space(model.place)
+        of_pulls = jax.vmap(lambda network, pull, at: losses_of(network, pull, fabric, at))
+        losses = jax.tree.map(jnp.mean, of_pulls(model.networks, pulls, frames))
+        return losses.data + losses.clamps + weight * (losses.work + losses.force), losses
+
     def epoch(progress: Progress, _):
         model, state, done = progress
-        weight = (done >= recipe.warm_up).astype(float)
-        gradient, losses = jax.grad(total, has_aux=True)(model, space, pulls, frames, weight)
+        weight = (done >= recipe.warm_up).astype(float)  # of the physics
+        gradient, losses = jax.grad(total, has_aux=True)(model, weight)
         change, state = adam(recipe).update(gradient, state)
         change = eqx.tree_at(lambda m: m.free, change, replace_fn=lambda free: FABRIC_RATE * free)
         return Progress(eqx.apply_updates(model, change), state, done + 1), losses

@@ -1,11 +1,16 @@
-"""The weak form: the work of stress and load in a few smooth virtual displacements.
+"""A pull's motion, its strain and stress, and the weak form: the work in virtual displacements.
+
+The displacement is the network's plus the even stretch between the clamps. The sheet has sides X
+(the pull) and Y; the law is in the axes of warp and weft, which are turned by an angle from X.
+Stress is force per width [N/m]: no thickness enters.
 
 The virtual displacements vanish at the clamps. They do not at the free edges, so that their balance
-makes the traction there zero. One more virtual displacement grows evenly from clamp to clamp and
-gives the balance with the measured force. First derivatives in space suffice. For a given motion
-the work is linear in the stiffness (virtual fields method: Pierron and Grediac 2012).
+makes the traction there zero. One more grows evenly from clamp to clamp and gives the balance with
+the measured force. First derivatives in space suffice. For a given motion the work is linear in the
+stiffness (virtual fields method: Pierron and Grediac 2012).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -14,14 +19,144 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.polynomial import Legendre, Polynomial
 
-from r2s.estimation.pinn.losses import field, gradients, load
-from r2s.estimation.pinn.network import DisplacementField, T, X, Y
+from r2s.environment.contact import friction_dissipation
+from r2s.estimation.pinn.network import DisplacementField, Jet, Pairs, T, X, Y
 from r2s.estimation.pinn.pulls import Pull
-from r2s.estimation.pinn.stress import nominal_stress
 from r2s.materials.fabric import Fabric
+from r2s.materials.turned import TurnedMembrane
 
+EDGE_NODES = 6  # of Gauss's quadrature along a clamp
 NODES = 12  # of the quadrature along each side
 DEGREES = (7, 8)  # number of polynomials along and across the pull
+
+Gradient = Float[Array, "axis 2"]  # of displacement in X and Y, [-]
+Voigt = Float[Array, " 3"]  # strain (E11, E22, 2 E12) [-]
+
+
+# Displacement
+
+
+def field(
+    network: DisplacementField,
+    pull: Pull,
+    places: Float[Array, "point 2"],
+    frames: Int[Array, " point"],
+    pairs: Pairs = (),
+) -> Jet:
+    """Displacements [m] at places (X, Y) [m] in frames, with derivatives.
+
+    `pairs` of inputs are those of the second derivatives.
+    """
+    jet = network.jet(_inputs(pull, places, frames), pairs)
+    share = (places[:, 0] / pull.size[0])[:, None]
+    near, far = ([part[frames] for part in clamp] for clamp in (pull.near, pull.far))
+    value, rate, acceleration = (n + share * (f - n) for n, f in zip(near, far, strict=True))
+    slope, slope_rate = ((f - n) / pull.size[0] for f, n in zip(far[:2], near[:2], strict=True))
+    even = {(0, T): slope_rate, (T, T): acceleration}
+    added = [even.get(pair, jnp.zeros_like(value)) for pair in pairs]
+    first = jet.first + jnp.stack([slope, jnp.zeros_like(slope), rate])
+    second = jet.second + jnp.stack(added) if added else jet.second
+    return Jet(jet.value + value, first, second)
+
+
+def displacement(
+    network: DisplacementField,
+    pull: Pull,
+    places: Float[Array, "point 2"],
+    frames: Int[Array, " point"],
+) -> Float[Array, "point axis"]:
+    """Displacements [m], see `field`, without derivatives."""
+    share = (places[:, 0] / pull.size[0])[:, None]
+    near, far = pull.near.value[frames], pull.far.value[frames]
+    return network(_inputs(pull, places, frames)) + near + share * (far - near)
+
+
+def _inputs(pull: Pull, places, frames) -> Float[Array, "point 3"]:
+    return jnp.concatenate([places, pull.times[frames][:, None]], axis=1)
+
+
+def gradients(jet: Jet) -> Float[Array, "point axis 2"]:
+    """Gradients [-] of the displacement in X and Y."""
+    return jnp.moveaxis(jet.first[:2], 0, -1)
+
+
+def marker_residual(network: DisplacementField, pull: Pull) -> Float[Array, "frame marker axis"]:
+    """Differences [m] of the network from the markers; zero where they are not seen."""
+    number, markers, axes = pull.displacement.shape
+    places = jnp.tile(pull.places, (number, 1))
+    moved = displacement(network, pull, places, jnp.repeat(jnp.arange(number), markers))
+    difference = moved.reshape(number, markers, axes) - pull.displacement
+    return jnp.where(pull.seen[..., None], difference, 0)
+
+
+def clamp_residual(network: DisplacementField, pull: Pull) -> Float[Array, "point axis"]:
+    """Differences [m] of the network from both clamps, at nodes along them in every frame."""
+    nodes = jnp.asarray((np.polynomial.legendre.leggauss(EDGE_NODES)[0] + 1) / 2, float)
+    number = len(pull.times)
+    y = jnp.tile(nodes * pull.size[1], 2 * number)
+    frames = jnp.repeat(jnp.arange(number), 2 * EDGE_NODES)
+    ends = jnp.tile(jnp.repeat(jnp.array([0.0, 1.0], y.dtype), EDGE_NODES), number)
+    places = jnp.stack([ends * pull.size[0], y], axis=1)
+    clamp = jnp.where(ends[:, None] > 0, pull.far.value[frames], pull.near.value[frames])
+    return displacement(network, pull, places, frames) - clamp
+
+
+# Stress and load
+
+
+def green_strain(gradient: Gradient) -> Voigt:
+    """Green strain [-] of a gradient of displacement, exact for any rotation."""
+    f = gradient + jnp.eye(2, dtype=gradient.dtype)
+    return jnp.stack([(f[:, 0] @ f[:, 0] - 1) / 2, (f[:, 1] @ f[:, 1] - 1) / 2, f[:, 0] @ f[:, 1]])
+
+
+def small_strain(gradient: Gradient) -> Voigt:
+    """Small strain [-] of a gradient of displacement, with the engineering shear."""
+    return jnp.stack([gradient[0, 0], gradient[1, 1], gradient[0, 1] + gradient[1, 0]])
+
+
+def nominal_stress(
+    fabric: Fabric,
+    angle: Float[Array, ""],
+    gradient: Gradient,
+    rate: Gradient | None = None,
+    strain: Callable[[Gradient], Voigt] = green_strain,
+) -> Gradient:
+    """First Piola-Kirchhoff stress [N/m], the derivative of the energy in the gradient.
+
+    Its first column is the traction on an edge across X, per width at rest. In Green strain it is
+    F S, in small strain the symmetric stress.
+
+    - `angle`: from X to the warp, [rad].
+    - `gradient`: of the displacement, [-].
+    - `rate`: of the gradient [1/s]. With it the stress has the part of Kelvin-Voigt damping:
+      `fabric.damping` times the stiffness times the rate of strain.
+    - `strain`: `green_strain` or `small_strain`.
+    """
+    energy = TurnedMembrane(fabric.membrane, angle).energy_density
+    at, pull_back = jax.vjp(strain, gradient)
+    if rate is not None:
+        at = at + fabric.damping * jax.jvp(strain, (gradient,), (rate,))[1]
+    return pull_back(jax.grad(energy)(at))[0]
+
+
+def load(
+    fabric: Fabric,
+    pull: Pull,
+    velocity: Float[Array, " axis"],
+    acceleration: Float[Array, " axis"],
+) -> Float[Array, " axis"]:
+    """Load [N/m^2] that the stress must balance: inertia, damping and friction, less the weight.
+
+    The friction is that of the cloth solver on a table (`r2s.environment.contact`).
+    """
+    limit = fabric.friction * fabric.density * pull.normal
+    friction = jax.grad(friction_dissipation, argnums=1)(limit, velocity)
+    damped = acceleration + fabric.mass_damping * velocity - pull.gravity
+    return fabric.density * damped + friction
+
+
+# Virtual work
 
 
 class Virtual(NamedTuple):
@@ -55,14 +190,17 @@ def virtual_fields(
     at, weight = np.polynomial.legendre.leggauss(nodes)
     places = np.stack(np.meshgrid((at + 1) / 2, (at + 1) / 2, indexing="ij"), -1).reshape(-1, 2)
     weights = np.outer(weight, weight).ravel() / 4
-    along, across = ([_legendre(i) for i in range(count)] for count in degrees)
-    pairs = [(f * Polynomial([0, 1, -1]), g) for f in along for g in across]
-    pairs.append((Polynomial([0, 1]), Polynomial([1])))
+
+    def legendre(degree: int) -> Polynomial:
+        return Legendre.basis(degree, [0, 1]).convert(kind=Polynomial)
 
     def values(functions, places) -> np.ndarray:
         x, y = places.T
         return np.array([f(x) * g(y) for f, g in functions])
 
+    along, across = ([legendre(i) for i in range(count)] for count in degrees)
+    pairs = [(f * Polynomial([0, 1, -1]), g) for f in along for g in across]
+    pairs.append((Polynomial([0, 1]), Polynomial([1])))
     slopes = [values([(f.deriv(), g) for f, g in pairs], places)]
     slopes.append(values([(f, g.deriv()) for f, g in pairs], places))
     slope = np.stack(slopes, axis=2)
@@ -70,11 +208,6 @@ def virtual_fields(
     at_markers = values(pairs, np.zeros((0, 2)) if markers is None else markers) / size
     parts = places, weights, values(pairs, places) / size, slope / size[..., None]
     return Virtual(*(jnp.asarray(part, float) for part in (*parts, at_markers[:-1].T)))
-
-
-def _legendre(degree: int) -> Polynomial:
-    """Legendre polynomial on 0..1."""
-    return Legendre.basis(degree, [0, 1]).convert(kind=Polynomial)
 
 
 class Kinematics(NamedTuple):

@@ -1,38 +1,47 @@
-"""The stiffness whose motions in equilibrium fit markers and force best, and its covariance.
+"""The physics-informed network as an estimator: stiffness from markers and force of stretchings.
 
-Damped Gauss-Newton steps within the ranges, by the derivatives of `equilibrium`; the noise of
-markers and force is estimated with the stiffness. The loop is our own, since solvers of optimistix
-begin each motion anew and cannot estimate the noise: from three pulls
-`optimistix.LevenbergMarquardt` arrives at the same place, to 0.05 standard errors, in 34 steps and
-71 CPU seconds, where such a loop took 7 steps and 12 CPU seconds.
+A network is trained on each pull (`r2s.estimation.pinn.training`). From it the motions in
+equilibrium are computed (`r2s.estimation.pinn.equilibrium`), and the stiffness whose motions fit
+markers and force best, with its covariance.
+
+The fit takes damped Gauss-Newton steps within the ranges, and estimates the noise of markers and
+force with the stiffness. The loop is our own, since solvers of optimistix begin each motion anew
+and cannot estimate the noise: from three pulls `optimistix.LevenbergMarquardt` arrives at the same
+place, to 0.05 standard errors, in 34 steps and 71 CPU seconds, where such a loop took 7 steps and
+12 CPU seconds.
 """
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimation.least_squares import (
-    Damping,
-    at_bound,
-    damped,
-    newton_step,
-    proposed,
-)
+from r2s.estimation.estimate import Estimate, Nuisance
+from r2s.estimation.law_error import to_small_strain
+from r2s.estimation.least_squares import Damping, at_bound, damped, newton_step, proposed
 from r2s.estimation.pinn.equilibrium import Motion, equilibrium, prepare
 from r2s.estimation.pinn.network import Network
-from r2s.estimation.pinn.pulls import Pull
+from r2s.estimation.pinn.pulls import Pull, stacked
+from r2s.estimation.pinn.training import NOISE, QUICK, Recipe, Trained, train
 from r2s.estimation.pinn.weak_form import DEGREES
 from r2s.estimation.standard_errors import to_small_strain
 from r2s.materials.parameters import ParameterSpace
 from r2s.materials.stiffening_space import stiffens
 
-LONGEST = 0.1  # Gauss-Newton step, of a range
+# near the clamps the tension carries some of the weight, which the model gives to the table
+FRICTION_ERROR = 0.1  # [-]
+# between a mesh of 33 x 33 vertices and the continuum, over four noise seeds of five fabrics
+STIFFNESS_ERROR, COUPLING_ERROR = 0.006, 0.004  # relative; [-]
+MODEL_ERRORS = {"friction": FRICTION_ERROR, "coupling": COUPLING_ERROR, "nu": COUPLING_ERROR}
+MAX_STEP = 0.1  # of Gauss-Newton, of a range
 BOUNDS = 1e-3, 1 - 1e-3  # of places in the ranges
 FLAT_PRIOR = 12.0  # one over the variance of a uniform distribution on 0..1
-STEPS = 60  # most Gauss-Newton steps
+MAX_STEPS = 60
 SMALL = 0.05  # of the standard errors: the Gauss-Newton step at which it has converged
 LEAST_NOISE = (1e-7, 1e-5)  # of markers [m], and of the force over its greatest [-]
 
@@ -66,14 +75,93 @@ class _Equations(NamedTuple):
     matrix: Float[np.ndarray, "dim dim"]
 
 
-def balance(
+def estimate(
+    pulls: Sequence[Pull],
+    space: ParameterSpace,
+    recipe: Recipe = QUICK,
+    *,
+    progress: Callable[[int, float], None] | None = None,
+    checkpoint: Path | None = None,
+    key: PRNGKeyArray,
+) -> Estimate:
+    """The fabric of one or several pulls.
+
+    The standard errors come from the noise, from the change of the estimate with the number of
+    virtual displacements, from what the model leaves out, and from what stiffness changes between
+    half the stretch and all of it (they are those of stiffness at small strain). A parameter that
+    the pulls do not determine has the standard error of its range. Without a force the nuisance
+    "stiffness scale" says that the scale is not identifiable; ratios of stiffness may be.
+
+    - `recipe`: of the training.
+    - `progress`: called with the number of each chunk of training and its loss [m^2].
+    - `checkpoint`: a file from which a killed training goes on.
+
+    Raises `ValueError` for pulls that do not go together, `RuntimeError` when the training diverges
+    or no motion is in equilibrium.
+    """
+    began = time.perf_counter()
+    trained = train(
+        space, stacked(list(pulls)), recipe, report=progress, checkpoint=checkpoint, key=key
+    )
+    networks = [
+        jax.tree.map(lambda leaf, i=i: leaf[i], trained.model.networks) for i in range(len(pulls))
+    ]
+    found = fit(space, networks, pulls, trained.places[-1], NOISE, DEGREES)
+    fewer = DEGREES[0] - 1, DEGREES[1] - 1
+    change = fit(space, networks, pulls, found.place, found.noise, fewer).place - found.place
+    errors = [
+        STIFFNESS_ERROR if r.unit == "N/m" else MODEL_ERRORS.get(r.name, 0.0) for r in space.ranges
+    ]
+    model = np.diag([(error / r.width) ** 2 for error, r in zip(errors, space.ranges, strict=True)])
+    covariance = found.covariance + np.outer(change, change) + model + found.law
+    words = f"{len(pulls)} pull{'s' if len(pulls) > 1 else ''}"
+    if pulls[0].force is None:
+        words += ", no force: the scale of stiffness is not identifiable"
+    words += "" if found.converged else ", not converged"
+    found = found._replace(covariance=covariance)
+    return _estimate(f"pinn ({words})", found, space, trained, pulls, began)
+
+
+def _estimate(
+    approach: str, found: Fit, space: ParameterSpace, trained: Trained, pulls, began: float
+) -> Estimate:
+    widths = np.array([bound.width for bound in space.ranges])
+    errors = np.sqrt(np.diag(found.covariance))
+    places = np.concatenate([trained.places, found.places, found.place[None]])
+    history = np.asarray(jax.vmap(space.values)(jnp.asarray(places, float)))
+    nuisances = [Nuisance("marker noise", "m", found.noise[0], np.nan)]
+    if pulls[0].force is not None:
+        nuisances.append(Nuisance("force noise", "-", found.noise[1], np.nan))
+    scale = np.array([r.unit == "N/m" for r in space.ranges]) * widths
+    if scale.any():
+        weights = scale / np.count_nonzero(scale)
+        mean = float(np.exp(np.log(history[-1][scale > 0]).mean()))
+        spread = float(np.sqrt(weights @ found.covariance @ weights))  # relative, since log
+        nuisances.append(Nuisance("stiffness scale", "N/m", mean, spread * mean))
+    return Estimate(
+        approach=approach,
+        fabric=space(jnp.asarray(found.place, float)),
+        ranges=space.ranges,
+        values=history[-1],
+        standard_errors=widths * errors,
+        correlation=found.covariance / np.outer(errors, errors),
+        nuisances=tuple(nuisances),
+        loss=float(found.losses[-1]),
+        losses=np.concatenate([trained.losses * NOISE[0] ** 2, found.losses])[:, None],
+        history=history[:-1, None],
+        seconds=time.perf_counter() - began,
+        converged=found.converged,
+    )
+
+
+def fit(
     space: ParameterSpace,
     networks: Sequence[Network],
     pulls: Sequence[Pull],
     place: Float[np.ndarray, " dim"],
     noise: tuple[float, float],
     degrees: tuple[int, int] = DEGREES,
-    steps: int = STEPS,
+    steps: int = MAX_STEPS,
 ) -> Fit:
     """The place in the parameter space whose motions in equilibrium fit markers and force best.
 
@@ -92,8 +180,11 @@ def balance(
     given, starts = zip(*ready, strict=True)
 
     def motions_at(place: Array, starts) -> list[Motion]:
-        each = zip(pulls, given, starts, strict=True)
-        return [equilibrium(space, place, *one) for one in each]
+        parts = zip(pulls, given, starts, strict=True)
+        return [equilibrium(space, place, *part) for part in parts]
+
+    def equations(motions: Sequence[Motion], at: Array) -> _Equations:
+        return _equations(motions, pulls, noise, np.asarray(at, np.float64) - 0.5)
 
     low, high = (jnp.full(space.dim, bound, float) for bound in BOUNDS)
     at = jnp.clip(jnp.asarray(place, float), low, high)
@@ -101,35 +192,29 @@ def balance(
     if not any(motion.is_balanced.any() for motion in motions):
         raise RuntimeError("no pull has a motion in equilibrium")
     places, losses, converged = [], [], False
-
-    def equations(motions: Sequence[Motion], at: Array) -> _Equations:
-        return _equations(motions, pulls, noise, np.asarray(at, np.float64) - 0.5)
-
     for _ in range(steps):
         places.append(np.asarray(at, np.float64))
-        losses.append(_left(motions, pulls)[0] ** 2)
+        losses.append(_rms_residuals(motions, pulls)[0] ** 2)
         here = equations(motions, at)
         gradient, matrix = (jnp.asarray(part, float) for part in here[1:])
         step = np.abs(newton_step(gradient, matrix, at_bound(at, gradient, low, high)))
         small = SMALL * np.sqrt(np.diag(np.linalg.inv(here.matrix)))
-        is_near = not _unbalanced(motions) and bool(np.all(step <= LONGEST))
+        is_near = not _unbalanced(motions) and bool(np.all(step <= MAX_STEP))
         converged = is_near and bool(np.all(step < small))
         if converged:
             break
-        trial = proposed(at, gradient, matrix, damping, low, high, LONGEST)
+        trial = proposed(at, gradient, matrix, damping, low, high, MAX_STEP)
         there = motions_at(trial, [motion.coefficients for motion in motions])
         loss = equations(there, trial).loss
         is_better = (_unbalanced(there), loss) < (_unbalanced(motions), here.loss)
         damping = damped(damping, jnp.asarray(is_better))
         if is_better:
             at, motions = trial, there
-        elif np.all(
-            np.abs(trial - at) < small
-        ):  # the tolerance of the motions decides what is better
-            converged = is_near
+        elif np.all(np.abs(trial - at) < small):
+            converged = is_near  # the tolerance of the motions decides what is better
             break
-        if is_near:  # what is left of a longer step is not noise
-            left = _left(motions, pulls)
+        if is_near:  # the residuals of a longer step are not noise
+            left = _rms_residuals(motions, pulls)
             noise = max(left[0], LEAST_NOISE[0]), max(left[1], LEAST_NOISE[1])
     covariance = np.linalg.inv(equations(motions, at).matrix)
     law = np.zeros_like(covariance)
@@ -159,8 +244,8 @@ def _equations(
     loss, gradient = FLAT_PRIOR * off @ off / 2, FLAT_PRIOR * off
     matrix = FLAT_PRIOR * np.eye(len(off))
     for motion, pull in zip(motions, pulls, strict=True):
-        apart = np.asarray(pull.far.value - pull.near.value, np.float64)
-        stretch = np.linalg.norm(apart - apart[0], axis=1)
+        span = np.asarray(pull.far.value - pull.near.value, np.float64)
+        stretch = np.linalg.norm(span - span[0], axis=1)
         counts = np.asarray(motion.is_balanced) & (stretch <= until * stretch.max())
         markers, force = _residuals(motion, pull)
         rows = [(markers / noise[0], np.asarray(motion.markers_by_place) / noise[0])]
@@ -183,7 +268,7 @@ def _residuals(motion: Motion, pull: Pull) -> tuple[np.ndarray, np.ndarray]:
     return markers, (force - measured) / _greatest(pull)
 
 
-def _left(motions: Sequence[Motion], pulls: Sequence[Pull]) -> tuple[float, float]:
+def _rms_residuals(motions: Sequence[Motion], pulls: Sequence[Pull]) -> tuple[float, float]:
     """The rms of `_residuals` of all pulls, in the frames that are in equilibrium."""
     parts = []
     for motion, pull in zip(motions, pulls, strict=True):
