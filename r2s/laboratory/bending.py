@@ -14,6 +14,7 @@ flat until it rests. The coefficient depends on which of several sets of folds i
 
 from collections.abc import Sequence
 from functools import cache
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -63,12 +64,10 @@ class Cantilever(eqx.Module):
     def make(
         cls, overhangs: Sequence[float], direction: float = 0.0, name: str = "cantilever"
     ) -> "Cantilever":
-        """From the readings [m] of one direction.
+        """From readings [m], whose mean errs by `OVERHANG_DEVIATION` or by their scatter.
 
-        The error of their mean is `OVERHANG_DEVIATION`, or that of their scatter where it is more.
-
-        Raises `ValueError` that names the test: no reading, one that is none in metres, readings
-        that differ by more than a factor of two.
+        Raises `ValueError` that names the test for no reading, for one that is none in metres, and
+        for readings that differ by more than a factor of two.
         """
         read = np.asarray(overhangs, float)
         if read.ndim != 1 or not read.size or not np.isfinite(read).all() or not (read > 0).all():
@@ -88,10 +87,7 @@ class Cantilever(eqx.Module):
         mean = float(np.exp(np.mean(np.log(read))))
         return cls(jnp.asarray(mean, float), jnp.asarray(deviation, float), direction, name)
 
-    @property
-    def count(self) -> int:
-        """Number of data."""
-        return 1
+    count: ClassVar[int] = 1  # of data
 
     def residuals(self, fabric: Fabric) -> Float[Array, " 1"]:
         """The fabric's overhang less the measured one, in standard deviations."""
@@ -160,11 +156,8 @@ class Drape(eqx.Module):
         deviation: float = DRAPE_DEVIATION,
         name: str = "drape",
     ) -> "Drape":
-        """From what the tester reads; see the fields.
-
-        Raises `ValueError` that names the test: a coefficient in per cent, radii that are
-        diameters or none in metres.
-        """
+        """Raises `ValueError` that names the test for a coefficient in per cent, and for radii that
+        are diameters or none in metres."""
         if not 0 < coefficient < 1:
             raise ValueError(
                 f"{name}: a drape coefficient is a share from 0 to 1, got {coefficient}: "
@@ -181,10 +174,7 @@ class Drape(eqx.Module):
         mean, error = (jnp.asarray(n, float) for n in (coefficient, deviation))
         return cls(mean, error, (float(specimen), float(support)), name)
 
-    @property
-    def count(self) -> int:
-        """Number of data."""
-        return 1
+    count: ClassVar[int] = 1  # of data
 
     def residuals(self, fabric: Fabric) -> Float[Array, " 1"]:
         """The fabric's coefficient less the measured one, in standard deviations."""
@@ -208,10 +198,9 @@ class Ring(eqx.Module):
 
 
 def ring(radii: tuple[float, float] = RADII, shape: tuple[int, int] = RING_SHAPE) -> Ring:
-    """The ring of a specimen.
+    """The ring of a specimen, with `shape` vertices around and cells from the support to the rim.
 
-    - `radii`: of specimen and support, [m].
-    - `shape`: vertices around, and cells from the support to the rim.
+    `radii`: of specimen and support, [m].
     """
     with jax.ensure_compile_time_eval():  # sizes follow from the mesh, also under `jax.jit`
         return _ring(radii, shape)

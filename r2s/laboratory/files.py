@@ -17,7 +17,6 @@ stitch-by-stitch is one with a `file` that ends in .h5, see `read_knit`.
 import hashlib
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -72,22 +71,23 @@ def read_tests(path: Path | str) -> LaboratoryTests:
     if not isinstance(stored, dict) or stored.get("format") != FORMAT:
         found = stored.get("format") if isinstance(stored, dict) else type(stored).__name__
         raise ValueError(f"{path}: laboratory tests have the format {FORMAT!r}, found {found!r}")
-    if unknown := sorted(set(stored) - {"format", "source", *READERS}):
+    if unknown := sorted(set(stored) - {"format", "source", *KINDS}):
         raise ValueError(
-            f"{path}: unknown: {', '.join(unknown)}; known: source, {', '.join(READERS)}"
+            f"{path}: unknown: {', '.join(unknown)}; known: source, {', '.join(KINDS)}"
         )
     source = stored.get("source", "")
     if not isinstance(source, str):
         raise ValueError(f"{path}: source: expected text, found {source!r}")
     tests: list[Test] = []
-    for kind, read in READERS.items():
-        entries = stored.get(kind, [])
+    for name, kind in KINDS.items():
+        entries = stored.get(name, [])
         if not isinstance(entries, list):
-            raise ValueError(f"{path}: {kind}: expected a list, found {type(entries).__name__}")
+            raise ValueError(f"{path}: {name}: expected a list, found {type(entries).__name__}")
         for number, entry in enumerate(entries, 1):
-            tests += read(path.parent, f"{path}: {kind[:-1]} {number}", entry)
+            where = f"{path}: {name[:-1]} {number}"
+            tests += _entry(kind, where, entry).read(path.parent, where)
     if not tests:
-        raise ValueError(f"{path}: no test: it has neither {', '.join(READERS)}")
+        raise ValueError(f"{path}: no test: it has neither {', '.join(KINDS)}")
     return LaboratoryTests(tuple(tests), source, path.stem)
 
 
@@ -96,6 +96,9 @@ class _Knit:
     file: str
     direction: float
     specimen: float = SPECIMEN
+
+    def read(self, folder: Path, where: str) -> list[Test]:
+        return list(read_knit(_existing(folder / self.file, where), self.direction, self.specimen))
 
 
 @dataclass(frozen=True)
@@ -106,11 +109,25 @@ class _Pull:
     width: float
     specimen: float = SPECIMEN
 
+    def read(self, folder: Path, where: str) -> list[Test]:
+        file = _existing(folder / self.file, where)
+        header = " ".join(header_of(file)).lower()
+        units = {"extension": METRES} if "extension" in header else {"strain": SHARES}
+        units |= {"force": NEWTONS} | ({"width": METRES} if "width" in header else {})
+        along, force, *width = read_columns(file, units).values.T
+        extension = along if "extension" in units else along * self.length
+        middle, name = width[0] if width else None, f"{where} ({file.name})"
+        size = self.length, self.width
+        return [Pull.make(extension, force, size, self.direction, middle, self.specimen, name)]
+
 
 @dataclass(frozen=True)
 class _Cantilever:
     direction: float
     overhangs: tuple[float, ...]
+
+    def read(self, _: Path, where: str) -> list[Test]:
+        return [Cantilever.make(self.overhangs, self.direction, name=where)]
 
 
 @dataclass(frozen=True)
@@ -120,9 +137,24 @@ class _Drape:
     support_radius: float = RADII[1]
     deviation: float = DRAPE_DEVIATION
 
+    def read(self, _: Path, where: str) -> list[Test]:
+        radii = self.specimen_radius, self.support_radius
+        return [Drape.make(self.coefficient, radii, self.deviation, name=where)]
 
-def _entry(kind: type, where: str, entry: Any) -> Any:
-    """The dataclass `kind` from an entry of a file, its direction as an angle [rad]."""
+
+KINDS: dict[str, Any] = {"pulls": _Pull, "cantilevers": _Cantilever, "drapes": _Drape}
+
+
+def _existing(file: Path, where: str) -> Path:
+    if not file.is_file():
+        raise FileNotFoundError(f"{where}: no such file: {file}")
+    return file
+
+
+def _entry(kind: Any, where: str, entry: Any) -> Any:
+    """An entry of a file, as one of `KINDS`, its direction as an angle [rad]."""
+    if kind is _Pull and isinstance(entry, dict) and str(entry.get("file")).endswith(".h5"):
+        kind = _Knit
     if isinstance(entry, dict) and "direction" in entry:
         direction: Any = DIRECTIONS.get(str(entry["direction"]), entry["direction"])
         is_number = isinstance(direction, int | float) and not isinstance(direction, bool)
@@ -138,65 +170,23 @@ def _entry(kind: type, where: str, entry: Any) -> Any:
         raise ValueError(f"{where}: a number is too large: {error}") from error
 
 
-def _pulls(folder: Path, where: str, entry: Any) -> list[Test]:
-    is_knit = isinstance(entry, dict) and str(entry.get("file")).endswith(".h5")
-    given = _entry(_Knit if is_knit else _Pull, where, entry)
-    file = folder / given.file
-    if not file.is_file():
-        raise FileNotFoundError(f"{where}: no such file: {file}")
-    if is_knit:
-        return list(read_knit(file, given.direction, given.specimen))
-    header = " ".join(header_of(file)).lower()
-    units = {"extension": METRES} if "extension" in header else {"strain": SHARES}
-    units |= {"force": NEWTONS} | ({"width": METRES} if "width" in header else {})
-    along, force, *width = read_columns(file, units).values.T
-    extension = along if "extension" in units else along * given.length
-    middle, name = width[0] if width else None, f"{where} ({file.name})"
-    size = given.length, given.width
-    return [Pull.make(extension, force, size, given.direction, middle, given.specimen, name)]
-
-
-def _cantilevers(folder: Path, where: str, entry: Any) -> list[Test]:
-    del folder
-    given = _entry(_Cantilever, where, entry)
-    return [Cantilever.make(given.overhangs, given.direction, name=where)]
-
-
-def _drapes(folder: Path, where: str, entry: Any) -> list[Test]:
-    del folder
-    given = _entry(_Drape, where, entry)
-    radii = given.specimen_radius, given.support_radius
-    return [Drape.make(given.coefficient, radii, given.deviation, name=where)]
-
-
-READERS: dict[str, Callable[[Path, str, Any], list[Test]]] = {
-    "pulls": _pulls,
-    "cantilevers": _cantilevers,
-    "drapes": _drapes,
-}
-
-
 def read_knit(path: Path | str, direction: float, specimen: float = SPECIMEN) -> list[Pull]:
     """The uniaxial pulls in one file of stitch-by-stitch, but for the first.
 
     Singal et al., Nature Communications 15, 2622 (2024); repository sabetta/stitch-by-stitch (MIT
     licence), commit 0ed27f35, `data/uniaxial_experiments/experimentData/outputData_{yarn} {stitch}
-    {X,Y}.h5`: force [N] and tracked pins [pixel] of five pulls of a swatch. X is along the courses
-    (rows), Y along the wales. Its notebook has what the files lack: the width of the clamp, which
-    gives the scale, that strain counts from the first frame of the second pull, and that the first
-    pull, of a swatch never stretched before, is left out. The fabrics' weight is not given.
+    {X,Y}.h5`: force [N] and tracked pins [pixel] of five pulls of a swatch, X along the courses, Y
+    along the wales. Its notebook says the width of the clamp, which gives the scale, that strain
+    counts from the first frame of the second pull, and that the first pull is left out, of a swatch
+    never stretched before.
 
-    - `direction`: of the pull from the warp, [rad]: 0 for Y and pi/2 for X.
-    - `specimen`: see `Pull`.
+    `direction`: of the pull from the warp, [rad]: 0 for Y and pi/2 for X. `specimen`: see `Pull`.
 
-    Needs h5py: pip install 'r2s[laboratory]'. Raises FileNotFoundError; ValueError that names the
-    file and the pull: no such file of HDF5, arrays that are missing or of other shapes; ImportError
-    that names the extra.
+    Raises ValueError that names the file and the pull for arrays that are missing or of other
+    shapes; ImportError that names the extra.
     """
     path = Path(path)
     h5py = require("h5py", "laboratory", "the pulls of stitch-by-stitch")
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file")
     try:
         with h5py.File(path, "r") as file:
             arrays = {

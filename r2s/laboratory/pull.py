@@ -54,19 +54,14 @@ class Pull(eqx.Module):
         specimen: float = SPECIMEN,
         name: str = "pull",
     ) -> "Pull":
-        """From what a tester writes.
+        """From what a tester writes, thinned to `SAMPLES` means over equal parts of the stretch.
 
         - `extension`, `force`: [m], [N], of a load that grows.
         - `size`: free length between the clamps and width at rest, [m].
         - `direction`: of the pull, from the warp, [rad].
         - `width`: of its middle at each sample, [m], where measured.
 
-        The curve is thinned to `SAMPLES` means over equal parts of its stretch.
-
-        Raises `ValueError` that names the pull: sizes that are not positive, fewer than three
-        samples, an extension that looks like per cent or millimetres, a force above that of any
-        fabric, one that does not rise, falls before the end, or is not zero at rest; a strip that
-        is let go again.
+        Raises `ValueError` that names the pull and what is wrong with the curve or its units.
         """
         length, wide = size
         if not (0 < wide < 5 and 0 < length < 5):

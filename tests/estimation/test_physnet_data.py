@@ -71,15 +71,6 @@ def test_other_settings_in_the_same_folder_are_refused(folder):
         dataclasses.replace(TINY, scenario="lift")
 
 
-def test_other_data_can_have_the_same_view(folder, tmp_path):
-    view = dataset.load_manifest(folder).view
-    settings = dataclasses.replace(TINY, num_fabrics=2, seed=6)
-    assert dataset.make(tmp_path, settings, progress=False, view=view).view == view
-    moved = dataclasses.replace(view, floor=0.1)
-    with pytest.raises(ValueError, match="has data of View.*asked for View.*floor=0.1"):
-        dataset.make(tmp_path, settings, progress=False, view=moved)
-
-
 def test_ranges_are_those_of_the_family_unless_given():
     assert [bound.name for bound in Settings(solver="points").ranges] == ["E h", "nu"]
     assert len(Settings().ranges) == 7

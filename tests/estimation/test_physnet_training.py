@@ -12,7 +12,7 @@ from r2s.estimation import checkpoint
 from r2s.estimation.physnet import training
 from r2s.estimation.physnet.dataset import DEPTH_UNIT, Data
 from r2s.estimation.physnet.images import Flaws, View
-from r2s.estimation.physnet.training import DEEPER, PAPER, Architecture, PhysNet, Schedule
+from r2s.estimation.physnet.training import DEEPER, Architecture, Schedule
 
 VIEW = View((0.0, -1.0, 0.0), (0.0, 0.0, 0.0), 16.0, 16, 0.5, 1.5, -1.0)
 SMALL = Architecture(size=16, channels=(4, 4), hidden=(16,))
@@ -138,11 +138,3 @@ def test_losses_of_three_points_on_a_line():
             others = [v for k, v in squares.items() if anchor in k]
             losses += [max(own - other + 5, 0) for other in others]
     np.testing.assert_allclose(training.triplet_loss(points, 5.0), np.mean(losses))
-
-
-def test_the_paper_s_network_has_its_layers():
-    network = jax.eval_shape(lambda: PhysNet.make(PAPER, key=jax.random.key(0)))
-    assert [c.weight.shape for c in network.convolutions] == [(32, 1, 5, 5), (64, 32, 5, 5)]
-    assert [layer.weight.shape for layer in network.layers] == [
-        (256, 64 * 64 * 64), (256, 256), (2, 256),
-    ]  # fmt: skip

@@ -63,9 +63,9 @@ def even_pull(force: bool = True, seed: int = 0, frames: int = FRAMES, growth: f
 
 
 def small_network(pull: Pull) -> Network:
-    low, high = jnp.zeros(3), jnp.concatenate([pull.size, pull.times[-1:]])
+    high = jnp.concatenate([pull.size, pull.times[-1:]])
     scale = jnp.asarray(1e-3, float)
-    return Network.make(low, high, scale, width=5, layers=3, key=jr.key(1))
+    return Network.make(high, scale, width=5, layers=3, key=jr.key(1))
 
 
 @pytest.fixture(autouse=True)

@@ -233,8 +233,9 @@ def test_each_loss_is_one_when_its_error_is_the_noise():
 
 def test_losses_have_finite_gradients():
     given = pull(stretched(2.0), force=jnp.full(FRAMES, 3.0), normal=9.81)
-    low, high = jnp.zeros(3), jnp.array([*SIZE, 0.02])
-    network = Network.make(low, high, jnp.asarray(0.01), width=5, layers=3, key=jr.key(3))
+    network = Network.make(
+        jnp.array([*SIZE, 0.02]), jnp.asarray(0.01), width=5, layers=3, key=jr.key(3)
+    )
 
     def loss(network):
         return sum(losses_of(network, given, FABRIC, jnp.arange(3)))

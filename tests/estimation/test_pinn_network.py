@@ -22,8 +22,8 @@ ANGLE = jnp.asarray(0.4)
 
 
 def some_network() -> Network:
-    low, high = jnp.zeros(3), jnp.array([0.45, 0.3, 1.2])
-    return Network.make(low, high, jnp.asarray(0.02), width=9, layers=4, key=jr.key(0))
+    high = jnp.array([0.45, 0.3, 1.2])
+    return Network.make(high, jnp.asarray(0.02), width=9, layers=4, key=jr.key(0))
 
 
 class PlaneStrainSpace(IsotropicSpace):

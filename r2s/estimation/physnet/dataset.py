@@ -69,9 +69,6 @@ class Settings:
             raise ValueError(f"the space has the ranges {expected}, found {names}")
         if self.scenario not in SIX:
             raise ValueError(f"scenario must be one of {list(SIX)}, found {self.scenario!r}")
-        for name in ("num_fabrics", "num_levels", "num_frames", "per_shard"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, found {getattr(self, name)}")
 
     @property
     def space(self) -> ParameterSpace:
@@ -109,19 +106,16 @@ class Data(NamedTuple):
     places: Float[np.ndarray, "fabric dim"]
 
 
-def make(
-    folder: Path | str, settings: Settings, progress: bool = True, view: View | None = None
-) -> Manifest:
+def make(folder: Path | str, settings: Settings, progress: bool = True) -> Manifest:
     """Write a manifest and the missing shards of a data set.
 
     A shard depends on the settings and on its own number alone, so that an interrupted call can be
-    repeated. Without a `view`, such as that of the data of an existing network, the motions of the
-    first shard determine it. Raises `ValueError` when the folder has data of other settings or of
-    another view.
+    repeated. The motions of the first shard determine the view. Raises `ValueError` when the folder
+    has data of other settings.
     """
     from tqdm import tqdm
 
-    folder = Path(folder)
+    folder, view = Path(folder), None
     folder.mkdir(parents=True, exist_ok=True)
     if (folder / "manifest.json").exists():
         stored = load_manifest(folder)
@@ -130,8 +124,6 @@ def make(
             raise ValueError(
                 f"{folder} has data of other settings: {', '.join(changed)}; choose another folder"
             )
-        if view not in (None, stored.view):
-            raise ValueError(f"{folder} has data of {stored.view}, asked for {view}")
         view = stored.view
     missing = [n for n in range(settings.num_shards) if not _shard(folder, n).exists()]
     if not missing:

@@ -60,12 +60,11 @@ class PullForce(eqx.Module):
 
 
 def pull_force(recording: Recording, frames: Sequence[int]) -> PullForce | None:
-    """That of a recording at some frames; None where it is no stretching, or has no force.
+    """The force of a recording at some frames; None where it is no stretching, or has no force.
 
     What is across the pull is left out: it is noise for the most part. `least` is `SHARE` of the
-    largest force, or what lets `NOISE` count like a flawed image.
-
-    Raises what `r2s.estimation.problem.force_at` raises, and `ValueError` where the force is zero.
+    largest force, or what lets `NOISE` count like a flawed image. Raises as `force_at`, and
+    `ValueError` where the force is zero.
     """
     if recording.info.scenario != "stretching":
         return None

@@ -55,15 +55,11 @@ class Perceptron(nn.Module):
 
     def setup(self) -> None:
         sizes = (3, *(self.layers - 1) * (self.width,), AXES)
-        draw, dtype = nn.initializers.glorot_normal(), jnp.zeros((), float).dtype
-        shapes = list(zip(sizes, sizes[1:], strict=False))
-        self.kernels = [
-            self.param(f"kernel_{i}", draw, shape, dtype) for i, shape in enumerate(shapes)
-        ]
-        self.biases = [
-            self.param(f"bias_{i}", nn.initializers.zeros, shape[1:], dtype)
-            for i, shape in enumerate(shapes)
-        ]
+        shapes = list(enumerate(zip(sizes, sizes[1:], strict=False)))
+        glorot, zeros = nn.initializers.glorot_normal(), nn.initializers.zeros
+        dtype = jnp.zeros((), float).dtype
+        self.kernels = [self.param(f"kernel_{i}", glorot, shape, dtype) for i, shape in shapes]
+        self.biases = [self.param(f"bias_{i}", zeros, shape[1:], dtype) for i, shape in shapes]
 
     def __call__(self, inputs: Float[Array, "point 3"]) -> Float[Array, "point axis"]:
         """Outputs at inputs."""
@@ -116,7 +112,6 @@ class Network(eqx.Module):
     @classmethod
     def make(
         cls,
-        low: Float[Array, " 3"],
         high: Float[Array, " 3"],
         scale: Float[Array, ""],
         *,
@@ -125,9 +120,8 @@ class Network(eqx.Module):
         shrink: float = 1.0,
         key: PRNGKeyArray,
     ) -> "Network":
-        """A network with random kernels (Glorot) and no biases.
+        """A network with random kernels (Glorot) and no biases, for inputs from zero to `high`.
 
-        - `low`, `high`: ends of the inputs [m, m, s].
         - `scale`: displacement [m] for an output of 1.
         - `width`, `layers`: see `Perceptron`.
         - `shrink`: divisor of the last kernel, for a motion that is small at first.
@@ -135,7 +129,7 @@ class Network(eqx.Module):
         module = Perceptron(width, layers)
         params: Any = module.init(key, jnp.zeros((1, 3), float))["params"]
         params[f"kernel_{layers - 1}"] /= shrink
-        return cls(module, params, (low + high) / 2, (high - low) / 2, scale)
+        return cls(module, params, high / 2, high / 2, scale)
 
     def __call__(self, points: Float[Array, "point 3"]) -> Float[Array, "point axis"]:
         """Displacements [m] at points (X [m], Y [m], t [s])."""

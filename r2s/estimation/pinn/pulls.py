@@ -75,13 +75,11 @@ def pull_from(recording: Recording, *, without_force: bool = False) -> Pull:
     The pull is along the first side of the recording's sheet. The force is that on the clamp at the
     end of that side; a force of one number is taken along the pull. The model is that of a sheet in
     its plane: inertia, and on the table friction, while the table carries the weight. Where the
-    recording does not say the places of its markers, they are a grid with as many rows as columns,
-    each marker in the middle of its cell.
+    recording does not say the places of its markers, they are a square grid, each marker in the
+    middle of its cell.
 
-    Raises `ValueError` for fewer than 3 frames, frames that are not evenly spaced, markers that are
-    missing, lost, off the sheet or out of its plane, another way of holding, and a force that is
-    missing (unless `without_force`), does not cover the frames, points the other way or is not in
-    newtons.
+    Raises `ValueError` that names the recording and says which condition it does not meet: of the
+    frames, the markers, the clamps, and the force (unless `without_force`).
     """
     try:
         return _pull(recording, without_force)
@@ -271,28 +269,24 @@ def pulled(
     strain: float = 0.04,
     moving: float = 1.0,
 ) -> Recording:
-    """A stretching of a fabric, with 81 markers and the force on the pulled clamp.
+    """A synthetic stretching of a fabric, with 81 markers and the force on the pulled clamp.
 
-    - `name`: of the fabric, in the recording's.
-    - `angle`: from the pull to the warp, [rad].
+    - `name`: of the fabric, in the recording's. `angle`: from the pull to the warp, [rad].
     - `shape`: vertices of the sheet along its sides.
     - `marker_noise` [m], `force_noise`: over the largest force [-].
-    - `steps`: of the simulation from frame to frame. A force is that of the last of them, as a load
-      cell shows it, and not their mean.
+    - `steps`: of the simulation from frame to frame, of which a force is that of the last.
     - `strain`: by which the sheet is pulled, of its length [-]. `moving`: how long, [s].
 
     Raises `RuntimeError` when the simulation diverges, and `ValueError` for a pull that does not
     end within the frames.
     """
     experiment = stretching(num_frames=frames, strain=strain, moving=moving)
-    # every step is a frame of what is simulated: its forces are those at its end
-    each_step = stretching(
+    fine = stretching(  # every step is a frame: its forces are those at its end
         num_frames=steps * (frames - 1) + 1,
         interval=STRETCHING_INTERVAL / steps,
         route=experiment.route,
     )
-    scenario = each_step.scenario(shape)
-    scenario = dataclasses.replace(scenario, turn=jnp.asarray(angle, float))
+    scenario = dataclasses.replace(fine.scenario(shape), turn=jnp.asarray(angle, float))
     found = _simulated(scenario, fabric, STRETCHING_INTERVAL / steps)
     if not np.isfinite(np.asarray(found.x)).all():
         raise RuntimeError(f"the simulation of {name} diverged")

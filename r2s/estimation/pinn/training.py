@@ -116,7 +116,7 @@ def init(
         high = jnp.concatenate([pull.size, pull.times[-1:]])
         scale = jnp.max(jnp.abs(pull.displacement)) / 2
         size: dict[str, Any] = {"width": width, "layers": layers, "shrink": SHRINK}
-        return Network.make(jnp.zeros_like(high), high, scale, **size, key=key)
+        return Network.make(high, scale, **size, key=key)
 
     keys = jr.split(key, pulls.angle.shape[0])
     return Model(jax.vmap(network)(pulls, keys), jnp.zeros(space.dim, float))
