@@ -36,7 +36,6 @@ def mjcf(
     table: float | None = 0.0,
     yarns: bool = True,
     timestep: float = 5e-4,
-    integrator: str = "discrete",
 ) -> tuple[str, Loss]:
     """A whole model, and what is lost: a sheet, horizontal at a `height` [m], over a table.
 
@@ -44,7 +43,7 @@ def mjcf(
     - `table`: z of its surface [m]; None: there is none.
     - `yarns`: springs along warp and weft, for a mesh such as `r2s.rectangle`; without, the nearest
       isotropic sheet.
-    - `timestep` [s]; `integrator`: of MuJoCo.
+    - `timestep`: of MuJoCo, [s].
 
     Vertex i is the body "v<i>" and number i of the flex "cloth". Raises `ValueError` for a batch,
     for a membrane without positive stiffness, and with yarns for a mesh that has none.
@@ -60,7 +59,7 @@ def mjcf(
     plane = f'<geom type="plane" size="0 0 1" pos="0 0 {table!r}" {friction}/>'
     names = " ".join(f"v{i}" for i in range(len(mesh.rest)))
     text = f"""<mujoco>
-  <option timestep="{timestep!r}" gravity="0 0 {-GRAVITY}" integrator="{integrator}"/>
+  <option timestep="{timestep!r}" gravity="0 0 {-GRAVITY}" integrator="discrete"/>
   <size memory="1G"/>
   <worldbody>
     {plane if table is not None else ""}

@@ -12,8 +12,6 @@ from r2s.estimation.pinn.network import Network, T, X, Y
 from r2s.estimation.pinn.weak_form import green_strain, nominal_stress, small_strain
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import OrthotropicMembrane
-from r2s.materials.parameters import IsotropicSpace
-from r2s.materials.solid import LinearSolid, lame
 from r2s.materials.turned import TurnedMembrane, turned
 from r2s.mesh.mesh import rectangle
 
@@ -24,16 +22,6 @@ ANGLE = jnp.asarray(0.4)
 def some_network() -> Network:
     high = jnp.array([0.45, 0.3, 1.2])
     return Network.make(high, jnp.asarray(0.02), width=9, layers=4, key=jr.key(0))
-
-
-class PlaneStrainSpace(IsotropicSpace):
-    """Isotropic solids in plane strain, as the published method has them: E times thickness, nu."""
-
-    def __call__(self, u):
-        modulus, ratio = self.values(u)
-        mu, lam = (jnp.asarray(value) for value in lame(modulus, ratio))
-        law = OrthotropicMembrane(lam + 2 * mu, lam, lam + 2 * mu, mu)
-        return dataclasses.replace(super().__call__(u), membrane=law)
 
 
 @pytest.mark.parametrize("pairs", [((X, X), (X, Y), (Y, Y), (T, T)), ((X, T), (Y, T), (T, T))])
@@ -101,25 +89,6 @@ def test_a_turned_isotropic_law_is_the_same():
     strain = jnp.array([0.02, -0.01, 0.03])
     found = TurnedMembrane(law, ANGLE).energy_density(strain)
     np.testing.assert_allclose(found, law.energy_density(strain), rtol=1e-12)
-
-
-def test_plane_strain_is_that_of_the_solid():
-    """A sheet of 1 m is a block in 2-D, whose law is that of plane strain."""
-    space = PlaneStrainSpace.make(1.0)
-    place = jnp.array([0.3, 0.7])
-    modulus, ratio = space.values(place)
-    solid = LinearSolid.make(modulus, ratio)
-    change = gradient(5, 0.01)
-    expected = solid.energy_density(jnp.eye(2) + change)
-    found = space(place).membrane.energy_density(small_strain(change))
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
-
-
-def test_plane_stress_is_softer_than_plane_strain():
-    place = jnp.array([0.3, 0.7])
-    stress, strain = (f.make(1.0)(place).membrane for f in (IsotropicSpace, PlaneStrainSpace))
-    assert float(stress.c11) < 0.9 * float(strain.c11)
-    np.testing.assert_allclose(stress.c33, strain.c33)
 
 
 def test_a_turned_law_stretches_a_sheet_of_the_cloth():

@@ -1,22 +1,14 @@
-"""Sliders for a fabric: what is simulated, and what a browser shows when one is moved."""
+"""Sliders for a fabric: what is simulated, and what the page shows when one is moved."""
 
-import base64
-import contextlib
-import io
-import json
 import socket
-import subprocess
 import sys
 import time
-import urllib.request
 from types import SimpleNamespace
 
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
-from browser import BROWSER, needs_browser
-from matplotlib.image import imread
 
 from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
@@ -29,13 +21,6 @@ from r2s.viewer.page import Subject, move
 
 pytest.importorskip("viser")
 
-FLAGS = (
-    "--headless=new", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-sync",
-    "--disable-background-networking", "--disable-component-update", "--use-gl=angle",
-    "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--window-size=1100,800",
-    "--remote-debugging-port=0",
-)  # fmt: skip
-SLIDER = "document.querySelectorAll('[role=slider]')[1]"  # the frame's is before the parameters'
 SHAPE = (5, 5)
 
 
@@ -58,6 +43,13 @@ def shown(subject):
     made = page.Page(subject, start, port=free_port())
     yield made
     made.close()
+
+
+def wait_until(holds, timeout=60.0):
+    end = time.monotonic() + timeout
+    while not holds():
+        assert time.monotonic() < end, "nothing came in time"
+        time.sleep(0.1)
 
 
 def free_port():
@@ -116,7 +108,7 @@ def test_only_the_last_place_of_a_slider_is_shown(subject, shown):
     before = shown.moved
     for value in np.linspace(0.1, 0.9, 9):
         shown._sliders[2].value = float(value)
-    wait_for(lambda: shown.u[2] == pytest.approx(0.9))
+    wait_until(lambda: shown.u[2] == pytest.approx(0.9))
     after = shown.moved.motion.x
     assert np.allclose(after, move(subject, jnp.asarray(shown.u)).motion.x)
     assert not np.allclose(after, before.motion.x, atol=1e-3)
@@ -129,11 +121,11 @@ def test_a_motion_that_fails_is_said_and_the_page_goes_on(shown, monkeypatch):
     before, whole = shown.moved, page.move
     monkeypatch.setattr(page, "move", fail)
     shown._sliders[2].value = 0.2
-    wait_for(lambda: shown.u[2] == pytest.approx(0.2))
+    wait_until(lambda: shown.u[2] == pytest.approx(0.2))
     assert shown.moved is before and "out of memory" in shown._describe(0)
     monkeypatch.setattr(page, "move", whole)
     shown._sliders[2].value = 0.3
-    wait_for(lambda: shown.moved is not before)
+    wait_until(lambda: shown.moved is not before)
     assert not shown.failure
 
 
@@ -147,91 +139,3 @@ def test_what_cannot_be_saved_is_said(shown):
     shown._save(save, SimpleNamespace(client=client))
     shown._save(lambda fabric: f"{float(fabric.density):.2f}", SimpleNamespace(client=client))
     assert told == [("not saved", "disk is full"), ("saved", "0.19")]
-
-
-class Browser:
-    """A page in headless Chromium, by its debugging protocol."""
-
-    def __init__(self, folder):
-        from websockets.sync.client import connect
-
-        flags = [*FLAGS, f"--user-data-dir={folder}", "about:blank"]
-        self.process = subprocess.Popen(
-            [str(BROWSER), *flags], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
-        )
-        port = wait_for(lambda: (folder / "DevToolsActivePort").read_text().split()[0])
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
-            target = next(each for each in json.load(answer) if each["type"] == "page")
-        self.socket = connect(target["webSocketDebuggerUrl"], max_size=None)
-        self.count = 0
-
-    def call(self, method, **arguments):
-        self.count += 1
-        self.socket.send(json.dumps({"id": self.count, "method": method, "params": arguments}))
-        while True:
-            answer = json.loads(self.socket.recv(timeout=60))
-            if answer.get("id") == self.count:
-                assert "error" not in answer, answer
-                return answer["result"]
-
-    def evaluate(self, script):
-        found = self.call("Runtime.evaluate", expression=script, returnByValue=True)
-        assert "exceptionDetails" not in found, found
-        return found["result"].get("value")
-
-    def press(self, key):
-        for kind in ("rawKeyDown", "keyUp"):
-            about = {"key": key, "code": key, "windowsVirtualKeyCode": KEYS[key]}
-            self.call("Input.dispatchKeyEvent", type=kind, **about)
-
-    def picture(self):
-        return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
-
-    def close(self):
-        self.socket.close()
-        self.process.terminate()
-        self.process.wait()
-
-
-KEYS = {"ArrowRight": 39, "Home": 36}
-
-
-def wait_for(found, timeout=60.0):
-    """What a function gives once it gives something and does not raise."""
-    end = time.monotonic() + timeout
-    while True:
-        with contextlib.suppress(OSError, IndexError):
-            if value := found():
-                return value
-        assert time.monotonic() < end, "nothing came in time"
-        time.sleep(0.1)
-
-
-def is_blue(png):
-    """Which pixels of a picture have the colour of the cloth."""
-    red, green, blue = imread(io.BytesIO(png))[..., :3].transpose(2, 0, 1)
-    return (blue > 0.35) & (blue > 1.2 * green) & (blue > 2 * red)
-
-
-@needs_browser
-def test_a_slider_moved_in_a_browser_moves_the_cloth(shown, tmp_path):
-    browser = Browser(tmp_path)
-    try:
-        browser.call("Page.navigate", url=shown.url)
-        wait_for(lambda: browser.evaluate(f"!!{SLIDER}"))
-        time.sleep(3)
-        before, picture = shown.moved, browser.picture()
-        browser.evaluate(f"{SLIDER}.focus()")
-        browser.press("Home")
-        wait_for(lambda: shown.u[0] == 0)
-        after = shown.moved
-        time.sleep(2)
-        changed = browser.picture()
-        (tmp_path / "before.png").write_bytes(picture)
-        (tmp_path / "after.png").write_bytes(changed)
-        assert not np.allclose(after.motion.x, before.motion.x, atol=1e-3)
-        sheets = is_blue(picture), is_blue(changed)
-        assert min(sheet.sum() for sheet in sheets) > 1000
-        assert (sheets[0] ^ sheets[1]).sum() > 0.05 * sheets[0].sum()
-    finally:
-        browser.close()

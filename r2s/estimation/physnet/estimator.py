@@ -41,8 +41,8 @@ NOISE = 0.01  # [N] of a load cell, which is to count no more than a flaw either
 class PullForce(eqx.Module):
     """The recorded force on the pulled clamp at the frames of the images.
 
-    - `values`: along the pull, [N]. - `direction`: of the pull, a unit vector. - `least`: less than
-      this counts by its difference, more by its ratio, [N].
+    - `values`: along the pull, [N]. - `direction`: of the pull, a unit vector.
+    - `least`: less than this counts by its difference, more by its ratio, [N].
     """
 
     values: Float[Array, " frame"]

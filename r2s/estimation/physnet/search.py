@@ -71,11 +71,8 @@ def emulated(
 ) -> Trials:
     """Trials, of which the last is where the target most likely lies.
 
-    - `shared`: number of parts of an answer, such as frames, that share one error of the target.
-    - `options`: of `search`.
-
-    The share `FIRST` of the calls fills the cube. Raises `ValueError` for fewer than `dim` + 2
-    calls, and as `search` does.
+    `shared`: number of parts of an answer, such as frames, that share one error of the target; for
+    the other arguments see `search`. Raises `ValueError` for fewer than `dim` + 2 calls.
     """
     if num_calls < dim + 2:
         raise ValueError(f"expected at least {dim + 2} calls in {dim} dimensions, got {num_calls}")

@@ -23,6 +23,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt
 
+from r2s._util.files import parse
 from r2s.estimation import checkpoint
 from r2s.estimation.physnet.dataset import DEPTH_UNIT, Data
 from r2s.estimation.physnet.images import Flaws, View, flawed, grey
@@ -38,14 +39,9 @@ SLOPE = 0.25  # initial slope of PReLU
 
 @dataclass(frozen=True)
 class Architecture:
-    """The sizes of a network.
-
-    - `size`: side of the image, [pixel].
+    """- `size`: side of the image, [pixel]; to be halved as often as there are convolutions.
     - `channels`: output channels of the convolutions.
-    - `hidden`: widths of the hidden fully connected layers.
-    - `dim`: dimensions of the map.
-
-    Raises `ValueError` when the image cannot be halved as often as there are convolutions.
+    - `hidden`: widths of the hidden fully connected layers. - `dim`: dimensions of the map.
     """
 
     size: int = 64
@@ -383,18 +379,14 @@ def load(path: Path | str) -> Training:
     arrays, header = checkpoint.read(path)
     if header.get("format") != FORMAT:
         raise ValueError(f"{path}: expected format {FORMAT}, found {header.get('format')}")
+    view = parse(View, header["view"], f"{path}")
+    architecture = parse(Architecture, header["architecture"], f"{path}")
     schedule = header["schedule"] | {"flaws": Flaws(**header["schedule"]["flaws"])}
-    architecture = Architecture(**_tuples(header["architecture"]))
-    empty = begin(View(**_tuples(header["view"])), architecture, Schedule(**schedule))
+    empty = begin(view, architecture, Schedule(**schedule))
     network, optimiser = checkpoint.tree_from(arrays, _state(empty))
     network = eqx.combine(network, empty.network)
     curve = tuple(Row(*row) for row in header["curve"])
     return empty._replace(network=network, optimiser=optimiser, curve=curve, data=header["data"])
-
-
-def _tuples(values: dict[str, Any]) -> dict[str, Any]:
-    """The values with tuples in place of JSON's lists."""
-    return {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
 
 
 def _state(training: Training) -> tuple[Any, Any]:

@@ -7,8 +7,7 @@ markers and force best, with its covariance.
 The fit takes damped Gauss-Newton steps within the ranges, and estimates the noise of markers and
 force with the stiffness. The loop is our own, since solvers of optimistix begin each motion anew
 and cannot estimate the noise: from three pulls `optimistix.LevenbergMarquardt` arrives at the same
-place, to 0.05 standard errors, in 34 steps and 71 CPU seconds, where such a loop took 7 steps and
-12 CPU seconds.
+place with six times the CPU seconds.
 """
 
 import time
@@ -64,15 +63,6 @@ class Fit(NamedTuple):
     losses: Float[np.ndarray, " step"]
     converged: bool
     law: Float[np.ndarray, "dim dim"]
-
-
-class _Equations(NamedTuple):
-    """Half a sum of squares with that of the prior, its gradient, and its Hessian without
-    curvature."""
-
-    loss: float
-    gradient: Float[np.ndarray, " dim"]
-    matrix: Float[np.ndarray, "dim dim"]
 
 
 def estimate(
@@ -169,10 +159,8 @@ def fit(
 
     - `networks`: trained, one for each of the `pulls`.
     - `place`: to begin with, in the space's unit cube.
-    - `noise`: of the markers [m], and of the force over its greatest [-], to begin with. What is
-      left of the residuals replaces it.
-    - `degrees`: of the virtual displacements, along and across the pull.
-    - `steps`: at most.
+    - `noise`: of the markers [m], and of the force over its greatest [-], to begin with.
+    - `degrees`: of the virtual displacements, along and across the pull. - `steps`: at most.
 
     Raises `RuntimeError` when no motion is in equilibrium.
     """
@@ -183,7 +171,7 @@ def fit(
         parts = zip(pulls, given, starts, strict=True)
         return [equilibrium(space, place, *part) for part in parts]
 
-    def equations(motions: Sequence[Motion], at: Array) -> _Equations:
+    def equations(motions: Sequence[Motion], at: Array) -> tuple[float, np.ndarray, np.ndarray]:
         return _equations(motions, pulls, noise, np.asarray(at, np.float64) - 0.5)
 
     low, high = (jnp.full(space.dim, bound, float) for bound in BOUNDS)
@@ -195,18 +183,18 @@ def fit(
     for _ in range(steps):
         places.append(np.asarray(at, np.float64))
         losses.append(_rms_residuals(motions, pulls)[0] ** 2)
-        here = equations(motions, at)
-        gradient, matrix = (jnp.asarray(part, float) for part in here[1:])
+        loss, *normal = equations(motions, at)
+        gradient, matrix = (jnp.asarray(part, float) for part in normal)
         step = np.abs(newton_step(gradient, matrix, at_bound(at, gradient, low, high)))
-        small = SMALL * np.sqrt(np.diag(np.linalg.inv(here.matrix)))
+        small = SMALL * np.sqrt(np.diag(np.linalg.inv(normal[1])))
         is_near = not _unbalanced(motions) and bool(np.all(step <= MAX_STEP))
         converged = is_near and bool(np.all(step < small))
         if converged:
             break
         trial = proposed(at, gradient, matrix, damping, low, high, MAX_STEP)
         there = motions_at(trial, [motion.coefficients for motion in motions])
-        loss = equations(there, trial).loss
-        is_better = (_unbalanced(there), loss) < (_unbalanced(motions), here.loss)
+        trial_loss = equations(there, trial)[0]
+        is_better = (_unbalanced(there), trial_loss) < (_unbalanced(motions), loss)
         damping = damped(damping, jnp.asarray(is_better))
         if is_better:
             at, motions = trial, there
@@ -216,7 +204,7 @@ def fit(
         if is_near:  # the residuals of a longer step are not noise
             left = _rms_residuals(motions, pulls)
             noise = max(left[0], LEAST_NOISE[0]), max(left[1], LEAST_NOISE[1])
-    covariance = np.linalg.inv(equations(motions, at).matrix)
+    covariance = np.linalg.inv(equations(motions, at)[2])
     law = np.zeros_like(covariance)
     if not stiffens(space.ranges):
         law = _law_error(motions, pulls, noise, space.dim)
@@ -235,8 +223,10 @@ def _equations(
     noise: tuple[float, float],
     off: Float[np.ndarray, " dim"],
     until: float = 1.0,
-) -> _Equations:
-    """Normal equations of all pulls, in the frames that are in equilibrium.
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Half the sum of squares of all pulls and the prior, its gradient and Gauss-Newton matrix.
+
+    Frames count that are in equilibrium.
 
     - `off`: place less the mean of the prior.
     - `until`: share of the greatest stretch, up to which frames count.
@@ -258,7 +248,7 @@ def _equations(
             loss += value @ value / 2
             gradient = gradient + slope.T @ value
             matrix = matrix + slope.T @ slope
-    return _Equations(float(loss), gradient, matrix)
+    return float(loss), gradient, matrix
 
 
 def _residuals(motion: Motion, pull: Pull) -> tuple[np.ndarray, np.ndarray]:
@@ -291,9 +281,9 @@ def _law_error(
     frames up to half of the greatest, see `r2s.estimation.standard_errors`."""
     steps, variances = [], []
     for until in (0.5, 1.0):
-        found = _equations(motions, pulls, noise, np.zeros(dim), until)
-        steps.append(-np.linalg.solve(found.matrix, found.gradient))
-        variances.append(np.diag(np.linalg.inv(found.matrix)))
+        _, gradient, matrix = _equations(motions, pulls, noise, np.zeros(dim), until)
+        steps.append(-np.linalg.solve(matrix, gradient))
+        variances.append(np.diag(np.linalg.inv(matrix)))
     (half, whole), (half_variance, variance) = steps, variances
     off = to_small_strain(half - whole, half_variance - variance)
     return np.outer(off, off)

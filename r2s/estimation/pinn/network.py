@@ -34,6 +34,11 @@ class Jet(eqx.Module):
     first: Float[Array, "3 *point axis"]
     second: Float[Array, "pair *point axis"]
 
+    @property
+    def gradient(self) -> Float[Array, "*point axis 2"]:
+        """Derivatives in X and Y [-]."""
+        return jnp.moveaxis(self.first[:2], 0, -1)
+
 
 @runtime_checkable
 class DisplacementField(Protocol):

@@ -42,11 +42,8 @@ DEGREES, NODES = (3, 4), 8  # of its virtual displacements and their quadrature
 
 
 class Recipe(NamedTuple):
-    """How to train.
-
-    - `warm_up`, `adam`: epochs without and with physics.
-    - `chunk`: epochs for which frames are drawn.
-    - `width`, `layers`: of the network.
+    """- `warm_up`, `adam`: epochs without and with physics.
+    - `chunk`: epochs for which frames are drawn. - `width`, `layers`: of the network.
     """
 
     warm_up: int = 200
@@ -85,13 +82,8 @@ class Trained(NamedTuple):
 
 
 class Losses(NamedTuple):
-    """Terms of a loss, each [-].
-
-    - `data`: distance of the markers.
-    - `clamps`: displacement at the clamps.
-    - `work`: virtual work in displacements that vanish at the clamps.
-    - `force`: on the far clamp, beside the measured one; 0 without one.
-    """
+    """Terms of a loss, each [-]: distance of the markers (`data`), displacement at the clamps,
+    virtual work in displacements that vanish there, and force on the far clamp (0 without one)."""
 
     data: Float[Array, "*pull"]
     clamps: Float[Array, "*pull"]
@@ -99,12 +91,7 @@ class Losses(NamedTuple):
     force: Float[Array, "*pull"]
 
 
-class Progress(NamedTuple):
-    """State of a training: model, state of Adam, and number of epochs that are done."""
-
-    model: Model
-    state: Any
-    epoch: Int[Array, ""]
+Progress = tuple[Model, Any, Int[Array, ""]]  # with the state of Adam, and the epochs done
 
 
 def init(
@@ -174,7 +161,7 @@ def train_chunk(
         gradient, losses = jax.grad(total, has_aux=True)(model, weight)
         change, state = adam(recipe).update(gradient, state)
         change = eqx.tree_at(lambda m: m.free, change, replace_fn=lambda free: FABRIC_RATE * free)
-        return Progress(eqx.apply_updates(model, change), state, done + 1), losses
+        return (eqx.apply_updates(model, change), state, done + 1), losses
 
     progress, losses = jax.lax.scan(epoch, progress, None, recipe.chunk)
     return progress, jax.tree.map(lambda values: values[-1], losses)
@@ -191,16 +178,13 @@ def train(
 ) -> Trained:
     """Train a network for each of some stacked pulls, and their fabric, together.
 
-    - `report`: called after every chunk with its number and the loss of the markers [m^2].
-    - `checkpoint`: a file that is written after every chunk, and from which a killed training of
-      the same problem goes on.
-
-    Raises `RuntimeError` when a loss is not finite, `ValueError` for a checkpoint of another
-    problem.
+    After every chunk `report` is called with its number and the loss of the markers [m^2], and a
+    `checkpoint` is written, from which a killed training of the same problem goes on. Raises
+    `RuntimeError` when a loss is not finite, `ValueError` for a checkpoint of another problem.
     """
     key_init, key_chunks = jr.split(key)
     model: Any = init(space, pulls, recipe.width, recipe.layers, key=key_init)
-    progress = Progress(model, adam(recipe).init(model), jnp.zeros((), int))
+    progress: Progress = model, adam(recipe).init(model), jnp.zeros((), int)
     losses, places = np.zeros(0), np.zeros((0, space.dim))
     run = {"kind": "training of networks"}
     if checkpoint is not None:
@@ -213,9 +197,9 @@ def train(
         if not np.isfinite(now).all():
             raise RuntimeError(f"training diverged in chunk {chunk + 1}: {now}")
         losses = np.append(losses, now.data)
-        places = np.concatenate([places, np.asarray(progress.model.place)[None]])
+        places = np.concatenate([places, np.asarray(progress[0].place)[None]])
         if checkpoint is not None:
             checkpoints.save(checkpoint, checkpoints.arrays_of((progress, losses, places)), run)
         if report is not None:
             report(chunk, float(now.data) * NOISE[0] ** 2)
-    return Trained(progress.model, np.asarray(losses), np.asarray(places))
+    return Trained(progress[0], np.asarray(losses), np.asarray(places))

@@ -43,10 +43,7 @@ def field(
     frames: Int[Array, " point"],
     pairs: Pairs = (),
 ) -> Jet:
-    """Displacements [m] at places (X, Y) [m] in frames, with derivatives.
-
-    `pairs` of inputs are those of the second derivatives.
-    """
+    """Displacements [m] at places (X, Y) [m] in frames, with second derivatives in `pairs`."""
     jet = network.jet(_inputs(pull, places, frames), pairs)
     share = (places[:, 0] / pull.size[0])[:, None]
     near, far = ([part[frames] for part in clamp] for clamp in (pull.near, pull.far))
@@ -73,11 +70,6 @@ def displacement(
 
 def _inputs(pull: Pull, places, frames) -> Float[Array, "point 3"]:
     return jnp.concatenate([places, pull.times[frames][:, None]], axis=1)
-
-
-def gradients(jet: Jet) -> Float[Array, "point axis 2"]:
-    """Gradients [-] of the displacement in X and Y."""
-    return jnp.moveaxis(jet.first[:2], 0, -1)
 
 
 def marker_residual(network: DisplacementField, pull: Pull) -> Float[Array, "frame marker axis"]:
@@ -129,8 +121,7 @@ def nominal_stress(
 
     - `angle`: from X to the warp, [rad].
     - `gradient`: of the displacement, [-].
-    - `rate`: of the gradient [1/s]. With it the stress has the part of Kelvin-Voigt damping:
-      `fabric.damping` times the stiffness times the rate of strain.
+    - `rate`: of the gradient [1/s]; adds Kelvin-Voigt damping.
     - `strain`: `green_strain` or `small_strain`.
     """
     energy = TurnedMembrane(fabric.membrane, angle).energy_density
@@ -184,8 +175,7 @@ def virtual_fields(
     """Products x (1 - x) P_i(x) P_j(y) of Legendre polynomials, scaled to a mean slope of 1.
 
     - `degrees`: number of polynomials along and across the pull.
-    - `nodes`: of the quadrature along each side.
-    - `markers`: their places on the unit square.
+    - `nodes`: of the quadrature along each side. - `markers`: places on the unit square.
     """
     at, weight = np.polynomial.legendre.leggauss(nodes)
     places = np.stack(np.meshgrid((at + 1) / 2, (at + 1) / 2, indexing="ij"), -1).reshape(-1, 2)
@@ -231,7 +221,7 @@ def kinematics(
     places = jnp.tile(virtual.nodes * pull.size[None], (number, 1))
     jet = field(network, pull, places, jnp.repeat(frames, nodes), ((X, T), (Y, T), (T, T)))
     rate = jnp.moveaxis(jet.second[:2], 0, -1)
-    parts = gradients(jet), rate, jet.first[T], jet.second[2]
+    parts = jet.gradient, rate, jet.first[T], jet.second[2]
     return Kinematics(*(part.reshape(number, nodes, *part.shape[1:]) for part in parts))
 
 
