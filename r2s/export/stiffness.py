@@ -115,7 +115,7 @@ def probes(stiffness: Stiffness) -> dict[str, float]:
 
 
 def positive_probes(stiffness: Stiffness) -> dict[str, float]:
-    """`probes`. Raises `ValueError` when one has no positive energy."""
+    """`probes`; raises `ValueError` when one has no positive energy."""
     found = probes(stiffness)
     if not min(found.values()) > 0:
         raise ValueError(f"the membrane has no positive stiffness in every probe: {found}")
@@ -181,9 +181,9 @@ def with_springs(
 ) -> Sheet:
     """The isotropic sheet, with Poisson's ratio within bounds, and the springs beside it.
 
-    Exact where that sheet is within the bounds and, unless they may be `negative`, the springs are
-    not; else the nearest, by the probes' logarithms. Raises `ValueError` for a membrane whose
-    shear is coupled to its yarns, or without positive stiffness in every probe.
+    Exact where such a sheet is within the bounds and its springs positive or allowed to be
+    `negative`; else the nearest, by the probes' logarithms. Raises `ValueError` for a membrane
+    whose shear is coupled to its yarns, or without positive stiffness in every probe.
     """
     if np.abs(stiffness[2, :2]).max() > 1e-6 * np.abs(stiffness).max():
         raise ValueError(f"warp and weft are not the axes of this membrane: {stiffness}")

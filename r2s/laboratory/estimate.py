@@ -42,11 +42,8 @@ POOR_FIT = 3.0  # standard deviations (root mean square), beyond which a test do
 
 
 class Fit(NamedTuple):
-    """How an estimate fits one test.
-
-    - `test`: its name. `errors`: root mean square of its residuals, in standard deviations.
-    - `words`: measured and expected.
-    """
+    """How an estimate fits one test: its name, the root mean square of its residuals [standard
+    deviations], and the measured and expected value in `words`."""
 
     test: str
     errors: float
@@ -73,12 +70,12 @@ def estimate(
     if quick:
         others = np.random.default_rng(0).random((STARTS - 1, space.dim))
         ends = [_descend(quick, space, each, progress) for each in (start, *others)]
-        start = min(ends, key=lambda end: end.loss).place
+        start = min(ends, key=lambda end: end[0])[1]
     tell(progress, "simulating drapes" if len(quick) < len(tests) else "fitting")
-    found = _descend(tests, space, start, progress)
-    if not np.isfinite(found.loss):
+    loss, end, converged = _descend(tests, space, start, progress)
+    if not np.isfinite(loss):
         raise RuntimeError("no specimen of the drape test comes to rest: are its radii right?")
-    place = jnp.asarray(found.place, float)
+    place = jnp.asarray(end, float)
     covariance = _place_covariance(tests, space, place)
     deviation = np.sqrt(np.diag(covariance))
     values = np.asarray(space.values(place))
@@ -90,11 +87,11 @@ def estimate(
         standard_errors=deviation * np.array([bound.width for bound in space.ranges]),
         correlation=covariance / np.outer(deviation, deviation),
         nuisances=(),
-        loss=found.loss,
-        losses=np.array([[found.loss]]),
+        loss=loss,
+        losses=np.array([[loss]]),
         history=values[None, None],
         seconds=time.perf_counter() - begun,
-        converged=found.converged,
+        converged=converged,
         loss_unit="-",
     )
 
@@ -166,16 +163,11 @@ def _residuals_of(test: Test, fabric: Fabric) -> Array:
     return test.residuals(fabric)
 
 
-class _End(NamedTuple):
-    place: np.ndarray
-    loss: float  # mean square of the residuals, of the prior's too, [-]
-    converged: bool
-
-
 def _descend(
     tests: tuple[Test, ...], space: ParameterSpace, start, progress: Progress | None
-) -> _End:
-    """Where a descent of `BoundedGaussNewton` within the cube ends."""
+) -> tuple[float, np.ndarray, bool]:
+    """A descent of `BoundedGaussNewton` within the cube: the mean square of the residuals, with
+    those of the prior, [-]; the place; and whether it converged."""
     mean, precision = space.prior()
     low, high = MARGIN, 1 - MARGIN
     solver = BoundedGaussNewton(
@@ -191,7 +183,7 @@ def _descend(
         if is_done:
             break
     converged = bool(is_done) and bool(result == optimistix.RESULTS.successful)
-    return _End(np.asarray(place), 2 * float(state.loss) / size, converged)
+    return 2 * float(state.loss) / size, np.asarray(place), converged
 
 
 @eqx.filter_jit

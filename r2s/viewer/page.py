@@ -105,11 +105,10 @@ def _simulated(subject: Subject, u: Float[Array, " dim"]) -> tuple[Trajectory, A
 class Page:
     """A server on a thread of its own, until `close`.
 
-    Only the last of the places that a slider was dragged through is simulated. `moved` is the
-    motion that the page shows, `u` the place of its fabric in the space, and `failure` the reason
-    when there is no motion of it.
+    `moved` is the motion that the page shows, `u` the place of its fabric in the space, and
+    `failure` the reason when there is no motion of it. Of the places through which a slider is
+    dragged only the last is simulated.
 
-    - `subject`: the motion, the space of fabrics and the recording.
     - `u`: where the sliders begin, in the unit cube of the subject's space.
     - `save`: called with the fabric that is shown when its button is pressed; returns the text
       of the notification. None: no button.
