@@ -161,7 +161,7 @@ def _likely_places(
     return tried[generator.choice(len(tried), number, replace=False, p=chance / chance.sum())]
 
 
-def _candidates(best: Places, generator: np.random.Generator) -> Places:
+def _candidates(best: Float[np.ndarray, "centre dim"], generator: np.random.Generator) -> Places:
     """Random places of the unit cube, half of them anywhere and half around the best so far."""
     dim = best.shape[1]
     anywhere = generator.random((CANDIDATES, dim))
