@@ -3,7 +3,6 @@
 Needs scikit-optimize and scikit-learn: pip install 'r2s[physnet]'.
 """
 
-import importlib.util
 import shutil
 import sys
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
+from r2s._util.extras import require
 from r2s.estimation.default_spaces import RANGES
 from r2s.estimation.method import ANY, Budget, Method, Reads, seed_of
 from r2s.estimation.physnet import dataset, estimator, images, training
@@ -47,8 +47,8 @@ def train_network(
     """
     options: dict[str, Any] = {"ranges": RANGES}
     if solver == "points":
-        options = {"solver": solver, "num_levels": 3, "shape": NETWORK_SHAPE[solver]}
-        options |= {"per_shard": 4}
+        shape = NETWORK_SHAPE[solver]
+        options = {"solver": solver, "num_levels": 3, "shape": shape, "per_shard": 4}
     settings = dataset.Settings(scenario, budget.fabrics, seed=seed, **options)
     folder = path.with_name(f"{path.name}.images")
     view = dataset.make(folder, settings, progress=progress).view
@@ -57,8 +57,11 @@ def train_network(
         begun = training.load(path)
     else:
         begun = training.begin(view, schedule=schedule)._replace(data=f"{scenario} on {solver}")
-    report = _print_epoch if progress else None
-    trained = training.train(begun, dataset.load(folder), path, report)
+
+    def report(epoch: int, row: training.Row) -> None:
+        print(f"network, epoch {epoch}: triplet accuracy {row.accuracy:.1%}", file=sys.stderr)
+
+    trained = training.train(begun, dataset.load(folder), path, report if progress else None)
     shutil.rmtree(folder)
     return trained
 
@@ -66,10 +69,6 @@ def train_network(
 def _images_of(recording: Recording) -> tuple[int, ...]:
     """The frames of which the network has images."""
     return dataset.frame_indices(recording.info.frames_used, dataset.Settings.num_frames)
-
-
-def _print_epoch(epoch: int, row: training.Row) -> None:
-    print(f"network, epoch {epoch}: triplet accuracy {row.accuracy:.1%}", file=sys.stderr)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,8 +96,7 @@ class PhysNetMethod(Method):
         return Reads(_images_of(recording), points=None, force=force)
 
     def _estimate(self, recordings, space, budget, key):
-        if importlib.util.find_spec(self.library) is None:
-            raise ImportError(f"{self.name} needs {self.library}: pip install 'r2s[physnet]'")
+        require(self.library, "physnet", self.name)  # before hours of training
         recording, solver = recordings[0], self.chosen_solver
         trained = self._trained(recording, seed_of(key))
         scenario = from_recording(recording, NETWORK_SHAPE[solver])
