@@ -35,7 +35,7 @@ from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
 from r2s.recordings.recording import Recording, load, save
 from r2s.scenarios import synthetic
 from r2s.scenarios.scenario import Scenario, rollout
-from r2s.study.mujoco_sheet import Material, as_plate, moved
+from r2s.study.mujoco import Material, as_plate, moved
 
 NOISE = 1e-3  # [m], of the clouds
 STRICT = 3e-3  # [m], of a loss in which what lies farther off hardly counts

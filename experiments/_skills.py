@@ -16,13 +16,13 @@ from scipy.stats import norm
 from r2s.estimation.estimate import Estimate
 from r2s.materials.fabric import Fabric
 from r2s.study import engine, results, verdicts
-from r2s.study.cells import read_metadata
 from r2s.study.configuration import MOTIONS, ON_CLOTH
-from r2s.study.estimates import EstimateCell, read_estimate
-from r2s.study.evaluations import EvaluationCell
-from r2s.study.matrix import SMALL, configuration_named, synthetic
-from r2s.study.mujoco_cells import FABRIC as FLEX
-from r2s.study.sources import strain_dependent
+from r2s.study.estimates import EstimateTask, read_estimate
+from r2s.study.evaluations import EvaluationTask
+from r2s.study.mujoco import FABRIC as FLEX
+from r2s.study.plan import SMALL, configuration_named, synthetic
+from r2s.study.recordings import strain_dependent
+from r2s.study.tasks import read_metadata
 from r2s.study.verdicts import SURFACE
 
 JUDGED = ("fling", "shaking")
@@ -60,23 +60,23 @@ def predicted_elsewhere(folder: Path, configuration: str, repeat: str) -> Line:
     return _judged(folder, _cells(configuration, FLEX, MOTIONS, int(repeat)))
 
 
-def _judged(folder: Path, cells: list[EvaluationCell]) -> Line:
+def _judged(folder: Path, cells: list[EvaluationTask]) -> Line:
     return _errors(cells, folder) | _cost(_estimate(cells), folder)
 
 
-def _estimate(cells: list[EvaluationCell]) -> EstimateCell:
+def _estimate(cells: list[EvaluationTask]) -> EstimateTask:
     """The one that some cells evaluate."""
     (found,) = {cell.estimate for cell in cells if cell.estimate is not None}
     return found
 
 
-def _cost(cell: EstimateCell, folder: Path) -> Line:
+def _cost(cell: EstimateTask, folder: Path) -> Line:
     return {"CPU s": f"{read_metadata(cell, folder)['cpu_seconds']:.0f}"}
 
 
 def _cells(
     configuration: str, fabric: str, motions: Sequence[str], repeat: int = 0
-) -> list[EvaluationCell]:
+) -> list[EvaluationTask]:
     plan = replace(
         SMALL,
         configurations=(configuration_named(configuration),),
@@ -95,7 +95,7 @@ def _cells(
     ]
 
 
-def _errors(cells: list[EvaluationCell], folder: Path) -> Line:
+def _errors(cells: list[EvaluationTask], folder: Path) -> Line:
     """Make some cells, and say what rows they give: by motion floor, errors and skill."""
     failed = engine.run([*verdicts.ensembles(cells), *cells], folder, engine.Serial())
     if failed:
@@ -105,10 +105,10 @@ def _errors(cells: list[EvaluationCell], folder: Path) -> Line:
     line: Line = {}
     for motion in dict.fromkeys(cell.scenario for cell in cells):
         line |= _of(motion, found[found.evaluated_on == motion])
-    return line | made_by(cells, folder)
+    return line | made_by([*verdicts.ensembles(cells), *cells], folder)
 
 
-def _of_law(cell: EvaluationCell, law: str) -> EvaluationCell:
+def _of_law(cell: EvaluationTask, law: str) -> EvaluationTask:
     if cell.estimate is None or law == "told":
         return cell
     return replace(cell, estimate=replace(cell.estimate, law=law))
@@ -147,7 +147,7 @@ def repeated(folder: Path, configuration: str, fabric: str, repeat: str) -> Line
     }
 
 
-def _off(cell: EstimateCell, found: Estimate) -> tuple[np.ndarray, np.ndarray]:
+def _off(cell: EstimateTask, found: Estimate) -> tuple[np.ndarray, np.ndarray]:
     """How far an estimate is from the truth, by parameter: in shares of it (the coupling as it is),
     and in standard errors, both as in the range."""
     true = results.true_values(cell, found.ranges)
@@ -156,7 +156,7 @@ def _off(cell: EstimateCell, found: Estimate) -> tuple[np.ndarray, np.ndarray]:
     return off, off / found.standard_errors
 
 
-def _over_truth(cell: EstimateCell, folder: Path) -> Line:
+def _over_truth(cell: EstimateTask, folder: Path) -> Line:
     found = read_estimate(cell, folder)
     if found is None:
         return {"warp": "diverged"}
@@ -188,7 +188,7 @@ def _growth(fabric: Fabric, axis: int) -> float:
     return float(fabric.membrane.energy_density(strain) / small.energy_density(strain)) - 1
 
 
-def _agreement(found: Estimate, cell: EstimateCell) -> str:
+def _agreement(found: Estimate, cell: EstimateTask) -> str:
     """Whether the recordings do, by the likelihood by chance; else which does not."""
     if found.agreement is None:
         return "not judged"

@@ -12,20 +12,18 @@ from pathlib import Path
 
 from r2s._util.files import source_hash, write_text
 from r2s._util.threads import cores
-from r2s.study.cells import Cell
-from r2s.study.environment import processor
-from r2s.study.origins import origins
+from r2s.study.tasks import Task, processor, provenance
 
 SOURCE = 16  # hexadecimal digits of a hash
 Line = dict[str, str]  # of a table, by column
 
 
-def made_by(cells: Iterable[Cell], folder: Path) -> Line:
-    """The source that made the cells of a line, and all that these need.
+def made_by(tasks: Iterable[Task], folder: Path) -> Line:
+    """The source that made the tasks of a line, and all that these need.
 
     Raises `ValueError` for more than one: figures of two sources are no table.
     """
-    noted = {words.partition("source ")[2].partition(";")[0] for words in origins(cells, folder)}
+    noted = {words.partition("source ")[2].partition(";")[0] for words in provenance(tasks, folder)}
     if len(noted) > 1:
         raise ValueError(f"{folder} is of several sources, empty it: {', '.join(sorted(noted))}")
     return {"made by source": ", ".join(each[:8] for each in noted)}

@@ -8,7 +8,7 @@ import pandas as pd
 
 from r2s.mesh.mesh import rectangle
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
-from r2s.study.motions import Motion
+from r2s.study.report.figures import Motion
 from r2s.study.statistics.frame import as_frame, labelled
 
 FABRICS = ("black_denim", "grey_interlock", "pink_solid")

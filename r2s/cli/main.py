@@ -31,7 +31,7 @@ from r2s.cli.show import Show
 from r2s.cli.simulate import Simulate
 from r2s.cli.study import Study
 from r2s.cli.view import View
-from r2s.study.environment import one_thread
+from r2s.study.engine import one_thread
 
 NO_CACHE = "--no-cache"
 Command = (

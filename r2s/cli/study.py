@@ -70,10 +70,11 @@ class Study:
         Raises `ValueError` for settings that make no sense and when cells are missing at the end,
         `OSError`, and `ImportError` that names the extra for workers.
         """
-        from r2s.study import engine, matrix, results, verdicts
+        from r2s.study import engine, results, verdicts
+        from r2s.study import plan as plans
 
-        plan = matrix.with_changes(
-            matrix.PRESETS[self.preset],
+        plan = plans.with_changes(
+            plans.PRESETS[self.preset],
             list(chain(*self.configurations)),
             list(chain(*self.fabrics)),
             self.repeats,
@@ -82,10 +83,10 @@ class Study:
             self.seed,
         )
         if self.data is None:
-            cells = matrix.synthetic(plan)
+            cells = plans.synthetic(plan)
         else:
-            cells = matrix.recorded(self.data, self.density, plan)
-        matrix.check_simulators(cells)
+            cells = plans.recorded(self.data, self.density, plan)
+        plans.check_simulators(cells)
         with self._runner() as runner:
             failed = engine.run([*verdicts.ensembles(cells), *cells], self.out, runner)
         source = str(self.data or "synthetic")
@@ -100,12 +101,10 @@ class Study:
         """One process, or workers of this machine, of Slurm or of a scheduler."""
         from r2s.study import engine
 
-        if not (self.workers > 1 or self.scheduler or self.slurm):
-            return closing(engine.OneProcess())
-        from r2s.study import cluster
-
         if self.scheduler:
-            return closing(cluster.at(self.scheduler))
+            return closing(engine.at(self.scheduler))
         if self.slurm:
-            return closing(cluster.slurm(self.slurm))
-        return closing(cluster.local(self.workers, self.compilation_cache))
+            return closing(engine.slurm(self.slurm))
+        if self.workers > 1:
+            return closing(engine.local(self.workers, self.compilation_cache))
+        return closing(engine.OneProcess())

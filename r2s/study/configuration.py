@@ -1,15 +1,14 @@
-"""What a study compares: configurations, judged on three motions that no estimate has seen."""
+"""What a study compares: configurations, evaluated on three motions that no estimate has seen."""
 
 from typing import NamedTuple
 
 APPROACHES = {"diffcloud": "DIFFCLOUD", "diffcp": "DiffCP", "physnet": "PhysNet", "pinn": "PINN"}
-PUBLISHED = "-published"  # behind an approach: by the recipe of its paper, as it is
+PUBLISHED = "-published"  # after an approach: by the recipe of its paper
 AND = "+"  # between scenarios that are estimated from together
-MOTIONS = ("folding", "fling", "shaking")  # that no estimate has seen
+MOTIONS = ("folding", "fling", "shaking")
 # baselines that are configurations as well, and what stands for an approach in their labels
-REFERENCES = {"true": "true fabric on", "middle": "middle of the prior on"}
-# the baseline of what an estimate on material points predicts on the cloth, as all others do
-ON_CLOTH = "on_cloth"
+REFERENCES = {"true": "true fabric on", "middle": "prior median on"}
+ON_CLOTH = "on_cloth"  # the baseline of estimates on material points that predict on the cloth
 
 
 class Configuration(NamedTuple):
@@ -24,7 +23,6 @@ class Configuration(NamedTuple):
 
     @property
     def scenarios(self) -> tuple[str, ...]:
-        """What it estimates from."""
         return tuple(self.estimated_from.split(AND))
 
     @property
@@ -40,7 +38,7 @@ class Configuration(NamedTuple):
 
 
 def as_configuration(configuration: Configuration, baseline: str) -> Configuration:
-    """What a table calls a baseline that is a line of its own; any other as it is."""
+    """The configuration that stands for a baseline in tables; any other as it is."""
     if baseline in REFERENCES:
         return Configuration(REFERENCES[baseline], configuration.solver, "")
     words = {"other_fabric": "of another fabric", ON_CLOTH: "found on points"}.get(baseline)
@@ -50,13 +48,12 @@ def as_configuration(configuration: Configuration, baseline: str) -> Configurati
 
 
 def _named(approach: str) -> str:
-    """An approach in words; what is none, as it is."""
     own = approach.removesuffix(PUBLISHED)
     return APPROACHES.get(own, own) + (" as published" if own != approach else "")
 
 
 def is_reference(label: str) -> bool:
-    """Whether a label is that of no estimate, but of a fabric to compare with, on a solver."""
+    """Whether a label is that of a fabric to compare with, not of an estimate."""
     return label.startswith(("default ", *(f"{name} " for name in REFERENCES.values())))
 
 
@@ -75,11 +72,11 @@ PAPER_CONFIGURATIONS = (
 PUBLISHED_CONFIGURATIONS = tuple(
     each._replace(approach=each.approach + PUBLISHED) for each in PAPER_CONFIGURATIONS
 )
-"""The same by the recipes of the approaches' papers, to compare with."""
+"""The same by the recipes of the approaches' papers."""
 
 TOGETHER_CONFIGURATIONS = tuple(
     Configuration("diffcloud", "cloth", AND.join(each))
     for each in (("lifting", "stretching"), ("lifting", "wind", "stretching", "fling"))
 )
-"""What the paper does not have: a lift and pulls in three directions, or these with a wind and a
-fling, of one fabric together."""
+"""Several recordings of one fabric together, which the paper does not have: a lift and pulls in
+three directions, also with a wind and a fling."""

@@ -1,104 +1,244 @@
-"""Runs the cells of a study in the order of their dependencies, here or on workers.
+"""Runs the tasks of a study in the order of their dependencies, with a forecast and progress.
 
-Nothing that is finished is lost: a result is there whole or not at all, a cell that fails does not
-stop the others, and a run that was killed goes on where it was.
+Tasks run in this process, in one of its own, or on workers of Dask: processes of this machine, jobs
+of Slurm, or whatever a scheduler serves. A result is written completely or not at all, a task that
+fails does not stop the others, and a run that was killed continues where it was.
 """
 
+import abc
+import io
 import os
+import re
+import shutil
 import sys
-from collections.abc import Iterable, Iterator
+import threading
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from graphlib import TopologicalSorter
+from contextlib import contextmanager
+from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any
 
-from tqdm import tqdm
+from r2s import compilation
+from r2s._util.extras import require
+from r2s._util.threads import LIMIT
+from r2s.study.tasks import Task, attempt, dependencies, with_dependencies
 
-from r2s.compilation import clear_beyond
-from r2s.study.cells import Cell, dependencies, execute, with_dependencies
-from r2s.study.durations import expected_seconds, in_words
-from r2s.study.environment import begin_worker, environment
-from r2s.study.progress import progress
+ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+# Compiles a step in 60 to 70 % of the time. XLA ends a process whose flags it does not know, so
+# only releases that know it are given it.
+COMPILE_FAST, KNOWN_TO = "--xla_cpu_use_fusion_emitters=false", "0.10."
+JAX_LEVEL = "1"  # of XLA's messages, which JAX sets where it is not set
+TRIES, RETRIES = 2, 5  # of a task whose process died, without and with Dask
+JOB = {"cores": 1, "processes": 1, "memory": "8GB", "walltime": "04:00:00"}  # of Slurm
+# CPU seconds of the first recording of a compilation group, with compilation, and of each further
+# one; by the beginning of the group's name, the longest that fits.
+SECONDS: dict[str, tuple[float, float]] = {
+    "": (1.0, 1.0),
+    "networks cloth": (100.0, 100.0),
+    "networks points": (200.0, 200.0),
+    "recordings": (25.0, 15.0),
+    "recordings of MuJoCo": (60.0, 60.0),
+    "ensembles": (100.0, 60.0),
+    "ensembles of MuJoCo": (200.0, 200.0),
+    "estimates diffcloud": (250.0, 200.0),
+    "estimates diffcloud cloth wind": (500.0, 400.0),
+    "estimates diffcloud cloth lifting+": (1000.0, 800.0),
+    "estimates diffcp": (300.0, 250.0),
+    "estimates physnet": (60.0, 40.0),
+    "estimates pinn": (120.0, 100.0),
+    "evaluations": (15.0, 8.0),
+}
+REFRESH, LINES = 1.0, 30.0  # [s] between updates of the bar, and between lines in a file
+SHAPE = "{desc}: {percentage:3.0f} %, {elapsed} elapsed{postfix}"
+# [s] that count as done at the expected pace, until finished tasks give a better estimate
+TRUST = 300.0
 
-MOST_MEMORY = 0.9e9  # [byte]: a process that holds more after a cell lets its programs go
-TRIES = 2  # of a cell whose process died
+Outcome = tuple[Task, str]  # why it failed, or ""
 
 
-@runtime_checkable
-class Runner(Protocol):
-    """What makes cells: here one after the other, or elsewhere many at once."""
+class Runner(abc.ABC):
+    """Runs tasks, `processes` at once."""
 
-    @property
-    def processes(self) -> int:
-        """How many cells are made at once."""
-        ...
+    processes: int = 1
 
-    def submit(self, cell: Cell, folder: Path) -> None:
-        """Take a cell whose dependencies are made."""
-        ...
+    @abc.abstractmethod
+    def run(self, tasks: Sequence[Task], folder: Path) -> Iterator[Outcome]:
+        """Yield each task when it is done, with why it failed, or "".
 
-    def finished(self) -> Iterator[tuple[Cell, str]]:
-        """Yield each cell when it is done, with why it failed, or "".
-
-        Others may be submitted meanwhile. The iterator ends when none is left.
+        `tasks`: in an order in which dependencies come first.
         """
-        ...
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 - nothing to release by default
         """Release the workers."""
-        ...
 
 
-class Serial:
-    """One cell after the other in this process, those that compile alike together."""
+def run(tasks: Iterable[Task], folder: Path, runner: Runner) -> dict[Task, str]:
+    """Make tasks and their dependencies; return those that failed, with the reason.
 
-    processes = 1
+    Existing results are left alone; tasks that failed before are tried again.
+    """
+    waiting = [task for task in _ordered(tasks) if not task.is_made(folder)]
+    failed: dict[Task, str] = {}
+    if not waiting:
+        return failed
+    seconds = expected_seconds(waiting)
+    tqdm = require("tqdm", "study", "a study").tqdm
+    total, processes = sum(seconds.values()), runner.processes
+    print(
+        f"study: {len(waiting)} cells, about {in_words(total / processes)} on {processes} "
+        f"{'process' if processes == 1 else 'processes'}",
+        file=sys.stderr,
+        flush=True,
+    )
+    with progress(total, len(waiting), processes) as bar:
+        for task, reason in runner.run(waiting, folder):
+            bar.update(seconds[task])
+            lost = [need for need in dependencies(task) if need in failed]
+            if lost:
+                failed[task] = f"needs {lost[0].kind} {lost[0].name}, which is missing"
+            elif reason:
+                tqdm.write(f"missing: {task.kind} {task.name}: {reason}", file=sys.stderr)
+                failed[task] = reason
+    return failed
 
-    def __init__(self) -> None:
-        self._waiting: list[tuple[Cell, Path]] = []
 
-    def submit(self, cell: Cell, folder: Path) -> None:
-        self._waiting.append((cell, folder))
-
-    def finished(self) -> Iterator[tuple[Cell, str]]:
-        last = ""
-        while self._waiting:
-            groups = [cell.compilation_group for cell, _ in self._waiting]
-            cell, folder = self._waiting.pop(groups.index(last) if last in groups else 0)
-            last = cell.compilation_group
-            yield cell, self.make(cell, folder)
-
-    def make(self, cell: Cell, folder: Path) -> str:
-        """Make a cell and return why it failed, or ""."""
-        return attempt(cell, folder)
-
-    def close(self) -> None:
-        pass
+def _ordered(tasks: Iterable[Task]) -> list[Task]:
+    """Tasks and their dependencies, dependencies first, and groups that compile alike together."""
+    depth: dict[Task, int] = {}
+    for task in with_dependencies(tasks):
+        depth[task] = 1 + max((depth[need] for need in dependencies(task)), default=0)
+    return sorted(depth, key=lambda task: (depth[task], task.compilation_group))
 
 
-class OneProcess(Serial):
-    """Make cells as `Serial` does, in a process of its own, with the same numbers as workers.
+def expected_seconds(tasks: Iterable[Task]) -> dict[Task, float]:
+    """The time of each task, [CPU s], when they are made in this order."""
+    compiled: set[str] = set()
+    found = {}
+    for task in tasks:
+        group = task.compilation_group
+        first, further = SECONDS[max(filter(group.startswith, SECONDS), key=len)]
+        found[task] = (further if group in compiled else first) + (task.runs - 1) * further
+        compiled.add(group)
+    return found
 
-    Linear algebra is threaded as the environment said when it was loaded, and sums in another
-    order are other numbers.
+
+def in_words(seconds: float) -> str:
+    """A time [s] in seconds, minutes or hours, such as "20 min"."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 100 * 60 else f"{seconds / 3600:.0f} h"
+
+
+@contextmanager
+def progress(seconds: float, count: int, processes: int) -> Iterator[Any]:
+    """Progress on stderr: a bar on a terminal, a line every half minute in a file.
+
+    It is updated by the expected CPU seconds of each task that is done, of `seconds` in all, and
+    refreshed while tasks are running.
+    """
+    tqdm = require("tqdm", "study", "a study").tqdm
+    is_terminal = sys.stderr.isatty()
+    stream = sys.stderr if is_terminal else io.StringIO()
+    stop = threading.Event()
+    with tqdm(total=seconds, desc=f"study of {count} cells", bar_format=SHAPE, file=stream) as bar:
+
+        def show() -> None:
+            while not stop.wait(REFRESH if is_terminal else LINES):
+                pace = (TRUST + bar.format_dict["elapsed"]) / (TRUST + bar.n / processes)
+                left = pace * (seconds - bar.n) / processes
+                bar.set_postfix_str(f"about {in_words(left)} left", refresh=False)
+                if is_terminal:
+                    bar.refresh()
+                else:
+                    print(bar, file=sys.stderr, flush=True)
+
+        thread = threading.Thread(target=show, daemon=True)
+        thread.start()
+        try:
+            yield bar
+        finally:
+            stop.set()
+            thread.join()
+
+
+def one_thread(flags: str) -> str:
+    """XLA's flags with linear algebra in one thread, as sheets are too small for more.
+
+    XLA reads no further than the last word, so existing flags come first.
+    """
+    if ONE_THREAD in flags:
+        return flags
+    is_known = version("jaxlib").startswith(KNOWN_TO) and "fusion_emitters" not in flags
+    parts = [flags, COMPILE_FAST if is_known else "", ONE_THREAD]
+    return " ".join(part for part in parts if part)
+
+
+def environment(workers: int, compilation_cache: Path | None = None) -> dict[str, str]:
+    """The environment of a worker before it imports JAX, for `workers` on one machine.
+
+    Each has one thread, so that sums are in the same order on any runner, and a share of the GPUs'
+    memory. A fabric that fails in a batch does not stop the others. Compiled programs are stored in
+    `compilation_cache`, by default where `r2s.compilation.keep` has them.
+    """
+    level = os.environ.get("TF_CPP_MIN_LOG_LEVEL", JAX_LEVEL)
+    found = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    found |= {
+        LIMIT: "1",
+        "XLA_FLAGS": one_thread(os.environ.get("XLA_FLAGS", "")),
+        "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.9 / workers:.3f}",
+        "EQX_ON_ERROR": "nan",
+        "TF_CPP_MIN_LOG_LEVEL": "3" if level == JAX_LEVEL else level,  # see `r2s.__main__`
+    }
+    if compilation_cache is not None:
+        found["JAX_COMPILATION_CACHE_DIR"] = str(compilation_cache)
+    return found
+
+
+def begin_worker(number: int | None = None) -> None:
+    """Prepare a process that runs tasks, and on Linux bind it to a core by its number.
+
+    JAX makes as many threads as it has cores, and those of several processes would wait for each
+    other.
+    """
+    if number is not None and hasattr(os, "sched_setaffinity"):
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {cores[number % len(cores)]})
+    compilation.keep()
+
+
+class Serial(Runner):
+    """Runs one task after the other in this process."""
+
+    def run(self, tasks: Sequence[Task], folder: Path) -> Iterator[Outcome]:
+        for task in tasks:
+            yield task, attempt(task, folder)
+
+
+class OneProcess(Runner):
+    """Runs one task after the other in a process of its own, with the same numbers as workers.
+
+    Linear algebra is threaded as the environment says when it is loaded, and sums in another order
+    are other numbers.
     """
 
     def __init__(self) -> None:
-        super().__init__()
-        os.environ.update(environment(1))  # the process inherits it
+        os.environ.update(environment(1))  # inherited by the process
         self._pool = self._start()
 
-    def make(self, cell: Cell, folder: Path) -> str:
-        reason = ""
-        for _ in range(TRIES):
-            try:
-                return self._pool.submit(attempt, cell, folder, cell.key).result()
-            except BrokenProcessPool as error:
-                reason = f"{type(error).__name__}: {error}"
-                self._pool = self._start()
-        return reason
+    def run(self, tasks: Sequence[Task], folder: Path) -> Iterator[Outcome]:
+        for task in tasks:
+            reason = ""
+            for _ in range(TRIES):
+                try:
+                    reason = self._pool.submit(attempt, task, folder, task.key).result()
+                    break
+                except BrokenProcessPool as error:
+                    reason = f"{type(error).__name__}: {error}"
+                    self._pool = self._start()
+            yield task, reason
 
     def close(self) -> None:
         self._pool.shutdown(cancel_futures=True)
@@ -108,56 +248,91 @@ class OneProcess(Serial):
         return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=begin_worker)
 
 
-def attempt(cell: Cell, folder: Path, key: str | None = None) -> str:
-    """Make a cell and return why it failed, or "".
+class DaskWorkers(Runner):
+    """Runs tasks on the workers of a Dask client."""
 
-    `key`: the cell's key in the process that asks, which may have another version of r2s.
-    """
-    if key not in (None, cell.key):
-        return "a worker has another version of r2s: install the same everywhere"
-    try:
-        execute(cell, folder)
-    except Exception as error:  # whatever it is, the other cells go on
-        return f"{type(error).__name__}: {error}"
-    finally:
-        clear_beyond(MOST_MEMORY)
-    return ""
+    def __init__(self, client: Any, processes: int, cluster: Any = None) -> None:
+        self.client, self.processes, self._cluster = client, processes, cluster
+
+    def run(self, tasks: Sequence[Task], folder: Path) -> Iterator[Outcome]:
+        from distributed import as_completed
+
+        futures: dict[Task, Any] = {}
+        for place, task in enumerate(tasks):
+            needs = [futures[need] for need in dependencies(task) if need in futures]
+            arguments = (task, folder.absolute(), task.key, *needs)
+            options = {"pure": False, "retries": RETRIES, "priority": -place}
+            futures[task] = self.client.submit(attempt, *arguments, **options)
+        task_of = {future.key: task for task, future in futures.items()}
+        for future in as_completed(list(futures.values())):
+            if future.status == "finished":
+                yield task_of[future.key], future.result()
+            else:
+                error = future.exception()
+                yield task_of[future.key], f"{type(error).__name__}: {error}"
+
+    def close(self) -> None:
+        self.client.close()
+        if self._cluster is not None:
+            self._cluster.close()
 
 
-def run(cells: Iterable[Cell], folder: Path, runner: Runner) -> dict[Cell, str]:
-    """Make cells and what they need; return those that are missing at the end, with the reason.
-
-    Cells that are made already are left alone, those that failed before are tried again.
-    """
-    waiting = [cell for cell in with_dependencies(cells) if not cell.is_made(folder)]
-    seconds = expected_seconds(waiting)
-    needs = {cell: [need for need in dependencies(cell) if need in seconds] for cell in waiting}
-    failed: dict[Cell, str] = {}
-    if not waiting:
-        return failed
-    order = TopologicalSorter(needs)
-    order.prepare()
-    total, processes = sum(seconds.values()), runner.processes
-    print(
-        f"study: {len(waiting)} cells, about {in_words(total / processes)} on {processes} "
-        f"{'process' if processes == 1 else 'processes'}",
-        file=sys.stderr,
-        flush=True,
+def local(workers: int, compilation_cache: Path | None = None) -> DaskWorkers:
+    """Worker processes on this machine, one thread each."""
+    distributed = require("distributed", "cluster", "several workers")
+    _configure(environment(workers, compilation_cache))
+    cluster = distributed.LocalCluster(
+        n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0"
     )
-    with progress(total, len(waiting), runner.processes) as bar:
-        for cell in order.get_ready():
-            runner.submit(cell, folder)
-        for cell, reason in runner.finished():
-            bar.update(seconds[cell])
-            if reason:
-                tqdm.write(f"missing: {cell.kind} {cell.name}: {reason}", file=sys.stderr)
-                failed[cell] = reason
-                continue
-            order.done(cell)
-            for other in order.get_ready():
-                runner.submit(other, folder)
-    for cell in waiting:  # what is needed comes first
-        lost = [need for need in needs[cell] if need in failed]
-        if lost:
-            failed[cell] = f"needs {lost[0].kind} {lost[0].name}, which is missing"
-    return failed
+    return _of_cluster(cluster, workers)
+
+
+def at(address: str) -> DaskWorkers:
+    """The workers of a running scheduler, such as "tcp://node:8786"."""
+    client = require("distributed", "cluster", "workers of a scheduler").Client(address)
+    return DaskWorkers(client, max(len(client.scheduler_info()["workers"]), 1))
+
+
+def slurm(jobs: int) -> DaskWorkers:
+    """As many Slurm jobs of one worker each, which must see the study's folder too.
+
+    Partition and account come from the configuration file of dask-jobqueue. Raises `OSError` where
+    there is no Slurm.
+    """
+    jobqueue = require("dask_jobqueue.slurm", "cluster", "Slurm")
+    if shutil.which("sbatch") is None:
+        raise OSError("no command sbatch: submit from a node of the Slurm cluster")
+    variables = environment(1)
+    _configure(variables)  # the scheduler runs here
+    # the workers read their part of Dask's settings from their own environment
+    variables |= {"DASK_DISTRIBUTED__WORKER__MEMORY__TERMINATE": "False"}
+    exports = [f"export {name}='{value}'" for name, value in variables.items()]
+    cluster = jobqueue.SLURMCluster(**JOB, job_script_prologue=exports)
+    cluster.scale(jobs=jobs)
+    return _of_cluster(cluster, jobs)
+
+
+def _configure(variables: dict[str, str]) -> None:
+    """Set what Dask gives to the processes that it starts, before they import anything."""
+    require("dask", "cluster", "several workers").config.set(
+        {
+            "distributed.nanny.pre-spawn-environ": variables,
+            "distributed.worker.multiprocessing-method": "spawn",
+            "distributed.scheduler.allowed-failures": RETRIES,
+            "distributed.worker.memory.terminate": False,  # JAX keeps what it compiled
+        }
+    )
+
+
+def _of_cluster(cluster: Any, processes: int) -> DaskWorkers:
+    from distributed import Client, WorkerPlugin
+
+    class OneCore(WorkerPlugin):
+        """Binds a worker to a core, by the number at the end of its name."""
+
+        def setup(self, worker: Any) -> None:
+            begin_worker(int(re.findall(r"\d+", str(worker.name))[-1]))
+
+    client = Client(cluster)
+    client.register_plugin(OneCore())
+    return DaskWorkers(client, processes, cluster)

@@ -1,15 +1,15 @@
-"""Cells of ensembles: how well a judged motion is known, and what other fabrics do in it.
+"""Ensembles: how accurately a motion for evaluation is known, and how other fabrics move in it.
 
-Members differ from the truth by what no one can see, or by what its mesh and steps leave. Their
-distances from it, over time, are its floor (`r2s.metrics.horizon`).
+Members differ from the truth by unmeasurable perturbations, or by mesh and time step. Their
+distances from it over time give its floor (`r2s.metrics.horizon`).
 """
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -26,29 +26,44 @@ from r2s.recordings.recording import cloud
 from r2s.scenarios.resolution import explicit_cloth
 from r2s.scenarios.scenario import rollout
 from r2s.scenarios.standard import Experiment
-from r2s.study.cells import Cell, result_files
-from r2s.study.sources import SyntheticRecording, read, strain_dependent
-from r2s.study.starts import SETTLING, started
+from r2s.study.recordings import (
+    SETTLING,
+    Shape,
+    Source,
+    SyntheticRecording,
+    read,
+    started,
+    strain_dependent,
+)
+from r2s.study.tasks import Task, result_files
 
 ENSEMBLE = "ensemble.npz"
-STIFFNESS, PATH = 1e-3, 2e-4  # [-] and [m], either way: what no one can tell
-FINER, COARSER = 3 / 2, 1 / 2  # cells a side: of the finer mesh, and of other fabrics' sheets
+STIFFNESS, PATH = 1e-3, 2e-4  # [-] and [m], either way: below what can be measured
+FINER, COARSER = 3 / 2, 1 / 2  # elements a side: of the finer mesh, and of other fabrics' sheets
 APART = "apart "  # before the name of another fabric
 WAYS = (1, -1)
 
+Own = TypeVar("Own")  # a fabric, in the terms of a simulator
+
+
+class Moved(NamedTuple):
+    """Positions [m] of the vertices of a mesh in the frames of a motion."""
+
+    x: np.ndarray
+    mesh: Mesh
+
 
 @dataclass(frozen=True)
-class EnsembleCell(Cell):
-    """The ensemble of a synthetic recording that is judged by.
+class EnsembleTask(Task):
+    """The ensemble of a synthetic recording for evaluation.
 
-    A sheet that hangs starts in all members as the truth does, so that none buckles to another
-    side; each comes to rest with its own fabric. So do predictions, and what that start alone does
-    is a cause of its own (`start`): other members are compared with the truth started anew. No
-    member has contact of layers, for the sake of
-    time; a recording that has is compared with the truth without.
+    A sheet that hangs starts in all members, as in predictions, in the truth's shape, and settles
+    with the member's fabric. The effect of that alone is the cause `start`; other members are
+    compared with the truth that settled again. No member has self-contact, to save time; neither
+    has the truth that they are compared with.
 
-    - `others`: presets whose truths move in the same way; on half the cells, all of them and the
-      truth's own fabric, so that what the mesh does is no difference between fabrics.
+    - `others`: presets whose truths move in the same way. They and the truth's own fabric are
+      simulated on half the elements, so that the mesh makes no difference between fabrics.
     """
 
     kind: ClassVar[str] = "ensembles"
@@ -67,53 +82,81 @@ class EnsembleCell(Cell):
 
     @property
     def lacks_layers(self) -> bool:
-        """Whether its recording has contact of layers, which no member has."""
+        """Whether its recording has self-contact, which no member has."""
         return self.recording.has_layers
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
-        """Distances [m] of every member from the truth, or from it started anew, in each frame."""
+        """Distances [m] of every member from the truth, or from it settled again, in each frame."""
         source = self.recording
         truth, experiment, shape = source.truth, source.experiment, source.truth.shape
         fabric = strain_dependent(source.fabric, truth)
         base = simulated(experiment, fabric, shape)
         if not np.isfinite(base.x).all():
             raise RuntimeError(f"the truth of {self.name} diverged")
-        hangs = experiment.sheet.weft[2] != 0
-        start = base.x[0].reshape(*shape, 3) if hangs else None  # as predictions do
-        anew = simulated(experiment, fabric, shape, start=start) if hangs else base
-        points = points_of(anew)
+        start = base.x[0].reshape(*shape, 3) if source.has_start else None
 
-        def away(experiment: Experiment, fabric: Fabric, shape: Any, steps: int = 1) -> np.ndarray:
-            moved = simulated(experiment, fabric, shape, steps, start)
-            return to_surface(points, moved.x, moved.mesh.faces)
+        def simulate(
+            fabric: Fabric, shape: tuple[int, int], experiment: Experiment, steps: int = 1
+        ) -> Moved:
+            return simulated(experiment, fabric, shape, steps, start)
 
-        recording = read(source, folder)
-        clouds = [cloud(recording, frame) for frame in range(len(recording.times))]
-        found = {
-            "recording": [to_surface(clouds, base.x, base.mesh.faces)],
-            "stiffness": [
-                away(experiment, _scaled(fabric, 1 + way * STIFFNESS), shape) for way in WAYS
-            ],
-            "path": [away(shifted(experiment, way * PATH), fabric, shape) for way in WAYS],
-            "mesh": [away(experiment, fabric, cells_a_side(shape, FINER))],
-            "step": [away(experiment, fabric, shape, steps=2)],
-        }
-        if hangs:
-            found["start"] = [to_surface(points_of(base), anew.x, anew.mesh.faces)]
-        coarse = cells_a_side(shape, COARSER)
-        own = points_of(simulated(experiment, fabric, coarse, start=start))
-        for name in self.others:
-            moved = simulated(experiment, strain_dependent(name, truth), coarse, start=start)
-            found[APART + name] = [to_surface(own, moved.x, moved.mesh.faces)]
+        settled = base if start is None else simulate(fabric, shape, experiment)
+        others = {name: strain_dependent(name, truth) for name in self.others}
+        found = member_distances(settled, fabric, shape, experiment, simulate, _scaled, others)
+        found["recording"] = [recorded_distances(source, folder, base)]
+        if start is not None:
+            found["start"] = [to_surface(points_of(base), settled.x, settled.mesh.faces)]
         return save_ensemble(out, experiment, found)
 
 
 class Ensemble(NamedTuple):
-    """What `EnsembleCell` found: distances [m] by cause, and of other fabrics, at times [s]."""
+    """Distances [m] by cause, and of other fabrics, at times [s]."""
 
     times: Float[np.ndarray, " frame"]
     causes: dict[str, Float[np.ndarray, "member frame"]]
     apart: Float[np.ndarray, "other frame"]
+
+
+def member_distances(
+    reference: Moved,
+    fabric: Own,
+    shape: tuple[int, int],
+    experiment: Experiment,
+    simulate: Callable[..., Moved],
+    scaled: Callable[[Own, float], Own],
+    others: Mapping[str, Own],
+) -> dict[str, list[Float[np.ndarray, " frame"]]]:
+    """Distances [m] of the members of an ensemble from a reference, by cause.
+
+    - `simulate`: called with a fabric, a shape, an experiment and how many `steps` for one.
+    - `scaled`: a fabric that is stiffer by a factor.
+    - `others`: further fabrics by name; their distances are from `fabric` on the same mesh.
+    """
+    points = points_of(reference)
+
+    def away(moved: Moved, points: list[np.ndarray] = points) -> np.ndarray:
+        return to_surface(points, moved.x, moved.mesh.faces)
+
+    found = {
+        "stiffness": [
+            away(simulate(scaled(fabric, 1 + way * STIFFNESS), shape, experiment)) for way in WAYS
+        ],
+        "path": [away(simulate(fabric, shape, shifted(experiment, way * PATH))) for way in WAYS],
+        "mesh": [away(simulate(fabric, refined(shape, FINER), experiment))],
+        "step": [away(simulate(fabric, shape, experiment, steps=2))],
+    }
+    coarse = refined(shape, COARSER)
+    own = points_of(simulate(fabric, coarse, experiment))
+    for name, other in others.items():
+        found[APART + name] = [away(simulate(other, coarse, experiment), own)]
+    return found
+
+
+def recorded_distances(source: Source, folder: Path, base: Moved) -> Float[np.ndarray, " frame"]:
+    """Distances [m] of the points of a recording from a simulated sheet."""
+    recording = read(source, folder)
+    clouds = [cloud(recording, frame) for frame in range(len(recording.times))]
+    return to_surface(clouds, base.x, base.mesh.faces)
 
 
 def save_ensemble(
@@ -126,9 +169,9 @@ def save_ensemble(
     return {"diverged": [name for name, row in arrays.items() if not np.isfinite(row).all()]}
 
 
-def read_ensemble(cell: Cell, folder: Path) -> Ensemble:
-    """The ensemble of a cell of this kind that is made."""
-    with result_files(cell, folder) as files, np.load(files / ENSEMBLE) as stored:
+def read_ensemble(task: Task, folder: Path) -> Ensemble:
+    """The ensemble of a finished task."""
+    with result_files(task, folder) as files, np.load(files / ENSEMBLE) as stored:
         arrays = dict(stored)
     times = arrays.pop("times")
     causes = {name: each for name, each in arrays.items() if not name.startswith(APART)}
@@ -136,17 +179,10 @@ def read_ensemble(cell: Cell, folder: Path) -> Ensemble:
     return Ensemble(times, causes, np.concatenate(apart))
 
 
-def ensemble_of(recording: SyntheticRecording) -> EnsembleCell:
-    """The ensemble of a recording, beside all other presets of the study."""
+def ensemble_of(recording: SyntheticRecording) -> EnsembleTask:
+    """The ensemble of a recording, with all other presets as other fabrics."""
     others = tuple(name for name in presets.FIVE if name != recording.fabric)
-    return EnsembleCell(recording, others)
-
-
-class Moved(NamedTuple):
-    """Positions [m] of the vertices of a mesh in the frames of a motion."""
-
-    x: np.ndarray
-    mesh: Mesh
+    return EnsembleTask(recording, others)
 
 
 _rollout = eqx.filter_jit(rollout)
@@ -157,11 +193,11 @@ def simulated(
     fabric: Fabric,
     shape: tuple[int, int],
     steps: int = 1,
-    start: Float[np.ndarray, "row column 3"] | None = None,
+    start: Shape | None = None,
 ) -> Moved:
     """A motion in explicit steps; NaN from where it diverged.
 
-    `steps`: times as many. `start`: see `r2s.study.starts`.
+    `steps`: how many for one. `start`: see `r2s.study.recordings.started`.
     """
     scenario = started(experiment.scenario(shape), start)
     solver = explicit_cloth(scenario, fabric)
@@ -172,7 +208,7 @@ def simulated(
 
 
 def points_of(moved: Moved) -> list[np.ndarray]:
-    """Points of the sheet in each frame, the same places of the fabric in all."""
+    """Points of the sheet in each frame, at the same material places in all."""
     faces = moved.mesh.faces
     resolution = max(math.ceil(math.sqrt(POINTS / len(faces))), 1)
     points = np.asarray(jax.vmap(lambda x: sample(x, faces, resolution))(jnp.asarray(moved.x)))
@@ -181,7 +217,7 @@ def points_of(moved: Moved) -> list[np.ndarray]:
 
 
 def _scaled(fabric: Fabric, factor: float) -> Fabric:
-    """A fabric whose energies of membrane and bending are `factor` times as large.
+    """A fabric whose membrane and bending energies are `factor` times as large.
 
     All laws of truths have a part `small` that is linear in its stiffnesses.
     """
@@ -196,14 +232,14 @@ def _scaled(fabric: Fabric, factor: float) -> Fabric:
 
 
 def shifted(experiment: Experiment, way: float) -> Experiment:
-    """With the first gripper aside by so much [m], and the last one the other way."""
+    """With the first gripper moved aside [m], and the last one the other way."""
     path = np.array(experiment.route.path, float)
     path[:, 0, 0] += way
     path[:, -1, 1] -= way
     return experiment._replace(route=experiment.route._replace(path=path))
 
 
-def cells_a_side(shape: tuple[int, int], factor: float) -> tuple[int, int]:
-    """Vertices of a mesh with `factor` times as many cells along either side."""
+def refined(shape: tuple[int, int], factor: float) -> tuple[int, int]:
+    """Vertices of a mesh with `factor` times as many elements along either side."""
     rows, columns = (max(round(factor * (count - 1)), 1) + 1 for count in shape)
     return rows, columns

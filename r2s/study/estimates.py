@@ -1,4 +1,4 @@
-"""Cells that estimate: each approach from each scenario, on either solver."""
+"""Tasks that estimate: each approach from each scenario, on either solver."""
 
 import json
 import shutil
@@ -20,20 +20,18 @@ from r2s.estimation.methods import METHODS
 from r2s.estimation.physnet.method import TrainingBudget, train_network
 from r2s.materials import prior
 from r2s.recordings.recording import Recording
-from r2s.study.cells import KEY_LENGTH, VERSIONS, Cell, result_files
-from r2s.study.configuration import AND
-from r2s.study.environment import processor
-from r2s.study.sources import Source, read
+from r2s.study.configuration import AND, APPROACHES
+from r2s.study.recordings import Source, read
+from r2s.study.tasks import KEY_LENGTH, VERSIONS, Task, processor, result_files
 
 ESTIMATE, NETWORK = "estimate.json", "network.eqx"
 SHAPES = {"cloth": (9, 9), "points": (7, 7)}  # vertices of the simulated sheet
-APPROACHES = ("diffcloud", "diffcp", "physnet", "pinn")
 SOLVERS = {name: tuple(METHODS[name].supports) for name in APPROACHES}
 
 
 @dataclass(frozen=True)
 class Budgets:
-    """What estimates may cost: by approach, and the training of PhysNet's network."""
+    """The costs of estimates by approach, and of training PhysNet's network."""
 
     diffcloud: Budget = METHODS["diffcloud"].budget
     diffcp: Budget = METHODS["diffcp"].budget
@@ -43,7 +41,7 @@ class Budgets:
 
 
 @dataclass(frozen=True)
-class TrainedNetwork(Cell):
+class TrainedNetwork(Task):
     """PhysNet's network for a scenario on a solver."""
 
     kind: ClassVar[str] = "networks"
@@ -62,25 +60,24 @@ class TrainedNetwork(Cell):
         return f"networks {self.solver} {self.scenario}"
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
-        """A trained network; the simulated images are not kept."""
+        """Train the network."""
         trained = train_network(out / NETWORK, self.scenario, self.solver, self.budget, self.seed)
         return {"seed": self.seed, "triplet_accuracy": trained.curve[-1].accuracy}
 
 
 @dataclass(frozen=True)
-class EstimateCell(Cell):
+class EstimateTask(Task):
     """An estimate of a fabric.
 
     - `approach`: "diffcloud", "diffcp", "physnet" or "pinn", or "-published" behind one of these.
     - `solver`: "cloth" or "points".
-    - `sources`: the recordings; several of them for approaches that take several.
+    - `sources`: one recording, or several for approaches that accept them.
     - `density`: areal density as weighed, [kg/m^2].
     - `network`: of "physnet" and "physnet-published".
-    - `prior`: "fabrics" where what fabrics of this weight are like is known (`prior`),
-      else "flat", as on the command line.
-    - `resolves`: on meshes that resolve the fabric (`descend_by_meshes`), not `SHAPES`.
-    - `law`: "told": the laws that the recordings tell (`law_told_by`), as on the command line; else
-      as in `with_law`.
+    - `prior`: "fabrics" for the prior of fabrics of this weight (`r2s.materials.prior`), else
+      "flat".
+    - `resolves`: on meshes that resolve the fabric (`r2s.estimation.mesh_ladder`), not `SHAPES`.
+    - `law`: as in `with_law`; "told": the laws that the recordings identify (`law_told_by`).
     """
 
     kind: ClassVar[str] = "estimates"
@@ -107,7 +104,7 @@ class EstimateCell(Cell):
 
     @property
     def scenario(self) -> str:
-        """What it is estimated from, as in `Configuration.estimated_from`."""
+        """The scenarios of its recordings, as in `Configuration.estimated_from`."""
         return AND.join(dict.fromkeys(source.scenario for source in self.sources))
 
     @property
@@ -119,15 +116,14 @@ class EstimateCell(Cell):
         return f"estimates {self.approach} {self.solver} {self.scenario}"
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
-        """An estimate; one whose every simulation diverged is a result too, and says so."""
+        """An estimate; one whose simulations all diverged is a result too, and says so."""
         recordings = [read(source, folder) for source in self.sources]
-        space = default_space(self.solver, self.density)
-        space = with_law(space, self.law_from(recordings))
+        space = with_law(default_space(self.solver, self.density), self.law_from(recordings))
         if self.prior != "flat":
             space = prior.informed(space, self.density)
         try:
             found = self._estimated(recordings, space, folder)
-        except jax.errors.JaxRuntimeError:  # out of memory, say: no result, to be tried again
+        except jax.errors.JaxRuntimeError:  # such as out of memory: no result, to be tried again
             raise
         except (RuntimeError, FloatingPointError) as error:
             return {"seed": self.repeat, "diverged": f"{error}"}
@@ -135,12 +131,12 @@ class EstimateCell(Cell):
         return {"seed": self.repeat, "diverged": ""}
 
     def law_from(self, recordings: Sequence[Recording]) -> Law:
-        """The law of the fabrics that it chooses from, told by its recordings where that is so."""
+        """The law of the fabrics that are searched."""
         return law_told_by(recordings) if self.law == "told" else self.law
 
     def begun(self, folder: Path) -> Path:
-        """Where the state of an estimate lies until it is made, so that a killed one goes on: by
-        the same source, versions and processor, since another would not come by there."""
+        """The state of an unfinished estimate, from which it continues after a kill: by the same
+        source, versions and processor, as others would not have come to it."""
         made_by = sha256(f"{source_hash()} {VERSIONS} {processor()}".encode()).hexdigest()
         return folder / "begun" / f"{self.name}-{self.key}-{made_by[:KEY_LENGTH]}"
 
@@ -153,21 +149,19 @@ class EstimateCell(Cell):
         return found
 
 
-def method_of(cell: EstimateCell, network: Path | None = None) -> Method:
-    """The method of a cell with what it takes beside the recordings.
-
-    `network`: the folder of a trained one, which "physnet" needs to estimate.
-    """
-    kind = METHODS[cell.approach]
-    others: dict[str, Any] = {"network": network and network / NETWORK}
-    taken = {name: value for name, value in others.items() if name in kind.options()}
-    shape = None if cell.resolves else SHAPES[cell.solver]
-    return kind(solver=cell.solver, shape=shape, **taken)
+def method_of(task: EstimateTask, network: Path | None = None) -> Method:
+    """The method of a task; `network`: the folder of a trained one, which "physnet" needs to
+    estimate."""
+    kind = METHODS[task.approach]
+    options: dict[str, Any] = {"shape": None if task.resolves else SHAPES[task.solver]}
+    if "network" in kind.options():
+        options["network"] = network and network / NETWORK
+    return kind(solver=task.solver, **options)
 
 
-def read_estimate(cell: EstimateCell, folder: Path) -> Estimate | None:
-    """The estimate of a cell that is made; None where it diverged."""
-    with result_files(cell, folder) as files:
+def read_estimate(task: EstimateTask, folder: Path) -> Estimate | None:
+    """The estimate of a finished task; None where it diverged."""
+    with result_files(task, folder) as files:
         if not (files / ESTIMATE).exists():
             return None
         return from_json(json.loads((files / ESTIMATE).read_text(encoding="utf-8")))

@@ -1,4 +1,4 @@
-"""Cells that judge: a fabric in motions that its estimate never saw, beside recordings of them."""
+"""Tasks that evaluate a fabric in motions that its estimate never saw."""
 
 import dataclasses
 import json
@@ -26,35 +26,33 @@ from r2s.scenarios.resolution import EDGE, MEMBRANE_DAMPING, explicit_cloth, gri
 from r2s.scenarios.scenario import Scenario, from_recording
 from r2s.solvers.explicit.cloth import ExplicitCloth
 from r2s.solvers.mpm.sheet import Sheet, longest_edge, stable_step
-from r2s.study.cells import Cell, result_files
 from r2s.study.configuration import ON_CLOTH, Configuration
-from r2s.study.estimates import EstimateCell, read_estimate
-from r2s.study.sources import Source, read, read_start
-from r2s.study.starts import SETTLING, started
+from r2s.study.estimates import EstimateTask, read_estimate
+from r2s.study.recordings import SETTLING, Shape, Source, read, read_start, started
+from r2s.study.tasks import Task, result_files
 
-MIDDLE = -1  # instead of the number of a draw
+MIDDLE = -1  # instead of the number of a sample: the prior median
 MEASURED, MOTION = "measured.json", "motion.npz"
 # vertices of the simulated sheet: with 25 x 25 of the cloth a fling of grey interlock is 7 mm off
 SHAPES = {"cloth": (33, 33), "points": (9, 9)}
 # substeps a second, above which implicit steps, of so many seconds, are three times as fast
 MOST, IMPLICIT = 150_000, 1 / 240
-RETRIES = (2, 4)  # times the substeps, of a prediction that was lost
+RETRIES = (2, 4)  # times the substeps, of a prediction that diverged
 LADDER = math.sqrt(2)  # steps between frames are powers of this: few programs to compile
 
 
 @dataclass(frozen=True)
-class EvaluationCell(Cell):
-    """How near simulations of a fabric come to recordings of one scenario.
+class EvaluationTask(Task):
+    """The distance of simulations of a fabric from recordings of one scenario.
 
-    - `estimate`: whose fabric is judged; None: that of a draw, or the true one.
-    - `solver`: "cloth", in explicit steps, or "points", on `SHAPES`. What was estimated on points
-      is judged on both: whose fabric is nearer is told where all are simulated alike.
+    - `estimate`: whose fabric is evaluated; None: that of a sample, or the true one.
+    - `solver`: "cloth", in explicit steps, or "points", on `SHAPES`. Estimates on points are
+      evaluated on both, as only on the cloth all fabrics are simulated alike.
     - `density`: areal, [kg/m^2].
-    - `recordings`: what it is judged by, together, since they compile once.
-    - `draw`: a number of `r2s.materials.prior.draws`, which know the density alone: together these
-      are the default; each fabric has its own. `MIDDLE`: the middle of that prior, the best
-      guess. None: the truth of synthetic recordings at small strain; of MuJoCo's sheet its
-      material in the laws of r2s (`r2s.study.mujoco_sheet.as_plate`).
+    - `recordings`: evaluated together, since they compile once.
+    - `draw`: a number of `r2s.materials.prior.draws`, given the density; together these are the
+      default, and each fabric has its own. `MIDDLE`: the median of that prior. None: the truth of
+      synthetic recordings at small strain; of MuJoCo's sheet `r2s.study.mujoco.as_plate`.
     - `other`: whether `estimate` is that of another fabric, for comparison.
     - `every`: 1 compares all frames that count, 3 every third.
     """
@@ -62,7 +60,7 @@ class EvaluationCell(Cell):
     kind: ClassVar[str] = "evaluations"
     settings: ClassVar[tuple[Any, ...]] = (SHAPES, MOST, IMPLICIT, RETRIES, LADDER, SETTLING)
 
-    estimate: EstimateCell | None
+    estimate: EstimateTask | None
     solver: str
     density: float
     fabric: str
@@ -84,19 +82,18 @@ class EvaluationCell(Cell):
 
     @property
     def scenario(self) -> str:
-        """What is judged."""
         return self.recordings[0].scenario
 
     @property
     def configuration(self) -> Configuration:
-        """Whose fabric it is: an approach's on a solver, or that of none (see `baseline`)."""
+        """That of the estimate; without one, of no approach on the solver (see `baseline`)."""
         if self.estimate is None:
             return Configuration("", self.solver, "")
         return Configuration(self.estimate.approach, self.solver, self.estimate.scenario)
 
     @property
     def repeat(self) -> str:
-        """Which of several estimates, or draws, alike; "" where there is one."""
+        """The number of the estimate or sample; "" where there is one."""
         if self.estimate is not None:
             return str(self.estimate.repeat)
         return "" if self.draw in (None, MIDDLE) else str(self.draw)
@@ -124,7 +121,7 @@ class EvaluationCell(Cell):
         return len(self.recordings)
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
-        """Simulate every recording's motion: metrics of each, its motion, its distances from the
+        """Simulate every recording's motion: its metrics, the motion, its distances from the
         recording's points in the frames that count, and why a run diverged."""
         recordings = [read(source, folder) for source in self.recordings]
         fabric = self._fabric(folder)
@@ -135,38 +132,41 @@ class EvaluationCell(Cell):
         else:
             starts = [read_start(source, folder) for source in self.recordings]
             motions = predict(recordings, fabric, self.solver, starts)
-        measured, diverged, arrays = {}, {}, {}
+        measured, diverged, steps, arrays = {}, {}, {}, {}
         for source, recording, motion in zip(self.recordings, recordings, motions, strict=True):
-            args = self.every, source.is_given, self.shape  # what cameras see is cropped
+            # what cameras observe is cropped
+            args = self.every, source.is_given, self.shape
             found = prediction_error.against_motion(recording, motion.x, *args)
             away = prediction_error.from_surface(recording, motion.x, self.shape)
             found["surface"] = float(np.mean(away))
-            measured[source.name] = {name: _json_number(value) for name, value in found.items()}
+            measured[source.name] = {
+                name: value if math.isfinite(value) else None for name, value in found.items()
+            }
             arrays |= {f"x {source.name}": np.asarray(motion.x, np.float32), source.name: away}
             if motion.failure:
                 diverged[source.name] = motion.failure
+            if motion.steps:
+                steps[source.name] = motion.steps
         write_json(out / MEASURED, measured)
         np.savez_compressed(out / MOTION, **arrays)
-        pairs = zip(self.recordings, motions, strict=True)
-        steps = {source.name: motion.steps for source, motion in pairs if motion.steps}
         return {"diverged": diverged, "runs": len(recordings), "steps": steps}
 
     def _fabric(self, folder: Path) -> Fabric | None:
-        if self.estimate is None:
-            if self.draw is None:
-                return self.recordings[0].small_strain_fabric
-            if self.draw == MIDDLE:
-                return prior.middle(self.density)
-            key = jr.fold_in(jr.key(getattr(self.recordings[0], "seed", 0)), self.draw)
-            drawn = prior.draws(self.density, 1, jr.fold_in(key, crc32(self.fabric.encode())))
-            return jax.tree.map(lambda leaf: leaf[0], drawn)
-        found = read_estimate(self.estimate, folder)
-        return None if found is None else found.fabric
+        if self.estimate is not None:
+            found = read_estimate(self.estimate, folder)
+            return None if found is None else found.fabric
+        if self.draw is None:
+            return self.recordings[0].small_strain_fabric
+        if self.draw == MIDDLE:
+            return prior.middle(self.density)
+        key = jr.fold_in(jr.key(getattr(self.recordings[0], "seed", 0)), self.draw)
+        drawn = prior.draws(self.density, 1, jr.fold_in(key, crc32(self.fabric.encode())))
+        return jax.tree.map(lambda leaf: leaf[0], drawn)
 
 
-def read_measured(cell: EvaluationCell, folder: Path) -> dict[str, dict[str, float]]:
+def read_measured(task: EvaluationTask, folder: Path) -> dict[str, dict[str, float]]:
     """The metrics of each recording by name; NaN where the motion diverged."""
-    with result_files(cell, folder) as files:
+    with result_files(task, folder) as files:
         stored = json.loads((files / MEASURED).read_text(encoding="utf-8"))
     return {
         name: {metric: math.nan if value is None else value for metric, value in row.items()}
@@ -175,36 +175,34 @@ def read_measured(cell: EvaluationCell, folder: Path) -> dict[str, dict[str, flo
 
 
 def read_motions(
-    cell: EvaluationCell, folder: Path
+    task: EvaluationTask, folder: Path
 ) -> dict[str, Float[np.ndarray, "frame vertex 3"]]:
-    """Positions [m] of all motions, by the recording that each is beside."""
-    with result_files(cell, folder) as files, np.load(files / MOTION) as stored:
-        return {source.name: stored[f"x {source.name}"] for source in cell.recordings}
+    """Positions [m] of all motions, by the name of their recording."""
+    with result_files(task, folder) as files, np.load(files / MOTION) as stored:
+        return {source.name: stored[f"x {source.name}"] for source in task.recordings}
 
 
-def read_distances(cell: EvaluationCell, folder: Path) -> dict[str, Float[np.ndarray, " frame"]]:
+def read_distances(task: EvaluationTask, folder: Path) -> dict[str, Float[np.ndarray, " frame"]]:
     """Distances [m] of each recording's points from the sheet, by its name, in frames that count;
     NaN where the motion diverged."""
-    with result_files(cell, folder) as files, np.load(files / MOTION) as stored:
-        return {source.name: stored[source.name] for source in cell.recordings}
+    with result_files(task, folder) as files, np.load(files / MOTION) as stored:
+        return {source.name: stored[source.name] for source in task.recordings}
 
 
 def predict(
     recordings: list[Recording],
     fabric: Fabric,
     solver: str,
-    starts: Sequence[Float[np.ndarray, "row column 3"] | None] = (),
-    shape: tuple[int, int] | None = None,
+    starts: Sequence[Shape | None] = (),
 ) -> list[Motion]:
     """The motions of a fabric in recordings of one scenario.
 
-    `solver`: "cloth" in explicit steps, whose own error is that of their mesh alone (in implicit
-    ones for fabrics that need more than `MOST`: what bends so stiffly moves smoothly), or "points"
-    for material points in a grid that serves all recordings. `starts`: of each recording the shape
-    in its first frame [m], see `r2s.study.starts`; none: from flat sheets. `shape`: vertices along
-    warp and weft; None: those of `SHAPES`.
+    - `solver`: "cloth" in explicit steps, whose only error is that of their mesh (in implicit ones
+      for fabrics that need more than `MOST`), or "points" for material points in one grid for all.
+    - `starts`: of each recording the shape in its first frame [m], see
+      `r2s.study.recordings.started`; none: from flat sheets.
     """
-    scenarios = [from_recording(each, shape or SHAPES[solver]) for each in recordings]
+    scenarios = [from_recording(each, SHAPES[solver]) for each in recordings]
     if starts:
         scenarios = [started(*each) for each in zip(scenarios, starts, strict=True)]
     most = max(scenario.substeps for scenario in scenarios)
@@ -222,10 +220,10 @@ def predict(
 
 
 def _until_stable(scenario: Scenario, fabric: Fabric, solver: ExplicitCloth | Sheet) -> Motion:
-    """A motion; one of the cloth that is lost is made again in shorter substeps, then in implicit
+    """A motion; one of the cloth that diverges is repeated in shorter substeps, then in implicit
     steps.
 
-    The limit of substeps is that of a sheet whose cells keep their shape: some collapse where a
+    The limit of substeps is that of a sheet whose elements keep their shape. Some collapse where a
     soft sheet is flung, and that is no property of the fabric.
     """
     motion = prediction_error.predict_motion(scenario, fabric, solver)
@@ -254,17 +252,12 @@ def _implicit(scenario: Scenario, fabric: Fabric) -> Motion:
 
 
 def _points(scenarios: list[Scenario], fabric: Fabric) -> Sheet:
-    paths = [jnp.concatenate([getattr(s, name) for s in scenarios]) for name in ("path", "start")]
-    everywhere = dataclasses.replace(scenarios[0], path=paths[0], start=paths[1])
     first = scenarios[0]
-    mesh = first.scene.mesh
-    spacing = longest_edge(mesh) / EDGE
-    limit = float(stable_step(mesh, spacing, fabric, MEMBRANE_DAMPING))
+    paths = [jnp.concatenate([getattr(s, name) for s in scenarios]) for name in ("path", "start")]
+    everywhere = dataclasses.replace(first, path=paths[0], start=paths[1])
+    spacing = longest_edge(first.scene.mesh) / EDGE
+    limit = float(stable_step(first.scene.mesh, spacing, fabric, MEMBRANE_DAMPING))
     needed = max(first.substeps, first.interval / limit) + 1
     substeps = math.ceil(LADDER ** math.ceil(math.log(needed) / math.log(LADDER)))
     grid = grid_around(everywhere, spacing)
     return Sheet.make(first.scene, grid, fabric, first.interval / substeps, MEMBRANE_DAMPING)
-
-
-def _json_number(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""What the cells of a study found: the table of results, parameters, and all that is published."""
+"""The results of a study: one table, the estimated parameters, and all that is published."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -14,18 +14,16 @@ from r2s.estimation.default_spaces import law_of, with_law
 from r2s.estimation.method import default_space
 from r2s.materials.parameters import Range
 from r2s.metrics import prediction_error
-from r2s.study.cells import Cell, result_files, with_dependencies
-from r2s.study.estimates import ESTIMATE, EstimateCell, read_estimate
-from r2s.study.evaluations import EvaluationCell, read_measured
-from r2s.study.matrix import Plan
-from r2s.study.motions import judged_recordings
-from r2s.study.origins import origins
-from r2s.study.report import disclosures
-from r2s.study.report.publish import publish as publish_report
-from r2s.study.sources import SyntheticRecording, read, true_fabric
-from r2s.study.statistics.frame import PLACE, as_frame, write_results
-from r2s.study.statistics.means import with_skill
-from r2s.study.verdicts import SURFACE, judged_motions, verdicts
+from r2s.study.estimates import ESTIMATE, EstimateTask, read_estimate
+from r2s.study.evaluations import EvaluationTask, read_measured
+from r2s.study.plan import Plan
+from r2s.study.recordings import SyntheticRecording, read, true_fabric
+from r2s.study.report import page
+from r2s.study.report.figures import judged_recordings
+from r2s.study.report.tables import tables_of_the_making
+from r2s.study.statistics.frame import PLACE, as_frame, with_skill, write_results
+from r2s.study.tasks import Task, provenance, result_files, with_dependencies
+from r2s.study.verdicts import SURFACE, ensembles, judged_motions, verdicts
 
 PRINTED = ("skill", "findings")  # the other tables are in files
 PARAMETERS = ("solver", "recording", "parameter", "unit", "is_log", "value", "standard_error",
@@ -33,8 +31,8 @@ PARAMETERS = ("solver", "recording", "parameter", "unit", "is_log", "value", "st
 
 
 def publish(
-    cells: Sequence[EvaluationCell],
-    failed: dict[Cell, str],
+    tasks: Sequence[EvaluationTask],
+    failed: dict[Task, str],
     out: Path,
     plan: Plan,
     source: str,
@@ -42,28 +40,29 @@ def publish(
 ) -> None:
     """Write `results.csv`, `estimates/`, `tables/` and `report.html`, and print the main tables.
 
-    - `failed`: cells without a result, and why.
+    - `failed`: tasks without a result, and why.
     - `source`: where the recordings are from, in words.
     - `paper`: a folder with the tables of the paper.
     """
-    results = collect(cells, out)
+    results, estimates = collect(tasks, out), estimates_made(tasks, out)
     write_results(out / "results.csv", results)
-    for cell in estimates_made(cells, out):
-        with result_files(cell, out) as files:
+    for task in estimates:
+        with result_files(task, out) as files:
             if (files / ESTIMATE).exists():
                 (out / "estimates").mkdir(exist_ok=True)
-                write_text(out / f"estimates/{cell.name}.json", (files / ESTIMATE).read_text())
+                write_text(out / f"estimates/{task.name}.json", (files / ESTIMATE).read_text())
     settings = {"recordings": source} | {f.name: str(getattr(plan, f.name)) for f in fields(plan)}
-    settings |= {f"cells made by {by}": str(count) for by, count in origins(cells, out).items()}
-    tables = publish_report(
+    made_by = provenance([*ensembles(tasks), *tasks], out)
+    settings |= {f"cells made by {by}": str(count) for by, count in made_by.items()}
+    tables = page.publish(
         out,
         results,
-        judged_recordings(cells, out),
-        parameters(cells, out),
-        [(f"{cell.kind} {cell.name}", reason) for cell, reason in failed.items()],
+        judged_recordings(tasks, out),
+        parameters(tasks, out),
+        [(f"{task.kind} {task.name}", reason) for task, reason in failed.items()],
         settings,
         paper,
-        [disclosures.section(cells, estimates_made(cells, out), out)],
+        tables_of_the_making(tasks, estimates, out),
     )
     for name in PRINTED:
         if name in tables:
@@ -71,30 +70,29 @@ def publish(
     print(f"\n{out / 'report.html'} has the pictures, {out / 'results.csv'} every figure.")
 
 
-def collect(cells: Iterable[EvaluationCell], folder: Path) -> pd.DataFrame:
-    """The results of all cells that are made, in their order (`r2s.study.statistics.frame`), and of
-    given recordings how far two trials differ."""
-    cells = list(cells)
-    known = judged_motions(cells, folder)
-    rows: list[dict[str, Any]] = []
-    for cell in cells:
-        if not cell.is_made(folder):
+def collect(tasks: Sequence[EvaluationTask], folder: Path) -> pd.DataFrame:
+    """The results of all finished tasks (`r2s.study.statistics.frame`), and of given recordings the
+    distances between trials."""
+    known = judged_motions(tasks, folder)
+    rows: dict[tuple, dict[str, Any]] = {}  # trials may share a recording and its references
+    for task in tasks:
+        if not task.is_made(folder):
             continue
-        told = verdicts(cell, known, folder)
-        for recording, measured in read_measured(cell, folder).items():
+        judged = verdicts(task, known, folder)
+        for recording, measured in read_measured(task, folder).items():
             place = {
-                **cell.configuration._asdict(),
-                "fabric": cell.fabric,
-                "repeat": cell.repeat,
+                **task.configuration._asdict(),
+                "fabric": task.fabric,
+                "repeat": task.repeat,
                 "recording": recording,
-                "evaluated_on": cell.scenario,
-                "baseline": cell.baseline,
+                "evaluated_on": task.scenario,
+                "baseline": task.baseline,
             }
-            own = {row["metric"]: row for row in (*_metrics(measured), *told.get(recording, ()))}
-            rows += [place | row for row in own.values()]
-    # given trials may share some of what they are judged by, whose references are alike
-    once = {tuple(row[name] for name in PLACE): row for row in reversed(rows)}
-    results = as_frame([*reversed(once.values()), *_repeatability(cells, folder)])
+            own = {row["metric"]: row for row in (*_metrics(measured), *judged.get(recording, ()))}
+            for row in own.values():
+                full = place | row
+                rows.setdefault(tuple(full[name] for name in PLACE), full)
+    results = as_frame([*rows.values(), *_repeatability(tasks, folder)])
     return with_skill(results, SURFACE)
 
 
@@ -105,10 +103,10 @@ def _metrics(measured: dict[str, float]) -> list[dict[str, Any]]:
     ]
 
 
-def _repeatability(cells: Sequence[EvaluationCell], folder: Path) -> list[dict[str, Any]]:
-    """How far two trials of a fabric in a motion are from each other, for given recordings."""
+def _repeatability(tasks: Sequence[EvaluationTask], folder: Path) -> list[dict[str, Any]]:
+    """The distances between successive trials of a fabric in a motion, for given recordings."""
     trials = defaultdict(list)
-    for source in dict.fromkeys(source for cell in cells for source in cell.recordings):
+    for source in dict.fromkeys(source for task in tasks for source in task.recordings):
         if source.is_given and source.is_made(folder):
             trials[source.fabric, source.scenario].append(source)
     found = []
@@ -127,44 +125,47 @@ def _repeatability(cells: Sequence[EvaluationCell], folder: Path) -> list[dict[s
     return found
 
 
-def estimates_made(cells: Iterable[EvaluationCell], folder: Path) -> list[EstimateCell]:
-    """The estimates that cells need and that are made."""
-    needed = with_dependencies(cells)
-    return [cell for cell in needed if isinstance(cell, EstimateCell) and cell.is_made(folder)]
+def estimates_made(tasks: Iterable[EvaluationTask], folder: Path) -> list[EstimateTask]:
+    """The finished estimates that tasks depend on."""
+    needed = with_dependencies(tasks)
+    return [task for task in needed if isinstance(task, EstimateTask) and task.is_made(folder)]
 
 
-def parameters(cells: Iterable[EvaluationCell], folder: Path) -> pd.DataFrame:
-    """What was estimated, a line a parameter, with `PARAMETERS`.
+def parameters(tasks: Iterable[EvaluationTask], folder: Path) -> pd.DataFrame:
+    """The estimated parameters, a line each, with `PARAMETERS`.
 
     The standard error is relative for a logarithmic range, else in the unit; `truth` is NaN where
     it is not known.
     """
     rows = []
-    for cell in estimates_made(cells, folder):
-        estimate = read_estimate(cell, folder)
+    for task in estimates_made(tasks, folder):
+        estimate = read_estimate(task, folder)
         if estimate is None:
             continue
-        truth = true_values(cell, estimate.ranges)
+        truth = true_values(task, estimate.ranges)
         numbers = estimate.values, estimate.standard_errors, estimate.identifiable, truth
         columns = [np.asarray(each).tolist() for each in numbers]
         for bound, *own in zip(estimate.ranges, *columns, strict=True):
-            rows.append((cell.solver, cell.name, bound.name, bound.unit, bound.log, *own))
+            rows.append((task.solver, task.name, bound.name, bound.unit, bound.log, *own))
     return pd.DataFrame(rows, columns=list(PARAMETERS))
 
 
-def true_values(cell: EstimateCell, ranges: Sequence[Range]) -> np.ndarray:
+def true_values(task: EstimateTask, ranges: Sequence[Range]) -> np.ndarray:
     """The parameters [unit of the range] of a synthetic recording's fabric, of constant ones those
-    at small strain; NaN where unknown, as of given recordings, of another simulator's sheet, and of
-    multipliers of an assumed fabric."""
-    source = cell.sources[0]
+    at small strain.
+
+    NaN where unknown: of given recordings, of another simulator's sheet, and of multipliers of an
+    assumed fabric.
+    """
+    source = task.sources[0]
     if (
-        cell.solver != "cloth"
-        or not isinstance(source, SyntheticRecording)
+        not isinstance(source, SyntheticRecording)
         or source.truth.materials
+        or task.solver != "cloth"
     ):
         return np.full(len(ranges), np.nan)
     law = law_of(ranges)
-    space = with_law(default_space("cloth", cell.density), law)
-    values = space.values(space.to_unit(true_fabric(cell.fabric, law, source.truth)))
+    space = with_law(default_space("cloth", task.density), law)
+    values = space.values(space.to_unit(true_fabric(task.fabric, law, source.truth)))
     known = {bound.name: float(v) for bound, v in zip(space.ranges, values, strict=True)}
     return np.array([known.get(bound.name, np.nan) for bound in ranges])

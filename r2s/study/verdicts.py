@@ -1,7 +1,6 @@
-"""What the distances to a surface say of a fabric: up to the horizon, beside the floor, as skill.
+"""Errors of predictions up to the horizon, with their floor; beyond it, features of the motion.
 
-Beyond the horizon features that do not depend on the phase are compared
-(`r2s.metrics.horizon`).
+Beyond the horizon features that do not depend on the phase are compared (`r2s.metrics.phase_free`).
 """
 
 import math
@@ -19,20 +18,18 @@ from r2s.metrics import horizon
 from r2s.metrics.horizon import floor_of, horizon_of, within
 from r2s.recordings.recording import Recording, cloud
 from r2s.scenarios.scenario import from_recording
-from r2s.study.ensembles import EnsembleCell, ensemble_of, read_ensemble
-from r2s.study.evaluations import EvaluationCell, read_distances, read_motions
-from r2s.study.mujoco_cells import MujocoEnsemble, MujocoRecording
-from r2s.study.sources import Source, SyntheticRecording, read
+from r2s.study.ensembles import EnsembleTask, ensemble_of, read_ensemble
+from r2s.study.evaluations import EvaluationTask, read_distances, read_motions
+from r2s.study.mujoco import MujocoEnsemble, MujocoRecording
+from r2s.study.recordings import Source, SyntheticRecording, read
 
-SURFACE = "surface"  # the metric that is judged within the horizon
-BEYOND = "beyond "  # before the name of a feature that is compared from the horizon on
+SURFACE = "surface"  # the metric within the horizon
+BEYOND = "beyond "  # before the name of a feature that is compared beyond it
 FEWEST = 4  # frames that are compared beyond it
-# of recordings that were simulated
-ENSEMBLES = {SyntheticRecording: ensemble_of, MujocoRecording: MujocoEnsemble}
 
 
 class Judged(NamedTuple):
-    """What is known of a motion that is judged by.
+    """How accurately a motion for evaluation is known.
 
     - `times`: of the frames that count, [s]. `floor`: of each, [m]. `horizon`: [s].
     """
@@ -47,31 +44,30 @@ class Judged(NamedTuple):
         return within(self.times, self.horizon)
 
 
-def ensembles(cells: Iterable[EvaluationCell]) -> list[EnsembleCell | MujocoEnsemble]:
-    """Of all recordings that cells judge by and that were simulated."""
-    sources = dict.fromkeys(source for cell in cells for source in cell.recordings)
-    found = [_ensemble(each) for each in sources]
-    return [each for each in found if each is not None]
+def ensembles(tasks: Iterable[EvaluationTask]) -> list[EnsembleTask | MujocoEnsemble]:
+    """The ensembles of all simulated recordings that tasks evaluate on."""
+    sources = dict.fromkeys(source for task in tasks for source in task.recordings)
+    return [found for each in sources if (found := _ensemble(each)) is not None]
 
 
-def _ensemble(source: Source) -> EnsembleCell | MujocoEnsemble | None:
-    make = ENSEMBLES.get(type(source))
-    return None if make is None else make(source)
+def _ensemble(source: Source) -> EnsembleTask | MujocoEnsemble | None:
+    if isinstance(source, SyntheticRecording):
+        return ensemble_of(source)
+    return MujocoEnsemble(source) if isinstance(source, MujocoRecording) else None
 
 
-def judged_motions(cells: Iterable[EvaluationCell], folder: Path) -> dict[Source, Judged]:
-    """What ensembles that are made say of each recording."""
-    sources = [cell.recording for cell in ensembles(cells)]
-    found = {source: judged_motion(source, folder) for source in sources}
+def judged_motions(tasks: Iterable[EvaluationTask], folder: Path) -> dict[Source, Judged]:
+    """`judged_motion` of each recording whose ensemble is finished."""
+    found = {task.recording: judged_motion(task.recording, folder) for task in ensembles(tasks)}
     return {source: judged for source, judged in found.items() if judged is not None}
 
 
 def judged_motion(source: Source, folder: Path) -> Judged | None:
-    """What the ensemble of a recording says of it; None where there is none, or it is not made."""
-    cell = _ensemble(source)
-    if cell is None or not cell.is_made(folder):
+    """Floor and horizon of a recording; None where its ensemble is missing."""
+    task = _ensemble(source)
+    if task is None or not task.is_made(folder):
         return None
-    ensemble = read_ensemble(cell, folder)
+    ensemble = read_ensemble(task, folder)
     first, last = read(source, folder).info.frames_used
     used = slice(first, last + 1)
     floor, times = floor_of(ensemble.causes)[used], ensemble.times[used]
@@ -79,29 +75,31 @@ def judged_motion(source: Source, folder: Path) -> Judged | None:
 
 
 def verdicts(
-    cell: EvaluationCell, known: Mapping[Source, Judged], folder: Path
+    task: EvaluationTask, known: Mapping[Source, Judged], folder: Path
 ) -> dict[str, list[dict[str, Any]]]:
-    """What a cell that is made says of its recordings whose motion is judged, by their names.
+    """Metric, unit and value of the errors of a finished task, by the names of its recordings.
 
-    Each has the metric, unit and value of an error: first that of `SURFACE` with floor and horizon,
-    then those of what is compared beyond the horizon. `known`: from `judged_motions`.
+    First comes `SURFACE` with floor and horizon, then the features beyond the horizon. `known`:
+    from `judged_motions`; other recordings are left out.
     """
-    sources = [source for source in cell.recordings if source in known]
+    sources = [source for source in task.recordings if source in known]
     if not sources:
         return {}
-    distances, x = read_distances(cell, folder), read_motions(cell, folder)
+    distances, x = read_distances(task, folder), read_motions(task, folder)
     found = {}
     for source in sources:
         judged = known[source]
         surface = {"metric": SURFACE, "unit": "m", **within_horizon(distances[source.name], judged)}
         recording = read(source, folder)
-        found[source.name] = [surface, *_beyond(recording, x[source.name], cell.shape, judged)]
+        found[source.name] = [surface, *_beyond(recording, x[source.name], task.shape, judged)]
     return found
 
 
 def within_horizon(away: Float[np.ndarray, " frame"], judged: Judged) -> dict[str, Any]:
-    """The mean of distances [m] before the horizon, beside the floor's; NaN for a run that
-    diverged, whenever it did, and where no frame is before the horizon."""
+    """The mean of distances [m] before the horizon, and of the floor.
+
+    NaN for a run that diverged at any time, and where no frame is before the horizon.
+    """
     inside = judged.inside
     if not inside.any():
         return {"value": np.nan, "horizon": judged.horizon}
@@ -115,9 +113,10 @@ def as_recorded(
     faces: Int[Array, "face 3"],
     counts: Sequence[int],
 ) -> list[Float[np.ndarray, "_ 3"]]:
-    """So many points [m] of a sheet's whole surface in each frame, drawn anew in each, as those of
-    a recording that is judged by are: so that extents, and what the centroid of points moves by
-    chance, are alike in both, whatever the mesh."""
+    """Random points [m] of a sheet's whole surface in each frame, as many as its recording has.
+
+    So extents and the noise of the centroid are the same in both, whatever the mesh.
+    """
     generator = np.random.default_rng(0)
     resolution = math.ceil(math.sqrt(2 * max(counts) / len(faces)))
     every = np.asarray(jax.vmap(lambda at: sample(at, faces, resolution))(jnp.asarray(x, float)))

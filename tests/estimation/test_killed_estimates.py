@@ -6,7 +6,8 @@ import pytest
 
 from r2s.estimation.estimate import point_estimate
 from r2s.estimation.method import Method, default_space
-from r2s.study import estimates, matrix
+from r2s.study import estimates
+from r2s.study import plan as plans
 
 NOTHING = point_estimate(
     "none",
@@ -21,8 +22,8 @@ NOTHING = point_estimate(
 
 @pytest.fixture
 def cell():
-    plan = matrix.with_changes(matrix.SMALL, ["diffcloud-cloth-lifting"], ["grey_interlock"])
-    return next(each.estimate for each in matrix.synthetic(plan) if each.estimate is not None)
+    plan = plans.with_changes(plans.SMALL, ["diffcloud-cloth-lifting"], ["grey_interlock"])
+    return next(each.estimate for each in plans.synthetic(plan) if each.estimate is not None)
 
 
 def test_an_estimate_that_was_killed_goes_on_from_its_checkpoint(cell, tmp_path, monkeypatch):

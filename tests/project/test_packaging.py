@@ -18,7 +18,7 @@ from folders import ROOT
 import r2s
 from r2s.cli.study import Study
 from r2s.recordings.manifest import default_manifest
-from r2s.study import matrix
+from r2s.study import plan as plans
 
 MANIFESTS = ROOT / "data_manifests"
 PACKAGE = Path(r2s.__file__).parent
@@ -152,4 +152,4 @@ def test_a_wheel_knows_the_data_sets(tmp_path: Path) -> None:
 def test_make_study_runs_a_preset_that_there_is():
     text = (ROOT / "Makefile").read_text(encoding="utf-8")
     (default,) = re.findall(r"^PRESET \?= (\w+)$", text, re.MULTILINE)
-    assert default in matrix.PRESETS and Study(out=ROOT).preset == default
+    assert default in plans.PRESETS and Study(out=ROOT).preset == default

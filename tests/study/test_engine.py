@@ -15,16 +15,16 @@ from folders import TESTS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.study import cells, durations, engine, progress
-from r2s.study.cells import Cell
-from r2s.study.ensembles import EnsembleCell
-from r2s.study.environment import environment, one_core
-from r2s.study.evaluations import SHAPES, EvaluationCell
-from r2s.study.starts import SETTLING
+from r2s.study import engine, tasks
+from r2s.study.engine import environment
+from r2s.study.ensembles import EnsembleTask
+from r2s.study.evaluations import SHAPES, EvaluationTask
+from r2s.study.recordings import SETTLING
+from r2s.study.tasks import Task
 
 
 @dataclass(frozen=True)
-class Number(Cell):
+class Number(Task):
     """Writes a number; a negative one fails."""
 
     kind: ClassVar[str] = "numbers"
@@ -45,12 +45,12 @@ class Number(Cell):
 
 
 @dataclass(frozen=True)
-class Sum(Cell):
+class Sum(Task):
     """The sum of others."""
 
     kind: ClassVar[str] = "sums"
 
-    parts: tuple[Cell, ...]
+    parts: tuple[Task, ...]
     label: str = "sum"
 
     @property
@@ -63,8 +63,8 @@ class Sum(Cell):
         return {}
 
 
-def value_of(cell: Cell, folder: Path) -> int:
-    with cells.result_files(cell, folder) as files:
+def value_of(cell: Task, folder: Path) -> int:
+    with tasks.result_files(cell, folder) as files:
         return int((files / "value.txt").read_text())
 
 
@@ -73,7 +73,7 @@ def tree() -> Sum:
 
 
 def test_needs_come_first_and_once(tmp_path):
-    order = [cell.name for cell in cells.with_dependencies([tree()])]
+    order = [cell.name for cell in tasks.with_dependencies([tree()])]
     assert order == ["n1", "n2", "a", "n3", "b", "whole"]
     assert engine.run([tree()], tmp_path, engine.Serial()) == {}
     assert value_of(tree(), tmp_path) == 8
@@ -98,24 +98,18 @@ def test_what_is_made_is_not_made_again_and_says_how_it_was_made(tmp_path):
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.zip")}
     engine.run([tree()], tmp_path, engine.Serial())
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.zip")} == times
-    noted = cells.read_metadata(Number(3), tmp_path)
+    noted = tasks.read_metadata(Number(3), tmp_path)
     assert noted["config"] == "Number(value=3, pause=0.0)" and noted["seed"] == 3
     assert {"r2s", "jax"} <= noted["versions"].keys()
     assert noted["seconds"] >= 0 and noted["peak_memory_MB"] > 10
 
 
-def test_the_key_depends_on_the_configuration_of_what_is_needed():
-    assert Sum((Number(1),)).key == Sum((Number(1),)).key
-    assert Sum((Number(1),)).key != Sum((Number(2),)).key
-    assert Sum((Sum((Number(1),)),)).key != Sum((Sum((Number(1, 0.5),)),)).key
-    assert Number(1).key != Sum((Number(1),)).key
-
-
-def test_the_key_depends_on_the_settings_that_results_do(monkeypatch):
+def test_the_key_depends_on_all_that_results_do(monkeypatch):
     before, sum_before = Number(1).key, Sum((Number(1),)).key
+    assert len({before, Number(2).key, sum_before, Sum((Number(1, 0.5),)).key}) == 4
     monkeypatch.setattr(Number, "settings", ((33, 33),))
     assert Number(1).key != before and Sum((Number(1),)).key != sum_before
-    assert SHAPES in EvaluationCell.settings and SETTLING in EnsembleCell.settings
+    assert SHAPES in EvaluationTask.settings and SETTLING in EnsembleTask.settings
 
 
 def test_a_damaged_result_is_made_again(tmp_path):
@@ -131,7 +125,7 @@ def test_a_full_disk_is_a_reason_and_leaves_nothing_behind(tmp_path, monkeypatch
         raise OSError(28, f"cannot write {path}: no space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr(cells, "write_bytes", full)
+        patched.setattr(tasks, "write_bytes", full)
         failed = engine.run([Number(1)], tmp_path, engine.Serial())
     assert "no space left" in failed[Number(1)]
     assert not list(tmp_path.rglob("*.zip"))
@@ -168,7 +162,7 @@ def test_a_run_that_was_killed_goes_on(tmp_path, after):
 
 
 @dataclass(frozen=True)
-class Dying(Cell):
+class Dying(Task):
     """Ends its process."""
 
     kind: ClassVar[str] = "deaths"
@@ -195,23 +189,14 @@ def test_a_process_apart_has_a_workers_environment_and_may_die(tmp_path, monkeyp
     assert os.environ["OPENBLAS_NUM_THREADS"] == "1"
 
 
-@pytest.mark.parametrize("set_to, expected", [(None, "3"), ("1", "3"), ("0", "0")])
-def test_workers_do_not_print_what_xla_says_of_kept_programs(monkeypatch, set_to, expected):
-    if set_to is None:
-        monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL", raising=False)
-    else:
-        monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", set_to)  # JAX sets 1 where nothing is set
-    assert environment(1)["TF_CPP_MIN_LOG_LEVEL"] == expected
-
-
 @pytest.mark.slow(group="study")
 def test_workers_of_dask_make_the_same_and_survive_a_kill(tmp_path):
-    cluster = pytest.importorskip("r2s.study.cluster", reason="needs the extra cluster")
+    pytest.importorskip("distributed", reason="needs the extra cluster")
     sums = [Sum((Number(i, 0.2), Number(i + 1, 0.2)), f"s{i}") for i in range(6)]
     sums.append(Sum((Number(-1), Number(0, 0.2)), "bad"))
-    runner = cluster.local(2)
+    runner = engine.local(2)
     try:
-        client = runner._client
+        client = runner.client
         cores = list(client.run(_cores).values())
         # a process that dies in the middle of a cell
         client.run_on_scheduler(lambda: None)
@@ -233,16 +218,6 @@ def _cores() -> set[int]:
     return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
 
 
-def test_a_process_takes_the_core_that_has_least_to_do(monkeypatch):
-    psutil, taken = pytest.importorskip("psutil"), []
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {1, 3, 4}, raising=False)
-    monkeypatch.setattr(os, "sched_setaffinity", lambda *given: taken.append(given), raising=False)
-    monkeypatch.setattr(psutil, "cpu_percent", lambda **_: [0.0, 90.0, 0.0, 20.0, 40.0])
-    one_core()
-    one_core(5)
-    assert taken == [(0, {3}), (0, {4})]
-
-
 SBATCH = """#!/bin/sh
 for script; do :; done
 cp "$script" "$0.$$"
@@ -254,20 +229,20 @@ echo "Submitted batch job $!"
 @pytest.mark.slow(group="study")
 def test_jobs_of_slurm_make_the_same_with_a_stand_in_for_sbatch(tmp_path, monkeypatch):
     """The stand-in runs a job's script at once, as Slurm would on a node that is free."""
-    cluster = pytest.importorskip("r2s.study.cluster", reason="needs the extra cluster")
+    pytest.importorskip("distributed", reason="needs the extra cluster")
     monkeypatch.setenv("PATH", "/usr/bin:/bin")
     with pytest.raises(OSError, match="sbatch"):
-        cluster.slurm(1)
+        engine.slurm(1)
     for name, script in (("sbatch", SBATCH), ("scancel", '#!/bin/sh\nkill -- "-$1"\n')):
         (tmp_path / name).write_text(script)
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     monkeypatch.setenv("PYTHONPATH", str(TESTS))
     sums = [Sum((Number(i, 0.1), Number(i + 1, 0.1)), f"s{i}") for i in range(4)]
-    runner = cluster.slurm(2)
+    runner = engine.slurm(2)
     try:
         assert not engine.run(sums, tmp_path / "out", runner)
-        settings = runner._client.run(os.getenv, "OPENBLAS_NUM_THREADS")
+        settings = runner.client.run(os.getenv, "OPENBLAS_NUM_THREADS")
     finally:
         runner.close()
     assert [value_of(cell, tmp_path / "out") for cell in sums] == [1, 3, 5, 7]
@@ -277,16 +252,40 @@ def test_jobs_of_slurm_make_the_same_with_a_stand_in_for_sbatch(tmp_path, monkey
 
 def test_a_file_gets_a_line_in_time_while_a_cell_is_running(tmp_path, capfd, monkeypatch):
     """Half a minute as delivered; a tenth of a second here."""
-    monkeypatch.setattr(progress, "LINES", 0.1)
+    monkeypatch.setattr(engine, "LINES", 0.1)
     engine.run([Number(1, pause=0.55)], tmp_path, engine.Serial())
     lines = capfd.readouterr().err.splitlines()
     assert len([line for line in lines if line.startswith("study of 1 cells:   0 %")]) >= 3
 
 
 def test_a_study_says_beforehand_how_long_it_takes(tmp_path, capfd, monkeypatch):
-    monkeypatch.setitem(durations.SECONDS, "numbers", (150.0, 30.0))
+    monkeypatch.setitem(engine.SECONDS, "numbers", (150.0, 30.0))
     engine.run([Number(1), Number(2)], tmp_path, engine.Serial())
     forecast = "study: 2 cells, about 3 min on 1 process"
     assert capfd.readouterr().err.splitlines()[0] == forecast
     engine.run([Number(1), Number(2)], tmp_path, engine.Serial())
     assert "study:" not in capfd.readouterr().err
+
+
+def test_every_version_and_source_that_made_results_is_counted(tmp_path, monkeypatch):
+    made = [Number(i) for i in range(5)]
+    for task in made[:2]:
+        tasks.execute(task, tmp_path)
+    assert list(tasks.provenance(made, tmp_path).values()) == [2]
+    monkeypatch.setitem(tasks.VERSIONS, "jax", "0.0.1")
+    tasks.execute(made[2], tmp_path)
+    monkeypatch.setattr(tasks, "source_hash", lambda: "another")
+    tasks.execute(made[3], tmp_path)
+    found = tasks.provenance(made, tmp_path)
+    assert list(found.values()) == [2, 1, 1] and "source another" in "".join(found)
+
+
+def test_the_tables_of_a_study_of_mixed_origin_are_refused(tmp_path):
+    (tmp_path / "tables").mkdir()
+    lines = ["setting,value", "version of r2s,1", "cells made by a,2", "cells made by b,1"]
+    (tmp_path / "tables" / "settings.csv").write_text("\n".join(lines))
+    driver = TESTS.parent / "experiments" / "_documents.py"
+    done = subprocess.run(
+        [sys.executable, driver, "--study", tmp_path], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 1 and "mixed" in done.stderr

@@ -7,11 +7,15 @@ import pandas as pd
 import pytest
 from made_up_study import FABRICS, made_up_results
 
-from r2s.metrics.statistics import interval, p_value
-from r2s.study.configuration import PAPER_CONFIGURATIONS, PUBLISHED_CONFIGURATIONS
+from r2s.metrics.crossed import interval, p_value
+from r2s.study.configuration import (
+    MOTIONS,
+    PAPER_CONFIGURATIONS,
+    PUBLISHED_CONFIGURATIONS,
+    Configuration,
+)
 from r2s.study.statistics.comparisons import answers, compare, judge
-from r2s.study.statistics.conclusions import findings
-from r2s.study.statistics.paper import COLUMNS, read_paper
+from r2s.study.statistics.conclusions import average, beside_paper, findings, read_paper
 
 DIFFCLOUD_L, DIFFCLOUD_W, DIFFCP = PAPER_CONFIGURATIONS[:3]
 PINN_POINTS, PINN_CLOTH = PAPER_CONFIGURATIONS[6:]
@@ -62,7 +66,7 @@ def right():
 def test_conclusions_that_are_right_hold(right):
     *found, physnet = answers(findings(right, NO_PAPER)).values()
     assert set(found) == {"holds"}
-    assert physnet == "cannot be told"  # DiffCP diverges: how much its repeats differ is not known
+    assert physnet == "undecided"  # DiffCP diverges: how much its repeats differ is not known
     without = findings(right[right.approach != "diffcp"], NO_PAPER)
     assert list(answers(without).values())[-1] == "holds"
 
@@ -70,7 +74,7 @@ def test_conclusions_that_are_right_hold(right):
 def test_conclusions_that_are_wrong_do_not():
     wrong = made_up(reversed_of, fabrics=MANY, trials=6, repeats=4)
     *found, diffcp, physnet = answers(findings(wrong, NO_PAPER)).values()
-    assert diffcp == "cannot be told"  # none diverged
+    assert diffcp == "undecided"  # none diverged
     assert {*found, physnet} == {"does not hold"}
 
 
@@ -87,7 +91,7 @@ def test_what_is_alike_does_not_hold_and_what_is_unclear_is_not_told():
     alike = compare("", results[results.evaluated_on == "fling"], LIFTING, WIND)
     few = made_up(lambda *_: 0.02, noise=0.4, fabrics=FABRICS[:2])
     judged = judge([("alike", alike), ("unclear", compare("", few, LIFTING, WIND))])
-    assert list(judged.answer) == ["does not hold", "cannot be told"]
+    assert list(judged.answer) == ["does not hold", "undecided"]
 
 
 def test_more_recordings_and_estimates_are_no_more_fabrics():
@@ -104,7 +108,7 @@ def test_more_recordings_and_estimates_are_no_more_fabrics():
     one = results[results.fabric == FABRICS[0]]
     alone = judge([("", compare("", one, LIFTING, WIND))])
     assert alone.ratio[0] == pytest.approx(1.1**3, rel=1e-3) and math.isnan(alone.p[0])
-    assert alone.answer[0] == "cannot be told" and math.isnan(alone.needed[0])
+    assert alone.answer[0] == "undecided" and math.isnan(alone.needed[0])
 
 
 def test_studies_without_an_effect_find_no_more_than_chance_does():
@@ -135,27 +139,7 @@ def test_what_cannot_be_told_says_how_many_fabrics_would_tell():
 
     judged = judge([("", compare("", made_up(distance, noise=0.01, trials=2), LIFTING, WIND))])
     found = judged.iloc[0]
-    assert found.answer == "cannot be told" and found.fewest < found.needed < found.most
-
-
-def test_missing_configurations_are_named():
-    results = made_up(lambda *_: 0.02, trials=2)
-    for part in (results[results.approach != "pinn"], results[:0], results[results.approach == ""]):
-        judged = findings(part, NO_PAPER)
-        assert set(judged.answer) <= {"cannot be told", "does not hold"}
-    judged = findings(results[results.approach != "pinn"], NO_PAPER)
-    assert judged.lacking.str.contains("no rows of PINN cloth stretching").any()
-
-
-def test_the_paper_is_quoted_when_it_is_there():
-    rows = [
-        (motion, "paper_chamfer", "black_denim", configuration.label, 0.1 * (i + 1))
-        for motion in ("folding", "fling", "shaking")
-        for i, configuration in enumerate(PAPER_CONFIGURATIONS)
-    ]
-    judged = findings(made_up(as_concluded, trials=2), pd.DataFrame(rows, columns=COLUMNS))
-    found = judged[judged.comparison == f"in fling {LIFTING[0]} better than {WIND[0]}"].iloc[0]
-    assert (found.paper_smaller, found.paper_larger) == pytest.approx((0.1, 0.2))
+    assert found.answer == "undecided" and found.fewest < found.needed < found.most
 
 
 def test_nothing_is_found_in_favour_of_a_side_that_diverged():
@@ -172,9 +156,9 @@ def test_nothing_is_found_in_favour_of_a_side_that_diverged():
     assert loses.answer == "holds"
     assert (loses.diverged_smaller, loses.diverged_larger) == (0, 20)
     wins = compared(DIFFCLOUD_L, 1)
-    assert wins.answer == "cannot be told" and wins.diverged_smaller == 20
+    assert wins.answer == "undecided" and wins.diverged_smaller == 20
     nothing = compared(DIFFCLOUD_W, 4)
-    assert nothing.lacking == "all of it diverged" and nothing.answer == "cannot be told"
+    assert nothing.lacking == "all of it diverged" and nothing.answer == "undecided"
 
 
 def test_estimates_that_diverge_by_chance_are_no_explosion():
@@ -185,5 +169,81 @@ def test_estimates_that_diverge_by_chance_are_no_explosion():
 
     judged = findings(made_up(some, fabrics=FABRICS[:2], repeats=1), NO_PAPER)
     found = judged[judged.conclusion.str.contains("explode")].iloc[0]
-    assert found.answer == "cannot be told" and found.p > 0.05
+    assert found.answer == "undecided" and found.p > 0.05
     assert found.comparison.endswith("2 of 2, 0 of 14")
+
+
+HEADER = "metric,fabric,diffcloud-diffsim-lifting,pinn-difftaichi-stretching\n"
+LINES = "CD,Black Denim,0.25,0.5\nCD,Red Jet Set,0.75,1.5\nCD,Average,9,9\nHD,Black Denim,1.25,2\n"
+DIFFCLOUD, PINN = (
+    Configuration("diffcloud", "cloth", "lifting"),
+    Configuration("pinn", "points", "stretching"),
+)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for motion in MOTIONS:
+        (tmp_path / f"{motion}.csv").write_text(HEADER + LINES)
+    return tmp_path
+
+
+def test_tables_are_read(folder):
+    paper = read_paper(folder)
+    assert set(zip(paper.evaluated_on, paper.metric, strict=True)) == {
+        (motion, metric) for motion in MOTIONS for metric in ("paper_chamfer", "paper_hausdorff")
+    }
+    part = paper[(paper.evaluated_on == "fling") & (paper.metric == "paper_chamfer")]
+    values = part.set_index(["configuration", "fabric"]).value.to_dict()
+    assert values == {
+        (DIFFCLOUD.label, "black_denim"): 0.25,
+        (DIFFCLOUD.label, "red_jet_set"): 0.75,
+        (PINN.label, "black_denim"): 0.5,
+        (PINN.label, "red_jet_set"): 1.5,
+    }
+    assert average(paper, "fling", [DIFFCLOUD, PINN]) == 0.75
+    assert math.isnan(average(paper, "fling", [Configuration("", "cloth", "")]))
+    assert read_paper(None).empty
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "No columns"),
+        ("metric,fabric,diffcloud-bullet-lifting\n", ".*diffcloud-bullet-lifting"),
+        (HEADER + "CD,Black Denim,0.25\n", "CD of Black Denim: .*found nan"),
+        (HEADER + "MD,Black Denim,0.25,1\n", "found 'MD'"),
+        (HEADER + "CD,Black Denim,0.25,many\n", ".*above zero, found 'many'"),
+        (HEADER + "CD,Black Denim,-1,1\n", ".*above zero, found '-1'"),
+        (HEADER + "CD,Red,1,1\nCD,Red,1,1\n", "CD of Red is given twice"),
+    ],
+)
+def test_damaged_tables_are_refused(folder, text, message):
+    (folder / "fling.csv").write_text(text)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_paper(folder)
+    assert "fling.csv" in str(caught.value)
+    (folder / "fling.csv").unlink()
+    with pytest.raises(FileNotFoundError, match="fling.csv"):
+        read_paper(folder)
+
+
+def test_ours_stand_beside_theirs(folder):
+    def nan(configuration, fabric, *_):
+        return math.nan if fabric == "pink_solid" else 0.02
+
+    results = made_up_results(nan, configurations=[DIFFCLOUD], noise=0.0, trials=2)
+    table = beside_paper(results, read_paper(folder), "fling").set_index("fabric")
+    assert set(table.columns) == {
+        "DIFFCLOUD cloth lifting",
+        "default cloth",
+        "DIFFCLOUD cloth lifting, paper",
+        "PINN points stretching, paper",
+    }
+    ours, theirs = table["DIFFCLOUD cloth lifting"], table["DIFFCLOUD cloth lifting, paper"]
+    assert ours["black_denim"] == pytest.approx(0.4) and theirs["black_denim"] == 0.25
+    assert ours["pink_solid"] == ours["mean"] == math.inf and math.isnan(theirs["pink_solid"])
+    assert theirs["mean"] == 0.5
+    alone = beside_paper(results, read_paper(None), "fling")
+    assert list(alone.columns) == ["fabric", "DIFFCLOUD cloth lifting", "default cloth"]
+    assert list(beside_paper(results[:0], read_paper(None), "fling").columns) == ["fabric"]

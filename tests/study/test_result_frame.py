@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 from made_up_study import made_up_results
 
-from r2s.study.configuration import PAPER_CONFIGURATIONS, Configuration
+from r2s.study.configuration import PAPER_CONFIGURATIONS
 from r2s.study.statistics import frame
-from r2s.study.statistics.frame import as_frame, labelled, write_results
+from r2s.study.statistics.frame import as_frame, write_results
 
 
 def row(value, recording="towel_1", baseline="", metric="chamfer", repeat="1", **more):
@@ -59,25 +59,6 @@ def test_what_is_judged_before_a_horizon_does_not_hide_what_diverged_after_it():
     assert kept(row(0.1), row(math.nan, metric="surface", floor=1e-3)) == ["chamfer", "surface"]
 
 
-def test_configurations_are_in_the_order_of_the_paper_and_defaults_last():
-    new = Configuration("new", "cloth", "wind")
-    results = made_up_results(configurations=[new, *reversed(PAPER_CONFIGURATIONS)])
-    assert frame.configurations(results) == [*PAPER_CONFIGURATIONS, new]
-    labels = list(results.configuration.cat.categories)
-    assert labels[:2] == ["DIFFCLOUD cloth lifting", "DIFFCLOUD cloth wind"]
-    assert labels[-2:] == ["new cloth wind", "default cloth"]
-
-
-def test_references_count_for_themselves():
-    baselines = "true", "middle", "default", "on_cloth", "other_fabric", "repeatability"
-    found = labelled(as_frame([row(0.1, baseline=each) for each in baselines]))
-    assert list(found.configuration) == [
-        "true fabric on cloth", "middle of the prior on cloth", "default cloth",
-        "new (found on points) cloth lifting", "new (of another fabric) cloth lifting",
-        "another trial cloth lifting",
-    ]  # fmt: skip
-
-
 def test_means_are_over_fabrics_that_every_configuration_has():
     results = made_up_results(configurations=PAPER_CONFIGURATIONS[:2])
     lacking = results[(results.fabric != "pink_solid") | (results.estimated_from != "wind")]
@@ -85,10 +66,3 @@ def test_means_are_over_fabrics_that_every_configuration_has():
     assert len(frame.fabrics_in_common(results)) == 3
     apart = lacking[(lacking.fabric == "pink_solid") | (lacking.estimated_from != "lifting")]
     assert len(frame.fabrics_in_common(apart)) == 3  # no fabric has both: all count
-
-
-def test_what_diverged_has_no_logarithm_and_movements_are_common_to_fabrics():
-    results = labelled(as_frame([row(math.nan), row(math.inf, "rag_1"), row(1.0, "bag_1")]))
-    assert list(results.diverged) == [True, True, False]
-    assert np.isnan(results.log).tolist() == [True, True, False]
-    assert set(results.movement) == {"_1"}

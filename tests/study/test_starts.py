@@ -1,24 +1,23 @@
 """From what shape a prediction of a hanging sheet starts."""
 
-import dataclasses
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s.materials import presets
-from r2s.metrics import prediction_error
-from r2s.metrics.losses import to_surface
-from r2s.metrics.prediction_error import Motion
+from r2s.metrics.surface_distance import to_surface
 from r2s.recordings.recording import cloud
-from r2s.scenarios.resolution import explicit_cloth
 from r2s.scenarios.standard import SIX
-from r2s.solvers.explicit.cloth import ExplicitCloth
-from r2s.study.cells import execute
-from r2s.study.evaluations import _explicit, _until_stable, predict
-from r2s.study.sources import SyntheticRecording, TruthSettings, read, read_start, small_strain
-from r2s.study.starts import SETTLING, started
+from r2s.study.evaluations import predict
+from r2s.study.recordings import (
+    SETTLING,
+    SyntheticRecording,
+    TruthSettings,
+    read,
+    read_start,
+    small_strain,
+    started,
+)
+from r2s.study.tasks import execute
 
 FLING = SIX["fling"](num_frames=30)
 
@@ -62,36 +61,6 @@ def test_the_true_fabric_begins_where_its_recording_does(tmp_path, monkeypatch):
 
     assert np.all(away([start]) < 3e-3)
     assert np.all(away(()) > 5e-3)
-
-
-def test_only_what_bends_and_damps_very_stiffly_is_predicted_in_implicit_steps():
-    scenarios = [FLING.scenario((33, 33))]
-    usual = presets.black_denim()
-    assert isinstance(_explicit(scenarios, usual), ExplicitCloth)
-    board = dataclasses.replace(
-        usual,
-        bending=jax.tree.map(lambda b: 0 * b + 1e-3, usual.bending),
-        damping=jnp.asarray(0.07),
-    )
-    assert _explicit(scenarios, board) is None
-
-
-def test_a_prediction_of_the_cloth_that_is_lost_is_made_again_in_shorter_substeps(monkeypatch):
-    scenario, fabric, tried = FLING.scenario((5, 5)), presets.grey_interlock(), []
-    solver = explicit_cloth(scenario, fabric)
-
-    def motion(_, __, solver=None):
-        tried.append(solver.substeps if solver else None)
-        return Motion(np.zeros((1, 25, 3)), "" if len(tried) > lost else "was unstable")
-
-    monkeypatch.setattr(prediction_error, "predict_motion", motion)
-    every = [solver.substeps, 2 * solver.substeps, 4 * solver.substeps, None]
-    words = "explicit steps", "explicit steps, 2 times as many", "explicit steps, 4 times as many"
-    for lost, told in enumerate((*words, "implicit steps, lost in explicit ones")):
-        found = _until_stable(scenario, fabric, solver)
-        assert (found.failure, found.steps) == ("", told)  # and says so
-        assert tried == every[: lost + 1]
-        tried.clear()
 
 
 def test_given_recordings_and_lying_sheets_have_no_start(tmp_path):

@@ -14,10 +14,10 @@ import pytest
 from r2s.materials import presets
 from r2s.study import engine, results, verdicts
 from r2s.study.ensembles import read_ensemble
-from r2s.study.evaluations import EvaluationCell
-from r2s.study.matrix import DRAWS
-from r2s.study.report.disclosures import verdict
-from r2s.study.sources import SyntheticRecording, small_strain
+from r2s.study.evaluations import EvaluationTask
+from r2s.study.plan import DRAWS
+from r2s.study.recordings import SyntheticRecording, small_strain
+from r2s.study.report.tables import verdict
 from r2s.study.verdicts import SURFACE
 
 KNOWN = 1 / 3  # of what fabrics differ by: mesh and step, mean up to the horizon
@@ -46,7 +46,7 @@ def test_the_true_fabric_beats_the_default_where_the_truth_is_known(tmp_path, fa
     source = SyntheticRecording(fabric, motion, 0, True)
     density = float(small_strain(fabric).density)
     draws = (None, *range(DRAWS))
-    cells = [EvaluationCell(None, "cloth", density, fabric, (source,), each) for each in draws]
+    cells = [EvaluationTask(None, "cloth", density, fabric, (source,), each) for each in draws]
     ensembles = verdicts.ensembles(cells)
     assert engine.run([*ensembles, *cells], tmp_path, engine.Serial()) == {}
     found = results.collect(cells, tmp_path)

@@ -7,10 +7,10 @@ import r2s
 from r2s.metrics import horizon
 from r2s.study import engine, results, verdicts
 from r2s.study.ensembles import read_ensemble
-from r2s.study.evaluations import EvaluationCell
-from r2s.study.motions import judged_recordings
-from r2s.study.report.disclosures import truth_table, verdict
-from r2s.study.sources import SyntheticRecording, TruthSettings, small_strain
+from r2s.study.evaluations import EvaluationTask
+from r2s.study.recordings import SyntheticRecording, TruthSettings, small_strain
+from r2s.study.report.figures import judged_recordings
+from r2s.study.report.tables import truth_table, verdict
 from r2s.study.verdicts import BEYOND, SURFACE, Judged
 
 FABRIC = "grey_interlock"
@@ -51,7 +51,7 @@ def test_a_truth_is_judged_beside_its_own_ensemble(tmp_path, monkeypatch):
     monkeypatch.setattr("r2s.study.evaluations.SHAPES", {"cloth": (9, 9), "points": (9, 9)})
     source = SyntheticRecording(FABRIC, "fling", 0, True, TruthSettings((9, 9), stiffening=0.0))
     density = float(small_strain(FABRIC).density)
-    cells = [EvaluationCell(None, "cloth", density, FABRIC, (source,), each) for each in (None, 0)]
+    cells = [EvaluationTask(None, "cloth", density, FABRIC, (source,), each) for each in (None, 0)]
     ensembles = verdicts.ensembles(cells)
     assert engine.run([*ensembles, *cells], tmp_path, engine.Serial()) == {}
     judged = verdicts.judged_motions(cells, tmp_path)[source]

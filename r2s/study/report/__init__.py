@@ -1,8 +1,7 @@
 """The report of a study: `report.html`, one file that works without a network.
 
-- `publish`: writes it and its tables; `opening`: what it begins with, in words.
-- `charts`, `motion_figure`: plotly figures; `tables`: tables of text; `disclosures`: what the
-  study was made with. `report.html.j2`: the page.
+- `page`: its sections and words; `report.html.j2`: its template.
+- `figures`: plotly figures. `tables`: tables of text, and of how the study was made.
 
 Needs plotly and Jinja2: pip install 'r2s[study]'.
 """

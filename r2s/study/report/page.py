@@ -1,6 +1,7 @@
-"""A report as one HTML file: sections of words, tables and figures in a template."""
+"""The sections of a report and their words, as one HTML file that needs no network."""
 
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,13 +11,40 @@ import pandas as pd
 import plotly.graph_objects as go
 from plotly.offline import get_plotlyjs
 
-from r2s.study.report.tables import MISSING, significant
+from r2s._util.files import write_text
+from r2s.metrics.statistics import LEVEL
+from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS
+from r2s.study.report import tables as text_tables
+from r2s.study.report.figures import (
+    Motion,
+    colours_of,
+    error_chart,
+    interval_chart,
+    motion_figures,
+)
+from r2s.study.report.tables import MISSING, mean_table, mean_text, significant
+from r2s.study.statistics import comparisons, conclusions, frame
+from r2s.study.verdicts import BEYOND, SURFACE
+
+# The first that is there compares configurations: within the horizon, where one is known. The
+# parts of a sheet that cameras did not see do not count. Hausdorff distances are those of outliers.
+JUDGED_BY = (SURFACE, "chamfer_real_to_sim", "chamfer", "chamfer_cropped", conclusions.CHAMFER)
+DISTANCES = (*JUDGED_BY[:-1], "chamfer_sim_to_real", "hausdorff")
+MOST_MOTIONS = 15  # that are drawn
+VERSIONS = ("r2s", "jax", "jaxlib", "equinox", "numpy", "scipy", "pandas", "statsmodels", "plotly")
+INTERVAL = f"means over fabrics, with {LEVEL:.0%} intervals for fabrics like these"
+QUESTION = (
+    "Which approach, on which solver and from which recording, estimates a fabric that moves as "
+    "the real one does?"
+)
+
+Tables = dict[str, tuple[str, pd.DataFrame]]  # by name, with a caption
 
 
 class Section(NamedTuple):
     """A part of the report: paragraphs, tables by name with a caption, figures by title.
 
-    `folded`: figures are drawn when a reader opens them, for a browser has few 3-D contexts.
+    `folded`: figures are drawn when a reader opens them, as browsers have few 3-D contexts.
     """
 
     heading: str
@@ -26,7 +54,64 @@ class Section(NamedTuple):
     folded: bool = False
 
 
-def render(sections: Sequence[Section]) -> str:
+def publish(
+    out: Path,
+    results: pd.DataFrame,
+    motions: Sequence[Motion] = (),
+    parameters: pd.DataFrame | None = None,
+    missing: Sequence[tuple[str, str]] = (),
+    settings: Mapping[str, str] | None = None,
+    paper_folder: Path | None = None,
+    making: Tables | None = None,
+) -> dict[str, pd.DataFrame]:
+    """Write `report.html` and `tables/` into `out`; returns the tables by name.
+
+    - `results`: see `r2s.study.statistics.frame`. `motions`: recordings to draw.
+    - `parameters`: the estimates (`r2s.study.results.parameters`).
+    - `missing`: tasks without a result, and why. `settings`: those of the study.
+    - `paper_folder`: the paper's tables, see `r2s.study.statistics.conclusions`.
+    - `making`: tables of how the study was made.
+
+    Raises what `read_paper` raises, and OSError that names what cannot be written.
+    """
+    papers = conclusions.read_paper(paper_folder)
+    every = frame.labelled(frame.without_undefined(results))
+    fabrics = frame.fabrics_in_common(every)
+    shared = every[every.fabric.isin(fabrics)]
+    metric = next((each for each in JUDGED_BY if each in set(shared.metric)), SURFACE)
+    skip = frame.undecided(shared, SURFACE) if metric == SURFACE else []
+    decided = shared[(shared.metric == metric) & ~shared.recording.isin(skip)]
+    judged = conclusions.findings(decided, papers)
+    drawn = [label for each in motions for label in each.vertices]
+    colours = colours_of([*every.configuration.cat.categories, *drawn])
+    known = frame.with_floor(shared, SURFACE)
+    with_skill = known[known.baseline != frame.DEFAULT]
+    opening = _opening(decided, with_skill, judged, len(fabrics), len(missing))
+    sections = [
+        Section(QUESTION, opening, figures=_picture(with_skill, decided, metric, colours)),
+        _skill(shared, every, known),
+        _findings(judged, metric, skip),
+        *_motions(motions, colours),
+        Section("Ranks", (), _ranks(decided, metric)),
+        Section("Parameters", (), _parameters(parameters)),
+        Section("How it was made", (), making or {}),
+        Section("All distances", (), _distances(shared, papers)),
+        _missing(every, missing),
+        Section("Settings", (), {"settings": ("", _settings(settings or {}))}),
+    ]
+    sections = [each for each in sections if each.words or each.tables]
+    tables = {name: table for each in sections for name, (_, table) in each.tables.items()}
+    (out / "tables").mkdir(parents=True, exist_ok=True)
+    for old in (out / "tables").glob("*.csv"):
+        old.unlink()
+    for name, table in tables.items():
+        text = table.to_csv(index=False, lineterminator="\n")
+        write_text(out / "tables" / f"{name}.csv", text)
+    write_text(out / "report.html", _render(sections))
+    return tables
+
+
+def _render(sections: Sequence[Section]) -> str:
     """The page as HTML, which needs no other file and no network."""
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
@@ -44,3 +129,207 @@ def _html_table(table: pd.DataFrame) -> str:
 def _json_figure(figure: go.Figure) -> str:
     text = figure.update_layout(template="plotly_white").to_json() or ""
     return text.replace("<", "\\u003c")  # "<" would end the element that holds it
+
+
+def _picture(
+    with_skill: pd.DataFrame, decided: pd.DataFrame, metric: str, colours: Mapping[str, str]
+) -> dict[str, go.Figure]:
+    """A chart of skills, or where none is known of mean distances, by its title."""
+    known = with_skill[with_skill.skill.notna()]
+    where = f"in motions that no estimate has seen, with {LEVEL:.0%} intervals"
+    if len(known):
+        marks = {0.0: "default", 1.0: "floor"}
+        chart = interval_chart(frame.means(known, "skill"), colours, "skill [-]", marks)
+        return {f"Skill {where}": chart}
+    if len(decided):
+        chart = interval_chart(frame.means(decided), colours, f"{metric} [m]", {})
+        return {f"Mean {metric} {where}": chart}
+    return {}
+
+
+def _opening(
+    decided: pd.DataFrame,
+    with_skill: pd.DataFrame,
+    judged: pd.DataFrame,
+    fabrics: int,
+    missing: int,
+) -> list[str]:
+    """Three sentences: what was done, the best configurations, and the significance."""
+    own = decided[decided.baseline == ""]
+    done = (
+        f"{len(frame.configurations(decided))} configurations (approach, solver, source) estimated "
+        f"{_number(fabrics, 'fabric')} and were evaluated on {decided.recording.nunique()} "
+        f"recordings of {', '.join(frame.motions(decided)) or 'no motion'}, which no estimate has "
+        f"seen. Of {len(own)} predictions {int(own.diverged.sum())} diverged; "
+        f"{_number(missing, 'cell')} of the study {'is' if missing == 1 else 'are'} missing."
+    )
+    if fabrics < 2:
+        significance = (
+            "One fabric decides nothing between approaches: differences between them may be those "
+            "of this fabric, and there are no intervals and no tests."
+        )
+    else:
+        found = list(comparisons.answers(judged).values())
+        counts = [found.count(each) for each in (comparisons.HOLDS, comparisons.HOLDS_NOT)]
+        significance = (
+            f"Of the paper's {len(found)} conclusions {counts[0]} hold and {counts[1]} do not; "
+            f"{found.count(comparisons.UNKNOWN)} cannot be decided from {fabrics} fabrics."
+        )
+    return [done, _best(own, with_skill[with_skill.baseline == ""]), significance]
+
+
+def _best(own: pd.DataFrame, with_skill: pd.DataFrame) -> str:
+    """The configuration with the best mean by motion, of those of which no run diverged."""
+    known = with_skill[with_skill.skill.notna()]
+    column, part = ("skill", known) if len(known) else ("value", own)
+    found = []
+    for motion in frame.motions(part):
+        table = frame.means(part[part.evaluated_on == motion], column).droplevel("evaluated_on")
+        table = table[np.isfinite(table["mean"])]
+        if len(table):
+            label = table["mean"].idxmax() if column == "skill" else table["mean"].idxmin()
+            write = "{:.2f}".format if column == "skill" else "{:.3g}".format
+            found.append(f"{label} in {motion} ({mean_text(table.loc[label], write)})")
+    if not found:
+        return "No configuration has a result that could be compared."
+    what = "The highest mean skill" if column == "skill" else "The smallest mean distance"
+    return f"{what} has {'; '.join(found)}."
+
+
+def _number(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def _skill(shared: pd.DataFrame, every: pd.DataFrame, known: pd.DataFrame) -> Section:
+    """Error, floor and skill by configuration; and features of the motion beyond the horizon."""
+    if known.empty:
+        return Section("Skill", ("No recording has a floor and a horizon: no skill is known.",))
+    words = [
+        "Skill is (default - error) / (default - floor): 1 where the error is as small as the "
+        "accuracy of the truth, 0 for the mean of random fabrics of the same weight (the default). "
+        "It is not known where the default is not clearly above the floor. A run that diverged has "
+        "an infinite error and a skill of minus infinity.",
+        "The true fabric has the truth's stiffness at small strain. The prior median is the best "
+        "guess from the weight alone: an approach that is not better has learned nothing.",
+    ]
+    if left_out := sorted(set(every.fabric) - set(shared.fabric)):
+        words.append(
+            f"Not every configuration has an estimate of {', '.join(left_out)}: means do not "
+            "include it, the table by fabric does."
+        )
+    table = text_tables.skill_table(frame.means(known), frame.skills(known))
+    found: Tables = {
+        "skill": (f"Error up to the horizon, floor and skill: {INTERVAL}", table),
+        "learned": (
+            "Error of the prior median over that of each configuration",
+            comparisons.learned(known, SURFACE),
+        ),
+        "skill_by_fabric": ("Skill by fabric", _by_fabric(frame.with_floor(every, SURFACE))),
+    }
+    beyond = shared[shared.metric.str.startswith(BEYOND)]
+    for motion in frame.motions(beyond):
+        table = mean_table(beyond[beyond.evaluated_on == motion], "metric")
+        text = f"{motion}, differences to the recording beyond the horizon: {INTERVAL}"
+        found[f"beyond_{motion}"] = text, table
+    return Section("Skill", words, {name: each for name, each in found.items() if len(each[1])})
+
+
+def _by_fabric(known: pd.DataFrame) -> pd.DataFrame:
+    keys = ["fabric", "evaluated_on", "configuration"]
+    found = known.groupby(keys, observed=True)[["value", "floor", "skill"]].mean()
+    found["diverged"] = known.groupby(keys, observed=True).diverged.sum()
+    millimetres = {"error [mm]": 1e3 * found.value, "floor [mm]": 1e3 * found.floor}
+    return found.assign(**millimetres).drop(columns=["value", "floor"]).reset_index()
+
+
+def _findings(judged: pd.DataFrame, metric: str, skip: Sequence[str]) -> Section:
+    words = [
+        f"Each conclusion of the paper (Ru et al. 2025) is tested on {metric}, with one number for "
+        "each fabric. Ratios are above 1 where the conclusion is right; p is Student's t test with "
+        "Holm's correction. Runs that diverged have no ratio, and nothing is concluded in favour "
+        "of a side that has any.",
+        *(f"{answer.capitalize()}: {x}" for x, answer in comparisons.answers(judged).items()),
+    ]
+    if skip:
+        words.append(
+            f"{len(skip)} recordings do not discriminate between fabrics and count neither here "
+            f"nor in ranks: {', '.join(skip)}."
+        )
+    return Section("The paper's conclusions", words, {"findings": ("Comparisons", judged)})
+
+
+def _motions(motions: Sequence[Motion], colours: Mapping[str, str]) -> list[Section]:
+    shown = motions[:MOST_MOTIONS]
+    if not shown:
+        return []
+    titles = [each.title for each in shown]
+    errors = [error_chart(each, colours) for each in shown]
+    words = (
+        "Mean distance of the recorded points from each simulated surface. Differences within the "
+        "shaded floor are not significant; beyond the horizon an error says nothing about a "
+        "fabric. Lines are dashed for material points, and end where a run diverged."
+    )
+    turn = (
+        "Recorded points and simulated sheets: open a motion, move the slider, turn the view; a "
+        "click in the legend shows or hides a sheet."
+    )
+    if len(motions) > len(shown):
+        turn += f" {len(motions) - len(shown)} more recordings are not shown."
+    figures = dict(zip(titles, motion_figures(shown, colours), strict=True))
+    return [
+        Section("Error over time", (words,), figures=dict(zip(titles, errors, strict=True))),
+        Section("Motions", (turn,), figures=figures, folded=True),
+    ]
+
+
+def _ranks(decided: pd.DataFrame, metric: str) -> Tables:
+    parts = {m: decided[decided.evaluated_on == m] for m in frame.motions(decided)}
+    parts |= {"all motions": decided} if len(parts) > 1 else {}
+    ranked = {m: r for m, part in parts.items() if (r := comparisons.rank(part)) is not None}
+    if not ranked:
+        return {}
+    tests = "; ".join(f"{name}: {each.words}" for name, each in ranked.items())
+    table = pd.concat({name: each.table for name, each in ranked.items()}, names=["motion"])
+    text = f"Mean ranks by {metric} with {LEVEL:.0%} intervals, and how often first. {tests}"
+    return {"ranks": (text, table.reset_index())}
+
+
+def _parameters(parameters: pd.DataFrame | None) -> Tables:
+    groups = () if parameters is None else parameters.groupby("solver")
+    text = f"with {LEVEL:.0%} intervals, and the truth where it is known"
+    return {
+        f"parameters_{solver}": (f"Estimates on {solver}, {text}", frame.parameter_intervals(part))
+        for solver, part in groups
+    }
+
+
+def _distances(shared: pd.DataFrame, papers: pd.DataFrame) -> Tables:
+    found: Tables = {}
+    for metric in DISTANCES:
+        own = shared[(shared.metric == metric) & shared.evaluated_on.isin(MOTIONS)]
+        if len(own):
+            found[metric] = f"{metric}: {INTERVAL}", mean_table(own, "evaluated_on")
+    one_by_one = text_tables.recording_table(shared, "chamfer_real_to_sim")
+    if len(one_by_one):
+        found["recordings"] = "chamfer_real_to_sim [mm] of every recording", one_by_one
+    for motion in MOTIONS:
+        table = conclusions.beside_paper(shared, papers, motion)
+        if len(table.columns) > 1:
+            cited = f"; paper: {conclusions.CITED}" if len(papers) else ""
+            text = f"Chamfer distance on {motion} in the units of the paper [-]{cited}"
+            found[f"{motion}_{conclusions.CHAMFER}"] = text, table
+    return found
+
+
+def _missing(every: pd.DataFrame, missing: Sequence[tuple[str, str]]) -> Section:
+    there = frame.configurations(every)
+    absent = [each.label for each in PAPER_CONFIGURATIONS if each not in there]
+    words = f"Configurations of the paper that have no result here: {', '.join(absent)}."
+    table = pd.DataFrame(list(missing), columns=["cell", "reason"])
+    found = {"missing": ("Cells without a result, and why", table)} if missing else {}
+    return Section("What is missing", (words,) if absent else (), found)
+
+
+def _settings(settings: Mapping[str, str]) -> pd.DataFrame:
+    lines = [*settings.items(), *((f"version of {name}", version(name)) for name in VERSIONS)]
+    return pd.DataFrame(lines, columns=["setting", "value"])

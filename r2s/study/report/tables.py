@@ -1,15 +1,38 @@
-"""Tables of a report that hold text: means with their intervals, side by side by motion."""
+"""Tables of a report: means with their intervals as text, and how the study was made."""
 
-from collections.abc import Callable, Iterable
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
+from r2s.estimation.default_spaces import FROM, fixed, with_law
+from r2s.estimation.method import default_space
 from r2s.study.configuration import ON_CLOTH
-from r2s.study.statistics.frame import CONFIGURATION, motions
-from r2s.study.statistics.means import means
+from r2s.study.ensembles import Ensemble, read_ensemble
+from r2s.study.estimates import EstimateTask, method_of
+from r2s.study.evaluations import EvaluationTask
+from r2s.study.recordings import SyntheticRecording, read, true_fabric
+from r2s.study.statistics.frame import CONFIGURATION, means, motions
+from r2s.study.tasks import read_metadata, with_dependencies
+from r2s.study.verdicts import Judged, ensembles, judged_motions
 
 MISSING = "-"
+LEAST = 2e-3  # [m]: the effect of mesh and step in a converged motion, mean up to the horizon
+TRUTHS = (
+    "Recordings for evaluation: horizon; floor, and mean distances up to the horizon by cause: "
+    "0.1 % more stiffness, grippers moved by 0.2 mm, a finer mesh, half the step, and settling "
+    "again in the start of predictions. A recording is converged where mesh and step together "
+    f"move it by less than {1e3 * LEAST:g} mm, and chaotic where stiffness or path move it by more"
+)
+DATA = (
+    "What every approach reads of its recordings: a difference between approaches may be one "
+    "between their data or priors"
+)
+RANGES = "Ranges of estimated parameters, and fixed values. Truths: geometric mean at small strain"
 
 
 def significant(value: float) -> str:
@@ -18,6 +41,11 @@ def significant(value: float) -> str:
     if 1e3 <= abs(rounded) < 1e6:  # "g" would write 1.23e+03
         return f"{rounded:.0f}"
     return f"{rounded:#.3g}".removesuffix(".")
+
+
+def millimetres(metres: float) -> str:
+    """A length [m] in millimetres to a tenth; below one to a hundredth."""
+    return f"{1e3 * metres:.1f}" if abs(metres) >= 0.995e-3 else f"{1e3 * metres:.2f}"
 
 
 def mean_text(row: pd.Series, write: Callable[[float], str]) -> str:
@@ -30,14 +58,9 @@ def mean_text(row: pd.Series, write: Callable[[float], str]) -> str:
     return write(row["mean"]) + ends
 
 
-def millimetres(metres: float) -> str:
-    """A length [m] in millimetres to a tenth; below one to a hundredth."""
-    return f"{1e3 * metres:.1f}" if abs(metres) >= 0.995e-3 else f"{1e3 * metres:.2f}"
-
-
 def skill_table(errors: pd.DataFrame, skills: pd.DataFrame) -> pd.DataFrame:
-    """Error, floor and skill by motion, a line a configuration; from `means.means` and
-    `means.skills`."""
+    """Error, floor and skill by motion, a line a configuration; from `means` and `skills` of
+    `r2s.study.statistics.frame`."""
     columns: dict[str, dict[str, str]] = {}
     for (label, motion), row in skills.iterrows():
         skill = mean_text(row, "{:.2f}".format) if row.runs > 0 else "not known"
@@ -45,12 +68,12 @@ def skill_table(errors: pd.DataFrame, skills: pd.DataFrame) -> pd.DataFrame:
             skill = "0"
         elif 0 < row.known < row.judged:
             skill += f", known in {row.known:.0f} of {row.judged:.0f}"
-        cells = {
+        texts = {
             "error [mm]": mean_text(errors.loc[(label, motion)], millimetres),
             "floor [mm]": f"{1e3 * row.floor:.2f}",
             "skill": skill,
         }
-        for name, text in cells.items():
+        for name, text in texts.items():
             columns.setdefault(f"{motion}: {name}", {})[str(label)] = text
     order = dict.fromkeys(map(str, skills.index.get_level_values("configuration")))
     return _by_configuration(pd.DataFrame(columns), order)
@@ -72,16 +95,15 @@ def mean_table(results: pd.DataFrame, column: str) -> pd.DataFrame:
 
 
 def _by_configuration(table: pd.DataFrame, order: Iterable[str]) -> pd.DataFrame:
-    """A table of text by configuration, in some order, with that as its first column."""
     table = table.reindex([label for label in order if label in table.index]).fillna(MISSING)
     return table.rename_axis("configuration").reset_index()
 
 
 def recording_table(results: pd.DataFrame, metric: str) -> pd.DataFrame:
-    """Errors [mm] in given recordings one by one, beside what they are compared with.
+    """Errors [mm] in each given recording, with their references.
 
-    Recordings that are given have an estimate of another fabric beside their own; there are none
-    of synthetic ones. Of an estimate the first repeat counts, of the default all draws.
+    Only given recordings have an estimate of another fabric. Of an estimate the first repeat
+    counts, of the default all samples.
     """
     own = results[(results.metric == metric) & (results.baseline != ON_CLOTH)]
     whose = own[own.baseline == "other_fabric"][CONFIGURATION].drop_duplicates()
@@ -94,3 +116,113 @@ def recording_table(results: pd.DataFrame, metric: str) -> pd.DataFrame:
         table = table.rename(columns={"": "estimate"}).reset_index().rename_axis(columns=None)
         found.append(table.assign(configuration=" ".join(configuration)))
     return pd.concat(found)
+
+
+def tables_of_the_making(
+    tasks: Sequence[EvaluationTask], estimates: Sequence[EstimateTask], folder: Path
+) -> dict[str, tuple[str, pd.DataFrame]]:
+    """How a study was made, by name with a caption; `estimates`: the finished ones."""
+    found = {
+        "truths": (TRUTHS, truth_table(tasks, folder)),
+        "data": (DATA, data_table(estimates, folder)),
+        "ranges": (RANGES, range_table(tasks)),
+        "costs": ("Time and memory, compilation included", cost_table(tasks, folder)),
+    }
+    return {name: each for name, each in found.items() if len(each[1])}
+
+
+def truth_table(tasks: Sequence[EvaluationTask], folder: Path) -> pd.DataFrame:
+    """How accurately each recording is known: horizon, floor by cause [mm] and a verdict."""
+    known = judged_motions(tasks, folder)
+    rows = [
+        {"recording": task.recording.name, "horizon [s]": known[task.recording].horizon}
+        | _truth(known[task.recording], read_ensemble(task, folder), task.lacks_layers)
+        for task in ensembles(tasks)
+        if task.recording in known
+    ]
+    return pd.DataFrame(rows)
+
+
+def _truth(judged: Judged, ensemble: Ensemble, is_layered: bool) -> dict[str, Any]:
+    if not judged.inside.any():
+        return {"verdict": "no frame is known"}
+    inside = np.isin(ensemble.times, judged.times[judged.inside])
+    left = {cause: float(each[:, inside].mean()) for cause, each in ensemble.causes.items()}
+    words = verdict(*(left[cause] for cause in ("stiffness", "path", "mesh", "step")))
+    floor = float(judged.floor[judged.inside].mean())
+    shown = {f"{name} [mm]": 1e3 * length for name, length in ({"floor": floor} | left).items()}
+    return {**shown, "verdict": "not known: ensemble without self-contact" if is_layered else words}
+
+
+def verdict(stiffness: float, path: float, mesh: float, step: float) -> str:
+    """Whether a truth is converged, from the mean distances of its ensemble [m]."""
+    if np.hypot(stiffness, path) > LEAST:
+        return "chaotic"
+    rest = float(np.hypot(mesh, step))
+    return "converged" if rest <= LEAST else f"not converged: {1e3 * rest:.1f} mm"
+
+
+def data_table(estimates: Iterable[EstimateTask], folder: Path) -> pd.DataFrame:
+    """What each approach reads of its recordings, by the first estimate."""
+    rows = {}
+    for task in estimates:
+        place = f"{task.approach} on {task.solver}", task.scenario
+        if place in rows or not all(source.is_made(folder) for source in task.sources):
+            continue
+        recordings = [read(source, folder) for source in task.sources]
+        reads = [method_of(task).reads(recording) for recording in recordings]
+        rows[place] = {
+            "approach": place[0],
+            "motion": place[1],
+            "recordings": len(recordings),
+            "frames": ", ".join(dict.fromkeys(str(len(each.frames)) for each in reads)),
+            "clouds": any(each.points != 0 for each in reads),
+            "markers": any(each.markers for each in reads),
+            "force of grippers": any(each.force for each in reads),
+            "prior": task.prior,
+            "laws": task.law_from(recordings),
+        }
+    return pd.DataFrame(list(rows.values()))
+
+
+def range_table(tasks: Iterable[EvaluationTask]) -> pd.DataFrame:
+    """A line for each parameter of each solver, and for each fixed value."""
+    # estimates on points are predicted on the cloth, too
+    tasks = [c for c in tasks if c.estimate is not None and c.solver == c.estimate.solver]
+    rows = []
+    for solver in dict.fromkeys(task.solver for task in tasks):
+        own = [task for task in tasks if task.solver == solver]
+        laws = {task.estimate.law for task in own if task.estimate is not None}
+        law = "linear" if laws <= {"linear"} else "stiffening+softening"
+        space = with_law(default_space(solver, own[0].density), law)
+        sources = [source for task in own for source in task.recordings]
+        synthetic = [each for each in sources if isinstance(each, SyntheticRecording)]
+        names = dict.fromkeys(each.fabric for each in synthetic if not each.truth.materials)
+        units = [space.to_unit(true_fabric(name, law)) for name in names]
+        mean = np.mean(units, axis=0) if units else np.full(space.dim, np.nan)
+        middle = space.values(jnp.full(space.dim, 0.5, float))
+        truths = space.values(jnp.asarray(mean, float))
+        for bound, half, truth in zip(space.ranges, middle.tolist(), truths.tolist(), strict=True):
+            numbers = (bound.low, bound.high, half, truth)
+            rows.append((solver, bound.name, bound.unit, *numbers, FROM.get(bound.name)))
+        for density in dict.fromkeys(task.density for task in own):
+            for each in fixed(default_space(solver, density)):
+                row = (solver, each.name, each.unit, *(each.value,) * 3, np.nan, each.origin)
+                rows += [row] if row not in rows else []
+    header = ["solver", "parameter", "unit", "low", "high", "middle", "truths", "from"]
+    return pd.DataFrame(rows, columns=header)
+
+
+def cost_table(tasks: Sequence[EvaluationTask], folder: Path) -> pd.DataFrame:
+    """The costs of the finished tasks, their dependencies and ensembles, by compilation group."""
+    groups = defaultdict(list)
+    for task in with_dependencies([*ensembles(tasks), *tasks]):
+        if task.is_made(folder):
+            groups[task.compilation_group].append(read_metadata(task, folder))
+    rows = []
+    for group, noted in groups.items():
+        seconds = [each["cpu_seconds"] for each in noted]
+        memory = max(each["peak_memory_MB"] for each in noted)
+        rows.append((group, len(noted), sum(seconds), float(np.median(seconds)), memory))
+    times = ["CPU seconds in all", "CPU seconds of one (median)"]
+    return pd.DataFrame(rows, columns=["kind", "count", *times, "peak memory [MB]"])

@@ -1,10 +1,8 @@
 """The analysis of a study: pure functions from tables of results to tables.
 
-- `frame`: the results as one long table, `results.csv`.
-- `means`: means over fabrics with their intervals; skill.
-- `comparisons`: which of two sides is better, and what is known of it.
-- `conclusions`: the conclusions of the paper as such comparisons; `paper`: its tables.
-- `ranks`, `factors`: who is best more often, and what the distance depends on.
+- `frame`: the results as one long table; errors, floors and skills with their intervals.
+- `comparisons`: tests of which side is better, and ranks.
+- `conclusions`: the paper's conclusions as such tests, and its tables.
 
 Needs pandas and statsmodels: pip install 'r2s[study]'.
 """

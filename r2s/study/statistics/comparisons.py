@@ -1,9 +1,12 @@
-"""Comparisons: which of two sides has the smaller distances, tested over fabrics.
+"""Comparisons: which of two sides has the smaller distances, tested over fabrics; and ranks.
 
-A comparison is one number a fabric, the mean logarithm of the ratio of two distances, above zero
-where the hypothesis is right; intervals and tests are Student's t over fabrics (`means.crossed`).
-A run that diverged has no distance: a comparison leaves it out, and nothing is concluded in favour
-of a side of which a run diverged.
+A comparison has one number a fabric, the mean logarithm of the ratio of two distances, above zero
+where the hypothesis is right; intervals and tests are Student's t over fabrics (`frame.crossed`).
+A run that diverged has no distance: comparisons leave it out, and nothing is concluded in favour of
+a side of which a run diverged.
+
+Distances differ more between recordings than between configurations; ranks within a recording are
+comparable. Demsar 2006, Statistical comparisons of classifiers over multiple data sets.
 """
 
 from collections.abc import Iterable, Sequence
@@ -11,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
 from r2s.metrics.statistics import (
@@ -22,21 +26,22 @@ from r2s.metrics.statistics import (
     units_needed,
 )
 from r2s.study.configuration import ON_CLOTH
-from r2s.study.statistics.frame import motions
+from r2s.study.statistics.frame import DEFAULT, ESTIMATE, motions
 
 MARGIN = 0.05  # an interval of the ratio within 1 +- this says that there is no difference
-HOLDS, HOLDS_NOT, UNKNOWN = "holds", "does not hold", "cannot be told"
+HOLDS, HOLDS_NOT, UNKNOWN = "holds", "does not hold", "undecided"
 NOTHING = CrossedMean(np.nan, 0, np.nan, 0.0, np.nan)
 
 
 class Comparison(NamedTuple):
-    """One test; `lacking` says why there is none.
+    """One test.
 
     - `found`: the mean over fabrics of the logarithm of the ratio (of what `words` say, where it
       is no ratio), above zero where the hypothesis is right.
-    - `agreeing`: in how many of the fabrics it is above zero.
+    - `agreeing`: in how many fabrics it is above zero.
     - `diverged`: runs that did, of the side that should be smaller, and of the larger.
-    - `paper`: the two averages that the paper's tables have for it, [-]; NaN: none.
+    - `paper`: the two averages in the paper's tables, [-]; NaN: none.
+    - `lacking`: why there is no test, or "".
     """
 
     words: str
@@ -49,16 +54,13 @@ class Comparison(NamedTuple):
 
 
 def compare(
-    words: str,
-    results: pd.DataFrame,
-    smaller: Sequence[str],
-    larger: Sequence[str],
+    words: str, results: pd.DataFrame, smaller: Sequence[str], larger: Sequence[str]
 ) -> Comparison:
     """Compare configurations over the recordings that they share; of several on a side the
     geometric mean counts.
 
-    `results`: of one metric, from `frame.labelled`. `smaller`, `larger`: labels of configurations
-    that are expected to have the smaller and the larger distances.
+    `results`: labelled, of one metric. `smaller`, `larger`: labels of the configurations that are
+    expected to have the smaller and the larger distances.
     """
     there = set(results.configuration)
     if missing := [each for each in (*smaller, *larger) if each not in there]:
@@ -76,7 +78,7 @@ def compare(
     wide = part.pivot(index=[*place, "repeat"], columns="configuration", values=["log", "alone"])
     logs, alone = wide["log"].astype(float), wide["alone"].fillna(False).astype(bool)
     of_recording = logs.groupby(place).mean()
-    # what was run once stands beside every repeat of the other side
+    # a configuration that ran once is compared with every repeat of the other side
     once = alone.groupby(place).transform("any")
     logs = logs.where(~once, logs.groupby(place).transform("mean"))
 
@@ -113,12 +115,12 @@ def compared(
 def judge(comparisons: Iterable[tuple[str, Comparison]]) -> pd.DataFrame:
     """The answer to each comparison of each conclusion, after Holm's correction for all of them.
 
-    A comparison holds where p is below `SIGNIFICANCE` and speaks for it. It does not hold where p
-    speaks against it, or where the interval of the ratio says that there is no difference to speak
-    of (`MARGIN`). Columns: `conclusion`, `comparison`, `answer`, `lacking`, `ratio` with `low` and
-    `high`, `p`, `p_holm`, `agreeing` of `fabrics`, `diverged_smaller` and `diverged_larger`,
-    `needed`, `fewest`, `most`: where it cannot be told, fabrics that would tell a ratio like this,
-    at least one as far from 1 as `MARGIN`; `paper_smaller`, `paper_larger`.
+    A comparison holds where p is below `SIGNIFICANCE` in favour of it. It does not hold where p is
+    against it, or where the interval of the ratio lies within `MARGIN` of 1. Columns: `conclusion`,
+    `comparison`, `answer`, `lacking`, `ratio` with `low` and `high`, `p`, `p_holm`, `agreeing` of
+    `fabrics`; `needed`, `fewest`, `most`: where there is no answer, the number of fabrics that
+    would show a ratio like this, at least one as far from 1 as `MARGIN`; `diverged_smaller`,
+    `diverged_larger`, `paper_smaller`, `paper_larger`.
     """
     pairs = list(comparisons)
     p = np.array([p_value(each.found) for _, each in pairs])
@@ -146,9 +148,7 @@ def judge(comparisons: Iterable[tuple[str, Comparison]]) -> pd.DataFrame:
                 "p_holm": holm,
                 "agreeing": each.agreeing,
                 "fabrics": each.found.units,
-                "needed": needed[0],
-                "fewest": needed[1],
-                "most": needed[2],
+                **dict(zip(("needed", "fewest", "most"), needed, strict=True)),
                 "diverged_smaller": each.diverged[0],
                 "diverged_larger": each.diverged[1],
                 "paper_smaller": each.paper[0],
@@ -156,26 +156,6 @@ def judge(comparisons: Iterable[tuple[str, Comparison]]) -> pd.DataFrame:
             }
         )
     return pd.DataFrame(rows)
-
-
-def learned(results: pd.DataFrame, metric: str) -> pd.DataFrame:
-    """Whether the errors of each configuration (`conclusion`) on each motion (`comparison`) are
-    below those of the prior's middle on the same solver, in the recordings that have a skill.
-
-    An approach that knows the prior of fabrics does as well as its middle by learning nothing, so
-    this, and not the skill against random draws of it, says what a recording has taught. The true
-    fabric is among the configurations: it bounds what can be learned.
-    """
-    known = results[(results.metric == metric) & results.skill.notna()]
-    pairs = []
-    for motion in motions(known):
-        part = known[known.evaluated_on == motion]
-        whose = part[["configuration", "solver", "baseline"]].drop_duplicates()
-        middles = whose[whose.baseline == "middle"].set_index("solver").configuration.to_dict()
-        for label, solver, baseline in whose.sort_values("configuration").itertuples(index=False):
-            if baseline in ("", "true", ON_CLOTH) and solver in middles:
-                pairs.append((str(label), compare(motion, part, [label], [middles[solver]])))
-    return judge(pairs)
 
 
 def _answer(comparison: Comparison, low: float, high: float, p: float) -> str:
@@ -199,3 +179,96 @@ def answers(judged: pd.DataFrame) -> dict[str, str]:
         else:
             found[conclusion] = HOLDS if (own == HOLDS).all() else UNKNOWN
     return found
+
+
+def learned(results: pd.DataFrame, metric: str) -> pd.DataFrame:
+    """Whether the errors of each configuration (`conclusion`) on each motion (`comparison`) are
+    below those of the prior median on the same solver, in the recordings that have a skill.
+
+    An approach that knows the prior is as good as its median without learning anything: this test,
+    and not the skill against samples, says what a recording has taught. The true fabric is among
+    the configurations: it bounds what can be learned.
+    """
+    known = results[(results.metric == metric) & results.skill.notna()]
+    pairs = []
+    for motion in motions(known):
+        part = known[known.evaluated_on == motion]
+        whose = part[["configuration", "solver", "baseline"]].drop_duplicates()
+        middles = whose[whose.baseline == "middle"].set_index("solver").configuration.to_dict()
+        for label, solver, baseline in whose.sort_values("configuration").itertuples(index=False):
+            if baseline in (ESTIMATE, "true", ON_CLOTH) and solver in middles:
+                pairs.append((str(label), compare(motion, part, [label], [middles[solver]])))
+    return judge(pairs)
+
+
+class Ranks(NamedTuple):
+    """Mean ranks, 1 the best, of the configurations that have the same recordings.
+
+    - `table`: by configuration `mean` over fabrics, `low` and `high` of its interval, and `first`,
+      the share of recordings in which it is the best.
+    - `recordings`, `fabrics`: how many count. `left_out`: configurations that lack most of them.
+    - `p`: of Friedman's test of all but default fabrics, with fabrics as blocks; NaN for fewer than
+      three configurations or two fabrics.
+    - `difference`: the critical difference of two mean ranks (Nemenyi).
+    """
+
+    table: pd.DataFrame
+    recordings: int
+    fabrics: int
+    left_out: list[str]
+    p: float
+    difference: float
+
+    @property
+    def words(self) -> str:
+        """The sample and the tests, in words."""
+        words = f"{len(self.table)} configurations, {self.recordings} recordings, "
+        words += f"{self.fabrics} fabrics, critical difference {self.difference:.2f}"
+        words += f", Friedman's p {self.p:.2g}" if np.isfinite(self.p) else ""
+        return words + (f", left out {', '.join(self.left_out)}" if self.left_out else "")
+
+
+def rank(results: pd.DataFrame) -> Ranks | None:
+    """The ranks by one metric of estimates and defaults, from labelled results; None where fewer
+    than two share a recording.
+
+    Ranks are of means over repeats; a mean with a repeat that diverged is last. Configurations that
+    lack more than half of the recordings are left out, then recordings that another one lacks.
+    """
+    own = results[results.baseline.isin((ESTIMATE, DEFAULT))]
+    own = own.assign(value=own.value.where(~own.diverged, np.inf))
+    place = ["fabric", "movement"]
+    table = own.groupby([*place, "configuration"], observed=True).value.mean().unstack()
+    is_kept = table.notna().mean() >= 0.5
+    left_out = list(map(str, table.columns[~is_kept]))
+    table = table.loc[:, is_kept].dropna()
+    if len(table.columns) < 2 or table.empty:
+        return None
+    ranks = table.rank(axis=1)
+    of_fabric = ranks.groupby("fabric").mean()
+    ends = [
+        interval(crossed_mean(of_fabric[each].to_numpy(), [ranks[each].unstack().to_numpy()]))
+        for each in ranks.columns
+    ]
+    low, high = np.clip(np.array(ends).T, 1, len(ranks.columns))
+    is_best = ranks.eq(ranks.min(axis=1), axis=0)
+    first = is_best.div(is_best.sum(axis=1), axis=0).mean()
+    found = pd.DataFrame({"mean": of_fabric.mean(), "low": low, "high": high, "first": first})
+    defaults = set(own[own.baseline == DEFAULT].configuration)
+    tested = of_fabric.loc[:, [each not in defaults for each in of_fabric.columns]].T.to_numpy()
+    can_test = len(tested) > 2 and len(of_fabric) > 1 and np.ptp(tested, axis=0).any()
+    return Ranks(
+        table=found.sort_values("mean", kind="stable"),
+        recordings=len(table),
+        fabrics=len(of_fabric),
+        left_out=left_out,
+        p=float(stats.friedmanchisquare(*tested).pvalue) if can_test else np.nan,
+        difference=critical_difference(len(ranks.columns), len(of_fabric)),
+    )
+
+
+def critical_difference(treatments: int, blocks: int) -> float:
+    """The least significant difference of two mean ranks (Nemenyi's test; Demsar 2006, section
+    3.2.2)."""
+    quantile = stats.studentized_range.ppf(1 - SIGNIFICANCE, treatments, np.inf) / np.sqrt(2)
+    return float(quantile * np.sqrt(treatments * (treatments + 1) / (6 * blocks)))

@@ -1,10 +1,14 @@
-"""The conclusions of the paper (Ru et al. 2025) as comparisons of our results.
+"""The conclusions of the paper (Ru et al. 2025) as comparisons of our results, and its tables.
 
-They follow from the averages of the paper's tables, from what is best in them, and from its words
-on DiffCP (unstable gradients, exploding losses) and PhysNet.
+The conclusions follow from the averages of the paper's tables, from what is best in them, and from
+its words on DiffCP (unstable gradients, exploding losses) and PhysNet. Its numbers are not part of
+this package: they are in a folder that the user has, with `folding.csv`, `fling.csv` and
+`shaking.csv`. The header of these is `metric,fabric` and then one name for each configuration, such
+as `diffcloud-diffsim-lifting`; `metric` is CD or HD.
 """
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,15 +16,19 @@ import pandas as pd
 from r2s.study.configuration import APPROACHES, MOTIONS, PAPER_CONFIGURATIONS, Configuration
 from r2s.study.statistics.comparisons import Comparison, compare, compared, judge
 from r2s.study.statistics.frame import configurations
-from r2s.study.statistics.paper import average
 
 LIFTING, WIND, DIFFCP = PAPER_CONFIGURATIONS[:3]
 PINN_POINTS, PINN_CLOTH = PAPER_CONFIGURATIONS[6:]
+CITED = "Ru et al. 2025, tables"
+SOLVERS = {"diffsim": "cloth", "difftaichi": "points"}
+CHAMFER, HAUSDORFF = "paper_chamfer", "paper_hausdorff"
+METRICS = {"CD": CHAMFER, "HD": HAUSDORFF}
+COLUMNS = ["evaluated_on", "metric", "fabric", "configuration", "value"]
 
 
 def findings(results: pd.DataFrame, paper: pd.DataFrame) -> pd.DataFrame:
-    """The answers to all conclusions (`comparisons.judge`), by results of one metric from
-    `frame.labelled`; estimates by published recipes do not count."""
+    """The answers to all conclusions (`comparisons.judge`), by labelled results of one metric;
+    estimates by published recipes do not count."""
     is_own = ~results.approach.str.endswith("-published") & (results.approach != "")
     own = results[is_own & (results.baseline == "") & results.evaluated_on.isin(MOTIONS)]
     return judge((words, each) for words, group in _conclusions(own, paper) for each in group)
@@ -82,7 +90,7 @@ def _sides(
     smaller: Sequence[Configuration],
     larger: Sequence[Configuration],
 ) -> Comparison:
-    """Some configurations against others on one motion, beside the averages of the paper."""
+    """Configurations against others on one motion, with the averages of the paper."""
     first, second = ([each.label for each in side] for side in (smaller, larger))
     words = f"in {motion} {' and '.join(first)} better than {' and '.join(second)}"
     quoted = average(paper, motion, smaller), average(paper, motion, larger)
@@ -133,10 +141,10 @@ def _easier(results: pd.DataFrame, paper: pd.DataFrame, easy: str, hard: str) ->
 
 
 def _diverges_more(results: pd.DataFrame, approach: str) -> Comparison:
-    """The share of an approach's estimates that diverged, less that of others, by fabric.
+    """The share of an approach's estimates that diverged minus that of others, by fabric.
 
-    An estimate counts as diverged when a motion that it predicts did; what gradients did on the
-    way to a fabric that can be simulated is not among the results.
+    An estimate counts as diverged when a motion that it predicts did; the gradients of a search are
+    not among the results.
     """
     words = "share of the estimates that diverged, less that of other approaches"
     keys = ["is_own", "fabric", "configuration", "repeat"]
@@ -148,20 +156,20 @@ def _diverges_more(results: pd.DataFrame, approach: str) -> Comparison:
         return Comparison(words, lacking=f"no rows {'of others' if len(sides[0]) else 'of DiffCP'}")
     words += ": " + ", ".join(f"{s['sum'].sum()} of {s['size'].sum()}" for s in sides)
     if not lost.any():
-        why = "no estimate diverged, and what gradients did on the way is not in the results"
+        why = "no estimate diverged, and the gradients of searches are not in the results"
         return Comparison(words, lacking=why)
     own, others = (side.droplevel("is_own") for side in sides)
     numbers = own["sum"] / own["size"] - others["sum"] / others["size"]
     tested = compared(words, numbers, is_ratio=False)
-    # Counts may agree in all fabrics by chance: fabrics differ at least by what counts do.
+    # counts may agree in all fabrics by chance, so the spread is at least that of counts
     chance = np.sqrt(lost.mean() * (1 - lost.mean()) * np.mean(1 / own["size"]))
     spread = float(max(tested.found.spread, chance))
     return tested._replace(found=tested.found._replace(spread=spread))
 
 
 def _varies_more(results: pd.DataFrame, approach: str, other: str) -> Comparison:
-    """The deviation between repeats of the logarithm of the distance, over that of another; of
-    several configurations of an approach the geometric mean."""
+    """The standard deviation between repeats of the logarithm of the distance, over that of another
+    approach; of several configurations the geometric mean."""
     words = f"deviation between repeats: {APPROACHES[approach]}'s over {APPROACHES[other]}'s"
     if not (results.approach == approach).any():
         return Comparison(words, lacking=f"no rows of {APPROACHES[approach]}")
@@ -178,3 +186,81 @@ def _varies_more(results: pd.DataFrame, approach: str, other: str) -> Comparison
         return Comparison(words, lacking="no recording with two or more repeats of both")
     by_movement = numbers.unstack()
     return compared(words, by_movement.mean(axis=1), [by_movement], (lost[1], lost[0]))
+
+
+def read_paper(folder: Path | str | None) -> pd.DataFrame:
+    """Read the paper's three tables as one with `COLUMNS`; it is empty without a folder.
+
+    Lines of averages are left out. Raises FileNotFoundError, or a ValueError that names the file
+    and what is wrong: another header, an unknown configuration or metric, a fabric given twice, a
+    value that is missing or no positive number.
+    """
+    tables = [] if folder is None else [_read(Path(folder), motion) for motion in MOTIONS]
+    return pd.concat([pd.DataFrame(columns=COLUMNS), *tables])
+
+
+def _read(folder: Path, motion: str) -> pd.DataFrame:
+    path = folder / f"{motion}.csv"
+    try:
+        table = pd.read_csv(path, dtype=str)
+        if list(table.columns[:2]) != ["metric", "fabric"] or len(table.columns) < 3:
+            raise ValueError(f"expected metric,fabric,COLUMNS, found {','.join(table.columns)}")
+        if unknown := set(table.metric) - set(METRICS):
+            raise ValueError(f"expected the metric CD or HD, found {min(unknown)!r}")
+        table = table[table.fabric != "Average"]
+        if (twice := table.duplicated(["metric", "fabric"])).any():
+            raise ValueError(f"{' of '.join(table[twice].iloc[0, :2])} is given twice")
+        found = table.melt(["metric", "fabric"], var_name="configuration")
+        numbers = pd.to_numeric(found.value, errors="coerce")
+        if not (is_right := (numbers > 0) & np.isfinite(numbers)).all():
+            metric, fabric, _, text = found[~is_right].iloc[0]
+            raise ValueError(f"{metric} of {fabric}: expected a number above zero, found {text!r}")
+        labels = {name: _configuration(name).label for name in table.columns[2:]}
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return found.assign(
+        evaluated_on=motion,
+        metric=found.metric.map(METRICS),
+        fabric=found.fabric.str.strip().str.lower().str.replace(" ", "_"),
+        configuration=found.configuration.map(labels),
+        value=numbers,
+    )[COLUMNS]
+
+
+def _configuration(name: str) -> Configuration:
+    parts = name.split("-")
+    if len(parts) != 3 or parts[1] not in SOLVERS:
+        known = " or ".join(SOLVERS)
+        raise ValueError(f"expected APPROACH-SIMULATOR-SCENARIO with {known}, found {name!r}")
+    return Configuration(parts[0], SOLVERS[parts[1]], parts[2])
+
+
+def average(paper: pd.DataFrame, motion: str, whose: Sequence[Configuration]) -> float:
+    """The paper's mean Chamfer distance over fabrics and configurations, [-]; NaN when one is
+    missing."""
+    part = paper[(paper.evaluated_on == motion) & (paper.metric == CHAMFER)]
+    means = part.groupby("configuration").value.mean()
+    labels = [each.label for each in whose]
+    if not labels or not set(labels) <= set(means.index):
+        return np.nan
+    return float(means[labels].mean())
+
+
+def beside_paper(results: pd.DataFrame, paper: pd.DataFrame, motion: str) -> pd.DataFrame:
+    """The Chamfer distances of one motion in the paper's units [-], ours beside the paper's: a
+    column a configuration, a line a fabric, last their mean; infinite where a run diverged.
+
+    `results`: labelled.
+    """
+    own = results[(results.metric == CHAMFER) & (results.evaluated_on == motion)]
+    own = own[own.baseline.isin(("", "default"))]
+    ours = own.assign(value=own.value.where(~own.diverged, np.inf)).pivot_table(
+        index="fabric", columns="configuration", values="value", observed=True
+    )
+    part = paper[(paper.evaluated_on == motion) & (paper.metric == CHAMFER)]
+    theirs = part.pivot_table(index="fabric", columns="configuration", values="value")
+    theirs.columns = [f"{label}, paper" for label in theirs.columns]
+    ours.columns = list(map(str, ours.columns))
+    table = pd.concat([ours, theirs], axis=1)
+    table.loc["mean"] = table.mean()
+    return table.rename_axis("fabric").reset_index()

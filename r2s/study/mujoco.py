@@ -1,28 +1,52 @@
-"""A sheet of MuJoCo's flex in an experiment: a motion that no solver of r2s has made.
+"""A sheet of MuJoCo's flex: recordings whose motion no solver of r2s has made.
 
 All of it is MuJoCo's own: a St. Venant-Kirchhoff membrane with hinges on triangles, its contact
 with the table and of the sheet with itself, steps of its linearly implicit integrator "discrete",
 and its air, which acts on each vertex as on a cube with faces of the vertex's area (its "inertia
-box" model: no lift, and as much drag along the sheet as across it). From `r2s.scenarios` come where
-the sheet lies, what holds it, how that moves and when it is looked at. Needs r2s[mujoco].
+box" model: no lift, and as much drag along the sheet as across it). `r2s.scenarios` gives the start
+of the sheet, its grippers and their path, and the frames. Needs r2s[mujoco].
 
 The material is that of MuJoCo's reference, XML, `flex`: Todorov, Erez and Tassa, "MuJoCo: a physics
 engine for model-based control", IROS 2012.
 """
 
+import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
 
+import jax.numpy as jnp
+import jax.random as jr
 import numpy as np
 from jaxtyping import Float
 
 from r2s._util.extras import require
 from r2s._util.units import AIR_DENSITY, GRAVITY
 from r2s.materials.fabric import Fabric
+from r2s.metrics.surface_distance import POINTS
+from r2s.recordings.recording import save
+from r2s.scenarios import synthetic
 from r2s.scenarios.scenario import Scenario
 from r2s.scenarios.standard import Experiment
+from r2s.study.ensembles import (
+    COARSER,
+    FINER,
+    PATH,
+    STIFFNESS,
+    Moved,
+    member_distances,
+    recorded_distances,
+    save_ensemble,
+)
+from r2s.study.recordings import RECORDING, START, SimulatedRecording, number_of
+from r2s.study.tasks import Task
 
+FABRIC = "mujoco_flex"
+SCENARIOS = ("lifting", "folding", "fling", "shaking")  # without fans and clamps
+OTHERS = (0.25, 0.5, 2.0, 4.0)  # times as stiff: as the membranes of the presets differ
 GRIP = 10.0  # [kg], of a held vertex: the sheet's pull moves it by less than 1e-7 m in a step
+STEP = 1.6e-3  # [s]: longest time step
 ELASTICITY = ("young", "poisson", "thickness", "damping")
 AXES = ("1 0 0", "0 1 0", "0 0 1")
 
@@ -55,13 +79,111 @@ class Resolution(NamedTuple):
     """- `shape`: vertices along warp and weft. - `step`: longest time step, [s]."""
 
     shape: tuple[int, int] = (25, 25)
-    step: float = 1.6e-3
+    step: float = STEP
 
 
-SHEET, STUDIED = Material(), Resolution()
+@dataclass(frozen=True)
+class MujocoRecording(SimulatedRecording):
+    """A recording of a sheet of MuJoCo; fields as in `SyntheticRecording`."""
+
+    settings: ClassVar[tuple[Any, ...]] = (GRIP,)
+
+    scenario: str
+    number: int = 0
+    unseen: bool = False
+    seed: int = 0
+    material: Material = Material()
+    resolution: Resolution = Resolution()
+    fabric: str = FABRIC
+
+    def __post_init__(self) -> None:
+        if self.scenario not in SCENARIOS:
+            raise ValueError(f"{FABRIC} has {', '.join(SCENARIOS)}, not {self.scenario}")
+
+    @property
+    def name(self) -> str:
+        return f"{self.scenario}_{self.fabric}_{'u' * self.unseen}{self.number}"
+
+    @property
+    def compilation_group(self) -> str:
+        return f"recordings of MuJoCo {self.scenario}"
+
+    @property
+    def small_strain_fabric(self) -> Fabric | None:
+        return as_plate(self.material)
+
+    def make(self, folder: Path, out: Path) -> dict[str, Any]:
+        """Simulate the recording; raises as `moved`."""
+        experiment = self.experiment
+        scenario = experiment.scenario(self.resolution.shape)
+        number = number_of(self.fabric, self.scenario, self.number, self.unseen)
+        key = jr.fold_in(jr.key(self.seed), number)
+        x = moved(scenario, self.material, self.resolution.step)
+        if self.unseen and scenario.brake is not None:
+            np.save(out / START, x[0].reshape(*self.resolution.shape, 3))
+        made = synthetic.seen_of(
+            jnp.asarray(x, float),
+            experiment,
+            scenario,
+            self.fabric,
+            self.number,
+            self.sensing,
+            key=key,
+        )
+        source = f"MuJoCo's flex: {made.info.source}"
+        info = dataclasses.replace(made.info, name=self.name, source=source)
+        save(dataclasses.replace(made, info=info), out / RECORDING)
+        return {"seed": self.seed, "frames": len(made.times)}
 
 
-def as_plate(material: Material = SHEET) -> Fabric:
+@dataclass(frozen=True)
+class MujocoEnsemble(Task):
+    """The ensemble of a recording of MuJoCo's sheet, as `r2s.study.ensembles.EnsembleTask`.
+
+    Every member is MuJoCo's, settles by itself, and has self-contact, as the recording. The other
+    fabrics are sheets whose Young's modulus is so many times as large.
+    """
+
+    kind: ClassVar[str] = "ensembles"
+    settings: ClassVar[tuple[Any, ...]] = (STIFFNESS, PATH, FINER, COARSER, POINTS)
+    lacks_layers: ClassVar[bool] = False
+
+    recording: MujocoRecording
+    others: tuple[float, ...] = OTHERS
+
+    @property
+    def name(self) -> str:
+        return self.recording.name
+
+    @property
+    def compilation_group(self) -> str:
+        return f"ensembles of MuJoCo {self.recording.scenario}"
+
+    def make(self, folder: Path, out: Path) -> dict[str, Any]:
+        """Distances [m] of every member from the truth in each frame.
+
+        Raises as `moved`, also where a member diverges.
+        """
+        source = self.recording
+        experiment, material, (shape, step) = source.experiment, source.material, source.resolution
+
+        def simulate(
+            material: Material, shape: tuple[int, int], experiment: Experiment, steps: int = 1
+        ) -> Moved:
+            scenario = experiment.scenario(shape)
+            return Moved(moved(scenario, material, step / steps), scenario.scene.mesh)
+
+        def stiffer(material: Material, factor: float) -> Material:
+            return material._replace(young=factor * material.young)
+
+        base = simulate(material, shape, experiment)
+        others = {f"{factor:g}": stiffer(material, factor) for factor in self.others}
+        found = member_distances(base, material, shape, experiment, simulate, stiffer, others)
+        found["recording"] = [recorded_distances(source, folder, base)]
+        return save_ensemble(out, experiment, found)
+
+
+def as_plate(material: Material) -> Fabric:
     """The fabric of r2s whose membrane and bending are those of a material at small strain.
 
     A thin isotropic plate (Timoshenko and Woinowsky-Krieger, "Theory of plates and shells", 1959):
@@ -87,7 +209,7 @@ def mujoco_module() -> Any:
 
 
 def moved(
-    scenario: Scenario, material: Material = SHEET, step: float = STUDIED.step
+    scenario: Scenario, material: Material, step: float = STEP
 ) -> Float[np.ndarray, "frame vertex 3"]:
     """Positions [m] of the sheet in the frames of a scenario.
 
@@ -132,18 +254,6 @@ def moved(
             )
     found[-1] = flat + data.qpos.reshape(flat.shape)
     return found
-
-
-def motion(
-    experiment: Experiment,
-    material: Material = SHEET,
-    resolution: Resolution = STUDIED,
-) -> Float[np.ndarray, "frame vertex 3"]:
-    """Positions [m] of the sheet in the frames of an experiment; raises as `moved`.
-
-    Vertices and faces are those of `experiment.scenario(resolution.shape)`.
-    """
-    return moved(experiment.scenario(resolution.shape), material, resolution.step)
 
 
 def _path(scenario: Scenario, frames: Float[np.ndarray, " step"]) -> np.ndarray:

@@ -1,11 +1,10 @@
-"""What a study estimates from and judges by: recordings, synthetic or given.
+"""The recordings that a study estimates from and evaluates on, synthetic or given.
 
-Synthetic recordings are not the estimators' own model: but for folds, whose layers touch, their
-mesh is finer than the one that estimates begin on, their steps are shorter, and their fabrics
-stiffen with the strain and soften with the curvature, as measured ones do (DIFFCLOUD from a lift
-and pulls together estimates such laws, all others constant stiffness). Predictions have their mesh:
-what that does is in the floor, and in no error.
-Those of a sheet of MuJoCo are of another simulator altogether (`r2s.study.mujoco_cells`).
+Synthetic recordings do not come from the estimators' own model: except for folds, whose layers
+touch, their mesh is finer, their time steps are shorter, and their fabrics stiffen with the strain
+and soften with the curvature, as measured ones do. (DIFFCLOUD from a lift and pulls together
+estimates such laws; all other configurations have constant stiffness.) Recordings of MuJoCo's sheet
+are of another simulator (`r2s.study.mujoco`).
 """
 
 import dataclasses
@@ -19,6 +18,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
+from scipy.interpolate import RegularGridInterpolator
 
 from r2s.compilation import compile_once
 from r2s.estimation.default_spaces import Law
@@ -30,15 +30,17 @@ from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
 from r2s.recordings import manifest
 from r2s.recordings.recording import Recording, load, save
 from r2s.scenarios import synthetic
-from r2s.scenarios.resolution import explicit_cloth
-from r2s.scenarios.scenario import rollout
-from r2s.scenarios.standard import STRETCHING_INTERVAL, Experiment
-from r2s.study.cells import Cell, result_files
-from r2s.study.drawn import RECORDING, START, experiment_of, number_of, pull_of
+from r2s.scenarios.paths import draw
+from r2s.scenarios.scenario import Scenario, rollout
+from r2s.scenarios.solvers import explicit_cloth
+from r2s.scenarios.standard import SIX, STRETCHING_INTERVAL, Experiment
+from r2s.study.tasks import Task, result_files
 
+RECORDING = "recording.npz"
+START = "start.npy"  # the shape of a hanging sheet in its first frame
 STRETCH = 1.1  # where half of `TruthSettings.stiffening` is reached; Wang et al. 2011: up to 1.167
 SOFTENING, KNEE = 0.35, 20.0  # [-] and [1/m], of a `SofteningPlate`
-# Of each truth its own, drawn once within what fabrics have, since no one has measured them.
+# Not measured: one sample for each fabric, within the range of fabrics.
 DAMPING = {
     "camel_ponte_roma": 0.016,
     "black_denim": 0.006,
@@ -55,7 +57,12 @@ FRICTION = {
 }  # [-]
 PULL_FRAMES = 48  # of a pull for `r2s.estimation.pinn`: the longest ends before the last of them
 LAYERED = (17, 17)  # vertices at most of a sheet that touches itself, in implicit steps
-SAME_SCENARIO = {"lift": "lifting", "fold": "folding"}  # how recordings of others call them
+SAME_SCENARIO = {"lift": "lifting", "fold": "folding"}  # names in other data sets
+# [s] of damped settling, after which another fabric rests near the truth's shape: 1.8 mm from where
+# it is after 3 s at most; after 0.4 s 4.6 mm
+SETTLING = 0.75
+
+Shape = Float[np.ndarray, "row column 3"]
 
 
 @dataclass(frozen=True)
@@ -63,14 +70,13 @@ class TruthSettings:
     """How synthetic recordings are made.
 
     - `shape`: vertices along warp and weft; of a sheet that touches itself `LAYERED` at most.
-    - `max_step`: longest implicit time step, [s], of a sheet that touches itself or is stretched.
-      All others go in explicit steps, which leave no error of their own.
-    - `stiffening`: stiffness along a yarn far stretched over that of the preset, which is at zero
-      strain; half way at an extension of 10 %. Bending softens, too (`r2s.materials.stiffening`).
-      Assumed, not measured. 0: constant stiffness, of the membrane and in bending, as the
-      estimators assume.
+    - `max_step`: longest implicit time step, [s], of a sheet that touches itself or is stretched;
+      all others have explicit steps.
+    - `stiffening`: stiffness along a yarn at large strain over that at zero strain; half of the
+      increase is reached at an extension of 10 %. Bending softens, too
+      (`r2s.materials.stiffening`). Assumed, not measured. 0: constant stiffness of both.
     - `materials`: a folder of ARCSim material files, FABRIC.json of every preset, with measured
-      tables to take instead; "": none.
+      tables to use instead; "": none.
     - `materials_digest`: a hash of those files, from `with_measured_tables`.
     - `self_contact`: whether the sheet touches itself in a fold.
     """
@@ -83,18 +89,18 @@ class TruthSettings:
     self_contact: bool = True
 
 
-class Source(Cell):
-    """A recording, of a `fabric` in a `scenario`, that is estimated from or judged by."""
+class Source(Task):
+    """A recording of a `fabric` in a `scenario`."""
 
     kind: ClassVar[str] = "recordings"
-    is_given: ClassVar[bool] = False  # whether it was read, not simulated
+    is_given: ClassVar[bool] = False  # read, not simulated
 
-    fabric: str  # a field of each class, in an order of its own, as keys have it
+    fabric: str  # fields of each subclass, in the order that keys have
     scenario: str
 
     @property
     def has_start(self) -> bool:
-        """Whether the shape of the sheet in the first frame of a judged motion is known."""
+        """Whether the shape of the sheet in the first frame is known."""
         return False
 
     @property
@@ -104,12 +110,12 @@ class Source(Cell):
 
 
 class SimulatedRecording(Source):
-    """A recording of a motion of `r2s.scenarios`, by whichever simulator.
+    """A recording of a motion of `r2s.scenarios`, by any simulator.
 
-    - `number`: 0 is the motion of the scenario without any numbers; others are drawn within
-      `r2s.scenarios.standard.LIMITS`, the same for all fabrics.
-    - `unseen`: whether its motion is drawn to be judged by; none of these is one to estimate from.
-      Its clouds are all of the surface, without any error.
+    - `number`: 0 is the scenario's standard motion; others are sampled within
+      `r2s.scenarios.paths.LIMITS`, the same for all fabrics.
+    - `unseen`: whether it is for evaluation: its motion is none to estimate from, and its clouds
+      are the whole surface without noise.
     """
 
     number: int
@@ -122,12 +128,11 @@ class SimulatedRecording(Source):
 
     @property
     def experiment(self) -> Experiment:
-        """What is done to the sheet."""
         return experiment_of(self.scenario, self.number, self.unseen, self.seed)
 
     @property
     def sensing(self) -> synthetic.Sensing:
-        """How cameras see it."""
+        """How cameras observe it."""
         return synthetic.WHOLE if self.unseen else synthetic.sensing(self.experiment)
 
 
@@ -160,6 +165,15 @@ class SyntheticRecording(SimulatedRecording):
     def compilation_group(self) -> str:
         return f"recordings {self.scenario}"
 
+    @property
+    def has_layers(self) -> bool:
+        """Whether the sheet touches itself."""
+        return self.truth.self_contact and self.scenario == "folding"
+
+    @property
+    def small_strain_fabric(self) -> Fabric | None:
+        return None if self.truth.materials else small_strain(self.fabric)
+
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
         """Simulate the recording."""
         fabric, truth = strain_dependent(self.fabric, self.truth), self.truth
@@ -182,10 +196,9 @@ class SyntheticRecording(SimulatedRecording):
         return {"seed": self.seed, "frames": len(made.times)}
 
     def _recorded(self, fabric: Fabric, out: Path, key: PRNGKeyArray) -> Recording:
-        """A motion of `r2s.scenarios`; of one to judge by also how a hanging sheet starts."""
-        truth, layers = self.truth, self.has_layers
+        """A motion of `r2s.scenarios`; writes the start of a hanging sheet for evaluation."""
+        truth, layers, motion = self.truth, self.has_layers, None
         shape = min(truth.shape, LAYERED) if layers else truth.shape
-        motion = None
         if not layers and self.scenario != "stretching":
             scenario = self.experiment.scenario(shape)
             motion = _rollout(scenario, fabric, solver=explicit_cloth(scenario, fabric))
@@ -202,15 +215,6 @@ class SyntheticRecording(SimulatedRecording):
             motion=motion,
             key=key,
         )
-
-    @property
-    def has_layers(self) -> bool:
-        """Whether the sheet touches itself."""
-        return self.truth.self_contact and self.scenario == "folding"
-
-    @property
-    def small_strain_fabric(self) -> Fabric | None:
-        return None if self.truth.materials else small_strain(self.fabric)
 
 
 @dataclass(frozen=True)
@@ -231,11 +235,11 @@ class GivenRecording(Source):
         return self.recording
 
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
-        """Read the recording, and keep it as it was read."""
+        """Read the recording, and store it as it was read."""
         rules = manifest.manifest_for(self.folder)
-        read = manifest.read_recording(self.folder, rules, self.recording)
-        save(read, out / RECORDING)
-        return {"frames": len(read.times), "verified": read.info.verified}
+        found = manifest.read_recording(self.folder, rules, self.recording)
+        save(found, out / RECORDING)
+        return {"frames": len(found.times), "verified": found.info.verified}
 
 
 _rollout = compile_once(rollout)
@@ -253,27 +257,89 @@ def find_recordings(folder: Path) -> list[GivenRecording]:
         for file in manifest.sources(folder, rules, name):
             digest.update(file.read_bytes())
         info = manifest.read_recording(folder, rules, name).info
-        found.append(
-            GivenRecording(
-                folder=str(folder),
-                recording=name,
-                fabric=info.fabric,
-                scenario=SAME_SCENARIO.get(info.scenario, info.scenario),
-                trial=info.trial,
-                digest=digest.hexdigest(),
-            )
-        )
+        scenario = SAME_SCENARIO.get(info.scenario, info.scenario)
+        place = (str(folder), name, info.fabric, scenario, info.trial)
+        found.append(GivenRecording(*place, digest.hexdigest()))
     if not found:
         raise ValueError(f"{folder}: no recording that a manifest describes")
     return found
 
 
-def with_measured_tables(truth: TruthSettings, folder: Path) -> TruthSettings:
-    """Settings with the measured tables in a folder, one file FABRIC.json for each preset: those
-    that a study does not estimate are what others are compared with.
+def read(source: Source, folder: Path) -> Recording:
+    """The recording of a finished task."""
+    with result_files(source, folder) as files:
+        return load(files / RECORDING)
 
-    Raises `FileNotFoundError` for one that is missing, and what `arcsim.read_material`
-    raises.
+
+def read_start(source: Source, folder: Path) -> Shape | None:
+    """The true shape [m] of a hanging sheet in the first frame of a recording for evaluation.
+
+    None for a sheet that lies on the table, and for given recordings, where it is not known.
+    """
+    if not source.has_start:
+        return None
+    with result_files(source, folder) as files:
+        return np.load(files / START)
+
+
+def started(scenario: Scenario, shape: Shape | None) -> Scenario:
+    """A scenario whose sheet starts in a shape and settles for `SETTLING` before it moves.
+
+    A sheet that hangs from corners drawn together buckles into one of several shapes, by mesh and
+    fabric: from a flat sheet the true fabric on another mesh may begin a centimetre away. The cloud
+    of the first frame does not fix that shape (a sheet laid onto it leaves it within 0.2 s); the
+    truth's own shape does.
+
+    - `shape`: positions [m] of a regular grid of the sheet in the first frame, along warp and
+      weft; None: unknown, the scenario is unchanged.
+
+    Raises `ValueError` for a sheet that lies on the table, which starts flat.
+    """
+    if shape is None:
+        return scenario
+    if scenario.brake is None:
+        raise ValueError("a sheet that lies on the table starts flat, but a shape was given")
+    rest = np.asarray(scenario.scene.mesh.rest, np.float64)
+    along = tuple(np.linspace(0, 1, count) for count in shape.shape[:2])
+    start = RegularGridInterpolator(along, shape)(np.clip(rest / rest.max(axis=0), 0, 1))
+    held = scenario.path[1]
+    return dataclasses.replace(
+        scenario,
+        start=scenario.scene.place(jnp.asarray(start, float), held),
+        path=scenario.path.at[0].set(held),
+        lead_in=math.ceil(SETTLING / scenario.interval),
+    )
+
+
+def experiment_of(scenario: str, number: int, unseen: bool, seed: int) -> Experiment:
+    """Motion `number` of a scenario, the same for all fabrics; see `SimulatedRecording`."""
+    if number == 0 and not unseen:
+        return SIX[scenario]()
+    return SIX[scenario](**numbers_of(scenario, number, unseen, seed))
+
+
+def numbers_of(scenario: str, number: int, unseen: bool, seed: int) -> dict[str, float]:
+    """The sampled parameters of a motion."""
+    key = jr.fold_in(jr.key(seed), number_of(scenario))  # scenarios do not share their numbers
+    return draw(scenario, 1, key=jr.fold_in(key, 2 * number + unseen))[0]
+
+
+def pull_of(number: int, angle: float, seed: int) -> dict[str, float]:
+    """Stretch and time of a pull at an `angle` [degrees] to the warp, the same for all fabrics;
+    sampled for each angle and number within `r2s.scenarios.paths.LIMITS`."""
+    key = jr.fold_in(jr.key(seed), number_of("pull", number, float(angle)))
+    return draw("stretching", 1, key=key)[0]
+
+
+def number_of(*parts: Any) -> int:
+    """A hash of the parts, below 2^31."""
+    return int.from_bytes(sha256(repr(parts).encode()).digest()[:4], "big") >> 1
+
+
+def with_measured_tables(truth: TruthSettings, folder: Path) -> TruthSettings:
+    """Settings with the measured tables in a folder, a file FABRIC.json for each preset.
+
+    Raises `FileNotFoundError` for one that is missing, and what `arcsim.read_material` raises.
     """
     digest = sha256()
     for fabric in presets.FIVE:
@@ -283,23 +349,6 @@ def with_measured_tables(truth: TruthSettings, folder: Path) -> TruthSettings:
     return dataclasses.replace(
         truth, materials=str(folder), materials_digest=digest.hexdigest()[:16]
     )
-
-
-def read(source: Source, folder: Path) -> Recording:
-    """The recording of a cell that is made."""
-    with result_files(source, folder) as files:
-        return load(files / RECORDING)
-
-
-def read_start(source: Source, folder: Path) -> Float[np.ndarray, "row column 3"] | None:
-    """The truth's shape [m] in the first frame of a recording that is judged by, where it hangs.
-
-    None for a sheet that lies on the table, and for given recordings: no one knows theirs.
-    """
-    if not source.has_start:
-        return None
-    with result_files(source, folder) as files:
-        return np.load(files / START)
 
 
 def strain_dependent(name: str, truth: TruthSettings = TruthSettings()) -> Fabric:
@@ -325,18 +374,15 @@ def strain_dependent(name: str, truth: TruthSettings = TruthSettings()) -> Fabri
 
 
 def small_strain(name: str) -> Fabric:
-    """The preset with a truth's own damping and friction.
-
-    Its constant stiffness is that of `strain_dependent` at zero strain and curvature: what an
-    estimate from a synthetic recording is compared with.
-    """
+    """The preset with a truth's own damping and friction: `strain_dependent` at zero strain and
+    curvature, which an estimate from a synthetic recording is compared with."""
     damping, friction = (jnp.asarray(each[name], float) for each in (DAMPING, FRICTION))
     return dataclasses.replace(presets.FIVE[name](), damping=damping, friction=friction)
 
 
 def true_fabric(name: str, law: Law, truth: TruthSettings = TruthSettings()) -> Fabric:
-    """The fabric that a recording is made with, of those laws that an estimate has; where it has
-    constant ones the stiffness is that at small strain."""
+    """The fabric that a recording is made with in the laws of an estimate: stiffnesses that it has
+    as constants are those at small strain."""
     small, changing = small_strain(name), strain_dependent(name, truth)
     return dataclasses.replace(
         changing,

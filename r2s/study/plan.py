@@ -1,8 +1,8 @@
-"""Which cells a study has: configurations (approach, solver, scenario) by fabrics by motions."""
+"""The tasks of a study: configurations (approach, solver, scenario) by fabrics by motions."""
 
 import dataclasses
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,13 +18,12 @@ from r2s.study.configuration import (
     TOGETHER_CONFIGURATIONS,
     Configuration,
 )
-from r2s.study.estimates import SOLVERS, Budgets, EstimateCell, TrainedNetwork
-from r2s.study.evaluations import MIDDLE, EvaluationCell
-from r2s.study.mujoco_cells import FABRIC as FLEX
-from r2s.study.mujoco_cells import SCENARIOS as IN_MUJOCO
-from r2s.study.mujoco_cells import MujocoRecording
-from r2s.study.mujoco_sheet import Material, mujoco_module
-from r2s.study.sources import (
+from r2s.study.estimates import SOLVERS, Budgets, EstimateTask, TrainedNetwork
+from r2s.study.evaluations import MIDDLE, EvaluationTask
+from r2s.study.mujoco import FABRIC as FLEX
+from r2s.study.mujoco import SCENARIOS as IN_MUJOCO
+from r2s.study.mujoco import Material, MujocoRecording, mujoco_module
+from r2s.study.recordings import (
     GivenRecording,
     Source,
     SyntheticRecording,
@@ -35,8 +34,8 @@ from r2s.study.sources import (
 )
 
 ESTIMATED_FROM = ("lifting", "wind", "stretching")
-DRAWS = 4  # of the prior, which are the default together
-TOGETHER = 10  # recordings that one cell judges
+DRAWS = 4  # samples of the prior, which are the default together
+TOGETHER = 10  # recordings that one task evaluates
 PULLS = (0.0, 45.0, 90.0)  # [degrees], of stretchings that are estimated from together
 FEWER_FABRICS = 32  # at most, to train PhysNet's network on material points
 
@@ -57,12 +56,12 @@ own by published recipes; none that an approach refuses."""
 class Plan:
     """The settings of a study.
 
-    - `configurations`, `fabrics`: which to estimate.
+    - `configurations`, `fabrics`: what to estimate.
     - `repeats`: estimates of each, from other motions.
-    - `judged`: motions of each of `MOTIONS` to judge by.
-    - `truth`: how synthetic recordings are made. `budgets`: what estimates may cost.
+    - `judged`: motions of each of `MOTIONS` to evaluate on.
+    - `truth`: how synthetic recordings are made. `budgets`: the costs of estimates.
     - `every`: 1 compares all frames that count, 3 every third.
-    - `draws`: of the prior, which are the default together.
+    - `draws`: samples of the prior, which are the default together.
     """
 
     configurations: tuple[Configuration, ...]
@@ -83,20 +82,22 @@ ALL = Plan(
     judged=EVALUATION // len(MOTIONS),
     truth=TruthSettings(self_contact=True),
 )
+QUICK = Budgets(
+    diffcp=METHODS["diffcp"].budget._replace(coarse=4, starts=1),
+    physnet=METHODS["physnet"].budget._replace(evaluations=40),
+    training=TrainingBudget(fabrics=32, epochs=2, steps=40),
+)
 ONE_FABRIC = Plan(
     configurations=PAPER_CONFIGURATIONS,
     fabrics=("camel_ponte_roma",),
     repeats=1,
     judged=1,
-    budgets=Budgets(
-        diffcp=METHODS["diffcp"].budget._replace(coarse=4, starts=1),
-        physnet=METHODS["physnet"].budget._replace(evaluations=40),
-        training=TrainingBudget(fabrics=32, epochs=2, steps=40),
-    ),
+    budgets=QUICK,
     every=3,
     draws=2,
 )
-SMALL = Plan(
+SMALL = dataclasses.replace(
+    ONE_FABRIC,
     configurations=(
         Configuration("diffcloud", "cloth", "lifting"),
         Configuration("diffcloud", "cloth", "wind"),
@@ -107,16 +108,12 @@ SMALL = Plan(
         Configuration("pinn", "cloth", "stretching"),
     ),
     fabrics=("camel_ponte_roma", "grey_interlock", FLEX),
-    repeats=1,
     judged=2,
-    budgets=Budgets(
+    budgets=dataclasses.replace(
+        QUICK,
         diffcloud=METHODS["diffcloud"].budget._replace(iterations=15),
-        diffcp=METHODS["diffcp"].budget._replace(coarse=4, starts=1, iterations=2),
-        physnet=METHODS["physnet"].budget._replace(evaluations=40),
-        training=TrainingBudget(fabrics=32, epochs=2, steps=40),
+        diffcp=QUICK.diffcp._replace(iterations=2),
     ),
-    every=3,
-    draws=2,
 )
 PRESETS = {
     "one_fabric": ONE_FABRIC,
@@ -129,8 +126,8 @@ PRESETS = {
 def configuration_named(text: str) -> Configuration:
     """The configuration written as "diffcloud-cloth-lifting".
 
-    Raises `ValueError` that says why for one that its approach refuses, and names all there are for
-    any other.
+    Raises `ValueError` that gives the reason of one that its approach refuses, and for any other
+    the names of all.
     """
     names = {"-".join(each): each for each in FULL}
     if text not in names:
@@ -151,7 +148,7 @@ def with_changes(
     materials: str = "",
     seed: int = 0,
 ) -> Plan:
-    """A plan with other settings; None, or nothing, leaves one as it is.
+    """A plan with other settings; None or empty leaves a setting unchanged.
 
     - `configurations`: their names, such as "diffcloud-cloth-lifting".
     - `materials`: a folder of measured tables, see `TruthSettings`.
@@ -162,22 +159,22 @@ def with_changes(
     for name, number in (("repeats", repeats), ("judged", judged)):
         if number is not None and number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
-    chosen, truth = tuple(fabrics or plan.fabrics), plan.truth
+    truth = with_measured_tables(plan.truth, Path(materials)) if materials else plan.truth
     return dataclasses.replace(
         plan,
         configurations=tuple(map(configuration_named, configurations or ())) or plan.configurations,
-        fabrics=chosen,
-        repeats=plan.repeats if repeats is None else repeats,
-        judged=plan.judged if judged is None else judged,
-        truth=with_measured_tables(truth, Path(materials)) if materials else truth,
+        fabrics=tuple(fabrics or plan.fabrics),
+        repeats=repeats or plan.repeats,
+        judged=judged or plan.judged,
+        truth=truth,
         seed=seed,
     )
 
 
-def synthetic(plan: Plan) -> list[EvaluationCell]:
-    """The evaluations of a study of synthetic recordings, which need all other cells.
+def synthetic(plan: Plan) -> list[EvaluationTask]:
+    """The evaluations of a study of synthetic recordings, which depend on all other tasks.
 
-    The sheet of MuJoCo has the configurations whose scenario it knows. Raises `ValueError` for an
+    MuJoCo's sheet has the configurations whose scenario it supports. Raises `ValueError` for an
     unknown fabric.
     """
 
@@ -190,14 +187,15 @@ def synthetic(plan: Plan) -> list[EvaluationCell]:
 
     found = []
     for fabric in plan.fabrics:
-        density = _density(fabric, plan.truth)
+        is_flex = fabric == FLEX
+        density = Material().density if is_flex else strain_dependent(fabric, plan.truth).density
         unseen = [
             tuple(recording(fabric, scenario, number, True) for number in range(plan.judged))
             for scenario in MOTIONS
         ]
         estimates = []
         for configuration in plan.configurations:
-            if fabric == FLEX and not set(configuration.scenarios) <= set(IN_MUJOCO):
+            if is_flex and not set(configuration.scenarios) <= set(IN_MUJOCO):
                 continue
             for repeat in range(plan.repeats):
                 sources = tuple(
@@ -205,14 +203,14 @@ def synthetic(plan: Plan) -> list[EvaluationCell]:
                     for scenario in configuration.scenarios
                     for angle in _angles(configuration, scenario)
                 )
-                estimates.append(_estimate(configuration, sources, density, plan, repeat))
-        found += _evaluations(estimates, fabric, density, unseen, plan)
+                estimates.append(_estimate(configuration, sources, float(density), plan, repeat))
+        found += _evaluations(estimates, fabric, float(density), unseen, plan)
     return found
 
 
-def check_simulators(cells: Iterable[EvaluationCell]) -> None:
-    """Raise `ImportError`, before anything is made, where cells need MuJoCo and it is missing."""
-    if any(isinstance(source, MujocoRecording) for cell in cells for source in cell.recordings):
+def check_simulators(tasks: Iterable[EvaluationTask]) -> None:
+    """Raise `ImportError`, before anything is made, where tasks need MuJoCo and it is missing."""
+    if any(isinstance(source, MujocoRecording) for task in tasks for source in task.recordings):
         try:
             mujoco_module()
         except ImportError as error:
@@ -220,33 +218,25 @@ def check_simulators(cells: Iterable[EvaluationCell]) -> None:
 
 
 def _angles(configuration: Configuration, scenario: str) -> tuple[float | None, ...]:
-    """To the warp [degrees], of the stretchings of a scenario; None: one along the warp, as the
-    other approaches take it."""
+    """Of the pulls of a scenario to the warp [degrees]; None: a standard motion, along the warp."""
     is_pulled = configuration.approach == "pinn" or len(configuration.scenarios) > 1
     return PULLS if is_pulled and scenario == "stretching" else (None,)
 
 
-def _density(fabric: str, truth: TruthSettings) -> float:
-    """Areal density as weighed, [kg/m^2]."""
-    if fabric == FLEX:
-        return Material().density
-    return float(strain_dependent(fabric, truth).density)
-
-
-def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationCell]:
+def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationTask]:
     """The evaluations of a study of the recordings in a folder.
 
     - `density`: areal density to assume, [kg/m^2].
-    - `plan`: gives configurations, of which those count that have recordings to estimate from, and
-      budgets.
+    - `plan`: gives budgets and configurations; those without a recording to estimate from are left
+      out.
 
-    A repeat is a recording. An estimate is judged by those `MOTIONS` of the same fabric and trial
-    (of all trials where that trial has none) that it has not seen, and beside the estimate of
+    Each recording is a repeat. An estimate is evaluated on those `MOTIONS` of the same fabric and
+    trial (of all trials where that trial has none) that it has not seen, and so is the estimate of
     another fabric. Raises what `find_recordings` raises, and `ValueError` for a density that is
-    none, when no configuration has a recording to estimate from, or none is there to judge by.
+    not positive, and when nothing is there to estimate from or to evaluate on.
     """
-    default_space("cloth", density)  # refuses a density that is none
-    # clouds of real cameras need all of the search, and there are few frames to judge by
+    default_space("cloth", density)  # raises for a density that is not positive
+    # clouds of real cameras need the whole search, and there are few frames to evaluate on
     budgets = dataclasses.replace(plan.budgets, diffcloud=METHODS["diffcloud"].budget)
     plan = dataclasses.replace(plan, budgets=budgets, every=1)
     recordings = find_recordings(folder)
@@ -258,62 +248,57 @@ def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationCell]:
             f"{folder}: nothing to estimate from ({', '.join(ESTIMATED_FROM)}) or to judge by "
             f"({', '.join(MOTIONS)}); found {sorted({r.scenario for r in recordings})}"
         )
-    found: list[EvaluationCell] = []
+    found: list[EvaluationTask] = []
     for configuration in plan.configurations:
-        sources = _together(seen, configuration.scenarios)
         estimates = [
-            _estimate(configuration, each, density, plan, repeat)
-            for repeat, each in enumerate(sources)
+            _estimate(configuration, sources, density, plan, repeat)
+            for repeat, sources in enumerate(_together(seen, configuration.scenarios))
         ]
-        own = [each[0] for each in sources]
-        for index, (recording, estimate) in enumerate(zip(own, estimates, strict=True)):
-            others = [r for r in _of_trial(unseen, recording) if r not in estimate.sources]
-            judged = _by_scenario(others)
-            found += _evaluations([estimate], recording.fabric, density, judged, plan)
-            other = _other_fabric(own, index)
+        for index, estimate in enumerate(estimates):
+            same = [r for r in unseen if r.fabric == estimate.fabric]
+            trial = getattr(estimate.sources[0], "trial", "")
+            same = [r for r in same if r.trial == trial] or same
+            by_scenario: dict[str, list[Source]] = defaultdict(list)
+            for each in same:
+                if each not in estimate.sources:
+                    by_scenario[each.scenario].append(each)
+            judged = [tuple(each) for each in by_scenario.values()]
+            found += _evaluations([estimate], estimate.fabric, density, judged, plan)
+            following = [*estimates[index + 1 :], *estimates[:index]]
+            other = next((e for e in following if e.fabric != estimate.fabric), None)
             if other is not None:
+                own = configuration.solver, density, estimate.fabric
                 found += [
-                    EvaluationCell(
-                        estimate=estimates[other],
-                        solver=configuration.solver,
-                        density=density,
-                        fabric=recording.fabric,
-                        recordings=together,
-                        other=True,
-                        every=plan.every,
-                    )
+                    EvaluationTask(other, *own, together, other=True, every=plan.every)
                     for together in judged
                 ]
     return list(dict.fromkeys(found))  # configurations share the default fabric
 
 
 def _evaluations(
-    estimates: Sequence[EstimateCell],
+    estimates: Sequence[EstimateTask],
     fabric: str,
     density: float,
-    judged: Iterable[tuple[Source, ...]],
+    judged: Sequence[tuple[Source, ...]],
     plan: Plan,
-) -> list[EvaluationCell]:
-    """Cells for estimates of a fabric on their solver and on the cloth, and first, on all of these,
-    for the draws that are the default, the middle of their prior, and the true fabric where it is
-    known.
+) -> list[EvaluationTask]:
+    """Evaluations of estimates of a fabric on their solver and on the cloth. First come, on all of
+    these, the default's samples, the prior median, and the true fabric where it is known.
 
     `judged`: the recordings of each scenario.
     """
     if not estimates:
         return []
-    # the cloth always: what is estimated on points is judged on it, too
     solvers = dict.fromkeys(("cloth", *(estimate.solver for estimate in estimates)))
-    judged = list(judged)
     is_known = all(each.small_strain_fabric is not None for group in judged for each in group)
-    whose: list[tuple[EstimateCell | None, str, int | None]] = []
+    whose: list[tuple[EstimateTask | None, str, int | None]] = []
     for solver in solvers:
         whose += [(None, solver, draw) for draw in (*range(plan.draws), MIDDLE)]
         whose += [(None, solver, None)] if is_known else []
     whose += [(each, each.solver, None) for each in estimates]
     whose += [(each, "cloth", None) for each in estimates if each.solver != "cloth"]
     return [
-        EvaluationCell(
+        EvaluationTask(
             estimate,
             solver,
             density,
@@ -334,11 +319,10 @@ def _estimate(
     density: float,
     plan: Plan,
     repeat: int,
-) -> EstimateCell:
+) -> EstimateTask:
     approach, solver, scenario = configuration
-    # published recipes are what they are, whatever a plan cuts
-    kept = configuration.is_published
-    budget = METHODS[approach].budget if kept else getattr(plan.budgets, approach)
+    # a plan does not change published recipes
+    own = METHODS[approach].budget if configuration.is_published else None
     network = None
     if "network" in METHODS[approach].options():
         training = plan.budgets.training
@@ -346,15 +330,14 @@ def _estimate(
             fewer = min(training.fabrics, FEWER_FABRICS)
             training = dataclasses.replace(training, fabrics=fewer)
         network = TrainedNetwork(solver, scenario, training, plan.seed)
-    fabric = sources[0].fabric
     as_commands_do = (approach, solver) == ("diffcloud", "cloth")  # `r2s estimate`
-    return EstimateCell(
+    return EstimateTask(
         approach,
         solver,
-        fabric,
+        sources[0].fabric,
         sources,
         density,
-        budget,
+        own or getattr(plan.budgets, approach),
         network,
         repeat,
         prior="fabrics" if as_commands_do else "flat",
@@ -363,21 +346,14 @@ def _estimate(
     )
 
 
-def _by_scenario(recordings: Iterable[GivenRecording]) -> list[tuple[GivenRecording, ...]]:
-    found: Mapping[str, list[GivenRecording]] = defaultdict(list)
-    for recording in recordings:
-        found[recording.scenario].append(recording)
-    return [tuple(together) for together in found.values()]
-
-
 def _together(
     recordings: Iterable[GivenRecording], scenarios: Sequence[str]
 ) -> list[tuple[GivenRecording, ...]]:
-    """The recordings of each estimate: those of one scenario each alone, those of several by fabric
-    and trial, where all of them are there."""
+    """The recordings of each estimate: each recording of one scenario alone, those of several
+    scenarios by fabric and trial, where all of them are there."""
     if len(scenarios) == 1:
         return [(each,) for each in recordings if each.scenario == scenarios[0]]
-    trials: Mapping[tuple[str, str], list[GivenRecording]] = defaultdict(list)
+    trials: dict[tuple[str, str], list[GivenRecording]] = defaultdict(list)
     for each in recordings:
         if each.scenario in scenarios:
             trials[each.fabric, each.trial].append(each)
@@ -386,15 +362,3 @@ def _together(
         for every in trials.values()
         if {each.scenario for each in every} == set(scenarios)
     ]
-
-
-def _of_trial(unseen: list[GivenRecording], recording: GivenRecording) -> list[GivenRecording]:
-    same = [r for r in unseen if r.fabric == recording.fabric]
-    return [r for r in same if r.trial == recording.trial] or same
-
-
-def _other_fabric(recordings: Sequence[GivenRecording], index: int) -> int | None:
-    """The next recording of another fabric, going round."""
-    order = [(index + step) % len(recordings) for step in range(1, len(recordings))]
-    fabric = recordings[index].fabric
-    return next((i for i in order if recordings[i].fabric != fabric), None)

@@ -11,21 +11,29 @@ import pytest
 from r2s.cli.study import Study
 from r2s.mesh.surface import nearest
 from r2s.scenarios.standard import SIX
-from r2s.study import engine, matrix
-from r2s.study.cells import with_dependencies
-from r2s.study.configuration import MOTIONS
-from r2s.study.drawn import experiment_of
+from r2s.study import engine
 from r2s.study.ensembles import read_ensemble
-from r2s.study.estimates import EstimateCell
-from r2s.study.evaluations import EvaluationCell, read_measured, read_motions
-from r2s.study.mujoco_cells import FABRIC, MujocoEnsemble, MujocoRecording
-from r2s.study.mujoco_sheet import Material, Resolution, as_plate, motion, moved
-from r2s.study.sources import SyntheticRecording, read
+from r2s.study.evaluations import EvaluationTask, read_measured, read_motions
+from r2s.study.mujoco import (
+    FABRIC,
+    Material,
+    MujocoEnsemble,
+    MujocoRecording,
+    Resolution,
+    as_plate,
+    moved,
+)
+from r2s.study.recordings import experiment_of, read
 from r2s.study.verdicts import judged_motion
 
 has_mujoco = importlib.util.find_spec("mujoco") is not None
 needs_mujoco = pytest.mark.skipif(not has_mujoco, reason="needs r2s[mujoco]")
+SHEET = Material()
 COARSE = Resolution((5, 5), 1 / 300)
+
+
+def motion(experiment, material=SHEET, resolution=COARSE):
+    return moved(experiment.scenario(resolution.shape), material, resolution.step)
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +42,7 @@ def moves():
     if not has_mujoco:
         pytest.skip("needs r2s[mujoco]")
     names = ("lifting", "folding", "fling", "shaking")
-    return {name: motion(SIX[name](), resolution=COARSE) for name in names}
+    return {name: motion(SIX[name]()) for name in names}
 
 
 def test_held_vertices_follow_the_path(moves):
@@ -64,9 +72,9 @@ def test_a_hanging_sheet_is_at_rest_below_its_grippers_and_stretches_by_its_weig
 
 
 def test_the_same_sheet_moves_alike_and_another_does_not(moves):
-    again = motion(SIX["fling"](), resolution=COARSE)
+    again = motion(SIX["fling"]())
     np.testing.assert_array_equal(again, moves["fling"])
-    other = motion(SIX["fling"](), Material(young=8e3), COARSE)
+    other = motion(SIX["fling"](), Material(young=8e3))
     assert np.abs(other - again).max() > 5e-3
 
 
@@ -75,7 +83,7 @@ def test_a_sheet_that_is_lost_is_an_error_that_says_when():
     scenario = SIX["lifting"]().scenario(COARSE.shape)
     torn = dataclasses.replace(scenario, path=scenario.path.at[-1].set(jnp.nan))
     with pytest.raises(RuntimeError, match=r"diverged after 3\.\d+ s"):
-        moved(torn, step=COARSE.step)
+        moved(torn, SHEET, COARSE.step)
 
 
 @needs_mujoco
@@ -97,37 +105,12 @@ def test_a_recording_has_the_experiment_s_times_and_clouds_on_the_sheet(tmp_path
     made, experiment = read(cell, tmp_path), experiment_of("lifting", 1, True, 0)
     np.testing.assert_allclose(made.times, experiment.times, atol=1e-6)
     assert (made.info.fabric, made.info.scenario) == (FABRIC, "lifting")
-    x = motion(experiment, resolution=COARSE)[-1]
+    x = motion(experiment)[-1]
     points = np.asarray(made.points)[-1][np.asarray(made.mask)[-1]]
     faces = experiment.scenario((5, 5)).scene.mesh.faces
     found, weights = nearest(jnp.asarray(points, float), jnp.asarray(x, float), faces)
     on_sheet = np.einsum("pk,pki->pi", weights, x[np.asarray(faces)[found]])
     assert np.abs(points - on_sheet).max() < 1e-5
-
-
-def test_presets_have_the_sheet_with_the_configurations_that_can_be():
-    plans = {name: plan for name, plan in matrix.PRESETS.items() if FABRIC in plan.fabrics}
-    for name, plan in plans.items():
-        small = matrix.with_changes(plan, repeats=1, judged=1)
-        cells = [cell for cell in matrix.synthetic(small) if cell.fabric == FABRIC]
-        assert {cell.scenario for cell in cells} == set(MOTIONS), name
-        needed = with_dependencies(cells)
-        estimates = [cell for cell in needed if isinstance(cell, EstimateCell)]
-        lifts = {c for c in plan.configurations if c.estimated_from == "lifting"}
-        assert len(estimates) == len(lifts) > 0
-        assert {cell.scenario for cell in estimates} == {"lifting"}
-        assert {cell.density for cell in estimates} == {Material().density}
-        assert not any(isinstance(cell, SyntheticRecording) for cell in needed)
-
-
-def test_the_sheet_is_moved_as_the_other_fabrics_are():
-    made = with_dependencies(matrix.synthetic(matrix.with_changes(matrix.SMALL, judged=1)))
-    paths = {}
-    for cell in made:
-        if isinstance(cell, SyntheticRecording | MujocoRecording) and cell.unseen:
-            path = experiment_of(cell.scenario, cell.number, cell.unseen, cell.seed).route.path
-            paths.setdefault(cell.scenario, set()).add(path.tobytes())
-    assert {scenario: len(found) for scenario, found in paths.items()} == dict.fromkeys(MOTIONS, 1)
 
 
 def test_a_scenario_that_mujoco_s_sheet_does_not_have_is_refused():
@@ -147,7 +130,7 @@ def test_a_study_without_the_wheel_says_so_before_it_makes_anything(tmp_path, mo
 @needs_mujoco
 def test_ours_predicts_the_sheet_of_mujoco_from_where_it_hangs(tmp_path):
     cell = MujocoRecording("fling", 0, unseen=True, resolution=Resolution((13, 13), 2e-3))
-    judged = EvaluationCell(None, "cloth", Material().density, FABRIC, (cell,), draw=0, every=3)
+    judged = EvaluationTask(None, "cloth", Material().density, FABRIC, (cell,), draw=0, every=3)
     assert engine.run([judged], tmp_path, engine.Serial()) == {}
     (found,) = read_measured(judged, tmp_path).values()
     assert found["chamfer_real_to_sim"] < 0.03
@@ -182,9 +165,3 @@ def test_a_material_is_the_plate_that_stretches_shears_and_bends_as_it_does():
     stiffness = 2e4 * 2e-3**3 / 12 / (1 - 0.25**2)  # [N m]
     assert float(fabric.bending.stiffness) == pytest.approx(stiffness, rel=1e-5)
     assert float(fabric.density) == pytest.approx(0.3)
-
-
-def test_the_material_stands_beside_estimates_of_the_sheet():
-    plan = dataclasses.replace(matrix.SMALL, fabrics=(FABRIC,), judged=1)
-    true = [cell for cell in matrix.synthetic(plan) if cell.baseline == "true"]
-    assert {cell.scenario for cell in true if cell.solver == "cloth"} == set(MOTIONS)

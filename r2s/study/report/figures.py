@@ -1,0 +1,315 @@
+"""Plotly figures of a report: means, errors over time, and motions in 3-D with a time slider."""
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import plotly.express as px
+import plotly.graph_objects as go
+from jaxtyping import Bool, Float, Integer
+
+from r2s.mesh.mesh import rectangle
+from r2s.metrics.horizon import within
+from r2s.recordings.recording import cloud
+from r2s.study.configuration import MOTIONS, ON_CLOTH, REFERENCES, as_configuration, is_reference
+from r2s.study.evaluations import EvaluationTask, read_distances, read_motions
+from r2s.study.recordings import Source, read
+from r2s.study.verdicts import Judged, judged_motion
+
+# Okabe and Ito's colours, which the colour-blind can distinguish, and then darker ones.
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7", "#B8A800", "#5D3A9B",
+           "#994F00", "#006CD1", "#40B0A6", "#7D7D00")  # fmt: skip
+INK, BROWN, GREY, SAND, RED = "#202020", "#8a6d5a", "#8c8c8c", "#ecdcb0", "#c4004f"
+OF_REFERENCES = {REFERENCES["true"]: INK, REFERENCES["middle"]: BROWN}
+ABOVE = 1.1  # of the largest error that is shown, the upper end of a chart
+RUNAWAY = 2.0  # times the largest error of a reference: what is farther off is out of the chart
+DRAWN = 13  # vertices a side that are drawn, at most
+BUDGET = 7_000_000  # characters of all positions of a page
+CHARACTERS = 7  # of a coordinate in millimetres to a tenth, such as "-123.4,"
+FEWEST_POINTS, MOST_POINTS = 150, 800  # of a cloud, in a frame
+NOW = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}}
+
+
+class Motion(NamedTuple):
+    """A recording and the simulations of its motion, at the frames that count.
+
+    - `times`: of the frames, [s]. `clouds`: the points of each frame, [m].
+    - `faces`: the triangles of each configuration's sheet, by its label.
+    - `vertices`: of each configuration, [m]; not finite where it diverged. Of several runs
+      (estimates, or samples of the default) one.
+    - `errors`: the distances of the points from the sheets of all runs, [m].
+    - `floor`: the accuracy of the recording, [m]. `horizon`: the time up to which it discriminates
+      between fabrics, [s]. None: not known.
+    """
+
+    fabric: str
+    evaluated_on: str
+    recording: str
+    times: Float[np.ndarray, " frame"]
+    clouds: Sequence[Float[np.ndarray, "_ 3"]]
+    faces: Mapping[str, Integer[np.ndarray, "face 3"]]
+    vertices: Mapping[str, Float[np.ndarray, "frame vertex 3"]]
+    errors: Mapping[str, Float[np.ndarray, "run frame"]]
+    floor: Float[np.ndarray, " frame"] | None = None
+    horizon: float | None = None
+
+    @property
+    def title(self) -> str:
+        return f"{self.evaluated_on}, {self.fabric.replace('_', ' ')} ({self.recording})"
+
+    @property
+    def inside(self) -> Bool[np.ndarray, " frame"]:
+        """Which frames are before the horizon; all, where none is known."""
+        return within(self.times, np.inf if self.horizon is None else self.horizon)
+
+    @property
+    def mean_errors(self) -> dict[str, Float[np.ndarray, " frame"]]:
+        """The mean over runs, [m]; infinite where one of them has diverged."""
+        return {
+            label: np.where(np.isfinite(runs), runs, np.inf).mean(axis=0)
+            for label, runs in self.errors.items()
+        }
+
+
+def judged_recordings(tasks: Iterable[EvaluationTask], folder: Path) -> list[Motion]:
+    """The first recording of each fabric and motion with its finished simulations by all
+    configurations, references and defaults, in the order of `MOTIONS`.
+
+    Of several estimates, or samples, the sheet is that of the one with the median error within the
+    horizon. Estimates come first, the default last.
+    """
+    groups: dict[Source, dict[str, list[EvaluationTask]]] = defaultdict(lambda: defaultdict(list))
+    for task in tasks:
+        if not task.other and task.is_made(folder):
+            label = as_configuration(task.configuration, task.baseline).label
+            groups[task.recordings[0]][label].append(task)
+    first = {(source.fabric, source.scenario): source for source in reversed(groups)}
+    found = [
+        _motion(source, groups[source], folder) for source in groups if source in first.values()
+    ]
+    order = {motion: i for i, motion in enumerate(MOTIONS)}
+    return sorted(found, key=lambda each: order.get(each.evaluated_on, len(order)))
+
+
+def _motion(source: Source, group: Mapping[str, list[EvaluationTask]], folder: Path) -> Motion:
+    recording = read(source, folder)
+    first, last = recording.info.frames_used
+    judged = judged_motion(source, folder)
+    rank = {"": 0, ON_CLOTH: 0, "true": 1, "middle": 2, "default": 3}
+    errors, vertices, faces = {}, {}, {}
+    for label, tasks in sorted(group.items(), key=lambda each: rank[each[1][0].baseline]):
+        runs = np.stack([read_distances(task, folder)[source.name] for task in tasks])
+        chosen = tasks[median_run(runs, judged)]
+        x = read_motions(chosen, folder)[source.name][first : last + 1]
+        errors[label] = runs
+        vertices[label], shape = thinned(x, chosen.shape)
+        faces[label] = np.asarray(rectangle(recording.info.sheet.size, shape).faces)
+    return Motion(
+        fabric=source.fabric,
+        evaluated_on=source.scenario,
+        recording=source.name,
+        times=np.asarray(recording.times)[first : last + 1],
+        clouds=tuple(cloud(recording, frame) for frame in range(first, last + 1)),
+        faces=faces,
+        vertices=vertices,
+        errors=errors,
+        floor=None if judged is None else judged.floor,
+        horizon=None if judged is None else judged.horizon,
+    )
+
+
+def median_run(runs: Float[np.ndarray, "run frame"], judged: Judged | None) -> int:
+    """The run with the median mean error within the horizon; runs that diverged are last."""
+    if judged is not None and judged.inside.any():
+        runs = runs[:, judged.inside]
+    means = np.where(np.isfinite(runs), runs, np.inf).mean(axis=1)
+    return int(np.argsort(means, kind="stable")[(len(means) - 1) // 2])
+
+
+def thinned(
+    x: Float[np.ndarray, "frame vertex 3"], shape: Sequence[int]
+) -> tuple[Float[np.ndarray, "frame _ 3"], tuple[int, int]]:
+    """Every n-th vertex of a sheet so that at most `DRAWN` a side are left, and their shape."""
+    largest = max(shape) - 1
+    strides = [n for n in range(1, largest + 1) if all((side - 1) % n == 0 for side in shape)]
+    stride = next((n for n in strides if largest // n < DRAWN), 1)
+    grid = x.reshape(len(x), *shape, 3)[:, ::stride, ::stride]
+    return grid.reshape(len(x), -1, 3), (grid.shape[1], grid.shape[2])
+
+
+def colours_of(labels: Iterable[str]) -> dict[str, str]:
+    """The colour of each label, one for a whole page; references are dark, brown and grey."""
+    found: dict[str, str] = {}
+    for label in dict.fromkeys(labels):
+        if is_reference(label):
+            own = [colour for name, colour in OF_REFERENCES.items() if label.startswith(name)]
+            found[label] = own[0] if own else GREY
+        else:
+            count = sum(not is_reference(each) for each in found)
+            found[label] = COLOURS[count % len(COLOURS)]
+    return found
+
+
+def interval_chart(
+    means: pd.DataFrame, colours: Mapping[str, str], title: str, marks: Mapping[float, str]
+) -> go.Figure:
+    """Means with their intervals, a panel a motion, a line a configuration.
+
+    `means`: from `r2s.study.statistics.frame.means`. `marks`: values with a vertical line.
+    """
+    table = means.reset_index()
+    table["configuration"] = table.configuration.astype(str)
+    known = np.isfinite(table["mean"])
+    low = min([*marks, *table["mean"][known], 0.0])
+    diverged = table.diverged.map("{:.0f}".format) + " of " + table.runs.map("{:.0f}".format)
+    table = table.assign(
+        above=table.high - table["mean"],
+        below=table["mean"] - table.low,
+        note=(diverged + " runs diverged").where(~known, ""),
+    )
+    table["mean"] = table["mean"].where(known, low)
+    labels = list(dict.fromkeys(table.configuration))
+    figure = px.scatter(
+        table,
+        x="mean",
+        y="configuration",
+        facet_col="evaluated_on",
+        error_x="above",
+        error_x_minus="below",
+        text="note",
+        color="configuration",
+        color_discrete_map=dict(colours),
+        category_orders={"configuration": labels},
+        labels={"mean": title, "configuration": "", "evaluated_on": "motion"},
+        height=140 + 32 * len(labels),
+    )
+    for value, words in marks.items():
+        figure.add_vline(value, line_dash="dot", annotation_text=words)
+    return figure.update_traces(textposition="middle right").update_layout(showlegend=False)
+
+
+def error_chart(motion: Motion, colours: Mapping[str, str]) -> go.Figure:
+    """The mean error [mm] of each configuration's runs against time, until one of them diverged.
+
+    The floor is shaded; beyond the horizon the chart is pale.
+    """
+    times, means, figure = motion.times, motion.mean_errors, go.Figure()
+    # errors that run away do not widen the chart
+    finite = {
+        label: float(np.max(mean, where=np.isfinite(mean), initial=0.0))
+        for label, mean in means.items()
+    }
+    known = max((e for label, e in finite.items() if is_reference(label)), default=0.0)
+    top = 1e3 * ABOVE * min(max(finite.values(), default=0.0), RUNAWAY * known or np.inf) or 1.0
+    if motion.floor is not None:
+        floor = np.minimum(1e3 * motion.floor, 2 * top)  # an infinite one fills the chart
+        shade = {"mode": "none", "fill": "tozeroy", "fillcolor": SAND, "name": "floor"}
+        figure.add_scatter(x=times, y=floor, **shade)
+    for label, mean in means.items():
+        runs, dash = motion.errors[label], "dash" if "points" in label.split() else "solid"
+        lost = int((~np.isfinite(runs).all(axis=1)).sum())
+        words = f"{label} ({lost} of {len(runs)} diverged)" if lost else label
+        y = np.where(np.isfinite(mean), 1e3 * mean, np.nan)
+        line = {"color": colours[label], "dash": dash}
+        figure.add_scatter(x=times, y=y, mode="lines", line=line, name=words)
+    if motion.horizon is not None and np.isfinite(motion.horizon):
+        end = max(times[-1], motion.horizon)
+        figure.add_vrect(motion.horizon, end, fillcolor="white", opacity=0.65, line_width=0)
+        words = f"horizon {motion.horizon:.2f} s"
+        figure.add_vline(motion.horizon, line_color=RED, annotation_text=words)
+    figure.update_xaxes(title="time [s]", range=[times[0], max(times[-1], times[0] + 1e-3)])
+    figure.update_yaxes(title="distance to the simulated surface [mm]", range=[0, top])
+    return figure.update_layout(title=motion.title, height=460)
+
+
+def motion_figures(motions: Sequence[Motion], colours: Mapping[str, str]) -> list[go.Figure]:
+    """A 3-D figure with a time slider for each motion; together they have at most `BUDGET`.
+
+    Of long or fine recordings every n-th frame is drawn, and of clouds as many points as fit. The
+    slider begins at the last frame before the horizon.
+    """
+    return [_figure(each, colours, BUDGET // len(motions)) for each in motions]
+
+
+def _figure(motion: Motion, colours: Mapping[str, str], budget: int) -> go.Figure:
+    frames, count = _affordable(motion, budget)
+    generator = np.random.default_rng(0)
+    finite = [motion.clouds[i][np.isfinite(motion.clouds[i]).all(axis=1)] for i in frames]
+    clouds = [generator.permutation(each)[:count] for each in finite]
+    data = [
+        [
+            {"type": "scatter3d", **_positions(cloud)},
+            *({"type": "mesh3d", **_vertices(x[: i + 1])} for x in motion.vertices.values()),
+        ]
+        for i, cloud in zip(frames, clouds, strict=True)
+    ]
+    start = max(int(motion.inside[frames].sum()) - 1, 0)
+    points = {"mode": "markers", "marker": {"size": 1.5, "color": RED}, "name": "recorded points"}
+    looks = [points, *(_look(motion, label, colours[label]) for label in motion.vertices)]
+    names = [f"{motion.times[i]:.2f} s" for i in frames]
+    figure = go.Figure(
+        [look | own for look, own in zip(looks, data[start], strict=True)],
+        frames=[go.Frame(name=name, data=own) for name, own in zip(names, data, strict=True)],
+    )
+    steps = [{"method": "animate", "label": name, "args": [[name], NOW]} for name in names]
+    moving = NOW | {"fromcurrent": True, "frame": {"duration": 80, "redraw": True}}
+    buttons = [
+        {"method": "animate", "label": "Play", "args": [None, moving]},
+        {"method": "animate", "label": "Pause", "args": [[None], NOW]},
+    ]
+    return figure.update_layout(
+        height=620,
+        title=motion.title,
+        scene=_scene(clouds),
+        sliders=[{"active": start, "steps": steps, "currentvalue": {"prefix": "time: "}}],
+        updatemenus=[
+            {"type": "buttons", "direction": "left", "x": 0, "y": 1.1, "buttons": buttons}
+        ],
+    )
+
+
+def _affordable(motion: Motion, budget: int) -> tuple[np.ndarray, int]:
+    """Which frames, and how many points of each, fit into a budget of characters."""
+    vertices = sum(x.shape[1] for x in motion.vertices.values())
+    count = len(motion.times)
+    for stride in range(1, count + 1):
+        frames = np.arange(0, count, stride)
+        room = budget / CHARACTERS / 3 / (len(frames) + 1) - vertices
+        if room >= FEWEST_POINTS:
+            return frames, int(min(room, MOST_POINTS))
+    return np.arange(1), FEWEST_POINTS
+
+
+def _look(motion: Motion, label: str, colour: str) -> dict:
+    """Of a sheet; the first configuration and the true fabric are visible, others on a click."""
+    corners = zip("ijk", np.asarray(motion.faces[label], np.uint16).T, strict=True)
+    is_shown = label == next(iter(motion.vertices)) or label.startswith(REFERENCES["true"])
+    legend = {"name": label, "showlegend": True, "visible": True if is_shown else "legendonly"}
+    return dict(corners) | legend | {"color": colour, "flatshading": True, "hoverinfo": "name"}
+
+
+def _vertices(x: np.ndarray) -> dict:
+    """The last vertices of a motion; where it diverged, those before it, not visible."""
+    is_known = np.all(np.isfinite(x), axis=(1, 2))
+    last = x[is_known][-1] if is_known.any() else np.zeros_like(x[0])
+    return {**_positions(last), "opacity": 0.75 if is_known[-1] else 0.0}
+
+
+def _positions(points: np.ndarray) -> dict:
+    # lists: plotly does not document its packed arrays for frames
+    return dict(zip("xyz", np.round(1e3 * points.T, 1).tolist(), strict=True))
+
+
+def _scene(clouds: Sequence[np.ndarray]) -> dict:
+    """Axes [mm] around most of the points: neither outliers nor sheets that fly off widen them."""
+    dots = np.concatenate(clouds) if any(map(len, clouds)) else np.zeros((1, 3))
+    low, high = 1e3 * np.percentile(dots, [1, 99], axis=0)
+    margin = max(0.2 * float((high - low).max()), 50.0)
+    axes = {
+        f"{name}axis": {"range": [float(a - margin), float(b + margin)], "title": f"{name} [mm]"}
+        for name, a, b in zip("xyz", low, high, strict=True)
+    }
+    return {**axes, "aspectmode": "data"}

@@ -1,0 +1,86 @@
+"""Distances between recordings and motions: zero for the truth, larger for another fabric."""
+
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+from r2s import scenarios
+from r2s.materials import presets
+from r2s.metrics import prediction_error
+from r2s.recordings.recording import cloud
+from r2s.scenarios import synthetic
+from r2s.scenarios.standard import SIX
+from r2s.solvers.failures import Failure
+from r2s.solvers.simulate import Trajectory
+
+
+@pytest.fixture(scope="module")
+def lift():
+    return synthetic.record(scenarios.lifting(), presets.grey_interlock(), "grey", key=jr.key(1))
+
+
+@pytest.fixture(scope="module")
+def predicted(lift):
+    """The motion of the lift with its true fabric."""
+    return prediction_error.predict(lift, presets.grey_interlock())
+
+
+def test_a_recording_is_at_no_distance_from_itself(lift):
+    found = prediction_error.against_recording(lift, lift)
+    assert all(value == 0 for value in found.values())
+
+
+def test_the_true_fabric_is_nearer_than_another_and_than_noise_allows(lift, predicted):
+    truth = prediction_error.against_motion(lift, predicted)
+    other = prediction_error.against_motion(
+        lift, prediction_error.predict(lift, presets.pink_solid())
+    )
+    # 1 mm of noise, sampling of the surface every 5 mm, one point in a hundred 0.2 m away
+    assert truth["chamfer_real_to_sim"] < 0.007
+    assert truth["chamfer_real_to_sim"] < other["chamfer_real_to_sim"]
+    assert truth["hausdorff"] >= truth["chamfer"]
+
+
+@pytest.mark.slow(group="study")
+def test_a_whole_surface_tells_the_true_fabric_by_every_metric():
+    experiment, fabric = SIX["fling"](), presets.grey_interlock()
+    seen = synthetic.record(experiment, fabric, "grey", seen=synthetic.WHOLE, key=jr.key(0))
+    clouds = [cloud(seen, frame) for frame in (0, 30)]
+    assert all(len(points) == len(clouds[0]) > 5000 for points in clouds)
+    truth, other = (
+        prediction_error.against_motion(seen, prediction_error.predict(seen, each), 6, False)
+        for each in (fabric, presets.pink_solid())
+    )
+    for name, value in truth.items():
+        assert value < other[name] / 1.5, name
+    assert truth["hausdorff"] < 0.01  # samples of the surface, 8 mm apart
+
+
+def test_a_diverged_motion_is_a_result(lift):
+    shape = (len(lift.times), 81, 3)
+    found = prediction_error.against_motion(lift, np.full(shape, np.nan))
+    whole = prediction_error.against_recording(lift, lift)
+    assert found.keys() == whole.keys()
+    assert all(np.isnan(value) for value in found.values())
+
+
+def test_a_run_that_fails_is_lost_from_there_on_and_says_why(monkeypatch):
+    failed = Trajectory(
+        x=jnp.zeros((3, 9, 3)),
+        ok=jnp.array([True, False, True]),
+        failure=jnp.array(Failure.NON_FINITE.value),
+        failed_frame=jnp.array(1),
+        failed_step=jnp.array(2),
+    )
+    monkeypatch.setattr(prediction_error, "_rollout", lambda *_, **__: failed)
+    scenario = SIX["fling"]().scenario((3, 3))
+    moved = prediction_error.predict_motion(scenario, presets.grey_interlock())
+    assert np.isfinite(moved.x).all(axis=(1, 2)).tolist() == [True, False, False]
+    assert "frame 1, step 2" in moved.failure
+
+
+def test_the_cropped_distance_leaves_out_what_the_recording_cannot_show(lift, predicted):
+    found = prediction_error.against_motion(lift, predicted)
+    assert found["chamfer_sim_to_real_cropped"] < found["chamfer_sim_to_real"]
+    assert cloud(lift, 20)[:, 2].min() > 0
