@@ -11,7 +11,6 @@ from r2s.estimation.judgement import sensitivity
 from r2s.estimation.method import Budget, Method
 from r2s.estimation.methods import METHODS
 from r2s.estimation.problem import NuisancePrior, Problem
-from r2s.estimation.registry import METHODS
 from r2s.laboratory.bending import Cantilever, Drape
 from r2s.laboratory.files import read_tests
 from r2s.laboratory.pull import Pull

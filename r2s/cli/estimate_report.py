@@ -9,7 +9,6 @@ from r2s.estimation.cards import Card, Provenance, fingerprint
 from r2s.estimation.consistency import FORCE
 from r2s.estimation.estimate import Agreement, Estimate, Misfit, describe
 from r2s.estimation.method import COARSEST, Method, Progress, tell
-from r2s.estimation.misfits import FORCE
 from r2s.laboratory.estimate import APPROACH, POOR_FIT, consistency, fits
 from r2s.laboratory.files import LaboratoryTests
 from r2s.laboratory.pull import Pull

@@ -22,8 +22,8 @@ from r2s.estimation.problem import POINTS, Problem, read_by_problem
 from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import ParameterSpace
 from r2s.recordings.recording import Recording
+from r2s.scenarios.resolution import material_points
 from r2s.scenarios.scenario import from_recording
-from r2s.scenarios.solvers import material_points
 
 WIDTH = 0.02  # of the range: the slope of exact material points is rough below that
 SEARCHED = ("coarse", "starts", "iterations")

@@ -17,6 +17,7 @@ from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import ParameterSpace
 from r2s.mesh.mesh import Mesh
 from r2s.mesh.surface import nearest
+from r2s.metrics.losses import TOUCHING, length, robust_weight, surface_residuals
 from r2s.recordings.recording import (
     MeasurementUncertainty,
     Recording,
@@ -25,7 +26,7 @@ from r2s.recordings.recording import (
     subsample,
 )
 from r2s.recordings.views import Views
-from r2s.scenarios.scenario import Scenario, from_recording
+from r2s.scenarios.scenario import Scenario, from_recording, rollout
 
 POINTS = 300  # at most, of a cloud
 TARGETS = 1200  # at most, of a cloud that the sheet must lie near

@@ -24,7 +24,7 @@ from jaxtyping import Float
 from r2s._util.extras import require
 from r2s._util.units import AIR_DENSITY, GRAVITY
 from r2s.materials.fabric import Fabric
-from r2s.metrics.surface_distance import POINTS
+from r2s.metrics.losses import POINTS
 from r2s.recordings.recording import save
 from r2s.scenarios import synthetic
 from r2s.scenarios.scenario import Scenario

@@ -16,8 +16,7 @@ from r2s.estimation.method import Budget
 from r2s.estimation.prediction import free_nuisances, nuisances, predict, theta_length
 from r2s.estimation.problem import NuisancePrior, Problem, default_nuisance_prior
 from r2s.materials import presets
-from r2s.materials.informed_space import InformedSpace
-from r2s.materials.parameters import UNIFORM_DEVIATION, OrthotropicSpace
+from r2s.materials.parameters import OrthotropicSpace
 from r2s.recordings.recording import MeasurementUncertainty
 from r2s.scenarios import synthetic
 

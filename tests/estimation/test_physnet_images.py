@@ -13,9 +13,8 @@ from r2s import scenarios
 from r2s.estimation.physnet import images
 from r2s.estimation.physnet.images import View, depths_of_sheet, view_around
 from r2s.mesh.mesh import rectangle
-from r2s.recordings.cameras.calibration import DepthCamera, calibrated
-from r2s.recordings.cameras.camera import Camera
-from r2s.recordings.cameras.render import render
+from r2s.recordings.cameras import Camera, DepthCamera
+from r2s.recordings.views import render
 from r2s.scenarios import synthetic
 
 VIEW = View((0.1, -0.4, 0.6), (0.1, 0.1, 0.1), 40.0, 32, 0.4, 1.0, -1.0)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import r2s
-from r2s.estimation.estimate_json import as_json, from_json
+from r2s.estimation.estimate import as_json, from_json
 from r2s.estimation.pinn import estimator, published_recipe
 from r2s.estimation.pinn.equilibrium import equilibrium, prepare
 from r2s.estimation.pinn.estimator import estimate, fit

@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 
 from r2s import scenarios
-from r2s.estimation.diffcloud import last_frame
 from r2s.estimation.method import default_space
-from r2s.estimation.pinn.pulls import pull_from
-from r2s.estimation.pinn.synthetic_pulls import pulled
+from r2s.estimation.methods import METHODS, last_frame
+from r2s.estimation.pinn.pulls import pull_from, pulled
 from r2s.estimation.prediction import Prediction
 from r2s.estimation.problem import POINTS, Problem
-from r2s.estimation.registry import METHODS
 from r2s.materials import presets
 from r2s.scenarios import synthetic
 
@@ -92,17 +90,17 @@ def test_the_network_reads_markers_and_force_and_no_clouds(pull):
 
 
 def test_images_are_made_of_some_frames(lift):
-    from r2s.estimation.physnet import preprocess
-    from r2s.estimation.physnet.views import view_around
+    from r2s.estimation.physnet import images
+    from r2s.estimation.physnet.images import view_around
 
     reads = METHODS["physnet"]().reads(lift)
     assert reads.points is None and len(reads.frames) == 8
     x = np.asarray(lift.points)[np.asarray(lift.mask)]
     view = view_around((0.2, -0.6, 0.6), x, 32, 0.0)
-    seen = preprocess.of_clouds(view, lift, reads.frames)
+    seen = images.of_clouds(view, lift, reads.frames)
     hidden = poisoned(lift, others(lift, reads.frames))
-    assert np.array_equal(seen, preprocess.of_clouds(view, hidden, reads.frames))
-    changed = preprocess.of_clouds(view, poisoned(lift, reads.frames[-1:]), reads.frames)
+    assert np.array_equal(seen, images.of_clouds(view, hidden, reads.frames))
+    changed = images.of_clouds(view, poisoned(lift, reads.frames[-1:]), reads.frames)
     assert not np.array_equal(seen, changed)
 
 

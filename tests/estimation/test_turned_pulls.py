@@ -20,7 +20,7 @@ from r2s.estimation.method import default_space
 from r2s.estimation.methods import METHODS
 from r2s.estimation.normal_equations import loss_of
 from r2s.estimation.pinn.pulls import pulled
-from r2s.estimation.prediction import predict
+from r2s.estimation.prediction import derivatives_at, predict, predictions_at, theta_length
 from r2s.estimation.problem import Problem
 from r2s.materials import presets
 from r2s.recordings.recording import load, save

@@ -16,7 +16,6 @@ from r2s.environment.air import Air
 from r2s.environment.contact import Table
 from r2s.environment.scene import Control, Scene
 from r2s.estimation.default_spaces import on_cloth
-from r2s.estimation.identifiability import FixedParameter
 from r2s.laboratory.bending import Cantilever, Drape, coefficient, drape, overhang, ring
 from r2s.laboratory.estimate import consistency, estimate, fits, informed
 from r2s.laboratory.files import read_knit, read_tests

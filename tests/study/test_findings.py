@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from made_up_study import FABRICS, made_up_results
 
-from r2s.metrics.crossed import interval, p_value
+from r2s.metrics.statistics import interval, p_value
 from r2s.study.configuration import (
     MOTIONS,
     PAPER_CONFIGURATIONS,

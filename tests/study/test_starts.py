@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s.metrics.surface_distance import to_surface
+from r2s.metrics.losses import to_surface
 from r2s.recordings.recording import cloud
 from r2s.scenarios.standard import SIX
 from r2s.study.evaluations import predict

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s.mesh.surface import sample
-from r2s.recordings.cameras.camera import Camera
+from r2s.recordings.cameras import Camera
 from r2s.recordings.recording import Recording
 from r2s.scenarios.standard import Experiment
 from r2s.scenarios.synthetic import sensing

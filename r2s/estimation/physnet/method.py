@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from r2s._util.extras import require
 from r2s.estimation.default_spaces import RANGES
-from r2s.estimation.method import ANY, Budget, Method, Reads, seed_of
+from r2s.estimation.method import ANY, Budget, DataRequirements, Method, seed_of
 from r2s.estimation.physnet import dataset, estimator, images, training
 from r2s.estimation.problem import read_by_problem
 from r2s.recordings.recording import Recording
@@ -93,7 +93,7 @@ class PhysNetMethod(Method):
 
     def reads(self, recording):
         force = not self.published and read_by_problem(recording).force
-        return Reads(_images_of(recording), points=None, force=force)
+        return DataRequirements(_images_of(recording), points=None, force=force)
 
     def _estimate(self, recordings, space, budget, key):
         require(self.library, "physnet", self.name)  # before hours of training

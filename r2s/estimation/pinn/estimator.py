@@ -21,7 +21,6 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation.estimate import Estimate, Nuisance
-from r2s.estimation.law_error import to_small_strain
 from r2s.estimation.least_squares import Damping, at_bound, damped, newton_step, proposed
 from r2s.estimation.pinn.equilibrium import Motion, equilibrium, prepare
 from r2s.estimation.pinn.network import Network

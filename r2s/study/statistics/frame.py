@@ -26,9 +26,8 @@ import pandas as pd
 from scipy.stats import norm
 
 from r2s._util.files import write_text
-from r2s.metrics.crossed import CrossedMean, crossed_mean, interval
 from r2s.metrics.horizon import skill
-from r2s.metrics.statistics import LEVEL
+from r2s.metrics.statistics import LEVEL, CrossedMean, crossed_mean, interval
 from r2s.study.configuration import (
     MOTIONS,
     ON_CLOTH,
@@ -166,7 +165,7 @@ def crossed(values: pd.Series) -> CrossedMean:
     """The mean over fabrics of the means over recordings and repeats; infinite values do not count.
 
     `values`: indexed by fabric, movement and repeat. The analysis of variance of
-    `r2s.metrics.crossed` is used instead of statsmodels' `MixedLM`: in studies of two fabrics
+    `r2s.metrics.statistics` is used instead of statsmodels' `MixedLM`: in studies of two fabrics
     without an effect, tests at a level of 5 % find 0 %, those of `MixedLM` 18 % (four motions;
     deviations 0.2 between fabrics, 0.1 between motions and in the rest).
     """
