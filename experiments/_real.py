@@ -14,8 +14,7 @@ from r2s._util.files import write_json
 from r2s.estimation.estimate import Estimate, as_json, from_json
 from r2s.estimation.methods import DiffCloud
 from r2s.materials.fabric import Fabric
-from r2s.materials.informed_space import InformedSpace
-from r2s.materials.parameters import ParameterSpace
+from r2s.materials.parameters import InformedSpace, ParameterSpace
 from r2s.metrics import prediction_error
 from r2s.metrics.prediction_error import distances
 from r2s.recordings.recording import Recording, RecordingInfo, gripper_positions

@@ -16,15 +16,18 @@ from r2s.laboratory.files import read_tests
 from r2s.laboratory.pull import Pull
 from r2s.materials import presets
 from r2s.materials.bending import BendingLaw, HingeBending, HingeLaw
-from r2s.materials.fabric import Fabric
-from r2s.materials.fold_length import fold_length
-from r2s.materials.informed_space import InformedSpace
+from r2s.materials.fabric import Fabric, fold_length
 from r2s.materials.membrane import MembraneLaw, OrthotropicMembrane, SpringMembrane
-from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
+from r2s.materials.nonlinear_spaces import SofteningSpace, StiffeningSpace
+from r2s.materials.parameters import (
+    InformedSpace,
+    IsotropicSpace,
+    OrthotropicSpace,
+    ParameterSpace,
+    Range,
+)
 from r2s.materials.plate import OrthotropicPlate, PlateBending, PlateLaw
-from r2s.materials.softening_space import SofteningSpace
 from r2s.materials.stiffening import StiffeningMembrane
-from r2s.materials.stiffening_space import StiffeningSpace
 from r2s.materials.tables import TableBending, TableMembrane
 from r2s.mesh.mesh import Mesh, rectangle
 from r2s.metrics.prediction_error import distances

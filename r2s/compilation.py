@@ -23,9 +23,9 @@ from typing import Any
 import equinox as eqx
 import jax
 
+from r2s._util.arrays import is_traced
 from r2s._util.extras import require
 from r2s._util.threads import cores, settings
-from r2s._util.traced import is_traced
 
 MOST = 1_000_000_000  # [byte] of all programs in a folder: some hundred motions with gradients
 SHORT = 0.1  # [s]: what compiles sooner is not kept

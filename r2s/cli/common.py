@@ -112,7 +112,7 @@ def choose_shape(
     Also what a result tells of it, and lines for people: the error it is expected to leave, or a
     warning where that is too large.
     """
-    from r2s._util.memory import check
+    from r2s._util.threads import check
     from r2s.scenarios import resolution
 
     shape = asked or resolution.shape_for(fabric, size, motion)

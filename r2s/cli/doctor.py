@@ -112,7 +112,7 @@ def _fabric(
     name: str, fabric: "Fabric", shape: tuple[int, int]
 ) -> tuple[dict[str, Any], list[str]]:
     """Whether its numbers are plausible, and the error that a mesh leaves in each motion."""
-    from r2s.materials.fold_length import fold_length
+    from r2s.materials.fabric import fold_length
     from r2s.scenarios import resolution
     from r2s.scenarios.standard import SIDE
 

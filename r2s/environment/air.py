@@ -6,6 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r2s._util.units import AIR_DENSITY
+from r2s.mesh.mesh import Mesh
+from r2s.mesh.strain_samples import area_normals
 
 STILL = 1e-3  # [m/s]: below this flow along a face, its friction fades to linear
 
@@ -86,3 +88,22 @@ class Fan(eqx.Module):
         across = offset - jnp.outer(offset @ along, along)
         distance = jnp.sqrt(jnp.sum(across**2, axis=1) + (self.edge / 4) ** 2)  # smooth on the axis
         return jax.nn.sigmoid(4 * (self.radius - distance) / self.edge)
+
+
+Vertices = Float[Array, "vertex 3"]
+
+
+def drag_on_vertices(
+    mesh: Mesh, air: Air, fan: Fan | None, x: Vertices, v: Vertices, wind: Float[Array, "*vertex 3"]
+) -> Vertices:
+    """The drag [N], from positions [m], velocities [m/s] and the wind [m/s] of a control.
+
+    That on an element goes in equal parts to its corners.
+    """
+    strength = 1.0 if fan is None else fan(x)[:, None]
+    flow = v - jnp.broadcast_to(wind, x.shape) * strength
+    corners = mesh.samples.corners
+    relative = jnp.mean(flow[corners], axis=1)
+    force = -jax.vmap(jax.grad(air.dissipation))(relative, area_normals(mesh, x))
+    share = force[:, None] / corners.shape[1]
+    return jnp.zeros_like(x).at[corners].add(share)

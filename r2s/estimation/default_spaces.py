@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 from r2s.materials import prior
+from r2s.materials.nonlinear_spaces import SOFTENING, SofteningSpace, StiffeningSpace, stiffens
 from r2s.materials.parameters import (
     LOSSES,
     IsotropicSpace,
@@ -16,8 +17,6 @@ from r2s.materials.parameters import (
     ParameterSpace,
     Range,
 )
-from r2s.materials.softening_space import SOFTENING, SofteningSpace
-from r2s.materials.stiffening_space import StiffeningSpace, stiffens
 from r2s.recordings.recording import Recording
 
 Law = Literal["linear", "stiffening", "softening", "stiffening+softening"]

@@ -36,7 +36,7 @@ from r2s.estimation.prediction import (
 )
 from r2s.estimation.problem import Problem, Problems, motion_alone
 from r2s.estimation.standard_errors import equations
-from r2s.materials.informed_space import InformedSpace
+from r2s.materials.parameters import InformedSpace
 from r2s.mesh.surface import nearest
 from r2s.scenarios.resolution import ORDER
 

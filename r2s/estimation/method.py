@@ -19,8 +19,7 @@ from jaxtyping import PRNGKeyArray
 
 from r2s.estimation.default_spaces import on_cloth, on_points
 from r2s.estimation.estimate import Estimate
-from r2s.materials.informed_space import InformedSpace
-from r2s.materials.parameters import ParameterSpace
+from r2s.materials.parameters import InformedSpace, ParameterSpace
 from r2s.recordings.recording import Recording
 
 SOLVERS = ("cloth", "points")

@@ -27,8 +27,7 @@ from r2s.estimation.method import Progress, tell
 from r2s.laboratory.bending import Cantilever, Drape, overhang
 from r2s.laboratory.pull import Pull
 from r2s.materials.fabric import Fabric
-from r2s.materials.informed_space import InformedSpace
-from r2s.materials.parameters import UNIFORM_DEVIATION, ParameterSpace
+from r2s.materials.parameters import UNIFORM_DEVIATION, InformedSpace, ParameterSpace
 
 Test = Pull | Cantilever | Drape
 

@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from r2s.materials.fabric import Fabric
-from r2s.materials.membrane import MembraneLaw
-from r2s.materials.turned import turned
+from r2s.materials.membrane import MembraneLaw, turned
 
 SAMPLES = 24  # of a curve, evenly over its stretch
 SPECIMEN = 0.05  # relative, by which specimens of a fabric differ (standard deviation)

@@ -1,11 +1,13 @@
 """Fabric: what an estimator estimates. Presets with provenance are in `r2s.materials.presets`."""
 
+import math
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from r2s._util.units import GRAVITY
 from r2s.materials.membrane import OrthotropicMembrane
 from r2s.materials.plate import PlateBending
 
@@ -87,3 +89,22 @@ def constant_laws(fabric: Fabric) -> tuple[OrthotropicMembrane, PlateBending]:
             f"{type(membrane).__name__} and {type(bending).__name__}"
         )
     return membrane, bending
+
+
+DIRECTIONS = (0.0, math.pi / 4, math.pi / 2, 3 * math.pi / 4)  # of bending, from the warp [rad]
+
+
+def fold_length(fabric: Fabric) -> Float[Array, ""]:
+    """The gravito-bending length [m], at which a fabric bends under its own weight.
+
+    It is (bending / (density g))^(1/3), with the mean stiffness over four directions: Peirce's
+    bending length (Journal of the Textile Institute 21, 1930). A strip of that length, held at one
+    end, sags by an eighth of it. Longer cells cannot take the folds of a sheet, which then moves
+    otherwise than a fine one (`docs/solvers.md` says by how much).
+
+    >>> from r2s.materials import presets
+    >>> round(float(1e3 * fold_length(presets.grey_interlock())), 1)  # [mm]
+    14.3
+    """
+    along = jnp.stack([fabric.bending.stiffness_along(angle) for angle in DIRECTIONS])
+    return (jnp.mean(along) / (fabric.density * GRAVITY)) ** (1 / 3)

@@ -18,9 +18,8 @@ from jaxtyping import PRNGKeyArray
 
 from r2s.materials import presets
 from r2s.materials.fabric import Fabric
-from r2s.materials.informed_space import InformedSpace
 from r2s.materials.membrane import OrthotropicMembrane
-from r2s.materials.parameters import ParameterSpace
+from r2s.materials.parameters import InformedSpace, ParameterSpace
 from r2s.materials.plate import PlateBending
 
 BENDING, EXPONENT, SPREAD = -9.197, 1.230, 0.80  # of the logarithms

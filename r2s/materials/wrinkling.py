@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from r2s._util.once import once
+from r2s._util.arrays import once
 from r2s.materials.bending import BendingLaw
 from r2s.materials.membrane import MembraneLaw, stress_and_tangent
 from r2s.materials.wrinkle_limits import (

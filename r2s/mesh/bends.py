@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from r2s._util.once import once
+from r2s._util.arrays import once
 
 Positions = Float[Array, "vertex 3"]
 

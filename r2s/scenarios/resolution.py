@@ -12,8 +12,7 @@ import math
 import numpy as np
 
 from r2s.compilation import compile_once
-from r2s.materials.fabric import Fabric
-from r2s.materials.fold_length import fold_length
+from r2s.materials.fabric import Fabric, fold_length
 from r2s.scenarios.scenario import Scenario
 from r2s.scenarios.standard import SIDE
 from r2s.solvers.explicit.cloth import ExplicitCloth

@@ -15,7 +15,7 @@ from r2s.environment.air import Air, Fan
 from r2s.environment.contact import Table
 from r2s.environment.scene import Control, Scene, along_path
 from r2s.materials.fabric import Fabric
-from r2s.materials.turned import TurnedMembrane
+from r2s.materials.membrane import TurnedMembrane
 from r2s.mesh.mesh import Mesh, corner, rectangle
 from r2s.mesh.mesh import resized as resized_mesh
 from r2s.recordings.recording import Recording, SheetPlacement

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from r2s._util.memory import planned
-from r2s._util.traced import is_traced
+from r2s._util.arrays import is_traced
+from r2s._util.threads import planned
 from r2s.environment.scene import Control
 from r2s.solvers.failures import Failure, describe, first_failure, no_failure
 from r2s.solvers.implicit.newton import SAVED

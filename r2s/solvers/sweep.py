@@ -21,7 +21,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from r2s._util.files import write_bytes
-from r2s._util.memory import check, planned
+from r2s._util.threads import check, planned
 
 AXIS = "member"
 

@@ -29,7 +29,7 @@ from r2s.estimation.method import default_space  # noqa: E402
 from r2s.estimation.methods import METHODS  # noqa: E402
 from r2s.materials import presets  # noqa: E402
 from r2s.materials.arcsim import read_material  # noqa: E402
-from r2s.materials.informed_space import InformedSpace  # noqa: E402
+from r2s.materials.parameters import InformedSpace  # noqa: E402
 from r2s.recordings.open import load_trajectory  # noqa: E402
 from r2s.recordings.recording import load, save  # noqa: E402
 
@@ -154,7 +154,7 @@ def test_a_number_of_frames_is_whole(frames: str) -> None:
 
 
 def test_a_mesh_that_does_not_fit_memory_is_refused(monkeypatch) -> None:
-    monkeypatch.setattr("r2s._util.memory.available", lambda: 10**9)
+    monkeypatch.setattr("r2s._util.threads.available", lambda: 10**9)
     fabric = presets.grey_interlock()
     with pytest.raises(MemoryError, match="3000 x 3000 needs .* take a coarser one"):
         choose_shape((3000, 3000), fabric, (0.3, 0.3), "lifting")

@@ -27,8 +27,7 @@ from r2s.estimation.method import Budget
 from r2s.estimation.prediction import derivatives_at, theta_length
 from r2s.estimation.problem import Force, NuisancePrior, Problem
 from r2s.materials import presets
-from r2s.materials.informed_space import InformedSpace
-from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace
+from r2s.materials.parameters import InformedSpace, IsotropicSpace, OrthotropicSpace
 from r2s.scenarios import resolution, synthetic
 
 EXACT = NuisancePrior(0.0, 0.0)

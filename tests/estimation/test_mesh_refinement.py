@@ -19,8 +19,7 @@ from r2s.estimation.methods import DiffCloud
 from r2s.estimation.prediction import derivatives_at, theta_length
 from r2s.estimation.problem import NuisancePrior, Problem
 from r2s.materials import presets
-from r2s.materials.informed_space import InformedSpace
-from r2s.materials.parameters import IsotropicSpace
+from r2s.materials.parameters import InformedSpace, IsotropicSpace
 from r2s.scenarios import resolution, synthetic
 
 EXACT = NuisancePrior(0.0, 0.0)

@@ -11,8 +11,7 @@ import pytest
 from r2s.estimation.pinn.network import Network, T, X, Y
 from r2s.estimation.pinn.weak_form import green_strain, nominal_stress, small_strain
 from r2s.materials.fabric import Fabric
-from r2s.materials.membrane import OrthotropicMembrane
-from r2s.materials.turned import TurnedMembrane, turned
+from r2s.materials.membrane import OrthotropicMembrane, TurnedMembrane, turned
 from r2s.mesh.mesh import rectangle
 
 FABRIC = Fabric.make(0.3, (200.0, 40.0, 120.0, 30.0), 1e-5, damping=0.02)

@@ -26,9 +26,13 @@ from r2s.estimation.standard_errors import (
     to_small_strain,
 )
 from r2s.materials import presets
-from r2s.materials.informed_space import InformedSpace
-from r2s.materials.parameters import UNIFORM_DEVIATION, OrthotropicSpace, ParameterSpace
-from r2s.materials.stiffening_space import StiffeningSpace
+from r2s.materials.nonlinear_spaces import StiffeningSpace
+from r2s.materials.parameters import (
+    UNIFORM_DEVIATION,
+    InformedSpace,
+    OrthotropicSpace,
+    ParameterSpace,
+)
 from r2s.scenarios import stretching, synthetic
 
 FABRIC = presets.grey_interlock()

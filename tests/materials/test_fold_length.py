@@ -8,8 +8,7 @@ from elastica import elastica
 
 from r2s._util.units import GRAVITY
 from r2s.materials import presets
-from r2s.materials.fabric import Fabric
-from r2s.materials.fold_length import fold_length
+from r2s.materials.fabric import Fabric, fold_length
 
 
 def test_a_strip_of_this_length_sags_by_an_eighth_of_it():

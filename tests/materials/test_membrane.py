@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from r2s._util.units import isotropic_bending, isotropic_membrane
 from r2s.materials.membrane import OrthotropicMembrane
-from r2s.mesh.elements import strains
-from r2s.mesh.strain_samples import deformation_gradient
+from r2s.mesh.strain_samples import deformation_gradient, strains
 
 few = settings(max_examples=25, deadline=None)
 UNIFORM = {  # warp and weft images in the plane

@@ -9,10 +9,9 @@ import pytest
 from r2s.estimation.default_spaces import on_cloth, with_law
 from r2s.materials import presets, prior
 from r2s.materials.membrane import OrthotropicMembrane
+from r2s.materials.nonlinear_spaces import SofteningSpace, StiffeningSpace
 from r2s.materials.plate import PlateBending
-from r2s.materials.softening_space import SofteningSpace
 from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
-from r2s.materials.stiffening_space import StiffeningSpace
 from r2s.scenarios.standard import draw
 
 

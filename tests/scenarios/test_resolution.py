@@ -9,7 +9,7 @@ from folders import ROOT
 from scipy.stats import gmean
 
 from r2s.materials import presets
-from r2s.materials.fold_length import fold_length
+from r2s.materials.fabric import fold_length
 from r2s.scenarios import resolution
 from r2s.scenarios.resolution import (
     ENOUGH,

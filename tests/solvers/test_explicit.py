@@ -11,9 +11,8 @@ from conftest import cloth, flat, step
 
 import r2s
 from r2s._util.units import GRAVITY
-from r2s.environment.air import Air, Fan
+from r2s.environment.air import Air, Fan, drag_on_vertices
 from r2s.environment.contact import Table
-from r2s.environment.drag import drag_on_vertices
 from r2s.environment.scene import Control, Scene
 from r2s.materials.plate import PlateBending
 from r2s.scenarios.energy import stored_energy
@@ -22,8 +21,7 @@ from r2s.solvers.explicit.elements import bending_force, membrane_force, membran
 from r2s.solvers.explicit.grid import grid_force, laws_on_grid
 from r2s.solvers.explicit.grid_membrane import Samples
 from r2s.solvers.explicit.layout import Layout
-from r2s.solvers.explicit.stability import SAFETY, longest_relaxing_step
-from r2s.solvers.explicit.viscosity import Viscosity
+from r2s.solvers.explicit.stability import SAFETY, Viscosity, longest_relaxing_step
 from r2s.solvers.failures import Failure
 
 

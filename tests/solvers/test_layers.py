@@ -15,13 +15,13 @@ from r2s.environment.contact import Table, pressure
 from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric
 from r2s.mesh.mesh import Mesh, rectangle
+from r2s.solvers.contact import contacts
 from r2s.solvers.contact import contacts as contact
-from r2s.solvers.contact import detection
 from r2s.solvers.contact.broad_phase import BVH, Pairs, build_bvh
-from r2s.solvers.contact.detection import SelfContact
+from r2s.solvers.contact.contacts import SelfContact
 from r2s.solvers.failures import Failure
 from r2s.solvers.implicit.cloth import Cloth
-from r2s.solvers.implicit.linear.elimination import Elimination
+from r2s.solvers.implicit.linear.system import Elimination
 from r2s.solvers.simulate import simulate
 
 FABRIC = Fabric.make(0.2, (60.0, 10.0, 60.0, 20.0), 1e-5)
@@ -29,7 +29,7 @@ THICKNESS, RATE = jnp.asarray(1e-3), jnp.asarray(100.0)
 SIZE = 0.2  # [m]
 
 # compiled as a whole, which is quicker than operation by operation
-touching, colliding = eqx.filter_jit(detection.touching), eqx.filter_jit(detection.colliding)
+touching, colliding = eqx.filter_jit(contacts.touching), eqx.filter_jit(contacts.colliding)
 contact_energy = eqx.filter_jit(contact.contact_energy)
 contact_hessians = eqx.filter_jit(contact.contact_hessians)
 

@@ -10,11 +10,10 @@ import scipy.spatial
 from conftest import dense
 
 from r2s.mesh.mesh import Mesh, rectangle
-from r2s.solvers.implicit.linear.band import Band
 from r2s.solvers.implicit.linear.dissection import levels
-from r2s.solvers.implicit.linear.elimination import Elimination
-from r2s.solvers.implicit.linear.factor import factor, solve
+from r2s.solvers.implicit.linear.factor import Band, factor, solve
 from r2s.solvers.implicit.linear.pattern import Pattern, assemble, pinned, product
+from r2s.solvers.implicit.linear.system import Elimination
 
 # compiled once for each mesh, for all tests
 factored = jax.jit(factor, static_argnames="is_definite")

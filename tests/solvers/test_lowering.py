@@ -9,7 +9,7 @@ import pytest
 
 import r2s
 from r2s.materials import presets
-from r2s.solvers.implicit.linear.elimination import Elimination
+from r2s.solvers.implicit.linear.system import Elimination
 from r2s.solvers.mpm import Grid
 from r2s.solvers.mpm.sheet import Sheet
 

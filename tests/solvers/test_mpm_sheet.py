@@ -17,7 +17,7 @@ from r2s.environment.contact import Table
 from r2s.environment.scene import Control, Scene
 from r2s.materials.bending import HingeBending
 from r2s.materials.fabric import Fabric
-from r2s.mesh.elements import vertex_masses
+from r2s.mesh.strain_samples import vertex_masses
 from r2s.scenarios.energy import stored_energy
 from r2s.solvers.explicit.elements import (
     bending_force,
@@ -28,8 +28,7 @@ from r2s.solvers.explicit.elements import (
 )
 from r2s.solvers.failures import Failure
 from r2s.solvers.mpm import Grid, Sheet
-from r2s.solvers.mpm.sheet import stable_step
-from r2s.solvers.mpm.transverse import Transverse, unit_normal
+from r2s.solvers.mpm.sheet import Transverse, stable_step, unit_normal
 
 SPACING = 0.05
 

@@ -43,11 +43,11 @@ def test_a_chunk_that_does_not_fit_memory_is_refused_before_it_runs(monkeypatch)
         jax.debug.callback(lambda: calls.append(1))
         return jnp.outer(member["a"] + jnp.arange(1000.0), jnp.arange(1000.0)).sum(0)
 
-    monkeypatch.setattr("r2s._util.memory.available", lambda: 10_000)
+    monkeypatch.setattr("r2s._util.threads.available", lambda: 10_000)
     with pytest.raises(MemoryError, match=r"a chunk of 4 members needs .* GB.*below 4"):
         sweep(counted, members_of(8), chunk=4)
     assert not calls
-    monkeypatch.setattr("r2s._util.memory.available", lambda: None)  # nobody says
+    monkeypatch.setattr("r2s._util.threads.available", lambda: None)  # nobody says
     assert sweep(counted, members_of(8), chunk=4).shape == (8, 1000)
     assert len(calls) == 2  # once a chunk
 

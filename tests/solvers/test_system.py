@@ -7,8 +7,7 @@ import pytest
 from conftest import dense
 
 from r2s.mesh.mesh import rectangle
-from r2s.solvers.implicit.linear.elimination import Elimination
-from r2s.solvers.implicit.linear.system import Far, apply_inverse, prepare
+from r2s.solvers.implicit.linear.system import Elimination, Far, apply_inverse, prepare
 
 MESH = rectangle((1.0, 1.0), (6, 6))
 COUNT = 36

@@ -23,7 +23,7 @@ from r2s.environment.contact import friction_dissipation
 from r2s.estimation.pinn.network import DisplacementField, Jet, Pairs, T, X, Y
 from r2s.estimation.pinn.pulls import Pull
 from r2s.materials.fabric import Fabric
-from r2s.materials.turned import TurnedMembrane
+from r2s.materials.membrane import TurnedMembrane
 
 EDGE_NODES = 6  # of Gauss's quadrature along a clamp
 NODES = 12  # of the quadrature along each side

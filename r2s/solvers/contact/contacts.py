@@ -11,10 +11,20 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from r2s.environment import contact
-from r2s.solvers.contact.proximity import separation
+from r2s.mesh.mesh import Mesh
+from r2s.solvers.contact.broad_phase import (
+    BVH,
+    Pairs,
+    all_pairs,
+    build_bvh,
+    candidate_pairs,
+    candidate_pairs_in_tree,
+)
+from r2s.solvers.contact.proximity import closest_weights, separation, time_of_impact
 
 Positions = Float[Array, "vertex 3"]
 
@@ -85,3 +95,154 @@ def _energy_apart(thickness, rate, apart, anchor, normal, area, limit):
     slip = velocity - (velocity @ normal) * normal
     pressed = area * contact.normal_potential(depth)
     return pressed + contact.friction_dissipation(limit, slip) / rate
+
+
+WATCHED = 1.5  # thicknesses, up to which places that are close at the start of a step touch
+CLOSEST = 0.1  # thicknesses, below which a step may not bring any two places
+SMALL = 400  # vertices, up to which every pair is looked at, and a matrix couples all
+
+
+class SelfContact(eqx.Module):
+    """How contacts of a sheet with itself are found.
+
+    - `search`: the pairs of its vertices and triangles, and of its edges, that may meet; of a large
+      mesh, a tree in which to find them.
+    - `capacity`: how many contacts a step may have; four times as many pairs may be near each
+      other. A step that needs more is NaN.
+    """
+
+    search: Pairs | BVH
+    capacity: int = eqx.field(static=True)
+
+    @classmethod
+    def make(cls, mesh: Mesh, capacity: int | None = None) -> "SelfContact":
+        """The search for contacts of a mesh.
+
+        The capacity is by default 512, or 24 for each vertex if that is more: what a sheet that is
+        folded flat needs. Up to 400 vertices every pair of places is looked at in each step.
+        """
+        count, faces = mesh.rest.shape[0], np.asarray(mesh.faces)
+        capacity = max(512, 24 * count) if capacity is None else capacity
+        if count <= SMALL:
+            return cls(all_pairs(faces), capacity)
+        return cls(build_bvh(faces, np.asarray(mesh.rest)), capacity)
+
+    def candidates(
+        self, start: Positions, end: Positions, reach: Float[Array, ""]
+    ) -> tuple[Pairs, Bool[Array, ""]]:
+        """The pairs that may come within `reach` [m] in a straight motion; if there are more."""
+        # the boxes around neighbouring parts of a flat sheet overlap: 8 pairs for each vertex
+        capacity = 4 * self.capacity
+        if isinstance(self.search, Pairs):
+            return candidate_pairs(self.search, start, end, reach, capacity)
+        return candidate_pairs_in_tree(self.search, start, end, reach, capacity, 2 * capacity)
+
+
+def touching(
+    self_contact: SelfContact,
+    mesh: Mesh,
+    thickness: Float[Array, ""],
+    friction: Float[Array, ""],
+    x: Positions,
+) -> tuple[Contacts, Bool[Array, ""]]:
+    """The contacts of places that are close to each other, and whether the capacity sufficed."""
+    reach = WATCHED * thickness
+    found, overflow = self_contact.candidates(x, x, reach)
+    corners = x[found.stencils]
+    weights, normals, distance = jax.vmap(_plane)(corners, found.is_edges)
+    is_close = found.is_real & (distance < reach)
+    area = _area(mesh, found.stencils)
+    depth = jnp.maximum(thickness - distance, 0)
+    limit = friction * area * contact.pressure(depth)
+    empty = _empty(self_contact.capacity, x)
+    contacts = _append(empty, is_close, found.stencils, weights, normals, area, limit)
+    return contacts, ~overflow & (contacts.count <= self_contact.capacity)
+
+
+def colliding(
+    self_contact: SelfContact,
+    mesh: Mesh,
+    thickness: Float[Array, ""],
+    before: Positions,
+    after: Positions,
+    contacts: Contacts,
+) -> tuple[Contacts, Bool[Array, ""], Bool[Array, ""]]:
+    """The contacts and those that the motion from `before` to `after` lacks; whether it lacks
+    none; whether the capacity sufficed.
+    """
+    gap = CLOSEST * thickness
+    drift = jnp.mean(after - before, axis=0)  # no pair comes closer by what all have in common
+    found, overflow = self_contact.candidates(before, after - drift[None], gap)
+    start, end = before[found.stencils], after[found.stencils]
+    impact = jax.vmap(time_of_impact, in_axes=(0, 0, 0, None))
+    times = jax.lax.stop_gradient(impact(start, end, found.is_edges, gap))
+    is_hit = found.is_real & jnp.isfinite(times)
+    times = jnp.where(is_hit, times, 0)
+    refine = jax.vmap(_refined, in_axes=(0, 0, 0, 0, None))
+    at = refine(times, start, end, found.is_edges, gap)[:, None, None]
+    weights, normals, _ = jax.vmap(_plane)(start + at * (end - start), found.is_edges)
+    area = _area(mesh, found.stencils)
+    more = _append(contacts, is_hit, found.stencils, weights, normals, area, jnp.zeros_like(area))
+    return more, ~jnp.any(is_hit), ~overflow & (more.count <= self_contact.capacity)
+
+
+def _refined(time, start, end, is_edges, gap):
+    """A time of impact, which is known to 1 % of the gap, made exact by Newton's method.
+
+    Two steps, so that it also has the derivative of the exact time. Not for a pair that was too
+    close from the start, nor for one that only grazes.
+    """
+
+    def distance(t):
+        return _plane(start + t * (end - start), is_edges)[2]
+
+    exact = time
+    for _ in range(2):
+        error, rate = jax.jvp(distance, (exact,), (jnp.ones_like(exact),))
+        approaches = (time > 0) & (rate < -gap)  # else it would take longer than the step
+        step = (error - gap) / jnp.where(approaches, rate, 1)
+        exact = jnp.where(approaches, jnp.clip(exact - step, 0, 1), exact)
+    return exact
+
+
+def _plane(corners, is_edges):
+    """Weights, normal and distance [m] of the closest points of a pair."""
+    weights = closest_weights(corners, is_edges)
+    between = separation(corners, weights)
+    squared = jnp.sum(between**2)
+    distance = jnp.sqrt(jnp.where(squared > 0, squared, 1))  # safe where two places coincide
+    return weights, between / distance, jnp.where(squared > 0, distance, 0)
+
+
+def _area(mesh: Mesh, stencils: Int[Array, "pair 4"]) -> Float[Array, " pair"]:
+    return jnp.mean(mesh.vertex_area[stencils], axis=1)
+
+
+def _empty(capacity: int, x: Positions) -> Contacts:
+    return Contacts(
+        stencils=jnp.zeros((capacity, 4), int),
+        weights=jnp.zeros((capacity, 4), x.dtype),
+        normals=jnp.zeros((capacity, 3), x.dtype),
+        area=jnp.zeros(capacity, x.dtype),
+        limit=jnp.zeros(capacity, x.dtype),
+        count=jnp.zeros((), int),
+    )
+
+
+def _append(contacts: Contacts, chosen: Bool[Array, " pair"], *columns: Array) -> Contacts:
+    """The contacts with the chosen rows of others after them, as far as there is room."""
+    places = contacts.count + jnp.cumsum(chosen) - 1
+    places = jnp.where(chosen, places, contacts.area.shape[0])  # out of bounds is dropped
+
+    def put(column, values):
+        return column.at[places].set(values, mode="drop")
+
+    stencils, weights, normals, area, limit = columns
+    return Contacts(
+        stencils=put(contacts.stencils, stencils),
+        weights=put(contacts.weights, weights),
+        normals=put(contacts.normals, normals),
+        area=put(contacts.area, area),
+        limit=put(contacts.limit, limit),
+        count=contacts.count + jnp.sum(chosen),
+    )

@@ -16,14 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from r2s._util.traced import is_traced
+from r2s._util.arrays import is_traced
 from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric
 from r2s.materials.plate import PlateLaw
 from r2s.mesh.mesh import Mesh
 from r2s.solvers.explicit import elements
-from r2s.solvers.explicit.batch_last import batch_last
-from r2s.solvers.explicit.layout import Layout
+from r2s.solvers.explicit.elements import moved_velocity
+from r2s.solvers.explicit.layout import Layout, batch_last
 from r2s.solvers.explicit.sheet import (
     Cells,
     ForceInputs,
@@ -34,10 +34,8 @@ from r2s.solvers.explicit.sheet import (
     remembered,
     slices,
 )
-from r2s.solvers.explicit.stability import check_step, longest_relaxing_step
-from r2s.solvers.explicit.viscosity import RELAXATION, Viscosity
+from r2s.solvers.explicit.stability import RELAXATION, Viscosity, check_step, longest_relaxing_step
 from r2s.solvers.failures import Failure, all_finite, first_failure, no_failure
-from r2s.solvers.implicit.substep import moved_velocity
 
 Positions = Float[Array, "vertex 3"]
 OfSamples = Float[Array, "element sample 3"]

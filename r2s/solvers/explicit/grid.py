@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from r2s._util.once import once
+from r2s._util.arrays import once
 from r2s.environment.air import STILL, Air
 from r2s.materials.fabric import Fabric
 from r2s.mesh.vectors import Vector, add, cross, dot, scale, subtract
@@ -18,7 +18,7 @@ from r2s.solvers.explicit.grid_bending import bending_force, twists
 from r2s.solvers.explicit.grid_membrane import Samples, membrane_force
 from r2s.solvers.explicit.laws import Response, critical_stress, response
 from r2s.solvers.explicit.layout import Layout, is_cell, part
-from r2s.solvers.explicit.viscosity import Viscosity
+from r2s.solvers.explicit.stability import Viscosity
 
 
 class GridLaws(NamedTuple):

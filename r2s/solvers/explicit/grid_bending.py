@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from r2s._util.once import once
+from r2s._util.arrays import once
 from r2s.mesh.vectors import Vector, add, cross, dot, scale, subtract
 from r2s.solvers.explicit.layout import Layout, is_cell, part
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from r2s._util.once import once
+from r2s._util.arrays import once
 from r2s.materials.wrinkling import Prepared, follow, relieved
 from r2s.mesh.strain_samples import GAUSS
 from r2s.mesh.vectors import Vector, add, dot, scale, subtract
@@ -26,7 +26,7 @@ Corners = tuple[Vector, Vector, Vector, Vector]
 class Samples(NamedTuple):
     """What the samples remember of the substep before, in a row.
 
-    - `relaxed`: stress (`r2s.solvers.explicit.viscosity`), [N/m].
+    - `relaxed`: stress (`r2s.solvers.explicit.stability`), [N/m].
     - `hidden`: scaled wrinkles; None: the mesh has none.
     """
 

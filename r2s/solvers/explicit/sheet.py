@@ -12,19 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r2s._util.once import once
-from r2s.environment.air import Air, Fan
-from r2s.environment.drag import drag_on_vertices
+from r2s._util.arrays import once
+from r2s.environment.air import Air, Fan, drag_on_vertices
 from r2s.materials.fabric import Fabric
 from r2s.materials.plate import PlateLaw
 from r2s.mesh.mesh import Mesh
 from r2s.mesh.vectors import Vector
-from r2s.solvers.explicit.batch_last import batch_last
 from r2s.solvers.explicit.elements import bending_force, membrane_force, membrane_stress
 from r2s.solvers.explicit.grid import grid_force, laws_on_grid
 from r2s.solvers.explicit.grid_membrane import Samples
-from r2s.solvers.explicit.layout import Layout
-from r2s.solvers.explicit.viscosity import Viscosity
+from r2s.solvers.explicit.layout import Layout, batch_last
+from r2s.solvers.explicit.stability import Viscosity
 
 Vertices = Float[Array, "vertex 3"]
 Cells = tuple[tuple[int, int], tuple[float, float]]
@@ -33,7 +31,7 @@ Cells = tuple[tuple[int, int], tuple[float, float]]
 class Memory(NamedTuple):
     """What the samples of a membrane remember of the substep before.
 
-    - `relaxed`: stress (`r2s.solvers.explicit.viscosity`), [N/m].
+    - `relaxed`: stress (`r2s.solvers.explicit.stability`), [N/m].
     - `hidden`: scaled wrinkles; None: the mesh has none, or is no grid.
     - `begun`: whether there was a substep.
     """

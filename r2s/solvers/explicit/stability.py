@@ -1,6 +1,7 @@
 """How long an explicit step may be."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -56,3 +57,30 @@ def check_step(dt: float, longest: Float[Array, ""], material: str) -> None:
             f"the step is limited by {material} to {limit:.4g} s, got dt = {dt:.4g} s: take a "
             "shorter step, a coarser mesh or grid, a softer or heavier material, or less damping"
         )
+
+
+RELAXATION = 2e-3  # [s]: docs/solvers.md says what motions differ by
+
+
+class Viscosity(NamedTuple):
+    """Of substeps of one length, all dimensionless.
+
+    - `share`: viscous stress over what the elastic stress is ahead.
+    - `rate`: of that, which is caught up in a substep.
+    """
+
+    share: Array
+    rate: Array
+
+    @classmethod
+    def make(cls, damping: Array, relaxation: Array, dt: Array) -> "Viscosity":
+        """From times, [s]. Without relaxation it is Kelvin's and Voigt's, a substep behind."""
+        return cls(damping / (relaxation + dt), dt / (relaxation + dt))
+
+    def resist(self, stress: Array, relaxed: Array, begun: Array) -> tuple[Array, Array]:
+        """Stress with viscosity, and the relaxed stress after the substep, [N/m].
+
+        Where a motion has not `begun`, nothing has changed so far.
+        """
+        ahead = jnp.where(begun, stress - relaxed, 0)
+        return stress + self.share * ahead, stress + (self.rate - 1) * ahead

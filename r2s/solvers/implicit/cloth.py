@@ -17,12 +17,12 @@ from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric
 from r2s.materials.wrinkling import membrane_on_samples, tangents_on_samples
 from r2s.mesh.bends import unwrapped
-from r2s.mesh.elements import area_normals
 from r2s.mesh.mesh import Mesh
-from r2s.solvers.contact.detection import SMALL, SelfContact, colliding, touching
+from r2s.mesh.strain_samples import area_normals
+from r2s.solvers.contact.contacts import SMALL, SelfContact, colliding, touching
 from r2s.solvers.failures import Failure, first_failure, no_failure
 from r2s.solvers.implicit.generalised_alpha import by_generalised_alpha, rates_after
-from r2s.solvers.implicit.linear.elimination import Elimination
+from r2s.solvers.implicit.linear.system import Elimination
 from r2s.solvers.implicit.newton import minimise
 from r2s.solvers.implicit.potential import IncrementalPotential, residual
 

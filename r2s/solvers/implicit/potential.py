@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from r2s._util.once import once
+from r2s._util.arrays import once
 from r2s._util.units import GRAVITY
 from r2s.environment import contact
 from r2s.environment.air import Air
@@ -40,9 +40,8 @@ from r2s.mesh.bends import unwrapped
 from r2s.mesh.mesh import Mesh
 from r2s.mesh.strain_samples import on_samples
 from r2s.solvers.contact.contacts import Contacts, contact_energy, contact_hessians
-from r2s.solvers.implicit.linear.elimination import Elimination
 from r2s.solvers.implicit.linear.pattern import add_between, add_elements, assemble
-from r2s.solvers.implicit.linear.system import Far
+from r2s.solvers.implicit.linear.system import Elimination, Far
 
 Positions = Float[Array, "vertex 3"]
 Blocks = Float[Array, "block 3 3"]

@@ -17,7 +17,7 @@ from r2s.mesh.mesh import Mesh
 from r2s.solvers.explicit.stability import check_step, longest_step
 from r2s.solvers.failures import first_failure, no_failure
 from r2s.solvers.mpm.background import Background, Held
-from r2s.solvers.mpm.stability import failure_of_step
+from r2s.solvers.mpm.grid import failure_of_step
 from r2s.solvers.mpm.transfer import affine_factor
 
 Points = Float[Array, "particle axis"]

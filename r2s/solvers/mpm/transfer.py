@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from r2s._util.once import once
+from r2s._util.arrays import once
 from r2s.solvers.mpm.grid import Grid
 
 Points = Float[Array, "particle axis"]

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 
 def once(function: Callable, *arguments: Any) -> Any:
@@ -27,3 +28,8 @@ def once(function: Callable, *arguments: Any) -> Any:
         lambda: function(*arguments),
         lambda: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes),
     )
+
+
+def is_traced(*trees: Any) -> bool:
+    """Whether some array of some pytrees is traced, so that its numbers are not known."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
