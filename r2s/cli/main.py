@@ -19,16 +19,10 @@ except ImportError:
 
 from r2s import compilation
 from r2s._util.threads import leave
-from r2s.cli.check import Check
-from r2s.cli.check_grad import CheckGrad
-from r2s.cli.data import Data
-from r2s.cli.doctor import Doctor
+from r2s.cli.checks import CheckGrad, Doctor
 from r2s.cli.estimate import EstimateCard
-from r2s.cli.evaluate import Evaluate
-from r2s.cli.export import Export
-from r2s.cli.sensitivity import Sensitivity
-from r2s.cli.show import Show
-from r2s.cli.simulate import Simulate
+from r2s.cli.motions import Evaluate, Export, Sensitivity, Simulate
+from r2s.cli.recordings import Check, Data, Show
 from r2s.cli.study import Study
 from r2s.cli.view import View
 from r2s.study.engine import one_thread

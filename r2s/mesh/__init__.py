@@ -1,9 +1,9 @@
 """The geometry of a sheet, apart from what it is made of.
 
 - `mesh`: the rest shape, in material coordinates.
-- `strain_samples`: where its strain is taken, in triangles or quadrilaterals.
+- `strain_samples`: where its strain is taken, in triangles or quadrilaterals; strains, normals and
+  masses of a moved sheet.
 - `bends`, `plate_elements`: where its curvature is taken, angles first.
-- `elements`: strains, normals and masses of a moved sheet.
 - `vectors`: vectors and small matrices as tuples of arrays.
 - `surface`: points on a moved sheet, and the nearest one to a point in space.
 """

@@ -16,8 +16,8 @@ pytest.importorskip("tyro")
 
 from recorded_lift import recorded  # noqa: E402
 
+from r2s.cli.checks import EXCLUDED, implausible  # noqa: E402
 from r2s.cli.common import choose_shape, make_experiment, print_result  # noqa: E402
-from r2s.cli.doctor import EXCLUDED, implausible  # noqa: E402
 from r2s.cli.estimate import EstimateCard  # noqa: E402
 from r2s.cli.estimate_report import Outcome, approach, assumed  # noqa: E402
 from r2s.cli.main import main  # noqa: E402

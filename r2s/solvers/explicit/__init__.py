@@ -2,10 +2,10 @@
 
 - `cloth`: the solver, `init` and `step`.
 - `sheet`: all of them, from substep to substep.
-- `elements`: of membrane and bending on any mesh, and bounds on their frequencies.
-- `grid`: the same on the grid of a `rectangle`, by slices; `layout`: how its arrays lie.
-- `batch_last`: members of a batch side by side.
-- `viscosity`: of a membrane whose fast waves are not to shorten the steps; `stability`: how long
-  these may be.
+- `elements`: of membrane and bending on any mesh, bounds on their frequencies, and what a substep
+  does to a vertex.
+- `grid`, `grid_membrane`, `grid_bending`: the same on the grid of a `rectangle`, by slices;
+  `layout`: how its arrays lie, with a batch as the last axis.
+- `stability`: how long substeps may be; a viscosity of the membrane that does not shorten them.
 - `laws`: what the laws of one element say of arrays side by side.
 """

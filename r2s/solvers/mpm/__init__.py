@@ -1,11 +1,10 @@
 """The material point method: the second simulator, in 2-D and 3-D from one code.
 
-- `grid`: the nodes.
+- `grid`: the nodes, and why a motion failed.
 - `transfer`: from particles to the grid (`p2g`) and back (`g2p`).
 - `background`: gravity, table, walls and grippers at the nodes.
 - `block`: a solid body of particles (`r2s.materials.solid`).
-- `transverse`, `sheet`: a sheet of the same fabrics as `r2s.Cloth`.
-- `stability`: why a motion failed.
+- `sheet`: a sheet of the same fabrics as `r2s.Cloth`.
 """
 
 from r2s.solvers.mpm.background import Background

@@ -1,12 +1,70 @@
-"""`r2s data`: recordings, public ones and one's own."""
+"""Commands on recordings: `r2s check`, `r2s show` and `r2s data`."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
-from r2s.cli.common import Json
+from r2s.cli.common import Json, RecordingPath
+
+
+@dataclass(frozen=True)
+class Check:
+    """Say what is suspicious in a recording, each with the figure behind it.
+
+    Looks at the scale, gravity and table where the whole sheet is seen at rest, at how far points
+    are from the grippers, whether markers or the whole sheet stretch, the frames' times, how late
+    the top of the cloud follows the grippers, the number of points, outliers, and crops. What a
+    recording does not show is said to be not shown. Exit code 1 when something is suspicious.
+
+        r2s check recordings/lift_tan
+        r2s check lift.npz --json
+    """
+
+    recording: RecordingPath
+    json: Json = False
+
+    def run(self) -> int:
+        from r2s.cli.common import print_result
+        from r2s.recordings.checks import check
+        from r2s.recordings.open import open_recording
+
+        found = check(open_recording(self.recording))
+        suspicious = sum(each.is_suspicious for each in found)
+        content = {"suspicious": suspicious, "findings": [each._asdict() for each in found]}
+        total = f"{suspicious} of {len(found)} suspicious" if suspicious else "nothing suspicious"
+        print_result(self.json, content, [*(each.describe() for each in found), total])
+        return int(suspicious > 0)
+
+
+@dataclass(frozen=True)
+class Show:
+    """Draw a recording: a contact sheet (PNG) and a video of clouds, grippers and simulated cloth.
+
+    All panels have one scale, in metres. RECORDING is an NPZ of r2s, or a folder of frames with
+    its manifest.json beside it; without one, the manifest of DIFFCLOUD is taken.
+
+        r2s show recordings/lift_tan --out pictures
+        r2s show lift.npz --trajectory simulated.npz --out pictures --video gif
+    """
+
+    recording: RecordingPath
+    out: Annotated[Path, arg(metavar="FOLDER")]
+    """Where the pictures go; it is made when it is not there."""
+    trajectory: Annotated[Path | None, arg(metavar="FILE")] = None
+    """NPZ with x (frame, vertex, 3) [m], at the recording's frames, and faces (face, 3)."""
+    video: Literal["auto", "gif", "mp4", "none"] = "auto"
+    """auto: an MP4 where OpenCV is installed, else a GIF."""
+
+    def run(self) -> None:
+        from r2s.recordings.open import load_trajectory, open_recording
+        from r2s.viewer.pictures import show
+
+        cloth = None if self.trajectory is None else load_trajectory(self.trajectory)
+        for path in show(open_recording(self.recording), self.out, cloth, self.video):
+            print(path)
+
 
 Manifests = Annotated[
     Path | None,

@@ -1,0 +1,278 @@
+"""Commands on fabrics: `r2s simulate`, `sensitivity`, `evaluate` and `export`."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from r2s.cli.common import ChosenShape, FabricName, Json, Motion, Scenario, Shape
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """Simulate a fabric in one of the six scenarios, and write its motion as an NPZ.
+
+    The NPZ has x (frame, vertex, 3) [m] and faces (face, 3), as `r2s show --trajectory` reads it.
+    With --recording it is also seen by two depth cameras, with noise and outliers: a synthetic
+    recording to estimate from. Numbers of the motion are those of `r2s.scenarios.standard`, in SI
+    units.
+
+        r2s simulate lifting --fabric black_denim --motion height=0.3 --out lift.npz
+        r2s simulate fling --fabric mine.json --shape 33 33 --out x.npz --recording fling.npz
+    """
+
+    scenario: Scenario
+    out: Annotated[Path, arg(metavar="FILE")]
+    """NPZ of the motion."""
+    fabric: FabricName = "grey_interlock"
+    motion: Motion = ()
+    solver: Literal["cloth", "explicit", "points"] = "cloth"
+    """The implicit cloth, the cloth in explicit steps, or material points."""
+    shape: ChosenShape = None
+    self_contact: bool = False
+    """The sheet touches itself (cloth only; slower)."""
+    recording: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Also write a synthetic recording, as NPZ."""
+    seed: int = 0
+    """Seed of the recording's noise."""
+    json: Json = False
+
+    def run(self) -> int:
+        import jax
+        import numpy as np
+
+        from r2s import scenarios
+        from r2s._util.files import check_folders
+        from r2s.cli.common import choose_shape, load_card, make_experiment, print_result
+        from r2s.cli.waiting import Waiting
+        from r2s.compilation import compile_once
+        from r2s.recordings.open import save_trajectory
+        from r2s.recordings.recording import save
+        from r2s.scenarios import synthetic
+        from r2s.scenarios.scenario import rollout
+
+        check_folders(self.out, self.recording)
+        if self.self_contact and self.solver != "cloth":
+            raise ValueError(
+                "--self-contact is of the implicit cloth: explicit steps have none, and material "
+                "points touch through their grid"
+            )
+        card, experiment = load_card(self.fabric), make_experiment(self.scenario, self.motion)
+        fabric, size = card.fabric, experiment.sheet.size
+        shape, told, of_mesh = choose_shape(self.shape, fabric, size, self.scenario)
+        scenario = experiment.scenario(shape, self.self_contact)
+        make_solver = {
+            "cloth": None,
+            "explicit": scenarios.explicit_cloth,
+            "points": scenarios.material_points,
+        }[self.solver]
+        solver = None if make_solver is None else make_solver(scenario, fabric)
+        with Waiting("compiling the motion") as line:
+            moved = compile_once(rollout)
+            moved.prepare(scenario, fabric, solver=solver)
+            line.say(f"simulating {scenario.num_frames} frames")
+            motion = moved(scenario, fabric, solver=solver)
+            ok, failure = np.asarray(motion.ok), motion.explain()
+        save_trajectory(self.out, motion.x, scenario.scene.mesh.faces)
+        lines = [f"{self.out}: {len(ok)} frames of {motion.x.shape[1]} vertices", *of_mesh]
+        if failure:
+            lines.append(f"the simulation {failure}")
+        elif self.recording is not None:
+            with Waiting("recording the motion"):
+                made = synthetic.record(
+                    experiment,
+                    fabric,
+                    card.name,
+                    shape=shape,
+                    self_contact=self.self_contact,
+                    solver=make_solver,
+                    motion=motion,
+                    key=jax.random.key(self.seed),
+                )
+            save(made, self.recording)
+            lines.append(f"{self.recording}: {made.points.shape[1]} points a frame at most")
+        result = {
+            "scenario": self.scenario,
+            "fabric": card.name,
+            "solver": self.solver,
+            "frames": len(ok),
+            "vertices": int(motion.x.shape[1]),
+            **told,
+            "interval_s": scenario.interval,
+            "diverged_in_frame": int(np.argmin(ok)) if failure else None,
+            "failure": failure or None,
+            "out": self.out,
+            "recording": self.recording,
+        }
+        print_result(self.json, result, lines)
+        return 1 if failure else 0
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """Say what a planned motion would reveal of a fabric, before anybody makes it.
+
+    Simulates the motion with a preset that is like the fabric, as seen by two depth cameras, and
+    prints how well each parameter would be known, and which combinations where one is not.
+    Numbers of the motion are those of `r2s.scenarios.standard`, in SI units.
+
+        r2s sensitivity lifting --fabric black_denim --motion height=0.3 moving=2
+        r2s sensitivity wind --fabric grey_interlock --motion speed=3 --noise 0.002
+    """
+
+    scenario: Scenario
+    fabric: str = "grey_interlock"
+    """A preset of `r2s.materials.presets`."""
+    motion: Motion = ()
+    noise: float = 1e-3
+    """Standard deviation of each coordinate of a point [m]."""
+    seed: int = 0
+    """Seed of the noise."""
+    json: Json = False
+
+    def run(self) -> None:
+        from r2s.cli.common import mesh_warning, parse_numbers, print_result
+        from r2s.estimation.estimate import as_json, describe
+        from r2s.estimation.judgement import evaluate_design
+        from r2s.estimation.method import COARSEST
+        from r2s.scenarios.standard import SIDE
+
+        numbers = parse_numbers(self.motion)
+        found = evaluate_design(self.scenario, self.fabric, numbers, self.noise, self.seed)
+        coarse = mesh_warning(COARSEST, found.fabric, (SIDE, SIDE), self.scenario)
+        print_result(self.json, as_json(found), [*describe(found), *coarse])
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Say how well a fabric predicts recorded motions: distances in metres, mean over the frames.
+
+    chamfer_real_to_sim is the mean distance from a recorded point to the simulated surface,
+    chamfer_sim_to_real the reverse, hausdorff the largest; `paper_` figures have no unit.
+
+        r2s evaluate denim.json fold.npz
+        r2s evaluate grey_interlock recordings/fold_tan --json
+    """
+
+    fabric: Positional[FabricName]
+    recordings: Annotated[Positional[tuple[Path, ...]], arg(metavar="RECORDING")]
+    """NPZ, or folders."""
+    shape: ChosenShape = None
+    json: Json = False
+
+    def run(self) -> int:
+        from r2s.cli.common import choose_shape, load_card, print_result
+        from r2s.metrics import prediction_error
+        from r2s.recordings.open import open_recordings
+        from r2s.scenarios.scenario import from_recording
+
+        card, found, failures, lines = load_card(self.fabric), {}, {}, []
+        meshes: dict[str, dict] = {}
+        for recording in open_recordings(self.recordings):
+            name, size = recording.info.name, recording.info.sheet.size
+            shape, meshes[name], words = choose_shape(
+                self.shape, card.fabric, size, recording.info.scenario
+            )
+            motion = prediction_error.predict_motion(from_recording(recording, shape), card.fabric)
+            metrics = prediction_error.against_motion(recording, motion.x, shape=shape)
+            found[name] = metrics
+            lines += [f"{name}:", *(f"    {line}" for line in words)]
+            lines += [_line(metric, value) for metric, value in metrics.items()]
+            if math.isnan(metrics["chamfer_real_to_sim"]):
+                failures[name] = motion.failure
+                lines.append(f"    the simulation {failures[name]}")
+        if not found:
+            raise ValueError("no recording: name an NPZ, or a folder that holds some")
+        units = {name: prediction_error.UNITS.get(name, "m") for name in next(iter(found.values()))}
+        result = {"fabric": card.name, "units": units, "recordings": found, "failures": failures}
+        result["meshes"] = meshes
+        print_result(self.json, result, lines)
+        return 1 if failures else 0
+
+
+def _line(metric: str, value: float) -> str:
+    from r2s.metrics.prediction_error import UNITS
+
+    text = f"{value:.4f}" if UNITS.get(metric) == "-" else f"{1e3 * value:.2f} mm"
+    return f"    {metric:32s}{text:>12s}"
+
+
+if TYPE_CHECKING:
+    from r2s.export import Loss
+    from r2s.materials.fabric import Fabric
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a fabric for another simulator, and say what is lost on the way.
+
+    mujoco: a model (MJCF) of a sheet; newton: arguments of add_cloth_mesh and add_spring (JSON);
+    arcsim: a material file (JSON); pybullet: arguments of loadSoftBody (JSON). MuJoCo and Newton
+    get springs along the yarns, unless --isotropic. The sheet is a grid as in `r2s simulate`.
+
+        r2s export denim.json --to mujoco --size 0.3 0.3 --shape 17 17 --out sheet.xml
+        r2s export black_denim --to arcsim --out material.json
+    """
+
+    fabric: Positional[FabricName]
+    to: Literal["mujoco", "newton", "newton-vbd", "arcsim", "pybullet"]
+    """The simulator."""
+    out: Annotated[Path, arg(metavar="FILE")]
+    """What is written."""
+    size: tuple[float, float] = (0.3, 0.3)
+    """Sides of the sheet, warp and weft [m]; stiffness of edges depends on the mesh."""
+    shape: Shape = (9, 9)
+    isotropic: bool = False
+    """The nearest isotropic sheet alone."""
+    json: Json = False
+
+    def run(self) -> int:
+        from r2s.cli.common import load_card, mesh_warning, print_result
+
+        card = load_card(self.fabric)
+        loss = self._write(card.fabric, card.name)
+        result = {
+            "fabric": card.name,
+            "to": self.to,
+            "out": str(self.out),
+            "relative_energy_error": {"membrane": loss.membrane, "bending": loss.bending},
+            "lost": loss.lost,
+        }
+        lines = [f"{self.out}: {card.name} for {self.to}"]
+        for part in ("membrane", "bending"):
+            errors = getattr(loss, part).items()
+            if errors:
+                lines.append(f"{part}: " + ", ".join(f"{name} {e:+.1%}" for name, e in errors))
+        if self.to != "arcsim":
+            lines += mesh_warning(self.shape, card.fabric, self.size, "lifting")
+        print_result(self.json, result, [*lines, *(f"lost: {text}" for text in loss.lost)])
+        return 0
+
+    def _write(self, fabric: "Fabric", name: str) -> "Loss":
+        from r2s._util.files import write_json, write_text
+        from r2s.export import arcsim, mujoco, newton, pybullet
+        from r2s.mesh.mesh import rectangle
+
+        if self.to == "arcsim":
+            try:
+                return arcsim.write(self.out, fabric, name)
+            except TypeError as error:  # a law that such a file cannot hold
+                raise ValueError(str(error)) from error
+        mesh, yarns = rectangle(self.size, self.shape), not self.isotropic
+        if self.to == "mujoco":
+            text, loss = mujoco.mjcf(fabric, mesh, yarns=yarns)
+            write_text(self.out, text)
+            return loss
+        if self.to == "pybullet":
+            arguments, loss = pybullet.soft_body(fabric, mesh)
+            write_json(self.out, {"loadSoftBody": arguments})
+            return loss
+        kind = "vbd" if self.to == "newton-vbd" else "semi_implicit"
+        made, loss = newton.cloth(fabric, mesh, kind, yarns=yarns)
+        damping = float(fabric.damping)
+        rows = newton.spring_arguments(made.springs, damping) if made.springs else []
+        model = {"add_cloth_mesh": made.arguments, "add_spring": rows, "fields": made.fields}
+        write_json(self.out, model)
+        return loss
