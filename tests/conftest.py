@@ -28,7 +28,7 @@ from r2s.environment.contact import Table
 from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric
 from r2s.mesh.mesh import Mesh, rectangle
-from r2s.mesh.strain_samples import strains, vertex_masses
+from r2s.mesh.surface import strains, vertex_masses
 from r2s.solvers.implicit.cloth import Cloth, ClothState
 from r2s.solvers.implicit.linear.pattern import Pattern
 

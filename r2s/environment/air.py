@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from r2s._util.units import AIR_DENSITY
 from r2s.mesh.mesh import Mesh
-from r2s.mesh.strain_samples import area_normals
+from r2s.mesh.surface import area_normals
 
 STILL = 1e-3  # [m/s]: below this flow along a face, its friction fades to linear
 

@@ -1,9 +1,8 @@
 """The geometry of a sheet, apart from what it is made of.
 
 - `mesh`: the rest shape, in material coordinates.
-- `strain_samples`: where its strain is taken, in triangles or quadrilaterals; strains, normals and
-  masses of a moved sheet.
+- `strain_samples`: where its strain is taken, in triangles or quadrilaterals.
 - `bends`, `plate_elements`: where its curvature is taken, angles first.
 - `vectors`: vectors and small matrices as tuples of arrays.
-- `surface`: points on a moved sheet, and the nearest one to a point in space.
+- `surface`: strains, normals and masses of a moved sheet; the nearest place to a point in space.
 """

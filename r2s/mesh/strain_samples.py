@@ -15,8 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from r2s.mesh.mesh import Mesh
-
 GAUSS = 1 / 3**0.5  # places of two points on (-1, 1)
 
 
@@ -126,24 +124,3 @@ def green_strain_gradient(
     deformation = deformation_gradient(corners, gradients)
     products = jnp.einsum("cs,it->stci", gradients, deformation)
     return jnp.stack([products[0, 0], products[1, 1], products[0, 1] + products[1, 0]])
-
-
-Positions = Float[Array, "vertex 3"]
-
-
-def strains(mesh: Mesh, x: Positions) -> Float[Array, "sample 3"]:
-    """Green strain (E11, E22, 2 E12) [-] of every sample, at positions [m]."""
-    return mesh.samples.strains(x).reshape(-1, 3)
-
-
-def area_normals(mesh: Mesh, x: Positions) -> Float[Array, "element 3"]:
-    """Normals of the elements that strains are taken in, as long as their areas, [m^2]."""
-    corners = x[mesh.samples.corners]
-    if corners.shape[1] == 4:  # across the diagonals of a quadrilateral
-        return jnp.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]) / 2
-    return jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
-
-
-def vertex_masses(mesh: Mesh, density: Float[Array, ""]) -> Float[Array, " vertex"]:
-    """Lumped mass [kg] of every vertex of a sheet, from its areal density [kg/m^2]."""
-    return density * mesh.vertex_area

@@ -13,7 +13,8 @@ from r2s.environment.scene import Control
 from r2s.materials.fabric import Fabric
 from r2s.materials.wrinkling import membrane_on_samples
 from r2s.mesh.mesh import Mesh
-from r2s.mesh.strain_samples import on_samples, vertex_masses
+from r2s.mesh.strain_samples import on_samples
+from r2s.mesh.surface import vertex_masses
 from r2s.scenarios.scenario import Scenario, SheetSolver, as_cut, begin, stepped
 
 Energies = Float[Array, " frame"]

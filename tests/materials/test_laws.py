@@ -15,7 +15,7 @@ from r2s.environment.scene import Control
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import SpringMembrane
 from r2s.mesh.mesh import Mesh, rectangle
-from r2s.mesh.strain_samples import strains
+from r2s.mesh.surface import strains
 
 CELL = SIZE / (SHAPE[0] - 1)  # side of the sheet's squares, [m]
 few = settings(max_examples=25, deadline=None)

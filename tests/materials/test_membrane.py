@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from r2s._util.units import isotropic_bending, isotropic_membrane
 from r2s.materials.membrane import OrthotropicMembrane
-from r2s.mesh.strain_samples import deformation_gradient, strains
+from r2s.mesh.strain_samples import deformation_gradient
+from r2s.mesh.surface import strains
 
 few = settings(max_examples=25, deadline=None)
 UNIFORM = {  # warp and weft images in the plane

@@ -15,7 +15,7 @@ from r2s.materials.bending import HingeBending
 from r2s.materials.fabric import Fabric
 from r2s.materials.tables import HINGE_FACTOR, TableBending
 from r2s.mesh.mesh import rectangle
-from r2s.mesh.strain_samples import strains
+from r2s.mesh.surface import strains
 from r2s.recordings.recording import RecordingInfo, make_recording
 from r2s.scenarios.energy import stored_energy
 from r2s.scenarios.resolution import material_points

@@ -26,7 +26,7 @@ from r2s.environment.scene import Control, along_path
 from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import OrthotropicSpace
 from r2s.mesh.mesh import rectangle
-from r2s.mesh.strain_samples import vertex_masses
+from r2s.mesh.surface import vertex_masses
 from r2s.scenarios.scenario import rollout
 from r2s.scenarios.standard import lifting
 from r2s.solvers.implicit.cloth import ClothState

@@ -21,7 +21,7 @@ from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import OrthotropicMembrane
 from r2s.materials.plate import OrthotropicPlate, PlateBending
 from r2s.mesh.mesh import rectangle
-from r2s.mesh.strain_samples import strains
+from r2s.mesh.surface import strains
 
 LENGTH = 0.2  # [m], with the held cell
 DENSITY = 0.2  # [kg/m^2]

@@ -24,7 +24,7 @@ from r2s._util.units import AIR_DENSITY, GRAVITY
 from r2s.environment import contact
 from r2s.environment.scene import Control, along_path
 from r2s.materials.fabric import Fabric
-from r2s.mesh.strain_samples import vertex_masses
+from r2s.mesh.surface import vertex_masses
 from r2s.solvers.implicit.cloth import Cloth
 from r2s.solvers.implicit.generalised_alpha import coefficients
 from r2s.solvers.simulate import simulate

@@ -17,7 +17,7 @@ from r2s.environment.contact import Table
 from r2s.environment.scene import Control, Scene
 from r2s.materials.bending import HingeBending
 from r2s.materials.fabric import Fabric
-from r2s.mesh.strain_samples import vertex_masses
+from r2s.mesh.surface import vertex_masses
 from r2s.scenarios.energy import stored_energy
 from r2s.solvers.explicit.elements import (
     bending_force,

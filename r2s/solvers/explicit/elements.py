@@ -16,7 +16,8 @@ from r2s.environment.contact import PRESSURE_STIFFNESS, SLIP_SPEED
 from r2s.materials.fabric import Fabric
 from r2s.materials.wrinkling import membrane_on_samples, stress_on_samples
 from r2s.mesh.mesh import Mesh
-from r2s.mesh.strain_samples import green_strain_gradient, strains, vertex_masses
+from r2s.mesh.strain_samples import green_strain_gradient
+from r2s.mesh.surface import strains, vertex_masses
 from r2s.mesh.vectors import Vector
 
 Vertices = Float[Array, "vertex 3"]

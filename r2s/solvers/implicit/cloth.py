@@ -18,7 +18,7 @@ from r2s.materials.fabric import Fabric
 from r2s.materials.wrinkling import membrane_on_samples, tangents_on_samples
 from r2s.mesh.bends import unwrapped
 from r2s.mesh.mesh import Mesh
-from r2s.mesh.strain_samples import area_normals
+from r2s.mesh.surface import area_normals
 from r2s.solvers.contact.contacts import SMALL, SelfContact, colliding, touching
 from r2s.solvers.failures import Failure, first_failure, no_failure
 from r2s.solvers.implicit.generalised_alpha import by_generalised_alpha, rates_after

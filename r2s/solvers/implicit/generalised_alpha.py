@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r2s.materials.wrinkling import tangents_on_samples
-from r2s.mesh.strain_samples import area_normals, vertex_masses
+from r2s.mesh.surface import area_normals, vertex_masses
 from r2s.solvers.implicit.potential import IncrementalPotential, table_forces
 
 Positions = Float[Array, "vertex 3"]
