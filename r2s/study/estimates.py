@@ -76,7 +76,7 @@ class EstimateTask(Task):
     - `network`: of "physnet" and "physnet-published".
     - `prior`: "fabrics" for the prior of fabrics of this weight (`r2s.materials.prior`), else
       "flat".
-    - `resolves`: on meshes that resolve the fabric (`r2s.estimation.mesh_ladder`), not `SHAPES`.
+    - `resolves`: on meshes that resolve it (`r2s.estimation.mesh_refinement`), not `SHAPES`.
     - `law`: as in `with_law`; "told": the laws that the recordings identify (`law_told_by`).
     """
 

@@ -1,6 +1,6 @@
 """Errors of predictions up to the horizon, with their floor; beyond it, features of the motion.
 
-Beyond the horizon features that do not depend on the phase are compared (`r2s.metrics.phase_free`).
+Beyond the horizon features that do not depend on the phase are compared (`r2s.metrics.horizon`).
 """
 
 import math

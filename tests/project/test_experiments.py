@@ -96,7 +96,7 @@ def test_what_a_table_of_skills_compares_is_all_predicted_on_the_cloth(module, n
 def test_a_line_of_several_sources_is_refused(tables, tmp_path: Path, monkeypatch) -> None:
     words = "r2s 0.3.0; source {}; a processor"
     found = dict.fromkeys([words.format("a" * 16)], 3)
-    monkeypatch.setattr(tables, "origins", lambda cells, folder: found)
+    monkeypatch.setattr(tables, "provenance", lambda cells, folder: found)
     assert tables.made_by([], tmp_path) == {"made by source": "a" * 8}
     found[words.format("b" * 16)] = 1
     with pytest.raises(ValueError, match="several sources"):

@@ -339,11 +339,11 @@ def test_an_impact_is_never_late_and_hardly_early(kind, dtype):
 
 
 def test_an_impact_that_takes_too_many_advances_is_early(monkeypatch):
-    monkeypatch.setattr(proximity, "MAX_ADVANCES", 3)
     start, end, is_edges = motions("very fast", np.float64, 8)
+    found = np.asarray(impacts(start, end, is_edges, GAP))
+    monkeypatch.setattr(proximity, "MAX_ADVANCES", 3)
     # anew, with what the limit is now
     again = jax.jit(jax.vmap(lambda a, b, e: time_of_impact(a, b, e, jnp.asarray(GAP))))
     early = np.asarray(again(start, end, is_edges))
-    found = np.asarray(impacts(start, end, is_edges, GAP))
     assert np.all(early <= found)
     assert np.any(np.isfinite(early) & np.isinf(found))

@@ -134,7 +134,7 @@ def test_a_full_disk_is_a_reason_and_leaves_nothing_behind(tmp_path, monkeypatch
 
 STUDY = """
 import sys
-sys.path.insert(0, {tests!r})
+sys.path[:0] = {tests!r}
 from pathlib import Path
 from test_engine import Number, Sum
 from r2s.study import engine
@@ -145,7 +145,7 @@ engine.run(cells, Path({folder!r}), engine.Serial())
 
 @pytest.mark.parametrize("after", [pytest.param(0.1, marks=pytest.mark.slow(group="study")), 0.25])
 def test_a_run_that_was_killed_goes_on(tmp_path, after):
-    code = STUDY.format(tests=str(TESTS), folder=str(tmp_path))
+    code = STUDY.format(tests=[str(Path(__file__).parent), str(TESTS)], folder=str(tmp_path))
     killed = subprocess.Popen([sys.executable, "-c", code])
     deadline = time.time() + 60
     while time.time() < deadline and not list(tmp_path.rglob("*.zip")):
@@ -237,7 +237,7 @@ def test_jobs_of_slurm_make_the_same_with_a_stand_in_for_sbatch(tmp_path, monkey
         (tmp_path / name).write_text(script)
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
-    monkeypatch.setenv("PYTHONPATH", str(TESTS))
+    monkeypatch.setenv("PYTHONPATH", f"{Path(__file__).parent}{os.pathsep}{TESTS}")
     sums = [Sum((Number(i, 0.1), Number(i + 1, 0.1)), f"s{i}") for i in range(4)]
     runner = engine.slurm(2)
     try:

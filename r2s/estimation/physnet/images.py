@@ -251,7 +251,7 @@ def of_depths(
 class Flaws(NamedTuple):
     """The errors of training images. Shares and scales are upper ends, drawn anew for each image.
 
-    The defaults are from the effect of the typical flaws in `r2s.recordings.cameras.synthetic_rgbd`
+    The defaults are from the effect of the typical flaws in `r2s.recordings.synthetic_rgbd`
     and of clouds of two cameras on images of 64 x 64: 5 to 22 % of the pixels at a border are lost,
     up to 10 % beside it are gained, and a tenth of the depths there are more than 6 to 8 mm wrong.
 
