@@ -282,9 +282,13 @@ def local(workers: int, compilation_cache: Path | None = None) -> DaskWorkers:
     distributed = require("distributed", "cluster", "several workers")
     _configure(environment(workers, compilation_cache))
     cluster = distributed.LocalCluster(
-        n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0"
+        n_workers=workers,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address=":0",
+        preload=[__name__],
     )
-    return _of_cluster(cluster, workers)
+    return DaskWorkers(distributed.Client(cluster), workers, cluster)
 
 
 def at(address: str) -> DaskWorkers:
@@ -300,6 +304,7 @@ def slurm(jobs: int) -> DaskWorkers:
     there is no Slurm.
     """
     jobqueue = require("dask_jobqueue.slurm", "cluster", "Slurm")
+    distributed = require("distributed", "cluster", "Slurm")
     if shutil.which("sbatch") is None:
         raise OSError("no command sbatch: submit from a node of the Slurm cluster")
     variables = environment(1)
@@ -307,9 +312,11 @@ def slurm(jobs: int) -> DaskWorkers:
     # the workers read their part of Dask's settings from their own environment
     variables |= {"DASK_DISTRIBUTED__WORKER__MEMORY__TERMINATE": "False"}
     exports = [f"export {name}='{value}'" for name, value in variables.items()]
-    cluster = jobqueue.SLURMCluster(**JOB, job_script_prologue=exports)
+    cluster = jobqueue.SLURMCluster(
+        **JOB, job_script_prologue=exports, worker_extra_args=["--preload", __name__]
+    )
     cluster.scale(jobs=jobs)
-    return _of_cluster(cluster, jobs)
+    return DaskWorkers(distributed.Client(cluster), jobs, cluster)
 
 
 def _configure(variables: dict[str, str]) -> None:
@@ -324,15 +331,6 @@ def _configure(variables: dict[str, str]) -> None:
     )
 
 
-def _of_cluster(cluster: Any, processes: int) -> DaskWorkers:
-    from distributed import Client, WorkerPlugin
-
-    class OneCore(WorkerPlugin):
-        """Binds a worker to a core, by the number at the end of its name."""
-
-        def setup(self, worker: Any) -> None:
-            begin_worker(int(re.findall(r"\d+", str(worker.name))[-1]))
-
-    client = Client(cluster)
-    client.register_plugin(OneCore())
-    return DaskWorkers(client, processes, cluster)
+def dask_setup(worker: Any) -> None:
+    """Prepare a worker of Dask that preloads this module; its name ends with a number."""
+    begin_worker(int(re.findall(r"\d+", str(worker.name))[-1]))
