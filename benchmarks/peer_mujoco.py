@@ -1,7 +1,7 @@
 """MuJoCo's flex in the scene "hang": the same membrane (Green strain) on the same mesh.
 
-Its own masses are equal for all vertices; they are set to those of the areas, so that the model is
-that of r2s but for the bending, and the two converge to the same motion.
+The model is the export's, whose masses are those of the vertices' areas: it is that of r2s but for
+the bending, and the two converge to the same motion. The held vertices have no joints.
 """
 
 from functools import partial
@@ -10,32 +10,21 @@ import _hang
 import mujoco  # pyright: ignore[reportMissingImports]
 import numpy as np
 
-from r2s._util.units import GRAVITY
-from r2s.export.mujoco import flexcomp
+from r2s.export.mujoco import mjcf
 
 mujoco.set_mju_user_warning(lambda message: None)  # or it writes a log file where it is run
-MODEL = """
-<mujoco>
-  <option timestep="{step}" gravity="0 0 -{gravity}" integrator="{integrator}">
-    <flag contact="disable"/>
-  </option>
-  <size memory="2G"/>
-  <worldbody>{flex}</worldbody>
-</mujoco>
-"""
 
 
 def _model(integrator: str, size: int, substeps: int, damping: float):
     mesh, step = _hang.sheet(size), 1 / (60 * substeps)
-    flex, _ = flexcomp(_hang.fabric(damping), mesh, held=(0, size - 1))
-    text = MODEL.format(step=step, gravity=GRAVITY, integrator=integrator, flex=flex)
-    model = mujoco.MjModel.from_xml_string(text)
-    free = model.flex_vertbodyid > 0  # the others belong to the world
-    bodies = model.flex_vertbodyid[free]
-    scale = _hang.DENSITY * np.asarray(mesh.vertex_area)[free] / model.body_mass[bodies]
-    model.body_mass[bodies] *= scale
-    model.body_inertia[bodies] *= scale[:, None]
-    mujoco.mj_setConst(model, mujoco.MjData(model))
+    text, _ = mjcf(_hang.fabric(damping), mesh, table=None, yarns=False, timestep=step)
+    spec = mujoco.MjSpec.from_string(text)
+    for held in (0, size - 1):
+        for joint in spec.body(f"v{held}").joints:
+            spec.delete(joint)
+    model = spec.compile()
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     return model
 
 
@@ -58,5 +47,5 @@ def _forward(integrator: str, size: int, substeps: int, damping: float):
     return call
 
 
-forward_implicit = partial(_forward, "discrete")  # linearly implicit, MuJoCo >= 3.13
-forward_explicit = partial(_forward, "Euler")
+forward_implicit = partial(_forward, "DISCRETE")  # linearly implicit, MuJoCo >= 3.13
+forward_explicit = partial(_forward, "EULER")

@@ -35,7 +35,6 @@ def _model(size: int, damping: float, differentiable: bool):
         builder.particle_flags[corner] &= ~newton.ParticleFlags.ACTIVE
     model = builder.finalize(requires_grad=differentiable)
     model.particle_grid = None  # no contact between particles
-    export.set_edges(model, fabric, mesh, KIND)
     return model, newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False)
 
 

@@ -19,8 +19,9 @@ from r2s import scenarios
 from r2s.materials import presets
 from r2s.mesh.mesh import ELEMENTS
 from r2s.recordings.recording import corner
+from r2s.scenarios.paths import Route, ease
 from r2s.scenarios.scenario import rollout
-from r2s.scenarios.standard import ALL_CORNERS, SIDE, Experiment, Route, ease, on_table
+from r2s.scenarios.standard import ALL_CORNERS, SIDE, Experiment, on_table
 
 MAX_STEP = 1 / 90  # [s]
 run = eqx.filter_jit(rollout)

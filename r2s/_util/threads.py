@@ -11,11 +11,9 @@ wait for ever.
 
 import contextvars
 import os
-import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,7 +22,6 @@ import jax
 Item = TypeVar("Item")
 Found = TypeVar("Found")
 LIMIT = "R2S_THREADS"
-BACKGROUND = "r2s background"  # name of a thread
 # of JAX, that a thread may have of its own
 SETTINGS = (
     "jax_enable_x64",
@@ -88,48 +85,6 @@ def _told(result: Found, number: int, done: Callable[[int], None] | None) -> Fou
     if done is not None:
         done(number)
     return result
-
-
-@contextmanager
-def background(calls: Iterable[Callable[[], Any]]) -> Iterator[None]:
-    """Calls on a thread of their own, one after the other, while the body of a `with` runs.
-
-    For what the body will wait for otherwise, such as a program to compile. Those that have not
-    begun at its end are left out, and errors too: the body meets them itself. One that has begun
-    goes on, see `leave`. On a single core, and where JAX has settings of the calling thread alone,
-    there are none.
-    """
-    if threads() < 2 or not _are_everywhere(settings()):
-        yield
-        return
-    ended = threading.Event()
-
-    def work() -> None:
-        for call in calls:
-            if ended.is_set():
-                return
-            try:
-                call()
-            except Exception:  # the body meets it itself
-                return
-
-    threading.Thread(target=work, name=BACKGROUND, daemon=True).start()
-    try:
-        yield
-    finally:
-        ended.set()
-
-
-def leave(code: int) -> int:
-    """An exit code; or, where a thread of `background` still works, the end of the process with it.
-
-    For the end of a command, which need not wait until what it has no use for is compiled.
-    """
-    if any(thread.name == BACKGROUND for thread in threading.enumerate()):
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-    return code
 
 
 def cores() -> int:

@@ -84,7 +84,7 @@ def parse_numbers(motion: Iterable[str]) -> dict[str, float]:
 def make_experiment(scenario: str, motion: Iterable[str]) -> "Experiment":
     """Make an experiment of `r2s.scenarios`; `ValueError` names the numbers that it takes."""
     from r2s import scenarios
-    from r2s.scenarios.standard import LIMITS
+    from r2s.scenarios.paths import LIMITS
 
     make = scenarios.SIX[scenario]
     known = {*LIMITS[scenario], *inspect.signature(make).parameters} - NOT_NUMBERS

@@ -18,7 +18,6 @@ except ImportError:
     sys.exit("r2s: error: the command line needs tyro: pip install 'r2s[cli]'")
 
 from r2s import compilation
-from r2s._util.threads import leave
 from r2s.cli.checks import CheckGrad, Doctor
 from r2s.cli.estimate import EstimateCard
 from r2s.cli.motions import Evaluate, Export, Sensitivity, Simulate
@@ -89,7 +88,7 @@ def command() -> int:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
             compilation.keep()
-    return leave(main())
+    return main()
 
 
 def _warn(message, *_, **__) -> None:

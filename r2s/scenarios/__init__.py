@@ -1,6 +1,7 @@
 """The six scenarios of the study, for any fabric and solver.
 
 - `scenario`: a sheet at rest, what holds it, how that moves, which frames count; `rollout`.
+- `paths`: where what holds the sheet goes; the limits within which motions are drawn.
 - `standard`: lifting, wind, stretching, folding, fling, shaking; a swing; varied at random.
 - `resolution`: which mesh, step and grid are fine enough.
 - `energy`: where the energy goes.

@@ -10,7 +10,7 @@ from r2s.estimation.method import default_space
 from r2s.estimation.methods import METHODS
 from r2s.estimation.physnet.method import TrainingBudget
 from r2s.materials import presets
-from r2s.scenarios.standard import ESTIMATION, EVALUATION
+from r2s.scenarios.paths import ESTIMATION, EVALUATION
 from r2s.study.configuration import (
     MOTIONS,
     PAPER_CONFIGURATIONS,

@@ -30,9 +30,10 @@ from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
 from r2s.recordings import manifest
 from r2s.recordings.recording import Recording, load, save
 from r2s.scenarios import synthetic
+from r2s.scenarios.paths import draw
 from r2s.scenarios.resolution import explicit_cloth
 from r2s.scenarios.scenario import Scenario, rollout
-from r2s.scenarios.standard import SIX, STRETCHING_INTERVAL, Experiment, draw
+from r2s.scenarios.standard import SIX, STRETCHING_INTERVAL, Experiment
 from r2s.study.tasks import Task, result_files
 
 RECORDING = "recording.npz"
@@ -112,7 +113,7 @@ class SimulatedRecording(Source):
     """A recording of a motion of `r2s.scenarios`, by any simulator.
 
     - `number`: 0 is the scenario's standard motion; others are sampled within
-      `r2s.scenarios.standard.LIMITS`, the same for all fabrics.
+      `r2s.scenarios.paths.LIMITS`, the same for all fabrics.
     - `unseen`: whether it is for evaluation: its motion is none to estimate from, and its clouds
       are the whole surface without noise.
     """
@@ -325,7 +326,7 @@ def numbers_of(scenario: str, number: int, unseen: bool, seed: int) -> dict[str,
 
 def pull_of(number: int, angle: float, seed: int) -> dict[str, float]:
     """Stretch and time of a pull at an `angle` [degrees] to the warp, the same for all fabrics;
-    sampled for each angle and number within `r2s.scenarios.standard.LIMITS`."""
+    sampled for each angle and number within `r2s.scenarios.paths.LIMITS`."""
     key = jr.fold_in(jr.key(seed), number_of("pull", number, float(angle)))
     return draw("stretching", 1, key=key)[0]
 

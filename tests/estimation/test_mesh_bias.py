@@ -1,13 +1,13 @@
 """The discretization error of an estimate, and what a prior and bounds make of it."""
 
 import dataclasses
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+from known_ends import PLACE, SMALL, SPACE, problem, valley
 
 from r2s import scenarios
 from r2s.estimation import descent
@@ -23,34 +23,16 @@ from r2s.estimation.mesh_bias import (
     factor,
     mesh_error,
 )
-from r2s.estimation.method import Budget
 from r2s.estimation.prediction import derivatives_at, theta_length
-from r2s.estimation.problem import Force, NuisancePrior, Problem
+from r2s.estimation.problem import Force, Problem
 from r2s.materials import presets
 from r2s.materials.parameters import InformedSpace, IsotropicSpace, OrthotropicSpace
 from r2s.scenarios import resolution, synthetic
 
-EXACT = NuisancePrior(0.0, 0.0)
-SMALL = Budget(coarse=2, starts=1, iterations=4, around=0)
-SPACE = IsotropicSpace.make(float(presets.grey_interlock().density))
-PLACE = jnp.array([0.5, 0.5])
 FAMILY = OrthotropicSpace.make(float(presets.grey_interlock().density))
 SHAPE = (3, 3)
 DIM = 2
 AT_BOUND = np.array([0.5, 1 - MARGIN])  # the second at its bound
-
-
-def lift_of(stiffer: float = 1.0):
-    """A recorded lift of a fabric that is stiffer than that at `PLACE`, without noise."""
-    motion: dict[str, Any] = {"height": 0.2, "inward": 0.1, "moving": 0.4}
-    experiment = scenarios.lifting(num_frames=6, interval=1 / 10, **motion)
-    fabric = SPACE(PLACE.at[0].add(np.log(stiffer) / SPACE.ranges[0].width))
-    seen = synthetic.WHOLE._replace(points=300)
-    return synthetic.record(experiment, fabric, "knit", seen=seen, shape=(5, 5), key=jr.key(0))
-
-
-def problem(stiffer: float, shape=(5, 5)) -> Problem:
-    return Problem.make(lift_of(stiffer), SPACE, shape=shape, nuisance_prior=EXACT)
 
 
 @pytest.fixture(scope="module")
@@ -106,22 +88,6 @@ def lifted():
     fabric = presets.grey_interlock()
     record = synthetic.record(experiment, fabric, "grey", shape=(4, 4), key=jr.key(1))
     return Problem.make(record, FAMILY, num_points=60, shape=(4, 4))
-
-
-def valley(lifted, size):
-    """The end of a descent in a quadratic loss, and what the loss is at any place."""
-    random = np.random.default_rng(0)
-    root = random.normal(size=(size, 2 * size))
-    matrix = jnp.asarray(root @ root.T)
-    end = jnp.full(size, 0.5).at[lifted.space.dim :].set(0.0)
-
-    def at(place, gradient: Any = 0.0, loss: Any = 0.0):
-        found = matrix @ (place - end) + gradient
-        one = jnp.ones(())
-        return Normal(loss * one, one, one, found, matrix, 1e-4 * matrix)
-
-    one = jnp.ones(())
-    return Descent(end, at(end), one, one, one, jnp.zeros((), int)), at
 
 
 def test_where_an_estimate_errs_by_more_than_noise_its_posterior_is_that_of_less_information(

@@ -1,44 +1,22 @@
 """Estimates by meshes: when a finer one is used, and whether other searches confirm the end."""
 
 import dataclasses
-from typing import Any
 
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+from known_ends import PLACE, SMALL, SPACE, lift_of, problem
 
-from r2s import scenarios
 from r2s.estimation import descent, mesh_refinement
 from r2s.estimation.descent import DEFAULT, Search
 from r2s.estimation.estimate import as_json, describe, from_json, point_estimate
 from r2s.estimation.gauss_newton import Descent, Normal, normal_from
 from r2s.estimation.mesh_refinement import ALIKE, LIKELY, look_again
-from r2s.estimation.method import Budget
 from r2s.estimation.methods import DiffCloud
 from r2s.estimation.prediction import derivatives_at, theta_length
-from r2s.estimation.problem import NuisancePrior, Problem
-from r2s.materials import presets
-from r2s.materials.parameters import InformedSpace, IsotropicSpace
-from r2s.scenarios import resolution, synthetic
-
-EXACT = NuisancePrior(0.0, 0.0)
-SMALL = Budget(coarse=2, starts=1, iterations=4, around=0)
-SPACE = IsotropicSpace.make(float(presets.grey_interlock().density))
-PLACE = jnp.array([0.5, 0.5])
-
-
-def lift(stiffer: float = 1.0):
-    """A recorded lift of a fabric that is stiffer than that at `PLACE`, without noise."""
-    motion: dict[str, Any] = {"height": 0.2, "inward": 0.1, "moving": 0.4}
-    experiment = scenarios.lifting(num_frames=6, interval=1 / 10, **motion)
-    fabric = SPACE(PLACE.at[0].add(np.log(stiffer) / SPACE.ranges[0].width))
-    seen = synthetic.WHOLE._replace(points=300)
-    return synthetic.record(experiment, fabric, "knit", seen=seen, shape=(5, 5), key=jr.key(0))
-
-
-def problem(stiffer: float, shape=(5, 5)) -> Problem:
-    return Problem.make(lift(stiffer), SPACE, shape=shape, nuisance_prior=EXACT)
+from r2s.materials.parameters import InformedSpace
+from r2s.scenarios import resolution
 
 
 def of_loss(loss: float, size: int = 3) -> Descent:
@@ -53,7 +31,7 @@ def of_loss(loss: float, size: int = 3) -> Descent:
 def test_a_finer_mesh_is_taken_where_the_coarse_one_is_not_enough(enough, shape, monkeypatch):
     monkeypatch.setattr(resolution, "LADDER", (2, 3, 5))
     monkeypatch.setattr(resolution, "ENOUGH", enough)
-    found = mesh_refinement.descend_by_meshes([lift()], SPACE, SMALL, key=jr.key(0))
+    found = mesh_refinement.descend_by_meshes([lift_of()], SPACE, SMALL, key=jr.key(0))
     assert found.shape == shape
     assert found.mesh_bias is not None and np.all(found.standard_errors >= found.mesh_bias)
     truth = float(SPACE.values(PLACE)[0])
@@ -70,7 +48,7 @@ def test_an_estimate_on_the_finest_mesh_stays_at_its_end_within_what_is_known(mo
     monkeypatch.setattr(resolution, "ENOUGH", 1e-9)
     known, off = 0.1, 0.02
     prior = InformedSpace.make(SPACE, PLACE + off, jnp.eye(2) / known**2)
-    both, budget = [lift(), lift()], SMALL._replace(around=2)
+    both, budget = [lift_of(), lift_of()], SMALL._replace(around=2)
     found = mesh_refinement.descend_by_meshes(both, prior, budget, key=jr.key(0))
     assert found.shape == (5, 5)
     assert found.reached is not None  # on the mesh before
@@ -84,7 +62,7 @@ def test_an_estimate_on_the_finest_mesh_stays_at_its_end_within_what_is_known(mo
 @pytest.mark.slow(group="estimates")
 def test_an_estimate_is_named_by_the_mesh_of_what_moves_freely():
     """Whichever recording comes first: a pull has a coarser one on the last rung."""
-    free = lift()
+    free = lift_of()
     taut = dataclasses.replace(free, info=dataclasses.replace(free.info, scenario="stretching"))
     assert mesh_refinement._named([free, taut], [(33, 33), (17, 17)]) == (33, 33)
     assert mesh_refinement._named([taut, free], [(17, 17), (33, 33)]) == (33, 33)
@@ -92,7 +70,7 @@ def test_an_estimate_is_named_by_the_mesh_of_what_moves_freely():
 
 
 def test_one_recording_of_a_taut_sheet_is_searched_on_the_coarsest_mesh_and_others_are_not():
-    free = lift()
+    free = lift_of()
     taut = dataclasses.replace(free, info=dataclasses.replace(free.info, scenario="stretching"))
 
     def longest(*recordings):
@@ -105,7 +83,9 @@ def test_one_recording_of_a_taut_sheet_is_searched_on_the_coarsest_mesh_and_othe
 def test_a_shape_that_is_asked_for_is_kept(monkeypatch):
     monkeypatch.setattr(resolution, "LADDER", (2, 3, 5))
     monkeypatch.setattr(resolution, "ENOUGH", 1e-9)
-    found = mesh_refinement.descend_by_meshes([lift()], SPACE, SMALL, shape=(3, 3), key=jr.key(0))
+    found = mesh_refinement.descend_by_meshes(
+        [lift_of()], SPACE, SMALL, shape=(3, 3), key=jr.key(0)
+    )
     assert found.shape == (3, 3)
 
 
@@ -125,13 +105,13 @@ def test_where_all_diverges_on_a_finer_mesh_the_estimate_is_of_the_coarser_and_s
     monkeypatch.setattr(mesh_refinement, "judged", lambda *_, **__: nothing)
     monkeypatch.setattr(resolution, "LADDER", (2, 3, 5))
     monkeypatch.setattr(resolution, "ENOUGH", 1e-9)
-    found = mesh_refinement.descend_by_meshes([lift()], SPACE, SMALL, key=jr.key(0))
+    found = mesh_refinement.descend_by_meshes([lift_of()], SPACE, SMALL, key=jr.key(0))
     assert searched == [(9, True), (9, False), (25, False)]
     assert found.shape == (3, 3)
     assert found.refused.startswith("5 x 5 vertices") and "diverged" in found.refused
     assert from_json(as_json(found)).refused == found.refused
     with pytest.raises(RuntimeError, match="diverged"):  # the finest was asked for
-        mesh_refinement.descend_by_meshes([lift()], SPACE, SMALL, finest=True, key=jr.key(0))
+        mesh_refinement.descend_by_meshes([lift_of()], SPACE, SMALL, finest=True, key=jr.key(0))
 
 
 @pytest.mark.slow(group="estimates")
@@ -261,4 +241,4 @@ def test_an_estimate_says_how_many_searches_ended_there(unsure, words):
 
 def test_a_shape_and_the_finest_mesh_exclude_each_other():
     with pytest.raises(ValueError, match="leave it out"):
-        DiffCloud(finest=True, shape=(9, 9)).estimate([lift()], SPACE, key=jr.key(0))
+        DiffCloud(finest=True, shape=(9, 9)).estimate([lift_of()], SPACE, key=jr.key(0))

@@ -1,13 +1,13 @@
 """Standard errors: of a smooth loss, of a rough one, and of a law that is not constant."""
 
 import dataclasses
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+from known_ends import valley
 
 from r2s import scenarios
 from r2s.estimation import gauss_newton
@@ -58,22 +58,6 @@ def lifted():
 def errors_by(problems, end, prior, led, is_truth=False):
     """`covariance` where steps lead from places and their normal equations."""
     return covariance(problems, end, prior, steps_apart(problems, end, prior, led), is_truth)
-
-
-def valley(lifted, size):
-    """The end of a descent in a quadratic loss, and what the loss is at any place."""
-    random = np.random.default_rng(0)
-    root = random.normal(size=(size, 2 * size))
-    matrix = jnp.asarray(root @ root.T)
-    end = jnp.full(size, 0.5).at[lifted.space.dim :].set(0.0)
-
-    def at(place, gradient: Any = 0.0, loss: Any = 0.0):
-        found = matrix @ (place - end) + gradient
-        one = jnp.ones(())
-        return Normal(loss * one, one, one, found, matrix, 1e-4 * matrix)
-
-    one = jnp.ones(())
-    return Descent(end, at(end), one, one, one, jnp.zeros((), int)), at
 
 
 def test_the_prior_of_theta_holds_what_is_known_of_the_fabric(lifted):

@@ -12,7 +12,7 @@ from r2s.materials.membrane import OrthotropicMembrane
 from r2s.materials.nonlinear_spaces import SofteningSpace, StiffeningSpace
 from r2s.materials.plate import PlateBending
 from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
-from r2s.scenarios.standard import draw
+from r2s.scenarios.paths import draw
 
 
 def test_draws_are_fabrics_with_the_stated_spread_and_the_weight_that_is_known():

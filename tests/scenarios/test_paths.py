@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r2s.recordings.recording import corner
-from r2s.scenarios import standard
+from r2s.scenarios import paths
 from r2s.scenarios.standard import ALL_CORNERS, SIX, hanging, on_table, varied, wind
 
 DURATION = 59 / 15  # [s]
@@ -32,16 +32,16 @@ def test_every_path_is_smooth_and_at_rest_at_both_ends(name):
 @pytest.mark.parametrize("held", ["origin", "warp", "weft", "opposite"])
 def test_any_corner_can_be_folded_onto_the_opposite_one(held):
     sheet = on_table(SIZE, (held,))
-    path = standard.fold_path(sheet, DURATION, reach=1.0).path[:, 0]
+    path = paths.fold_path(sheet, DURATION, reach=1.0).path[:, 0]
     np.testing.assert_allclose(path[0], corner(sheet, held), atol=1e-12)
-    there = corner(sheet, standard.OPPOSITE[held])
+    there = corner(sheet, paths.OPPOSITE[held])
     np.testing.assert_allclose(path[-1, :2], there[:2], atol=1e-12)
     assert path[:, 2].min() >= sheet.origin[2] - 1e-12
-    assert path[-1, 2] == pytest.approx(sheet.origin[2] + standard.TABLE_GAP)
+    assert path[-1, 2] == pytest.approx(sheet.origin[2] + paths.TABLE_GAP)
 
 
 def test_a_lift_goes_up_and_inward():
-    path = standard.lift_path(on_table(SIZE, ("weft",)), DURATION, height=0.3, inward=0.1).path
+    path = paths.lift_path(on_table(SIZE, ("weft",)), DURATION, height=0.3, inward=0.1).path
     moved = path[-1, 0] - path[0, 0]
     assert moved[2] == pytest.approx(0.3)
     assert np.linalg.norm(moved[:2]) == pytest.approx(0.1)
@@ -49,7 +49,7 @@ def test_a_lift_goes_up_and_inward():
 
 
 def test_a_pull_moves_one_clamp_by_its_strain():
-    path = standard.pull_path(on_table(SIZE, ALL_CORNERS), DURATION, strain=0.05).path
+    path = paths.pull_path(on_table(SIZE, ALL_CORNERS), DURATION, strain=0.05).path
     moved = path[-1] - path[0]
     np.testing.assert_allclose(moved[:, 0], [0, 0, 0.05 * SIZE[0], 0.05 * SIZE[0]], atol=1e-12)
     np.testing.assert_array_equal(moved[:, 1:], 0)
@@ -57,11 +57,11 @@ def test_a_pull_moves_one_clamp_by_its_strain():
 
 def test_a_fling_comes_back_and_a_shake_moves_one_gripper():
     sheet = hanging(SIZE, 0.5)
-    flung = standard.fling_path(sheet, DURATION, forward=0.3).path
+    flung = paths.fling_path(sheet, DURATION, forward=0.3).path
     away = flung - flung[:1]
     assert away[..., 1].max() == pytest.approx(0.3, rel=1e-3)
     np.testing.assert_allclose(away[-1], 0, atol=1e-12)
-    shaken = standard.shake_path(sheet, DURATION, amplitude=0.05, frequency=1.5).path
+    shaken = paths.shake_path(sheet, DURATION, amplitude=0.05, frequency=1.5).path
     away = shaken - shaken[:1]
     np.testing.assert_array_equal(away[:, 0], 0)
     assert np.abs(away[:, 1, 2]).max() == pytest.approx(0.05, rel=0.02)
@@ -71,21 +71,21 @@ def test_a_fling_comes_back_and_a_shake_moves_one_gripper():
 
 @pytest.mark.parametrize("name", SIX)
 def test_drawn_numbers_keep_their_limits_and_their_seed(name):
-    drawn = standard.draw(name, standard.EVALUATION, key=jr.key(1))
-    assert drawn == standard.draw(name, standard.EVALUATION, key=jr.key(1))
+    drawn = paths.draw(name, paths.EVALUATION, key=jr.key(1))
+    assert drawn == paths.draw(name, paths.EVALUATION, key=jr.key(1))
     for numbers in drawn:
-        limits = standard.LIMITS[name].items()
+        limits = paths.LIMITS[name].items()
         assert all(low <= numbers[number] <= high for number, (low, high) in limits)
-    assert len({tuple(numbers.values()) for numbers in drawn}) == standard.EVALUATION
+    assert len({tuple(numbers.values()) for numbers in drawn}) == paths.EVALUATION
 
 
 def test_what_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="a scenario is one of"):
-        standard.draw("dancing", 1, key=jr.key(0))
+        paths.draw("dancing", 1, key=jr.key(0))
     with pytest.raises(ValueError, match="one gripper"):
-        standard.lift_path(hanging(SIZE, 0.5), DURATION)
+        paths.lift_path(hanging(SIZE, 0.5), DURATION)
     with pytest.raises(ValueError, match="two grippers"):
-        standard.fling_path(on_table(SIZE, ("origin",)), DURATION)
+        paths.fling_path(on_table(SIZE, ("origin",)), DURATION)
 
 
 NOT_POSITIVE = st.floats(max_value=0.0)

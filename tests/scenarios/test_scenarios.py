@@ -18,9 +18,10 @@ from r2s.mesh.mesh import rectangle
 from r2s.mesh.surface import strains
 from r2s.recordings.recording import RecordingInfo, make_recording
 from r2s.scenarios.energy import stored_energy
+from r2s.scenarios.paths import Route
 from r2s.scenarios.resolution import material_points
 from r2s.scenarios.scenario import from_recording, rollout
-from r2s.scenarios.standard import CLEARANCE, SIX, Route
+from r2s.scenarios.standard import CLEARANCE, SIX
 
 SHAPE = (5, 5)
 SOFTEST, STIFFEST = "grey_interlock", "black_denim"

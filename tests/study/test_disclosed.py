@@ -11,7 +11,7 @@ from r2s.estimation import default_spaces
 from r2s.estimation.method import default_space
 from r2s.estimation.pinn.pulls import pulled
 from r2s.materials import presets, prior
-from r2s.scenarios.standard import LIMITS
+from r2s.scenarios.paths import LIMITS
 from r2s.study import plan as plans
 from r2s.study.recordings import pull_of, small_strain
 from r2s.study.report.tables import range_table

@@ -1,8 +1,6 @@
 """Calls on threads give what calls one after the other give."""
 
 import re
-import subprocess
-import sys
 import threading
 import time
 
@@ -63,14 +61,11 @@ def test_an_error_is_raised_and_what_has_not_begun_is_left_out(two_cores):
     ],
 )
 def test_settings_of_the_calling_thread_alone_hold(two_cores, setting):
-    """Threads would not have them: the caller works itself, and nothing goes in the background."""
-    made = []
+    """Threads would not have them: the caller works itself."""
     with setting():
         here = threads.settings()
         found = threads.thread_map(lambda _: threads.settings(), [1, 2])
-        with threads.background([lambda: made.append(1)]):
-            time.sleep(0.05)
-    assert found == [here] * 2 and made == []
+    assert found == [here] * 2
 
 
 def test_numpys_settings_hold_on_threads(two_cores):
@@ -107,25 +102,6 @@ def test_on_one_core_the_caller_works_alone(monkeypatch):
     monkeypatch.setattr(threads, "threads", lambda: 1)
     found = threads.thread_map(lambda _: threading.get_ident(), range(3))
     assert set(found) == {threading.get_ident()}
-    made = []
-    with threads.background([lambda: made.append(1)]):
-        pass
-    assert made == []
-
-
-def test_in_the_background_another_thread_works_until_the_body_ends(two_cores):
-    began, end, made = threading.Event(), threading.Event(), []
-
-    def first():
-        began.set()
-        end.wait(timeout=10)
-        raise ValueError("which the body would meet itself")
-
-    with threads.background([first, lambda: made.append(1)]):
-        assert began.wait(timeout=10)  # while the body is here
-    end.set()
-    time.sleep(0.1)
-    assert made == []  # it had not begun
 
 
 def test_two_threads_that_call_a_function_first_trace_it_once(two_cores):
@@ -140,22 +116,6 @@ def test_two_threads_that_call_a_function_first_trace_it_once(two_cores):
     found = threads.thread_map(doubled, [jnp.ones(3), 2 * jnp.ones(3)])
     assert [each.tolist() for each in found] == [[2.0] * 3, [4.0] * 3]
     assert len(traced) == 1
-
-
-def test_the_end_of_a_command_does_not_wait_for_the_background():
-    """Nor does what is written go lost."""
-    code = """
-import time
-from r2s._util import threads
-threads.threads = lambda: 2
-with threads.background([lambda: time.sleep(60)]):
-    print("the body")
-raise SystemExit(threads.leave(3))
-"""
-    began = time.monotonic()
-    ended = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, timeout=55)
-    assert (ended.returncode, ended.stdout) == (3, b"the body\n") and time.monotonic() - began < 50
-    assert threads.leave(3) == 3
 
 
 def batches(function, *args):

@@ -1,0 +1,50 @@
+"""Estimates whose end is known: a lift of a known fabric, and a quadratic loss."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+
+from r2s import scenarios
+from r2s.estimation.gauss_newton import Descent, Normal
+from r2s.estimation.method import Budget
+from r2s.estimation.problem import NuisancePrior, Problem
+from r2s.materials import presets
+from r2s.materials.parameters import IsotropicSpace
+from r2s.scenarios import synthetic
+
+EXACT = NuisancePrior(0.0, 0.0)
+SMALL = Budget(coarse=2, starts=1, iterations=4, around=0)
+SPACE = IsotropicSpace.make(float(presets.grey_interlock().density))
+PLACE = jnp.array([0.5, 0.5])
+
+
+def lift_of(stiffer: float = 1.0):
+    """A recorded lift of a fabric that is stiffer than that at `PLACE`, without noise."""
+    motion: dict[str, Any] = {"height": 0.2, "inward": 0.1, "moving": 0.4}
+    experiment = scenarios.lifting(num_frames=6, interval=1 / 10, **motion)
+    fabric = SPACE(PLACE.at[0].add(np.log(stiffer) / SPACE.ranges[0].width))
+    seen = synthetic.WHOLE._replace(points=300)
+    return synthetic.record(experiment, fabric, "knit", seen=seen, shape=(5, 5), key=jr.key(0))
+
+
+def problem(stiffer: float, shape=(5, 5)) -> Problem:
+    """That of `lift_of`, without nuisances."""
+    return Problem.make(lift_of(stiffer), SPACE, shape=shape, nuisance_prior=EXACT)
+
+
+def valley(lifted, size):
+    """The end of a descent in a quadratic loss, and what the loss is at any place."""
+    random = np.random.default_rng(0)
+    root = random.normal(size=(size, 2 * size))
+    matrix = jnp.asarray(root @ root.T)
+    end = jnp.full(size, 0.5).at[lifted.space.dim :].set(0.0)
+
+    def at(place, gradient: Any = 0.0, loss: Any = 0.0):
+        found = matrix @ (place - end) + gradient
+        one = jnp.ones(())
+        return Normal(loss * one, one, one, found, matrix, 1e-4 * matrix)
+
+    one = jnp.ones(())
+    return Descent(end, at(end), one, one, one, jnp.zeros((), int)), at
