@@ -113,9 +113,11 @@ def test_a_method_keeps_the_contract_on_the_cloth(recording, name):
     seen = []
     found = ran(name, recording, SPACE, progress=lambda step, loss: seen.append(loss))
     assert found.approach.startswith(name) and np.isfinite(found.loss) and seen
-    assert found.converged is False  # the budget is much too small
-    assert from_json(as_json(found)).converged is False
-    assert "converged: no, the budget ended the search" in describe(found)
+    # four frames in 0.3 s tell little beyond the prior: two steps arrive, 14 evaluations do not
+    assert found.converged is (name == "diffcloud")
+    assert from_json(as_json(found)).converged is found.converged
+    words = "yes" if found.converged else "no, the budget ended the search"
+    assert any(line.startswith(f"converged: {words}") for line in describe(found))
 
 
 @pytest.mark.slow(group="estimates")
