@@ -64,7 +64,7 @@ class Stop(NamedTuple):
 # follow, roughly.
 AT_THE_END, ON_THE_WAY = Stop(5e-3, 4, 5e-4, 10.0), Stop(0.03, 2, 3e-3, 10.0)
 MORE_FRAMES = Stop(0.03, 2, 0.02, 1.0)
-Row = list[Descent]  # one iteration: the descents of all starts
+Iteration = list[Descent]  # one iteration: the descents of all starts
 DEFAULT = Budget(shares=(0.25, 0.5))
 
 
@@ -78,7 +78,7 @@ class Search(NamedTuple):
     """
 
     problems: Problems
-    rows: list[Row]
+    rows: list[Iteration]
     seconds: float
     derive: Derive
     reached: tuple[int, int] | None = None
@@ -106,7 +106,7 @@ class Search(NamedTuple):
         return fabric_at(self.problems[0], self.theta[theta_indices(self.problems, 0)])
 
 
-def search(
+def multi_start(
     problems: Problems,
     budget: Budget,
     *,
@@ -144,7 +144,7 @@ def search(
     return Search(problems, rows, time.perf_counter() - began, derive)
 
 
-def _begin(problems: Problems, budget: Budget, start, derive: Derive, progress, key) -> Row:
+def _begin(problems: Problems, budget: Budget, start, derive: Derive, progress, key) -> Iteration:
     dim, count = problems[0].space.dim, max(budget.coarse, budget.starts)
     if start is None:
         start = jnp.clip(problems[0].space.prior()[0], MARGIN, 1 - MARGIN)
@@ -192,7 +192,7 @@ def _seen(problems: Problems, budget: Budget, stage: int) -> Problems:
 
 def _fresh(
     problems: Problems, budget: Budget, thetas: list, scale: float, stage: int, derive: Derive
-) -> Row:
+) -> Iteration:
     """Descents that begin at some thetas, in a stage."""
     damping, limit = Damping.initial(), jnp.asarray(scale, float)
     seen = _seen(problems, budget, stage)
@@ -203,7 +203,9 @@ def _fresh(
     ]
 
 
-def _next(problems: Problems, budget: Budget, rows: list[Row], derive: Derive) -> Row | None:
+def _next(
+    problems: Problems, budget: Budget, rows: list[Iteration], derive: Derive
+) -> Iteration | None:
     """The next iteration; None at the end."""
     row = rows[-1]
     _, best = _best(row)
@@ -215,7 +217,7 @@ def _next(problems: Problems, budget: Budget, rows: list[Row], derive: Derive) -
     moving = [i for i in kept_on if not _arrived(problems, stage, i, prior, stop)]
     is_passed = budget.near and now < _last_stage(budget)
     if is_passed or not moving or len(stage) > budget.iterations:
-        return _later(problems, budget, row, derive)
+        return _next_stage(problems, budget, row, derive)
     seen = _seen(problems, budget, now)
     trials = [propose(problems, row[i], prior) for i in moving]
     tried = normals_at(seen, trials, [row[i].scale for i in moving], budget.width, derive)
@@ -225,11 +227,11 @@ def _next(problems: Problems, budget: Budget, rows: list[Row], derive: Derive) -
     return after
 
 
-def _rows_of_stage(rows: list[Row], stage: int) -> list[Row]:
+def _rows_of_stage(rows: list[Iteration], stage: int) -> list[Iteration]:
     return [row for row in rows if int(_best(row)[1].stage) == stage]
 
 
-def _kept(row: Row, iteration: int) -> list[int]:
+def _kept(row: Iteration, iteration: int) -> list[int]:
     """Indices of the descents of the latest stage that go on: of many, the better half every few
     iterations (successive halving, Jamieson and Talwalkar 2016)."""
     now = max(int(descent.stage) for descent in row)
@@ -239,7 +241,9 @@ def _kept(row: Row, iteration: int) -> list[int]:
     return sorted(sorted(there, key=losses.__getitem__)[:count])
 
 
-def _later(problems: Problems, budget: Budget, row: Row, derive: Derive) -> Row | None:
+def _next_stage(
+    problems: Problems, budget: Budget, row: Iteration, derive: Derive
+) -> Iteration | None:
     """The next stage, of the best descent alone, or the next best where that diverges in the frames
     that count then; None after the last. Raises `RuntimeError` where all diverge.
 
@@ -265,7 +269,7 @@ def _later(problems: Problems, budget: Budget, row: Row, derive: Derive) -> Row 
     return after
 
 
-def _best(row: Row) -> tuple[int, Descent]:
+def _best(row: Iteration) -> tuple[int, Descent]:
     """The descent of the least loss in the latest stage, and its index."""
     last = max(int(descent.stage) for descent in row)
     losses = [float(d.normal.loss) if int(d.stage) == last else np.inf for d in row]
@@ -290,7 +294,7 @@ def has_arrived(found: Search, budget: Budget) -> bool:
     return _arrived(found.problems, stage, found.which, prior, _stop(budget, now))
 
 
-def _arrived(problems: Problems, stage: list[Row], start: int, prior, stop: Stop) -> bool:
+def _arrived(problems: Problems, stage: list[Iteration], start: int, prior, stop: Stop) -> bool:
     """Whether a descent is at its end by a criterion of `stop`, or diverged. Rejected steps do not
     count: the next is shorter, and may gain."""
     now = stage[-1][start]
@@ -315,7 +319,7 @@ def _arrived(problems: Problems, stage: list[Row], start: int, prior, stop: Stop
     return not value < then - max(least, stop.gain * float(now.normal.loss))
 
 
-def stacked(rows: list[Row]) -> Descent:
+def stacked(rows: list[Iteration]) -> Descent:
     """All descents of some iterations, with the leading axes (iteration, start)."""
     flat = [descent for row in rows for descent in row]
     shape = (len(rows), len(rows[0]))
@@ -329,7 +333,7 @@ def _run_of(problems: Problems, budget: Budget, start, key) -> dict[str, str]:
     return {"kind": "descent", "run": checkpoints.fingerprint(problems, budget, start, key)}
 
 
-def _resumed(checkpoint: Path, run: dict[str, str], budget: Budget) -> list[Row]:
+def _resumed(checkpoint: Path, run: dict[str, str], budget: Budget) -> list[Iteration]:
     """The iterations in a checkpoint. Without a file none, and files built on an older one are
     removed."""
     if not checkpoint.exists():

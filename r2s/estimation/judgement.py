@@ -23,7 +23,7 @@ from r2s.estimation.consistency import (
     with_density,
     with_free_density,
 )
-from r2s.estimation.descent import DEFAULT, Row, Search, has_arrived, search, stacked
+from r2s.estimation.descent import DEFAULT, Iteration, Search, has_arrived, multi_start, stacked
 from r2s.estimation.estimate import Agreement, Estimate
 from r2s.estimation.gauss_newton import (
     MARGIN,
@@ -82,13 +82,15 @@ def descend(
     not rise between 0 and 1.
     """
     problems = (problems,) if isinstance(problems, Problem) else problems
-    found = search(problems, budget, start=start, checkpoint=checkpoint, progress=progress, key=key)
-    return judged(
+    found = multi_start(
+        problems, budget, start=start, checkpoint=checkpoint, progress=progress, key=key
+    )
+    return with_uncertainty(
         found, budget, approach=approach, checkpoint=checkpoint, progress=progress, key=key
     )
 
 
-def judged(
+def with_uncertainty(
     found: Search,
     budget: Budget,
     *,
@@ -168,7 +170,7 @@ def each_alone(
         return []
     alone = budget._replace(coarse=0, starts=1, shares=(), near=True, leads_on=True)
     return [
-        search(
+        multi_start(
             (problem,),
             alone,
             start=theta[theta_indices(problems, which)],
@@ -193,7 +195,7 @@ def _with_density(
     """The agreement with the density that all recordings lead to; as it is where they diverge."""
     loose, start = with_free_density(problems, theta)
     try:
-        end = search(
+        end = multi_start(
             loose,
             budget._replace(coarse=0, starts=1, shares=(), near=True, leads_on=False),
             start=start,
@@ -210,7 +212,7 @@ def _with_density(
 def collect(
     problems: Problems,
     best: Descent,
-    rows: list[Row],
+    rows: list[Iteration],
     covariance: Float[np.ndarray, "theta theta"],
     approach: str,
     seconds: float,

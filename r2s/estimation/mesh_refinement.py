@@ -20,10 +20,10 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimation.descent import Search, search
+from r2s.estimation.descent import Search, multi_start
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import FINEST, MARGIN, Descent, loss_from
-from r2s.estimation.judgement import each_alone, judged
+from r2s.estimation.judgement import each_alone, with_uncertainty
 from r2s.estimation.mesh_bias import OtherMesh, factor
 from r2s.estimation.method import Budget, Progress, tell
 from r2s.estimation.prediction import Derive, Theta, remembering
@@ -76,7 +76,7 @@ def descend_by_meshes(
     at, refused = _refined(run, at, levels[1:], finest)
     tell(progress, "standard errors")
     ratio = 2.0 if refused else _ratio(at.shapes)
-    estimate = judged(
+    estimate = with_uncertainty(
         at.found,
         budget,
         other_mesh=OtherMesh(run.problems(_others(at.shapes, ratio)), factor(ratio)),
@@ -122,7 +122,7 @@ class _Run(NamedTuple):
             budget = near(budget)
             suffix = f".{name.replace(' ', '')}{'' if leads_on else '.end'}.npz"
             path = path and path.with_suffix(suffix)
-        found = search(
+        found = multi_start(
             self.problems(shapes),
             budget._replace(leads_on=leads_on),
             start=start,
@@ -199,7 +199,7 @@ def look_again(
     """
     problems, ends, count = found.problems, [found], 1
     once = budget._replace(coarse=0, starts=1, near=False, leads_on=True)
-    again = partial(search, problems, derive=found.derive, progress=progress, key=key)
+    again = partial(multi_start, problems, derive=found.derive, progress=progress, key=key)
     while count < MOST:
         start = _sample(problems[0].space, jr.fold_in(key, count))
         count += 1
@@ -257,10 +257,10 @@ def descend_weighted(
     key: PRNGKeyArray,
 ) -> Estimate:
     """`r2s.estimation.judgement.descend`, several recordings weighted by `weights`."""
-    found = search(problems, budget, checkpoint=checkpoint, progress=progress, key=key)
+    found = multi_start(problems, budget, checkpoint=checkpoint, progress=progress, key=key)
     if len(problems) > 1:
         alone = each_alone(problems, budget, found.theta, key, found.derive, progress)
-        found = search(
+        found = multi_start(
             _weighted(problems, weights(alone)),
             near(budget),
             start=found.theta,
@@ -269,7 +269,7 @@ def descend_weighted(
             derive=found.derive,
             key=key,
         )
-    return judged(
+    return with_uncertainty(
         found, budget, approach=approach, checkpoint=checkpoint, progress=progress, key=key
     )
 

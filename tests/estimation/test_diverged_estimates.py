@@ -11,7 +11,7 @@ import pytest
 from r2s import scenarios
 from r2s.estimation import baselines, descent, gauss_newton, mesh_bias
 from r2s.estimation.gauss_newton import Descent, Normal
-from r2s.estimation.judgement import NO_DERIVATIVE, judged
+from r2s.estimation.judgement import NO_DERIVATIVE, with_uncertainty
 from r2s.estimation.mesh_bias import MeshError, OtherMesh
 from r2s.estimation.method import Budget
 from r2s.estimation.prediction import derivatives_at, theta_length
@@ -61,7 +61,7 @@ def test_the_next_best_descent_goes_on_where_the_best_diverges_later(problem, mo
     stages = []
     while row is not None:
         stages.append(descent._best(row))
-        row = descent._later((problem,), BUDGET, row, derivatives_at)
+        row = descent._next_stage((problem,), BUDGET, row, derivatives_at)
     assert [which for which, _ in stages] == [0, 0, 0, 1]
     assert float(stages[-1][1].normal.loss) == pytest.approx(3e-6)
 
@@ -69,14 +69,14 @@ def test_the_next_best_descent_goes_on_where_the_best_diverges_later(problem, mo
 def test_where_all_diverge_it_is_said_and_why(problem, monkeypatch):
     monkeypatch.setattr(descent, "_fresh", fresh([np.inf, np.inf]))
     monkeypatch.setattr(descent, "explain", lambda *_: "frame 3: speed.")
-    row = descent._later((problem,), BUDGET, row_of(problem, [1e-6, 2e-6]), derivatives_at)
+    row = descent._next_stage((problem,), BUDGET, row_of(problem, [1e-6, 2e-6]), derivatives_at)
     with pytest.raises(
         RuntimeError, match="all descents diverged, the first frame 3: speed. Check"
     ):
         while row is not None:
-            row = descent._later((problem,), BUDGET, row, derivatives_at)
+            row = descent._next_stage((problem,), BUDGET, row, derivatives_at)
     with pytest.raises(RuntimeError, match="all starts of the descents diverged"):
-        descent.search((problem,), Budget(shares=(), coarse=0, starts=1), key=jr.key(0))
+        descent.multi_start((problem,), Budget(shares=(), coarse=0, starts=1), key=jr.key(0))
 
 
 def test_cma_es_gives_no_fabric_of_runs_that_all_diverged(problem, monkeypatch):
@@ -115,8 +115,8 @@ def test_without_a_derivative_an_estimate_is_not_sure_and_knows_what_was_known(p
         return [(seen, jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), s)) for seen, s in found]
 
     budget = Budget(coarse=0, starts=1, around=0, iterations=3)
-    found = descent.search((problem,), budget, derive=without, key=jr.key(0))
-    estimate = judged(found, budget, key=jr.key(1))
+    found = descent.multi_start((problem,), budget, derive=without, key=jr.key(0))
+    estimate = with_uncertainty(found, budget, key=jr.key(1))
     assert not estimate.converged and estimate.unsure == NO_DERIVATIVE
     _, precision = problem.space.prior()
     widths = np.array([each.width for each in problem.space.ranges])

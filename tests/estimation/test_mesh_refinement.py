@@ -105,9 +105,9 @@ def test_where_all_diverges_on_a_finer_mesh_the_estimate_is_of_the_coarser_and_s
         return Search(problems, [[end]], 0.0, derivatives_at)
 
     nothing = point_estimate("none", SPACE, PLACE, 0.0, np.zeros((1, 1)), np.zeros((1, 1, 2)), 0.0)
-    monkeypatch.setattr(mesh_refinement, "search", search)
+    monkeypatch.setattr(mesh_refinement, "multi_start", search)
     monkeypatch.setattr(mesh_refinement, "look_again", lambda found, *_, **__: found)
-    monkeypatch.setattr(mesh_refinement, "judged", lambda *_, **__: nothing)
+    monkeypatch.setattr(mesh_refinement, "with_uncertainty", lambda *_, **__: nothing)
     monkeypatch.setattr(resolution, "LADDER", (2, 3, 5))
     monkeypatch.setattr(resolution, "ENOUGH", 1e-9)
     found = mesh_refinement.descend_by_meshes([lift_of()], SPACE, SMALL, key=jr.key(0))
@@ -188,7 +188,7 @@ def looked(monkeypatch, first: Search, *others: Search | None, losses):
         scales.append(float(scale))
         return losses(float(predicted[0][0]))
 
-    monkeypatch.setattr(mesh_refinement, "search", search)
+    monkeypatch.setattr(mesh_refinement, "multi_start", search)
     monkeypatch.setattr(mesh_refinement, "loss_from", loss)
     return look_again(first, DEFAULT, key=jr.key(0)), starts, scales
 
