@@ -13,6 +13,7 @@ from folders import ROOT
 from r2s.cli.main import main
 from r2s.estimation.baselines import MASS
 from r2s.estimation.baselines import STRETCH as MULTIPLIER
+from r2s.estimation import default_spaces
 from r2s.estimation.estimate import point_estimate
 from r2s.estimation.method import default_space
 from r2s.estimation.methods import METHODS, DiffCloud
@@ -32,7 +33,7 @@ from r2s.study.recordings import (
     small_strain,
     strain_dependent,
 )
-from r2s.study.report.tables import cost_table, recording_table
+from r2s.study.report.tables import cost_table, range_table, recording_table
 from r2s.study.statistics.frame import as_frame
 from r2s.study.tasks import read_metadata, with_dependencies
 
@@ -271,3 +272,16 @@ def test_given_recordings_are_shown_one_by_one():
     }  # fmt: skip
     assert second.default == 45.0 and np.isnan(second.estimate)
     assert recording_table(as_frame(rows[:2]), "chamfer_real_to_sim").empty  # as synthetic ones
+
+
+def test_every_range_and_fixed_value_stands_in_the_table():
+    table = range_table(plans.synthetic(plans.SMALL))
+    shown = set(zip(table.solver, table.parameter, strict=True))
+    for solver in ("cloth", "points"):
+        space = default_space(solver, 0.2)
+        names = [each.name for each in (*space.ranges, *default_spaces.fixed(space))]
+        assert {(solver, name) for name in names} <= shown
+    assert table["from"].notna().all() and (table["from"] != "").all()
+    # as many densities as fabrics
+    densities = table[(table.solver == "points") & (table.parameter == "density")]
+    assert len(densities) == len(plans.SMALL.fabrics)

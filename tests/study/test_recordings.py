@@ -1,17 +1,25 @@
-"""From what shape a prediction of a hanging sheet starts."""
+"""Recordings for evaluation and the start of their predictions; pulls."""
+
+from typing import Any
 
 import jax.numpy as jnp
+import jax.random as jr
 import numpy as np
 import pytest
 
 from r2s.metrics.losses import to_surface
+from r2s.estimation.pinn.pulls import pulled
+from r2s.materials import presets
 from r2s.recordings.recording import cloud
+from r2s.scenarios.paths import LIMITS
 from r2s.scenarios.standard import SIX
+from r2s.study import plan as plans
 from r2s.study.evaluations import predict
 from r2s.study.recordings import (
     SETTLING,
     SyntheticRecording,
     TruthSettings,
+    pull_of,
     read,
     read_start,
     small_strain,
@@ -65,3 +73,28 @@ def test_the_true_fabric_begins_where_its_recording_does(tmp_path, monkeypatch):
 
 def test_given_recordings_and_lying_sheets_have_no_start(tmp_path):
     assert read_start(SyntheticRecording("pink_solid", "folding", 0, True), tmp_path) is None
+
+
+def test_pulls_differ_in_stretch_and_rate_from_angle_to_angle_and_number_to_number():
+    drawn = [pull_of(number, angle, 0) for number in range(4) for angle in plans.PULLS]
+    for name, (low, high) in LIMITS["stretching"].items():
+        values = [each[name] for each in drawn]
+        assert len(set(values)) == len(values) and low <= min(values) and max(values) <= high
+    assert drawn != [pull_of(number, angle, 1) for number in range(4) for angle in plans.PULLS]
+
+
+@pytest.mark.slow(group="study")
+def test_shorter_steps_of_a_pull_change_the_force_that_holds_it_and_the_markers_little():
+    """On the way, in a pull faster than those of the study, the force of a soft knit by 8 %."""
+    settings: dict[str, Any] = {"frames": 9, "moving": 0.25, "shape": (5, 5), "key": jr.key(0)}
+    exact: dict[str, Any] = {"marker_noise": 0.0, "force_noise": 0.0}
+    fine, finer = (
+        pulled(presets.grey_interlock(), "grey", steps=steps, **settings, **exact)
+        for steps in (3, 6)
+    )
+    assert fine.markers is not None and finer.markers is not None
+    force, other = (np.asarray(each.force)[:, 0] for each in (fine, finer))
+    assert abs(force[-1] - other[-1]) < 0.01 * force.max()
+    assert np.abs(force - other).max() < 0.1 * force.max()
+    assert np.asarray(fine.times) == pytest.approx(np.arange(9) / 30)
+    assert np.abs(np.asarray(fine.markers - finer.markers)).max() < 1e-4
