@@ -91,7 +91,12 @@ class Losses(NamedTuple):
     force: Float[Array, "*pull"]
 
 
-Progress = tuple[Model, Any, Int[Array, ""]]  # with the state of Adam, and the epochs done
+class Progress(NamedTuple):
+    """State of a training: model, state of Adam, and number of epochs that are done."""
+
+    model: Model
+    state: Any
+    epoch: Int[Array, ""]
 
 
 def init(
@@ -161,7 +166,7 @@ def train_chunk(
         gradient, losses = jax.grad(total, has_aux=True)(model, weight)
         change, state = adam(recipe).update(gradient, state)
         change = eqx.tree_at(lambda m: m.free, change, replace_fn=lambda free: FABRIC_RATE * free)
-        return (eqx.apply_updates(model, change), state, done + 1), losses
+        return Progress(eqx.apply_updates(model, change), state, done + 1), losses
 
     progress, losses = jax.lax.scan(epoch, progress, None, recipe.chunk)
     return progress, jax.tree.map(lambda values: values[-1], losses)
@@ -184,7 +189,7 @@ def train(
     """
     key_init, key_chunks = jr.split(key)
     model: Any = init(space, pulls, recipe.width, recipe.layers, key=key_init)
-    progress: Progress = model, adam(recipe).init(model), jnp.zeros((), int)
+    progress = Progress(model, adam(recipe).init(model), jnp.zeros((), int))
     losses, places = np.zeros(0), np.zeros((0, space.dim))
     run = {"kind": "training of networks"}
     if checkpoint is not None:
@@ -197,9 +202,9 @@ def train(
         if not np.isfinite(now).all():
             raise RuntimeError(f"training diverged in chunk {chunk + 1}: {now}")
         losses = np.append(losses, now.data)
-        places = np.concatenate([places, np.asarray(progress[0].place)[None]])
+        places = np.concatenate([places, np.asarray(progress.model.place)[None]])
         if checkpoint is not None:
             checkpoints.save(checkpoint, checkpoints.arrays_of((progress, losses, places)), run)
         if report is not None:
             report(chunk, float(now.data) * NOISE[0] ** 2)
-    return Trained(progress[0], np.asarray(losses), np.asarray(places))
+    return Trained(progress.model, np.asarray(losses), np.asarray(places))
