@@ -17,14 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from r2s.materials.bending import HingeBending, HingeLaw
 from r2s.materials.membrane import OrthotropicMembrane
-from r2s.materials.tables import (
-    HINGE_FACTOR,
-    LARGE_STRETCH,
-    _between,
-    _edge_row,
-    _engineering,
-    _stretched,
-)
+from r2s.materials.tables import HINGE_FACTOR, LARGE_STRETCH, _between
 from r2s.mesh.bends import hinge_angle
 from r2s.mesh.mesh import Mesh
 from r2s.mesh.strain_samples import green_strain
@@ -59,7 +52,8 @@ class DiffSimTableMembrane(eqx.Module):
             return jnp.prod(jnp.where(corner > 0, above, 1 - above)) * sample
 
         corners = jnp.indices((2, 2, 2)).reshape(3, 8).T.astype(strain.dtype)  # of the cell
-        return _engineering(jnp.sum(jax.vmap(weighed)(corners), axis=0))
+        c11, c12, c22, c33 = jnp.sum(jax.vmap(weighed)(corners), axis=0)
+        return OrthotropicMembrane(c11, c12, c22, c33 / 2)
 
     def energy_density(self, strain: Float[Array, " 3"]) -> Float[Array, ""]:
         return self.at(strain).energy_density(strain)
@@ -72,7 +66,8 @@ class DiffSimTableMembrane(eqx.Module):
         weight = (jnp.sqrt(largest) - 1) / LARGE_STRETCH
         angle = 8 * (jnp.arctan2(shear, difference) / 2) / jnp.pi
         shifted = jnp.clip(2 * weight - 0.5, 0, 1)
-        return jnp.maximum(2 * _stretched(self.stiffness, shifted, 1.25 * angle - 0.5), 0)
+        small, large = self.stiffness[0], _between(self.stiffness[1:], 1.25 * angle - 0.5)
+        return jnp.maximum(2 * (small + shifted * (large - small)), 0)
 
 
 class DiffSimTableBending(HingeLaw):
@@ -84,7 +79,7 @@ class DiffSimTableBending(HingeLaw):
 
     def at(self, direction: Float[Array, ""], curvature: Float[Array, ""]) -> HingeBending:
         """The constant stiffness that DiffSim uses at a curvature [1/m], as of a `TableBending`."""
-        row = 1.5 * _edge_row(direction) - 0.5
+        row = 1.5 * (2 - 4 * direction / jnp.pi) - 0.5
         column = 1.25 * (-curvature / 10.0) - 0.5
         return HingeBending(_between(_between(self.stiffness, row), column) / HINGE_FACTOR)
 

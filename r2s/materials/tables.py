@@ -42,7 +42,12 @@ class TableMembrane(eqx.Module):
         """
         stretch, angle = _principal(strain)
         weight = jnp.clip((stretch - 1) / LARGE_STRETCH, 0, 1)
-        return _stable(_stretched(self.stiffness, weight, 8 * angle / jnp.pi))
+        small, large = self.stiffness[0], _between(self.stiffness[1:], 8 * angle / jnp.pi)
+        published = small + weight * (large - small)
+        least = jnp.array([0, -jnp.inf, 0, 0], published.dtype)
+        c11, c12, c22, c33 = jnp.maximum(published, least)
+        bound = jnp.sqrt(jnp.maximum(c11 * c22, jnp.finfo(published.dtype).tiny))
+        return OrthotropicMembrane(c11, jnp.clip(c12, -bound, bound), c22, c33 / 2)
 
     def energy_density(self, strain: Float[Array, " 3"]) -> Float[Array, ""]:
         """Energy per rest area [J/m^2] at a Green strain (E11, E22, 2 E12) [-], of the stiffness
@@ -68,7 +73,7 @@ class TableBending(HingeLaw):
 
         `direction` is that of the line which the hinge bends [rad], at right angles to its edge.
         """
-        row, column = _edge_row(direction), jnp.abs(curvature) / CURVATURE_STEP
+        row, column = 2 - 4 * direction / jnp.pi, jnp.abs(curvature) / CURVATURE_STEP
         return HingeBending(_between(_between(self.stiffness, row), column) / HINGE_FACTOR)
 
 
@@ -80,18 +85,6 @@ def _between(table: Float[Array, "row ..."], index: Float[Array, ""]) -> Float[A
     low = below.astype(int)
     # this form, so that equal rows give exactly what they hold
     return table[low] + (index - below) * (table[low + 1] - table[low])
-
-
-def _edge_row(direction: Float[Array, ""]) -> Float[Array, ""]:
-    """The row [-] of a bending table for the edge of a hinge, from the line that it bends [rad]."""
-    return 2 - 4 * direction / jnp.pi
-
-
-def _stretched(
-    stiffness: Float[Array, "6 4"], weight: Float[Array, ""], angle: Float[Array, ""]
-) -> Float[Array, " 4"]:
-    """From row 0 at weight 0 to the large-strain row at weight 1; `angle` in steps of a row."""
-    return stiffness[0] + weight * (_between(stiffness[1:], angle) - stiffness[0])
 
 
 def _principal(strain: Float[Array, " 3"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -108,15 +101,3 @@ def _principal(strain: Float[Array, " 3"]) -> tuple[Float[Array, ""], Float[Arra
     has_angle = squared > 1e-12 * BLUR**2
     angle = jnp.arctan2(jnp.abs(shear), jnp.where(has_angle, difference, 1)) / 2
     return stretch, jnp.pi / 4 + squared / (squared + BLUR**2) * (angle - jnp.pi / 4)
-
-
-def _stable(published: Float[Array, " 4"]) -> OrthotropicMembrane:
-    """A law from published numbers [N/m], without negative stiffness."""
-    c11, c12, c22, c33 = jnp.maximum(published, jnp.array([0, -jnp.inf, 0, 0], published.dtype))
-    bound = jnp.sqrt(jnp.maximum(c11 * c22, jnp.finfo(published.dtype).tiny))
-    return _engineering(jnp.stack([c11, jnp.clip(c12, -bound, bound), c22, c33]))
-
-
-def _engineering(published: Float[Array, " 4"]) -> OrthotropicMembrane:
-    c11, c12, c22, c33 = published
-    return OrthotropicMembrane(c11, c12, c22, c33 / 2)

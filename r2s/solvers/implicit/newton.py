@@ -276,14 +276,11 @@ def _one_by_one(function):
         def single(moving):
             return function(*eqx.combine(moving, still))
 
-        outputs = jax.lax.map(single, moving) if _on_cpu() else jax.vmap(single)(moving)
+        on_cpu = jax.default_backend() == "cpu"
+        outputs = jax.lax.map(single, moving) if on_cpu else jax.vmap(single)(moving)
         return outputs, jax.tree.map(lambda _: True, outputs)
 
     return call
-
-
-def _on_cpu():
-    return jax.default_backend() == "cpu"
 
 
 def _masked(force: Positions, free: Bool[Array, " vertex"]) -> Positions:
