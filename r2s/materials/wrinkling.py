@@ -201,8 +201,7 @@ def membrane_on_samples(
 ) -> Any:
     """The membrane law of every sample in a time step that starts near a strain [-].
 
-    On cells that wrinkle these are `Wrinkled`. The bending stiffness is the mean of warp and
-    weft.
+    On cells that wrinkle these are `Wrinkled`.
     """
     laws = on_samples(membrane.at, strain)
     if samples.hidden_waves is None:
@@ -210,10 +209,14 @@ def membrane_on_samples(
     stiffness = on_samples(
         lambda law, none: jax.hessian(law.energy_density)(none), laws, 0 * strain
     )
-    bent = (bending.stiffness_along(0.0) + bending.stiffness_along(jnp.pi / 2)) / 2
-    critical = bent * samples.hidden_waves[:, None] ** 2
+    critical = mean_bending(bending) * samples.hidden_waves[:, None] ** 2
     critical = jnp.broadcast_to(critical, (*strain.shape[:2], 2))
     return Wrinkled(laws, critical, on_samples(prepare_search, stiffness, critical))
+
+
+def mean_bending(bending: BendingLaw) -> Float[Array, ""]:
+    """The bending stiffness [N m] of wrinkles: the mean of warp and weft."""
+    return (bending.stiffness_along(0.0) + bending.stiffness_along(jnp.pi / 2)) / 2
 
 
 def released(

@@ -9,7 +9,7 @@ from jaxtyping import Array
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import OrthotropicMembrane
 from r2s.materials.plate import OrthotropicPlate, PlateBending
-from r2s.materials.wrinkling import Prepared, prepare_search
+from r2s.materials.wrinkling import Prepared, mean_bending, prepare_search
 from r2s.mesh.vectors import Vector, add, dot, scale
 
 CONSTANT = OrthotropicMembrane, PlateBending, OrthotropicPlate
@@ -71,14 +71,10 @@ def response(law: Any, batched: bool) -> Response:
 
 def critical_stress(fabric: Fabric, waves: tuple[float, float], batched: bool) -> Array:
     """Compressive stress (2, ...) [N/m] at which cells buckle, as in `r2s.materials.wrinkling`."""
-
-    def of_one(law):
-        return (law.stiffness_along(0.0) + law.stiffness_along(jnp.pi / 2)) / 2
-
     squares = jnp.asarray([wave**2 for wave in waves], float)
     if not batched:
-        return of_one(fabric.bending) * squares
-    bent = jax.vmap(of_one, in_axes=-1)(fabric.bending)
+        return mean_bending(fabric.bending) * squares
+    bent = jax.vmap(mean_bending, in_axes=-1)(fabric.bending)
     return squares[:, None, None] * bent[None, None]
 
 
