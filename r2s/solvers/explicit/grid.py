@@ -6,6 +6,7 @@ The strains, curvatures and laws are those of `r2s.solvers.explicit.elements` on
 from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -72,8 +73,10 @@ def grid_force(
     pushed = _drag(layout, air, corners, cell_corners(layout, flow))
     twisted = once(partial(twists, layout), corners, rates)
     of_twists, of_turns = bending_force(layout, laws, x, v, twisted)
-    total = [add(a, b, pushed) for a, b in zip(of_cells, of_twists, strict=True)]
-    return add(to_vertices(layout, total), of_turns), samples
+    total = tuple(add(a, b, pushed) for a, b in zip(of_cells, of_twists, strict=True))
+    _, to_places = jax.vjp(partial(cell_corners, layout), x)  # it is linear: of anything
+    one, two, three = (part(each, layout.room, layout.count) for each in to_places(total)[0])
+    return add((one, two, three), of_turns), samples
 
 
 def cell_corners(layout: Layout, x: Vector) -> tuple[Vector, Vector, Vector, Vector]:
@@ -87,18 +90,6 @@ def cell_corners(layout: Layout, x: Vector) -> tuple[Vector, Vector, Vector, Vec
         return one, two, three
 
     return corner(0), corner(columns), corner(columns + 1), corner(1)
-
-
-def to_vertices(layout: Layout, corners: list[Vector]) -> Vector:
-    """The sum at every vertex of what its four cells give to their corners."""
-    columns, count = layout.shape[1], layout.count
-    shifts = columns + 1, 1, 0, columns
-
-    def summed(axis: int) -> Array:
-        parts = [part(c[axis], s, count) for c, s in zip(corners, shifts, strict=True)]
-        return parts[0] + parts[1] + parts[2] + parts[3]
-
-    return summed(0), summed(1), summed(2)
 
 
 def _drag(layout: Layout, air: Air, corners, flows) -> Vector:

@@ -8,6 +8,7 @@ Gauss points share two of each. All samples lie in one row: those of all cells a
 from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -104,29 +105,8 @@ def _sides(layout: Layout, corners: Corners) -> tuple[list[Vector], list[Vector]
 
 
 def _forces(layout: Layout, corners: Corners, stresses: list[Vector]) -> list[Vector]:
-    warps, wefts = _sides(layout, corners)
-    warp, weft = layout.spacing
-    inside = is_cell(layout, warps[0][0])
-    area = jnp.asarray(warp * weft / 4, warps[0][0].dtype)
-    zero = jnp.zeros_like(area)
-
-    def pull(place: int, axis: int) -> Vector:
-        """Of the yarns along an axis, at a place across them, [N]."""
-        samples = [s for s, places in enumerate(SAMPLES) if places[1 - axis] == place]
-        own: Array = sum((stresses[s][axis] for s in samples), start=zero)
-        yarns, others = (warps, wefts) if axis == 0 else (wefts, warps)
-        total = scale(own, yarns[place])
-        for s in samples:
-            total = add(total, scale(stresses[s][2], others[SAMPLES[s][axis]]))
-        weight = jnp.where(inside, area / layout.spacing[axis], 0)
-        return scale(weight, total)
-
-    pulls = [pull(place, axis) for axis in (0, 1) for place in (0, 1)]
-    first, second, third, fourth = pulls
-    near = add(scale(PLACES[1], first), scale(PLACES[0], second))
-    far = add(scale(PLACES[0], first), scale(PLACES[1], second))
-    left = add(scale(PLACES[1], third), scale(PLACES[0], fourth))
-    right = add(scale(PLACES[0], third), scale(PLACES[1], fourth))
-    none = scale(0.0, near)
-    of_a, of_b = add(near, left), subtract(right, near)
-    return [of_a, of_b, subtract(subtract(none, far), right), subtract(far, left)]
+    _, to_corners = jax.vjp(partial(_strains, layout), corners)
+    inside = is_cell(layout, corners[0][0])
+    area = jnp.asarray(layout.spacing[0] * layout.spacing[1] / 4, corners[0][0].dtype)
+    weight = jnp.where(inside, -area, 0)
+    return list(to_corners([scale(weight, stress) for stress in stresses])[0])
