@@ -7,9 +7,9 @@ import jax.random as jr
 import numpy as np
 import pytest
 
-from r2s.metrics.losses import to_surface
 from r2s.estimation.pinn.pulls import pulled
 from r2s.materials import presets
+from r2s.metrics.losses import to_surface
 from r2s.recordings.recording import cloud
 from r2s.scenarios.paths import LIMITS
 from r2s.scenarios.standard import SIX
