@@ -1,5 +1,5 @@
 # make study [PRESET=name] [DATA=folder] [OUT=folder] [WORKERS=number] [ARGS=...], make test, make
-# test-slow [GROUP=name], make check, make docs: each sets up what it needs.
+# test-slow [GROUP=name], make test-annotations, make check, make docs: each sets up what it needs.
 PYTHON ?= python3
 VENV := .venv
 STAMP := $(VENV)/.installed
@@ -11,6 +11,9 @@ PRESET ?= one_fabric
 WORKERS ?= 2
 # What takes minutes: `make test-slow GROUP=cloth` runs one group, `make test-slow` all of them.
 GROUPS := cloth points motions estimates arrival pinn physnet study verdicts documents
+# Slow tests check the shapes in annotations as they run, which takes half as long again; so do the
+# fast tests by `make test-annotations`.
+TYPED := --jaxtyping-packages=r2s,beartype.beartype
 GROUP :=
 
 # Most of the fast tests' time is compilation: they do without XLA's optimisation. Two processes of
@@ -25,19 +28,25 @@ QUICK := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 
 MODULES := r2s $(filter-out r2s.__init__,$(subst /,.,$(basename \
 	$(wildcard r2s/*.py) $(patsubst %/__init__.py,%.py,$(wildcard r2s/*/__init__.py)))))
 
-.PHONY: study test test-slow $(addprefix test-slow-,$(GROUPS)) lint types check docs clean
+.PHONY: study test test-annotations test-slow $(addprefix test-slow-,$(GROUPS)) lint types check docs clean
 
 study: $(STAMP)
 	$(RUN) experiments/study.py --preset $(PRESET) $(if $(DATA),--data "$(DATA)") --out "$(OUT)" \
 		--workers $(WORKERS) $(ARGS)
 
+FAST = $(ALONE) XLA_FLAGS="$(QUICK)" $(RUN) -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+
 test: $(STAMP)
-	$(ALONE) XLA_FLAGS="$(QUICK)" $(RUN) -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+	$(FAST)
+
+test-annotations: $(STAMP)
+	$(FAST) $(TYPED)
 
 test-slow: $(if $(GROUP),test-slow-$(GROUP),$(addprefix test-slow-,$(GROUPS)))
 
 $(addprefix test-slow-,$(GROUPS)): test-slow-%: $(STAMP)
-	$(ALONE) $(RUN) -m pytest -q -n 2 --dist worksteal --durations=5 -m "slow(group='$*')"
+	$(ALONE) $(RUN) -m pytest -q -n 2 $(TYPED) --dist worksteal --durations=5 \
+		-m "slow(group='$*')"
 
 lint: $(STAMP)
 	$(RUN) -m ruff check .

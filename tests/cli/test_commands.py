@@ -62,6 +62,7 @@ def test_a_recording_is_simulated_and_judged(tmp_path: Path, capsys: pytest.Capt
     assert mesh["shape"] == [3, 3] and mesh["mesh_error_m"] > 0.005
 
 
+@pytest.mark.slow(group="study")
 def test_export_warns_of_a_mesh_that_is_too_coarse(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
@@ -80,6 +81,7 @@ def test_the_doctor_says_which_mesh_a_fabric_needs(capsys: pytest.CaptureFixture
     assert re.search(r"folding: \d\.\d mm, enough", capsys.readouterr().out)
 
 
+@pytest.mark.slow(group="study")
 def test_exports_are_files_and_say_what_is_lost(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

@@ -30,6 +30,7 @@ def lying(sheet, fabric):
     return cloth(sheet, table=0.0), flat(sheet, float(fabric.thickness) - REST_DEPTH)
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_dropped_sheet_rests_on_the_table(sheet, fabric):
     solver = cloth(sheet, table=0.0)
     states = roll(solver, fabric, solver.init(flat(sheet, 4e-3)), 150)
@@ -39,6 +40,7 @@ def test_a_dropped_sheet_rests_on_the_table(sheet, fabric):
     assert np.max(np.abs(states.v[-1])) < 1e-6
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_sliding_sheet_decelerates_by_friction(sheet, fabric, lying):
     solver, start = lying
     states = roll(solver, fabric, solver.init(start, everywhere([0.8, 0.6, 0.0], sheet)), 8)

@@ -127,6 +127,7 @@ def test_a_law_of_ones_own_and_a_batch_are_refused():
         Card.make("endless", endless, MEASURED)
 
 
+@pytest.mark.slow(group="estimates")
 @given(
     st.lists(st.floats(0, 1), min_size=7, max_size=7),
     st.lists(st.one_of(st.just(float("nan")), st.floats(1e-6, 10)), min_size=7, max_size=7),

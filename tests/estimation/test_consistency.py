@@ -233,6 +233,7 @@ def lifted():
     return synthetic.record(experiment, KNIT, "lift", shape=SHAPE, key=jax.random.key(0))
 
 
+@pytest.mark.slow(group="estimates")
 def test_what_fits_is_not_named(pulled, lifted):
     for recording in (pulled, lifted):
         problem = problem_of(recording)
@@ -242,6 +243,7 @@ def test_what_fits_is_not_named(pulled, lifted):
         assert share < 0.01
 
 
+@pytest.mark.slow(group="estimates")
 def test_a_marker_on_another_cloth_is_named(pulled):
     away = jnp.asarray(pulled.markers).at[1:, 2].add(jnp.array([0.0, 0.03, 0.02]))
     problem = problem_of(dataclasses.replace(pulled, markers=away))
@@ -295,6 +297,7 @@ def test_a_density_is_asked_for_where_a_force_is_missed_or_recordings_are_apart(
     assert not asks_for_density(both[:1] * 2, odd, [])  # nothing weighs the sheet
 
 
+@pytest.mark.slow(group="estimates")
 def test_a_density_that_is_freed_is_the_one_that_was_found(pulled):
     """A theta in which it is half a standard deviation of 10 % heavier stays as heavy."""
     prior = NuisancePrior(density=0.1)
@@ -305,6 +308,7 @@ def test_a_density_that_is_freed_is_the_one_that_was_found(pulled):
     assert density == pytest.approx(float(KNIT.density) * np.exp(0.05), rel=1e-5)
 
 
+@pytest.mark.slow(group="estimates")
 def test_points_of_another_thing_are_counted(lifted):
     mask = np.asarray(lifted.mask)
     points = np.array(lifted.points)

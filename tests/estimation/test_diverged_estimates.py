@@ -109,6 +109,7 @@ def test_a_descent_does_not_go_where_its_derivative_is_not_finite(problem):
         assert (after.damping < start.damping) == is_taken
 
 
+@pytest.mark.slow(group="estimates")
 def test_without_a_derivative_an_estimate_is_not_sure_and_knows_what_was_known(problem):
     def without(problems, theta, width=None):
         found = derivatives_at(problems, theta, width)

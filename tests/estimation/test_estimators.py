@@ -72,6 +72,7 @@ AWAY = jnp.array([0.1, -0.2, 0.5, 0.1, 0.3, 0.2, -0.1, 0.4])
 PULLED = pytest.param("pulled", marks=pytest.mark.slow(group="estimates"))
 
 
+@pytest.mark.slow(group="estimates")
 @pytest.mark.parametrize("scale", [0.0, 0.01])
 @pytest.mark.parametrize("kind", ["small", PULLED])
 def test_the_objective_has_the_gradient_that_differences_have(kind, scale, request):
@@ -104,6 +105,7 @@ def test_a_narrow_secant_is_the_derivative(small):
     assert np.asarray(secant.x) == pytest.approx(np.asarray(exact.x), abs=1e-4 * largest)
 
 
+@pytest.mark.slow(group="estimates")
 def test_a_delay_by_frames_shifts_and_one_between_them_is_third_order():
     times = jnp.arange(12.0)
     x = jnp.stack([times**2, times, 3 - times], axis=1)[:, None]
@@ -113,6 +115,7 @@ def test_a_delay_by_frames_shifts_and_one_between_them_is_third_order():
     np.testing.assert_allclose(between[3:-2, 0, 0], (times[3:-2] - 0.3) ** 2, atol=1e-12)
 
 
+@pytest.mark.slow(group="estimates")
 def test_an_early_camera_is_predicted_as_an_early_recording(recording):
     """Clouds on a clock that is a frame early are explained, by that delay, as on the right one."""
     late = set_time_offset(recording, -0.1)
@@ -255,6 +258,7 @@ def test_recordings_of_one_fabric_add_up(small):
     assert np.all(np.asarray(two.matrix[10:15, 15:]) == 0)
 
 
+@pytest.mark.slow(group="estimates")
 def test_an_estimate_lowers_the_loss_and_survives_its_file(estimated):
     found = estimated
     assert np.nanmin(found.losses[-1]) < np.nanmin(found.losses[0])
@@ -267,6 +271,7 @@ def test_an_estimate_lowers_the_loss_and_survives_its_file(estimated):
     assert again.nuisances == found.nuisances and again.combinations == found.combinations
 
 
+@pytest.mark.slow(group="estimates")
 def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(small, estimated, tmp_path):
     path, whole = tmp_path / "descent.npz", estimated
 
@@ -342,6 +347,7 @@ def test_what_a_beginning_is(small):
             descend(small, SMALL._replace(shares=shares), key=jr.key(0))
 
 
+@pytest.mark.slow(group="estimates")
 @pytest.mark.parametrize("kind", ["small", "pulled"])
 def test_a_beginning_counts_as_a_window_of_the_first_frames_does(kind, request):
     """In the loss and in the normal equations of any motion; later frames have no say."""

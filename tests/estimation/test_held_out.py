@@ -69,6 +69,7 @@ def test_what_cannot_be_held_out_is_named(lift):
         held_out.choose([without, called(lift, "b")], "a")
 
 
+@pytest.mark.slow(group="estimates")
 def test_the_true_fabric_is_better_than_draws_and_a_wrong_one_is_not(lift):
     true = presets.grey_interlock()
     found = held_out.judge(lift, true, SHAPE, count=3)
@@ -79,6 +80,7 @@ def test_the_true_fabric_is_better_than_draws_and_a_wrong_one_is_not(lift):
     assert not wrong.is_better and wrong.defaults == found.defaults
 
 
+@pytest.mark.slow(group="estimates")
 def test_a_motion_is_judged_in_the_air_that_was_found():
     fabric, thick = presets.grey_interlock(), 5.0
     experiment = scenarios.fling(num_frames=24)

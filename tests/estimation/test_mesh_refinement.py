@@ -74,6 +74,7 @@ def test_an_estimate_is_named_by_the_mesh_of_what_moves_freely():
     assert mesh_refinement._named([taut], [(17, 5)]) == (17, 5)
 
 
+@pytest.mark.slow(group="estimates")
 def test_one_recording_of_a_taut_sheet_is_searched_on_the_coarsest_mesh_and_others_are_not():
     free = lift_of()
     taut = dataclasses.replace(free, info=dataclasses.replace(free.info, scenario="stretching"))
@@ -85,6 +86,7 @@ def test_one_recording_of_a_taut_sheet_is_searched_on_the_coarsest_mesh_and_othe
     assert longest(free, taut) == [9, 17, 33] and longest(taut, taut) == [9, 17, 17]
 
 
+@pytest.mark.slow(group="estimates")
 def test_a_shape_that_is_asked_for_is_kept(monkeypatch):
     monkeypatch.setattr(resolution, "LADDER", (2, 3, 5))
     monkeypatch.setattr(resolution, "ENOUGH", 1e-9)
@@ -94,6 +96,7 @@ def test_a_shape_that_is_asked_for_is_kept(monkeypatch):
     assert found.shape == (3, 3)
 
 
+@pytest.mark.slow(group="estimates")
 def test_where_all_diverges_on_a_finer_mesh_the_estimate_is_of_the_coarser_and_says_so(monkeypatch):
     searched: list[tuple[int, bool]] = []
 

@@ -104,6 +104,7 @@ def test_an_estimate_goes_on_and_is_the_last_of_what_was_tried(observation, tmp_
     assert not first.identifiable.any()
 
 
+@pytest.mark.slow(group="physnet")
 def test_the_published_recipe_gives_the_best_of_what_was_tried(observation, tmp_path):
     pytest.importorskip("skopt")
 

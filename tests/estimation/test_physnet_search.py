@@ -24,6 +24,7 @@ TARGET = respond(TRUTH[None])[0]
 optimised = partial(bayesian, num_first=8)
 
 
+@pytest.mark.slow(group="physnet")
 def test_answers_find_what_losses_alone_do_not_and_losses_what_chance_does_not():
     found = emulated(respond, TARGET, 3, num_calls=24, seed=1)
     by_losses = optimised(respond, TARGET, dim=3, num_calls=24, seed=1)

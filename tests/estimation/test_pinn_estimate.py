@@ -78,6 +78,7 @@ def coarse(monkeypatch):
 FAMILY = OrthotropicSpace.make(DENSITY)
 
 
+@pytest.mark.slow(group="pinn")
 def test_an_even_stretch_gives_the_warp_of_the_closed_form():
     """And not what it does not depend on: weft and shear keep the deviation of their range."""
     pull = even_pull()
@@ -90,6 +91,7 @@ def test_an_even_stretch_gives_the_warp_of_the_closed_form():
     assert deviations[0] < 1e-2 and deviations[2] > 0.5 and deviations[4] > 0.99
 
 
+@pytest.mark.slow(group="pinn")
 @pytest.mark.parametrize("growth", [0.0, 0.05, 0.2])
 def test_what_stiffness_grows_by_is_an_error_of_the_small_strain_s(growth):
     """A constant stiffness is a mean over the pull; half of the stretch tells how far it is off."""
@@ -105,6 +107,7 @@ def test_what_stiffness_grows_by_is_an_error_of_the_small_strain_s(growth):
     assert errors[4] < 1e-3  # of bending a flat sheet says nothing, and nothing changes
 
 
+@pytest.mark.slow(group="pinn")
 def test_yarns_that_may_stiffen_have_no_error_for_not_doing_so():
     pull = even_pull(frames=21, growth=0.2)
     space = StiffeningSpace.make(FAMILY)
@@ -115,6 +118,7 @@ def test_yarns_that_may_stiffen_have_no_error_for_not_doing_so():
 PLACE = np.array([0.5, 0.4, 0.6, 0.7, 0.5, 0.5, 0.5])
 
 
+@pytest.mark.slow(group="pinn")
 def test_without_force_the_scale_is_not_identifiable():
     """Motions in equilibrium are the same when all stiffnesses are doubled: only the force
     differs."""
@@ -128,6 +132,7 @@ def test_without_force_the_scale_is_not_identifiable():
     np.testing.assert_allclose(stiff.force[1:], 2 * soft.force[1:], rtol=1e-2)
 
 
+@pytest.mark.slow(group="pinn")
 def test_derivatives_of_the_motion_in_equilibrium_against_differences():
     pull = dataclasses.replace(even_pull(), normal=jnp.asarray(9.81))  # with friction
     given = prepare(small_network(pull), pull, (3, 3))
@@ -145,6 +150,7 @@ def test_derivatives_of_the_motion_in_equilibrium_against_differences():
         np.testing.assert_allclose(slope, differences, rtol=2e-2, atol=2e-2 * np.abs(slope).max())
 
 
+@pytest.mark.slow(group="pinn")
 def test_a_frame_that_is_not_in_equilibrium_does_not_count(monkeypatch):
     """Its derivative may come out as anything, and would decide the estimate."""
     pull, place = even_pull(), jnp.asarray(PLACE)

@@ -210,6 +210,7 @@ def test_friction_resists_the_motion():
     np.testing.assert_allclose(more[-1, -1, 0] / end_value(virtual), limit, rtol=0.1)
 
 
+@pytest.mark.slow(group="pinn")
 def test_each_loss_is_one_when_its_error_is_the_noise():
     """Of the markers, and of the force; the exact motion of a sheet without inertia has none."""
     function = stretched(2.0)

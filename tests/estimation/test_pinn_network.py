@@ -23,6 +23,7 @@ def some_network() -> Network:
     return Network.make(high, jnp.asarray(0.02), width=9, layers=4, key=jr.key(0))
 
 
+@pytest.mark.slow(group="pinn")
 @pytest.mark.parametrize("pairs", [((X, X), (X, Y), (Y, Y), (T, T)), ((X, T), (Y, T), (T, T))])
 def test_jets_are_the_derivatives(pairs):
     network = some_network()
@@ -90,6 +91,7 @@ def test_a_turned_isotropic_law_is_the_same():
     np.testing.assert_allclose(found, law.energy_density(strain), rtol=1e-12)
 
 
+@pytest.mark.slow(group="pinn")
 def test_a_turned_law_stretches_a_sheet_of_the_cloth():
     """The stored energy of a stretched mesh is that of the law at its strain."""
     from r2s.scenarios.energy import stored_energy

@@ -50,6 +50,7 @@ def observation(recording):
     return ImageObservation.make(scenario, images, FRAMES, SPACE, untrained, pull=pull)
 
 
+@pytest.mark.slow(group="estimates")
 def test_the_true_force_is_where_it_was_recorded_and_twice_the_stiffness_apart(observation):
     true = SPACE.to_unit(KNIT)
     warp, weft = (SPACE.ranges[i] for i in (0, 1))
@@ -86,6 +87,7 @@ def test_noise_of_a_load_cell_counts_like_a_flawed_image_at_most(recording):
     assert 0.7 * FLAW < float(jnp.max(jnp.abs(away))) <= 1.01 * FLAW
 
 
+@pytest.mark.slow(group="estimates")
 def test_only_a_stretching_has_one_and_the_published_method_reads_none(recording):
     _, seen = recording
     lift = synthetic.record(
@@ -99,6 +101,7 @@ def test_only_a_stretching_has_one_and_the_published_method_reads_none(recording
         pull_force(still, FRAMES)
 
 
+@pytest.mark.slow(group="estimates")
 def test_a_state_file_of_another_observation_is_refused(observation, tmp_path):
     """Its answers would be those of another density, and its target another recording's."""
     path, calls = tmp_path / "search.npz", SPACE.dim + 2

@@ -79,6 +79,7 @@ def test_the_prior_of_theta_holds_what_is_known_of_the_fabric(lifted):
     np.testing.assert_allclose(np.linalg.inv(told), precision, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow(group="estimates")
 def test_deviations_are_those_of_a_smooth_loss_or_of_how_far_descents_lie_apart(lifted):
     problems, prior = (lifted,), 1e-9
     size = theta_length(problems)

@@ -51,6 +51,7 @@ def at_angle(recording, degrees):
     return dataclasses.replace(recording, info=dataclasses.replace(recording.info, angle=degrees))
 
 
+@pytest.mark.slow(group="pinn")
 def test_the_true_fabric_predicts_a_pull_at_its_angle_and_no_other(bias):
     assert bias.info.angle == 30.0
     off = {}
@@ -68,6 +69,7 @@ def test_the_true_fabric_predicts_a_pull_at_its_angle_and_no_other(bias):
     assert off[70.0][0] > 3 * off[30.0][0] and off[70.0][1] > 2.5 * off[30.0][1]
 
 
+@pytest.mark.slow(group="pinn")
 def test_a_pull_along_the_weft_is_that_of_a_fabric_whose_yarns_are_swapped(bias):
     law = FABRIC.membrane
     swapped = dataclasses.replace(law, c11=law.c22, c22=law.c11)

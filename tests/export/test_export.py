@@ -82,6 +82,7 @@ def test_the_nearest_isotropic_sheet_is_the_nearest():
         assert squares(best.modulus * factor, best.poisson + shift) > squares(*best[:2])
 
 
+@pytest.mark.slow(group="motions")
 @settings(max_examples=15)
 @given(st.lists(st.floats(1.0, 1e3), min_size=3, max_size=3), st.floats(-0.9, 0.9))
 def test_sheet_and_springs_together_are_the_fabric(numbers, coupling):
@@ -129,6 +130,7 @@ EXPORTS = {
 }
 
 
+@pytest.mark.slow(group="motions")
 @pytest.mark.parametrize("name", EXPORTS)
 def test_each_says_what_is_lost(name):
     loss = EXPORTS[name](DENIM, MESH)

@@ -50,6 +50,7 @@ def pulled(fabric: Fabric, name: str, most: float = 0.2, noise: float = 0.0) -> 
 # Pulls
 
 
+@pytest.mark.slow(group="study")
 @pytest.mark.parametrize(
     "direction, c11, c12, c22", [(0.0, 300, -60, 200), (np.pi / 2, 200, -60, 300)]
 )
@@ -70,6 +71,7 @@ def test_a_strip_pulled_askew_has_the_modulus_of_a_turned_orthotropic_sheet():
     assert float(tension) / small == pytest.approx(1 / (along @ compliance @ along), rel=1e-5)
 
 
+@pytest.mark.slow(group="study")
 def test_yarns_stiffen_by_their_ratio_each_at_its_own_knee():
     law = StiffeningMembrane.make(LAW, 10.0, 1.02, 1.2)
     for direction, soon in ((0.0, True), (np.pi / 2, False)):
@@ -81,6 +83,7 @@ def test_yarns_stiffen_by_their_ratio_each_at_its_own_knee():
         assert 6 < far / limit < 10
 
 
+@pytest.mark.slow(group="study")
 def test_the_force_of_a_pull_has_the_derivatives_of_differences():
     law = StiffeningMembrane.make(LAW, 8.0, 1.05, 1.1)
 
@@ -102,6 +105,7 @@ def test_a_law_that_follows_the_strain_has_no_curve():
         uniaxial(law, jnp.asarray(1.1), 0.0)
 
 
+@pytest.mark.slow(group="study")
 @pytest.mark.parametrize("cells, off", [((16, 4), 0.03), ((4, 4), 0.15)], ids=["4:1", "1:1"])
 def test_clamps_pull_a_long_strip_as_free_sides_do(cells, off):
     """A sheet between two clamps, simulated; a square one is stiffer, by less than `off`."""
@@ -144,6 +148,7 @@ def test_a_strip_that_hardly_sags_is_a_beam():
 # Drapes
 
 
+@pytest.mark.slow(group="study")
 def test_a_rigid_disc_does_not_drape_and_a_limp_one_hangs_down():
     run = eqx.filter_jit(
         lambda fabric: coefficient(SMALL_RING, drape(SMALL_RING, fabric, jax.random.key(0)))
@@ -154,6 +159,7 @@ def test_a_rigid_disc_does_not_drape_and_a_limp_one_hangs_down():
     assert found[2] > 0
 
 
+@pytest.mark.slow(group="study")
 def test_a_drape_has_the_derivative_of_differences():
     fabric, key = presets.pink_solid(), jax.random.key(0)
 
@@ -192,6 +198,7 @@ def errors(found, fabric: Fabric, space) -> dict[str, float]:
     )
 
 
+@pytest.mark.slow(group="study")
 @pytest.mark.parametrize("name", ["black_denim", "camel_ponte_roma"])
 def test_pulls_and_a_cantilever_tell_the_stiffnesses(name):
     fabric = presets.MEASURED[name]()
@@ -209,6 +216,7 @@ def test_pulls_and_a_cantilever_tell_the_stiffnesses(name):
     assert found.converged
 
 
+@pytest.mark.slow(group="study")
 def test_a_sheet_that_stiffens_is_told_by_its_pulls():
     fabric = presets.grey_interlock()
     small = fabric.membrane
@@ -235,6 +243,7 @@ def test_a_drape_tells_bending_where_nothing_else_does():
     assert known["bending"] < 0.3
 
 
+@pytest.mark.slow(group="study")
 def test_what_tests_tell_is_the_prior_of_an_estimate_from_motions():
     fabric = presets.black_denim()
     space = on_cloth(float(fabric.density))
@@ -277,6 +286,7 @@ def test_a_motion_after_tests_tells_more_than_either():
         r2s.METHODS["cma-es"]().estimate([lift], informed(space, told), key=jax.random.key(0))
 
 
+@pytest.mark.slow(group="study")
 def test_a_motion_that_leads_elsewhere_than_the_tests_contradicts_them():
     space = on_cloth(0.32)
     tests = [pulled(presets.black_denim(), each) for each in ANGLES]
@@ -451,6 +461,7 @@ def test_pulls_of_knits_are_read_in_metres(tmp_path: Path):
         read_knit(file, 0.0)
 
 
+@pytest.mark.slow(group="study")
 def test_tests_alone_make_a_card(tmp_path: Path, capsys: pytest.CaptureFixture):
     pytest.importorskip("tyro")
     from r2s.cli.main import main

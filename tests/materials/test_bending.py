@@ -94,6 +94,7 @@ def test_an_unwrapped_angle_differs_by_whole_turns_and_is_nearest(angle, near):
     assert abs(found - near) <= np.pi * (1 + 1e-9)
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("elements", ["wrinkling", "rising"])
 def test_second_derivatives_of_bends_are_those_of_their_gradients(elements):
     sheet = rectangle((0.3, 0.2), (4, 3), elements)

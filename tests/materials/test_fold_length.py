@@ -19,6 +19,7 @@ def test_a_strip_of_this_length_sags_by_an_eighth_of_it():
     assert elastica(number)[1] == pytest.approx(1 / 8, rel=0.05)  # it bends more than slightly
 
 
+@pytest.mark.slow(group="cloth")
 def test_it_has_a_gradient_and_a_batch():
     stiffnesses = jnp.array([1e-6, 8e-6])
 

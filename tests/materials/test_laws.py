@@ -132,6 +132,7 @@ def test_uniaxial_stretch_across_the_yarns_is_exact(degrees, sheet, fabric):
 # Mass damping
 
 
+@pytest.mark.slow(group="cloth")
 def test_mass_damping_brakes_a_fall(sheet):
     rate = 3.0  # [1/s]
     fabric = Fabric.make(0.2, (300.0, 60.0, 200.0, 80.0), 2e-5, mass_damping=rate)
@@ -166,6 +167,7 @@ def test_friction_of_the_air_has_derivatives_at_no_flow_along(flow):
     assert jnp.all(jnp.isfinite(jax.hessian(air.dissipation)(jnp.array(flow), area_normal)))
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("degrees", [35, 90])
 def test_a_tilted_sheet_glides_at_its_terminal_velocity(degrees, sheet, fabric):
     # the flows along and across the sheet do not know of each other, nor does it turn
@@ -206,6 +208,7 @@ def test_the_wind_of_a_fan_has_a_gradient_on_its_axis():
     assert slope == pytest.approx(0)  # and not NaN
 
 
+@pytest.mark.slow(group="cloth")
 def test_the_same_wind_at_every_vertex_is_a_uniform_one(sheet, fabric):
     solver = cloth(sheet, air=AIR_DENSITY)
     start = solver.init(flat(sheet) @ rotation(0.4, 0).T)

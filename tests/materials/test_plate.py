@@ -66,6 +66,7 @@ def inner_elements(mesh: Mesh):
     return np.all(count[index.reshape(3, -1)] == 2, axis=0)
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("name", MESHES)
 @given(k11=numbers, k22=numbers, k12=numbers)
 def test_a_constant_curvature_is_seen_exactly(name, k11, k22, k12):
@@ -126,6 +127,7 @@ def test_a_solid_plate_has_the_textbook_stiffness():
     assert beam == pytest.approx(2e9 * 1e-9 / 24)
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize(
     "law", [PlateBending.make(0.3, 0.2), OrthotropicPlate(*jnp.array([0.3, 0.4, 0.2]))]
 )
@@ -147,6 +149,7 @@ def test_the_hessian_is_the_derivative_of_the_force(law, sheet, fabric):
     np.testing.assert_allclose(product, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
 
 
+@pytest.mark.slow(group="cloth")
 def test_quadrilaterals_favour_neither_warp_nor_weft_nor_a_diagonal():
     fabric = Fabric.make(0.2, (60.0, 20.0, 60.0, 20.0), 2e-5)
     lift = lifting(num_frames=40).scenario((9, 9))

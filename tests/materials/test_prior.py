@@ -71,6 +71,7 @@ def test_a_yarn_stiffens_half_way_at_a_stretch_and_at_most_by_a_ratio(axis):
         StiffeningMembrane.make(SMALL, 0.5, 1.1)
 
 
+@pytest.mark.slow(group="cloth")
 def test_no_strain_makes_a_sheet_stiffer_than_its_stiffest():
     law = StiffeningMembrane.make(SMALL, 2.0, 1.1)
     most = _tangent(law.stiffest, jnp.zeros(3))

@@ -141,6 +141,7 @@ def test_a_table_of_equal_rows_is_a_constant_law():
         assert energy == constant.energy_density(jnp.array(strain))
 
 
+@pytest.mark.slow(group="cloth")
 def test_the_stress_is_the_secant_stiffness_times_the_strain():
     law, strain = MEMBRANE, strain_of(1.1, 0.3, 0.98)
     stress = jax.grad(law.at(strain).energy_density)(strain)
@@ -205,6 +206,7 @@ def tabled(membrane, bending):
     return dataclasses.replace(fabric, membrane=membrane, bending=bending)
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_sheet_hangs_by_the_stiffness_of_its_strain(sheet):
     # by the first row, so stretched along the warp; without C12 its width does not matter
     membrane = TableMembrane(0.1 * STRETCHING.at[:, 1].set(0.0))
@@ -227,6 +229,7 @@ def test_a_sheet_hangs_by_the_stiffness_of_its_strain(sheet):
     assert extension(False) > 1.1 * extension(True)  # so the table makes a difference
 
 
+@pytest.mark.slow(group="cloth")
 def test_derivatives_of_a_step_agree_with_differences(sheet):
     solver = cloth(sheet, FIRST_ROW)
 

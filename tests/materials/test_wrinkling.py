@@ -45,6 +45,7 @@ def by_search(matrix: np.ndarray, strain: np.ndarray) -> float:
     return -min(min(end.fun for end in ends), 0.0)
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("name", presets.FIVE)
 def test_wrinkles_release_what_a_search_finds(name):
     """And what their gradual beginning adds: at most the parabola of half the critical stress."""
@@ -73,6 +74,7 @@ def test_derivatives_agree_with_differences_and_the_rest_is_convex(name):
         assert np.linalg.eigvalsh(matrix - second).min() > 0
 
 
+@pytest.mark.slow(group="cloth")
 def test_forces_on_material_points_are_those_of_the_stored_energy():
     mesh, fabric = rectangle((0.2, 0.2), (5, 5), "wrinkling"), presets.grey_interlock()
     noise = np.random.default_rng(1).normal(size=(25, 3)) * 2e-3
@@ -92,6 +94,7 @@ def test_forces_on_material_points_are_those_of_the_stored_energy():
     assert jax.jit(stored(mesh))(x) < 0.5 * jax.jit(stiffer)(x)
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_motion_of_wrinkled_cells_has_the_gradient_that_differences_have():
     sheet = rectangle((0.2, 0.2), (5, 5), "wrinkling")
     scene = r2s.Scene(sheet, jnp.array([0, 4]), r2s.Table.make(-jnp.inf), r2s.Air.make())
@@ -127,6 +130,7 @@ def test_stiffness_changes_gradually_as_wrinkles_begin():
     assert np.abs(np.diff(second, axis=0)).max() < 0.1 * matrix.max()
 
 
+@pytest.mark.slow(group="cloth")
 def test_the_critical_stress_is_that_of_waves_as_long_as_a_cell():
     """So it grows as cells shrink, and is less along the longer side of a cell."""
     fabric = presets.grey_interlock()
@@ -159,6 +163,7 @@ def test_derivatives_in_the_law_agree_with_differences_up_to_the_most_that_is_hi
         assert float(found) == pytest.approx(float(ahead - behind) / (2 * h), rel=1e-5, abs=1e-9)
 
 
+@pytest.mark.slow(group="cloth")
 def test_equal_compression_in_all_directions_releases_shear_too():
     matrix = np.array([[100.0, 30.0, 0.0], [30.0, 100.0, 0.0], [0.0, 0.0, 35.0]])
     for kind, bound in ((jnp.float32, 0.1), (jnp.float64, 1e-6)):
@@ -208,6 +213,7 @@ def test_a_search_from_other_wrinkles_ends_at_the_same_ones():
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("name", presets.FIVE)
 def test_known_wrinkles_give_the_energy_its_slope_and_the_closed_form_its_curvature(name):
     sheet, fabric = rectangle((0.3, 0.2), (3, 2)), presets.FIVE[name]()

@@ -35,6 +35,7 @@ def test_every_inner_edge_has_one_hinge(shape):
     assert sorted(tuple(sorted(hinge)) for hinge in mesh.hinges[:, :2].tolist()) == inner
 
 
+@pytest.mark.slow(group="cloth")
 @given(st.tuples(counts, counts))
 @few
 def test_the_borders_go_once_around_the_sheet(shape):
@@ -62,6 +63,7 @@ def test_hinges_measure_their_edge_and_triangles(sheet):
     assert sheet.hinge_area == pytest.approx(cell**2, rel=1e-12)
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("elements", ELEMENTS)
 @given(st.tuples(sides, sides), st.tuples(counts, counts))
 @few

@@ -53,6 +53,7 @@ def test_nothing_on_a_triangle_is_nearer(corners, point):
     assert distance >= np.min(others) - cell
 
 
+@pytest.mark.slow(group="cloth")
 def test_nearest_places_on_a_sheet_equal_a_search_of_all_triangles(sheet, crumpled):
     x, points = crumpled
     found, _ = places(points, x, sheet.faces)

@@ -114,6 +114,7 @@ def test_residuals_of_masked_points_are_zero(surface, sheet):
     assert jnp.all(distance[1::2] == 0) and jnp.all(distance[::2] > 0)
 
 
+@pytest.mark.slow(group="motions")
 def test_a_point_on_the_sheet_has_the_normal_as_direction(sheet):
     points = jnp.array([[0.07, 0.11, 0.0]])
     distance, direction, *_ = surface_residuals(points, EVERY[:1], flat(sheet), sheet.faces)

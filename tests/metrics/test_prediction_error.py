@@ -31,6 +31,7 @@ def test_a_recording_is_at_no_distance_from_itself(lift):
     assert all(value == 0 for value in found.values())
 
 
+@pytest.mark.slow(group="motions")
 def test_the_true_fabric_is_nearer_than_another_and_than_noise_allows(lift, predicted):
     truth = prediction_error.against_motion(lift, predicted)
     other = prediction_error.against_motion(

@@ -77,6 +77,7 @@ def test_the_first_acceleration_reaches_a_braked_solver():
     assert jnp.all(begin(free, dataclasses.replace(scenario, acceleration=None)).v_before == 0)
 
 
+@pytest.mark.slow(group="study")
 def test_clouds_lie_on_the_sheet_evenly_and_off_it_by_the_noise():
     mesh = rectangle((0.4, 0.2), (3, 3))
     x = np.stack([np.pad(np.asarray(mesh.rest), ((0, 0), (0, 1)))] * 2)

@@ -53,6 +53,7 @@ def configuration(folder: Path, move: str = "grasp", **others) -> SimpleNamespac
     return SimpleNamespace(**(parts | others))
 
 
+@pytest.mark.slow(group="study")
 def test_a_garment_is_grabbed_where_the_arms_are_and_follows_them(tmp_path: Path):
     run = Environment(configuration(tmp_path))
     assert run.get_master_start_time() == START
@@ -69,6 +70,7 @@ def test_a_garment_is_grabbed_where_the_arms_are_and_follows_them(tmp_path: Path
     assert raised[:, 2].min() > -1e-3 and np.isfinite(raised).all()
 
 
+@pytest.mark.slow(group="study")
 def test_a_fling_begins_where_the_arms_do_and_waits_there(tmp_path: Path):
     run = Environment(configuration(tmp_path, "fling"))
     run.step_to_time(0.1)

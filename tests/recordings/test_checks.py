@@ -174,6 +174,7 @@ def test_a_sheet_that_stretches_is_found(rendered):
     assert suspicious(read(rendered(1.15))) & {"stretch", "reach"}
 
 
+@pytest.mark.slow(group="motions")
 def test_markers_that_move_apart_are_found():
     pulled = synthetic.record(
         scenarios.stretching(num_frames=6, interval=0.2, moving=0.8),

@@ -97,6 +97,7 @@ def error(tracks: Tracks, truth: np.ndarray) -> float:
 TRUTH = np.stack([in_image(stretched(strain)) for strain in strains()])
 
 
+@pytest.mark.slow(group="motions")
 def test_all_markers_are_kept_to_a_fifth_of_a_pixel(pull: list[np.ndarray]) -> None:
     tracks = track(pull)
     assert tracks.seen.all() and tracks.pixels.shape == (60, 81, 2)
@@ -116,6 +117,7 @@ def test_the_strain_comes_back_in_metres(pull: list[np.ndarray]) -> None:
     assert on_table(metres, 0.01).shape == (9, 81, 3)
 
 
+@pytest.mark.slow(group="motions")
 def test_covered_markers_are_reported_and_found_again(pull: list[np.ndarray]) -> None:
     frames, covered = [], []
     for i, image in enumerate(pull):

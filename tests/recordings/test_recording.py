@@ -227,6 +227,7 @@ def test_subsample_refuses_bad_numbers() -> None:
             subsample(record(ones(3, 4)), 5, voxel, seed=0)
 
 
+@pytest.mark.slow(group="motions")
 @given(clouds=CLOUDS, verified=st.sampled_from([True, False, None]), fabric=st.text(max_size=5))
 @settings(max_examples=20, deadline=None)
 def test_save_and_load_give_the_same_recording(

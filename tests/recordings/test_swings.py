@@ -109,6 +109,7 @@ def test_a_swing_is_read_on_the_arm_s_clock_with_its_sheet_below_the_bar(file: P
     assert np.asarray(read.markers_seen).all()
 
 
+@pytest.mark.slow(group="motions")
 def test_the_fabric_that_swung_is_where_its_markers_are_and_a_light_one_is_not(file: Path):
     read = read_swing(file, BAR)
     scenario = from_recording(read, (5, 5))

@@ -76,6 +76,7 @@ def test_the_workspace_less_its_border_is_what_counts():
     np.testing.assert_array_equal(seen, np.abs(np.asarray(x)[:, 0]) < 0.08)
 
 
+@pytest.mark.slow(group="motions")
 def test_samples_in_view_are_those_near_which_the_exact_images_have_points():
     mesh = rectangle((0.3, 0.3), (31, 31))
     rest = np.asarray(mesh.rest)
@@ -140,6 +141,7 @@ def lifted() -> Recording:
     return dataclasses.replace(made, info=dataclasses.replace(made.info, views=views, doubt=doubt))
 
 
+@pytest.mark.slow(group="motions")
 def test_a_recording_keeps_its_cameras_and_doubt(lifted: Recording, tmp_path: Path):
     save(lifted, tmp_path / "lift.npz")
     assert load(tmp_path / "lift.npz").info == lifted.info
@@ -158,6 +160,7 @@ def theta_of(problem: Problem, place) -> jax.Array:
     return jnp.concatenate([place, jnp.zeros(len(problem.nuisance_prior.scales))])
 
 
+@pytest.mark.slow(group="motions")
 def test_a_sheet_that_is_larger_than_its_clouds_is_found_by_what_should_have_been_seen(problem):
     """Clouds of one half of the sheet lie on the whole of it; the other half lies near no cloud."""
     theta = theta_of(problem, FAMILY.to_unit(FABRIC))
@@ -184,6 +187,7 @@ def test_a_sheet_that_is_larger_than_its_clouds_is_found_by_what_should_have_bee
     assert both[0] < 3 * one_way[0] and both[1] > 20 * both[0]
 
 
+@pytest.mark.slow(group="motions")
 def test_what_should_have_been_seen_has_the_gradient_that_differences_have(problem):
     place = FAMILY.to_unit(FABRIC) + 0.1
     alone = dataclasses.replace(problem, clouds=None)  # the nearest points of both may change
@@ -208,6 +212,7 @@ def test_windows_and_beginnings_keep_and_hide_what_should_have_been_seen(problem
     np.testing.assert_array_equal(counted, np.arange(len(problem.frames)) < 2)
 
 
+@pytest.mark.slow(group="motions")
 def test_on_material_points_the_size_is_taken_as_written_down(lifted):
     """Else a recording that doubts its size could not be simulated on them at all."""
     (made,) = problems_on_points([lifted], on_points(0.2), (5, 5))

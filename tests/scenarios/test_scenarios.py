@@ -60,6 +60,7 @@ def check(scenario, fabric, found):
     assert found.kinetic[0] < mass / 2 * 0.01**2  # it starts at rest, to 1 cm/s
 
 
+@pytest.mark.slow(group="motions")
 @pytest.mark.parametrize("name", ["lifting", "folding"])
 def test_a_sheet_on_the_table_is_lifted_and_folded(name):
     fabric = presets.FIVE[STIFFEST]()
@@ -202,6 +203,7 @@ def test_every_scenario_on_every_solver(name, kind, fabric):
         assert stretched.mean(axis=1).max() < 0.12 and stretched.max() < 1
 
 
+@pytest.mark.slow(group="motions")
 def test_the_energy_of_a_table_law_is_that_of_its_stiffness_there():
     mesh = rectangle((0.2, 0.2), (4, 4))
     fabric = presets.grey_interlock()

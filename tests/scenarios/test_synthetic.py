@@ -48,6 +48,7 @@ def test_the_same_key_gives_the_same_recording(recording):
     np.testing.assert_array_equal(recording.points, again.points)
 
 
+@pytest.mark.slow(group="motions")
 def test_the_cloud_lies_on_the_sheet_but_for_noise_and_outliers(recording):
     moved = rollout(from_recording(recording), presets.grey_interlock())
     assert bool(jnp.all(moved.ok))
@@ -60,6 +61,7 @@ def test_the_cloud_lies_on_the_sheet_but_for_noise_and_outliers(recording):
     assert 0.5e-3 < np.median(distance) < 2.5e-3
 
 
+@pytest.mark.slow(group="motions")
 def test_the_view_is_partial(recording):
     moved = rollout(from_recording(recording), presets.grey_interlock())
     faces = from_recording(recording).scene.mesh.faces
@@ -71,6 +73,7 @@ def test_the_view_is_partial(recording):
 SHAPE = (5, 5)
 
 
+@pytest.mark.slow(group="motions")
 def test_a_hanging_sheet_in_the_wind_is_in_view():
     experiment = scenarios.wind(num_frames=6, interval=1 / 10, speed=3.0)
     fabric = presets.grey_interlock()

@@ -47,6 +47,7 @@ def settled(solver, mesh):
     return jnp.asarray(roll(solver, damped, solver.init(hanging(mesh)), 400).x[-1])
 
 
+@pytest.mark.slow(group="cloth")
 def test_free_fall_is_exact(sheet, fabric):
     # BDF2 differentiates parabolas exactly, given a point of the parabola before the start
     x, v, g = flat(sheet) @ rotation(0.5, 0).T, [0.3, 0.0, 1.0], [0.0, 0.0, -GRAVITY]
@@ -62,6 +63,7 @@ def test_free_fall_is_exact(sheet, fabric):
     assert states.x == pytest.approx(exact, abs=1e-10)  # tolerance of the solve, 1e-11 m a step
 
 
+@pytest.mark.slow(group="cloth")
 def test_free_fall_from_init_is_half_a_step_late(sheet, fabric):
     # `init` continues the velocity backwards, without gravity
     solver = cloth(sheet)
@@ -100,6 +102,7 @@ def test_damping_does_not_brake_a_rotation(sheet):
     assert spin[1] == pytest.approx(spin[0], rel=1e-7)
 
 
+@pytest.mark.slow(group="cloth")
 def test_damping_is_proportional_to_stiffness():
     sheet = rectangle((SIZE, SIZE), SHAPE, "quadrilaterals")  # without bending others give way
     # the first standing wave of a free sheet, x = s + a cos(pi s / L), on a grid of 4 cells
@@ -116,6 +119,7 @@ def test_damping_is_proportional_to_stiffness():
     assert peaks[1] / peaks[0] == pytest.approx(np.exp(-(rate**2) * 0.005 / 2 * period), rel=0.03)
 
 
+@pytest.mark.slow(group="cloth")
 def test_handles_are_where_they_are_put(sheet, fabric):
     solver = cloth(sheet, FIRST_ROW)
     start = flat(sheet)
@@ -136,6 +140,7 @@ def test_a_path_is_linear_between_knots_and_rests_beyond():
     assert np.asarray(found[:, 0]) == pytest.approx(np.array(expected))
 
 
+@pytest.mark.slow(group="cloth")
 def test_air_takes_energy_from_a_swing(sheet, fabric):
     ends = []
     for air in (0.0, AIR_DENSITY):
@@ -146,6 +151,7 @@ def test_air_takes_energy_from_a_swing(sheet, fabric):
     assert ends[1] - hung < 0.5 * (ends[0] - hung)
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_smooth_swing_converges_to_second_order(sheet):
     fabric = Fabric.make(0.2, LAW, 1e-3)
     start = settled(cloth(sheet, FIRST_ROW), sheet)  # `init` is exact for a sheet at rest
@@ -187,6 +193,7 @@ def disturbed():
     return state, both
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("seed", range(3))
 def test_forces_are_minus_the_gradient_of_the_energy(disturbed, seed):
     state, both = disturbed
@@ -197,6 +204,7 @@ def test_forces_are_minus_the_gradient_of_the_energy(disturbed, seed):
     assert jnp.sum(both(increment, x)[2] * direction) == pytest.approx(float(expected), rel=1e-6)
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("seed", range(3))
 def test_the_hessian_is_the_derivative_of_the_forces(disturbed, seed):
     state, both = disturbed
@@ -220,6 +228,7 @@ def test_the_convex_hessian_is_positive_definite(disturbed, seed):
     assert jnp.linalg.eigvalsh(exact)[0] < 0  # so these states are a test
 
 
+@pytest.mark.slow(group="cloth")
 def test_the_convex_hessian_is_exact_on_a_flat_sheet_under_tension(sheet, disturbed):
     _, both = disturbed
     solver = cloth(sheet, FIRST_ROW, table=0.0, air=AIR_DENSITY)
@@ -231,6 +240,7 @@ def test_the_convex_hessian_is_exact_on_a_flat_sheet_under_tension(sheet, distur
     assert np.asarray(convex) == pytest.approx(np.asarray(exact), rel=1e-9, abs=1e-9)
 
 
+@pytest.mark.slow(group="cloth")
 def test_the_step_ends_in_balance(sheet, fabric):
     solver = cloth(sheet, FIRST_ROW)
     state = solver.init(hanging(sheet, 0.5))
@@ -250,6 +260,7 @@ EXTREME = [  # density, C11, C22, C33, bending
 ]
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("is_double", [False, True])
 def test_extreme_fabrics_stay_finite(is_double):
     with jax.enable_x64(is_double):
@@ -273,6 +284,7 @@ def test_the_step_must_be_positive(sheet, dt):
         cloth(sheet, dt=dt)
 
 
+@pytest.mark.slow(group="cloth")
 def test_the_noise_of_the_energy_does_not_stop_newtons_method():
     """The last steps of a soft sheet gain less than the sum of its energies is exact to."""
     space = OrthotropicSpace.make(0.19)

@@ -106,6 +106,7 @@ def test_the_elastica_bends_little_like_a_beam():
 NUMBERS = [1.0, 3.0, 10.0, 30.0]
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("elements", ["quadrilaterals", "falling"])
 @pytest.mark.parametrize("axis", [0, 1], ids=["warp", "weft"])
 @pytest.mark.parametrize("number", NUMBERS)
@@ -160,12 +161,14 @@ def in_the_limit(value, law, elements: str = "quadrilaterals") -> float:
     return 2 * fine - coarse
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("elements", ["falling", "rising", "quadrilaterals"])
 def test_a_thin_strip_of_plate_has_its_stiffness(elements):
     found = in_the_limit(small_stiffness, PlateBending.make(1.0), elements)
     assert found == pytest.approx(1, rel=2e-3)
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("ratio", [-0.3, 0.3])
 def test_a_strip_of_plate_is_free_to_curve_across(ratio):
     # but for the faces at its border, which do not see how they should curve across
@@ -260,6 +263,7 @@ def test_hinges_twist_too_stiffly():
     assert 2 * fine - coarse == pytest.approx(buckling(1 / (1 + 1 / 4), 4), rel=0.04)
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("share", [0.9, 1.1])
 def test_a_strip_on_its_edge_stays_upright_up_to_its_critical_weight(share):
     mesh = strip(16, 0)

@@ -30,6 +30,7 @@ def explicit(mesh, fabric, held=(), dt=0.01, table=-jnp.inf, **options):
     return ExplicitCloth.make(scene, dt, fabric, **options)
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("elements", ["quadrilaterals", "wrinkling"])
 @pytest.mark.parametrize("shape", [(6, 5), (2, 5)])
 def test_forces_on_the_grid_are_those_by_gathers(shape, elements, fabric):
@@ -68,6 +69,7 @@ def test_forces_on_the_grid_are_those_by_gathers(shape, elements, fabric):
     assert kept == pytest.approx(np.asarray(remembered), rel=1e-9, abs=1e-9)
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_free_sheet_falls_as_a_stone(sheet, fabric):
     solver = explicit(sheet, fabric)
     moved = eqx.filter_jit(solver.step)(
@@ -79,6 +81,7 @@ def test_a_free_sheet_falls_as_a_stone(sheet, fabric):
     assert int(moved.failure) == Failure.NONE
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_batch_is_its_members(sheet, fabric):
     solver = explicit(sheet, fabric, held=(0, 4))
     start = solver.init(flat(sheet))
@@ -126,6 +129,7 @@ def moved(solver, fabric, wind=(0.0, 0.0, 0.0), height=0.0, v=None, steps=1):
     return state
 
 
+@pytest.mark.slow(group="cloth")
 def test_the_grid_moves_as_any_mesh_does_in_the_wind_of_a_fan(fabric):
     mesh = r2s.rectangle((0.3, 0.2), (4, 5), "quadrilaterals")
     fan = Fan(*(jnp.asarray(v) for v in ((0.1, 0.1, -0.2), (0.0, 0.3, 1.0), 0.1, 0.05)))
@@ -140,6 +144,7 @@ def test_the_grid_moves_as_any_mesh_does_in_the_wind_of_a_fan(fabric):
     np.testing.assert_allclose(one.v, other.v, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow(group="cloth")
 def test_laws_that_are_not_constant_move_the_grid_as_any_mesh(fabric):
     springs = r2s.SpringMembrane(*(jnp.asarray(c) for c in (300.0, 200.0, 80.0)))
     fabric = eqx.tree_at(lambda f: f.membrane, fabric, springs)
@@ -164,6 +169,7 @@ def test_friction_stops_a_sliding_sheet_after_the_way_of_coulomb(fabric):
     assert float(jnp.mean(moved(solver, fabric, height=rest, v=v, steps=30).v[:, 0])) < 1e-3
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_motion_in_explicit_steps_has_its_derivative(fabric):
     sheet = r2s.rectangle((0.2, 0.2), (3, 3), "quadrilaterals")
     solver = explicit(sheet, fabric, held=(0,), dt=0.005)
@@ -183,6 +189,7 @@ def test_a_motion_in_explicit_steps_has_its_derivative(fabric):
     assert float(forward) == pytest.approx(float(difference), rel=1e-6)
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_fabric_that_is_too_stiff_for_the_substeps_is_refused_or_fails(sheet, fabric):
     solver = explicit(sheet, fabric, held=(0,))
     stiff = eqx.tree_at(
@@ -278,6 +285,7 @@ def test_a_free_sheet_keeps_its_momentum_and_loses_energy(sheet, fabric):
     assert np.all(np.diff(energies) < 0)
 
 
+@pytest.mark.slow(group="cloth")
 def test_grippers_carry_the_weight_of_a_sheet_at_rest(fabric):
     """On any mesh and on the grid, and through the account of energy."""
     scenario = r2s.wind((0.2, 0.2), speed=0.0, num_frames=3).scenario((4, 4))
@@ -289,6 +297,7 @@ def test_grippers_carry_the_weight_of_a_sheet_at_rest(fabric):
         assert float(found.dissipated[-1]) > -1e-6
 
 
+@pytest.mark.slow(group="cloth")
 def test_explicit_steps_of_a_lift_go_where_small_implicit_ones_go(fabric):
     scenario = r2s.lifting((0.3, 0.3), num_frames=12, moving=0.6).scenario((5, 5))
     run = eqx.filter_jit(r2s.rollout)

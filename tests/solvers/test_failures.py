@@ -27,6 +27,7 @@ def crumpled(sheet):
     return flat(sheet) + 0.02 * jax.random.normal(jax.random.key(0), (len(sheet.rest), 3))
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_run_that_goes_well_has_no_failure(sheet, fabric):
     moved = run(cloth(sheet), fabric, flat(sheet))
     assert bool(jnp.all(moved.ok)) and moved.explain() == ""
@@ -37,6 +38,7 @@ def test_a_run_that_goes_well_has_no_failure(sheet, fabric):
     ]
 
 
+@pytest.mark.slow(group="cloth")
 def test_newton_that_is_cut_short_is_named_with_frame_and_step(sheet, fabric):
     solver = dataclasses.replace(cloth(sheet), max_iterations=1)
     moved = run(solver, fabric, crumpled(sheet))
@@ -46,6 +48,7 @@ def test_newton_that_is_cut_short_is_named_with_frame_and_step(sheet, fabric):
     assert bool(jnp.all(jnp.isnan(moved.x)))
 
 
+@pytest.mark.slow(group="cloth")
 def test_the_frame_and_step_are_those_in_which_it_failed(sheet, fabric):
     # the wind is not a number from the second step of the second frame on
     wind = STILL.wind.at[1, 1:].set(jnp.nan).at[2].set(jnp.nan)
@@ -58,12 +61,14 @@ def test_the_frame_and_step_are_those_in_which_it_failed(sheet, fabric):
     assert int(later.failed_frame) == -1 and "1 frames before the first one" in later.explain()
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_matrix_that_is_not_definite_is_named(sheet, fabric):
     lighter_than_nothing = dataclasses.replace(fabric, density=-fabric.density)
     moved = run(cloth(sheet), lighter_than_nothing, crumpled(sheet))
     assert moved.failure == Failure.LINEAR_SOLVE.value
 
 
+@pytest.mark.slow(group="cloth")
 def test_in_a_sweep_each_member_has_its_own(sheet, fabric):
     solver, x = cloth(sheet), flat(sheet)
 

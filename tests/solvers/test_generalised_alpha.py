@@ -56,6 +56,7 @@ def test_the_fastest_vibrations_are_damped_to_the_spectral_radius(spectral_radiu
     assert largest == pytest.approx(spectral_radius, abs=2e-3)
 
 
+@pytest.mark.slow(group="cloth")
 def test_free_fall_is_exact(sheet, fabric):
     x = flat(sheet) @ rotation(0.5, 0).T
     v, g = everywhere([0.3, 0.0, 1.0], sheet), everywhere([0.0, 0.0, -GRAVITY], sheet)
@@ -90,6 +91,7 @@ def test_a_smooth_swing_converges_to_second_order_with_less_error_than_bdf2(shee
     assert errors[0] < 0.5 * errors[1]
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_swing_loses_less_energy_than_by_bdf2(sheet, fabric):
     lost, scale = [], 0.2 * SIZE**3 * GRAVITY / 2  # weight times half the length
     for solver in (cloth(sheet, FIRST_ROW), by_alpha(cloth(sheet, FIRST_ROW))):
@@ -100,6 +102,7 @@ def test_a_swing_loses_less_energy_than_by_bdf2(sheet, fabric):
     assert 0 < lost[1] < 0.8 * lost[0]  # the rest is of the fastest vibrations
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_sheet_that_falls_onto_a_table_comes_to_rest_on_it(sheet, fabric):
     solver = by_alpha(cloth(sheet, table=0.0))
     down = everywhere([0.0, 0.0, -GRAVITY], sheet)
@@ -121,6 +124,7 @@ def test_a_sheet_that_falls_onto_a_table_comes_to_rest_on_it(sheet, fabric):
     assert np.all(np.diff(energies) < 1e-3 * (energies[0] - energies[-1]))
 
 
+@pytest.mark.slow(group="cloth")
 def test_grippers_carry_the_weight(sheet, fabric):
     solver = by_alpha(cloth(sheet, FIRST_ROW))
     damped = Fabric.make(0.2, LAW, 1e-3, damping=0.05)
@@ -184,6 +188,7 @@ def test_the_gradient_agrees_with_differences(name, lifted):
     assert abs(found) > 1e-12
 
 
+@pytest.mark.slow(group="cloth")
 def test_what_does_not_go_is_refused(sheet, fabric):
     scene = cloth(sheet, FIRST_ROW, table=0.0).scene
     for wrong in (-0.1, 1.0):

@@ -76,6 +76,7 @@ def gradient(value_and_grad, inputs):
     return value_and_grad(inputs)[1]
 
 
+@pytest.mark.slow(group="cloth")
 def test_the_motion_touches_the_table_and_slides_on_it(value_and_grad, inputs):
     (_, x), _ = value_and_grad(inputs)
     x = np.asarray(x)

@@ -143,6 +143,7 @@ def test_a_layer_rests_on_another_with_its_weight():
     assert jnp.sum(push, axis=0) == pytest.approx(0, abs=1e-9 * weight)  # action is reaction
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("friction", [SLIPPERY, 1.0])
 def test_friction_between_layers_is_that_of_coulomb(friction):
     mesh, x = two_sheets(0.96647e-3)  # where it carries the weight
@@ -186,6 +187,7 @@ def test_the_hessian_of_a_contact_is_that_of_its_energy(pressed):
     assert np.linalg.eigvalsh(np.asarray(blocks).reshape(-1, 12, 12)).min() > -1e-6
 
 
+@pytest.mark.slow(group="cloth")
 def test_too_many_contacts_are_not_forgotten():
     mesh, x = two_sheets(0.5e-3)
     search = SelfContact.make(mesh, 8)

@@ -71,6 +71,7 @@ def batch(fabric: r2s.Fabric) -> r2s.Fabric:
     return jax.tree.map(lambda leaf: jnp.stack([leaf, 1.1 * leaf]), fabric)
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("make", [cloth, by_dissection, by_generalised_alpha, explicit, points])
 def test_a_motion_its_gradient_and_its_batch_lower_for_accelerators(make):
     function, fabric = height(make()), presets.black_denim()
@@ -80,6 +81,7 @@ def test_a_motion_its_gradient_and_its_batch_lower_for_accelerators(make):
     assert "tensor<2x16x3x" in many  # two members of 16 vertices
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_longer_motion_makes_no_larger_a_program():
     """Time is a loop of the program: nothing is unrolled over steps."""
     solver, fabric = cloth(), presets.black_denim()

@@ -248,6 +248,7 @@ def failed(moved):
     return Failure(codes[-1]), int(np.argmax(codes != Failure.NONE))
 
 
+@pytest.mark.slow(group="points")
 def test_a_step_that_is_too_long_and_inputs_that_are_not_finite_are_named():
     solver, material, x = small_block(2, gravity=0.0)
     noise = 1e-3 * jax.random.normal(jax.random.key(0), x.shape)
@@ -270,6 +271,7 @@ def test_a_step_that_is_too_long_and_inputs_that_are_not_finite_are_named():
     assert code == Failure.TIME_STEP and step > 2
 
 
+@pytest.mark.slow(group="points")
 def test_failures_pass_through_vmap_and_gradients():
     solver, material, x = small_block(2, gravity=0.0)
     controls = still(4, 60, 2)

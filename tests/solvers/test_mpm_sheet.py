@@ -49,6 +49,7 @@ def elastic(fabric):
     return eqx.tree_at(lambda f: f.damping, fabric, jnp.zeros((), float))
 
 
+@pytest.mark.slow(group="points")
 def test_momenta_are_kept_to_rounding(sheet, elastic):
     solver = solver_of(sheet, elastic)
     solver = eqx.tree_at(lambda s: s.background.gravity, solver, jnp.zeros((), float))
@@ -65,6 +66,7 @@ def test_momenta_are_kept_to_rounding(sheet, elastic):
     assert np.max(np.abs(angular[0])) > 1e-5
 
 
+@pytest.mark.slow(group="points")
 def test_free_fall_is_exact(sheet, elastic):
     solver = solver_of(sheet, elastic)
     moved = states(solver, elastic, solver.init(flat(sheet)), still(1, 60))
@@ -74,6 +76,7 @@ def test_free_fall_is_exact(sheet, elastic):
     assert np.asarray(moved.x) == pytest.approx(expected, abs=1e-12)
 
 
+@pytest.mark.slow(group="points")
 def test_the_forces_are_those_of_the_energy(sheet, fabric):
     x = flat(sheet) + 0.01 * jax.random.normal(jax.random.key(0), (25, 3))
     for bending in (fabric.bending, HingeBending(jnp.asarray(2e-5))):
@@ -237,6 +240,7 @@ def test_held_vertices_follow_their_path_exactly(sheet, elastic):
     assert np.array_equal(np.asarray(moved.x)[:, [0, 4]], np.asarray(path[0]))
 
 
+@pytest.mark.slow(group="points")
 def test_a_grid_of_cells_moves_as_the_same_mesh_by_gathers():
     """Wrinkles, drag and viscosity included; wrinkles that are followed lag a little behind."""
     mesh = r2s.rectangle((0.2, 0.15), (5, 4))
@@ -281,6 +285,7 @@ def test_what_cannot_work_is_refused(sheet, elastic):
         solver_of(sheet, elastic).init(flat(sheet, 1.0))
 
 
+@pytest.mark.slow(group="points")
 def test_a_sheet_that_is_carried_out_of_the_grid_ends_the_run(sheet, elastic):
     """Also where every vertex is held, and its place known all the time."""
     solver = solver_of(sheet, elastic, held=tuple(range(25)))

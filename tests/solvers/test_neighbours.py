@@ -169,6 +169,7 @@ def test_a_tree_has_each_face_and_each_part_once(shape):
 CAPACITY = {(2, 2): 10, (4, 7): 3000, (9, 9): 12_000, (17, 17): 50_000}
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize(
     ("shape", "dtype"),
     [

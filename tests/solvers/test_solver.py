@@ -33,6 +33,7 @@ def test_what_is_kept_does_not_change_the_gradient(loss, fabric):
         assert np.asarray(a) == pytest.approx(np.asarray(b), rel=1e-9, abs=1e-15)
 
 
+@pytest.mark.slow(group="cloth")
 def test_only_the_frames_that_are_wanted_are_simulated(sheet, fabric):
     solver = cloth(sheet, held=(0,), air=1.2)
     controls = Control(jnp.zeros((5, 2, 1, 3)), jnp.zeros((5, 2, 3)))

@@ -41,6 +41,7 @@ def hung(law, axis: int, tension):
     return along, np.sqrt(1 - c12 / c22 * (along**2 - 1))
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("law", [(20.0, 8.0, 12.0, 6.0), (900.0, 200.0, 1500.0, 100.0)])
 @pytest.mark.parametrize("axis", [0, 1], ids=["warp", "weft"])
 def test_a_hanging_strip_gets_longer_and_narrower_under_its_weight(axis, law):
@@ -109,6 +110,7 @@ def smooth():
     return Fabric.make(DENSITY, (300.0, 60.0, 200.0, 80.0), 1e-6, friction=0.0)
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("degrees", [0, 30, 90, -60])
 def test_a_strip_with_free_sides_balances_its_tension_at_any_angle(degrees, sheet, smooth):
     solver, x, tension = strip_cut_at(degrees, sheet, smooth)
@@ -134,6 +136,7 @@ def test_a_strip_pulled_by_its_ends_comes_to_strain_uniformly(degrees, sheet, sm
 # A sheet on the table
 
 
+@pytest.mark.slow(group="cloth")
 def test_table_and_grippers_carry_the_weight(sheet):
     # without friction, with which a sheet that is pulled sideways creeps for long
     law = (300.0, 60.0, 200.0, 80.0)

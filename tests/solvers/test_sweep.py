@@ -26,6 +26,7 @@ def members_of(count):
     return {"a": np.linspace(0.0, 1.0, count), "b": np.arange(float(count))}
 
 
+@pytest.mark.slow(group="cloth")
 @settings(max_examples=15, deadline=None)
 @given(count=st.integers(1, 9), chunk=st.integers(1, 12))
 def test_a_sweep_is_the_loop_over_its_members(count, chunk):

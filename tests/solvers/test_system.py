@@ -57,6 +57,7 @@ def inverse(blocks, far: Far, is_definite: bool):
     return jax.jit(lambda b: apply_inverse(EQUATIONS, system, b, is_definite))
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize(("least", "is_definite"), [(1.0, True), (1.0, False), (-3.0, False)])
 @pytest.mark.parametrize("stiffness", [1.0, 1e3])
 def test_the_solution_solves(least, is_definite, stiffness):
@@ -67,6 +68,7 @@ def test_the_solution_solves(least, is_definite, stiffness):
     assert np.linalg.norm(np.ravel(found) - expected) < tolerance * np.linalg.norm(expected)
 
 
+@pytest.mark.slow(group="cloth")
 def test_the_transpose_of_the_solution_is_the_solution():
     apply = inverse(blocks(1.0), far(10.0), False)
     assert np.all(np.asarray(apply(jnp.zeros((COUNT, 3)))) == 0)

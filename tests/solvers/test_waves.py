@@ -48,6 +48,7 @@ def period(solver, fabric, rest, shape):
     return solver.dt * (crossings[2] - crossings[0])
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("kind", ["longitudinal", "shear"])
 @pytest.mark.parametrize("axis", [0, 1], ids=["warp", "weft"])
 def test_waves_in_the_plane_have_the_speed_of_their_stiffness(axis, kind):
@@ -82,6 +83,7 @@ def hung(along, stiffness: float, tension: float):
     return heights[np.rint(along / cell).astype(int)], stretch(tension)
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("axis", [0, 1], ids=["warp", "weft"])
 def test_transverse_waves_have_the_speed_of_the_tension(axis):
     mesh, along = strip(axis)

@@ -79,6 +79,7 @@ def test_needs_come_first_and_once(tmp_path):
     assert value_of(tree(), tmp_path) == 8
 
 
+@pytest.mark.slow(group="study")
 @settings(max_examples=25, deadline=None)
 @given(values=st.lists(st.integers(-2, 3), min_size=1, max_size=6))
 def test_what_fails_stops_only_what_needs_it(tmp_path_factory, values):
@@ -176,6 +177,7 @@ class Dying(Task):
         return {}
 
 
+@pytest.mark.slow(group="study")
 def test_a_process_apart_has_a_workers_environment_and_may_die(tmp_path, monkeypatch):
     for name in environment(1):
         monkeypatch.setenv(name, os.environ.get(name, ""))  # put back at the end

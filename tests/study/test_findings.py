@@ -111,6 +111,7 @@ def test_more_recordings_and_estimates_are_no_more_fabrics():
     assert alone.answer[0] == "undecided" and math.isnan(alone.needed[0])
 
 
+@pytest.mark.slow(group="study")
 def test_studies_without_an_effect_find_no_more_than_chance_does():
     """Two fabrics that differ at random, and motions whose differences all fabrics share."""
     generator, p, held = np.random.default_rng(0), [], 0

@@ -86,6 +86,7 @@ def test_a_sheet_that_is_lost_is_an_error_that_says_when():
         moved(torn, SHEET, COARSE.step)
 
 
+@pytest.mark.slow(group="study")
 @needs_mujoco
 def test_half_the_step_changes_less_than_a_step_that_is_twice_as_long():
     experiment = SIX["lifting"](num_frames=8, moving=0.4)
@@ -98,6 +99,7 @@ def test_half_the_step_changes_less_than_a_step_that_is_twice_as_long():
     assert change(1 / 600) < change(1 / 150) / 2
 
 
+@pytest.mark.slow(group="study")
 @needs_mujoco
 def test_a_recording_has_the_experiment_s_times_and_clouds_on_the_sheet(tmp_path):
     cell = MujocoRecording("lifting", 1, unseen=True, resolution=COARSE)

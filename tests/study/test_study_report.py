@@ -150,6 +150,7 @@ def test_positions_of_a_motion_are_those_of_its_sheet_to_a_tenth_of_a_millimetre
         np.testing.assert_allclose(shown, 1e3 * x, atol=0.0501)
 
 
+@pytest.mark.slow(group="study")
 def test_a_large_study_stays_within_the_limit(tmp_path):
     """Fifteen motions of twelve sheets of 13 x 13 vertices and 5,000 points in 120 frames."""
     generator, mesh = np.random.default_rng(0), rectangle((0.4, 0.4), (13, 13))

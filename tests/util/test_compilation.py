@@ -77,6 +77,7 @@ print(compiled.count("/jax/compilation_cache/cache_hits"), folder.parent == Path
 """
 
 
+@pytest.mark.slow(group="study")
 def test_another_process_finds_what_one_compiled(tmp_path: Path) -> None:
     run = [sys.executable, "-c", KEPT, str(tmp_path)]
     environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "true"}
@@ -121,6 +122,7 @@ def test_to_import_r2s_leaves_the_cache_of_jax_alone() -> None:
     subprocess.run([sys.executable, "-c", told], check=True, timeout=120)
 
 
+@pytest.mark.slow(group="study")
 @pytest.mark.skipif(sys.platform != "linux", reason="mappings are told by Linux alone")
 def test_a_program_takes_mappings_until_it_is_let_go() -> None:
     run = compile_once(lambda x: jnp.sin(2 * x).sum())
