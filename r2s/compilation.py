@@ -1,4 +1,4 @@
-"""Compiled programs: once for all threads of a process, before they are needed, and kept in files.
+"""Compiled programs: once for all threads of a process, and kept in files.
 
 Most of what a short command takes is compilation. `keep` has JAX write what it compiles to the
 user's cache folder, and read it from there; tracing and lowering remain. Who can write that folder
@@ -54,14 +54,6 @@ class Compiled:
             found = jitted(*args, **kwargs)
             self._ready.add(program)
             return found
-
-    def prepare(self, *args: Any, **kwargs: Any) -> None:
-        """Compile for these arguments, and run nothing; from any thread."""
-        program, jitted = self._of(args, kwargs)
-        with self._locks.setdefault(program, threading.RLock()):
-            if program not in self._ready:
-                jitted.lower(*args, **kwargs).compile()
-                self._ready.add(program)
 
     def _of(self, args: tuple, kwargs: dict) -> tuple[Any, Any]:
         """What tells one program from another, and what compiles it."""

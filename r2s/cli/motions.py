@@ -40,6 +40,7 @@ class Simulate:
     json: Json = False
 
     def run(self) -> int:
+        import equinox as eqx
         import jax
         import numpy as np
 
@@ -47,7 +48,6 @@ class Simulate:
         from r2s._util.files import check_folders
         from r2s.cli.common import choose_shape, load_card, make_experiment, print_result
         from r2s.cli.waiting import Waiting
-        from r2s.compilation import compile_once
         from r2s.recordings.open import save_trajectory
         from r2s.recordings.recording import save
         from r2s.scenarios import synthetic
@@ -70,8 +70,8 @@ class Simulate:
         }[self.solver]
         solver = None if make_solver is None else make_solver(scenario, fabric)
         with Waiting("compiling the motion") as line:
-            moved = compile_once(rollout)
-            moved.prepare(scenario, fabric, solver=solver)
+            lowered = eqx.filter_jit(rollout).lower(scenario, fabric, solver=solver)
+            moved = lowered.compile()
             line.say(f"simulating {scenario.num_frames} frames")
             motion = moved(scenario, fabric, solver=solver)
             ok, failure = np.asarray(motion.ok), motion.explain()

@@ -34,7 +34,7 @@ def settings(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     compilation_cache.reset_cache()
 
 
-def test_what_was_prepared_is_neither_traced_nor_run_again() -> None:
+def test_a_program_is_made_once_for_each_shape_and_static_part() -> None:
     traced = []
 
     @compile_once
@@ -42,7 +42,7 @@ def test_what_was_prepared_is_neither_traced_nor_run_again() -> None:
         traced.append(times)
         return x * times
 
-    scaled.prepare(jnp.ones(3), 2)
+    assert scaled(jnp.ones(3), 2).tolist() == [2.0] * 3
     assert scaled(4 * jnp.ones(3), 2).tolist() == [8.0] * 3
     assert traced == [2]
     assert scaled(jnp.ones(3), 3).tolist() == [3.0] * 3  # another static part, another program

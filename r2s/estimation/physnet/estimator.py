@@ -127,7 +127,7 @@ class ImageObservation(eqx.Module):
                 "expected one image for each frame"
             )
         network, view = training.network, training.view
-        points = eqx.filter_jit(jax.vmap(network))(jnp.asarray(images, float))
+        points = _points(network, jnp.asarray(images, float))
         if pull is not None:
             points = jnp.concatenate([points, pull.recorded], axis=1)
         rest = np.asarray(scenario.scene.mesh.rest)
@@ -140,6 +140,11 @@ class ImageObservation(eqx.Module):
     def target(self) -> Float[np.ndarray, " part"]:
         """The answer that a search is to reach: that of the recorded images."""
         return np.asarray(_flat(self.points))
+
+
+@eqx.filter_jit
+def _points(network: PhysNet, images: Float[Array, "frame down across"]) -> Array:
+    return jax.vmap(network)(images)
 
 
 @eqx.filter_jit
