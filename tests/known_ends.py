@@ -1,5 +1,6 @@
-"""Estimates whose end is known: a lift of a known fabric, and a quadratic loss."""
+"""Short lifts of known fabrics, the problems of their estimates, and a quadratic loss."""
 
+import functools
 from typing import Any
 
 import jax.numpy as jnp
@@ -11,13 +12,28 @@ from r2s.estimation.gauss_newton import Descent, Normal
 from r2s.estimation.method import Budget
 from r2s.estimation.problem import NuisancePrior, Problem
 from r2s.materials import presets
-from r2s.materials.parameters import IsotropicSpace
+from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace
+from r2s.recordings.recording import Recording
 from r2s.scenarios import synthetic
 
+FABRIC = presets.grey_interlock()
+FAMILY = OrthotropicSpace.make(float(FABRIC.density))
 EXACT = NuisancePrior(0.0, 0.0)
 SMALL = Budget(coarse=2, starts=1, iterations=4, around=0)
 SPACE = IsotropicSpace.make(float(presets.grey_interlock().density))
 PLACE = jnp.array([0.5, 0.5])
+
+
+@functools.cache
+def short_lift(num_frames: int = 4) -> Recording:
+    """Of a sheet of few vertices, seen by cameras; the second half of the frames counts."""
+    experiment = scenarios.lifting(num_frames=num_frames, interval=1 / 10, height=0.2, moving=0.3)
+    return synthetic.record(experiment, FABRIC, "grey", shape=(4, 4), key=jr.key(1))
+
+
+def short_problem(num_frames: int = 4) -> Problem:
+    """That of `short_lift`, with the usual nuisances."""
+    return Problem.make(short_lift(num_frames), FAMILY, num_points=60, shape=(4, 4))
 
 
 def lift_of(stiffer: float = 1.0):

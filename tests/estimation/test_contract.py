@@ -10,21 +10,19 @@ import jax.random as jr
 import numpy as np
 import pytest
 from folders import TESTS
+from known_ends import FABRIC, PLACE, lift_of, short_lift
+from known_ends import FAMILY as SPACE
+from known_ends import SPACE as ISOTROPIC
 
-from r2s import scenarios
 from r2s.estimation import cards
 from r2s.estimation.checkpoint import arrays_of, load, read, save, tree_from
 from r2s.estimation.estimate import as_json, describe, from_json, point_estimate
 from r2s.estimation.method import Budget, default_space, seed_of
 from r2s.estimation.methods import METHODS
 from r2s.estimation.pinn import published_recipe, training
-from r2s.materials import presets
 from r2s.materials.fabric_json import fabric_as_json, fabric_from_json
 from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace
-from r2s.scenarios import synthetic
 
-FABRIC = presets.grey_interlock()
-SPACE = OrthotropicSpace.make(float(FABRIC.density))
 DATA = TESTS / "data"
 TINY = {
     "diffcloud": Budget(coarse=0, starts=1, iterations=2, around=0),
@@ -37,9 +35,7 @@ TINY = {
 
 @pytest.fixture(scope="module")
 def recording():
-    motion: dict[str, Any] = {"height": 0.2, "inward": 0.1, "moving": 0.3}
-    experiment = scenarios.lifting(num_frames=4, interval=1 / 10, **motion)
-    return synthetic.record(experiment, FABRIC, "grey", shape=(4, 4), key=jr.key(1))
+    return short_lift()
 
 
 def test_the_command_line_offers_every_method_and_no_other():
@@ -203,19 +199,12 @@ def test_the_network_takes_a_stretching(name):
 )
 def test_a_descent_that_arrives_has_converged_and_a_truth_beyond_a_bound_is_named(low, high, bound):
     """The range of its stiffness goes from `low` to `high` times the truth."""
-    space = IsotropicSpace.make(float(FABRIC.density))
-    place = jnp.array([0.5, 0.5])
-    truth = float(space.values(place)[0])
-    motion: dict[str, Any] = {"height": 0.2, "inward": 0.1, "moving": 0.4}
-    experiment = scenarios.lifting(num_frames=6, interval=1 / 10, **motion)
-    seen = synthetic.WHOLE._replace(points=300)
-    lifted = synthetic.record(
-        experiment, space(place), "knit", seen=seen, shape=(5, 5), key=jr.key(0)
-    )
+    space = ISOTROPIC
+    truth = float(space.values(PLACE)[0])
     stiffness = dataclasses.replace(space.ranges[0], low=low * truth, high=high * truth)
     space = dataclasses.replace(space, ranges=(stiffness, *space.ranges[1:]))
     budget = Budget(coarse=0, starts=1, iterations=40, around=0)
-    found = METHODS["diffcloud"](shape=(5, 5)).estimate([lifted], space, budget, key=jr.key(0))
+    found = METHODS["diffcloud"](shape=(5, 5)).estimate([lift_of()], space, budget, key=jr.key(0))
     assert found.converged and found.at_bounds.get(stiffness.name) == bound
     told = [line for line in describe(found) if line.startswith(stiffness.name)]
     assert any(f"at its {bound} bound" in line for line in told) == (bound is not None)

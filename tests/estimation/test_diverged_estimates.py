@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+from known_ends import FABRIC, short_lift
 
-from r2s import scenarios
 from r2s.estimation import baselines, descent, gauss_newton, mesh_bias
 from r2s.estimation.gauss_newton import Descent, Normal
 from r2s.estimation.judgement import NO_DERIVATIVE, with_uncertainty
@@ -16,19 +16,15 @@ from r2s.estimation.mesh_bias import MeshError, OtherMesh
 from r2s.estimation.method import Budget
 from r2s.estimation.prediction import derivatives_at, theta_length
 from r2s.estimation.problem import NuisancePrior, Problem
-from r2s.materials import presets, prior
+from r2s.materials import prior
 from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace
-from r2s.scenarios import synthetic
 
 BUDGET = Budget(shares=(0.25, 0.5), starts=2)
 
 
 @pytest.fixture(scope="module")
 def problem():
-    fabric = presets.grey_interlock()
-    experiment = scenarios.lifting(num_frames=4, interval=1 / 10, height=0.2, moving=0.3)
-    seen = synthetic.record(experiment, fabric, "lift", shape=(3, 3), key=jr.key(0))
-    return Problem.make(seen, IsotropicSpace.make(float(fabric.density)), shape=(3, 3))
+    return Problem.make(short_lift(), IsotropicSpace.make(float(FABRIC.density)), shape=(4, 4))
 
 
 def row_of(problem, losses):

@@ -4,12 +4,10 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
-import jax.random as jr
 import numpy as np
 import pytest
-from known_ends import PLACE, SMALL, SPACE, problem, valley
+from known_ends import FABRIC, PLACE, SMALL, SPACE, problem, short_lift, short_problem, valley
 
-from r2s import scenarios
 from r2s.estimation import descent
 from r2s.estimation.gauss_newton import MARGIN, Descent, Normal, held_back, only_held, room
 from r2s.estimation.least_squares import bounded_step
@@ -25,12 +23,9 @@ from r2s.estimation.mesh_bias import (
 )
 from r2s.estimation.prediction import derivatives_at, theta_length
 from r2s.estimation.problem import Force, Problem
-from r2s.materials import presets
-from r2s.materials.parameters import InformedSpace, IsotropicSpace, OrthotropicSpace
-from r2s.scenarios import resolution, synthetic
+from r2s.materials.parameters import InformedSpace, IsotropicSpace
+from r2s.scenarios import resolution
 
-FAMILY = OrthotropicSpace.make(float(presets.grey_interlock().density))
-SHAPE = (3, 3)
 DIM = 2
 AT_BOUND = np.array([0.5, 1 - MARGIN])  # the second at its bound
 
@@ -83,11 +78,7 @@ def test_steps_to_finer_and_coarser_meshes_lead_to_the_same_limit():
 
 @pytest.fixture(scope="module")
 def lifted():
-    """A lift of few frames and vertices."""
-    experiment = scenarios.lifting(num_frames=4, interval=1 / 10, height=0.2, moving=0.3)
-    fabric = presets.grey_interlock()
-    record = synthetic.record(experiment, fabric, "grey", shape=(4, 4), key=jr.key(1))
-    return Problem.make(record, FAMILY, num_points=60, shape=(4, 4))
+    return short_problem()
 
 
 def test_where_an_estimate_errs_by_more_than_noise_its_posterior_is_that_of_less_information(
@@ -241,12 +232,9 @@ def pull(problem: Problem) -> Problem:
 @pytest.fixture(scope="module")
 def problems():
     """A short lift of a fabric of which the prior knows as much as of every nuisance."""
-    fabric = presets.grey_interlock()
-    space = IsotropicSpace.make(float(fabric.density))
+    space = IsotropicSpace.make(float(FABRIC.density))
     known = InformedSpace.make(space, jnp.full(space.dim, 0.5), jnp.eye(space.dim))
-    experiment = scenarios.lifting(num_frames=4, interval=1 / 10, height=0.2, moving=0.3)
-    seen = synthetic.record(experiment, fabric, "lift", shape=SHAPE, key=jr.key(0))
-    return (Problem.make(seen, known, shape=SHAPE),)
+    return (Problem.make(short_lift(), known, shape=(4, 4)),)
 
 
 def _end(theta, gradient, matrix) -> Descent:

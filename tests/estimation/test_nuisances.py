@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+from known_ends import FABRIC, FAMILY, short_problem
 
 from r2s import scenarios
 from r2s.estimation import baselines, gauss_newton
@@ -20,8 +21,6 @@ from r2s.materials.parameters import OrthotropicSpace
 from r2s.recordings.recording import MeasurementUncertainty
 from r2s.scenarios import synthetic
 
-FABRIC = presets.grey_interlock()
-FAMILY = OrthotropicSpace.make(float(FABRIC.density))
 RATIO = 1.2
 
 
@@ -33,16 +32,9 @@ def blown():
     return Problem.make(record, FAMILY, num_points=60, shape=(4, 4))
 
 
-def lift(num_frames: int) -> Problem:
-    """Of a sheet of few vertices; the second half of the frames counts."""
-    experiment = scenarios.lifting(num_frames=num_frames, interval=1 / 10, height=0.2, moving=0.3)
-    record = synthetic.record(experiment, FABRIC, "grey", shape=(4, 4), key=jr.key(1))
-    return Problem.make(record, FAMILY, num_points=60, shape=(4, 4))
-
-
 @pytest.fixture(scope="module")
 def lifted():
-    return lift(4)
+    return short_problem()
 
 
 @pytest.mark.slow(group="estimates")

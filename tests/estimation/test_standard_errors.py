@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
-from known_ends import valley
+from known_ends import FABRIC, FAMILY, short_problem, valley
 
-from r2s import scenarios
 from r2s.estimation import gauss_newton
 from r2s.estimation.gauss_newton import Descent, Normal, normals_at
 from r2s.estimation.method import Budget
@@ -25,7 +24,6 @@ from r2s.estimation.standard_errors import (
     steps_apart,
     to_small_strain,
 )
-from r2s.materials import presets
 from r2s.materials.nonlinear_spaces import StiffeningSpace
 from r2s.materials.parameters import (
     UNIFORM_DEVIATION,
@@ -33,26 +31,17 @@ from r2s.materials.parameters import (
     OrthotropicSpace,
     ParameterSpace,
 )
-from r2s.scenarios import stretching, synthetic
+from r2s.scenarios import stretching
 
-FABRIC = presets.grey_interlock()
-FAMILY = OrthotropicSpace.make(float(FABRIC.density))
 FRAMES, NOISE, SCALE = 40, 2e-3, 1.0  # -, [N], of the force at the end of the pull [N]
 STRETCH = np.linspace(0, 1, FRAMES)  # of that at the end
 SPACE = OrthotropicSpace.make(0.2)
 WIDTH = SPACE.ranges[0].width  # of the logarithm of the warp's stiffness
 
 
-def lift(num_frames: int) -> Problem:
-    """Of a sheet of few vertices; the second half of the frames counts."""
-    experiment = scenarios.lifting(num_frames=num_frames, interval=1 / 10, height=0.2, moving=0.3)
-    record = synthetic.record(experiment, FABRIC, "grey", shape=(4, 4), key=jr.key(1))
-    return Problem.make(record, FAMILY, num_points=60, shape=(4, 4))
-
-
 @pytest.fixture(scope="module")
 def lifted():
-    return lift(4)
+    return short_problem()
 
 
 def errors_by(problems, end, prior, led, is_truth=False):
@@ -159,7 +148,7 @@ def test_where_derivatives_overflow_nothing_is_known(lifted):
 def test_deviations_hang_on_no_limit_and_hardly_on_rounding():
     """Of an end that is moved by less than single precision resolves, and of a mesh that moves
     alike: two answers would differ by far."""
-    problems, budget = (lift(8),), Budget(around=4)
+    problems, budget = (short_problem(8),), Budget(around=4)
     nuisances = jnp.zeros(theta_length(problems) - FAMILY.dim)
     theta, zero = jnp.concatenate([FAMILY.to_unit(FABRIC), nuisances]), jnp.zeros(())
 
