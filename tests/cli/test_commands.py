@@ -118,6 +118,7 @@ def test_the_doctor_knows_the_installation(capsys: pytest.CaptureFixture) -> Non
     assert all(f"!={version}" in jax for version in EXCLUDED)
 
 
+@pytest.mark.slow(group="study")
 def test_the_doctor_finds_wrong_units(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     for make in presets.MEASURED.values():
         assert not list(implausible(make()))

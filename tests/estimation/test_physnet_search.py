@@ -40,6 +40,7 @@ def test_a_flawed_target_is_not_followed_beyond_its_flaws():
     assert np.abs(found.places[-1] - TRUTH).max() < 0.15
 
 
+@pytest.mark.slow(group="physnet")
 @pytest.mark.parametrize("run", [partial(emulated, dim=3), partial(optimised, dim=3)])
 def test_a_search_continues_from_its_file_as_if_uninterrupted(run, tmp_path):
     path = tmp_path / "trials.npz"
@@ -60,6 +61,7 @@ def test_a_search_continues_from_its_file_as_if_uninterrupted(run, tmp_path):
         run(respond, TARGET, num_calls=15, seed=3, path=path)
 
 
+@pytest.mark.slow(group="physnet")
 def test_calls_that_fail_are_left_out_and_avoided():
     def fails(places):
         return np.where(places[:, [0]] > 0.5, np.nan, respond(places))

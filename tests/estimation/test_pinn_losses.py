@@ -232,6 +232,7 @@ def test_each_loss_is_one_when_its_error_is_the_noise():
     assert float(terms(given, softer).force) > 1 and float(terms(given, softer).work) > 1
 
 
+@pytest.mark.slow(group="pinn")
 def test_losses_have_finite_gradients():
     given = pull(stretched(2.0), force=jnp.full(FRAMES, 3.0), normal=9.81)
     network = Network.make(

@@ -62,6 +62,7 @@ def test_a_strip_pulls_by_its_modulus_and_gets_wider_or_narrower(direction, c11,
         assert float(across) == pytest.approx(np.sqrt(1 - 2 * c12 / c22 * strain), rel=1e-9)
 
 
+@pytest.mark.slow(group="study")
 def test_a_strip_pulled_askew_has_the_modulus_of_a_turned_orthotropic_sheet():
     angle, small = 0.5, 1e-6
     compliance = np.linalg.inv(np.array([[300.0, -60.0, 0], [-60.0, 200.0, 0], [0, 0, 40.0]]))
@@ -379,6 +380,7 @@ def test_a_curve_that_is_no_pull_is_named(strain, force, words):
         Pull.make(0.2 * np.array(strain), np.array(force, float), SIZE)
 
 
+@pytest.mark.slow(group="study")
 def test_widths_do_not_make_the_errors_of_tensions_smaller():
     """What scatters more than it should says so, with widths as without."""
     fabric, space = presets.black_denim(), on_cloth(0.32)

@@ -29,6 +29,7 @@ def test_draws_are_fabrics_with_the_stated_spread_and_the_weight_that_is_known()
         prior.draws(0.0, 1, jr.key(0))
 
 
+@pytest.mark.slow(group="cloth")
 def test_draws_of_a_key_are_the_same_in_either_precision():
     """Else a study judged in float64 is of other motions than one in float32."""
     double = prior.draws(0.2, 3, jr.key(0)), draw("fling", 2, key=jr.key(0))
@@ -56,6 +57,7 @@ def _tangent(law, strain):
     return np.asarray(jax.hessian(law.energy_density)(strain))
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_yarn_stiffens_half_way_at_a_stretch_and_at_most_by_a_ratio(axis):
     law = StiffeningMembrane.make(SMALL, 2.0, 1.1)

@@ -81,6 +81,7 @@ def test_a_run_that_fails_is_lost_from_there_on_and_says_why(monkeypatch):
     assert "frame 1, step 2" in moved.failure
 
 
+@pytest.mark.slow(group="motions")
 def test_the_cropped_distance_leaves_out_what_the_recording_cannot_show(lift, predicted):
     found = prediction_error.against_motion(lift, predicted)
     assert found["chamfer_sim_to_real_cropped"] < found["chamfer_sim_to_real"]

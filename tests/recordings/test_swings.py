@@ -124,6 +124,7 @@ def test_the_fabric_that_swung_is_where_its_markers_are_and_a_light_one_is_not(f
     assert error(light) > 3 * error(FABRIC)
 
 
+@pytest.mark.slow(group="motions")
 def test_a_swing_is_kept_with_the_places_of_its_markers(file: Path, tmp_path: Path):
     read = read_swing(file, BAR)
     save(read, tmp_path / "kept.npz")

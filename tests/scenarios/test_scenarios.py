@@ -170,6 +170,7 @@ def test_both_sides_of_a_stretching_are_clamped_straight():
     np.testing.assert_allclose(handles[:, 1], rest[:, 1], atol=1e-12)
 
 
+@pytest.mark.slow(group="motions")
 def test_material_points_fit_the_scenario():
     """Their grid covers where the sheet can be, and meets the table; their steps fill a frame."""
     scenario, fabric = scenarios.lifting(height=0.3).scenario(SHAPE), presets.black_denim()

@@ -180,6 +180,7 @@ def test_a_strip_of_plate_is_free_to_curve_across(ratio):
 HINGES = HingeBending(jnp.ones((), float))
 
 
+@pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("elements", ["falling", "alternating"])
 def test_hinges_along_a_thin_strip_act_in_series_with_its_diagonals(elements):
     # Where the diagonals are parallel, the strip twists as it bends; where they alternate, the

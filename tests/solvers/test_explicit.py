@@ -103,6 +103,7 @@ def test_a_batch_is_its_members(sheet, fabric):
     assert held == pytest.approx(np.broadcast_to(control.handles, held.shape), abs=0)
 
 
+@pytest.mark.slow(group="cloth")
 def test_too_few_substeps_and_self_contact_are_refused(sheet, fabric):
     limit = float(stable_step(sheet, fabric))
     with pytest.raises(ValueError, match=f"limited by .* to {limit:.4g} s"):
@@ -111,6 +112,7 @@ def test_too_few_substeps_and_self_contact_are_refused(sheet, fabric):
         explicit(sheet, fabric, self_contact=True)
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_step_that_explodes_is_a_recorded_failure(sheet, fabric):
     solver = explicit(sheet, fabric)
     start = solver.init(flat(sheet).at[0, 0].set(jnp.nan))
@@ -157,6 +159,7 @@ def test_laws_that_are_not_constant_move_the_grid_as_any_mesh(fabric):
     np.testing.assert_allclose(one.x, other.x, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow(group="cloth")
 def test_friction_stops_a_sliding_sheet_after_the_way_of_coulomb(fabric):
     """Speed falls by friction times gravity a second."""
     mesh = r2s.rectangle((0.3, 0.2), (3, 3), "quadrilaterals")

@@ -225,6 +225,7 @@ def test_the_limit_is_where_a_block_starts_to_explode(factor, stays):
     assert (speed < 2e-3) == stays
 
 
+@pytest.mark.slow(group="points")
 def test_a_particle_outside_is_refused_and_one_that_leaves_is_recorded():
     solver, material, x = small_block(2, gravity=0.0)
     with pytest.raises(ValueError, match="outside the grid"):

@@ -192,6 +192,7 @@ def test_a_tree_finds_the_same(shape, dtype):
         assert shape == (2, 2) or np.any(found.is_real)
 
 
+@pytest.mark.slow(group="cloth")
 def test_a_tree_reports_too_many():
     faces, rest = sheet((9, 9))
     boxes, (start, end) = build_bvh(faces, rest), crumpled(rest, 1)

@@ -63,6 +63,7 @@ def right():
     return made_up(as_concluded, fabrics=MANY, trials=6, repeats=4)
 
 
+@pytest.mark.slow(group="study")
 def test_conclusions_that_are_right_hold(right):
     *found, physnet = answers(findings(right, NO_PAPER)).values()
     assert set(found) == {"holds"}
@@ -78,6 +79,7 @@ def test_conclusions_that_are_wrong_do_not():
     assert {*found, physnet} == {"does not hold"}
 
 
+@pytest.mark.slow(group="study")
 def test_findings_are_not_of_published_recipes(right):
     worse = made_up(
         lambda *_: 0.5, configurations=PUBLISHED_CONFIGURATIONS, fabrics=MANY, trials=6, repeats=4

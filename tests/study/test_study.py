@@ -48,6 +48,7 @@ def test_what_is_judged_was_never_estimated_from():
     assert len(set(motions)) == len(motions) / len(fabrics)  # all fabrics are moved alike
 
 
+@pytest.mark.slow(group="study")
 def test_a_truth_has_the_stiffness_of_the_preset_at_rest_and_more_when_stretched():
     preset, truth = small_strain("grey_interlock"), strain_dependent("grey_interlock")
 

@@ -177,6 +177,7 @@ def skilled(rows):
     return labelled(with_skill(as_frame(rows), SURFACE))
 
 
+@pytest.mark.slow(group="study")
 def test_one_fabric_is_said_to_decide_nothing(tmp_path):
     publish(tmp_path / "one", skilled(made_up(FABRICS[:1])))
     publish(tmp_path / "three", skilled(made_up()))
