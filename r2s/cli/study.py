@@ -14,7 +14,7 @@ class Study:
     """Estimate fabrics by several approaches, judge them on unseen motions, and write a report.
 
     Results that are there already are not made again: interrupted, the same command goes on. The
-    preset "one_fabric" takes about 20 minutes on two cores; "paper" and "full" are for a cluster.
+    preset "one_fabric" takes about 45 minutes on two cores; "paper" and "full" are for a cluster.
 
         r2s study --out results --workers 2
         r2s study --data recordings --density 0.2 --out results

@@ -34,22 +34,23 @@ JAX_LEVEL = "1"  # of XLA's messages, which JAX sets where it is not set
 TRIES, RETRIES = 2, 5  # of a task whose process died, without and with Dask
 JOB = {"cores": 1, "processes": 1, "memory": "8GB", "walltime": "04:00:00"}  # of Slurm
 # CPU seconds of the first recording of a compilation group, with compilation, and of each further
-# one; by the beginning of the group's name, the longest that fits.
+# one; by the beginning of the group's name, the longest that fits. Of "one_fabric" as measured
+# (two hyper-threads of one core, all cells from empty caches).
 SECONDS: dict[str, tuple[float, float]] = {
     "": (1.0, 1.0),
-    "networks cloth": (100.0, 100.0),
-    "networks points": (200.0, 200.0),
-    "recordings": (25.0, 15.0),
+    "networks cloth": (170.0, 170.0),
+    "networks points": (150.0, 150.0),
+    "recordings": (28.0, 20.0),
     "recordings of MuJoCo": (60.0, 60.0),
-    "ensembles": (100.0, 60.0),
+    "ensembles": (160.0, 110.0),
     "ensembles of MuJoCo": (200.0, 200.0),
-    "estimates diffcloud": (250.0, 200.0),
-    "estimates diffcloud cloth wind": (500.0, 400.0),
+    "estimates diffcloud": (560.0, 500.0),
+    "estimates diffcloud cloth wind": (1070.0, 1000.0),
     "estimates diffcloud cloth lifting+": (1000.0, 800.0),
-    "estimates diffcp": (300.0, 250.0),
-    "estimates physnet": (60.0, 40.0),
-    "estimates pinn": (120.0, 100.0),
-    "evaluations": (15.0, 8.0),
+    "estimates diffcp": (130.0, 110.0),
+    "estimates physnet": (45.0, 35.0),
+    "estimates pinn": (70.0, 60.0),
+    "evaluations": (20.0, 13.0),
 }
 REFRESH, LINES = 1.0, 30.0  # [s] between updates of the bar, and between lines in a file
 SHAPE = "{desc}: {percentage:3.0f} %, {elapsed} elapsed{postfix}"
