@@ -107,11 +107,16 @@ def run(tasks: Iterable[Task], folder: Path, runner: Runner) -> dict[Task, str]:
 
 
 def _ordered(tasks: Iterable[Task]) -> list[Task]:
-    """Tasks and their dependencies, dependencies first, and groups that compile alike together."""
-    depth: dict[Task, int] = {}
-    for task in with_dependencies(tasks):
-        depth[task] = 1 + max((depth[need] for need in dependencies(task)), default=0)
-    return sorted(depth, key=lambda task: (depth[task], task.compilation_group))
+    """Tasks and their dependencies: first what the longest chain of tasks still waits for. Of equal
+    ones those that compile alike are together."""
+    found = list(with_dependencies(tasks))
+    chain = dict.fromkeys(found, 0.0)  # [CPU s] of what waits for a task, and then with it
+    for task in reversed(found):
+        _, further = _seconds(task)
+        chain[task] += task.runs * further
+        for need in dependencies(task):
+            chain[need] = max(chain[need], chain[task])
+    return sorted(found, key=lambda task: (-chain[task], task.compilation_group))
 
 
 def expected_seconds(tasks: Iterable[Task]) -> dict[Task, float]:
@@ -119,11 +124,16 @@ def expected_seconds(tasks: Iterable[Task]) -> dict[Task, float]:
     compiled: set[str] = set()
     found = {}
     for task in tasks:
-        group = task.compilation_group
-        first, further = SECONDS[max(filter(group.startswith, SECONDS), key=len)]
-        found[task] = (further if group in compiled else first) + (task.runs - 1) * further
-        compiled.add(group)
+        first, further = _seconds(task)
+        is_first = task.compilation_group not in compiled
+        found[task] = (first if is_first else further) + (task.runs - 1) * further
+        compiled.add(task.compilation_group)
     return found
+
+
+def _seconds(task: Task) -> tuple[float, float]:
+    """Of the first recording of a task, with compilation, and of each further one, [CPU s]."""
+    return SECONDS[max(filter(task.compilation_group.startswith, SECONDS), key=len)]
 
 
 def in_words(seconds: float) -> str:
