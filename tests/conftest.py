@@ -32,7 +32,7 @@ from r2s.mesh.surface import strains, vertex_masses
 from r2s.solvers.implicit.cloth import Cloth, ClothState
 from r2s.solvers.implicit.linear.pattern import Pattern
 
-# Of the tests that take minutes: a group takes less than twenty on two cores, verdicts forty.
+# Of the tests that take more than a second or two, up to minutes.
 SLOW_GROUPS = (
     "cloth",
     "points",

@@ -34,8 +34,8 @@ JAX_LEVEL = "1"  # of XLA's messages, which JAX sets where it is not set
 TRIES, RETRIES = 2, 5  # of a task whose process died, without and with Dask
 JOB = {"cores": 1, "processes": 1, "memory": "8GB", "walltime": "04:00:00"}  # of Slurm
 # CPU seconds of the first recording of a compilation group, with compilation, and of each further
-# one; by the beginning of the group's name, the longest that fits. Of "one_fabric" as measured
-# (two hyper-threads of one core, all cells from empty caches).
+# one; by the beginning of the group's name, the longest that fits. What "one_fabric" has is about
+# what its run took from empty caches (two threads of one core); the others are guesses.
 SECONDS: dict[str, tuple[float, float]] = {
     "": (1.0, 1.0),
     "networks cloth": (170.0, 170.0),

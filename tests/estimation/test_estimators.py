@@ -198,46 +198,6 @@ def test_a_marker_that_is_off_in_every_frame_is_one_error(pulled):
     )
 
 
-def test_the_scatter_of_a_gradient_is_that_of_the_jackknife():
-    """Of a straight line through points: as if each cluster in turn had been left out."""
-    random = np.random.default_rng(0)
-    rows, values = random.normal(size=(6, 4, 2)), random.normal(size=(6, 4))
-    whole = np.einsum("cpu,cpv->uv", rows, rows)
-
-    def fit(kept):
-        return np.linalg.lstsq(rows[kept].reshape(-1, 2), values[kept].ravel(), None)[0]
-
-    best = fit(np.arange(6))
-    scores = np.einsum("cpu,cp->cu", rows, rows @ best - values)
-    left = np.stack([fit(np.arange(6) != i) - best for i in range(6)])
-    matrices = np.einsum("cpu,cpv->cuv", rows, rows)
-    inverse = np.linalg.inv(whole)
-    clusters = jnp.asarray(scores), jnp.asarray(matrices)
-
-    def covariance(noise):
-        found = gauss_newton.scatter(*clusters, jnp.full(6, noise), jnp.zeros((2, 2)), 1.0)
-        return inverse @ np.asarray(found) @ inverse
-
-    np.testing.assert_allclose(covariance(0.0), left.T @ left, rtol=1e-9)
-    # nor is it less than by independent errors, of a variance of 100 here
-    np.testing.assert_allclose(covariance(100.0), 100 * inverse, rtol=1e-9)
-    least = np.linalg.eigvalsh(covariance(0.1) - 0.1 * inverse)
-    assert least[0] > -1e-12
-
-
-def test_without_the_cluster_that_alone_tells_a_number_that_is_what_the_prior_allows():
-    """The slope of a line whose points but for the last cluster's all lie in one place."""
-    rows = np.ones((3, 4, 2))
-    rows[:, :, 1] = np.array([0.0, 0.0, 1.0])[:, None]
-    matrices, precision, weight = np.einsum("cpu,cpv->cuv", rows, rows), np.diag([4.0, 25.0]), 1e-9
-    scores = np.array([[0.1, 0.0], [-0.3, 0.0], [0.2, 0.2]])  # not at the minimum of the slope
-    parts = jnp.asarray(scores), jnp.asarray(matrices), jnp.zeros(3)
-    found = gauss_newton.scatter(*parts, jnp.asarray(precision), weight)
-    inverse = np.linalg.inv(matrices.sum(axis=0) + weight * precision)
-    error = np.sqrt((inverse @ np.asarray(found) @ inverse)[1, 1])
-    assert 1 / 5 < error < 1 / 4  # the others tell a little of it by the mean
-
-
 @pytest.mark.slow(group="estimates")
 def test_recordings_of_one_fabric_add_up(small):
     theta = jnp.concatenate([jnp.full(7, 0.45), AWAY])
