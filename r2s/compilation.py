@@ -62,9 +62,10 @@ class Compiled:
         shapes = tuple((leaf.shape, str(leaf.dtype), leaf.weak_type) for leaf in leaves)
         parts, static_tree = jax.tree.flatten(static)
         types = tuple(map(type, parts))
-        if types not in self._jitted:  # of one function all have the same programs
-            self._jitted[types] = eqx.filter_jit(functools.partial(self._function))
-        jitted = self._jitted[types]
+        jitted = self._jitted.get(types)
+        if jitted is None:  # apart, as one function has the same programs wherever it is compiled
+            jitted = eqx.filter_jit(functools.partial(self._function))
+            jitted = self._jitted.setdefault(types, jitted)  # another thread's, if it was first
         return (tree, shapes, types, tuple(parts), static_tree, settings()), jitted
 
 

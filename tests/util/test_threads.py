@@ -4,6 +4,7 @@ import re
 import threading
 import time
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -104,8 +105,15 @@ def test_on_one_core_the_caller_works_alone(monkeypatch):
     assert set(found) == {threading.get_ident()}
 
 
-def test_two_threads_that_call_a_function_first_trace_it_once(two_cores):
+def test_two_threads_that_call_a_function_first_trace_it_once(two_cores, monkeypatch):
     traced = []
+    jit = eqx.filter_jit
+
+    def slow_jit(function):  # so that both threads ask for a program before there is one
+        time.sleep(0.05)
+        return jit(function)
+
+    monkeypatch.setattr(eqx, "filter_jit", slow_jit)
 
     @compile_once
     def doubled(x):
