@@ -115,12 +115,3 @@ def green_strain(
     deformation = deformation_gradient(corners, gradients)
     warp, weft = deformation[:, 0], deformation[:, 1]
     return jnp.stack([(warp @ warp - 1) / 2, (weft @ weft - 1) / 2, warp @ weft])
-
-
-def green_strain_gradient(
-    corners: Float[Array, "corner 3"], gradients: Float[Array, "corner 2"]
-) -> Float[Array, "3 corner 3"]:
-    """Derivative [1/m] of `green_strain` in the corners."""
-    deformation = deformation_gradient(corners, gradients)
-    products = jnp.einsum("cs,it->stci", gradients, deformation)
-    return jnp.stack([products[0, 0], products[1, 1], products[0, 1] + products[1, 0]])

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r2s._util.units import AIR_DENSITY, GRAVITY
-from r2s.environment.air import Air
+from r2s.environment.air import Air, Fan
 from r2s.environment.contact import (
     PRESSURE_STIFFNESS,
     SLIP_SPEED,
@@ -131,6 +131,15 @@ def test_drag_is_the_pressure_of_the_normal_flow(velocity, normal):
 
     change = directional_difference(potential, velocity, jnp.ones(3), 1e-5)
     assert -change == pytest.approx(float(np.sum(expected)), rel=1e-6, abs=1e-8)
+
+
+def test_a_fan_blows_half_at_its_radius_and_less_outside():
+    fan = Fan(jnp.zeros(3), jnp.array([2.0, 0.0, 0.0]), jnp.asarray(0.3), jnp.asarray(0.2))
+    far = 0.7  # along the axis, which changes nothing
+    places = jnp.array([[far, 0.0, 0.0], [far, 0.2, 0.0], [far, 0.0, 0.3], [0.0, 0.0, 0.4]])
+    blown = fan(places)
+    assert blown[1] == pytest.approx(0.88, abs=0.01) and blown[3] == pytest.approx(0.12, abs=0.01)
+    assert blown[0] > 0.99 and blown[2] == pytest.approx(0.5, abs=0.01)
 
 
 def test_negative_air_is_refused():

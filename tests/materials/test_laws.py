@@ -132,7 +132,6 @@ def test_uniaxial_stretch_across_the_yarns_is_exact(degrees, sheet, fabric):
 # Mass damping
 
 
-@pytest.mark.slow(group="cloth")
 def test_mass_damping_brakes_a_fall(sheet):
     rate = 3.0  # [1/s]
     fabric = Fabric.make(0.2, (300.0, 60.0, 200.0, 80.0), 2e-5, mass_damping=rate)

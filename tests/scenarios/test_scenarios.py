@@ -89,6 +89,12 @@ def test_a_hanging_sheet_starts_at_rest_and_loses_what_it_is_given(shaken):
     assert middle[2] < 0.7 - 0.4 * 0.45  # it hangs
 
 
+def test_work_of_the_air_that_a_sheet_does_not_keep_is_dissipated(shaken):
+    _, _, found = shaken
+    blown = dataclasses.replace(found, air=found.air + 1.0)
+    assert blown.dissipated - found.dissipated == pytest.approx(1.0)
+
+
 def test_grippers_bear_the_weight(shaken):
     _, fabric, found = shaken
     weight = float(fabric.density) * 0.45**2 * GRAVITY

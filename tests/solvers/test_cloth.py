@@ -102,7 +102,6 @@ def test_damping_does_not_brake_a_rotation(sheet):
     assert spin[1] == pytest.approx(spin[0], rel=1e-7)
 
 
-@pytest.mark.slow(group="cloth")
 def test_damping_is_proportional_to_stiffness():
     sheet = rectangle((SIZE, SIZE), SHAPE, "quadrilaterals")  # without bending others give way
     # the first standing wave of a free sheet, x = s + a cos(pi s / L), on a grid of 4 cells

@@ -17,7 +17,12 @@ from r2s.environment.scene import Control, Scene
 from r2s.materials.plate import PlateBending
 from r2s.scenarios.energy import stored_energy
 from r2s.solvers.explicit.cloth import ExplicitCloth, stable_step
-from r2s.solvers.explicit.elements import bending_force, membrane_force, membrane_stress
+from r2s.solvers.explicit.elements import (
+    bending_force,
+    membrane_force,
+    membrane_stress,
+    moved_velocity,
+)
 from r2s.solvers.explicit.grid import grid_force, laws_on_grid
 from r2s.solvers.explicit.grid_membrane import Samples
 from r2s.solvers.explicit.layout import Layout
@@ -157,6 +162,18 @@ def test_laws_that_are_not_constant_move_the_grid_as_any_mesh(fabric):
     v = jax.random.normal(jax.random.key(0), (len(mesh.rest), 3))
     one, other = (moved(each, fabric, v=v, steps=2) for each in (grid, gathers))
     np.testing.assert_allclose(one.x, other.x, rtol=0, atol=1e-10)
+
+
+def test_friction_on_the_table_is_its_coefficient_times_what_presses():
+    dt, friction, speed = jnp.asarray(1e-3), jnp.asarray(0.4), jnp.asarray([0.6])
+    v = speed, 0 * speed, jnp.asarray([-0.05])
+    height, none = jnp.asarray([-1e-4]), jnp.zeros(())
+    after = moved_velocity(
+        dt, (0 * speed,) * 3, jnp.ones(1), v, height, jnp.asarray(0.2), friction, none
+    )
+    pushed = after[2] - v[2] + dt * GRAVITY  # normal impulse per mass, [m/s]
+    assert pushed[0] > 0.01
+    assert speed - after[0] == pytest.approx(np.asarray(friction * pushed), rel=1e-3)
 
 
 @pytest.mark.slow(group="cloth")

@@ -57,7 +57,7 @@ def test_momenta_are_kept_to_rounding(sheet, elastic):
     noise = 0.05 * jax.random.normal(jax.random.key(0), x.shape)
     start = solver.init(x, noise + 3 * (x - SIZE / 2)[:, jnp.array([2, 0, 1])])
     # pressed and tilted, so that what is between the layers acts too
-    pressed = start.d * 0.8 + 0.1 * jax.random.normal(jax.random.key(1), start.d.shape)
+    pressed = start.d * 0.3 + 0.1 * jax.random.normal(jax.random.key(1), start.d.shape)
     start = dataclasses.replace(start, d=pressed)
     moved = states(solver, elastic, start, still(1, 60))
     linear, angular = momenta(moved, vertex_masses(sheet, elastic.density), SPACING)
@@ -192,6 +192,20 @@ def pair(sheet, fabric):
     grid = Grid.covering((-0.15, -0.15, 0.0), (0.35, 0.35, 0.3), SPACING)
     scene = Scene(mesh, jnp.zeros(0, int), Table.make(0.0), Air.make(density=0.0))
     return Sheet.make(scene, grid, fabric, 5e-4), fabric
+
+
+def test_pressed_layers_push_each_other_away(pair, sheet):
+    solver, fabric = pair
+    start = solver.init(jnp.concatenate([flat(sheet, 0.1), flat(sheet, 0.1 + 0.3 * SPACING)]))
+    gaps = []
+    for pressed in (1.0, 0.4):  # they press below 0.5
+        moved = states(
+            solver, fabric, dataclasses.replace(start, d=pressed * start.d), still(1, 20)
+        )
+        heights = np.asarray(moved.x)[-1, :, 2].reshape(2, 25)
+        gaps.append(np.mean(heights[1] - heights[0]))
+    assert gaps[0] == pytest.approx(0.3 * SPACING, rel=1e-3)
+    assert gaps[1] > gaps[0] + 1e-4
 
 
 @pytest.mark.slow(group="points")

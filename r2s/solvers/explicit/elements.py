@@ -16,7 +16,7 @@ from r2s.environment.contact import PRESSURE_STIFFNESS, SLIP_SPEED
 from r2s.materials.fabric import Fabric
 from r2s.materials.wrinkling import membrane_on_samples, stress_on_samples
 from r2s.mesh.mesh import Mesh
-from r2s.mesh.strain_samples import green_strain_gradient
+from r2s.mesh.strain_samples import green_strain
 from r2s.mesh.surface import strains, vertex_masses
 from r2s.mesh.vectors import Vector
 
@@ -68,7 +68,7 @@ def membrane_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
     count = samples.corners.shape[1]
 
     def square(corners, gradients, areas):
-        rates = jax.vmap(green_strain_gradient, in_axes=(None, 0))(corners, gradients)
+        rates = jax.vmap(jax.jacfwd(green_strain), in_axes=(None, 0))(corners, gradients)
         rates = rates.reshape(*rates.shape[:2], -1)
         share = areas / jnp.sum(areas)
         stiffness = jnp.einsum("q,qsi,st,qtj->ij", share, rates, tangent, rates)
