@@ -167,10 +167,9 @@ def test_laws_that_are_not_constant_move_the_grid_as_any_mesh(fabric):
 def test_friction_on_the_table_is_its_coefficient_times_what_presses():
     dt, friction, speed = jnp.asarray(1e-3), jnp.asarray(0.4), jnp.asarray([0.6])
     v = speed, 0 * speed, jnp.asarray([-0.05])
-    height, none = jnp.asarray([-1e-4]), jnp.zeros(())
-    after = moved_velocity(
-        dt, (0 * speed,) * 3, jnp.ones(1), v, height, jnp.asarray(0.2), friction, none
-    )
+    height, still = jnp.asarray([-1e-4]), 0 * speed
+    fabric = jnp.asarray(0.2), friction, jnp.zeros(())
+    after = moved_velocity(dt, (still, still, still), jnp.ones(1), v, height, *fabric)
     pushed = after[2] - v[2] + dt * GRAVITY  # normal impulse per mass, [m/s]
     assert pushed[0] > 0.01
     assert speed - after[0] == pytest.approx(np.asarray(friction * pushed), rel=1e-3)
