@@ -11,7 +11,7 @@ PRESET ?= one_fabric
 WORKERS ?= 2
 # What takes longer than a second or two: `make test-slow GROUP=cloth` runs one group, `make
 # test-slow` all of them.
-GROUPS := cloth points motions estimates arrival pinn physnet study verdicts documents
+GROUPS := cloth mpm motions estimates arrival pinn physnet study verdicts documents
 # Slow tests check the shapes in annotations as they run, which takes half as long again; so do the
 # fast tests by `make test-annotations`.
 TYPED := --jaxtyping-packages=r2s,beartype.beartype

@@ -16,8 +16,6 @@ from jaxtyping import Array, Float
 
 import r2s
 from r2s._util.units import GRAVITY
-from r2s.environment.air import Air
-from r2s.environment.contact import Table
 
 SIDE = 1.0  # of the sheet, [m]
 DENSITY = 0.2  # [kg/m^2]
@@ -49,19 +47,18 @@ def hang(
     elements: str = "wrinkling",
     spectral_radius: float | None = None,
 ):
-    """Solver, start and controls with `substeps` implicit steps in a frame of 1/60 s.
+    """Solver, start, control and the `substeps` implicit steps in a frame of 1/60 s.
 
-    `elements`: of the mesh. `spectral_radius`: see `r2s.Cloth.make`.
+    `elements`: of the mesh. `spectral_radius`: see `r2s.ImplicitCloth`.
     """
     mesh = sheet(size, elements)
-    held = jnp.array([0, size - 1])
-    scene = r2s.Scene(mesh, held, Table.make(-jnp.inf), Air.make(density=0.0))
-    solver = r2s.Cloth.make(scene, 1 / (60 * substeps), spectral_radius=spectral_radius)
+    pinned = jnp.array([0, size - 1])
+    scene = r2s.Scene(mesh, pinned, air=None)
+    solver = r2s.ImplicitCloth(scene, 1 / (60 * substeps), spectral_radius=spectral_radius)
     x = flat(mesh)
     falling = jnp.where(scene.is_free[:, None], jnp.array([[0.0, 0.0, -GRAVITY]]), 0)
-    handles = jnp.broadcast_to(x[held], (frames, substeps, 2, 3))
-    controls = r2s.Control(handles, jnp.zeros((frames, substeps, 3)))
-    return solver, solver.init(x, acceleration=falling), controls
+    control = r2s.Control(jnp.broadcast_to(x[pinned], (frames * substeps, 2, 3)))
+    return solver, solver.init(x, acceleration=falling), control, substeps
 
 
 def explicit_hang(size: int, fabric: r2s.Fabric, frames: int = FRAMES, finer: int = 1):
@@ -69,20 +66,20 @@ def explicit_hang(size: int, fabric: r2s.Fabric, frames: int = FRAMES, finer: in
 
     `finer`: times as many substeps as are needed.
     """
-    solver, start, controls = hang(size, EXPLICIT_STEPS, frames)
-    explicit = r2s.ExplicitCloth.make(solver.scene, solver.dt, fabric)
+    solver, start, control, every = hang(size, EXPLICIT_STEPS, frames)
+    explicit = r2s.ExplicitCloth(solver.scene, float(solver.dt), fabric)
     explicit = dataclasses.replace(explicit, substeps=finer * explicit.substeps)
-    return explicit, explicit.init(start.x), controls
+    return explicit, explicit.init(start.x), control, every
 
 
-def motion(fabric: r2s.Fabric, solver, start, controls: r2s.Control) -> Float[Array, "frame n 3"]:
+def motion(fabric: r2s.Fabric, solver, start, control, every: int) -> Float[Array, "frame n 3"]:
     """The positions [m] at the end of every frame."""
-    return r2s.simulate(solver, fabric, start, controls).x
+    return r2s.simulate(solver, fabric, start, control, save_every=every).x
 
 
-def motion_loss(fabric: r2s.Fabric, solver, start, controls) -> Float[Array, ""]:
+def motion_loss(fabric: r2s.Fabric, solver, start, control, every: int) -> Float[Array, ""]:
     """The mean squared distance from the start [m^2], over frames and vertices."""
-    moved = motion(fabric, solver, start, controls) - start.x
+    moved = motion(fabric, solver, start, control, every) - start.x
     return jnp.mean(jnp.sum(moved**2, axis=-1))
 
 

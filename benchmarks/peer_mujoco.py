@@ -1,7 +1,7 @@
 """MuJoCo's flex in the scene "hang": the same membrane (Green strain) on the same mesh.
 
 The model is the export's, whose masses are those of the vertices' areas: it is that of r2s but for
-the bending, and the two converge to the same motion. The held vertices have no joints.
+the bending, and the two converge to the same motion. The pinned vertices have no joints.
 """
 
 from functools import partial
@@ -19,8 +19,8 @@ def _model(integrator: str, size: int, substeps: int, damping: float):
     mesh, step = _hang.sheet(size), 1 / (60 * substeps)
     text, _ = mjcf(_hang.fabric(damping), mesh, table=None, yarns=False, timestep=step)
     spec = mujoco.MjSpec.from_string(text)
-    for held in (0, size - 1):
-        for joint in spec.body(f"v{held}").joints:
+    for pinned in (0, size - 1):
+        for joint in spec.body(f"v{pinned}").joints:
             spec.delete(joint)
     model = spec.compile()
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")

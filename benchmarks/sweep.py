@@ -19,15 +19,15 @@ import numpy as np
 from _measure import Line, command_line, keep
 
 import r2s
-from r2s.solvers.mpm import Grid, Sheet
+from r2s.solvers.mpm import Grid, MPMCloth
 from r2s.solvers.mpm.sheet import stable_step
 
 MOST = 4096  # fabrics, the stiffest of which all batches have the substeps of
 SPREAD = 1.5
 IMPLICIT_STEPS = 4  # in a frame of 1/60 s: within 2 mm over half a second
 SAFETY = 0.9  # of the longest stable step of material points
-SIDES = {"implicit": (9, 17), "gradient": (9, 17), "explicit": (9, 17, 33), "points": (17,)}
-FRAMES = {"implicit": 15, "gradient": 15, "explicit": 15, "points": 3}  # of 1/60 s
+SIDES = {"implicit": (9, 17), "gradient": (9, 17), "explicit": (9, 17, 33), "mpm": (17,)}
+FRAMES = {"implicit": 15, "gradient": 15, "explicit": 15, "mpm": 3}  # of 1/60 s
 CAPTION = (
     "A quarter of a second of the scene hang (material points: a twentieth) of many fabrics in one "
     "vmap, on one core of a CPU and on a GPU, wall time without compilation. Seconds of motion are "
@@ -46,24 +46,23 @@ def fabrics(count: int) -> r2s.Fabric:
 
 
 def setting(kind: str, side: int) -> tuple[tuple, int]:
-    """Solver, start and controls, and how many steps they are."""
+    """Solver, start, control and steps a frame, and how many steps they are."""
     frames, batch = FRAMES[kind], fabrics(MOST)
     stiffest = jax.tree.map(jnp.max, batch)
     stiffest = eqx.tree_at(lambda f: f.density, stiffest, jnp.min(batch.density))
     if kind == "explicit":
         found = _hang.explicit_hang(side, stiffest, frames)
         return found, found[0].substeps * _hang.EXPLICIT_STEPS * frames
-    solver, start, controls = _hang.hang(side, IMPLICIT_STEPS, frames)
-    if kind == "points":
+    solver, start, control, every = _hang.hang(side, IMPLICIT_STEPS, frames)
+    if kind == "mpm":
         spacing = _hang.SIDE / (side - 1)
         longest = float(stable_step(solver.scene.mesh, spacing, stiffest, None))
         steps = int(np.ceil(1 / (60 * SAFETY * longest)))
         grid = Grid.covering((-0.2, -0.2, -0.4), (1.2, 1.2, 0.3), spacing)
-        points = Sheet.make(solver.scene, grid, stiffest, 1 / (60 * steps))
-        handles = jnp.broadcast_to(start.x[solver.scene.held], (frames, steps, 2, 3))
-        controls = r2s.Control(handles, jnp.zeros((frames, steps, 3)))
-        return (points, points.init(start.x), controls), steps * frames
-    return (solver, start, controls), IMPLICIT_STEPS * frames
+        points = MPMCloth(solver.scene, 1 / (60 * steps), stiffest, grid)
+        path = jnp.broadcast_to(start.x[solver.scene.pinned], (frames * steps, 2, 3))
+        return (points, points.init(start.x), r2s.Control(path), steps), steps * frames
+    return (solver, start, control, every), IMPLICIT_STEPS * frames
 
 
 def line(kind: str, side: int, members: int, repeats: int) -> Line:
@@ -74,7 +73,7 @@ def line(kind: str, side: int, members: int, repeats: int) -> Line:
     function = _hang.motion
     if kind == "gradient":
         function = eqx.filter_value_and_grad(_hang.motion_loss)
-    batched = eqx.filter_vmap(function, in_axes=(eqx.if_array(0), None, None, None))
+    batched = eqx.filter_vmap(function, in_axes=(eqx.if_array(0), None, None, None, None))
     run = eqx.filter_jit(batched).lower(batch, *arguments).compile()
     seconds, found = _measure.timed(
         lambda: jax.block_until_ready(run(batch, *arguments)), repeats, wall=True

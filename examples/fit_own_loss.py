@@ -14,20 +14,19 @@ import r2s
 
 STEPS = 40
 sheet = r2s.rectangle((0.15, 0.05), (7, 3))  # [m]
-held = jnp.arange(6)  # the first two rows: a strip that is clamped, and droops
-scene = r2s.Scene(sheet, held, r2s.Table.make(-jnp.inf), r2s.Air.make())
-solver = r2s.Cloth.make(scene, dt=0.02)  # [s]
+pinned = jnp.arange(6)  # the first two rows: a strip that is clamped, and droops
+scene = r2s.Scene(sheet, pinned)
+solver = r2s.ImplicitCloth(scene, dt=0.02)  # [s]
 start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
 space = r2s.OrthotropicSpace.make(density=0.2)  # [kg/m^2]
 BENDING = [bound.name for bound in space.ranges].index("bending")
-handles = jnp.broadcast_to(start[held], (1, STEPS, 6, 3))
-controls = r2s.Control(handles, jnp.zeros((1, STEPS, 3)))
+control = r2s.Control(jnp.broadcast_to(start[pinned], (STEPS, 6, 3)))
 
 
 def droop(place):
     """How far below the clamp the free end is [m], of the fabric at a place of the space."""
     fabric = eqx.tree_at(lambda f: f.mass_damping, space(place), jnp.asarray(8.0))  # [1/s]
-    return -r2s.simulate(solver, fabric, solver.init(start), controls).x[-1, -3:, 2].mean()
+    return -r2s.simulate(solver, fabric, solver.init(start), control).x[-1, -3:, 2].mean()
 
 
 def fabric_place(bending):

@@ -17,8 +17,8 @@ from r2s.materials import presets
 
 STEPS, FASTEST = 20, 0.5  # [m/s]
 sheet = r2s.rectangle((0.2, 0.2), (4, 4))  # [m]
-scene = r2s.Scene(sheet, jnp.array([0]), r2s.Table.make(-jnp.inf), r2s.Air.make())
-solver = r2s.Cloth.make(scene, dt=0.02)  # [s]
+scene = r2s.Scene(sheet, [0])
+solver = r2s.ImplicitCloth(scene, dt=0.02)  # [s]
 start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
 GOAL = start[-1]
 
@@ -27,12 +27,12 @@ def loss(network):
     """Mean squared distance [m^2] of the free corner from where it began."""
 
     def step(carry, _):
-        state, handle = carry
-        seen = jnp.concatenate([state.x[-1] - GOAL, state.v[-1], handle - start[0]])
-        handle = handle + solver.dt * FASTEST * jnp.tanh(network(seen))
-        control = r2s.Control(handle[None], jnp.zeros(3))
+        state, gripper = carry
+        seen = jnp.concatenate([state.x[-1] - GOAL, state.v[-1], gripper - start[0]])
+        gripper = gripper + solver.dt * FASTEST * jnp.tanh(network(seen))
+        control = r2s.Control(gripper[None])
         state = solver.step(presets.camel_ponte_roma(), state, control)
-        return (state, handle), jnp.sum((state.x[-1] - GOAL) ** 2)
+        return (state, gripper), jnp.sum((state.x[-1] - GOAL) ** 2)
 
     (_, _), squares = jax.lax.scan(step, (solver.init(start), start[0]), None, STEPS)
     return jnp.mean(squares)

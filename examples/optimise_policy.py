@@ -16,19 +16,19 @@ from r2s.materials import presets
 STEPS, KNOTS, ITERATIONS = 24, 4, 40
 TARGET = jnp.array([0.12, 0.15, 0.001])  # [m]
 sheet = r2s.rectangle((0.2, 0.2), (5, 5))  # [m]
-scene = r2s.Scene(sheet, jnp.array([0]), r2s.Table.make(0.0), r2s.Air.make())  # vertex 0 is held
-solver = r2s.Cloth.make(scene, dt=0.025)  # [s]
+scene = r2s.Scene(sheet, pinned=[0], table=0.0)
+solver = r2s.ImplicitCloth(scene, dt=0.025)  # [s]
 start = jnp.pad(sheet.rest, ((0, 0), (0, 1)), constant_values=0.001)
 
 
 def final(knots):
-    """Positions [m] after the held corner went along knots (knot, 3) [m], linear between them."""
+    """Positions [m] after the pinned corner went along knots (knot, 3) [m], linear between them."""
     times = jnp.arange(1, STEPS + 1) / STEPS
     at = jnp.linspace(0, 1, KNOTS + 1)
     way = jnp.concatenate([start[:1], start[:1] + knots])
-    handles = jax.vmap(lambda axis: jnp.interp(times, at, axis), in_axes=1, out_axes=1)(way)
-    controls = r2s.Control(handles[:, None, None], jnp.zeros((STEPS, 1, 3)))
-    return r2s.simulate(solver, presets.black_denim(), solver.init(start), controls).x[-1]
+    path = jax.vmap(lambda axis: jnp.interp(times, at, axis), in_axes=1, out_axes=1)(way)
+    control = r2s.Control(path[:, None])
+    return r2s.simulate(solver, presets.black_denim(), solver.init(start), control).final_state.x
 
 
 def loss(knots):

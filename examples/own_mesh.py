@@ -48,13 +48,10 @@ if __name__ == "__main__":
     loaded: Any = trimesh.load(path, process=False, force="mesh")
     sheet = r2s.Mesh.make(np.asarray(loaded.vertices)[:, :2], np.asarray(loaded.faces))
     middle = jnp.asarray(np.flatnonzero(np.linalg.norm(sheet.rest, axis=1) < 0.07))
-    solver = r2s.Cloth.make(
-        r2s.Scene(sheet, middle, r2s.Table.make(-jnp.inf), r2s.Air.make()), dt=0.02
-    )
+    solver = r2s.ImplicitCloth(r2s.Scene(sheet, middle), dt=0.02)
     start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
-    handles = jnp.broadcast_to(start[middle], (1, 75, len(middle), 3))
-    controls = r2s.Control(handles, jnp.zeros((1, 75, 3)))
+    control = r2s.Control(jnp.broadcast_to(start[middle], (75, len(middle), 3)))
     moved = eqx.filter_jit(r2s.simulate)(
-        solver, r2s.presets.black_denim(), solver.init(start), controls
+        solver, r2s.presets.black_denim(), solver.init(start), control
     )
     print(f"{len(sheet.rest)} vertices; the edge hangs {-1e3 * moved.x[-1, :, 2].min():.1f} mm low")

@@ -19,7 +19,7 @@ from _tables import Line
 from scipy.stats import norm
 
 from r2s import scenarios
-from r2s.estimation.consistency import outlier_fractions
+from r2s.estimation.consistency import fits
 from r2s.estimation.default_spaces import law_told_by, on_cloth, with_law
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.gauss_newton import loss_from
@@ -45,7 +45,7 @@ STEP = 1 / 180  # [s], of truths in implicit steps on fine meshes
 class Case(NamedTuple):
     """A recording of a known sheet.
 
-    - `scenario`, `motion`: one of `r2s.scenarios.SIX`, and its numbers.
+    - `scenario`, `motion`: one of `r2s.scenarios.SCENARIOS`, and its numbers.
     - `fabric`: its numbers at small strain.
     - `shape`, `elements`: of the mesh that moved; `simulator`: "implicit", "stiffening" (explicit
       steps, laws that change with the strain) or "mujoco" (of `material`).
@@ -163,7 +163,7 @@ def recorded(name: str, folder: Path) -> Recording:
 
 def _made(name: str) -> Recording:
     case, key = CASES[name], jr.fold_in(jr.key(66), list(CASES).index(name))
-    experiment = scenarios.SIX[case.scenario](case.size, **dict(case.motion))
+    experiment = scenarios.SCENARIOS[case.scenario](case.size, **dict(case.motion))
     seen = synthetic.sensing(experiment)._replace(noise=NOISE, outliers=case.outliers)
     seen = seen if case.outliers else seen._replace(margin=-math.inf)  # told by its colour
     fabric, scenario = case.fabric, experiment.scenario(case.shape, elements=case.elements)
@@ -221,9 +221,7 @@ def arrived(folder: Path, case: str, seed: str) -> Line:
         seen = predictions_at((problem,), theta)
         line[f"loss of {name}"] = f"{1e6 * loss_from((problem,), seen):.3f}"
         line[f"mm of {name}"] = f"{1e3 * away(problem, seen[0]):.2f}"
-        line[f"% beyond 3 mm of {name}"] = (
-            f"{100 * outlier_fractions((problem,), seen, STRICT)[0]:.1f}"
-        )
+        line[f"% beyond 3 mm of {name}"] = f"{100 * fits((problem,), seen, STRICT)[0].outliers:.1f}"
     line |= in_errors(space, truth, found) | told(found)
     return line | {"CPU s": f"{seconds:.0f}"}
 
@@ -275,6 +273,6 @@ def in_errors(space: ParameterSpace, truth: Fabric, found: Estimate) -> Line:
 def told(found: Estimate) -> Line:
     """What the estimate says of itself."""
     return {
-        "left out": f"{100 * max(found.left_out, default=0.0):.1f} %",
+        "left out": f"{100 * max((each.outliers for each in found.fits), default=0.0):.1f} %",
         "converged": "yes" if found.converged else "no",
     }

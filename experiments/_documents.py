@@ -2,6 +2,7 @@
 
 python experiments/_documents.py                      # all tables that a document shows
 python experiments/_documents.py --study results      # first the skill of preset three_fabrics
+python experiments/_documents.py --headline           # first the README's, from skill_by_fabric
 """
 
 import argparse
@@ -11,7 +12,7 @@ import sys
 import time
 from pathlib import Path
 
-from _tables import Line, insert, shown, write
+from _tables import Line, insert, read, shown, write
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
@@ -51,12 +52,48 @@ def copy_skill(results: Path) -> None:
     write(RESULTS / "study_small.csv", lines, SKILL, facts)
 
 
+HEADLINE = (
+    "Mean distance [mm] of an unseen fling from its simulation, predicted from a lift and three "
+    "pulls of the same fabric."
+)
+ROWS = {
+    "estimate": "fling: estimate",
+    "weight alone": "fling: middle",
+    "true fabric": "fling: true fabric",
+    "floor": "fling: floor",
+}
+
+
+def make_headline() -> None:
+    """The estimates of both runs of skill_by_fabric, beside the prior mean, truth and floor."""
+    first, facts = read(RESULTS / "skill_by_fabric.csv")
+    again, _ = read(RESULTS / "skill_by_fabric_again.csv")
+    columns = {line["fabric"]: line for line in first}
+    second = {line["fabric"]: line["fling: estimate"] for line in again}
+    lines = [
+        {"": name} | {fabric.replace("_", " "): columns[fabric][key] for fabric in columns}
+        for name, key in ROWS.items()
+    ]
+    repeated = {fabric.replace("_", " "): second.get(fabric, "-") for fabric in columns}
+    lines.insert(1, {"": "estimate, again"} | repeated)
+    made = {
+        "table": HEADLINE,
+        "command": "python experiments/_documents.py --headline",
+        "version": facts["version"],
+        "date": facts["date"],
+    }
+    write(RESULTS / "headline.csv", lines, HEADLINE, facts | made)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--study", type=Path, help="folder that `make study` left")
+    parser.add_argument("--headline", action="store_true", help="the README's table")
     a = parser.parse_args()
     if a.study:
         copy_skill(a.study)
-    for document in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
+    if a.headline:
+        make_headline()
+    for document in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
         for name in MARK.findall(document.read_text(encoding="utf-8")):
             insert(document, name, shown(RESULTS / f"{name}.csv"))

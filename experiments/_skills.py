@@ -27,6 +27,7 @@ from r2s.study.verdicts import SURFACE
 
 JUDGED = ("fling", "shaking")
 OUTSIDE = "*"  # behind a number whose 90 % interval does not hold the truth
+NARROWED = 0.5  # of the prior standard deviation: what is below counts as determined
 ESTIMATES = ("", ON_CLOTH)
 NAMED = {name: "estimate" for name in ESTIMATES} | {
     "true": "true fabric",
@@ -38,7 +39,7 @@ NAMED = {name: "estimate" for name in ESTIMATES} | {
 def predicted(folder: Path, configuration: str, fabric: str, law: str) -> Line:
     """The line of a table: errors [mm] and skill in the first fling and shaking, numbers of the
     fabric over the truth's at small strain, how many of these the intervals hold, by how many
-    standard errors what is called identifiable is off, and the seconds of a CPU that it took.
+    standard errors what is narrowed to half of the prior is off, and the seconds of a CPU.
 
     `law`: "told" by the recordings, as in a study, or one of `r2s.estimation.default_spaces`.
     """
@@ -126,7 +127,7 @@ def _of(motion: str, rows: pd.DataFrame) -> Line:
 
 def repeated(folder: Path, configuration: str, fabric: str, repeat: str) -> Line:
     """The line of a table: how an estimate from the recordings of that number stands to the truth,
-    by parameter in its standard errors, in brackets what is not called identifiable, and by how
+    by parameter in its standard errors, in brackets what is not narrowed to half, and by how
     much the rest is off at most."""
     cells = _cells(configuration, fabric, JUDGED, int(repeat))
     cell = _estimate([_of_law(each, "told") for each in cells])
@@ -137,11 +138,11 @@ def repeated(folder: Path, configuration: str, fabric: str, repeat: str) -> Line
         return {"converged": "diverged"}
     off, away = _off(cell, found)
     line: Line = {}
-    for bound, errors, is_known in zip(found.ranges, away, found.identifiable, strict=True):
+    for bound, errors, is_known in zip(found.ranges, away, found.narrowing < NARROWED, strict=True):
         line[bound.name] = f"{errors:+.2f}" if is_known else f"({errors:+.2f})"
-    known = np.abs(off[found.identifiable])
+    known = np.abs(off[found.narrowing < NARROWED])
     return line | {
-        "identifiable off at most": f"{known.max():.3f}" if len(known) else "-",
+        "narrowed off at most": f"{known.max():.3f}" if len(known) else "-",
         "converged": "yes" if found.converged else "no",
         "recordings agree": _agreement(found, cell),
     }
@@ -166,17 +167,17 @@ def _over_truth(cell: EstimateTask, folder: Path) -> Line:
     for bound, apart, errors in zip(found.ranges, off, away, strict=True):
         number = f"{np.exp(apart):.2f}" if bound.log else f"{apart:+.2f}"
         line[bound.name] = number + OUTSIDE * bool(errors >= norm.ppf(0.95))
-    known = away[found.identifiable]
+    known = away[found.narrowing < NARROWED]
     fabric = strain_dependent(cell.fabric)
     for name, axis in (("warp", 0), ("weft", 1)):
         grown = [f"{_growth(each, axis):.1%}" for each in (found.fabric, fabric)]
         line[f"growth of {name} (truth)"] = f"{grown[0]} ({grown[1]})"
     return line | {
         "converged": "yes" if found.converged else "no",
-        "left out": ", ".join(f"{share:.0%}" for share in found.left_out),
+        "left out": ", ".join(f"{fit.outliers:.0%}" for fit in found.fits),
         "recordings agree": _agreement(found, cell),
         "in 90 % intervals": f"{np.sum(away < norm.ppf(0.95))} of {len(away)}",
-        "identifiable": f"{len(known)}",
+        "narrowed": f"{len(known)}",
         "errors off at most": f"{known.max():.1f}" if len(known) else "-",
     }
 

@@ -31,7 +31,7 @@ SHAPE = (8, 8)  # vertices, as many as are tracked
 SECONDS = 5.0  # of each swing
 KNOT = 0.02  # [s], between knots of the path; the arm logs poses every 0.01 to 0.1 s
 DENSITY = 1.0  # relative deviation of a density that nobody measured
-BUDGET = Budget(coarse=24, starts=3, iterations=25, around=0, shares=(0.3,))
+BUDGET = Budget(num_probes=0, frame_fractions=(0.3,))
 CAPTION = "Swings predicted from four others: mean distances [mm]."
 
 _rollout = eqx.filter_jit(rollout)
@@ -60,11 +60,11 @@ def _read(file: Path) -> Recording:
     """A swing with as many knots as any of its duration, so that one program serves all."""
     recording = read_swing(file, known_bar(), SECONDS)
     times = np.arange(0, float(recording.times[-1]) + KNOT, KNOT)
-    path = np.asarray(recording.handle_path).reshape(len(recording.handle_times), -1)
-    at = [np.interp(times, np.asarray(recording.handle_times), column) for column in path.T]
-    ends = np.stack(at, axis=1).reshape(-1, *recording.handle_path.shape[1:])
+    path = np.asarray(recording.gripper_path).reshape(len(recording.gripper_times), -1)
+    at = [np.interp(times, np.asarray(recording.gripper_times), column) for column in path.T]
+    ends = np.stack(at, axis=1).reshape(-1, *recording.gripper_path.shape[1:])
     knots = (jnp.asarray(ends, float), jnp.asarray(times, float))
-    return eqx.tree_at(lambda r: (r.handle_path, r.handle_times), recording, knots)
+    return eqx.tree_at(lambda r: (r.gripper_path, r.gripper_times), recording, knots)
 
 
 def _problem(recording: Recording, space: ParameterSpace) -> Problem:

@@ -15,7 +15,7 @@ from pathlib import Path
 from _skills import predicted_elsewhere
 from _tables import Line, command_line, resumed
 
-CONFIGURATIONS = ("diffcloud-cloth-lifting", "diffcp-points-lifting", "physnet-cloth-lifting")
+CONFIGURATIONS = ("diffcloud-cloth-lifting", "diffcp-mpm-lifting", "physnet-cloth-lifting")
 CAPTION = (
     "Of MuJoCo's sheet, from one of its lifts: mean distances [mm] up to the horizon, and skill. "
     "True fabric: its material in the laws of r2s."

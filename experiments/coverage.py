@@ -6,7 +6,7 @@ python experiments/coverage.py --same-model lifting --out results/same_model.csv
 Each repeat has recordings of its own, a lift and three pulls as in the study (finer meshes, other
 laws), and its own start of the search. With --same-model the recordings come from the estimator's
 own mesh and laws, and each estimate begins at the truth: the intervals are judged, not the search.
-The table has errors over standard errors, in brackets what is not called identifiable; a second
+The table has errors over standard errors, in brackets what is not narrowed to half; a second
 one, beside it, how often the intervals of each parameter hold the truth.
 """
 
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from _skills import repeated
+from _skills import NARROWED, repeated
 from _tables import Line, command_line, keep, resumed
 from scipy.stats import norm
 
@@ -30,15 +30,15 @@ from r2s.scenarios import synthetic
 TOGETHER = "diffcloud-cloth-lifting+stretching"
 CAPTION = (
     "Errors over standard errors of estimates from a lift and three pulls; in brackets what is not "
-    "called identifiable, and by how much the rest is off at most (a share of the truth; of the "
-    "coupling the difference)."
+    "narrowed to half of the prior, and by how much the rest is off at most (a share of the truth; "
+    "of the coupling the difference)."
 )
 SUMMARY = (
     "Of these estimates: how many 90 % intervals hold the truth, how often a parameter is called "
-    "identifiable, how many of these intervals hold it, and the largest error then, in standard "
+    "narrowed, how many of these intervals hold it, and the largest error then, in standard "
     "errors."
 )
-OTHERS = ("fabric", "repeat", "identifiable off at most", "converged", "recordings agree")
+OTHERS = ("fabric", "repeat", "narrowed off at most", "converged", "recordings agree")
 DIVERGED = "(inf)"  # what is no estimate holds no truth
 
 
@@ -58,7 +58,7 @@ def _held(errors: np.ndarray, known: np.ndarray) -> Line:
     inside = errors < norm.ppf(0.95)
     return {
         "held": f"{inside.sum()} of {len(inside)}",
-        "identifiable": f"{known.sum()}",
+        "narrowed": f"{known.sum()}",
         "held of these": f"{inside[known].sum()}" if known.any() else "-",
         "errors off at most": f"{errors[known].max():.1f}" if known.any() else "-",
     }
@@ -67,15 +67,16 @@ def _held(errors: np.ndarray, known: np.ndarray) -> Line:
 def by_same_model(scenario: str, fabric: str, repeat: str) -> Line:
     """Errors over standard errors of an estimate that begins at the truth."""
     truth, seed = presets.FIVE[fabric](), 1000 + int(repeat)
-    recording = synthetic.record(scenarios.SIX[scenario](), truth, fabric, key=jax.random.key(seed))
+    experiment = scenarios.SCENARIOS[scenario]()
+    recording = synthetic.record(experiment, truth, fabric, key=jax.random.key(seed))
     space = OrthotropicSpace.make(float(truth.density))
     problem = Problem.make(recording, space, seed=seed)
-    budget, start = DEFAULT._replace(coarse=0, starts=1), space.to_unit(truth)
+    budget, start = DEFAULT._replace(num_samples=0, num_starts=1), space.to_unit(truth)
     estimate = descend(problem, budget, start=start, key=jax.random.key(0))
     true = np.asarray(space.values(start))
     relative = np.where([bound.log for bound in space.ranges], true, 1.0)
     errors = (np.asarray(estimate.values) - true) / relative / estimate.standard_errors
-    named = zip(space.ranges, errors, estimate.identifiable, strict=True)
+    named = zip(space.ranges, errors, estimate.narrowing < NARROWED, strict=True)
     return {bound.name: f"{z:+.2f}" if known else f"({z:+.2f})" for bound, z, known in named}
 
 

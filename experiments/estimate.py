@@ -19,8 +19,9 @@ from _tables import command_line
 
 import r2s
 from r2s._util.files import write_json
-from r2s.estimation.estimate import as_json, describe
+from r2s.estimation.estimate import as_json
 from r2s.estimation.method import Method
+from r2s.estimation.summary import describe
 
 METHODS = ("diffcloud", "diffcp", "physnet", "pinn")
 DIFFCP_SHAPE = (7, 7)  # vertices of the sheet of material points

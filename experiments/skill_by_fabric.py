@@ -31,7 +31,7 @@ CAPTION = (
 )
 PUBLISHED = (
     "diffcloud-published-cloth-lifting",
-    "diffcp-published-points-lifting",
+    "diffcp-published-mpm-lifting",
     "physnet-published-cloth-lifting",
     "pinn-published-cloth-stretching",
 )

@@ -23,10 +23,10 @@ loss_at = eqx.filter_jit(gauss_newton.loss_at)
 normal_at = eqx.filter_jit(gauss_newton.normal_at)
 
 
-def in_vacuum(scenario: r2s.Scenario, fabric: object = None) -> r2s.Cloth:
+def in_vacuum(scenario: r2s.Scenario, fabric: object = None) -> r2s.ImplicitCloth:
     """The cloth without air, in steps a quarter as long as the scenario's."""
     vacuum = eqx.tree_at(lambda s: s.air.density, scenario.scene, jnp.zeros((), float))
-    return r2s.Cloth.make(vacuum, scenario.interval / (4 * scenario.substeps))
+    return r2s.ImplicitCloth(vacuum, scenario.interval / (4 * scenario.substeps))
 
 
 def line(problem: r2s.Problem, truth: np.ndarray, width: float, damped: str) -> Line:

@@ -70,11 +70,11 @@ def read_case(
     count = hands or (2 if folder.name.startswith("double") else 1)
     paths = _hands(arrays["controller_points"] * UPWARDS, count)
     placed = sheet or _around(clouds[0], paths[0])
-    if len(placed.held) != count:
+    if len(placed.pinned) != count:
         raise ValueError(
-            f"{folder}: {count} hands hold the sheet, found {len(placed.held)} corners"
+            f"{folder}: {count} hands hold the sheet, found {len(placed.pinned)} corners"
         )
-    corners = np.array([corner(placed, name) for name in placed.held])
+    corners = np.array([corner(placed, name) for name in placed.pinned])
     times = np.arange(len(clouds)) / RATE
     info = RecordingInfo(
         name=folder.name,
@@ -156,8 +156,8 @@ def _around(
         origin=(float(low[0]), float(low[1]), height),
         warp=(float(warp[0]), float(warp[1]), 0.0),
         weft=(float(weft[0]), float(weft[1]), 0.0),
-        held=(),
+        pinned=(),
     )
     places = {name: corner(bare, name) for name in recordings.CORNERS}
-    held = [min(places, key=lambda name: float(np.linalg.norm(places[name] - h))) for h in hands]
-    return SheetPlacement(bare.size, bare.origin, bare.warp, bare.weft, tuple(held))
+    pinned = [min(places, key=lambda name: float(np.linalg.norm(places[name] - h))) for h in hands]
+    return SheetPlacement(bare.size, bare.origin, bare.warp, bare.weft, tuple(pinned))

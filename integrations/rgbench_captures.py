@@ -44,8 +44,8 @@ def read_capture(
     paths, a sheet that is not held at two corners.
     """
     folder = Path(folder)
-    if len(sheet.held) != 2:
-        raise ValueError(f"{folder}: two arms hold the sheet, found {len(sheet.held)} held corners")
+    if len(sheet.pinned) != 2:
+        raise ValueError(f"{folder}: two arms hold the sheet, found {len(sheet.pinned)} corners")
     frames = _frames(folder / "segment_pcds")
     rotation, shift = _extrinsics(folder / "calibration" / "world_to_camera_transform.json")
     times, left = read_arm(folder / "joints" / PATH.format("left"), BASES["left"])

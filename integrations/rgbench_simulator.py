@@ -34,14 +34,12 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from r2s._util.extras import require
-from r2s.environment.air import Air
-from r2s.environment.contact import Table
 from r2s.environment.scene import Control, Scene
 from r2s.estimation import cards
 from r2s.materials import presets
 from r2s.materials.fabric import Fabric, constant_laws
 from r2s.mesh.mesh import Mesh, rectangle
-from r2s.solvers.implicit.cloth import Cloth
+from r2s.solvers.implicit.cloth import ImplicitCloth
 
 SPACING, TIMESTEP = 0.02, 0.01  # [m], [s]
 MOVES = ("grasp", "fold", "fling")
@@ -88,8 +86,8 @@ class Environment:
         if len(np.unique(self._held)) < len(ARMS):
             raise ValueError("both arms hold one vertex of the sheet: take a smaller env.spacing")
         self._from = flat[self._held]
-        scene = Scene(mesh, jnp.asarray(self._held), Table.make(0.0), Air.make())
-        solver = Cloth.make(scene, self.dt)
+        scene = Scene(mesh, self._held, table=0.0)
+        solver = ImplicitCloth(scene, self.dt)
         self._step = eqx.filter_jit(solver.step)
         self._state = solver.init(jnp.asarray(flat, float))
         self._count = 0
@@ -131,7 +129,7 @@ class Environment:
         )
 
     def _path(self, time: float) -> Float[np.ndarray, "2 3"]:
-        """Where the held vertices are at a time [s]: before a fling the sheet is lifted to where
+        """Where the pinned vertices are at a time [s]: before a fling the sheet is lifted to where
         the arms begin, and waits there; else it lies until it is grabbed."""
         if not self._is_fling:
             return self._from if time < self._grab else self._grippers(time)

@@ -2,7 +2,7 @@
 
 from r2s.environment.air import Air, Fan
 from r2s.environment.contact import Table
-from r2s.environment.scene import Control, Scene
+from r2s.environment.scene import Control, Scene, along_path
 from r2s.estimation.cards import Card, Provenance
 from r2s.estimation.cards import read as read_card
 from r2s.estimation.cards import write as write_card
@@ -16,7 +16,7 @@ from r2s.laboratory.files import read_tests
 from r2s.laboratory.pull import Pull
 from r2s.materials import presets
 from r2s.materials.bending import BendingLaw, HingeBending, HingeLaw
-from r2s.materials.fabric import Fabric, fold_length
+from r2s.materials.fabric import Fabric, bending_length
 from r2s.materials.membrane import MembraneLaw, OrthotropicMembrane, SpringMembrane
 from r2s.materials.nonlinear_spaces import SofteningSpace, StiffeningSpace
 from r2s.materials.parameters import (
@@ -36,19 +36,20 @@ from r2s.recordings.recording import Recording, RecordingInfo, SheetPlacement, m
 from r2s.recordings.recording import load as load_recording
 from r2s.recordings.recording import save as save_recording
 from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
-from r2s.scenarios.resolution import explicit_cloth, material_points
+from r2s.scenarios.resolution import explicit_cloth, mpm_cloth
 from r2s.scenarios.scenario import Scenario, from_recording, rollout
 from r2s.scenarios.standard import Experiment, fling, folding, lifting, shaking, stretching, wind
 from r2s.scenarios.synthetic import record
 from r2s.solvers.explicit.cloth import ExplicitCloth
-from r2s.solvers.failures import Failure
-from r2s.solvers.implicit.cloth import Cloth, ClothState
-from r2s.solvers.simulate import Solver, Trajectory, predicted_memory, simulate
+from r2s.solvers.implicit.cloth import ImplicitCloth, ImplicitState
+from r2s.solvers.mpm.sheet import MPMCloth
+from r2s.solvers.results import Result
+from r2s.solvers.simulate import Solution, Solver, predicted_memory, simulate
 
 __all__ = [
     # what a fabric is
     "Fabric",
-    "fold_length",
+    "bending_length",
     "presets",
     "MembraneLaw",
     "OrthotropicMembrane",
@@ -67,17 +68,19 @@ __all__ = [
     "rectangle",
     "Scene",
     "Control",
+    "along_path",
     "Air",
     "Fan",
     "Table",
     # solvers and motions
     "Solver",
-    "Cloth",
-    "ClothState",
+    "ImplicitCloth",
+    "ImplicitState",
     "ExplicitCloth",
+    "MPMCloth",
     "simulate",
-    "Trajectory",
-    "Failure",
+    "Solution",
+    "Result",
     "predicted_memory",
     # experiments
     "Scenario",
@@ -90,7 +93,7 @@ __all__ = [
     "shaking",
     "rollout",
     "explicit_cloth",
-    "material_points",
+    "mpm_cloth",
     "energy_balance",
     "EnergyBalance",
     "clamp_force",

@@ -23,19 +23,17 @@ import pytest
 
 from r2s._util.units import GRAVITY
 from r2s.compilation import clear
-from r2s.environment.air import Air
-from r2s.environment.contact import Table
 from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric
 from r2s.mesh.mesh import Mesh, rectangle
 from r2s.mesh.surface import strains, vertex_masses
-from r2s.solvers.implicit.cloth import Cloth, ClothState
+from r2s.solvers.implicit.cloth import ImplicitCloth, ImplicitState
 from r2s.solvers.implicit.linear.pattern import Pattern
 
 # Of the tests that take more than a second or two, up to minutes.
 SLOW_GROUPS = (
     "cloth",
-    "points",
+    "mpm",
     "motions",
     "estimates",
     "arrival",
@@ -155,10 +153,11 @@ def unchecked():
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
-def cloth(mesh: Mesh, held=(), table: float = -jnp.inf, air: float = 0.0, dt: float = DT) -> Cloth:
+def cloth(
+    mesh: Mesh, pinned=(), table: float | None = None, air: float | None = None, dt: float = DT
+) -> ImplicitCloth:
     """A solver for a sheet; by default free, without table, in vacuum."""
-    held = jnp.asarray(tuple(held), int)
-    return Cloth.make(Scene(mesh, held, Table.make(table), Air.make(density=air)), dt)
+    return ImplicitCloth(Scene(mesh, tuple(pinned), table, air), dt)
 
 
 def flat(mesh: Mesh, height: float = 0.0):
@@ -179,19 +178,28 @@ def everywhere(vector, mesh: Mesh):
 
 
 @eqx.filter_jit
-def step(solver: Cloth, fabric: Fabric, state: ClothState, control: Control) -> ClothState:
+def step(
+    solver: ImplicitCloth, fabric: Fabric, state: ImplicitState, control: Control
+) -> ImplicitState:
     return solver.step(fabric, state, control)
 
 
-def roll(solver: Cloth, fabric: Fabric, state: ClothState, count: int, path=None, wind=(0, 0, 0)):
+def roll(
+    solver: ImplicitCloth,
+    fabric: Fabric,
+    state: ImplicitState,
+    count: int,
+    path=None,
+    wind=(0, 0, 0),
+):
     """The states from `state` on, after each of `count` steps, as numpy arrays (time, vertex, 3).
 
-    `path` gives the handles' positions at a time [s] from the start; by default they stay.
+    `path` gives the pinned vertices' positions at a time [s] from the start; by default they stay.
     """
-    states, start = [state], state.x[solver.scene.held]
+    states, start = [state], state.x[solver.scene.pinned]
     for i in range(1, count + 1):
-        handles = start if path is None else path(i * solver.dt)
-        states.append(step(solver, fabric, states[-1], Control(handles, jnp.asarray(wind, float))))
+        pinned = start if path is None else path(i * solver.dt)
+        states.append(step(solver, fabric, states[-1], Control(pinned, jnp.asarray(wind, float))))
     return jax.tree.map(lambda *leaves: np.stack(leaves), *states)
 
 

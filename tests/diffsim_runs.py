@@ -19,7 +19,6 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from r2s._util.units import GRAVITY
 from r2s.environment.air import Air
-from r2s.environment.contact import Table
 from r2s.environment.scene import Scene
 from r2s.estimation.estimate import Estimate
 from r2s.estimation.judgement import descend
@@ -46,17 +45,17 @@ _motion = eqx.filter_jit(rollout)
 class Made(NamedTuple):
     """A run of the other simulator.
 
-    - `mesh`, `held`: the sheet and its held vertices. `start`: positions at rest, [m].
+    - `mesh`, `held`: the sheet and its pinned vertices. `start`: positions at rest, [m].
     - `times`, `x`, `handles`: of the frames [s], vertices and handles in them [m].
     - `told`: its settings.
     """
 
     mesh: Mesh
-    held: Int[np.ndarray, " handle"]
+    held: Int[np.ndarray, " pinned"]
     start: Float[np.ndarray, "vertex 3"]
     times: Float[np.ndarray, " frame"]
     x: Float[np.ndarray, "frame vertex 3"]
-    handles: Float[np.ndarray, "frame handle 3"]
+    handles: Float[np.ndarray, "frame gripper 3"]
     told: dict
 
 
@@ -80,7 +79,7 @@ def read(folder: Path, name: str) -> Made:
 
 
 def first_acceleration(made: Made) -> Float[np.ndarray, "vertex 3"]:
-    """Of a sheet that is let go at rest [m/s^2]: gravity and wind, but for the held vertices."""
+    """Of a sheet that is let go at rest [m/s^2]: gravity and wind, but for the pinned vertices."""
     faces = np.asarray(made.mesh.faces)
     corners = made.start[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2  # [m^2]
@@ -116,7 +115,7 @@ def scenario_of(
     lead_in = SETTLING if at_rest else 1
     air = Air.make(made.told["wind"]["density"], drag_coefficient=2.0, friction_coefficient=0.0)
     return Scenario(
-        scene=Scene(made.mesh, jnp.asarray(made.held), Table.make(-jnp.inf), air),
+        scene=Scene(made.mesh, made.held, air=air),
         start=array(made.start),
         path=array(handles),
         path_times=array(times),

@@ -19,7 +19,7 @@ from r2s.scenarios import synthetic
 FABRIC = presets.grey_interlock()
 FAMILY = OrthotropicSpace.make(float(FABRIC.density))
 EXACT = NuisancePrior(0.0, 0.0)
-SMALL = Budget(coarse=2, starts=1, iterations=4, around=0)
+SMALL = Budget(num_samples=2, num_starts=1, max_iterations=4, num_probes=0)
 SPACE = IsotropicSpace.make(float(presets.grey_interlock().density))
 PLACE = jnp.array([0.5, 0.5])
 

@@ -28,23 +28,20 @@ def box(dimension: int, cells: int = 16, **options) -> Background:
     return Background.make(grid, **options)
 
 
-def still(frames: int, substeps: int, dimension: int = 3, handles: int = 0) -> Control:
-    """Controls without wind, and with handles at the origin."""
-    wind = jnp.zeros((frames, substeps, 3))
-    return Control(jnp.zeros((frames, substeps, handles, dimension)), wind)
+def still(steps: int, dimension: int = 3, grippers: int = 0) -> Control:
+    """The control of some steps without wind, and with grippers at the origin."""
+    return Control(jnp.zeros((steps, grippers, dimension)))
 
 
 @eqx.filter_jit
-def states(solver, fabric, state, controls):
-    """The states at the end of every step, as numpy arrays with a leading axis of time."""
-    count = controls.wind.shape[0] * controls.wind.shape[1]
-    flat = jax.tree.map(lambda leaf: leaf.reshape(count, *leaf.shape[2:]), controls)
+def states(solver, fabric, state, control):
+    """The states at the end of every step, with a leading axis of time."""
 
     def step(state, control):
         state = solver.step(fabric, state, control)
         return state, state
 
-    return jax.lax.scan(step, state, flat)[1]
+    return jax.lax.scan(step, state, control)[1]
 
 
 def spin(matrices):

@@ -105,6 +105,7 @@ def read_json(path: Path | str, kind: type[T]) -> T:
 
     Fields are numbers (finite), strings, booleans, tuples (JSON lists), mappings and dataclasses,
     or one of these or null.
+    A class attribute `former` of `kind` has the present names of fields that files call otherwise.
     The metadata "unknown" of a field is the hint in the error when it is missing or null. Raises
     OSError, or a ValueError that names the file and the field: no JSON, fields missing or unknown,
     values of another type, or what `kind` itself refuses.
@@ -157,6 +158,7 @@ def _read(kind: Any, value: Any, where: str) -> Any:
 
 def _read_fields(kind: Any, value: Any, where: str) -> Any:
     _expect(isinstance(value, dict), "an object", value, where)
+    value = {getattr(kind, "former", {}).get(name, name): each for name, each in value.items()}
     fields = {field.name: field for field in dataclasses.fields(kind)}
     for name, field in fields.items():
         if "unknown" in field.metadata and value.get(name) is None:

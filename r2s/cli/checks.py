@@ -44,11 +44,11 @@ class CheckGrad:
         import jax.numpy as jnp
 
         from r2s.cli.common import load_card, make_experiment, mesh_warning, print_result
-        from r2s.scenarios import material_points
+        from r2s.scenarios import mpm_cloth
         from r2s.scenarios.scenario import rollout
         from r2s.solvers.gradient_check import compare
 
-        if self.solver == "points" and (self.self_contact or self.forward):
+        if self.solver == "mpm" and (self.self_contact or self.forward):
             raise ValueError("--self-contact and --forward are of the cloth")
         if not self.tolerance > 0:
             raise ValueError(f"--tolerance must be positive, got {self.tolerance}")
@@ -57,7 +57,7 @@ class CheckGrad:
             fabric = card.fabric
             experiment = make_experiment(self.scenario, self.motion)
             scenario = experiment.scenario(self.shape, self.self_contact)
-            solver = material_points(scenario, fabric) if self.solver == "points" else None
+            solver = mpm_cloth(scenario, fabric) if self.solver == "mpm" else None
 
             def loss(fabric):
                 x = rollout(scenario, fabric, solver=solver).x
@@ -152,13 +152,13 @@ class Doctor:
         import jax.numpy as jnp
 
         from r2s.cli.common import load_card, make_experiment
-        from r2s.scenarios import material_points
+        from r2s.scenarios import mpm_cloth
         from r2s.scenarios.scenario import rollout
         from r2s.solvers.simulate import predicted_memory
 
         fabric = load_card(self.fabric or "grey_interlock").fabric
         scenario = make_experiment(name, self.motion).scenario(self.shape)
-        points = material_points(scenario, fabric)
+        points = mpm_cloth(scenario, fabric)
 
         def loss(fabric):
             return jnp.mean(rollout(scenario, fabric).x ** 2)
@@ -187,11 +187,11 @@ def _fabric(
     name: str, fabric: "Fabric", shape: tuple[int, int]
 ) -> tuple[dict[str, Any], list[str]]:
     """Whether its numbers are plausible, and the error that a mesh leaves in each motion."""
-    from r2s.materials.fabric import fold_length
+    from r2s.materials.fabric import bending_length
     from r2s.scenarios import resolution
     from r2s.scenarios.standard import SIDE
 
-    found, length, sheet = list(implausible(fabric)), float(fold_length(fabric)), (SIDE, SIDE)
+    found, length, sheet = list(implausible(fabric)), float(bending_length(fabric)), (SIDE, SIDE)
     errors = {m: resolution.mesh_error(fabric, sheet, shape, m) for m in resolution.TABLE}
     lines = [
         f"fabric {name}: {'see below' if found else 'plausible'}",

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from r2s.scenarios import Experiment
 
 A_VERTEX = 2.5e4  # [byte] of a mesh and its elimination, at least (100 x 100 vertices)
-NOT_NUMBERS = {"path", "route", "size", "held"}  # parameters of an experiment that are no numbers
+NOT_NUMBERS = {"path", "route", "size", "pinned"}  # parameters of an experiment that are no numbers
 ScenarioName = Literal["lifting", "wind", "stretching", "folding", "fling", "shaking"]
 Scenario = Annotated[
     Positional[ScenarioName], arg(metavar="SCENARIO", help="A scenario of the study.")
@@ -44,9 +44,7 @@ ChosenShape = Annotated[
     tuple[int, int] | None,
     arg(help="Vertices along warp and weft; by default as many as the fabric's folds need."),
 ]
-SolverName = Annotated[
-    Literal["cloth", "points"], arg(help="The implicit cloth, or material points.")
-]
+SolverName = Annotated[Literal["cloth", "mpm"], arg(help="The implicit cloth, or material points.")]
 Json = Annotated[bool, arg(help="Print one JSON object.")]
 
 
@@ -86,7 +84,7 @@ def make_experiment(scenario: str, motion: Iterable[str]) -> "Experiment":
     from r2s import scenarios
     from r2s.scenarios.paths import LIMITS
 
-    make = scenarios.SIX[scenario]
+    make = scenarios.SCENARIOS[scenario]
     known = {*LIMITS[scenario], *inspect.signature(make).parameters} - NOT_NUMBERS
     numbers: dict[str, Any] = {**parse_numbers(motion)}
     if unknown := sorted(set(numbers) - known):

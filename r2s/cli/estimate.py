@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from r2s.recordings.recording import Recording
 
 LIGHTEST, HEAVIEST = 0.005, 5.0  # [kg/m^2]: finer than any gauze, heavier than any carpet
-SEARCH = ("coarse", "starts", "iterations", "evaluations")  # numbers of a search
+SEARCH = ("num_samples", "num_starts", "max_iterations", "max_evaluations")  # numbers of a search
 
 MethodName = Literal[
     "diffcloud",
@@ -34,7 +34,7 @@ class EstimateCard:
     """Estimate a fabric from recordings of it, and write its card.
 
     RECORDING is an NPZ of r2s, a folder of them, a folder of frames with its manifest, or a JSON
-    file of laboratory tests (pulls, cantilevers, drapes: docs/laboratory.md); several are taken for
+    file of laboratory tests (pulls, cantilevers, drapes: docs/guide/laboratory.md); several are taken for
     the same fabric. Of three or more, two of them no stretchings, the last motion with clouds (a
     fold only where there is no other) is held out: the estimate is judged on it, beside fabrics of
     which only the weight is known. Says whether the method converged, and which numbers ended at a
@@ -61,7 +61,7 @@ class EstimateCard:
     """The card, JSON."""
     method: MethodName = "diffcloud"
     """How to estimate."""
-    solver: Literal["cloth", "points"] | None = None
+    solver: Literal["cloth", "mpm"] | None = None
     """What simulates: the cloth (orthotropic fabrics) or material points (isotropic ones); by
     default what the method supports."""
     law: Literal["linear", "stiffening", "softening", "stiffening+softening"] | None = None
@@ -75,13 +75,13 @@ class EstimateCard:
     flat for what takes no prior."""
     name: str = ""
     """Name of the fabric; by default that of the recording."""
-    coarse: int | None = None
-    """Places of the range that are tried first (diffcloud none, diffcp 12)."""
-    starts: int | None = None
+    num_samples: int | None = None
+    """Samples of the parameter range that are tried first (diffcloud none, diffcp 12)."""
+    num_starts: int | None = None
     """Descents from the best of them, or from the prior mean (diffcloud 1, diffcp 2)."""
-    iterations: int | None = None
+    max_iterations: int | None = None
     """Gauss-Newton steps of each stage (25); of pinn and the recipes the epochs."""
-    evaluations: int | None = None
+    max_evaluations: int | None = None
     """Simulations of a search (cma-es 600, physnet 80)."""
     angles: Annotated[tuple[float, ...], arg(metavar="DEGREES")] = ()
     """From the pull of each stretching to the warp; by default what the recordings say."""
@@ -98,13 +98,15 @@ class EstimateCard:
     """Seed of the coarse search, or of the network and its search."""
     date: str = ""
     """To write on the card; r2s looks at no clock."""
+    force: bool = False
+    """Write the card even where the estimate explains none of the recordings."""
     json: bool = False
     """Print the card as one JSON object."""
 
     def run(self) -> int:
         from r2s._util.files import check_folders
         from r2s.cli.common import print_result
-        from r2s.cli.estimate_report import make_card, report
+        from r2s.cli.estimate_report import explains_nothing, make_card, report
         from r2s.cli.waiting import Waiting
         from r2s.estimation import cards
         from r2s.estimation.checkpoint import forget
@@ -112,6 +114,8 @@ class EstimateCard:
         check_folders(self.out)
         with Waiting("reading the recordings") as progress:
             outcome = self._estimate(progress)
+        if (reason := explains_nothing(outcome)) and not self.force:
+            raise RuntimeError(f"{reason}; no card is written without --force")
         card = make_card(outcome, self.name, self.date)
         cards.write(self.out, card)
         forget(self._progress_file)
@@ -247,7 +251,8 @@ class EstimateCard:
         """The method's budget with the numbers asked for; `ValueError` for one that it lacks."""
         asked = {name: getattr(self, name) for name in SEARCH if getattr(self, name) is not None}
         for name in asked:
-            if name not in method.heeds:
-                takes = ", ".join(f"--{each}" for each in method.heeds)
-                raise ValueError(f"--{name} is not of {method.name}: it takes {takes}")
+            if name not in method.budget_fields:
+                takes = ", ".join(f"--{each}" for each in method.budget_fields)
+                words = f"--{name} is not of {method.name}: it takes {takes}"
+                raise ValueError(words.replace("_", "-"))
         return method.budget._replace(**asked)

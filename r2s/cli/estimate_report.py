@@ -7,8 +7,9 @@ from r2s.cli.common import mesh_warning
 from r2s.estimation import held_out
 from r2s.estimation.cards import Card, Provenance, fingerprint
 from r2s.estimation.consistency import FORCE
-from r2s.estimation.estimate import Agreement, Estimate, Misfit, describe
+from r2s.estimation.estimate import Agreement, Estimate, Misfit
 from r2s.estimation.method import COARSEST, Method, Progress, tell
+from r2s.estimation.summary import describe
 from r2s.laboratory.estimate import APPROACH, POOR_FIT, consistency, fits
 from r2s.laboratory.files import LaboratoryTests
 from r2s.laboratory.pull import Pull
@@ -16,6 +17,7 @@ from r2s.recordings.recording import Recording, clouds_are_markers
 from r2s.scenarios.resolution import alike
 
 POOR = 0.5  # share of outliers, above which a recording is hardly explained at all
+NOTHING = 0.9  # share of outliers, above which nothing is explained
 CONTRADICTION = 0.01  # p-value below which motions contradict laboratory tests
 PARTS = {  # of a fabric: names of the parameters that estimate them
     "membrane": {"warp", "E h"},
@@ -123,6 +125,18 @@ def report(outcome: Outcome) -> list[str]:
     return lines
 
 
+def explains_nothing(outcome: Outcome) -> str:
+    """Why an estimate is a failure: nearly all of every recording is outliers; else ""."""
+    shares = [fit.outliers for fit in outcome.estimate.fits]
+    if not shares or min(shares) < NOTHING:
+        return ""
+    return (
+        f"the estimate explains nothing: {100 * min(shares):.0f} % or more of every recording are "
+        "outliers. Are the clouds in metres, with z up, and do scale, rotation, translation and "
+        "path of the manifest place them on the sheet? See r2s check and r2s show"
+    )
+
+
 def unread(method: Method, recordings: Sequence[Recording]) -> Iterator[str]:
     """What of each recording the method does not read."""
     for each in recordings:
@@ -141,7 +155,7 @@ def unread(method: Method, recordings: Sequence[Recording]) -> Iterator[str]:
         if len(reads.frames) < last - first + 1:
             left.append(f"{last - first + 1 - len(reads.frames)} of {last - first + 1} frames")
         if left:
-            yield f"not read of {each.info.name}: {', '.join(left)}"
+            yield f"not used of {each.info.name}: {', '.join(left)}"
 
 
 def agreement(
@@ -156,7 +170,6 @@ def agreement(
         yield f"shares in the loss: {', '.join(f'{name} {share:.2g}' for name, share in pairs)}"
     found = estimate.agreement
     if found is None:
-        yield "not judged: whether the recordings agree"
         return
     if found.density is not None and found.doubts_density:
         yield (
@@ -198,16 +211,16 @@ def _contradiction(
 
 
 def misfits(estimate: Estimate, recordings: Sequence[Recording]) -> Iterator[str]:
-    """What of the recordings does not fit the fabric, and the share of outliers of each."""
+    """What of the recordings does not fit the fabric."""
     names = [each.info.name for each in recordings]
-    if not estimate.left_out:
-        yield "not judged: what of the recordings does not fit"
     for each in estimate.misfits:
         yield f"warning: {names[each.recording]}: {_misfit(each)}"
-    for name, share in zip(names, estimate.left_out, strict=False):
-        line = f"left out of {name}: {100 * share:.1f} % as outliers"
-        poor = "its density, wind, path or scale may be wrong, or the mesh is too coarse"
-        yield f"warning: {line}: {poor}" if share > POOR else line
+    for fit in estimate.fits:
+        if fit.outliers > POOR:
+            yield (
+                f"warning: {100 * fit.outliers:.0f} % of {fit.recording} are outliers: its "
+                "density, wind, path or scale may be wrong, or the mesh is too coarse"
+            )
 
 
 def _misfit(found: Misfit) -> str:
@@ -244,8 +257,8 @@ def _weighed(outcome: Outcome) -> Iterator[str]:
     pulls = [isinstance(test, Pull) for each in outcome.laboratory for test in each.tests]
     if recordings and not any(forces) and not any(pulls):
         yield (
-            f"stiffness is that of a sheet of {outcome.density:g} kg/m^2, in proportion: no force "
-            "of a pull and no wind tells whether that is right"
+            f"stiffness is in proportion to the density given, {outcome.density:g} kg/m^2: without "
+            "the force of a pull, or wind, no recording can check it"
         )
 
 

@@ -20,10 +20,12 @@ except ImportError:
 from r2s import compilation
 from r2s.cli.checks import CheckGrad, Doctor
 from r2s.cli.estimate import EstimateCard
-from r2s.cli.motions import Evaluate, Export, Sensitivity, Simulate
+from r2s.cli.evaluate import Evaluate
+from r2s.cli.motions import Export, Sensitivity, Simulate
 from r2s.cli.recordings import Check, Data, Show
 from r2s.cli.study import Study
 from r2s.cli.view import View
+from r2s.estimation.cards import version
 from r2s.study.engine import one_thread
 
 NO_CACHE = "--no-cache"
@@ -49,6 +51,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Raises SystemExit, with 0 after --help and 2 after a wrong usage, whose message is on stderr.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
+    if list(arguments) == ["--version"]:
+        print(f"r2s {version()}")
+        return 0
     try:
         command = tyro.cli(
             Command,  # pyright: ignore[reportArgumentType]

@@ -1,6 +1,5 @@
-"""Commands on fabrics: `r2s simulate`, `sensitivity`, `evaluate` and `export`."""
+"""Commands on fabrics: `r2s simulate`, `sensitivity` and `export`."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -28,7 +27,7 @@ class Simulate:
     """NPZ of the motion."""
     fabric: FabricName = "grey_interlock"
     motion: Motion = ()
-    solver: Literal["cloth", "explicit", "points"] = "cloth"
+    solver: Literal["cloth", "explicit", "mpm"] = "cloth"
     """The implicit cloth, the cloth in explicit steps, or material points."""
     shape: ChosenShape = None
     self_contact: bool = False
@@ -66,7 +65,7 @@ class Simulate:
         make_solver = {
             "cloth": None,
             "explicit": scenarios.explicit_cloth,
-            "points": scenarios.material_points,
+            "mpm": scenarios.mpm_cloth,
         }[self.solver]
         solver = None if make_solver is None else make_solver(scenario, fabric)
         with Waiting("compiling the motion") as line:
@@ -115,7 +114,7 @@ class Sensitivity:
     """Say what a planned motion would reveal of a fabric, before anybody makes it.
 
     Simulates the motion with a preset that is like the fabric, as seen by two depth cameras, and
-    prints how well each parameter would be known, and which combinations where one is not.
+    prints how well each parameter would be known.
     Numbers of the motion are those of `r2s.scenarios.standard`, in SI units.
 
         r2s sensitivity lifting --fabric black_denim --motion height=0.3 moving=2
@@ -134,69 +133,16 @@ class Sensitivity:
 
     def run(self) -> None:
         from r2s.cli.common import mesh_warning, parse_numbers, print_result
-        from r2s.estimation.estimate import as_json, describe
+        from r2s.estimation.estimate import as_json
         from r2s.estimation.judgement import evaluate_design
         from r2s.estimation.method import COARSEST
+        from r2s.estimation.summary import describe
         from r2s.scenarios.standard import SIDE
 
         numbers = parse_numbers(self.motion)
         found = evaluate_design(self.scenario, self.fabric, numbers, self.noise, self.seed)
         coarse = mesh_warning(COARSEST, found.fabric, (SIDE, SIDE), self.scenario)
         print_result(self.json, as_json(found), [*describe(found), *coarse])
-
-
-@dataclass(frozen=True)
-class Evaluate:
-    """Say how well a fabric predicts recorded motions: distances in metres, mean over the frames.
-
-    chamfer_real_to_sim is the mean distance from a recorded point to the simulated surface,
-    chamfer_sim_to_real the reverse, hausdorff the largest; `paper_` figures have no unit.
-
-        r2s evaluate denim.json fold.npz
-        r2s evaluate grey_interlock recordings/fold_tan --json
-    """
-
-    fabric: Positional[FabricName]
-    recordings: Annotated[Positional[tuple[Path, ...]], arg(metavar="RECORDING")]
-    """NPZ, or folders."""
-    shape: ChosenShape = None
-    json: Json = False
-
-    def run(self) -> int:
-        from r2s.cli.common import choose_shape, load_card, print_result
-        from r2s.metrics import prediction_error
-        from r2s.recordings.open import open_recordings
-        from r2s.scenarios.scenario import from_recording
-
-        card, found, failures, lines = load_card(self.fabric), {}, {}, []
-        meshes: dict[str, dict] = {}
-        for recording in open_recordings(self.recordings):
-            name, size = recording.info.name, recording.info.sheet.size
-            shape, meshes[name], words = choose_shape(
-                self.shape, card.fabric, size, recording.info.scenario
-            )
-            motion = prediction_error.predict_motion(from_recording(recording, shape), card.fabric)
-            metrics = prediction_error.against_motion(recording, motion.x, shape=shape)
-            found[name] = metrics
-            lines += [f"{name}:", *(f"    {line}" for line in words)]
-            lines += [_line(metric, value) for metric, value in metrics.items()]
-            if math.isnan(metrics["chamfer_real_to_sim"]):
-                failures[name] = motion.failure
-                lines.append(f"    the simulation {failures[name]}")
-        if not found:
-            raise ValueError("no recording: name an NPZ, or a folder that holds some")
-        units = {name: prediction_error.UNITS.get(name, "m") for name in next(iter(found.values()))}
-        result = {"fabric": card.name, "units": units, "recordings": found, "failures": failures}
-        result["meshes"] = meshes
-        print_result(self.json, result, lines)
-        return 1 if failures else 0
-
-
-def _line(metric: str, value: float) -> str:
-    from r2s.metrics.prediction_error import UNITS
-
-    text = f"{value:.4f}" if UNITS.get(metric) == "-" else f"{1e3 * value:.2f} mm"
-    return f"    {metric:32s}{text:>12s}"
 
 
 if TYPE_CHECKING:

@@ -6,20 +6,23 @@ import threading
 import time
 from typing import Any
 
-TICK = 1.0  # [s]
+TICK, PAUSE = 1.0, 30.0  # [s]
 
 
 class Waiting:
     """A line on a terminal that says what is done, rewritten every `tick` seconds.
 
     A thread of its own rewrites it: the main one waits for the compiler or the solver, which let
-    others run. Called as a `Progress` of an estimator, it shows iteration and loss. Nothing is
-    written to a `stream` that is no terminal.
+    others run. Called as a `Progress` of an estimator, it shows iteration and loss. A `stream` that
+    is no terminal, such as a file, gets a line of its own every `pause` seconds.
     """
 
-    def __init__(self, words: str, stream: Any = None, tick: float = TICK) -> None:
+    def __init__(
+        self, words: str, stream: Any = None, tick: float = TICK, pause: float = PAUSE
+    ) -> None:
         self._stream = sys.stderr if stream is None else stream
-        self._shown = self._stream.isatty()
+        self._is_terminal = self._stream.isatty()
+        tick = tick if self._is_terminal else pause
         self._words, self._numbers, self._began, self._since = words, "", *[time.monotonic()] * 2
         self._tick, self._stop = tick, threading.Event()
         self._lock, self._thread = threading.Lock(), threading.Thread(target=self._run, daemon=True)
@@ -27,35 +30,41 @@ class Waiting:
     def say(self, words: str) -> None:
         """What is done from now on."""
         self._words, self._since = words, time.monotonic()
-        self._write()
+        self._rewrite()
 
     def __call__(self, iteration: int, loss: float) -> None:
         self._numbers = f", iteration {iteration}, root of loss {loss**0.5:.3g}"
-        self._write()
+        self._rewrite()
 
     def __enter__(self) -> "Waiting":
-        if self._shown:
-            self._thread.start()
+        self._thread.start()
         return self
 
     def __exit__(self, *_) -> None:
         self._stop.set()
-        if self._shown:
-            self._thread.join()
+        self._thread.join()
+        if self._is_terminal:
             self._stream.write("\r\x1b[K")
             self._stream.flush()
 
+    def _rewrite(self) -> None:
+        if self._is_terminal:
+            self._write()
+
     def _run(self) -> None:
-        self._write()
+        self._rewrite()
         while not self._stop.wait(self._tick):
             self._write()
 
     def _write(self) -> None:
-        if not self._shown or self._stop.is_set():
+        if self._stop.is_set():
             return
         now = time.monotonic()
         here, all_ = now - self._since, now - self._began
         text = f"{self._words}{self._numbers}: {here:.0f} s, {all_:.0f} s in all"
+        if not self._is_terminal:
+            print(text, file=self._stream, flush=True)
+            return
         with self._lock:
             width = shutil.get_terminal_size().columns - 1  # a line that is folded would stay
             self._stream.write(f"\r\x1b[K{text[:width]}")

@@ -94,14 +94,19 @@ Vertices = Float[Array, "vertex 3"]
 
 
 def drag_on_vertices(
-    mesh: Mesh, air: Air, fan: Fan | None, x: Vertices, v: Vertices, wind: Float[Array, "*vertex 3"]
+    mesh: Mesh,
+    air: Air,
+    fan: Fan | None,
+    x: Vertices,
+    v: Vertices,
+    wind: Float[Array, "*vertex 3"] | None,
 ) -> Vertices:
     """The drag [N], from positions [m], velocities [m/s] and the wind [m/s] of a control.
 
     That on an element goes in equal parts to its corners.
     """
     strength = 1.0 if fan is None else fan(x)[:, None]
-    flow = v - jnp.broadcast_to(wind, x.shape) * strength
+    flow = v if wind is None else v - jnp.broadcast_to(wind, x.shape) * strength
     corners = mesh.samples.corners
     relative = jnp.mean(flow[corners], axis=1)
     force = -jax.vmap(jax.grad(air.dissipation))(relative, area_normals(mesh, x))

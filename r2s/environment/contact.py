@@ -11,15 +11,15 @@ SLIP_SPEED = 2e-3  # [m/s]: below it friction fades to zero, so that it has a gr
 class Table(eqx.Module):
     """A horizontal table.
 
-    - `height`: z of its surface, [m]. Minus infinity is no table.
+    - `height`: z of its surface, [m]; minus infinity where there is none.
     """
 
     height: Float[Array, "*batch"]
 
     @classmethod
-    def make(cls, height: float = 0.0) -> "Table":
-        """A table with its surface at z = `height` [m]."""
-        return cls(jnp.asarray(height, float))
+    def make(cls, height: float | None = 0.0) -> "Table":
+        """A table with its surface at z = `height` [m]; None: there is none."""
+        return cls(jnp.asarray(-jnp.inf if height is None else height, float))
 
     def depth(
         self, position: Float[Array, "*vertex 3"], offset: Float[Array, ""]

@@ -1,67 +1,138 @@
-"""A scene: what an experiment fixes. Sheet, held vertices, table, air; and what grippers do."""
+"""A scene: what an experiment fixes. Sheet, pinned vertices, table, air; and what grippers do."""
+
+from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from r2s._util.arrays import is_traced
+from r2s._util.units import AIR_DENSITY, GRAVITY
 from r2s.environment.air import Air, Fan
 from r2s.environment.contact import Table
 from r2s.mesh.mesh import Mesh
 
 
 class Control(eqx.Module):
-    """What grippers and air do: at one step, or with a leading time axis over a motion.
+    """What grippers and air do: at the end of one step, or of every step of a motion.
 
-    - `handles`: positions of the held vertices at the end of the step, [m].
-    - `wind`: [m/s], uniform (3 numbers), or one for each vertex (vertex, 3).
+    - `pinned`: positions of the pinned vertices, [m]: (pinned, 3), or (step, pinned, 3).
+    - `wind`: [m/s], the same everywhere (3 numbers), or one for each vertex (vertex, 3); over a
+      motion with a leading axis of steps, or one that stays. None: still air.
     """
 
-    handles: Float[Array, "*time handle axis"]
-    wind: Float[Array, "*time_and_vertex 3"]
+    pinned: Float[Array, "*step pinned axis"]
+    wind: Float[Array, "*step_and_vertex 3"] | None = None
+
+    def at(self, step: Int[Array, ""] | int) -> "Control":
+        """That of one step of a motion."""
+        return jax.tree.map(lambda part: part[step], self)
 
 
 class Scene(eqx.Module):
-    """What an experiment fixes; gravity is 9.81 m/s^2 along -z.
+    """What an experiment fixes.
 
     - `mesh`: the sheet.
-    - `held`: the vertices that grippers hold, one a handle.
-    - `table`, `air`: the surroundings.
+    - `pinned`: the vertices whose positions a `Control` gives.
+    - `table`: horizontal, as `Table` or the height of its surface [m]; None: there is none.
+    - `air`: as `Air` or its density [kg/m^3]; None: there is none.
     - `fan`: where the wind blows; None: everywhere.
+    - `gravity`: downwards (along -z), [m/s^2].
+
+    Raises `ValueError` for vertices that the mesh does not have, or that stand twice.
     """
 
     mesh: Mesh
-    held: Int[Array, " handle"]
+    pinned: Int[Array, " pinned"]
     table: Table
     air: Air
-    fan: Fan | None = None
+    fan: Fan | None
+    gravity: Float[Array, ""]
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        pinned: Int[Array, " pinned"] | np.ndarray | Sequence[int] = (),
+        table: Table | float | None = None,
+        air: Air | float | None = AIR_DENSITY,
+        fan: Fan | None = None,
+        gravity: Float[Array, ""] | float = GRAVITY,
+    ) -> None:
+        self.mesh, self.fan = mesh, fan
+        self.pinned = jnp.asarray(pinned, int)
+        self.table = table if isinstance(table, Table) else Table.make(table)
+        self.air = air if isinstance(air, Air) else Air.make(air or 0.0)
+        self.gravity = jnp.asarray(gravity, float)
+        _check(mesh, self.pinned)
 
     @property
     def is_free(self) -> Bool[Array, " vertex"]:
-        """Which vertices no gripper holds."""
-        return jnp.ones(self.mesh.rest.shape[0], bool).at[self.held].set(False)
+        """Which vertices are not pinned."""
+        return jnp.ones(self.mesh.rest.shape[0], bool).at[self.pinned].set(False)
+
+    def check(self, state: Any, control: Control) -> None:
+        """Raise `ValueError` for positions, grippers or wind of another shape than this scene's.
+
+        Shapes are known where values are traced, too.
+        """
+        vertices, grippers = self.mesh.rest.shape[0], len(self.pinned)
+        for name, array in (("state.x", state.x), ("state.v", state.v)):
+            if array.shape != (vertices, 3):
+                raise ValueError(
+                    f"{name} must be ({vertices}, 3), a place or velocity of each vertex of the "
+                    f"mesh; got {array.shape}"
+                )
+        if control.pinned.shape != (grippers, 3):
+            raise ValueError(
+                f"control.pinned must be ({grippers}, 3) in a step, a place of each pinned "
+                f"vertex; got {control.pinned.shape}"
+            )
+        if control.wind is not None and control.wind.shape not in ((3,), (vertices, 3)):
+            raise ValueError(
+                f"control.wind must be (3,) or ({vertices}, 3) in a step [m/s]; got "
+                f"{control.wind.shape}"
+            )
 
     def place(
-        self, x: Float[Array, "vertex 3"], handles: Float[Array, "handle 3"]
+        self, x: Float[Array, "vertex 3"], pinned: Float[Array, "pinned 3"]
     ) -> Float[Array, "vertex 3"]:
-        """Positions with the held vertices put to `handles` [m]."""
-        return x.at[self.held].set(handles)
+        """Positions [m] with the pinned vertices put where `pinned` [m] says."""
+        return x.at[self.pinned].set(pinned)
 
     def wind_on_elements(
-        self, x: Float[Array, "vertex 3"], wind: Float[Array, "*vertex 3"]
+        self, x: Float[Array, "vertex 3"], wind: Float[Array, "*vertex 3"] | None
     ) -> Float[Array, "element 3"]:
         """The wind [m/s] at the middle of every element, of a sheet at `x` [m]."""
+        if wind is None:
+            return jnp.zeros((len(self.mesh.samples.corners), 3), x.dtype)
         strength = 1.0 if self.fan is None else self.fan(x)[:, None]
         at_vertices = jnp.broadcast_to(wind, x.shape) * strength
         return jnp.mean(at_vertices[self.mesh.samples.corners], axis=1)
 
 
+def _check(mesh: Mesh, pinned: Array) -> None:
+    """Raise `ValueError` for pinned vertices that a mesh does not have, where they are known."""
+    if pinned.ndim != 1:
+        raise ValueError(f"pinned must be a list of vertices, got an array of {pinned.shape}")
+    if is_traced(pinned):
+        return
+    count, numbers = mesh.rest.shape[0], np.asarray(pinned)
+    beyond = numbers[(numbers < 0) | (numbers >= count)]
+    if beyond.size:
+        raise ValueError(f"pinned has vertex {beyond[0]}, the mesh has {count}: 0 to {count - 1}")
+    if len(set(numbers.tolist())) < len(numbers):
+        raise ValueError(f"a vertex is pinned twice: {sorted(numbers.tolist())}")
+
+
 def along_path(
     times: Float[Array, " step"],
     knot_times: Float[Array, " knot"],
-    path: Float[Array, "knot handle 3"],
-) -> Float[Array, "step handle 3"]:
-    """Handle positions [m] at times [s], linear between the knots, at rest before and after."""
+    path: Float[Array, "knot gripper 3"],
+) -> Float[Array, "step gripper 3"]:
+    """Gripper positions [m] at times [s], linear between the knots, at rest before and after."""
     knots = path.reshape(path.shape[0], -1)
     at = jax.vmap(lambda column: jnp.interp(times, knot_times, column), in_axes=1, out_axes=1)
     return at(knots).reshape(times.shape[0], *path.shape[1:])

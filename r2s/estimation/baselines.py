@@ -32,7 +32,7 @@ from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import ParameterSpace, Range
 from r2s.mesh.surface import sample
 from r2s.metrics.losses import one_sided_chamfer, surface_residuals
-from r2s.solvers.mpm.sheet import Sheet
+from r2s.solvers.mpm.sheet import MPMCloth
 
 EDGE = 1e-3  # of the unit cube: beyond it the sigmoid's slope is lost
 EPOCHS = 51
@@ -182,8 +182,8 @@ def diffcp_recipe(
     descends on all frames that count. Raises `ValueError` for a problem that is not on material
     points.
     """
-    if not isinstance(problem.solver, Sheet):
-        raise ValueError("DiffCP simulates material points: see `methods.problems_on_points`")
+    if not isinstance(problem.solver, MPMCloth):
+        raise ValueError("DiffCP simulates material points: see `methods.problems_on_mpm`")
     start = [
         bound.to_unit(jnp.asarray(PUBLISHED_START[bound.name], float))
         if bound.name in PUBLISHED_START

@@ -7,7 +7,7 @@ show that: a misfit there counts as noise.) A sheet taken to be ten times as hea
 the stiffness to hang as recorded, and pulls far harder than its load cell showed: where
 `asks_for_density` says so, a descent `with_free_density` finds which density would fit.
 
-`misfits` and `outlier_fractions`: nothing that was recorded is left out silently.
+`misfits` and `fits`: nothing that was recorded is left out silently.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import special, stats
 
-from r2s.estimation.estimate import UNLIKELY, Agreement, Contradiction, Misfit
+from r2s.estimation.estimate import UNLIKELY, Agreement, Contradiction, Fit, Misfit
 from r2s.estimation.gauss_newton import Descent, held_back, prior_weight
 from r2s.estimation.least_squares import common_axes
 from r2s.estimation.normal_equations import marker_distances, point_distances
@@ -269,17 +269,17 @@ def misfits(
     return tuple(found)
 
 
-def outlier_fractions(
-    problems: Problems, predicted: Sequence[Prediction], scale: float
-) -> tuple[float, ...]:
-    """The fraction [-] of points or markers of each recording that lie beyond the `scale` [m] of
-    the loss (`r2s.metrics.losses.robust`)."""
-    fractions = []
+def fits(problems: Problems, predicted: Sequence[Prediction], scale: float) -> tuple[Fit, ...]:
+    """How far each recording's points or markers are from its prediction, and the share of them
+    that lies beyond the `scale` [m] of the loss (`r2s.metrics.losses.robust`)."""
+    found = []
     for problem, seen in zip(problems, predicted, strict=True):
         distance, mask = marker_distances(problem, seen) or point_distances(problem, seen, scale)
-        is_out = np.asarray(robust_weight(distance, scale) < LITTLE)[np.asarray(mask)]
-        fractions.append(float(is_out.mean()) if is_out.size else 0.0)
-    return tuple(fractions)
+        known = np.asarray(mask)
+        is_out = np.asarray(robust_weight(distance, scale) < LITTLE)[known]
+        mean = float(np.mean(np.asarray(distance)[known])) if known.any() else np.nan
+        found.append(Fit("", mean, float(is_out.mean()) if is_out.size else 0.0))
+    return tuple(found)
 
 
 def _strays(which: int, problem: Problem, seen: Prediction) -> list[Misfit]:

@@ -88,7 +88,7 @@ def on_cloth(density: float) -> OrthotropicSpace:
     return OrthotropicSpace(density=space.density, thickness=space.thickness, ranges=RANGES)
 
 
-def on_points(density: float, losses: tuple[Range, ...] = ()) -> IsotropicSpace:
+def on_mpm(density: float, losses: tuple[Range, ...] = ()) -> IsotropicSpace:
     """Isotropic sheets of an areal density, [kg/m^2]; raises as `IsotropicSpace.make`.
 
     Damping and friction are the prior's median, or parameters (`losses`). The sheet in the middle

@@ -65,7 +65,7 @@ class Stop(NamedTuple):
 AT_THE_END, ON_THE_WAY = Stop(5e-3, 4, 5e-4, 10.0), Stop(0.03, 2, 3e-3, 10.0)
 MORE_FRAMES = Stop(0.03, 2, 0.02, 1.0)
 Iteration = list[Descent]  # one iteration: the descents of all starts
-DEFAULT = Budget(shares=(0.25, 0.5))
+DEFAULT = Budget(frame_fractions=(0.25, 0.5))
 
 
 class Search(NamedTuple):
@@ -121,12 +121,13 @@ def multi_start(
 
     `derive`: of an earlier search in the same recordings. `words`: for the progress.
     """
-    if budget.starts < 1:
-        raise ValueError(f"an estimate needs a start or more, got {budget.starts}")
-    if any(not low < high for low, high in itertools.pairwise((0.0, *budget.shares, 1.0))):
-        raise ValueError(f"shares of the frames must rise between 0 and 1, got {budget.shares}")
-    if budget.around < 0 or budget.around % 2:
-        raise ValueError(f"places around the end are in pairs: an even number, got {budget.around}")
+    if budget.num_starts < 1:
+        raise ValueError(f"an estimate needs a start or more, got {budget.num_starts}")
+    fractions, probes = budget.frame_fractions, budget.num_probes
+    if any(not low < high for low, high in itertools.pairwise((0.0, *fractions, 1.0))):
+        raise ValueError(f"frame_fractions must rise between 0 and 1, got {fractions}")
+    if probes < 0 or probes % 2:
+        raise ValueError(f"num_probes: places around the end are in pairs, got {probes}")
     check_shared(problems)
     clear_in_time()
     began, derive = time.perf_counter(), derive or remembering()
@@ -145,19 +146,19 @@ def multi_start(
 
 
 def _begin(problems: Problems, budget: Budget, start, derive: Derive, progress, key) -> Iteration:
-    dim, count = problems[0].space.dim, max(budget.coarse, budget.starts)
+    dim, count = problems[0].space.dim, max(budget.num_samples, budget.num_starts)
     if start is None:
         start = jnp.clip(problems[0].space.prior()[0], MARGIN, 1 - MARGIN)
     places = jax.random.uniform(key, (count, dim), float)
     nothing = jnp.zeros((count, theta_length(problems) - dim), float)
     thetas = jnp.concatenate([places, nothing], axis=1).at[0, : len(start)].set(start)
-    if budget.coarse:
+    if budget.num_samples:
         losses = losses_at(_seen(problems, budget, 0), thetas, progress)
         if not np.any(np.isfinite(losses)):
             raise _diverged(f"all {count} simulations of the coarse search", problems, thetas[0])
         thetas = thetas[np.argsort(losses)]
     tell(progress, "compiling the derivatives")
-    row = _fresh(problems, budget, list(thetas[: budget.starts]), 0.0, 0, derive)
+    row = _fresh(problems, budget, list(thetas[: budget.num_starts]), 0.0, 0, derive)
     if not any(_is_finite(each) for each in row):
         raise _diverged("all starts of the descents", problems, thetas[0])
     return row
@@ -180,7 +181,7 @@ def _diverged(what: str, problems: Problems, theta: Theta) -> RuntimeError:
 
 def _share(budget: Budget, stage: int) -> float:
     """The share of the frames that count in a stage."""
-    shares = (*budget.shares, 1.0)
+    shares = (*budget.frame_fractions, 1.0)
     return (shares[0], *shares)[stage]
 
 
@@ -196,7 +197,7 @@ def _fresh(
     """Descents that begin at some thetas, in a stage."""
     damping, limit = Damping.initial(), jnp.asarray(scale, float)
     seen = _seen(problems, budget, stage)
-    normals = normals_at(seen, thetas, [limit] * len(thetas), budget.width, derive)
+    normals = normals_at(seen, thetas, [limit] * len(thetas), budget.secant_width, derive)
     return [
         Descent(theta, normal, damping.value, damping.growth, limit, jnp.asarray(stage))
         for theta, normal in zip(thetas, normals, strict=True)
@@ -215,12 +216,12 @@ def _next(
     stop = _stop(budget, now)
     kept_on = _kept(row, len(stage))
     moving = [i for i in kept_on if not _arrived(problems, stage, i, prior, stop)]
-    is_passed = budget.near and now < _last_stage(budget)
-    if is_passed or not moving or len(stage) > budget.iterations:
+    is_passed = budget.warm_start and now < _last_stage(budget)
+    if is_passed or not moving or len(stage) > budget.max_iterations:
         return _next_stage(problems, budget, row, derive)
     seen = _seen(problems, budget, now)
     trials = [propose(problems, row[i], prior) for i in moving]
-    tried = normals_at(seen, trials, [row[i].scale for i in moving], budget.width, derive)
+    tried = normals_at(seen, trials, [row[i].scale for i in moving], budget.secant_width, derive)
     after = list(row)
     for i, trial, normal in zip(moving, trials, tried, strict=True):
         after[i] = accept(problems, row[i], trial, normal, prior)
@@ -278,13 +279,13 @@ def _best(row: Iteration) -> tuple[int, Descent]:
 
 
 def _last_stage(budget: Budget) -> int:
-    return len(budget.shares) + 1
+    return len(budget.frame_fractions) + 1
 
 
 def _stop(budget: Budget, stage: int) -> Stop:
     if stage < _last_stage(budget):
         return MORE_FRAMES
-    return ON_THE_WAY if budget.leads_on else AT_THE_END
+    return ON_THE_WAY if budget.is_intermediate else AT_THE_END
 
 
 def has_arrived(found: Search, budget: Budget) -> bool:
@@ -346,6 +347,6 @@ def _resumed(checkpoint: Path, run: dict[str, str], budget: Budget) -> list[Iter
     like = Descent(vector, normal, none, none, none, jnp.zeros((0, 0), int))
     stored = checkpoints.tree_from(arrays, like)
     return [
-        [jax.tree.map(lambda leaf, i=i, j=j: leaf[i, j], stored) for j in range(budget.starts)]
+        [jax.tree.map(lambda leaf, i=i, j=j: leaf[i, j], stored) for j in range(budget.num_starts)]
         for i in range(len(stored.stage))
     ]

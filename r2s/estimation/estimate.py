@@ -1,25 +1,27 @@
 """The result of an estimator: a fabric, its standard errors, how it was found; and its JSON object.
 
-Estimates of version 0.2.0 are read, too.
+Estimates of versions 0.2.0 and 0.3.0 are read, too.
 """
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from r2s.materials.fabric import Fabric
 from r2s.materials.fabric_json import fabric_as_json, fabric_from_json
-from r2s.materials.parameters import ParameterSpace, Range
+from r2s.materials.parameters import UNIFORM_DEVIATION, ParameterSpace, Range
 
-FORMAT = "r2s-estimate/3"
-FORMAT_0_2 = "r2s-estimate/2"
-IDENTIFIABLE = 0.025  # greatest standard error, relative or absolute: two of them are 5 %
+FORMAT = "r2s-estimate/4"
+FORMAT_0_2, FORMAT_0_3 = "r2s-estimate/2", "r2s-estimate/3"
+NINETY = 1.645  # standard errors on either side of a 90 % interval
 DOUBT, FAR = 4.5, 3.0  # standard errors, and a factor, from which on a density is doubted
 AT_BOUND = 5e-3  # of a range's width: an estimate that is nearer to an end has reached the bound
-LEAST_EXPONENT = 0.05  # a parameter with a smaller share in a combination is not named
+NAMED = 3  # correlations that are printed, the largest
 
 
 class Nuisance(NamedTuple):
@@ -95,17 +97,24 @@ class Misfit(NamedTuple):
     unit: str
 
 
-class Combination(NamedTuple):
-    """A product of powers of parameters (for those on a linear scale: a sum) that is known.
+class Fit(NamedTuple):
+    """How far an estimate's motion is from a recording, and what noise and mesh allow.
 
-    - `exponents`: of each parameter by name, the largest 1.
-    - `value`: the product, in the units that follow.
-    - `standard_error`: relative if all of them are logarithmic, [-].
+    - `recording`: its name.
+    - `distance`: mean distance of its points from the simulated sheet, or of its markers from their
+      places there, [m].
+    - `outliers`: share of them that the robust loss hardly counts, [-].
+    - `noise`: the mean distance that the noise of its points alone gives, [m]
+      (`r2s.recordings.noise`); NaN: unknown.
+    - `mesh`: expected discretization error of this motion on the estimate's mesh, [m]
+      (`r2s.scenarios.resolution.mesh_error`); NaN: unknown.
     """
 
-    exponents: dict[str, float]
-    value: float
-    standard_error: float
+    recording: str
+    distance: float
+    outliers: float
+    noise: float = float("nan")
+    mesh: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -116,6 +125,8 @@ class Estimate:
     - `fabric`; `ranges`, `values`: its parameters, in the units of the ranges.
     - `standard_errors`: relative where the range is logarithmic, else absolute; NaN from a method
       that gives none. The ranges count as a flat prior.
+    - `prior_errors`: the same before any recording, from the prior; empty: that of the ranges alone
+      (uniform).
     - `correlation`: of the parameters, [-].
     - `nuisances`: quantities of the recordings that were not known exactly.
     - `loss`: at the estimate, in its `loss_unit`: of PhysNet a distance on its map, [-].
@@ -130,8 +141,8 @@ class Estimate:
       errors, which include it; None: not estimated.
     - `shape`: vertices of the simulated sheet along warp and weft; None: unknown.
     - `refused`: a finer mesh that the fabric needs, and why it was not used; or "".
-    - `misfits`: what of the recordings does not fit. `left_out`: of each recording the share of
-      outliers, [-]; empty where that was not judged.
+    - `misfits`: what of the recordings does not fit. `fits`: how far each is from the estimate's
+      motion; empty where that was not judged.
     - `shares`: of each recording in the loss, [-]; empty of one, or of a method without.
     - `agreement`: of several recordings; None: not judged, or no two determine the same.
     """
@@ -153,11 +164,12 @@ class Estimate:
     shape: tuple[int, int] | None = None
     agreement: Agreement | None = None
     misfits: tuple[Misfit, ...] = ()
-    left_out: tuple[float, ...] = ()
+    fits: tuple[Fit, ...] = ()
     shares: tuple[float, ...] = ()
     refused: str = ""
     reached: tuple[int, int] | None = None
     unsure: str = ""
+    prior_errors: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
 
     @property
     def at_bounds(self) -> dict[str, Literal["lower", "upper"]]:
@@ -172,53 +184,40 @@ class Estimate:
         return found
 
     @property
-    def identifiable(self) -> np.ndarray:
-        """Which parameters the recording determines: to 5 % (or 0.05) with 95 % confidence.
+    def narrowing(self) -> Float[np.ndarray, " parameter"]:
+        """Standard deviation of each parameter after the recordings over that before, [-].
 
-        None that ended at a bound: the truth may lie beyond.
+        1: they tell nothing of it, or less than the prior. NaN without standard errors.
         """
-        return (self.standard_errors < IDENTIFIABLE) & self._inside
+        prior = self.prior_errors
+        if not len(prior):
+            prior = np.array([bound.width * UNIFORM_DEVIATION for bound in self.ranges])
+        return np.minimum(self.standard_errors / prior, 1)
 
     @property
-    def _inside(self) -> np.ndarray:
-        """Which parameters did not end at a bound."""
-        at_bounds = self.at_bounds
-        return np.array([each.name not in at_bounds for each in self.ranges], bool)
+    def intervals(self) -> Float[np.ndarray, "parameter 2"]:
+        """90 % interval of each parameter in its unit, within its range; NaN without standard
+        errors."""
+        bounds, log = self.ranges, np.array([bound.log for bound in self.ranges])
+        half, values = NINETY * self.standard_errors, np.asarray(self.values, float)
+        signs = np.array([-1.0, 1.0])
+        off = np.outer(half, signs)
+        ends = np.where(log[:, None], values[:, None] * np.exp(off), values[:, None] + off)
+        return np.clip(ends, [[b.low] for b in bounds], [[b.high] for b in bounds])
 
-    @property
-    def combinations(self) -> list[Combination]:
-        """Combinations of parameters that are identifiable although the parameters are not.
-
-        Eigenvectors of the parameters' covariance, on the scales of their ranges, whose standard
-        error is at most `IDENTIFIABLE`; the best known first.
-        """
-        known = np.isfinite(self.standard_errors) & self._inside
-        index = np.flatnonzero(known & ~self.identifiable)
-        if len(index) < 2:
-            return []
-        scale = self.standard_errors[index]
-        covariance = self.correlation[np.ix_(index, index)] * np.outer(scale, scale)
-        squares, vectors = np.linalg.eigh(covariance)
-        found = []
-        for square, vector in zip(squares, vectors.T, strict=True):
-            vector = vector / vector[np.argmax(np.abs(vector))]
-            standard_error = float(np.sqrt(max(square, 0)) * np.linalg.norm(vector))
-            if standard_error < IDENTIFIABLE:
-                powers = [(int(i), float(power)) for i, power in zip(index, vector, strict=True)]
-                found.append(_combination(self, powers, standard_error))
-        return found
-
-
-def _combination(
-    estimate: Estimate, powers: list[tuple[int, float]], standard_error: float
-) -> Combination:
-    powers = [(i, power) for i, power in powers if abs(power) >= LEAST_EXPONENT]
-    value = 1.0
-    for i, power in powers:
-        number = float(estimate.values[i])
-        value *= number**power if estimate.ranges[i].log else float(np.exp(power * number))
-    named = {estimate.ranges[i].name: round(power, 2) for i, power in powers}
-    return Combination(named, value, standard_error)
+    def correlated(self, count: int = NAMED) -> list[tuple[str, str, float]]:
+        """The pairs of parameters with the largest correlations, the largest first: what the
+        recordings cannot tell apart is near 1 or -1."""
+        names, (rows, columns) = (
+            [each.name for each in self.ranges],
+            np.triu_indices(len(self.ranges), 1),
+        )
+        pairs = [
+            (names[i], names[j], float(self.correlation[i, j]))
+            for i, j in zip(rows, columns, strict=True)
+            if np.isfinite(self.correlation[i, j])
+        ]
+        return sorted(pairs, key=lambda pair: -abs(pair[2]))[:count]
 
 
 def point_estimate(
@@ -254,67 +253,21 @@ def point_estimate(
     )
 
 
-def describe(estimate: Estimate) -> list[str]:
-    """Lines for people: each parameter, combination and nuisance, and how the search ended."""
-    lines = []
-    rows = zip(
-        estimate.ranges,
-        estimate.values,
-        estimate.standard_errors,
-        estimate.identifiable,
-        strict=True,
-    )
-    for bound, value, standard_error, identifiable in rows:
-        spread = f"{standard_error:.1%}" if bound.log else f"{standard_error:.3f}"
-        word = "identifiable" if identifiable else "not identifiable"
-        if not np.isfinite(standard_error):
-            spread, word = "", "no standard error"
-        side = estimate.at_bounds.get(bound.name)
-        limit = bound.low if side == "lower" else bound.high
-        end = f", at its {side} bound {limit:g}" if side else ""
-        unit = "" if bound.unit == "-" else f" {bound.unit}"
-        lines.append(f"{bound.name:14s}{value:10.4g}{unit:6s} +- {spread:8s}{word}{end}")
-    if estimate.shape is not None:
-        lines.append(f"mesh: {estimate.shape[0]} x {estimate.shape[1]} vertices")
-    if estimate.mesh_bias is not None:
-        pairs = zip(estimate.ranges, estimate.mesh_bias, strict=True)
-        parts = [f"{r.name} {b:.0%}" if r.log else f"{r.name} {b:.2f}" for r, b in pairs]
-        lines.append(f"of the errors the mesh makes: {', '.join(parts)}")
-    for found in estimate.combinations:
-        powers = " ".join(f"{name}^{power:g}" for name, power in found.exponents.items())
-        lines.append(f"known to {found.standard_error:.1%}: {powers}")
-    for name, unit, value, standard_error in estimate.nuisances:
-        unit = "" if unit == "-" else f" {unit}"
-        spread = f" +- {standard_error:.2g}" if np.isfinite(standard_error) else ""
-        lines.append(f"{name:14s}{value:10.4g}{unit:6s}{spread}")
-    if estimate.converged is not None:
-        words = "yes" if estimate.converged else "no, the budget ended the search"
-        if estimate.unsure:
-            words = f"no, not sure: {estimate.unsure}"
-        elif estimate.reached is not None:
-            ended, searches = estimate.reached
-            words += f", {ended} of {searches} searches from different starts fit as well"
-        lines.append(f"converged: {words}")
-        named = ", ".join(f"{name} ({side})" for name, side in estimate.at_bounds.items())
-        warned = f"warning: at a bound, beyond which the truth may lie: {named}"
-        lines.append(warned if named else "at a bound: none")
-    return lines
-
-
 def as_json(estimate: Estimate) -> dict[str, Any]:
     """An estimate with units, for a file; numbers that are not finite are None (null)."""
     parameters, agreement = {}, None
     if estimate.agreement is not None:
         odd = estimate.agreement.contradiction
         agreement = estimate.agreement._asdict() | {"contradiction": odd and odd._asdict()}
-    numbers = zip(estimate.values, estimate.standard_errors, estimate.identifiable, strict=True)
-    for bound, (value, error, identifiable) in zip(estimate.ranges, numbers, strict=True):
+    columns = estimate.values, estimate.intervals, estimate.standard_errors, estimate.narrowing
+    for bound, value, interval, error, ratio in zip(estimate.ranges, *columns, strict=True):
         parameters[bound.name] = {
             "value": _finite_or_none(value),
             "unit": bound.unit,
+            "interval_90": _nested(interval),
             "standard_error": _finite_or_none(error),
             "standard_error_is": "relative" if bound.log else "absolute",
-            "identifiable": bool(identifiable),
+            "posterior_over_prior": _finite_or_none(ratio),
             "bounds": [bound.low, bound.high],
         }
     return {
@@ -325,7 +278,6 @@ def as_json(estimate: Estimate) -> dict[str, Any]:
         "parameters": parameters,
         "correlation": _nested(estimate.correlation),
         "fabric": fabric_as_json(estimate.fabric),
-        "combinations": [each._asdict() for each in estimate.combinations],
         "shape": None if estimate.shape is None else list(estimate.shape),
         "refused": estimate.refused,
         "reached": None if estimate.reached is None else list(estimate.reached),
@@ -334,12 +286,8 @@ def as_json(estimate: Estimate) -> dict[str, Any]:
         "agreement": agreement,
         "shares": list(estimate.shares),
         "misfits": [each._asdict() for each in estimate.misfits],
-        "left_out": list(estimate.left_out),
-        "nuisances": [
-            each._asdict()
-            | {name: _finite_or_none(getattr(each, name)) for name in ("value", "standard_error")}
-            for each in estimate.nuisances
-        ],
+        "fits": [_row(each) for each in estimate.fits],
+        "nuisances": [_row(each) for each in estimate.nuisances],
         "loss": _finite_or_none(estimate.loss),
         "loss_unit": estimate.loss_unit,
         "seconds": estimate.seconds,
@@ -349,14 +297,14 @@ def as_json(estimate: Estimate) -> dict[str, Any]:
 
 
 def from_json(stored: dict[str, Any]) -> Estimate:
-    """The estimate that `as_json` made, or that version 0.2.0 wrote.
+    """The estimate that `as_json` made, or that versions 0.2.0 and 0.3.0 wrote.
 
     What was left out of `losses` and `history` is empty. Raises `ValueError` when the object is of
     another format or its fabric is none, `KeyError` when a key is missing.
     """
     if stored.get("format") == FORMAT_0_2:
         stored = upgraded(stored)
-    if stored.get("format") != FORMAT:
+    if stored.get("format") not in (FORMAT, FORMAT_0_3):
         raise ValueError(f"expected an estimate of format {FORMAT}, got {stored.get('format')}")
 
     def optional(name: str, read: Callable[[Any], Any]) -> Any:
@@ -392,8 +340,22 @@ def from_json(stored: dict[str, Any]) -> Estimate:
         agreement=optional("agreement", _agreement),
         shares=tuple(stored.get("shares", ())),
         misfits=tuple(Misfit(**each) for each in stored.get("misfits", ())),
-        left_out=tuple(stored.get("left_out", ())),
+        fits=tuple(_fit(each) for each in stored.get("fits", ())),
+        prior_errors=_prior_errors(parameters),
     )
+
+
+def _fit(stored: dict[str, Any]) -> Fit:
+    name, *numbers = (stored[key] for key in Fit._fields)
+    return Fit(name, *map(_number, numbers))
+
+
+def _prior_errors(parameters: dict[str, Any]) -> np.ndarray:
+    """Those that posterior over prior says; empty of version 0.3.0, which does not."""
+    pairs = [(p["standard_error"], p.get("posterior_over_prior")) for p in parameters.values()]
+    if not all(error and ratio for error, ratio in pairs):
+        return np.zeros(0)
+    return np.array([error / ratio for error, ratio in pairs])
 
 
 def _agreement(stored: dict[str, Any]) -> Agreement:
@@ -410,7 +372,6 @@ def upgraded(stored: dict[str, Any]) -> dict[str, Any]:
     Of convergence version 0.2.0 knew only that of the physics-informed network, in words.
     """
     renamed = {"deviation": "standard_error", "deviation_is": "standard_error_is"}
-    renamed |= {"determined": "identifiable"}
 
     def rename(entry: dict[str, Any]) -> dict[str, Any]:
         return {renamed.get(key, key): value for key, value in entry.items()}
@@ -422,7 +383,6 @@ def upgraded(stored: dict[str, Any]) -> dict[str, Any]:
         "format": FORMAT,
         "converged": known,
         "parameters": {name: rename(entry) for name, entry in stored["parameters"].items()},
-        "combinations": [rename(entry) for entry in stored["combinations"]],
         "nuisances": [rename(entry) for entry in stored["conditions"]],
         "fabric": _fabric_0_2(fabric) if "C11" in fabric else fabric,
     }
@@ -444,6 +404,14 @@ def _fabric_0_2(stored: dict[str, Any]) -> dict[str, Any]:
 
 def _finite_or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
+
+
+def _row(values: Any) -> dict[str, Any]:
+    """A named tuple's fields, with None for numbers that are not finite."""
+    return {
+        name: _finite_or_none(each) if isinstance(each, float) else each
+        for name, each in values._asdict().items()
+    }
 
 
 def _nested(values: np.ndarray) -> Any:

@@ -32,7 +32,7 @@ class HeldOut(NamedTuple):
     - `recording`: its name. `error`: the mean distance of its points from the estimate's surface,
       over the frames that count, [m]; infinite where the simulation diverged.
     - `defaults`: the same of samples of the prior, without the `diverged` ones, [m]. `middle`: of
-      the fabric in the middle of the prior, the best guess by the weight.
+      the prior mean, the best guess by the weight.
     - `air`: density of the air that all of them moved in, relative to that written down.
     """
 
@@ -45,37 +45,46 @@ class HeldOut(NamedTuple):
 
     @property
     def is_better(self) -> bool:
-        """Whether the error is less than that of the middle of the prior, and than the mean of the
+        """Whether the error is less than that of the prior mean, and than the mean of the
         samples; False where none of these ran."""
         return bool(self.defaults) and self.error < min(float(np.mean(self.defaults)), self.middle)
 
     @property
     def is_discriminating(self) -> bool:
-        """Whether the motion discriminates: not where samples, middle and estimate are alike in it
-        (`ALIKE`), as in a fold that lies on the table."""
+        """Whether the motion discriminates: not where samples, prior mean and estimate are alike
+        in it (`ALIKE`), as in a fold that lies on the table."""
         others = [each for each in (*self.defaults, self.middle) if np.isfinite(each)]
         least, most = min(others, default=0.0), max(others, default=0.0)
         return most > ALIKE * least or not least / ALIKE <= self.error < ALIKE * most
 
     def describe(self) -> str:
-        """One line; a warning where the estimate is no better than knowing nothing."""
+        """One line: the errors, and what they say; a warning where the prior is as good."""
         lost = f", {self.diverged} more diverged" if self.diverged else ""
         errors = np.array(self.defaults or (np.nan,))
         least, most, mean = (_mm(each) for each in (errors.min(), errors.max(), errors.mean()))
-        known = f"knowing nothing {mean} mm ({least} to {most}, {len(self.defaults)} draws{lost}; "
-        known += f"the middle of the prior {_mm(self.middle)})"
         error = f"{_mm(self.error)} mm" if np.isfinite(self.error) else "the simulation diverged"
         air = "" if self.air == 1 else f" (all in air {self.air:.2f} times as dense, as found)"
-        words = f"held out, {self.recording}: {error}; {known}{air}"
-        if not self.is_discriminating:
-            return f"{words}: fabrics hardly differ in it, so not told whether it is better"
-        if self.is_better:
-            best = self.error < min(self.defaults)
-            return f"{words}: better than {'every draw' if best else 'the draws on average'}"
-        return (
-            f"warning: {words}: not better than knowing nothing, or it is a motion of another "
-            "fabric (it is not among the recordings that are compared with each other)"
+        words = (
+            f"held-out motion {self.recording}: mean distance {error}; prior mean "
+            f"{_mm(self.middle)} mm; prior samples {mean} mm on average ({least} to {most}, "
+            f"{len(self.defaults)} samples{lost}){air}"
         )
+        if not self.is_discriminating:
+            return f"{words}: fabrics hardly differ in this motion, no verdict"
+        if self.is_better:
+            others = "every" if self.error < min(self.defaults) else "the average"
+            return f"{words}: better than the prior mean and {others} sample"
+        return (
+            f"warning: {words}: not better than {' and '.join(self._not_beaten)}, so do not rely "
+            "on this estimate in such motions; or the recording is of another fabric"
+        )
+
+    @property
+    def _not_beaten(self) -> list[str]:
+        """Which of the prior's two errors this one is not below."""
+        average = float(np.mean(self.defaults)) if self.defaults else -np.inf
+        pairs = (self.middle, "the prior mean"), (average, "the average sample of the prior")
+        return [name for other, name in pairs if not self.error < other]
 
 
 def choose(recordings: Sequence[Recording], name: str | None = None) -> int | None:
@@ -130,8 +139,8 @@ def judge(
     count: int = DRAWS,
     air: float = 1.0,
 ) -> HeldOut:
-    """The errors of a fabric, of the middle of the prior of its density and of `count` samples of
-    it, in a recording.
+    """The errors of a fabric, of the prior mean of its density and of `count` samples of the
+    prior, in a recording.
 
     All are simulated by the cloth on a mesh of `shape`, in the steps of an estimate
     (`r2s.estimation.mesh_refinement.in_mesh_steps`), with `air` times the density of the air. Size

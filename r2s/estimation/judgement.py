@@ -18,8 +18,8 @@ from r2s.estimation import mesh_bias
 from r2s.estimation.consistency import (
     agreement,
     asks_for_density,
+    fits,
     misfits,
-    outlier_fractions,
     with_density,
     with_free_density,
 )
@@ -109,7 +109,7 @@ def with_uncertainty(
     """
     began, problems = time.perf_counter(), found.problems
     best, prior = found.best, prior_weight(problems, found.best.normal)
-    predicted = found.derive(problems, best.theta, budget.width)
+    predicted = found.derive(problems, best.theta, budget.secant_width)
     coarse, beside = coarser_of(problems, other_mesh)
     around = jax.random.fold_in(key, 1)
     covariance = covariance_at(problems, budget, best, around, tried_on=coarse, derive=found.derive)
@@ -140,7 +140,7 @@ def with_uncertainty(
         tell(progress, "a recording alone diverged: not compared")
         alone = []
     shares = tuple(float(each) for each in recording_weights(problems)) if alone else ()
-    biases = mesh_bias.alone(coarse, beside, alone, found.derive, budget.width)
+    biases = mesh_bias.alone(coarse, beside, alone, found.derive, budget.secant_width)
     agreed = agreement(coarse, alone, biases) if alone else None
     missed = misfits(problems, best.theta, seen)
     if asks_for_density(problems, agreed, missed):
@@ -151,7 +151,7 @@ def with_uncertainty(
         agreement=agreed,
         shares=shares,
         misfits=missed,
-        left_out=outlier_fractions(problems, seen, float(best.scale)),
+        fits=fits(problems, seen, float(best.scale)),
         reached=found.reached,
         unsure=unsure,
     )
@@ -168,7 +168,7 @@ def each_alone(
     """The ends of descents in each of several recordings alone, from a theta of all of them."""
     if len(problems) < 2:
         return []
-    alone = budget._replace(coarse=0, starts=1, shares=(), near=True, leads_on=True)
+    alone = _from_near(budget)._replace(is_intermediate=True)
     return [
         multi_start(
             (problem,),
@@ -181,6 +181,12 @@ def each_alone(
         ).best
         for which, problem in enumerate(problems)
     ]
+
+
+def _from_near(budget: Budget) -> Budget:
+    """A budget for one descent of all frames, from a start near its end."""
+    one = budget._replace(num_samples=0, num_starts=1, frame_fractions=())
+    return one._replace(warm_start=True, is_intermediate=False)
 
 
 def _with_density(
@@ -197,7 +203,7 @@ def _with_density(
     try:
         end = multi_start(
             loose,
-            budget._replace(coarse=0, starts=1, shares=(), near=True, leads_on=False),
+            _from_near(budget),
             start=start,
             checkpoint=checkpoint,
             progress=progress,
@@ -248,7 +254,7 @@ def collect(
 
 
 def sensitivity(problems: Problem | Problems, fabric: Fabric) -> Estimate:
-    """Standard errors and combinations that recordings would give, were a fabric the true one.
+    """Standard errors that recordings would give, were a fabric the true one.
 
     Nothing is fitted: it takes nine simulations with their derivatives. Make the recordings with
     `r2s.scenarios.synthetic.record` from the motion in question and the cameras that there are.
@@ -276,21 +282,21 @@ def evaluate_design(
 ) -> Estimate:
     """The `sensitivity` of a motion that nobody has made yet.
 
-    - `scenario`, `numbers`: the motion, one of `r2s.scenarios.SIX` and its arguments.
+    - `scenario`, `numbers`: the motion, one of `r2s.scenarios.SCENARIOS` and its arguments.
     - `fabric`: a preset, which counts as the true fabric.
     - `noise`: of the clouds, [m]; `seed`: of the noise.
 
     Raises `ValueError` for a scenario, preset or number that does not exist, and for numbers out of
     range.
     """
-    if scenario not in scenarios.SIX:
-        raise ValueError(f"a scenario is one of {', '.join(scenarios.SIX)}, got {scenario!r}")
+    if scenario not in scenarios.SCENARIOS:
+        raise ValueError(f"a scenario is one of {', '.join(scenarios.SCENARIOS)}, got {scenario!r}")
     if fabric not in presets.FIVE:
         raise ValueError(f"a preset is one of {', '.join(presets.FIVE)}, got {fabric!r}")
     if not noise >= 0:
         raise ValueError(f"noise must not be negative [m], got {noise:g}")
     try:
-        experiment = scenarios.SIX[scenario](**numbers)
+        experiment = scenarios.SCENARIOS[scenario](**numbers)
     except TypeError as error:
         known = inspect.signature(getattr(scenarios, scenario)).parameters
         raise ValueError(f"{scenario}: {error}; it takes {', '.join(known)}") from None

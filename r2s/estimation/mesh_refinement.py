@@ -124,7 +124,7 @@ class _Run(NamedTuple):
             path = path and path.with_suffix(suffix)
         found = multi_start(
             self.problems(shapes),
-            budget._replace(leads_on=leads_on),
+            budget._replace(is_intermediate=leads_on),
             start=start,
             checkpoint=path,
             progress=self.progress,
@@ -198,7 +198,7 @@ def look_again(
     repeats all of this.
     """
     problems, ends, count = found.problems, [found], 1
-    once = budget._replace(coarse=0, starts=1, near=False, leads_on=True)
+    once = budget._replace(num_samples=0, num_starts=1, warm_start=False, is_intermediate=True)
     again = partial(multi_start, problems, derive=found.derive, progress=progress, key=key)
     while count < MOST:
         start = _sample(problems[0].space, jr.fold_in(key, count))
@@ -217,7 +217,7 @@ def look_again(
     likely = [e for e, loss in zip(ends, losses, strict=True) if loss <= LIKELY * min(losses)]
     others = tuple(each.theta for each in likely if each is not best)
     if best is not found:
-        to_the_end = once._replace(shares=(), near=True, leads_on=False)
+        to_the_end = once._replace(frame_fractions=(), warm_start=True, is_intermediate=False)
         best = again(to_the_end, start=best.theta, words="its end")
         ends.append(best)
     lost = f"none of {count - 1} searches from other starts fits as well"
@@ -240,7 +240,7 @@ def _sample(space: ParameterSpace, key: PRNGKeyArray) -> Float[Array, " dim"]:
 def _losses(ends: list[Search], budget: Budget) -> list[float]:
     """The losses [m^2] of some ends, all by one outlier scale."""
     scale = min((each.best.scale for each in ends), key=float)
-    predicted = [each.derive(each.problems, each.theta, budget.width) for each in ends]
+    predicted = [each.derive(each.problems, each.theta, budget.secant_width) for each in ends]
     return [
         loss_from(each.problems, [seen for seen, _ in pairs], scale)
         for each, pairs in zip(ends, predicted, strict=True)
@@ -292,7 +292,7 @@ def _weighted(problems: Problems, counts: Sequence[Float[Array, ""]]) -> tuple[P
 
 def near(budget: Budget) -> Budget:
     """The budget of a descent that begins near its end."""
-    return budget._replace(coarse=0, starts=1, shares=(), near=True)
+    return budget._replace(num_samples=0, num_starts=1, frame_fractions=(), warm_start=True)
 
 
 def _levels(recordings: Recordings) -> list[list[Shape]]:

@@ -8,6 +8,8 @@ key. `r2s.estimation.methods.METHODS` has all methods.
 
 import abc
 import dataclasses
+import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,12 +19,14 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from r2s.estimation.default_spaces import on_cloth, on_points
-from r2s.estimation.estimate import Estimate
+from r2s.estimation.default_spaces import on_cloth, on_mpm
+from r2s.estimation.estimate import Estimate, Fit
 from r2s.materials.parameters import InformedSpace, ParameterSpace
-from r2s.recordings.recording import Recording
+from r2s.recordings.noise import mean_distance, point_noise
+from r2s.recordings.recording import Recording, clouds_are_markers
+from r2s.scenarios.resolution import mesh_error
 
-SOLVERS = ("cloth", "points")
+SOLVERS = ("cloth", "mpm")
 COARSEST = (9, 9)  # vertices of a simulated sheet
 ANY = None  # every scenario
 Progress = Callable[[int, float], None]  # called with the iteration and the best loss
@@ -36,34 +40,36 @@ def tell(progress: Progress | None, words: str) -> None:
 
 
 class Budget(NamedTuple):
-    """How much an estimate may cost. Each method has its own numbers, see `Method.heeds`.
+    """How much an estimate may cost. Each method uses some of these, see `Method.budget_fields`.
 
-    - `coarse`: places of the range that are tried first; 0: descend from the start alone.
-    - `starts`: how many of the best places are descended from. Of more than three descents the
+    - `num_samples`: of the parameter range that are tried first; 0: descend from the start alone.
+    - `num_starts`: how many of the best samples are descended from. Of more than three descents the
       better half go on every three iterations, until three are left.
-    - `iterations`: at most, of each stage of a descent. First all starts descend; then the best one
+    - `max_iterations`: of each stage of a descent. First all starts descend; then the best one
       descends with outliers left out, until its next step would change no parameter by more than
       about a tenth of its standard error. Of a method that trains: its epochs.
-    - `width`: over which slopes are taken, see `r2s.estimation.prediction.sensitivities`.
-    - `shares`: of the frames, from the first, that count in earlier stages. The end of a long
-      motion can depend so steeply on the fabric that a loss over all of it is low only near the
-      truth; the loss of its beginning leads there.
-    - `around`: an even number of places around the end, from which Gauss-Newton steps are taken;
-      the standard errors grow by how far apart these steps end.
-    - `evaluations`: simulations of a search without derivatives.
-    - `leads_on`: whether a descent on a finer mesh goes on from the end, which may be less exact.
-    - `near`: whether the start is near the end: outliers are left out from there on.
+    - `secant_width`: over which slopes are taken, see `r2s.estimation.prediction.sensitivities`;
+      None: exact derivatives.
+    - `frame_fractions`: of the frames, from the first, that count in earlier stages. The end of a
+      long motion can depend so steeply on the fabric that a loss over all of it is low only near
+      the truth; the loss of its beginning leads there.
+    - `num_probes`: an even number of places around the end, from which Gauss-Newton steps are
+      taken; the standard errors grow by how far apart these steps end.
+    - `max_evaluations`: simulations of a search without derivatives.
+    - `is_intermediate`: whether a descent on a finer mesh goes on from the end, which may be less
+      exact.
+    - `warm_start`: whether the start is near the end: outliers are left out from there on.
     """
 
-    coarse: int = 24
-    starts: int = 3
-    iterations: int = 25
-    width: float | None = None
-    shares: tuple[float, ...] = ()
-    around: int = 8
-    evaluations: int = 80
-    leads_on: bool = False
-    near: bool = False
+    num_samples: int = 24
+    num_starts: int = 3
+    max_iterations: int = 25
+    secant_width: float | None = None
+    frame_fractions: tuple[float, ...] = ()
+    num_probes: int = 8
+    max_evaluations: int = 80
+    is_intermediate: bool = False
+    warm_start: bool = False
 
 
 class DataRequirements(NamedTuple):
@@ -92,7 +98,7 @@ class Method(abc.ABC):
 
     Of every method:
 
-    - `name`: in the registry. `budget`: its default. `heeds`: the numbers of it that it uses.
+    - `name`: in the registry. `budget`: its default. `budget_fields`: those that it uses.
     - `supports`: by solver the scenarios that it estimates from; None: all of them.
     - `refusals`: by solver why it does not support it.
     - `several`: whether it takes more than one recording of a fabric.
@@ -101,7 +107,7 @@ class Method(abc.ABC):
 
     Of one instance:
 
-    - `solver`: "cloth", or "points" (material points); None: the first that the method supports.
+    - `solver`: "cloth", or "mpm" (material points); None: the first that the method supports.
     - `shape`: vertices of the simulated sheet along warp and weft; None: those of the method
       (`diffcloud`: by meshes that resolve the fabric, see `r2s.estimation.mesh_refinement`).
     - `checkpoint`: a file that a killed run resumes from; None: it begins again.
@@ -110,7 +116,7 @@ class Method(abc.ABC):
 
     name: ClassVar[str]
     budget: ClassVar[Budget]
-    heeds: ClassVar[tuple[str, ...]]
+    budget_fields: ClassVar[tuple[str, ...]]
     supports: ClassVar[Mapping[str, tuple[str, ...] | None]]
     refusals: ClassVar[Mapping[str, str]] = {}
     several: ClassVar[bool] = False
@@ -139,7 +145,15 @@ class Method(abc.ABC):
         self.check(recordings)
         if isinstance(space, InformedSpace):
             self.check_prior()
-        return self._estimate(list(recordings), space, budget or self.budget, key)
+        began = time.perf_counter()
+        found = self._estimate(list(recordings), space, budget or self.budget, key)
+        seconds = max(found.seconds, time.perf_counter() - began)  # of a resumed run the former
+        compared = [allowance(*pair, found) for pair in zip(found.fits, recordings, strict=False)]
+        errors = np.sqrt(np.diag(np.linalg.inv(np.asarray(space.prior()[1], float))))
+        errors *= [bound.width for bound in space.ranges]
+        return dataclasses.replace(
+            found, fits=tuple(compared), prior_errors=errors, seconds=seconds
+        )
 
     def check(self, recordings: Sequence[Recording]) -> None:
         """Raise `ValueError` that says why if the method does not support these recordings."""
@@ -200,10 +214,20 @@ class Method(abc.ABC):
         """`estimate` of recordings that were checked."""
 
 
+def allowance(fit: Fit, recording: Recording, estimate: Estimate) -> Fit:
+    """A fit to a recording with its name, and what its noise and the estimate's mesh allow."""
+    info, noise, mesh = recording.info, math.nan, math.nan
+    if not clouds_are_markers(recording):
+        noise = mean_distance(point_noise(recording))
+    if estimate.shape is not None:
+        mesh = mesh_error(estimate.fabric, info.sheet.size, estimate.shape, info.scenario)
+    return fit._replace(recording=info.name, noise=noise, mesh=mesh)
+
+
 def default_space(solver: str, density: float) -> ParameterSpace:
     """The default space of a solver (`r2s.estimation.default_spaces`): orthotropic on the cloth,
     isotropic on material points. `density`: areal, [kg/m^2], else `ValueError`."""
-    return on_cloth(density) if solver == "cloth" else on_points(density)
+    return on_cloth(density) if solver == "cloth" else on_mpm(density)
 
 
 def seed_of(key: PRNGKeyArray) -> int:

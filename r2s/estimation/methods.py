@@ -22,12 +22,12 @@ from r2s.estimation.problem import POINTS, Problem, read_by_problem
 from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import ParameterSpace
 from r2s.recordings.recording import Recording
-from r2s.scenarios.resolution import material_points
+from r2s.scenarios.resolution import mpm_cloth
 from r2s.scenarios.scenario import from_recording
 
 WIDTH = 0.02  # of the range: the slope of exact material points is rough below that
-SEARCHED = ("coarse", "starts", "iterations")
-NO_POINTS = {"points": "it differentiates through the cloth; on material points take diffcp"}
+SEARCHED = ("num_samples", "num_starts", "max_iterations")
+NO_POINTS = {"mpm": "it differentiates through the cloth; on material points take diffcp"}
 NO_CLOTH = {"cloth": "it differentiates through material points; on the cloth take diffcloud"}
 
 
@@ -36,12 +36,12 @@ class DiffCloud(Method):
     """The method of DIFFCLOUD: Gauss-Newton descents through the cloth.
 
     - `finest`: continues on the finest mesh, whichever fabric is found on the coarser: minutes
-      instead of one, and right where the fabric's folds decide (docs/estimators.md).
+      instead of one, and right where the fabric's folds decide (docs/guide/estimate.md).
     """
 
     name = "diffcloud"
-    budget = descent.DEFAULT._replace(coarse=0, starts=1)
-    heeds = SEARCHED
+    budget = descent.DEFAULT._replace(num_samples=0, num_starts=1)
+    budget_fields = SEARCHED
     supports = {"cloth": ANY}
     refusals = NO_POINTS
     several = True
@@ -73,9 +73,9 @@ class DiffCP(Method):
     of the range."""
 
     name = "diffcp"
-    budget = Budget(coarse=12, starts=2, width=WIDTH, around=4)
-    heeds = SEARCHED
-    supports = {"points": ANY}
+    budget = Budget(num_samples=12, num_starts=2, secant_width=WIDTH, num_probes=4)
+    budget_fields = SEARCHED
+    supports = {"mpm": ANY}
     refusals = NO_CLOTH
     several = True
     takes_prior = True
@@ -84,7 +84,7 @@ class DiffCP(Method):
         return read_by_problem(recording)
 
     def _estimate(self, recordings, space, budget, key):
-        problems = problems_on_points(recordings, space, self.chosen_shape)
+        problems = problems_on_mpm(recordings, space, self.chosen_shape)
         found = descend_weighted(
             problems,
             budget,
@@ -101,9 +101,9 @@ class CMAES(Method):
     """CMA-ES on the loss of the default methods. Needs cma: pip install 'r2s[cma]'."""
 
     name = "cma-es"
-    budget = Budget(evaluations=600)
-    heeds = ("evaluations",)
-    supports = {"cloth": ANY, "points": ANY}
+    budget = Budget(max_evaluations=600)
+    budget_fields = ("max_evaluations",)
+    supports = {"cloth": ANY, "mpm": ANY}
     several = True
 
     def reads(self, recording):
@@ -112,11 +112,11 @@ class CMAES(Method):
     def _estimate(self, recordings, space, budget, key):
         require("cma", "cma", "CMA-ES")  # before anything is simulated
         shape = self.chosen_shape
-        if self.chosen_solver == "points":
-            problems = problems_on_points(recordings, space, shape)
+        if self.chosen_solver == "mpm":
+            problems = problems_on_mpm(recordings, space, shape)
         else:
             problems = tuple(Problem.make(each, space, shape=shape) for each in recordings)
-        found = baselines.cma_es(problems, budget.evaluations, progress=self.progress, key=key)
+        found = baselines.cma_es(problems, budget.max_evaluations, progress=self.progress, key=key)
         return dataclasses.replace(found, shape=shape)
 
 
@@ -128,8 +128,8 @@ class PublishedDiffCloud(Method):
     """
 
     name = "diffcloud-published"
-    budget = Budget(iterations=baselines.EPOCHS)
-    heeds = ("iterations",)
+    budget = Budget(max_iterations=baselines.EPOCHS)
+    budget_fields = ("max_iterations",)
     supports = {"cloth": ANY}
     refusals = NO_POINTS
 
@@ -145,7 +145,7 @@ class PublishedDiffCloud(Method):
         del key  # it starts in the middle
         problem = Problem.make(recordings[0], space, shape=self.chosen_shape)
         assumed = space.middle() if self.assumed is None else self.assumed
-        found = baselines.diffcloud_recipe(problem, assumed, budget.iterations, self.progress)
+        found = baselines.diffcloud_recipe(problem, assumed, budget.max_iterations, self.progress)
         return dataclasses.replace(found, shape=self.chosen_shape)
 
 
@@ -154,9 +154,9 @@ class PublishedDiffCP(Method):
     """The public settings of DiffCP, `r2s.estimation.baselines.diffcp_recipe`."""
 
     name = "diffcp-published"
-    budget = Budget(iterations=baselines.EPOCHS)
-    heeds = ("iterations",)
-    supports = {"points": ANY}
+    budget = Budget(max_iterations=baselines.EPOCHS)
+    budget_fields = ("max_iterations",)
+    supports = {"mpm": ANY}
     refusals = NO_CLOTH
 
     def reads(self, recording):
@@ -164,12 +164,12 @@ class PublishedDiffCP(Method):
 
     def _estimate(self, recordings, space, budget, key):
         del key  # it starts where the public code does
-        (problem,) = problems_on_points(recordings, space, self.chosen_shape)
-        found = baselines.diffcp_recipe(problem, budget.iterations, self.progress)
+        (problem,) = problems_on_mpm(recordings, space, self.chosen_shape)
+        found = baselines.diffcp_recipe(problem, budget.max_iterations, self.progress)
         return dataclasses.replace(found, shape=self.chosen_shape)
 
 
-def problems_on_points(
+def problems_on_mpm(
     recordings: Sequence[Recording], space: ParameterSpace, shape: tuple[int, int]
 ) -> tuple[Problem, ...]:
     """The problems of recordings, simulated by material points of a mesh of `shape` vertices,
@@ -182,7 +182,7 @@ def problems_on_points(
     problems = []
     for each in recordings:
         problem = Problem.make(each, space, shape=shape, as_seen=False)
-        sheet = material_points(problem.scenario, stiffest)
+        sheet = mpm_cloth(problem.scenario, stiffest)
         background = dataclasses.replace(sheet.background, forward_mode=False)
         exact_size = problem.nuisance_prior._replace(size=0.0)
         solver = dataclasses.replace(sheet, background=background)

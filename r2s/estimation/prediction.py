@@ -301,7 +301,7 @@ def _seen_from(problem: Problem, x: Float[Array, "all 3"] | Array, theta: Theta)
     """Vertices of all frames in the cameras' frame, at the frames that count of their clock."""
     prior, own = problem.nuisance_prior, theta[problem.space.dim + len(SHARED) :]
     x = _delayed(x, prior.time * own[4] / problem.scenario.interval)[jnp.array(problem.frames)]
-    pivot = x[:, problem.scenario.scene.held[:1]]
+    pivot = x[:, problem.scenario.scene.pinned[:1]]
     cosine, sine = jnp.cos(prior.turn * own[3]), jnp.sin(prior.turn * own[3])
     turn = jnp.stack([jnp.stack([cosine, -sine]), jnp.stack([sine, cosine])])
     offset = x - pivot

@@ -140,13 +140,14 @@ def covariance_at(
     """
     there, here = tried_on or problems, end
     if there is not problems:
-        normal = normal_from(there, end.theta, derive(there, end.theta, budget.width), end.scale)
+        predicted = derive(there, end.theta, budget.secant_width)
+        normal = normal_from(there, end.theta, predicted, end.scale)
         here = dataclasses.replace(end, normal=normal)
     apart = jnp.zeros((0, len(end.theta)), float)
-    if budget.around:
+    if budget.num_probes:
         weight = prior_weight(there, here.normal)
-        places = list(sample_around(there, here, weight, budget.around, key))
-        normals = normals_at(there, places, [end.scale] * len(places), budget.width)
+        places = list(sample_around(there, here, weight, budget.num_probes, key))
+        normals = normals_at(there, places, [end.scale] * len(places), budget.secant_width)
         apart = steps_apart(there, here, weight, list(zip(places, normals, strict=True)))
     prior = prior_weight(problems, end.normal)
     return np.asarray(covariance(problems, end, prior, apart, is_truth))

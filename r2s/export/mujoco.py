@@ -6,7 +6,7 @@ the same mesh; and hinges of bending stiffness E h^3 / (12 (1 - nu^2)), too stif
 Both stiffnesses fix E and h (`r2s.materials.solid.plate_solid`): h is not the fabric's thickness,
 which is the `radius` of its contacts. `damping` is a Kelvin-Voigt time [s], as in r2s.
 
-The model has a body for each vertex, held vertices tied to mocap bodies, and springs along the
+The model has a body for each vertex, pinned vertices tied to mocap bodies, and springs along the
 yarns (spatial tendons) that make it orthotropic.
 """
 
@@ -31,7 +31,7 @@ def mjcf(
     fabric: Fabric,
     mesh: Mesh,
     *,
-    held: tuple[int, ...] = (),
+    pinned: tuple[int, ...] = (),
     height: float = 0.0,
     table: float | None = 0.0,
     yarns: bool = True,
@@ -39,7 +39,7 @@ def mjcf(
 ) -> tuple[str, Loss]:
     """A whole model, and what is lost: a sheet, horizontal at a `height` [m], over a table.
 
-    - `held`: vertices that are tied to mocap bodies, in this order: move `mjData.mocap_pos`.
+    - `pinned`: vertices that are tied to mocap bodies, in this order: move `mjData.mocap_pos`.
     - `table`: z of its surface [m]; None: there is none.
     - `yarns`: springs along warp and weft, for a mesh such as `r2s.rectangle`; without, the nearest
       isotropic sheet.
@@ -63,7 +63,7 @@ def mjcf(
   <size memory="1G"/>
   <worldbody>
     {plane if table is not None else ""}
-{_bodies(fabric, mesh, held, height)}
+{_bodies(fabric, mesh, pinned, height)}
   </worldbody>
   <deformable>
     <flex name="cloth" dim="2" radius="{float(fabric.thickness)!r}" body="{names}"
@@ -72,7 +72,7 @@ def mjcf(
       <elasticity {_elasticity(fabric, mesh, sheet)}/>
     </flex>
   </deformable>
-{tendons}{_grips(held, timestep)}</mujoco>
+{tendons}{_grips(pinned, timestep)}</mujoco>
 """
     return text, stiffness.loss_of(fabric, sheet.stiffness, mesh, lost)
 
@@ -101,12 +101,12 @@ def _elasticity(fabric: Fabric, mesh: Mesh, sheet: stiffness.Sheet) -> str:
     )
 
 
-def _bodies(fabric: Fabric, mesh: Mesh, held: tuple[int, ...], height: float) -> str:
-    """A mocap body for each held vertex, in their order, and a body for each vertex."""
+def _bodies(fabric: Fabric, mesh: Mesh, pinned: tuple[int, ...], height: float) -> str:
+    """A mocap body for each pinned vertex, in their order, and a body for each vertex."""
     mass = float(fabric.density) * np.asarray(mesh.vertex_area, np.float64)
     flat = np.pad(np.asarray(mesh.rest, np.float64), ((0, 0), (0, 1)))
     places = flat + [0.0, 0.0, height]
-    lines = [f'    <body name="h{i}" pos="{_numbers(places[i])}" mocap="true"/>' for i in held]
+    lines = [f'    <body name="h{i}" pos="{_numbers(places[i])}" mocap="true"/>' for i in pinned]
     for i in range(len(places)):
         joints = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in AXES)
         tiny = _numbers(np.full(3, 1e-6 * mass[i]))
@@ -116,13 +116,13 @@ def _bodies(fabric: Fabric, mesh: Mesh, held: tuple[int, ...], height: float) ->
     return "\n".join(lines)
 
 
-def _grips(held: tuple[int, ...], timestep: float) -> str:
-    """What ties held vertices to their mocap bodies, as stiff as the time step allows."""
+def _grips(pinned: tuple[int, ...], timestep: float) -> str:
+    """What ties pinned vertices to their mocap bodies, as stiff as the time step allows."""
     lines = [
         f'    <connect body1="v{i}" body2="h{i}" anchor="0 0 0" solref="{2 * timestep!r} 1"/>'
-        for i in held
+        for i in pinned
     ]
-    return "  <equality>\n" + "\n".join(lines) + "\n  </equality>\n" if held else ""
+    return "  <equality>\n" + "\n".join(lines) + "\n  </equality>\n" if pinned else ""
 
 
 def _tendons(springs: Springs, damping: float) -> str:

@@ -26,12 +26,10 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import root_scalar
 
 from r2s._util.units import GRAVITY
-from r2s.environment.air import Air
-from r2s.environment.contact import Table
 from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric
 from r2s.mesh.mesh import Mesh
-from r2s.solvers.implicit.cloth import Cloth
+from r2s.solvers.implicit.cloth import ImplicitCloth
 
 SLOPE = np.radians(41.5)  # of the standard's plane [rad]
 OVERHANG_DEVIATION = 0.03  # relative
@@ -191,8 +189,8 @@ class Ring(eqx.Module):
     - `num_around`: vertices of a circle. `radii`: of specimen and support, [m].
     """
 
-    settling: Cloth
-    resting: Cloth
+    settling: ImplicitCloth
+    resting: ImplicitCloth
     num_around: int = eqx.field(static=True)
     radii: tuple[float, float] = eqx.field(static=True)
 
@@ -214,8 +212,8 @@ def _ring(radii: tuple[float, float], shape: tuple[int, int]) -> Ring:
     turns = 2 * np.pi * (np.arange(around) + np.arange(len(circles))[:, None] % 2 / 2) / around
     rest = circles[:, None, None] * np.stack([np.cos(turns), np.sin(turns)], axis=-1)
     mesh = Mesh.make(rest.reshape(-1, 2), _faces(around, len(circles)))
-    scene = Scene(mesh, jnp.arange(2 * around), Table.make(-1.0), Air.make(0.0))
-    settling, resting = (Cloth.make(scene, dt) for dt, _ in (SETTLING, RESTING))
+    scene = Scene(mesh, range(2 * around), air=None)
+    settling, resting = (ImplicitCloth(scene, dt) for dt, _ in (SETTLING, RESTING))
     return Ring(settling, resting, around, radii)
 
 
@@ -241,9 +239,9 @@ def drape(specimen: Ring, fabric: Fabric, key: PRNGKeyArray) -> Float[Array, "ve
     flat = jnp.pad(scene.mesh.rest, ((0, 0), (0, 1)))
     uneven = UNEVENNESS * jr.normal(key, (len(flat),), flat.dtype)
     start = flat.at[:, 2].set(jnp.where(scene.is_free, uneven, 0))
-    control = Control(flat[scene.held], jnp.zeros(3, flat.dtype))
+    control = Control(flat[scene.pinned])
 
-    def steps(solver: Cloth, count: int, fabric: Fabric, x: Array) -> tuple[Array, Array]:
+    def steps(solver: ImplicitCloth, count: int, fabric: Fabric, x: Array) -> tuple[Array, Array]:
         def step(state, _):
             return solver.step(fabric, state, control), None
 

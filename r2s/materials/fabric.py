@@ -5,8 +5,10 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from r2s._util.arrays import is_traced
 from r2s._util.units import GRAVITY
 from r2s.materials.membrane import OrthotropicMembrane
 from r2s.materials.plate import PlateBending
@@ -80,6 +82,32 @@ class Fabric(eqx.Module):
         )
 
 
+def check_fabric(fabric: Any) -> None:
+    """Raise `ValueError` for a fabric with a number that none has, such as a negative stiffness.
+
+    Of a batch, if one member has it. A traced fabric passes, and so does what is no `Fabric`.
+    """
+    if not isinstance(fabric, Fabric) or is_traced(fabric):
+        return
+    numbers = {
+        "density [kg/m^2]": (fabric.density, True),
+        "thickness [m]": (fabric.thickness, True),
+        "damping [s]": (fabric.damping, False),
+        "friction [-]": (fabric.friction, False),
+        "mass_damping [1/s]": (fabric.mass_damping, False),
+    }
+    if isinstance(fabric.membrane, OrthotropicMembrane):
+        law = fabric.membrane
+        numbers |= {f"membrane.{n} [N/m]": (getattr(law, n), True) for n in ("c11", "c22", "c33")}
+    if isinstance(fabric.bending, PlateBending):
+        numbers["bending.stiffness [N m]"] = fabric.bending.stiffness, False
+    for name, (values, must_be_positive) in numbers.items():
+        least = float(np.min(np.asarray(values)))
+        if not least >= 0 or (must_be_positive and least == 0):
+            word = "positive" if must_be_positive else "not negative"
+            raise ValueError(f"fabric: {name} must be {word}, found {least:g}")
+
+
 def constant_laws(fabric: Fabric) -> tuple[OrthotropicMembrane, PlateBending]:
     """The laws of a fabric whose stiffness is constant; raises `TypeError` for another one."""
     membrane, bending = fabric.membrane, fabric.bending
@@ -94,16 +122,16 @@ def constant_laws(fabric: Fabric) -> tuple[OrthotropicMembrane, PlateBending]:
 DIRECTIONS = (0.0, math.pi / 4, math.pi / 2, 3 * math.pi / 4)  # of bending, from the warp [rad]
 
 
-def fold_length(fabric: Fabric) -> Float[Array, ""]:
+def bending_length(fabric: Fabric) -> Float[Array, ""]:
     """The gravito-bending length [m], at which a fabric bends under its own weight.
 
     It is (bending / (density g))^(1/3), with the mean stiffness over four directions: Peirce's
     bending length (Journal of the Textile Institute 21, 1930). A strip of that length, held at one
     end, sags by an eighth of it. Longer cells cannot take the folds of a sheet, which then moves
-    otherwise than a fine one (`docs/solvers.md` says by how much).
+    otherwise than a fine one (`docs/guide/simulate.md` says by how much).
 
     >>> from r2s.materials import presets
-    >>> round(float(1e3 * fold_length(presets.grey_interlock())), 1)  # [mm]
+    >>> round(float(1e3 * bending_length(presets.grey_interlock())), 1)  # [mm]
     14.3
     """
     along = jnp.stack([fabric.bending.stiffness_along(angle) for angle in DIRECTIONS])

@@ -85,6 +85,10 @@ class Mesh(eqx.Module):
             plate=PlateElements.of_triangles(rest, faces, hinges, area, bends),
         )
 
+    def lay_flat(self, z: float = 0.0) -> Float[Array, "vertex 3"]:
+        """Positions [m] of the sheet at rest in the plane at `z` [m], warp along x."""
+        return jnp.pad(self.rest, ((0, 0), (0, 1)), constant_values=z)
+
 
 def _check(rest: np.ndarray, faces: np.ndarray) -> None:
     if rest.ndim != 2 or rest.shape[1] != 2 or not np.all(np.isfinite(rest)):

@@ -101,7 +101,7 @@ def _pieces(points: Points) -> Float[np.ndarray, "kept 3"]:
 
 
 def _still(recording: Recording) -> list[int]:
-    path, knots = np.asarray(recording.handle_path), np.asarray(recording.handle_times)
+    path, knots = np.asarray(recording.gripper_path), np.asarray(recording.gripper_times)
     moved = np.linalg.norm(path - path[:1], axis=-1).max(axis=1) > STILL
     begins = float(knots[np.argmax(moved)]) if moved.any() else np.inf
     return np.flatnonzero(np.asarray(recording.times) <= begins).tolist() or [0]
@@ -160,7 +160,7 @@ def _extents(frames: Frames) -> list[Finding]:
         if len(points) >= FEWEST:
             away = np.linalg.norm(points[:, None] - grippers[None], axis=-1)
             farthest = np.quantile(away, 1 - ENDS, axis=0)
-            ratios[frame] = np.max(farthest / [_reach(sheet, name) for name in sheet.held])
+            ratios[frame] = np.max(farthest / [_reach(sheet, name) for name in sheet.pinned])
     if np.isnan(ratios).all():
         return [Finding.make("reach", np.nan, f"no frame has {FEWEST} points")]
     largest, *others = sorted(ratios[np.isfinite(ratios)], reverse=True)
@@ -201,7 +201,7 @@ def _check_clock(frames: Frames) -> list[Finding]:
     gaps = np.diff(np.asarray(recording.times, np.float64))
     middle = float(np.median(gaps)) if len(gaps) else np.nan
     uneven = float(np.abs(gaps / middle - 1).max()) if len(gaps) else np.nan
-    path, knots = np.asarray(recording.handle_path), np.asarray(recording.handle_times)
+    path, knots = np.asarray(recording.gripper_path), np.asarray(recording.gripper_times)
     moved = np.linalg.norm(np.diff(path, axis=0), axis=-1).max(axis=1)
     lag, rate = _lag(frames)
     why = "" if np.isfinite(lag) else "the tops of the clouds do not show it"
@@ -225,8 +225,8 @@ def _lag(frames: Frames) -> tuple[float, float]:
     tops = {frame: _top(frames.clouds[frame]) for frame in shown}
     lowest = recording.info.table_height + UP if _lies(recording) else -np.inf
     up = [frame for frame in shown if tops[frame][2] > lowest]
-    path = np.asarray(recording.handle_path)
-    compared = (2,) if len(recording.info.sheet.held) == 1 else (2, 0, 1)  # one corner leans aside
+    path = np.asarray(recording.gripper_path)
+    compared = (2,) if len(recording.info.sheet.pinned) == 1 else (2, 0, 1)  # one leans aside
     axes = [axis for axis in compared if np.ptp(_leader(path, axis)) > MOVES]
     if len(up) < FRAMES or not axes:
         return np.nan, np.nan
@@ -257,8 +257,8 @@ def _residual(recording: Recording, at: np.ndarray, tops: np.ndarray, axes: list
     Robust, since a top may be a stray point. A scale that is off by up to `SCALE` counts for
     nothing: in a slow motion it looks like a lag.
     """
-    knots = np.asarray(recording.handle_times, np.float64)
-    path = np.asarray(recording.handle_path, np.float64)
+    knots = np.asarray(recording.gripper_times, np.float64)
+    path = np.asarray(recording.gripper_path, np.float64)
     left = 0.0
     for axis in axes:
         there = np.interp(at, knots, _leader(path, axis))
@@ -309,7 +309,7 @@ def _stray_share(
 ) -> float:
     """Share of points that are alone, or farther from a gripper than the sheet reaches."""
     far = np.zeros(len(points), bool)
-    for name, at in zip(sheet.held, held, strict=True):
+    for name, at in zip(sheet.pinned, held, strict=True):
         far |= np.linalg.norm(points - at, axis=1) > BEYOND * _reach(sheet, name)
     return float(np.mean(far | outliers(points, NEIGHBOURS, DEVIATIONS)))
 

@@ -46,7 +46,7 @@ class Transform:
 
 @dataclass(frozen=True)
 class Gripper:
-    """The commanded path: `file` (knot, 3) or (knot, handle, 3), `rate` knots per second [Hz].
+    """The commanded path: `file` (knot, 3) or (knot, gripper, 3), `rate` knots per second [Hz].
 
     `offset` [m] leads, in the world, from the commanded tool point to the cloth that is held;
     `note` says how it was measured.
@@ -310,7 +310,7 @@ def _scenario_of(manifest: Manifest, name: str) -> tuple[str, str, str]:
 def _read_path(file: Path) -> np.ndarray:
     path = read_values(file)
     if path.ndim not in (2, 3) or path.shape[-1] != 3 or len(path) == 0:
-        raise ValueError(f"{file}: expected (knot, 3) or (knot, handle, 3), found {path.shape}")
+        raise ValueError(f"{file}: expected (knot, 3) or (knot, gripper, 3), found {path.shape}")
     if not np.isfinite(path).all():
         raise ValueError(f"{file}: the gripper path is not finite")
     return path

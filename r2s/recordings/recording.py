@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,8 +27,8 @@ CLOCK_TOLERANCE = 1e-6  # [s], rounding when a time is a frame number over a rat
 class SheetPlacement:
     """Where the rectangular sheet lies at rest, in metres, z up.
 
-    `held` names the corner of each handle: "origin", "warp" (at the end of the warp side), "weft"
-    or "opposite". Raises ValueError for sides that are not positive, directions that are not
+    `pinned` names the corner of each gripper: "origin", "warp" (at the end of the warp side),
+    "weft" or "opposite". Raises ValueError for sides that are not positive, directions that are not
     orthonormal, and unknown corners.
     """
 
@@ -36,7 +36,8 @@ class SheetPlacement:
     origin: tuple[float, float, float]  # [m], world position of the rest corner (0, 0)
     warp: tuple[float, float, float]  # unit vector, world direction of the warp side
     weft: tuple[float, float, float]  # unit vector, world direction of the weft side
-    held: tuple[str, ...]
+    pinned: tuple[str, ...]
+    former: ClassVar[dict[str, str]] = {"held": "pinned"}  # names in files of before 0.4
 
     def __post_init__(self) -> None:
         if not all(np.isfinite(side) and side > 0 for side in self.size):
@@ -47,7 +48,7 @@ class SheetPlacement:
         if not np.allclose(axes @ axes.T, np.eye(2), atol=1e-6):
             found = f"found {self.warp} and {self.weft}"
             raise ValueError(f"sheet: warp and weft must be orthonormal, {found}")
-        for name in self.held:
+        for name in self.pinned:
             if name not in CORNERS:
                 raise ValueError(f"sheet: unknown corner {name!r}, expected one of {list(CORNERS)}")
 
@@ -141,12 +142,12 @@ class Recording(eqx.Module):
 
     points: Float[Array, "frame point 3"]  # [m], padded with zeros; only where mask
     mask: Bool[Array, "frame point"]
-    times: Float[Array, " frame"]  # [s], on the clock of handle_times
-    handle_path: Float[Array, "knot handle 3"]  # [m], held still before the first knot
-    handle_times: Float[Array, " knot"]  # [s]
+    times: Float[Array, " frame"]  # [s], on the clock of gripper_times
+    gripper_path: Float[Array, "knot gripper 3"]  # [m], held still before the first knot
+    gripper_times: Float[Array, " knot"]  # [s]
     info: RecordingInfo = eqx.field(static=True)
     force: Float[Array, " sample"] | Float[Array, "sample 3"] | None = None  # [N]
-    force_times: Float[Array, " sample"] | None = None  # [s], on the clock of handle_times
+    force_times: Float[Array, " sample"] | None = None  # [s], on the clock of gripper_times
     markers: Float[Array, "frame marker 3"] | None = None  # [m], zero where not markers_seen
     markers_seen: Bool[Array, "frame marker"] | None = None
     marker_places: Float[Array, "marker 2"] | None = None  # [m], along warp and weft
@@ -155,8 +156,8 @@ class Recording(eqx.Module):
 def make_recording(
     clouds: Sequence[Any] | None,
     times: Any,
-    handle_path: Any,
-    handle_times: Any,
+    gripper_path: Any,
+    gripper_times: Any,
     info: RecordingInfo,
     *,
     force: Any = None,
@@ -169,14 +170,14 @@ def make_recording(
 
     - `clouds`: one (points, 3) array per frame, [m]; None: the markers that are seen.
     - `times`: (frame,), `info.time_offset` included, [s].
-    - `handle_path`: (knot, handle, 3), or (knot, 3) for one handle, [m]. `handle_times`: [s].
+    - `gripper_path`: (knot, gripper, 3), or (knot, 3) for one gripper, [m]. `gripper_times`: [s].
     - `force`, `force_times`: (sample,) or (sample, 3) [N], and (sample,) [s].
     - `markers`: (frame, marker, 3), [m]. `markers_seen`: (frame, marker); None: where finite.
     - `marker_places`: (marker, 2), where they are on the sheet along warp and weft, [m].
 
     Raises ValueError that names the recording, and the frame where there is one: clouds that are
-    empty or not finite, times that do not increase, a path of other handles than `info.sheet.held`
-    or that ends before the last frame, and arrays that do not belong together.
+    empty or not finite, times that do not increase, a path of other grippers than
+    `info.sheet.pinned` or that ends before the last frame, and arrays that do not belong together.
     """
     try:
         marks = _check_markers(markers, markers_seen)
@@ -194,9 +195,9 @@ def make_recording(
         if marks is not None and len(marks[0]) != len(checked):
             raise ValueError(f"markers in {len(marks[0])} frames, but clouds in {len(checked)}")
         places = _check_places(marker_places, marks, info.sheet.size)
-        path = _check_path(handle_path, info.sheet.held)
+        path = _check_path(gripper_path, info.sheet.pinned)
         clock = _check_times(times, "times", len(checked))
-        knots = _check_times(handle_times, "handle_times", len(path))
+        knots = _check_times(gripper_times, "gripper_times", len(path))
         _check_end(knots, clock)
         log = _check_force(force, force_times)
     except ValueError as error:
@@ -206,8 +207,8 @@ def make_recording(
         points=jnp.asarray(points, float),
         mask=jnp.asarray(mask),
         times=jnp.asarray(clock, float),
-        handle_path=jnp.asarray(path, float),
-        handle_times=jnp.asarray(knots, float),
+        gripper_path=jnp.asarray(path, float),
+        gripper_times=jnp.asarray(knots, float),
         info=info,
         force=_floats(log and log[0]),
         force_times=_floats(log and log[1]),
@@ -221,13 +222,13 @@ def set_time_offset(recording: Recording, offset: float) -> Recording:
     """The recording with another offset [s] between the cameras' clock and that of the grippers.
 
     Markers move with the frames, the force does not. Raises ValueError when the last frame comes
-    after the end of the handle path.
+    after the end of the gripper path.
     """
     shift = offset - recording.info.time_offset
     times = np.asarray(recording.times, np.float64) + shift
     info = replace(recording.info, time_offset=offset)
     try:
-        _check_end(np.asarray(recording.handle_times), times)
+        _check_end(np.asarray(recording.gripper_times), times)
     except ValueError as error:
         raise ValueError(f"recording {info.name}: time offset {offset:g} s: {error}") from error
     return replace(recording, times=jnp.asarray(times, float), info=info)
@@ -246,8 +247,8 @@ def clouds_are_markers(recording: Recording) -> bool:
 
 def gripper_positions(recording: Recording) -> Float[np.ndarray, "frame gripper 3"]:
     """Where the grippers are at the frames [m]: linear between knots, at rest before and after."""
-    path = np.asarray(recording.handle_path, np.float64)
-    times, knots = (np.asarray(t, np.float64) for t in (recording.times, recording.handle_times))
+    path = np.asarray(recording.gripper_path, np.float64)
+    times, knots = (np.asarray(t, np.float64) for t in (recording.times, recording.gripper_times))
     columns = path.reshape(len(path), -1).T
     at = np.stack([np.interp(times, knots, column) for column in columns], axis=1)
     return at.reshape(-1, *path.shape[1:])
@@ -289,11 +290,11 @@ def save(recording: Recording, path: Path | str) -> None:
     """Write the recording to `path` as one NPZ, whole or not at all; OSError names `path`.
 
     Arrays: `points` (all frames', 3) and `offsets` (frame + 1), where frame i is
-    `points[offsets[i]:offsets[i + 1]]`; `times`, `handle_path`, `handle_times`; where recorded
+    `points[offsets[i]:offsets[i + 1]]`; `times`, `gripper_path`, `gripper_times`; where recorded
     `force`, `force_times`, `markers`, `markers_seen`; `meta`: JSON of format and `info`.
     """
     mask = np.asarray(recording.mask)
-    names = ("times", "handle_path", "handle_times", *OPTIONAL)
+    names = ("times", "gripper_path", "gripper_times", *OPTIONAL)
     arrays = {name: getattr(recording, name) for name in names}
     write_npz(
         path,
@@ -311,7 +312,9 @@ def load(path: Path | str) -> Recording:
     recording, or of another version of the format.
     """
     try:
-        arrays = read_npz(path, "meta", "points", "offsets", "times", "handle_path", "handle_times")
+        stored = read_npz(path, "meta", "points", "offsets", "times")
+        # "handle" was the gripper before 0.4
+        arrays = {name.replace("handle_", "gripper_"): part for name, part in stored.items()}
         meta = json.loads(str(arrays["meta"]))
         if meta["format"] not in READABLE:
             raise ValueError(
@@ -321,8 +324,8 @@ def load(path: Path | str) -> Recording:
         return make_recording(
             _split(arrays["points"], arrays["offsets"]),
             arrays["times"],
-            arrays["handle_path"],
-            arrays["handle_times"],
+            arrays["gripper_path"],
+            arrays["gripper_times"],
             parse(RecordingInfo, meta["info"], "info"),
             **{name: arrays[name] for name in OPTIONAL if name in arrays},
         )
@@ -393,7 +396,7 @@ def _check_times(times: Any, what: str, count: int) -> np.ndarray:
 def _check_end(knots: np.ndarray, times: np.ndarray) -> None:
     if knots[-1] < times[-1] - CLOCK_TOLERANCE:
         raise ValueError(
-            f"the handle path ends at {knots[-1]:g} s, before the last frame at {times[-1]:g} s: "
+            f"the gripper path ends at {knots[-1]:g} s, before the last frame at {times[-1]:g} s: "
             "log it longer, leave the last frames out, or correct the time offset"
         )
 
@@ -433,15 +436,15 @@ def _check_markers(markers: Any, seen: Any) -> tuple[np.ndarray, np.ndarray] | N
     return np.where(seen[..., None], markers, 0), seen
 
 
-def _check_path(path: Any, held: tuple[str, ...]) -> np.ndarray:
+def _check_path(path: Any, pinned: tuple[str, ...]) -> np.ndarray:
     path = np.asarray(path, np.float64)
     path = path[:, None] if path.ndim == 2 else path
     if path.ndim != 3 or path.shape[2] != 3 or len(path) == 0:
-        raise ValueError(f"the handle path must be (knot, handle, 3), found {path.shape}")
-    if path.shape[1] != len(held):
-        raise ValueError(f"the path has {path.shape[1]} handles, the sheet is held at {held}")
+        raise ValueError(f"the gripper path must be (knot, gripper, 3), found {path.shape}")
+    if path.shape[1] != len(pinned):
+        raise ValueError(f"the path has {path.shape[1]} grippers, the sheet is pinned at {pinned}")
     if not np.isfinite(path).all():
-        raise ValueError("the handle path must be finite [m]")
+        raise ValueError("the gripper path must be finite [m]")
     return path
 
 

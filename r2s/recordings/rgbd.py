@@ -161,20 +161,21 @@ def write_rig(folder: Path | str, rig: Rig) -> None:
 def rgbd_recording(
     folder: Path | str,
     info: RecordingInfo,
-    handle_path: Any,
-    handle_times: Any,
+    gripper_path: Any,
+    gripper_times: Any,
     *,
     rig: Rig | None = None,
     **measured: Any,
 ) -> Recording:
     """The recording in a folder of RGB-D images.
 
-    `info.time_offset` is added to the cameras' times. `handle_path`, `handle_times` and `measured`
-    (force, markers) are as in `make_recording`. Raises as `stream` and `make_recording` do.
+    `info.time_offset` is added to the cameras' times. `gripper_path`, `gripper_times` and
+    `measured` (force, markers) are as in `make_recording`. Raises as `stream` and `make_recording`
+    do.
     """
     times, clouds = read_clouds(folder, rig or read_rig(folder))
     clock = times + info.time_offset
-    return make_recording(clouds, clock, handle_path, handle_times, info, **measured)
+    return make_recording(clouds, clock, gripper_path, gripper_times, info, **measured)
 
 
 def read_clouds(

@@ -9,9 +9,9 @@
 """
 
 from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
-from r2s.scenarios.resolution import explicit_cloth, material_points
+from r2s.scenarios.resolution import explicit_cloth, mpm_cloth
 from r2s.scenarios.standard import (
-    SIX,
+    SCENARIOS,
     Experiment,
     fling,
     folding,
@@ -24,7 +24,7 @@ from r2s.scenarios.standard import (
 )
 
 __all__ = [
-    "SIX",
+    "SCENARIOS",
     "EnergyBalance",
     "Experiment",
     "energy_balance",
@@ -33,7 +33,7 @@ __all__ = [
     "fling",
     "folding",
     "lifting",
-    "material_points",
+    "mpm_cloth",
     "shaking",
     "stretching",
     "swing",

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from r2s._util.units import GRAVITY
 from r2s.environment.air import drag_on_vertices
 from r2s.environment.scene import Control
 from r2s.materials.fabric import Fabric
@@ -16,6 +15,7 @@ from r2s.mesh.mesh import Mesh
 from r2s.mesh.strain_samples import on_samples
 from r2s.mesh.surface import vertex_masses
 from r2s.scenarios.scenario import Scenario, SheetSolver, as_cut, begin, stepped
+from r2s.solvers.simulate import grouped
 
 Energies = Float[Array, " frame"]
 
@@ -24,7 +24,7 @@ class EnergyBalance(eqx.Module):
     """A motion with its forces [N], and its energies at every frame, [J].
 
     - `x`: positions, [m].
-    - `forces`: of the grippers on each held vertex, mean since the frame before. `last`: the same
+    - `forces`: of the grippers on each pinned vertex, mean since the frame before. `last`: the same
       at the frame itself, at the end of the last step.
     - `stored`: in membrane and bending; `kinetic`; `potential`: of gravity, above z = 0.
     - `grippers`, `air`: their work on the sheet since the first frame.
@@ -33,8 +33,8 @@ class EnergyBalance(eqx.Module):
     """
 
     x: Float[Array, "frame vertex 3"]
-    forces: Float[Array, "frame handle 3"]
-    last: Float[Array, "frame handle 3"]
+    forces: Float[Array, "frame gripper 3"]
+    last: Float[Array, "frame gripper 3"]
     stored: Energies
     kinetic: Energies
     potential: Energies
@@ -60,14 +60,14 @@ def energy_balance(
     """
     solver, substeps = stepped(scenario, max_step, solver)
     fabric = as_cut(scenario, fabric)
-    mesh, held = scenario.scene.mesh, scenario.scene.held
+    mesh, pinned = scenario.scene.mesh, scenario.scene.pinned
 
     def step(carried: Any, control: Control):
         state, before = carried
         after, forces = solver.step_with_forces(fabric, state, control)
         moved = after.x - state.x
         drag = _drag(scenario, state, after, control)
-        work = jnp.sum((before + forces) / 2 * moved[held]), jnp.sum(drag * moved)
+        work = jnp.sum((before + forces) / 2 * moved[pinned]), jnp.sum(drag * moved)
         return (after, forces), (forces, *work)
 
     def frame(carried: Any, control: Control):
@@ -75,8 +75,9 @@ def energy_balance(
         mean = jnp.mean(forces, axis=0)
         return (state, last), (state.x, state.v, mean, last, *(jnp.sum(part) for part in work))
 
-    start = begin(solver, scenario), jnp.zeros((len(held), 3), float)
-    _, (x, v, forces, last, grippers, air) = jax.lax.scan(frame, start, scenario.controls(substeps))
+    start = begin(solver, scenario), jnp.zeros((len(pinned), 3), float)
+    control = grouped(scenario.controls(substeps), substeps)
+    _, (x, v, forces, last, grippers, air) = jax.lax.scan(frame, start, control)
     first = scenario.lead_in - 1
 
     def since(work):
@@ -90,7 +91,7 @@ def energy_balance(
         last=last[first:],
         stored=jax.vmap(lambda x: stored_energy(mesh, fabric, x))(x),
         kinetic=jnp.sum(mass[None] * jnp.sum(v**2, axis=2), axis=1) / 2,
-        potential=GRAVITY * jnp.sum(mass[None] * x[..., 2], axis=1),
+        potential=scenario.scene.gravity * jnp.sum(mass[None] * x[..., 2], axis=1),
         grippers=since(grippers),
         air=since(air),
     )
@@ -99,11 +100,11 @@ def energy_balance(
 def clamp_force(scenario: Scenario, found: EnergyBalance) -> Float[Array, "frame 3"]:
     """The force [N] on the pulled clamp of a stretching at its frames, as a load cell shows it.
 
-    Not the mean since the frame before, which lags by half a frame. The clamp is the held vertices
-    at the end of the warp.
+    Not the mean since the frame before, which lags by half a frame. The clamp is the pinned
+    vertices at the end of the warp.
     """
-    mesh, held = scenario.scene.mesh, scenario.scene.held
-    pulled = mesh.rest[held, 0] > jnp.max(mesh.rest[:, 0]) / 2
+    mesh, pinned = scenario.scene.mesh, scenario.scene.pinned
+    pulled = mesh.rest[pinned, 0] > jnp.max(mesh.rest[:, 0]) / 2
     return jnp.sum(jnp.where(pulled[None, :, None], found.last, 0), axis=1)
 
 

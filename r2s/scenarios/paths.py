@@ -69,7 +69,7 @@ def lift_path(
     inward: float = 0.15,
     moving: float = 2.5,
 ) -> Route:
-    """The held corner goes up by `height` and towards the opposite one by `inward` [m].
+    """The pinned corner goes up by `height` and towards the opposite one by `inward` [m].
 
     It moves for `moving` of `duration` [s].
 
@@ -81,7 +81,7 @@ def lift_path(
     not_negative("m", height=height, inward=inward)
     positive("s", moving=moving)
     _ends(duration, "moving", moving)
-    here, there = _corner(sheet), corner(sheet, OPPOSITE[sheet.held[0]])
+    here, there = _corner(sheet), corner(sheet, OPPOSITE[sheet.pinned[0]])
     away = inward * _unit(there - here) + height * UP
     return _route(duration, lambda t: here + ease(t / moving)[:, None] * away)
 
@@ -93,7 +93,7 @@ def fold_path(
     height: float = 0.3,
     moving: float = 2.5,
 ) -> Route:
-    """The held corner goes over to the opposite one, on half an ellipse, in `moving` [s].
+    """The pinned corner goes over to the opposite one, on half an ellipse, in `moving` [s].
 
     It ends after the fraction `reach` [-] of the way; `height` [-] is the ellipse's over that way.
     """
@@ -101,7 +101,7 @@ def fold_path(
     not_negative("-", height=height)
     positive("s", moving=moving)
     _ends(duration, "moving", moving)
-    here, there = _corner(sheet), corner(sheet, OPPOSITE[sheet.held[0]])
+    here, there = _corner(sheet), corner(sheet, OPPOSITE[sheet.pinned[0]])
     across = reach * (there - here)
     up = height * float(np.linalg.norm(across)) * UP
 
@@ -119,13 +119,13 @@ def pull_path(
 ) -> Route:
     """Two clamps from corner to corner: that at the warp's end is pulled in `moving` [s].
 
-    By `strain` [-] times the sheet's length. The grippers are the held corners.
+    By `strain` [-] times the sheet's length. The grippers are the pinned corners.
     """
     not_negative("-", strain=strain)
     positive("s", moving=moving)
     _ends(duration, "moving", moving)
-    corners = np.array([corner(sheet, name) for name in sheet.held])
-    pulled = np.array([name in ("warp", "opposite") for name in sheet.held], float)
+    corners = np.array([corner(sheet, name) for name in sheet.pinned])
+    pulled = np.array([name in ("warp", "opposite") for name in sheet.pinned], float)
     away = strain * sheet.size[0] * np.outer(pulled, sheet.warp)
     return _route(duration, lambda t: corners + ease(t / moving)[:, None, None] * away)
 
@@ -205,7 +205,7 @@ def swing_path(
     not_negative("m", sway=sway)
     not_negative("degrees", turn=turn)
     _check_frequency(frequency)
-    ends = np.array([corner(sheet, name) for name in sheet.held])
+    ends = np.array([corner(sheet, name) for name in sheet.pinned])
     middle = ends.mean(axis=0)
 
     def at(t):
@@ -247,16 +247,16 @@ def _route(duration: float, at: Callable[[np.ndarray], np.ndarray]) -> Route:
 
 
 def _corner(sheet: SheetPlacement) -> Float[np.ndarray, "3"]:
-    if len(sheet.held) != 1:
-        raise ValueError(f"this path is of one gripper, the sheet is held at {sheet.held}")
-    return corner(sheet, sheet.held[0])
+    if len(sheet.pinned) != 1:
+        raise ValueError(f"this path is of one gripper, the sheet is held at {sheet.pinned}")
+    return corner(sheet, sheet.pinned[0])
 
 
 def _drawn_together(sheet: SheetPlacement, gap: float) -> Float[np.ndarray, "2 3"]:
-    if len(sheet.held) != 2:
-        raise ValueError(f"this path is of two grippers, the sheet is held at {sheet.held}")
+    if len(sheet.pinned) != 2:
+        raise ValueError(f"this path is of two grippers, the sheet is held at {sheet.pinned}")
     _share("gap", gap)
-    corners = np.array([corner(sheet, name) for name in sheet.held])
+    corners = np.array([corner(sheet, name) for name in sheet.pinned])
     middle = corners.mean(axis=0)
     return middle + gap * (corners - middle)
 

@@ -1,10 +1,10 @@
 """Which mesh, step and grid are fine enough for a fabric and a motion.
 
 The error of a mesh depends on the length of its cells over the fabric's bending length
-(`r2s.fold_length`). `TABLE` is measured (`experiments/mesh_error.py`, sheets of 0.45 m): geometric
-means over five fabrics of the distance from 33 x 33 vertices, and for the error of these the share
-that the power `ORDER` leaves. Logarithms are interpolated; beyond the table the error is that power
-of the cells' length.
+(`r2s.bending_length`). `TABLE` is measured (`experiments/mesh_error.py`, sheets of 0.45 m):
+geometric means over five fabrics of the distance from 33 x 33 vertices, and for the error of these
+the share that the power `ORDER` leaves. Logarithms are interpolated; beyond the table the error is
+that power of the cells' length.
 """
 
 import math
@@ -12,12 +12,12 @@ import math
 import numpy as np
 
 from r2s.compilation import compile_once
-from r2s.materials.fabric import Fabric, fold_length
+from r2s.materials.fabric import Fabric, bending_length
 from r2s.scenarios.scenario import Scenario
 from r2s.scenarios.standard import SIDE
 from r2s.solvers.explicit.cloth import ExplicitCloth
 from r2s.solvers.mpm.grid import Grid
-from r2s.solvers.mpm.sheet import Sheet, longest_edge, stable_step
+from r2s.solvers.mpm.sheet import MPMCloth, longest_edge, stable_step
 
 Shape = tuple[int, int]
 
@@ -36,7 +36,7 @@ ORDER = 1.0  # of the error in the cells' length, where it is not measured
 ENOUGH = 6e-3  # [m], error of a mesh that is fine enough, of sheets of the study's size: a choice
 LADDER = (9, 17, 33)  # vertices along the longer side
 
-_fold_length = compile_once(fold_length)  # the derivatives in it take seconds one by one
+_bending_length = compile_once(bending_length)  # the derivatives in it take seconds one by one
 
 
 def mesh_error(fabric: Fabric, size: tuple[float, float], shape: Shape, motion: str) -> float:
@@ -51,7 +51,7 @@ def mesh_error(fabric: Fabric, size: tuple[float, float], shape: Shape, motion: 
     motion = SAME.get(motion, motion)
     if motion in TAUT:
         return math.nan
-    cell, length = longest_cell(size, shape), float(_fold_length(fabric))
+    cell, length = longest_cell(size, shape), float(_bending_length(fabric))
     if not length:
         return math.inf
     ratio = cell / length
@@ -110,7 +110,7 @@ def warning(fabric: Fabric, size: tuple[float, float], shape: Shape, motion: str
         return ""
     return (
         f"a mesh of {shape[0]} x {shape[1]} is coarse for this fabric: it folds at "
-        f"{1e3 * float(_fold_length(fabric)):.0f} mm, the cells are "
+        f"{1e3 * float(_bending_length(fabric)):.0f} mm, the cells are "
         f"{1e3 * longest_cell(size, shape):.0f} mm long, so that a motion is expected to be "
         f"{1e3 * error:.0f} mm off ({advice(fabric, size, shape, motion)})"
     )
@@ -123,7 +123,7 @@ def advice(fabric: Fabric, size: tuple[float, float], shape: Shape, motion: str)
     return f"try {finer[0]} x {finer[1]}" if is_finer else "the finest that was measured, or finer"
 
 
-# [s]: a held vertex goes straight in a step. At 10 m/s^2 its path is off by 0.09 mm in the middle.
+# [s]: a pinned vertex goes straight in a step. At 10 m/s^2 that is off by 0.09 mm in the middle.
 MAX_EXPLICIT_STEP = 1 / 120
 MEMBRANE_DAMPING = 1e-4  # [s]: what is longer costs ten times as many steps, and shows in no motion
 EDGE = 1.5  # longest edge of the mesh over the grid's spacing
@@ -138,11 +138,11 @@ def explicit_cloth(
     """A solver in explicit steps for a scenario: `rollout(scenario, fabric, solver=...)`.
 
     `fabric` is the stiffest that it will be used for, or a batch of all of them; `membrane_damping`
-    [s] as in `r2s.ExplicitCloth.make`. Steps of at most `MAX_EXPLICIT_STEP` fill the time between
+    [s] as in `r2s.ExplicitCloth`. Steps of at most `MAX_EXPLICIT_STEP` fill the time between
     frames. Raises `ValueError` for a scenario with self-contact.
     """
     steps = max(scenario.substeps, math.ceil(scenario.interval / MAX_EXPLICIT_STEP - 1e-9))
-    return ExplicitCloth.make(
+    return ExplicitCloth(
         scenario.scene,
         scenario.interval / steps,
         fabric,
@@ -151,16 +151,16 @@ def explicit_cloth(
     )
 
 
-def material_points(
+def mpm_cloth(
     scenario: Scenario,
     fabric: Fabric,
     spacing: float | None = None,
     membrane_damping: float | None = MEMBRANE_DAMPING,
-) -> Sheet:
+) -> MPMCloth:
     """A solver of material points for a scenario: `rollout(scenario, fabric, solver=...)`.
 
     `fabric` is the stiffest that it will be used for. The grid's `spacing` [m] is by default the
-    mesh's longest edge over `EDGE`; `membrane_damping` [s] as in `r2s.solvers.mpm.Sheet`. Raises
+    mesh's longest edge over `EDGE`; `membrane_damping` [s] as in `r2s.MPMCloth`. Raises
     `ValueError` when the mesh is too coarse for the grid, or the scenario has self-contact.
     """
     if scenario.self_contact:
@@ -173,7 +173,8 @@ def material_points(
     substeps = max(scenario.substeps, math.ceil(scenario.interval / limit))
     # the limit is in float32, and a step must not be above it by a rounding
     dt = scenario.interval / (substeps + 1)
-    return Sheet.make(scenario.scene, grid_around(scenario, spacing), fabric, dt, membrane_damping)
+    grid = grid_around(scenario, spacing)
+    return MPMCloth(scenario.scene, dt, fabric, grid, membrane_damping)
 
 
 def grid_around(scenario: Scenario, spacing: float) -> Grid:
@@ -182,11 +183,11 @@ def grid_around(scenario: Scenario, spacing: float) -> Grid:
     No vertex is farther from the nearest gripper than `STRETCHED` times the way in the sheet.
     """
     path, start = np.asarray(scenario.path), np.asarray(scenario.start)
-    rest, held = np.asarray(scenario.scene.mesh.rest), np.asarray(scenario.scene.held)
-    away = np.linalg.norm(rest[:, None] - rest[held][None], axis=2)
+    rest, pinned = np.asarray(scenario.scene.mesh.rest), np.asarray(scenario.scene.pinned)
+    away = np.linalg.norm(rest[:, None] - rest[pinned][None], axis=2)
     reach = STRETCHED * away.min(axis=1, initial=np.inf).max()
-    if not len(held):
-        raise ValueError("a grid can't be chosen for a sheet that nothing holds: make the Sheet")
+    if not len(pinned):
+        raise ValueError("a grid can't be chosen for a sheet that nothing holds: make the MPMCloth")
     lower = np.minimum(path.min(axis=(0, 1)) - reach, start.min(axis=0))
     upper = np.maximum(path.max(axis=(0, 1)) + reach, start.max(axis=0))
     lower[2] = max(lower[2], float(scenario.scene.table.height))

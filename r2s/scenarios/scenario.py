@@ -12,16 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from r2s.environment.air import Air, Fan
-from r2s.environment.contact import Table
+from r2s._util.arrays import is_traced
+from r2s.environment.air import Fan
 from r2s.environment.scene import Control, Scene, along_path
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import TurnedMembrane
 from r2s.mesh.mesh import Mesh, corner, rectangle
 from r2s.mesh.mesh import resized as resized_mesh
 from r2s.recordings.recording import Recording, SheetPlacement
-from r2s.solvers.implicit.cloth import Cloth, prepare_mesh
-from r2s.solvers.simulate import Solver, Trajectory, simulate
+from r2s.solvers.implicit.cloth import MAX_ITERATIONS, ImplicitCloth, prepare_mesh
+from r2s.solvers.simulate import Solution, Solver, simulate
 
 CLEARANCE = 1e-3  # [m], between the table and a sheet that lies on it
 LEAD_IN = 0.5  # [s], in which the grippers go from the sheet at rest to where their path begins
@@ -40,13 +40,13 @@ CLAMPED = {"stretching": CLAMPS, "swing": BAR}  # sides that are held in a scena
 
 
 class SheetSolver(Solver, Protocol):
-    """A solver of a held sheet: Cloth, ExplicitCloth and Sheet."""
+    """A solver of a held sheet: ImplicitCloth, ExplicitCloth and MPMCloth."""
 
     def init(self, x: Array, v: Array | None = None, acceleration: Array | None = None) -> Any:
         """The state at positions [m], velocities [m/s] and accelerations [m/s^2]; None: zero."""
 
     def step_with_forces(self, fabric: Fabric, state: Any, control: Control) -> tuple[Any, Array]:
-        """The state `dt` later, and the mean forces [N] on the held vertices, weight included."""
+        """The state `dt` later, and the mean forces [N] on the pinned vertices, weight included."""
         ...
 
 
@@ -84,9 +84,9 @@ class Scenario(eqx.Module):
     """An experiment, for any fabric. Its arrays are traced: one compilation serves all recordings
     of as many frames and knots.
 
-    - `scene`: sheet, table, air, fan, held vertices.
+    - `scene`: sheet, table, air, fan, pinned vertices.
     - `start`: positions at rest, [m].
-    - `path`, `path_times`: of the held vertices, [m] and [s].
+    - `path`, `path_times`: of the pinned vertices, [m] and [s].
     - `first_time`: of the first frame, [s].
     - `interval`: between frames, [s].
     - `num_frames`, `lead_in`: frames that count from the first, and frames simulated before it.
@@ -101,7 +101,7 @@ class Scenario(eqx.Module):
 
     scene: Scene
     start: Float[Array, "vertex 3"]
-    path: Float[Array, "knot handle 3"]
+    path: Float[Array, "knot gripper 3"]
     path_times: Float[Array, " knot"]
     first_time: Float[Array, ""]
     interval: float = eqx.field(static=True)
@@ -121,24 +121,20 @@ class Scenario(eqx.Module):
             self.layout = Layout(self.scene.mesh)
 
     def controls(self, substeps: int) -> Control:
-        """What grippers and air do at the end of every substep, axes (frame, substep)."""
+        """What grippers and air do at the end of every step, of `substeps` between frames."""
         frames = self.num_frames + self.lead_in - 1  # the first state needs no step
         steps = jnp.arange(1, frames * substeps + 1) / substeps - self.lead_in
         times = self.first_time + self.interval * steps.astype(float)
-        handles = along_path(times, self.path_times, self.path)
-        wind = jnp.zeros((frames * substeps, 3), float)
-        if self.wind is not None and self.wind_times is not None:
-            wind = along_path(times, self.wind_times, self.wind[:, None])[:, 0]
-        return Control(
-            handles.reshape(frames, substeps, *self.path.shape[1:]),
-            wind.reshape(frames, substeps, 3),
-        )
+        path = along_path(times, self.path_times, self.path)
+        if self.wind is None or self.wind_times is None:
+            return Control(path)
+        return Control(path, along_path(times, self.wind_times, self.wind[:, None])[:, 0])
 
 
 def from_placement(
     sheet: SheetPlacement,
     table_height: float,
-    path: Float[Array, "knot handle 3"],
+    path: Float[Array, "knot gripper 3"],
     path_times: Float[Array, " knot"],
     times: Float[np.ndarray, " frame"],
     shape: tuple[int, int] = (9, 9),
@@ -152,7 +148,7 @@ def from_placement(
 
     - `path` [m], `path_times` [s]: of the grippers. `times`: of the frames, [s].
     - `shape`, `elements`: of the mesh (`r2s.mesh.mesh.rectangle`).
-    - `clamps`: pairs of held corners: all of the side between them is held, straight and evenly
+    - `clamps`: pairs of pinned corners: all of the side between them is held, straight and evenly
       spread.
     - `wind`: of a fan in front of the sheet's middle, which starts with the first frame, [m/s].
     - `self_contact`: the sheet does not pass through itself.
@@ -172,16 +168,16 @@ def from_placement(
         bowed = np.sin(np.pi * np.asarray(mesh.rest) / np.asarray(sheet.size)).prod(axis=1)
         start = start + BOW * bowed[:, None] * normal
     start[:, 2] = np.maximum(start[:, 2], table_height + CLEARANCE)
-    held, shares = _grip(sheet, shape, clamps)
+    pinned, shares = _grip(sheet, shape, clamps)
     path = path if not clamps else jnp.einsum("vh,khi->kvi", jnp.asarray(shares, float), path)
     lead_in = math.ceil((SETTLING if hangs else LEAD_IN) / interval)
     begin = min(times[0], float(path_times[0]))
     knots = jnp.asarray([begin - lead_in * interval, begin - lead_in * interval / 2], float)
-    at_rest = jnp.asarray(start[held], float)
+    at_rest = jnp.asarray(start[pinned], float)
     wind = wind if wind is not None and any(wind) else None
     rising, rising_times = (None, None) if wind is None else _gust(wind, float(times[0]))
     fan = None if wind is None else _fan(sheet, wind)
-    scene = Scene(mesh, jnp.asarray(held), Table.make(table_height), Air.make(), fan)
+    scene = Scene(mesh, pinned, table_height, fan=fan)
     return Scenario(
         scene=scene,
         start=jnp.asarray(start, float),
@@ -214,9 +210,9 @@ def _interval(times: Float[np.ndarray, " frame"]) -> float:
 def _grip(
     sheet: SheetPlacement, shape: tuple[int, int], clamps: tuple[tuple[str, str], ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The held vertices, and the share of each handle in the place of each (vertex, handle)."""
-    each = np.eye(len(sheet.held))
-    corners = [corner(shape, name) for name in sheet.held]
+    """The pinned vertices, and the share of each gripper in the place of each (vertex, gripper)."""
+    each = np.eye(len(sheet.pinned))
+    corners = [corner(shape, name) for name in sheet.pinned]
     shares = dict(zip(corners, each, strict=True))
     for pair in clamps:
         first, last = (corner(shape, name) for name in pair)
@@ -244,7 +240,7 @@ def _gust(wind: tuple[float, float, float], begin: float):
 def steps_between(
     interval: float,
     mesh: Mesh,
-    path: Float[np.ndarray, "knot handle 3"],
+    path: Float[np.ndarray, "knot gripper 3"],
     path_times: Float[np.ndarray, " knot"],
 ) -> int:
     """How many steps to make in an interval [s]: the least such that none is above `MAX_STEP`, and
@@ -261,14 +257,14 @@ def steps_between(
 def from_recording(recording: Recording, shape: tuple[int, int] = (9, 9)) -> Scenario:
     """The scenario of a recording: its sheet, table, gripper path, wind and frame times.
 
-    A "stretching" has the sides between the held corners clamped, a "swing" the one along the bar.
+    A "stretching" has the sides between its corners clamped, a "swing" the one along the bar.
     """
     info = recording.info
     scenario = from_placement(
         info.sheet,
         info.table_height,
-        recording.handle_path,
-        recording.handle_times,
+        recording.gripper_path,
+        recording.gripper_times,
         np.asarray(recording.times),
         shape,
         clamps=CLAMPED.get(info.scenario, ()),
@@ -292,16 +288,16 @@ def as_cut(scenario: Scenario, fabric: Fabric) -> Fabric:
 def resized(scenario: Scenario, ratio: Float[Array, ""]) -> Scenario:
     """The scenario of a sheet `ratio` times as long and as wide, held where it is.
 
-    Its held vertices stay where they were if there is one of them; several move apart at first.
+    Its pinned vertices stay where they were if there is one of them; several move apart at first.
     """
-    held = scenario.start[scenario.scene.held]
-    fixed = jnp.mean(held, axis=0, keepdims=True)
+    pinned = scenario.start[scenario.scene.pinned]
+    fixed = jnp.mean(pinned, axis=0, keepdims=True)
 
     def grown(places: Float[Array, "place 3"]) -> Float[Array, "place 3"]:
         return fixed + ratio * (places - fixed)
 
     scene = dataclasses.replace(scenario.scene, mesh=resized_mesh(scenario.scene.mesh, ratio))
-    path = scenario.path.at[0].set(grown(held))
+    path = scenario.path.at[0].set(grown(pinned))
     return dataclasses.replace(scenario, scene=scene, start=grown(scenario.start), path=path)
 
 
@@ -318,19 +314,34 @@ def rollout(
     max_step: float | None = None,
     solver: SheetSolver | None = None,
     frames: Int[Array, ""] | int | None = None,
-) -> Trajectory:
-    """How a fabric moves in a scenario: positions [m] at its frames, or at the first of them.
+) -> Solution:
+    """How a fabric moves in a scenario, at its frames; times are those of the frames.
 
-    By the cloth, in the scenario's steps, or in so many that none is above `max_step` [s]. Or by
-    another `solver` of the same scene, whose step divides the time between frames, such as
-    `r2s.scenarios.material_points`. For `frames` see `r2s.simulate`.
+    By the implicit cloth, in the scenario's steps, or in so many that none is above `max_step` [s].
+    Or by another `solver` of the same scene, whose step divides the time between frames, such as
+    `r2s.scenarios.mpm_cloth`. `frames`: how many are simulated, which may be traced; the
+    others repeat the last.
     """
     solver, substeps = stepped(scenario, max_step, solver)
     skipped = scenario.lead_in - 1
-    start, controls = begin(solver, scenario), scenario.controls(substeps)
-    wanted = None if frames is None else frames + skipped
-    moved = simulate(solver, as_cut(scenario, fabric), start, controls, frames=wanted)
-    return moved.from_frame(skipped)
+    found = simulate(
+        solver,
+        as_cut(scenario, fabric),
+        begin(solver, scenario),
+        scenario.controls(substeps),
+        save_every=substeps,
+        saves=None if frames is None else frames + skipped,
+    )
+    before = scenario.lead_in * scenario.interval - scenario.first_time
+    return Solution(
+        found.x[skipped:],
+        found.v[skipped:],
+        found.times[skipped:] - before,
+        found.final_state,
+        found.ok[skipped:],
+        found.result,
+        found.failed_at - before,
+    )
 
 
 def stepped(
@@ -350,14 +361,21 @@ def stepped(
         dt = scenario.interval / substeps
         x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
         elimination, search = _prepared(scenario.layout, scenario.self_contact, x64)
-        solver = Cloth(scenario.scene, elimination, dt, search)
-        if scenario.brake is not None:
-            solver = dataclasses.replace(solver, max_iterations=ITERATIONS)
+        solver = ImplicitCloth(
+            scenario.scene,
+            dt,
+            self_contact=search,
+            max_iterations=MAX_ITERATIONS if scenario.brake is None else ITERATIONS,
+            elimination=elimination,
+        )
     else:
-        substeps = round(scenario.interval / solver.dt)
-        if abs(substeps * solver.dt - scenario.interval) > 1e-6 * scenario.interval:
+        if is_traced(solver.dt):
+            raise ValueError("make an implicit solver in the function that is traced: its step is")
+        dt = float(solver.dt)
+        substeps = round(scenario.interval / dt)
+        if abs(substeps * dt - scenario.interval) > 1e-6 * scenario.interval:
             raise ValueError(
-                f"steps must fill the {scenario.interval:g} s between frames, got {solver.dt:g} s"
+                f"steps must fill the {scenario.interval:g} s between frames, got {dt:g} s"
             )
     if scenario.brake is None:
         return solver, substeps
@@ -394,7 +412,7 @@ class BrakedState(eqx.Module):
 
     @property
     def failure(self) -> Int[Array, ""]:
-        """The first `r2s.solvers.failures.Failure` so far."""
+        """The first `r2s.solvers.results.Result` so far."""
         return self.inner.failure
 
 
@@ -404,7 +422,7 @@ class Braked(eqx.Module):
     solver: SheetSolver
     brake: Float[Array, ""]
     steps: int = eqx.field(static=True)
-    dt: float = eqx.field(static=True)
+    dt: Float[Array, ""]
 
     def check(self, fabric: Fabric) -> None:
         """Raises `ValueError` where the steps are too long for a fabric."""
@@ -427,8 +445,8 @@ class Braked(eqx.Module):
 
     def step_with_forces(
         self, fabric: Fabric, state: BrakedState, control: Control
-    ) -> tuple[BrakedState, Float[Array, "handle 3"]]:
-        """The state `dt` later, and the grippers' forces [N] on the held vertices."""
+    ) -> tuple[BrakedState, Float[Array, "pinned 3"]]:
+        """The state `dt` later, and the grippers' forces [N] on the pinned vertices."""
         braked = self._braked(fabric, state)
         inner, forces = self.solver.step_with_forces(braked, state.inner, control)
         return BrakedState(inner, state.count + 1), forces

@@ -41,7 +41,7 @@ class Experiment(NamedTuple):
     - `sheet`: where it is at rest, and which corners the grippers hold; `route`: their path.
     - `times`: of the frames, [s]. `frames_used`: the first and the last frame that count.
     - `wind`: of a fan in front of the sheet's middle, from the first frame on, [m/s]; None: none.
-    - `clamps`: pairs of held corners between which the whole side is held.
+    - `clamps`: pairs of pinned corners between which the whole side is held.
     - `table_height`: [m].
     """
 
@@ -78,7 +78,7 @@ class Experiment(NamedTuple):
 
 def lifting(
     size: Size = (SIDE, SIDE),
-    held: str = "origin",
+    pinned: str = "origin",
     *,
     route: Route | None = None,
     num_frames: int = NUM_FRAMES,
@@ -93,13 +93,13 @@ def lifting(
     >>> scenario.start.shape, scenario.num_frames
     ((25, 3), 60)
     """
-    done = _moved("lifting", on_table(size, (held,)), route, num_frames, interval, path)
+    done = _moved("lifting", on_table(size, (pinned,)), route, num_frames, interval, path)
     return done._replace(frames_used=(num_frames // 2, num_frames - 1))
 
 
 def folding(
     size: Size = (SIDE, SIDE),
-    held: str = "origin",
+    pinned: str = "origin",
     *,
     route: Route | None = None,
     num_frames: int = NUM_FRAMES,
@@ -107,7 +107,7 @@ def folding(
     **path: float,
 ) -> Experiment:
     """A sheet lies flat on the table; a corner is brought onto the opposite one: `fold_path`."""
-    return _moved("folding", on_table(size, (held,)), route, num_frames, interval, path)
+    return _moved("folding", on_table(size, (pinned,)), route, num_frames, interval, path)
 
 
 def stretching(
@@ -199,7 +199,7 @@ def swing(
     return _moved("swing", sheet, route, num_frames, interval, path)._replace(clamps=BAR)
 
 
-SIX: dict[str, Callable[..., Experiment]] = {
+SCENARIOS: dict[str, Callable[..., Experiment]] = {
     "lifting": lifting,
     "wind": wind,
     "stretching": stretching,
@@ -217,20 +217,20 @@ def varied(
     The study has `ESTIMATION` of each to estimate from and `EVALUATION` to judge by:
     split a key, so that they differ.
     """
-    return [SIX[name](size, **numbers) for numbers in draw(name, number, key=key)]
+    return [SCENARIOS[name](size, **numbers) for numbers in draw(name, number, key=key)]
 
 
-def on_table(size: Size, held: tuple[str, ...], height: float = CLEARANCE) -> SheetPlacement:
+def on_table(size: Size, pinned: tuple[str, ...], height: float = CLEARANCE) -> SheetPlacement:
     """A sheet of `size` [m], horizontal at a `height` [m], warp along x and weft along y."""
     not_negative("m", height=height)
-    return SheetPlacement(size, (0.0, 0.0, height), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), held)
+    return SheetPlacement(size, (0.0, 0.0, height), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), pinned)
 
 
 def hanging(size: Size, height: float) -> SheetPlacement:
     """A sheet of `size` [m], vertical, held by the ends of its warp at a `height` [m], along x."""
     positive("m", height=height)
-    held = ("origin", "warp")
-    return SheetPlacement(size, (0.0, 0.0, height), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), held)
+    pinned = ("origin", "warp")
+    return SheetPlacement(size, (0.0, 0.0, height), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), pinned)
 
 
 _PATHS: dict[str, Callable[..., Route]] = {

@@ -24,7 +24,7 @@ from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
 from r2s.scenarios.scenario import Scenario, SheetSolver, rollout
 from r2s.scenarios.standard import SIDE, Experiment
 from r2s.solvers.mpm.sheet import longest_edge
-from r2s.solvers.simulate import Trajectory
+from r2s.solvers.simulate import Solution
 
 SPACING = SIDE * math.sqrt(2) / 80  # [m], between samples of the surface
 POINTS = 2000  # a frame
@@ -90,7 +90,7 @@ def record(
     max_step: float | None = None,
     self_contact: bool = False,
     solver: Callable[[Scenario, Fabric], SheetSolver] | None = None,
-    motion: Trajectory | None = None,
+    motion: Solution | None = None,
     key: PRNGKeyArray,
 ) -> Recording:
     """Record a simulated experiment with a fabric; the same `key` gives the same recording.
@@ -99,7 +99,7 @@ def record(
     - `seen`: cameras and their errors; None: those of `sensing`.
     - `shape`: vertices along warp and weft. `max_step`: longest time step, [s].
     - `self_contact`: whether the sheet touches itself.
-    - `solver`: makes another solver than the cloth, such as `r2s.scenarios.material_points`.
+    - `solver`: makes another solver than the cloth, such as `r2s.scenarios.mpm_cloth`.
     - `motion`: that of these arguments, if known; a stretching, which also has markers and the
       force on the pulled clamp, is simulated in any case.
 

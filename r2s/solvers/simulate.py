@@ -6,13 +6,14 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s._util.arrays import is_traced
 from r2s._util.threads import planned
 from r2s.environment.scene import Control
-from r2s.solvers.failures import Failure, describe, first_failure, no_failure
 from r2s.solvers.implicit.newton import SAVED
+from r2s.solvers.results import Result, describe, first_failure, no_failure
 
 State = TypeVar("State")
 
@@ -22,10 +23,10 @@ class Solver(Protocol[State]):
     """What `simulate` and the estimators ask of a solver.
 
     Its fabric is an `r2s.Fabric`, or what else its bodies are made of. A state has positions `x`
-    [m] and a `failure` (`r2s.Failure`).
+    [m], velocities `v` [m/s] and a `failure`, the first `Result` of the run that is no success.
     """
 
-    dt: float  # [s]
+    dt: Any  # [s], a number or an array without axes
 
     def step(self, fabric: Any, state: State, control: Control, /) -> State:
         """The state `dt` later."""
@@ -52,110 +53,175 @@ def predicted_memory(function: Callable, *args) -> int:
     return planned(run.lower(arrays).compile())
 
 
-class Trajectory(eqx.Module):
-    """A motion, and whether and where it failed. Under `jax.vmap` every field has a batch axis.
+class Solution(eqx.Module):
+    """A motion, where it ended, and whether it failed. Under `jax.vmap` all fields have a batch
+    axis.
 
-    - `x`: positions at the end of every frame, [m].
-    - `ok`: whether they are finite and nothing failed; False from the frame on in which a run did.
-    - `failure`: why, an `r2s.solvers.failures.Failure`; 0: it did not fail.
-    - `failed_frame`, `failed_step`: the frame, and the step in it, of the first failure; -1: none.
+    - `x`, `v`: positions [m] and velocities [m/s] at the `times` [s] that are saved.
+    - `final_state`: after the last step; `simulate` goes on from it.
+    - `ok`: of each saved time, whether all is finite and nothing has failed so far.
+    - `result`: a `Result`; `Result.SUCCESS` is 0.
+    - `failed_at`: the time [s] at the end of the step that failed first; NaN: none did.
     """
 
-    x: Float[Array, "frame vertex axis"]
-    ok: Bool[Array, " frame"]
-    failure: Int[Array, ""]
-    failed_frame: Int[Array, ""]
-    failed_step: Int[Array, ""]
-
-    def from_frame(self, first: int) -> "Trajectory":
-        """The motion from a frame on, which becomes frame 0. A failure before it has a negative
-        frame.
-        """
-        frame = jnp.where(self.failure == 0, -1, self.failed_frame - first)
-        return Trajectory(self.x[first:], self.ok[first:], self.failure, frame, self.failed_step)
+    x: Float[Array, "save vertex axis"]
+    v: Float[Array, "save vertex axis"]
+    times: Float[Array, " save"]
+    final_state: Any
+    ok: Bool[Array, " save"]
+    result: Int[Array, ""]
+    failed_at: Float[Array, ""]
 
     def explain(self) -> str:
-        """One sentence: what failed, in which frame and step; empty when nothing did.
+        """One sentence: what failed, and when; empty when nothing did.
 
         It is that of one run; of a batch, pick a member first. Raises `ValueError` for a batch.
         """
-        if self.failure.ndim:
-            raise ValueError(f"expected one run, got a batch of shape {self.failure.shape}")
-        if not int(self.failure):
+        if self.result.ndim:
+            raise ValueError(f"expected one run, got a batch of shape {self.result.shape}")
+        if not int(self.result):
             return ""
-        frame, step = int(self.failed_frame), int(self.failed_step)
-        where = f"frame {frame}" if frame >= 0 else f"{-frame} frames before the first one"
-        return f"failed in {where}, step {step}: {describe(int(self.failure))}"
+        time = float(self.failed_at)  # of a scenario the first frame is at 0
+        when = f"at {time:.4g} s" if time >= 0 else f"{-time:.4g} s before the first frame"
+        return f"failed {when}: {describe(int(self.result))}"
 
 
 def simulate(
     solver: Solver[State],
     fabric: Any,
-    start: State,
-    controls: Control,
+    state: State,
+    control: Control,
+    *,
+    save_every: int | None = None,
+    save_at: Float[Array, " save"] | None = None,
     keep_solutions: bool = True,
-    frames: Int[Array, ""] | int | None = None,
-) -> Trajectory:
-    """The motion under `controls`, whose leading axes are (frame, substep).
+    saves: Int[Array, ""] | int | None = None,
+) -> Solution:
+    """The motion from a state under a control of every step.
 
-    `frames`: how many are simulated, which may be traced; the others repeat the last. None: all.
+    - `control`: with a leading axis of steps; a `wind` without one stays.
+    - `save_every`: steps between saved times; the first is at the end of so many. By default 1.
+    - `save_at`: times [s] since `state`, instead: cubic in between by the positions and velocities
+      at both ends of a step.
+    - `keep_solutions`: reverse mode keeps one state a saved time, and of every step its solution.
+      Without, it keeps the states alone and solves the steps between two of them again: the time
+      of one more forward run, for the memory of about saves + steps between them.
+    - `saves`: how many saved times are simulated, which may be traced; the others repeat the last.
+
     Raises `ValueError` for a fabric that is too stiff for the solver's steps (`Solver.check`); a
-    run with a traced one fails in its first step (`Failure.TIME_STEP`).
-
-    Reverse mode keeps one state a frame, and of every step its solution. Without `keep_solutions`
-    it keeps the states of the frames alone and solves the steps of one frame at a time again: the
-    time of one more forward run, for the memory of about frames + substeps states.
+    run with a traced one fails in its first step (`Result.TIME_STEP`). And for steps that
+    `save_every` does not divide, and times beyond the last step.
     """
     if not is_traced(solver, fabric):
         solver.check(fabric)
-    names = (SAVED,) if keep_solutions else ()
-    policy = jax.checkpoint_policies.save_only_these_names(*names)
+    every = save_every or 1
+    groups = grouped(control, every)
+    if save_at is not None:
+        _check_times(save_every, save_at, control.pinned.shape[0], solver.dt)
+    end, x, v, failures = _run(solver, fabric, state, groups, keep_solutions, saves)
+    # once, and not in every step
+    failures = jnp.where(solver.fits(fabric), failures, Result.TIME_STEP.value)
+    unfailed = jnp.cumprod(jnp.all(failures == Result.SUCCESS.value, axis=1)).astype(bool)
+    dt = jnp.asarray(solver.dt, x.dtype)
+    times = jnp.arange(1, len(x) + 1, dtype=x.dtype) * every * dt
+    if save_at is not None:
+        times = jnp.asarray(save_at, x.dtype)
+        x, v, unfailed = _at(times / dt, state, x, v, unfailed, dt)
+    ok = jnp.all(jnp.isfinite(x), axis=(1, 2)) & unfailed
+    result, failed_at = _first(failures.ravel(), dt)
+    return Solution(x, v, times, end, ok, result, failed_at)
 
-    def substep(state, control):
+
+def _run(solver, fabric, state, control, keep_solutions: bool, saves):
+    """The state at the end, positions and velocities after every group of steps, and the failures
+    (group, step) of all steps."""
+    policy = jax.checkpoint_policies.save_only_these_names(*(SAVED,) * keep_solutions)
+
+    def step(state, control):
         state = solver.step(fabric, state, control)
         return state, _failure(state)
 
-    substep = jax.checkpoint(substep, policy=policy)
+    step = jax.checkpoint(step, policy=policy)
 
-    def moved(state, control):
-        state, failures = jax.lax.scan(substep, state, control)
-        return state, (state.x, failures)  # pyright: ignore[reportAttributeAccessIssue]
+    def group(state, control):
+        state, failures = jax.lax.scan(step, state, control)
+        return state, (state.x, state.v, failures)
 
     def wanted(state, at):
         number, control = at
 
         def still():
-            steps = jax.tree.leaves(control)[0].shape[0]
-            return state, (state.x, jnp.broadcast_to(no_failure(), (steps,)))
+            steps = control.pinned.shape[0]
+            return state, (state.x, state.v, jnp.broadcast_to(no_failure(), (steps,)))
 
-        return jax.lax.cond(number < frames, lambda: moved(state, control), still)
+        return jax.lax.cond(number < saves, lambda: group(state, control), still)
 
-    if frames is None:
-        _, (x, failures) = jax.lax.scan(jax.checkpoint(moved, policy=policy), start, controls)
+    if saves is None:
+        state, found = jax.lax.scan(jax.checkpoint(group, policy=policy), state, control)
     else:
-        numbers = jnp.arange(jax.tree.leaves(controls)[0].shape[0])
+        numbers = jnp.arange(control.pinned.shape[0])
         wanted = jax.checkpoint(wanted, policy=policy)
-        _, (x, failures) = jax.lax.scan(wanted, start, (numbers, controls))
-    # once, and not in every step
-    failures = jnp.where(solver.fits(fabric), failures, Failure.TIME_STEP.value)
-    unfailed = jnp.all(failures == Failure.NONE.value, axis=1)
-    ok = jnp.all(jnp.isfinite(x), axis=(1, 2)) & jnp.cumprod(unfailed).astype(bool)
-    return Trajectory(x, ok, *_first_failure(failures))
+        state, found = jax.lax.scan(wanted, state, (numbers, control))
+    return state, *found
+
+
+def grouped(control: Control, every: int) -> Control:
+    """The control of a motion with axes (group, step), in groups of `every` steps."""
+    if control.pinned.ndim != 3:
+        raise ValueError(
+            "control.pinned must be (step, pinned, axis), the control of every step; got an array "
+            f"of shape {control.pinned.shape}"
+        )
+    steps = control.pinned.shape[0]
+    if every < 1 or steps % every:
+        raise ValueError(f"save_every must divide the {steps} steps of the control, got {every}")
+    wind = control.wind
+    if wind is not None and wind.ndim == 1:
+        wind = jnp.broadcast_to(wind, (steps, 3))
+    return jax.tree.map(
+        lambda part: part.reshape(steps // every, every, *part.shape[1:]),
+        Control(control.pinned, wind),
+    )
+
+
+def _check_times(save_every: int | None, times: Any, steps: int, dt: Any) -> None:
+    if save_every is not None:
+        raise ValueError("save_every and save_at exclude each other")
+    if is_traced(times, dt):
+        return
+    first, last = float(np.min(times)), float(np.max(times))
+    if first < 0 or last > steps * float(dt) * (1 + 1e-5):
+        raise ValueError(
+            f"save_at must lie between 0 and {steps * float(dt):g} s, the end of the control; "
+            f"found {first:g} to {last:g} s"
+        )
+
+
+def _at(places: Array, state: Any, x: Array, v: Array, unfailed: Array, dt: Any):
+    """Positions, velocities and whether nothing failed at `places`, counted in steps: the cubic
+    by both ends of a step (Hermite)."""
+    count = len(x)
+    x, v = (jnp.concatenate([a[None], b]) for a, b in ((state.x, x), (state.v, v)))
+    step = jnp.clip(places.astype(int), 0, count - 1)
+    s = (places - step).astype(x.dtype)[:, None, None]
+    (x0, x1), (v0, v1) = (x[step], x[step + 1]), (v[step] * dt, v[step + 1] * dt)
+    over = x1 - x0
+    at = x0 + s * (v0 + s * (3 * over - 2 * v0 - v1 + s * (v0 + v1 - 2 * over)))
+    rate = v0 + s * (2 * (3 * over - 2 * v0 - v1) + 3 * s * (v0 + v1 - 2 * over))
+    return at, rate / dt, unfailed[step]
 
 
 def _failure(state: Any) -> Int[Array, ""]:
     """The failure that a state carries, or that its positions are not finite."""
     finite = jnp.all(jnp.isfinite(jax.lax.stop_gradient(state.x)))
-    seen = jnp.where(finite, Failure.NONE.value, Failure.NON_FINITE.value)
+    seen = jnp.where(finite, Result.SUCCESS.value, Result.NON_FINITE.value)
     return first_failure(state.failure, seen)
 
 
-def _first_failure(failures: Int[Array, "frame step"]) -> tuple[Array, Array, Array]:
-    """Code, frame and step of the first failure."""
+def _first(failures: Int[Array, " step"], dt: Array) -> tuple[Array, Array]:
+    """Code and time [s] of the first failure."""
     if not failures.size:
-        return no_failure(), no_failure() - 1, no_failure() - 1
-    failures, steps = failures.ravel(), failures.shape[1]
-    first = jnp.argmax(failures != Failure.NONE.value)
-    code = failures[first]
-    failed = code != Failure.NONE.value
-    return code, jnp.where(failed, first // steps, -1), jnp.where(failed, first % steps, -1)
+        return no_failure(), jnp.full((), jnp.nan)
+    first = jnp.argmax(failures != Result.SUCCESS.value)
+    failed = failures[first] != Result.SUCCESS.value
+    return failures[first], jnp.where(failed, (first + 1).astype(dt.dtype) * dt, jnp.nan)

@@ -41,7 +41,7 @@ def as_configuration(configuration: Configuration, baseline: str) -> Configurati
     """The configuration that stands for a baseline in tables; any other as it is."""
     if baseline in REFERENCES:
         return Configuration(REFERENCES[baseline], configuration.solver, "")
-    words = {"other_fabric": "of another fabric", ON_CLOTH: "found on points"}.get(baseline)
+    words = {"other_fabric": "of another fabric", ON_CLOTH: "found by MPM"}.get(baseline)
     if words is None:
         return configuration
     return configuration._replace(approach=f"{_named(configuration.approach)} ({words})")
@@ -60,11 +60,11 @@ def is_reference(label: str) -> bool:
 PAPER_CONFIGURATIONS = (
     Configuration("diffcloud", "cloth", "lifting"),
     Configuration("diffcloud", "cloth", "wind"),
-    Configuration("diffcp", "points", "lifting"),
+    Configuration("diffcp", "mpm", "lifting"),
     Configuration("physnet", "cloth", "lifting"),
     Configuration("physnet", "cloth", "wind"),
-    Configuration("physnet", "points", "lifting"),
-    Configuration("pinn", "points", "stretching"),
+    Configuration("physnet", "mpm", "lifting"),
+    Configuration("pinn", "mpm", "stretching"),
     Configuration("pinn", "cloth", "stretching"),
 )
 """The configurations in the tables of Ru et al. 2025, in their order."""

@@ -39,7 +39,7 @@ JOB = {"cores": 1, "processes": 1, "memory": "8GB", "walltime": "04:00:00"}  # o
 SECONDS: dict[str, tuple[float, float]] = {
     "": (1.0, 1.0),
     "networks cloth": (170.0, 170.0),
-    "networks points": (150.0, 150.0),
+    "networks mpm": (150.0, 150.0),
     "recordings": (28.0, 20.0),
     "recordings of MuJoCo": (60.0, 60.0),
     "ensembles": (160.0, 110.0),

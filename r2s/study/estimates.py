@@ -25,7 +25,7 @@ from r2s.study.recordings import Source, read
 from r2s.study.tasks import KEY_LENGTH, VERSIONS, Task, processor, result_files
 
 ESTIMATE, NETWORK = "estimate.json", "network.eqx"
-SHAPES = {"cloth": (9, 9), "points": (7, 7)}  # vertices of the simulated sheet
+SHAPES = {"cloth": (9, 9), "mpm": (7, 7)}  # vertices of the simulated sheet
 SOLVERS = {name: tuple(METHODS[name].supports) for name in APPROACHES}
 
 
@@ -70,7 +70,7 @@ class EstimateTask(Task):
     """An estimate of a fabric.
 
     - `approach`: "diffcloud", "diffcp", "physnet" or "pinn", or "-published" behind one of these.
-    - `solver`: "cloth" or "points".
+    - `solver`: "cloth" or "mpm".
     - `sources`: one recording, or several for approaches that accept them.
     - `density`: areal density as weighed, [kg/m^2].
     - `network`: of "physnet" and "physnet-published".

@@ -25,7 +25,7 @@ from r2s.recordings.recording import Recording
 from r2s.scenarios.resolution import EDGE, MEMBRANE_DAMPING, explicit_cloth, grid_around
 from r2s.scenarios.scenario import Scenario, from_recording
 from r2s.solvers.explicit.cloth import ExplicitCloth
-from r2s.solvers.mpm.sheet import Sheet, longest_edge, stable_step
+from r2s.solvers.mpm.sheet import MPMCloth, longest_edge, stable_step
 from r2s.study.configuration import ON_CLOTH, Configuration
 from r2s.study.estimates import EstimateTask, read_estimate
 from r2s.study.recordings import SETTLING, Shape, Source, read, read_start, started
@@ -34,7 +34,7 @@ from r2s.study.tasks import Task, result_files
 MIDDLE = -1  # instead of the number of a sample: the prior median
 MEASURED, MOTION = "measured.json", "motion.npz"
 # vertices of the simulated sheet: with 25 x 25 of the cloth a fling of grey interlock is 7 mm off
-SHAPES = {"cloth": (33, 33), "points": (9, 9)}
+SHAPES = {"cloth": (33, 33), "mpm": (9, 9)}
 # substeps a second, above which implicit steps, of so many seconds, are three times as fast
 MOST, IMPLICIT = 150_000, 1 / 240
 RETRIES = (2, 4)  # times the substeps, of a prediction that diverged
@@ -46,7 +46,7 @@ class EvaluationTask(Task):
     """The distance of simulations of a fabric from recordings of one scenario.
 
     - `estimate`: whose fabric is evaluated; None: that of a sample, or the true one.
-    - `solver`: "cloth", in explicit steps, or "points", on `SHAPES`. Estimates on points are
+    - `solver`: "cloth", in explicit steps, or "mpm", on `SHAPES`. Estimates on points are
       evaluated on both, as only on the cloth all fabrics are simulated alike.
     - `density`: areal, [kg/m^2].
     - `recordings`: evaluated together, since they compile once.
@@ -198,7 +198,7 @@ def predict(
     """The motions of a fabric in recordings of one scenario.
 
     - `solver`: "cloth" in explicit steps, whose only error is that of their mesh (in implicit ones
-      for fabrics that need more than `MOST`), or "points" for material points in one grid for all.
+      for fabrics that need more than `MOST`), or "mpm" for material points in one grid for all.
     - `starts`: of each recording the shape in its first frame [m], see
       `r2s.study.recordings.started`; none: from flat sheets.
     """
@@ -207,7 +207,7 @@ def predict(
         scenarios = [started(*each) for each in zip(scenarios, starts, strict=True)]
     most = max(scenario.substeps for scenario in scenarios)
     in_equal_steps = [dataclasses.replace(scenario, substeps=most) for scenario in scenarios]
-    make = _points if solver == "points" else _explicit
+    make = _points if solver == "mpm" else _explicit
     shared = make(in_equal_steps, fabric)
     if shared is None:
         words = "implicit steps, too stiff for explicit ones"
@@ -219,7 +219,7 @@ def predict(
     return motions
 
 
-def _until_stable(scenario: Scenario, fabric: Fabric, solver: ExplicitCloth | Sheet) -> Motion:
+def _until_stable(scenario: Scenario, fabric: Fabric, solver: ExplicitCloth | MPMCloth) -> Motion:
     """A motion; one of the cloth that diverges is repeated in shorter substeps, then in implicit
     steps.
 
@@ -251,7 +251,7 @@ def _implicit(scenario: Scenario, fabric: Fabric) -> Motion:
     return prediction_error.predict_motion(dataclasses.replace(scenario, substeps=steps), fabric)
 
 
-def _points(scenarios: list[Scenario], fabric: Fabric) -> Sheet:
+def _points(scenarios: list[Scenario], fabric: Fabric) -> MPMCloth:
     first = scenarios[0]
     paths = [jnp.concatenate([getattr(s, name) for s in scenarios]) for name in ("path", "start")]
     everywhere = dataclasses.replace(first, path=paths[0], start=paths[1])
@@ -260,4 +260,4 @@ def _points(scenarios: list[Scenario], fabric: Fabric) -> Sheet:
     needed = max(first.substeps, first.interval / limit) + 1
     substeps = math.ceil(LADDER ** math.ceil(math.log(needed) / math.log(LADDER)))
     grid = grid_around(everywhere, spacing)
-    return Sheet.make(first.scene, grid, fabric, first.interval / substeps, MEMBRANE_DAMPING)
+    return MPMCloth(first.scene, first.interval / substeps, fabric, grid, MEMBRANE_DAMPING)

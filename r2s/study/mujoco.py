@@ -45,7 +45,7 @@ from r2s.study.tasks import Task
 FABRIC = "mujoco_flex"
 SCENARIOS = ("lifting", "folding", "fling", "shaking")  # without fans and clamps
 OTHERS = (0.25, 0.5, 2.0, 4.0)  # times as stiff: as the membranes of the presets differ
-GRIP = 10.0  # [kg], of a held vertex: the sheet's pull moves it by less than 1e-7 m in a step
+GRIP = 10.0  # [kg], of a pinned vertex: the sheet's pull moves it by less than 1e-7 m in a step
 STEP = 1.6e-3  # [s]: longest time step
 ELASTICITY = ("young", "poisson", "thickness", "damping")
 AXES = ("1 0 0", "0 1 0", "0 0 1")
@@ -229,14 +229,14 @@ def moved(
     data = mujoco.MjData(model)
     flat = _flat(scenario)
     data.qpos[:] = (np.asarray(scenario.start, float) - flat).ravel()
-    held = (3 * np.asarray(scenario.scene.held)[:, None] + np.arange(3)).ravel()
+    pinned = (3 * np.asarray(scenario.scene.pinned)[:, None] + np.arange(3)).ravel()
     is_free = np.ones(model.nv)
-    is_free[held] = 0
+    is_free[pinned] = 0
     brake = 0.0 if scenario.brake is None else float(scenario.brake)
     model.dof_damping[:] = brake * is_free * model.body_mass[model.dof_bodyid]
     frames = scenario.num_frames + scenario.lead_in - 1
     path = _path(scenario, np.arange(frames * substeps + 1) / substeps - scenario.lead_in)
-    path = path.reshape(len(path), -1) - flat.ravel()[held]
+    path = path.reshape(len(path), -1) - flat.ravel()[pinned]
     velocity = np.diff(path, axis=0) / dt
     found = np.empty((scenario.num_frames, *flat.shape))
     for frame in range(frames):
@@ -245,7 +245,7 @@ def moved(
         if frame >= scenario.lead_in:
             found[frame - scenario.lead_in] = flat + data.qpos.reshape(flat.shape)
         for count in range(frame * substeps, (frame + 1) * substeps):
-            data.qpos[held], data.qvel[held] = path[count], velocity[count]
+            data.qpos[pinned], data.qvel[pinned] = path[count], velocity[count]
             mujoco.mj_step(model, data)
         if not (np.isfinite(data.qpos).all() and np.abs(data.qpos).max() < 10):
             when = (frame - scenario.lead_in) * scenario.interval
@@ -257,7 +257,7 @@ def moved(
 
 
 def _path(scenario: Scenario, frames: Float[np.ndarray, " step"]) -> np.ndarray:
-    """Places [m] of the held vertices (step, vertex, 3) at times counted in frames."""
+    """Places [m] of the pinned vertices (step, vertex, 3) at times counted in frames."""
     times = float(scenario.first_time) + scenario.interval * frames
     knots, path = np.asarray(scenario.path_times, float), np.asarray(scenario.path, float)
     placed = [np.interp(times, knots, along) for along in path.reshape(len(knots), -1).T]
@@ -266,7 +266,7 @@ def _path(scenario: Scenario, frames: Float[np.ndarray, " step"]) -> np.ndarray:
 
 def _mjcf(scenario: Scenario, material: Material, dt: float) -> str:
     """The model: a body for each vertex, where it is when the sheet is flat and unstretched."""
-    mesh, held = scenario.scene.mesh, set(np.asarray(scenario.scene.held).tolist())
+    mesh, pinned = scenario.scene.mesh, set(np.asarray(scenario.scene.pinned).tolist())
     contact = f'friction="{material.friction} 0.005 0.0001" solref="{_text(material.solref)}"'
     contact += f' solimp="{_text(material.solimp)}"'
     elastic = " ".join(f'{name}="{getattr(material, name)}"' for name in ELASTICITY)
@@ -274,7 +274,7 @@ def _mjcf(scenario: Scenario, material: Material, dt: float) -> str:
     areas = np.asarray(mesh.vertex_area, np.float64)
     places = _flat(scenario)
     bodies = "\n".join(
-        _body(i, place, area, material, i in held)
+        _body(i, place, area, material, i in pinned)
         for i, (place, area) in enumerate(zip(places, areas.tolist(), strict=True))
     )
     return f"""<mujoco>
@@ -296,13 +296,13 @@ def _mjcf(scenario: Scenario, material: Material, dt: float) -> str:
 """
 
 
-def _body(i: int, place: np.ndarray, area: float, material: Material, is_held: bool) -> str:
+def _body(i: int, place: np.ndarray, area: float, material: Material, is_pinned: bool) -> str:
     """A vertex: a cube with faces of its `area` [m^2] to the air, which does not turn."""
-    mass = GRIP if is_held else material.density * area
+    mass = GRIP if is_pinned else material.density * area
     joints = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in AXES)
     inertia = _text([mass * area / 6] * 3)
     inertial = f'<inertial pos="0 0 0" mass="{mass!r}" diaginertia="{inertia}"/>'
-    floats = ' gravcomp="1"' if is_held else ""
+    floats = ' gravcomp="1"' if is_pinned else ""
     return f'    <body name="v{i}" pos="{_text(place.tolist())}"{floats}>{inertial}{joints}</body>'
 
 

@@ -83,8 +83,8 @@ ALL = Plan(
     truth=TruthSettings(self_contact=True),
 )
 QUICK = Budgets(
-    diffcp=METHODS["diffcp"].budget._replace(coarse=4, starts=1),
-    physnet=METHODS["physnet"].budget._replace(evaluations=40),
+    diffcp=METHODS["diffcp"].budget._replace(num_samples=4, num_starts=1),
+    physnet=METHODS["physnet"].budget._replace(max_evaluations=40),
     training=TrainingBudget(fabrics=32, epochs=2, steps=40),
 )
 ONE_FABRIC = Plan(
@@ -102,17 +102,17 @@ SMALL = dataclasses.replace(
         Configuration("diffcloud", "cloth", "lifting"),
         Configuration("diffcloud", "cloth", "wind"),
         TOGETHER_CONFIGURATIONS[0],
-        Configuration("diffcp", "points", "lifting"),
+        Configuration("diffcp", "mpm", "lifting"),
         Configuration("physnet", "cloth", "lifting"),
-        Configuration("pinn", "points", "stretching"),
+        Configuration("pinn", "mpm", "stretching"),
         Configuration("pinn", "cloth", "stretching"),
     ),
     fabrics=("camel_ponte_roma", "grey_interlock", FLEX),
     judged=2,
     budgets=dataclasses.replace(
         QUICK,
-        diffcloud=METHODS["diffcloud"].budget._replace(iterations=15),
-        diffcp=QUICK.diffcp._replace(iterations=2),
+        diffcloud=METHODS["diffcloud"].budget._replace(max_iterations=15),
+        diffcp=QUICK.diffcp._replace(max_iterations=2),
     ),
 )
 PRESETS = {
@@ -326,7 +326,7 @@ def _estimate(
     network = None
     if "network" in METHODS[approach].options():
         training = plan.budgets.training
-        if solver == "points":
+        if solver == "mpm":
             fewer = min(training.fabrics, FEWER_FABRICS)
             training = dataclasses.replace(training, fabrics=fewer)
         network = TrainedNetwork(solver, scenario, training, plan.seed)

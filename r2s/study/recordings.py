@@ -33,7 +33,7 @@ from r2s.scenarios import synthetic
 from r2s.scenarios.paths import draw
 from r2s.scenarios.resolution import explicit_cloth
 from r2s.scenarios.scenario import Scenario, rollout
-from r2s.scenarios.standard import SIX, STRETCHING_INTERVAL, Experiment
+from r2s.scenarios.standard import SCENARIOS, STRETCHING_INTERVAL, Experiment
 from r2s.study.tasks import Task, result_files
 
 RECORDING = "recording.npz"
@@ -302,11 +302,11 @@ def started(scenario: Scenario, shape: Shape | None) -> Scenario:
     rest = np.asarray(scenario.scene.mesh.rest, np.float64)
     along = tuple(np.linspace(0, 1, count) for count in shape.shape[:2])
     start = RegularGridInterpolator(along, shape)(np.clip(rest / rest.max(axis=0), 0, 1))
-    held = scenario.path[1]
+    pinned = scenario.path[1]
     return dataclasses.replace(
         scenario,
-        start=scenario.scene.place(jnp.asarray(start, float), held),
-        path=scenario.path.at[0].set(held),
+        start=scenario.scene.place(jnp.asarray(start, float), pinned),
+        path=scenario.path.at[0].set(pinned),
         lead_in=math.ceil(SETTLING / scenario.interval),
     )
 
@@ -314,8 +314,8 @@ def started(scenario: Scenario, shape: Shape | None) -> Scenario:
 def experiment_of(scenario: str, number: int, unseen: bool, seed: int) -> Experiment:
     """Motion `number` of a scenario, the same for all fabrics; see `SimulatedRecording`."""
     if number == 0 and not unseen:
-        return SIX[scenario]()
-    return SIX[scenario](**numbers_of(scenario, number, unseen, seed))
+        return SCENARIOS[scenario]()
+    return SCENARIOS[scenario](**numbers_of(scenario, number, unseen, seed))
 
 
 def numbers_of(scenario: str, number: int, unseen: bool, seed: int) -> dict[str, float]:

@@ -27,7 +27,7 @@ from r2s.study.verdicts import SURFACE, ensembles, judged_motions, verdicts
 
 PRINTED = ("skill", "findings")  # the other tables are in files
 PARAMETERS = ("solver", "recording", "parameter", "unit", "is_log", "value", "standard_error",
-              "is_identifiable", "truth")  # fmt: skip
+              "posterior_over_prior", "truth")  # fmt: skip
 
 
 def publish(
@@ -143,7 +143,7 @@ def parameters(tasks: Iterable[EvaluationTask], folder: Path) -> pd.DataFrame:
         if estimate is None:
             continue
         truth = true_values(task, estimate.ranges)
-        numbers = estimate.values, estimate.standard_errors, estimate.identifiable, truth
+        numbers = estimate.values, estimate.standard_errors, estimate.narrowing, truth
         columns = [np.asarray(each).tolist() for each in numbers]
         for bound, *own in zip(estimate.ranges, *columns, strict=True):
             rows.append((task.solver, task.name, bound.name, bound.unit, bound.log, *own))

@@ -23,7 +23,7 @@ from r2s.metrics.losses import masked_mean, surface_residuals
 from r2s.recordings.recording import Recording, subsample
 from r2s.scenarios import Experiment
 from r2s.scenarios.scenario import Scenario, from_recording, rollout
-from r2s.solvers.simulate import Trajectory
+from r2s.solvers.simulate import Solution
 
 MAX_POINTS = 1500  # of a cloud: more change neither the picture nor the distance
 CLOTH, EDGES, CLOUD, GRIPPER = (0, 114, 178), (0, 60, 100), (213, 94, 0), (30, 30, 30)
@@ -74,7 +74,7 @@ class Moved(NamedTuple):
     - `mean_error`: over the frames that count [m]; NaN when one of them has none.
     """
 
-    motion: Trajectory
+    motion: Solution
     error: Float[Array, " frame"]
     mean_error: Float[Array, ""]
 
@@ -87,7 +87,7 @@ def move(subject: Subject, u: Float[Array, " dim"]) -> Moved:
 
 
 @eqx.filter_jit
-def _simulated(subject: Subject, u: Float[Array, " dim"]) -> tuple[Trajectory, Array]:
+def _simulated(subject: Subject, u: Float[Array, " dim"]) -> tuple[Solution, Array]:
     """The motion, and its `error`: that of `chamfer_real_to_sim`, but to the surface itself."""
     motion = rollout(subject.scenario, subject.space(u))
     if subject.clouds is None:
@@ -221,7 +221,7 @@ class Page:
             scene.add_mesh_simple("/cloth", x, faces, visible=is_finite, **look)
             edges = {"color": EDGES, "wireframe": True}
             scene.add_mesh_simple("/mesh", x, faces, visible=is_finite, **edges)
-            self._points("/grippers", x[np.asarray(of_sheet.held)], GRIPPER, 4 * POINT)
+            self._points("/grippers", x[np.asarray(of_sheet.pinned)], GRIPPER, 4 * POINT)
             if clouds is not None:
                 cloud = np.asarray(clouds.points[frame])[np.asarray(clouds.mask[frame])]
                 self._points("/recording", cloud, CLOUD, POINT)

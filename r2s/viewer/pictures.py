@@ -193,9 +193,9 @@ def _draw_frame(axes: Any, content: _Content, frame: int) -> list[Any]:
         seen = np.asarray(recording.markers)[frame][np.asarray(recording.markers_seen)[frame]]
         crosses: dict[str, Any] = {"marker": "x", "depthshade": False}
         artists.append(axes.scatter(*seen.T, s=14, color=MARKER, zorder=6, **crosses))
-    times, now = np.asarray(recording.handle_times), float(recording.times[frame])
+    times, now = np.asarray(recording.gripper_times), float(recording.times[frame])
     knots = np.append(times[times < now], now)
-    for gripper in np.asarray(recording.handle_path).transpose(1, 2, 0):  # its path so far
+    for gripper in np.asarray(recording.gripper_path).transpose(1, 2, 0):  # its path so far
         path = np.stack([np.interp(knots, times, axis) for axis in gripper])
         artists += axes.plot(*path, color=GRIPPER, linewidth=0.9, zorder=7)
         artists += axes.plot(*path[:, -1:], "o", color=GRIPPER, markersize=5, zorder=8)
@@ -243,7 +243,7 @@ def _limits(
     most of the points are always in.
     """
     sheet = recording.info.sheet
-    path = np.asarray(recording.handle_path).reshape(-1, 3)
+    path = np.asarray(recording.gripper_path).reshape(-1, 3)
     known = np.concatenate([path, _outline(sheet)])
     low, high, reach = known.min(axis=0), known.max(axis=0), 0.5 * max(sheet.size)
     around = low - reach, high + reach

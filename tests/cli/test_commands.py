@@ -180,7 +180,8 @@ def test_a_card_comes_from_a_recording_and_goes_on_where_it_was(
     command = ["simulate", "lifting", "--out", str(tmp_path / "x.npz"), "--shape", "5", "5"]
     assert main([*command, "--recording", str(recording)]) == 0
     command = ["estimate", str(recording), "--density", "0.19", "--out", str(card), "--json"]
-    command += ["--shape", "5", "5", "--coarse", "4", "--starts", "1", "--iterations", "6"]
+    command += ["--shape", "5", "5", "--num-samples", "4", "--num-starts", "1"]
+    command += ["--max-iterations", "6"]
     capsys.readouterr()
     assert main([*command, "--date", "2026-01-31"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -209,7 +210,7 @@ def test_the_doctor_predicts_step_and_memory(capsys: pytest.CaptureFixture) -> N
     assert 0 < told["memory_bytes"] < told["gradient_memory_bytes"]
 
 
-FAILED = r"failed in (frame \d+|\d+ frames before the first one), step \d+: [A-Z]"
+FAILED = r"failed (at [\d.]+ s|[\d.]+ s before the first frame): [A-Z]"
 STORM = ["--motion", "speed=1e200", "num_frames=2", "--shape", "3", "3"]  # its drag overflows
 
 
@@ -243,7 +244,7 @@ def test_a_recording_that_cannot_be_simulated_says_why(
     result = json.loads(capsys.readouterr().out)
     assert re.match(FAILED, result["failures"]["storm"])
     assert result["recordings"]["storm"]["chamfer_real_to_sim"] is None
-    budget = ["--shape", "3", "3", "--coarse", "1", "--starts", "1"]
+    budget = ["--shape", "3", "3", "--num-samples", "1", "--num-starts", "1"]
     command = ["estimate", str(tmp_path / "storm.npz"), "--density", "0.32", *budget]
     assert main([*command, "--out", str(tmp_path / "card.json")]) != 0
     assert re.search(f"all 1 simulations .* the first {FAILED}", capsys.readouterr().err)
@@ -275,11 +276,11 @@ def test_fabrics_of_this_weight_are_known_to_whom_they_help(options, is_alone, k
 
 
 def test_a_card_says_what_was_neither_weighed_nor_estimated():
-    on_cloth, on_points = (
-        {each.name for each in default_space(solver, 0.2).ranges} for solver in ("cloth", "points")
+    on_cloth, on_mpm = (
+        {each.name for each in default_space(solver, 0.2).ranges} for solver in ("cloth", "mpm")
     )
     assert assumed(on_cloth) == ("thickness", "mass_damping")
-    assert assumed(on_points) == ("bending", "damping", "friction", "thickness", "mass_damping")
+    assert assumed(on_mpm) == ("bending", "damping", "friction", "thickness", "mass_damping")
     whole = ("membrane", "bending", "damping", "friction", "thickness", "mass_damping")
     assert assumed({each.name for each in (STRETCH, MASS)}) == whole
 

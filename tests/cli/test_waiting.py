@@ -1,4 +1,4 @@
-"""The line that says what a command does: it moves while nothing else does, on terminals alone."""
+"""The line that says what a command does: it moves on a terminal, and is written to a file."""
 
 import io
 import time
@@ -23,9 +23,15 @@ def test_the_line_moves_while_the_main_thread_waits() -> None:
     assert "iteration 3, root of loss 0.002" in told and told.endswith("\r\x1b[K")
 
 
-def test_nothing_is_written_where_nobody_looks() -> None:
+def test_a_file_gets_a_line_now_and_then() -> None:
     file = io.StringIO()
-    with Waiting("compiling", file, tick=0.01) as line:
-        time.sleep(0.05)
+    with Waiting("compiling", file, pause=0.1) as line:
         line.say("simulating")
-    assert file.getvalue() == ""
+        line(1, 4e-6)
+        time.sleep(0.35)
+    lines = file.getvalue().splitlines()
+    assert 2 <= len(lines) <= 4 and all(each.startswith("simulating") for each in lines)
+    quick = io.StringIO()
+    with Waiting("compiling", quick):
+        pass
+    assert quick.getvalue() == ""

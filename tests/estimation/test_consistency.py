@@ -17,15 +17,15 @@ from r2s.estimation.consistency import (
     agreement,
     asks_for_density,
     density_of,
+    fits,
     information_of,
     misfits,
     outlier,
-    outlier_fractions,
     scatter_of,
     with_free_density,
 )
 from r2s.estimation.descent import DEFAULT
-from r2s.estimation.estimate import Agreement, Contradiction, Estimate, Misfit, point_estimate
+from r2s.estimation.estimate import Agreement, Contradiction, Estimate, Fit, Misfit, point_estimate
 from r2s.estimation.judgement import each_alone
 from r2s.estimation.methods import DiffCloud
 from r2s.estimation.prediction import fabric_at, predict, theta_length
@@ -239,8 +239,8 @@ def test_what_fits_is_not_named(pulled, lifted):
         problem = problem_of(recording)
         theta, seen = at_truth(problem)
         assert misfits((problem,), theta, seen) == ()
-        (share,) = outlier_fractions((problem,), seen, STRICT)
-        assert share < 0.01
+        (fit,) = fits((problem,), seen, STRICT)
+        assert fit.outliers < 0.01 and fit.distance < 2e-3
 
 
 @pytest.mark.slow(group="estimates")
@@ -252,8 +252,8 @@ def test_a_marker_on_another_cloth_is_named(pulled):
     assert (found.recording, found.what, found.unit) == (0, "marker 2", "m")
     assert found.off == pytest.approx(np.hypot(0.03, 0.02), abs=2e-3)
     count = pulled.markers.shape[1]
-    (share,) = outlier_fractions((problem,), seen, STRICT)
-    assert share == pytest.approx(1 / count, abs=0.02)
+    (fit,) = fits((problem,), seen, STRICT)
+    assert fit.outliers == pytest.approx(1 / count, abs=0.02)
 
 
 def test_a_marker_that_stays_behind_or_is_lost_on_the_way_is_named(pulled):
@@ -315,8 +315,8 @@ def test_points_of_another_thing_are_counted(lifted):
     points[:, ::5, 2] += 0.3
     problem = problem_of(dataclasses.replace(lifted, points=jnp.asarray(points)))
     _, seen = at_truth(problem)
-    (share,) = outlier_fractions((problem,), seen, STRICT)
-    assert share == pytest.approx(mask[:, ::5].sum() / mask.sum(), abs=0.05)
+    (fit,) = fits((problem,), seen, STRICT)
+    assert fit.outliers == pytest.approx(mask[:, ::5].sum() / mask.sum(), abs=0.05)
 
 
 def test_what_was_written_down_and_does_not_fit_is_named(lifted):
@@ -336,14 +336,14 @@ def test_the_command_says_so(lifted, pulled):
             Misfit(1, "air", 5.0, "standard deviations"),
             Misfit(0, "force", 2.5, "of its size"),
         ),
-        left_out=(0.02, 0.76),
+        fits=(Fit("pull", 1e-3, 0.02), Fit("lift", 9e-3, 0.76)),
     )
     lines = [*estimate_report.misfits(found, [pulled, lifted])]
     assert "pull" in lines[0] and "marker 2 is 36 mm" in lines[0]
     assert "lift" in lines[1] and "the density" in lines[1]
     assert "pull" in lines[2] and "off by 250 %" in lines[2] and "density" in lines[2]
-    assert lines[3] == f"left out of {pulled.info.name}: 2.0 % as outliers"
-    assert lines[4].startswith("warning") and "76.0 %" in lines[4] and "density" in lines[4]
+    (last,) = lines[3:]
+    assert last.startswith("warning: 76 % of lift are outliers") and "density" in last
 
 
 @pytest.mark.parametrize("is_coarse", [False, True])
@@ -369,8 +369,8 @@ def test_clouds_that_nobody_recorded_are_not_left_unread(pulled):
     bare = make_recording(
         None,
         pulled.times,
-        pulled.handle_path,
-        pulled.handle_times,
+        pulled.gripper_path,
+        pulled.gripper_times,
         pulled.info,
         markers=pulled.markers,
         marker_places=pulled.marker_places,

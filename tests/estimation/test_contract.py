@@ -16,20 +16,21 @@ from known_ends import SPACE as ISOTROPIC
 
 from r2s.estimation import cards
 from r2s.estimation.checkpoint import arrays_of, load, read, save, tree_from
-from r2s.estimation.estimate import as_json, describe, from_json, point_estimate
+from r2s.estimation.estimate import as_json, from_json, point_estimate
 from r2s.estimation.method import Budget, default_space, seed_of
 from r2s.estimation.methods import METHODS
 from r2s.estimation.pinn import published_recipe, training
+from r2s.estimation.summary import describe
 from r2s.materials.fabric_json import fabric_as_json, fabric_from_json
 from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace
 
 DATA = TESTS / "data"
 TINY = {
-    "diffcloud": Budget(coarse=0, starts=1, iterations=2, around=0),
-    "diffcp": Budget(coarse=0, starts=1, iterations=1, width=0.02, around=0),
-    "cma-es": Budget(evaluations=14),
-    "diffcloud-published": Budget(iterations=2),
-    "diffcp-published": Budget(iterations=2),
+    "diffcloud": Budget(num_samples=0, num_starts=1, max_iterations=2, num_probes=0),
+    "diffcp": Budget(0, num_starts=1, max_iterations=1, secant_width=0.02, num_probes=0),
+    "cma-es": Budget(max_evaluations=14),
+    "diffcloud-published": Budget(max_iterations=2),
+    "diffcp-published": Budget(max_iterations=2),
 }
 
 
@@ -42,20 +43,20 @@ def test_the_command_line_offers_every_method_and_no_other():
     commands = pytest.importorskip("r2s.cli.estimate")
     assert set(get_args(commands.MethodName)) == set(METHODS)
     assert all(method.name == name for name, method in METHODS.items())
-    assert all(set(method.heeds) <= set(Budget._fields) for method in METHODS.values())
+    assert all(set(method.budget_fields) <= set(Budget._fields) for method in METHODS.values())
 
 
 @pytest.mark.parametrize(
     "name, solver, number, words",
     [
         ("diffcp", "cloth", 1, "differentiates through material points; on the cloth take diffcl"),
-        ("diffcloud", "points", 1, "on material points take diffcp"),
+        ("diffcloud", "mpm", 1, "on material points take diffcp"),
         ("pinn", "cloth", 1, "not from lifting: the network from clouds .* does not find the fab"),
-        ("pinn", "points", 1, "not from lifting: the network from clouds .* does not find the fab"),
+        ("pinn", "mpm", 1, "not from lifting: the network from clouds .* does not find the fab"),
         ("pinn-published", "cloth", 1, "estimates from stretching, not from lifting"),
         ("physnet", "cloth", 2, "takes one recording, got 2"),
         ("diffcloud", "cloth", 0, "needs a recording"),
-        ("cma-es", "felt", 1, "a solver is one of cloth, points, got 'felt'"),
+        ("cma-es", "felt", 1, "a solver is one of cloth, mpm, got 'felt'"),
     ],
 )
 def test_what_is_not_supported_is_refused_with_a_reason(recording, name, solver, number, words):
@@ -75,13 +76,13 @@ def test_the_network_takes_no_lift_beside_a_pull(recording):
 def test_every_method_supports_a_solver_and_says_why_not_the_other():
     for method in METHODS.values():
         assert method.supports
-        for solver in ("cloth", "points"):
+        for solver in ("cloth", "mpm"):
             assert method.refusal(solver, "stretching") == "" or method.refusals[solver]
 
 
 def test_the_space_is_that_of_the_solver_and_a_key_has_a_seed():
     assert isinstance(default_space("cloth", 0.2), OrthotropicSpace)
-    assert isinstance(default_space("points", 0.2), IsotropicSpace)
+    assert isinstance(default_space("mpm", 0.2), IsotropicSpace)
     assert seed_of(jax.random.key(7)) == 7
 
 
@@ -121,9 +122,9 @@ def test_a_method_keeps_the_contract_on_the_cloth(recording, name):
     "name, solver",
     [
         ("diffcloud-published", "cloth"),
-        ("diffcp", "points"),
-        ("diffcp-published", "points"),
-        ("cma-es", "points"),
+        ("diffcp", "mpm"),
+        ("diffcp-published", "mpm"),
+        ("cma-es", "mpm"),
     ],
 )
 def test_other_methods_keep_the_contract(recording, name, solver):
@@ -150,7 +151,8 @@ def test_physnet_trains_its_network_once(recording, tmp_path, monkeypatch):
     with jax.numpy_dtype_promotion("standard"):
         for name in ("physnet", "physnet-published"):
             method = METHODS[name](**others)
-            found[name] = method.estimate([recording], SPACE, Budget(evaluations=9), key=jr.key(0))
+            budget = Budget(max_evaluations=9)
+            found[name] = method.estimate([recording], SPACE, budget, key=jr.key(0))
             others["training_budget"] = TrainingBudget(0)  # what is there is not trained again
     assert not list(tmp_path.glob("*.images"))
     blown = dataclasses.replace(
@@ -172,7 +174,7 @@ def test_the_network_takes_a_stretching(name):
     pull = pulled(FABRIC, "grey", 0.0, key=jr.key(0))
     method = METHODS[name]()
     with jax.numpy_dtype_promotion("standard"):
-        found = method.estimate([pull], SPACE, Budget(iterations=10), key=jr.key(0))
+        found = method.estimate([pull], SPACE, Budget(max_iterations=10), key=jr.key(0))
     assert found.approach.startswith(name) and np.isfinite(found.values).all()
     assert isinstance(found.converged, bool)
     if name == "pinn-published":
@@ -203,7 +205,7 @@ def test_a_descent_that_arrives_has_converged_and_a_truth_beyond_a_bound_is_name
     truth = float(space.values(PLACE)[0])
     stiffness = dataclasses.replace(space.ranges[0], low=low * truth, high=high * truth)
     space = dataclasses.replace(space, ranges=(stiffness, *space.ranges[1:]))
-    budget = Budget(coarse=0, starts=1, iterations=40, around=0)
+    budget = Budget(num_samples=0, num_starts=1, max_iterations=40, num_probes=0)
     found = METHODS["diffcloud"](shape=(5, 5)).estimate([lift_of()], space, budget, key=jr.key(0))
     assert found.converged and found.at_bounds.get(stiffness.name) == bound
     told = [line for line in describe(found) if line.startswith(stiffness.name)]
@@ -216,9 +218,6 @@ def test_bounds_are_named_at_both_ends_and_nowhere_else():
     found = point_estimate("test", SPACE, place, 0.0, nothing, nothing, 0.0)
     expected = {"warp": "lower", "weft": "upper", "coupling": "lower", "friction": "upper"}
     assert found.at_bounds == expected
-    sure = dataclasses.replace(found, standard_errors=np.full(7, 1e-3), correlation=np.eye(7))
-    inside = [name not in expected for name in (each.name for each in found.ranges)]
-    assert sure.identifiable.tolist() == inside  # beyond a bound no error says how far it is
     stored = json.loads(json.dumps(as_json(found), allow_nan=False))
     assert stored["at_bounds"] == expected and stored["converged"] is False
     assert from_json(stored).at_bounds == expected
@@ -238,14 +237,9 @@ def test_an_estimate_of_version_0_2_0_is_read():
     assert found.nuisances[0].standard_error == 0.0005 and found.history.shape == (2, 2, 7)
     assert found.values[0] == stored["parameters"]["warp"]["value"]
     assert float(found.fabric.membrane.c33) == stored["fabric"]["C33"]["value"]
-    (known,) = found.combinations
-    assert known._asdict() == {
-        **{key: stored["combinations"][0][key] for key in ("exponents", "value")},
-        "standard_error": stored["combinations"][0]["deviation"],
-    }
     again = from_json(as_json(found))
     np.testing.assert_array_equal(again.values, found.values)
-    assert as_json(again)["format"] == "r2s-estimate/3"
+    assert as_json(again)["format"] == "r2s-estimate/4"
 
 
 @pytest.mark.parametrize(
@@ -304,5 +298,5 @@ def test_a_checkpoint_is_of_one_run(tmp_path):
 
 
 def test_the_usual_budgets_of_the_network_are_those_of_its_recipes():
-    assert METHODS["pinn"].budget.iterations == training.QUICK.adam
-    assert METHODS["pinn-published"].budget.iterations == published_recipe.EPOCHS
+    assert METHODS["pinn"].budget.max_iterations == training.QUICK.adam
+    assert METHODS["pinn-published"].budget.max_iterations == published_recipe.EPOCHS

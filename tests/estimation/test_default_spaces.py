@@ -39,7 +39,7 @@ def test_every_truth_is_inside_and_none_has_the_fixed_values(name):
     truth = small_strain(name)
     place = np.asarray(default_space("cloth", float(truth.density)).to_unit(truth))
     assert np.all((place > 0.006) & (place < 0.994))
-    space = default_space("points", float(truth.density))
+    space = default_space("mpm", float(truth.density))
     told = space.middle()
     assert not np.isclose(float(told.damping), float(truth.damping), rtol=0.02)
     assert not np.isclose(float(told.friction), float(truth.friction), rtol=0.02)

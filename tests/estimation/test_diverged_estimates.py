@@ -19,7 +19,7 @@ from r2s.estimation.problem import NuisancePrior, Problem
 from r2s.materials import prior
 from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace
 
-BUDGET = Budget(shares=(0.25, 0.5), starts=2)
+BUDGET = Budget(frame_fractions=(0.25, 0.5), num_starts=2)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def fresh(losses):
     """Instead of new descents: whose losses, once all frames count, are those of their places."""
 
     def made(problems, budget, thetas, scale, stage, derive):
-        shared = budget.shares and stage <= len(budget.shares)
+        shared = budget.frame_fractions and stage <= len(budget.frame_fractions)
         found = [1e-6 if shared else losses[int(theta[0])] for theta in thetas]
         row = [row_of(problems[0], [loss])[0] for loss in found]
         changes = {"scale": jnp.asarray(scale), "stage": jnp.asarray(stage)}
@@ -72,7 +72,7 @@ def test_where_all_diverge_it_is_said_and_why(problem, monkeypatch):
         while row is not None:
             row = descent._next_stage((problem,), BUDGET, row, derivatives_at)
     with pytest.raises(RuntimeError, match="all starts of the descents diverged"):
-        descent.multi_start((problem,), Budget(shares=(), coarse=0, starts=1), key=jr.key(0))
+        descent.multi_start((problem,), Budget(num_samples=0, num_starts=1), key=jr.key(0))
 
 
 def test_cma_es_gives_no_fabric_of_runs_that_all_diverged(problem, monkeypatch):
@@ -111,7 +111,7 @@ def test_without_a_derivative_an_estimate_is_not_sure_and_knows_what_was_known(p
         found = derivatives_at(problems, theta, width)
         return [(seen, jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), s)) for seen, s in found]
 
-    budget = Budget(coarse=0, starts=1, around=0, iterations=3)
+    budget = Budget(num_samples=0, num_starts=1, num_probes=0, max_iterations=3)
     found = descent.multi_start((problem,), budget, derive=without, key=jr.key(0))
     estimate = with_uncertainty(found, budget, key=jr.key(1))
     assert not estimate.converged and estimate.unsure == NO_DERIVATIVE

@@ -12,21 +12,22 @@ from windows import window
 
 from r2s import scenarios
 from r2s.estimation import baselines, descent, gauss_newton, prediction
-from r2s.estimation.estimate import Estimate, as_json, from_json
+from r2s.estimation.estimate import Estimate, as_json, from_json, point_estimate
 from r2s.estimation.gauss_newton import Descent, normals_at
 from r2s.estimation.judgement import descend, sensitivity
 from r2s.estimation.method import Budget
-from r2s.estimation.methods import problems_on_points
+from r2s.estimation.methods import problems_on_mpm
 from r2s.estimation.normal_equations import loss_of, normal_equations_of
 from r2s.estimation.prediction import Prediction, Sensitivity, _delayed, predict, sensitivities
 from r2s.estimation.problem import OWN, NuisancePrior, Problem, beginning
+from r2s.estimation.summary import next_recording
 from r2s.materials import presets
 from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace, Range
 from r2s.recordings.recording import set_time_offset
 from r2s.scenarios import synthetic
 
 ALL = NuisancePrior(time=0.05, density=0.2, air=0.3, size=0.05)
-SMALL = Budget(coarse=2, starts=1, iterations=4, shares=(0.5,), around=2)
+SMALL = Budget(num_samples=2, num_starts=1, max_iterations=4, frame_fractions=(0.5,), num_probes=2)
 FABRIC = presets.grey_interlock()
 FAMILY = OrthotropicSpace.make(float(FABRIC.density))
 
@@ -228,7 +229,8 @@ def test_an_estimate_lowers_the_loss_and_survives_its_file(estimated):
     assert float(again.fabric.membrane.c12) == pytest.approx(float(found.fabric.membrane.c12))
     names = ["density ratio", "air ratio", "size ratio", *OWN]
     assert [c.name for c in again.nuisances] == names
-    assert again.nuisances == found.nuisances and again.combinations == found.combinations
+    assert again.nuisances == found.nuisances and again.fits == found.fits
+    np.testing.assert_allclose(again.narrowing, found.narrowing)
 
 
 @pytest.mark.slow(group="estimates")
@@ -260,27 +262,48 @@ def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(small, estimated, tmp
         descend(small, SMALL, checkpoint=path, key=jr.key(0))
 
 
-def test_what_is_known_of_a_product_is_said():
-    """Two parameters of which only the ratio is known, and a third that is."""
+def test_intervals_narrowing_and_correlations_are_those_of_the_covariance():
+    """Two parameters of which only the ratio is known, and a third that is known alone."""
     ranges = (
         Range("a", "N/m", 1.0, 100.0),
         Range("b", "N/m", 1.0, 100.0),
-        Range("c", "-", 0.1, 10.0),
+        Range("c", "-", -0.9, 0.9, log=False),
     )
     spread, ratio = 0.5, 0.01
     covariance = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 0]]) * spread**2
     covariance += np.diag([ratio**2 / 2, ratio**2 / 2, 1e-4])
     deviation = np.sqrt(np.diag(covariance))
     found = Estimate(
-        "test", FABRIC, ranges, np.array([8.0, 2.0, 1.0]), deviation,
+        "test", FABRIC, ranges, np.array([8.0, 2.0, 0.1]), deviation,
         covariance / np.outer(deviation, deviation), (), 0.0, np.zeros((1, 1)),
         np.zeros((1, 1, 3)), 0.0, None,
     )  # fmt: skip
-    assert found.identifiable.tolist() == [False, False, True]
-    (known,) = found.combinations
-    assert sorted(known.exponents.values()) == [-1.0, 1.0] and set(known.exponents) == {"a", "b"}
-    assert known.value == pytest.approx(4 if known.exponents["a"] > 0 else 0.25)
-    assert known.standard_error == pytest.approx(ratio, rel=1e-6)
+    factor = np.exp(1.645 * deviation[0])
+    expected = [[8 / factor, 8 * factor], [1.0, 2 * factor], [0.1 - 0.01645, 0.1 + 0.01645]]
+    assert found.intervals == pytest.approx(np.array(expected))  # b's is cut at its range
+    uniform = 1 / np.sqrt(12)
+    assert found.narrowing == pytest.approx(
+        [spread / (np.log(100) * uniform)] * 2 + [0.01 / (1.8 * uniform)], rel=0.01
+    )
+    (one, other, r), *_ = found.correlated()
+    assert {one, other} == {"a", "b"} and r == pytest.approx(1, abs=1e-3)
+    known = dataclasses.replace(found, prior_errors=2 * deviation)
+    assert known.narrowing == pytest.approx([0.5] * 3)
+    assert from_json(as_json(known)).narrowing == pytest.approx([0.5] * 3)
+
+
+def test_the_next_recording_is_that_of_what_is_narrowed_least():
+    space = OrthotropicSpace.make(0.2)
+    place, none = jnp.full(space.dim, 0.5), np.zeros((1, 1))
+    found = point_estimate("any", space, place, 0.0, none, none[None], 0.0)
+    assert next_recording(found) == []  # without standard errors nobody knows
+    widths = np.array([bound.width for bound in space.ranges])
+    for number, words in ((0, "stretchings"), (4, "cantilever"), (5, "fling"), (6, "table")):
+        errors = 0.01 * widths
+        errors[number] = widths[number]
+        errors[:4] = errors[number] if number == 0 else errors[:4]
+        (line,) = next_recording(dataclasses.replace(found, standard_errors=errors))
+        assert words in line and space.ranges[number].name in line
 
 
 def test_what_a_beginning_is(small):
@@ -298,13 +321,13 @@ def test_what_a_beginning_is(small):
     assert frames(late, 0.67) == [False, True, True, False]
     assert frames(late, 0.01) == [False, True, False, False]
     with pytest.raises(ValueError, match="needs a start or more, got 0"):
-        descend(small, SMALL._replace(starts=0), key=jr.key(0))
+        descend(small, SMALL._replace(num_starts=0), key=jr.key(0))
     for count in (3, -2):
-        with pytest.raises(ValueError, match=f"an even number, got {count}"):
-            descend(small, SMALL._replace(around=count), key=jr.key(0))
+        with pytest.raises(ValueError, match=f"in pairs, got {count}"):
+            descend(small, SMALL._replace(num_probes=count), key=jr.key(0))
     for shares in ((0.5, 0.25), (0.5, 1.0), (0.0,), (0.5, 0.5)):
-        with pytest.raises(ValueError, match="shares of the frames must rise between 0 and 1"):
-            descend(small, SMALL._replace(shares=shares), key=jr.key(0))
+        with pytest.raises(ValueError, match="frame_fractions must rise between 0 and 1"):
+            descend(small, SMALL._replace(frame_fractions=shares), key=jr.key(0))
 
 
 @pytest.mark.slow(group="estimates")
@@ -419,9 +442,10 @@ def test_a_known_fabric_and_a_late_clock_are_found(name):
     problem = Problem.make(record, space, nuisance_prior=NuisancePrior(time=0.1))
     found = descend(problem, approach="test", key=jr.key(0))
     truth = np.asarray(space.values(space.to_unit(fabric)))
-    assert found.identifiable.sum() >= 3
+    narrowed = found.narrowing < 0.05
+    assert narrowed.sum() >= 3
     error = np.abs(np.where(truth > 0, found.values / truth - 1, found.values - truth))
-    assert np.all(error[found.identifiable] < 0.1)
+    assert np.all(error[narrowed] < 0.1)
     delay = found.nuisances[-1]
     assert delay.name == "time" and abs(delay.value - 0.08) < 0.01
 
@@ -463,7 +487,7 @@ def test_a_planned_motion_reveals_more_with_better_cameras():
 @pytest.mark.slow(group="estimates")
 def test_material_points_find_a_known_modulus():
     """Of an isotropic sheet, by DiffCP; the same sheet of cloth is refused."""
-    from r2s.scenarios import material_points
+    from r2s.scenarios import mpm_cloth
 
     space = IsotropicSpace.make(0.2, plate=5e-4)
     place = jnp.array([0.3, 0.6])
@@ -473,15 +497,15 @@ def test_material_points_find_a_known_modulus():
         space(place),
         "sheet",
         shape=(4, 4),
-        solver=lambda scenario, fabric: material_points(scenario, space(jnp.ones(2))),
+        solver=lambda scenario, fabric: mpm_cloth(scenario, space(jnp.ones(2))),
         key=jr.key(0),
     )
     problem = Problem.make(record, space, num_points=100, shape=(4, 4))
     with pytest.raises(ValueError, match="material points"):
         baselines.diffcp_recipe(problem)
-    budget = Budget(coarse=0, starts=1, iterations=6, width=0.02, around=2)
+    budget = Budget(num_samples=0, num_starts=1, max_iterations=6, secant_width=0.02, num_probes=2)
     start = jnp.array([0.25, 0.5])
-    found = descend(problems_on_points([record], space, (4, 4)), budget, start=start, key=jr.key(0))
+    found = descend(problems_on_mpm([record], space, (4, 4)), budget, start=start, key=jr.key(0))
     truth = np.asarray(space.values(place))
     spread = found.standard_errors * np.where([b.log for b in space.ranges], truth, 1)
     assert np.all(np.abs(found.values - truth) < 4 * spread)

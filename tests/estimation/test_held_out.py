@@ -120,24 +120,26 @@ def test_a_run_that_diverged_is_no_better_than_anything():
         assert lost.describe().startswith("warning")
     assert "diverged" in HeldOut("fling", float("inf"), (1e-2,), 0, 1e-2).describe()
     nothing_else = HeldOut("fling", 4e-3, (8e-3, 12e-3), 0, float("inf"))
-    assert nothing_else.is_better and "the middle of the prior -" in nothing_else.describe()
+    assert nothing_else.is_better and "prior mean - mm" in nothing_else.describe()
 
 
 def test_the_line_says_better_or_warns():
     good = HeldOut("fling", 4e-3, (8e-3, 12e-3), 1, 9e-3).describe()
     assert good == (
-        "held out, fling: 4.0 mm; knowing nothing 10.0 mm (8.0 to 12.0, 2 draws, 1 more diverged; "
-        "the middle of the prior 9.0): better than every draw"
+        "held-out motion fling: mean distance 4.0 mm; prior mean 9.0 mm; prior samples 10.0 mm on "
+        "average (8.0 to 12.0, 2 samples, 1 more diverged): better than the prior mean and every "
+        "sample"
     )
     apart = (8e-3, 12e-3)
-    assert HeldOut("fling", 9e-3, apart, 0, 1e-2).describe().endswith("draws on average")
-    assert HeldOut("fling", 11e-3, apart, 0, 2e-2).describe().startswith("warning: held out")
+    assert HeldOut("fling", 9e-3, apart, 0, 1e-2).describe().endswith("the average sample")
+    assert HeldOut("fling", 11e-3, apart, 0, 2e-2).describe().startswith("warning: held-out")
 
 
 def test_an_estimate_that_is_worse_than_the_best_guess_by_the_weight_has_learnt_nothing():
     """The draws scatter about the middle of the prior, which is nearer than most of them."""
     found = HeldOut("fling", 16e-3, (10e-3, 48e-3), 0, 8.5e-3)
     assert not found.is_better and found.describe().startswith("warning")
+    assert "not better than the prior mean, so" in found.describe()
 
 
 def test_a_motion_in_which_all_fabrics_are_alike_tells_nothing():
@@ -145,8 +147,8 @@ def test_a_motion_in_which_all_fabrics_are_alike_tells_nothing():
     fold = (2.4e-3, 2.6e-3)
     for error in (2.0e-3, 3.1e-3):
         words = HeldOut("fold", error, fold, 0, 2.5e-3).describe()
-        assert not words.startswith("warning") and "not told" in words
+        assert not words.startswith("warning") and "no verdict" in words
     assert HeldOut("fold", 9e-3, fold, 0, 2.5e-3).describe().startswith("warning")
-    assert HeldOut("fold", 1e-3, fold, 0, 2.5e-3).describe().endswith("better than every draw")
+    assert HeldOut("fold", 1e-3, fold, 0, 2.5e-3).describe().endswith("and every sample")
     apart = HeldOut("fold", 2.4e-3, fold, 0, 9e-3)  # the middle is another fabric, too
     assert apart.is_discriminating and apart.is_better

@@ -11,11 +11,11 @@ from known_ends import FABRIC, FAMILY, short_problem
 
 from r2s import scenarios
 from r2s.estimation import baselines, gauss_newton
-from r2s.estimation.estimate import describe
 from r2s.estimation.judgement import descend
 from r2s.estimation.method import Budget
 from r2s.estimation.prediction import free_nuisances, nuisances, predict, theta_length
 from r2s.estimation.problem import NuisancePrior, Problem, default_nuisance_prior
+from r2s.estimation.summary import describe
 from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
 from r2s.recordings.recording import MeasurementUncertainty
@@ -82,12 +82,12 @@ def test_the_air_is_in_doubt_where_a_wind_blows(blown, lifted):
 @pytest.mark.slow(group="estimates")
 def test_an_estimate_says_what_was_in_doubt(lifted):
     """And places around its end have a say in its deviations alone."""
-    budget = Budget(coarse=0, starts=1, iterations=1, around=0)
+    budget = Budget(num_samples=0, num_starts=1, max_iterations=1, num_probes=0)
 
     def run(budget):
         return descend(lifted, budget, key=jr.key(0))
 
-    alone, found = run(budget), run(budget._replace(around=4))
+    alone, found = run(budget), run(budget._replace(num_probes=4))
     np.testing.assert_array_equal(found.values, alone.values)
     np.testing.assert_array_equal(found.losses, alone.losses)
     assert np.all(found.standard_errors > 0) and np.all(np.isfinite(found.standard_errors))

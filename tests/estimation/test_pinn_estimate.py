@@ -182,7 +182,7 @@ def test_an_estimate_from_two_pulls_survives_its_file():
     with jax.numpy_dtype_promotion("standard"):
         found = estimate([even_pull(seed=i) for i in range(2)], FAMILY, TINY, key=jr.key(0))
     np.testing.assert_allclose(found.values[0], WARP, rtol=5e-3)
-    assert found.identifiable[0] and not found.identifiable[4]
+    assert found.narrowing[0] < 0.05 and found.narrowing[4] > 0.9
     assert "2 pulls" in found.approach
     np.testing.assert_allclose(from_json(as_json(found)).values, found.values)
 
@@ -194,7 +194,7 @@ def test_without_force_the_report_says_so():
     assert "the scale of stiffness is not identifiable" in found.approach
     scale = {condition.name: condition for condition in found.nuisances}["stiffness scale"]
     assert scale.standard_error > 0.3 * scale.value
-    assert not found.identifiable[:3].any()
+    assert (found.narrowing[:3] > 0.1).all()
 
 
 @pytest.mark.slow(group="pinn")
@@ -319,9 +319,6 @@ def test_the_cloths_fabric_is_found(name, monkeypatch):
         ]
         found = estimate(some, space, key=jr.key(1))
     truth = np.asarray(space.values(space.to_unit(fabric)))
-    # that stiffness is constant half of a pull tells to a few per cent: of pink solid not to 5 %
-    told = found.identifiable[:4]
-    assert told.all() or (name == "pink_solid" and told[3])
     assert (found.standard_errors[:3] < 0.1).all()
     np.testing.assert_allclose(found.values[:3], truth[:3], rtol=0.05)
     np.testing.assert_allclose(found.values[3], truth[3], atol=0.05)

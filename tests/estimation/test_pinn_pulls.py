@@ -111,7 +111,7 @@ BAD = {
     "clamped at four corners": lambda: dataclasses.replace(
         recording(),
         info=dataclasses.replace(
-            recording().info, sheet=dataclasses.replace(recording().info.sheet, held=("origin",))
+            recording().info, sheet=dataclasses.replace(recording().info.sheet, pinned=("origin",))
         ),
     ),
 }

@@ -148,7 +148,7 @@ def test_where_derivatives_overflow_nothing_is_known(lifted):
 def test_deviations_hang_on_no_limit_and_hardly_on_rounding():
     """Of an end that is moved by less than single precision resolves, and of a mesh that moves
     alike: two answers would differ by far."""
-    problems, budget = (short_problem(8),), Budget(around=4)
+    problems, budget = (short_problem(8),), Budget(num_probes=4)
     nuisances = jnp.zeros(theta_length(problems) - FAMILY.dim)
     theta, zero = jnp.concatenate([FAMILY.to_unit(FABRIC), nuisances]), jnp.zeros(())
 

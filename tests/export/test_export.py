@@ -171,7 +171,7 @@ def test_mujoco_has_the_sheet_in_its_numbers():
 
 
 def test_mujoco_has_masses_grips_and_yarns_in_a_whole_model():
-    text, _ = mujoco.mjcf(DENIM, MESH, held=(3,))
+    text, _ = mujoco.mjcf(DENIM, MESH, pinned=(3,))
     tree = xml.fromstring(text)
     masses = [float(each.attrib["mass"]) for each in tree.iter("inertial")]
     np.testing.assert_allclose(masses, 0.32 * np.asarray(MESH.vertex_area))

@@ -24,7 +24,7 @@ def drape() -> r2s.Scenario:
     times = INTERVAL * np.arange(FRAMES + 1)
     eased = np.clip(times, 0, 1) ** 2 * (3 - 2 * np.clip(times, 0, 1))
     way = (corners.mean(axis=0) - corners) / 20
-    scene = r2s.Scene(mesh, held, r2s.Table.make(-jnp.inf), r2s.Air.make(density=0.0))
+    scene = r2s.Scene(mesh, held, air=None)
     falling = jnp.array([0.0, 0.0, -GRAVITY])
     return r2s.Scenario(
         scene=scene,
@@ -44,13 +44,13 @@ def in_mujoco(scenario: r2s.Scenario) -> np.ndarray:
     """Positions [m] (vertex, 3) of the exported fabric at the end, without contact."""
     mujoco = pytest.importorskip("mujoco", reason="needs r2s[mujoco]")
     dt, sheet = INTERVAL / STEPS, scenario.scene.mesh
-    text, _ = mjcf(FABRIC, sheet, held=CORNERS, height=HEIGHT, table=None, timestep=dt)
+    text, _ = mjcf(FABRIC, sheet, pinned=CORNERS, height=HEIGHT, table=None, timestep=dt)
     model = mujoco.MjModel.from_xml_string(text)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     brake(model, FABRIC)
     data = mujoco.MjData(model)
-    for handles in np.asarray(scenario.controls(STEPS).handles).reshape(-1, len(CORNERS), 3):
-        data.mocap_pos[:] = handles
+    for pinned in np.asarray(scenario.controls(STEPS).pinned):
+        data.mocap_pos[:] = pinned
         mujoco.mj_step(model, data)
     mujoco.mj_kinematics(model, data)  # positions lag by a step otherwise
     mujoco.mj_flex(model, data)

@@ -12,8 +12,6 @@ import pytest
 
 import r2s
 from r2s._util.units import GRAVITY
-from r2s.environment.air import Air
-from r2s.environment.contact import Table
 from r2s.environment.scene import Control, Scene
 from r2s.estimation.default_spaces import on_cloth
 from r2s.laboratory.bending import Cantilever, Drape, coefficient, drape, overhang, ring
@@ -28,7 +26,7 @@ from r2s.materials.nonlinear_spaces import StiffeningSpace
 from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
 from r2s.materials.tables import TableMembrane
 from r2s.mesh.mesh import rectangle
-from r2s.solvers.implicit.cloth import Cloth
+from r2s.solvers.implicit.cloth import ImplicitCloth
 from r2s.solvers.implicit.potential import residual
 
 LAW = OrthotropicMembrane(*(jnp.asarray(c, float) for c in (300.0, -60.0, 200.0, 40.0)))
@@ -115,8 +113,8 @@ def test_clamps_pull_a_long_strip_as_free_sides_do(cells, off):
     warp = np.asarray(mesh.rest[:, 0])
     ends = np.flatnonzero((warp < 1e-9) | (warp > length - 1e-9))
     fabric = Fabric.make(0.01, (300.0, 90.0, 300.0, 105.0), 1e-7)
-    scene = Scene(mesh, jnp.asarray(ends), Table.make(-10.0), Air.make(0.0))
-    solver = Cloth.make(scene, 5.0)
+    scene = Scene(mesh, ends, air=None)
+    solver = ImplicitCloth(scene, 5.0)
     flat = jnp.pad(mesh.rest, ((0, 0), (0, 1)))
     start = flat.at[:, 0].multiply(1.05)
     control = Control(start[ends], jnp.zeros(3))
@@ -479,7 +477,7 @@ def test_tests_alone_make_a_card(tmp_path: Path, capsys: pytest.CaptureFixture):
     assert card.provenance.method == "estimated by r2s: laboratory tests"
     assert card.provenance.recordings[0][0] == "tests"
     assert "cantilever 1: overhang 50.0 mm measured" in capsys.readouterr().out
-    assert main([*command, "--starts", "1"]) == 1
+    assert main([*command, "--num-starts", "1"]) == 1
     assert main([*command, "--method", "physnet"]) == 1
     assert "--method, --solver" in capsys.readouterr().err
     assert main([*command, "--law", "stiffening"]) == 0

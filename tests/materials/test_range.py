@@ -28,23 +28,23 @@ MOST_WEIGHT = 1.0
 @pytest.mark.parametrize(
     "table",
     [
-        pytest.param(-jnp.inf, id="air"),
+        pytest.param(None, id="air"),
         pytest.param(0.0, id="table"),
     ],
 )
 def test_every_fabric_of_the_range_has_a_finite_gradient(table):
     with jax.enable_x64(False):
         mesh = rectangle((SIDE, SIDE), (CELLS + 1, CELLS + 1))
-        solver = cloth(mesh, held=(0,), table=table, air=1.2, dt=1 / 60)
+        solver = cloth(mesh, pinned=(0,), table=table, air=1.2, dt=1 / 60)
         along = jnp.minimum(jnp.arange(1, 61) / 60, 1.0)
-        handle = jnp.stack([0.1 * along, 0.1 * along, 1e-3 + 0.2 * along], axis=-1)
-        controls = Control(handle.reshape(20, 3, 1, 3), jnp.zeros((20, 3, 3)))
+        path = jnp.stack([0.1 * along, 0.1 * along, 1e-3 + 0.2 * along], axis=-1)
+        control = Control(path[:, None])
         start = solver.init(flat(mesh, 1e-3))
 
         @eqx.filter_jit
         def both(fabric):
             def run(fabric):
-                return jnp.mean(simulate(solver, fabric, start, controls).x[-1] ** 2)
+                return jnp.mean(simulate(solver, fabric, start, control, save_every=3).x[-1] ** 2)
 
             return jax.value_and_grad(run)(fabric)
 

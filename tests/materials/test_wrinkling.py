@@ -97,16 +97,16 @@ def test_forces_on_material_points_are_those_of_the_stored_energy():
 @pytest.mark.slow(group="cloth")
 def test_a_motion_of_wrinkled_cells_has_the_gradient_that_differences_have():
     sheet = rectangle((0.2, 0.2), (5, 5), "wrinkling")
-    scene = r2s.Scene(sheet, jnp.array([0, 4]), r2s.Table.make(-jnp.inf), r2s.Air.make())
-    solver, start = r2s.Cloth.make(scene, dt=0.01), jnp.pad(sheet.rest, ((0, 0), (0, 1)))
+    scene = r2s.Scene(sheet, [0, 4])
+    solver, start = r2s.ImplicitCloth(scene, dt=0.01), jnp.pad(sheet.rest, ((0, 0), (0, 1)))
     nearer = jnp.outer(jnp.linspace(0, 0.04, 10), jnp.array([0.0, 1, 0]))
     path = start[jnp.array([0, 4])][None] + jnp.stack([nearer, -nearer], axis=1)
-    controls = r2s.Control(path[None], jnp.zeros((1, 10, 3)))
+    control = r2s.Control(path)
     knit = presets.grey_interlock()
 
     def height(stiffness):
         fabric = eqx.tree_at(lambda f: f.bending.stiffness, knit, stiffness)
-        return jnp.mean(r2s.simulate(solver, fabric, solver.init(start), controls).x[-1, :, 2])
+        return jnp.mean(r2s.simulate(solver, fabric, solver.init(start), control).x[-1, :, 2])
 
     height, at = jax.jit(height), jnp.asarray(5.5e-6)
     slope, h = jax.jit(jax.grad(height))(at), 1e-10

@@ -10,9 +10,9 @@ from r2s.materials import presets
 from r2s.metrics import prediction_error
 from r2s.recordings.recording import cloud
 from r2s.scenarios import synthetic
-from r2s.scenarios.standard import SIX
-from r2s.solvers.failures import Failure
-from r2s.solvers.simulate import Trajectory
+from r2s.scenarios.standard import SCENARIOS
+from r2s.solvers.results import Result
+from r2s.solvers.simulate import Solution
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_the_true_fabric_is_nearer_than_another_and_than_noise_allows(lift, pred
 
 @pytest.mark.slow(group="study")
 def test_a_whole_surface_tells_the_true_fabric_by_every_metric():
-    experiment, fabric = SIX["fling"](), presets.grey_interlock()
+    experiment, fabric = SCENARIOS["fling"](), presets.grey_interlock()
     seen = synthetic.record(experiment, fabric, "grey", seen=synthetic.WHOLE, key=jr.key(0))
     clouds = [cloud(seen, frame) for frame in (0, 30)]
     assert all(len(points) == len(clouds[0]) > 5000 for points in clouds)
@@ -67,18 +67,20 @@ def test_a_diverged_motion_is_a_result(lift):
 
 
 def test_a_run_that_fails_is_lost_from_there_on_and_says_why(monkeypatch):
-    failed = Trajectory(
+    failed = Solution(
         x=jnp.zeros((3, 9, 3)),
+        v=jnp.zeros((3, 9, 3)),
+        times=jnp.arange(3) / 15,
+        final_state=None,
         ok=jnp.array([True, False, True]),
-        failure=jnp.array(Failure.NON_FINITE.value),
-        failed_frame=jnp.array(1),
-        failed_step=jnp.array(2),
+        result=jnp.array(Result.NON_FINITE.value),
+        failed_at=jnp.array(0.05),
     )
     monkeypatch.setattr(prediction_error, "_rollout", lambda *_, **__: failed)
-    scenario = SIX["fling"]().scenario((3, 3))
+    scenario = SCENARIOS["fling"]().scenario((3, 3))
     moved = prediction_error.predict_motion(scenario, presets.grey_interlock())
     assert np.isfinite(moved.x).all(axis=(1, 2)).tolist() == [True, False, False]
-    assert "frame 1, step 2" in moved.failure
+    assert "failed at 0.05 s" in moved.failure
 
 
 @pytest.mark.slow(group="motions")

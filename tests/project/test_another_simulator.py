@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 from r2s._util.units import GRAVITY
-from r2s.environment.air import Air
-from r2s.environment.contact import Table
 from r2s.environment.scene import Scene
 from r2s.estimation.method import Budget
 from r2s.materials.fabric import Fabric
@@ -19,7 +17,7 @@ from r2s.materials.parameters import OrthotropicSpace
 from r2s.mesh.mesh import rectangle
 from r2s.mesh.surface import nearest
 from r2s.scenarios.scenario import Scenario, begin, rollout, stepped
-from r2s.solvers.implicit.cloth import Cloth
+from r2s.solvers.implicit.cloth import ImplicitCloth
 
 needs_data = pytest.mark.skipif(not runs.DATA.is_dir(), reason=f"no data in {runs.DATA}")
 INTERVAL = 0.02  # [s]
@@ -38,7 +36,7 @@ def dropped(air: float = 0.0, brake: float | None = None) -> Scenario:
     start = jnp.pad(mesh.rest, ((0, 0), (0, 1)))
     falling = jnp.zeros_like(start).at[1:, 2].set(-GRAVITY)
     return Scenario(
-        scene=Scene(mesh, jnp.array([0]), Table.make(-jnp.inf), Air.make(air)),
+        scene=Scene(mesh, [0], air=air),
         start=start,
         path=jnp.zeros((2, 1, 3)),
         path_times=jnp.array([0.0, 1.0]),
@@ -73,7 +71,7 @@ def test_the_first_acceleration_reaches_a_braked_solver():
     state = begin(solver, scenario)
     assert jnp.all(state.inner.v_before[1:, 2] == GRAVITY * solver.dt)
 
-    free = Cloth.make(scenario.scene, 0.01)
+    free = ImplicitCloth(scenario.scene, 0.01)
     assert jnp.all(begin(free, dataclasses.replace(scenario, acceleration=None)).v_before == 0)
 
 

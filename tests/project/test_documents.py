@@ -13,7 +13,7 @@ from folders import ROOT
 import r2s
 
 README = ROOT / "README.md"
-DOCUMENTS = [README, *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 SOURCES = [
     path for name in ("r2s", "experiments", "benchmarks") for path in (ROOT / name).rglob("*.py")
 ]
@@ -55,6 +55,8 @@ def test_the_files_and_modules_that_a_document_names_are_there(document):
         assert (ROOT / name).exists(), f"{document.name} names {name}"
     for name in re.findall(r"\]\(([\w./]+\.(?:md|jpg|csv))\)", text):
         assert (document.parent / name).exists(), f"{document.name} links to {name}"
+    wide = [line for line in text.splitlines() if len(line) > 120]
+    assert not wide, f"{document.name}: longer than 120 characters: {wide[0][:80]}"
 
 
 @pytest.mark.parametrize("source", [*DOCUMENTS, *SOURCES], ids=lambda path: path.name)
@@ -84,7 +86,7 @@ def test_the_tables_of_a_document_are_those_of_its_files(document, tables):
 def test_a_file_of_results_says_what_made_it_and_is_shown(path, tables):
     lines, facts = tables.read(path)
     assert lines and {"table", "command", "version", "machine", "date"} <= set(facts)
-    shown = f"<!-- {path.stem} -->", f"(results/{path.name})"
+    shown = f"<!-- {path.stem} -->", f"({path.name})"
     texts = [document.read_text(encoding="utf-8") for document in DOCUMENTS]
     assert any(words in text for words in shown for text in texts)
 

@@ -82,7 +82,7 @@ def test_a_folder_without_the_scenario_is_named(module, tmp_path: Path) -> None:
         module("_recordings").recordings_in(tmp_path, "lift")
 
 
-@pytest.mark.parametrize("name", ["diffcp-points-lifting", "pinn-cloth-stretching"])
+@pytest.mark.parametrize("name", ["diffcp-mpm-lifting", "pinn-cloth-stretching"])
 def test_what_a_table_of_skills_compares_is_all_predicted_on_the_cloth(module, name: str) -> None:
     pytest.importorskip("psutil", reason="needs r2s[study]")
     cells = module("_skills")._cells(name, "grey_interlock", ("fling",))
@@ -103,16 +103,16 @@ def test_a_line_of_several_sources_is_refused(tables, tmp_path: Path, monkeypatc
         tables.made_by([], tmp_path)
 
 
-def test_what_is_not_identifiable_or_diverged_is_no_interval_that_holds(module) -> None:
+def test_what_is_not_narrowed_or_diverged_is_no_interval_that_holds(module) -> None:
     by_parameter = module("coverage").by_parameter
     line = {"fabric": "knit", "repeat": "1", "warp": "+0.50", "damping": "(-2.00)"}
-    lines = [line | {"identifiable off at most": "0.1"}, {"repeat": "2", "converged": "diverged"}]
+    lines = [line | {"narrowed off at most": "0.1"}, {"repeat": "2", "converged": "diverged"}]
     warp, damping, every = by_parameter(lines)
-    assert (warp["held"], warp["identifiable"], warp["held of these"]) == ("1 of 2", "1", "1")
+    assert (warp["held"], warp["narrowed"], warp["held of these"]) == ("1 of 2", "1", "1")
     assert (damping["held"], damping["errors off at most"]) == ("0 of 2", "-")
     assert every["held"] == "1 of 4" and every["errors off at most"] == "0.5"
     # as a table that begins with the one that diverged is read back
-    lost = {"converged": "diverged", "warp": "", "damping": "", "identifiable off at most": ""}
+    lost = {"converged": "diverged", "warp": "", "damping": "", "narrowed off at most": ""}
     again = {"converged": "yes"} | lines[0]
     read_back = [
         {"fabric": "knit", "repeat": n} | each for n, each in zip("21", (lost, again), strict=True)

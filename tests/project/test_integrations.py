@@ -174,8 +174,8 @@ def test_a_case_is_a_sheet_that_hands_lift(tmp_path: Path, hands: int):
     recording = read_case(case(tmp_path, hands))
     info = recording.info
     assert sorted(info.sheet.size) == pytest.approx([0.3, 0.4], abs=1e-6)
-    assert len(info.sheet.held) == hands
-    path = np.asarray(recording.handle_path)
+    assert len(info.sheet.pinned) == hands
+    path = np.asarray(recording.gripper_path)
     np.testing.assert_allclose(path[-1, :, 2] - path[0, :, 2], 0.2, atol=1e-6)
     turn = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
     ends = np.array([[0.4, 0.3], [0.4, 0.0]])[:hands] @ turn.T

@@ -31,7 +31,11 @@ def test_every_manifest_and_the_public_names_are_package_data() -> None:
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     patterns = settings["package-data"]["r2s"]
     listed = {path.resolve() for pattern in patterns for path in PACKAGE.glob(pattern)}
-    others = {PACKAGE / "__init__.pyi", PACKAGE / "study" / "report" / "report.html.j2"}
+    others = {
+        PACKAGE / "__init__.pyi",
+        PACKAGE / "py.typed",
+        PACKAGE / "study" / "report" / "report.html.j2",
+    }
     assert listed == {*others, *MANIFESTS.rglob("*.json")}
 
 
@@ -48,7 +52,8 @@ IMPORTED_AS = {
 def test_every_library_that_is_declared_is_imported() -> None:
     """All but the tools of development, which are run as commands."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    extras = {k: v for k, v in project["optional-dependencies"].items() if k != "dev"}
+    others = "dev", "all"
+    extras = {k: v for k, v in project["optional-dependencies"].items() if k not in others}
     listed = [text for group in (project["dependencies"], *extras.values()) for text in group]
     names = {re.split(r"[<>=!]", text)[0] for text in listed}
     folders = (ROOT / each for each in ("r2s", "experiments", "benchmarks"))

@@ -47,8 +47,8 @@ def test_a_capture_is_in_the_world_and_on_the_arms_clock(capture: Path) -> None:
     np.testing.assert_allclose(recording.times, 0.05 + 0.06 * np.arange(5), atol=1e-6)
     for i in range(5):
         np.testing.assert_allclose(cloud(recording, i), POINTS + [0, 0, 0.06 * i], atol=1e-6)
-    np.testing.assert_allclose(recording.handle_path[10, :, 1], [0.25, -0.25])
-    np.testing.assert_allclose(recording.handle_path[10, :, 2], [0.1, 0.1], atol=1e-6)
+    np.testing.assert_allclose(recording.gripper_path[10, :, 1], [0.25, -0.25])
+    np.testing.assert_allclose(recording.gripper_path[10, :, 2], [0.1, 0.1], atol=1e-6)
     info = recording.info
     assert (info.fabric, info.scenario, info.trial) == (
         "green_tshirt",

@@ -37,7 +37,7 @@ def folder(tmp_path_factory):
 def said(folder, capsys, *names, density=DENSITY):
     """What the command prints."""
     files = [str(folder / f"{name}.npz") for name in names]
-    budget = ["--coarse", "4", "--starts", "1", "--law", "linear", "--shape", "5", "5"]
+    budget = ["--num-samples", "4", "--num-starts", "1", "--law", "linear", "--shape", "5", "5"]
     out = ["--out", str(folder / "card.json"), "--density", str(density)]
     assert main(["estimate", *files, *out, *budget]) == 0
     return capsys.readouterr().out

@@ -192,11 +192,11 @@ def test_markers_that_move_apart_are_found():
 
 
 @pytest.mark.slow(group="motions")
-@pytest.mark.parametrize("name", list(scenarios.SIX))
+@pytest.mark.parametrize("name", list(scenarios.SCENARIOS))
 @pytest.mark.parametrize("fabric", list(presets.FIVE))
 def test_nothing_is_suspicious_in_the_study_s_recordings(name, fabric):
     made = synthetic.record(
-        scenarios.SIX[name](), presets.FIVE[fabric](), fabric, key=jax.random.key(0)
+        scenarios.SCENARIOS[name](), presets.FIVE[fabric](), fabric, key=jax.random.key(0)
     )
     assert suspicious(made) == set()
 

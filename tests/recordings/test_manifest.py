@@ -148,8 +148,8 @@ def test_a_recording_is_in_metres_and_seconds(folder: Path) -> None:
     # The turn takes x to -y and y to x; half a metre a unit; one of the two equal points is kept.
     np.testing.assert_allclose(cloud(recording, 1), [[1, -0.5, 2.5], [0, 0, 1.5]], rtol=1e-6)
     np.testing.assert_allclose(recording.times, [-0.01, 0.04, 0.09], rtol=1e-6)
-    np.testing.assert_allclose(recording.handle_path[:, 0, 2], [1.5, 3.5])
-    np.testing.assert_allclose(recording.handle_times, [0, 0.1], rtol=1e-6)
+    np.testing.assert_allclose(recording.gripper_path[:, 0, 2], [1.5, 3.5])
+    np.testing.assert_allclose(recording.gripper_times, [0, 0.1], rtol=1e-6)
 
 
 def test_discovery_takes_every_folder_that_fits(folder: Path) -> None:
@@ -210,10 +210,10 @@ def test_a_missing_folder_or_gripper_is_named(folder: Path) -> None:
 @pytest.mark.parametrize(
     "path, words",
     [
-        (GRIPPER[:1], r"pull_tan: the handle path ends at 0 s, before the last frame at 0.09 s"),
+        (GRIPPER[:1], r"pull_tan: the gripper path ends at 0 s, before the last frame at 0.09 s"),
         (GRIPPER[:, :2], r"gripper.npy: expected \(knot, 3\)"),
         (GRIPPER * np.nan, "gripper.npy: the gripper path is not finite"),
-        (GRIPPER[:, None].repeat(2, axis=1), "2 handles, the sheet is held at"),
+        (GRIPPER[:, None].repeat(2, axis=1), "the path has 2 grippers, the sheet is pinned at"),
     ],
 )
 def test_a_bad_gripper_path_is_an_error(folder: Path, path: np.ndarray, words: str) -> None:
@@ -263,7 +263,7 @@ def test_all_real_recordings_are_whole_and_verified(real: dict[str, Recording]) 
         assert info.verified is True
         assert info.fabric in ("navy", "paper", "polka", "redblack", "tan")
         assert info.trial in ("1", "2") and info.scenario in ("lift", "fold")
-        assert recording.times.shape == (25,) and recording.handle_times.shape == (25,)
+        assert recording.times.shape == (25,) and recording.gripper_times.shape == (25,)
         heights = np.asarray(recording.points[..., 2])[np.asarray(recording.mask)]
         assert info.table_height - 0.002 <= heights.min() and heights.max() < 0.5
         top = np.array([len(cloud(recording, frame)) for frame in range(25)])
@@ -272,7 +272,7 @@ def test_all_real_recordings_are_whole_and_verified(real: dict[str, Recording]) 
 
 def test_the_real_gripper_paths_are_the_documented_ones(real: dict[str, Recording]) -> None:
     for recording in real.values():
-        path = np.asarray(recording.handle_path)[:, 0]
+        path = np.asarray(recording.gripper_path)[:, 0]
         if recording.info.scenario == "lift":  # documented in the frame of DIFFCLOUD's simulation
             start, end, offset = (0.002, 0.304, 0.223), (0.001, -0.245, 1.107), 0.0
             there = (0.67, 0.15, 0)
@@ -283,5 +283,5 @@ def test_the_real_gripper_paths_are_the_documented_ones(real: dict[str, Recordin
         for at, written in ((path[0], start), (path[-1], end)):
             expected = 0.35 * turn @ written + there + np.array([0, 0, offset])
             np.testing.assert_allclose(at, expected, atol=5e-4)
-        held = corner(recording.info.sheet, recording.info.sheet.held[0])
+        held = corner(recording.info.sheet, recording.info.sheet.pinned[0])
         np.testing.assert_allclose(path[0][:2], held[:2], atol=2e-3)

@@ -36,7 +36,7 @@ SHEET = SheetPlacement(
     origin=(0.1, 0.0, 0.05),
     warp=(0.0, 1.0, 0.0),
     weft=(-1.0, 0.0, 0.0),
-    held=("opposite",),
+    pinned=("opposite",),
 )
 INFO = RecordingInfo(
     name="lift_tan",
@@ -63,8 +63,8 @@ CLOUDS = st.lists(
 def record(clouds: list[Any], info: RecordingInfo = INFO, **changes: Any) -> Recording:
     fields = {
         "times": np.arange(len(clouds)) * 0.1 - 0.05,
-        "handle_path": np.linspace(0, 1, 36).reshape(12, 3),
-        "handle_times": np.arange(12) * 0.1,
+        "gripper_path": np.linspace(0, 1, 36).reshape(12, 3),
+        "gripper_times": np.arange(12) * 0.1,
     } | changes
     return make_recording(clouds, info=info, **fields)
 
@@ -96,11 +96,11 @@ def test_padding_keeps_the_points(clouds: list[np.ndarray]) -> None:
 
 
 def test_one_handle_gets_its_axis_and_two_keep_theirs() -> None:
-    assert record(ones(3, 4)).handle_path.shape == (12, 1, 3)
-    two = replace(INFO, sheet=replace(SHEET, held=("origin", "warp")))
-    assert record(ones(3, 4), two, handle_path=np.zeros((12, 2, 3))).handle_path.shape[1] == 2
-    with pytest.raises(ValueError, match="2 handles, the sheet is held at"):
-        record(ones(3, 4), handle_path=np.zeros((12, 2, 3)))
+    assert record(ones(3, 4)).gripper_path.shape == (12, 1, 3)
+    two = replace(INFO, sheet=replace(SHEET, pinned=("origin", "warp")))
+    assert record(ones(3, 4), two, gripper_path=np.zeros((12, 2, 3))).gripper_path.shape[1] == 2
+    with pytest.raises(ValueError, match="the path has 2 grippers, the sheet is pinned at"):
+        record(ones(3, 4), gripper_path=np.zeros((12, 2, 3)))
 
 
 @pytest.mark.parametrize(
@@ -127,13 +127,13 @@ def test_a_bad_cloud_names_its_frame(bad: Any, words: str) -> None:
         ({"times": [0.2, 0.1]}, "times must increase: 0.2 s at 0, then 0.1 s"),
         ({"times": [0.0, np.nan]}, "times must be finite"),
         (
-            {"handle_path": np.zeros((12, 2))},
-            r"the handle path must be \(knot, handle, 3\), found \(12, 1, 2\)",
+            {"gripper_path": np.zeros((12, 2))},
+            r"the gripper path must be \(knot, gripper, 3\), found \(12, 1, 2\)",
         ),
-        ({"handle_path": np.zeros((0, 3))}, "the handle path must be"),
-        ({"handle_path": np.full((12, 3), np.inf)}, "the handle path must be finite"),
-        ({"handle_times": np.arange(11.0)}, r"handle_times must have the shape \(12,\)"),
-        ({"handle_times": np.zeros(12)}, "handle_times must increase"),
+        ({"gripper_path": np.zeros((0, 3))}, "the gripper path must be"),
+        ({"gripper_path": np.full((12, 3), np.inf)}, "the gripper path must be finite"),
+        ({"gripper_times": np.arange(11.0)}, r"gripper_times must have the shape \(12,\)"),
+        ({"gripper_times": np.zeros(12)}, "gripper_times must increase"),
     ],
 )
 def test_a_bad_clock_or_path_is_refused(changes: dict[str, Any], words: str) -> None:
@@ -149,7 +149,7 @@ def test_a_path_that_ends_early_states_both_times() -> None:
 
 def test_times_that_single_precision_cannot_part_are_refused() -> None:
     since_1970 = np.array([1.7e9, 1.7e9 + 0.1])
-    changes = {"times": since_1970, "handle_times": since_1970[0] + np.arange(12.0)}
+    changes = {"times": since_1970, "gripper_times": since_1970[0] + np.arange(12.0)}
     if jax.config.read("jax_enable_x64"):
         assert record(ones(3, 4), **changes).times[1] > 1.7e9
     else:
@@ -179,7 +179,7 @@ def test_corners_of_a_sheet() -> None:
         ({"origin": (0.0, np.inf, 0.0)}, "origin must be finite"),
         ({"warp": (0.0, 1.1, 0.0)}, "orthonormal"),
         ({"warp": (-1.0, 0.0, 0.0)}, "orthonormal"),
-        ({"held": ("middle",)}, "unknown corner 'middle'.*'opposite'"),
+        ({"pinned": ("middle",)}, "unknown corner 'middle'.*'opposite'"),
     ],
 )
 def test_a_bad_sheet_is_refused(change: dict[str, Any], words: str) -> None:
@@ -241,7 +241,7 @@ def test_save_and_load_give_the_same_recording(
     save(recording, path)
     loaded = load(path)
     assert loaded.info == recording.info and hash(loaded.info) == hash(recording.info)
-    for name in ("points", "mask", "times", "handle_path", "handle_times"):
+    for name in ("points", "mask", "times", "gripper_path", "gripper_times"):
         before, after = getattr(recording, name), getattr(loaded, name)
         assert before.dtype == after.dtype
         np.testing.assert_array_equal(before, after)
@@ -365,7 +365,7 @@ def test_the_offset_of_the_clocks_can_be_set_again() -> None:
     np.testing.assert_allclose(moved.times, [0.1, 0.2], rtol=1e-6)
     assert moved.info.time_offset == 0.1
     np.testing.assert_allclose(set_time_offset(moved, -0.05).times, recording.times, atol=1e-7)
-    with pytest.raises(ValueError, match="lift_tan: time offset 2 s: the handle path ends at 1.1"):
+    with pytest.raises(ValueError, match="lift_tan: time offset 2 s: the gripper path ends at 1.1"):
         set_time_offset(recording, 2.0)
 
 

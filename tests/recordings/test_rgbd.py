@@ -211,10 +211,10 @@ def test_a_simulated_fabric_comes_back_within_2_mm(motion_of: str, tmp_path: Pat
     from r2s.recordings.synthetic_rgbd import write_rgbd
     from r2s.scenarios import synthetic
     from r2s.scenarios.scenario import from_recording, rollout
-    from r2s.scenarios.standard import SIX
+    from r2s.scenarios.standard import SCENARIOS
 
     fabric = presets.grey_interlock()
-    recorded = synthetic.record(SIX[motion_of](), fabric, "grey", key=jr.key(0))
+    recorded = synthetic.record(SCENARIOS[motion_of](), fabric, "grey", key=jr.key(0))
     scenario = from_recording(recorded, (17, 17))
     moved = np.asarray(rollout(scenario, fabric).x)[::10]
     faces, times = np.asarray(scenario.scene.mesh.faces), np.asarray(recorded.times)[::10]

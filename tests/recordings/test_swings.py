@@ -71,7 +71,7 @@ def test_the_bar_of_a_swing_is_straight_and_follows_its_ends():
     experiment = swing(SIZE, num_frames=21)
     scenario = experiment.scenario((5, 4))
     path, ends = np.asarray(scenario.path)[2:], experiment.route.path
-    held = np.asarray(scenario.scene.held)
+    held = np.asarray(scenario.scene.pinned)
     order = np.argsort(held)
     np.testing.assert_array_equal(held[order], np.arange(5) * 4)  # one side of the warp
     share = np.linspace(0, 1, 5)[None, :, None]
@@ -101,7 +101,7 @@ def test_a_swing_is_read_on_the_arm_s_clock_with_its_sheet_below_the_bar(file: P
     frames = len(read.times)
     np.testing.assert_allclose(read.times, np.arange(frames) * 0.1, atol=1e-6)
     ends = bar_path(moved["tool_position"], moved["tool_quaternion_xyzw"], BAR)
-    np.testing.assert_allclose(read.handle_path, ends, atol=1e-6)
+    np.testing.assert_allclose(read.gripper_path, ends, atol=1e-6)
     assert read.markers is not None
     for frame, tracked in ((0, 0), (5, 4), (10, 8)):  # every 0.1 s and every 0.125 s
         expected = moved["points"][tracked].reshape(-1, 3)
@@ -177,8 +177,8 @@ def test_places_of_markers_off_the_sheet_are_named(file: Path):
         make_recording(
             None,
             read.times,
-            read.handle_path,
-            read.handle_times,
+            read.gripper_path,
+            read.gripper_times,
             read.info,
             markers=read.markers,
             marker_places=100 * np.asarray(read.marker_places),
@@ -191,7 +191,7 @@ def test_a_swing_tells_the_density(file: Path):
     prior = NuisancePrior(0.0, 0.0, density=1.0)
     space = OrthotropicSpace.make(0.2)
     problem = Problem.make(read_swing(file, BAR), space, shape=(5, 5), nuisance_prior=prior)
-    found = descend(problem, Budget(12, 2, 15, around=0), key=jr.key(0))
+    found = descend(problem, Budget(12, 2, 15, num_probes=0), key=jr.key(0))
     (density,) = found.nuisances
     assert 0.2 * density.value == pytest.approx(0.12, rel=0.15)
 
@@ -209,7 +209,7 @@ def test_every_public_swing_is_read_and_its_bar_is_where_the_tool_says():
         read = open_recording(file)
         ends = np.stack(
             [
-                np.interp(read.times, read.handle_times, np.asarray(read.handle_path)[:, i, k])
+                np.interp(read.times, read.gripper_times, np.asarray(read.gripper_path)[:, i, k])
                 for i in range(2)
                 for k in range(3)
             ],

@@ -12,9 +12,9 @@ from windows import window
 
 from r2s import scenarios
 from r2s.estimation import normal_equations
-from r2s.estimation.default_spaces import on_points
+from r2s.estimation.default_spaces import on_mpm
 from r2s.estimation.gauss_newton import normals_at
-from r2s.estimation.methods import problems_on_points
+from r2s.estimation.methods import problems_on_mpm
 from r2s.estimation.prediction import predict
 from r2s.estimation.problem import NuisancePrior, Problem, beginning, check_shared
 from r2s.materials import presets
@@ -215,7 +215,7 @@ def test_windows_and_beginnings_keep_and_hide_what_should_have_been_seen(problem
 @pytest.mark.slow(group="motions")
 def test_on_material_points_the_size_is_taken_as_written_down(lifted):
     """Else a recording that doubts its size could not be simulated on them at all."""
-    (made,) = problems_on_points([lifted], on_points(0.2), (5, 5))
+    (made,) = problems_on_mpm([lifted], on_mpm(0.2), (5, 5))
     assert made.nuisance_prior == NuisancePrior((0.01, 0.02, 0.03), 0.1, 0.05)
     theta = theta_of(made, jnp.full(made.space.dim, 0.5))
     assert jax.eval_shape(predict, made, theta).x.shape[1:] == (25, 3)

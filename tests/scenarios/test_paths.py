@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 
 from r2s.recordings.recording import corner
 from r2s.scenarios import paths
-from r2s.scenarios.standard import ALL_CORNERS, SIX, hanging, on_table, varied, wind
+from r2s.scenarios.standard import ALL_CORNERS, SCENARIOS, hanging, on_table, varied, wind
 
 DURATION = 59 / 15  # [s]
 SIZE = (0.3, 0.2)  # [m]
 
 
-@pytest.mark.parametrize("name", SIX)
+@pytest.mark.parametrize("name", SCENARIOS)
 def test_every_path_is_smooth_and_at_rest_at_both_ends(name):
-    for experiment in (SIX[name](), *varied(name, 5, key=jr.key(0))):
+    for experiment in (SCENARIOS[name](), *varied(name, 5, key=jr.key(0))):
         times, path = experiment.route
         rate = 1 / np.diff(times)[:, None, None]
         velocity = np.diff(path, axis=0) * rate
@@ -69,7 +69,7 @@ def test_a_fling_comes_back_and_a_shake_moves_one_gripper():
     assert np.sum(risen != 0) == pytest.approx(2 * 1.5 * (DURATION - 0.5), abs=1.5)
 
 
-@pytest.mark.parametrize("name", SIX)
+@pytest.mark.parametrize("name", SCENARIOS)
 def test_drawn_numbers_keep_their_limits_and_their_seed(name):
     drawn = paths.draw(name, paths.EVALUATION, key=jr.key(1))
     assert drawn == paths.draw(name, paths.EVALUATION, key=jr.key(1))
@@ -122,7 +122,7 @@ WRONG: dict[str, dict[str, tuple[st.SearchStrategy[float], str]]] = {
 
 
 @pytest.mark.parametrize(
-    ("name", "number"), [(name, number) for name in SIX for number in WRONG[name]]
+    ("name", "number"), [(name, number) for name in SCENARIOS for number in WRONG[name]]
 )
 @given(data=st.data())
 def test_numbers_that_make_no_sense_are_refused(name, number, data):
@@ -130,7 +130,7 @@ def test_numbers_that_make_no_sense_are_refused(name, number, data):
     strategy, unit = WRONG[name][number]
     value = data.draw(st.one_of(strategy, st.sampled_from([math.nan, math.inf, -math.inf])))
     with pytest.raises(ValueError) as error:
-        SIX[name](**{number: value})
+        SCENARIOS[name](**{number: value})
     text = str(error.value)
     assert text.startswith(f"{number} must") and f"[{unit}], found {value}" in text
 
@@ -150,7 +150,7 @@ def test_numbers_that_make_no_sense_are_refused(name, number, data):
 )
 def test_a_path_that_would_not_come_to_rest_is_refused(name, numbers, words):
     with pytest.raises(ValueError, match=words):
-        SIX[name](**numbers)
+        SCENARIOS[name](**numbers)
 
 
 def test_numbers_beside_a_route_are_refused():

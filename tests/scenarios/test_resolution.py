@@ -9,7 +9,7 @@ from folders import ROOT
 from scipy.stats import gmean
 
 from r2s.materials import presets
-from r2s.materials.fabric import fold_length
+from r2s.materials.fabric import bending_length
 from r2s.scenarios import resolution
 from r2s.scenarios.resolution import (
     ENOUGH,
@@ -34,7 +34,7 @@ def test_errors_are_those_of_the_table_where_it_has_an_entry(motion):
     knit = presets.grey_interlock()
     for ratio, error in TABLE[motion]:
         # cells of a ninth of the sheet that are so many fold lengths long
-        bending = (SIDE / 8 / ratio / float(fold_length(knit))) ** 3
+        bending = (SIDE / 8 / ratio / float(bending_length(knit))) ** 3
         assert mesh_error(with_bending(knit, bending), SIZE, (9, 9), motion) == pytest.approx(
             error, rel=1e-4
         )
@@ -84,7 +84,7 @@ def test_the_table_is_that_of_the_experiment():
     path = ROOT / "docs/results/mesh_error_by_fabric.csv"
     text = [line for line in path.read_text().splitlines() if not line.startswith("#")]
     rows = list(csv.DictReader(text))
-    lengths = {name: float(fold_length(make())) for name, make in presets.FIVE.items()}
+    lengths = {name: float(bending_length(make())) for name, make in presets.FIVE.items()}
     assert {row["motion"] for row in rows} == set(TABLE)
     for motion, table in TABLE.items():
         mine = [row for row in rows if row["motion"] == motion]

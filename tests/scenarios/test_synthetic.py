@@ -88,14 +88,14 @@ def test_a_hanging_sheet_in_the_wind_is_in_view():
 
 
 @pytest.mark.slow(group="motions")
-@pytest.mark.parametrize("kind", ["cloth", "points"])
-@pytest.mark.parametrize("name", scenarios.SIX)
+@pytest.mark.parametrize("kind", ["cloth", "mpm"])
+@pytest.mark.parametrize("name", scenarios.SCENARIOS)
 def test_every_scenario_is_recorded_by_either_solver(name, kind):
     """On another mesh and with smaller steps than the estimators' own."""
-    solver = scenarios.material_points if kind == "points" else None
+    solver = scenarios.mpm_cloth if kind == "mpm" else None
     finer = {"shape": (13, 13), "max_step": 1 / 90, "solver": solver}
     record = synthetic.record(
-        scenarios.SIX[name](), presets.black_denim(), "denim", **finer, key=jr.key(0)
+        scenarios.SCENARIOS[name](), presets.black_denim(), "denim", **finer, key=jr.key(0)
     )
     assert len(record.times) == 60
     x = np.asarray(rollout(from_recording(record), presets.black_denim()).x)

@@ -11,10 +11,9 @@ from diffsim_step import FOLDER, load, repeat, wind_force
 
 from r2s._util.units import GRAVITY
 from r2s.environment.air import Air
-from r2s.environment.contact import Table
 from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric
-from r2s.solvers.implicit.cloth import Cloth
+from r2s.solvers.implicit.cloth import ImplicitCloth
 
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason=f"no trajectories in {FOLDER}")
 
@@ -59,7 +58,7 @@ def cloth_of(setting, dt):
         pytest.skip("DiffSim's drag along the faces is linear in the flow, ours is quadratic")
     air = Air.make(float(setting.air_density), drag_coefficient=2.0, friction_coefficient=0.0)
     held = jnp.flatnonzero(setting.spring > 0)
-    return Cloth.make(Scene(setting.mesh, held, Table.make(-jnp.inf), air), dt)
+    return ImplicitCloth(Scene(setting.mesh, held, air=air), dt)
 
 
 def fabric_of(setting, damping):
@@ -74,7 +73,7 @@ def test_a_sheet_hung_by_its_edge_has_its_rest_shape(path):
     setting, recorded = load(path)
     solver, fabric = cloth_of(setting, dt=0.04), fabric_of(setting, damping=0.1)
     state = solver.init(setting.start)
-    control = Control(state.x[solver.scene.held], setting.wind)
+    control = Control(state.x[solver.scene.pinned], setting.wind)
     for _ in range(30):
         before, state = state, step(solver, fabric, state, control)
     assert jnp.max(jnp.abs(state.x - before.x)) < 1e-6  # so it rests
@@ -92,7 +91,7 @@ def as_ours(setting, stiffer):
 
 
 def first_acceleration(setting):
-    """Of an unstrained sheet at rest [m/s^2]: gravity and wind, but for the held vertices."""
+    """Of an unstrained sheet at rest [m/s^2]: gravity and wind, but for the pinned vertices."""
     force = wind_force(setting, jnp.zeros_like(setting.start), setting.start)
     acceleration = force / setting.mass[:, None] - GRAVITY * jnp.eye(3)[2:]
     return jnp.where(setting.spring[:, None] > 0, 0.0, acceleration)
@@ -104,8 +103,8 @@ def roll(setting, dt):
     state = solver.init(setting.start, None, first_acceleration(setting))
     frames, per_frame = [], round(FRAME / dt)
     for i in range(1, UNTIL * per_frame + 1):
-        handles = (setting.start + setting.moved(jnp.asarray(i * dt)))[solver.scene.held]
-        state = step(solver, fabric, state, Control(handles, setting.wind))
+        pinned = (setting.start + setting.moved(jnp.asarray(i * dt)))[solver.scene.pinned]
+        state = step(solver, fabric, state, Control(pinned, setting.wind))
         if i % per_frame == 0:
             frames.append(np.asarray(state.x))
     return np.stack(frames)

@@ -12,7 +12,7 @@ from r2s._util.units import AIR_DENSITY
 from r2s.environment.contact import Table
 from r2s.environment.scene import Control, along_path
 from r2s.materials.fabric import Fabric
-from r2s.solvers.implicit.cloth import Cloth
+from r2s.solvers.implicit.cloth import ImplicitCloth
 from r2s.solvers.simulate import simulate
 
 FRAMES, SUBSTEPS = 6, 5
@@ -26,7 +26,7 @@ class Inputs(eqx.Module):
     fabric: Fabric
     x: Float[Array, "vertex 3"]
     v: Float[Array, "vertex 3"]
-    path: Float[Array, "knot handle 3"]
+    path: Float[Array, "knot gripper 3"]
     height: Float[Array, ""]
     wind: Float[Array, " 3"]
 
@@ -44,15 +44,15 @@ def inputs(sheet, fabric):
 @pytest.fixture(scope="module")
 def run(sheet):
     """The motion of inputs, as a function of them."""
-    fixed = cloth(sheet, held=(0,), table=0.0, air=AIR_DENSITY)
+    fixed = cloth(sheet, pinned=(0,), table=0.0, air=AIR_DENSITY)
 
     def run(inputs):
         scene = eqx.tree_at(lambda scene: scene.table, fixed.scene, Table(inputs.height))
-        solver = Cloth.make(scene, DT, tolerance=1e-13)  # so that differences have little noise
+        solver = ImplicitCloth(scene, DT, tolerance=1e-13)  # so that differences have little noise
         times = jnp.arange(1, FRAMES * SUBSTEPS + 1).astype(float) * DT
-        handles = along_path(times, KNOTS, inputs.path).reshape(FRAMES, SUBSTEPS, 1, 3)
-        controls = Control(handles, jnp.broadcast_to(inputs.wind, (FRAMES, SUBSTEPS, 3)))
-        return simulate(solver, inputs.fabric, solver.init(inputs.x, inputs.v), controls).x
+        control = Control(along_path(times, KNOTS, inputs.path), inputs.wind)
+        start = solver.init(inputs.x, inputs.v)
+        return simulate(solver, inputs.fabric, start, control, save_every=SUBSTEPS).x
 
     return run
 

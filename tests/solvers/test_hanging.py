@@ -13,7 +13,7 @@ from r2s.mesh.mesh import borders, rectangle
 from r2s.mesh.surface import sample
 from r2s.metrics.losses import surface_residuals
 from r2s.scenarios.scenario import Braked, rollout, stepped
-from r2s.solvers.implicit.cloth import Cloth
+from r2s.solvers.implicit.cloth import ImplicitCloth
 
 SIDE, RADIUS = 0.4, 0.15  # [m]
 
@@ -82,6 +82,6 @@ def test_a_sheet_that_hangs_may_take_as_many_iterations_as_its_first_step_needs(
     from five of twelve starts that differed by 1e-7 m, by their times up to 560."""
     braked, _ = stepped(scenarios.wind().scenario((3, 3)))
     lying, _ = stepped(scenarios.lifting().scenario((3, 3)))
-    assert isinstance(braked, Braked) and isinstance(lying, Cloth)
-    assert isinstance(braked.solver, Cloth)
+    assert isinstance(braked, Braked) and isinstance(lying, ImplicitCloth)
+    assert isinstance(braked.solver, ImplicitCloth)
     assert braked.solver.max_iterations > 560 > lying.max_iterations

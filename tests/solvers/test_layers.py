@@ -10,8 +10,7 @@ import pytest
 from conftest import cloth, directional_difference, everywhere, flat, roll
 
 from r2s._util.units import GRAVITY
-from r2s.environment.air import Air
-from r2s.environment.contact import Table, pressure
+from r2s.environment.contact import pressure
 from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric
 from r2s.mesh.mesh import Mesh, rectangle
@@ -19,9 +18,9 @@ from r2s.solvers.contact import contacts
 from r2s.solvers.contact import contacts as contact
 from r2s.solvers.contact.broad_phase import BVH, Pairs, build_bvh
 from r2s.solvers.contact.contacts import SelfContact
-from r2s.solvers.failures import Failure
-from r2s.solvers.implicit.cloth import Cloth
+from r2s.solvers.implicit.cloth import ImplicitCloth
 from r2s.solvers.implicit.linear.system import Elimination
+from r2s.solvers.results import Result
 from r2s.solvers.simulate import simulate
 
 FABRIC = Fabric.make(0.2, (60.0, 10.0, 60.0, 20.0), 1e-5)
@@ -95,16 +94,16 @@ def test_crossings_are_counted():
 @pytest.mark.slow(group="cloth")
 def test_a_corner_folded_over_passes_through_nothing():
     mesh = rectangle((SIZE, SIZE), (7, 7))
-    free = cloth(mesh, held=(0,), table=0.0, air=1.2, dt=1 / 60)
+    free = cloth(mesh, pinned=(0,), table=0.0, air=1.2, dt=1 / 60)
     steps = jnp.arange(1, 61) / 60
     along = jnp.minimum(steps / 0.5, 1.0)  # the corner goes over in half a second, then holds
     height = 0.002 + 0.1 * jnp.sin(jnp.pi * along)
-    handle = jnp.stack([along * (SIZE - 0.01), along * (SIZE - 0.01), height], axis=-1)
-    controls = Control(handle.reshape(20, 3, 1, 3), jnp.zeros((20, 3, 3)))
+    path = jnp.stack([along * (SIZE - 0.01), along * (SIZE - 0.01), height], axis=-1)
+    control = Control(path[:, None])
     through = []
     for solver in (free, with_self_contact(free)):
         start = solver.init(flat(mesh, 1e-3))
-        motion = eqx.filter_jit(simulate)(solver, FABRIC, start, controls)
+        motion = eqx.filter_jit(simulate)(solver, FABRIC, start, control, save_every=3)
         assert bool(jnp.all(motion.ok))
         through.append([crossings(mesh, x) for x in motion.x])
     assert max(through[0]) > 10  # so there is something to prevent
@@ -114,7 +113,7 @@ def test_a_corner_folded_over_passes_through_nothing():
 @pytest.mark.parametrize("speed", [pytest.param(1.0, marks=pytest.mark.slow(group="cloth")), 5.0])
 def test_a_sheet_thrown_at_another_does_not_tunnel(speed):
     mesh, x = two_sheets(0.02)
-    solver = with_self_contact(cloth(mesh, held=range(16), dt=1 / 60))
+    solver = with_self_contact(cloth(mesh, pinned=range(16), dt=1 / 60))
     v = everywhere([0.0, 0.0, 0.0], mesh).at[16:, 2].set(-speed)
     states = roll(solver, FABRIC, solver.init(x, v), 12)
     assert np.all(np.isfinite(states.x))
@@ -125,7 +124,7 @@ def test_a_sheet_thrown_at_another_does_not_tunnel(speed):
 @pytest.mark.slow(group="cloth")
 def test_a_layer_rests_on_another_with_its_weight():
     mesh, x = two_sheets(0.9e-3)
-    solver = with_self_contact(cloth(mesh, held=range(16)))
+    solver = with_self_contact(cloth(mesh, pinned=range(16)))
     still = roll(
         solver,
         Fabric.make(0.2, (60.0, 10.0, 60.0, 20.0), 1e-5, mass_damping=20.0),
@@ -148,7 +147,7 @@ def test_a_layer_rests_on_another_with_its_weight():
 def test_friction_between_layers_is_that_of_coulomb(friction):
     mesh, x = two_sheets(0.96647e-3)  # where it carries the weight
     fabric = Fabric.make(0.2, (600.0, 10.0, 600.0, 200.0), 1e-4, friction=friction)
-    solver = with_self_contact(cloth(mesh, held=range(16)))
+    solver = with_self_contact(cloth(mesh, pinned=range(16)))
     v = everywhere([0.0, 0.0, 0.0], mesh).at[16:, 0].set(0.2)
     states = roll(solver, fabric, solver.init(x, v), 12)
     speed = states.v[:, 16:, 0].mean(axis=1)
@@ -192,14 +191,14 @@ def test_too_many_contacts_are_not_forgotten():
     mesh, x = two_sheets(0.5e-3)
     search = SelfContact.make(mesh, 8)
     assert not touching(search, mesh, THICKNESS, jnp.asarray(0.5), x)[1]
-    solver = with_self_contact(cloth(mesh, held=range(16)), lambda mesh: search)
+    solver = with_self_contact(cloth(mesh, pinned=range(16)), lambda mesh: search)
     after = roll(solver, FABRIC, solver.init(x), 1)
-    assert np.all(np.isnan(after.x[-1])) and after.failure[-1] == Failure.SELF_CONTACT
+    assert np.all(np.isnan(after.x[-1])) and after.failure[-1] == Result.SELF_CONTACT
 
 
 def test_a_large_mesh_searches_a_tree_and_iterates():
-    scene = Scene(rectangle((1.0, 1.0), (21, 21)), jnp.array([0]), Table.make(), Air.make())
-    large = Cloth.make(scene, 0.02, self_contact=True)
+    scene = Scene(rectangle((1.0, 1.0), (21, 21)), [0], table=0.0)
+    large = ImplicitCloth(scene, 0.02, self_contact=True)
     assert large.self_contact is not None and not large.elimination.couples_all
     assert isinstance(large.self_contact.search, BVH)
     assert large.self_contact.capacity == 24 * 441
@@ -210,14 +209,14 @@ def landing(make):
     mesh, x = two_sheets(3e-3, count=3)
     # crumpled: where edges are parallel, the closest points jump
     x = x + jnp.asarray(np.random.default_rng(0).normal(size=x.shape)) * 3e-4
-    solver = with_self_contact(cloth(mesh, held=range(9)), make)
-    controls = Control(jnp.broadcast_to(x[:9], (1, 8, 9, 3)), jnp.zeros((1, 8, 3)))
+    solver = with_self_contact(cloth(mesh, pinned=range(9)), make)
+    control = Control(jnp.broadcast_to(x[:9], (8, 9, 3)))
     weights = jax.random.normal(jax.random.key(1), x.shape)
     v = everywhere([0.1, 0.0, 0.0], mesh).at[:, 2].set(-0.4)
 
     def loss(inputs):
         fabric, x, v = inputs
-        moved = simulate(solver, fabric, solver.init(x, v), controls).x[-1]
+        moved = simulate(solver, fabric, solver.init(x, v), control, save_every=8).x[-1]
         return jnp.sum(weights * moved), moved
 
     return eqx.filter_jit(jax.value_and_grad(loss, has_aux=True)), x, v

@@ -11,47 +11,46 @@ import r2s
 from r2s.materials import presets
 from r2s.solvers.implicit.linear.system import Elimination
 from r2s.solvers.mpm import Grid
-from r2s.solvers.mpm.sheet import Sheet
+from r2s.solvers.mpm.sheet import MPMCloth
 
 PLATFORMS = ("cuda", "tpu")
 
 
 def scene() -> r2s.Scene:
     sheet = r2s.rectangle((0.1, 0.1), (4, 4))
-    return r2s.Scene(sheet, jnp.array([0]), r2s.Table.make(0.0), r2s.Air.make())
+    return r2s.Scene(sheet, [0], table=0.0)
 
 
-def cloth() -> r2s.Cloth:
-    return r2s.Cloth.make(scene(), dt=0.01)
+def cloth() -> r2s.ImplicitCloth:
+    return r2s.ImplicitCloth(scene(), dt=0.01)
 
 
-def by_dissection() -> r2s.Cloth:
+def by_dissection() -> r2s.ImplicitCloth:
     """As on an accelerator, where no loop over a band of vertices is wanted."""
     mesh = scene().mesh
     return dataclasses.replace(cloth(), elimination=Elimination.make(mesh, order="dissection"))
 
 
-def by_generalised_alpha() -> r2s.Cloth:
-    return r2s.Cloth.make(scene(), dt=0.01, spectral_radius=0.6)
+def by_generalised_alpha() -> r2s.ImplicitCloth:
+    return r2s.ImplicitCloth(scene(), dt=0.01, spectral_radius=0.6)
 
 
 def explicit() -> r2s.ExplicitCloth:
-    return r2s.ExplicitCloth.make(scene(), 0.01, presets.black_denim())
+    return r2s.ExplicitCloth(scene(), 0.01, presets.black_denim())
 
 
-def points() -> Sheet:
+def points() -> MPMCloth:
     grid = Grid.covering((0.0, 0.0, 0.0), (0.5, 0.5, 0.5), 0.05)
-    return Sheet.make(scene(), grid, presets.black_denim(), 1e-4, membrane_damping=1e-4)
+    return MPMCloth(scene(), 1e-4, presets.black_denim(), grid, membrane_damping=1e-4)
 
 
 def height(solver) -> Callable:
     """The mean height [m] of a sheet after two steps, of a fabric."""
     rest = solver.scene.mesh.rest
     start = jnp.concatenate([rest + 0.2, jnp.full((len(rest), 1), 0.25)], axis=1)
-    handles = jnp.broadcast_to(start[0], (1, 2, 1, 3))
-    controls = r2s.Control(handles, jnp.zeros((1, 2, 3)))
+    control = r2s.Control(jnp.broadcast_to(start[0], (2, 1, 3)))
     state = solver.init(start)
-    return lambda fabric: r2s.simulate(solver, fabric, state, controls).x[-1, :, 2].mean()
+    return lambda fabric: r2s.simulate(solver, fabric, state, control).x[-1, :, 2].mean()
 
 
 def lowered(function: Callable, fabric: r2s.Fabric) -> str:
@@ -88,9 +87,9 @@ def test_a_longer_motion_makes_no_larger_a_program():
     start = jnp.pad(solver.scene.mesh.rest, ((0, 0), (0, 1)), constant_values=0.01)
 
     def size(steps: int) -> int:
-        controls = r2s.Control(jnp.zeros((1, steps, 1, 3)), jnp.zeros((1, steps, 3)))
+        control = r2s.Control(jnp.zeros((steps, 1, 3)))
         return len(
-            lowered(lambda f: r2s.simulate(solver, f, solver.init(start), controls).x, fabric)
+            lowered(lambda f: r2s.simulate(solver, f, solver.init(start), control).x, fabric)
         )
 
     assert abs(size(40) - size(2)) < 0.01 * size(2)  # numbers in the text have more digits

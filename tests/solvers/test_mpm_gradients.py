@@ -11,12 +11,11 @@ from jaxtyping import Array, Float
 from mpm_bodies import lattice
 
 import r2s
-from r2s.environment.air import Air
 from r2s.environment.contact import Table
 from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric
 from r2s.materials.solid import FixedCorotated, NeoHookean, Solid
-from r2s.solvers.mpm import Background, Block, Grid, Sheet
+from r2s.solvers.mpm import Background, Block, Grid, MPMCloth
 from r2s.solvers.simulate import simulate
 
 REFERENCE = SHARED / "data" / "difftaichi_reference"
@@ -48,7 +47,7 @@ BLOCK_WHERE = {  # what to differ, and by how much
 }
 
 
-@pytest.fixture(scope="module", params=[2, pytest.param(3, marks=pytest.mark.slow(group="points"))])
+@pytest.fixture(scope="module", params=[2, pytest.param(3, marks=pytest.mark.slow(group="mpm"))])
 def block(request):
     """Value and gradient of a block that is dragged over a table, and its inputs."""
     spacing, axes = 0.1, slice(-request.param, None)  # the last ones
@@ -80,10 +79,8 @@ def block(request):
     fixed = Block.make(background, volume, _solid(inputs), 1e-3).gripped(x, handle, 0.06)
 
     def run(inputs):
-        path = inputs.path.reshape(4, BLOCK_STEPS // 4, 1, x.shape[1])
-        controls = Control(path, jnp.zeros((4, BLOCK_STEPS // 4, 3)))
-        start = fixed.init(inputs.x, inputs.v)
-        return simulate(fixed, _solid(inputs), start, controls).x
+        start, every = fixed.init(inputs.x, inputs.v), BLOCK_STEPS // 4
+        return simulate(fixed, _solid(inputs), start, Control(inputs.path), save_every=every).x
 
     def loss(inputs):
         return jnp.sum(weights * run(inputs)[-1])
@@ -114,12 +111,12 @@ def _agrees(value_and_grad, inputs, where, size):
     assert abs(found) > 1e-12
 
 
-@pytest.mark.slow(group="points")
+@pytest.mark.slow(group="mpm")
 def test_forward_mode_equals_reverse_mode(block):
     _, inputs, _, solver = block
     solver = eqx.tree_at(lambda s: s.background, solver, _forward(solver.background))
     state = solver.init(inputs.x, inputs.v)
-    control = Control(inputs.path[0], jnp.zeros(3))
+    control = Control(inputs.path[0])
 
     def step(young):
         solid = _solid(eqx.tree_at(lambda i: i.young, inputs, young))
@@ -168,9 +165,9 @@ def sheet_motion(sheet, fabric):
     """Value and gradient of a sheet that is lifted off a table by a corner, in wind."""
     x = flat(sheet, 2e-3)
     grid = Grid.covering((-0.1, -0.1, 0.0), (0.4, 0.4, 0.3), 0.05)
-    scene = Scene(sheet, jnp.array([0]), Table.make(0.0), Air.make())
+    scene = Scene(sheet, [0], table=0.0)
     fabric = eqx.tree_at(lambda f: f.damping, fabric, jnp.asarray(2e-4, float))
-    solver = Sheet.make(scene, grid, fabric, 5e-4)
+    solver = MPMCloth(scene, 5e-4, fabric, grid)
     weights = jax.random.normal(jax.random.key(0), x.shape)
     shift = jnp.linspace(0, 1, SHEET_STEPS)[:, None, None] * jnp.array([[[0.01, 0.005, 0.02]]])
     v = jnp.broadcast_to(jnp.array([[0.2, 0.1, -0.1]]), x.shape)
@@ -178,22 +175,21 @@ def sheet_motion(sheet, fabric):
     inputs = SheetInputs(fabric, x, v, x[None, :1] + shift, wind)
 
     def loss(inputs):
-        path = inputs.path.reshape(6, SHEET_STEPS // 6, 1, 3)
-        controls = Control(path, jnp.broadcast_to(inputs.wind, (6, SHEET_STEPS // 6, 3)))
-        moved = simulate(solver, inputs.fabric, solver.init(inputs.x, inputs.v), controls).x
-        return jnp.sum(weights * moved[-1])
+        control, start = Control(inputs.path, inputs.wind), solver.init(inputs.x, inputs.v)
+        moved = simulate(solver, inputs.fabric, start, control, save_every=SHEET_STEPS // 6)
+        return jnp.sum(weights * moved.final_state.x)
 
     return jax.jit(jax.value_and_grad(loss)), inputs
 
 
-@pytest.mark.slow(group="points")
+@pytest.mark.slow(group="mpm")
 @pytest.mark.parametrize("name", SHEET_WHERE)
 def test_the_gradient_of_a_sheet_agrees_with_differences(name, sheet_motion):
     value_and_grad, inputs = sheet_motion
     _agrees(value_and_grad, inputs, *SHEET_WHERE[name])
 
 
-@pytest.mark.slow(group="points")
+@pytest.mark.slow(group="mpm")
 def test_a_gradient_needs_a_tenth_of_the_memory_of_all_states():
     """Of 2,000 steps; the states of the frames, and of the steps in one, are kept."""
     frames, substeps = 50, 40
@@ -202,11 +198,12 @@ def test_a_gradient_needs_a_tenth_of_the_memory_of_all_states():
     background = Background.make(grid)
     material = Solid.make(FixedCorotated.make(1e3, 0.3), 1e3)
     solver = Block.make(background, volume, material, 1e-4)
-    controls = Control(jnp.zeros((frames, substeps, 0, 2)), jnp.zeros((frames, substeps, 3)))
+    control = Control(jnp.zeros((frames * substeps, 0, 2)))
 
     def loss(young):
         solid = Solid.make(FixedCorotated.make(young, 0.3), 1e3)
-        return jnp.sum(simulate(solver, solid, solver.init(x), controls).x[-1])
+        moved = simulate(solver, solid, solver.init(x), control, save_every=substeps)
+        return jnp.sum(moved.final_state.x)
 
     needed = r2s.predicted_memory(jax.grad(loss), jnp.asarray(1e3))
     a_state = len(x) * (2 + 2 + 4 + 4) * 8  # [byte]
@@ -216,8 +213,8 @@ def test_a_gradient_needs_a_tenth_of_the_memory_of_all_states():
 @pytest.mark.parametrize(
     "name, law",
     [
-        pytest.param("fcr", FixedCorotated, marks=pytest.mark.slow(group="points")),
-        pytest.param("nh", NeoHookean, marks=pytest.mark.slow(group="points")),
+        pytest.param("fcr", FixedCorotated, marks=pytest.mark.slow(group="mpm")),
+        pytest.param("nh", NeoHookean, marks=pytest.mark.slow(group="mpm")),
     ],
 )
 def test_difftaichi_is_repeated_with_its_gradients(name, law):
@@ -240,12 +237,12 @@ def test_difftaichi_is_repeated_with_its_gradients(name, law):
     volume, target = jnp.full(count, float(data["p_vol"])), number(data["target"])
     material = Solid.make(law(mu=number(data["mu"]), lam=number(data["la"])), float(data["p_mass"]))
     solver = Block.make(background, volume, material, float(data["dt"]))
-    controls = Control(jnp.zeros((32, steps // 32, 0, 2)), jnp.zeros((32, steps // 32, 3)))
+    control = Control(jnp.zeros((steps, 0, 2)))
 
     def loss(v, apart, mu, lam, x):
         solid = eqx.tree_at(lambda s: (s.law.mu, s.law.lam), material, (mu, lam))
         start = solver.init(x, jnp.broadcast_to(v[None], x.shape) + apart)
-        x = simulate(solver, solid, start, controls).x[-1]
+        x = simulate(solver, solid, start, control, save_every=steps // 32).final_state.x
         return jnp.sum((jnp.mean(x, axis=0) - target) ** 2) / 2, x
 
     x = number(data["x_init"])

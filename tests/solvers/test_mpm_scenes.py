@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 import r2s
-from r2s.environment.air import Air
 from r2s.environment.contact import Table
 from r2s.materials import presets
 from r2s.materials.solid import FixedCorotated, Solid
-from r2s.solvers.mpm import Background, Block, Grid, Sheet, block, layered, sheet
+from r2s.solvers.mpm import Background, Block, Grid, MPMCloth, block, layered, sheet
 
 SIDE, SHAPE = 0.45, (17, 17)
 FRAMES, INTERVAL = 60, 1 / 15  # [s]
@@ -31,7 +30,7 @@ def along(*direction):
     return jnp.array([direction])
 
 
-MOTIONS = {  # held vertices, their displacement [m] and the wind [m/s] at a time [s]
+MOTIONS = {  # pinned vertices, their displacement [m] and the wind [m/s] at a time [s]
     "lift": ((ORIGIN,), lambda t: along(0.15, 0.15, 0.5) * ease(t / 3), lambda t: jnp.zeros(3)),
     "fold": (
         (ORIGIN,),
@@ -66,36 +65,31 @@ MOTIONS = {  # held vertices, their displacement [m] and the wind [m/s] at a tim
 }
 
 
-def controls_of(x, held, path, wind, substeps):
-    times = jnp.arange(1, FRAMES * substeps + 1).astype(float).reshape(FRAMES, substeps)
-    times = times * INTERVAL / substeps
-
-    def each(of):
-        return jax.vmap(jax.vmap(of))(times)
-
-    return r2s.Control(x[held][None, None] + each(path), each(wind))
+def control_of(x, pinned, path, wind, substeps):
+    times = jnp.arange(1, FRAMES * substeps + 1).astype(float) * INTERVAL / substeps
+    return r2s.Control(x[pinned][None] + jax.vmap(path)(times), jax.vmap(wind)(times))
 
 
 def setting(name, fabric):
-    """Solver, start and controls."""
-    held, path, wind = MOTIONS[name]
-    mesh, held = r2s.rectangle((SIDE, SIDE), SHAPE), jnp.array(held)
+    """Solver, start, control and steps a frame."""
+    pinned, path, wind = MOTIONS[name]
+    mesh, pinned = r2s.rectangle((SIDE, SIDE), SHAPE), jnp.array(pinned)
     grid = Grid.covering((-0.9, -0.6, 0.0), (1.35, 1.05, 1.2), SIDE / 16)
     limit = float(sheet.stable_step(mesh, grid.spacing, fabric, MEMBRANE_DAMPING))
     substeps = math.ceil(INTERVAL / limit)
-    scene = r2s.Scene(mesh, held, Table.make(0.0), Air.make())
-    solver = Sheet.make(scene, grid, fabric, INTERVAL / substeps, MEMBRANE_DAMPING)
+    scene = r2s.Scene(mesh, pinned, table=0.0)
+    solver = MPMCloth(scene, INTERVAL / substeps, fabric, grid, MEMBRANE_DAMPING)
     x = jnp.pad(mesh.rest, ((0, 0), (0, 1)), constant_values=1e-3)
-    return solver, x, controls_of(x, held, path, wind, substeps)
+    return solver, x, control_of(x, pinned, path, wind, substeps), substeps
 
 
-@pytest.mark.slow(group="points")
+@pytest.mark.slow(group="mpm")
 @pytest.mark.parametrize("fabric", ["camel_ponte_roma", "black_denim"])
 @pytest.mark.parametrize("name", MOTIONS)
 def test_a_sheet_neither_tears_nor_enters_the_table(name, fabric):
     fabric = presets.FIVE[fabric]()
-    solver, x, controls = setting(name, fabric)
-    moved = eqx.filter_jit(r2s.simulate)(solver, fabric, solver.init(x), controls)
+    solver, x, control, every = setting(name, fabric)
+    moved = eqx.filter_jit(r2s.simulate)(solver, fabric, solver.init(x), control, save_every=every)
     assert bool(moved.ok.all())
     assert float(jnp.min(moved.x[..., 2])) >= 0
     mesh = solver.scene.mesh
@@ -104,11 +98,11 @@ def test_a_sheet_neither_tears_nor_enters_the_table(name, fabric):
     # the knit's corner, of C11 = 31 N/m, is flung at several g
     assert np.max(stretch) < (1.7 if name == "fling" else 1.6)
     assert np.max(np.mean(stretch, axis=1)) < 1.1
-    held = np.asarray(solver.scene.held)
-    assert np.array_equal(np.asarray(moved.x)[:, held], np.asarray(controls.handles)[:, -1])
+    path = np.asarray(control.pinned)[every - 1 :: every]
+    assert np.array_equal(np.asarray(moved.x)[:, np.asarray(solver.scene.pinned)], path)
 
 
-@pytest.mark.slow(group="points")
+@pytest.mark.slow(group="mpm")
 @pytest.mark.parametrize("young", [1e2, 1e4, 1e6])
 @pytest.mark.parametrize("poisson", [0.05, 0.45])
 def test_gradients_of_a_lifted_block_are_finite_in_single_precision(young, poisson):
@@ -133,10 +127,11 @@ def test_gradients_of_a_lifted_block_are_finite_in_single_precision(young, poiss
         def still(t):
             return jnp.zeros(3)
 
-        controls = controls_of(flat, jnp.array([0]), path, still, substeps)
+        control = control_of(flat, jnp.array([0]), path, still, substeps)
 
         def loss(young, poisson):
-            moved = r2s.simulate(solver, solid(young, poisson), solver.init(x), controls)
+            start = solver.init(x)
+            moved = r2s.simulate(solver, solid(young, poisson), start, control, save_every=substeps)
             return jnp.mean(moved.x[-1] ** 2), moved.ok
 
         run = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True))

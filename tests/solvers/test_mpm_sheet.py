@@ -12,8 +12,6 @@ from mpm_bodies import momenta, states, still
 
 import r2s
 from r2s._util.units import GRAVITY
-from r2s.environment.air import Air
-from r2s.environment.contact import Table
 from r2s.environment.scene import Control, Scene
 from r2s.materials.bending import HingeBending
 from r2s.materials.fabric import Fabric
@@ -26,21 +24,20 @@ from r2s.solvers.explicit.elements import (
     membrane_frequency,
     membrane_stress,
 )
-from r2s.solvers.failures import Failure
-from r2s.solvers.mpm import Grid, Sheet
+from r2s.solvers.mpm import Grid, MPMCloth
 from r2s.solvers.mpm.sheet import Transverse, stable_step, unit_normal
+from r2s.solvers.results import Result
 
 SPACING = 0.05
 
 
-def solver_of(mesh, fabric, held=(), table=-jnp.inf, air=0.0, dt=5e-4, room=0.25, **options):
+def solver_of(mesh, fabric, pinned=(), table=None, air=None, dt=5e-4, room=0.25, **options):
     """A solver for a sheet with room [m] around it."""
     high = float(jnp.max(mesh.rest)) + room
     grid = Grid.covering((-room, -room, -room), (high, high, room), SPACING)
-    if np.isfinite(table):
+    if table is not None:
         grid = Grid.covering((-room, -room, table), (high, high, table + room), SPACING)
-    scene = Scene(mesh, jnp.asarray(tuple(held), int), Table.make(table), Air.make(density=air))
-    return Sheet.make(scene, grid, fabric, dt, **options)
+    return MPMCloth(Scene(mesh, tuple(pinned), table, air), dt, fabric, grid, **options)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +46,7 @@ def elastic(fabric):
     return eqx.tree_at(lambda f: f.damping, fabric, jnp.zeros((), float))
 
 
-@pytest.mark.slow(group="points")
+@pytest.mark.slow(group="mpm")
 def test_momenta_are_kept_to_rounding(sheet, elastic):
     solver = solver_of(sheet, elastic)
     solver = eqx.tree_at(lambda s: s.background.gravity, solver, jnp.zeros((), float))
@@ -59,24 +56,24 @@ def test_momenta_are_kept_to_rounding(sheet, elastic):
     # pressed and tilted, so that what is between the layers acts too
     pressed = start.d * 0.3 + 0.1 * jax.random.normal(jax.random.key(1), start.d.shape)
     start = dataclasses.replace(start, d=pressed)
-    moved = states(solver, elastic, start, still(1, 60))
+    moved = states(solver, elastic, start, still(60))
     linear, angular = momenta(moved, vertex_masses(sheet, elastic.density), SPACING)
     assert linear == pytest.approx(np.broadcast_to(linear[0], linear.shape), abs=1e-14)
     assert angular == pytest.approx(np.broadcast_to(angular[0], angular.shape), abs=1e-14)
     assert np.max(np.abs(angular[0])) > 1e-5
 
 
-@pytest.mark.slow(group="points")
+@pytest.mark.slow(group="mpm")
 def test_free_fall_is_exact(sheet, elastic):
     solver = solver_of(sheet, elastic)
-    moved = states(solver, elastic, solver.init(flat(sheet)), still(1, 60))
+    moved = states(solver, elastic, solver.init(flat(sheet)), still(60))
     count = np.arange(1, 61)
     fallen = -GRAVITY * solver.dt**2 * count * (count + 1) / 2
     expected = np.asarray(flat(sheet))[None] + fallen[:, None, None] * np.array([0, 0, 1.0])
     assert np.asarray(moved.x) == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.slow(group="points")
+@pytest.mark.slow(group="mpm")
 def test_the_forces_are_those_of_the_energy(sheet, fabric):
     x = flat(sheet) + 0.01 * jax.random.normal(jax.random.key(0), (25, 3))
     for bending in (fabric.bending, HingeBending(jnp.asarray(2e-5))):
@@ -94,7 +91,7 @@ def test_the_forces_are_those_of_the_energy(sheet, fabric):
         assert rigid == pytest.approx(np.asarray(found), rel=1e-9, abs=1e-12)
 
 
-@pytest.mark.slow(group="points")
+@pytest.mark.slow(group="mpm")
 def test_the_frequencies_are_bounds_of_those_of_the_matrices(sheet, fabric):
     mass = jnp.repeat(vertex_masses(sheet, fabric.density), 3)
     none = eqx.tree_at(lambda f: f.bending, fabric, HingeBending(jnp.zeros((), float)))
@@ -107,18 +104,18 @@ def test_the_frequencies_are_bounds_of_those_of_the_matrices(sheet, fabric):
         assert largest < float(eqx.filter_jit(bound)(sheet, of)) < 6 * largest
 
 
-@pytest.mark.slow(group="points")
+@pytest.mark.slow(group="mpm")
 def test_a_hanging_sheet_stretches_as_it_should():
     """Force per width P = C11 (s^2 - 1) s / 2 at a stretch s carries what hangs below."""
     shape, length = (9, 5), 0.4
     mesh = r2s.rectangle((length, 0.2), shape)
     fabric = Fabric.make(0.3, (12.0, 0.0, 12.0, 6.0), 1e-5, damping=2e-3, mass_damping=6.0)
     grid = Grid.covering((-0.1, -0.1, -0.7), (0.1, 0.3, 0.1), SPACING)
-    scene = Scene(mesh, jnp.arange(5), Table.make(-jnp.inf), Air.make(density=0.0))
-    solver = Sheet.make(scene, grid, fabric, 1.2e-3)
+    solver = MPMCloth(Scene(mesh, range(5), air=None), 1.2e-3, fabric, grid)
     x = jnp.stack([0 * mesh.rest[:, 0], mesh.rest[:, 1], -mesh.rest[:, 0]], axis=1)
-    controls = Control(jnp.broadcast_to(x[:5], (1, 1800, 5, 3)), jnp.zeros((1, 1800, 3)))
-    found = eqx.filter_jit(r2s.simulate)(solver, fabric, solver.init(x), controls).x[-1]
+    control = Control(jnp.broadcast_to(x[:5], (1800, 5, 3)))
+    found = eqx.filter_jit(r2s.simulate)(solver, fabric, solver.init(x), control, save_every=1800)
+    found = found.x[-1]
     where = np.linspace(0, length, 2001)
     stretch = np.ones_like(where)
     for _ in range(50):  # Newton
@@ -190,8 +187,8 @@ def pair(sheet, fabric):
     """Two sheets, and a solver for them over a table."""
     mesh, fabric = _two(sheet), eqx.tree_at(lambda f: f.damping, fabric, jnp.asarray(2e-4, float))
     grid = Grid.covering((-0.15, -0.15, 0.0), (0.35, 0.35, 0.3), SPACING)
-    scene = Scene(mesh, jnp.zeros(0, int), Table.make(0.0), Air.make(density=0.0))
-    return Sheet.make(scene, grid, fabric, 5e-4), fabric
+    scene = Scene(mesh, table=0.0, air=None)
+    return MPMCloth(scene, 5e-4, fabric, grid), fabric
 
 
 def test_pressed_layers_push_each_other_away(pair, sheet):
@@ -199,20 +196,18 @@ def test_pressed_layers_push_each_other_away(pair, sheet):
     start = solver.init(jnp.concatenate([flat(sheet, 0.1), flat(sheet, 0.1 + 0.3 * SPACING)]))
     gaps = []
     for pressed in (1.0, 0.4):  # they press below 0.5
-        moved = states(
-            solver, fabric, dataclasses.replace(start, d=pressed * start.d), still(1, 20)
-        )
+        moved = states(solver, fabric, dataclasses.replace(start, d=pressed * start.d), still(20))
         heights = np.asarray(moved.x)[-1, :, 2].reshape(2, 25)
         gaps.append(np.mean(heights[1] - heights[0]))
     assert gaps[0] == pytest.approx(0.3 * SPACING, rel=1e-3)
     assert gaps[1] > gaps[0] + 1e-4
 
 
-@pytest.mark.slow(group="points")
+@pytest.mark.slow(group="mpm")
 def test_a_sheet_that_falls_on_another_stays_on_it(pair, sheet):
     solver, fabric = pair
     x = jnp.concatenate([flat(sheet, 2e-3), flat(sheet, 0.12)])
-    moved = states(solver, fabric, solver.init(x), still(1, 1500))
+    moved = states(solver, fabric, solver.init(x), still(1500))
     low, high = np.asarray(moved.x)[:, :25, 2], np.asarray(moved.x)[:, 25:, 2]
     assert np.min(low) >= 0
     assert np.min(high - low) > 0.2 * SPACING
@@ -220,13 +215,13 @@ def test_a_sheet_that_falls_on_another_stays_on_it(pair, sheet):
     assert 0.7 * SPACING < np.mean(high[-1] - low[-1]) < 1.3 * SPACING
 
 
-@pytest.mark.slow(group="points")
+@pytest.mark.slow(group="mpm")
 def test_sheets_that_part_do_not_hold_each_other(pair, sheet):
     solver, fabric = pair
     solver = eqx.tree_at(lambda s: s.background.gravity, solver, jnp.zeros((), float))
     x = jnp.concatenate([flat(sheet, 0.1), flat(sheet, 0.1 + SPACING)])
     apart = jnp.repeat(jnp.array([[0.0, 0.0, -0.2], [0.0, 0.0, 0.2]]), 25, axis=0)
-    moved = states(solver, fabric, solver.init(x, apart), still(1, 1500))
+    moved = states(solver, fabric, solver.init(x, apart), still(1500))
     low, high = np.asarray(moved.v)[-1, :25, 2], np.asarray(moved.v)[-1, 25:, 2]
     gap = np.asarray(moved.x)[-1, 25:, 2] - np.asarray(moved.x)[-1, :25, 2]
     assert np.min(gap) > 1.5 * SPACING
@@ -236,35 +231,35 @@ def test_sheets_that_part_do_not_hold_each_other(pair, sheet):
 def test_wind_gives_the_momentum_of_its_drag(sheet, elastic):
     solver = solver_of(sheet, elastic, air=1.2)
     solver = eqx.tree_at(lambda s: s.background.gravity, solver, jnp.zeros((), float))
-    wind = jnp.broadcast_to(jnp.array([0.0, 0.0, 3.0]), (1, 60, 3))
-    controls = dataclasses.replace(still(1, 60), wind=wind)
+    wind = jnp.broadcast_to(jnp.array([0.0, 0.0, 3.0]), (60, 3))
+    controls = dataclasses.replace(still(60), wind=wind)
     moved = states(solver, elastic, solver.init(flat(sheet)), controls)
     gained = np.sum(np.asarray(vertex_masses(sheet, elastic.density))[:, None] * moved.v[0], axis=0)
     expected = solver.dt * 1.2 * 2 / 2 * SIZE**2 * 3.0**2
     assert gained == pytest.approx([0, 0, expected], abs=1e-14)
 
 
-@pytest.mark.slow(group="points")
+@pytest.mark.slow(group="mpm")
 def test_held_vertices_follow_their_path_exactly(sheet, elastic):
-    solver = solver_of(sheet, elastic, held=(0, 4))
+    solver = solver_of(sheet, elastic, pinned=(0, 4))
     x = flat(sheet)
-    time = jnp.linspace(0, 1, 60)[None, :, None, None]
-    path = x[jnp.array([0, 4])][None, None] + time * jnp.array([[[[0.01, 0.0, 0.02]]]])
-    moved = states(solver, elastic, solver.init(x), Control(path, jnp.zeros((1, 60, 3))))
-    assert np.array_equal(np.asarray(moved.x)[:, [0, 4]], np.asarray(path[0]))
+    time = jnp.linspace(0, 1, 60)[:, None, None]
+    path = x[jnp.array([0, 4])][None] + time * jnp.array([[[0.01, 0.0, 0.02]]])
+    moved = states(solver, elastic, solver.init(x), Control(path))
+    assert np.array_equal(np.asarray(moved.x)[:, [0, 4]], np.asarray(path))
 
 
-@pytest.mark.slow(group="points")
+@pytest.mark.slow(group="mpm")
 def test_a_grid_of_cells_moves_as_the_same_mesh_by_gathers():
     """Wrinkles, drag and viscosity included; wrinkles that are followed lag a little behind."""
     mesh = r2s.rectangle((0.2, 0.15), (5, 4))
     fabric = Fabric.make(0.3, (40.0, 2.0, 30.0, 8.0), 1e-5, damping=2e-3, friction=0.4)
-    solver = solver_of(mesh, fabric, held=(0,), table=0.0, air=1.2, dt=2e-4)
+    solver = solver_of(mesh, fabric, pinned=(0,), table=0.0, air=1.2, dt=2e-4)
     assert solver.cells is not None
     x = flat(mesh, 1e-3)
-    rise = jnp.linspace(0, 0.05, 100)[None, :, None, None]
-    path = x[:1][None, None] + rise * jnp.ones((1, 1, 1, 3))
-    controls = Control(path, jnp.broadcast_to(jnp.array([0.5, 0.0, 1.0]), (1, 100, 3)))
+    rise = jnp.linspace(0, 0.05, 100)[:, None, None]
+    path = x[:1][None] + rise * jnp.ones((1, 1, 3))
+    controls = Control(path, jnp.broadcast_to(jnp.array([0.5, 0.0, 1.0]), (100, 3)))
     found = states(solver, fabric, solver.init(x), controls)
     gathers = dataclasses.replace(solver, cells=None)
     expected = states(gathers, fabric, gathers.init(x), controls)
@@ -299,15 +294,16 @@ def test_what_cannot_work_is_refused(sheet, elastic):
         solver_of(sheet, elastic).init(flat(sheet, 1.0))
 
 
-@pytest.mark.slow(group="points")
+@pytest.mark.slow(group="mpm")
 def test_a_sheet_that_is_carried_out_of_the_grid_ends_the_run(sheet, elastic):
     """Also where every vertex is held, and its place known all the time."""
-    solver = solver_of(sheet, elastic, held=tuple(range(25)))
-    x, height = flat(sheet), jnp.linspace(0, 0.5, 60)[None, :, None, None]
-    path = x[None, None] + height * jnp.array([[[[0.0, 0.0, 1.0]]]])
-    moved = r2s.simulate(solver, elastic, solver.init(x), Control(path, jnp.zeros((1, 60, 3))))
-    assert moved.failure == Failure.GRID and not moved.ok[0]
-    assert int(moved.failed_step) == int(jnp.argmax(path[0, :, 0, 2] > solver_top(solver)))
+    solver = solver_of(sheet, elastic, pinned=tuple(range(25)))
+    x, height = flat(sheet), jnp.linspace(0, 0.5, 60)[:, None, None]
+    path = x[None] + height * jnp.array([[[0.0, 0.0, 1.0]]])
+    moved = r2s.simulate(solver, elastic, solver.init(x), Control(path))
+    assert moved.result == Result.GRID and not moved.ok[-1]
+    first = int(jnp.argmax(path[:, 0, 2] > solver_top(solver)))
+    assert float(moved.failed_at) == pytest.approx((first + 1) * solver.dt)
 
 
 def solver_top(solver):

@@ -47,7 +47,7 @@ def test_each_is_the_transpose_of_the_other(case):
     assert there == pytest.approx(float(jnp.sum(value * values) + jnp.sum(moment * slopes)))
 
 
-@pytest.mark.slow(group="points")
+@pytest.mark.slow(group="mpm")
 def test_the_reverse_rules_equal_those_of_jax(case):
     grid, x, values, slopes, nodes = case
     for fast, plain, inputs in (

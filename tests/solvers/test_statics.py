@@ -23,8 +23,8 @@ force = eqx.filter_jit(residual)
 def pull(solver, fabric, states):
     """Forces [N] with which the grippers hold a sheet that is at rest in the last of its states."""
     state = jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), states)
-    control = Control(state.x[solver.scene.held], jnp.zeros(3))
-    return np.asarray(force(solver.potential(fabric, state, control), state.x))[solver.scene.held]
+    control = Control(state.x[solver.scene.pinned], jnp.zeros(3))
+    return np.asarray(force(solver.potential(fabric, state, control), state.x))[solver.scene.pinned]
 
 
 # A strip that hangs, and gets narrower

@@ -97,14 +97,12 @@ import numpy as np
 import dataclasses
 import r2s
 from r2s import presets
-from r2s.environment.air import Air
-from r2s.environment.contact import Table
 from r2s.solvers.sweep import sweep
 
 sheet = r2s.rectangle((0.2, 0.2), (3, 3))
-solver = r2s.Cloth.make(r2s.Scene(sheet, jnp.array([0]), Table.make(-1.0), Air.make()), dt=0.02)
+solver = r2s.ImplicitCloth(r2s.Scene(sheet, [0]), dt=0.02)
 start = jnp.concatenate([sheet.rest, jnp.zeros((9, 1))], axis=1)
-still = r2s.Control(jnp.broadcast_to(start[0], (2, 3, 1, 3)), jnp.zeros((2, 3, 3)))
+still = r2s.Control(jnp.broadcast_to(start[0], (6, 1, 3)))
 
 def lowest(density):
     fabric = presets.grey_interlock()

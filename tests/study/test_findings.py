@@ -27,7 +27,7 @@ MANY = tuple(f"fabric{i}" for i in range(10))  # that is what it takes to tell s
 def as_concluded(configuration, fabric, motion, trial, repeat):
     """Distances that make all conclusions right."""
     value = {"folding": 0.01, "fling": 0.03, "shaking": 0.025}[motion]
-    if motion == "shaking" and configuration.solver == "points":
+    if motion == "shaking" and configuration.solver == "mpm":
         value *= 1.5
     if motion == "fling" and configuration.solver == "cloth":
         value *= 1.5
@@ -45,7 +45,7 @@ def reversed_of(configuration, fabric, motion, trial, repeat):
     value = {"folding": 0.03, "fling": 0.02, "shaking": 0.02}[motion]
     if motion == "shaking" and configuration.solver == "cloth":
         value *= 1.5
-    if motion == "fling" and configuration.solver == "points":
+    if motion == "fling" and configuration.solver == "mpm":
         value *= 1.5
     if configuration.estimated_from == "wind":
         value *= 1.3 if motion == "folding" else 0.8
@@ -180,7 +180,7 @@ HEADER = "metric,fabric,diffcloud-diffsim-lifting,pinn-difftaichi-stretching\n"
 LINES = "CD,Black Denim,0.25,0.5\nCD,Red Jet Set,0.75,1.5\nCD,Average,9,9\nHD,Black Denim,1.25,2\n"
 DIFFCLOUD, PINN = (
     Configuration("diffcloud", "cloth", "lifting"),
-    Configuration("pinn", "points", "stretching"),
+    Configuration("pinn", "mpm", "stretching"),
 )
 
 
@@ -241,7 +241,7 @@ def test_ours_stand_beside_theirs(folder):
         "DIFFCLOUD cloth lifting",
         "default cloth",
         "DIFFCLOUD cloth lifting, paper",
-        "PINN points stretching, paper",
+        "PINN mpm stretching, paper",
     }
     ours, theirs = table["DIFFCLOUD cloth lifting"], table["DIFFCLOUD cloth lifting, paper"]
     assert ours["black_denim"] == pytest.approx(0.4) and theirs["black_denim"] == 0.25

@@ -10,7 +10,7 @@ import pytest
 
 from r2s.cli.study import Study
 from r2s.mesh.surface import nearest
-from r2s.scenarios.standard import SIX
+from r2s.scenarios.standard import SCENARIOS
 from r2s.study import engine
 from r2s.study.ensembles import read_ensemble
 from r2s.study.evaluations import EvaluationTask, read_measured, read_motions
@@ -42,13 +42,13 @@ def moves():
     if not has_mujoco:
         pytest.skip("needs r2s[mujoco]")
     names = ("lifting", "folding", "fling", "shaking")
-    return {name: motion(SIX[name]()) for name in names}
+    return {name: motion(SCENARIOS[name]()) for name in names}
 
 
 def test_held_vertices_follow_the_path(moves):
     for name, x in moves.items():
-        experiment = SIX[name]()
-        route, held = experiment.route, np.asarray(experiment.scenario((5, 5)).scene.held)
+        experiment = SCENARIOS[name]()
+        route, held = experiment.route, np.asarray(experiment.scenario((5, 5)).scene.pinned)
         path = route.path.reshape(len(route.times), -1).T
         wanted = np.stack([np.interp(experiment.times, route.times, along) for along in path], 1)
         np.testing.assert_allclose(x[:, held].reshape(len(x), -1), wanted, atol=1e-5)
@@ -72,15 +72,15 @@ def test_a_hanging_sheet_is_at_rest_below_its_grippers_and_stretches_by_its_weig
 
 
 def test_the_same_sheet_moves_alike_and_another_does_not(moves):
-    again = motion(SIX["fling"]())
+    again = motion(SCENARIOS["fling"]())
     np.testing.assert_array_equal(again, moves["fling"])
-    other = motion(SIX["fling"](), Material(young=8e3))
+    other = motion(SCENARIOS["fling"](), Material(young=8e3))
     assert np.abs(other - again).max() > 5e-3
 
 
 @needs_mujoco
 def test_a_sheet_that_is_lost_is_an_error_that_says_when():
-    scenario = SIX["lifting"]().scenario(COARSE.shape)
+    scenario = SCENARIOS["lifting"]().scenario(COARSE.shape)
     torn = dataclasses.replace(scenario, path=scenario.path.at[-1].set(jnp.nan))
     with pytest.raises(RuntimeError, match=r"diverged after 3\.\d+ s"):
         moved(torn, SHEET, COARSE.step)
@@ -89,7 +89,7 @@ def test_a_sheet_that_is_lost_is_an_error_that_says_when():
 @pytest.mark.slow(group="study")
 @needs_mujoco
 def test_half_the_step_changes_less_than_a_step_that_is_twice_as_long():
-    experiment = SIX["lifting"](num_frames=8, moving=0.4)
+    experiment = SCENARIOS["lifting"](num_frames=8, moving=0.4)
 
     def change(step):
         """Of the positions, when the step is halved, rms [m]."""

@@ -35,7 +35,7 @@ def test_what_diverged_is_last():
 
     found = rank(made_up(some))
     assert found is not None
-    assert found.table["mean"]["DiffCP points lifting"] == len(found.table)
+    assert found.table["mean"]["DiffCP mpm lifting"] == len(found.table)
 
 
 def test_what_is_judged_on_less_than_half_is_left_out():
@@ -44,7 +44,7 @@ def test_what_is_judged_on_less_than_half_is_left_out():
     is_lost = (results.approach == "pinn") & results.recording.str.endswith("denim1")
     found = rank(results[~is_lost])
     assert found is not None
-    assert found.left_out == ["DiffCP points lifting"] and found.recordings == 11
+    assert found.left_out == ["DiffCP mpm lifting"] and found.recordings == 11
 
 
 def test_alike_configurations_are_not_told_apart():

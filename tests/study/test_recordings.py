@@ -12,7 +12,7 @@ from r2s.materials import presets
 from r2s.metrics.losses import to_surface
 from r2s.recordings.recording import cloud
 from r2s.scenarios.paths import LIMITS
-from r2s.scenarios.standard import SIX
+from r2s.scenarios.standard import SCENARIOS
 from r2s.study import plan as plans
 from r2s.study.evaluations import predict
 from r2s.study.recordings import (
@@ -27,7 +27,7 @@ from r2s.study.recordings import (
 )
 from r2s.study.tasks import execute
 
-FLING = SIX["fling"](num_frames=30)
+FLING = SCENARIOS["fling"](num_frames=30)
 
 
 def test_a_hanging_sheet_starts_in_the_shape_that_is_given_held_where_the_path_begins():
@@ -37,7 +37,7 @@ def test_a_hanging_sheet_starts_in_the_shape_that_is_given_held_where_the_path_b
     free = np.asarray(other.scene.is_free)
     expected = shape[::2, ::2].reshape(-1, 3)  # vertices that both meshes have
     np.testing.assert_allclose(np.asarray(moved.start)[free], expected[free], atol=1e-6)
-    held = np.asarray(moved.scene.held)
+    held = np.asarray(moved.scene.pinned)
     np.testing.assert_allclose(np.asarray(moved.start)[held], np.asarray(other.path)[1], atol=1e-6)
     assert bool(jnp.all(moved.path[0] == moved.path[1]))
     assert (moved.lead_in - 1) * moved.interval < SETTLING <= moved.lead_in * moved.interval + 1e-9
@@ -45,7 +45,7 @@ def test_a_hanging_sheet_starts_in_the_shape_that_is_given_held_where_the_path_b
 
 
 def test_a_sheet_on_the_table_starts_flat():
-    lying = SIX["folding"]().scenario((5, 5))
+    lying = SCENARIOS["folding"]().scenario((5, 5))
     assert started(lying, None) is lying
     with pytest.raises(ValueError, match="lies on the table"):
         started(lying, np.zeros((5, 5, 3)))

@@ -265,7 +265,7 @@ def test_given_recordings_are_shown_one_by_one():
     rows = [row("", 0.02), row("default", 0.03), row("other_fabric", 0.025)]
     rows += [row("repeatability", 0.01), row("", 0.09, repeat="1"), row("on_cloth", 0.5)]
     rows += [row("default", 0.04, "fold_silk2"), row("default", 0.05, "fold_silk2", repeat="1")]
-    rows += [row("default", 0.7, solver="points")]
+    rows += [row("default", 0.7, solver="mpm")]
     table = recording_table(as_frame(rows), "chamfer_real_to_sim").set_index("recording")
     first, second = table.loc["fold_silk"], table.loc["fold_silk2"]
     assert dict(first[["estimate", "default", "other_fabric", "repeatability"]]) == {
@@ -278,11 +278,11 @@ def test_given_recordings_are_shown_one_by_one():
 def test_every_range_and_fixed_value_stands_in_the_table():
     table = range_table(plans.synthetic(plans.SMALL))
     shown = set(zip(table.solver, table.parameter, strict=True))
-    for solver in ("cloth", "points"):
+    for solver in ("cloth", "mpm"):
         space = default_space(solver, 0.2)
         names = [each.name for each in (*space.ranges, *default_spaces.fixed(space))]
         assert {(solver, name) for name in names} <= shown
     assert table["from"].notna().all() and (table["from"] != "").all()
     # as many densities as fabrics
-    densities = table[(table.solver == "points") & (table.parameter == "density")]
+    densities = table[(table.solver == "mpm") & (table.parameter == "density")]
     assert len(densities) == len(plans.SMALL.fabrics)

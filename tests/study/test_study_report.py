@@ -31,7 +31,7 @@ from r2s.study.statistics.frame import (
 from r2s.study.verdicts import Judged
 
 LIMIT = 15_000_000  # bytes of a report
-LABELS = "DIFFCLOUD cloth lifting", "DiffCP points lifting"
+LABELS = "DIFFCLOUD cloth lifting", "DiffCP mpm lifting"
 REFERENCES = "true fabric on cloth", "prior median on cloth", "default cloth"
 VOID = {"meta", "br"}
 ESTIMATED = pd.DataFrame(

@@ -48,7 +48,7 @@ def test_a_sheet_does_not_differ_from_itself_beyond_the_horizon_whatever_its_mes
 @pytest.mark.slow(group="study")
 def test_a_truth_is_judged_beside_its_own_ensemble(tmp_path, monkeypatch):
     """A 9 x 9 truth, its prediction on the same mesh, and the whole way to the rows."""
-    monkeypatch.setattr("r2s.study.evaluations.SHAPES", {"cloth": (9, 9), "points": (9, 9)})
+    monkeypatch.setattr("r2s.study.evaluations.SHAPES", {"cloth": (9, 9), "mpm": (9, 9)})
     source = SyntheticRecording(FABRIC, "fling", 0, True, TruthSettings((9, 9), stiffening=0.0))
     density = float(small_strain(FABRIC).density)
     cells = [EvaluationTask(None, "cloth", density, FABRIC, (source,), each) for each in (None, 0)]

@@ -24,10 +24,10 @@ from r2s.estimation.physnet.images import (
 )
 from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
-from r2s.scenarios.resolution import material_points
+from r2s.scenarios.resolution import mpm_cloth
 from r2s.scenarios.scenario import Scenario, rollout
-from r2s.scenarios.standard import SIX, Experiment, varied
-from r2s.solvers.mpm.sheet import Sheet
+from r2s.scenarios.standard import SCENARIOS, Experiment, varied
+from r2s.solvers.mpm.sheet import MPMCloth
 
 FORMAT = "r2s-physnet-data/3"
 DEPTH_UNIT = 1e-4  # [m], of the depths in the files
@@ -38,14 +38,14 @@ DENSITY = 0.2  # [kg/m^2], of all fabrics
 class Settings:
     """The settings that determine a data set.
 
-    - `scenario`: a name in `r2s.scenarios.SIX`.
+    - `scenario`: a name in `r2s.scenarios.SCENARIOS`.
     - `num_fabrics`: fabrics, drawn uniformly from the unit cube of the space.
     - `num_levels`: motions of each fabric, the same for all of a shard; see `levels`.
     - `num_frames`: frames of each motion, evenly spread over those that count.
     - `size`: side of the images, [pixel].
     - `shape`: vertices of the sheet along warp and weft.
     - `ranges`: of the space; without ranges its defaults.
-    - `solver`: "cloth" of orthotropic fabrics, or "points" (material points) of isotropic ones.
+    - `solver`: "cloth" of orthotropic fabrics, or "mpm" (material points) of isotropic ones.
     - `per_shard`: fabrics in a file.
     """
 
@@ -67,8 +67,8 @@ class Settings:
         names, expected = ([bound.name for bound in ranges] for ranges in (self.ranges, default))
         if names[: len(expected)] != expected:
             raise ValueError(f"the space has the ranges {expected}, found {names}")
-        if self.scenario not in SIX:
-            raise ValueError(f"scenario must be one of {list(SIX)}, found {self.scenario!r}")
+        if self.scenario not in SCENARIOS:
+            raise ValueError(f"scenario must be one of {list(SCENARIOS)}, found {self.scenario!r}")
 
     @property
     def space(self) -> ParameterSpace:
@@ -81,7 +81,7 @@ class Settings:
         return -(-self.num_fabrics // self.per_shard)
 
     def _default_space(self) -> OrthotropicSpace | IsotropicSpace:
-        return (IsotropicSpace if self.solver == "points" else OrthotropicSpace).make(DENSITY)
+        return (IsotropicSpace if self.solver == "mpm" else OrthotropicSpace).make(DENSITY)
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def make(folder: Path | str, settings: Settings, progress: bool = True) -> Manif
     for number in tqdm(missing, "shards", disable=None if progress else True):
         places, x, ok = _simulate(settings, number, substeps, solver)
         if view is None:
-            experiment, points = SIX[settings.scenario](), x[ok].reshape(-1, 3)
+            experiment, points = SCENARIOS[settings.scenario](), x[ok].reshape(-1, 3)
             eye, floor = eye_of(experiment), floor_of(experiment)
             view = view_around(eye, points, settings.size, floor)
         write_json(folder / "manifest.json", asdict(Manifest(FORMAT, settings, view)))
@@ -173,7 +173,8 @@ def levels(settings: Settings, number: int = 0) -> list[Experiment]:
     Each shard has variations of its own, so that a network cannot learn them by heart.
     """
     key = jr.fold_in(jr.key(settings.seed), 2**20 + number)  # different from that of the fabrics
-    return [SIX[settings.scenario](), *varied(settings.scenario, settings.num_levels - 1, key=key)]
+    others = varied(settings.scenario, settings.num_levels - 1, key=key)
+    return [SCENARIOS[settings.scenario](), *others]
 
 
 def frame_indices(used: tuple[int, int], number: int) -> tuple[int, ...]:
@@ -186,7 +187,7 @@ def _shard(folder: Path, number: int) -> Path:
     return folder / f"{number:04d}.npz"
 
 
-def _shared(settings: Settings) -> tuple[int, Sheet | None]:
+def _shared(settings: Settings) -> tuple[int, MPMCloth | None]:
     """The steps between frames and the solver of all shards, so that they compile once.
 
     The solver is None for the cloth, or material points whose step and grid serve all motions.
@@ -201,11 +202,11 @@ def _shared(settings: Settings) -> tuple[int, Sheet | None]:
     times = jnp.concatenate([scenario.path_times for scenario in scenarios])
     stiffest = settings.space(jnp.ones(len(settings.ranges), float))
     everywhere = dataclasses.replace(scenarios[0], path=path, path_times=times)
-    return substeps, material_points(everywhere, stiffest)
+    return substeps, mpm_cloth(everywhere, stiffest)
 
 
 @eqx.filter_jit
-def _rollouts(scenarios: Scenario, fabrics: Fabric, solver: Sheet | None):
+def _rollouts(scenarios: Scenario, fabrics: Fabric, solver: MPMCloth | None):
     def one(scenario: Scenario, fabric: Fabric):
         # the grid serves all scenarios, but each has a fan of its own
         own = solver and eqx.tree_at(lambda s: s.scene, solver, scenario.scene)
@@ -215,7 +216,7 @@ def _rollouts(scenarios: Scenario, fabrics: Fabric, solver: Sheet | None):
     return eqx.filter_vmap(one)(scenarios, fabrics)
 
 
-def _simulate(settings: Settings, number: int, substeps: int, solver: Sheet | None):
+def _simulate(settings: Settings, number: int, substeps: int, solver: MPMCloth | None):
     """Places of the fabrics, motions [m] and which of them are ok, of a shard."""
     first = number * settings.per_shard
     count = min(settings.per_shard, settings.num_fabrics - first)
@@ -240,7 +241,7 @@ _depths = eqx.filter_jit(eqx.filter_vmap(depths_of_sheet, in_axes=(None, 0, None
 
 def _write(path: Path, settings: Settings, view: View, places, x, ok) -> None:
     """Write a shard with depths in units of `DEPTH_UNIT`."""
-    experiment = SIX[settings.scenario]()
+    experiment = SCENARIOS[settings.scenario]()
     faces = experiment.scenario(settings.shape).scene.mesh.faces
     fine = per_face(view, settings.shape, experiment.sheet.size)
     x = jnp.asarray(np.where(np.isfinite(x), x, 0))

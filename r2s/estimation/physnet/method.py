@@ -17,10 +17,10 @@ from r2s.estimation.method import ANY, Budget, DataRequirements, Method, seed_of
 from r2s.estimation.physnet import dataset, estimator, images, training
 from r2s.estimation.problem import read_by_problem
 from r2s.recordings.recording import Recording
-from r2s.scenarios.resolution import material_points
+from r2s.scenarios.resolution import mpm_cloth
 from r2s.scenarios.scenario import from_recording
 
-NETWORK_SHAPE = {"cloth": (9, 9), "points": (7, 7)}
+NETWORK_SHAPE = {"cloth": (9, 9), "mpm": (7, 7)}
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def train_network(
     goes on. `progress` shows a bar of the simulations, and prints a line an epoch, on stderr.
     """
     options: dict[str, Any] = {"ranges": RANGES}
-    if solver == "points":
+    if solver == "mpm":
         shape = NETWORK_SHAPE[solver]
         options = {"solver": solver, "num_levels": 3, "shape": shape, "per_shard": 4}
     settings = dataset.Settings(scenario, budget.fabrics, seed=seed, **options)
@@ -81,9 +81,9 @@ class PhysNetMethod(Method):
     """
 
     name = "physnet"
-    budget = Budget(evaluations=80)
-    heeds = ("evaluations",)
-    supports = {"cloth": ANY, "points": ANY}
+    budget = Budget(max_evaluations=80)
+    budget_fields = ("max_evaluations",)
+    supports = {"cloth": ANY, "mpm": ANY}
     takes_shape = False
     library: ClassVar[str] = "sklearn"
     published: ClassVar[bool] = False  # without the force of a stretching, too
@@ -103,7 +103,7 @@ class PhysNetMethod(Method):
         frames = _images_of(recording)
         seen = images.of_clouds(trained.view, recording, frames)
         stiffest = space(jnp.ones(space.dim, float))
-        points = None if solver == "cloth" else material_points(scenario, stiffest)
+        points = None if solver == "cloth" else mpm_cloth(scenario, stiffest)
         pull = None if self.published else estimator.pull_force(recording, frames)
         observation = estimator.ImageObservation.make(
             scenario, seen, frames, space, trained, points, pull
@@ -111,7 +111,7 @@ class PhysNetMethod(Method):
         return estimator.estimate(
             observation,
             published=self.published,
-            num_calls=budget.evaluations,
+            num_calls=budget.max_evaluations,
             seed=seed_of(key),
             path=self.checkpoint,
             progress=self.progress,

@@ -22,15 +22,15 @@ CHUNK = 100  # epochs of the published recipe between two losses
 class PINN(Method):
     """The physics-informed network, from the markers and force of stretchings.
 
-    No solver simulates: "cloth" and "points" tell which space is estimated. `Budget.iterations`
+    No solver simulates: "cloth" and "mpm" tell which space is estimated. `Budget.iterations`
     are the epochs with physics of the networks' training.
     """
 
     name = "pinn"
-    budget = Budget(iterations=200)
-    heeds = ("iterations",)
-    supports = {"cloth": ("stretching",), "points": ("stretching",)}
-    refusals = {"cloth": ALONE, "points": ALONE}
+    budget = Budget(max_iterations=200)
+    budget_fields = ("max_iterations",)
+    supports = {"cloth": ("stretching",), "mpm": ("stretching",)}
+    refusals = {"cloth": ALONE, "mpm": ALONE}
     several = True
     takes_shape = False
 
@@ -45,7 +45,7 @@ class PINN(Method):
         return estimate(
             pulls,
             space,
-            Recipe(adam=budget.iterations),
+            Recipe(adam=budget.max_iterations),
             progress=self.progress,
             checkpoint=self.checkpoint,
             key=key,
@@ -60,7 +60,7 @@ class PublishedPINN(PINN):
     """
 
     name = "pinn-published"
-    budget = Budget(iterations=10_000)
+    budget = Budget(max_iterations=10_000)
     refusals = {}
 
     def reads(self, recording):
@@ -69,7 +69,7 @@ class PublishedPINN(PINN):
     def _estimate(self, recordings, space, budget, key):
         from r2s.estimation.pinn import published_recipe  # needs flax
 
-        began, epochs = time.perf_counter(), budget.iterations
+        began, epochs = time.perf_counter(), budget.max_iterations
         pulls = [pull_from(recording, without_force=True) for recording in recordings]
         train = published_recipe.train
         trained = train(space, stacked(pulls), epochs, min(CHUNK, epochs), key=key)

@@ -201,19 +201,19 @@ def _check_on_sheet(displacement, height, seen, places, side: float) -> None:
 
 def _clamps(recording: Recording, times: np.ndarray, axes: np.ndarray, size: np.ndarray):
     """Displacement, velocity and acceleration of both clamps, by cubic splines of their path."""
-    held = recording.info.sheet.held
+    pinned = recording.info.sheet.pinned
     corners = {"origin": (0, 0), "weft": (0, 1), "warp": (1, 0), "opposite": (1, 1)}
-    if set(held) != set(corners):
-        raise ValueError(f"a stretching is clamped at four corners, this sheet is held at {held}")
-    world = np.asarray(recording.handle_path, np.float64) - np.asarray(recording.info.sheet.origin)
-    path = world @ axes[:2].T - np.array([corners[name] for name in held]) * size
-    knots, columns = np.asarray(recording.handle_times, np.float64), path.reshape(len(path), -1).T
+    if set(pinned) != set(corners):
+        raise ValueError(f"a stretching is clamped at four corners, this sheet is held at {pinned}")
+    world = np.asarray(recording.gripper_path, np.float64) - np.asarray(recording.info.sheet.origin)
+    path = world @ axes[:2].T - np.array([corners[name] for name in pinned]) * size
+    knots, columns = np.asarray(recording.gripper_times, np.float64), path.reshape(len(path), -1).T
     moved = np.stack([np.interp(times, knots, column) for column in columns], axis=1)
     spline = CubicSpline(times, moved.reshape(len(times), *path.shape[1:]))
     derivatives = np.stack([spline(times, order) for order in range(3)])
     ends = []
     for pair in (("origin", "weft"), ("warp", "opposite")):
-        first, second = (derivatives[:, :, held.index(name)] for name in pair)
+        first, second = (derivatives[:, :, pinned.index(name)] for name in pair)
         if np.max(np.abs(first[0] - second[0])) > 1e-3 * min(size):
             raise ValueError(f"the clamp from {pair[0]} to {pair[1]} turns: it must go straight")
         ends.append((first + second) / 2)

@@ -1,6 +1,6 @@
 """The cloth in explicit steps: as many symplectic substeps in a step as its waves need.
 
-The physics are those of `r2s.Cloth`, but for the fastest waves of the membrane
+The physics are those of `r2s.ImplicitCloth`, but for the fastest waves of the membrane
 (`viscosity`). A substep needs no solve, and all its arrays are worked on side by side:
 of a batch, its members. For derivatives the implicit cloth is better: these would go through every
 substep.
@@ -8,7 +8,7 @@ substep.
 
 import math
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,10 +17,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s._util.arrays import is_traced
+from r2s._util.units import Scalar
 from r2s.environment.scene import Control, Scene
-from r2s.materials.fabric import Fabric
+from r2s.materials.fabric import Fabric, check_fabric
 from r2s.materials.plate import PlateLaw
 from r2s.mesh.mesh import Mesh
+from r2s.solvers.arguments import check_step_arguments
 from r2s.solvers.explicit import elements
 from r2s.solvers.explicit.elements import moved_velocity
 from r2s.solvers.explicit.layout import Layout, batch_last
@@ -35,7 +37,7 @@ from r2s.solvers.explicit.sheet import (
     slices,
 )
 from r2s.solvers.explicit.stability import RELAXATION, Viscosity, check_step, longest_relaxing_step
-from r2s.solvers.failures import Failure, all_finite, first_failure, no_failure
+from r2s.solvers.results import Result, all_finite, first_failure, no_failure
 
 Positions = Float[Array, "vertex 3"]
 OfSamples = Float[Array, "element sample 3"]
@@ -47,7 +49,7 @@ TRACED = (
 )
 REFUSED = (
     "explicit steps do not know contact of the sheet with itself: take the implicit cloth, "
-    "r2s.Cloth.make(..., self_contact=True), or material points, r2s.material_points"
+    "r2s.ImplicitCloth(..., self_contact=True), or material points, r2s.mpm_cloth"
 )
 
 
@@ -57,7 +59,7 @@ class ExplicitState(eqx.Module):
     - `hidden`: scaled wrinkles of every sample, from where the next substep goes on; None: the mesh
       has none, or is no grid.
     - `begun`: whether there was a step.
-    - `failure`: the first `r2s.solvers.failures.Failure` of the run so far.
+    - `failure`: the first `r2s.solvers.results.Result` of the run so far.
     """
 
     x: Positions
@@ -71,76 +73,80 @@ class ExplicitState(eqx.Module):
 class ExplicitCloth(eqx.Module):
     """A sheet in a scene, stepped by symplectic Euler in substeps.
 
-    `make` makes one. `jax.vmap` of `step` runs a batch with its members side by side.
+    `jax.vmap` of `step` runs a batch with its members side by side.
 
-    - `scene`: sheet, held vertices, table, air.
+    - `scene`: sheet, pinned vertices, table, air, gravity. Its mesh must not be traced.
+    - `dt`: step, [s]; another one is another program.
+    - `fabric`: the stiffest that it will be used for, or a batch of all: it gives the substeps, the
+      fewest below `stable_step`.
     - `membrane_damping`: damping time of the membrane, [s]; None: the fabric's.
-    - `relaxation`: of the membrane's viscosity, [s].
-    - `dt`: step, [s]. `substeps`: in a step.
+    - `relaxation`: of the membrane's viscosity, [s]; 0 is plain Kelvin-Voigt damping, in far
+      shorter substeps.
+    - `substeps`: in a step, instead of those of the fabric, which may be None then.
     - `grid`: vertices along warp and weft of a rectangle of quadrilaterals, and the spacing
       between them [m]; None: any other mesh, whose forces take several times as long.
+
+    Raises `ValueError` for a step that is not positive, for substeps that are too long, with their
+    limit, for a fabric that is traced or has no limit, and for self-contact.
     """
 
     scene: Scene
+    dt: float = eqx.field(static=True)
     membrane_damping: Float[Array, ""] | None
     relaxation: Float[Array, ""]
-    dt: float = eqx.field(static=True)
     substeps: int = eqx.field(static=True)
     grid: Cells | None = eqx.field(static=True)
 
-    @classmethod
-    def make(
-        cls,
+    def __init__(
+        self,
         scene: Scene,
         dt: float,
-        fabric: Fabric,
-        membrane_damping: float | None = None,
-        relaxation: float = RELAXATION,
+        fabric: Fabric | None = None,
+        membrane_damping: Scalar | None = None,
+        relaxation: Scalar = RELAXATION,
         *,
         substeps: int | None = None,
+        grid: Cells | Literal["of the mesh"] | None = "of the mesh",
         self_contact: bool = False,
-    ) -> "ExplicitCloth":
-        """A solver for a scene, whose mesh must not be traced.
-
-        - `fabric`: the stiffest that it will be used for, or a batch of all.
-        - `membrane_damping`, `relaxation`: as in `ExplicitCloth`. A relaxation of 0 is plain
-          Kelvin-Voigt damping, in far shorter substeps.
-        - `substeps`: in a step; None: the fewest below `stable_step`.
-
-        Raises `ValueError` for a step that is not positive, for substeps that are too long, with
-        their limit, for a fabric that is traced or has no limit, and for self-contact.
-        """
+    ) -> None:
         if self_contact:
             raise ValueError(REFUSED)
         if is_traced(fabric):
             raise ValueError(TRACED)
         if substeps is not None and (substeps != int(substeps) or substeps < 1):
             raise ValueError(f"substeps must be a whole number from 1 on, got {substeps}")
+        dt = float(dt)
         if not (math.inf > dt > 0 and relaxation >= 0 and (membrane_damping or 0) >= 0):
             raise ValueError(
                 "dt must be positive, damping time and relaxation not negative, got "
                 f"{dt} s, {membrane_damping} s and {relaxation} s"
             )
-        damping = None if membrane_damping is None else jnp.asarray(membrane_damping, float)
-        relaxing = jnp.asarray(relaxation, float)
+        self.scene, self.dt = scene, dt
+        damped = membrane_damping is not None
+        self.membrane_damping = jnp.asarray(membrane_damping, float) if damped else None
+        self.relaxation = jnp.asarray(relaxation, float)
         with jax.ensure_compile_time_eval():
-            longest = shortest(scene.mesh, fabric, damping, relaxing)
-            grid = cells_of(scene.mesh)
+            self.grid = cells_of(scene.mesh) if grid == "of the mesh" else grid
+        if fabric is None:
+            if substeps is None:
+                raise ValueError("expected a fabric, which gives the substeps, or substeps")
+            self.substeps = substeps
+            return
+        with jax.ensure_compile_time_eval():
+            longest = shortest(scene.mesh, fabric, self.membrane_damping, self.relaxation)
         if not 0 < longest < math.inf:
             raise ValueError(
                 f"the fabric has no longest substep (found {longest} s): its density and its "
                 "stiffness must be positive, its numbers finite"
             )
-        if substeps is None:
-            substeps = max(1, math.ceil(dt / longest * (1 + 1e-6)))
-        solver = cls(scene, damping, relaxing, float(dt), int(substeps), grid)
-        solver._check_substep(longest)
-        return solver
+        self.substeps = substeps or max(1, math.ceil(dt / longest * (1 + 1e-6)))
+        self._check_substep(longest)
 
     def check(self, fabric: Fabric) -> None:
         """Raises `ValueError` when the substeps are too long for a fabric, unless it is traced."""
         if is_traced(fabric):
             return
+        check_fabric(fabric)
         with jax.ensure_compile_time_eval():
             times = self.membrane_damping, self.relaxation
             self._check_substep(shortest(self.scene.mesh, fabric, *times))
@@ -165,38 +171,42 @@ class ExplicitCloth(eqx.Module):
         return ExplicitState(x, v, *no_memory(self.scene.mesh, self.grid, x.dtype), no_failure())
 
     def step(self, fabric: Fabric, state: ExplicitState, control: Control) -> ExplicitState:
-        """The state `dt` later, with the held vertices at `control.handles`."""
+        """The state `dt` later, with the pinned vertices at `control.pinned`."""
         return self._step(fabric, state, control, False)[0]
 
     def step_with_forces(
         self, fabric: Fabric, state: ExplicitState, control: Control
-    ) -> tuple[ExplicitState, Float[Array, "handle 3"]]:
-        """The state `dt` later, and the grippers' mean forces [N] on the held vertices."""
+    ) -> tuple[ExplicitState, Float[Array, "pinned 3"]]:
+        """The state `dt` later, and the grippers' mean forces [N] on the pinned vertices."""
         after, impulse = self._step(fabric, state, control, True)
-        return after, impulse[self.scene.held] / self.dt
+        return after, impulse[self.scene.pinned] / self.dt
 
     def _step(self, fabric: Fabric, state: ExplicitState, control: Control, with_impulse: bool):
+        check_step_arguments(self.scene, fabric, state, control, ExplicitState)
         scene, dtype = self.scene, state.x.dtype
         carried = jnp.zeros_like(state.x)
-        carried = carried.at[scene.held].set((control.handles - state.x[scene.held]) / self.dt)
+        carried = carried.at[scene.pinned].set((control.pinned - state.x[scene.pinned]) / self.dt)
         damping = fabric.damping if self.membrane_damping is None else self.membrane_damping
         substep = jnp.asarray(self.dt / self.substeps, dtype)
         memory = Memory(state.relaxed, state.hidden, state.begun)
         viscosity = Viscosity.make(damping, self.relaxation, substep)
         around = viscosity, scene.air, scene.fan
+        wind = jnp.zeros(3, dtype) if control.wind is None else control.wind
         inputs = _Inputs(
-            ForceInputs(fabric, *around, state.x, state.v, control.wind, memory),
+            ForceInputs(fabric, *around, state.x, state.v, wind, memory),
             carried,
             scene.is_free.astype(dtype),
             scene.table.height,
+            scene.gravity,
+            substep,
             jnp.zeros_like(state.x) if with_impulse else None,
         )
         if self.grid is not None and isinstance(fabric.bending, PlateLaw):
-            advance = partial(_advance_grid, *self.grid, self.dt, self.substeps)
+            advance = partial(_advance_grid, *self.grid, self.substeps)
             moved = batch_last(advance, inputs)
         else:
-            moved = _advance(scene.mesh, self.dt, self.substeps, inputs)
-        x = scene.place(moved.x, control.handles)
+            moved = _advance(scene.mesh, self.substeps, inputs)
+        x = scene.place(moved.x, control.pinned)
         asked = state.x, state.v, fabric, control
         failure = first_failure(state.failure, _failure(asked, (x, moved.v)))
         relaxed, hidden, begun = moved.memory
@@ -216,16 +226,18 @@ class _Inputs(NamedTuple):
     """All that a step depends on; with a batch as last axis in `_advance_grid`."""
 
     forces: ForceInputs
-    carried: Array  # velocities of held vertices
+    carried: Array  # velocities of pinned vertices
     is_free: Array
     table_height: Array
+    gravity: Array
+    substep: Array  # [s]
     impulse: Array | None
 
 
-def _advance(mesh: Mesh, dt: float, substeps: int, inputs: _Inputs) -> _Moving:
+def _advance(mesh: Mesh, substeps: int, inputs: _Inputs) -> _Moving:
     """What the substeps of a step change, of any mesh."""
     start, fabric = inputs.forces, inputs.forces.fabric
-    small = jnp.asarray(dt / substeps, start.x.dtype)
+    small = inputs.substep
     mass = fabric.density * mesh.vertex_area
     free, carried = inputs.is_free > 0, tuple(inputs.carried.T)
 
@@ -233,7 +245,7 @@ def _advance(mesh: Mesh, dt: float, substeps: int, inputs: _Inputs) -> _Moving:
         x, v, memory, impulse = moving
         force, memory = force_by_gathers(mesh, start._replace(x=x, v=v, memory=memory))
         height = x[:, 2] - inputs.table_height - fabric.thickness
-        others = fabric.density, fabric.friction, fabric.mass_damping
+        others = fabric.density, fabric.friction, fabric.mass_damping, inputs.gravity
         moved = moved_velocity(small, tuple(force.T), mass, tuple(v.T), height, *others)
         v = jnp.stack([jnp.where(free, m, c) for m, c in zip(moved, carried, strict=True)], 1)
         if impulse is not None:
@@ -244,16 +256,17 @@ def _advance(mesh: Mesh, dt: float, substeps: int, inputs: _Inputs) -> _Moving:
     return jax.lax.scan(substep, moving, length=substeps)[0]
 
 
-def _advance_grid(shape, spacing, dt, substeps: int, batched: bool, inputs: _Inputs) -> _Moving:
+def _advance_grid(shape, spacing, substeps: int, batched: bool, inputs: _Inputs) -> _Moving:
     """What the substeps of a step change, on a grid."""
     layout, start = Layout(shape, spacing, batched), inputs.forces
     force_of, samples = slices(layout, start)
     count, room = layout.count, layout.room
-    dt = jnp.asarray(dt / substeps, start.x.dtype)
+    dt = layout.row(inputs.substep)
     names = ("density", "friction", "mass_damping", "thickness")
     *others, thickness = (layout.row(getattr(start.fabric, name)) for name in names)
     mass = others[0] * layout.constant(layout.vertex_areas, 0, start.x)
     contact = layout.row(inputs.table_height) + thickness
+    others.append(layout.row(inputs.gravity))
     free, carried = inputs.is_free > 0, _columns(inputs.carried)
 
     def inner(arrays):
@@ -289,8 +302,8 @@ def _columns(vectors: Array) -> tuple[Array, Array, Array]:
 
 def _failure(inputs: Any, results: Any) -> Int[Array, ""]:
     """Inputs that are not finite give `NON_FINITE`, results that are not `TIME_STEP`."""
-    code = jnp.where(all_finite(results), Failure.NONE.value, Failure.TIME_STEP.value)
-    return jnp.where(all_finite(inputs), code, Failure.NON_FINITE.value)
+    code = jnp.where(all_finite(results), Result.SUCCESS.value, Result.TIME_STEP.value)
+    return jnp.where(all_finite(inputs), code, Result.NON_FINITE.value)
 
 
 @eqx.filter_jit

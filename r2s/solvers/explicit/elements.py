@@ -1,6 +1,6 @@
 """Membrane and bending of a sheet as forces on its vertices, and bounds on their frequencies.
 
-Strains, curvatures and laws are those of `r2s.Cloth`; here they give forces, for explicit steps.
+Strains, curvatures and laws are those of `r2s.ImplicitCloth`; here they give forces.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from r2s._util.units import GRAVITY
 from r2s.environment.contact import PRESSURE_STIFFNESS, SLIP_SPEED
 from r2s.materials.fabric import Fabric
 from r2s.materials.wrinkling import membrane_on_samples, stress_on_samples
@@ -134,16 +133,18 @@ def moved_velocity(
     density: Array,
     friction: Array,
     mass_damping: Array,
+    gravity: Array,
 ) -> Vector:
     """Velocities [m/s] at the end of a substep `dt` [s].
 
     - `force`: all but those below, [N]; `mass`: [kg]; `v`: velocities before, [m/s].
     - `height`: above the place where contact with the table begins, [m].
     - `density` [kg/m^2], `friction` [-], `mass_damping` [1/s]: of the fabric.
+    - `gravity`: downwards, [m/s^2].
     """
     braking = 1 / (1 + dt * mass_damping)
     along, across, up = (braking * (u + dt * f / mass) for u, f in zip(v, force, strict=True))
-    up = up - braking * dt * GRAVITY
+    up = up - braking * dt * gravity
     # depth = free depth - dt^2 PRESSURE_STIFFNESS / density * depth^2
     free = jnp.maximum(-height - dt * up, 0)
     stiff = braking * dt**2 * PRESSURE_STIFFNESS / density

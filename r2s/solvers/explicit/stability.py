@@ -59,7 +59,7 @@ def check_step(dt: float, longest: Float[Array, ""], material: str) -> None:
         )
 
 
-RELAXATION = 2e-3  # [s]: docs/solvers.md says what motions differ by
+RELAXATION = 2e-3  # [s]: docs/guide/simulate.md says what motions differ by
 
 
 class Viscosity(NamedTuple):

@@ -1,8 +1,8 @@
 """The cloth: a sheet of triangles, implicit in time, second order, differentiable.
 
-A step goes one way: `Cloth.step` sets up the potential of the step (`potential`), Newton's method
-minimises it (`newton`) with a sparse factor (`linear`), and where the sheet touches itself that is
-repeated with the contacts that it was found to need (`self_contact`).
+`ImplicitCloth.step` sets up the potential of the step (`potential`), Newton's method minimises it
+(`newton`) with a sparse factor (`linear`), and where the sheet touches itself that is repeated with
+the contacts that it was found to need (`self_contact`).
 """
 
 import dataclasses
@@ -12,30 +12,34 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from r2s._util.arrays import is_traced
+from r2s._util.units import positive
 from r2s.environment import contact
 from r2s.environment.scene import Control, Scene
-from r2s.materials.fabric import Fabric
+from r2s.materials.fabric import Fabric, check_fabric
 from r2s.materials.wrinkling import membrane_on_samples, tangents_on_samples
 from r2s.mesh.bends import unwrapped
 from r2s.mesh.mesh import Mesh
 from r2s.mesh.surface import area_normals
+from r2s.solvers.arguments import LONGEST, check_step_arguments
 from r2s.solvers.contact.contacts import SMALL, SelfContact, colliding, touching
-from r2s.solvers.failures import Failure, first_failure, no_failure
 from r2s.solvers.implicit.generalised_alpha import by_generalised_alpha, rates_after
 from r2s.solvers.implicit.linear.system import Elimination
 from r2s.solvers.implicit.newton import minimise
 from r2s.solvers.implicit.potential import IncrementalPotential, residual
+from r2s.solvers.results import Result, first_failure, no_failure
 
 Positions = Float[Array, "vertex 3"]
 
 MAX_CONTACT_STEP = 1 / 30  # [s]
+MAX_ITERATIONS = 200  # of Newton's method
 MAX_ATTEMPTS = 12  # at a step with self-contact, before it fails
 
 
-class ClothState(eqx.Module):
+class ImplicitState(eqx.Module):
     """- `x`, `v`: positions [m] and velocities [m/s], world frame, z up.
     - `x_before`, `v_before`: those of the step before, which the second-order formula needs.
-    - `failure`: the first `r2s.solvers.failures.Failure` of the run so far.
+    - `failure`: the first `r2s.solvers.results.Result` of the run so far.
     - `a`, `pull`: accelerations and forces per mass but for the table's, [m/s^2], which the
       generalised-alpha method needs; None of BDF2.
     """
@@ -49,69 +53,73 @@ class ClothState(eqx.Module):
     pull: Float[Array, "vertex 3"] | None = None
 
 
-class Cloth(eqx.Module):
+class ImplicitCloth(eqx.Module):
     """A sheet in a scene, stepped by BDF2 or generalised alpha; each step is solved to convergence.
 
-    Differentiable, forward and reverse, in fabric, state, control and scene. `make` makes one.
+    Differentiable, forward and reverse, in fabric, state, control, scene and step.
 
-    - `scene`: sheet, held vertices, table, air.
-    - `elimination`: how the linear systems of its mesh are solved.
+    - `scene`: sheet, pinned vertices, table, air, gravity. All may be traced but the mesh.
     - `dt`: step, [s].
-    - `self_contact`: how the sheet finds contacts with itself; None: it passes through itself.
+    - `self_contact`: True: the sheet does not pass through itself; in the solver, how it finds
+      contacts with itself.
     - `tolerance`: the solve ends when no coordinate changes by more, [m]. None: `loss_tolerance` in
       float32, 1e-11 in float64.
     - `max_iterations`: of Newton's method; a step that needs more fails.
     - `spectral_radius`: of the generalised-alpha method (`generalised_alpha`), from 0 to
       below 1: what a step leaves of the fastest vibrations. None: BDF2, which leaves nothing.
+    - `elimination`: how the linear systems of the mesh are solved; None: it is worked out, as are
+      contacts, by `prepare_mesh`, for which the mesh must not be traced.
+
+    Raises `ValueError` for a step that is not positive, or too long for self-contact, for a
+    spectral radius beyond its limits, and for one with self-contact.
     """
 
     scene: Scene
+    dt: Float[Array, ""]
     elimination: Elimination
-    dt: float = eqx.field(static=True)
-    self_contact: SelfContact | None = None
-    tolerance: float | None = eqx.field(static=True, default=None)
-    max_iterations: int = eqx.field(static=True, default=200)
-    spectral_radius: float | None = eqx.field(static=True, default=None)
+    self_contact: SelfContact | None
+    tolerance: float | None = eqx.field(static=True)
+    max_iterations: int = eqx.field(static=True)
+    spectral_radius: float | None = eqx.field(static=True)
 
-    @classmethod
-    def make(
-        cls,
+    def __init__(
+        self,
         scene: Scene,
-        dt: float,
+        dt: Float[Array, ""] | float,
         *,
-        self_contact: bool = False,
+        self_contact: SelfContact | bool | None = None,
         tolerance: float | None = None,
-        max_iterations: int = 200,
+        max_iterations: int = MAX_ITERATIONS,
         spectral_radius: float | None = None,
-    ) -> "Cloth":
-        """A cloth solver for a scene, whose table and air may be traced, but not its mesh.
-
-        Raises `ValueError` for a step that is not positive, or too long for self-contact, for a
-        spectral radius beyond its limits, and for one with self-contact.
-        """
-        elimination, search = prepare_mesh(scene.mesh, self_contact)
-        return cls(scene, elimination, dt, search, tolerance, max_iterations, spectral_radius)
-
-    def __check_init__(self):
-        if not self.dt > 0:
-            raise ValueError(f"dt must be positive, got {self.dt} s")
-        if self.self_contact is not None and self.dt > MAX_CONTACT_STEP:
+        elimination: Elimination | None = None,
+    ) -> None:
+        if not is_traced(dt):
+            positive("s", dt=float(dt))
+            if float(dt) > LONGEST:
+                raise ValueError(f"dt is a time step in seconds, at most {LONGEST}, got {dt}")
+        self.scene, self.dt = scene, jnp.asarray(dt, float)
+        search = None if isinstance(self_contact, bool) else self_contact
+        if elimination is None:
+            elimination, search = prepare_mesh(scene.mesh, bool(self_contact))
+        self.elimination, self.self_contact = elimination, search
+        self.tolerance, self.max_iterations = tolerance, max_iterations
+        self.spectral_radius = spectral_radius
+        searches = self.self_contact is not None
+        if searches and not is_traced(dt) and float(dt) > MAX_CONTACT_STEP:
             raise ValueError(
                 f"with self-contact dt must be at most {MAX_CONTACT_STEP:.4f} s, since contacts "
-                f"are planes that stand still in a step; got {self.dt} s"
+                f"are planes that stand still in a step; got {dt} s"
             )
-        if self.spectral_radius is None:
+        if spectral_radius is None:
             return
-        if not 0 <= self.spectral_radius < 1:
-            raise ValueError(
-                f"spectral_radius must be from 0 to below 1, got {self.spectral_radius}"
-            )
-        if self.self_contact is not None:
+        if not 0 <= spectral_radius < 1:
+            raise ValueError(f"spectral_radius must be from 0 to below 1, got {spectral_radius}")
+        if searches:
             raise ValueError("self-contact goes with BDF2 only: leave spectral_radius at None")
 
     def init(
         self, x: Positions, v: Positions | None = None, acceleration: Positions | None = None
-    ) -> ClothState:
+    ) -> ImplicitState:
         """A state from positions [m], velocities [m/s], accelerations [m/s^2] (default: zero).
 
         The acceleration extrapolates the step before; with a wrong one the velocity lags by half a
@@ -121,30 +129,32 @@ class Cloth(eqx.Module):
         a = jnp.zeros_like(x) if acceleration is None else acceleration
         before = x - self.dt * v + self.dt**2 / 2 * a, v - self.dt * a
         forces = (None, None) if self.spectral_radius is None else (a, a)
-        return ClothState(x, v, *before, no_failure(), *forces)
+        return ImplicitState(x, v, *before, no_failure(), *forces)
 
     def check(self, fabric: Fabric) -> None:
-        """Implicit steps are stable for any fabric."""
+        """Raises `ValueError` for a fabric that has a negative stiffness, or the like."""
+        check_fabric(fabric)
 
     def fits(self, fabric: Fabric) -> Bool[Array, ""]:
         """Implicit steps are stable for any fabric."""
         return jnp.ones((), bool)
 
     def step_with_forces(
-        self, fabric: Fabric, state: ClothState, control: Control
-    ) -> tuple[ClothState, Float[Array, "handle 3"]]:
-        """The state `dt` later, and the grippers' forces [N] on the held vertices, without those
+        self, fabric: Fabric, state: ImplicitState, control: Control
+    ) -> tuple[ImplicitState, Float[Array, "pinned 3"]]:
+        """The state `dt` later, and the grippers' forces [N] on the pinned vertices, without those
         of self-contact.
         """
         after = self.step(fabric, state, control)
         forces = residual(self.potential(fabric, state, control), after.x)
-        return after, forces[self.scene.held]
+        return after, forces[self.scene.pinned]
 
-    def step(self, fabric: Fabric, state: ClothState, control: Control) -> ClothState:
-        """The state `dt` later, with the held vertices at `control.handles`."""
+    def step(self, fabric: Fabric, state: ImplicitState, control: Control) -> ImplicitState:
+        """The state `dt` later, with the pinned vertices at `control.pinned`."""
+        check_step_arguments(self.scene, fabric, state, control, ImplicitState)
         step = self.potential(fabric, state, control)
         ahead = self.dt * (3 * state.v - state.v_before) / 2  # the mean rate, second order
-        guess = self.scene.place(state.x + ahead, control.handles)
+        guess = self.scene.place(state.x + ahead, control.pinned)
         solve = self._minimise if self.self_contact is None else self._minimise_with_contacts
         x, failure = solve(step, state.x, guess)
         failure = first_failure(state.failure, failure)
@@ -152,10 +162,10 @@ class Cloth(eqx.Module):
             v, forces = step.rate * (x - step.x_anchor), ()
         else:
             v, *forces = rates_after(step, state, x, self.dt, self.spectral_radius)
-        return ClothState(x, v, state.x, state.v, failure, *forces)
+        return ImplicitState(x, v, state.x, state.v, failure, *forces)
 
     def potential(
-        self, fabric: Fabric, state: ClothState, control: Control
+        self, fabric: Fabric, state: ImplicitState, control: Control
     ) -> IncrementalPotential:
         """What this step minimises, without self-contact.
 
@@ -168,7 +178,9 @@ class Cloth(eqx.Module):
             raise ValueError("the state has no accelerations: begin with this solver's `init`")
         return by_generalised_alpha(step, state, self.dt, self.spectral_radius)
 
-    def _by_bdf2(self, fabric: Fabric, state: ClothState, control: Control) -> IncrementalPotential:
+    def _by_bdf2(
+        self, fabric: Fabric, state: ImplicitState, control: Control
+    ) -> IncrementalPotential:
         """By 2 dt v' = 3 x' - 4 x + x_before, and likewise for all rates."""
         mesh, rate = self.scene.mesh, jnp.asarray(1.5 / self.dt, float)
         depth = self.scene.table.depth(state.x, fabric.thickness)
@@ -200,13 +212,14 @@ class Cloth(eqx.Module):
             area_normals=area_normals(mesh, state.x),
             friction_limit=fabric.friction * mesh.vertex_area * contact.pressure(depth),
             wind=self.scene.wind_on_elements(_extrapolated(state.x, state.x_before), control.wind),
+            gravity=self.scene.gravity,
             elimination=self.elimination,
         )
 
     def _minimise(self, step: IncrementalPotential, before: Positions, guess: Positions):
         del before
-        single = loss_tolerance(self.dt)
-        tolerance = self.tolerance or (1e-11 if guess.dtype == jnp.float64 else single)
+        usual = 1e-11 if guess.dtype == jnp.float64 else loss_tolerance(self.dt)
+        tolerance = usual if self.tolerance is None else self.tolerance
         return minimise(step, guess, self.scene.is_free, tolerance, self.max_iterations)
 
     def _minimise_with_contacts(
@@ -223,20 +236,20 @@ class Cloth(eqx.Module):
             x, contacts, _, failure = state
             x, newton = self._minimise(dataclasses.replace(step, contacts=contacts), before, x)
             contacts, is_free, fits = colliding(search, mesh, fabric.thickness, before, x, contacts)
-            full = jnp.where(fits, Failure.NONE.value, Failure.SELF_CONTACT.value)
+            full = jnp.where(fits, Result.SUCCESS.value, Result.SELF_CONTACT.value)
             return x, contacts, is_free, first_failure(first_failure(failure, newton), full)
 
         def body(state, _):
-            is_done = state[2] | (state[3] != Failure.NONE.value)
+            is_done = state[2] | (state[3] != Result.SUCCESS.value)
             return jax.lax.cond(is_done, lambda: state, lambda: attempt(state)), None
 
         contacts, fits = touching(search, mesh, fabric.thickness, fabric.friction, before)
-        failure = jnp.where(fits, Failure.NONE.value, Failure.SELF_CONTACT.value).astype(int)
+        failure = jnp.where(fits, Result.SUCCESS.value, Result.SELF_CONTACT.value).astype(int)
         begin = guess, contacts, jnp.zeros((), bool), failure
         (x, _, is_free, failure), _ = jax.lax.scan(body, begin, length=MAX_ATTEMPTS)
-        unresolved = jnp.where(is_free, Failure.NONE.value, Failure.SELF_CONTACT.value)
+        unresolved = jnp.where(is_free, Result.SUCCESS.value, Result.SELF_CONTACT.value)
         failure = first_failure(failure, unresolved)
-        return jnp.where(failure == Failure.NONE.value, x, jnp.nan), failure
+        return jnp.where(failure == Result.SUCCESS.value, x, jnp.nan), failure
 
 
 def prepare_mesh(mesh: Mesh, self_contact: bool) -> tuple[Elimination, SelfContact | None]:
@@ -247,13 +260,13 @@ def prepare_mesh(mesh: Mesh, self_contact: bool) -> tuple[Elimination, SelfConta
         return Elimination.make(mesh, couples_all), search
 
 
-def loss_tolerance(dt: float) -> float:
+def loss_tolerance(dt: Float[Array, ""] | float) -> Float[Array, ""]:
     """The tolerance [m] of a step [s] whose errors are lost in those of mesh and time step.
 
     1e-5 m at 1/60 s and above, shrinking with the square of the step as the formula's error does,
     down to 1e-6 m, near the rounding.
     """
-    return min(max(1e-5 * (60 * dt) ** 2, 1e-6), 1e-5)
+    return jnp.clip(1e-5 * (60 * jnp.asarray(dt, float)) ** 2, 1e-6, 1e-5)
 
 
 def _anchor(now: Array, before: Array) -> Array:

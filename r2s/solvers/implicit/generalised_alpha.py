@@ -49,9 +49,9 @@ def coefficients(spectral_radius: float) -> Coefficients:
 
 
 def by_generalised_alpha(
-    step: IncrementalPotential, state: Any, dt: float, spectral_radius: float
+    step: IncrementalPotential, state: Any, dt: Float[Array, ""], spectral_radius: float
 ) -> IncrementalPotential:
-    """The potential of a step `dt` [s] from a `ClothState`, in place of BDF2's.
+    """The potential of a step `dt` [s] from a `ImplicitState`, in place of BDF2's.
 
     The drag takes normals, and the viscosity stiffness, that are extrapolated to the end: those
     of the start would make them first order.
@@ -81,7 +81,11 @@ def by_generalised_alpha(
 
 
 def rates_after(
-    step: IncrementalPotential, state: Any, x: Positions, dt: float, spectral_radius: float
+    step: IncrementalPotential,
+    state: Any,
+    x: Positions,
+    dt: Float[Array, ""],
+    spectral_radius: float,
 ) -> tuple[Positions, Positions, Positions]:
     """Velocities [m/s], accelerations and forces per mass without contact [m/s^2] after a step that
     ended at `x` [m].
@@ -95,12 +99,12 @@ def rates_after(
     return v, a, (balanced - force * state.pull - contact) / (1 - force)
 
 
-def _lags(dt: float, beta: float, gamma: float) -> tuple[float, float]:
+def _lags(dt: Float[Array, ""], beta: float, gamma: float) -> tuple[Array, Array]:
     """Of the anchor behind the start: in velocity [s], and in acceleration [s^2]."""
     return dt * (beta / gamma - 1), dt**2 * (beta / gamma - 0.5)
 
 
-def _anchor(function: Callable, state: Any, lags: tuple[float, float]) -> Array:
+def _anchor(function: Callable, state: Any, lags: tuple[Array, Array]) -> Array:
     """What the rate of a function of positions is taken from: of its value, as of positions."""
 
     def rate(x, v):

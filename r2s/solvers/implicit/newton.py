@@ -10,7 +10,6 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s.materials.wrinkling import no_wrinkles
-from r2s.solvers.failures import Failure
 from r2s.solvers.implicit.linear.pattern import raise_diagonal
 from r2s.solvers.implicit.linear.system import System, apply_inverse, prepare
 from r2s.solvers.implicit.potential import (
@@ -21,6 +20,7 @@ from r2s.solvers.implicit.potential import (
     potential,
     residual,
 )
+from r2s.solvers.results import Result
 
 Positions = Float[Array, "vertex 3"]
 CONVEX_ITERATIONS = 3  # before the exact Hessian is tried
@@ -67,10 +67,10 @@ def minimise(
     step: IncrementalPotential,
     start: Positions,
     free: Bool[Array, " vertex"],
-    tolerance: float,
+    tolerance: Float[Array, ""] | float,
     max_iterations: int,
 ) -> tuple[Positions, Int[Array, ""]]:
-    """Positions [m] that minimise an incremental potential, and a `Failure` code.
+    """Positions [m] that minimise an incremental potential, and a `Result` code.
 
     Newton's method, with a convex stand-in for the Hessian at first, then with more and more of the
     exact one. A factor serves as long as the steps shrink fast. The derivative, forward and
@@ -81,11 +81,11 @@ def minimise(
     - `tolerance`: it has converged when no coordinate changes by more, [m].
     - `max_iterations`: after which it has failed.
     """
-    x, code = _minimise(tolerance, max_iterations, step, start, free)
+    x, code = _minimise(max_iterations, jnp.asarray(tolerance, start.dtype), step, start, free)
     return x, jax.lax.stop_gradient(code).astype(int)
 
 
-def _newton(tolerance, max_iterations, step, start, free):
+def _newton(max_iterations, tolerance, step, start, free):
     # one loop over the places that are looked at: each function is in the program once
 
     def look(state: _Search) -> _Search:
@@ -104,7 +104,7 @@ def _newton(tolerance, max_iterations, step, start, free):
 
     found = jax.lax.while_loop(unfinished, look, _begin(step, start, free))
     code = _failure(found, tolerance)
-    return jnp.where(code == Failure.NONE.value, found.at.x, jnp.nan), code.astype(start.dtype)
+    return jnp.where(code == Result.SUCCESS.value, found.at.x, jnp.nan), code.astype(start.dtype)
 
 
 def _begin(step, start, free) -> _Search:
@@ -211,13 +211,13 @@ def _moved(state: _Search, line: _Line, goes_on: Bool[Array, ""]) -> _Search:
     return chosen._replace(system=state.system, line=line, goes_on=goes_on)
 
 
-def _failure(found: _Search, tolerance: float) -> Int[Array, ""]:
+def _failure(found: _Search, tolerance: Float[Array, ""]) -> Int[Array, ""]:
     """Why a search failed; a NaN compares false, so that it never counts as convergence."""
-    reason = jnp.where(jnp.isnan(found.moved), Failure.LINEAR_SOLVE.value, Failure.NEWTON.value)
+    reason = jnp.where(jnp.isnan(found.moved), Result.LINEAR_SOLVE.value, Result.NEWTON.value)
     is_finite = jnp.isfinite(found.at.value)
-    reason = jnp.where(is_finite, reason, Failure.NON_FINITE.value)
+    reason = jnp.where(is_finite, reason, Result.NON_FINITE.value)
     converged = (found.moved <= tolerance) & is_finite
-    return jnp.where(converged, Failure.NONE.value, reason)
+    return jnp.where(converged, Result.SUCCESS.value, reason)
 
 
 def _next_shift(state: _Search, usable: Array) -> Array:
@@ -235,8 +235,8 @@ def _second(step, x, blend: Array | float = 1.0, shift: Array | float = 0.0, wri
 
 
 @eqx.filter_custom_jvp
-def _minimise(tolerance, max_iterations, step, start, free):
-    return _one_by_one(partial(_newton, tolerance, max_iterations))(step, start, free)
+def _minimise(max_iterations, tolerance, step, start, free):
+    return _one_by_one(partial(_newton, max_iterations))(tolerance, step, start, free)
 
 
 @_minimise.def_jvp

@@ -21,7 +21,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from r2s._util.arrays import once
-from r2s._util.units import GRAVITY
 from r2s.environment import contact
 from r2s.environment.air import Air
 from r2s.environment.contact import Table
@@ -83,6 +82,7 @@ class IncrementalPotential(eqx.Module):
     area_normals: Float[Array, "element 3"]
     friction_limit: Float[Array, " vertex"]
     wind: Float[Array, "element 3"]
+    gravity: Float[Array, ""]
     elimination: Elimination
     contacts: Contacts | None = None
 
@@ -227,7 +227,7 @@ def _vertex_energy(step, x, x_anchor, v_anchor, area, limit):
     drag = mass * step.fabric.mass_damping / 2 * jnp.sum(velocity**2)
     return (
         mass * step.inertia / 2 * jnp.sum(offset**2)
-        + mass * GRAVITY * x[2]
+        + mass * step.gravity * x[2]
         + step.contact_weight * _table_energy(step, x, x_anchor, area, limit)
         + drag / step.rate
     )

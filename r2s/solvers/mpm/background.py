@@ -16,15 +16,15 @@ Vectors = Float[Array, "particle axis"]
 Matrices = Float[Array, "particle axis axis"]
 Columns = list[Float[Array, "_ _"]]  # (1, node) or (node, 1)
 
-GRIPPED = 0.25  # share of a node's mass; at the border of held and free particles it is a half
+GRIPPED = 0.25  # share of a node's mass; at the border of pinned and free particles it is a half
 
 
-class Held(eqx.Module):
+class Pinned(eqx.Module):
     """Positions [m], velocities [m/s] and masses [kg] of the particles that grippers carry."""
 
-    x: Float[Array, "held axis"]
-    v: Float[Array, "held axis"]
-    mass: Float[Array, " held"]
+    x: Float[Array, "pinned axis"]
+    v: Float[Array, "pinned axis"]
+    mass: Float[Array, " pinned"]
 
 
 class Background(eqx.Module):
@@ -53,7 +53,7 @@ class Background(eqx.Module):
         cls,
         grid: Grid,
         table: Table | None = None,
-        gravity: float = GRAVITY,
+        gravity: Float[Array, ""] | float = GRAVITY,
         walls: int = 0,
         sticky: bool = False,
         mass_floor: float = 1e-15,
@@ -76,7 +76,7 @@ class Background(eqx.Module):
         mass: Float[Array, " particle"],
         momentum: Vectors,
         affine: Matrices,
-        held: Held | None = None,
+        pinned: Pinned | None = None,
     ) -> tuple[Vectors, Matrices]:
         """Velocities [m/s] and affine velocity matrices [1/s] of particles after a step.
 
@@ -85,7 +85,7 @@ class Background(eqx.Module):
         - `x`, `mass`: positions [m] and masses [kg] at the start of the step.
         - `momentum`, `affine`: momenta [kg m/s] and affine momenta [kg/s], with what forces and
           stresses have added in the step.
-        - `held`: particles that impose their velocity on the nodes around them.
+        - `pinned`: particles that impose their velocity on the nodes around them.
         """
         with jax.named_scope("particles_to_grid"):
             still = jnp.zeros_like(affine[:, :1])
@@ -93,14 +93,14 @@ class Background(eqx.Module):
             slopes = jnp.concatenate([affine, still], axis=1)
             nodes = self._to_nodes(x, values, slopes)
         floor = self.mass_floor * jnp.mean(mass)
-        gripped = held is not None and held.x.shape[0]
+        gripped = pinned is not None and pinned.x.shape[0]
         if not gripped and 3 ** x.shape[1] * x.shape[0] < nodes.shape[0]:
             velocity = partial(self._velocity, dt, friction, floor, None)
             v, moment = g2p_through(self.grid, x, nodes, velocity, self.forward_mode)
             return v, affine_factor(self.grid) * moment
         with jax.named_scope("grid"):
             columns = jnp.split(nodes, nodes.shape[1], axis=1)
-            own = held if gripped else None
+            own = pinned if gripped else None
             v = self._velocity(dt, friction, floor, own, columns, self._index())
             v = jnp.concatenate(v, axis=1)
         with jax.named_scope("grid_to_particles"):
@@ -113,7 +113,7 @@ class Background(eqx.Module):
         dt: float,
         friction: Array,
         floor: Array,
-        held: Held | None,
+        pinned: Pinned | None,
         nodes: Columns,
         index: list[Array],
     ) -> Columns:
@@ -121,8 +121,8 @@ class Background(eqx.Module):
         *momentum, mass = nodes
         v = [quotient(each, mass + floor) for each in momentum]
         v[-1] = v[-1] - dt * self.gravity
-        if held is not None:
-            v = self._gripped(v, mass, floor, held)
+        if pinned is not None:
+            v = self._gripped(v, mass, floor, pinned)
         return self._walled(self._on_table(v, friction, index[-1]), index)
 
     def _to_nodes(self, x: Vectors, values: Array, slopes: Array) -> Array:
@@ -136,15 +136,15 @@ class Background(eqx.Module):
             for axis in range(len(shape))
         ]
 
-    def _gripped(self, v: Columns, mass: Array, floor: Array, held: Held) -> Columns:
+    def _gripped(self, v: Columns, mass: Array, floor: Array, pinned: Pinned) -> Columns:
         """Velocities that blend into the grippers' where up to `GRIPPED` of the mass is held.
 
         Beyond that share a node has the grippers' velocity: nodes that are held only in part would
         let the body creep out of the grip.
         """
-        values = jnp.concatenate([held.mass[:, None] * held.v, held.mass[:, None]], axis=1)
-        flat = jnp.zeros((*values.shape, held.x.shape[1]), values.dtype)
-        nodes = self._to_nodes(held.x, values, flat)
+        values = jnp.concatenate([pinned.mass[:, None] * pinned.v, pinned.mass[:, None]], axis=1)
+        flat = jnp.zeros((*values.shape, pinned.x.shape[1]), values.dtype)
+        nodes = self._to_nodes(pinned.x, values, flat)
         *carried, weight = jnp.split(nodes, nodes.shape[1], axis=1)
         share = jnp.minimum(quotient(weight, mass + floor) / GRIPPED, 1)
         grip = [quotient(each, weight + floor) for each in carried]

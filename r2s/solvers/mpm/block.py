@@ -15,10 +15,10 @@ from r2s.environment.scene import Control
 from r2s.materials.solid import Solid, product
 from r2s.mesh.mesh import Mesh
 from r2s.solvers.explicit.stability import check_step, longest_step
-from r2s.solvers.failures import first_failure, no_failure
-from r2s.solvers.mpm.background import Background, Held
+from r2s.solvers.mpm.background import Background, Pinned
 from r2s.solvers.mpm.grid import failure_of_step
 from r2s.solvers.mpm.transfer import affine_factor
+from r2s.solvers.results import first_failure, no_failure
 
 Points = Float[Array, "particle axis"]
 
@@ -29,7 +29,7 @@ class BlockState(eqx.Module):
     - `x`, `v`: positions [m] and velocities [m/s].
     - `C`: affine velocity matrices, [1/s].
     - `F`: deformation gradients, [-].
-    - `failure`: the first `r2s.solvers.failures.Failure` of the run so far.
+    - `failure`: the first `r2s.solvers.results.Result` of the run so far.
     """
 
     x: Float[Array, "particle axis"]
@@ -47,16 +47,16 @@ class Block(eqx.Module):
 
     - `background`: grid, table, walls, gravity.
     - `volume`: volumes of the particles at rest, [m^3]; in 2-D of a body of 1 m depth.
-    - `held`, `handle_of`: the particles that grippers carry, and the handle that carries each.
-    - `offset`: positions of the held particles relative to their handles, [m].
+    - `pinned`, `gripper_of`: the particles that grippers carry, and the gripper that carries each.
+    - `offset`: positions of the pinned particles relative to their grippers, [m].
     - `dt`: step, [s].
     """
 
     background: Background
     volume: Float[Array, " particle"]
-    held: Int[Array, " held"]
-    handle_of: Int[Array, " held"]
-    offset: Float[Array, "held axis"]
+    pinned: Int[Array, " pinned"]
+    gripper_of: Int[Array, " pinned"]
+    offset: Float[Array, "pinned axis"]
     dt: float = eqx.field(static=True)
 
     @classmethod
@@ -75,25 +75,25 @@ class Block(eqx.Module):
         solver.check(solid)
         return solver
 
-    def gripped(self, x: Points, handles: Float[Array, "handle axis"], radius: float) -> "Block":
-        """The solver with grippers that carry the particles within `radius` [m] of the handles.
+    def gripped(self, x: Points, grippers: Float[Array, "gripper axis"], radius: float) -> "Block":
+        """The solver with grippers that carry the particles within `radius` [m] of the grippers.
 
-        `x` and `handles` are the positions [m] of particles and grippers when the grippers close.
+        `x` and `grippers` are the positions [m] of particles and grippers when the grippers close.
         Raises `ValueError` when a gripper finds no particle.
         """
-        distance = np.linalg.norm(np.asarray(x)[:, None] - np.asarray(handles)[None], axis=2)
+        distance = np.linalg.norm(np.asarray(x)[:, None] - np.asarray(grippers)[None], axis=2)
         nearest = np.argmin(distance, axis=1)
-        held = np.flatnonzero(np.min(distance, axis=1) <= radius)
-        empty = np.setdiff1d(np.arange(len(handles)), nearest[held])
+        pinned = np.flatnonzero(np.min(distance, axis=1) <= radius)
+        empty = np.setdiff1d(np.arange(len(grippers)), nearest[pinned])
         if len(empty):
             raise ValueError(
                 f"gripper {empty[0]} finds no particle within {radius} m: the nearest is "
                 f"{distance[:, empty[0]].min():.4g} m away"
             )
-        handle_of = nearest[held]
-        offset = jnp.asarray(x)[held] - jnp.asarray(handles)[handle_of]
-        parts = (jnp.asarray(held), jnp.asarray(handle_of), offset)
-        return eqx.tree_at(lambda s: (s.held, s.handle_of, s.offset), self, parts)
+        gripper_of = nearest[pinned]
+        offset = jnp.asarray(x)[pinned] - jnp.asarray(grippers)[gripper_of]
+        parts = (jnp.asarray(pinned), jnp.asarray(gripper_of), offset)
+        return eqx.tree_at(lambda s: (s.pinned, s.gripper_of, s.offset), self, parts)
 
     def check(self, solid: Solid) -> None:
         """Raises `ValueError` when the step is too long for a solid, unless that is traced."""
@@ -116,13 +116,13 @@ class Block(eqx.Module):
         return BlockState(x, v, jnp.zeros_like(identity), identity, no_failure())
 
     def step(self, fabric: Solid, state: BlockState, control: Control) -> BlockState:
-        """The state `dt` later, with the held particles at `control.handles` plus their offsets."""
-        dt, held = self.dt, self.held
+        """The state `dt` later, its pinned particles at `control.pinned` plus their offsets."""
+        dt, pinned = self.dt, self.pinned
         deformation = state.F + dt * jax.vmap(product)(state.C, state.F)
         mass = fabric.density * self.volume
-        goal = control.handles[self.handle_of] + self.offset
-        carried = Held(state.x[held], (goal - state.x[held]) / dt, mass[held])
-        v = _put(state.v, held, carried.v)
+        goal = control.pinned[self.gripper_of] + self.offset
+        carried = Pinned(state.x[pinned], (goal - state.x[pinned]) / dt, mass[pinned])
+        v = _put(state.v, pinned, carried.v)
         momentum = mass[:, None] * (1 - dt * fabric.mass_damping) * v
         stress = jax.vmap(fabric.law.kirchhoff)(deformation)
         stress += fabric.damping * jax.vmap(fabric.law.viscous)(state.C)
@@ -131,16 +131,16 @@ class Block(eqx.Module):
         v, C = self.background.advance(
             dt, fabric.friction, state.x, mass, momentum, affine, carried
         )
-        v, C = _put(v, held, carried.v), _put(C, held, jnp.zeros_like(C[held]))
-        x = _put(state.x + dt * v, held, goal)
+        v, C = _put(v, pinned, carried.v), _put(C, pinned, jnp.zeros_like(C[pinned]))
+        x = _put(state.x + dt * v, pinned, goal)
         failure = failure_of_step(self.background.grid, state.x, x, (fabric, control))
         failure = first_failure(state.failure, failure)
         return BlockState(self.background.project(x), v, C, deformation, failure)
 
 
-def _put(values: Array, where: Array, held: Array) -> Array:
-    """Values with those of the held particles replaced."""
-    return values.at[where].set(held) if where.shape[0] else values
+def _put(values: Array, where: Array, pinned: Array) -> Array:
+    """Values with those of the pinned particles replaced."""
+    return values.at[where].set(pinned) if where.shape[0] else values
 
 
 def stable_step(background: Background, solid: Solid) -> Float[Array, ""]:

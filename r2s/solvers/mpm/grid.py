@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from r2s.solvers.failures import Failure, all_finite
+from r2s.solvers.results import Result, all_finite
 
 REACH = 2  # nodes that a particle needs beyond it, on each side
 MAX_NODES = 2**27  # about 2 GB in 3-D
@@ -97,7 +97,7 @@ Points = Float[Array, "particle axis"]
 
 
 def failure_of_step(grid: Grid, before: Points, after: Points, inputs: Any) -> Int[Array, ""]:
-    """The `r2s.solvers.failures.Failure` of one step.
+    """The `r2s.solvers.results.Result` of one step.
 
     - `before`: positions at the start of the step, [m].
     - `after`: positions at its end, also of particles that have left the grid, [m].
@@ -110,6 +110,6 @@ def failure_of_step(grid: Grid, before: Points, after: Points, inputs: Any) -> I
     outside = ~jnp.all(grid.inside(after))
     thrown = jnp.any(jnp.abs(after - before) > grid.spacing)
     unstable = ~all_finite(after) | (outside & thrown)
-    code = jnp.where(outside, Failure.GRID.value, Failure.NONE.value)
-    code = jnp.where(unstable, Failure.TIME_STEP.value, code)
-    return jnp.where(all_finite((before, inputs)), code, Failure.NON_FINITE.value)
+    code = jnp.where(outside, Result.GRID.value, Result.SUCCESS.value)
+    code = jnp.where(unstable, Result.TIME_STEP.value, code)
+    return jnp.where(all_finite((before, inputs)), code, Result.NON_FINITE.value)

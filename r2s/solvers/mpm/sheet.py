@@ -1,11 +1,13 @@
 """A sheet of fabric by the material point method: a mesh whose vertices are the particles.
 
 After Jiang, Gast and Teran 2017, whom DiffCP (Zheng et al. 2024) follows. The laws of membrane and
-bending, the mesh and the `Fabric` are those of `r2s.Cloth`. The forces on the vertices go through
-the grid; across the sheet the grid's velocity gradient drives compression and shear between layers
-(`transverse`). So contact of the sheet with itself, with the table and with walls comes
+bending, the mesh and the `Fabric` are those of `r2s.ImplicitCloth`. The forces on the vertices go
+through the grid; across the sheet the grid's velocity gradient drives compression and shear between
+layers (`transverse`). So contact of the sheet with itself, with the table and with walls comes
 from the grid, and keeps layers about a spacing apart. The steps are explicit in time.
 """
+
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -13,16 +15,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from r2s._util.units import Scalar, positive
 from r2s.environment.scene import Control, Scene
-from r2s.materials.fabric import Fabric
+from r2s.materials.fabric import Fabric, check_fabric
 from r2s.mesh.mesh import Mesh
+from r2s.solvers.arguments import check_step_arguments
 from r2s.solvers.explicit.elements import bending_frequency, membrane_frequency
 from r2s.solvers.explicit.sheet import Cells, ForceInputs, Memory, cells_of, no_memory, sheet_force
 from r2s.solvers.explicit.stability import RELAXATION, Viscosity, check_step, longest_relaxing_step
-from r2s.solvers.failures import first_failure, no_failure
 from r2s.solvers.mpm.background import Background
 from r2s.solvers.mpm.grid import Grid, failure_of_step
 from r2s.solvers.mpm.transfer import affine_factor
+from r2s.solvers.results import first_failure, no_failure
 
 Vector = Float[Array, " 3"]
 
@@ -92,14 +96,14 @@ ONSET = 0.5  # [-]: layers press when they are about a spacing apart
 CONTACT = 20.0  # [N/m]: some cm of a fabric's weight press layers together by a tenth
 
 
-class SheetState(eqx.Module):
+class MPMState(eqx.Module):
     """A sheet at one time.
 
     - `x`, `v`: positions [m] and velocities [m/s] of the vertices.
     - `C`: affine velocity matrices of the vertices, [1/s].
     - `d`: transverse directions of the faces, [-].
     - `memory`: of the membrane's samples.
-    - `failure`: the first `r2s.solvers.failures.Failure` of the run so far.
+    - `failure`: the first `r2s.solvers.results.Result` of the run so far.
     """
 
     x: Float[Array, "vertex 3"]
@@ -110,71 +114,72 @@ class SheetState(eqx.Module):
     failure: Int[Array, ""]
 
 
-class Sheet(eqx.Module):
+class MPMCloth(eqx.Module):
     """A sheet in a scene, stepped explicitly on a grid.
 
     It is differentiable in fabric, state, control and scene; in forward mode when the background
     allows it.
 
-    - `scene`: sheet, held vertices, air; its table is the background's.
-    - `background`: grid, table, walls, gravity.
-    - `transverse`: compression and shear between layers.
+    - `scene`: sheet, pinned vertices, table, air, gravity.
+    - `dt`: step, [s].
+    - `fabric`: the stiffest that the solver will be used for; None: the step is not checked.
+    - `grid`: of the `background`, which has the scene's table and gravity; or that itself.
     - `membrane_damping`: damping time of the membrane, [s]; None: the fabric's.
     - `relaxation`: of the membrane's viscosity, [s].
-    - `dt`: step, [s].
+    - `forward_mode`: as in `Background`.
+    - `transverse`: compression and shear between layers.
     - `cells`: as in `ExplicitCloth.grid`.
+
+    Raises `ValueError` when the step is too long for the fabric (the text gives the limit) or
+    the mesh is too coarse for the grid.
     """
 
     scene: Scene
+    dt: float = eqx.field(static=True)
     background: Background
     transverse: Transverse
     membrane_damping: Float[Array, ""] | None
     relaxation: Float[Array, ""]
-    dt: float = eqx.field(static=True)
     cells: Cells | None = eqx.field(static=True)
 
-    @classmethod
-    def make(
-        cls,
+    def __init__(
+        self,
         scene: Scene,
-        grid: Grid,
-        fabric: Fabric,
         dt: float,
-        membrane_damping: float | None = None,
-        relaxation: float = RELAXATION,
+        fabric: Fabric | None = None,
+        grid: Grid | None = None,
+        membrane_damping: Scalar | None = None,
+        relaxation: Scalar = RELAXATION,
+        *,
         forward_mode: bool = False,
-    ) -> "Sheet":
-        """A solver for a scene on a grid, in steps `dt` [s].
-
-        - `fabric`: the stiffest that the solver will be used for.
-        - `membrane_damping`, `relaxation`: as in `ExplicitCloth.make`, [s].
-        - `forward_mode`: as in `Background`.
-
-        Raises `ValueError` when the step is too long for the fabric (the text gives the limit) or
-        the mesh is too coarse for the grid.
-        """
-        if not dt > 0:
-            raise ValueError(f"dt must be positive, got {dt} s")
+        background: Background | None = None,
+        transverse: Transverse | None = None,
+        cells: Cells | Literal["of the mesh"] | None = "of the mesh",
+    ) -> None:
+        positive("s", dt=dt)
+        self.scene, self.dt = scene, float(dt)
+        if background is None:
+            if grid is None:
+                raise ValueError("expected a grid, or a background")
+            around = scene.table, scene.gravity
+            background = Background.make(grid, *around, forward_mode=forward_mode)
+        self.background, grid = background, background.grid
         edge = longest_edge(scene.mesh)
         if edge > COARSEST * grid.spacing:
             raise ValueError(
                 f"the mesh has an edge of {edge:.4g} m, the grid a spacing of {grid.spacing:.4g} "
                 f"m: edges may be {COARSEST} spacings long, or layers slip through between vertices"
             )
-        solver = cls(
-            scene,
-            Background.make(grid, scene.table, forward_mode=forward_mode),
-            between_layers(),
-            None if membrane_damping is None else jnp.asarray(membrane_damping, float),
-            jnp.asarray(relaxation, float),
-            float(dt),
-            cells_of(scene.mesh),
-        )
-        solver.check(fabric)
-        return solver
+        self.transverse = transverse or between_layers()
+        damping = None if membrane_damping is None else jnp.asarray(membrane_damping, float)
+        self.membrane_damping, self.relaxation = damping, jnp.asarray(relaxation, float)
+        self.cells = cells_of(scene.mesh) if cells == "of the mesh" else cells
+        if fabric is not None:
+            self.check(fabric)
 
     def check(self, fabric: Fabric) -> None:
         """Raises `ValueError` when the step is too long for a fabric, unless that is traced."""
+        check_fabric(fabric)
         mesh, spacing = self.scene.mesh, self.background.grid.spacing
         with jax.ensure_compile_time_eval():
             times = self.membrane_damping, self.relaxation
@@ -187,7 +192,7 @@ class Sheet(eqx.Module):
 
     def init(
         self, x: Vertices, v: Vertices | None = None, acceleration: Vertices | None = None
-    ) -> SheetState:
+    ) -> MPMState:
         """A state from positions [m] and velocities [m/s] (default: zero), with free layers.
 
         The `acceleration` is not used. Raises `ValueError` when a vertex is outside the grid,
@@ -198,45 +203,46 @@ class Sheet(eqx.Module):
         normals = jax.vmap(unit_normal)(x[self.scene.mesh.faces])
         none = jnp.zeros((*x.shape, 3), x.dtype)
         memory = no_memory(self.scene.mesh, self.cells, x.dtype)
-        return SheetState(x, v, none, normals, memory, no_failure())
+        return MPMState(x, v, none, normals, memory, no_failure())
 
-    def step(self, fabric: Fabric, state: SheetState, control: Control) -> SheetState:
-        """The state `dt` later, with the held vertices at `control.handles`."""
+    def step(self, fabric: Fabric, state: MPMState, control: Control) -> MPMState:
+        """The state `dt` later, with the pinned vertices at `control.pinned`."""
         return self.step_with_forces(fabric, state, control)[0]
 
     def step_with_forces(
-        self, fabric: Fabric, state: SheetState, control: Control
-    ) -> tuple[SheetState, Float[Array, "handle 3"]]:
-        """The state `dt` later, and the grippers' mean forces [N] on the held vertices.
+        self, fabric: Fabric, state: MPMState, control: Control
+    ) -> tuple[MPMState, Float[Array, "pinned 3"]]:
+        """The state `dt` later, and the grippers' mean forces [N] on the pinned vertices.
 
-        The held vertices get their grippers' velocity twice: before the transfer to the grid and
+        The pinned vertices get their grippers' velocity twice: before the transfer to the grid and
         after the transfer back. The forces are the momentum that this takes, over `dt`.
         """
-        mesh, held, dt = self.scene.mesh, self.scene.held, self.dt
+        check_step_arguments(self.scene, fabric, state, control, MPMState)
+        mesh, pinned, dt = self.scene.mesh, self.scene.pinned, self.dt
         mass = fabric.density * mesh.vertex_area
         d = self._transverse_directions(fabric, state)
         force, stress = self._transverse_forces(state.x, d)
         of_sheet, memory = self._sheet_forces(fabric, state, control)
         force += of_sheet
         momentum = mass[:, None] * (1 - dt * fabric.mass_damping) * state.v + dt * force
-        carried = (control.handles - state.x[held]) / dt
-        momentum_held = mass[held][:, None] * carried
-        impulse = momentum_held - momentum[held]
-        momentum = momentum.at[held].set(momentum_held)
+        carried = (control.pinned - state.x[pinned]) / dt
+        momentum_pinned = mass[pinned][:, None] * carried
+        impulse = momentum_pinned - momentum[pinned]
+        momentum = momentum.at[pinned].set(momentum_pinned)
         factor = dt * affine_factor(self.background.grid)
         affine = mass[:, None, None] * state.C - factor * stress
         v, C = self.background.advance(dt, fabric.friction, state.x, mass, momentum, affine)
-        impulse += momentum_held - mass[held][:, None] * v[held]
-        v = v.at[held].set(carried)
+        impulse += momentum_pinned - mass[pinned][:, None] * v[pinned]
+        v = v.at[pinned].set(carried)
         moved = state.x + dt * v
         failure = failure_of_step(self.background.grid, state.x, moved, (fabric, control))
-        inside = self.background.grid.inside(control.handles)[:, None]
-        handles = jnp.where(inside, control.handles, jnp.nan)
-        x = self.background.project(moved).at[held].set(handles)
+        inside = self.background.grid.inside(control.pinned)[:, None]
+        goal = jnp.where(inside, control.pinned, jnp.nan)
+        x = self.background.project(moved).at[pinned].set(goal)
         failure = first_failure(state.failure, failure)
-        return SheetState(x, v, C, d, memory, failure), impulse / dt
+        return MPMState(x, v, C, d, memory, failure), impulse / dt
 
-    def _transverse_directions(self, fabric: Fabric, state: SheetState) -> Float[Array, "face 3"]:
+    def _transverse_directions(self, fabric: Fabric, state: MPMState) -> Float[Array, "face 3"]:
         """The directions that the grid's velocity gradient carries, after the return mapping."""
         faces = self.scene.mesh.faces
         rates = jnp.mean(state.C[faces], axis=1)
@@ -256,14 +262,15 @@ class Sheet(eqx.Module):
         return force, stress
 
     def _sheet_forces(
-        self, fabric: Fabric, state: SheetState, control: Control
+        self, fabric: Fabric, state: MPMState, control: Control
     ) -> tuple[Vertices, Memory]:
         """Forces [N] of membrane, bending and air on the vertices, and the samples' memory."""
         scene, x, v = self.scene, state.x, state.v
         damping = fabric.damping if self.membrane_damping is None else self.membrane_damping
         viscosity = Viscosity.make(damping, self.relaxation, jnp.asarray(self.dt, x.dtype))
         around = viscosity, scene.air, scene.fan
-        inputs = ForceInputs(fabric, *around, x, v, control.wind, state.memory)
+        wind = jnp.zeros(3, x.dtype) if control.wind is None else control.wind
+        inputs = ForceInputs(fabric, *around, x, v, wind, state.memory)
         return sheet_force(scene.mesh, self.cells, inputs)
 
 
@@ -278,7 +285,7 @@ def stable_step(
     """The longest step [s] that is stable for a fabric near its rest shape.
 
     - `spacing`: of the grid, [m].
-    - `membrane_damping`, `relaxation`: as in `Sheet`, [s].
+    - `membrane_damping`, `relaxation`: as in `MPMCloth`, [s].
 
     The squares of the highest frequencies of membrane, bending and layers have bounds that add.
     The grid only lowers the frequencies of the mesh.

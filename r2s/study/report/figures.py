@@ -209,7 +209,7 @@ def error_chart(motion: Motion, colours: Mapping[str, str]) -> go.Figure:
         shade = {"mode": "none", "fill": "tozeroy", "fillcolor": SAND, "name": "floor"}
         figure.add_scatter(x=times, y=floor, **shade)
     for label, mean in means.items():
-        runs, dash = motion.errors[label], "dash" if "points" in label.split() else "solid"
+        runs, dash = motion.errors[label], "dash" if "mpm" in label.split() else "solid"
         lost = int((~np.isfinite(runs).all(axis=1)).sum())
         words = f"{label} ({lost} of {len(runs)} diverged)" if lost else label
         y = np.where(np.isfinite(mean), 1e3 * mean, np.nan)

@@ -20,7 +20,7 @@ from r2s.study.statistics.frame import configurations
 LIFTING, WIND, DIFFCP = PAPER_CONFIGURATIONS[:3]
 PINN_POINTS, PINN_CLOTH = PAPER_CONFIGURATIONS[6:]
 CITED = "Ru et al. 2025, tables"
-SOLVERS = {"diffsim": "cloth", "difftaichi": "points"}
+SOLVERS = {"diffsim": "cloth", "difftaichi": "mpm"}
 CHAMFER, HAUSDORFF = "paper_chamfer", "paper_hausdorff"
 METRICS = {"CD": CHAMFER, "HD": HAUSDORFF}
 COLUMNS = ["evaluated_on", "metric", "fabric", "configuration", "value"]
@@ -48,12 +48,12 @@ def _conclusions(
     )
     yield (
         "In shaking the cloth solver is better than material points.",
-        [_solvers(results, paper, "shaking", "cloth", "points")],
+        [_solvers(results, paper, "shaking", "cloth", "mpm")],
     )
     yield (
         "In fling material points are better than the cloth solver.",
         [
-            _solvers(results, paper, "fling", "points", "cloth"),
+            _solvers(results, paper, "fling", "mpm", "cloth"),
             sides("fling", (PINN_POINTS, DIFFCP), *([c for c in cloth if c in there] or cloth)),
         ],
     )

@@ -233,5 +233,14 @@ def parameter_intervals(parameters: pd.DataFrame) -> pd.DataFrame:
     factor = np.exp(reach.where(is_log))
     low = (value / factor).where(is_log, value - reach)
     high = (value * factor).where(is_log, value + reach)
-    columns = ["recording", "parameter", "unit", "value", "low", "high", "is_identifiable", "truth"]
+    columns = [
+        "recording",
+        "parameter",
+        "unit",
+        "value",
+        "low",
+        "high",
+        "posterior_over_prior",
+        "truth",
+    ]
     return parameters.assign(low=low, high=high)[columns]

@@ -1,4 +1,4 @@
-"""Why a run of a solver failed: one code for cloth and material points alike."""
+"""How a run of a solver ended: one code for all solvers."""
 
 import enum
 from typing import Any, SupportsInt
@@ -8,10 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 
-class Failure(enum.IntEnum):
-    """What failed first. A state carries it as an integer, so that it passes through `jax.jit`."""
+class Result(enum.IntEnum):
+    """Success, or what failed first. A state carries it as an integer, which passes through
+    `jax.jit`."""
 
-    NONE = 0
+    SUCCESS = 0
     NEWTON = 1
     SELF_CONTACT = 2
     LINEAR_SOLVE = 3
@@ -21,22 +22,22 @@ class Failure(enum.IntEnum):
 
 
 _SENTENCES = {
-    Failure.NONE: "Nothing failed.",
-    Failure.NEWTON: "Newton's method did not converge: shorten the step, or allow more iterations.",
-    Failure.SELF_CONTACT: (
+    Result.SUCCESS: "Nothing failed.",
+    Result.NEWTON: "Newton's method did not converge: shorten the step, or allow more iterations.",
+    Result.SELF_CONTACT: (
         "The contacts of the fabric with itself were not resolved: shorten the step, or allow more "
         "rounds of contact."
     ),
-    Failure.LINEAR_SOLVE: (
+    Result.LINEAR_SOLVE: (
         "The linear solve of a Newton step failed: check that stiffnesses and masses are positive "
         "and finite, or shorten the step."
     ),
-    Failure.GRID: "A particle left the grid: enlarge the grid, or shorten the step.",
-    Failure.TIME_STEP: (
+    Result.GRID: "A particle left the grid: enlarge the grid, or shorten the step.",
+    Result.TIME_STEP: (
         "The explicit time step was unstable: shorten the step, soften the material, or coarsen "
         "the grid."
     ),
-    Failure.NON_FINITE: (
+    Result.NON_FINITE: (
         "A position became infinite or not a number: check the fabric, the control and the initial "
         "state, or shorten the step."
     ),
@@ -46,10 +47,10 @@ _SENTENCES = {
 def describe(code: SupportsInt) -> str:
     """One sentence that says what a failure code means and what to do.
 
-    Accepts a `Failure`, an integer or an integer array without axes. Raises `ValueError` for a
+    Accepts a `Result`, an integer or an integer array without axes. Raises `ValueError` for a
     number that is no code.
     """
-    return _SENTENCES[Failure(int(code))]
+    return _SENTENCES[Result(int(code))]
 
 
 def all_finite(tree: Any) -> Bool[Array, ""]:
@@ -64,4 +65,4 @@ def no_failure() -> Int[Array, ""]:
 
 def first_failure(before: Int[Array, ""], now: Int[Array, ""]) -> Int[Array, ""]:
     """The code of a run so far and of what comes after it: the first failure stays."""
-    return jnp.where(before == Failure.NONE.value, now, before).astype(int)
+    return jnp.where(before == Result.SUCCESS.value, now, before).astype(int)

@@ -1,0 +1,134 @@
+"""`r2s evaluate`: how close a fabric's simulation comes to recorded motions."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+from tyro.conf import Positional, arg
+
+from r2s.cli.common import ChosenShape, FabricName, Json
+
+if TYPE_CHECKING:
+    from r2s.estimation.cards import Card
+    from r2s.recordings.recording import Recording
+
+DISTANCE = "chamfer_real_to_sim"
+EXPLAINED = {
+    DISTANCE: "mean distance from a recorded point to the simulated sheet",
+    "chamfer_sim_to_real": "the reverse: large where cameras do not see the sheet",
+    "chamfer": "the mean of both",
+    "hausdorff": "the largest distance: that of one outlier, or of a part that no camera sees",
+    "paper_chamfer": "of the study: sum of mean squares, each cloud scaled by its first frame",
+    "paper_hausdorff": "of the study: the largest distance, scaled likewise",
+}
+CROPPED = "; without the simulated sheet below the lowest recorded point"
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Say how well a fabric predicts recorded motions: mean distance of the recorded points from
+    the simulated sheet, over the frames that count.
+
+    Beside it stand the same of the prior mean (the fabric that one would guess from the weight
+    alone), and what the noise of the points and the simulated mesh allow.
+
+        r2s evaluate denim.json fold.npz
+        r2s evaluate grey_interlock recordings/fold_tan --json
+    """
+
+    fabric: Positional[FabricName]
+    recordings: Annotated[Positional[tuple[Path, ...]], arg(metavar="RECORDING")]
+    """NPZ, or folders."""
+    shape: ChosenShape = None
+    all: bool = False
+    """Print the other distances, too, with what each is."""
+    json: Json = False
+
+    def run(self) -> int:
+        from r2s.cli.common import load_card, print_result
+        from r2s.metrics.prediction_error import UNITS
+        from r2s.recordings.open import open_recordings
+
+        card, lines = load_card(self.fabric), []
+        judged: dict[str, Judged] = {}
+        for recording in open_recordings(self.recordings):
+            found = self._judge(card, recording)
+            judged[recording.info.name] = found
+            lines += found.lines(recording.info.name, self.all)
+        if not judged:
+            raise ValueError("no recording: name an NPZ, or a folder that holds some")
+        failures = {name: each.failure for name, each in judged.items() if each.failure}
+        metrics = {name: each.metrics for name, each in judged.items()}
+        units = {name: UNITS.get(name, "m") for name in next(iter(metrics.values()))}
+        result = {"fabric": card.name, "units": units, "recordings": metrics, "failures": failures}
+        result["prior_mean"] = {name: each.prior_mean for name, each in judged.items()}
+        result["noise"] = {name: each.noise for name, each in judged.items()}
+        result["meshes"] = {name: each.mesh for name, each in judged.items()}
+        result["estimated_from"] = [name for name, each in judged.items() if each.is_own]
+        print_result(self.json, result, lines)
+        return 1 if failures else 0
+
+    def _judge(self, card: "Card", recording: "Recording") -> "Judged":
+        from r2s.cli.common import choose_shape
+        from r2s.estimation.cards import fingerprint
+        from r2s.materials import prior
+        from r2s.metrics import prediction_error
+        from r2s.recordings.noise import mean_distance, point_noise
+        from r2s.scenarios.scenario import from_recording
+
+        info, fabric = recording.info, card.fabric
+        shape, mesh, words = choose_shape(self.shape, fabric, info.sheet.size, info.scenario)
+        scenario = from_recording(recording, shape)
+        motion = prediction_error.predict_motion(scenario, fabric)
+        metrics = prediction_error.against_motion(recording, motion.x, shape=shape)
+        guess = prediction_error.predict_motion(scenario, prior.middle(float(fabric.density)))
+        guessed = prediction_error.against_motion(recording, guess.x, shape=shape)
+        failed = math.isnan(metrics[DISTANCE])
+        own = fingerprint(recording) in {digest for _, digest in card.provenance.recordings}
+        noise = mean_distance(point_noise(recording))
+        why = str(motion.failure) if failed else ""
+        return Judged(metrics, guessed[DISTANCE], noise, mesh, words, why, own)
+
+
+class Judged(NamedTuple):
+    """What `Evaluate` says of one recording.
+
+    - `metrics`: those of `r2s.metrics.prediction_error`. `prior_mean`, `noise`: mean distances [m]
+      that the prior mean leaves, and that the noise of the points alone gives.
+    - `mesh`, `words`: of the simulated mesh. `failure`: why the simulation diverged, or "".
+    - `is_own`: whether the card was estimated from this recording.
+    """
+
+    metrics: dict[str, float]
+    prior_mean: float
+    noise: float
+    mesh: dict[str, Any]
+    words: list[str]
+    failure: str
+    is_own: bool
+
+    def lines(self, name: str, with_all: bool) -> list[str]:
+        """For people."""
+        if self.failure:
+            return [f"{name}: the simulation {self.failure}"]
+        lines = [
+            f"{name}: mean distance {_mm(self.metrics[DISTANCE])}; prior mean "
+            f"{_mm(self.prior_mean)}; the noise of its points allows {_mm(self.noise)}",
+            *(f"    {words}" for words in self.words),
+        ]
+        if self.is_own:
+            lines.append(
+                "    the card was estimated from this recording, which tests no prediction"
+            )
+        if with_all:
+            for metric, value in self.metrics.items():
+                text = f"{value:.4f}" if metric.startswith("paper_") else _mm(value)
+                words = EXPLAINED.get(metric.removesuffix("_cropped"), "")
+                words += CROPPED * metric.endswith("_cropped")
+                lines.append(f"    {metric:29s}{text:>10s}  {words}")
+        return lines
+
+
+def _mm(value: float) -> str:
+    return f"{1e3 * value:.2f} mm" if math.isfinite(value) else "unknown"
