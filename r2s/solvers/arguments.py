@@ -5,7 +5,7 @@ from typing import Any
 from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric
 
-LONGEST = 0.5  # [s], of a time step: what is longer is hardly meant in seconds
+LONGEST = 10.0  # [s], of a step, as while a sheet comes to rest: more is hardly meant in seconds
 
 
 def check_step_arguments(

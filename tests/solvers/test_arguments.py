@@ -71,7 +71,7 @@ def test_numbers_that_no_fabric_has_are_named(solver, where, value, words):
 
 
 def test_a_step_of_seconds_is_questioned():
-    with pytest.raises(ValueError, match="in seconds, at most 0.5, got 20"):
+    with pytest.raises(ValueError, match="in seconds, at most 10.0, got 20"):
         r2s.ImplicitCloth(SCENE, 20.0)
 
 

@@ -31,7 +31,7 @@ from r2s.scenarios.energy import clamp_force, energy_balance
 from r2s.scenarios.scenario import Scenario, SheetSolver, rollout
 
 Images = Float[np.ndarray, "frame down across"]
-# A flawed image lies 0.45 from a flawless one on the map (docs/guide/estimate.md), and a sheet of 9 x 9
+# A flawed image lies 0.45 from a flawless one on the map, and a sheet of 9 x 9
 # vertices errs by some 5 % in the force of a pull: both get the same weight.
 FLAW, SHARE = 0.45, 0.05
 SCALE = FLAW / SHARE
