@@ -34,10 +34,11 @@ class EstimateCard:
     """Estimate a fabric from recordings of it, and write its card.
 
     RECORDING is an NPZ of r2s, a folder of them, a folder of frames with its manifest, or a JSON
-    file of laboratory tests (docs/guide/laboratory.md); several are taken for the same fabric. Of three or more, two of them no stretchings, the last motion with clouds (a
-    fold only where there is no other) is held out: the estimate is judged on it, beside fabrics of
-    which only the weight is known. Says whether the method converged, and which numbers ended at a
-    bound of their range. A killed run of diffcloud, diffcp, physnet or pinn goes on where it was,
+    file of laboratory tests (docs/guide/laboratory.md); several are taken for the same fabric.
+    Of three or more, two of them no stretchings, the last motion with clouds (a fold only where
+    there is no other) is held out: the estimate is judged on it, beside fabrics of which only
+    the weight is known. Says whether the method converged, and which numbers ended at a bound
+    of their range. A killed run of diffcloud, diffcp, physnet or pinn goes on where it was,
     from FILE.progress.npz.
 
     diffcloud differentiates through the cloth, diffcp through material points, cma-es tries fabrics
