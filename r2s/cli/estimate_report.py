@@ -131,8 +131,8 @@ def explains_nothing(outcome: Outcome) -> str:
     if not shares or min(shares) < NOTHING:
         return ""
     return (
-        f"the estimate explains nothing: {100 * min(shares):.0f} % or more of every recording are "
-        "outliers. Are the clouds in metres, with z up, and do scale, rotation, translation and "
+        f"the estimate explains nothing: at least {100 * min(shares):.0f} % of the points of every "
+        "recording are outliers. Are the clouds in metres, with z up, and do scale, rotation, translation and "
         "path of the manifest place them on the sheet? See r2s check and r2s show"
     )
 

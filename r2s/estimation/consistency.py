@@ -277,7 +277,8 @@ def fits(problems: Problems, predicted: Sequence[Prediction], scale: float) -> t
         distance, mask = marker_distances(problem, seen) or point_distances(problem, seen, scale)
         known = np.asarray(mask)
         is_out = np.asarray(robust_weight(distance, scale) < LITTLE)[known]
-        mean = float(np.mean(np.asarray(distance)[known])) if known.any() else np.nan
+        near = np.asarray(distance)[known][~is_out]
+        mean = float(np.mean(near)) if near.size else np.nan
         found.append(Fit("", mean, float(is_out.mean()) if is_out.size else 0.0))
     return tuple(found)
 

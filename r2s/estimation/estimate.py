@@ -102,7 +102,7 @@ class Fit(NamedTuple):
 
     - `recording`: its name.
     - `distance`: mean distance of its points from the simulated sheet, or of its markers from their
-      places there, [m].
+      places there, without outliers, [m].
     - `outliers`: share of them that the robust loss hardly counts, [-].
     - `noise`: the mean distance that the noise of its points alone gives, [m]
       (`r2s.recordings.noise`); NaN: unknown.

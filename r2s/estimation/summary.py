@@ -85,13 +85,13 @@ def _mesh_share(estimate: Estimate, mesh: str) -> list[str]:
         return []
     pairs = zip(estimate.ranges, estimate.mesh_bias, strict=True)
     parts = [f"{r.name} {100 * b:.0f} %" if r.log else f"{r.name} {b:.2f}" for r, b in pairs]
-    return [f"of these, discretization error{mesh}: {', '.join(parts)}"]
+    return [f"discretization error{mesh}, part of the intervals: {', '.join(parts)}"]
 
 
 def _fit(fit: Fit, mesh: str) -> str:
     allowed = [f"{words} {_mm(value)}" for words, value in (
         ("the noise of its points allows", fit.noise),
-        (f"the mesh{mesh.removeprefix(' on')} is expected to add", fit.mesh),
+        (f"the mesh{mesh.replace(' on ', ' of ')} is expected to add", fit.mesh),
     ) if np.isfinite(value)]  # fmt: skip
     words = f"fit to {fit.recording}: mean distance {_mm(fit.distance)}"
     outliers = f"{100 * fit.outliers:.1f} % outliers"
