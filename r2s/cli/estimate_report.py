@@ -132,8 +132,8 @@ def explains_nothing(outcome: Outcome) -> str:
         return ""
     return (
         f"the estimate explains nothing: at least {100 * min(shares):.0f} % of the points of every "
-        "recording are outliers. Are the clouds in metres, with z up, and do scale, rotation, translation and "
-        "path of the manifest place them on the sheet? See r2s check and r2s show"
+        "recording are outliers. Are the clouds in metres, with z up, and do scale, rotation, "
+        "translation and path of the manifest place them on the sheet? See r2s check and r2s show"
     )
 
 
