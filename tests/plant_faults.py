@@ -119,14 +119,14 @@ FAULTS = (
     ),
     Fault(
         "gravity in explicit steps: upwards",
-        "up = up - braking * dt * GRAVITY",
-        "up = up + braking * dt * GRAVITY",
+        "up = up - braking * dt * gravity",
+        "up = up + braking * dt * gravity",
         "solvers/test_explicit.py",
     ),
     Fault(
         "gravity in implicit steps: along y",
-        "+ mass * GRAVITY * x[2]",
-        "+ mass * GRAVITY * x[1]",
+        "+ mass * step.gravity * x[2]",
+        "+ mass * step.gravity * x[1]",
         "solvers/test_cloth.py",
     ),
     Fault(
