@@ -17,7 +17,7 @@ sheet = r2s.rectangle((0.15, 0.05), (7, 3))  # [m]
 pinned = jnp.arange(6)  # the first two rows: a strip that is clamped, and droops
 scene = r2s.Scene(sheet, pinned)
 solver = r2s.ImplicitCloth(scene, dt=0.02)  # [s]
-start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
+start = sheet.lay_flat()
 space = r2s.OrthotropicSpace.make(density=0.2)  # [kg/m^2]
 BENDING = [bound.name for bound in space.ranges].index("bending")
 control = r2s.Control(jnp.broadcast_to(start[pinned], (STEPS, 6, 3)))

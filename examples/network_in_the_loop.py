@@ -19,7 +19,7 @@ STEPS, FASTEST = 20, 0.5  # [m/s]
 sheet = r2s.rectangle((0.2, 0.2), (4, 4))  # [m]
 scene = r2s.Scene(sheet, [0])
 solver = r2s.ImplicitCloth(scene, dt=0.02)  # [s]
-start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
+start = sheet.lay_flat()
 GOAL = start[-1]
 
 

@@ -35,7 +35,7 @@ sheet = r2s.rectangle((0.2, 0.2), (5, 5))  # [m]
 pinned = jnp.array([0, 4])
 scene = r2s.Scene(sheet, pinned)
 solver = r2s.ImplicitCloth(scene, dt=0.02)  # [s]
-start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
+start = sheet.lay_flat()
 control = r2s.Control(jnp.broadcast_to(start[pinned], (20, 2, 3)))
 knit = presets.grey_interlock()
 

@@ -20,7 +20,7 @@ sheet = r2s.rectangle((0.2, 0.2), (4, 4))  # [m]
 pinned = jnp.array([0, 3])
 scene = r2s.Scene(sheet, pinned)
 solver = r2s.ImplicitCloth(scene, dt=0.025)  # [s]
-start = jnp.pad(sheet.rest, ((0, 0), (0, 1)))
+start = sheet.lay_flat()
 control = r2s.Control(jnp.broadcast_to(start[pinned], (STEPS, 2, 3)))
 space = r2s.OrthotropicSpace.make(density=0.2)  # [kg/m^2]
 

@@ -162,7 +162,7 @@ def cloth(
 
 def flat(mesh: Mesh, height: float = 0.0):
     """Positions of a flat, horizontal sheet at a height [m]."""
-    return jnp.pad(mesh.rest, ((0, 0), (0, 1)), constant_values=height)
+    return mesh.lay_flat(height)
 
 
 def rotation(angle: float, axis: int):

@@ -28,8 +28,9 @@ class Control(eqx.Module):
     wind: Float[Array, "*step_and_vertex 3"] | None = None
 
     def at(self, step: Int[Array, ""] | int) -> "Control":
-        """That of one step of a motion."""
-        return jax.tree.map(lambda part: part[step], self)
+        """That of one step of a motion; a wind of 3 numbers stays."""
+        steady = self.wind is None or self.wind.ndim == 1
+        return Control(self.pinned[step], self.wind if steady else self.wind[step])
 
 
 class Scene(eqx.Module):
@@ -64,7 +65,7 @@ class Scene(eqx.Module):
         self.mesh, self.fan = mesh, fan
         self.pinned = jnp.asarray(pinned, int)
         self.table = table if isinstance(table, Table) else Table.make(table)
-        self.air = air if isinstance(air, Air) else Air.make(air or 0.0)
+        self.air = air if isinstance(air, Air) else Air.make(0.0 if air is None else air)
         self.gravity = jnp.asarray(gravity, float)
         _check(mesh, self.pinned)
 

@@ -150,7 +150,7 @@ def alone(
 def _laid_onto(here: Problem, there: Problem, slope: Sensitivity) -> Sensitivity:
     """A derivative on one mesh at the vertices of another."""
     meshes = here.scenario.scene.mesh, there.scenario.scene.mesh
-    own, other = (jnp.pad(mesh.rest, ((0, 0), (0, 1))) for mesh in meshes)
+    own, other = (mesh.lay_flat() for mesh in meshes)
     face, weights = nearest(other, own, meshes[0].faces)
     corners = meshes[0].faces[face]
     laid = jnp.einsum("vk,fvkiu->fviu", weights, slope.x[:, corners])

@@ -236,7 +236,7 @@ def drape(specimen: Ring, fabric: Fabric, key: PRNGKeyArray) -> Float[Array, "ve
     `key`: of the unevenness that it starts with. Derivatives are those of the sheet at rest.
     """
     scene = specimen.resting.scene
-    flat = jnp.pad(scene.mesh.rest, ((0, 0), (0, 1)))
+    flat = scene.mesh.lay_flat()
     uneven = UNEVENNESS * jr.normal(key, (len(flat),), flat.dtype)
     start = flat.at[:, 2].set(jnp.where(scene.is_free, uneven, 0))
     control = Control(flat[scene.pinned])

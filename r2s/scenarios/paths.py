@@ -248,13 +248,13 @@ def _route(duration: float, at: Callable[[np.ndarray], np.ndarray]) -> Route:
 
 def _corner(sheet: SheetPlacement) -> Float[np.ndarray, "3"]:
     if len(sheet.pinned) != 1:
-        raise ValueError(f"this path is of one gripper, the sheet is held at {sheet.pinned}")
+        raise ValueError(f"this path is of one gripper, the sheet is pinned at {sheet.pinned}")
     return corner(sheet, sheet.pinned[0])
 
 
 def _drawn_together(sheet: SheetPlacement, gap: float) -> Float[np.ndarray, "2 3"]:
     if len(sheet.pinned) != 2:
-        raise ValueError(f"this path is of two grippers, the sheet is held at {sheet.pinned}")
+        raise ValueError(f"this path is of two grippers, the sheet is pinned at {sheet.pinned}")
     _share("gap", gap)
     corners = np.array([corner(sheet, name) for name in sheet.pinned])
     middle = corners.mean(axis=0)

@@ -114,7 +114,7 @@ def simulate(
     """
     if not is_traced(solver, fabric):
         solver.check(fabric)
-    every = save_every or 1
+    every = 1 if save_every is None else save_every
     groups = grouped(control, every)
     if save_at is not None:
         _check_times(save_every, save_at, control.pinned.shape[0], solver.dt)

@@ -46,7 +46,7 @@ class EvaluationTask(Task):
     """The distance of simulations of a fabric from recordings of one scenario.
 
     - `estimate`: whose fabric is evaluated; None: that of a sample, or the true one.
-    - `solver`: "cloth", in explicit steps, or "mpm", on `SHAPES`. Estimates on points are
+    - `solver`: "cloth", in explicit steps, or "mpm", on `SHAPES`. Estimates by MPM are
       evaluated on both, as only on the cloth all fabrics are simulated alike.
     - `density`: areal, [kg/m^2].
     - `recordings`: evaluated together, since they compile once.

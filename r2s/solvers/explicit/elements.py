@@ -73,7 +73,7 @@ def membrane_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
         stiffness = jnp.einsum("q,qsi,st,qtj->ij", share, rates, tangent, rates)
         return count * jnp.linalg.eigvalsh(stiffness)[-1] / fabric.density
 
-    corners = _flat(mesh)[samples.corners]
+    corners = mesh.lay_flat()[samples.corners]
     return jnp.max(jax.vmap(square)(corners, samples.gradients, samples.areas))
 
 
@@ -89,7 +89,7 @@ def bending_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
     if not bends.vertices.shape[0]:
         return jnp.zeros((), float)
     vertices, areas = law.elements(mesh).vertices, law.areas(mesh)
-    rates = law.elements(mesh).gradients(bends.gradients(_flat(mesh)))
+    rates = law.elements(mesh).gradients(bends.gradients(mesh.lay_flat()))
     count, size = rates.shape[:2]
     unbent = jnp.zeros(bends.vertices.shape[0], mesh.rest.dtype)
     laws, flat = law.on_elements(mesh, unbent), law.curvatures(mesh, unbent)
@@ -115,10 +115,6 @@ def _largest(
     root = jnp.linalg.cholesky(tangent + 1e-6 * size * jnp.eye(len(tangent), dtype=tangent.dtype))
     scaled = root.T @ rates
     return jnp.linalg.eigvalsh(scaled @ scaled.T)[-1]
-
-
-def _flat(mesh: Mesh) -> Vertices:
-    return jnp.pad(mesh.rest, ((0, 0), (0, 1)))
 
 
 SOLVES = 3  # of Newton's method for the slip, which comes from below, within 1 % of it

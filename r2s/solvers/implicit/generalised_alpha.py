@@ -51,7 +51,7 @@ def coefficients(spectral_radius: float) -> Coefficients:
 def by_generalised_alpha(
     step: IncrementalPotential, state: Any, dt: Float[Array, ""], spectral_radius: float
 ) -> IncrementalPotential:
-    """The potential of a step `dt` [s] from a `ImplicitState`, in place of BDF2's.
+    """The potential of a step `dt` [s] from an `ImplicitState`, in place of BDF2's.
 
     The drag takes normals, and the viscosity stiffness, that are extrapolated to the end: those
     of the start would make them first order.

@@ -59,7 +59,7 @@ class IncrementalPotential(eqx.Module):
     - `angles`: of the bends at the start of the step, [rad].
     - `area_normals`: of the elements at the start of the step, [m^2].
     - `friction_limit`: coefficient times normal force at the start of the step, [N].
-    - `wind`: on the elements, [m/s].
+    - `wind`: on the elements, [m/s]. `gravity`: downwards, [m/s^2].
     - `elimination`: how its Hessian is eliminated.
     - `contacts`: of the sheet with itself; None: it passes through itself.
     """

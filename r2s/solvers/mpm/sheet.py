@@ -123,7 +123,8 @@ class MPMCloth(eqx.Module):
     - `scene`: sheet, pinned vertices, table, air, gravity.
     - `dt`: step, [s].
     - `fabric`: the stiffest that the solver will be used for; None: the step is not checked.
-    - `grid`: of the `background`, which has the scene's table and gravity; or that itself.
+    - `grid`: of the `background`, which takes the scene's table and gravity when it is made: of
+      others make another solver. Or the background itself.
     - `membrane_damping`: damping time of the membrane, [s]; None: the fabric's.
     - `relaxation`: of the membrane's viscosity, [s].
     - `forward_mode`: as in `Background`.
