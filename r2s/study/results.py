@@ -26,7 +26,7 @@ from r2s.study.tasks import Task, provenance, result_files, with_dependencies
 from r2s.study.verdicts import SURFACE, ensembles, judged_motions, verdicts
 
 PRINTED = ("skill", "findings")  # the other tables are in files
-PARAMETERS = ("solver", "recording", "parameter", "unit", "is_log", "value", "standard_error",
+PARAMETERS = ("solver", "recording", "parameter", "unit", "value", "low", "high",
               "posterior_over_prior", "truth")  # fmt: skip
 
 
@@ -134,8 +134,7 @@ def estimates_made(tasks: Iterable[EvaluationTask], folder: Path) -> list[Estima
 def parameters(tasks: Iterable[EvaluationTask], folder: Path) -> pd.DataFrame:
     """The estimated parameters, a line each, with `PARAMETERS`.
 
-    The standard error is relative for a logarithmic range, else in the unit; `truth` is NaN where
-    it is not known.
+    `low` and `high` are the ends of the 90 % interval [unit]; `truth` is NaN where it is not known.
     """
     rows = []
     for task in estimates_made(tasks, folder):
@@ -143,10 +142,10 @@ def parameters(tasks: Iterable[EvaluationTask], folder: Path) -> pd.DataFrame:
         if estimate is None:
             continue
         truth = true_values(task, estimate.ranges)
-        numbers = estimate.values, estimate.standard_errors, estimate.narrowing, truth
+        numbers = estimate.values, *estimate.intervals.T, estimate.narrowing, truth
         columns = [np.asarray(each).tolist() for each in numbers]
         for bound, *own in zip(estimate.ranges, *columns, strict=True):
-            rows.append((task.solver, task.name, bound.name, bound.unit, bound.log, *own))
+            rows.append((task.solver, task.name, bound.name, bound.unit, *own))
     return pd.DataFrame(rows, columns=list(PARAMETERS))
 
 

@@ -298,7 +298,7 @@ def _parameters(parameters: pd.DataFrame | None) -> Tables:
     groups = () if parameters is None else parameters.groupby("solver")
     text = f"with {LEVEL:.0%} intervals, and the truth where it is known"
     return {
-        f"parameters_{solver}": (f"Estimates on {solver}, {text}", frame.parameter_intervals(part))
+        f"parameters_{solver}": (f"Estimates on {solver}, {text}", part.drop(columns="solver"))
         for solver, part in groups
     }
 

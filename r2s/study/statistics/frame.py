@@ -23,11 +23,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import norm
 
 from r2s._util.files import write_text
 from r2s.metrics.horizon import skill
-from r2s.metrics.statistics import LEVEL, CrossedMean, crossed_mean, interval
+from r2s.metrics.statistics import CrossedMean, crossed_mean, interval
 from r2s.study.configuration import (
     MOTIONS,
     ON_CLOTH,
@@ -221,26 +220,3 @@ def skills(results: pd.DataFrame) -> pd.DataFrame:
     found = pd.DataFrame(columns)
     found["known"] = found.known.fillna(0).astype(int)
     return found.join(means(known, "skill"))
-
-
-def parameter_intervals(parameters: pd.DataFrame) -> pd.DataFrame:
-    """Estimates [unit] with the ends of their intervals, from `r2s.study.results.parameters`.
-
-    Standard errors are those of the logarithm for a logarithmic range.
-    """
-    reach = norm.ppf((1 + LEVEL) / 2) * parameters.standard_error
-    value, is_log = parameters.value, parameters.is_log
-    factor = np.exp(reach.where(is_log))
-    low = (value / factor).where(is_log, value - reach)
-    high = (value * factor).where(is_log, value + reach)
-    columns = [
-        "recording",
-        "parameter",
-        "unit",
-        "value",
-        "low",
-        "high",
-        "posterior_over_prior",
-        "truth",
-    ]
-    return parameters.assign(low=low, high=high)[columns]
