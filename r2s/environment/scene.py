@@ -29,8 +29,9 @@ class Control(eqx.Module):
 
     def at(self, step: Int[Array, ""] | int) -> "Control":
         """That of one step of a motion; a wind of 3 numbers stays."""
-        steady = self.wind is None or self.wind.ndim == 1
-        return Control(self.pinned[step], self.wind if steady else self.wind[step])
+        wind = self.wind
+        steady = wind is None or wind.ndim == 1
+        return Control(self.pinned[step], wind if steady else wind[step])
 
 
 class Scene(eqx.Module):

@@ -21,12 +21,11 @@ from r2s._util.files import write_json
 from r2s.estimation import estimate as estimates
 from r2s.estimation.estimate import Estimate
 from r2s.materials import presets
-from r2s.materials.fabric import Fabric
+from r2s.materials.fabric import Fabric, check_fabric
 from r2s.materials.fabric_json import (
     LAWS,
     NUMBERS,
     check_keys,
-    check_numbers,
     expect,
     fabric_as_json,
     fabric_from_json,
@@ -84,7 +83,7 @@ class Card:
         if not provenance.version:
             provenance = dataclasses.replace(provenance, version=version())
         numbers, found = fabric_as_json(fabric), None
-        check_numbers(fabric)
+        check_fabric(fabric, may_lack=True)
         if isinstance(what, Estimate):
             full = estimates.as_json(what)
             kept = {key: value for key, value in full.items() if key not in LEFT_OUT}

@@ -13,6 +13,15 @@ from r2s._util.units import GRAVITY
 from r2s.materials.membrane import OrthotropicMembrane
 from r2s.materials.plate import PlateBending
 
+NUMBERS = {
+    "density": "kg/m^2",
+    "damping": "s",
+    "friction": "-",
+    "thickness": "m",
+    "mass_damping": "1/s",
+}
+POSITIVE = "density", "thickness"
+
 
 class Fabric(eqx.Module):
     """A fabric. A leading batch axis on every field makes it a sweep, for `jax.vmap`.
@@ -82,30 +91,28 @@ class Fabric(eqx.Module):
         )
 
 
-def check_fabric(fabric: Any) -> None:
+def check_fabric(fabric: Any, may_lack: bool = False) -> None:
     """Raise `ValueError` for a fabric with a number that none has, such as a negative stiffness.
 
     Of a batch, if one member has it. A traced fabric passes, and so does what is no `Fabric`.
+    `may_lack`: NaN passes, as a number that nobody knows.
     """
     if not isinstance(fabric, Fabric) or is_traced(fabric):
         return
-    numbers = {
-        "density [kg/m^2]": (fabric.density, True),
-        "thickness [m]": (fabric.thickness, True),
-        "damping [s]": (fabric.damping, False),
-        "friction [-]": (fabric.friction, False),
-        "mass_damping [1/s]": (fabric.mass_damping, False),
-    }
+    numbers = {name: (getattr(fabric, name), unit) for name, unit in NUMBERS.items()}
     if isinstance(fabric.membrane, OrthotropicMembrane):
         law = fabric.membrane
-        numbers |= {f"membrane.{n} [N/m]": (getattr(law, n), True) for n in ("c11", "c22", "c33")}
+        numbers |= {f"membrane.{n}": (getattr(law, n), "N/m") for n in ("c11", "c22", "c33")}
     if isinstance(fabric.bending, PlateBending):
-        numbers["bending.stiffness [N m]"] = fabric.bending.stiffness, False
-    for name, (values, must_be_positive) in numbers.items():
+        numbers["bending.stiffness"] = fabric.bending.stiffness, "N m"
+    for name, (values, unit) in numbers.items():
         least = float(np.min(np.asarray(values)))
+        must_be_positive = name in POSITIVE or name.startswith("membrane.")
+        if may_lack and math.isnan(least):
+            continue
         if not least >= 0 or (must_be_positive and least == 0):
             word = "positive" if must_be_positive else "not negative"
-            raise ValueError(f"fabric: {name} must be {word}, found {least:g}")
+            raise ValueError(f"fabric: {name} must be {word} [{unit}], found {least}")
 
 
 def constant_laws(fabric: Fabric) -> tuple[OrthotropicMembrane, PlateBending]:

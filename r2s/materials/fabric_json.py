@@ -13,19 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from r2s.materials.bending import HingeBending
-from r2s.materials.fabric import Fabric
+from r2s.materials.fabric import NUMBERS, Fabric, check_fabric
 from r2s.materials.membrane import OrthotropicMembrane, SpringMembrane
 from r2s.materials.plate import OrthotropicPlate, PlateBending
 from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
 from r2s.materials.tables import TableBending, TableMembrane
 
-NUMBERS = {
-    "density": "kg/m^2",
-    "damping": "s",
-    "friction": "-",
-    "thickness": "m",
-    "mass_damping": "1/s",
-}
 MEMBRANES = OrthotropicMembrane, StiffeningMembrane, SpringMembrane, TableMembrane
 BENDINGS = PlateBending, OrthotropicPlate, SofteningPlate, HingeBending, TableBending
 LAWS = {"membrane": (MEMBRANES, "N/m"), "bending": (BENDINGS, "N m")}
@@ -66,18 +59,8 @@ def fabric_from_json(stored: Any) -> Fabric:
     numbers = {n: _value(stored[n], unit, f"fabric: {n}", ()) for n, unit in NUMBERS.items()}
     laws = {part: _law_from(stored[part], part) for part in LAWS}
     fabric = Fabric(**numbers, **laws)
-    check_numbers(fabric)
+    check_fabric(fabric, may_lack=True)
     return fabric
-
-
-def check_numbers(fabric: Fabric) -> None:
-    """Raise `ValueError` for numbers that no fabric has; NaN passes as not known."""
-    for name, unit in NUMBERS.items():
-        value = float(getattr(fabric, name))
-        positive = name in ("density", "thickness")
-        if value < 0 or (positive and value == 0):
-            word = "positive" if positive else "not negative"
-            raise ValueError(f"fabric: {name} must be {word} [{unit}], found {value}")
 
 
 def nan_to_null(value: Any, where: str) -> Any:
