@@ -30,8 +30,9 @@ class Control(eqx.Module):
     def at(self, step: Int[Array, ""] | int) -> "Control":
         """That of one step of a motion; a wind of 3 numbers stays."""
         wind = self.wind
-        steady = wind is None or wind.ndim == 1
-        return Control(self.pinned[step], wind if steady else wind[step])
+        if wind is not None and wind.ndim > 1:
+            wind = wind[step]
+        return Control(self.pinned[step], wind)
 
 
 class Scene(eqx.Module):

@@ -88,7 +88,8 @@ def test_vertices_that_cannot_be_pinned_are_named(pinned, words):
 def test_a_steady_wind_stays_and_one_of_every_step_is_that_of_the_step():
     path, wind = jnp.zeros((4, 2, 3)), jnp.array([0.0, 1.0, 0.0])
     assert r2s.Control(path, wind).at(3).wind == pytest.approx(wind)
-    assert r2s.Control(path, jnp.arange(12.0).reshape(4, 3)).at(3).wind[0] == 9.0
+    gusts = jnp.arange(12.0).reshape(4, 3)
+    assert r2s.Control(path, gusts).at(3).wind == pytest.approx(gusts[3])
     assert r2s.Control(path).at(3).wind is None
 
 
@@ -102,16 +103,20 @@ def test_no_step_between_saves_is_refused(unchecked):
 def test_gravity_and_step_are_leaves_of_one_program():
     """A free sheet in vacuum falls by g dt^2 in its first implicit step, from rest."""
 
+    traced = []
+
     @jax.jit
     def fallen(gravity, dt):
+        traced.append(gravity)
         scene = r2s.Scene(SHEET, air=None, gravity=gravity)
         solver = dataclasses.replace(FREE, scene=scene, dt=dt)
         after = solver.step(FABRIC, solver.init(START), r2s.Control(jnp.zeros((0, 3))))
         return -after.x[:, 2].mean()
 
+    slope_of = jax.jit(jax.grad(fallen))
     for g, dt in ((9.81, 0.01), (1.62, 0.02)):
         g, dt = jnp.asarray(g), jnp.asarray(dt)
-        slope = jax.grad(fallen)(g, dt)
+        slope = slope_of(g, dt)
         assert slope == pytest.approx(float(fallen(g, dt) / g), rel=1e-6)
         assert slope == pytest.approx(float(4 / 9 * dt**2), rel=1e-6)  # BDF2's first step
-    assert fallen._cache_size() == 1
+    assert len(traced) <= 2  # for the value and its derivative, not for each step
