@@ -15,7 +15,7 @@ from r2s.cli.common import FabricName, Json, Motion, Scenario, ScenarioName, Sha
 
 @dataclass(frozen=True)
 class CheckGrad:
-    """Compare derivatives of a motion in every parameter of its fabric with central differences.
+    """Check derivatives of a motion by central differences.
 
     In double precision, of the mean squared distance [m^2] from where the sheet began, over frames
     and vertices. Differences are taken over two widths: where these disagree, the motion is rough
@@ -105,7 +105,7 @@ BENDS = (1e-8, 1e-2, "N m", "a moment per curvature and width: 1 mN mm is 1e-6 N
 
 @dataclass(frozen=True)
 class Doctor:
-    """Look at the installation; with a card, a mesh or a scenario, also at those.
+    """Check the installation, a card, a mesh or a scenario.
 
     Says versions, devices, precision and which extras there are; whether the numbers of a fabric
     are plausible in their units; whether a mesh is sound; whether the fabric can be simulated in a

@@ -48,6 +48,17 @@ SolverName = Annotated[Literal["cloth", "mpm"], arg(help="The implicit cloth, or
 Json = Annotated[bool, arg(help="Print one JSON object.")]
 
 
+def check_picture(path: Path | None) -> None:
+    """Raise `ImportError` or `FileNotFoundError`, before long work, where a picture can't be drawn
+    or written; nothing for None."""
+    from r2s._util.extras import require
+    from r2s._util.files import check_folders
+
+    if path is not None:
+        require("matplotlib", "study", "--plot")
+        check_folders(path)
+
+
 def load_card(text: str) -> "Card":
     """Read the card of a preset, or the card in a file.
 

@@ -31,7 +31,7 @@ MethodName = Literal[
 
 @dataclass(frozen=True)
 class EstimateCard:
-    """Estimate a fabric from recordings of it, and write its card.
+    """Estimate a fabric from recordings; writes its card.
 
     RECORDING is an NPZ of r2s, a folder of them, a folder of frames with its manifest, or a JSON
     file of laboratory tests (docs/guide/laboratory.md); several are taken for the same fabric.
@@ -102,16 +102,19 @@ class EstimateCard:
     """Write the card even where the estimate explains none of the recordings."""
     json: bool = False
     """Print the card as one JSON object."""
+    plot: Annotated[Path | None, arg(metavar="FILE")] = None
+    """A PNG: prior and posterior of each parameter, and the estimated sheet in three frames."""
 
     def run(self) -> int:
         from r2s._util.files import check_folders
-        from r2s.cli.common import print_result
+        from r2s.cli.common import check_picture, print_result
         from r2s.cli.estimate_report import explains_nothing, make_card, report
         from r2s.cli.waiting import Waiting
         from r2s.estimation import cards
         from r2s.estimation.checkpoint import forget
 
         check_folders(self.out)
+        check_picture(self.plot)
         with Waiting("reading the recordings") as progress:
             outcome = self._estimate(progress)
         if (reason := explains_nothing(outcome)) and not self.force:
@@ -119,6 +122,8 @@ class EstimateCard:
         card = make_card(outcome, self.name, self.date)
         cards.write(self.out, card)
         forget(self._progress_file)
+        if self.plot is not None:
+            _draw(self.plot, outcome)
         lines = [*report(outcome), f"{self.out}: {card.name}"]
         print_result(self.json, cards.as_json(card), lines)
         return 0
@@ -159,7 +164,9 @@ class EstimateCard:
         else:
             assert by_tests is not None
             found = by_tests
-        outcome = Outcome(method, self.density, prior, recordings, laboratory, found, by_tests)
+        outcome = Outcome(
+            method, self.density, prior, space, recordings, laboratory, found, by_tests
+        )
         if unseen is not None:
             return outcome.judged_by(unseen, progress)
         if len(recordings) < 2:
@@ -256,3 +263,26 @@ class EstimateCard:
                 words = f"--{name} is not of {method.name}: it takes {takes}"
                 raise ValueError(words.replace("_", "-"))
         return method.budget._replace(**asked)
+
+
+def _draw(path: Path, outcome: "Outcome") -> None:
+    """Draw an outcome, with the motion of its first recording that is no stretching."""
+    import numpy as np
+
+    from r2s.estimation.method import COARSEST
+    from r2s.metrics.prediction_error import predict_motion
+    from r2s.recordings.open import SimulatedCloth
+    from r2s.scenarios.resolution import alike
+    from r2s.scenarios.scenario import from_recording
+    from r2s.viewer.comparison import draw_estimate
+
+    estimate, recordings = outcome.estimate, outcome.recordings
+    if not recordings:
+        draw_estimate(path, estimate, outcome.space)
+        return
+    first = min(recordings, key=lambda each: each.info.scenario == "stretching")
+    shape = alike(estimate.shape or COARSEST, first.info.sheet.size)
+    scenario = from_recording(first, shape)
+    x = predict_motion(scenario, estimate.fabric).x
+    sheet = SimulatedCloth(x, np.asarray(scenario.scene.mesh.faces))
+    draw_estimate(path, estimate, outcome.space, first, sheet)

@@ -13,6 +13,7 @@ from r2s.estimation.summary import describe
 from r2s.laboratory.estimate import APPROACH, POOR_FIT, consistency, fits
 from r2s.laboratory.files import LaboratoryTests
 from r2s.laboratory.pull import Pull
+from r2s.materials.parameters import ParameterSpace
 from r2s.recordings.recording import Recording, clouds_are_markers
 from r2s.scenarios.resolution import alike
 
@@ -43,7 +44,8 @@ CAUSES = {  # of a nuisance far from its nominal value
 class Outcome:
     """What was estimated, and from what.
 
-    - `density`: as given, [kg/m^2]. `prior`: "flat" or "fabrics".
+    - `density`: as given, [kg/m^2]. `prior`: "flat" or "fabrics". `space`: the parameters, with
+      what was known before the recordings.
     - `estimate`; `by_tests`: by the laboratory tests alone, None without tests.
     - `judged`: what the recording that was held out says of the estimate; or, of several
       recordings, `why_not_judged`.
@@ -52,6 +54,7 @@ class Outcome:
     method: Method
     density: float
     prior: str
+    space: ParameterSpace
     recordings: Sequence[Recording]
     laboratory: Sequence[LaboratoryTests]
     estimate: Estimate

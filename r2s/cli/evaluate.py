@@ -27,13 +27,14 @@ CROPPED = "; without the simulated sheet below the lowest recorded point"
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Say how well a fabric predicts recorded motions: mean distance of the recorded points from
-    the simulated sheet, over the frames that count.
+    """Measure how well a fabric predicts recorded motions.
 
-    Beside it stand the same of the prior mean (the fabric that one would guess from the weight
-    alone), and what the noise of the points and the simulated mesh allow.
+    Prints the mean distance of the recorded points from the simulated sheet, over the frames that
+    count; beside it the same distance for the prior mean (the fabric that one would guess from the
+    weight alone), and what the noise of the points and the simulated mesh allow.
 
         r2s evaluate denim.json fold.npz
+        r2s evaluate denim.json fling.npz --plot fling.png
         r2s evaluate grey_interlock recordings/fold_tan --json
     """
 
@@ -43,13 +44,17 @@ class Evaluate:
     shape: ChosenShape = None
     all: bool = False
     """Print the other distances, too, with what each is."""
+    plot: Annotated[Path | None, arg(metavar="FILE")] = None
+    """A PNG of the last recording: its points in three frames, with the sheet of the fabric and
+    that of the prior mean, and the distance under each."""
     json: Json = False
 
     def run(self) -> int:
-        from r2s.cli.common import load_card, print_result
+        from r2s.cli.common import check_picture, load_card, print_result
         from r2s.metrics.prediction_error import UNITS
         from r2s.recordings.open import open_recordings
 
+        check_picture(self.plot)
         card, lines = load_card(self.fabric), []
         judged: dict[str, Judged] = {}
         for recording in open_recordings(self.recordings):
@@ -84,11 +89,21 @@ class Evaluate:
         metrics = prediction_error.against_motion(recording, motion.x, shape=shape)
         guess = prediction_error.predict_motion(scenario, prior.middle(float(fabric.density)))
         guessed = prediction_error.against_motion(recording, guess.x, shape=shape)
+        if self.plot is not None:
+            self._draw(self.plot, recording, scenario.scene.mesh.faces, motion.x, guess.x)
         failed = math.isnan(metrics[DISTANCE])
         own = fingerprint(recording) in {digest for _, digest in card.provenance.recordings}
         noise = mean_distance(point_noise(recording))
         why = str(motion.failure) if failed else ""
         return Judged(metrics, guessed[DISTANCE], noise, mesh, words, why, own)
+
+    def _draw(self, path: Path, recording: "Recording", faces, x, guess) -> None:
+        from r2s.recordings.open import SimulatedCloth
+        from r2s.viewer.comparison import draw_prediction
+
+        motions = {self.fabric: x, "prior mean": guess}
+        sheets = {Path(name).stem: SimulatedCloth(each, faces) for name, each in motions.items()}
+        draw_prediction(path, recording, sheets)
 
 
 class Judged(NamedTuple):

@@ -5,11 +5,12 @@ Exit codes: 0; 1 for an error, in one line on stderr; 2 for wrong usage. The com
 """
 
 import gc
+import inspect
 import os
 import sys
 import warnings
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any, Union
 
 try:
     import tyro
@@ -29,20 +30,20 @@ from r2s.estimation.cards import version
 from r2s.study.engine import one_thread
 
 NO_CACHE = "--no-cache"
-Command = (
-    Annotated[Data, subcommand("data")]
-    | Annotated[Check, subcommand("check")]
-    | Annotated[Show, subcommand("show")]
-    | Annotated[Sensitivity, subcommand("sensitivity")]
-    | Annotated[Simulate, subcommand("simulate")]
-    | Annotated[EstimateCard, subcommand("estimate")]
-    | Annotated[Evaluate, subcommand("evaluate")]
-    | Annotated[Export, subcommand("export")]
-    | Annotated[CheckGrad, subcommand("check-grad")]
-    | Annotated[Doctor, subcommand("doctor")]
-    | Annotated[Study, subcommand("study")]
-    | Annotated[View, subcommand("view")]
-)
+COMMANDS = {
+    "simulate": Simulate,
+    "data": Data,
+    "check": Check,
+    "show": Show,
+    "estimate": EstimateCard,
+    "evaluate": Evaluate,
+    "view": View,
+    "export": Export,
+    "sensitivity": Sensitivity,
+    "check-grad": CheckGrad,
+    "doctor": Doctor,
+    "study": Study,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -56,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     try:
         command = tyro.cli(
-            Command,  # pyright: ignore[reportArgumentType]
+            _choice(is_list=not set(arguments) & set(COMMANDS)),
             prog="r2s",
             description=(
                 "r2s: real-to-sim for fabrics. Each command tells more with --help. Compiled "
@@ -81,6 +82,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("r2s: error: interrupted", file=sys.stderr)
         return 1
     return 0
+
+
+def _choice(is_list: bool) -> Any:
+    """All commands, for tyro, which shows one text for a command in the list of all and in its own
+    help: in the list the first sentence, else all of it."""
+    kinds = []
+    for name, kind in COMMANDS.items():
+        first = (inspect.getdoc(kind) or "").split("\n\n")[0]
+        text = " ".join(first.split()) if is_list else None
+        kinds.append(Annotated[kind, subcommand(name, description=text)])
+    return Union[tuple(kinds)]  # noqa: UP007
 
 
 def command() -> int:

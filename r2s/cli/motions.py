@@ -11,7 +11,7 @@ from r2s.cli.common import ChosenShape, FabricName, Json, Motion, Scenario, Shap
 
 @dataclass(frozen=True)
 class Simulate:
-    """Simulate a fabric in one of the six scenarios, and write its motion as an NPZ.
+    """Simulate a fabric in one of six scenarios, as an NPZ.
 
     The NPZ has x (frame, vertex, 3) [m] and faces (face, 3), as `r2s show --trajectory` reads it.
     With --recording it is also seen by two depth cameras, with noise and outliers: a synthetic
@@ -111,10 +111,10 @@ class Simulate:
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Say what a planned motion would reveal of a fabric, before anybody makes it.
+    """Predict what a planned motion would determine.
 
     Simulates the motion with a preset that is like the fabric, as seen by two depth cameras, and
-    prints how well each parameter would be known.
+    prints the standard error that each parameter would have.
     Numbers of the motion are those of `r2s.scenarios.standard`, in SI units.
 
         r2s sensitivity lifting --fabric black_denim --motion height=0.3 moving=2
@@ -152,7 +152,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Export:
-    """Write a fabric for another simulator, and say what is lost on the way.
+    """Write a fabric for another simulator.
+
+    Says what is lost on the way.
 
     mujoco: a model (MJCF) of a sheet; newton: arguments of add_cloth_mesh and add_spring (JSON);
     arcsim: a material file (JSON); pybullet: arguments of loadSoftBody (JSON). MuJoCo and Newton

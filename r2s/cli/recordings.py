@@ -11,7 +11,7 @@ from r2s.cli.common import Json, RecordingPath
 
 @dataclass(frozen=True)
 class Check:
-    """Say what is suspicious in a recording, each with the figure behind it.
+    """Check a recording for mistakes.
 
     Looks at the scale, gravity and table where the whole sheet is seen at rest, at how far points
     are from the grippers, whether markers or the whole sheet stretch, the frames' times, how late
@@ -40,9 +40,9 @@ class Check:
 
 @dataclass(frozen=True)
 class Show:
-    """Draw a recording: a contact sheet (PNG) and a video of clouds, grippers and simulated cloth.
+    """Draw a recording: a contact sheet and a video.
 
-    All panels have one scale, in metres. RECORDING is an NPZ of r2s, or a folder of frames with
+    Both show clouds, grippers and, with --trajectory, a simulated sheet. All panels have one scale, in metres. RECORDING is an NPZ of r2s, or a folder of frames with
     its manifest.json beside it; without one, the manifest of DIFFCLOUD is taken.
 
         r2s show recordings/lift_tan --out pictures
@@ -150,7 +150,7 @@ class Convert:
 
 @dataclass(frozen=True)
 class Data:
-    """Recordings: which are public and how to get them, and how yours become those of r2s."""
+    """Convert your recordings, and get public ones."""
 
     command: Annotated[
         Annotated[Fetch, subcommand("fetch")]

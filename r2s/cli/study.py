@@ -11,7 +11,9 @@ from tyro.conf import UseAppendAction, arg
 
 @dataclass(frozen=True)
 class Study:
-    """Estimate fabrics by several approaches, judge them on unseen motions, and write a report.
+    """Compare several approaches on unseen motions.
+
+    Estimates fabrics by each, evaluates the estimates, and writes a report.
 
     Results that are there already are not made again: interrupted, the same command goes on. The
     preset "one_fabric" takes about 45 minutes on two cores; "paper" and "full" are for a cluster.

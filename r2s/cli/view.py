@@ -19,7 +19,7 @@ Size = tuple[float, float]
 
 @dataclass(frozen=True)
 class View:
-    """Show a fabric in motion in a browser, with a slider for each of its parameters.
+    """Show a fabric in motion in a browser, with sliders.
 
     With --recording the motion is the recording's, its points lie over the cloth, and their mean
     distance follows the sliders. Sliders run over the range of estimates; values are below them.

@@ -76,7 +76,7 @@ def show(
 
 def contact_sheet(path: Path, recording: Recording, cloth: SimulatedCloth | None = None) -> Path:
     """Write up to twelve frames, spread over the recording, as one PNG."""
-    content = _Content.make(recording, cloth)
+    content = Content.make(recording, cloth)
     count = len(recording.times)
     frames = np.unique(np.linspace(0, count - 1, min(MAX_PANELS, count)).round().astype(int))
     columns = min(4, len(frames))
@@ -88,13 +88,13 @@ def contact_sheet(path: Path, recording: Recording, cloth: SimulatedCloth | None
     figure.subplots_adjust(0.0, bottom, 0.96, top - 0.02, wspace=0.06, hspace=0.1)
     for i, frame in enumerate(frames):
         axes: Any = figure.add_subplot(rows, columns, i + 1, projection="3d")
-        _draw_surroundings(axes, content)
-        _draw_frame(axes, content, int(frame))
+        draw_surroundings(axes, content)
+        draw_frame(axes, content, int(frame))
         axes.set_title(_caption(recording, int(frame)), fontsize=9, y=0.98)
     if strip:
         curve = _draw_force(figure, recording, 0.75 / height, (strip - 0.45) / height)
         _mark_frames(curve, recording, frames)
-    _draw_title_and_legend(figure, content, 12)
+    draw_title_and_legend(figure, content, 12)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=100)
     write_bytes(path, buffer.getvalue())
@@ -103,19 +103,19 @@ def contact_sheet(path: Path, recording: Recording, cloth: SimulatedCloth | None
 
 def pictures(recording: Recording, cloth: SimulatedCloth | None = None) -> Iterator[np.ndarray]:
     """Each frame as a picture, (height, width, 3) in 0..255, of even sides."""
-    content = _Content.make(recording, cloth)
+    content = Content.make(recording, cloth)
     strip = 0.0 if recording.force is None else STRIP - 0.1  # [inch]: sides of even pixels
     height = 5.6 + strip
     figure = Figure(figsize=(6.4, height), dpi=100)
     canvas = FigureCanvasAgg(figure)
     figure.subplots_adjust(0.0, (0.34 + strip) / height, 0.96, 1 - 0.39 / height)
     axes: Any = figure.add_subplot(projection="3d")
-    _draw_surroundings(axes, content)
-    _draw_title_and_legend(figure, content, 11)
+    draw_surroundings(axes, content)
+    draw_title_and_legend(figure, content, 11)
     caption = figure.text(0.02, 1 - 0.56 / height, "", fontsize=10)
     curve = strip and _draw_force(figure, recording, 0.7 / height, (strip - 0.45) / height)
     for frame in range(len(recording.times)):
-        artists = _draw_frame(axes, content, frame)
+        artists = draw_frame(axes, content, frame)
         if strip:
             artists += _mark_frames(curve, recording, np.array([frame]))
         caption.set_text(_caption(recording, frame))
@@ -125,7 +125,7 @@ def pictures(recording: Recording, cloth: SimulatedCloth | None = None) -> Itera
             artist.remove()
 
 
-class _Content(NamedTuple):
+class Content(NamedTuple):
     """What the panels show.
 
     - `clouds`: points [m] of each frame, thinned.
@@ -139,7 +139,7 @@ class _Content(NamedTuple):
     high: np.ndarray
 
     @classmethod
-    def make(cls, recording: Recording, cloth: SimulatedCloth | None) -> "_Content":
+    def make(cls, recording: Recording, cloth: SimulatedCloth | None) -> "Content":
         generator = np.random.default_rng(0)
         frames = (cloud(recording, frame) for frame in range(len(recording.times)))
         clouds = [generator.permutation(points)[:MAX_DOTS] for points in frames]
@@ -150,7 +150,7 @@ class _Content(NamedTuple):
         return _inside(points, self.low, self.high)
 
 
-def _draw_surroundings(axes: Any, content: _Content) -> None:
+def draw_surroundings(axes: Any, content: Content) -> None:
     """Limits, one scale for all axes, labels, and what does not move: table and sheet at rest."""
     low, high, info = content.low, content.high, content.recording.info
     axes.patch.set_alpha(0)  # it would cover the labels of the panel to the left
@@ -172,7 +172,7 @@ def _draw_surroundings(axes: Any, content: _Content) -> None:
         axes.plot(*edge.T, np.full(5, info.table_height), color=GREY, linewidth=0.6, zorder=1)
 
 
-def _draw_frame(axes: Any, content: _Content, frame: int) -> list[Any]:
+def draw_frame(axes: Any, content: Content, frame: int) -> list[Any]:
     """Draw what moves, as it is in a frame; the artists."""
     artists, recording, cloth = [], content.recording, content.cloth
     if cloth is not None:
@@ -274,7 +274,8 @@ def _caption(recording: Recording, frame: int) -> str:
     return f"frame {frame}, {float(recording.times[frame]):.2f} s{counts}"
 
 
-def _draw_title_and_legend(figure: Any, content: _Content, fontsize: int) -> None:
+def draw_title_and_legend(figure: Any, content: Content, fontsize: int) -> None:
+    """The recording's name at the top of a figure, and what is drawn how at its bottom."""
     info = content.recording.info
     title = f"{info.name}: {info.scenario}, {info.fabric}, trial {info.trial}"
     figure.suptitle(title, fontsize=fontsize)
