@@ -200,7 +200,7 @@ class EstimateCard:
         from r2s.estimation.method import default_space
         from r2s.materials.prior import informed
 
-        if self.density > 0 and not LIGHTEST <= self.density <= HEAVIEST:
+        if not LIGHTEST <= self.density <= HEAVIEST:
             raise ValueError(
                 f"--density is in kg/m^2, got {self.density:g}: fabrics have {LIGHTEST} to "
                 f"{HEAVIEST:g} (100 g/m^2 are 0.1 kg/m^2)"

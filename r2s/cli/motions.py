@@ -8,6 +8,9 @@ from tyro.conf import Positional, arg
 
 from r2s.cli.common import ChosenShape, FabricName, Json, Motion, Scenario, Shape
 
+SMALL = 5e-4  # an error of an energy that is printed as 0.0%
+TINY = 1e-3  # least ratio of energies whose inverse is printed
+
 
 @dataclass(frozen=True)
 class Simulate:
@@ -146,6 +149,8 @@ class Sensitivity:
 
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from r2s.export import Loss
     from r2s.materials.fabric import Fabric
 
@@ -192,7 +197,9 @@ class Export:
         for part in ("membrane", "bending"):
             errors = getattr(loss, part).items()
             if errors:
-                lines.append(f"{part}: " + ", ".join(f"{name} {e:+.1%}" for name, e in errors))
+                errors = ", ".join(f"{name} {e:+.1%}" for name, e in errors)
+                lines.append(f"{part}, error of the energy: {errors}")
+                lines += _consequence(part, getattr(loss, part))
         if self.to != "arcsim":
             lines += mesh_warning(self.shape, card.fabric, self.size, "lifting")
         print_result(self.json, result, [*lines, *(f"lost: {text}" for text in loss.lost)])
@@ -224,3 +231,14 @@ class Export:
         model = {"add_cloth_mesh": made.arguments, "add_spring": rows, "fields": made.fields}
         write_json(self.out, model)
         return loss
+
+
+def _consequence(part: str, errors: "Mapping[str, float]") -> list[str]:
+    """What the largest error of an energy does to the exported sheet."""
+    name, worst = max(errors.items(), key=lambda pair: abs(pair[1]))
+    if abs(worst) < SMALL:
+        return []
+    ratio = max(1 + worst, TINY)
+    if part == "bending":  # a bending length grows as the cube root (Peirce 1930)
+        return [f"    so folds are {ratio ** (1 / 3):.2f} times as wide in that direction ({name})"]
+    return [f"    so the same force stretches it {1 / ratio:.2g} times as far ({name})"]

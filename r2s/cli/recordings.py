@@ -42,8 +42,9 @@ class Check:
 class Show:
     """Draw a recording: a contact sheet and a video.
 
-    Both show clouds, grippers and, with --trajectory, a simulated sheet. All panels have one scale, in metres. RECORDING is an NPZ of r2s, or a folder of frames with
-    its manifest.json beside it; without one, the manifest of DIFFCLOUD is taken.
+    Both show clouds, grippers and, with --trajectory, a simulated sheet, in one scale, in metres.
+    RECORDING is an NPZ of r2s, or a folder of frames with its manifest.json beside it; without one,
+    the manifest of DIFFCLOUD is taken.
 
         r2s show recordings/lift_tan --out pictures
         r2s show lift.npz --trajectory simulated.npz --out pictures --video gif
