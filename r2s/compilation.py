@@ -132,15 +132,15 @@ def machine() -> str:
     A program for two cores that runs on one waits for itself: a lift takes 20 times as long. A home
     folder may be shared by machines that do not understand each other's programs.
     """
-    told = [platform.machine(), platform.system(), f"{cores()} cores"]
+    parts = [platform.machine(), platform.system(), f"{cores()} cores"]
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:  # not Linux: the machine's own name
-        told += [platform.processor(), platform.node()]
+        parts += [platform.processor(), platform.node()]
     else:
         names = ("model name", "flags", "Features", "CPU part")
-        told += sorted({line for line in lines if line.startswith(names)})
-    return hashlib.sha256("\n".join(told).encode()).hexdigest()[:12]
+        parts += sorted({line for line in lines if line.startswith(names)})
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
 
 
 def clear() -> None:

@@ -191,10 +191,10 @@ def _fabric(
     from r2s.scenarios import resolution
     from r2s.scenarios.standard import SIDE
 
-    found, length, sheet = list(implausible(fabric)), float(bending_length(fabric)), (SIDE, SIDE)
+    wrong, length, sheet = list(implausible(fabric)), float(bending_length(fabric)), (SIDE, SIDE)
     errors = {m: resolution.mesh_error(fabric, sheet, shape, m) for m in resolution.TABLE}
     lines = [
-        f"fabric {name}: {'see below' if found else 'plausible'}",
+        f"fabric {name}: {'see below' if wrong else 'plausible'}",
         f"    it folds at {1e3 * length:.1f} mm: longer cells cannot follow",
         f"    expected errors of a sheet of {SIDE} m with {shape[0]} x {shape[1]} vertices:",
     ]
@@ -205,7 +205,7 @@ def _fabric(
         lines.append(f"        {motion}: {1e3 * error:.1f} mm, {words}")
     result = {
         "name": name,
-        "implausible": found,
+        "implausible": wrong,
         "fold_length_m": length,
         "mesh_error_m": errors,
     }
@@ -220,10 +220,10 @@ def installation() -> tuple[dict[str, Any], list[str], list[str]]:
     versions |= {name: _version(name) or "not installed" for name in PACKAGES}
     missing: dict[str, list[str]] = {}
     for requirement in (_version("r2s") and metadata.requires("r2s")) or ():
-        found = re.match(r"([\w.-]+).*extra == ['\"]([\w-]+)['\"]", requirement)
-        if found and found[2] != "dev":
-            lacking = missing.setdefault(found[2], [])
-            lacking += [] if _version(found[1]) else [found[1]]
+        match = re.match(r"([\w.-]+).*extra == ['\"]([\w-]+)['\"]", requirement)
+        if match and match[2] != "dev":
+            lacking = missing.setdefault(match[2], [])
+            lacking += [] if _version(match[1]) else [match[1]]
     devices = [f"{each.platform} {each.device_kind}" for each in jax.devices()]
     x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
     lines = [", ".join(f"{name} {version}" for name, version in versions.items())]

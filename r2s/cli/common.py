@@ -79,15 +79,15 @@ def load_card(text: str) -> "Card":
 
 def parse_numbers(motion: Iterable[str]) -> dict[str, float]:
     """Read texts NAME=NUMBER; raises `ValueError` that says what was expected."""
-    found = {}
+    numbers = {}
     for text in motion:
         name, _, value = text.partition("=")
         try:
-            found[name] = float(value)
+            numbers[name] = float(value)
         except ValueError:
             message = f"--motion expects NAME=NUMBER, such as height=0.3, got {text}"
             raise ValueError(message) from None
-    return found
+    return numbers
 
 
 def make_experiment(scenario: str, motion: Iterable[str]) -> "Experiment":

@@ -160,12 +160,12 @@ class EstimateCard:
         if recordings:
             space = informed(space, by_tests) if by_tests else space
             key = jax.random.key(self.seed)
-            found = method.estimate(recordings, space, self._budget(method), key=key)
+            result = method.estimate(recordings, space, self._budget(method), key=key)
         else:
             assert by_tests is not None
-            found = by_tests
+            result = by_tests
         outcome = Outcome(
-            method, self.density, prior, space, recordings, laboratory, found, by_tests
+            method, self.density, prior, space, recordings, laboratory, result, by_tests
         )
         if unseen is not None:
             return outcome.judged_by(unseen, progress)

@@ -65,10 +65,10 @@ class Outcome:
     def judged_by(self, recording: Recording, progress: Progress | None) -> "Outcome":
         """With what a recording that was held out says of the estimate."""
         tell(progress, f"judging by {recording.info.name}")
-        found = self.estimate
-        shape = alike(found.shape or COARSEST, recording.info.sheet.size)
-        air = held_out.air_found(found, self.recordings)
-        line = held_out.judge(recording, found.fabric, shape, air=air).describe()
+        estimate = self.estimate
+        shape = alike(estimate.shape or COARSEST, recording.info.sheet.size)
+        air = held_out.air_found(estimate, self.recordings)
+        line = held_out.judge(recording, estimate.fabric, shape, air=air).describe()
         by_cloth = "" if self.method.chosen_solver == "cloth" else " (by the cloth)"
         return replace(self, judged=line + by_cloth)
 
@@ -108,18 +108,18 @@ def assumed(estimated: set[str]) -> tuple[str, ...]:
 
 def report(outcome: Outcome) -> list[str]:
     """All lines on an outcome."""
-    found, recordings = outcome.estimate, outcome.recordings
-    coarse = _coarse(found, recordings)
+    estimate, recordings = outcome.estimate, outcome.recordings
+    coarse = _coarse(estimate, recordings)
     lines = [
-        *describe(found),
+        *describe(estimate),
         *unread(outcome.method, recordings),
         *_weighed(outcome),
-        *agreement(found, recordings, bool(coarse)),
-        *misfits(found, recordings),
+        *agreement(estimate, recordings, bool(coarse)),
+        *misfits(estimate, recordings),
         *coarse,
     ]
-    if found.refused:
-        lines.append(f"warning: estimated on a coarser mesh than {found.refused}")
+    if estimate.refused:
+        lines.append(f"warning: estimated on a coarser mesh than {estimate.refused}")
     lines += _laboratory(outcome)
     if outcome.judged:
         lines.append(outcome.judged)
@@ -171,41 +171,41 @@ def agreement(
     if estimate.shares:
         pairs = zip(names, estimate.shares, strict=False)
         yield f"shares in the loss: {', '.join(f'{name} {share:.2g}' for name, share in pairs)}"
-    found = estimate.agreement
-    if found is None:
+    agreed = estimate.agreement
+    if agreed is None:
         return
-    if found.density is not None and found.doubts_density:
+    if agreed.density is not None and agreed.doubts_density:
         yield (
-            f"warning: the recordings would agree on about {found.density[0]:.1g} times the "
+            f"warning: the recordings would agree on about {agreed.density[0]:.1g} times the "
             "density that was given: weigh the sheet again, in kg/m^2"
         )
-    if found.contradiction is not None:
-        yield _contradiction(estimate, found, names, is_coarse)
-    elif not found.doubts_density:
-        yield _agree(found, names)
+    if agreed.contradiction is not None:
+        yield _contradiction(estimate, agreed, names, is_coarse)
+    elif not agreed.doubts_density:
+        yield _agree(agreed, names)
 
 
-def _agree(found: Agreement, names: Sequence[str]) -> str:
-    alone = [name for name, told in zip(names, found.told, strict=True) if not told]
+def _agree(agreed: Agreement, names: Sequence[str]) -> str:
+    alone = [name for name, told in zip(names, agreed.told, strict=True) if not told]
     left = f"; too little information to compare: {', '.join(alone)}" if alone else ""
-    if not found.is_excused:
-        return f"the recordings agree (p = {found.p:.2g}){left}"
+    if not agreed.is_excused:
+        return f"the recordings agree (p = {agreed.p:.2g}){left}"
     return (
-        f"the recordings agree only within the errors of their meshes (p = {found.p:.2g}, without "
-        f"them {found.exact:.1g}): a stiffness that differs by a few times would not show{left}"
+        f"the recordings agree only within the errors of their meshes (p = {agreed.p:.2g}, without "
+        f"them {agreed.exact:.1g}): a stiffness that differs by a few times would not show{left}"
     )
 
 
 def _contradiction(
-    estimate: Estimate, found: Agreement, names: Sequence[str], is_coarse: bool
+    estimate: Estimate, agreed: Agreement, names: Sequence[str], is_coarse: bool
 ) -> str:
-    odd = found.contradiction
+    odd = agreed.contradiction
     assert odd is not None
     unit = next(each.unit for each in estimate.ranges if each.name == odd.parameter)
     own, others = (f"{value:.4g} {unit}".removesuffix(" -") for value in odd.values)
     against = "the others" if len(names) > 2 else names[1 - odd.recording]
     return (
-        f"warning: {names[odd.recording]} contradicts {against} (p = {found.p:.1g}; "
+        f"warning: {names[odd.recording]} contradicts {against} (p = {agreed.p:.1g}; "
         f"{odd.parameter} {own} by it, {others} by {against}, {odd.errors:.1f} standard errors "
         "apart): another fabric; wrong density, scale, path or markers (the force of a pull tells "
         "stiffness, other motions stiffness over density); or a law that cannot follow all of them "
@@ -226,20 +226,20 @@ def misfits(estimate: Estimate, recordings: Sequence[Recording]) -> Iterator[str
             )
 
 
-def _misfit(found: Misfit) -> str:
-    if found.unit == "m":
+def _misfit(misfit: Misfit) -> str:
+    if misfit.unit == "m":
         return (
-            f"{found.what} is {1e3 * found.off:.0f} mm from its place on the sheet, far more than "
-            "the others: on another cloth, or its place is wrong"
+            f"{misfit.what} is {1e3 * misfit.off:.0f} mm from its place on the sheet, far more "
+            "than the others: on another cloth, or its place is wrong"
         )
-    if found.what == FORCE:
+    if misfit.what == FORCE:
         return (
-            f"the force of this sheet is off by {100 * found.off:.0f} % of what was recorded: its "
+            f"the force of this sheet is off by {100 * misfit.off:.0f} % of what was recorded: its "
             "density [kg/m^2], or the unit of the force [N], may be off"
         )
     return (
-        f"{found.what} is {found.off:.1f} {found.unit} from what was written down: "
-        f"{CAUSES[found.what]} may be off"
+        f"{misfit.what} is {misfit.off:.1f} {misfit.unit} from what was written down: "
+        f"{CAUSES[misfit.what]} may be off"
     )
 
 

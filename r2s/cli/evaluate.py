@@ -58,9 +58,9 @@ class Evaluate:
         card, lines = load_card(self.fabric), []
         judged: dict[str, Judged] = {}
         for recording in open_recordings(self.recordings):
-            found = self._judge(card, recording)
-            judged[recording.info.name] = found
-            lines += found.lines(recording.info.name, self.all)
+            evaluation = self._judge(card, recording)
+            judged[recording.info.name] = evaluation
+            lines += evaluation.lines(recording.info.name, self.all)
         if not judged:
             raise ValueError("no recording: name an NPZ, or a folder that holds some")
         failures = {name: each.failure for name, each in judged.items() if each.failure}

@@ -73,10 +73,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read the output had enough
         sys.stdout = None
     except (ValueError, OSError, ImportError, RuntimeError, MemoryError) as error:
-        told = " ".join(str(error).split())
-        if "RESOURCE_EXHAUSTED" in told:
-            told += " Take fewer frames, shorter motions or a coarser mesh."
-        print(f"r2s: error: {told}", file=sys.stderr)
+        message = " ".join(str(error).split())
+        if "RESOURCE_EXHAUSTED" in message:
+            message += " Take fewer frames, shorter motions or a coarser mesh."
+        print(f"r2s: error: {message}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("r2s: error: interrupted", file=sys.stderr)

@@ -143,9 +143,9 @@ class Sensitivity:
         from r2s.scenarios.standard import SIDE
 
         numbers = parse_numbers(self.motion)
-        found = evaluate_design(self.scenario, self.fabric, numbers, self.noise, self.seed)
-        coarse = mesh_warning(COARSEST, found.fabric, (SIDE, SIDE), self.scenario)
-        print_result(self.json, as_json(found), [*describe(found), *coarse])
+        design = evaluate_design(self.scenario, self.fabric, numbers, self.noise, self.seed)
+        coarse = mesh_warning(COARSEST, design.fabric, (SIDE, SIDE), self.scenario)
+        print_result(self.json, as_json(design), [*describe(design), *coarse])
 
 
 if TYPE_CHECKING:

@@ -30,11 +30,13 @@ class Check:
         from r2s.recordings.checks import check
         from r2s.recordings.open import open_recording
 
-        found = check(open_recording(self.recording))
-        suspicious = sum(each.is_suspicious for each in found)
-        content = {"suspicious": suspicious, "findings": [each._asdict() for each in found]}
-        total = f"{suspicious} of {len(found)} suspicious" if suspicious else "nothing suspicious"
-        print_result(self.json, content, [*(each.describe() for each in found), total])
+        findings = check(open_recording(self.recording))
+        suspicious = sum(each.is_suspicious for each in findings)
+        content = {"suspicious": suspicious, "findings": [each._asdict() for each in findings]}
+        total = (
+            f"{suspicious} of {len(findings)} suspicious" if suspicious else "nothing suspicious"
+        )
+        print_result(self.json, content, [*(each.describe() for each in findings), total])
         return int(suspicious > 0)
 
 

@@ -67,7 +67,7 @@ def draw_estimate(
         _rows_of_frames(figure, recording, sheets, top=1 - 0.5 / height, bottom=bottom)
     top = 1 - (frames + 0.3) / height
     grid: Any = figure.add_gridspec(
-        rows, COLUMNS, left=0.05, right=0.97, top=top, bottom=0.5 / height, hspace=0.9, wspace=0.2
+        rows, COLUMNS, left=0.05, right=0.97, top=top, bottom=0.5 / height, hspace=0.6, wspace=0.2
     )
     mean, precision = space.prior()
     prior_deviation = np.sqrt(np.diag(np.linalg.inv(np.asarray(precision))))
@@ -94,7 +94,7 @@ def _rows_of_frames(
     content = Content.make(recording, next(iter(sheets.values())))
     for row, (name, sheet) in enumerate(sheets.items()):
         clouds = [cloud(recording, int(frame)) for frame in frames]
-        distances = to_surface(clouds, sheet.x[frames], sheet.faces)
+        distances = to_surface(clouds, sheet.x[frames], jnp.asarray(sheet.faces))
         shown = content._replace(cloth=sheet)
         for column, (frame, away) in enumerate(zip(frames, distances, strict=True)):
             axes: Any = figure.add_subplot(grid[row, column], projection="3d")
@@ -132,6 +132,7 @@ def _draw_densities(
     axes.set_xlim(bound.low, bound.high)
     axes.set_ylim(0, None)
     axes.set_yticks([])
+    axes.minorticks_off()
     axes.tick_params(labelsize=7)
     unit = "" if bound.unit == "-" else f" [{bound.unit}]"
     axes.set_title(bound.name + unit, fontsize=9)

@@ -271,7 +271,7 @@ def test_fabrics_of_this_weight_are_known_to_whom_they_help(options, is_alone, k
     assert isinstance(space, InformedSpace) == knows
     place = jnp.full(space.dim, 0.5)
     found = point_estimate("diffcloud", space, place, 0.0, np.zeros(1), np.zeros((1, 1, 1)), 0.0)
-    words = approach(Outcome(method, 0.2, prior, (), (), found, None))
+    words = approach(Outcome(method, 0.2, prior, space, (), (), found, None))
     assert ("prior of measured fabrics" in words) == knows
 
 
