@@ -8,6 +8,7 @@ at hand. Only arrays of numbers are read from the pickle, no code.
 """
 
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,20 @@ from jaxtyping import Float
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import ConvexHull
 
-from r2s.recordings import recording as recordings
-from r2s.recordings.recording import Recording, RecordingInfo, SheetPlacement, corner
+from r2s.recordings.clouds import numbers
+from r2s.recordings.recording import (
+    CORNERS,
+    Recording,
+    RecordingInfo,
+    SheetPlacement,
+    corner,
+    make_recording,
+)
 
 FILE = "final_data.pkl"
 RATE = 30.0  # frames a second
 UPWARDS = np.array([1.0, -1.0, -1.0])  # its z is down
-ARRAYS = {
+ARRAYS: dict[str, tuple[str | int, ...]] = {
     "object_points": ("frame", "point", 3),
     "object_visibilities": ("frame", "point"),
     "object_motions_valid": ("frame", "point"),
@@ -87,7 +95,7 @@ def read_case(
         table_height=float(np.quantile(clouds[0][:, 2], 0.01)),
         verified=None,
     )
-    return recordings.make_recording(clouds, times, corners + (paths - paths[:1]), times, info)
+    return make_recording(clouds, times, corners + (paths - paths[:1]), times, info)
 
 
 class _Arrays(pickle.Unpickler):
@@ -105,24 +113,20 @@ def _arrays(file: Path) -> dict[str, np.ndarray]:
     try:
         with open(file, "rb") as stream:
             stored = _Arrays(stream).load()
+        lacking = ARRAYS.keys() - stored.keys()
     except Exception as error:  # a damaged pickle raises anything
         raise ValueError(f"{file}: no arrays of PhysTwin: {error}") from error
-    if not isinstance(stored, dict):
-        raise ValueError(f"{file}: expected a dictionary of arrays, found {type(stored).__name__}")
-    if lacking := [name for name in ARRAYS if name not in stored]:
+    if lacking:
         raise ValueError(f"{file}: lacks {', '.join(lacking)}, has {', '.join(map(str, stored))}")
-    arrays = {name: np.asarray(stored[name]) for name in ARRAYS}
-    sizes: dict[str, int] = {}
-    for name, shape in ARRAYS.items():
-        fits = arrays[name].ndim == len(shape)
-        for axis, size in zip(shape, arrays[name].shape, strict=False):
-            expected = axis if isinstance(axis, int) else sizes.setdefault(axis, size)
-            fits = fits and size == expected and size > 0
-        if not fits or not np.isfinite(np.asarray(arrays[name], float)).all():
-            raise ValueError(
-                f"{file}: {name}: expected finite numbers {shape}, found {arrays[name].shape}"
-            )
-    return arrays
+    shape = np.shape(stored["object_visibilities"])
+    sizes: dict[Any, int] = dict(zip(("frame", "point"), shape, strict=False))
+    try:
+        return {
+            name: numbers(name, stored[name], *(sizes.get(axis, axis) for axis in shape))
+            for name, shape in ARRAYS.items()
+        }
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
 
 
 def _hands(
@@ -151,13 +155,13 @@ def _around(
     warp, weft = axes[best], across[best]
     low = warp * (hull @ warp).min() + weft * (hull @ weft).min()
     height = float(np.median(cloud[:, 2]))
-    bare = SheetPlacement(
+    sheet = SheetPlacement(
         size=(float(sides[best, 0]), float(sides[best, 1])),
         origin=(float(low[0]), float(low[1]), height),
         warp=(float(warp[0]), float(warp[1]), 0.0),
         weft=(float(weft[0]), float(weft[1]), 0.0),
         pinned=(),
     )
-    places = {name: corner(bare, name) for name in recordings.CORNERS}
-    pinned = [min(places, key=lambda name: float(np.linalg.norm(places[name] - h))) for h in hands]
-    return SheetPlacement(bare.size, bare.origin, bare.warp, bare.weft, tuple(pinned))
+    places = np.array([corner(sheet, name) for name in CORNERS])
+    nearest = np.linalg.norm(places - hands[:, None], axis=-1).argmin(axis=1)
+    return replace(sheet, pinned=tuple(list(CORNERS)[index] for index in nearest))

@@ -33,12 +33,12 @@ from scipy.ndimage import binary_closing, binary_fill_holes, label
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from r2s._util.extras import require
 from r2s.environment.scene import Control, Scene
 from r2s.estimation import cards
 from r2s.materials import presets
 from r2s.materials.fabric import Fabric, constant_laws
 from r2s.mesh.mesh import Mesh, rectangle
+from r2s.recordings.clouds import read_cloud
 from r2s.solvers.implicit.cloth import ImplicitCloth
 
 SPACING, TIMESTEP = 0.02, 0.01  # [m], [s]
@@ -186,7 +186,7 @@ def _lying(cfg: Any) -> Float[np.ndarray, "vertex 3"]:
     """Where the vertices of a garment's mesh lie at first, [m]."""
     pose = np.asarray(_value(cfg, "cloth.init_pose", [0, 0, 0, 1, 0, 0, 0]), float)
     turn = Rotation.from_quat(pose[[4, 5, 6, 3]])  # RGBench writes w first
-    return turn.apply(_read_obj(Path(_value(cfg, "cloth.model_path")))) + pose[:3]
+    return turn.apply(read_cloud(_value(cfg, "cloth.model_path"))) + pose[:3]
 
 
 def _fabric(cfg: Any) -> Fabric:
@@ -196,22 +196,11 @@ def _fabric(cfg: Any) -> Fabric:
     return card.fabric
 
 
-def _read_obj(path: Path) -> Float[np.ndarray, "vertex 3"]:
-    """The vertices of an OBJ file in its order, [m]."""
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such mesh of a garment")
-    trimesh = require("trimesh", "study", "a garment's mesh")
-    loaded = trimesh.load(path, process=False, maintain_order=True, force="mesh")
-    return np.asarray(loaded.vertices, float)
-
-
 def _value(cfg: Any, key: str, *default: Any) -> Any:
     """A value of a configuration whose parts are attributes, as those of OmegaConf are."""
-    found = cfg
+    value = cfg
     for name in key.split("."):
-        found = getattr(found, name, None)
-        if found is None and default:
-            return default[0]
-        if found is None:
-            raise ValueError(f"the configuration lacks {key}")
-    return found
+        value = getattr(value, name, None)
+    if value is None and not default:
+        raise ValueError(f"the configuration lacks {key}")
+    return default[0] if value is None else value
