@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from scipy.cluster.vq import kmeans2
-from scipy.spatial import ConvexHull
 
+from r2s._util.extras import require
 from r2s.recordings.clouds import numbers
 from r2s.recordings.recording import (
     CORNERS,
@@ -36,15 +36,13 @@ ARRAYS: dict[str, tuple[str | int, ...]] = {
     "object_motions_valid": ("frame", "point"),
     "controller_points": ("frame", "controller", 3),
 }
+# names that a pickle of arrays holds, where "core" stands for "_core", too
 ALLOWED = {
-    ("numpy", "ndarray"),
-    ("numpy", "dtype"),
-    ("numpy.core.multiarray", "_reconstruct"),
-    ("numpy._core.multiarray", "_reconstruct"),
-    ("numpy.core.multiarray", "scalar"),
-    ("numpy._core.multiarray", "scalar"),
-    ("numpy.core.numeric", "_frombuffer"),
-    ("numpy._core.numeric", "_frombuffer"),
+    "numpy.ndarray",
+    "numpy.dtype",
+    "numpy.core.multiarray._reconstruct",
+    "numpy.core.multiarray.scalar",
+    "numpy.core.numeric._frombuffer",
 }
 
 
@@ -69,7 +67,7 @@ def read_case(
     arrays = _arrays(folder / FILE)
     points = arrays["object_points"] * UPWARDS
     kept = arrays["object_visibilities"].astype(bool)
-    # whether a point moved plausibly is said of the step to the next frame; of the last, nothing is
+    # a motion is that to the next frame: the last frame has none
     kept[1:] &= arrays["object_motions_valid"].astype(bool)[:-1]
     clouds = [points[frame][mask] for frame, mask in enumerate(kept)]
     for frame, cloud in enumerate(clouds):
@@ -102,7 +100,7 @@ class _Arrays(pickle.Unpickler):
     """Reads arrays, and nothing that could run."""
 
     def find_class(self, module_name: str, global_name: str) -> Any:
-        if (module_name, global_name) not in ALLOWED:
+        if f"{module_name.replace('._core', '.core')}.{global_name}" not in ALLOWED:
             raise pickle.UnpicklingError(f"it holds {module_name}.{global_name}, which is no array")
         return super().find_class(module_name, global_name)
 
@@ -145,21 +143,15 @@ def _around(
     cloud: Float[np.ndarray, "point 3"], hands: Float[np.ndarray, "hand 3"]
 ) -> SheetPlacement:
     """The smallest rectangle around a cloud that lies, held where the hands are."""
-    flat = cloud[:, :2]
-    hull = flat[ConvexHull(flat).vertices]
-    edges = np.diff(np.concatenate([hull, hull[:1]]), axis=0)
-    axes = edges / np.linalg.norm(edges, axis=1, keepdims=True)
-    across = np.stack([-axes[:, 1], axes[:, 0]], axis=1)
-    sides = np.stack([np.ptp(hull @ axes.T, axis=0), np.ptp(hull @ across.T, axis=0)], axis=1)
-    best = int(np.argmin(sides.prod(axis=1)))
-    warp, weft = axes[best], across[best]
-    low = warp * (hull @ warp).min() + weft * (hull @ weft).min()
-    height = float(np.median(cloud[:, 2]))
+    cv2 = require("cv2", "camera", "a sheet around points")
+    centre, sides, degrees = cv2.minAreaRect(cloud[:, :2].astype(np.float32))
+    cosine, sine = float(np.cos(np.radians(degrees))), float(np.sin(np.radians(degrees)))
+    x, y = centre - np.array([[cosine, -sine], [sine, cosine]]) @ sides / 2
     sheet = SheetPlacement(
-        size=(float(sides[best, 0]), float(sides[best, 1])),
-        origin=(float(low[0]), float(low[1]), height),
-        warp=(float(warp[0]), float(warp[1]), 0.0),
-        weft=(float(weft[0]), float(weft[1]), 0.0),
+        size=sides,
+        origin=(float(x), float(y), float(np.median(cloud[:, 2]))),
+        warp=(cosine, sine, 0.0),
+        weft=(-sine, cosine, 0.0),
         pinned=(),
     )
     places = np.array([corner(sheet, name) for name in CORNERS])

@@ -18,6 +18,7 @@ from r2s.recordings.recording import (
     Recording,
     RecordingInfo,
     SheetPlacement,
+    interpolated,
     make_recording,
 )
 
@@ -52,7 +53,7 @@ def read_capture(
     rotation, shift = _extrinsics(folder / "calibration" / "world_to_camera_transform.json")
     times, left = read_arm(folder / "joints" / PATH.format("left"), BASES["left"])
     times_right, right = read_arm(folder / "joints" / PATH.format("right"), BASES["right"])
-    other = np.stack([np.interp(times, times_right, axis) for axis in right.T], axis=1)
+    other = interpolated(times, times_right, right)
     start, end = times[0], min(times[-1], times_right[-1])
     stamps = np.array([stamp for stamp, _ in frames])
     delay = float(np.mean(np.diff(stamps))) if camera_delay is None else camera_delay
@@ -62,12 +63,14 @@ def read_capture(
             f"{folder}: no cloud is from the time of the arms' paths, {start:.3f} to {end:.3f} s; "
             f"clouds are from {stamps[0]:.3f} to {stamps[-1]:.3f} s: are these of one capture?"
         )
-    garment, scenario, trial = _names(folder)
+    match = re.fullmatch(r"(.+)_(fling|fold|grasp)_(.+)", folder.name)
+    if not match:
+        raise ValueError(f"{folder}: expected a name such as white_shirt_grasp_2025-07-19-19-14-58")
     info = RecordingInfo(
         name=folder.name,
-        scenario=scenario,
-        fabric=garment,
-        trial=trial,
+        scenario=match[2],
+        fabric=match[1],
+        trial=match[3],
         source=f"RGBench, {folder}",
         frames_used=(0, len(kept) - 1),
         sheet=sheet,
@@ -124,10 +127,3 @@ def read_arm(file: Path, base: tuple[float, float, float]) -> tuple[np.ndarray, 
     values, lines = read_columns(file, dict.fromkeys(COLUMNS, {"": 1.0}))
     check_increasing(file, lines, values[:, 0])
     return values[:, 0], values[:, 1:] + np.array(base)
-
-
-def _names(folder: Path) -> tuple[str, str, str]:
-    match = re.fullmatch(r"(.+)_(fling|fold|grasp)_(.+)", folder.name)
-    if not match:
-        raise ValueError(f"{folder}: expected a name such as white_shirt_grasp_2025-07-19-19-14-58")
-    return match[1], match[2], match[3]

@@ -60,7 +60,7 @@ class DepthCamera:
         if (np.abs(np.array(self.centre) / size - 0.5) > OFF_CENTRE).any():
             raise ValueError(
                 f"centre {self.centre} is far from the middle of {size[0]} x {size[1]} pixels: are "
-                "these the intrinsics of another resolution? Scale focal_length and centre alike"
+                "these the intrinsics of another resolution? Scale focal_length and centre with it"
             )
         _check_pose(np.array(self.to_world))
 
@@ -136,7 +136,7 @@ def depth_jumps(
 ) -> Bool[np.ndarray, "down across"]:
     """Pixels at which the depth [m] jumps by more than `limit` [m] to a neighbour that has one.
 
-    There a pixel sees two surfaces at once, and cameras report a depth in between.
+    Such a pixel sees two surfaces, and cameras report a depth in between.
     """
     jumps = np.zeros(depth.shape, bool)
     for lines, marked in ((depth, jumps), (depth.T, jumps.T)):  # of two rows, of two columns

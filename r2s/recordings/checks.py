@@ -130,24 +130,17 @@ class Finding(NamedTuple):
 
 
 def _finding(key: str, figure: float, words: str = "", name: str = "") -> Finding:
-    """A figure of one of `CHECKS`; `words`: others than there, such as why it is NaN."""
+    """A figure of one of `CHECKS`; `words`: in place of the usual ones, such as why it is NaN."""
     unit, low, high, usual = CHECKS[key]
     return Finding(name or key, figure, unit, low, high, words or usual, ADVICE[key])
 
 
 class _Frames(NamedTuple):
-    """What checks look at.
-
-    - `thinned`: points of each frame, [m]. `clouds`: those that may be of the sheet (`_pieces`).
-    - `grippers`: where they are in each frame, [m].
-    - `still`: frames before the grippers move; the first one at least.
-    """
-
     recording: Recording
-    thinned: list[Points]
-    clouds: list[Points]
-    grippers: Float[np.ndarray, "frame gripper 3"]
-    still: list[int]
+    thinned: list[Points]  # of each frame, [m]
+    clouds: list[Points]  # those that may be of the sheet (`_pieces`)
+    grippers: Float[np.ndarray, "frame gripper 3"]  # [m]
+    still: list[int]  # frames before the grippers move; the first one at least
 
 
 def check(recording: Recording) -> list[Finding]:
@@ -166,9 +159,8 @@ def check(recording: Recording) -> list[Finding]:
     return sorted(findings, key=lambda finding: not finding.is_suspicious)
 
 
-def _lies(recording: Recording) -> bool:
-    """Whether the sheet lies at rest, rather than hangs."""
-    sheet = recording.info.sheet
+def _lies(sheet: SheetPlacement) -> bool:
+    """Whether a sheet lies at rest, rather than hangs."""
     return bool(abs(np.cross(sheet.warp, sheet.weft)[2]) > 0.9)
 
 
@@ -192,7 +184,7 @@ def _pieces(points: Points) -> Float[np.ndarray, "kept 3"]:
 def _check_sheet(frames: _Frames) -> list[Finding]:
     """Scale, gravity and stretch, as far as the recording shows them."""
     recording, first = frames.recording, frames.clouds[frames.still[0]]
-    if _lies(recording):
+    if _lies(recording.info.sheet):
         findings = _lying(recording, first)
     else:  # at rest it hangs below its grippers
         away = first.mean(axis=0) - frames.grippers[0].mean(axis=0)
@@ -257,8 +249,7 @@ def _extents(frames: _Frames) -> list[Finding]:
 
 def _reach(sheet: SheetPlacement, held: str) -> float:
     """How far the farthest corner is from a corner that is held, [m]."""
-    away = [np.linalg.norm(corner(sheet, name) - corner(sheet, held)) for name in CORNERS]
-    return float(max(away))
+    return max(float(np.linalg.norm(corner(sheet, c) - corner(sheet, held))) for c in CORNERS)
 
 
 def _marker_distances(recording: Recording) -> Finding:
@@ -282,8 +273,10 @@ def _check_clock(frames: _Frames) -> list[Finding]:
     """Intervals, rate, the grippers' speed, and how late the top of the cloud follows them."""
     recording = frames.recording
     gaps = np.diff(np.asarray(recording.times, np.float64))
-    middle = float(np.median(gaps)) if len(gaps) else np.nan
-    uneven = float(np.abs(gaps / middle - 1).max()) if len(gaps) else np.nan
+    middle, uneven = np.nan, np.nan
+    if len(gaps):
+        middle = float(np.median(gaps))
+        uneven = float(np.abs(gaps / middle - 1).max())
     path, knots = np.asarray(recording.gripper_path), np.asarray(recording.gripper_times)
     moved = np.linalg.norm(np.diff(path, axis=0), axis=-1).max(axis=1)
     lag, rate = _lag(frames)
@@ -303,7 +296,7 @@ def _lag(frames: _Frames) -> tuple[float, float]:
     NaN where no axis moves, or the best lag is the longest that is tried.
     """
     recording = frames.recording
-    lowest = recording.info.table_height + UP if _lies(recording) else -INF
+    lowest = recording.info.table_height + UP if _lies(recording.info.sheet) else -INF
     tops = {}
     for frame in range(recording.info.frames_used[0], recording.info.frames_used[1] + 1):
         points = frames.clouds[frame]
@@ -365,10 +358,14 @@ def _check_clouds(frames: _Frames) -> list[Finding]:
     """Number of points, outliers, faces of a box that cut the clouds, distance of the grippers."""
     info = frames.recording.info
     used = slice(info.frames_used[0], info.frames_used[1] + 1)
-    clouds, grippers = frames.thinned[used], frames.grippers[used]
-    pairs = list(zip(clouds, grippers, strict=True))
-    near = [np.max(KDTree(points).query(held)[0]) for points, held in pairs]
-    stray = [_stray_share(info.sheet, *pair) for pair in pairs]
+    clouds = frames.thinned[used]
+    farthest = BEYOND * np.array([_reach(info.sheet, name) for name in info.sheet.pinned])
+    stray, near = [], []
+    for points, grippers in zip(clouds, frames.grippers[used], strict=True):
+        away = np.linalg.norm(points[:, None] - grippers, axis=-1)
+        far = (away > farthest).any(axis=1)  # or alone
+        stray.append(np.mean(far | outliers(points, NEIGHBOURS, DEVIATIONS)))
+        near.append(away.min(axis=0).max())
     findings = [
         _finding("points", float(np.median([len(points) for points in clouds]))),
         _finding("outliers", float(np.median(stray))),
@@ -382,18 +379,6 @@ def _check_clouds(frames: _Frames) -> list[Finding]:
             words = f"share of frames whose clouds are cut {name} {letter} = {place:.3f} m"
             findings.append(_finding("crop", share, words, f"crop {letter}"))
     return findings
-
-
-def _stray_share(
-    sheet: SheetPlacement,
-    points: Float[np.ndarray, "point 3"],
-    held: Float[np.ndarray, "gripper 3"],
-) -> float:
-    """Share of points that are alone, or farther from a gripper than the sheet reaches."""
-    away = np.linalg.norm(points[:, None] - held, axis=-1)
-    farthest = [BEYOND * _reach(sheet, name) for name in sheet.pinned]
-    far = (away > farthest).any(axis=1)
-    return float(np.mean(far | outliers(points, NEIGHBOURS, DEVIATIONS)))
 
 
 def _cut(clouds: list[np.ndarray], axis: int, side: int) -> tuple[float, float]:

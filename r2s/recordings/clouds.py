@@ -91,7 +91,7 @@ def read_cloud(path: Path | str) -> Float[np.ndarray, "point 3"]:
     columns parted by blanks or commas, # starts a comment); pcd (needs pypcd4).
 
     Raises FileNotFoundError, ImportError (names the extra to install), or a ValueError that names
-    the file: unknown suffix, unreadable content, wrong shape, no points, non-finite points.
+    the file and what is wrong with it.
     """
     values = read_values(path)
     try:
@@ -101,10 +101,7 @@ def read_cloud(path: Path | str) -> Float[np.ndarray, "point 3"]:
 
 
 def read_values(path: Path | str, dtype: type | None = np.float64) -> Num[np.ndarray, "..."]:
-    """The numbers of a file as a type (None: its own), with neither shape nor values checked.
-
-    Raises as `read_cloud`, less what that says about shape and values.
-    """
+    """The numbers of a file as a type (None: its own), unchecked; raises as `read_cloud`."""
     path = Path(path)
     reader = READERS.get(path.suffix.lower())
     if reader is None:
@@ -175,7 +172,7 @@ def _read_obj(path: Path) -> np.ndarray:
 
 
 def _read_xyz(path: Path) -> np.ndarray:
-    with warnings.catch_warnings(action="ignore"):  # that there are no points is said elsewhere
+    with warnings.catch_warnings(action="ignore"):  # an empty file is an error of its own
         return np.loadtxt(path.read_text().replace(",", " ").splitlines(), ndmin=2)
 
 
@@ -259,10 +256,7 @@ def inside(points: Float[np.ndarray, "point 3"], how: Cleaning) -> Bool[np.ndarr
 def outliers(
     points: Float[np.ndarray, "point 3"], neighbours: int, deviations: float
 ) -> Bool[np.ndarray, " point"]:
-    """Which points are much farther from their nearest neighbours than points are on average.
-
-    None where there are no more points than `neighbours`; thin the cloud first.
-    """
+    """Which points of a thinned cloud are much farther from their neighbours than the average."""
     if neighbours == 0 or len(points) <= neighbours:
         return np.zeros(len(points), bool)
     apart = KDTree(points).query(points, neighbours + 1)[0][:, 1:].mean(axis=1)

@@ -49,8 +49,8 @@ class Transform:
 class Gripper:
     """The commanded path: `file` (knot, 3) or (knot, gripper, 3), `rate` knots per second [Hz].
 
-    `offset` [m] leads, in the world, from the commanded tool point to the cloth that is held;
-    `note` says how it was measured.
+    `offset` [m] is the place of the cloth that is held, in the world, less the commanded tool
+    point; `note` says how it was measured.
     """
 
     file: str
@@ -65,7 +65,7 @@ class Gripper:
 
 @dataclass(frozen=True)
 class Session:
-    """Recordings that were calibrated alike, and what moves their clouds into the world.
+    """Recordings of one calibration, and what moves their clouds into the world.
 
     - `recordings`: a regex for the whole folder name.
     - `shift`: is added to their points in the world, [m]; `note` says how it was found.
@@ -197,7 +197,7 @@ def read_recordings(
 
 
 def sources(folder: Path | str, manifest: Manifest, name: str) -> list[Path]:
-    """The files that a recording is read from, as far as they are there, sorted.
+    """The files that a recording is read from, as far as they exist, sorted.
 
     Its manifest, the gripper's path, cameras.json, and all in its folder but colour images.
     """

@@ -103,9 +103,9 @@ def convert(
 
     `folder` holds recordings, or is one of them; `only` is a regular expression for names. Beside
     each NPZ lies NAME.sha256, of the files that it was made from: one that they still have is up to
-    date, and skipped unless `force`. An NPZ is whole or not there, so a run that was killed goes on
-    where it was. Raises ValueError or OSError: no such recordings; and, after all the others were
-    converted, one for all recordings that could not be read, with file and frame.
+    date, and skipped unless `force`. A run that was killed continues where it was. Raises
+    ValueError or OSError: no such recordings; and, after all the others were converted, one for all
+    recordings that could not be read, with file and frame.
     """
     root, names = _names(Path(folder), only)
     manifest, to = manifest_for(root), Path(to)

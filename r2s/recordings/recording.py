@@ -254,10 +254,18 @@ def clouds_are_markers(recording: Recording) -> bool:
 def gripper_positions(recording: Recording) -> Float[np.ndarray, "frame gripper 3"]:
     """Where the grippers are at the frames [m]: linear between knots, at rest before and after."""
     arrays = recording.times, recording.gripper_times, recording.gripper_path
-    times, knots, path = (np.asarray(array, np.float64) for array in arrays)
-    columns = path.reshape(len(path), -1).T
-    positions = np.stack([np.interp(times, knots, column) for column in columns], axis=1)
-    return positions.reshape(-1, *path.shape[1:])
+    return interpolated(*(np.asarray(array, np.float64) for array in arrays))
+
+
+def interpolated(
+    times: Float[np.ndarray, " time"],
+    knots: Float[np.ndarray, " knot"],
+    values: Float[np.ndarray, "knot ..."],
+) -> Float[np.ndarray, "time ..."]:
+    """Values at knots [s], at other times [s]: linear between knots, constant before and after."""
+    columns = values.reshape(len(values), -1).T
+    between = np.stack([np.interp(times, knots, column) for column in columns], axis=1)
+    return between.reshape(-1, *values.shape[1:])
 
 
 def check_covered(clock: Float[np.ndarray, " sample"], times: Float[np.ndarray, " frame"]) -> None:

@@ -13,12 +13,14 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from r2s._util.files import read_npz
+from r2s._util.units import positive
 from r2s.recordings.clouds import numbers
 from r2s.recordings.recording import (
     MeasurementUncertainty,
     Recording,
     RecordingInfo,
     SheetPlacement,
+    interpolated,
     make_recording,
 )
 
@@ -42,7 +44,7 @@ class Bar:
     - `place_deviation`: of the bar in the frame of the tool, [m].
     - `tracker_error`: deviation of a coordinate [m] at rest, of each row from the bar down.
 
-    Raises ValueError for ends that are one, and lengths or deviations that are not positive.
+    Raises ValueError for lengths or deviations that are not positive.
     """
 
     ends: tuple[Vector, Vector]
@@ -54,11 +56,9 @@ class Bar:
     note: str
 
     def __post_init__(self) -> None:
-        if not self.length > 0:
-            raise ValueError(f"the ends of the bar must differ, found {self.ends}")
-        lengths = (self.drop, self.lag_deviation, self.place_deviation, *self.tracker_error)
-        if not min(lengths) > 0:
-            raise ValueError(f"drop and deviations must be positive, found {lengths}")
+        positive("m", length=self.length, drop=self.drop, place_deviation=self.place_deviation)
+        positive("s", lag_deviation=self.lag_deviation)
+        positive("m", tracker_error=min(self.tracker_error))
 
     @property
     def length(self) -> float:
@@ -141,7 +141,7 @@ def _recording(
     if len(times) < 2:
         raise ValueError(f"{len(times)} frames every {INTERVAL} s: the duration must be longer")
     shape = arrays["points"].shape[1:3]
-    markers = _resampled(times, tracked_at, arrays["points"]).reshape(len(times), -1, 3)
+    markers = interpolated(times, tracked_at, arrays["points"]).reshape(len(times), -1, 3)
     sides = (np.linspace(0, *side) for side in zip((bar.length, bar.drop), shape, strict=True))
     place = bar.place_deviation
     info = RecordingInfo(
@@ -163,7 +163,7 @@ def _recording(
         path,
         clock - start,
         info,
-        markers=markers,
+        markers=markers,  # NaN beside frames in which the tracker lost them
         marker_places=np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2),
     )
 
@@ -180,19 +180,6 @@ def _first_gap(name: str, tracked_at: np.ndarray, points: np.ndarray) -> float:
         )
         return float(tracked[gap])
     return float(tracked[-1])
-
-
-def _resampled(
-    times: Float[np.ndarray, " frame"],
-    tracked_at: Float[np.ndarray, " tracked"],
-    points: Float[np.ndarray, "tracked along down 3"],
-) -> Float[np.ndarray, "frame along down 3"]:
-    """Points at other times, linear between the tracker's frames; NaN beside those it lost."""
-    after = np.clip(np.searchsorted(tracked_at, times, side="right"), 1, len(tracked_at) - 1)
-    gap = tracked_at[after] - tracked_at[after - 1]
-    share = ((times - tracked_at[after - 1]) / np.maximum(gap, 1e-9))[:, None, None, None]
-    between = (1 - share) * points[after - 1] + share * points[after]
-    return np.where(share == 0, points[after - 1], between)
 
 
 def _sheet(ends: Float[np.ndarray, "2 3"], bar: Bar) -> SheetPlacement:

@@ -87,8 +87,7 @@ class Views:
       outlier filter erodes and in which nothing is asked of a cloud, [m].
     - `hidden`: distance from a gripper within which the robot's mask hides the sheet, [m].
 
-    Raises ValueError for no camera, a workspace with no room between its borders, and lengths that
-    are negative.
+    Raises ValueError for no camera, and where there is no room between borders.
     """
 
     cameras: tuple[DepthCamera, ...]

@@ -72,7 +72,7 @@ def test_a_stretch_becomes_a_recording() -> None:
     assert recording.markers_seen is not None and recording.force is not None
     assert int(recording.markers_seen.sum()) == 60 * 4 - 1
     at_frame = np.interp(TIMES, np.asarray(recording.force_times), np.asarray(recording.force))
-    np.testing.assert_allclose(at_frame, stiffening(pulled(TIMES), 1.5), atol=0.7)
+    np.testing.assert_allclose(at_frame, stiffening(pulled(TIMES), 1.5), atol=0.3)
 
 
 def pulled(times: np.ndarray) -> np.ndarray:

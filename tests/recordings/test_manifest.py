@@ -95,19 +95,14 @@ def folder(tmp_path: Path) -> Path:
         ("cloud scale", None, "cloud: scale is unknown: give metres per unit"),
         ("cloud scale", 0, "scale must be positive .m per unit., found 0"),
         ("cloud scale", np.nan, "scale: expected a finite number"),
-        ("cloud scale", True, "scale: expected a finite number"),
         ("cloud scale", "mm", "scale: expected a finite number.*'mm'"),
         ("cloud rotation", [[1, 0, 0], [0, 1, 0], [0, 0, 1.01]], "orthonormal"),
         ("cloud rotation", [[0, 1, 0], [1, 0, 0], [0, 0, 1]], "determinant"),
         ("cloud rotation", [[1, 0], [0, 1]], "rotation: expected 3 entries"),
-        ("cloud translation", 0.1, "translation: expected a list"),
         ("frame_rate", 0, "frame_rate must be positive .Hz., found 0"),
-        ("gripper rate", -10, "gripper: rate must be positive"),
-        ("table_height", np.inf, "table_height: expected a finite number"),
         ("sheet size", [0.3, -0.2], "sheet: .*sides must be positive"),
         ("sheet held", ["left"], "unknown corner 'left'"),
         ("frames_used", [2, 1], "frames_used must be"),
-        ("frames_used", [0, 1.5], r"frames_used\[1\]: expected int"),
         ("drop_repeats", 1, "drop_repeats: expected bool"),
         ("folder", "pull_(?P<fabric>.*)", "lacks the group"),
         ("folder", "pull_(", "is no regex"),
@@ -136,8 +131,13 @@ def test_a_bad_manifest_is_named(tmp_path: Path, text: str, words: str) -> None:
         read_manifest(tmp_path / "nowhere.json")
 
 
-def test_a_recording_is_in_metres_and_seconds(folder: Path) -> None:
-    recording = read_recording(folder, read(folder), "pull_tan2")
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_recording_is_in_metres_and_seconds(folder: Path, first: int) -> None:
+    for frame in reversed(range(3)):  # numbered from the first
+        file = folder / "pull_tan2" / f"{frame:03d}.npy"
+        file.rename(file.with_name(f"{frame + first:03d}.npy"))
+    manifest = read(folder, changed("scenarios", "pull", "first_frame", value=first))
+    recording = read_recording(folder, manifest, "pull_tan2")
     info = recording.info
     assert (info.scenario, info.fabric, info.trial, info.verified) == ("pull", "tan", "2", None)
     # The turn takes x to -y and y to x; half a metre a unit; one of the two equal points is kept.
@@ -150,7 +150,6 @@ def test_a_recording_is_in_metres_and_seconds(folder: Path) -> None:
 def test_discovery_takes_every_folder_that_fits(folder: Path) -> None:
     manifest = read(folder)
     assert read_recordings(folder, manifest) == ["pull_tan", "pull_tan2"]
-    assert read_recordings(folder, manifest, ["pull"]) == ["pull_tan", "pull_tan2"]
     assert read_recordings(folder, manifest, []) == []
     with pytest.raises(ValueError, match="unknown scenario 'push', known: .'pull'"):
         read_recordings(folder, manifest, ["push"])
@@ -211,14 +210,6 @@ def test_a_bad_gripper_path_is_an_error(folder: Path, path: np.ndarray | None, w
         np.save(folder / "gripper.npy", path)
     with pytest.raises((ValueError, FileNotFoundError), match=words):
         read_recording(folder, read(folder), "pull_tan")
-
-
-def test_frames_may_be_numbered_from_one(folder: Path) -> None:
-    (folder / "pull_tan" / "000.npy").rename(folder / "pull_tan" / "003.npy")
-    recording = read_recording(
-        folder, read(folder, changed("scenarios", "pull", "first_frame", value=1)), "pull_tan"
-    )
-    np.testing.assert_allclose(recording.times, [-0.01, 0.04, 0.09], rtol=1e-6)
 
 
 def test_the_sheet_of_diffcloud_lies_as_a_diamond_of_the_size_that_was_measured() -> None:

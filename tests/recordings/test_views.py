@@ -174,10 +174,10 @@ def test_a_sheet_that_is_larger_than_its_clouds_is_found_by_what_should_have_bee
     )
     blind = dataclasses.replace(cut, expected=None)
     one_way = [
-        float(normal_equations.loss_of(each, seen))
-        for each in (dataclasses.replace(problem, expected=None), blind)
+        float(normal_equations.loss_of(part, seen))
+        for part in (dataclasses.replace(problem, expected=None), blind)
     ]
-    both = [float(normal_equations.loss_of(each, seen)) for each in (problem, cut)]
+    both = [float(normal_equations.loss_of(part, seen)) for part in (problem, cut)]
     assert one_way[1] == pytest.approx(one_way[0], rel=0.5)  # what is left lies on the sheet
     assert both[0] < 3 * one_way[0] and both[1] > 20 * both[0]
 
