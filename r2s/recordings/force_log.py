@@ -5,7 +5,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -18,17 +17,12 @@ SHARES = {"-": 1.0, "%": 1e-2}
 GRAMS = ("g", "kg", "grams", "kilograms")  # of mass: no force
 
 
-class Columns(NamedTuple):
-    """- `values`: in SI, column by column in the order in which they were asked for.
-    - `lines`: of the file, where each sample stands.
-    """
+def read_columns(
+    path: Path | str, columns: Mapping[str, Mapping[str, float]]
+) -> tuple[Float[np.ndarray, "sample column"], list[int]]:
+    """Columns of a CSV with a header, in SI and in the order asked for, and the samples' lines.
 
-    values: Float[np.ndarray, "sample column"]
-    lines: tuple[int, ...]
-
-
-def read_columns(path: Path | str, columns: Mapping[str, Mapping[str, float]]) -> Columns:
-    """Read some columns of a CSV with a header, separated by commas, semicolons or tabs.
+    Commas, semicolons or tabs separate them.
 
     `columns`: their names and possible units. The header says which, as in "time_s", "Force [N]" or
     "force (mN)"; "" stands for none. Other columns, blank lines and comments (#) are skipped.
@@ -50,7 +44,7 @@ def read_columns(path: Path | str, columns: Mapping[str, Mapping[str, float]]) -
         rows.append([number_in(path, number, cells[index]) * unit for index, unit in places])
     if len(rows) < 2:
         raise ValueError(f"{path}: expected two samples or more, found {len(rows)}")
-    return Columns(np.array(rows), tuple(number for number, _ in lines[1:]))
+    return np.array(rows), [number for number, _ in lines[1:]]
 
 
 def header_of(path: Path | str) -> list[str]:
@@ -93,11 +87,14 @@ def _column(
         )
     index, unit = matches[0]
     if unit not in units:
-        mass = unit in GRAMS and "N" in units
-        hint = ": a mass is no force, write gf where a scale shows grams" if mass else ""
+        if unit in GRAMS and "N" in units:
+            raise ValueError(
+                f"{path}: {header[index]!r} is a mass: a force is in N, or in gf where a scale "
+                "shows grams (1 gf = 9.80665 mN): name the column force_gf if it does"
+            )
         raise ValueError(
             f"{path}: the unit of {header[index]!r} is not known: write one of {', '.join(units)} "
-            f"into the header, as in '{name} [{next(iter(units))}]'{hint}"
+            f"into the header, as in '{name} [{next(iter(units))}]'"
         )
     return index, units[unit]
 
