@@ -33,8 +33,7 @@ class DepthCamera:
     - `masks`: is there a folder of masks (else every pixel may be the fabric)?
     - `may_miss`: may the fabric be out of this camera's view in some frames?
 
-    Depth is the distance along z, not along the ray. Raises ValueError for intrinsics of another
-    resolution, a pose that is no rotation and shift, and lengths that are not positive.
+    Depth is the distance along z, not along the ray.
     """
 
     resolution: tuple[int, int]
@@ -93,10 +92,7 @@ def rows_of(pose: Float[np.ndarray, "4 4"]) -> Any:
 
 
 def look_at(position: tuple[float, ...], target: tuple[float, ...]) -> tuple[Row, Row, Row, Row]:
-    """`to_world` of a camera at a position that looks at a target [m]; up in its image is up.
-
-    Raises ValueError when it looks straight up or down.
-    """
+    """`to_world` of a camera that looks at a target [m], not straight up or down; up stays up."""
     forward = np.subtract(target, position)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     if np.linalg.norm(right) < 1e-9:

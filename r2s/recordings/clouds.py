@@ -17,7 +17,7 @@ from r2s._util.extras import require
 def numbers(what: str, values: Any, *shape: int | str) -> Float[np.ndarray, "..."]:
     """`values` as float64 of a shape, in which a name stands for any size.
 
-    Raises ValueError that begins with `what`: no numbers, another shape, none, some not finite.
+    Raises ValueError that begins with `what`, also where there are none, or some are not finite.
     """
     try:
         array = np.asarray(values, np.float64)
@@ -46,8 +46,7 @@ def find_numbered(
     """The files of a folder by the last number in their names (`000.npy`, `frame_12.npy`).
 
     All must have one of the `suffixes`; others are skipped. `first`: the number that the first file
-    must have. Raises FileNotFoundError (no such folder, no such file) or ValueError (mixed formats,
-    two files of one number, a number is missing).
+    must have. Raises FileNotFoundError or ValueError that names the folder and the frame.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -210,8 +209,6 @@ class Cleaning:
     - `neighbours`, `deviations`: a point is an outlier where its mean distance from this many
       neighbours is above the mean of all by this many standard deviations; 0 neighbours: none is.
     - `max_points`, `seed`: at most so many points a frame are drawn at random; 0: all.
-
-    Raises ValueError for a box without inside and for numbers that are negative.
     """
 
     workspace: tuple[Corner, Corner]

@@ -52,8 +52,7 @@ class Swings(Dataset):
 def known_datasets(folder: Path | str | None = None) -> dict[str, Dataset | Manifest]:
     """The data sets whose manifests lie in `folder` (None: that of the project), by name.
 
-    Raises FileNotFoundError when there is no such folder, ValueError as `read_dataset`, or when
-    two manifests have one name.
+    Raises FileNotFoundError, or ValueError as `read_dataset` and for a repeated name.
     """
     folder = default_manifest().parent if folder is None else Path(folder)
     if not folder.is_dir():
@@ -91,8 +90,7 @@ def known_bar() -> Bar:
 def fetch(name: str, folder: Path | str, manifests: Path | str | None = None) -> Iterator[str]:
     """Check a data set in a folder against its manifest; says what it finds, line by line.
 
-    Raises ValueError, after all else was done: an unknown name, files that are corrupt or missing;
-    the error then says how to get them, and where to put them.
+    At last raises ValueError for files that are corrupt or missing, which says how to get them.
     """
     known = known_datasets(manifests)
     if name not in known:

@@ -20,9 +20,7 @@ GRAMS = ("g", "kg", "grams", "kilograms")  # of mass: no force
 def read_columns(
     path: Path | str, columns: Mapping[str, Mapping[str, float]]
 ) -> tuple[Float[np.ndarray, "sample column"], list[int]]:
-    """Columns of a CSV with a header, in SI and in the order asked for, and the samples' lines.
-
-    Commas, semicolons or tabs separate them.
+    """Columns of a CSV (of commas, semicolons or tabs) in SI, and the lines of the samples.
 
     `columns`: their names and possible units. The header says which, as in "time_s", "Force [N]" or
     "force (mN)"; "" stands for none. Other columns, blank lines and comments (#) are skipped.
@@ -135,10 +133,9 @@ class ForceLog:
 
 
 def read_force_log(path: Path | str, time: str = "time", force: str = "force") -> ForceLog:
-    """Read the columns `time` and `force` of a CSV, as `read_columns`.
+    """Read the columns `time` (s, ms, us) and `force` (N, mN, cN, kN, gf, kgf) of a CSV.
 
-    Their units: seconds (s, ms, us), newtons (N, mN, cN, kN, gf, kgf). Raises also ValueError for
-    times that do not increase.
+    Raises as `read_columns`, and ValueError for times that do not increase.
     """
     values, lines = read_columns(path, {time: SECONDS, force: NEWTONS})
     check_increasing(path, lines, values[:, 0])
@@ -157,8 +154,7 @@ def estimate_offset(
     force is fitted by a cubic in the displacement, since fabrics stiffen, at offsets up to
     `longest` [s] from where both records begin together. The pull must begin and end in the video.
 
-    Raises ValueError when nothing moves, when no offset explains 90 % of the force's variance, or
-    when the best is at the end of the range.
+    Raises ValueError when no offset explains 90 % of the force's variance.
     """
     if displacement.shape != times.shape or not np.isfinite(displacement).all():
         raise ValueError("give one finite displacement [m] for each frame's time")

@@ -17,8 +17,7 @@ IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 def read_grey(path: Path | str) -> Iterator[UInt8[np.ndarray, "height width"]]:
     """The frames of a video, or of a folder of numbered images (`find_numbered`), as grey images.
 
-    Raises FileNotFoundError, ImportError (names the extra), or a ValueError that names the file
-    and the frame: no video, no images, a damaged one or one of another size than the first.
+    Raises FileNotFoundError, ImportError (names the extra), or ValueError (file and frame).
     """
     path = Path(path)
     frames = _images(path) if path.is_dir() else _video(path)
@@ -94,8 +93,7 @@ def read_depth(
     """A depth image in metres; 0 where the camera measured nothing (0, NaN or infinity in files).
 
     16-bit PNG or NPY, `scale` metres per unit, `resolution` pixels (across, down). Raises
-    FileNotFoundError or ValueError that names the file: truncated, of another kind or size,
-    negative depths, no depth at all, depths that are no metres.
+    FileNotFoundError, or ValueError that names the file.
     """
     units = read_values(path, None) if path.suffix.lower() == ".npy" else read_png(path)
     if units.ndim != 2 or units.dtype == np.uint8:
@@ -127,7 +125,7 @@ def read_depth(
 def read_mask(path: Path, resolution: tuple[int, int]) -> Bool[np.ndarray, "down across"]:
     """Which pixels a mask marks: those that are not zero, in any channel but opacity.
 
-    Raises FileNotFoundError or ValueError that names the file: truncated, of another size.
+    Raises as `read_depth`.
     """
     image = read_png(path)
     _check_size(path, image, resolution, "make the masks in the pixels of the depth images")
@@ -141,10 +139,7 @@ def encode_png(image: Num[np.ndarray, "down across *channel"]) -> bytes:
 
 
 def write_depth(path: Path, depth: Float[np.ndarray, "down across"], scale: float) -> None:
-    """Write a depth image [m] as a 16-bit PNG in units of `scale` [m].
-
-    Raises ValueError for a depth that does not fit into 16 bits.
-    """
+    """Write a depth image [m] as a 16-bit PNG in units of `scale` [m]; ValueError: does not fit."""
     units = np.rint(depth / scale)
     if units.max() > DEEPEST:
         raise ValueError(f"{depth.max():g} m does not fit into 16 bits of {scale:g} m")

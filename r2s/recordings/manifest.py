@@ -218,8 +218,7 @@ def read_recording(
     `info.verified`: True if all its files have the values listed in the manifest, None if some are
     not listed; False, with a warning, if a listed one differs or is missing.
 
-    Raises FileNotFoundError or a ValueError that names the file or folder: a name that fits no
-    scenario or several, files that are missing, damaged, empty or not finite.
+    Raises FileNotFoundError or a ValueError that names the file or folder.
     """
     folder = Path(folder)
     scenario_name, scenario, match = _scenario_of(manifest, name)

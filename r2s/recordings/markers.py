@@ -42,9 +42,8 @@ def plane_homography(
 ) -> Float[np.ndarray, "3 3"]:
     """The map from an image to the plane of the table, by least squares over known points.
 
-    `pixels` [px] and `metres` [m] are the same points. Raises ValueError when there are fewer than
-    four, when three of four lie on a line, or when it misses a point by more than `tolerance` [m]:
-    then two are swapped, one is misread, or the lens distorts.
+    `pixels` [px] and `metres` [m] are the same points, four or more. Raises ValueError when they do
+    not determine it, or when it misses one by more than `tolerance` [m].
     """
     cv2 = require("cv2", "camera", "the plane of the table")
     if len(pixels) < 4 or len(pixels) != len(metres):
@@ -112,8 +111,7 @@ def track(
     - `dark`: whether the dots are darker than the cloth.
     - `origin`: place of the first marker in the first frame, [px]; see `find_grid`.
 
-    Raises ValueError that names the frame: no frames, fewer dots than the grid has in the first
-    one, fewer than half of them in a later one.
+    Raises ValueError that names the frame, where the grid or half of its markers is not found.
     """
     pixels, seen = [], []
     state: _State | None = None
@@ -189,8 +187,7 @@ def find_grid(
 
     The grid may be turned and seen at an angle, but not mirrored. Its first marker is the corner
     nearest to `origin` [px], or else the one from which columns run most to the right and rows most
-    downward. Raises ValueError when the grid is not there as a whole, when the dots continue beside
-    it, or when rows and columns from `origin` have the other's length.
+    downward. Raises ValueError when the dots make no such grid, or a larger one.
     """
     grid = _circles_grid(places, shape)
     along, down = places[grid[0, -1]] - places[grid[0, 0]], places[grid[-1, 0]] - places[grid[0, 0]]

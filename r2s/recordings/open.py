@@ -58,10 +58,7 @@ def open_recording(path: Path | str) -> Recording:
 
 
 def open_recordings(paths: Sequence[Path]) -> Iterator[Recording]:
-    """Read recordings: of NPZ files, of folders of them, or of folders of clouds or images.
-
-    Raises as `open_recording`.
-    """
+    """Read recordings of NPZ files, folders of them, or folders of frames (`open_recording`)."""
     for path in paths:
         files = sorted(path.glob("*.npz"))
         if not files or (path / "manifest.json").exists():
@@ -78,8 +75,7 @@ def load_trajectory(path: Path | str) -> SimulatedCloth:
     """Read what `save_trajectory` wrote: an NPZ with `x` and `faces`.
 
     Positions that are not finite are accepted: a run that diverged is read as far as it went.
-    Raises FileNotFoundError, or a ValueError that names the file: it is damaged, an array is
-    missing or of another shape, or a face has a vertex that does not exist.
+    Raises FileNotFoundError, or a ValueError that names the file and what is wrong with it.
     """
     try:
         arrays = read_npz(path, "x", "faces")

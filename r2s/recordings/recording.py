@@ -30,8 +30,7 @@ class SheetPlacement:
     """Where the rectangular sheet lies at rest, in metres, z up.
 
     `pinned` names the corner of each gripper: "origin", "warp" (at the end of the warp side),
-    "weft" or "opposite". Raises ValueError for sides that are not positive, directions that are not
-    orthonormal, and unknown corners.
+    "weft" or "opposite".
     """
 
     size: tuple[float, float]  # [m], lengths of the warp and the weft side
@@ -70,8 +69,6 @@ class MeasurementUncertainty:
     - `size`: of the sheet's side length, relative.
     - `air`: of the force of the air at its speed (its drag coefficient), relative; 0: exact, but
       for a wind that blows, whose force an estimate always doubts.
-
-    Raises ValueError for one that is negative or not finite.
     """
 
     shift: tuple[float, float, float]
@@ -95,9 +92,6 @@ class RecordingInfo:
       cameras lag behind the grippers. `set_time_offset` changes it.
     - `doubt`: standard deviations of all this; `views`: the cameras; None: unknown.
     - `angle`: from the pull of a stretching to the warp: 45 on the bias, 90 along the weft.
-
-    Raises ValueError for a wind, an offset or an angle that is not finite, and for an angle of
-    another motion.
     """
 
     name: str
@@ -174,9 +168,8 @@ def make_recording(
     - `markers`: (frame, marker, 3), [m]. `markers_seen`: (frame, marker); None: where finite.
     - `marker_places`: (marker, 2), where they are on the sheet along warp and weft, [m].
 
-    Raises ValueError that names the recording, and the frame where there is one: clouds that are
-    empty or not finite, times that do not increase, a path of other grippers than
-    `info.sheet.pinned` or that ends before the last frame, and arrays that do not belong together.
+    Raises ValueError that names the recording, and the frame where there is one: arrays that are
+    empty or not finite, do not increase, end too early, or do not belong together.
     """
     try:
         markers, markers_seen = _check_markers(markers, markers_seen)
@@ -322,8 +315,7 @@ def save(recording: Recording, path: Path | str) -> None:
 def load(path: Path | str) -> Recording:
     """Read what `save` wrote, in this version of the format or an earlier one.
 
-    Raises FileNotFoundError, or a ValueError that names the file if it is damaged, not a
-    recording, or of another version of the format.
+    Raises FileNotFoundError, or a ValueError that names the file and what is wrong with it.
     """
     try:
         stored = read_npz(path, "meta", "points", "offsets", "times")

@@ -61,8 +61,7 @@ def frame_times(folder: Path, count: int, frame_rate: float) -> Float[np.ndarray
 def read_times(path: Path) -> Float[np.ndarray, " frame"]:
     """The frames' times [s] from the last column of a CSV file; a line of titles may come first.
 
-    Raises FileNotFoundError, or ValueError that names the file and the line: no number, times that
-    do not increase, or intervals that seconds cannot have.
+    Raises FileNotFoundError, or ValueError that names the file and the line.
     """
     rows = read_lines(path)
     if rows and re.match("[A-Za-z]", rows[0][1][-1]):
@@ -165,9 +164,8 @@ def rgbd_recording(
 ) -> Recording:
     """The recording in a folder of RGB-D images.
 
-    `info.time_offset` is added to the cameras' times. `gripper_path`, `gripper_times` and
-    `measured` (force, markers) are as in `make_recording`. Raises as `stream` and `make_recording`
-    do.
+    `info.time_offset` is added to the cameras' times. `gripper_path`, `gripper_times`, `measured`
+    (force, markers) and errors are as in `make_recording`; errors also as in `stream`.
     """
     times, clouds = read_clouds(folder, rig or read_rig(folder))
     clock = times + info.time_offset
@@ -194,9 +192,7 @@ def stream(
     """Time [s] and cleaned cloud [m] of one frame after the other: the images of one are in memory.
 
     `frame_rate` [Hz] is used where the rig has none. Raises FileNotFoundError, ImportError (names
-    the extra), or ValueError that names the file or camera and frame, what was expected, and what
-    to do: files that are missing, damaged, of another size or unit; frames without partner; a
-    mask without pixels; points outside of the workspace.
+    the extra), or ValueError that names the file or camera and frame, and what to do.
     """
     folder = Path(folder)
     rate = rig.frame_rate or frame_rate

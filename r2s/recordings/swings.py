@@ -43,8 +43,6 @@ class Bar:
     - `lag`: of the tracker's clock behind the arm's, [s]. `lag_deviation`: between recordings, [s].
     - `place_deviation`: of the bar in the frame of the tool, [m].
     - `tracker_error`: deviation of a coordinate [m] at rest, of each row from the bar down.
-
-    Raises ValueError for lengths or deviations that are not positive.
     """
 
     ends: tuple[Vector, Vector]
@@ -82,8 +80,7 @@ def read_swing(path: Path | str, bar: Bar, duration: float | None = None) -> Rec
     whole sheet for longer than `LONGEST_GAP` the recording ends, with a warning. `duration` [s]
     from the first frame on; None: all.
 
-    Raises FileNotFoundError, or a ValueError that names the file and what is wrong with its arrays,
-    the bar, or the duration.
+    Raises FileNotFoundError, or a ValueError that names the file and what is wrong with it.
     """
     path = Path(path)
     try:

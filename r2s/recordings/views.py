@@ -86,8 +86,6 @@ class Views:
     - `border`: width of the strip, along the borders of the sheet and of the workspace, which the
       outlier filter erodes and in which nothing is asked of a cloud, [m].
     - `hidden`: distance from a gripper within which the robot's mask hides the sheet, [m].
-
-    Raises ValueError for no camera, and where there is no room between borders.
     """
 
     cameras: tuple[DepthCamera, ...]
