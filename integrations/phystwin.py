@@ -8,35 +8,41 @@ at hand. Only arrays of numbers are read from the pickle, no code.
 """
 
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.cluster.vq import kmeans2
-from scipy.spatial import ConvexHull
 
-from r2s.recordings import recording as recordings
-from r2s.recordings.recording import Recording, RecordingInfo, SheetPlacement, corner
+from r2s._util.extras import require
+from r2s.recordings.clouds import numbers
+from r2s.recordings.recording import (
+    CORNERS,
+    Recording,
+    RecordingInfo,
+    SheetPlacement,
+    corner,
+    make_recording,
+)
 
 FILE = "final_data.pkl"
 RATE = 30.0  # frames a second
 UPWARDS = np.array([1.0, -1.0, -1.0])  # its z is down
-ARRAYS = {
+ARRAYS: dict[str, tuple[str | int, ...]] = {
     "object_points": ("frame", "point", 3),
     "object_visibilities": ("frame", "point"),
     "object_motions_valid": ("frame", "point"),
     "controller_points": ("frame", "controller", 3),
 }
+# names that a pickle of arrays holds, where "core" stands for "_core", too
 ALLOWED = {
-    ("numpy", "ndarray"),
-    ("numpy", "dtype"),
-    ("numpy.core.multiarray", "_reconstruct"),
-    ("numpy._core.multiarray", "_reconstruct"),
-    ("numpy.core.multiarray", "scalar"),
-    ("numpy._core.multiarray", "scalar"),
-    ("numpy.core.numeric", "_frombuffer"),
-    ("numpy._core.numeric", "_frombuffer"),
+    "numpy.ndarray",
+    "numpy.dtype",
+    "numpy.core.multiarray._reconstruct",
+    "numpy.core.multiarray.scalar",
+    "numpy.core.numeric._frombuffer",
 }
 
 
@@ -61,7 +67,7 @@ def read_case(
     arrays = _arrays(folder / FILE)
     points = arrays["object_points"] * UPWARDS
     kept = arrays["object_visibilities"].astype(bool)
-    # whether a point moved plausibly is said of the step to the next frame; of the last, nothing is
+    # a motion is that to the next frame: the last frame has none
     kept[1:] &= arrays["object_motions_valid"].astype(bool)[:-1]
     clouds = [points[frame][mask] for frame, mask in enumerate(kept)]
     for frame, cloud in enumerate(clouds):
@@ -87,14 +93,14 @@ def read_case(
         table_height=float(np.quantile(clouds[0][:, 2], 0.01)),
         verified=None,
     )
-    return recordings.make_recording(clouds, times, corners + (paths - paths[:1]), times, info)
+    return make_recording(clouds, times, corners + (paths - paths[:1]), times, info)
 
 
 class _Arrays(pickle.Unpickler):
     """Reads arrays, and nothing that could run."""
 
     def find_class(self, module_name: str, global_name: str) -> Any:
-        if (module_name, global_name) not in ALLOWED:
+        if f"{module_name.replace('._core', '.core')}.{global_name}" not in ALLOWED:
             raise pickle.UnpicklingError(f"it holds {module_name}.{global_name}, which is no array")
         return super().find_class(module_name, global_name)
 
@@ -105,24 +111,20 @@ def _arrays(file: Path) -> dict[str, np.ndarray]:
     try:
         with open(file, "rb") as stream:
             stored = _Arrays(stream).load()
+        lacking = ARRAYS.keys() - stored.keys()
     except Exception as error:  # a damaged pickle raises anything
         raise ValueError(f"{file}: no arrays of PhysTwin: {error}") from error
-    if not isinstance(stored, dict):
-        raise ValueError(f"{file}: expected a dictionary of arrays, found {type(stored).__name__}")
-    if lacking := [name for name in ARRAYS if name not in stored]:
+    if lacking:
         raise ValueError(f"{file}: lacks {', '.join(lacking)}, has {', '.join(map(str, stored))}")
-    arrays = {name: np.asarray(stored[name]) for name in ARRAYS}
-    sizes: dict[str, int] = {}
-    for name, shape in ARRAYS.items():
-        fits = arrays[name].ndim == len(shape)
-        for axis, size in zip(shape, arrays[name].shape, strict=False):
-            expected = axis if isinstance(axis, int) else sizes.setdefault(axis, size)
-            fits = fits and size == expected and size > 0
-        if not fits or not np.isfinite(np.asarray(arrays[name], float)).all():
-            raise ValueError(
-                f"{file}: {name}: expected finite numbers {shape}, found {arrays[name].shape}"
-            )
-    return arrays
+    shape = np.shape(stored["object_visibilities"])
+    sizes: dict[Any, int] = dict(zip(("frame", "point"), shape, strict=False))
+    try:
+        return {
+            name: numbers(name, stored[name], *(sizes.get(axis, axis) for axis in shape))
+            for name, shape in ARRAYS.items()
+        }
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
 
 
 def _hands(
@@ -141,23 +143,17 @@ def _around(
     cloud: Float[np.ndarray, "point 3"], hands: Float[np.ndarray, "hand 3"]
 ) -> SheetPlacement:
     """The smallest rectangle around a cloud that lies, held where the hands are."""
-    flat = cloud[:, :2]
-    hull = flat[ConvexHull(flat).vertices]
-    edges = np.diff(np.concatenate([hull, hull[:1]]), axis=0)
-    axes = edges / np.linalg.norm(edges, axis=1, keepdims=True)
-    across = np.stack([-axes[:, 1], axes[:, 0]], axis=1)
-    sides = np.stack([np.ptp(hull @ axes.T, axis=0), np.ptp(hull @ across.T, axis=0)], axis=1)
-    best = int(np.argmin(sides.prod(axis=1)))
-    warp, weft = axes[best], across[best]
-    low = warp * (hull @ warp).min() + weft * (hull @ weft).min()
-    height = float(np.median(cloud[:, 2]))
-    bare = SheetPlacement(
-        size=(float(sides[best, 0]), float(sides[best, 1])),
-        origin=(float(low[0]), float(low[1]), height),
-        warp=(float(warp[0]), float(warp[1]), 0.0),
-        weft=(float(weft[0]), float(weft[1]), 0.0),
+    cv2 = require("cv2", "camera", "a sheet around points")
+    centre, sides, degrees = cv2.minAreaRect(cloud[:, :2].astype(np.float32))
+    cosine, sine = float(np.cos(np.radians(degrees))), float(np.sin(np.radians(degrees)))
+    x, y = centre - np.array([[cosine, -sine], [sine, cosine]]) @ sides / 2
+    sheet = SheetPlacement(
+        size=sides,
+        origin=(float(x), float(y), float(np.median(cloud[:, 2]))),
+        warp=(cosine, sine, 0.0),
+        weft=(-sine, cosine, 0.0),
         pinned=(),
     )
-    places = {name: corner(bare, name) for name in recordings.CORNERS}
-    pinned = [min(places, key=lambda name: float(np.linalg.norm(places[name] - h))) for h in hands]
-    return SheetPlacement(bare.size, bare.origin, bare.warp, bare.weft, tuple(pinned))
+    places = np.array([corner(sheet, name) for name in CORNERS])
+    nearest = np.linalg.norm(places - hands[:, None], axis=-1).argmin(axis=1)
+    return replace(sheet, pinned=tuple(list(CORNERS)[index] for index in nearest))

@@ -5,23 +5,26 @@ public code (both wrappers of moved points); the page on the data has left and r
 round, in a frame that would be left-handed. Needs pypcd4: pip install 'r2s[pcd]'.
 """
 
-import csv
 import json
 import re
 from pathlib import Path
 
 import numpy as np
 
-from r2s.recordings.clouds import read_cloud
+from r2s.recordings.cameras import is_rotation
+from r2s.recordings.clouds import numbers, read_cloud
+from r2s.recordings.force_log import check_increasing, header_of, read_columns
 from r2s.recordings.recording import (
     Recording,
     RecordingInfo,
     SheetPlacement,
+    interpolated,
     make_recording,
 )
 
 FRAME = re.compile(r"pointcloud_(\d+(?:\.\d+)?)_segmented\.pcd")
 BASES = {"left": (0.0, 0.25, 0.0), "right": (0.0, -0.25, 0.0)}  # [m], in the world
+COLUMNS = ("time", "pos_x", "pos_y", "pos_z")
 PATH = "{}_arm_joint_states_and_end_pose.csv"
 
 
@@ -50,7 +53,7 @@ def read_capture(
     rotation, shift = _extrinsics(folder / "calibration" / "world_to_camera_transform.json")
     times, left = read_arm(folder / "joints" / PATH.format("left"), BASES["left"])
     times_right, right = read_arm(folder / "joints" / PATH.format("right"), BASES["right"])
-    other = np.stack([np.interp(times, times_right, axis) for axis in right.T], axis=1)
+    other = interpolated(times, times_right, right)
     start, end = times[0], min(times[-1], times_right[-1])
     stamps = np.array([stamp for stamp, _ in frames])
     delay = float(np.mean(np.diff(stamps))) if camera_delay is None else camera_delay
@@ -60,12 +63,14 @@ def read_capture(
             f"{folder}: no cloud is from the time of the arms' paths, {start:.3f} to {end:.3f} s; "
             f"clouds are from {stamps[0]:.3f} to {stamps[-1]:.3f} s: are these of one capture?"
         )
-    garment, scenario, trial = _names(folder)
+    match = re.fullmatch(r"(.+)_(fling|fold|grasp)_(.+)", folder.name)
+    if not match:
+        raise ValueError(f"{folder}: expected a name such as white_shirt_grasp_2025-07-19-19-14-58")
     info = RecordingInfo(
         name=folder.name,
-        scenario=scenario,
-        fabric=garment,
-        trial=trial,
+        scenario=match[2],
+        fabric=match[1],
+        trial=match[3],
         source=f"RGBench, {folder}",
         frames_used=(0, len(kept) - 1),
         sheet=sheet,
@@ -86,35 +91,26 @@ def read_capture(
 def _frames(folder: Path) -> list[tuple[float, Path]]:
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of clouds")
-    found = [(float(m[1]), p) for p in folder.iterdir() if (m := FRAME.fullmatch(p.name))]
-    if len(found) < 2:
+    frames = {float(m[1]): p for p in folder.iterdir() if (m := FRAME.fullmatch(p.name))}
+    if len(frames) < 2:
         raise FileNotFoundError(
             f"{folder}: expected clouds such as pointcloud_1752924898.25_segmented.pcd, "
-            f"found {len(found)}"
+            f"found {len(frames)}"
         )
-    found.sort()
-    for (time, file), (then, twin) in zip(found[:-1], found[1:], strict=True):
-        if then == time:
-            raise ValueError(f"{folder}: {file.name} and {twin.name} are of one time: keep one")
-    return found
+    return sorted(frames.items())
 
 
 def _extrinsics(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """The rotation and the shift [m] from the world to the camera."""
     try:
-        matrix = np.array(json.loads(file.read_text(encoding="utf-8")), float)
-    except (ValueError, TypeError) as error:
-        raise ValueError(
-            f"{file}: expected a list of four rows of four numbers: {error}"
-        ) from error
-    if matrix.shape != (4, 4) or not np.allclose(matrix[3], [0, 0, 0, 1]):
-        raise ValueError(
-            f"{file}: expected a 4 x 4 matrix with the last row 0, 0, 0, 1, found {matrix.tolist()}"
-        )
-    rotation = matrix[:3, :3]
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        matrix = numbers("the extrinsics", json.loads(file.read_text(encoding="utf-8")), 4, 4)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}: expected four rows of four numbers") from error
+    if not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise ValueError(f"{file}: the last row must be 0, 0, 0, 1, found {matrix[3].tolist()}")
+    if not is_rotation(matrix[:3, :3], 1e-3):
         raise ValueError(f"{file}: its rotation is none: rows must be orthonormal, determinant 1")
-    return rotation, matrix[:3, 3]
+    return matrix[:3, :3], matrix[:3, 3]
 
 
 def read_arm(file: Path, base: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
@@ -122,30 +118,12 @@ def read_arm(file: Path, base: tuple[float, float, float]) -> tuple[np.ndarray, 
 
     Raises FileNotFoundError, or ValueError that names the file: columns or values of a path.
     """
-    names = ("time", "pos_x", "pos_y", "pos_z")
-    with open(file, encoding="utf-8", newline="") as text:
-        reader = csv.DictReader(text)
-        if lacking := [name for name in names if name not in (reader.fieldnames or ())]:
-            raise ValueError(
-                f"{file}: lacks the columns {', '.join(lacking)}, found {reader.fieldnames}: make "
-                "them from the joints with rgbench.csv_data of the authors"
-            )
-        rows = []
-        for number, row in enumerate(reader, 2):
-            try:
-                rows.append([float(row[name]) for name in names])
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"{file}: line {number}: {error}") from error
-    values = np.array(rows).reshape(-1, 4)
-    if len(values) < 2 or not np.isfinite(values).all():
-        raise ValueError(f"{file}: expected two or more lines of finite numbers")
-    if not (later := np.diff(values[:, 0]) > 0).all():
-        raise ValueError(f"{file}: line {later.argmin() + 3}: times must increase")
+    header = header_of(file)
+    if lacking := [name for name in COLUMNS if name not in header]:
+        raise ValueError(
+            f"{file}: lacks the columns {', '.join(lacking)}, found {header}: make them from the "
+            "joints with rgbench.csv_data of the authors"
+        )
+    values, lines = read_columns(file, dict.fromkeys(COLUMNS, {"": 1.0}))
+    check_increasing(file, lines, values[:, 0])
     return values[:, 0], values[:, 1:] + np.array(base)
-
-
-def _names(folder: Path) -> tuple[str, str, str]:
-    match = re.fullmatch(r"(.+)_(fling|fold|grasp)_(.+)", folder.name)
-    if not match:
-        raise ValueError(f"{folder}: expected a name such as white_shirt_grasp_2025-07-19-19-14-58")
-    return match[1], match[2], match[3]

@@ -33,17 +33,17 @@ from scipy.ndimage import binary_closing, binary_fill_holes, label
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from r2s._util.extras import require
 from r2s.environment.scene import Control, Scene
 from r2s.estimation import cards
 from r2s.materials import presets
 from r2s.materials.fabric import Fabric, constant_laws
 from r2s.mesh.mesh import Mesh, rectangle
+from r2s.recordings.clouds import read_cloud
+from r2s.recordings.recording import interpolated
 from r2s.solvers.implicit.cloth import ImplicitCloth
 
 SPACING, TIMESTEP = 0.02, 0.01  # [m], [s]
 MOVES = ("grasp", "fold", "fling")
-ARMS = ("left", "right")
 
 
 class Environment:
@@ -53,37 +53,42 @@ class Environment:
     world, z up, with the table at z = 0.
     """
 
-    def __init__(self, cfg: Any, **kwargs: Any) -> None:
+    def __init__(self, cfg: Any, **_: Any) -> None:
         """From the configuration of a run; see the module for what is r2s's own in it.
 
         Raises `ValueError` that names the key: one that is missing, a motion that RGBench does not
         have; and as `read_arm`, `r2s.estimation.cards.read` and `garment` do.
         """
-        del kwargs
         self.cfg = cfg
         move = _value(cfg, "action.type", "grasp")
         if move not in MOVES:
             raise ValueError(f"action.type is one of {', '.join(MOVES)}, got {move!r}")
-        paths = [Path(_value(cfg, f"data.robot_joints.{arm}_arm_csv_path")) for arm in ARMS]
-        self._arms = [read_arm(file, BASES[arm]) for file, arm in zip(paths, ARMS, strict=True)]
+        self._arms = [
+            read_arm(Path(_value(cfg, f"data.robot_joints.{arm}_arm_csv_path")), base)
+            for arm, base in BASES.items()
+        ]
         self._start = min(float(times[0]) for times, _ in self._arms)
         self._is_fling = move == "fling"
         self._prepare = float(_value(cfg, "action.fling_prepare_time", 2.0))
         self._wait = float(_value(cfg, "action.fling_wait_time", 3.0))
         self._grab = float(_value(cfg, "evaluate.start_calculate_time", 0.0))
         self.dt = float(_value(cfg, "env.timestep", TIMESTEP))
-        lying = _lying(cfg)
+        pose = np.asarray(_value(cfg, "cloth.init_pose", [0, 0, 0, 1, 0, 0, 0]), float)
+        turn = Rotation.from_quat(pose[[4, 5, 6, 3]])  # RGBench writes w first
+        lying = turn.apply(read_cloud(_value(cfg, "cloth.model_path"))) + pose[:3]
         mesh = garment(lying[:, :2], float(_value(cfg, "env.spacing", SPACING)))
         mass = float(_value(cfg, "cloth_params.mass"))
-        self.fabric = layered(_fabric(cfg), mass / float(jnp.sum(mesh.area)))
+        name = str(_value(cfg, "env.card"))
+        card = cards.preset(name) if name in presets.MEASURED else cards.read(name)
+        self.fabric = layered(card.fabric, mass / float(jnp.sum(mesh.area)))
         flat = np.concatenate([mesh.rest, np.full((len(mesh.rest), 1), self.fabric.thickness)], 1)
         grips = self._grippers(self._grab)
         if self._is_fling:
             grips = lying[list(_value(cfg, "cloth_params.shoulder_index"))]
-        if len(grips) != len(ARMS):
+        if len(grips) != len(BASES):
             raise ValueError(f"cloth_params.shoulder_index: expected two, found {len(grips)}")
         self._held = np.asarray(KDTree(flat[:, :2]).query(grips[:, :2])[1])
-        if len(np.unique(self._held)) < len(ARMS):
+        if len(np.unique(self._held)) < len(BASES):
             raise ValueError("both arms hold one vertex of the sheet: take a smaller env.spacing")
         self._from = flat[self._held]
         scene = Scene(mesh, self._held, table=0.0)
@@ -123,10 +128,8 @@ class Environment:
 
     def _grippers(self, time: float) -> Float[np.ndarray, "2 3"]:
         """Where the grippers are [m], a time [s] after the start; at rest before and after."""
-        at = self._start + time
-        return np.array(
-            [[np.interp(at, times, axis) for axis in places.T] for times, places in self._arms]
-        )
+        at = np.array([self._start + time])
+        return np.concatenate([interpolated(at, times, places) for times, places in self._arms])
 
     def _path(self, time: float) -> Float[np.ndarray, "2 3"]:
         """Where the pinned vertices are at a time [s]: before a fling the sheet is lifted to where
@@ -182,36 +185,11 @@ def garment(points: Float[np.ndarray, "point 2"], spacing: float) -> Mesh:
     return Mesh.make(low + np.asarray(whole.rest)[used], faces.reshape(-1, 3))
 
 
-def _lying(cfg: Any) -> Float[np.ndarray, "vertex 3"]:
-    """Where the vertices of a garment's mesh lie at first, [m]."""
-    pose = np.asarray(_value(cfg, "cloth.init_pose", [0, 0, 0, 1, 0, 0, 0]), float)
-    turn = Rotation.from_quat(pose[[4, 5, 6, 3]])  # RGBench writes w first
-    return turn.apply(_read_obj(Path(_value(cfg, "cloth.model_path")))) + pose[:3]
-
-
-def _fabric(cfg: Any) -> Fabric:
-    """The fabric of the card that a configuration names."""
-    name = str(_value(cfg, "env.card"))
-    card = cards.preset(name) if name in presets.MEASURED else cards.read(name)
-    return card.fabric
-
-
-def _read_obj(path: Path) -> Float[np.ndarray, "vertex 3"]:
-    """The vertices of an OBJ file in its order, [m]."""
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such mesh of a garment")
-    trimesh = require("trimesh", "study", "a garment's mesh")
-    loaded = trimesh.load(path, process=False, maintain_order=True, force="mesh")
-    return np.asarray(loaded.vertices, float)
-
-
 def _value(cfg: Any, key: str, *default: Any) -> Any:
     """A value of a configuration whose parts are attributes, as those of OmegaConf are."""
-    found = cfg
+    value = cfg
     for name in key.split("."):
-        found = getattr(found, name, None)
-        if found is None and default:
-            return default[0]
-        if found is None:
-            raise ValueError(f"the configuration lacks {key}")
-    return found
+        value = getattr(value, name, None)
+    if value is None and not default:
+        raise ValueError(f"the configuration lacks {key}")
+    return default[0] if value is None else value

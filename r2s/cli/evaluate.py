@@ -79,7 +79,7 @@ class Evaluate:
         from r2s.estimation.cards import fingerprint
         from r2s.materials import prior
         from r2s.metrics import prediction_error
-        from r2s.recordings.noise import mean_distance, point_noise
+        from r2s.recordings.checks import mean_distance, point_noise
         from r2s.scenarios.scenario import from_recording
 
         info, fabric = recording.info, card.fabric

@@ -80,11 +80,10 @@ Manifests = Annotated[
 
 @dataclass(frozen=True)
 class Fetch:
-    """Bring a public data set into a folder, and verify it.
+    """Verify a public data set in a folder, or say how to get it.
 
-    Files that are there and are what was published are left alone. A corrupt file is named and
-    never replaced unasked. What cannot be downloaded automatically is said, with its licence, how
-    to get it, and where to put it. Run it again then: it checks what is there.
+    A corrupt file is named. For a missing one it says the licence, how to get it, and where to put
+    it: none of the data sets may be downloaded without a person. Then run it again.
 
         r2s data fetch diffcloud --to recordings
     """
@@ -111,14 +110,13 @@ class List:
 
     def run(self) -> None:
         from r2s.cli.common import print_result
-        from r2s.recordings.datasets import Dataset, known_datasets
+        from r2s.recordings.datasets import known_datasets
 
         result, lines = {}, []
         for name, data in known_datasets(self.manifests).items():
-            automatic = isinstance(data, Dataset) and bool(data.downloads) and not data.layout
-            result[name] = {"title": data.title, "licence": data.licence, "automatic": automatic}
+            result[name] = {"title": data.title, "licence": data.licence, "automatic": False}
             lines += [f"{name}: {data.title}", f"    licence: {data.licence}"]
-            lines.append(f"    {'downloaded automatically' if automatic else 'fetched by hand'}")
+            lines.append("    fetched by hand")
         print_result(self.json, result, lines)
 
 

@@ -105,7 +105,7 @@ class Fit(NamedTuple):
       places there, without outliers, [m].
     - `outliers`: share of them that the robust loss hardly counts, [-].
     - `noise`: the mean distance that the noise of its points alone gives, [m]
-      (`r2s.recordings.noise`); NaN: unknown.
+      (`r2s.recordings.checks`); NaN: unknown.
     - `mesh`: expected discretization error of this motion on the estimate's mesh, [m]
       (`r2s.scenarios.resolution.mesh_error`); NaN: unknown.
     """

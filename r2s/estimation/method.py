@@ -22,7 +22,7 @@ from jaxtyping import PRNGKeyArray
 from r2s.estimation.default_spaces import on_cloth, on_mpm
 from r2s.estimation.estimate import Estimate, Fit
 from r2s.materials.parameters import InformedSpace, ParameterSpace
-from r2s.recordings.noise import mean_distance, point_noise
+from r2s.recordings.checks import mean_distance, point_noise
 from r2s.recordings.recording import Recording, clouds_are_markers
 from r2s.scenarios.resolution import mesh_error
 

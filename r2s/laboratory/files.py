@@ -114,7 +114,7 @@ class _Pull:
         header = " ".join(header_of(file)).lower()
         units = {"extension": METRES} if "extension" in header else {"strain": SHARES}
         units |= {"force": NEWTONS} | ({"width": METRES} if "width" in header else {})
-        along, force, *width = read_columns(file, units).values.T
+        along, force, *width = read_columns(file, units)[0].T
         extension = along if "extension" in units else along * self.length
         middle, name = width[0] if width else None, f"{where} ({file.name})"
         size = self.length, self.width

@@ -2,14 +2,16 @@
 
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from r2s._util.extras import require
+from r2s._util.units import positive
 
 Row = tuple[float, float, float, float]
 
@@ -31,9 +33,7 @@ class DepthCamera:
     - `masks`: is there a folder of masks (else every pixel may be the fabric)?
     - `may_miss`: may the fabric be out of this camera's view in some frames?
 
-    Depth is the distance along z, not along the ray. Raises ValueError for lengths that are not
-    positive, a centre far from the image's (the mark of another resolution), a pose that is no
-    rotation and shift, and a distortion of another length.
+    Depth is the distance along z, not along the ray.
     """
 
     resolution: tuple[int, int]
@@ -46,13 +46,11 @@ class DepthCamera:
     may_miss: bool = False
 
     def __post_init__(self) -> None:
-        if min(self.resolution) < 1:
-            raise ValueError(f"resolution must be at least one pixel, found {self.resolution}")
-        if not min(self.focal_length) > 0:
-            raise ValueError(f"focal_length must be positive [pixel], found {self.focal_length}")
+        positive("pixel", resolution=min(self.resolution), focal_length=min(self.focal_length))
         if not self.depth_scale > 0:
-            found = f"found {self.depth_scale}: {IN_MILLIMETRES}"
-            raise ValueError(f"depth_scale must be positive, {found}")
+            raise ValueError(
+                f"depth_scale must be positive, found {self.depth_scale}: {IN_MILLIMETRES}"
+            )
         if len(self.distortion) not in DISTORTIONS:
             raise ValueError(
                 f"distortion has one of {DISTORTIONS} numbers, found {self.distortion}"
@@ -61,7 +59,7 @@ class DepthCamera:
         if (np.abs(np.array(self.centre) / size - 0.5) > OFF_CENTRE).any():
             raise ValueError(
                 f"centre {self.centre} is far from the middle of {size[0]} x {size[1]} pixels: are "
-                "these the intrinsics of another resolution? Scale focal_length and centre alike"
+                "these the intrinsics of another resolution? Scale focal_length and centre with it"
             )
         _check_pose(np.array(self.to_world))
 
@@ -70,11 +68,10 @@ def _check_pose(pose: np.ndarray) -> None:
     if not np.array_equal(pose[3], [0, 0, 0, 1]):
         hint = "transpose it" if np.array_equal(pose[:, 3], [0, 0, 0, 1]) else "give rows"
         raise ValueError(f"to_world must end with the row 0 0 0 1, found {pose[3]}: {hint}")
-    rotation = pose[:3, :3]
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
+    if not is_rotation(pose[:3, :3], 1e-4):
         raise ValueError(
-            f"to_world is no rotation and shift, its first rows and columns are {rotation.tolist()}"
-            ": give the camera's x, y and z axes in the world as columns"
+            f"to_world is no rotation and shift, found {pose[:3, :3].tolist()}: give the camera's "
+            "x, y and z axes in the world as columns"
         )
     if np.abs(pose[:3, 3]).max() > FARTHEST:
         raise ValueError(
@@ -83,21 +80,28 @@ def _check_pose(pose: np.ndarray) -> None:
         )
 
 
-def look_at(position: tuple[float, ...], target: tuple[float, ...]) -> tuple[Row, Row, Row, Row]:
-    """`to_world` of a camera at a position that looks at a target [m]; up in its image is up.
+def is_rotation(matrix: np.ndarray, tolerance: float) -> bool:
+    """Whether the rows of a matrix are orthonormal, and its determinant is positive."""
+    square = np.allclose(matrix @ matrix.T, np.eye(3), rtol=0, atol=tolerance)
+    return square and bool(np.linalg.det(matrix) > 0)
 
-    Raises ValueError when it looks straight up or down.
-    """
+
+def rows_of(pose: Float[np.ndarray, "4 4"]) -> Any:
+    """A matrix as the tuples of `DepthCamera.to_world`."""
+    return tuple(map(tuple, pose.tolist()))
+
+
+def look_at(position: tuple[float, ...], target: tuple[float, ...]) -> tuple[Row, Row, Row, Row]:
+    """`to_world` of a camera that looks at a target [m], not straight up or down; up stays up."""
     forward = np.subtract(target, position)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     if np.linalg.norm(right) < 1e-9:
         raise ValueError(f"a camera at {position} looking at {target} has no way up in its image")
-    down = np.cross(forward, right)
-    axes = [axis / np.linalg.norm(axis) for axis in (right, down, forward)]
+    axes = (right, np.cross(forward, right), forward)
     pose = np.eye(4)
-    pose[:3] = np.stack([*axes, np.array(position)], axis=1)
-    rows = [tuple(float(value) for value in row) for row in pose]
-    return rows[0], rows[1], rows[2], rows[3]  # pyright: ignore[reportReturnType]
+    pose[:3, :3] = np.stack([axis / np.linalg.norm(axis) for axis in axes], axis=1)
+    pose[:3, 3] = position
+    return rows_of(pose)
 
 
 def matrix(camera: DepthCamera) -> Float[np.ndarray, "3 3"]:
@@ -114,14 +118,11 @@ def rays(camera: DepthCamera) -> Float[np.ndarray, "down across 2"]:
     """
     columns, rows = (np.arange(size, dtype=float) for size in camera.resolution)
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
+    directions = (pixels - camera.centre) / camera.focal_length
     if any(camera.distortion):
-        lens = np.array(camera.distortion)
-        flat = require("cv2", "camera", "lens distortion").undistortPoints(
-            pixels.reshape(-1, 1, 2), matrix(camera), lens
-        )
-        directions = flat.reshape(pixels.shape)
-    else:
-        directions = (pixels - camera.centre) / camera.focal_length
+        cv2 = require("cv2", "camera", "lens distortion")
+        lens = matrix(camera), np.array(camera.distortion)
+        directions = cv2.undistortPoints(pixels.reshape(-1, 1, 2), *lens).reshape(pixels.shape)
     directions.setflags(write=False)
     return directions
 
@@ -131,7 +132,7 @@ def depth_jumps(
 ) -> Bool[np.ndarray, "down across"]:
     """Pixels at which the depth [m] jumps by more than `limit` [m] to a neighbour that has one.
 
-    There a pixel sees two surfaces at once, and cameras report a depth in between.
+    Such a pixel sees two surfaces, and cameras report a depth in between.
     """
     jumps = np.zeros(depth.shape, bool)
     for lines, marked in ((depth, jumps), (depth.T, jumps.T)):  # of two rows, of two columns
@@ -199,12 +200,9 @@ class Camera(eqx.Module):
         A z-buffer: of the points in a pixel, those within `DEPTH_TOLERANCE` of the nearest.
         """
         pixel, depth = self.project(points)
-        index, inside = self._pixels(pixel, depth)
-        nearest = jax.ops.segment_min(depth, index, self.resolution[0] * self.resolution[1] + 1)
-        return inside & (depth <= nearest[index] + DEPTH_TOLERANCE)
-
-    def _pixels(self, pixel, depth) -> tuple[Int[Array, " point"], Bool[Array, " point"]]:
-        across, down = jnp.floor(pixel[:, 0]).astype(int), jnp.floor(pixel[:, 1]).astype(int)
         width, height = self.resolution
+        across, down = jnp.floor(pixel[:, 0]).astype(int), jnp.floor(pixel[:, 1]).astype(int)
         inside = (depth > 0) & (across >= 0) & (across < width) & (down >= 0) & (down < height)
-        return jnp.where(inside, down * width + across, width * height), inside
+        index = jnp.where(inside, down * width + across, width * height)
+        nearest = jax.ops.segment_min(depth, index, width * height + 1)
+        return inside & (depth <= nearest[index] + DEPTH_TOLERANCE)

@@ -1,5 +1,6 @@
-"""What is suspicious in a recording, each with the figure behind it: sheet, clock, clouds."""
+"""What a recording shows of itself: what is suspicious, each with its figure, and its noise."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,6 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from r2s.recordings.clouds import outliers, voxel_means
-from r2s.recordings.findings import Finding
 from r2s.recordings.recording import (
     CORNERS,
     Recording,
@@ -20,9 +20,50 @@ from r2s.recordings.recording import (
     gripper_positions,
 )
 
-__all__ = ["Finding", "check"]
-
 Points = Float[np.ndarray, "point 3"]
+
+INF = np.inf
+# unit, between which figures it is expected, what the figure is
+CHECKS = {
+    "frames": ("-", -INF, 0.05, "largest deviation from an even interval"),
+    "rate": ("Hz", 1.0, 240.0, "frames a second"),
+    "grippers": ("m/s", -INF, 5.0, "greatest speed of a gripper"),
+    # clean synthetic recordings show up to 0.08 s
+    "clock": ("s", -0.1, 0.1, "delay of the top of the cloud after the grippers"),
+    "clock rate": ("-", 0.95, 1.05, "how fast the cameras' clock runs"),
+    "points": ("-", 150, INF, "points of a frame, thinned to 5 mm,"),
+    "outliers": ("-", -INF, 0.03, "share of points that are off the sheet"),
+    "grip": ("m", -INF, 0.08, "distance from a gripper to the nearest point (median over frames)"),
+    "crop": ("-", -INF, 0.3, ""),
+    # a side that was measured with a ruler is good to 0.5 %
+    "scale": ("-", 0.975, 1.025, "length of the side at rest, over the one written down,"),
+    "gravity": ("degrees", -INF, 1.5, "tilt of the sheet that lies on the table"),
+    "plumb": ("degrees", -INF, 4.0, "angle from the vertical of the line from grippers to sheet"),
+    "table": ("m", -0.01, 0.01, "height of the sheet at rest above the table"),
+    "reach": ("-", 0.55, 1.06, "farthest point from a gripper, over how far the sheet reaches,"),
+    "stretch": ("-", -INF, 1.08, "the same, over what it is at rest,"),
+    "markers": ("-", 0.5, 1.1, "distance of neighbouring markers over that on the sheet (95 %),"),
+}
+CALIBRATION = "check the cameras' calibration and depth scale, and the sheet's size"
+CLOCK = "check the frame rate and time_offset: does a clap or a jerk come at one time in both?"
+ADVICE = {
+    "frames": "frames were dropped, or their times are not their own: resample them",
+    "rate": "are times in seconds?",
+    "grippers": "are the path in metres and its times in seconds?",
+    "clock": CLOCK,
+    "clock rate": CLOCK,
+    "points": "move the cameras nearer, or widen masks and workspace",
+    "outliers": "clean masks, or narrow the workspace",
+    "grip": "the frames of cameras and grippers differ, or the clock does",
+    "crop": "widen the workspace or the crop, or move the camera",
+    "scale": CALIBRATION,
+    "gravity": "the world's z must point up: check the cameras' pose against a level",
+    "plumb": "the world's z must point up: check the cameras' pose against a plumb line",
+    "table": "check table_height and the cameras' pose",
+    "reach": CALIBRATION,
+    "stretch": "the sheet stretches, or the cameras' scale changes with the place",
+    "markers": "the sheet stretches, or markers were taken for others",
+}
 
 VOXEL = 0.005  # [m], to which clouds are thinned
 AROUND, FEW = 0.02, 4  # [m], in which a point of a sheet has more others than that
@@ -52,46 +93,83 @@ FACE = 0.003  # [m], thickness of the layer along a face of a box that cut the c
 CROWDED = 30  # points in that layer, so that a face is one
 SAME = 0.0015  # [m], within which the ends of clouds agree where a box cut them
 ABOVE = 0.025  # [m] above the table, below which clouds are often cut on purpose
+# noise
+NOISE_FRAMES, NOISE_POINTS = 6, 300  # that are looked at
+PATCH = 16  # points of some mm of a dense cloud, which are nearly in a plane
 
 
-class Frames(NamedTuple):
-    """What checks look at.
-
-    - `thinned`: points of each frame, [m]. `clouds`: those that have others around, and are in a
-      piece that is large enough to be a part of the sheet.
-    - `grippers`: where they are in each frame, [m].
-    - `still`: frames before the grippers move; the first one at least.
+class Finding(NamedTuple):
+    """- `check`: what was looked at. `figure`, `unit`: what was measured; NaN: nothing shows it.
+    - `low`, `high`: between which it is expected.
+    - `words`: what the figure is; `advice`: what to look at where it is not as expected.
     """
 
+    check: str
+    figure: float
+    unit: str
+    low: float
+    high: float
+    words: str
+    advice: str
+
+    @property
+    def is_suspicious(self) -> bool:
+        """Whether the figure was measured and is not as expected."""
+        return bool(np.isfinite(self.figure)) and not self.low <= self.figure <= self.high
+
+    def describe(self) -> str:
+        """One line for people."""
+        if not np.isfinite(self.figure):
+            return f"not shown   {self.check}: {self.words}"
+        unit = "" if self.unit == "-" else f" {self.unit}"
+        expected = f"{self.low:g} to {self.high:g}"
+        if np.isinf(self.low) or np.isinf(self.high):
+            expected = f"at most {self.high:g}" if np.isinf(self.low) else f"at least {self.low:g}"
+        line = f"{self.check}: {self.words} {self.figure:.3g}{unit}, expected {expected}{unit}"
+        return f"suspicious  {line}: {self.advice}" if self.is_suspicious else f"good        {line}"
+
+
+def _finding(key: str, figure: float, words: str = "", name: str = "") -> Finding:
+    """A figure of one of `CHECKS`; `words`: in place of the usual ones, such as why it is NaN."""
+    unit, low, high, usual = CHECKS[key]
+    return Finding(name or key, figure, unit, low, high, words or usual, ADVICE[key])
+
+
+class _Frames(NamedTuple):
     recording: Recording
-    thinned: list[Points]
-    clouds: list[Points]
-    grippers: Float[np.ndarray, "frame gripper 3"]
-    still: list[int]
+    thinned: list[Points]  # of each frame, [m]
+    clouds: list[Points]  # those that may be of the sheet (`_pieces`)
+    grippers: Float[np.ndarray, "frame gripper 3"]  # [m]
+    still: list[int]  # frames before the grippers move; the first one at least
 
 
 def check(recording: Recording) -> list[Finding]:
     """All findings of a recording, the suspicious ones first."""
     thinned = [voxel_means(cloud(recording, f), VOXEL) for f in range(len(recording.times))]
-    alone = clouds_are_markers(recording)  # far from each other
-    clouds = thinned if alone else [_pieces(points) for points in thinned]
-    frames = Frames(recording, thinned, clouds, gripper_positions(recording), _still(recording))
-    found = [*_check_sheet(frames), *_check_clock(frames), *_check_clouds(frames)]
-    return sorted(found, key=lambda finding: not finding.is_suspicious)
+    sparse = clouds_are_markers(recording)
+    clouds = thinned if sparse else [_pieces(points) for points in thinned]
+    path, knots = np.asarray(recording.gripper_path), np.asarray(recording.gripper_times)
+    moved = np.linalg.norm(path - path[:1], axis=-1).max(axis=1) > STILL
+    start = float(knots[np.argmax(moved)]) if moved.any() else INF
+    still = np.flatnonzero(np.asarray(recording.times) <= start).tolist() or [0]
+    frames = _Frames(recording, thinned, clouds, gripper_positions(recording), still)
+    findings = [*_check_sheet(frames), *_check_clock(frames)]
+    if not sparse:
+        findings += _check_clouds(frames)
+    return sorted(findings, key=lambda finding: not finding.is_suspicious)
 
 
-def _lies(recording: Recording) -> bool:
-    """Whether the sheet lies at rest, rather than hangs."""
-    sheet = recording.info.sheet
+def _lies(sheet: SheetPlacement) -> bool:
+    """Whether a sheet lies at rest, rather than hangs."""
     return bool(abs(np.cross(sheet.warp, sheet.weft)[2]) > 0.9)
 
 
 def _pieces(points: Points) -> Float[np.ndarray, "kept 3"]:
-    """Points that have others around them, in pieces large enough to be a part of the sheet."""
+    """Points that have others near them, in pieces large enough to be a part of the sheet."""
     if len(points) <= FEW:
         return points
-    around = KDTree(points).query_ball_point(points, AROUND, return_length=True)
-    points = points[np.asarray(around) > FEW]
+    near = KDTree(points).query_ball_point(points, AROUND, return_length=True)
+    points = points[np.asarray(near) > FEW]
     if not len(points):
         return points
     pairs = KDTree(points).query_pairs(APART, output_type="ndarray")
@@ -100,26 +178,19 @@ def _pieces(points: Points) -> Float[np.ndarray, "kept 3"]:
     return points[(np.bincount(piece) >= SCRAP * len(points))[piece]]
 
 
-def _still(recording: Recording) -> list[int]:
-    path, knots = np.asarray(recording.gripper_path), np.asarray(recording.gripper_times)
-    moved = np.linalg.norm(path - path[:1], axis=-1).max(axis=1) > STILL
-    begins = float(knots[np.argmax(moved)]) if moved.any() else np.inf
-    return np.flatnonzero(np.asarray(recording.times) <= begins).tolist() or [0]
-
-
 # The sheet: is it as large as was written down, level where it lies, and does it keep its length?
 
 
-def _check_sheet(frames: Frames) -> list[Finding]:
+def _check_sheet(frames: _Frames) -> list[Finding]:
     """Scale, gravity and stretch, as far as the recording shows them."""
     recording, first = frames.recording, frames.clouds[frames.still[0]]
-    if _lies(recording):
-        found = _lying(recording, first)
+    if _lies(recording.info.sheet):
+        findings = _lying(recording, first)
     else:  # at rest it hangs below its grippers
         away = first.mean(axis=0) - frames.grippers[0].mean(axis=0)
         tilt = float(np.degrees(np.arctan2(np.hypot(away[0], away[1]), -away[2])))
-        found = [Finding.make("plumb", tilt, name="gravity")]
-    return [*found, *_extents(frames), _marker_distances(recording)]
+        findings = [_finding("plumb", tilt, name="gravity")]
+    return [*findings, *_extents(frames), _marker_distances(recording)]
 
 
 def _lying(recording: Recording, first: Points) -> list[Finding]:
@@ -129,19 +200,21 @@ def _lying(recording: Recording, first: Points) -> list[Finding]:
     above = (first - np.array(sheet.origin)) @ np.cross(*axes)
     first = first[np.abs(above) < NEAR_PLANE]
     flat = (first - np.array(sheet.origin)) @ axes.T
-    whole = _seen_share(flat, sheet.size) >= MOST_SEEN and len(first) > FEWEST
-    why = "" if whole else "no frame shows the whole sheet at rest"
-    found = []
-    for axis, side in enumerate(("warp", "weft")):
-        ends = np.quantile(flat[:, axis], [ENDS, 1 - ENDS]) if whole else np.full(2, np.nan)
-        ratio = float(np.ptp(ends)) / (1 - 2 * ENDS) / sheet.size[axis]
-        found.append(Finding.make("scale", ratio, why, f"scale, {side}"))
-    tilt, height = np.nan, np.nan
-    if whole:
+    tilt, height, ratios, why = np.nan, np.nan, (np.nan, np.nan), ""
+    if _seen_share(flat, sheet.size) >= MOST_SEEN and len(first) > FEWEST:
+        ends = np.quantile(flat, [ENDS, 1 - ENDS], axis=0)
+        ratios = np.ptp(ends, axis=0) / (1 - 2 * ENDS) / sheet.size
         normal = np.linalg.svd(first - first.mean(axis=0), full_matrices=False)[2][2]
         tilt = float(np.degrees(np.arccos(np.clip(abs(normal[2]), -1, 1))))
         height = float(np.median(first[:, 2]) - recording.info.table_height)
-    return [*found, Finding.make("gravity", tilt, why), Finding.make("table", height, why)]
+    else:
+        why = "no frame shows the whole sheet at rest"
+    return [
+        _finding("scale", float(ratios[0]), why, "scale, warp"),
+        _finding("scale", float(ratios[1]), why, "scale, weft"),
+        _finding("gravity", tilt, why),
+        _finding("table", height, why),
+    ]
 
 
 def _seen_share(flat: Float[np.ndarray, "point 2"], size: tuple[float, float]) -> float:
@@ -152,93 +225,101 @@ def _seen_share(flat: Float[np.ndarray, "point 2"], size: tuple[float, float]) -
     return len(np.unique(inside, axis=0)) / float(cells.prod())
 
 
-def _extents(frames: Frames) -> list[Finding]:
+def _extents(frames: _Frames) -> list[Finding]:
     """How far points are from the grippers, over how far the sheet reaches from there."""
     sheet = frames.recording.info.sheet
+    reach = [_reach(sheet, name) for name in sheet.pinned]
     ratios = np.full(len(frames.clouds), np.nan)
     for frame, (points, grippers) in enumerate(zip(frames.clouds, frames.grippers, strict=True)):
         if len(points) >= FEWEST:
             away = np.linalg.norm(points[:, None] - grippers[None], axis=-1)
-            farthest = np.quantile(away, 1 - ENDS, axis=0)
-            ratios[frame] = np.max(farthest / [_reach(sheet, name) for name in sheet.pinned])
+            ratios[frame] = np.max(np.quantile(away, 1 - ENDS, axis=0) / reach)
     if np.isnan(ratios).all():
-        return [Finding.make("reach", np.nan, f"no frame has {FEWEST} points")]
+        return [_finding("reach", np.nan, f"no frame has {FEWEST} points")]
     largest, *others = sorted(ratios[np.isfinite(ratios)], reverse=True)
     while others and largest > LONELY * others[0]:
         largest, *others = others
     most, still = float(largest), ratios[frames.still]
-    whole = bool((still > WHOLE).any())
-    grown = most / float(np.nanmax(still)) if whole else np.nan
-    why = "" if whole else "not seen whole at rest"
-    return [Finding.make("reach", most), Finding.make("stretch", grown, why)]
+    if (still > WHOLE).any():
+        stretch = _finding("stretch", most / float(np.nanmax(still)))
+    else:
+        stretch = _finding("stretch", np.nan, "not seen whole at rest")
+    return [_finding("reach", most), stretch]
 
 
 def _reach(sheet: SheetPlacement, held: str) -> float:
     """How far the farthest corner is from a corner that is held, [m]."""
-    away = [np.linalg.norm(corner(sheet, name) - corner(sheet, held)) for name in CORNERS]
-    return float(max(away))
+    return max(float(np.linalg.norm(corner(sheet, c) - corner(sheet, held))) for c in CORNERS)
 
 
 def _marker_distances(recording: Recording) -> Finding:
     """How far apart neighbouring markers get, over how far they are on the sheet."""
     if recording.markers is None or recording.markers_seen is None:
-        return Finding.make("markers", np.nan, "no markers")
+        return _finding("markers", np.nan, "no markers")
     markers, seen = np.asarray(recording.markers), np.asarray(recording.markers_seen)
     places = recording.marker_places
     places = markers[0] if places is None else np.asarray(places)
-    gaps, nearest = (np.asarray(found)[:, 1] for found in KDTree(places).query(places, 2))
+    gaps, nearest = KDTree(places).query(places, 2)
+    gaps, nearest = gaps[:, 1], np.asarray(nearest)[:, 1]
     apart = np.linalg.norm(markers - markers[:, nearest], axis=-1) / gaps
     both = seen & seen[:, nearest]
-    return Finding.make("markers", float(np.quantile(apart[both], 0.95)) if both.any() else np.nan)
+    return _finding("markers", float(np.quantile(apart[both], 0.95)) if both.any() else np.nan)
 
 
 # The clock: do the frames come when they should, and when the grippers move?
 
 
-def _check_clock(frames: Frames) -> list[Finding]:
+def _check_clock(frames: _Frames) -> list[Finding]:
     """Intervals, rate, the grippers' speed, and how late the top of the cloud follows them."""
     recording = frames.recording
     gaps = np.diff(np.asarray(recording.times, np.float64))
-    middle = float(np.median(gaps)) if len(gaps) else np.nan
-    uneven = float(np.abs(gaps / middle - 1).max()) if len(gaps) else np.nan
+    middle, uneven = np.nan, np.nan
+    if len(gaps):
+        middle = float(np.median(gaps))
+        uneven = float(np.abs(gaps / middle - 1).max())
     path, knots = np.asarray(recording.gripper_path), np.asarray(recording.gripper_times)
     moved = np.linalg.norm(np.diff(path, axis=0), axis=-1).max(axis=1)
     lag, rate = _lag(frames)
     why = "" if np.isfinite(lag) else "the tops of the clouds do not show it"
     return [
-        Finding.make("frames", uneven),
-        Finding.make("rate", 1 / middle),
-        Finding.make("grippers", float((moved / np.diff(knots)).max(initial=0.0))),
-        Finding.make("clock", lag, why),
-        Finding.make("clock rate", rate, why),
+        _finding("frames", uneven),
+        _finding("rate", 1 / middle),
+        _finding("grippers", float((moved / np.diff(knots)).max(initial=0.0))),
+        _finding("clock", lag, why),
+        _finding("clock rate", rate, why),
     ]
 
 
-def _lag(frames: Frames) -> tuple[float, float]:
+def _lag(frames: _Frames) -> tuple[float, float]:
     """How late [s] the top of the cloud follows the grippers, and the rate of its clock.
 
     NaN where no axis moves, or the best lag is the longest that is tried.
     """
     recording = frames.recording
-    first, last = recording.info.frames_used
-    shown = [f for f in range(first, last + 1) if len(frames.clouds[f]) >= FEWEST]
-    tops = {frame: _top(frames.clouds[frame]) for frame in shown}
-    lowest = recording.info.table_height + UP if _lies(recording) else -np.inf
-    up = [frame for frame in shown if tops[frame][2] > lowest]
-    path = np.asarray(recording.gripper_path)
+    lowest = recording.info.table_height + UP if _lies(recording.info.sheet) else -INF
+    tops = {}
+    for frame in range(recording.info.frames_used[0], recording.info.frames_used[1] + 1):
+        points = frames.clouds[frame]
+        if len(points) < FEWEST:
+            continue
+        highest = points[points[:, 2] >= np.quantile(points[:, 2], TOP)]
+        top = np.median(highest, axis=0)
+        if top[2] > lowest:
+            tops[frame] = top
     compared = (2,) if len(recording.info.sheet.pinned) == 1 else (2, 0, 1)  # one leans aside
+    path = np.asarray(recording.gripper_path)
     axes = [axis for axis in compared if np.ptp(_leader(path, axis)) > MOVES]
-    if len(up) < FRAMES or not axes:
+    if len(tops) < FRAMES or not axes:
         return np.nan, np.nan
-    times, tops = np.asarray(recording.times, np.float64)[up], np.array([tops[f] for f in up])
-    start = float(recording.times[0])  # where clocks of any rate agree
+    times = np.asarray(recording.times, np.float64)
+    start, times = float(times[0]), times[list(tops)]  # clocks of any rate agree at the start
     clocks = [start + rate * (times - start) for rate in RATES]
-    left = np.array([[_residual(recording, t - lag, tops, axes) for lag in LAGS] for t in clocks])
-    usual = int(np.argmin(np.abs(RATES - 1)))
+    places = np.array(list(tops.values()))
+    left = np.array([[_residual(recording, t - lag, places, axes) for lag in LAGS] for t in clocks])
+    written = (int(np.argmin(np.abs(RATES - 1))), int(np.argmin(np.abs(LAGS))))
     best = np.unravel_index(left.argmin(), left.shape)
-    if left[best] > CLEARLY * left[usual].min():
-        best = (usual, int(left[usual].argmin()))
-    written = (usual, int(np.argmin(np.abs(LAGS))))
+    if left[best] > CLEARLY * left[written[0]].min():
+        best = (written[0], int(left[written[0]].argmin()))
     if left[written] < NEAR**2 or left[best] > CLEARLY * left[written]:
         best = written
     if best[1] in (0, len(LAGS) - 1):
@@ -259,59 +340,45 @@ def _residual(recording: Recording, at: np.ndarray, tops: np.ndarray, axes: list
     """
     knots = np.asarray(recording.gripper_times, np.float64)
     path = np.asarray(recording.gripper_path, np.float64)
-    left = 0.0
+    variance = 0.0
     for axis in axes:
-        there = np.interp(at, knots, _leader(path, axis))
-        leads, follows = (places - np.median(places) for places in (there, tops[:, axis]))
-        size = max(float(leads @ leads), np.finfo(float).tiny)
-        off = follows - np.clip(leads @ follows / size, 1 - SCALE, 1 + SCALE) * leads
-        left += float((1.4826 * np.median(np.abs(off - np.median(off)))) ** 2)
-    return left
-
-
-def _top(points: Points) -> np.ndarray:
-    """The middle of the highest points."""
-    return np.median(points[points[:, 2] >= np.quantile(points[:, 2], TOP)], axis=0)
+        leader = np.interp(at, knots, _leader(path, axis))
+        leader = leader - np.median(leader)
+        top = tops[:, axis] - np.median(tops[:, axis])
+        size = max(float(leader @ leader), np.finfo(float).tiny)
+        off = top - np.clip(leader @ top / size, 1 - SCALE, 1 + SCALE) * leader
+        variance += float((1.4826 * np.median(np.abs(off - np.median(off)))) ** 2)
+    return variance
 
 
 # The clouds: are there enough points, on the sheet alone, and was none of it cut off?
 
 
-def _check_clouds(frames: Frames) -> list[Finding]:
+def _check_clouds(frames: _Frames) -> list[Finding]:
     """Number of points, outliers, faces of a box that cut the clouds, distance of the grippers."""
-    recording = frames.recording
-    if clouds_are_markers(recording):
-        return []
-    first, last = recording.info.frames_used
-    clouds, held = frames.thinned[first : last + 1], frames.grippers[first : last + 1]
-    pairs = list(zip(clouds, held, strict=True))
-    near = [np.max(KDTree(points).query(at)[0]) for points, at in pairs]
-    stray = [_stray_share(recording.info.sheet, *pair) for pair in pairs]
-    found = [
-        Finding.make("points", float(np.median([len(points) for points in clouds]))),
-        Finding.make("outliers", float(np.median(stray))),
-        Finding.make("grip", float(np.median(near))),
+    info = frames.recording.info
+    used = slice(info.frames_used[0], info.frames_used[1] + 1)
+    clouds = frames.thinned[used]
+    farthest = BEYOND * np.array([_reach(info.sheet, name) for name in info.sheet.pinned])
+    stray, near = [], []
+    for points, grippers in zip(clouds, frames.grippers[used], strict=True):
+        away = np.linalg.norm(points[:, None] - grippers, axis=-1)
+        far = (away > farthest).any(axis=1)  # or alone
+        stray.append(np.mean(far | outliers(points, NEIGHBOURS, DEVIATIONS)))
+        near.append(away.min(axis=0).max())
+    findings = [
+        _finding("points", float(np.median([len(points) for points in clouds]))),
+        _finding("outliers", float(np.median(stray))),
+        _finding("grip", float(np.median(near))),
     ]
     for axis, letter in enumerate("xyz"):
         for side, name in ((-1, "below"), (1, "above")):
             share, place = _cut(clouds, axis, side)
-            if axis == 2 and side < 0 and place < recording.info.table_height + ABOVE:
+            if axis == 2 and side < 0 and place < info.table_height + ABOVE:
                 continue  # the table, or a cut just above it
             words = f"share of frames whose clouds are cut {name} {letter} = {place:.3f} m"
-            found.append(Finding.make("crop", share, words, f"crop {letter}"))
-    return found
-
-
-def _stray_share(
-    sheet: SheetPlacement,
-    points: Float[np.ndarray, "point 3"],
-    held: Float[np.ndarray, "gripper 3"],
-) -> float:
-    """Share of points that are alone, or farther from a gripper than the sheet reaches."""
-    far = np.zeros(len(points), bool)
-    for name, at in zip(sheet.pinned, held, strict=True):
-        far |= np.linalg.norm(points - at, axis=1) > BEYOND * _reach(sheet, name)
-    return float(np.mean(far | outliers(points, NEIGHBOURS, DEVIATIONS)))
+            findings.append(_finding("crop", share, words, f"crop {letter}"))
+    return findings
 
 
 def _cut(clouds: list[np.ndarray], axis: int, side: int) -> tuple[float, float]:
@@ -319,5 +386,34 @@ def _cut(clouds: list[np.ndarray], axis: int, side: int) -> tuple[float, float]:
     ends = np.array([side * np.max(side * points[:, axis]) for points in clouds])
     place = side * np.max(side * ends)
     crowd = np.array([np.sum(side * (place - points[:, axis]) < FACE + VOXEL) for points in clouds])
-    there = (np.abs(ends - place) < SAME + VOXEL / 2) & (crowd >= CROWDED)
-    return float(np.mean(there)), float(place)
+    is_cut = (np.abs(ends - place) < SAME + VOXEL / 2) & (crowd >= CROWDED)
+    return float(np.mean(is_cut)), float(place)
+
+
+# Noise of the points
+
+
+def point_noise(recording: Recording) -> float:
+    """Standard deviation [m] of points across the surface; NaN where there are too few.
+
+    It is that from the plane through the `PATCH` nearest points, median over points of some
+    frames. The sheet's own curvature within these counts as noise.
+    """
+    first, last = recording.info.frames_used
+    deviations: list[float] = []
+    for frame in np.unique(np.linspace(first, last, NOISE_FRAMES).round().astype(int)):
+        points = cloud(recording, int(frame))
+        if len(points) < PATCH:
+            continue
+        chosen = points[:: max(1, len(points) // NOISE_POINTS)]
+        patches = points[KDTree(points).query(chosen, PATCH)[1]]
+        patches = patches - patches.mean(axis=1, keepdims=True)
+        least = np.linalg.eigvalsh(np.einsum("pni,pnj->pij", patches, patches))[:, 0]
+        # a plane through the patch takes three of its degrees of freedom
+        deviations += np.sqrt(np.maximum(least, 0) / (PATCH - 3)).tolist()
+    return float(np.median(deviations)) if deviations else math.nan
+
+
+def mean_distance(deviation: float) -> float:
+    """The mean distance [m] from a surface that normal noise of a standard deviation [m] gives."""
+    return deviation * math.sqrt(2 / math.pi)

@@ -1,15 +1,43 @@
 """Point clouds: files, frames in folders, thinning and cleaning."""
 
 import re
+import warnings
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Num
 from scipy.spatial import KDTree
 
 from r2s._util.extras import require
+
+
+def numbers(what: str, values: Any, *shape: int | str) -> Float[np.ndarray, "..."]:
+    """`values` as float64 of a shape, in which a name stands for any size.
+
+    Raises ValueError that begins with `what`, also where there are none, or some are not finite.
+    """
+    try:
+        array = np.asarray(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{what}: expected an array of numbers: {error}") from error
+    if array.size == 0:
+        raise ValueError(f"{what} is empty")
+    sizes = zip(shape, array.shape, strict=False)
+    fits = all(isinstance(axis, str) or axis == size for axis, size in sizes)
+    if array.ndim != len(shape) or not fits:
+        expected = ", ".join(map(str, shape))
+        raise ValueError(f"{what} must have the shape ({expected}), found {array.shape}")
+    bad = ~np.isfinite(array.reshape(len(array), -1)).all(axis=1)
+    if bad.any():
+        first = int(bad.argmax())
+        raise ValueError(
+            f"{what}: {bad.sum()} of {len(array)} are not finite, the first is number {first}: "
+            f"{array[first]}"
+        )
+    return array
 
 
 def find_numbered(
@@ -18,46 +46,41 @@ def find_numbered(
     """The files of a folder by the last number in their names (`000.npy`, `frame_12.npy`).
 
     All must have one of the `suffixes`; others are skipped. `first`: the number that the first file
-    must have. Raises FileNotFoundError (no such folder, no such file) or ValueError (mixed formats,
-    two files of one number, a number is missing).
+    must have. Raises FileNotFoundError or ValueError that names the folder and the frame.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder")
-    found = [(_number(path, suffixes), path) for path in sorted(folder.iterdir())]
-    numbered = [(number, path) for number, path in found if number is not None]
-    if not numbered:
-        formats = f"formats: {', '.join(suffixes)}"
+    frames: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        digits = re.findall(r"[0-9]+", path.stem)
+        is_frame = digits and path.suffix.lower() in suffixes and not path.name.startswith(".")
+        if not is_frame or not path.is_file():
+            continue
+        other = frames.setdefault(int(digits[-1]), path)
+        if other != path:
+            raise ValueError(
+                f"{folder}: frame {int(digits[-1])} is there twice: {other.name} and {path.name}: "
+                "remove one"
+            )
+    if not frames:
         raise FileNotFoundError(
-            f"{folder}: no numbered frames such as 000{next(iter(suffixes))} ({formats})"
+            f"{folder}: no numbered frames such as 000{next(iter(suffixes))} "
+            f"(formats: {', '.join(suffixes)})"
         )
-    formats = sorted({path.suffix.lower() for _, path in numbered})
+    formats = sorted({path.suffix.lower() for path in frames.values()})
     if len(formats) > 1:
         raise ValueError(f"{folder}: frames of mixed formats: {', '.join(formats)}")
-    frames: dict[int, Path] = {}
-    for number, path in numbered:
-        if number in frames:
-            names = f"{frames[number].name} and {path.name}"
-            raise ValueError(f"{folder}: frame {number} is there twice: {names}: remove one")
-        frames[number] = path
     start = min(frames) if first is None else first
-    for number in range(start, max(frames)):
-        if number not in frames:
-            found = f"found {len(frames)} frames from {min(frames)} to {max(frames)}"
-            raise ValueError(
-                f"{folder}: frame {number} is missing ({found}): restore it, or number the frames "
-                "without gaps"
-            )
     if min(frames) < start:
         raise ValueError(f"{folder}: frame {min(frames)} comes before the first frame, {start}")
+    for number in range(start, max(frames)):
+        if number not in frames:
+            raise ValueError(
+                f"{folder}: frame {number} is missing (found {len(frames)} frames from "
+                f"{min(frames)} to {max(frames)}): restore it, or number the frames without gaps"
+            )
     return dict(sorted(frames.items()))
-
-
-def _number(path: Path, suffixes: Collection[str]) -> int | None:
-    if path.name.startswith(".") or path.suffix.lower() not in suffixes or not path.is_file():
-        return None
-    digits = re.findall(r"[0-9]+", path.stem)
-    return int(digits[-1]) if digits else None
 
 
 def read_cloud(path: Path | str) -> Float[np.ndarray, "point 3"]:
@@ -67,46 +90,29 @@ def read_cloud(path: Path | str) -> Float[np.ndarray, "point 3"]:
     columns parted by blanks or commas, # starts a comment); pcd (needs pypcd4).
 
     Raises FileNotFoundError, ImportError (names the extra to install), or a ValueError that names
-    the file: unknown suffix, unreadable content, wrong shape, no points, non-finite points.
+    the file and what is wrong with it.
     """
-    path = Path(path)
-    points = read_values(path)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"{path}: expected an array (points, 3), found {points.shape}")
-    if len(points) == 0:
-        raise ValueError(f"{path}: the cloud is empty")
-    bad = ~np.isfinite(points).all(axis=1)
-    if bad.any():
-        raise ValueError(
-            f"{path}: {bad.sum()} of {len(points)} points are not finite, "
-            f"the first is point {bad.argmax()}: {points[bad.argmax()]}: export the cloud without "
-            "pixels that have no depth"
-        )
-    return points
+    values = read_values(path)
+    try:
+        return numbers("the cloud", values, "point", 3)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}: export the points that have a depth") from error
 
 
-def read_values(path: Path | str) -> Float[np.ndarray, "..."]:
-    """The numbers of a file as float64, with neither shape nor values checked.
-
-    Raises as `read_cloud`, less what that says about shape and values.
-    """
+def read_values(path: Path | str, dtype: type | None = np.float64) -> Num[np.ndarray, "..."]:
+    """The numbers of a file as a type (None: its own), unchecked; raises as `read_cloud`."""
     path = Path(path)
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         known = ", ".join(READERS)
         raise ValueError(f"{path}: unknown suffix {path.suffix!r}, expected one of {known}")
     try:
-        return np.asarray(reader(path), np.float64)
+        return np.asarray(reader(path), dtype)
     except (FileNotFoundError, ImportError):
         raise
     except Exception as error:  # the libraries raise anything, from IndexError to their own types
         kind = path.suffix.lower()[1:]
-        raise ValueError(f"{path}: cannot be read as {kind}: {error}") from error
-
-
-def find_frames(folder: Path | str, first: int | None = None) -> list[Path]:
-    """The numbered clouds of a folder, by their number; arguments and errors: `find_numbered`."""
-    return list(find_numbered(folder, READERS, first).values())
+        raise ValueError(f"{path}: cannot be read as {kind}: {error}: copy it again") from error
 
 
 def voxel_means(points: Float[np.ndarray, "point 3"], voxel: float) -> Float[np.ndarray, "cell 3"]:
@@ -145,45 +151,28 @@ def _read_npy(path: Path) -> np.ndarray:
 
 def _read_ply(path: Path) -> np.ndarray:
     trimesh = require("trimesh", "study", f"{path}: clouds in ply files")
-    count = _ply_vertices(path.read_bytes())
-    if count == 0:
-        return np.zeros((0, 3))
+    header = path.read_bytes().partition(b"end_header")[0]
+    promised = re.search(rb"^element vertex (\d+)", header, re.MULTILINE)
+    if not header.startswith(b"ply") or promised is None:
+        raise ValueError("no ply header that names vertices")
+    if int(promised[1]) == 0:
+        return np.zeros(0)
     # process=False: else vertices are merged and reordered.
-    loaded = trimesh.load(path, process=False)
-    vertices = np.asarray(getattr(loaded, "vertices", ()))
-    if len(vertices) != count:
-        raise ValueError(f"the header promises {count} vertices, found {len(vertices)}")
+    vertices = np.asarray(getattr(trimesh.load(path, process=False), "vertices", ()))
+    if len(vertices) != int(promised[1]):
+        raise ValueError(f"the header promises {int(promised[1])} vertices, found {len(vertices)}")
     return vertices
-
-
-def _ply_vertices(data: bytes) -> int:
-    """The number of vertices that the header promises; trimesh takes a cut ASCII file as it is."""
-    header, end, body = data.partition(b"end_header")
-    if not data.startswith(b"ply") or not end:
-        raise ValueError("no ply header")
-    counts = {
-        name: int(count) for name, count in re.findall(rb"^element (\S+) (\d+)", header, re.M)
-    }
-    if b"vertex" not in counts:
-        raise ValueError("the header names no vertices")
-    if b"format ascii" in header:
-        lines = sum(1 for line in body.splitlines() if line.strip())
-        if lines < sum(counts.values()):
-            raise ValueError(f"cut short: {lines} of {sum(counts.values())} lines of data")
-    return counts[b"vertex"]
 
 
 def _read_obj(path: Path) -> np.ndarray:
     # By hand: trimesh drops the vertices that no face uses and repeats others.
     lines = (line.split() for line in path.read_text().splitlines())
-    rows = [line[1:4] for line in lines if line[:1] == ["v"]]
-    return np.array(rows, np.float64) if rows else np.zeros((0, 3))
+    return np.array([line[1:4] for line in lines if line[:1] == ["v"]], np.float64)
 
 
 def _read_xyz(path: Path) -> np.ndarray:
-    lines = [line.split("#")[0].replace(",", " ") for line in path.read_text().splitlines()]
-    rows = [line for line in lines if line.strip()]
-    return np.loadtxt(rows, ndmin=2) if rows else np.zeros((0, 3))
+    with warnings.catch_warnings(action="ignore"):  # an empty file is an error of its own
+        return np.loadtxt(path.read_text().replace(",", " ").splitlines(), ndmin=2)
 
 
 def _read_pcd(path: Path) -> np.ndarray:
@@ -220,8 +209,6 @@ class Cleaning:
     - `neighbours`, `deviations`: a point is an outlier where its mean distance from this many
       neighbours is above the mean of all by this many standard deviations; 0 neighbours: none is.
     - `max_points`, `seed`: at most so many points a frame are drawn at random; 0: all.
-
-    Raises ValueError for a box without inside and for numbers that are negative.
     """
 
     workspace: tuple[Corner, Corner]
@@ -266,10 +253,7 @@ def inside(points: Float[np.ndarray, "point 3"], how: Cleaning) -> Bool[np.ndarr
 def outliers(
     points: Float[np.ndarray, "point 3"], neighbours: int, deviations: float
 ) -> Bool[np.ndarray, " point"]:
-    """Which points are much farther from their nearest neighbours than points are on average.
-
-    None where there are no more points than `neighbours`; thin the cloud first.
-    """
+    """Which points of a thinned cloud are much farther from their neighbours than the average."""
     if neighbours == 0 or len(points) <= neighbours:
         return np.zeros(len(points), bool)
     apart = KDTree(points).query(points, neighbours + 1)[0][:, 1:].mean(axis=1)

@@ -2,10 +2,9 @@
 
 import csv
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -18,24 +17,16 @@ SHARES = {"-": 1.0, "%": 1e-2}
 GRAMS = ("g", "kg", "grams", "kilograms")  # of mass: no force
 
 
-class Columns(NamedTuple):
-    """- `values`: in SI, column by column in the order in which they were asked for.
-    - `lines`: of the file, where each sample stands.
-    """
-
-    values: Float[np.ndarray, "sample column"]
-    lines: tuple[int, ...]
-
-
-def read_columns(path: Path | str, columns: Mapping[str, Mapping[str, float]]) -> Columns:
-    """Read some columns of a CSV with a header, separated by commas, semicolons or tabs.
+def read_columns(
+    path: Path | str, columns: Mapping[str, Mapping[str, float]]
+) -> tuple[Float[np.ndarray, "sample column"], list[int]]:
+    """Columns of a CSV (of commas, semicolons or tabs) in SI, and the lines of the samples.
 
     `columns`: their names and possible units. The header says which, as in "time_s", "Force [N]" or
-    "force (mN)". Other columns, blank lines and lines that start with # are skipped.
+    "force (mN)"; "" stands for none. Other columns, blank lines and comments (#) are skipped.
 
     Raises FileNotFoundError, or a ValueError that names the file and the line.
     """
-    path = Path(path)
     lines = read_lines(path)
     if not lines:
         raise ValueError(f"{path}: the log is empty")
@@ -51,63 +42,54 @@ def read_columns(path: Path | str, columns: Mapping[str, Mapping[str, float]]) -
         rows.append([number_in(path, number, cells[index]) * unit for index, unit in places])
     if len(rows) < 2:
         raise ValueError(f"{path}: expected two samples or more, found {len(rows)}")
-    return Columns(np.array(rows), tuple(number for number, _ in lines[1:]))
+    return np.array(rows), [number for number, _ in lines[1:]]
 
 
 def header_of(path: Path | str) -> list[str]:
     """The cells of a CSV's header; none of an empty file."""
-    lines = read_lines(Path(path))
-    return lines[0][1] if lines else []
+    return next((cells for _, cells in read_lines(path)), [])
 
 
-def read_lines(path: Path) -> list[tuple[int, list[str]]]:
+def read_lines(path: Path | str) -> list[tuple[int, list[str]]]:
     """The cells of a CSV's lines with their numbers, but for blank ones and comments (#).
 
     Raises FileNotFoundError, or a ValueError that names the file.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = Path(path).read_text(encoding="utf-8-sig")
+        lines = dict(enumerate(text.splitlines(), 1))
+        kept = {n: line for n, line in lines.items() if line.strip() and line.lstrip()[0] != "#"}
+        delimiter = max(",;\t", key=next(iter(kept.values()), "").count)
+        rows = list(csv.reader(kept.values(), delimiter=delimiter, skipinitialspace=True))
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: no text in UTF-8 ({error.reason}): export it again") from error
-    kept = [
-        (number, line)
-        for number, line in enumerate(text.splitlines(), 1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if not kept:
-        return []
-    delimiter = max(",;\t", key=kept[0][1].count)
-    cells = csv.reader([line for _, line in kept], delimiter=delimiter, skipinitialspace=True)
-    numbers = [number for number, _ in kept]
-    try:
-        cells = list(cells)
     except csv.Error as error:
         raise ValueError(f"{path}: no CSV: {error}") from error
-    if len(cells) != len(numbers):
+    if len(rows) != len(kept):
         raise ValueError(f"{path}: a quotation mark is not closed")
-    return [(n, [c.strip() for c in row]) for n, row in zip(numbers, cells, strict=True)]
+    return [(n, [c.strip() for c in row]) for n, row in zip(kept, rows, strict=True)]
 
 
 def _column(
-    path: Path, header: list[str], name: str, units: Mapping[str, float]
+    path: Path | str, header: list[str], name: str, units: Mapping[str, float]
 ) -> tuple[int, float]:
     """The index of a column, and its unit in SI."""
     unit_of = r"(?:[\s_]*[\[(]?\s*([\w%-]+)\s*[\])]?)?"
     pattern = re.compile(re.escape(name) + unit_of, re.IGNORECASE)
-    found = [(i, match[1]) for i, cell in enumerate(header) if (match := pattern.fullmatch(cell))]
-    if len(found) != 1:
+    matches = [(i, m[1] or "") for i, cell in enumerate(header) if (m := pattern.fullmatch(cell))]
+    if len(matches) != 1:
         raise ValueError(
             f"{path}: expected one column {name!r} with its unit, such as "
-            f"'{name}_{next(iter(units))}', found {len(found)} in {header}: rename it, or name "
+            f"'{name}_{next(iter(units))}', found {len(matches)} in {header}: rename it, or name "
             "the column that is meant"
         )
-    index, unit = found[0]
-    if unit in GRAMS and "N" in units:
-        raise ValueError(
-            f"{path}: {header[index]!r} is a mass: a force is in N, or in gf where a scale shows "
-            "grams (1 gf = 9.80665 mN): name the column force_gf if it does"
-        )
+    index, unit = matches[0]
     if unit not in units:
+        if unit in GRAMS and "N" in units:
+            raise ValueError(
+                f"{path}: {header[index]!r} is a mass: a force is in N, or in gf where a scale "
+                "shows grams (1 gf = 9.80665 mN): name the column force_gf if it does"
+            )
         raise ValueError(
             f"{path}: the unit of {header[index]!r} is not known: write one of {', '.join(units)} "
             f"into the header, as in '{name} [{next(iter(units))}]'"
@@ -115,7 +97,7 @@ def _column(
     return index, units[unit]
 
 
-def number_in(path: Path, line: int, cell: str, what: str = "a finite number") -> float:
+def number_in(path: Path | str, line: int, cell: str, what: str = "a finite number") -> float:
     """The number in a cell; ValueError that names the file and the line when there is none."""
     try:
         value = float(cell)
@@ -124,6 +106,17 @@ def number_in(path: Path, line: int, cell: str, what: str = "a finite number") -
     if not np.isfinite(value):
         raise ValueError(f"{path}: line {line}: expected {what}, found {cell!r}: write a number")
     return value
+
+
+def check_increasing(
+    path: Path | str, lines: Sequence[int], times: Float[np.ndarray, " sample"]
+) -> None:
+    """Raise a `ValueError` that names the file and the first line whose time [s] is not later."""
+    for at in np.flatnonzero(np.diff(times) <= 0)[:1]:
+        raise ValueError(
+            f"{path}: line {lines[at + 1]}: times must increase, found {times[at]:.9g} s, then "
+            f"{times[at + 1]:.9g} s: sort the lines by time, and drop those that are repeated"
+        )
 
 
 WORST_FIT = 0.9  # share of the force's variance that the displacement must explain
@@ -140,53 +133,13 @@ class ForceLog:
 
 
 def read_force_log(path: Path | str, time: str = "time", force: str = "force") -> ForceLog:
-    """Read the columns `time` and `force` of a CSV, as `read_columns`.
+    """Read the columns `time` (s, ms, us) and `force` (N, mN, cN, kN, gf, kgf) of a CSV.
 
-    Their units: seconds (s, ms, us), newtons (N, mN, cN, kN, gf, kgf). Raises also ValueError for
-    times that do not increase.
+    Raises as `read_columns`, and ValueError for times that do not increase.
     """
-    path = Path(path)
     values, lines = read_columns(path, {time: SECONDS, force: NEWTONS})
-    later = np.diff(values[:, 0]) > 0
-    if not later.all():
-        at = int(later.argmin())
-        first, then = values[at, 0], values[at + 1, 0]
-        raise ValueError(
-            f"{path}: line {lines[at + 1]}: times must increase, found {first:g} s, then "
-            f"{then:g} s: sort the log, or keep one of samples that are there twice"
-        )
+    check_increasing(path, lines, values[:, 0])
     return ForceLog(values[:, 0], values[:, 1], str(path))
-
-
-def at_frames(
-    log: ForceLog, times: Float[np.ndarray, " frame"], offset: float = 0.0
-) -> Float[np.ndarray, " frame"]:
-    """The force [N] at the frames of a video, each the mean over the time of a frame.
-
-    Frame i is taken at `times[i] + offset` [s] on the log's clock. Raises ValueError that names
-    the frame: times that do not increase, a frame outside the log, or in a gap of it.
-    """
-    if len(times) == 0 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        raise ValueError("the times of the frames must be finite and increase [s]")
-    at = times + offset
-    interval = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
-    slack = 0.5 * interval
-    for frame in np.flatnonzero((at < log.times[0] - slack) | (at > log.times[-1] + slack))[:1]:
-        raise ValueError(
-            f"{log.name}: frame {frame}, at {at[frame]:.3f} s on the log's clock, is outside of "
-            f"the log, which runs from {log.times[0]:.3f} to {log.times[-1]:.3f} s: check the "
-            f"offset ({offset:g} s), or use the frames in between"
-        )
-    gap = np.diff(log.times)
-    after = np.clip(np.searchsorted(log.times, at), 1, len(log.times) - 1)
-    wide = gap[after - 1] > max(5 * float(np.median(gap)), 2 * interval)
-    for frame in np.flatnonzero(wide)[:1]:
-        start = log.times[after[frame] - 1]
-        raise ValueError(
-            f"{log.name}: frame {frame}, at {at[frame]:.3f} s, is in a gap of the log, "
-            f"{gap[after[frame] - 1]:.3f} s from {start:.3f} s on: leave these frames out"
-        )
-    return _means(log, at, slack)
 
 
 def estimate_offset(
@@ -195,27 +148,26 @@ def estimate_offset(
     displacement: Float[np.ndarray, " frame"],
     longest: float = 5.0,
 ) -> float:
-    """The offset [s] for `at_frames`, from the motion: that at which displacement explains force.
+    """What to add to the frames' `times` [s] to have those of the log, from the motion.
 
     `displacement` [m] is how far the pulled side went, for example the mean over its markers. The
     force is fitted by a cubic in the displacement, since fabrics stiffen, at offsets up to
     `longest` [s] from where both records begin together. The pull must begin and end in the video.
 
-    Raises ValueError when nothing moves, when no offset explains 90 % of the force's variance, or
-    when the best is at the end of the range.
+    Raises ValueError when no offset explains 90 % of the force's variance.
     """
     if displacement.shape != times.shape or not np.isfinite(displacement).all():
         raise ValueError("give one finite displacement [m] for each frame's time")
     if np.ptp(displacement) == 0 or np.ptp(log.force) == 0:
         raise ValueError(f"{log.name}: nothing moves, or the force is constant: no offset shows")
-    start = log.times[0] - times[0]
-    step = max(FINEST, float(np.median(np.diff(times))) / 20)
-    tried = start + np.arange(-longest, longest + step, step)
-    basis = _cubic(displacement)
+    interval = float(np.median(np.diff(times)))
+    step = max(FINEST, interval / 20)
+    tried = log.times[0] - times[0] + np.arange(-longest, longest + step, step)
+    scaled = (displacement - displacement.mean()) / np.ptp(displacement)
+    basis = np.linalg.qr(np.stack([scaled**power for power in range(4)], axis=1))[0]
     # As noisy as it would be at the frames: else the cubic follows the noise of single samples.
-    half = 0.5 * float(np.median(np.diff(times)))
-    smooth = ForceLog(log.times, _means(log, log.times, half), log.name)
-    fits = np.array([_explained(smooth, times, basis, offset) for offset in tried])
+    smooth = ForceLog(log.times, _means(log, 0.5 * interval), log.name)
+    fits = np.array([_explained(smooth, times + offset, basis) for offset in tried])
     best = int(fits.argmax())
     if not fits[best] > WORST_FIT:
         raise ValueError(
@@ -228,33 +180,23 @@ def estimate_offset(
             f"{log.name}: the best offset, {tried[best]:.2f} s, is the last that the records "
             "allow: they must hold the rest before the pull and after it"
         )
-    before, here, after = fits[best - 1 : best + 2]
-    bend = before - 2 * here + after
+    before, peak, after = fits[best - 1 : best + 2]
+    bend = before - 2 * peak + after
     return float(tried[best] + (step * 0.5 * (before - after) / bend if bend < 0 else 0.0))
 
 
-def _means(log: ForceLog, at: np.ndarray, half: float) -> np.ndarray:
-    """The mean force within `half` [s] of times on the log's clock, as far as the log goes."""
+def _means(log: ForceLog, half: float) -> np.ndarray:
+    """The mean force within `half` [s] of each sample, as far as the log goes."""
     integral = make_interp_spline(log.times, log.force, k=1).antiderivative()
-    low, high = (np.clip(at + sign * half, log.times[0], log.times[-1]) for sign in (-1, 1))
-    width = high - low
-    mean = (integral(high) - integral(low)) / np.where(width > 0, width, 1)
-    return np.where(width > 0, mean, np.interp(at, log.times, log.force))
+    low, high = (np.clip(log.times + sign * half, log.times[0], log.times[-1]) for sign in (-1, 1))
+    return (integral(high) - integral(low)) / (high - low)
 
 
-def _cubic(displacement: np.ndarray) -> np.ndarray:
-    """An orthonormal basis of cubics in the displacement, over the frames."""
-    scaled = (displacement - displacement.mean()) / np.ptp(displacement)
-    return np.linalg.qr(np.stack([scaled**power for power in range(4)], axis=1))[0]
-
-
-def _explained(log: ForceLog, times: np.ndarray, basis: np.ndarray, offset: float) -> float:
-    """Which share of the force's variance at the frames a cubic in the displacement explains."""
-    at = times + offset
-    if at[0] < log.times[0] - 1e-9 or at[-1] > log.times[-1] + 1e-9:
-        # Rest goes on before a log and after it, but not for long: half of the frames must be in.
-        if ((at >= log.times[0]) & (at <= log.times[-1])).sum() < len(at) / 2:
-            return -np.inf
+def _explained(log: ForceLog, at: np.ndarray, basis: np.ndarray) -> float:
+    """Which share of the force's variance, at times on the log's clock, a basis explains."""
+    inside = (at >= log.times[0] - 1e-9) & (at <= log.times[-1] + 1e-9)
+    if inside.sum() < len(at) / 2:  # rest continues outside of a log, but not for long
+        return -np.inf
     force = np.interp(at, log.times, log.force)
     force = force - force.mean()
     variance = float(force @ force)

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Num, UInt8
 
 from r2s._util.extras import require
 from r2s._util.files import write_bytes
-from r2s.recordings.clouds import find_numbered
+from r2s.recordings.clouds import find_numbered, read_values
 
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -17,8 +17,7 @@ IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 def read_grey(path: Path | str) -> Iterator[UInt8[np.ndarray, "height width"]]:
     """The frames of a video, or of a folder of numbered images (`find_numbered`), as grey images.
 
-    Raises FileNotFoundError, ImportError (names the extra), or a ValueError that names the file
-    and the frame: no video, no images, a damaged one or one of another size than the first.
+    Raises FileNotFoundError, ImportError (names the extra), or ValueError (file and frame).
     """
     path = Path(path)
     frames = _images(path) if path.is_dir() else _video(path)
@@ -30,7 +29,7 @@ def read_grey(path: Path | str) -> Iterator[UInt8[np.ndarray, "height width"]]:
                 f"{name}: frame {number} has {image.shape[1]} x {image.shape[0]} pixels, the first "
                 f"{size[1]} x {size[0]}: one recording needs one size"
             )
-        yield image
+        yield np.asarray(image, np.uint8)
 
 
 def _images(folder: Path) -> Iterator[tuple[Path, np.ndarray]]:
@@ -41,7 +40,7 @@ def _images(folder: Path) -> Iterator[tuple[Path, np.ndarray]]:
         image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
         if image is None:
             raise ValueError(f"{file}: damaged: copy it again from the camera")
-        yield file, np.asarray(image, np.uint8)
+        yield file, image
 
 
 def _video(path: Path) -> Iterator[tuple[Path, np.ndarray]]:
@@ -49,23 +48,21 @@ def _video(path: Path) -> Iterator[tuple[Path, np.ndarray]]:
         raise FileNotFoundError(f"{path}: no such video file or folder of images")
     cv2 = require("cv2", "camera", "videos and images")
     capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise ValueError(f"{path}: no video that OpenCV can read: convert it to MP4 (H.264)")
+    promised, number = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0
     try:
-        if not capture.isOpened():
-            raise ValueError(f"{path}: no video that OpenCV can read: convert it to MP4 (H.264)")
-        promised, number = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0
-        while (found := capture.read())[0]:
+        while (frame := capture.read())[0]:
             number += 1
-            image = found[1] if found[1].ndim == 2 else cv2.cvtColor(found[1], cv2.COLOR_BGR2GRAY)
-            yield path, np.asarray(image, np.uint8)
+            image = frame[1]
+            yield path, image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     finally:
         capture.release()
-    if number < promised - 1:  # some containers count one frame too many
+    if number < max(promised - 1, 1):  # some containers count one frame too many
         raise ValueError(
             f"{path}: frame {number} cannot be read, of {promised} that the file promises: it is "
             "cut short or damaged; copy it again, or cut it before that frame"
         )
-    if number == 0:
-        raise ValueError(f"{path}: the video has no frames")
 
 
 def read_png(path: Path) -> np.ndarray:
@@ -96,11 +93,10 @@ def read_depth(
     """A depth image in metres; 0 where the camera measured nothing (0, NaN or infinity in files).
 
     16-bit PNG or NPY, `scale` metres per unit, `resolution` pixels (across, down). Raises
-    FileNotFoundError or ValueError that names the file: truncated, of another kind or size,
-    negative depths, no depth at all, depths that are no metres.
+    FileNotFoundError, or ValueError that names the file.
     """
-    units = _read_npy(path) if path.suffix.lower() == ".npy" else read_png(path)
-    if units.ndim != 2 or units.dtype == np.uint8 or units.dtype.kind not in "uif":
+    units = read_values(path, None) if path.suffix.lower() == ".npy" else read_png(path)
+    if units.ndim != 2 or units.dtype == np.uint8:
         kind = f"{8 * units.dtype.itemsize} bits in {units.shape[2] if units.ndim > 2 else 1}"
         raise ValueError(
             f"{path}: expected depth as a 16-bit PNG or NPY of one channel, found {kind}: "
@@ -108,22 +104,28 @@ def read_depth(
         )
     _check_size(path, units, resolution, "export the depth at the resolution of the calibration")
     depth = np.asarray(units, np.float32)
-    if units.dtype.kind == "f":
-        depth = np.where(np.isfinite(depth), depth, np.float32(0))
+    depth = np.where(np.isfinite(depth), depth, np.float32(0))
     if (depth < 0).any():
         raise ValueError(
             f"{path}: {(depth < 0).sum()} depths are negative, the least is {depth.min():g}: "
             "depth is the distance along the camera's axis, 0 where unknown"
         )
     depth = depth * np.float32(scale)
-    _check_unit(path, depth, scale)
+    if not (depth > 0).any():
+        raise ValueError(f"{path}: no pixel has a depth: drop the frame from all folders")
+    median = float(np.median(depth[depth > 0]))
+    if not NEAREST <= median <= FARTHEST:
+        raise ValueError(
+            f"{path}: the median depth is {median:g} m with depth_scale {scale:g}: depth_scale is "
+            "metres per unit of the file, 0.001 for millimetres, 1 for metres"
+        )
     return depth
 
 
 def read_mask(path: Path, resolution: tuple[int, int]) -> Bool[np.ndarray, "down across"]:
     """Which pixels a mask marks: those that are not zero, in any channel but opacity.
 
-    Raises FileNotFoundError or ValueError that names the file: truncated, of another size.
+    Raises as `read_depth`.
     """
     image = read_png(path)
     _check_size(path, image, resolution, "make the masks in the pixels of the depth images")
@@ -137,10 +139,7 @@ def encode_png(image: Num[np.ndarray, "down across *channel"]) -> bytes:
 
 
 def write_depth(path: Path, depth: Float[np.ndarray, "down across"], scale: float) -> None:
-    """Write a depth image [m] as a 16-bit PNG in units of `scale` [m].
-
-    Raises ValueError for a depth that does not fit into 16 bits.
-    """
+    """Write a depth image [m] as a 16-bit PNG in units of `scale` [m]; ValueError: does not fit."""
     units = np.rint(depth / scale)
     if units.max() > DEEPEST:
         raise ValueError(f"{depth.max():g} m does not fit into 16 bits of {scale:g} m")
@@ -148,35 +147,9 @@ def write_depth(path: Path, depth: Float[np.ndarray, "down across"], scale: floa
 
 
 def _check_size(path: Path, image: np.ndarray, resolution: tuple[int, int], remedy: str) -> None:
-    found = image.shape[1], image.shape[0]
-    if found != tuple(resolution):
-        size = "{} x {}".format
+    down, across = image.shape[:2]
+    if (across, down) != tuple(resolution):
         raise ValueError(
-            f"{path}: the image has {size(*found)} pixels, cameras.json says {size(*resolution)}: "
-            f"{remedy}"
+            f"{path}: the image has {across} x {down} pixels, cameras.json says "
+            f"{resolution[0]} x {resolution[1]}: {remedy}"
         )
-
-
-def _check_unit(path: Path, depth: np.ndarray, scale: float) -> None:
-    sample = depth[::4, ::4]
-    sample = sample[sample > 0]
-    if len(sample) == 0 and not (depth > 0).any():
-        raise ValueError(f"{path}: no pixel has a depth: drop the frame from all folders")
-    if len(sample) and not NEAREST <= (middle := float(np.median(sample))) <= FARTHEST:
-        raise ValueError(
-            f"{path}: the median depth is {middle:g} m with depth_scale {scale:g}: depth_scale is "
-            "metres per unit of the file, 0.001 for millimetres, 1 for metres"
-        )
-
-
-def _read_npy(path: Path) -> np.ndarray:
-    try:
-        values = np.load(path, allow_pickle=False)
-        if not isinstance(values, np.ndarray):
-            raise ValueError("an archive of arrays, expected one depth image")
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # a damaged file raises anything
-        size = path.stat().st_size
-        raise ValueError(f"{path}: damaged NPY of {size} bytes ({error}): copy it again") from error
-    return values

@@ -13,7 +13,8 @@ from jaxtyping import Float
 
 from r2s._util.files import read_json
 from r2s._util.units import positive
-from r2s.recordings.clouds import find_frames, read_cloud, read_values
+from r2s.recordings.cameras import is_rotation
+from r2s.recordings.clouds import READERS, find_numbered, numbers, read_cloud, read_values
 from r2s.recordings.recording import (
     MeasurementUncertainty,
     Recording,
@@ -38,18 +39,18 @@ class Transform:
 
     def __post_init__(self) -> None:
         positive("m per unit", scale=self.scale)
-        rotation = np.array(self.rotation)
-        square = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-6)
-        if not square or np.linalg.det(rotation) < 0:
-            raise ValueError(f"rotation must be orthonormal with determinant 1, found {rotation}")
+        if not is_rotation(np.array(self.rotation), 1e-6):
+            raise ValueError(
+                f"rotation must be orthonormal with determinant 1, found {self.rotation}"
+            )
 
 
 @dataclass(frozen=True)
 class Gripper:
     """The commanded path: `file` (knot, 3) or (knot, gripper, 3), `rate` knots per second [Hz].
 
-    `offset` [m] leads, in the world, from the commanded tool point to the cloth that is held;
-    `note` says how it was measured.
+    `offset` [m] is the place of the cloth that is held, in the world, less the commanded tool
+    point; `note` says how it was measured.
     """
 
     file: str
@@ -64,7 +65,7 @@ class Gripper:
 
 @dataclass(frozen=True)
 class Session:
-    """Recordings that were calibrated alike, and what moves their clouds into the world.
+    """Recordings of one calibration, and what moves their clouds into the world.
 
     - `recordings`: a regex for the whole folder name.
     - `shift`: is added to their points in the world, [m]; `note` says how it was found.
@@ -148,10 +149,7 @@ def to_world(transform: Transform, points: Float[np.ndarray, "*_ 3"]) -> np.ndar
 
 
 def hash_values(values: np.ndarray) -> str:
-    """The sha256 of the values as little-endian float32 in C order.
-
-    Copies in double and in single precision, or in another file format, have one hash.
-    """
+    """The sha256 of the values as little-endian float32 in C order, whatever the file's format."""
     return hashlib.sha256(np.asarray(values, "<f4").tobytes()).hexdigest()
 
 
@@ -160,18 +158,15 @@ def default_manifest() -> Path:
     return Path(__file__).parents[1] / "data_manifests" / "diffcloud.json"
 
 
-def manifest_for(folder: Path | str) -> Manifest:
-    """The manifest of a folder of recordings: its own `manifest.json`, else the default one.
-
-    Raises as `read_manifest`.
-    """
-    return read_manifest(manifest_of(folder))
-
-
 def manifest_of(folder: Path | str) -> Path:
-    """The file of `manifest_for`."""
+    """The file of a folder of recordings: its own `manifest.json`, else the default one."""
     own = Path(folder) / "manifest.json"
     return own if own.exists() else default_manifest()
+
+
+def manifest_for(folder: Path | str) -> Manifest:
+    """The manifest of a folder of recordings (`manifest_of`); raises as `read_manifest`."""
+    return read_manifest(manifest_of(folder))
 
 
 def read_manifest(path: Path | str) -> Manifest:
@@ -202,12 +197,12 @@ def read_recordings(
 
 
 def sources(folder: Path | str, manifest: Manifest, name: str) -> list[Path]:
-    """The files that a recording is read from, as far as they are there, sorted.
+    """The files that a recording is read from, as far as they exist, sorted.
 
     Its manifest, the gripper's path, cameras.json, and all in its folder but colour images.
     """
     folder = Path(folder)
-    gripper = folder / manifest.scenarios[_scenario_of(manifest, name)[0]].gripper.file
+    gripper = folder / _scenario_of(manifest, name)[1].gripper.file
     inside = (path for path in (folder / name).rglob("*") if path.parent.name != "colour")
     files = (manifest_of(folder), gripper, find_rig(folder / name), *inside)
     return sorted({path for path in files if path is not None and path.is_file()})
@@ -223,27 +218,38 @@ def read_recording(
     `info.verified`: True if all its files have the values listed in the manifest, None if some are
     not listed; False, with a warning, if a listed one differs or is missing.
 
-    Raises FileNotFoundError or a ValueError that names the file or folder: a name that fits no
-    scenario or several, files that are missing, damaged, empty or not finite.
+    Raises FileNotFoundError or a ValueError that names the file or folder.
     """
     folder = Path(folder)
-    scenario_name, fabric, trial = _scenario_of(manifest, name)
-    scenario = manifest.scenarios[scenario_name]
+    scenario_name, scenario, match = _scenario_of(manifest, name)
     path = _read_path(folder / scenario.gripper.file)
     if find_rig(folder / name):
         rig = read_rig(folder / name)
-        times, seen = read_clouds(folder / name, rig, scenario.frame_rate, watch)
-        clouds, verified = [to_world(scenario.cloud, points) for points in seen], None
+        times, clouds = read_clouds(folder / name, rig, scenario.frame_rate, watch)
+        verified = None
     else:
-        times, clouds, verified = _numbered_clouds(folder, manifest, name, scenario, path, watch)
-    session = _session(scenario, name)
-    clouds = [points + np.array(session.shift) for points in clouds]
+        frames = list(find_numbered(folder / name, READERS, scenario.first_frame).values())
+        times = np.arange(len(frames)) / scenario.frame_rate
+        clouds = [read_cloud(frame) for frame in watch(frames)]
+        files = {f"{name}/{frame.name}": c for frame, c in zip(frames, clouds, strict=True)}
+        verified = _verify(manifest.files, name, files | {scenario.gripper.file: path})
+        if scenario.drop_repeats:
+            clouds = [_distinct(points) for points in clouds]
+    shift, views = (0.0, 0.0, 0.0), scenario.views
+    if scenario.sessions:
+        patterns = [session.recordings for session in scenario.sessions]
+        session = scenario.sessions[_matching(name, patterns, "sessions")[0]]
+        shift = session.shift
+        if views is not None:
+            box = session.workspace or views.clean.workspace
+            views = replace(views, clean=replace(views.clean, workspace=box))
+            views = shifted(views, shift)
     source = f"{manifest.source.repository} {manifest.source.commit} {manifest.source.path}"
     info = RecordingInfo(
         name=name,
         scenario=scenario_name,
-        fabric=fabric,
-        trial=trial,
+        fabric=match["fabric"],
+        trial=match["trial"] or "1",
         source=source if verified else str(folder / name),
         frames_used=scenario.frames_used,
         sheet=scenario.sheet,
@@ -251,10 +257,10 @@ def read_recording(
         verified=verified,
         time_offset=scenario.time_offset,
         doubt=scenario.doubt,
-        views=_moved_views(scenario.views, session),
+        views=views,
     )
     return make_recording(
-        clouds,
+        [to_world(scenario.cloud, points) + np.array(shift) for points in clouds],
         times + scenario.time_offset,
         to_world(scenario.gripper.transform, path) + np.array(scenario.gripper.offset),
         np.arange(len(path)) / scenario.gripper.rate,
@@ -262,69 +268,40 @@ def read_recording(
     )
 
 
-def _numbered_clouds(
-    folder: Path,
-    manifest: Manifest,
-    name: str,
-    scenario: Scenario,
-    path: np.ndarray,
-    watch: Watch,
-) -> tuple[np.ndarray, list[np.ndarray], bool | None]:
-    """Times [s] on the cameras' clock, clouds [m] in the world, and whether they are verified."""
-    frames = find_frames(folder / name, scenario.first_frame)
-    clouds = {f"{name}/{frame.name}": read_cloud(frame) for frame in watch(frames)}
-    verified = _verify(manifest.files, name, clouds | {scenario.gripper.file: path})
-    kept = [_distinct(points) if scenario.drop_repeats else points for points in clouds.values()]
-    world = [to_world(scenario.cloud, points) for points in kept]
-    return np.arange(len(frames)) / scenario.frame_rate, world, verified
-
-
-def _session(scenario: Scenario, name: str) -> Session:
-    if not scenario.sessions:
-        return Session(".*", (0.0, 0.0, 0.0), "")
-    fits = [each for each in scenario.sessions if re.fullmatch(each.recordings, name)]
+def _matching(name: str, patterns: Sequence[str], kind: str) -> tuple[int, re.Match[str]]:
+    """The one of some patterns that the name of a recording fits, by its number."""
+    matches = [re.fullmatch(pattern, name) for pattern in patterns]
+    fits = [(index, match) for index, match in enumerate(matches) if match]
     if len(fits) != 1:
-        known = [each.recordings for each in scenario.sessions]
-        raise ValueError(f"{name!r} fits {len(fits)} sessions, expected one of: {known}")
+        raise ValueError(f"{name!r} fits {len(fits)} {kind}, expected one of: {list(patterns)}")
     return fits[0]
 
 
-def _moved_views(views: Views | None, session: Session) -> Views | None:
-    """The views of a session's recordings, in the world."""
-    if views is None:
-        return None
-    if session.workspace is not None:
-        views = replace(views, clean=replace(views.clean, workspace=session.workspace))
-    return shifted(views, session.shift)
-
-
-def _scenario_of(manifest: Manifest, name: str) -> tuple[str, str, str]:
-    fits = [(s, m) for s, v in manifest.scenarios.items() if (m := re.fullmatch(v.folder, name))]
-    if len(fits) != 1:
-        patterns = {s: v.folder for s, v in manifest.scenarios.items()}
-        raise ValueError(f"{name!r} fits {len(fits)} scenarios, expected one of: {patterns}")
-    scenario, match = fits[0]
-    return scenario, match["fabric"], match["trial"] or "1"
+def _scenario_of(manifest: Manifest, name: str) -> tuple[str, Scenario, re.Match[str]]:
+    """The scenario of a recording, and the match of its folder with groups fabric and trial."""
+    known = list(manifest.scenarios.items())
+    index, match = _matching(name, [scenario.folder for _, scenario in known], "scenarios")
+    return *known[index], match
 
 
 def _read_path(file: Path) -> np.ndarray:
     path = read_values(file)
-    if path.ndim not in (2, 3) or path.shape[-1] != 3 or len(path) == 0:
-        raise ValueError(f"{file}: expected (knot, 3) or (knot, gripper, 3), found {path.shape}")
-    if not np.isfinite(path).all():
-        raise ValueError(f"{file}: the gripper path is not finite")
-    return path
+    try:
+        return numbers("the gripper path", path, "knot", *["gripper"] * (path.ndim - 2), 3)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}: expected (knot, 3) or (knot, gripper, 3)") from error
 
 
-def _verify(listed: Mapping[str, str], name: str, found: Mapping[str, np.ndarray]) -> bool | None:
-    differ = [f for f, values in found.items() if f in listed and hash_values(values) != listed[f]]
-    differ += [f for f in listed if f.startswith(f"{name}/") and f not in found]
+def _verify(listed: Mapping[str, str], name: str, values: Mapping[str, np.ndarray]) -> bool | None:
+    """Whether values of files are those listed for a recording; None: some are not listed."""
+    differ = [f for f, v in values.items() if f in listed and hash_values(v) != listed[f]]
+    differ += [f for f in listed if f.startswith(f"{name}/") and f not in values]
     if differ:
         warnings.warn(
-            f"{name}: not the published values, or missing: {', '.join(differ)}", stacklevel=4
+            f"{name}: not the published values, or missing: {', '.join(differ)}", stacklevel=3
         )
         return False
-    return True if all(file in listed for file in found) else None
+    return True if values.keys() <= listed.keys() else None
 
 
 def _distinct(points: np.ndarray) -> np.ndarray:

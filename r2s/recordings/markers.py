@@ -5,21 +5,34 @@
     markers = to_metres(homography, tracks.pixels)
 
 OpenCV detects the dots and finds their grid in the first frame; it has no tracker for dots that are
-covered for a while and come back.
+covered for a while and come back. It also finds the corners of a checkerboard on the table
+(`cv2.findChessboardCornersSB`), and removes the distortion of a lens (`cv2.undistortPoints`).
 
 Images are grey, 8 bits, (height, width); places in them are (x, y), x to the right and y down,
 [px], whole numbers at the centres of pixels. Needs OpenCV: pip install 'r2s[camera]'.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 from scipy.spatial import KDTree
 
 from r2s._util.extras import require
+
+Places = Float[np.ndarray, "dot 2"]
+Sizes = Float[np.ndarray, " dot"]
+
+CONTRAST = 0.12  # a dot differs from the cloth by at least this part of its brightness
+ROUND = 0.6  # least ratio of a dot's width to its length, in the image
+CIRCULAR = 0.8  # least 4 pi area / perimeter^2 of a dot; of half a disc it is 0.75
+SIZE_CHANGE = 1.14  # factor by which a dot may differ from the others in how its diameter changed
+SMALLEST, LARGEST = 4.0, 6.0  # [px] a dot is across at least; at most this part of the image
+STEP = 3  # grey levels from one threshold to the next
+FIRST_BLUR = 1.6  # [px], before the size of the dots is known
+GATE = 0.4  # of the spacing: farther from its prediction a dot is another one
+CREDIBLE = 0.2  # of the spacing: farther from the smooth motion of all a dot is no marker
 
 
 def plane_homography(
@@ -29,49 +42,31 @@ def plane_homography(
 ) -> Float[np.ndarray, "3 3"]:
     """The map from an image to the plane of the table, by least squares over known points.
 
-    `pixels` [px] and `metres` [m] are the same points. Raises ValueError when there are fewer than
-    four, when three of four lie on a line, or when it misses a point by more than `tolerance` [m]:
-    then two are swapped, one is misread, or the lens bends (see `undistort`).
+    `pixels` [px] and `metres` [m] are the same points, four or more. Raises ValueError when they do
+    not determine it, or when it misses one by more than `tolerance` [m].
     """
     cv2 = require("cv2", "camera", "the plane of the table")
     if len(pixels) < 4 or len(pixels) != len(metres):
-        found = f"found {len(pixels)} in the image and {len(metres)} on the table"
-        raise ValueError(f"a plane needs at least four points, known in both: {found}")
+        raise ValueError(
+            "a plane needs at least four points, known in both: found "
+            f"{len(pixels)} in the image and {len(metres)} on the table"
+        )
     for name, points in (("image", pixels), ("table", metres)):
         if not np.isfinite(points).all():
             raise ValueError(f"the points in the {name} must be finite")
         extent = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if extent[1] < 1e-3 * extent[0]:
             raise ValueError(f"the points in the {name} lie on a line: spread them over the table")
-    found, _ = cv2.findHomography(np.asarray(pixels, float), np.asarray(metres, float), 0)
-    if found is None or not np.isfinite(found).all():
+    homography, _ = cv2.findHomography(np.asarray(pixels, float), np.asarray(metres, float), 0)
+    if homography is None or not np.isfinite(homography).all():
         raise ValueError("no plane fits the points: three of them lie on a line, or two coincide")
-    misses = np.linalg.norm(to_metres(found, np.asarray(pixels, float)) - metres, axis=1)
+    misses = np.linalg.norm(to_metres(homography, np.asarray(pixels, float)) - metres, axis=1)
     if misses.max() > tolerance:
         raise ValueError(
             f"the plane misses point {misses.argmax()} by {1e3 * misses.max():.1f} mm: two points "
             "are swapped, one is misread, or the lens distorts"
         )
-    return np.asarray(found, float)
-
-
-def checkerboard(
-    image: np.ndarray, shape: tuple[int, int], square: float
-) -> tuple[Float[np.ndarray, "point 2"], Float[np.ndarray, "point 2"]]:
-    """The inner corners of a checkerboard on the table, [px] and [m], for `plane_homography`.
-
-    `shape`: inner corners along the two sides, the first side being the x axis of the table;
-    `square` [m]: side of a field. Raises ValueError when it is not seen.
-    """
-    cv2 = require("cv2", "camera", "the plane of the table")
-    found, corners = cv2.findChessboardCornersSB(image, shape, None, cv2.CALIB_CB_ACCURACY)
-    if not found:
-        raise ValueError(
-            f"no checkerboard with {shape[0]} x {shape[1]} inner corners: count the corners, not "
-            "the fields, and show all of it with a white border"
-        )
-    x, y = np.meshgrid(np.arange(shape[0]), np.arange(shape[1]))
-    return corners.reshape(-1, 2).astype(float), square * np.stack([x, y], -1).reshape(-1, 2)
+    return homography
 
 
 def to_metres(
@@ -87,40 +82,7 @@ def on_table(places: Float[np.ndarray, "*_ 2"], height: float) -> Float[np.ndarr
     return np.concatenate([places, np.full((*places.shape[:-1], 1), height)], axis=-1)
 
 
-def undistort(
-    pixels: Float[np.ndarray, "*_ 2"],
-    matrix: Float[np.ndarray, "3 3"],
-    distortion: Float[np.ndarray, " coefficient"],
-) -> Float[np.ndarray, "*_ 2"]:
-    """Places [px] as a lens without distortion would show them, by OpenCV's camera model."""
-    cv2 = require("cv2", "camera", "the plane of the table")
-    flat = np.ascontiguousarray(pixels.reshape(-1, 1, 2), float)
-    return cv2.undistortPoints(flat, matrix, distortion, P=matrix).reshape(pixels.shape)
-
-
-Places = Float[np.ndarray, "dot 2"]
-
-CONTRAST = 0.12  # a dot differs from the cloth by at least this part of its brightness
-ROUND = 0.6  # least ratio of a dot's width to its length, in the image
-CIRCULAR = 0.8  # least 4 pi area / perimeter^2 of a dot; of half a disc it is 0.75
-SIZE_CHANGE = 1.14  # factor by which a dot may differ from the others in how its diameter changed
-SMALLEST, LARGEST = 4.0, 6.0  # [px] a dot is across at least; at most this part of the image
-STEP = 3  # grey levels from one threshold to the next
-FIRST_BLUR = 1.6  # [px], before the size of the dots is known
-GATE = 0.4  # of the spacing: farther from its prediction a dot is another one
-CREDIBLE = 0.2  # of the spacing: farther from the smooth motion of all a dot is no marker
-
-
-@dataclass(frozen=True)
-class Dots:
-    """Dots in an image: `centres` to a fraction of a pixel, and `sizes` (diameters), both [px]."""
-
-    centres: Places
-    sizes: Float[np.ndarray, " dot"]
-
-
-@dataclass(frozen=True)
-class Tracks:
+class Tracks(NamedTuple):
     """Markers through a video, those of a grid row by row.
 
     - `pixels`: where they are, [px]; NaN where they are not seen.
@@ -149,14 +111,21 @@ def track(
     - `dark`: whether the dots are darker than the cloth.
     - `origin`: place of the first marker in the first frame, [px]; see `find_grid`.
 
-    Raises ValueError that names the frame: no frames, fewer dots than the grid has in the first
-    one, fewer than half of them in a later one.
+    Raises ValueError that names the frame, where the grid or half of its markers is not found.
     """
     pixels, seen = [], []
-    state: Any = None
+    state: _State | None = None
     for number, image in enumerate(frames):
         try:
-            state = _begin(image, shape, dark, origin) if state is None else _follow(state, image)
+            if state is None:
+                centres, sizes = detect(image, dark)
+                grid = find_grid(centres, shape, origin)
+                places = centres[grid]
+                visible = np.ones(len(grid), bool)
+                state = _State(places, np.zeros_like(places), visible, sizes[grid], _smooth(shape))
+            else:
+                dots = detect(image, dark, float(np.median(state.sizes)))
+                state = _follow(state, *dots)
         except ValueError as error:
             raise ValueError(f"frame {number}: {error}") from error
         pixels.append(np.where(state.seen[:, None], state.places, np.nan))
@@ -166,8 +135,10 @@ def track(
     return Tracks(np.stack(pixels), np.stack(seen), shape)
 
 
-def detect(image: np.ndarray, dark: bool = True, diameter: float | None = None) -> Dots:
-    """The round dots of an image, darker (or, if not `dark`, brighter) than what is around them.
+def detect(
+    image: np.ndarray, dark: bool = True, diameter: float | None = None
+) -> tuple[Places, Sizes]:
+    """Centres and diameters [px] of the round dots, darker (or not) than what is around them.
 
     `diameter` [px] is about that of a dot; when None, that of most of the round dots in the image.
     OpenCV's blob detector looks at the image through many thresholds, so uneven light moves no
@@ -175,21 +146,23 @@ def detect(image: np.ndarray, dark: bool = True, diameter: float | None = None) 
     """
     if diameter is None:
         largest = min(image.shape) / LARGEST
-        sizes = _blobs(image, dark, FIRST_BLUR, (SMALLEST, largest)).sizes
+        _, sizes = _blobs(image, dark, FIRST_BLUR, (SMALLEST, largest))
         if not len(sizes):
             raise ValueError(
                 "no round dots in the image: are they darker than the cloth, and in focus"
             )
-        alike = np.abs(np.log(sizes[:, None] / sizes)) < 0.25
-        diameter = float(np.median(sizes[alike[alike.sum(axis=1).argmax()]]))
+        similar = np.abs(np.log(sizes[:, None] / sizes)) < 0.25
+        diameter = float(np.median(sizes[similar[similar.sum(axis=1).argmax()]]))
     limits = 0.6 * diameter, 1.6 * diameter
-    dots = _blobs(image, dark, max(0.8, 0.1 * diameter), limits)
-    if not len(dots.centres):
+    centres, sizes = _blobs(image, dark, max(0.8, 0.1 * diameter), limits)
+    if not len(centres):
         raise ValueError(f"no round dots of about {diameter:.0f} px across: is the light on?")
-    return dots
+    return centres, sizes
 
 
-def _blobs(image: np.ndarray, dark: bool, blur: float, diameters: tuple[float, float]) -> Dots:
+def _blobs(
+    image: np.ndarray, dark: bool, blur: float, diameters: tuple[float, float]
+) -> tuple[Places, Sizes]:
     """Round blobs with diameters [px] between two limits, in an image smoothed by `blur` [px]."""
     cv2 = require("cv2", "camera", "markers")
     options = cv2.SimpleBlobDetector.Params()
@@ -202,9 +175,9 @@ def _blobs(image: np.ndarray, dark: bool, blur: float, diameters: tuple[float, f
     options.filterByCircularity, options.minCircularity = True, CIRCULAR
     options.filterByInertia, options.minInertiaRatio = True, ROUND**2
     smooth = cv2.GaussianBlur(image, (0, 0), blur)
-    found = cv2.SimpleBlobDetector.create(options).detect(smooth)
-    centres = np.array([blob.pt for blob in found], float).reshape(-1, 2)
-    return Dots(centres, np.array([blob.size for blob in found], float))
+    blobs = cv2.SimpleBlobDetector.create(options).detect(smooth)
+    centres = np.array([blob.pt for blob in blobs], float).reshape(-1, 2)
+    return centres, np.array([blob.size for blob in blobs], float)
 
 
 def find_grid(
@@ -214,11 +187,12 @@ def find_grid(
 
     The grid may be turned and seen at an angle, but not mirrored. Its first marker is the corner
     nearest to `origin` [px], or else the one from which columns run most to the right and rows most
-    downward. Raises ValueError when the grid is not there as a whole, when the dots go on beside
-    it, or when rows and columns from `origin` have the other's length.
+    downward. Raises ValueError when the dots make no such grid, or a larger one.
     """
-    rows, columns = shape
-    grid = _unmirrored(places, _circles_grid(places, shape))
+    grid = _circles_grid(places, shape)
+    along, down = places[grid[0, -1]] - places[grid[0, 0]], places[grid[-1, 0]] - places[grid[0, 0]]
+    if along[0] * down[1] <= along[1] * down[0]:  # mirrored
+        grid = grid[:, ::-1]
     _check_whole(places, grid)
     turns = [turn for k in range(4) if (turn := np.rot90(grid, k)).shape == shape]
     if origin is None:
@@ -230,36 +204,25 @@ def find_grid(
             return turn.reshape(-1)
     raise ValueError(
         f"from the corner at {tuple(np.round(places[nearest]).tolist())} px the grid has not "
-        f"{rows} rows and {columns} columns, seen unmirrored: swap them, or name another"
+        f"{shape[0]} rows and {shape[1]} columns, seen unmirrored: swap them, or name another"
     )
-
-
-# From dots to a grid
 
 
 def _circles_grid(places: Places, shape: tuple[int, int]) -> Integer[np.ndarray, "row column"]:
     """The dots of a grid as OpenCV finds it, from any of its corners, mirrored or not."""
     cv2 = require("cv2", "camera", "markers")
-    dots = np.asarray(places, np.float32)[:, None]
     if min(shape) < 2:
         raise ValueError(f"a grid has two rows and columns or more, found the shape {shape}")
-    is_there, found = False, np.zeros(0)
+    dots, has_grid, corners = np.asarray(places, np.float32)[:, None], False, np.zeros(0)
     if len(places) >= shape[0] * shape[1]:
-        flags = cv2.CALIB_CB_SYMMETRIC_GRID
-        finder = cv2.CirclesGridFinderParameters()
-        is_there, found = cv2.findCirclesGrid(dots, shape[::-1], flags, None, finder)
-    if not is_there:
+        flags, finder = cv2.CALIB_CB_SYMMETRIC_GRID, cv2.CirclesGridFinderParameters()
+        has_grid, corners = cv2.findCirclesGrid(dots, shape[::-1], flags, None, finder)
+    if not has_grid:
         raise ValueError(
             f"expected a grid of {shape[0]} x {shape[1]} markers, found {len(places)} dots that "
             "make none: start at a frame that shows all, in focus, with none covered"
         )
-    return np.asarray(KDTree(places).query(found.reshape(-1, 2))[1]).reshape(shape)
-
-
-def _unmirrored(places: Places, grid: np.ndarray) -> np.ndarray:
-    """The grid with its columns reversed if they are not to its rows as right is to down."""
-    along, down = places[grid[0, -1]] - places[grid[0, 0]], places[grid[-1, 0]] - places[grid[0, 0]]
-    return grid if along[0] * down[1] > along[1] * down[0] else grid[:, ::-1]
+    return np.asarray(KDTree(places).query(corners.reshape(-1, 2))[1]).reshape(shape)
 
 
 def _check_whole(places: Places, grid: np.ndarray) -> None:
@@ -282,71 +245,61 @@ def _uprightness(places: np.ndarray, grid: np.ndarray) -> float:
     return float(along[0] / np.linalg.norm(along) + down[1] / np.linalg.norm(down))
 
 
-# From frame to frame
-
-
-@dataclass(frozen=True)
-class _State:
+class _State(NamedTuple):
     """Where the markers are, [px], and go, [px/frame]; of those not seen, where they should be."""
 
     places: np.ndarray
     velocities: np.ndarray
-    sizes: np.ndarray  # [px], in the first frame
     seen: np.ndarray
+    sizes: np.ndarray  # [px], in the first frame
     basis: np.ndarray  # smooth functions on the grid, (marker, function)
-    spacing: float  # [px]
-    diameter: float  # [px]
-    dark: bool
 
 
-def _begin(image: np.ndarray, shape: tuple[int, int], dark: bool, origin: Any) -> _State:
-    dots = detect(image, dark)
-    grid = find_grid(dots.centres, shape, origin)
-    places, sizes = dots.centres[grid], dots.sizes[grid]
-    return _State(
-        places=places,
-        velocities=np.zeros_like(places),
-        sizes=sizes,
-        seen=np.ones(len(grid), bool),
-        basis=_smooth(shape),
-        spacing=_spacing(places),
-        diameter=float(np.median(sizes)),
-        dark=dark,
-    )
-
-
-def _spacing(places: Places) -> float:
-    return float(np.median(KDTree(places).query(places, 2)[0][:, 1]))
-
-
-def _follow(state: _State, image: np.ndarray) -> _State:
-    dots = detect(image, state.dark, state.diameter)
+def _follow(state: _State, centres: Places, sizes: Sizes) -> _State:
+    """The state at the next frame, which shows dots."""
+    spacing = float(np.median(KDTree(state.places).query(state.places, 2)[0][:, 1]))
     ahead = state.places + state.velocities
-    match = _assign(ahead, dots, state, state.seen)
-    # Those that were lost are looked for where the others' motion would have brought them.
-    ahead = np.where((match >= 0)[:, None], ahead, _carried(state, dots, match, ahead))
-    match = _assign(ahead, dots, state, np.ones(len(ahead), bool))
-    match = np.where(_credible(state, dots, match), match, -1)
+    ratios = sizes, state.sizes
+    match = _assign(ahead, centres, ratios, GATE * spacing, state.seen)
+    # Those not matched are looked for where the others' motion would have brought them.
+    motion = _motion(state, centres, match)
+    if motion is not None:
+        ahead = np.where((match >= 0)[:, None], ahead, state.places + motion)
+    match = _assign(ahead, centres, ratios, GATE * spacing, np.ones(len(ahead), bool))
+    motion = _motion(state, centres, match)
+    if motion is not None:
+        off = np.linalg.norm(centres[match] - state.places - motion, axis=1)
+        match = np.where(off < CREDIBLE * spacing, match, -1)
     seen = match >= 0
     if 2 * seen.sum() < len(seen):
         raise ValueError(
             f"only {seen.sum()} of {len(seen)} markers are still found: the cloth is covered, or "
-            f"moved by more than {GATE * state.spacing:.0f} px from one frame to the next"
+            f"moved by more than {GATE * spacing:.0f} px from one frame to the next"
         )
-    hidden = _carried(state, dots, match, ahead)
-    places = np.where(seen[:, None], dots.centres[match], hidden)
+    motion = _motion(state, centres, match)
+    hidden = ahead if motion is None else state.places + motion
+    places = np.where(seen[:, None], centres[match], hidden)
     velocities = np.where(state.seen[:, None], places - state.places, 0.0)
-    return replace(state, places=places, velocities=velocities, seen=seen, spacing=_spacing(places))
+    return state._replace(places=places, velocities=velocities, seen=seen)
 
 
-def _assign(ahead: np.ndarray, dots: Dots, state: _State, wanted: np.ndarray) -> np.ndarray:
-    """The dot of each wanted marker, -1 for none: each the other's nearest, and alike in size."""
-    distance, nearest = KDTree(dots.centres).query(ahead)
-    back = np.asarray(KDTree(ahead).query(dots.centres)[1])
+def _assign(
+    ahead: np.ndarray,
+    centres: Places,
+    sizes: tuple[Sizes, np.ndarray],
+    farthest: float,
+    wanted: np.ndarray,
+) -> np.ndarray:
+    """The dot of each wanted marker, -1 for none: nearest to each other, and similar in size.
+
+    `sizes`: of the dots now, and of the markers in the first frame.
+    """
+    distance, nearest = KDTree(centres).query(ahead)
+    back = np.asarray(KDTree(ahead).query(centres)[1])
     mutual = back[nearest] == np.arange(len(ahead))
-    near = wanted & mutual & (distance < GATE * state.spacing)
+    near = wanted & mutual & (distance < farthest)
     # A dot that is half covered is smaller than the stretch makes the others, and its centre off.
-    ratio = dots.sizes[nearest] / state.sizes
+    ratio = sizes[0][nearest] / sizes[1]
     common = np.median(ratio[near]) if near.any() else 1.0
     kept = near & (np.abs(np.log(ratio / common)) < np.log(SIZE_CHANGE))
     return np.where(kept, nearest, -1)
@@ -359,31 +312,15 @@ def _smooth(shape: tuple[int, int]) -> np.ndarray:
     return np.stack(terms, axis=-1).reshape(shape[0] * shape[1], -1)
 
 
-def _motion(state: _State, dots: Dots, match: np.ndarray) -> np.ndarray | None:
-    """The smooth motion [px] of the grid since the frame before, by those that are matched."""
+def _motion(state: _State, centres: Places, match: np.ndarray) -> np.ndarray | None:
+    """The smooth motion [px] of the grid since the frame before; None: too few are matched."""
     seen = match >= 0
     if seen.sum() < 2 * state.basis.shape[1]:
         return None
-    moved = dots.centres[match[seen]] - state.places[seen]
-    weights = np.ones(len(moved))
+    moved = centres[match[seen]] - state.places[seen]
+    weights = np.ones((len(moved), 1))
     for _ in range(3):  # a few that are wrong must not pull the others along
-        weighted = weights[:, None]
-        fit = np.linalg.lstsq(state.basis[seen] * weighted, moved * weighted, rcond=None)[0]
-        off = np.linalg.norm(moved - state.basis[seen] @ fit, axis=1)
+        fit = np.linalg.lstsq(state.basis[seen] * weights, moved * weights, rcond=None)[0]
+        off = np.linalg.norm(moved - state.basis[seen] @ fit, axis=1, keepdims=True)
         weights = 1 / np.maximum(1, off / (2 * np.median(off) + 1e-3))
     return state.basis @ fit
-
-
-def _carried(state: _State, dots: Dots, match: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """Places [px] to which the motion of the matched dots carries all markers; else `ahead`."""
-    motion = _motion(state, dots, match)
-    return ahead if motion is None else state.places + motion
-
-
-def _credible(state: _State, dots: Dots, match: np.ndarray) -> np.ndarray:
-    """Whether each match moves nearly as the others do."""
-    motion = _motion(state, dots, match)
-    if motion is None:
-        return match >= 0
-    off = np.linalg.norm(dots.centres[match] - state.places - motion, axis=1)
-    return (match >= 0) & (off < CREDIBLE * state.spacing)

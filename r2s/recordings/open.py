@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -45,33 +45,25 @@ def open_recording(path: Path | str) -> Recording:
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such recording, neither an NPZ nor a folder")
     if path.is_file():
-        return _load(path)
+        return read_swing(path, known_bar()) if is_swing(path) else load(path)
     path = path.resolve()
+    folder, name = path.parent, path.name
     if (path / "manifest.json").exists():
-        manifest = manifest_for(path)
-        names = read_recordings(path, manifest)
+        names = read_recordings(path, manifest_for(path))
         if len(names) != 1:
             known = ", ".join(names) or "none that fits its manifest"
             raise ValueError(f"{path}: name one of its recordings, as {path}/NAME: {known}")
-        return read_recording(path, manifest, names[0])
-    return read_recording(path.parent, manifest_for(path.parent), path.name)
-
-
-def _load(path: Path) -> Recording:
-    return read_swing(path, known_bar()) if is_swing(path) else load(path)
+        folder, name = path, names[0]
+    return read_recording(folder, manifest_for(folder), name)
 
 
 def open_recordings(paths: Sequence[Path]) -> Iterator[Recording]:
-    """Read recordings: of NPZ files, of folders of them, or of folders of clouds or images.
-
-    Raises as `open_recording`.
-    """
+    """Read recordings of NPZ files, folders of them, or folders of frames (`open_recording`)."""
     for path in paths:
-        files = sorted(path.glob("*.npz")) if path.is_dir() else []
-        if files and not (path / "manifest.json").exists():
-            yield from map(_load, files)
-        else:
-            yield open_recording(path)
+        files = sorted(path.glob("*.npz"))
+        if not files or (path / "manifest.json").exists():
+            files = [path]
+        yield from map(open_recording, files)
 
 
 def save_trajectory(path: Path | str, x: Any, faces: Any) -> None:
@@ -83,8 +75,7 @@ def load_trajectory(path: Path | str) -> SimulatedCloth:
     """Read what `save_trajectory` wrote: an NPZ with `x` and `faces`.
 
     Positions that are not finite are accepted: a run that diverged is read as far as it went.
-    Raises FileNotFoundError, or a ValueError that names the file: it is damaged, an array is
-    missing or of another shape, or a face has a vertex that does not exist.
+    Raises FileNotFoundError, or a ValueError that names the file and what is wrong with it.
     """
     try:
         arrays = read_npz(path, "x", "faces")
@@ -108,9 +99,9 @@ def convert(
 
     `folder` holds recordings, or is one of them; `only` is a regular expression for names. Beside
     each NPZ lies NAME.sha256, of the files that it was made from: one that they still have is up to
-    date, and skipped unless `force`. An NPZ is whole or not there, so a run that was killed goes on
-    where it was. Raises ValueError or OSError: no such recordings; and, after all the others were
-    converted, one for all recordings that could not be read, with file and frame.
+    date, and skipped unless `force`. A run that was killed continues where it was. Raises
+    ValueError or OSError: no such recordings; and, after all the others were converted, one for all
+    recordings that could not be read, with file and frame.
     """
     root, names = _names(Path(folder), only)
     manifest, to = manifest_for(root), Path(to)
@@ -133,17 +124,19 @@ def _names(folder: Path, only: str) -> tuple[Path, list[str]]:
         wanted = re.compile(only)
     except re.error as error:
         raise ValueError(f"only: {only!r} is no regular expression: {error}") from error
-    found = read_recordings(folder, manifest_for(folder))
+    known = read_recordings(folder, manifest_for(folder))
     one = folder.resolve()
-    if not found and one.name in read_recordings(one.parent, manifest_for(one.parent)):
+    if not known and one.name in read_recordings(one.parent, manifest_for(one.parent)):
         return one.parent, [one.name]
-    if not (names := [name for name in found if wanted.search(name)]):
-        which = f" whose name matches {only!r}; there are {', '.join(found)}"
-        hint = (
-            f" whose name fits a scenario of {manifest_of(folder)}: write a manifest.json beside "
-            "the recordings, as in data_manifests/templates"
+    if not known:
+        raise ValueError(
+            f"{folder}: no recording whose name fits a scenario of {manifest_of(folder)}: write a "
+            "manifest.json beside the recordings, as in data_manifests/templates"
         )
-        raise ValueError(f"{folder}: no recording{which if found else hint}")
+    if not (names := [name for name in known if wanted.search(name)]):
+        raise ValueError(
+            f"{folder}: no recording whose name matches {only!r}; there are {', '.join(known)}"
+        )
     return folder, names
 
 
@@ -151,24 +144,20 @@ def _convert_one(
     root: Path, manifest: Manifest, name: str, to: Path, force: bool, label: str
 ) -> str:
     file, mark = to / f"{name}.npz", to / f"{name}.sha256"
-    made_from = _fingerprint(root, sources(root, manifest, name))
-    is_there = file.is_file() and mark.is_file()
-    if is_there and not force and mark.read_text(encoding="utf-8").strip() == made_from:
+    total = hashlib.sha256(FORMAT.encode())
+    for source in sources(root, manifest, name):
+        total.update(
+            f"\0{source.relative_to(root) if source.is_relative_to(root) else ''}\0".encode()
+        )
+        with open(source, "rb") as data:
+            total.update(hashlib.file_digest(data, "sha256").digest())
+    made_from = total.hexdigest()
+    is_converted = file.is_file() and mark.is_file()
+    if is_converted and not force and mark.read_text(encoding="utf-8").strip() == made_from:
         return f"up to date, {file}"
     tqdm = require("tqdm", "study", "progress bars").tqdm
     bar = partial(tqdm, desc=label, unit=" frames", disable=None, leave=False)
     recording = read_recording(root, manifest, name, bar)
     save(recording, file)
     write_text(mark, made_from + "\n")
-    points = int(recording.mask.sum())
-    return f"{len(recording.times)} frames, {points} points, {file}"
-
-
-def _fingerprint(root: Path, files: Iterable[Path]) -> str:
-    """One sha256 of the names of files, their contents, and the format of recordings."""
-    total = hashlib.sha256(FORMAT.encode())
-    for file in files:
-        total.update(f"\0{file.relative_to(root) if file.is_relative_to(root) else ''}\0".encode())
-        with open(file, "rb") as data:
-            total.update(hashlib.file_digest(data, "sha256").digest())
-    return total.hexdigest()
+    return f"{len(recording.times)} frames, {int(recording.mask.sum())} points, {file}"

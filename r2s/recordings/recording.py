@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from r2s._util.files import parse, read_npz, write_npz
-from r2s.recordings.clouds import draw_points, voxel_means
+from r2s._util.units import positive
+from r2s.recordings.clouds import draw_points, numbers, voxel_means
 from r2s.recordings.views import Views
 
 FORMAT = "r2s-recording/3"
@@ -20,6 +21,7 @@ FORMAT = "r2s-recording/3"
 READABLE = ("r2s-recording/1", "r2s-recording/2", FORMAT)
 CORNERS = {"origin": (0, 0), "warp": (1, 0), "weft": (0, 1), "opposite": (1, 1)}
 OPTIONAL = ("force", "force_times", "markers", "markers_seen", "marker_places")
+PATH = ("knot", "gripper", 3)
 CLOCK_TOLERANCE = 1e-6  # [s], rounding when a time is a frame number over a rate
 
 
@@ -28,8 +30,7 @@ class SheetPlacement:
     """Where the rectangular sheet lies at rest, in metres, z up.
 
     `pinned` names the corner of each gripper: "origin", "warp" (at the end of the warp side),
-    "weft" or "opposite". Raises ValueError for sides that are not positive, directions that are not
-    orthonormal, and unknown corners.
+    "weft" or "opposite".
     """
 
     size: tuple[float, float]  # [m], lengths of the warp and the weft side
@@ -46,11 +47,9 @@ class SheetPlacement:
             raise ValueError(f"sheet: origin must be finite [m], found {self.origin}")
         axes = np.array([self.warp, self.weft])
         if not np.allclose(axes @ axes.T, np.eye(2), atol=1e-6):
-            found = f"found {self.warp} and {self.weft}"
-            raise ValueError(f"sheet: warp and weft must be orthonormal, {found}")
-        for name in self.pinned:
-            if name not in CORNERS:
-                raise ValueError(f"sheet: unknown corner {name!r}, expected one of {list(CORNERS)}")
+            raise ValueError(f"sheet: warp and weft must be orthonormal, found {axes.tolist()}")
+        for name in set(self.pinned) - CORNERS.keys():
+            raise ValueError(f"sheet: unknown corner {name!r}, expected one of {list(CORNERS)}")
 
 
 def corner(sheet: SheetPlacement, name: str) -> Float[np.ndarray, "3"]:
@@ -70,8 +69,6 @@ class MeasurementUncertainty:
     - `size`: of the sheet's side length, relative.
     - `air`: of the force of the air at its speed (its drag coefficient), relative; 0: exact, but
       for a wind that blows, whose force an estimate always doubts.
-
-    Raises ValueError for one that is negative or not finite.
     """
 
     shift: tuple[float, float, float]
@@ -81,9 +78,9 @@ class MeasurementUncertainty:
     air: float = 0.0
 
     def __post_init__(self) -> None:
-        for value in (*self.shift, self.turn, self.time, self.size, self.air):
-            if not (np.isfinite(value) and value >= 0):
-                raise ValueError(f"doubt: standard deviations must not be negative, found {self}")
+        values = np.array([*self.shift, self.turn, self.time, self.size, self.air])
+        if not (np.isfinite(values) & (values >= 0)).all():
+            raise ValueError(f"doubt: standard deviations must not be negative, found {self}")
 
 
 @dataclass(frozen=True)
@@ -95,9 +92,6 @@ class RecordingInfo:
       cameras lag behind the grippers. `set_time_offset` changes it.
     - `doubt`: standard deviations of all this; `views`: the cameras; None: unknown.
     - `angle`: from the pull of a stretching to the warp: 45 on the bias, 90 along the weft.
-
-    Raises ValueError for a wind, an offset or an angle that is not finite, and for an angle of
-    another motion.
     """
 
     name: str
@@ -118,10 +112,9 @@ class RecordingInfo:
     def __post_init__(self) -> None:
         if self.wind is not None and (len(self.wind) != 3 or not np.isfinite(self.wind).all()):
             raise ValueError(f"wind must be three finite numbers [m/s], found {self.wind}")
-        if not np.isfinite(self.time_offset):
-            raise ValueError(f"time_offset must be finite [s], found {self.time_offset}")
-        if not np.isfinite(self.angle):
-            raise ValueError(f"angle must be finite [degrees], found {self.angle}")
+        for name, unit in (("time_offset", "s"), ("angle", "degrees")):
+            if not np.isfinite(value := getattr(self, name)):
+                raise ValueError(f"{name} must be finite [{unit}], found {value}")
         if self.angle and self.scenario != "stretching":
             raise ValueError(
                 f"angle is that of a stretching to the warp, found {self.angle} degrees for "
@@ -168,53 +161,60 @@ def make_recording(
 ) -> Recording:
     """Pad ragged clouds into a Recording, in JAX's default precision.
 
-    - `clouds`: one (points, 3) array per frame, [m]; None: the markers that are seen.
+    - `clouds`: one (point, 3) array per frame, [m]; None: the markers that are seen.
     - `times`: (frame,), `info.time_offset` included, [s].
     - `gripper_path`: (knot, gripper, 3), or (knot, 3) for one gripper, [m]. `gripper_times`: [s].
     - `force`, `force_times`: (sample,) or (sample, 3) [N], and (sample,) [s].
     - `markers`: (frame, marker, 3), [m]. `markers_seen`: (frame, marker); None: where finite.
     - `marker_places`: (marker, 2), where they are on the sheet along warp and weft, [m].
 
-    Raises ValueError that names the recording, and the frame where there is one: clouds that are
-    empty or not finite, times that do not increase, a path of other grippers than
-    `info.sheet.pinned` or that ends before the last frame, and arrays that do not belong together.
+    Raises ValueError that names the recording, and the frame where there is one: arrays that are
+    empty or not finite, do not increase, end too early, or do not belong together.
     """
     try:
-        marks = _check_markers(markers, markers_seen)
+        markers, markers_seen = _check_markers(markers, markers_seen)
         if clouds is None:
-            clouds = [] if marks is None else [at[seen] for at, seen in zip(*marks, strict=True)]
-        checked = [_check_cloud(cloud, frame) for frame, cloud in enumerate(clouds)]
+            pairs = () if markers is None else zip(markers, markers_seen, strict=True)
+            clouds = [places[seen] for places, seen in pairs]
+        clouds = [
+            numbers(f"frame {frame}: the cloud", cloud, "point", 3)
+            for frame, cloud in enumerate(clouds)
+        ]
         first, last = info.frames_used
-        if not checked:
-            raise ValueError("no frames: a recording needs at least one cloud")
-        if not 0 <= first <= last < len(checked):
+        if not 0 <= first <= last < len(clouds):
             raise ValueError(
-                f"frames_used is {first}..{last}, but there are {len(checked)} frames: they count "
+                f"frames_used is {first}..{last}, but there are {len(clouds)} frames: they count "
                 "from 0, the last one included"
             )
-        if marks is not None and len(marks[0]) != len(checked):
-            raise ValueError(f"markers in {len(marks[0])} frames, but clouds in {len(checked)}")
-        places = _check_places(marker_places, marks, info.sheet.size)
+        if markers is not None and len(markers) != len(clouds):
+            raise ValueError(f"markers in {len(markers)} frames, but clouds in {len(clouds)}")
+        if marker_places is not None:
+            marker_places = _check_places(marker_places, markers, info.sheet.size)
         path = _check_path(gripper_path, info.sheet.pinned)
-        clock = _check_times(times, "times", len(checked))
-        knots = _check_times(gripper_times, "gripper_times", len(path))
-        _check_end(knots, clock)
-        log = _check_force(force, force_times)
+        times = _check_times("times", times, len(clouds))
+        knots = _check_times("gripper_times", gripper_times, len(path))
+        _check_end(knots, times)
+        if (force is None) != (force_times is None):
+            raise ValueError("force and force_times: one is missing, give both or neither")
+        if force is not None:
+            vector = (3,) if np.ndim(force) > 1 else ()
+            force = numbers("force [N]", force, "sample", *vector)
+            force_times = _check_times("force_times", force_times, len(force))
     except ValueError as error:
         raise ValueError(f"recording {info.name}: {error}") from error
-    points, mask = _pad(checked, max(map(len, checked)))
+    points, mask = _pad(clouds, max(map(len, clouds)))
     return Recording(
         points=jnp.asarray(points, float),
         mask=jnp.asarray(mask),
-        times=jnp.asarray(clock, float),
+        times=jnp.asarray(times, float),
         gripper_path=jnp.asarray(path, float),
         gripper_times=jnp.asarray(knots, float),
         info=info,
-        force=_floats(log and log[0]),
-        force_times=_floats(log and log[1]),
-        markers=_floats(marks and marks[0]),
-        markers_seen=None if marks is None else jnp.asarray(marks[1]),
-        marker_places=_floats(places),
+        force=_floats(force),
+        force_times=_floats(force_times),
+        markers=_floats(markers),
+        markers_seen=None if markers_seen is None else jnp.asarray(markers_seen),
+        marker_places=_floats(marker_places),
     )
 
 
@@ -224,9 +224,8 @@ def set_time_offset(recording: Recording, offset: float) -> Recording:
     Markers move with the frames, the force does not. Raises ValueError when the last frame comes
     after the end of the gripper path.
     """
-    shift = offset - recording.info.time_offset
-    times = np.asarray(recording.times, np.float64) + shift
     info = replace(recording.info, time_offset=offset)
+    times = np.asarray(recording.times, np.float64) + (offset - recording.info.time_offset)
     try:
         _check_end(np.asarray(recording.gripper_times), times)
     except ValueError as error:
@@ -247,11 +246,19 @@ def clouds_are_markers(recording: Recording) -> bool:
 
 def gripper_positions(recording: Recording) -> Float[np.ndarray, "frame gripper 3"]:
     """Where the grippers are at the frames [m]: linear between knots, at rest before and after."""
-    path = np.asarray(recording.gripper_path, np.float64)
-    times, knots = (np.asarray(t, np.float64) for t in (recording.times, recording.gripper_times))
-    columns = path.reshape(len(path), -1).T
-    at = np.stack([np.interp(times, knots, column) for column in columns], axis=1)
-    return at.reshape(-1, *path.shape[1:])
+    arrays = recording.times, recording.gripper_times, recording.gripper_path
+    return interpolated(*(np.asarray(array, np.float64) for array in arrays))
+
+
+def interpolated(
+    times: Float[np.ndarray, " time"],
+    knots: Float[np.ndarray, " knot"],
+    values: Float[np.ndarray, "knot ..."],
+) -> Float[np.ndarray, "time ..."]:
+    """Values at knots [s], at other times [s]: linear between knots, constant before and after."""
+    columns = values.reshape(len(values), -1).T
+    between = np.stack([np.interp(times, knots, column) for column in columns], axis=1)
+    return between.reshape(-1, *values.shape[1:])
 
 
 def check_covered(clock: Float[np.ndarray, " sample"], times: Float[np.ndarray, " frame"]) -> None:
@@ -275,8 +282,8 @@ def subsample(recording: Recording, num_points: int, voxel: float | None, seed: 
     """
     if num_points < 1:
         raise ValueError(f"num_points must be at least 1, found {num_points}")
-    if voxel is not None and not (np.isfinite(voxel) and voxel > 0):
-        raise ValueError(f"voxel must be positive [m], found {voxel}")
+    if voxel is not None:
+        positive("m", voxel=voxel)
     thinned = []
     for frame in range(len(recording.times)):
         points = cloud(recording, frame)
@@ -308,8 +315,7 @@ def save(recording: Recording, path: Path | str) -> None:
 def load(path: Path | str) -> Recording:
     """Read what `save` wrote, in this version of the format or an earlier one.
 
-    Raises FileNotFoundError, or a ValueError that names the file if it is damaged, not a
-    recording, or of another version of the format.
+    Raises FileNotFoundError, or a ValueError that names the file and what is wrong with it.
     """
     try:
         stored = read_npz(path, "meta", "points", "offsets", "times")
@@ -341,21 +347,10 @@ def _split(points: np.ndarray, offsets: np.ndarray) -> list[np.ndarray]:
     return np.split(points, offsets[1:-1])
 
 
-def _of_shape(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
-    values = np.asarray(values, np.float64)
-    if values.shape != shape:
-        raise ValueError(f"{what} must have the shape {shape}, found {values.shape}")
-    return values
-
-
-def _check_places(
-    places: Any, marks: tuple[np.ndarray, np.ndarray] | None, size: tuple[float, float]
-) -> np.ndarray | None:
-    if places is None:
-        return None
-    if marks is None:
+def _check_places(places: Any, markers: Any, size: tuple[float, float]) -> np.ndarray:
+    if markers is None:
         raise ValueError("marker_places without markers")
-    places = _of_shape(places, (marks[0].shape[1], 2), "marker_places")
+    places = numbers("marker_places [m]", places, markers.shape[1], 2)
     if not ((places >= -CLOCK_TOLERANCE) & (places <= np.array(size) + CLOCK_TOLERANCE)).all():
         raise ValueError(
             f"marker_places must lie on the sheet of {size} m, found {places.min(axis=0)} to "
@@ -364,24 +359,8 @@ def _check_places(
     return places
 
 
-def _check_cloud(points: Any, frame: int) -> np.ndarray:
-    try:
-        points = np.asarray(points, np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"frame {frame}: no array of numbers: {error}") from error
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"frame {frame}: expected points of shape (n, 3), found {points.shape}")
-    if len(points) == 0:
-        raise ValueError(f"frame {frame}: the cloud is empty")
-    if bad := int((~np.isfinite(points).all(axis=1)).sum()):
-        raise ValueError(f"frame {frame}: {bad} of {len(points)} points are not finite")
-    return points
-
-
-def _check_times(times: Any, what: str, count: int) -> np.ndarray:
-    times = _of_shape(times, (count,), what)
-    if not np.isfinite(times).all():
-        raise ValueError(f"{what} must be finite [s]")
+def _check_times(what: str, times: Any, count: int) -> np.ndarray:
+    times = numbers(f"{what} [s]", times, count)
     # as they will be kept: in single precision, times of a clock that counts from 1970 are equal
     kept = np.asarray(jnp.asarray(times, float))
     for at in np.flatnonzero(np.diff(kept) <= 0)[:1]:
@@ -401,26 +380,12 @@ def _check_end(knots: np.ndarray, times: np.ndarray) -> None:
         )
 
 
-def _check_force(force: Any, times: Any) -> tuple[np.ndarray, np.ndarray] | None:
-    if force is None and times is None:
-        return None
-    if force is None or times is None:
-        raise ValueError("force and force_times: one is missing, give both or neither")
-    force = np.asarray(force, np.float64)
-    if len(force.shape) not in (1, 2) or force.shape[1:] not in ((), (3,)) or len(force) == 0:
-        raise ValueError(f"force must be (sample,) or (sample, 3) [N], found {force.shape}")
-    if not np.isfinite(force).all():
-        bad = int((~np.isfinite(force.reshape(len(force), -1)).all(axis=1)).argmax())
-        raise ValueError(f"force must be finite [N], found {force[bad]} in sample {bad}")
-    return force, _check_times(times, "force_times", len(force))
-
-
-def _check_markers(markers: Any, seen: Any) -> tuple[np.ndarray, np.ndarray] | None:
-    """Markers, zero where they are not seen, and where they are."""
+def _check_markers(markers: Any, seen: Any) -> tuple[Any, Any]:
+    """Markers, zero where they are not seen, and where they are; None and None for none."""
     if markers is None:
         if seen is not None:
             raise ValueError("markers_seen without markers")
-        return None
+        return None, None
     markers = np.asarray(markers, np.float64)
     if markers.ndim != 3 or markers.shape[2] != 3:
         raise ValueError(f"markers must be (frame, marker, 3) [m], found {markers.shape}")
@@ -430,25 +395,20 @@ def _check_markers(markers: Any, seen: Any) -> tuple[np.ndarray, np.ndarray] | N
         raise ValueError(
             f"markers_seen must be {finite.shape} of bool, found {seen.shape} of {seen.dtype}"
         )
-    if (seen & ~finite).any():
-        frame, marker = np.argwhere(seen & ~finite)[0]
+    for frame, marker in np.argwhere(seen & ~finite)[:1]:
         raise ValueError(f"frame {frame}: marker {marker} is seen, but its place is not finite")
     return np.where(seen[..., None], markers, 0), seen
 
 
 def _check_path(path: Any, pinned: tuple[str, ...]) -> np.ndarray:
     path = np.asarray(path, np.float64)
-    path = path[:, None] if path.ndim == 2 else path
-    if path.ndim != 3 or path.shape[2] != 3 or len(path) == 0:
-        raise ValueError(f"the gripper path must be (knot, gripper, 3), found {path.shape}")
+    path = numbers("the gripper path [m]", path[:, None] if path.ndim == 2 else path, *PATH)
     if path.shape[1] != len(pinned):
         raise ValueError(f"the path has {path.shape[1]} grippers, the sheet is pinned at {pinned}")
-    if not np.isfinite(path).all():
-        raise ValueError("the gripper path must be finite [m]")
     return path
 
 
-def _floats(values: np.ndarray | None) -> Array | None:
+def _floats(values: Any) -> Array | None:
     return None if values is None else jnp.asarray(values, float)
 
 

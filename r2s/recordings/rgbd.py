@@ -7,17 +7,10 @@ The folder of a recording holds, for each camera that `cameras.json` names,
     NAME/colour/000.png ...  PNG or JPG, same numbers; may be missing, is not read
     NAME/times.csv           seconds, in the last column; may be missing if `frame_rate` is given
 
-and `cameras.json` lies there, or in the folder above for all recordings of one set:
-
-    {"frame_rate": 15, "clean": {"workspace": [[-0.1, -0.1, 0], [0.6, 0.6, 0.5]]}, "cameras":
-      {"left": {"resolution": [1280, 720], "focal_length": [920, 920], "centre": [640, 360],
-                "distortion": [], "to_world": [[...4 numbers...], ..., [0, 0, 0, 1]],
-                "depth_scale": 0.001}}}
-
-The fields are those of `Rig`, `Cleaning` and `DepthCamera`.
+and `cameras.json` lies there, or in the folder above for all recordings of one set: the fields of
+`Rig`, `Cleaning` and `DepthCamera`; docs/guide/record.md shows one.
 """
 
-import dataclasses
 import hashlib
 import itertools
 import re
@@ -31,42 +24,57 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from r2s._util.files import read_json, write_json
+from r2s._util.files import read_json
 from r2s.recordings import images
 from r2s.recordings.cameras import DepthCamera, back_project, depth_jumps, from_world, moved
 from r2s.recordings.clouds import Cleaning, clean, find_numbered, inside
-from r2s.recordings.force_log import number_in, read_lines
+from r2s.recordings.force_log import check_increasing, number_in, read_lines
 from r2s.recordings.recording import Recording, RecordingInfo, make_recording
 
+NAME = "cameras.json"
 LONGEST = 5.0  # [s] between frames: above, times are taken for milliseconds or nanoseconds
+MOST = 0.5  # of the points behind a mask: at least so many are in the workspace
+DISAGREE = 0.005  # [m]: cameras whose clouds are closer than this are not swapped
+COMPARED = 2000  # points of each cloud
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def frame_times(folder: Path, count: int, frame_rate: float) -> Float[np.ndarray, " frame"]:
+    """The times [s] of the frames of a camera: its times.csv, else by a frame rate [Hz].
+
+    Raises FileNotFoundError where there is neither, or ValueError as `read_times`.
+    """
+    path = folder / "times.csv"
+    if path.is_file():
+        times = read_times(path)
+        if len(times) != count:
+            raise ValueError(
+                f"{path}: {len(times)} times, but {count} frames in {folder / 'depth'}: "
+                "one line a frame"
+            )
+        return times
+    if frame_rate > 0:
+        return np.arange(count) / frame_rate
+    raise FileNotFoundError(f"{path}: no such file, and no frame_rate in {NAME}: give either")
 
 
 def read_times(path: Path) -> Float[np.ndarray, " frame"]:
     """The frames' times [s] from the last column of a CSV file; a line of titles may come first.
 
-    Raises FileNotFoundError, or ValueError that names the file and the line: no number, times that
-    do not increase, or intervals that seconds cannot have.
+    Raises FileNotFoundError, or ValueError that names the file and the line.
     """
     rows = read_lines(path)
     if rows and re.match("[A-Za-z]", rows[0][1][-1]):
         rows = rows[1:]
-    times = np.array(
-        [number_in(path, number, cells[-1], "a time [s] last") for number, cells in rows]
-    )
+    times = np.array([number_in(path, line, cells[-1], "a time [s] last") for line, cells in rows])
     if len(times) == 0:
         raise ValueError(f"{path}: no times: expected one line a frame, its time [s] last")
-    steps = np.diff(times)
-    if (steps <= 0).any():
-        at = int((steps <= 0).argmax())
-        word = "twice" if steps[at] == 0 else "before the time of the line above"
+    check_increasing(path, [line for line, _ in rows], times)
+    interval = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    if interval > LONGEST:
         raise ValueError(
-            f"{path}: line {rows[at + 1][0]}: {times[at + 1]:.9g} s is there {word} "
-            f"({times[at]:.9g} s): sort the frames by time and drop those that are repeated"
-        )
-    if len(steps) and np.median(steps) > LONGEST:
-        raise ValueError(
-            f"{path}: frames are {np.median(steps):g} s apart: give times in seconds, "
-            "not in milliseconds or nanoseconds"
+            f"{path}: frames are {interval:g} s apart: give times in seconds, not in milliseconds "
+            "or nanoseconds"
         )
     return times
 
@@ -83,32 +91,24 @@ def pair(
     first, clock = next(iter(times.items()))
     if tolerance == 0:
         tolerance = float(np.median(np.diff(clock)) / 2) if len(clock) > 1 else 0.0
-    begin = max(t[0] for t in times.values()) - tolerance
+    start = max(t[0] for t in times.values()) - tolerance
     end = min(t[-1] for t in times.values()) + tolerance
-    used = np.flatnonzero((clock >= begin) & (clock <= end))
+    used = np.flatnonzero((clock >= start) & (clock <= end))
     if len(used) == 0:
         spans = ", ".join(f"{name} {t[0]:g} to {t[-1]:g} s" for name, t in times.items())
         raise ValueError(f"the cameras never ran at once: {spans}: check that they share a clock")
-    pairs = {first: used}
+    pairs = {}
     for name, other in times.items():
-        nearest = np.abs(other[None] - clock[used, None]).argmin(axis=1)
-        apart = np.abs(other[nearest] - clock[used])
+        pairs[name] = np.abs(other[None] - clock[used, None]).argmin(axis=1)
+        apart = np.abs(other[pairs[name]] - clock[used])
         if (apart > tolerance * (1 + 1e-9)).any():
             at = int(apart.argmax())
             raise ValueError(
                 f"frame {used[at]} of {first} at {clock[used[at]]:g} s has no frame of {name} "
-                f"within {tolerance:g} s, the nearest is at {other[nearest[at]]:g} s: restore the "
-                "frame, or raise pair_tolerance"
+                f"within {tolerance:g} s, the nearest is at {other[pairs[name][at]]:g} s: restore "
+                "the frame, or raise pair_tolerance"
             )
-        pairs[name] = nearest
     return pairs
-
-
-NAME = "cameras.json"
-MOST = 0.5  # of the points behind a mask: at least so many are in the workspace
-DISAGREE = 0.005  # [m]: cameras whose clouds are closer than this are not swapped
-COMPARED = 2000  # points of each cloud
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -153,11 +153,6 @@ def find_rig(folder: Path | str) -> Path | None:
     return next((path for path in places if path.is_file()), None)
 
 
-def write_rig(folder: Path | str, rig: Rig) -> None:
-    """Write the cameras to `folder`, for `read_rig`."""
-    write_json(Path(folder) / NAME, dataclasses.asdict(rig))
-
-
 def rgbd_recording(
     folder: Path | str,
     info: RecordingInfo,
@@ -169,9 +164,8 @@ def rgbd_recording(
 ) -> Recording:
     """The recording in a folder of RGB-D images.
 
-    `info.time_offset` is added to the cameras' times. `gripper_path`, `gripper_times` and
-    `measured` (force, markers) are as in `make_recording`. Raises as `stream` and `make_recording`
-    do.
+    `info.time_offset` is added to the cameras' times. `gripper_path`, `gripper_times`, `measured`
+    (force, markers) and errors are as in `make_recording`; errors also as in `stream`.
     """
     times, clouds = read_clouds(folder, rig or read_rig(folder))
     clock = times + info.time_offset
@@ -198,14 +192,12 @@ def stream(
     """Time [s] and cleaned cloud [m] of one frame after the other: the images of one are in memory.
 
     `frame_rate` [Hz] is used where the rig has none. Raises FileNotFoundError, ImportError (names
-    the extra), or ValueError that names the file or camera and frame, what was expected, and what
-    to do: files that are missing, damaged, of another size or unit; frames without partner; a
-    mask without pixels; points outside of the workspace.
+    the extra), or ValueError that names the file or camera and frame, and what to do.
     """
     folder = Path(folder)
     rate = rig.frame_rate or frame_rate
     files = {name: _files(folder / name, camera) for name, camera in rig.cameras.items()}
-    times = {name: _times(folder / name, len(files[name]), rate) for name in rig.cameras}
+    times = {name: frame_times(folder / name, len(files[name]), rate) for name in rig.cameras}
     try:
         pairs = pair(times, rig.pair_tolerance)
     except ValueError as error:
@@ -251,28 +243,12 @@ def _files(folder: Path, camera: DepthCamera) -> list[tuple[Path, Path | None]]:
 
 
 def _same_frames(folder: Path, kind: str, depths: Mapping[int, Any], others: Mapping) -> None:
-    for lacking, numbers, there in ((kind, others, depths), ("depth", depths, others)):
-        for number in there:
-            if number not in numbers:
-                raise ValueError(
-                    f"{folder / lacking}: frame {number} is missing, {there[number]} is there: "
-                    f"export it again, or drop the frame; depth and {kind} have the same numbers"
-                )
-
-
-def _times(folder: Path, count: int, frame_rate: float) -> Float[np.ndarray, " frame"]:
-    path = folder / "times.csv"
-    if path.is_file():
-        times = read_times(path)
-        if len(times) != count:
-            raise ValueError(
-                f"{path}: {len(times)} times, but {count} frames in {folder / 'depth'}: "
-                "one line a frame"
-            )
-        return times
-    if frame_rate > 0:
-        return np.arange(count) / frame_rate
-    raise FileNotFoundError(f"{path}: no such file, and no frame_rate in {NAME}: give either")
+    for number in sorted(depths.keys() ^ others.keys()):
+        lacking, path = (kind, depths[number]) if number in depths else ("depth", others[number])
+        raise ValueError(
+            f"{folder / lacking}: frame {number} is missing, but {path} exists: export it again, "
+            f"or drop the frame; depth and {kind} have the same numbers"
+        )
 
 
 def _camera_cloud(
@@ -284,36 +260,43 @@ def _camera_cloud(
     _warn_of_repeats(name, depth_file, depth, last)
     where = depth > 0
     if mask_file is not None:
-        mask = images.read_mask(mask_file, camera.resolution)
-        if not mask.any() and not camera.may_miss:
-            raise ValueError(
-                f"{mask_file}: the mask is empty: segment the frame again, or set "
-                f'"may_miss": true for {name!r} in {NAME} if the fabric was out of its view'
-            )
-        if mask.all():
-            raise ValueError(
-                f"{mask_file}: the mask marks every pixel: write 0 where the fabric is not, or set "
-                f'"masks": false for {name!r} in {NAME}'
-            )
-        if mask.any() and not (where & mask).any():
-            raise ValueError(
-                f"{depth_file}: no depth behind the mask {mask_file}: check that masks and depth "
-                "are of one frame and in the same pixels"
-            )
-        where &= mask
+        where &= _mask(name, camera, depth_file, mask_file, where)
     if rig.clean.edge > 0:
         where &= ~depth_jumps(depth, rig.clean.edge)
     seen = back_project(camera, depth, where)
     points = moved(np.array(camera.to_world), seen)
     kept = inside(points, rig.clean)
-    enough = MOST if mask_file is not None else 0
-    if len(points) and (not kept.any() or kept.mean() < enough):
+    least = MOST if mask_file is not None else 0
+    if len(points) and (not kept.any() or kept.mean() < least):
         raise ValueError(
             f"{depth_file}: {kept.mean():.0%} of {len(points)} points of {name!r} are in the "
-            f"workspace {rig.clean.workspace} [m], they lie around "
+            f"workspace {rig.clean.workspace} [m], their median is at "
             f"{np.median(points, axis=0).round(3).tolist()} m: {_remedy(rig, name, seen)}"
         )
     return points[kept]
+
+
+def _mask(
+    name: str, camera: DepthCamera, depth_file: Path, mask_file: Path, has_depth: np.ndarray
+) -> np.ndarray:
+    """The mask of a frame, checked against the pixels that have a depth."""
+    mask = images.read_mask(mask_file, camera.resolution)
+    if not mask.any() and not camera.may_miss:
+        raise ValueError(
+            f"{mask_file}: the mask is empty: segment the frame again, or set "
+            f'"may_miss": true for {name!r} in {NAME} if the fabric was out of its view'
+        )
+    if mask.all():
+        raise ValueError(
+            f"{mask_file}: the mask marks every pixel: write 0 where the fabric is not, or set "
+            f'"masks": false for {name!r} in {NAME}'
+        )
+    if mask.any() and not (has_depth & mask).any():
+        raise ValueError(
+            f"{depth_file}: no depth behind the mask {mask_file}: check that masks and depth "
+            "are of one frame and in the same pixels"
+        )
+    return mask
 
 
 def _remedy(rig: Rig, name: str, seen: Float[np.ndarray, "point 3"]) -> str:
@@ -323,13 +306,13 @@ def _remedy(rig: Rig, name: str, seen: Float[np.ndarray, "point 3"]) -> str:
         "its inverse (is it world to camera?)": np.linalg.inv(pose),
         "axes that point right, up and backward (is it OpenGL's?)": pose @ OPENGL,
     }
-    for other, camera in rig.cameras.items():
-        if other != name:
-            tries[f"that of {other!r} (are the two swapped?)"] = np.array(camera.to_world)
-    shares = {what: inside(moved(p, seen), rig.clean).mean() for what, p in tries.items()}
-    best = max(shares, key=lambda what: shares[what])
-    if shares[best] >= MOST:
-        return f"with {best} instead of to_world, {shares[best]:.0%} would be: correct {NAME}"
+    for other in rig.cameras.keys() - {name}:
+        swapped = f"that of {other!r} (are the two swapped?)"
+        tries[swapped] = np.array(rig.cameras[other].to_world)
+    for words, other_pose in tries.items():
+        share = inside(moved(other_pose, seen), rig.clean).mean()
+        if share >= MOST:
+            return f"with {words} instead of to_world, {share:.0%} would be: correct {NAME}"
     return f"check to_world, depth_scale and workspace in {NAME}"
 
 

@@ -13,11 +13,14 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from r2s._util.files import read_npz
+from r2s._util.units import positive
+from r2s.recordings.clouds import numbers
 from r2s.recordings.recording import (
     MeasurementUncertainty,
     Recording,
     RecordingInfo,
     SheetPlacement,
+    interpolated,
     make_recording,
 )
 
@@ -40,8 +43,6 @@ class Bar:
     - `lag`: of the tracker's clock behind the arm's, [s]. `lag_deviation`: between recordings, [s].
     - `place_deviation`: of the bar in the frame of the tool, [m].
     - `tracker_error`: deviation of a coordinate [m] at rest, of each row from the bar down.
-
-    Raises ValueError for ends that are one, and lengths or deviations that are not positive.
     """
 
     ends: tuple[Vector, Vector]
@@ -53,11 +54,9 @@ class Bar:
     note: str
 
     def __post_init__(self) -> None:
-        if not self.length > 0:
-            raise ValueError(f"the ends of the bar must differ, found {self.ends}")
-        numbers = (self.drop, self.lag_deviation, self.place_deviation, *self.tracker_error)
-        if not min(numbers) > 0:
-            raise ValueError(f"drop and deviations must be positive, found {numbers}")
+        positive("m", length=self.length, drop=self.drop, place_deviation=self.place_deviation)
+        positive("s", lag_deviation=self.lag_deviation)
+        positive("m", tracker_error=min(self.tracker_error))
 
     @property
     def length(self) -> float:
@@ -81,8 +80,7 @@ def read_swing(path: Path | str, bar: Bar, duration: float | None = None) -> Rec
     whole sheet for longer than `LONGEST_GAP` the recording ends, with a warning. `duration` [s]
     from the first frame on; None: all.
 
-    Raises FileNotFoundError, or a ValueError that names the file and what is wrong with its arrays,
-    the bar, or the duration.
+    Raises FileNotFoundError, or a ValueError that names the file and what is wrong with it.
     """
     path = Path(path)
     try:
@@ -100,20 +98,19 @@ def bar_path(
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    found = read_npz(path, *ARRAYS)
-    arrays = {name: np.asarray(found[name], np.float64) for name in ARRAYS}
-    points, frames = arrays["points"], len(arrays["times"])
-    if points.ndim != 4 or points.shape[0] != frames or points.shape[3] != 3:
+    stored = read_npz(path, *ARRAYS)
+    points, frames, samples = stored["points"], len(stored["times"]), len(stored["tool_times"])
+    if points.ndim != 4 or len(points) != frames or points.shape[3] != 3:
         raise ValueError(
             f"points must be ({frames}, along the bar, down, 3) [m], found {points.shape}"
         )
-    for name, count in (("tool_position", 3), ("tool_quaternion_xyzw", 4)):
-        if arrays[name].shape != (len(arrays["tool_times"]), count):
-            raise ValueError(
-                f"{name} must be {(len(arrays['tool_times']), count)}, found {arrays[name].shape}"
-            )
-        if not np.isfinite(arrays[name]).all():
-            raise ValueError(f"{name} is not finite")
+    shapes = {
+        "times": ("frame",),
+        "tool_times": ("sample",),
+        "tool_position": (samples, 3),
+        "tool_quaternion_xyzw": (samples, 4),
+    }
+    arrays = {name: numbers(name, stored[name], *shape) for name, shape in shapes.items()}
     lengths = np.linalg.norm(arrays["tool_quaternion_xyzw"], axis=1)
     if np.abs(lengths - 1).max() > UNIT:
         raise ValueError(
@@ -122,7 +119,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     for name in ("times", "tool_times"):
         if not (np.diff(arrays[name]) >= 0).all():
             raise ValueError(f"{name} must increase [s]")
-    return arrays
+    return arrays | {"points": np.asarray(points, np.float64)}
 
 
 def _recording(
@@ -132,18 +129,17 @@ def _recording(
     tool = np.flatnonzero(np.diff(arrays["tool_times"], prepend=-np.inf) > 1e-4)
     path = bar_path(arrays["tool_position"][tool], arrays["tool_quaternion_xyzw"][tool], bar)
     clock = arrays["tool_times"][tool]
-    seen_at = arrays["times"] - bar.lag
-    end = min(_first_gap(name, seen_at, arrays["points"]), clock[-1])
+    tracked_at = arrays["times"] - bar.lag
+    start = tracked_at[0]
+    end = min(_first_gap(name, tracked_at, arrays["points"]), clock[-1])
     if duration is not None:
-        end = min(end, seen_at[0] + duration)
-    times = np.arange(seen_at[0], end, INTERVAL)
+        end = min(end, start + duration)
+    times = np.arange(start, end, INTERVAL)
     if len(times) < 2:
         raise ValueError(f"{len(times)} frames every {INTERVAL} s: the duration must be longer")
-    markers, seen = _resampled(times, seen_at, arrays["points"])
-    times = times - seen_at[0]  # single precision is finest near 0
-    across = arrays["points"].shape[1:3]
-    sides = (np.linspace(0, *side) for side in zip((bar.length, bar.drop), across, strict=True))
-    places = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
+    shape = arrays["points"].shape[1:3]
+    markers = interpolated(times, tracked_at, arrays["points"]).reshape(len(times), -1, 3)
+    sides = (np.linspace(0, *side) for side in zip((bar.length, bar.drop), shape, strict=True))
     place = bar.place_deviation
     info = RecordingInfo(
         name=name,
@@ -160,45 +156,27 @@ def _recording(
     )
     return make_recording(
         None,
-        times,
+        times - start,  # single precision is finest near 0
         path,
-        clock - seen_at[0],
+        clock - start,
         info,
-        markers=markers,
-        markers_seen=seen,
-        marker_places=places,
+        markers=markers,  # NaN beside frames in which the tracker lost them
+        marker_places=np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2),
     )
 
 
-def _first_gap(name: str, seen_at: np.ndarray, points: np.ndarray) -> float:
+def _first_gap(name: str, tracked_at: np.ndarray, points: np.ndarray) -> float:
     """The end, or where the tracker lost the whole sheet for longer than `LONGEST_GAP`, [s]."""
-    tracked = seen_at[np.isfinite(points.reshape(len(points), -1)).any(axis=1)]
-    gaps = np.flatnonzero(np.diff(tracked) > LONGEST_GAP)
-    if not len(gaps):
-        return float(tracked[-1])
-    lost, found = tracked[gaps[0]] - seen_at[0], tracked[gaps[0] + 1] - seen_at[0]
-    warnings.warn(
-        f"{name}: the tracker lost the sheet from {lost:.2f} to {found:.2f} s: it is read until "
-        f"then, of {seen_at[-1] - seen_at[0]:.2f} s",
-        stacklevel=4,
-    )
-    return float(tracked[gaps[0]])
-
-
-def _resampled(
-    times: Float[np.ndarray, " frame"],
-    seen_at: Float[np.ndarray, " tracked"],
-    points: Float[np.ndarray, "tracked along down 3"],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points at other times, linear between the tracker's frames, and which of them were seen."""
-    after = np.clip(np.searchsorted(seen_at, times, side="right"), 1, len(seen_at) - 1)
-    gap = seen_at[after] - seen_at[after - 1]
-    share = ((times - seen_at[after - 1]) / np.maximum(gap, 1e-9))[:, None, None, None]
-    moved = (1 - share) * points[after - 1] + share * points[after]
-    exact = np.where(share == 0, points[after - 1], moved)
-    flat = exact.reshape(len(times), -1, 3)
-    seen = np.asarray(np.isfinite(flat).all(axis=-1))
-    return np.where(seen[..., None], flat, 0), seen
+    tracked = tracked_at[np.isfinite(points.reshape(len(points), -1)).any(axis=1)]
+    for gap in np.flatnonzero(np.diff(tracked) > LONGEST_GAP)[:1]:
+        begin, end = tracked[gap : gap + 2] - tracked_at[0]
+        warnings.warn(
+            f"{name}: the tracker lost the sheet from {begin:.2f} to {end:.2f} s: it is read until "
+            f"then, of {tracked_at[-1] - tracked_at[0]:.2f} s",
+            stacklevel=4,
+        )
+        return float(tracked[gap])
+    return float(tracked[-1])
 
 
 def _sheet(ends: Float[np.ndarray, "2 3"], bar: Bar) -> SheetPlacement:

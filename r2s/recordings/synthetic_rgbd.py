@@ -1,17 +1,17 @@
 """Synthetic RGB-D recordings: a moving mesh as folders of images, with the flaws of real ones."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, gaussian_filter, zoom
 
-from r2s._util.files import write_bytes, write_text
+from r2s._util.files import write_bytes, write_json, write_text
 from r2s.mesh.mesh import rectangle
 from r2s.recordings.cameras import DepthCamera, depth_jumps, from_world, rays
 from r2s.recordings.images import encode_png, write_depth
-from r2s.recordings.rgbd import Rig, write_rig
+from r2s.recordings.rgbd import NAME, Rig
 from r2s.recordings.views import render
 
 TABLE, TABLE_CELLS = 2.0, 8  # [m] and cells along each side of the table
@@ -59,14 +59,15 @@ def write_rgbd(
     """
     folder, faces = Path(folder), np.asarray(faces)
     folder.mkdir(parents=True, exist_ok=True)
-    write_rig(folder, rig)
+    write_json(folder / NAME, asdict(rig))
     # in cells, so that few of them reach behind a camera
     table = rectangle((TABLE, TABLE), (TABLE_CELLS + 1, TABLE_CELLS + 1))
     plane = np.pad(np.asarray(table.rest) - TABLE / 2, ((0, 0), (0, 1)))
     both = np.concatenate([faces, x.shape[1] + np.asarray(table.faces)])
     for order, (name, camera) in enumerate(rig.cameras.items()):
-        for kind in ("depth", "masks"):
-            (folder / name / kind).mkdir(parents=True, exist_ok=True)
+        depths, masks = folder / name / "depth", folder / name / "masks"
+        depths.mkdir(parents=True, exist_ok=True)
+        masks.mkdir(exist_ok=True)
         rows = [f"{frame},{time:.6f}\n" for frame, time in enumerate(times)]
         write_text(folder / name / "times.csv", "frame,time\n" + "".join(rows))
         for frame, positions in enumerate(x):
@@ -78,9 +79,9 @@ def write_rgbd(
                 raise ValueError(f"camera {name!r} does not see the mesh in frame {frame}")
             file = f"{frame:03d}.png"
             seen = flawed_depth(camera, depth, which, *mesh, flaws, generator)
-            write_depth(folder / name / "depth" / file, seen, camera.depth_scale)
+            write_depth(depths / file, seen, camera.depth_scale)
             marked = flawed_mask(mask, flaws.mask_error, generator)
-            write_bytes(folder / name / "masks" / file, encode_png(marked.astype(np.uint8) * 255))
+            write_bytes(masks / file, encode_png(marked.astype(np.uint8) * 255))
 
 
 def flawed_depth(
@@ -93,7 +94,6 @@ def flawed_depth(
     generator: np.random.Generator,
 ) -> Float[np.ndarray, "down across"]:
     """A rendered depth image [m] (with the faces that it shows) as a real camera gives it."""
-    found = depth > 0
     flawed = depth.copy()
     edges = np.flatnonzero(depth_jumps(depth, STEP))
     chance = generator.random(len(edges))
@@ -106,7 +106,7 @@ def flawed_depth(
         flawed[generator.random(depth.shape, np.float32) < flaws.holes] = 0
     if flaws.grazing < 90:
         flawed[_turned_away(camera, which, x, faces, flaws.grazing)] = 0
-    return np.where(found, np.maximum(flawed, 0), 0)
+    return np.where(depth > 0, np.maximum(flawed, 0), 0)
 
 
 def flawed_mask(
@@ -123,25 +123,21 @@ def flawed_mask(
 
 
 def _mix(depth: np.ndarray, places: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Depths between those of pixels and of a neighbour on the other side of the edge."""
-    rows, columns = np.unravel_index(places, depth.shape)
-    here = depth[rows, columns]
-    there = here
-    for down, across in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-        row = np.clip(rows + down, 0, depth.shape[0] - 1)
-        column = np.clip(columns + across, 0, depth.shape[1] - 1)
-        other = depth[row, column]
-        farther = (other > 0) & (np.abs(other - here) > np.abs(there - here))
-        there = np.where(farther, other, there)
-    return here + generator.random(len(places)) * (there - here)
+    """Depths between those of pixels and of the neighbour that differs most."""
+    padded = np.pad(depth, 1, mode="edge")
+    shifts = padded[1:-1, 2:], padded[2:, 1:-1], padded[1:-1, :-2], padded[:-2, 1:-1]
+    beside = np.stack([shifted.flat[places] for shifted in shifts])
+    own = depth.flat[places]
+    apart = np.where(beside > 0, np.abs(beside - own), 0)
+    other = beside[apart.argmax(axis=0), np.arange(len(places))]
+    return own + generator.random(len(places)) * np.where(apart.any(axis=0), other - own, 0)
 
 
 def _turned_away(camera, which, x, faces, limit: float) -> Bool[np.ndarray, "down across"]:
     corners = from_world(camera, np.asarray(x, np.float64))[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    directions = rays(camera)
-    normal = normals[which]  # where there is no face, any: nothing is seen there
-    along = np.abs(normal[..., 2] + np.einsum("rci,rci->rc", normal[..., :2], directions))
-    length = np.sqrt(1 + (directions**2).sum(axis=-1))
-    return along < np.cos(np.deg2rad(limit)) * length
+    normal = normals[which]  # where there is no face, any: nothing is seen
+    ray = rays(camera)
+    along = np.abs(normal[..., 2] + (normal[..., :2] * ray).sum(axis=-1))
+    return along < np.cos(np.deg2rad(limit)) * np.sqrt(1 + (ray**2).sum(axis=-1))

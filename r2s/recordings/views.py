@@ -1,20 +1,19 @@
 """What calibrated cameras see of a mesh."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from r2s.recordings.cameras import DepthCamera, back_project, from_world, moved, rays
+from r2s.recordings.cameras import DepthCamera, back_project, from_world, moved, rays, rows_of
 from r2s.recordings.clouds import Cleaning, Corner, clean
 
 NEAREST = 0.01  # [m]: what is nearer than this, or behind the camera, is not seen
 ROUNDING = 1e-9
-PAIRS = 1 << 19  # of face and pixel that are looked at together: about 100 MB
 
 
 def render(
@@ -25,32 +24,30 @@ def render(
     A z-buffer, exact: depths are those at which the pixels' rays, bent by the lens, meet the
     triangles. Both sides of a face are seen.
     """
-    across, down = camera.resolution
+    directions = rays(camera)
     corners = from_world(camera, np.asarray(x, np.float64))[faces]
-    kept = np.flatnonzero(corners[..., 2].max(axis=1) > NEAREST)
-    corners = corners[kept]
-    depth = np.full(across * down, np.inf)
-    which = np.full(across * down, -1, np.int32)
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     # A ray d meets the plane of a, b, c with the barycentric weights d.(b x c), d.(c x a),
     # d.(a x b), but for a factor, and at the depth det(a, b, c) / (sum of them).
-    sides = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
-    volume = np.einsum("fi,fi->f", a, sides[:, 0])
-    directions = rays(camera).reshape(-1, 2)
-    for face, pixel in _pairs(_boxes(rays(camera), corners), across):
-        ray = directions[pixel]
-        weights = sides[face, :, 2] + np.einsum("pki,pi->pk", sides[face, :, :2], ray)
-        weights *= np.sign(volume[face])[:, None]
-        total = weights.sum(axis=1)
-        inside = (weights >= 0).all(axis=1) & (total * NEAREST < np.abs(volume[face]))
-        inside &= total > 0
-        face, pixel = face[inside], pixel[inside]
-        z = np.abs(volume[face]) / total[inside]
-        np.minimum.at(depth, pixel, z)
-        nearest = z == depth[pixel]
-        which[pixel[nearest]] = kept[face[nearest]]
+    sides = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
+    volume = np.einsum("fi,fi->f", a, sides[..., 0])
+    sides, volume = sides * np.sign(volume)[:, None, None], np.abs(volume)
+    boxes = _boxes(directions, corners)
+    depth = np.full(directions.shape[:2], np.inf)
+    which = np.full(directions.shape[:2], -1, np.int32)
+    for face in np.flatnonzero(corners[..., 2].max(axis=1) > NEAREST):
+        left, right, top, bottom = boxes[face]
+        patch = slice(top, bottom + 1), slice(left, right + 1)
+        weights = directions[patch] @ sides[face, :2] + sides[face, 2]
+        total = weights.sum(axis=-1)
+        hit = (weights >= 0).all(axis=-1) & (total > 0) & (total * NEAREST < volume[face])
+        z = np.full(total.shape, np.inf)
+        z[hit] = volume[face] / total[hit]
+        nearest = hit & (z <= depth[patch])
+        depth[patch][nearest] = z[nearest]
+        which[patch][nearest] = face
     depth[np.isinf(depth)] = 0
-    return depth.reshape(down, across), which.reshape(down, across)
+    return depth, which
 
 
 def _boxes(
@@ -75,20 +72,8 @@ def _boxes(
     return np.stack(boxes, axis=1)
 
 
-def _pairs(boxes: np.ndarray, across: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Faces and the pixels in their boxes, some thousands of pairs at a time."""
-    widths = np.maximum(boxes[:, 1] - boxes[:, 0] + 1, 0)
-    counts = widths * np.maximum(boxes[:, 3] - boxes[:, 2] + 1, 0)
-    group = np.cumsum(counts) // PAIRS
-    for members in np.split(np.arange(len(boxes)), np.flatnonzero(np.diff(group)) + 1):
-        face = np.repeat(members, counts[members])
-        starts = np.repeat(np.cumsum(counts[members]) - counts[members], counts[members])
-        place = np.arange(len(face)) - starts
-        column = boxes[face, 0] + place % widths[face]
-        yield face, (boxes[face, 2] + place // widths[face]) * across + column
-
-
 CELL = 0.015  # [m]: width, at the sheet, of the cells in which samples hide each other
+FARTHEST = 5.0  # [m], of a sheet from its cameras
 DEPTH = 0.02  # [m]: samples this much behind the nearest in their cell are hidden
 
 
@@ -101,9 +86,6 @@ class Views:
     - `border`: width of the strip, along the borders of the sheet and of the workspace, which the
       outlier filter erodes and in which nothing is asked of a cloud, [m].
     - `hidden`: distance from a gripper within which the robot's mask hides the sheet, [m].
-
-    Raises ValueError for no camera, a workspace with no room between its borders, and lengths that
-    are negative.
     """
 
     cameras: tuple[DepthCamera, ...]
@@ -126,20 +108,14 @@ class Views:
 
 def shifted(views: Views, shift: Corner) -> Views:
     """The views of cameras, and of a workspace, that stand elsewhere by a shift [m]."""
-
-    def beside(place: Corner) -> Corner:
-        x, y, z = (float(a + b) for a, b in zip(place, shift, strict=True))
-        return x, y, z
-
-    cameras = []
-    for camera in views.cameras:
-        pose = np.array(camera.to_world)
-        pose[:3, 3] += shift
-        rows = tuple(tuple(float(value) for value in row) for row in pose)
-        cameras.append(replace(camera, to_world=rows))
-    low, high = views.clean.workspace
-    clean = replace(views.clean, workspace=(beside(low), beside(high)))
-    return replace(views, cameras=tuple(cameras), clean=clean)
+    move = np.eye(4)
+    move[:3, 3] = shift
+    cameras = [
+        replace(camera, to_world=rows_of(move @ np.array(camera.to_world)))
+        for camera in views.cameras
+    ]
+    corners: Any = tuple(map(tuple, (np.array(views.clean.workspace) + shift).tolist()))
+    return replace(views, cameras=tuple(cameras), clean=replace(views.clean, workspace=corners))
 
 
 def in_view(
@@ -179,15 +155,11 @@ def _unhidden(camera: DepthCamera, samples: Float[Array, "sample 3"]) -> Bool[Ar
     return inside & (depth <= nearest[index] + DEPTH)
 
 
-def _cells(camera: DepthCamera, farthest: float = 5.0) -> int:
-    """Cells from the middle of the image to its edge, for sheets up to so far away [m]."""
-    slope = max(
-        max(centre, size - centre) / focal
-        for size, focal, centre in zip(
-            camera.resolution, camera.focal_length, camera.centre, strict=True
-        )
-    )
-    return math.ceil(slope * farthest / CELL) + 1
+def _cells(camera: DepthCamera) -> int:
+    """Cells from the middle of the image to its edge, for sheets up to 5 m away."""
+    size, focal, centre = map(np.array, (camera.resolution, camera.focal_length, camera.centre))
+    slope = float((np.maximum(centre, size - centre) / focal).max())
+    return math.ceil(slope * FARTHEST / CELL) + 1
 
 
 def observed(

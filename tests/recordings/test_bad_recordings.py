@@ -44,10 +44,18 @@ def said(folder, capsys, *names, density=DENSITY):
 
 
 @pytest.mark.slow(group="estimates")
-def test_a_lift_and_a_pull_of_one_fabric_agree(folder, capsys):
-    text = said(folder[0], capsys, "lift", "pull")
-    assert "the recordings agree" in text and "contradicts" not in text
-    assert "shares in the loss" in text and "not judged by another recording: 3" in text
+@pytest.mark.parametrize(
+    ("names", "density", "words"),
+    [
+        (["lift", "pull"], DENSITY, ["recordings agree", "not judged by another recording: 3"]),
+        (["lift"], 10 * DENSITY, ["no force of a pull"]),
+        (["stray"], DENSITY, ["marker {far} is", "another cloth"]),
+    ],
+)
+def test_what_recordings_show_is_said(folder, capsys, names, density, words):
+    text = said(folder[0], capsys, *names, density=density)
+    assert all(part.format(far=folder[1]) in text for part in words)
+    assert "contradicts" not in text or names != ["lift", "pull"]
 
 
 @pytest.mark.slow(group="estimates")
@@ -56,16 +64,3 @@ def test_a_density_that_is_off_by_ten_is_told_by_the_force_of_a_pull(folder, cap
     (line,) = [line for line in text.splitlines() if "would agree on" in line]
     assert line.startswith("warning")
     assert 0.05 <= float(line.split("agree on about ")[1].split()[0]) <= 0.3
-
-
-@pytest.mark.slow(group="estimates")
-def test_a_lift_alone_says_that_nothing_weighs_it(folder, capsys):
-    text = said(folder[0], capsys, "lift", density=10 * DENSITY)
-    assert "in proportion: no force of a pull" in text
-
-
-@pytest.mark.slow(group="estimates")
-def test_a_marker_that_stays_behind_is_named(folder, capsys):
-    where, marker = folder
-    text = said(where, capsys, "stray")
-    assert f"marker {marker} is" in text and "another cloth" in text

@@ -19,7 +19,7 @@ from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
 from r2s.recordings.datasets import Swings, known_bar, known_datasets
 from r2s.recordings.open import open_recording
-from r2s.recordings.recording import load, make_recording, save
+from r2s.recordings.recording import gripper_positions, load, save
 from r2s.recordings.swings import Bar, bar_path, read_swing
 from r2s.scenarios.scenario import from_recording, rollout
 from r2s.scenarios.standard import swing
@@ -81,19 +81,6 @@ def test_the_bar_of_a_swing_is_straight_and_follows_its_ends():
     assert np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) == pytest.approx(SIZE[0])
 
 
-@pytest.mark.parametrize(
-    ("changed", "words"),
-    [
-        ({"num_frames": 1}, "at least 2"),
-        ({"sway": -0.1}, "sway"),
-        ({"frequency": 50.0}, "at most 12 1/s"),
-    ],
-)
-def test_a_swing_that_cannot_be_is_refused(changed, words):
-    with pytest.raises(ValueError, match=words):
-        swing(**changed)
-
-
 def test_a_swing_is_read_on_the_arm_s_clock_with_its_sheet_below_the_bar(file: Path, moved):
     read = read_swing(file, BAR)
     assert read.info.scenario == "swing" and read.info.sheet.size == pytest.approx(SIZE)
@@ -133,9 +120,9 @@ def test_a_swing_is_kept_with_the_places_of_its_markers(file: Path, tmp_path: Pa
     np.testing.assert_array_equal(again.marker_places, read.marker_places)
     problem = Problem.make(again, OrthotropicSpace.make(0.12), shape=(5, 5))
     assert problem.markers is not None and read.markers is not None
-    around = read.markers[0][np.asarray(problem.markers.vertices)]
-    there = jnp.einsum("mk,mki->mi", problem.markers.weights, around)
-    np.testing.assert_allclose(there, read.markers[0], atol=1e-6)
+    corners = read.markers[0][np.asarray(problem.markers.vertices)]
+    places = jnp.einsum("mk,mki->mi", problem.markers.weights, corners)
+    np.testing.assert_allclose(places, read.markers[0], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -143,23 +130,17 @@ def test_a_swing_is_kept_with_the_places_of_its_markers(file: Path, tmp_path: Pa
     [
         ("points", lambda a: a[..., 0], "along the bar, down, 3"),
         ("tool_quaternion_xyzw", lambda a: 2 * a, "length 1"),
-        ("tool_position", lambda a: a + np.nan, "tool_position is not finite"),
+        ("tool_position", lambda a: a + np.nan, "tool_position: .* not finite"),
         ("tool_times", lambda a: a[::-1], "must increase"),
-        ("tool_position", lambda a: a[1:], "tool_position must be"),
+        ("tool_position", lambda a: a[1:], "tool_position must have the shape"),
         ("times", lambda a: a + 100, "frames every"),
+        ("tool_quaternion_xyzw", lambda a: a * 0 + [0, 0.5**0.5, 0, 0.5**0.5], "about level"),
     ],
 )
 def test_what_is_wrong_with_a_swing_is_named(tmp_path: Path, moved, name, change, words):
     np.savez(tmp_path / "bad.npz", **(moved | {name: change(moved[name])}))
-    with pytest.raises(ValueError, match=words) as raised:
+    with pytest.raises(ValueError, match=f"bad.npz: .*{words}"):
         read_swing(tmp_path / "bad.npz", BAR)
-    assert "bad.npz" in str(raised.value)
-
-
-def test_a_bar_that_stands_upright_is_refused(file: Path):
-    upright = dataclasses.replace(BAR, ends=((0.0, 0.0, 0.0), (0.0, 0.0, 0.3)))
-    with pytest.raises(ValueError, match="about level"):
-        read_swing(file, upright)
 
 
 def test_where_the_tracker_lost_the_sheet_the_recording_ends_with_a_warning(tmp_path: Path, moved):
@@ -169,20 +150,6 @@ def test_where_the_tracker_lost_the_sheet_the_recording_ends_with_a_warning(tmp_
     with pytest.warns(UserWarning, match="lost the sheet from 0.88 to 1.75 s"):
         read = read_swing(tmp_path / "lost.npz", BAR)
     assert float(read.times[-1]) < 0.9
-
-
-def test_places_of_markers_off_the_sheet_are_named(file: Path):
-    read = read_swing(file, BAR)
-    with pytest.raises(ValueError, match="must lie on the sheet"):
-        make_recording(
-            None,
-            read.times,
-            read.gripper_path,
-            read.gripper_times,
-            read.info,
-            markers=read.markers,
-            marker_places=100 * np.asarray(read.marker_places),
-        )
 
 
 @pytest.mark.slow(group="estimates")
@@ -207,14 +174,7 @@ def test_every_public_swing_is_read_and_its_bar_is_where_the_tool_says():
     """To within 45 mm, which is the tracker's error while it moves fast."""
     for file in sorted(DATA.glob("*.npz"))[::5]:
         read = open_recording(file)
-        ends = np.stack(
-            [
-                np.interp(read.times, read.gripper_times, np.asarray(read.gripper_path)[:, i, k])
-                for i in range(2)
-                for k in range(3)
-            ],
-            axis=1,
-        ).reshape(-1, 2, 1, 3)
+        ends = gripper_positions(read)[:, :, None]
         share = np.linspace(0, 1, 8)[None, :, None]
         bar = (1 - share) * ends[:, 0] + share * ends[:, 1]
         top = np.asarray(read.markers).reshape(-1, 8, 8, 3)[:, :, 0]

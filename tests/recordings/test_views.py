@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
-from windows import window
 
 from r2s import scenarios
 from r2s.estimation import normal_equations
@@ -16,7 +15,7 @@ from r2s.estimation.default_spaces import on_mpm
 from r2s.estimation.gauss_newton import normals_at
 from r2s.estimation.methods import problems_on_mpm
 from r2s.estimation.prediction import predict
-from r2s.estimation.problem import NuisancePrior, Problem, beginning, check_shared
+from r2s.estimation.problem import NuisancePrior, Problem, check_shared
 from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
 from r2s.mesh.mesh import rectangle
@@ -40,6 +39,7 @@ def camera(position, target=(0.0, 0.0, 0.0)) -> DepthCamera:
 
 
 ABOVE = camera((0.05, -0.1, 1.0))
+FACES = np.asarray(rectangle((0.3, 0.3), (31, 31)).faces)
 
 
 def sheet(height: float, side: float = 0.3) -> np.ndarray:
@@ -69,10 +69,8 @@ def test_two_cameras_see_what_either_sees_and_a_gripper_hides_what_is_near_it():
 
 def test_the_workspace_less_its_border_is_what_counts():
     x = jnp.asarray(sheet(0.0))
-    box = ((-0.1, -1.0, -1.0), (0.1, 1.0, 1.0))
-    seen = np.asarray(
-        in_view(Views((ABOVE,), dataclasses.replace(WHOLE, workspace=box), border=0.02), x, NOBODY)
-    )
+    narrow = dataclasses.replace(WHOLE, workspace=((-0.1, -1.0, -1.0), (0.1, 1.0, 1.0)))
+    seen = np.asarray(in_view(Views((ABOVE,), narrow, border=0.02), x, NOBODY))
     np.testing.assert_array_equal(seen, np.abs(np.asarray(x)[:, 0]) < 0.08)
 
 
@@ -95,17 +93,14 @@ def test_samples_in_view_are_those_near_which_the_exact_images_have_points():
 
 
 def test_the_outlier_filter_takes_the_borders_of_a_sheet():
-    x, faces = sheet(0.0), np.asarray(rectangle((0.3, 0.3), (31, 31)).faces)
-    whole = observed(Views((ABOVE,), WHOLE), x, faces)
-    eroded = observed(
-        Views((ABOVE,), dataclasses.replace(WHOLE, neighbours=60, deviations=0.5)), x, faces
-    )
+    filtered = dataclasses.replace(WHOLE, neighbours=60, deviations=0.5)
+    whole, eroded = (observed(Views((ABOVE,), c), sheet(0.0), FACES) for c in (WHOLE, filtered))
     assert len(eroded) < len(whole)
     assert np.abs(whole[:, :2]).max() - np.abs(eroded[:, :2]).max() > 2e-3
 
 
 def test_views_move_with_the_clouds():
-    x, faces = sheet(0.0), np.asarray(rectangle((0.3, 0.3), (31, 31)).faces)
+    x, faces = sheet(0.0), FACES
     shift = (0.02, -0.03, 0.04)
     views = Views((ABOVE,), dataclasses.replace(WHOLE, workspace=((-0.1, -1.0, -1.0), BOX[1])))
     moved = observed(shifted(views, shift), x + np.array(shift), faces)
@@ -179,10 +174,10 @@ def test_a_sheet_that_is_larger_than_its_clouds_is_found_by_what_should_have_bee
     )
     blind = dataclasses.replace(cut, expected=None)
     one_way = [
-        float(normal_equations.loss_of(each, seen))
-        for each in (dataclasses.replace(problem, expected=None), blind)
+        float(normal_equations.loss_of(part, seen))
+        for part in (dataclasses.replace(problem, expected=None), blind)
     ]
-    both = [float(normal_equations.loss_of(each, seen)) for each in (problem, cut)]
+    both = [float(normal_equations.loss_of(part, seen)) for part in (problem, cut)]
     assert one_way[1] == pytest.approx(one_way[0], rel=0.5)  # what is left lies on the sheet
     assert both[0] < 3 * one_way[0] and both[1] > 20 * both[0]
 
@@ -192,24 +187,14 @@ def test_what_should_have_been_seen_has_the_gradient_that_differences_have(probl
     place = FAMILY.to_unit(FABRIC) + 0.1
     alone = dataclasses.replace(problem, clouds=None)  # the nearest points of both may change
     theta = theta_of(alone, place).at[7:].set(jnp.array([0, 0, 0.5, 1.2, -1.1, 0.9, 0.4, -0.3]))
-    (found,), loss = normals_at((alone,), [theta], [jnp.zeros(())]), []
+    (normal,), loss = normals_at((alone,), [theta], [jnp.zeros(())]), []
     for index in (0, 2, 9, 10, 13, 14):  # fabric, size, shift, turn, clock
         width = 1e-5
         steps = [theta.at[index].add(s * width) for s in (1, -1)]
         loss = [n.loss for n in normals_at((alone,), steps, [jnp.zeros(())] * 2)]
         difference = float(loss[0] - loss[1]) / (2 * width)
-        most = float(jnp.max(jnp.abs(found.gradient)))
-        assert float(found.gradient[index]) == pytest.approx(difference, rel=1e-2, abs=1e-3 * most)
-
-
-def test_windows_and_beginnings_keep_and_hide_what_should_have_been_seen(problem):
-    last = problem.frames[-1]
-    later = window(problem, last, last)
-    assert later.expected is not None and len(later.expected.targets) == 1
-    early = beginning(problem, 2 / len(problem.frames)).expected
-    assert early is not None
-    counted = np.asarray(early.mask).any(axis=1)
-    np.testing.assert_array_equal(counted, np.arange(len(problem.frames)) < 2)
+        most = float(jnp.max(jnp.abs(normal.gradient)))
+        assert float(normal.gradient[index]) == pytest.approx(difference, rel=1e-2, abs=1e-3 * most)
 
 
 @pytest.mark.slow(group="motions")
