@@ -1,11 +1,10 @@
-"""The curvature tensor of a sheet, from its bends, in elements of a plate.
+"""The curvature tensor of a sheet in elements of a plate, from its bends.
 
 In a triangle mesh an element is a face. Its three hinges see its three neighbours: six vertices, as
-many as a quadratic has coefficients. So there is one quadratic that bends the three hinges as they
-are bent, and its second derivatives are the face's curvature, exact for a sheet of constant
-curvature on any mesh (as in the enhanced basic shell triangle of Flores and Oñate 2005, whose patch
-is the same). Where a face lies at the border of the sheet and lacks hinges, it is the smallest
-curvature that bends those it has.
+many as a quadratic has coefficients. The second derivatives of the quadratic with the curvature of
+these hinges are the face's curvature, exact for a sheet of constant curvature on any mesh (as in
+the enhanced basic shell triangle of Flores and Oñate 2005, whose patch is the same). A face at the
+border of the sheet, which lacks hinges, has the smallest curvature with those of its hinges.
 
 In a grid an element is a vertex. Its line along the warp turns by k11 times the spacing, that along
 the weft by k22 times it, and from one side of a cell to the other the sheet twists by k12 times it
@@ -34,11 +33,11 @@ SINGULAR = 1e-3  # of the greatest singular value: directions that the hinges do
 class PlateElements(eqx.Module):
     """The elements of a sheet that bends as a plate.
 
-    - `bends`: what the curvatures are made of.
+    - `bends`: of the lines, cells or hinges of the sheet.
     - `areas`: rest areas of the elements, [m^2].
-    - `vertices`: of each element. Where it has fewer than others its first one stands for them.
-    - `of_element`: its bends. Where there is none, bend 0, with no share in curvature.
-    - `places`: which of the bend's vertices each of the element's is; their number: none of them.
+    - `vertices`: of each element; its first one is repeated where it has fewer than others.
+    - `of_element`: its bends; bend 0, with no share in the curvature, where it has fewer.
+    - `places`: which of the bend's vertices each of the element's is; their number for none.
     - `to_curvature`: from the curvatures of the bends to that of the element, (k11, k22, 2 k12).
     """
 
@@ -55,13 +54,15 @@ class PlateElements(eqx.Module):
         rest: Float[np.ndarray, "vertex 2"],
         faces: Int[np.ndarray, "face 3"],
         hinges: Int[np.ndarray, "hinge 4"],
+        hinge_faces: Int[np.ndarray, "hinge 2"],
         areas: Float[np.ndarray, " face"],
         bends: Bends,
     ) -> "PlateElements":
         """The faces of a mesh at rest [m], with the `bends` of its hinges."""
-        of_face = _hinges_of_faces(faces, hinges)
-        to_curvature = _from_hinges(rest, hinges, of_face)
-        return cls._of(bends, areas, of_face, to_curvature)
+        # the hinge on the edge opposite to each corner; -1 at the border
+        of_face, corner = np.full(faces.shape, -1), faces[hinge_faces] == hinges[:, 2:, None]
+        of_face[hinge_faces, np.argmax(corner, axis=2)] = np.arange(len(hinges))[:, None]
+        return cls._of(bends, areas, of_face, _from_hinges(rest, hinges, of_face))
 
     @classmethod
     def of_grid(cls, spacing: tuple[float, float], shape: tuple[int, int]) -> "PlateElements":
@@ -184,14 +185,6 @@ def _inner(lines: Int[np.ndarray, "inner across"]) -> Int[np.ndarray, "along acr
 def _share(count: int) -> np.ndarray:
     """Of the vertices of a line, in units of its spacing."""
     return np.concatenate([[0.5], np.ones(count - 2), [0.5]])
-
-
-def _hinges_of_faces(faces, hinges) -> Int[np.ndarray, "face 3"]:
-    """The hinge on the edge opposite to each corner; -1 at the border."""
-    index = {tuple(sorted(ends)): hinge for hinge, ends in enumerate(hinges[:, :2].tolist())}
-    others = np.sort(faces[:, [[1, 2], [2, 0], [0, 1]]], axis=2)
-    found = [index.get(tuple(ends), -1) for ends in others.reshape(-1, 2).tolist()]
-    return np.reshape(found, (-1, 3))
 
 
 def _from_hinges(rest, hinges, of_face) -> Float[np.ndarray, "face 3 3"]:

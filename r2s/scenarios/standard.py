@@ -1,15 +1,13 @@
 """The six scenarios of the study, each a function of the sheet's size and the grippers' path.
 
-An experiment does not know how it will be simulated: `Experiment.scenario` puts it on a mesh. The
+An experiment is independent of mesh and solver: `Experiment.scenario` puts it on a mesh. The
 grippers follow a `route` that was recorded, or a smooth path (`r2s.scenarios.paths`).
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from r2s._util.units import not_negative, positive
 from r2s.recordings.recording import SheetPlacement
@@ -24,7 +22,7 @@ from r2s.scenarios.paths import (
     shake_path,
     swing_path,
 )
-from r2s.scenarios.scenario import BAR, CLAMPS, CLEARANCE, Scenario, from_placement
+from r2s.scenarios.scenario import BAR, CLAMPS, CLEARANCE, Experiment
 
 SIDE = 0.45  # [m], the study's sheets
 NUM_FRAMES = 60
@@ -33,47 +31,6 @@ SWING_SIDE, SWING_FRAMES, SWING_INTERVAL = 0.3, 50, 0.1  # [m], -, [s]: those of
 GRIP_HEIGHT = 0.7  # [m] above the table, of a hanging sheet's grippers
 ALL_CORNERS = ("origin", "weft", "warp", "opposite")
 Size = tuple[float, float]
-
-
-class Experiment(NamedTuple):
-    """What is done to a sheet, for any fabric and any solver.
-
-    - `sheet`: where it is at rest, and which corners the grippers hold; `route`: their path.
-    - `times`: of the frames, [s]. `frames_used`: the first and the last frame that count.
-    - `wind`: of a fan in front of the sheet's middle, from the first frame on, [m/s]; None: none.
-    - `clamps`: pairs of pinned corners between which the whole side is held.
-    - `table_height`: [m].
-    """
-
-    name: str
-    sheet: SheetPlacement
-    route: Route
-    times: Float[np.ndarray, " frame"]
-    frames_used: tuple[int, int]
-    wind: tuple[float, float, float] | None = None
-    clamps: tuple[tuple[str, str], ...] = ()
-    table_height: float = 0.0
-
-    def scenario(
-        self,
-        shape: tuple[int, int] = (9, 9),
-        self_contact: bool = False,
-        elements: str = "wrinkling",
-    ) -> Scenario:
-        """On a mesh of `shape` vertices along warp and weft, made of `elements`
-        (`r2s.mesh.mesh.rectangle`); with `self_contact` it does not pass through itself."""
-        return from_placement(
-            self.sheet,
-            self.table_height,
-            jnp.asarray(self.route.path, float),
-            jnp.asarray(self.route.times, float),
-            self.times,
-            shape,
-            elements=elements,
-            clamps=self.clamps,
-            wind=self.wind,
-            self_contact=self_contact,
-        )
 
 
 def lifting(

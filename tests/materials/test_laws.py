@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r2s._util.units import AIR_DENSITY, GRAVITY
-from r2s.environment.air import STILL, Air, Fan
+from r2s.environment.air import STILL, Air
 from r2s.environment.scene import Control
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import SpringMembrane
@@ -31,28 +31,25 @@ def membrane_energy(mesh, membrane, x):
     return jnp.sum(mesh.samples.areas.ravel() * jax.vmap(membrane.energy_density)(strains(mesh, x)))
 
 
-# Springs in the plane
-
-
 def spring_energy(x, first, second, constant, length):
     """Energy [J] of springs [N/m] between vertices, of a rest length [m]."""
     stretched = np.linalg.norm(x[second] - x[first], axis=-1)
     return np.sum(constant / 2 * (stretched - length) ** 2)
 
 
+INDEX = np.arange(25).reshape(SHAPE)
+
+
 def structural_springs(x, warp, weft):
     """Energy [J] of springs on the edges along warp and weft, those of the boundary by half."""
-    index = np.arange(25).reshape(SHAPE)
     half = np.array([0.5, 1, 1, 1, 0.5])
-    return spring_energy(x, index[:-1], index[1:], warp * half, CELL) + spring_energy(
-        x, index[:, :-1], index[:, 1:], weft * half[:, None], CELL
-    )
+    along = spring_energy(x, INDEX[:-1], INDEX[1:], warp * half, CELL)
+    return along + spring_energy(x, INDEX[:, :-1], INDEX[:, 1:], weft * half[:, None], CELL)
 
 
 def diagonal_springs(x, constant):
     """Energy [J] of springs on both diagonals of every cell."""
-    index = np.arange(25).reshape(SHAPE)
-    pairs = (index[:-1, :-1], index[1:, 1:]), (index[1:, :-1], index[:-1, 1:])
+    pairs = (INDEX[:-1, :-1], INDEX[1:, 1:]), (INDEX[1:, :-1], INDEX[:-1, 1:])
     return sum(spring_energy(x, *pair, constant, 2**0.5 * CELL) for pair in pairs)
 
 
@@ -83,41 +80,26 @@ def test_small_strains_of_springs_see_an_orthotropic_membrane():
     assert np.asarray(stiffness) == pytest.approx(expected, abs=1e-12)
 
 
-COLLAPSED = {  # (E11, E22, 2 E12)
-    "warp": (-0.5, 0.0, 0.0),
-    "all": (-0.5, -0.5, 0.0),
-    "bias": (-0.25, -0.25, -0.5),
-    "inverted": (-2.0, -2.0, 1.0),  # what no triangle has
-}
-
-
-@pytest.mark.parametrize("name", COLLAPSED)
-def test_collapsed_springs_have_finite_energy_and_force(name):
-    membrane = law(SpringMembrane, 30.0, 20.0, 8.0)
-    strain = jnp.array(COLLAPSED[name])
+@pytest.mark.parametrize(
+    "strain",  # (E11, E22, 2 E12): of the warp, of all, of the bias; inside out
+    [(-0.5, 0.0, 0.0), (-0.5, -0.5, 0.0), (-0.25, -0.25, -0.5), (-2.0, -2.0, 1.0)],
+)
+def test_collapsed_springs_have_finite_energy_and_force(strain):
+    membrane, strain = law(SpringMembrane, 30.0, 20.0, 8.0), jnp.array(strain)
     value, force = jax.value_and_grad(membrane.energy_density)(strain)
     assert 0 < value <= (30 + 20 + 2 * 8) / 2
     assert jnp.all(jnp.isfinite(force))
     assert jnp.all(jnp.isfinite(jax.hessian(membrane.energy_density)(strain)))
 
 
-def turned(mesh, angle):
-    """A mesh whose warp is at minus an angle [rad] to the axes of the rectangle `mesh`."""
-    rest = mesh.rest @ rotation(angle, 2)[:2, :2].T
-    return Mesh.make(np.asarray(rest), np.asarray(mesh.faces))
-
-
-# Orthotropic and isotropic sheets
-
-
-INNER = np.arange(25).reshape(SHAPE)[1:-1, 1:-1].ravel()
 forces = jax.jit(jax.grad(stored_energy, argnums=2))
 
 
-@pytest.mark.parametrize("degrees", [30, 45, -70])
+@pytest.mark.parametrize("degrees", [30, -70])
 def test_uniaxial_stretch_across_the_yarns_is_exact(degrees, sheet, fabric):
     angle, stretch = np.deg2rad(degrees), 1.1
-    mesh = turned(sheet, -angle)  # the warp at this angle to the stretch
+    rest = sheet.rest @ rotation(-angle, 2)[:2, :2].T  # the warp at this angle to the stretch
+    mesh = Mesh.make(np.asarray(rest), np.asarray(sheet.faces))
     x = (flat(sheet) * jnp.array([[stretch, 1.0, 1.0]])) @ rotation(0.7, 0).T
     green, c, s = (stretch**2 - 1) / 2, np.cos(angle), np.sin(angle)
     e11, e22, shear = green * c**2, green * s**2, -2 * green * c * s
@@ -126,10 +108,7 @@ def test_uniaxial_stretch_across_the_yarns_is_exact(degrees, sheet, fabric):
     assert found == pytest.approx(np.tile([e11, e22, shear], (32, 1)), abs=1e-13)
     assert stored_energy(mesh, fabric, x) == pytest.approx(SIZE**2 * density, rel=1e-12)
     force = forces(mesh, fabric, x)
-    assert jnp.max(jnp.abs(force[INNER])) < 1e-12 * jnp.max(jnp.abs(force))
-
-
-# Mass damping
+    assert jnp.max(jnp.abs(force[INDEX[1:-1, 1:-1].ravel()])) < 1e-12 * jnp.max(jnp.abs(force))
 
 
 def test_mass_damping_brakes_a_fall(sheet):
@@ -142,9 +121,6 @@ def test_mass_damping_brakes_a_fall(sheet):
     expected = -GRAVITY / rate * (1 - np.exp(-rate * time))
     assert velocity == pytest.approx(np.tile(expected[:, None], 25), rel=0.01)
     assert velocity[-1] == pytest.approx(-GRAVITY / rate, rel=0.03)  # exp(-3.6)
-
-
-# Air
 
 
 @given(st.tuples(*[st.floats(-3, 3)] * 2), st.floats(-3, 3))
@@ -179,32 +155,6 @@ def test_a_tilted_sheet_glides_at_its_terminal_velocity(degrees, sheet, fabric):
     along, across = (weight * np.sin(tilt) / 1.2) ** 0.5, (weight * np.cos(tilt) / 2.0) ** 0.5
     expected = -along * uphill - across * normal
     assert states.v[-1] == pytest.approx(np.tile(expected, (25, 1)), rel=0.01, abs=1e-3)
-
-
-def fan(radius, edge):
-    point, axis = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.0, 2.0, 0.0])
-    return Fan(point, axis, jnp.array(radius), jnp.array(edge))
-
-
-def strength(jet, distance, along=0.7):
-    """Of a fan's wind at a distance [m] from the axis, and somewhere along it."""
-    return float(jet(jnp.array([[1.0, 2.0 + along, 3.0 + distance]]))[0])
-
-
-def test_the_wind_of_a_fan_falls_across_its_edge():
-    jet = fan(0.3, 0.02)
-    assert strength(jet, 0.0) == pytest.approx(1, abs=1e-12)
-    rounding = 0.02 / 0.3 / 32  # of the distance, on the axis
-    assert strength(jet, 0.3) == pytest.approx(0.5, abs=1.1 * rounding)
-    assert strength(jet, 0.29) == pytest.approx(0.88, abs=0.005)
-    assert strength(jet, 0.31) == pytest.approx(0.12, abs=0.005)
-    assert strength(jet, 0.6) < 1e-12
-    assert strength(jet, 0.31, along=-5.0) == pytest.approx(strength(jet, 0.31))
-
-
-def test_the_wind_of_a_fan_has_a_gradient_on_its_axis():
-    slope = jax.grad(lambda point: fan(0.05, 0.1)(point[None])[0])(jnp.array([1.0, 2.5, 3.0]))
-    assert slope == pytest.approx(0)  # and not NaN
 
 
 @pytest.mark.slow(group="cloth")

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from r2s._util.units import isotropic_bending, isotropic_membrane
 from r2s.materials.membrane import OrthotropicMembrane
-from r2s.mesh.strain_samples import deformation_gradient
 from r2s.mesh.surface import strains
 
 few = settings(max_examples=25, deadline=None)
@@ -48,17 +47,6 @@ def test_rigid_motion_neither_strains_nor_pulls(sheet, fabric, angle, axis, shif
     x = flat(sheet) @ rotation(angle, axis).T + jnp.array([shift])
     assert jnp.max(jnp.abs(strains(sheet, x))) < 1e-13  # rounding of shifts up to 5 m
     assert jnp.max(jnp.abs(forces(sheet, fabric, x))) < 1e-12  # [N]
-
-
-def test_deformation_gradient_has_the_images_of_warp_and_weft(sheet):
-    warp, weft = np.array([1.0, 0.3, -0.2]), np.array([0.1, 0.8, 0.4])
-    x = sheet.rest @ jnp.array([warp, weft])
-    samples = sheet.samples
-    for sample in range(samples.areas.shape[1]):
-        gradients = samples.gradients[:, sample]
-        found = jax.vmap(deformation_gradient)(x[samples.corners], gradients)
-        expected = np.tile(np.stack([warp, weft], 1), (len(found), 1, 1))
-        assert found == pytest.approx(expected, abs=1e-14)
 
 
 strain = st.tuples(*[st.floats(-1, 1)] * 3)

@@ -51,13 +51,6 @@ def bent(mesh: Mesh, k11, k22, k12):
     return jnp.stack([x, y, (k11 * x**2 + k22 * y**2) / 2 + k12 * x * y], axis=1)
 
 
-def test_a_plate_alike_in_all_directions_twists_as_it_bends():
-    """Curvatures of 1 and -1 along two axes are a twist along those at 45 degrees."""
-    law = PlateBending.make(2.0, 0.3)
-    bending, twist = jnp.array([1.0, -1.0, 0.0]), jnp.array([0.0, 0.0, 2.0])
-    assert law.energy_density(twist) == pytest.approx(float(law.energy_density(bending)))
-
-
 def seen(mesh: Mesh, x):
     return mesh.plate.curvatures(mesh.plate.bends.curvatures_at(x))
 

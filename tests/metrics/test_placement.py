@@ -45,13 +45,3 @@ def test_a_recording_is_not_placed_beyond_what_may_be_in_doubt() -> None:
     place = best_placement([cloud + np.array([0.0, 0.0, 0.2]) for cloud in surface(500, 0)], motion)
     assert np.max(np.abs(place.shift)) <= FARTHEST and abs(place.turn) <= TURN
     assert place.shift[2] == pytest.approx(-FARTHEST, rel=1e-3)
-
-
-def test_frames_that_cannot_be_compared_are_named() -> None:
-    real, motion = surface(50, 0), surface(50, 1)
-    with pytest.raises(ValueError, match="1 recorded frames, 2 simulated"):
-        best_placement(real[:1], motion)
-    with pytest.raises(ValueError, match="simulated frame 1"):
-        best_placement(real, [motion[0], motion[1] * np.nan])
-    with pytest.raises(ValueError, match="recorded frame 0"):
-        best_placement([real[0][:0], real[1]], motion)

@@ -26,11 +26,6 @@ def predicted(lift):
     return prediction_error.predict(lift, presets.grey_interlock())
 
 
-def test_a_recording_is_at_no_distance_from_itself(lift):
-    found = prediction_error.against_recording(lift, lift)
-    assert all(value == 0 for value in found.values())
-
-
 @pytest.mark.slow(group="motions")
 def test_the_true_fabric_is_nearer_than_another_and_than_noise_allows(lift, predicted):
     truth = prediction_error.against_motion(lift, predicted)
