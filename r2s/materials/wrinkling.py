@@ -1,18 +1,18 @@
 """Wrinkles finer than a mesh: a cell that is compressed gives way as the sheet within it buckles.
 
-A thin sheet hardly resists compression: it buckles. Wrinkles that are longer than two cells are the
-mesh's own. A cell cannot take a shorter one, nor a fold across its middle, but by compressing its
-membrane, hundreds of times as stiff as bending: the mesh locks. So the strain of a sample is
-shortened by wrinkles that are not seen, L >= 0 (a symmetric matrix), which cost as much as the
-shortest of them, of one cell's length: waves of wavenumber k and shortening L store the energy
-B k^2 L, with the bending stiffness B, along either side of the cell. The energy that is left is
+A thin sheet hardly resists compression: it buckles. A mesh shows wrinkles that are longer than two
+cells. For a shorter one, or a fold across its middle, a cell would have to compress its membrane,
+hundreds of times as stiff as bending: the mesh locks. So the strain of a sample is shortened by
+hidden wrinkles L >= 0 (a symmetric matrix) of one cell's length: waves of wavenumber k and
+shortening L store the energy B k^2 L, with the bending stiffness B, along either side of the cell.
+The energy of a sample is
 
     min over L >= 0 of  W(E + L) + B (k1^2 L11 + k2^2 L22)
 
 (the relaxed energy of tension fields, Pipkin 1986, with a price on wrinkles). The critical
-stress B k^2 = B (2 pi / side)^2 grows without limit as cells shrink. Wrinkles do not begin at once
-there, but from half of it on (a term of the cost that is convex, too; along the yarns that are less
-stiff nearer to it), so that the stiffness has no jump: Newton's method goes to and fro over jumps.
+stress B k^2 = B (2 pi / side)^2 grows without limit as cells shrink. Wrinkles begin gradually from
+half of it on (by another convex term of the cost; nearer to it along the less stiff yarns), so that
+the stiffness has no jump, over which Newton's method would alternate.
 """
 
 from collections.abc import Callable
@@ -75,14 +75,14 @@ class Prepared(NamedTuple):
 
 
 class Wrinkled(eqx.Module):
-    """A membrane law whose compression gives way to wrinkles that the mesh does not show.
+    """A membrane law with wrinkles that the mesh does not show.
 
-    What gives way is that of the law's stiffness at zero strain, all but `SHARE` of it.
+    They release compression by the law's stiffness at zero strain, all but `SHARE` of it.
 
     - `law`: the law of a sheet without them.
     - `critical`: compressive stress at which it buckles along warp and weft, [N/m].
-    - `prepared`: what the search for wrinkles needs of that stiffness and stress.
-    - `hidden`: wrinkles that are known already, from `search`; None: they are searched for.
+    - `prepared`: the search for wrinkles of that stiffness and stress.
+    - `hidden`: known wrinkles, from `search`; None: they are searched for.
     """
 
     law: Any
@@ -100,10 +100,10 @@ class Wrinkled(eqx.Module):
         With known wrinkles the first derivative is right, since they are optimal, but no other.
         """
         if self.hidden is None:
-            freed = _released(self.prepared, strain)
+            energy = released(self.prepared, strain)
         else:
-            freed = -_cost(self.hidden, _at_strain(self.prepared, strain))
-        return self.law.energy_density(strain) - (1 - SHARE) * freed
+            energy = -_cost(self.hidden, _at_strain(self.prepared, strain))
+        return self.law.energy_density(strain) - (1 - SHARE) * energy
 
 
 def split(law: Any) -> tuple[Any, Wrinkled | None]:
@@ -131,8 +131,7 @@ def tangents_on_samples(
 ) -> Float[Array, "element sample 3 3"]:
     """The stiffness [N/m] of every sample at its strain [-].
 
-    Wrinkles are found for all side by side: their derivative takes a tenth of the time it takes
-    sample by sample.
+    All wrinkles are found in one loop: their derivative takes a tenth of the time of a `vmap`.
     """
     taut, wrinkled = split(law)
     tangent = on_samples(lambda law, strain: stress_and_tangent(law, strain)[1], taut, strain)
@@ -160,8 +159,7 @@ def stress_on_samples(
 def search(law: Any, strain: Float[Array, "element sample 3"], start: Any = None) -> Any:
     """The wrinkles of all samples at a strain [-], for `Wrinkled.hidden`, without derivatives.
 
-    Each is an array over all samples. None for a law that has none. A `start` near them, such as
-    those at a strain close by, makes it shorter.
+    Arrays over all samples; None for a law without them. A `start` near them shortens the search.
     """
     wrinkled = split(law)[1]
     if wrinkled is None:
@@ -211,18 +209,6 @@ def mean_bending(bending: BendingLaw) -> Float[Array, ""]:
     return (bending.stiffness_along(0.0) + bending.stiffness_along(jnp.pi / 2)) / 2
 
 
-def released(
-    stiffness: Float[Array, "3 3"], critical: Float[Array, " 2"], strain: Float[Array, " 3"]
-) -> Number:
-    """The energy per area [J/m^2] that wrinkles release, zero or more.
-
-    - `stiffness`: against (E11, E22, 2 E12), positive definite, [N/m].
-    - `critical`: compressive stress at which they begin along warp and weft, [N/m].
-    - `strain`: (E11, E22, 2 E12) [-].
-    """
-    return _released(prepare_search(stiffness, critical), strain)
-
-
 def follow(law: Prepared, strain: Vector, hidden: Vector) -> Vector:
     """The scaled wrinkles at a strain by one Newton step from those nearby."""
     # in stages: XLA works each of a stage's results out from the beginning
@@ -239,11 +225,12 @@ def relieved(law: Prepared, hidden: Vector) -> Vector:
 
 
 @eqx.filter_custom_jvp
-def _released(prepared: Prepared, strain: Float[Array, " 3"]) -> Number:
+def released(prepared: Prepared, strain: Float[Array, " 3"]) -> Number:
+    """The energy per area [J/m^2] that wrinkles release at a strain [-], zero or more."""
     return -_cost(_hidden(prepared, strain), _at_strain(prepared, strain))
 
 
-@_released.def_jvp
+@released.def_jvp
 def _released_jvp(primals, tangents):
     # the wrinkles are optimal, so their change does not count (it does in the next derivative);
     # but those at their limit change with it
@@ -270,10 +257,11 @@ def _cost(hidden: Vector, problem: Prepared) -> Number:
 
 @jax.jit
 def prepare_search(stiffness: Float[Array, "3 3 ..."], critical: Float[Array, "2 ..."]) -> Prepared:
-    """What the search needs of a law.
+    """The search, from the stiffness [N/m] against (E11, E22, 2 E12) and the compressive stress
+    [N/m] at which wrinkles begin along warp and weft.
 
     Wrinkles are scaled along warp and weft by fourth roots of their stiffness, which keeps them
-    symmetric and positive, and makes all fabrics alike. Their unit is that of their onset.
+    symmetric and positive, and brings all fabrics to one scale. Their unit is that of their onset.
     """
     (c11, c12, c13), (_, c22, c23), (_, _, c33) = (tuple(row) for row in stiffness)
     # laws by table may have no stiffness along one of them
@@ -322,15 +310,12 @@ def _none(prepared: Prepared) -> Vector:
 
 @eqx.filter_custom_jvp
 def _hidden(prepared: Prepared, strain: Float[Array, "*sample 3"]) -> Vector:
-    """The scaled wrinkles that release most: descents, then a semismooth Newton method.
-
-    Of one sample, or of all in a row.
-    """
+    """The scaled wrinkles that release most, of one sample or of all in a row."""
     return _search(_at_strain(prepared, strain), _none(prepared))
 
 
 def _search(problem: Prepared, start: Vector) -> Vector:
-    """The scaled wrinkles, from a start: of one sample, or of all in arrays."""
+    """The scaled wrinkles from a start, by descents, then by a semismooth Newton method."""
     close = CLOSE * jnp.finfo(problem.most.dtype).eps
 
     def descent(hidden, _):

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from r2s._util.units import AIR_DENSITY, GRAVITY
 from r2s.environment.air import STILL, Air
-from r2s.environment.scene import Control
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import SpringMembrane
 from r2s.mesh.mesh import Mesh, rectangle
@@ -134,14 +133,6 @@ def test_flow_along_a_face_pulls_it_along(flow, normal_flow):
     assert force == pytest.approx(expected, rel=1e-9, abs=1.3 * 0.4 / 2 * 0.02 * STILL**2)
 
 
-@pytest.mark.parametrize("flow", [(0.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
-def test_friction_of_the_air_has_derivatives_at_no_flow_along(flow):
-    air, area_normal = Air.make(), jnp.array([0.0, 0.0, 0.02])
-    force = jax.grad(air.dissipation)(jnp.array(flow), area_normal)
-    assert force[:2] == pytest.approx(0)
-    assert jnp.all(jnp.isfinite(jax.hessian(air.dissipation)(jnp.array(flow), area_normal)))
-
-
 @pytest.mark.slow(group="cloth")
 @pytest.mark.parametrize("degrees", [35, 90])
 def test_a_tilted_sheet_glides_at_its_terminal_velocity(degrees, sheet, fabric):
@@ -155,17 +146,3 @@ def test_a_tilted_sheet_glides_at_its_terminal_velocity(degrees, sheet, fabric):
     along, across = (weight * np.sin(tilt) / 1.2) ** 0.5, (weight * np.cos(tilt) / 2.0) ** 0.5
     expected = -along * uphill - across * normal
     assert states.v[-1] == pytest.approx(np.tile(expected, (25, 1)), rel=0.01, abs=1e-3)
-
-
-@pytest.mark.slow(group="cloth")
-def test_the_same_wind_at_every_vertex_is_a_uniform_one(sheet, fabric):
-    solver = cloth(sheet, air=AIR_DENSITY)
-    start = solver.init(flat(sheet) @ rotation(0.4, 0).T)
-    wind, none = jnp.array([1.0, -2.0, 3.0]), start.x[:0]
-    uniform, each = (
-        # what a step is made of; for each kind of wind it would compile anew
-        solver.potential(fabric, start, Control(none, wind))
-        for wind in (wind, everywhere(wind, sheet))
-    )
-    assert np.asarray(uniform.wind) == pytest.approx(np.tile(wind, (16, 1)), abs=1e-12)
-    assert jax.tree.all(jax.tree.map(lambda a, b: jnp.allclose(a, b, 1e-12), uniform, each))

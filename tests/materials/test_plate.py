@@ -1,24 +1,19 @@
 """Plates: the curvature of faces is exact, and its energy that of Kirchhoff's plate."""
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import cloth, directional_difference, flat
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 
-from r2s.environment.scene import Control
 from r2s.materials.fabric import Fabric
 from r2s.materials.plate import OrthotropicPlate, PlateBending
 from r2s.mesh.mesh import ELEMENTS, Mesh, rectangle
 from r2s.scenarios.scenario import rollout
 from r2s.scenarios.standard import lifting
-from r2s.solvers.implicit.potential import hessian, residual
 
 SLIGHT = 1e-4  # so that angles are slopes
 numbers = st.floats(-1.0, 1.0)
@@ -125,28 +120,6 @@ def test_a_solid_plate_has_the_textbook_stiffness():
     # free to curve across, it is a beam of E h^3 / 12
     beam = law.energy_density(jnp.asarray([1.0, -0.3, 0.0]))
     assert beam == pytest.approx(2e9 * 1e-9 / 24)
-
-
-@pytest.mark.slow(group="cloth")
-@pytest.mark.parametrize(
-    "law", [PlateBending.make(0.3, 0.2), OrthotropicPlate(*jnp.array([0.3, 0.4, 0.2]))]
-)
-def test_the_hessian_is_the_derivative_of_the_force(law, sheet, fabric):
-    x = flat(sheet) + 0.02 * jax.random.normal(jax.random.key(1), (25, 3))
-    fabric = Fabric(fabric.density, fabric.membrane, law, *list(fabric.__dict__.values())[3:])
-    solver = cloth(sheet)
-    state, control = solver.init(flat(sheet)), Control(jnp.zeros((0, 3)), jnp.zeros(3))
-    increment = solver.potential(fabric, state, control)
-    direction = jax.random.normal(jax.random.key(2), x.shape)
-    expected = directional_difference(jax.jit(partial(residual, increment)), x, direction, 1e-7)
-    pattern, blocks = increment.elimination.pattern, jax.jit(hessian)(increment, x)
-    product = np.zeros((25, 3))
-    np.add.at(
-        product,
-        np.asarray(pattern.rows),
-        np.einsum("bij,bj->bi", blocks, direction[pattern.columns]),
-    )
-    np.testing.assert_allclose(product, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
 
 
 @pytest.mark.slow(group="cloth")

@@ -6,14 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import FIRST_ROW, SIZE, cloth, flat, roll, step
+from conftest import FIRST_ROW, SIZE, cloth, flat, roll
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from r2s._util.units import GRAVITY
-from r2s.environment.scene import Control
-from r2s.materials.bending import HingeBending
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import MembraneLaw, OrthotropicMembrane
 from r2s.materials.tables import HINGE_FACTOR, TableBending, TableMembrane
@@ -165,17 +163,3 @@ def test_a_sheet_hangs_by_the_stiffness_of_its_strain(sheet):
 
     assert height[0] - height[-1] - SIZE == pytest.approx(extension(True), rel=0.01)
     assert extension(False) > 1.1 * extension(True)  # so the table makes a difference
-
-
-@pytest.mark.slow(group="cloth")
-def test_a_sheet_of_equal_rows_moves_like_one_of_constant_stiffness(sheet):
-    solver = cloth(sheet, FIRST_ROW)
-    state = solver.init(1.02 * flat(sheet))
-    control = Control(state.x[:5], jnp.zeros(3))
-    constant = Fabric.make(0.2, (300.0, 60.0, 200.0, 80.0), 0.0, damping=0.05)
-    constant = dataclasses.replace(constant, bending=HingeBending(jnp.asarray(2e-5, float)))
-    rows = jnp.tile(numbers(constant.membrane), (6, 1))
-    bending = TableBending(jnp.full((3, 5), HINGE_FACTOR * 2e-5))
-    found = step(solver, tabled(TableMembrane(rows), bending), state, control)
-    expected = step(solver, constant, state, control)
-    assert found.x == pytest.approx(np.asarray(expected.x), abs=1e-11)

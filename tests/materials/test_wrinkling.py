@@ -1,6 +1,5 @@
 """Cells that wrinkle: their energy is the least over wrinkles that the mesh does not show."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,11 +9,15 @@ from scipy.optimize import minimize
 import r2s
 from r2s import rectangle
 from r2s.materials import presets, wrinkling
-from r2s.materials.wrinkling import LEAST, membrane_on_samples, released
-from r2s.scenarios.energy import stored_energy
-from r2s.solvers.explicit.elements import bending_force, membrane_force, membrane_stress
+from r2s.materials.wrinkling import LEAST, membrane_on_samples, prepare_search
 
 CRITICAL = 0.5  # [N/m]
+
+
+def released(stiffness, critical, strain):
+    return wrinkling.released(prepare_search(stiffness, critical), strain)
+
+
 value = jax.jit(released)
 slope = jax.jit(jax.grad(released, argnums=2))
 curvature = jax.jit(jax.hessian(released, argnums=2))
@@ -72,46 +75,6 @@ def test_derivatives_agree_with_differences_and_the_rest_is_convex(name):
         tolerance = 1e-6 * matrix.max()
         np.testing.assert_allclose(second, differences(slope, strain), atol=tolerance)
         assert np.linalg.eigvalsh(matrix - second).min() > 0
-
-
-@pytest.mark.slow(group="cloth")
-def test_forces_on_material_points_are_those_of_the_stored_energy():
-    mesh, fabric = rectangle((0.2, 0.2), (5, 5), "wrinkling"), presets.grey_interlock()
-    noise = np.random.default_rng(1).normal(size=(25, 3)) * 2e-3
-    x = jnp.asarray(np.pad(0.95 * np.array(mesh.rest), ((0, 0), (0, 1))) + noise)
-
-    def stored(mesh):
-        return lambda x: stored_energy(mesh, fabric, x)
-
-    def forces(x):
-        membrane = membrane_force(mesh, x, membrane_stress(mesh, fabric, x))
-        return membrane + bending_force(mesh, fabric, x, 0 * x)
-
-    force = jax.jit(forces)(x)
-    expected = -jax.jit(jax.grad(stored(mesh)))(x)
-    np.testing.assert_allclose(force, expected, atol=1e-6 * np.abs(expected).max())
-    stiffer = stored(rectangle((0.2, 0.2), (5, 5), "quadrilaterals"))
-    assert jax.jit(stored(mesh))(x) < 0.5 * jax.jit(stiffer)(x)
-
-
-@pytest.mark.slow(group="cloth")
-def test_a_motion_of_wrinkled_cells_has_the_gradient_that_differences_have():
-    sheet = rectangle((0.2, 0.2), (5, 5), "wrinkling")
-    scene = r2s.Scene(sheet, [0, 4])
-    solver, start = r2s.ImplicitCloth(scene, dt=0.01), jnp.pad(sheet.rest, ((0, 0), (0, 1)))
-    nearer = jnp.outer(jnp.linspace(0, 0.04, 10), jnp.array([0.0, 1, 0]))
-    path = start[jnp.array([0, 4])][None] + jnp.stack([nearer, -nearer], axis=1)
-    control = r2s.Control(path)
-    knit = presets.grey_interlock()
-
-    def height(stiffness):
-        fabric = eqx.tree_at(lambda f: f.bending.stiffness, knit, stiffness)
-        return jnp.mean(r2s.simulate(solver, fabric, solver.init(start), control).x[-1, :, 2])
-
-    height, at = jax.jit(height), jnp.asarray(5.5e-6)
-    slope, h = jax.jit(jax.grad(height))(at), 1e-10
-    differences = (height(at + h) - height(at - h)) / (2 * h)
-    assert float(slope) == pytest.approx(float(differences), rel=1e-4)
 
 
 def test_below_half_of_the_critical_stress_nothing_is_released():

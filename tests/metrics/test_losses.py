@@ -48,17 +48,6 @@ def test_masked_points_change_neither_value_nor_gradient(clouds):
     assert jnp.isnan(chamfer(points, ~EVERY, targets))
 
 
-def test_the_gradient_of_chamfer_agrees_with_differences(clouds):
-    def loss(both):
-        return chamfer(both[0], EVERY, both[1])
-
-    direction = tuple(jax.random.normal(jax.random.key(i), c.shape) for i, c in enumerate(clouds))
-    expected = directional_difference(loss, clouds, direction, 1e-6)
-    gradient = jax.grad(loss)(clouds)
-    found = sum(jnp.sum(g * d) for g, d in zip(gradient, direction, strict=True))
-    assert found == pytest.approx(float(expected), rel=1e-7)
-
-
 @pytest.fixture
 def surface(sheet):
     """A crumpled sheet with points around it."""
@@ -124,6 +113,7 @@ def test_the_robust_weight_is_its_slope_over_the_distance(distance, scale):
 
 def test_with_a_scale_what_is_far_off_does_not_pull():
     near, far = jnp.array(1e-4), jnp.array(0.1)
+    assert robust_weight(jnp.array(OUTLIER_SCALE)) == pytest.approx(0.5)
     assert robust(near, 5e-3) == pytest.approx(0.5e-8, rel=1e-3)
     assert robust(far, 5e-3) == pytest.approx(5e-3**2 / 2, rel=1e-2)
 
@@ -131,10 +121,3 @@ def test_with_a_scale_what_is_far_off_does_not_pull():
         return float(robust_weight(far, scale) * far)
 
     assert pull(5e-3) < 1e-3 * pull(0.0)
-
-
-def test_the_robust_loss_is_quadratic_near_and_flat_far():
-    assert robust(jnp.array(1e-5)) == pytest.approx(0.5e-10, rel=1e-6)
-    assert robust_weight(jnp.array(OUTLIER_SCALE)) == pytest.approx(0.5)
-    far = robust(jnp.array([1.0, 2.0]))
-    assert far[1] - far[0] == pytest.approx(OUTLIER_SCALE**2 * np.log(2), rel=1e-3)

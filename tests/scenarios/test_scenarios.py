@@ -60,19 +60,6 @@ def check(scenario, fabric, found):
     assert found.kinetic[0] < mass / 2 * 0.01**2  # it starts at rest, to 1 cm/s
 
 
-@pytest.mark.slow(group="motions")
-@pytest.mark.parametrize("name", ["lifting", "folding"])
-def test_a_sheet_on_the_table_is_lifted_and_folded(name):
-    fabric = presets.FIVE[STIFFEST]()
-    scenario = SCENARIOS[name](**FRAMES, moving=0.8).scenario(SHAPE)
-    found = account(scenario, fabric)
-    check(scenario, fabric, found)
-    start = np.asarray(found.x[0])
-    # nothing has moved but the contact's 0.07 mm
-    np.testing.assert_allclose(start, np.asarray(scenario.start), atol=2e-4)
-    assert np.abs(np.asarray(stretch(scenario.scene.mesh, found.x))).mean() < 0.05
-
-
 @pytest.fixture(scope="module")
 def shaken():
     """A fabric in the scenario, the motion with its energies, and the grippers' forces."""
