@@ -233,8 +233,13 @@ class IsotropicSpace(ParameterSpace):
         positive("m", plate=plate, thickness=thickness)
         not_negative("s", damping=damping)
         not_negative("-", friction=friction)
-        numbers = (jnp.asarray(n, float) for n in (density, plate, damping, friction, thickness))
-        space = cls(*numbers)
+        space = cls(
+            density=jnp.asarray(density, float),
+            plate=jnp.asarray(plate, float),
+            damping=jnp.asarray(damping, float),
+            friction=jnp.asarray(friction, float),
+            thickness=jnp.asarray(thickness, float),
+        )
         return replace(space, ranges=(*space.ranges, *losses))
 
     def __call__(self, u: Float[Array, " dim"]) -> Fabric:
@@ -360,8 +365,9 @@ class InformedSpace(ParameterSpace):
                 f"a space of {space.dim} parameters needs as many means and a precision of "
                 f"{space.dim} x {space.dim}, got {mean.shape} and {precision.shape}"
             )
-        normal = jnp.asarray(mean, float), jnp.asarray(precision, float)
-        return cls(space, *normal, space.ranges, measured)
+        mean, precision = jnp.asarray(mean, float), jnp.asarray(precision, float)
+        ranges = space.ranges
+        return cls(space=space, mean=mean, precision=precision, ranges=ranges, measured=measured)
 
     def __call__(self, u: Float[Array, " dim"]) -> Fabric:
         """The fabric at a point of the unit cube."""

@@ -40,16 +40,6 @@ def test_a_dropped_sheet_rests_on_the_table(sheet, fabric):
     assert np.max(np.abs(states.v[-1])) < 1e-6
 
 
-@pytest.mark.slow(group="cloth")
-def test_a_sliding_sheet_decelerates_by_friction(sheet, fabric, lying):
-    solver, start = lying
-    states = roll(solver, fabric, solver.init(start, everywhere([0.8, 0.6, 0.0], sheet)), 8)
-    speed = np.mean(np.linalg.norm(states.v[:, :, :2], axis=2), axis=1)
-    deceleration = (speed[4] - speed[8]) / (4 * DT)
-    assert deceleration == pytest.approx(0.5 * GRAVITY, rel=0.02)  # 3^-4 of the start-up is left
-    assert states.v[8, :, 0] / states.v[8, :, 1] == pytest.approx(0.8 / 0.6, rel=1e-6)
-
-
 def pulled(lying, fabric, acceleration, count):
     """Speeds of a sheet at rest on the table that a uniform force pulls along."""
     solver, start = lying

@@ -71,27 +71,3 @@ def test_an_unwrapped_angle_differs_by_whole_turns_and_is_nearest(angle, near):
     turns = (found - angle) / (2 * np.pi)
     assert turns == pytest.approx(round(turns), abs=1e-9)
     assert abs(found - near) <= np.pi * (1 + 1e-9)
-
-
-@pytest.mark.slow(group="cloth")
-@pytest.mark.parametrize("elements", ["wrinkling", "rising"])
-def test_second_derivatives_of_bends_are_those_of_their_gradients(elements):
-    sheet = rectangle((0.3, 0.2), (4, 3), elements)
-    bends = sheet.plate.bends
-    random = np.random.default_rng(0)
-    flat = np.pad(np.asarray(sheet.rest), ((0, 0), (0, 1)))
-    x = jnp.asarray(flat + 0.03 * random.normal(size=flat.shape))
-    moments = jnp.asarray(random.normal(size=len(bends.per_angle)))
-    found = bends.second_derivatives(x, moments)
-
-    def corner_gradients(corners, index):
-        """Of one bend, of its own vertices."""
-        return bends.gradients(x.at[bends.vertices[index]].set(corners))[index]
-
-    for index in range(0, len(moments), 5):
-        vertices = np.asarray(bends.vertices[index])
-        if len(set(vertices.tolist())) < len(vertices):
-            continue  # padded with one that has no weight
-        expected = jax.jacfwd(corner_gradients)(x[vertices], index) * moments[index]
-        largest = float(jnp.max(jnp.abs(expected)))
-        np.testing.assert_allclose(found[index], expected, rtol=0, atol=1e-10 * largest)

@@ -43,14 +43,6 @@ def test_the_bounds_are_reached_at_the_ends():
     assert np.asarray(high) == pytest.approx([bound.high for bound in FAMILY.ranges], rel=1e-12)
 
 
-@given(st.floats(0.1, 10), st.floats(1.1, 100), st.floats(-1, 2), st.booleans())
-@few
-def test_value_and_place_of_a_range_are_inverse(low, ratio, place, is_log):
-    bound = Range("any", "-", low, low * ratio, is_log)
-    value = bound.from_unit(jnp.array(place))
-    assert bound.to_unit(value) == pytest.approx(place, abs=1e-9)
-
-
 @pytest.mark.parametrize(
     "low, high, is_log", [(2.0, 1.0, True), (1.0, 1.0, False), (0.0, 1.0, True), (-1.0, 1.0, True)]
 )

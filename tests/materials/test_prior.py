@@ -59,7 +59,7 @@ def test_a_yarn_stiffens_half_way_at_a_stretch_and_at_most_by_a_ratio(axis):
         others = np.ones((3, 3), bool)
         others[axis, axis] = False
         assert found[others] == pytest.approx(at_rest[others])
-    with pytest.raises(ValueError, match="1 or more"):
+    with pytest.raises(ValueError, match="ratio >= 1"):
         StiffeningMembrane.make(SMALL, 0.5, 1.1)
 
 

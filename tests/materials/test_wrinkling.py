@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-import r2s
 from r2s import rectangle
 from r2s.materials import presets, wrinkling
 from r2s.materials.wrinkling import LEAST, membrane_on_samples, prepare_search
@@ -109,11 +108,8 @@ def test_the_critical_stress_is_that_of_waves_as_long_as_a_cell():
 @pytest.mark.parametrize("name", ["black_denim", "grey_interlock"])
 def test_derivatives_in_the_law_agree_with_differences_up_to_the_most_that_is_hidden(name):
     """Half of the strains are compressed by more than wrinkles can hide."""
-    matrix, at, h = (
-        stiffness(name) + np.diag([0.5, 0.5], 1) + np.diag([0.5, 0.5], -1),
-        jnp.asarray([CRITICAL, 2 * CRITICAL]),
-        1e-5,
-    )
+    matrix = stiffness(name) + np.diag([0.5, 0.5], 1) + np.diag([0.5, 0.5], -1)
+    at, h = jnp.asarray([CRITICAL, 2 * CRITICAL]), 1e-5
     random = np.random.default_rng(4)
     in_law = jax.jit(jax.grad(released, argnums=(0, 1)))
     for strain in random.uniform([-0.6, -0.6, -0.1], [0.1, 0.1, 0.1], (20, 3)):
@@ -151,28 +147,21 @@ def test_without_stiffness_along_a_yarn_all_is_finite(diagonal):
 
 def test_a_search_from_other_wrinkles_ends_at_the_same_ones():
     """Wherever it starts: the energy that is left is convex, so that there is one minimum."""
-    random = np.random.default_rng(1)
-    count = 2000
+    random, count = np.random.default_rng(1), 2000
     warp, weft = np.exp(random.uniform(np.log(3), np.log(3000), (2, count)))
-    matrix = np.zeros((count, 3, 3))
-    matrix[:, 0, 0], matrix[:, 1, 1] = warp, weft
     coupling = random.uniform(-0.97, 0.97, count) * np.sqrt(warp * weft)
-    matrix[:, 0, 1] = matrix[:, 1, 0] = coupling
-    matrix[:, 2, 2] = np.exp(random.uniform(0, np.log(1000), count))
-    critical = np.repeat(np.exp(random.uniform(np.log(1e-3), np.log(5), (count, 1))), 2, axis=1)
-    strain = random.normal(size=(1, count, 3)) * 0.1
-    laws = wrinkling.Wrinkled(
-        r2s.OrthotropicMembrane(*jnp.asarray([[warp], [coupling], [weft], [matrix[:, 2, 2]]])),
-        jnp.asarray(critical[None]),
-        jax.vmap(jax.vmap(wrinkling.prepare_search))(
-            jnp.asarray(matrix[None]), jnp.asarray(critical[None])
-        ),
-    )
-    found = wrinkling.search(laws, jnp.asarray(strain))
-    others = wrinkling.search(laws, jnp.asarray(random.permutation(strain, axis=1)))
-    again = wrinkling.search(laws, jnp.asarray(strain), others)
-    assert np.mean(np.abs(np.asarray(found[0])) > 1) > 0.2  # there is something to find
-    for one, other in zip(found, again, strict=True):
+    shear, critical = np.exp(random.uniform([[0], [np.log(1e-3)]], [[7], [np.log(5)]], (2, count)))
+    zero = np.zeros(count)
+    matrix = jnp.array([[warp, coupling, zero], [coupling, weft, zero], [zero, zero, shear]])
+    strain = jnp.asarray(random.normal(size=(1, count, 3)) * 0.1)
+    buckling = jnp.asarray([critical, critical])
+    prepared = jax.tree.map(lambda leaf: leaf[None], wrinkling.prepare_search(matrix, buckling))
+    laws = wrinkling.Wrinkled(None, buckling.T[None], prepared)
+    hidden = wrinkling.search(laws, strain)
+    others = wrinkling.search(laws, jnp.asarray(random.permutation(np.asarray(strain), axis=1)))
+    again = wrinkling.search(laws, strain, others)
+    assert np.mean(np.abs(np.asarray(hidden[0])) > 1) > 0.2  # there are wrinkles
+    for one, other in zip(hidden, again, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-8)
 
 
@@ -184,21 +173,15 @@ def test_known_wrinkles_give_the_energy_its_slope_and_the_closed_form_its_curvat
     law = membrane_on_samples(sheet.samples, fabric.membrane, fabric.bending, 0 * strain)
     known = wrinkling.with_wrinkles(law, wrinkling.search(law, strain))
 
-    def energies(law, strain):
-        return jax.vmap(jax.vmap(lambda law, strain: law.energy_density(strain)))(law, strain)
+    def of_all(function, law):
+        return jax.vmap(jax.vmap(lambda law, e: function(law.energy_density)(e)))(law, strain)
 
-    def slopes(law, strain):
-        return jax.vmap(jax.vmap(lambda law, strain: jax.grad(law.energy_density)(strain)))(
-            law, strain
-        )
-
-    np.testing.assert_allclose(energies(known, strain), energies(law, strain), rtol=1e-9)
-    np.testing.assert_allclose(slopes(known, strain), slopes(law, strain), rtol=1e-7, atol=1e-9)
+    energies, slopes = of_all(lambda energy: energy, law), of_all(jax.grad, law)
+    np.testing.assert_allclose(of_all(lambda energy: energy, known), energies, rtol=1e-9)
+    np.testing.assert_allclose(of_all(jax.grad, known), slopes, rtol=1e-7, atol=1e-9)
     stress = wrinkling.stress_on_samples(law, strain)
     tangent = wrinkling.tangents_on_samples(law, strain)
-    np.testing.assert_allclose(stress, slopes(law, strain), rtol=1e-7, atol=1e-9)
-    by_derivative = jax.vmap(jax.vmap(lambda law, e: jax.hessian(law.energy_density)(e)))(
-        law, strain
-    )
+    np.testing.assert_allclose(stress, slopes, rtol=1e-7, atol=1e-9)
+    by_derivative = of_all(jax.hessian, law)
     largest = float(jnp.max(jnp.abs(by_derivative)))
     np.testing.assert_allclose(tangent, by_derivative, rtol=0, atol=1e-9 * largest)
