@@ -50,8 +50,9 @@ def lifting(
     >>> scenario.start.shape, scenario.num_frames
     ((25, 3), 60)
     """
-    done = _moved("lifting", on_table(size, (pinned,)), route, num_frames, interval, path)
-    return done._replace(frames_used=(num_frames // 2, num_frames - 1))
+    sheet, used = on_table(size, (pinned,)), (num_frames // 2, num_frames - 1)
+    moved = _moved("lifting", lift_path, sheet, route, num_frames, interval, path)
+    return moved._replace(frames_used=used)
 
 
 def folding(
@@ -64,7 +65,8 @@ def folding(
     **path: float,
 ) -> Experiment:
     """A sheet lies flat on the table; a corner is brought onto the opposite one: `fold_path`."""
-    return _moved("folding", on_table(size, (pinned,)), route, num_frames, interval, path)
+    sheet = on_table(size, (pinned,))
+    return _moved("folding", fold_path, sheet, route, num_frames, interval, path)
 
 
 def stretching(
@@ -83,7 +85,8 @@ def stretching(
     opposite). `path`: see `pull_path`.
     """
     sheet = on_table(size, ALL_CORNERS, height)
-    return _moved("stretching", sheet, route, num_frames, interval, path)._replace(clamps=CLAMPS)
+    moved = _moved("stretching", pull_path, sheet, route, num_frames, interval, path)
+    return moved._replace(clamps=CLAMPS)
 
 
 def wind(
@@ -106,8 +109,8 @@ def wind(
         raise ValueError(f"aside must be from -90 to 90 [degrees], found {aside}")
     angle = np.radians(aside)
     blows = (float(speed * np.sin(angle)), float(speed * np.cos(angle)), 0.0)
-    done = _moved("wind", hanging(size, height), route, num_frames, interval, path)
-    return done._replace(wind=blows)
+    moved = _moved("wind", hold_path, hanging(size, height), route, num_frames, interval, path)
+    return moved._replace(wind=blows)
 
 
 def fling(
@@ -120,7 +123,7 @@ def fling(
     **path: float,
 ) -> Experiment:
     """A sheet hangs from its top corners, which rapidly go forward and back: `fling_path`."""
-    return _moved("fling", hanging(size, height), route, num_frames, interval, path)
+    return _moved("fling", fling_path, hanging(size, height), route, num_frames, interval, path)
 
 
 def shaking(
@@ -133,7 +136,7 @@ def shaking(
     **path: float,
 ) -> Experiment:
     """A sheet hangs from its top corners, of which one goes up and down: `shake_path`."""
-    return _moved("shaking", hanging(size, height), route, num_frames, interval, path)
+    return _moved("shaking", shake_path, hanging(size, height), route, num_frames, interval, path)
 
 
 def swing(
@@ -145,15 +148,15 @@ def swing(
     interval: float = SWING_INTERVAL,
     **path: float,
 ) -> Experiment:
-    """A sheet hangs from a bar along its warp, which goes to and fro and turns; not of the study.
+    """A sheet hangs from a bar along its warp, which sways and turns; not of the study.
 
     A `route` is that of both ends of the bar. `path`: see `swing_path`.
 
     >>> swing((0.3, 0.3)).scenario((4, 4)).path.shape[1]  # vertices along the bar
     4
     """
-    sheet = hanging(size, height)
-    return _moved("swing", sheet, route, num_frames, interval, path)._replace(clamps=BAR)
+    moved = _moved("swing", swing_path, hanging(size, height), route, num_frames, interval, path)
+    return moved._replace(clamps=BAR)
 
 
 SCENARIOS: dict[str, Callable[..., Experiment]] = {
@@ -190,31 +193,21 @@ def hanging(size: Size, height: float) -> SheetPlacement:
     return SheetPlacement(size, (0.0, 0.0, height), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), pinned)
 
 
-_PATHS: dict[str, Callable[..., Route]] = {
-    "lifting": lift_path,
-    "wind": hold_path,
-    "stretching": pull_path,
-    "folding": fold_path,
-    "fling": fling_path,
-    "shaking": shake_path,
-    "swing": swing_path,
-}
-
-
 def _moved(
     name: str,
+    made: Callable[..., Route],
     sheet: SheetPlacement,
     route: Route | None,
     num_frames: int,
     interval: float,
     path: dict[str, float],
 ) -> Experiment:
-    """An experiment all of whose frames count: on a `route`, or on the path of these numbers."""
+    """An experiment all of whose frames count, on a `route` or on the path `made` of numbers."""
     if num_frames < 2:
         raise ValueError(f"num_frames must be at least 2, found {num_frames}")
     positive("s", interval=interval)
     if route is not None and path:
         raise ValueError(f"{name}: a route is given, which {', '.join(path)} would not change")
     times = np.arange(num_frames) * interval
-    route = _PATHS[name](sheet, times[-1], **path) if route is None else route
+    route = made(sheet, times[-1], **path) if route is None else route
     return Experiment(name, sheet, route, times, (0, num_frames - 1))

@@ -30,16 +30,6 @@ def lying(sheet, fabric):
     return cloth(sheet, table=0.0), flat(sheet, float(fabric.thickness) - REST_DEPTH)
 
 
-@pytest.mark.slow(group="cloth")
-def test_a_dropped_sheet_rests_on_the_table(sheet, fabric):
-    solver = cloth(sheet, table=0.0)
-    states = roll(solver, fabric, solver.init(flat(sheet, 4e-3)), 150)
-    depth = float(fabric.thickness) - states.x[100:, :, 2]
-    assert np.max(depth) < 2e-4
-    assert depth == pytest.approx(REST_DEPTH, rel=1e-3)  # and it does not sink
-    assert np.max(np.abs(states.v[-1])) < 1e-6
-
-
 def pulled(lying, fabric, acceleration, count):
     """Speeds of a sheet at rest on the table that a uniform force pulls along."""
     solver, start = lying

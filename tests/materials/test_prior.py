@@ -59,16 +59,11 @@ def test_a_yarn_stiffens_half_way_at_a_stretch_and_at_most_by_a_ratio(axis):
         others = np.ones((3, 3), bool)
         others[axis, axis] = False
         assert found[others] == pytest.approx(at_rest[others])
+    stiffest = _tangent(law.stiffest, jnp.zeros(3))
+    for strain in jr.uniform(jr.key(0), (20, 3), minval=-1.0, maxval=1.0):
+        assert np.linalg.eigvalsh(stiffest - _tangent(law, strain)).min() > -1e-9
     with pytest.raises(ValueError, match="ratio >= 1"):
         StiffeningMembrane.make(SMALL, 0.5, 1.1)
-
-
-@pytest.mark.slow(group="cloth")
-def test_no_strain_makes_a_sheet_stiffer_than_its_stiffest():
-    law = StiffeningMembrane.make(SMALL, 2.0, 1.1)
-    most = _tangent(law.stiffest, jnp.zeros(3))
-    for strain in jr.uniform(jr.key(0), (50, 3), minval=-1.0, maxval=1.0):
-        assert np.linalg.eigvalsh(most - _tangent(law, strain)).min() > -1e-9
 
 
 def test_a_plate_loses_half_of_what_it_can_at_its_knee():

@@ -83,12 +83,6 @@ def test_what_is_no_cloud_is_refused(name, unchecked):
         distances(SQUARE, cloud)
 
 
-def test_paper_units_need_a_first_frame_with_a_size():
-    point = np.zeros((3, 3))
-    with pytest.raises(ValueError, match="more than one place"):
-        paper_units(SQUARE, SQUARE, point, SQUARE)
-
-
 def surface(count: int, seed: int) -> list[np.ndarray]:
     """Points of a bent sheet [m] in two frames of its motion."""
     u, v = np.random.default_rng(seed).uniform(-0.2, 0.2, (2, 2, count))
