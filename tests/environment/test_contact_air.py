@@ -1,4 +1,4 @@
-"""Table and air: rest, Coulomb friction and its smoothing, terminal velocity, wind."""
+"""Table and air: Coulomb friction and its smoothing, terminal velocity, wind, mass damping."""
 
 import equinox as eqx
 import jax
@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r2s._util.units import AIR_DENSITY, GRAVITY
-from r2s.environment.air import Air, Fan
+from r2s.environment.air import STILL, Air, Fan
 from r2s.environment.contact import (
     PRESSURE_STIFFNESS,
     SLIP_SPEED,
@@ -19,6 +19,7 @@ from r2s.environment.contact import (
     normal_potential,
     pressure,
 )
+from r2s.materials.fabric import Fabric
 
 few = settings(max_examples=25, deadline=None)
 REST_DEPTH = (0.2 * GRAVITY / PRESSURE_STIFFNESS) ** 0.5  # [m], where pressure carries 0.2 kg/m^2
@@ -112,3 +113,26 @@ def test_a_fan_blows_half_at_its_radius_and_less_outside():
     assert blown[1] == pytest.approx(0.88, abs=0.02) and blown[3] == pytest.approx(0.12, abs=0.02)
     assert blown[0] > 0.99 and blown[2] == pytest.approx(0.5, abs=0.03)
     assert jax.grad(lambda x: fan(x)[0])(places[:1]) == pytest.approx(0)  # on the axis, not NaN
+
+
+@given(st.tuples(*[st.floats(-3, 3)] * 2), st.floats(-3, 3))
+@few
+def test_flow_along_a_face_pulls_it_along(flow, normal_flow):
+    air = Air.make(1.3, 0.0, 0.4)
+    area_normal = jnp.array([0.0, 0.0, 0.02])
+    force = -jax.grad(air.dissipation)(-jnp.array([*flow, normal_flow]), area_normal)
+    expected = 1.3 * 0.4 / 2 * 0.02 * np.hypot(*flow) * np.array([*flow, 0.0])
+    # where the flow is slow its friction fades to linear
+    assert force == pytest.approx(expected, rel=1e-9, abs=1.3 * 0.4 / 2 * 0.02 * STILL**2)
+
+
+def test_mass_damping_brakes_a_fall(sheet):
+    rate = 3.0  # [1/s]
+    fabric = Fabric.make(0.2, (300.0, 60.0, 200.0, 80.0), 2e-5, mass_damping=rate)
+    solver = cloth(sheet)
+    start = solver.init(flat(sheet), acceleration=everywhere([0.0, 0.0, -GRAVITY], sheet))
+    velocity = roll(solver, fabric, start, 120).v[1:, :, 2]
+    time = DT * np.arange(1, 121)
+    expected = -GRAVITY / rate * (1 - np.exp(-rate * time))
+    assert velocity == pytest.approx(np.tile(expected[:, None], 25), rel=0.01)
+    assert velocity[-1] == pytest.approx(-GRAVITY / rate, rel=0.03)  # exp(-3.6)
