@@ -155,16 +155,16 @@ class Experiment(NamedTuple):
         sheet that hangs also comes to rest, braked by `BRAKE` for `SETTLING`. Raises `ValueError`
         when the frames are not evenly spaced.
         """
-        sheet, times, knot_times = self.sheet, np.asarray(self.times), np.asarray(self.route.times)
+        sheet, times = self.sheet, np.asarray(self.times)
+        path_times, path = (jnp.asarray(part, float) for part in self.route)
         interval = _interval(times)
         mesh = rectangle(sheet.size, shape, elements)
         start, hangs = _at_rest(sheet, np.asarray(mesh.rest), self.table_height)
         pinned, shares = _grip(sheet, shape, self.clamps)
-        path = jnp.asarray(self.route.path, float)
         if self.clamps:
             path = jnp.einsum("vh,khi->kvi", jnp.asarray(shares, float), path)
         lead_in = math.ceil((SETTLING if hangs else LEAD_IN) / interval)
-        first, before = min(times[0], float(knot_times[0])), lead_in * interval
+        first, before = min(times[0], float(path_times[0])), lead_in * interval
         knots = jnp.asarray([first - before, first - before / 2], float)
         at_rest = jnp.asarray(start[pinned], float)
         wind = self.wind if self.wind is not None and any(self.wind) else None
@@ -174,12 +174,12 @@ class Experiment(NamedTuple):
             scene=Scene(mesh, pinned, self.table_height, fan=fan),
             start=jnp.asarray(start, float),
             path=jnp.concatenate([at_rest[None], path[:1], path]),
-            path_times=jnp.concatenate([knots, jnp.asarray(knot_times, float)]),
+            path_times=jnp.concatenate([knots, path_times]),
             first_time=jnp.asarray(times[0], float),
             interval=interval,
             num_frames=len(times),
             lead_in=lead_in,
-            substeps=steps_between(interval, mesh, np.asarray(path), knot_times),
+            substeps=steps_between(interval, mesh, np.asarray(path), np.asarray(path_times)),
             wind=gust,
             wind_times=gust_times,
             brake=jnp.asarray(BRAKE, float) if hangs else None,
