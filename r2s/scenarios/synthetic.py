@@ -114,8 +114,8 @@ def record(
         balance = _energy_balance(scenario, fabric, max_step, made)
         measured, x = _measured(experiment, scenario, balance, key), balance.x
     else:
-        motion = motion or _rollout(scenario, fabric, max_step, made)
-        x = motion.x
+        known = _rollout(scenario, fabric, max_step, made) if motion is None else motion
+        x = known.x
     if x.shape != (scenario.num_frames, *scenario.start.shape):
         raise ValueError(
             f"expected a motion of {scenario.num_frames} frames and {len(scenario.start)} "

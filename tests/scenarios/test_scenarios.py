@@ -31,7 +31,7 @@ account = eqx.filter_jit(scenarios.energy_balance)
 
 def stretch(mesh, x):
     """The greatest principal stretch less one [-] of every strain sample, (frame, sample)."""
-    e11, e22, shear = np.moveaxis(jax.vmap(lambda x: strains(mesh, x))(x), -1, 0)
+    e11, e22, shear = np.asarray(jax.vmap(lambda x: strains(mesh, x))(x)).transpose(2, 0, 1)
     return np.sqrt(1 + e11 + e22 + np.hypot(e11 - e22, shear)) - 1
 
 
