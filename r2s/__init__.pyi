@@ -18,13 +18,14 @@ from r2s.materials import presets
 from r2s.materials.bending import BendingLaw, HingeBending, HingeLaw
 from r2s.materials.fabric import Fabric, bending_length
 from r2s.materials.membrane import MembraneLaw, OrthotropicMembrane, SpringMembrane
-from r2s.materials.nonlinear_spaces import SofteningSpace, StiffeningSpace
 from r2s.materials.parameters import (
     InformedSpace,
     IsotropicSpace,
     OrthotropicSpace,
     ParameterSpace,
     Range,
+    SofteningSpace,
+    StiffeningSpace,
 )
 from r2s.materials.plate import OrthotropicPlate, PlateBending, PlateLaw
 from r2s.materials.stiffening import StiffeningMembrane

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from r2s._util.units import AIR_DENSITY
+from r2s._util.units import AIR_DENSITY, not_negative
 from r2s.mesh.mesh import Mesh
 from r2s.mesh.surface import area_normals
 
@@ -38,16 +38,10 @@ class Air(eqx.Module):
 
         Raises `ValueError` when one is negative.
         """
-        if min(density, drag_coefficient, friction_coefficient) < 0:
-            raise ValueError(
-                "air needs a density >= 0 kg/m^3 and coefficients of drag and friction >= 0, "
-                f"got {density}, {drag_coefficient} and {friction_coefficient}"
-            )
-
-        def array(value):
-            return jnp.asarray(value, float)
-
-        return cls(array(density), array(drag_coefficient), array(friction_coefficient))
+        not_negative("kg/m^3", density=density)
+        not_negative("-", drag=drag_coefficient, friction=friction_coefficient)
+        numbers = density, drag_coefficient, friction_coefficient
+        return cls(*(jnp.asarray(number, float) for number in numbers))
 
     def dissipation(
         self, relative_velocity: Float[Array, " 3"], area_normal: Float[Array, " 3"]
@@ -68,7 +62,7 @@ class Air(eqx.Module):
 
 
 class Fan(eqx.Module):
-    """A round jet of air, as wide everywhere: where the wind of a control blows, and how much.
+    """A round jet of air of constant width: where the wind of a control blows, and how much.
 
     - `centre`: a point of its axis, [m].
     - `axis`: its direction; any length but 0.
@@ -93,6 +87,12 @@ class Fan(eqx.Module):
 Vertices = Float[Array, "vertex 3"]
 
 
+def wind_on_vertices(fan: Fan | None, x: Vertices, wind: Float[Array, "*vertex 3"]) -> Vertices:
+    """The wind [m/s] of a control at positions [m]."""
+    strength = 1.0 if fan is None else fan(x)[:, None]
+    return jnp.broadcast_to(wind, x.shape) * strength
+
+
 def drag_on_vertices(
     mesh: Mesh,
     air: Air,
@@ -105,8 +105,7 @@ def drag_on_vertices(
 
     That on an element goes in equal parts to its corners.
     """
-    strength = 1.0 if fan is None else fan(x)[:, None]
-    flow = v if wind is None else v - jnp.broadcast_to(wind, x.shape) * strength
+    flow = v if wind is None else v - wind_on_vertices(fan, x, wind)
     corners = mesh.samples.corners
     relative = jnp.mean(flow[corners], axis=1)
     force = -jax.vmap(jax.grad(air.dissipation))(relative, area_normals(mesh, x))

@@ -1,4 +1,4 @@
-"""A scene: what an experiment fixes. Sheet, pinned vertices, table, air; and what grippers do."""
+"""A scene: sheet, pinned vertices, table and air of an experiment; and the control of each step."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,13 +11,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from r2s._util.arrays import is_traced
 from r2s._util.units import AIR_DENSITY, GRAVITY
-from r2s.environment.air import Air, Fan
+from r2s.environment.air import Air, Fan, wind_on_vertices
 from r2s.environment.contact import Table
 from r2s.mesh.mesh import Mesh
 
 
 class Control(eqx.Module):
-    """What grippers and air do: at the end of one step, or of every step of a motion.
+    """Positions of the grippers and the wind, at the end of one step or of every step of a motion.
 
     - `pinned`: positions of the pinned vertices, [m]: (pinned, 3), or (step, pinned, 3).
     - `wind`: [m/s], the same everywhere (3 numbers), or one for each vertex (vertex, 3); over a
@@ -36,7 +36,7 @@ class Control(eqx.Module):
 
 
 class Scene(eqx.Module):
-    """What an experiment fixes.
+    """The fixed parts of an experiment.
 
     - `mesh`: the sheet.
     - `pinned`: the vertices whose positions a `Control` gives.
@@ -111,9 +111,7 @@ class Scene(eqx.Module):
         """The wind [m/s] at the middle of every element, of a sheet at `x` [m]."""
         if wind is None:
             return jnp.zeros((len(self.mesh.samples.corners), 3), x.dtype)
-        strength = 1.0 if self.fan is None else self.fan(x)[:, None]
-        at_vertices = jnp.broadcast_to(wind, x.shape) * strength
-        return jnp.mean(at_vertices[self.mesh.samples.corners], axis=1)
+        return jnp.mean(wind_on_vertices(self.fan, x, wind)[self.mesh.samples.corners], axis=1)
 
 
 def _check(mesh: Mesh, pinned: Array) -> None:
@@ -137,5 +135,5 @@ def along_path(
 ) -> Float[Array, "step gripper 3"]:
     """Gripper positions [m] at times [s], linear between the knots, at rest before and after."""
     knots = path.reshape(path.shape[0], -1)
-    at = jax.vmap(lambda column: jnp.interp(times, knot_times, column), in_axes=1, out_axes=1)
-    return at(knots).reshape(times.shape[0], *path.shape[1:])
+    interpolated = jax.vmap(jnp.interp, in_axes=(None, None, 1), out_axes=1)
+    return interpolated(times, knot_times, knots).reshape(times.shape[0], *path.shape[1:])

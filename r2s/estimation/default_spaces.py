@@ -9,13 +9,16 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 from r2s.materials import prior
-from r2s.materials.nonlinear_spaces import SOFTENING, SofteningSpace, StiffeningSpace, stiffens
 from r2s.materials.parameters import (
     LOSSES,
+    SOFTENING,
     IsotropicSpace,
     OrthotropicSpace,
     ParameterSpace,
     Range,
+    SofteningSpace,
+    StiffeningSpace,
+    stiffens,
 )
 from r2s.recordings.recording import Recording
 

@@ -38,7 +38,7 @@ from r2s.estimation.prediction import (
     theta_length,
 )
 from r2s.estimation.problem import Problem, Problems, seen_where
-from r2s.materials.nonlinear_spaces import stiffens
+from r2s.materials.parameters import stiffens
 
 FARTHEST = 2.0  # times the median distance, beyond which a step is shortened
 # from the change of stiffness between half a pull and all of it, to that from small strain: twice

@@ -1,7 +1,7 @@
 """Material files of ARCSim and DiffSim: the tables of Wang, O'Brien and Ramamoorthi 2011 as JSON.
 
-Such a file has an areal density and the tables of `r2s.materials.tables`, as published. It knows no
-damping, friction and thickness: ARCSim and DiffSim keep them elsewhere.
+Such a file has an areal density and the tables of `r2s.materials.tables`, as published. Damping,
+friction and thickness are elsewhere in ARCSim and DiffSim.
 """
 
 import dataclasses
@@ -11,9 +11,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from r2s._util.files import read_json, write_json
+from r2s._util.files import parse, read_json, write_json
 from r2s.materials.bending import HingeBending
-from r2s.materials.fabric import Fabric
+from r2s.materials.fabric import Fabric, check_fabric
 from r2s.materials.membrane import OrthotropicMembrane
 from r2s.materials.plate import OrthotropicPlate, PlateBending
 from r2s.materials.tables import HINGE_FACTOR, TableBending, TableMembrane
@@ -38,9 +38,8 @@ class Material:
     def __post_init__(self):
         if not self.density > 0:
             raise ValueError(f"density must be above 0 kg/m^2, got {self.density}")
-        for row, (c11, _, c22, _) in enumerate(
-            self.stretching
-        ):  # measured C12, C33 may be negative
+        # measured C12 and C33 may be negative
+        for row, (c11, _, c22, _) in enumerate(self.stretching):
             if not min(c11, c22) > 0:
                 raise ValueError(
                     f"stretching[{row}]: C11 and C22 must be above 0 N/m, got {c11} and {c22}"
@@ -62,23 +61,20 @@ def read_material(
 ) -> Fabric:
     """The fabric of a material file, whose stiffness follows the strain and the curvature.
 
-    What the file does not hold is given: damping time [s], friction [-], thickness [m], mass
-    damping [1/s]. Raises `OSError`; `ValueError` that names the file, the key and what was expected
-    there, or one of the given numbers.
+    The arguments are what the file does not hold: damping time [s], friction [-], thickness [m],
+    mass damping [1/s]. Raises `OSError`; `ValueError` that names the file, the key and what was
+    expected there, or one of the arguments.
     """
-    if not (min(damping, friction, mass_damping) >= 0 and thickness > 0):
-        raise ValueError(
-            "damping [s], friction [-] and mass damping [1/s] must not be negative, and thickness "
-            f"[m] positive, got {damping}, {friction}, {mass_damping} and {thickness}"
-        )
     material = read_json(path, Material)
     others = (damping, friction, thickness, mass_damping)
-    return Fabric(
+    fabric = Fabric(
         jnp.asarray(material.density, float),
         TableMembrane(jnp.asarray(material.stretching, float)),
         TableBending(jnp.asarray(material.bending, float)),
         *(jnp.asarray(number, float) for number in others),
     )
+    check_fabric(fabric)
+    return fabric
 
 
 def write_material(
@@ -97,22 +93,14 @@ def write_material(
         raise ValueError(
             f"a material file holds one fabric, got a batch of shape {jnp.shape(fabric.density)}"
         )
-    try:
-        material = Material(
-            density=float(fabric.density),
-            stretching=_rows(_stretching(fabric.membrane, diffsim), (6, 4)),
-            bending=_rows(_bending(fabric.bending), (3, 5)),
-            name=name,
-        )
-    except ValueError as error:
-        raise ValueError(f"cannot write {path}: {error}") from error
-    write_json(path, dataclasses.asdict(material))
-
-
-def _rows(table: np.ndarray, shape: tuple[int, int]) -> Any:
-    if table.shape != shape:
-        raise ValueError(f"expected a table of shape {shape}, got {table.shape}: one fabric only")
-    return tuple(tuple(float(entry) for entry in row) for row in table)
+    content = {
+        "density": float(fabric.density),
+        "stretching": _stretching(fabric.membrane, diffsim).tolist(),
+        "bending": _bending(fabric.bending).tolist(),
+        "name": name,
+    }
+    parse(Material, content, f"cannot write {path}")
+    write_json(path, content)
 
 
 def _stretching(law: Any, diffsim: bool) -> np.ndarray:

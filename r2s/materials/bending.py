@@ -1,9 +1,9 @@
 """Bending laws of hinges: the energy that a fabric stores in the angle between two triangles.
 
 A hinge is an edge of rest length l with the rest area A of its two triangles. Its curvature is
-theta l / A, its energy A times the law's energy per area: exact for bending along the lines of a
-grid of squares, but up to three times too much across its diagonals, at any resolution, and 0.8 of
-it in a free strip. `r2s.materials.plate` has neither flaw.
+theta l / A, its energy A times the law's energy per area. That is exact for bending along the lines
+of a grid of squares, but up to three times too much across its diagonals, at any resolution, and
+0.8 of it in a free strip. `r2s.materials.plate` has neither flaw.
 """
 
 import math
@@ -21,12 +21,12 @@ from r2s.mesh.plate_elements import PlateElements
 
 
 class BendingLaw(eqx.Module):
-    """What the solvers ask of a bending law, which owns the elements that it acts on.
+    """The methods of a bending law that solvers call; it defines the elements that it acts on.
 
-    A law of one's own derives from `HingeLaw` (the angle between two triangles) or from
+    A user's law derives from `HingeLaw` (the angle between two triangles) or from
     `r2s.materials.plate.PlateLaw` (the curvature tensor).
 
-    - `element`, `bend`: what its elements and its bends are called in the pattern of a matrix.
+    - `element`, `bend`: names of its elements and of its bends in the pattern of a matrix.
     """
 
     element: eqx.AbstractClassVar[str]

@@ -65,37 +65,28 @@ class Fabric(eqx.Module):
         >>> float(fabric.membrane.c12)
         60.0
         """
-        c11, c12, c22, c33 = membrane
-        if not min(density, c11, c22, c33, thickness) > 0:
-            raise ValueError(
-                "density [kg/m^2], C11, C22, C33 [N/m] and thickness [m] must be positive, got "
-                f"{density}, {c11}, {c22}, {c33} and {thickness}"
-            )
-        if not c12**2 < c11 * c22:
-            raise ValueError(
-                f"C12^2 must be less than C11 C22, or the sheet has a negative stiffness: "
-                f"C12 = {c12} N/m, C11 C22 = {c11 * c22} (N/m)^2"
-            )
-        if not min(bending, damping, friction, mass_damping) >= 0:
-            raise ValueError(
-                "bending stiffness [N m], damping [s], friction [-] and mass damping [1/s] must "
-                f"not be negative, got {bending}, {damping}, {friction} and {mass_damping}"
-            )
         stiffnesses = (jnp.asarray(number, float) for number in membrane)
         others = (damping, friction, thickness, mass_damping)
-        return cls(
+        fabric = cls(
             jnp.asarray(density, float),
             OrthotropicMembrane(*stiffnesses),
             PlateBending.make(bending),
             *(jnp.asarray(number, float) for number in others),
         )
+        check_fabric(fabric)
+        c11, c12, c22, _ = membrane
+        if not c12**2 < c11 * c22:
+            raise ValueError(
+                f"C12^2 must be less than C11 C22, or the sheet has a negative stiffness: "
+                f"C12 = {c12} N/m, C11 C22 = {c11 * c22} (N/m)^2"
+            )
+        return fabric
 
 
 def check_fabric(fabric: Any, may_lack: bool = False) -> None:
-    """Raise `ValueError` for a fabric with a number that none has, such as a negative stiffness.
+    """Raise `ValueError` for a fabric, or a member of a batch, with a number out of its range.
 
-    Of a batch, if one member has it. A traced fabric passes, and so does what is no `Fabric`.
-    `may_lack`: NaN passes, as a number that nobody knows.
+    A traced fabric passes, and so does what is no `Fabric`. `may_lack`: NaN passes, as unknown.
     """
     if not isinstance(fabric, Fabric) or is_traced(fabric):
         return
@@ -135,7 +126,7 @@ def bending_length(fabric: Fabric) -> Float[Array, ""]:
     It is (bending / (density g))^(1/3), with the mean stiffness over four directions: Peirce's
     bending length (Journal of the Textile Institute 21, 1930). A strip of that length, held at one
     end, sags by an eighth of it. Longer cells cannot take the folds of a sheet, which then moves
-    otherwise than a fine one (`docs/guide/simulate.md` says by how much).
+    differently from a fine one (`docs/guide/simulate.md` says by how much).
 
     >>> from r2s.materials import presets
     >>> round(float(1e3 * bending_length(presets.grey_interlock())), 1)  # [mm]

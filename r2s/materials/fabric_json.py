@@ -1,13 +1,12 @@
-"""A fabric as JSON: areal density, the two laws with every number, damping, friction, thickness.
-
-Every number stands beside its unit. NaN, a number that nobody knows, is null.
-"""
+"""A fabric as JSON: every number, also those of its laws, beside its unit. NaN is null: unknown."""
 
 import dataclasses
+import inspect
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +23,6 @@ BENDINGS = PlateBending, OrthotropicPlate, SofteningPlate, HingeBending, TableBe
 LAWS = {"membrane": (MEMBRANES, "N/m"), "bending": (BENDINGS, "N m")}
 TABLE_SHAPES = {TableMembrane: (6, 4), TableBending: (3, 5)}
 DIMENSIONLESS = "poissons_ratio", "ratio", "loss", "knee_weft"
-WITHIN = {(StiffeningMembrane, "small"), (SofteningPlate, "small")}  # laws that hold another one
 
 
 def fabric_as_json(fabric: Fabric) -> dict[str, Any]:
@@ -35,9 +33,7 @@ def fabric_as_json(fabric: Fabric) -> dict[str, Any]:
     """
     if jnp.ndim(fabric.density):
         raise ValueError(f"expected one fabric, got a batch of shape {jnp.shape(fabric.density)}")
-    stored: dict[str, Any] = {}
-    for name, unit in NUMBERS.items():
-        stored[name] = _entry(getattr(fabric, name), unit)
+    stored: dict[str, Any] = {n: _entry(getattr(fabric, n), unit) for n, unit in NUMBERS.items()}
     for part, (laws, _) in LAWS.items():
         law = getattr(fabric, part)
         if type(law) not in laws:
@@ -57,7 +53,7 @@ def fabric_from_json(stored: Any) -> Fabric:
     """
     check_keys(stored, (*NUMBERS, *LAWS), "fabric")
     numbers = {n: _value(stored[n], unit, f"fabric: {n}", ()) for n, unit in NUMBERS.items()}
-    laws = {part: _law_from(stored[part], part) for part in LAWS}
+    laws = {part: _law_from(stored[part], part, f"fabric: {part}") for part in LAWS}
     fabric = Fabric(**numbers, **laws)
     check_fabric(fabric, may_lack=True)
     return fabric
@@ -66,21 +62,14 @@ def fabric_from_json(stored: Any) -> Fabric:
 def nan_to_null(value: Any, where: str) -> Any:
     """Nested JSON values with None for NaN; `ValueError` that says where a number is infinite."""
     if isinstance(value, Mapping):
-        return {key: nan_to_null(each, f"{where}: {key}") for key, each in value.items()}
+        return {key: nan_to_null(entry, f"{where}: {key}") for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [nan_to_null(each, f"{where}[{i}]") for i, each in enumerate(value)]
+        return [nan_to_null(entry, f"{where}[{i}]") for i, entry in enumerate(value)]
     if isinstance(value, float) and not math.isfinite(value):
         if math.isnan(value):
             return None
         raise ValueError(f"{where}: a file holds finite numbers, found {value}")
     return value
-
-
-def null_to_nan(value: Any) -> Any:
-    """Nested lists of numbers with NaN for None."""
-    if isinstance(value, list):
-        return [null_to_nan(each) for each in value]
-    return math.nan if value is None else value
 
 
 def check_keys(stored: Any, expected: Iterable[str], where: str) -> None:
@@ -100,20 +89,21 @@ def expect(holds: bool, where: str, expected: str, found: Any) -> None:
 
 
 def _law_as_json(law: Any, part: str) -> dict[str, Any]:
-    fields: dict[str, Any] = {}
-    for name in _field_names(law):
-        value, is_law = getattr(law, name), (type(law), name) in WITHIN
-        unit = _unit(part, type(law), name)
-        fields[name] = _law_as_json(value, part) if is_law else _entry(value, unit)
-    return {"law": type(law).__name__, **fields}
+    stored: dict[str, Any] = {"law": type(law).__name__}
+    for name, within in _fields(type(law)).items():
+        value, unit = getattr(law, name), _unit(part, type(law), name)
+        stored[name] = _law_as_json(value, part) if within else _entry(value, unit)
+    return stored
 
 
 def _entry(value: Any, unit: str) -> dict[str, Any]:
     return {"value": np.asarray(value).tolist(), "unit": unit}
 
 
-def _field_names(law: Any) -> list[str]:
-    return [field.name for field in dataclasses.fields(law)]
+def _fields(law: type) -> dict[str, bool]:
+    """The names of a law's fields, and whether each is a law itself."""
+    kinds = {field.name: field.type for field in dataclasses.fields(law)}
+    return {n: inspect.isclass(k) and issubclass(k, eqx.Module) for n, k in kinds.items()}
 
 
 def _unit(part: str, law: type, name: str) -> str:
@@ -122,29 +112,27 @@ def _unit(part: str, law: type, name: str) -> str:
     return "-" if name in DIMENSIONLESS else LAWS[part][1]
 
 
-def _law_from(stored: Any, part: str, within: str = "") -> Any:
+def _law_from(stored: Any, part: str, where: str) -> Any:
     kinds = {kind.__name__: kind for kind in LAWS[part][0]}
-    where = f"fabric: {part}{within}"
     name = stored.get("law") if isinstance(stored, dict) else None
     expect(name in kinds, f"{where}: law", f"one of {', '.join(kinds)}", name)
     kind = kinds[name]  # pyright: ignore[reportArgumentType]
-    check_keys(stored, ("law", *_field_names(kind)), where)
-    shape = TABLE_SHAPES.get(kind, ())
-    fields = {}
-    for n in _field_names(kind):
-        if (kind, n) in WITHIN:
-            fields[n] = _law_from(stored[n], part, f"{within}: {n}")
-        else:
-            fields[n] = _value(stored[n], _unit(part, kind, n), f"{where}: {n}", shape)
+    names = _fields(kind)
+    check_keys(stored, ("law", *names), where)
+    fields, shape = {}, TABLE_SHAPES.get(kind, ())
+    for name, within in names.items():
+        value, at = stored[name], f"{where}: {name}"
+        unit = _unit(part, kind, name)
+        fields[name] = _law_from(value, part, at) if within else _value(value, unit, at, shape)
     return kind(**fields)
 
 
 def _value(stored: Any, unit: str, where: str, shape: tuple[int, ...]) -> jax.Array:
     check_keys(stored, ("value", "unit"), where)
     expect(stored["unit"] == unit, f"{where}: unit", repr(unit), stored["unit"])
-    values = np.array(null_to_nan(stored["value"]), object)
-    numbers = [isinstance(v, int | float) and not isinstance(v, bool) for v in values.flat]
+    values = np.array(stored["value"], object)
+    numbers = [isinstance(v, int | float | None) and not isinstance(v, bool) for v in values.flat]
     expected = f"numbers of shape {shape}" if shape else "a number, or null"
     fits = values.shape == shape and all(numbers)
     expect(fits, f"{where}: value", expected, stored["value"])
-    return jnp.asarray(values.astype(float), float)
+    return jnp.asarray(values.astype(float), float)  # None is NaN

@@ -1,8 +1,8 @@
 """Membrane laws: the energy that a fabric stores in the Green strain of a triangle.
 
 A law is a pytree of parameters with two methods: `energy_density` of a strain, and `at`, which
-gives the law that a time step uses. A law whose energy says it all returns itself; one whose
-stiffness follows the strain (`r2s.materials.tables`) returns its stiffness there.
+gives the law that a time step uses. A law with an energy returns itself; one whose stiffness
+depends on the strain (`r2s.materials.tables`) returns the law of its stiffness there.
 """
 
 from typing import Any, Protocol, runtime_checkable
@@ -19,7 +19,7 @@ COLLAPSED = 1e-6  # squared stretch below which a spring has no direction, nor f
 
 @runtime_checkable
 class MembraneLaw(Protocol):
-    """What the cloth asks of a membrane law."""
+    """The methods of a membrane law that solvers call."""
 
     def at(self, strain: Float[Array, " 3"]) -> "MembraneLaw":
         """The law that a time step uses which starts near this strain (E11, E22, 2 E12) [-]."""
@@ -70,9 +70,9 @@ class SpringMembrane(eqx.Module):
     On a grid of squares in triangles its energy is that of springs on the edges and on both
     diagonals of every cell (for the diagonal that is no edge: as long as the cell is bent little).
     Small strains see an orthotropic membrane with C11 = warp + shear / 2, C22 = weft + shear / 2
-    and C12 = C33 = shear / 2: springs cannot choose the coupling apart from the shear (Cauchy).
+    and C12 = C33 = shear / 2: coupling and shear of springs are the same (Cauchy).
 
-    - `warp``, `weft`: of the structural springs, force per width and stretch, [N/m].
+    - `warp`, `weft`: of the structural springs, force per width and stretch, [N/m].
     - `shear`: likewise of the springs at +45 and -45 degrees, [N/m].
     """
 

@@ -5,18 +5,20 @@ sensitivities, multi-start and sampling.
 """
 
 import abc
-import dataclasses
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from r2s._util.units import not_negative, positive
 from r2s.materials.fabric import Fabric, constant_laws
 from r2s.materials.membrane import OrthotropicMembrane
 from r2s.materials.plate import PlateBending
+from r2s.materials.stiffening import HALF, SofteningPlate, StiffeningMembrane
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ class ParameterSpace(eqx.Module):
         return jnp.full(self.dim, 0.5, float), jnp.eye(self.dim, dtype=float) / UNIFORM_DEVIATION**2
 
     def middle(self) -> Fabric:
-        """The fabric in the middle of all ranges: what one assumes knowing nothing."""
+        """The fabric in the middle of all ranges: an assumption without any information."""
         return self(jnp.full(self.dim, 0.5, float))
 
 
@@ -143,7 +145,7 @@ class OrthotropicSpace(ParameterSpace):
     Parameters:
 
     - warp, weft: stiffness in a uniaxial pull [N/m], which is C11 and C22 less C12^2 over the other
-      one. A motion determines these, where C11 alone would go up and down with C12.
+      one. A motion determines these, but hardly C11 apart from C12.
     - shear: C33 [N/m].
     - coupling: C12 / sqrt(C11 C22) [-], within -1..1, so that C stays positive definite while C12
       may be negative.
@@ -174,27 +176,17 @@ class OrthotropicSpace(ParameterSpace):
     @classmethod
     def make(cls, density: float, thickness: float = 1e-3) -> "OrthotropicSpace":
         """The space of an areal density [kg/m^2] and a thickness [m], which must be positive."""
-        if not (density > 0 and thickness > 0):
-            raise ValueError(
-                f"areal density and thickness must be positive, got {density} kg/m^2 and "
-                f"{thickness} m"
-            )
+        positive("kg/m^2", density=density)
+        positive("m", thickness=thickness)
         return cls(density=jnp.asarray(density, float), thickness=jnp.asarray(thickness, float))
 
     def __call__(self, u: Float[Array, " dim"]) -> Fabric:
         """The fabric at a point of the unit cube."""
         warp, weft, c33, coupling, bending, damping, friction = self.values(u)
         c11, c22 = warp / (1 - coupling**2), weft / (1 - coupling**2)
-        c12 = coupling * jnp.sqrt(c11 * c22)
-        return Fabric(
-            self.density,
-            OrthotropicMembrane(c11, c12, c22, c33),
-            PlateBending.make(bending),
-            damping,
-            friction,
-            self.thickness,
-            jnp.zeros((), float),
-        )
+        membrane = OrthotropicMembrane(c11, coupling * jnp.sqrt(c11 * c22), c22, c33)
+        others = (damping, friction, self.thickness, jnp.zeros((), float))
+        return Fabric(self.density, membrane, PlateBending.make(bending), *others)
 
     def to_unit(self, fabric: Fabric) -> Float[Array, " dim"]:
         """The point of the unit cube where a fabric lies; outside of it, beyond the bounds."""
@@ -237,12 +229,10 @@ class IsotropicSpace(ParameterSpace):
 
         `losses`: `LOSSES` makes damping and friction parameters.
         """
-        if not min(density, plate, thickness) > 0 or min(damping, friction) < 0:
-            raise ValueError(
-                "areal density [kg/m^2], plate and contact thickness [m] must be positive, damping "
-                f"[s] and friction not negative, got {density}, {plate}, {thickness}, {damping} "
-                f"and {friction}"
-            )
+        positive("kg/m^2", density=density)
+        positive("m", plate=plate, thickness=thickness)
+        not_negative("s", damping=damping)
+        not_negative("-", friction=friction)
         space = cls(
             density=jnp.asarray(density, float),
             plate=jnp.asarray(plate, float),
@@ -250,7 +240,7 @@ class IsotropicSpace(ParameterSpace):
             friction=jnp.asarray(friction, float),
             thickness=jnp.asarray(thickness, float),
         )
-        return dataclasses.replace(space, ranges=(*space.ranges, *losses))
+        return replace(space, ranges=(*space.ranges, *losses))
 
     def __call__(self, u: Float[Array, " dim"]) -> Fabric:
         """The fabric at a point of the unit cube."""
@@ -259,15 +249,8 @@ class IsotropicSpace(ParameterSpace):
         c11 = modulus / (1 - ratio**2)
         membrane = OrthotropicMembrane(c11, ratio * c11, c11, modulus / (2 * (1 + ratio)))
         bending = PlateBending(c11 * self.plate**2 / 12, ratio)
-        return Fabric(
-            self.density,
-            membrane,
-            bending,
-            damping,
-            friction,
-            self.thickness,
-            jnp.zeros((), float),
-        )
+        others = (damping, friction, self.thickness, jnp.zeros((), float))
+        return Fabric(self.density, membrane, bending, *others)
 
     def to_unit(self, fabric: Fabric) -> Float[Array, " dim"]:
         """The point where the isotropic part of a fabric's membrane lies: C11 and C22 averaged."""
@@ -279,12 +262,87 @@ class IsotropicSpace(ParameterSpace):
         return self.places(*values)
 
 
+STIFFENING = (
+    Range("stiffening", "-", 1.02, 1000.0),
+    Range("knee warp", "-", 3e-3, 10.0),
+    Range("knee weft", "-", 3e-3, 10.0),
+)
+
+
+def stiffens(ranges: Iterable[Range]) -> bool:
+    """Whether parameters of a space, or of an estimate, are of yarns that may stiffen."""
+    return STIFFENING[0].name in {bounds.name for bounds in ranges}
+
+
+class StiffeningSpace(ExtendedSpace):
+    """The fabrics of a space of constant stiffness, with yarns that stiffen
+    (`r2s.materials.stiffening`).
+
+    Parameters: those of the other space, at small strain, and
+
+    - stiffening: of the tangent far stretched to that at rest, [-].
+    - knee warp, knee weft: the stretch less 1 at which half of the growth is reached, [-]. Pulls of
+      knits along wales and courses cannot be followed with one knee for both.
+    """
+
+    extra: ClassVar[tuple[Range, ...]] = STIFFENING
+
+    def extended(self, fabric: Fabric, values: Float[Array, " extra"]) -> Fabric:
+        """The fabric, stiffening."""
+        ratio, *knees = values
+        strains = [((1 + knee) ** 2 - 1) / 2 / HALF for knee in knees]
+        membrane = StiffeningMembrane(fabric.membrane, ratio, *strains)
+        return replace(fabric, membrane=membrane)
+
+    def reduced(self, fabric: Fabric) -> tuple[Fabric, Float[Array, " extra"]]:
+        """The fabric at small strain; one that does not stiffen has the least ratio."""
+        law = fabric.membrane
+        if not isinstance(law, StiffeningMembrane):
+            least = self.ranges[-3].to_unit(jnp.asarray(self.ranges[-3].low))
+            return fabric, jnp.stack([least, 0.5, 0.5])
+        knees = (jnp.sqrt(1 + 2 * HALF * strain) - 1 for strain in (law.knee, law.knee_weft))
+        small = replace(fabric, membrane=law.small)
+        return small, self.places(law.ratio, *knees)
+
+
+# the loss below 8/9, so that the moment grows; knees where sheets of decimetres bend
+SOFTENING = (
+    Range("bending loss", "-", 0.0, 0.85, log=False),
+    Range("bending knee", "1/m", 3.0, 300.0),
+)
+
+
+class SofteningSpace(ExtendedSpace):
+    """The fabrics of a space of constant bending stiffness, whose bending softens
+    (`SofteningPlate`).
+
+    Parameters: those of the other space, at small curvature, and
+
+    - bending loss: share of the bending stiffness that is lost at large curvatures, [-].
+    - bending knee: curvature at which half of it is lost, [1/m].
+    """
+
+    extra: ClassVar[tuple[Range, ...]] = SOFTENING
+
+    def extended(self, fabric: Fabric, values: Float[Array, " extra"]) -> Fabric:
+        """The fabric, softening."""
+        return replace(fabric, bending=SofteningPlate(fabric.bending, *values))
+
+    def reduced(self, fabric: Fabric) -> tuple[Fabric, Float[Array, " extra"]]:
+        """The fabric at small curvature; one that does not soften loses nothing."""
+        law = fabric.bending
+        if not isinstance(law, SofteningPlate):
+            return fabric, jnp.array([0.0, 0.5])
+        small = replace(fabric, bending=law.small)
+        return small, self.places(law.loss, law.knee)
+
+
 class InformedSpace(ParameterSpace):
     """A space with a normal distribution over its places instead of a uniform one.
 
     - `space`: the space itself.
     - `mean`, `precision`: of the place; the precision is the inverse of its covariance.
-    - `measured`: whether tests of this very fabric told them, and not what fabrics alike are.
+    - `measured`: whether they come from tests of this fabric, and not from similar fabrics.
     """
 
     space: ParameterSpace
@@ -307,8 +365,9 @@ class InformedSpace(ParameterSpace):
                 f"a space of {space.dim} parameters needs as many means and a precision of "
                 f"{space.dim} x {space.dim}, got {mean.shape} and {precision.shape}"
             )
-        means, known = jnp.asarray(mean, float), jnp.asarray(precision, float)
-        return cls(space=space, mean=means, precision=known, ranges=space.ranges, measured=measured)
+        mean, precision = jnp.asarray(mean, float), jnp.asarray(precision, float)
+        ranges = space.ranges
+        return cls(space=space, mean=mean, precision=precision, ranges=ranges, measured=measured)
 
     def __call__(self, u: Float[Array, " dim"]) -> Fabric:
         """The fabric at a point of the unit cube."""

@@ -1,8 +1,8 @@
 """Bending of a sheet as a thin plate: the energy in its curvature tensor.
 
 A plate law sees the curvature (k11, k22, 2 k12) of an element, by warp and weft
-(`r2s.mesh.plate_elements`), as a membrane law sees a strain. It bends alike in all directions
-of a rectangle, and twists as a plate does, which hinges (`r2s.materials.bending`) do not.
+(`r2s.mesh.plate_elements`), as a membrane law sees a strain. Its stiffness does not depend on the
+direction of the mesh, and it twists as a plate does, unlike hinges (`r2s.materials.bending`).
 """
 
 import math
@@ -22,15 +22,15 @@ from r2s.mesh.plate_elements import PlateElements
 class PlateLaw(BendingLaw):
     """A bending law of faces or vertices: of their curvature tensor.
 
-    The weft must be an axis of symmetry, so that small twists do not bend the sheet: curvature and
-    twist of a grid are not seen at one place.
+    The weft must be an axis of symmetry, so that small twists do not bend the sheet: a grid has its
+    curvature and its twist at different places.
     """
 
     element: ClassVar[str] = "plate"
     bend: ClassVar[str] = "plate_bends"
 
     def at(self, curvature: Float[Array, " 3"]) -> "PlateLaw":
-        """The law of a time step near a curvature [1/m]: itself, as its energy says it all."""
+        """The law of a time step near a curvature [1/m]: itself, as it has an energy."""
         return self
 
     @abstractmethod
@@ -47,16 +47,14 @@ class PlateLaw(BendingLaw):
 
     def stiffness_along(self, angle: float) -> Float[Array, ""]:
         """Stiffness [N m] of the flat plate against a cylinder at an angle [rad] to the warp."""
-        flat = jnp.zeros(3, float)
+        flat, (c, s) = jnp.zeros(3, float), (math.cos(angle), math.sin(angle))
         matrix = jax.hessian(self.at(flat).energy_density)(flat)
-        cylinder = jnp.asarray(
-            [math.cos(angle) ** 2, math.sin(angle) ** 2, math.sin(2 * angle)], float
-        )
+        cylinder = jnp.asarray([c**2, s**2, math.sin(2 * angle)], float)
         return cylinder @ matrix @ cylinder
 
 
 class PlateBending(PlateLaw):
-    """The Kirchhoff plate, alike in all directions, of constant stiffness.
+    """The isotropic Kirchhoff plate, of constant stiffness.
 
     - `stiffness`: moment per curvature and width of a plate that may not curve across, [N m].
     - `poissons_ratio`: how much it curves across when it may, [-]; -1 < nu < 1.
@@ -76,9 +74,8 @@ class PlateBending(PlateLaw):
         cls, youngs_modulus: Scalar, poissons_ratio: Scalar, thickness: Scalar
     ) -> "PlateBending":
         """Of a solid plate, from Young's modulus [Pa], Poisson's ratio [-] and thickness [m]."""
-        return cls.make(
-            isotropic_bending(youngs_modulus, poissons_ratio, thickness), poissons_ratio
-        )
+        stiffness = isotropic_bending(youngs_modulus, poissons_ratio, thickness)
+        return cls.make(stiffness, poissons_ratio)
 
     def energy_density(self, curvature: Float[Array, " 3"]) -> Float[Array, ""]:
         """Energy per rest area [J/m^2] at a curvature [1/m]: Timoshenko and Woinowsky-Krieger 1959,

@@ -59,18 +59,7 @@ def royal_target() -> Fabric:
     return Fabric.make(0.22, (2000.0, 9.2, 2000.0, 52.0), 4.3e-5)
 
 
-FIVE = {
-    "camel_ponte_roma": camel_ponte_roma,
-    "black_denim": black_denim,
-    "grey_interlock": grey_interlock,
-    "pink_solid": pink_solid,
-    "red_jet_set": red_jet_set,
-}
-
-MEASURED = {
-    **FIVE,
-    "ivory_rib_knit": ivory_rib_knit,
-    "white_dots_on_black": white_dots_on_black,
-    "white_swim_solid": white_swim_solid,
-    "royal_target": royal_target,
-}
+_STUDY = camel_ponte_roma, black_denim, grey_interlock, pink_solid, red_jet_set
+_OTHERS = ivory_rib_knit, white_dots_on_black, white_swim_solid, royal_target
+FIVE = {make.__name__: make for make in _STUDY}
+MEASURED = {make.__name__: make for make in (*_STUDY, *_OTHERS)}

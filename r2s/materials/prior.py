@@ -1,6 +1,6 @@
-"""What one knows of a fabric before it has moved, but for its weight.
+"""The distribution of fabrics before any recording, given their areal density.
 
-Not laid around the fabrics of the study:
+Not fitted to the fabrics of the study:
 
 - Bending, from the areal density d [kg/m^2]: B = exp(-9.197) d^1.230 [N m], with a standard
   deviation of 0.80 in its logarithm. Fitted to the mean of warp, weft and bias of the 251 distinct
@@ -16,6 +16,7 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from r2s._util.units import positive
 from r2s.materials import presets
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import OrthotropicMembrane
@@ -25,17 +26,15 @@ from r2s.materials.plate import PlateBending
 BENDING, EXPONENT, SPREAD = -9.197, 1.230, 0.80  # of the logarithms
 COUPLING, DAMPING, FRICTION = (-0.5, 0.5), (1e-3, 3e-2), (0.2, 0.8)  # -, [s], -
 THICKNESS = 1e-3  # [m]
-MANY, LEAST = 1024, 1e-3  # draws that tell a distribution; a range over which they do not vary
+MANY, LEAST = 1024, 1e-3  # draws for a distribution; a deviation below which they do not vary
 
 
 def draws(density: float, count: int, key: PRNGKeyArray) -> Fabric:
-    """`count` fabrics of an areal density [kg/m^2], with a leading axis on every array; of one key
-    the same in float32 and float64.
+    """`count` fabrics of an areal density [kg/m^2], with a leading axis on every array.
 
-    Raises `ValueError` for a density that is not positive.
+    Of one key they are the same in float32 and float64.
     """
-    if not density > 0:
-        raise ValueError(f"the areal density must be positive, got {density} kg/m^2")
+    positive("kg/m^2", density=density)
     keys = jr.split(key, 6)
     mean, deviation = _membranes()
     yarns = jnp.exp(mean[0] + deviation[0] * _normal(keys[0], (2, count)))
@@ -63,38 +62,31 @@ def fabrics(density: float, count: int, key: PRNGKeyArray) -> list[Fabric]:
 
 
 def informed(space: ParameterSpace, density: float) -> InformedSpace:
-    """A space that knows of this prior: mean and covariance of the places of `MANY` draws in it,
-    always the same. Of the numbers of a law that stiffens it knows no more than the space does.
+    """A space with this prior: mean and covariance of the places of `MANY` draws in it.
 
-    Raises `ValueError` for a density that is not positive.
+    Parameters in which draws do not vary, those of a law that stiffens, keep the space's own prior.
     """
     drawn = draws(density, MANY, jr.key(0))
     places = np.asarray(jax.vmap(space.to_unit)(drawn), np.float64)
     varies = places.std(axis=0) > LEAST
     mean, precision = (np.array(part, np.float64) for part in space.prior())
     mean[varies] = np.clip(places[:, varies].mean(axis=0), 0, 1)
-    known = np.linalg.inv(np.cov(places[:, varies].T))
-    precision[np.ix_(varies, varies)] = known
+    precision[np.ix_(varies, varies)] = np.linalg.inv(np.cov(places[:, varies].T))
     return InformedSpace.make(space, jnp.asarray(mean, float), jnp.asarray(precision, float))
 
 
 def middle(density: float) -> Fabric:
-    """The fabric in the middle of the prior, for an areal density [kg/m^2]: the median of every
-    number that is drawn.
-
-    Raises `ValueError` for a density that is not positive.
-    """
-    if not density > 0:
-        raise ValueError(f"the areal density must be positive, got {density} kg/m^2")
+    """The fabric with the median of every number of the prior, for an areal density [kg/m^2]."""
+    positive("kg/m^2", density=density)
     yarn, shear = np.exp(_membranes()[0]).tolist()
-    coupling, friction = sum(COUPLING) / 2, sum(FRICTION) / 2
+    coupling = sum(COUPLING) / 2
     c11 = yarn / (1 - coupling**2)
     return Fabric.make(
         density,
         (c11, coupling * c11, c11, shear),
         float(np.exp(BENDING + EXPONENT * np.log(density))),
         damping=float(np.sqrt(DAMPING[0] * DAMPING[1])),
-        friction=friction,
+        friction=sum(FRICTION) / 2,
         thickness=THICKNESS,
     )
 

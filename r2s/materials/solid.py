@@ -3,16 +3,15 @@
 A law (`SolidLaw`) is a pytree of parameters with methods of one particle.
 """
 
-from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from r2s._util.units import Scalar, isotropic_bending, isotropic_membrane
+from r2s._util.arrays import is_traced
+from r2s._util.units import Scalar
 
 Matrix = Float[Array, "axis axis"]
 
@@ -40,12 +39,6 @@ class SolidLaw(Protocol):
         ...
 
 
-def lame(young: Scalar, poisson: Scalar) -> tuple[Scalar, Scalar]:
-    """Lame's constants mu and lambda [Pa] from Young's modulus [Pa] and Poisson's ratio [-]."""
-    mu = young / (2 * (1 + poisson))
-    return mu, young * poisson / ((1 + poisson) * (1 - 2 * poisson))
-
-
 class _Isotropic(eqx.Module):
     """An isotropic law with Lame's constants `mu` and `lam` [Pa]."""
 
@@ -58,12 +51,13 @@ class _Isotropic(eqx.Module):
 
         Raises `ValueError` when one is out of its physical range, unless it is traced.
         """
-        if _refuted(lambda: young > 0 and -1 < poisson < 0.5, young, poisson):
+        if not is_traced(young, poisson) and not (float(young) > 0 and -1 < float(poisson) < 0.5):
             raise ValueError(
                 "Young's modulus must be positive [Pa] and Poisson's ratio between -1 and 0.5, "
                 f"got {young} and {poisson}"
             )
-        mu, lam = lame(young, poisson)
+        mu = young / (2 * (1 + poisson))
+        lam = young * poisson / ((1 + poisson) * (1 - 2 * poisson))
         return cls(jnp.asarray(mu, float), jnp.asarray(lam, float))
 
     def modulus(self, dimension: int) -> Float[Array, ""]:
@@ -151,7 +145,7 @@ class Solid(eqx.Module):
         Raises `ValueError` when one is out of its physical range, unless it is traced.
         """
         values = density, damping, friction, mass_damping
-        if _refuted(lambda: density > 0 and min(values[1:]) >= 0, *values):
+        if not is_traced(values) and not (float(density) > 0 and min(map(float, values[1:])) >= 0):
             raise ValueError(
                 "density [kg/m^3] must be positive; damping [s], friction [-] and mass damping "
                 f"[1/s] must not be negative, got {values}"
@@ -159,25 +153,13 @@ class Solid(eqx.Module):
         return cls(law, *(jnp.asarray(value, float) for value in values))
 
 
-def plate_stiffness(
-    young: Scalar, poisson: Scalar, thickness: Scalar
-) -> tuple[tuple[Scalar, Scalar, Scalar, Scalar], Scalar]:
-    """Membrane stiffnesses (C11, C12, C22, C33) [N/m] and bending stiffness [N m] of a plate.
-
-    The plate is of a solid of Young's modulus [Pa], Poisson's ratio [-] and a thickness [m].
-    """
-    membrane = isotropic_membrane(young, poisson, thickness)
-    return membrane, isotropic_bending(young, poisson, thickness)
-
-
 def plate_solid(c11: Scalar, c12: Scalar, bending: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     """Young's modulus [Pa], Poisson's ratio [-] and thickness [m] of a plate of given stiffness.
 
-    The inverse of `plate_stiffness`: nu = C12 / C11, h^2 = 12 B / C11, from C11 and C12 [N/m] and
-    the bending stiffness B [N m] of an isotropic sheet.
+    nu = C12 / C11 and h^2 = 12 B / C11, from C11 and C12 [N/m] and the bending stiffness B [N m] of
+    an isotropic sheet.
 
-    >>> membrane, bending = plate_stiffness(1e5, 0.3, 1e-3)
-    >>> [round(x, 6) for x in plate_solid(membrane[0], membrane[1], bending)]
+    >>> [round(x, 3) for x in plate_solid(109.89010989, 32.967032967, 9.1575091575e-6)]
     [100000.0, 0.3, 0.001]
     """
     poisson = c12 / c11
@@ -250,14 +232,6 @@ def _solve(matrix: Matrix, right: Float[Array, " axis"]) -> Float[Array, " axis"
     a, b, c = matrix
     cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
     return jnp.sum(cofactors * right[:, None], axis=0) / jnp.sum(a * cofactors[0])
-
-
-def _refuted(condition: Callable[[], Any], *values: Scalar) -> bool:
-    """Whether a condition on values is false; False when one of them is traced."""
-    if any(isinstance(value, Tracer) for value in values):
-        return False
-    with jax.ensure_compile_time_eval():
-        return not condition()
 
 
 def _identity(like: Matrix) -> Matrix:

@@ -2,7 +2,7 @@
 
 Knits and wovens stiffen once their crimp is pulled out (Wang, O'Brien and Ramamoorthi 2011 measured
 tables of it), and bend more easily once the friction between their yarns is overcome. The curves
-here are assumed; that they have one energy makes such a sheet a converged truth to judge others by.
+here are assumed. They derive from an energy, so that the motion of such a sheet converges.
 """
 
 import equinox as eqx
@@ -41,23 +41,21 @@ class StiffeningMembrane(eqx.Module):
         stretch_weft: float | None = None,
     ) -> "StiffeningMembrane":
         """From the ratio, and the stretch (above 1) at which half of the growth is reached, of the
-        warp and of the weft (None: alike).
+        warp and of the weft (None: the same).
 
-        Raises `ValueError` for a sheet that would soften, or a stretch that is none.
+        Raises `ValueError` for a ratio below 1, or a stretch that is not above 1.
         """
         stretches = (stretch, stretch if stretch_weft is None else stretch_weft)
         if not (ratio >= 1 and min(stretches) > 1):
-            raise ValueError(
-                f"a ratio of 1 or more and a stretch above 1, got {ratio}, {stretches}"
-            )
-        numbers = (ratio, *((each**2 - 1) / 2 / HALF for each in stretches))
+            raise ValueError(f"needs a ratio >= 1 and stretches > 1, got {ratio} and {stretches}")
+        numbers = (ratio, *((stretch**2 - 1) / 2 / HALF for stretch in stretches))
         more, *knees = (
             jnp.broadcast_to(jnp.asarray(n, float), jnp.shape(small.c11)) for n in numbers
         )
         return cls(small, more, *knees)
 
     def at(self, strain: Float[Array, " 3"]) -> "StiffeningMembrane":
-        """Itself: its energy says it all."""
+        """Itself: it has an energy."""
         return self
 
     @property

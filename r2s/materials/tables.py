@@ -1,12 +1,11 @@
-"""Laws from tables of measured stiffness, which follows the strain or the curvature.
+"""Laws from tables of measured stiffness, which depends on the strain or the curvature.
 
 Wang, O'Brien and Ramamoorthi ("Data-driven elastic models for cloth: modeling and measurement", ACM
 Transactions on Graphics 30(4), 2011) measured fabrics as such tables; ARCSim and DiffSim use them,
 and `r2s.materials.arcsim` reads their files.
 
-What was measured is a secant stiffness: stress = C(E) E, bending moment = B(kappa) kappa. Such a
-stress derives from no energy: a time step takes from `at` the law of constant stiffness at its
-start.
+The tables are secant stiffness: stress = C(E) E, bending moment = B(kappa) kappa. Such a stress
+derives from no energy: a time step uses the law of constant stiffness at its start, from `at`.
 """
 
 import equinox as eqx
@@ -83,7 +82,7 @@ def _between(table: Float[Array, "row ..."], index: Float[Array, ""]) -> Float[A
     index = jnp.clip(index, 0, last)
     below = jnp.clip(jnp.floor(index), 0, last - 1)
     low = below.astype(int)
-    # this form, so that equal rows give exactly what they hold
+    # in this form equal rows give exactly their numbers
     return table[low] + (index - below) * (table[low + 1] - table[low])
 
 

@@ -1,15 +1,14 @@
-"""Where the bending of a sheet is taken: angles between two wings at an axis.
+"""The bends of a sheet: angles between two wings at an axis.
 
 A bend is an axis and two wings, each a difference of vertices. In a triangle mesh it is a hinge: an
 inner edge with its two triangles. In a grid (`r2s.mesh.plate_elements`) wings are the edges on
 either side of a vertex and the axis is the line across them. The angle is signed, 0 when flat, and
-keeps its meaning when the wings fold right over; over a rest length it is a curvature.
+well defined up to a full fold; over a rest length it is a curvature.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from r2s._util.arrays import once
@@ -31,14 +30,6 @@ class Bends(eqx.Module):
     weights: Float[Array, "bend 4 corner"] | None
     per_angle: Float[Array, " bend"]
     rest_curvature: Float[Array, " bend"]
-
-    @classmethod
-    def of_hinges(
-        cls, hinges: Int[np.ndarray, "hinge 4"], per_angle: Float[np.ndarray, " hinge"]
-    ) -> "Bends":
-        """The hinges of a flat mesh of triangles, with their curvature over angle [1/m]."""
-        flat = jnp.zeros(len(hinges), float)
-        return cls(jnp.asarray(hinges, int), None, jnp.asarray(per_angle, float), flat)
 
     def corners(self, x: Positions) -> Float[Array, "bend 4 3"]:
         """The corners of every bend [m], up to a shift of each."""
@@ -78,7 +69,7 @@ class Bends(eqx.Module):
             weights = jnp.moveaxis(self.weights, 0, -1)
         # the angle depends on the axis and the two wings
         vectors, shares = (
-            (each[1] - each[0], each[2] - each[0], each[3] - each[0]) for each in (corners, weights)
+            (part[1] - part[0], part[2] - part[0], part[3] - part[0]) for part in (corners, weights)
         )
         second = once(_angle_second_derivatives, *vectors)
         scale = (moments * self.per_angle)[None, None, None]
@@ -125,13 +116,12 @@ def _angle_second_derivatives(
     axis: Float[Array, "3 bend"], left: Float[Array, "3 bend"], right: Float[Array, "3 bend"]
 ) -> dict[tuple[int, int], Float[Array, "3 3 bend"]]:
     """Second derivatives [rad/m^2] of the angle of bends in their axis (0), left (1) and right (2)
-    wing [m]; those that are not there are zero. Bends are the last axis, to be worked on side by
-    side.
+    wing [m]; the missing ones are zero. Bends are the last axis, over which loops vectorise.
 
     In a wing the derivative of the angle is -+ |axis| n / |n|^2 with n = axis x wing, in the axis
     it is that of either wing times minus the wing's share along the axis (`hinge_angle_gradient`).
     """
-    found = {}
+    second = {}
     squared = jnp.sum(axis**2, axis=0)[None]
     length = jnp.sqrt(squared)
     of_axis = jnp.zeros((3, 3, axis.shape[1]), axis.dtype)
@@ -146,9 +136,9 @@ def _angle_second_derivatives(
         in_axis = in_axis - _outer(normal / area, axis / length)
         share = jnp.sum(wing * axis, axis=0)[None] / squared
         of_axis -= _outer(gradient, (wing - 2 * share * axis) / squared) + share[None] * in_axis
-        found[place, place], found[place, 0] = in_wing, in_axis
-        found[0, place] = in_axis.swapaxes(0, 1)
-    return found | {(0, 0): of_axis}
+        second[place, place], second[place, 0] = in_wing, in_axis
+        second[0, place] = in_axis.swapaxes(0, 1)
+    return second | {(0, 0): of_axis}
 
 
 def _outer(a: Float[Array, "3 bend"], b: Float[Array, "3 bend"]) -> Float[Array, "3 3 bend"]:
@@ -207,6 +197,6 @@ def _normals(corners):
 def unwrapped(angle: Float[Array, "*bend"], near: Float[Array, "*bend"]) -> Float[Array, "*bend"]:
     """The angle [rad] plus the whole turns that bring it nearest to another one.
 
-    A bend that folds right over then goes on from pi, and does not jump to minus pi.
+    So the angle of a bend that folds over does not jump from pi to minus pi.
     """
     return angle + 2 * jnp.pi * jnp.round((near - angle) / (2 * jnp.pi))

@@ -1,6 +1,8 @@
 """The rest shape of a sheet: a mesh in material coordinates, and what follows from it."""
 
-import dataclasses
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,13 +27,13 @@ class Mesh(eqx.Module):
     - `rest`: material coordinates (warp, weft), [m].
     - `faces`: corners of the triangles, counter-clockwise in material coordinates.
     - `hinges`: the two ends of each inner edge, then the two vertices opposite to it.
-    - `area`, `vertex_area`: rest areas of the faces, and what they share out to each vertex, [m^2].
+    - `area`, `vertex_area`: rest areas of the faces, and the share of each vertex in them, [m^2].
     - `hinge_length`, `hinge_area`: of each hinge's edge [m], and its two faces together [m^2].
     - `hinge_direction`: angle between the warp and the line that the hinge bends, which is at right
       angles to its edge, 0 to pi/2 [rad].
-    - `hinge_bends`: the hinges as what bends.
-    - `samples`: where its strain is taken, in elements which meet the air, too.
-    - `plate`: where its curvature is taken.
+    - `hinge_bends`: the bends at the hinges.
+    - `samples`: where strain is evaluated, in elements on which the air acts, too.
+    - `plate`: where curvature is evaluated.
     """
 
     rest: Float[Array, "vertex 2"]
@@ -51,8 +53,8 @@ class Mesh(eqx.Module):
         """A mesh of linear triangles, from material coordinates [m].
 
         Raises `ValueError` for wrong shapes, indices out of range, vertices in no face, an edge of
-        more than two faces, faces that are degenerate or clockwise, and a sheet so large or small
-        that its coordinates are hardly in metres.
+        more than two faces, faces that are degenerate or clockwise, and a sheet below `SMALLEST` or
+        above `LARGEST`, whose coordinates are probably not in metres.
         """
         rest, faces = np.asarray(rest, float), np.asarray(faces)
         _check(rest, faces)
@@ -70,7 +72,12 @@ class Mesh(eqx.Module):
         np.add.at(vertex_area, faces.ravel(), np.repeat(area / 3, 3))
         length = np.linalg.norm(ends, axis=-1)
         hinge_area = area[hinge_faces].sum(axis=-1)
-        bends = Bends.of_hinges(hinges, length / hinge_area)
+        bends = Bends(
+            vertices=jnp.asarray(hinges, int),
+            weights=None,
+            per_angle=jnp.asarray(length / hinge_area, float),
+            rest_curvature=jnp.zeros(len(hinges), float),
+        )
         return cls(
             rest=jnp.asarray(rest, float),
             faces=jnp.asarray(faces, int),
@@ -82,7 +89,7 @@ class Mesh(eqx.Module):
             hinge_direction=jnp.asarray(np.arctan2(*np.abs(ends.T)), float),
             hinge_bends=bends,
             samples=StrainSamples.of_triangles(rest, faces),
-            plate=PlateElements.of_triangles(rest, faces, hinges, area, bends),
+            plate=PlateElements.of_triangles(rest, faces, hinges, hinge_faces, area, bends),
         )
 
     def lay_flat(self, z: float = 0.0) -> Float[Array, "vertex 3"]:
@@ -113,29 +120,30 @@ def _check(rest: np.ndarray, faces: np.ndarray) -> None:
 
 def _hinges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Inner edges with their two opposite vertices, and the two faces of each."""
-    sides: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
-    for index, face in enumerate(faces):
-        for i in range(3):
-            start, end, opposite = (int(face[(i + k) % 3]) for k in range(3))
-            key = (min(start, end), max(start, end))
-            sides.setdefault(key, []).append((start, opposite, index))
-    hinges, pairs = [], []
-    for (low, high), touching in sides.items():
-        if len(touching) > 2:
-            raise ValueError(
-                f"edge {low}-{high} belongs to {len(touching)} faces, at most 2 may be"
-            )
-        if len(touching) == 2 and touching[0][0] == touching[1][0]:
-            raise ValueError(
-                f"faces {touching[0][2]} and {touching[1][2]} lie on the same side of edge "
-                f"{low}-{high}: faces must not overlap"
-            )
-        if len(touching) == 2:
-            # the left triangle is the one that runs along the edge from its start
-            (start, left, face_left), (_, right, face_right) = touching
-            hinges.append((start, high if start == low else low, left, right))
-            pairs.append((face_left, face_right))
-    return np.reshape(hinges, (-1, 4)).astype(int), np.reshape(pairs, (-1, 2)).astype(int)
+    # of each face: start, end and opposite vertex of its sides
+    sides = np.stack([np.roll(faces, -k, axis=1) for k in range(3)], axis=2).reshape(-1, 3)
+    edges, first, edge, count = np.unique(
+        np.sort(sides[:, :2], axis=1),
+        axis=0,
+        return_index=True,
+        return_inverse=True,
+        return_counts=True,
+    )
+    if np.max(count) > 2:
+        low, high = edges[np.argmax(count)]
+        raise ValueError(f"edge {low}-{high} belongs to {np.max(count)} faces, at most 2 may be")
+    edge = edge.ravel()
+    order = np.argsort(first[edge], kind="stable")  # edges in the order of their first sides
+    pairs = order[count[edge[order]] == 2].reshape(-1, 2)
+    left, right = sides[pairs].transpose(1, 0, 2)  # the left face goes from start to end
+    if np.any(overlap := left[:, 0] == right[:, 0]):
+        one, other = pairs[overlap][0] // 3
+        low, high = sorted(left[overlap][0, :2].tolist())
+        raise ValueError(
+            f"faces {one} and {other} lie on the same side of edge {low}-{high}: faces must not "
+            "overlap"
+        )
+    return np.column_stack([left, right[:, 2]]), pairs // 3
 
 
 def borders(mesh: Mesh) -> Bool[Array, "face 3"]:
@@ -152,33 +160,21 @@ def borders(mesh: Mesh) -> Bool[Array, "face 3"]:
 def resized(mesh: Mesh, ratio: Float[Array, ""] | float) -> Mesh:
     """The sheet cut `ratio` times as long and as wide, of the same vertices."""
 
-    def bends(part: Bends) -> Bends:
-        return dataclasses.replace(
-            part,
-            per_angle=part.per_angle / ratio,
-            rest_curvature=part.rest_curvature / ratio,
-        )
+    def scaled(part: Any, lengths: Sequence[str], areas: Sequence[str], inverse: Sequence[str]):
+        changed = {name: getattr(part, name) * ratio for name in lengths}
+        changed |= {name: getattr(part, name) * ratio**2 for name in areas}
+        return replace(part, **changed, **{name: getattr(part, name) / ratio for name in inverse})
 
-    waves = mesh.samples.hidden_waves
-    samples = dataclasses.replace(
-        mesh.samples,
-        gradients=mesh.samples.gradients / ratio,
-        areas=mesh.samples.areas * ratio**2,
-        hidden_waves=None if waves is None else waves / ratio,
-    )
-    plate = dataclasses.replace(
-        mesh.plate, bends=bends(mesh.plate.bends), areas=mesh.plate.areas * ratio**2
-    )
-    return dataclasses.replace(
-        mesh,
-        rest=mesh.rest * ratio,
-        area=mesh.area * ratio**2,
-        vertex_area=mesh.vertex_area * ratio**2,
-        hinge_length=mesh.hinge_length * ratio,
-        hinge_area=mesh.hinge_area * ratio**2,
+    def bends(part: Bends) -> Bends:
+        return scaled(part, (), (), ("per_angle", "rest_curvature"))
+
+    waves = () if mesh.samples.hidden_waves is None else ("hidden_waves",)
+    plate = scaled(mesh.plate, (), ("areas",), ())
+    return replace(
+        scaled(mesh, ("rest", "hinge_length"), ("area", "vertex_area", "hinge_area"), ()),
         hinge_bends=bends(mesh.hinge_bends),
-        samples=samples,
-        plate=plate,
+        samples=scaled(mesh.samples, (), ("areas",), ("gradients", *waves)),
+        plate=replace(plate, bends=bends(plate.bends)),
     )
 
 
@@ -187,12 +183,11 @@ def rectangle(
 ) -> Mesh:
     """A rectangle of `size` (warp, weft) [m] with `shape` vertices along warp and weft.
 
-    Vertex (i, j) has the index i * shape[1] + j. The `elements` that its strain and its curvature
-    are taken in are "quadrilaterals", which favour no direction; "wrinkling", which are these, but
-    give way where they are compressed (`r2s.materials.wrinkling`); or triangles as of any other
-    mesh, whose folds the diagonals of the cells direct: "falling" (from the corner of the warp to
-    that of the weft),
-    "rising" (from the origin to the opposite corner) or "alternating" (which bends too softly).
+    Vertex (i, j) has the index i * shape[1] + j. The `elements` of strain and curvature are
+    "quadrilaterals", which favour no direction; "wrinkling", quadrilaterals that give way under
+    compression (`r2s.materials.wrinkling`); or triangles as of any other mesh, whose diagonals
+    direct the folds: "falling" (from the corner of the warp to that of the weft), "rising" (from
+    the origin to the opposite corner) or "alternating" (which bends too softly).
 
     Raises `ValueError` when a side is not positive or has no two vertices, or for other elements.
 
@@ -215,7 +210,7 @@ def rectangle(
         return mesh
     spacing = size[0] / (rows - 1), size[1] / (columns - 1)
     plate = PlateElements.of_grid(spacing, shape)
-    return dataclasses.replace(
+    return replace(
         mesh,
         vertex_area=plate.areas,  # a vertex is an element of the plate
         samples=StrainSamples.of_grid(spacing, shape, elements == "wrinkling"),

@@ -1,11 +1,10 @@
-"""The curvature tensor of a sheet, from its bends, in elements of a plate.
+"""The curvature tensor of a sheet in elements of a plate, from its bends.
 
 In a triangle mesh an element is a face. Its three hinges see its three neighbours: six vertices, as
-many as a quadratic has coefficients. So there is one quadratic that bends the three hinges as they
-are bent, and its second derivatives are the face's curvature, exact for a sheet of constant
-curvature on any mesh (as in the enhanced basic shell triangle of Flores and Oñate 2005, whose patch
-is the same). Where a face lies at the border of the sheet and lacks hinges, it is the smallest
-curvature that bends those it has.
+many as a quadratic has coefficients. The second derivatives of the quadratic with the curvature of
+these hinges are the face's curvature, exact for a sheet of constant curvature on any mesh (as in
+the enhanced basic shell triangle of Flores and Oñate 2005, whose patch is the same). A face at the
+border of the sheet, which lacks hinges, has the smallest curvature with those of its hinges.
 
 In a grid an element is a vertex. Its line along the warp turns by k11 times the spacing, that along
 the weft by k22 times it, and from one side of a cell to the other the sheet twists by k12 times it
@@ -28,17 +27,17 @@ TURN = np.array([[1, 0, 0, 0, 0], [1, 0, 0, 1, -1], [0, 1, 0, 0, 0], [0, 0, 1, 0
 # the twist of a cell between its sides along the warp, and between those along the weft.
 TWIST_WARP = np.array([[1, 1, 0, 0, 0], [0, 0, 1, 1, 0], [3, -1, 0, 0, 0], [1, 1, 2, -2, 0]]) / 2
 TWIST_WEFT = np.array([[1, 0, 0, 1, 0], [0, 1, 1, 0, 0], [1, -2, 2, 1, 0], [3, 0, 0, -1, 0]]) / 2
-SINGULAR = 1e-3  # of the greatest singular value: directions that the hinges do not see
+SINGULAR = 1e-3  # of the greatest singular value: directions that the hinges do not bend in
 
 
 class PlateElements(eqx.Module):
     """The elements of a sheet that bends as a plate.
 
-    - `bends`: what the curvatures are made of.
+    - `bends`: of the lines, cells or hinges of the sheet.
     - `areas`: rest areas of the elements, [m^2].
-    - `vertices`: of each element. Where it has fewer than others its first one stands for them.
-    - `of_element`: its bends. Where there is none, bend 0, with no share in curvature.
-    - `places`: which of the bend's vertices each of the element's is; their number: none of them.
+    - `vertices`: of each element; its first one is repeated where it has fewer than others.
+    - `of_element`: its bends; bend 0, with no share in the curvature, where it has fewer.
+    - `places`: which of the bend's vertices each of the element's is; their number for none.
     - `to_curvature`: from the curvatures of the bends to that of the element, (k11, k22, 2 k12).
     """
 
@@ -55,25 +54,28 @@ class PlateElements(eqx.Module):
         rest: Float[np.ndarray, "vertex 2"],
         faces: Int[np.ndarray, "face 3"],
         hinges: Int[np.ndarray, "hinge 4"],
+        hinge_faces: Int[np.ndarray, "hinge 2"],
         areas: Float[np.ndarray, " face"],
         bends: Bends,
     ) -> "PlateElements":
         """The faces of a mesh at rest [m], with the `bends` of its hinges."""
-        of_face = _hinges_of_faces(faces, hinges)
-        to_curvature = _from_hinges(rest, hinges, of_face)
-        return cls._of(bends, areas, of_face, to_curvature)
+        # the hinge on the edge opposite to each corner; -1 at the border
+        of_face, corner = np.full(faces.shape, -1), faces[hinge_faces] == hinges[:, 2:, None]
+        of_face[hinge_faces, np.argmax(corner, axis=2)] = np.arange(len(hinges))[:, None]
+        return cls._of(bends, areas, of_face, _from_hinges(rest, hinges, of_face))
 
     @classmethod
     def of_grid(cls, spacing: tuple[float, float], shape: tuple[int, int]) -> "PlateElements":
         """The vertices of a grid of `shape` vertices, [m] apart along warp and weft."""
         bends, (warp, weft, twist) = _grid_bends(spacing, shape)
-        areas = np.prod(spacing) * np.outer(*map(_share, shape))
+        areas = np.prod(spacing) * np.outer(*(np.r_[0.5, np.ones(n - 2), 0.5] for n in shape))
         of_element = np.full((*shape, 4), -1)
-        if warp:
-            of_element[..., 0] = _inner(np.arange(warp).reshape(-1, shape[1]))
+        if warp:  # the turn nearest to each vertex on its line
+            lines = np.arange(warp).reshape(-1, shape[1])
+            of_element[..., 0] = np.pad(lines, ((1, 1), (0, 0)), mode="edge")
         if weft:
             lines = warp + np.arange(weft).reshape(-1, shape[0])
-            of_element[..., 1] = _inner(lines).T
+            of_element[..., 1] = np.pad(lines, ((1, 1), (0, 0)), mode="edge").T
         of_cells = warp + weft + np.arange(twist).reshape(np.array(shape) - 1)
         of_element[:-1, :-1, 2], of_element[:-1, :-1, 3] = of_cells, of_cells + twist
         to_curvature = np.zeros((*shape, 3, 4))
@@ -120,13 +122,11 @@ def _vertices_of_elements(bends: Bends, of_element) -> tuple[np.ndarray, np.ndar
     of_bends = np.where(np.any(weights != 0, axis=1), of_bends, -1)
     # a row of -1 for the bends that do not exist, the last
     listed = np.concatenate([of_bends, np.full((1, none), -1)])[of_element]
-    found = [np.unique(row[row >= 0]) for row in listed.reshape(len(of_element), -1)]
-    width = max(1, *(len(row) for row in found))
-    vertices = np.zeros((len(found), width), int)
-    is_one = np.arange(width) < np.array([[len(row)] for row in found])
-    for row, into in zip(found, vertices, strict=True):
-        into[: len(row)] = row
-        into[len(row) :] = row[:1] if len(row) else 0
+    own = [np.unique(row[row >= 0]) for row in listed.reshape(len(of_element), -1)]
+    counts = np.array([len(row) for row in own])
+    is_one = np.arange(max(1, *counts)) < counts[:, None]
+    vertices = np.repeat([[row[0] if len(row) else 0] for row in own], is_one.shape[1], axis=1)
+    vertices[is_one] = np.concatenate(own)
     same = vertices[:, None, :, None] == listed[:, :, None, :]  # (element, bend, vertex, of bend)
     same &= is_one[:, None, :, None]
     return vertices, np.where(same.any(axis=-1), same.argmax(axis=-1), none)
@@ -144,7 +144,7 @@ def _grid_bends(
     vertices = np.concatenate([warp, weft, cell, cell])
     # to the left of the axis is what is ahead of it along the weft, but behind it along the warp
     weights = [warp_weights[:, [0, 1, 3, 2]], weft_weights]
-    weights += [np.broadcast_to(each, (len(twist), 4, 5)) for each in (TWIST_WARP, TWIST_WEFT)]
+    weights += [np.broadcast_to(part, (len(twist), 4, 5)) for part in (TWIST_WARP, TWIST_WEFT)]
     lengths = np.repeat(
         [spacing[0], spacing[1], spacing[1] / 2, spacing[0] / 2],
         [len(warp), len(weft), len(twist), len(twist)],
@@ -166,8 +166,8 @@ def _turns(index: Int[np.ndarray, "along across"]) -> tuple[np.ndarray, np.ndarr
     """
     middle = index[1:-1]
     across = np.pad(index, ((0, 0), (1, 1)), mode="edge")[1:-1]
-    around = middle, index[2:], index[:-2], across[:, 2:], across[:, :-2]
-    vertices = np.stack([part.ravel() for part in around], axis=1)
+    parts = middle, index[2:], index[:-2], across[:, 2:], across[:, :-2]
+    vertices = np.stack([part.ravel() for part in parts], axis=1)
     weights = np.broadcast_to(TURN, (len(vertices), 4, 5)).copy()
     for at_border in (3, 4):  # the axis begins or ends at the vertex itself
         alone = vertices[:, at_border] == vertices[:, 0]
@@ -176,32 +176,14 @@ def _turns(index: Int[np.ndarray, "along across"]) -> tuple[np.ndarray, np.ndarr
     return vertices, weights
 
 
-def _inner(lines: Int[np.ndarray, "inner across"]) -> Int[np.ndarray, "along across"]:
-    """The turn nearest to each vertex on its line."""
-    return np.pad(lines, ((1, 1), (0, 0)), mode="edge")
-
-
-def _share(count: int) -> np.ndarray:
-    """Of the vertices of a line, in units of its spacing."""
-    return np.concatenate([[0.5], np.ones(count - 2), [0.5]])
-
-
-def _hinges_of_faces(faces, hinges) -> Int[np.ndarray, "face 3"]:
-    """The hinge on the edge opposite to each corner; -1 at the border."""
-    index = {tuple(sorted(ends)): hinge for hinge, ends in enumerate(hinges[:, :2].tolist())}
-    others = np.sort(faces[:, [[1, 2], [2, 0], [0, 1]]], axis=2)
-    found = [index.get(tuple(ends), -1) for ends in others.reshape(-1, 2).tolist()]
-    return np.reshape(found, (-1, 3))
-
-
 def _from_hinges(rest, hinges, of_face) -> Float[np.ndarray, "face 3 3"]:
     """The inverse of what constant curvatures do to the hinges of each face."""
     if not len(hinges):
         return np.zeros((len(of_face), 3, 3))
-    seen = np.where(of_face[:, :, None] >= 0, _bent(rest, hinges)[of_face], 0)
+    of_hinges = np.where(of_face[:, :, None] >= 0, _bent(rest, hinges)[of_face], 0)
     # in the norm of tensors, which no rotation changes: (k11, k22, sqrt(2) k12)
     scale = np.array([1, 1, np.sqrt(2)])
-    return scale[:, None] * np.linalg.pinv(seen * scale, rcond=SINGULAR)
+    return scale[:, None] * np.linalg.pinv(of_hinges * scale, rcond=SINGULAR)
 
 
 def _bent(rest, hinges) -> Float[np.ndarray, "hinge 3"]:

@@ -1,9 +1,9 @@
-"""Where the strain of a sheet is taken: samples in its elements, triangles or quadrilaterals.
+"""Samples of strain in the elements of a sheet, triangles or quadrilaterals.
 
 The deformation gradient at a sample is linear in the element's corners: F = sum_c x_c g_c^T, with
 the gradients g_c of the corners' shape functions. A triangle has one sample. A quadrilateral of a
-grid is bilinear, with 2 x 2 Gauss points: it bends in its plane and folds along lines that a
-triangle cannot follow without stretching, and favours neither of its diagonals.
+grid is bilinear, with 2 x 2 Gauss points: it bends in its plane and folds along lines where a
+triangle would stretch, and favours neither of its diagonals.
 """
 
 from collections.abc import Callable
@@ -53,9 +53,8 @@ class StrainSamples(eqx.Module):
         compression gives way (`r2s.materials.wrinkling`).
         """
         corners = cells(shape)
-        places = GAUSS * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-        along = signs * (1 + signs * places[:, None])[..., ::-1] / 2  # (sample, corner, axis)
+        along = signs * (1 + signs * (GAUSS * signs)[:, None])[..., ::-1] / 2  # of (sample, corner)
         gradients = np.broadcast_to(along / np.array(spacing), (len(corners), 4, 4, 2))
         areas = np.full((len(corners), 4), np.prod(spacing) / 4)
         # nodes can take a wave of two cells, but not one of a single cell
@@ -81,37 +80,30 @@ class StrainSamples(eqx.Module):
 def on_samples(function: Callable, *arrays: Any) -> Any:
     """`function` of every sample, of pytrees of arrays whose first axes are (element, sample).
 
-    All samples are in one row meanwhile: rows of an element's four leave vector units idle.
+    It maps over one long axis: rows of an element's four samples leave vector units idle.
     """
     first = jax.tree.leaves(arrays)[0].shape[:2]
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), arrays)
-    found = jax.vmap(function)(*flat)
-    return jax.tree.map(lambda leaf: leaf.reshape(*first, *leaf.shape[1:]), found)
+    mapped = jax.vmap(function)(*flat)
+    return jax.tree.map(lambda leaf: leaf.reshape(*first, *leaf.shape[1:]), mapped)
 
 
 def cells(shape: tuple[int, int]) -> Int[np.ndarray, "cell 4"]:
     """The vertices (0, 0), (1, 0), (1, 1) and (0, 1) of each cell of a grid of `shape` vertices."""
     index = np.arange(shape[0] * shape[1]).reshape(shape)
-    around = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
-    return np.stack([corner.ravel() for corner in around], axis=1)
-
-
-def deformation_gradient(
-    corners: Float[Array, "corner 3"], gradients: Float[Array, "corner 2"]
-) -> Float[Array, "3 2"]:
-    """F = sum_c x_c g_c^T [-]: the world images of the unit warp and weft vectors.
-
-    `corners` are positions [m], `gradients` those of their shape functions [1/m].
-    """
-    # from one corner on, as the gradients add up to zero: places in the world would cost precision
-    edges = jnp.stack([corner - corners[0] for corner in corners[1:]], axis=1)
-    return edges @ gradients[1:]
+    corners = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    return np.stack([corner.ravel() for corner in corners], axis=1)
 
 
 def green_strain(
     corners: Float[Array, "corner 3"], gradients: Float[Array, "corner 2"]
 ) -> Float[Array, " 3"]:
-    """Green strain (E11, E22, 2 E12) [-] of a sample, E = (F^T F - 1) / 2."""
-    deformation = deformation_gradient(corners, gradients)
+    """Green strain (E11, E22, 2 E12) [-] of a sample, E = (F^T F - 1) / 2.
+
+    `corners` are positions [m], `gradients` those of their shape functions [1/m].
+    """
+    # from one corner on, as the gradients add up to zero: places in the world would cost precision
+    edges = jnp.stack([corner - corners[0] for corner in corners[1:]], axis=1)
+    deformation = edges @ gradients[1:]  # the images of the unit warp and weft vectors
     warp, weft = deformation[:, 0], deformation[:, 1]
     return jnp.stack([(warp @ warp - 1) / 2, (weft @ weft - 1) / 2, warp @ weft])

@@ -1,4 +1,4 @@
-"""What a moved sheet shows: strains, normals and masses; points on it, the nearest to a point."""
+"""A moved sheet: strains, normals and masses; points on its surface, the nearest to a point."""
 
 import jax
 import jax.numpy as jnp
@@ -106,7 +106,7 @@ def prolonged(
     length: Float[Array, ""] | float,
 ) -> Float[Array, "point 3"]:
     """Barycentric weights of the place nearest to each point when its triangle, whose nearest place
-    has `weights`, goes on in its plane by a `length` [m] beyond that place. Not differentiable,
+    has `weights`, is extended in its plane by a `length` [m] beyond that place. Not differentiable,
     like `nearest`."""
     points, corners = jax.lax.stop_gradient((points, corners))
     edges = corners[:, 1:] - corners[:, :1]
@@ -135,19 +135,14 @@ def _edge_weight(point, a, b):
     return jnp.clip((point - a) @ edge / length, 0, 1)
 
 
-def sample_weights(resolution: int) -> Float[Array, "sample 3"]:
-    """Barycentric weights of `resolution`^2 places spread evenly over a triangle."""
+def sample(
+    x: Float[Array, "vertex 3"], faces: Int[Array, "face 3"], resolution: int
+) -> Float[Array, "sample 3"]:
+    """`resolution`^2 evenly spread points [m] on each face."""
     steps = jnp.arange(resolution, dtype=float)
     i, j = (axis.ravel() for axis in jnp.meshgrid(steps, steps, indexing="ij"))
     upright = i + j < resolution  # the small triangles come upright and, between them, inverted
     first = jnp.where(upright, i + 1 / 3, resolution - i - 1 / 3) / resolution
     second = jnp.where(upright, j + 1 / 3, resolution - j - 1 / 3) / resolution
-    return jnp.stack([1 - first - second, first, second], axis=1)
-
-
-def sample(
-    x: Float[Array, "vertex 3"], faces: Int[Array, "face 3"], resolution: int
-) -> Float[Array, "sample 3"]:
-    """`resolution`^2 evenly spread points [m] on each face."""
-    weights = sample_weights(resolution)
+    weights = jnp.stack([1 - first - second, first, second], axis=1)
     return jnp.einsum("sk,fki->fsi", weights, x[faces]).reshape(-1, 3)

@@ -1,8 +1,8 @@
-"""What a motion can say of a fabric, and what is comparable beyond that.
+"""How far motions of fabrics can be compared: error floor, predictability horizon, skill.
 
-A motion is known up to a floor: the error of its mesh and step, and what invisible differences,
-such as 0.1 % of stiffness, grow to. From the horizon on, where the floor is a large share of the
-difference between fabrics, motions are compared by `features`, which do not depend on the phase.
+A motion is known up to a floor: the error of its mesh and step, and the growth of tiny differences,
+such as 0.1 % of stiffness. From the horizon on, where the floor is a large share of the difference
+between fabrics, motions are compared by `features`, which do not depend on the phase.
 As in weather forecasts (Lorenz, "The predictability of a flow which possesses many scales of
 motion", Tellus 21, 1969); the skill is that of Murphy ("Skill scores based on the mean square
 error", Monthly Weather Review 116, 1988), with the floor as the perfect forecast.
@@ -37,7 +37,8 @@ def floor_of(
     """
     if not causes:
         raise ValueError("a floor needs a cause or more")
-    means = [np.mean(np.where(np.isnan(each), np.inf, each), axis=0) for each in causes.values()]
+    members = (np.where(np.isnan(away), np.inf, away) for away in causes.values())
+    means = [np.mean(away, axis=0) for away in members]
     return np.sqrt(np.sum(np.square(means), axis=0))
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from r2s.mesh.surface import nearest, prolonged
 from r2s.recordings.clouds import draw_points
 
-TOUCHING = 1e-6  # [m]: what is nearer lies on the sheet
+TOUCHING = 1e-6  # [m]: nearer points lie on the sheet
 OUTLIER_SCALE = 0.015  # [m]: a point much farther away than this counts as an outlier
 
 
@@ -47,8 +47,8 @@ def surface_residuals(
     nearest place: a small motion `dx` of the vertices changes the distance by
     -direction . sum(weights dx).
 
-    With its `borders` (`r2s.mesh.mesh.borders`) the sheet goes on beyond them, in the planes of its
-    faces, by `slack` [m]: else noise, which pulls at a border only outward, makes it seem larger.
+    With its `borders` (`r2s.mesh.mesh.borders`) the sheet is extended beyond them, in the planes of
+    its faces, by `slack` [m]: else noise, which pulls a border only outward, makes it seem larger.
     """
     face, weights = nearest(points, x, faces)
     if borders is not None:
@@ -126,11 +126,9 @@ def to_surface(
     drawn = [draw_points(cloud, most, (0, frame)) for frame, cloud in enumerate(clouds)]
     rows = [np.resize(cloud, (most, 3)) for cloud in drawn]  # repeated where too few
     weights = [_weights(min(len(cloud), most), most) for cloud in clouds]
-    found = _mean_distances(
-        jnp.asarray(rows, float), jnp.asarray(weights, float), jnp.asarray(x), faces
-    )
-    finite = np.isfinite(x).all(axis=(1, 2))
-    return np.where(finite, np.asarray(found, float), np.nan)
+    points = jnp.asarray(rows, float), jnp.asarray(weights, float)
+    means = np.asarray(_mean_distances(*points, jnp.asarray(x), faces), float)
+    return np.where(np.isfinite(x).all(axis=(1, 2)), means, np.nan)
 
 
 def _weights(count: int, most: int) -> np.ndarray:

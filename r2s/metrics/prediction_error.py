@@ -98,11 +98,6 @@ class Motion(NamedTuple):
     steps: str = ""
 
 
-def predict(recording: Recording, fabric: Fabric) -> Float[np.ndarray, "frame vertex 3"]:
-    """Positions [m] of a fabric in the motion of a recording; NaN from where it diverged."""
-    return predict_motion(from_recording(recording), fabric).x
-
-
 def predict_motion(scenario: Scenario, fabric: Fabric, solver: SheetSolver | None = None) -> Motion:
     """The motion of a fabric in a scenario; by the cloth unless another solver is given."""
     moved = _rollout(scenario, fabric, solver=solver)
@@ -174,12 +169,12 @@ def _frame(real, simulated, first_real, first_simulated, crop: bool) -> dict[str
     are cut off above the table, where a simulation still has a sheet.
     """
     whole = distances(real, simulated)
-    found = whole | paper_units(real, simulated, first_real, first_simulated)
+    metrics = whole | paper_units(real, simulated, first_real, first_simulated)
     if not crop:
-        return found
+        return metrics
     visible = simulated[simulated[:, 2] >= real[:, 2].min()]
     cropped = distances(real, visible) if len(visible) else {}
-    return found | {f"{name}_cropped": cropped.get(name, float("nan")) for name in whole}
+    return metrics | {f"{name}_cropped": cropped.get(name, float("nan")) for name in whole}
 
 
 class Placement(NamedTuple):
@@ -204,14 +199,8 @@ def best_placement(real: Sequence[Cloud], simulated: Sequence[Cloud], seed: int 
     them. `real`, `simulated`: clouds of the frames, [m]; `seed`: of the `PLACED` points that are
     drawn. At most `FARTHEST` [m] along each axis and `TURN` [rad]; distances from recording to
     motion, squared up to `OUTLIER` (soft L1). Raises `ValueError` for another number of frames,
-    and for one that is empty or not finite.
+    and for points that are not finite.
     """
-    if len(real) != len(simulated):
-        raise ValueError(f"{len(real)} recorded frames, {len(simulated)} simulated ones")
-    for name, clouds in (("recorded", real), ("simulated", simulated)):
-        for frame, points in enumerate(clouds):
-            if not len(points) or not np.all(np.isfinite(points)):
-                raise ValueError(f"{name} frame {frame} is empty, or not finite")
     random = np.random.default_rng(seed)
     clouds = [np.asarray(points, float) for points in real]
     frames = [points[random.permutation(len(points))[:PLACED]] for points in clouds]
@@ -228,5 +217,5 @@ def best_placement(real: Sequence[Cloud], simulated: Sequence[Cloud], seed: int 
         return np.concatenate([tree.query(placed(at(share), frame))[0] for tree, frame in pairs])
 
     start = np.zeros(len(bounds))
-    found = least_squares(residuals, start, bounds=(-1, 1), loss="soft_l1", f_scale=OUTLIER)
-    return at(found.x)
+    fit = least_squares(residuals, start, bounds=(-1, 1), loss="soft_l1", f_scale=OUTLIER)
+    return at(fit.x)

@@ -1,7 +1,7 @@
 """Means over a sample of units measured under the same levels of other factors.
 
-Fabrics are the units, motions such a factor: all fabrics were moved by the same motions, whose
-share of the variance does not show in the spread between fabrics. Components of the variance:
+Fabrics are the units, motions such a factor: all fabrics make the same motions, whose share of the
+variance is not in the spread between fabrics. Components of the variance:
 Cornfield and Tukey 1956, Average values of mean squares in factorials; degrees of freedom:
 Satterthwaite 1946, An approximate distribution of estimates of variance components.
 """
@@ -79,28 +79,28 @@ def _shared(table: Float[np.ndarray, "unit level"]) -> tuple[float, int]:
     return max(0.0, between - interaction / (units * levels)), levels - 1
 
 
-def interval(found: CrossedMean) -> tuple[float, float]:
+def interval(sample: CrossedMean) -> tuple[float, float]:
     """The interval of `LEVEL` for the mean of all units (Student's t); NaN for one unit."""
-    reach = float(special.stdtrit(found.freedom, (1 + LEVEL) / 2)) * found.error
-    return found.mean - reach, found.mean + reach
+    reach = float(special.stdtrit(sample.freedom, (1 + LEVEL) / 2)) * sample.error
+    return sample.mean - reach, sample.mean + reach
 
 
-def p_value(found: CrossedMean) -> float:
+def p_value(sample: CrossedMean) -> float:
     """The two-sided p that the mean of all units is zero (Student's t); NaN for one unit.
 
     With at most the degrees of freedom of the units alone: Satterthwaite's are many where the
     spread happens to be small, too many for the tails that a correction for many tests needs.
     """
-    if found.units < 2:
+    if sample.units < 2:
         return np.nan
-    if found.error == 0:
-        return 0.0 if found.mean else 1.0
-    freedom = min(found.freedom, found.units - 1)
-    return float(2 * special.stdtr(freedom, -abs(found.mean) / found.error))
+    if sample.error == 0:
+        return 0.0 if sample.mean else 1.0
+    freedom = min(sample.freedom, sample.units - 1)
+    return float(2 * special.stdtr(freedom, -abs(sample.mean) / sample.error))
 
 
 def units_needed(
-    found: CrossedMean, effect: float, significance: float
+    sample: CrossedMean, effect: float, significance: float
 ) -> tuple[float, float, float]:
     """How many units distinguish a mean of `effect` from zero with a power of `POWER`.
 
@@ -108,16 +108,16 @@ def units_needed(
     `MOST_UNITS`, NaN for one unit. By the noncentral t distribution (Cohen 1988, Statistical power
     analysis for the behavioral sciences, chapter 2).
     """
-    if found.units < 2:
+    if sample.units < 2:
         return np.nan, np.nan, np.nan
-    free = found.units - 1
+    free = sample.units - 1
     ends = free / stats.chi2.ppf([(1 + LEVEL) / 2, (1 - LEVEL) / 2], free)
     counts = range(2, MOST_UNITS + 1)
 
     def needed(scale: float) -> float:
-        variance = found.spread**2 * scale
+        variance = sample.spread**2 * scale
         place = bisect_left(
-            counts, POWER, key=lambda n: _power(n, variance, found.shared, effect, significance)
+            counts, POWER, key=lambda n: _power(n, variance, sample.shared, effect, significance)
         )
         return float(counts[place]) if place < len(counts) else np.inf
 

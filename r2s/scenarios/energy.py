@@ -1,4 +1,4 @@
-"""A motion with its forces, and the account of its energy: given, held and lost."""
+"""A motion with its forces and its energy balance."""
 
 from typing import Any
 
@@ -60,13 +60,15 @@ def energy_balance(
     """
     solver, substeps = stepped(scenario, max_step, solver)
     fabric = as_cut(scenario, fabric)
-    mesh, pinned = scenario.scene.mesh, scenario.scene.pinned
+    scene = scenario.scene
+    mesh, pinned = scene.mesh, scene.pinned
 
     def step(carried: Any, control: Control):
         state, before = carried
         after, forces = solver.step_with_forces(fabric, state, control)
         moved = after.x - state.x
-        drag = _drag(scenario, state, after, control)
+        middle = (state.x + after.x) / 2, (state.v + after.v) / 2
+        drag = drag_on_vertices(mesh, scene.air, scene.fan, *middle, control.wind)
         work = jnp.sum((before + forces) / 2 * moved[pinned]), jnp.sum(drag * moved)
         return (after, forces), (forces, *work)
 
@@ -91,7 +93,7 @@ def energy_balance(
         last=last[first:],
         stored=jax.vmap(lambda x: stored_energy(mesh, fabric, x))(x),
         kinetic=jnp.sum(mass[None] * jnp.sum(v**2, axis=2), axis=1) / 2,
-        potential=scenario.scene.gravity * jnp.sum(mass[None] * x[..., 2], axis=1),
+        potential=scene.gravity * jnp.sum(mass[None] * x[..., 2], axis=1),
         grippers=since(grippers),
         air=since(air),
     )
@@ -122,10 +124,3 @@ def stored_energy(mesh: Mesh, fabric: Fabric, x: Float[Array, "vertex 3"]) -> Fl
     curvatures = fabric.bending.curvatures(mesh, bent)
     bending = jax.vmap(lambda law, curvature: law.energy_density(curvature))(laws, curvatures)
     return jnp.sum(mesh.samples.areas * membrane) + jnp.sum(fabric.bending.areas(mesh) * bending)
-
-
-def _drag(scenario: Scenario, state: Any, after: Any, control: Control):
-    """The force of the air [N] on the vertices, in the middle of a step."""
-    scene = scenario.scene
-    x, v = (state.x + after.x) / 2, (state.v + after.v) / 2
-    return drag_on_vertices(scene.mesh, scene.air, scene.fan, x, v, control.wind)

@@ -31,7 +31,7 @@ TABLE: dict[str, tuple[tuple[float, float], ...]] = {
     "fling": ((0.83, 12.9e-3), (1.66, 25.8e-3), (3.31, 31.9e-3)),
 }
 SAME = {"lift": "lifting", "fold": "folding"}  # names that recordings have
-TAUT = ("stretching",)  # what has no folds, and was not measured
+TAUT = ("stretching",)  # motions without folds, not measured
 ORDER = 1.0  # of the error in the cells' length, where it is not measured
 ENOUGH = 6e-3  # [m], error of a mesh that is fine enough, of sheets of the study's size: a choice
 LADDER = (9, 17, 33)  # vertices along the longer side
@@ -43,8 +43,8 @@ def mesh_error(fabric: Fabric, size: tuple[float, float], shape: Shape, motion: 
     """Expected error [m] of a motion on a mesh, rms over the sheet and mean over the motion.
 
     - `size`: of the sheet, [m]. `shape`: of the mesh, vertices along warp and weft.
-    - `motion`: one of `TABLE`, or its name in recordings (`SAME`); for others the largest of all,
-      NaN for what is `TAUT`.
+    - `motion`: one of `TABLE`, or its name in recordings (`SAME`); for others the largest error of
+      all, NaN for those in `TAUT`.
 
     Infinite for a fabric without bending. Fabrics scatter about it by a factor of 1.7.
     """
@@ -98,13 +98,13 @@ def ladder(size: tuple[float, float]) -> list[Shape]:
 
 
 def alike(shape: Shape, size: tuple[float, float]) -> Shape:
-    """The mesh of a sheet of another `size` [m] that is of the same step of the `ladder` as a
-    `shape`: as many vertices along its longer side; where no step has so many, the shape itself."""
-    return next((each for each in ladder(size) if max(each) == max(shape)), shape)
+    """The mesh of the `ladder` of another `size` [m] with as many vertices along its longer side as
+    a `shape`; if it has none, the shape itself."""
+    return next((mesh for mesh in ladder(size) if max(mesh) == max(shape)), shape)
 
 
 def warning(fabric: Fabric, size: tuple[float, float], shape: Shape, motion: str) -> str:
-    """A line for people, with the figure, when a mesh is too coarse for a fabric; else empty."""
+    """A warning with the expected error when a mesh is too coarse for a fabric; else empty."""
     error = mesh_error(fabric, size, shape, motion)
     if not error > ENOUGH * max(size) / SIDE:
         return ""
@@ -125,7 +125,7 @@ def advice(fabric: Fabric, size: tuple[float, float], shape: Shape, motion: str)
 
 # [s]: a pinned vertex goes straight in a step. At 10 m/s^2 that is off by 0.09 mm in the middle.
 MAX_EXPLICIT_STEP = 1 / 120
-MEMBRANE_DAMPING = 1e-4  # [s]: what is longer costs ten times as many steps, and shows in no motion
+MEMBRANE_DAMPING = 1e-4  # [s]: longer ones cost ten times as many steps, with the same motion
 EDGE = 1.5  # longest edge of the mesh over the grid's spacing
 STRETCHED = 1.3  # how much longer the way from a gripper to a vertex may be than at rest
 

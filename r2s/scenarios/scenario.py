@@ -1,10 +1,10 @@
-"""Scenarios: a sheet at rest, what holds it, how that moves, and which frames count."""
+"""Scenarios: a sheet at rest, its grippers and their motion, and the frames that count."""
 
 import dataclasses
 import functools
 import math
 from hashlib import sha256
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
 import jax
@@ -20,6 +20,7 @@ from r2s.materials.membrane import TurnedMembrane
 from r2s.mesh.mesh import Mesh, corner, rectangle
 from r2s.mesh.mesh import resized as resized_mesh
 from r2s.recordings.recording import Recording, SheetPlacement
+from r2s.scenarios.paths import Route
 from r2s.solvers.implicit.cloth import MAX_ITERATIONS, ImplicitCloth, prepare_mesh
 from r2s.solvers.simulate import Solution, Solver, simulate
 
@@ -27,12 +28,10 @@ CLEARANCE = 1e-3  # [m], between the table and a sheet that lies on it
 LEAD_IN = 0.5  # [s], in which the grippers go from the sheet at rest to where their path begins
 MAX_STEP = 0.025  # [s]: 1 mm from the limit of small steps in a lift of 2.5 s, by measurement
 SETTLING = 3.0  # [s], in which a sheet that hangs comes to rest before the first frame
-BRAKE = 8.0  # [1/s], mass damping meanwhile: a sheet of 0.45 m swings at 5.6/s, and has lost its
-# energy by 4e-11
-ITERATIONS = 1000  # of Newton's method, of a sheet that hangs: laid onto a cloud it starts far from
-# rest, and on 33 x 33 vertices its first step may take more than 500 (by its time)
+BRAKE = 8.0  # [1/s], mass damping meanwhile: of a sheet of 0.45 m 4e-11 of the energy remain
+ITERATIONS = 1000  # of Newton's method, of a hanging sheet: 33 x 33 vertices may need over 500
 BOW = 0.01  # [m], by which a hanging sheet starts out of its plane, so that it buckles to one side
-GUST = 0.5  # [s], in which a wind rises from nothing
+GUST = 0.5  # [s], in which a wind rises from zero
 JET = (1 / 3, 1 / 4)  # radius and edge of a fan's jet, of the sheet's shorter side
 CLAMPS = (("origin", "weft"), ("warp", "opposite"))  # sides that a stretching holds
 BAR = (("origin", "warp"),)  # the side that a swing holds
@@ -50,6 +49,7 @@ class SheetSolver(Solver, Protocol):
         ...
 
 
+@dataclasses.dataclass(frozen=True)
 class Layout:
     """How the vertices and elements of a mesh are joined, whatever its size: hashable.
 
@@ -57,27 +57,18 @@ class Layout:
     made for a scenario that is traced. `mesh` has this layout, and must not be traced.
     """
 
-    def __init__(self, mesh: Mesh) -> None:
-        self.mesh = mesh
-        rest = np.asarray(mesh.rest)
+    mesh: Mesh = dataclasses.field(compare=False, repr=False)
+    key: str = dataclasses.field(init=False)
+
+    def __post_init__(self) -> None:
+        rest = np.asarray(self.mesh.rest)
         extent = np.ptp(rest, axis=0)
         ranks = [np.unique(np.round(axis, 6), return_inverse=True)[1] for axis in (rest / extent).T]
-        parts = [*ranks, *filter(_is_index, jax.tree.leaves(mesh))]
+        leaves = map(np.asarray, jax.tree.leaves(self.mesh))
+        parts = [*ranks, *(leaf for leaf in leaves if np.issubdtype(leaf.dtype, np.integer))]
         arrays = [np.asarray(part, np.int32) for part in parts]
-        self._key = int(np.argmax(extent)), *((part.shape, part.tobytes()) for part in arrays)
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def __repr__(self) -> str:  # the same in every process
-        return f"Layout({sha256(repr(self._key).encode()).hexdigest()[:16]})"
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Layout) and self._key == other._key
-
-
-def _is_index(part: Any) -> bool:
-    return eqx.is_array(part) and np.issubdtype(part.dtype, np.integer)
+        key = np.argmax(extent), *((array.shape, array.tobytes()) for array in arrays)
+        object.__setattr__(self, "key", sha256(repr(key).encode()).hexdigest())
 
 
 class Scenario(eqx.Module):
@@ -131,68 +122,84 @@ class Scenario(eqx.Module):
         return Control(path, along_path(times, self.wind_times, self.wind[:, None])[:, 0])
 
 
-def from_placement(
-    sheet: SheetPlacement,
-    table_height: float,
-    path: Float[Array, "knot gripper 3"],
-    path_times: Float[Array, " knot"],
-    times: Float[np.ndarray, " frame"],
-    shape: tuple[int, int] = (9, 9),
-    *,
-    elements: str = "wrinkling",
-    clamps: tuple[tuple[str, str], ...] = (),
-    wind: tuple[float, float, float] | None = None,
-    self_contact: bool = False,
-) -> Scenario:
-    """A scenario for a rectangular sheet, held at named corners, over a table.
+class Experiment(NamedTuple):
+    """The motion of a sheet's grippers and the wind, for any fabric and any solver.
 
-    - `path` [m], `path_times` [s]: of the grippers. `times`: of the frames, [s].
-    - `shape`, `elements`: of the mesh (`r2s.mesh.mesh.rectangle`).
-    - `clamps`: pairs of pinned corners: all of the side between them is held, straight and evenly
+    - `sheet`: where it is at rest, and which corners the grippers hold; `route`: their path.
+    - `times`: of the frames, [s]. `frames_used`: the first and the last frame that count.
+    - `wind`: of a fan in front of the sheet's middle, from the first frame on, [m/s]; None: none.
+    - `clamps`: pairs of pinned corners; all of the side between them is held, straight and evenly
       spread.
-    - `wind`: of a fan in front of the sheet's middle, which starts with the first frame, [m/s].
-    - `self_contact`: the sheet does not pass through itself.
-
-    Before the first frame the grippers go from the sheet's corners to where the path begins; a
-    sheet that hangs also comes to rest, braked by `BRAKE` for `SETTLING`. Raises `ValueError` when
-    the frames are not evenly spaced.
+    - `table_height`: [m].
     """
-    times = np.asarray(times)
-    interval = _interval(times)
-    mesh = rectangle(sheet.size, shape, elements)
+
+    name: str
+    sheet: SheetPlacement
+    route: Route
+    times: Float[np.ndarray, " frame"]
+    frames_used: tuple[int, int]
+    wind: tuple[float, float, float] | None = None
+    clamps: tuple[tuple[str, str], ...] = ()
+    table_height: float = 0.0
+
+    def scenario(
+        self,
+        shape: tuple[int, int] = (9, 9),
+        self_contact: bool = False,
+        elements: str = "wrinkling",
+    ) -> Scenario:
+        """On a mesh of `shape` vertices along warp and weft, made of `elements`
+        (`r2s.mesh.mesh.rectangle`); with `self_contact` it does not pass through itself.
+
+        Before the first frame the grippers go from the sheet's corners to where the path begins; a
+        sheet that hangs also comes to rest, braked by `BRAKE` for `SETTLING`. Raises `ValueError`
+        when the frames are not evenly spaced.
+        """
+        sheet, times = self.sheet, np.asarray(self.times)
+        path_times, path = (jnp.asarray(part, float) for part in self.route)
+        interval = _interval(times)
+        mesh = rectangle(sheet.size, shape, elements)
+        start, hangs = _at_rest(sheet, np.asarray(mesh.rest), self.table_height)
+        pinned, shares = _grip(sheet, shape, self.clamps)
+        if self.clamps:
+            path = jnp.einsum("vh,khi->kvi", jnp.asarray(shares, float), path)
+        lead_in = math.ceil((SETTLING if hangs else LEAD_IN) / interval)
+        first, before = min(times[0], float(path_times[0])), lead_in * interval
+        knots = jnp.asarray([first - before, first - before / 2], float)
+        at_rest = jnp.asarray(start[pinned], float)
+        wind = self.wind if self.wind is not None and any(self.wind) else None
+        gust, gust_times = (None, None) if wind is None else _gust(wind, float(times[0]))
+        fan = None if wind is None else _fan(sheet, wind)
+        return Scenario(
+            scene=Scene(mesh, pinned, self.table_height, fan=fan),
+            start=jnp.asarray(start, float),
+            path=jnp.concatenate([at_rest[None], path[:1], path]),
+            path_times=jnp.concatenate([knots, path_times]),
+            first_time=jnp.asarray(times[0], float),
+            interval=interval,
+            num_frames=len(times),
+            lead_in=lead_in,
+            substeps=steps_between(interval, mesh, np.asarray(path), np.asarray(path_times)),
+            wind=gust,
+            wind_times=gust_times,
+            brake=jnp.asarray(BRAKE, float) if hangs else None,
+            self_contact=self_contact,
+        )
+
+
+def _at_rest(
+    sheet: SheetPlacement, rest: np.ndarray, table_height: float
+) -> tuple[np.ndarray, bool]:
+    """Where the vertices start, [m], and whether the sheet hangs."""
     axes = np.array([sheet.warp, sheet.weft])
     normal = np.cross(*axes)
-    hangs = abs(normal[2]) < 0.9
-    start = np.asarray(sheet.origin) + np.asarray(mesh.rest) @ axes
+    hangs = bool(abs(normal[2]) < 0.9)
+    start = np.asarray(sheet.origin) + rest @ axes
     if hangs:
-        bowed = np.sin(np.pi * np.asarray(mesh.rest) / np.asarray(sheet.size)).prod(axis=1)
+        bowed = np.sin(np.pi * rest / np.asarray(sheet.size)).prod(axis=1)
         start = start + BOW * bowed[:, None] * normal
     start[:, 2] = np.maximum(start[:, 2], table_height + CLEARANCE)
-    pinned, shares = _grip(sheet, shape, clamps)
-    path = path if not clamps else jnp.einsum("vh,khi->kvi", jnp.asarray(shares, float), path)
-    lead_in = math.ceil((SETTLING if hangs else LEAD_IN) / interval)
-    begin = min(times[0], float(path_times[0]))
-    knots = jnp.asarray([begin - lead_in * interval, begin - lead_in * interval / 2], float)
-    at_rest = jnp.asarray(start[pinned], float)
-    wind = wind if wind is not None and any(wind) else None
-    rising, rising_times = (None, None) if wind is None else _gust(wind, float(times[0]))
-    fan = None if wind is None else _fan(sheet, wind)
-    scene = Scene(mesh, pinned, table_height, fan=fan)
-    return Scenario(
-        scene=scene,
-        start=jnp.asarray(start, float),
-        path=jnp.concatenate([at_rest[None], path[:1], path]),
-        path_times=jnp.concatenate([knots, path_times]),
-        first_time=jnp.asarray(times[0], float),
-        interval=interval,
-        num_frames=len(times),
-        lead_in=lead_in,
-        substeps=steps_between(interval, mesh, np.asarray(path), np.asarray(path_times)),
-        wind=rising,
-        wind_times=rising_times,
-        brake=jnp.asarray(BRAKE, float) if hangs else None,
-        self_contact=self_contact,
-    )
+    return start, hangs
 
 
 def _interval(times: Float[np.ndarray, " frame"]) -> float:
@@ -211,9 +218,8 @@ def _grip(
     sheet: SheetPlacement, shape: tuple[int, int], clamps: tuple[tuple[str, str], ...]
 ) -> tuple[np.ndarray, np.ndarray]:
     """The pinned vertices, and the share of each gripper in the place of each (vertex, gripper)."""
-    each = np.eye(len(sheet.pinned))
     corners = [corner(shape, name) for name in sheet.pinned]
-    shares = dict(zip(corners, each, strict=True))
+    shares = dict(zip(corners, np.eye(len(corners)), strict=True))
     for pair in clamps:
         first, last = (corner(shape, name) for name in pair)
         side = np.arange(first, last + 1, 1 if last - first < shape[1] else shape[1])
@@ -243,8 +249,8 @@ def steps_between(
     path: Float[np.ndarray, "knot gripper 3"],
     path_times: Float[np.ndarray, " knot"],
 ) -> int:
-    """How many steps to make in an interval [s]: the least such that none is above `MAX_STEP`, and
-    no gripper goes farther in one than the shortest edge. The formula is stable for any fabric."""
+    """The least number of steps in an interval [s] such that none is above `MAX_STEP`, and no
+    gripper goes farther in one than the shortest edge."""
     corners = np.asarray(mesh.rest)[np.asarray(mesh.faces)]
     edge = np.min(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1))
     moved = np.linalg.norm(np.diff(path, axis=0), axis=-1)
@@ -260,16 +266,10 @@ def from_recording(recording: Recording, shape: tuple[int, int] = (9, 9)) -> Sce
     A "stretching" has the sides between its corners clamped, a "swing" the one along the bar.
     """
     info = recording.info
-    scenario = from_placement(
-        info.sheet,
-        info.table_height,
-        recording.gripper_path,
-        recording.gripper_times,
-        np.asarray(recording.times),
-        shape,
-        clamps=CLAMPED.get(info.scenario, ()),
-        wind=info.wind,
-    )
+    route = Route(np.asarray(recording.gripper_times), np.asarray(recording.gripper_path))
+    clamps = CLAMPED.get(info.scenario, ())
+    given = info.sheet, route, np.asarray(recording.times), info.frames_used, info.wind
+    scenario = Experiment(info.scenario, *given, clamps, info.table_height).scenario(shape)
     if not info.angle:
         return scenario
     return dataclasses.replace(scenario, turn=jnp.asarray(math.radians(info.angle), float))
@@ -324,7 +324,7 @@ def rollout(
     """
     solver, substeps = stepped(scenario, max_step, solver)
     skipped = scenario.lead_in - 1
-    found = simulate(
+    motion = simulate(
         solver,
         as_cut(scenario, fabric),
         begin(solver, scenario),
@@ -334,20 +334,20 @@ def rollout(
     )
     before = scenario.lead_in * scenario.interval - scenario.first_time
     return Solution(
-        found.x[skipped:],
-        found.v[skipped:],
-        found.times[skipped:] - before,
-        found.final_state,
-        found.ok[skipped:],
-        found.result,
-        found.failed_at - before,
+        motion.x[skipped:],
+        motion.v[skipped:],
+        motion.times[skipped:] - before,
+        motion.final_state,
+        motion.ok[skipped:],
+        motion.result,
+        motion.failed_at - before,
     )
 
 
 def stepped(
     scenario: Scenario, max_step: float | None = None, solver: SheetSolver | None = None
 ) -> tuple[SheetSolver, int]:
-    """The solver of a motion, which brakes the sheet before its first frame, and its steps a frame.
+    """The solver of a motion, which brakes the sheet before its first frame; its steps per frame.
 
     The arguments are those of `rollout`. Raises `ValueError` when a solver's step does not fit, or
     `max_step` is not positive.

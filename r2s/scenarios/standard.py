@@ -1,15 +1,13 @@
 """The six scenarios of the study, each a function of the sheet's size and the grippers' path.
 
-An experiment does not know how it will be simulated: `Experiment.scenario` puts it on a mesh. The
+An experiment is independent of mesh and solver: `Experiment.scenario` puts it on a mesh. The
 grippers follow a `route` that was recorded, or a smooth path (`r2s.scenarios.paths`).
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from r2s._util.units import not_negative, positive
 from r2s.recordings.recording import SheetPlacement
@@ -24,7 +22,7 @@ from r2s.scenarios.paths import (
     shake_path,
     swing_path,
 )
-from r2s.scenarios.scenario import BAR, CLAMPS, CLEARANCE, Scenario, from_placement
+from r2s.scenarios.scenario import BAR, CLAMPS, CLEARANCE, Experiment
 
 SIDE = 0.45  # [m], the study's sheets
 NUM_FRAMES = 60
@@ -33,47 +31,6 @@ SWING_SIDE, SWING_FRAMES, SWING_INTERVAL = 0.3, 50, 0.1  # [m], -, [s]: those of
 GRIP_HEIGHT = 0.7  # [m] above the table, of a hanging sheet's grippers
 ALL_CORNERS = ("origin", "weft", "warp", "opposite")
 Size = tuple[float, float]
-
-
-class Experiment(NamedTuple):
-    """What is done to a sheet, for any fabric and any solver.
-
-    - `sheet`: where it is at rest, and which corners the grippers hold; `route`: their path.
-    - `times`: of the frames, [s]. `frames_used`: the first and the last frame that count.
-    - `wind`: of a fan in front of the sheet's middle, from the first frame on, [m/s]; None: none.
-    - `clamps`: pairs of pinned corners between which the whole side is held.
-    - `table_height`: [m].
-    """
-
-    name: str
-    sheet: SheetPlacement
-    route: Route
-    times: Float[np.ndarray, " frame"]
-    frames_used: tuple[int, int]
-    wind: tuple[float, float, float] | None = None
-    clamps: tuple[tuple[str, str], ...] = ()
-    table_height: float = 0.0
-
-    def scenario(
-        self,
-        shape: tuple[int, int] = (9, 9),
-        self_contact: bool = False,
-        elements: str = "wrinkling",
-    ) -> Scenario:
-        """On a mesh of `shape` vertices along warp and weft, made of `elements`
-        (`r2s.mesh.mesh.rectangle`); with `self_contact` it does not pass through itself."""
-        return from_placement(
-            self.sheet,
-            self.table_height,
-            jnp.asarray(self.route.path, float),
-            jnp.asarray(self.route.times, float),
-            self.times,
-            shape,
-            elements=elements,
-            clamps=self.clamps,
-            wind=self.wind,
-            self_contact=self_contact,
-        )
 
 
 def lifting(
@@ -93,8 +50,9 @@ def lifting(
     >>> scenario.start.shape, scenario.num_frames
     ((25, 3), 60)
     """
-    done = _moved("lifting", on_table(size, (pinned,)), route, num_frames, interval, path)
-    return done._replace(frames_used=(num_frames // 2, num_frames - 1))
+    sheet, used = on_table(size, (pinned,)), (num_frames // 2, num_frames - 1)
+    moved = _moved("lifting", lift_path, sheet, route, num_frames, interval, path)
+    return moved._replace(frames_used=used)
 
 
 def folding(
@@ -107,7 +65,8 @@ def folding(
     **path: float,
 ) -> Experiment:
     """A sheet lies flat on the table; a corner is brought onto the opposite one: `fold_path`."""
-    return _moved("folding", on_table(size, (pinned,)), route, num_frames, interval, path)
+    sheet = on_table(size, (pinned,))
+    return _moved("folding", fold_path, sheet, route, num_frames, interval, path)
 
 
 def stretching(
@@ -126,7 +85,8 @@ def stretching(
     opposite). `path`: see `pull_path`.
     """
     sheet = on_table(size, ALL_CORNERS, height)
-    return _moved("stretching", sheet, route, num_frames, interval, path)._replace(clamps=CLAMPS)
+    moved = _moved("stretching", pull_path, sheet, route, num_frames, interval, path)
+    return moved._replace(clamps=CLAMPS)
 
 
 def wind(
@@ -149,8 +109,8 @@ def wind(
         raise ValueError(f"aside must be from -90 to 90 [degrees], found {aside}")
     angle = np.radians(aside)
     blows = (float(speed * np.sin(angle)), float(speed * np.cos(angle)), 0.0)
-    done = _moved("wind", hanging(size, height), route, num_frames, interval, path)
-    return done._replace(wind=blows)
+    moved = _moved("wind", hold_path, hanging(size, height), route, num_frames, interval, path)
+    return moved._replace(wind=blows)
 
 
 def fling(
@@ -163,7 +123,7 @@ def fling(
     **path: float,
 ) -> Experiment:
     """A sheet hangs from its top corners, which rapidly go forward and back: `fling_path`."""
-    return _moved("fling", hanging(size, height), route, num_frames, interval, path)
+    return _moved("fling", fling_path, hanging(size, height), route, num_frames, interval, path)
 
 
 def shaking(
@@ -176,7 +136,7 @@ def shaking(
     **path: float,
 ) -> Experiment:
     """A sheet hangs from its top corners, of which one goes up and down: `shake_path`."""
-    return _moved("shaking", hanging(size, height), route, num_frames, interval, path)
+    return _moved("shaking", shake_path, hanging(size, height), route, num_frames, interval, path)
 
 
 def swing(
@@ -188,15 +148,15 @@ def swing(
     interval: float = SWING_INTERVAL,
     **path: float,
 ) -> Experiment:
-    """A sheet hangs from a bar along its warp, which goes to and fro and turns; not of the study.
+    """A sheet hangs from a bar along its warp, which sways and turns; not of the study.
 
     A `route` is that of both ends of the bar. `path`: see `swing_path`.
 
     >>> swing((0.3, 0.3)).scenario((4, 4)).path.shape[1]  # vertices along the bar
     4
     """
-    sheet = hanging(size, height)
-    return _moved("swing", sheet, route, num_frames, interval, path)._replace(clamps=BAR)
+    moved = _moved("swing", swing_path, hanging(size, height), route, num_frames, interval, path)
+    return moved._replace(clamps=BAR)
 
 
 SCENARIOS: dict[str, Callable[..., Experiment]] = {
@@ -233,31 +193,21 @@ def hanging(size: Size, height: float) -> SheetPlacement:
     return SheetPlacement(size, (0.0, 0.0, height), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), pinned)
 
 
-_PATHS: dict[str, Callable[..., Route]] = {
-    "lifting": lift_path,
-    "wind": hold_path,
-    "stretching": pull_path,
-    "folding": fold_path,
-    "fling": fling_path,
-    "shaking": shake_path,
-    "swing": swing_path,
-}
-
-
 def _moved(
     name: str,
+    made: Callable[..., Route],
     sheet: SheetPlacement,
     route: Route | None,
     num_frames: int,
     interval: float,
     path: dict[str, float],
 ) -> Experiment:
-    """An experiment all of whose frames count: on a `route`, or on the path of these numbers."""
+    """An experiment all of whose frames count, on a `route` or on the path `made` of numbers."""
     if num_frames < 2:
         raise ValueError(f"num_frames must be at least 2, found {num_frames}")
     positive("s", interval=interval)
     if route is not None and path:
         raise ValueError(f"{name}: a route is given, which {', '.join(path)} would not change")
     times = np.arange(num_frames) * interval
-    route = _PATHS[name](sheet, times[-1], **path) if route is None else route
+    route = made(sheet, times[-1], **path) if route is None else route
     return Experiment(name, sheet, route, times, (0, num_frames - 1))

@@ -1,7 +1,7 @@
 """Synthetic recordings: a known fabric, moved by a solver and seen by cameras.
 
-An estimate from one of its own solver, mesh and step tests the estimator, not the solver: the error
-on a real fabric is larger. `record` takes any scenario, solver, mesh and step.
+An estimate with the solver, mesh and step of the recording tests the estimator, not the solver: the
+error on a real fabric is larger. `record` takes any scenario, solver, mesh and step.
 """
 
 import math
@@ -22,7 +22,7 @@ from r2s.recordings.cameras import Camera
 from r2s.recordings.recording import Recording, RecordingInfo, corner, make_recording
 from r2s.scenarios.energy import EnergyBalance, clamp_force, energy_balance
 from r2s.scenarios.scenario import Scenario, SheetSolver, rollout
-from r2s.scenarios.standard import SIDE, Experiment
+from r2s.scenarios.standard import ALL_CORNERS, SIDE, Experiment
 from r2s.solvers.mpm.sheet import longest_edge
 from r2s.solvers.simulate import Solution
 
@@ -61,22 +61,23 @@ def sensing(experiment: Experiment) -> Sensing:
     For a sheet on the table, from the left and from above. For one that hangs, both from the side
     from which the wind blows. In a stretching the sheet is told from the table by its colour.
     """
-    if experiment.sheet.weft[2] > -0.5:
+    sheet, margin = experiment.sheet, MARGIN
+    if sheet.weft[2] > -0.5:
+        eyes, target = [(-0.5, -0.1, 0.5), (0.1, -0.4, 0.9)], (0.25, 0.25, 0.1)
+        low, high = np.array([-0.1, -0.1, 0.0]), np.array([0.6, 0.6, 0.5])
         margin = -math.inf if experiment.name == "stretching" else MARGIN
-        return Sensing(cameras(), ((-0.1, -0.1, 0.0), (0.6, 0.6, 0.5)), margin=margin)
-    sheet = experiment.sheet
-    corners = np.array([corner(sheet, name) for name in ("origin", "warp", "weft", "opposite")])
-    middle = corners.mean(axis=0)
-    eyes = middle + np.array([(-0.35, -1.1, 0.15), (0.55, -1.0, 0.4)])
-    target = middle + np.array([0.0, 0.1, 0.0])
-    low, high = corners.min(axis=0) - [0.1, 0.3, 0.1], corners.max(axis=0) + [0.1, 0.5, 0.1]
-    region = (tuple(low.tolist()), tuple(high.tolist()))
-    target = jnp.asarray(target, float)
-    return Sensing(tuple(Camera(jnp.asarray(eye, float), target) for eye in eyes), region)
+    else:
+        corners = np.array([corner(sheet, name) for name in ALL_CORNERS])
+        middle = corners.mean(axis=0)
+        eyes = middle + np.array([(-0.35, -1.1, 0.15), (0.55, -1.0, 0.4)])
+        target = middle + np.array([0.0, 0.1, 0.0])
+        low, high = corners.min(axis=0) - [0.1, 0.3, 0.1], corners.max(axis=0) + [0.1, 0.5, 0.1]
+    cameras = tuple(Camera(jnp.asarray(eye, float), jnp.asarray(target, float)) for eye in eyes)
+    return Sensing(cameras, (tuple(low.tolist()), tuple(high.tolist())), margin=margin)
 
 
 WHOLE = Sensing((), ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), 10_000, 0.0, 0.0, margin=-math.inf)
-"""All of the surface, as it is: to judge by, as the study does with 10,000 points a frame."""
+"""All of the surface without errors, for evaluation: 10,000 points a frame, as in the study."""
 
 
 def record(
@@ -110,20 +111,21 @@ def record(
     made = None if solver is None else solver(scenario, fabric)
     measured: dict[str, Any] = {}
     if experiment.name == "stretching":
-        found = _energy_balance(scenario, fabric, max_step, made)
-        measured = _measured(experiment, scenario, found, key)
+        balance = _energy_balance(scenario, fabric, max_step, made)
+        measured, x = _measured(experiment, scenario, balance, key), balance.x
     else:
-        found = motion or _rollout(scenario, fabric, max_step, made)
-    if found.x.shape != (scenario.num_frames, *scenario.start.shape):
+        known = _rollout(scenario, fabric, max_step, made) if motion is None else motion
+        x = known.x
+    if x.shape != (scenario.num_frames, *scenario.start.shape):
         raise ValueError(
             f"expected a motion of {scenario.num_frames} frames and {len(scenario.start)} "
-            f"vertices, got {found.x.shape}"
+            f"vertices, got {x.shape}"
         )
-    if not np.isfinite(found.x).all():
+    if not np.isfinite(x).all():
         why = (motion or _rollout(scenario, fabric, max_step, made)).explain()
         raise RuntimeError(f"the simulation of {name} {why}")
     seen = sensing(experiment) if seen is None else seen
-    return seen_of(found.x, experiment, scenario, name, trial, seen, measured, key=key)
+    return seen_of(x, experiment, scenario, name, trial, seen, measured, key=key)
 
 
 def seen_of(
@@ -175,13 +177,6 @@ def _measured(
     }
 
 
-def cameras() -> tuple[Camera, Camera]:
-    """Two depth cameras in front of the sheet, one from the left and one from above."""
-    target = jnp.array([0.25, 0.25, 0.1], float)
-    positions = [(-0.5, -0.1, 0.5), (0.1, -0.4, 0.9)]
-    return tuple(Camera(jnp.array(p, float), target) for p in positions)  # pyright: ignore
-
-
 _rollout = compile_once(rollout)
 _energy_balance = compile_once(energy_balance)
 
@@ -221,7 +216,7 @@ def _observe_frame(x: Float[Array, "vertex 3"], faces, resolution: int, lowest, 
     if seen.cameras:
         by_camera = [camera.sees(surface) for camera in seen.cameras]
         visible &= jnp.any(jnp.stack(by_camera), axis=0)
-    # a random order with what is seen in front: its first points are a random choice of the seen
+    # a random order with the visible points in front, so that its first ones are drawn from them
     order = jnp.argsort(jr.uniform(key_pick, visible.shape, float) + (~visible).astype(float))
     count = min(seen.points, len(surface))
     order = order[:count]
@@ -231,7 +226,7 @@ def _observe_frame(x: Float[Array, "vertex 3"], faces, resolution: int, lowest, 
     low, high = (jnp.asarray(end, float) for end in seen.region)
     where = jr.uniform(key_where, (count, 3), float)
     stray = low[None] + (high - low)[None] * where
-    # one in a hundred, and three at least: a sheet flat on the table gives nothing else
+    # three at least: of a sheet flat on the table no point is visible
     strays = jnp.maximum(3, seen.outliers * jnp.sum(visible[order], dtype=float))
     is_stray = jnp.arange(count, dtype=float) >= count - strays
     return jnp.where(is_stray[:, None], stray, points), visible[order] | is_stray

@@ -53,5 +53,5 @@ def test_the_middle_of_the_prior_is_the_median_of_its_draws():
         median = float(jnp.median(part(drawn)))
         assert float(part(middle)) == pytest.approx(median, rel=0.08)
     assert float(middle.friction) == pytest.approx(float(jnp.median(drawn.friction)), abs=0.02)
-    with pytest.raises(ValueError, match="areal density"):
+    with pytest.raises(ValueError, match="density must be positive"):
         prior.middle(0.0)

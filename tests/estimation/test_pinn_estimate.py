@@ -21,8 +21,7 @@ from r2s.estimation.pinn.published_recipe import motion_residual
 from r2s.estimation.pinn.pulls import Clamp, Pull, pull_from, pulled, stacked
 from r2s.estimation.pinn.training import Recipe, train
 from r2s.materials import presets
-from r2s.materials.nonlinear_spaces import StiffeningSpace
-from r2s.materials.parameters import OrthotropicSpace
+from r2s.materials.parameters import OrthotropicSpace, StiffeningSpace
 from r2s.materials.stiffening import StiffeningMembrane
 from r2s.scenarios import fling, folding, shaking
 from r2s.scenarios.scenario import rollout

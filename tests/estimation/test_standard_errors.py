@@ -24,12 +24,12 @@ from r2s.estimation.standard_errors import (
     steps_apart,
     to_small_strain,
 )
-from r2s.materials.nonlinear_spaces import StiffeningSpace
 from r2s.materials.parameters import (
     UNIFORM_DEVIATION,
     InformedSpace,
     OrthotropicSpace,
     ParameterSpace,
+    StiffeningSpace,
 )
 from r2s.scenarios import stretching
 

@@ -22,7 +22,7 @@ from r2s.materials import presets
 from r2s.materials.fabric import Fabric
 from r2s.materials.fabric_json import fabric_as_json, fabric_from_json
 from r2s.materials.membrane import OrthotropicMembrane
-from r2s.materials.nonlinear_spaces import StiffeningSpace
+from r2s.materials.parameters import StiffeningSpace
 from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
 from r2s.materials.tables import TableMembrane
 from r2s.mesh.mesh import rectangle

@@ -1,20 +1,18 @@
-"""Families: the unit cube and the fabrics it stands for."""
+"""Parameter spaces: the unit cube and its fabrics. The length at which a fabric bends."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from elastica import elastica
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.materials.fabric import Fabric
-from r2s.materials.parameters import (
-    LOSSES,
-    IsotropicSpace,
-    OrthotropicSpace,
-    Range,
-)
-from r2s.materials.presets import FIVE
+from r2s._util.units import GRAVITY
+from r2s.materials.fabric import Fabric, bending_length
+from r2s.materials.parameters import LOSSES, IsotropicSpace, OrthotropicSpace, Range
+from r2s.materials.presets import FIVE, pink_solid
 
 few = settings(max_examples=25, deadline=None)
 FAMILY = OrthotropicSpace.make(0.2)
@@ -24,8 +22,10 @@ there_and_back = jax.jit(lambda u: FAMILY.to_unit(FAMILY(u)))
 
 @given(places)
 @few
-def test_a_fabric_is_located_where_it_came_from(place):
+def test_a_fabric_is_located_where_it_came_from_and_stable(place):
     assert np.asarray(there_and_back(jnp.asarray(place))) == pytest.approx(place, abs=1e-9)
+    law = FAMILY(jnp.asarray(place)).membrane
+    assert min(law.c11, law.c22, law.c33, law.c11 * law.c22 - law.c12**2) > 0
 
 
 @pytest.mark.parametrize("name", FIVE)
@@ -43,35 +43,6 @@ def test_the_bounds_are_reached_at_the_ends():
     assert np.asarray(high) == pytest.approx([bound.high for bound in FAMILY.ranges], rel=1e-12)
 
 
-@given(places)
-@few
-def test_every_fabric_of_the_cube_is_stable(place):
-    law = FAMILY(jnp.asarray(place)).membrane
-    stiffness = np.array([[float(law.c11), float(law.c12)], [float(law.c12), float(law.c22)]])
-    assert np.linalg.eigvalsh(stiffness)[0] > 0
-    assert law.c33 > 0
-
-
-def test_every_fabric_has_the_density_and_thickness_of_the_family():
-    fabric = OrthotropicSpace.make(0.17, 2e-3)(jnp.linspace(0.0, 1.0, 7))
-    assert (float(fabric.density), float(fabric.thickness)) == (0.17, 2e-3)
-
-
-def test_the_middle_is_the_geometric_one():
-    fabric = FAMILY.middle()
-    assert fabric.membrane.c11 == pytest.approx((3.0 * 3000.0) ** 0.5)
-    assert fabric.bending.stiffness == pytest.approx((1e-7 * 1e-3) ** 0.5)
-    assert fabric.membrane.c12 == pytest.approx(0, abs=1e-12)  # the coupling's scale is linear
-
-
-@given(st.floats(0.1, 10), st.floats(1.1, 100), st.floats(-1, 2), st.booleans())
-@few
-def test_value_and_place_of_a_range_are_inverse(low, ratio, place, is_log):
-    bound = Range("any", "-", low, low * ratio, is_log)
-    value = bound.from_unit(jnp.array(place))
-    assert bound.to_unit(value) == pytest.approx(place, abs=1e-9)
-
-
 @pytest.mark.parametrize(
     "low, high, is_log", [(2.0, 1.0, True), (1.0, 1.0, False), (0.0, 1.0, True), (-1.0, 1.0, True)]
 )
@@ -86,20 +57,19 @@ def test_density_and_thickness_must_be_positive(density, thickness):
         OrthotropicSpace.make(density, thickness)
 
 
-BAD = {
-    "density": ((0.0, (1.0, 0.0, 1.0, 1.0), 1e-5), "density .* must be positive"),
-    "stiffness": ((0.1, (1.0, 0.0, -1.0, 1.0), 1e-5), "must be positive"),
-    "coupling": ((0.1, (1.0, -1.0, 1.0, 1.0), 1e-5), "C12.2 must be less than C11 C22"),
-    "bending": ((0.1, (1.0, 0.0, 1.0, 1.0), -1e-5), "must not be negative"),
-    "not a number": ((float("nan"), (1.0, 0.0, 1.0, 1.0), 1e-5), "must be positive"),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_a_fabric_out_of_its_physical_range_is_refused(name):
-    arguments, reason = BAD[name]
+@pytest.mark.parametrize(
+    ("density", "membrane", "bending", "reason"),
+    [
+        (0.0, (1.0, 0.0, 1.0, 1.0), 1e-5, "density must be positive"),
+        (0.1, (1.0, 0.0, -1.0, 1.0), 1e-5, "membrane.c22 must be positive"),
+        (0.1, (1.0, -1.0, 1.0, 1.0), 1e-5, "C12.2 must be less than C11 C22"),
+        (0.1, (1.0, 0.0, 1.0, 1.0), -1e-5, "bending.stiffness must be not negative"),
+        (float("nan"), (1.0, 0.0, 1.0, 1.0), 1e-5, "density must be positive"),
+    ],
+)
+def test_a_fabric_out_of_its_physical_range_is_refused(density, membrane, bending, reason):
     with pytest.raises(ValueError, match=reason):
-        Fabric.make(*arguments)
+        Fabric.make(density, membrane, bending)
 
 
 def test_an_isotropic_sheet_has_damping_and_friction_where_asked():
@@ -113,3 +83,25 @@ def test_an_isotropic_sheet_has_damping_and_friction_where_asked():
     same = given(place[:2])
     assert (float(same.damping), float(same.friction)) == pytest.approx((0.01, 0.5))
     np.testing.assert_allclose(found.membrane.c11, same.membrane.c11)
+
+
+def test_a_strip_of_the_bending_length_sags_by_an_eighth_of_it():
+    fabric = pink_solid()
+    length = float(bending_length(fabric))
+    number = float(fabric.density) * GRAVITY * length**3 / float(fabric.bending.stiffness)
+    assert number == pytest.approx(1, rel=1e-5)
+    assert elastica(number)[1] == pytest.approx(1 / 8, rel=0.05)  # it bends more than slightly
+
+
+@pytest.mark.slow(group="cloth")
+def test_the_bending_length_has_a_gradient_and_a_batch():
+    stiffnesses = jnp.array([1e-6, 8e-6])
+
+    def length(bending):
+        fabric = Fabric.make(0.2, (30.0, 0.0, 30.0, 10.0), 1e-5)
+        return bending_length(eqx.tree_at(lambda f: f.bending.stiffness, fabric, bending))
+
+    lengths = jax.vmap(length)(stiffnesses)
+    assert lengths[1] / lengths[0] == pytest.approx(2, rel=1e-5)
+    slope = jax.grad(length)(stiffnesses[0])
+    assert slope == pytest.approx(float(lengths[0] / (3 * stiffnesses[0])), rel=1e-4)

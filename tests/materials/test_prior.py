@@ -9,7 +9,7 @@ import pytest
 from r2s.estimation.default_spaces import on_cloth, with_law
 from r2s.materials import presets, prior
 from r2s.materials.membrane import OrthotropicMembrane
-from r2s.materials.nonlinear_spaces import SofteningSpace, StiffeningSpace
+from r2s.materials.parameters import SofteningSpace, StiffeningSpace
 from r2s.materials.plate import PlateBending
 from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
 from r2s.scenarios.paths import draw
@@ -40,16 +40,6 @@ def test_draws_of_a_key_are_the_same_in_either_precision():
         np.testing.assert_allclose(np.asarray(one), np.asarray(other), rtol=1e-5)
 
 
-def test_the_fabrics_of_the_study_are_possible_and_not_in_the_middle():
-    """Each lies within three deviations of the prior; together they are softer than its middle."""
-    found = prior.draws(0.2, 4000, jr.key(1)).membrane
-    drawn = np.log(np.asarray(found.c11))
-    five = [np.log(float(make().membrane.c11)) for make in presets.FIVE.values()]
-    away = (np.array(five) - drawn.mean()) / drawn.std()
-    assert np.all(np.abs(away) < 3)
-    assert np.mean(away) < -0.5
-
-
 SMALL = OrthotropicMembrane(*(jnp.asarray(c) for c in (30.0, 5.0, 60.0, 10.0)))
 
 
@@ -69,16 +59,11 @@ def test_a_yarn_stiffens_half_way_at_a_stretch_and_at_most_by_a_ratio(axis):
         others = np.ones((3, 3), bool)
         others[axis, axis] = False
         assert found[others] == pytest.approx(at_rest[others])
-    with pytest.raises(ValueError, match="1 or more"):
+    stiffest = _tangent(law.stiffest, jnp.zeros(3))
+    for strain in jr.uniform(jr.key(0), (20, 3), minval=-1.0, maxval=1.0):
+        assert np.linalg.eigvalsh(stiffest - _tangent(law, strain)).min() > -1e-9
+    with pytest.raises(ValueError, match="ratio >= 1"):
         StiffeningMembrane.make(SMALL, 0.5, 1.1)
-
-
-@pytest.mark.slow(group="cloth")
-def test_no_strain_makes_a_sheet_stiffer_than_its_stiffest():
-    law = StiffeningMembrane.make(SMALL, 2.0, 1.1)
-    most = _tangent(law.stiffest, jnp.zeros(3))
-    for strain in jr.uniform(jr.key(0), (50, 3), minval=-1.0, maxval=1.0):
-        assert np.linalg.eigvalsh(most - _tangent(law, strain)).min() > -1e-9
 
 
 def test_a_plate_loses_half_of_what_it_can_at_its_knee():

@@ -6,22 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import FIRST_ROW, SIZE, cloth, flat, roll, step
+from conftest import FIRST_ROW, SIZE, cloth, flat, roll
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from r2s._util.units import GRAVITY
-from r2s.environment.scene import Control
-from r2s.materials.bending import HingeBending
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import MembraneLaw, OrthotropicMembrane
-from r2s.materials.tables import (
-    BLUR,
-    HINGE_FACTOR,
-    TableBending,
-    TableMembrane,
-)
+from r2s.materials.tables import HINGE_FACTOR, TableBending, TableMembrane
 
 few = settings(max_examples=25, deadline=None)
 STRETCHING = jnp.array(  # [N/m]; numbers of no fabric, which tell the rows apart
@@ -63,11 +56,14 @@ slope = jax.jit(jax.jacfwd(_look, argnums=1))
 bend = jax.jit(lambda law, direction, curvature: law.at(direction, curvature).stiffness)
 
 
-@pytest.mark.parametrize("row", range(6))
-def test_the_rows_are_the_published_ones(row):
-    strain = jnp.zeros(3) if row == 0 else strain_of(LARGE, ROW_DIRECTIONS[row - 1])
-    # the blur of the direction, which falls with the square of the strain
-    assert look(MEMBRANE, strain) == pytest.approx(np.asarray(STRETCHING[row]), rel=1e-4)
+def test_the_rows_are_the_published_ones_and_directions_between_them_linear():
+    strains = [jnp.zeros(3), *(strain_of(LARGE, direction) for direction in ROW_DIRECTIONS)]
+    for strain, row in zip(strains, STRETCHING, strict=True):
+        # the blur of the direction, which falls with the square of the strain
+        assert look(MEMBRANE, strain) == pytest.approx(np.asarray(row), rel=1e-4)
+    between = 0.75 * STRETCHING[3] + 0.25 * STRETCHING[4]
+    strain = strain_of(LARGE, jnp.deg2rad(22.5 * 2.25))
+    assert look(MEMBRANE, strain) == pytest.approx(np.asarray(between), rel=1e-4)
 
 
 def test_stiffness_is_linear_in_the_stretch_and_constant_beyond_the_table():
@@ -78,57 +74,12 @@ def test_stiffness_is_linear_in_the_stretch_and_constant_beyond_the_table():
         assert found == pytest.approx(np.asarray(expected), rel=1e-3)
 
 
-def test_stiffness_is_linear_in_the_direction_between_rows():
-    found = look(MEMBRANE, strain_of(LARGE, jnp.deg2rad(22.5 * 2.25)))
-    expected = 0.75 * STRETCHING[3] + 0.25 * STRETCHING[4]
-    assert found == pytest.approx(np.asarray(expected), rel=1e-4)
-
-
-@given(st.floats(0.7, 1.3), st.floats(0.7, 1.3), st.floats(0, 1.57))
-@few
-def test_both_biases_are_alike(high, low, direction):
-    left, right = (look(MEMBRANE, strain_of(high, sign * direction, low)) for sign in (1, -1))
-    assert left == pytest.approx(np.asarray(right), rel=1e-12)
-
-
 @pytest.mark.parametrize("size", [0.0, 1e-300, 1e-160, 1e-30, 1e-12, 1e-8, 1e-3, 0.3, -0.2, -0.5])
 def test_stiffness_and_its_derivatives_are_finite(size):
     for direction in ([1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 1, 1e-9], [1, -1, 0]):
         strain = size * jnp.array(direction, float)
         assert jnp.all(jnp.isfinite(look(MEMBRANE, strain)))
         assert jnp.all(jnp.isfinite(slope(MEMBRANE, strain)))
-
-
-def test_single_precision_stays_single_and_finite():
-    with jax.enable_x64(False):
-        law = TableMembrane(jnp.asarray(np.asarray(STRETCHING), jnp.float32))
-        for size in (0.0, 1e-30, 1e-12, 1e-4, 0.1):
-            strain = size * jnp.array([1.0, 0.999, -1e-3], jnp.float32)
-            assert look(law, strain).dtype == jnp.float32
-            assert jnp.all(jnp.isfinite(slope(law, strain)))
-
-
-@pytest.mark.parametrize("biaxial", [0.0, 0.05, 0.15])
-def test_stiffness_is_smooth_where_the_principal_stretches_are_equal(biaxial):
-    # a step of a thousandth of the blur across the place changes no more than the blur allows
-    def at(offset):
-        return look(MEMBRANE, strain_of(1 + biaxial, 0.0, 1 + biaxial) + offset)
-
-    span = float(jnp.max(jnp.ptp(STRETCHING, axis=0)))
-    for direction in ([1.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 1.0, 1.0]):
-        offset = 1e-3 * BLUR * jnp.array(direction)
-        change = at(offset) - at(-offset)
-        assert jnp.max(jnp.abs(change)) < 0.02 * span
-
-
-@pytest.mark.parametrize("strain", [[0.03, -0.01, 0.02], [0.01, 0.012, -0.003], [1e-4, 2e-4, 3e-4]])
-def test_derivatives_agree_with_differences(strain):
-    at, size = jnp.array(strain), 1e-7
-    sides = [
-        (look(MEMBRANE, at + size * axis) - look(MEMBRANE, at - size * axis)) / (2 * size)
-        for axis in jnp.eye(3)
-    ]
-    assert slope(MEMBRANE, at).T == pytest.approx(np.stack(sides), rel=1e-5, abs=1e-3)
 
 
 def test_a_table_of_equal_rows_is_a_constant_law():
@@ -139,26 +90,6 @@ def test_a_table_of_equal_rows_is_a_constant_law():
         assert jnp.all(look(law, jnp.array(strain)) == numbers(constant))
         energy = law.energy_density(jnp.array(strain))
         assert energy == constant.energy_density(jnp.array(strain))
-
-
-@pytest.mark.slow(group="cloth")
-def test_the_stress_is_the_secant_stiffness_times_the_strain():
-    law, strain = MEMBRANE, strain_of(1.1, 0.3, 0.98)
-    stress = jax.grad(law.at(strain).energy_density)(strain)
-    c11, c12, c22, c33 = look(law, strain)
-    e11, e22, shear = strain
-    expected = [c11 * e11 + c12 * e22, c12 * e11 + c22 * e22, c33 * shear / 2]
-    assert stress == pytest.approx(np.array(expected), rel=1e-12)
-    # no energy has this stress: work around a closed loop of strains is not zero
-    tangent = jax.jacfwd(lambda strain: jax.grad(law.at(strain).energy_density)(strain))
-    total = jax.jacfwd(lambda e: _stress(law, e))(strain)
-    assert tangent(strain).shape == total.shape
-    assert jnp.max(jnp.abs(total - total.T)) > 1.0  # [N/m]
-
-
-def _stress(law, strain):
-    held = law.at(strain)
-    return jax.grad(lambda e: held.energy_density(e))(strain)
 
 
 @given(st.lists(st.floats(-100, 400), min_size=24, max_size=24), *[st.floats(-0.4, 0.4)] * 3)
@@ -185,8 +116,6 @@ def test_bending_is_linear_between_its_entries_and_constant_beyond():
     expected = (BENDING[0, 2] + BENDING[0, 3] + BENDING[1, 2] + BENDING[1, 3]) / 4
     assert HINGE_FACTOR * found == pytest.approx(float(expected), rel=1e-12)
     assert bend(law, jnp.array(0.0), jnp.array(1e3)) == bend(law, jnp.array(0.0), jnp.array(40.0))
-    derivative = jax.jacfwd(bend, argnums=(1, 2))(law, jnp.array(0.0), jnp.array(0.0))
-    assert np.all(np.isfinite(derivative))
 
 
 def test_the_hinge_has_the_force_of_the_published_stiffness():
@@ -227,33 +156,3 @@ def test_a_sheet_hangs_by_the_stiffness_of_its_strain(sheet):
 
     assert height[0] - height[-1] - SIZE == pytest.approx(extension(True), rel=0.01)
     assert extension(False) > 1.1 * extension(True)  # so the table makes a difference
-
-
-@pytest.mark.slow(group="cloth")
-def test_derivatives_of_a_step_agree_with_differences(sheet):
-    solver = cloth(sheet, FIRST_ROW)
-
-    def end(scales):
-        tables = TableMembrane(STRETCHING * scales[0]), TableBending(BENDING * scales[1])
-        state = solver.init(flat(sheet) * scales[2])
-        after = step(solver, tabled(*tables), state, Control(state.x[:5], jnp.zeros(3)))
-        return jnp.sum(after.x[5:] ** 2)
-
-    scales, size = jnp.array([1.0, 1.0, 1.05]), 1e-5
-    found = jax.grad(end)(scales)
-    expected = [(end(scales + e) - end(scales - e)) / (2 * size) for e in size * jnp.eye(3)]
-    assert found == pytest.approx(np.array(expected), rel=1e-4, abs=1e-7)
-
-
-@pytest.mark.slow(group="cloth")
-def test_a_sheet_of_equal_rows_moves_like_one_of_constant_stiffness(sheet):
-    solver = cloth(sheet, FIRST_ROW)
-    state = solver.init(1.02 * flat(sheet))
-    control = Control(state.x[:5], jnp.zeros(3))
-    constant = Fabric.make(0.2, (300.0, 60.0, 200.0, 80.0), 0.0, damping=0.05)
-    constant = dataclasses.replace(constant, bending=HingeBending(jnp.asarray(2e-5, float)))
-    rows = jnp.tile(numbers(constant.membrane), (6, 1))
-    bending = TableBending(jnp.full((3, 5), HINGE_FACTOR * 2e-5))
-    found = step(solver, tabled(TableMembrane(rows), bending), state, control)
-    expected = step(solver, constant, state, control)
-    assert found.x == pytest.approx(np.asarray(expected.x), abs=1e-11)

@@ -48,19 +48,13 @@ def test_the_borders_go_once_around_the_sheet(shape):
     assert np.any(np.isin((first + second) / 2, (0, 1, 2)), axis=1).all()
 
 
-def test_a_hinge_lies_between_its_two_triangles(sheet):
+def test_a_hinge_lies_between_its_two_triangles_and_measures_them(sheet):
     faces = {frozenset(face) for face in sheet.faces.tolist()}
     for start, end, left, right in sheet.hinges.tolist():
-        assert frozenset((start, end, left)) in faces
-        assert frozenset((start, end, right)) in faces
-
-
-def test_hinges_measure_their_edge_and_triangles(sheet):
-    cell = 0.05
-    length = np.asarray(sheet.hinge_length)
-    straight, diagonal = np.isclose(length, cell), np.isclose(length, cell * 2**0.5)
+        assert {frozenset((start, end, left)), frozenset((start, end, right))} <= faces
+    straight, diagonal = (np.isclose(sheet.hinge_length, 0.05 * x) for x in (1, 2**0.5))
     assert np.all(straight | diagonal) and diagonal.sum() == 16
-    assert sheet.hinge_area == pytest.approx(cell**2, rel=1e-12)
+    assert sheet.hinge_area == pytest.approx(0.05**2, rel=1e-12)
 
 
 @pytest.mark.slow(group="cloth")
@@ -78,13 +72,13 @@ def test_samples_share_out_the_sheet_and_know_the_slope_of_a_plane(elements, siz
 
 def test_corners_are_where_they_are_called():
     mesh = rectangle((0.3, 0.7), (3, 4))
-    places = {name: mesh.rest[corner((3, 4), name)].tolist() for name in ("origin", "warp")}
-    places |= {name: mesh.rest[corner((3, 4), name)].tolist() for name in ("weft", "opposite")}
-    assert places == {"origin": [0, 0], "warp": [0.3, 0], "weft": [0, 0.7], "opposite": [0.3, 0.7]}
+    expected = {"origin": [0, 0], "warp": [0.3, 0], "weft": [0, 0.7], "opposite": [0.3, 0.7]}
+    assert {name: mesh.rest[corner((3, 4), name)].tolist() for name in expected} == expected
     with pytest.raises(ValueError, match="a corner is one of"):
         corner((3, 4), "middle")
 
 
+OVERLAPPING = np.array([[0.0, 0.0], [1.0, 0.0], [0.3, 1.0], [0.7, 1.0]])
 BAD = {
     "clockwise": (SQUARE, [[0, 1, 2], [0, 3, 2]], "face 1 .* counter-clockwise"),
     "degenerate": (np.array([[0.0, 0], [1, 0], [2, 0]]), [[0, 1, 2]], "not degenerate"),
@@ -100,6 +94,8 @@ BAD = {
     "wrong shape of rest": (np.ones((3, 3)), [[0, 1, 2]], r"\(vertex, 2\).* got shape \(3, 3\)"),
     "wrong shape of faces": (SQUARE, [[0, 1, 2, 3]], r"\(face, 3\), got shape \(1, 4\)"),
     "faces that are no integers": (SQUARE, [[0.0, 1, 2], [0, 2, 3]], "must be integers"),
+    "faces that overlap": (OVERLAPPING, [[0, 1, 2], [0, 1, 3]], "must not overlap"),
+    "no faces": (np.zeros((3, 2)), np.zeros((0, 3), int), "at least one face"),
 }
 
 
@@ -110,31 +106,15 @@ def test_what_is_no_sheet_is_refused_with_the_reason(name, unchecked):
         Mesh.make(rest, np.array(faces))
 
 
-@pytest.mark.parametrize("size, shape", [((-1.0, 1.0), (3, 3)), ((1.0, 0.0), (3, 3))])
-def test_a_rectangle_needs_positive_sides(size, shape):
-    with pytest.raises(ValueError, match="sides > 0 m"):
+@pytest.mark.parametrize(
+    ("size", "shape", "reason"),
+    [
+        ((-1.0, 1.0), (3, 3), "sides > 0 m"),
+        ((1.0, 1.0), (1, 3), ">= 2 vertices"),
+        ((300.0, 300.0), (3, 3), "expected 0.001 to 50.0 m: are they in millimetres"),
+        ((1e-4, 1e-4), (3, 3), "expected 0.001 to 50.0 m"),
+    ],
+)
+def test_a_rectangle_of_no_sheet_is_refused(size, shape, reason):
+    with pytest.raises(ValueError, match=reason):
         rectangle(size, shape)
-
-
-def test_a_rectangle_needs_two_vertices_a_side():
-    with pytest.raises(ValueError, match=">= 2 vertices"):
-        rectangle((1.0, 1.0), (1, 3))
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_faces_that_overlap_are_refused():
-    rest = np.array([[0.0, 0.0], [1.0, 0.0], [0.3, 1.0], [0.7, 1.0]])
-    with pytest.raises(ValueError, match="must not overlap"):
-        Mesh.make(rest, np.array([[0, 1, 2], [0, 1, 3]]))
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_a_mesh_without_faces_is_refused():
-    with pytest.raises(ValueError, match="at least one face"):
-        Mesh.make(np.zeros((3, 2)), np.zeros((0, 3), int))
-
-
-@pytest.mark.parametrize("size", [300.0, 1e-4])
-def test_coordinates_that_are_not_metres_are_refused(size):
-    with pytest.raises(ValueError, match="expected 0.001 to 50.0 m: are they in millimetres"):
-        rectangle((size, size), (3, 3))

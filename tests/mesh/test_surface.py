@@ -8,7 +8,7 @@ from conftest import flat
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.mesh.surface import nearest, sample, sample_weights
+from r2s.mesh.surface import nearest, sample
 
 few = settings(max_examples=25, deadline=None)
 TRIANGLE = jnp.array([[0, 1, 2]])
@@ -18,13 +18,7 @@ triangles = st.tuples(*[st.tuples(coordinate, coordinate, coordinate)] * 3).filt
 )
 find = jax.jit(nearest)
 GRID = 60
-
-
-def grid_weights():
-    """All multiples of 1 / GRID that are barycentric weights."""
-    i, j = np.meshgrid(np.arange(GRID + 1), np.arange(GRID + 1), indexing="ij")
-    first, second = i[i + j <= GRID] / GRID, j[i + j <= GRID] / GRID
-    return np.stack([1 - first - second, first, second], 1)
+fine = jax.jit(lambda corners: sample(corners, TRIANGLE, GRID))
 
 
 @pytest.fixture(scope="module")
@@ -47,22 +41,10 @@ def test_nothing_on_a_triangle_is_nearer(corners, point):
     found, weights = places(jnp.asarray(point[None]), jnp.asarray(corners), TRIANGLE)
     distance = np.linalg.norm(found[0] - point)
     assert np.min(weights) >= -1e-12 and np.sum(weights) == pytest.approx(1, abs=1e-12)
-    others = np.linalg.norm(grid_weights() @ corners - point, axis=1)
+    others = np.linalg.norm(np.asarray(fine(jnp.asarray(corners))) - point, axis=1)
     cell = np.max(np.linalg.norm(np.roll(corners, 1, axis=0) - corners, axis=1)) / GRID
     assert distance <= np.min(others) + 1e-9
     assert distance >= np.min(others) - cell
-
-
-@pytest.mark.slow(group="cloth")
-def test_nearest_places_on_a_sheet_equal_a_search_of_all_triangles(sheet, crumpled):
-    x, points = crumpled
-    found, _ = places(points, x, sheet.faces)
-    candidates = np.einsum("sk,fki->fsi", grid_weights(), np.asarray(x[sheet.faces])).reshape(-1, 3)
-    gaps = np.asarray(points)[:, None] - candidates
-    others = np.min(np.linalg.norm(gaps, axis=2), axis=1)
-    distance = np.linalg.norm(found - np.asarray(points), axis=1)
-    cell = 0.15 / GRID  # edges are shorter than 0.15 m
-    assert np.all(distance <= others + 1e-12) and np.all(distance >= others - cell)
 
 
 def test_nearest_places_equal_those_of_trimesh(sheet, crumpled):
@@ -82,19 +64,12 @@ def test_a_place_on_the_sheet_is_its_own_nearest(sheet, crumpled):
 
 @pytest.mark.parametrize("resolution", range(1, 8))
 def test_samples_lie_one_in_each_small_triangle(resolution):
-    weights = np.asarray(sample_weights(resolution))
+    weights = np.asarray(sample(jnp.eye(3), TRIANGLE, resolution))  # barycentric
     assert weights.shape == (resolution**2, 3) and np.all(weights > 0)
     assert weights.sum(axis=1) == pytest.approx(1, abs=1e-14)
-    assert weights.mean(axis=0) == pytest.approx(1 / 3, abs=1e-14)
+    assert weights.mean(axis=0) == pytest.approx(1 / 3, abs=1e-14)  # the centroid
     small = {tuple(cell) for cell in np.floor(resolution * weights).tolist()}
     assert len(small) == resolution**2
     # and in the middle of it: a third or two thirds from each of its sides
     place = (resolution * weights) % 1
     assert np.minimum(np.abs(place - 1 / 3), np.abs(place - 2 / 3)) == pytest.approx(0, abs=1e-12)
-
-
-def test_samples_have_the_centroid_of_each_face(sheet, crumpled):
-    x, _ = crumpled
-    points = np.asarray(sample(x, sheet.faces, 3)).reshape(32, 9, 3)
-    centroids = np.asarray(x[sheet.faces].mean(axis=1))
-    assert points.mean(axis=1) == pytest.approx(centroids, abs=1e-14)

@@ -30,12 +30,6 @@ def test_what_all_units_share_is_seen_in_the_levels_alone():
     assert found.freedom == pytest.approx(3)
 
 
-def test_levels_that_a_unit_lacks_do_not_count():
-    table = np.array([[1.0, 2.0, np.nan], [1.5, 2.0, 7.0]])
-    assert crossed_mean(np.ones(2), [table]) == crossed_mean(np.ones(2), [table[:, :2]])
-    assert crossed_mean(np.ones(2), [table[:, 2:]]).shared == 0
-
-
 def test_the_variance_of_the_mean_is_right_on_average():
     generator, units, levels = np.random.default_rng(0), 4, 5
     errors, means = [], []

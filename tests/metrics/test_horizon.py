@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import r2s
-from r2s.mesh.mesh import rectangle
 from r2s.mesh.surface import sample
 from r2s.metrics import horizon
 from r2s.metrics.horizon import floor_of, horizon_of, skill, within
@@ -54,18 +53,6 @@ def test_points_of_a_sheet_are_at_no_distance_from_it_and_others_at_their_own():
     assert found[:2] == pytest.approx([0, 7e-3], abs=1e-9) and np.isnan(found[2])
     with pytest.raises(ValueError, match="frame 1 has no points"):
         to_surface([chosen, chosen[:0], chosen], x, mesh.faces)
-
-
-def test_points_count_alike_in_whichever_order_they_lie():
-    """A cloud made of cubes lies in the order of its places: the first would be a strip of it."""
-    mesh = rectangle((0.3, 0.3), (9, 9))
-    x = np.pad(np.asarray(mesh.rest), ((0, 0), (0, 1)))[None]
-    places = np.random.default_rng(0).uniform(0, 0.3, (4 * POINTS, 2))
-    above = np.column_stack([places, 0.1 * places[:, 0]])  # mean height 15 mm
-    in_order = above[np.argsort(above[:, 0])]
-    assert in_order[:POINTS, 2].mean() < 5e-3
-    for cloud in (above, in_order):
-        assert to_surface([cloud], x, mesh.faces)[0] == pytest.approx(15e-3, rel=0.05)
 
 
 def swing(phase: float) -> list[np.ndarray]:

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import directional_difference, flat, rotation
+from conftest import directional_difference, flat
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -37,22 +37,6 @@ def test_one_sided_chamfer_by_hand():
     assert one_sided_chamfer(points, mask, targets) == pytest.approx(0.75)
 
 
-def test_a_cloud_is_at_no_distance_from_itself(clouds):
-    points, targets = clouds
-    assert chamfer(points, EVERY, points) == 0
-    assert chamfer(points, EVERY, jnp.concatenate([targets, points])) == 0
-
-
-def test_chamfer_does_not_change_with_rigid_motion(clouds):
-    points, targets = clouds
-
-    def move(cloud):
-        return cloud @ rotation(0.8, 1).T + jnp.array([[1.0, -2.0, 0.5]])
-
-    expected = float(chamfer(points, EVERY, targets))
-    assert chamfer(move(points), EVERY, move(targets)) == pytest.approx(expected, rel=1e-10)
-
-
 def test_masked_points_change_neither_value_nor_gradient(clouds):
     points, targets = clouds
     mask = jnp.arange(40) < 25
@@ -61,21 +45,7 @@ def test_masked_points_change_neither_value_nor_gradient(clouds):
     assert chamfer(points, mask, targets) == chamfer(points[:25], mask[:25], targets)
     gradient = jax.grad(one_sided_chamfer)(points, mask, targets)
     assert jnp.all(gradient[25:] == 0) and jnp.all(gradient[:25] != 0)
-
-
-def test_an_empty_mask_is_nan(clouds):
-    assert jnp.isnan(chamfer(clouds[0], ~EVERY, clouds[1]))
-
-
-def test_the_gradient_of_chamfer_agrees_with_differences(clouds):
-    def loss(both):
-        return chamfer(both[0], EVERY, both[1])
-
-    direction = tuple(jax.random.normal(jax.random.key(i), c.shape) for i, c in enumerate(clouds))
-    expected = directional_difference(loss, clouds, direction, 1e-6)
-    gradient = jax.grad(loss)(clouds)
-    found = sum(jnp.sum(g * d) for g, d in zip(gradient, direction, strict=True))
-    assert found == pytest.approx(float(expected), rel=1e-7)
+    assert jnp.isnan(chamfer(points, ~EVERY, targets))
 
 
 @pytest.fixture
@@ -88,6 +58,8 @@ def surface(sheet):
 
 def test_residuals_are_distances_along_their_direction(surface, sheet):
     points, x = surface
+    mask = jnp.arange(40) % 2 == 0
+    assert jnp.all((residuals(points, mask, x, sheet.faces)[0] > 0) == mask)
     distance, direction, vertices, weights = residuals(points, EVERY, x, sheet.faces)
     place = np.einsum("pk,pki->pi", weights, np.asarray(x[vertices]))
     gap = np.asarray(distance)[:, None] * np.asarray(direction)
@@ -106,20 +78,6 @@ def test_residuals_move_with_the_vertices_as_described(surface, sheet):
     expected = directional_difference(distance, x, motion, 1e-7)
     described = -jnp.einsum("pi,pk,pki->p", direction, weights, motion[vertices])
     assert np.asarray(described) == pytest.approx(np.asarray(expected), abs=1e-5)
-
-
-def test_residuals_of_masked_points_are_zero(surface, sheet):
-    points, x = surface
-    distance, *_ = residuals(points, jnp.arange(40) % 2 == 0, x, sheet.faces)
-    assert jnp.all(distance[1::2] == 0) and jnp.all(distance[::2] > 0)
-
-
-@pytest.mark.slow(group="motions")
-def test_a_point_on_the_sheet_has_the_normal_as_direction(sheet):
-    points = jnp.array([[0.07, 0.11, 0.0]])
-    distance, direction, *_ = surface_residuals(points, EVERY[:1], flat(sheet), sheet.faces)
-    assert distance[0] < 1e-12
-    assert np.asarray(direction[0]) == pytest.approx(np.array([0, 0, 1]), abs=1e-12)
 
 
 def test_with_slack_noise_does_not_pull_at_the_borders(sheet):
@@ -155,6 +113,7 @@ def test_the_robust_weight_is_its_slope_over_the_distance(distance, scale):
 
 def test_with_a_scale_what_is_far_off_does_not_pull():
     near, far = jnp.array(1e-4), jnp.array(0.1)
+    assert robust_weight(jnp.array(OUTLIER_SCALE)) == pytest.approx(0.5)
     assert robust(near, 5e-3) == pytest.approx(0.5e-8, rel=1e-3)
     assert robust(far, 5e-3) == pytest.approx(5e-3**2 / 2, rel=1e-2)
 
@@ -162,10 +121,3 @@ def test_with_a_scale_what_is_far_off_does_not_pull():
         return float(robust_weight(far, scale) * far)
 
     assert pull(5e-3) < 1e-3 * pull(0.0)
-
-
-def test_the_robust_loss_is_quadratic_near_and_flat_far():
-    assert robust(jnp.array(1e-5)) == pytest.approx(0.5e-10, rel=1e-6)
-    assert robust_weight(jnp.array(OUTLIER_SCALE)) == pytest.approx(0.5)
-    far = robust(jnp.array([1.0, 2.0]))
-    assert far[1] - far[0] == pytest.approx(OUTLIER_SCALE**2 * np.log(2), rel=1e-3)

@@ -25,21 +25,14 @@ from r2s.scenarios.standard import CLEARANCE, SCENARIOS
 
 SHAPE = (5, 5)
 SOFTEST, STIFFEST = "grey_interlock", "black_denim"
-FRAMES = {"num_frames": 15}
 
 account = eqx.filter_jit(scenarios.energy_balance)
 
 
-@jax.vmap
-def principal_strains(strain):
-    e11, e22, shear = strain.T
-    mean, half = (e11 + e22) / 2, (e11 - e22) / 2
-    return mean + jnp.sqrt(half**2 + shear**2 / 4)
-
-
 def stretch(mesh, x):
     """The greatest principal stretch less one [-] of every strain sample, (frame, sample)."""
-    return jnp.sqrt(1 + 2 * principal_strains(jax.vmap(lambda x: strains(mesh, x))(x))) - 1
+    e11, e22, shear = np.asarray(jax.vmap(lambda x: strains(mesh, x))(x)).transpose(2, 0, 1)
+    return np.sqrt(1 + e11 + e22 + np.hypot(e11 - e22, shear)) - 1
 
 
 def solver_of(kind, scenario, fabric):
@@ -58,19 +51,6 @@ def check(scenario, fabric, found):
     assert found.dissipated[-1] > 0
     mass = float(fabric.density) * float(jnp.sum(scenario.scene.mesh.area))
     assert found.kinetic[0] < mass / 2 * 0.01**2  # it starts at rest, to 1 cm/s
-
-
-@pytest.mark.slow(group="motions")
-@pytest.mark.parametrize("name", ["lifting", "folding"])
-def test_a_sheet_on_the_table_is_lifted_and_folded(name):
-    fabric = presets.FIVE[STIFFEST]()
-    scenario = SCENARIOS[name](**FRAMES, moving=0.8).scenario(SHAPE)
-    found = account(scenario, fabric)
-    check(scenario, fabric, found)
-    start = np.asarray(found.x[0])
-    # nothing has moved but the contact's 0.07 mm
-    np.testing.assert_allclose(start, np.asarray(scenario.start), atol=2e-4)
-    assert np.abs(np.asarray(stretch(scenario.scene.mesh, found.x))).mean() < 0.05
 
 
 @pytest.fixture(scope="module")
@@ -144,10 +124,8 @@ def test_a_recording_of_an_experiment_is_of_the_same_scenario(name):
     experiment = SCENARIOS[name]()
     sheet = experiment.sheet
     info = RecordingInfo("a", name, "b", "1", "c", (0, 59), sheet, 0.0, None, wind=experiment.wind)
-    clouds = [np.zeros((1, 3))] * 60
-    record = make_recording(
-        clouds, experiment.times, experiment.route.path, experiment.route.times, info
-    )
+    clouds, (times, path) = [np.zeros((1, 3))] * 60, experiment.route
+    record = make_recording(clouds, experiment.times, path, times, info)
     again, first = from_recording(record, SHAPE), experiment.scenario(SHAPE)
     assert jax.tree.structure(again) == jax.tree.structure(first)
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(first), strict=True):
@@ -188,6 +166,8 @@ def test_material_points_fit_the_scenario():
     wrong = dataclasses.replace(solver, dt=solver.dt * 1.37)
     with pytest.raises(ValueError, match="fill the 0.0666667 s between frames"):
         rollout(scenario, fabric, solver=wrong)
+    with pytest.raises(ValueError, match="comes from the grid"):
+        mpm_cloth(SCENARIOS["folding"]().scenario(SHAPE, self_contact=True), fabric)
 
 
 @pytest.mark.slow(group="motions")
@@ -201,7 +181,7 @@ def test_every_scenario_on_every_solver(name, kind, fabric):
     scenario = SCENARIOS[name]().scenario(shape, self_contact=kind == "layers")
     found = account(scenario, made, None, solver_of(kind, scenario, made))
     check(scenario, made, found)
-    stretched = np.asarray(stretch(scenario.scene.mesh, found.x))
+    stretched = stretch(scenario.scene.mesh, found.x)
     if fabric == STIFFEST:
         # all but the faces around a vertex that alone holds the weight
         assert np.quantile(stretched, 0.95, axis=1).max() < 0.05
@@ -221,9 +201,3 @@ def test_the_energy_of_a_table_law_is_that_of_its_stiffness_there():
 
     table = TableBending(jnp.full((3, 5), HINGE_FACTOR * 1e-5))
     assert of(table) == pytest.approx(of(HingeBending(jnp.asarray(1e-5))), rel=1e-12)
-
-
-def test_material_points_refuse_the_self_contact_of_the_cloth():
-    scenario = SCENARIOS["folding"]().scenario((5, 5), self_contact=True)
-    with pytest.raises(ValueError, match="comes from the grid"):
-        mpm_cloth(scenario, presets.grey_interlock())

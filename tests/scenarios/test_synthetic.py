@@ -25,27 +25,9 @@ def test_a_camera_sees_the_nearer_of_two_sheets():
     assert seen[1600:].mean() < 0.1  # but for the far sheet's edge
 
 
-def test_a_point_projects_where_similar_triangles_say():
-    camera = Camera(jnp.array([0.0, -2.0, 0.0]), jnp.zeros(3))
-    pixel, depth = camera.project(jnp.array([[0.1, 0.0, 0.05]]))
-    assert depth[0] == pytest.approx(2.0)
-    # 200 pixels of focal length; right is +x, down is -z
-    np.testing.assert_allclose(pixel[0], [80 + 200 * 0.05, 60 - 200 * 0.025], atol=1e-9)
-
-
-def recorded_lift():
-    return synthetic.record(scenarios.lifting(), presets.grey_interlock(), "grey", key=jr.key(0))
-
-
 @pytest.fixture(scope="module")
 def recording():
-    return recorded_lift()
-
-
-@pytest.mark.slow(group="motions")
-def test_the_same_key_gives_the_same_recording(recording):
-    again = recorded_lift()
-    np.testing.assert_array_equal(recording.points, again.points)
+    return synthetic.record(scenarios.lifting(), presets.grey_interlock(), "grey", key=jr.key(0))
 
 
 @pytest.mark.slow(group="motions")
@@ -59,32 +41,11 @@ def test_the_cloud_lies_on_the_sheet_but_for_noise_and_outliers(recording):
     assert 0.002 < stray < 0.02  # one point in a hundred is an outlier
     # 3-D noise of 1 mm, of which the surface takes up what lies along it
     assert 0.5e-3 < np.median(distance) < 2.5e-3
-
-
-@pytest.mark.slow(group="motions")
-def test_the_view_is_partial(recording):
-    moved = rollout(from_recording(recording), presets.grey_interlock())
-    faces = from_recording(recording).scene.mesh.faces
-    surface = np.asarray(sample(moved.x[40], faces, 8))
-    hidden = KDTree(cloud(recording, 40)).query(surface)[0] > 0.02
+    hidden = KDTree(cloud(recording, 45)).query(surface)[0] > 0.02
     assert 0.05 < hidden.mean() < 0.95
 
 
 SHAPE = (5, 5)
-
-
-@pytest.mark.slow(group="motions")
-def test_a_hanging_sheet_in_the_wind_is_in_view():
-    experiment = scenarios.wind(num_frames=6, interval=1 / 10, speed=3.0)
-    fabric = presets.grey_interlock()
-    whole = synthetic.record(experiment, fabric, "grey", shape=SHAPE, key=jr.key(2))
-    assert whole.info.scenario == "wind" and whole.info.wind == (0.0, 3.0, 0.0)
-    np.testing.assert_allclose(whole.times, experiment.times, atol=1e-9)
-    scenario = from_recording(whole, SHAPE)
-    assert scenario.brake is not None
-    moved = synthetic._rollout(scenario, fabric, None, None)
-    surface = np.asarray(sample(moved.x[-1], scenario.scene.mesh.faces, 16))
-    assert np.mean(KDTree(cloud(whole, 5)).query(surface)[0] < 0.02) > 0.8
 
 
 @pytest.mark.slow(group="motions")

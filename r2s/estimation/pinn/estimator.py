@@ -28,8 +28,7 @@ from r2s.estimation.pinn.pulls import Pull, stacked
 from r2s.estimation.pinn.training import NOISE, QUICK, Recipe, Trained, train
 from r2s.estimation.pinn.weak_form import DEGREES
 from r2s.estimation.standard_errors import to_small_strain
-from r2s.materials.nonlinear_spaces import stiffens
-from r2s.materials.parameters import ParameterSpace
+from r2s.materials.parameters import ParameterSpace, stiffens
 
 # near the clamps the tension carries some of the weight, which the model gives to the table
 FRICTION_ERROR = 0.1  # [-]
