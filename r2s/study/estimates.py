@@ -93,13 +93,6 @@ class EstimateTask(Task):
     informed: bool = False
     law: Law | Literal["told"] = "linear"
 
-    def __post_init__(self) -> None:
-        if len(self.sources) > 1 and not METHODS[self.approach].several:
-            raise ValueError(f"{self.approach} is from one recording, got {len(self.sources)}")
-        for source in self.sources:
-            if reason := METHODS[self.approach].refusal(self.solver, source.scenario):
-                raise ValueError(f"{self.approach}: {reason}")
-
     @property
     def scenario(self) -> str:
         """The scenarios of its recordings, as in `Configuration.estimated_from`."""

@@ -137,14 +137,17 @@ def publish(
     drawn = [label for motion in motions for label in motion.vertices]
     colours = colours_of([*every.configuration.cat.categories, *drawn])
     known = frame.with_floor(shared, SURFACE)
-    with_skill = known[known.baseline != frame.DEFAULT]
+    with_skill = known[known.skill.notna()]
+    column, part = ("skill", with_skill) if len(with_skill) else ("value", decided)
+    means = frame.means(part, column)
     lines = [
         *(settings or {}).items(),
         *((f"version of {name}", version(name)) for name in VERSIONS),
     ]
-    opening = _opening(decided, with_skill, judged, len(fabrics), len(missing))
+    opening = [_done(decided, len(fabrics), len(missing)), _best(means, part, column)]
+    opening += [_significance(judged, len(fabrics))]
     sections = [
-        Section(QUESTION, opening, figures=_picture(with_skill, decided, metric, colours)),
+        Section(QUESTION, opening, figures=_chart(means, column, metric, colours)),
         _skill(shared, every, known),
         _findings(judged, metric, skip),
         *_motions(motions, colours),
@@ -184,63 +187,39 @@ def _json_figure(figure: go.Figure) -> str:
     return text.replace("<", "\\u003c")  # "<" would end the element that holds it
 
 
-def _picture(
-    with_skill: pd.DataFrame, decided: pd.DataFrame, metric: str, colours: Mapping[str, str]
+def _chart(
+    means: pd.DataFrame, column: str, metric: str, colours: Mapping[str, str]
 ) -> dict[str, go.Figure]:
-    """A chart of skills, or where none is known of mean distances, by its title."""
-    known = with_skill[with_skill.skill.notna()]
-    where = f"in motions that no estimate has seen, with {LEVEL:.0%} intervals"
-    if len(known):
-        marks = {0.0: "default", 1.0: "floor"}
-        chart = interval_chart(frame.means(known, "skill"), colours, "skill [-]", marks)
-        return {f"Skill {where}": chart}
-    if len(decided):
-        chart = interval_chart(frame.means(decided), colours, f"{metric} [m]", {})
-        return {f"Mean {metric} {where}": chart}
-    return {}
+    """The mean skills, or where none is known the mean distances, by the title of the chart."""
+    if means.empty:
+        return {}
+    what, unit, marks = f"Mean {metric}", f"{metric} [m]", {}
+    if column == "skill":
+        what, unit, marks = "Skill", "skill [-]", {0.0: "default", 1.0: "floor"}
+    title = f"{what} in motions that no estimate has seen, with {LEVEL:.0%} intervals"
+    return {title: interval_chart(means, colours, unit, marks)}
 
 
-def _opening(
-    decided: pd.DataFrame,
-    with_skill: pd.DataFrame,
-    judged: pd.DataFrame,
-    fabrics: int,
-    missing: int,
-) -> list[str]:
-    """What was done, the best configurations, and the significance."""
+def _done(decided: pd.DataFrame, fabrics: int, missing: int) -> str:
     own = decided[decided.baseline == ""]
     of_fabrics = f"{fabrics} {'fabric' if fabrics == 1 else 'fabrics'}"
     are_missing = "cell of the study is" if missing == 1 else "cells of the study are"
-    done = (
+    return (
         f"{len(frame.configurations(decided))} configurations (approach, solver, source) estimated "
         f"{of_fabrics} and were evaluated on {decided.recording.nunique()} recordings of "
         f"{', '.join(frame.motions(decided)) or 'no motion'}, which no estimate has seen. Of "
         f"{len(own)} predictions {int(own.diverged.sum())} diverged; {missing} {are_missing} "
         "missing."
     )
-    if fabrics < 2:
-        significance = (
-            "One fabric decides nothing between approaches: differences between them may be those "
-            "of this fabric, and there are no intervals and no tests."
-        )
-    else:
-        answers = list(comparisons.answers(judged).values())
-        significance = (
-            f"Of the paper's {len(answers)} conclusions {answers.count(comparisons.HOLDS)} hold "
-            f"and {answers.count(comparisons.HOLDS_NOT)} do not; "
-            f"{answers.count(comparisons.UNKNOWN)} cannot be decided from {fabrics} fabrics."
-        )
-    return [done, _best(own, with_skill[with_skill.baseline == ""]), significance]
 
 
-def _best(own: pd.DataFrame, with_skill: pd.DataFrame) -> str:
+def _best(means: pd.DataFrame, part: pd.DataFrame, column: str) -> str:
     """The configuration with the best mean by motion, of those of which no run diverged."""
-    known = with_skill[with_skill.skill.notna()]
-    column, part = ("skill", known) if len(known) else ("value", own)
+    labels = set(part[part.baseline == ""].configuration)
     best = []
     for motion in frame.motions(part):
-        table = frame.means(part[part.evaluated_on == motion], column).droplevel("evaluated_on")
-        table = table[np.isfinite(table["mean"])]
+        table = means.xs(motion, level="evaluated_on")
+        table = table[np.isfinite(table["mean"]) & table.index.isin(labels)]
         if len(table):
             label = table["mean"].idxmax() if column == "skill" else table["mean"].idxmin()
             write = "{:.2f}".format if column == "skill" else "{:.3g}".format
@@ -249,6 +228,20 @@ def _best(own: pd.DataFrame, with_skill: pd.DataFrame) -> str:
         return "No configuration has a result that could be compared."
     what = "The highest mean skill" if column == "skill" else "The smallest mean distance"
     return f"{what} has {'; '.join(best)}."
+
+
+def _significance(judged: pd.DataFrame, fabrics: int) -> str:
+    if fabrics < 2:
+        return (
+            "One fabric decides nothing between approaches: differences between them may be those "
+            "of this fabric, and there are no intervals and no tests."
+        )
+    answers = list(comparisons.answers(judged).values())
+    return (
+        f"Of the paper's {len(answers)} conclusions {answers.count(comparisons.HOLDS)} hold "
+        f"and {answers.count(comparisons.HOLDS_NOT)} do not; "
+        f"{answers.count(comparisons.UNKNOWN)} cannot be decided from {fabrics} fabrics."
+    )
 
 
 def _skill(shared: pd.DataFrame, every: pd.DataFrame, known: pd.DataFrame) -> Section:
