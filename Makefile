@@ -32,7 +32,7 @@ MODULES := r2s $(filter-out r2s.__init__,$(subst /,.,$(basename \
 .PHONY: study test test-annotations test-slow $(addprefix test-slow-,$(GROUPS)) lint types check docs clean
 
 study: $(STAMP)
-	$(RUN) experiments/study.py --preset $(PRESET) $(if $(DATA),--data "$(DATA)") --out "$(OUT)" \
+	$(RUN) -m r2s study --preset $(PRESET) $(if $(DATA),--data "$(DATA)") --out "$(OUT)" \
 		--workers $(WORKERS) $(ARGS)
 
 FAST = $(ALONE) XLA_FLAGS="$(QUICK)" $(RUN) -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder

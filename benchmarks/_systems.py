@@ -2,7 +2,7 @@
 
 The accuracy of a run is its rms distance from the same system's motion with far smaller steps, over
 all vertices and the frames of the first half second, so that no system is judged by the model of
-another. (After that the sheet buckles, and two motions that differ by little part there.)
+another. (After that the sheet buckles, and two motions that differ by little separate.)
 """
 
 import importlib

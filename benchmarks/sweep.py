@@ -51,8 +51,8 @@ def setting(kind: str, side: int) -> tuple[tuple, int]:
     stiffest = jax.tree.map(jnp.max, batch)
     stiffest = eqx.tree_at(lambda f: f.density, stiffest, jnp.min(batch.density))
     if kind == "explicit":
-        found = _hang.explicit_hang(side, stiffest, frames)
-        return found, found[0].substeps * _hang.EXPLICIT_STEPS * frames
+        arguments = _hang.explicit_hang(side, stiffest, frames)
+        return arguments, arguments[0].substeps * _hang.EXPLICIT_STEPS * frames
     solver, start, control, every = _hang.hang(side, IMPLICIT_STEPS, frames)
     if kind == "mpm":
         spacing = _hang.SIDE / (side - 1)
@@ -75,10 +75,10 @@ def line(kind: str, side: int, members: int, repeats: int) -> Line:
         function = eqx.filter_value_and_grad(_hang.motion_loss)
     batched = eqx.filter_vmap(function, in_axes=(eqx.if_array(0), None, None, None, None))
     run = eqx.filter_jit(batched).lower(batch, *arguments).compile()
-    seconds, found = _measure.timed(
+    seconds, results = _measure.timed(
         lambda: jax.block_until_ready(run(batch, *arguments)), repeats, wall=True
     )
-    leaves = [np.asarray(leaf).reshape(members, -1) for leaf in jax.tree.leaves(found)]
+    leaves = [np.asarray(leaf).reshape(members, -1) for leaf in jax.tree.leaves(results)]
     finite = np.all([np.isfinite(leaf).all(axis=1) for leaf in leaves], axis=0)
     step = seconds / steps
     return head | {

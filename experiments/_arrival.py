@@ -1,8 +1,8 @@
 """Thirty recordings of known sheets, and what an estimate from each of them comes to.
 
-The true numbers of each fit on a mesh that estimates go to: most sheets are stiff in bending. None
-is more than two and a half standard deviations off what is known of fabrics of its weight, beyond
-which intervals of what a recording does not tell would miss whatever the search does.
+Most sheets are stiff in bending, so that the meshes of estimates resolve them. None is more than
+two and a half standard deviations from the prior mean of its weight: beyond that, intervals of what
+a recording does not determine would miss it whatever the search does.
 """
 
 import dataclasses
@@ -68,7 +68,7 @@ def _stiff(
 ):
     """A fabric from its uniaxial stiffness, with a coupling of 0.2 and a damping of 6 ms."""
     coupling = 0.2
-    c11, c22 = (each / (1 - coupling**2) for each in yarns)
+    c11, c22 = (stiffness / (1 - coupling**2) for stiffness in yarns)
     stiffness = c11, coupling * (c11 * c22) ** 0.5, c22, shear
     return Fabric.make(density, stiffness, bending, damping=6e-3, friction=friction, thickness=1e-3)
 
@@ -164,8 +164,9 @@ def recorded(name: str, folder: Path) -> Recording:
 def _made(name: str) -> Recording:
     case, key = CASES[name], jr.fold_in(jr.key(66), list(CASES).index(name))
     experiment = scenarios.SCENARIOS[case.scenario](case.size, **dict(case.motion))
-    seen = synthetic.sensing(experiment)._replace(noise=NOISE, outliers=case.outliers)
-    seen = seen if case.outliers else seen._replace(margin=-math.inf)  # told by its colour
+    sensing = synthetic.sensing(experiment)._replace(noise=NOISE, outliers=case.outliers)
+    if not case.outliers:  # the sheet differs from the table by its colour
+        sensing = sensing._replace(margin=-math.inf)
     fabric, scenario = case.fabric, experiment.scenario(case.shape, elements=case.elements)
     if case.simulator == "stiffening":
         fabric = dataclasses.replace(
@@ -174,20 +175,18 @@ def _made(name: str) -> Recording:
             bending=SofteningPlate(fabric.bending, jnp.asarray(0.35), jnp.asarray(20.0)),
         )
     if case.scenario == "stretching":
-        found = synthetic.record(
-            experiment, fabric, name, seen=seen, shape=case.shape, max_step=STEP, key=key
+        recording = synthetic.record(
+            experiment, fabric, name, seen=sensing, shape=case.shape, max_step=STEP, key=key
         )
-    elif case.simulator == "mujoco":
-        assert case.material is not None
-        x = jnp.asarray(moved(scenario, case.material), float)
-        found = synthetic.seen_of(x, experiment, scenario, name, 1, seen, key=key)
     else:
         x = _moved(scenario, fabric, case)
-        found = synthetic.seen_of(x, experiment, scenario, name, 1, seen, key=key)
-    return dataclasses.replace(found, info=dataclasses.replace(found.info, name=name))
+        recording = synthetic.seen_of(x, experiment, scenario, name, 1, sensing, key=key)
+    return dataclasses.replace(recording, info=dataclasses.replace(recording.info, name=name))
 
 
 def _moved(scenario: Scenario, fabric: Fabric, case: Case) -> jax.Array:
+    if case.material is not None:
+        return jnp.asarray(moved(scenario, case.material), float)
     if case.simulator == "stiffening":
         motion = rollout(scenario, fabric, solver=scenarios.explicit_cloth(scenario, fabric))
     else:
@@ -207,23 +206,31 @@ def arrived(folder: Path, case: str, seed: str) -> Line:
     density = float(truth.density)
     space = prior.informed(with_law(on_cloth(density), law_told_by([recording])), density)
     began = time.process_time()
-    found = DiffCloud().estimate([recording], space, key=jr.key(int(seed)))
+    estimate = DiffCloud().estimate([recording], space, key=jr.key(int(seed)))
     seconds = time.process_time() - began
-    assert found.shape is not None
-    problem = problem_of(recording, space, found.shape)
+    assert estimate.shape is not None
+    problem = problem_of(recording, space, estimate.shape)
     ends = {
-        "end": end_of(problem, found),
+        "end": end_of(problem, estimate),
         "true": place_of(problem, space.to_unit(truth)),
         "prior": place_of(problem, space.prior()[0]),
     }
-    line: Line = {"mesh": "{} x {}".format(*found.shape)}
+    line: Line = {"mesh": "{} x {}".format(*estimate.shape)}
     for name, theta in ends.items():
-        seen = predictions_at((problem,), theta)
-        line[f"loss of {name}"] = f"{1e6 * loss_from((problem,), seen):.3f}"
-        line[f"mm of {name}"] = f"{1e3 * away(problem, seen[0]):.2f}"
-        line[f"% beyond 3 mm of {name}"] = f"{100 * fits((problem,), seen, STRICT)[0].outliers:.1f}"
-    line |= in_errors(space, truth, found) | told(found)
-    return line | {"CPU s": f"{seconds:.0f}"}
+        predictions = predictions_at((problem,), theta)
+        beyond = fits((problem,), predictions, STRICT)[0].outliers
+        line[f"loss of {name}"] = f"{1e6 * loss_from((problem,), predictions):.3f}"
+        line[f"mm of {name}"] = f"{1e3 * away(problem, predictions[0]):.2f}"
+        line[f"% beyond 3 mm of {name}"] = f"{100 * beyond:.1f}"
+    return (
+        line
+        | in_errors(space, truth, estimate)
+        | {
+            "left out": f"{100 * max((fit.outliers for fit in estimate.fits), default=0.0):.1f} %",
+            "converged": "yes" if estimate.converged else "no",
+            "CPU s": f"{seconds:.0f}",
+        }
+    )
 
 
 def problem_of(recording: Recording, space: ParameterSpace, shape: tuple[int, int]) -> Problem:
@@ -239,40 +246,32 @@ def place_of(problem: Problem, unit: jax.Array) -> jax.Array:
     return jnp.zeros(theta_length((problem,)), float).at[: problem.space.dim].set(inside)
 
 
-def end_of(problem: Problem, found: Estimate) -> jax.Array:
+def end_of(problem: Problem, estimate: Estimate) -> jax.Array:
     """The theta of an estimate, with its nuisances."""
     units = [
         bound.to_unit(jnp.asarray(value, float))
-        for bound, value in zip(found.ranges, found.values, strict=True)
+        for bound, value in zip(estimate.ranges, estimate.values, strict=True)
     ]
     theta = place_of(problem, jnp.stack(units))
-    for each, nuisance in zip(free_nuisances((problem,)), found.nuisances, strict=True):
+    for free, nuisance in zip(free_nuisances((problem,)), estimate.nuisances, strict=True):
         value = np.log(nuisance.value) if nuisance.name.endswith(" ratio") else nuisance.value
-        theta = theta.at[each.place].set(value / each.scale)
+        theta = theta.at[free.place].set(value / free.scale)
     return theta
 
 
-def away(problem: Problem, seen: Prediction) -> float:
+def away(problem: Problem, prediction: Prediction) -> float:
     """Mean distance [m] of points or markers from the sheet."""
-    distance, mask = marker_distances(problem, seen) or point_distances(problem, seen)
+    distance, mask = marker_distances(problem, prediction) or point_distances(problem, prediction)
     return float(np.asarray(distance)[np.asarray(mask)].mean())
 
 
-def in_errors(space: ParameterSpace, truth: Fabric, found: Estimate) -> Line:
+def in_errors(space: ParameterSpace, truth: Fabric, estimate: Estimate) -> Line:
     """How far each number is from the truth, in standard errors, with these in brackets."""
     true = np.asarray(space.values(space.to_unit(truth)))
-    rows = zip(found.ranges, found.values, true, found.standard_errors, strict=True)
+    rows = zip(estimate.ranges, estimate.values, true, estimate.standard_errors, strict=True)
     line, inside = {}, []
-    for bound, value, there, error in rows:
-        off = np.log(value / there) if bound.log else value - there
+    for bound, value, true_value, error in rows:
+        off = np.log(value / true_value) if bound.log else value - true_value
         line[bound.name] = f"{off / error:+.2f} ({error:.3g})"
         inside.append(abs(off / error) < norm.ppf(0.95))
     return line | {"held": f"{sum(inside)} of {len(inside)}"}
-
-
-def told(found: Estimate) -> Line:
-    """What the estimate says of itself."""
-    return {
-        "left out": f"{100 * max((each.outliers for each in found.fits), default=0.0):.1f} %",
-        "converged": "yes" if found.converged else "no",
-    }

@@ -17,13 +17,34 @@ from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import InformedSpace, ParameterSpace
 from r2s.metrics import prediction_error
 from r2s.metrics.prediction_error import distances
-from r2s.recordings.recording import Recording, RecordingInfo, gripper_positions
+from r2s.recordings import manifest
+from r2s.recordings.recording import Recording, RecordingInfo, gripper_positions, load
 from r2s.recordings.views import observed
 from r2s.scenarios.scenario import from_recording, resized
 
 SIZE = "size ratio"  # the nuisance that belongs to the fabric
 GROUPS = ("own lift", "other trial's lift", "other fabrics' lifts", "fold itself")
 Clouds = list[np.ndarray]
+
+
+def recordings_in(folder: Path, scenario: str) -> list[Recording]:
+    """Read the recordings of a scenario that lie in a folder.
+
+    The folder holds NPZ files of r2s, or folders of clouds with a `manifest.json`. Raises
+    `ValueError` when it holds none of this scenario.
+    """
+    files = sorted(folder.glob("*.npz"))
+    if files and not (folder / "manifest.json").exists():
+        recordings = [
+            recording for recording in map(load, files) if recording.info.scenario == scenario
+        ]
+    else:
+        rules = manifest.manifest_for(folder)
+        names = manifest.read_recordings(folder, rules, [scenario])
+        recordings = [manifest.read_recording(folder, rules, name) for name in names]
+    if not recordings:
+        raise ValueError(f"{folder}: no recording of {scenario}")
+    return recordings
 
 
 def estimated(
@@ -34,10 +55,10 @@ def estimated(
     file = kept / f"{recording.info.name}.{shape[0]}x{shape[1]}{known}.json"
     if file.exists():
         return from_json(json.loads(file.read_text(encoding="utf-8")))
-    found = DiffCloud(shape=shape).estimate([recording], space, key=jax.random.key(0))
+    estimate = DiffCloud(shape=shape).estimate([recording], space, key=jax.random.key(0))
     kept.mkdir(parents=True, exist_ok=True)
-    write_json(file, as_json(found))
-    return found
+    write_json(file, as_json(estimate))
+    return estimate
 
 
 def group_of(fold: RecordingInfo, source: RecordingInfo) -> str:
@@ -59,7 +80,7 @@ def size_of(estimate: Estimate) -> float:
     return next((each.value for each in estimate.nuisances if each.name == SIZE), 1.0)
 
 
-def seen(
+def observed_of(
     recording: Recording, fabric: Fabric, shape: tuple[int, int], size: float = 1.0
 ) -> Clouds | None:
     """What the recording's cameras would have seen of a fabric in the frames that count, [m].
@@ -88,24 +109,24 @@ def beside(
     shape: tuple[int, int],
 ) -> dict[str, list[Clouds | None]]:
     """What a fold's cameras would have seen of the estimates and of samples of the prior."""
-    found: dict[str, list[Clouds | None]] = {name: [] for name in GROUPS}
+    clouds: dict[str, list[Clouds | None]] = {name: [] for name in GROUPS}
     for info, estimate in made:
         if group := group_of(fold.info, info):
-            found[group].append(seen(fold, estimate.fabric, shape, size_of(estimate)))
-    return found | {"prior": [seen(fold, fabric, shape) for fabric in samples]}
+            clouds[group].append(observed_of(fold, estimate.fabric, shape, size_of(estimate)))
+    return clouds | {"prior": [observed_of(fold, fabric, shape) for fabric in samples]}
 
 
 def errors(real: Clouds, others: list[Clouds | None]) -> tuple[float, float]:
     """Mean distance [mm] both ways, as read and placed; infinite where a simulation diverged."""
-    found = []
+    pairs = []
     for other in others:
         if other is None or not all(len(points) for points in other):
-            found.append((np.inf, np.inf))
+            pairs.append((np.inf, np.inf))
             continue
         place = prediction_error.best_placement(real, other)
-        there = [prediction_error.placed(place, points) for points in real]
-        found.append((_both_ways(real, other), _both_ways(there, other)))
-    as_read, placed = np.mean(found, axis=0)
+        moved = [prediction_error.placed(place, points) for points in real]
+        pairs.append((_both_ways(real, other), _both_ways(moved, other)))
+    as_read, placed = np.mean(pairs, axis=0)
     return float(as_read), float(placed)
 
 

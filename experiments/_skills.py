@@ -15,15 +15,14 @@ from scipy.stats import norm
 
 from r2s.estimation.estimate import Estimate
 from r2s.materials.fabric import Fabric
-from r2s.study import engine, results, verdicts
-from r2s.study.configuration import MOTIONS, ON_CLOTH
+from r2s.study import engine, results
+from r2s.study.configuration import ON_CLOTH
+from r2s.study.ensembles import SURFACE, ensembles
 from r2s.study.estimates import EstimateTask, read_estimate
 from r2s.study.evaluations import EvaluationTask
-from r2s.study.mujoco import FABRIC as FLEX
 from r2s.study.plan import SMALL, configuration_named, synthetic
 from r2s.study.recordings import strain_dependent
-from r2s.study.tasks import read_metadata
-from r2s.study.verdicts import SURFACE
+from r2s.study.tasks import Task, read_metadata
 
 JUDGED = ("fling", "shaking")
 OUTSIDE = "*"  # behind a number whose 90 % interval does not hold the truth
@@ -43,41 +42,36 @@ def predicted(folder: Path, configuration: str, fabric: str, law: str) -> Line:
 
     `law`: "told" by the recordings, as in a study, or one of `r2s.estimation.default_spaces`.
     """
-    cells = [_of_law(each, law) for each in _cells(configuration, fabric, JUDGED)]
-    line = _errors(cells, folder)
-    estimate = _estimate(cells)
-    return line | _over_truth(estimate, folder) | _cost(estimate, folder)
+    tasks, estimate = _tasks(configuration, fabric)
+    if law != "told":
+        estimate = replace(estimate, law=law)
+        tasks = [
+            task if task.estimate is None else replace(task, estimate=estimate) for task in tasks
+        ]
+    return _errors(tasks, folder) | _over_truth(estimate, folder) | _cost(estimate, folder)
 
 
-def predicted_alone(folder: Path, configuration: str, fabric: str) -> Line:
-    """The line of a table: errors [mm] and skill of an estimate in the first fling and shaking of a
-    fabric, and the seconds of a CPU that it took."""
-    return _judged(folder, _cells(configuration, fabric, JUDGED))
+def predicted_alone(
+    folder: Path,
+    configuration: str,
+    fabric: str,
+    repeat: str = "0",
+    motions: Sequence[str] = JUDGED,
+) -> Line:
+    """The line of a table: errors [mm] and skill of an estimate from the recordings of that number
+    in the first motions of a fabric, and the seconds of a CPU that it took."""
+    tasks, estimate = _tasks(configuration, fabric, int(repeat), motions)
+    return _errors(tasks, folder) | _cost(estimate, folder)
 
 
-def predicted_elsewhere(folder: Path, configuration: str, repeat: str) -> Line:
-    """As `predicted_alone`, in the first fold, fling and shaking of MuJoCo's sheet, of an estimate
-    from its lift of that number."""
-    return _judged(folder, _cells(configuration, FLEX, MOTIONS, int(repeat)))
+def _cost(estimate: EstimateTask, folder: Path) -> Line:
+    return {"CPU s": f"{read_metadata(estimate, folder)['cpu_seconds']:.0f}"}
 
 
-def _judged(folder: Path, cells: list[EvaluationTask]) -> Line:
-    return _errors(cells, folder) | _cost(_estimate(cells), folder)
-
-
-def _estimate(cells: list[EvaluationTask]) -> EstimateTask:
-    """The one that some cells evaluate."""
-    (found,) = {cell.estimate for cell in cells if cell.estimate is not None}
-    return found
-
-
-def _cost(cell: EstimateTask, folder: Path) -> Line:
-    return {"CPU s": f"{read_metadata(cell, folder)['cpu_seconds']:.0f}"}
-
-
-def _cells(
-    configuration: str, fabric: str, motions: Sequence[str], repeat: int = 0
-) -> list[EvaluationTask]:
+def _tasks(
+    configuration: str, fabric: str, repeat: int = 0, motions: Sequence[str] = JUDGED
+) -> tuple[list[EvaluationTask], EstimateTask]:
+    """The evaluations of an estimate and of its references on the cloth, and the estimate."""
     plan = replace(
         SMALL,
         configurations=(configuration_named(configuration),),
@@ -87,95 +81,94 @@ def _cells(
         every=1,
         draws=4,
     )
-    return [
-        cell
-        for cell in synthetic(plan)
-        if cell.scenario in motions
-        and cell.solver == "cloth"
-        and (cell.estimate is None or cell.estimate.repeat == repeat)
+    tasks = [
+        task
+        for task in synthetic(plan)
+        if task.scenario in motions
+        and task.solver == "cloth"
+        and (task.estimate is None or task.estimate.repeat == repeat)
     ]
+    (estimate,) = {task.estimate for task in tasks if task.estimate is not None}
+    return tasks, estimate
 
 
-def _errors(cells: list[EvaluationTask], folder: Path) -> Line:
-    """Make some cells, and say what rows they give: by motion floor, errors and skill."""
-    failed = engine.run([*verdicts.ensembles(cells), *cells], folder, engine.Serial())
-    if failed:
+def _run(tasks: Sequence[Task], folder: Path) -> None:
+    if failed := engine.run(tasks, folder, engine.Runner()):
         raise RuntimeError(next(iter(failed.values())))
-    found = results.collect(cells, folder)
-    found = found[found.metric == SURFACE]
+
+
+def _errors(tasks: list[EvaluationTask], folder: Path) -> Line:
+    """Run some evaluations: by motion floor, errors and skill."""
+    every = [*ensembles(tasks), *tasks]
+    _run(every, folder)
+    rows = results.collect(tasks, folder)
+    rows = rows[rows.metric == SURFACE]
     line: Line = {}
-    for motion in dict.fromkeys(cell.scenario for cell in cells):
-        line |= _of(motion, found[found.evaluated_on == motion])
-    return line | made_by([*verdicts.ensembles(cells), *cells], folder)
-
-
-def _of_law(cell: EvaluationTask, law: str) -> EvaluationTask:
-    if cell.estimate is None or law == "told":
-        return cell
-    return replace(cell, estimate=replace(cell.estimate, law=law))
+    for motion in dict.fromkeys(task.scenario for task in tasks):
+        line |= _of(motion, rows[rows.evaluated_on == motion])
+    return line | made_by(every, folder)
 
 
 def _of(motion: str, rows: pd.DataFrame) -> Line:
-    found: Line = {f"{motion}: floor": _millimetres(rows.floor.iloc[0])}
+    line: Line = {f"{motion}: floor": _millimetres(rows.floor.iloc[0])}
     for baseline, name in NAMED.items():
         values = rows[rows.baseline == baseline].value
         if len(values):  # another simulator's sheet has no true fabric
-            found[f"{motion}: {name}"] = _millimetres(values.mean(skipna=False))
+            line[f"{motion}: {name}"] = _millimetres(values.mean(skipna=False))
     (skill,) = set(rows[rows.baseline.isin(ESTIMATES)].skill)
-    return found | {f"{motion}: skill": "not told" if np.isnan(skill) else f"{skill:.2f}"}
+    return line | {f"{motion}: skill": "not told" if np.isnan(skill) else f"{skill:.2f}"}
 
 
 def repeated(folder: Path, configuration: str, fabric: str, repeat: str) -> Line:
     """The line of a table: how an estimate from the recordings of that number stands to the truth,
     by parameter in its standard errors, in brackets what is not narrowed to half, and by how
     much the rest is off at most."""
-    cells = _cells(configuration, fabric, JUDGED, int(repeat))
-    cell = _estimate([_of_law(each, "told") for each in cells])
-    if failed := engine.run([cell], folder, engine.Serial()):
-        raise RuntimeError(next(iter(failed.values())))
-    found = read_estimate(cell, folder)
-    if found is None:
+    _, task = _tasks(configuration, fabric, int(repeat))
+    _run([task], folder)
+    estimate = read_estimate(task, folder)
+    if estimate is None:
         return {"converged": "diverged"}
-    off, away = _off(cell, found)
+    off, away = _off(task, estimate)
+    is_narrowed = estimate.narrowing < NARROWED
     line: Line = {}
-    for bound, errors, is_known in zip(found.ranges, away, found.narrowing < NARROWED, strict=True):
+    for bound, errors, is_known in zip(estimate.ranges, away, is_narrowed, strict=True):
         line[bound.name] = f"{errors:+.2f}" if is_known else f"({errors:+.2f})"
-    known = np.abs(off[found.narrowing < NARROWED])
+    known = np.abs(off[is_narrowed])
     return line | {
         "narrowed off at most": f"{known.max():.3f}" if len(known) else "-",
-        "converged": "yes" if found.converged else "no",
-        "recordings agree": _agreement(found, cell),
+        "converged": "yes" if estimate.converged else "no",
+        "recordings agree": _agreement(estimate, task),
     }
 
 
-def _off(cell: EstimateTask, found: Estimate) -> tuple[np.ndarray, np.ndarray]:
+def _off(task: EstimateTask, estimate: Estimate) -> tuple[np.ndarray, np.ndarray]:
     """How far an estimate is from the truth, by parameter: in shares of it (the coupling as it is),
     and in standard errors, both as in the range."""
-    true = results.true_values(cell, found.ranges)
-    rows = zip(found.ranges, found.values, true, strict=True)
-    off = np.array([np.log(v / there) if bound.log else v - there for bound, v, there in rows])
-    return off, off / found.standard_errors
+    true = results.true_values(task, estimate.ranges)
+    rows = zip(estimate.ranges, estimate.values, true, strict=True)
+    off = np.array([np.log(v / truth) if bound.log else v - truth for bound, v, truth in rows])
+    return off, off / estimate.standard_errors
 
 
-def _over_truth(cell: EstimateTask, folder: Path) -> Line:
-    found = read_estimate(cell, folder)
-    if found is None:
+def _over_truth(task: EstimateTask, folder: Path) -> Line:
+    estimate = read_estimate(task, folder)
+    if estimate is None:
         return {"warp": "diverged"}
-    off, away = _off(cell, found)
+    off, away = _off(task, estimate)
     away = np.abs(away)
     line: Line = {}
-    for bound, apart, errors in zip(found.ranges, off, away, strict=True):
+    for bound, apart, errors in zip(estimate.ranges, off, away, strict=True):
         number = f"{np.exp(apart):.2f}" if bound.log else f"{apart:+.2f}"
         line[bound.name] = number + OUTSIDE * bool(errors >= norm.ppf(0.95))
-    known = away[found.narrowing < NARROWED]
-    fabric = strain_dependent(cell.fabric)
+    known = away[estimate.narrowing < NARROWED]
+    fabrics = estimate.fabric, strain_dependent(task.fabric)
     for name, axis in (("warp", 0), ("weft", 1)):
-        grown = [f"{_growth(each, axis):.1%}" for each in (found.fabric, fabric)]
-        line[f"growth of {name} (truth)"] = f"{grown[0]} ({grown[1]})"
+        own, true = (f"{_growth(fabric, axis):.1%}" for fabric in fabrics)
+        line[f"growth of {name} (truth)"] = f"{own} ({true})"
     return line | {
-        "converged": "yes" if found.converged else "no",
-        "left out": ", ".join(f"{fit.outliers:.0%}" for fit in found.fits),
-        "recordings agree": _agreement(found, cell),
+        "converged": "yes" if estimate.converged else "no",
+        "left out": ", ".join(f"{fit.outliers:.0%}" for fit in estimate.fits),
+        "recordings agree": _agreement(estimate, task),
         "in 90 % intervals": f"{np.sum(away < norm.ppf(0.95))} of {len(away)}",
         "narrowed": f"{len(known)}",
         "errors off at most": f"{known.max():.1f}" if len(known) else "-",
@@ -189,14 +182,14 @@ def _growth(fabric: Fabric, axis: int) -> float:
     return float(fabric.membrane.energy_density(strain) / small.energy_density(strain)) - 1
 
 
-def _agreement(found: Estimate, cell: EstimateTask) -> str:
+def _agreement(estimate: Estimate, task: EstimateTask) -> str:
     """Whether the recordings do, by the likelihood by chance; else which does not."""
-    if found.agreement is None:
+    if estimate.agreement is None:
         return "not judged"
-    odd = found.agreement.contradiction
+    odd, p = estimate.agreement.contradiction, estimate.agreement.p
     if odd is None:
-        return f"yes, {found.agreement.p:.2g}"
-    return f"no, {found.agreement.p:.1g}: {cell.sources[odd.recording].name}, {odd.parameter}"
+        return f"yes, {p:.2g}"
+    return f"no, {p:.1g}: {task.sources[odd.recording].name}, {odd.parameter}"
 
 
 def _millimetres(value: float) -> str:

@@ -92,10 +92,10 @@ def _row(
     swing: Recording, fabric: Fabric, samples: Sequence[Fabric], offset: Float[np.ndarray, " 3"]
 ) -> dict[str, float]:
     """Errors [mm] of the tracker, of the estimate and of the samples, as read and placed."""
-    found, others = _gap(swing, fabric), [_gap(swing, sample) for sample in samples]
+    own, others = _gap(swing, fabric), [_gap(swing, sample) for sample in samples]
     row: dict[str, float] = {}
     for how, shift in {"": np.zeros(3), " placed": offset}.items():
-        of_rows = _of_rows(found + shift)
+        of_rows = _of_rows(own + shift)
         row["tracker" + how], row["estimate" + how] = of_rows[0], of_rows.mean()
         row["prior" + how] = float(np.nanmean([_of_rows(gap + shift) for gap in others]))
         row["estimate / tracker" + how] = row["estimate" + how] / row["tracker" + how]

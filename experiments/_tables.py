@@ -26,7 +26,7 @@ def made_by(tasks: Iterable[Task], folder: Path) -> Line:
     noted = {words.partition("source ")[2].partition(";")[0] for words in provenance(tasks, folder)}
     if len(noted) > 1:
         raise ValueError(f"{folder} is of several sources, empty it: {', '.join(sorted(noted))}")
-    return {"made by source": ", ".join(each[:8] for each in noted)}
+    return {"made by source": ", ".join(source[:8] for source in noted)}
 
 
 def command_line(document: str | None, out: str) -> argparse.ArgumentParser:
@@ -43,7 +43,7 @@ def write(path: Path, lines: Sequence[Line], caption: str, facts: Line | None = 
     source of r2s (`r2s._util.files.source_hash`), on which machine and when; `facts`
     replaces any of these, or adds to them.
     """
-    told = {
+    comments = {
         "table": caption,
         "command": shlex.join(["python", *sys.argv]),
         "version": f"r2s {importlib.metadata.version('r2s')}",
@@ -53,12 +53,12 @@ def write(path: Path, lines: Sequence[Line], caption: str, facts: Line | None = 
         "date": time.strftime("%Y-%m-%d"),
     } | (facts or {})
     path.parent.mkdir(parents=True, exist_ok=True)
-    comments = "".join(f"# {name}: {text}\n" for name, text in told.items())
+    head = "".join(f"# {name}: {text}\n" for name, text in comments.items())
     text = io.StringIO()
     writer = csv.DictWriter(text, _header(lines), lineterminator="\n")
     writer.writeheader()
     writer.writerows(lines)
-    write_text(path, comments + text.getvalue())
+    write_text(path, head + text.getvalue())
 
 
 def keep(path: Path, lines: Sequence[Line], caption: str, facts: Line | None = None) -> None:
@@ -70,9 +70,9 @@ def keep(path: Path, lines: Sequence[Line], caption: str, facts: Line | None = N
 def read(path: Path) -> tuple[list[Line], Line]:
     """Read the lines of a table that `write` wrote, and what its comments say."""
     text = path.read_text(encoding="utf-8").splitlines()
-    told = [line[2:].split(": ", 1) for line in text if line.startswith("# ")]
+    comments = [line[2:].split(": ", 1) for line in text if line.startswith("# ")]
     lines = csv.DictReader(line for line in text if not line.startswith("# "))
-    return list(lines), {name: fact for name, fact in told}
+    return list(lines), {name: fact for name, fact in comments}
 
 
 def shown(path: Path) -> str:

@@ -12,8 +12,11 @@ samples of it (the default), and MuJoCo's material in the laws of r2s (the "true
 from functools import partial
 from pathlib import Path
 
-from _skills import predicted_elsewhere
+from _skills import predicted_alone
 from _tables import Line, command_line, resumed
+
+from r2s.study.configuration import MOTIONS
+from r2s.study.mujoco import FABRIC
 
 CONFIGURATIONS = ("diffcloud-cloth-lifting", "diffcp-mpm-lifting", "physnet-cloth-lifting")
 CAPTION = (
@@ -29,8 +32,9 @@ if __name__ == "__main__":
     parser.add_argument("--folder", type=Path, default=Path("results/skill_by_fabric"))
     a = parser.parse_args()
     jobs: list[Line] = [
-        {"configuration": each, "repeat": f"{repeat}"}
-        for each in a.configurations
-        for repeat in range(a.repeats if each == CONFIGURATIONS[0] else 1)
+        {"configuration": name, "repeat": f"{repeat}"}
+        for name in a.configurations
+        for repeat in range(a.repeats if name == CONFIGURATIONS[0] else 1)
     ]
-    resumed(a.out, CAPTION, jobs, partial(predicted_elsewhere, a.folder))
+    make = partial(predicted_alone, a.folder, fabric=FABRIC, motions=MOTIONS)
+    resumed(a.out, CAPTION, jobs, make)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from _recordings import recordings_in
+from _real import recordings_in
 from _tables import command_line
 
 import r2s

@@ -68,8 +68,8 @@ def distance(motion: str, x: np.ndarray, finest: np.ndarray) -> np.ndarray:
     A hanging sheet buckles to either side: it is mirrored where that is nearer.
     """
     both = [finest, finest * [1, -1, 1]] if motion == "hang" else [finest]
-    each = [np.sqrt(((x - y) ** 2).sum(axis=-1).mean(axis=(1, 2))) for y in both]
-    return 1e3 * min(each, key=np.mean)
+    rms = [np.sqrt(((x - y) ** 2).sum(axis=-1).mean(axis=(1, 2))) for y in both]
+    return 1e3 * min(rms, key=np.mean)
 
 
 if __name__ == "__main__":
@@ -86,8 +86,8 @@ if __name__ == "__main__":
             line: Line = {"motion": motion, "fabric": fabric, "elements": elements}
             for count in a.sizes:
                 x = places(folder, motion, fabric, elements, count)
-                found = distance(motion, x, finest)
-                line[f"{count}"] = f"{found.mean():.2f}"
-                line[f"{count} at the end"] = f"{found[-1]:.2f}"
+                errors = distance(motion, x, finest)
+                line[f"{count}"] = f"{errors.mean():.2f}"
+                line[f"{count} at the end"] = f"{errors[-1]:.2f}"
             lines.append(line)
             keep(a.out, lines, "Distance [mm] from the finest mesh, mean and at the end.")

@@ -19,8 +19,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from _real import beside, compared, errors, estimated, frames_of
-from _recordings import recordings_in
+from _real import beside, compared, errors, estimated, frames_of, recordings_in
 from _swings import predict_swings
 from _tables import command_line, keep
 

@@ -49,8 +49,8 @@ if __name__ == "__main__":
     for damped, factory in (("fabric and air", None), ("nothing", in_vacuum)):
         if factory is not None:
             fabric = dataclasses.replace(fabric, damping=jnp.asarray(1e-9, float))
-        seen = r2s.record(lift, fabric, a.fabric, solver=factory, key=jax.random.key(0))
-        problem = r2s.Problem.make(seen, space, num_points=100)
+        recording = r2s.record(lift, fabric, a.fabric, solver=factory, key=jax.random.key(0))
+        problem = r2s.Problem.make(recording, space, num_points=100)
         problem = dataclasses.replace(problem, solver=factory and factory(problem.scenario))
         truth = np.pad(space.to_unit(fabric), (0, len(problem.nuisance_prior.scales)))
         lines += [line(problem, truth, width, damped) for width in (0.5, 0.05, 0.005, 5e-4)]

@@ -8,8 +8,8 @@ import pandas as pd
 
 from r2s.mesh.mesh import rectangle
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS, Configuration
-from r2s.study.report.figures import Motion
-from r2s.study.statistics.frame import as_frame, labelled
+from r2s.study.figures import Motion
+from r2s.study.results import as_frame, labelled
 
 FABRICS = ("black_denim", "grey_interlock", "pink_solid")
 METRICS = {"chamfer": ("m", 1.0), "paper_chamfer": ("-", 20.0), "hausdorff": ("m", 3.0)}

@@ -72,8 +72,9 @@ class Study:
         Raises `ValueError` for settings that make no sense and when cells are missing at the end,
         `OSError`, and `ImportError` that names the extra for workers.
         """
-        from r2s.study import engine, results, verdicts
+        from r2s.study import engine, report
         from r2s.study import plan as plans
+        from r2s.study.ensembles import ensembles
 
         plan = plans.with_changes(
             plans.PRESETS[self.preset],
@@ -90,9 +91,9 @@ class Study:
             cells = plans.recorded(self.data, self.density, plan)
         plans.check_simulators(cells)
         with self._runner() as runner:
-            failed = engine.run([*verdicts.ensembles(cells), *cells], self.out, runner)
+            failed = engine.run([*ensembles(cells), *cells], self.out, runner)
         source = str(self.data or "synthetic")
-        results.publish(cells, failed, self.out, plan, source, self.paper)
+        report.publish_study(cells, failed, self.out, plan, source, self.paper)
         if failed:
             raise ValueError(
                 f"{len(failed)} cells are missing: {self.out / 'report.html'} says why"

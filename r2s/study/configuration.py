@@ -41,10 +41,13 @@ def as_configuration(configuration: Configuration, baseline: str) -> Configurati
     """The configuration that stands for a baseline in tables; any other as it is."""
     if baseline in REFERENCES:
         return Configuration(REFERENCES[baseline], configuration.solver, "")
-    words = {"other_fabric": "of another fabric", ON_CLOTH: "found by MPM"}.get(baseline)
-    if words is None:
-        return configuration
-    return configuration._replace(approach=f"{_named(configuration.approach)} ({words})")
+    name = _named(configuration.approach)
+    names = {
+        "other_fabric": f"{name} (of another fabric)",
+        ON_CLOTH: f"{name} (found by MPM)",
+        "repeatability": "another trial",
+    }
+    return configuration._replace(approach=names.get(baseline, configuration.approach))
 
 
 def _named(approach: str) -> str:
@@ -70,13 +73,13 @@ PAPER_CONFIGURATIONS = (
 """The configurations in the tables of Ru et al. 2025, in their order."""
 
 PUBLISHED_CONFIGURATIONS = tuple(
-    each._replace(approach=each.approach + PUBLISHED) for each in PAPER_CONFIGURATIONS
+    c._replace(approach=c.approach + PUBLISHED) for c in PAPER_CONFIGURATIONS
 )
 """The same by the recipes of the approaches' papers."""
 
 TOGETHER_CONFIGURATIONS = tuple(
-    Configuration("diffcloud", "cloth", AND.join(each))
-    for each in (("lifting", "stretching"), ("lifting", "wind", "stretching", "fling"))
+    Configuration("diffcloud", "cloth", estimated_from)
+    for estimated_from in ("lifting+stretching", "lifting+wind+stretching+fling")
 )
 """Several recordings of one fabric together, which the paper does not have: a lift and pulls in
 three directions, also with a wind and a fling."""

@@ -5,13 +5,12 @@ of Slurm, or whatever a scheduler serves. A result is written completely or not 
 fails does not stop the others, and a run that was killed continues where it was.
 """
 
-import abc
-import io
 import os
 import re
 import shutil
 import sys
 import threading
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -31,7 +30,7 @@ ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 # only releases that know it are given it.
 COMPILE_FAST, KNOWN_TO = "--xla_cpu_use_fusion_emitters=false", "0.10."
 JAX_LEVEL = "1"  # of XLA's messages, which JAX sets where it is not set
-TRIES, RETRIES = 2, 5  # of a task whose process died, without and with Dask
+RETRIES = 5  # of a task whose process died, with Dask
 JOB = {"cores": 1, "processes": 1, "memory": "8GB", "walltime": "04:00:00"}  # of Slurm
 # CPU seconds of the first recording of a compilation group, with compilation, and of each further
 # one; by the beginning of the group's name, the longest that fits. What "one_fabric" has is about
@@ -52,27 +51,27 @@ SECONDS: dict[str, tuple[float, float]] = {
     "estimates pinn": (70.0, 60.0),
     "evaluations": (20.0, 13.0),
 }
-REFRESH, LINES = 1.0, 30.0  # [s] between updates of the bar, and between lines in a file
-SHAPE = "{desc}: {percentage:3.0f} %, {elapsed} elapsed{postfix}"
+REFRESH, LINES = 1.0, 30.0  # [s] between updates on a terminal, and between lines in a file
 # [s] that count as done at the expected pace, until finished tasks give a better estimate
 TRUST = 300.0
 
 Outcome = tuple[Task, str]  # why it failed, or ""
 
 
-class Runner(abc.ABC):
-    """Runs tasks, `processes` at once."""
+class Runner:
+    """Runs tasks one after the other in this process; subclasses run `processes` at once."""
 
     processes: int = 1
 
-    @abc.abstractmethod
     def run(self, tasks: Sequence[Task], folder: Path) -> Iterator[Outcome]:
         """Yield each task when it is done, with why it failed, or "".
 
         `tasks`: in an order in which dependencies come first.
         """
+        for task in tasks:
+            yield task, attempt(task, folder)
 
-    def close(self) -> None:  # noqa: B027 - nothing to release by default
+    def close(self) -> None:
         """Release the workers."""
 
 
@@ -86,49 +85,45 @@ def run(tasks: Iterable[Task], folder: Path, runner: Runner) -> dict[Task, str]:
     if not waiting:
         return failed
     seconds = expected_seconds(waiting)
-    tqdm = require("tqdm", "study", "a study").tqdm
     total, processes = sum(seconds.values()), runner.processes
-    print(
+    _say(
         f"study: {len(waiting)} cells, about {in_words(total / processes)} on {processes} "
-        f"{'process' if processes == 1 else 'processes'}",
-        file=sys.stderr,
-        flush=True,
+        f"{'process' if processes == 1 else 'processes'}"
     )
-    with progress(total, len(waiting), processes) as bar:
+    with progress(total, len(waiting), processes) as done:
         for task, reason in runner.run(waiting, folder):
-            bar.update(seconds[task])
-            lost = [need for need in dependencies(task) if need in failed]
-            if lost:
-                failed[task] = f"needs {lost[0].kind} {lost[0].name}, which is missing"
+            done.append(seconds[task])
+            missing = [need for need in dependencies(task) if need in failed]
+            if missing:
+                failed[task] = f"needs {missing[0].kind} {missing[0].name}, which is missing"
             elif reason:
-                tqdm.write(f"missing: {task.kind} {task.name}: {reason}", file=sys.stderr)
+                _say(f"missing: {task.kind} {task.name}: {reason}")
                 failed[task] = reason
     return failed
 
 
 def _ordered(tasks: Iterable[Task]) -> list[Task]:
     """Tasks and their dependencies: first what the longest chain of tasks still waits for. Of equal
-    ones those that compile alike are together."""
-    found = list(with_dependencies(tasks))
-    chain = dict.fromkeys(found, 0.0)  # [CPU s] of what waits for a task, and then with it
-    for task in reversed(found):
-        _, further = _seconds(task)
-        chain[task] += task.runs * further
-        for need in dependencies(task):
-            chain[need] = max(chain[need], chain[task])
-    return sorted(found, key=lambda task: (-chain[task], task.compilation_group))
+    ones those of a compilation group are together."""
+    needed = list(with_dependencies(tasks))
+    chain = dict.fromkeys(needed, 0.0)  # [CPU s] of what waits for a task, and then with it
+    for task in reversed(needed):
+        chain[task] += task.runs * _seconds(task)[1]
+        for dependency in dependencies(task):
+            chain[dependency] = max(chain[dependency], chain[task])
+    return sorted(needed, key=lambda task: (-chain[task], task.compilation_group))
 
 
 def expected_seconds(tasks: Iterable[Task]) -> dict[Task, float]:
     """The time of each task, [CPU s], when they are made in this order."""
     compiled: set[str] = set()
-    found = {}
+    seconds = {}
     for task in tasks:
         first, further = _seconds(task)
         is_first = task.compilation_group not in compiled
-        found[task] = (first if is_first else further) + (task.runs - 1) * further
+        seconds[task] = (first if is_first else further) + (task.runs - 1) * further
         compiled.add(task.compilation_group)
-    return found
+    return seconds
 
 
 def _seconds(task: Task) -> tuple[float, float]:
@@ -144,35 +139,35 @@ def in_words(seconds: float) -> str:
 
 
 @contextmanager
-def progress(seconds: float, count: int, processes: int) -> Iterator[Any]:
-    """Progress on stderr: a bar on a terminal, a line every half minute in a file.
+def progress(seconds: float, count: int, processes: int) -> Iterator[list[float]]:
+    """Progress on stderr while tasks run: each second on a terminal, each half minute in a file.
 
-    It is updated by the expected CPU seconds of each task that is done, of `seconds` in all, and
-    refreshed while tasks are running.
+    To the list that it yields the caller appends the expected time of each task that is done, of
+    `seconds` in all, [CPU s].
     """
-    tqdm = require("tqdm", "study", "a study").tqdm
-    is_terminal = sys.stderr.isatty()
-    stream = sys.stderr if is_terminal else io.StringIO()
-    stop = threading.Event()
-    with tqdm(total=seconds, desc=f"study of {count} cells", bar_format=SHAPE, file=stream) as bar:
+    done: list[float] = []
+    began, stop, is_terminal = time.monotonic(), threading.Event(), sys.stderr.isatty()
 
-        def show() -> None:
-            while not stop.wait(REFRESH if is_terminal else LINES):
-                pace = (TRUST + bar.format_dict["elapsed"]) / (TRUST + bar.n / processes)
-                left = pace * (seconds - bar.n) / processes
-                bar.set_postfix_str(f"about {in_words(left)} left", refresh=False)
-                if is_terminal:
-                    bar.refresh()
-                else:
-                    print(bar, file=sys.stderr, flush=True)
+    def show() -> None:
+        while not stop.wait(REFRESH if is_terminal else LINES):
+            elapsed, made = time.monotonic() - began, sum(done)
+            pace = (TRUST + elapsed) / (TRUST + made / processes)
+            left = pace * (seconds - made) / processes
+            words = f"study of {count} cells: {100 * made / seconds:3.0f} %"
+            words += f", {in_words(elapsed)} elapsed, about {in_words(left)} left"
+            _say(f"\r{words:<79}" if is_terminal else words, "" if is_terminal else "\n")
 
-        thread = threading.Thread(target=show, daemon=True)
-        thread.start()
-        try:
-            yield bar
-        finally:
-            stop.set()
-            thread.join()
+    thread = threading.Thread(target=show, daemon=True)
+    thread.start()
+    try:
+        yield done
+    finally:
+        stop.set()
+        thread.join()
+
+
+def _say(words: str, end: str = "\n") -> None:
+    print(words, end=end, file=sys.stderr, flush=True)
 
 
 def one_thread(flags: str) -> str:
@@ -191,12 +186,11 @@ def environment(workers: int, compilation_cache: Path | None = None) -> dict[str
     """The environment of a worker before it imports JAX, for `workers` on one machine.
 
     Each has one thread, so that sums are in the same order on any runner, and a share of the GPUs'
-    memory. A fabric that fails in a batch does not stop the others. Compiled programs are stored in
-    `compilation_cache`, by default where `r2s.compilation.keep` has them.
+    memory. Compiled programs are by default where `r2s.compilation.keep` has them.
     """
     level = os.environ.get("TF_CPP_MIN_LOG_LEVEL", JAX_LEVEL)
-    found = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    found |= {
+    variables = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    variables |= {
         LIMIT: "1",
         "XLA_FLAGS": one_thread(os.environ.get("XLA_FLAGS", "")),
         "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.9 / workers:.3f}",
@@ -204,36 +198,22 @@ def environment(workers: int, compilation_cache: Path | None = None) -> dict[str
         "TF_CPP_MIN_LOG_LEVEL": "3" if level == JAX_LEVEL else level,  # see `r2s.__main__`
     }
     if compilation_cache is not None:
-        found["JAX_COMPILATION_CACHE_DIR"] = str(compilation_cache)
-    return found
+        variables["JAX_COMPILATION_CACHE_DIR"] = str(compilation_cache)
+    return variables
 
 
 def begin_worker(number: int | None = None) -> None:
-    """Prepare a process that runs tasks, and on Linux bind it to a core by its number.
-
-    JAX makes as many threads as it has cores, and those of several processes would wait for each
-    other.
-    """
+    """Prepare a process that runs tasks, and on Linux bind it to a core by its number: JAX makes as
+    many threads as it has cores, and those of several processes would wait for each other."""
     if number is not None and hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, {cores[number % len(cores)]})
     compilation.keep()
 
 
-class Serial(Runner):
-    """Runs one task after the other in this process."""
-
-    def run(self, tasks: Sequence[Task], folder: Path) -> Iterator[Outcome]:
-        for task in tasks:
-            yield task, attempt(task, folder)
-
-
 class OneProcess(Runner):
-    """Runs one task after the other in a process of its own, with the same numbers as workers.
-
-    Linear algebra is threaded as the environment says when it is loaded, and sums in another order
-    are other numbers.
-    """
+    """Runs one task after the other in a process of its own, in the environment of workers, so that
+    the numbers are the same."""
 
     def __init__(self) -> None:
         os.environ.update(environment(1))  # inherited by the process
@@ -241,14 +221,11 @@ class OneProcess(Runner):
 
     def run(self, tasks: Sequence[Task], folder: Path) -> Iterator[Outcome]:
         for task in tasks:
-            reason = ""
-            for _ in range(TRIES):
-                try:
-                    reason = self._pool.submit(attempt, task, folder, task.key).result()
-                    break
-                except BrokenProcessPool as error:
-                    reason = f"{type(error).__name__}: {error}"
-                    self._pool = self._start()
+            try:
+                reason = self._pool.submit(attempt, task, folder, task.key).result()
+            except BrokenProcessPool as error:
+                reason = f"{type(error).__name__}: {error}"
+                self._pool = self._start()
             yield task, reason
 
     def close(self) -> None:
@@ -309,11 +286,8 @@ def at(address: str) -> DaskWorkers:
 
 
 def slurm(jobs: int) -> DaskWorkers:
-    """As many Slurm jobs of one worker each, which must see the study's folder too.
-
-    Partition and account come from the configuration file of dask-jobqueue. Raises `OSError` where
-    there is no Slurm.
-    """
+    """As many Slurm jobs of one worker each, with the partition and account of dask-jobqueue's
+    configuration file. Raises `OSError` where there is no Slurm."""
     jobqueue = require("dask_jobqueue.slurm", "cluster", "Slurm")
     distributed = require("distributed", "cluster", "Slurm")
     if shutil.which("sbatch") is None:

@@ -74,9 +74,8 @@ class EstimateTask(Task):
     - `sources`: one recording, or several for approaches that accept them.
     - `density`: areal density as weighed, [kg/m^2].
     - `network`: of "physnet" and "physnet-published".
-    - `prior`: "fabrics" for the prior of fabrics of this weight (`r2s.materials.prior`), else
-      "flat".
-    - `resolves`: on meshes that resolve it (`r2s.estimation.mesh_refinement`), not `SHAPES`.
+    - `informed`: as `r2s estimate`, with the prior of fabrics of this weight
+      (`r2s.materials.prior`), and on meshes that resolve the fabric; else flat, and on `SHAPES`.
     - `law`: as in `with_law`; "told": the laws that the recordings identify (`law_told_by`).
     """
 
@@ -91,16 +90,8 @@ class EstimateTask(Task):
     budget: Budget
     network: TrainedNetwork | None = None
     repeat: int = 0
-    prior: str = "flat"
-    resolves: bool = False
+    informed: bool = False
     law: Law | Literal["told"] = "linear"
-
-    def __post_init__(self) -> None:
-        if len(self.sources) > 1 and not METHODS[self.approach].several:
-            raise ValueError(f"{self.approach} is from one recording, got {len(self.sources)}")
-        for source in self.sources:
-            if reason := METHODS[self.approach].refusal(self.solver, source.scenario):
-                raise ValueError(f"{self.approach}: {reason}")
 
     @property
     def scenario(self) -> str:
@@ -119,15 +110,15 @@ class EstimateTask(Task):
         """An estimate; one whose simulations all diverged is a result too, and says so."""
         recordings = [read(source, folder) for source in self.sources]
         space = with_law(default_space(self.solver, self.density), self.law_from(recordings))
-        if self.prior != "flat":
+        if self.informed:
             space = prior.informed(space, self.density)
         try:
-            found = self._estimated(recordings, space, folder)
+            estimate = self._estimated(recordings, space, folder)
         except jax.errors.JaxRuntimeError:  # such as out of memory: no result, to be tried again
             raise
         except (RuntimeError, FloatingPointError) as error:
             return {"seed": self.repeat, "diverged": f"{error}"}
-        write_json(out / ESTIMATE, as_json(found))
+        write_json(out / ESTIMATE, as_json(estimate))
         return {"seed": self.repeat, "diverged": ""}
 
     def law_from(self, recordings: Sequence[Recording]) -> Law:
@@ -135,8 +126,8 @@ class EstimateTask(Task):
         return law_told_by(recordings) if self.law == "told" else self.law
 
     def begun(self, folder: Path) -> Path:
-        """The state of an unfinished estimate, from which it continues after a kill: by the same
-        source, versions and processor, as others would not have come to it."""
+        """The state of an unfinished estimate, from which the same source, versions and processor
+        continue it after a kill."""
         made_by = sha256(f"{source_hash()} {VERSIONS} {processor()}".encode()).hexdigest()
         return folder / "begun" / f"{self.name}-{self.key}-{made_by[:KEY_LENGTH]}"
 
@@ -144,16 +135,16 @@ class EstimateTask(Task):
         key, network, begun = jr.key(self.repeat), self.network, self.begun(folder)
         with nullcontext() if network is None else result_files(network, folder) as files:
             method = replace(method_of(self, files), checkpoint=begun / "state.npz")
-            found = method.estimate(recordings, space, self.budget, key=key)
+            estimate = method.estimate(recordings, space, self.budget, key=key)
         shutil.rmtree(begun, ignore_errors=True)
-        return found
+        return estimate
 
 
 def method_of(task: EstimateTask, network: Path | None = None) -> Method:
     """The method of a task; `network`: the folder of a trained one, which "physnet" needs to
     estimate."""
     kind = METHODS[task.approach]
-    options: dict[str, Any] = {"shape": None if task.resolves else SHAPES[task.solver]}
+    options: dict[str, Any] = {"shape": None if task.informed else SHAPES[task.solver]}
     if "network" in kind.options():
         options["network"] = network and network / NETWORK
     return kind(solver=task.solver, **options)

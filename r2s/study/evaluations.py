@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 from zlib import crc32
 
 import equinox as eqx
@@ -16,7 +16,6 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Float
 
-from r2s._util.files import write_json
 from r2s.materials import prior
 from r2s.materials.fabric import Fabric
 from r2s.metrics import prediction_error
@@ -31,7 +30,6 @@ from r2s.study.estimates import EstimateTask, read_estimate
 from r2s.study.recordings import SETTLING, Shape, Source, read, read_start, started
 from r2s.study.tasks import Task, result_files
 
-MIDDLE = -1  # instead of the number of a sample: the prior median
 MEASURED, MOTION = "measured.json", "motion.npz"
 # vertices of the simulated sheet: with 25 x 25 of the cloth a fling of grey interlock is 7 mm off
 SHAPES = {"cloth": (33, 33), "mpm": (9, 9)}
@@ -45,15 +43,15 @@ LADDER = math.sqrt(2)  # steps between frames are powers of this: few programs t
 class EvaluationTask(Task):
     """The distance of simulations of a fabric from recordings of one scenario.
 
-    - `estimate`: whose fabric is evaluated; None: that of a sample, or the true one.
-    - `solver`: "cloth", in explicit steps, or "mpm", on `SHAPES`. Estimates by MPM are
-      evaluated on both, as only on the cloth all fabrics are simulated alike.
+    - `estimate`: whose fabric is evaluated; None: that of a reference.
+    - `solver`: "cloth", in explicit steps, or "mpm", on `SHAPES`.
     - `density`: areal, [kg/m^2].
     - `recordings`: evaluated together, since they compile once.
-    - `draw`: a number of `r2s.materials.prior.draws`, given the density; together these are the
-      default, and each fabric has its own. `MIDDLE`: the median of that prior. None: the truth of
-      synthetic recordings at small strain; of MuJoCo's sheet `r2s.study.mujoco.as_plate`.
-    - `other`: whether `estimate` is that of another fabric, for comparison.
+    - `baseline`: as in `r2s.study.results`. "default": a sample of the prior, given the density;
+      "middle": its median; "true": the truth of synthetic recordings at small strain, of MuJoCo's
+      sheet `r2s.study.mujoco.as_plate`. Estimates by MPM are evaluated on the cloth, too, since
+      only there all fabrics have the same solver.
+    - `draw`: the number of the sample (`r2s.materials.prior.draws`). Each fabric has its own.
     - `every`: 1 compares all frames that count, 3 every third.
     """
 
@@ -65,20 +63,9 @@ class EvaluationTask(Task):
     density: float
     fabric: str
     recordings: tuple[Source, ...]
-    draw: int | None = None
-    other: bool = False
+    baseline: str = ""
+    draw: int = 0
     every: int = 1
-
-    @property
-    def baseline(self) -> str:
-        """As in `r2s.study.statistics.frame`."""
-        if self.estimate is not None:
-            if self.other:
-                return "other_fabric"
-            return "" if self.solver == self.estimate.solver else ON_CLOTH
-        if self.draw is None:
-            return "true"
-        return "middle" if self.draw == MIDDLE else "default"
 
     @property
     def scenario(self) -> str:
@@ -96,15 +83,14 @@ class EvaluationTask(Task):
         """The number of the estimate or sample; "" where there is one."""
         if self.estimate is not None:
             return str(self.estimate.repeat)
-        return "" if self.draw in (None, MIDDLE) else str(self.draw)
+        return str(self.draw) if self.baseline == "default" else ""
 
     @property
     def name(self) -> str:
         whose = f"{self.baseline}{self.repeat}_{self.solver}_{self.fabric}"
         if self.estimate is not None:
             whose = self.estimate.name
-        on = f"{self.fabric}_" if self.other else ""
-        on += "cloth_" if self.baseline == ON_CLOTH else ""
+        on = {"other_fabric": f"{self.fabric}_", ON_CLOTH: "cloth_"}.get(self.baseline, "")
         return f"{whose}_on_{on}{self.scenario}_{self.recordings[0].name.split('_')[-1]}"
 
     @property
@@ -127,73 +113,66 @@ class EvaluationTask(Task):
         fabric = self._fabric(folder)
         if fabric is None:
             count = self.shape[0] * self.shape[1]
-            lost = [np.full((len(each.times), count, 3), np.nan) for each in recordings]
-            motions = [Motion(x, "the estimate diverged") for x in lost]
+            motions = [
+                Motion(np.full((len(recording.times), count, 3), np.nan), "the estimate diverged")
+                for recording in recordings
+            ]
         else:
             starts = [read_start(source, folder) for source in self.recordings]
             motions = predict(recordings, fabric, self.solver, starts)
-        measured, diverged, steps, arrays = {}, {}, {}, {}
+        measured, diverged, arrays = {}, {}, {}
         for source, recording, motion in zip(self.recordings, recordings, motions, strict=True):
             # what cameras observe is cropped
-            args = self.every, source.is_given, self.shape
-            found = prediction_error.against_motion(recording, motion.x, *args)
-            away = prediction_error.from_surface(recording, motion.x, self.shape)
-            found["surface"] = float(np.mean(away))
-            measured[source.name] = {
-                name: value if math.isfinite(value) else None for name, value in found.items()
-            }
-            arrays |= {f"x {source.name}": np.asarray(motion.x, np.float32), source.name: away}
+            metrics = prediction_error.against_motion(
+                recording, motion.x, self.every, source.is_given, self.shape
+            )
+            distances = prediction_error.from_surface(recording, motion.x, self.shape)
+            measured[source.name] = metrics | {"surface": float(np.mean(distances))}
+            arrays |= {f"x {source.name}": np.asarray(motion.x, np.float32)}
+            arrays |= {source.name: distances}
             if motion.failure:
                 diverged[source.name] = motion.failure
-            if motion.steps:
-                steps[source.name] = motion.steps
-        write_json(out / MEASURED, measured)
+        (out / MEASURED).write_text(json.dumps(measured), encoding="utf-8")
         np.savez_compressed(out / MOTION, **arrays)
-        return {"diverged": diverged, "runs": len(recordings), "steps": steps}
+        return {"diverged": diverged, "runs": len(recordings)}
 
     def _fabric(self, folder: Path) -> Fabric | None:
         if self.estimate is not None:
-            found = read_estimate(self.estimate, folder)
-            return None if found is None else found.fabric
-        if self.draw is None:
+            estimate = read_estimate(self.estimate, folder)
+            return None if estimate is None else estimate.fabric
+        if self.baseline == "true":
             return self.recordings[0].small_strain_fabric
-        if self.draw == MIDDLE:
+        if self.baseline == "middle":
             return prior.middle(self.density)
         key = jr.fold_in(jr.key(getattr(self.recordings[0], "seed", 0)), self.draw)
         drawn = prior.draws(self.density, 1, jr.fold_in(key, crc32(self.fabric.encode())))
         return jax.tree.map(lambda leaf: leaf[0], drawn)
 
 
-def read_measured(task: EvaluationTask, folder: Path) -> dict[str, dict[str, float]]:
-    """The metrics of each recording by name; NaN where the motion diverged."""
-    with result_files(task, folder) as files:
-        stored = json.loads((files / MEASURED).read_text(encoding="utf-8"))
-    return {
-        name: {metric: math.nan if value is None else value for metric, value in row.items()}
-        for name, row in stored.items()
-    }
+class Prediction(NamedTuple):
+    """What is stored of a recording; NaN where the motion diverged.
+
+    - `metrics`: by name. `x`: positions of the motion, [m].
+    - `distances`: of the recording's points from the sheet, in frames that count, [m].
+    """
+
+    metrics: dict[str, float]
+    x: Float[np.ndarray, "frame vertex 3"]
+    distances: Float[np.ndarray, " frame"]
 
 
-def read_motions(
-    task: EvaluationTask, folder: Path
-) -> dict[str, Float[np.ndarray, "frame vertex 3"]]:
-    """Positions [m] of all motions, by the name of their recording."""
+def read_predictions(task: EvaluationTask, folder: Path) -> dict[str, Prediction]:
+    """The predictions of a finished task by the name of their recording."""
     with result_files(task, folder) as files, np.load(files / MOTION) as stored:
-        return {source.name: stored[f"x {source.name}"] for source in task.recordings}
-
-
-def read_distances(task: EvaluationTask, folder: Path) -> dict[str, Float[np.ndarray, " frame"]]:
-    """Distances [m] of each recording's points from the sheet, by its name, in frames that count;
-    NaN where the motion diverged."""
-    with result_files(task, folder) as files, np.load(files / MOTION) as stored:
-        return {source.name: stored[source.name] for source in task.recordings}
+        measured = json.loads((files / MEASURED).read_text(encoding="utf-8"))
+        return {
+            name: Prediction(metrics, stored[f"x {name}"], stored[name])
+            for name, metrics in measured.items()
+        }
 
 
 def predict(
-    recordings: list[Recording],
-    fabric: Fabric,
-    solver: str,
-    starts: Sequence[Shape | None] = (),
+    recordings: list[Recording], fabric: Fabric, solver: str, starts: Sequence[Shape | None] = ()
 ) -> list[Motion]:
     """The motions of a fabric in recordings of one scenario.
 
@@ -202,48 +181,38 @@ def predict(
     - `starts`: of each recording the shape in its first frame [m], see
       `r2s.study.recordings.started`; none: from flat sheets.
     """
-    scenarios = [from_recording(each, SHAPES[solver]) for each in recordings]
+    scenarios = [from_recording(recording, SHAPES[solver]) for recording in recordings]
     if starts:
-        scenarios = [started(*each) for each in zip(scenarios, starts, strict=True)]
+        scenarios = [started(*pair) for pair in zip(scenarios, starts, strict=True)]
     most = max(scenario.substeps for scenario in scenarios)
-    in_equal_steps = [dataclasses.replace(scenario, substeps=most) for scenario in scenarios]
-    make = _points if solver == "mpm" else _explicit
-    shared = make(in_equal_steps, fabric)
-    if shared is None:
-        words = "implicit steps, too stiff for explicit ones"
-        return [_implicit(each, fabric)._replace(steps=words) for each in in_equal_steps]
-    motions = []
-    for scenario in in_equal_steps:
-        own = eqx.tree_at(lambda s: s.scene, shared, scenario.scene)
-        motions.append(_until_stable(scenario, fabric, own))
-    return motions
+    scenarios = [dataclasses.replace(scenario, substeps=most) for scenario in scenarios]
+    if solver == "mpm":
+        points = _points(scenarios, fabric)
+        return [
+            prediction_error.predict_motion(
+                scenario, fabric, eqx.tree_at(lambda s: s.scene, points, scenario.scene)
+            )
+            for scenario in scenarios
+        ]
+    cloth = explicit_cloth(scenarios[0], fabric)
+    if cloth.substeps / cloth.dt > MOST:
+        return [_implicit(scenario, fabric) for scenario in scenarios]
+    return [_explicit(scenario, fabric, cloth) for scenario in scenarios]
 
 
-def _until_stable(scenario: Scenario, fabric: Fabric, solver: ExplicitCloth | MPMCloth) -> Motion:
-    """A motion; one of the cloth that diverges is repeated in shorter substeps, then in implicit
-    steps.
+def _explicit(scenario: Scenario, fabric: Fabric, cloth: ExplicitCloth) -> Motion:
+    """A motion; one that diverges is repeated in shorter substeps, then in implicit steps.
 
     The limit of substeps is that of a sheet whose elements keep their shape. Some collapse where a
     soft sheet is flung, and that is no property of the fabric.
     """
-    motion = prediction_error.predict_motion(scenario, fabric, solver)
-    if not isinstance(solver, ExplicitCloth):
-        return motion._replace(steps="material points")
-    for times in RETRIES:
-        if not motion.failure:
-            break
-        finer = dataclasses.replace(solver, substeps=times * solver.substeps)
+    cloth = eqx.tree_at(lambda s: s.scene, cloth, scenario.scene)
+    for times in (1, *RETRIES):
+        finer = dataclasses.replace(cloth, substeps=times * cloth.substeps)
         motion = prediction_error.predict_motion(scenario, fabric, finer)
-        motion = motion._replace(steps=f"explicit steps, {times} times as many")
-    if motion.failure:
-        return _implicit(scenario, fabric)._replace(steps="implicit steps, lost in explicit ones")
-    return motion if motion.steps else motion._replace(steps="explicit steps")
-
-
-def _explicit(scenarios: list[Scenario], fabric: Fabric) -> ExplicitCloth | None:
-    """None where there would be too many substeps."""
-    solver = explicit_cloth(scenarios[0], fabric)
-    return solver if solver.substeps / solver.dt <= MOST else None
+        if not motion.failure:
+            return motion
+    return _implicit(scenario, fabric)
 
 
 def _implicit(scenario: Scenario, fabric: Fabric) -> Motion:
@@ -252,6 +221,7 @@ def _implicit(scenario: Scenario, fabric: Fabric) -> Motion:
 
 
 def _points(scenarios: list[Scenario], fabric: Fabric) -> MPMCloth:
+    """Material points in one grid and step for all scenarios."""
     first = scenarios[0]
     paths = [jnp.concatenate([getattr(s, name) for s in scenarios]) for name in ("path", "start")]
     everywhere = dataclasses.replace(first, path=paths[0], start=paths[1])

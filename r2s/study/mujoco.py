@@ -11,7 +11,7 @@ engine for model-based control", IROS 2012.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -24,23 +24,11 @@ from jaxtyping import Float
 from r2s._util.extras import require
 from r2s._util.units import AIR_DENSITY, GRAVITY
 from r2s.materials.fabric import Fabric
-from r2s.metrics.losses import POINTS
-from r2s.recordings.recording import save
+from r2s.recordings.recording import Recording
 from r2s.scenarios import synthetic
 from r2s.scenarios.scenario import Scenario
 from r2s.scenarios.standard import Experiment
-from r2s.study.ensembles import (
-    COARSER,
-    FINER,
-    PATH,
-    STIFFNESS,
-    Moved,
-    member_distances,
-    recorded_distances,
-    save_ensemble,
-)
-from r2s.study.recordings import RECORDING, START, SimulatedRecording, number_of
-from r2s.study.tasks import Task
+from r2s.study.recordings import Moved, Shape, SimulatedRecording, number_of
 
 FABRIC = "mujoco_flex"
 SCENARIOS = ("lifting", "folding", "fling", "shaking")  # without fans and clamps
@@ -48,6 +36,8 @@ OTHERS = (0.25, 0.5, 2.0, 4.0)  # times as stiff: as the membranes of the preset
 GRIP = 10.0  # [kg], of a pinned vertex: the sheet's pull moves it by less than 1e-7 m in a step
 STEP = 1.6e-3  # [s]: longest time step
 ELASTICITY = ("young", "poisson", "thickness", "damping")
+# of contacts: time constant [s], damping ratio [-], and impedance
+CONTACT = 'solref="0.005 1.0" solimp="0.9 0.95 0.001"'
 AXES = ("1 0 0", "0 1 0", "0 0 1")
 
 
@@ -59,8 +49,6 @@ class Material(NamedTuple):
     - `density`: areal, [kg/m^2].
     - `radius`: of its contacts: the middle of the sheet is as high above the table, [m].
     - `friction`: of sliding, [-].
-    - `solref`, `solimp`: of contacts: time constant [s], damping ratio [-], and impedance.
-    - `air`: density of the medium, [kg/m^3].
     """
 
     young: float = 12e3
@@ -70,39 +58,27 @@ class Material(NamedTuple):
     density: float = 0.2
     radius: float = 1e-3
     friction: float = 0.8
-    solref: tuple[float, float] = (0.005, 1.0)
-    solimp: tuple[float, float, float] = (0.9, 0.95, 0.001)
-    air: float = AIR_DENSITY
-
-
-class Resolution(NamedTuple):
-    """- `shape`: vertices along warp and weft. - `step`: longest time step, [s]."""
-
-    shape: tuple[int, int] = (25, 25)
-    step: float = STEP
 
 
 @dataclass(frozen=True)
 class MujocoRecording(SimulatedRecording):
-    """A recording of a sheet of MuJoCo; fields as in `SyntheticRecording`."""
+    """A recording of a sheet of MuJoCo.
 
-    settings: ClassVar[tuple[Any, ...]] = (GRIP,)
+    - `shape`: vertices along warp and weft. `step`: longest time step, [s].
 
-    scenario: str
-    number: int = 0
-    unseen: bool = False
-    seed: int = 0
+    Every member of its ensemble settles by itself, and has self-contact, as the recording. The
+    other fabrics are sheets whose Young's modulus is so many times as large (`OTHERS`).
+    """
+
+    settings: ClassVar[tuple[Any, ...]] = (GRIP, OTHERS)
+
     material: Material = Material()
-    resolution: Resolution = Resolution()
-    fabric: str = FABRIC
+    shape: tuple[int, int] = (25, 25)
+    step: float = STEP
 
     def __post_init__(self) -> None:
         if self.scenario not in SCENARIOS:
             raise ValueError(f"{FABRIC} has {', '.join(SCENARIOS)}, not {self.scenario}")
-
-    @property
-    def name(self) -> str:
-        return f"{self.scenario}_{self.fabric}_{'u' * self.unseen}{self.number}"
 
     @property
     def compilation_group(self) -> str:
@@ -112,75 +88,39 @@ class MujocoRecording(SimulatedRecording):
     def small_strain_fabric(self) -> Fabric | None:
         return as_plate(self.material)
 
-    def make(self, folder: Path, out: Path) -> dict[str, Any]:
-        """Simulate the recording; raises as `moved`."""
+    @property
+    def others(self) -> Mapping[str, Material]:
+        """Sheets of other moduli, by the factor."""
+        return {f"{factor:g}": self.stiffer(self.material, factor) for factor in OTHERS}
+
+    def stiffer(self, material: Material, factor: float) -> Material:
+        """A material with `factor` times the Young's modulus."""
+        return material._replace(young=factor * material.young)
+
+    def simulate(
+        self,
+        material: Material,
+        shape: tuple[int, int],
+        experiment: Experiment,
+        steps: int = 1,
+        start: Shape | None = None,
+    ) -> Moved:
+        """A motion, `steps` for one; raises as `moved`."""
+        scenario = experiment.scenario(shape)
+        return Moved(moved(scenario, material, self.step / steps), scenario.scene.mesh)
+
+    def record(self, out: Path) -> Recording:
+        """As of the base; raises as `moved`."""
         experiment = self.experiment
-        scenario = experiment.scenario(self.resolution.shape)
+        scenario = experiment.scenario(self.shape)
         number = number_of(self.fabric, self.scenario, self.number, self.unseen)
         key = jr.fold_in(jr.key(self.seed), number)
-        x = moved(scenario, self.material, self.resolution.step)
-        if self.unseen and scenario.brake is not None:
-            np.save(out / START, x[0].reshape(*self.resolution.shape, 3))
-        made = synthetic.seen_of(
-            jnp.asarray(x, float),
-            experiment,
-            scenario,
-            self.fabric,
-            self.number,
-            self.sensing,
-            key=key,
-        )
-        source = f"MuJoCo's flex: {made.info.source}"
-        info = dataclasses.replace(made.info, name=self.name, source=source)
-        save(dataclasses.replace(made, info=info), out / RECORDING)
-        return {"seed": self.seed, "frames": len(made.times)}
-
-
-@dataclass(frozen=True)
-class MujocoEnsemble(Task):
-    """The ensemble of a recording of MuJoCo's sheet, as `r2s.study.ensembles.EnsembleTask`.
-
-    Every member is MuJoCo's, settles by itself, and has self-contact, as the recording. The other
-    fabrics are sheets whose Young's modulus is so many times as large.
-    """
-
-    kind: ClassVar[str] = "ensembles"
-    settings: ClassVar[tuple[Any, ...]] = (STIFFNESS, PATH, FINER, COARSER, POINTS)
-    lacks_layers: ClassVar[bool] = False
-
-    recording: MujocoRecording
-    others: tuple[float, ...] = OTHERS
-
-    @property
-    def name(self) -> str:
-        return self.recording.name
-
-    @property
-    def compilation_group(self) -> str:
-        return f"ensembles of MuJoCo {self.recording.scenario}"
-
-    def make(self, folder: Path, out: Path) -> dict[str, Any]:
-        """Distances [m] of every member from the truth in each frame.
-
-        Raises as `moved`, also where a member diverges.
-        """
-        source = self.recording
-        experiment, material, (shape, step) = source.experiment, source.material, source.resolution
-
-        def simulate(
-            material: Material, shape: tuple[int, int], experiment: Experiment, steps: int = 1
-        ) -> Moved:
-            scenario = experiment.scenario(shape)
-            return Moved(moved(scenario, material, step / steps), scenario.scene.mesh)
-
-        def stiffer(material: Material, factor: float) -> Material:
-            return material._replace(young=factor * material.young)
-
-        base = simulate(material, shape, experiment)
-        others = {f"{factor:g}": stiffer(material, factor) for factor in self.others}
-        found = member_distances(base, material, shape, experiment, simulate, stiffer, others)
-        found["recording"] = [recorded_distances(source, folder, base)]
-        return save_ensemble(out, experiment, found)
+        x = jnp.asarray(moved(scenario, self.material, self.step), float)
+        self.save_start(out, scenario, x)
+        arguments = x, experiment, scenario, self.fabric, self.number, self.sensing
+        made = synthetic.seen_of(*arguments, key=key)
+        info = dataclasses.replace(made.info, source=f"MuJoCo's flex: {made.info.source}")
+        return dataclasses.replace(made, info=info)
 
 
 def as_plate(material: Material) -> Fabric:
@@ -188,8 +128,7 @@ def as_plate(material: Material) -> Fabric:
 
     A thin isotropic plate (Timoshenko and Woinowsky-Krieger, "Theory of plates and shells", 1959):
     E h / (1 - nu^2) [N/m], and E h^3 / (12 (1 - nu^2)) [N m] with a Poisson's ratio of bending of
-    zero, as other fabrics of r2s: alike where a sheet bends one way. Hinges on triangles, air and
-    contact are not the fabric's, so it moves as the sheet does only in part.
+    zero, as other fabrics of r2s.
     """
     young, poisson, thickness = material.young, material.poisson, material.thickness
     stiff = young * thickness / (1 - poisson**2)
@@ -216,9 +155,8 @@ def moved(
     - `scenario`: gives mesh, grippers, table and frames; its elements and solver are not used.
     - `step`: longest time step, [s].
 
-    Held vertices go along the path to rounding. A sheet that hangs comes to rest before its first
-    frame, braked as in `r2s.scenarios`. The same arguments give the same numbers on one machine.
-    Raises `ImportError` that names the extra, and `RuntimeError` that says when it diverges.
+    A sheet that hangs comes to rest before its first frame, braked as in `r2s.scenarios`. Raises
+    `ImportError` that names the extra, and `RuntimeError` that says when it diverges.
     """
     mujoco = mujoco_module()
     mujoco.set_mju_user_warning(lambda message: None)  # or it writes a log file where it is run
@@ -235,15 +173,18 @@ def moved(
     brake = 0.0 if scenario.brake is None else float(scenario.brake)
     model.dof_damping[:] = brake * is_free * model.body_mass[model.dof_bodyid]
     frames = scenario.num_frames + scenario.lead_in - 1
-    path = _path(scenario, np.arange(frames * substeps + 1) / substeps - scenario.lead_in)
-    path = path.reshape(len(path), -1) - flat.ravel()[pinned]
+    steps = np.arange(frames * substeps + 1) / substeps - scenario.lead_in  # in frames
+    times = float(scenario.first_time) + scenario.interval * steps
+    knots, path = np.asarray(scenario.path_times, float), np.asarray(scenario.path, float)
+    placed = [np.interp(times, knots, along) for along in path.reshape(len(knots), -1).T]
+    path = np.stack(placed, axis=1) - flat.ravel()[pinned]
     velocity = np.diff(path, axis=0) / dt
-    found = np.empty((scenario.num_frames, *flat.shape))
+    x = np.empty((scenario.num_frames, *flat.shape))
     for frame in range(frames):
         if frame == scenario.lead_in:
             model.dof_damping[:] = 0
         if frame >= scenario.lead_in:
-            found[frame - scenario.lead_in] = flat + data.qpos.reshape(flat.shape)
+            x[frame - scenario.lead_in] = flat + data.qpos.reshape(flat.shape)
         for count in range(frame * substeps, (frame + 1) * substeps):
             data.qpos[pinned], data.qvel[pinned] = path[count], velocity[count]
             mujoco.mj_step(model, data)
@@ -252,39 +193,34 @@ def moved(
             raise RuntimeError(
                 f"MuJoCo's sheet diverged after {when:g} s: try steps below {dt:.2g} s"
             )
-    found[-1] = flat + data.qpos.reshape(flat.shape)
-    return found
-
-
-def _path(scenario: Scenario, frames: Float[np.ndarray, " step"]) -> np.ndarray:
-    """Places [m] of the pinned vertices (step, vertex, 3) at times counted in frames."""
-    times = float(scenario.first_time) + scenario.interval * frames
-    knots, path = np.asarray(scenario.path_times, float), np.asarray(scenario.path, float)
-    placed = [np.interp(times, knots, along) for along in path.reshape(len(knots), -1).T]
-    return np.stack(placed, axis=1).reshape(-1, *path.shape[1:])
+    x[-1] = flat + data.qpos.reshape(flat.shape)
+    return x
 
 
 def _mjcf(scenario: Scenario, material: Material, dt: float) -> str:
     """The model: a body for each vertex, where it is when the sheet is flat and unstretched."""
     mesh, pinned = scenario.scene.mesh, set(np.asarray(scenario.scene.pinned).tolist())
-    contact = f'friction="{material.friction} 0.005 0.0001" solref="{_text(material.solref)}"'
-    contact += f' solimp="{_text(material.solimp)}"'
+    contact = f'friction="{material.friction} 0.005 0.0001" {CONTACT}'
     elastic = " ".join(f'{name}="{getattr(material, name)}"' for name in ELASTICITY)
     names = " ".join(f"v{i}" for i in range(len(mesh.rest)))
-    areas = np.asarray(mesh.vertex_area, np.float64)
-    places = _flat(scenario)
-    bodies = "\n".join(
-        _body(i, place, area, material, i in pinned)
-        for i, (place, area) in enumerate(zip(places, areas.tolist(), strict=True))
-    )
+    joints = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in AXES)
+    places, areas = _flat(scenario).tolist(), np.asarray(mesh.vertex_area, np.float64).tolist()
+    bodies = ""
+    for i, (place, area) in enumerate(zip(places, areas, strict=True)):
+        mass = GRIP if i in pinned else material.density * area
+        inertia = _text([mass * area / 6] * 3)  # of a cube with faces of the vertex's area
+        floats = ' gravcomp="1"' if i in pinned else ""
+        bodies += f'    <body name="v{i}" pos="{_text(place)}"{floats}>'
+        bodies += (
+            f'<inertial pos="0 0 0" mass="{mass!r}" diaginertia="{inertia}"/>{joints}</body>\n'
+        )
     return f"""<mujoco>
-  <option timestep="{dt!r}" gravity="0 0 -{GRAVITY}" density="{material.air}"
+  <option timestep="{dt!r}" gravity="0 0 -{GRAVITY}" density="{AIR_DENSITY}"
       integrator="discrete" solver="CG" cone="elliptic"/>
   <size memory="1G"/>
   <worldbody>
     <geom type="plane" size="0 0 1" pos="0 0 {float(scenario.scene.table.height)}" {contact}/>
-{bodies}
-  </worldbody>
+{bodies}  </worldbody>
   <deformable>
     <flex name="sheet" dim="2" radius="{material.radius}" body="{names}"
         element="{_text(np.asarray(mesh.faces).ravel().tolist())}">
@@ -294,16 +230,6 @@ def _mjcf(scenario: Scenario, material: Material, dt: float) -> str:
   </deformable>
 </mujoco>
 """
-
-
-def _body(i: int, place: np.ndarray, area: float, material: Material, is_pinned: bool) -> str:
-    """A vertex: a cube with faces of its `area` [m^2] to the air, which does not turn."""
-    mass = GRIP if is_pinned else material.density * area
-    joints = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in AXES)
-    inertia = _text([mass * area / 6] * 3)
-    inertial = f'<inertial pos="0 0 0" mass="{mass!r}" diaginertia="{inertia}"/>'
-    floats = ' gravcomp="1"' if is_pinned else ""
-    return f'    <body name="v{i}" pos="{_text(place.tolist())}"{floats}>{inertial}{joints}</body>'
 
 
 def _flat(scenario: Scenario) -> Float[np.ndarray, "vertex 3"]:

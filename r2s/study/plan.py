@@ -13,23 +13,23 @@ from r2s.materials import presets
 from r2s.scenarios.paths import ESTIMATION, EVALUATION
 from r2s.study.configuration import (
     MOTIONS,
+    ON_CLOTH,
     PAPER_CONFIGURATIONS,
     PUBLISHED_CONFIGURATIONS,
     TOGETHER_CONFIGURATIONS,
     Configuration,
 )
 from r2s.study.estimates import SOLVERS, Budgets, EstimateTask, TrainedNetwork
-from r2s.study.evaluations import MIDDLE, EvaluationTask
+from r2s.study.evaluations import EvaluationTask
 from r2s.study.mujoco import FABRIC as FLEX
 from r2s.study.mujoco import SCENARIOS as IN_MUJOCO
-from r2s.study.mujoco import Material, MujocoRecording, mujoco_module
+from r2s.study.mujoco import MujocoRecording, mujoco_module
 from r2s.study.recordings import (
     GivenRecording,
     Source,
     SyntheticRecording,
     TruthSettings,
     find_recordings,
-    strain_dependent,
     with_measured_tables,
 )
 
@@ -80,7 +80,6 @@ ALL = Plan(
     fabrics=(*presets.FIVE, FLEX),
     repeats=ESTIMATION,
     judged=EVALUATION // len(MOTIONS),
-    truth=TruthSettings(self_contact=True),
 )
 QUICK = Budgets(
     diffcp=METHODS["diffcp"].budget._replace(num_samples=4, num_starts=1),
@@ -124,12 +123,9 @@ PRESETS = {
 
 
 def configuration_named(text: str) -> Configuration:
-    """The configuration written as "diffcloud-cloth-lifting".
-
-    Raises `ValueError` that gives the reason of one that its approach refuses, and for any other
-    the names of all.
-    """
-    names = {"-".join(each): each for each in FULL}
+    """The configuration written as "diffcloud-cloth-lifting". Raises `ValueError` that says why its
+    approach refuses it, or names all configurations."""
+    names = {"-".join(configuration): configuration for configuration in FULL}
     if text not in names:
         approach, *others = text.rsplit("-", 2)
         if approach in METHODS and len(others) == 2:
@@ -148,14 +144,8 @@ def with_changes(
     materials: str = "",
     seed: int = 0,
 ) -> Plan:
-    """A plan with other settings; None or empty leaves a setting unchanged.
-
-    - `configurations`: their names, such as "diffcloud-cloth-lifting".
-    - `materials`: a folder of measured tables, see `TruthSettings`.
-
-    Raises `ValueError` for numbers below 1 and unknown names, and what `with_measured_tables`
-    raises.
-    """
+    """A plan with other settings; None or empty leaves a setting unchanged. Raises `ValueError` for
+    numbers below 1 and unknown configurations, and what `with_measured_tables` raises."""
     for name, number in (("repeats", repeats), ("judged", judged)):
         if number is not None and number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
@@ -172,40 +162,35 @@ def with_changes(
 
 
 def synthetic(plan: Plan) -> list[EvaluationTask]:
-    """The evaluations of a study of synthetic recordings, which depend on all other tasks.
+    """The evaluations of a study of synthetic recordings, which depend on all other tasks; of
+    MuJoCo's sheet for the scenarios that it supports. Raises `ValueError` for an unknown fabric."""
 
-    MuJoCo's sheet has the configurations whose scenario it supports. Raises `ValueError` for an
-    unknown fabric.
-    """
-
-    def recording(fabric: str, scenario: str, number: int, is_unseen: bool, angle=None) -> Source:
+    def recording(fabric: str, scenario: str, number: int, **settings):
         if fabric == FLEX:
-            return MujocoRecording(scenario, number, is_unseen, plan.seed)
-        return SyntheticRecording(
-            fabric, scenario, number, is_unseen, plan.truth, plan.seed, angle=angle
-        )
+            return MujocoRecording(fabric, scenario, number, seed=plan.seed, **settings)
+        settings["truth"] = plan.truth
+        return SyntheticRecording(fabric, scenario, number, seed=plan.seed, **settings)
 
-    found = []
+    evaluations = []
     for fabric in plan.fabrics:
-        is_flex = fabric == FLEX
-        density = Material().density if is_flex else strain_dependent(fabric, plan.truth).density
         unseen = [
-            tuple(recording(fabric, scenario, number, True) for number in range(plan.judged))
+            tuple(recording(fabric, scenario, i, unseen=True) for i in range(plan.judged))
             for scenario in MOTIONS
         ]
+        density = float(unseen[0][0].material.density)
         estimates = []
         for configuration in plan.configurations:
-            if is_flex and not set(configuration.scenarios) <= set(IN_MUJOCO):
+            if fabric == FLEX and not set(configuration.scenarios) <= set(IN_MUJOCO):
                 continue
             for repeat in range(plan.repeats):
                 sources = tuple(
-                    recording(fabric, scenario, repeat, False, angle)
+                    recording(fabric, scenario, repeat, **pull)
                     for scenario in configuration.scenarios
-                    for angle in _angles(configuration, scenario)
+                    for pull in _pulls(configuration, scenario)
                 )
-                estimates.append(_estimate(configuration, sources, float(density), plan, repeat))
-        found += _evaluations(estimates, fabric, float(density), unseen, plan)
-    return found
+                estimates.append(_estimate(configuration, sources, density, plan, repeat))
+        evaluations += _evaluations(estimates, fabric, density, unseen, plan)
+    return evaluations
 
 
 def check_simulators(tasks: Iterable[EvaluationTask]) -> None:
@@ -217,62 +202,60 @@ def check_simulators(tasks: Iterable[EvaluationTask]) -> None:
             raise ImportError(f"{error}, or leave {FLEX} out of --fabrics") from error
 
 
-def _angles(configuration: Configuration, scenario: str) -> tuple[float | None, ...]:
-    """Of the pulls of a scenario to the warp [degrees]; None: a standard motion, along the warp."""
+def _pulls(configuration: Configuration, scenario: str) -> list[dict[str, float]]:
+    """The angles of the pulls of a scenario; one without an angle is a standard motion."""
     is_pulled = configuration.approach == "pinn" or len(configuration.scenarios) > 1
-    return PULLS if is_pulled and scenario == "stretching" else (None,)
+    return [{"angle": angle} for angle in PULLS if is_pulled and scenario == "stretching"] or [{}]
 
 
 def recorded(folder: Path, density: float, plan: Plan) -> list[EvaluationTask]:
     """The evaluations of a study of the recordings in a folder.
 
-    - `density`: areal density to assume, [kg/m^2].
-    - `plan`: gives budgets and configurations; those without a recording to estimate from are left
-      out.
+    `density`: areal density to assume, [kg/m^2]. `plan`: gives budgets and configurations.
 
     Each recording is a repeat. An estimate is evaluated on those `MOTIONS` of the same fabric and
     trial (of all trials where that trial has none) that it has not seen, and so is the estimate of
     another fabric. Raises what `find_recordings` raises, and `ValueError` for a density that is
-    not positive, and when nothing is there to estimate from or to evaluate on.
+    not positive, and without recordings to estimate from or to evaluate on.
     """
     default_space("cloth", density)  # raises for a density that is not positive
     # clouds of real cameras need the whole search, and there are few frames to evaluate on
     budgets = dataclasses.replace(plan.budgets, diffcloud=METHODS["diffcloud"].budget)
     plan = dataclasses.replace(plan, budgets=budgets, every=1)
     recordings = find_recordings(folder)
-    wanted = {each for c in plan.configurations for each in c.scenarios}
-    seen = [r for r in recordings if r.scenario in wanted]
+    wanted = {scenario for c in plan.configurations for scenario in c.scenarios}
+    sources = [r for r in recordings if r.scenario in wanted]
     unseen = [r for r in recordings if r.scenario in MOTIONS]
-    if not seen or not unseen:
+    if not sources or not unseen:
         raise ValueError(
             f"{folder}: nothing to estimate from ({', '.join(ESTIMATED_FROM)}) or to judge by "
             f"({', '.join(MOTIONS)}); found {sorted({r.scenario for r in recordings})}"
         )
-    found: list[EvaluationTask] = []
+    evaluations: list[EvaluationTask] = []
     for configuration in plan.configurations:
         estimates = [
-            _estimate(configuration, sources, density, plan, repeat)
-            for repeat, sources in enumerate(_together(seen, configuration.scenarios))
+            _estimate(configuration, group, density, plan, repeat)
+            for repeat, group in enumerate(_together(sources, configuration.scenarios))
         ]
         for index, estimate in enumerate(estimates):
             same = [r for r in unseen if r.fabric == estimate.fabric]
             trial = getattr(estimate.sources[0], "trial", "")
             same = [r for r in same if r.trial == trial] or same
             by_scenario: dict[str, list[Source]] = defaultdict(list)
-            for each in same:
-                if each not in estimate.sources:
-                    by_scenario[each.scenario].append(each)
-            judged = [tuple(each) for each in by_scenario.values()]
-            found += _evaluations([estimate], estimate.fabric, density, judged, plan)
+            for recording in same:
+                if recording not in estimate.sources:
+                    by_scenario[recording.scenario].append(recording)
+            judged = [tuple(group) for group in by_scenario.values()]
+            evaluations += _evaluations([estimate], estimate.fabric, density, judged, plan)
             following = [*estimates[index + 1 :], *estimates[:index]]
             other = next((e for e in following if e.fabric != estimate.fabric), None)
             if other is not None:
-                own = configuration.solver, density, estimate.fabric
-                found += [
-                    EvaluationTask(other, *own, together, other=True, every=plan.every)
-                    for together in judged
+                whose = other, configuration.solver, density, estimate.fabric
+                evaluations += [
+                    EvaluationTask(*whose, group, "other_fabric", every=plan.every)
+                    for group in judged
                 ]
-    return list(dict.fromkeys(found))  # configurations share the default fabric
+    return list(dict.fromkeys(evaluations))  # configurations share the default fabric
 
 
 def _evaluations(
@@ -290,26 +273,18 @@ def _evaluations(
     if not estimates:
         return []
     solvers = dict.fromkeys(("cloth", *(estimate.solver for estimate in estimates)))
-    is_known = all(each.small_strain_fabric is not None for group in judged for each in group)
-    whose: list[tuple[EstimateTask | None, str, int | None]] = []
-    for solver in solvers:
-        whose += [(None, solver, draw) for draw in (*range(plan.draws), MIDDLE)]
-        whose += [(None, solver, None)] if is_known else []
-    whose += [(each, each.solver, None) for each in estimates]
-    whose += [(each, "cloth", None) for each in estimates if each.solver != "cloth"]
+    is_known = all(r.small_strain_fabric is not None for group in judged for r in group)
+    references = [*(("default", i) for i in range(plan.draws)), ("middle", 0)]
+    references += [("true", 0)] if is_known else []
+    whose: list[tuple[EstimateTask | None, str, str, int]] = []
+    whose += [(None, solver, *reference) for solver in solvers for reference in references]
+    whose += [(estimate, estimate.solver, "", 0) for estimate in estimates]
+    whose += [(each, "cloth", ON_CLOTH, 0) for each in estimates if each.solver != "cloth"]
     return [
-        EvaluationTask(
-            estimate,
-            solver,
-            density,
-            fabric,
-            recordings[first : first + TOGETHER],
-            draw=draw,
-            every=plan.every,
-        )
-        for estimate, solver, draw in whose
-        for recordings in judged
-        for first in range(0, len(recordings), TOGETHER)
+        EvaluationTask(estimate, solver, density, fabric, part, baseline, draw, plan.every)
+        for estimate, solver, baseline, draw in whose
+        for group in judged
+        for part in (group[i : i + TOGETHER] for i in range(0, len(group), TOGETHER))
     ]
 
 
@@ -340,8 +315,7 @@ def _estimate(
         own or getattr(plan.budgets, approach),
         network,
         repeat,
-        prior="fabrics" if as_commands_do else "flat",
-        resolves=as_commands_do,
+        informed=as_commands_do,
         law="told" if as_commands_do else "linear",
     )
 
@@ -350,15 +324,15 @@ def _together(
     recordings: Iterable[GivenRecording], scenarios: Sequence[str]
 ) -> list[tuple[GivenRecording, ...]]:
     """The recordings of each estimate: each recording of one scenario alone, those of several
-    scenarios by fabric and trial, where all of them are there."""
+    scenarios by fabric and trial, if all scenarios are among them."""
     if len(scenarios) == 1:
-        return [(each,) for each in recordings if each.scenario == scenarios[0]]
+        return [(recording,) for recording in recordings if recording.scenario == scenarios[0]]
     trials: dict[tuple[str, str], list[GivenRecording]] = defaultdict(list)
-    for each in recordings:
-        if each.scenario in scenarios:
-            trials[each.fabric, each.trial].append(each)
+    for recording in recordings:
+        if recording.scenario in scenarios:
+            trials[recording.fabric, recording.trial].append(recording)
     return [
-        tuple(sorted(every, key=lambda each: scenarios.index(each.scenario)))
-        for every in trials.values()
-        if {each.scenario for each in every} == set(scenarios)
+        tuple(sorted(group, key=lambda recording: scenarios.index(recording.scenario)))
+        for group in trials.values()
+        if {recording.scenario for recording in group} == set(scenarios)
     ]

@@ -2,22 +2,24 @@
 
 Synthetic recordings do not come from the estimators' own model: except for folds, whose layers
 touch, their mesh is finer, their time steps are shorter, and their fabrics stiffen with the strain
-and soften with the curvature, as measured ones do. (DIFFCLOUD from a lift and pulls together
-estimates such laws; all other configurations have constant stiffness.) Recordings of MuJoCo's sheet
-are of another simulator (`r2s.study.mujoco`).
+and soften with the curvature, as measured ones do.
 """
 
 import dataclasses
 import math
+from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Float
 from scipy.interpolate import RegularGridInterpolator
 
 from r2s.compilation import compile_once
@@ -27,6 +29,7 @@ from r2s.materials import presets
 from r2s.materials.arcsim import read_material
 from r2s.materials.fabric import Fabric, constant_laws
 from r2s.materials.stiffening import SofteningPlate, StiffeningMembrane
+from r2s.mesh.mesh import Mesh
 from r2s.recordings import manifest
 from r2s.recordings.recording import Recording, load, save
 from r2s.scenarios import synthetic
@@ -34,27 +37,21 @@ from r2s.scenarios.paths import draw
 from r2s.scenarios.resolution import explicit_cloth
 from r2s.scenarios.scenario import Scenario, rollout
 from r2s.scenarios.standard import SCENARIOS, STRETCHING_INTERVAL, Experiment
+from r2s.solvers.simulate import Solution
 from r2s.study.tasks import Task, result_files
 
 RECORDING = "recording.npz"
 START = "start.npy"  # the shape of a hanging sheet in its first frame
 STRETCH = 1.1  # where half of `TruthSettings.stiffening` is reached; Wang et al. 2011: up to 1.167
 SOFTENING, KNEE = 0.35, 20.0  # [-] and [1/m], of a `SofteningPlate`
-# Not measured: one sample for each fabric, within the range of fabrics.
-DAMPING = {
-    "camel_ponte_roma": 0.016,
-    "black_denim": 0.006,
-    "grey_interlock": 0.009,
-    "pink_solid": 0.004,
-    "red_jet_set": 0.012,
-}  # [s]
-FRICTION = {
-    "camel_ponte_roma": 0.62,
-    "black_denim": 0.45,
-    "grey_interlock": 0.37,
-    "pink_solid": 0.55,
-    "red_jet_set": 0.28,
-}  # [-]
+# Damping [s] and friction [-]. Not measured: one sample for each fabric, in the range of fabrics.
+LOSSES = {
+    "camel_ponte_roma": (0.016, 0.62),
+    "black_denim": (0.006, 0.45),
+    "grey_interlock": (0.009, 0.37),
+    "pink_solid": (0.004, 0.55),
+    "red_jet_set": (0.012, 0.28),
+}
 PULL_FRAMES = 48  # of a pull for `r2s.estimation.pinn`: the longest ends before the last of them
 LAYERED = (17, 17)  # vertices at most of a sheet that touches itself, in implicit steps
 SAME_SCENARIO = {"lift": "lifting", "fold": "folding"}  # names in other data sets
@@ -75,10 +72,8 @@ class TruthSettings:
     - `stiffening`: stiffness along a yarn at large strain over that at zero strain; half of the
       increase is reached at an extension of 10 %. Bending softens, too
       (`r2s.materials.stiffening`). Assumed, not measured. 0: constant stiffness of both.
-    - `materials`: a folder of ARCSim material files, FABRIC.json of every preset, with measured
-      tables to use instead; "": none.
-    - `materials_digest`: a hash of those files, from `with_measured_tables`.
-    - `self_contact`: whether the sheet touches itself in a fold.
+    - `materials`, `materials_digest`: a folder with measured tables to use instead, and a hash of
+      it, see `with_measured_tables`; "": none.
     """
 
     shape: tuple[int, int] = (33, 33)
@@ -86,22 +81,24 @@ class TruthSettings:
     stiffening: float = 2.0
     materials: str = ""
     materials_digest: str = ""
-    self_contact: bool = True
 
 
+class Moved(NamedTuple):
+    """Positions [m] of the vertices of a mesh in the frames of a motion."""
+
+    x: np.ndarray
+    mesh: Mesh
+
+
+@dataclass(frozen=True)
 class Source(Task):
     """A recording of a `fabric` in a `scenario`."""
 
     kind: ClassVar[str] = "recordings"
     is_given: ClassVar[bool] = False  # read, not simulated
 
-    fabric: str  # fields of each subclass, in the order that keys have
+    fabric: str
     scenario: str
-
-    @property
-    def has_start(self) -> bool:
-        """Whether the shape of the sheet in the first frame is known."""
-        return False
 
     @property
     def small_strain_fabric(self) -> Fabric | None:
@@ -109,6 +106,7 @@ class Source(Task):
         return None
 
 
+@dataclass(frozen=True)
 class SimulatedRecording(Source):
     """A recording of a motion of `r2s.scenarios`, by any simulator.
 
@@ -116,24 +114,64 @@ class SimulatedRecording(Source):
       `r2s.scenarios.paths.LIMITS`, the same for all fabrics.
     - `unseen`: whether it is for evaluation: its motion is none to estimate from, and its clouds
       are the whole surface without noise.
+
+    A subclass simulates its motion, and those of an ensemble (`r2s.study.ensembles`), with a
+    `material` in its own terms. Where `keeps_start`, a hanging sheet starts in the truth's shape.
     """
 
-    number: int
-    unseen: bool
-    seed: int
+    keeps_start: ClassVar[bool] = False
+
+    number: int = 0
+    unseen: bool = False
+    seed: int = 0
 
     @property
-    def has_start(self) -> bool:
-        return self.experiment.sheet.weft[2] != 0  # else it lies on the table
+    def name(self) -> str:
+        return f"{self.scenario}_{self.fabric}_{'u' * self.unseen}{self.number}"
+
+    @property
+    def compilation_group(self) -> str:
+        return f"recordings {self.scenario}"
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, int]:
+        """Vertices along warp and weft."""
 
     @property
     def experiment(self) -> Experiment:
-        return experiment_of(self.scenario, self.number, self.unseen, self.seed)
+        """The motion, the same for all fabrics."""
+        if self.number == 0 and not self.unseen:
+            return SCENARIOS[self.scenario]()
+        key = jr.fold_in(jr.key(self.seed), number_of(self.scenario))
+        (numbers,) = draw(self.scenario, 1, key=jr.fold_in(key, 2 * self.number + self.unseen))
+        return SCENARIOS[self.scenario](**numbers)
 
     @property
     def sensing(self) -> synthetic.Sensing:
         """How cameras observe it."""
         return synthetic.WHOLE if self.unseen else synthetic.sensing(self.experiment)
+
+    @property
+    def has_layers(self) -> bool:
+        """Whether the sheet touches itself, and the members of its ensemble do not."""
+        return False
+
+    def make(self, folder: Path, out: Path) -> dict[str, Any]:
+        """Simulate the recording."""
+        made = self.record(out)
+        info = dataclasses.replace(made.info, name=self.name, trial=str(self.number))
+        save(dataclasses.replace(made, info=info), out / RECORDING)
+        return {"seed": self.seed, "frames": len(made.times)}
+
+    @abstractmethod
+    def record(self, out: Path) -> Recording:
+        """Simulate the recording, and `save_start`."""
+
+    def save_start(self, out: Path, scenario: Scenario, x: Any) -> None:
+        """Write the shape in the first frame of a hanging sheet for evaluation."""
+        if self.unseen and scenario.brake is not None:
+            np.save(out / START, np.asarray(x[0]).reshape(*self.shape, 3))
 
 
 @dataclass(frozen=True)
@@ -145,15 +183,11 @@ class SyntheticRecording(SimulatedRecording):
     """
 
     settings: ClassVar[tuple[Any, ...]] = (
-        *(STRETCH, SOFTENING, KNEE, DAMPING, FRICTION, PULL_FRAMES, LAYERED),
+        *(STRETCH, SOFTENING, KNEE, LOSSES, PULL_FRAMES, LAYERED),
     )
+    keeps_start: ClassVar[bool] = True
 
-    fabric: str
-    scenario: str
-    number: int = 0
-    unseen: bool = False
     truth: TruthSettings = TruthSettings()
-    seed: int = 0
     angle: float | None = None
 
     @property
@@ -162,56 +196,78 @@ class SyntheticRecording(SimulatedRecording):
         return f"{self.scenario}_{self.fabric}{turned}_{'u' * self.unseen}{self.number}"
 
     @property
-    def compilation_group(self) -> str:
-        return f"recordings {self.scenario}"
-
-    @property
     def has_layers(self) -> bool:
-        """Whether the sheet touches itself."""
-        return self.truth.self_contact and self.scenario == "folding"
+        return self.scenario == "folding"
 
     @property
     def small_strain_fabric(self) -> Fabric | None:
         return None if self.truth.materials else small_strain(self.fabric)
 
-    def make(self, folder: Path, out: Path) -> dict[str, Any]:
-        """Simulate the recording."""
-        fabric, truth = strain_dependent(self.fabric, self.truth), self.truth
+    @property
+    def material(self) -> Fabric:
+        return strain_dependent(self.fabric, self.truth)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.truth.shape
+
+    @property
+    def others(self) -> Mapping[str, Fabric]:
+        """The truths of all other presets."""
+        names = [name for name in presets.FIVE if name != self.fabric]
+        return {name: strain_dependent(name, self.truth) for name in names}
+
+    def simulate(
+        self,
+        material: Fabric,
+        shape: tuple[int, int],
+        experiment: Experiment,
+        steps: int = 1,
+        start: Shape | None = None,
+    ) -> Moved:
+        """A motion in explicit steps, `steps` for one; NaN from where it diverged."""
+        scenario = started(experiment.scenario(shape), start)
+        motion = _moved(scenario, material, steps)
+        ok = np.logical_and.accumulate(np.asarray(motion.ok))[:, None, None]
+        return Moved(np.where(ok, np.asarray(motion.x), np.nan), scenario.scene.mesh)
+
+    def stiffer(self, material: Fabric, factor: float) -> Fabric:
+        """A fabric whose membrane and bending energies are `factor` times as large."""
+
+        def where(f: Fabric) -> list:
+            membrane = getattr(f.membrane, "small", f.membrane)
+            bending = getattr(f.bending, "small", f.bending)
+            return [membrane, bending.stiffness]
+
+        parts = [jax.tree.map(lambda leaf: factor * leaf, part) for part in where(material)]
+        return eqx.tree_at(where, material, parts)
+
+    def record(self, out: Path) -> Recording:
         key = jr.fold_in(jr.key(self.seed), number_of(self.fabric, self.scenario, self.number))
         if self.angle is not None:
-            made = pulled(
-                fabric,
+            return pulled(
+                self.material,
                 self.fabric,
                 math.radians(self.angle),
-                shape=truth.shape,
+                shape=self.shape,
                 frames=PULL_FRAMES,
-                steps=math.ceil(STRETCHING_INTERVAL / truth.max_step - 1e-9),
+                steps=math.ceil(STRETCHING_INTERVAL / self.truth.max_step - 1e-9),
                 key=jr.fold_in(key, round(self.angle)),
                 **pull_of(self.number, self.angle, self.seed),
             )
-        else:
-            made = self._recorded(fabric, out, key)
-        info = dataclasses.replace(made.info, name=self.name, trial=str(self.number))
-        save(dataclasses.replace(made, info=info), out / RECORDING)
-        return {"seed": self.seed, "frames": len(made.times)}
-
-    def _recorded(self, fabric: Fabric, out: Path, key: PRNGKeyArray) -> Recording:
-        """A motion of `r2s.scenarios`; writes the start of a hanging sheet for evaluation."""
-        truth, layers, motion = self.truth, self.has_layers, None
-        shape = min(truth.shape, LAYERED) if layers else truth.shape
-        if not layers and self.scenario != "stretching":
-            scenario = self.experiment.scenario(shape)
-            motion = _rollout(scenario, fabric, solver=explicit_cloth(scenario, fabric))
-            if self.unseen and scenario.brake is not None:
-                np.save(out / START, np.asarray(motion.x[0]).reshape(*shape, 3))
+        motion, experiment = None, self.experiment
+        if not self.has_layers and self.scenario != "stretching":
+            scenario = experiment.scenario(self.shape)
+            motion = _moved(scenario, self.material)
+            self.save_start(out, scenario, motion.x)
         return synthetic.record(
-            self.experiment,
-            fabric,
+            experiment,
+            self.material,
             self.fabric,
             seen=self.sensing,
-            shape=shape,
-            max_step=truth.max_step,
-            self_contact=layers,
+            shape=min(self.shape, LAYERED) if self.has_layers else self.shape,
+            max_step=self.truth.max_step,
+            self_contact=self.has_layers,
             motion=motion,
             key=key,
         )
@@ -223,11 +279,9 @@ class GivenRecording(Source):
 
     is_given: ClassVar[bool] = True
 
+    trial: str
     folder: str
     recording: str
-    fabric: str
-    scenario: str
-    trial: str
     digest: str
 
     @property
@@ -237,12 +291,18 @@ class GivenRecording(Source):
     def make(self, folder: Path, out: Path) -> dict[str, Any]:
         """Read the recording, and store it as it was read."""
         rules = manifest.manifest_for(self.folder)
-        found = manifest.read_recording(self.folder, rules, self.recording)
-        save(found, out / RECORDING)
-        return {"frames": len(found.times), "verified": found.info.verified}
+        recording = manifest.read_recording(self.folder, rules, self.recording)
+        save(recording, out / RECORDING)
+        return {"frames": len(recording.times), "verified": recording.info.verified}
 
 
 _rollout = compile_once(rollout)
+
+
+def _moved(scenario: Scenario, fabric: Fabric, steps: int = 1) -> Solution:
+    solver = explicit_cloth(scenario, fabric)
+    solver = dataclasses.replace(solver, substeps=steps * solver.substeps)
+    return _rollout(scenario, fabric, solver=solver)
 
 
 def find_recordings(folder: Path) -> list[GivenRecording]:
@@ -251,18 +311,18 @@ def find_recordings(folder: Path) -> list[GivenRecording]:
     Raises what `r2s.recordings.manifest` raises, and `ValueError` when there is none.
     """
     rules = manifest.manifest_for(folder)
-    found = []
+    recordings = []
     for name in manifest.read_recordings(folder, rules):
         digest = sha256()
         for file in manifest.sources(folder, rules, name):
             digest.update(file.read_bytes())
         info = manifest.read_recording(folder, rules, name).info
         scenario = SAME_SCENARIO.get(info.scenario, info.scenario)
-        place = (str(folder), name, info.fabric, scenario, info.trial)
-        found.append(GivenRecording(*place, digest.hexdigest()))
-    if not found:
+        place = (info.fabric, scenario, info.trial, str(folder), name)
+        recordings.append(GivenRecording(*place, digest.hexdigest()))
+    if not recordings:
         raise ValueError(f"{folder}: no recording that a manifest describes")
-    return found
+    return recordings
 
 
 def read(source: Source, folder: Path) -> Recording:
@@ -276,10 +336,8 @@ def read_start(source: Source, folder: Path) -> Shape | None:
 
     None for a sheet that lies on the table, and for given recordings, where it is not known.
     """
-    if not source.has_start:
-        return None
     with result_files(source, folder) as files:
-        return np.load(files / START)
+        return np.load(files / START) if (files / START).exists() else None
 
 
 def started(scenario: Scenario, shape: Shape | None) -> Scenario:
@@ -287,12 +345,9 @@ def started(scenario: Scenario, shape: Shape | None) -> Scenario:
 
     A sheet that hangs from corners drawn together buckles into one of several shapes, by mesh and
     fabric: from a flat sheet the true fabric on another mesh may begin a centimetre away. The cloud
-    of the first frame does not fix that shape (a sheet laid onto it leaves it within 0.2 s); the
-    truth's own shape does.
+    of the first frame does not fix that shape; the truth's own does.
 
-    - `shape`: positions [m] of a regular grid of the sheet in the first frame, along warp and
-      weft; None: unknown, the scenario is unchanged.
-
+    `shape`: positions [m] of a regular grid along warp and weft; None: the scenario is unchanged.
     Raises `ValueError` for a sheet that lies on the table, which starts flat.
     """
     if shape is None:
@@ -309,19 +364,6 @@ def started(scenario: Scenario, shape: Shape | None) -> Scenario:
         path=scenario.path.at[0].set(pinned),
         lead_in=math.ceil(SETTLING / scenario.interval),
     )
-
-
-def experiment_of(scenario: str, number: int, unseen: bool, seed: int) -> Experiment:
-    """Motion `number` of a scenario, the same for all fabrics; see `SimulatedRecording`."""
-    if number == 0 and not unseen:
-        return SCENARIOS[scenario]()
-    return SCENARIOS[scenario](**numbers_of(scenario, number, unseen, seed))
-
-
-def numbers_of(scenario: str, number: int, unseen: bool, seed: int) -> dict[str, float]:
-    """The sampled parameters of a motion."""
-    key = jr.fold_in(jr.key(seed), number_of(scenario))  # scenarios do not share their numbers
-    return draw(scenario, 1, key=jr.fold_in(key, 2 * number + unseen))[0]
 
 
 def pull_of(number: int, angle: float, seed: int) -> dict[str, float]:
@@ -376,7 +418,7 @@ def strain_dependent(name: str, truth: TruthSettings = TruthSettings()) -> Fabri
 def small_strain(name: str) -> Fabric:
     """The preset with a truth's own damping and friction: `strain_dependent` at zero strain and
     curvature, which an estimate from a synthetic recording is compared with."""
-    damping, friction = (jnp.asarray(each[name], float) for each in (DAMPING, FRICTION))
+    damping, friction = (jnp.asarray(value, float) for value in LOSSES[name])
     return dataclasses.replace(presets.FIVE[name](), damping=damping, friction=friction)
 
 

@@ -4,10 +4,10 @@ A task is a frozen dataclass. Its fields say what it is made from, other tasks a
 is a hash of all of these. A file with that key is the result, and is not made again.
 """
 
+import io
 import json
 import os
 import platform
-import re
 import resource
 import tempfile
 import time
@@ -25,9 +25,7 @@ from typing import Any, ClassVar
 from r2s import compilation
 from r2s._util.files import source_hash, write_bytes
 
-# Files and folders of results call a task a cell, and so do their keys.
-FORMAT, FOLDER = "r2s-cell/1", "cells"
-CLASSES = re.compile(r"\b(Estimate|Evaluation|Ensemble)Task\(")
+FORMAT, FOLDER = "r2s-cell/1", "cells"  # files and folders of results call a task a cell
 KEY_LENGTH = 16  # hexadecimal digits of a key in a file's name
 METADATA = "about.json"  # among the files of a result
 MOST_MEMORY = 0.9e9  # [byte]: a process that holds more after a task clears its programs
@@ -69,15 +67,10 @@ class Task:
         """
 
     @property
-    def configuration_text(self) -> str:
-        """All fields, including those of the tasks that it depends on."""
-        return CLASSES.sub(r"\1Cell(", repr(self))
-
-    @property
     def key(self) -> str:
-        """A hash of the configuration, and of the settings of this task and its dependencies."""
+        """A hash of all fields, and of the settings of this task and its dependencies."""
         settings = [task.settings for task in with_dependencies([self])]
-        text = f"{FORMAT} {VERSIONS['r2s']} {self.configuration_text} {settings!r}"
+        text = f"{FORMAT} {VERSIONS['r2s']} {self!r} {settings!r}"
         return sha256(text.encode()).hexdigest()[:KEY_LENGTH]
 
     def path(self, folder: Path) -> Path:
@@ -98,25 +91,26 @@ def dependencies(task: Task) -> tuple[Task, ...]:
 
 def with_dependencies(tasks: Iterable[Task]) -> list[Task]:
     """Tasks and all their dependencies, dependencies first."""
-    found: dict[Task, None] = {}
+    ordered: dict[Task, None] = {}
 
     def visit(task: Task) -> None:
-        if task not in found:
-            for need in dependencies(task):
-                visit(need)
-            found[task] = None
+        if task not in ordered:
+            for dependency in dependencies(task):
+                visit(dependency)
+            ordered[task] = None
 
     for task in tasks:
         visit(task)
-    return list(found)
+    return list(ordered)
 
 
 def execute(task: Task, folder: Path) -> None:
     """Make the result of a task, unless it exists; raises what `make` and writing raise."""
-    path = task.path(folder)
     if task.is_made(folder):
         return
     began, cpu_began = time.perf_counter(), time.process_time()
+    unit = 1e6 if os.uname().sysname == "Darwin" else 1e3  # bytes there, kilobytes elsewhere
+    packed = io.BytesIO()
     with tempfile.TemporaryDirectory(prefix="r2s-") as scratch:
         noted = task.make(folder, Path(scratch))
         metadata = {
@@ -124,18 +118,21 @@ def execute(task: Task, folder: Path) -> None:
             "key": task.key,
             "kind": task.kind,
             "name": task.name,
-            "config": task.configuration_text,
+            "config": repr(task),
             "versions": VERSIONS,
             "source": source_hash()[:KEY_LENGTH],
             "processor": processor(),
             "seconds": time.perf_counter() - began,
             "cpu_seconds": time.process_time() - cpu_began,
-            "peak_memory_MB": _peak_memory(),  # of the process so far
+            "peak_memory_MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit,
             **noted,
         }
-        packed = _pack(Path(scratch), metadata)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, packed)
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr(METADATA, json.dumps(metadata, indent=2) + "\n")
+            for file in sorted(Path(scratch).iterdir()):
+                archive.write(file, file.name)
+    task.path(folder).parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(task.path(folder), packed.getvalue())
 
 
 def attempt(task: Task, folder: Path, key: str | None = None, *needs: str) -> str:
@@ -146,11 +143,11 @@ def attempt(task: Task, folder: Path, key: str | None = None, *needs: str) -> st
     """
     if key not in (None, task.key):
         return "a worker has another version of r2s: install the same everywhere"
-    if not all(need.is_made(folder) for need in dependencies(task)):
+    if not all(dependency.is_made(folder) for dependency in dependencies(task)):
         return "a dependency is missing"
     try:
         execute(task, folder)
-    except Exception as error:  # whatever it is, the other tasks go on
+    except Exception as error:  # whatever it is, the other tasks are still run
         return f"{type(error).__name__}: {error}"
     finally:
         compilation.clear_beyond(MOST_MEMORY)
@@ -193,18 +190,3 @@ def processor() -> str:
     lines = cpus.read_text().splitlines() if cpus.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()
-
-
-def _pack(scratch: Path, metadata: dict[str, Any]) -> bytes:
-    (scratch / METADATA).write_text(json.dumps(metadata, indent=2) + "\n", encoding="utf-8")
-    whole = scratch / ".whole.zip"
-    with zipfile.ZipFile(whole, "w", zipfile.ZIP_DEFLATED) as packed:
-        for file in sorted(scratch.iterdir()):
-            if file != whole:
-                packed.write(file, file.name)
-    return whole.read_bytes()
-
-
-def _peak_memory() -> float:
-    scale = 1e6 if os.uname().sysname == "Darwin" else 1e3  # bytes there, kilobytes elsewhere
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale

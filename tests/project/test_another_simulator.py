@@ -15,7 +15,6 @@ from r2s.estimation.method import Budget
 from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import OrthotropicSpace
 from r2s.mesh.mesh import rectangle
-from r2s.mesh.surface import nearest
 from r2s.scenarios.scenario import Scenario, begin, rollout, stepped
 from r2s.solvers.implicit.cloth import ImplicitCloth
 
@@ -75,27 +74,6 @@ def test_the_first_acceleration_reaches_a_braked_solver():
     assert jnp.all(begin(free, dataclasses.replace(scenario, acceleration=None)).v_before == 0)
 
 
-@pytest.mark.slow(group="study")
-def test_clouds_lie_on_the_sheet_evenly_and_off_it_by_the_noise():
-    mesh = rectangle((0.4, 0.2), (3, 3))
-    x = np.stack([np.pad(np.asarray(mesh.rest), ((0, 0), (0, 1)))] * 2)
-    x[1, :, 2] += 0.3
-    clouds = runs.sampled(x, mesh, 4000, jax.random.key(0), noise=2e-3)
-    assert clouds.mask.all()
-    points = np.asarray(clouds.points)
-    assert points[:, :, 2].mean(axis=1) == pytest.approx([0.0, 0.3], abs=2e-4)
-    assert points[:, :, 2].std(axis=1) == pytest.approx(2e-3, rel=0.05)
-    quarter = np.mean((points[0, :, 0] < 0.2) & (points[0, :, 1] < 0.1))
-    assert quarter == pytest.approx(0.25, abs=4 * np.sqrt(0.25 * 0.75 / 4000))
-    face, _ = nearest(clouds.points[1], jnp.asarray(x[1]), mesh.faces)
-    assert np.bincount(np.asarray(face)).min() > 0.8 * 4000 / len(mesh.faces)
-
-
-def test_trajectories_that_are_not_there_are_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="lift1_x.npz"):
-        runs.read(tmp_path, "lift1_x")
-
-
 @needs_data
 def test_the_first_acceleration_is_what_the_other_simulator_does_first():
     made = runs.read(runs.DATA, runs.WIND.format("camel"))
@@ -107,22 +85,6 @@ def test_the_first_acceleration_is_what_the_other_simulator_does_first():
     assert gained[free, 2] == pytest.approx(acceleration[free, 2] * steps, rel=0.05)
     along = gained[free, 1].mean() / (acceleration[free, 1].mean() * steps)
     assert 0.4 < along < 1  # the sheet gives way to the wind
-
-
-@needs_data
-def test_the_errors_of_a_motion_with_itself_are_none_and_a_shift_is_found():
-    made = runs.read(runs.DATA, runs.LIFT.format("denim"))
-    x = runs.truth(made)
-    np.testing.assert_array_equal(runs.errors(x, x), np.zeros(10))
-    assert runs.errors(x + np.array([3e-3, 4e-3, 0]), x) == pytest.approx(5e-3)
-
-
-@needs_data
-def test_a_run_with_too_few_frames_is_named():
-    made = runs.read(runs.DATA, runs.LIFT.format("denim"))
-    assert len(runs.truth(made, count=60)) == 60
-    with pytest.raises(ValueError, match="expected 61 frames"):
-        runs.truth(made, count=61)
 
 
 @pytest.mark.slow(group="estimates")

@@ -79,18 +79,17 @@ def test_jobs_that_are_done_are_not_done_again(tables, tmp_path: Path) -> None:
 def test_a_folder_without_the_scenario_is_named(module, tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_text('{"format": "none"}')
     with pytest.raises(ValueError, match=str(tmp_path)):
-        module("_recordings").recordings_in(tmp_path, "lift")
+        module("_real").recordings_in(tmp_path, "lift")
 
 
 @pytest.mark.parametrize("name", ["diffcp-mpm-lifting", "pinn-cloth-stretching"])
 def test_what_a_table_of_skills_compares_is_all_predicted_on_the_cloth(module, name: str) -> None:
     pytest.importorskip("psutil", reason="needs r2s[study]")
-    cells = module("_skills")._cells(name, "grey_interlock", ("fling",))
+    cells, estimate = module("_skills")._tasks(name, "grey_interlock", motions=("fling",))
     assert {cell.solver for cell in cells} == {"cloth"}
     whose = [cell.baseline for cell in cells]
     assert len(whose) == 7 and whose.count("default") == 4  # samples, middle, truth, estimate
-    (estimate,) = (cell for cell in cells if cell.estimate is not None)
-    assert "-".join(estimate.estimate.name.split("_")[:3]) == name
+    assert "-".join(estimate.name.split("_")[:3]) == name
 
 
 def test_a_line_of_several_sources_is_refused(tables, tmp_path: Path, monkeypatch) -> None:

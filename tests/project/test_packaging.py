@@ -34,7 +34,7 @@ def test_every_manifest_and_the_public_names_are_package_data() -> None:
     others = {
         PACKAGE / "__init__.pyi",
         PACKAGE / "py.typed",
-        PACKAGE / "study" / "report" / "report.html.j2",
+        PACKAGE / "study" / "report.html.j2",
     }
     assert listed == {*others, *MANIFESTS.rglob("*.json")}
 

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import zipfile
 from dataclasses import dataclass
@@ -12,8 +13,6 @@ from typing import Any, ClassVar
 
 import pytest
 from folders import TESTS
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from r2s.study import engine, tasks
 from r2s.study.engine import environment
@@ -68,6 +67,10 @@ def value_of(cell: Task, folder: Path) -> int:
         return int((files / "value.txt").read_text())
 
 
+def pairs(count: int, pause: float) -> list[Sum]:
+    return [Sum((Number(i, pause), Number(i + 1, pause)), f"s{i}") for i in range(count)]
+
+
 def tree() -> Sum:
     return Sum((Sum((Number(1), Number(2)), "a"), Sum((Number(2), Number(3)), "b")), "whole")
 
@@ -75,34 +78,28 @@ def tree() -> Sum:
 def test_needs_come_first_and_once(tmp_path):
     order = [cell.name for cell in tasks.with_dependencies([tree()])]
     assert order == ["n1", "n2", "a", "n3", "b", "whole"]
-    assert engine.run([tree()], tmp_path, engine.Serial()) == {}
+    assert engine.run([tree()], tmp_path, engine.Runner()) == {}
     assert value_of(tree(), tmp_path) == 8
 
 
-@pytest.mark.slow(group="study")
-@settings(max_examples=25, deadline=None)
-@given(values=st.lists(st.integers(-2, 3), min_size=1, max_size=6))
-def test_what_fails_stops_only_what_needs_it(tmp_path_factory, values):
-    folder = tmp_path_factory.mktemp("study")
-    sums = [Sum((Number(value), Number(5)), f"s{i}") for i, value in enumerate(values)]
-    failed = engine.run(sums, folder, engine.Serial())
-    for cell, value in zip(sums, values, strict=True):
-        assert cell.is_made(folder) == (value >= 0)
-        assert (cell in failed) == (value < 0)
-        if value < 0:
-            assert failed[cell] == f"needs numbers n{value}, which is missing"
-            assert failed[Number(value)] == "ValueError: is below zero"
+def test_what_fails_stops_only_what_needs_it(tmp_path):
+    sums = [Sum((Number(value), Number(5)), f"s{value}") for value in (1, -2, 3)]
+    failed = engine.run(sums, tmp_path, engine.Runner())
+    assert [cell.is_made(tmp_path) for cell in sums] == [True, False, True]
+    assert failed == {
+        Number(-2): "ValueError: is below zero",
+        sums[1]: "needs numbers n-2, which is missing",
+    }
 
 
 def test_what_is_made_is_not_made_again_and_says_how_it_was_made(tmp_path):
-    engine.run([tree()], tmp_path, engine.Serial())
+    engine.run([tree()], tmp_path, engine.Runner())
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.zip")}
-    engine.run([tree()], tmp_path, engine.Serial())
+    engine.run([tree()], tmp_path, engine.Runner())
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.zip")} == times
     noted = tasks.read_metadata(Number(3), tmp_path)
     assert noted["config"] == "Number(value=3, pause=0.0)" and noted["seed"] == 3
-    assert {"r2s", "jax"} <= noted["versions"].keys()
-    assert noted["seconds"] >= 0 and noted["peak_memory_MB"] > 10
+    assert {"r2s", "jax"} <= noted["versions"].keys() and noted["peak_memory_MB"] > 10
 
 
 def test_the_key_depends_on_all_that_results_do(monkeypatch):
@@ -114,52 +111,37 @@ def test_the_key_depends_on_all_that_results_do(monkeypatch):
 
 
 def test_a_damaged_result_is_made_again(tmp_path):
-    engine.run([Number(4)], tmp_path, engine.Serial())
+    engine.run([Number(4)], tmp_path, engine.Runner())
     path = Number(4).path(tmp_path)
     path.write_bytes(path.read_bytes()[:20])
-    engine.run([Number(4)], tmp_path, engine.Serial())
+    engine.run([Number(4)], tmp_path, engine.Runner())
     assert zipfile.is_zipfile(path) and value_of(Number(4), tmp_path) == 4
-
-
-def test_a_full_disk_is_a_reason_and_leaves_nothing_behind(tmp_path, monkeypatch):
-    def full(path, data):
-        raise OSError(28, f"cannot write {path}: no space left on device")
-
-    with monkeypatch.context() as patched:
-        patched.setattr(tasks, "write_bytes", full)
-        failed = engine.run([Number(1)], tmp_path, engine.Serial())
-    assert "no space left" in failed[Number(1)]
-    assert not list(tmp_path.rglob("*.zip"))
-    assert engine.run([Number(1)], tmp_path, engine.Serial()) == {}
 
 
 STUDY = """
 import sys
 sys.path[:0] = {tests!r}
 from pathlib import Path
-from test_engine import Number, Sum
+from test_engine import pairs
 from r2s.study import engine
-cells = [Sum((Number(i, 0.05), Number(i + 1, 0.05)), f"s{{i}}") for i in range(8)]
-engine.run(cells, Path({folder!r}), engine.Serial())
+engine.run(pairs(8, 0.05), Path({folder!r}), engine.Runner())
 """
 
 
-@pytest.mark.parametrize("after", [pytest.param(0.1, marks=pytest.mark.slow(group="study")), 0.25])
-def test_a_run_that_was_killed_goes_on(tmp_path, after):
+def test_a_run_that_was_killed_continues(tmp_path):
     code = STUDY.format(tests=[str(Path(__file__).parent), str(TESTS)], folder=str(tmp_path))
     killed = subprocess.Popen([sys.executable, "-c", code])
     deadline = time.time() + 60
     while time.time() < deadline and not list(tmp_path.rglob("*.zip")):
         time.sleep(0.01)
-    time.sleep(after)
+    time.sleep(0.25)
     os.kill(killed.pid, signal.SIGKILL)
     killed.wait()
     made = set(tmp_path.rglob("*.zip"))
     assert 0 < len(made) < 17
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
     assert made <= set(tmp_path.rglob("*.zip"))
-    sums = [Sum((Number(i, 0.05), Number(i + 1, 0.05)), f"s{i}") for i in range(8)]
-    assert [value_of(cell, tmp_path) for cell in sums] == [2 * i + 1 for i in range(8)]
+    assert [value_of(cell, tmp_path) for cell in pairs(8, 0.05)] == [2 * i + 1 for i in range(8)]
 
 
 @dataclass(frozen=True)
@@ -194,17 +176,12 @@ def test_a_process_apart_has_a_workers_environment_and_may_die(tmp_path, monkeyp
 @pytest.mark.slow(group="study")
 def test_workers_of_dask_make_the_same_and_survive_a_kill(tmp_path):
     pytest.importorskip("distributed", reason="needs the extra cluster")
-    sums = [Sum((Number(i, 0.2), Number(i + 1, 0.2)), f"s{i}") for i in range(6)]
-    sums.append(Sum((Number(-1), Number(0, 0.2)), "bad"))
+    sums = [*pairs(6, 0.2), Sum((Number(-1), Number(0, 0.2)), "bad")]
     runner = engine.local(2)
     try:
         client = runner.client
         cores = list(client.run(_cores).values())
-        # a process that dies in the middle of a cell
-        client.run_on_scheduler(lambda: None)
-        pid = next(iter(client.run(os.getpid).values()))
-        import threading
-
+        pid = next(iter(client.run(os.getpid).values()))  # dies in the middle of a cell
         threading.Timer(0.5, os.kill, (pid, signal.SIGKILL)).start()
         failed = engine.run(sums, tmp_path, runner)
     finally:
@@ -240,7 +217,7 @@ def test_jobs_of_slurm_make_the_same_with_a_stand_in_for_sbatch(tmp_path, monkey
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     monkeypatch.setenv("PYTHONPATH", f"{Path(__file__).parent}{os.pathsep}{TESTS}")
-    sums = [Sum((Number(i, 0.1), Number(i + 1, 0.1)), f"s{i}") for i in range(4)]
+    sums = pairs(4, 0.1)
     runner = engine.slurm(2)
     try:
         assert not engine.run(sums, tmp_path / "out", runner)
@@ -255,17 +232,17 @@ def test_jobs_of_slurm_make_the_same_with_a_stand_in_for_sbatch(tmp_path, monkey
 def test_a_file_gets_a_line_in_time_while_a_cell_is_running(tmp_path, capfd, monkeypatch):
     """Half a minute as delivered; a tenth of a second here."""
     monkeypatch.setattr(engine, "LINES", 0.1)
-    engine.run([Number(1, pause=0.55)], tmp_path, engine.Serial())
+    engine.run([Number(1, pause=0.55)], tmp_path, engine.Runner())
     lines = capfd.readouterr().err.splitlines()
     assert len([line for line in lines if line.startswith("study of 1 cells:   0 %")]) >= 3
 
 
 def test_a_study_says_beforehand_how_long_it_takes(tmp_path, capfd, monkeypatch):
     monkeypatch.setitem(engine.SECONDS, "numbers", (150.0, 30.0))
-    engine.run([Number(1), Number(2)], tmp_path, engine.Serial())
+    engine.run([Number(1), Number(2)], tmp_path, engine.Runner())
     forecast = "study: 2 cells, about 3 min on 1 process"
     assert capfd.readouterr().err.splitlines()[0] == forecast
-    engine.run([Number(1), Number(2)], tmp_path, engine.Serial())
+    engine.run([Number(1), Number(2)], tmp_path, engine.Runner())
     assert "study:" not in capfd.readouterr().err
 
 
@@ -280,14 +257,3 @@ def test_every_version_and_source_that_made_results_is_counted(tmp_path, monkeyp
     tasks.execute(made[3], tmp_path)
     found = tasks.provenance(made, tmp_path)
     assert list(found.values()) == [2, 1, 1] and "source another" in "".join(found)
-
-
-def test_the_tables_of_a_study_of_mixed_origin_are_refused(tmp_path):
-    (tmp_path / "tables").mkdir()
-    lines = ["setting,value", "version of r2s,1", "cells made by a,2", "cells made by b,1"]
-    (tmp_path / "tables" / "settings.csv").write_text("\n".join(lines))
-    driver = TESTS.parent / "experiments" / "_documents.py"
-    done = subprocess.run(
-        [sys.executable, driver, "--study", tmp_path], cwd=tmp_path, capture_output=True, text=True
-    )
-    assert done.returncode == 1 and "mixed" in done.stderr

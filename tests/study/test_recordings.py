@@ -18,7 +18,6 @@ from r2s.study.evaluations import predict
 from r2s.study.recordings import (
     SETTLING,
     SyntheticRecording,
-    TruthSettings,
     pull_of,
     read,
     read_start,
@@ -56,7 +55,7 @@ def test_the_true_fabric_begins_where_its_recording_does(tmp_path, monkeypatch):
     """Flat sheets of two meshes come to rest in two shapes, a centimetre apart."""
     shape = (25, 25)
     monkeypatch.setattr("r2s.study.evaluations.SHAPES", {"cloth": shape})
-    source = SyntheticRecording("camel_ponte_roma", "fling", 0, True, TruthSettings())
+    source = SyntheticRecording("camel_ponte_roma", "fling", 0, True)
     execute(source, tmp_path)
     recording, start = read(source, tmp_path), read_start(source, tmp_path)
     assert start is not None and start.shape == (*source.truth.shape, 3)
@@ -69,10 +68,6 @@ def test_the_true_fabric_begins_where_its_recording_does(tmp_path, monkeypatch):
 
     assert np.all(away([start]) < 3e-3)
     assert np.all(away(()) > 5e-3)
-
-
-def test_given_recordings_and_lying_sheets_have_no_start(tmp_path):
-    assert read_start(SyntheticRecording("pink_solid", "folding", 0, True), tmp_path) is None
 
 
 def test_pulls_differ_in_stretch_and_rate_from_angle_to_angle_and_number_to_number():

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from folders import ROOT
+from test_results import LIFTING, NOBODY, row
 
 from r2s.cli.main import main
 from r2s.estimation import default_spaces
@@ -19,12 +20,9 @@ from r2s.estimation.method import default_space
 from r2s.estimation.methods import METHODS, DiffCloud
 from r2s.materials import presets
 from r2s.materials.arcsim import write_material
-from r2s.study import engine, results
+from r2s.study import engine, report, results
 from r2s.study import plan as plans
-from r2s.study.configuration import (
-    Configuration,
-)
-from r2s.study.evaluations import EvaluationTask
+from r2s.study.evaluations import EvaluationTask, Prediction
 from r2s.study.recordings import (
     STRETCH,
     GivenRecording,
@@ -33,8 +31,8 @@ from r2s.study.recordings import (
     small_strain,
     strain_dependent,
 )
-from r2s.study.report.tables import cost_table, range_table, recording_table
-from r2s.study.statistics.frame import as_frame
+from r2s.study.results import as_frame
+from r2s.study.tables import cost_table, range_table, recording_table
 from r2s.study.tasks import read_metadata, with_dependencies
 
 
@@ -104,34 +102,25 @@ def tiny(monkeypatch):
         return dataclasses.replace(found, shape=method.chosen_shape)
 
     monkeypatch.setattr(DiffCloud, "_estimate", fake)
-    plan = plans.Plan(
-        (Configuration("diffcloud", "cloth", "lifting"),),
-        ("grey_interlock",),
-        1,
-        1,
-        TruthSettings((5, 5), 1 / 15),
-    )
-    return plans.synthetic(plan)[-1:], made
+    truth = TruthSettings((5, 5), 1 / 15)
+    return plans.synthetic(plans.Plan((LIFTING,), ("grey_interlock",), 1, 1, truth))[-1:], made
 
 
-def test_recordings_that_an_approach_does_not_support_are_refused():
-    names = ["diffcloud-cloth-lifting+stretching"]
-    plan = plans.with_changes(plans.SMALL, names, ["grey_interlock"])
-    both = next(c.estimate for c in plans.synthetic(plan) if c.estimate is not None)
-    assert [getattr(each, "angle", None) for each in both.sources] == [None, 0.0, 45.0, 90.0]
-    with pytest.raises(ValueError, match="from one recording, got 4"):
-        dataclasses.replace(both, approach="physnet")
-    with pytest.raises(ValueError, match="pinn: on cloth it estimates from stretching, not from l"):
-        dataclasses.replace(both, approach="pinn")
+def estimate_of(name):
+    """The estimate of a grey interlock by a configuration."""
+    plan = plans.with_changes(plans.SMALL, [name], ["grey_interlock"])
+    return next(c.estimate for c in plans.synthetic(plan) if c.estimate is not None)
+
+
+def test_a_lift_and_pulls_are_of_three_directions():
+    task = estimate_of("diffcloud-cloth-lifting+stretching")
+    assert [getattr(each, "angle", None) for each in task.sources] == [None, 0.0, 45.0, 90.0]
 
 
 def test_multipliers_of_an_assumed_fabric_have_no_truth():
-    plan = plans.with_changes(
-        plans.SMALL, ["diffcloud-published-cloth-lifting"], ["grey_interlock"]
-    )
-    cell = next(c.estimate for c in plans.synthetic(plan) if c.estimate is not None)
-    ranges = (*default_space("cloth", cell.density).ranges[:2], MULTIPLIER, MASS)
-    true = results.true_values(cell, ranges)
+    task = estimate_of("diffcloud-published-cloth-lifting")
+    ranges = (*default_space("cloth", task.density).ranges[:2], MULTIPLIER, MASS)
+    true = results.true_values(task, ranges)
     assert np.isfinite(true).tolist() == [True, True, False, False]
 
 
@@ -151,16 +140,16 @@ def test_each_fabric_has_draws_of_its_own(tmp_path):
 @pytest.mark.slow(group="study")
 def test_an_estimate_is_made_once_and_judged(tiny, tmp_path):
     cells, made = tiny
-    assert engine.run(cells, tmp_path, engine.Serial()) == {}
+    assert engine.run(cells, tmp_path, engine.Runner()) == {}
     found = results.collect(cells, tmp_path)
     assert set(found.approach) == {"diffcloud"} and set(found.repeat) == {"0"}
     assert np.isfinite(found.value).all() and (found.value > 0).all()
-    engine.run(cells, tmp_path, engine.Serial())
+    engine.run(cells, tmp_path, engine.Runner())
     assert len(made) == 1
     parameters = results.parameters(cells, tmp_path)
-    assert parameters.unit[0] == "N/m" and not np.isfinite(parameters.standard_error).any()
+    assert parameters.unit[0] == "N/m" and list(parameters.columns) == list(results.PARAMETERS)
     assert np.isfinite(parameters.truth).all()  # those of the preset
-    results.publish(cells, {}, tmp_path, plans.SMALL, "synthetic")
+    report.publish_study(cells, {}, tmp_path, plans.SMALL, "synthetic")
     assert "diffcloud" in (tmp_path / "report.html").read_text(encoding="utf-8")
     written = {path.stem for path in (tmp_path / "tables").iterdir()}
     assert {"ranges", "costs", "parameters_cloth", "settings"} <= written
@@ -177,7 +166,7 @@ def test_an_estimate_that_diverges_is_a_result(tiny, tmp_path, monkeypatch):
         raise RuntimeError("every simulation diverged")
 
     monkeypatch.setattr(METHODS["diffcloud"], "_estimate", explode)
-    assert engine.run(cells, tmp_path, engine.Serial()) == {}
+    assert engine.run(cells, tmp_path, engine.Runner()) == {}
     assert results.collect(cells, tmp_path).value.isna().all()
     reasons = read_metadata(cells[0], tmp_path)["diverged"]
     assert reasons == {source.name: "the estimate diverged" for source in cells[0].recordings}
@@ -209,7 +198,7 @@ def test_what_trials_share_counts_once(tmp_path, monkeypatch):
     """A fold that two lifts are judged by has one default, whichever lift brought it."""
 
     def given(name, scenario, trial):
-        return GivenRecording("", name, "knit", scenario, trial, "")
+        return GivenRecording("knit", scenario, trial, "", name, "")
 
     every = [given(f"lift{i}", "lifting", f"{i}") for i in (1, 2, 3)]
     every += [given(f"fold{i}", "folding", f"{i}") for i in (1, 2)]
@@ -222,8 +211,12 @@ def test_what_trials_share_counts_once(tmp_path, monkeypatch):
     ]
     # of trials 1 and 2 their own fold, of trial 3, which has none, both together
     assert [len(cell.recordings) for cell in cells] == [1, 1, 2]
-    measured = {cell: {each.name: {"chamfer": 1.0} for each in cell.recordings} for cell in cells}
-    monkeypatch.setattr(results, "read_measured", lambda cell, folder: measured[cell])
+
+    def predictions(cell, folder):
+        nothing = np.zeros((0, 0, 3)), np.zeros(0)
+        return {each.name: Prediction({"chamfer": 1.0}, *nothing) for each in cell.recordings}
+
+    monkeypatch.setattr(results, "read_predictions", predictions)
     monkeypatch.setattr(EvaluationTask, "is_made", lambda cell, folder: True)
     found = results.collect(cells, tmp_path)
     assert sorted(found.recording) == ["fold1", "fold2"]
@@ -231,7 +224,7 @@ def test_what_trials_share_counts_once(tmp_path, monkeypatch):
 
 def test_a_fling_that_an_estimate_has_seen_does_not_judge_it(tmp_path, monkeypatch):
     scenarios = ["lifting", "wind", "stretching", "fling", "shaking"]
-    every = [GivenRecording("", name, "knit", name, "1", "") for name in scenarios]
+    every = [GivenRecording("knit", name, "1", "", name, "") for name in scenarios]
     monkeypatch.setattr(plans, "find_recordings", lambda folder: every)
     names = ["diffcloud-cloth-lifting", "diffcloud-cloth-lifting+wind+stretching+fling"]
     cells = plans.recorded(tmp_path, 0.2, plans.with_changes(plans.SMALL, names))
@@ -246,26 +239,16 @@ def test_a_fling_that_an_estimate_has_seen_does_not_judge_it(tmp_path, monkeypat
 
 
 def test_given_recordings_are_shown_one_by_one():
-    def row(baseline, value, recording="fold_silk", repeat="0", solver="cloth"):
-        is_estimate = baseline in ("", "other_fabric", "on_cloth")
-        return {
-            "approach": "diffcloud" if is_estimate else "",
-            "solver": "" if baseline == "repeatability" else solver,
-            "estimated_from": "lifting" if is_estimate else "",
-            "fabric": "silk",
-            "repeat": repeat,
-            "recording": recording,
-            "evaluated_on": "folding",
-            "baseline": baseline,
-            "metric": "chamfer_real_to_sim",
-            "unit": "m",
-            "value": value,
-        }
+    def of(baseline, value, recording="fold_silk", repeat="0", solver="cloth"):
+        whose = LIFTING if baseline in ("", "other_fabric", "on_cloth") else NOBODY
+        solver = "" if baseline == "repeatability" else solver
+        more = {"metric": "chamfer_real_to_sim", "recording": recording, "fabric": "silk"}
+        return row(value, baseline, whose._replace(solver=solver), repeat, **more)
 
-    rows = [row("", 0.02), row("default", 0.03), row("other_fabric", 0.025)]
-    rows += [row("repeatability", 0.01), row("", 0.09, repeat="1"), row("on_cloth", 0.5)]
-    rows += [row("default", 0.04, "fold_silk2"), row("default", 0.05, "fold_silk2", repeat="1")]
-    rows += [row("default", 0.7, solver="mpm")]
+    rows = [of("", 0.02), of("default", 0.03), of("other_fabric", 0.025)]
+    rows += [of("repeatability", 0.01), of("", 0.09, repeat="1"), of("on_cloth", 0.5)]
+    rows += [of("default", 0.04, "fold_silk2"), of("default", 0.05, "fold_silk2", repeat="1")]
+    rows += [of("default", 0.7, solver="mpm")]
     table = recording_table(as_frame(rows), "chamfer_real_to_sim").set_index("recording")
     first, second = table.loc["fold_silk"], table.loc["fold_silk2"]
     assert dict(first[["estimate", "default", "other_fabric", "repeatability"]]) == {

@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,9 +16,9 @@ from r2s.mesh.mesh import rectangle
 from r2s.metrics.horizon import within
 from r2s.recordings.recording import cloud
 from r2s.study.configuration import MOTIONS, ON_CLOTH, REFERENCES, as_configuration, is_reference
-from r2s.study.evaluations import EvaluationTask, read_distances, read_motions
+from r2s.study.ensembles import Judged, judged_motions
+from r2s.study.evaluations import EvaluationTask, read_predictions
 from r2s.study.recordings import Source, read
-from r2s.study.verdicts import Judged, judged_motion
 
 # Okabe and Ito's colours, which the colour-blind can distinguish, and then darker ones.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7", "#B8A800", "#5D3A9B",
@@ -26,7 +27,7 @@ INK, BROWN, GREY, SAND, RED = "#202020", "#8a6d5a", "#8c8c8c", "#ecdcb0", "#c400
 OF_REFERENCES = {REFERENCES["true"]: INK, REFERENCES["middle"]: BROWN}
 ABOVE = 1.1  # of the largest error that is shown, the upper end of a chart
 RUNAWAY = 2.0  # times the largest error of a reference: what is farther off is out of the chart
-DRAWN = 13  # vertices a side that are drawn, at most
+DRAWN = 9  # vertices along a side that are drawn
 BUDGET = 7_000_000  # characters of all positions of a page
 CHARACTERS = 7  # of a coordinate in millimetres to a tenth, such as "-123.4,"
 FEWEST_POINTS, MOST_POINTS = 150, 800  # of a cloud, in a frame
@@ -74,7 +75,7 @@ class Motion(NamedTuple):
         }
 
 
-def judged_recordings(tasks: Iterable[EvaluationTask], folder: Path) -> list[Motion]:
+def judged_recordings(tasks: Sequence[EvaluationTask], folder: Path) -> list[Motion]:
     """The first recording of each fabric and motion with its finished simulations by all
     configurations, references and defaults, in the order of `MOTIONS`.
 
@@ -83,29 +84,28 @@ def judged_recordings(tasks: Iterable[EvaluationTask], folder: Path) -> list[Mot
     """
     groups: dict[Source, dict[str, list[EvaluationTask]]] = defaultdict(lambda: defaultdict(list))
     for task in tasks:
-        if not task.other and task.is_made(folder):
+        if task.baseline != "other_fabric" and task.is_made(folder):
             label = as_configuration(task.configuration, task.baseline).label
             groups[task.recordings[0]][label].append(task)
     first = {(source.fabric, source.scenario): source for source in reversed(groups)}
-    found = [
-        _motion(source, groups[source], folder) for source in groups if source in first.values()
-    ]
-    order = {motion: i for i, motion in enumerate(MOTIONS)}
-    return sorted(found, key=lambda each: order.get(each.evaluated_on, len(order)))
+    sources = [source for source in groups if source in first.values()]
+    sources.sort(key=lambda source: MOTIONS.index(source.scenario))
+    known = judged_motions(tasks, folder)
+    return [_motion(source, groups[source], known.get(source), folder) for source in sources]
 
 
-def _motion(source: Source, group: Mapping[str, list[EvaluationTask]], folder: Path) -> Motion:
+def _motion(
+    source: Source, group: Mapping[str, list[EvaluationTask]], judged: Judged | None, folder: Path
+) -> Motion:
     recording = read(source, folder)
     first, last = recording.info.frames_used
-    judged = judged_motion(source, folder)
     rank = {"": 0, ON_CLOTH: 0, "true": 1, "middle": 2, "default": 3}
     errors, vertices, faces = {}, {}, {}
-    for label, tasks in sorted(group.items(), key=lambda each: rank[each[1][0].baseline]):
-        runs = np.stack([read_distances(task, folder)[source.name] for task in tasks])
-        chosen = tasks[median_run(runs, judged)]
-        x = read_motions(chosen, folder)[source.name][first : last + 1]
-        errors[label] = runs
-        vertices[label], shape = thinned(x, chosen.shape)
+    for label, tasks in sorted(group.items(), key=lambda item: rank[item[1][0].baseline]):
+        runs = [read_predictions(task, folder)[source.name] for task in tasks]
+        errors[label] = np.stack([run.distances for run in runs])
+        x = runs[median_run(errors[label], judged)].x[first : last + 1]
+        vertices[label], shape = thinned(x, tasks[0].shape)
         faces[label] = np.asarray(rectangle(recording.info.sheet.size, shape).faces)
     return Motion(
         fabric=source.fabric,
@@ -132,25 +132,21 @@ def median_run(runs: Float[np.ndarray, "run frame"], judged: Judged | None) -> i
 def thinned(
     x: Float[np.ndarray, "frame vertex 3"], shape: Sequence[int]
 ) -> tuple[Float[np.ndarray, "frame _ 3"], tuple[int, int]]:
-    """Every n-th vertex of a sheet so that at most `DRAWN` a side are left, and their shape."""
-    largest = max(shape) - 1
-    strides = [n for n in range(1, largest + 1) if all((side - 1) % n == 0 for side in shape)]
-    stride = next((n for n in strides if largest // n < DRAWN), 1)
+    """Every n-th vertex of a square sheet so that `DRAWN` a side are left, and their shape."""
+    stride = max((shape[0] - 1) // (DRAWN - 1), 1)
     grid = x.reshape(len(x), *shape, 3)[:, ::stride, ::stride]
     return grid.reshape(len(x), -1, 3), (grid.shape[1], grid.shape[2])
 
 
 def colours_of(labels: Iterable[str]) -> dict[str, str]:
     """The colour of each label, one for a whole page; references are dark, brown and grey."""
-    found: dict[str, str] = {}
-    for label in dict.fromkeys(labels):
-        if is_reference(label):
-            own = [colour for name, colour in OF_REFERENCES.items() if label.startswith(name)]
-            found[label] = own[0] if own else GREY
-        else:
-            count = sum(not is_reference(each) for each in found)
-            found[label] = COLOURS[count % len(COLOURS)]
-    return found
+    labels, colours = list(dict.fromkeys(labels)), cycle(COLOURS)
+    return {
+        label: next((c for name, c in OF_REFERENCES.items() if label.startswith(name)), GREY)
+        if is_reference(label)
+        else next(colours)
+        for label in labels
+    }
 
 
 def interval_chart(
@@ -158,7 +154,7 @@ def interval_chart(
 ) -> go.Figure:
     """Means with their intervals, a panel a motion, a line a configuration.
 
-    `means`: from `r2s.study.statistics.frame.means`. `marks`: values with a vertical line.
+    `means`: from `r2s.study.results.means`. `marks`: values with a vertical line.
     """
     table = means.reset_index()
     table["configuration"] = table.configuration.astype(str)
@@ -210,8 +206,8 @@ def error_chart(motion: Motion, colours: Mapping[str, str]) -> go.Figure:
         figure.add_scatter(x=times, y=floor, **shade)
     for label, mean in means.items():
         runs, dash = motion.errors[label], "dash" if "mpm" in label.split() else "solid"
-        lost = int((~np.isfinite(runs).all(axis=1)).sum())
-        words = f"{label} ({lost} of {len(runs)} diverged)" if lost else label
+        diverged = int((~np.isfinite(runs).all(axis=1)).sum())
+        words = f"{label} ({diverged} of {len(runs)} diverged)" if diverged else label
         y = np.where(np.isfinite(mean), 1e3 * mean, np.nan)
         line = {"color": colours[label], "dash": dash}
         figure.add_scatter(x=times, y=y, mode="lines", line=line, name=words)
@@ -231,14 +227,14 @@ def motion_figures(motions: Sequence[Motion], colours: Mapping[str, str]) -> lis
     Of long or fine recordings every n-th frame is drawn, and of clouds as many points as fit. The
     slider begins at the last frame before the horizon.
     """
-    return [_figure(each, colours, BUDGET // len(motions)) for each in motions]
+    return [_figure(motion, colours, BUDGET // len(motions)) for motion in motions]
 
 
 def _figure(motion: Motion, colours: Mapping[str, str], budget: int) -> go.Figure:
     frames, count = _affordable(motion, budget)
     generator = np.random.default_rng(0)
     finite = [motion.clouds[i][np.isfinite(motion.clouds[i]).all(axis=1)] for i in frames]
-    clouds = [generator.permutation(each)[:count] for each in finite]
+    clouds = [generator.permutation(points)[:count] for points in finite]
     data = [
         [
             {"type": "scatter3d", **_positions(cloud)},

@@ -1,9 +1,8 @@
 """Comparisons: which of two sides has the smaller distances, tested over fabrics; and ranks.
 
 A comparison has one number a fabric, the mean logarithm of the ratio of two distances, above zero
-where the hypothesis is right; intervals and tests are Student's t over fabrics (`frame.crossed`).
-A run that diverged has no distance: comparisons leave it out, and nothing is concluded in favour of
-a side of which a run diverged.
+where the hypothesis is right; intervals and tests are Student's t over fabrics. A run that diverged
+has no distance: nothing is concluded in favour of a side of which one did.
 
 Distances differ more between recordings than between configurations; ranks within a recording are
 comparable. Demsar 2006, Statistical comparisons of classifiers over multiple data sets.
@@ -26,7 +25,7 @@ from r2s.metrics.statistics import (
     units_needed,
 )
 from r2s.study.configuration import ON_CLOTH
-from r2s.study.statistics.frame import DEFAULT, ESTIMATE, motions
+from r2s.study.results import DEFAULT, ESTIMATE, motions
 
 MARGIN = 0.05  # an interval of the ratio within 1 +- this says that there is no difference
 HOLDS, HOLDS_NOT, UNKNOWN = "holds", "does not hold", "undecided"
@@ -36,7 +35,7 @@ NOTHING = CrossedMean(np.nan, 0, np.nan, 0.0, np.nan)
 class Comparison(NamedTuple):
     """One test.
 
-    - `found`: the mean over fabrics of the logarithm of the ratio (of what `words` say, where it
+    - `effect`: the mean over fabrics of the logarithm of the ratio (of what `words` say, where it
       is no ratio), above zero where the hypothesis is right.
     - `agreeing`: in how many fabrics it is above zero.
     - `diverged`: runs that did, of the side that should be smaller, and of the larger.
@@ -45,7 +44,7 @@ class Comparison(NamedTuple):
     """
 
     words: str
-    found: CrossedMean = NOTHING
+    effect: CrossedMean = NOTHING
     agreeing: int = 0
     diverged: tuple[int, int] = (0, 0)
     is_ratio: bool = True
@@ -62,25 +61,26 @@ def compare(
     `results`: labelled, of one metric. `smaller`, `larger`: labels of the configurations that are
     expected to have the smaller and the larger distances.
     """
-    there = set(results.configuration)
-    if missing := [each for each in (*smaller, *larger) if each not in there]:
-        return Comparison(words, lacking=f"no rows of {', '.join(missing)}")
     sides = [*dict.fromkeys((*smaller, *larger))]
     part = results[results.configuration.isin(sides)]
     part = part.assign(configuration=part.configuration.astype(str))
+    if missing := [label for label in sides if not (part.configuration == label).any()]:
+        return Comparison(words, lacking=f"no rows of {', '.join(missing)}")
     counts = part.groupby("recording").configuration.transform("nunique")
     part = part[counts == len(sides)]
     if part.empty:
         return Comparison(words, lacking="nothing that both were judged on")
-    lost = [int(part[part.configuration.isin(side)].diverged.sum()) for side in (smaller, larger)]
+    first, second = (
+        int(part[part.configuration.isin(side)].diverged.sum()) for side in (smaller, larger)
+    )
     place = ["fabric", "movement"]
     part = part.assign(alone=part.groupby(["configuration", *place]).log.transform("size") == 1)
     wide = part.pivot(index=[*place, "repeat"], columns="configuration", values=["log", "alone"])
     logs, alone = wide["log"].astype(float), wide["alone"].fillna(False).astype(bool)
     of_recording = logs.groupby(place).mean()
     # a configuration that ran once is compared with every repeat of the other side
-    once = alone.groupby(place).transform("any")
-    logs = logs.where(~once, logs.groupby(place).transform("mean"))
+    ran_once = alone.groupby(place).transform("any")
+    logs = logs.where(~ran_once, logs.groupby(place).transform("mean"))
 
     def apart(table: pd.DataFrame) -> pd.Series:
         means = [table[list(side)].mean(axis=1, skipna=False) for side in (larger, smaller)]
@@ -88,8 +88,7 @@ def compare(
 
     by_movement = apart(of_recording).unstack()
     by_repeat = apart(logs).groupby(["fabric", "repeat"]).mean().unstack()
-    tables = [by_movement, by_repeat]
-    return compared(words, by_movement.mean(axis=1), tables, (lost[0], lost[1]))
+    return compared(words, by_movement.mean(axis=1), [by_movement, by_repeat], (first, second))
 
 
 def compared(
@@ -108,8 +107,8 @@ def compared(
         why = "all of it diverged" if sum(diverged) else "nothing that both were judged on"
         return Comparison(words, diverged=diverged, lacking=why)
     arrays = [table.reindex(numbers.index).to_numpy(float) for table in tables]
-    found = crossed_mean(numbers.to_numpy(float), arrays)
-    return Comparison(words, found, int((numbers > 0).sum()), diverged, is_ratio)
+    effect = crossed_mean(numbers.to_numpy(float), arrays)
+    return Comparison(words, effect, int((numbers > 0).sum()), diverged, is_ratio)
 
 
 def judge(comparisons: Iterable[tuple[str, Comparison]]) -> pd.DataFrame:
@@ -123,38 +122,37 @@ def judge(comparisons: Iterable[tuple[str, Comparison]]) -> pd.DataFrame:
     `diverged_larger`, `paper_smaller`, `paper_larger`.
     """
     pairs = list(comparisons)
-    p = np.array([p_value(each.found) for _, each in pairs])
+    p = np.array([p_value(comparison.effect) for _, comparison in pairs])
     corrected, known = np.full(len(p), np.nan), np.isfinite(p)
     if known.any():
         corrected[known] = multipletests(p[known], method="holm")[1]
     level = SIGNIFICANCE / max(1, int(known.sum()))
     rows = []
-    for (conclusion, each), own, holm in zip(pairs, p, corrected, strict=True):
-        low, high = np.exp(interval(each.found)) if each.is_ratio else (np.nan, np.nan)
-        answer, needed = _answer(each, low, high, holm), (np.nan,) * 3
-        if answer == UNKNOWN and not each.lacking:
-            effect = max(abs(each.found.mean), np.log1p(MARGIN))
-            needed = units_needed(each.found, effect, level)
-        rows.append(
-            {
-                "conclusion": conclusion,
-                "comparison": each.words,
-                "answer": answer,
-                "lacking": each.lacking,
-                "ratio": np.exp(each.found.mean) if each.is_ratio else np.nan,
-                "low": low,
-                "high": high,
-                "p": own,
-                "p_holm": holm,
-                "agreeing": each.agreeing,
-                "fabrics": each.found.units,
-                **dict(zip(("needed", "fewest", "most"), needed, strict=True)),
-                "diverged_smaller": each.diverged[0],
-                "diverged_larger": each.diverged[1],
-                "paper_smaller": each.paper[0],
-                "paper_larger": each.paper[1],
-            }
-        )
+    for (conclusion, comparison), own, holm in zip(pairs, p, corrected, strict=True):
+        effect, needed = comparison.effect, (np.nan,) * 3
+        ratio, low, high = np.exp((effect.mean, *interval(effect)))
+        if not comparison.is_ratio:
+            ratio, low, high = (np.nan,) * 3
+        answer = _answer(comparison, low, high, holm)
+        if answer == UNKNOWN and not comparison.lacking:
+            needed = units_needed(effect, max(abs(effect.mean), np.log1p(MARGIN)), level)
+        row = {
+            "conclusion": conclusion,
+            "comparison": comparison.words,
+            "answer": answer,
+            "lacking": comparison.lacking,
+            "ratio": ratio,
+            "low": low,
+            "high": high,
+            "p": own,
+            "p_holm": holm,
+            "agreeing": comparison.agreeing,
+            "fabrics": effect.units,
+            **dict(zip(("needed", "fewest", "most"), needed, strict=True)),
+            **dict(zip(("diverged_smaller", "diverged_larger"), comparison.diverged, strict=True)),
+            **dict(zip(("paper_smaller", "paper_larger"), comparison.paper, strict=True)),
+        }
+        rows.append(row)
     return pd.DataFrame(rows)
 
 
@@ -163,7 +161,7 @@ def _answer(comparison: Comparison, low: float, high: float, p: float) -> str:
         return UNKNOWN
     if 1 / (1 + MARGIN) < low and high < 1 + MARGIN and not any(comparison.diverged):
         return HOLDS_NOT
-    is_favoured = comparison.found.mean > 0
+    is_favoured = comparison.effect.mean > 0
     if p < SIGNIFICANCE and not comparison.diverged[0 if is_favoured else 1]:
         return HOLDS if is_favoured else HOLDS_NOT
     return UNKNOWN
@@ -172,22 +170,18 @@ def _answer(comparison: Comparison, low: float, high: float, p: float) -> str:
 def answers(judged: pd.DataFrame) -> dict[str, str]:
     """The answer to each conclusion: it holds where all its comparisons hold, and does not as soon
     as one of them does not."""
-    found = {}
+    by_conclusion = {}
     for conclusion, own in judged.groupby("conclusion", sort=False).answer:
-        if (own == HOLDS_NOT).any():
-            found[conclusion] = HOLDS_NOT
-        else:
-            found[conclusion] = HOLDS if (own == HOLDS).all() else UNKNOWN
-    return found
+        decided = HOLDS if (own == HOLDS).all() else UNKNOWN
+        by_conclusion[conclusion] = HOLDS_NOT if (own == HOLDS_NOT).any() else decided
+    return by_conclusion
 
 
 def learned(results: pd.DataFrame, metric: str) -> pd.DataFrame:
     """Whether the errors of each configuration (`conclusion`) on each motion (`comparison`) are
     below those of the prior median on the same solver, in the recordings that have a skill.
 
-    An approach that knows the prior is as good as its median without learning anything: this test,
-    and not the skill against samples, says what a recording has taught. The true fabric is among
-    the configurations: it bounds what can be learned.
+    This test, and not the skill against samples, says what a recording adds to the prior.
     """
     known = results[(results.metric == metric) & results.skill.notna()]
     pairs = []
@@ -206,26 +200,14 @@ class Ranks(NamedTuple):
 
     - `table`: by configuration `mean` over fabrics, `low` and `high` of its interval, and `first`,
       the share of recordings in which it is the best.
-    - `recordings`, `fabrics`: how many count. `left_out`: configurations that lack most of them.
     - `p`: of Friedman's test of all but default fabrics, with fabrics as blocks; NaN for fewer than
       three configurations or two fabrics.
-    - `difference`: the critical difference of two mean ranks (Nemenyi).
+    - `words`: the sample, the critical difference of two mean ranks, p, and what is left out.
     """
 
     table: pd.DataFrame
-    recordings: int
-    fabrics: int
-    left_out: list[str]
     p: float
-    difference: float
-
-    @property
-    def words(self) -> str:
-        """The sample and the tests, in words."""
-        words = f"{len(self.table)} configurations, {self.recordings} recordings, "
-        words += f"{self.fabrics} fabrics, critical difference {self.difference:.2f}"
-        words += f", Friedman's p {self.p:.2g}" if np.isfinite(self.p) else ""
-        return words + (f", left out {', '.join(self.left_out)}" if self.left_out else "")
+    words: str
 
 
 def rank(results: pd.DataFrame) -> Ranks | None:
@@ -238,33 +220,32 @@ def rank(results: pd.DataFrame) -> Ranks | None:
     own = results[results.baseline.isin((ESTIMATE, DEFAULT))]
     own = own.assign(value=own.value.where(~own.diverged, np.inf))
     place = ["fabric", "movement"]
-    table = own.groupby([*place, "configuration"], observed=True).value.mean().unstack()
-    is_kept = table.notna().mean() >= 0.5
-    left_out = list(map(str, table.columns[~is_kept]))
-    table = table.loc[:, is_kept].dropna()
-    if len(table.columns) < 2 or table.empty:
+    means = own.groupby([*place, "configuration"], observed=True).value.mean().unstack()
+    is_kept = means.notna().mean() >= 0.5
+    left_out = ", ".join(map(str, means.columns[~is_kept]))
+    means = means.loc[:, is_kept].dropna()
+    if len(means.columns) < 2 or means.empty:
         return None
-    ranks = table.rank(axis=1)
+    ranks = means.rank(axis=1)
     of_fabric = ranks.groupby("fabric").mean()
     ends = [
-        interval(crossed_mean(of_fabric[each].to_numpy(), [ranks[each].unstack().to_numpy()]))
-        for each in ranks.columns
+        interval(crossed_mean(of_fabric[label].to_numpy(), [ranks[label].unstack().to_numpy()]))
+        for label in ranks.columns
     ]
     low, high = np.clip(np.array(ends).T, 1, len(ranks.columns))
     is_best = ranks.eq(ranks.min(axis=1), axis=0)
     first = is_best.div(is_best.sum(axis=1), axis=0).mean()
-    found = pd.DataFrame({"mean": of_fabric.mean(), "low": low, "high": high, "first": first})
+    table = pd.DataFrame({"mean": of_fabric.mean(), "low": low, "high": high, "first": first})
     defaults = set(own[own.baseline == DEFAULT].configuration)
-    tested = of_fabric.loc[:, [each not in defaults for each in of_fabric.columns]].T.to_numpy()
+    tested = of_fabric.loc[:, ~of_fabric.columns.isin(defaults)].T.to_numpy()
     can_test = len(tested) > 2 and len(of_fabric) > 1 and np.ptp(tested, axis=0).any()
-    return Ranks(
-        table=found.sort_values("mean", kind="stable"),
-        recordings=len(table),
-        fabrics=len(of_fabric),
-        left_out=left_out,
-        p=float(stats.friedmanchisquare(*tested).pvalue) if can_test else np.nan,
-        difference=critical_difference(len(ranks.columns), len(of_fabric)),
-    )
+    p = float(stats.friedmanchisquare(*tested).pvalue) if can_test else np.nan
+    difference = critical_difference(len(table), len(of_fabric))
+    words = f"{len(table)} configurations, {len(means)} recordings, {len(of_fabric)} fabrics, "
+    words += f"critical difference {difference:.2f}"
+    words += f", Friedman's p {p:.2g}" if np.isfinite(p) else ""
+    words += f", left out {left_out}" if left_out else ""
+    return Ranks(table.sort_values("mean", kind="stable"), p, words)
 
 
 def critical_difference(treatments: int, blocks: int) -> float:

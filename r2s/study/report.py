@@ -1,5 +1,9 @@
-"""The sections of a report and their words, as one HTML file that needs no network."""
+"""The report of a study: `report.html`, one file that works without a network, and its tables.
 
+`report.html.j2` is the template of the page.
+"""
+
+import dataclasses
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -13,24 +17,31 @@ from plotly.offline import get_plotlyjs
 
 from r2s._util.files import write_text
 from r2s.metrics.statistics import LEVEL
+from r2s.study import comparisons, conclusions
+from r2s.study import results as frame
+from r2s.study import tables as text_tables
 from r2s.study.configuration import MOTIONS, PAPER_CONFIGURATIONS
-from r2s.study.report import tables as text_tables
-from r2s.study.report.figures import (
+from r2s.study.ensembles import BEYOND, SURFACE, ensembles
+from r2s.study.estimates import ESTIMATE
+from r2s.study.evaluations import EvaluationTask
+from r2s.study.figures import (
     Motion,
     colours_of,
     error_chart,
     interval_chart,
+    judged_recordings,
     motion_figures,
 )
-from r2s.study.report.tables import MISSING, mean_table, mean_text, significant
-from r2s.study.statistics import comparisons, conclusions, frame
-from r2s.study.verdicts import BEYOND, SURFACE
+from r2s.study.plan import Plan
+from r2s.study.tables import MISSING, mean_table, mean_text, significant
+from r2s.study.tasks import Task, provenance, result_files
 
 # The first that is there compares configurations: within the horizon, where one is known. The
 # parts of a sheet that cameras did not see do not count. Hausdorff distances are those of outliers.
 JUDGED_BY = (SURFACE, "chamfer_real_to_sim", "chamfer", "chamfer_cropped", conclusions.CHAMFER)
 DISTANCES = (*JUDGED_BY[:-1], "chamfer_sim_to_real", "hausdorff")
 MOST_MOTIONS = 15  # that are drawn
+PRINTED = ("skill", "findings")  # the other tables are in files
 VERSIONS = ("r2s", "jax", "jaxlib", "equinox", "numpy", "scipy", "pandas", "statsmodels", "plotly")
 INTERVAL = f"means over fabrics, with {LEVEL:.0%} intervals for fabrics like these"
 QUESTION = (
@@ -54,6 +65,47 @@ class Section(NamedTuple):
     folded: bool = False
 
 
+def publish_study(
+    tasks: Sequence[EvaluationTask],
+    failed: Mapping[Task, str],
+    out: Path,
+    plan: Plan,
+    source: str,
+    paper: Path | None = None,
+) -> None:
+    """Write `results.csv`, `estimates/`, `tables/` and `report.html`, and print the main tables.
+
+    - `failed`: tasks without a result, and why.
+    - `source`: where the recordings are from, in words.
+    - `paper`: a folder with the tables of the paper.
+    """
+    results, estimates = frame.collect(tasks, out), frame.estimates_made(tasks, out)
+    frame.write_results(out / "results.csv", results)
+    for task in estimates:
+        with result_files(task, out) as files:
+            if (files / ESTIMATE).exists():
+                (out / "estimates").mkdir(exist_ok=True)
+                write_text(out / f"estimates/{task.name}.json", (files / ESTIMATE).read_text())
+    made_by = provenance([*ensembles(tasks), *tasks], out)
+    settings = {"recordings": source}
+    settings |= {f.name: str(getattr(plan, f.name)) for f in dataclasses.fields(plan)}
+    settings |= {f"cells made by {by}": str(count) for by, count in made_by.items()}
+    tables = publish(
+        out,
+        results,
+        judged_recordings(tasks, out),
+        frame.parameters(tasks, out),
+        [(f"{task.kind} {task.name}", reason) for task, reason in failed.items()],
+        settings,
+        paper,
+        text_tables.tables_of_the_making(tasks, estimates, out),
+    )
+    for name in PRINTED:
+        if name in tables:
+            print(f"\n{tables[name].to_string(index=False)}")
+    print(f"\n{out / 'report.html'} has the pictures, {out / 'results.csv'} every figure.")
+
+
 def publish(
     out: Path,
     results: pd.DataFrame,
@@ -66,10 +118,10 @@ def publish(
 ) -> dict[str, pd.DataFrame]:
     """Write `report.html` and `tables/` into `out`; returns the tables by name.
 
-    - `results`: see `r2s.study.statistics.frame`. `motions`: recordings to draw.
+    - `results`: see `r2s.study.results`. `motions`: recordings to draw.
     - `parameters`: the estimates (`r2s.study.results.parameters`).
     - `missing`: tasks without a result, and why. `settings`: those of the study.
-    - `paper_folder`: the paper's tables, see `r2s.study.statistics.conclusions`.
+    - `paper_folder`: the paper's tables, see `r2s.study.conclusions`.
     - `making`: tables of how the study was made.
 
     Raises what `read_paper` raises, and OSError that names what cannot be written.
@@ -78,17 +130,24 @@ def publish(
     every = frame.labelled(frame.without_undefined(results))
     fabrics = frame.fabrics_in_common(every)
     shared = every[every.fabric.isin(fabrics)]
-    metric = next((each for each in JUDGED_BY if each in set(shared.metric)), SURFACE)
+    metric = next((name for name in JUDGED_BY if name in set(shared.metric)), SURFACE)
     skip = frame.undecided(shared, SURFACE) if metric == SURFACE else []
     decided = shared[(shared.metric == metric) & ~shared.recording.isin(skip)]
     judged = conclusions.findings(decided, papers)
-    drawn = [label for each in motions for label in each.vertices]
+    drawn = [label for motion in motions for label in motion.vertices]
     colours = colours_of([*every.configuration.cat.categories, *drawn])
     known = frame.with_floor(shared, SURFACE)
-    with_skill = known[known.baseline != frame.DEFAULT]
-    opening = _opening(decided, with_skill, judged, len(fabrics), len(missing))
+    with_skill = known[known.skill.notna()]
+    column, part = ("skill", with_skill) if len(with_skill) else ("value", decided)
+    means = frame.means(part, column)
+    lines = [
+        *(settings or {}).items(),
+        *((f"version of {name}", version(name)) for name in VERSIONS),
+    ]
+    opening = [_done(decided, len(fabrics), len(missing)), _best(means, part, column)]
+    opening += [_significance(judged, len(fabrics))]
     sections = [
-        Section(QUESTION, opening, figures=_picture(with_skill, decided, metric, colours)),
+        Section(QUESTION, opening, figures=_chart(means, column, metric, colours)),
         _skill(shared, every, known),
         _findings(judged, metric, skip),
         *_motions(motions, colours),
@@ -97,27 +156,24 @@ def publish(
         Section("How it was made", (), making or {}),
         Section("All distances", (), _distances(shared, papers)),
         _missing(every, missing),
-        Section("Settings", (), {"settings": ("", _settings(settings or {}))}),
+        Section(
+            "Settings", (), {"settings": ("", pd.DataFrame(lines, columns=["setting", "value"]))}
+        ),
     ]
-    sections = [each for each in sections if each.words or each.tables]
-    tables = {name: table for each in sections for name, (_, table) in each.tables.items()}
+    sections = [section for section in sections if section.words or section.tables]
+    tables = {name: table for section in sections for name, (_, table) in section.tables.items()}
     (out / "tables").mkdir(parents=True, exist_ok=True)
     for old in (out / "tables").glob("*.csv"):
         old.unlink()
     for name, table in tables.items():
         text = table.to_csv(index=False, lineterminator="\n")
         write_text(out / "tables" / f"{name}.csv", text)
-    write_text(out / "report.html", _render(sections))
-    return tables
-
-
-def _render(sections: Sequence[Section]) -> str:
-    """The page as HTML, which needs no other file and no network."""
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
     environment.filters |= {"table": _html_table, "figure": _json_figure}
     template = environment.get_template("report.html.j2")
-    return template.render(sections=sections, plotly=get_plotlyjs())
+    write_text(out / "report.html", template.render(sections=sections, plotly=get_plotlyjs()))
+    return tables
 
 
 def _html_table(table: pd.DataFrame) -> str:
@@ -131,73 +187,61 @@ def _json_figure(figure: go.Figure) -> str:
     return text.replace("<", "\\u003c")  # "<" would end the element that holds it
 
 
-def _picture(
-    with_skill: pd.DataFrame, decided: pd.DataFrame, metric: str, colours: Mapping[str, str]
+def _chart(
+    means: pd.DataFrame, column: str, metric: str, colours: Mapping[str, str]
 ) -> dict[str, go.Figure]:
-    """A chart of skills, or where none is known of mean distances, by its title."""
-    known = with_skill[with_skill.skill.notna()]
-    where = f"in motions that no estimate has seen, with {LEVEL:.0%} intervals"
-    if len(known):
-        marks = {0.0: "default", 1.0: "floor"}
-        chart = interval_chart(frame.means(known, "skill"), colours, "skill [-]", marks)
-        return {f"Skill {where}": chart}
-    if len(decided):
-        chart = interval_chart(frame.means(decided), colours, f"{metric} [m]", {})
-        return {f"Mean {metric} {where}": chart}
-    return {}
+    """The mean skills, or where none is known the mean distances, by the title of the chart."""
+    if means.empty:
+        return {}
+    what, unit, marks = f"Mean {metric}", f"{metric} [m]", {}
+    if column == "skill":
+        what, unit, marks = "Skill", "skill [-]", {0.0: "default", 1.0: "floor"}
+    title = f"{what} in motions that no estimate has seen, with {LEVEL:.0%} intervals"
+    return {title: interval_chart(means, colours, unit, marks)}
 
 
-def _opening(
-    decided: pd.DataFrame,
-    with_skill: pd.DataFrame,
-    judged: pd.DataFrame,
-    fabrics: int,
-    missing: int,
-) -> list[str]:
-    """Three sentences: what was done, the best configurations, and the significance."""
+def _done(decided: pd.DataFrame, fabrics: int, missing: int) -> str:
     own = decided[decided.baseline == ""]
-    done = (
+    of_fabrics = f"{fabrics} {'fabric' if fabrics == 1 else 'fabrics'}"
+    are_missing = "cell of the study is" if missing == 1 else "cells of the study are"
+    return (
         f"{len(frame.configurations(decided))} configurations (approach, solver, source) estimated "
-        f"{_number(fabrics, 'fabric')} and were evaluated on {decided.recording.nunique()} "
-        f"recordings of {', '.join(frame.motions(decided)) or 'no motion'}, which no estimate has "
-        f"seen. Of {len(own)} predictions {int(own.diverged.sum())} diverged; "
-        f"{_number(missing, 'cell')} of the study {'is' if missing == 1 else 'are'} missing."
+        f"{of_fabrics} and were evaluated on {decided.recording.nunique()} recordings of "
+        f"{', '.join(frame.motions(decided)) or 'no motion'}, which no estimate has seen. Of "
+        f"{len(own)} predictions {int(own.diverged.sum())} diverged; {missing} {are_missing} "
+        "missing."
     )
-    if fabrics < 2:
-        significance = (
-            "One fabric decides nothing between approaches: differences between them may be those "
-            "of this fabric, and there are no intervals and no tests."
-        )
-    else:
-        found = list(comparisons.answers(judged).values())
-        counts = [found.count(each) for each in (comparisons.HOLDS, comparisons.HOLDS_NOT)]
-        significance = (
-            f"Of the paper's {len(found)} conclusions {counts[0]} hold and {counts[1]} do not; "
-            f"{found.count(comparisons.UNKNOWN)} cannot be decided from {fabrics} fabrics."
-        )
-    return [done, _best(own, with_skill[with_skill.baseline == ""]), significance]
 
 
-def _best(own: pd.DataFrame, with_skill: pd.DataFrame) -> str:
+def _best(means: pd.DataFrame, part: pd.DataFrame, column: str) -> str:
     """The configuration with the best mean by motion, of those of which no run diverged."""
-    known = with_skill[with_skill.skill.notna()]
-    column, part = ("skill", known) if len(known) else ("value", own)
-    found = []
+    labels = set(part[part.baseline == ""].configuration)
+    best = []
     for motion in frame.motions(part):
-        table = frame.means(part[part.evaluated_on == motion], column).droplevel("evaluated_on")
-        table = table[np.isfinite(table["mean"])]
+        table = means.xs(motion, level="evaluated_on")
+        table = table[np.isfinite(table["mean"]) & table.index.isin(labels)]
         if len(table):
             label = table["mean"].idxmax() if column == "skill" else table["mean"].idxmin()
             write = "{:.2f}".format if column == "skill" else "{:.3g}".format
-            found.append(f"{label} in {motion} ({mean_text(table.loc[label], write)})")
-    if not found:
+            best.append(f"{label} in {motion} ({mean_text(table.loc[label], write)})")
+    if not best:
         return "No configuration has a result that could be compared."
     what = "The highest mean skill" if column == "skill" else "The smallest mean distance"
-    return f"{what} has {'; '.join(found)}."
+    return f"{what} has {'; '.join(best)}."
 
 
-def _number(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
+def _significance(judged: pd.DataFrame, fabrics: int) -> str:
+    if fabrics < 2:
+        return (
+            "One fabric decides nothing between approaches: differences between them may be those "
+            "of this fabric, and there are no intervals and no tests."
+        )
+    answers = list(comparisons.answers(judged).values())
+    return (
+        f"Of the paper's {len(answers)} conclusions {answers.count(comparisons.HOLDS)} hold "
+        f"and {answers.count(comparisons.HOLDS_NOT)} do not; "
+        f"{answers.count(comparisons.UNKNOWN)} cannot be decided from {fabrics} fabrics."
+    )
 
 
 def _skill(shared: pd.DataFrame, every: pd.DataFrame, known: pd.DataFrame) -> Section:
@@ -218,7 +262,7 @@ def _skill(shared: pd.DataFrame, every: pd.DataFrame, known: pd.DataFrame) -> Se
             "include it, the table by fabric does."
         )
     table = text_tables.skill_table(frame.means(known), frame.skills(known))
-    found: Tables = {
+    tables: Tables = {
         "skill": (f"Error up to the horizon, floor and skill: {INTERVAL}", table),
         "learned": (
             "Error of the prior median over that of each configuration",
@@ -230,16 +274,16 @@ def _skill(shared: pd.DataFrame, every: pd.DataFrame, known: pd.DataFrame) -> Se
     for motion in frame.motions(beyond):
         table = mean_table(beyond[beyond.evaluated_on == motion], "metric")
         text = f"{motion}, differences to the recording beyond the horizon: {INTERVAL}"
-        found[f"beyond_{motion}"] = text, table
-    return Section("Skill", words, {name: each for name, each in found.items() if len(each[1])})
+        tables[f"beyond_{motion}"] = text, table
+    return Section("Skill", words, {name: t for name, t in tables.items() if len(t[1])})
 
 
 def _by_fabric(known: pd.DataFrame) -> pd.DataFrame:
     keys = ["fabric", "evaluated_on", "configuration"]
-    found = known.groupby(keys, observed=True)[["value", "floor", "skill"]].mean()
-    found["diverged"] = known.groupby(keys, observed=True).diverged.sum()
-    millimetres = {"error [mm]": 1e3 * found.value, "floor [mm]": 1e3 * found.floor}
-    return found.assign(**millimetres).drop(columns=["value", "floor"]).reset_index()
+    means = known.groupby(keys, observed=True)[["value", "floor", "skill"]].mean()
+    means["diverged"] = known.groupby(keys, observed=True).diverged.sum()
+    millimetres = {"error [mm]": 1e3 * means.value, "floor [mm]": 1e3 * means.floor}
+    return means.assign(**millimetres).drop(columns=["value", "floor"]).reset_index()
 
 
 def _findings(judged: pd.DataFrame, metric: str, skip: Sequence[str]) -> Section:
@@ -262,8 +306,8 @@ def _motions(motions: Sequence[Motion], colours: Mapping[str, str]) -> list[Sect
     shown = motions[:MOST_MOTIONS]
     if not shown:
         return []
-    titles = [each.title for each in shown]
-    errors = [error_chart(each, colours) for each in shown]
+    titles = [motion.title for motion in shown]
+    errors = {motion.title: error_chart(motion, colours) for motion in shown}
     words = (
         "Mean distance of the recorded points from each simulated surface. Differences within the "
         "shaded floor are not significant; beyond the horizon an error says nothing about a "
@@ -277,7 +321,7 @@ def _motions(motions: Sequence[Motion], colours: Mapping[str, str]) -> list[Sect
         turn += f" {len(motions) - len(shown)} more recordings are not shown."
     figures = dict(zip(titles, motion_figures(shown, colours), strict=True))
     return [
-        Section("Error over time", (words,), figures=dict(zip(titles, errors, strict=True))),
+        Section("Error over time", (words,), figures=errors),
         Section("Motions", (turn,), figures=figures, folded=True),
     ]
 
@@ -288,8 +332,8 @@ def _ranks(decided: pd.DataFrame, metric: str) -> Tables:
     ranked = {m: r for m, part in parts.items() if (r := comparisons.rank(part)) is not None}
     if not ranked:
         return {}
-    tests = "; ".join(f"{name}: {each.words}" for name, each in ranked.items())
-    table = pd.concat({name: each.table for name, each in ranked.items()}, names=["motion"])
+    tests = "; ".join(f"{motion}: {ranks.words}" for motion, ranks in ranked.items())
+    table = pd.concat({motion: ranks.table for motion, ranks in ranked.items()}, names=["motion"])
     text = f"Mean ranks by {metric} with {LEVEL:.0%} intervals, and how often first. {tests}"
     return {"ranks": (text, table.reset_index())}
 
@@ -304,32 +348,27 @@ def _parameters(parameters: pd.DataFrame | None) -> Tables:
 
 
 def _distances(shared: pd.DataFrame, papers: pd.DataFrame) -> Tables:
-    found: Tables = {}
+    tables: Tables = {}
     for metric in DISTANCES:
         own = shared[(shared.metric == metric) & shared.evaluated_on.isin(MOTIONS)]
         if len(own):
-            found[metric] = f"{metric}: {INTERVAL}", mean_table(own, "evaluated_on")
+            tables[metric] = f"{metric}: {INTERVAL}", mean_table(own, "evaluated_on")
     one_by_one = text_tables.recording_table(shared, "chamfer_real_to_sim")
     if len(one_by_one):
-        found["recordings"] = "chamfer_real_to_sim [mm] of every recording", one_by_one
+        tables["recordings"] = "chamfer_real_to_sim [mm] of every recording", one_by_one
     for motion in MOTIONS:
         table = conclusions.beside_paper(shared, papers, motion)
         if len(table.columns) > 1:
             cited = f"; paper: {conclusions.CITED}" if len(papers) else ""
             text = f"Chamfer distance on {motion} in the units of the paper [-]{cited}"
-            found[f"{motion}_{conclusions.CHAMFER}"] = text, table
-    return found
+            tables[f"{motion}_{conclusions.CHAMFER}"] = text, table
+    return tables
 
 
 def _missing(every: pd.DataFrame, missing: Sequence[tuple[str, str]]) -> Section:
-    there = frame.configurations(every)
-    absent = [each.label for each in PAPER_CONFIGURATIONS if each not in there]
+    known = frame.configurations(every)
+    absent = [c.label for c in PAPER_CONFIGURATIONS if c not in known]
     words = f"Configurations of the paper that have no result here: {', '.join(absent)}."
     table = pd.DataFrame(list(missing), columns=["cell", "reason"])
-    found = {"missing": ("Cells without a result, and why", table)} if missing else {}
-    return Section("What is missing", (words,) if absent else (), found)
-
-
-def _settings(settings: Mapping[str, str]) -> pd.DataFrame:
-    lines = [*settings.items(), *((f"version of {name}", version(name)) for name in VERSIONS)]
-    return pd.DataFrame(lines, columns=["setting", "value"])
+    tables = {"missing": ("Cells without a result, and why", table)} if missing else {}
+    return Section("What is missing", (words,) if absent else (), tables)

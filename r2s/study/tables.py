@@ -12,13 +12,12 @@ import pandas as pd
 from r2s.estimation.default_spaces import FROM, fixed, with_law
 from r2s.estimation.method import default_space
 from r2s.study.configuration import ON_CLOTH
-from r2s.study.ensembles import Ensemble, read_ensemble
+from r2s.study.ensembles import ensembles, judged_motions
 from r2s.study.estimates import EstimateTask, method_of
 from r2s.study.evaluations import EvaluationTask
-from r2s.study.recordings import SyntheticRecording, read, true_fabric
-from r2s.study.statistics.frame import CONFIGURATION, means, motions
+from r2s.study.recordings import SimulatedRecording, SyntheticRecording, read, true_fabric
+from r2s.study.results import CONFIGURATION, means, motions
 from r2s.study.tasks import read_metadata, with_dependencies
-from r2s.study.verdicts import Judged, ensembles, judged_motions
 
 MISSING = "-"
 LEAST = 2e-3  # [m]: the effect of mesh and step in a converged motion, mean up to the horizon
@@ -60,7 +59,7 @@ def mean_text(row: pd.Series, write: Callable[[float], str]) -> str:
 
 def skill_table(errors: pd.DataFrame, skills: pd.DataFrame) -> pd.DataFrame:
     """Error, floor and skill by motion, a line a configuration; from `means` and `skills` of
-    `r2s.study.statistics.frame`."""
+    `r2s.study.results`."""
     columns: dict[str, dict[str, str]] = {}
     for (label, motion), row in skills.iterrows():
         skill = mean_text(row, "{:.2f}".format) if row.runs > 0 else "not known"
@@ -107,51 +106,46 @@ def recording_table(results: pd.DataFrame, metric: str) -> pd.DataFrame:
     """
     own = results[(results.metric == metric) & (results.baseline != ON_CLOTH)]
     whose = own[own.baseline == "other_fabric"][CONFIGURATION].drop_duplicates()
-    place, found = ["evaluated_on", "fabric", "recording"], [pd.DataFrame()]
+    place, tables = ["evaluated_on", "fabric", "recording"], [pd.DataFrame()]
     for configuration in whose.itertuples(index=False):
         is_own = (own[CONFIGURATION] == list(configuration)).all(axis=1)
         part = own[is_own | (own.approach == "") & own.solver.isin(("", configuration.solver))]
         part = part[(part.baseline == "default") | ~part.duplicated([*place, "baseline"])]
         table = 1e3 * part.pivot_table(index=place, columns="baseline", values="value")
         table = table.rename(columns={"": "estimate"}).reset_index().rename_axis(columns=None)
-        found.append(table.assign(configuration=" ".join(configuration)))
-    return pd.concat(found)
+        tables.append(table.assign(configuration=" ".join(configuration)))
+    return pd.concat(tables)
 
 
 def tables_of_the_making(
     tasks: Sequence[EvaluationTask], estimates: Sequence[EstimateTask], folder: Path
 ) -> dict[str, tuple[str, pd.DataFrame]]:
     """How a study was made, by name with a caption; `estimates`: the finished ones."""
-    found = {
+    tables = {
         "truths": (TRUTHS, truth_table(tasks, folder)),
         "data": (DATA, data_table(estimates, folder)),
         "ranges": (RANGES, range_table(tasks)),
         "costs": ("Time and memory, compilation included", cost_table(tasks, folder)),
     }
-    return {name: each for name, each in found.items() if len(each[1])}
+    return {name: (caption, table) for name, (caption, table) in tables.items() if len(table)}
 
 
 def truth_table(tasks: Sequence[EvaluationTask], folder: Path) -> pd.DataFrame:
     """How accurately each recording is known: horizon, floor by cause [mm] and a verdict."""
-    known = judged_motions(tasks, folder)
-    rows = [
-        {"recording": task.recording.name, "horizon [s]": known[task.recording].horizon}
-        | _truth(known[task.recording], read_ensemble(task, folder), task.lacks_layers)
-        for task in ensembles(tasks)
-        if task.recording in known
-    ]
+    rows = []
+    for source, judged in judged_motions(tasks, folder).items():
+        row: dict[str, Any] = {"recording": source.name, "horizon [s]": judged.horizon}
+        if not judged.inside.any():
+            rows.append(row | {"verdict": "no frame is known"})
+            continue
+        lengths = {"floor": float(judged.floor[judged.inside].mean())}
+        lengths |= {c: float(each[:, judged.inside].mean()) for c, each in judged.causes.items()}
+        row |= {f"{name} [mm]": 1e3 * length for name, length in lengths.items()}
+        row["verdict"] = verdict(*(lengths[c] for c in ("stiffness", "path", "mesh", "step")))
+        if isinstance(source, SimulatedRecording) and source.has_layers:
+            row["verdict"] = "not known: ensemble without self-contact"
+        rows.append(row)
     return pd.DataFrame(rows)
-
-
-def _truth(judged: Judged, ensemble: Ensemble, is_layered: bool) -> dict[str, Any]:
-    if not judged.inside.any():
-        return {"verdict": "no frame is known"}
-    inside = np.isin(ensemble.times, judged.times[judged.inside])
-    left = {cause: float(each[:, inside].mean()) for cause, each in ensemble.causes.items()}
-    words = verdict(*(left[cause] for cause in ("stiffness", "path", "mesh", "step")))
-    floor = float(judged.floor[judged.inside].mean())
-    shown = {f"{name} [mm]": 1e3 * length for name, length in ({"floor": floor} | left).items()}
-    return {**shown, "verdict": "not known: ensemble without self-contact" if is_layered else words}
 
 
 def verdict(stiffness: float, path: float, mesh: float, step: float) -> str:
@@ -175,11 +169,11 @@ def data_table(estimates: Iterable[EstimateTask], folder: Path) -> pd.DataFrame:
             "approach": place[0],
             "motion": place[1],
             "recordings": len(recordings),
-            "frames": ", ".join(dict.fromkeys(str(len(each.frames)) for each in reads)),
-            "clouds": any(each.points != 0 for each in reads),
-            "markers": any(each.markers for each in reads),
-            "force of grippers": any(each.force for each in reads),
-            "prior": task.prior,
+            "frames": ", ".join(dict.fromkeys(str(len(data.frames)) for data in reads)),
+            "clouds": any(data.points != 0 for data in reads),
+            "markers": any(data.markers for data in reads),
+            "force of grippers": any(data.force for data in reads),
+            "prior": "fabrics" if task.informed else "flat",
             "laws": task.law_from(recordings),
         }
     return pd.DataFrame(list(rows.values()))
@@ -196,8 +190,8 @@ def range_table(tasks: Iterable[EvaluationTask]) -> pd.DataFrame:
         law = "linear" if laws <= {"linear"} else "stiffening+softening"
         space = with_law(default_space(solver, own[0].density), law)
         sources = [source for task in own for source in task.recordings]
-        synthetic = [each for each in sources if isinstance(each, SyntheticRecording)]
-        names = dict.fromkeys(each.fabric for each in synthetic if not each.truth.materials)
+        synthetic = [source for source in sources if isinstance(source, SyntheticRecording)]
+        names = dict.fromkeys(source.fabric for source in synthetic if not source.truth.materials)
         units = [space.to_unit(true_fabric(name, law)) for name in names]
         mean = np.mean(units, axis=0) if units else np.full(space.dim, np.nan)
         middle = space.values(jnp.full(space.dim, 0.5, float))
@@ -206,8 +200,8 @@ def range_table(tasks: Iterable[EvaluationTask]) -> pd.DataFrame:
             numbers = (bound.low, bound.high, half, truth)
             rows.append((solver, bound.name, bound.unit, *numbers, FROM.get(bound.name)))
         for density in dict.fromkeys(task.density for task in own):
-            for each in fixed(default_space(solver, density)):
-                row = (solver, each.name, each.unit, *(each.value,) * 3, np.nan, each.origin)
+            for value in fixed(default_space(solver, density)):
+                row = (solver, value.name, value.unit, *(value.value,) * 3, np.nan, value.origin)
                 rows += [row] if row not in rows else []
     header = ["solver", "parameter", "unit", "low", "high", "middle", "truths", "from"]
     return pd.DataFrame(rows, columns=header)
@@ -221,8 +215,8 @@ def cost_table(tasks: Sequence[EvaluationTask], folder: Path) -> pd.DataFrame:
             groups[task.compilation_group].append(read_metadata(task, folder))
     rows = []
     for group, noted in groups.items():
-        seconds = [each["cpu_seconds"] for each in noted]
-        memory = max(each["peak_memory_MB"] for each in noted)
+        seconds = [metadata["cpu_seconds"] for metadata in noted]
+        memory = max(metadata["peak_memory_MB"] for metadata in noted)
         rows.append((group, len(noted), sum(seconds), float(np.median(seconds)), memory))
     times = ["CPU seconds in all", "CPU seconds of one (median)"]
     return pd.DataFrame(rows, columns=["kind", "count", *times, "peak memory [MB]"])

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from r2s.study.comparisons import Comparison, compare, compared, judge
 from r2s.study.configuration import APPROACHES, MOTIONS, PAPER_CONFIGURATIONS, Configuration
-from r2s.study.statistics.comparisons import Comparison, compare, compared, judge
-from r2s.study.statistics.frame import configurations
+from r2s.study.results import configurations
 
 LIFTING, WIND, DIFFCP = PAPER_CONFIGURATIONS[:3]
 PINN_POINTS, PINN_CLOTH = PAPER_CONFIGURATIONS[6:]
@@ -31,7 +31,11 @@ def findings(results: pd.DataFrame, paper: pd.DataFrame) -> pd.DataFrame:
     estimates by published recipes do not count."""
     is_own = ~results.approach.str.endswith("-published") & (results.approach != "")
     own = results[is_own & (results.baseline == "") & results.evaluated_on.isin(MOTIONS)]
-    return judge((words, each) for words, group in _conclusions(own, paper) for each in group)
+    return judge(
+        (words, comparison)
+        for words, comparisons in _conclusions(own, paper)
+        for comparison in comparisons
+    )
 
 
 def _conclusions(
@@ -40,8 +44,8 @@ def _conclusions(
     def sides(motion: str, smaller: Sequence[Configuration], *larger: Configuration) -> Comparison:
         return _sides(results, paper, motion, smaller, larger)
 
-    there = configurations(results)
-    cloth = [each for each in PAPER_CONFIGURATIONS if each.solver == "cloth"]
+    known = configurations(results)
+    cloth = [c for c in PAPER_CONFIGURATIONS if c.solver == "cloth"]
     yield (
         "Folding is reproduced far better than fling and shaking.",
         [_easier(results, paper, "folding", motion) for motion in ("fling", "shaking")],
@@ -54,7 +58,7 @@ def _conclusions(
         "In fling material points are better than the cloth solver.",
         [
             _solvers(results, paper, "fling", "mpm", "cloth"),
-            sides("fling", (PINN_POINTS, DIFFCP), *([c for c in cloth if c in there] or cloth)),
+            sides("fling", (PINN_POINTS, DIFFCP), *([c for c in cloth if c in known] or cloth)),
         ],
     )
     yield (
@@ -69,7 +73,7 @@ def _conclusions(
     for best, motion in ((PINN_CLOTH, "folding"), (PINN_POINTS, "fling")):
         yield (
             f"In {motion} {best.label} is the best configuration.",
-            [sides(motion, [best], each) for each in PAPER_CONFIGURATIONS if each != best],
+            [sides(motion, [best], other) for other in PAPER_CONFIGURATIONS if other != best],
         )
     yield (
         "The gradients of DiffCP explode: more of its estimates diverge than of others.",
@@ -91,7 +95,7 @@ def _sides(
     larger: Sequence[Configuration],
 ) -> Comparison:
     """Configurations against others on one motion, with the averages of the paper."""
-    first, second = ([each.label for each in side] for side in (smaller, larger))
+    first, second = ([c.label for c in side] for side in (smaller, larger))
     words = f"in {motion} {' and '.join(first)} better than {' and '.join(second)}"
     quoted = average(paper, motion, smaller), average(paper, motion, larger)
     part = results[results.evaluated_on == motion]
@@ -102,20 +106,19 @@ def _solvers(
     results: pd.DataFrame, paper: pd.DataFrame, motion: str, better: str, worse: str
 ) -> Comparison:
     """One solver against the other, of the approaches and scenarios that have both."""
-    there = configurations(results)
-    first = [c for c in there if c.solver == better and c._replace(solver=worse) in there]
+    known = configurations(results)
+    first = [c for c in known if c.solver == better and c._replace(solver=worse) in known]
     if not first:
         words = f"in {motion} {better} better than {worse}"
         return Comparison(words, lacking="no approach with rows of both solvers")
-    second = [each._replace(solver=worse) for each in first]
-    return _sides(results, paper, motion, first, second)
+    return _sides(results, paper, motion, first, [c._replace(solver=worse) for c in first])
 
 
 def _easier(results: pd.DataFrame, paper: pd.DataFrame, easy: str, hard: str) -> Comparison:
     """Distances on one motion against those on another, by the same configuration and fabric."""
     words = f"{hard} over {easy}, for the same configuration and fabric"
-    there = [each for each in PAPER_CONFIGURATIONS if each in configurations(results)]
-    quoted = average(paper, easy, there), average(paper, hard, there)
+    known = [c for c in PAPER_CONFIGURATIONS if c in configurations(results)]
+    quoted = average(paper, easy, known), average(paper, hard, known)
     part = results[results.evaluated_on.isin([easy, hard])]
     if part.empty:
         return Comparison(words, lacking="nothing that both were judged on", paper=quoted)
@@ -134,10 +137,10 @@ def _easier(results: pd.DataFrame, paper: pd.DataFrame, easy: str, hard: str) ->
     used = of_recording[is_known].groupby(["evaluated_on", "fabric", "movement"]).mean()
     tables = [used[motion].unstack() for motion in used.index.unique("evaluated_on")]
     tables.append(apart(logs, "repeat").groupby(["fabric", "repeat"]).mean().unstack())
-    lost = part.groupby("evaluated_on").diverged.sum()
-    diverged = int(lost.get(easy, 0)), int(lost.get(hard, 0))
-    found = compared(words, numbers.groupby("fabric").mean(), tables, diverged)
-    return found._replace(paper=quoted)
+    counts = part.groupby("evaluated_on").diverged.sum()
+    diverged = int(counts.get(easy, 0)), int(counts.get(hard, 0))
+    comparison = compared(words, numbers.groupby("fabric").mean(), tables, diverged)
+    return comparison._replace(paper=quoted)
 
 
 def _diverges_more(results: pd.DataFrame, approach: str) -> Comparison:
@@ -149,22 +152,22 @@ def _diverges_more(results: pd.DataFrame, approach: str) -> Comparison:
     words = "share of the estimates that diverged, less that of other approaches"
     keys = ["is_own", "fabric", "configuration", "repeat"]
     part = results.assign(is_own=results.approach == approach)
-    lost = part.groupby(keys, observed=True).diverged.any()
-    counts = lost.groupby(["is_own", "fabric"]).agg(["sum", "size"])
+    diverged = part.groupby(keys, observed=True).diverged.any()
+    counts = diverged.groupby(["is_own", "fabric"]).agg(["sum", "size"])
     sides = [counts[counts.index.get_level_values("is_own") == side] for side in (True, False)]
     if any(side.empty for side in sides):
         return Comparison(words, lacking=f"no rows {'of others' if len(sides[0]) else 'of DiffCP'}")
     words += ": " + ", ".join(f"{s['sum'].sum()} of {s['size'].sum()}" for s in sides)
-    if not lost.any():
+    if not diverged.any():
         why = "no estimate diverged, and the gradients of searches are not in the results"
         return Comparison(words, lacking=why)
     own, others = (side.droplevel("is_own") for side in sides)
     numbers = own["sum"] / own["size"] - others["sum"] / others["size"]
     tested = compared(words, numbers, is_ratio=False)
     # counts may agree in all fabrics by chance, so the spread is at least that of counts
-    chance = np.sqrt(lost.mean() * (1 - lost.mean()) * np.mean(1 / own["size"]))
-    spread = float(max(tested.found.spread, chance))
-    return tested._replace(found=tested.found._replace(spread=spread))
+    chance = np.sqrt(diverged.mean() * (1 - diverged.mean()) * np.mean(1 / own["size"]))
+    spread = float(max(tested.effect.spread, chance))
+    return tested._replace(effect=tested.effect._replace(spread=spread))
 
 
 def _varies_more(results: pd.DataFrame, approach: str, other: str) -> Comparison:
@@ -173,19 +176,19 @@ def _varies_more(results: pd.DataFrame, approach: str, other: str) -> Comparison
     words = f"deviation between repeats: {APPROACHES[approach]}'s over {APPROACHES[other]}'s"
     if not (results.approach == approach).any():
         return Comparison(words, lacking=f"no rows of {APPROACHES[approach]}")
-    spreads, lost = [], []
+    spreads, diverged = [], []
     for name in (approach, other):
         part = results[results.approach == name]
         groups = part.groupby(["configuration", "fabric", "movement"], observed=True)
         deviation = groups.log.std().where(~groups.diverged.any())
         logs = np.log(deviation.where(deviation > 0))
         spreads.append(logs.groupby(["fabric", "movement"]).mean())
-        lost.append(int(part.diverged.sum()))
+        diverged.append(int(part.diverged.sum()))
     numbers = spreads[0] - spreads[1]
     if not numbers.notna().any():
         return Comparison(words, lacking="no recording with two or more repeats of both")
     by_movement = numbers.unstack()
-    return compared(words, by_movement.mean(axis=1), [by_movement], (lost[1], lost[0]))
+    return compared(words, by_movement.mean(axis=1), [by_movement], (diverged[1], diverged[0]))
 
 
 def read_paper(folder: Path | str | None) -> pd.DataFrame:
@@ -210,19 +213,19 @@ def _read(folder: Path, motion: str) -> pd.DataFrame:
         table = table[table.fabric != "Average"]
         if (twice := table.duplicated(["metric", "fabric"])).any():
             raise ValueError(f"{' of '.join(table[twice].iloc[0, :2])} is given twice")
-        found = table.melt(["metric", "fabric"], var_name="configuration")
-        numbers = pd.to_numeric(found.value, errors="coerce")
+        rows = table.melt(["metric", "fabric"], var_name="configuration")
+        numbers = pd.to_numeric(rows.value, errors="coerce")
         if not (is_right := (numbers > 0) & np.isfinite(numbers)).all():
-            metric, fabric, _, text = found[~is_right].iloc[0]
+            metric, fabric, _, text = rows[~is_right].iloc[0]
             raise ValueError(f"{metric} of {fabric}: expected a number above zero, found {text!r}")
         labels = {name: _configuration(name).label for name in table.columns[2:]}
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    return found.assign(
+    return rows.assign(
         evaluated_on=motion,
-        metric=found.metric.map(METRICS),
-        fabric=found.fabric.str.strip().str.lower().str.replace(" ", "_"),
-        configuration=found.configuration.map(labels),
+        metric=rows.metric.map(METRICS),
+        fabric=rows.fabric.str.strip().str.lower().str.replace(" ", "_"),
+        configuration=rows.configuration.map(labels),
         value=numbers,
     )[COLUMNS]
 
@@ -240,7 +243,7 @@ def average(paper: pd.DataFrame, motion: str, whose: Sequence[Configuration]) ->
     missing."""
     part = paper[(paper.evaluated_on == motion) & (paper.metric == CHAMFER)]
     means = part.groupby("configuration").value.mean()
-    labels = [each.label for each in whose]
+    labels = [configuration.label for configuration in whose]
     if not labels or not set(labels) <= set(means.index):
         return np.nan
     return float(means[labels].mean())
