@@ -12,7 +12,7 @@ from r2s import rectangle
 from r2s.materials import presets, wrinkling
 from r2s.materials.wrinkling import LEAST, membrane_on_samples, released
 from r2s.scenarios.energy import stored_energy
-from r2s.solvers.explicit.elements import bending_force, membrane_force, membrane_stress
+from r2s.solvers.explicit.sheet import bending_force, membrane_force, membrane_stress
 
 CRITICAL = 0.5  # [N/m]
 value = jax.jit(released)

@@ -19,6 +19,7 @@ their own for the reverse mode, which gathers once for all that it needs: half t
 import itertools
 import math
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -126,18 +127,18 @@ def _pairing_slope(grid: Grid, x: Points, values: Values, slopes: Slopes, nodes:
 @jax.custom_vjp
 def p2g(grid: Grid, x: Points, values: Values, slopes: Slopes) -> Nodes:
     """`p2g_plain` with a faster reverse mode and no forward mode; constant in the grid."""
-    return _p2g_forward(grid, x, values, slopes)[0]
+    return _forward(p2g_plain, grid, x, values, slopes)[0]
 
 
 @jax.custom_vjp
 def g2p(grid: Grid, x: Points, nodes: Nodes) -> tuple[Values, Slopes]:
     """`g2p_plain` with a faster reverse mode and no forward mode; constant in the grid."""
-    return _g2p_forward(grid, x, nodes)[0]
+    return _forward(g2p_plain, grid, x, nodes)[0]
 
 
-def _p2g_forward(grid, x, values, slopes):
-    inputs = _kept((x, values, slopes))
-    return _kept(p2g_plain(grid, *inputs)), (grid, *inputs)
+def _forward(plain, grid, *inputs):
+    inputs = _kept(inputs)
+    return _kept(plain(grid, *inputs)), (grid, *inputs)
 
 
 def _p2g_reverse(saved, nodes):
@@ -145,11 +146,6 @@ def _p2g_reverse(saved, nodes):
     nodes = _kept(nodes)
     slope = _pairing_slope(grid, x, values, slopes, nodes)
     return _no_slope(grid), *_kept((slope, *g2p_plain(grid, x, nodes)))
-
-
-def _g2p_forward(grid, x, nodes):
-    inputs = _kept((x, nodes))
-    return _kept(g2p_plain(grid, *inputs)), (grid, *inputs)
 
 
 def _g2p_reverse(saved, parts):
@@ -160,8 +156,7 @@ def _g2p_reverse(saved, parts):
 
 
 def _kept(values):
-    """Values that XLA computes once and stores; it would compute them anew for each of the
-    transfers' many uses."""
+    """Values that XLA computes once and stores, and not anew for each of their many uses."""
     return jax.lax.optimization_barrier(values)
 
 
@@ -170,8 +165,8 @@ def _no_slope(grid: Grid) -> Grid:
 
 
 _around.defvjp(_around_forward, _around_reverse)
-p2g.defvjp(_p2g_forward, _p2g_reverse)
-g2p.defvjp(_g2p_forward, _g2p_reverse)
+p2g.defvjp(partial(_forward, p2g_plain), _p2g_reverse)
+g2p.defvjp(partial(_forward, g2p_plain), _g2p_reverse)
 
 
 class _Stencil:
@@ -191,8 +186,7 @@ class _Stencil:
         strides = jnp.asarray(_strides(grid), int)[None]
         self.first = jnp.sum(first * strides, axis=1)
         self.corner = list(first.T)
-        self.away = place * grid.spacing
-        self.spacing = grid.spacing
+        self.away, self.spacing = place * grid.spacing, grid.spacing
         axes = range(x.shape[1])
         splines = (1.5 - place) ** 2 / 2, 0.75 - (place - 1) ** 2, (place - 0.5) ** 2 / 2
         slopes = place - 1.5, 2 - 2 * place, place - 0.5
@@ -226,7 +220,7 @@ class _Stencil:
         return value, moment - value[:, :, None] * self.away[:, None]
 
     def affine(self, values: Values, slopes: Slopes) -> tuple[Values, list[Values]]:
-        """The particles' affine fields at their first nodes, and the steps between nodes."""
+        """The particles' affine fields at their first nodes, and the differences between nodes."""
         start = values - jnp.sum(slopes * self.away[:, None], axis=2)
         return start, [slopes[:, :, i] * self.spacing for i in range(slopes.shape[2])]
 
@@ -246,11 +240,8 @@ def _affine_axis(value, steps):
     """An affine field at all nodes, from its value at the first and its steps along the axes."""
     if not steps:
         return [value]
-    return [
-        part
-        for i in range(3)
-        for part in _affine_axis(value + i * steps[0] if i else value, steps[1:])
-    ]
+    nodes = value, value + steps[0], value + 2 * steps[0]
+    return [part for node in nodes for part in _affine_axis(node, steps[1:])]
 
 
 def _p2g_axis(weights, value, steps):
@@ -286,9 +277,8 @@ def _slope_axis(weights, rates, rows):
 
 def _thirds(rows):
     count = len(rows) // 3
-    return [rows[i * count : (i + 1) * count] for i in range(3)]
+    return rows[:count], rows[count : 2 * count], rows[2 * count :]
 
 
 def _dot(weights, parts):
-    low, middle, high = (weight * part for weight, part in zip(weights, parts, strict=True))
-    return low + middle + high
+    return weights[0] * parts[0] + weights[1] * parts[1] + weights[2] * parts[2]
