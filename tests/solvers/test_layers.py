@@ -26,10 +26,9 @@ THICKNESS, RATE = jnp.asarray(1e-3), jnp.asarray(100.0)
 SIZE = 0.2  # [m]
 
 # compiled as a whole, which is quicker than operation by operation
-touching, colliding, contact_energy, contact_hessians = map(
-    eqx.filter_jit,
-    (contact.touching, contact.colliding, contact.contact_energy, contact.contact_hessians),
-)
+touching, colliding = eqx.filter_jit(contact.touching), eqx.filter_jit(contact.colliding)
+contact_energy = eqx.filter_jit(contact.contact_energy)
+contact_hessians = eqx.filter_jit(contact.contact_hessians)
 
 
 @eqx.filter_jit

@@ -1,9 +1,7 @@
 """Neighbours: which parts of a sheet may meet in a motion, by boxes around what they sweep.
 
-A pair is a vertex and a triangle, or two edges, that share no vertex
-(`r2s.solvers.contact.proximity`). Small meshes search among `all_pairs` with `candidate_pairs`;
-large ones with `candidate_pairs_in_tree`, by a tree of boxes around their faces, which finds the
-same.
+A pair is a vertex and a triangle, or two edges, that share no vertex (`proximity`). Small meshes
+search among `all_pairs`; large ones in a tree of boxes around their faces, which finds the same.
 """
 
 import equinox as eqx

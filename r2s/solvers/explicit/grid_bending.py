@@ -1,8 +1,7 @@
 """The bending of a grid's plate: turns of its lines at the vertices, twists of its cells.
 
 The same as `PlateElements.of_grid`: a vertex has the curvatures of its two turns, or of the nearest
-ones at the border, and of the cell whose origin it is. All but the angles is linear in what it
-depends on, so that forces follow from moments by its transpose.
+ones at the border, and of the cell whose origin it is.
 """
 
 from functools import partial
@@ -52,22 +51,24 @@ def bending_force(
     layout: Layout, laws: Any, x: Vector, v: Vector, corners: Any, rates: Any
 ) -> tuple[Any, Vector]:
     """Forces [N] of the twists on the corners of the cells, and of the turns on the vertices."""
-    turned, twisted = (
-        once(partial(_turns, layout), x, v),
-        once(partial(_twists, layout), corners, rates),
-    )
+    twisted = once(partial(_twists, layout), corners, rates)
+    turned = once(partial(_turns, layout), x, v)
     bent = (*turned, *twisted)
-    curvature, to_angles = jax.vjp(partial(_curvature, layout), [b.angle for b in bent])
-    rate = _curvature(layout, [b.rate for b in bent])
+    curvature = _curvature(layout, [bend.angle for bend in bent])
+    rate = _curvature(layout, [bend.rate for bend in bent])
     stress = laws.bending.damped(curvature, rate, laws.damping)
-    moments = to_angles(scale(layout.areas(stress[0]), stress))[0]
-    strengths = [
-        tuple(scale(-moment, gradient) for gradient in b.gradients)
-        for moment, b in zip(moments, bent, strict=True)
-    ]
-    _, to_corners = jax.vjp(_twist_parts, corners)
-    _, to_vertices = jax.vjp(partial(_turn_parts, layout), x)
-    return to_corners(tuple(strengths[2:]))[0], layout.inner(to_vertices(tuple(strengths[:2]))[0])
+    warp, weft, twist = scale(layout.areas(stress[0]), stress)
+    share = layout.constant(_of_cell(layout), layout.first_cell, twist)
+    twist = jnp.where(share > 0, -2 * share * layout.padded(twist, -layout.first_cell, 0), 0)
+    strengths = tuple(
+        tuple(scale(twist / layout.spacing[1 - axis], gradient) for gradient in bend.gradients)
+        for axis, bend in enumerate(twisted)
+    )
+    _, to_corners = jax.vjp(_twist_parts, corners)  # it is linear: of anything
+    of_warp, of_weft = (
+        _turn_force(layout, axis, turned[axis], moment) for axis, moment in ((0, warp), (1, weft))
+    )
+    return to_corners(strengths)[0], add(of_warp, of_weft)
 
 
 def _turns(layout: Layout, x: Vector, v: Vector) -> tuple[Bent, Bent]:
@@ -96,8 +97,7 @@ def _turn_parts(layout: Layout, x: Vector) -> tuple[Parts, Parts]:
         step, aside = (columns, 1) if axis == 0 else (1, columns)
         place = shifted(0)
         after, before = (subtract(shifted(shift), place) for shift in (step, -step))
-        where, last = np.indices(layout.shape)[1 - axis], layout.shape[1 - axis] - 1
-        has_next, has_last = (layout.constant(where != end, -columns, x[0]) for end in (last, 0))
+        has_next, has_last = _borders(layout, axis, x[0])
         forward = scale(has_next, subtract(shifted(aside), place))
         across = add(forward, scale(has_last, subtract(place, shifted(-aside))))
         # left of the axis is what is ahead along the weft, but what is behind along the warp
@@ -134,8 +134,52 @@ def _curvature(layout: Layout, angles: list[Array]) -> Vector:
         curvatures.append(jnp.where(first, after, jnp.where(last, before, own)))
     cells = 2 * (angles[2] / layout.spacing[1] + angles[3] / layout.spacing[0])
     cells = part(cells, -layout.first_cell, count)
-    # of a cell's twist in the curvature 2 k12 of the vertex that is its origin
+    share = layout.constant(_of_cell(layout), 0, cells)
+    return curvatures[0], curvatures[1], jnp.where(share > 0, share * cells, 0)
+
+
+def _of_cell(layout: Layout) -> np.ndarray:
+    """The share of a cell's twist in the curvature 2 k12 of the vertex that is its origin."""
     share = np.sqrt(np.prod(layout.spacing) / layout.vertex_areas) / 2
     share[-1], share[:, -1] = 0, 0
-    share = layout.constant(share, 0, cells)
-    return curvatures[0], curvatures[1], jnp.where(share > 0, share * cells, 0)
+    return share
+
+
+def _turn_force(layout: Layout, axis: int, turned: Bent, moment: Array) -> Vector:
+    """Forces [N] on the vertices, from moments [N m^2] that go with their curvature.
+
+    By sums of slices: the transposes of slices, which JAX would take, are slower.
+    """
+    columns, count = layout.shape[1], layout.count
+    step, aside = (columns, 1) if axis == 0 else (1, columns)
+    where, last = np.indices(layout.shape)[axis], layout.shape[axis] - 1
+    wide = layout.padded(moment, 2 * columns, 2 * columns)
+    length = layout.length(-columns)
+    own, after, before = (part(wide, columns + s, length) for s in (0, step, -step))
+    next_to_first = layout.constant(where == 1, -columns, own)
+    next_to_last = layout.constant(where == last - 1, -columns, own)
+    total = own + next_to_first * before + next_to_last * after
+    exists = _turn_exists(layout, axis, own)
+    strength = jnp.where(exists, -total / layout.spacing[axis], 0)
+    of_axis, of_left, of_right = (scale(strength, gradient) for gradient in turned.gradients)
+    of_next, of_last = (of_left, of_right) if axis == 1 else (of_right, of_left)
+    has_next, has_last = _borders(layout, axis, own)
+    forward, backward = scale(has_next, of_axis), scale(has_last, of_axis)
+    of_own = subtract(subtract(backward, forward), add(of_next, of_last))
+
+    def shifted(x: Vector, shift: int) -> Vector:
+        return parts(x, columns + shift, count)
+
+    ends = add(shifted(of_next, -step), shifted(of_last, step))
+    sides = subtract(shifted(forward, -aside), shifted(backward, aside))
+    return add(shifted(of_own, 0), ends, sides)
+
+
+def _borders(layout: Layout, axis: int, like: Array) -> tuple[Array, Array]:
+    """Whether a place has a next and a last one across an axis."""
+    where, last = np.indices(layout.shape)[1 - axis], layout.shape[1 - axis] - 1
+    columns = layout.shape[1]
+    return (
+        layout.constant(where != last, -columns, like),
+        layout.constant(where != 0, -columns, like),
+    )

@@ -108,8 +108,8 @@ def check_step(dt: float, longest: Float[Array, ""], material: str) -> None:
 def membrane_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
     """A bound on the square of the membrane's highest frequency [1/s^2], flat and unstrained.
 
-    The bound is that of the worst element, with its mass in equal parts at its corners (Fried
-    1972). A law that stiffens counts as its property `stiffest`, if it has one.
+    That of the worst element, with its mass in equal parts at its corners (Fried 1972). A law that
+    stiffens counts as its property `stiffest`, if it has one.
     """
     law = getattr(fabric.membrane, "stiffest", fabric.membrane)
     zero = jnp.zeros(3, jax.tree.leaves(law)[0].dtype)
@@ -131,8 +131,7 @@ def membrane_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
 def bending_frequency(mesh: Mesh, fabric: Fabric) -> Float[Array, ""]:
     """A bound on the square of the highest frequency of bending [1/s^2], flat and at rest.
 
-    The bound is that of the worst face or hinge, with the vertices' masses in equal parts among
-    the elements that share them.
+    That of the worst element, with the vertices' masses in equal parts among their elements.
     """
     mass = vertex_masses(mesh, fabric.density)
     law = fabric.bending

@@ -162,11 +162,10 @@ def _judged(at: _Point, line: _Line, point: _Point) -> tuple[_Line, Bool[Array, 
     """A line search after a trial point, and whether it has not ended.
 
     It takes the first of 1, 1/2, 1/4, ... that lowers the potential enough (Armijo) and ends short
-    of where it would rise as steeply as it fell. The gain of the last Newton steps is hidden by the
-    noise of a sum of many energies: there it is enough that the slope is half of what it was (as
-    Hager and Zhang 2005 do). If that is 1, it takes the last of 1, 2, 4, ... up to which the
-    potential falls steeply: away from a shape that is about to buckle the convex stand-in is far
-    too cautious.
+    of where it would rise as steeply as it fell. Where rounding hides the gain it is enough that
+    the slope is half of what it was (Hager and Zhang 2005). If that is 1, it takes the last of 1,
+    2, 4, ... up to which the potential falls steeply: away from a shape that is about to buckle the
+    convex stand-in is far too cautious.
     """
     last_place = jnp.finfo(point.value.dtype).eps * jnp.abs(at.value)
     ahead = jnp.sum(line.direction * point.force)

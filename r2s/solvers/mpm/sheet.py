@@ -1,10 +1,9 @@
 """A sheet of fabric by the material point method: a mesh whose vertices are the particles.
 
 After Jiang, Gast and Teran 2017, whom DiffCP (Zheng et al. 2024) follows. The laws of membrane and
-bending, the mesh and the `Fabric` are those of `r2s.ImplicitCloth`. The forces on the vertices go
-through the grid; across the sheet the grid's velocity gradient drives compression and shear between
-layers (`transverse`). So contact of the sheet with itself, with the table and with walls comes
-from the grid, and keeps layers about a spacing apart. The steps are explicit in time.
+bending, the mesh and the `Fabric` are those of `r2s.ImplicitCloth`. Contact of the sheet with
+itself, with the table and with walls comes from the grid: across the sheet its velocity gradient
+drives compression and shear between layers (`Transverse`), which stay about a spacing apart.
 """
 
 from typing import Literal
@@ -70,9 +69,7 @@ class Transverse(eqx.Module):
         self, corners: Float[Array, "3 3"], direction: Vector
     ) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
         """Forces on the corners per rest area [Pa], and the Kirchhoff stress times the thickness
-        [N/m], which goes to the grid.
-
-        Together they exert no torque, since rotations do not change the energy.
+        [N/m] for the grid. Together they exert no torque.
         """
         in_corners, in_direction = jax.grad(self.energy, argnums=(0, 1))(corners, direction)
         return -in_corners, in_direction[:, None] * direction[None]

@@ -10,10 +10,9 @@ affine velocity matrix C of APIC is 4 / spacing^2 times the moment (Jiang, Schro
 and Stomakhin 2015; Hu et al., "A moving least squares material point method", 2018).
 
 Both work axis by axis (the weights are products over the axes), and with one row of nodes at a
-time: 27 additions of (particle, channel) into the grid, which XLA makes in place, are faster on the
-CPU than one addition of all windows, sorted particles, or sums over cells. Both have a rule of
-their own for the reverse mode, which gathers once for all that it needs: half the time of JAX's in
-3-D. `g2p_plain` and `p2g_plain` have none, so that they can be differentiated forward.
+time: 27 additions of (particle, channel) into the grid, which XLA makes in place, are fastest on
+the CPU. Both have a rule of their own for the reverse mode: half the time of JAX's in 3-D.
+`g2p_plain` and `p2g_plain` have none, so that they can be differentiated forward.
 """
 
 import itertools
@@ -93,10 +92,6 @@ def _around(grid: Grid, first: Int[Array, " particle"], nodes: Nodes) -> Columns
     return _around_plain(grid, first, nodes)
 
 
-def _around_forward(grid, first, nodes):
-    return _around_plain(grid, first, nodes), (grid, first)
-
-
 def _around_reverse(saved, columns):
     grid, first = saved
     offsets = _offsets(grid)
@@ -108,17 +103,11 @@ def _around_reverse(saved, columns):
 
 
 def _pairing_slope(grid: Grid, x: Points, values: Values, slopes: Slopes, nodes: Nodes) -> Points:
-    """The derivative in x of sum_ip w_ip (value_p + slope_p d_ip) . node_i.
-
-    The derivative of that sum in the nodes is `p2g`, in values and slopes `g2p`; this is the third
-    that their reverse rules need.
-    """
+    """The derivative in x of sum_ip w_ip (value_p + slope_p d_ip) . node_i."""
     stencil = _Stencil(grid, x)
     rows = stencil.rows(nodes)
-    affine = _affine_axis(*stencil.affine(values, slopes))
-    products = [
-        jnp.sum(a * row, axis=1, keepdims=True) for a, row in zip(affine, rows, strict=True)
-    ]
+    pairs = zip(_affine_axis(*stencil.affine(values, slopes)), rows, strict=True)
+    products = [jnp.sum(affine * row, axis=1, keepdims=True) for affine, row in pairs]
     _, *gradients = _slope_axis(stencil.weights, stencil.rates, products)
     value, *_ = _g2p_axis(stencil.weights, rows)
     return jnp.concatenate(gradients, axis=1) - jnp.sum(value[:, :, None] * slopes, axis=1)
@@ -164,7 +153,7 @@ def _no_slope(grid: Grid) -> Grid:
     return jax.tree.map(jnp.zeros_like, grid)
 
 
-_around.defvjp(_around_forward, _around_reverse)
+_around.defvjp(lambda *inputs: (_around_plain(*inputs), inputs[:2]), _around_reverse)
 p2g.defvjp(partial(_forward, p2g_plain), _p2g_reverse)
 g2p.defvjp(partial(_forward, g2p_plain), _g2p_reverse)
 
@@ -196,16 +185,14 @@ class _Stencil:
 
     def rows(self, nodes: Nodes) -> list[Values]:
         """The field at each of the nodes."""
-        wheres = [self.first + offset for offset in self._offsets]
-        return [nodes.at[where].get(mode="promise_in_bounds") for where in wheres]
+        places = [self.first + offset for offset in self._offsets]
+        return [nodes.at[place].get(mode="promise_in_bounds") for place in places]
 
     def index(self) -> list[Int[Array, "1 node"]]:
         """Of each axis, the indices of all rows one after another."""
-        steps = np.array(list(itertools.product(range(3), repeat=len(self.corner))))
-        return [
-            (jnp.asarray(steps[:, i, None], int) + corner[None]).reshape(1, -1)
-            for i, corner in enumerate(self.corner)
-        ]
+        steps = np.array(list(itertools.product(range(3), repeat=len(self.corner)))).T
+        pairs = zip(steps, self.corner, strict=True)
+        return [(jnp.asarray(s[:, None], int) + first[None]).reshape(1, -1) for s, first in pairs]
 
     def means(self, columns: Columns) -> tuple[Values, Slopes]:
         """Weighted means and first moments of a field's rows, of one offset after another."""
@@ -248,10 +235,9 @@ def _p2g_axis(weights, value, steps):
     """An affine field at all nodes, as `_affine_axis` gives it, times the nodes' weights."""
     if not weights:
         return [value]
-    parts = []
-    for i, weight in enumerate(weights[0]):
-        here = value + i * steps[0] if i else value
-        parts += _p2g_axis(weights[1:], weight * here, [weight * step for step in steps[1:]])
+    nodes, parts = (value, value + steps[0], value + 2 * steps[0]), []
+    for weight, node in zip(weights[0], nodes, strict=True):
+        parts += _p2g_axis(weights[1:], weight * node, [weight * step for step in steps[1:]])
     return parts
 
 
