@@ -28,7 +28,7 @@ from r2s.materials.fabric import Fabric
 from r2s.mesh.mesh import Mesh, rectangle
 from r2s.mesh.surface import strains, vertex_masses
 from r2s.solvers.implicit.cloth import ImplicitCloth, ImplicitState
-from r2s.solvers.implicit.linear.pattern import Pattern
+from r2s.solvers.implicit.system import Pattern
 
 # Of the tests that take more than a second or two, up to minutes.
 SLOW_GROUPS = (
@@ -170,6 +170,11 @@ def rotation(angle: float, axis: int):
     i, j = [k for k in range(3) if k != axis]
     c, s = jnp.cos(angle), jnp.sin(angle)
     return jnp.eye(3).at[i, i].set(c).at[j, j].set(c).at[i, j].set(-s).at[j, i].set(s)
+
+
+def hanging(mesh: Mesh, angle: float = 0.0):
+    """Positions of a flat sheet that hangs from its first row, swung out by an angle."""
+    return flat(mesh) @ rotation(angle - np.pi / 2, 1).T
 
 
 def everywhere(vector, mesh: Mesh):

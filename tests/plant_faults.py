@@ -175,7 +175,7 @@ FAULTS = (
         "material points: no stress between layers",
         "mass[:, None, None] * state.C - factor * stress",
         "mass[:, None, None] * state.C",
-        "solvers/test_mpm_sheet.py solvers/test_mpm_scenes.py",
+        "solvers/test_mpm_sheet.py",
     ),
     Fault(
         "self-contact: a sign of the weights",

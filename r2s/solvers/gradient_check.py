@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
+import jax.flatten_util
 from jaxtyping import Array, Float
 
 from r2s.materials.fabric import Fabric
@@ -52,13 +52,10 @@ def compare(
     >>> {row.verdict for row in rows}
     {'agrees'}
     """
-    leaves, tree = jax.tree.flatten(fabric)
-    start = jnp.concatenate([jnp.ravel(leaf) for leaf in leaves])
-    ends = [sum(leaf.size for leaf in leaves[: i + 1]) for i in range(len(leaves) - 1)]
+    start, unravel = jax.flatten_util.ravel_pytree(fabric)
 
     def of_vector(vector: Float[Array, " number"]) -> Float[Array, ""]:
-        pairs = zip(jnp.split(vector, ends), leaves, strict=True)
-        return function(jax.tree.unflatten(tree, [p.reshape(leaf.shape) for p, leaf in pairs]))
+        return function(unravel(vector))
 
     slope = jax.jit((jax.jacfwd if forward else jax.grad)(of_vector))(start)
     value = jax.jit(of_vector)
@@ -81,7 +78,7 @@ def judge(
     scale = abs(value) or 1.0
 
     def difference(width: float) -> float:
-        above, below = (function(start.at[i].add(side * width * scale)) for side in (1, -1))
+        above, below = (function(start.at[i].add(sign * width * scale)) for sign in (1, -1))
         return float(above - below) / (2 * width * scale)
 
     wide, narrow = (difference(width) for width in WIDTHS)
@@ -101,8 +98,8 @@ def judge(
 
 
 def _names(fabric: Fabric) -> list[str]:
-    found = []
+    names = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(fabric)[0]:
         name = jax.tree_util.keystr(path).lstrip(".")
-        found += [name] if leaf.ndim == 0 else [f"{name}[{i}]" for i in range(leaf.size)]
-    return found
+        names += [name] if leaf.ndim == 0 else [f"{name}[{i}]" for i in range(leaf.size)]
+    return names

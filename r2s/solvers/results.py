@@ -1,4 +1,4 @@
-"""How a run of a solver ended: one code for all solvers."""
+"""What the steps of all solvers share: checks of their arguments, and how a run ended."""
 
 import enum
 from typing import Any, SupportsInt
@@ -6,6 +6,11 @@ from typing import Any, SupportsInt
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
+
+from r2s.environment.scene import Control, Scene
+from r2s.materials.fabric import Fabric
+
+LONGEST = 10.0  # [s], of a step, as while a sheet comes to rest: more is hardly meant in seconds
 
 
 class Result(enum.IntEnum):
@@ -66,3 +71,20 @@ def no_failure() -> Int[Array, ""]:
 def first_failure(before: Int[Array, ""], now: Int[Array, ""]) -> Int[Array, ""]:
     """The code of a run so far and of what comes after it: the first failure stays."""
     return jnp.where(before == Result.SUCCESS.value, now, before).astype(int)
+
+
+def check_step_arguments(
+    scene: Scene, fabric: Any, state: Any, control: Any, kind: type[Any]
+) -> None:
+    """Raise `TypeError` for arguments in another order, `ValueError` for shapes that do not fit.
+
+    - `kind`: that of the solver's states.
+    """
+    expected = ("fabric", fabric, Fabric), ("state", state, kind), ("control", control, Control)
+    for name, argument, cls in expected:
+        if not isinstance(argument, cls):
+            raise TypeError(
+                f"step(fabric, state, control): {name} must be a {cls.__name__}, got "
+                f"{type(argument).__name__}"
+            )
+    scene.check(state, control)

@@ -20,7 +20,7 @@ State = TypeVar("State")
 
 @runtime_checkable
 class Solver(Protocol[State]):
-    """What `simulate` and the estimators ask of a solver.
+    """What `simulate` and the estimators need of a solver.
 
     Its fabric is an `r2s.Fabric`, or what else its bodies are made of. A state has positions `x`
     [m], velocities `v` [m/s] and a `failure`, the first `Result` of the run that is no success.
@@ -43,8 +43,7 @@ class Solver(Protocol[State]):
 def predicted_memory(function: Callable, *args) -> int:
     """The memory [byte] that a jitted call of `function` on `args` will need, as compiled.
 
-    That of arguments, results and all that is held between. Nothing runs. What a device's libraries
-    take for themselves comes on top.
+    That of arguments, results and intermediates, without a device's libraries. Nothing runs.
 
         predicted_memory(jax.value_and_grad(loss), fabric)
     """
@@ -119,7 +118,6 @@ def simulate(
     if save_at is not None:
         _check_times(save_every, save_at, control.pinned.shape[0], solver.dt)
     end, x, v, failures = _run(solver, fabric, state, groups, keep_solutions, saves)
-    # once, and not in every step
     failures = jnp.where(solver.fits(fabric), failures, Result.TIME_STEP.value)
     unfailed = jnp.cumprod(jnp.all(failures == Result.SUCCESS.value, axis=1)).astype(bool)
     dt = jnp.asarray(solver.dt, x.dtype)
@@ -139,7 +137,9 @@ def _run(solver, fabric, state, control, keep_solutions: bool, saves):
 
     def step(state, control):
         state = solver.step(fabric, state, control)
-        return state, _failure(state)
+        finite = jnp.all(jnp.isfinite(jax.lax.stop_gradient(state.x)))
+        code = jnp.where(finite, Result.SUCCESS.value, Result.NON_FINITE.value)
+        return state, first_failure(state.failure, code)
 
     step = jax.checkpoint(step, policy=policy)
 
@@ -150,19 +150,17 @@ def _run(solver, fabric, state, control, keep_solutions: bool, saves):
     def wanted(state, at):
         number, control = at
 
-        def still():
-            steps = control.pinned.shape[0]
-            return state, (state.x, state.v, jnp.broadcast_to(no_failure(), (steps,)))
-
-        return jax.lax.cond(number < saves, lambda: group(state, control), still)
+        none = jnp.broadcast_to(no_failure(), control.pinned.shape[:1])
+        still = state, (state.x, state.v, none)
+        return jax.lax.cond(number < saves, lambda: group(state, control), lambda: still)
 
     if saves is None:
-        state, found = jax.lax.scan(jax.checkpoint(group, policy=policy), state, control)
+        state, saved = jax.lax.scan(jax.checkpoint(group, policy=policy), state, control)
     else:
         numbers = jnp.arange(control.pinned.shape[0])
         wanted = jax.checkpoint(wanted, policy=policy)
-        state, found = jax.lax.scan(wanted, state, (numbers, control))
-    return state, *found
+        state, saved = jax.lax.scan(wanted, state, (numbers, control))
+    return state, *saved
 
 
 def grouped(control: Control, every: int) -> Control:
@@ -189,10 +187,10 @@ def _check_times(save_every: int | None, times: Any, steps: int, dt: Any) -> Non
         raise ValueError("save_every and save_at exclude each other")
     if is_traced(times, dt):
         return
-    first, last = float(np.min(times)), float(np.max(times))
-    if first < 0 or last > steps * float(dt) * (1 + 1e-5):
+    first, last, end = float(np.min(times)), float(np.max(times)), steps * float(dt)
+    if first < 0 or last > end * (1 + 1e-5):
         raise ValueError(
-            f"save_at must lie between 0 and {steps * float(dt):g} s, the end of the control; "
+            f"save_at must lie between 0 and {end:g} s, the end of the control; "
             f"found {first:g} to {last:g} s"
         )
 
@@ -211,17 +209,10 @@ def _at(places: Array, state: Any, x: Array, v: Array, unfailed: Array, dt: Any)
     return at, rate / dt, unfailed[step]
 
 
-def _failure(state: Any) -> Int[Array, ""]:
-    """The failure that a state carries, or that its positions are not finite."""
-    finite = jnp.all(jnp.isfinite(jax.lax.stop_gradient(state.x)))
-    seen = jnp.where(finite, Result.SUCCESS.value, Result.NON_FINITE.value)
-    return first_failure(state.failure, seen)
-
-
 def _first(failures: Int[Array, " step"], dt: Array) -> tuple[Array, Array]:
     """Code and time [s] of the first failure."""
     if not failures.size:
         return no_failure(), jnp.full((), jnp.nan)
-    first = jnp.argmax(failures != Result.SUCCESS.value)
-    failed = failures[first] != Result.SUCCESS.value
-    return failures[first], jnp.where(failed, (first + 1).astype(dt.dtype) * dt, jnp.nan)
+    failed = failures != Result.SUCCESS.value
+    first = jnp.argmax(failed)
+    return failures[first], jnp.where(failed[first], (first + 1).astype(dt.dtype) * dt, jnp.nan)

@@ -1,6 +1,6 @@
 """A function of one fabric (or trajectory, or seed) for thousands, on all devices of all hosts.
 
-    for first, found in stream(lowest, fabrics, chunk=256, folder=Path("sweep")):
+    for first, results in stream(lowest, fabrics, chunk=256, folder=Path("sweep")):
         ...
 
 `lowest` is a pure function of one member; `fabrics` has a leading axis on every array. A chunk is
@@ -40,8 +40,8 @@ def sweep(
     >>> sweep(lambda member: member["a"] + member["b"], members, chunk=2).tolist()
     [1.0, 2.0, 3.0]
     """
-    parts = [found for _, found in stream(function, members, chunk, folder=folder, devices=devices)]
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    chunks = stream(function, members, chunk, folder=folder, devices=devices)
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *(part for _, part in chunks))
 
 
 def stream(
@@ -67,24 +67,29 @@ def stream(
     count = _length(members)
     size = -(-min(chunk, count) // devices.size) * devices.size
     run = _sharded(function, devices)
-    like = compiled = None
+    compiled = like = None
     for first in range(0, count, size):
         part = _part(members, slice(first, first + size))
         kept = min(size, count - first)
         path = None if folder is None else folder / f"{first:08d}-{_digest(part)}.eqx"
         if path is not None and path.exists():
-            like = _structure(function, part) if like is None else like
+            like = jax.eval_shape(jax.vmap(function), part) if like is None else like
             yield first, _read(path, like, kept)
             continue
-        whole = jax.tree.map(lambda leaf: _padded(leaf, size), part)
-        shards = _shard(whole, devices)
+        shards = _shard(part, size, devices)
         if compiled is None:
             compiled = run.lower(shards).compile()
             check(planned(compiled), f"a chunk of {size} members", f"take a chunk below {size}")
-        found = _on_host(compiled(shards), kept)
+        results = compiled(shards)
+        if jax.process_count() > 1:
+            results = multihost_utils.process_allgather(results, tiled=True)
+        results = _part(jax.device_get(results), slice(kept))
         if path is not None and jax.process_index() == 0:
-            _write(path, found)
-        yield first, found
+            buffer = io.BytesIO()
+            eqx.tree_serialise_leaves(buffer, results)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(path, buffer.getvalue())
+        yield first, results
 
 
 def all_devices() -> Mesh:
@@ -113,22 +118,15 @@ def _part(members: Any, chosen: slice) -> Any:
     return jax.tree.map(lambda leaf: np.asarray(leaf[chosen]), members)
 
 
-def _padded(leaf: np.ndarray, size: int) -> np.ndarray:
-    return np.concatenate([leaf, np.repeat(leaf[-1:], size - len(leaf), axis=0)])
-
-
-def _shard(part: Any, devices: Mesh) -> Any:
-    """On the devices, of which a process sees its own alone."""
+def _shard(part: Any, size: int, devices: Mesh) -> Any:
+    """Members, of which the last is repeated, on the devices; a process sees its own alone."""
     sharding = NamedSharding(devices, PartitionSpec(AXIS))
-    return jax.tree.map(
-        lambda leaf: jax.make_array_from_callback(leaf.shape, sharding, lambda at: leaf[at]), part
-    )
 
+    def of_leaf(leaf: np.ndarray) -> jax.Array:
+        whole = np.concatenate([leaf, np.repeat(leaf[-1:], size - len(leaf), axis=0)])
+        return jax.make_array_from_callback(whole.shape, sharding, lambda at: whole[at])
 
-def _on_host(found: Any, kept: int) -> Any:
-    if jax.process_count() > 1:
-        found = multihost_utils.process_allgather(found, tiled=True)
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[:kept], found)
+    return jax.tree.map(of_leaf, part)
 
 
 def _digest(part: Any) -> str:
@@ -138,18 +136,6 @@ def _digest(part: Any) -> str:
     return digest.hexdigest()[:16]
 
 
-def _structure(function: Callable[[Any], Any], part: Any) -> Any:
-    one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), part)
-    return jax.eval_shape(function, one)
-
-
-def _write(path: Path, found: Any) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    buffer = io.BytesIO()
-    eqx.tree_serialise_leaves(buffer, found)
-    write_bytes(path, buffer.getvalue())
-
-
 def _read(path: Path, like: Any, kept: int) -> Any:
-    shaped = jax.tree.map(lambda s: np.empty((kept, *s.shape), s.dtype), like)
-    return eqx.tree_deserialise_leaves(path, shaped)
+    empty = jax.tree.map(lambda leaf: np.empty((kept, *leaf.shape[1:]), leaf.dtype), like)
+    return eqx.tree_deserialise_leaves(path, empty)

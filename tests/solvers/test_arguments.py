@@ -47,8 +47,12 @@ def test_shapes_that_do_not_fit_are_named(solver, change, words):
             step(FABRIC, state, control)
 
 
-def test_arguments_in_another_order_are_named(solver):
+def test_arguments_in_another_order_and_steps_are_named(solver):
+    with pytest.raises(ValueError, match="in seconds, at most 10.0, got 20"):
+        r2s.ImplicitCloth(SCENE, 20.0)
     state = solver.init(START)
+    with pytest.raises(ValueError, match="save_every must divide"):
+        r2s.simulate(solver, FABRIC, state, r2s.Control(CONTROL.pinned[None]), save_every=0)
     with pytest.raises(TypeError, match="fabric must be a Fabric, got .*State"):
         solver.step(state, FABRIC, CONTROL)
     with pytest.raises(TypeError, match="control must be a Control, got .*Array"):
@@ -71,11 +75,6 @@ def test_numbers_that_no_fabric_has_are_named(solver, where, value, words):
         r2s.simulate(solver, bad, solver.init(START), control)
 
 
-def test_a_step_of_seconds_is_questioned():
-    with pytest.raises(ValueError, match="in seconds, at most 10.0, got 20"):
-        r2s.ImplicitCloth(SCENE, 20.0)
-
-
 @pytest.mark.parametrize(
     ("pinned", "words"),
     [([100], "pinned has vertex 100, the mesh has 9"), ([0, 0], "pinned twice"), ([-1], "-1")],
@@ -91,13 +90,6 @@ def test_a_steady_wind_stays_and_one_of_every_step_is_that_of_the_step():
     gusts = jnp.arange(12.0).reshape(4, 3)
     assert r2s.Control(path, gusts).at(3).wind == pytest.approx(gusts[3])
     assert r2s.Control(path).at(3).wind is None
-
-
-def test_no_step_between_saves_is_refused(unchecked):
-    control = r2s.Control(CONTROL.pinned[None])
-    solver = SOLVERS["implicit"]()
-    with pytest.raises(ValueError, match="save_every must divide"):
-        r2s.simulate(solver, FABRIC, solver.init(START), control, save_every=0)
 
 
 def test_gravity_and_step_are_leaves_of_one_program():

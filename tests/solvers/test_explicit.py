@@ -1,6 +1,7 @@
 """Explicit steps of the cloth: forces on the grid, falls, batches, and what is refused."""
 
 import dataclasses
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -11,116 +12,19 @@ from conftest import flat
 
 import r2s
 from r2s._util.units import GRAVITY
-from r2s.environment.air import Air, Fan, drag_on_vertices
+from r2s.environment.air import Air, Fan
 from r2s.environment.scene import Control, Scene
 from r2s.materials.plate import PlateBending
 from r2s.scenarios.energy import stored_energy
-from r2s.solvers.explicit.cloth import ExplicitCloth, stable_step
-from r2s.solvers.explicit.elements import (
-    bending_force,
-    membrane_force,
-    membrane_stress,
-    moved_velocity,
-)
-from r2s.solvers.explicit.grid import grid_force, laws_on_grid
-from r2s.solvers.explicit.grid_membrane import Samples
-from r2s.solvers.explicit.layout import Layout
+from r2s.solvers.explicit.cloth import ExplicitCloth, moved_velocity
+from r2s.solvers.explicit.grid import sheet_force
+from r2s.solvers.explicit.sheet import ForceInputs, cells_of, force_by_gathers, no_memory
 from r2s.solvers.explicit.stability import SAFETY, Viscosity, longest_relaxing_step
 from r2s.solvers.results import Result
 
 
 def explicit(mesh, fabric, pinned=(), dt=0.01, table=None, **options):
     return ExplicitCloth(Scene(mesh, tuple(pinned), table, air=None), dt, fabric, **options)
-
-
-@pytest.mark.slow(group="cloth")
-@pytest.mark.parametrize("elements", ["quadrilaterals", "wrinkling"])
-@pytest.mark.parametrize("shape", [(6, 5), (2, 5)])
-def test_forces_on_the_grid_are_those_by_gathers(shape, elements, fabric):
-    mesh = r2s.rectangle((0.3, 0.2), shape, elements)
-    fabric = eqx.tree_at(lambda f: f.bending, fabric, PlateBending.make(1e-3, 0.3))
-    x = flat(mesh) + 0.01 * jax.random.normal(jax.random.key(0), (mesh.rest.shape[0], 3))
-    v = jax.random.normal(jax.random.key(1), x.shape)
-    layout = Layout(shape, (0.3 / (shape[0] - 1), 0.2 / (shape[1] - 1)))
-    viscosity = Viscosity(jnp.asarray(3.0), jnp.asarray(0.2))
-    laws = laws_on_grid(layout, fabric, viscosity, elements == "wrinkling")
-    count = mesh.samples.areas.size
-    past = jax.random.normal(jax.random.key(2), (count, 3))
-    none = jnp.zeros(4 * layout.length(layout.first_cell))
-    relaxed = layout.to_cells(past.reshape(-1, 4, 3))
-    samples = Samples(relaxed, (none, none, none) if elements == "wrinkling" else None)
-    wide, rates = layout.wide(x), layout.wide(v)
-    begun = jnp.asarray(True)
-
-    def on_grid(samples):
-        return grid_force(layout, laws, Air.make(), wide, rates, rates, samples, begun)
-
-    run = jax.jit(on_grid)
-    for _ in range(12):  # of Newton's method for the wrinkles
-        found, after = run(samples)
-        samples = after._replace(relaxed=relaxed)
-
-    def by_gathers(x, v):
-        stress, remembered = viscosity.resist(membrane_stress(mesh, fabric, x), past, begun)
-        force = membrane_force(mesh, x, stress) + bending_force(mesh, fabric, x, v)
-        drag = drag_on_vertices(mesh, Air.make(), None, x, v, jnp.zeros(3))
-        return force + drag, remembered
-
-    expected, remembered = jax.jit(by_gathers)(x, v)
-    assert jnp.stack(found, axis=1) == pytest.approx(np.asarray(expected), rel=1e-9, abs=1e-11)
-    kept = layout.from_cells(after.relaxed).reshape(-1, 3)
-    assert kept == pytest.approx(np.asarray(remembered), rel=1e-9, abs=1e-9)
-
-
-@pytest.mark.slow(group="cloth")
-def test_a_free_sheet_falls_as_a_stone(sheet, fabric):
-    solver = explicit(sheet, fabric)
-    moved = eqx.filter_jit(solver.step)(
-        fabric, solver.init(flat(sheet)), Control(jnp.zeros((0, 3)), jnp.zeros(3))
-    )
-    count, small = solver.substeps, solver.dt / solver.substeps
-    fallen = -GRAVITY * small**2 * count * (count + 1) / 2
-    assert moved.x == pytest.approx(np.asarray(flat(sheet, fallen)), abs=1e-12)
-    assert int(moved.failure) == Result.SUCCESS
-
-
-@pytest.mark.slow(group="cloth")
-def test_a_batch_is_its_members(sheet, fabric):
-    solver = explicit(sheet, fabric, pinned=(0, 4))
-    start = solver.init(flat(sheet))
-    control = Control(flat(sheet)[jnp.array([0, 4])] + 0.002, jnp.array([0.5, 0.0, 0.0]))
-    membrane = fabric.membrane
-    scales = jnp.array([0.5, 0.8, 1.0, 0.9])
-
-    def moved(softer, lighter):
-        of = eqx.tree_at(lambda f: f.membrane, fabric, jax.tree.map(lambda c: c * softer, membrane))
-        of = eqx.tree_at(lambda f: f.density, of, fabric.density / lighter)
-        return solver.step(of, start, control).x
-
-    alone = jnp.stack([eqx.filter_jit(moved)(s, jnp.ones(())) for s in scales])
-    batch = eqx.filter_jit(jax.vmap(moved))(scales, jnp.ones(4))
-    assert batch == pytest.approx(np.asarray(alone), abs=1e-10)
-    nested = eqx.filter_jit(jax.vmap(jax.vmap(moved, (0, None)), (None, 0)))(scales, jnp.ones(2))
-    assert nested[1] == pytest.approx(np.asarray(alone), abs=1e-10)
-    held = np.asarray(alone)[:, [0, 4]]
-    assert held == pytest.approx(np.broadcast_to(control.pinned, held.shape), abs=0)
-
-
-@pytest.mark.slow(group="cloth")
-def test_too_few_substeps_and_self_contact_are_refused(sheet, fabric):
-    limit = float(stable_step(sheet, fabric))
-    with pytest.raises(ValueError, match=f"limited by .* to {limit:.4g} s"):
-        explicit(sheet, fabric, dt=2 * limit, substeps=1)
-    with pytest.raises(ValueError, match="contact of the sheet with itself.*mpm_cloth"):
-        explicit(sheet, fabric, self_contact=True)
-
-
-@pytest.mark.slow(group="cloth")
-def test_a_step_that_explodes_is_a_recorded_failure(sheet, fabric):
-    solver = explicit(sheet, fabric)
-    start = solver.init(flat(sheet).at[0, 0].set(jnp.nan))
-    control = Control(jnp.zeros((0, 3)), jnp.zeros(3))
-    assert int(eqx.filter_jit(solver.step)(fabric, start, control).failure) == Result.NON_FINITE
 
 
 def moved(solver, fabric, wind=(0.0, 0.0, 0.0), height=0.0, v=None, steps=1):
@@ -135,31 +39,68 @@ def moved(solver, fabric, wind=(0.0, 0.0, 0.0), height=0.0, v=None, steps=1):
 
 
 @pytest.mark.slow(group="cloth")
-def test_the_grid_moves_as_any_mesh_does_in_the_wind_of_a_fan(fabric):
-    mesh = r2s.rectangle((0.3, 0.2), (4, 5), "quadrilaterals")
+@pytest.mark.parametrize("law", ["constant", "springs", "wrinkling"])
+@pytest.mark.parametrize("shape", [(6, 5), (2, 5)])
+def test_forces_on_the_grid_are_those_by_gathers(shape, law, fabric):
+    mesh = r2s.rectangle((0.3, 0.2), shape, "wrinkling" if law == "wrinkling" else "quadrilaterals")
+    fabric = dataclasses.replace(fabric, bending=PlateBending.make(1e-3, 0.3))
+    if law == "springs":
+        springs = r2s.SpringMembrane(*(jnp.asarray(c) for c in (300.0, 200.0, 80.0)))
+        fabric = dataclasses.replace(fabric, membrane=springs)
+    x = flat(mesh) + 0.01 * jax.random.normal(jax.random.key(0), (mesh.rest.shape[0], 3))
+    v = jax.random.normal(jax.random.key(1), x.shape)
+    cells, viscosity = cells_of(mesh), Viscosity(jnp.asarray(3.0), jnp.asarray(0.2))
     fan = Fan(*(jnp.asarray(v) for v in ((0.1, 0.1, -0.2), (0.0, 0.3, 1.0), 0.1, 0.05)))
-    scene = Scene(mesh, [0], fan=fan)
-    grid = ExplicitCloth(scene, 0.01, fabric)
-    gathers = dataclasses.replace(grid, grid=None)
-    assert grid.grid is not None
-    one, other = (moved(each, fabric, (0.0, 2.0, 5.0), steps=3) for each in (grid, gathers))
-    still = moved(grid, fabric, steps=3)
-    assert jnp.max(jnp.abs(one.x - still.x)) > 1e-4  # the wind is felt
-    np.testing.assert_allclose(one.x, other.x, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(one.v, other.v, rtol=0, atol=1e-9)
+    none = no_memory(mesh, cells, x.dtype)
+    past = jax.random.normal(jax.random.key(2), none.relaxed.shape)
+    memory, wind = none._replace(relaxed=past, begun=jnp.asarray(True)), jnp.array([0.0, 2.0, 5.0])
+    inputs = ForceInputs(fabric, viscosity, Air.make(), fan, x, v, wind, memory)
+    expected, remembered = jax.jit(partial(force_by_gathers, mesh))(inputs)
+    run = jax.jit(partial(sheet_force, mesh, cells))
+    force = hidden = None
+    for _ in range(12):  # of Newton's method for the wrinkles
+        force, after = run(inputs)
+        hidden = after.hidden
+        inputs = inputs._replace(memory=memory._replace(hidden=hidden))
+    assert (hidden is not None) == (law == "wrinkling")
+    assert force == pytest.approx(np.asarray(expected), rel=1e-9, abs=1e-11)
+    assert after.relaxed == pytest.approx(np.asarray(remembered.relaxed), rel=1e-9, abs=1e-9)
 
 
 @pytest.mark.slow(group="cloth")
-def test_laws_that_are_not_constant_move_the_grid_as_any_mesh(fabric):
-    springs = r2s.SpringMembrane(*(jnp.asarray(c) for c in (300.0, 200.0, 80.0)))
-    fabric = eqx.tree_at(lambda f: f.membrane, fabric, springs)
-    mesh = r2s.rectangle((0.3, 0.2), (4, 5), "quadrilaterals")
-    scene = Scene(mesh, [0])
-    grid = ExplicitCloth(scene, 0.005, fabric)
-    gathers = dataclasses.replace(grid, grid=None)
-    v = jax.random.normal(jax.random.key(0), (len(mesh.rest), 3))
-    one, other = (moved(each, fabric, v=v, steps=2) for each in (grid, gathers))
-    np.testing.assert_allclose(one.x, other.x, rtol=0, atol=1e-10)
+def test_a_free_sheet_falls_as_a_stone(sheet, fabric):
+    solver = explicit(sheet, fabric)
+    after = moved(solver, fabric)
+    count, small = solver.substeps, solver.dt / solver.substeps
+    fallen = -GRAVITY * small**2 * count * (count + 1) / 2
+    assert after.x == pytest.approx(np.asarray(flat(sheet, fallen)), abs=1e-12)
+    assert int(after.failure) == Result.SUCCESS
+    broken = solver.init(flat(sheet).at[0, 0].set(jnp.nan))
+    still = Control(jnp.zeros((0, 3)), jnp.zeros(3))
+    failure = eqx.filter_jit(solver.step)(fabric, broken, still).failure
+    assert int(failure) == Result.NON_FINITE
+
+
+@pytest.mark.slow(group="cloth")
+def test_a_batch_is_its_members(sheet, fabric):
+    solver = explicit(sheet, fabric, pinned=(0, 4))
+    start = solver.init(flat(sheet))
+    control = Control(flat(sheet)[jnp.array([0, 4])] + 0.002, jnp.array([0.5, 0.0, 0.0]))
+    membrane = fabric.membrane
+    scales = jnp.array([0.5, 0.8, 1.0, 0.9])
+
+    def end(softer, lighter):
+        of = eqx.tree_at(lambda f: f.membrane, fabric, jax.tree.map(lambda c: c * softer, membrane))
+        of = eqx.tree_at(lambda f: f.density, of, fabric.density / lighter)
+        return solver.step(of, start, control).x
+
+    alone = jnp.stack([eqx.filter_jit(end)(s, jnp.ones(())) for s in scales])
+    batch = eqx.filter_jit(jax.vmap(end))(scales, jnp.ones(4))
+    assert batch == pytest.approx(np.asarray(alone), abs=1e-10)
+    nested = eqx.filter_jit(jax.vmap(jax.vmap(end, (0, None)), (None, 0)))(scales, jnp.ones(2))
+    assert nested[1] == pytest.approx(np.asarray(alone), abs=1e-10)
+    held = np.asarray(alone)[:, [0, 4]]
+    assert held == pytest.approx(np.broadcast_to(control.pinned, held.shape), abs=0)
 
 
 def test_friction_on_the_table_is_its_coefficient_times_what_presses():
@@ -194,9 +135,7 @@ def test_a_motion_in_explicit_steps_has_its_derivative(fabric):
     control = Control(flat(sheet)[:1], jnp.zeros(3))
 
     def sagged(factor):
-        of = eqx.tree_at(
-            lambda f: f.bending, fabric, PlateBending.make(1e-4 * factor, jnp.zeros(()))
-        )
+        of = dataclasses.replace(fabric, bending=PlateBending.make(1e-4 * factor, jnp.zeros(())))
         return jnp.sum(solver.step(of, start, control).x[:, 2] ** 2)
 
     sagged = jax.jit(sagged)
@@ -209,9 +148,7 @@ def test_a_motion_in_explicit_steps_has_its_derivative(fabric):
 @pytest.mark.slow(group="cloth")
 def test_a_fabric_that_is_too_stiff_for_the_substeps_is_refused_or_fails(sheet, fabric):
     solver = explicit(sheet, fabric, pinned=(0,))
-    stiff = eqx.tree_at(
-        lambda f: f.membrane, fabric, jax.tree.map(lambda c: 3 * c, fabric.membrane)
-    )
+    stiff = dataclasses.replace(fabric, membrane=jax.tree.map(lambda c: 3 * c, fabric.membrane))
     control = Control(jnp.zeros((2, 1, 3)))
 
     def move(fabric):
@@ -219,9 +156,9 @@ def test_a_fabric_that_is_too_stiff_for_the_substeps_is_refused_or_fails(sheet, 
 
     with pytest.raises(ValueError, match="limited by the fabric"):
         move(stiff)
-    moved = eqx.filter_jit(move)  # in which it is traced
-    assert bool(moved(fabric).ok.all())
-    failed = moved(stiff)  # though nothing has exploded yet
+    run = eqx.filter_jit(move)  # in which it is traced
+    assert bool(run(fabric).ok.all())
+    failed = run(stiff)  # though nothing has exploded yet
     assert int(failed.result) == Result.TIME_STEP and bool(jnp.isfinite(failed.x).all())
 
 
@@ -230,22 +167,21 @@ def test_a_fabric_that_is_too_stiff_for_the_substeps_is_refused_or_fails(sheet, 
     [
         ({"substeps": -5}, "whole number"),
         ({"dt": jnp.inf}, "dt must be positive"),
+        ({"substeps": 1}, "limited by the fabric"),
+        ({"self_contact": True}, "contact of the sheet with itself.*mpm_cloth"),
+        ({"density": 0.0}, "density and its stiffness must be positive"),
+        ({"density": jnp.nan}, "density and its stiffness must be positive"),
     ],
 )
-def test_wrong_numbers_of_an_explicit_cloth_are_refused(sheet, fabric, options, message):
+def test_what_cannot_be_stepped_is_refused(sheet, fabric, options, message):
+    density = jnp.asarray(options.pop("density", fabric.density))
     with pytest.raises(ValueError, match=message):
-        explicit(sheet, fabric, **options)
+        explicit(sheet, dataclasses.replace(fabric, density=density), **options)
 
 
-def test_a_fabric_without_a_longest_substep_is_refused(sheet, fabric):
-    def make(fabric):
-        return explicit(sheet, fabric).substeps
-
-    for density in (0.0, -1.0, jnp.nan):
-        with pytest.raises(ValueError, match="density and its stiffness must be positive"):
-            make(eqx.tree_at(lambda f: f.density, fabric, jnp.asarray(density)))
+def test_a_traced_fabric_gives_no_substeps(sheet, fabric):
     with pytest.raises(ValueError, match="must not be traced"):
-        jax.jit(make)(fabric)
+        jax.jit(lambda fabric: explicit(sheet, fabric).substeps)(fabric)
 
 
 @pytest.mark.parametrize("relaxation", [0.0, 1e-3, 1e-2])

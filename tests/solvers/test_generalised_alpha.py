@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,22 +11,20 @@ from conftest import (
     FIRST_ROW,
     SIZE,
     cloth,
-    directional_difference,
     energy,
     everywhere,
     flat,
+    hanging,
     roll,
     rotation,
 )
 
 from r2s._util.units import AIR_DENSITY, GRAVITY
 from r2s.environment import contact
-from r2s.environment.scene import Control, along_path
+from r2s.environment.scene import Control
 from r2s.materials.fabric import Fabric
-from r2s.mesh.surface import vertex_masses
 from r2s.solvers.implicit.cloth import ImplicitCloth
 from r2s.solvers.implicit.generalised_alpha import coefficients
-from r2s.solvers.simulate import simulate
 
 RADIUS = 0.6
 LAW = (300.0, 60.0, 200.0, 80.0)  # [N/m]
@@ -35,11 +32,6 @@ LAW = (300.0, 60.0, 200.0, 80.0)  # [N/m]
 
 def by_alpha(solver: ImplicitCloth, spectral_radius: float = RADIUS) -> ImplicitCloth:
     return dataclasses.replace(solver, spectral_radius=spectral_radius)
-
-
-def hanging(mesh, angle=0.0):
-    """Positions of a flat sheet that hangs from its first row, swung out by an angle."""
-    return flat(mesh) @ rotation(angle - np.pi / 2, 1).T
 
 
 @pytest.mark.parametrize("spectral_radius", [0.0, 0.6, 0.9])
@@ -122,69 +114,6 @@ def test_a_sheet_that_falls_onto_a_table_comes_to_rest_on_it(sheet, fabric):
 
     energies = jax.vmap(held)(states.x, states.v)
     assert np.all(np.diff(energies) < 1e-3 * (energies[0] - energies[-1]))
-
-
-@pytest.mark.slow(group="cloth")
-def test_grippers_carry_the_weight(sheet, fabric):
-    solver = by_alpha(cloth(sheet, FIRST_ROW))
-    damped = Fabric.make(0.2, LAW, 1e-3, damping=0.05)
-    states = roll(solver, damped, solver.init(hanging(sheet)), 400)
-    last = jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), states)
-    control = Control(last.x[:5], jnp.zeros(3))
-    _, forces = eqx.filter_jit(solver.step_with_forces)(damped, last, control)
-    weight = float(jnp.sum(vertex_masses(sheet, damped.density))) * GRAVITY
-    assert np.asarray(forces.sum(axis=0)) == pytest.approx([0, 0, weight], abs=1e-5 * weight)
-
-
-FRAMES, SUBSTEPS = 4, 5
-WHERE = {  # what to differ, and by how much [in its unit]
-    "density": (lambda i: i[0].density, 1e-6),
-    "c11": (lambda i: i[0].membrane.c11, 1e-1),
-    "bending": (lambda i: i[0].bending.stiffness, 1e-8),
-    "damping": (lambda i: i[0].damping, 1e-5),
-    "friction": (lambda i: i[0].friction, 1e-6),
-    "velocities": (lambda i: i[1], 1e-6),
-    "path": (lambda i: i[2], 1e-8),
-}
-
-
-@pytest.fixture(scope="module", params=[0.0, None], ids=["table", "no table"])
-def lifted(request, sheet, fabric):
-    """A corner that is lifted, off a table or in the air: value and gradient, inputs, height."""
-    fixed = by_alpha(cloth(sheet, pinned=(0,), table=request.param, air=AIR_DENSITY))
-    solver = dataclasses.replace(fixed, tolerance=1e-13)
-    start = flat(sheet, 0.93e-3)
-    shift = jnp.array([0.0, 0.4, 1.0])[:, None, None] * jnp.array([[[0.06, 0.02, 0.06]]])
-    inputs = fabric, everywhere([0.05, 0.02, 0.0], sheet), start[:1][None] + shift
-    weights = jax.random.normal(jax.random.key(1), (FRAMES, 25, 3))
-
-    def loss(inputs):
-        fabric, v, path = inputs
-        times = jnp.arange(1, FRAMES * SUBSTEPS + 1).astype(float) * DT
-        control = Control(along_path(times, jnp.array([0.0, 0.1, 0.2]), path))
-        moved = simulate(solver, fabric, solver.init(start, v), control, save_every=SUBSTEPS)
-        return jnp.sum(weights * moved.x)
-
-    return jax.jit(jax.value_and_grad(loss)), inputs, request.param
-
-
-@pytest.mark.slow(group="cloth")
-@pytest.mark.parametrize("name", WHERE)
-def test_the_gradient_agrees_with_differences(name, lifted):
-    value_and_grad, inputs, height = lifted
-    where, size = WHERE[name]
-    if name == "friction" and height is None:
-        assert where(value_and_grad(inputs)[1]) == 0
-        return
-
-    def value(part):
-        return value_and_grad(eqx.tree_at(where, inputs, part))[0]
-
-    direction = jax.random.normal(jax.random.key(2), where(inputs).shape)
-    expected = directional_difference(value, where(inputs), direction, size)
-    found = jnp.sum(where(value_and_grad(inputs)[1]) * direction)
-    assert found == pytest.approx(float(expected), rel=1e-4 if height == 0 else 1e-5)
-    assert abs(found) > 1e-12
 
 
 @pytest.mark.slow(group="cloth")

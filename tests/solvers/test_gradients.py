@@ -41,14 +41,21 @@ def inputs(sheet, fabric):
     return Inputs(fabric, x, v, path, jnp.asarray(0.0, float), jnp.array([0.5, -0.3, 0.8]))
 
 
-@pytest.fixture(scope="module")
-def run(sheet):
-    """The motion of inputs, as a function of them."""
+ALPHA = pytest.param(0.6, marks=pytest.mark.slow(group="cloth"), id="alpha")
+
+
+@pytest.fixture(scope="module", params=[pytest.param(None, id="BDF2"), ALPHA])
+def run(sheet, request):
+    """The motion of inputs, as a function of them, by either method."""
     fixed = cloth(sheet, pinned=(0,), table=0.0, air=AIR_DENSITY)
+    accurate = {
+        "tolerance": 1e-13,
+        "spectral_radius": request.param,
+    }  # differences have little noise
 
     def run(inputs):
         scene = eqx.tree_at(lambda scene: scene.table, fixed.scene, Table(inputs.height))
-        solver = ImplicitCloth(scene, DT, tolerance=1e-13)  # so that differences have little noise
+        solver = ImplicitCloth(scene, DT, **accurate)
         times = jnp.arange(1, FRAMES * SUBSTEPS + 1).astype(float) * DT
         control = Control(along_path(times, KNOTS, inputs.path), inputs.wind)
         start = solver.init(inputs.x, inputs.v)
@@ -74,15 +81,6 @@ def value_and_grad(loss):
 @pytest.fixture(scope="module")
 def gradient(value_and_grad, inputs):
     return value_and_grad(inputs)[1]
-
-
-@pytest.mark.slow(group="cloth")
-def test_the_motion_touches_the_table_and_slides_on_it(value_and_grad, inputs):
-    (_, x), _ = value_and_grad(inputs)
-    x = np.asarray(x)
-    touching = x[-1, :, 2] < float(inputs.fabric.thickness)
-    assert 5 < touching.sum() < 20
-    assert np.max(np.abs(x[-1] - x[0])[touching, :2]) > 3e-3
 
 
 WHERE = {  # what to differ, and by how much [in its unit]
@@ -156,9 +154,3 @@ def test_a_batch_of_fabrics_equals_the_loop(loss, value_and_grad, several):
         for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(expected_slope), strict=True):
             error = np.max(np.abs(np.asarray(a[i]) - np.asarray(b)))
             assert error <= 1e-7 * np.max(np.abs(np.asarray(b)))  # conditioning of the solves
-
-
-def test_the_same_input_gives_the_same_bits(value_and_grad, several):
-    first, second = value_and_grad(several[0]), value_and_grad(several[0])
-    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
-        assert np.array_equal(np.asarray(a), np.asarray(b))

@@ -1,4 +1,4 @@
-"""Sparse matrices over a mesh: elements add up, and the factor solves."""
+"""Sparse matrices over a mesh: elements add up, and they are solved by factors or iteration."""
 
 import itertools
 
@@ -10,19 +10,28 @@ import scipy.spatial
 from conftest import dense
 
 from r2s.mesh.mesh import Mesh, rectangle
-from r2s.solvers.implicit.linear.dissection import levels
-from r2s.solvers.implicit.linear.factor import Band, factor, solve
-from r2s.solvers.implicit.linear.pattern import Pattern, assemble, pinned, product
-from r2s.solvers.implicit.linear.system import Elimination
+from r2s.solvers.implicit.band import Band
+from r2s.solvers.implicit.dissection import Dissection
+from r2s.solvers.implicit.system import (
+    Elimination,
+    Far,
+    Pattern,
+    apply_inverse,
+    assemble,
+    pinned,
+    prepare,
+    product,
+)
 
 # compiled once for each mesh, for all tests
-factored = jax.jit(factor, static_argnames="is_definite")
-solved = jax.jit(solve)
+factored = jax.jit(lambda order, blocks: order.factor(blocks))
+pivoted = jax.jit(lambda order, blocks: order.factor(blocks, is_definite=False))
+solved = jax.jit(lambda order, factors, right: order.solve(factors, right))
 
 
-def scattered(count: int) -> Mesh:
+def scattered() -> Mesh:
     """The Delaunay triangles of random points."""
-    points = np.random.default_rng(3).random((count, 2))
+    points = np.random.default_rng(3).random((120, 2))
     points = points[np.unique(scipy.spatial.Delaunay(points).simplices)]
     return Mesh.make(points, scipy.spatial.Delaunay(points).simplices)
 
@@ -38,20 +47,14 @@ MESHES = {
     "one face": lambda: rectangle((1.0, 1.0), (2, 2)),
     "square": lambda: rectangle((1.0, 1.0), (9, 9)),
     "strip": lambda: rectangle((1.0, 0.01), (40, 2)),
-    "scattered": lambda: scattered(120),
+    "scattered": scattered,
     "two pieces": two_pieces,
 }
 
 
-def orders(mesh, pattern):
-    """A mesh's equations by either order of elimination."""
-    places = np.asarray(mesh.rest), np.asarray(pattern.rows), np.asarray(pattern.columns)
-    return {"band": Band.make(*places), "dissection": levels(*places)}
-
-
 @pytest.fixture(scope="module", params=itertools.product(MESHES, ("band", "dissection")), ids=str)
 def problem(request):
-    """A mesh, and the blocks of a random positive definite matrix over it."""
+    """An elimination, elements of a random positive definite matrix over it, and its blocks."""
     mesh = MESHES[request.param[0]]()
     random = np.random.default_rng(0)
 
@@ -62,8 +65,7 @@ def problem(request):
     corners = mesh.samples.corners
     parts = elements(*corners.shape), elements(len(mesh.hinges), 4)
     vertices = jnp.tile(jnp.eye(3), (len(mesh.rest), 1, 1))
-    pattern = Elimination.make(mesh).pattern
-    equations = Elimination(pattern, orders(mesh, pattern)[request.param[1]])
+    equations = Elimination.make(mesh, order=request.param[1])
     blocks = jax.jit(assemble)(equations.pattern, vertices, samples=parts[0], hinges=parts[1])
     return mesh, equations, parts, blocks
 
@@ -73,63 +75,50 @@ def test_elements_add_up(problem):
     matrix = np.zeros((len(mesh.rest), 3, len(mesh.rest), 3))
     for elements, matrices in zip((mesh.samples.corners, mesh.hinges), parts, strict=True):
         for element, part in zip(np.asarray(elements), np.asarray(matrices), strict=True):
-            for i, row in enumerate(element):
-                for j, column in enumerate(element):
-                    matrix[row, :, column] += part[i, :, j]
-    size = 3 * len(mesh.rest)
-    matrix = matrix.reshape(size, size) + np.eye(size)
-    assert np.asarray(dense(equations.pattern, blocks)) == pytest.approx(
-        matrix, rel=1e-12, abs=1e-9
-    )
+            np.add.at(matrix, np.ix_(element, range(3), element, range(3)), part)
+    matrix = matrix.reshape(3 * len(mesh.rest), -1) + np.eye(3 * len(mesh.rest))
+    assert dense(equations.pattern, blocks) == pytest.approx(matrix, rel=1e-12, abs=1e-9)
 
 
-def test_the_factor_solves(problem):
+def test_the_factor_solves_and_its_solution_is_its_own_transpose(problem):
     mesh, equations, _, blocks = problem
-    right = jnp.asarray(np.random.default_rng(1).normal(size=(len(mesh.rest), 3)))
-    x = solved(equations.order, factored(equations.order, blocks), right)
+    right, other = jnp.asarray(np.random.default_rng(1).normal(size=(2, len(mesh.rest), 3)))
+    factors = factored(equations.order, blocks)
+    x = solved(equations.order, factors, right)
     expected = np.linalg.solve(np.asarray(dense(equations.pattern, blocks)), right.ravel())
     assert np.asarray(x).ravel() == pytest.approx(expected, rel=1e-8, abs=1e-9)
-    assert np.asarray(product(equations.pattern, blocks, x)) == pytest.approx(
-        np.asarray(right), abs=1e-8
-    )
+    assert product(equations.pattern, blocks, x) == pytest.approx(np.asarray(right), abs=1e-8)
+    (back,) = jax.linear_transpose(lambda b: solved(equations.order, factors, b), right)(other)
+    assert jnp.sum(back * right) == pytest.approx(float(jnp.sum(other * x)), rel=1e-8)
 
 
-@pytest.mark.slow(group="cloth")
-def test_every_depth_of_dissection_and_every_group_gives_the_same(problem):
+def test_an_indefinite_matrix_has_no_factor_but_one_by_pivoting(problem):
     mesh, equations, _, blocks = problem
-    right = jnp.ones((len(mesh.rest), 3))
-    expected = solved(equations.order, factored(equations.order, blocks), right)
-    rows, columns = np.asarray(equations.pattern.rows), np.asarray(equations.pattern.columns)
-    places = np.asarray(mesh.rest), rows, columns
-    depths = [levels(*places, leaf) for leaf in (6, 1000)]
-    for others in (*depths, *(Band.make(*places, size) for size in (1, 3, 1000))):
-        found = solved(others, factored(others, blocks), right)
-        assert np.asarray(found) == pytest.approx(np.asarray(expected), rel=1e-8, abs=1e-10)
-
-
-def test_an_indefinite_matrix_has_no_factor(problem):
-    mesh, equations, _, blocks = problem
-    vertex = len(mesh.rest) // 2
-    bad = blocks.at[equations.pattern.diagonal[vertex], 0, 0].set(-1.0)
-    x = solved(equations.order, factored(equations.order, bad), jnp.ones((len(mesh.rest), 3)))
-    assert not np.all(np.isfinite(x))
-
-
-def test_an_indefinite_matrix_is_solved_when_asked(problem):
-    mesh, equations, _, blocks = problem
-    vertex = len(mesh.rest) // 2
-    bad = blocks.at[equations.pattern.diagonal[vertex], 0, 0].add(-500.0)
-    right = jnp.ones((len(mesh.rest), 3))
-    x = solved(equations.order, factored(equations.order, bad, is_definite=False), right)
+    vertex = equations.pattern.diagonal[len(mesh.rest) // 2]
+    bad, right = blocks.at[vertex, 0, 0].add(-500.0), jnp.ones((len(mesh.rest), 3))
     matrix = np.asarray(dense(equations.pattern, bad))
     assert np.linalg.eigvalsh(matrix)[0] < 0
+    x = solved(equations.order, factored(equations.order, bad), right)
+    assert not np.all(np.isfinite(x))
+    x = solved(equations.order, pivoted(equations.order, bad), right)
     expected = np.linalg.solve(matrix, np.ones(len(matrix)))
     assert np.asarray(x).ravel() == pytest.approx(expected, rel=1e-7, abs=1e-9)
 
 
+def test_held_vertices_do_not_move(problem):
+    mesh, equations, _, blocks = problem
+    free = jnp.ones(len(mesh.rest), bool).at[jnp.array([0, 2])].set(False)
+    right = jnp.where(free[:, None], jnp.ones((len(mesh.rest), 3)), 0.0)
+    held = pinned(equations.pattern, blocks, free)
+    x = solved(equations.order, factored(equations.order, held), right)
+    assert np.all(np.asarray(x)[[0, 2]] == 0)
+    force = np.asarray(product(equations.pattern, blocks, x))[np.asarray(free)]
+    assert force == pytest.approx(np.ones_like(force), abs=1e-8)
+
+
 def test_a_wide_mesh_is_dissected_and_a_narrow_one_is_a_band():
     square, long = rectangle((1.0, 1.0), (90, 90)), rectangle((9.0, 1.0), (180, 20))
-    assert not isinstance(Elimination.make(square).order, Band)
+    assert isinstance(Elimination.make(square).order, Dissection)
     narrow = Elimination.make(long).order
     assert isinstance(narrow, Band) and narrow.width == 2 * 20 + 2
 
@@ -141,25 +130,62 @@ def test_a_pattern_holds_more_vertices_than_squares_fit_in_32_bits():
     assert np.asarray(pattern.columns)[-3:].tolist() == [59_999, 59_998, 59_999]
 
 
-def test_held_vertices_do_not_move(problem):
-    mesh, equations, _, blocks = problem
-    free = jnp.ones(len(mesh.rest), bool).at[jnp.array([0, 2])].set(False)
-    right = jnp.where(free[:, None], jnp.ones((len(mesh.rest), 3)), 0.0)
-    x = solved(
-        equations.order, factored(equations.order, pinned(equations.pattern, blocks, free)), right
-    )
-    assert np.all(np.asarray(x)[[0, 2]] == 0)
-    force = np.asarray(product(equations.pattern, blocks, x))[np.asarray(free)]
-    assert force == pytest.approx(np.ones_like(force), abs=1e-8)
+COUNT = 36
+FREE = jnp.ones(COUNT, bool).at[jnp.array([0, 5])].set(False)
 
 
-def test_a_solution_is_transposed_by_itself(problem):
-    mesh, equations, _, blocks = problem
-    factors = factored(equations.order, blocks)
-    right, other = jnp.asarray(np.random.default_rng(2).normal(size=(2, len(mesh.rest), 3)))
+@pytest.fixture(scope="module")
+def square():
+    return Elimination.make(rectangle((1.0, 1.0), (6, 6)))
 
-    def run(b):
-        return solved(equations.order, factors, b)
 
-    (back,) = jax.linear_transpose(run, right)(other)
-    assert np.asarray(back) == pytest.approx(np.asarray(run(other)), rel=1e-8, abs=1e-10)
+def coupled(square, least: float, stiffness: float):
+    """Blocks with eigenvalues from `least` [-] on, springs between distant vertices, as contact
+    makes them, and the whole matrix, that of the identity where vertices are held."""
+    random = np.random.default_rng(0)
+    matrix = np.zeros((COUNT, 3, COUNT, 3))
+    rows, columns = np.asarray(square.pattern.rows), np.asarray(square.pattern.columns)
+    matrix[rows, :, columns] = random.normal(size=(len(rows), 3, 3))
+    matrix = matrix.reshape(3 * COUNT, -1)
+    matrix = matrix + matrix.T
+    matrix += (least - np.linalg.eigvalsh(matrix)[0]) * np.eye(3 * COUNT)
+    matrix = matrix.reshape(COUNT, 3, COUNT, 3)
+    blocks = jnp.asarray(matrix[rows, :, columns])
+    weights, axes = np.array([1.0, -0.5, -0.3, -0.2]), random.normal(size=(12, 3))
+    parts = np.einsum("a,pi,b,pj->paibj", weights, axes, weights, axes) * stiffness
+    parts[-1] = 0  # this one is none
+    stencils = np.stack([random.choice(COUNT, 4, replace=False) for _ in axes])
+    for stencil, part in zip(stencils, parts, strict=True):
+        np.add.at(matrix, np.ix_(stencil, range(3), stencil, range(3)), part)
+    held = np.flatnonzero(~np.asarray(FREE))
+    matrix[held], matrix[:, :, held] = 0, 0
+    matrix[held, :, held] = np.eye(3)
+    return blocks, Far(jnp.asarray(stencils), jnp.asarray(parts)), matrix.reshape(3 * COUNT, -1)
+
+
+@pytest.mark.slow(group="cloth")
+@pytest.mark.parametrize(("least", "is_definite"), [(1.0, True), (1.0, False), (-3.0, False)])
+@pytest.mark.parametrize("stiffness", [1.0, 1e3])
+def test_couplings_outside_the_pattern_are_solved_by_iteration(
+    square, least, is_definite, stiffness
+):
+    blocks, far, whole = coupled(square, least, stiffness)
+    right, left = jax.random.normal(jax.random.key(0), (2, COUNT, 3))
+    system = prepare(square, blocks, far, FREE, is_definite)
+    apply = jax.jit(lambda b: apply_inverse(square, system, b, is_definite))
+    x, expected = np.ravel(apply(right)), np.linalg.solve(whole, np.ravel(right))
+    tolerance = 1e-6 if is_definite else 1e-9  # a search needs no more
+    assert np.linalg.norm(x - expected) < tolerance * np.linalg.norm(expected)
+    assert np.all(np.asarray(apply(jnp.zeros((COUNT, 3)))) == 0)
+    back = jax.vjp(apply, right)[1](left)[0]
+    assert jnp.sum(back * right) == pytest.approx(float(jnp.sum(left * apply(right))), rel=1e-4)
+
+
+def test_where_the_iteration_does_not_converge_it_says_so(square):
+    # the blocks are definite, the whole is not: conjugate gradients have no business there
+    blocks, far, whole = coupled(square, 1.0, -1e3)
+    system = prepare(square, blocks, far, FREE)
+    x = jax.jit(lambda b: apply_inverse(square, system, b))(jnp.ones((COUNT, 3)))
+    exact = np.linalg.solve(whole, np.ones(3 * COUNT))
+    wrong = np.linalg.norm(np.ravel(x) - exact) > 1e-3 * np.linalg.norm(exact)
+    assert not wrong or np.all(np.isnan(np.asarray(x)))

@@ -15,9 +15,9 @@ from r2s._util.units import GRAVITY
 from r2s.environment.contact import Table
 from r2s.environment.scene import Control
 from r2s.materials.solid import FixedCorotated, LinearSolid, NeoHookean
-from r2s.solvers.mpm import Background, Block, Grid, layered
+from r2s.solvers.mpm import Background, Block, Grid
 from r2s.solvers.mpm.block import stable_step
-from r2s.solvers.results import Result, describe
+from r2s.solvers.results import Result
 
 STEPS = still(60, 2)
 
@@ -108,12 +108,9 @@ def test_three_dimensions_repeat_two():
     assert np.ptp(np.asarray(found.x)[..., 1], axis=0) == pytest.approx(0, abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    "sticky, friction",
-    [(False, 0.0), (False, 0.3), pytest.param(True, 0.3, marks=pytest.mark.slow(group="mpm"))],
-)
-def test_a_block_on_the_table_sticks_slides_or_slows(sticky, friction):
-    background = box(2, 8, table=Table.make(0.25), sticky=sticky)
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_a_block_on_the_table_slides_or_slows(friction):
+    background = box(2, 8, table=Table.make(0.25))
     x, volume = lattice((0.3, 0.25), (0.55, 0.5), 1 / 16)
     material = solid(2e5, 0.2, friction=friction, damping=1e-3)
     solver = Block.make(background, volume, material, 1e-3)
@@ -123,10 +120,7 @@ def test_a_block_on_the_table_sticks_slides_or_slows(sticky, friction):
     assert np.max(np.asarray(moved.x)[-1, :, 1]) == pytest.approx(0.5 - 1 / 32, abs=0.02)
     gone = np.mean(np.asarray(moved.x)[-1, :, 0] - np.asarray(x)[:, 0])
     expected = 0.5 * 0.1 - friction * GRAVITY * 0.1**2 / 2  # of a rigid one
-    if sticky:
-        assert abs(gone) < 0.01
-    else:
-        assert gone == pytest.approx(expected, abs=2e-3)
+    assert gone == pytest.approx(expected, abs=2e-3)
 
 
 @pytest.mark.slow(group="mpm")
@@ -185,22 +179,8 @@ def test_grippers_carry_their_particles_exactly_and_the_rest_follows():
     assert np.asarray(moved.x)[:, held] == pytest.approx(expected, abs=1e-14)
     shift = np.asarray(moved.x)[-1] - np.asarray(x)
     assert shift == pytest.approx(np.broadcast_to([0.1, 0.15], shift.shape), abs=0.03)
-
-
-def test_a_gripper_that_finds_nothing_is_refused():
-    solver, _, x = small_block(2)
     with pytest.raises(ValueError, match="gripper 1 finds no particle within 0.1 m"):
         solver.gripped(x, jnp.array([[0.5, 0.6], [0.9, 0.9]]), 0.1)
-
-
-def test_layers_of_a_sheet_fill_its_volume_and_are_odd():
-    mesh = r2s.rectangle((0.25, 0.25), (4, 4))
-    sheet = jnp.pad(mesh.rest + 0.3, ((0, 0), (0, 1)), constant_values=0.5)
-    x, volume = layered(mesh, sheet, 0.05, layers=3)
-    assert float(volume.sum()) == pytest.approx(0.25**2 * 0.05)
-    assert np.asarray(x[:16]) == pytest.approx(np.asarray(sheet))
-    with pytest.raises(ValueError, match="odd number of layers"):
-        layered(mesh, sheet, 0.1, layers=2)
 
 
 def test_a_step_above_the_limit_is_refused_with_the_limit():
@@ -254,44 +234,15 @@ def failed(moved):
 @pytest.mark.slow(group="mpm")
 def test_a_step_that_is_too_long_and_inputs_that_are_not_finite_are_named():
     solver, material, x = small_block(2, gravity=0.0)
-    noise = 1e-3 * jax.random.normal(jax.random.key(0), x.shape)
-    controls = still(240, 2)
+    noise, controls = 1e-3 * jax.random.normal(jax.random.key(0), x.shape), still(240, 2)
     assert failed(states(solver, material, solver.init(x, noise), controls)) == (Result.SUCCESS, 0)
     windy = dataclasses.replace(controls, wind=jnp.zeros((240, 3)).at[65].set(jnp.nan))
-    moved = states(solver, material, solver.init(x, noise), windy)
-    assert failed(moved) == (Result.NON_FINITE, 65)
-    # what fails afterwards does not hide it
+    # the block leaves the grid afterwards, which does not hide it
     moved = states(solver, material, solver.init(x, jnp.full(x.shape, 5.0)), windy)
     assert not np.isfinite(moved.x[-1]).all()
     assert failed(moved) == (Result.NON_FINITE, 65)
-    broken = eqx.tree_at(lambda m: m.law.mu, material, jnp.asarray(jnp.nan))
-    assert failed(states(solver, broken, solver.init(x), controls)) == (Result.NON_FINITE, 0)
-    limit = float(stable_step(solver.background, material))
-    long = dataclasses.replace(solver, dt=4 * limit)
+    long = dataclasses.replace(solver, dt=4 * float(stable_step(solver.background, material)))
     with pytest.raises(ValueError, match="limited"):
         long.check(material)
     code, step = failed(states(long, material, long.init(x, noise), controls))
     assert code == Result.TIME_STEP and step > 2
-
-
-@pytest.mark.slow(group="mpm")
-def test_failures_pass_through_vmap_and_gradients():
-    solver, material, x = small_block(2, gravity=0.0)
-    controls = still(240, 2)
-
-    def loss(speed):
-        moved = r2s.simulate(solver, material, solver.init(x, speed * jnp.ones_like(x)), controls)
-        return jnp.sum(moved.x[-1])
-
-    def code(speed):
-        start = solver.init(x, speed * jnp.ones_like(x))
-        return states(solver, material, start, controls).failure[-1]
-
-    speeds = jnp.array([0.5, 5.0])
-    codes = jax.jit(jax.vmap(code))(speeds)
-    assert codes.tolist() == [Result.SUCCESS, Result.GRID]
-    slopes = jax.jit(jax.vmap(jax.grad(loss)))(speeds)
-    assert float(slopes[0]) == pytest.approx(x.size * 240 * solver.dt)  # free flight
-    assert [describe(c).split(":")[0] for c in codes] == [
-        "Nothing failed.", "A particle left the grid",
-    ]  # fmt: skip

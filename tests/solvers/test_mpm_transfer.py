@@ -71,17 +71,6 @@ def _slopes(transfer, grid, inputs):
     return jax.grad(loss, argnums=tuple(range(len(inputs))))(*inputs)  # jit would take longer
 
 
-def test_the_derivative_in_positions_agrees_with_differences(case):
-    grid, x, values, slopes, _ = case
-
-    def loss(x):
-        return jnp.sum(jnp.sin(p2g(grid, x, values, slopes)))
-
-    direction = jnp.sin(jnp.arange(x.size, dtype=float)).reshape(x.shape)
-    expected = directional_difference(loss, x, direction, 1e-6)
-    assert jnp.sum(jax.grad(loss)(x) * direction) == pytest.approx(float(expected), rel=1e-7)
-
-
 def test_forward_mode_equals_differences(case):
     grid, x, _, _, nodes = case
 

@@ -4,17 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
-from r2s.solvers.contact import proximity
-from r2s.solvers.contact.proximity import (
-    closest_weights,
-    separation,
-    time_of_impact,
-)
-from tests.conftest import rotation
+from r2s.solvers.contact.proximity import closest_weights, separation, time_of_impact
 
 COUNT = 600  # pairs in a batch, all of the same shape to share compilations
 GAP = 1e-3  # [m]
@@ -28,7 +19,6 @@ def distance(corners, is_edges):
 
 
 weights_of = jax.jit(jax.vmap(closest_weights))
-one_weights = jax.jit(closest_weights)
 distances = jax.jit(jax.vmap(distance))
 jacobians = jax.jit(jax.vmap(jax.jacrev(closest_weights)))
 impacts = jax.jit(jax.vmap(time_of_impact, in_axes=(0, 0, 0, None)))
@@ -84,36 +74,6 @@ def test_no_points_are_closer(kind):
 
 
 @KINDS
-def test_single_precision_finds_the_same_distance(kind):
-    corners, is_edges = pairs(kind)
-    corners = corners.astype(np.float32)
-    found = np.asarray(distances(corners, is_edges), float)
-    expected = np.asarray(distances(corners.astype(float), is_edges))
-    assert np.max(np.abs(found - expected)) < 1e-6
-
-
-def grid(is_edges: bool, count: int = 15):
-    """Weights of points all over a pair's bodies."""
-    s, t = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(0, 1, count)]))
-    if is_edges:
-        return np.stack([1 - s, s, t - 1, -t], axis=1)
-    return np.stack([np.ones_like(s), s - 1, -s * (1 - t), -s * t], axis=1)
-
-
-WHOLE = st.integers(-2, 2).map(float)
-FINE = st.floats(-1, 1, width=32)
-
-
-@settings(max_examples=200, deadline=None)
-@given(st.one_of(arrays(float, (4, 3), elements=WHOLE), arrays(float, (4, 3), elements=FINE)))
-@pytest.mark.parametrize("is_edges", [True, False])
-def test_no_points_of_a_dense_sample_are_closer(is_edges, corners):
-    weights = np.asarray(one_weights(corners, np.array(is_edges)))
-    sampled = np.linalg.norm(grid(is_edges) @ corners, axis=1)
-    assert np.linalg.norm(weights @ corners) <= sampled.min() + 1e-7
-
-
-@KINDS
 @DTYPES
 def test_the_weights_have_a_finite_derivative(kind, dtype):
     corners, is_edges = pairs(kind)
@@ -134,22 +94,6 @@ def test_the_weights_have_the_right_derivative():
     assert same.mean() > 0.99
     expected = np.asarray(ahead - behind)[same] / 2e-6
     assert found[same] == pytest.approx(expected, rel=1e-5, abs=1e-6)
-
-
-def test_the_distance_varies_as_if_the_weights_stayed():
-    corners, is_edges = pairs("anywhere", 3)
-    gradient = jax.jit(jax.vmap(jax.grad(distance)))(corners, is_edges)
-    weights = np.asarray(weights_of(corners, is_edges))
-    between = np.einsum("pw,pwx->px", weights, corners)
-    normal = between / np.linalg.norm(between, axis=1, keepdims=True)
-    assert np.asarray(gradient) == pytest.approx(weights[:, :, None] * normal[:, None], abs=1e-9)
-
-
-def test_the_points_move_with_the_pair():
-    corners, is_edges = pairs("anywhere", 4)
-    turned = corners @ np.asarray(rotation(0.7, 2) @ rotation(1.9, 0)).T + np.array([3.0, -2, 1])
-    expected = np.asarray(weights_of(corners, is_edges))
-    assert np.asarray(weights_of(turned, is_edges)) == pytest.approx(expected, abs=1e-9)
 
 
 def test_a_small_separation_is_exact_far_from_the_origin():
@@ -180,42 +124,21 @@ def rounded(height, speed, aside=BESIDE):
     return lambda gap: (height - np.sqrt(gap**2 - aside**2)) / speed
 
 
+DOWN = (0, 0, -0.1)
 HITS = {  # a pair; how its first body moves; the time at which it comes as close as a gap
     "vertex on face": (vertex(2e-3, 3e-3, 5e-3), (0, 0, -9e-3), level(5e-3, 9e-3)),
-    "vertex on face from below": (vertex(2e-3, 3e-3, -5e-3), (0, 0, 9e-3), level(5e-3, 9e-3)),
-    "vertex right through, 5 m/s in 25 ms": (
-        vertex(2e-3, 3e-3, 0.06),
-        (0, 0, -0.125),
-        level(0.06, 0.125),
-    ),
-    "vertex beside an edge": (vertex(5e-3, -BESIDE, 3e-3), (0, 0, -0.1), rounded(3e-3, 0.1)),
-    "vertex beside a corner": (
-        vertex(-0.6 * BESIDE, -0.8 * BESIDE, 3e-3),
-        (0, 0, -0.1),
-        rounded(3e-3, 0.1),
-    ),
-    "vertex sliding in over an edge": (
-        vertex(5e-3, -0.05, BESIDE),
-        (0, 0.125, 0),
-        rounded(0.05, 0.125),
-    ),
-    "edges crossing": (
-        edge((4e-3, -5e-3, 4e-3), (4e-3, 5e-3, 4e-3)),
-        (0, 0, -0.1),
-        level(4e-3, 0.1),
-    ),
-    "edges parallel": (edge((2e-3, 0, 4e-3), (12e-3, 0, 4e-3)), (0, 0, -0.1), level(4e-3, 0.1)),
-    "edges crossing beside an end": (
-        edge((-BESIDE, -5e-3, 4e-3), (-BESIDE, 5e-3, 4e-3)),
-        (0, 0, -0.1),
-        rounded(4e-3, 0.1),
-    ),
+    "vertex from below": (vertex(2e-3, 3e-3, -5e-3), (0, 0, 9e-3), level(5e-3, 9e-3)),
+    "vertex right through": (vertex(2e-3, 3e-3, 0.06), (0, 0, -0.125), level(0.06, 0.125)),
+    "vertex beside an edge": (vertex(5e-3, -BESIDE, 3e-3), DOWN, rounded(3e-3, 0.1)),
+    "vertex over an edge": (vertex(5e-3, -0.05, BESIDE), (0, 0.125, 0), rounded(0.05, 0.125)),
+    "edges crossing": (edge((4e-3, -5e-3, 4e-3), (4e-3, 5e-3, 4e-3)), DOWN, level(4e-3, 0.1)),
+    "edges parallel": (edge((2e-3, 0, 4e-3), (12e-3, 0, 4e-3)), DOWN, level(4e-3, 0.1)),
     "edges end on end": (
         edge((-0.01 - BESIDE, 0, 4e-3), (-BESIDE, 0, 4e-3)),
-        (0, 0, -0.1),
+        DOWN,
         rounded(4e-3, 0.1),
     ),
-    "edge shrunk to a point": (edge(*2 * [(4e-3, 0, 4e-3)]), (0, 0, -0.1), level(4e-3, 0.1)),
+    "edge shrunk to a point": (edge(*2 * [(4e-3, 0, 4e-3)]), DOWN, level(4e-3, 0.1)),
     "grazing": (
         edge((-0.06, -0.99 * GAP, -5e-3), (-0.06, -0.99 * GAP, 5e-3)),
         (0.12, 0, 0),
@@ -223,7 +146,7 @@ HITS = {  # a pair; how its first body moves; the time at which it comes as clos
     ),
 }
 MISSES = {
-    "vertex beside an edge": (vertex(5e-3, -1.02 * GAP, 3e-3), (0, 0, -0.1)),
+    "vertex beside an edge": (vertex(5e-3, -1.02 * GAP, 3e-3), DOWN),
     "vertex sliding over the face": (vertex(5e-3, -0.05, 1.02 * GAP), (0, 0.125, 0)),
     "vertex that stops in time": (vertex(2e-3, 3e-3, 4e-3), (0, 0, 1.02 * GAP - 4e-3)),
     "vertex that leaves": (vertex(2e-3, 3e-3, 1.02 * GAP), (0, 0, 0.1)),
@@ -336,14 +259,3 @@ def test_an_impact_is_never_late_and_hardly_early(kind, dtype):
     within = history[0] < GAP - rounding
     stays = (history.min(axis=0) < 0.97 * history[0]) | (history[-1] < GAP - rounding)
     assert np.all(found[within & stays] == 0)
-
-
-def test_an_impact_that_takes_too_many_advances_is_early(monkeypatch):
-    start, end, is_edges = motions("very fast", np.float64, 8)
-    found = np.asarray(impacts(start, end, is_edges, GAP))
-    monkeypatch.setattr(proximity, "MAX_ADVANCES", 3)
-    # anew, with what the limit is now
-    again = jax.jit(jax.vmap(lambda a, b, e: time_of_impact(a, b, e, jnp.asarray(GAP))))
-    early = np.asarray(again(start, end, is_edges))
-    assert np.all(early <= found)
-    assert np.any(np.isfinite(early) & np.isinf(found))

@@ -1,17 +1,13 @@
 """Neighbours: which parts of a sheet may meet in a motion, by boxes around what they sweep.
 
-A pair is a vertex and a triangle, or two edges, that share no vertex
-(`r2s.solvers.contact.proximity`). Small meshes search among `all_pairs` with `candidate_pairs`;
-large ones with `candidate_pairs_in_tree`, by a tree of boxes around their faces, which finds the
-same.
+A pair is a vertex and a triangle, or two edges, that share no vertex (`proximity`). Small meshes
+search among `all_pairs`; large ones in a tree of boxes around their faces, which finds the same.
 """
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-
-Boxes = tuple[Array, Array]  # their lowest and highest corners
 
 
 class Pairs(eqx.Module):
@@ -83,13 +79,11 @@ def candidate_pairs(
     That is, along each axis the boxes around what the two sweep come as close. In the order of
     `pairs`. Also whether there are more than `capacity`; the last ones are then left out.
     """
-    low, high = _swept(start, end)
+    low, high = jnp.minimum(start, end), jnp.maximum(start, end)
     is_near = pairs.is_real
     for axis in range(3):  # apart, as it is several times as fast as all at once
-        lows = [low[:, axis][corner] for corner in pairs.stencils.T]
-        highs = [high[:, axis][corner] for corner in pairs.stencils.T]
-        low_first, low_second = _of_bodies(jnp.minimum, lows, pairs.is_edges)
-        high_first, high_second = _of_bodies(jnp.maximum, highs, pairs.is_edges)
+        low_first, low_second = _of_bodies(jnp.minimum, low[:, axis], pairs)
+        high_first, high_second = _of_bodies(jnp.maximum, high[:, axis], pairs)
         is_near &= (low_first <= high_second + reach) & (low_second <= high_first + reach)
     index, is_real, is_over = _compact(is_near, capacity)
     stencils = jnp.where(is_real[:, None], pairs.stencils[index], 0)
@@ -102,17 +96,9 @@ def build_bvh(faces: Int[np.ndarray, "face 3"], rest: Float[np.ndarray, "vertex 
     depth = (len(faces) - 1).bit_length()
     leaves = _leaves(np.asarray(rest)[faces].mean(axis=1), np.arange(len(faces)), depth)
     ends, of_faces = _edges(faces)
-
-    def array(values):
-        return jnp.asarray(values, int)
-
     owned = _owned(of_faces)
-    return BVH(
-        faces=array(faces),
-        leaves=array(leaves),
-        vertices=array(_owned(faces)),
-        edges=array(np.where(owned[:, :, None] < 0, -1, ends[owned])),
-    )
+    edges = np.where(owned[:, :, None] < 0, -1, ends[owned])
+    return BVH(*(jnp.asarray(array, int) for array in (faces, leaves, _owned(faces), edges)))
 
 
 def candidate_pairs_in_tree(
@@ -121,19 +107,17 @@ def candidate_pairs_in_tree(
     end: Float[Array, "vertex 3"],
     reach: Float[Array, ""],
     capacity: int,
-    node_capacity: int | None = None,
+    node_capacity: int,
 ) -> tuple[Pairs, Bool[Array, ""]]:
     """What `candidate_pairs` finds among all pairs, in another order, without looking at them all.
 
     From level to level down the tree it keeps those pairs of nodes whose boxes come within reach,
-    at most `node_capacity` (default: `capacity`); that there were more counts as overflow too.
+    at most `node_capacity`; that there were more counts as overflow too.
     """
-    node_capacity = capacity if node_capacity is None else node_capacity
     first, second, is_real, is_over = _near_faces(tree, start, end, reach, node_capacity)
-    found, is_over_too = candidate_pairs(
-        _of_faces(tree, first, second, is_real), start, end, reach, capacity
-    )
-    return found, is_over | is_over_too
+    owned = _of_faces(tree, first, second, is_real)
+    near, is_over_too = candidate_pairs(owned, start, end, reach, capacity)
+    return near, is_over | is_over_too
 
 
 def _edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -174,15 +158,18 @@ def _owned(parts: Int[np.ndarray, "face 3"]) -> Int[np.ndarray, "face owned"]:
 
 def _near_faces(tree, start, end, reach, capacity):
     """Pairs of faces whose boxes come within reach; which are real; whether there were more."""
-    levels = [_face_boxes(tree, start, end)]
+    corners, is_face = tree.faces[tree.leaves], (tree.leaves >= 0)[:, None]
+    low = jnp.minimum(start, end)[corners].min(axis=1)
+    high = jnp.maximum(start, end)[corners].max(axis=1)
+    # inside out where there is no face
+    levels = [(jnp.where(is_face, low, jnp.inf), jnp.where(is_face, high, -jnp.inf))]
     for _ in range(tree.depth):
         low, high = levels[0]
         levels.insert(0, (low.reshape(-1, 2, 3).min(axis=1), high.reshape(-1, 2, 3).max(axis=1)))
-
-    def is_small(level):
-        return 2**level * (2**level + 1) // 2 <= capacity
-
-    top = max(level for level in range(tree.depth + 1) if level == 0 or is_small(level))
+    fitting = (
+        level for level in range(tree.depth + 1) if 2**level * (2**level + 1) // 2 <= capacity
+    )
+    top = max(fitting, default=0)
     first, second = (jnp.asarray(index) for index in np.triu_indices(2**top))
     is_real, is_over = jnp.ones(len(first), bool), jnp.zeros((), bool)
     for level in range(top, tree.depth + 1):
@@ -198,10 +185,9 @@ def _near_faces(tree, start, end, reach, capacity):
 
 def _children(first, second, is_real):
     """The pairs of the children of pairs of nodes, the first not above the second."""
-    child = jnp.arange(2)
-    firsts = jnp.broadcast_to((2 * first[:, None] + child[None])[:, :, None], (len(first), 2, 2))
-    seconds = jnp.broadcast_to((2 * second[:, None] + child[None])[:, None, :], firsts.shape)
-    are_real = is_real[:, None, None] & (firsts <= seconds)
+    firsts = 2 * first[:, None] + jnp.array([[0, 0, 1, 1]])
+    seconds = 2 * second[:, None] + jnp.array([[0, 1, 0, 1]])
+    are_real = is_real[:, None] & (firsts <= seconds)
     return firsts.ravel(), seconds.ravel(), are_real.ravel()
 
 
@@ -226,24 +212,13 @@ def _of_faces(tree: BVH, first, second, is_real) -> Pairs:
     return Pairs(corners, of_edges, jnp.tile(is_real, len(stencils)) & is_apart & is_owned)
 
 
-def _face_boxes(tree: BVH, start, end) -> Boxes:
-    """The boxes around what the faces of the leaves sweep; inside out where there is no face."""
-    low, high = _swept(start, end)
-    corners = tree.faces[tree.leaves]
-    is_face = (tree.leaves >= 0)[:, None]
-    lows, highs = low[corners].min(axis=1), high[corners].max(axis=1)
-    return jnp.where(is_face, lows, jnp.inf), jnp.where(is_face, highs, -jnp.inf)
-
-
-def _swept(start, end) -> Boxes:
-    return jnp.minimum(start, end), jnp.maximum(start, end)
-
-
-def _of_bodies(extreme, corners, is_edges):
+def _of_bodies(extreme, coordinates, pairs: Pairs):
     """The least or greatest coordinate of the corners of each of the two bodies."""
-    a, b, c, d = corners
+    a, b, c, d = (coordinates[corner] for corner in pairs.stencils.T)
     first, second = extreme(a, b), extreme(c, d)
-    return jnp.where(is_edges, first, a), jnp.where(is_edges, second, extreme(second, b))
+    return jnp.where(pairs.is_edges, first, a), jnp.where(
+        pairs.is_edges, second, extreme(second, b)
+    )
 
 
 def _compact(mask, capacity):

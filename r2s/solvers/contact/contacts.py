@@ -6,7 +6,7 @@ at the time of their impact in the step. So a contact is lagged, like friction a
 energy is convex.
 """
 
-from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -29,6 +29,11 @@ from r2s.solvers.contact.proximity import closest_weights, separation, time_of_i
 Positions = Float[Array, "vertex 3"]
 
 
+WATCHED = 1.5  # thicknesses, up to which places that are close at the start of a step touch
+CLOSEST = 0.1  # thicknesses, below which a step may not bring any two places
+SMALL = 400  # vertices, up to which every pair is looked at, and a matrix couples all
+
+
 class Contacts(eqx.Module):
     """Planes that pairs of places may not cross.
 
@@ -46,6 +51,24 @@ class Contacts(eqx.Module):
     limit: Float[Array, " contact"]
     count: Int[Array, ""]
 
+    @classmethod
+    def none(cls, capacity: int, dtype: Any) -> "Contacts":
+        """An empty list."""
+        one, three, four = (jnp.zeros((capacity, *axes), dtype) for axes in ((), (3,), (4,)))
+        return cls(jnp.zeros((capacity, 4), int), four, three, one, one, jnp.zeros((), int))
+
+    def appended(self, chosen: Bool[Array, " pair"], *columns: Array) -> "Contacts":
+        """With the chosen rows of other stencils to limits, as far as there is room."""
+        places = self.count + jnp.cumsum(chosen) - 1
+        places = jnp.where(chosen, places, self.area.shape[0])  # out of bounds is dropped
+        own = self.stencils, self.weights, self.normals, self.area, self.limit
+        stencils, weights, normals, area, limit = (
+            column.at[places].set(values, mode="drop")
+            for column, values in zip(own, columns, strict=True)
+        )
+        count = self.count + jnp.sum(chosen)
+        return Contacts(stencils, weights, normals, area, limit, count)
+
 
 def contact_energy(
     contacts: Contacts,
@@ -55,8 +78,12 @@ def contact_energy(
     x_anchor: Positions,
 ) -> Float[Array, ""]:
     """Energy [J] of pressure, and dissipation of friction over the rate [1/s], of a step."""
-    energy = jax.vmap(partial(_pair_energy, thickness, rate))
-    return jnp.sum(energy(*_elements(contacts, x, x_anchor)))
+
+    def one(corners, anchor, weights, *rest):
+        apart, before = separation(corners, weights), separation(anchor, weights)
+        return _energy_apart(thickness, rate, apart, before, *rest)
+
+    return jnp.sum(jax.vmap(one)(*_elements(contacts, x, x_anchor)))
 
 
 def contact_hessians(
@@ -84,22 +111,12 @@ def _elements(contacts: Contacts, x: Positions, x_anchor: Positions):
     return *places, contacts.weights, contacts.normals, contacts.area, contacts.limit
 
 
-def _pair_energy(thickness, rate, corners, anchor, weights, *rest):
-    apart, from_ = separation(corners, weights), separation(anchor, weights)
-    return _energy_apart(thickness, rate, apart, from_, *rest)
-
-
 def _energy_apart(thickness, rate, apart, anchor, normal, area, limit):
     depth = jnp.maximum(thickness - apart @ normal, 0)
     velocity = rate * (apart - anchor)
     slip = velocity - (velocity @ normal) * normal
     pressed = area * contact.normal_potential(depth)
     return pressed + contact.friction_dissipation(limit, slip) / rate
-
-
-WATCHED = 1.5  # thicknesses, up to which places that are close at the start of a step touch
-CLOSEST = 0.1  # thicknesses, below which a step may not bring any two places
-SMALL = 400  # vertices, up to which every pair is looked at, and a matrix couples all
 
 
 class SelfContact(eqx.Module):
@@ -147,15 +164,14 @@ def touching(
 ) -> tuple[Contacts, Bool[Array, ""]]:
     """The contacts of places that are close to each other, and whether the capacity sufficed."""
     reach = WATCHED * thickness
-    found, overflow = self_contact.candidates(x, x, reach)
-    corners = x[found.stencils]
-    weights, normals, distance = jax.vmap(_plane)(corners, found.is_edges)
-    is_close = found.is_real & (distance < reach)
-    area = _area(mesh, found.stencils)
+    near, overflow = self_contact.candidates(x, x, reach)
+    weights, normals, distance = jax.vmap(_plane)(x[near.stencils], near.is_edges)
+    area = _area(mesh, near)
     depth = jnp.maximum(thickness - distance, 0)
     limit = friction * area * contact.pressure(depth)
-    empty = _empty(self_contact.capacity, x)
-    contacts = _append(empty, is_close, found.stencils, weights, normals, area, limit)
+    is_close = near.is_real & (distance < reach)
+    empty = Contacts.none(self_contact.capacity, x.dtype)
+    contacts = empty.appended(is_close, near.stencils, weights, normals, area, limit)
     return contacts, ~overflow & (contacts.count <= self_contact.capacity)
 
 
@@ -172,17 +188,17 @@ def colliding(
     """
     gap = CLOSEST * thickness
     drift = jnp.mean(after - before, axis=0)  # no pair comes closer by what all have in common
-    found, overflow = self_contact.candidates(before, after - drift[None], gap)
-    start, end = before[found.stencils], after[found.stencils]
+    near, overflow = self_contact.candidates(before, after - drift[None], gap)
+    start, end = before[near.stencils], after[near.stencils]
     impact = jax.vmap(time_of_impact, in_axes=(0, 0, 0, None))
-    times = jax.lax.stop_gradient(impact(start, end, found.is_edges, gap))
-    is_hit = found.is_real & jnp.isfinite(times)
+    times = jax.lax.stop_gradient(impact(start, end, near.is_edges, gap))
+    is_hit = near.is_real & jnp.isfinite(times)
     times = jnp.where(is_hit, times, 0)
     refine = jax.vmap(_refined, in_axes=(0, 0, 0, 0, None))
-    at = refine(times, start, end, found.is_edges, gap)[:, None, None]
-    weights, normals, _ = jax.vmap(_plane)(start + at * (end - start), found.is_edges)
-    area = _area(mesh, found.stencils)
-    more = _append(contacts, is_hit, found.stencils, weights, normals, area, jnp.zeros_like(area))
+    at = refine(times, start, end, near.is_edges, gap)[:, None, None]
+    weights, normals, _ = jax.vmap(_plane)(start + at * (end - start), near.is_edges)
+    area = _area(mesh, near)
+    more = contacts.appended(is_hit, near.stencils, weights, normals, area, jnp.zeros_like(area))
     return more, ~jnp.any(is_hit), ~overflow & (more.count <= self_contact.capacity)
 
 
@@ -214,35 +230,5 @@ def _plane(corners, is_edges):
     return weights, between / distance, jnp.where(squared > 0, distance, 0)
 
 
-def _area(mesh: Mesh, stencils: Int[Array, "pair 4"]) -> Float[Array, " pair"]:
-    return jnp.mean(mesh.vertex_area[stencils], axis=1)
-
-
-def _empty(capacity: int, x: Positions) -> Contacts:
-    return Contacts(
-        stencils=jnp.zeros((capacity, 4), int),
-        weights=jnp.zeros((capacity, 4), x.dtype),
-        normals=jnp.zeros((capacity, 3), x.dtype),
-        area=jnp.zeros(capacity, x.dtype),
-        limit=jnp.zeros(capacity, x.dtype),
-        count=jnp.zeros((), int),
-    )
-
-
-def _append(contacts: Contacts, chosen: Bool[Array, " pair"], *columns: Array) -> Contacts:
-    """The contacts with the chosen rows of others after them, as far as there is room."""
-    places = contacts.count + jnp.cumsum(chosen) - 1
-    places = jnp.where(chosen, places, contacts.area.shape[0])  # out of bounds is dropped
-
-    def put(column, values):
-        return column.at[places].set(values, mode="drop")
-
-    stencils, weights, normals, area, limit = columns
-    return Contacts(
-        stencils=put(contacts.stencils, stencils),
-        weights=put(contacts.weights, weights),
-        normals=put(contacts.normals, normals),
-        area=put(contacts.area, area),
-        limit=put(contacts.limit, limit),
-        count=contacts.count + jnp.sum(chosen),
-    )
+def _area(mesh: Mesh, pairs: Pairs) -> Float[Array, " pair"]:
+    return jnp.mean(mesh.vertex_area[pairs.stencils], axis=1)

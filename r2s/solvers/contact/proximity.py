@@ -84,22 +84,22 @@ def time_of_impact(
     with a plane: the one across the line between the closest points separates the bodies until
     the first of their corners arrives, so time may advance to there. If `MAX_ADVANCES` were not
     enough (31 were, for each of a million pairs at random), it would return the time reached, which
-    may be far too early, but not late: nothing meets before it.
+    may be far too early, but is not late.
     """
-    start, end = _centred(start), _centred(end)
+    start, end = (corners - jnp.mean(corners, axis=0, keepdims=True) for corners in (start, end))
     motion = end - start
     size = jnp.maximum(jnp.max(jnp.abs(start)), jnp.max(jnp.abs(end)))
     rounding = 32 * jnp.finfo(start.dtype).eps * size
-    distances = jax.vmap(lambda corners: _distance(corners, is_edges))
-    at_start, at_end = distances(jnp.stack([start, end]))
 
-    def is_near(distance):
-        return distance <= gap * (1 + TOLERANCE) + rounding
+    def distance(corners):
+        return _length(separation(corners, closest_weights(corners, is_edges)))
 
-    floor = jnp.where(is_near(at_start), DIP * at_start, gap)
+    distances = jax.vmap(distance)(jnp.stack([start, end]))
+    starts_near, ends_near = distances <= gap * (1 + TOLERANCE) + rounding
+    floor = jnp.where(starts_near, DIP * distances[0], gap)
     met = _advance(start, motion, is_edges, floor, TOLERANCE * floor + rounding)
-    of_near = jnp.where(jnp.isfinite(met) | is_near(at_end), 0.0, jnp.inf)
-    return jnp.where(is_near(at_start), of_near, met)
+    of_near = jnp.where(jnp.isfinite(met) | ends_near, 0.0, jnp.inf)
+    return jnp.where(starts_near, of_near, met)
 
 
 def _advance(start, motion, is_edges, floor, tolerance):
@@ -170,14 +170,6 @@ def _interior(corners, is_edges):
     weights = jnp.where(is_edges, edges, triangle)
     sign = _either(is_edges, _EDGES_SIGN, _TRIANGLE_SIGN, corners.dtype)
     return weights, normal, jnp.all(sign * weights >= 0) & ~is_thin
-
-
-def _centred(corners):
-    return corners - jnp.mean(corners, axis=0, keepdims=True)
-
-
-def _distance(corners, is_edges):
-    return _length(separation(corners, closest_weights(corners, is_edges)))
 
 
 def _length(vector):

@@ -1,13 +1,12 @@
 """The cloth in explicit steps: as many symplectic substeps in a step as its waves need.
 
 The physics are those of `r2s.ImplicitCloth`, but for the fastest waves of the membrane
-(`viscosity`). A substep needs no solve, and all its arrays are worked on side by side:
+(`stability.Viscosity`). A substep needs no solve, and all its arrays are worked on side by side:
 of a batch, its members. For derivatives the implicit cloth is better: these would go through every
 substep.
 """
 
 import math
-from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -18,31 +17,28 @@ from jaxtyping import Array, Bool, Float, Int
 
 from r2s._util.arrays import is_traced
 from r2s._util.units import Scalar
+from r2s.environment.contact import PRESSURE_STIFFNESS, SLIP_SPEED
 from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric, check_fabric
-from r2s.materials.plate import PlateLaw
 from r2s.mesh.mesh import Mesh
-from r2s.solvers.arguments import check_step_arguments
-from r2s.solvers.explicit import elements
-from r2s.solvers.explicit.elements import moved_velocity
-from r2s.solvers.explicit.layout import Layout, batch_last
-from r2s.solvers.explicit.sheet import (
-    Cells,
-    ForceInputs,
-    Memory,
-    cells_of,
-    force_by_gathers,
-    no_memory,
-    remembered,
-    slices,
+from r2s.mesh.vectors import Vector, add, scale, subtract
+from r2s.solvers.explicit.grid import Slices, grid_for
+from r2s.solvers.explicit.layout import batch_last
+from r2s.solvers.explicit.sheet import Cells, ForceInputs, Gathers, Memory, cells_of, no_memory
+from r2s.solvers.explicit.stability import RELAXATION, check_step, longest_sheet_step
+from r2s.solvers.results import (
+    Result,
+    all_finite,
+    check_step_arguments,
+    first_failure,
+    no_failure,
 )
-from r2s.solvers.explicit.stability import RELAXATION, Viscosity, check_step, longest_relaxing_step
-from r2s.solvers.results import Result, all_finite, first_failure, no_failure
 
 Positions = Float[Array, "vertex 3"]
 OfSamples = Float[Array, "element sample 3"]
 
 ROUNDING = 1e-3  # of a limit in float32
+SOLVES = 3  # of Newton's method for the slip, which comes from below, within 1 % of it
 TRACED = (
     "the fabric that gives the substeps must not be traced: make the solver outside of jit, grad "
     "and vmap, of the stiffest fabric, and trace its steps"
@@ -56,8 +52,8 @@ REFUSED = (
 class ExplicitState(eqx.Module):
     """- `x`, `v`: positions [m] and velocities [m/s], world frame, z up.
     - `relaxed`: stress of every sample that its viscosity remembers, [N/m].
-    - `hidden`: scaled wrinkles of every sample, from where the next substep goes on; None: the mesh
-      has none, or is no grid.
+    - `hidden`: scaled wrinkles of every sample, near which the next substep finds its own; None:
+      the mesh has none, or is no grid.
     - `begun`: whether there was a step.
     - `failure`: the first `r2s.solvers.results.Result` of the run so far.
     """
@@ -132,8 +128,7 @@ class ExplicitCloth(eqx.Module):
                 raise ValueError("expected a fabric, which gives the substeps, or substeps")
             self.substeps = substeps
             return
-        with jax.ensure_compile_time_eval():
-            longest = shortest(scene.mesh, fabric, self.membrane_damping, self.relaxation)
+        longest = self._longest_substep(fabric)
         if not 0 < longest < math.inf:
             raise ValueError(
                 f"the fabric has no longest substep (found {longest} s): its density and its "
@@ -147,14 +142,21 @@ class ExplicitCloth(eqx.Module):
         if is_traced(fabric):
             return
         check_fabric(fabric)
-        with jax.ensure_compile_time_eval():
-            times = self.membrane_damping, self.relaxation
-            self._check_substep(shortest(self.scene.mesh, fabric, *times))
+        self._check_substep(self._longest_substep(fabric))
 
     def fits(self, fabric: Fabric) -> Bool[Array, ""]:
         """Whether the substeps are short enough for a fabric, which may be traced."""
         longest = stable_step(self.scene.mesh, fabric, self.membrane_damping, self.relaxation)
         return self.dt / self.substeps <= (1 + ROUNDING) * longest
+
+    def _longest_substep(self, fabric: Fabric) -> float:
+        """The least `stable_step` [s] of a fabric, or of all members of a batch."""
+        limit = stable_step
+        for _ in range(jnp.ndim(fabric.density)):
+            limit = eqx.filter_vmap(limit, in_axes=(None, 0, None, None))
+        with jax.ensure_compile_time_eval():
+            limits = limit(self.scene.mesh, fabric, self.membrane_damping, self.relaxation)
+            return float(np.min(np.asarray(limits)))
 
     def _check_substep(self, longest: float) -> None:
         material = f"the fabric and the mesh (dt = {self.dt:g} s in {self.substeps} substeps)"
@@ -186,14 +188,10 @@ class ExplicitCloth(eqx.Module):
         scene, dtype = self.scene, state.x.dtype
         carried = jnp.zeros_like(state.x)
         carried = carried.at[scene.pinned].set((control.pinned - state.x[scene.pinned]) / self.dt)
-        damping = fabric.damping if self.membrane_damping is None else self.membrane_damping
         substep = jnp.asarray(self.dt / self.substeps, dtype)
         memory = Memory(state.relaxed, state.hidden, state.begun)
-        viscosity = Viscosity.make(damping, self.relaxation, substep)
-        around = viscosity, scene.air, scene.fan
-        wind = jnp.zeros(3, dtype) if control.wind is None else control.wind
         inputs = _Inputs(
-            ForceInputs(fabric, *around, state.x, state.v, wind, memory),
+            ForceInputs.make(self, fabric, state, control.wind, memory, substep),
             carried,
             scene.is_free.astype(dtype),
             scene.table.height,
@@ -201,16 +199,50 @@ class ExplicitCloth(eqx.Module):
             substep,
             jnp.zeros_like(state.x) if with_impulse else None,
         )
-        if self.grid is not None and isinstance(fabric.bending, PlateLaw):
-            advance = partial(_advance_grid, *self.grid, self.substeps)
-            moved = batch_last(advance, inputs)
+        grid = grid_for(self.grid, fabric)
+        if grid is None:
+            moved = self._advance(Gathers(scene.mesh), inputs)
         else:
-            moved = _advance(scene.mesh, self.substeps, inputs)
+            moved = batch_last(lambda batched, x: self._advance(Slices(*grid, batched), x), inputs)
         x = scene.place(moved.x, control.pinned)
-        asked = state.x, state.v, fabric, control
-        failure = first_failure(state.failure, _failure(asked, (x, moved.v)))
+        failure = _failure((state.x, state.v, fabric, control), (x, moved.v))
+        failure = first_failure(state.failure, failure)
         relaxed, hidden, begun = moved.memory
         return ExplicitState(x, moved.v, relaxed, hidden, begun, failure), moved.impulse
+
+    def _advance(self, layout: Slices | Gathers, inputs: "_Inputs") -> "_Moving":
+        """What the substeps of a step change; of a batch as the last axis on a grid."""
+        start, fabric = inputs.forces, inputs.forces.fabric
+        force_of, memory = layout.forces(start)
+        dt, gravity = layout.row(inputs.substep), layout.row(inputs.gravity)
+        density, friction, mass_damping, thickness = (
+            layout.row(number)
+            for number in (fabric.density, fabric.friction, fabric.mass_damping, fabric.thickness)
+        )
+        others = density, friction, mass_damping, gravity
+        mass = density * layout.areas(start.x)
+        contact = layout.row(inputs.table_height) + thickness
+        free, carried = inputs.is_free > 0, _columns(inputs.carried)
+
+        def substep(_, moving: _Moving) -> _Moving:
+            force, memory = force_of(moving.x, moving.v, moving.memory)
+            x, v, impulse = layout.inner(moving.x), layout.inner(moving.v), moving.impulse
+            unheld = moved_velocity(dt, force, mass, v, x[2] - contact, *others)
+            pairs = zip(unheld, carried, strict=True)
+            along, across, up = (jnp.where(free, own, given) for own, given in pairs)
+            moved = along, across, up
+            if impulse is not None:
+                impulse = add(impulse, scale(mass, subtract(moved, unheld)))
+            placed = add(x, scale(dt, moved))
+            wide = layout.put(moving.x, placed), layout.put(moving.v, moved)
+            return _Moving(*wide, memory, impulse)
+
+        impulse = None if inputs.impulse is None else _columns(inputs.impulse)
+        moving = _Moving(layout.wide(start.x), layout.wide(start.v), memory, impulse)
+        x, v, memory, impulse = jax.lax.fori_loop(0, self.substeps, substep, moving)
+        impulse = None if impulse is None else jnp.stack(impulse, axis=1)
+        x, v = (jnp.stack(layout.inner(wide), axis=1) for wide in (x, v))
+        return _Moving(x, v, layout.remembered(memory), impulse)
 
 
 class _Moving(NamedTuple):
@@ -218,12 +250,12 @@ class _Moving(NamedTuple):
 
     x: Any
     v: Any
-    memory: Any
+    memory: Memory
     impulse: Any  # [N s], of the grippers, added up; None: it is not asked for
 
 
 class _Inputs(NamedTuple):
-    """All that a step depends on; with a batch as last axis in `_advance_grid`."""
+    """All that a step depends on; of a batch as the last axis on a grid."""
 
     forces: ForceInputs
     carried: Array  # velocities of pinned vertices
@@ -234,69 +266,7 @@ class _Inputs(NamedTuple):
     impulse: Array | None
 
 
-def _advance(mesh: Mesh, substeps: int, inputs: _Inputs) -> _Moving:
-    """What the substeps of a step change, of any mesh."""
-    start, fabric = inputs.forces, inputs.forces.fabric
-    small = inputs.substep
-    mass = fabric.density * mesh.vertex_area
-    free, carried = inputs.is_free > 0, tuple(inputs.carried.T)
-
-    def substep(moving: _Moving, _):
-        x, v, memory, impulse = moving
-        force, memory = force_by_gathers(mesh, start._replace(x=x, v=v, memory=memory))
-        height = x[:, 2] - inputs.table_height - fabric.thickness
-        others = fabric.density, fabric.friction, fabric.mass_damping, inputs.gravity
-        moved = moved_velocity(small, tuple(force.T), mass, tuple(v.T), height, *others)
-        v = jnp.stack([jnp.where(free, m, c) for m, c in zip(moved, carried, strict=True)], 1)
-        if impulse is not None:
-            impulse += mass[:, None] * (v - jnp.stack(moved, axis=1))
-        return _Moving(x + small * v, v, memory, impulse), None
-
-    moving = _Moving(start.x, start.v, start.memory, inputs.impulse)
-    return jax.lax.scan(substep, moving, length=substeps)[0]
-
-
-def _advance_grid(shape, spacing, substeps: int, batched: bool, inputs: _Inputs) -> _Moving:
-    """What the substeps of a step change, on a grid."""
-    layout, start = Layout(shape, spacing, batched), inputs.forces
-    force_of, samples = slices(layout, start)
-    count, room = layout.count, layout.room
-    dt = layout.row(inputs.substep)
-    names = ("density", "friction", "mass_damping", "thickness")
-    *others, thickness = (layout.row(getattr(start.fabric, name)) for name in names)
-    mass = others[0] * layout.constant(layout.vertex_areas, 0, start.x)
-    contact = layout.row(inputs.table_height) + thickness
-    others.append(layout.row(inputs.gravity))
-    free, carried = inputs.is_free > 0, _columns(inputs.carried)
-
-    def inner(arrays):
-        return tuple(each[room : room + count] for each in arrays)
-
-    def put(wide, arrays):
-        return tuple(w.at[room : room + count].set(a) for w, a in zip(wide, arrays, strict=True))
-
-    def substep(_, moving: _Moving) -> _Moving:
-        x, v, (samples, begun), impulse = moving
-        force, samples = force_of(x, v, samples, begun)
-        here = inner(x)
-        unheld = moved_velocity(dt, force, mass, inner(v), here[2] - contact, *others)
-        moved = tuple(jnp.where(free, m, c) for m, c in zip(unheld, carried, strict=True))
-        if impulse is not None:
-            given = zip(impulse, moved, unheld, strict=True)
-            impulse = tuple(i + mass * (m - u) for i, m, u in given)
-        placed = tuple(a + dt * b for a, b in zip(here, moved, strict=True))
-        return _Moving(put(x, placed), put(v, moved), (samples, jnp.ones_like(begun)), impulse)
-
-    impulse = None if inputs.impulse is None else _columns(inputs.impulse)
-    memory = samples, layout.row(start.memory.begun)
-    moving = _Moving(layout.wide(start.x), layout.wide(start.v), memory, impulse)
-    x, v, (samples, begun), impulse = jax.lax.fori_loop(0, substeps, substep, moving)
-    memory = remembered(layout, samples, begun[0] if batched else begun)
-    impulse = None if impulse is None else jnp.stack(impulse, axis=1)
-    return _Moving(jnp.stack(inner(x), axis=1), jnp.stack(inner(v), axis=1), memory, impulse)
-
-
-def _columns(vectors: Array) -> tuple[Array, Array, Array]:
+def _columns(vectors: Array) -> Vector:
     return vectors[:, 0], vectors[:, 1], vectors[:, 2]
 
 
@@ -318,15 +288,50 @@ def stable_step(
     `membrane_damping`, `relaxation`: as in `ExplicitCloth`, [s]. The squares of the highest
     frequencies of membrane and bending have bounds that add. Table and friction do not limit it.
     """
-    damping = fabric.damping if membrane_damping is None else jnp.asarray(membrane_damping, float)
-    bending = elements.bending_frequency(mesh, fabric), fabric.damping
-    stretching = elements.membrane_frequency(mesh, fabric)
-    return longest_relaxing_step(stretching, damping, jnp.asarray(relaxation, float), [bending])
+    return longest_sheet_step(mesh, fabric, membrane_damping, relaxation)
 
 
-def shortest(mesh: Mesh, fabric: Fabric, damping: Array | None, relaxation: Array) -> float:
-    """The least `stable_step` [s] of a fabric, or of all members of a batch."""
-    limit = stable_step
-    for _ in range(jnp.ndim(fabric.density)):
-        limit = eqx.filter_vmap(limit, in_axes=(None, 0, None, None))
-    return float(np.min(np.asarray(limit(mesh, fabric, damping, relaxation))))
+def moved_velocity(
+    dt: Array,
+    force: Vector,
+    mass: Array,
+    v: Vector,
+    height: Array,
+    density: Array,
+    friction: Array,
+    mass_damping: Array,
+    gravity: Array,
+) -> Vector:
+    """Velocities [m/s] at the end of a substep `dt` [s].
+
+    - `force`: all but those below, [N]; `mass`: [kg]; `v`: velocities before, [m/s].
+    - `height`: above the place where contact with the table begins, [m].
+    - `density` [kg/m^2], `friction` [-], `mass_damping` [1/s]: of the fabric.
+    - `gravity`: downwards, [m/s^2].
+    """
+    braking = 1 / (1 + dt * mass_damping)
+    along, across, up = (braking * (u + dt * f / mass) for u, f in zip(v, force, strict=True))
+    up = up - braking * dt * gravity
+    # depth = free depth - dt^2 PRESSURE_STIFFNESS / density * depth^2
+    free = jnp.maximum(-height - dt * up, 0)
+    stiff = braking * dt**2 * PRESSURE_STIFFNESS / density
+    depth = 2 * free / (1 + jnp.sqrt(1 + 4 * stiff * free))
+    pushed = braking * dt * PRESSURE_STIFFNESS / density * depth**2
+    # a root that has a derivative where nothing slides
+    speed = jnp.sqrt(along**2 + across**2 + jnp.finfo(along.dtype).tiny)
+    kept = _kept_slip(speed, friction * pushed)
+    return kept * along, kept * across, up + pushed
+
+
+def _kept_slip(speed: Array, loss: Array) -> Array:
+    """The fraction of a sliding speed [m/s] that friction leaves, of which it can take `loss`.
+
+    With r the speed that is left, r + loss r / sqrt(r^2 + SLIP_SPEED^2) = speed.
+    """
+    left = jnp.maximum(speed - loss, speed * SLIP_SPEED / (SLIP_SPEED + loss))
+    for _ in range(SOLVES):
+        squared = left**2 + SLIP_SPEED**2
+        share = loss / jnp.sqrt(squared)
+        off = left * (1 + share) - speed
+        left = left - off / (1 + share * SLIP_SPEED**2 / squared)
+    return left / speed

@@ -15,8 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from r2s.environment.air import Fan
-from r2s.mesh.vectors import Vector, scale, subtract
+from r2s.mesh.vectors import Vector
 
 
 class Layout(NamedTuple):
@@ -45,17 +44,39 @@ class Layout(NamedTuple):
         """The first place from which a cell could reach vertex 0."""
         return -self.shape[1] - 1
 
+    def length(self, first: int) -> int:
+        """Of arrays that begin at a place: cells end with the vertices, bends as far after them as
+        they begin before.
+        """
+        return self.count - first if first == self.first_cell else self.count - 2 * first
+
     def constant(self, values: np.ndarray, first: int, like: Array) -> Array:
         """Numbers of the vertices as an array that begins at a place, zero outside."""
         row = np.pad(np.asarray(values, float).ravel(), self.room)[first + self.room :]
         row = row[: self.length(first)]
         return jnp.asarray(row[:, None] if self.batched else row, like.dtype)
 
-    def length(self, first: int) -> int:
-        """Of arrays that begin at a place: cells end with the vertices, bends as far after them as
-        they begin before.
-        """
-        return self.count - first if first == self.first_cell else self.count - 2 * first
+    def is_cell(self, like: Array) -> Array:
+        """Which places are the origin of a cell."""
+        rows, columns = np.indices(self.shape)
+        inside = (rows < self.shape[0] - 1) & (columns < self.shape[1] - 1)
+        return self.constant(inside, self.first_cell, like) > 0
+
+    def areas(self, like: Array) -> Array:
+        """Rest areas of the vertices, [m^2]."""
+        return self.constant(self.vertex_areas, 0, like)
+
+    @property
+    def vertex_areas(self) -> np.ndarray:
+        """Rest areas of the vertices, [m^2], as a matrix."""
+        along = [np.ones(count) for count in self.shape]
+        for each in along:
+            each[[0, -1]] = 0.5
+        return np.prod(self.spacing) * np.outer(*along)
+
+    def row(self, number: Array) -> Array:
+        """A number of each member, for arrays (place, member)."""
+        return number[None] if self.batched else number
 
     def padded(self, array: Array, first: int, last: int) -> Array:
         """With zeros before the first and after the last place."""
@@ -67,17 +88,14 @@ class Layout(NamedTuple):
         one, two, three = (self.padded(x[:, i], self.room, self.room) for i in range(3))
         return one, two, three
 
-    @property
-    def vertex_areas(self) -> np.ndarray:
-        """Rest areas of the vertices, [m^2]."""
-        along = [np.ones(count) for count in self.shape]
-        for each in along:
-            each[[0, -1]] = 0.5
-        return np.prod(self.spacing) * np.outer(*along)
+    def inner(self, x: Vector) -> Vector:
+        """What has room on either side without it."""
+        return parts(x, self.room, self.count)
 
-    def row(self, number: Array) -> Array:
-        """A number of each member, for arrays (place, member)."""
-        return number[None] if self.batched else number
+    def put(self, wide: Vector, x: Vector) -> Vector:
+        """The vertices' components in an array with room."""
+        at = slice(self.room, self.room + self.count)
+        return wide[0].at[at].set(x[0]), wide[1].at[at].set(x[1]), wide[2].at[at].set(x[2])
 
     def to_cells(self, samples: Array) -> Vector:
         """Vectors (cell, sample, 3, ...) of the cells alone: a row of all places of each sample."""
@@ -98,38 +116,15 @@ class Layout(NamedTuple):
         square = cells.reshape(*self.shape, *cells.shape[1:])[:-1, :-1]
         return square.reshape((rows - 1) * (columns - 1), *cells.shape[1:])
 
-    def flow(self, x: Vector, v: Vector, wind: Array, fan: Fan | None) -> Vector:
-        """Velocities [m/s] less the wind's: one for all vertices (3, ...), or (vertex, 3, ...)."""
-        if wind.ndim == (2 if self.batched else 1):
-            blowing = self.rows(wind)
-        else:
-            blowing = self.wide(wind)
-        if fan is not None:
-            blows = jax.vmap(Fan.__call__, -1, -1) if self.batched else Fan.__call__
-            strength = blows(fan, jnp.stack(x, axis=1))
-            blowing = scale(strength, blowing)
-        return subtract(v, blowing)
-
-    def rows(self, vector: Array) -> Vector:
-        """A vector for all vertices, (3, ...)."""
-        return self.row(vector[0]), self.row(vector[1]), self.row(vector[2])
-
-    def index(self) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column of every vertex."""
-        rows, columns = np.indices(self.shape)
-        return rows, columns
-
 
 def part(array: Array, begin: int, length: int) -> Array:
     """Some places of a row."""
     return array[begin : begin + length]
 
 
-def is_cell(layout: Layout, like: Array) -> Array:
-    """Which places are the origin of a cell."""
-    rows, columns = layout.index()
-    inside = (rows < layout.shape[0] - 1) & (columns < layout.shape[1] - 1)
-    return layout.constant(inside, layout.first_cell, like) > 0
+def parts(x: Vector, begin: int, length: int) -> Vector:
+    """Some places of a vector's components."""
+    return part(x[0], begin, length), part(x[1], begin, length), part(x[2], begin, length)
 
 
 def batch_last(function: Callable[[bool, Any], Any], inputs: Any) -> Any:
@@ -141,50 +136,36 @@ def batch_last(function: Callable[[bool, Any], Any], inputs: Any) -> Any:
     """
     arrays, static = eqx.partition(inputs, eqx.is_array)
 
-    def of_arrays(batched, arrays):
+    def plain(batched: bool, arrays: Any) -> Any:
         return function(batched, eqx.combine(arrays, static))
 
-    @jax.custom_batching.custom_vmap
-    def of_members(arrays):
-        return of_arrays(True, arrays)
+    def batching(batched: bool) -> Callable:
+        run = jax.custom_batching.custom_vmap(partial(plain, batched))
 
-    @of_members.def_vmap
-    def _(size, in_batched, arrays):
-        count = jax.tree.leaves(arrays)[0].shape[-1]
+        @run.def_vmap
+        def _(size, in_batched, arrays):
+            def last(leaf, is_batched):
+                moved = jnp.broadcast_to(leaf[..., None], (*leaf.shape, size))
+                if is_batched:
+                    moved = jnp.moveaxis(leaf, 0, -1)
+                return moved.reshape(*moved.shape[:-2], -1) if batched else moved
 
-        def merged(leaf, is_batched):
-            leaf = (
-                jnp.moveaxis(leaf, 0, -1) if is_batched else jnp.repeat(leaf[..., None], size, -1)
-            )
-            return leaf.reshape(*leaf.shape[:-2], count * size)
+            def first(leaf):
+                leaf = leaf.reshape(*leaf.shape[:-1], -1, size) if batched else leaf
+                return jnp.moveaxis(leaf, -1, 0)
 
-        merged = of_members(jax.tree.map(merged, arrays, in_batched[0]))
-        found = jax.tree.map(
-            lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], count, size), -1, 0), merged
-        )
-        return found, jax.tree.map(lambda _: True, found)
+            results = batching(True)(jax.tree.map(last, arrays, in_batched[0]))
+            results = jax.tree.map(first, results)
+            return results, jax.tree.map(lambda _: True, results)
 
-    @jax.custom_batching.custom_vmap
-    def of_one(arrays):
-        return of_arrays(False, arrays)
-
-    @of_one.def_vmap
-    def _(size, in_batched, arrays):
-        def last(leaf, is_batched):
-            if is_batched:
-                return jnp.moveaxis(leaf, 0, -1)
-            return jnp.broadcast_to(leaf[..., None], (*leaf.shape, size))
-
-        found = of_members(jax.tree.map(last, arrays, in_batched[0]))
-        found = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), found)
-        return found, jax.tree.map(lambda _: True, found)
+        return run
 
     @jax.custom_jvp
     def called(arrays):
-        return of_one(arrays)
+        return batching(False)(arrays)
 
     @called.defjvp
     def _(primals, tangents):
-        return jax.jvp(partial(of_arrays, False), primals, tangents)
+        return jax.jvp(partial(plain, False), primals, tangents)
 
     return called(arrays)

@@ -1,6 +1,6 @@
-"""Forces on a sheet from substep to substep, with what the viscosity of its membrane remembers.
+"""Forces on the vertices of a sheet from substep to substep, on any mesh.
 
-By slices where the mesh is a grid, by gathers elsewhere.
+Strains, curvatures and laws are those of `r2s.ImplicitCloth`; here they give forces.
 """
 
 from collections.abc import Callable
@@ -12,16 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from r2s._util.arrays import once
 from r2s.environment.air import Air, Fan, drag_on_vertices
 from r2s.materials.fabric import Fabric
-from r2s.materials.plate import PlateLaw
+from r2s.materials.wrinkling import membrane_on_samples, stress_on_samples
 from r2s.mesh.mesh import Mesh
+from r2s.mesh.surface import strains
 from r2s.mesh.vectors import Vector
-from r2s.solvers.explicit.elements import bending_force, membrane_force, membrane_stress
-from r2s.solvers.explicit.grid import grid_force, laws_on_grid
-from r2s.solvers.explicit.grid_membrane import Samples
-from r2s.solvers.explicit.layout import Layout, batch_last
 from r2s.solvers.explicit.stability import Viscosity
 
 Vertices = Float[Array, "vertex 3"]
@@ -31,13 +27,14 @@ Cells = tuple[tuple[int, int], tuple[float, float]]
 class Memory(NamedTuple):
     """What the samples of a membrane remember of the substep before.
 
-    - `relaxed`: stress (`r2s.solvers.explicit.stability`), [N/m].
-    - `hidden`: scaled wrinkles; None: the mesh has none, or is no grid.
+    - `relaxed`: stress (`Viscosity`), [N/m]: (element, sample, 3), or a row of all for each of
+      three components.
+    - `hidden`: scaled wrinkles, likewise; None: the mesh has none, or is no grid.
     - `begun`: whether there was a substep.
     """
 
-    relaxed: Float[Array, "element sample 3"]
-    hidden: Float[Array, "element sample 3"] | None
+    relaxed: Any
+    hidden: Any
     begun: Array
 
 
@@ -52,6 +49,17 @@ class ForceInputs(NamedTuple):
     v: Vertices
     wind: Array
     memory: Memory
+
+    @classmethod
+    def make(
+        cls, solver: Any, fabric: Fabric, state: Any, wind: Array | None, memory: Memory, dt: Any
+    ) -> "ForceInputs":
+        """Of a solver with a scene, a membrane damping and a relaxation, in steps of `dt` [s]."""
+        x, v, scene = state.x, state.v, solver.scene
+        damping = fabric.damping if solver.membrane_damping is None else solver.membrane_damping
+        viscosity = Viscosity.make(damping, solver.relaxation, jnp.asarray(dt, x.dtype))
+        wind = jnp.zeros(3, x.dtype) if wind is None else wind
+        return cls(fabric, viscosity, scene.air, scene.fan, x, v, wind, memory)
 
 
 def cells_of(mesh: Mesh) -> Cells | None:
@@ -73,19 +81,50 @@ def no_memory(mesh: Mesh, cells: Cells | None, dtype: Any) -> Memory:
     return Memory(none, none if wrinkles else None, jnp.asarray(False))
 
 
-def sheet_force(mesh: Mesh, cells: Cells | None, inputs: ForceInputs) -> tuple[Vertices, Memory]:
-    """Forces [N] of membrane, bending and air on the vertices, and what the samples remember.
+class Gathers(NamedTuple):
+    """Any mesh, with the methods of `grid.Slices`; its arrays have no room."""
 
-    `cells`: vertices along warp and weft of a rectangle of quadrilaterals, and the spacing between
-    them [m]; None: any mesh.
-    """
-    if cells is None or not isinstance(inputs.fabric.bending, PlateLaw):
-        return force_by_gathers(mesh, inputs)
-    return batch_last(partial(_force_by_slices, *cells), inputs)
+    mesh: Mesh
+
+    def row(self, number: Array) -> Array:
+        """A number, for arrays over the vertices."""
+        return number
+
+    def areas(self, like: Array) -> Array:
+        """Rest areas of the vertices, [m^2]."""
+        return self.mesh.vertex_area
+
+    def wide(self, x: Vertices) -> Vector:
+        """Components of vectors of the vertices."""
+        return x[:, 0], x[:, 1], x[:, 2]
+
+    def inner(self, x: Vector) -> Vector:
+        """Those of the vertices alone."""
+        return x
+
+    def put(self, wide: Vector, x: Vector) -> Vector:
+        """The reverse of `inner`."""
+        return x
+
+    def forces(self, inputs: ForceInputs) -> tuple[Callable, Memory]:
+        """The forces as a function of components of positions, of velocities, and memory; and the
+        memory at first.
+        """
+
+        def force(x: Vector, v: Vector, memory: Memory) -> tuple[Vector, Memory]:
+            moved = {"x": jnp.stack(x, axis=1), "v": jnp.stack(v, axis=1), "memory": memory}
+            total, memory = force_by_gathers(self.mesh, inputs._replace(**moved))
+            return self.wide(total), memory
+
+        return force, inputs.memory
+
+    def remembered(self, memory: Memory) -> Memory:
+        """The memory of the cells."""
+        return memory
 
 
 def force_by_gathers(mesh: Mesh, inputs: ForceInputs) -> tuple[Vertices, Memory]:
-    """`sheet_force` on any mesh."""
+    """Forces [N] of membrane, bending and air on the vertices, and what the samples remember."""
     fabric, viscosity, air, fan, x, v, wind, memory = inputs
     past = memory.relaxed.reshape(-1, 3)
     stress = membrane_stress(mesh, fabric, x)
@@ -96,34 +135,34 @@ def force_by_gathers(mesh: Mesh, inputs: ForceInputs) -> tuple[Vertices, Memory]
     return force, Memory(relaxed, memory.hidden, jnp.ones_like(memory.begun))
 
 
-def slices(layout: Layout, inputs: ForceInputs) -> tuple[Callable, Samples]:
-    """The forces on a grid as a function of positions and velocities with room (`Layout`), samples
-    and whether there was a substep; and the samples at first. With a batch as last axis.
-    """
-    viscosity, air = jax.tree.map(layout.row, (inputs.viscosity, inputs.air))
-    relaxed, hidden, _ = inputs.memory
-    laws = laws_on_grid(layout, inputs.fabric, viscosity, hidden is not None)
-
-    def force(x: Vector, v: Vector, samples: Samples, begun: Array) -> tuple[Vector, Samples]:
-        flow = layout.flow(x, v, inputs.wind, inputs.fan)
-        return grid_force(layout, laws, air, x, v, flow, samples, begun)
-
-    known = None if hidden is None else layout.to_cells(hidden)
-    return force, Samples(layout.to_cells(relaxed), known)
+def membrane_stress(mesh: Mesh, fabric: Fabric, x: Vertices) -> Float[Array, "sample 3"]:
+    """Of all strain samples at positions [m], [N/m]."""
+    strain = mesh.samples.strains(x)
+    laws = membrane_on_samples(mesh.samples, fabric.membrane, fabric.bending, strain)
+    return stress_on_samples(laws, strain).reshape(-1, 3)
 
 
-def remembered(layout: Layout, samples: Samples, begun: Array) -> Memory:
-    """The samples of a grid as the memory of its cells."""
-    hidden = None if samples.hidden is None else layout.from_cells(samples.hidden)
-    return Memory(layout.from_cells(samples.relaxed), hidden, begun)
+def membrane_force(mesh: Mesh, x: Vertices, stress: Float[Array, "sample 3"]) -> Vertices:
+    """Forces [N] of stresses [N/m] on the vertices."""
+    _, to_forces = jax.vjp(partial(strains, mesh), x)
+    return -to_forces(mesh.samples.areas.reshape(-1)[:, None] * stress)[0]
 
 
-def _force_by_slices(shape, spacing, batched: bool, inputs: ForceInputs) -> tuple[Array, Memory]:
-    layout = Layout(shape, spacing, batched)
-    force_of, samples = slices(layout, inputs)
-    begun = inputs.memory.begun
-    x, v = layout.wide(inputs.x), layout.wide(inputs.v)
-    force, samples = force_of(x, v, samples, layout.row(begun))
-    # XLA would sum it up within the stack, element by element
-    force = once(lambda *force: force, *force)
-    return jnp.stack(force, axis=1), remembered(layout, samples, jnp.ones_like(begun))
+def bending_force(mesh: Mesh, fabric: Fabric, x: Vertices, v: Vertices) -> Vertices:
+    """Forces [N] of bending with Kelvin-Voigt viscosity on the vertices."""
+    law, areas = fabric.bending, fabric.bending.areas(mesh)
+    bends = law.bends(mesh)
+
+    def bend(x: Vertices) -> Array:
+        return law.curvatures(mesh, bends.curvatures_at(x))
+
+    bent = law.on_elements(mesh, bends.curvatures_at(x))
+
+    def moments(curvature: Array) -> Array:
+        return jax.vmap(lambda law, k: jax.grad(law.energy_density)(k))(bent, curvature)
+
+    curvature, rate = jax.jvp(bend, (x,), (v,))
+    moment, viscous = jax.jvp(moments, (curvature,), (rate,))
+    _, to_forces = jax.vjp(bend, x)
+    areas = areas if curvature.ndim == 1 else areas[:, None]
+    return -to_forces(areas * (moment + fabric.damping * viscous))[0]

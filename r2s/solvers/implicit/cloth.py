@@ -21,13 +21,18 @@ from r2s.materials.wrinkling import membrane_on_samples, tangents_on_samples
 from r2s.mesh.bends import unwrapped
 from r2s.mesh.mesh import Mesh
 from r2s.mesh.surface import area_normals
-from r2s.solvers.arguments import LONGEST, check_step_arguments
 from r2s.solvers.contact.contacts import SMALL, SelfContact, colliding, touching
 from r2s.solvers.implicit.generalised_alpha import by_generalised_alpha, rates_after
-from r2s.solvers.implicit.linear.system import Elimination
 from r2s.solvers.implicit.newton import minimise
 from r2s.solvers.implicit.potential import IncrementalPotential, residual
-from r2s.solvers.results import Result, first_failure, no_failure
+from r2s.solvers.implicit.system import Elimination
+from r2s.solvers.results import (
+    LONGEST,
+    Result,
+    check_step_arguments,
+    first_failure,
+    no_failure,
+)
 
 Positions = Float[Array, "vertex 3"]
 
@@ -38,19 +43,19 @@ MAX_ATTEMPTS = 12  # at a step with self-contact, before it fails
 
 class ImplicitState(eqx.Module):
     """- `x`, `v`: positions [m] and velocities [m/s], world frame, z up.
-    - `x_before`, `v_before`: those of the step before, which the second-order formula needs.
+    - `x_before`, `v_before`: those of the step before, for the second-order formula.
     - `failure`: the first `r2s.solvers.results.Result` of the run so far.
     - `a`, `pull`: accelerations and forces per mass but for the table's, [m/s^2], which the
       generalised-alpha method needs; None of BDF2.
     """
 
-    x: Float[Array, "vertex 3"]
-    v: Float[Array, "vertex 3"]
-    x_before: Float[Array, "vertex 3"]
-    v_before: Float[Array, "vertex 3"]
+    x: Positions
+    v: Positions
+    x_before: Positions
+    v_before: Positions
     failure: Int[Array, ""] = eqx.field(default_factory=no_failure)
-    a: Float[Array, "vertex 3"] | None = None
-    pull: Float[Array, "vertex 3"] | None = None
+    a: Positions | None = None
+    pull: Positions | None = None
 
 
 class ImplicitCloth(eqx.Module):
@@ -104,18 +109,15 @@ class ImplicitCloth(eqx.Module):
         self.elimination, self.self_contact = elimination, search
         self.tolerance, self.max_iterations = tolerance, max_iterations
         self.spectral_radius = spectral_radius
-        searches = self.self_contact is not None
-        if searches and not is_traced(dt) and float(dt) > MAX_CONTACT_STEP:
+        if search is not None and not is_traced(dt) and float(dt) > MAX_CONTACT_STEP:
             raise ValueError(
                 f"with self-contact dt must be at most {MAX_CONTACT_STEP:.4f} s, since contacts "
                 f"are planes that stand still in a step; got {dt} s"
             )
-        if spectral_radius is None:
-            return
-        if not 0 <= spectral_radius < 1:
+        if spectral_radius is not None and not 0 <= spectral_radius < 1:
             raise ValueError(f"spectral_radius must be from 0 to below 1, got {spectral_radius}")
-        if searches:
-            raise ValueError("self-contact goes with BDF2 only: leave spectral_radius at None")
+        if search is not None and spectral_radius is not None:
+            raise ValueError("self-contact needs BDF2: leave spectral_radius at None")
 
     def init(
         self, x: Positions, v: Positions | None = None, acceleration: Positions | None = None
@@ -155,8 +157,10 @@ class ImplicitCloth(eqx.Module):
         step = self.potential(fabric, state, control)
         ahead = self.dt * (3 * state.v - state.v_before) / 2  # the mean rate, second order
         guess = self.scene.place(state.x + ahead, control.pinned)
-        solve = self._minimise if self.self_contact is None else self._minimise_with_contacts
-        x, failure = solve(step, state.x, guess)
+        if self.self_contact is None:
+            x, failure = self._minimise(step, guess)
+        else:
+            x, failure = self._minimise_with_contacts(self.self_contact, step, state.x, guess)
         failure = first_failure(state.failure, failure)
         if self.spectral_radius is None:
             v, forces = step.rate * (x - step.x_anchor), ()
@@ -189,9 +193,8 @@ class ImplicitCloth(eqx.Module):
         angles_before = unwrapped(bends.angles(state.x_before), angles)
         strain, strain_before = (mesh.samples.strains(x) for x in (state.x, state.x_before))
         strain_anchor = _anchor(strain, strain_before)
-        membrane = membrane_on_samples(
-            mesh.samples, fabric.membrane, fabric.bending, _extrapolated(strain, strain_before)
-        )
+        ahead = _extrapolated(strain, strain_before)
+        membrane = membrane_on_samples(mesh.samples, fabric.membrane, fabric.bending, ahead)
         bent = bends.curvatures(_extrapolated(angles, angles_before))
         return IncrementalPotential(
             mesh=mesh,
@@ -216,39 +219,38 @@ class ImplicitCloth(eqx.Module):
             elimination=self.elimination,
         )
 
-    def _minimise(self, step: IncrementalPotential, before: Positions, guess: Positions):
-        del before
+    def _minimise(self, step: IncrementalPotential, guess: Positions):
         usual = 1e-11 if guess.dtype == jnp.float64 else loss_tolerance(self.dt)
         tolerance = usual if self.tolerance is None else self.tolerance
         return minimise(step, guess, self.scene.is_free, tolerance, self.max_iterations)
 
     def _minimise_with_contacts(
-        self, step: IncrementalPotential, before: Positions, guess: Positions
+        self, search: SelfContact, step: IncrementalPotential, before: Positions, guess: Positions
     ):
         """The end of a step from `before` in which the sheet does not pass through itself.
 
         The step is solved, with the contacts known so far, until its motion lacks none.
         """
-        search, mesh, fabric = self.self_contact, self.scene.mesh, step.fabric
-        assert search is not None
+        mesh, fabric = self.scene.mesh, step.fabric
+
+        def unless(fine):
+            return jnp.where(fine, Result.SUCCESS.value, Result.SELF_CONTACT.value).astype(int)
 
         def attempt(state):
             x, contacts, _, failure = state
-            x, newton = self._minimise(dataclasses.replace(step, contacts=contacts), before, x)
+            x, newton = self._minimise(dataclasses.replace(step, contacts=contacts), x)
             contacts, is_free, fits = colliding(search, mesh, fabric.thickness, before, x, contacts)
-            full = jnp.where(fits, Result.SUCCESS.value, Result.SELF_CONTACT.value)
-            return x, contacts, is_free, first_failure(first_failure(failure, newton), full)
+            failure = first_failure(first_failure(failure, newton), unless(fits))
+            return x, contacts, is_free, failure
 
         def body(state, _):
             is_done = state[2] | (state[3] != Result.SUCCESS.value)
             return jax.lax.cond(is_done, lambda: state, lambda: attempt(state)), None
 
         contacts, fits = touching(search, mesh, fabric.thickness, fabric.friction, before)
-        failure = jnp.where(fits, Result.SUCCESS.value, Result.SELF_CONTACT.value).astype(int)
-        begin = guess, contacts, jnp.zeros((), bool), failure
+        begin = guess, contacts, jnp.zeros((), bool), unless(fits)
         (x, _, is_free, failure), _ = jax.lax.scan(body, begin, length=MAX_ATTEMPTS)
-        unresolved = jnp.where(is_free, Result.SUCCESS.value, Result.SELF_CONTACT.value)
-        failure = first_failure(failure, unresolved)
+        failure = first_failure(failure, unless(is_free))
         return jnp.where(failure == Result.SUCCESS.value, x, jnp.nan), failure
 
 

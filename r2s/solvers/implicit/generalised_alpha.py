@@ -59,7 +59,8 @@ def by_generalised_alpha(
     mass, force, beta, gamma = coefficients(spectral_radius)
     rate = jnp.asarray(gamma / (beta * dt), float)
     inertia = (1 - mass) / ((1 - force) * beta * dt**2)
-    lags = _lags(dt, beta, gamma)
+    # of the anchor behind the start: in velocity [s], and in acceleration [s^2]
+    lags = dt * (beta / gamma - 1), dt**2 * (beta / gamma - 0.5)
     x_anchor = state.x - lags[0] * state.v - lags[1] * state.a
     kept = (1 - mass) * (1 / (2 * beta) - 1) - mass
     pulled = (1 - mass) / (beta * dt) * state.v + kept * state.a + force * state.pull
@@ -97,11 +98,6 @@ def rates_after(
     contact = table_forces(step, x) / vertex_masses(step.mesh, step.fabric.density)[:, None]
     balanced = (1 - mass) * a + mass * state.a
     return v, a, (balanced - force * state.pull - contact) / (1 - force)
-
-
-def _lags(dt: Float[Array, ""], beta: float, gamma: float) -> tuple[Array, Array]:
-    """Of the anchor behind the start: in velocity [s], and in acceleration [s^2]."""
-    return dt * (beta / gamma - 1), dt**2 * (beta / gamma - 0.5)
 
 
 def _anchor(function: Callable, state: Any, lags: tuple[Array, Array]) -> Array:

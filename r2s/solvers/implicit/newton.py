@@ -10,8 +10,6 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
 from r2s.materials.wrinkling import no_wrinkles
-from r2s.solvers.implicit.linear.pattern import raise_diagonal
-from r2s.solvers.implicit.linear.system import System, apply_inverse, prepare
 from r2s.solvers.implicit.potential import (
     IncrementalPotential,
     far_couplings,
@@ -20,6 +18,7 @@ from r2s.solvers.implicit.potential import (
     potential,
     residual,
 )
+from r2s.solvers.implicit.system import System, apply_inverse, prepare, raise_diagonal
 from r2s.solvers.results import Result
 
 Positions = Float[Array, "vertex 3"]
@@ -53,7 +52,7 @@ class _Line(NamedTuple):
 class _Search(NamedTuple):
     at: _Point
     line: _Line  # from there
-    goes_on: Bool[Array, ""]  # whether it is still looked along this line
+    searching: Bool[Array, ""]  # whether the line search has not ended
     moved: Float[Array, ""]  # the last change, [m]
     system: System
     is_stale: Bool[Array, ""]  # whether the next step needs new factors
@@ -86,25 +85,29 @@ def minimise(
 
 
 def _newton(max_iterations, tolerance, step, start, free):
-    # one loop over the places that are looked at: each function is in the program once
-
+    # one loop over all trial points: each function is in the program once
     def look(state: _Search) -> _Search:
-        state = jax.lax.cond(state.goes_on, lambda: state, lambda: _turned(step, free, state))
+        state = jax.lax.cond(state.searching, lambda: state, lambda: _turned(step, free, state))
         near = state.at.wrinkles
         point = _look(step, free, state.at.x + state.line.trial * state.line.direction, near)
-        line, goes_on = _judged(state.at, state.line, point)
-        return _moved(state, line, goes_on)
+        line, searching = _judged(state.at, state.line, point)
+        return _moved(state, line, searching)
 
     def unfinished(state: _Search):
         # a raised diagonal shortens steps: what is short with one may be far from the minimum
         is_raised = state.shift > FIRST_SHIFT * jnp.finfo(state.shift.dtype).eps
         more = ((state.moved > tolerance) | is_raised) & (state.count < max_iterations)
         more &= jnp.isfinite(state.at.value) & ~jnp.isnan(state.moved)
-        return state.goes_on | more
+        return state.searching | more
 
-    found = jax.lax.while_loop(unfinished, look, _begin(step, start, free))
-    code = _failure(found, tolerance)
-    return jnp.where(code == Result.SUCCESS.value, found.at.x, jnp.nan), code.astype(start.dtype)
+    end = jax.lax.while_loop(unfinished, look, _begin(step, start, free))
+    # a NaN compares false, so that it never counts as convergence
+    reason = jnp.where(jnp.isnan(end.moved), Result.LINEAR_SOLVE.value, Result.NEWTON.value)
+    is_finite = jnp.isfinite(end.at.value)
+    reason = jnp.where(is_finite, reason, Result.NON_FINITE.value)
+    converged = (end.moved <= tolerance) & is_finite
+    code = jnp.where(converged, Result.SUCCESS.value, reason)
+    return jnp.where(converged, end.at.x, jnp.nan), code.astype(start.dtype)
 
 
 def _begin(step, start, free) -> _Search:
@@ -118,7 +121,7 @@ def _begin(step, start, free) -> _Search:
     return _Search(
         at=at,
         line=_Line(jnp.zeros_like(start), zero, infinite, yes, zero + 1, zero, at),
-        goes_on=yes,
+        searching=yes,
         moved=infinite,
         system=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes),
         is_stale=yes,
@@ -132,7 +135,7 @@ def _begin(step, start, free) -> _Search:
 def _look(step, free, x: Positions, near: Any) -> _Point:
     wrinkles = find_wrinkles(step, x, near)
     value, force = jax.value_and_grad(potential, argnums=1)(step, x, wrinkles)
-    return _Point(x, value, _masked(force, free), wrinkles)
+    return _Point(x, value, jnp.where(free[:, None], force, 0), wrinkles)
 
 
 def _turned(step, free, state: _Search) -> _Search:
@@ -151,20 +154,18 @@ def _turned(step, free, state: _Search) -> _Search:
     usable = slope <= 0  # an indefinite Hessian has NaN for factors
     full = jnp.max(jnp.abs(direction))
     one = jnp.ones((), direction.dtype)
-    direction = jnp.where(usable, direction, 0)
-    line = _Line(direction, slope, full, usable, one, 0 * one, state.at)
-    return state._replace(system=system, line=line, goes_on=jnp.ones((), bool))
+    line = _Line(jnp.where(usable, direction, 0), slope, full, usable, one, 0 * one, state.at)
+    return state._replace(system=system, line=line, searching=jnp.ones((), bool))
 
 
 def _judged(at: _Point, line: _Line, point: _Point) -> tuple[_Line, Bool[Array, ""]]:
-    """A line search after it looked at a point, and whether it goes on.
+    """A line search after a trial point, and whether it has not ended.
 
     It takes the first of 1, 1/2, 1/4, ... that lowers the potential enough (Armijo) and ends short
-    of where it would rise as steeply as it fell. The gain of the last Newton steps is hidden by the
-    noise of a sum of many energies: there it is enough that the slope is half of what it was (as
-    Hager and Zhang 2005 do). If that is 1, it takes the last of 1, 2, 4, ... up to which the
-    potential falls steeply: away from a shape that is about to buckle the convex stand-in is far
-    too cautious.
+    of where it would rise as steeply as it fell. Where rounding hides the gain it is enough that
+    the slope is half of what it was (Hager and Zhang 2005). If that is 1, it takes the last of 1,
+    2, 4, ... up to which the potential falls steeply: away from a shape that is about to buckle the
+    convex stand-in is far too cautious.
     """
     last_place = jnp.finfo(point.value.dtype).eps * jnp.abs(at.value)
     ahead = jnp.sum(line.direction * point.force)
@@ -180,17 +181,17 @@ def _judged(at: _Point, line: _Line, point: _Point) -> tuple[_Line, Bool[Array, 
         length=jnp.where(is_fine, line.trial, line.length),
         best=jax.tree.map(partial(jnp.where, is_fine), point, line.best),
     )
-    return line, (grows | shrinks) & line.usable  # without a direction there is nothing to find
+    return line, (grows | shrinks) & line.usable
 
 
-def _moved(state: _Search, line: _Line, goes_on: Bool[Array, ""]) -> _Search:
-    """The search after a look: at the end of its line once that is found."""
+def _moved(state: _Search, line: _Line, searching: Bool[Array, ""]) -> _Search:
+    """The search after a trial point: at the end of its line once that is known."""
     usable, is_first = line.usable, state.count < 0
     # a search that found nothing has not arrived
     moved = jnp.where(line.length > 0, line.length * line.full, line.full)
     # where even the convex stand-in gives no direction it is NaN, and the loop ends
-    is_lost = (state.blend == 0) & (state.shift > LAST_SHIFT)
-    moved = jnp.where(usable, moved, jnp.where(is_lost, line.full, state.moved))
+    is_indefinite = (state.blend == 0) & (state.shift > LAST_SHIFT)
+    moved = jnp.where(usable, moved, jnp.where(is_indefinite, line.full, state.moved))
     is_slow = (moved > SLOW * state.moved) & (state.count >= CONVEX_ITERATIONS)
     blend = jnp.where(is_slow, (state.blend + state.limit) / 2, state.blend)
     # where the Hessian is indefinite: half of the exact one, or none; the stand-in is only rounded
@@ -206,18 +207,9 @@ def _moved(state: _Search, line: _Line, goes_on: Bool[Array, ""]) -> _Search:
         count=state.count + 1,
     )
     # the factors stay where they are: a choice between them would copy them
-    new, old = (each._replace(system=None, line=None) for each in (arrived, state))
-    chosen = jax.tree.map(lambda a, b: jnp.where(goes_on, b, a), new, old)
-    return chosen._replace(system=state.system, line=line, goes_on=goes_on)
-
-
-def _failure(found: _Search, tolerance: Float[Array, ""]) -> Int[Array, ""]:
-    """Why a search failed; a NaN compares false, so that it never counts as convergence."""
-    reason = jnp.where(jnp.isnan(found.moved), Result.LINEAR_SOLVE.value, Result.NEWTON.value)
-    is_finite = jnp.isfinite(found.at.value)
-    reason = jnp.where(is_finite, reason, Result.NON_FINITE.value)
-    converged = (found.moved <= tolerance) & is_finite
-    return jnp.where(converged, Result.SUCCESS.value, reason)
+    new, old = (search._replace(system=None, line=None) for search in (arrived, state))
+    chosen = jax.tree.map(lambda a, b: jnp.where(searching, b, a), new, old)
+    return chosen._replace(system=state.system, line=line, searching=searching)
 
 
 def _next_shift(state: _Search, usable: Array) -> Array:
@@ -247,15 +239,15 @@ def _minimise_jvp(primals, tangents):
     held_dot = jnp.zeros_like(x) if start_dot is None else jnp.where(free[:, None], 0, start_dot)
     _, force_dot = eqx.filter_jvp(residual, (step, x), (step_dot, held_dot))
     # linear in the right-hand side, so that it batches and transposes with the same factors
-    system = _one_by_one(_exact_system)(step, x, free)
-    right = _masked(force_dot, free)
+
+    def exact(step, x, free):
+        # where a shape is about to buckle the minimum may be a saddle: not definite
+        return prepare(step.elimination, *_second(step, x), free, is_definite=False)
+
+    system = _one_by_one(exact)(step, x, free)
+    right = jnp.where(free[:, None], force_dot, 0)
     x_dot = held_dot - apply_inverse(step.elimination, system, right, is_definite=False)
     return (x, code), (x_dot, jnp.zeros_like(code))
-
-
-def _exact_system(step, x, free):
-    # where a shape is about to buckle the minimum may be found as a saddle: not definite
-    return prepare(step.elimination, *_second(step, x), free, is_definite=False)
 
 
 def _one_by_one(function):
@@ -281,7 +273,3 @@ def _one_by_one(function):
         return outputs, jax.tree.map(lambda _: True, outputs)
 
     return call
-
-
-def _masked(force: Positions, free: Bool[Array, " vertex"]) -> Positions:
-    return jnp.where(free[:, None], force, 0)

@@ -39,8 +39,7 @@ from r2s.mesh.bends import unwrapped
 from r2s.mesh.mesh import Mesh
 from r2s.mesh.strain_samples import on_samples
 from r2s.solvers.contact.contacts import Contacts, contact_energy, contact_hessians
-from r2s.solvers.implicit.linear.pattern import add_between, add_elements, assemble
-from r2s.solvers.implicit.linear.system import Elimination, Far
+from r2s.solvers.implicit.system import Elimination, Far, add_elements, assemble
 
 Positions = Float[Array, "vertex 3"]
 Blocks = Float[Array, "block 3 3"]
@@ -99,9 +98,9 @@ def potential(step: IncrementalPotential, x: Positions, wrinkles: Any = None) ->
 
 def _others(step: IncrementalPotential, x: Positions) -> Float[Array, ""]:
     """The potential [J] without that of the membrane."""
-    total = jnp.sum(_map(_drag_energy, step, _middles(step, x), *_drag(step)))
+    total = jnp.sum(_map(_drag_energy, step, *_drag(step, x)))
     total += _bending_energy(step, _curvatures(step, x))
-    total += jnp.sum(_map(_vertex_energy, step, x, *_vertices(step)))
+    total += jnp.sum(_map(_vertex_energy, step, *_vertices(step, x)))
     if step.contacts is None:
         return total
     return total + contact_energy(step.contacts, step.fabric.thickness, step.rate, x, step.x_anchor)
@@ -154,19 +153,20 @@ def hessian(
         wrinkles = find_wrinkles(step, x)
     pattern, blend = step.elimination.pattern, jnp.asarray(hessian_blend, x.dtype)
     samples = _membrane_hessians(step, x, blend, wrinkles) + _drag_hessians(step, x)
-    vertices = _map(jax.hessian(_vertex_energy, argnums=1), step, x, *_vertices(step))
+    vertices = _map(jax.hessian(_vertex_energy, argnums=1), step, *_vertices(step, x))
     bending = {step.bending.element: _bending_hessians(step, x)}
     blocks = assemble(pattern, vertices, samples=samples, **bending)
+    bends = pattern.slots[step.bending.bend]
     blocks = jax.lax.cond(
         blend > 0,
-        lambda: add_elements(
-            blocks, pattern.slots[step.bending.bend], blend * _angle_hessians(step, x)
-        ),
+        lambda: add_elements(blocks, bends, blend * _angle_hessians(step, x)),
         lambda: blocks,
     )
     if step.contacts is None or not step.elimination.couples_all:
         return blocks
-    return add_between(pattern, blocks, step.contacts.stencils, _contact_hessians(step, x))
+    stencils = step.contacts.stencils  # between any vertices: the pattern is full
+    slots = stencils[:, :, None] * len(x) + stencils[:, None, :]
+    return add_elements(blocks, slots, _contact_hessians(step, x))
 
 
 def far_couplings(step: IncrementalPotential, x: Positions) -> Far | None:
@@ -186,33 +186,25 @@ def _samples(step: IncrementalPotential, x: Positions, wrinkles: Any = None):
     return law, step.membrane_tangent, strain, step.strain_anchor
 
 
-def _drag(step: IncrementalPotential):
-    return step.mesh.samples.corners, step.area_normals, step.wind
+def _drag(step: IncrementalPotential, x: Positions):
+    corners = step.mesh.samples.corners
+    return x[corners].mean(axis=1), corners, step.area_normals, step.wind
 
 
-def _middles(step: IncrementalPotential, x: Positions) -> Float[Array, "element 3"]:
-    return x[step.mesh.samples.corners].mean(axis=1)
-
-
-def _vertices(step: IncrementalPotential):
-    return step.x_anchor, step.v_anchor, step.mesh.vertex_area, step.friction_limit
+def _vertices(step: IncrementalPotential, x: Positions):
+    return x, step.x_anchor, step.v_anchor, step.mesh.vertex_area, step.friction_limit
 
 
 def _viscous_energy(step, change: Array, stress_change: Array) -> Array:
-    """Dissipation of one element in a step, per area [J/m^2].
-
-    The viscous stress is damping x tangent x rate, with the law's tangent at the anchor, from where
-    the strain has changed.
-    """
+    """Dissipation of one element in a step, per area [J/m^2], by its change since the anchor."""
     return step.fabric.damping * step.rate / 2 * jnp.sum(change * stress_change)
 
 
 def _sample_energy(step, law: MembraneLaw, tangent: Array, strain: Array, anchor: Array) -> Array:
     """Stored energy and dissipation of the membrane, per area [J/m^2]."""
     change = strain - anchor
-    return law.energy_density(strain) + _viscous_energy(
-        step, change, jnp.sum(tangent * change[None], axis=1)
-    )
+    viscous = _viscous_energy(step, change, jnp.sum(tangent * change[None], axis=1))
+    return law.energy_density(strain) + viscous
 
 
 def _drag_energy(step, middle, corners, normal, wind):
@@ -289,7 +281,7 @@ def _membrane_hessians(
     """Second derivatives [N/m] of each element's membrane energy in its corners.
 
     Exact with all of the stress, since the Green strain is quadratic in the corners. Elements are
-    the last axis, so that they are worked on side by side.
+    the last axis, for vectorised loops.
     """
     samples = step.mesh.samples
     law, tangent_before, strain, anchor = _samples(step, x, wrinkles)
@@ -304,11 +296,11 @@ def _membrane_hessians(
     corners = jnp.moveaxis(x[samples.corners], 0, -1)
     corners = corners - corners[:1]  # places in the world would cost precision
     slopes = jnp.moveaxis(samples.gradients, 0, -1)
-    every = [
+    shares = [
         _from_sample(corners, slopes[q], carried[:, :, q], tangent[:, :, :, q])
         for q in range(len(slopes))
     ]
-    return jnp.moveaxis(sum(every[1:], start=every[0]), -1, 0)
+    return jnp.moveaxis(sum(shares[1:], start=shares[0]), -1, 0)
 
 
 def _from_sample(
@@ -317,23 +309,22 @@ def _from_sample(
     stress: Float[Array, "3 element"],
     tangent: Float[Array, "3 3 element"],
 ) -> Float[Array, "corner 3 corner 3 element"]:
-    """The share of one sample of every element, whose stress and tangent hold its area."""
+    """The share of one sample of every element, whose stress and tangent include its area."""
 
     def rates_and_rows(corners, slopes, tangent):
         along, across = slopes[:, :1], slopes[:, 1:]
-        warp, weft = (jnp.sum(each * corners, axis=0)[None] for each in (along, across))
+        warp, weft = (jnp.sum(slope * corners, axis=0)[None] for slope in (along, across))
         rates = along * warp, across * weft, along * weft + across * warp  # of strain, in corners
-        return rates, [
-            sum(tangent[i, j][None, None] * rates[j] for j in range(3)) for i in range(3)
-        ]
+        rows = [sum(tangent[i, j][None, None] * rates[j] for j in range(3)) for i in range(3)]
+        return rates, rows
 
-    total = _carried(slopes, stress)
+    total = _geometric(slopes, stress)
     for rate, row in zip(*once(rates_and_rows, corners, slopes, tangent), strict=True):
         total = total + rate[:, :, None, None] * row[None, None]
     return total
 
 
-def _carried(slopes, stress) -> Float[Array, "corner 3 corner 3 element"]:
+def _geometric(slopes, stress) -> Float[Array, "corner 3 corner 3 element"]:
     """The geometric stiffness of one sample of every element."""
     one, two = slopes[:, None, 0], slopes[:, None, 1]
     other_one, other_two = slopes[None, :, 0], slopes[None, :, 1]
@@ -352,7 +343,7 @@ def _stress_and_tangent(step, law: MembraneLaw, tangent_before: Array, strain: A
 
 def _drag_hessians(step: IncrementalPotential, x: Positions):
     """Second derivatives [N/m] of each element's drag in its corners, equal in all of them."""
-    of_middle = _map(jax.hessian(_drag_energy, argnums=1), step, _middles(step, x), *_drag(step))
+    of_middle = _map(jax.hessian(_drag_energy, argnums=1), step, *_drag(step, x))
     count = step.mesh.samples.corners.shape[1]
     shape = len(of_middle), count, 3, count, 3
     return jnp.broadcast_to(of_middle[:, None, :, None], shape) / count**2

@@ -34,7 +34,6 @@ class Background(eqx.Module):
     - `table`: nodes at or below its height lose downward velocity; None: no table.
     - `gravity`: downward acceleration, [m/s^2].
     - `walls`: number of nodes at each end of an axis that lose outward velocity; 0: no walls.
-    - `sticky`: whether nodes of the table lose all velocity; otherwise Coulomb friction acts.
     - `mass_floor`: mass added to every node, over the mean mass of a particle [-].
     - `forward_mode`: whether JAX derives the transfers itself, so that `jax.jvp` works; the own
       rules, which are the default, have a faster reverse mode.
@@ -44,7 +43,6 @@ class Background(eqx.Module):
     table: Table | None
     gravity: Float[Array, ""]
     walls: int = eqx.field(static=True, default=0)
-    sticky: bool = eqx.field(static=True, default=False)
     mass_floor: float = eqx.field(static=True, default=1e-15)
     forward_mode: bool = eqx.field(static=True, default=False)
 
@@ -55,7 +53,6 @@ class Background(eqx.Module):
         table: Table | None = None,
         gravity: Float[Array, ""] | float = GRAVITY,
         walls: int = 0,
-        sticky: bool = False,
         mass_floor: float = 1e-15,
         forward_mode: bool = False,
     ) -> "Background":
@@ -65,8 +62,7 @@ class Background(eqx.Module):
                 f"walls must be from 0 to less than half of {min(grid.shape)} nodes and the mass "
                 f"floor >= 0, got {walls} and {mass_floor}"
             )
-        downwards = jnp.asarray(gravity, float)
-        return cls(grid, table, downwards, walls, sticky, mass_floor, forward_mode)
+        return cls(grid, table, jnp.asarray(gravity, float), walls, mass_floor, forward_mode)
 
     def advance(
         self,
@@ -78,9 +74,8 @@ class Background(eqx.Module):
         affine: Matrices,
         pinned: Pinned | None = None,
     ) -> tuple[Vectors, Matrices]:
-        """Velocities [m/s] and affine velocity matrices [1/s] of particles after a step.
+        """Velocities [m/s] and affine velocity matrices [1/s] of particles after a step `dt` [s].
 
-        - `dt`: step, [s].
         - `friction`: Coulomb coefficient against the table, [-].
         - `x`, `mass`: positions [m] and masses [kg] at the start of the step.
         - `momentum`, `affine`: momenta [kg m/s] and affine momenta [kg/s], with what forces and
@@ -93,16 +88,14 @@ class Background(eqx.Module):
             slopes = jnp.concatenate([affine, still], axis=1)
             nodes = self._to_nodes(x, values, slopes)
         floor = self.mass_floor * jnp.mean(mass)
-        gripped = pinned is not None and pinned.x.shape[0]
-        if not gripped and 3 ** x.shape[1] * x.shape[0] < nodes.shape[0]:
-            velocity = partial(self._velocity, dt, friction, floor, None)
+        grip = None if pinned is None or not pinned.x.shape[0] else pinned
+        velocity = partial(self._velocity, dt, friction, floor, grip)
+        if grip is None and 3 ** x.shape[1] * x.shape[0] < nodes.shape[0]:
             v, moment = g2p_through(self.grid, x, nodes, velocity, self.forward_mode)
             return v, affine_factor(self.grid) * moment
         with jax.named_scope("grid"):
             columns = jnp.split(nodes, nodes.shape[1], axis=1)
-            own = pinned if gripped else None
-            v = self._velocity(dt, friction, floor, own, columns, self._index())
-            v = jnp.concatenate(v, axis=1)
+            v = jnp.concatenate(velocity(columns, self._index()), axis=1)
         with jax.named_scope("grid_to_particles"):
             get = g2p_plain if self.forward_mode else g2p
             v, moment = get(self.grid, x, v)
@@ -119,7 +112,7 @@ class Background(eqx.Module):
     ) -> Columns:
         """Velocities [m/s] of nodes from their momenta [kg m/s] and masses [kg], by axes."""
         *momentum, mass = nodes
-        v = [quotient(each, mass + floor) for each in momentum]
+        v = [quotient(part, mass + floor) for part in momentum]
         v[-1] = v[-1] - dt * self.gravity
         if pinned is not None:
             v = self._gripped(v, mass, floor, pinned)
@@ -130,11 +123,9 @@ class Background(eqx.Module):
 
     def _index(self) -> list[Array]:
         """Of each axis, the indices of all nodes, each (node, 1)."""
-        shape = self.grid.shape
-        return [
-            jax.lax.broadcasted_iota(jnp.asarray(0).dtype, shape, axis).reshape(-1, 1)
-            for axis in range(len(shape))
-        ]
+        shape, kind = self.grid.shape, jnp.asarray(0).dtype
+        axes = range(len(shape))
+        return [jax.lax.broadcasted_iota(kind, shape, axis).reshape(-1, 1) for axis in axes]
 
     def _gripped(self, v: Columns, mass: Array, floor: Array, pinned: Pinned) -> Columns:
         """Velocities that blend into the grippers' where up to `GRIPPED` of the mass is held.
@@ -147,7 +138,7 @@ class Background(eqx.Module):
         nodes = self._to_nodes(pinned.x, values, flat)
         *carried, weight = jnp.split(nodes, nodes.shape[1], axis=1)
         share = jnp.minimum(quotient(weight, mass + floor) / GRIPPED, 1)
-        grip = [quotient(each, weight + floor) for each in carried]
+        grip = [quotient(part, weight + floor) for part in carried]
         return [u + share * (g - u) for u, g in zip(v, grip, strict=True)]
 
     def _on_table(self, v: Columns, friction: Float[Array, ""], index: Array) -> Columns:
@@ -160,12 +151,10 @@ class Background(eqx.Module):
         height = self.grid.lower[-1] + self.grid.spacing * index.astype(v[-1].dtype)
         below = height <= self.table.height + 1e-6 * self.grid.spacing
         *along, normal = v
-        if self.sticky:
-            return [jnp.where(below, 0, each) for each in v]
         impulse = jnp.maximum(-normal, 0)
-        speed = jnp.sqrt(sum(each**2 for each in along) + SLIP_SPEED**2)
+        speed = jnp.sqrt(sum(part**2 for part in along) + SLIP_SPEED**2)
         kept = jnp.maximum(1 - friction * impulse / speed, 0)
-        slid = [jnp.where(below, kept * each, each) for each in along]
+        slid = [jnp.where(below, kept * part, part) for part in along]
         return [*slid, jnp.where(below, jnp.maximum(normal, 0), normal)]
 
     def _walled(self, v: Columns, index: list[Array]) -> Columns:
@@ -173,8 +162,8 @@ class Background(eqx.Module):
         if not self.walls:
             return v
         columns = []
-        for each, place, count in zip(v, index, self.grid.shape, strict=True):
-            low = jnp.where(place < self.walls, jnp.maximum(each, 0), each)
+        for part, place, count in zip(v, index, self.grid.shape, strict=True):
+            low = jnp.where(place < self.walls, jnp.maximum(part, 0), part)
             columns.append(jnp.where(place > count - self.walls, jnp.minimum(low, 0), low))
         return columns
 

@@ -1,8 +1,7 @@
 """A solid body of particles, in 2-D or 3-D, by the material point method.
 
 MLS-MPM (Hu et al. 2018) with APIC, explicit in time (symplectic Euler), as in DiffTaichi and
-DiffCP. A thin sheet of particles stretches, shears and bends as an isotropic solid of its
-thickness does.
+DiffCP.
 """
 
 import equinox as eqx
@@ -13,7 +12,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from r2s.environment.scene import Control
 from r2s.materials.solid import Solid, product
-from r2s.mesh.mesh import Mesh
 from r2s.solvers.explicit.stability import check_step, longest_step
 from r2s.solvers.mpm.background import Background, Pinned
 from r2s.solvers.mpm.grid import failure_of_step
@@ -153,29 +151,3 @@ def stable_step(background: Background, solid: Solid) -> Float[Array, ""]:
     grid = background.grid
     square = 4 * solid.law.modulus(len(grid.shape)) / (solid.density * grid.spacing**2)
     return longest_step([(square, solid.damping)])
-
-
-def layered(
-    mesh: Mesh, x: Float[Array, "vertex 3"], thickness: float, layers: int = 3
-) -> tuple[Points, Float[Array, " particle"]]:
-    """Positions [m] and volumes [m^3] of particles that fill a sheet in layers.
-
-    - `x`: positions of the mesh's vertices, [m]; they are the middle layer, which comes first.
-    - `thickness`: thickness of the solid, [m].
-    - `layers`: number of layers across the thickness.
-
-    Raises `ValueError` when the thickness is not positive or the number of layers is not odd.
-    """
-    if not thickness > 0 or layers < 1 or layers % 2 == 0:
-        raise ValueError(
-            "a sheet needs a thickness > 0 m and an odd number of layers, got "
-            f"{thickness} and {layers}"
-        )
-    corners = x[mesh.faces]
-    faces = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = jnp.zeros_like(x).at[mesh.faces].add(faces[:, None])
-    normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
-    places = (np.arange(layers) - layers // 2) / layers * thickness
-    places = places[np.argsort(np.abs(places), kind="stable")]
-    particles = jnp.concatenate([x + float(place) * normals for place in places])
-    return particles, jnp.tile(mesh.vertex_area * (thickness / layers), layers)

@@ -62,12 +62,10 @@ class Grid(eqx.Module):
     @property
     def axes(self) -> tuple[Float[Array, " ..."], ...]:
         """The coordinates of the nodes [m] along each axis, ready to be broadcast to `shape`."""
-        dimension = len(self.shape)
+        indices = jnp.ogrid[tuple(slice(count) for count in self.shape)]
         return tuple(
-            (self.lower[i] + self.spacing * jnp.arange(count).astype(float)).reshape(
-                [-1 if i == k else 1 for k in range(dimension)]
-            )
-            for i, count in enumerate(self.shape)
+            low + self.spacing * index.astype(float)
+            for low, index in zip(self.lower, indices, strict=True)
         )
 
     def inside(self, x: Float[Array, "particle axis"]) -> Bool[Array, " particle"]:

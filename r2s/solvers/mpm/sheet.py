@@ -1,10 +1,9 @@
 """A sheet of fabric by the material point method: a mesh whose vertices are the particles.
 
 After Jiang, Gast and Teran 2017, whom DiffCP (Zheng et al. 2024) follows. The laws of membrane and
-bending, the mesh and the `Fabric` are those of `r2s.ImplicitCloth`. The forces on the vertices go
-through the grid; across the sheet the grid's velocity gradient drives compression and shear between
-layers (`transverse`). So contact of the sheet with itself, with the table and with walls comes
-from the grid, and keeps layers about a spacing apart. The steps are explicit in time.
+bending, the mesh and the `Fabric` are those of `r2s.ImplicitCloth`. Contact of the sheet with
+itself, with the table and with walls comes from the grid: across the sheet its velocity gradient
+drives compression and shear between layers (`Transverse`), which stay about a spacing apart.
 """
 
 from typing import Literal
@@ -19,22 +18,25 @@ from r2s._util.units import Scalar, positive
 from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric, check_fabric
 from r2s.mesh.mesh import Mesh
-from r2s.solvers.arguments import check_step_arguments
-from r2s.solvers.explicit.elements import bending_frequency, membrane_frequency
-from r2s.solvers.explicit.sheet import Cells, ForceInputs, Memory, cells_of, no_memory, sheet_force
-from r2s.solvers.explicit.stability import RELAXATION, Viscosity, check_step, longest_relaxing_step
+from r2s.solvers.explicit.grid import sheet_force
+from r2s.solvers.explicit.sheet import Cells, ForceInputs, Memory, cells_of, no_memory
+from r2s.solvers.explicit.stability import RELAXATION, check_step, longest_sheet_step
 from r2s.solvers.mpm.background import Background
 from r2s.solvers.mpm.grid import Grid, failure_of_step
 from r2s.solvers.mpm.transfer import affine_factor
-from r2s.solvers.results import first_failure, no_failure
+from r2s.solvers.results import check_step_arguments, first_failure, no_failure
 
 Vector = Float[Array, " 3"]
+Vertices = Float[Array, "vertex 3"]
 
+COARSEST = 1.8  # longest edge of a mesh over the grid's spacing, so that layers cannot pass
+ONSET = 0.5  # [-]: layers press when they are about a spacing apart
+CONTACT = 20.0  # [N/m]: some cm of a fabric's weight press layers together by a tenth
 SMOOTHING = 1e-6  # [-]: added to the tilt's norm, which is then differentiable at no tilt
 
 
 class Transverse(eqx.Module):
-    """The stiffnesses of contact between layers.
+    """The stiffnesses of contact between layers (docs/theory.md).
 
     - `compression`, `shear`: K and G, force per width, [N/m].
     - `onset`: c, [-].
@@ -48,9 +50,8 @@ class Transverse(eqx.Module):
         """Energy per area [J/m^2] of a triangle [m] and its transverse direction [-]."""
         along = direction @ unit_normal(corners)
         tilt = direction @ direction - along**2
-        return (
-            self.compression / 3 * jnp.maximum(self.onset - along, 0) ** 3 + self.shear / 2 * tilt
-        )
+        pressed = self.compression / 3 * jnp.maximum(self.onset - along, 0) ** 3
+        return pressed + self.shear / 2 * tilt
 
     def return_mapping(
         self, corners: Float[Array, "3 3"], direction: Vector, friction: Float[Array, ""]
@@ -68,9 +69,7 @@ class Transverse(eqx.Module):
         self, corners: Float[Array, "3 3"], direction: Vector
     ) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
         """Forces on the corners per rest area [Pa], and the Kirchhoff stress times the thickness
-        [N/m], which goes to the grid.
-
-        Together they exert no torque, since rotations do not change the energy.
+        [N/m] for the grid. Together they exert no torque.
         """
         in_corners, in_direction = jax.grad(self.energy, argnums=(0, 1))(corners, direction)
         return -in_corners, in_direction[:, None] * direction[None]
@@ -87,13 +86,6 @@ def unit_normal(corners: Float[Array, "3 3"]) -> Vector:
     """The unit normal of a triangle [-]."""
     normal = jnp.cross(corners[1] - corners[0], corners[2] - corners[0])
     return normal / jnp.sqrt(normal @ normal)
-
-
-Vertices = Float[Array, "vertex 3"]
-
-COARSEST = 1.8  # longest edge of a mesh over the grid's spacing, so that layers cannot pass
-ONSET = 0.5  # [-]: layers press when they are about a spacing apart
-CONTACT = 20.0  # [N/m]: some cm of a fabric's weight press layers together by a tenth
 
 
 class MPMState(eqx.Module):
@@ -162,8 +154,9 @@ class MPMCloth(eqx.Module):
         if background is None:
             if grid is None:
                 raise ValueError("expected a grid, or a background")
-            around = scene.table, scene.gravity
-            background = Background.make(grid, *around, forward_mode=forward_mode)
+            background = Background.make(
+                grid, scene.table, scene.gravity, forward_mode=forward_mode
+            )
         self.background, grid = background, background.grid
         edge = longest_edge(scene.mesh)
         if edge > COARSEST * grid.spacing:
@@ -183,8 +176,7 @@ class MPMCloth(eqx.Module):
         check_fabric(fabric)
         mesh, spacing = self.scene.mesh, self.background.grid.spacing
         with jax.ensure_compile_time_eval():
-            times = self.membrane_damping, self.relaxation
-            longest = stable_step(mesh, spacing, fabric, *times)
+            longest = stable_step(mesh, spacing, fabric, self.membrane_damping, self.relaxation)
         check_step(self.dt, longest, "the fabric, the mesh and the grid")
 
     def fits(self, fabric: Fabric) -> Bool[Array, ""]:
@@ -223,7 +215,8 @@ class MPMCloth(eqx.Module):
         mass = fabric.density * mesh.vertex_area
         d = self._transverse_directions(fabric, state)
         force, stress = self._transverse_forces(state.x, d)
-        of_sheet, memory = self._sheet_forces(fabric, state, control)
+        inputs = ForceInputs.make(self, fabric, state, control.wind, state.memory, dt)
+        of_sheet, memory = sheet_force(mesh, self.cells, inputs)
         force += of_sheet
         momentum = mass[:, None] * (1 - dt * fabric.mass_damping) * state.v + dt * force
         carried = (control.pinned - state.x[pinned]) / dt
@@ -262,18 +255,6 @@ class MPMCloth(eqx.Module):
         force = jnp.zeros_like(x).at[mesh.faces].add(mesh.area[:, None, None] * forces)
         return force, stress
 
-    def _sheet_forces(
-        self, fabric: Fabric, state: MPMState, control: Control
-    ) -> tuple[Vertices, Memory]:
-        """Forces [N] of membrane, bending and air on the vertices, and the samples' memory."""
-        scene, x, v = self.scene, state.x, state.v
-        damping = fabric.damping if self.membrane_damping is None else self.membrane_damping
-        viscosity = Viscosity.make(damping, self.relaxation, jnp.asarray(self.dt, x.dtype))
-        around = viscosity, scene.air, scene.fan
-        wind = jnp.zeros(3, x.dtype) if control.wind is None else control.wind
-        inputs = ForceInputs(fabric, *around, x, v, wind, state.memory)
-        return sheet_force(scene.mesh, self.cells, inputs)
-
 
 @eqx.filter_jit
 def stable_step(
@@ -291,11 +272,8 @@ def stable_step(
     The squares of the highest frequencies of membrane, bending and layers have bounds that add.
     The grid only lowers the frequencies of the mesh.
     """
-    damping = fabric.damping if membrane_damping is None else jnp.asarray(membrane_damping, float)
-    layers = between_layers().frequency(fabric.density, spacing)
-    others = [(bending_frequency(mesh, fabric), fabric.damping), (layers, jnp.zeros((), float))]
-    membrane, relaxing = membrane_frequency(mesh, fabric), jnp.asarray(relaxation, float)
-    return longest_relaxing_step(membrane, damping, relaxing, others)
+    layers = between_layers().frequency(fabric.density, spacing), jnp.zeros((), float)
+    return longest_sheet_step(mesh, fabric, membrane_damping, relaxation, [layers])
 
 
 def between_layers() -> Transverse:

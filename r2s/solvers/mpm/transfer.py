@@ -10,15 +10,15 @@ affine velocity matrix C of APIC is 4 / spacing^2 times the moment (Jiang, Schro
 and Stomakhin 2015; Hu et al., "A moving least squares material point method", 2018).
 
 Both work axis by axis (the weights are products over the axes), and with one row of nodes at a
-time: 27 additions of (particle, channel) into the grid, which XLA makes in place, are faster on the
-CPU than one addition of all windows, sorted particles, or sums over cells. Both have a rule of
-their own for the reverse mode, which gathers once for all that it needs: half the time of JAX's in
-3-D. `g2p_plain` and `p2g_plain` have none, so that they can be differentiated forward.
+time: 27 additions of (particle, channel) into the grid, which XLA makes in place, are fastest on
+the CPU. Both have a rule of their own for the reverse mode: half the time of JAX's in 3-D.
+`g2p_plain` and `p2g_plain` have none, so that they can be differentiated forward.
 """
 
 import itertools
 import math
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -92,10 +92,6 @@ def _around(grid: Grid, first: Int[Array, " particle"], nodes: Nodes) -> Columns
     return _around_plain(grid, first, nodes)
 
 
-def _around_forward(grid, first, nodes):
-    return _around_plain(grid, first, nodes), (grid, first)
-
-
 def _around_reverse(saved, columns):
     grid, first = saved
     offsets = _offsets(grid)
@@ -107,17 +103,11 @@ def _around_reverse(saved, columns):
 
 
 def _pairing_slope(grid: Grid, x: Points, values: Values, slopes: Slopes, nodes: Nodes) -> Points:
-    """The derivative in x of sum_ip w_ip (value_p + slope_p d_ip) . node_i.
-
-    The derivative of that sum in the nodes is `p2g`, in values and slopes `g2p`; this is the third
-    that their reverse rules need.
-    """
+    """The derivative in x of sum_ip w_ip (value_p + slope_p d_ip) . node_i."""
     stencil = _Stencil(grid, x)
     rows = stencil.rows(nodes)
-    affine = _affine_axis(*stencil.affine(values, slopes))
-    products = [
-        jnp.sum(a * row, axis=1, keepdims=True) for a, row in zip(affine, rows, strict=True)
-    ]
+    pairs = zip(_affine_axis(*stencil.affine(values, slopes)), rows, strict=True)
+    products = [jnp.sum(affine * row, axis=1, keepdims=True) for affine, row in pairs]
     _, *gradients = _slope_axis(stencil.weights, stencil.rates, products)
     value, *_ = _g2p_axis(stencil.weights, rows)
     return jnp.concatenate(gradients, axis=1) - jnp.sum(value[:, :, None] * slopes, axis=1)
@@ -126,18 +116,18 @@ def _pairing_slope(grid: Grid, x: Points, values: Values, slopes: Slopes, nodes:
 @jax.custom_vjp
 def p2g(grid: Grid, x: Points, values: Values, slopes: Slopes) -> Nodes:
     """`p2g_plain` with a faster reverse mode and no forward mode; constant in the grid."""
-    return _p2g_forward(grid, x, values, slopes)[0]
+    return _forward(p2g_plain, grid, x, values, slopes)[0]
 
 
 @jax.custom_vjp
 def g2p(grid: Grid, x: Points, nodes: Nodes) -> tuple[Values, Slopes]:
     """`g2p_plain` with a faster reverse mode and no forward mode; constant in the grid."""
-    return _g2p_forward(grid, x, nodes)[0]
+    return _forward(g2p_plain, grid, x, nodes)[0]
 
 
-def _p2g_forward(grid, x, values, slopes):
-    inputs = _kept((x, values, slopes))
-    return _kept(p2g_plain(grid, *inputs)), (grid, *inputs)
+def _forward(plain, grid, *inputs):
+    inputs = _kept(inputs)
+    return _kept(plain(grid, *inputs)), (grid, *inputs)
 
 
 def _p2g_reverse(saved, nodes):
@@ -145,11 +135,6 @@ def _p2g_reverse(saved, nodes):
     nodes = _kept(nodes)
     slope = _pairing_slope(grid, x, values, slopes, nodes)
     return _no_slope(grid), *_kept((slope, *g2p_plain(grid, x, nodes)))
-
-
-def _g2p_forward(grid, x, nodes):
-    inputs = _kept((x, nodes))
-    return _kept(g2p_plain(grid, *inputs)), (grid, *inputs)
 
 
 def _g2p_reverse(saved, parts):
@@ -160,8 +145,7 @@ def _g2p_reverse(saved, parts):
 
 
 def _kept(values):
-    """Values that XLA computes once and stores; it would compute them anew for each of the
-    transfers' many uses."""
+    """Values that XLA computes once and stores, and not anew for each of their many uses."""
     return jax.lax.optimization_barrier(values)
 
 
@@ -169,9 +153,9 @@ def _no_slope(grid: Grid) -> Grid:
     return jax.tree.map(jnp.zeros_like, grid)
 
 
-_around.defvjp(_around_forward, _around_reverse)
-p2g.defvjp(_p2g_forward, _p2g_reverse)
-g2p.defvjp(_g2p_forward, _g2p_reverse)
+_around.defvjp(lambda *inputs: (_around_plain(*inputs), inputs[:2]), _around_reverse)
+p2g.defvjp(partial(_forward, p2g_plain), _p2g_reverse)
+g2p.defvjp(partial(_forward, g2p_plain), _g2p_reverse)
 
 
 class _Stencil:
@@ -191,8 +175,7 @@ class _Stencil:
         strides = jnp.asarray(_strides(grid), int)[None]
         self.first = jnp.sum(first * strides, axis=1)
         self.corner = list(first.T)
-        self.away = place * grid.spacing
-        self.spacing = grid.spacing
+        self.away, self.spacing = place * grid.spacing, grid.spacing
         axes = range(x.shape[1])
         splines = (1.5 - place) ** 2 / 2, 0.75 - (place - 1) ** 2, (place - 0.5) ** 2 / 2
         slopes = place - 1.5, 2 - 2 * place, place - 0.5
@@ -202,16 +185,14 @@ class _Stencil:
 
     def rows(self, nodes: Nodes) -> list[Values]:
         """The field at each of the nodes."""
-        wheres = [self.first + offset for offset in self._offsets]
-        return [nodes.at[where].get(mode="promise_in_bounds") for where in wheres]
+        places = [self.first + offset for offset in self._offsets]
+        return [nodes.at[place].get(mode="promise_in_bounds") for place in places]
 
     def index(self) -> list[Int[Array, "1 node"]]:
         """Of each axis, the indices of all rows one after another."""
-        steps = np.array(list(itertools.product(range(3), repeat=len(self.corner))))
-        return [
-            (jnp.asarray(steps[:, i, None], int) + corner[None]).reshape(1, -1)
-            for i, corner in enumerate(self.corner)
-        ]
+        steps = np.array(list(itertools.product(range(3), repeat=len(self.corner)))).T
+        pairs = zip(steps, self.corner, strict=True)
+        return [(jnp.asarray(s[:, None], int) + first[None]).reshape(1, -1) for s, first in pairs]
 
     def means(self, columns: Columns) -> tuple[Values, Slopes]:
         """Weighted means and first moments of a field's rows, of one offset after another."""
@@ -226,7 +207,7 @@ class _Stencil:
         return value, moment - value[:, :, None] * self.away[:, None]
 
     def affine(self, values: Values, slopes: Slopes) -> tuple[Values, list[Values]]:
-        """The particles' affine fields at their first nodes, and the steps between nodes."""
+        """The particles' affine fields at their first nodes, and the differences between nodes."""
         start = values - jnp.sum(slopes * self.away[:, None], axis=2)
         return start, [slopes[:, :, i] * self.spacing for i in range(slopes.shape[2])]
 
@@ -246,21 +227,17 @@ def _affine_axis(value, steps):
     """An affine field at all nodes, from its value at the first and its steps along the axes."""
     if not steps:
         return [value]
-    return [
-        part
-        for i in range(3)
-        for part in _affine_axis(value + i * steps[0] if i else value, steps[1:])
-    ]
+    nodes = value, value + steps[0], value + 2 * steps[0]
+    return [part for node in nodes for part in _affine_axis(node, steps[1:])]
 
 
 def _p2g_axis(weights, value, steps):
     """An affine field at all nodes, as `_affine_axis` gives it, times the nodes' weights."""
     if not weights:
         return [value]
-    parts = []
-    for i, weight in enumerate(weights[0]):
-        here = value + i * steps[0] if i else value
-        parts += _p2g_axis(weights[1:], weight * here, [weight * step for step in steps[1:]])
+    nodes, parts = (value, value + steps[0], value + 2 * steps[0]), []
+    for weight, node in zip(weights[0], nodes, strict=True):
+        parts += _p2g_axis(weights[1:], weight * node, [weight * step for step in steps[1:]])
     return parts
 
 
@@ -286,9 +263,8 @@ def _slope_axis(weights, rates, rows):
 
 def _thirds(rows):
     count = len(rows) // 3
-    return [rows[i * count : (i + 1) * count] for i in range(3)]
+    return rows[:count], rows[count : 2 * count], rows[2 * count :]
 
 
 def _dot(weights, parts):
-    low, middle, high = (weight * part for weight, part in zip(weights, parts, strict=True))
-    return low + middle + high
+    return weights[0] * parts[0] + weights[1] * parts[1] + weights[2] * parts[2]
