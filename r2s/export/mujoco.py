@@ -48,11 +48,12 @@ def mjcf(
     Vertex i is the body "v<i>" and number i of the flex "cloth". Raises `ValueError` for a batch,
     for a membrane without positive stiffness, and with yarns for a mesh that has none.
     """
-    sheet = stiffness.nearest_sheet(fabric, yarns, POISSON, negative=False)
-    tendons = ""
     if yarns:
+        sheet = stiffness.with_springs(fabric, POISSON, negative=False)
         springs = stiffness.yarn_springs(mesh, sheet.warp, sheet.weft)
         tendons = _tendons(springs, float(fabric.damping))
+    else:
+        sheet, tendons = stiffness.nearest_isotropic(fabric, POISSON), ""
     lost = (LARGE,) if yarns else ()
     lost += (RIGID,) if float(fabric.mass_damping) else ()
     friction = f'friction="{float(fabric.friction)!r} 0.005 0.0001"'

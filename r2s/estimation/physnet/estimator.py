@@ -21,8 +21,8 @@ from jaxtyping import Array, Float
 
 from r2s.estimation.checkpoint import fingerprint
 from r2s.estimation.estimate import Estimate, point_estimate
-from r2s.estimation.physnet import search
 from r2s.estimation.physnet.images import View, depths_of_sheet, grey, per_face
+from r2s.estimation.physnet.search import Places, search
 from r2s.estimation.physnet.training import PhysNet, Training
 from r2s.estimation.problem import force_at
 from r2s.materials.parameters import ParameterSpace
@@ -118,14 +118,7 @@ class ImageObservation(eqx.Module):
         - `images`: of `r2s.estimation.physnet.images`, one for each of the `frames`.
         - `training`: the trained network with its view.
         - `pull`: the force at the same frames, see `pull_force`.
-
-        Raises `ValueError` when images and frames differ in number, or a frame is not simulated.
         """
-        if len(images) != len(frames) or not all(0 <= f < scenario.num_frames for f in frames):
-            raise ValueError(
-                f"{len(images)} images at frames {frames}, of {scenario.num_frames} simulated: "
-                "expected one image for each frame"
-            )
         network, view = training.network, training.view
         points = _points(network, jnp.asarray(images, float))
         if pull is not None:
@@ -160,13 +153,13 @@ def answers(
     def of_place(place):
         fabric, force = observation.space(place), []
         if (pull := observation.pull) is None:
-            found = rollout(scenario, fabric, solver=observation.solver)
-            ok = jnp.all(found.ok)
+            motion = rollout(scenario, fabric, solver=observation.solver)
+            ok = jnp.all(motion.ok)
         else:
-            found = energy_balance(scenario, fabric, solver=observation.solver)
-            ok = jnp.all(jnp.isfinite(found.x)) & jnp.all(jnp.isfinite(found.last))
-            force = [pull.coordinate(clamp_force(scenario, found)[frames] @ pull.direction)]
-        x, faces = found.x[frames], scenario.scene.mesh.faces
+            motion = energy_balance(scenario, fabric, solver=observation.solver)
+            ok = jnp.all(jnp.isfinite(motion.x)) & jnp.all(jnp.isfinite(motion.last))
+            force = [pull.coordinate(clamp_force(scenario, motion)[frames] @ pull.direction)]
+        x, faces = motion.x[frames], scenario.scene.mesh.faces
         depth = depths_of_sheet(observation.view, x, faces, observation.per_face)
         images = jax.vmap(partial(grey, observation.view))(depth)
         points = jnp.concatenate([jax.vmap(observation.network)(images), *force], axis=1)
@@ -194,8 +187,8 @@ def estimate(
     """The fabric most likely to look as recorded, by `num_calls` simulations.
 
     - `published`: by Bayesian optimisation of the distance on the map, as in the study of Duan et
-      al.; the estimate is the best simulation. Otherwise an emulator (`search.emulated`) predicts
-      the points of simulated images, and the last simulation is that of the estimate.
+      al.; the estimate is the best simulation. Otherwise an emulator predicts the points of
+      simulated images, and the last simulation is that of the estimate.
     - `batch`: simulations that run together.
     - `path`: file of the search, from which it continues; one of another observation is refused.
     - `progress`: called with the number of simulations and the least loss, after every batch.
@@ -205,31 +198,28 @@ def estimate(
     """
     began, space = time.perf_counter(), observation.space
 
-    def respond(places: search.Places) -> Float[np.ndarray, "place part"]:
+    def respond(places: Places) -> Float[np.ndarray, "place part"]:
         padded = np.full((batch, places.shape[1]), 0.5)  # so that it compiles once
         padded[: len(places)] = places
         return np.asarray(answers(observation, jnp.asarray(padded, float)))[: len(places)]
 
-    # the error of the images counts as the same in all frames
-    shared = {} if published else {"shared": len(observation.frames)}
-    trials = (search.bayesian if published else search.emulated)(
+    trials = search(
         respond,
         observation.target,
         space.dim,
+        published=published,
         num_calls=num_calls,
+        shared=len(observation.frames),  # the error of the images is the same in all frames
         batch=batch,
         seed=seed,
         path=path,
         run=fingerprint(observation) if path else "",
         progress=progress,
-        **shared,
     )
     losses, places = trials.losses, jnp.asarray(trials.places, float)
     chosen = int(np.nanargmin(losses)) if published else len(losses) - 1
     if not np.isfinite(losses[chosen]):
-        simulate = eqx.filter_jit(rollout)
-        found = simulate(observation.scenario, space(places[chosen]), solver=observation.solver)
-        raise RuntimeError(f"the simulation of the estimate {found.explain()} Narrow the ranges.")
+        raise RuntimeError("the simulation of the estimate diverged: narrow the ranges")
     way = "Bayesian optimisation" if published else "emulated answers"
     return point_estimate(
         f"physnet ({way}, {num_calls} simulations)",

@@ -43,7 +43,7 @@ def train_network(
     """Train the network for a scenario on a solver, and write it to `path`.
 
     The simulated images lie in a folder beside `path` until it is trained, so that a killed run
-    goes on. `progress` shows a bar of the simulations, and prints a line an epoch, on stderr.
+    continues. `progress` shows a bar of the simulations, and prints a line an epoch, on stderr.
     """
     options: dict[str, Any] = {"ranges": RANGES}
     if solver == "mpm":
@@ -101,12 +101,12 @@ class PhysNetMethod(Method):
         trained = self._trained(recording, seed_of(key))
         scenario = from_recording(recording, NETWORK_SHAPE[solver])
         frames = _images_of(recording)
-        seen = images.of_clouds(trained.view, recording, frames)
+        recorded = images.of_clouds(trained.view, recording, frames)
         stiffest = space(jnp.ones(space.dim, float))
         points = None if solver == "cloth" else mpm_cloth(scenario, stiffest)
         pull = None if self.published else estimator.pull_force(recording, frames)
         observation = estimator.ImageObservation.make(
-            scenario, seen, frames, space, trained, points, pull
+            scenario, recorded, frames, space, trained, points, pull
         )
         return estimator.estimate(
             observation,
