@@ -25,9 +25,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy.integrate import solve_ivp
 from scipy.optimize import root_scalar
 
+from r2s._util.checks import expect
 from r2s._util.units import GRAVITY
 from r2s.environment.scene import Control, Scene
-from r2s.laboratory.pull import expect
 from r2s.materials.fabric import Fabric
 from r2s.mesh.mesh import Mesh
 from r2s.solvers.implicit.cloth import ImplicitCloth

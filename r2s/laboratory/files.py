@@ -24,11 +24,12 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from r2s._util.checks import expect
 from r2s._util.extras import require
 from r2s._util.files import parse
 from r2s.laboratory.bending import DRAPE_DEVIATION, RADII, Cantilever, Drape
 from r2s.laboratory.estimate import Test
-from r2s.laboratory.pull import SPECIMEN, Pull, expect
+from r2s.laboratory.pull import SPECIMEN, Pull
 from r2s.recordings.force_log import METRES, NEWTONS, SHARES, header_of, read_columns
 
 FORMAT = "r2s-laboratory/1"

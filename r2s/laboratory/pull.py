@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from r2s._util.checks import expect
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import MembraneLaw, turned
 
@@ -139,12 +140,6 @@ def uniaxial(
     free = step(found)  # from its minimum a step has the derivatives of the minimum
     tension = stretch * jax.grad(energy)(along, free)
     return tension, jnp.sqrt(jnp.maximum(1 + 2 * free[0], 1e-6))
-
-
-def expect(holds: bool | np.bool_, problem: str) -> None:
-    """Raise `ValueError` that says the problem, unless the condition holds."""
-    if not holds:
-        raise ValueError(problem)
 
 
 def _check(name: str, stretch: np.ndarray, tension: np.ndarray, across: np.ndarray) -> None:

@@ -22,11 +22,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.estimation.least_squares import Damping, at_bound, damped, newton_step, proposed
-from r2s.estimation.pinn.equilibrium import Motion, equilibrium, prepare
 from r2s.estimation.pinn.network import Network
 from r2s.estimation.pinn.pulls import Pull, stacked
 from r2s.estimation.pinn.training import NOISE, QUICK, Recipe, Trained, train
-from r2s.estimation.pinn.weak_form import DEGREES
+from r2s.estimation.pinn.weak_form import DEGREES, Motion, equilibrium, prepare
 from r2s.estimation.standard_errors import to_small_strain
 from r2s.materials.nonlinear_spaces import stiffens
 from r2s.materials.parameters import ParameterSpace

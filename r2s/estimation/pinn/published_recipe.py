@@ -19,7 +19,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimation.pinn.network import DisplacementField, T, X, Y
+from r2s.estimation.pinn.network import Network, T, X, Y
 from r2s.estimation.pinn.pulls import Pull
 from r2s.estimation.pinn.training import Model, Trained, init
 from r2s.estimation.pinn.weak_form import (
@@ -147,7 +147,7 @@ def motion_loss(model: Model, space: ParameterSpace, pulls: Pull) -> tuple[Float
 
 
 def motion_residual(
-    network: DisplacementField, pull: Pull, fabric: Fabric, places, frames
+    network: Network, pull: Pull, fabric: Fabric, places, frames
 ) -> Float[Array, "point axis"]:
     """Residual [N/m^2] of the equation of motion in small strain: divergence of the stress less
     the load. Damping of the stress is left out, as it would need third derivatives."""

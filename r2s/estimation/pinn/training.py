@@ -18,7 +18,7 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from r2s.estimation import checkpoint as checkpoints
-from r2s.estimation.pinn.network import DisplacementField, Network
+from r2s.estimation.pinn.network import Network
 from r2s.estimation.pinn.pulls import Pull
 from r2s.estimation.pinn.weak_form import (
     clamp_residual,
@@ -114,9 +114,7 @@ def init(
     return Model(jax.vmap(network)(pulls, keys), jnp.zeros(space.dim, float))
 
 
-def losses_of(
-    network: DisplacementField, pull: Pull, fabric: Fabric, frames: Int[Array, " frame"]
-) -> Losses:
+def losses_of(network: Network, pull: Pull, fabric: Fabric, frames: Int[Array, " frame"]) -> Losses:
     """The losses of one pull, with the weak form in some frames.
 
     The work counts beside that of the measured force over the width; without a force, of the stress
