@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
-from jaxtyping import Array
 
 from r2s.estimation.pinn import published_recipe, weak_form
-from r2s.estimation.pinn.network import Jet, Network, T, X, Y
+from r2s.estimation.pinn.network import Jet, Network, Perceptron, T, X, Y
 from r2s.estimation.pinn.pulls import Clamp, Pull
 from r2s.estimation.pinn.training import NOISE, losses_of
 from r2s.estimation.pinn.weak_form import (
@@ -121,11 +120,10 @@ def test_jets_are_the_derivatives(pairs):
 # The strong form
 
 
-class Exact(eqx.Module):
+class Exact(Network):
     """A displacement in closed form in place of a network."""
 
     function: Any = eqx.field(static=True)
-    scale: Array
 
     def __call__(self, points):
         return jax.vmap(self.one)(points)
@@ -141,8 +139,8 @@ class Exact(eqx.Module):
         return Jet(self(points), jnp.moveaxis(first, 2, 0), chosen)
 
 
-def exact(function) -> Any:
-    return Exact(function, jnp.ones(()))
+def exact(function) -> Exact:
+    return Exact(Perceptron(1, 2), {}, jnp.zeros(3), jnp.ones(3), jnp.ones(()), function)
 
 
 def pull(function, force=None, normal: float = 0.0):
