@@ -146,7 +146,7 @@ class Sensitivity:
 
 
 if TYPE_CHECKING:
-    from r2s.export import Loss
+    from r2s.export.stiffness import Loss
     from r2s.materials.fabric import Fabric
 
 

@@ -249,7 +249,8 @@ def estimate_from_cloth(fabric, space, monkeypatch, **options):
         pulled(fabric, "made", angle, key=key, **options)
         for angle, key in zip(angles, keys, strict=True)
     ]
-    return estimate([pull_from(recording) for recording in recordings], space, key=jr.key(1))
+    pulls = [pull_from(recording) for recording in recordings]
+    return estimate(pulls, space, Recipe(), key=jr.key(1))
 
 
 @pytest.mark.slow(group="pinn")
