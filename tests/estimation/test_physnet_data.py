@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s.estimation.physnet import dataset, estimator, images, training
+from r2s.estimation.physnet import dataset, images, method, training
 from r2s.estimation.physnet.dataset import Settings
-from r2s.estimation.physnet.estimator import ImageObservation
+from r2s.estimation.physnet.method import ImageObservation
 from r2s.estimation.physnet.training import Architecture
 
 TINY = Settings(
@@ -40,7 +40,7 @@ def observation(folder):
 
 def distances(observation, places):
     """The rms distances on the map."""
-    off = np.asarray(estimator.answers(observation, jnp.asarray(places))) - observation.target
+    off = np.asarray(method.answers(observation, jnp.asarray(places))) - observation.target
     return np.sqrt((off**2).mean(axis=1))
 
 
@@ -95,7 +95,7 @@ def test_an_estimate_continues_from_its_file(observation, tmp_path, published, c
     """It is the last of the simulations; as published, the best."""
     pytest.importorskip("skopt" if published else "sklearn")
     options = {"published": published, "num_calls": calls, "path": tmp_path / "trials.npz"}
-    first, again = (estimator.estimate(observation, **options) for _ in range(2))
+    first, again = (method.estimate(observation, **options) for _ in range(2))
     assert first.losses.shape == (calls, 1)
     assert first.loss == (first.losses.min() if published else first.losses[-1])
     np.testing.assert_array_equal(first.history, again.history)

@@ -7,17 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r2s.estimation.physnet import estimator, training
-from r2s.estimation.physnet.estimator import (
+from r2s.estimation.physnet import method, training
+from r2s.estimation.physnet.images import view_of
+from r2s.estimation.physnet.method import (
     FLAW,
     NOISE,
     SCALE,
     ImageObservation,
+    PhysNetMethod,
+    PublishedPhysNet,
     PullForce,
     pull_force,
 )
-from r2s.estimation.physnet.images import view_of
-from r2s.estimation.physnet.method import PhysNetMethod, PublishedPhysNet
 from r2s.estimation.physnet.training import Architecture
 from r2s.materials import presets
 from r2s.materials.parameters import OrthotropicSpace
@@ -55,7 +56,7 @@ def test_the_true_force_is_where_it_was_recorded_and_twice_the_stiffness_apart(o
     warp, weft = (SPACE.ranges[i] for i in (0, 1))
     slippery = true.at[-1].set(0.0)  # so that the yarns take the pull alone, not the table
     twice = slippery.at[0].add(np.log(2) / warp.width).at[1].add(np.log(2) / weft.width)
-    answers = np.asarray(estimator.answers(observation, jnp.stack([true, slippery, twice])))
+    answers = np.asarray(method.answers(observation, jnp.stack([true, slippery, twice])))
     width = observation.points.shape[1]
     parts = [each.reshape(len(FRAMES), width) / np.sqrt(width) for each in answers]
     recorded = np.asarray(observation.points[:, -1])  # the last coordinate of a point
@@ -103,11 +104,11 @@ def test_only_a_stretching_has_one_and_the_published_method_reads_none(recording
 def test_a_state_file_of_another_observation_is_refused(observation, tmp_path):
     """Its answers would be those of another density, and its target another recording's."""
     options = {"num_calls": SPACE.dim + 2, "path": tmp_path / "search.npz"}
-    whole, again = (estimator.estimate(observation, **options) for _ in range(2))
+    whole, again = (method.estimate(observation, **options) for _ in range(2))
     assert np.array_equal(whole.losses, again.losses)
     assert "0x" not in repr(jax.tree.structure(observation))  # the same in another process
     heavier = dataclasses.replace(observation, space=OrthotropicSpace.make(0.3))
     further = dataclasses.replace(observation, points=observation.points + 1.0)
     for other in (heavier, further):
         with pytest.raises(ValueError, match="another run"):
-            estimator.estimate(other, **options)
+            method.estimate(other, **options)

@@ -22,7 +22,6 @@ from r2s.scenarios.scenario import Scenario, rollout
 from r2s.scenarios.standard import SCENARIOS, Experiment, varied
 from r2s.solvers.mpm.sheet import MPMCloth
 
-FORMAT = "r2s-physnet-data/3"
 DEPTH_UNIT = 1e-4  # [m], of the depths in the files
 DENSITY = 0.2  # [kg/m^2], of all fabrics
 
@@ -69,7 +68,6 @@ class Settings:
 class Manifest:
     """The file `manifest.json`: settings and view of the data."""
 
-    format: str
     settings: Settings
     view: View
 
@@ -109,18 +107,14 @@ def make(folder: Path | str, settings: Settings, progress: bool = True) -> Manif
         places, x, ok = _simulate(settings, number, substeps, solver)
         if view is None:
             view = view_of(SCENARIOS[settings.scenario](), x[ok].reshape(-1, 3), settings.size)
-        write_json(folder / "manifest.json", asdict(Manifest(FORMAT, settings, view)))
+        write_json(folder / "manifest.json", asdict(Manifest(settings, view)))
         _write(_shard(folder, number), settings, view, places, x, ok)
     return load_manifest(folder)
 
 
 def load_manifest(folder: Path | str) -> Manifest:
     """The manifest of a data set. Raises `ValueError` that names the file when it is damaged."""
-    path = Path(folder) / "manifest.json"
-    manifest = read_json(path, Manifest)
-    if manifest.format != FORMAT:
-        raise ValueError(f"{path}: expected format {FORMAT}, found {manifest.format}")
-    return manifest
+    return read_json(Path(folder) / "manifest.json", Manifest)
 
 
 def load(folder: Path | str) -> Data:
