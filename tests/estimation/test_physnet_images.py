@@ -121,7 +121,7 @@ def test_borders_lose_gain_and_err_and_nothing_else_does():
     there = whole > 0
     inner = np.asarray(ndimage.binary_erosion(there, np.ones((3, 3))), bool)
     outer = np.asarray(ndimage.binary_dilation(there, np.ones((3, 3))), bool)
-    flaw = jax.jit(jax.vmap(images.flawed, in_axes=(None, None, None, 0)), static_argnums=1)
+    flaw = jax.jit(jax.vmap(images.flawed, in_axes=(None, None, None, 0)), static_argnums=(1, 2))
     keys = jax.random.split(jax.random.key(0), 50)
     flaws = dataclasses.replace(CLEAN, lost=0.5, gained=0.2, flying=1e-2)
     broken = np.asarray(flaw(jnp.asarray(whole), VIEW, flaws, keys))
