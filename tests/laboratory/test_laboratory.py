@@ -274,19 +274,6 @@ def test_a_motion_contradicts_tests_where_it_is_sure_and_far_away():
     assert consistency(by_tests, shifted(8.0, 0.7)) < 1e-6
 
 
-@pytest.mark.slow(group="study")
-def test_widths_do_not_make_the_errors_of_tensions_smaller():
-    """Scatter beyond the assumed errors makes standard errors grow, with widths as without."""
-    random = np.random.default_rng(0)
-    rough = [
-        dataclasses.replace(p, tension=p.tension * (1 + 0.06 * random.normal(size=24)))
-        for p in pulls_of(DENIM)
-    ]
-    narrow = [dataclasses.replace(p, across=p.across * jnp.nan) for p in rough]
-    shear = [estimate(tests, SPACE).standard_errors[2] for tests in (rough, narrow)]
-    assert shear[0] == pytest.approx(shear[1], rel=0.2)
-
-
 def test_a_drape_that_does_not_come_to_rest_is_an_error(monkeypatch: pytest.MonkeyPatch):
     failed = lambda self, fabric: jnp.full(1, jnp.nan) * fabric.density  # noqa: E731
     monkeypatch.setattr(Drape, "residuals", failed)

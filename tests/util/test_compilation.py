@@ -1,11 +1,9 @@
 """Compiled programs: compiled once and ahead, kept in files, let go."""
 
-import os
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -59,35 +57,6 @@ def test_equal_numbers_of_other_types_are_other_programs() -> None:
 
 def test_a_compiled_function_is_differentiated_like_any_other() -> None:
     assert float(jax.grad(compile_once(lambda x: x**3))(2.0)) == pytest.approx(12.0)
-
-
-KEPT = """
-import sys
-from pathlib import Path
-from r2s import compilation
-folder = compilation.keep(Path(sys.argv[1]))
-import jax, jax.numpy as jnp
-events = []
-jax.monitoring.register_event_listener(lambda name, **_: events.append(name))
-def slow(x):
-    for i in range(150):
-        x = jnp.sin(x @ x) + i
-    return x
-print(float(jax.jit(slow)(jnp.ones((8, 8))).sum()), folder.parent == Path(sys.argv[1]))
-print(events.count("/jax/compilation_cache/cache_hits"))
-"""
-
-
-@pytest.mark.slow(group="study")
-def test_another_process_reads_what_one_compiled(tmp_path: Path) -> None:
-    run = [sys.executable, "-c", KEPT, str(tmp_path)]
-    options: dict[str, Any] = {"check": True, "capture_output": True, "text": True, "timeout": 120}
-    options["env"] = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "true"}
-    (one, misses), (other, hits) = (
-        subprocess.run(run, **options).stdout.splitlines() for _ in range(2)
-    )
-    assert one == other and one.endswith(" True")
-    assert int(misses) == 0 and int(hits) >= 1
 
 
 def test_a_folder_that_cannot_be_made_is_one_warning(tmp_path: Path, settings: None) -> None:
