@@ -81,7 +81,7 @@ def mjcf(
 def brake(model: Any, fabric: Fabric) -> None:
     """Set the mass damping [1/s] of a model of MuJoCo in which all that moves is this fabric.
 
-    MJCF knows no damping of a flex's joints; the engine does.
+    MJCF has no damping of a flex's joints; the engine does.
     """
     mass = np.asarray(model.body_mass)[np.asarray(model.dof_bodyid)]
     model.dof_damping[:] = float(fabric.mass_damping) * mass

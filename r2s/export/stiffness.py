@@ -36,7 +36,7 @@ class Loss(NamedTuple):
     """What an export loses.
 
     - `membrane`: by probe, the relative error of the exported energy at a small strain: pulls along
-      warp, bias and weft with free sides, shear, and both yarns alike.
+      warp, bias and weft with free sides, shear, and both yarns equally.
     - `bending`: likewise of cylinders along warp, weft and both biases; empty: not exported.
     - `lost`: what else is, in words.
     """

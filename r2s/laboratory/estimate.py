@@ -54,7 +54,7 @@ def estimate(
 ) -> Estimate:
     """The fabric of a space that explains some tests of it.
 
-    Parameters on which no test depends stay at the prior mean. `progress` is told what is being
+    Parameters on which no test depends stay at the prior mean. `progress` reports what is being
     done. Raises `ValueError` without a test, and `RuntimeError` where no specimen of a drape comes
     to rest.
     """

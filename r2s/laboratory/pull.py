@@ -134,10 +134,8 @@ def uniaxial(
         tangent = jax.jacfwd(slope, argnums=1)(along, free)
         return free - jnp.linalg.solve(tangent, slope(along, free))
 
-    found = jax.lax.stop_gradient(
-        jax.lax.fori_loop(0, NEWTON, lambda _, free: step(free), jnp.zeros(2, float))
-    )
-    free = step(found)  # from its minimum a step has the derivatives of the minimum
+    free = jax.lax.fori_loop(0, NEWTON, lambda _, free: step(free), jnp.zeros(2, float))
+    free = step(jax.lax.stop_gradient(free))  # so it has the derivatives of the minimum
     tension = stretch * jax.grad(energy)(along, free)
     return tension, jnp.sqrt(jnp.maximum(1 + 2 * free[0], 1e-6))
 

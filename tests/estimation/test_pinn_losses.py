@@ -123,8 +123,7 @@ class Exact(Network):
         first = jax.vmap(jax.jacfwd(self.one))(points)
         second = jax.vmap(jax.hessian(self.one))(points)
         chosen = [second[:, :, i, j] for i, j in pairs]
-        chosen = jnp.stack(chosen) if chosen else jnp.zeros((0, len(points), 2))
-        return Jet(self(points), jnp.moveaxis(first, 2, 0), chosen)
+        return Jet(self(points), jnp.moveaxis(first, 2, 0), jnp.stack(chosen))
 
 
 def exact(function) -> Exact:

@@ -38,7 +38,7 @@ class View:
     - `focal_length`: [pixel].
     - `size`: side of the image, [pixel].
     - `near`, `far`: depths that become white and black, [m].
-    - `floor`: height below which points are left out, as fabric and table look alike there, [m].
+    - `floor`: height below which points are left out, as the table may be among them, [m].
     """
 
     position: Triple
@@ -52,7 +52,7 @@ class View:
 
 def view_of(experiment: Experiment, points: Float[np.ndarray, "point 3"], size: int) -> View:
     """`view_around` points from the first camera of `r2s.scenarios.synthetic.sensing`, above the
-    height at which its cameras see sheet and table alike."""
+    height below which its cameras see the table, too."""
     sensed = sensing(experiment)
     x, y, z = (float(value) for value in sensed.cameras[0].position)
     return view_around((x, y, z), points, size, experiment.table_height + max(sensed.margin, -1.0))

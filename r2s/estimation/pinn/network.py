@@ -87,8 +87,7 @@ class Perceptron(nn.Module):
             product = jnp.concatenate([z, *slopes, *curves]) @ kernel
             value, *parts = jnp.split(product, 4 + len(pairs))
             value, slopes, curves = value + bias[None], parts[:3], parts[3:]
-        second = jnp.stack(curves) if pairs else jnp.zeros((0, *value.shape), value.dtype)
-        return Jet(value, jnp.stack(slopes), second)
+        return Jet(value, jnp.stack(slopes), jnp.stack(curves))
 
 
 class Network(eqx.Module):

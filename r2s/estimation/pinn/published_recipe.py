@@ -139,8 +139,7 @@ def motion_loss(model: Model, space: ParameterSpace, pulls: Pull) -> tuple[Float
         return jnp.mean(jax.vmap(residual)(model.networks, pulls) ** 2) / number
 
     def add(sums, frame):
-        found = jax.value_and_grad(of_frame)(model, frame)
-        return jax.tree.map(jnp.add, sums, found), None
+        return jax.tree.map(jnp.add, sums, jax.value_and_grad(of_frame)(model, frame)), None
 
     nothing = jax.tree.map(jnp.zeros_like, (model.free[0], model))
     return jax.lax.scan(add, nothing, jnp.arange(number))[0]

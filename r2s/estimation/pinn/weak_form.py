@@ -54,7 +54,7 @@ def field(
     pull: Pull,
     places: Float[Array, "point 2"],
     frames: Int[Array, " point"],
-    pairs: Pairs = (),
+    pairs: Pairs,
 ) -> Jet:
     """Displacements [m] at places (X, Y) [m] in frames, with second derivatives in `pairs`."""
     jet = network.jet(_inputs(pull, places, frames), pairs)
@@ -65,8 +65,7 @@ def field(
     even = {(0, T): slope_rate, (T, T): acceleration}
     added = [even.get(pair, jnp.zeros_like(value)) for pair in pairs]
     first = jet.first + jnp.stack([slope, jnp.zeros_like(slope), rate])
-    second = jet.second + jnp.stack(added) if added else jet.second
-    return Jet(jet.value + value, first, second)
+    return Jet(jet.value + value, first, jet.second + jnp.stack(added))
 
 
 def displacement(
