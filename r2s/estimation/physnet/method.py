@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from r2s._util.checks import expect
 from r2s._util.extras import require
 from r2s.estimation.checkpoint import fingerprint
 from r2s.estimation.default_spaces import RANGES
@@ -39,6 +40,7 @@ from r2s.recordings.recording import Recording
 from r2s.scenarios.energy import clamp_force, energy_balance
 from r2s.scenarios.resolution import mpm_cloth
 from r2s.scenarios.scenario import Scenario, SheetSolver, from_recording, rollout
+from r2s.scenarios.standard import SCENARIOS
 
 Images = Float[np.ndarray, "frame down across"]
 # A flawed image lies 0.45 from a flawless one on the map, and a sheet of 9 x 9
@@ -85,8 +87,8 @@ def pull_force(recording: Recording, frames: Sequence[int]) -> PullForce | None:
     direction = jnp.asarray(recording.info.sheet.warp, float)
     along = force.values @ (force.directions @ direction)
     largest = jnp.max(jnp.abs(along))
-    if not largest > 0:
-        raise ValueError(f"{recording.info.name}: the force on the pulled clamp is zero throughout")
+    is_pulled = bool(largest > 0)
+    expect(is_pulled, f"{recording.info.name}: the force on the pulled clamp is zero throughout")
     return PullForce(along, direction, jnp.maximum(SHARE * largest, NOISE / SHARE))
 
 
@@ -265,7 +267,9 @@ def train_network(
 
     The simulated images lie in a folder beside `path` until it is trained, so that a killed run
     continues. `progress` shows a bar of the simulations, and prints a line an epoch, on stderr.
+    Raises `ValueError` for a scenario that r2s does not simulate.
     """
+    expect(scenario in SCENARIOS, f"scenario must be one of {list(SCENARIOS)}, found {scenario!r}")
     options: dict[str, Any] = {"ranges": RANGES}
     if solver == "mpm":
         shape = NETWORK_SHAPE[solver]
