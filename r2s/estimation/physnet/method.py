@@ -33,7 +33,7 @@ from r2s.estimation.estimate import Estimate, point_estimate
 from r2s.estimation.method import ANY, Budget, DataRequirements, Method, seed_of
 from r2s.estimation.physnet import dataset, training
 from r2s.estimation.physnet.images import View, depths_of_sheet, grey, of_clouds, per_face
-from r2s.estimation.physnet.search import Places, search
+from r2s.estimation.physnet.search import BATCH, Places, search
 from r2s.estimation.problem import force_at, read_by_problem
 from r2s.materials.parameters import ParameterSpace
 from r2s.recordings.recording import Recording
@@ -192,7 +192,6 @@ def estimate(
     *,
     published: bool = False,
     num_calls: int = 80,
-    batch: int = 4,
     seed: int = 0,
     path: Path | str | None = None,
     progress: Callable[[int, float], None] | None = None,
@@ -202,7 +201,6 @@ def estimate(
     - `published`: by Bayesian optimisation of the distance on the map, as in the study of Duan et
       al.; the estimate is the best simulation. Otherwise an emulator predicts the points of
       simulated images, and the last simulation is that of the estimate.
-    - `batch`: simulations that run together.
     - `path`: file of the search, from which it continues; one of another observation is refused.
     - `progress`: called with the number of simulations and the least loss, after every batch.
 
@@ -212,7 +210,7 @@ def estimate(
     began, space = time.perf_counter(), observation.space
 
     def respond(places: Places) -> Float[np.ndarray, "place part"]:
-        padded = np.full((batch, places.shape[1]), 0.5)  # so that it compiles once
+        padded = np.full((BATCH, places.shape[1]), 0.5)  # so that it compiles once
         padded[: len(places)] = places
         return np.asarray(answers(observation, jnp.asarray(padded, float)))[: len(places)]
 
@@ -223,7 +221,6 @@ def estimate(
         published=published,
         num_calls=num_calls,
         shared=len(observation.frames),  # the error of the images is the same in all frames
-        batch=batch,
         seed=seed,
         path=path,
         run=fingerprint(observation) if path else "",

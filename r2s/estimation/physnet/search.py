@@ -23,6 +23,7 @@ from scipy.stats import qmc
 from r2s._util.extras import require
 from r2s.estimation import checkpoint
 
+BATCH = 4  # calls that are answered together
 COMPONENTS = 10  # principal components of the answers, at most
 FIRST = 0.4  # share of the calls at places of Sobol's sequence
 FIRST_CALLS = 16  # the same of Bayesian optimisation, in calls
@@ -68,7 +69,6 @@ def search(
     published: bool = False,
     num_calls: int = 80,
     shared: int = 1,
-    batch: int = 4,
     seed: int = 0,
     path: Path | str | None = None,
     run: str = "",
@@ -76,7 +76,7 @@ def search(
 ) -> Trials:
     """The trials of a search. The last is where the target most likely lies, unless `published`.
 
-    - `respond`: gives the answers of up to `batch` places.
+    - `respond`: gives the answers of up to `BATCH` places.
     - `published`: by Bayesian optimisation, not by an emulator of the answers.
     - `shared`: number of parts of an answer, such as frames, that share one error of the target.
     - `path`: file that stores the trials after every batch, and from which the search continues.
@@ -91,7 +91,7 @@ def search(
     num_first = FIRST_CALLS if published else max(int(FIRST * num_calls), dim + 1)
     ask = _improving_places if published else partial(_likely_places, shared=shared)
     header = {"kind": "search", "run": run, "dim": dim, "calls": num_calls}
-    header |= {"first": num_first, "batch": batch, "seed": seed}
+    header |= {"first": num_first, "batch": BATCH, "seed": seed}
     trials = Trials(np.zeros((0, dim)), np.zeros((0, len(target))))
     if path is not None and (stored := checkpoint.load(path, header)) is not None:
         trials = Trials(**stored)
@@ -99,10 +99,10 @@ def search(
     first = sequence.random_base2(max(num_first - 1, 0).bit_length())[:num_first]
     while (done := len(trials.places)) < num_calls:
         if done < num_first:
-            places = first[done : min(done + batch, num_calls)]
+            places = first[done : min(done + BATCH, num_calls)]
         else:
             generator = np.random.default_rng([seed, done])
-            places = ask(trials, batch, num_calls - done, generator)
+            places = ask(trials, num_calls - done, generator)
         new = places, respond(places) - target
         trials = Trials(*(np.concatenate(pair) for pair in zip(trials, new, strict=True)))
         if path is not None:
@@ -113,16 +113,16 @@ def search(
 
 
 def _likely_places(
-    trials: Trials, batch: int, left: int, generator: np.random.Generator, *, shared: int = 1
+    trials: Trials, left: int, generator: np.random.Generator, *, shared: int = 1
 ) -> Places:
-    """At most `batch` places, drawn by the likelihood of the target; of `left` = 1 the most likely.
+    """At most `BATCH` places, drawn by the likelihood of the target; of `left` = 1 the most likely.
 
     The likelihood is from the emulator's deviation and the error of the target, which the least
     loss estimates.
     """
     known = trials.successful
     best = known.places[np.argsort(known.losses)[:CENTRES]]
-    number = min(batch, left - 1)
+    number = min(BATCH, left - 1)
     tried = np.concatenate([_candidates(best, generator) for _ in range(1 if number else 4)])
     misfit = _misfit(known, shared * known.losses.min() ** 2, tried)
     if not number:
@@ -166,9 +166,7 @@ def _misfit(trials: Trials, variance: float, tried: Places) -> Float[np.ndarray,
     return total
 
 
-def _improving_places(
-    trials: Trials, batch: int, left: int, generator: np.random.Generator
-) -> Places:
+def _improving_places(trials: Trials, left: int, generator: np.random.Generator) -> Places:
     """The next places: those of the greatest expected improvement of a Gaussian process.
 
     The process is one of the logarithm of the losses. A call that failed counts as the worst that
@@ -190,4 +188,4 @@ def _improving_places(
     with warnings.catch_warnings():  # that a length is at its bound, or a place was tried before
         warnings.simplefilter("ignore")
         optimizer.tell(trials.places.tolist(), losses.tolist(), fit=False)
-        return np.array(optimizer.ask(min(batch, left)))
+        return np.array(optimizer.ask(min(BATCH, left)))
