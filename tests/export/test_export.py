@@ -3,6 +3,7 @@
 import dataclasses
 import xml.etree.ElementTree as xml
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,8 @@ from conftest import stored_energy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s._util.units import isotropic_membrane
+import r2s
+from r2s._util.units import GRAVITY, isotropic_membrane
 from r2s.export import arcsim, mujoco, newton, pybullet, stiffness
 from r2s.materials import presets
 from r2s.materials.arcsim import read_material
@@ -287,3 +289,68 @@ def test_bullets_springs_are_the_membrane_that_it_says():
     assert arguments["mass"] == pytest.approx(0.32 * 0.06) and not loss.bending
     spring, damping = (arguments[f"spring{kind}Stiffness"] for kind in ("Elastic", "Damping"))
     assert damping == pytest.approx(0.01 * spring)
+
+
+# A motion
+
+
+FALLING = Fabric.make(0.2, (100.0, 30.0, 100.0, 35.0), 1e-5, damping=2e-4, mass_damping=3.0)
+SIDE, SIZE, HEIGHT = 0.3, 9, 0.5  # [m], vertices a side, of the sheet that starts flat [m]
+FRAMES, INTERVAL, STEPS = 45, 1 / 30, 68  # -, [s], steps of MuJoCo in a frame
+CORNERS = (0, SIZE - 1, SIZE**2 - SIZE, SIZE**2 - 1)
+
+
+def falling_sheet() -> r2s.Scenario:
+    """The four corners come together within a second, in vacuum, while the sheet falls."""
+    mesh = rectangle((SIDE, SIDE), (SIZE, SIZE))
+    start = np.pad(np.asarray(mesh.rest), ((0, 0), (0, 1)), constant_values=HEIGHT)
+    corners = start[np.array(CORNERS)]
+    times = INTERVAL * np.arange(FRAMES + 1)
+    eased = np.clip(times, 0, 1) ** 2 * (3 - 2 * np.clip(times, 0, 1))
+    way = (corners.mean(axis=0) - corners) / 20
+    scene = r2s.Scene(mesh, jnp.array(CORNERS), air=None)
+    return r2s.Scenario(
+        scene=scene,
+        start=jnp.asarray(start, float),
+        path=jnp.asarray(corners + eased[:, None, None] * way, float),
+        path_times=jnp.asarray(times, float),
+        first_time=jnp.asarray(INTERVAL, float),
+        interval=INTERVAL,
+        num_frames=FRAMES,
+        lead_in=1,
+        substeps=4,
+        acceleration=jnp.where(scene.is_free[:, None], jnp.array([0.0, 0.0, -GRAVITY]), 0.0),
+    )
+
+
+def in_mujoco(scenario: r2s.Scenario) -> np.ndarray:
+    """Positions [m] (vertex, 3) of the exported fabric at the end, without contact."""
+    engine = pytest.importorskip("mujoco", reason="needs r2s[mujoco]")
+    step, options = INTERVAL / STEPS, {"pinned": CORNERS, "height": HEIGHT, "table": None}
+    text, _ = mujoco.mjcf(FALLING, scenario.scene.mesh, timestep=step, **options)
+    model = engine.MjModel.from_xml_string(text)
+    model.opt.disableflags |= engine.mjtDisableBit.mjDSBL_CONTACT
+    mujoco.brake(model, FALLING)
+    data = engine.MjData(model)
+    for pinned in np.asarray(scenario.controls(STEPS).pinned):
+        data.mocap_pos[:] = pinned
+        engine.mj_step(model, data)
+    engine.mj_kinematics(model, data)  # positions lag by a step otherwise
+    engine.mj_flex(model, data)
+    return data.flexvert_xpos.copy()
+
+
+@pytest.mark.slow(group="motions")
+def test_an_exported_fabric_hangs_in_mujoco_as_ours_does() -> None:
+    """As users run it: in single precision, promotion as usual."""
+    with (
+        jax.enable_x64(False),
+        jax.numpy_dtype_promotion("standard"),
+        jax.numpy_rank_promotion("allow"),
+    ):
+        scenario = falling_sheet()
+        theirs = in_mujoco(scenario)
+        ours = np.asarray(eqx.filter_jit(r2s.rollout)(scenario, FALLING).x)
+    distance = np.sqrt(np.mean(np.sum((ours[-1] - theirs) ** 2, axis=-1))) / SIDE
+    moved = np.sqrt(np.mean(np.sum((ours[-1] - ours[0]) ** 2, axis=-1))) / SIDE
+    assert distance < 0.05 < moved
