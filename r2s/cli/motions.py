@@ -151,7 +151,7 @@ class Sensitivity:
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from r2s.export import Loss
+    from r2s.export.stiffness import Loss
     from r2s.materials.fabric import Fabric
 
 
@@ -225,10 +225,9 @@ class Export:
             write_json(self.out, {"loadSoftBody": arguments})
             return loss
         kind = "vbd" if self.to == "newton-vbd" else "semi_implicit"
-        made, loss = newton.cloth(fabric, mesh, kind, yarns=yarns)
-        damping = float(fabric.damping)
-        rows = newton.spring_arguments(made.springs, damping) if made.springs else []
-        model = {"add_cloth_mesh": made.arguments, "add_spring": rows, "fields": made.fields}
+        cloth, loss = newton.cloth(fabric, mesh, kind, yarns=yarns)
+        springs, fields = cloth.springs, cloth.fields
+        model = {"add_cloth_mesh": cloth.arguments, "add_spring": springs, "fields": fields}
         write_json(self.out, model)
         return loss
 

@@ -48,11 +48,12 @@ def mjcf(
     Vertex i is the body "v<i>" and number i of the flex "cloth". Raises `ValueError` for a batch,
     for a membrane without positive stiffness, and with yarns for a mesh that has none.
     """
-    sheet = stiffness.nearest_sheet(fabric, yarns, POISSON, negative=False)
-    tendons = ""
     if yarns:
+        sheet = stiffness.with_springs(fabric, POISSON, negative=False)
         springs = stiffness.yarn_springs(mesh, sheet.warp, sheet.weft)
         tendons = _tendons(springs, float(fabric.damping))
+    else:
+        sheet, tendons = stiffness.nearest_isotropic(fabric, POISSON), ""
     lost = (LARGE,) if yarns else ()
     lost += (RIGID,) if float(fabric.mass_damping) else ()
     friction = f'friction="{float(fabric.friction)!r} 0.005 0.0001"'
@@ -80,7 +81,7 @@ def mjcf(
 def brake(model: Any, fabric: Fabric) -> None:
     """Set the mass damping [1/s] of a model of MuJoCo in which all that moves is this fabric.
 
-    MJCF knows no damping of a flex's joints; the engine does.
+    MJCF has no damping of a flex's joints; the engine does.
     """
     mass = np.asarray(model.body_mass)[np.asarray(model.dof_bodyid)]
     model.dof_damping[:] = float(fabric.mass_damping) * mass

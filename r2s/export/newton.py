@@ -20,7 +20,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from r2s.export import stiffness
-from r2s.export.stiffness import Loss, Springs
+from r2s.export.stiffness import Loss
 from r2s.materials.fabric import Fabric
 from r2s.mesh.mesh import Mesh
 
@@ -37,12 +37,12 @@ RIGID = "mass damping is not expressible: multiply velocities by exp(-rate dt) i
 
 class Cloth(NamedTuple):
     """- `arguments`: for `add_cloth_mesh`.
-    - `springs`: for `add_spring` (`spring_arguments`); None: the sheet is isotropic.
+    - `springs`: for `add_spring`, of each; none: the sheet is isotropic.
     - `fields`: to set on the finished model: of contact.
     """
 
     arguments: dict[str, float]
-    springs: Springs | None
+    springs: list[dict[str, Any]]
     fields: dict[str, float]
 
 
@@ -58,14 +58,19 @@ def cloth(
     Raises `ValueError` for a batch, for a membrane without positive stiffness, and with yarns for a
     mesh that has none.
     """
-    sheet = stiffness.nearest_sheet(fabric, yarns)
-    springs = stiffness.yarn_springs(mesh, sheet.warp, sheet.weft) if yarns else None
+    sheet = stiffness.with_springs(fabric) if yarns else stiffness.nearest_isotropic(fabric)
+    springs = []
+    if yarns:
+        pairs, constants, _ = stiffness.yarn_springs(mesh, sheet.warp, sheet.weft)
+        for (i, j), k in zip(pairs.tolist(), constants.tolist(), strict=True):
+            damping = float(fabric.damping) * max(k, 0.0)
+            springs.append({"i": i, "j": j, "ke": k, "kd": damping, "control": 0.0})
     lost = (LARGE, EDGES, DAMPING[kind])
     lost += (RIGID,) if float(fabric.mass_damping) else ()
     near = stiffness.isotropic(sheet.modulus, sheet.poisson)
     contact = {"soft_contact_mu": float(fabric.friction)}
-    made = Cloth(_arguments(fabric, mesh, kind, near), springs, contact)
-    return made, stiffness.loss_of(fabric, sheet.stiffness, mesh, lost)
+    cloth = Cloth(_arguments(fabric, mesh, kind, near), springs, contact)
+    return cloth, stiffness.loss_of(fabric, sheet.stiffness, mesh, lost)
 
 
 def _arguments(fabric: Fabric, mesh: Mesh, kind: Kind, sheet: np.ndarray) -> dict[str, float]:
@@ -83,14 +88,6 @@ def _arguments(fabric: Fabric, mesh: Mesh, kind: Kind, sheet: np.ndarray) -> dic
         "edge_kd": float(np.mean(kd)),
         "particle_radius": float(fabric.thickness),
     }
-
-
-def spring_arguments(found: Springs, damping: float) -> list[dict[str, Any]]:
-    """The arguments of `add_spring` for each spring; `damping` is the fabric's time [s]."""
-    rows = zip(found.ends.tolist(), found.constants.tolist(), strict=True)
-    return [
-        {"i": i, "j": j, "ke": k, "kd": damping * max(k, 0.0), "control": 0.0} for (i, j), k in rows
-    ]
 
 
 def edge_factors(

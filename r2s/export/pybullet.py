@@ -26,8 +26,7 @@ def soft_body(fabric: Fabric, mesh: Mesh) -> tuple[dict[str, float | int], Loss]
 
     Raises `ValueError` for a batch, and for a membrane without positive stiffness.
     """
-    stiffness.check_single(fabric)
-    own = stiffness.positive_probes(stiffness.membrane_stiffness(fabric))
+    own = stiffness.positive_probes(fabric)
     unit = stiffness.probes(spring_stiffness(mesh))
     spring = float(np.exp(np.mean([np.log(own[name] / unit[name]) for name in own])))
     lost = (CAUCHY, NO_BENDING, MASSES)

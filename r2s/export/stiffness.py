@@ -10,7 +10,6 @@ has C11 = C12 + 2 C33. So with the fabric's C12 and C33 and k = C11 - C12 - 2 C3
 the fabric's stiffness at small strains, exactly. A k may be negative; the sum is stable.
 """
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -33,12 +32,11 @@ NEGLIGIBLE = 1e-6  # of the sheet's stiffness: springs that are at their bound, 
 VARIABLE = ("Table", "Spring", "Stiffening", "Softening")  # in names of laws without one stiffness
 
 
-@dataclass(frozen=True)
-class Loss:
+class Loss(NamedTuple):
     """What an export loses.
 
     - `membrane`: by probe, the relative error of the exported energy at a small strain: pulls along
-      warp, bias and weft with free sides, shear, and both yarns alike.
+      warp, bias and weft with free sides, shear, and both yarns equally.
     - `bending`: likewise of cylinders along warp, weft and both biases; empty: not exported.
     - `lost`: what else is, in words.
     """
@@ -46,11 +44,6 @@ class Loss:
     membrane: dict[str, float]
     bending: dict[str, float]
     lost: tuple[str, ...]
-
-    @property
-    def worst(self) -> float:
-        """The largest error of all probes' energies, relative."""
-        return max((abs(e) for e in (*self.membrane.values(), *self.bending.values())), default=0.0)
 
 
 class Sheet(NamedTuple):
@@ -114,18 +107,14 @@ def probes(stiffness: Stiffness) -> dict[str, float]:
     }
 
 
-def positive_probes(stiffness: Stiffness) -> dict[str, float]:
-    """`probes`; raises `ValueError` when one has no positive energy."""
-    found = probes(stiffness)
-    if not min(found.values()) > 0:
-        raise ValueError(f"the membrane has no positive stiffness in every probe: {found}")
-    return found
-
-
-def check_single(fabric: Fabric) -> None:
-    """Raise `ValueError` for a batch of fabrics."""
+def positive_probes(fabric: Fabric) -> dict[str, float]:
+    """`probes` of a fabric; raises `ValueError` for a batch, or when one has no positive energy."""
     if shape := jnp.shape(fabric.density):
         raise ValueError(f"one fabric is exported at a time, got a batch of shape {shape}")
+    own = probes(membrane_stiffness(fabric))
+    if not min(own.values()) > 0:
+        raise ValueError(f"the membrane has no positive stiffness in every probe: {own}")
+    return own
 
 
 # The nearest sheet
@@ -137,13 +126,12 @@ def isotropic(modulus: float, poisson: float) -> Stiffness:
     return np.array([[c11, poisson * c11, 0], [poisson * c11, c11, 0], [0, 0, shear]])
 
 
-def nearest_isotropic(stiffness: Stiffness, bounds: tuple[float, float] = BOUNDS) -> Sheet:
+def nearest_isotropic(fabric: Fabric, bounds: tuple[float, float] = BOUNDS) -> Sheet:
     """The nearest isotropic sheet with Poisson's ratio within bounds.
 
-    An isotropic stiffness within the bounds comes back to rounding. Raises `ValueError` when a
-    probe has no positive energy.
+    An isotropic stiffness within the bounds comes back to rounding. Raises as `positive_probes`.
     """
-    own = positive_probes(stiffness)
+    own, stiffness = positive_probes(fabric), membrane_stiffness(fabric)
 
     def ratios(poisson: float) -> np.ndarray:
         unit = probes(isotropic(1.0, poisson))
@@ -152,52 +140,31 @@ def nearest_isotropic(stiffness: Stiffness, bounds: tuple[float, float] = BOUNDS
     poisson = float(np.clip(stiffness[0, 1] / stiffness[0, 0], *bounds))
     if np.ptp(ratios(poisson)) > 1e-6:
         options = {"xatol": 1e-9}
-        found: Any = minimize_scalar(
+        minimum: Any = minimize_scalar(
             lambda p: np.var(ratios(p)), bounds=bounds, method="bounded", options=options
         )
-        poisson = float(found.x)
+        poisson = float(minimum.x)
     return Sheet(float(np.exp(ratios(poisson).mean())), poisson)
 
 
-def nearest_sheet(
-    fabric: Fabric,
-    yarns: bool,
-    poisson: tuple[float, float] = BOUNDS,
-    negative: bool = True,
-) -> Sheet:
-    """A fabric as an isotropic sheet, with springs along its `yarns` or without.
-
-    - `poisson`: bounds of Poisson's ratio. - `negative`: whether springs may be.
-
-    Raises `ValueError` for a batch, and for a membrane without positive stiffness.
-    """
-    check_single(fabric)
-    own = membrane_stiffness(fabric)
-    return with_springs(own, poisson, negative) if yarns else nearest_isotropic(own, poisson)
-
-
 def with_springs(
-    stiffness: Stiffness, poisson: tuple[float, float] = BOUNDS, negative: bool = True
+    fabric: Fabric, poisson: tuple[float, float] = BOUNDS, negative: bool = True
 ) -> Sheet:
-    """The isotropic sheet, with Poisson's ratio within bounds, and the springs beside it.
+    """The isotropic sheet, with Poisson's ratio within bounds, and the springs along its yarns.
 
     Exact where such a sheet is within the bounds and its springs positive or allowed to be
-    `negative`; else the nearest, by the probes' logarithms. Raises `ValueError` for a membrane
-    whose shear is coupled to its yarns, or without positive stiffness in every probe.
+    `negative`; else the nearest, by the probes' logarithms. Raises as `positive_probes`, and
+    `ValueError` for a membrane whose shear is coupled to its yarns.
     """
+    start, stiffness = nearest_isotropic(fabric, poisson), membrane_stiffness(fabric)
     if np.abs(stiffness[2, :2]).max() > 1e-6 * np.abs(stiffness).max():
         raise ValueError(f"warp and weft are not the axes of this membrane: {stiffness}")
-    start = nearest_isotropic(stiffness, poisson)
     c11, c12, c22, c33 = (float(stiffness[i]) for i in ((0, 0), (0, 1), (1, 1), (2, 2)))
     base = c12 + 2 * c33
     ratio = c12 / base if base > 0 else np.inf
     springs = (c11 - base, c22 - base)
     if poisson[0] <= ratio <= poisson[1] and (negative or min(springs) >= 0):
         return Sheet(base * (1 - ratio**2), ratio, *springs)
-    return _fitted(stiffness, poisson, start)
-
-
-def _fitted(stiffness: Stiffness, poisson: tuple[float, float], start: Sheet) -> Sheet:
     own, scale = probes(stiffness), start.modulus
 
     def sheet_of(parameters: np.ndarray) -> Sheet:
@@ -206,8 +173,8 @@ def _fitted(stiffness: Stiffness, poisson: tuple[float, float], start: Sheet) ->
         return Sheet(float(scale * np.exp(modulus)), ratio, warp, weft)
 
     def residuals(parameters: np.ndarray) -> np.ndarray:
-        found = probes(sheet_of(parameters).stiffness)
-        return np.log([found[name] / own[name] for name in own])
+        exported = probes(sheet_of(parameters).stiffness)
+        return np.log([exported[name] / own[name] for name in own])
 
     bounds = [-5.0, poisson[0], 0.0, 0.0], [5.0, poisson[1], 100.0, 100.0]
     ratio = np.clip(start.poisson, poisson[0] + 1e-3, poisson[1] - 1e-3)
@@ -276,12 +243,12 @@ def hinge_bending(mesh: Mesh, stiffness: float) -> dict[str, float]:
         density = jax.vmap(law.energy_density)(law.curvatures(mesh, bent))
         return float(jnp.sum(law.areas(mesh) * density))
 
-    found = {}
+    bending = {}
     for name, angle in DIRECTIONS.items():
         along = flat @ [np.cos(angle), np.sin(angle)]
         cylinder = np.concatenate([flat, CURVATURE * along[:, None] ** 2 / 2], axis=1)
-        found[name] = stiffness * energy(hinges, cylinder) / energy(plate, cylinder)
-    return found
+        bending[name] = stiffness * energy(hinges, cylinder) / energy(plate, cylinder)
+    return bending
 
 
 # What is lost
@@ -299,14 +266,13 @@ def loss_of(fabric: Fabric, near: Stiffness, mesh: Mesh | None, lost: tuple[str,
     - `mesh`: on which it bends by hinges of `hinge_stiffness`; None: it does not bend.
     - `lost`: what else is.
     """
-    hinges, bending = hinge_stiffness(fabric, mesh) if mesh is not None else 0.0, {}
-    if mesh is not None and hinges:
+    bending = {}
+    if mesh is not None and (hinges := hinge_stiffness(fabric, mesh)):
         bending = relative_errors(hinge_bending(mesh, hinges), bending_stiffness(fabric))
     membrane = relative_errors(probes(near), probes(membrane_stiffness(fabric)))
-    laws = ((fabric.membrane, "strain"), (fabric.bending, "curvature"))
-    variable = tuple(
-        f"{name}: stiffness follows the {what}; that of the flat sheet at rest is exported"
-        for name, what in ((type(law).__name__, what) for law, what in laws)
-        if any(word in name for word in VARIABLE)
-    )
-    return Loss(membrane, bending, (*variable, *lost))
+    for law, what in ((fabric.bending, "curvature"), (fabric.membrane, "strain")):
+        name = type(law).__name__
+        if any(word in name for word in VARIABLE):
+            text = f"{name}: stiffness follows the {what}; that of the flat sheet is exported"
+            lost = (text, *lost)
+    return Loss(membrane, bending, lost)

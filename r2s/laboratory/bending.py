@@ -25,6 +25,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy.integrate import solve_ivp
 from scipy.optimize import root_scalar
 
+from r2s._util.checks import expect
 from r2s._util.units import GRAVITY
 from r2s.environment.scene import Control, Scene
 from r2s.materials.fabric import Fabric
@@ -68,18 +69,11 @@ class Cantilever(eqx.Module):
         for readings that differ by more than a factor of two.
         """
         read = np.asarray(overhangs, float)
-        if read.ndim != 1 or not read.size or not np.isfinite(read).all() or not (read > 0).all():
-            raise ValueError(f"{name}: overhangs must be positive [m], got {read.tolist()}")
-        if read.max() > 0.5 or read.min() < 0.005:
-            raise ValueError(
-                f"{name}: overhangs of fabrics are 0.005 to 0.5 m, got {read.tolist()}: are they "
-                "in centimetres, or bending lengths?"
-            )
-        if read.max() > 2 * read.min():
-            raise ValueError(
-                f"{name}: the readings differ by more than twice, {read.tolist()} m: are they of "
-                "one direction?"
-            )
+        is_length = read.ndim == 1 and read.size > 0 and ((read > 0.005) & (read < 0.5)).all()
+        given = f"{name}: overhangs of fabrics are 0.005 to 0.5 m, got {read.tolist()}"
+        expect(is_length, f"{given}: are they in centimetres, or bending lengths?")
+        is_one = read.max() < 2 * read.min()
+        expect(is_one, f"{name}: overhangs of one direction do not differ so: {read.tolist()} m")
         scatter = np.std(np.log(read), ddof=1) / np.sqrt(len(read)) if len(read) > 1 else 0.0
         deviation = max(float(scatter), OVERHANG_DEVIATION)
         mean = float(np.exp(np.mean(np.log(read))))
@@ -123,9 +117,9 @@ def _elastica(slope: float) -> float:
     def shape(tip: float) -> tuple[float, float]:
         """Length [-] and slope of the chord [rad] of a strip whose tip has a slope [rad]."""
         start = [tip, 0.0, 0.0, 0.0]
-        found = solve_ivp(rates, (0, 100), start, events=clamped, rtol=1e-9, atol=1e-12)
-        _, _, run, drop = found.y[:, -1]
-        return float(found.t[-1]), float(np.arctan2(drop, run))
+        strip = solve_ivp(rates, (0, 100), start, events=clamped, rtol=1e-9, atol=1e-12)
+        _, _, run, drop = strip.y[:, -1]
+        return float(strip.t[-1]), float(np.arctan2(drop, run))
 
     bracket = 1e-3, np.pi / 2 - 1e-3
     tip = root_scalar(lambda tip: shape(float(tip))[1] - slope, bracket=bracket).root
@@ -156,19 +150,14 @@ class Drape(eqx.Module):
     ) -> "Drape":
         """Raises `ValueError` that names the test for a coefficient in per cent, and for radii that
         are diameters or none in metres."""
-        if not 0 < coefficient < 1:
-            raise ValueError(
-                f"{name}: a drape coefficient is a share from 0 to 1, got {coefficient}: "
-                "is it in per cent?"
-            )
+        is_share = 0 < coefficient < 1
+        expect(is_share, f"{name}: a coefficient is 0 to 1, got {coefficient}: is it in per cent?")
         specimen, support = radii
-        if not SMALLEST <= support <= specimen - SMALLEST or specimen > 0.2:
-            raise ValueError(
-                f"{name}: the radii [m] of specimen and support are such as {RADII}, got {radii}: "
-                "are they diameters, or in centimetres?"
-            )
-        if not 0 < deviation < 0.5:
-            raise ValueError(f"{name}: the deviation is a share such as 0.03, got {deviation}")
+        is_ring = SMALLEST <= support <= specimen - SMALLEST and specimen <= 0.2
+        given = f"{name}: the radii of specimen and support are such as {RADII} m, got {radii}"
+        expect(is_ring, f"{given}: are they diameters, or in centimetres?")
+        is_error = 0 < deviation < 0.5
+        expect(is_error, f"{name}: the deviation is a share such as 0.03, got {deviation}")
         mean, error = (jnp.asarray(n, float) for n in (coefficient, deviation))
         return cls(mean, error, (float(specimen), float(support)), name)
 
@@ -195,39 +184,33 @@ class Ring(eqx.Module):
     radii: tuple[float, float] = eqx.field(static=True)
 
 
+@cache
 def ring(radii: tuple[float, float] = RADII, shape: tuple[int, int] = RING_SHAPE) -> Ring:
     """The ring of a specimen, with `shape` vertices around and cells from the support to the rim.
 
-    `radii`: of specimen and support, [m].
+    `radii`: of specimen and support, [m]. Each circle is turned by half a vertex against the last.
     """
-    with jax.ensure_compile_time_eval():  # sizes follow from the mesh, also under `jax.jit`
-        return _ring(radii, shape)
-
-
-@cache
-def _ring(radii: tuple[float, float], shape: tuple[int, int]) -> Ring:
-    around, cells = shape
+    num_around, cells = shape
     width = (radii[0] - radii[1]) / cells
     circles = radii[1] + width * np.arange(-1, cells + 1)
-    turns = 2 * np.pi * (np.arange(around) + np.arange(len(circles))[:, None] % 2 / 2) / around
+    half = np.arange(len(circles))[:, None] % 2 / 2
+    turns = 2 * np.pi * (np.arange(num_around) + half) / num_around
     rest = circles[:, None, None] * np.stack([np.cos(turns), np.sin(turns)], axis=-1)
-    mesh = Mesh.make(rest.reshape(-1, 2), _faces(around, len(circles)))
-    scene = Scene(mesh, range(2 * around), air=None)
-    settling, resting = (ImplicitCloth(scene, dt) for dt, _ in (SETTLING, RESTING))
-    return Ring(settling, resting, around, radii)
+    faces = [_faces_between(circle, num_around) for circle in range(len(circles) - 1)]
+    with jax.ensure_compile_time_eval():  # sizes follow from the mesh, also under `jax.jit`
+        mesh = Mesh.make(rest.reshape(-1, 2), np.concatenate(faces))
+        scene = Scene(mesh, range(2 * num_around), air=None)
+        settling, resting = (ImplicitCloth(scene, dt) for dt, _ in (SETTLING, RESTING))
+    return Ring(settling, resting, num_around, radii)
 
 
-def _faces(around: int, circles: int) -> Int[np.ndarray, "face 3"]:
-    """Triangles between circles, each of which is turned by half a vertex against the last."""
-    here = np.arange(around)
-    ahead = (here + 1) % around
-    faces = []
-    for circle in range(circles - 1):
-        a, b = here + circle * around, ahead + circle * around
-        c, d = a + around, b + around
-        pairs = [(a, c, b), (b, c, d)] if circle % 2 == 0 else [(a, d, b), (a, c, d)]
-        faces += [np.stack(pair, axis=1) for pair in pairs]
-    return np.concatenate(faces)
+def _faces_between(circle: int, num_around: int) -> Int[np.ndarray, "face 3"]:
+    """Triangles between a circle and the next one."""
+    a = np.arange(num_around) + circle * num_around
+    b = np.roll(a, -1)
+    c, d = a + num_around, b + num_around
+    corners = [(a, c, b), (b, c, d)] if circle % 2 == 0 else [(a, d, b), (a, c, d)]
+    return np.concatenate([np.stack(each, axis=1) for each in corners])
 
 
 def drape(specimen: Ring, fabric: Fabric, key: PRNGKeyArray) -> Float[Array, "vertex 3"]:

@@ -1,7 +1,7 @@
 """The fabric that best explains laboratory tests, and the prior that it gives to motions.
 
-    found = estimate((pull_along_warp, pull_along_weft, cantilever), on_cloth(density))
-    space = informed(on_cloth(density), found)      # for an estimate from motions beside them
+    by_tests = estimate((pull_along_warp, pull_along_weft, cantilever), on_cloth(density))
+    space = informed(on_cloth(density), by_tests)      # for an estimate from motions beside them
 
 The estimate has the least sum of squares of all tests' residuals and of the prior of the space.
 Standard errors are those of the linearised problem; where the tests scatter by more than they
@@ -41,8 +41,8 @@ POOR_FIT = 3.0  # standard deviations (root mean square), beyond which a test do
 
 
 class Fit(NamedTuple):
-    """How an estimate fits one test: its name, the root mean square of its residuals [standard
-    deviations], and the measured and expected value in `words`."""
+    """The name of a test, the rms of its residuals [standard deviations], and what was measured and
+    is expected in `words`."""
 
     test: str
     errors: float
@@ -54,11 +54,9 @@ def estimate(
 ) -> Estimate:
     """The fabric of a space that explains some tests of it.
 
-    Parameters on which no test depends stay at the prior mean. `progress` is called with the number
-    of steps and the loss, a mean square of residuals, [-].
-
-    Raises `ValueError` without a test, and `RuntimeError` where no specimen of a drape comes to
-    rest.
+    Parameters on which no test depends stay at the prior mean. `progress` reports what is being
+    done. Raises `ValueError` without a test, and `RuntimeError` where no specimen of a drape comes
+    to rest.
     """
     if not tests:
         raise ValueError("no laboratory test")
@@ -68,10 +66,10 @@ def estimate(
     start = np.asarray(space.prior()[0])
     if quick:
         others = np.random.default_rng(0).random((STARTS - 1, space.dim))
-        ends = [_descend(quick, space, each, progress) for each in (start, *others)]
+        ends = [_descend(quick, space, place) for place in (start, *others)]
         start = min(ends, key=lambda end: end[0])[1]
     tell(progress, "simulating drapes" if len(quick) < len(tests) else "fitting")
-    loss, end, converged = _descend(tests, space, start, progress)
+    loss, end, converged = _descend(tests, space, start)
     if not np.isfinite(loss):
         raise RuntimeError("no specimen of the drape test comes to rest: are its radii right?")
     place = jnp.asarray(end, float)
@@ -95,19 +93,19 @@ def estimate(
     )
 
 
-def informed(space: ParameterSpace, found: Estimate) -> InformedSpace:
+def informed(space: ParameterSpace, by_tests: Estimate) -> InformedSpace:
     """The space with an estimate from laboratory tests as its prior."""
-    precision = jnp.asarray(np.linalg.inv(_covariance(found)), float)
-    return InformedSpace.make(space, space.to_unit(found.fabric), precision, measured=True)
+    precision = jnp.asarray(np.linalg.inv(_covariance(by_tests)), float)
+    return InformedSpace.make(space, space.to_unit(by_tests.fabric), precision, measured=True)
 
 
-def consistency(by_tests: Estimate, found: Estimate) -> float:
+def consistency(by_tests: Estimate, by_motions: Estimate) -> float:
     """The p-value of an estimate from motions, given that of the tests that are its prior, [-].
 
-    The difference has the covariance of `by_tests` less that of `found` (Hausman, Econometrica 46,
-    1978), and the error of its mesh, where that was estimated. In directions that the motions did
-    not improve, the errors of mesh and law are independent: there the covariances add. Counted are
-    the parameters that the tests identify.
+    The difference has the covariance of `by_tests` less that of `by_motions` (Hausman, Econometrica
+    46, 1978), and the error of the mesh, where that was estimated. In directions that the motions
+    did not improve, the errors of mesh and law are independent: there the covariances add. Only
+    parameters that the tests identify count.
     """
     ranges = by_tests.ranges
     widths = np.array([bound.width for bound in ranges])
@@ -119,13 +117,13 @@ def consistency(by_tests: Estimate, found: Estimate) -> float:
         pairs = zip(ranges, estimate.values, strict=True)
         return np.array([float(bound.to_unit(jnp.asarray(v, float))) for bound, v in pairs])
 
-    off = (place(found) - place(by_tests))[which]
-    before, after = (_covariance(each)[np.ix_(which, which)] for each in (by_tests, found))
+    off = (place(by_motions) - place(by_tests))[which]
+    before, after = (_covariance(one)[np.ix_(which, which)] for one in (by_tests, by_motions))
     variances, axes = np.linalg.eigh(before - after)
     sums = np.einsum("ij,ik,kj->j", axes, before + after, axes)
     variances = np.where(variances > SLACK * np.max(np.linalg.eigvalsh(before)), variances, sums)
-    if found.mesh_bias is not None:
-        variances = variances + (axes**2).T @ (found.mesh_bias / widths)[which] ** 2
+    if by_motions.mesh_bias is not None:
+        variances = variances + (axes**2).T @ (by_motions.mesh_bias / widths)[which] ** 2
     return float(chi2.sf(np.sum((axes.T @ off) ** 2 / variances), len(off)))
 
 
@@ -144,9 +142,9 @@ def _fit(test: Test, fabric: Fabric) -> Fit:
     residuals = np.asarray(_residuals_of(test, fabric))
     errors = float(np.sqrt(np.sum(residuals**2) / test.count))
     if isinstance(test, Pull):
-        most, force = float(test.stretch.max()) - 1, float(test.tension.max())
+        most, largest = float(test.stretch.max()) - 1, float(test.tension.max())
         share = float(test.misfit(fabric))
-        words = f"up to {force:.3g} N/m at {most:.1%}: off by {share:.1%} of that (rms)"
+        words = f"up to {largest:.3g} N/m at {most:.1%}: off by {share:.1%} of that (rms)"
     elif isinstance(test, Cantilever):
         measured, expected = float(test.overhang), float(overhang(fabric, test.direction))
         words = f"overhang {1e3 * measured:.1f} mm measured, {1e3 * expected:.1f} mm expected"
@@ -162,44 +160,34 @@ def _residuals_of(test: Test, fabric: Fabric) -> Array:
     return test.residuals(fabric)
 
 
+def _residuals(u: Array, args: tuple[tuple[Test, ...], ParameterSpace]) -> Array:
+    tests, space = args
+    return jnp.concatenate([test.residuals(space(u)) for test in tests])
+
+
 def _descend(
-    tests: tuple[Test, ...], space: ParameterSpace, start, progress: Progress | None
+    tests: tuple[Test, ...], space: ParameterSpace, start: np.ndarray
 ) -> tuple[float, np.ndarray, bool]:
-    """A descent of `BoundedGaussNewton` within the cube: the mean square of the residuals, with
+    """The least squares from a start within the unit cube: the mean square of the residuals and of
     those of the prior, [-]; the place; and whether it converged."""
     mean, precision = space.prior()
     low, high = MARGIN, 1 - MARGIN
     solver = BoundedGaussNewton(
         rtol=TOLERANCE, atol=TOLERANCE, low=low, high=high, mean=mean, precision=precision
     )
-    place, given = jnp.clip(jnp.asarray(start, float), low, high), (tests, space)
-    state = solver.init(_residuals, place, given, {}, None, None, frozenset())
-    size = len(jax.eval_shape(_residuals, place, given)[0]) + space.dim
-    for count in range(1, MAX_STEPS + 1):
-        place, state, is_done, result = _step(solver, place, given, state)
-        if progress is not None:
-            progress(count, 2 * float(state.loss) / size)
-        if is_done:
-            break
-    converged = bool(is_done) and bool(result == optimistix.RESULTS.successful)
-    return 2 * float(state.loss) / size, np.asarray(place), converged
-
-
-@eqx.filter_jit
-def _step(solver: BoundedGaussNewton, place: Array, given, state):
-    place, state, _ = solver.step(_residuals, place, given, {}, state, frozenset())
-    return place, state, *solver.terminate(_residuals, place, given, {}, state, frozenset())
-
-
-def _residuals(u: Array, given: tuple[tuple[Test, ...], ParameterSpace]):
-    tests, space = given
-    return jnp.concatenate([test.residuals(space(u)) for test in tests]), None
+    place, args = jnp.clip(jnp.asarray(start, float), low, high), (tests, space)
+    solution = optimistix.least_squares(
+        _residuals, solver, place, args, max_steps=MAX_STEPS, throw=False
+    )
+    size = len(jax.eval_shape(_residuals, place, args)) + space.dim
+    converged = bool(solution.result == optimistix.RESULTS.successful)
+    return 2 * float(solution.stats["loss"]) / size, np.asarray(solution.value), converged
 
 
 @eqx.filter_jit
 def _linearised(tests: tuple[Test, ...], space: ParameterSpace, u: Array):
     """Residuals of tests, and their derivative in a place."""
-    value, slope = jax.linearize(lambda u: _residuals(u, (tests, space))[0], u)
+    value, slope = jax.linearize(lambda u: _residuals(u, (tests, space)), u)
     return value, jax.vmap(slope, out_axes=1)(jnp.eye(len(u), dtype=u.dtype))
 
 

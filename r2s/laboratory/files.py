@@ -19,11 +19,12 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
+from r2s._util.checks import expect
 from r2s._util.extras import require
 from r2s._util.files import parse
 from r2s.laboratory.bending import DRAPE_DEVIATION, RADII, Cantilever, Drape
@@ -57,60 +58,29 @@ class LaboratoryTests(NamedTuple):
         return digest.hexdigest()
 
 
-def read_tests(path: Path | str) -> LaboratoryTests:
-    """Read a file of laboratory tests.
+@dataclass(frozen=True)
+class _Directed:
+    direction: float
 
-    Raises FileNotFoundError, or a ValueError that names the file and the test: no JSON, another
-    format, keys that are missing or unknown, units and values that no test has, no test at all.
-    """
-    path = Path(path)
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: no JSON: {error}") from error
-    if not isinstance(stored, dict) or stored.get("format") != FORMAT:
-        found = stored.get("format") if isinstance(stored, dict) else type(stored).__name__
-        raise ValueError(f"{path}: laboratory tests have the format {FORMAT!r}, found {found!r}")
-    if unknown := sorted(set(stored) - {"format", "source", *KINDS}):
-        raise ValueError(
-            f"{path}: unknown: {', '.join(unknown)}; known: source, {', '.join(KINDS)}"
-        )
-    source = stored.get("source", "")
-    if not isinstance(source, str):
-        raise ValueError(f"{path}: source: expected text, found {source!r}")
-    tests: list[Test] = []
-    for name, kind in KINDS.items():
-        entries = stored.get(name, [])
-        if not isinstance(entries, list):
-            raise ValueError(f"{path}: {name}: expected a list, found {type(entries).__name__}")
-        for number, entry in enumerate(entries, 1):
-            where = f"{path}: {name[:-1]} {number}"
-            tests += _entry(kind, where, entry).read(path.parent, where)
-    if not tests:
-        raise ValueError(f"{path}: no test: it has neither {', '.join(KINDS)}")
-    return LaboratoryTests(tuple(tests), source, path.stem)
+    def __post_init__(self) -> None:
+        names = ", ".join(DIRECTIONS)
+        is_angle = 0 <= self.direction <= math.pi
+        expect(is_angle, f"direction: {names}, or 0 to pi rad, found {self.direction:g}")
 
 
 @dataclass(frozen=True)
-class _Knit:
+class _Pull(_Directed):
     file: str
-    direction: float
+    length: float = math.nan  # a file of stitch-by-stitch has its own
+    width: float = math.nan
     specimen: float = SPECIMEN
 
-    def read(self, folder: Path, where: str) -> list[Test]:
-        return list(read_knit(_existing(folder / self.file, where), self.direction, self.specimen))
-
-
-@dataclass(frozen=True)
-class _Pull:
-    file: str
-    direction: float
-    length: float
-    width: float
-    specimen: float = SPECIMEN
-
-    def read(self, folder: Path, where: str) -> list[Test]:
-        file = _existing(folder / self.file, where)
+    def read(self, folder: Path, where: str) -> list[Pull]:
+        file = folder / self.file
+        if not file.is_file():
+            raise FileNotFoundError(f"{where}: no such file: {file}")
+        if file.suffix == ".h5":
+            return read_knit(file, self.direction, self.specimen)
         header = " ".join(header_of(file)).lower()
         units = {"extension": METRES} if "extension" in header else {"strain": SHARES}
         units |= {"force": NEWTONS} | ({"width": METRES} if "width" in header else {})
@@ -122,11 +92,10 @@ class _Pull:
 
 
 @dataclass(frozen=True)
-class _Cantilever:
-    direction: float
+class _Cantilever(_Directed):
     overhangs: tuple[float, ...]
 
-    def read(self, _: Path, where: str) -> list[Test]:
+    def read(self, _: Path, where: str) -> list[Cantilever]:
         return [Cantilever.make(self.overhangs, self.direction, name=where)]
 
 
@@ -137,37 +106,48 @@ class _Drape:
     support_radius: float = RADII[1]
     deviation: float = DRAPE_DEVIATION
 
-    def read(self, _: Path, where: str) -> list[Test]:
+    def read(self, _: Path, where: str) -> list[Drape]:
         radii = self.specimen_radius, self.support_radius
         return [Drape.make(self.coefficient, radii, self.deviation, name=where)]
 
 
-KINDS: dict[str, Any] = {"pulls": _Pull, "cantilevers": _Cantilever, "drapes": _Drape}
+@dataclass(frozen=True)
+class _File:
+    format: str
+    source: str = ""
+    pulls: tuple[_Pull, ...] = ()
+    cantilevers: tuple[_Cantilever, ...] = ()
+    drapes: tuple[_Drape, ...] = ()
+
+    def __post_init__(self) -> None:
+        expect(self.format == FORMAT, f"expected the format {FORMAT}, found {self.format}")
 
 
-def _existing(file: Path, where: str) -> Path:
-    if not file.is_file():
-        raise FileNotFoundError(f"{where}: no such file: {file}")
-    return file
+def read_tests(path: Path | str) -> LaboratoryTests:
+    """Read a file of laboratory tests.
 
-
-def _entry(kind: Any, where: str, entry: Any) -> Any:
-    """An entry of a file, as one of `KINDS`, its direction as an angle [rad]."""
-    if kind is _Pull and isinstance(entry, dict) and str(entry.get("file")).endswith(".h5"):
-        kind = _Knit
-    if isinstance(entry, dict) and "direction" in entry:
-        direction: Any = DIRECTIONS.get(str(entry["direction"]), entry["direction"])
-        is_number = isinstance(direction, int | float) and not isinstance(direction, bool)
-        if not is_number or not 0 <= direction <= math.pi:
-            raise ValueError(
-                f"{where}: direction: expected {', '.join(DIRECTIONS)}, or an angle from the warp, "
-                f"0 to pi rad, found {direction!r}"
-            )
-        entry = entry | {"direction": direction}
+    Raises FileNotFoundError, or a ValueError that names the file and the test: no JSON, another
+    format, keys that are missing or unknown, units and values that no test has, no test at all.
+    """
+    path = Path(path)
     try:
-        return parse(kind, entry, where)
-    except OverflowError as error:
-        raise ValueError(f"{where}: a number is too large: {error}") from error
+        stored = json.loads(path.read_text(encoding="utf-8-sig"), object_hook=_with_angle)
+        content = parse(_File, stored, f"{path}")
+    except (json.JSONDecodeError, UnicodeDecodeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"{path}: no JSON: {error}") from error
+    tests: list[Test] = []
+    for kind in ("pulls", "cantilevers", "drapes"):
+        for number, entry in enumerate(getattr(content, kind), 1):
+            tests += entry.read(path.parent, f"{path}: {kind[:-1]} {number}")
+    expect(bool(tests), f"{path}: no test: it has neither pulls, nor cantilevers, nor drapes")
+    return LaboratoryTests(tuple(tests), content.source, path.stem)
+
+
+def _with_angle(entry: dict) -> dict:
+    """An object of the file, in which an angle [rad] replaces the name of a direction."""
+    if entry.get("direction") not in list(DIRECTIONS):
+        return entry
+    return entry | {"direction": DIRECTIONS[entry["direction"]]}
 
 
 def read_knit(path: Path | str, direction: float, specimen: float = SPECIMEN) -> list[Pull]:
@@ -182,37 +162,28 @@ def read_knit(path: Path | str, direction: float, specimen: float = SPECIMEN) ->
 
     `direction`: of the pull from the warp, [rad]: 0 for Y and pi/2 for X. `specimen`: see `Pull`.
 
-    Raises ValueError that names the file and the pull for arrays that are missing or of other
-    shapes; ImportError that names the extra.
+    Raises ValueError that names the file, and ImportError that names the extra.
     """
     path = Path(path)
     h5py = require("h5py", "laboratory", "the pulls of stitch-by-stitch")
     try:
         with h5py.File(path, "r") as file:
-            arrays = {
-                name: tuple(np.asarray(file[name][key], float) for key in ("traj", "forces"))
-                for name in KNIT_PULLS
-            }
+            forces = [np.asarray(file[name]["forces"], float) for name in KNIT_PULLS]
+            pins = [np.asarray(file[name]["traj"], float) for name in KNIT_PULLS]
             clamp, fabric = (float(file[key][0]) for key in ("clampSize", "fabricSize"))
-        if not min(clamp, fabric) > 0:
-            raise ValueError(f"sizes must be positive, found {clamp} and {fabric}")
+        # between the clamps, and between the sides, [pixel]
+        spans = [
+            np.linalg.norm([at[UPPER] - at[LOWER], at[RIGHT] - at[LEFT]], axis=1) for at in pins
+        ]
     except Exception as error:  # a file of another layout raises anything
         raise ValueError(f"{path}: no pulls of stitch-by-stitch: {error}") from error
-    spans = {}  # between the clamps, and between the sides, [pixel]
-    for name, (pins, force) in arrays.items():
-        if pins.ndim != 3 or pins.shape[0] < 4 or pins.shape[1:] != (2, len(force)):
-            raise ValueError(
-                f"{path}: {name}: expected pins (four or more, 2, {len(force)}), found {pins.shape}"
-            )
-        along, across = pins[UPPER] - pins[LOWER], pins[RIGHT] - pins[LEFT]
-        spans[name] = np.linalg.norm([along, across], axis=1)
-    length, width = spans[KNIT_PULLS[0]][:, 0]
+    expect(min(clamp, fabric) > 0, f"{path}: sizes must be positive, found {clamp} and {fabric}")
+    length, width = spans[0][:, 0]
     scale = CLAMP_WIDTH / clamp  # [m] a pixel
     size = float(length * scale), fabric * scale
     pulls = []
-    for name, (_, force) in arrays.items():
-        extension = (spans[name][0] - length) * scale
-        middle = spans[name][1] / width * size[1]
+    for name, (along, across), force in zip(KNIT_PULLS, spans, forces, strict=True):
+        extension, middle = (along - length) * scale, across / width * size[1]
         title = f"{path.name}: {name}"
         pulls.append(Pull.make(extension, force, size, direction, middle, specimen, title))
     return pulls

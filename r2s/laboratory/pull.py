@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from r2s._util.checks import expect
 from r2s.materials.fabric import Fabric
 from r2s.materials.membrane import MembraneLaw, turned
 
@@ -63,24 +64,16 @@ class Pull(eqx.Module):
         Raises `ValueError` that names the pull and what is wrong with the curve or its units.
         """
         length, wide = size
-        if not (0 < wide < 5 and 0 < length < 5):
-            raise ValueError(f"{name}: length and width are in metres, got {length} and {wide}")
         extension, force = np.asarray(extension, float), np.asarray(force, float)
-        if extension.shape != force.shape or extension.ndim != 1 or len(force) < 3:
-            raise ValueError(
-                f"{name}: expected three samples or more of extension and force, found "
-                f"{extension.shape} and {force.shape}"
-            )
-        if not 0 < specimen < 1:
-            raise ValueError(
-                f"{name}: specimen is a relative deviation such as 0.05, got {specimen}"
-            )
+        expect(0 < wide < 5 and 0 < length < 5, f"{name}: sizes are in metres, got {size}")
+        is_curve = extension.ndim == 1 and extension.shape == force.shape and len(force) >= 3
+        expect(is_curve, f"{name}: expected three samples or more, as many forces as extensions")
+        expect(0 < specimen < 1, f"{name}: specimen is a share such as 0.05, got {specimen}")
         stretch, tension = 1 + extension / length, force / wide
         middle = np.full(len(force), np.nan) if width is None else np.asarray(width, float) / wide
         _check(name, stretch, tension, middle)
         columns = _thinned(np.stack([stretch, tension, middle], axis=1))
-        if len(columns) < 3:
-            raise ValueError(f"{name}: fewer than three samples have a force above zero")
+        expect(len(columns) >= 3, f"{name}: fewer than three samples have a force above zero")
         stretches, tensions, widths = (jnp.asarray(column, float) for column in columns.T)
         angle, spread = (jnp.asarray(number, float) for number in (direction, specimen))
         return cls(stretches, tensions, widths, angle, spread, name)
@@ -141,59 +134,33 @@ def uniaxial(
         tangent = jax.jacfwd(slope, argnums=1)(along, free)
         return free - jnp.linalg.solve(tangent, slope(along, free))
 
-    found = jax.lax.stop_gradient(
-        jax.lax.fori_loop(0, NEWTON, lambda _, free: step(free), jnp.zeros(2, float))
-    )
-    free = step(found)  # from its minimum a step has the derivatives of the minimum
+    free = jax.lax.fori_loop(0, NEWTON, lambda _, free: step(free), jnp.zeros(2, float))
+    free = step(jax.lax.stop_gradient(free))  # so it has the derivatives of the minimum
     tension = stretch * jax.grad(energy)(along, free)
     return tension, jnp.sqrt(jnp.maximum(1 + 2 * free[0], 1e-6))
 
 
 def _check(name: str, stretch: np.ndarray, tension: np.ndarray, across: np.ndarray) -> None:
-    if not (np.isfinite(stretch).all() and np.isfinite(tension).all()):
-        raise ValueError(f"{name}: extension and force must be finite")
-    most = float(stretch.max()) - 1
-    if most > 4:
-        raise ValueError(
-            f"{name}: the strip would stretch to {most + 1:.1f} times its length: is the extension "
-            "in per cent, or in millimetres? It is taken in metres"
-        )
-    if most < 2e-3:
-        raise ValueError(
-            f"{name}: the strip stretches by {most:.2g} of its length at most: is the extension "
-            "in metres, and the length right?"
-        )
-    stiffest = float(np.max(tension)) / most
-    if stiffest > 2e5:
-        raise ValueError(
-            f"{name}: a stiffness of {stiffest:.3g} N/m is above that of any fabric: is the force "
-            "in grams or millinewtons? It is taken in newtons"
-        )
-    back = float(np.max(np.maximum.accumulate(stretch) - stretch))
-    if back > BACK * most:
-        raise ValueError(
-            f"{name}: the extension goes back by {back / most:.0%} of its largest: a pull is of a "
-            "load that grows; leave out what comes after"
-        )
-    if not tension[np.argmax(stretch)] > max(0.0, float(tension[np.argmin(stretch)])):
-        raise ValueError(
-            f"{name}: the force does not rise with the extension: are columns swapped?"
-        )
-    strongest = float(np.max(tension))
-    if float(np.mean(tension[stretch > 1 + 0.98 * most])) < BROKEN * strongest:
-        raise ValueError(f"{name}: the force falls before the end: leave out what comes after")
-    early = tension[stretch < 1 + 0.02 * most]
-    at_rest = float(np.min(early)) / strongest if len(early) else 0.0
-    if at_rest > PRELOAD:
-        raise ValueError(
-            f"{name}: at rest the force is {at_rest:.0%} of the largest: take away what the tester "
-            "shows without a strip, or count the length from where it pulls"
-        )
-    wide = across[np.isfinite(across)]
-    if len(wide) and not (0.05 < wide.min() and wide.max() < 3):
-        raise ValueError(
-            f"{name}: widths are {wide.min():.2g} to {wide.max():.2g} of that at rest: in metres?"
-        )
+    """Raise `ValueError` for a curve that is no pull or has other units."""
+    is_finite = np.isfinite(stretch).all() and np.isfinite(tension).all()
+    expect(is_finite, f"{name}: extension and force must be finite")
+    most, strongest = float(stretch.max()) - 1, float(tension.max())
+    size = f"{name}: the strip stretches by {most:.2g} of its length at most"
+    expect(most > 2e-3, f"{size}: is the extension in metres?")
+    expect(most < 4, f"{size}: is the extension in per cent, or in millimetres?")
+    stiffest = f"{name}: a stiffness of {strongest / most:.3g} N/m is above that of any fabric"
+    expect(strongest < 2e5 * most, f"{stiffest}: is the force in grams or millinewtons?")
+    back = float(np.max(np.maximum.accumulate(stretch) - stretch)) / most
+    expect(back < BACK, f"{name}: the extension goes back by {back:.0%}: leave out the unloading")
+    rises = tension[np.argmax(stretch)] > max(0.0, float(tension[np.argmin(stretch)]))
+    expect(rises, f"{name}: the force does not rise with the extension: are columns swapped?")
+    last = tension[stretch > 1 + 0.98 * most].mean()
+    expect(last > BROKEN * strongest, f"{name}: the force falls before the end: leave that out")
+    first = np.min(tension[stretch < 1 + 0.02 * most], initial=strongest) / strongest
+    is_loaded = PRELOAD < first < 1
+    expect(not is_loaded, f"{name}: at rest the force is {first:.0%} of the largest: subtract it")
+    widths = across[np.isfinite(across)]
+    expect(((widths > 0.05) & (widths < 3)).all(), f"{name}: are the widths in metres?")
 
 
 def _thinned(curve: Float[np.ndarray, "sample 3"]) -> Float[np.ndarray, "mean 3"]:

@@ -103,7 +103,7 @@ def _rows_of_frames(
             axes.set_title(f"{name}, {float(recording.times[frame]):.2f} s", fontsize=10, y=0.98)
             distance = f"mean distance {1e3 * away:.1f} mm" if np.isfinite(away) else "diverged"
             axes.text2D(0.5, -0.06, distance, ha="center", fontsize=10, transform=axes.transAxes)
-    draw_title_and_legend(figure, shown, 11)
+    draw_title_and_legend(figure, shown)
 
 
 def _draw_densities(

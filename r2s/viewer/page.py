@@ -79,19 +79,13 @@ class Moved(NamedTuple):
     mean_error: Float[Array, ""]
 
 
-def move(subject: Subject, u: Float[Array, " dim"]) -> Moved:
-    """The motion of the fabric at `u`, and how far the recording is from it."""
-    motion, error = _simulated(subject, u)
-    first, last = subject.frames_used
-    return Moved(motion, error, jnp.mean(error[first : last + 1]))
-
-
 @eqx.filter_jit
-def _simulated(subject: Subject, u: Float[Array, " dim"]) -> tuple[Solution, Array]:
-    """The motion, and its `error`: that of `chamfer_real_to_sim`, but to the surface itself."""
+def move(subject: Subject, u: Float[Array, " dim"]) -> Moved:
+    """The motion of the fabric at `u`, and how far the recording is from its surface."""
     motion = rollout(subject.scenario, subject.space(u))
     if subject.clouds is None:
-        return motion, jnp.full(motion.ok.shape, jnp.nan)
+        nowhere = jnp.full(motion.ok.shape, jnp.nan)
+        return Moved(motion, nowhere, nowhere[0])
     faces = subject.scenario.scene.mesh.faces
 
     def distance(frame):
@@ -99,15 +93,16 @@ def _simulated(subject: Subject, u: Float[Array, " dim"]) -> tuple[Solution, Arr
         return masked_mean(surface_residuals(points, mask, x, faces)[0], mask)
 
     error = jax.lax.map(distance, (subject.clouds.points, subject.clouds.mask, motion.x))
-    return motion, jnp.where(motion.ok, error, jnp.nan)
+    error = jnp.where(motion.ok, error, jnp.nan)
+    first, last = subject.frames_used
+    return Moved(motion, error, jnp.mean(error[first : last + 1]))
 
 
 class Page:
     """A server on a thread of its own, until `close`.
 
     `moved` is the motion that the page shows, `u` the place of its fabric in the space, and
-    `failure` the reason when there is no motion of it. Of the places through which a slider is
-    dragged only the last is simulated.
+    `failure` why it has no motion. While a slider is dragged only its last place is simulated.
 
     - `u`: where the sliders begin, in the unit cube of the subject's space.
     - `save`: called with the fabric that is shown when its button is pressed; returns the text
@@ -173,8 +168,8 @@ class Page:
         self._play = gui.add_checkbox("play", False)
         self._frame.on_update(lambda _: self._draw())
         for bound, place in zip(subject.space.ranges, self.u, strict=True):
-            hint = f"{bound.low:g} to {bound.high:g} {bound.unit}"
-            hint += ", on a logarithmic scale" if bound.log else ""
+            scale = ", on a logarithmic scale" if bound.log else ""
+            hint = f"{bound.low:g} to {bound.high:g} {bound.unit}{scale}"
             slider = gui.add_slider(bound.name, 0.0, 1.0, 0.01, float(place), hint=hint)
             slider.on_update(lambda _: self._changed.set())
             self._sliders.append(slider)
@@ -196,12 +191,12 @@ class Page:
         while not self._stop.is_set():
             if self._changed.is_set():
                 self._changed.clear()
-                wanted = np.array([slider.value for slider in self._sliders], self.u.dtype)
+                u = np.array([slider.value for slider in self._sliders], self.u.dtype)
                 try:
-                    self.moved, self.failure = move(self.subject, jnp.asarray(wanted)), ""
-                except RuntimeError as error:  # such as of memory: the page goes on
+                    self.moved, self.failure = move(self.subject, jnp.asarray(u)), ""
+                except RuntimeError as error:  # such as of memory: the page stays open
                     self.failure = f"No motion of this fabric: {error}. Shown is the last one."
-                self.u = wanted
+                self.u = u
                 self._draw()
             if self._play.value and time.monotonic() >= due:
                 due = time.monotonic() + interval
@@ -217,10 +212,10 @@ class Page:
             faces = np.asarray(of_sheet.mesh.faces)
             x = np.asarray(self.moved.motion.x[frame], np.float32)
             is_finite = bool(self.moved.motion.ok[frame])
-            look = {"color": CLOTH, "side": "double", "flat_shading": True}
-            scene.add_mesh_simple("/cloth", x, faces, visible=is_finite, **look)
+            sides = {"color": CLOTH, "side": "double", "flat_shading": True}
             edges = {"color": EDGES, "wireframe": True}
-            scene.add_mesh_simple("/mesh", x, faces, visible=is_finite, **edges)
+            for name, look in (("/cloth", sides), ("/mesh", edges)):
+                scene.add_mesh_simple(name, x, faces, visible=is_finite, **look)
             self._points("/grippers", x[np.asarray(of_sheet.pinned)], GRIPPER, 4 * POINT)
             if clouds is not None:
                 cloud = np.asarray(clouds.points[frame])[np.asarray(clouds.mask[frame])]

@@ -8,7 +8,6 @@ Needs matplotlib: pip install 'r2s[study]'; the video is an MP4 where OpenCV is 
 
 import importlib.util
 import io
-import itertools
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -76,27 +75,11 @@ def show(
 
 def contact_sheet(path: Path, recording: Recording, cloth: SimulatedCloth | None = None) -> Path:
     """Write up to twelve frames, spread over the recording, as one PNG."""
-    content = Content.make(recording, cloth)
     count = len(recording.times)
     frames = np.unique(np.linspace(0, count - 1, min(MAX_PANELS, count)).round().astype(int))
-    columns = min(4, len(frames))
-    rows = -(-len(frames) // columns)
-    strip = 0.0 if recording.force is None else STRIP
-    height = 3.3 * rows + 0.9 + strip  # [inch]
-    figure = Figure(figsize=(3.6 * columns, height))
-    top, bottom = 1 - 0.55 / height, (0.4 + strip) / height
-    figure.subplots_adjust(0.0, bottom, 0.96, top - 0.02, wspace=0.06, hspace=0.1)
-    for i, frame in enumerate(frames):
-        axes: Any = figure.add_subplot(rows, columns, i + 1, projection="3d")
-        draw_surroundings(axes, content)
-        draw_frame(axes, content, int(frame))
-        axes.set_title(_caption(recording, int(frame)), fontsize=9, y=0.98)
-    if strip:
-        curve = _draw_force(figure, recording, 0.75 / height, (strip - 0.45) / height)
-        _mark_frames(curve, recording, frames)
-    draw_title_and_legend(figure, content, 12)
+    figure = _drawn(Content.make(recording, cloth), frames.tolist(), (3.6, 3.3))
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=100)
+    figure.savefig(buffer, format="png")
     write_bytes(path, buffer.getvalue())
     return path
 
@@ -104,25 +87,10 @@ def contact_sheet(path: Path, recording: Recording, cloth: SimulatedCloth | None
 def pictures(recording: Recording, cloth: SimulatedCloth | None = None) -> Iterator[np.ndarray]:
     """Each frame as a picture, (height, width, 3) in 0..255, of even sides."""
     content = Content.make(recording, cloth)
-    strip = 0.0 if recording.force is None else STRIP - 0.1  # [inch]: sides of even pixels
-    height = 5.6 + strip
-    figure = Figure(figsize=(6.4, height), dpi=100)
-    canvas = FigureCanvasAgg(figure)
-    figure.subplots_adjust(0.0, (0.34 + strip) / height, 0.96, 1 - 0.39 / height)
-    axes: Any = figure.add_subplot(projection="3d")
-    draw_surroundings(axes, content)
-    draw_title_and_legend(figure, content, 11)
-    caption = figure.text(0.02, 1 - 0.56 / height, "", fontsize=10)
-    curve = strip and _draw_force(figure, recording, 0.7 / height, (strip - 0.45) / height)
     for frame in range(len(recording.times)):
-        artists = draw_frame(axes, content, frame)
-        if strip:
-            artists += _mark_frames(curve, recording, np.array([frame]))
-        caption.set_text(_caption(recording, frame))
+        canvas = FigureCanvasAgg(_drawn(content, [frame], (6.4, 4.7)))
         canvas.draw()
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
-        for artist in artists:
-            artist.remove()
 
 
 class Content(NamedTuple):
@@ -150,6 +118,31 @@ class Content(NamedTuple):
         return _inside(points, self.low, self.high)
 
 
+def _drawn(content: Content, frames: list[int], panel: tuple[float, float]) -> Figure:
+    """A figure with a panel for each frame, of a width and height [inch]; the force below them."""
+    columns = min(4, len(frames))
+    rows = -(-len(frames) // columns)
+    recording = content.recording
+    strip = 0.0 if recording.force is None else STRIP
+    height = panel[1] * rows + 0.9 + strip
+    figure = Figure(figsize=(panel[0] * columns, height), dpi=100)
+    top, bottom = 1 - 0.57 / height, (0.4 + strip) / height
+    figure.subplots_adjust(0.0, bottom, 0.96, top, wspace=0.06, hspace=0.1)
+    for i, frame in enumerate(frames):
+        axes: Any = figure.add_subplot(rows, columns, i + 1, projection="3d")
+        draw_surroundings(axes, content)
+        draw_frame(axes, content, frame)
+        first, last = recording.info.frames_used
+        caption = f"frame {frame}, {float(recording.times[frame]):.2f} s"
+        caption += "" if first <= frame <= last else " (not used)"
+        axes.set_title(caption, fontsize=9, y=0.98)
+    if strip:
+        axes = figure.add_axes((0.08, 0.75 / height, 0.86, (strip - 0.45) / height))
+        _draw_force(axes, recording, frames)
+    draw_title_and_legend(figure, content)
+    return figure
+
+
 def draw_surroundings(axes: Any, content: Content) -> None:
     """Limits, one scale for all axes, labels, and what does not move: table and sheet at rest."""
     low, high, info = content.low, content.high, content.recording.info
@@ -172,61 +165,46 @@ def draw_surroundings(axes: Any, content: Content) -> None:
         axes.plot(*edge.T, np.full(5, info.table_height), color=GREY, linewidth=0.6, zorder=1)
 
 
-def draw_frame(axes: Any, content: Content, frame: int) -> list[Any]:
-    """Draw what moves, as it is in a frame; the artists."""
-    artists, recording, cloth = [], content.recording, content.cloth
+def draw_frame(axes: Any, content: Content, frame: int) -> None:
+    """Draw what moves, as it is in a frame."""
+    recording, cloth = content.recording, content.cloth
     if cloth is not None:
         x = cloth.x[frame]
         faces = cloth.faces[content.visible(x)[cloth.faces].all(axis=1)]
         style: dict[str, Any] = {"facecolor": (CLOTH, 0.25), "edgecolor": (CLOTH, 0.7)}
-        sheet = Poly3DCollection(x[faces], linewidth=0.35, zorder=3, **style)
-        artists.append(axes.add_collection3d(sheet))
+        axes.add_collection3d(Poly3DCollection(x[faces], linewidth=0.35, zorder=3, **style))
         if len(faces) < len(cloth.faces):
             text = "part of the cloth is out of the picture"
-            place = {"ha": "center", "transform": axes.transAxes}
-            artists.append(axes.text2D(0.5, 0.02, text, fontsize=8, **place))
+            axes.text2D(0.5, 0.02, text, fontsize=8, ha="center", transform=axes.transAxes)
     points = content.clouds[frame]
     points = points[content.visible(points)]
     dots: dict[str, Any] = {"linewidths": 0, "depthshade": False}
-    artists.append(axes.scatter(*points.T, s=2.2, color=CLOUD, zorder=5, **dots))
+    axes.scatter(*points.T, s=2.2, color=CLOUD, zorder=5, **dots)
     if recording.markers is not None and recording.markers_seen is not None:
-        seen = np.asarray(recording.markers)[frame][np.asarray(recording.markers_seen)[frame]]
-        crosses: dict[str, Any] = {"marker": "x", "depthshade": False}
-        artists.append(axes.scatter(*seen.T, s=14, color=MARKER, zorder=6, **crosses))
+        markers = np.asarray(recording.markers)[frame][np.asarray(recording.markers_seen)[frame]]
+        axes.scatter(*markers.T, s=14, color=MARKER, zorder=6, marker="x", depthshade=False)
     times, now = np.asarray(recording.gripper_times), float(recording.times[frame])
     knots = np.append(times[times < now], now)
     for gripper in np.asarray(recording.gripper_path).transpose(1, 2, 0):  # its path so far
         path = np.stack([np.interp(knots, times, axis) for axis in gripper])
-        artists += axes.plot(*path, color=GRIPPER, linewidth=0.9, zorder=7)
-        artists += axes.plot(*path[:, -1:], "o", color=GRIPPER, markersize=5, zorder=8)
-    return artists
+        axes.plot(*path, color=GRIPPER, linewidth=0.9, zorder=7)
+        axes.plot(*path[:, -1:], "o", color=GRIPPER, markersize=5, zorder=8)
 
 
-def _draw_force(figure: Any, recording: Recording, bottom: float, height: float) -> Any:
-    """The force [N] while the frames were taken, in a strip of the figure; of a vector its size."""
-    axes = figure.add_axes((0.08, bottom, 0.86, height))
-    axes.plot(np.asarray(recording.force_times), _force(recording), color=GRIPPER, linewidth=1.1)
+def _draw_force(axes: Any, recording: Recording, frames: list[int]) -> None:
+    """The force [N] (of a vector its size) while the frames were taken; dots at some of them."""
+    force, logged = np.asarray(recording.force), np.asarray(recording.force_times)
+    force = force if force.ndim == 1 else np.linalg.norm(force, axis=1)
+    axes.plot(logged, force, color=GRIPPER, linewidth=1.1)
     times = np.asarray(recording.times)
+    at_frames = np.interp(times[frames], logged, force, left=np.nan, right=np.nan)
+    axes.plot(times[frames], at_frames, "o", color=CLOUD, markersize=4, zorder=3)
     margin = 0.02 * float(np.ptp(times)) or 1.0
     axes.set_xlim(times[0] - margin, times[-1] + margin)
     axes.set_xlabel("time [s]", fontsize=8, labelpad=1)
     axes.set_ylabel("force [N]", fontsize=8)
     axes.tick_params(labelsize=7)
     axes.grid(color=GREY, alpha=0.3, linewidth=0.5)
-    return axes
-
-
-def _mark_frames(axes: Any, recording: Recording, frames: np.ndarray) -> list[Any]:
-    """Dots on the curve of the force at frames; none where the log does not reach."""
-    times = np.asarray(recording.times)[frames]
-    options: dict[str, Any] = {"left": np.nan, "right": np.nan}
-    force = np.interp(times, np.asarray(recording.force_times), _force(recording), **options)
-    return axes.plot(times, force, "o", color=CLOUD, markersize=4, zorder=3)
-
-
-def _force(recording: Recording) -> np.ndarray:
-    force = np.asarray(recording.force)
-    return force if force.ndim == 1 else np.linalg.norm(force, axis=1)
 
 
 def _inside(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -242,21 +220,17 @@ def _limits(
     What is farther from the first two than half of the sheet's side flew off, or is no cloth; but
     most of the points are always in.
     """
-    sheet = recording.info.sheet
     path = np.asarray(recording.gripper_path).reshape(-1, 3)
-    known = np.concatenate([path, _outline(sheet)])
-    low, high, reach = known.min(axis=0), known.max(axis=0), 0.5 * max(sheet.size)
-    around = low - reach, high + reach
-    near = points[_inside(points, *around)]
-    if len(near) < 0.8 * len(points):
-        near = points
-    if len(near):
-        ends = np.percentile(near, [0.5, 99.5], axis=0)
-        low, high = np.minimum(low, ends[0]), np.maximum(high, ends[1])
+    known = np.concatenate([path, _outline(recording.info.sheet)])
+    low, high, reach = known.min(axis=0), known.max(axis=0), 0.5 * max(recording.info.sheet.size)
+    wide = low - reach, high + reach
+    near = points[_inside(points, *wide)]
+    near = points if len(near) < 0.8 * len(points) else near
+    corners = [low, high, *(np.percentile(near, [0.5, 99.5], axis=0) if len(near) else ())]
     if cloth is not None:
         vertices = cloth.x.reshape(-1, 3)
-        met = vertices[_inside(vertices, *around)]
-        low, high = np.min([low, *met], axis=0), np.max([high, *met], axis=0)
+        corners.extend(vertices[_inside(vertices, *wide)])
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
     least = FLAT * float((high - low).max())
     centre, half = (low + high) / 2, np.maximum(high - low, least) / 2
     return centre - 1.04 * half, centre + 1.04 * half
@@ -268,22 +242,15 @@ def _outline(sheet: SheetPlacement) -> np.ndarray:
     return np.stack([corner(sheet, name) for name in names])
 
 
-def _caption(recording: Recording, frame: int) -> str:
-    first, last = recording.info.frames_used
-    counts = "" if first <= frame <= last else " (not used)"
-    return f"frame {frame}, {float(recording.times[frame]):.2f} s{counts}"
-
-
-def draw_title_and_legend(figure: Any, content: Content, fontsize: int) -> None:
-    """The recording's name at the top of a figure, and what is drawn how at its bottom."""
+def draw_title_and_legend(figure: Any, content: Content) -> None:
     info = content.recording.info
     title = f"{info.name}: {info.scenario}, {info.fabric}, trial {info.trial}"
-    figure.suptitle(title, fontsize=fontsize)
+    figure.suptitle(title, fontsize=11)
     outside = 1 - float(content.visible(np.concatenate(content.clouds)).mean())
-    left_out = f" ({outside:.1%} out of the picture)" if outside >= 5e-4 else ""
+    omitted = f" ({outside:.1%} out of the picture)" if outside >= 5e-4 else ""
     dot: dict[str, Any] = {"linestyle": "", "marker": "o"}
     handles = [
-        Line2D([], [], color=CLOUD, markersize=4, label=f"recorded cloud{left_out}", **dot),
+        Line2D([], [], color=CLOUD, markersize=4, label=f"recorded cloud{omitted}", **dot),
         Line2D([], [], color=GRIPPER, marker="o", markersize=5, linewidth=1, label="gripper"),
         Line2D([], [], color=GREY, linestyle="--", linewidth=1, label="sheet at rest"),
     ]
@@ -291,10 +258,10 @@ def draw_title_and_legend(figure: Any, content: Content, fontsize: int) -> None:
         handles.append(Line2D([], [], color=MARKER, linestyle="", marker="x", label="marker"))
     if content.cloth is not None:
         handles.append(Line2D([], [], color=CLOTH, linewidth=5, alpha=0.5, label="simulated cloth"))
-    narrow = figure.get_figwidth() < 8
-    spacing: dict[str, Any] = {"columnspacing": 0.9, "handletextpad": 0.3} if narrow else {}
-    spacing |= {"loc": "lower center", "ncols": len(handles), "frameon": False}
-    figure.legend(handles=handles, fontsize=7.5 if narrow else 9, **spacing)
+    narrow: dict[str, Any] = {"columnspacing": 0.9, "handletextpad": 0.3, "fontsize": 7.5}
+    options = narrow if figure.get_figwidth() < 8 else {"fontsize": 9}
+    options |= {"loc": "lower center", "ncols": len(handles), "frameon": False}
+    figure.legend(handles=handles, **options)
 
 
 def write_gif(path: Path, frames: Pictures, interval: float) -> None:
@@ -304,13 +271,13 @@ def write_gif(path: Path, frames: Pictures, interval: float) -> None:
     images = [Image.fromarray(pixels) for pixels in frames]
     # One palette for all, from the fullest picture: else colours flicker, and files are larger.
     palette = images[len(images) // 2].quantize(64)
-    small = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    buffer = io.BytesIO()
+    first, *others = (i.quantize(palette=palette, dither=Image.Dither.NONE) for i in images)
     # GIFs count in hundredths of a second: round the times, not the intervals, which would add up.
-    times = np.round(100 * interval * np.arange(len(small) + 1))
+    times = np.round(100 * interval * np.arange(len(images) + 1))
     duration = [max(20, 10 * int(step)) for step in np.diff(times)]  # [ms]
-    options = {"save_all": True, "append_images": small[1:], "loop": 0, "optimize": False}
-    small[0].save(buffer, format="GIF", duration=duration, **options)
+    options = {"save_all": True, "append_images": others, "loop": 0, "optimize": False}
+    buffer = io.BytesIO()
+    first.save(buffer, format="GIF", duration=duration, **options)
     write_bytes(path, buffer.getvalue())
 
 
@@ -320,15 +287,12 @@ def write_mp4(path: Path, frames: Pictures, interval: float) -> None:
     Needs OpenCV: pip install 'r2s[camera]'. Raises OSError where it cannot write MP4.
     """
     cv2 = require("cv2", "camera", "videos as MP4 (a GIF needs no extra)")
-    frames = iter(frames)
-    first = next(frames)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        part = Path(folder) / "video.mp4"
-        size, code = first.shape[1::-1], cv2.VideoWriter.fourcc(*"mp4v")
-        writer = cv2.VideoWriter(str(part), code, 1 / interval, size)
-        if not writer.isOpened():
-            raise OSError(f"{path}: OpenCV cannot write MP4 here: ask for a GIF")
-        for pixels in itertools.chain([first], frames):
+        part, writer = Path(folder) / "video.mp4", cv2.VideoWriter()
+        for pixels in frames:
+            code, size = cv2.VideoWriter.fourcc(*"mp4v"), pixels.shape[1::-1]
+            if not writer.isOpened() and not writer.open(str(part), code, 1 / interval, size):
+                raise OSError(f"{path}: OpenCV cannot write MP4 here: ask for a GIF")
             writer.write(np.ascontiguousarray(pixels[..., ::-1]))
         writer.release()
         write_bytes(path, part.read_bytes())

@@ -298,5 +298,5 @@ def test_a_checkpoint_is_of_one_run(tmp_path):
 
 
 def test_the_usual_budgets_of_the_network_are_those_of_its_recipes():
-    assert METHODS["pinn"].budget.max_iterations == training.QUICK.adam
+    assert METHODS["pinn"].budget.max_iterations == training.Recipe().adam
     assert METHODS["pinn-published"].budget.max_iterations == published_recipe.EPOCHS

@@ -1,4 +1,4 @@
-"""Depth images of points: where a surface is, cropped and scaled alike whatever measured it."""
+"""Depth images of points: of simulated surfaces and of recorded clouds."""
 
 import dataclasses
 
@@ -106,10 +106,10 @@ def test_holes_are_filled_and_strays_dropped():
 
 def test_flaws_are_those_asked_for():
     depth = jnp.full((32, 32), 0.8)
-    flaws = CLEAN._replace(noise=1e-3)
+    flaws = dataclasses.replace(CLEAN, noise=1e-3)
     noisy = images.flawed(depth, VIEW, flaws, jax.random.key(0))
     np.testing.assert_allclose(np.std(noisy), 0.64e-3, rtol=0.1)
-    flaws = CLEAN._replace(holes=0.4)
+    flaws = dataclasses.replace(CLEAN, holes=0.4)
     shares = [
         float((images.flawed(depth, VIEW, flaws, jax.random.key(i)) == 0).mean()) for i in range(20)
     ]
@@ -121,9 +121,9 @@ def test_borders_lose_gain_and_err_and_nothing_else_does():
     there = whole > 0
     inner = np.asarray(ndimage.binary_erosion(there, np.ones((3, 3))), bool)
     outer = np.asarray(ndimage.binary_dilation(there, np.ones((3, 3))), bool)
-    flaw = jax.jit(jax.vmap(images.flawed, in_axes=(None, None, None, 0)), static_argnums=1)
+    flaw = jax.jit(jax.vmap(images.flawed, in_axes=(None, None, None, 0)), static_argnums=(1, 2))
     keys = jax.random.split(jax.random.key(0), 50)
-    flaws = CLEAN._replace(lost=0.5, gained=0.2, flying=1e-2)
+    flaws = dataclasses.replace(CLEAN, lost=0.5, gained=0.2, flying=1e-2)
     broken = np.asarray(flaw(jnp.asarray(whole), VIEW, flaws, keys))
     np.testing.assert_array_equal(
         broken[:, inner], np.broadcast_to(whole[inner], (50, inner.sum()))
@@ -138,37 +138,23 @@ def test_borders_lose_gain_and_err_and_nothing_else_does():
     assert 2e-3 < error.mean() < 8e-3  # of Laplace's, the mean is the scale: 0 to 1e-2
 
 
-@pytest.mark.parametrize(
-    "depths, message",
-    [
-        (np.ones((2, 24, 32)), r"cup: expected images of 32 x 32 pixels, found \(2, 24, 32\)"),
-        (np.zeros((2, 32, 32)), "cup, frame 5: 0 pixels have a depth, expected at least 5"),
-        (np.full((2, 32, 32), 700.0), "cup, frame 5: the median depth is 700 m.*in metres"),
-        (np.full((2, 32, 32), np.nan), "cup, frame 5: 1024 depths are not finite"),
-    ],
-)
-def test_broken_depth_is_refused(depths, message):
-    with pytest.raises(ValueError, match=message):
-        images.of_depths(VIEW, depths, "cup", (5, 9))
-
-
-def test_clouds_become_depth(fabric):
+def test_clouds_become_depth():
     experiment = scenarios.lifting()
-    view = view_around(
-        images.eye_of(experiment), np.array([[0, 0, 0.01], [0.45, 0.45, 0.4]]), 32, 0.004
-    )
+    view = images.view_of(experiment, np.array([[0, 0, 0.01], [0.45, 0.45, 0.4]]), 32)
     cloud = np.random.default_rng(0).uniform([0.1, 0.1, 0.1], [0.3, 0.3, 0.3], (2000, 3))
     info = synthetic.RecordingInfo(
-        "r", "lifting", "f", "1", "s", (0, 1), experiment.sheet, 0.0, None
+        "cup", "lifting", "f", "1", "s", (0, 1), experiment.sheet, 0.0, None
     )
     path = np.zeros((2, 1, 3))
     recording = synthetic.make_recording([cloud, cloud[:1999]], [0, 1], path, [0, 1], info)
-    seen = images.of_clouds(view, recording, (0, 1))
-    assert seen.shape == (2, 32, 32)
-    assert np.abs(seen[0] - seen[1]).max() < 0.3
-    far = dataclasses.replace(recording, points=recording.points * 1000)
-    with pytest.raises(ValueError, match="r, frame 0: 0 pixels have a depth.*units are not metres"):
-        images.of_clouds(view, far, (0, 1))
+    first, second = images.of_clouds(view, recording, (0, 1))
+    assert first.shape == (32, 32) and np.abs(first - second).max() < 0.3
+    empty = dataclasses.replace(recording, points=recording.points * 1000)
+    eye = jnp.asarray(view.position)[None, None]
+    close = dataclasses.replace(recording, points=eye + 0.01 * (recording.points - eye))
+    for broken, message in ((empty, "0 pixels have a depth"), (close, "the median depth is .* m")):
+        with pytest.raises(ValueError, match=f"cup, frame 0: {message}"):
+            images.of_clouds(view, broken, (0, 1))
 
 
 def test_a_stray_point_that_was_spread_is_dropped():

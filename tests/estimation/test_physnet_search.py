@@ -1,14 +1,12 @@
 """Searches of the unit cube: they find a target, survive failures, and continue from their file."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 
 pytest.importorskip("skopt")
 pytest.importorskip("sklearn")
 
-from r2s.estimation.physnet.search import bayesian, emulated  # noqa: E402
+from r2s.estimation.physnet import search  # noqa: E402
 
 TRUTH = np.array([0.3, 0.7, 0.55])
 
@@ -21,13 +19,20 @@ def respond(places):
 
 
 TARGET = respond(TRUTH[None])[0]
-optimised = partial(bayesian, num_first=8)
+
+
+@pytest.fixture(autouse=True)
+def few_calls(monkeypatch):
+    monkeypatch.setattr(search, "FIRST_CALLS", 8)
+
+
+def searched(answer=respond, target=TARGET, *, calls=24, seed=1, **options):
+    return search.search(answer, target, 3, num_calls=calls, seed=seed, **options)
 
 
 @pytest.mark.slow(group="physnet")
 def test_answers_find_what_losses_alone_do_not_and_losses_what_chance_does_not():
-    found = emulated(respond, TARGET, 3, num_calls=24, seed=1)
-    by_losses = optimised(respond, TARGET, dim=3, num_calls=24, seed=1)
+    found, by_losses = searched(), searched(published=True)
     random = respond(np.random.default_rng(1).random((24, 3))) - TARGET
     assert np.abs(found.places[-1] - TRUTH).max() < 0.02
     assert found.losses[-1] < by_losses.losses.min() / 2
@@ -36,15 +41,15 @@ def test_answers_find_what_losses_alone_do_not_and_losses_what_chance_does_not()
 
 def test_a_flawed_target_is_not_followed_beyond_its_flaws():
     flawed = TARGET + 0.1 * np.random.default_rng(0).standard_normal(12)
-    found = emulated(respond, flawed, 3, num_calls=24, seed=1)
+    found = searched(target=flawed)
     assert np.abs(found.places[-1] - TRUTH).max() < 0.15
 
 
 @pytest.mark.slow(group="physnet")
-@pytest.mark.parametrize("run", [partial(emulated, dim=3), partial(optimised, dim=3)])
-def test_a_search_continues_from_its_file_as_if_uninterrupted(run, tmp_path):
-    path = tmp_path / "trials.npz"
-    whole = run(respond, TARGET, num_calls=15, seed=2)
+@pytest.mark.parametrize("published", [False, True])
+def test_a_search_continues_from_its_file_as_if_uninterrupted(published, tmp_path):
+    options = {"published": published, "calls": 15}
+    whole, options["path"] = searched(**options), tmp_path / "trials.npz"
 
     class Stopped(Exception):
         pass
@@ -54,11 +59,11 @@ def test_a_search_continues_from_its_file_as_if_uninterrupted(run, tmp_path):
             raise Stopped
 
     with pytest.raises(Stopped):
-        run(respond, TARGET, num_calls=15, seed=2, path=path, progress=stop)
-    resumed = run(respond, TARGET, num_calls=15, seed=2, path=path)
+        searched(progress=stop, **options)
+    resumed = searched(**options)
     np.testing.assert_array_equal(resumed.places, whole.places)
-    with pytest.raises(ValueError, match="seed 2 there, 3 asked"):
-        run(respond, TARGET, num_calls=15, seed=3, path=path)
+    with pytest.raises(ValueError, match="seed 1 there, 3 asked"):
+        searched(**options | {"seed": 3})
 
 
 @pytest.mark.slow(group="physnet")
@@ -66,12 +71,12 @@ def test_calls_that_fail_are_left_out_and_avoided():
     def fails(places):
         return np.where(places[:, [0]] > 0.5, np.nan, respond(places))
 
-    found = emulated(fails, TARGET, 3, num_calls=24, seed=0)
+    found = searched(fails, seed=0)
     assert np.isnan(found.losses[:9]).sum() >= 3
     assert np.abs(found.places[-1] - TRUTH).max() < 0.05
-    optimum = optimised(fails, TARGET, dim=3, num_calls=16, seed=0)
+    optimum = searched(fails, calls=16, seed=0, published=True)
     assert np.isnan(optimum.losses[8:]).mean() < 0.4
     with pytest.raises(RuntimeError, match="all 9 calls failed"):
-        emulated(lambda places: respond(places) * np.nan, TARGET, 3, num_calls=24)
-    with pytest.raises(ValueError, match="at least 5 calls in 3 dimensions, got 4"):
-        emulated(respond, TARGET, 3, num_calls=4)
+        searched(lambda places: respond(places) * np.nan)
+    with pytest.raises(ValueError, match="at least 5 calls"):
+        searched(calls=4)

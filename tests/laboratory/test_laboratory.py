@@ -1,8 +1,9 @@
-"""Pulls, cantilevers and drapes, against mechanics, and back from their numbers."""
+"""Pulls, cantilevers and drapes against mechanics, and fabrics estimated from them."""
 
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -31,8 +32,11 @@ from r2s.solvers.implicit.potential import residual
 
 LAW = OrthotropicMembrane(*(jnp.asarray(c, float) for c in (300.0, -60.0, 200.0, 40.0)))
 ANGLES = {"warp": 0.0, "bias": np.pi / 4, "weft": np.pi / 2}
+OFF = {"warp": 0.05, "weft": -0.04, "bias": 0.03}  # relative errors of forces
 SIZE = (0.2, 0.05)  # of strips [m]
 SMALL_RING = ring(shape=(36, 4))
+DENIM = presets.black_denim()
+SPACE = on_cloth(0.32)  # of denim
 
 
 def pulled(fabric: Fabric, name: str, most: float = 0.2, noise: float = 0.0) -> Pull:
@@ -45,19 +49,21 @@ def pulled(fabric: Fabric, name: str, most: float = 0.2, noise: float = 0.0) -> 
     return Pull.make(extension, force, SIZE, ANGLES[name], width, name=name)
 
 
+def pulls_of(fabric: Fabric, noise: dict[str, float] | None = None) -> list[Pull]:
+    return [pulled(fabric, name, noise=(noise or {}).get(name, 0.0)) for name in ANGLES]
+
+
 # Pulls
 
 
 @pytest.mark.slow(group="study")
-@pytest.mark.parametrize(
-    "direction, c11, c12, c22", [(0.0, 300, -60, 200), (np.pi / 2, 200, -60, 300)]
-)
-def test_a_strip_pulls_by_its_modulus_and_gets_wider_or_narrower(direction, c11, c12, c22):
+@pytest.mark.parametrize("direction, c11, c22", [(0.0, 300, 200), (np.pi / 2, 200, 300)])
+def test_a_strip_pulls_by_its_modulus_and_gets_wider_or_narrower(direction, c11, c22):
     for stretch in (1.001, 1.1, 1.4):
         tension, across = uniaxial(LAW, jnp.asarray(stretch), direction)
         strain = (stretch**2 - 1) / 2
-        assert float(tension) == pytest.approx(stretch * (c11 - c12**2 / c22) * strain, rel=1e-9)
-        assert float(across) == pytest.approx(np.sqrt(1 - 2 * c12 / c22 * strain), rel=1e-9)
+        assert float(tension) == pytest.approx(stretch * (c11 - 60**2 / c22) * strain, rel=1e-9)
+        assert float(across) == pytest.approx(np.sqrt(1 + 2 * 60 / c22 * strain), rel=1e-9)
 
 
 @pytest.mark.slow(group="study")
@@ -68,18 +74,6 @@ def test_a_strip_pulled_askew_has_the_modulus_of_a_turned_orthotropic_sheet():
     along = np.array([c**2, s**2, c * s])  # stress of a unit tension
     tension, _ = uniaxial(LAW, jnp.asarray(1 + small), angle)
     assert float(tension) / small == pytest.approx(1 / (along @ compliance @ along), rel=1e-5)
-
-
-@pytest.mark.slow(group="study")
-def test_yarns_stiffen_by_their_ratio_each_at_its_own_knee():
-    law = StiffeningMembrane.make(LAW, 10.0, 1.02, 1.2)
-    for direction, soon in ((0.0, True), (np.pi / 2, False)):
-        start, there, far = (
-            float(uniaxial(law, jnp.asarray(s), direction)[0]) for s in (1.001, 1.05, 3.0)
-        )
-        assert (there / 0.05 > 2.5 * start / 0.001) == soon
-        limit = 3.0 * (3.0**2 - 1) / 2 * (300.0 if soon else 200.0)
-        assert 6 < far / limit < 10
 
 
 @pytest.mark.slow(group="study")
@@ -99,9 +93,8 @@ def test_the_force_of_a_pull_has_the_derivatives_of_differences():
 
 
 def test_a_law_that_follows_the_strain_has_no_curve():
-    law = TableMembrane(jnp.full((6, 4), 100.0))
     with pytest.raises(TypeError, match="TableMembrane has no energy"):
-        uniaxial(law, jnp.asarray(1.1), 0.0)
+        uniaxial(TableMembrane(jnp.full((6, 4), 100.0)), jnp.asarray(1.1), 0.0)
 
 
 @pytest.mark.slow(group="study")
@@ -113,10 +106,8 @@ def test_clamps_pull_a_long_strip_as_free_sides_do(cells, off):
     warp = np.asarray(mesh.rest[:, 0])
     ends = np.flatnonzero((warp < 1e-9) | (warp > length - 1e-9))
     fabric = Fabric.make(0.01, (300.0, 90.0, 300.0, 105.0), 1e-7)
-    scene = Scene(mesh, ends, air=None)
-    solver = ImplicitCloth(scene, 5.0)
-    flat = jnp.pad(mesh.rest, ((0, 0), (0, 1)))
-    start = flat.at[:, 0].multiply(1.05)
+    solver = ImplicitCloth(Scene(mesh, ends, air=None), 5.0)
+    start = jnp.pad(mesh.rest, ((0, 0), (0, 1))).at[:, 0].multiply(1.05)
     control = Control(start[ends], jnp.zeros(3))
     state = solver.init(start)
     for _ in range(5):
@@ -130,192 +121,186 @@ def test_clamps_pull_a_long_strip_as_free_sides_do(cells, off):
 # Cantilevers
 
 
-def test_the_overhang_at_the_standard_slope_is_twice_the_bending_length():
-    """ASTM D1388 takes half of it; the elastica says 2.0003."""
+def test_a_strip_overhangs_twice_its_bending_length_and_sags_like_a_beam():
+    """ASTM D1388 takes half of the overhang; the elastica says 2.0003."""
     fabric = Fabric.make(0.2, (300.0, 0.0, 300.0, 100.0), 2e-5)
     length = (2e-5 / (0.2 * GRAVITY)) ** (1 / 3)
     assert float(overhang(fabric)) / length == pytest.approx(2.0003, abs=1e-4)
-
-
-def test_a_strip_that_hardly_sags_is_a_beam():
-    slope = 0.01  # the tip sags by w L^4 / (8 B)
-    fabric = Fabric.make(0.2, (300.0, 0.0, 300.0, 100.0), 2e-5)
-    beam = (8 * slope * 2e-5 / (0.2 * GRAVITY)) ** (1 / 3)
+    slope = 0.01  # the tip of a beam sags by w L^4 / (8 B)
+    beam = (8 * slope) ** (1 / 3) * length
     assert float(overhang(fabric, 0.0, slope)) == pytest.approx(beam, rel=1e-3)
 
 
 # Drapes
 
 
+def with_bending(fabric: Fabric, stiffness) -> Fabric:
+    return eqx.tree_at(lambda f: f.bending.stiffness, fabric, jnp.asarray(stiffness, float))
+
+
+@eqx.filter_jit
+def draped(fabric: Fabric):
+    return coefficient(SMALL_RING, drape(SMALL_RING, fabric, jax.random.key(0)))
+
+
 @pytest.mark.slow(group="study")
 def test_a_rigid_disc_does_not_drape_and_a_limp_one_hangs_down():
-    run = eqx.filter_jit(
-        lambda fabric: coefficient(SMALL_RING, drape(SMALL_RING, fabric, jax.random.key(0)))
-    )
-    found = [float(run(with_bending(presets.black_denim(), b))) for b in (3e-2, 1e-4, 2e-5)]
-    assert found[0] == pytest.approx(1, abs=0.01)
-    assert found[0] > found[1] + 0.1 > found[2] + 0.2
-    assert found[2] > 0
+    rigid, soft, limp = (float(draped(with_bending(DENIM, b))) for b in (3e-2, 1e-4, 2e-5))
+    assert rigid == pytest.approx(1, abs=0.01)
+    assert rigid > soft + 0.1 > limp + 0.2 > 0.2
 
 
 @pytest.mark.slow(group="study")
 def test_a_drape_has_the_derivative_of_differences():
-    fabric, key = presets.pink_solid(), jax.random.key(0)
+    fabric = presets.pink_solid()
 
     @eqx.filter_jit
     def at(change):
-        softer = with_bending(fabric, fabric.bending.stiffness * jnp.exp(change))
-        value = coefficient(SMALL_RING, drape(SMALL_RING, softer, key))
-        return value, value
+        return draped(with_bending(fabric, fabric.bending.stiffness * jnp.exp(change)))
 
-    slope = float(jax.jacfwd(at, has_aux=True)(jnp.zeros(()))[0])
-    ends = [float(at(jnp.asarray(side * 1e-3))[0]) for side in (1, -1)]
+    slope = float(jax.jacfwd(at)(jnp.zeros(())))
+    ends = [float(at(jnp.asarray(side * 1e-3))) for side in (1, -1)]
     assert slope == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=3e-3)
     assert slope > 0.05
-
-
-def with_bending(fabric: Fabric, stiffness) -> Fabric:
-    return eqx.tree_at(lambda f: f.bending.stiffness, fabric, jnp.asarray(stiffness, float))
 
 
 # Estimates
 
 
-def truth(fabric: Fabric, space) -> np.ndarray:
-    return np.asarray(space.values(space.to_unit(fabric)))
-
-
-def errors(found, fabric: Fabric, space) -> dict[str, float]:
+def errors(estimated, fabric: Fabric, space) -> dict[str, float]:
     """Of each parameter, in standard errors."""
-    true = truth(fabric, space)
-    off = [
-        np.log(v / t) if r.log else v - t
-        for r, v, t in zip(space.ranges, found.values, true, strict=True)
-    ]
-    return dict(
-        zip((r.name for r in space.ranges), np.array(off) / found.standard_errors, strict=True)
-    )
+    truth = np.asarray(space.values(space.to_unit(fabric)))
+    triples = zip(space.ranges, estimated.values, truth, strict=True)
+    off = np.array([np.log(v / t) if r.log else v - t for r, v, t in triples])
+    return by_name(off / estimated.standard_errors, space)
+
+
+def by_name(values, space) -> dict[str, float]:
+    return dict(zip((bound.name for bound in space.ranges), values, strict=True))
 
 
 @pytest.mark.slow(group="study")
 @pytest.mark.parametrize("name", ["black_denim", "camel_ponte_roma"])
-def test_pulls_and_a_cantilever_tell_the_stiffnesses(name):
+def test_pulls_and_a_cantilever_determine_the_stiffnesses(name):
     fabric = presets.MEASURED[name]()
     space = on_cloth(float(fabric.density))
-    tests = [
-        pulled(fabric, d, noise=n) for d, n in (("warp", 0.05), ("weft", -0.04), ("bias", 0.03))
-    ]
-    found = estimate([*tests, Cantilever.make([1.02 * float(overhang(fabric))])], space)
-    off = errors(found, fabric, space)
-    assert all(abs(off[each]) < 2 for each in ("warp", "weft", "shear", "coupling", "bending"))
-    known = dict(zip((r.name for r in space.ranges), found.standard_errors, strict=True))
+    cantilever = Cantilever.make([1.02 * float(overhang(fabric))])
+    estimated = estimate([*pulls_of(fabric, OFF), cantilever], space)
+    off = errors(estimated, fabric, space)
+    assert all(abs(off[n]) < 2 for n in ("warp", "weft", "shear", "coupling", "bending"))
+    known = by_name(estimated.standard_errors, space)
     assert known["warp"] == pytest.approx(SPECIMEN, rel=0.3)
     assert known["bending"] == pytest.approx(0.09, rel=0.4)  # three times that of the overhang
-    assert known["damping"] > 1 and known["friction"] > 0.5  # nothing tells these
-    assert found.converged
+    assert known["damping"] > 1 and known["friction"] > 0.5  # no test depends on these
+    assert estimated.converged
 
 
 @pytest.mark.slow(group="study")
-def test_a_sheet_that_stiffens_is_told_by_its_pulls():
+def test_pulls_determine_how_a_sheet_stiffens():
     fabric = presets.grey_interlock()
-    small = fabric.membrane
-    fabric = dataclasses.replace(fabric, membrane=StiffeningMembrane.make(small, 6.0, 1.08, 1.05))
-    space = StiffeningSpace.make(on_cloth(float(fabric.density)))
-    tests = [pulled(fabric, each, 0.25) for each in ANGLES]
-    found = estimate(tests, space)
-    off = errors(found, fabric, space)
+    stiffening = StiffeningMembrane.make(fabric.membrane, 6.0, 1.08, 1.05)
+    fabric = dataclasses.replace(fabric, membrane=stiffening)
+    linear = on_cloth(float(fabric.density))
+    space = StiffeningSpace.make(linear)
+    tests = [pulled(fabric, name, 0.25) for name in ANGLES]
+    estimated = estimate(tests, space)
+    off = errors(estimated, fabric, space)
     assert all(abs(off[name]) < 1.5 for name in off if name not in ("damping", "friction"))
-    assert all(each.errors < 0.5 for each in fits(tests, found.fabric)[:3])
-    straight = estimate(tests, on_cloth(float(fabric.density)))
-    assert max(each.errors for each in fits(tests, straight.fabric)) > 2
+    assert all(fit.errors < 0.5 for fit in fits(tests, estimated.fabric))
+    assert max(fit.errors for fit in fits(tests, estimate(tests, linear).fabric)) > 2
 
 
 @pytest.mark.slow(group="cloth")
-def test_a_drape_tells_bending_where_nothing_else_does():
+def test_a_drape_determines_bending_where_nothing_else_does():
     fabric = presets.pink_solid()
     space = on_cloth(float(fabric.density))
     value = float(coefficient(ring(), drape(ring(), fabric, jax.random.key(3))))
-    found = estimate([*(pulled(fabric, each) for each in ANGLES), Drape.make(value)], space)
-    off = errors(found, fabric, space)
-    assert abs(off["bending"]) < 2
-    known = dict(zip((r.name for r in space.ranges), found.standard_errors, strict=True))
-    assert known["bending"] < 0.3
+    estimated = estimate([*pulls_of(fabric), Drape.make(value)], space)
+    assert abs(errors(estimated, fabric, space)["bending"]) < 2
+    assert by_name(estimated.standard_errors, space)["bending"] < 0.3
 
 
 @pytest.mark.slow(group="study")
-def test_what_tests_tell_is_the_prior_of_an_estimate_from_motions():
-    fabric = presets.black_denim()
-    space = on_cloth(float(fabric.density))
-    found = estimate([pulled(fabric, each) for each in ANGLES], space)
-    known = informed(space, found)
+def test_tests_one_after_the_other_give_what_they_give_together():
+    cantilever = Cantilever.make([float(overhang(DENIM))])
+    first = estimate(pulls_of(DENIM), SPACE)
+    known = informed(SPACE, first)
     mean, precision = known.prior()
-    np.testing.assert_allclose(known.values(mean), found.values, rtol=1e-6)
-    widths = np.array([r.width for r in space.ranges])
-    np.testing.assert_allclose(
-        np.sqrt(np.diag(np.linalg.inv(precision))) * widths, found.standard_errors, rtol=1e-4
-    )
-    again = estimate([Cantilever.make([float(overhang(fabric))])], known)  # one after the other
-    together = estimate(
-        [*(pulled(fabric, e) for e in ANGLES), Cantilever.make([float(overhang(fabric))])], space
-    )
+    np.testing.assert_allclose(known.values(mean), first.values, rtol=1e-6)
+    widths = np.array([r.width for r in SPACE.ranges])
+    deviations = np.sqrt(np.diag(np.linalg.inv(precision)))
+    np.testing.assert_allclose(deviations * widths, first.standard_errors, rtol=1e-4)
+    again = estimate([cantilever], known)
+    together = estimate([*pulls_of(DENIM), cantilever], SPACE)
     np.testing.assert_allclose(again.values, together.values, rtol=0.01)
     np.testing.assert_allclose(again.standard_errors, together.standard_errors, rtol=0.02)
 
 
 @pytest.mark.slow(group="estimates")
-def test_a_motion_after_tests_tells_more_than_either():
-    """A lift on 9 x 9 vertices, whose mesh says nothing of a fabric for sure, after pulls and a
-    cantilever that are off by up to 5 %."""
-    fabric = presets.black_denim()
-    space = on_cloth(float(fabric.density))
-    noise = {"warp": 0.05, "weft": -0.04, "bias": 0.03}
-    tests = [pulled(fabric, each, noise=noise[each]) for each in ANGLES]
-    told = estimate([*tests, Cantilever.make([1.02 * float(overhang(fabric))])], space)
-    lift = r2s.record(r2s.lifting(), fabric, "denim", key=jax.random.key(1))
+def test_a_motion_after_tests_determines_more_than_either():
+    """A lift on 9 x 9 vertices, after pulls and a cantilever that are off by up to 5 %."""
+    cantilever = Cantilever.make([1.02 * float(overhang(DENIM))])
+    by_tests = estimate([*pulls_of(DENIM, OFF), cantilever], SPACE)
+    lift = r2s.record(r2s.lifting(), DENIM, "denim", key=jax.random.key(1))
     method = r2s.METHODS["diffcloud"](shape=(9, 9))
-    both = method.estimate([lift], informed(space, told), key=jax.random.key(0))
-    alone = method.estimate([lift], space, key=jax.random.key(0))
-    off = errors(both, fabric, space)
-    assert all(abs(value) < 2.5 for value in off.values())
-    for which, name in enumerate(off):
-        assert both.standard_errors[which] < alone.standard_errors[which], name
-        assert both.standard_errors[which] < told.standard_errors[which], name
-    assert consistency(told, both) > 0.01
+    both = method.estimate([lift], informed(SPACE, by_tests), key=jax.random.key(0))
+    alone = method.estimate([lift], SPACE, key=jax.random.key(0))
+    assert all(abs(off) < 2.5 for off in errors(both, DENIM, SPACE).values())
+    assert (both.standard_errors < alone.standard_errors).all()
+    assert (both.standard_errors < by_tests.standard_errors).all()
+    assert consistency(by_tests, both) > 0.01
     with pytest.raises(ValueError, match="cma-es takes no account"):
-        r2s.METHODS["cma-es"]().estimate([lift], informed(space, told), key=jax.random.key(0))
+        r2s.METHODS["cma-es"]().estimate([lift], informed(SPACE, by_tests), key=jax.random.key(0))
 
 
-@pytest.mark.slow(group="study")
-def test_a_motion_that_leads_elsewhere_than_the_tests_contradicts_them():
-    space = on_cloth(0.32)
-    tests = [pulled(presets.black_denim(), each) for each in ANGLES]
-    told = estimate(tests, space)
-    assert consistency(told, told) == 1
-    better = 0.7 * told.standard_errors  # than by the tests alone
-    values = told.values * np.array([1.5, 1, 1, 1, 1, 1, 1])
-    assert (
-        consistency(told, dataclasses.replace(told, values=values, standard_errors=better)) < 1e-6
-    )
+def test_a_motion_contradicts_tests_where_it_is_sure_and_far_away():
+    """One that knows no better than the tests, or whose mesh errs, does not."""
+    by_tests = estimate(pulls_of(DENIM), SPACE)
+    widths = np.array([bound.width for bound in SPACE.ranges])
+
+    def shifted(by: float, known: float):
+        """By so many of the tests' standard errors in the membrane; known so much worse."""
+        shift = np.where(np.arange(SPACE.dim) < 3, by, 0) * by_tests.standard_errors / widths
+        place = np.asarray(SPACE.to_unit(by_tests.fabric)) + shift
+        values = np.asarray(SPACE.values(jnp.asarray(place, float)))
+        deviations = known * by_tests.standard_errors
+        return dataclasses.replace(by_tests, values=values, standard_errors=deviations)
+
+    assert consistency(by_tests, by_tests) == 1
+    assert min(consistency(by_tests, shifted(0.5, worse)) for worse in (1.0, 1.2)) > 0.3
+    better = shifted(2.0, 0.7)
+    blamed = dataclasses.replace(better, mesh_bias=2 * by_tests.standard_errors)
+    assert consistency(by_tests, better) < 0.05 and consistency(by_tests, blamed) > 0.3
+    assert consistency(by_tests, shifted(8.0, 0.7)) < 1e-6
 
 
-@pytest.mark.parametrize("law", [StiffeningMembrane.make(LAW, 5.0, 1.1, 1.2), SofteningPlate])
-def test_laws_that_hold_another_one_go_into_a_file_and_back(law):
-    fabric = presets.black_denim()
-    if isinstance(law, StiffeningMembrane):
-        fabric = dataclasses.replace(fabric, membrane=law)
-    else:
-        plate = law(fabric.bending, jnp.asarray(0.4), jnp.asarray(20.0))
-        fabric = dataclasses.replace(fabric, bending=plate)
+def test_a_drape_that_does_not_come_to_rest_is_an_error(monkeypatch: pytest.MonkeyPatch):
+    failed = lambda self, fabric: jnp.full(1, jnp.nan) * fabric.density  # noqa: E731
+    monkeypatch.setattr(Drape, "residuals", failed)
+    with pytest.raises(RuntimeError, match="no specimen of the drape test comes to rest"):
+        estimate([Drape.make(0.4)], on_cloth(0.2))
+
+
+@pytest.mark.parametrize("part", ["membrane", "bending"])
+def test_laws_that_hold_another_one_go_into_a_file_and_back(part):
+    laws = {
+        "membrane": StiffeningMembrane.make(LAW, 5.0, 1.1, 1.2),
+        "bending": SofteningPlate(DENIM.bending, jnp.asarray(0.4), jnp.asarray(20.0)),
+    }
+    fabric = dataclasses.replace(DENIM, **{part: laws[part]})
     stored = fabric_as_json(fabric)
     back = fabric_from_json(json.loads(json.dumps(stored)))
     assert jax.tree.all(jax.tree.map(np.array_equal, back, fabric))
-    part = stored["membrane" if isinstance(law, StiffeningMembrane) else "bending"]
-    part["small"].pop(next(name for name in part["small"] if name != "law"))
+    small = stored[part]["small"]
+    small.pop(next(name for name in small if name != "law"))
     with pytest.raises(ValueError, match="small: missing"):
         fabric_from_json(stored)
 
 
 # Files
+
+
+PULL = {"file": "warp.csv", "direction": "warp", "length": 0.2, "width": 0.05}
 
 
 def written(folder: Path, **kinds) -> Path:
@@ -324,51 +309,50 @@ def written(folder: Path, **kinds) -> Path:
     return path
 
 
-def curve(folder: Path, header: str, unit: float = 1.0, force: float = 1.0) -> str:
+def write_curve(folder: Path, header: str, unit: float = 1.0, force: float = 1.0) -> None:
+    """Up to a strain of 0.1, of 300 N/m."""
     rows = [f"{unit * e:.6g},{force * 300 * 0.05 * e / 0.2:.6g}" for e in np.linspace(0, 0.02, 20)]
     (folder / "warp.csv").write_text("\n".join([header, *rows]))
-    return "warp.csv"
-
-
-def test_the_units_of_a_curve_are_those_of_its_header(tmp_path: Path):
-    pull = {"direction": "warp", "length": 0.2, "width": 0.05}
-    found = []
-    for header, unit, force in (
-        ("extension_m,force_N", 1, 1),
-        ("Extension [mm],Force [mN]", 1e3, 1e3),
-        ("strain_%,force_gf", 500, 1 / 9.80665e-3),
-    ):
-        path = written(tmp_path, pulls=[pull | {"file": curve(tmp_path, header, unit, force)}])
-        found.append(read_tests(path).tests[0])
-    for other in found[1:]:
-        np.testing.assert_allclose(other.tension, found[0].tension, rtol=1e-4)
-        np.testing.assert_allclose(other.stretch, found[0].stretch, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
-    "header, unit, force, words",
+    "header, unit, force",
     [
-        ("extension_m,force_g", 1, 1, "is a mass: a force is in N, or in gf"),
-        ("extension_m,force_N", 500, 1, "per cent, or in millimetres"),
-        ("extension_m,force_N", 1, 1e5, "is the force in grams or millinewtons"),
-        ("extension_m,force_N", 1, -1, "the force does not rise"),
-        ("extension_m,force_N", 1e-3, 1, "stretches by 0.0001 of its length at most"),
-        ("extension,force_N", 1, 1, "unit of 'extension' is not known"),
-        ("stretch_m,force_N", 1, 1, "expected one column 'strain'"),
+        ("extension_m,force_N", 1, 1),
+        ("Extension [mm],Force [mN]", 1e3, 1e3),
+        ("strain_%,force_gf", 500, 1 / 9.80665e-3),
     ],
 )
-def test_a_curve_in_other_units_is_named(tmp_path: Path, header, unit, force, words):
-    file = curve(tmp_path, header, unit, force)
-    pull = {"file": file, "direction": "warp", "length": 0.2, "width": 0.05}
-    with pytest.raises(ValueError, match=words):
-        read_tests(written(tmp_path, pulls=[pull]))
+def test_the_units_of_a_curve_are_those_of_its_header(tmp_path: Path, header, unit, force):
+    write_curve(tmp_path, header, unit, force)
+    (pull,) = read_tests(written(tmp_path, pulls=[PULL])).tests
+    assert isinstance(pull, Pull)
+    np.testing.assert_allclose(pull.tension, 300 * (pull.stretch - 1), rtol=1e-4)
+    assert float(pull.stretch[-1]) == pytest.approx(1.1, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    "header, unit, force, word",
+    [
+        ("extension_m,force_g", 1, 1, "mass"),
+        ("extension_m,force_N", 500, 1, "per cent"),
+        ("extension_m,force_N", 1, 1e5, "millinewtons"),
+        ("extension_m,force_N", 1, -1, "does not rise"),
+        ("extension_m,force_N", 1e-3, 1, "in metres"),
+        ("extension,force_N", 1, 1, "unit of 'extension'"),
+    ],
+)
+def test_a_curve_in_other_units_is_named(tmp_path: Path, header, unit, force, word):
+    write_curve(tmp_path, header, unit, force)
+    with pytest.raises(ValueError, match=word):
+        read_tests(written(tmp_path, pulls=[PULL]))
 
 
 @pytest.mark.parametrize(
     "strain, force, words",
     [
         ([0, 0.05, 0.1, 0.05, 0], [0, 1, 2, 0.6, 0], "goes back by 100%"),
-        ([0, 0.02, 0.05, 0.08, 0.1], [0, 1, 2, 3, 0.2], "the force falls before the end"),
+        ([0, 0.02, 0.05, 0.08, 0.1], [0, 1, 2, 3, 0.2], "falls before the end"),
         ([0, 0.05, 0.08, 0.1], [1, 1.5, 1.8, 2], "at rest the force is 50%"),
         ([0, 0.05, 0.1], [0, -1, 2], "fewer than three samples"),
     ],
@@ -378,64 +362,24 @@ def test_a_curve_that_is_no_pull_is_named(strain, force, words):
         Pull.make(0.2 * np.array(strain), np.array(force, float), SIZE)
 
 
-@pytest.mark.slow(group="study")
-def test_widths_do_not_make_the_errors_of_tensions_smaller():
-    """What scatters more than it should says so, with widths as without."""
-    fabric, space = presets.black_denim(), on_cloth(0.32)
-    random, found = np.random.default_rng(0), {}
-    pulls = [pulled(fabric, each) for each in ANGLES]
-    rough = [
-        dataclasses.replace(each, tension=each.tension * (1 + 0.06 * random.normal(size=24)))
-        for each in pulls
-    ]
-    for name, tests in (
-        ("with", rough),
-        ("without", [dataclasses.replace(each, across=each.across * jnp.nan) for each in rough]),
-    ):
-        found[name] = estimate(tests, space).standard_errors[2]  # of the shear
-    assert found["with"] == pytest.approx(found["without"], rel=0.2)
-
-
-def test_a_drape_that_does_not_come_to_rest_is_an_error(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(
-        Drape, "residuals", lambda self, fabric: jnp.full(1, jnp.nan) * fabric.density
-    )
-    with pytest.raises(RuntimeError, match="no specimen of the drape test comes to rest"):
-        estimate([Drape.make(0.4)], on_cloth(0.2))
-
-
 @pytest.mark.parametrize(
     "kinds, words",
     [
         ({}, "no test"),
         ({"pull": []}, "unknown: pull"),
-        ({"cantilevers": [{"direction": "warp", "overhangs": [6.1, 6.2]}]}, "in centimetres"),
+        ({"pulls": [PULL]}, "pull 1: no such file"),
+        ({"cantilevers": [{"direction": "warp", "overhangs": [6.1]}]}, "in centimetres"),
         ({"cantilevers": [{"direction": "warp", "overhangs": [0.03, 0.07]}]}, "of one direction"),
         ({"cantilevers": [{"direction": 45, "overhangs": [0.05]}]}, "0 to pi rad"),
-        ({"cantilevers": [{"overhangs": [0.05]}]}, "cantilever 1: missing: direction"),
-        ({"drapes": [{"coefficient": 42}]}, "is it in per cent"),
-        ({"cantilevers": [{"direction": "warp", "overhangs": [10**400]}]}, "a number is too large"),
-        ({"cantilevers": [{"direction": True, "overhangs": [0.05]}]}, "direction: expected"),
-        ({"source": [1], "drapes": [{"coefficient": 0.4}]}, "source: expected text"),
-        ({"drapes": [{"coefficient": 0.4, "deviation": 5}]}, "the deviation is a share"),
-        ({"drapes": [{"coefficient": 0.4, "support_radius": 0.1499}]}, "drape 1: the radii"),
-        (
-            {"pulls": [{"file": "", "direction": "warp", "length": 0.2, "width": 0.05}]},
-            "pull 1: no such file",
-        ),
-        (
-            {"drapes": [{"coefficient": 0.4, "specimen_radius": 0.3, "support_radius": 0.18}]},
-            "diameters",
-        ),
-        ({"drapes": [{"coefficient": 0.4, "radius": 0.3}]}, "drape 1: unknown: radius"),
-        (
-            {"pulls": [{"file": "no.csv", "direction": "warp", "length": 0.2, "width": 0.05}]},
-            "no.csv",
-        ),
+        ({"cantilevers": [{"direction": "up", "overhangs": [0.05]}]}, "direction: expected"),
+        ({"cantilevers": [{"overhangs": [0.05]}]}, "missing: direction"),
+        ({"cantilevers": [{"direction": "warp", "overhangs": [10**400]}]}, "too large"),
+        ({"drapes": [{"coefficient": 42}]}, "drape 1: .*per cent"),
+        ({"drapes": [{"coefficient": 0.4, "support_radius": 0.18}]}, "diameters"),
     ],
 )
 def test_tests_that_are_none_are_named(tmp_path: Path, kinds: dict, words: str):
-    with pytest.raises((ValueError, FileNotFoundError), match=words):
+    with pytest.raises((ValueError, FileNotFoundError), match=f"tests.json: .*{words}"):
         read_tests(written(tmp_path, **kinds))
 
 
@@ -450,7 +394,8 @@ def test_pulls_of_knits_are_read_in_metres(tmp_path: Path):
             pins[0, 0], pins[1, 0] = 200 - 20 * (stretch - 1), -200 + 20 * (stretch - 1)
             pins[-2, 1], pins[-1, 1] = 240 * stretch, 0
             h5[f"{name}/traj"], h5[f"{name}/forces"] = pins, 20 * (stretch - 1)
-    pulls = read_knit(file, 0.0)
+    path = written(tmp_path, pulls=[{"file": file.name, "direction": "warp"}])
+    pulls: Any = read_tests(path).tests
     assert len(pulls) == 4  # the first one was never stretched before
     np.testing.assert_allclose(pulls[0].tension, 20 * (pulls[0].stretch - 1) / 0.1, rtol=1e-6)
     assert float(pulls[0].stretch.max()) == pytest.approx(1.5, abs=0.02)
@@ -467,8 +412,8 @@ def test_tests_alone_make_a_card(tmp_path: Path, capsys: pytest.CaptureFixture):
     from r2s.cli.main import main
     from r2s.estimation import cards
 
-    pull = {"file": curve(tmp_path, "extension_m,force_N"), "length": 0.2, "width": 0.05}
-    pulls = [pull | {"direction": each} for each in ("warp", "weft")]
+    write_curve(tmp_path, "extension_m,force_N")
+    pulls = [PULL | {"direction": direction} for direction in ("warp", "weft")]
     path = written(tmp_path, pulls=pulls, cantilevers=[{"direction": "warp", "overhangs": [0.05]}])
     command = ["estimate", str(path), "--density", "0.2", "--out", str(tmp_path / "card.json")]
     assert main(command) == 0
@@ -483,24 +428,3 @@ def test_tests_alone_make_a_card(tmp_path: Path, capsys: pytest.CaptureFixture):
     assert main([*command, "--law", "stiffening"]) == 0
     law = cards.read(tmp_path / "card.json").fabric.membrane
     assert isinstance(law, StiffeningMembrane)
-
-
-def test_an_estimate_that_errs_by_its_mesh_does_not_contradict_tests_that_it_lies_near():
-    """It knows no better than the tests do, and half a standard error is no contradiction."""
-    space = on_cloth(0.32)
-    told = estimate([pulled(presets.black_denim(), each) for each in ANGLES], space)
-    widths = np.array([bound.width for bound in space.ranges])
-
-    def shifted(by: float, known: float):
-        """By so many of the tests' standard errors in the membrane; known so much worse."""
-        shift = np.where(np.arange(space.dim) < 3, by, 0) * told.standard_errors / widths
-        places = np.asarray(space.to_unit(told.fabric)) + shift
-        values = np.asarray(space.values(jnp.asarray(places, float)))
-        errors = known * told.standard_errors
-        return dataclasses.replace(told, values=values, standard_errors=errors)
-
-    for worse in (1.0, 1.2):
-        assert consistency(told, shifted(0.5, worse)) > 0.3
-    better = shifted(2.0, 0.7)
-    blamed = dataclasses.replace(better, mesh_bias=2 * told.standard_errors)
-    assert consistency(told, better) < 0.05 and consistency(told, blamed) > 0.3

@@ -34,9 +34,9 @@ def test_within_a_call_others_come_one_after_the_other(two_cores):
     def inner(_):
         return threads.thread_map(lambda _: threading.get_ident(), range(3))
 
-    found = threads.thread_map(inner, range(4))
-    assert all(len(set(each)) == 1 for each in found)
-    assert threading.get_ident() not in found[0]
+    calls = threads.thread_map(inner, range(4))
+    assert all(len(set(call)) == 1 for call in calls)
+    assert threading.get_ident() not in calls[0]
 
 
 def test_an_error_is_raised_and_what_has_not_begun_is_left_out(two_cores):
@@ -61,28 +61,23 @@ def test_an_error_is_raised_and_what_has_not_begun_is_left_out(two_cores):
         lambda: jax.default_matmul_precision("highest"),
     ],
 )
-def test_settings_of_the_calling_thread_alone_hold(two_cores, setting):
-    """Threads would not have them: the caller works itself."""
+def test_settings_of_the_calling_thread_hold(two_cores, setting):
     with setting():
         here = threads.settings()
-        found = threads.thread_map(lambda _: threads.settings(), [1, 2])
-    assert found == [here] * 2
-
-
-def test_numpys_settings_hold_on_threads(two_cores):
+        assert threads.thread_map(lambda _: threads.settings(), [1, 2]) == [here] * 2
     with np.errstate(divide="raise"):
         found = threads.thread_map(lambda _: np.geterr()["divide"], [1, 2])
     assert found == ["raise"] * 2
 
 
-def test_how_many_are_done_is_told_by_the_caller(two_cores):
-    told = []
+def test_the_caller_says_how_many_are_done(two_cores):
+    reports = []
 
     def done(number):
-        told.append((number, threading.get_ident()))
+        reports.append((number, threading.get_ident()))
 
     threads.thread_map(abs, range(4), done)
-    assert told == [(number, threading.get_ident()) for number in (1, 2, 3, 4)]
+    assert reports == [(number, threading.get_ident()) for number in (1, 2, 3, 4)]
 
 
 @pytest.mark.parametrize(("limit", "count"), [("1", 1), ("", 4), (" 1000 ", 4), ("3", 3)])
@@ -90,6 +85,8 @@ def test_the_environment_limits_the_threads(monkeypatch, limit, count):
     monkeypatch.setattr(threads, "cores", lambda: 4)
     monkeypatch.setenv(threads.LIMIT, limit)
     assert threads.threads() == count
+    if count == 1:
+        assert threads.thread_map(lambda _: threading.get_ident(), [0]) == [threading.get_ident()]
 
 
 @pytest.mark.parametrize("limit", ["0", "many", "-1"])
@@ -97,12 +94,6 @@ def test_a_limit_that_is_none_is_refused(monkeypatch, limit):
     monkeypatch.setenv(threads.LIMIT, limit)
     with pytest.raises(ValueError, match="whole number from 1 on"):
         threads.threads()
-
-
-def test_on_one_core_the_caller_works_alone(monkeypatch):
-    monkeypatch.setattr(threads, "threads", lambda: 1)
-    found = threads.thread_map(lambda _: threading.get_ident(), range(3))
-    assert set(found) == {threading.get_ident()}
 
 
 def test_two_threads_that_call_a_function_first_trace_it_once(two_cores, monkeypatch):
@@ -121,8 +112,8 @@ def test_two_threads_that_call_a_function_first_trace_it_once(two_cores, monkeyp
         time.sleep(0.1)
         return 2 * x
 
-    found = threads.thread_map(doubled, [jnp.ones(3), 2 * jnp.ones(3)])
-    assert [each.tolist() for each in found] == [[2.0] * 3, [4.0] * 3]
+    results = threads.thread_map(doubled, [jnp.ones(3), 2 * jnp.ones(3)])
+    assert [result.tolist() for result in results] == [[2.0] * 3, [4.0] * 3]
     assert len(traced) == 1
 
 

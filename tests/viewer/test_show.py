@@ -17,20 +17,12 @@ from r2s.recordings.open import (
     save_trajectory,
 )
 from r2s.recordings.recording import save
-from r2s.viewer.pictures import (
-    _draw_force,
-    _mark_frames,
-    contact_sheet,
-    pictures,
-    show,
-)
+from r2s.viewer.pictures import _draw_force, contact_sheet, pictures, show
 
 
 def colours(path: Path) -> set[tuple[int, int, int]]:
-    image = Image.open(path).convert("RGB")
-    found = image.getcolors(image.width * image.height)
-    assert found is not None
-    return {colour for _, colour in found}  # type: ignore[misc]
+    pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
+    return set(map(tuple, np.unique(pixels, axis=0).tolist()))
 
 
 def test_a_sheet_and_a_gif_are_written(tmp_path: Path) -> None:
@@ -69,25 +61,21 @@ def test_the_force_is_drawn_below(tmp_path: Path, vector: bool) -> None:
     force = 3 * times
     log = np.outer(force, [0.6, 0.0, -0.8]) if vector else force
     pulled = recorded(force=log, force_times=times)
-    curve = _draw_force(Figure(), pulled, 0.1, 0.2)
-    np.testing.assert_allclose(curve.lines[0].get_ydata(), force, rtol=1e-12)
-    (marked,) = _mark_frames(curve, pulled, np.arange(FRAMES))
+    axes = Figure().add_subplot()
+    _draw_force(axes, pulled, list(range(FRAMES)))
+    curve, dots = (np.asarray(line.get_ydata(), float) for line in axes.lines)
+    np.testing.assert_allclose(curve, force, rtol=1e-12)
     expected = np.where(np.arange(FRAMES) / 15 < 0.1, np.nan, np.arange(FRAMES) / 5)
-    np.testing.assert_allclose(marked.get_ydata(), expected, rtol=1e-12)
-    assert curve.get_xlim()[1] < 0.3  # the frames end long before the log
-
-    def size(recording, name):
-        return Image.open(contact_sheet(tmp_path / name, recording)).height
-
-    assert size(pulled, "with.png") > size(recorded(), "without.png") + 100
-
-
-def test_a_video_with_a_force() -> None:
-    pulled = recorded(3, force=np.arange(4.0), force_times=np.arange(4.0) / 20)
+    np.testing.assert_allclose(dots, expected, rtol=1e-12)
+    assert axes.get_xlim()[1] < 0.3  # the frames end long before the log
+    heights = [
+        Image.open(contact_sheet(tmp_path / "sheet.png", recording)).height
+        for recording in (recorded(), pulled)
+    ]
+    assert heights[1] > heights[0] + 100
     frames = list(pictures(pulled))
-    assert len(frames) == 3 and all(side % 2 == 0 for side in frames[0].shape[:2])
-    below = [frame[-160:] for frame in frames]
-    assert (below[0] != below[1]).any() and (below[1] != below[2]).any()  # the dot moves
+    assert len(frames) == FRAMES and all(side % 2 == 0 for side in frames[0].shape[:2])
+    assert (frames[2][-160:] != frames[3][-160:]).any()  # the dot moves
 
 
 def test_a_video_of_opencv(tmp_path: Path) -> None:
@@ -118,24 +106,16 @@ def test_a_trajectory_is_read_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "arrays, words",
     [
-        ({"x": cloth().x}, "no trajectory .*lacks the arrays faces; has x"),
-        ({"x": cloth().x[0], "faces": cloth().faces}, r"expected x .frame, vertex, 3.*\(4, 3\)"),
+        ({"x": cloth().x}, "lacks the arrays faces"),
+        ({"x": cloth().x[0], "faces": cloth().faces}, "expected x .frame, vertex, 3"),
         ({"x": cloth().x, "faces": cloth().faces + 1}, "faces must be numbers of the 4 vertices"),
         ({"x": cloth().x, "faces": cloth().faces * 1.0}, "faces must be numbers"),
     ],
 )
 def test_a_trajectory_that_is_none_names_the_file(tmp_path: Path, arrays, words: str) -> None:
     np.savez(tmp_path / "t.npz", **arrays)
-    with pytest.raises(ValueError, match=f"t.npz: {words}"):
+    with pytest.raises(ValueError, match=f"t.npz: .*{words}"):
         load_trajectory(tmp_path / "t.npz")
-
-
-def test_a_damaged_trajectory_and_none(tmp_path: Path) -> None:
-    (tmp_path / "t.npz").write_bytes(b"PK cut")
-    with pytest.raises(ValueError, match="t.npz: no trajectory"):
-        load_trajectory(tmp_path / "t.npz")
-    with pytest.raises(FileNotFoundError, match="none.npz"):
-        load_trajectory(tmp_path / "none.npz")
 
 
 def test_recordings_are_opened_by_what_they_are(tmp_path: Path) -> None:

@@ -13,15 +13,8 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Float, Int, UInt
 
-from r2s._util.files import read_json, write_bytes, write_json
-from r2s.estimation.physnet.images import (
-    View,
-    depths_of_sheet,
-    eye_of,
-    floor_of,
-    per_face,
-    view_around,
-)
+from r2s._util.files import read_json, read_npz, write_bytes, write_json
+from r2s.estimation.physnet.images import View, depths_of_sheet, per_face, view_of
 from r2s.materials.fabric import Fabric
 from r2s.materials.parameters import IsotropicSpace, OrthotropicSpace, ParameterSpace, Range
 from r2s.scenarios.resolution import mpm_cloth
@@ -29,7 +22,6 @@ from r2s.scenarios.scenario import Scenario, rollout
 from r2s.scenarios.standard import SCENARIOS, Experiment, varied
 from r2s.solvers.mpm.sheet import MPMCloth
 
-FORMAT = "r2s-physnet-data/3"
 DEPTH_UNIT = 1e-4  # [m], of the depths in the files
 DENSITY = 0.2  # [kg/m^2], of all fabrics
 
@@ -60,35 +52,22 @@ class Settings:
     per_shard: int = 16
     seed: int = 0
 
-    def __post_init__(self) -> None:
-        default = self._default_space().ranges
-        if not self.ranges:  # stored with the data, so that later defaults do not change them
-            object.__setattr__(self, "ranges", default)
-        names, expected = ([bound.name for bound in ranges] for ranges in (self.ranges, default))
-        if names[: len(expected)] != expected:
-            raise ValueError(f"the space has the ranges {expected}, found {names}")
-        if self.scenario not in SCENARIOS:
-            raise ValueError(f"scenario must be one of {list(SCENARIOS)}, found {self.scenario!r}")
-
     @property
     def space(self) -> ParameterSpace:
         """The fabrics from which those of the data are drawn."""
-        return dataclasses.replace(self._default_space(), ranges=self.ranges)
+        space = (IsotropicSpace if self.solver == "mpm" else OrthotropicSpace).make(DENSITY)
+        return dataclasses.replace(space, ranges=self.ranges) if self.ranges else space
 
     @property
     def num_shards(self) -> int:
         """Number of files."""
         return -(-self.num_fabrics // self.per_shard)
 
-    def _default_space(self) -> OrthotropicSpace | IsotropicSpace:
-        return (IsotropicSpace if self.solver == "mpm" else OrthotropicSpace).make(DENSITY)
-
 
 @dataclass(frozen=True)
 class Manifest:
     """The file `manifest.json`: settings and view of the data."""
 
-    format: str
     settings: Settings
     view: View
 
@@ -119,49 +98,36 @@ def make(folder: Path | str, settings: Settings, progress: bool = True) -> Manif
     folder.mkdir(parents=True, exist_ok=True)
     if (folder / "manifest.json").exists():
         stored = load_manifest(folder)
-        old, new = asdict(stored.settings), asdict(settings)
-        if changed := [f"{k} {old[k]} there, {new[k]} asked" for k in old if old[k] != new[k]]:
-            raise ValueError(
-                f"{folder} has data of other settings: {', '.join(changed)}; choose another folder"
-            )
+        if stored.settings != settings:
+            raise ValueError(f"{folder} has data of other settings: remove it, or choose another")
         view = stored.view
     missing = [n for n in range(settings.num_shards) if not _shard(folder, n).exists()]
-    if not missing:
-        return load_manifest(folder)
-    substeps, solver = _shared(settings)
+    substeps, solver = _shared(settings) if missing else (1, None)
     for number in tqdm(missing, "shards", disable=None if progress else True):
         places, x, ok = _simulate(settings, number, substeps, solver)
         if view is None:
-            experiment, points = SCENARIOS[settings.scenario](), x[ok].reshape(-1, 3)
-            eye, floor = eye_of(experiment), floor_of(experiment)
-            view = view_around(eye, points, settings.size, floor)
-        write_json(folder / "manifest.json", asdict(Manifest(FORMAT, settings, view)))
+            view = view_of(SCENARIOS[settings.scenario](), x[ok].reshape(-1, 3), settings.size)
+        write_json(folder / "manifest.json", asdict(Manifest(settings, view)))
         _write(_shard(folder, number), settings, view, places, x, ok)
     return load_manifest(folder)
 
 
 def load_manifest(folder: Path | str) -> Manifest:
     """The manifest of a data set. Raises `ValueError` that names the file when it is damaged."""
-    path = Path(folder) / "manifest.json"
-    manifest = read_json(path, Manifest)
-    if manifest.format != FORMAT:
-        raise ValueError(f"{path}: expected format {FORMAT}, found {manifest.format}")
-    return manifest
+    return read_json(Path(folder) / "manifest.json", Manifest)
 
 
 def load(folder: Path | str) -> Data:
     """All shards of a data set. Raises `ValueError` that names what is missing or damaged."""
-    folder = Path(folder)
+    folder, names = Path(folder), ("ok", "depth", "places")
     settings, parts = load_manifest(folder).settings, []
     for number in range(settings.num_shards):
         path = _shard(folder, number)
         try:
-            with np.load(path, allow_pickle=False) as file:
-                parts.append([file[name] for name in ("ok", "depth", "places")])
-        except Exception as error:  # a damaged file raises anything
-            raise ValueError(
-                f"{path} is missing or damaged: remove it and call `make` again, it goes on"
-            ) from error
+            arrays = read_npz(path, *names)
+        except (FileNotFoundError, ValueError) as error:
+            raise ValueError(f"{path} is missing or damaged: remove it and begin again") from error
+        parts.append([arrays[name] for name in names])
     ok, depth, places = (np.concatenate(part) for part in zip(*parts, strict=True))
     fabric = np.repeat(np.arange(len(places)), settings.num_levels)
     return Data(depth[ok], fabric[ok], places)
@@ -200,7 +166,8 @@ def _shared(settings: Settings) -> tuple[int, MPMCloth | None]:
         return substeps, None
     path = jnp.concatenate([scenario.path for scenario in scenarios])
     times = jnp.concatenate([scenario.path_times for scenario in scenarios])
-    stiffest = settings.space(jnp.ones(len(settings.ranges), float))
+    space = settings.space
+    stiffest = space(jnp.ones(space.dim, float))
     everywhere = dataclasses.replace(scenarios[0], path=path, path_times=times)
     return substeps, mpm_cloth(everywhere, stiffest)
 
@@ -210,19 +177,18 @@ def _rollouts(scenarios: Scenario, fabrics: Fabric, solver: MPMCloth | None):
     def one(scenario: Scenario, fabric: Fabric):
         # the grid serves all scenarios, but each has a fan of its own
         own = solver and eqx.tree_at(lambda s: s.scene, solver, scenario.scene)
-        found = rollout(scenario, fabric, solver=own)
-        return found.x, jnp.all(found.ok) & jnp.all(jnp.isfinite(found.x))
+        motion = rollout(scenario, fabric, solver=own)
+        return motion.x, jnp.all(motion.ok) & jnp.all(jnp.isfinite(motion.x))
 
     return eqx.filter_vmap(one)(scenarios, fabrics)
 
 
 def _simulate(settings: Settings, number: int, substeps: int, solver: MPMCloth | None):
     """Places of the fabrics, motions [m] and which of them are ok, of a shard."""
-    first = number * settings.per_shard
-    count = min(settings.per_shard, settings.num_fabrics - first)
+    count = min(settings.per_shard, settings.num_fabrics - number * settings.per_shard)
     # always a whole shard, so that it compiles once and does not depend on the number of fabrics
     key = jr.fold_in(jr.key(settings.seed), number)
-    places = jr.uniform(key, (settings.per_shard, len(settings.ranges)), float)
+    places = jr.uniform(key, (settings.per_shard, settings.space.dim), float)
     experiments = levels(settings, number)
     scenarios = [
         dataclasses.replace(experiment.scenario(settings.shape), substeps=substeps)

@@ -1,12 +1,10 @@
-"""Grey images of depth, as the network takes them: of a simulated surface, a recorded cloud or a
-camera's measurement.
+"""Grey images of depth, as the network takes them: of a simulated surface or a recorded cloud.
 
-All of them pass `depth_of`, which crops and scales simulated and recorded images alike, and `grey`.
+Both pass `depth_of`, which crops and scales them in the same way, and `grey`.
 """
 
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,9 +21,9 @@ Triple = tuple[float, float, float]
 Depth = Float[Array, "down across"]  # [m]; 0 where there is none
 LAYER = 0.02  # [m], by which points of another layer lie behind the nearest of a pixel
 MARGIN = 0.08  # around all points, as a share of the image and of the range of depths
-ALIKE = 2  # least number of 8 neighbours within `LAYER` of a pixel that is no stray
+SUPPORT = 2  # least number of 8 neighbours within `LAYER` of a pixel that is no stray
 SPECK = 5  # the same among 5 x 5 pixels, where `REACH` has spread measured points
-AROUND = 5  # least number of 8 neighbours with depth, from which a hole is filled
+FILLED = 5  # least number of 8 neighbours with depth, from which a hole is filled
 PASSES = 2  # of filling: holes of up to about 4 pixels across
 DARKEST = 0.2  # grey of the farthest depth; a pixel without depth is 0
 REACH = 0.25  # half the side of the square of a measured point, over the distance between points
@@ -40,7 +38,7 @@ class View:
     - `focal_length`: [pixel].
     - `size`: side of the image, [pixel].
     - `near`, `far`: depths that become white and black, [m].
-    - `floor`: height below which points are left out, as fabric and table look alike there, [m].
+    - `floor`: height below which points are left out, as the table may be among them, [m].
     """
 
     position: Triple
@@ -51,24 +49,13 @@ class View:
     far: float
     floor: float
 
-    def __post_init__(self) -> None:
-        if not (self.size >= 1 and self.focal_length > 0 and 0 < self.near < self.far):
-            raise ValueError(
-                "a view needs size >= 1, focal_length > 0 and 0 < near < far; got size "
-                f"{self.size}, focal_length {self.focal_length:g}, near {self.near:g} m, far "
-                f"{self.far:g} m"
-            )
 
-
-def eye_of(experiment: Experiment) -> Triple:
-    """The position of the first camera of `r2s.scenarios.synthetic.sensing`, [m]."""
-    x, y, z = (float(value) for value in sensing(experiment).cameras[0].position)
-    return x, y, z
-
-
-def floor_of(experiment: Experiment) -> float:
-    """The height [m] below which the cameras of an experiment see sheet and table alike."""
-    return experiment.table_height + max(sensing(experiment).margin, -1.0)
+def view_of(experiment: Experiment, points: Float[np.ndarray, "point 3"], size: int) -> View:
+    """`view_around` points from the first camera of `r2s.scenarios.synthetic.sensing`, above the
+    height below which its cameras see the table, too."""
+    sensed = sensing(experiment)
+    x, y, z = (float(value) for value in sensed.cameras[0].position)
+    return view_around((x, y, z), points, size, experiment.table_height + max(sensed.margin, -1.0))
 
 
 def view_around(eye: Triple, points: Float[np.ndarray, "point 3"], size: int, floor: float) -> View:
@@ -171,15 +158,15 @@ def depth_of_cloud(view: View, points: Float[Array, "point 3"], mask: Bool[Array
 
 def grey(view: View, depth: Depth) -> Float[Array, "down across"]:
     """The grey image of a depth image [m]: 1 for the nearest depth, `DARKEST` for the farthest,
-    0 for none. Strays (with fewer than `ALIKE` neighbours near their depth) are dropped, and then
-    holes filled by the mean of at least `AROUND` neighbours.
+    0 for none. Strays (with fewer than `SUPPORT` neighbours near their depth) are dropped, and then
+    holes filled by the mean of at least `FILLED` neighbours.
     """
-    around = _neighbours(depth)
-    near = (around > 0) & (jnp.abs(around - depth[None]) < LAYER)
-    depth = jnp.where(jnp.sum(near, axis=0) >= ALIKE, depth, 0)
+    beside = _neighbours(depth)
+    near = (beside > 0) & (jnp.abs(beside - depth[None]) < LAYER)
+    depth = jnp.where(jnp.sum(near, axis=0) >= SUPPORT, depth, 0)
     for _ in range(PASSES):
         number, mean = _mean_depth(_neighbours(depth))
-        depth = jnp.where((depth > 0) | (number < AROUND), depth, mean)
+        depth = jnp.where((depth > 0) | (number < FILLED), depth, mean)
     shade = (view.far - depth) / (view.far - view.near)
     return jnp.where(depth > 0, DARKEST + (1 - DARKEST) * jnp.clip(shade, 0, 1), 0)
 
@@ -192,55 +179,35 @@ def _neighbours(values: Depth, reach: int = 1) -> Float[Array, "n down across"]:
     return jnp.stack([padded[i : i + rows, j : j + columns] for i, j in shifts])
 
 
-def _mean_depth(around: Float[Array, "n down across"]):
+def _mean_depth(beside: Float[Array, "n down across"]):
     """How many neighbours of every pixel have a depth, and the mean of those [m]."""
-    number = jnp.sum(around > 0, axis=0, dtype=around.dtype)
-    return number, jnp.sum(around, axis=0) / jnp.maximum(number, 1)
+    number = jnp.sum(beside > 0, axis=0, dtype=beside.dtype)
+    return number, jnp.sum(beside, axis=0) / jnp.maximum(number, 1)
 
 
-def of_clouds(view: View, recording: Recording, frames: tuple[int, ...]) -> np.ndarray:
-    """The images (frame, down, across) of a recording's clouds at some frames.
+def of_clouds(
+    view: View, recording: Recording, frames: tuple[int, ...]
+) -> Float[np.ndarray, "frame down across"]:
+    """The images of a recording's clouds at some frames.
 
-    Raises `ValueError` as `of_depths` does.
+    Raises `ValueError` that names the frame when its points are too few, not in metres, or not
+    where the view looks.
     """
-    chosen = np.array(frames)
-    depth = jax.jit(jax.vmap(partial(depth_of_cloud, view)))(
-        recording.points[chosen], recording.mask[chosen]
-    )
-    return of_depths(view, np.asarray(depth), recording.info.name, frames)
-
-
-def of_depths(
-    view: View,
-    depths: Float[np.ndarray, "frame down across"],
-    name: str = "depth images",
-    frames: tuple[int, ...] = (),
-) -> np.ndarray:
-    """The images of depths [m] in the view's own pixels.
-
-    Raises `ValueError` that names the frame when depths have another size, are not finite, are
-    missing, are not in metres or are not where the view looks.
-    """
-    if depths.ndim != 3 or depths.shape[1:] != (view.size, view.size):
-        raise ValueError(
-            f"{name}: expected images of {view.size} x {view.size} pixels, found {depths.shape}"
-        )
+    clouds = recording.points[np.array(frames)], recording.mask[np.array(frames)]
+    depths = np.asarray(jax.jit(jax.vmap(partial(depth_of_cloud, view)))(*clouds))
     least = LEAST * view.size**2 / 64**2
-    for number, depth in enumerate(depths):
-        at = f"{name}, frame {frames[number] if frames else number}"
-        seen = depth > 0
-        if not np.isfinite(depth).all():
-            raise ValueError(f"{at}: {(~np.isfinite(depth)).sum()} depths are not finite")
-        if seen.sum() < least:
+    for frame, depth in zip(frames, depths, strict=True):
+        covered = depth[depth > 0]
+        if len(covered) < least:
             raise ValueError(
-                f"{at}: {seen.sum()} pixels have a depth, expected at least {least:.0f}: the frame "
-                f"is empty, the view looks elsewhere, or the units are not metres"
+                f"{recording.info.name}, frame {frame}: {len(covered)} pixels have a depth, "
+                f"expected at least {least:.0f}: the frame is empty, the view looks elsewhere, or "
+                "the units are not metres"
             )
-        median = float(np.median(depth[seen]))
-        if not view.near / 2 <= median <= 2 * view.far:
+        if not view.near / 2 <= np.median(covered) <= 2 * view.far:
             raise ValueError(
-                f"{at}: the median depth is {median:g} m, the view expects {view.near:g} to "
-                f"{view.far:g} m: give depths in metres, from the view's camera"
+                f"{recording.info.name}, frame {frame}: the median depth is {np.median(covered):g} "
+                f"m, the view expects {view.near:g} to {view.far:g} m: give points in metres"
             )
     return np.asarray(jax.jit(jax.vmap(partial(grey, view)))(jnp.asarray(depths, float)))
 
@@ -248,12 +215,12 @@ def of_depths(
 # Errors of training images
 
 
-class Flaws(NamedTuple):
+@dataclass(frozen=True)
+class Flaws:
     """The errors of training images. Shares and scales are upper ends, drawn anew for each image.
 
-    The defaults are from the effect of the typical flaws in `r2s.recordings.synthetic_rgbd`
-    and of clouds of two cameras on images of 64 x 64: 5 to 22 % of the pixels at a border are lost,
-    up to 10 % beside it are gained, and a tenth of the depths there are more than 6 to 8 mm wrong.
+    The defaults come from images of 64 x 64 of two cameras: 5 to 22 % of the pixels at a border are
+    lost, up to 10 % beside it are gained, and a tenth of the depths there err by over 6 to 8 mm.
 
     - `noise`: standard deviation of depth at 1 m, which grows with its square, [m].
     - `holes`: share of the pixels that lose their depth.
@@ -286,13 +253,14 @@ def flawed(depth: Depth, view: View, flaws: Flaws, key: Array) -> Depth:
 def _with_ragged_borders(depth: Depth, flaws: Flaws, share: Float[Array, "3"], key: Array) -> Depth:
     """Depth [m] with lost, gained and wrong pixels at its borders."""
     key_lost, key_error = jax.random.split(key)
-    around, there = _neighbours(depth), depth > 0
-    number, beside = _mean_depth(around)
-    border = there & jnp.any((around == 0) | (jnp.abs(around - depth[None]) > LAYER), axis=0)
-    outside = ~there & (number > 0)
+    beside, is_sheet = _neighbours(depth), depth > 0
+    number, mean = _mean_depth(beside)
+    is_apart = (beside == 0) | (jnp.abs(beside - depth[None]) > LAYER)
+    border = is_sheet & jnp.any(is_apart, axis=0)
+    outside = ~is_sheet & (number > 0)
     chance = jax.random.uniform(key_lost, depth.shape, depth.dtype)
     gained = outside & (chance < flaws.gained * share[0])
     lost = border & (chance < flaws.lost * share[1])
     error = flaws.flying * share[2] * jax.random.laplace(key_error, depth.shape, depth.dtype)
-    depth = jnp.where(gained, beside, jnp.where(lost, 0, depth))
+    depth = jnp.where(gained, mean, jnp.where(lost, 0, depth))
     return jnp.where((border | outside) & (depth > 0), depth + error, depth)

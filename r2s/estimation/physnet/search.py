@@ -2,12 +2,12 @@
 
 Two ways choose the places:
 
-- `emulated`: a Gaussian process emulates each principal component of the answers, because 80
-  answers of many numbers say more of where the target lies than 80 losses (composite Bayesian
-  optimisation, Astudillo and Frazier 2019). scikit-optimize models a scalar loss alone: with
-  `emulated` shear, friction and coupling are 0.05, 0.05 and 0.30 of the range off (80 simulations),
-  with Bayesian optimisation 0.25, 0.10 and 0.60 (44 simulations; version 0.2.0).
-- `bayesian`: Bayesian optimisation of the loss, as in the published recipe, by scikit-optimize.
+- A Gaussian process emulates each principal component of the answers, because 80 answers of many
+  numbers say more of where the target lies than 80 losses (composite Bayesian optimisation,
+  Astudillo and Frazier 2019). Scikit-optimize models a scalar loss alone: so shear, friction and
+  coupling are 0.05, 0.05 and 0.30 of the range off (80 simulations), by Bayesian optimisation 0.25,
+  0.10 and 0.60 (44 simulations; version 0.2.0).
+- Bayesian optimisation of the loss by scikit-optimize, as in the published recipe.
 """
 
 import warnings
@@ -23,8 +23,9 @@ from scipy.stats import qmc
 from r2s._util.extras import require
 from r2s.estimation import checkpoint
 
+BATCH = 4  # calls that are answered together
 COMPONENTS = 10  # principal components of the answers, at most
-FIRST = 0.4  # share of the calls that fill the cube evenly
+FIRST = 0.4  # share of the calls at places of Sobol's sequence
 FIRST_CALLS = 16  # the same of Bayesian optimisation, in calls
 CANDIDATES = 1000  # random places anywhere, and as many around the best
 CENTRES = 5  # number of the best places
@@ -60,68 +61,37 @@ class Trials(NamedTuple):
         return Trials(self.places[succeeded], self.residuals[succeeded])
 
 
-def emulated(
-    respond: Respond,
-    target: Float[np.ndarray, " part"],
-    dim: int,
-    *,
-    num_calls: int = 80,
-    shared: int = 1,
-    **options: Any,
-) -> Trials:
-    """Trials, of which the last is where the target most likely lies.
-
-    `shared`: number of parts of an answer, such as frames, that share one error of the target; for
-    the other arguments see `search`. Raises `ValueError` for fewer than `dim` + 2 calls.
-    """
-    if num_calls < dim + 2:
-        raise ValueError(f"expected at least {dim + 2} calls in {dim} dimensions, got {num_calls}")
-    first = max(int(FIRST * num_calls), dim + 1)
-    ask = partial(_likely_places, shared=shared)
-    return search(respond, target, ask, dim, num_calls=num_calls, num_first=first, **options)
-
-
-def bayesian(
-    respond: Respond,
-    target: Float[np.ndarray, " part"],
-    dim: int,
-    *,
-    num_first: int = FIRST_CALLS,
-    **options: Any,
-) -> Trials:
-    """Trials by Bayesian optimisation of the loss; for the arguments see `search`."""
-    return search(respond, target, _improving_places, dim, num_first=num_first, **options)
-
-
 def search(
     respond: Respond,
     target: Float[np.ndarray, " part"],
-    ask: Callable[[Trials, int, int, np.random.Generator], Places],
     dim: int,
     *,
-    num_first: int,
+    published: bool = False,
     num_calls: int = 80,
-    batch: int = 4,
+    shared: int = 1,
     seed: int = 0,
     path: Path | str | None = None,
     run: str = "",
     progress: Callable[[int, float], None] | None = None,
 ) -> Trials:
-    """The trials of a search of `num_calls` calls.
+    """The trials of a search. The last is where the target most likely lies, unless `published`.
 
-    - `respond`: gives the answers of up to `batch` places.
-    - `ask`: gives the places of the next calls from the trials, the most that it may give, the
-      number of calls that are left, and a generator of random numbers.
-    - `num_first`: calls at places of Sobol's sequence, before `ask` is used.
+    - `respond`: gives the answers of up to `BATCH` places.
+    - `published`: by Bayesian optimisation, not by an emulator of the answers.
+    - `shared`: number of parts of an answer, such as frames, that share one error of the target.
     - `path`: file that stores the trials after every batch, and from which the search continues.
     - `run`: identifies this search (`r2s.estimation.checkpoint.fingerprint`).
     - `progress`: called with the number of calls and the least loss, after every batch.
 
-    The same seed gives the same trials. Raises `ValueError` when the file is of another search, and
-    `RuntimeError` when all calls fail.
+    The same seed gives the same trials. Raises `ValueError` when the file is of another search or
+    the emulator has fewer than `dim` + 2 calls, and `RuntimeError` when all calls fail.
     """
+    if not published and num_calls < dim + 2:
+        raise ValueError(f"expected at least {dim + 2} calls in {dim} dimensions, got {num_calls}")
+    num_first = FIRST_CALLS if published else max(int(FIRST * num_calls), dim + 1)
+    ask = _improving_places if published else partial(_likely_places, shared=shared)
     header = {"kind": "search", "run": run, "dim": dim, "calls": num_calls}
-    header |= {"first": num_first, "batch": batch, "seed": seed}
+    header |= {"first": num_first, "batch": BATCH, "seed": seed}
     trials = Trials(np.zeros((0, dim)), np.zeros((0, len(target))))
     if path is not None and (stored := checkpoint.load(path, header)) is not None:
         trials = Trials(**stored)
@@ -129,10 +99,10 @@ def search(
     first = sequence.random_base2(max(num_first - 1, 0).bit_length())[:num_first]
     while (done := len(trials.places)) < num_calls:
         if done < num_first:
-            places = first[done : min(done + batch, num_calls)]
+            places = first[done : min(done + BATCH, num_calls)]
         else:
             generator = np.random.default_rng([seed, done])
-            places = ask(trials, batch, num_calls - done, generator)
+            places = ask(trials, num_calls - done, generator)
         new = places, respond(places) - target
         trials = Trials(*(np.concatenate(pair) for pair in zip(trials, new, strict=True)))
         if path is not None:
@@ -143,16 +113,16 @@ def search(
 
 
 def _likely_places(
-    trials: Trials, batch: int, left: int, generator: np.random.Generator, *, shared: int = 1
+    trials: Trials, left: int, generator: np.random.Generator, *, shared: int = 1
 ) -> Places:
-    """The next places, drawn by the likelihood of the target; for the last call the most likely.
+    """At most `BATCH` places, drawn by the likelihood of the target; of `left` = 1 the most likely.
 
     The likelihood is from the emulator's deviation and the error of the target, which the least
     loss estimates.
     """
     known = trials.successful
     best = known.places[np.argsort(known.losses)[:CENTRES]]
-    number = min(batch, left - 1)
+    number = min(BATCH, left - 1)
     tried = np.concatenate([_candidates(best, generator) for _ in range(1 if number else 4)])
     misfit = _misfit(known, shared * known.losses.min() ** 2, tried)
     if not number:
@@ -168,8 +138,8 @@ def _candidates(best: Float[np.ndarray, "centre dim"], generator: np.random.Gene
     low, high = np.log(WIDTHS)
     widths = np.exp(generator.uniform(low, high, (CANDIDATES, 1)))
     centres = best[generator.integers(len(best), size=CANDIDATES)]
-    around = centres + widths * generator.standard_normal((CANDIDATES, dim))
-    return np.concatenate([anywhere, np.clip(around, 0, 1)])
+    near = centres + widths * generator.standard_normal((CANDIDATES, dim))
+    return np.concatenate([anywhere, np.clip(near, 0, 1)])
 
 
 def _misfit(trials: Trials, variance: float, tried: Places) -> Float[np.ndarray, " place"]:
@@ -196,9 +166,7 @@ def _misfit(trials: Trials, variance: float, tried: Places) -> Float[np.ndarray,
     return total
 
 
-def _improving_places(
-    trials: Trials, batch: int, left: int, generator: np.random.Generator
-) -> Places:
+def _improving_places(trials: Trials, left: int, generator: np.random.Generator) -> Places:
     """The next places: those of the greatest expected improvement of a Gaussian process.
 
     The process is one of the logarithm of the losses. A call that failed counts as the worst that
@@ -220,4 +188,4 @@ def _improving_places(
     with warnings.catch_warnings():  # that a length is at its bound, or a place was tried before
         warnings.simplefilter("ignore")
         optimizer.tell(trials.places.tolist(), losses.tolist(), fit=False)
-        return np.array(optimizer.ask(min(batch, left)))
+        return np.array(optimizer.ask(min(BATCH, left)))

@@ -1,7 +1,7 @@
 """The physics-informed network as an estimator: stiffness from markers and force of stretchings.
 
 A network is trained on each pull (`r2s.estimation.pinn.training`). From it the motions in
-equilibrium are computed (`r2s.estimation.pinn.equilibrium`), and the stiffness whose motions fit
+equilibrium are computed (`r2s.estimation.pinn.weak_form`), and the stiffness whose motions fit
 markers and force best, with its covariance.
 
 The fit takes damped Gauss-Newton steps within the ranges, and estimates the noise of markers and
@@ -22,11 +22,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from r2s.estimation.estimate import Estimate, Nuisance
 from r2s.estimation.least_squares import Damping, at_bound, damped, newton_step, proposed
-from r2s.estimation.pinn.equilibrium import Motion, equilibrium, prepare
 from r2s.estimation.pinn.network import Network
 from r2s.estimation.pinn.pulls import Pull, stacked
-from r2s.estimation.pinn.training import NOISE, QUICK, Recipe, Trained, train
-from r2s.estimation.pinn.weak_form import DEGREES
+from r2s.estimation.pinn.training import NOISE, Recipe, train
+from r2s.estimation.pinn.weak_form import DEGREES, Motion, equilibrium, prepare
 from r2s.estimation.standard_errors import to_small_strain
 from r2s.materials.parameters import ParameterSpace, stiffens
 
@@ -66,7 +65,7 @@ class Fit(NamedTuple):
 def estimate(
     pulls: Sequence[Pull],
     space: ParameterSpace,
-    recipe: Recipe = QUICK,
+    recipe: Recipe,
     *,
     progress: Callable[[int, float], None] | None = None,
     checkpoint: Path | None = None,
@@ -82,7 +81,7 @@ def estimate(
 
     - `recipe`: of the training.
     - `progress`: called with the number of each chunk of training and its loss [m^2].
-    - `checkpoint`: a file from which a killed training goes on.
+    - `checkpoint`: a file from which a killed training continues.
 
     Raises `ValueError` for pulls that do not go together, `RuntimeError` when the training diverges
     or no motion is in equilibrium.
@@ -94,52 +93,52 @@ def estimate(
     networks = [
         jax.tree.map(lambda leaf, i=i: leaf[i], trained.model.networks) for i in range(len(pulls))
     ]
-    found = fit(space, networks, pulls, trained.places[-1], NOISE, DEGREES)
+    best = fit(space, networks, pulls, trained.places[-1], NOISE, DEGREES)
     fewer = DEGREES[0] - 1, DEGREES[1] - 1
-    change = fit(space, networks, pulls, found.place, found.noise, fewer).place - found.place
+    change = fit(space, networks, pulls, best.place, best.noise, fewer).place - best.place
     errors = [
         STIFFNESS_ERROR if r.unit == "N/m" else MODEL_ERRORS.get(r.name, 0.0) for r in space.ranges
     ]
     model = np.diag([(error / r.width) ** 2 for error, r in zip(errors, space.ranges, strict=True)])
-    covariance = found.covariance + np.outer(change, change) + model + found.law
+    covariance = best.covariance + np.outer(change, change) + model + best.law
     words = f"{len(pulls)} pull{'s' if len(pulls) > 1 else ''}"
-    if pulls[0].force is None:
+    has_force = pulls[0].force is not None
+    if not has_force:
         words += ", no force: the scale of stiffness is not identifiable"
-    words += "" if found.converged else ", not converged"
-    found = found._replace(covariance=covariance)
-    return _estimate(f"pinn ({words})", found, space, trained, pulls, began)
-
-
-def _estimate(
-    approach: str, found: Fit, space: ParameterSpace, trained: Trained, pulls, began: float
-) -> Estimate:
-    widths = np.array([bound.width for bound in space.ranges])
-    errors = np.sqrt(np.diag(found.covariance))
-    places = np.concatenate([trained.places, found.places, found.place[None]])
+    words += "" if best.converged else ", not converged"
+    deviations = np.sqrt(np.diag(covariance))
+    places = np.concatenate([trained.places, best.places, best.place[None]])
     history = np.asarray(jax.vmap(space.values)(jnp.asarray(places, float)))
-    nuisances = [Nuisance("marker noise", "m", found.noise[0], np.nan)]
-    if pulls[0].force is not None:
-        nuisances.append(Nuisance("force noise", "-", found.noise[1], np.nan))
-    scale = np.array([r.unit == "N/m" for r in space.ranges]) * widths
-    if scale.any():
-        weights = scale / np.count_nonzero(scale)
-        mean = float(np.exp(np.log(history[-1][scale > 0]).mean()))
-        spread = float(np.sqrt(weights @ found.covariance @ weights))  # relative, since log
-        nuisances.append(Nuisance("stiffness scale", "N/m", mean, spread * mean))
     return Estimate(
-        approach=approach,
-        fabric=space(jnp.asarray(found.place, float)),
+        approach=f"pinn ({words})",
+        fabric=space(jnp.asarray(best.place, float)),
         ranges=space.ranges,
         values=history[-1],
-        standard_errors=widths * errors,
-        correlation=found.covariance / np.outer(errors, errors),
-        nuisances=tuple(nuisances),
-        loss=float(found.losses[-1]),
-        losses=np.concatenate([trained.losses * NOISE[0] ** 2, found.losses])[:, None],
+        standard_errors=np.array([bound.width for bound in space.ranges]) * deviations,
+        correlation=covariance / np.outer(deviations, deviations),
+        nuisances=_nuisances(space, history[-1], covariance, best.noise, has_force),
+        loss=float(best.losses[-1]),
+        losses=np.concatenate([trained.losses * NOISE[0] ** 2, best.losses])[:, None],
         history=history[:-1, None],
         seconds=time.perf_counter() - began,
-        converged=found.converged,
+        converged=best.converged,
     )
+
+
+def _nuisances(
+    space: ParameterSpace, values: np.ndarray, covariance: np.ndarray, noise, has_force: bool
+) -> tuple[Nuisance, ...]:
+    """The noise of markers and force, and the geometric mean of the stiffnesses."""
+    nuisances = [Nuisance("marker noise", "m", noise[0], np.nan)]
+    if has_force:
+        nuisances.append(Nuisance("force noise", "-", noise[1], np.nan))
+    scale = np.array([bound.width if bound.unit == "N/m" else 0.0 for bound in space.ranges])
+    if scale.any():
+        weights = scale / np.count_nonzero(scale)
+        mean = float(np.exp(np.log(values[scale > 0]).mean()))
+        spread = float(np.sqrt(weights @ covariance @ weights))  # relative, since log
+        nuisances.append(Nuisance("stiffness scale", "N/m", mean, spread * mean))
+    return tuple(nuisances)
 
 
 def fit(
@@ -190,12 +189,12 @@ def fit(
         if converged:
             break
         trial = proposed(at, gradient, matrix, damping, low, high, MAX_STEP)
-        there = motions_at(trial, [motion.coefficients for motion in motions])
-        trial_loss = equations(there, trial)[0]
-        is_better = (_unbalanced(there), trial_loss) < (_unbalanced(motions), loss)
+        changed = motions_at(trial, [motion.coefficients for motion in motions])
+        trial_loss = equations(changed, trial)[0]
+        is_better = (_unbalanced(changed), trial_loss) < (_unbalanced(motions), loss)
         damping = damped(damping, jnp.asarray(is_better))
         if is_better:
-            at, motions = trial, there
+            at, motions = trial, changed
         elif np.all(np.abs(trial - at) < small):
             converged = is_near  # the tolerance of the motions decides what is better
             break

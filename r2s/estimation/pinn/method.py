@@ -22,8 +22,8 @@ CHUNK = 100  # epochs of the published recipe between two losses
 class PINN(Method):
     """The physics-informed network, from the markers and force of stretchings.
 
-    No solver simulates: "cloth" and "mpm" tell which space is estimated. `Budget.iterations`
-    are the epochs with physics of the networks' training.
+    No solver simulates: "cloth" and "mpm" are names of the space. `Budget.max_iterations` is the
+    number of epochs with physics in the networks' training.
     """
 
     name = "pinn"

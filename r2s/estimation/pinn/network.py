@@ -4,7 +4,7 @@ The network is a module of flax. Derivatives are carried forward through the lay
 in one matrix product per layer, so that no reverse pass is nested in another.
 """
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -38,15 +38,6 @@ class Jet(eqx.Module):
     def gradient(self) -> Float[Array, "*point axis 2"]:
         """Derivatives in X and Y [-]."""
         return jnp.moveaxis(self.first[:2], 0, -1)
-
-
-@runtime_checkable
-class DisplacementField(Protocol):
-    """Displacements [m] at points (X [m], Y [m], t [s]): a network, or an exact solution."""
-
-    def __call__(self, points: Float[Array, "point 3"]) -> Float[Array, "point axis"]: ...
-
-    def jet(self, points: Float[Array, "point 3"], pairs: Pairs) -> Jet: ...
 
 
 class Perceptron(nn.Module):
@@ -89,15 +80,14 @@ class Perceptron(nn.Module):
             curve = -2 * z * slope
             # lists, because gradients of indexed arrays are slow scatters
             curves = [
-                slope * own + curve * slopes[i] * slopes[j]
-                for own, (i, j) in zip(curves, pairs, strict=True)
+                slope * second + curve * slopes[i] * slopes[j]
+                for second, (i, j) in zip(curves, pairs, strict=True)
             ]
-            slopes = [slope * own for own in slopes]
+            slopes = [slope * first for first in slopes]
             product = jnp.concatenate([z, *slopes, *curves]) @ kernel
             value, *parts = jnp.split(product, 4 + len(pairs))
             value, slopes, curves = value + bias[None], parts[:3], parts[3:]
-        second = jnp.stack(curves) if pairs else jnp.zeros((0, *value.shape), value.dtype)
-        return Jet(value, jnp.stack(slopes), second)
+        return Jet(value, jnp.stack(slopes), jnp.stack(curves))
 
 
 class Network(eqx.Module):

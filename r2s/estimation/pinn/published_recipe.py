@@ -19,7 +19,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from r2s.estimation.pinn.network import DisplacementField, T, X, Y
+from r2s.estimation.pinn.network import Network, T, X, Y
 from r2s.estimation.pinn.pulls import Pull
 from r2s.estimation.pinn.training import Model, Trained, init
 from r2s.estimation.pinn.weak_form import (
@@ -139,15 +139,14 @@ def motion_loss(model: Model, space: ParameterSpace, pulls: Pull) -> tuple[Float
         return jnp.mean(jax.vmap(residual)(model.networks, pulls) ** 2) / number
 
     def add(sums, frame):
-        found = jax.value_and_grad(of_frame)(model, frame)
-        return jax.tree.map(jnp.add, sums, found), None
+        return jax.tree.map(jnp.add, sums, jax.value_and_grad(of_frame)(model, frame)), None
 
     nothing = jax.tree.map(jnp.zeros_like, (model.free[0], model))
     return jax.lax.scan(add, nothing, jnp.arange(number))[0]
 
 
 def motion_residual(
-    network: DisplacementField, pull: Pull, fabric: Fabric, places, frames
+    network: Network, pull: Pull, fabric: Fabric, places, frames
 ) -> Float[Array, "point axis"]:
     """Residual [N/m^2] of the equation of motion in small strain: divergence of the stress less
     the load. Damping of the stress is left out, as it would need third derivatives."""

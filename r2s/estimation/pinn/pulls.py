@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from scipy.interpolate import CubicSpline
 
+from r2s._util.checks import expect
 from r2s._util.units import GRAVITY
 from r2s.estimation.problem import force_at
 from r2s.materials.fabric import Fabric
@@ -92,37 +93,29 @@ def stacked(pulls: list[Pull]) -> Pull:
 
     Raises `ValueError` when their shapes differ or only some have a force.
     """
-    if not pulls:
-        raise ValueError("no recordings: one stretching is needed at least")
-    if len({pull.force is None for pull in pulls}) > 1:
-        raise ValueError("some recordings have a force and some not: leave it out of all, or none")
+    has_force = {pull.force is not None for pull in pulls}
+    expect(len(has_force) == 1, "either all recordings have a force, or none")
     shapes = {pull.displacement.shape for pull in pulls}
-    if len(shapes) > 1:
-        raise ValueError(
-            f"recordings must have as many frames and markers, found (frame, marker, axis) "
-            f"{sorted(shapes)}: leave frames out"
-        )
+    expect(len(shapes) == 1, f"recordings must have as many frames and markers, found {shapes}")
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *pulls)
 
 
 def _pull(recording: Recording, without_force: bool) -> Pull:
     sheet, (first, last) = recording.info.sheet, recording.info.frames_used
-    size = np.asarray(sheet.size)
+    size, used = np.asarray(sheet.size), slice(first, last + 1)
     axes = np.array([sheet.warp, sheet.weft, np.cross(sheet.warp, sheet.weft)])
-    used = slice(first, last + 1)
     times = np.asarray(recording.times, np.float64)[used]
-    _check_times(times)
+    expect(len(times) >= FEWEST_FRAMES, f"{len(times)} frames: at least {FEWEST_FRAMES} are needed")
+    steps = np.diff(times)
+    expect(np.ptp(steps) <= 0.01 * steps.mean(), "frames must be evenly spaced: resample")
     if recording.markers is None or recording.markers_seen is None:
-        raise ValueError(
-            "no markers: a stretching needs them in each frame (r2s.recordings.markers.track)"
-        )
+        raise ValueError("no markers: track them in each frame (r2s.recordings.markers.track)")
     seen = np.asarray(recording.markers_seen)[used]
-    _check_seen(seen, first)
     world = np.asarray(recording.markers, np.float64)[used]
     local = (world - np.asarray(sheet.origin)) @ axes.T
     places = _places(recording, size, seen.shape[1])
     displacement = local[..., :2] - places
-    _check_on_sheet(displacement, local[..., 2], seen, places, min(size))
+    _check_markers(seen, displacement, local[..., 2], first, min(size))
     near, far = _clamps(recording, times, axes, size)
     force = None if without_force else _force(recording, used, axes[0])
     if force is not None:
@@ -144,67 +137,41 @@ def _pull(recording: Recording, without_force: bool) -> Pull:
     )
 
 
-def _check_times(times: np.ndarray) -> None:
-    if len(times) < FEWEST_FRAMES:
-        raise ValueError(
-            f"{len(times)} frames: at least {FEWEST_FRAMES} are needed for an acceleration"
-        )
-    steps = np.diff(times)
-    if np.ptp(steps) > 0.01 * steps.mean():
-        raise ValueError(
-            f"frames must be evenly spaced, found {steps.min():g} to {steps.max():g} s: resample"
-        )
-
-
-def _check_seen(seen: np.ndarray, first: int) -> None:
+def _check_markers(
+    seen: np.ndarray, displacement: np.ndarray, height: np.ndarray, first: int, side: float
+) -> None:
+    """Raise `ValueError` for markers that are missing, not on the sheet or not in its plane."""
     never = np.flatnonzero(~seen.any(axis=0))
-    if len(never):
-        raise ValueError(f"marker {never[0]} is seen in no frame ({len(never)} such): leave it out")
+    expect(len(never) == 0, f"markers {never} are seen in no frame: leave them out")
     share = seen.mean(axis=1)
-    if share.min() < FEWEST_SEEN:
-        frame = int(share.argmin())
-        raise ValueError(
-            f"frame {frame + first}: {seen[frame].sum()} of {seen.shape[1]} markers are seen, at "
-            f"least {FEWEST_SEEN:.0%} are needed: track them again, or leave the frame out"
-        )
+    frame = int(share.argmin())
+    few = f"frame {frame + first}: {seen[frame].sum()} of {seen.shape[1]} markers are seen"
+    expect(share[frame] >= FEWEST_SEEN, f"{few}, at least {FEWEST_SEEN:.0%} are needed")
+    off = np.where(seen[0], np.linalg.norm(displacement[0], axis=-1), 0)
+    begins = f"marker {off.argmax()} begins {1e3 * off.max():.0f} mm from its place on the sheet"
+    expect(off.max() <= OFF_PLACE * side, f"{begins}: in another order, or not in metres?")
+    away = np.where(seen, np.abs(height), 0)
+    frame, marker = np.unravel_index(away.argmax(), away.shape)
+    flies = f"frame {frame + first}: marker {marker} is {1e3 * away.max():.1f} mm out of the plane"
+    expect(away.max() <= OFF_PLANE * side, f"{flies} of the sheet, which must stay flat")
 
 
 def _places(recording: Recording, size: np.ndarray, count: int) -> np.ndarray:
     """Places [m] of the markers on the sheet at rest."""
-    if recording.marker_places is None:
-        side = math.isqrt(count)
-        if side * side != count:
-            raise ValueError(f"{count} markers are no square grid: give their places on the sheet")
-        along = (np.arange(side) + 0.5) / side
-        return np.stack(np.meshgrid(along, along, indexing="ij"), -1).reshape(-1, 2) * size
-    return np.asarray(recording.marker_places, np.float64)
-
-
-def _check_on_sheet(displacement, height, seen, places, side: float) -> None:
-    off = np.where(seen[0], np.linalg.norm(displacement[0], axis=-1), 0)
-    marker = int(np.argmax(off))
-    if off[marker] > OFF_PLACE * side:
-        found = 1e3 * (places[marker] + displacement[0, marker])
-        raise ValueError(
-            f"frame 0: marker {marker} is at {found.round(1)} mm on the sheet, its place is "
-            f"{(1e3 * places[marker]).round(1)} mm: not on the sheet at rest, in another order, or "
-            "not in metres"
-        )
-    away = np.where(seen, np.abs(height), 0)
-    if away.max() > OFF_PLANE * side:
-        frame, marker = np.unravel_index(away.argmax(), away.shape)
-        raise ValueError(
-            f"frame {frame}: marker {marker} is {1e3 * away.max():.1f} mm out of the sheet's plane,"
-            f" at most {1e3 * OFF_PLANE * side:.1f} mm: the sheet must stay flat"
-        )
+    if recording.marker_places is not None:
+        return np.asarray(recording.marker_places, np.float64)
+    side = math.isqrt(count)
+    expect(side**2 == count, f"{count} markers are no square grid: give their places on the sheet")
+    along = (np.arange(side) + 0.5) / side
+    return np.stack(np.meshgrid(along, along, indexing="ij"), -1).reshape(-1, 2) * size
 
 
 def _clamps(recording: Recording, times: np.ndarray, axes: np.ndarray, size: np.ndarray):
     """Displacement, velocity and acceleration of both clamps, by cubic splines of their path."""
     pinned = recording.info.sheet.pinned
     corners = {"origin": (0, 0), "weft": (0, 1), "warp": (1, 0), "opposite": (1, 1)}
-    if set(pinned) != set(corners):
-        raise ValueError(f"a stretching is clamped at four corners, this sheet is held at {pinned}")
+    is_clamped = set(pinned) == set(corners)
+    expect(is_clamped, f"a stretching is clamped at four corners, this sheet is held at {pinned}")
     world = np.asarray(recording.gripper_path, np.float64) - np.asarray(recording.info.sheet.origin)
     path = world @ axes[:2].T - np.array([corners[name] for name in pinned]) * size
     knots, columns = np.asarray(recording.gripper_times, np.float64), path.reshape(len(path), -1).T
@@ -214,8 +181,8 @@ def _clamps(recording: Recording, times: np.ndarray, axes: np.ndarray, size: np.
     ends = []
     for pair in (("origin", "weft"), ("warp", "opposite")):
         first, second = (derivatives[:, :, pinned.index(name)] for name in pair)
-        if np.max(np.abs(first[0] - second[0])) > 1e-3 * min(size):
-            raise ValueError(f"the clamp from {pair[0]} to {pair[1]} turns: it must go straight")
+        is_straight = np.max(np.abs(first[0] - second[0])) <= 1e-3 * min(size)
+        expect(is_straight, f"the clamp from {pair[0]} to {pair[1]} turns: it must go straight")
         ends.append((first + second) / 2)
     return ends
 
@@ -226,33 +193,20 @@ def _force(recording: Recording, used: slice, along: np.ndarray) -> np.ndarray:
     if force is None:
         raise ValueError(
             "no force: without it only ratios of stiffness are identifiable, not their scale; add "
-            "the load cell's log (r2s.recordings.force_log), or take the pull with "
-            "r2s.estimation.pinn.pulls.pull_from(recording, without_force=True)"
+            "the load cell's log (r2s.recordings.force_log)"
         )
     return np.asarray(force.values, np.float64) @ (np.asarray(force.directions) @ along)
 
 
 def _check_unit(force: np.ndarray, pulled: np.ndarray, size: np.ndarray) -> None:
     """Raise `ValueError` when force over stretch is not the stiffness of any fabric."""
-    stretch = pulled / size[0]
-    if np.ptp(stretch) < 1e-3:
-        raise ValueError(
-            f"the clamps move apart by {1e3 * np.ptp(pulled):.2g} mm: no stretching, or not [m]"
-        )
+    stretch, (low, high) = pulled / size[0], STIFFNESSES
+    moved = f"the clamps move apart by {1e3 * np.ptp(pulled):.2g} mm"
+    expect(np.ptp(stretch) >= 1e-3, f"{moved}: no stretching, or not in metres")
     stiffness = float(np.polyfit(stretch, force / size[1], 1)[0])
-    if -stiffness > STIFFNESSES[0]:
-        raise ValueError(
-            f"the force on the pulled clamp falls while it is pulled ({stiffness:.3g} N/m): it "
-            "must be positive along the pull"
-        )
-    if not STIFFNESSES[0] <= stiffness <= STIFFNESSES[1]:
-        raise ValueError(
-            f"force and stretch give {stiffness:.3g} N/m, fabrics have {STIFFNESSES[0]:g} to "
-            f"{STIFFNESSES[1]:g}: is the force in newtons, and the path in metres?"
-        )
-
-
-_simulated = eqx.filter_jit(energy_balance)
+    ratio = f"force over stretch is {stiffness:.3g} N/m, of fabrics {low:g} to {high:g}"
+    expect(stiffness >= -low, f"{ratio}: the force must be positive along the pull")
+    expect(low <= stiffness <= high, f"{ratio}: is the force in newtons, and the path in metres?")
 
 
 def pulled(
@@ -287,11 +241,12 @@ def pulled(
         route=experiment.route,
     )
     scenario = dataclasses.replace(fine.scenario(shape), turn=jnp.asarray(angle, float))
-    found = _simulated(scenario, fabric, STRETCHING_INTERVAL / steps)
-    if not np.isfinite(np.asarray(found.x)).all():
+    simulate = eqx.filter_jit(energy_balance)
+    motion = simulate(scenario, fabric, STRETCHING_INTERVAL / steps)
+    if not np.isfinite(np.asarray(motion.x)).all():
         raise RuntimeError(f"the simulation of {name} diverged")
     key_markers, key_force = jr.split(key)
-    force = np.asarray(clamp_force(scenario, found))[::steps]
+    force = np.asarray(clamp_force(scenario, motion))[::steps]
     spread = force_noise * np.abs(force).max()
     info = RecordingInfo(
         name=f"stretching_{name}_{np.degrees(angle):.0f}",
@@ -311,7 +266,7 @@ def pulled(
         experiment.route.path,
         experiment.route.times,
         info,
-        markers=markers_of(found.x[::steps], scenario, key_markers, marker_noise),
+        markers=markers_of(motion.x[::steps], scenario, key_markers, marker_noise),
         force=force + spread * np.asarray(jr.normal(key_force, force.shape, float)),
         force_times=experiment.times,
     )

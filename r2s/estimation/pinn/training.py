@@ -18,7 +18,7 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from r2s.estimation import checkpoint as checkpoints
-from r2s.estimation.pinn.network import DisplacementField, Network
+from r2s.estimation.pinn.network import Network
 from r2s.estimation.pinn.pulls import Pull
 from r2s.estimation.pinn.weak_form import (
     clamp_residual,
@@ -42,7 +42,8 @@ DEGREES, NODES = (3, 4), 8  # of its virtual displacements and their quadrature
 
 
 class Recipe(NamedTuple):
-    """- `warm_up`, `adam`: epochs without and with physics.
+    """- `warm_up`, `adam`: epochs without and with physics. Few: the fit needs a motion to begin
+      with, and its accelerations, no more.
     - `chunk`: epochs for which frames are drawn. - `width`, `layers`: of the network.
     """
 
@@ -51,9 +52,6 @@ class Recipe(NamedTuple):
     chunk: int = 100
     width: int = 32
     layers: int = 7
-
-
-QUICK = Recipe()  # the fit needs a motion to begin with, and its accelerations, no more
 
 
 class Model(eqx.Module):
@@ -114,9 +112,7 @@ def init(
     return Model(jax.vmap(network)(pulls, keys), jnp.zeros(space.dim, float))
 
 
-def losses_of(
-    network: DisplacementField, pull: Pull, fabric: Fabric, frames: Int[Array, " frame"]
-) -> Losses:
+def losses_of(network: Network, pull: Pull, fabric: Fabric, frames: Int[Array, " frame"]) -> Losses:
     """The losses of one pull, with the weak form in some frames.
 
     The work counts beside that of the measured force over the width; without a force, of the stress
@@ -175,7 +171,7 @@ def train_chunk(
 def train(
     space: ParameterSpace,
     pulls: Pull,
-    recipe: Recipe = QUICK,
+    recipe: Recipe,
     *,
     report: Callable[[int, float], None] | None = None,
     checkpoint: Path | None = None,
@@ -184,7 +180,7 @@ def train(
     """Train a network for each of some stacked pulls, and their fabric, together.
 
     After every chunk `report` is called with its number and the loss of the markers [m^2], and a
-    `checkpoint` is written, from which a killed training of the same problem goes on. Raises
+    `checkpoint` is written, from which a killed training of the same problem continues. Raises
     `RuntimeError` when a loss is not finite, `ValueError` for a checkpoint of another problem.
     """
     key_init, key_chunks = jr.split(key)
