@@ -172,6 +172,13 @@ def rotation(angle: float, axis: int):
     return jnp.eye(3).at[i, i].set(c).at[j, j].set(c).at[i, j].set(-s).at[j, i].set(s)
 
 
+def two_of(mesh: Mesh) -> Mesh:
+    """Two copies of a sheet that do not touch."""
+    rest, faces = np.asarray(mesh.rest), np.asarray(mesh.faces)
+    both = np.concatenate([rest, rest + [2.0, 0.0]])
+    return Mesh.make(both, np.concatenate([faces, faces + len(rest)]))
+
+
 def hanging(mesh: Mesh, angle: float = 0.0):
     """Positions of a flat sheet that hangs from its first row, swung out by an angle."""
     return flat(mesh) @ rotation(angle - np.pi / 2, 1).T

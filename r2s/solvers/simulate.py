@@ -57,7 +57,7 @@ class Solution(eqx.Module):
     axis.
 
     - `x`, `v`: positions [m] and velocities [m/s] at the `times` [s] that are saved.
-    - `final_state`: after the last step; `simulate` goes on from it.
+    - `final_state`: after the last step; `simulate` can start from it.
     - `ok`: of each saved time, whether all is finite and nothing has failed so far.
     - `result`: a `Result`; `Result.SUCCESS` is 0.
     - `failed_at`: the time [s] at the end of the step that failed first; NaN: none did.

@@ -56,8 +56,8 @@ def stream(
 
     - `members`: a pytree of arrays with a leading axis, all of the same length.
     - `chunk`: members at once, rounded up to a multiple of the devices.
-    - `folder`: where each chunk's result is kept. One that is there for the same members is read,
-      so that an interrupted sweep goes on. Take another folder for another function.
+    - `folder`: where each chunk's result is kept. One of the same members is read, so that an
+      interrupted sweep is resumed. Take another folder for another function.
     - `devices`: a mesh with the axis "member"; by default all devices of all processes.
 
     A member that diverges stops nothing. Raises `ValueError` for arrays of different lengths, or

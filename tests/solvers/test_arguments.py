@@ -50,6 +50,9 @@ def test_shapes_that_do_not_fit_are_named(solver, change, words):
 def test_arguments_in_another_order_and_steps_are_named(solver):
     with pytest.raises(ValueError, match="in seconds, at most 10.0, got 20"):
         r2s.ImplicitCloth(SCENE, 20.0)
+    for wrong in (0.0, float("nan")):
+        with pytest.raises(ValueError, match="dt must be positive"):
+            r2s.ImplicitCloth(SCENE, wrong)
     state = solver.init(START)
     with pytest.raises(ValueError, match="save_every must divide"):
         r2s.simulate(solver, FABRIC, state, r2s.Control(CONTROL.pinned[None]), save_every=0)

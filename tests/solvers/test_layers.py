@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import cloth, directional_difference, everywhere, flat, roll
+from conftest import cloth, directional_difference, everywhere, flat, roll, two_of
 
 from r2s._util.units import GRAVITY
 from r2s.environment.scene import Control, Scene
@@ -72,12 +72,8 @@ def with_self_contact(solver, make=lambda mesh: SelfContact.make(mesh, 256)):
 def two_sheets(gap: float, size: float = 0.1, count: int = 4):
     """One mesh of two square sheets, and positions with the second above the first [m]."""
     one = rectangle((size, size), (count, count))
-    rest, faces = np.asarray(one.rest), np.asarray(one.faces)
-    mesh = Mesh.make(
-        np.concatenate([rest, rest + [1.0, 0.0]]), np.concatenate([faces, faces + len(rest)])
-    )
     lower, upper = flat(one), flat(one, gap)
-    return mesh, jnp.concatenate([lower, upper + jnp.array([[0.003, 0.002, 0.0]])])
+    return two_of(one), jnp.concatenate([lower, upper + jnp.array([[0.003, 0.002, 0.0]])])
 
 
 @pytest.mark.slow(group="cloth")

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.spatial
-from conftest import dense
+from conftest import dense, two_of
 
 from r2s.mesh.mesh import Mesh, rectangle
 from r2s.solvers.implicit.band import Band
@@ -36,19 +36,12 @@ def scattered() -> Mesh:
     return Mesh.make(points, scipy.spatial.Delaunay(points).simplices)
 
 
-def two_pieces() -> Mesh:
-    """Two sheets that do not touch."""
-    one = rectangle((1.0, 1.0), (6, 7))
-    rest, faces = np.asarray(one.rest), np.asarray(one.faces)
-    return Mesh.make(np.concatenate([rest, rest + [2.0, 0.0]]), np.concatenate([faces, faces + 42]))
-
-
 MESHES = {
     "one face": lambda: rectangle((1.0, 1.0), (2, 2)),
     "square": lambda: rectangle((1.0, 1.0), (9, 9)),
     "strip": lambda: rectangle((1.0, 0.01), (40, 2)),
     "scattered": scattered,
-    "two pieces": two_pieces,
+    "two pieces": lambda: two_of(rectangle((1.0, 1.0), (6, 7))),
 }
 
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import SIZE, everywhere, flat, rotation
+from conftest import SIZE, everywhere, flat, rotation, two_of
 from mpm_bodies import momenta, states, still
 
 import r2s
@@ -159,18 +159,10 @@ def test_stresses_between_layers_exert_no_torque():
     )
 
 
-def _two(mesh):
-    """A mesh of two separate copies of a sheet."""
-    rest, faces = np.asarray(mesh.rest), np.asarray(mesh.faces)
-    aside = rest + np.array([1.0, 0.0])
-    count = len(rest)
-    return r2s.Mesh.make(np.concatenate([rest, aside]), np.concatenate([faces, faces + count]))
-
-
 @pytest.fixture(scope="module")
 def pair(sheet, fabric):
     """Two sheets, and a solver for them over a table."""
-    mesh, fabric = _two(sheet), eqx.tree_at(lambda f: f.damping, fabric, jnp.asarray(2e-4, float))
+    mesh, fabric = two_of(sheet), eqx.tree_at(lambda f: f.damping, fabric, jnp.asarray(2e-4, float))
     grid = Grid.covering((-0.15, -0.15, 0.0), (0.35, 0.35, 0.3), SPACING)
     scene = Scene(mesh, table=0.0, air=None)
     return MPMCloth(scene, 5e-4, fabric, grid), fabric

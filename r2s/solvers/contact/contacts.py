@@ -166,7 +166,7 @@ def touching(
     reach = WATCHED * thickness
     near, overflow = self_contact.candidates(x, x, reach)
     weights, normals, distance = jax.vmap(_plane)(x[near.stencils], near.is_edges)
-    area = _area(mesh, near)
+    area = jnp.mean(mesh.vertex_area[near.stencils], axis=1)
     depth = jnp.maximum(thickness - distance, 0)
     limit = friction * area * contact.pressure(depth)
     is_close = near.is_real & (distance < reach)
@@ -183,7 +183,7 @@ def colliding(
     after: Positions,
     contacts: Contacts,
 ) -> tuple[Contacts, Bool[Array, ""], Bool[Array, ""]]:
-    """The contacts and those that the motion from `before` to `after` lacks; whether it lacks
+    """The contacts, with those that the motion from `before` to `after` lacks; whether it lacks
     none; whether the capacity sufficed.
     """
     gap = CLOSEST * thickness
@@ -197,7 +197,7 @@ def colliding(
     refine = jax.vmap(_refined, in_axes=(0, 0, 0, 0, None))
     at = refine(times, start, end, near.is_edges, gap)[:, None, None]
     weights, normals, _ = jax.vmap(_plane)(start + at * (end - start), near.is_edges)
-    area = _area(mesh, near)
+    area = jnp.mean(mesh.vertex_area[near.stencils], axis=1)
     more = contacts.appended(is_hit, near.stencils, weights, normals, area, jnp.zeros_like(area))
     return more, ~jnp.any(is_hit), ~overflow & (more.count <= self_contact.capacity)
 
@@ -228,7 +228,3 @@ def _plane(corners, is_edges):
     squared = jnp.sum(between**2)
     distance = jnp.sqrt(jnp.where(squared > 0, squared, 1))  # safe where two places coincide
     return weights, between / distance, jnp.where(squared > 0, distance, 0)
-
-
-def _area(mesh: Mesh, pairs: Pairs) -> Float[Array, " pair"]:
-    return jnp.mean(mesh.vertex_area[pairs.stencils], axis=1)

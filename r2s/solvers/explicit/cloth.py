@@ -44,7 +44,7 @@ TRACED = (
     "and vmap, of the stiffest fabric, and trace its steps"
 )
 REFUSED = (
-    "explicit steps do not know contact of the sheet with itself: take the implicit cloth, "
+    "explicit steps have no contact of the sheet with itself: take the implicit cloth, "
     "r2s.ImplicitCloth(..., self_contact=True), or material points, r2s.mpm_cloth"
 )
 

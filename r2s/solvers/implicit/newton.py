@@ -197,27 +197,23 @@ def _moved(state: _Search, line: _Line, searching: Bool[Array, ""]) -> _Search:
     # where the Hessian is indefinite: half of the exact one, or none; the stand-in is only rounded
     less = jnp.where(state.blend > LEAST_BLEND, state.blend / 2, 0)
     limit = jnp.where(state.blend > 0, state.blend, state.limit)
+    # more of the diagonal where rounding made the convex stand-in indefinite, else less
+    least = FIRST_SHIFT * jnp.finfo(state.shift.dtype).eps
+    higher = jnp.where(state.blend == 0, jnp.maximum(4 * state.shift, least), state.shift)
+    lower = jnp.where(state.shift > least, state.shift / 2, 0)
     arrived = state._replace(
         at=line.best,
         moved=moved,
         is_stale=is_first | ~usable | (line.length != 1) | (moved > STALE * state.moved),
         blend=jnp.where(usable, jnp.minimum(blend, 1), less),
         limit=jnp.where(usable, jnp.minimum(1.2 * state.limit, 2), limit),
-        shift=_next_shift(state, usable),
+        shift=jnp.where(usable, lower, higher),
         count=state.count + 1,
     )
     # the factors stay where they are: a choice between them would copy them
     new, old = (search._replace(system=None, line=None) for search in (arrived, state))
     chosen = jax.tree.map(lambda a, b: jnp.where(searching, b, a), new, old)
     return chosen._replace(system=state.system, line=line, searching=searching)
-
-
-def _next_shift(state: _Search, usable: Array) -> Array:
-    """More of it where rounding made the convex stand-in indefinite, less where it did not."""
-    least = FIRST_SHIFT * jnp.finfo(state.shift.dtype).eps
-    more = jnp.where(state.blend == 0, jnp.maximum(4 * state.shift, least), state.shift)
-    less = jnp.where(state.shift > least, state.shift / 2, 0)
-    return jnp.where(usable, less, more)
 
 
 def _second(step, x, blend: Array | float = 1.0, shift: Array | float = 0.0, wrinkles: Any = None):
@@ -238,12 +234,12 @@ def _minimise_jvp(primals, tangents):
     x, code = checkpoint_name(_minimise(*primals), SAVED)
     held_dot = jnp.zeros_like(x) if start_dot is None else jnp.where(free[:, None], 0, start_dot)
     _, force_dot = eqx.filter_jvp(residual, (step, x), (step_dot, held_dot))
-    # linear in the right-hand side, so that it batches and transposes with the same factors
 
     def exact(step, x, free):
         # where a shape is about to buckle the minimum may be a saddle: not definite
         return prepare(step.elimination, *_second(step, x), free, is_definite=False)
 
+    # linear in the right-hand side, so that it batches and transposes with the same factors
     system = _one_by_one(exact)(step, x, free)
     right = jnp.where(free[:, None], force_dot, 0)
     x_dot = held_dot - apply_inverse(step.elimination, system, right, is_definite=False)
@@ -253,8 +249,8 @@ def _minimise_jvp(primals, tangents):
 def _one_by_one(function):
     """`function`, which under `vmap` on a CPU runs for one member of the batch after the other.
 
-    So no member waits for the slowest, and the factors fit the cache. Nor is there a gain from a
-    batch there; and jaxlib 0.10.1 for the CPU can hang in a batched factorisation inside a loop.
+    So no member waits for the slowest, and the factors fit the cache. And jaxlib 0.10.1 for the
+    CPU can hang in a batched factorisation inside a loop.
     """
 
     @jax.custom_batching.custom_vmap

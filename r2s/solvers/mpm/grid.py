@@ -95,11 +95,7 @@ Points = Float[Array, "particle axis"]
 
 
 def failure_of_step(grid: Grid, before: Points, after: Points, inputs: Any) -> Int[Array, ""]:
-    """The `r2s.solvers.results.Result` of one step.
-
-    - `before`: positions at the start of the step, [m].
-    - `after`: positions at its end, also of particles that have left the grid, [m].
-    - `inputs`: what else the step depends on, such as fabric and control.
+    """The `r2s.solvers.results.Result` of one step, from positions [m] and its other inputs.
 
     Inputs that are not finite give `NON_FINITE`. A result that is not finite gives `TIME_STEP`, and
     so does a particle that leaves the grid while one moves by more than a spacing in the step, as
