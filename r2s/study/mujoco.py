@@ -115,10 +115,10 @@ class MujocoRecording(SimulatedRecording):
         scenario = experiment.scenario(self.shape)
         number = number_of(self.fabric, self.scenario, self.number, self.unseen)
         key = jr.fold_in(jr.key(self.seed), number)
-        x = jnp.asarray(moved(scenario, self.material, self.step), float)
+        x = moved(scenario, self.material, self.step)
         self.save_start(out, scenario, x)
-        arguments = x, experiment, scenario, self.fabric, self.number, self.sensing
-        made = synthetic.seen_of(*arguments, key=key)
+        whose = experiment, scenario, self.fabric, self.number, self.sensing
+        made = synthetic.seen_of(jnp.asarray(x, float), *whose, key=key)
         info = dataclasses.replace(made.info, source=f"MuJoCo's flex: {made.info.source}")
         return dataclasses.replace(made, info=info)
 
